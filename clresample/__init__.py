@@ -1,0 +1,28 @@
+"""clresample: resampling and convolution between telescopes in one OpenCL operator."""
+
+from importlib import import_module
+
+__version__ = "0.1.0"
+
+# Each public name and the module it lives in; imported when first used, so that the command line
+# answers at once and no OpenCL driver is touched before it is needed.
+_HOMES = {
+    "Device": "device",
+    "DeviceError": "device",
+    "Grid": "grid",
+    "PSF": "psf",
+    "Resampler": "resample",
+    "get_device": "device",
+    "list_devices": "device",
+}
+__all__ = sorted(_HOMES)
+
+
+def __getattr__(name):
+    if name not in _HOMES:
+        raise AttributeError(f"module 'clresample' has no attribute {name!r}")
+    return getattr(import_module(f"clresample.{_HOMES[name]}"), name)
+
+
+def __dir__():
+    return [*globals(), *__all__]

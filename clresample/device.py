@@ -1,0 +1,263 @@
+"""One OpenCL device: its choice, its memory, its kernels, and readable errors.
+
+pyopencl is imported when a device is first asked for, never before.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+
+from .discover import (
+    DeviceError,
+    DeviceInfo,
+    builds_fp64,
+    choose,
+    format_size,
+    kind_of,
+    list_devices,
+    load_pyopencl,
+)
+
+__all__ = ["Device", "DeviceError", "DeviceInfo", "get_device", "list_devices"]
+
+# NVIDIA and AMD mishandle fills of 2 GiB and more: zero memory in pieces [bytes].
+FILL_BYTES = 1 << 30
+# Status codes after which the device or its queue no longer answers.
+# -9999 is NVIDIA's own code for an illegal access, after which its context is dead.
+LOST = {
+    "DEVICE_NOT_AVAILABLE",
+    "OUT_OF_RESOURCES",
+    "INVALID_COMMAND_QUEUE",
+    "INVALID_CONTEXT",
+    "INVALID_DEVICE",
+    "EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST",
+    "-9999",
+}
+FULL = {"MEM_OBJECT_ALLOCATION_FAILURE", "INVALID_BUFFER_SIZE", "OUT_OF_HOST_MEMORY"}
+
+
+class Device:
+    """An OpenCL device with one context and one in-order queue; `get_device` makes it.
+
+    context, queue, cl: pyopencl's Context, CommandQueue and Device
+    name, platform, kind: what the driver calls it; kind is "GPU", "CPU", "ACCELERATOR" or "OTHER"
+    compute_units, max_group: counts; memory, max_alloc [bytes]: all of it, and the largest buffer
+    """
+
+    def __init__(self, cl_device):
+        cl = load_pyopencl()
+        self.cl = cl_device
+        self.name = cl_device.name.strip()
+        self.platform = cl_device.platform.name.strip()
+        self.kind = kind_of(cl_device)
+        self.compute_units = cl_device.max_compute_units
+        self.memory = cl_device.global_mem_size
+        self.max_alloc = cl_device.max_mem_alloc_size
+        self.max_group = cl_device.max_work_group_size
+        self._enqueue = cl.enqueue_nd_range_kernel
+        self._error = cl.Error
+        self._programs = {}
+        try:
+            self.context = cl.Context([cl_device])
+            self.queue = cl.CommandQueue(self.context, cl_device)
+        except cl.Error as error:
+            raise self._explain(error) from error
+
+    def __repr__(self):
+        return f"Device({self.platform}: {self.name})"
+
+    @functools.cached_property
+    def has_fp64(self):
+        """True where a kernel in double precision builds."""
+        return builds_fp64(self.context)
+
+    def empty(self, shape, dtype):
+        """A pyopencl array (shape) with undefined values; DeviceError where it cannot fit."""
+        import pyopencl.array
+
+        dtype = np.dtype(dtype)
+        # Python's own integers: a size past 2^63 must be refused, not wrapped.
+        shape = (int(shape),) if np.ndim(shape) == 0 else tuple(map(int, shape))
+        n_bytes = math.prod(shape, start=dtype.itemsize)
+        if n_bytes > min(self.max_alloc, self.memory):
+            raise self._too_large(shape, dtype, n_bytes)
+        try:
+            return pyopencl.array.Array(self.queue, shape, dtype)
+        except self._error as error:
+            if _status(error) in FULL:
+                raise self._too_large(shape, dtype, n_bytes) from error
+            raise self._explain(error) from error
+
+    def zeros(self, shape, dtype):
+        """A pyopencl array (shape) of zeros; DeviceError where it cannot fit."""
+        import pyopencl as cl
+
+        array = self.empty(shape, dtype)
+        try:
+            for start in range(0, array.nbytes, FILL_BYTES):
+                n_bytes = min(FILL_BYTES, array.nbytes - start)
+                cl.enqueue_fill_buffer(self.queue, array.base_data, b"\0", start, n_bytes)
+        except self._error as error:
+            raise self._explain(error) from error
+        return array
+
+    def put(self, values, dtype=None):
+        """A C-contiguous copy of a NumPy array on the device, native byte order, cast to dtype."""
+        import pyopencl as cl
+
+        values = np.asarray(values)
+        dtype = (values.dtype if dtype is None else np.dtype(dtype)).newbyteorder("=")
+        values = np.asarray(values, dtype=dtype, order="C")
+        array = self.empty(values.shape, dtype)
+        try:
+            if values.size:
+                cl.enqueue_copy(self.queue, array.base_data, values)
+        except self._error as error:
+            raise self._explain(error) from error
+        return array
+
+    def get(self, array):
+        """The values of a pyopencl array as a NumPy array, once all that was queued is done."""
+        try:
+            return array.get(self.queue)
+        except self._error as error:
+            raise self._explain(error) from error
+
+    def kernel(self, file, name, *, dtype=np.float32, **defines):
+        """A fresh pyopencl.Kernel `name` from kernels/`file`; equal requests share one program.
+
+        defines: macros; True defines the bare name, False and None leave it out
+        DeviceError: the file does not build here (with the compiler's log), or no float64
+        """
+        import pyopencl as cl
+
+        dtype = np.dtype(dtype)
+        if dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
+            raise ValueError(f"dtype is {dtype}; kernels are built for float32 or float64")
+        key = (file, dtype, tuple(sorted(defines.items())))
+        if key not in self._programs:
+            self._programs[key] = self._build(file, dtype, defines)
+        return cl.Kernel(self._programs[key], name)
+
+    def launch(self, kernel, global_size, local_size=None):
+        """Queue a kernel whose arguments are set; sizes (x, y, z) as OpenCL counts them."""
+        try:
+            return self._enqueue(self.queue, kernel, global_size, local_size)
+        except self._error as error:
+            raise self._explain(error) from error
+
+    def finish(self):
+        """Wait until everything queued is done."""
+        try:
+            self.queue.finish()
+        except self._error as error:
+            raise self._explain(error) from error
+
+    def _build(self, file, dtype, defines):
+        import pyopencl as cl
+
+        if dtype == np.float64:
+            if not self.has_fp64:
+                raise DeviceError(
+                    f"{self.name} has no double precision: use float32, or another device "
+                    "(`clresample devices` lists them)"
+                )
+            defines = {**defines, "REAL": "double", "USE_DOUBLE": True}
+        else:
+            defines = {**defines, "REAL": "float"}
+        lines = [_define(key, value) for key, value in defines.items()]
+        source = "\n".join([*filter(None, lines), f'#line 1 "{file}"', read_kernel(file)])
+        program = cl.Program(self.context, source)
+        try:
+            return program.build(options=["-cl-std=CL1.2"])
+        except cl.Error as error:
+            raise DeviceError(
+                f"{file} does not build on {self.name} ({self.platform}) with "
+                f"{defines}; the compiler says:\n{_build_log(error)}\n"
+                "Update the driver, or choose another device with CLRESAMPLE_DEVICE "
+                "(`clresample devices` lists them)"
+            ) from error
+
+    def _too_large(self, shape, dtype, n_bytes):
+        return DeviceError(
+            f"an array {shape} of {dtype} needs {format_size(n_bytes)}; {self.name} has "
+            f"{format_size(self.memory)} in all and {format_size(self.max_alloc)} in one buffer: "
+            "use smaller batches or tiles, or free other arrays"
+        )
+
+    def _explain(self, error):
+        """A DeviceError for what a user can meet; a mistake in our own calls stays as it is."""
+        status = _status(error)
+        if status in FULL:
+            return DeviceError(
+                f"{self.name} is out of memory ({status}; it has {format_size(self.memory)} in "
+                "all): use smaller batches or tiles, or free other arrays"
+            )
+        if status in LOST:
+            return DeviceError(
+                f"{self.name} ({self.platform}) no longer answers ({status}): start again, look "
+                "at the driver's log for a reset or a time limit on kernels, use smaller "
+                "batches, or choose another device with CLRESAMPLE_DEVICE"
+            )
+        return error
+
+
+def get_device(choice=None):
+    """The chosen device; asked twice it is the same object.
+
+    choice: None, a Device, an index, "platform:device" (each an index or part of a name), or part
+        of a device's or platform's name. None reads CLRESAMPLE_DEVICE (the same forms), then
+        PYOPENCL_CTX (pyopencl's form), and then takes the first GPU, or else the first CPU.
+    DeviceError: there is no platform, or nothing fits the choice
+    """
+    return choice if isinstance(choice, Device) else _open(choose(choice))
+
+
+def kernels_folder():
+    """The folder of kernel sources: in the installed package, or beside it in a checkout."""
+    package = Path(__file__).resolve().parent
+    for folder in (package / "kernels", package.parent / "kernels"):
+        if folder.is_dir():
+            return folder
+    raise DeviceError(f"the kernel sources are missing beside {package}: reinstall clresample")
+
+
+@functools.cache
+def read_kernel(file):
+    """The source of kernels/`file`, each line `#include "x"` replaced by that file's text."""
+
+    def paste(match):
+        line = source.count("\n", 0, match.start()) + 2
+        return f'#line 1 "{match[1]}"\n{read_kernel(match[1])}\n#line {line} "{file}"'
+
+    source = (kernels_folder() / file).read_text(encoding="utf-8")
+    return re.sub(r'^#include "(.+)"$', paste, source, flags=re.MULTILINE)
+
+
+@functools.cache
+def _open(cl_device):
+    return Device(cl_device)
+
+
+def _define(name, value):
+    if value is None or value is False:
+        return None
+    return f"#define {name} {1 if value is True else value}"
+
+
+def _build_log(error):
+    """The compiler's own words out of pyopencl's message."""
+    log = re.sub(r"\(options: .*\)\s*$", "", str(error).split(">:\n", 1)[-1], flags=re.DOTALL)
+    return log.strip()
+
+
+def _status(error):
+    """The name of an OpenCL error's status, or its number where it has none."""
+    code = getattr(error, "code", None)
+    names = vars(load_pyopencl().status_code)
+    return next((n for n, c in names.items() if n.isupper() and c == code), str(code))

@@ -1,0 +1,191 @@
+"""Which OpenCL devices there are, and which of them a choice means.
+
+pyopencl is imported when this is first asked, never before.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+# Order of preference when nothing is chosen; a kind that is not listed comes last.
+KINDS = ("GPU", "CPU", "ACCELERATOR")
+# Compiles only where double is a type of 8 bytes, whatever the driver claims.
+FP64_PROBE = """
+#pragma OPENCL EXTENSION cl_khr_fp64 : enable
+typedef char proof[sizeof(double) == 8 ? 1 : -1];
+__kernel void probe(__global double *x) { x[0] = x[0] / 3.0; }
+"""
+
+
+class DeviceError(RuntimeError):
+    """The device cannot do what was asked; the message says why and what to do about it."""
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """One row of the table of devices; sizes in bytes, `fp64` None where it could not be tried."""
+
+    index: int
+    platform: str
+    name: str
+    kind: str
+    version: str
+    compute_units: int
+    memory: int
+    max_alloc: int
+    fp64: bool | None
+    chosen: bool
+
+
+def list_devices():
+    """Every OpenCL device as a DeviceInfo, the one `get_device()` would take marked `chosen`."""
+    found = _found()
+    try:
+        chosen = choose(None)
+    except DeviceError:  # nothing fits the environment's choice: the table is what helps then
+        chosen = None
+    return [
+        DeviceInfo(
+            index=i_device,
+            platform=device.platform.name.strip(),
+            name=device.name.strip(),
+            kind=kind_of(device),
+            version=" ".join(device.version.split()[:2]),  # "OpenCL 3.0 vendor text"
+            compute_units=device.max_compute_units,
+            memory=device.global_mem_size,
+            max_alloc=device.max_mem_alloc_size,
+            fp64=_try_fp64(device),
+            chosen=device == chosen,
+        )
+        for i_device, device in enumerate(found)
+    ]
+
+
+def format_size(n_bytes):
+    """A number of bytes as a person reads it: 3.5 GiB, 512 MiB, 12 B."""
+    for unit, power in (("GiB", 30), ("MiB", 20), ("KiB", 10)):
+        if n_bytes >= 1 << power:
+            return f"{n_bytes / (1 << power):.3g} {unit}"
+    return f"{n_bytes} B"
+
+
+def choose(choice):
+    """The pyopencl device for a choice as `get_device` takes it."""
+    found = _found()
+    if choice is not None:
+        return _match(str(choice), found, "device")
+    if os.environ.get("CLRESAMPLE_DEVICE"):
+        return _match(os.environ["CLRESAMPLE_DEVICE"], found, "CLRESAMPLE_DEVICE")
+    if os.environ.get("PYOPENCL_CTX"):
+        return _match_pyopencl(os.environ["PYOPENCL_CTX"], found)
+    return min(found, key=_preference)
+
+
+def _match(choice, found, source):
+    """The preferred device among those that fit: index, then platform:device, then a name."""
+    text = choice.strip().lower()
+    fits = []
+    if text.isdecimal():
+        fits = found[int(text) : int(text) + 1]
+    elif ":" in text:
+        fits = _match_pair(*text.split(":", 1), found)
+    # A name may hold digits alone or a colon ("gfx906:xnack-"), so names are tried last.
+    if not fits and text:
+        fits = [d for d in found if text in d.name.lower()]
+        fits = fits or [d for d in found if text in d.platform.name.lower()]
+    if not fits:
+        raise _no_fit(source, choice, found)
+    return min(fits, key=_preference)
+
+
+def _match_pair(platform, device, found):
+    platforms = list(dict.fromkeys(d.platform for d in found))
+    if platform.isdecimal():
+        platforms = platforms[int(platform) : int(platform) + 1]
+    else:
+        platforms = [p for p in platforms if platform in p.name.lower()]
+    groups = [[d for d in found if d.platform == p] for p in platforms]
+    if device.isdecimal():
+        return [d for group in groups for d in group[int(device) : int(device) + 1]]
+    return [d for group in groups for d in group if device in d.name.lower()]
+
+
+def _match_pyopencl(choice, found):
+    """The first device that pyopencl itself reads from PYOPENCL_CTX."""
+    cl = load_pyopencl()
+    try:
+        return cl.choose_devices(interactive=False, answers=choice.split(":"))[0]
+    except (RuntimeError, cl.Error) as error:
+        raise _no_fit("PYOPENCL_CTX", choice, found) from error
+
+
+def _no_fit(source, choice, found):
+    names = "; ".join(f"{i} = {d.platform.name}: {d.name}" for i, d in enumerate(found))
+    return DeviceError(f"{source} is {choice!r}, which fits no device; there are: {names}")
+
+
+def _preference(device):
+    kind = kind_of(device)
+    return not device.available, KINDS.index(kind) if kind in KINDS else len(KINDS)
+
+
+def _found():
+    """Every device of every platform, in the drivers' order; DeviceError where there is none."""
+    cl = load_pyopencl()
+    try:
+        platforms = cl.get_platforms()
+    except cl.Error:  # the loader's way of saying that there are none
+        platforms = []
+    found = []
+    for platform in platforms:
+        try:
+            found += platform.get_devices()
+        except cl.Error:  # a driver without a device, such as a GPU's on a machine without one
+            continue
+    if found:
+        return found
+    what = "OpenCL platform" if not platforms else f"device on {platforms[0].name}"
+    vendors = os.environ.get("OCL_ICD_VENDORS")
+    if vendors and not Path(vendors).exists():
+        way = (
+            f"OCL_ICD_VENDORS names a missing folder, {vendors}, which hides every driver: unset it"
+        )
+    else:
+        way = "install your GPU's OpenCL driver, or the CPU runtime: pip install 'clresample[pocl]'"
+        if vendors:
+            way += f"; OCL_ICD_VENDORS={vendors} limits the search to that place"
+    raise DeviceError(f"no {what} found: {way}")
+
+
+def load_pyopencl():
+    try:
+        import pyopencl
+    except ImportError as error:
+        raise DeviceError(
+            f"pyopencl cannot be imported ({error}): pip install 'clresample[pocl]'"
+        ) from error
+    return pyopencl
+
+
+def kind_of(device):
+    types = load_pyopencl().device_type
+    return next((kind for kind in KINDS if device.type & getattr(types, kind)), "OTHER")
+
+
+def _try_fp64(device):
+    cl = load_pyopencl()
+    try:
+        return builds_fp64(cl.Context([device]))
+    except cl.Error:
+        return None
+
+
+def builds_fp64(context):
+    cl = load_pyopencl()
+    try:
+        cl.Program(context, FP64_PROBE).build()
+    except cl.Error:
+        return False
+    return True
