@@ -39,12 +39,12 @@ class DeviceInfo:
     chosen: bool
 
 
-def list_devices():
-    """Every OpenCL device as a DeviceInfo, the one `get_device()` would take marked `chosen`."""
+def list_devices(choice=None):
+    """Every OpenCL device as a DeviceInfo, the one `get_device(choice)` would take marked."""
     found = _found()
     try:
-        chosen = choose(None)
-    except DeviceError:  # nothing fits the environment's choice: the table is what helps then
+        chosen = choose(choice)
+    except DeviceError:  # nothing fits the choice: the table is what helps then
         chosen = None
     return [
         DeviceInfo(
