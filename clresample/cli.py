@@ -14,7 +14,7 @@ from . import __version__
 from .device import DeviceError, get_device, list_devices
 from .discover import format_size
 
-HEAD = "|#|platform|device|kind|OpenCL|units|memory|largest buffer|fp64".split("|")
+COLUMNS = ("platform", "device", "kind", "OpenCL", "units", "memory", "largest buffer", "fp64")
 
 
 class Parser(argparse.ArgumentParser):
@@ -75,7 +75,7 @@ def _run_devices(arguments):
 
 def format_table(devices):
     """The DeviceInfo rows as aligned text."""
-    rows = [HEAD]
+    rows = [("", "#", *COLUMNS)]
     for info in devices:
         rows.append(
             (

@@ -6,8 +6,10 @@ pyopencl is imported when a device is first asked for, never before.
 from __future__ import annotations
 
 import functools
+import gc
 import math
 import re
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +48,8 @@ class Device:
 
     context, queue, cl: pyopencl's Context, CommandQueue and Device
     name, platform, kind: what the driver calls it; kind is "GPU", "CPU", "ACCELERATOR" or "OTHER"
-    compute_units, max_group: counts; memory, max_alloc [bytes]: all of it, and the largest buffer
+    compute_units, max_group: counts
+    memory, max_alloc, in_use [bytes]: all of it, the largest buffer, what arrays made here hold
     """
 
     def __init__(self, cl_device):
@@ -59,6 +62,7 @@ class Device:
         self.memory = cl_device.global_mem_size
         self.max_alloc = cl_device.max_mem_alloc_size
         self.max_group = cl_device.max_work_group_size
+        self.in_use = 0
         self._enqueue = cl.enqueue_nd_range_kernel
         self._error = cl.Error
         self._programs = {}
@@ -84,13 +88,11 @@ class Device:
         # Python's own integers: a size past 2^63 must be refused, not wrapped.
         shape = (int(shape),) if np.ndim(shape) == 0 else tuple(map(int, shape))
         n_bytes = math.prod(shape, start=dtype.itemsize)
-        if n_bytes > min(self.max_alloc, self.memory):
-            raise self._too_large(shape, dtype, n_bytes)
+        if n_bytes > self.memory:
+            raise self._too_large(n_bytes)
         try:
-            return pyopencl.array.Array(self.queue, shape, dtype)
+            return pyopencl.array.Array(self.queue, shape, dtype, allocator=self._allocate)
         except self._error as error:
-            if _status(error) in FULL:
-                raise self._too_large(shape, dtype, n_bytes) from error
             raise self._explain(error) from error
 
     def zeros(self, shape, dtype):
@@ -183,11 +185,31 @@ class Device:
                 "(`clresample devices` lists them)"
             ) from error
 
-    def _too_large(self, shape, dtype, n_bytes):
+    def _allocate(self, n_bytes):
+        # Some CPU runtimes promise more memory than there is, and the process dies on writing it:
+        # count what is in use, each buffer until it is gone.
+        import pyopencl as cl
+
+        if self.in_use + n_bytes > self.memory:
+            gc.collect()  # arrays in reference cycles are still counted
+        if n_bytes > min(self.max_alloc, self.memory - self.in_use):
+            raise self._too_large(n_bytes)
+        try:
+            buffer = _buffer_type()(self.context, cl.mem_flags.READ_WRITE, n_bytes)
+        except self._error as error:
+            raise (self._too_large(n_bytes) if _status(error) in FULL else error) from error
+        self.in_use += n_bytes
+        weakref.finalize(buffer, self._freed, n_bytes).atexit = False
+        return buffer
+
+    def _freed(self, n_bytes):
+        self.in_use -= n_bytes
+
+    def _too_large(self, n_bytes):
         return DeviceError(
-            f"an array {shape} of {dtype} needs {format_size(n_bytes)}; {self.name} has "
-            f"{format_size(self.memory)} in all and {format_size(self.max_alloc)} in one buffer: "
-            "use smaller batches or tiles, or free other arrays"
+            f"an array needs {format_size(n_bytes)}; {self.name} has {format_size(self.memory)} in "
+            f"all, {format_size(self.in_use)} of them in use, and {format_size(self.max_alloc)} for "
+            "one buffer: use smaller batches or tiles, or free other arrays"
         )
 
     def _explain(self, error):
@@ -205,6 +227,14 @@ class Device:
                 "batches, or choose another device with CLRESAMPLE_DEVICE"
             )
         return error
+
+
+@functools.cache
+def _buffer_type():
+    class Buffer(load_pyopencl().Buffer):
+        """pyopencl's own cannot be watched by a weak reference; a Python class can."""
+
+    return Buffer
 
 
 def get_device(choice=None):
