@@ -10,7 +10,7 @@ import numpy as np
 
 # [samples] half of what confusing the centre n/2 with (n-1)/2 gives, well above centroid errors
 CORE_TOLERANCE = 0.25
-# light beyond the image's edge worth telling: good HST and HSC PSF images have 2 to 4.6 % by this rule
+# light beyond the image's edge worth telling; by this rule, good HST and HSC images have 2 to 5 %
 EDGE_TOLERANCE = 0.05
 # relative slack on the band's edge, above the rounding of A^T nu in float64
 BAND_SLACK = 1e-12
@@ -27,7 +27,7 @@ class PSF:
     """PSF images of one instrument, each band divided by its own sum.
 
     images (C, ny, nx) [1]: samples, pixel response included; a single (ny, nx) image is one band
-    spacing [px]: distance of two samples in pixels of the grid the PSF belongs to; 0.5 = 2x oversampled
+    spacing [px]: distance of two samples in pixels of the PSF's grid; 0.5 = 2x oversampled
     center (C, 2) [samples]: (y, x) array coordinates of each band's centre. Given as None: the
         geometric centre (n-1)/2; as "core": the centroid of each band's core; else (2,) or (C, 2)
 
@@ -111,7 +111,7 @@ class PSF:
     def spectrum(self, nu_y, nu_x, matrix=None):
         """Fourier transform of the samples, straight at the frequencies f = A^T nu.
 
-            P^(f) = sum_s P[s] exp(-2 pi i f.(s - center) spacing),   0 where |f|_inf > 1/(2 spacing)
+            P^(f) = sum_s P[s] exp(-2 pi i f.(s - center) spacing),  0 where |f|_inf > 1/(2 spacing)
 
         nu_y (Ky,), nu_x (Kx,) [cycles per pixel]: frequencies, axis by axis, of the other grid
         matrix (2, 2): A, from this PSF's pixels to those of the other grid; None = identity
@@ -173,12 +173,13 @@ class PSF:
                     f"({center[0]:g}, {center[1]:g}): the result is shifted by as much; "
                     'center="core" takes the core'
                 )
+        n_y, n_x = self.images.shape[1:]
         for i_band, light in enumerate(self.edge_light()):
             if abs(light) > EDGE_TOLERANCE:
                 messages.append(
-                    f"PSF band {i_band}: about {100 * light:.1f} % of the light lies beyond the edge "
-                    f"of the {self.images.shape[1]} x {self.images.shape[2]} image: a larger image, or "
-                    "one without background, is needed"
+                    f"PSF band {i_band}: about {100 * light:.1f} % of the light lies beyond the "
+                    f"edge of the {n_y} x {n_x} image: a larger image, or one without background, "
+                    "is needed"
                 )
         return messages
 
@@ -207,7 +208,8 @@ def _core(image):
     core = np.array(peak, dtype=np.float64)
     for _ in range(50):  # a Gaussian core halves its error at least once per step
         y, x = (np.arange(n) - c for n, c in zip(image.shape, core, strict=True))
-        weighted = np.exp(-0.5 * (y / sigma) ** 2)[:, None] * image * np.exp(-0.5 * (x / sigma) ** 2)
+        weight_y, weight_x = np.exp(-0.5 * (y / sigma) ** 2), np.exp(-0.5 * (x / sigma) ** 2)
+        weighted = weight_y[:, None] * image * weight_x
         # twice the weighted centroid is the full step when core and weight are equally wide
         step = 2 * np.array([weighted.sum(axis=1) @ y, weighted.sum(axis=0) @ x]) / weighted.sum()
         if not (np.abs(core + step - peak) <= 2 * sigma).all():
@@ -229,9 +231,8 @@ def _gaussian(n, spacing, sigma):
 def _pixel_gaussian(n, spacing, sigma):
     """Integral over the unit pixel; erfc of |u| keeps the digits of the wings."""
     width = math.sqrt(2) * sigma
-    return np.array(
-        [math.erfc((u - 0.5) / width) - math.erfc((u + 0.5) / width) for u in np.abs(_offsets(n, spacing))]
-    )
+    offsets = np.abs(_offsets(n, spacing))
+    return np.array([math.erfc((u - 0.5) / width) - math.erfc((u + 0.5) / width) for u in offsets])
 
 
 def _waves(frequencies, positions):
