@@ -1,0 +1,254 @@
+"""The operator's three paths as chains of matrix products on the device.
+
+    forward   Z = D o (Ty I Tx)            both model axes to frequencies, then the difference spectra
+              aligned    I2 = Sy Z Sx
+              affine     g = Sy twist(Z Sx),  I2 = gather(g) along each line
+              distorted  I2[p] = sum_x (Sy Z)[p, x] Sx[p, x]
+    adjoint   the same factors transposed, in reverse order
+
+All matrices are real: rows or columns 2i, 2i+1 are the cos and sin parts of frequency i.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from .contract import Contraction, Matrix, padded
+
+
+class Images(NamedTuple):
+    """`count` images of a caller, item b at offset + b * stride in `buffer` [elements]."""
+
+    buffer: object
+    offset: int
+    shape: tuple[int, int]
+
+    @property
+    def stride(self):
+        return self.shape[0] * self.shape[1]
+
+    def matrix(self, axes=(0, 1)) -> Matrix:
+        """The images as matrices, transposed where `axes` is (1, 0)."""
+        ld, step = (self.shape[1], 1) if axes == (0, 1) else (1, self.shape[1])
+        return Matrix(self.buffer, ld, self.stride, step=step, offset=self.offset)
+
+
+class Path:
+    """What the three paths share: the model's two axes and the difference spectra.
+
+    plans: one for all items of a batch, or one for each item; smaller ones are padded with zeros
+    """
+
+    def __init__(self, device, dtype, plans):
+        self.device, self.dtype, self.plans = device, dtype, plans
+        first = plans[0]
+        self.n_bands = first.n_bands
+        self.axes = first.axes
+        self.n_y, self.n_x = (first.mapping.shape_in[axis] for axis in self.axes)
+        self.h_y, self.h_x = (max(len(p.nu[i]) for p in plans) for i in (0, 1))
+        self.k_y, self.k_x = 2 * self.h_y, 2 * self.h_x
+        self.k_pad = padded(self.k_x)
+        self.in_y = self._table([p.in_y for p in plans], self.k_y, self.n_y)
+        self.in_y_t = self._table([p.in_y.T for p in plans], self.n_y, self.k_y)
+        self.in_x = self._table([p.in_x for p in plans], self.k_x, padded(self.n_x))
+        self.in_x_t = self._table([p.in_x.T for p in plans], self.n_x, self.k_pad)
+        self.spectra = device.empty((len(plans), self.n_bands, self.h_y, 4, self.k_pad // 2), dtype)
+        self.plain = Contraction(device, dtype)
+        self.ragged = Contraction(device, dtype, ragged=True)
+        self.mix = Contraction(device, dtype, epilogue="MIX")
+        self.scratch = {}
+
+    # rows and row length of the intermediate matrices, per image: name -> (rows, ld)
+    def scratch_shapes(self):
+        return {"half": (max(self.n_y, self.n_rows), self.k_pad), "spectrum": (self.k_y, self.k_pad)}
+
+    def reserve(self, n_images):
+        """Make room for the intermediates of `n_images` images at a time."""
+        if self.scratch.get("n_images", 0) != n_images:
+            self.scratch = {"n_images": n_images} | {
+                name: self.device.empty((n_images, rows, ld), self.dtype)
+                for name, (rows, ld) in self.scratch_shapes().items()
+            }
+
+    def set_spectra(self, spectra):
+        """Upload D(+,+), D(+,-): one pair (C, Hy, Hx) for each plan."""
+        host = np.zeros(self.spectra.shape, self.dtype)
+        for item, (d_plus, d_minus) in zip(host, spectra, strict=True):
+            planes = (d_plus.real, d_plus.imag, d_minus.real, d_minus.imag)
+            for i, plane in enumerate(planes):
+                item[:, : plane.shape[1], i, : plane.shape[2]] = plane
+        self.device.upload(host, self.spectra)
+
+    def analyse(self, images: Images, n):
+        """Z = D o (Ty I Tx) of `n` images, into scratch "spectrum"."""
+        half, z = self._scratch("half", self.n_y), self._scratch("spectrum")
+        self.plain(self.n_y, self.k_x, self.n_x, n, images.matrix(self.axes), self.in_x_t, half)
+        self.mix(self.k_y, self.k_x, self.n_y, n, self.in_y, half, z, self._epilogue(self.spectra),
+                 self.n_bands)
+
+    def synthesise(self, images: Images, n):
+        """I = Ty^T Z Tx^T of `n` images, from scratch "spectrum": the model end of the adjoint."""
+        half, z = self._scratch("half", self.n_y), self._scratch("spectrum")
+        self.plain(self.n_y, self.k_x, self.k_y, n, self.in_y_t, z, half)
+        self.ragged(self.n_y, self.n_x, self.k_x, n, half, self.in_x, images.matrix(self.axes))
+
+    def _table(self, tables, *shape) -> Matrix:
+        """Host tables, one per plan, zero-padded to a common shape, on the device."""
+        host = np.zeros((len(tables), *shape), self.dtype)
+        for item, table in zip(host, tables, strict=True):
+            item[tuple(slice(n) for n in table.shape)] = table
+        stride = int(np.prod(shape)) if len(tables) > 1 else 0
+        return Matrix(self.device.put(host).base_data, shape[-1], stride, div=self.n_bands)
+
+    def _scratch(self, name, rows=None) -> Matrix:
+        array = self.scratch[name]
+        return Matrix(array.base_data, array.shape[2], (rows or array.shape[1]) * array.shape[2])
+
+    def _epilogue(self, array):
+        stride = int(np.prod(array.shape[1:])) if len(self.plans) > 1 else 0
+        return array.base_data, stride, int(np.prod(array.shape[2:]))
+
+
+class Aligned(Path):
+    """Grids whose axes are parallel, crossed or mirrored: four thin products each way."""
+
+    def __init__(self, device, dtype, plans):
+        self.n_rows, self.n_columns = plans[0].mapping.shape_out
+        super().__init__(device, dtype, plans)
+        self.out_y = self._table([p.out_y for p in plans], self.n_rows, self.k_y)
+        self.out_y_t = self._table([p.out_y.T for p in plans], self.k_y, self.n_rows)
+        self.out_x = self._table([p.out_x for p in plans], self.k_x, padded(self.n_columns))
+        self.out_x_t = self._table([p.out_x.T for p in plans], self.n_columns, self.k_pad)
+        self.mix_adjoint = Contraction(device, dtype, epilogue="MIX", adjoint=True)
+
+    def forward(self, x: Images, y: Images, n):
+        self.analyse(x, n)
+        half, z = self._scratch("half", self.n_rows), self._scratch("spectrum")
+        self.plain(self.n_rows, self.k_x, self.k_y, n, self.out_y, z, half)
+        self.ragged(self.n_rows, self.n_columns, self.k_x, n, half, self.out_x, y.matrix())
+
+    def adjoint(self, y: Images, x: Images, n):
+        half, z = self._scratch("half", self.n_rows), self._scratch("spectrum")
+        self.plain(self.n_rows, self.k_x, self.n_columns, n, y.matrix(), self.out_x_t, half)
+        self.mix_adjoint(self.k_y, self.k_x, self.n_rows, n, self.out_y_t, half, z,
+                         self._epilogue(self.spectra), self.n_bands)
+        self.synthesise(x, n)
+
+
+class Affine(Path):
+    """Any affine mapping in two passes: columns of the model to lines, then along each line."""
+
+    def __init__(self, device, dtype, plans):
+        self.by_row = plans[0].lines.by_row
+        n_rows, n_steps = plans[0].mapping.shape_out
+        self.n_rows, self.n_steps = (n_rows, n_steps) if self.by_row else (n_steps, n_rows)
+        self.n_columns = max(p.out_x.shape[1] for p in plans)
+        self.n_pad = padded(self.n_columns)
+        super().__init__(device, dtype, plans)
+        self.out_y = self._table([p.out_y for p in plans], self.n_rows, self.k_y)
+        self.out_y_t = self._table([p.out_y.T for p in plans], self.k_y, self.n_rows)
+        self.out_x = self._table([p.out_x for p in plans], self.k_x, self.n_pad)
+        self.out_x_t = self._table([p.out_x.T for p in plans], self.n_columns, self.k_pad)
+        turns = [np.stack([np.cos(p.twist), np.sin(p.twist)], axis=1) for p in plans]
+        self.turn = self._table(turns, self.h_y, 2, self.n_pad)
+        self.mix_adjoint = Contraction(device, dtype, epilogue="MIX", adjoint=True)
+        self.twist = Contraction(device, dtype, epilogue="TWIST")
+        self.twist_adjoint = Contraction(device, dtype, epilogue="TWIST", adjoint=True)
+        lines = [p.lines for p in plans]
+        self.to_pixels = Gather(self, [p.start for p in lines], [p.weight for p in lines],
+                                self.n_steps)
+        self.to_columns = Gather(self, [p.start_t for p in lines], [p.weight_t for p in lines],
+                                 self.n_pad)
+
+    def scratch_shapes(self):
+        return super().scratch_shapes() | {"turned": (self.k_y, self.n_pad),
+                                           "lines": (self.n_rows, self.n_pad)}
+
+    def forward(self, x: Images, y: Images, n):
+        self.analyse(x, n)
+        z, turned, g = (self._scratch(name) for name in ("spectrum", "turned", "lines"))
+        self.twist(self.k_y, self.n_columns, self.k_x, n, z, self.out_x, turned, self._turn(),
+                   self.n_bands)
+        self.plain(self.n_rows, self.n_columns, self.k_y, n, self.out_y, turned, g)
+        self.to_pixels(g, self._lines_of(y), n)
+
+    def adjoint(self, y: Images, x: Images, n):
+        z, turned, g = (self._scratch(name) for name in ("spectrum", "turned", "lines"))
+        self.to_columns(self._lines_of(y), g, n)
+        self.twist_adjoint(self.k_y, self.n_columns, self.n_rows, n, self.out_y_t, g, turned,
+                           self._turn(), self.n_bands)
+        self.mix_adjoint(self.k_y, self.k_x, self.n_columns, n, turned, self.out_x_t, z,
+                         self._epilogue(self.spectra), self.n_bands)
+        self.synthesise(x, n)
+
+    def _turn(self):
+        return self.turn.buffer, self.turn.stride, 0
+
+    def _lines_of(self, y: Images) -> Matrix:
+        return y.matrix((0, 1) if self.by_row else (1, 0))
+
+
+class Distorted(Path):
+    """Any positions: the spectral sum straight at each observed pixel."""
+
+    def __init__(self, device, dtype, plans):
+        self.n_rows = int(np.prod(plans[0].mapping.shape_out))
+        super().__init__(device, dtype, plans)
+        self.out_y = self._table([p.out_y for p in plans], self.n_rows, self.k_y)
+        self.out_y_t = self._table([p.out_y.T for p in plans], self.k_y, self.n_rows)
+        self.out_x = self._table([p.out_x for p in plans], self.n_rows, self.k_pad)
+        self.mix_adjoint = Contraction(device, dtype, epilogue="MIX", adjoint=True, long_sums=True)
+        self.rowdot = device.kernel("warp.cl", "rowdot", dtype=dtype)
+        self.rowscale = device.kernel("warp.cl", "rowscale", dtype=dtype)
+        scalars = [np.int32, np.int32, np.int32, np.int32]
+        for kernel in (self.rowdot, self.rowscale):
+            kernel.set_scalar_arg_dtypes([*scalars, None, np.uint64, None, None])
+
+    def forward(self, x: Images, y: Images, n):
+        self.analyse(x, n)
+        half, z = self._scratch("half", self.n_rows), self._scratch("spectrum")
+        self.plain(self.n_rows, self.k_x, self.k_y, n, self.out_y, z, half)
+        self._ends(self.rowdot, y, half)
+        self.device.launch(self.rowdot, (self.n_rows, n))
+
+    def adjoint(self, y: Images, x: Images, n):
+        half, z = self._scratch("half", self.n_rows), self._scratch("spectrum")
+        self._ends(self.rowscale, y, half)
+        self.device.launch(self.rowscale, (self.k_pad, self.n_rows, n))
+        self.mix_adjoint(self.k_y, self.k_x, self.n_rows, n, self.out_y_t, half, z,
+                         self._epilogue(self.spectra), self.n_bands)
+        self.synthesise(x, n)
+
+    def _ends(self, kernel, y: Images, half: Matrix):
+        kernel.set_args(self.n_rows, self.k_pad, self.n_bands, len(self.plans), y.buffer, y.offset,
+                        half.buffer, self.out_x.buffer)
+
+
+class Gather:
+    """Sparse sums along lines, out[l, p] = sum_t weight[l, t, p] in[l, start[l, p] + t]."""
+
+    def __init__(self, path: Path, starts, weights, n_out):
+        self.path, self.n_out = path, n_out
+        self.n_taps = max(w.shape[1] for w in weights)
+        n_lines = path.n_rows
+        start = np.zeros((len(starts), n_lines, n_out), np.int32)
+        weight = np.zeros((len(starts), n_lines, self.n_taps, n_out), path.dtype)
+        for i, (s, w) in enumerate(zip(starts, weights, strict=True)):
+            start[i, :, : s.shape[1]] = s
+            weight[i, :, : w.shape[1], : w.shape[2]] = w
+        self.start, self.weight = path.device.put(start), path.device.put(weight)
+        self.kernel = path.device.kernel("warp.cl", "gather", dtype=path.dtype)
+        i, size = np.int32, np.uint64
+        self.kernel.set_scalar_arg_dtypes(
+            [i, i, i, i, i, None, size, i, i, i, None, size, i, i, i, None, None])
+
+    def __call__(self, source: Matrix, target: Matrix, n):
+        path = self.path
+        self.kernel.set_args(
+            self.n_out, path.n_rows, self.n_taps, path.n_bands, len(path.plans),
+            source.buffer, source.offset, source.stride, source.ld, source.step,
+            target.buffer, target.offset, target.stride, target.ld, target.step,
+            self.start.base_data, self.weight.base_data)
+        path.device.launch(self.kernel, (self.n_out, path.n_rows, n))

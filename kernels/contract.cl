@@ -1,0 +1,157 @@
+/* Tiled matrix contraction, with the point-wise stages of the resampling operator folded in.
+ *
+ *   C[b] = A[b] . B[b]                      A (m, k), B (k, n), C (m, n), row-major
+ *
+ * One work-item owns an MR x VW tile of C in registers: B is read as aligned VW-wide vectors, A as
+ * scalars that broadcast.  No local memory, no barrier, no builtin.
+ *
+ * Layout: n_pad = n rounded up to VW.  B always has ld n_pad with zeros in the padding; so has C,
+ *   unless RAGGED, when C is a caller's array: element (i, j) at i * ldc + j * step_c, any alignment.
+ *   A is any array: element (i, l) at i * lda + l * step_a, so it may be read transposed.
+ * Batch: item b uses A + (b / div_a) * stride_a and likewise for B, so a table that all bands of a
+ *   scene share has div = n_bands, one that every scene shares has stride 0.
+ * BLOCK, if defined, sums k in blocks of that length, so that float32 keeps its accuracy on long sums.
+ * Rows beyond m read row m - 1 again and are not stored.
+ *
+ * Epilogue, at most one of (rows 2i, 2i+1 hold the cos and sin parts of row frequency i):
+ *   MIX    columns 2j, 2j+1 hold cos and sin of column frequency j.  The quad (CC, CS, SC, SS) is a
+ *          pair of complex amplitudes at (+nu_y, +nu_x) and (+nu_y, -nu_x); each is multiplied by its
+ *          spectrum D and turned back into a quad.  E: spectra (n_bands, k_y, 4, n_pad / 2), planes
+ *          Re D(+,+), Im D(+,+), Re D(+,-), Im D(+,-).  SIGN -1 conjugates D: the adjoint.
+ *   TWIST  rotates each (cos, sin) row pair by the angle of E: (k_y, 2, n_pad), planes cos and sin.
+ *          SIGN -1 turns the other way: the adjoint.
+ *   E of item b starts at (b / n_bands) * stride_e + (b % n_bands) * band_e.
+ *
+ * Launch: global = (n_pad / VW, ceil(m / MR), batch), each rounded up to its local size.
+ */
+#include "common.h"
+
+#ifndef VW          /* columns a work-item owns: one vector */
+#define VW 16
+#endif
+#ifndef MR          /* rows a work-item owns; even, so that (cos, sin) pairs stay together */
+#define MR 6
+#endif
+#ifndef WGX
+#define WGX 1
+#endif
+#ifndef WGY
+#define WGY 1
+#endif
+#ifndef SIGN
+#define SIGN 1
+#endif
+
+#define WIDE VEC(VW)
+#if VW == 16
+#define HALF VEC(8)
+#define EVEN(v) (v).s02468ace
+#define ODD(v) (v).s13579bdf
+#elif VW == 8
+#define HALF VEC(4)
+#define EVEN(v) (v).s0246
+#define ODD(v) (v).s1357
+#elif VW == 4
+#define HALF VEC(2)
+#define EVEN(v) (v).s02
+#define ODD(v) (v).s13
+#else
+#define HALF REAL
+#define EVEN(v) (v).s0
+#define ODD(v) (v).s1
+#endif
+
+#define AT(type, p) (*(__global type *)(p))
+#define STEP(l) {                                                                  \
+        const WIDE v = AT(const WIDE, B + (size_t)(l) * n_pad);                    \
+        _Pragma("unroll")                                                          \
+        for (int i = 0; i < MR; ++i) acc[i] += row[i][(size_t)(l) * step_a] * v;   \
+    }
+
+__kernel __attribute__((reqd_work_group_size(WGX, WGY, 1)))
+void contract(const int m, const int n, const int n_pad, const int k,
+              __global const REAL *restrict A, const ulong offset_a, const int lda,
+              const int step_a, const int stride_a, const int div_a,
+              __global const REAL *restrict B, const int stride_b, const int div_b,
+              __global REAL *restrict C, const ulong offset_c, const int ldc, const int step_c,
+              const int stride_c,
+              __global const REAL *restrict E, const int stride_e, const int band_e,
+              const int n_bands)
+{
+    const int j0 = (int)get_global_id(0) * VW;
+    const int i0 = (int)get_global_id(1) * MR;
+    const int b = (int)get_global_id(2);
+    if (j0 >= n_pad || i0 >= m) return;
+    A += offset_a + (size_t)(b / div_a) * stride_a;
+    B += (size_t)(b / div_b) * stride_b + j0;
+
+    __global const REAL *row[MR];
+    WIDE acc[MR];
+#pragma unroll
+    for (int i = 0; i < MR; ++i) {
+        row[i] = A + (size_t)(i0 + i < m ? i0 + i : m - 1) * lda;
+        acc[i] = (WIDE)(0);
+    }
+#ifdef BLOCK
+    WIDE sum[MR];
+#pragma unroll
+    for (int i = 0; i < MR; ++i) sum[i] = (WIDE)(0);
+    for (int l0 = 0; l0 < k; l0 += BLOCK) {
+        const int l1 = l0 + BLOCK < k ? l0 + BLOCK : k;
+#pragma unroll
+        for (int i = 0; i < MR; ++i) acc[i] = (WIDE)(0);
+        for (int l = l0; l < l1; ++l) STEP(l)
+#pragma unroll
+        for (int i = 0; i < MR; ++i) sum[i] += acc[i];
+    }
+#pragma unroll
+    for (int i = 0; i < MR; ++i) acc[i] = sum[i];
+#else
+    for (int l = 0; l < k; ++l) STEP(l)
+#endif
+
+#if defined(MIX)
+    E += (size_t)(b / n_bands) * stride_e + (size_t)(b % n_bands) * band_e + j0 / 2;
+#pragma unroll
+    for (int i = 0; i < MR; i += 2) {
+        if (i0 + i >= m) break;
+        const WIDE c = acc[i], s = acc[i + 1];
+        __global const REAL *d = E + (size_t)((i0 + i) / 2) * 2 * n_pad;
+        const HALF pr = AT(const HALF, d), pi = SIGN * AT(const HALF, d + n_pad / 2);
+        const HALF mr = AT(const HALF, d + n_pad), mi = SIGN * AT(const HALF, d + n_pad / 2 * 3);
+        const HALF fpr = EVEN(c) - ODD(s), fpi = -(ODD(c) + EVEN(s));   /* F(+nu_y, +nu_x) */
+        const HALF fmr = EVEN(c) + ODD(s), fmi = ODD(c) - EVEN(s);      /* F(+nu_y, -nu_x) */
+        const HALF gpr = pr * fpr - pi * fpi, gpi = pr * fpi + pi * fpr;
+        const HALF gmr = mr * fmr - mi * fmi, gmi = mr * fmi + mi * fmr;
+        EVEN(acc[i]) = gpr + gmr;
+        ODD(acc[i]) = gmi - gpi;
+        EVEN(acc[i + 1]) = -(gpi + gmi);
+        ODD(acc[i + 1]) = gmr - gpr;
+    }
+#elif defined(TWIST)
+    E += (size_t)(b / n_bands) * stride_e + j0;
+#pragma unroll
+    for (int i = 0; i < MR; i += 2) {
+        if (i0 + i >= m) break;
+        const WIDE c = acc[i], s = acc[i + 1];
+        __global const REAL *t = E + (size_t)((i0 + i) / 2) * 2 * n_pad;
+        const WIDE cos_t = AT(const WIDE, t), sin_t = SIGN * AT(const WIDE, t + n_pad);
+        acc[i] = c * cos_t + s * sin_t;
+        acc[i + 1] = s * cos_t - c * sin_t;
+    }
+#endif
+
+    C += offset_c + (size_t)b * stride_c;
+#pragma unroll
+    for (int i = 0; i < MR; ++i) {
+        if (i0 + i >= m) break;
+#ifdef RAGGED
+        __global REAL *c = C + (size_t)(i0 + i) * ldc + (size_t)j0 * step_c;
+        const REAL *lane = (const REAL *)&acc[i];
+        for (int j = 0; j < VW; ++j)
+            if (j0 + j < n) c[(size_t)j * step_c] = lane[j];
+#else
+        AT(WIDE, C + (size_t)(i0 + i) * ldc + j0) = acc[i];
+#endif
+    }
+}
