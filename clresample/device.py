@@ -123,6 +123,32 @@ class Device:
             raise self._explain(error) from error
         return array
 
+    def upload(self, values, array):
+        """Overwrite a device array with a C-contiguous NumPy array of its size and dtype."""
+        self._copy(array.base_data, values, dst_offset=array.offset)
+
+    def download(self, array, values):
+        """Overwrite a C-contiguous NumPy array with a device array, once what was queued is done."""
+        self._copy(values, array.base_data, src_offset=array.offset)
+
+    def copy(self, source, target):
+        """Overwrite a device array with another of its size and dtype."""
+        self._copy(
+            target.base_data,
+            source.base_data,
+            byte_count=source.nbytes,
+            src_offset=source.offset,
+            dst_offset=target.offset,
+        )
+
+    def _copy(self, target, source, **options):
+        import pyopencl as cl
+
+        try:
+            cl.enqueue_copy(self.queue, target, source, **options)
+        except self._error as error:
+            raise self._explain(error) from error
+
     def get(self, array):
         """The values of a pyopencl array as a NumPy array, once all that was queued is done."""
         try:
@@ -207,8 +233,8 @@ class Device:
 
     def _too_large(self, n_bytes):
         return DeviceError(
-            f"an array needs {format_size(n_bytes)}; {self.name} has {format_size(self.memory)} in "
-            f"all, {format_size(self.in_use)} of them in use, and {format_size(self.max_alloc)} for "
+            f"an array needs {format_size(n_bytes)}; {self.name} has {format_size(self.memory)}, "
+            f"{format_size(self.in_use)} of it in use, and takes {format_size(self.max_alloc)} in "
             "one buffer: use smaller batches or tiles, or free other arrays"
         )
 
