@@ -193,18 +193,17 @@ def wrap_radius(psf: PSF, matrix) -> tuple[float, float]:
 
     K >= N + radius keeps what leaves one edge of the model from coming in at the other.
     """
-    pixels = np.zeros(2)
-    for axis in (0, 1):
-        light = np.abs(psf.images).sum(axis=2 - axis)
-        distance = np.abs(np.arange(light.shape[1]) - psf.center[:, axis, None]) * psf.spacing
-        limit = distance.max()
-        order = np.argsort(distance, axis=1)
-        inside = np.take_along_axis(light, order, axis=1).cumsum(axis=1)
-        beyond = 1 - inside / inside[:, -1:]
-        r = np.take_along_axis(distance, order, axis=1)
-        reach = np.where(beyond > WRAP_TOLERANCE, r, 0).max()
-        pixels[axis] = min(WRAP_MARGIN * reach, limit)
-    radius = np.abs(matrix) @ (pixels + 0.5 * psf.spacing)
+    y, x = (np.abs(np.arange(n) - psf.center[:, i, None]) * psf.spacing
+            for i, n in enumerate(psf.images.shape[1:]))
+    distance = np.hypot(y[:, :, None], x[:, None, :]).reshape(psf.n_bands, -1)
+    light = np.abs(psf.images).reshape(psf.n_bands, -1)
+    order = np.argsort(-distance, axis=1)
+    beyond = np.take_along_axis(light, order, axis=1).cumsum(axis=1)
+    lit = beyond > WRAP_TOLERANCE * beyond[:, -1:]
+    reach = (np.take_along_axis(distance, order, axis=1) * lit).max()
+    circle = np.linalg.norm(matrix, axis=1) * (WRAP_MARGIN * reach + psf.spacing)
+    image = np.abs(matrix) @ (np.array([y.max(), x.max()]) + 0.5 * psf.spacing)
+    radius = np.minimum(circle, image)
     return float(radius[0]), float(radius[1])
 
 
