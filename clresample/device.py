@@ -66,11 +66,8 @@ class Device:
         self._enqueue = cl.enqueue_nd_range_kernel
         self._error = cl.Error
         self._programs = {}
-        try:
-            self.context = cl.Context([cl_device])
-            self.queue = cl.CommandQueue(self.context, cl_device)
-        except cl.Error as error:
-            raise self._explain(error) from error
+        self.context = self._call(cl.Context, [cl_device])
+        self.queue = self._call(cl.CommandQueue, self.context, cl_device)
 
     def __repr__(self):
         return f"Device({self.platform}: {self.name})"
@@ -90,37 +87,26 @@ class Device:
         n_bytes = math.prod(shape, start=dtype.itemsize)
         if n_bytes > self.memory:
             raise self._too_large(n_bytes)
-        try:
-            return pyopencl.array.Array(self.queue, shape, dtype, allocator=self._allocate)
-        except self._error as error:
-            raise self._explain(error) from error
+        return self._call(pyopencl.array.Array, self.queue, shape, dtype, allocator=self._allocate)
 
     def zeros(self, shape, dtype):
         """A pyopencl array (shape) of zeros; DeviceError where it cannot fit."""
         import pyopencl as cl
 
         array = self.empty(shape, dtype)
-        try:
-            for start in range(0, array.nbytes, FILL_BYTES):
-                n_bytes = min(FILL_BYTES, array.nbytes - start)
-                cl.enqueue_fill_buffer(self.queue, array.base_data, b"\0", start, n_bytes)
-        except self._error as error:
-            raise self._explain(error) from error
+        for start in range(0, array.nbytes, FILL_BYTES):
+            n_bytes = min(FILL_BYTES, array.nbytes - start)
+            self._call(cl.enqueue_fill_buffer, self.queue, array.base_data, b"\0", start, n_bytes)
         return array
 
     def put(self, values, dtype=None):
         """A C-contiguous copy of a NumPy array on the device, native byte order, cast to dtype."""
-        import pyopencl as cl
-
         values = np.asarray(values)
         dtype = (values.dtype if dtype is None else np.dtype(dtype)).newbyteorder("=")
         values = np.asarray(values, dtype=dtype, order="C")
         array = self.empty(values.shape, dtype)
-        try:
-            if values.size:
-                cl.enqueue_copy(self.queue, array.base_data, values)
-        except self._error as error:
-            raise self._explain(error) from error
+        if values.size:
+            self.upload(values, array)
         return array
 
     def upload(self, values, array):
@@ -128,7 +114,7 @@ class Device:
         self._copy(array.base_data, values, dst_offset=array.offset)
 
     def download(self, array, values):
-        """Overwrite a C-contiguous NumPy array with a device array, once what was queued is done."""
+        """Overwrite a C-contiguous NumPy array with a device array, once all queued is done."""
         self._copy(values, array.base_data, src_offset=array.offset)
 
     def copy(self, source, target):
@@ -144,17 +130,11 @@ class Device:
     def _copy(self, target, source, **options):
         import pyopencl as cl
 
-        try:
-            cl.enqueue_copy(self.queue, target, source, **options)
-        except self._error as error:
-            raise self._explain(error) from error
+        self._call(cl.enqueue_copy, self.queue, target, source, **options)
 
     def get(self, array):
         """The values of a pyopencl array as a NumPy array, once all that was queued is done."""
-        try:
-            return array.get(self.queue)
-        except self._error as error:
-            raise self._explain(error) from error
+        return self._call(array.get, self.queue)
 
     def kernel(self, file, name, *, dtype=np.float32, **defines):
         """A fresh pyopencl.Kernel `name` from kernels/`file`; equal requests share one program.
@@ -174,17 +154,21 @@ class Device:
 
     def launch(self, kernel, global_size, local_size=None):
         """Queue a kernel whose arguments are set; sizes (x, y, z) as OpenCL counts them."""
-        try:
-            return self._enqueue(self.queue, kernel, global_size, local_size)
-        except self._error as error:
-            raise self._explain(error) from error
+        return self._call(self._enqueue, self.queue, kernel, global_size, local_size)
 
     def finish(self):
         """Wait until everything queued is done."""
+        self._call(self.queue.finish)
+
+    def _call(self, function, *arguments, **options):
+        """What a function of pyopencl returns; an error that a user can meet made readable."""
         try:
-            self.queue.finish()
+            return function(*arguments, **options)
         except self._error as error:
-            raise self._explain(error) from error
+            message = self._explain(_status(error))
+            if message is None:  # a mistake of our own stays as it is
+                raise
+            raise DeviceError(message) from error
 
     def _build(self, file, dtype, defines):
         import pyopencl as cl
@@ -223,7 +207,9 @@ class Device:
         try:
             buffer = _buffer_type()(self.context, cl.mem_flags.READ_WRITE, n_bytes)
         except self._error as error:
-            raise (self._too_large(n_bytes) if _status(error) in FULL else error) from error
+            if _status(error) in FULL:
+                raise self._too_large(n_bytes) from error
+            raise
         self.in_use += n_bytes
         weakref.finalize(buffer, self._freed, n_bytes).atexit = False
         return buffer
@@ -238,21 +224,19 @@ class Device:
             "one buffer: use smaller batches or tiles, or free other arrays"
         )
 
-    def _explain(self, error):
-        """A DeviceError for what a user can meet; a mistake in our own calls stays as it is."""
-        status = _status(error)
+    def _explain(self, status):
         if status in FULL:
-            return DeviceError(
-                f"{self.name} is out of memory ({status}; it has {format_size(self.memory)} in "
-                "all): use smaller batches or tiles, or free other arrays"
+            return (
+                f"{self.name} is out of memory ({status}; it has {format_size(self.memory)}): use "
+                "smaller batches or tiles, or free other arrays"
             )
         if status in LOST:
-            return DeviceError(
+            return (
                 f"{self.name} ({self.platform}) no longer answers ({status}): start again, look "
                 "at the driver's log for a reset or a time limit on kernels, use smaller "
                 "batches, or choose another device with CLRESAMPLE_DEVICE"
             )
-        return error
+        return None
 
 
 @functools.cache

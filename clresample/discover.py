@@ -86,15 +86,13 @@ def choose(choice):
 def _match(choice, found, source):
     """The preferred device among those that fit: index, then platform:device, then a name."""
     text = choice.strip().lower()
-    fits = []
     if text.isdecimal():
         fits = found[int(text) : int(text) + 1]
-    elif ":" in text:
-        fits = _match_pair(*text.split(":", 1), found)
-    # A name may hold digits alone or a colon ("gfx906:xnack-"), so names are tried last.
-    if not fits and text:
-        fits = [d for d in found if text in d.name.lower()]
-        fits = fits or [d for d in found if text in d.platform.name.lower()]
+    else:
+        fits = _match_pair(*text.split(":", 1), found) if ":" in text else []
+        # A name may hold a colon, as in "gfx906:xnack-", so names are tried last.
+        fits = fits or [d for d in found if text and text in d.name.lower()]
+        fits = fits or [d for d in found if text and text in d.platform.name.lower()]
     if not fits:
         raise _no_fit(source, choice, found)
     return min(fits, key=_preference)

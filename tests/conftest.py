@@ -1,6 +1,8 @@
 """Fixtures: every OpenCL device of the machine, and the folder of real images."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -33,3 +35,12 @@ def data():
     if not folder.is_dir():
         pytest.skip(f"no data folder at {folder}: set CLRESAMPLE_DATA to test on real images")
     return folder
+
+
+def run_python(*arguments, **environment):
+    """Python on `arguments` in the checkout, under more environment variables."""
+    command = [sys.executable, *arguments]
+    environment = {**os.environ, **environment}
+    return subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+    )
