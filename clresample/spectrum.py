@@ -19,10 +19,10 @@ import numpy as np
 from .grid import Mapping
 from .psf import PSF
 
-# Light of the observed PSF beyond the wrap radius, as a fraction: float32's own rounding.
-WRAP_TOLERANCE = 1e-7
-# The sharp edge of the band rings beyond that radius; half as much again keeps what wraps below 4e-7
-# of an image (0.06 dB at 58 dB, HSC -> RUBIN; measured over COSMOS galaxies).
+# Light of the observed PSF beyond the wrap radius, as a fraction; images drawn by FFT ring at 1e-6.
+WRAP_TOLERANCE = 1e-5
+# A Gaussian reaches that at 4.9 sigma, and the sharp edge of the band rings beyond: half as much again
+# (7.4 sigma, 1e-12 of the light) keeps what wraps below 4e-7 of an image, 0.06 dB at 58 dB.
 WRAP_MARGIN = 1.5
 # |P1^| below which the division is floored: 1e-6 of a point source's light per frequency, ten times
 # the rounding of a PSF stored in float32.
