@@ -179,7 +179,7 @@ def _decide(points, true, tolerance_px, matrix=None):
     aligned = np.where(np.eye(2) == diagonal, matrix, 0.0)
     offset, departure = _centred(points, true, aligned)
     if departure <= tolerance_px:
-        whole = np.rint(aligned), np.rint(offset)
+        whole = np.rint(aligned) + 0.0, np.rint(offset) + 0.0  # no -0
         moved = _departure(points, true, *whole)
         if moved <= NOISE_PX:
             return "aligned", *whole, moved

@@ -164,24 +164,34 @@ class PSF:
         (either sign) beyond the edge, by `edge_light`.
         """
         messages = []
-        for i_band, (core, center) in enumerate(zip(self.core(), self.center, strict=True)):
-            off = core - center
-            if np.abs(off).max() > CORE_TOLERANCE:
-                messages.append(
-                    f"PSF band {i_band}: the core is at (y, x) = ({core[0]:.2f}, {core[1]:.2f}), "
-                    f"({off[0]:+.2f}, {off[1]:+.2f}) samples off the centre "
-                    f"({center[0]:g}, {center[1]:g}): the result is shifted by as much; "
-                    'center="core" takes the core'
-                )
-        n_y, n_x = self.images.shape[1:]
-        for i_band, light in enumerate(self.edge_light()):
-            if abs(light) > EDGE_TOLERANCE:
-                messages.append(
-                    f"PSF band {i_band}: about {100 * light:.1f} % of the light lies beyond the "
-                    f"edge of the {n_y} x {n_x} image: a larger image, or one without background, "
-                    "is needed"
-                )
+        cores = self.core()
+        off = cores - self.center
+        far = np.abs(off).max(axis=1)
+        if far.max() > CORE_TOLERANCE:
+            i = int(far.argmax())
+            messages.append(
+                f"PSF core off the centre, {_bands(far > CORE_TOLERANCE)}: in band {i} it is at "
+                f"(y, x) = ({cores[i, 0]:.2f}, {cores[i, 1]:.2f}), ({off[i, 0]:+.2f}, "
+                f"{off[i, 1]:+.2f}) samples from ({self.center[i, 0]:g}, {self.center[i, 1]:g}), "
+                'and shifts the result by as much; center="core" takes the core'
+            )
+        light = self.edge_light()
+        cut = np.abs(light) > EDGE_TOLERANCE
+        if cut.any():
+            i = int(np.abs(light).argmax())
+            n_y, n_x = self.images.shape[1:]
+            messages.append(
+                f"PSF light cut at the edge of the {n_y} x {n_x} image, {_bands(cut)}: in band {i} "
+                f"about {100 * light[i]:.1f} % lies beyond; a larger image, or one without "
+                "background, is needed"
+            )
         return messages
+
+
+def _bands(chosen):
+    """The bands of a mask, in words."""
+    numbers = np.flatnonzero(chosen)
+    return f"band{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"
 
 
 def _center(images, center):
