@@ -23,7 +23,7 @@ LAYERS = [
         "reference_prox",
     },
     {"discover", "device"},
-    {"contract", "linop", "testing"},
+    {"contract", "linop", "paths", "testing"},
     {"resample", "split", "scene", "prox", "tiles"},
     {"initialize", "deblend", "measure"},
     {"io", "simulate", "plot", "demo", "cli"},
