@@ -8,9 +8,10 @@ import pyopencl as cl
 import pytest
 from conftest import ROOT, run_python
 
-from clresample import DeviceError, discover
+from clresample import DeviceError, discover, list_devices
 from clresample import device as device_module
 
+POCL = "Portable Computing Language"
 SCALE = """#include "common.h"
 #ifndef OFFSET
 #define OFFSET 0
@@ -21,7 +22,10 @@ __kernel void scale(__global const REAL *x, __global REAL *out)
     out[i] = 2 * x[i] + OFFSET;
 }
 """
-BROKEN = '#include "common.h"\n__kernel void broken(__global REAL *x)\n{\n    x[0] = missing;\n}\n'
+BROKEN = """__kernel void early(__global float *x) { x[0] = absent; }
+#include "common.h"
+__kernel void late(__global REAL *x) { x[0] = missing; }
+"""
 
 
 @pytest.fixture
@@ -39,7 +43,7 @@ def kernels(tmp_path, monkeypatch):
 def pocl():
     """The first PoCL platform; the test is skipped where there is none."""
     for platform in cl.get_platforms():
-        if "Portable Computing Language" in platform.name:
+        if platform.name == POCL:
             return platform
     pytest.skip("no PoCL here: its settings cannot be tried")
 
@@ -144,6 +148,13 @@ def test_our_own_mistakes_stay_as_they_are(device, monkeypatch):
 # ---- kernels ----
 
 
+def test_double_precision_is_found(device):
+    if device.platform != POCL:
+        pytest.skip("whether this device has double precision is not known beforehand")
+    assert device.has_fp64
+    assert all(info.fp64 for info in list_devices() if info.platform == POCL)
+
+
 @pytest.mark.smoke
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_a_kernel_in_either_precision(device, kernels, dtype):
@@ -170,14 +181,15 @@ def test_equal_requests_share_a_program_and_not_a_kernel(device, kernels):
 
 def test_a_failed_build_shows_the_compilers_log(device, kernels):
     with pytest.raises(DeviceError) as failure:
-        device.kernel("broken.cl", "broken", SIDE=7)
+        device.kernel("broken.cl", "late", SIDE=7)
     message = str(failure.value)
     assert f"broken.cl does not build on {device.name}" in message
     assert "'SIDE': 7" in message
     assert "missing" in message
     assert "CLRESAMPLE_DEVICE" in message
-    if device.platform == "Portable Computing Language":
-        assert "broken.cl:4:" in message  # the line of the file, not of what was compiled
+    if device.platform == POCL:  # the lines of the file, not of what was compiled
+        assert "broken.cl:1:" in message
+        assert "broken.cl:3:" in message
 
 
 def test_dtype_is_one_of_two(device):

@@ -57,8 +57,8 @@ def fakes(monkeypatch):
     one, two = Fake("Alpha OpenCL"), Fake("Beta")
     found = [
         Fake("Core 7", one),
-        Fake("Iris", one, "GPU"),
-        Fake("Big 100", two, "GPU", available=False),
+        Fake("Iris", one, "GPU", available=False),
+        Fake("Big 100", two, "GPU"),
         Fake("gfx906:xnack-", two, "GPU"),
     ]
     monkeypatch.setattr(discover, "_found", lambda: found)
@@ -70,12 +70,13 @@ def fakes(monkeypatch):
 @pytest.mark.parametrize(
     ("choice", "expected"),
     [
-        (None, 1),  # the first GPU that is available
+        (None, 2),  # the first GPU that is available
         (0, 0),
         ("3", 3),
         ("core", 0),
         ("big 100", 2),
-        ("alpha", 1),  # a platform's name: its preferred device
+        ("alpha", 0),  # a platform's name: its preferred device that is available
+        ("iris", 1),
         ("alpha:core", 0),
         ("1:0", 2),
         ("beta:1", 3),
