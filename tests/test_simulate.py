@@ -112,10 +112,10 @@ def test_sdr_has_no_square():
 
 def test_drawn_gaussian_is_the_closed_form(galsim):
     """A Gaussian under a Gaussian PSF and a pixel is a product of error functions."""
-    image = draw(galsim.Gaussian(sigma=0.3), RUBIN_UGRIZY.grid(41), psf_sigma_arcsec=0.4)
+    image = draw(galsim.Gaussian(sigma=0.12), RUBIN_UGRIZY.grid(41), psf_sigma_arcsec=0.297)
     assert image.dtype == np.float64
-    # GalSim's cuts in k space (1e-4) bound the error
-    np.testing.assert_allclose(image, PSF.gaussian(0.5 / 0.2).images[0], atol=1e-4 * image.max())
+    exact = PSF.gaussian(np.hypot(0.12, 0.297) / 0.2).images[0]
+    np.testing.assert_allclose(image, exact, atol=1e-5 * image.max())  # GalSim: 3e-6 of the peak
 
 
 @pytest.mark.parametrize("angle_deg", [0, 30, 90, 137])
