@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from astropy.coordinates import SkyCoord
-from astropy.wcs import WCS, DistortionLookupTable, NoConvergence, Sip, WcsError
+from astropy.wcs import WCS, DistortionLookupTable, NoConvergence, Sip
 from astropy.wcs.utils import wcs_to_celestial_frame
 
 from clresample.mapping import NOISE_PX, Mapping, lattice, map_affine, map_positions
@@ -52,10 +52,10 @@ class Grid:
             wcs_to_celestial_frame(wcs)
             grid = cls(shape, wcs)
             scale = grid.pixel_scale_arcsec
-        except (WcsError, ValueError) as error:
+        except Exception as error:  # wcslib raises a dozen kinds, RuntimeError among them
             raise ValueError(f"wcs cannot be used: {' '.join(str(error).split())}") from error
         if not scale > 0:
-            raise ValueError(f"wcs gives the image's central pixel the size {scale} arcsec")
+            raise ValueError(f"wcs cannot be used: its central pixel has the size {scale} arcsec")
         return grid
 
     @classmethod

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import warnings
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -17,6 +18,9 @@ from astropy.wcs import WCS
 from clresample import __version__
 from clresample.grid import Grid
 from clresample.psf import PSF
+
+# cards that only a third axis has
+THIRD_AXIS = re.compile(r"(NAXIS|CTYPE|CUNIT|CRPIX|CRVAL|CDELT|CROTA)3|(PC|CD)(3_\d|\d_3)")
 
 
 class FitsError(ValueError):
@@ -54,7 +58,7 @@ def read_image(path, *, hdu=None, bands=None):
     with _open(path) as hdus:
         chosen = _choose_hdu(path, hdus, hdu)
         data, header = _pixels(path, chosen), chosen.header.copy()
-        wcs = WCS(header, hdus)
+        wcs = _celestial(path, header, hdus)
         if not wcs.has_celestial:
             raise FitsError(f"{path}: HDU {_label(hdus, chosen)} has no celestial WCS")
         # data axes run against FITS axes; the band axis is the one that is not on the sky
@@ -133,7 +137,7 @@ def write_fits(
     if bands is not None and len(bands) != n_bands:
         raise ValueError(f"bands has {len(bands)} names, data {n_bands} bands")
     placed = grid.to_wcs().to_fits(relax=True)  # a primary header, and HDUs of look-up tables
-    hdus = [fits.PrimaryHDU(data, _header(placed[0].header, data.ndim))]
+    hdus = [fits.PrimaryHDU(data, placed[0].header)]
     cards = hdus[0].header
     if unit:
         cards["BUNIT"] = (unit, "flux per pixel")
@@ -144,8 +148,8 @@ def write_fits(
         coverage = np.asarray(coverage)
         if coverage.ndim not in (2, 3) or coverage.shape[-2:] != grid.shape:
             raise ValueError(f"coverage has the shape {coverage.shape}, the grid {grid.shape}")
-        header = _header(placed[0].header, coverage.ndim)
-        hdus.append(fits.ImageHDU(coverage.astype(np.uint8), header, name="COVERAGE"))
+        covered = coverage.astype(np.uint8)
+        hdus.append(fits.ImageHDU(covered, placed[0].header, name="COVERAGE"))
         hdus[-1].header["COMMENT"] = "1 where the input image covers the pixel's centre, else 0"
     _replace(path, fits.HDUList(hdus + list(placed[1:])))
 
@@ -209,6 +213,29 @@ def _pixels(path, hdu):
     return data
 
 
+def _celestial(path, header, hdus):
+    """The WCS of the first two axes if these are on the sky, else the whole one.
+
+    astropy takes SIP and look-up tables (and with a third axis, TPV) for two axes only.
+    """
+    third = [key for key in header if THIRD_AXIS.fullmatch(key)]
+    first = header.copy()
+    for key in third:
+        del first[key]
+    first["NAXIS"] = first["WCSAXES"] = 2
+    coupled = any(header[key] for key in third if "_" in key and key[-3:] != "3_3")
+    for cards in [header] if coupled else [first, header]:
+        try:
+            wcs = WCS(cards, hdus)
+        except Exception as error:  # of wcslib, by the dozen
+            problem = error
+        else:
+            if wcs.has_celestial or cards is header:
+                return wcs
+    reason = " ".join(str(problem).split())
+    raise FitsError(f"{path}: WCS cannot be used ({reason})") from problem
+
+
 def _native(data):
     """C-contiguous native float: float32 where it holds every value, else float64."""
     dtype = np.result_type(data.dtype.newbyteorder("="), np.float32)
@@ -244,13 +271,6 @@ def _choose_bands(path, names, bands):
 
 def _ascii(text):
     return str(text).encode("ascii", "replace").decode()
-
-
-def _header(wcs_header, n_axes):
-    header = wcs_header.copy()
-    if n_axes > 2:
-        header["WCSAXES"] = n_axes
-    return header
 
 
 def _add_provenance(header, dtype, device, inputs, shift_px):

@@ -49,15 +49,18 @@ class Mapping:
 
     @property
     def covered(self):
-        """(My, Mx) bool: observed pixels whose centre lies on the model, [-1/2, N - 1/2]."""
+        """(My, Mx) bool: observed pixels whose centre lies on the model, [-1/2, N - 1/2].
+
+        Centres on the very edge count, whatever the last digits of two WCS make of them.
+        """
+        low, high = -0.5 - NOISE_PX, np.array(self.shape_in) - 0.5 + NOISE_PX
         if self.kind == "distorted":
-            inside = (self.positions >= -0.5) & (self.positions <= np.array(self.shape_in) - 0.5)
-            return inside.all(axis=-1)
+            return ((self.positions >= low) & (self.positions <= high)).all(axis=-1)
         n, m = (np.arange(n, dtype=np.float64) for n in self.shape_out)
         inside = np.ones(self.shape_out, dtype=bool)
-        for (a, b), t, n_in in zip(self.matrix, self.offset, self.shape_in, strict=True):
+        for (a, b), t, top in zip(self.matrix, self.offset, high, strict=True):
             x = a * n[:, None] + (b * m + t)
-            inside &= (x >= -0.5) & (x <= n_in - 0.5)
+            inside &= (x >= low) & (x <= top)
         return inside
 
     def window(self, in_origin, in_shape, out_origin, out_shape, *, tolerance_px=None):
