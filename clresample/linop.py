@@ -28,11 +28,11 @@ class LinOp:
         self._staged = {}
 
     def forward(self, x, out=None):
-        """A x.  x (B,) + shape_in -> (B,) + shape_out; `out`, of x's kind, receives it if given."""
+        """A x.  x (B,) + shape_in -> (B,) + shape_out, into `out` (of x's kind) if given."""
         return self._apply(self._forward, "x", x, out, self.shape_in, self.shape_out)
 
     def adjoint(self, y, out=None):
-        """A^T y.  y (B,) + shape_out -> (B,) + shape_in; `out`, of y's kind, receives it if given."""
+        """A^T y.  y (B,) + shape_out -> (B,) + shape_in, into `out` (of y's kind) if given."""
         return self._apply(self._adjoint, "y", y, out, self.shape_out, self.shape_in)
 
     __call__ = __matmul__ = forward
@@ -61,7 +61,12 @@ class LinOp:
 
     def _apply(self, run, name, x, out, shape_x, shape_out):
         single = shape_x[0] == 1 == shape_out[0] and len(shape_x) == len(shape_out) == 3
-        shape = tuple(np.shape(x) if isinstance(x, (list, tuple)) else x.shape)
+        on_device = hasattr(x, "base_data")
+        if not on_device:
+            x = np.asarray(x)
+            if np.iscomplexobj(x):
+                raise ValueError(f"{name} is {x.dtype}, the operator is real ({self.dtype})")
+        shape = tuple(x.shape)
         if shape == shape_x:
             batch, shape_result = 1, shape_out
         elif len(shape) == len(shape_x) + 1 and shape[1:] == shape_x and shape[0] > 0:
@@ -70,15 +75,24 @@ class LinOp:
             batch, shape_result = 1, shape_out[1:]
         else:
             raise ValueError(f"{name} has shape {shape}, expected {shape_x} or (B,) + {shape_x}")
-        if out is not None and tuple(out.shape) != shape_result:
-            raise ValueError(f"out has shape {tuple(out.shape)}, expected {shape_result}")
+        if out is not None:
+            if on_device != hasattr(out, "base_data") or not hasattr(out, "shape"):
+                raise ValueError(f"out is a {_kind(out)}, but {name} a {_kind(x)}: both must be "
+                                 "NumPy arrays or both pyopencl arrays")
+            if tuple(out.shape) != shape_result:
+                raise ValueError(f"out has shape {tuple(out.shape)}, expected {shape_result}")
         batched_x, batched_out = (batch, *shape_x), (batch, *shape_out)
 
-        if not isinstance(x, np.ndarray) and hasattr(x, "base_data"):
+        if on_device:
             x = self._checked(name, x)
             out = self.device.empty(shape_result, self.dtype) if out is None \
                 else self._checked("out", out)
+            others = {a.queue for a in (x, out)} - {None, self.device.queue}
+            for queue in others:  # of the caller, who may still write or read there
+                queue.finish()
             run(x.reshape(batched_x), out.reshape(batched_out))
+            if others:
+                self.device.finish()
             return out
         x_device, out_device = self._staging(name, batched_x, batched_out)
         self.device.upload(np.ascontiguousarray(x, dtype=self.dtype), x_device)
@@ -95,7 +109,11 @@ class LinOp:
         if array.dtype != self.dtype:
             raise ValueError(f"{name} has dtype {array.dtype}, the operator has {self.dtype}")
         if not array.flags.c_contiguous:
-            raise ValueError(f"{name} has strides {array.strides}: a device array must be C-contiguous")
+            raise ValueError(f"{name} has strides {array.strides} for the shape {array.shape}: "
+                             "a device array must be C-contiguous")
+        if array.context != self.device.context:
+            raise ValueError(f"{name} belongs to an OpenCL context of {array.context.devices}, the "
+                             f"operator to that of {self.device}: make it with op.device.put")
         return array
 
     def _staging(self, name, shape_x, shape_out):
@@ -104,6 +122,10 @@ class LinOp:
             self._staged[name] = (shape_x, self.device.empty(shape_x, self.dtype),
                                   self.device.empty(shape_out, self.dtype))
         return self._staged[name][1:]
+
+
+def _kind(array):
+    return f"{type(array).__module__}.{type(array).__name__}"
 
 
 class Adjoint(LinOp):

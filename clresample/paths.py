@@ -158,9 +158,9 @@ class Affine(Path):
         self.twist_adjoint = Contraction(device, dtype, epilogue="TWIST", adjoint=True)
         lines = [p.lines for p in plans]
         self.to_pixels = Gather(self, [p.start for p in lines], [p.weight for p in lines],
-                                self.n_steps)
+                                self.n_columns, self.n_steps)
         self.to_columns = Gather(self, [p.start_t for p in lines], [p.weight_t for p in lines],
-                                 self.n_pad)
+                                 self.n_steps, self.n_pad)
 
     def scratch_shapes(self):
         return super().scratch_shapes() | {"turned": (self.k_y, self.n_pad),
@@ -227,17 +227,23 @@ class Distorted(Path):
 
 
 class Gather:
-    """Sparse sums along lines, out[l, p] = sum_t weight[l, t, p] in[l, start[l, p] + t]."""
+    """Sparse sums along lines, out[l, p] = sum_t weight[l, t, p] in[l, start[l, p] + t].
 
-    def __init__(self, path: Path, starts, weights, n_out):
+    starts, weights: one for each plan; n_in, n_out: elements of a line on either side
+    """
+
+    def __init__(self, path: Path, starts, weights, n_in, n_out):
         self.path, self.n_out = path, n_out
         self.n_taps = max(w.shape[1] for w in weights)
         n_lines = path.n_rows
         start = np.zeros((len(starts), n_lines, n_out), np.int32)
         weight = np.zeros((len(starts), n_lines, self.n_taps, n_out), path.dtype)
         for i, (s, w) in enumerate(zip(starts, weights, strict=True)):
-            start[i, :, : s.shape[1]] = s
-            weight[i, :, : w.shape[1], : w.shape[2]] = w
+            # with more taps than its own, a plan's last ones would read beyond the line
+            back = np.maximum(s - (n_in - self.n_taps), 0)
+            taps = back[:, None] + np.arange(w.shape[1])[:, None]
+            start[i, :, : s.shape[1]] = s - back
+            np.put_along_axis(weight[i, :, :, : w.shape[2]], taps, w, axis=1)
         self.start, self.weight = path.device.put(start), path.device.put(weight)
         self.kernel = path.device.kernel("warp.cl", "gather", dtype=path.dtype)
         i, size = np.int32, np.uint64

@@ -46,9 +46,13 @@ class Resampler(LinOp):
                    shift=(0.0, 0.0)) -> Resampler:
         """An operator on batches whose item b has its own geometry and PSFs, plans[b].
 
-        plans: one for batches of any length, or one for each item; alike in kind, axes, bands, shapes
+        plans: one for batches of any length, or one for each item; alike in kind, axes, bands,
+            shapes and, when affine, in whether lines are rows
         shift (2,) or (len(plans), 2) [model px]
+        Raises ValueError for plans that differ in these.
         """
+        if not plans:
+            raise ValueError("plans is empty, at least one is needed")
         for i, plan in enumerate(plans):
             for name in ("kind", "axes", "n_bands"):
                 if getattr(plan, name) != getattr(plans[0], name):
@@ -58,6 +62,11 @@ class Resampler(LinOp):
                 if getattr(plan.mapping, name) != getattr(plans[0].mapping, name):
                     raise ValueError(f"plans[{i}] has {name} {getattr(plan.mapping, name)}, "
                                      f"plans[0] has {getattr(plans[0].mapping, name)}")
+            if plan.lines is not None and plan.lines.by_row != plans[0].lines.by_row:
+                along = {True: "rows", False: "columns"}
+                raise ValueError(f"plans[{i}] runs along the observed {along[plan.lines.by_row]}, "
+                                 f"plans[0] along the {along[plans[0].lines.by_row]}: give those "
+                                 "turned by more than 45 degrees their own operator")
         op = cls.__new__(cls)
         op._setup(plans, dtype, device, shift)
         return op
@@ -80,7 +89,11 @@ class Resampler(LinOp):
 
     @shift.setter
     def shift(self, shift):
-        self._shift = np.broadcast_to(np.asarray(shift, np.float64), (len(self.plans), 2)).copy()
+        shift, expected = np.asarray(shift, np.float64), (len(self.plans), 2)
+        if shift.shape not in ((), (2,), expected) or not np.isfinite(shift).all():
+            raise ValueError(f"shift is {shift}, must be (2,) or {expected} finite numbers")
+        self._shift = np.broadcast_to(shift, expected).copy()
+        self._shift.flags.writeable = False  # a change must come through this setter
         self._identity = all(p.identity for p in self.plans) and not self._shift.any()
         self._path.set_spectra([p.shifted(s) for p, s in zip(self.plans, self._shift, strict=True)])
 
