@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 # Columns of device matrices are padded with zeros to a multiple of this, the widest vector used.
 COLUMN_PAD = 16
-# Terms summed at a stretch in long sums: rounding grows with the root of this, not of k.
-SUM_BLOCK = 256
+# Fewest terms summed at a stretch; the root of k balances the rounding of the stretches and of their
+# sum. At 16 the float32 operator is twice as accurate as without stretches, for 6 % of its time.
+SUM_BLOCK = 16
 
 
 def padded(n: int) -> int:
@@ -21,7 +23,7 @@ class Matrix(NamedTuple):
     """A batch of matrices in device memory; item b starts at offset + (b // div) * stride.
 
     buffer: OpenCL buffer; offset, ld, stride [elements]: start, distance of rows, of items
-    step [elements]: distance of columns (only for the left factor, and for a ragged result)
+    step [elements]: distance of columns (only of a strided left factor, and of a ragged result)
     """
 
     buffer: object
@@ -38,21 +40,21 @@ class Contraction:
     epilogue: None, "MIX" (difference spectra) or "TWIST" (rotation of cos and sin rows)
     adjoint: conjugate the epilogue
     ragged: C is a caller's array, of any strides; otherwise its rows are padded with zeros
-    long_sums: k may be many thousands; sum it in blocks
+    strided: A's columns may be any distance apart; otherwise they are adjacent
     """
 
     def __init__(self, device, dtype, *, epilogue=None, adjoint=False, ragged=False,
-                 long_sums=False):
+                 strided=False):
         self.device = device
         self.tile = _tile(device, np.dtype(dtype))
         defines = {epilogue: True} if epilogue else {}
         self.kernel = device.kernel(
             "contract.cl", "contract", dtype=dtype, SIGN=-1 if adjoint else 1, RAGGED=ragged,
-            BLOCK=SUM_BLOCK if long_sums else None, **self.tile, **defines,
+            STRIDED=strided, **self.tile, **defines,
         )
         i, size = np.int32, np.uint64
         self.kernel.set_scalar_arg_dtypes(
-            [i, i, i, i, None, size, i, i, i, i, None, i, i, None, size, i, i, i, None, i, i, i]
+            [i, i, i, i, i, None, size, i, i, i, i, None, i, i, None, size, i, i, i, None, i, i, i]
         )
 
     def __call__(self, m, n, k, batch, a: Matrix, b: Matrix, c: Matrix, e=None, n_bands=1):
@@ -66,9 +68,9 @@ class Contraction:
         n_pad = padded(n)
         buffer_e, stride_e, band_e = e or (None, 0, 0)
         self.kernel.set_args(
-            m, n, n_pad, k, a.buffer, a.offset, a.ld, a.step, a.stride, a.div,
-            b.buffer, b.stride, b.div, c.buffer, c.offset, c.ld, c.step, c.stride,
-            buffer_e, stride_e, band_e, n_bands,
+            m, n, n_pad, k, max(SUM_BLOCK, math.isqrt(k)),
+            a.buffer, a.offset, a.ld, a.step, a.stride, a.div, b.buffer, b.stride, b.div,
+            c.buffer, c.offset, c.ld, c.step, c.stride, buffer_e, stride_e, band_e, n_bands,
         )
         tile = self.tile
         x, y = -(-n_pad // tile["VW"]), -(-m // tile["MR"])

@@ -11,6 +11,7 @@ All matrices are real: rows or columns 2i, 2i+1 are the cos and sin parts of fre
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -56,6 +57,7 @@ class Path:
         self.in_x_t = self._table([p.in_x.T for p in plans], self.n_x, self.k_pad)
         self.spectra = device.empty((len(plans), self.n_bands, self.h_y, 4, self.k_pad // 2), dtype)
         self.plain = Contraction(device, dtype)
+        self.first = Contraction(device, dtype, strided=self.axes != (0, 1))
         self.ragged = Contraction(device, dtype, ragged=True)
         self.mix = Contraction(device, dtype, epilogue="MIX")
         self.scratch = {}
@@ -84,7 +86,7 @@ class Path:
     def analyse(self, images: Images, n):
         """Z = D o (Ty I Tx) of `n` images, into scratch "spectrum"."""
         half, z = self._scratch("half", self.n_y), self._scratch("spectrum")
-        self.plain(self.n_y, self.k_x, self.n_x, n, images.matrix(self.axes), self.in_x_t, half)
+        self.first(self.n_y, self.k_x, self.n_x, n, images.matrix(self.axes), self.in_x_t, half)
         self.mix(self.k_y, self.k_x, self.n_y, n, self.in_y, half, z, self._epilogue(self.spectra),
                  self.n_bands)
 
@@ -99,7 +101,7 @@ class Path:
         host = np.zeros((len(tables), *shape), self.dtype)
         for item, table in zip(host, tables, strict=True):
             item[tuple(slice(n) for n in table.shape)] = table
-        stride = int(np.prod(shape)) if len(tables) > 1 else 0
+        stride = math.prod(shape) if len(tables) > 1 else 0
         return Matrix(self.device.put(host).base_data, shape[-1], stride, div=self.n_bands)
 
     def _scratch(self, name, rows=None) -> Matrix:
@@ -107,8 +109,8 @@ class Path:
         return Matrix(array.base_data, array.shape[2], (rows or array.shape[1]) * array.shape[2])
 
     def _epilogue(self, array):
-        stride = int(np.prod(array.shape[1:])) if len(self.plans) > 1 else 0
-        return array.base_data, stride, int(np.prod(array.shape[2:]))
+        stride = math.prod(array.shape[1:]) if len(self.plans) > 1 else 0
+        return array.base_data, stride, math.prod(array.shape[2:])
 
 
 class Aligned(Path):
@@ -194,12 +196,12 @@ class Distorted(Path):
     """Any positions: the spectral sum straight at each observed pixel."""
 
     def __init__(self, device, dtype, plans):
-        self.n_rows = int(np.prod(plans[0].mapping.shape_out))
+        self.n_rows = math.prod(plans[0].mapping.shape_out)
         super().__init__(device, dtype, plans)
         self.out_y = self._table([p.out_y for p in plans], self.n_rows, self.k_y)
         self.out_y_t = self._table([p.out_y.T for p in plans], self.k_y, self.n_rows)
         self.out_x = self._table([p.out_x for p in plans], self.n_rows, self.k_pad)
-        self.mix_adjoint = Contraction(device, dtype, epilogue="MIX", adjoint=True, long_sums=True)
+        self.mix_adjoint = Contraction(device, dtype, epilogue="MIX", adjoint=True)
         self.rowdot = device.kernel("warp.cl", "rowdot", dtype=dtype)
         self.rowscale = device.kernel("warp.cl", "rowscale", dtype=dtype)
         scalars = [np.int32, np.int32, np.int32, np.int32]
@@ -234,26 +236,26 @@ class Gather:
 
     def __init__(self, path: Path, starts, weights, n_in, n_out):
         self.path, self.n_out = path, n_out
-        self.n_taps = max(w.shape[1] for w in weights)
+        n_taps = max(w.shape[1] for w in weights)
         n_lines = path.n_rows
         start = np.zeros((len(starts), n_lines, n_out), np.int32)
-        weight = np.zeros((len(starts), n_lines, self.n_taps, n_out), path.dtype)
+        weight = np.zeros((len(starts), n_lines, n_taps, n_out), path.dtype)
         for i, (s, w) in enumerate(zip(starts, weights, strict=True)):
             # with more taps than its own, a plan's last ones would read beyond the line
-            back = np.maximum(s - (n_in - self.n_taps), 0)
+            back = np.maximum(s - (n_in - n_taps), 0)
             taps = back[:, None] + np.arange(w.shape[1])[:, None]
             start[i, :, : s.shape[1]] = s - back
             np.put_along_axis(weight[i, :, :, : w.shape[2]], taps, w, axis=1)
         self.start, self.weight = path.device.put(start), path.device.put(weight)
-        self.kernel = path.device.kernel("warp.cl", "gather", dtype=path.dtype)
+        self.kernel = path.device.kernel("warp.cl", "gather", dtype=path.dtype, N_TAPS=n_taps)
         i, size = np.int32, np.uint64
         self.kernel.set_scalar_arg_dtypes(
-            [i, i, i, i, i, None, size, i, i, i, None, size, i, i, i, None, None])
+            [i, i, i, i, None, size, i, i, i, None, size, i, i, i, None, None])
 
     def __call__(self, source: Matrix, target: Matrix, n):
         path = self.path
         self.kernel.set_args(
-            self.n_out, path.n_rows, self.n_taps, path.n_bands, len(path.plans),
+            self.n_out, path.n_rows, path.n_bands, len(path.plans),
             source.buffer, source.offset, source.stride, source.ld, source.step,
             target.buffer, target.offset, target.stride, target.ld, target.step,
             self.start.base_data, self.weight.base_data)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from .grid import Grid
@@ -132,5 +134,5 @@ class Resampler(LinOp):
 
 
 def _images(array, start, shape) -> Images:
-    offset = array.offset // array.dtype.itemsize + start * int(np.prod(shape))
+    offset = array.offset // array.dtype.itemsize + start * math.prod(shape)
     return Images(array.base_data, offset, shape[1:])

@@ -7,10 +7,12 @@
  *
  * Layout: n_pad = n rounded up to VW.  B always has ld n_pad with zeros in the padding; so has C,
  *   unless RAGGED, when C is a caller's array: element (i, j) at i * ldc + j * step_c, any alignment.
- *   A is any array: element (i, l) at i * lda + l * step_a, so it may be read transposed.
+ *   A is any array: element (i, l) at i * lda + l, or at i * lda + l * step_a if STRIDED, so that it
+ *   may be read transposed.
  * Batch: item b uses A + (b / div_a) * stride_a and likewise for B, so a table that all bands of a
  *   scene share has div = n_bands, one that every scene shares has stride 0.
- * BLOCK, if defined, sums k in blocks of that length, so that float32 keeps its accuracy on long sums.
+ * Terms are summed in stretches of `block` and the stretches' sums in a second set of registers:
+ *   rounding then grows with the root of block + k / block, not of k.
  * Rows beyond m read row m - 1 again and are not stored.
  *
  * Epilogue, at most one of (rows 2i, 2i+1 hold the cos and sin parts of row frequency i):
@@ -61,15 +63,16 @@
 #define ODD(v) (v).s1
 #endif
 
+#ifdef STRIDED
+#define STEP_A (size_t)step_a
+#else
+#define STEP_A 1
+#endif
+
 #define AT(type, p) (*(__global type *)(p))
-#define STEP(l) {                                                                  \
-        const WIDE v = AT(const WIDE, B + (size_t)(l) * n_pad);                    \
-        _Pragma("unroll")                                                          \
-        for (int i = 0; i < MR; ++i) acc[i] += row[i][(size_t)(l) * step_a] * v;   \
-    }
 
 __kernel __attribute__((reqd_work_group_size(WGX, WGY, 1)))
-void contract(const int m, const int n, const int n_pad, const int k,
+void contract(const int m, const int n, const int n_pad, const int k, const int block,
               __global const REAL *restrict A, const ulong offset_a, const int lda,
               const int step_a, const int stride_a, const int div_a,
               __global const REAL *restrict B, const int stride_b, const int div_b,
@@ -92,23 +95,19 @@ void contract(const int m, const int n, const int n_pad, const int k,
         row[i] = A + (size_t)(i0 + i < m ? i0 + i : m - 1) * lda;
         acc[i] = (WIDE)(0);
     }
-#ifdef BLOCK
-    WIDE sum[MR];
+    for (int l0 = 0; l0 < k; l0 += block) {
+        const int l1 = l0 + block < k ? l0 + block : k;
+        WIDE part[MR];
 #pragma unroll
-    for (int i = 0; i < MR; ++i) sum[i] = (WIDE)(0);
-    for (int l0 = 0; l0 < k; l0 += BLOCK) {
-        const int l1 = l0 + BLOCK < k ? l0 + BLOCK : k;
+        for (int i = 0; i < MR; ++i) part[i] = (WIDE)(0);
+        for (int l = l0; l < l1; ++l) {
+            const WIDE v = AT(const WIDE, B + (size_t)l * n_pad);
 #pragma unroll
-        for (int i = 0; i < MR; ++i) acc[i] = (WIDE)(0);
-        for (int l = l0; l < l1; ++l) STEP(l)
+            for (int i = 0; i < MR; ++i) part[i] += row[i][l * STEP_A] * v;
+        }
 #pragma unroll
-        for (int i = 0; i < MR; ++i) sum[i] += acc[i];
+        for (int i = 0; i < MR; ++i) acc[i] += part[i];
     }
-#pragma unroll
-    for (int i = 0; i < MR; ++i) acc[i] = sum[i];
-#else
-    for (int l = 0; l < k; ++l) STEP(l)
-#endif
 
 #if defined(MIX)
     E += (size_t)(b / n_bands) * stride_e + (size_t)(b % n_bands) * band_e + j0 / 2;
