@@ -235,7 +235,8 @@ class Gather:
     """
 
     def __init__(self, path: Path, starts, weights, n_in, n_out):
-        self.path, self.n_out = path, n_out
+        self.device, self.n_rows, self.n_out = path.device, path.n_rows, n_out
+        self.n_bands, self.n_plans = path.n_bands, len(path.plans)
         n_taps = max(w.shape[1] for w in weights)
         n_lines = path.n_rows
         start = np.zeros((len(starts), n_lines, n_out), np.int32)
@@ -253,10 +254,9 @@ class Gather:
             [i, i, i, i, None, size, i, i, i, None, size, i, i, i, None, None])
 
     def __call__(self, source: Matrix, target: Matrix, n):
-        path = self.path
         self.kernel.set_args(
-            self.n_out, path.n_rows, path.n_bands, len(path.plans),
+            self.n_out, self.n_rows, self.n_bands, self.n_plans,
             source.buffer, source.offset, source.stride, source.ld, source.step,
             target.buffer, target.offset, target.stride, target.ld, target.step,
             self.start.base_data, self.weight.base_data)
-        path.device.launch(self.kernel, (self.n_out, path.n_rows, n))
+        self.device.launch(self.kernel, (self.n_out, self.n_rows, n))
