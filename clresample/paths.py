@@ -83,10 +83,17 @@ class Path:
                 item[:, : plane.shape[1], i, : plane.shape[2]] = plane
         self.device.upload(host, self.spectra)
 
-    def analyse(self, images: Images, n):
-        """Z = D o (Ty I Tx) of `n` images, into scratch "spectrum"."""
+    def analyse(self, images: Images, n, spread=False):
+        """Z = D o (Ty I Tx) for `n` images, into scratch "spectrum".
+
+        spread: the images are n / n_bands, each of which is seen in every band
+        """
         half, z = self._scratch("half", self.n_y), self._scratch("spectrum")
-        self.first(self.n_y, self.k_x, self.n_x, n, images.matrix(self.axes), self.in_x_t, half)
+        in_x_t = self.in_x_t._replace(div=1) if spread else self.in_x_t
+        self.first(self.n_y, self.k_x, self.n_x, n // self.n_bands if spread else n,
+                   images.matrix(self.axes), in_x_t, half)
+        if spread:
+            half = half._replace(div=self.n_bands)
         self.mix(self.k_y, self.k_x, self.n_y, n, self.in_y, half, z, self._epilogue(self.spectra),
                  self.n_bands)
 
@@ -125,8 +132,8 @@ class Aligned(Path):
         self.out_x_t = self._table([p.out_x.T for p in plans], self.n_columns, self.k_pad)
         self.mix_adjoint = Contraction(device, dtype, epilogue="MIX", adjoint=True)
 
-    def forward(self, x: Images, y: Images, n):
-        self.analyse(x, n)
+    def forward(self, x: Images, y: Images, n, spread=False):
+        self.analyse(x, n, spread)
         half, z = self._scratch("half", self.n_rows), self._scratch("spectrum")
         self.plain(self.n_rows, self.k_x, self.k_y, n, self.out_y, z, half)
         self.ragged(self.n_rows, self.n_columns, self.k_x, n, half, self.out_x, y.matrix())
@@ -168,8 +175,8 @@ class Affine(Path):
         return super().scratch_shapes() | {"turned": (self.k_y, self.n_pad),
                                            "lines": (self.n_rows, self.n_pad)}
 
-    def forward(self, x: Images, y: Images, n):
-        self.analyse(x, n)
+    def forward(self, x: Images, y: Images, n, spread=False):
+        self.analyse(x, n, spread)
         z, turned, g = (self._scratch(name) for name in ("spectrum", "turned", "lines"))
         self.twist(self.k_y, self.n_columns, self.k_x, n, z, self.out_x, turned, self._turn(),
                    self.n_bands)
@@ -208,8 +215,8 @@ class Distorted(Path):
         for kernel in (self.rowdot, self.rowscale):
             kernel.set_scalar_arg_dtypes([*scalars, None, np.uint64, None, None])
 
-    def forward(self, x: Images, y: Images, n):
-        self.analyse(x, n)
+    def forward(self, x: Images, y: Images, n, spread=False):
+        self.analyse(x, n, spread)
         half, z = self._scratch("half", self.n_rows), self._scratch("spectrum")
         self.plain(self.n_rows, self.k_x, self.k_y, n, self.out_y, z, half)
         self._ends(self.rowdot, y, half)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -111,20 +112,28 @@ class Resampler(LinOp):
         reports = [p.report for p in self.plans]
         return reports[0] if len(reports) == 1 else reports
 
+    def render(self, x, out=None):
+        """One image seen in every band: x (Ny, Nx) or (B, Ny, Nx) -> (C, My, Mx) or (B, C, My, Mx)."""
+        return self._apply(self._render, "x", x, out, self.shape_in[1:], self.shape_out)
+
+    def _render(self, x, out):
+        self._run(functools.partial(self._path.forward, spread=True), x, out, (1, *x.shape[1:]),
+                  self.shape_out, identity=False)
+
     def _forward(self, x, out):
         self._run(self._path.forward, x, out, self.shape_in, self.shape_out)
 
     def _adjoint(self, y, out):
         self._run(self._path.adjoint, y, out, self.shape_out, self.shape_in)
 
-    def _run(self, chain, source, target, shape_source, shape_target):
+    def _run(self, chain, source, target, shape_source, shape_target, identity=True):
         batch = source.shape[0]
         if len(self.plans) not in (1, batch):
             raise ValueError(f"the batch has {batch} items, the operator {len(self.plans)} plans")
-        if self._identity:
+        if identity and self._identity:
             self.device.copy(source, target)
             return
-        n_bands = shape_source[0]
+        n_bands = self.plans[0].n_bands
         # per-item tables are counted from a launch's first item, so they go in one group
         group = min(self._group, batch) if len(self.plans) == 1 else batch
         self._path.reserve(group * n_bands)
