@@ -102,6 +102,23 @@ class Grid:
             return np.tensordot(self.jacobian, np.stack([n, m]), 1) + _column(self.origin, n.ndim)
         return self._world(n, m)
 
+    def pixel(self, a, b):
+        """Pixel positions at points of the sky, the inverse of `sky`.
+
+        a, b: y and x [arcsec] if flat, else longitude and latitude [deg] in the WCS's own frame
+            (right ascension and declination if that is equatorial); any shapes that broadcast
+        returns (..., 2) [px]: (y, x); NaN where the projection holds no such point
+        """
+        a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
+        if self.wcs is None:
+            inverse = np.linalg.inv(self.jacobian)
+            return (np.stack([a, b], axis=-1) - self.origin) @ inverse.T
+        result = np.full(a.shape + (2,), np.nan)
+        good = np.isfinite(a) & np.isfinite(b)
+        if good.any():
+            result[good] = _pixels(self.wcs, a[good], b[good])
+        return result
+
     def map_to(self, grid_in, tolerance_px=1e-4):
         """Mapping of this grid's pixels into those of `grid_in`: X = A p + t, or one by one.
 
@@ -217,7 +234,12 @@ def _positions(grid_from, grid_to, n, m):
     if not frames[0].is_equivalent_frame(frames[1]):
         sky = SkyCoord(lon, lat, unit="deg", frame=frames[0]).transform_to(frames[1]).spherical
         lon, lat = sky.lon.deg, sky.lat.deg
-    wcs = grid_to.wcs
+    result[good] = _pixels(grid_to.wcs, lon, lat)
+    return result
+
+
+def _pixels(wcs, lon, lat):
+    """Pixels (L, 2), (y, x), at the finite points lon, lat (L,) [deg]; NaN where there is none."""
     world = np.stack([lon, lat] if wcs.wcs.lng < wcs.wcs.lat else [lat, lon], axis=-1)
     try:
         pixels = wcs.all_world2pix(
@@ -228,8 +250,7 @@ def _positions(grid_from, grid_to, n, m):
         for lost in (error.divergent, error.slow_conv):
             if lost is not None:
                 pixels[lost] = np.nan
-    result[good] = pixels[:, ::-1]
-    return result
+    return pixels[:, ::-1]
 
 
 def _flat_affine(grid_from, grid_to):

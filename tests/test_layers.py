@@ -15,9 +15,13 @@ LAYERS = [
         "psf",
         "spectrum",
         "observation",
+        "sources",
+        "frame",
+        "result",
         "boxes",
         "solve",
         "surveys",
+        "tiling",
         "galaxies",
         "reference",
         "reference_prox",
@@ -25,8 +29,8 @@ LAYERS = [
     {"discover", "device"},
     {"contract", "linop", "paths", "testing"},
     {"resample", "split", "scene", "prox", "tiles"},
-    {"initialize", "deblend", "measure"},
-    {"io", "simulate", "plot", "demo", "cli"},
+    {"initialize", "engine", "deblend", "measure"},
+    {"io", "simulate", "plot", "demo", "cli", "cli_options", "cli_resample"},
 ]
 RANKS = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 MODULES = sorted((ROOT / "clresample").glob("*.py"))

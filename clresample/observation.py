@@ -1,0 +1,278 @@
+"""What one instrument saw of a patch of sky: pixels, weights, PSF and where it all lies."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+
+from .grid import Grid
+from .psf import PSF
+
+# [mag] AB magnitude of 1 uJy
+ZERO_POINT_UJY = 23.9
+# [sigma] pixels further from the median are sources: one in 370 of pure noise is lost
+CLIP = 3.0
+# each round drops at least one pixel; 3 to 8 rounds settle images that are half sources
+MAX_ROUNDS = 50
+# pixels that a noise estimate takes at least: the error of their MAD is a fifth of it
+MIN_PIXELS = 32
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Observation:
+    """Images of one instrument, one per channel, on one pixel grid.
+
+        chi2 = sum weights (model - data)^2
+
+    data (C, Ny, Nx) [counts per pixel]: background-subtracted images; (Ny, Nx) is one channel. Read
+        back, they are float64 and hold 0 where they were NaN or infinite
+    psf: PSF of C bands, pixel response included; one band serves all channels
+    grid: Grid of (Ny, Nx)
+    weights [counts^-2]: inverse variance, 0 = ignore this pixel; or, instead of it,
+    variance [counts^2]: NaN, infinite, zero and negative ones mean: ignore this pixel. Weights and
+        variances are (C, Ny, Nx), or (Ny, Nx) for all channels, (C,) or one number for all pixels
+    mask (C, Ny, Nx) or (Ny, Nx): True = ignore this pixel; may come with either of the two or alone
+    channels (C,): names, unique over all instruments; None numbers them after `name`
+    zero_points (C,) or one number [mag]: AB magnitude of one count
+    name: of the instrument, for messages
+
+    With neither weights nor variance the noise is estimated, channel by channel, from the scatter
+    of the background (`noise_sigma`), and `messages` says so. That is one number for the whole
+    image: it leaves out the sources' own photon noise, and in resampled or stacked images, whose
+    noise is correlated between pixels, it is the scatter of single pixels, from which chi2 comes
+    out too small and flux errors too optimistic.
+
+    Read back: data and weights (C, Ny, Nx) float64, psf of C bands, grid, channels, zero_points
+    (C,) or None, name, n_bad = number of pixels whose weight became 0 because their data were NaN
+    or infinite or their weight or variance was no number, messages = what the user should know.
+
+    Raises ValueError for shapes that disagree, negative or infinite weights, masks that are not
+    made of 0 and 1, channel names that are not unique, both weights and variance, and where the
+    noise cannot be estimated.
+    """
+
+    data: np.ndarray
+    psf: PSF
+    grid: Grid
+    weights: np.ndarray
+    channels: tuple[str, ...]
+    zero_points: np.ndarray | None
+    name: str | None
+    n_bad: int
+    messages: tuple[str, ...]
+
+    def __init__(self, data, psf, grid, *, weights=None, variance=None, mask=None, channels=None,
+                 zero_points=None, name=None):
+        data = _numbers("data", data)
+        if data.ndim == 2:
+            data = data[None]
+        if data.ndim != 3 or 0 in data.shape:
+            raise ValueError(f"data must be (C, Ny, Nx) or (Ny, Nx), not {data.shape}")
+        if data.shape[1:] != tuple(grid.shape):
+            raise ValueError(f"data has images of {data.shape[1:]} pixels, grid has {grid.shape}")
+        n_channels = len(data)
+        if psf.n_bands not in (1, n_channels):
+            raise ValueError(f"psf has {psf.n_bands} bands, data have {n_channels} channels: "
+                             "give one band, or one for each channel")
+        if psf.n_bands != n_channels:
+            psf = psf.select([0] * n_channels)
+        channels = _channels(channels, name, n_channels)
+        if zero_points is not None:
+            zero_points = _per_channel("zero_points", zero_points, n_channels)
+
+        bad = ~np.isfinite(data)
+        masked = _mask(mask, data.shape)
+        if weights is not None and variance is not None:
+            raise ValueError("weights and variance are both given: an observation takes one")
+        messages = []
+        if weights is not None:
+            weights, no_weight = _weights(weights, data.shape)
+        elif variance is not None:
+            weights, no_weight = _inverse(variance, data.shape)
+        else:
+            weights, messages = _estimated(data, bad | masked, channels)
+            no_weight = np.zeros_like(bad)
+        n_bad = int(np.count_nonzero(~masked & (no_weight | (bad & (weights > 0)))))
+        weights = np.where(bad | masked, 0.0, weights)
+        if n_bad:
+            what = "NaN or infinite pixel" if variance is None else "pixel without data or variance"
+            messages.append(f"{n_bad} {what}{'s have' if n_bad > 1 else ' has'} weight 0")
+        messages += [f"channel {channel} has no pixel with a weight"
+                     for channel, seen in zip(channels, weights.any(axis=(1, 2)), strict=True)
+                     if not seen]
+        data = np.where(bad, 0.0, data)
+        for array in (data, weights):
+            array.flags.writeable = False
+        for key, value in {
+            "data": data, "psf": psf, "grid": grid, "weights": weights, "channels": channels,
+            "zero_points": zero_points, "name": name, "n_bad": n_bad, "messages": tuple(messages),
+        }.items():
+            object.__setattr__(self, key, value)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(C, Ny, Nx)."""
+        return self.data.shape
+
+    @property
+    def label(self) -> str:
+        """What messages call this observation: its name, or else its channels."""
+        return self.name or f"with channels {', '.join(self.channels)}"
+
+    @property
+    def flux_scale(self) -> np.ndarray | None:
+        """Flux of one count (C,) [uJy]: 10^(-0.4 (zero_points - 23.9)); None without them."""
+        if self.zero_points is None:
+            return None
+        return 10 ** (-0.4 * (self.zero_points - ZERO_POINT_UJY))
+
+
+def check_observations(observations):
+    """Raise ValueError unless these observations can be fitted together.
+
+    There is at least one, channel names are unique over all of them, zero points are given by all
+    of them or by none, and their grids are all flat or all placed by a WCS.
+    """
+    if not observations:
+        raise ValueError("observations is empty, at least one is needed")
+    first = {}
+    for observation in observations:
+        for channel in observation.channels:
+            if channel in first:
+                raise ValueError(f"channel name {channel!r} is given twice, by the observations "
+                                 f"{first[channel].label!r} and {observation.label!r}")
+            first[channel] = observation
+    for what, have in (
+        ("zero_points", [o.zero_points is not None for o in observations]),
+        ("a WCS", [o.grid.wcs is not None for o in observations]),
+    ):
+        if len(set(have)) > 1:
+            of, rest = (observations[have.index(there)].label for there in (True, False))
+            raise ValueError(f"observation {of!r} has {what}, {rest!r} has none: give all or none")
+
+
+def noise_sigma(image, mask=None) -> float:
+    """Standard deviation of an image's background, sources clipped away.
+
+        sigma = MAD / q,   MAD = median |x - median x|  over |x - median x| <= 3 sigma, iterated
+
+    with q = 0.672 the same quantity of a unit Gaussian cut at 3 sigma. Unbiased for white noise;
+    too large by 2 % where faint wings of sources fill 3 % of the pixels, by a third where they fill
+    half of them. Of correlated noise it is the scatter of single pixels.
+
+    image (Ny, Nx); mask (Ny, Nx): True = ignore; NaN and infinite pixels are ignored too
+    Raises ValueError for fewer than 32 pixels, and where more than half of them have one value.
+    """
+    image = np.asarray(image, dtype=np.float64)
+    good = np.isfinite(image)
+    if mask is not None:
+        good &= ~np.asarray(mask, dtype=bool)
+    values = image[good]
+    if values.size < MIN_PIXELS:
+        raise ValueError(f"{values.size} pixels are left to estimate the noise from, "
+                         f"{MIN_PIXELS} are needed")
+    sigma = np.median(np.abs(values - np.median(values))) / NormalDist().inv_cdf(0.75)
+    inside = math.erf(CLIP / math.sqrt(2))
+    quantile = NormalDist().inv_cdf(0.5 + inside / 4)
+    for _ in range(MAX_ROUNDS):
+        distance = np.abs(values - np.median(values))
+        kept = distance <= CLIP * sigma
+        sigma = np.median(distance[kept]) / quantile
+        if kept.all():
+            break
+        values = values[kept]
+    if not sigma > 0:
+        raise ValueError("more than half of the pixels have the same value: "
+                         "no noise can be estimated from them")
+    return float(sigma)
+
+
+def _numbers(name, values):
+    """A fresh float64 array."""
+    try:
+        return np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be an array of real numbers: {error}") from None
+
+
+def _channels(channels, name, n_channels):
+    if channels is None:
+        return tuple(f"{name or 'channel'}{i}" for i in range(n_channels))
+    channels = (channels,) if isinstance(channels, str) else tuple(channels)
+    if len(channels) != n_channels:
+        raise ValueError(f"channels has {len(channels)} names, data have {n_channels} channels")
+    if not all(isinstance(channel, str) and channel for channel in channels):
+        raise ValueError(f"channels must be names, not {channels}")
+    if len(set(channels)) < n_channels:
+        raise ValueError(f"channels must be unique, not {channels}")
+    return channels
+
+
+def _per_channel(name, values, n_channels):
+    values = _numbers(name, values)
+    if values.shape not in ((), (n_channels,)) or not np.isfinite(values).all():
+        raise ValueError(f"{name} must be one finite number or {n_channels}, one for each channel, "
+                         f"not {values}")
+    values = np.broadcast_to(values, n_channels).copy()
+    values.flags.writeable = False
+    return values
+
+
+def _spread(name, values, shape):
+    """Numbers given for each pixel, channel or all at once: (C, Ny, Nx)."""
+    if values.shape == shape[:1]:
+        return np.broadcast_to(values[:, None, None], shape)
+    if values.shape not in ((), shape[1:], shape):
+        raise ValueError(f"{name} has the shape {values.shape}, data {shape}")
+    return np.broadcast_to(values, shape)
+
+
+def _mask(mask, shape):
+    if mask is None:
+        return np.zeros(shape, dtype=bool)
+    values = np.asarray(mask)
+    if values.shape not in (shape[1:], shape):
+        raise ValueError(f"mask has the shape {values.shape}, data {shape}")
+    if values.dtype != bool and not np.isin(values, (0, 1)).all():
+        odd = values[~np.isin(values, (0, 1))].flat[0]
+        raise ValueError(f"mask must be True (ignore) or False, not {odd}: "
+                         "choose the bits that spoil a pixel")
+    return np.broadcast_to(values.astype(bool), shape)
+
+
+def _weights(weights, shape):
+    """Weights (C, Ny, Nx), and where they were NaN."""
+    weights = _spread("weights", _numbers("weights", weights), shape)
+    for wrong, what in ((weights < 0, "negative"), (np.isinf(weights), "infinite")):
+        if wrong.any():
+            raise ValueError(f"weights has {np.count_nonzero(wrong)} {what} values, the first at "
+                             f"(channel, y, x) = {tuple(np.argwhere(wrong)[0].tolist())}: "
+                             "a weight is an inverse variance, 0 to ignore a pixel")
+    lost = np.isnan(weights)
+    return np.where(lost, 0.0, weights), lost
+
+
+def _inverse(variance, shape):
+    """Weights (C, Ny, Nx) from variances, and where these were no variance."""
+    variance = _spread("variance", _numbers("variance", variance), shape)
+    good = variance >= np.finfo(np.float64).tiny  # the inverse of less may overflow
+    return np.divide(1.0, variance, out=np.zeros(shape), where=good), ~good
+
+
+def _estimated(data, ignored, channels):
+    """Weights (C, Ny, Nx) from each channel's own background, and what to tell about it."""
+    weights, messages = np.ones(data.shape), []
+    for i, channel in enumerate(channels):
+        if ignored[i].all():
+            continue  # no pixel of it will keep its weight
+        try:
+            sigma = noise_sigma(data[i], ignored[i])
+        except ValueError as error:
+            raise ValueError(f"channel {channel}: {error}; give weights or variance") from None
+        weights[i] = sigma**-2
+        messages.append(f"noise of channel {channel} estimated from the background: "
+                        f"sigma = {sigma:.4g} counts")
+    return weights, messages
