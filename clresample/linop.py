@@ -135,6 +135,9 @@ class Adjoint(LinOp):
         super().__init__(op.device, op.dtype, op.shape_out, op.shape_in)
         self.op = op
 
+    def _apply(self, *call):
+        return self.op._apply(*call)  # frames in tiles stay on the host this way round too
+
     def _forward(self, x, out):
         self.op._adjoint(x, out)
 
