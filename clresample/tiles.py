@@ -25,8 +25,13 @@ class TiledResampler(LinOp):
 
     A window is what the tile's pixels see: where they lie and the wrap radius around, falling
     smoothly to zero at its edge, zero beyond the model's. Windows start at whole pixels, so that
-    tiles with one Jacobian share an operator and differ in its shift. A distorted frame is affine in
-    tiles where tolerance_px allows.
+    tiles with one Jacobian share an operator and differ in its shift. A distorted frame is affine
+    tile by tile where tolerance_px allows.
+
+    Against one tile, images as sharp as the model's PSF agree to 2e-6 (5e-6 where the PSF samples
+    alias), which is what padding that single tile otherwise changes. White noise, sharper than the
+    PSF, agrees to 1e-6 from HST to HSC, 1e-4 from Euclid to Rubin, 6e-2 between rotated equal
+    pixels, whose sinc interpolation never ends.
 
     grid_in, psf_in, grid_out, psf_out, dtype, device, shift, tolerance_px: as in `Resampler`
     memory [bytes]: device memory to stay within; None = 1 GiB, or a quarter of what the device has
@@ -39,16 +44,34 @@ class TiledResampler(LinOp):
     small for the smallest tile.
     """
 
-    def __init__(self, grid_in: Grid, psf_in: PSF, grid_out: Grid, psf_out: PSF, *,
-                 dtype=np.float32, device=None, shift=(0.0, 0.0), tolerance_px=1e-4, memory=None,
-                 progress=True):
+    def __init__(
+        self,
+        grid_in: Grid,
+        psf_in: PSF,
+        grid_out: Grid,
+        psf_out: PSF,
+        *,
+        dtype=np.float32,
+        device=None,
+        shift=(0.0, 0.0),
+        tolerance_px=1e-4,
+        memory=None,
+        progress=True,
+    ):
         n_bands = max(psf_in.n_bands, psf_out.n_bands)
         super().__init__(device, dtype, (n_bands, *grid_in.shape), (n_bands, *grid_out.shape))
         self.memory = min(MEMORY, self.device.memory // 4) if memory is None else memory
         self.shift, self.progress = shift, progress
         self.psf_in, self.psf_out, self.precision = psf_in, psf_out, Precision.of(dtype)
-        self.groups = make_groups(grid_in, psf_in, grid_out, psf_out, precision=self.precision,
-                                  tolerance_px=tolerance_px, memory=self.memory)
+        self.groups = make_groups(
+            grid_in,
+            psf_in,
+            grid_out,
+            psf_out,
+            precision=self.precision,
+            tolerance_px=tolerance_px,
+            memory=self.memory,
+        )
         self._built = None, None
 
     @property
@@ -128,8 +151,13 @@ class TiledResampler(LinOp):
         Where pixels and PSF are the same the operator is None: the window is the tile.
         """
         # tqdm's None: a bar on a terminal only
-        with tqdm(total=self.n_tiles, unit="tile", desc="resampling", leave=False,
-                  disable=None if self.progress else True) as bar:
+        with tqdm(
+            total=self.n_tiles,
+            unit="tile",
+            desc="resampling",
+            leave=False,
+            disable=None if self.progress else True,
+        ) as bar:
             for group in self.groups:
                 for tile in group.tiles:
                     place = tile.place + self.shift

@@ -1,4 +1,4 @@
-"""Tiles of a frame: how large they should be, where they lie, and which of them share an operator."""
+"""Tiles of a frame: how large they should be, where they lie, which of them share an operator."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ TRIAL_PX = 32  # [observed px] side of the tile that shows which frequencies the
 # A window reaches half the wrap radius beyond its tile at full weight, then falls to zero over the
 # other half, or over TAPER_PX [model px]: cut sharply, an image rings through the tile.
 FLAT, TAPER_PX = 0.5, 24
-SIDES = np.unique(np.rint(8 * 2 ** (np.arange(45) / 4)).astype(int))  # [observed px] to choose from
-# What a tile costs besides its arithmetic, as the flops of that time: launches and the tables of its
-# shift (1 ms, where PoCL does 40 Gflop/s), and each pixel's way out of the frame and back (2 ns).
+# [observed px] sides to choose from, 8 to 16384
+SIDES = np.unique(np.rint(8 * 2 ** (np.arange(45) / 4)).astype(int))
+# What a tile costs besides its arithmetic, as the flops of that time: launches and the tables of
+# its shift (1 ms, where PoCL does 40 Gflop/s); each pixel's way out of the frame and back (2 ns).
 FLOPS_TILE, FLOPS_PIXEL = 4e7, 80
 
 
@@ -49,8 +50,16 @@ class Group:
     tiles: list[Tile]
 
 
-def make_groups(grid_in: Grid, psf_in: PSF, grid_out: Grid, psf_out: PSF, *, precision: Precision,
-                tolerance_px: float, memory: int) -> list[Group]:
+def make_groups(
+    grid_in: Grid,
+    psf_in: PSF,
+    grid_out: Grid,
+    psf_out: PSF,
+    *,
+    precision: Precision,
+    tolerance_px: float,
+    memory: int,
+) -> list[Group]:
     """Tiles that give every observed pixel on the model once, in groups that share an operator.
 
     grid_in, psf_in: the model's; grid_out, psf_out: the observation's
@@ -78,10 +87,13 @@ def make_groups(grid_in: Grid, psf_in: PSF, grid_out: Grid, psf_out: PSF, *, pre
     groups = []
     for start, mapping, mask in tiles:
         group, place = _find(groups, mapping, margin, margin - radius * FLAT, tolerance_px)
-        group.tiles.append(Tile((int(corner[0] + start[0]), int(corner[1] + start[1])), place, mask))
+        origin = tuple(int(a + b) for a, b in zip(corner, start, strict=True))
+        group.tiles.append(Tile(origin, place, mask))
     if not groups:
-        raise ValueError(f"grids do not overlap: no pixel of the observation {grid_out.shape} lies "
-                         f"on the model {grid_in.shape}")
+        raise ValueError(
+            f"grids do not overlap: no pixel of the observation {grid_out.shape} lies on the model "
+            f"{grid_in.shape}"
+        )
     return groups
 
 
@@ -101,10 +113,11 @@ class Sizes:
         self.border = 2 * int(margin.max()) + 2
         self.pad = max(k - n for k, n in zip(n_fft, window.shape_in, strict=True))
         # the band's edge, known to one frequency of the small plan
-        self.band = max((h + 1) / k for h, k in zip(plan.report["n_frequencies"], n_fft, strict=True))
+        n_frequencies = plan.report["n_frequencies"]
+        self.band = max((h + 1) / k for h, k in zip(n_frequencies, n_fft, strict=True))
         self.columns, self.taps, self.taps_back = 0.0, 0, 0
         if kind == "affine":
-            self.taps, self.taps_back = (w.shape[1] for w in (plan.lines.weight, plan.lines.weight_t))
+            self.taps, self.taps_back = plan.lines.weight.shape[1], plan.lines.weight_t.shape[1]
             reach = np.abs(trial.matrix) @ np.subtract(trial.shape_out, 1)
             self.columns = (plan.out_x.shape[1] - self.taps) / max(reach.min(), 1)
 
@@ -122,7 +135,8 @@ class Sizes:
         elif kind == "affine":
             j = int(self.columns * self.scale * m) + self.taps + 16
             flops += k * k * j + m * k * j + m * m * self.taps
-            tables += 2 * m * k + 4 * j * wide + m * (m * (self.taps + 1) + j * (self.taps_back + 2))
+            tables += 2 * m * k + 4 * j * wide
+            tables += m * (m * (self.taps + 1) + j * (self.taps_back + 2))
             spectra += (k + m) * j
         else:
             flops += m * m * k * (k + 1)
@@ -144,8 +158,9 @@ class Sizes:
             if best is None or counts[0] * counts[1] * time < best[0]:
                 best = counts[0] * counts[1] * time, tile
         if best is None:
-            raise ValueError(f"memory is {memory} bytes, but tiles of {max(tile)} pixels a side "
-                             f"need {n_bytes}")
+            raise ValueError(
+                f"memory is {memory} bytes, but tiles of {max(tile)} pixels a side need {n_bytes}"
+            )
         return best[1]
 
 
@@ -162,7 +177,7 @@ def window_of(mapping: Mapping, margin) -> Mapping:
 
 
 def _lay(region, grid_in, shape, kind, tolerance_px):
-    """Kind of the tiles of a region; unless it is worse than `kind`: their starts, mappings, masks."""
+    """Kind of a region's tiles; unless it is worse than `kind`: their starts, mappings, masks."""
     tiles = []
     for first in product(*(range(0, n, m) for n, m in zip(region.shape, shape, strict=True))):
         # the last tiles of a row or column overlap those before
@@ -204,7 +219,7 @@ def _find(groups, mapping, margin, width, tolerance_px):
 
 
 def _taper(shape, width):
-    """Weights along each axis: 1 inside, down to 0 over `width` (2,) [px] with three smooth slopes."""
+    """Weights along each axis: 1 inside, down to 0 over `width` (2,) [px], smooth to order 3."""
     tapers = []
     for n, w in zip(shape, width, strict=True):
         u = np.minimum((np.minimum(np.arange(n), np.arange(n)[::-1]) + 0.5) / w, 1)

@@ -177,22 +177,24 @@ def test_slight_distortion_is_affine_tile_by_tile():
 
 
 def test_strong_distortion_is_followed_pixel_by_pixel():
-    """Each tile takes the PSF at its own scale and angle: it is what the operator of a cutout gives."""
+    """Each tile takes the PSF at its own scale and angle, as the operator of a cutout does."""
     one, two = NOTEBOOK_SURVEYS["EUCLID"], NOTEBOOK_SURVEYS["RUBIN"]
     grid_in = tan(one.pixel_scale_arcsec, (300, 290))
     grid_out = tan(two.pixel_scale_arcsec, (150, 160), angle_deg=3, sip=3e-5)
     x = field(grid_in, one.psf(), np.random.default_rng(7))
-    tiled = TiledResampler(grid_in, one.psf(), grid_out, two.psf(), dtype=np.float64,
-                           memory=2 * SMALL)
+    tiled = TiledResampler(
+        grid_in, one.psf(), grid_out, two.psf(), dtype=np.float64, memory=2 * SMALL
+    )
     assert tiled.kind == "distorted" and tiled.n_tiles > 3
     result = tiled(x)
     for group in tiled.groups[:3]:
         (y0, x0), shape = group.tiles[0].origin, tiled.tile_shape
         cutout = grid_out.cutout(y0, x0, shape)
         part = Resampler(grid_in, one.psf(), cutout, two.psf(), dtype=np.float64)
-        np.testing.assert_array_equal(tiled.covered[y0:y0 + shape[0], x0:x0 + shape[1]],
-                                      part.covered)
-        error = result[:, y0:y0 + shape[0], x0:x0 + shape[1]] - part(x)
+        np.testing.assert_array_equal(
+            tiled.covered[y0 : y0 + shape[0], x0 : x0 + shape[1]], part.covered
+        )
+        error = result[:, y0 : y0 + shape[0], x0 : x0 + shape[1]] - part(x)
         assert np.linalg.norm(error) < 5e-6 * np.linalg.norm(result)
 
 
