@@ -46,8 +46,9 @@ class Observation:
     out too small and flux errors too optimistic.
 
     Read back: data and weights (C, Ny, Nx) float64, psf of C bands, grid, channels, zero_points
-    (C,) or None, name, n_bad = number of pixels whose weight became 0 because their data were NaN
-    or infinite or their weight or variance was no number, messages = what the user should know.
+    (C,) or None, name, n_bad = number of unmasked pixels whose weight became 0 because their data
+    were NaN or infinite, their weight NaN, or their variance NaN or not positive, messages = what
+    the user should know.
 
     Raises ValueError for shapes that disagree, negative or infinite weights, masks that are not
     made of 0 and 1, channel names that are not unique, both weights and variance, and where the
@@ -98,8 +99,8 @@ class Observation:
         n_bad = int(np.count_nonzero(~masked & (no_weight | (bad & (weights > 0)))))
         weights = np.where(bad | masked, 0.0, weights)
         if n_bad:
-            what = "NaN or infinite pixel" if variance is None else "pixel without data or variance"
-            messages.append(f"{n_bad} {what}{'s have' if n_bad > 1 else ' has'} weight 0")
+            messages.append(f"{n_bad} of {data.size} pixels have weight 0: no usable data, "
+                            "weight or variance")
         messages += [f"channel {channel} has no pixel with a weight"
                      for channel, seen in zip(channels, weights.any(axis=(1, 2)), strict=True)
                      if not seen]

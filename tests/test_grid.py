@@ -11,6 +11,7 @@ from headers import (
     OBSERVED,
     RA,
     SCALE,
+    SIP,
     cd_header,
     grid_of,
     header,
@@ -140,3 +141,28 @@ def test_what_is_no_grid():
     thin = Grid((4, 4), None, np.array([[1.0, 1.0], [1.0, 1.0 + 1e-14]]), np.zeros(2))
     with pytest.raises(ValueError, match="singular"):
         thin.map_to(Grid.flat((4, 4), 1.0))
+
+
+@pytest.mark.parametrize("case", [name for name, _ in observed_headers()] + ["tables"])
+def test_pixel_undoes_sky(case):
+    wcs = with_tables() if case == "tables" else WCS(dict(observed_headers())[case])
+    grid = Grid.from_wcs(wcs, OBSERVED)
+    n, m = np.meshgrid([-3.0, 0.0, 17.3, 36.0], [-0.5, 20.75, 50.0], indexing="ij")
+    back = grid.pixel(*grid.sky(n, m))
+    assert back.shape == (4, 3, 2)
+    np.testing.assert_allclose(back, np.stack([n, m], axis=-1), atol=1e-7)
+    # right ascension first, whatever the order of the header's axes
+    if case not in ("tables", "SIP", "TPV"):
+        np.testing.assert_allclose(grid.pixel(RA, DEC), (18, 21.5), atol=1e-7)
+
+
+def test_pixel_of_a_flat_grid_and_of_no_place():
+    grid = Grid.flat((4, 7), (0.5, 0.3), angle_deg=30, flip=True, center_arcsec=(1.0, -2.0))
+    np.testing.assert_allclose(grid.pixel(1.0, -2.0), (1.5, 3.0), atol=1e-14)
+    sky = np.random.default_rng(2).normal(size=(2, 5))
+    np.testing.assert_allclose(grid.sky(*grid.pixel(*sky).T), sky, atol=1e-14)
+    for ctype in ("TAN", "SIN", "TAN-SIP"):
+        cards = header(MODEL, ctype=ctype, **(SIP if ctype == "TAN-SIP" else {}))
+        pixels = grid_of(cards, MODEL).pixel([RA, RA + 180, np.nan], [DEC, -DEC, 0.0])
+        np.testing.assert_allclose(pixels[0], (44.5, 54.5), atol=1e-6)
+        assert np.isnan(pixels[1:]).all()
