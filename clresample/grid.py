@@ -113,11 +113,7 @@ class Grid:
         if self.wcs is None:
             inverse = np.linalg.inv(self.jacobian)
             return (np.stack([a, b], axis=-1) - self.origin) @ inverse.T
-        result = np.full(a.shape + (2,), np.nan)
-        good = np.isfinite(a) & np.isfinite(b)
-        if good.any():
-            result[good] = _pixels(self.wcs, a[good], b[good])
-        return result
+        return _pixels(self.wcs, a.ravel(), b.ravel()).reshape(a.shape + (2,))
 
     def map_to(self, grid_in, tolerance_px=1e-4):
         """Mapping of this grid's pixels into those of `grid_in`: X = A p + t, or one by one.
@@ -239,7 +235,7 @@ def _positions(grid_from, grid_to, n, m):
 
 
 def _pixels(wcs, lon, lat):
-    """Pixels (L, 2), (y, x), at the finite points lon, lat (L,) [deg]; NaN where there is none."""
+    """Pixels (L, 2), (y, x), at the points lon, lat (L,) [deg]; NaN where there is none."""
     world = np.stack([lon, lat] if wcs.wcs.lng < wcs.wcs.lat else [lat, lon], axis=-1)
     try:
         pixels = wcs.all_world2pix(

@@ -192,9 +192,9 @@ def noise_sigma(image, mask=None) -> float:
 
 
 def _numbers(name, values):
-    """A fresh float64 array."""
+    """As float64."""
     try:
-        return np.array(values, dtype=np.float64)
+        return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be an array of real numbers: {error}") from None
 

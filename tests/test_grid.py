@@ -163,6 +163,9 @@ def test_pixel_of_a_flat_grid_and_of_no_place():
     np.testing.assert_allclose(grid.sky(*grid.pixel(*sky).T), sky, atol=1e-14)
     for ctype in ("TAN", "SIN", "TAN-SIP"):
         cards = header(MODEL, ctype=ctype, **(SIP if ctype == "TAN-SIP" else {}))
-        pixels = grid_of(cards, MODEL).pixel([RA, RA + 180, np.nan], [DEC, -DEC, 0.0])
+        pixels = grid_of(cards, MODEL).pixel([RA, RA + 180, np.nan, 0], [DEC, -DEC, 0, np.inf])
         np.testing.assert_allclose(pixels[0], (44.5, 54.5), atol=1e-6)
         assert np.isnan(pixels[1:]).all()
+    # so far from the image, the polynomials of SIP have no inverse (the last grid's)
+    assert np.isnan(grid_of(cards, MODEL).pixel(RA, [DEC, DEC + 60])[1]).all()
+    assert grid_of(cards, MODEL).pixel([], []).shape == (0, 2)
