@@ -162,7 +162,8 @@ def noise_sigma(image, mask=None) -> float:
 
     with q = 0.672 the same quantity of a unit Gaussian cut at 3 sigma. Unbiased for white noise;
     too large by 2 % where faint wings of sources fill 3 % of the pixels, by a third where they fill
-    half, by 30 to 50 % on a 48 x 58 cutout of a real blend: there, better give the noise. Of correlated noise it is the scatter of single pixels.
+    half, by 30 to 50 % on a 48 x 58 cutout of a real blend: there, better give the noise.
+    Of correlated noise it is the scatter of single pixels.
 
     image (Ny, Nx); mask (Ny, Nx): True = ignore; NaN and infinite pixels are ignored too
     Raises ValueError for fewer than 32 pixels, and where more than half of them have one value.
