@@ -1,0 +1,91 @@
+"""Where an observation's pixels lie in the model frame, and which part of the frame was seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import ndimage
+
+from .mapping import Mapping
+from .observation import Observation
+
+# rounds of p <- p + A^-1 (X - X(p)) for a distorted mapping: each multiplies the error by the
+# distortion's relative change over it, 1e-2 at most in real instruments
+INVERSE_ROUNDS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Footprint:
+    """One observation's pixels in the model frame: X(p) = A p + t + shift.
+
+    observation: what was seen; mapping: of its grid to the frame's; shift (2,) [model px]
+    """
+
+    observation: Observation
+    mapping: Mapping
+    shift: np.ndarray
+
+    @classmethod
+    def of(cls, result, i_observation):
+        """Footprint of one observation of a fitted blend, at its fitted shift."""
+        observation = result.observations[i_observation]
+        mapping = observation.grid.map_to(result.frame.grid)
+        return cls(observation, mapping, np.asarray(result.shifts[i_observation], np.float64))
+
+    @cached_property
+    def used(self) -> np.ndarray:
+        """Pixels (C, My, Mx) that a fit looks at: those with a weight, on the frame."""
+        return (self.observation.weights > 0) & self.mapping.covered
+
+    @cached_property
+    def positions(self) -> np.ndarray:
+        """Centres (My, Mx, 2) [model px] of all pixels: (y, x)."""
+        n, m = np.indices(self.mapping.shape_out)
+        return self.mapping.at(n, m) + self.shift
+
+    def locate(self, points) -> np.ndarray:
+        """Points (..., 2) [model px] in observed pixels (n, m): the inverse of X(p)."""
+        points = np.asarray(points, dtype=np.float64) - self.shift
+        inverse = np.linalg.inv(self.mapping.matrix)
+        pixels = (points - self.mapping.offset) @ inverse.T
+        if self.mapping.kind == "distorted":
+            top = np.array(self.mapping.shape_out) - 1
+            for _ in range(INVERSE_ROUNDS):
+                near = np.clip(np.rint(np.nan_to_num(pixels)), 0, top).astype(int)
+                pixels = near + (points - self.mapping.at(near[..., 0], near[..., 1])) @ inverse.T
+        return pixels
+
+    def holds(self, points) -> np.ndarray:
+        """Which points (..., 2) [model px] lie on a pixel of the image, weighted or not: (...)."""
+        return self._look(points)[0]
+
+    def weighted(self, points) -> np.ndarray:
+        """At which points (..., 2) [model px] the pixel has a weight: (C, ...) bool."""
+        held, (n, m) = self._look(points)
+        return held & (self.observation.weights > 0)[:, n, m]
+
+    def _look(self, points):
+        pixels = np.floor(np.nan_to_num(self.locate(points), nan=-1.0) + 0.5)
+        top = np.array(self.mapping.shape_out) - 1
+        held = ((pixels >= 0) & (pixels <= top)).all(axis=-1)
+        return held, np.moveaxis(np.clip(pixels, 0, top).astype(int), -1, 0)
+
+
+def open_edge(footprints, shape) -> np.ndarray:
+    """Pixels of the frame from which light may leave what was observed: (Ny, Nx) bool.
+
+    Those on the frame's edge, those without a weight in any channel that are connected to the edge
+    through others of the kind, and the neighbours of these. Masked pixels within an image, single
+    or in patches, are no edge.
+    """
+    points = np.stack(np.indices(shape), axis=-1)
+    seen = np.zeros(shape, dtype=bool)
+    for footprint in footprints:
+        seen |= footprint.weighted(points).any(axis=0)
+    blind = np.pad(~seen, 1, constant_values=True)
+    ring = np.pad(np.zeros(shape, dtype=bool), 1, constant_values=True)
+    neighbours = np.ones((3, 3), dtype=bool)
+    beyond = ndimage.binary_propagation(ring, neighbours, mask=blind)
+    return ndimage.binary_dilation(beyond, neighbours)[1:-1, 1:-1]
