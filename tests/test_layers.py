@@ -18,6 +18,8 @@ LAYERS = [
         "sources",
         "frame",
         "result",
+        "shapes",
+        "footprint",
         "boxes",
         "solve",
         "surveys",
@@ -27,10 +29,10 @@ LAYERS = [
         "reference_prox",
     },
     {"discover", "device"},
-    {"contract", "linop", "paths", "testing"},
+    {"contract", "factors", "linop", "paths", "sincs", "testing"},
     {"resample", "split", "scene", "prox", "tiles"},
     {"initialize", "engine", "deblend", "measure"},
-    {"io", "simulate", "plot", "demo", "cli", "cli_options", "cli_resample"},
+    {"io", "store", "simulate", "plot", "demo", "cli", "cli_options", "cli_resample"},
 ]
 RANKS = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 MODULES = sorted((ROOT / "clresample").glob("*.py"))
