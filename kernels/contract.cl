@@ -2,10 +2,10 @@
  *
  *   C[b] = A[b] . B[b]                      A (m, k), B (k, n), C (m, n), row-major
  *
- * One work-item owns an MR x VW tile of C in registers: B is read as aligned VW-wide vectors, A as
- * scalars that broadcast.  No local memory, no barrier, no builtin.
+ * One work-item owns a tile of C in registers, MR rows x NV vectors of VW columns: B is read as
+ * aligned vectors, A as scalars that broadcast.  No local memory, no barrier, no builtin.
  *
- * Layout: n_pad = n rounded up to VW.  B always has ld n_pad with zeros in the padding; so has C,
+ * Layout: n_pad = n rounded up to VW; a tile that reaches beyond works on its first vector again.  B always has ld n_pad with zeros in the padding; so has C,
  *   unless RAGGED, when C is a caller's array: element (i, j) at i * ldc + j * step_c, any alignment.
  *   A is any array: element (i, l) at i * lda + l, or at i * lda + l * step_a if STRIDED, so that it
  *   may be read transposed.
@@ -24,12 +24,15 @@
  *          SIGN -1 turns the other way: the adjoint.
  *   E of item b starts at (b / n_bands) * stride_e + (b % n_bands) * band_e.
  *
- * Launch: global = (n_pad / VW, ceil(m / MR), batch), each rounded up to its local size.
+ * Launch: global = (ceil(n_pad / (NV VW)), ceil(m / MR), batch), each rounded up to its local size.
  */
 #include "common.h"
 
-#ifndef VW          /* columns a work-item owns: one vector */
+#ifndef VW          /* columns of a vector */
 #define VW 16
+#endif
+#ifndef NV          /* vectors a work-item owns in each row */
+#define NV 1
 #endif
 #ifndef MR          /* rows a work-item owns; even, so that (cos, sin) pairs stay together */
 #define MR 6
@@ -70,6 +73,7 @@
 #endif
 
 #define AT(type, p) (*(__global type *)(p))
+#define UNROLL(i, n) _Pragma("unroll") for (int i = 0; i < (n); ++i)
 
 __kernel __attribute__((reqd_work_group_size(WGX, WGY, 1)))
 void contract(const int m, const int n, const int n_pad, const int k, const int block,
@@ -81,76 +85,71 @@ void contract(const int m, const int n, const int n_pad, const int k, const int 
               __global const REAL *restrict E, const int stride_e, const int band_e,
               const int n_bands)
 {
-    const int j0 = (int)get_global_id(0) * VW;
+    const int j0 = (int)get_global_id(0) * NV * VW;
     const int i0 = (int)get_global_id(1) * MR;
     const int b = (int)get_global_id(2);
     if (j0 >= n_pad || i0 >= m) return;
     A += offset_a + (size_t)(b / div_a) * stride_a;
-    B += (size_t)(b / div_b) * stride_b + j0;
+    B += (size_t)(b / div_b) * stride_b;
+    C += offset_c + (size_t)b * stride_c;
 
     __global const REAL *row[MR];
-    WIDE acc[MR];
-#pragma unroll
-    for (int i = 0; i < MR; ++i) {
-        row[i] = A + (size_t)(i0 + i < m ? i0 + i : m - 1) * lda;
-        acc[i] = (WIDE)(0);
-    }
+    int column[NV];
+    WIDE acc[MR][NV];
+    UNROLL(v, NV) column[v] = j0 + v * VW < n_pad ? j0 + v * VW : j0;
+    UNROLL(i, MR) row[i] = A + (size_t)(i0 + i < m ? i0 + i : m - 1) * lda;
+    UNROLL(i, MR) UNROLL(v, NV) acc[i][v] = (WIDE)(0);
     for (int l0 = 0; l0 < k; l0 += block) {
         const int l1 = l0 + block < k ? l0 + block : k;
-        WIDE part[MR];
-#pragma unroll
-        for (int i = 0; i < MR; ++i) part[i] = (WIDE)(0);
+        WIDE part[MR][NV], right[NV];
+        UNROLL(i, MR) UNROLL(v, NV) part[i][v] = (WIDE)(0);
         for (int l = l0; l < l1; ++l) {
-            const WIDE v = AT(const WIDE, B + (size_t)l * n_pad);
-#pragma unroll
-            for (int i = 0; i < MR; ++i) part[i] += row[i][l * STEP_A] * v;
+            UNROLL(v, NV) right[v] = AT(const WIDE, B + (size_t)l * n_pad + column[v]);
+            UNROLL(i, MR) UNROLL(v, NV) part[i][v] += row[i][l * STEP_A] * right[v];
         }
-#pragma unroll
-        for (int i = 0; i < MR; ++i) acc[i] += part[i];
+        UNROLL(i, MR) UNROLL(v, NV) acc[i][v] += part[i][v];
     }
 
 #if defined(MIX)
-    E += (size_t)(b / n_bands) * stride_e + (size_t)(b % n_bands) * band_e + j0 / 2;
-#pragma unroll
-    for (int i = 0; i < MR; i += 2) {
+    E += (size_t)(b / n_bands) * stride_e + (size_t)(b % n_bands) * band_e;
+    UNROLL(h, MR / 2) UNROLL(v, NV) {
+        const int i = 2 * h;
         if (i0 + i >= m) break;
-        const WIDE c = acc[i], s = acc[i + 1];
-        __global const REAL *d = E + (size_t)((i0 + i) / 2) * 2 * n_pad;
+        const WIDE c = acc[i][v], s = acc[i + 1][v];
+        __global const REAL *d = E + (size_t)(i0 / 2 + h) * 2 * n_pad + column[v] / 2;
         const HALF pr = AT(const HALF, d), pi = SIGN * AT(const HALF, d + n_pad / 2);
         const HALF mr = AT(const HALF, d + n_pad), mi = SIGN * AT(const HALF, d + n_pad / 2 * 3);
         const HALF fpr = EVEN(c) - ODD(s), fpi = -(ODD(c) + EVEN(s));   /* F(+nu_y, +nu_x) */
         const HALF fmr = EVEN(c) + ODD(s), fmi = ODD(c) - EVEN(s);      /* F(+nu_y, -nu_x) */
         const HALF gpr = pr * fpr - pi * fpi, gpi = pr * fpi + pi * fpr;
         const HALF gmr = mr * fmr - mi * fmi, gmi = mr * fmi + mi * fmr;
-        EVEN(acc[i]) = gpr + gmr;
-        ODD(acc[i]) = gmi - gpi;
-        EVEN(acc[i + 1]) = -(gpi + gmi);
-        ODD(acc[i + 1]) = gmr - gpr;
+        EVEN(acc[i][v]) = gpr + gmr;
+        ODD(acc[i][v]) = gmi - gpi;
+        EVEN(acc[i + 1][v]) = -(gpi + gmi);
+        ODD(acc[i + 1][v]) = gmr - gpr;
     }
 #elif defined(TWIST)
-    E += (size_t)(b / n_bands) * stride_e + j0;
-#pragma unroll
-    for (int i = 0; i < MR; i += 2) {
+    E += (size_t)(b / n_bands) * stride_e;
+    UNROLL(h, MR / 2) UNROLL(v, NV) {
+        const int i = 2 * h;
         if (i0 + i >= m) break;
-        const WIDE c = acc[i], s = acc[i + 1];
-        __global const REAL *t = E + (size_t)((i0 + i) / 2) * 2 * n_pad;
+        const WIDE c = acc[i][v], s = acc[i + 1][v];
+        __global const REAL *t = E + (size_t)(i0 / 2 + h) * 2 * n_pad + column[v];
         const WIDE cos_t = AT(const WIDE, t), sin_t = SIGN * AT(const WIDE, t + n_pad);
-        acc[i] = c * cos_t + s * sin_t;
-        acc[i + 1] = s * cos_t - c * sin_t;
+        acc[i][v] = c * cos_t + s * sin_t;
+        acc[i + 1][v] = s * cos_t - c * sin_t;
     }
 #endif
 
-    C += offset_c + (size_t)b * stride_c;
-#pragma unroll
-    for (int i = 0; i < MR; ++i) {
+    UNROLL(i, MR) UNROLL(v, NV) {
         if (i0 + i >= m) break;
 #ifdef RAGGED
-        __global REAL *c = C + (size_t)(i0 + i) * ldc + (size_t)j0 * step_c;
-        const REAL *lane = (const REAL *)&acc[i];
+        __global REAL *c = C + (size_t)(i0 + i) * ldc + (size_t)column[v] * step_c;
+        const REAL *lane = (const REAL *)&acc[i][v];
         for (int j = 0; j < VW; ++j)
-            if (j0 + j < n) c[(size_t)j * step_c] = lane[j];
+            if (column[v] + j < n) c[(size_t)j * step_c] = lane[j];
 #else
-        AT(WIDE, C + (size_t)(i0 + i) * ldc + j0) = acc[i];
+        AT(WIDE, C + (size_t)(i0 + i) * ldc + column[v]) = acc[i][v];
 #endif
     }
 }
