@@ -1,0 +1,353 @@
+"""Joint deblending: one scene fitted to every instrument's images at once, one blend or thousands."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .device import DeviceError, get_device
+from .engine import Engine, Prior, Problem, Rates
+from .frame import Frame, model_frame
+from .initialize import View, box_around, solve_spectra, start
+from .observation import Observation, check_observations
+from .operators import operator
+from .prox import Chain, Positivity
+from .result import Component, Result
+from .sources import Extended, Point, Source
+
+# The stopping rule looks at this many iterations; so often losses come back from the device.
+CHECK = 5
+# Iterations before a fit may stop: AMSGrad's first steps are all of one length.
+AT_LEAST = 20
+# A loss this many times the best one, or NaN, is a divergence.
+DIVERGED = 10.0
+# A batch is repacked when this part of it has converged.
+REPACK = 0.25
+# Ragged batches: frames and observations are padded to multiples of this [px].
+PAD_PX = 16
+# Spectrum steps come in units of the flux's error plus this part of the flux.
+SPECTRUM_PART = 0.02
+# Device memory of one group of scenes [bytes], unless told otherwise.
+MEMORY = 1 << 30
+# Scenes fitted side by side: enough to hide the launches, few enough for a CPU's cache.
+SCENES = {"CPU": 32}
+SCENES_ELSEWHERE = 1024
+
+
+@dataclass(frozen=True)
+class Blend:
+    """One patch of sky: what was seen, and what is there.
+
+    observations: at least one Observation; sources: Point and Extended
+    frame: the model's Frame; None = `model_frame` of the observations
+    """
+
+    observations: tuple[Observation, ...]
+    sources: tuple[Source, ...]
+    frame: Frame | None = None
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A blend of a batch that could not be fitted; `status` says why."""
+
+    blend: Blend
+    status: str
+
+    converged = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How a fit goes.
+
+    max_iter: most iterations; tol: a fit ends when the loss falls by less than this part of itself
+        over 5 iterations
+    prior: the Prior of extended sources' morphologies about their smooth profiles; None fits the
+        morphologies themselves, by the constraints alone
+    constraints: Chain of proximal operators on the morphologies
+    rates: the solver's steps
+    fit_shifts: let each observation but the first move by a constant shift
+    fit_sky: fit a constant per channel
+    """
+
+    max_iter: int = 100
+    tol: float = 1e-4
+    prior: Prior | None = Prior()
+    constraints: Chain = field(default_factory=lambda: Chain(Positivity()))
+    rates: Rates = Rates()
+    fit_shifts: bool = False
+    fit_sky: bool = False
+
+    def __post_init__(self):
+        if self.max_iter < 0:
+            raise ValueError(f"max_iter is {self.max_iter}, must be 0 or more")
+        if not 0 <= self.tol < 1:
+            raise ValueError(f"tol is {self.tol}, must be at least 0 and under 1")
+
+
+def deblend(observations, sources, *, frame=None, settings=None, device=None,
+            dtype=np.float32) -> Result:
+    """Fit one scene to all observations at once.
+
+        min 1/2 sum_o |sqrt(w_o) (R_o sum_s A_s S_s - d_o)|^2 + 1/2 |z|^2,   A >= 0, S in constraints
+
+    observations, sources, frame: see Blend; settings: see Settings
+    raises ValueError for what `check_observations`, `model_frame` and `Source` refuse, and when no
+    source lies inside the frame. Ctrl-C ends the fit with the best state so far.
+    """
+    blend = Blend(tuple(observations), tuple(sources), frame)
+    settings = settings or Settings()
+    device = get_device(device)
+    fit = _Fit(blend, settings, device, dtype, pad=1)
+    (done,) = _iterate([fit], settings, device, dtype)
+    return done.result()
+
+
+def deblend_many(blends, *, settings=None, device=None, dtype=np.float32, memory=MEMORY,
+                 progress=None) -> list[Result | Failure]:
+    """Fit many blends side by side; each comes out as if it were fitted alone, to float accuracy.
+
+    blends: Blend, with sizes, sources, PSFs, WCS and instruments of their own
+    memory [bytes]: of the device for one group of scenes
+    progress: called with the number of blends done after each group
+    returns a Result for each blend, in their order, or a Failure: it does not harm the others
+    """
+    settings, device = settings or Settings(), get_device(device)
+    blends = list(blends)
+    out: list[Result | Failure | None] = [None] * len(blends)
+    pad = PAD_PX if len({_sizes(b) for b in blends}) > 1 else 1
+    limit = SCENES.get(device.kind, SCENES_ELSEWHERE)
+    waiting = defaultdict(list)
+    n_done = 0
+
+    def run(group):
+        nonlocal n_done
+        for (i, _), done in zip(group, _try(group, settings, device, dtype), strict=True):
+            out[i] = done
+        n_done += len(group)
+        if progress is not None:
+            progress(n_done)
+
+    for i, blend in enumerate(blends):
+        try:
+            fit = _Fit(blend, settings, device, dtype, pad=pad)
+        except (ValueError, DeviceError, np.linalg.LinAlgError) as error:
+            out[i] = Failure(blend, f"failed: {error}")
+            n_done += 1
+            continue
+        group = waiting[fit.problem.signature]
+        group.append((i, fit))
+        if len(group) >= limit or sum(f.bytes for _, f in group) + fit.bytes > memory:
+            run(waiting.pop(fit.problem.signature))
+    for group in waiting.values():
+        run(group)
+    return out
+
+
+def _try(group, settings, device, dtype):
+    """Results of a group of fits; where the device refuses all at once, one by one."""
+    try:
+        return [fit.result() for fit in _iterate([f for _, f in group], settings, device, dtype)]
+    except DeviceError as error:
+        if len(group) == 1:
+            return [Failure(group[0][1].blend, f"failed: {error}")]
+        return [done for item in group for done in _try([item], settings, device, dtype)]
+
+
+def _sizes(blend):
+    return tuple(o.data.shape for o in blend.observations), blend.frame and blend.frame.shape
+
+
+class _Fit:
+    """One blend on its way from data to result."""
+
+    def __init__(self, blend, settings, device, dtype, *, pad):
+        began = time.perf_counter()
+        self.blend, self.settings = blend, settings
+        check_observations(blend.observations)
+        self.frame = blend.frame or model_frame(blend.observations)
+        positions = self.frame.place(blend.sources)
+        inside = self.frame.inside(positions)
+        self.messages = [f"source {i} at {p} [px] lies outside the model frame {self.frame.shape}"
+                         for i, p in enumerate(positions) if not inside[i]]
+        self.fitted = np.flatnonzero(inside)
+        if not len(self.fitted):
+            raise ValueError(f"none of the {len(positions)} sources lies inside the model frame "
+                             f"{self.frame.shape}")
+        self.padded = _padded_frame(self.frame, pad)
+        self.views, self.units = [], []
+        for o in blend.observations:
+            view, unit = _view(self.padded, o, pad, device, dtype, private=settings.fit_shifts)
+            self.views.append(view)
+            self.units.append(unit)
+        self.unit = np.concatenate(self.units)
+        self.losses, self.status = [], "iteration limit"
+        sources = [blend.sources[i] for i in self.fitted]
+        self.start = start(self.padded, sources, positions[inside], self.views,
+                           fit_shifts=settings.fit_shifts, fit_sky=settings.fit_sky)
+        self.start.base[:, self.frame.shape[0] :] = 0
+        self.start.base[:, :, self.frame.shape[1] :] = 0
+        self.problem = self._problem(sources)
+        self.seconds = {"setup": time.perf_counter() - began}
+
+    def _problem(self, sources):
+        begin, views = self.start, self.views
+        peak = begin.base.max(axis=(1, 2), keepdims=True)
+        base = begin.base / np.where(peak > 0, peak, 1)
+        spectra = begin.spectra * peak[:, 0]
+        units = [v.render(base) for v in views]
+        noise = 1 / np.sqrt(np.maximum(
+            np.concatenate([(u**2).sum(axis=2) for u in units], axis=1), 1e-30))
+        origin, center, morphs = [], [], []
+        for i, image in enumerate(base):
+            brightness = (spectra[i] / _pixel_noise(views)).max()
+            low, size, middle = box_around(image, begin.positions[begin.source[i]], brightness)
+            origin.append(low)
+            center.append(middle)
+            morphs.append(image[low[0] : low[0] + size[0], low[1] : low[1] + size[1]].copy())
+        seen = noise < 1e14
+        return Problem(
+            shape=self.padded.shape,
+            ops=[v.op for v in views],
+            data=[v.data for v in views],
+            weights=[v.root**2 for v in views],
+            origin=np.array(origin), center=np.array(center), base=morphs,
+            field=[np.zeros_like(m) for m in morphs], morph=[m.copy() for m in morphs],
+            fixed=np.array([isinstance(sources[i], Point) for i in begin.source]),
+            spectra=spectra, scale=np.where(seen, noise + SPECTRUM_PART * spectra, 0),
+            sky=begin.sky, fit_sky=self.settings.fit_sky,
+        )
+
+    @property
+    def bytes(self):
+        """Device memory of the scene in a batch, roughly."""
+        pixels = sum(2 * np.prod(o.shape_in) + 4 * np.prod(o.shape_out) for o in self.problem.ops)
+        return int(8 * (pixels + 12 * sum(m.size for m in self.problem.morph)))
+
+    def result(self) -> Result:
+        """Everything back in the data's own units, spectra solved for the final morphologies."""
+        began, p, n = time.perf_counter(), self.problem, len(self.problem.spectra)
+        morphs = np.zeros((n, *p.shape))
+        for full, (y, x), m in zip(morphs, p.origin, p.morph, strict=True):
+            peak = m.max() if m.max() > 0 else 1.0
+            full[y : y + m.shape[0], x : x + m.shape[1]] = m / peak
+        units = [v.render(morphs) for v in self.views]
+        spectra, sky, covariance = solve_spectra(units, self.views, self.settings.fit_sky)
+        components = []
+        for i, ((y, x), m) in enumerate(zip(p.origin, p.morph, strict=True)):
+            part = morphs[i, y : y + m.shape[0], x : x + m.shape[1]]
+            components.append(Component(int(self.fitted[self.start.source[i]]), (int(y), int(x)),
+                                        part, spectra[i] * self.unit))
+        rendered = []
+        for view, o in zip(self.views, self.blend.observations, strict=True):
+            images = view.op.render(morphs.astype(view.op.dtype)).astype(np.float64)
+            rendered.append(images[..., : o.data.shape[1], : o.data.shape[2]])
+        self.seconds["result"] = time.perf_counter() - began
+        return Result(
+            observations=self.blend.observations, frame=self.frame, sources=self.blend.sources,
+            components=tuple(components), rendered=tuple(rendered), sky=sky * self.unit,
+            covariance=covariance * self.unit[:, None, None] ** 2, shifts=self.start.shifts,
+            losses=np.array(self.losses), status=self.status, messages=tuple(self.messages),
+            seconds=self.seconds,
+        )
+
+
+def _iterate(fits, settings, device, dtype):
+    """Run the fits of one signature until each has stopped; they keep their final problems."""
+    began = time.perf_counter()
+    running = list(fits)
+    engine = _engine(running, settings, device, dtype)
+    live = np.ones(len(running), bool)
+    try:
+        for _ in range(0, settings.max_iter, CHECK):
+            engine.save()
+            losses = engine.run(min(CHECK, settings.max_iter - engine.n_steps))
+            stop = _stopped(running, live, losses, settings)
+            if stop.any() or engine.n_steps >= settings.max_iter:
+                _settle(running, live, stop, engine)
+                live &= ~stop
+            if not live.any() or engine.n_steps >= settings.max_iter:
+                break
+            if (~live).mean() >= REPACK:
+                running = [f for f, on in zip(running, live, strict=True) if on]
+                now = engine.problems_now()
+                for f, p in zip(running, [p for p, on in zip(now, live, strict=True) if on],
+                                strict=True):
+                    f.problem = p
+                engine = _engine(running, settings, device, dtype)
+                live = np.ones(len(running), bool)
+    except KeyboardInterrupt:
+        for f, p, on in zip(running, engine.problems_now(saved=True), live, strict=True):
+            if on:
+                f.problem, f.status = p, "interrupted"
+    if settings.max_iter and live.any():
+        final = engine.final_losses()
+        for f, loss, on in zip(running, final, live, strict=True):
+            if on:
+                f.losses.append(float(loss))
+    for f in fits:
+        f.seconds["fit"] = (time.perf_counter() - began) / len(fits)
+    return fits
+
+
+def _engine(fits, settings, device, dtype):
+    return Engine([f.problem for f in fits], device, dtype, chain=settings.constraints,
+                  prior=settings.prior, rates=settings.rates)
+
+
+def _stopped(fits, live, losses, settings):
+    """Which fits end here (B,), from the losses (n, B) of the last iterations; they are told why."""
+    stop = np.zeros(len(fits), bool)
+    for i, f in enumerate(fits):
+        if not live[i]:
+            continue
+        f.losses.extend(losses[:, i].tolist())
+        now, best = f.losses[-1], np.nanmin(f.losses)
+        if not np.isfinite(losses[:, i]).all() or now > DIVERGED * best:
+            f.status, stop[i] = "diverged", True
+        elif len(f.losses) >= AT_LEAST and f.losses[-1 - CHECK] - now < settings.tol * now:
+            f.status, stop[i] = "converged", True
+    return stop
+
+
+def _settle(fits, live, stop, engine):
+    """Bring the state of fits that stopped (or all live ones, at the end) back to the host."""
+    now = engine.problems_now()
+    saved = engine.problems_now(saved=True) if any(f.status == "diverged" for f in fits) else now
+    for i, f in enumerate(fits):
+        if live[i]:
+            f.problem = saved[i] if f.status == "diverged" else now[i]
+
+
+def _padded_frame(frame, pad):
+    shape = tuple(-(-n // pad) * pad for n in frame.shape)
+    return frame if shape == frame.shape else Frame(frame.grid.cutout(0, 0, shape), frame.psf)
+
+
+def _view(frame, observation, pad, device, dtype, *, private):
+    """An observation in units of its channels' noise, padded, and these units (Co,)."""
+    shape = tuple(-(-n // pad) * pad for n in observation.data.shape[1:])
+    grid = observation.grid
+    if shape != observation.data.shape[1:]:
+        grid = grid.cutout(0, 0, shape)
+    op = operator(frame, grid, observation.psf, dtype=dtype, device=device, private=private)
+    low = [(0, 0)] + [(0, n - m) for n, m in zip(shape, observation.data.shape[1:], strict=True)]
+    data, weights = np.pad(observation.data, low), np.pad(observation.weights, low)
+    seen = weights > 0
+    unit = np.array([1 / np.sqrt(np.median(w[s])) if s.any() else 1.0
+                     for w, s in zip(weights, seen, strict=True)])
+    root = np.sqrt(weights) * unit[:, None, None] * op.covered
+    return View(op, root, data / unit[:, None, None]), unit
+
+
+def _pixel_noise(views):
+    """Noise (C,) of one model pixel per channel, in the views' units."""
+    noise = []
+    for view in views:
+        area = abs(np.linalg.det(view.op.plans[0].mapping.matrix))
+        noise += [1 / np.sqrt(area)] * view.data.shape[0]
+    return np.array(noise)

@@ -1,0 +1,215 @@
+/* One step of proximal AMSGrad (Melchior et al. 2019) on morphologies, spectra and sky levels.
+ *
+ *   m <- B1 m + (1 - B1) g,  v <- B2 v + (1 - B2) g^2,  h <- max(h, v)
+ *   x <- x - rate (m / (1 - B1^t)) / (sqrt(h / (1 - B2^t)) + EPSILON)
+ *
+ * A morphology with a prior is S = base + amp o (K z): base its expected profile, amp how far it may
+ * depart, K the correlation kernel (separable taps (2 RADIUS + 1), symmetric), z unit normal.  The
+ * variable is z, its gradient K (amp o dS) + z; constraints act on S.  Without a prior it is S itself.
+ *
+ * blur        scratch = K_x v,  v = amp o dS where S > 0 (WEIGH: the gradient), or z
+ * step_field  z <- AMSGrad with g = K_y scratch + z
+ * form        S = base + amp o K_y scratch
+ * step_morph  S <- AMSGrad with g = dS
+ *             launch of these: (X, tallest box, len(active)); for the sources listed in `active`
+ * step_spectra   A <- max(0, AMSGrad in units of `scale` with g = scale o dA); launch: (n)
+ * step_sky       sky <- sky - SKY_RATE sum(w r) / sum(w); launch: (B * C)
+ *             pull (B, n_rows): sum of w r of each observed row; channel c has rows
+ *             row0[c] .. row0[c + 1] - 1
+ * losses      out[i_loss, b] = sum of loss rows + 1/2 sum_s |z_s|^2; launch: (B)
+ * rescale     A[s, c] *= factor[s]: what a normalisation took out of a morphology; launch: (S * C)
+ *
+ * t1 = 1 / (1 - B1^t), t2 = 1 / (1 - B2^t) come from the host.
+ * table, morph, first: as in scene.cl; all flat buffers share one layout.
+ */
+#include "common.h"
+#ifndef B1
+#define B1 0.9
+#endif
+#ifndef B2
+#define B2 0.999
+#endif
+#ifndef EPSILON      /* far below a unit-normal variable's gradient, far above float32's underflow */
+#define EPSILON 1e-8
+#endif
+#ifndef SKY_RATE     /* of a Newton step: sources and sky exchange light, a full one overshoots */
+#define SKY_RATE 0.5
+#endif
+#ifndef RADIUS
+#define RADIUS 6
+#endif
+#ifdef ROWS
+#define FOR_X(x, n) for (int x = 0; x < (n); ++x)
+#else
+#define FOR_X(x, n) for (int x = (int)get_global_id(0); x < (n); x += (int)get_global_size(0))
+#endif
+#define ROW \
+    const int s = active[get_global_id(2)], y = (int)get_global_id(1); \
+    const int ny = table[8 * s + 3], nx = table[8 * s + 4]; \
+    if (y >= ny) return; \
+    const size_t box = (size_t)table[8 * s + 7] * 16, row = box + (size_t)y * nx;
+
+/* sqrt(x), x >= 0, from plain arithmetic so that loops vectorise everywhere: a first guess of 1 / sqrt
+ * from the exponent, then Newton's steps, each of which doubles the digits from 5 bits on. */
+static REAL root(const REAL x)
+{
+#ifdef USE_DOUBLE
+    REAL y = as_double(0x5fe6eb50c7b537a9L - (as_long(x) >> 1));
+    y = y * (1.5 - 0.5 * x * y * y);
+#else
+    REAL y = as_float(0x5f3759df - (as_int(x) >> 1));
+#endif
+    y = y * ((REAL)1.5 - (REAL)0.5 * x * y * y);
+    y = y * ((REAL)1.5 - (REAL)0.5 * x * y * y);
+    y = y * ((REAL)1.5 - (REAL)0.5 * x * y * y);
+    return x * y;
+}
+
+static REAL amsgrad(const REAL g, __global REAL *restrict m, __global REAL *restrict v,
+                    __global REAL *restrict h, const size_t i, const REAL t1, const REAL t2)
+{
+    const REAL mi = (REAL)B1 * m[i] + (REAL)(1 - B1) * g;
+    const REAL vi = (REAL)B2 * v[i] + (REAL)(1 - B2) * g * g;
+    const REAL hi = h[i] > vi ? h[i] : vi;
+    m[i] = mi;
+    v[i] = vi;
+    h[i] = hi;
+    return mi * t1 / (root(hi * t2) + (REAL)EPSILON);
+}
+
+__kernel void blur(__global const int *restrict active, __global const int *restrict table,
+                   __global const REAL *restrict taps, const int weigh,
+                   __global const REAL *restrict v, __global const REAL *restrict amp,
+                   __global const REAL *restrict morph, __global REAL *restrict weighed,
+                   __global REAL *restrict scratch)
+{
+    ROW
+    __global const REAL *restrict source = v + row;
+#ifdef ROWS
+    if (weigh) {                       /* once a pixel rather than once a tap */
+        for (int x = 0; x < nx; ++x)
+            weighed[row + x] = morph[row + x] > 0 ? amp[row + x] * v[row + x] : (REAL)0;
+        source = weighed + row;
+    }
+    for (int x = 0; x < nx; ++x) scratch[row + x] = 0;
+    for (int t = -RADIUS; t <= RADIUS; ++t) {
+        const int low = t < 0 ? -t : 0, high = t > 0 ? nx - t : nx;
+        const REAL k = taps[t + RADIUS];
+        for (int x = low; x < high; ++x) scratch[row + x] += k * source[x + t];
+    }
+#else
+    FOR_X(x, nx) {
+        REAL sum = 0;
+        for (int t = -RADIUS; t <= RADIUS; ++t) {
+            const int i = x + t;
+            if (i < 0 || i >= nx) continue;
+            const REAL u = weigh ? (morph[row + i] > 0 ? amp[row + i] * source[i] : (REAL)0)
+                                 : source[i];
+            sum += taps[t + RADIUS] * u;
+        }
+        scratch[row + x] = sum;
+    }
+#endif
+}
+
+/* K_y scratch of one row into `out`. */
+static void blur_y(__global const REAL *restrict taps, __global const REAL *restrict scratch,
+                   const size_t box, const int y, const int ny, const int nx,
+                   __global REAL *restrict out)
+{
+    const size_t row = box + (size_t)y * nx;
+    FOR_X(x, nx) out[row + x] = 0;
+    for (int t = -RADIUS; t <= RADIUS; ++t) {
+        if (y + t < 0 || y + t >= ny) continue;
+        const REAL k = taps[t + RADIUS];
+        __global const REAL *restrict in = scratch + box + (size_t)(y + t) * nx;
+        FOR_X(x, nx) out[row + x] += k * in[x];
+    }
+}
+
+__kernel void step_field(__global const int *restrict active, __global const int *restrict table,
+                         __global const REAL *restrict taps, __global const REAL *restrict scratch,
+                         __global REAL *restrict field, __global REAL *restrict m,
+                         __global REAL *restrict v, __global REAL *restrict h,
+                         __global REAL *restrict gradient,
+                         const REAL rate, const REAL t1, const REAL t2)
+{
+    ROW
+    blur_y(taps, scratch, box, y, ny, nx, gradient);
+    FOR_X(x, nx) {
+        const size_t i = row + x;
+        field[i] -= rate * amsgrad(gradient[i] + field[i], m, v, h, i, t1, t2);
+    }
+}
+
+__kernel void form(__global const int *restrict active, __global const int *restrict table,
+                   __global const REAL *restrict taps, __global const REAL *restrict scratch,
+                   __global const REAL *restrict base, __global const REAL *restrict amp,
+                   __global REAL *restrict morph)
+{
+    ROW
+    blur_y(taps, scratch, box, y, ny, nx, morph);
+    FOR_X(x, nx) morph[row + x] = base[row + x] + amp[row + x] * morph[row + x];
+}
+
+__kernel void step_morph(__global const int *restrict active, __global const int *restrict table,
+                         __global const REAL *restrict gradient, __global REAL *restrict morph,
+                         __global REAL *restrict m, __global REAL *restrict v,
+                         __global REAL *restrict h, const REAL rate, const REAL t1, const REAL t2)
+{
+    ROW
+    FOR_X(x, nx) {
+        const size_t i = row + x;
+        morph[i] -= rate * amsgrad(gradient[i], m, v, h, i, t1, t2);
+    }
+}
+
+__kernel void step_spectra(__global const REAL *restrict gradient,
+                           __global const REAL *restrict scale, __global REAL *restrict spectra,
+                           __global REAL *restrict m, __global REAL *restrict v,
+                           __global REAL *restrict h, const REAL rate, const REAL t1, const REAL t2)
+{
+    const size_t i = get_global_id(0);
+    const REAL a = spectra[i]
+                 - rate * scale[i] * amsgrad(scale[i] * gradient[i], m, v, h, i, t1, t2);
+    spectra[i] = a < 0 ? (REAL)0 : a;
+}
+
+__kernel void step_sky(const int n_channels, const int n_rows, __global const int *restrict row0,
+                       __global const REAL *restrict pull, __global const REAL *restrict inverse,
+                       __global REAL *restrict sky)
+{
+    const int i = (int)get_global_id(0), b = i / n_channels, c = i % n_channels;
+    REAL sum = 0;
+    for (int r = row0[c]; r < row0[c + 1]; ++r) sum += pull[(size_t)b * n_rows + r];
+    sky[i] -= (REAL)SKY_RATE * sum * inverse[i];
+}
+
+__kernel void losses(__global const int *restrict first, __global const int *restrict table,
+                     const int n_rows, __global const REAL *restrict rows, const int prior,
+                     __global const REAL *restrict field, __global REAL *restrict out,
+                     const int i_loss)
+{
+    const int b = (int)get_global_id(0);
+    REAL total = 0;
+    for (int r = 0; r < n_rows; ++r) total += rows[(size_t)b * n_rows + r];
+    if (prior)
+        for (int s = first[b]; s < first[b + 1]; ++s) {
+            const size_t box = (size_t)table[8 * s + 7] * 16;
+            const int n = table[8 * s + 3] * table[8 * s + 4];
+            REAL part[8] = {0, 0, 0, 0, 0, 0, 0, 0};
+            int i = 0;
+            for (; i + 8 <= n; i += 8)
+                for (int k = 0; k < 8; ++k) part[k] += field[box + i + k] * field[box + i + k];
+            for (; i < n; ++i) part[0] += field[box + i] * field[box + i];
+            for (int k = 0; k < 8; ++k) total += (REAL)0.5 * part[k];
+        }
+    out[(size_t)i_loss * get_global_size(0) + b] = total;
+}
+
+__kernel void rescale(__global const REAL *restrict factor, const int n_channels,
+                      __global REAL *restrict spectra)
+{
+    const size_t i = get_global_id(0);
+    spectra[i] *= factor[i / n_channels];
+}
