@@ -11,6 +11,8 @@ import argparse
 import sys
 
 from . import __version__
+from .cli_options import add_device_option
+from .cli_resample import add_resample
 from .device import DeviceError, get_device, list_devices
 from .discover import format_size
 
@@ -44,16 +46,6 @@ def main(argv=None):
         _fail(arguments, "interrupted")
         return 130  # what a shell reports after Ctrl-C
     return 0
-
-
-def add_device_option(parser):
-    """Add `--device`, whose value `get_device` takes as it is."""
-    parser.add_argument(
-        "--device",
-        metavar="CHOICE",
-        help="index, platform:device or part of a name; without it CLRESAMPLE_DEVICE, then "
-        "PYOPENCL_CTX, then the first GPU, then the first CPU",
-    )
 
 
 def add_devices(commands):
@@ -101,7 +93,7 @@ def _fail(arguments, message):
     return 2
 
 
-COMMANDS = (add_devices,)
+COMMANDS = (add_resample, add_devices)
 
 
 if __name__ == "__main__":
