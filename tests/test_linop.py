@@ -7,6 +7,7 @@ from geometries import GEOMETRIES, ONE_OF_EACH, TYPES, distance, operator, psfs
 from clresample.device import Device, load_pyopencl
 from clresample.linop import LinOp
 from clresample.psf import PSF
+from clresample.resample import Resampler
 from clresample.testing import check_adjoint, dense
 
 every_type = pytest.mark.parametrize("dtype", TYPES, ids=lambda t: t.__name__)
@@ -76,6 +77,24 @@ def test_permuted_bands_are_not_swapped_back(device, geometry):
     swapped = operator(device, GEOMETRIES[geometry](), *(psf.select([1, 0]) for psf in psfs()))
     np.testing.assert_array_equal(swapped(x[::-1]), op(x)[::-1])
     assert distance(op(x[::-1])[::-1], op(x)) > 0.01
+
+
+@every_path
+@every_type
+def test_one_image_in_every_band(device, geometry, dtype):
+    op = build(device, geometry, dtype)
+    x = noise((3, *op.shape_in[1:]), dtype)
+    truth = op(np.repeat(x[:, None], 2, axis=1))
+    np.testing.assert_array_equal(op.render(x), truth)
+    np.testing.assert_array_equal(op.render(x[1]), truth[1])
+    on_device, out = device.put(x), device.empty(truth.shape, dtype)
+    assert op.render(on_device, out=out) is out
+    np.testing.assert_array_equal(op.render(on_device[1:]).get(), truth[1:])
+    np.testing.assert_array_equal(out.get(), truth)
+    with pytest.raises(ValueError, match=r"x has shape \(2, 31, 25\), expected \(31, 26\)"):
+        op.render(x[:2, :, 1:])
+    plans = Resampler.from_plans(op.plans * 3, dtype=dtype, device=device)
+    np.testing.assert_array_equal(plans.render(x), truth)
 
 
 @every_path
