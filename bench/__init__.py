@@ -1,0 +1,1 @@
+"""Benchmarks and evidence, run from a checkout: `python -m bench.render` and its neighbours."""
