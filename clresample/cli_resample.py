@@ -168,11 +168,13 @@ def run(arguments):
     result = op(pixels)
     took = time.perf_counter() - started
     covered = op.covered
+    written = result if len(result) > 1 else result[0]
+    named = any(not band.isdigit() for band in image.bands)
     write_fits(
         arguments.output,
-        result,
+        written,
         reference.grid,
-        bands=image.bands,
+        bands=image.bands if named else None,
         coverage=covered,
         unit=unit,
         device=op.device.name,
@@ -181,7 +183,7 @@ def run(arguments):
         overwrite=arguments.overwrite,
     )
     print(
-        f"{arguments.output}: {' x '.join(map(str, result.shape))} pixels, "
+        f"{arguments.output}: {' x '.join(map(str, written.shape))} pixels, "
         f"{100 * covered.mean():.3g} % covered; {op.kind} grids, {op.n_tiles} "
         f"tile{'s' * (op.n_tiles > 1)}, {took:.2f} s on {op.device.name}"
     )
