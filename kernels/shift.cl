@@ -1,0 +1,144 @@
+/* Shifts by complex exponentials, and the two ends of the contraction that follows them.
+ *
+ *   shift_line    G[(y, k), n] = F(y, nu_k) w_x[k, n]                      F: spectra along x alone
+ *   shift_plane   G[(l, k, +-), n] = F(nu_l, +-nu_k) w_y[l, n] w_x[k, n]^(+-1)      F: 2-D spectra
+ *                 w[k, n] = exp(2 pi i nu_k X_n): displacement X of step n along one unrotated axis
+ *   unshift_*     the adjoints: sums over n, from G back to F
+ *
+ *   Z   spectra F as real sums.  Line: row y, columns 2k, 2k+1 = the sums with cos and sin,
+ *       F = C - iS.  Plane: rows 2l, 2l+1 too: (CC, CS; SC, SS), F(+,+) = CC - SS - i(CS + SC),
+ *       F(+,-) = CC + SS + i(CS - SC).  Item b at b * stride_z; rows ld_z apart.
+ *   w   (n_k, 2, n_cols): planes cos and sin, zero beyond the last step
+ *   G   real and imaginary parts as rows of length ld: line row 2 (y h_x + k) + (re, im); plane row
+ *       4 (l h_x + k) + (re+, im+, re-, im-).  Item b owns the columns from b * n_cols.
+ *   Rows y or l run from `first` to first + n_units - 1, and G starts at the first.
+ *   n_cols is a multiple of LANES, ld of 16.
+ *   Launch: shift (n_cols / LANES, h_x, n_units * n_items), unshift (h_x, n_units * n_items).
+ *
+ *   collect  out[b, pixel] = sum over chunks of part[chunk, l, b * n_cols + i]; 0 where not covered
+ *            launch (n_i, n_l, n_items); pixel = l * step_l + i * step_i
+ *   spread   part[l, b * n_cols + i] = y[b, pixel] where covered, else 0, the adjoint of one chunk
+ *            launch (ld, n_l); columns that are no pixel's become 0
+ */
+#include "common.h"
+
+#define LANES 8
+#define WIDE VEC(LANES)
+#define AT(p) (*(__global WIDE *)(p))
+#define SEE(p) (*(__global const WIDE *)(p))
+#define SUM(v) ((((v).s0 + (v).s1) + ((v).s2 + (v).s3)) + (((v).s4 + (v).s5) + ((v).s6 + (v).s7)))
+
+__kernel void shift_line(const int h_x, const int n_units, const int first,
+                         __global const REAL *restrict Z, const int stride_z, const int ld_z,
+                         __global const REAL *restrict w_y, __global const REAL *restrict w_x,
+                         __global REAL *restrict G, const int n_cols, const int ld)
+{
+    const int j = (int)get_global_id(0) * LANES, k = (int)get_global_id(1);
+    const int unit = (int)get_global_id(2) % n_units, b = (int)get_global_id(2) / n_units;
+    Z += (size_t)b * stride_z + (size_t)(first + unit) * ld_z + 2 * k;
+    w_x += (size_t)2 * k * n_cols + j;
+    G += (size_t)2 * (unit * h_x + k) * ld + b * n_cols + j;
+    const REAL c = Z[0], s = Z[1];
+    const WIDE cx = SEE(w_x), sx = SEE(w_x + n_cols);
+    AT(G) = c * cx + s * sx;
+    AT(G + ld) = c * sx - s * cx;
+}
+
+__kernel void unshift_line(const int h_x, const int n_units, const int first,
+                           __global REAL *restrict Z, const int stride_z, const int ld_z,
+                           __global const REAL *restrict w_y, __global const REAL *restrict w_x,
+                           __global const REAL *restrict G, const int n_cols, const int ld)
+{
+    const int k = (int)get_global_id(0);
+    const int unit = (int)get_global_id(1) % n_units, b = (int)get_global_id(1) / n_units;
+    Z += (size_t)b * stride_z + (size_t)(first + unit) * ld_z + 2 * k;
+    w_x += (size_t)2 * k * n_cols;
+    G += (size_t)2 * (unit * h_x + k) * ld + b * n_cols;
+    WIDE c = (WIDE)(0), s = (WIDE)(0);
+    for (int j = 0; j < n_cols; j += LANES) {
+        const WIDE cx = SEE(w_x + j), sx = SEE(w_x + n_cols + j);
+        const WIDE re = SEE(G + j), im = SEE(G + ld + j);
+        c += re * cx + im * sx;
+        s += re * sx - im * cx;
+    }
+    Z[0] = SUM(c);
+    Z[1] = SUM(s);
+}
+
+__kernel void shift_plane(const int h_x, const int n_units, const int first,
+                          __global const REAL *restrict Z, const int stride_z, const int ld_z,
+                          __global const REAL *restrict w_y, __global const REAL *restrict w_x,
+                          __global REAL *restrict G, const int n_cols, const int ld)
+{
+    const int j = (int)get_global_id(0) * LANES, k = (int)get_global_id(1);
+    const int unit = (int)get_global_id(2) % n_units, b = (int)get_global_id(2) / n_units;
+    Z += (size_t)b * stride_z + (size_t)2 * (first + unit) * ld_z + 2 * k;
+    w_y += (size_t)2 * (first + unit) * n_cols + j;
+    w_x += (size_t)2 * k * n_cols + j;
+    G += (size_t)4 * (unit * h_x + k) * ld + b * n_cols + j;
+    const REAL pr = Z[0] - Z[ld_z + 1], pi = -(Z[1] + Z[ld_z]);       /* F(+,+) */
+    const REAL mr = Z[0] + Z[ld_z + 1], mi = Z[1] - Z[ld_z];          /* F(+,-) */
+    const WIDE cy = SEE(w_y), sy = SEE(w_y + n_cols), cx = SEE(w_x), sx = SEE(w_x + n_cols);
+    const WIDE cc = cy * cx, ss = sy * sx, sc = sy * cx, cs = cy * sx;
+    AT(G) = pr * (cc - ss) - pi * (sc + cs);
+    AT(G + ld) = pr * (sc + cs) + pi * (cc - ss);
+    AT(G + (size_t)2 * ld) = mr * (cc + ss) - mi * (sc - cs);
+    AT(G + (size_t)3 * ld) = mr * (sc - cs) + mi * (cc + ss);
+}
+
+__kernel void unshift_plane(const int h_x, const int n_units, const int first,
+                            __global REAL *restrict Z, const int stride_z, const int ld_z,
+                            __global const REAL *restrict w_y, __global const REAL *restrict w_x,
+                            __global const REAL *restrict G, const int n_cols, const int ld)
+{
+    const int k = (int)get_global_id(0);
+    const int unit = (int)get_global_id(1) % n_units, b = (int)get_global_id(1) / n_units;
+    Z += (size_t)b * stride_z + (size_t)2 * (first + unit) * ld_z + 2 * k;
+    w_y += (size_t)2 * (first + unit) * n_cols;
+    w_x += (size_t)2 * k * n_cols;
+    G += (size_t)4 * (unit * h_x + k) * ld + b * n_cols;
+    WIDE pr = (WIDE)(0), pi = (WIDE)(0), mr = (WIDE)(0), mi = (WIDE)(0);
+    for (int j = 0; j < n_cols; j += LANES) {
+        const WIDE cy = SEE(w_y + j), sy = SEE(w_y + n_cols + j);
+        const WIDE cx = SEE(w_x + j), sx = SEE(w_x + n_cols + j);
+        const WIDE cc = cy * cx, ss = sy * sx, sc = sy * cx, cs = cy * sx;
+        const WIDE re_p = SEE(G + j), im_p = SEE(G + ld + j);
+        const WIDE re_m = SEE(G + (size_t)2 * ld + j), im_m = SEE(G + (size_t)3 * ld + j);
+        pr += re_p * (cc - ss) + im_p * (sc + cs);
+        pi += im_p * (cc - ss) - re_p * (sc + cs);
+        mr += re_m * (cc + ss) + im_m * (sc - cs);
+        mi += im_m * (cc + ss) - re_m * (sc - cs);
+    }
+    const REAL a = SUM(pr), b_ = SUM(pi), c = SUM(mr), d = SUM(mi);
+    Z[0] = a + c;
+    Z[1] = d - b_;
+    Z[ld_z] = -(b_ + d);
+    Z[ld_z + 1] = c - a;
+}
+
+__kernel void collect(const int n_chunks, const int n_cols, const int ld,
+                      __global const REAL *restrict part, __global const uchar *restrict covered,
+                      __global REAL *restrict out, const ulong offset, const int stride,
+                      const int step_l, const int step_i)
+{
+    const int i = (int)get_global_id(0), l = (int)get_global_id(1), b = (int)get_global_id(2);
+    const size_t step = (size_t)get_global_size(1) * ld;
+    const size_t pixel = (size_t)l * step_l + (size_t)i * step_i;
+    part += (size_t)l * ld + (size_t)b * n_cols + i;
+    REAL sum = 0;
+    for (int chunk = 0; chunk < n_chunks; ++chunk) sum += part[chunk * step];
+    out[offset + (size_t)b * stride + pixel] = covered[pixel] ? sum : (REAL)0;
+}
+
+__kernel void spread(const int n_items, const int n_i, const int n_cols,
+                     __global REAL *restrict part, __global const uchar *restrict covered,
+                     __global const REAL *restrict y, const ulong offset, const int stride,
+                     const int step_l, const int step_i)
+{
+    const int j = (int)get_global_id(0), l = (int)get_global_id(1);
+    const int b = j / n_cols, i = j % n_cols;
+    const size_t pixel = (size_t)l * step_l + (size_t)i * step_i;
+    REAL value = 0;
+    if (b < n_items && i < n_i && covered[pixel]) value = y[offset + (size_t)b * stride + pixel];
+    part[(size_t)l * get_global_size(0) + j] = value;
+}
