@@ -16,7 +16,7 @@ from .spectrum import Plan, Precision, make_plan
 PATHS = {"aligned": Aligned, "affine": Affine, "distorted": Distorted}
 # Intermediate matrices of one launch group [bytes]: in a CPU's cache they are read back at speed; a
 # GPU wants the whole batch in flight.
-GROUP_BYTES = {"CPU": 16 << 20}
+GROUP_BYTES = {"CPU": 4 << 20}
 GROUP_BYTES_OTHER = 1 << 30
 
 
