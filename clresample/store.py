@@ -203,11 +203,11 @@ def _placed(grid, number):
     """WCS cards that give back the same float64, and HDUs of look-up tables numbered apart."""
     placed = grid.to_wcs().to_fits(relax=RELAX)
     for hdu in placed:
-        for k, card in enumerate(hdu.header.cards):
+        for k, card in enumerate(list(hdu.header.cards)):
             value = card.value
             if isinstance(value, float) and fits.Card.fromstring(str(card)).value != value:
+                del hdu.header[k]
                 hdu.header.insert(k, fits.Card.fromstring(f"{card.keyword:8}= {value:.17G}"))
-                del hdu.header[k + 1]
     cards = placed[0].header
     for axis in (1, 2):
         for key in (f"DP{axis}.EXTVER", f"D2IM{axis}.EXTVER"):
