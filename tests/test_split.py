@@ -135,7 +135,7 @@ def test_any_size(device, shape_in, shape_out, dtype):
 
 @pytest.mark.parametrize("angle", [0, 30])
 def test_ours_and_the_papers_agree_on_galaxies(device, angle):
-    # Euclid to Rubin; what is left is float32 and a little of D's step of 5e-4
+    # Euclid to Rubin; what is left is float32 and a little of D's step of 6e-4
     grid_in, grid_out = Grid.flat((60, 53), 0.1), Grid.flat((31, 28), 0.2, angle_deg=angle)
     pair = PSF.gaussian(1.6), PSF.gaussian([1.485, 1.8], n_pixels=(41, 40))
     ours = Resampler(grid_in, pair[0], grid_out, pair[1], device=device)
