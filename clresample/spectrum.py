@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .grid import Mapping
+from .lines import Lines, Window, transpose_taps
 from .psf import PSF
 
 # Light of the observed PSF beyond the wrap radius, as a fraction; images drawn by FFT ring at 1e-6.
@@ -27,30 +28,6 @@ WRAP_MARGIN = 1.5
 # |P1^| below which the division is floored: 1e-6 of a point source's light per frequency, ten times
 # the rounding of a PSF stored in float32.
 DIVISION_FLOOR = 1e-6
-
-
-@dataclass(frozen=True)
-class Window:
-    """Kaiser-Bessel window that interpolates along a line: `n_taps` columns, `oversampling` x Nyquist.
-
-    phi(u) = I0(beta sqrt(1 - (2u/W)^2)) / I0(beta),   phi^(f) = W sinh(b) / (b I0(beta)),
-    b^2 = beta^2 - (pi W f)^2.  Relative error exp(-pi W sqrt(1 - 1/oversampling)).
-    """
-
-    n_taps: int
-    oversampling: float
-
-    @property
-    def beta(self) -> float:
-        return np.pi * self.n_taps * (1 - 0.5 / self.oversampling)
-
-    def __call__(self, u):
-        inside = np.clip(1 - (2 * u / self.n_taps) ** 2, 0, None)
-        return np.i0(self.beta * np.sqrt(inside)) / np.i0(self.beta) * (inside > 0)
-
-    def transform(self, f):
-        b = np.sqrt((self.beta**2 - (np.pi * self.n_taps * f) ** 2).clip(1e-300))
-        return self.n_taps * np.sinh(b) / (b * np.i0(self.beta))
 
 
 @dataclass(frozen=True)
@@ -65,22 +42,6 @@ class Precision:
         if np.dtype(dtype) == np.float32:
             return cls(3e-8, Window(10, 1.5))  # window error 1e-8
         return cls(1e-16, Window(16, 2.0))  # window error 4e-16
-
-
-@dataclass(frozen=True)
-class Lines:
-    """Observed pixels as straight lines through the model: pass 2 of the affine path.
-
-    forward:  out[l, q] = sum_t weight[l, t, q] g[l, start[l, q] + t]
-    adjoint:  g[l, j] = sum_t weight_t[l, t, j] out[l, start_t[l, j] + t]
-    by_row: lines are rows of the observed image (position q = column) or its columns (q = row)
-    """
-
-    by_row: bool
-    start: np.ndarray
-    weight: np.ndarray
-    start_t: np.ndarray
-    weight_t: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -289,32 +250,14 @@ def _line_tables(mapping: Mapping, nu, d, center, window: Window):
     n_columns = int(np.ceil((x_last - x_first) / spacing)) + window.n_taps + 1
     columns = x_first + (np.arange(n_columns) - window.n_taps / 2) * spacing
 
-    start = np.where(covered, np.floor(u - window.n_taps / 2).astype(int) + 1, 0)
-    taps = np.arange(window.n_taps)[:, None]
-    weight = window(u[:, None, :] - start[:, None, :] - taps) * covered[:, None, :]
-    start_t, weight_t = _transpose_taps(start, weight, covered, n_columns)
+    below = np.floor(u - window.n_taps / 2)
+    start = np.where(covered, below.astype(int) + 1, 0)
+    weight = window.taps(u - window.n_taps / 2 - below) * covered[:, :, None]
+    start_t, weight_t = transpose_taps(start, weight, covered, n_columns)
     y0 = (a - r * c) * np.arange(n_lines) + t_y - r * t_x
     return {
         "out_y": _waves(nu[0], y0),
         "out_x": _waves(nu[1], columns).T,
         "twist": 2 * np.pi * np.outer(nu[0], r * columns),
-        "lines": Lines(bool(by_row), start, weight, start_t, weight_t),
+        "lines": Lines(bool(by_row), start, weight.swapaxes(1, 2), start_t, weight_t),
     }, d
-
-
-def _transpose_taps(start, weight, covered, n_columns):
-    """The same sparse lines read the other way: for each column, the observed pixels it feeds."""
-    n_lines, n_taps, n_steps = weight.shape
-    i_line, i_step = np.nonzero(covered)
-    i_line, i_step = np.repeat(i_line, n_taps), np.repeat(i_step, n_taps)
-    i_tap = np.tile(np.arange(n_taps), len(i_line) // n_taps)
-    i_column = start[i_line, i_step] + i_tap
-    first = np.full((n_lines, n_columns), n_steps - 1)
-    np.minimum.at(first, (i_line, i_column), i_step)
-    last = np.zeros((n_lines, n_columns), dtype=int)
-    np.maximum.at(last, (i_line, i_column), i_step)
-    n_back = max(int((last - first).max()) + 1, 1)
-    first = np.minimum(first, n_steps - n_back)
-    back = np.zeros((n_lines, n_back, n_columns))
-    back[i_line, i_step - first[i_line, i_column], i_column] = weight[i_line, i_tap, i_step]
-    return first, back

@@ -13,6 +13,7 @@ LAYERS = [
         "grid",
         "mapping",
         "psf",
+        "lines",
         "spectrum",
         "observation",
         "sources",
