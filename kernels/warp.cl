@@ -7,9 +7,9 @@
  *            or columns of an observed image.
  *   start (n_tables, n_lines, n_out), weight (n_tables, n_lines, N_TAPS, n_out)
  *   Taps of weight 0 stand for "outside" and may read any element of the line.
- *   Launch: (n_out, n_lines, batch).
+ *   Launch: (n_out rounded up to the local size, n_lines, batch).
  *
- * rowdot   y[b, p] = sum_x T[b, p, x] * E[p, x]          launch: (n_positions, batch)
+ * rowdot   y[b, p] = sum_x T[b, p, x] * E[p, x]          launch: (n_positions rounded up, batch)
  * rowscale T[b, p, x] = y[b, p] * E[p, x]                launch: (n_pad, n_positions, batch)
  *          The two ends of the any-position path: each observed pixel p has its own table row E[p].
  *   E (n_tables, n_positions, n_pad), T (batch, n_positions, n_pad): zero in the padding
@@ -30,6 +30,7 @@ __kernel void gather(const int n_out, const int n_lines, const int n_bands, cons
                      __global const int *restrict start, __global const REAL *restrict weight)
 {
     const int p = (int)get_global_id(0), l = (int)get_global_id(1), b = (int)get_global_id(2);
+    if (p >= n_out) return;
     const size_t i_line = (size_t)(n_tables > 1 ? b / n_bands : 0) * n_lines + l;
     weight += i_line * N_TAPS * n_out + p;
     in += in_offset + (size_t)b * in_stride + (size_t)l * in_ld
@@ -45,6 +46,7 @@ __kernel void rowdot(const int n_positions, const int n_pad, const int n_bands, 
                      __global const REAL *restrict T, __global const REAL *restrict E)
 {
     const int p = (int)get_global_id(0), b = (int)get_global_id(1);
+    if (p >= n_positions) return;
     const size_t i_table = n_tables > 1 ? b / n_bands : 0;
     T += ((size_t)b * n_positions + p) * n_pad;
     E += (i_table * n_positions + p) * n_pad;
