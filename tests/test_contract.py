@@ -65,7 +65,7 @@ def test_product(device, tile, shape, dtype):
 
 
 @every_type
-def test_one_right_factor_for_all_and_tables_shared_by_bands(device, tile, dtype):
+def test_one_right_factor_for_all_and_tables_shared_by_bands(device, dtype):
     need(device, dtype)
     m, n, k, n_bands = 5, 19, 11, 3
     a, b = random(6, m, k), random(1, k, n)
@@ -103,7 +103,7 @@ def test_a_callers_arrays_read_and_written_transposed(device, tile, dtype):
 
 
 @every_type
-def test_a_callers_rows_of_any_length(device, tile, dtype):
+def test_a_callers_rows_of_any_length(device, dtype):
     need(device, dtype)
     m, n, k = 9, 18, 4
     a, b = random(2, m, k), random(1, k, n)
@@ -161,7 +161,7 @@ def test_mix_multiplies_by_the_spectra(device, tile, n_tables, adjoint, dtype):
 
 @every_type
 @pytest.mark.parametrize("adjoint", [False, True])
-def test_twist_rotates_cos_and_sin_rows(device, tile, adjoint, dtype):
+def test_twist_rotates_cos_and_sin_rows(device, adjoint, dtype):
     need(device, dtype)
     h_y, n, k = 5, 21, 9
     a, b, angle = random(3, 2 * h_y, k), random(3, k, n), random(h_y, n)
@@ -181,7 +181,7 @@ def test_twist_rotates_cos_and_sin_rows(device, tile, adjoint, dtype):
     check(device.get(result)[..., :n], truth, dtype)
 
 
-def test_long_sums_keep_their_accuracy(device, tile, monkeypatch):
+def test_long_sums_keep_their_accuracy(device, monkeypatch):
     # positive terms: the running sum, and with it each rounding, grows with k
     k = 40_000
     a, b = (np.abs(random(*shape)).astype(np.float32) for shape in ((8, k), (k, 16)))
