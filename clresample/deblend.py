@@ -16,12 +16,15 @@ from .observation import Observation, check_observations
 from .operators import operator
 from .prox import Chain, Positivity
 from .result import Component, Result
+from .shifts import shift_steps
 from .sources import Extended, Point, Source
 
-# The stopping rule looks at this many iterations; so often losses come back from the device.
+# So often (iterations) losses come back from the device.
 CHECK = 5
-# Iterations before a fit may stop: AMSGrad's first steps are all of one length.
-AT_LEAST = 20
+# So often (iterations) observations are shifted: what follows a shift is most of it by then.
+MOVE = 10
+# The stopping rule compares the best loss with the best one this many iterations ago.
+PATIENCE = 15
 # A loss this many times the best one, or NaN, is a divergence.
 DIVERGED = 10.0
 # A batch is repacked when this part of it has converged.
@@ -90,12 +93,13 @@ class Settings:
 
 
 def deblend(observations, sources, *, frame=None, settings=None, device=None,
-            dtype=np.float32) -> Result:
+            dtype=np.float32, progress=None) -> Result:
     """Fit one scene to all observations at once.
 
         min 1/2 sum_o |sqrt(w_o) (R_o sum_s A_s S_s - d_o)|^2 + 1/2 |z|^2,   A >= 0, S in constraints
 
     observations, sources, frame: see Blend; settings: see Settings
+    progress: called every few iterations with their number so far and the loss (1,)
     raises ValueError for what `check_observations`, `model_frame` and `Source` refuse, and when no
     source lies inside the frame. Ctrl-C ends the fit with the best state so far.
     """
@@ -103,7 +107,7 @@ def deblend(observations, sources, *, frame=None, settings=None, device=None,
     settings = settings or Settings()
     device = get_device(device)
     fit = _Fit(blend, settings, device, dtype, pad=1)
-    (done,) = _iterate([fit], settings, device, dtype)
+    (done,) = _iterate([fit], settings, device, dtype, progress)
     return done.result()
 
 
@@ -188,7 +192,7 @@ class _Fit:
         self.losses, self.status = [], "iteration limit"
         sources = [blend.sources[i] for i in self.fitted]
         self.start = start(self.padded, sources, positions[inside], self.views,
-                           fit_shifts=settings.fit_shifts, fit_sky=settings.fit_sky)
+                           fit_sky=settings.fit_sky)
         self.start.base[:, self.frame.shape[0] :] = 0
         self.start.base[:, :, self.frame.shape[1] :] = 0
         self.problem = self._problem(sources)
@@ -256,7 +260,7 @@ class _Fit:
         )
 
 
-def _iterate(fits, settings, device, dtype):
+def _iterate(fits, settings, device, dtype, progress=None):
     """Run the fits of one signature until each has stopped; they keep their final problems."""
     began = time.perf_counter()
     running = list(fits)
@@ -270,8 +274,12 @@ def _iterate(fits, settings, device, dtype):
             if stop.any() or engine.n_steps >= settings.max_iter:
                 _settle(running, live, stop, engine)
                 live &= ~stop
+            if progress is not None:
+                progress(engine.n_steps, losses[-1])
             if not live.any() or engine.n_steps >= settings.max_iter:
                 break
+            if settings.fit_shifts and engine.n_steps % MOVE == 0:
+                _move(running, live, engine)
             if (~live).mean() >= REPACK:
                 running = [f for f, on in zip(running, live, strict=True) if on]
                 now = engine.problems_now()
@@ -294,6 +302,17 @@ def _iterate(fits, settings, device, dtype):
     return fits
 
 
+def _move(fits, live, engine):
+    """Shift the observations of the fits that go on to where their models agree."""
+    for f, p, on in zip(fits, engine.problems_now(), live, strict=True):
+        if on:
+            f.start.shifts = f.start.shifts + shift_steps(p)
+            for op, shift in zip(p.ops, f.start.shifts, strict=True):
+                op.shift = shift
+    for i, op in enumerate(engine.ops):
+        op.shift = np.array([f.start.shifts[i] for f in fits])
+
+
 def _engine(fits, settings, device, dtype):
     return Engine([f.problem for f in fits], device, dtype, chain=settings.constraints,
                   prior=settings.prior, rates=settings.rates)
@@ -309,7 +328,7 @@ def _stopped(fits, live, losses, settings):
         now, best = f.losses[-1], np.nanmin(f.losses)
         if not np.isfinite(losses[:, i]).all() or now > DIVERGED * best:
             f.status, stop[i] = "diverged", True
-        elif len(f.losses) >= AT_LEAST and f.losses[-1 - CHECK] - now < settings.tol * now:
+        elif len(f.losses) > PATIENCE and min(f.losses[:-PATIENCE]) - best < settings.tol * best:
             f.status, stop[i] = "converged", True
     return stop
 

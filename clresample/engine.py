@@ -185,7 +185,7 @@ class Engine:
         """Kernels with their arguments set, in the order of one iteration."""
         d, i32 = self.device, np.int32
         cpu = d.kind == "CPU"
-        options = {"dtype": self.dtype, "ROWS": cpu}
+        options = {"dtype": self.dtype, "ROWS": cpu, "B1": BETA1, "B2": BETA2}
         n, n_sources = len(self.problems), len(self.host_boxes)
         width = 1 if cpu else self.widest
         n_channels, n_rows = i32(self.n_channels), i32(self.row0[-1])
@@ -223,11 +223,11 @@ class Engine:
                     "scene.cl", "gather_morph", (width, self.tallest, self.n_free), free, table,
                     self.models[j], self.spectra, *geometry, i32(j > 0), self.d_morph))
         self.history = d.empty((HISTORY, n), self.dtype)
-        self._losses = d.kernel("update.cl", "losses", dtype=self.dtype)
+        self._losses = d.kernel("update.cl", "losses", **options)
         self._losses.set_args(first, table, n_rows, self.rows_loss.data,
                               i32(self.prior is not None), self.field.data, self.history.data,
                               i32(0))
-        self._spectra_kernel = d.kernel("update.cl", "step_spectra", dtype=self.dtype)
+        self._spectra_kernel = d.kernel("update.cl", "step_spectra", **options)
         self._spectra_kernel.set_args(*(a.base_data for a in (
             self.d_spectra, self.scale, self.spectra, *self.moments_spectra)),
             *[self.dtype.type(0)] * 3)

@@ -39,6 +39,8 @@ RIDGE = 1e-8
 # A box holds pixels brighter than this part of the peak: what matters at the noise, within bounds
 BOX_NOISE, BOX_FAINTEST, BOX_BRIGHTEST = 0.1, 1e-4, 5e-3
 SMALLEST_RADIUS_PX = 5
+# Light this far under the brightest is none: float32 would keep it as denormals, 20 times slower.
+DARK = 1e-20
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +58,9 @@ class View:
 
     def render(self, images):
         """Whitened unit-spectrum images (n, Co, My * Mx) of model images (n, Ny, Nx)."""
-        out = self.op.render(np.ascontiguousarray(images, self.op.dtype)) * self.root
+        faint = np.abs(images) < DARK * np.abs(images).max(initial=0)
+        images = np.where(faint, 0, images).astype(self.op.dtype)
+        out = self.op.render(images) * self.root
         return out.reshape(*out.shape[:2], -1).astype(np.float64)
 
 
