@@ -32,8 +32,9 @@ LAYERS = [
     {"discover", "device"},
     {"contract", "factors", "linop", "paths", "sincs", "testing"},
     {"resample", "split", "scene", "prox", "tiles"},
-    {"initialize", "engine", "deblend", "measure"},
-    {"io", "store", "simulate", "plot", "demo", "cli", "cli_options", "cli_resample"},
+    {"initialize", "shifts", "engine", "deblend", "detect", "measure"},
+    {"io", "store", "simulate", "plot", "demo", "cli", "cli_options", "cli_resample",
+     "cli_deblend", "scenefile", "plot_deblended"},
 ]
 RANKS = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 MODULES = sorted((ROOT / "clresample").glob("*.py"))
