@@ -16,7 +16,10 @@ def tile(request, monkeypatch):
     if request.param != "device's":
         group, size = (8, 8) if request.param in ("GPU", "pairs") else (1, 1)
         vector, vectors, rows = {
-            "CPU": (8, 1, 6), "wide CPU": (16, 2, 8), "GPU": (4, 1, 8), "pairs": (2, 3, 8)
+            "CPU": (8, 1, 6),
+            "wide CPU": (16, 2, 8),
+            "GPU": (4, 1, 8),
+            "pairs": (2, 3, 8),
         }[request.param]
         chosen = {"VW": vector, "NV": vectors, "MR": rows, "WGX": group, "WGY": size}
         monkeypatch.setattr(contract, "_tile", lambda device, dtype: chosen)
