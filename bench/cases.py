@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 
@@ -13,7 +11,7 @@ from clresample import Resampler
 from clresample.galaxies import draw, import_galsim, open_catalogue, random_galaxy
 from clresample.surveys import Survey
 
-from .common import ROOT, BadOption
+from .common import BadOption, data_folder
 
 # Sigma of the Gaussian that band-limits a galaxy before it is drawn [model pixels].
 SMOOTHING_PX = 2.0
@@ -116,8 +114,7 @@ class Galaxies:
         import_galsim()
         self.catalogue = None
         if folder is None:
-            data = os.environ.get("CLRESAMPLE_DATA") or ROOT.parent / "shared" / "data"
-            folder = Path(data) / "cosmos"
+            folder = data_folder() / "cosmos"
             folder = folder if folder.is_dir() else None
         if folder is not None:
             try:

@@ -98,6 +98,11 @@ def survey_pairs():
     return [(a, b) for i, a in enumerate(names) for b in names[i:]]
 
 
+def data_folder():
+    """Folder of real images and catalogues: CLRESAMPLE_DATA, or one beside the checkout."""
+    return Path(os.environ.get("CLRESAMPLE_DATA") or ROOT.parent / "shared" / "data")
+
+
 def run(main, parser):
     """Run `main(options)`; what a user can mend is told in one line, with exit status 2."""
     options = parser.parse_args()
