@@ -174,6 +174,7 @@ class _Fit:
         self.blend, self.settings = blend, settings
         check_observations(blend.observations)
         self.frame = blend.frame or model_frame(blend.observations)
+        _check_profiles(blend.sources, self.frame)
         positions = self.frame.place(blend.sources)
         inside = self.frame.inside(positions)
         self.messages = [f"source {i} at {p} [px] lies outside the model frame {self.frame.shape}"
@@ -340,6 +341,14 @@ def _settle(fits, live, stop, engine):
     for i, f in enumerate(fits):
         if live[i]:
             f.problem = saved[i] if f.status == "diverged" else now[i]
+
+
+def _check_profiles(sources, frame):
+    for i, source in enumerate(sources):
+        profile = getattr(source, "profile", None)
+        if profile is not None and np.shape(profile) != frame.shape:
+            raise ValueError(f"profile of source {i} has the shape {np.shape(profile)}, "
+                             f"the model frame {frame.shape}")
 
 
 def _padded_frame(frame, pad):

@@ -142,7 +142,7 @@ class _ProfileFit:
         self.frame, self.views, self.fit_sky = frame, views, fit_sky
         self.psf_moment = moment(frame.psf)
         self.positions = np.array(positions, dtype=np.float64)
-        self.kinds, self.source, mean, scatter = [], [], [], []
+        self.kinds, self.source, self.given, mean, scatter = [], [], {}, [], []
         scale = float(np.mean(frame.grid.pixel_scale_arcsec))
         for i, source in enumerate(sources):
             count = source.n_components if isinstance(source, Extended) else 1
@@ -153,6 +153,11 @@ class _ProfileFit:
                     n = 2 if source.free else 0
                     mean.append(np.zeros(n))
                     scatter.append(np.full(n, STAR_SCATTER_PX))
+                elif source.profile is not None:
+                    self.kinds.append("given")
+                    self.given[i] = _given(source.profile, frame.shape)
+                    mean.append(np.zeros(0))
+                    scatter.append(np.zeros(0))
                 else:
                     self.kinds.append("galaxy")
                     size = np.log(SIZE_ARCSEC / scale) + COMPONENT_SPREAD * (k - (count - 1) / 2)
@@ -175,6 +180,8 @@ class _ProfileFit:
             position = self.positions[source]
             if kind == "galaxy":
                 out.append(profile_with_slopes(part, position, shape, self.psf_moment))
+            elif kind == "given":
+                out.append(self.given[source][None])
             else:
                 moved = position + (part if kind == "star" else 0)
                 out.append(point(self.frame.psf, moved, shape)[: 1 + len(part)])
@@ -276,6 +283,12 @@ class _ProfileFit:
         slopes = np.array([_slope(model, axis) for axis in (-2, -1)])
         out = op.forward(slopes.astype(op.dtype)) * self.views[i_view].root
         return out.reshape(*out.shape[:2], -1).astype(np.float64)
+
+
+def _given(profile, shape):
+    """A source's own profile (Ny, Nx) at unit sum, on the frame and its padding."""
+    padding = [(0, n - m) for n, m in zip(shape, np.shape(profile), strict=True)]
+    return np.pad(np.asarray(profile, dtype=np.float64), padding) / np.sum(profile)
 
 
 def _slope(images, axis):

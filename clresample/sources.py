@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -52,11 +52,27 @@ class Point(Source):
 
 @dataclass(frozen=True, kw_only=True)
 class Extended(Source):
-    """A galaxy: `n_components` morphologies about one centre, each with a spectrum of its own."""
+    """A galaxy: `n_components` morphologies about one centre, each with a spectrum of its own.
+
+    profile (Ny, Nx) [1]: what its one morphology is expected to look like under the model's PSF, on
+        the frame's pixels, non-negative; None = a smooth profile fitted to the data
+    """
 
     n_components: int = 1
+    profile: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self):
         super().__post_init__()
         if self.n_components < 1:
             raise ValueError(f"n_components is {self.n_components}, must be 1 or more")
+        if self.profile is None:
+            return
+        if self.n_components > 1:
+            raise ValueError(f"profile is given for n_components = {self.n_components}: "
+                             "it serves one component")
+        profile = np.asarray(self.profile, dtype=np.float64)
+        if profile.ndim != 2 or not (np.isfinite(profile) & (profile >= 0)).all():
+            raise ValueError(f"profile with shape {profile.shape} must be (Ny, Nx), finite and "
+                             "not negative")
+        if not profile.any():
+            raise ValueError("profile is zero everywhere")

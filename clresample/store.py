@@ -146,7 +146,9 @@ def _about(result):
         "messages": result.messages,
         "seconds": result.seconds,
         "sources": [
-            {"kind": type(s).__name__} | {f.name: getattr(s, f.name) for f in fields(s)}
+            # without what fits start from (Extended.profile): the morphologies came of it
+            {"kind": type(s).__name__}
+            | {f.name: getattr(s, f.name) for f in fields(s) if f.compare}
             for s in result.sources
         ],
         "frame": _placing(result.frame.grid, result.frame.psf),
