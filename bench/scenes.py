@@ -1,0 +1,138 @@
+"""Simulated Euclid + Rubin scenes as blends to fit, and how well they were fitted."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+from astropy.table import Table
+
+from clresample import PSF
+from clresample.deblend import Blend
+from clresample.frame import model_frame
+from clresample.measure import summary
+from clresample.observation import Observation
+from clresample.simulate import sdr, simulate_scene
+from clresample.sources import Extended
+from clresample.surveys import NOTEBOOK_SURVEYS
+
+from .cases import Case, Galaxies
+from .common import data_folder
+
+# Each mode's instruments; the model always lives on Euclid's pixels, those of the truth.
+MODES = {"rubin": ("rubin",), "euclid": ("euclid",), "joint": ("euclid", "rubin")}
+COLOURS_FILE = "catsim_ugrizy.fits"
+# Relative change of a PSF that makes its operators new ones, and changes no result.
+NUDGE = 1e-9
+
+
+class Scenes:
+    """Scenes by their seed, of COSMOS galaxies with CatSim colours where the data folder has them.
+
+    folder: of the COSMOS galaxies; see `cases.Galaxies`
+    name: what the record says they are
+    """
+
+    def __init__(self, folder=None):
+        galaxies = Galaxies(folder)
+        path = data_folder() / COLOURS_FILE
+        self.catalogue = galaxies.catalogue
+        self.colours = Table.read(path) if path.is_file() else None
+        self.name = f"{galaxies.name}, {'power-law' if self.colours is None else 'CatSim'} colours"
+
+    def take(self, seed, *, angle_deg=0.0, flip=False):
+        """`SimulatedScene` of a seed, Rubin's pixels turned or mirrored."""
+        return simulate_scene(
+            seed, catalogue=self.catalogue, colours=self.colours, angle_deg=angle_deg, flip=flip
+        )
+
+
+def observation(image):
+    """A `SimulatedImage` as the fit is given it."""
+    return Observation(
+        image.data,
+        image.psf,
+        image.grid,
+        weights=image.weights,
+        channels=image.survey.bands,
+        zero_points=image.survey.zero_points_mag,
+        name=image.survey.name,
+    )
+
+
+def blend(scene, mode, *, profiles=None):
+    """What a fit in one of MODES is given: images, true positions, Euclid's pixels.
+
+    profiles (S, Ny, Nx): where the morphologies start; None leaves that to the fit
+    """
+    observations = tuple(observation(getattr(scene, name)) for name in MODES[mode])
+    if profiles is None:
+        profiles = [None] * len(scene.profiles)
+    sources = tuple(
+        Extended(position_px=tuple(position), profile=profile)
+        for position, profile in zip(scene.euclid.positions_px, profiles, strict=True)
+    )
+    return Blend(observations, sources, model_frame(observations, grid=scene.euclid.grid))
+
+
+def as_new(scene, rng):
+    """The same scene with PSFs that no operator was made for yet, the same to 1e-9."""
+
+    def nudged(image):
+        noise = rng.standard_normal(image.psf.images.shape)
+        return replace(image, psf=PSF(image.psf.images * (1 + NUDGE * noise)))
+
+    return replace(scene, euclid=nudged(scene.euclid), rubin=nudged(scene.rubin))
+
+
+def with_noise(scene, rng):
+    """The same scene with other noise."""
+    return replace(scene, euclid=scene.euclid.with_noise(rng), rubin=scene.rubin.with_noise(rng))
+
+
+def scores(result, scene):
+    """SDR [dB] of each source's morphology, against its truth on Euclid's pixels, both of sum 1."""
+    models = np.zeros_like(scene.euclid.truth)
+    for component in result.components:
+        (y, x), (n_y, n_x) = component.origin, component.morphology.shape
+        models[component.source, y : y + n_y, x : x + n_x] += component.morphology
+    return sdr(scene.euclid.truth, models, unit_sum=True).tolist()
+
+
+def chi2(result):
+    """Chi2 per pixel {instrument: over all its channels}."""
+    found = summary(result)
+    total = {}
+    for o in result.observations:
+        n = np.array([found["n_pixels"][name] for name in o.channels])
+        total[o.name] = float(n @ [found["chi2"][name] for name in o.channels] / n.sum())
+    return total
+
+
+def iterations(result):
+    """How many iterations a fit took."""
+    return summary(result)["n_iterations"]
+
+
+class GalSimClock:
+    """Times one GalSim quintic render, EUCLID -> RUBIN at N = 118, whenever it is asked."""
+
+    N_MODEL = 118
+
+    def __init__(self, galaxies=None):
+        case = Case(NOTEBOOK_SURVEYS["EUCLID"], NOTEBOOK_SURVEYS["RUBIN"], self.N_MODEL)
+        self._render = case.galsim()
+        self._stamp, _ = case.draw((galaxies or Galaxies()).take(0, case))
+        self._render(self._stamp)
+        self.times_s = []
+
+    def tick(self):
+        start = time.perf_counter()
+        self._render(self._stamp)
+        self.times_s.append(time.perf_counter() - start)
+
+    def take_ms(self):
+        """Median [ms] of the renders since it was last asked."""
+        times, self.times_s = self.times_s, []
+        return float(np.median(times)) * 1e3
