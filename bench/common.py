@@ -20,6 +20,7 @@ from clresample import DeviceError, __version__, get_device
 from clresample.surveys import NOTEBOOK_SURVEYS, PAPER_SURVEYS
 
 ROOT = Path(__file__).resolve().parents[1]
+REPORT = ROOT / "bench" / "report"
 # Calls of a fast function for each call of the slowest, so that its median is one of many.
 MAX_REPEATS = 20
 
@@ -36,6 +37,16 @@ class Parser(argparse.ArgumentParser):
 
     def add_json(self):
         self.add_argument("--json", metavar="FILE", type=Path, help="write rows and record there")
+
+    def add_folder(self):
+        self.add_argument(
+            "--folder",
+            type=Path,
+            default=REPORT,
+            metavar="FOLDER",
+            help="of the report: results go there, and an interrupted run continues from there "
+            "(bench/report)",
+        )
 
     def add_surveys(self):
         self.add_argument(
@@ -106,12 +117,22 @@ def data_folder():
 def run(main, parser):
     """Run `main(options)`; what a user can mend is told in one line, with exit status 2."""
     options = parser.parse_args()
+    json_file, folder = (getattr(options, name, None) for name in ("json", "folder"))
     try:
-        if options.json and (options.json.is_dir() or not options.json.resolve().parent.is_dir()):
-            raise BadOption(f"--json {options.json} is not a file in a folder that exists")
+        if json_file and (json_file.is_dir() or not json_file.resolve().parent.is_dir()):
+            raise BadOption(f"--json {json_file} is not a file in a folder that exists")
+        if folder:
+            _make_folder(folder)
         main(options)
     except (BadOption, DeviceError, ImportError) as error:
         parser.error(" ".join(str(error).split()))
+
+
+def _make_folder(folder):
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadOption(f"--folder {folder}: {error.strerror}") from error
 
 
 def on_one_thread():
@@ -175,6 +196,7 @@ def record(threads):
         "device": device.name,
         "platform": f"{device.platform}, {device.cl.platform.version}",
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}",
+        "load": f"{os.getloadavg()[0]:.1f} processes wanted a core, mean of the last minute",
         "python": platform.python_version(),
         "clresample": __version__,
         **{name: version(name) for name in ("numpy", "pyopencl", "galsim")},
@@ -203,13 +225,55 @@ def print_record(record):
 
 def write_json(path, content):
     """Write JSON whole or not at all; infinite and undefined numbers become null."""
-    text = json.dumps(_finite(content), indent=1, allow_nan=False) + "\n"
+    write_text(path, json.dumps(_finite(content), indent=1, allow_nan=False) + "\n")
+
+
+def write_text(path, text):
+    """Write a file whole or not at all."""
     part = path.with_name(path.name + ".part")
     try:
         part.write_text(text, encoding="utf-8")
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
+
+
+class Log:
+    """What a run has found so far, one line of JSON for each part; it goes on where it ended.
+
+    path: the file
+    settings: what all parts of it share; a file of another run is refused in one line
+    done: parts by their keys; a part appended twice counts as it was the last time
+    """
+
+    def __init__(self, path, settings):
+        self.path, self.done = path, {}
+        text = path.read_bytes() if path.exists() else b""
+        whole = text[: text.rfind(b"\n") + 1]
+        if len(whole) < len(text):  # the run ended in the middle of a line
+            os.truncate(path, len(whole))
+        if not whole:
+            self._append(settings)
+            return
+        found, *parts = map(json.loads, whole.splitlines())
+        for name, value in settings.items():
+            if found.get(name) != value:
+                raise BadOption(
+                    f"{path} comes from a run with {name} {found.get(name)}, not {value}: "
+                    "remove it or name another --folder"
+                )
+        for key, part in parts:
+            self.done[tuple(key)] = part
+
+    def append(self, key, part):
+        """Keep a part, `key` being a tuple of strings and numbers; interruptions leave it whole."""
+        self._append([key, part])
+        self.done[key] = part
+
+    def _append(self, content):
+        line = json.dumps(_finite(content), allow_nan=False) + "\n"
+        with self.path.open("ab", buffering=0) as file:
+            file.write(line.encode())
 
 
 def _finite(value):
