@@ -71,6 +71,9 @@ class Parser(argparse.ArgumentParser):
             metavar="N",
             help="galaxies in each mean SDR (%(default)s)",
         )
+        self.add_catalogue()
+
+    def add_catalogue(self):
         self.add_argument(
             "--catalogue",
             type=Path,
@@ -91,6 +94,14 @@ def positive(kind):
 
     convert.__name__ = f"positive {kind.__name__}"
     return convert
+
+
+def seed(text):
+    """An option's type: a whole number, 0 or more."""
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is below 0")
+    return value
 
 
 def pair_of_surveys(text):
@@ -221,6 +232,14 @@ def print_row(columns, row):
 def print_record(record):
     for name, value in record.items():
         print(f"{name}: {value}")
+
+
+def print_summary(summary):
+    """Groups of figures, one on each line; see `summarise` of a benchmark."""
+    for group, figures in summary.items():
+        print(f"{group}:")
+        for name, value in figures.items():
+            print(f"  {name}: {value:.3f}" if isinstance(value, float) else f"  {name}: {value}")
 
 
 def write_json(path, content):

@@ -110,6 +110,13 @@ def chi2(result):
     return total
 
 
+def chi2_of_all(result):
+    """Chi2 per pixel over all channels of all instruments."""
+    found = summary(result)
+    n = np.array(list(found["n_pixels"].values()))
+    return float(n @ list(found["chi2"].values()) / n.sum())
+
+
 def iterations(result):
     """How many iterations a fit took."""
     return summary(result)["n_iterations"]
@@ -131,6 +138,10 @@ class GalSimClock:
         start = time.perf_counter()
         self._render(self._stamp)
         self.times_s.append(time.perf_counter() - start)
+
+    def ticks(self, n):
+        for _ in range(n):
+            self.tick()
 
     def take_ms(self):
         """Median [ms] of the renders since it was last asked."""
