@@ -27,13 +27,15 @@ HISTORY = 16
 
 @dataclass(frozen=True)
 class Prior:
-    """What is expected of a morphology S = base (1 + alpha K z), z unit normal.
+    """What is expected of a morphology: S = base + alpha sqrt(base) K z, z unit normal.
 
-    alpha: relative scatter of a pixel about its expected profile
+    The structure of galaxies is made of clumps, whose number, and so the variance, goes with the light.
+
+    alpha: scatter of the brightest pixel about its expected profile, relative
     correlation_px [model px]: Gaussian sigma of the kernel K that correlates neighbours
     """
 
-    alpha: float = 0.3
+    alpha: float = 0.1
     correlation_px: float = 2.0
 
     @property
@@ -140,7 +142,7 @@ class Engine:
         self.field = flat([p.field for p in problems])
         self.morph = flat([p.morph for p in problems])
         alpha = self.prior.alpha if self.prior else 0.0
-        self.amp = flat([[alpha * base for base in p.base] for p in problems])
+        self.amp = flat([[alpha * np.sqrt(base) for base in p.base] for p in problems])
         zeros = self.device.zeros
         self.moments = [
             flat([p.moments_morph[i] for p in problems]) if problems[0].moments_morph

@@ -37,7 +37,7 @@ LONGEST_STEP, N_ITERATIONS, ENOUGH = 0.7, 10, 0.5
 # Sources exactly on top of each other share their light: a ridge on the scaled normal matrix
 RIDGE = 1e-8
 # A box holds pixels brighter than this part of the peak: what matters at the noise, within bounds
-BOX_NOISE, BOX_FAINTEST, BOX_BRIGHTEST = 0.1, 1e-4, 5e-3
+BOX_NOISE, BOX_FAINTEST, BOX_BRIGHTEST = 0.1, 1e-5, 5e-3
 SMALLEST_RADIUS_PX = 5
 # Light this far under the brightest is none: float32 would keep it as denormals, 20 times slower.
 DARK = 1e-20
