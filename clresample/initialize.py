@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from .frame import Frame
-from .profiles import moment, point, profile, profile_with_slopes
+from .profiles import moment, point, profile
 from .resample import Resampler
 from .sources import Extended, Point
 
@@ -58,8 +58,8 @@ class View:
 
     def render(self, images):
         """Whitened unit-spectrum images (n, Co, My * Mx) of model images (n, Ny, Nx)."""
-        faint = np.abs(images) < DARK * np.abs(images).max(initial=0)
-        images = np.where(faint, 0, images).astype(self.op.dtype)
+        images = images.astype(self.op.dtype)
+        images[np.abs(images) < DARK * np.abs(images).max(initial=0)] = 0
         out = self.op.render(images) * self.root
         return out.reshape(*out.shape[:2], -1).astype(np.float64)
 
@@ -179,7 +179,7 @@ class _ProfileFit:
         for kind, source, part in zip(self.kinds, self.source, parts, strict=True):
             position = self.positions[source]
             if kind == "galaxy":
-                out.append(profile_with_slopes(part, position, shape, self.psf_moment))
+                out.append(profile(part, position, shape, self.psf_moment))
             elif kind == "given":
                 out.append(self.given[source][None])
             else:

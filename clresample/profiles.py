@@ -13,38 +13,37 @@ import numpy as np
 
 from .psf import PSF
 
-# Steps of the central differences in (ln sigma, g1, g2, ln beta): errors of their square, under 1e-3.
-STEPS = (0.02, 0.02, 0.02, 0.05)
-
-
 def covariance(parameters, psf_moment):
-    """C (2, 2) [px^2] from (ln sigma [px], g1, g2, ln beta); |e| = |g| / sqrt(1 + g^2) stays under 1."""
-    sigma2 = np.exp(2 * parameters[0])
-    e1, e2 = np.asarray(parameters[1:3]) / np.sqrt(1 + np.dot(parameters[1:3], parameters[1:3]))
-    return sigma2 * np.array([[1 + e1, e2], [e2, 1 - e1]]) + psf_moment
+    """C (2, 2) [px^2] and its derivatives (3, 2, 2) by (ln sigma [px], g1, g2).
+
+    e = g / sqrt(1 + g^2), so that |e| stays under 1
+    """
+    log_sigma, g1, g2 = parameters[:3]
+    sigma2, root = np.exp(2 * log_sigma), np.sqrt(1 + g1**2 + g2**2)
+    shape = np.array([[[1, 0], [0, -1]], [[0, 1], [1, 0]]])
+    e = np.array([g1, g2]) / root
+    de = (np.eye(2) - np.outer(e, e)) / root  # de_i / dg_j
+    own = sigma2 * (np.eye(2) + np.tensordot(e, shape, 1))
+    slopes = np.array([2 * own, *(sigma2 * np.tensordot(de[:, j], shape, 1) for j in (0, 1))])
+    return own + psf_moment, slopes
 
 
-def profile(parameters, position, shape, psf_moment, origin=(0, 0)):
-    """Profile (ny, nx) of unit integral on the pixels from `origin` on."""
-    c = covariance(parameters, psf_moment)
-    det = np.linalg.det(c)
-    dy, dx = (np.arange(n) + o - p for n, o, p in zip(shape, origin, position, strict=True))
+def profile(parameters, position, shape, psf_moment):
+    """Profile of unit integral and its derivatives by (ln sigma, g1, g2, ln beta), (5, ny, nx)."""
+    c, slopes = covariance(parameters, psf_moment)
+    inverse, beta = np.linalg.inv(c), np.exp(parameters[3])
+    dy, dx = (np.arange(n) - p for n, p in zip(shape, position, strict=True))
     dy = dy[:, None]
-    q = (c[1, 1] * dy**2 - 2 * c[0, 1] * dy * dx + c[0, 0] * dx**2) / det
-    beta = np.exp(parameters[3])
-    return (1 + q / (2 * beta)) ** (-beta - 1) / (2 * np.pi * np.sqrt(det))
-
-
-def profile_with_slopes(parameters, position, shape, psf_moment):
-    """The profile and its derivatives by each parameter (5, ny, nx)."""
-    images = [profile(parameters, position, shape, psf_moment)]
-    for k, step in enumerate(STEPS):
-        high, low = np.array(parameters), np.array(parameters)
-        high[k] += step
-        low[k] -= step
-        images.append((profile(high, position, shape, psf_moment)
-                       - profile(low, position, shape, psf_moment)) / (2 * step))
-    return np.array(images)
+    u, v = (inverse[i, 0] * dy + inverse[i, 1] * dx for i in (0, 1))  # C^-1 x
+    q = dy * u + dx * v
+    s = np.exp(-(beta + 1) * np.log1p(q / (2 * beta))) / (2 * np.pi * np.sqrt(np.linalg.det(c)))
+    fall = (beta + 1) / (2 * beta + q)  # - d ln S / dq
+    out = [s]
+    for dc in slopes:
+        dq = -(dc[0, 0] * u**2 + 2 * dc[0, 1] * u * v + dc[1, 1] * v**2)
+        out.append(-s * (fall * dq + 0.5 * np.trace(inverse @ dc)))
+    out.append(s * (q * fall - beta * np.log1p(q / (2 * beta))))
+    return np.array(out)
 
 
 def moment(psf: PSF) -> np.ndarray:
