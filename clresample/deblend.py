@@ -14,7 +14,7 @@ from .frame import Frame, model_frame
 from .initialize import View, box_around, solve_spectra, start
 from .observation import Observation, check_observations
 from .operators import operator
-from .prox import Chain, Positivity
+from .prox import Chain, Monotone, Positivity
 from .result import Component, Result
 from .shifts import shift_steps
 from .sources import Extended, Point, Source
@@ -71,16 +71,16 @@ class Settings:
         over 5 iterations
     prior: the Prior of extended sources' morphologies about their smooth profiles; None fits the
         morphologies themselves, by the constraints alone
-    constraints: Chain of proximal operators on the morphologies
+    constraints: Chain of proximal operators on the morphologies: non-negative, and monotone by the sweep
     rates: the solver's steps
     fit_shifts: let each observation but the first move by a constant shift
     fit_sky: fit a constant per channel
     """
 
-    max_iter: int = 100
+    max_iter: int = 200
     tol: float = 1e-4
     prior: Prior | None = Prior()
-    constraints: Chain = field(default_factory=lambda: Chain(Positivity()))
+    constraints: Chain = field(default_factory=lambda: Chain(Positivity(), Monotone()))
     rates: Rates = Rates()
     fit_shifts: bool = False
     fit_sky: bool = False
