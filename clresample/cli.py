@@ -11,6 +11,7 @@ import argparse
 import sys
 
 from . import __version__
+from .cli_deblend import add_deblend
 from .cli_options import add_device_option
 from .cli_resample import add_resample
 from .device import DeviceError, get_device, list_devices
@@ -93,7 +94,7 @@ def _fail(arguments, message):
     return 2
 
 
-COMMANDS = (add_resample, add_devices)
+COMMANDS = (add_resample, add_deblend, add_devices)
 
 
 if __name__ == "__main__":
