@@ -11,7 +11,9 @@ import platform
 import re
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from importlib.metadata import version
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -80,6 +82,15 @@ class Parser(argparse.ArgumentParser):
             metavar="FOLDER",
             help="COSMOS galaxies; default: cosmos in CLRESAMPLE_DATA, or in the "
             "data folder beside the checkout, or else parametric galaxies",
+        )
+
+    def add_processes(self):
+        self.add_argument(
+            "--processes",
+            type=positive(int),
+            default=2,
+            metavar="N",
+            help="processes, of one thread each (%(default)s)",
         )
 
 
@@ -167,6 +178,17 @@ def on_one_thread():
         command = [sys.executable, *sys.orig_argv[1:]]
         os.execve(sys.executable, command, {**os.environ, **wanted})
     return " ".join(f"{name}={value}" for name, value in wanted.items())
+
+
+def in_processes(function, tasks, n_processes):
+    """Pairs (task, function(*task)) in the order in which other processes finish them."""
+    pool = ProcessPoolExecutor(n_processes, mp_context=get_context("spawn"))
+    try:
+        futures = {pool.submit(function, *task): task for task in tasks}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def interleaved_ms(functions, *, seconds, least=5):
