@@ -15,6 +15,7 @@ from .initialize import View, box_around, solve_spectra, start
 from .observation import Observation, check_observations
 from .operators import operator
 from .prox import Chain, Monotone, Positivity
+from .resize import resized
 from .result import Component, Result
 from .shifts import shift_steps
 from .sources import Extended, Point, Source
@@ -29,6 +30,8 @@ PATIENCE = 15
 DIVERGED = 10.0
 # A batch is repacked when this part of it has converged.
 REPACK = 0.25
+# So often (iterations) boxes are fitted to the light they hold.
+RESIZE = 40
 # Ragged batches: frames and observations are padded to multiples of this [px].
 PAD_PX = 16
 # Spectrum steps come in units of the flux's error plus this part of the flux.
@@ -78,7 +81,7 @@ class Settings:
     """
 
     max_iter: int = 200
-    tol: float = 1e-4
+    tol: float = 1e-5
     prior: Prior | None = Prior()
     constraints: Chain = field(default_factory=lambda: Chain(Positivity(), Monotone()))
     rates: Rates = Rates()
@@ -202,14 +205,15 @@ class _Fit:
     def _problem(self, sources):
         begin, views = self.start, self.views
         peak = begin.base.max(axis=(1, 2), keepdims=True)
-        base = begin.base / np.where(peak > 0, peak, 1)
+        self.base = base = begin.base / np.where(peak > 0, peak, 1)
+        self.noise = _pixel_noise(views)
         spectra = begin.spectra * peak[:, 0]
         units = [v.render(base) for v in views]
         noise = 1 / np.sqrt(np.maximum(
             np.concatenate([(u**2).sum(axis=2) for u in units], axis=1), 1e-30))
         origin, center, morphs = [], [], []
         for i, image in enumerate(base):
-            brightness = (spectra[i] / _pixel_noise(views)).max()
+            brightness = (spectra[i] / self.noise).max()
             low, size, middle = box_around(image, begin.positions[begin.source[i]], brightness)
             origin.append(low)
             center.append(middle)
@@ -281,14 +285,18 @@ def _iterate(fits, settings, device, dtype, progress=None):
                 break
             if settings.fit_shifts and engine.n_steps % MOVE == 0:
                 _move(running, live, engine)
-            if (~live).mean() >= REPACK:
-                running = [f for f, on in zip(running, live, strict=True) if on]
-                now = engine.problems_now()
-                for f, p in zip(running, [p for p, on in zip(now, live, strict=True) if on],
-                                strict=True):
-                    f.problem = p
-                engine = _engine(running, settings, device, dtype)
-                live = np.ones(len(running), bool)
+            resize = engine.n_steps % RESIZE == 0
+            if resize or (~live).mean() >= REPACK:
+                going = [(f, p) for f, p, on in zip(running, engine.problems_now(), live, strict=True)
+                         if on]
+                changed = len(going) < len(running)
+                for f, p in going:
+                    f.problem = resized(p, f.base, f.noise) if resize else p
+                    changed |= f.problem is not p
+                if changed:
+                    running = [f for f, _ in going]
+                    engine = _engine(running, settings, device, dtype)
+                    live = np.ones(len(running), bool)
     except KeyboardInterrupt:
         for f, p, on in zip(running, engine.problems_now(saved=True), live, strict=True):
             if on:

@@ -36,8 +36,9 @@ MODEL_ERROR = 0.15
 LONGEST_STEP, N_ITERATIONS, ENOUGH = 0.7, 10, 0.5
 # Sources exactly on top of each other share their light: a ridge on the scaled normal matrix
 RIDGE = 1e-8
-# A box holds pixels brighter than this part of the peak: what matters at the noise, within bounds
-BOX_NOISE, BOX_FAINTEST, BOX_BRIGHTEST = 0.1, 1e-5, 5e-3
+# A box holds what reaches this part of the noise: the profile, or the structure that the prior allows
+# about it (alpha = 0.1 of the root of the light); as a part of the peak, within these bounds.
+BOX_NOISE, BOX_FAINTEST, BOX_BRIGHTEST = 0.1, 1e-7, 5e-3
 SMALLEST_RADIUS_PX = 5
 # Light this far under the brightest is none: float32 would keep it as denormals, 20 times slower.
 DARK = 1e-20
@@ -318,13 +319,19 @@ def _accumulate(state, columns, lit, weight, residual):
     state["right"] -= solved.T @ (lit_weighted @ residual)
 
 
+def box_threshold(brightness):
+    """Part of the peak above which a pixel is worth its place, the peak being `brightness` sigma."""
+    brightness = max(brightness, 1.0)
+    return np.clip(min(BOX_NOISE / brightness, brightness**-2), BOX_FAINTEST, BOX_BRIGHTEST)
+
+
 def box_around(base, position, brightness):
     """Box of one profile: origin (2,) and shape (2,) inside the frame, and its centre pixel (2,).
 
     base (Ny, Nx): profile; position (2,) [px]; brightness: its peak over the noise of a model pixel,
     in the channel that sees it best
     """
-    threshold = np.clip(BOX_NOISE / max(brightness, 1e-30), BOX_FAINTEST, BOX_BRIGHTEST) * base.max()
+    threshold = box_threshold(brightness) * base.max()
     pixel = np.clip(np.floor(np.asarray(position) + 0.5).astype(int), 0, np.array(base.shape) - 1)
     lit = base > threshold
     low, high = np.zeros(2, int), np.zeros(2, int)
