@@ -198,7 +198,7 @@ class Engine:
             k = d.kernel(file, name, **options, **defines)
             k.set_args(*(a.base_data if hasattr(a, "base_data") else a for a in args))
             self._kept.append(args)  # OpenCL does not keep what a kernel's arguments point to
-            return lambda: d.launch(k, size, local)
+            return lambda: self._launch(k, size, local)
 
         self._iteration = []
         for j, op in enumerate(self.ops):
@@ -276,7 +276,7 @@ class Engine:
         for launch in self._iteration:
             launch()
         self._losses.set_arg(7, np.int32(i_loss))
-        self.device.launch(self._losses, (len(self.problems),))
+        self._launch(self._losses, (len(self.problems),))
 
     def save(self):
         """Keep a copy of the parameters on the device."""
@@ -293,7 +293,7 @@ class Engine:
         t = [real(1 / (1 - beta**self.n_steps)) for beta in (BETA1, BETA2)]
         for k, value in enumerate((real(self.rates.spectrum), *t)):
             self._spectra_kernel.set_arg(6 + k, value)
-        self.device.launch(self._spectra_kernel, (self.spectra.size,))
+        self._launch(self._spectra_kernel, (self.spectra.size,))
         if self.problems[0].fit_sky:
             self._sky_step()
         if not self.n_free:
@@ -303,13 +303,20 @@ class Engine:
             self._morph_kernel.set_arg(self._n_morph_args + k, value)
         if self.prior is not None:
             self._blur_gradient()
-        self.device.launch(self._morph_kernel, self._morph_size)
+        self._launch(self._morph_kernel, self._morph_size)
         if self.prior is not None:
             self._blur_field()
             self._form()
         self.chain.prox(self.morph, self.boxes, step=rate, active=self.free, factor=self.factor)
         if self.prior is None:
             self._rescale()
+
+    def _launch(self, kernel, size, local=None):
+        """Groups of one on CPUs: left to choose, their runtimes pick another size for every box and
+        build each kernel anew for it, 0.6 s in all; a GPU's drivers choose well and build once."""
+        if local is None and self.device.kind == "CPU":
+            local = (1,) * len(size)
+        self.device.launch(kernel, size, local)
 
     def channel(self, i_observation) -> int:
         """First channel of an observation."""
