@@ -111,7 +111,7 @@ def run(arguments):
     if not arguments.no_figure:
         from .plot_deblended import plot_deblended
 
-        plot_deblended(paths[3], result, title=Path(arguments.scene).name)
+        plot_deblended(paths[3], result, title=", ".join(o.name for o in result.observations))
     _report(arguments, result, summary(result), device, time.perf_counter() - started)
     for path in paths:
         print(path)

@@ -166,7 +166,7 @@ def _write_png(path, figure):
     part = path.with_name(f".part-{os.getpid()}-{path.name}")
     try:
         few = Image.open(drawn).convert("RGB")
-        few = few.quantize(N_COLOURS, Image.Quantize.MAXCOVERAGE, dither=0)
+        few = few.quantize(N_COLOURS, Image.Quantize.MAXCOVERAGE, kmeans=4, dither=0)
         few.save(part, format="png", optimize=True)
         os.replace(part, path)
     finally:

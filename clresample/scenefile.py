@@ -23,6 +23,7 @@ from .frame import Frame, model_frame
 from .grid import intersection, union
 from .io import FitsError, _choose_bands, _choose_hdu, _native, _open, _pixels, read_image, read_psf
 from .observation import Observation, check_observations
+from .prox import Chain, Positivity
 from .psf import PSFWarning
 from .scenekeys import SceneError, parse
 from .sources import Source
@@ -83,7 +84,7 @@ def read_scene(path) -> SceneFile:
     return SceneFile(
         tuple(observations),
         frame,
-        replace(Settings(), **tables["fit"]),
+        _settings(tables["fit"]),
         sources,
         detection.get("threshold", THRESHOLD),
         detection.get("passes", 2),
@@ -137,6 +138,16 @@ def _observation(where, folder, table, inputs, notes):
         raise SceneError(f"{where}: {_by_key(error)}") from error
     notes += [f"{name}: {message}" for message in observation.messages]
     return observation
+
+
+def _settings(table):
+    """`monotone = false`: morphologies of any form, not negative; structure_px is the prior's."""
+    given, default = dict(table), Settings()
+    if not given.pop("monotone", True):
+        given["constraints"] = Chain(Positivity())
+    if "structure_px" in given:
+        given["prior"] = replace(default.prior, correlation_px=given.pop("structure_px"))
+    return replace(default, **given)
 
 
 def _by_key(error):

@@ -102,6 +102,8 @@ TABLES = {
     "fit": {
         "max_iter": Kind("a whole number, 0 or more", _whole),
         "tol": Kind("a number from 0 to 1", lambda value: _number(value) and 0 <= value < 1),
+        "monotone": SWITCH,
+        "structure_px": POSITIVE,
         "fit_shifts": SWITCH,
         "fit_sky": SWITCH,
     },

@@ -9,6 +9,7 @@ from astropy.table import QTable, Table
 from clresample.catalogue import read_sources
 from clresample.grid import Grid
 from clresample.io import write_fits
+from clresample.prox import Chain, Positivity
 from clresample.psf import PSF
 from clresample.scenefile import SceneError, read_scene
 from clresample.sources import Extended, Point
@@ -126,6 +127,8 @@ psf_sigma_px = 0.7
 [fit]
 max_iter = 7
 tol = 0.01
+monotone = false
+structure_px = 1.5
 fit_shifts = true
 fit_sky = true
 """,
@@ -144,6 +147,7 @@ fit_sky = true
     np.testing.assert_allclose(found.frame.place(found.sources), [(10, 12), (20, 22)], atol=1e-6)
     s = found.settings
     assert (s.max_iter, s.tol, s.fit_shifts, s.fit_sky) == (7, 0.01, True, True)
+    assert s.prior.correlation_px == 1.5 and str(s.constraints) == str(Chain(Positivity()))
     assert set(found.inputs) == {
         "scene",
         "sources",
