@@ -185,7 +185,7 @@ class _ProfileFit:
                 out.append(self.given[source][None])
             else:
                 moved = position + (part if kind == "star" else 0)
-                out.append(point(self.frame.psf, moved, shape)[: 1 + len(part)])
+                out.append(point(self.frame.psf, moved, shape, slopes=kind == "star"))
         return out
 
     def linearise(self, theta):

@@ -54,10 +54,12 @@ def moment(psf: PSF) -> np.ndarray:
     return np.array([[yy, yx], [yx, xx]])
 
 
-def point(psf: PSF, position, shape):
+def point(psf: PSF, position, shape, *, slopes=True):
     """The PSF at a sub-pixel position and its derivatives by (y, x) (3, ny, nx), unit integral.
 
         S(x) = K^-2 sum_nu P^(nu) exp(2 pi i nu.(x - c))      K > n + the PSF's own extent
+
+    slopes: with the derivatives; else (1, ny, nx)
     """
     extent = int(np.ceil(max(psf.images.shape[1:]) * psf.spacing))
     n_fft = max(shape) + 2 * extent + 1
@@ -66,8 +68,11 @@ def point(psf: PSF, position, shape):
     spectrum = psf.spectrum(nu, nu)[0] / n_fft**2
     waves_y, waves_x = (np.exp(2j * np.pi * np.outer(np.arange(n) - p, nu))
                         for n, p in zip(shape, position, strict=True))
+    half = waves_y @ spectrum
+    image = (half @ waves_x.T).real
+    if not slopes:
+        return image[None]
     slope = -2j * np.pi * nu
-    return np.array([
-        (waves_y @ (spectrum * by * bx) @ waves_x.T).real
-        for by, bx in ((1, 1), (slope[:, None], 1), (1, slope))
-    ])
+    by_y = (waves_y * slope) @ spectrum @ waves_x.T
+    by_x = (half * slope) @ waves_x.T
+    return np.array([image, by_y.real, by_x.real])
