@@ -40,6 +40,7 @@ LAYERS = [
         "simulate",
         "plot",
         "demo",
+        "demo_resample",
         "cli",
         "cli_options",
         "cli_resample",
