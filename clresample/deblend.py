@@ -1,4 +1,4 @@
-"""Joint deblending: one scene fitted to every instrument's images at once, one blend or thousands."""
+"""Joint deblending: one scene fitted to all instruments' images, one blend or thousands."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .prox import Chain, Monotone, Positivity
 from .resize import resized
 from .result import Component, Result
 from .shifts import shift_steps
-from .sources import Extended, Point, Source
+from .sources import Point, Source
 
 # So often (iterations) losses come back from the device.
 CHECK = 5
@@ -74,7 +74,8 @@ class Settings:
         over 5 iterations
     prior: the Prior of extended sources' morphologies about their smooth profiles; None fits the
         morphologies themselves, by the constraints alone
-    constraints: Chain of proximal operators on the morphologies: non-negative, and monotone by the sweep
+    constraints: Chain of proximal operators on the morphologies: non-negative, and monotone by the
+        sweep
     rates: the solver's steps
     fit_shifts: let each observation but the first move by a constant shift
     fit_sky: fit a constant per channel
@@ -99,7 +100,7 @@ def deblend(observations, sources, *, frame=None, settings=None, device=None,
             dtype=np.float32, progress=None) -> Result:
     """Fit one scene to all observations at once.
 
-        min 1/2 sum_o |sqrt(w_o) (R_o sum_s A_s S_s - d_o)|^2 + 1/2 |z|^2,   A >= 0, S in constraints
+        min 1/2 sum_o |sqrt(w_o) (R_o sum_s A_s S_s - d_o)|^2 + 1/2 |z|^2,  A >= 0, S constrained
 
     observations, sources, frame: see Blend; settings: see Settings
     progress: called every few iterations with their number so far and the loss (1,)
@@ -207,8 +208,8 @@ class _Fit:
         peak = begin.base.max(axis=(1, 2), keepdims=True)
         self.base = base = begin.base / np.where(peak > 0, peak, 1)
         self.noise = _pixel_noise(views)
-        spectra = begin.spectra * peak[:, 0]
         units = [v.render(base) for v in views]
+        spectra, sky, _ = solve_spectra(units, views, self.settings.fit_sky)
         noise = 1 / np.sqrt(np.maximum(
             np.concatenate([(u**2).sum(axis=2) for u in units], axis=1), 1e-30))
         origin, center, morphs = [], [], []
@@ -228,7 +229,7 @@ class _Fit:
             field=[np.zeros_like(m) for m in morphs], morph=[m.copy() for m in morphs],
             fixed=np.array([isinstance(sources[i], Point) for i in begin.source]),
             spectra=spectra, scale=np.where(seen, noise + SPECTRUM_PART * spectra, 0),
-            sky=begin.sky, fit_sky=self.settings.fit_sky,
+            sky=sky, fit_sky=self.settings.fit_sky,
         )
 
     @property
@@ -287,8 +288,8 @@ def _iterate(fits, settings, device, dtype, progress=None):
                 _move(running, live, engine)
             resize = engine.n_steps % RESIZE == 0
             if resize or (~live).mean() >= REPACK:
-                going = [(f, p) for f, p, on in zip(running, engine.problems_now(), live, strict=True)
-                         if on]
+                now = zip(running, engine.problems_now(), live, strict=True)
+                going = [(f, p) for f, p, on in now if on]
                 changed = len(going) < len(running)
                 for f, p in going:
                     f.problem = resized(p, f.base, f.noise) if resize else p
@@ -328,7 +329,7 @@ def _engine(fits, settings, device, dtype):
 
 
 def _stopped(fits, live, losses, settings):
-    """Which fits end here (B,), from the losses (n, B) of the last iterations; they are told why."""
+    """Which fits end here (B,), from the losses (n, B) of the last iterations."""
     stop = np.zeros(len(fits), bool)
     for i, f in enumerate(fits):
         if not live[i]:

@@ -1,7 +1,8 @@
 """The iteration of a batch of scenes, all of it on the device: model, residual, gradients, update.
 
     L = 1/2 sum_o |sqrt(w_o) (R_o M + sky - d_o)|^2 + 1/2 |z|^2,      M_c = sum_s A[s, c] S_s
-    G_o = R_o^T w_o (R_o M + sky - d_o),  dS_s = sum_c A[s, c] G_c on the box,  dA[s, c] = <S_s, G_c>
+    G_o = R_o^T w_o (R_o M + sky - d_o),  dS_s = sum_c A[s, c] G_c on the box,
+    dA[s, c] = <S_s, G_c>
 
 The kernels are scene.cl (model, residual, gradients) and update.cl (proximal AMSGrad).
 """
@@ -29,7 +30,7 @@ HISTORY = 16
 class Prior:
     """What is expected of a morphology: S = base + alpha sqrt(base) K z, z unit normal.
 
-    The structure of galaxies is made of clumps, whose number, and so the variance, goes with the light.
+    The structure of galaxies is made of clumps, whose number, and so the variance, follows light.
 
     alpha: scatter of the brightest pixel about its expected profile, relative
     correlation_px [model px]: Gaussian sigma of the kernel K that correlates neighbours
@@ -204,7 +205,7 @@ class Engine:
         for j, op in enumerate(self.ops):
             n_bands, my, mx = op.shape_out
             channel = self.channel(j)
-            geometry = n_channels, i32(channel), i32(n_bands), i32(self.shape[0]), i32(self.shape[1])
+            geometry = n_channels, i32(channel), i32(n_bands), *map(i32, self.shape)
             group = 1 if cpu else GROUP_ELSEWHERE
             first_width = 1 if cpu else self.shape[1]
             self._iteration += [
@@ -260,7 +261,7 @@ class Engine:
         self._n_morph_args, self._morph_size = len(args), size
 
     def run(self, n_steps):
-        """Losses (n_steps, B) before each of `n_steps` iterations, which are done when they come."""
+        """Losses (n_steps, B) before each of `n_steps` iterations; these are done by then."""
         for i in range(n_steps):
             self.gradient(i)
             self.update()

@@ -1,4 +1,4 @@
-"""Where a fit starts: smooth profiles, positions of free stars and shifts, fitted to all data at once.
+"""Where a fit starts: smooth profiles, free stars' positions and shifts, fitted to all data.
 
 Gauss-Newton on the shapes with the spectra eliminated (variable projection), over every channel of
 every instrument, so that a source that only one of them sees still starts right:
@@ -6,7 +6,7 @@ every instrument, so that a source that only one of them sees still starts right
     min  sum_pixels w (d - sum_s A_s R S_s)^2 + sum ((theta - mean) / scatter)^2,     A >= 0
 
 Smooth profiles leave a tenth of a bright galaxy's light unexplained; the weights know it,
-1/w = sigma^2 + (MODEL_ERROR * model)^2, or a neighbour's spiral arms would be taken for a faint source.
+1/w = sigma^2 + (MODEL_ERROR * model)^2, or spiral arms would be taken for faint neighbours.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from .profiles import moment, point, profile
 from .resample import Resampler
 from .sources import Extended, Point
 
-# What galaxies are before anyone looks: Gaussian sigma 0.25" (half-light radius 0.3") with a scatter of
-# 0.4 in its logarithm, as in deep fields; ellipticity 0.26 per component (Leauthaud et al. 2007);
-# wings between exponential and Gaussian.
+# What galaxies are before anyone looks: Gaussian sigma 0.25" (half-light radius 0.3") with a
+# scatter of 0.4 in its logarithm, as in deep fields; ellipticity 0.26 per component (Leauthaud et
+# al. 2007); wings between exponential and Gaussian.
 SIZE_ARCSEC, SIZE_SCATTER = 0.25, 0.4
 ELLIPTICITY_SCATTER = 0.26
 WINGS, WINGS_SCATTER = 5.0, 0.7
@@ -36,8 +36,8 @@ MODEL_ERROR = 0.15
 LONGEST_STEP, N_ITERATIONS, ENOUGH = 0.7, 10, 0.5
 # Sources exactly on top of each other share their light: a ridge on the scaled normal matrix
 RIDGE = 1e-8
-# A box holds what reaches this part of the noise: the profile, or the structure that the prior allows
-# about it (alpha = 0.1 of the root of the light); as a part of the peak, within these bounds.
+# A box holds what reaches this part of the noise: the profile, or the structure that the prior
+# allows about it (alpha = 0.1 of the root of the light); as a part of the peak, within bounds.
 BOX_NOISE, BOX_FAINTEST, BOX_BRIGHTEST = 0.1, 1e-7, 5e-3
 SMALLEST_RADIUS_PX = 5
 # Light this far under the brightest is none: float32 would keep it as denormals, 20 times slower.
@@ -118,7 +118,7 @@ def solve_spectra(units, views, sky=False, model=None):
 
 
 def _non_negative(rows, target, weight, n_free=0):
-    """min |target - a rows|^2 with a >= 0 but for the last n_free; the covariance of a, unconstrained."""
+    """min |target - a rows|^2, a >= 0 but for the last n_free; and a's unconstrained covariance."""
     normal = (rows * weight) @ rows.T
     size = np.sqrt(np.diag(normal))
     seen = size > 1e-12 * size.max(initial=0)
@@ -189,7 +189,7 @@ class _ProfileFit:
         return out
 
     def linearise(self, theta):
-        """Model at theta: spectra, residuals, chi2's normal equations with the spectra eliminated."""
+        """At theta: spectra, chi2, and its normal equations with the spectra eliminated."""
         images = self.images(theta)
         self._set_shifts(theta)
         rendered = [view.render(np.concatenate(images)) for view in self.views]
@@ -222,10 +222,10 @@ class _ProfileFit:
                     lit = np.concatenate([lit, [view.root[c].ravel()]])
                 _accumulate(state, columns, lit, weight, residual)
                 channel += 1
-        pull = (self.mean - theta) / self.scatter**2
-        state["chi2"] += float(((self.mean - theta) / self.scatter) @ ((self.mean - theta) / self.scatter))
+        pull = (self.mean - theta) / self.scatter
+        state["chi2"] += float(pull @ pull)
         state["normal"] += np.diag(self.scatter**-2.0)
-        state["right"] += pull
+        state["right"] += pull / self.scatter
         return state
 
     def run(self):
@@ -277,7 +277,7 @@ class _ProfileFit:
                     view.op.shift = first + move
 
     def _shift_slopes(self, i_view, images, spectra):
-        """Derivatives (2, Co, P) of a view's whitened model by its shift: R of the model's slopes."""
+        """Derivatives (2, Co, P) of a view's whitened model by its shift: R of its slopes."""
         op = self.views[i_view].op
         units = np.array([i[0] for i in images])
         model = np.einsum("nc,nyx->cyx", spectra[:, : op.shape_out[0]], units)
@@ -300,7 +300,8 @@ def _slope(images, axis):
         nu[n // 2] = 0  # a lone Nyquist term has no slope
     shape = [1] * images.ndim
     shape[axis] = n
-    return np.fft.ifft(np.fft.fft(images, axis=axis) * (2j * np.pi * nu).reshape(shape), axis=axis).real
+    waves = np.fft.fft(images, axis=axis) * (2j * np.pi * nu).reshape(shape)
+    return np.fft.ifft(waves, axis=axis).real
 
 
 def _accumulate(state, columns, lit, weight, residual):
@@ -320,7 +321,7 @@ def _accumulate(state, columns, lit, weight, residual):
 
 
 def box_threshold(brightness):
-    """Part of the peak above which a pixel is worth its place, the peak being `brightness` sigma."""
+    """Part of the peak above which a pixel is worth its place; the peak is `brightness` sigma."""
     brightness = max(brightness, 1.0)
     return np.clip(min(BOX_NOISE / brightness, brightness**-2), BOX_FAINTEST, BOX_BRIGHTEST)
 
@@ -328,8 +329,8 @@ def box_threshold(brightness):
 def box_around(base, position, brightness):
     """Box of one profile: origin (2,) and shape (2,) inside the frame, and its centre pixel (2,).
 
-    base (Ny, Nx): profile; position (2,) [px]; brightness: its peak over the noise of a model pixel,
-    in the channel that sees it best
+    base (Ny, Nx): profile; position (2,) [px]; brightness: its peak over the noise of a model
+    pixel, in the channel that sees it best
     """
     threshold = box_threshold(brightness) * base.max()
     pixel = np.clip(np.floor(np.asarray(position) + 0.5).astype(int), 0, np.array(base.shape) - 1)

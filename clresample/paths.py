@@ -1,6 +1,6 @@
 """The operator's three paths as chains of matrix products on the device.
 
-    forward   Z = D o (Ty I Tx)            both model axes to frequencies, then the difference spectra
+    forward   Z = D o (Ty I Tx)            both axes to frequencies, then the difference spectra
               aligned    I2 = Sy Z Sx
               affine     g = Sy twist(Z Sx),  I2 = gather(g) along each line
               distorted  I2[p] = sum_x (Sy Z)[p, x] Sx[p, x]
@@ -68,7 +68,8 @@ class Path:
 
     # rows and row length of the intermediate matrices, per image: name -> (rows, ld)
     def scratch_shapes(self):
-        return {"half": (max(self.n_y, self.n_rows), self.k_pad), "spectrum": (self.k_y, self.k_pad)}
+        n_half = max(self.n_y, self.n_rows)
+        return {"half": (n_half, self.k_pad), "spectrum": (self.k_y, self.k_pad)}
 
     def reserve(self, n_images):
         """Make room for the intermediates of `n_images` images at a time."""

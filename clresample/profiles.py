@@ -3,8 +3,8 @@
     S(x) = (1 + q / (2 beta))^(-beta - 1),   q = (x - c)^T C^-1 (x - c)
     C = sigma^2 [[1 + e1, e2], [e2, 1 - e1]] + C_psf      rows and columns (y, x)
 
-beta -> infinity is a Gaussian, small beta has wings; C_psf is the model PSF's own second moment, so that
-sigma -> 0 is a star.  Point sources are the model's PSF itself, interpolated by its band-limit.
+beta -> infinity is a Gaussian, small beta has wings; C_psf is the model PSF's own second moment, so
+that sigma -> 0 is a star.  Point sources are the model's PSF itself, interpolated by its band.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from .psf import PSF
+
 
 def covariance(parameters, psf_moment):
     """C (2, 2) [px^2] and its derivatives (3, 2, 2) by (ln sigma [px], g1, g2).
@@ -49,7 +50,8 @@ def profile(parameters, position, shape, psf_moment):
 def moment(psf: PSF) -> np.ndarray:
     """Second moment (2, 2) [px^2] of the first band's image about its centre, rows (y, x)."""
     image = psf.images[0]
-    y, x = ((np.arange(n) - c) * psf.spacing for n, c in zip(image.shape, psf.center[0], strict=True))
+    y, x = ((np.arange(n) - c) * psf.spacing
+            for n, c in zip(image.shape, psf.center[0], strict=True))
     yy, xx, yx = (y**2) @ image.sum(1), (x**2) @ image.sum(0), y @ image @ x
     return np.array([[yy, yx], [yx, xx]])
 

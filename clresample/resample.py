@@ -31,9 +31,9 @@ class Resampler(LinOp):
     shift (2,) [model px]: moves every observed pixel; may be set again at any time
     tolerance_px [model px]: departures up to this count as none when the path is chosen
 
-    Images are flux per pixel, (C, Ny, Nx) or (B, C, Ny, Nx).  Observed pixels whose centre the model
-    does not cover come out as 0; `covered` (My, Mx) tells which are covered, `kind` the path taken,
-    `report` what the set-up found.
+    Images are flux per pixel, (C, Ny, Nx) or (B, C, Ny, Nx).  Observed pixels whose centre the
+    model does not cover come out as 0; `covered` (My, Mx) tells which are covered, `kind` the path
+    taken, `report` what the set-up found.
     Raises ValueError for grids that do not overlap and for band counts that do not match.
     Source: eqs. `reconvampling2D`, `I2model` of the paper, summed in frequency space.
     """
@@ -102,7 +102,7 @@ class Resampler(LinOp):
 
     @property
     def covered(self):
-        """Observed pixels (My, Mx) whose centre lies on the model; one mask for each of many plans."""
+        """Observed pixels (My, Mx) whose centre lies on the model; a mask per plan of many."""
         masks = [p.mapping.covered for p in self.plans]
         return masks[0] if len(masks) == 1 else np.stack(masks)
 
@@ -113,7 +113,7 @@ class Resampler(LinOp):
         return reports[0] if len(reports) == 1 else reports
 
     def render(self, x, out=None):
-        """One image seen in every band: x (Ny, Nx) or (B, Ny, Nx) -> (C, My, Mx) or (B, C, My, Mx)."""
+        """One image seen in every band: x (Ny, Nx) -> (C, My, Mx), or batches of both."""
         return self._apply(self._render, "x", x, out, self.shape_in[1:], self.shape_out)
 
     def _render(self, x, out):

@@ -73,7 +73,7 @@ def _same(problem, i, box):
 
 
 def _moved(array, origin, low, high, fill):
-    """The array of a box at `origin` in the box from `low` to `high`, new pixels from `fill` or 0."""
+    """The array of a box at `origin`, in the box from `low` to `high`; new pixels from `fill`."""
     y, x = (slice(a, b) for a, b in zip(low, high, strict=True))
     out = np.zeros(high - low, array.dtype) if fill is None else fill[y, x].astype(array.dtype)
     first, last = np.maximum(low, origin), np.minimum(high, np.array(origin) + array.shape)

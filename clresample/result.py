@@ -39,8 +39,8 @@ class Result:
     """The fitted model of one blend.
 
     observations, frame, sources: what was fitted; components (n): in the order of the sources
-    rendered: per observation (n, Co, My, Mx) [1], each component's morphology on its pixels under its
-        PSF: spectrum times this is the model of the data
+    rendered: per observation (n, Co, My, Mx) [1], each component's morphology on its pixels under
+        its PSF: spectrum times this is the model of the data
     sky (C,) [counts]: constant background per channel, 0 where it was not fitted
     covariance (C, n, n) [counts^2]: of the spectra of one channel over all components, inverse of
         the normal matrix with morphologies fixed (and sky free where it was); infinite variance for
@@ -76,7 +76,8 @@ class Result:
     def channel_slices(self) -> list[slice]:
         """For each observation, its part of a spectrum."""
         ends = np.cumsum([len(o.channels) for o in self.observations])
-        return [slice(end - len(o.channels), end) for o, end in zip(self.observations, ends, strict=True)]
+        return [slice(end - len(o.channels), end)
+                for o, end in zip(self.observations, ends, strict=True)]
 
     def source_model(self, i_source, i_observation=None) -> np.ndarray:
         """One source (C, Ny, Nx) in the model frame, or (Co, My, Mx) as an observation sees it."""
@@ -89,12 +90,14 @@ class Result:
             return model
         channels = self.channel_slices()[i_observation]
         unit = self.rendered[i_observation]
-        return sum(c.spectrum[channels, None, None] * unit[i] for i, c in parts)
+        zero = np.zeros(self.observations[i_observation].data.shape)
+        return sum((c.spectrum[channels, None, None] * unit[i] for i, c in parts), zero)
 
     def model(self, i_observation) -> np.ndarray:
         """All sources and the sky (Co, My, Mx) [counts] as an observation sees them."""
         channels = self.channel_slices()[i_observation]
-        spectra = np.array([c.spectrum[channels] for c in self.components])
+        n_channels = channels.stop - channels.start
+        spectra = np.array([c.spectrum[channels] for c in self.components]).reshape(-1, n_channels)
         image = np.einsum("nc,ncyx->cyx", spectra, self.rendered[i_observation])
         return image + self.sky[channels, None, None]
 

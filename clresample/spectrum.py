@@ -1,4 +1,4 @@
-"""The resampling operator worked out on paper: band, difference spectrum and factor tables, in float64.
+"""The resampling operator worked out in float64: band, difference spectrum and factor tables.
 
 With X = A p + t the position of observed pixel p in model pixels and nu = kappa / K,
 
@@ -22,8 +22,8 @@ from .psf import PSF
 
 # Light of the observed PSF beyond the wrap radius, as a fraction; images drawn by FFT ring at 1e-6.
 WRAP_TOLERANCE = 1e-5
-# A Gaussian reaches that at 4.9 sigma, and the sharp edge of the band rings beyond: half as much again
-# (7.4 sigma, 1e-12 of the light) keeps what wraps below 4e-7 of an image, 0.06 dB at 58 dB.
+# A Gaussian reaches that at 4.9 sigma, and the sharp edge of the band rings beyond: half as much
+# again (7.4 sigma, 1e-12 of the light) keeps what wraps below 4e-7 of an image, 0.06 dB at 58 dB.
 WRAP_MARGIN = 1.5
 # |P1^| below which the division is floored: 1e-6 of a point source's light per frequency, ten times
 # the rounding of a PSF stored in float32.
@@ -32,7 +32,7 @@ DIVISION_FLOOR = 1e-6
 
 @dataclass(frozen=True)
 class Precision:
-    """What a floating-point type deserves: where to cut the band, how to interpolate along a line."""
+    """What a floating-point type deserves: where the band ends, how lines are interpolated."""
 
     band_tolerance: float  # |D| / max |D| below which a frequency is dropped
     window: Window
@@ -54,7 +54,8 @@ class Plan:
     axes: the model axis of each table axis; (1, 0) where the observed rows run along the model's y
     d_plus, d_minus (C, Hy, Hx) complex: D(+,+), D(+,-) times K^-2 and the half-plane weights
     in_y (2Hy, Ny), in_x (2Hx, Nx): transforms of the model
-    out_y, out_x: aligned (My, 2Hy), (2Hx, Mx); affine (L, 2Hy), (2Hx, J); distorted (P, 2Hy), (P, 2Hx)
+    out_y, out_x: aligned (My, 2Hy), (2Hx, Mx); affine (L, 2Hy), (2Hx, J); distorted (P, 2Hy),
+        (P, 2Hx)
     twist (Hy, J) [rad], lines: affine only
     report: wrap_radius_px, n_fft (K), n_frequencies, max_gain (C,) = max |D| / |det A|,
         floored_power (C,) = share of the observed PSF's power where the division was floored
@@ -98,8 +99,8 @@ def make_plan(mapping: Mapping, psf_in: PSF, psf_out: PSF, *, precision: Precisi
                 "give one band or as many as the other"
             )
     if not mapping.covered.any():
-        raise ValueError(f"the grids do not overlap: no pixel of the observation {mapping.shape_out} "
-                         f"lies on the model {mapping.shape_in}")
+        raise ValueError("the grids do not overlap: no pixel of the observation "
+                         f"{mapping.shape_out} lies on the model {mapping.shape_in}")
     radius = wrap_radius(psf_out, mapping.matrix)
     n_fft = tuple(_odd(n + h) for n, h in zip(mapping.shape_in, radius, strict=True))
     nu_y, nu_x = (np.arange(_half_count(mapping.matrix, psf_out.spacing, i, n_fft[i])) / n_fft[i]
@@ -171,8 +172,8 @@ def wrap_radius(psf: PSF, matrix) -> tuple[float, float]:
 def difference_spectrum(matrix, psf_in: PSF, psf_out: PSF, nu_y, nu_x):
     """D on nu_y >= 0 and nu_x from -max to +max, and a report of what the division had to do.
 
-    D = |det A| P2^ conj(P1^) / max(|P1^|, floor)^2: the exact ratio wherever the model's PSF carries
-    more than DIVISION_FLOOR, falling to zero with |P1^| below it.
+    D = |det A| P2^ conj(P1^) / max(|P1^|, floor)^2: the exact ratio wherever the model's PSF
+    carries more than DIVISION_FLOOR, falling to zero with |P1^| below it.
     """
     both = np.concatenate([-nu_x[:0:-1], nu_x])
     p1 = psf_in.spectrum(nu_y, both)
@@ -227,7 +228,8 @@ def _line_tables(mapping: Mapping, nu, d, center, window: Window):
     """Observed rows (or columns) as lines y = y0 + r x through the model, and pass 2 along them.
 
     Along a line a plane wave has the single frequency nu_x + r nu_y; columns finer than its Nyquist
-    spacing by window.oversampling carry it, divided by the window's transform.  Returns (tables, d).
+    spacing by window.oversampling carry it, divided by the window's transform.  Returns
+    (tables, d).
     """
     slope = np.abs(mapping.matrix[1]) / np.linalg.norm(mapping.matrix, axis=0)
     by_row = slope[1] >= slope[0]
