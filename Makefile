@@ -6,7 +6,7 @@ VENV ?= .venv
 STAMP = $(VENV)/made
 RUN = $(VENV)/bin/python -m
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint clean paper paper-full
 
 demo: $(STAMP)
 	$(RUN) clresample.demo $(ARGS)
@@ -17,6 +17,23 @@ test: $(STAMP)
 lint: $(STAMP)
 	$(RUN) ruff check .
 	$(RUN) ruff format --check .
+
+# The paper's evidence, in bench/report/report.md; an interrupted run continues, a larger one adds.
+paper: GALAXIES = 1000
+paper: GALAXIES_MORE = 200
+paper: SECONDS = 1
+paper: SCENES = 100
+paper-full: GALAXIES = 10000
+paper-full: GALAXIES_MORE = 10000
+paper-full: SECONDS = 5
+paper-full: SCENES = 2315
+paper paper-full: $(STAMP)
+	$(RUN) bench.accuracy --galaxies $(GALAXIES)
+	$(RUN) bench.accuracy --wide --galaxies $(GALAXIES_MORE)
+	$(RUN) bench.accuracy --printed --galaxies $(GALAXIES_MORE)
+	$(RUN) bench.timing --seconds $(SECONDS)
+	$(RUN) bench.joint --scenes $(SCENES)
+	$(RUN) bench.report
 
 clean:
 	rm -rf $(VENV) dist .pytest_cache .ruff_cache

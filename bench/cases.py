@@ -47,7 +47,7 @@ class Case:
         return self.survey_out.grid(self.n_obs, angle_deg=self.angle_deg)
 
     def operator(self, scheme=Resampler, **options):
-        """Ours, or the paper's `SplitResampler`, from the model's PSF image to the observation's."""
+        """Ours, or the paper's scheme, from the model's PSF image to the observation's."""
         return scheme(
             self.grid_in, self.survey_in.psf(), self.grid_out, self.survey_out.psf(), **options
         )

@@ -50,6 +50,24 @@ class Parser(argparse.ArgumentParser):
             "(bench/report)",
         )
 
+    def add_sizes(self, sizes):
+        self.add_argument(
+            "--sizes",
+            nargs="+",
+            metavar="N",
+            type=positive(int),
+            help=f"model pixels a side (default: {' '.join(map(str, sizes))})",
+        )
+
+    def add_seconds(self, seconds, what):
+        self.add_argument(
+            "--seconds",
+            type=positive(float),
+            default=seconds,
+            metavar="S",
+            help=f"how long each {what} is measured (%(default)s)",
+        )
+
     def add_surveys(self):
         self.add_argument(
             "--printed",

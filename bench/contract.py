@@ -92,13 +92,7 @@ def main(options):
 
 def parser():
     parser = common.Parser("bench.contract", description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--seconds",
-        type=common.positive(float),
-        default=0.3,
-        metavar="S",
-        help="how long each row is measured (%(default)s)",
-    )
+    parser.add_seconds(0.3, "row")
     parser.add_json()
     return parser
 

@@ -222,20 +222,8 @@ def parser():
         action="store_true",
         help="the main pair at 4 sizes, and one row of every other pair",
     )
-    parser.add_argument(
-        "--sizes",
-        nargs="+",
-        type=common.positive(int),
-        metavar="N",
-        help=f"model pixels a side (default: {' '.join(map(str, SIZES))})",
-    )
-    parser.add_argument(
-        "--seconds",
-        type=common.positive(float),
-        default=0.3,
-        metavar="S",
-        help="how long each row is measured (%(default)s)",
-    )
+    parser.add_sizes(SIZES)
+    parser.add_seconds(0.3, "row")
     parser.add_surveys()
     parser.add_galaxies(3)
     parser.add_json()

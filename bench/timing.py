@@ -1,0 +1,143 @@
+"""Section 4 of the paper: times of ours, the paper's scheme and GalSim on the paper's grid.
+
+    python -m bench.timing [--seconds S] [--printed] [--pairs FROM-TO ...] [--folder FOLDER]
+
+Stamps of 20 to 200 model pixels a side, from every survey to all of larger pixels, aligned; both
+schemes on one pair up to 400 pixels, turned as well.  Times are medians of one image of one band,
+from NumPy array to NumPy array, one thread each, all methods called in turn; set-up is apart: what
+the first image takes beyond a later one, with the kernels compiled.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from tqdm import tqdm
+
+from clresample.split import SplitResampler
+
+from . import common, figures, report
+from .cases import Case, Galaxies
+from .timing_findings import PAPER_FIT, findings, line_fit
+
+SIZES = (20, 30, 50, 70, 100, 150, 200)  # [model pixels a side], the paper's
+MAIN_PAIR, MAIN_SIZES, ANGLE_DEG = ("EUCLID", "RUBIN"), (50, 100, 200, 300, 400), 30.0
+N_SETUPS = 3  # of each method; the first compiles and does not count
+
+
+def plan(options):
+    """Cases to time: the paper's grid, and what is missing in it for the curves of one pair."""
+    surveys = common.surveys(options.printed)
+    pairs = options.pairs or [pair for pair in common.survey_pairs() if pair[0] != pair[1]]
+    sizes = options.sizes or SIZES
+    grid = [(pair, n, 0.0) for pair in pairs for n in sizes]
+    main = [
+        (MAIN_PAIR, n, angle) for n in options.sizes or MAIN_SIZES for angle in (0.0, ANGLE_DEG)
+    ]
+    return {
+        (*pair, n, angle): Case(*(surveys[name] for name in pair), n, angle)
+        for pair, n, angle in dict.fromkeys(grid + main)
+    }
+
+
+def measure(case, galaxies, seconds):
+    """Times of one case: {"ms": one image, "setup_ms": before the first}, by method."""
+    image = case.draw(galaxies.take(0, case))[0]
+
+    def operator(**options):
+        op = case.operator(**options)
+        return lambda: op(image)
+
+    def galsim(interpolant):
+        render = case.galsim(interpolant)
+        return lambda: render(image)
+
+    makers = {
+        "ours": operator,
+        "paper": lambda: operator(scheme=SplitResampler),
+        "quintic": lambda: galsim("quintic"),
+        "sinc": lambda: galsim("sinc"),
+    }
+    calls, first_ms = {}, {}
+    for name, make in makers.items():
+        times = []
+        for _ in range(N_SETUPS):
+            start = time.perf_counter()
+            calls[name] = make()
+            calls[name]()
+            times.append(time.perf_counter() - start)
+        first_ms[name] = 1e3 * float(np.median(times[1:]))
+    ms = common.interleaved_ms(calls, seconds=seconds)
+    return {"ms": ms, "setup_ms": {n: max(0.0, first_ms[n] - ms[n]) for n in ms}}
+
+
+def means(rows, kind):
+    """Sizes, and mean times [ms] by method over the pairs of each size."""
+    sizes = sorted({row["n_model"] for row in rows})
+    return sizes, {
+        name: [float(np.mean([r[kind][name] for r in rows if r["n_model"] == n])) for n in sizes]
+        for name in rows[0][kind]
+    }
+
+
+def main(options):
+    cases, galaxies = plan(options), Galaxies(options.catalogue)
+    for (name_in, name_out, n_model, _), case in cases.items():
+        if case.n_obs == 0:
+            raise common.BadOption(
+                f"--sizes {n_model}: no observed pixel from {name_in} to {name_out}"
+            )
+    threads = common.on_one_thread()
+    record = common.record(threads) | {
+        "surveys": "printed table" if options.printed else "notebooks",
+        "times": "one image of one band, NumPy to NumPy, medians of interleaved calls",
+    }
+    settings = {
+        key: record[key]
+        for key in ("clresample", "galsim", "device", "machine", "threads", "surveys")
+    }
+    log = common.Log(options.folder / "timing.jsonl", settings | {"seconds": options.seconds})
+    for key, case in tqdm(cases.items(), desc="timing", unit=" cases"):
+        if key not in log.done:
+            log.append(key, measure(case, galaxies, options.seconds))
+    rows = [
+        dict(zip(("from", "to", "n_model", "angle_deg"), key))
+        | {"n_obs": case.n_obs}
+        | log.done[key]
+        for key, case in cases.items()
+    ]
+
+    sizes = options.sizes or SIZES
+    grid = [row for row in rows if row["angle_deg"] == 0 and row["n_model"] in sizes]
+    curves = {}
+    for angle in (0.0, ANGLE_DEG):
+        of_pair = sorted(
+            (row["n_model"], row["ms"]["ours"], row["ms"]["paper"])
+            for row in rows
+            if (row["from"], row["to"], row["angle_deg"]) == (*MAIN_PAIR, angle)
+            and row["n_model"] in (options.sizes or MAIN_SIZES)
+        )
+        curves[angle] = [list(column) for column in zip(*of_pair)]
+    sizes, running = means(grid, "ms")
+    _, setups = means(grid, "setup_ms")
+    fits = {scheme: line_fit(grid, scheme)[0] for scheme in ("paper", "ours")}
+    figures.time_ratios(options.folder / "timing-time_ratios.png", grid, fits, PAPER_FIT)
+    figures.absolute_timings(options.folder / "timing-absolute_timings.png", sizes, running, setups)
+    figures.schemes(options.folder / "timing-schemes.png", curves)
+    found = list(findings(grid, curves, sizes, running))
+    report.save(options.folder, "timing", record, found, rows=rows)
+
+
+def parser():
+    parser = common.Parser("bench.timing", description=__doc__.splitlines()[0])
+    parser.add_sizes(SIZES)
+    parser.add_seconds(1.0, "case")
+    parser.add_surveys()
+    parser.add_catalogue()
+    parser.add_folder()
+    return parser
+
+
+if __name__ == "__main__":
+    common.run(main, parser())
