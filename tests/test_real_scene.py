@@ -20,14 +20,14 @@ CHI2 = {"HST": 1.12, "HSC": 0.92}
 
 @pytest.fixture(scope="module")
 def fitted(data, tmp_path_factory):
-    """The fit of docs/hst_hsc.toml, its time [s] from files to files, and its folder."""
+    """The fit of docs/hst_hsc.toml, its processor time [s] from files to files, and its folder."""
     folder = tmp_path_factory.mktemp("real")
     text = (ROOT / "docs" / "hst_hsc.toml").read_text()
     scene = folder / "hst_hsc.toml"
     scene.write_text(text.replace("../../shared/data", str(data.resolve())))
-    started = time.perf_counter()
+    started = time.process_time()
     assert main(["deblend", str(scene), "-o", str(folder / "out")]) == 0
-    took = time.perf_counter() - started
+    took = time.process_time() - started
     return read_result(folder / "out" / "result.fits"), took, folder / "out"
 
 
@@ -71,5 +71,5 @@ def test_shift_is_what_images_show(fitted):
 
 def test_it_takes_seconds_and_writes_the_figure(fitted):
     _, took, folder = fitted
-    assert took < 30  # s on two cores
+    assert took < 2 * 30  # s: half a minute of two cores, whatever else they do
     assert (folder / "deblended.png").stat().st_size < 400_000
