@@ -141,32 +141,37 @@ def _outputs(arguments):
 
 
 def _fit(arguments, scene, settings, device):
-    from .detect import detect, detect_more
-
+    """The fit; before it, where sources or shifts are to be found, a short one to find them in."""
     given = {"frame": scene.frame, "device": device, "dtype": np.dtype(arguments.dtype)}
-    sources = scene.sources
-    if sources is None:
-        try:
-            found = detect(
-                scene.observations, scene.frame, threshold=scene.threshold, device=device
-            )
-        except ImportError as error:
-            raise ValueError(
-                f"{arguments.scene}: {error}; or give a catalogue in [sources]"
-            ) from error
-        sources = found.sources
-        if sources and scene.passes > 1 and settings.max_iter > 0:
-            first = replace(settings, max_iter=min(FIRST_LOOK, settings.max_iter))
-            result = _deblend(arguments, "first look", scene.observations, sources, first, given)
-            if result.status == "interrupted":
-                return result
+    sources, looking = scene.sources, scene.sources is None
+    if looking:
+        sources = _detect(arguments, scene, device)
+    if settings.max_iter and (settings.fit_shifts or (looking and scene.passes > 1)):
+        first = replace(settings, max_iter=min(FIRST_LOOK, settings.max_iter))
+        result = _deblend(arguments, "first look", scene.observations, sources, first, given)
+        if result.status == "interrupted":
+            return result
+        given["shifts"] = result.shifts
+        if looking and scene.passes > 1:
+            from .detect import detect_more
+
             sources += detect_more(result, threshold=scene.threshold, device=device).sources
-        if not sources:
-            raise ValueError(
-                f"{arguments.scene}: no source above {scene.threshold:g} sigma; lower "
-                "threshold in [detection], or give a catalogue in [sources]"
-            )
     return _deblend(arguments, "fit", scene.observations, sources, settings, given)
+
+
+def _detect(arguments, scene, device):
+    from .detect import detect
+
+    try:
+        found = detect(scene.observations, scene.frame, threshold=scene.threshold, device=device)
+    except ImportError as error:
+        raise ValueError(f"{arguments.scene}: {error}; or give a catalogue in [sources]") from error
+    if not found.sources:
+        raise ValueError(
+            f"{arguments.scene}: no source above {scene.threshold:g} sigma; lower threshold in "
+            "[detection], or give a catalogue in [sources]"
+        )
+    return found.sources
 
 
 def _deblend(arguments, what, observations, sources, settings, given):

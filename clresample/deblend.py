@@ -49,11 +49,14 @@ class Blend:
 
     observations: at least one Observation; sources: Point and Extended
     frame: the model's Frame; None = `model_frame` of the observations
+    shifts (n_observations, 2) [model px]: of the observations' pixels, where known; a fit of shifts
+        starts from them. What moved by more than a pixel is best fitted again from there
     """
 
     observations: tuple[Observation, ...]
     sources: tuple[Source, ...]
     frame: Frame | None = None
+    shifts: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -96,18 +99,18 @@ class Settings:
             raise ValueError(f"tol is {self.tol}, must be at least 0 and under 1")
 
 
-def deblend(observations, sources, *, frame=None, settings=None, device=None,
+def deblend(observations, sources, *, frame=None, shifts=None, settings=None, device=None,
             dtype=np.float32, progress=None) -> Result:
     """Fit one scene to all observations at once.
 
         min 1/2 sum_o |sqrt(w_o) (R_o sum_s A_s S_s - d_o)|^2 + 1/2 |z|^2,  A >= 0, S constrained
 
-    observations, sources, frame: see Blend; settings: see Settings
+    observations, sources, frame, shifts: see Blend; settings: see Settings
     progress: called every few iterations with their number so far and the loss (1,)
     raises ValueError for what `check_observations`, `model_frame` and `Source` refuse, and when no
     source lies inside the frame. Ctrl-C ends the fit with the best state so far.
     """
-    blend = Blend(tuple(observations), tuple(sources), frame)
+    blend = Blend(tuple(observations), tuple(sources), frame, shifts)
     settings = settings or Settings()
     device = get_device(device)
     fit = _Fit(blend, settings, device, dtype, pad=1)
@@ -187,10 +190,14 @@ class _Fit:
         if not len(self.fitted):
             raise ValueError(f"none of the {len(positions)} sources lies inside the model frame "
                              f"{self.frame.shape}")
+        shifts = _shifts(blend)
+        private = settings.fit_shifts or shifts.any()
         self.padded = _padded_frame(self.frame, pad)
         self.views, self.units = [], []
         for o in blend.observations:
-            view, unit = _view(self.padded, o, pad, device, dtype, private=settings.fit_shifts)
+            view, unit = _view(self.padded, o, pad, device, dtype, private=private)
+            if private:
+                view.op.shift = shifts[len(self.views)]
             self.views.append(view)
             self.units.append(unit)
         self.unit = np.concatenate(self.units)
@@ -358,6 +365,15 @@ def _check_profiles(sources, frame):
         if profile is not None and np.shape(profile) != frame.shape:
             raise ValueError(f"profile of source {i} has the shape {np.shape(profile)}, "
                              f"the model frame {frame.shape}")
+
+
+def _shifts(blend):
+    """Shifts (n_observations, 2) [model px] that a blend comes with."""
+    expected = len(blend.observations), 2
+    shifts = np.zeros(expected) if blend.shifts is None else np.asarray(blend.shifts, float)
+    if shifts.shape != expected or not np.isfinite(shifts).all():
+        raise ValueError(f"shifts is {shifts.tolist()}, must be {expected} finite numbers")
+    return shifts
 
 
 def _padded_frame(frame, pad):
