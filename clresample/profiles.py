@@ -66,15 +66,11 @@ def point(psf: PSF, position, shape, *, slopes=True):
     extent = int(np.ceil(max(psf.images.shape[1:]) * psf.spacing))
     n_fft = max(shape) + 2 * extent + 1
     n_fft += 1 - n_fft % 2
-    nu = np.arange(-(n_fft // 2), n_fft // 2 + 1) / n_fft
-    spectrum = psf.spectrum(nu, nu)[0] / n_fft**2
-    waves_y, waves_x = (np.exp(2j * np.pi * np.outer(np.arange(n) - p, nu))
-                        for n, p in zip(shape, position, strict=True))
-    half = waves_y @ spectrum
-    image = (half @ waves_x.T).real
-    if not slopes:
-        return image[None]
-    slope = -2j * np.pi * nu
-    by_y = (waves_y * slope) @ spectrum @ waves_x.T
-    by_x = (half * slope) @ waves_x.T
-    return np.array([image, by_y.real, by_x.real])
+    nu = np.fft.fftfreq(n_fft)
+    shift_y, shift_x = (np.exp(-2j * np.pi * nu * p) for p in position)
+    spectrum = psf.spectrum(nu, nu)[0] * shift_y[:, None] * shift_x
+    spectra = [spectrum]
+    if slopes:
+        slope = -2j * np.pi * nu
+        spectra += [slope[:, None] * spectrum, slope * spectrum]
+    return np.fft.ifft2(spectra).real[:, : shape[0], : shape[1]].copy()
