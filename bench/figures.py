@@ -96,13 +96,13 @@ def resampled(path, cases):
         _sky(axes[0, 1], case.truth, limits, "truth")
         residuals = case.ours - case.truth, case.galsim - case.truth
         width = max(np.abs(residual).max() for residual in residuals)
-        name = f"residual, ±{100 * width / case.truth.max():.2g} % of peak"
         names = f"ours: {case.sdr[0]:.1f} dB", f"GalSim: {case.sdr[1]:.1f} dB"
         for i, (image, residual) in enumerate(zip((case.ours, case.galsim), residuals)):
             _sky(axes[1, i], image, limits, names[i])
             colours = {"cmap": RESIDUAL_COLOURS, "vmin": -width, "vmax": width}
             axes[2, i].imshow(residual, origin="lower", **colours)
-            axes[2, i].set_title(name, size=8, pad=3)
+            percent = 100 * np.abs(residual).max() / case.truth.max()
+            axes[2, i].set_title(f"residual ≤ {percent:.1g} % of peak", size=8, pad=3)
         for ax in axes.flat:
             ax.set(xticks=[], yticks=[])
             ax.spines[:].set_color(FAINT)
@@ -158,7 +158,7 @@ def time_ratios(path, rows, fits, paper):
         ratio = [row["ms"][name] / row["ms"]["quintic"] for row in rows]
         points = ax.scatter(m, ratio, c=[row["n_model"] for row in rows], s=16, cmap="viridis")
         a, b = fits[name]
-        ax.plot(line, a + b * line, color=COLOURS["paper"], label=f"fit: {a:.2g} + {b:.2g} M")
+        ax.plot(line, a + b * line, color=COLOURS["paper"], label=f"fit: {line_text(a, b)}")
         ax.set_title(f"{NAMES[name]} / GalSim quintic", size=10)
         ax.set_xlabel("M, observed pixels a side")
         ax.set_ylim(0, 1.12 * max(ratio))
@@ -168,11 +168,11 @@ def time_ratios(path, rows, fits, paper):
         "--",
         color=INK,
         lw=1,
-        label=f"the paper's fit: {paper[0]:g} + {paper[1]:g} M",
+        label=f"the paper's fit: {line_text(*paper)}",
     )
     axes[0, 0].set_ylabel("ratio of times")
     for ax in axes[0]:
-        ax.legend(frameon=False, fontsize=8, loc="upper left")
+        ax.legend(frameon=False, fontsize=8)
     figure.colorbar(points, ax=list(axes[0]), label="N, model pixels a side", pad=0.01)
     save(path, figure)
 
@@ -186,7 +186,6 @@ def absolute_timings(path, sizes, means, setups):
         for name, values in times.items():
             _curve(ax, sizes, values, name, NAMES[name])
         ax.set_title(title, size=10)
-        ax.set_xlabel("N, model pixels a side")
     axes[0, 0].set_ylabel("time [ms]")
     axes[0, 0].legend(frameon=False, fontsize=8)
     save(path, figure)
@@ -201,16 +200,16 @@ def schemes(path, curves):
         _curve(left, sizes, paper, "paper", f"the paper's, {angle:g}°", style)
         ratio = np.divide(paper, ours)
         right.plot(sizes, ratio, style, marker="o", ms=4, color=INK, label=f"{angle:g}°")
+        place = {"xytext": (-3, 4), "ha": "right"} if style == "-" else {"xytext": (4, -9)}
         for x, y in zip(sizes, ratio):
-            right.annotate(
-                f"{y:.1f}", (x, y), xytext=(0, 5), textcoords="offset points", ha="right", size=7
-            )
+            right.annotate(f"{y:.1f}", (x, y), textcoords="offset points", size=7, **place)
     left.set_ylabel("time [ms]")
     left.set_title("both schemes, in one run", size=10)
     right.set(xscale="log", yscale="log")
+    _size_ticks(right, sizes)
+    right.margins(0.12)
     right.set_title("time of the paper's scheme over ours", size=10)
     for ax in (left, right):
-        ax.set_xlabel("N, model pixels a side")
         ax.legend(frameon=False, fontsize=8)
     save(path, figure)
 
@@ -218,6 +217,18 @@ def schemes(path, curves):
 def _curve(ax, x, y, name, label, style="-"):
     ax.loglog(x, y, style, marker=MARKERS[name], ms=4, color=COLOURS[name], label=label)
     ax.grid(color=BLANK)
+    _size_ticks(ax, x)
+
+
+def _size_ticks(ax, sizes):
+    ax.set_xticks(sizes, sizes)
+    ax.set_xticks([], minor=True)
+    ax.set_xlabel("N, model pixels a side")
+
+
+def line_text(intercept, slope):
+    """A straight line in M as text."""
+    return f"{intercept:.2g} {'-' if slope < 0 else '+'} {abs(slope):.2g} M"
 
 
 def _figure(n_y, n_x, width, height):

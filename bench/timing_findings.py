@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from .figures import line_text
 from .report import Finding
 
 PAPER_FIT = (-0.17, 0.048)  # time of the paper's code over GalSim's default: intercept, slope in M
@@ -20,10 +21,6 @@ def line_fit(rows, scheme):
     slope, intercept = np.polyfit(m, ratio, 1)
     left = np.var(ratio - intercept - slope * m)
     return (float(intercept), float(slope)), float(1 - left / np.var(ratio))
-
-
-def _line(intercept, slope):
-    return f"{intercept:.2g} {'-' if slope < 0 else '+'} {abs(slope):.2g} M"
 
 
 def slope(sizes, times):
@@ -45,8 +42,8 @@ def findings(rows, curves, sizes, means):
         "Time over GalSim's default against M",
         f"The time of the paper's scheme over GalSim's default is well described by a straight "
         f"line, {PAPER_FIT[0]} + {PAPER_FIT[1]} M.",
-        f"The paper's scheme, on OpenCL: {_line(*fits['paper'])} (R² = {r2:.2f}); its slope is "
-        f"{fits['paper'][1] / PAPER_FIT[1]:.2f} of the paper's. Ours: {_line(*fits['ours'])}.",
+        f"The paper's scheme, on OpenCL: {line_text(*fits['paper'])} (R² = {r2:.2f}); its slope is "
+        f"{fits['paper'][1] / PAPER_FIT[1]:.2f} of the paper's. Ours: {line_text(*fits['ours'])}.",
         r2 >= LINEAR_R2,
         "timing-time_ratios.png",
     )
