@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections import defaultdict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,6 +21,8 @@ from .result import Component, Result
 from .shifts import shift_steps
 from .sources import Point, Source
 
+# Status of a fit that Ctrl-C ended.
+INTERRUPTED = "interrupted"
 # So often (iterations) losses come back from the device.
 CHECK = 5
 # So often (iterations) observations are shifted: what follows a shift is most of it by then.
@@ -38,6 +41,8 @@ PAD_PX = 16
 SPECTRUM_PART = 0.02
 # Device memory of one group of scenes [bytes], unless told otherwise.
 MEMORY = 1 << 30
+# What can go wrong with one blend and is no reason to give up the others.
+ERRORS = (ValueError, ArithmeticError, DeviceError, MemoryError, np.linalg.LinAlgError)
 # Scenes fitted side by side: enough to hide the launches, few enough for a CPU's cache.
 SCENES = {"CPU": 32}
 SCENES_ELSEWHERE = 1024
@@ -124,8 +129,10 @@ def deblend_many(blends, *, settings=None, device=None, dtype=np.float32, memory
 
     blends: Blend, with sizes, sources, PSFs, WCS and instruments of their own
     memory [bytes]: of the device for one group of scenes
-    progress: called with the number of blends done after each group
-    returns a Result for each blend, in their order, or a Failure: it does not harm the others
+    progress: called with the number of blends done, after each group and each failure
+    returns a Result for each blend, in their order, or a Failure: it does not harm the others.
+        Ctrl-C ends the fits of the group that runs with the best state so far; what was done before
+        comes back, and Failures with the status "interrupted" for the rest
     """
     settings, device = settings or Settings(), get_device(device)
     blends = list(blends)
@@ -135,38 +142,57 @@ def deblend_many(blends, *, settings=None, device=None, dtype=np.float32, memory
     waiting = defaultdict(list)
     n_done = 0
 
-    def run(group):
+    def count(n):
         nonlocal n_done
-        for (i, _), done in zip(group, _try(group, settings, device, dtype), strict=True):
-            out[i] = done
-        n_done += len(group)
+        n_done += n
         if progress is not None:
             progress(n_done)
 
-    for i, blend in enumerate(blends):
-        try:
-            fit = _Fit(blend, settings, device, dtype, pad=pad)
-        except (ValueError, DeviceError, np.linalg.LinAlgError) as error:
-            out[i] = Failure(blend, f"failed: {error}")
-            n_done += 1
-            continue
-        group = waiting[fit.problem.signature]
-        group.append((i, fit))
-        if len(group) >= limit or sum(f.bytes for _, f in group) + fit.bytes > memory:
-            run(waiting.pop(fit.problem.signature))
-    for group in waiting.values():
-        run(group)
-    return out
+    def run(group):
+        for i, done in _try(group, settings, device, dtype):
+            out[i] = done
+        count(len(group))
+        if any(fit.status == INTERRUPTED for _, fit in group):
+            raise KeyboardInterrupt
+
+    try:
+        for i, blend in enumerate(blends):
+            try:
+                fit = _Fit(blend, settings, device, dtype, pad=pad)
+            except ERRORS as error:
+                out[i] = Failure(blend, f"failed: {error}")
+                count(1)
+                continue
+            group = waiting[fit.problem.signature]
+            group.append((i, fit))
+            if len(group) >= limit or sum(f.bytes for _, f in group) + fit.bytes > memory:
+                run(waiting.pop(fit.problem.signature))
+        while waiting:
+            run(waiting.popitem()[1])
+    except KeyboardInterrupt:
+        pass  # those without a result are told so
+    return [Failure(blend, INTERRUPTED) if done is None else done
+            for blend, done in zip(blends, out, strict=True)]
 
 
 def _try(group, settings, device, dtype):
-    """Results of a group of fits; where the device refuses all at once, one by one."""
+    """Yield (index, Result or Failure) of a group of fits; one by one where all at once fails."""
     try:
-        return [fit.result() for fit in _iterate([f for _, f in group], settings, device, dtype)]
-    except DeviceError as error:
+        _iterate([fit for _, fit in group], settings, device, dtype)
+    except ERRORS as error:
         if len(group) == 1:
-            return [Failure(group[0][1].blend, f"failed: {error}")]
-        return [done for item in group for done in _try([item], settings, device, dtype)]
+            yield group[0][0], Failure(group[0][1].blend, f"failed: {error}")
+            return
+        for item in group:
+            yield from _try([item], settings, device, dtype)
+            if item[1].status == INTERRUPTED:
+                return
+        return
+    for i, fit in group:
+        try:
+            yield i, fit.result()
+        except ERRORS as error:
+            yield i, Failure(fit.blend, f"failed: {error}")
 
 
 def _sizes(blend):
@@ -195,18 +221,18 @@ class _Fit:
         self.padded = _padded_frame(self.frame, pad)
         self.views, self.units = [], []
         for o in blend.observations:
-            view, unit = _view(self.padded, o, pad, device, dtype, private=private)
+            view, unit = _view(self.frame, self.padded, o, pad, device, dtype, private=private)
             if private:
                 view.op.shift = shifts[len(self.views)]
             self.views.append(view)
             self.units.append(unit)
+        if not any(view.root.any() for view in self.views):
+            raise ValueError("no observed pixel on the model frame has a weight")
         self.unit = np.concatenate(self.units)
         self.losses, self.status = [], "iteration limit"
         sources = [blend.sources[i] for i in self.fitted]
-        self.start = start(self.padded, sources, positions[inside], self.views,
+        self.start = start(self.frame, sources, positions[inside], self.views,
                            fit_sky=settings.fit_sky)
-        self.start.base[:, self.frame.shape[0] :] = 0
-        self.start.base[:, :, self.frame.shape[1] :] = 0
         self.problem = self._problem(sources)
         self.seconds = {"setup": time.perf_counter() - began}
 
@@ -228,7 +254,7 @@ class _Fit:
             morphs.append(image[low[0] : low[0] + size[0], low[1] : low[1] + size[1]].copy())
         seen = noise < 1e14
         return Problem(
-            shape=self.padded.shape,
+            shape=self.padded.shape, extent=self.frame.shape,
             ops=[v.op for v in views],
             data=[v.data for v in views],
             weights=[v.root**2 for v in views],
@@ -239,7 +265,7 @@ class _Fit:
             sky=sky, fit_sky=self.settings.fit_sky,
         )
 
-    @property
+    @functools.cached_property
     def bytes(self):
         """Device memory of the scene in a batch, roughly."""
         pixels = sum(2 * np.prod(o.shape_in) + 4 * np.prod(o.shape_out) for o in self.problem.ops)
@@ -262,6 +288,7 @@ class _Fit:
         rendered = []
         for view, o in zip(self.views, self.blend.observations, strict=True):
             images = view.op.render(morphs.astype(view.op.dtype)).astype(np.float64)
+            images *= _covered(view.op, self.frame)
             rendered.append(images[..., : o.data.shape[1], : o.data.shape[2]])
         self.seconds["result"] = time.perf_counter() - began
         return Result(
@@ -276,20 +303,20 @@ class _Fit:
 def _iterate(fits, settings, device, dtype, progress=None):
     """Run the fits of one signature until each has stopped; they keep their final problems."""
     began = time.perf_counter()
-    running = list(fits)
-    engine = _engine(running, settings, device, dtype)
-    live = np.ones(len(running), bool)
+    running, live, engine = list(fits), np.ones(len(fits), bool), None
     try:
+        engine = _engine(running, settings, device, dtype)
         for _ in range(0, settings.max_iter, CHECK):
-            engine.save()
             losses = engine.run(min(CHECK, settings.max_iter - engine.n_steps))
             stop = _stopped(running, live, losses, settings)
-            if stop.any() or engine.n_steps >= settings.max_iter:
-                _settle(running, live, stop, engine)
+            if engine.n_steps >= settings.max_iter:
+                stop = live.copy()
+            if stop.any():
+                _settle(running, stop, engine)
                 live &= ~stop
             if progress is not None:
                 progress(engine.n_steps, losses[-1])
-            if not live.any() or engine.n_steps >= settings.max_iter:
+            if not live.any():
                 break
             if settings.fit_shifts and engine.n_steps % MOVE == 0:
                 _move(running, live, engine)
@@ -302,18 +329,14 @@ def _iterate(fits, settings, device, dtype, progress=None):
                     f.problem = resized(p, f.base, f.noise) if resize else p
                     changed |= f.problem is not p
                 if changed:
-                    running = [f for f, _ in going]
-                    engine = _engine(running, settings, device, dtype)
-                    live = np.ones(len(running), bool)
+                    engine_new = _engine([f for f, _ in going], settings, device, dtype)
+                    running, live = [f for f, _ in going], np.ones(len(going), bool)
+                    engine = engine_new
     except KeyboardInterrupt:
-        for f, p, on in zip(running, engine.problems_now(saved=True), live, strict=True):
-            if on:
-                f.problem, f.status = p, "interrupted"
-    if settings.max_iter and live.any():
-        final = engine.final_losses()
-        for f, loss, on in zip(running, final, live, strict=True):
-            if on:
-                f.losses.append(float(loss))
+        for f, on in zip(running, live, strict=True):
+            f.status = INTERRUPTED if on else f.status
+        if engine is not None:
+            _settle(running, live, engine)
     for f in fits:
         f.seconds["fit"] = (time.perf_counter() - began) / len(fits)
     return fits
@@ -350,13 +373,17 @@ def _stopped(fits, live, losses, settings):
     return stop
 
 
-def _settle(fits, live, stop, engine):
-    """Bring the state of fits that stopped (or all live ones, at the end) back to the host."""
-    now = engine.problems_now()
-    saved = engine.problems_now(saved=True) if any(f.status == "diverged" for f in fits) else now
-    for i, f in enumerate(fits):
-        if live[i]:
-            f.problem = saved[i] if f.status == "diverged" else now[i]
+def _settle(fits, stop, engine):
+    """Bring the state of the fits that stop here back to the host, with its loss: the present one,
+    or the best one kept where that is better, or the present one half-way through an iteration."""
+    now, kept = engine.problems_now(), engine.problems_now(kept=True)
+    losses, best = engine.final_losses(), engine.best_losses()
+    for i in np.flatnonzero(stop):
+        fits[i].problem, loss = now[i], losses[i]
+        if fits[i].status == INTERRUPTED or not losses[i] <= best[i]:
+            fits[i].problem, loss = kept[i], best[i]
+        if np.isfinite(loss):
+            fits[i].losses.append(float(loss))
 
 
 def _check_profiles(sources, frame):
@@ -381,20 +408,29 @@ def _padded_frame(frame, pad):
     return frame if shape == frame.shape else Frame(frame.grid.cutout(0, 0, shape), frame.psf)
 
 
-def _view(frame, observation, pad, device, dtype, *, private):
-    """An observation in units of its channels' noise, padded, and these units (Co,)."""
+def _view(frame, padded, observation, pad, device, dtype, *, private):
+    """An observation in units of its channels' noise, padded, and these units (Co,).
+
+    Pixels beyond the frame itself have no weight, though they may lie on the padded one.
+    """
     shape = tuple(-(-n // pad) * pad for n in observation.data.shape[1:])
     grid = observation.grid
     if shape != observation.data.shape[1:]:
         grid = grid.cutout(0, 0, shape)
-    op = operator(frame, grid, observation.psf, dtype=dtype, device=device, private=private)
+    op = operator(padded, grid, observation.psf, dtype=dtype, device=device, extent=frame.shape,
+                  private=private)
     low = [(0, 0)] + [(0, n - m) for n, m in zip(shape, observation.data.shape[1:], strict=True)]
     data, weights = np.pad(observation.data, low), np.pad(observation.weights, low)
     seen = weights > 0
     unit = np.array([1 / np.sqrt(np.median(w[s])) if s.any() else 1.0
                      for w, s in zip(weights, seen, strict=True)])
-    root = np.sqrt(weights) * unit[:, None, None] * op.covered
+    root = np.sqrt(weights) * unit[:, None, None] * _covered(op, frame)
     return View(op, root, data / unit[:, None, None]), unit
+
+
+def _covered(op, frame):
+    """Observed pixels (My, Mx) whose centre lies on the frame itself, not on its padding."""
+    return replace(op.plans[0].mapping, shape_in=frame.shape).covered
 
 
 def _pixel_noise(views):

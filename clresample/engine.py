@@ -62,6 +62,7 @@ class Problem:
     """One scene with the state of its fit, on the host.
 
     shape (Ny, Nx) [px]: model frame
+    extent (Ny, Nx) [px]: the part of it, from its first pixel on, that is not padding
     ops: one Resampler per observation, on one plan
     data, weights: per observation (Co, My, Mx)
     origin, shape_box, center (S, 2) [px]: boxes, inside the frame
@@ -75,6 +76,7 @@ class Problem:
     """
 
     shape: tuple[int, int]
+    extent: tuple[int, int]
     ops: list[Resampler]
     data: list[np.ndarray]
     weights: list[np.ndarray]
@@ -117,7 +119,6 @@ class Engine:
         self.n_steps = problems[0].n_steps
         self.shape = problems[0].shape
         self.n_channels = problems[0].spectra.shape[1]
-        self._saved = None
         self._upload_sources()
         self._upload_observations()
         self._bind()
@@ -143,7 +144,7 @@ class Engine:
         self.field = flat([p.field for p in problems])
         self.morph = flat([p.morph for p in problems])
         alpha = self.prior.alpha if self.prior else 0.0
-        self.amp = flat([[alpha * np.sqrt(base) for base in p.base] for p in problems])
+        self.amp = flat([[alpha * np.sqrt(np.maximum(base, 0)) for base in p.base] for p in problems])
         zeros = self.device.zeros
         self.moments = [
             flat([p.moments_morph[i] for p in problems]) if problems[0].moments_morph
@@ -227,9 +228,15 @@ class Engine:
                     self.models[j], self.spectra, *geometry, i32(j > 0), self.d_morph))
         self.history = d.empty((HISTORY, n), self.dtype)
         self._losses = d.kernel("update.cl", "losses", **options)
+        self.best = self._put(np.full(n, np.inf))
         self._losses.set_args(first, table, n_rows, self.rows_loss.data,
                               i32(self.prior is not None), self.field.data, self.history.data,
-                              i32(0))
+                              self.best.data, i32(0))
+        state = self.field, self.morph, self.spectra, self.sky
+        self.kept = [d.put(d.get(a)) for a in state]
+        everyone = self.boxes.everyone.data
+        self._keep = kernel("update.cl", "keep", (width, self.tallest, n_sources), everyone, table,
+                            first, n_channels, self.history, self.best, *state, *self.kept)
         self._spectra_kernel = d.kernel("update.cl", "step_spectra", **options)
         self._spectra_kernel.set_args(*(a.base_data for a in (
             self.d_spectra, self.scale, self.spectra, *self.moments_spectra)),
@@ -261,31 +268,34 @@ class Engine:
         self._n_morph_args, self._morph_size = len(args), size
 
     def run(self, n_steps):
-        """Losses (n_steps, B) before each of `n_steps` iterations; these are done by then."""
+        """Losses (n_steps, B) before each of `n_steps` iterations, which are done by then.
+
+        Of each scene the state before the first of them is kept if its loss is the lowest so far.
+        """
+        if n_steps > HISTORY:
+            raise ValueError(f"n_steps is {n_steps}, losses of {HISTORY} are kept")
         for i in range(n_steps):
             self.gradient(i)
+            if i == 0:
+                self._keep()
             self.update()
         return self.device.get(self.history)[:n_steps].astype(np.float64)
 
     def final_losses(self):
         """Losses (B,) at the present parameters."""
-        self.gradient()
-        return self.device.get(self.history)[0].astype(np.float64)
+        self.gradient(1)  # not 0, which belongs to the states that are kept
+        return self.device.get(self.history)[1].astype(np.float64)
+
+    def best_losses(self):
+        """Losses (B,) of the states kept, infinite before the first iteration."""
+        return self.device.get(self.best).astype(np.float64)
 
     def gradient(self, i_loss=0):
         """Queue model, residual, gradients, and the losses into history[i_loss]."""
         for launch in self._iteration:
             launch()
-        self._losses.set_arg(7, np.int32(i_loss))
+        self._losses.set_arg(8, np.int32(i_loss))
         self._launch(self._losses, (len(self.problems),))
-
-    def save(self):
-        """Keep a copy of the parameters on the device."""
-        now = (self.field, self.morph, self.spectra, self.sky)
-        if self._saved is None:
-            self._saved = [self.device.empty(a.shape, a.dtype) for a in now]
-        for source, target in zip(now, self._saved, strict=True):
-            self.device.copy(source, target)
 
     def update(self):
         """Queue the proximal step along the gradients."""
@@ -323,10 +333,10 @@ class Engine:
         """First channel of an observation."""
         return sum(op.shape_out[0] for op in self.ops[:i_observation])
 
-    def problems_now(self, saved=False) -> list[Problem]:
-        """The problems with their present state, or the one last saved, back on the host."""
+    def problems_now(self, kept=False) -> list[Problem]:
+        """The problems with their present state, or the best one kept, back on the host."""
         get, unpack = self.device.get, self.host_boxes.unpack
-        state = self._saved if saved else (self.field, self.morph, self.spectra, self.sky)
+        state = self.kept if kept else (self.field, self.morph, self.spectra, self.sky)
         field, morph, spectra, sky = (get(a) for a in state)
         flats = [unpack(a) for a in (field, morph, *(get(m) for m in self.moments))]
         moments = [get(a) for a in self.moments_spectra]

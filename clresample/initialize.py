@@ -58,8 +58,11 @@ class View:
     data: np.ndarray
 
     def render(self, images):
-        """Whitened unit-spectrum images (n, Co, My * Mx) of model images (n, Ny, Nx)."""
-        images = images.astype(self.op.dtype)
+        """Whitened unit-spectrum images (n, Co, My * Mx) of model images (n, Ny, Nx).
+
+        Images smaller than the operator's frame are zero beyond.
+        """
+        images = _padded(images, self.op.shape_in).astype(self.op.dtype)
         images[np.abs(images) < DARK * np.abs(images).max(initial=0)] = 0
         out = self.op.render(images) * self.root
         return out.reshape(*out.shape[:2], -1).astype(np.float64)
@@ -156,7 +159,7 @@ class _ProfileFit:
                     scatter.append(np.full(n, STAR_SCATTER_PX))
                 elif source.profile is not None:
                     self.kinds.append("given")
-                    self.given[i] = _given(source.profile, frame.shape)
+                    self.given[i] = np.asarray(source.profile) / np.sum(source.profile)
                     mean.append(np.zeros(0))
                     scatter.append(np.zeros(0))
                 else:
@@ -282,14 +285,14 @@ class _ProfileFit:
         units = np.array([i[0] for i in images])
         model = np.einsum("nc,nyx->cyx", spectra[:, : op.shape_out[0]], units)
         slopes = np.array([_slope(model, axis) for axis in (-2, -1)])
-        out = op.forward(slopes.astype(op.dtype)) * self.views[i_view].root
+        out = op.forward(_padded(slopes, op.shape_in).astype(op.dtype)) * self.views[i_view].root
         return out.reshape(*out.shape[:2], -1).astype(np.float64)
 
 
-def _given(profile, shape):
-    """A source's own profile (Ny, Nx) at unit sum, on the frame and its padding."""
-    padding = [(0, n - m) for n, m in zip(shape, np.shape(profile), strict=True)]
-    return np.pad(np.asarray(profile, dtype=np.float64), padding) / np.sum(profile)
+def _padded(images, shape):
+    """Images (..., Ny, Nx) with zeros beyond, up to the last two of `shape`."""
+    more = [(0, n - m) for n, m in zip(shape[-2:], images.shape[-2:], strict=True)]
+    return np.pad(images, [(0, 0)] * (images.ndim - 2) + more)
 
 
 def _slope(images, axis):

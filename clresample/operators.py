@@ -21,16 +21,16 @@ N_PLANS, N_OPERATORS = 256, 32
 class _Recipe:
     """What a plan is made of, equal to another of the same bytes."""
 
-    def __init__(self, mapping, psf_in, psf_out, dtype):
+    def __init__(self, mapping, psf_in, psf_out, dtype, extent):
         self.mapping, self.psf_in, self.psf_out = mapping, psf_in, psf_out
-        self.precision = Precision.of(dtype)
+        self.precision, self.extent = Precision.of(dtype), extent
         digest = hashlib.sha256()
         parts = [mapping.matrix, mapping.offset, mapping.positions, mapping.area]
         for psf in (psf_in, psf_out):
             parts += [psf.images, psf.center, np.float64(psf.spacing)]
         for part in parts:
             digest.update(b"-" if part is None else np.ascontiguousarray(part).tobytes())
-        self.key = (mapping.kind, mapping.shape_in, mapping.shape_out, np.dtype(dtype).str,
+        self.key = (mapping.kind, mapping.shape_in, mapping.shape_out, extent, np.dtype(dtype).str,
                     tuple(p.images.shape for p in (psf_in, psf_out)), digest.digest())
 
     def __hash__(self):
@@ -42,7 +42,8 @@ class _Recipe:
 
 @functools.lru_cache(maxsize=N_PLANS)
 def _plan(recipe: _Recipe) -> Plan:
-    return make_plan(recipe.mapping, recipe.psf_in, recipe.psf_out, precision=recipe.precision)
+    return make_plan(recipe.mapping, recipe.psf_in, recipe.psf_out, precision=recipe.precision,
+                     extent=recipe.extent)
 
 
 @functools.lru_cache(maxsize=N_OPERATORS)
@@ -50,12 +51,14 @@ def _operator(recipe: _Recipe, dtype, device) -> Resampler:
     return Resampler.from_plans([_plan(recipe)], dtype=dtype, device=device)
 
 
-def operator(frame: Frame, grid: Grid, psf: PSF, *, dtype, device=None, private=False) -> Resampler:
+def operator(frame: Frame, grid: Grid, psf: PSF, *, dtype, device=None, extent=None,
+             private=False) -> Resampler:
     """The Resampler from `frame` to `grid` and `psf`; asked twice it is the same object.
 
+    extent (2,) [px]: what of the frame holds light, the rest is padding; None = all of it
     private: an operator of the caller's own, whose shift may be set, on the same plan
     """
-    recipe = _Recipe(grid.map_to(frame.grid), frame.psf, psf, dtype)
+    recipe = _Recipe(grid.map_to(frame.grid), frame.psf, psf, dtype, extent)
     device, dtype = get_device(device), np.dtype(dtype)
     if private:
         return Resampler.from_plans([_plan(recipe)], dtype=dtype, device=device)

@@ -60,7 +60,7 @@ def _box(problem, i, base, noise):
         elif first - low[axis] >= TRIM_PX:
             new_low[axis] = first
         if along[-1] > GROW_AT * light:
-            new_high[axis] = min(high[axis] + GROW_PX, problem.shape[axis])
+            new_high[axis] = min(high[axis] + GROW_PX, problem.extent[axis])
         elif high[axis] - last >= TRIM_PX:
             new_high[axis] = last
     return new_low, new_high

@@ -20,6 +20,7 @@ def shift_steps(problem) -> np.ndarray:
     problem: `engine.Problem` in its present state
     """
     model = np.zeros((problem.spectra.shape[1], *problem.shape))
+    light = model[:, : problem.extent[0], : problem.extent[1]]
     for spectrum, (y, x), morph in zip(problem.spectra, problem.origin, problem.morph, strict=True):
         n_y, n_x = morph.shape
         model[:, y : y + n_y, x : x + n_x] += spectrum[:, None, None] * morph
@@ -27,7 +28,9 @@ def shift_steps(problem) -> np.ndarray:
     for op, data, weights in zip(problem.ops, problem.data, problem.weights, strict=True):
         part = slice(channel, channel + op.shape_out[0])
         channel = part.stop
-        images = np.array([model[part], *np.gradient(model[part], axis=(1, 2))])
+        images = np.zeros((3, *op.shape_in))
+        images[..., : light.shape[1], : light.shape[2]] = (
+            light[part], *np.gradient(light[part], axis=(1, 2)))
         seen, *slopes = op.forward(images.astype(op.dtype)).astype(np.float64)
         rest = weights * (data - seen - problem.sky[part, None, None])
         normal = np.einsum("icyx,jcyx,cyx->ij", slopes, slopes, weights)

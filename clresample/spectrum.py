@@ -84,11 +84,14 @@ class Plan:
         return self.d_plus * (phase_y * phase_x), self.d_minus * (phase_y * phase_x.conj())
 
 
-def make_plan(mapping: Mapping, psf_in: PSF, psf_out: PSF, *, precision: Precision) -> Plan:
+def make_plan(mapping: Mapping, psf_in: PSF, psf_out: PSF, *, precision: Precision,
+              extent=None) -> Plan:
     """Tables that take a model to the observed pixels and PSF of `mapping`.
 
     mapping: observed pixels -> model pixels
     psf_in (1 or C bands), psf_out (C bands): PSF samples of the model and of the observation
+    extent (2,) [model px]: from its first pixel on, what of the model holds light, and sets the
+        frequencies; None = all of it
     raises ValueError for incompatible band counts or a PSF with no light in the band.
     """
     n_bands = max(psf_in.n_bands, psf_out.n_bands)
@@ -102,7 +105,7 @@ def make_plan(mapping: Mapping, psf_in: PSF, psf_out: PSF, *, precision: Precisi
         raise ValueError("the grids do not overlap: no pixel of the observation "
                          f"{mapping.shape_out} lies on the model {mapping.shape_in}")
     radius = wrap_radius(psf_out, mapping.matrix)
-    n_fft = tuple(_odd(n + h) for n, h in zip(mapping.shape_in, radius, strict=True))
+    n_fft = tuple(_odd(n + h) for n, h in zip(extent or mapping.shape_in, radius, strict=True))
     nu_y, nu_x = (np.arange(_half_count(mapping.matrix, psf_out.spacing, i, n_fft[i])) / n_fft[i]
                   for i in (0, 1))
     d, report = difference_spectrum(mapping.matrix, psf_in, psf_out, nu_y, nu_x)

@@ -17,6 +17,9 @@
  *             pull (B, n_rows): sum of w r of each observed row; channel c has rows
  *             row0[c] .. row0[c + 1] - 1
  * losses      out[i_loss, b] = sum of loss rows + 1/2 sum_s |z_s|^2; launch: (B)
+ *             best[b] = the lowest of those with i_loss = 0
+ * keep        kept_* <- field, morph, spectra, sky of the scenes whose loss[b] is best[b], and so
+ *             never of one whose loss is NaN; launch: (X, tallest box, S)
  * rescale     A[s, c] *= factor[s]: what a normalisation took out of a morphology; launch: (S * C)
  *
  * t1 = 1 / (1 - B1^t), t2 = 1 / (1 - B2^t) come from the host.
@@ -188,7 +191,7 @@ __kernel void step_sky(const int n_channels, const int n_rows, __global const in
 __kernel void losses(__global const int *restrict first, __global const int *restrict table,
                      const int n_rows, __global const REAL *restrict rows, const int prior,
                      __global const REAL *restrict field, __global REAL *restrict out,
-                     const int i_loss)
+                     __global REAL *restrict best, const int i_loss)
 {
     const int b = (int)get_global_id(0);
     REAL total = 0;
@@ -205,6 +208,28 @@ __kernel void losses(__global const int *restrict first, __global const int *res
             for (int k = 0; k < 8; ++k) total += (REAL)0.5 * part[k];
         }
     out[(size_t)i_loss * get_global_size(0) + b] = total;
+    if (i_loss == 0 && total < best[b]) best[b] = total;
+}
+
+__kernel void keep(__global const int *restrict active, __global const int *restrict table,
+                   __global const int *restrict first, const int n_channels,
+                   __global const REAL *restrict loss, __global const REAL *restrict best,
+                   __global const REAL *restrict field, __global const REAL *restrict morph,
+                   __global const REAL *restrict spectra, __global const REAL *restrict sky,
+                   __global REAL *restrict kept_field, __global REAL *restrict kept_morph,
+                   __global REAL *restrict kept_spectra, __global REAL *restrict kept_sky)
+{
+    ROW
+    const int b = table[8 * s];
+    if (!(loss[b] == best[b])) return;
+    FOR_X(x, nx) kept_field[row + x] = field[row + x];
+    FOR_X(x, nx) kept_morph[row + x] = morph[row + x];
+    if (y > 0 || get_global_id(0) > 0) return;
+    for (int c = 0; c < n_channels; ++c) {
+        const size_t i = (size_t)s * n_channels + c, j = (size_t)b * n_channels + c;
+        kept_spectra[i] = spectra[i];
+        if (s == first[b]) kept_sky[j] = sky[j];
+    }
 }
 
 __kernel void rescale(__global const REAL *restrict factor, const int n_channels,
