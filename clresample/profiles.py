@@ -9,10 +9,14 @@ that sigma -> 0 is a star.  Point sources are the model's PSF itself, interpolat
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 from .psf import PSF
 
+# Spectra of the model's PSF that are kept: stars of one frame share one, of 1 MB at 256 pixels.
+N_SPECTRA = 8
 
 def covariance(parameters, psf_moment):
     """C (2, 2) [px^2] and its derivatives (3, 2, 2) by (ln sigma [px], g1, g2).
@@ -68,9 +72,16 @@ def point(psf: PSF, position, shape, *, slopes=True):
     n_fft += 1 - n_fft % 2
     nu = np.fft.fftfreq(n_fft)
     shift_y, shift_x = (np.exp(-2j * np.pi * nu * p) for p in position)
-    spectrum = psf.spectrum(nu, nu)[0] * shift_y[:, None] * shift_x
+    spectrum = _spectrum(psf, n_fft) * shift_y[:, None] * shift_x
     spectra = [spectrum]
     if slopes:
         slope = -2j * np.pi * nu
         spectra += [slope[:, None] * spectrum, slope * spectrum]
     return np.fft.ifft2(spectra).real[:, : shape[0], : shape[1]].copy()
+
+
+@functools.lru_cache(maxsize=N_SPECTRA)
+def _spectrum(psf, n_fft):
+    """P^ of the first band (n_fft, n_fft) in the order of the FFT."""
+    nu = np.fft.fftfreq(n_fft)
+    return psf.spectrum(nu, nu)[0]
