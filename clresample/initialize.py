@@ -32,8 +32,9 @@ COMPONENT_SPREAD = 1.0
 # A star's position is known to this [px]; an observation's shift to that [model px].
 STAR_SCATTER_PX, SHIFT_SCATTER_PX = 0.5, 2.0
 MODEL_ERROR = 0.15
-# Gauss-Newton: longest step of a parameter, iterations, and the gain in chi2 that ends them
-LONGEST_STEP, N_ITERATIONS, ENOUGH = 0.7, 10, 0.5
+# Gauss-Newton: longest step of a parameter, iterations, and the part of chi2 that ends them when
+# it is all that one gains
+LONGEST_STEP, N_ITERATIONS, ENOUGH = 0.7, 10, 1e-3
 # Sources exactly on top of each other share their light: a ridge on the scaled normal matrix
 RIDGE = 1e-8
 # A box holds what reaches this part of the noise: the profile, or the structure that the prior
@@ -242,7 +243,7 @@ class _ProfileFit:
             gain = best["chi2"] - new["chi2"]
             if gain > 0:
                 best, damping = new, damping / 3
-                if gain < ENOUGH:
+                if gain < ENOUGH * new["chi2"]:
                     break
             else:
                 damping *= 10
