@@ -144,7 +144,8 @@ class Engine:
         self.field = flat([p.field for p in problems])
         self.morph = flat([p.morph for p in problems])
         alpha = self.prior.alpha if self.prior else 0.0
-        self.amp = flat([[alpha * np.sqrt(np.maximum(base, 0)) for base in p.base] for p in problems])
+        self.amp = flat([[alpha * np.sqrt(np.maximum(base, 0)) for base in p.base]
+                         for p in problems])
         zeros = self.device.zeros
         self.moments = [
             flat([p.moments_morph[i] for p in problems]) if problems[0].moments_morph

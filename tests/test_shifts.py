@@ -109,6 +109,7 @@ def truth(b, device):
     zeros = np.zeros((3, 2), int)
     return Problem(
         shape=SHARP.shape,
+        extent=SHARP.shape,
         ops=[
             operator(b.frame, o.grid, o.psf, dtype=np.float64, device=device)
             for o in b.observations
