@@ -67,7 +67,7 @@ psf_sigma_px = 0.8
 [fit]
 max_iter = 200
 tol = 1e-4
-# monotone = true                 # false for galaxies of arms and tails: not falling from the centre
+# monotone = true                 # false for galaxies of arms and tails
 # structure_px = 2.0              # size of the structure in a galaxy [model pixels]
 fit_shifts = false                # let all observations but the first move by a constant shift
 fit_sky = false                   # fit a constant in each channel

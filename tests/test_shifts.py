@@ -1,12 +1,11 @@
 """Shifts between observations are found during a fit, alone and in batches."""
 
-from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from clresample.deblend import Blend, Settings, deblend, deblend_many
-from clresample.engine import Problem
 from clresample.frame import model_frame
 from clresample.grid import Grid
 from clresample.observation import Observation
@@ -97,32 +96,26 @@ def test_the_step_is_the_shift_of_a_right_model(device):
     b = blend(shift, noise=1e-2)
     problem = truth(b, device)
     np.testing.assert_allclose(shift_steps(problem)[1], shift, atol=0.01)
-    blind = replace(problem, weights=[problem.weights[0], 0 * problem.weights[1]])
-    assert np.abs(shift_steps(blind)[1]).max() < 1e-3
+    problem.weights[1] = 0 * problem.weights[1]
+    assert np.abs(shift_steps(problem)[1]).max() < 1e-3
 
 
 def truth(b, device):
+    """What `shift_steps` reads of a problem whose model is right."""
     y, x = np.indices(SHARP.shape)
     galaxies = ((25, 25, 9e3, 2), (28, 31, 4e3, 4), (40, 45, 6e3, 2.5))
     morphs = [np.exp(-((y - a) ** 2 + (x - c) ** 2) / (2 * s**2)) for a, c, _, s in galaxies]
     peaks = np.array([flux / (2 * np.pi * s**2) for _, _, flux, s in galaxies])
-    zeros = np.zeros((3, 2), int)
-    return Problem(
+    return SimpleNamespace(
         shape=SHARP.shape,
-        extent=SHARP.shape,
         ops=[
             operator(b.frame, o.grid, o.psf, dtype=np.float64, device=device)
             for o in b.observations
         ],
         data=[o.data for o in b.observations],
         weights=[o.weights for o in b.observations],
-        origin=zeros,
-        center=zeros,
-        base=morphs,
-        field=morphs,
+        origin=np.zeros((3, 2), int),
         morph=morphs,
-        fixed=np.zeros(3, bool),
         spectra=np.repeat(peaks[:, None], 3, axis=1),
-        scale=np.ones((3, 3)),
         sky=np.zeros(3),
     )
