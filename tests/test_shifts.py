@@ -108,6 +108,7 @@ def truth(b, device):
     peaks = np.array([flux / (2 * np.pi * s**2) for _, _, flux, s in galaxies])
     return SimpleNamespace(
         shape=SHARP.shape,
+        extent=SHARP.shape,
         ops=[
             operator(b.frame, o.grid, o.psf, dtype=np.float64, device=device)
             for o in b.observations
