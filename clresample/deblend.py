@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import functools
 import time
 from collections import defaultdict
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from .device import DeviceError, get_device
-from .engine import Engine, Prior, Problem, Rates
-from .frame import Frame, model_frame
-from .initialize import View, box_around, solve_spectra, start
-from .observation import Observation, check_observations
-from .operators import operator
+from .engine import Engine, Prior, Rates
+from .fit import Fit
+from .frame import Frame
+from .observation import Observation
 from .prox import Chain, Monotone, Positivity
 from .resize import resized
-from .result import Component, Result
+from .result import Result
 from .shifts import shift_steps
-from .sources import Point, Source
+from .sources import Source
 
 # Status of a fit that Ctrl-C ended.
 INTERRUPTED = "interrupted"
@@ -37,8 +35,6 @@ REPACK = 0.25
 RESIZE = 40
 # Ragged batches: frames and observations are padded to multiples of this [px].
 PAD_PX = 16
-# Spectrum steps come in units of the flux's error plus this part of the flux.
-SPECTRUM_PART = 0.02
 # Device memory of one group of scenes [bytes], unless told otherwise.
 MEMORY = 1 << 30
 # What can go wrong with one blend and is no reason to give up the others.
@@ -78,8 +74,8 @@ class Failure:
 class Settings:
     """How a fit goes.
 
-    max_iter: most iterations; tol: a fit ends when the loss falls by less than this part of itself
-        over 5 iterations
+    max_iter: most iterations; tol: a fit ends when its best loss falls by less than this part of
+        itself over 15 iterations
     prior: the Prior of extended sources' morphologies about their smooth profiles; None fits the
         morphologies themselves, by the constraints alone
     constraints: Chain of proximal operators on the morphologies: non-negative, and monotone by the
@@ -118,7 +114,7 @@ def deblend(observations, sources, *, frame=None, shifts=None, settings=None, de
     blend = Blend(tuple(observations), tuple(sources), frame, shifts)
     settings = settings or Settings()
     device = get_device(device)
-    fit = _Fit(blend, settings, device, dtype, pad=1)
+    fit = Fit(blend, settings, device, dtype, pad=1)
     (done,) = _iterate([fit], settings, device, dtype, progress)
     return done.result()
 
@@ -158,7 +154,7 @@ def deblend_many(blends, *, settings=None, device=None, dtype=np.float32, memory
     try:
         for i, blend in enumerate(blends):
             try:
-                fit = _Fit(blend, settings, device, dtype, pad=pad)
+                fit = Fit(blend, settings, device, dtype, pad=pad)
             except ERRORS as error:
                 out[i] = Failure(blend, f"failed: {error}")
                 count(1)
@@ -197,107 +193,6 @@ def _try(group, settings, device, dtype):
 
 def _sizes(blend):
     return tuple(o.data.shape for o in blend.observations), blend.frame and blend.frame.shape
-
-
-class _Fit:
-    """One blend on its way from data to result."""
-
-    def __init__(self, blend, settings, device, dtype, *, pad):
-        began = time.perf_counter()
-        self.blend, self.settings = blend, settings
-        check_observations(blend.observations)
-        self.frame = blend.frame or model_frame(blend.observations)
-        _check_profiles(blend.sources, self.frame)
-        positions = self.frame.place(blend.sources)
-        inside = self.frame.inside(positions)
-        self.messages = [f"source {i} at {p} [px] lies outside the model frame {self.frame.shape}"
-                         for i, p in enumerate(positions) if not inside[i]]
-        self.fitted = np.flatnonzero(inside)
-        if not len(self.fitted):
-            raise ValueError(f"none of the {len(positions)} sources lies inside the model frame "
-                             f"{self.frame.shape}")
-        shifts = _shifts(blend)
-        private = settings.fit_shifts or shifts.any()
-        self.padded = _padded_frame(self.frame, pad)
-        self.views, self.units = [], []
-        for o in blend.observations:
-            view, unit = _view(self.frame, self.padded, o, pad, device, dtype, private=private)
-            if private:
-                view.op.shift = shifts[len(self.views)]
-            self.views.append(view)
-            self.units.append(unit)
-        if not any(view.root.any() for view in self.views):
-            raise ValueError("no observed pixel on the model frame has a weight")
-        self.unit = np.concatenate(self.units)
-        self.losses, self.status = [], "iteration limit"
-        sources = [blend.sources[i] for i in self.fitted]
-        self.start = start(self.frame, sources, positions[inside], self.views,
-                           fit_sky=settings.fit_sky)
-        self.problem = self._problem(sources)
-        self.seconds = {"setup": time.perf_counter() - began}
-
-    def _problem(self, sources):
-        begin, views = self.start, self.views
-        peak = begin.base.max(axis=(1, 2), keepdims=True)
-        self.base = base = begin.base / np.where(peak > 0, peak, 1)
-        self.noise = _pixel_noise(views)
-        units = [v.render(base) for v in views]
-        spectra, sky, _ = solve_spectra(units, views, self.settings.fit_sky)
-        noise = 1 / np.sqrt(np.maximum(
-            np.concatenate([(u**2).sum(axis=2) for u in units], axis=1), 1e-30))
-        origin, center, morphs = [], [], []
-        for i, image in enumerate(base):
-            brightness = (spectra[i] / self.noise).max()
-            low, size, middle = box_around(image, begin.positions[begin.source[i]], brightness)
-            origin.append(low)
-            center.append(middle)
-            morphs.append(image[low[0] : low[0] + size[0], low[1] : low[1] + size[1]].copy())
-        seen = noise < 1e14
-        return Problem(
-            shape=self.padded.shape, extent=self.frame.shape,
-            ops=[v.op for v in views],
-            data=[v.data for v in views],
-            weights=[v.root**2 for v in views],
-            origin=np.array(origin), center=np.array(center), base=morphs,
-            field=[np.zeros_like(m) for m in morphs], morph=[m.copy() for m in morphs],
-            fixed=np.array([isinstance(sources[i], Point) for i in begin.source]),
-            spectra=spectra, scale=np.where(seen, noise + SPECTRUM_PART * spectra, 0),
-            sky=sky, fit_sky=self.settings.fit_sky,
-        )
-
-    @functools.cached_property
-    def bytes(self):
-        """Device memory of the scene in a batch, roughly."""
-        pixels = sum(2 * np.prod(o.shape_in) + 4 * np.prod(o.shape_out) for o in self.problem.ops)
-        return int(8 * (pixels + 12 * sum(m.size for m in self.problem.morph)))
-
-    def result(self) -> Result:
-        """Everything back in the data's own units, spectra solved for the final morphologies."""
-        began, p, n = time.perf_counter(), self.problem, len(self.problem.spectra)
-        morphs = np.zeros((n, *p.shape))
-        for full, (y, x), m in zip(morphs, p.origin, p.morph, strict=True):
-            peak = m.max() if m.max() > 0 else 1.0
-            full[y : y + m.shape[0], x : x + m.shape[1]] = m / peak
-        units = [v.render(morphs) for v in self.views]
-        spectra, sky, covariance = solve_spectra(units, self.views, self.settings.fit_sky)
-        components = []
-        for i, ((y, x), m) in enumerate(zip(p.origin, p.morph, strict=True)):
-            part = morphs[i, y : y + m.shape[0], x : x + m.shape[1]]
-            components.append(Component(int(self.fitted[self.start.source[i]]), (int(y), int(x)),
-                                        part, spectra[i] * self.unit))
-        rendered = []
-        for view, o in zip(self.views, self.blend.observations, strict=True):
-            images = view.op.render(morphs.astype(view.op.dtype)).astype(np.float64)
-            images *= _covered(view.op, self.frame)
-            rendered.append(images[..., : o.data.shape[1], : o.data.shape[2]])
-        self.seconds["result"] = time.perf_counter() - began
-        return Result(
-            observations=self.blend.observations, frame=self.frame, sources=self.blend.sources,
-            components=tuple(components), rendered=tuple(rendered), sky=sky * self.unit,
-            covariance=covariance * self.unit[:, None, None] ** 2, shifts=self.start.shifts,
-            losses=np.array(self.losses), status=self.status, messages=tuple(self.messages),
-            seconds=self.seconds,
-        )
 
 
 def _iterate(fits, settings, device, dtype, progress=None):
@@ -346,11 +241,11 @@ def _move(fits, live, engine):
     """Shift the observations of the fits that go on to where their models agree."""
     for f, p, on in zip(fits, engine.problems_now(), live, strict=True):
         if on:
-            f.start.shifts = f.start.shifts + shift_steps(p)
-            for op, shift in zip(p.ops, f.start.shifts, strict=True):
+            f.shifts = f.shifts + shift_steps(p)
+            for op, shift in zip(p.ops, f.shifts, strict=True):
                 op.shift = shift
     for i, op in enumerate(engine.ops):
-        op.shift = np.array([f.start.shifts[i] for f in fits])
+        op.shift = np.array([f.shifts[i] for f in fits])
 
 
 def _engine(fits, settings, device, dtype):
@@ -384,59 +279,3 @@ def _settle(fits, stop, engine):
             fits[i].problem, loss = kept[i], best[i]
         if np.isfinite(loss):
             fits[i].losses.append(float(loss))
-
-
-def _check_profiles(sources, frame):
-    for i, source in enumerate(sources):
-        profile = getattr(source, "profile", None)
-        if profile is not None and np.shape(profile) != frame.shape:
-            raise ValueError(f"profile of source {i} has the shape {np.shape(profile)}, "
-                             f"the model frame {frame.shape}")
-
-
-def _shifts(blend):
-    """Shifts (n_observations, 2) [model px] that a blend comes with."""
-    expected = len(blend.observations), 2
-    shifts = np.zeros(expected) if blend.shifts is None else np.asarray(blend.shifts, float)
-    if shifts.shape != expected or not np.isfinite(shifts).all():
-        raise ValueError(f"shifts is {shifts.tolist()}, must be {expected} finite numbers")
-    return shifts
-
-
-def _padded_frame(frame, pad):
-    shape = tuple(-(-n // pad) * pad for n in frame.shape)
-    return frame if shape == frame.shape else Frame(frame.grid.cutout(0, 0, shape), frame.psf)
-
-
-def _view(frame, padded, observation, pad, device, dtype, *, private):
-    """An observation in units of its channels' noise, padded, and these units (Co,).
-
-    Pixels beyond the frame itself have no weight, though they may lie on the padded one.
-    """
-    shape = tuple(-(-n // pad) * pad for n in observation.data.shape[1:])
-    grid = observation.grid
-    if shape != observation.data.shape[1:]:
-        grid = grid.cutout(0, 0, shape)
-    op = operator(padded, grid, observation.psf, dtype=dtype, device=device, extent=frame.shape,
-                  private=private)
-    low = [(0, 0)] + [(0, n - m) for n, m in zip(shape, observation.data.shape[1:], strict=True)]
-    data, weights = np.pad(observation.data, low), np.pad(observation.weights, low)
-    seen = weights > 0
-    unit = np.array([1 / np.sqrt(np.median(w[s])) if s.any() else 1.0
-                     for w, s in zip(weights, seen, strict=True)])
-    root = np.sqrt(weights) * unit[:, None, None] * _covered(op, frame)
-    return View(op, root, data / unit[:, None, None]), unit
-
-
-def _covered(op, frame):
-    """Observed pixels (My, Mx) whose centre lies on the frame itself, not on its padding."""
-    return replace(op.plans[0].mapping, shape_in=frame.shape).covered
-
-
-def _pixel_noise(views):
-    """Noise (C,) of one model pixel per channel, in the views' units."""
-    noise = []
-    for view in views:
-        area = abs(np.linalg.det(view.op.plans[0].mapping.matrix))
-        noise += [1 / np.sqrt(area)] * view.data.shape[0]
-    return np.array(noise)

@@ -19,10 +19,10 @@ import numpy as np
 from scipy.signal import fftconvolve
 
 from .frame import Frame, model_frame
-from .initialize import MODEL_ERROR
 from .observation import MIN_PIXELS, Observation
 from .operators import operator
 from .sources import Extended
+from .spectra import MODEL_ERROR
 
 # [sigma] of the combined image: white noise reaches it once in two million independent pixels
 THRESHOLD = 5.0

@@ -7,12 +7,39 @@ from dataclasses import replace
 import numpy as np
 
 from .engine import Problem
-from .initialize import BOX_NOISE, box_around
 
+# A box holds what reaches this part of the noise: the profile, or the structure that the prior
+# allows about it (alpha = 0.1 of the root of the light); as a part of the peak, within bounds.
+BOX_NOISE, BOX_FAINTEST, BOX_BRIGHTEST = 0.1, 1e-7, 5e-3
+SMALLEST_RADIUS_PX = 5
 # [px] by which a side grows where light reaches it, and from which on trimming is worth the move
 GROW_PX, TRIM_PX = 8, 4
 # A box grows when its edge is this much brighter than a tenth of the noise.
 GROW_AT = 4.0
+
+
+def box_threshold(brightness):
+    """Part of the peak above which a pixel is worth its place; the peak is `brightness` sigma."""
+    brightness = max(brightness, 1.0)
+    return np.clip(min(BOX_NOISE / brightness, brightness**-2), BOX_FAINTEST, BOX_BRIGHTEST)
+
+
+def box_around(base, position, brightness):
+    """Box of one profile: origin (2,) and shape (2,) inside the frame, and its centre pixel (2,).
+
+    base (Ny, Nx): profile; position (2,) [px]; brightness: its peak over the noise of a model
+    pixel, in the channel that sees it best
+    """
+    threshold = box_threshold(brightness) * base.max()
+    pixel = np.clip(np.floor(np.asarray(position) + 0.5).astype(int), 0, np.array(base.shape) - 1)
+    lit = base > threshold
+    low, high = np.zeros(2, int), np.zeros(2, int)
+    for axis in (0, 1):
+        along = np.flatnonzero(lit.any(axis=1 - axis))
+        first, last = (along[0], along[-1]) if len(along) else (pixel[axis], pixel[axis])
+        low[axis] = max(min(first, pixel[axis] - SMALLEST_RADIUS_PX), 0)
+        high[axis] = min(max(last, pixel[axis] + SMALLEST_RADIUS_PX), base.shape[axis] - 1)
+    return low, high - low + 1, pixel - low
 
 
 def resized(problem: Problem, base, noise) -> Problem:
