@@ -10,9 +10,6 @@ A run continues where it was interrupted; more galaxies add to those that are th
 
 from __future__ import annotations
 
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
-
 import numpy as np
 from tqdm import tqdm
 
@@ -37,25 +34,17 @@ def run_chunks(cases, options, log):
         for case in cases
     ]
     missing = [
-        (case, start, stop)
+        (case, options.catalogue, start, stop)
         for case, start, stop in chunks
         if len(log.done.get(key(case, start), ())) < stop - start
     ]
     total = sum(stop - start for _, start, stop in chunks)
-    there = total - sum(stop - start for _, start, stop in missing)
-    pool = ProcessPoolExecutor(options.processes, mp_context=get_context("spawn"))
-    try:
-        futures = {
-            pool.submit(measure, case, options.catalogue, start, stop): (case, start, stop)
-            for case, start, stop in missing
-        }
-        with tqdm(total=total, initial=there, unit=" stamps", desc="accuracy") as bar:
-            for future in as_completed(futures):
-                case, start, stop = futures[future]
-                log.append(key(case, start), future.result())
-                bar.update(stop - start)
-    finally:
-        pool.shutdown(cancel_futures=True)
+    there = total - sum(stop - start for *_, start, stop in missing)
+    with tqdm(total=total, initial=there, unit=" stamps", desc="accuracy") as bar:
+        for task, rows in common.in_processes(measure, missing, options.processes):
+            case, _, start, stop = task
+            log.append(key(case, start), rows)
+            bar.update(stop - start)
 
 
 def key(case, start):
@@ -251,13 +240,7 @@ def parser():
         action="store_true",
         help=f"cut the stamps from drawings of {FIELD_ARCSEC:g} arcsec, so that no light folds in",
     )
-    parser.add_argument(
-        "--processes",
-        type=common.positive(int),
-        default=2,
-        metavar="N",
-        help="processes, of one thread each (%(default)s)",
-    )
+    parser.add_processes()
     parser.add_folder()
     return parser
 
