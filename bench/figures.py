@@ -191,11 +191,14 @@ def absolute_timings(path, sizes, means, setups):
     save(path, figure)
 
 
-def schemes(path, curves):
-    """Both schemes and their ratio against N; angle [deg] -> (sizes, ours [ms], paper [ms])."""
+def schemes(path, rows):
+    """Both schemes' times [ms] and their ratio against N; rows: as `timing` writes them."""
     figure, axes = _figure(1, 2, 4.6, 3.7)
     left, right = axes[0]
-    for (angle, (sizes, ours, paper)), style in zip(curves.items(), ("-", "--")):
+    for row, style in zip(rows, ("-", "--")):
+        angle, sizes, ours, paper = (
+            row[name] for name in ("angle_deg", "n_model", "ours", "paper")
+        )
         _curve(left, sizes, ours, "ours", f"ours, {angle:g}°", style)
         _curve(left, sizes, paper, "paper", f"the paper's, {angle:g}°", style)
         ratio = np.divide(paper, ours)

@@ -2,14 +2,16 @@
 
     python -m bench.timing [--seconds S] [--printed] [--pairs FROM-TO ...] [--folder FOLDER]
 
-Stamps of 20 to 200 model pixels a side, from every survey to all of larger pixels, aligned; both
-schemes on one pair up to 400 pixels, turned as well.  Times are medians of one image of one band,
-from NumPy array to NumPy array, one thread each, all methods called in turn; set-up is apart: what
-the first image takes beyond a later one, with the kernels compiled.
+Stamps of 20 to 200 model pixels a side, from every survey to all of larger pixels, aligned; then
+both schemes on one pair up to 400 pixels, turned as well, all sizes in turn.  Times are medians of
+one image of one band, from NumPy array to NumPy array, one thread each, all methods called in turn;
+set-up is apart: what the first image takes beyond a later one, with the kernels compiled.
 """
 
 from __future__ import annotations
 
+import functools
+import itertools
 import time
 
 import numpy as np
@@ -22,23 +24,16 @@ from .cases import Case, Galaxies
 from .timing_findings import PAPER_FIT, findings, line_fit
 
 SIZES = (20, 30, 50, 70, 100, 150, 200)  # [model pixels a side], the paper's
-MAIN_PAIR, MAIN_SIZES, ANGLE_DEG = ("EUCLID", "RUBIN"), (50, 100, 200, 300, 400), 30.0
+MAIN_PAIR, MAIN_SIZES, ANGLES_DEG = ("EUCLID", "RUBIN"), (50, 100, 200, 300, 400), (0.0, 30.0)
 N_SETUPS = 3  # of each method; the first compiles and does not count
 
 
 def plan(options):
-    """Cases to time: the paper's grid, and what is missing in it for the curves of one pair."""
+    """Cases to time, by pair and size: the paper's grid."""
     surveys = common.surveys(options.printed)
     pairs = options.pairs or [pair for pair in common.survey_pairs() if pair[0] != pair[1]]
     sizes = options.sizes or SIZES
-    grid = [(pair, n, 0.0) for pair in pairs for n in sizes]
-    main = [
-        (MAIN_PAIR, n, angle) for n in options.sizes or MAIN_SIZES for angle in (0.0, ANGLE_DEG)
-    ]
-    return {
-        (*pair, n, angle): Case(*(surveys[name] for name in pair), n, angle)
-        for pair, n, angle in dict.fromkeys(grid + main)
-    }
+    return {(*pair, n): Case(*(surveys[name] for name in pair), n) for pair in pairs for n in sizes}
 
 
 def measure(case, galaxies, seconds):
@@ -72,6 +67,33 @@ def measure(case, galaxies, seconds):
     return {"ms": ms, "setup_ms": {n: max(0.0, first_ms[n] - ms[n]) for n in ms}}
 
 
+def measure_schemes(surveys, sizes, galaxies, seconds):
+    """Times [ms] of both schemes on the main pair, all sizes and angles in turn.
+
+    returns a row for each angle; its columns run over the sizes: times "ours" and "paper", and
+        "products", the multiply-adds of the paper's contraction
+    """
+    survey_in, survey_out = (surveys[name] for name in MAIN_PAIR)
+    calls, products = {}, {}
+    for n_model, angle in itertools.product(sizes, ANGLES_DEG):
+        case = Case(survey_in, survey_out, n_model, angle)
+        image = case.draw(galaxies.take(0, case))[0]
+        ours, paper = case.operator(), case.operator(SplitResampler)
+        calls[angle, n_model, "ours"] = functools.partial(ours, image)
+        calls[angle, n_model, "paper"] = functools.partial(paper, image)
+        products[angle, n_model] = paper.report["n_terms"] * case.n_obs**2
+    ms = common.interleaved_ms(calls, seconds=seconds * len(calls))
+    return [
+        {
+            "angle_deg": angle,
+            "n_model": list(sizes),
+            **{name: [ms[angle, n, name] for n in sizes] for name in ("ours", "paper")},
+            "products": [products[angle, n] for n in sizes],
+        }
+        for angle in ANGLES_DEG
+    ]
+
+
 def means(rows, kind):
     """Sizes, and mean times [ms] by method over the pairs of each size."""
     sizes = sorted({row["n_model"] for row in rows})
@@ -83,7 +105,7 @@ def means(rows, kind):
 
 def main(options):
     cases, galaxies = plan(options), Galaxies(options.catalogue)
-    for (name_in, name_out, n_model, _), case in cases.items():
+    for (name_in, name_out, n_model), case in cases.items():
         if case.n_obs == 0:
             raise common.BadOption(
                 f"--sizes {n_model}: no observed pixel from {name_in} to {name_out}"
@@ -101,32 +123,24 @@ def main(options):
     for key, case in tqdm(cases.items(), desc="timing", unit=" cases"):
         if key not in log.done:
             log.append(key, measure(case, galaxies, options.seconds))
+    sizes = options.sizes or MAIN_SIZES
+    if (key := ("schemes", *sizes)) not in log.done:
+        surveys = common.surveys(options.printed)
+        log.append(key, measure_schemes(surveys, sizes, galaxies, options.seconds))
+    schemes = log.done[key]
     rows = [
-        dict(zip(("from", "to", "n_model", "angle_deg"), key))
-        | {"n_obs": case.n_obs}
-        | log.done[key]
-        for key, case in cases.items()
+        {"from": name_in, "to": name_out, "n_model": n_model, "n_obs": case.n_obs}
+        | log.done[name_in, name_out, n_model]
+        for (name_in, name_out, n_model), case in cases.items()
     ]
-
-    sizes = options.sizes or SIZES
-    grid = [row for row in rows if row["angle_deg"] == 0 and row["n_model"] in sizes]
-    curves = {}
-    for angle in (0.0, ANGLE_DEG):
-        of_pair = sorted(
-            (row["n_model"], row["ms"]["ours"], row["ms"]["paper"])
-            for row in rows
-            if (row["from"], row["to"], row["angle_deg"]) == (*MAIN_PAIR, angle)
-            and row["n_model"] in (options.sizes or MAIN_SIZES)
-        )
-        curves[angle] = [list(column) for column in zip(*of_pair)]
-    sizes, running = means(grid, "ms")
-    _, setups = means(grid, "setup_ms")
-    fits = {scheme: line_fit(grid, scheme)[0] for scheme in ("paper", "ours")}
-    figures.time_ratios(options.folder / "timing-time_ratios.png", grid, fits, PAPER_FIT)
+    sizes, running = means(rows, "ms")
+    _, setups = means(rows, "setup_ms")
+    fits = {scheme: line_fit(rows, scheme)[0] for scheme in ("paper", "ours")}
+    figures.time_ratios(options.folder / "timing-time_ratios.png", rows, fits, PAPER_FIT)
     figures.absolute_timings(options.folder / "timing-absolute_timings.png", sizes, running, setups)
-    figures.schemes(options.folder / "timing-schemes.png", curves)
-    found = list(findings(grid, curves, sizes, running))
-    report.save(options.folder, "timing", record, found, rows=rows)
+    figures.schemes(options.folder / "timing-schemes.png", schemes)
+    found = list(findings(rows, schemes, sizes, running))
+    report.save(options.folder, "timing", record, found, rows=rows, schemes=schemes)
 
 
 def parser():

@@ -29,10 +29,10 @@ def slope(sizes, times):
     return float(np.polyfit(*zip(*large), 1)[0]) if len(large) > 1 else None
 
 
-def findings(rows, curves, sizes, means):
+def findings(rows, schemes, sizes, means):
     """Findings of section 4; the numbers are those that `timing` writes.
 
-    rows: aligned survey pairs; curves: angle -> (sizes, ours [ms], paper [ms]) of the main pair
+    rows: aligned survey pairs; schemes: both schemes on the main pair, a row for each angle
     sizes, means: mean times [ms] of each method by size
     """
     fits = {scheme: line_fit(rows, scheme)[0] for scheme in ("paper", "ours")}
@@ -64,7 +64,10 @@ def findings(rows, curves, sizes, means):
     )
     table = [["angle", "N", "ours [ms]", "the paper's [ms]", "ratio"]]
     slopes, texts = [], []
-    for angle, (n_models, ours, paper) in curves.items():
+    for row in schemes:
+        angle, n_models, ours, paper = (
+            row[name] for name in ("angle_deg", "n_model", "ours", "paper")
+        )
         table += [
             [f"{angle:g}°", n, f"{o:.3f}", f"{p:.3f}", f"{p / o:.1f}"]
             for n, o, p in zip(n_models, ours, paper)
@@ -73,6 +76,8 @@ def findings(rows, curves, sizes, means):
         if None not in found.values():
             slopes.append(found)
             texts.append(f"{found['paper']:.2f} and {found['ours']:.2f} at {angle:g}°")
+            products = slope(n_models, row["products"])
+            texts[-1] += f" ({products:.2f} by the count of the paper's multiply-adds)"
     yield Finding(
         "",
         "Ours over the paper's scheme",
