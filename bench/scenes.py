@@ -12,7 +12,6 @@ from clresample import PSF
 from clresample.deblend import Blend
 from clresample.frame import model_frame
 from clresample.measure import summary
-from clresample.observation import Observation
 from clresample.simulate import sdr, simulate_scene
 from clresample.sources import Extended
 from clresample.surveys import NOTEBOOK_SURVEYS
@@ -48,25 +47,12 @@ class Scenes:
         )
 
 
-def observation(image):
-    """A `SimulatedImage` as the fit is given it."""
-    return Observation(
-        image.data,
-        image.psf,
-        image.grid,
-        weights=image.weights,
-        channels=image.survey.bands,
-        zero_points=image.survey.zero_points_mag,
-        name=image.survey.name,
-    )
-
-
 def blend(scene, mode, *, profiles=None):
     """What a fit in one of MODES is given: images, true positions, Euclid's pixels.
 
     profiles (S, Ny, Nx): where the morphologies start; None leaves that to the fit
     """
-    observations = tuple(observation(getattr(scene, name)) for name in MODES[mode])
+    observations = tuple(getattr(scene, name).observation() for name in MODES[mode])
     if profiles is None:
         profiles = [None] * len(scene.profiles)
     sources = tuple(

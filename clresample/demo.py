@@ -19,7 +19,6 @@ from .deblend import Settings, deblend
 from .device import DeviceError, get_device
 from .frame import model_frame
 from .measure import catalogue
-from .observation import Observation
 from .plot_deblended import plot_deblended
 from .simulate import sdr, simulate_scene
 from .sources import Extended
@@ -37,18 +36,7 @@ def fit_all(scene, *, device=None):
     All modes are fitted on Euclid's pixels, on which the truth lies; the SDR compares images of
     unit sum.
     """
-    seen = {
-        image.survey.name: Observation(
-            image.data,
-            image.psf,
-            image.grid,
-            weights=image.weights,
-            channels=image.survey.bands,
-            zero_points=image.survey.zero_points_mag,
-            name=image.survey.name,
-        )
-        for image in scene.images
-    }
+    seen = {image.survey.name: image.observation() for image in scene.images}
     sources = [
         Extended(sky_deg=tuple(map(float, place)), name=f"{i + 1}")
         for i, place in enumerate(scene.positions_deg)

@@ -13,6 +13,7 @@ import numpy as np
 
 from .galaxies import draw, open_catalogue, random_galaxy
 from .grid import Grid
+from .observation import Observation
 from .psf import PSF
 from .surveys import EUCLID_VIS, RUBIN_UGRIZY, Survey
 
@@ -87,6 +88,18 @@ class SimulatedImage:
         """(C, Ny, Nx) [1/counts^2]: inverse variance of the noise."""
         inverse = 1 / self.survey.noise_sigma**2
         return np.broadcast_to(inverse[:, None, None], self.data.shape).copy()
+
+    def observation(self):
+        """The image as the `Observation` that a fit is given."""
+        return Observation(
+            self.data,
+            self.psf,
+            self.grid,
+            weights=self.weights,
+            channels=self.survey.bands,
+            zero_points=self.survey.zero_points_mag,
+            name=self.survey.name,
+        )
 
     def with_noise(self, rng):
         """The same image with other noise, drawn from `rng`."""

@@ -94,16 +94,7 @@ def make_plan(mapping: Mapping, psf_in: PSF, psf_out: PSF, *, precision: Precisi
         frequencies; None = all of it
     raises ValueError for incompatible band counts or a PSF with no light in the band.
     """
-    n_bands = max(psf_in.n_bands, psf_out.n_bands)
-    for name, psf in (("psf_in", psf_in), ("psf_out", psf_out)):
-        if psf.n_bands not in (1, n_bands):
-            raise ValueError(
-                f"{name} has {psf.n_bands} bands but the other PSF has {n_bands}: "
-                "give one band or as many as the other"
-            )
-    if not mapping.covered.any():
-        raise ValueError("the grids do not overlap: no pixel of the observation "
-                         f"{mapping.shape_out} lies on the model {mapping.shape_in}")
+    n_bands = count_bands(mapping, psf_in, psf_out)
     radius = wrap_radius(psf_out, mapping.matrix)
     n_fft = tuple(_odd(n + h) for n, h in zip(extent or mapping.shape_in, radius, strict=True))
     nu_y, nu_x = (np.arange(_half_count(mapping.matrix, psf_out.spacing, i, n_fft[i])) / n_fft[i]
@@ -138,6 +129,24 @@ def make_plan(mapping: Mapping, psf_in: PSF, psf_out: PSF, *, precision: Precisi
     report |= {"wrap_radius_px": radius, "n_fft": n_fft, "n_frequencies": (h_y, h_x)}
     return Plan(mapping.kind, mapping, n_bands, is_identity(mapping, psf_in, psf_out), nu, axes,
                 d_plus, d_minus, in_y, in_x, report=report, **tables)
+
+
+def count_bands(mapping: Mapping, psf_in: PSF, psf_out: PSF) -> int:
+    """Bands of an operator between two PSFs of 1 or C bands.
+
+    raises ValueError for numbers of bands that do not agree, and for grids that do not overlap.
+    """
+    n_bands = max(psf_in.n_bands, psf_out.n_bands)
+    for name, psf in (("psf_in", psf_in), ("psf_out", psf_out)):
+        if psf.n_bands not in (1, n_bands):
+            raise ValueError(
+                f"{name} has {psf.n_bands} bands but the other PSF has {n_bands}: "
+                "give one band or as many as the other"
+            )
+    if not mapping.covered.any():
+        raise ValueError("the grids do not overlap: no pixel of the observation "
+                         f"{mapping.shape_out} lies on the model {mapping.shape_in}")
+    return n_bands
 
 
 def is_identity(mapping: Mapping, psf_in: PSF, psf_out: PSF) -> bool:

@@ -12,7 +12,7 @@ from .grid import Grid
 from .linop import LinOp
 from .psf import PSF
 from .sincs import sinc_difference, sinc_table
-from .spectrum import wrap_radius
+from .spectrum import count_bands, wrap_radius
 
 
 class SplitResampler(LinOp):
@@ -58,8 +58,13 @@ class SplitResampler(LinOp):
         return op
 
     def _setup(self, mapping, psf_in, psf_out, dtype, device, shift):
-        n_bands = max(psf_in.n_bands, psf_out.n_bands)
-        _check(mapping, psf_in, psf_out, n_bands)
+        if mapping.kind == "distorted":
+            raise ValueError(
+                f"grid_out departs from an affine mapping by {mapping.departure_px:.2g} px of "
+                "grid_in, more than tolerance_px: the shifts need one matrix for all pixels, "
+                "Resampler does not"
+            )
+        n_bands = count_bands(mapping, psf_in, psf_out)
         super().__init__(device, dtype, (n_bands, *mapping.shape_in), (n_bands, *mapping.shape_out))
         self.kind, self.covered = mapping.kind, mapping.covered
         radius = wrap_radius(psf_out, mapping.matrix)
@@ -218,22 +223,3 @@ class RotatedFactors(Factors):
         half = self._scratch("half")
         self.plain(self.n_y, 2 * self.h_x, self.z_rows, n, self.in_y, z, half)
         self._from_columns(half, x, n)
-
-
-def _check(mapping, psf_in, psf_out, n_bands):
-    if mapping.kind == "distorted":
-        raise ValueError(
-            f"grid_out departs from an affine mapping by {mapping.departure_px:.2g} px of grid_in, "
-            "more than tolerance_px: the shifts need one matrix for all pixels, Resampler does not"
-        )
-    for name, psf in (("psf_in", psf_in), ("psf_out", psf_out)):
-        if psf.n_bands not in (1, n_bands):
-            raise ValueError(
-                f"{name} has {psf.n_bands} bands but the other PSF has {n_bands}: "
-                "give one band or as many as the other"
-            )
-    if not mapping.covered.any():
-        raise ValueError(
-            f"the grids do not overlap: no pixel of the observation {mapping.shape_out} "
-            f"lies on the model {mapping.shape_in}"
-        )
