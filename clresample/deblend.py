@@ -214,6 +214,7 @@ def _iterate(fits, settings, device, dtype, progress=None):
             if not live.any():
                 break
             if settings.fit_shifts and engine.n_steps % MOVE == 0:
+                _remember(running, live, engine)
                 _move(running, live, engine)
             resize = engine.n_steps % RESIZE == 0
             if resize or (~live).mean() >= REPACK:
@@ -224,6 +225,7 @@ def _iterate(fits, settings, device, dtype, progress=None):
                     f.problem = resized(p, f.base, f.noise) if resize else p
                     changed |= f.problem is not p
                 if changed:
+                    _remember(running, live, engine)
                     engine_new = _engine([f for f, _ in going], settings, device, dtype)
                     running, live = [f for f, _ in going], np.ones(len(going), bool)
                     engine = engine_new
@@ -260,22 +262,38 @@ def _stopped(fits, live, losses, settings):
         if not live[i]:
             continue
         f.losses.extend(losses[:, i].tolist())
-        now, best = f.losses[-1], np.nanmin(f.losses)
-        if not np.isfinite(losses[:, i]).all() or now > DIVERGED * best:
+        finite = np.isfinite(losses[:, i]).all()
+        best = np.nanmin(f.losses) if finite else np.nan
+        if not finite or f.losses[-1] > DIVERGED * best:
             f.status, stop[i] = "diverged", True
         elif len(f.losses) > PATIENCE and min(f.losses[:-PATIENCE]) - best < settings.tol * best:
             f.status, stop[i] = "converged", True
     return stop
 
 
+def _remember(fits, live, engine):
+    """Bring the states kept on the device back to the host where they are the best so far."""
+    losses, kept = engine.best_losses(), engine.problems_now(kept=True)
+    for i in np.flatnonzero(live):
+        if losses[i] < fits[i].best[0]:
+            fits[i].best = float(losses[i]), kept[i], fits[i].shifts
+
+
 def _settle(fits, stop, engine):
     """Bring the state of the fits that stop here back to the host, with its loss: the present one,
-    or the best one kept where that is better, or the present one half-way through an iteration."""
-    now, kept = engine.problems_now(), engine.problems_now(kept=True)
-    losses, best = engine.final_losses(), engine.best_losses()
+    or the best one where that is better, or the present one half-way through an iteration."""
+    _remember(fits, stop, engine)
+    now, losses = engine.problems_now(), engine.final_losses()
     for i in np.flatnonzero(stop):
-        fits[i].problem, loss = now[i], losses[i]
-        if fits[i].status == INTERRUPTED or not losses[i] <= best[i]:
-            fits[i].problem, loss = kept[i], best[i]
-        if np.isfinite(loss):
-            fits[i].losses.append(float(loss))
+        f, loss = fits[i], float(losses[i])
+        if f.status != INTERRUPTED and loss <= f.best[0]:
+            f.problem = now[i]
+        elif f.best[1] is not None:
+            loss, f.problem, shifts = f.best
+            if shifts is not f.shifts:
+                f.shifts = shifts
+                for op, shift in zip(f.problem.ops, shifts, strict=True):
+                    op.shift = shift
+        else:
+            continue
+        f.losses.append(loss)

@@ -53,6 +53,7 @@ class Fit:
             raise ValueError("no observed pixel on the model frame has a weight")
         self.unit = np.concatenate(self.units)
         self.losses, self.status = [], "iteration limit"
+        self.best = np.inf, None, self.shifts  # the lowest loss, its Problem and shifts
         sources = [blend.sources[i] for i in self.fitted]
         self.start = start(self.frame, sources, positions[inside], self.views,
                            fit_sky=settings.fit_sky)
