@@ -29,6 +29,7 @@ LAYERS = [
         "galaxies",
         "reference",
         "reference_prox",
+        "reference_scene",
     },
     {"discover", "device"},
     {"contract", "factors", "linop", "paths", "sincs", "testing"},
