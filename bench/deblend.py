@@ -21,7 +21,7 @@ import time
 
 import numpy as np
 
-from clresample.deblend import Settings, deblend, deblend_many
+from clresample.joint import Settings, deblend, deblend_many
 
 from . import common, scenes
 

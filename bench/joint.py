@@ -19,7 +19,7 @@ import functools
 import numpy as np
 from tqdm import tqdm
 
-from clresample.deblend import Settings, deblend_many
+from clresample.joint import Settings, deblend_many
 
 from . import common, figures, joint_findings, report, scenes, sersic
 

@@ -9,8 +9,8 @@ import numpy as np
 from astropy.table import Table
 
 from clresample import PSF
-from clresample.deblend import Blend
 from clresample.frame import model_frame
+from clresample.joint import Blend
 from clresample.measure import summary
 from clresample.simulate import sdr, simulate_scene
 from clresample.sources import Extended

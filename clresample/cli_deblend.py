@@ -177,7 +177,7 @@ def _detect(arguments, scene, device):
 def _deblend(arguments, what, observations, sources, settings, given):
     from tqdm import tqdm
 
-    from .deblend import deblend
+    from .joint import deblend
 
     # disable=None: no bar where standard error is no terminal
     with tqdm(

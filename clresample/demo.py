@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from . import demo_resample
-from .deblend import Settings, deblend
 from .device import DeviceError, get_device
 from .frame import model_frame
+from .joint import Settings, deblend
 from .measure import catalogue
 from .plot_deblended import plot_deblended
 from .simulate import sdr, simulate_scene

@@ -14,9 +14,9 @@ from dataclasses import replace
 import numpy as np
 
 from .boxes import Boxes
-from .deblend import Blend
 from .device import get_device
 from .frame import model_frame
+from .joint import Blend
 from .prox import Chain, MaxNorm, Monotone, Positivity
 from .resample import Resampler
 from .sources import Extended

@@ -16,16 +16,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .catalogue import read_sources
-from .deblend import Settings
 from .detect import THRESHOLD
 from .frame import Frame, model_frame
 from .grid import intersection, union
 from .io import FitsError, _choose_bands, _choose_hdu, _native, _open, _pixels, read_image, read_psf
+from .joint import Settings
 from .observation import Observation, check_observations
 from .prox import Chain, Positivity
 from .psf import PSFWarning
 from .scenekeys import SceneError, parse
+from .source_table import read_sources
 from .sources import Source
 
 

@@ -5,9 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
+# Before NumPy is loaded: on small matrices BLAS threads only wait for each other, and for PoCL's.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from clresample import DeviceError, get_device, list_devices
+import pytest  # noqa: E402
+
+from clresample import DeviceError, get_device, list_devices  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
 

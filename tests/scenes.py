@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from clresample.deblend import Blend, deblend
 from clresample.engine import Problem
 from clresample.frame import Frame
 from clresample.grid import Grid
+from clresample.joint import Blend, deblend
 from clresample.observation import Observation
 from clresample.operators import operator
 from clresample.profiles import moment, point, profile

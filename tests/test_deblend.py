@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scenes import BRIGHT, blend, chi2, fit, frame, same, sources, truth
 
-from clresample.deblend import CHECK, PATIENCE, Settings, _stopped, deblend
 from clresample.engine import Engine, Rates
+from clresample.joint import CHECK, PATIENCE, Settings, _stopped, deblend
 from clresample.prox import Chain, MaxNorm, Monotone, Positivity
 from clresample.resample import Resampler
 from clresample.sources import Extended
@@ -197,7 +197,7 @@ def test_ctrl_c_gives_the_best_state(device, monkeypatch, where, when):
 def test_ctrl_c_while_an_engine_is_made(device, monkeypatch, when):
     """The first one, or one for boxes of other sizes."""
     interrupt_call(monkeypatch, "__init__", when)
-    monkeypatch.setattr("clresample.deblend.resized", lambda p, *_: replace(p))
+    monkeypatch.setattr("clresample.joint.resized", lambda p, *_: replace(p))
     result = fit(blend(BRIGHT), device, settings=Settings(max_iter=60, tol=0))
     assert result.status == "interrupted" and 0.85 < chi2(result) < 1.1
     if not when:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scenes import BRIGHT, FLUX, GALAXIES, SHAPE, blend, chi2, fit, frame, observe, same
 
-from clresample.deblend import Settings, deblend
 from clresample.frame import Frame
+from clresample.joint import Settings, deblend
 from clresample.observation import Observation
 from clresample.sources import Extended, Point
 

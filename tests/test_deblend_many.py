@@ -8,13 +8,13 @@ import pytest
 import scenes
 from scenes import GALAXIES, blend, chi2, frame
 
-from clresample import deblend as module
-from clresample.deblend import Blend, Failure, Settings, deblend_many
+from clresample import joint as module
 from clresample.device import DeviceError
 from clresample.engine import Engine
 from clresample.fit import Fit
 from clresample.frame import Frame
 from clresample.grid import Grid
+from clresample.joint import Blend, Failure, Settings, deblend_many
 from clresample.observation import Observation
 from clresample.psf import PSF
 from clresample.result import Result

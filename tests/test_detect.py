@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from blends import gaussian
 
-from clresample.deblend import Settings, deblend
 from clresample.detect import detect, detect_more
 from clresample.frame import model_frame
 from clresample.grid import Grid
+from clresample.joint import Settings, deblend
 from clresample.observation import Observation
 from clresample.operators import operator
 from clresample.profiles import point

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from clresample.deblend import Settings, deblend
 from clresample.grid import Grid
+from clresample.joint import Settings, deblend
 from clresample.observation import Observation
 from clresample.psf import PSF
 from clresample.sources import Extended

@@ -9,9 +9,9 @@ import pytest
 from scenes import BLURRED, SHAPE, SHARP, blend, frame, grids
 
 from clresample import operators
-from clresample.deblend import Settings, deblend
 from clresample.frame import Frame
 from clresample.grid import Grid
+from clresample.joint import Settings, deblend
 from clresample.operators import N_OPERATORS, N_PLANS, operator
 from clresample.psf import PSF
 

@@ -6,12 +6,12 @@ from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable, Table
 
-from clresample.catalogue import read_sources
 from clresample.grid import Grid
 from clresample.io import write_fits
 from clresample.prox import Chain, Positivity
 from clresample.psf import PSF
 from clresample.scenefile import SceneError, read_scene
+from clresample.source_table import read_sources
 from clresample.sources import Extended, Point
 
 GRID = Grid.flat((30, 34), 0.1).to_wcs(ra_deg=150.0, dec_deg=2.0)

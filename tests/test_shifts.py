@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clresample.deblend import Blend, Settings, deblend, deblend_many
 from clresample.frame import model_frame
 from clresample.grid import Grid
+from clresample.joint import Blend, Settings, deblend, deblend_many
 from clresample.observation import Observation
 from clresample.operators import operator
 from clresample.psf import PSF

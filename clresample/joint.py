@@ -86,7 +86,7 @@ class Settings:
     """
 
     max_iter: int = 200
-    tol: float = 1e-5
+    tol: float = 3e-5
     prior: Prior | None = Prior()
     constraints: Chain = field(default_factory=lambda: Chain(Positivity(), Monotone()))
     rates: Rates = Rates()
