@@ -8,9 +8,9 @@ from pathlib import Path
 # Before NumPy is loaded: on small matrices BLAS threads only wait for each other, and for PoCL's.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import pytest  # noqa: E402
+import pytest
 
-from clresample import DeviceError, get_device, list_devices  # noqa: E402
+from clresample import DeviceError, get_device, list_devices
 
 ROOT = Path(__file__).resolve().parents[1]
 
