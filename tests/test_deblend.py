@@ -175,16 +175,18 @@ def interrupt_call(monkeypatch, where, when):
     monkeypatch.setattr(Engine, where, method)
 
 
+@pytest.mark.parametrize("rates", [Rates(), Rates(field=0.002, spectrum=0.02)])
 @pytest.mark.parametrize("when", [0, 3, 12])
 @pytest.mark.parametrize("where", ["gradient", "update"])
-def test_ctrl_c_gives_the_best_state(device, monkeypatch, where, when):
-    """However far an iteration has come."""
+def test_ctrl_c_gives_the_best_state(device, monkeypatch, where, when, rates):
+    """However far an iteration has come, and be the state half-way through it a better one."""
     interrupt_call(monkeypatch, where, when)
-    result = fit(blend(BRIGHT), device, settings=Settings(max_iter=60, tol=0))
+    settings = Settings(max_iter=60, tol=0, rates=rates)
+    result = fit(blend(BRIGHT), device, settings=settings)
     assert result.status == "interrupted" and not result.converged
     monkeypatch.undo()
     done = when // CHECK * CHECK
-    whole = fit(blend(BRIGHT), device, settings=Settings(max_iter=max(done, 1), tol=0))
+    whole = fit(blend(BRIGHT), device, settings=replace(settings, max_iter=max(done, 1)))
     if when or where == "update":
         best = whole.losses[: done + 1 : CHECK].min()
         assert result.losses[-1] == pytest.approx(best, rel=1e-6)

@@ -86,6 +86,33 @@ def test_each_is_as_if_alone(device, settings, dtype):
         alike(result, fit(b, device, settings, dtype=dtype), dtype)
 
 
+def test_known_shifts_of_each(device):
+    """In one group, and in another engine once boxes have changed."""
+    settings = Settings(max_iter=45, tol=0)
+    moves = [(0.5, 0.5), (-1.0, 0.7), (0.0, 0.0)]
+    blends = [
+        replace(blend(seed=i, shift=move), shifts=np.array([(0, 0), move]))
+        for i, move in enumerate(moves)
+    ]
+    results = deblend_many(blends, settings=settings, device=device)
+    for b, result in zip(blends, results, strict=True):
+        alike(result, fit(b, device, settings, shifts=b.shifts))
+        assert chi2(result) < 1.1
+
+
+def test_the_best_state_has_its_own_shifts(device, monkeypatch):
+    """A shift that makes everything worse is taken back with what came of it."""
+
+    def astray(problem):
+        return np.array([(0.0, 0.0), (2.5, -2.0)])
+
+    monkeypatch.setattr(module, "shift_steps", astray)
+    settings = Settings(max_iter=15, tol=0, fit_shifts=True)
+    blends = [blend(seed=i) for i in range(2)]
+    for result in deblend_many(blends, settings=settings, device=device):
+        assert not result.shifts.any() and chi2(result) < 1.1
+
+
 def test_equal_blends_share_a_group_and_boxes_move(device, monkeypatch):
     """Of one size: one group, no padding, and the resizing of boxes in it."""
     engines = watch_engines(monkeypatch)
