@@ -22,6 +22,9 @@ from .resample import Resampler
 BETA1, BETA2 = 0.9, 0.999
 # Work-items that share one sum over a box: a CPU's vector unit does it alone.
 GROUP_ELSEWHERE = 64
+# Steps are damped by this part of a bound on the curvature, which is a few times too large: from a
+# start that fits, steps of one length for all pixels would take a bright source far from it.
+DAMPING = 0.3
 # Losses kept on the device until somebody looks.
 HISTORY = 16
 
@@ -38,6 +41,10 @@ class Prior:
 
     alpha: float = 0.1
     correlation_px: float = 2.0
+
+    def amplitude(self, base) -> np.ndarray:
+        """Scatter of a profile's pixels: alpha sqrt(base); 0 where a star's rings are negative."""
+        return self.alpha * np.sqrt(np.maximum(base, 0))
 
     @property
     def taps(self) -> np.ndarray:
@@ -71,6 +78,7 @@ class Problem:
     fixed (S): bool, the morphology stays as it is
     spectra, scale (S, C) [counts]: A and the step's natural size
     sky (C,) [counts]; fit_sky: whether it is free
+    damping (S,): gradients under which steps are shorter than the rates; see `curvature.damping`
     moments: AMSGrad's m, v, h of the morphologies (S arrays each) and of the spectra; None to start
     n_steps: iterations done so far
     """
@@ -89,6 +97,7 @@ class Problem:
     spectra: np.ndarray
     scale: np.ndarray
     sky: np.ndarray
+    damping: np.ndarray | None = None
     fit_sky: bool = False
     moments_morph: list[list[np.ndarray]] | None = None
     moments_spectra: np.ndarray | None = None
@@ -143,9 +152,9 @@ class Engine:
         self.base = flat([p.base for p in problems])
         self.field = flat([p.field for p in problems])
         self.morph = flat([p.morph for p in problems])
-        alpha = self.prior.alpha if self.prior else 0.0
-        self.amp = flat([[alpha * np.sqrt(np.maximum(base, 0)) for base in p.base]
-                         for p in problems])
+        amplitude = self.prior.amplitude if self.prior else np.zeros_like
+        self.amp = flat([[amplitude(base) for base in p.base] for p in problems])
+        self.damping = put(DAMPING * np.concatenate([p.damping for p in problems]))
         zeros = self.device.zeros
         self.moments = [
             flat([p.moments_morph[i] for p in problems]) if problems[0].moments_morph
@@ -259,11 +268,11 @@ class Engine:
             self._form = kernel("update.cl", "form", size, free, table, taps, self.blurred,
                                 self.base, self.amp, self.morph, **radius)
             self._morph_kernel = d.kernel("update.cl", "step_field", **options, **radius)
-            args = free, table, taps.data, self.blurred.data, self.field.data
+            args = free, table, self.damping.data, taps.data, self.blurred.data, self.field.data
             args += *(m.data for m in self.moments), self.d_morph.data
         else:
             self._morph_kernel = d.kernel("update.cl", "step_morph", **options)
-            args = free, table, self.d_morph.data, self.morph.data
+            args = free, table, self.damping.data, self.d_morph.data, self.morph.data
             args += tuple(m.data for m in self.moments)
         self._morph_kernel.set_args(*args, *[self.dtype.type(0)] * 3)
         self._n_morph_args, self._morph_size = len(args), size

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from .curvature import damping
 from .engine import Problem
 from .frame import Frame, model_frame
 from .initialize import start
@@ -77,7 +78,7 @@ class Fit:
             center.append(middle)
             morphs.append(image[low[0] : low[0] + size[0], low[1] : low[1] + size[1]].copy())
         seen = noise < 1e14
-        return Problem(
+        problem = Problem(
             shape=self.padded.shape, extent=self.frame.shape,
             ops=[v.op for v in views],
             data=[v.data for v in views],
@@ -88,6 +89,7 @@ class Fit:
             spectra=spectra, scale=np.where(seen, noise + SPECTRUM_PART * spectra, 0),
             sky=sky, fit_sky=self.settings.fit_sky,
         )
+        return replace(problem, damping=damping(problem, self.settings.prior))
 
     @functools.cached_property
     def bytes(self):

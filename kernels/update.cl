@@ -1,7 +1,7 @@
 /* One step of proximal AMSGrad (Melchior et al. 2019) on morphologies, spectra and sky levels.
  *
  *   m <- B1 m + (1 - B1) g,  v <- B2 v + (1 - B2) g^2,  h <- max(h, v)
- *   x <- x - rate (m / (1 - B1^t)) / (sqrt(h / (1 - B2^t)) + EPSILON)
+ *   x <- x - rate (m / (1 - B1^t)) / (sqrt(h / (1 - B2^t)) + e)
  *
  * A morphology with a prior is S = base + amp o (K z): base its expected profile, amp how far it may
  * depart, K the correlation kernel (separable taps (2 RADIUS + 1), symmetric), z unit normal.  The
@@ -22,6 +22,8 @@
  *             never of one whose loss is NaN; launch: (X, tallest box, S)
  * rescale     A[s, c] *= factor[s]: what a normalisation took out of a morphology; launch: (S * C)
  *
+ * e = EPSILON + rate damping[s] for morphologies: no step is longer than gradient / damping, a bound
+ * on the curvature; EPSILON for spectra, whose units are those of their errors.
  * t1 = 1 / (1 - B1^t), t2 = 1 / (1 - B2^t) come from the host.
  * table, morph, first: as in scene.cl; all flat buffers share one layout.
  */
@@ -69,7 +71,8 @@ static REAL root(const REAL x)
 }
 
 static REAL amsgrad(const REAL g, __global REAL *restrict m, __global REAL *restrict v,
-                    __global REAL *restrict h, const size_t i, const REAL t1, const REAL t2)
+                    __global REAL *restrict h, const size_t i, const REAL e, const REAL t1,
+                    const REAL t2)
 {
     const REAL mi = (REAL)B1 * m[i] + (REAL)(1 - B1) * g;
     const REAL vi = (REAL)B2 * v[i] + (REAL)(1 - B2) * g * g;
@@ -77,7 +80,7 @@ static REAL amsgrad(const REAL g, __global REAL *restrict m, __global REAL *rest
     m[i] = mi;
     v[i] = vi;
     h[i] = hi;
-    return mi * t1 / (root(hi * t2) + (REAL)EPSILON);
+    return mi * t1 / (root(hi * t2) + e);
 }
 
 __kernel void blur(__global const int *restrict active, __global const int *restrict table,
@@ -131,6 +134,7 @@ static void blur_y(__global const REAL *restrict taps, __global const REAL *rest
 }
 
 __kernel void step_field(__global const int *restrict active, __global const int *restrict table,
+                         __global const REAL *restrict damping,
                          __global const REAL *restrict taps, __global const REAL *restrict scratch,
                          __global REAL *restrict field, __global REAL *restrict m,
                          __global REAL *restrict v, __global REAL *restrict h,
@@ -138,10 +142,11 @@ __kernel void step_field(__global const int *restrict active, __global const int
                          const REAL rate, const REAL t1, const REAL t2)
 {
     ROW
+    const REAL e = (REAL)EPSILON + rate * damping[s];
     blur_y(taps, scratch, box, y, ny, nx, gradient);
     FOR_X(x, nx) {
         const size_t i = row + x;
-        field[i] -= rate * amsgrad(gradient[i] + field[i], m, v, h, i, t1, t2);
+        field[i] -= rate * amsgrad(gradient[i] + field[i], m, v, h, i, e, t1, t2);
     }
 }
 
@@ -156,14 +161,16 @@ __kernel void form(__global const int *restrict active, __global const int *rest
 }
 
 __kernel void step_morph(__global const int *restrict active, __global const int *restrict table,
+                         __global const REAL *restrict damping,
                          __global const REAL *restrict gradient, __global REAL *restrict morph,
                          __global REAL *restrict m, __global REAL *restrict v,
                          __global REAL *restrict h, const REAL rate, const REAL t1, const REAL t2)
 {
     ROW
+    const REAL e = (REAL)EPSILON + rate * damping[s];
     FOR_X(x, nx) {
         const size_t i = row + x;
-        morph[i] -= rate * amsgrad(gradient[i], m, v, h, i, t1, t2);
+        morph[i] -= rate * amsgrad(gradient[i], m, v, h, i, e, t1, t2);
     }
 }
 
@@ -174,7 +181,8 @@ __kernel void step_spectra(__global const REAL *restrict gradient,
 {
     const size_t i = get_global_id(0);
     const REAL a = spectra[i]
-                 - rate * scale[i] * amsgrad(scale[i] * gradient[i], m, v, h, i, t1, t2);
+                 - rate * scale[i] * amsgrad(scale[i] * gradient[i], m, v, h, i,
+                                               (REAL)EPSILON, t1, t2);
     spectra[i] = a < 0 ? (REAL)0 : a;
 }
 

@@ -149,6 +149,7 @@ def problem(
             "spectra": spectra,
             "scale": rng.uniform(0.1, 0.3, (n, 3)),
             "sky": rng.normal(size=3),
+            "damping": rng.uniform(0, 20, n),
             "fit_sky": True,
         }
         | given

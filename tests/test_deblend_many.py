@@ -58,7 +58,10 @@ def alike(together, alone, dtype=np.float32):
         assert together.model(k).shape == o.shape
         away = (together.model(k) - alone.model(k)) * np.sqrt(o.weights)
         assert np.abs(away).max() < (1e-6 if close else 0.05)  # sigma
-        np.testing.assert_array_equal(together.model(k) == 0, alone.model(k) == 0)
+        # what one does not cover, the other does not either; a faint pixel may round to nothing
+        dark = (together.model(k) == 0) != (alone.model(k) == 0)
+        assert np.abs(away + alone.model(k) * np.sqrt(o.weights))[dark].max(initial=0) < 1e-3
+        assert np.abs(alone.model(k) * np.sqrt(o.weights))[dark].max(initial=0) < 1e-3
     for c, d in zip(together.components, alone.components, strict=True):
         assert (c.source, c.origin) == (d.source, d.origin)
         assert c.morphology.shape == d.morphology.shape

@@ -11,7 +11,7 @@ from scenes import BOXES, problem
 from clresample import prox
 from clresample import reference_scene as ref
 from clresample.device import Device
-from clresample.engine import BETA1, HISTORY, Engine, Prior, Rates
+from clresample.engine import BETA1, DAMPING, HISTORY, Engine, Prior, Rates
 from clresample.prox import Chain, MaxNorm, Monotone, Positivity
 from clresample.psf import PSF
 from clresample.reference_prox import monotone_sweep
@@ -107,14 +107,21 @@ class Reference:
             image = np.maximum(self.morph[s], 0)
             self.morph[s] = monotone_sweep(image, p.center[s])
 
+    def _damped(self, s, rate):
+        return 1e-8 + rate * DAMPING * self.p.damping[s]
+
     def _move(self, s):
         if not self.prior:
-            direction, self.moments[s] = ref.amsgrad(self.d_morph[s], self.moments[s], self.i_step)
+            e = self._damped(s, RATES.morphology)
+            g = self.d_morph[s]
+            direction, self.moments[s] = ref.amsgrad(g, self.moments[s], self.i_step, epsilon=e)
             self.morph[s] = self.morph[s] - RATES.morphology * direction
             return
         amp, taps = PRIOR.alpha * np.sqrt(self.p.base[s]), PRIOR.taps
         g = ref.field_gradient(self.d_morph[s], self.morph[s], amp, self.field[s], taps)
-        direction, self.moments[s] = ref.amsgrad(g, self.moments[s], self.i_step)
+        direction, self.moments[s] = ref.amsgrad(
+            g, self.moments[s], self.i_step, epsilon=self._damped(s, RATES.field)
+        )
         self.field[s] = self.field[s] - RATES.field * direction
         self.morph[s] = ref.form(self.p.base[s], amp, self.field[s], taps)
 

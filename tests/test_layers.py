@@ -30,6 +30,7 @@ LAYERS = [
         "reference",
         "reference_prox",
         "reference_scene",
+        "curvature",
     },
     {"discover", "device"},
     {"contract", "factors", "linop", "paths", "sincs", "testing"},
