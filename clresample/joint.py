@@ -13,7 +13,7 @@ from .engine import Engine, Prior, Rates
 from .fit import Fit
 from .frame import Frame
 from .observation import Observation
-from .prox import Chain, Monotone, Positivity
+from .prox import Chain, MaxNorm, Monotone, Positivity, SumNorm
 from .resize import resized
 from .result import Result
 from .shifts import shift_steps
@@ -98,6 +98,10 @@ class Settings:
             raise ValueError(f"max_iter is {self.max_iter}, must be 0 or more")
         if not 0 <= self.tol < 1:
             raise ValueError(f"tol is {self.tol}, must be at least 0 and under 1")
+        scaling = [p for p in self.constraints._steps() if isinstance(p, MaxNorm | SumNorm)]
+        if self.prior is not None and scaling:
+            raise ValueError(f"constraints hold {scaling[0]!r}, but with a prior the profiles set the "
+                             "scale of the morphologies: leave it out, or give prior=None")
 
 
 def deblend(observations, sources, *, frame=None, shifts=None, settings=None, device=None,

@@ -8,7 +8,7 @@ from scenes import BRIGHT, blend, chi2, fit, frame, same, sources, truth
 
 from clresample.engine import Engine, Rates
 from clresample.joint import CHECK, PATIENCE, Settings, _stopped, deblend
-from clresample.prox import Chain, MaxNorm, Monotone, Positivity
+from clresample.prox import Chain, MaxNorm, Monotone, Positivity, SumNorm
 from clresample.resample import Resampler
 from clresample.sources import Extended
 
@@ -237,3 +237,10 @@ def test_a_second_run_gives_the_same_bits(device, plain):
 
 def test_given_sources_are_in_their_places(plain):
     assert plain.sources == sources(BRIGHT)
+
+
+@pytest.mark.parametrize("norm", [MaxNorm(), SumNorm()])
+def test_a_normalisation_beside_a_prior_is_refused(norm):
+    with pytest.raises(ValueError, match=r"constraints hold (Max|Sum)Norm"):
+        Settings(constraints=Chain(Positivity(), norm))
+    assert Settings(constraints=Chain(Positivity(), norm), prior=None).prior is None
