@@ -43,14 +43,19 @@ class Contraction:
     strided: A's columns may be any distance apart; otherwise they are adjacent
     """
 
-    def __init__(self, device, dtype, *, epilogue=None, adjoint=False, ragged=False,
-                 strided=False):
+    def __init__(self, device, dtype, *, epilogue=None, adjoint=False, ragged=False, strided=False):
         self.device = device
         self.tile = _tile(device, np.dtype(dtype))
         defines = {epilogue: True} if epilogue else {}
         self.kernel = device.kernel(
-            "contract.cl", "contract", dtype=dtype, SIGN=-1 if adjoint else 1, RAGGED=ragged,
-            STRIDED=strided, **self.tile, **defines,
+            "contract.cl",
+            "contract",
+            dtype=dtype,
+            SIGN=-1 if adjoint else 1,
+            RAGGED=ragged,
+            STRIDED=strided,
+            **self.tile,
+            **defines,
         )
         i, size = np.int32, np.uint64
         self.kernel.set_scalar_arg_dtypes(
@@ -62,15 +67,42 @@ class Contraction:
 
         e (buffer, stride, band stride): tables of the epilogue, shared by `n_bands` items
         """
-        if e is None and b.stride == 0 and a.step == 1 and a.stride == m * a.ld and a.div == 1 \
-                and c.step == 1 and c.stride == m * c.ld:
+        if (
+            e is None
+            and b.stride == 0
+            and a.step == 1
+            and a.stride == m * a.ld
+            and a.div == 1
+            and c.step == 1
+            and c.stride == m * c.ld
+        ):
             m, batch = m * batch, 1  # one right factor for all: their rows are one tall matrix
         n_pad = padded(n)
         buffer_e, stride_e, band_e = e or (None, 0, 0)
         self.kernel.set_args(
-            m, n, n_pad, k, max(SUM_BLOCK, math.isqrt(k)),
-            a.buffer, a.offset, a.ld, a.step, a.stride, a.div, b.buffer, b.stride, b.div,
-            c.buffer, c.offset, c.ld, c.step, c.stride, buffer_e, stride_e, band_e, n_bands,
+            m,
+            n,
+            n_pad,
+            k,
+            max(SUM_BLOCK, math.isqrt(k)),
+            a.buffer,
+            a.offset,
+            a.ld,
+            a.step,
+            a.stride,
+            a.div,
+            b.buffer,
+            b.stride,
+            b.div,
+            c.buffer,
+            c.offset,
+            c.ld,
+            c.step,
+            c.stride,
+            buffer_e,
+            stride_e,
+            band_e,
+            n_bands,
         )
         tile = self.tile
         x, y = -(-n_pad // (tile["NV"] * tile["VW"])), -(-m // tile["MR"])

@@ -23,7 +23,7 @@ def damping(problem, prior) -> np.ndarray:
     Where the start is far from the data, g > NOISE_GRADIENT sqrt(curvature), it falls as g^-2:
     there the size of the gradient itself limits the steps.
 
-    problem: engine.Problem at its start; prior: its Prior, or None for plain morphologies
+    problem: problem.Problem at its start; prior: its Prior, or None for plain morphologies
     """
     ones = [np.ones_like(base) for base in problem.base]
     units = [_spread(one, base, prior) for one, base in zip(ones, problem.base, strict=True)]
@@ -36,8 +36,10 @@ def damping(problem, prior) -> np.ndarray:
 
 
 def _boxes(problem):
-    return [(slice(None), *(slice(o, o + n) for o, n in zip(origin, base.shape, strict=True)))
-            for origin, base in zip(problem.origin, problem.base, strict=True)]
+    return [
+        (slice(None), *(slice(o, o + n) for o, n in zip(origin, base.shape, strict=True)))
+        for origin, base in zip(problem.origin, problem.base, strict=True)
+    ]
 
 
 def _model(problem, images):
@@ -59,9 +61,10 @@ def _pull(problem, model, prior, *, rest):
             image = image + problem.sky[part, None, None] - data
         pulls.append(op.adjoint(weights * image))
     pull = np.concatenate(pulls).astype(np.float64)
-    return [_gather(np.tensordot(spectrum, pull[box], 1), base, prior)
-            for spectrum, box, base in zip(problem.spectra, _boxes(problem), problem.base,
-                                           strict=True)]
+    return [
+        _gather(np.tensordot(spectrum, pull[box], 1), base, prior)
+        for spectrum, box, base in zip(problem.spectra, _boxes(problem), problem.base, strict=True)
+    ]
 
 
 def _spread(image, base, prior):

@@ -9,12 +9,13 @@ The kernels are scene.cl (model, residual, gradients) and update.cl (proximal AM
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from .boxes import Boxes
 from .device import Device
+from .problem import Prior, Problem, Rates
 from .prox import Chain
 from .resample import Resampler
 
@@ -29,91 +30,6 @@ DAMPING = 0.3
 HISTORY = 16
 
 
-@dataclass(frozen=True)
-class Prior:
-    """What is expected of a morphology: S = base + alpha sqrt(base) K z, z unit normal.
-
-    The structure of galaxies is made of clumps, whose number, and so the variance, follows light.
-
-    alpha: scatter of the brightest pixel about its expected profile, relative
-    correlation_px [model px]: Gaussian sigma of the kernel K that correlates neighbours
-    """
-
-    alpha: float = 0.1
-    correlation_px: float = 2.0
-
-    def amplitude(self, base) -> np.ndarray:
-        """Scatter of a profile's pixels: alpha sqrt(base); 0 where a star's rings are negative."""
-        return self.alpha * np.sqrt(np.maximum(base, 0))
-
-    @property
-    def taps(self) -> np.ndarray:
-        """K along one axis (2 radius + 1), cut at 3 sigma, so that K z has unit variance."""
-        radius = int(np.ceil(3 * self.correlation_px))
-        k = np.exp(-0.5 * (np.arange(-radius, radius + 1) / self.correlation_px) ** 2)
-        return k / np.linalg.norm(k)
-
-
-@dataclass(frozen=True)
-class Rates:
-    """Steps of the solver: `field` in units of the prior's scatter, `morphology` of its maximum,
-    `spectrum` in units of a flux's error and 2 % of the flux (see Problem.scale)."""
-
-    field: float = 0.1
-    morphology: float = 0.01
-    spectrum: float = 0.1
-
-
-@dataclass(eq=False)
-class Problem:
-    """One scene with the state of its fit, on the host.
-
-    shape (Ny, Nx) [px]: model frame
-    extent (Ny, Nx) [px]: the part of it, from its first pixel on, that is not padding
-    ops: one Resampler per observation, on one plan
-    data, weights: per observation (Co, My, Mx)
-    origin, shape_box, center (S, 2) [px]: boxes, inside the frame
-    base (S): arrays (ny, nx) [1]: expected profile (max = 1)
-    field, morph (S): arrays (ny, nx): z and S
-    fixed (S): bool, the morphology stays as it is
-    spectra, scale (S, C) [counts]: A and the step's natural size
-    sky (C,) [counts]; fit_sky: whether it is free
-    damping (S,): gradients under which steps are shorter than the rates; see `curvature.damping`
-    moments: AMSGrad's m, v, h of the morphologies (S arrays each) and of the spectra; None to start
-    n_steps: iterations done so far
-    """
-
-    shape: tuple[int, int]
-    extent: tuple[int, int]
-    ops: list[Resampler]
-    data: list[np.ndarray]
-    weights: list[np.ndarray]
-    origin: np.ndarray
-    center: np.ndarray
-    base: list[np.ndarray]
-    field: list[np.ndarray]
-    morph: list[np.ndarray]
-    fixed: np.ndarray
-    spectra: np.ndarray
-    scale: np.ndarray
-    sky: np.ndarray
-    damping: np.ndarray | None = None
-    fit_sky: bool = False
-    moments_morph: list[list[np.ndarray]] | None = None
-    moments_spectra: np.ndarray | None = None
-    n_steps: int = 0
-
-    @property
-    def signature(self):
-        """Scenes of equal signature can share a batch."""
-        return self.shape, self.fit_sky, self.n_steps, tuple(
-            (op.kind, op.plans[0].axes, op.shape_out) + _lines(op.plans[0]) for op in self.ops)
-
-
-def _lines(plan):
-    return (plan.lines.by_row,) if plan.lines is not None else ()
-
-
 class Engine:
     """A batch of problems of one signature on the device; `step` queues one iteration.
 
@@ -121,8 +37,16 @@ class Engine:
     prior: the Prior of all extended sources, or None to fit the morphologies themselves
     """
 
-    def __init__(self, problems: list[Problem], device: Device, dtype, *, chain: Chain,
-                 prior: Prior | None, rates: Rates):
+    def __init__(
+        self,
+        problems: list[Problem],
+        device: Device,
+        dtype,
+        *,
+        chain: Chain,
+        prior: Prior | None,
+        rates: Rates,
+    ):
         self.problems, self.device, self.dtype = problems, device, np.dtype(dtype)
         self.prior, self.chain, self.rates = prior, chain, rates
         self.n_steps = problems[0].n_steps
@@ -157,17 +81,23 @@ class Engine:
         self.damping = put(DAMPING * np.concatenate([p.damping for p in problems]))
         zeros = self.device.zeros
         self.moments = [
-            flat([p.moments_morph[i] for p in problems]) if problems[0].moments_morph
-            else zeros(self.host_boxes.size, self.dtype) for i in range(3)]
+            flat([p.moments_morph[i] for p in problems])
+            if problems[0].moments_morph
+            else zeros(self.host_boxes.size, self.dtype)
+            for i in range(3)
+        ]
         self.d_morph, self.blurred, self.weighed = (
-            zeros(self.host_boxes.size, self.dtype) for _ in range(3))
+            zeros(self.host_boxes.size, self.dtype) for _ in range(3)
+        )
         self.spectra = put(np.concatenate([p.spectra for p in problems]))
         self.scale = put(np.concatenate([p.scale for p in problems]))
         shape = self.spectra.shape
         self.moments_spectra = [
             put(np.concatenate([p.moments_spectra[i] for p in problems]))
-            if problems[0].moments_spectra is not None else zeros(shape, self.dtype)
-            for i in range(3)]
+            if problems[0].moments_spectra is not None
+            else zeros(shape, self.dtype)
+            for i in range(3)
+        ]
         self.d_spectra = self.device.zeros(shape, self.dtype)
         self.factor = put(np.ones(shape[0]))
         self.sky = put(np.array([p.sky for p in problems]))
@@ -180,8 +110,11 @@ class Engine:
             ops = [p.ops[i] for p in problems]
             if any(other is not op for other in ops):
                 op = Resampler.from_plans(
-                    [o.plans[0] for o in ops], dtype=self.dtype, device=self.device,
-                    shift=np.concatenate([o.shift for o in ops]))
+                    [o.plans[0] for o in ops],
+                    dtype=self.dtype,
+                    device=self.device,
+                    shift=np.concatenate([o.shift for o in ops]),
+                )
             self.ops.append(op)
             self.data.append(put(np.stack([p.data[i] for p in problems])))
             self.weights.append(put(np.stack([p.weights[i] for p in problems])))
@@ -190,9 +123,15 @@ class Engine:
         rows = [my for op in self.ops for my in [op.shape_out[1]] * op.shape_out[0]]
         self.row0 = np.concatenate([[0], np.cumsum(rows)])
         self.rows_loss, self.rows_pull = (
-            self.device.empty((n, int(self.row0[-1])), self.dtype) for _ in range(2))
-        total = np.concatenate([[w.sum(axis=(1, 2)) for w in p.weights][i]
-                                for p in problems for i in range(len(p.weights))])
+            self.device.empty((n, int(self.row0[-1])), self.dtype) for _ in range(2)
+        )
+        total = np.concatenate(
+            [
+                [w.sum(axis=(1, 2)) for w in p.weights][i]
+                for p in problems
+                for i in range(len(p.weights))
+            ]
+        )
         self.inverse = put(np.divide(1, total, where=total > 0, out=np.zeros_like(total)))
 
     def _bind(self):
@@ -220,53 +159,156 @@ class Engine:
             group = 1 if cpu else GROUP_ELSEWHERE
             first_width = 1 if cpu else self.shape[1]
             self._iteration += [
-                kernel("scene.cl", "compose", (first_width, self.shape[0], n * n_bands), first,
-                       table, self.morph, self.spectra, *geometry, self.models[j]),
+                kernel(
+                    "scene.cl",
+                    "compose",
+                    (first_width, self.shape[0], n * n_bands),
+                    first,
+                    table,
+                    self.morph,
+                    self.spectra,
+                    *geometry,
+                    self.models[j],
+                ),
                 lambda op=op, j=j: op._forward(self.models[j], self.images[j]),
-                kernel("scene.cl", "residual", (my, n_bands, n), n_channels, i32(channel),
-                       i32(n_bands), i32(my), i32(mx), i32(self.row0[channel]), n_rows,
-                       self.data[j], self.weights[j], self.sky, self.images[j], self.rows_loss,
-                       self.rows_pull),
+                kernel(
+                    "scene.cl",
+                    "residual",
+                    (my, n_bands, n),
+                    n_channels,
+                    i32(channel),
+                    i32(n_bands),
+                    i32(my),
+                    i32(mx),
+                    i32(self.row0[channel]),
+                    n_rows,
+                    self.data[j],
+                    self.weights[j],
+                    self.sky,
+                    self.images[j],
+                    self.rows_loss,
+                    self.rows_pull,
+                ),
                 lambda op=op, j=j: op._adjoint(self.images[j], self.models[j]),
-                kernel("scene.cl", "gather_spectra", (group, n_bands, n_sources), table,
-                       self.models[j], self.morph, *geometry, self.d_spectra,
-                       local=(group, 1, 1), WG=group),
+                kernel(
+                    "scene.cl",
+                    "gather_spectra",
+                    (group, n_bands, n_sources),
+                    table,
+                    self.models[j],
+                    self.morph,
+                    *geometry,
+                    self.d_spectra,
+                    local=(group, 1, 1),
+                    WG=group,
+                ),
             ]
             if self.n_free:
-                self._iteration.append(kernel(
-                    "scene.cl", "gather_morph", (width, self.tallest, self.n_free), free, table,
-                    self.models[j], self.spectra, *geometry, i32(j > 0), self.d_morph))
+                self._iteration.append(
+                    kernel(
+                        "scene.cl",
+                        "gather_morph",
+                        (width, self.tallest, self.n_free),
+                        free,
+                        table,
+                        self.models[j],
+                        self.spectra,
+                        *geometry,
+                        i32(j > 0),
+                        self.d_morph,
+                    )
+                )
         self.history = d.empty((HISTORY, n), self.dtype)
         self._losses = d.kernel("update.cl", "losses", **options)
         self.best = self._put(np.full(n, np.inf))
-        self._losses.set_args(first, table, n_rows, self.rows_loss.data,
-                              i32(self.prior is not None), self.field.data, self.history.data,
-                              self.best.data, i32(0))
+        self._losses.set_args(
+            first,
+            table,
+            n_rows,
+            self.rows_loss.data,
+            i32(self.prior is not None),
+            self.field.data,
+            self.history.data,
+            self.best.data,
+            i32(0),
+        )
         state = self.field, self.morph, self.spectra, self.sky
         self.kept = [d.put(d.get(a)) for a in state]
         everyone = self.boxes.everyone.data
-        self._keep = kernel("update.cl", "keep", (width, self.tallest, n_sources), everyone, table,
-                            first, n_channels, self.history, self.best, *state, *self.kept)
+        self._keep = kernel(
+            "update.cl",
+            "keep",
+            (width, self.tallest, n_sources),
+            everyone,
+            table,
+            first,
+            n_channels,
+            self.history,
+            self.best,
+            *state,
+            *self.kept,
+        )
         self._spectra_kernel = d.kernel("update.cl", "step_spectra", **options)
-        self._spectra_kernel.set_args(*(a.base_data for a in (
-            self.d_spectra, self.scale, self.spectra, *self.moments_spectra)),
-            *[self.dtype.type(0)] * 3)
-        self._sky_step = kernel("update.cl", "step_sky", (n * self.n_channels,), n_channels, n_rows,
-                                d.put(self.row0, np.int32), self.rows_pull, self.inverse, self.sky)
-        self._rescale = kernel("update.cl", "rescale", (n_sources * self.n_channels,), self.factor,
-                               n_channels, self.spectra)
+        self._spectra_kernel.set_args(
+            *(
+                a.base_data
+                for a in (self.d_spectra, self.scale, self.spectra, *self.moments_spectra)
+            ),
+            *[self.dtype.type(0)] * 3,
+        )
+        self._sky_step = kernel(
+            "update.cl",
+            "step_sky",
+            (n * self.n_channels,),
+            n_channels,
+            n_rows,
+            d.put(self.row0, np.int32),
+            self.rows_pull,
+            self.inverse,
+            self.sky,
+        )
+        self._rescale = kernel(
+            "update.cl",
+            "rescale",
+            (n_sources * self.n_channels,),
+            self.factor,
+            n_channels,
+            self.spectra,
+        )
         size = width, self.tallest, max(self.n_free, 1)
         if self.prior is not None:
             taps = self._put(self.prior.taps)
             self._kept.append(taps)
             radius = {"RADIUS": len(self.prior.taps) // 2}
             arrays = self.amp, self.morph, self.weighed, self.blurred
-            self._blur_gradient = kernel("update.cl", "blur", size, free, table, taps, i32(1),
-                                         self.d_morph, *arrays, **radius)
-            self._blur_field = kernel("update.cl", "blur", size, free, table, taps, i32(0),
-                                      self.field, *arrays, **radius)
-            self._form = kernel("update.cl", "form", size, free, table, taps, self.blurred,
-                                self.base, self.amp, self.morph, **radius)
+            self._blur_gradient = kernel(
+                "update.cl",
+                "blur",
+                size,
+                free,
+                table,
+                taps,
+                i32(1),
+                self.d_morph,
+                *arrays,
+                **radius,
+            )
+            self._blur_field = kernel(
+                "update.cl", "blur", size, free, table, taps, i32(0), self.field, *arrays, **radius
+            )
+            self._form = kernel(
+                "update.cl",
+                "form",
+                size,
+                free,
+                table,
+                taps,
+                self.blurred,
+                self.base,
+                self.amp,
+                self.morph,
+                **radius,
+            )
             self._morph_kernel = d.kernel("update.cl", "step_field", **options, **radius)
             args = free, table, self.damping.data, taps.data, self.blurred.data, self.field.data
             args += *(m.data for m in self.moments), self.d_morph.data
@@ -355,15 +397,24 @@ class Engine:
         for i, (p, end) in enumerate(zip(self.problems, ends, strict=True)):
             part = slice(end - len(p.spectra), end)
             field, morph, *m = (flat[part] for flat in flats)
-            out.append(replace(
-                p, field=field, morph=morph, moments_morph=m, spectra=spectra[part].astype(float),
-                sky=sky[i].astype(float), moments_spectra=np.stack([a[part] for a in moments]),
-                n_steps=self.n_steps))
+            out.append(
+                replace(
+                    p,
+                    field=field,
+                    morph=morph,
+                    moments_morph=m,
+                    spectra=spectra[part].astype(float),
+                    sky=sky[i].astype(float),
+                    moments_spectra=np.stack([a[part] for a in moments]),
+                    n_steps=self.n_steps,
+                )
+            )
         return out
 
     def _put(self, values):
         return self.device.put(values, self.dtype)
 
     def _flat(self, morphs):
-        return self._put(self.host_boxes.pack([m for scene in morphs for m in scene],
-                                              dtype=self.dtype))
+        return self._put(
+            self.host_boxes.pack([m for scene in morphs for m in scene], dtype=self.dtype)
+        )

@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 
 from .curvature import damping
-from .engine import Problem
 from .frame import Frame, model_frame
 from .initialize import start
 from .observation import check_observations
 from .operators import operator
+from .problem import Problem
 from .resize import box_around
 from .result import Component, Result
 from .sources import Point
@@ -34,12 +34,17 @@ class Fit:
         _check_profiles(blend.sources, self.frame)
         positions = self.frame.place(blend.sources)
         inside = self.frame.inside(positions)
-        self.messages = [f"source {i} at {p} [px] lies outside the model frame {self.frame.shape}"
-                         for i, p in enumerate(positions) if not inside[i]]
+        self.messages = [
+            f"source {i} at {p} [px] lies outside the model frame {self.frame.shape}"
+            for i, p in enumerate(positions)
+            if not inside[i]
+        ]
         self.fitted = np.flatnonzero(inside)
         if not len(self.fitted):
-            raise ValueError(f"none of the {len(positions)} sources lies inside the model frame "
-                             f"{self.frame.shape}")
+            raise ValueError(
+                f"none of the {len(positions)} sources lies inside the model frame "
+                f"{self.frame.shape}"
+            )
         self.shifts = _shifts(blend)
         private = settings.fit_shifts or self.shifts.any()
         self.padded = _padded_frame(self.frame, pad)
@@ -56,8 +61,9 @@ class Fit:
         self.losses, self.status = [], "iteration limit"
         self.best = np.inf, None, self.shifts  # the lowest loss, its Problem and shifts
         sources = [blend.sources[i] for i in self.fitted]
-        self.start = start(self.frame, sources, positions[inside], self.views,
-                           fit_sky=settings.fit_sky)
+        self.start = start(
+            self.frame, sources, positions[inside], self.views, fit_sky=settings.fit_sky
+        )
         self.problem = self._problem(sources)
         self.seconds = {"setup": time.perf_counter() - began}
 
@@ -68,8 +74,9 @@ class Fit:
         self.noise = _pixel_noise(views)
         units = [v.render(base) for v in views]
         spectra, sky, _ = solve_spectra(units, views, self.settings.fit_sky)
-        noise = 1 / np.sqrt(np.maximum(
-            np.concatenate([(u**2).sum(axis=2) for u in units], axis=1), 1e-30))
+        noise = 1 / np.sqrt(
+            np.maximum(np.concatenate([(u**2).sum(axis=2) for u in units], axis=1), 1e-30)
+        )
         origin, center, morphs = [], [], []
         for i, image in enumerate(base):
             brightness = (spectra[i] / self.noise).max()
@@ -79,15 +86,21 @@ class Fit:
             morphs.append(image[low[0] : low[0] + size[0], low[1] : low[1] + size[1]].copy())
         seen = noise < 1e14
         problem = Problem(
-            shape=self.padded.shape, extent=self.frame.shape,
+            shape=self.padded.shape,
+            extent=self.frame.shape,
             ops=[v.op for v in views],
             data=[v.data for v in views],
             weights=[v.root**2 for v in views],
-            origin=np.array(origin), center=np.array(center), base=morphs,
-            field=[np.zeros_like(m) for m in morphs], morph=[m.copy() for m in morphs],
+            origin=np.array(origin),
+            center=np.array(center),
+            base=morphs,
+            field=[np.zeros_like(m) for m in morphs],
+            morph=[m.copy() for m in morphs],
             fixed=np.array([isinstance(sources[i], Point) for i in begin.source]),
-            spectra=spectra, scale=np.where(seen, noise + SPECTRUM_PART * spectra, 0),
-            sky=sky, fit_sky=self.settings.fit_sky,
+            spectra=spectra,
+            scale=np.where(seen, noise + SPECTRUM_PART * spectra, 0),
+            sky=sky,
+            fit_sky=self.settings.fit_sky,
         )
         return replace(problem, damping=damping(problem, self.settings.prior))
 
@@ -109,8 +122,14 @@ class Fit:
         components = []
         for i, ((y, x), m) in enumerate(zip(p.origin, p.morph, strict=True)):
             part = morphs[i, y : y + m.shape[0], x : x + m.shape[1]]
-            components.append(Component(int(self.fitted[self.start.source[i]]), (int(y), int(x)),
-                                        part, spectra[i] * self.unit))
+            components.append(
+                Component(
+                    int(self.fitted[self.start.source[i]]),
+                    (int(y), int(x)),
+                    part,
+                    spectra[i] * self.unit,
+                )
+            )
         rendered = []
         for view, o in zip(self.views, self.blend.observations, strict=True):
             images = view.op.render(morphs.astype(view.op.dtype)).astype(np.float64)
@@ -118,10 +137,17 @@ class Fit:
             rendered.append(images[..., : o.data.shape[1], : o.data.shape[2]])
         self.seconds["result"] = time.perf_counter() - began
         return Result(
-            observations=self.blend.observations, frame=self.frame, sources=self.blend.sources,
-            components=tuple(components), rendered=tuple(rendered), sky=sky * self.unit,
-            covariance=covariance * self.unit[:, None, None] ** 2, shifts=self.shifts,
-            losses=np.array(self.losses), status=self.status, messages=tuple(self.messages),
+            observations=self.blend.observations,
+            frame=self.frame,
+            sources=self.blend.sources,
+            components=tuple(components),
+            rendered=tuple(rendered),
+            sky=sky * self.unit,
+            covariance=covariance * self.unit[:, None, None] ** 2,
+            shifts=self.shifts,
+            losses=np.array(self.losses),
+            status=self.status,
+            messages=tuple(self.messages),
             seconds=self.seconds,
         )
 
@@ -130,8 +156,10 @@ def _check_profiles(sources, frame):
     for i, source in enumerate(sources):
         profile = getattr(source, "profile", None)
         if profile is not None and np.shape(profile) != frame.shape:
-            raise ValueError(f"profile of source {i} has the shape {np.shape(profile)}, "
-                             f"the model frame {frame.shape}")
+            raise ValueError(
+                f"profile of source {i} has the shape {np.shape(profile)}, "
+                f"the model frame {frame.shape}"
+            )
 
 
 def _shifts(blend):
@@ -157,13 +185,24 @@ def _view(frame, padded, observation, pad, device, dtype, *, private):
     grid = observation.grid
     if shape != observation.data.shape[1:]:
         grid = grid.cutout(0, 0, shape)
-    op = operator(padded, grid, observation.psf, dtype=dtype, device=device, extent=frame.shape,
-                  private=private)
+    op = operator(
+        padded,
+        grid,
+        observation.psf,
+        dtype=dtype,
+        device=device,
+        extent=frame.shape,
+        private=private,
+    )
     low = [(0, 0)] + [(0, n - m) for n, m in zip(shape, observation.data.shape[1:], strict=True)]
     data, weights = np.pad(observation.data, low), np.pad(observation.weights, low)
     seen = weights > 0
-    unit = np.array([1 / np.sqrt(np.median(w[s])) if s.any() else 1.0
-                     for w, s in zip(weights, seen, strict=True)])
+    unit = np.array(
+        [
+            1 / np.sqrt(np.median(w[s])) if s.any() else 1.0
+            for w, s in zip(weights, seen, strict=True)
+        ]
+    )
     root = np.sqrt(weights) * unit[:, None, None] * _covered(op, frame)
     return View(op, root, data / unit[:, None, None]), unit
 

@@ -82,12 +82,16 @@ def model_frame(observations, *, grid=None, psf_sigma_px=0.8, shared=False) -> F
     for observation in observations:
         if (observation.grid.wcs is None) != (grid.wcs is None):
             kind, other = ("flat", "placed by a WCS")[:: 1 if grid.wcs is None else -1]
-            raise ValueError(f"grid is {kind}, observation {observation.label!r} {other}: "
-                             "give both a WCS (Grid.to_wcs)")
+            raise ValueError(
+                f"grid is {kind}, observation {observation.label!r} {other}: "
+                "give both a WCS (Grid.to_wcs)"
+            )
         if not _overlap(observation.grid, grid):
-            raise ValueError(f"observation {observation.label!r} does not overlap the model frame: "
-                             f"none of its {observation.grid.shape} pixels lies on the frame's "
-                             f"{grid.shape}")
+            raise ValueError(
+                f"observation {observation.label!r} does not overlap the model frame: "
+                f"none of its {observation.grid.shape} pixels lies on the frame's "
+                f"{grid.shape}"
+            )
     # the pixel adds its own variance, 1/12, to the Gaussian's
     radius = math.ceil(REACH * math.sqrt(psf_sigma_px**2 + 1 / 12))
     return Frame(grid, PSF.gaussian(psf_sigma_px, n_pixels=2 * radius + 1))
@@ -107,9 +111,11 @@ def _check_connected(observations, like):
     while far:
         met = [o for o in far if any(_boxes_meet(o.grid, n.grid, like) for n in near)]
         if not met:
-            raise ValueError(f"observation {far[0].label!r} does not overlap "
-                             f"{', '.join(repr(o.label) for o in near)}: these are not images of "
-                             "one patch of sky")
+            raise ValueError(
+                f"observation {far[0].label!r} does not overlap "
+                f"{', '.join(repr(o.label) for o in near)}: these are not images of "
+                "one patch of sky"
+            )
         near += met
         far = [o for o in far if o not in met]
 

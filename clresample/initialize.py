@@ -87,8 +87,9 @@ class _ProfileFit:
                     self.kinds.append("galaxy")
                     size = np.log(SIZE_ARCSEC / scale) + COMPONENT_SPREAD * (k - (count - 1) / 2)
                     mean.append(np.array([size, 0, 0, np.log(WINGS)]))
-                    scatter.append(np.array([SIZE_SCATTER, *[ELLIPTICITY_SCATTER] * 2,
-                                             WINGS_SCATTER]))
+                    scatter.append(
+                        np.array([SIZE_SCATTER, *[ELLIPTICITY_SCATTER] * 2, WINGS_SCATTER])
+                    )
         self.counts = [len(m) for m in mean]
         self.mean, self.scatter = np.concatenate(mean), np.concatenate(scatter)
 
@@ -120,8 +121,14 @@ class _ProfileFit:
             spectra, sky, _ = solve_spectra(units, self.views, self.fit_sky, models)
         models = self._models(units, spectra, sky)
         n = len(theta)
-        state = {"spectra": spectra, "sky": sky, "theta": theta, "chi2": 0.0,
-                 "normal": np.zeros((n, n)), "right": np.zeros(n)}
+        state = {
+            "spectra": spectra,
+            "sky": sky,
+            "theta": theta,
+            "chi2": 0.0,
+            "normal": np.zeros((n, n)),
+            "right": np.zeros(n),
+        }
         channel = 0
         for i, view in enumerate(self.views):
             for c in range(rendered[i].shape[1]):
@@ -166,8 +173,13 @@ class _ProfileFit:
         for kind, source, part in zip(self.kinds, self.source, self._parts(theta), strict=True):
             if kind == "star":
                 self.positions[source] += part
-        return Start(np.array(self.source), np.array(images), self.best["spectra"],
-                     self.best["sky"], self.positions)
+        return Start(
+            np.array(self.source),
+            np.array(images),
+            self.best["spectra"],
+            self.best["sky"],
+            self.positions,
+        )
 
     def _parts(self, theta):
         """The parameters of each component."""

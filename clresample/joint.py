@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .device import DeviceError, get_device
-from .engine import Engine, Prior, Rates
+from .engine import Engine
 from .fit import Fit
 from .frame import Frame
 from .observation import Observation
+from .problem import Prior, Rates
 from .prox import Chain, MaxNorm, Monotone, Positivity, SumNorm
 from .resize import resized
 from .result import Result
@@ -100,12 +101,23 @@ class Settings:
             raise ValueError(f"tol is {self.tol}, must be at least 0 and under 1")
         scaling = [p for p in self.constraints._steps() if isinstance(p, MaxNorm | SumNorm)]
         if self.prior is not None and scaling:
-            raise ValueError(f"constraints hold {scaling[0]!r}, but with a prior the profiles set the "
-                             "scale of the morphologies: leave it out, or give prior=None")
+            raise ValueError(
+                f"constraints hold {scaling[0]!r}, but with a prior the profiles set the "
+                "scale of the morphologies: leave it out, or give prior=None"
+            )
 
 
-def deblend(observations, sources, *, frame=None, shifts=None, settings=None, device=None,
-            dtype=np.float32, progress=None) -> Result:
+def deblend(
+    observations,
+    sources,
+    *,
+    frame=None,
+    shifts=None,
+    settings=None,
+    device=None,
+    dtype=np.float32,
+    progress=None,
+) -> Result:
     """Fit one scene to all observations at once.
 
         min 1/2 sum_o |sqrt(w_o) (R_o sum_s A_s S_s - d_o)|^2 + 1/2 |z|^2,  A >= 0, S constrained
@@ -123,8 +135,9 @@ def deblend(observations, sources, *, frame=None, shifts=None, settings=None, de
     return done.result()
 
 
-def deblend_many(blends, *, settings=None, device=None, dtype=np.float32, memory=MEMORY,
-                 progress=None) -> list[Result | Failure]:
+def deblend_many(
+    blends, *, settings=None, device=None, dtype=np.float32, memory=MEMORY, progress=None
+) -> list[Result | Failure]:
     """Fit many blends side by side; each comes out as if it were fitted alone, to float accuracy.
 
     blends: Blend, with sizes, sources, PSFs, WCS and instruments of their own
@@ -171,8 +184,10 @@ def deblend_many(blends, *, settings=None, device=None, dtype=np.float32, memory
             run(waiting.popitem()[1])
     except KeyboardInterrupt:
         pass  # those without a result are told so
-    return [Failure(blend, INTERRUPTED) if done is None else done
-            for blend, done in zip(blends, out, strict=True)]
+    return [
+        Failure(blend, INTERRUPTED) if done is None else done
+        for blend, done in zip(blends, out, strict=True)
+    ]
 
 
 def _try(group, settings, device, dtype):
@@ -255,8 +270,14 @@ def _move(fits, live, engine):
 
 
 def _engine(fits, settings, device, dtype):
-    return Engine([f.problem for f in fits], device, dtype, chain=settings.constraints,
-                  prior=settings.prior, rates=settings.rates)
+    return Engine(
+        [f.problem for f in fits],
+        device,
+        dtype,
+        chain=settings.constraints,
+        prior=settings.prior,
+        rates=settings.rates,
+    )
 
 
 def _stopped(fits, live, losses, settings):

@@ -77,16 +77,21 @@ class LinOp:
             raise ValueError(f"{name} has shape {shape}, expected {shape_x} or (B,) + {shape_x}")
         if out is not None:
             if on_device != hasattr(out, "base_data") or not hasattr(out, "shape"):
-                raise ValueError(f"out is a {_kind(out)}, but {name} a {_kind(x)}: both must be "
-                                 "NumPy arrays or both pyopencl arrays")
+                raise ValueError(
+                    f"out is a {_kind(out)}, but {name} a {_kind(x)}: both must be "
+                    "NumPy arrays or both pyopencl arrays"
+                )
             if tuple(out.shape) != shape_result:
                 raise ValueError(f"out has shape {tuple(out.shape)}, expected {shape_result}")
         batched_x, batched_out = (batch, *shape_x), (batch, *shape_out)
 
         if on_device:
             x = self._checked(name, x)
-            out = self.device.empty(shape_result, self.dtype) if out is None \
+            out = (
+                self.device.empty(shape_result, self.dtype)
+                if out is None
                 else self._checked("out", out)
+            )
             others = {a.queue for a in (x, out)} - {None, self.device.queue}
             for queue in others:  # of the caller, who may still write or read there
                 queue.finish()
@@ -109,18 +114,25 @@ class LinOp:
         if array.dtype != self.dtype:
             raise ValueError(f"{name} has dtype {array.dtype}, the operator has {self.dtype}")
         if not array.flags.c_contiguous:
-            raise ValueError(f"{name} has strides {array.strides} for the shape {array.shape}: "
-                             "a device array must be C-contiguous")
+            raise ValueError(
+                f"{name} has strides {array.strides} for the shape {array.shape}: "
+                "a device array must be C-contiguous"
+            )
         if array.context != self.device.context:
-            raise ValueError(f"{name} belongs to an OpenCL context of {array.context.devices}, the "
-                             f"operator to that of {self.device}: make it with op.device.put")
+            raise ValueError(
+                f"{name} belongs to an OpenCL context of {array.context.devices}, the "
+                f"operator to that of {self.device}: make it with op.device.put"
+            )
         return array
 
     def _staging(self, name, shape_x, shape_out):
         """Device arrays for NumPy callers, kept for the next call with the same shapes."""
         if self._staged.get(name, (None,))[0] != shape_x:
-            self._staged[name] = (shape_x, self.device.empty(shape_x, self.dtype),
-                                  self.device.empty(shape_out, self.dtype))
+            self._staged[name] = (
+                shape_x,
+                self.device.empty(shape_x, self.dtype),
+                self.device.empty(shape_out, self.dtype),
+            )
         return self._staged[name][1:]
 
 

@@ -65,8 +65,19 @@ class Observation:
     n_bad: int
     messages: tuple[str, ...]
 
-    def __init__(self, data, psf, grid, *, weights=None, variance=None, mask=None, channels=None,
-                 zero_points=None, name=None):
+    def __init__(
+        self,
+        data,
+        psf,
+        grid,
+        *,
+        weights=None,
+        variance=None,
+        mask=None,
+        channels=None,
+        zero_points=None,
+        name=None,
+    ):
         data = _numbers("data", data)
         if data.ndim == 2:
             data = data[None]
@@ -76,8 +87,10 @@ class Observation:
             raise ValueError(f"data has images of {data.shape[1:]} pixels, grid has {grid.shape}")
         n_channels = len(data)
         if psf.n_bands not in (1, n_channels):
-            raise ValueError(f"psf has {psf.n_bands} bands, data have {n_channels} channels: "
-                             "give one band, or one for each channel")
+            raise ValueError(
+                f"psf has {psf.n_bands} bands, data have {n_channels} channels: "
+                "give one band, or one for each channel"
+            )
         if psf.n_bands != n_channels:
             psf = psf.select([0] * n_channels)
         channels = _channels(channels, name, n_channels)
@@ -99,17 +112,27 @@ class Observation:
         n_bad = int(np.count_nonzero(~masked & (no_weight | (bad & (weights > 0)))))
         weights = np.where(bad | masked, 0.0, weights)
         if n_bad:
-            messages.append(f"{n_bad} of {data.size} pixels have weight 0: no usable data, "
-                            "weight or variance")
-        messages += [f"channel {channel} has no pixel with a weight"
-                     for channel, seen in zip(channels, weights.any(axis=(1, 2)), strict=True)
-                     if not seen]
+            messages.append(
+                f"{n_bad} of {data.size} pixels have weight 0: no usable data, weight or variance"
+            )
+        messages += [
+            f"channel {channel} has no pixel with a weight"
+            for channel, seen in zip(channels, weights.any(axis=(1, 2)), strict=True)
+            if not seen
+        ]
         data = np.where(bad, 0.0, data)
         for array in (data, weights):
             array.flags.writeable = False
         for key, value in {
-            "data": data, "psf": psf, "grid": grid, "weights": weights, "channels": channels,
-            "zero_points": zero_points, "name": name, "n_bad": n_bad, "messages": tuple(messages),
+            "data": data,
+            "psf": psf,
+            "grid": grid,
+            "weights": weights,
+            "channels": channels,
+            "zero_points": zero_points,
+            "name": name,
+            "n_bad": n_bad,
+            "messages": tuple(messages),
         }.items():
             object.__setattr__(self, key, value)
 
@@ -143,8 +166,10 @@ def check_observations(observations):
     for observation in observations:
         for channel in observation.channels:
             if channel in first:
-                raise ValueError(f"channel name {channel!r} is given twice, by the observations "
-                                 f"{first[channel].label!r} and {observation.label!r}")
+                raise ValueError(
+                    f"channel name {channel!r} is given twice, by the observations "
+                    f"{first[channel].label!r} and {observation.label!r}"
+                )
             first[channel] = observation
     for what, have in (
         ("zero_points", [o.zero_points is not None for o in observations]),
@@ -174,8 +199,9 @@ def noise_sigma(image, mask=None) -> float:
         good &= ~np.asarray(mask, dtype=bool)
     values = image[good]
     if values.size < MIN_PIXELS:
-        raise ValueError(f"{values.size} pixels are left to estimate the noise from, "
-                         f"{MIN_PIXELS} are needed")
+        raise ValueError(
+            f"{values.size} pixels are left to estimate the noise from, {MIN_PIXELS} are needed"
+        )
     sigma = np.median(np.abs(values - np.median(values))) / NormalDist().inv_cdf(0.75)
     inside = math.erf(CLIP / math.sqrt(2))
     quantile = NormalDist().inv_cdf(0.5 + inside / 4)
@@ -187,8 +213,9 @@ def noise_sigma(image, mask=None) -> float:
             break
         values = values[kept]
     if not sigma > 0:
-        raise ValueError("more than half of the pixels have the same value: "
-                         "no noise can be estimated from them")
+        raise ValueError(
+            "more than half of the pixels have the same value: no noise can be estimated from them"
+        )
     return float(sigma)
 
 
@@ -216,8 +243,9 @@ def _channels(channels, name, n_channels):
 def _per_channel(name, values, n_channels):
     values = _numbers(name, values)
     if values.shape not in ((), (n_channels,)) or not np.isfinite(values).all():
-        raise ValueError(f"{name} must be one finite number or {n_channels}, one for each channel, "
-                         f"not {values}")
+        raise ValueError(
+            f"{name} must be one finite number or {n_channels}, one for each channel, not {values}"
+        )
     values = np.broadcast_to(values, n_channels).copy()
     values.flags.writeable = False
     return values
@@ -240,8 +268,9 @@ def _mask(mask, shape):
         raise ValueError(f"mask has the shape {values.shape}, data {shape}")
     if values.dtype != bool and not np.isin(values, (0, 1)).all():
         odd = values[~np.isin(values, (0, 1))].flat[0]
-        raise ValueError(f"mask must be True (ignore) or False, not {odd}: "
-                         "choose the bits that spoil a pixel")
+        raise ValueError(
+            f"mask must be True (ignore) or False, not {odd}: choose the bits that spoil a pixel"
+        )
     return np.broadcast_to(values.astype(bool), shape)
 
 
@@ -250,9 +279,11 @@ def _weights(weights, shape):
     weights = _spread("weights", _numbers("weights", weights), shape)
     for wrong, what in ((weights < 0, "negative"), (np.isinf(weights), "infinite")):
         if wrong.any():
-            raise ValueError(f"weights has {np.count_nonzero(wrong)} {what} values, the first at "
-                             f"(channel, y, x) = {tuple(np.argwhere(wrong)[0].tolist())}: "
-                             "a weight is an inverse variance, 0 to ignore a pixel")
+            raise ValueError(
+                f"weights has {np.count_nonzero(wrong)} {what} values, the first at "
+                f"(channel, y, x) = {tuple(np.argwhere(wrong)[0].tolist())}: "
+                "a weight is an inverse variance, 0 to ignore a pixel"
+            )
     lost = np.isnan(weights)
     return np.where(lost, 0.0, weights), lost
 
@@ -275,6 +306,7 @@ def _estimated(data, ignored, channels):
         except ValueError as error:
             raise ValueError(f"channel {channel}: {error}; give weights or variance") from None
         weights[i] = sigma**-2
-        messages.append(f"noise of channel {channel} estimated from the background: "
-                        f"sigma = {sigma:.4g} counts")
+        messages.append(
+            f"noise of channel {channel} estimated from the background: sigma = {sigma:.4g} counts"
+        )
     return weights, messages

@@ -30,8 +30,15 @@ class _Recipe:
             parts += [psf.images, psf.center, np.float64(psf.spacing)]
         for part in parts:
             digest.update(b"-" if part is None else np.ascontiguousarray(part).tobytes())
-        self.key = (mapping.kind, mapping.shape_in, mapping.shape_out, extent, np.dtype(dtype).str,
-                    tuple(p.images.shape for p in (psf_in, psf_out)), digest.digest())
+        self.key = (
+            mapping.kind,
+            mapping.shape_in,
+            mapping.shape_out,
+            extent,
+            np.dtype(dtype).str,
+            tuple(p.images.shape for p in (psf_in, psf_out)),
+            digest.digest(),
+        )
 
     def __hash__(self):
         return hash(self.key)
@@ -42,8 +49,13 @@ class _Recipe:
 
 @functools.lru_cache(maxsize=N_PLANS)
 def _plan(recipe: _Recipe) -> Plan:
-    return make_plan(recipe.mapping, recipe.psf_in, recipe.psf_out, precision=recipe.precision,
-                     extent=recipe.extent)
+    return make_plan(
+        recipe.mapping,
+        recipe.psf_in,
+        recipe.psf_out,
+        precision=recipe.precision,
+        extent=recipe.extent,
+    )
 
 
 @functools.lru_cache(maxsize=N_OPERATORS)
@@ -51,8 +63,9 @@ def _operator(recipe: _Recipe, dtype, device) -> Resampler:
     return Resampler.from_plans([_plan(recipe)], dtype=dtype, device=device)
 
 
-def operator(frame: Frame, grid: Grid, psf: PSF, *, dtype, device=None, extent=None,
-             private=False) -> Resampler:
+def operator(
+    frame: Frame, grid: Grid, psf: PSF, *, dtype, device=None, extent=None, private=False
+) -> Resampler:
     """The Resampler from `frame` to `grid` and `psf`; asked twice it is the same object.
 
     extent (2,) [px]: what of the frame holds light, the rest is padding; None = all of it

@@ -95,12 +95,28 @@ class Path:
         """
         half, z = self._scratch("half", self.n_y), self._scratch("spectrum")
         in_x_t = self.in_x_t._replace(div=1) if spread else self.in_x_t
-        self.first(self.n_y, self.k_x, self.n_x, n // self.n_bands if spread else n,
-                   images.matrix(self.axes), in_x_t, half)
+        self.first(
+            self.n_y,
+            self.k_x,
+            self.n_x,
+            n // self.n_bands if spread else n,
+            images.matrix(self.axes),
+            in_x_t,
+            half,
+        )
         if spread:
             half = half._replace(div=self.n_bands)
-        self.mix(self.k_y, self.k_x, self.n_y, n, self.in_y, half, z, self._epilogue(self.spectra),
-                 self.n_bands)
+        self.mix(
+            self.k_y,
+            self.k_x,
+            self.n_y,
+            n,
+            self.in_y,
+            half,
+            z,
+            self._epilogue(self.spectra),
+            self.n_bands,
+        )
 
     def synthesise(self, images: Images, n):
         """I = Ty^T Z Tx^T of `n` images, from scratch "spectrum": the model end of the adjoint."""
@@ -146,8 +162,17 @@ class Aligned(Path):
     def adjoint(self, y: Images, x: Images, n):
         half, z = self._scratch("half", self.n_rows), self._scratch("spectrum")
         self.plain(self.n_rows, self.k_x, self.n_columns, n, y.matrix(), self.out_x_t, half)
-        self.mix_adjoint(self.k_y, self.k_x, self.n_rows, n, self.out_y_t, half, z,
-                         self._epilogue(self.spectra), self.n_bands)
+        self.mix_adjoint(
+            self.k_y,
+            self.k_x,
+            self.n_rows,
+            n,
+            self.out_y_t,
+            half,
+            z,
+            self._epilogue(self.spectra),
+            self.n_bands,
+        )
         self.synthesise(x, n)
 
 
@@ -171,30 +196,53 @@ class Affine(Path):
         self.twist = Contraction(device, dtype, epilogue="TWIST")
         self.twist_adjoint = Contraction(device, dtype, epilogue="TWIST", adjoint=True)
         lines = [p.lines for p in plans]
-        self.to_pixels = Gather(self, [p.start for p in lines], [p.weight for p in lines],
-                                self.n_columns, self.n_steps)
-        self.to_columns = Gather(self, [p.start_t for p in lines], [p.weight_t for p in lines],
-                                 self.n_steps, self.n_pad)
+        self.to_pixels = Gather(
+            self, [p.start for p in lines], [p.weight for p in lines], self.n_columns, self.n_steps
+        )
+        self.to_columns = Gather(
+            self, [p.start_t for p in lines], [p.weight_t for p in lines], self.n_steps, self.n_pad
+        )
 
     def scratch_shapes(self):
-        return super().scratch_shapes() | {"turned": (self.k_y, self.n_pad),
-                                           "lines": (self.n_rows, self.n_pad)}
+        return super().scratch_shapes() | {
+            "turned": (self.k_y, self.n_pad),
+            "lines": (self.n_rows, self.n_pad),
+        }
 
     def forward(self, x: Images, y: Images, n, spread=False):
         self.analyse(x, n, spread)
         z, turned, g = (self._scratch(name) for name in ("spectrum", "turned", "lines"))
-        self.twist(self.k_y, self.n_columns, self.k_x, n, z, self.out_x, turned, self._turn(),
-                   self.n_bands)
+        self.twist(
+            self.k_y, self.n_columns, self.k_x, n, z, self.out_x, turned, self._turn(), self.n_bands
+        )
         self.plain(self.n_rows, self.n_columns, self.k_y, n, self.out_y, turned, g)
         self.to_pixels(g, self._lines_of(y), n)
 
     def adjoint(self, y: Images, x: Images, n):
         z, turned, g = (self._scratch(name) for name in ("spectrum", "turned", "lines"))
         self.to_columns(self._lines_of(y), g, n)
-        self.twist_adjoint(self.k_y, self.n_columns, self.n_rows, n, self.out_y_t, g, turned,
-                           self._turn(), self.n_bands)
-        self.mix_adjoint(self.k_y, self.k_x, self.n_columns, n, turned, self.out_x_t, z,
-                         self._epilogue(self.spectra), self.n_bands)
+        self.twist_adjoint(
+            self.k_y,
+            self.n_columns,
+            self.n_rows,
+            n,
+            self.out_y_t,
+            g,
+            turned,
+            self._turn(),
+            self.n_bands,
+        )
+        self.mix_adjoint(
+            self.k_y,
+            self.k_x,
+            self.n_columns,
+            n,
+            turned,
+            self.out_x_t,
+            z,
+            self._epilogue(self.spectra),
+            self.n_bands,
+        )
         self.synthesise(x, n)
 
     def _turn(self):
@@ -231,13 +279,30 @@ class Distorted(Path):
         half, z = self._scratch("half", self.n_rows), self._scratch("spectrum")
         self._ends(self.rowscale, y, half)
         self.device.launch(self.rowscale, (self.k_pad, self.n_rows, n), (COLUMN_PAD, 1, 1))
-        self.mix_adjoint(self.k_y, self.k_x, self.n_rows, n, self.out_y_t, half, z,
-                         self._epilogue(self.spectra), self.n_bands)
+        self.mix_adjoint(
+            self.k_y,
+            self.k_x,
+            self.n_rows,
+            n,
+            self.out_y_t,
+            half,
+            z,
+            self._epilogue(self.spectra),
+            self.n_bands,
+        )
         self.synthesise(x, n)
 
     def _ends(self, kernel, y: Images, half: Matrix):
-        kernel.set_args(self.n_rows, self.k_pad, self.n_bands, len(self.plans), y.buffer, y.offset,
-                        half.buffer, self.out_x.buffer)
+        kernel.set_args(
+            self.n_rows,
+            self.k_pad,
+            self.n_bands,
+            len(self.plans),
+            y.buffer,
+            y.offset,
+            half.buffer,
+            self.out_x.buffer,
+        )
 
 
 def _whole_groups(n):
@@ -267,12 +332,26 @@ class Gather:
         self.kernel = path.device.kernel("warp.cl", "gather", dtype=path.dtype, N_TAPS=n_taps)
         i, size = np.int32, np.uint64
         self.kernel.set_scalar_arg_dtypes(
-            [i, i, i, i, None, size, i, i, i, None, size, i, i, i, None, None])
+            [i, i, i, i, None, size, i, i, i, None, size, i, i, i, None, None]
+        )
 
     def __call__(self, source: Matrix, target: Matrix, n):
         self.kernel.set_args(
-            self.n_out, self.n_rows, self.n_bands, self.n_plans,
-            source.buffer, source.offset, source.stride, source.ld, source.step,
-            target.buffer, target.offset, target.stride, target.ld, target.step,
-            self.start.base_data, self.weight.base_data)
+            self.n_out,
+            self.n_rows,
+            self.n_bands,
+            self.n_plans,
+            source.buffer,
+            source.offset,
+            source.stride,
+            source.ld,
+            source.step,
+            target.buffer,
+            target.offset,
+            target.stride,
+            target.ld,
+            target.step,
+            self.start.base_data,
+            self.weight.base_data,
+        )
         self.device.launch(self.kernel, (_whole_groups(self.n_out), self.n_rows, n), (GROUP, 1, 1))

@@ -18,6 +18,7 @@ from .psf import PSF
 # Spectra of the model's PSF that are kept: stars of one frame share one, of 1 MB at 256 pixels.
 N_SPECTRA = 8
 
+
 def covariance(parameters, psf_moment):
     """C (2, 2) [px^2] and its derivatives (3, 2, 2) by (ln sigma [px], g1, g2).
 
@@ -54,8 +55,9 @@ def profile(parameters, position, shape, psf_moment):
 def moment(psf: PSF) -> np.ndarray:
     """Second moment (2, 2) [px^2] of the first band's image about its centre, rows (y, x)."""
     image = psf.images[0]
-    y, x = ((np.arange(n) - c) * psf.spacing
-            for n, c in zip(image.shape, psf.center[0], strict=True))
+    y, x = (
+        (np.arange(n) - c) * psf.spacing for n, c in zip(image.shape, psf.center[0], strict=True)
+    )
     yy, xx, yx = (y**2) @ image.sum(1), (x**2) @ image.sum(0), y @ image @ x
     return np.array([[yy, yx], [yx, xx]])
 

@@ -32,8 +32,9 @@ def gather_morph(gradient, origin, morphs, spectra):
 def gather_spectra(gradient, origin, morphs):
     """dA (S, C) = <S_s, G_c>."""
     boxes = _boxes(origin, morphs)
-    return np.array([(gradient[box] * m).sum(axis=(1, 2))
-                     for m, box in zip(morphs, boxes, strict=True)])
+    return np.array(
+        [(gradient[box] * m).sum(axis=(1, 2)) for m, box in zip(morphs, boxes, strict=True)]
+    )
 
 
 def blur(image, taps):
@@ -71,5 +72,7 @@ def amsgrad(gradient, moments, i_step, *, beta1=0.9, beta2=0.999, epsilon=1e-8):
 
 
 def _boxes(origin, morphs):
-    return [(slice(None), slice(y, y + m.shape[0]), slice(x, x + m.shape[1]))
-            for (y, x), m in zip(origin, morphs, strict=True)]
+    return [
+        (slice(None), slice(y, y + m.shape[0]), slice(x, x + m.shape[1]))
+        for (y, x), m in zip(origin, morphs, strict=True)
+    ]

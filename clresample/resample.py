@@ -38,15 +38,26 @@ class Resampler(LinOp):
     Source: eqs. `reconvampling2D`, `I2model` of the paper, summed in frequency space.
     """
 
-    def __init__(self, grid_in: Grid, psf_in: PSF, grid_out: Grid, psf_out: PSF, *,
-                 dtype=np.float32, device=None, shift=(0.0, 0.0), tolerance_px=1e-4):
+    def __init__(
+        self,
+        grid_in: Grid,
+        psf_in: PSF,
+        grid_out: Grid,
+        psf_out: PSF,
+        *,
+        dtype=np.float32,
+        device=None,
+        shift=(0.0, 0.0),
+        tolerance_px=1e-4,
+    ):
         mapping = grid_out.map_to(grid_in, tolerance_px=tolerance_px)
         plan = make_plan(mapping, psf_in, psf_out, precision=Precision.of(dtype))
         self._setup([plan], dtype, device, shift)
 
     @classmethod
-    def from_plans(cls, plans: list[Plan], *, dtype=np.float32, device=None,
-                   shift=(0.0, 0.0)) -> Resampler:
+    def from_plans(
+        cls, plans: list[Plan], *, dtype=np.float32, device=None, shift=(0.0, 0.0)
+    ) -> Resampler:
         """An operator on batches whose item b has its own geometry and PSFs, plans[b].
 
         plans: one for batches of any length, or one for each item; alike in kind, axes, bands,
@@ -59,25 +70,35 @@ class Resampler(LinOp):
         for i, plan in enumerate(plans):
             for name in ("kind", "axes", "n_bands"):
                 if getattr(plan, name) != getattr(plans[0], name):
-                    raise ValueError(f"plans[{i}] has {name} {getattr(plan, name)}, "
-                                     f"plans[0] has {getattr(plans[0], name)}")
+                    raise ValueError(
+                        f"plans[{i}] has {name} {getattr(plan, name)}, "
+                        f"plans[0] has {getattr(plans[0], name)}"
+                    )
             for name in ("shape_in", "shape_out"):
                 if getattr(plan.mapping, name) != getattr(plans[0].mapping, name):
-                    raise ValueError(f"plans[{i}] has {name} {getattr(plan.mapping, name)}, "
-                                     f"plans[0] has {getattr(plans[0].mapping, name)}")
+                    raise ValueError(
+                        f"plans[{i}] has {name} {getattr(plan.mapping, name)}, "
+                        f"plans[0] has {getattr(plans[0].mapping, name)}"
+                    )
             if plan.lines is not None and plan.lines.by_row != plans[0].lines.by_row:
                 along = {True: "rows", False: "columns"}
-                raise ValueError(f"plans[{i}] runs along the observed {along[plan.lines.by_row]}, "
-                                 f"plans[0] along the {along[plans[0].lines.by_row]}: give those "
-                                 "turned by more than 45 degrees their own operator")
+                raise ValueError(
+                    f"plans[{i}] runs along the observed {along[plan.lines.by_row]}, "
+                    f"plans[0] along the {along[plans[0].lines.by_row]}: give those "
+                    "turned by more than 45 degrees their own operator"
+                )
         op = cls.__new__(cls)
         op._setup(plans, dtype, device, shift)
         return op
 
     def _setup(self, plans, dtype, device, shift):
         first = plans[0]
-        super().__init__(device, dtype, (first.n_bands, *first.mapping.shape_in),
-                         (first.n_bands, *first.mapping.shape_out))
+        super().__init__(
+            device,
+            dtype,
+            (first.n_bands, *first.mapping.shape_in),
+            (first.n_bands, *first.mapping.shape_out),
+        )
         self.plans, self.kind = plans, first.kind
         self._path = PATHS[first.kind](self.device, self.dtype, plans)
         per_image = sum(rows * ld for rows, ld in self._path.scratch_shapes().values())
@@ -117,8 +138,14 @@ class Resampler(LinOp):
         return self._apply(self._render, "x", x, out, self.shape_in[1:], self.shape_out)
 
     def _render(self, x, out):
-        self._run(functools.partial(self._path.forward, spread=True), x, out, (1, *x.shape[1:]),
-                  self.shape_out, identity=False)
+        self._run(
+            functools.partial(self._path.forward, spread=True),
+            x,
+            out,
+            (1, *x.shape[1:]),
+            self.shape_out,
+            identity=False,
+        )
 
     def _forward(self, x, out):
         self._run(self._path.forward, x, out, self.shape_in, self.shape_out)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .engine import Problem
+from .problem import Problem
 
 # A box holds what reaches this part of the noise: the profile, or the structure that the prior
 # allows about it (alpha = 0.1 of the root of the light); as a part of the peak, within bounds.
@@ -53,16 +53,19 @@ def resized(problem: Problem, base, noise) -> Problem:
         return problem
 
     def move(arrays, fill=None):
-        return [_moved(a, o, low, high, None if fill is None else fill[i])
-                for i, (a, o, (low, high)) in enumerate(zip(arrays, problem.origin, boxes,
-                                                            strict=True))]
+        return [
+            _moved(a, o, low, high, None if fill is None else fill[i])
+            for i, (a, o, (low, high)) in enumerate(zip(arrays, problem.origin, boxes, strict=True))
+        ]
 
     moments = problem.moments_morph
     return replace(
         problem,
         origin=np.array([low for low, _ in boxes]),
         center=problem.center + problem.origin - np.array([low for low, _ in boxes]),
-        base=move(problem.base, base), morph=move(problem.morph, base), field=move(problem.field),
+        base=move(problem.base, base),
+        morph=move(problem.morph, base),
+        field=move(problem.field),
         moments_morph=None if moments is None else [move(m) for m in moments],
     )
 
@@ -95,8 +98,9 @@ def _box(problem, i, base, noise):
 
 def _same(problem, i, box):
     low, high = box
-    return (np.array_equal(low, problem.origin[i])
-            and np.array_equal(high - low, problem.morph[i].shape))
+    return np.array_equal(low, problem.origin[i]) and np.array_equal(
+        high - low, problem.morph[i].shape
+    )
 
 
 def _moved(array, origin, low, high, fill):

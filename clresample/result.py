@@ -76,8 +76,10 @@ class Result:
     def channel_slices(self) -> list[slice]:
         """For each observation, its part of a spectrum."""
         ends = np.cumsum([len(o.channels) for o in self.observations])
-        return [slice(end - len(o.channels), end)
-                for o, end in zip(self.observations, ends, strict=True)]
+        return [
+            slice(end - len(o.channels), end)
+            for o, end in zip(self.observations, ends, strict=True)
+        ]
 
     def source_model(self, i_source, i_observation=None) -> np.ndarray:
         """One source (C, Ny, Nx) in the model frame, or (Co, My, Mx) as an observation sees it."""

@@ -17,7 +17,7 @@ SCATTER_PX = 2.0
 def shift_steps(problem) -> np.ndarray:
     """By how much to move the observations (n_observations, 2) [model px], the first not at all.
 
-    problem: `engine.Problem` in its present state
+    problem: `problem.Problem` in its present state
     """
     model = np.zeros((problem.spectra.shape[1], *problem.shape))
     light = model[:, : problem.extent[0], : problem.extent[1]]
@@ -30,7 +30,9 @@ def shift_steps(problem) -> np.ndarray:
         channel = part.stop
         images = np.zeros((3, *op.shape_in))
         images[..., : light.shape[1], : light.shape[2]] = (
-            light[part], *np.gradient(light[part], axis=(1, 2)))
+            light[part],
+            *np.gradient(light[part], axis=(1, 2)),
+        )
         seen, *slopes = op.forward(images.astype(op.dtype)).astype(np.float64)
         rest = weights * (data - seen - problem.sky[part, None, None])
         normal = np.einsum("icyx,jcyx,cyx->ij", slopes, slopes, weights)

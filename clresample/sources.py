@@ -68,11 +68,13 @@ class Extended(Source):
         if self.profile is None:
             return
         if self.n_components > 1:
-            raise ValueError(f"profile is given for n_components = {self.n_components}: "
-                             "it serves one component")
+            raise ValueError(
+                f"profile is given for n_components = {self.n_components}: it serves one component"
+            )
         profile = np.asarray(self.profile, dtype=np.float64)
         if profile.ndim != 2 or not (np.isfinite(profile) & (profile >= 0)).all():
-            raise ValueError(f"profile with shape {profile.shape} must be (Ny, Nx), finite and "
-                             "not negative")
+            raise ValueError(
+                f"profile with shape {profile.shape} must be (Ny, Nx), finite and not negative"
+            )
         if not profile.any():
             raise ValueError("profile is zero everywhere")

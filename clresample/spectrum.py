@@ -84,8 +84,9 @@ class Plan:
         return self.d_plus * (phase_y * phase_x), self.d_minus * (phase_y * phase_x.conj())
 
 
-def make_plan(mapping: Mapping, psf_in: PSF, psf_out: PSF, *, precision: Precision,
-              extent=None) -> Plan:
+def make_plan(
+    mapping: Mapping, psf_in: PSF, psf_out: PSF, *, precision: Precision, extent=None
+) -> Plan:
     """Tables that take a model to the observed pixels and PSF of `mapping`.
 
     mapping: observed pixels -> model pixels
@@ -97,8 +98,10 @@ def make_plan(mapping: Mapping, psf_in: PSF, psf_out: PSF, *, precision: Precisi
     n_bands = count_bands(mapping, psf_in, psf_out)
     radius = wrap_radius(psf_out, mapping.matrix)
     n_fft = tuple(_odd(n + h) for n, h in zip(extent or mapping.shape_in, radius, strict=True))
-    nu_y, nu_x = (np.arange(_half_count(mapping.matrix, psf_out.spacing, i, n_fft[i])) / n_fft[i]
-                  for i in (0, 1))
+    nu_y, nu_x = (
+        np.arange(_half_count(mapping.matrix, psf_out.spacing, i, n_fft[i])) / n_fft[i]
+        for i in (0, 1)
+    )
     d, report = difference_spectrum(mapping.matrix, psf_in, psf_out, nu_y, nu_x)
     d = np.broadcast_to(d, (n_bands,) + d.shape[1:])
 
@@ -124,11 +127,24 @@ def make_plan(mapping: Mapping, psf_in: PSF, psf_out: PSF, *, precision: Precisi
             axes, nu = (1, 0), (nu_x, nu_y)
             d_plus, d_minus = d_plus.swapaxes(1, 2), d_minus.swapaxes(1, 2).conj()
         tables = _aligned_tables(mapping, nu, axes, center)
-    in_y, in_x = (_waves(nu[i], np.arange(mapping.shape_in[axes[i]]) - center[axes[i]]).T
-                  for i in (0, 1))
+    in_y, in_x = (
+        _waves(nu[i], np.arange(mapping.shape_in[axes[i]]) - center[axes[i]]).T for i in (0, 1)
+    )
     report |= {"wrap_radius_px": radius, "n_fft": n_fft, "n_frequencies": (h_y, h_x)}
-    return Plan(mapping.kind, mapping, n_bands, is_identity(mapping, psf_in, psf_out), nu, axes,
-                d_plus, d_minus, in_y, in_x, report=report, **tables)
+    return Plan(
+        mapping.kind,
+        mapping,
+        n_bands,
+        is_identity(mapping, psf_in, psf_out),
+        nu,
+        axes,
+        d_plus,
+        d_minus,
+        in_y,
+        in_x,
+        report=report,
+        **tables,
+    )
 
 
 def count_bands(mapping: Mapping, psf_in: PSF, psf_out: PSF) -> int:
@@ -144,8 +160,10 @@ def count_bands(mapping: Mapping, psf_in: PSF, psf_out: PSF) -> int:
                 "give one band or as many as the other"
             )
     if not mapping.covered.any():
-        raise ValueError("the grids do not overlap: no pixel of the observation "
-                         f"{mapping.shape_out} lies on the model {mapping.shape_in}")
+        raise ValueError(
+            "the grids do not overlap: no pixel of the observation "
+            f"{mapping.shape_out} lies on the model {mapping.shape_in}"
+        )
     return n_bands
 
 
@@ -167,8 +185,10 @@ def wrap_radius(psf: PSF, matrix) -> tuple[float, float]:
 
     K >= N + radius keeps what leaves one edge of the model from coming in at the other.
     """
-    y, x = (np.abs(np.arange(n) - psf.center[:, i, None]) * psf.spacing
-            for i, n in enumerate(psf.images.shape[1:]))
+    y, x = (
+        np.abs(np.arange(n) - psf.center[:, i, None]) * psf.spacing
+        for i, n in enumerate(psf.images.shape[1:])
+    )
     distance = np.hypot(y[:, :, None], x[:, None, :]).reshape(psf.n_bands, -1)
     light = np.abs(psf.images).reshape(psf.n_bands, -1)
     order = np.argsort(-distance, axis=1)

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from clresample.engine import Problem
 from clresample.frame import Frame
 from clresample.grid import Grid
 from clresample.joint import Blend, deblend
 from clresample.observation import Observation
 from clresample.operators import operator
+from clresample.problem import Problem
 from clresample.profiles import moment, point, profile
 from clresample.psf import PSF
 from clresample.resample import Resampler

@@ -7,8 +7,8 @@ from scenes import BOXES, GALAXIES, blend, fit, problem
 from clresample import curvature as module
 from clresample import get_device
 from clresample.curvature import damping
-from clresample.engine import Prior
 from clresample.joint import Settings
+from clresample.problem import Prior
 
 
 @pytest.mark.parametrize("prior", [Prior(), None])

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scenes import BRIGHT, blend, chi2, fit, frame, same, sources, truth
 
-from clresample.engine import Engine, Rates
+from clresample.engine import Engine
 from clresample.joint import CHECK, PATIENCE, Settings, _stopped, deblend
+from clresample.problem import Rates
 from clresample.prox import Chain, MaxNorm, Monotone, Positivity, SumNorm
 from clresample.resample import Resampler
 from clresample.sources import Extended

@@ -11,7 +11,8 @@ from scenes import BOXES, problem
 from clresample import prox
 from clresample import reference_scene as ref
 from clresample.device import Device
-from clresample.engine import BETA1, DAMPING, HISTORY, Engine, Prior, Rates
+from clresample.engine import BETA1, DAMPING, HISTORY, Engine
+from clresample.problem import Prior, Rates
 from clresample.prox import Chain, MaxNorm, Monotone, Positivity
 from clresample.psf import PSF
 from clresample.reference_prox import monotone_sweep

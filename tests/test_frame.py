@@ -160,8 +160,9 @@ def test_inside_names_a_pixel():
 def test_hst_and_hsc(data):
     folder = data / "hst_hsc"
     hst, hsc = read_image(folder / "hst_f814w.fits"), read_image(folder / "hsc_grizy.fits")
-    psfs = read_psf(folder / "psf_hst_f814w.fits", center="core"), read_psf(
-        folder / "psf_hsc_grizy.fits", center="core"
+    psfs = (
+        read_psf(folder / "psf_hst_f814w.fits", center="core"),
+        read_psf(folder / "psf_hsc_grizy.fits", center="core"),
     )
     observations = [
         Observation(hsc.data, psfs[1], hsc.grid, channels=tuple("grizy"), name="HSC"),

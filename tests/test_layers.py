@@ -36,6 +36,7 @@ LAYERS = [
     {"contract", "factors", "linop", "paths", "sincs", "testing"},
     {"resample", "split", "scene", "operators", "prox", "tiles"},
     {
+        "problem",
         "spectra",
         "initialize",
         "image_start",

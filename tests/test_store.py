@@ -75,9 +75,7 @@ def rich(rng, grid, other, **given):
     second = Observation(
         rng.normal(size=other.shape), PSF.gaussian(2.1, spacing=0.5), other, zero_points=26.1
     )
-    rendered = tuple(
-        rng.normal(size=(3, *o.shape)).astype(np.float32) for o in (first, second)
-    )
+    rendered = tuple(rng.normal(size=(3, *o.shape)).astype(np.float32) for o in (first, second))
     return blend(
         components,
         grid=grid,
@@ -89,7 +87,7 @@ def rich(rng, grid, other, **given):
         shifts=rng.normal(size=(2, 2)),
         losses=rng.random(17),
         status="failed: no light in channel ö",
-        messages=("one 'line'", "another\twith \"quotes\""),
+        messages=("one 'line'", 'another\twith "quotes"'),
         seconds={"set-up": 1 / 3, "fit": np.float64(2 / 7)},
         **given,
     )
