@@ -86,8 +86,8 @@ class Settings:
     fit_sky: fit a constant per channel
     """
 
-    max_iter: int = 200
-    tol: float = 3e-5
+    max_iter: int = 300
+    tol: float = 1e-5
     prior: Prior | None = Prior()
     constraints: Chain = field(default_factory=lambda: Chain(Positivity(), Monotone()))
     rates: Rates = Rates()

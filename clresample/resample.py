@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import functools
 import math
+import warnings
 
 import numpy as np
 
 from .grid import Grid
 from .linop import LinOp
 from .paths import Affine, Aligned, Distorted, Images
-from .psf import PSF
-from .spectrum import Plan, Precision, make_plan
+from .psf import PSF, PSFWarning
+from .spectrum import DIVISION_FLOOR, Plan, Precision, make_plan
 
 PATHS = {"aligned": Aligned, "affine": Affine, "distorted": Distorted}
 # Intermediate matrices of one launch group [bytes]: in a CPU's cache they are read back at speed; a
 # GPU wants the whole batch in flight.
 GROUP_BYTES = {"CPU": 4 << 20}
 GROUP_BYTES_OTHER = 1 << 30
+# Amplification |D| / |det A| worth telling, above the few per cent of PSFs that nearly agree, and
+# the share of the observed PSF's power that the floor of the division may take untold.
+NOISY_GAIN, FLOORED_POWER = 2.0, 1e-3
 
 
 class Resampler(LinOp):
@@ -34,7 +38,8 @@ class Resampler(LinOp):
     Images are flux per pixel, (C, Ny, Nx) or (B, C, Ny, Nx).  Observed pixels whose centre the
     model does not cover come out as 0; `covered` (My, Mx) tells which are covered, `kind` the path
     taken, `report` what the set-up found.
-    Raises ValueError for grids that do not overlap and for band counts that do not match.
+    Raises ValueError for grids that do not overlap and for band counts that do not match.  Warns
+    (PSFWarning) of a difference kernel that amplifies noise, and of a division that was floored.
     Source: eqs. `reconvampling2D`, `I2model` of the paper, summed in frequency space.
     """
 
@@ -52,6 +57,7 @@ class Resampler(LinOp):
     ):
         mapping = grid_out.map_to(grid_in, tolerance_px=tolerance_px)
         plan = make_plan(mapping, psf_in, psf_out, precision=Precision.of(dtype))
+        _warn(plan.report)
         self._setup([plan], dtype, device, shift)
 
     @classmethod
@@ -167,6 +173,24 @@ class Resampler(LinOp):
         for start in range(0, batch, group):
             n = min(group, batch - start) * n_bands
             chain(_images(source, start, shape_source), _images(target, start, shape_target), n)
+
+
+def _warn(report):
+    """Tell of a difference kernel that does more than blur."""
+    gain, floored = report["max_gain"].max(), report["floored_power"].max()
+    told = []
+    if gain > NOISY_GAIN:
+        told.append(
+            f"the difference kernel amplifies some frequencies {gain:.3g} times, and noise "
+            "with them: the model's PSF is wider there than the observation's"
+        )
+    if floored > FLOORED_POWER:
+        told.append(
+            f"{floored:.2%} of the observed PSF's power lies where the model's carries less "
+            f"than {DIVISION_FLOOR:g} of its light: the division is floored there"
+        )
+    for message in told:
+        warnings.warn(message, PSFWarning, stacklevel=3)
 
 
 def _images(array, start, shape) -> Images:

@@ -238,6 +238,17 @@ def test_a_psf_that_is_too_wide_is_floored_and_told(device):
     np.testing.assert_array_equal(fine["floored_power"], 0)
 
 
+def test_amplified_noise_and_a_floored_division_are_told(device):
+    grid, wide, narrow = Grid.flat((20, 21), 0.1), PSF.gaussian(4.0), PSF.gaussian(0.8)
+    with pytest.warns(PSFWarning) as told:
+        Resampler(grid, wide, grid, narrow, device=device)
+    assert any("amplifies some frequencies" in str(w.message) for w in told)
+    assert any("the division is floored" in str(w.message) for w in told)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Resampler(grid, narrow, grid, wide, device=device)
+
+
 def test_errors_name_the_argument_and_give_both_values(device):
     grid, psf = Grid.flat((9, 8), 0.1), PSF.gaussian(1.0)
     far = Grid.flat((4, 5), 0.1, center_arcsec=(0, 2.0))
