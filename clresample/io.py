@@ -55,10 +55,10 @@ def read_image(path, *, hdu=None, bands=None):
     Raises FitsError (a ValueError, one line that names the file) for what is not there, not FITS,
     damaged, not an image, or without a celestial WCS.
     """
-    with _open(path) as hdus:
-        chosen = _choose_hdu(path, hdus, hdu)
-        data, header = _pixels(path, chosen), chosen.header.copy()
-        wcs = _celestial(path, header, hdus)
+    with open_fits(path) as hdus:
+        chosen = choose_hdu(path, hdus, hdu)
+        data, header = read_pixels(path, chosen), chosen.header.copy()
+        wcs = celestial_header(path, header, hdus)
         if not wcs.has_celestial:
             raise FitsError(f"{path}: HDU {_label(hdus, chosen)} has no celestial WCS")
         # data axes run against FITS axes; the band axis is the one that is not on the sky
@@ -71,8 +71,8 @@ def read_image(path, *, hdu=None, bands=None):
         except ValueError as error:
             raise FitsError(f"{path}: {error}") from error
     names = _band_names(header, len(data))
-    chosen = _choose_bands(path, names, bands)
-    return Image(_native(data[chosen]), grid, header, tuple(names[i] for i in chosen))
+    chosen = choose_bands(path, names, bands)
+    return Image(to_native(data[chosen]), grid, header, tuple(names[i] for i in chosen))
 
 
 def read_psf(path, *, hdu=None, bands=None, spacing=1.0, center=None):
@@ -82,13 +82,13 @@ def read_psf(path, *, hdu=None, bands=None, spacing=1.0, center=None):
 
     Raises FitsError as `read_image` does, and for samples that are no PSF.
     """
-    with _open(path) as hdus:
-        chosen = _choose_hdu(path, hdus, hdu)
-        data, header = _pixels(path, chosen), chosen.header
+    with open_fits(path) as hdus:
+        chosen = choose_hdu(path, hdus, hdu)
+        data, header = read_pixels(path, chosen), chosen.header
         data = data[None] if data.ndim == 2 else data
-        chosen = _choose_bands(path, _band_names(header, len(data)), bands)
+        chosen = choose_bands(path, _band_names(header, len(data)), bands)
     try:
-        return PSF(_native(data[chosen]), spacing=spacing, center=center)
+        return PSF(to_native(data[chosen]), spacing=spacing, center=center)
     except ValueError as error:
         raise FitsError(f"{path}: {error}") from error
 
@@ -142,8 +142,8 @@ def write_fits(
     if unit:
         cards["BUNIT"] = (unit, "flux per pixel")
     for i, name in enumerate(bands or ()):
-        cards[f"BAND{i + 1}"] = (_ascii(name), f"plane {i + 1}")
-    _add_provenance(cards, data.dtype, device, inputs or {}, shift_px)
+        cards[f"BAND{i + 1}"] = (to_ascii(name), f"plane {i + 1}")
+    add_provenance(cards, data.dtype, device, inputs or {}, shift_px)
     if coverage is not None:
         coverage = np.asarray(coverage)
         if coverage.ndim not in (2, 3) or coverage.shape[-2:] != grid.shape:
@@ -151,11 +151,11 @@ def write_fits(
         covered = coverage.astype(np.uint8)
         hdus.append(fits.ImageHDU(covered, placed[0].header, name="COVERAGE"))
         hdus[-1].header["COMMENT"] = "1 where the input image covers the pixel's centre, else 0"
-    _replace(path, fits.HDUList(hdus + list(placed[1:])))
+    replace_file(path, fits.HDUList(hdus + list(placed[1:])))
 
 
 @contextmanager
-def _open(path):
+def open_fits(path):
     """The HDUs of a file; whatever a bad one provokes becomes a FitsError of one line."""
     path = Path(path)
     if path.is_dir():
@@ -185,7 +185,7 @@ def _is_image(hdu):
     return hdu.is_image and len(hdu.shape) in (2, 3) and 0 not in hdu.shape
 
 
-def _choose_hdu(path, hdus, hdu):
+def choose_hdu(path, hdus, hdu):
     """The HDU by number, "NAME" or "NAME,VERSION", or the first image."""
     there = ", ".join(_label(hdus, one) for one in hdus)
     if hdu is None:
@@ -206,14 +206,15 @@ def _choose_hdu(path, hdus, hdu):
     return chosen
 
 
-def _pixels(path, hdu):
+def read_pixels(path, hdu):
+    """The data of an image HDU, whole."""
     data = hdu.data
     if data is None or data.shape != hdu.shape:
         raise FitsError(f"{path}: truncated, the pixels of HDU {hdu.name} are not all there")
     return data
 
 
-def _celestial(path, header, hdus):
+def celestial_header(path, header, hdus):
     """The WCS of the first two axes if these are on the sky, else the whole one.
 
     astropy takes SIP and look-up tables (and with a third axis, TPV) for two axes only.
@@ -236,7 +237,7 @@ def _celestial(path, header, hdus):
     raise FitsError(f"{path}: WCS cannot be used ({reason})") from problem
 
 
-def _native(data):
+def to_native(data):
     """C-contiguous native float: float32 where it holds every value, else float64."""
     dtype = np.result_type(data.dtype.newbyteorder("="), np.float32)
     return np.ascontiguousarray(data, dtype=dtype)
@@ -249,7 +250,7 @@ def _band_names(header, n_bands):
     return [str(header.get(key, i)).strip() for i, key in enumerate(keys)]
 
 
-def _choose_bands(path, names, bands):
+def choose_bands(path, names, bands):
     """Indices of the bands asked for by number or name."""
     if bands is None:
         return list(range(len(names)))
@@ -269,24 +270,26 @@ def _choose_bands(path, names, bands):
     return chosen
 
 
-def _ascii(text):
+def to_ascii(text):
+    """Text as FITS cards can hold it."""
     return str(text).encode("ascii", "replace").decode()
 
 
-def _add_provenance(header, dtype, device, inputs, shift_px):
+def add_provenance(header, dtype, device, inputs, shift_px):
+    """Cards that say what made a file, when, where and of what."""
     header["CREATOR"] = (f"clresample {__version__}", "software")
     header["DATE"] = (datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "written, UTC")
     header["CLDTYPE"] = (str(dtype), "arithmetic of the operator")
     if device is not None:
-        header["CLDEVICE"] = (_ascii(device), "OpenCL device")
+        header["CLDEVICE"] = (to_ascii(device), "OpenCL device")
     if shift_px is not None:
         header["CLSHIFTY"] = (float(shift_px[0]), "[pixel] shift applied, input rows")
         header["CLSHIFTX"] = (float(shift_px[1]), "[pixel] shift applied, input columns")
     for i, (what, file) in enumerate(inputs.items()):
-        header[f"CLFILE{i + 1}"] = (_ascii(Path(file).name), _ascii(what))
+        header[f"CLFILE{i + 1}"] = (to_ascii(Path(file).name), to_ascii(what))
 
 
-def _replace(path, hdus):
+def replace_file(path, hdus):
     """Write under another name in the same folder, then rename: the file is whole or absent."""
     part = path.with_name(f".part-{os.getpid()}-{path.name}")  # astropy needs the suffix, .gz too
     try:

@@ -19,7 +19,16 @@ import numpy as np
 from .detect import THRESHOLD
 from .frame import Frame, model_frame
 from .grid import intersection, union
-from .io import FitsError, _choose_bands, _choose_hdu, _native, _open, _pixels, read_image, read_psf
+from .io import (
+    FitsError,
+    choose_bands,
+    choose_hdu,
+    open_fits,
+    read_image,
+    read_pixels,
+    read_psf,
+    to_native,
+)
 from .joint import Settings
 from .observation import Observation, check_observations
 from .prox import Chain, Positivity
@@ -104,7 +113,7 @@ def _observation(where, folder, table, inputs, notes):
     inputs[f"PSF of {name}"] = folder / table["psf"]
     try:
         image = read_image(path, hdu=table.get("hdu"))
-        chosen = _choose_bands(path, image.bands, table.get("bands"))
+        chosen = choose_bands(path, image.bands, table.get("bands"))
         bands = Bands(len(image.data), chosen)
         given = {}
         for key, argument in (("weight", "weights"), ("variance", "variance"), ("mask", "mask")):
@@ -159,8 +168,8 @@ def _planes(path, table, key, bands):
     """Pixels (C, Ny, Nx) or (Ny, Nx) of a weight, variance or mask file; they need no WCS."""
     if path.name == Path(table["image"]).name and f"{key}_hdu" not in table:
         raise ValueError(f"{key} is in the image's own file: {key}_hdu must say which HDU it is")
-    with _open(path) as hdus:
-        data = _native(_pixels(path, _choose_hdu(path, hdus, table.get(f"{key}_hdu"))))
+    with open_fits(path) as hdus:
+        data = to_native(read_pixels(path, choose_hdu(path, hdus, table.get(f"{key}_hdu"))))
     if data.ndim == 2 or len(data) == 1:
         return data.reshape(data.shape[-2:])
     return data[bands.chosen] if len(data) == bands.n_all else data

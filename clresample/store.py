@@ -16,7 +16,15 @@ from astropy.wcs.wcs import WCSHDO_SIP
 
 from .frame import Frame
 from .grid import Grid
-from .io import FitsError, _add_provenance, _ascii, _celestial, _open, _replace, check_output
+from .io import (
+    FitsError,
+    add_provenance,
+    celestial_header,
+    check_output,
+    open_fits,
+    replace_file,
+    to_ascii,
+)
 from .measure import MEANINGS, catalogue
 from .observation import Observation
 from .psf import PSF, PSFWarning
@@ -49,9 +57,9 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
     path = Path(path)
     check_output(path, overwrite=overwrite)
     primary = fits.PrimaryHDU()
-    primary.header["CLSTATUS"] = (_ascii(" ".join(result.status.split())), "how the fit ended")
+    primary.header["CLSTATUS"] = (to_ascii(" ".join(result.status.split())), "how the fit ended")
     dtype = result.rendered[0].dtype
-    _add_provenance(primary.header, dtype, device, inputs or {}, None)
+    add_provenance(primary.header, dtype, device, inputs or {}, None)
     boxes = [(c.source, *c.origin, *c.morphology.shape) for c in result.components]
     flat = [np.ravel(c.morphology) for c in result.components]
     spectra = [c.spectrum for c in result.components]
@@ -74,14 +82,14 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
     for i, o in enumerate(result.observations):
         cards, tables = _placed(o.grid, i + 1)
         for k, channel in enumerate(o.channels):
-            cards[f"BAND{k + 1}"] = (_ascii(channel), f"plane {k + 1}")
+            cards[f"BAND{k + 1}"] = (to_ascii(channel), f"plane {k + 1}")
         hdus += [_image("DATA", o.data, cards, i), _image("WEIGHTS", o.weights, cards, i), *tables]
         if result.components:
             hdus.append(_image("MODEL", result.model(i), cards, i))
             hdus.append(_image("RESIDUAL", result.residual(i), cards, i))
         hdus.append(_image("RENDERED", result.rendered[i], None, i))
         hdus.append(_image("PSF", o.psf.images, None, i))
-    _replace(path, fits.HDUList(hdus))
+    replace_file(path, fits.HDUList(hdus))
 
 
 def read_result(path) -> Result:
@@ -89,7 +97,7 @@ def read_result(path) -> Result:
 
     Raises FitsError for what is not there, not FITS, damaged, or not such a file.
     """
-    with _open(path) as hdus:
+    with open_fits(path) as hdus:
         if "ABOUT" not in hdus or "COMPONENTS" not in hdus:
             raise FitsError(f"{path}: holds no fitted blend (no HDU ABOUT with COMPONENTS)")
         about = {row["key"]: json.loads(row["value"]) for row in hdus["ABOUT"].data}
@@ -128,7 +136,7 @@ def write_catalogue(path, table, *, overwrite=False):
     check_output(path, overwrite=overwrite)
     if not path.name.endswith(".ecsv"):
         hdus = [fits.PrimaryHDU(), _table(table, "CATALOGUE"), _flag_table()]
-        return _replace(path, fits.HDUList(hdus))
+        return replace_file(path, fits.HDUList(hdus))
     part = path.with_name(f".part-{os.getpid()}-{path.name}")
     try:
         table.write(part, format="ascii.ecsv", overwrite=True)
@@ -178,8 +186,8 @@ def _flag_table():
 
 def _table(table, name):
     """FITS knows ASCII only."""
-    table = QTable(table, names=[_ascii(column) for column in table.colnames])
-    table["name"] = [_ascii(value) for value in table["name"]]
+    table = QTable(table, names=[to_ascii(column) for column in table.colnames])
+    table["name"] = [to_ascii(value) for value in table["name"]]
     hdu = fits.table_to_hdu(table)
     hdu.name = name
     return hdu
@@ -224,7 +232,7 @@ def _grid(path, hdu, about, hdus):
     shape, flat = hdu.shape[-2:], about["flat"]
     if flat is not None:
         return Grid(shape, None, np.array(flat["jacobian"], float), np.array(flat["origin"], float))
-    return Grid.from_wcs(_celestial(path, hdu.header, hdus), shape)
+    return Grid.from_wcs(celestial_header(path, hdu.header, hdus), shape)
 
 
 def _psf(images, about):
