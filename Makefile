@@ -22,7 +22,7 @@ lint: $(STAMP)
 paper: GALAXIES = 600
 paper: GALAXIES_MORE = 120
 paper: SECONDS = 1
-paper: SCENES = 100
+paper: SCENES = 120
 paper-full: GALAXIES = 10000
 paper-full: GALAXIES_MORE = 10000
 paper-full: SECONDS = 5

@@ -128,6 +128,7 @@ def add_resample(commands):
 def run(arguments):
     """Read, resample, write. Raises ValueError or OSError, one line, for what cannot be used."""
     from .io import check_output, read_image, write_fits
+    from .resample import FLOORED_POWER
     from .tiles import TiledResampler
 
     check_output(arguments.output, overwrite=arguments.overwrite)
@@ -165,6 +166,9 @@ def run(arguments):
     except ValueError as error:
         raise ValueError(f"{arguments.image} as {arguments.like}: {error}") from error
     _check_gain(arguments, op.report["max_gain"])
+    floored = float(op.report["floored_power"].max())
+    if floored > FLOORED_POWER:
+        _note(f"{floored:.2%} of {arguments.psf_like}'s power lies beyond {arguments.psf}: floored")
     result = op(pixels)
     took = time.perf_counter() - started
     covered = op.covered

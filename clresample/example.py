@@ -65,8 +65,8 @@ psf_sigma_px = 0.8
 # footprint = "union"             # or "intersection"
 
 [fit]
-max_iter = 200
-tol = 1e-4
+# max_iter = 300
+# tol = 1e-5                      # a fit ends when its loss falls by less than this part of itself
 # monotone = true                 # false for galaxies of arms and tails
 # structure_px = 2.0              # size of the structure in a galaxy [model pixels]
 fit_shifts = false                # let all observations but the first move by a constant shift

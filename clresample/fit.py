@@ -14,6 +14,7 @@ from .initialize import start
 from .observation import check_observations
 from .operators import operator
 from .problem import Problem
+from .resample import concerns
 from .resize import box_around
 from .result import Component, Result
 from .sources import Point
@@ -55,6 +56,8 @@ class Fit:
                 view.op.shift = self.shifts[len(self.views)]
             self.views.append(view)
             self.units.append(unit)
+        for o, view in zip(blend.observations, self.views, strict=True):
+            self.messages += [f"{o.label}: {line}" for line in concerns(view.op.report)]
         if not any(view.root.any() for view in self.views):
             raise ValueError("no observed pixel on the model frame has a weight")
         self.unit = np.concatenate(self.units)

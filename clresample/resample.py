@@ -57,7 +57,8 @@ class Resampler(LinOp):
     ):
         mapping = grid_out.map_to(grid_in, tolerance_px=tolerance_px)
         plan = make_plan(mapping, psf_in, psf_out, precision=Precision.of(dtype))
-        _warn(plan.report)
+        for message in concerns(plan.report):
+            warnings.warn(message, PSFWarning, stacklevel=2)
         self._setup([plan], dtype, device, shift)
 
     @classmethod
@@ -175,8 +176,8 @@ class Resampler(LinOp):
             chain(_images(source, start, shape_source), _images(target, start, shape_target), n)
 
 
-def _warn(report):
-    """Tell of a difference kernel that does more than blur."""
+def concerns(report):
+    """What a user should know of a difference kernel that does more than blur, a line each."""
     gain, floored = report["max_gain"].max(), report["floored_power"].max()
     told = []
     if gain > NOISY_GAIN:
@@ -189,8 +190,7 @@ def _warn(report):
             f"{floored:.2%} of the observed PSF's power lies where the model's carries less "
             f"than {DIVISION_FLOOR:g} of its light: the division is floored there"
         )
-    for message in told:
-        warnings.warn(message, PSFWarning, stacklevel=3)
+    return told
 
 
 def _images(array, start, shape) -> Images:

@@ -39,7 +39,7 @@ def test_chi2_is_no_worse_than_others_reach(fitted):
 
 
 def test_residuals_hold_no_galaxy(fitted):
-    """Within 3 noise deviations of the peak's 2 %, in windows of a PSF's width."""
+    """Within 5 deviations of the noise and 5 % of the model, in windows of a PSF's width."""
     result, _, _ = fitted
     for i, o in enumerate(result.observations):
         width = {"HST": 5, "HSC": 4}[o.name]
