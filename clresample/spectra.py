@@ -11,7 +11,8 @@ from .resample import Resampler
 
 # Part of its light by which a model without a galaxy's own structure is wrong.
 MODEL_ERROR = 0.15
-# Sources exactly on top of each other share their light: a ridge on the scaled normal matrix.
+# Sources exactly on top of each other share their light, stars evenly, galaxies as their profiles
+# came out: a ridge on the scaled normal matrix.
 RIDGE = 1e-8
 # Light this far under the brightest is none: float32 would keep it as denormals, 20 times slower.
 DARK = 1e-20
