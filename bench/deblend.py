@@ -32,34 +32,29 @@ N_SCENES, N_QUICK = 24, 6
 N_TICKS = 10
 # [s] --quick leaves out batches that would not end by then
 QUICK_SECONDS = 42.0
+COST_COLUMNS = (
+    ("mode", 6, ""),
+    ("batch", 5, "d"),
+    ("n_sources", 9, "d"),
+    ("iterations", 10, "d"),
+    ("ms_per_iteration", 16, ".3f"),
+    ("galsim_ms", 9, ".3f"),
+    ("ratio", 6, ".2f"),
+    ("wall_s", 7, ".3f"),
+)
+SCORE_COLUMNS = (("sdr_median", 10, ".2f"), ("chi2", 6, ".3f"))
 COLUMNS = (
     ("seed", 4, "d"),
     ("view", 8, ""),
-    ("mode", 6, ""),
-    ("batch", 5, "d"),
-    ("n_sources", 9, "d"),
-    ("iterations", 10, "d"),
-    ("ms_per_iteration", 16, ".3f"),
-    ("galsim_ms", 9, ".3f"),
-    ("ratio", 6, ".2f"),
-    ("wall_s", 7, ".3f"),
+    *COST_COLUMNS,
     ("wall_again_s", 12, ".3f"),
-    ("sdr_median", 10, ".2f"),
-    ("chi2", 6, ".3f"),
+    *SCORE_COLUMNS,
     ("converged", 9, ""),
 )
 BATCH_COLUMNS = (
-    ("mode", 6, ""),
-    ("batch", 5, "d"),
-    ("n_sources", 9, "d"),
-    ("iterations", 10, "d"),
-    ("ms_per_iteration", 16, ".3f"),
-    ("galsim_ms", 9, ".3f"),
-    ("ratio", 6, ".2f"),
-    ("wall_s", 7, ".3f"),
+    *COST_COLUMNS,
     ("scenes_per_second", 17, ".2f"),
-    ("sdr_median", 10, ".2f"),
-    ("chi2", 6, ".3f"),
+    *SCORE_COLUMNS,
     ("n_converged", 11, "d"),
 )
 

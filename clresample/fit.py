@@ -120,7 +120,8 @@ class Fit:
         for full, (y, x), m in zip(morphs, p.origin, p.morph, strict=True):
             peak = m.max() if m.max() > 0 else 1.0
             full[y : y + m.shape[0], x : x + m.shape[1]] = m / peak
-        units = [v.render(morphs) for v in self.views]
+        observed = [v.observe(morphs) for v in self.views]
+        units = [v.whiten(images) for v, images in zip(self.views, observed, strict=True)]
         spectra, sky, covariance = solve_spectra(units, self.views, self.settings.fit_sky)
         components = []
         for i, ((y, x), m) in enumerate(zip(p.origin, p.morph, strict=True)):
@@ -134,9 +135,8 @@ class Fit:
                 )
             )
         rendered = []
-        for view, o in zip(self.views, self.blend.observations, strict=True):
-            images = view.op.render(morphs.astype(view.op.dtype)).astype(np.float64)
-            images *= _covered(view.op, self.frame)
+        for view, o, images in zip(self.views, self.blend.observations, observed, strict=True):
+            images = images.astype(np.float64) * _covered(view.op, self.frame)
             rendered.append(images[..., : o.data.shape[1], : o.data.shape[2]])
         self.seconds["result"] = time.perf_counter() - began
         return Result(

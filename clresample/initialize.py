@@ -41,7 +41,8 @@ class Start:
 
     source (n): the source of each component
     base (n, Ny, Nx): profiles over the frame, unit integral
-    spectra (n, C) [counts]: total flux; covariance (C, n, n); sky (C,)
+    spectra (n, C), sky (C,) [counts]: total fluxes and constants, by the weights that know of the
+        model error
     positions (S, 2) [px]
     """
 

@@ -59,11 +59,14 @@ class Path:
         self.in_y_t = self._table([p.in_y.T for p in plans], self.n_y, self.k_y)
         self.in_x = self._table([p.in_x for p in plans], self.k_x, padded(self.n_x))
         self.in_x_t = self._table([p.in_x.T for p in plans], self.n_x, self.k_pad)
+        self.out_y = self._table([p.out_y for p in plans], self.n_rows, self.k_y)
+        self.out_y_t = self._table([p.out_y.T for p in plans], self.k_y, self.n_rows)
         self.spectra = device.empty((len(plans), self.n_bands, self.h_y, 4, self.k_pad // 2), dtype)
         self.plain = Contraction(device, dtype)
         self.first = Contraction(device, dtype, strided=self.axes != (0, 1))
         self.ragged = Contraction(device, dtype, ragged=True)
         self.mix = Contraction(device, dtype, epilogue="MIX")
+        self.mix_adjoint = Contraction(device, dtype, epilogue="MIX", adjoint=True)
         self.scratch = {}
 
     # rows and row length of the intermediate matrices, per image: name -> (rows, ld)
@@ -93,7 +96,7 @@ class Path:
 
         spread: the images are n / n_bands, each of which is seen in every band
         """
-        half, z = self._scratch("half", self.n_y), self._scratch("spectrum")
+        half = self._scratch("half", self.n_y)
         in_x_t = self.in_x_t._replace(div=1) if spread else self.in_x_t
         self.first(
             self.n_y,
@@ -106,14 +109,18 @@ class Path:
         )
         if spread:
             half = half._replace(div=self.n_bands)
-        self.mix(
+        self.to_spectrum(self.mix, self.n_y, self.in_y, half, n)
+
+    def to_spectrum(self, mix: Contraction, k, left: Matrix, right: Matrix, n):
+        """Z = D o (left right) over k terms, into scratch "spectrum"; `mix` may conjugate D."""
+        mix(
             self.k_y,
             self.k_x,
-            self.n_y,
+            k,
             n,
-            self.in_y,
-            half,
-            z,
+            left,
+            right,
+            self._scratch("spectrum"),
             self._epilogue(self.spectra),
             self.n_bands,
         )
@@ -147,11 +154,8 @@ class Aligned(Path):
     def __init__(self, device, dtype, plans):
         self.n_rows, self.n_columns = plans[0].mapping.shape_out
         super().__init__(device, dtype, plans)
-        self.out_y = self._table([p.out_y for p in plans], self.n_rows, self.k_y)
-        self.out_y_t = self._table([p.out_y.T for p in plans], self.k_y, self.n_rows)
         self.out_x = self._table([p.out_x for p in plans], self.k_x, padded(self.n_columns))
         self.out_x_t = self._table([p.out_x.T for p in plans], self.n_columns, self.k_pad)
-        self.mix_adjoint = Contraction(device, dtype, epilogue="MIX", adjoint=True)
 
     def forward(self, x: Images, y: Images, n, spread=False):
         self.analyse(x, n, spread)
@@ -160,19 +164,9 @@ class Aligned(Path):
         self.ragged(self.n_rows, self.n_columns, self.k_x, n, half, self.out_x, y.matrix())
 
     def adjoint(self, y: Images, x: Images, n):
-        half, z = self._scratch("half", self.n_rows), self._scratch("spectrum")
+        half = self._scratch("half", self.n_rows)
         self.plain(self.n_rows, self.k_x, self.n_columns, n, y.matrix(), self.out_x_t, half)
-        self.mix_adjoint(
-            self.k_y,
-            self.k_x,
-            self.n_rows,
-            n,
-            self.out_y_t,
-            half,
-            z,
-            self._epilogue(self.spectra),
-            self.n_bands,
-        )
+        self.to_spectrum(self.mix_adjoint, self.n_rows, self.out_y_t, half, n)
         self.synthesise(x, n)
 
 
@@ -186,13 +180,10 @@ class Affine(Path):
         self.n_columns = max(p.out_x.shape[1] for p in plans)
         self.n_pad = padded(self.n_columns)
         super().__init__(device, dtype, plans)
-        self.out_y = self._table([p.out_y for p in plans], self.n_rows, self.k_y)
-        self.out_y_t = self._table([p.out_y.T for p in plans], self.k_y, self.n_rows)
         self.out_x = self._table([p.out_x for p in plans], self.k_x, self.n_pad)
         self.out_x_t = self._table([p.out_x.T for p in plans], self.n_columns, self.k_pad)
         turns = [np.stack([np.cos(p.twist), np.sin(p.twist)], axis=1) for p in plans]
         self.turn = self._table(turns, self.h_y, 2, self.n_pad)
-        self.mix_adjoint = Contraction(device, dtype, epilogue="MIX", adjoint=True)
         self.twist = Contraction(device, dtype, epilogue="TWIST")
         self.twist_adjoint = Contraction(device, dtype, epilogue="TWIST", adjoint=True)
         lines = [p.lines for p in plans]
@@ -219,7 +210,7 @@ class Affine(Path):
         self.to_pixels(g, self._lines_of(y), n)
 
     def adjoint(self, y: Images, x: Images, n):
-        z, turned, g = (self._scratch(name) for name in ("spectrum", "turned", "lines"))
+        turned, g = self._scratch("turned"), self._scratch("lines")
         self.to_columns(self._lines_of(y), g, n)
         self.twist_adjoint(
             self.k_y,
@@ -232,17 +223,7 @@ class Affine(Path):
             self._turn(),
             self.n_bands,
         )
-        self.mix_adjoint(
-            self.k_y,
-            self.k_x,
-            self.n_columns,
-            n,
-            turned,
-            self.out_x_t,
-            z,
-            self._epilogue(self.spectra),
-            self.n_bands,
-        )
+        self.to_spectrum(self.mix_adjoint, self.n_columns, turned, self.out_x_t, n)
         self.synthesise(x, n)
 
     def _turn(self):
@@ -258,10 +239,7 @@ class Distorted(Path):
     def __init__(self, device, dtype, plans):
         self.n_rows = math.prod(plans[0].mapping.shape_out)
         super().__init__(device, dtype, plans)
-        self.out_y = self._table([p.out_y for p in plans], self.n_rows, self.k_y)
-        self.out_y_t = self._table([p.out_y.T for p in plans], self.k_y, self.n_rows)
         self.out_x = self._table([p.out_x for p in plans], self.n_rows, self.k_pad)
-        self.mix_adjoint = Contraction(device, dtype, epilogue="MIX", adjoint=True)
         self.rowdot = device.kernel("warp.cl", "rowdot", dtype=dtype)
         self.rowscale = device.kernel("warp.cl", "rowscale", dtype=dtype)
         scalars = [np.int32, np.int32, np.int32, np.int32]
@@ -276,20 +254,10 @@ class Distorted(Path):
         self.device.launch(self.rowdot, (_whole_groups(self.n_rows), n), (GROUP, 1))
 
     def adjoint(self, y: Images, x: Images, n):
-        half, z = self._scratch("half", self.n_rows), self._scratch("spectrum")
+        half = self._scratch("half", self.n_rows)
         self._ends(self.rowscale, y, half)
         self.device.launch(self.rowscale, (self.k_pad, self.n_rows, n), (COLUMN_PAD, 1, 1))
-        self.mix_adjoint(
-            self.k_y,
-            self.k_x,
-            self.n_rows,
-            n,
-            self.out_y_t,
-            half,
-            z,
-            self._epilogue(self.spectra),
-            self.n_bands,
-        )
+        self.to_spectrum(self.mix_adjoint, self.n_rows, self.out_y_t, half, n)
         self.synthesise(x, n)
 
     def _ends(self, kernel, y: Images, half: Matrix):

@@ -31,15 +31,23 @@ class View:
     root: np.ndarray
     data: np.ndarray
 
-    def render(self, images):
-        """Whitened unit-spectrum images (n, Co, My * Mx) of model images (n, Ny, Nx).
+    def observe(self, images):
+        """Unit-spectrum images (n, Co, My, Mx) of model images (n, Ny, Nx).
 
         Images smaller than the operator's frame are zero beyond.
         """
         images = _padded(images, self.op.shape_in).astype(self.op.dtype)
         images[np.abs(images) < DARK * np.abs(images).max(initial=0)] = 0
-        out = self.op.render(images) * self.root
+        return self.op.render(images)
+
+    def whiten(self, observed):
+        """Observed images in units of their noise, (n, Co, My * Mx)."""
+        out = observed * self.root
         return out.reshape(*out.shape[:2], -1).astype(np.float64)
+
+    def render(self, images):
+        """Whitened unit-spectrum images (n, Co, My * Mx) of model images (n, Ny, Nx)."""
+        return self.whiten(self.observe(images))
 
 
 def _padded(images, shape):
