@@ -9,7 +9,7 @@ RUN = $(VENV)/bin/python -m
 .PHONY: demo test lint clean paper paper-full
 
 demo: $(STAMP)
-	$(RUN) clresample.demo $(ARGS)
+	$(RUN) clresample.cli.demo $(ARGS)
 
 test: $(STAMP)
 	$(RUN) pytest $(ARGS)

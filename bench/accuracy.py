@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from tqdm import tqdm
 
-from clresample.simulate import sdr
+from clresample.simulation.sdr import sdr
 
 from . import common, figures, report
 from .accuracy_findings import findings

@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from clresample import Resampler
-from clresample.galaxies import draw, import_galsim, open_catalogue, random_galaxy
-from clresample.surveys import Survey
+from clresample.simulation.galaxies import draw, import_galsim, open_catalogue, random_galaxy
+from clresample.simulation.surveys import Survey
 
 from .common import BadOption, data_folder
 

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from clresample import DeviceError, __version__, get_device
-from clresample.surveys import NOTEBOOK_SURVEYS, PAPER_SURVEYS
+from clresample.simulation.surveys import NOTEBOOK_SURVEYS, PAPER_SURVEYS
 
 ROOT = Path(__file__).resolve().parents[1]
 REPORT = ROOT / "bench" / "report"

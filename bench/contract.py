@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from clresample import get_device
-from clresample.contract import Contraction, Matrix, padded
-from clresample.surveys import NOTEBOOK_SURVEYS
+from clresample.device.contraction import Contraction, Matrix, padded
+from clresample.simulation.surveys import NOTEBOOK_SURVEYS
 
 from . import common
 from .cases import Case

@@ -21,7 +21,8 @@ import time
 
 import numpy as np
 
-from clresample.joint import Settings, deblend, deblend_many
+from clresample.deblending.batch import deblend, deblend_many
+from clresample.deblending.settings import Settings
 
 from . import common, scenes
 

@@ -8,7 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clresample.plot import RESIDUAL_COLOURS, SKY_COLOURS, import_figure, stretch, stretch_limits
+from clresample.files.panels import (
+    RESIDUAL_COLOURS,
+    SKY_COLOURS,
+    import_figure,
+    stretch,
+    stretch_limits,
+)
 
 DPI = 110  # dots per inch: a page's width in about 100 kB
 INK, FAINT, BLANK = "#20242c", "#c9ced8", "#f1f3f6"

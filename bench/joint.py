@@ -19,7 +19,8 @@ import functools
 import numpy as np
 from tqdm import tqdm
 
-from clresample.joint import Settings, deblend_many
+from clresample.deblending.batch import deblend_many
+from clresample.deblending.settings import Settings
 
 from . import common, figures, joint_findings, report, scenes, sersic
 

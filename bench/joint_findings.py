@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clresample.simulate import MAGNITUDE_RANGE
+from clresample.simulation.scenes import MAGNITUDE_RANGE
 
 from .report import Finding
 from .scenes import MODES

@@ -23,7 +23,7 @@ import time
 
 import numpy as np
 
-from clresample.simulate import sdr
+from clresample.simulation.sdr import sdr
 
 from . import common
 from .cases import Case, Galaxies

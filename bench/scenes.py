@@ -9,12 +9,13 @@ import numpy as np
 from astropy.table import Table
 
 from clresample import PSF
-from clresample.frame import model_frame
-from clresample.joint import Blend
-from clresample.measure import summary
-from clresample.simulate import sdr, simulate_scene
-from clresample.sources import Extended
-from clresample.surveys import NOTEBOOK_SURVEYS
+from clresample.deblending.blend import Blend
+from clresample.measurement.quality import summary
+from clresample.simulation.scenes import simulate_scene
+from clresample.simulation.sdr import sdr
+from clresample.simulation.surveys import NOTEBOOK_SURVEYS
+from clresample.sky.frame import model_frame
+from clresample.sky.sources import Extended
 
 from .cases import Case, Galaxies
 from .common import data_folder

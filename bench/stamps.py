@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clresample.galaxies import draw
-from clresample.simulate import sdr
-from clresample.split import SplitResampler
+from clresample.resampling.paper.resampler import PaperResampler
+from clresample.simulation.galaxies import draw
+from clresample.simulation.sdr import sdr
 
 from .cases import Case, Galaxies
 
@@ -53,7 +53,7 @@ def renderers(case):
     return {
         "ours": operator(np.float32),
         "ours64": operator(np.float64),
-        "paper": operator(np.float32, scheme=SplitResampler),
+        "paper": operator(np.float32, scheme=PaperResampler),
         "quintic": galsim("quintic"),
         "sinc": galsim("sinc"),
     }

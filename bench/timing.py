@@ -17,7 +17,7 @@ import time
 import numpy as np
 from tqdm import tqdm
 
-from clresample.split import SplitResampler
+from clresample.resampling.paper.resampler import PaperResampler
 
 from . import common, figures, report
 from .cases import Case, Galaxies
@@ -50,7 +50,7 @@ def measure(case, galaxies, seconds):
 
     makers = {
         "ours": operator,
-        "paper": lambda: operator(scheme=SplitResampler),
+        "paper": lambda: operator(scheme=PaperResampler),
         "quintic": lambda: galsim("quintic"),
         "sinc": lambda: galsim("sinc"),
     }
@@ -78,7 +78,7 @@ def measure_schemes(surveys, sizes, galaxies, seconds):
     for n_model, angle in itertools.product(sizes, ANGLES_DEG):
         case = Case(survey_in, survey_out, n_model, angle)
         image = case.draw(galaxies.take(0, case))[0]
-        ours, paper = case.operator(), case.operator(SplitResampler)
+        ours, paper = case.operator(), case.operator(PaperResampler)
         calls[angle, n_model, "ours"] = functools.partial(ours, image)
         calls[angle, n_model, "paper"] = functools.partial(paper, image)
         products[angle, n_model] = paper.report["n_terms"] * case.n_obs**2

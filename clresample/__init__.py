@@ -1,51 +1,107 @@
-"""clresample: resampling and convolution between telescopes in one OpenCL operator."""
+"""clresample: one exact operator between telescopes' pixels and PSFs, and joint deblending.
+
+Start with five things. A `Grid` says where an image's pixels lie on the sky and a `PSF` how they
+are blurred. A `Resampler` takes a model image from one grid and PSF to another, exactly, and its
+adjoint back. An `Observation` is an instrument's image with its grid, PSF and weights, and
+`deblend` fits one scene of sources to any number of observations; `catalogue` turns what it
+returns into a table. The rooms behind these names are described in docs/architecture.md.
+"""
 
 from importlib import import_module
+from typing import TYPE_CHECKING
 
 __version__ = "0.1.0"
 
-# Each public name and the module it lives in; imported when first used, so that the command line
-# answers at once and no OpenCL driver is touched before it is needed.
+# Each room's public names and the module that defines them; imported when first used, so that the
+# command line answers at once and no OpenCL driver is touched before it is needed.
+_ROOMS = {
+    # the sky: pixels, PSFs, images, sources
+    "sky": {
+        "grid": ("Grid",),
+        "psf": ("PSF",),
+        "observation": ("Observation",),
+        "sources": ("Extended", "Point"),
+        "frame": ("Frame", "model_frame"),
+    },
+    # the operator and its variants
+    "resampling": {
+        "resampler": ("Resampler",),
+        "tiled": ("TiledResampler",),
+        "paper.resampler": ("PaperResampler",),
+    },
+    # fits of scenes to observations
+    "deblending": {
+        "batch": ("deblend", "deblend_many"),
+        "blend": ("Blend", "Failure"),
+        "settings": ("Settings",),
+        "solver.prior": ("Prior",),
+        "solver.problem": ("StepSizes",),
+        "image_profiles": ("with_image_profiles",),
+        "result": ("Result",),
+    },
+    # sources found before a fit, quantities measured after it
+    "measurement": {
+        "detection": ("detect", "detect_more"),
+        "photometry": ("fluxes", "redistribute"),
+        "catalogue": ("Flag", "catalogue"),
+        "quality": ("summary",),
+    },
+    # results and catalogues on disk
+    "files": {
+        "results": ("read_result", "write_catalogue", "write_result"),
+    },
+    # scenes with their truth
+    "simulation": {
+        "scenes": ("simulate_scene",),
+    },
+    # OpenCL devices
+    "device": {
+        "device": ("Device", "get_device"),
+        "discovery": ("DeviceError", "list_devices"),
+    },
+}
 _HOMES = {
-    "Blend": "joint",
-    "Device": "device",
-    "DeviceError": "device",
-    "Extended": "sources",
-    "Failure": "joint",
-    "Flag": "measure",
-    "Frame": "frame",
-    "Grid": "grid",
-    "Observation": "observation",
-    "PSF": "psf",
-    "Point": "sources",
-    "Prior": "problem",
-    "Rates": "problem",
-    "Resampler": "resample",
-    "Result": "result",
-    "Settings": "joint",
-    "SplitResampler": "split",
-    "TiledResampler": "tiles",
-    "catalogue": "measure",
-    "deblend": "joint",
-    "deblend_many": "joint",
-    "fluxes": "measure",
-    "get_device": "device",
-    "list_devices": "device",
-    "model_frame": "frame",
-    "read_result": "store",
-    "redistribute": "measure",
-    "summary": "measure",
-    "with_image_profiles": "image_start",
-    "write_catalogue": "store",
-    "write_result": "store",
+    name: f"clresample.{room}.{module}"
+    for room, modules in _ROOMS.items()
+    for module, names in modules.items()
+    for name in names
 }
 __all__ = sorted(_HOMES)
+
+if TYPE_CHECKING:  # the same names for type checkers and editors
+    from .deblending.batch import deblend as deblend, deblend_many as deblend_many
+    from .deblending.blend import Blend as Blend, Failure as Failure
+    from .deblending.image_profiles import with_image_profiles as with_image_profiles
+    from .deblending.result import Result as Result
+    from .deblending.settings import Settings as Settings
+    from .deblending.solver.prior import Prior as Prior
+    from .deblending.solver.problem import StepSizes as StepSizes
+    from .device.device import Device as Device, get_device as get_device
+    from .device.discovery import DeviceError as DeviceError, list_devices as list_devices
+    from .files.results import (
+        read_result as read_result,
+        write_catalogue as write_catalogue,
+        write_result as write_result,
+    )
+    from .measurement.catalogue import Flag as Flag, catalogue as catalogue
+    from .measurement.detection import detect as detect, detect_more as detect_more
+    from .measurement.photometry import fluxes as fluxes, redistribute as redistribute
+    from .measurement.quality import summary as summary
+    from .resampling.paper.resampler import PaperResampler as PaperResampler
+    from .resampling.resampler import Resampler as Resampler
+    from .resampling.tiled import TiledResampler as TiledResampler
+    from .simulation.scenes import simulate_scene as simulate_scene
+    from .sky.frame import Frame as Frame, model_frame as model_frame
+    from .sky.grid import Grid as Grid
+    from .sky.observation import Observation as Observation
+    from .sky.psf import PSF as PSF
+    from .sky.sources import Extended as Extended, Point as Point
 
 
 def __getattr__(name):
     if name not in _HOMES:
         raise AttributeError(f"module 'clresample' has no attribute {name!r}")
-    return getattr(import_module(f"clresample.{_HOMES[name]}"), name)
+    return getattr(import_module(_HOMES[name]), name)
 
 
 def __dir__():

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from clresample import Resampler
-from clresample.io import read_image, read_psf
-from clresample.plot import compare, fwhm_px, plot_resampled
+from clresample.files.fits import read_image, read_psf
+from clresample.files.plot_resampled import compare, fwhm_px, plot_resampled
 
 HERE = Path(__file__).resolve().parent
 DATA = Path(os.environ.get("CLRESAMPLE_DATA") or HERE.parents[1] / "shared" / "data") / "hst_hsc"

@@ -1,18 +1,15 @@
 """Fixtures: every OpenCL device of the machine, and the folder of real images."""
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 # Before NumPy is loaded: on small matrices BLAS threads only wait for each other, and for PoCL's.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
+from helpers.checkout import ROOT
 
 from clresample import DeviceError, get_device, list_devices
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 def pytest_generate_tests(metafunc):
@@ -38,12 +35,3 @@ def data():
     if not folder.is_dir():
         pytest.skip(f"no data folder at {folder}: set CLRESAMPLE_DATA to test on real images")
     return folder
-
-
-def run_python(*arguments, **environment):
-    """Python on `arguments` in the checkout, under more environment variables."""
-    command = [sys.executable, *arguments]
-    environment = {**os.environ, **environment}
-    return subprocess.run(
-        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False
-    )

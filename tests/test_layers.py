@@ -1,104 +1,148 @@
-"""Who may import whom: a module only reaches down, and the NumPy layer knows no OpenCL."""
+"""The house: who may import whom, no circles, and nothing too long to read.
+
+Rooms are the folders of clresample/; a room may import the rooms named beside it here, and itself.
+"""
 
 import ast
 import subprocess
 import sys
 
 import pytest
-from conftest import ROOT
+from helpers.checkout import ROOT
 
-# From the ground up; a module may import from its own layer and from those before it.
-LAYERS = [
-    {
-        "grid",
-        "mapping",
-        "psf",
-        "lines",
-        "spectrum",
-        "observation",
-        "sources",
-        "frame",
-        "result",
-        "profiles",
-        "shapes",
-        "footprint",
-        "boxes",
-        "solve",
-        "surveys",
-        "tiling",
-        "galaxies",
-        "reference",
-        "reference_prox",
-        "reference_scene",
-        "curvature",
-    },
-    {"discover", "device"},
-    {"contract", "factors", "linop", "paths", "sincs", "testing"},
-    {"resample", "split", "scene", "operators", "prox", "tiles"},
-    {
-        "problem",
-        "spectra",
-        "initialize",
-        "image_start",
-        "shifts",
-        "resize",
-        "engine",
-        "fit",
-        "joint",
-        "detect",
-        "measure",
-    },
-    {
-        "io",
-        "store",
-        "simulate",
-        "plot",
-        "demo",
-        "demo_resample",
-        "cli",
-        "cli_options",
-        "cli_resample",
-        "cli_deblend",
-        "scenefile",
-        "scenekeys",
-        "source_table",
-        "example",
-        "plot_deblended",
-    },
+ROOMS = {
+    "device": (),
+    "sky": (),
+    "resampling": ("device", "sky"),
+    "deblending": ("device", "sky", "resampling"),
+    "measurement": ("sky", "resampling", "deblending"),
+    "files": ("sky", "deblending", "measurement"),
+    "simulation": ("sky",),
+    "cli": ("device", "sky", "resampling", "deblending", "measurement", "files", "simulation"),
+}
+# Rooms that work without any OpenCL driver.
+NUMPY_ONLY = ("sky", "simulation")
+MAX_LINES, MAX_CLASS, MAX_FUNCTION, MAX_FILES, MAX_FOLDERS = 300, 150, 60, 14, 9
+
+PACKAGE = ROOT / "clresample"
+MODULES = {
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in sorted(PACKAGE.rglob("*.py"))
+}
+SOURCES = [
+    path
+    for folder in ("clresample", "tests", "bench", "docs", "kernels")
+    for path in sorted((ROOT / folder).rglob("*"))
+    if path.suffix in (".py", ".cl", ".h")
 ]
-RANKS = {name: rank for rank, names in enumerate(LAYERS) for name in names}
-MODULES = sorted((ROOT / "clresample").glob("*.py"))
 
 
-def imported(tree):
-    """Every module that a syntax tree imports, at the top or inside functions, written in full."""
-    for node in ast.walk(tree):
+def imported(name, source, is_package=False):
+    """Every module that module `name` imports, at the top or inside functions, in full."""
+    home = name.split(".") if is_package else name.split(".")[:-1]
+    for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            home = ".".join(filter(None, ["clresample" * bool(node.level), node.module]))
-            yield home
-            if home == "clresample":  # from . import psf
-                yield from (f"clresample.{alias.name}" for alias in node.names)
+            base = home[: len(home) - node.level + 1] if node.level else []
+            base = ".".join([*base, *filter(None, [node.module])])
+            members = [f"{base}.{alias.name}" for alias in node.names]
+            inside = [member for member in members if member in MODULES]
+            yield from inside or [base]
 
 
-def violations(name, source):
-    """The imports in `source`, the text of module `name`, that its layer does not allow."""
-    rank = RANKS[name]
-    for target in imported(ast.parse(source)):
-        package, _, module = target.partition(".")
-        if package == "pyopencl" and rank == 0:
+def room_of(name):
+    """The room of a module of clresample's; "" for those beside the rooms."""
+    parts = name.split(".")
+    return parts[1] if len(parts) > 1 and parts[1] in ROOMS else ""
+
+
+def violations(name, source, is_package=False):
+    """The imports in `source`, the text of module `name`, that its room does not allow."""
+    room = room_of(name)
+    for target in imported(name, source, is_package):
+        if target.split(".")[0] == "pyopencl" and room in NUMPY_ONLY:
             yield target
-        if package == "clresample" and RANKS.get(module.split(".")[0], -1) > rank:
+        if target.split(".")[0] != "clresample" or target == "clresample":
+            continue
+        if room_of(target) != room and room_of(target) not in ROOMS.get(room, ()):
+            yield target
+        inside = "clresample.deblending.solver."
+        leaves = room_of(target) == "deblending" and not target.startswith(inside)
+        if name.startswith(inside) and leaves:  # the solver knows nothing of the fits around it
             yield target
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.stem)
-def test_imports_only_reach_down(path):
-    if path.stem == "__init__":
-        pytest.skip("names the modules, imports none before they are used")
-    assert path.stem in RANKS, f"give {path.name} a layer in {__file__}"
-    assert not list(violations(path.stem, path.read_text()))
+def graph():
+    """Which modules of clresample's each of them imports."""
+    return {
+        name: {
+            target
+            for target in imported(name, path.read_text(), path.stem == "__init__")
+            if target in MODULES and target not in ("clresample", name)
+        }
+        for name, path in MODULES.items()
+        if name != "clresample"  # names all public modules, imports none before they are used
+    }
+
+
+def find_circle(imports):
+    """Modules that import each other in a circle, or None."""
+    done = set()
+
+    def walk(name, way):
+        if name in way:
+            return [*way[way.index(name) :], name]
+        if name in done:
+            return None
+        circle = next(filter(None, (walk(n, [*way, name]) for n in imports.get(name, ()))), None)
+        done.add(name)
+        return circle
+
+    return next(filter(None, (walk(name, []) for name in imports)), None)
+
+
+def too_long(source):
+    """Classes and functions of a Python source that are over the limits, with their lengths."""
+    for node in ast.walk(ast.parse(source)):
+        n_lines = getattr(node, "end_lineno", 0) - getattr(node, "lineno", 0) + 1
+        if isinstance(node, ast.ClassDef) and n_lines > MAX_CLASS:
+            yield f"class {node.name}: {n_lines} lines"
+        if isinstance(node, ast.FunctionDef) and n_lines > MAX_FUNCTION:
+            yield f"{node.name}: {n_lines} lines"
+
+
+@pytest.mark.parametrize("name", sorted(set(MODULES) - {"clresample"}))
+def test_imports_only_reach_down(name):
+    path = MODULES[name]
+    assert not list(violations(name, path.read_text(), path.stem == "__init__"))
+
+
+def test_there_is_no_circle():
+    assert find_circle(graph()) is None
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_nothing_is_too_long(path):
+    source = path.read_text()
+    assert len(source.splitlines()) <= MAX_LINES
+    if path.suffix == ".py":
+        assert not list(too_long(source))
+
+
+def test_the_house_has_few_rooms_with_few_files():
+    rooms = [path for path in PACKAGE.iterdir() if path.is_dir() and path.name != "__pycache__"]
+    assert {path.name for path in rooms} - {"kernels"} == set(ROOMS)
+    assert len(rooms) <= MAX_FOLDERS
+    for folder in {path.parent for path in MODULES.values()} - {PACKAGE}:
+        assert len(list(folder.glob("*.py"))) <= MAX_FILES, folder
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_each_room_says_what_it_holds(room):
+    text = ast.get_docstring(ast.parse((PACKAGE / room / "__init__.py").read_text()))
+    assert text
+    assert "import" in text.lower()
 
 
 @pytest.mark.parametrize(
@@ -106,14 +150,30 @@ def test_imports_only_reach_down(path):
     [
         "import pyopencl.array",
         "from pyopencl import array",
-        "from .device import get_device",
-        "from . import device",
-        "def f():\n    from clresample.device import get_device",
-        "import clresample.linop",
+        "from ..device.device import get_device",
+        "from ..device import device",
+        "def f():\n    from clresample.device.device import get_device",
+        "import clresample.resampling.linop",
     ],
 )
 def test_an_upward_import_is_seen(line):
-    assert list(violations("psf", line))
+    assert list(violations("clresample.sky.psf", line))
+
+
+def test_the_solver_is_kept_from_the_fits_around_it():
+    assert list(violations("clresample.deblending.solver.engine", "from ..fit import Fit"))
+    assert not list(violations("clresample.deblending.solver.engine", "from .boxes import Boxes"))
+
+
+def test_a_circle_is_seen():
+    assert find_circle({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}})
+    assert find_circle({"a": {"b", "c"}, "b": {"c"}, "c": set()}) is None
+
+
+def test_length_is_seen():
+    body = "\n".join(["    x = 1"] * MAX_FUNCTION)
+    assert list(too_long(f"def f():\n{body}\n"))
+    assert not list(too_long(f"def f():\n{body[10:]}\n"))
 
 
 def test_import_alone_leaves_opencl_alone():

@@ -1,0 +1,54 @@
+"""The command `clresample`: one function per subcommand adds its parser and names what runs.
+
+A subcommand's function takes argparse's subparsers, adds its own, and calls
+`parser.set_defaults(run=...)`; `run(arguments)` raises ValueError, OSError or DeviceError for what
+the user can mend, which becomes one line on standard error and exit status 2.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from .. import __version__
+from ..device.discovery import DeviceError
+from .deblend import add_deblend
+from .devices import add_devices
+from .resample import add_resample
+
+
+class Parser(argparse.ArgumentParser):
+    """Complains in one line, without the usage that `--help` gives."""
+
+    def error(self, message):
+        self.exit(2, f"{self.prog}: {message}\n")
+
+
+def main(argv=None):
+    """Run `clresample` with these arguments (None: sys.argv's); returns the exit status."""
+    parser = Parser(
+        prog="clresample", description="Images between telescopes, on any OpenCL device."
+    )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for add_command in COMMANDS:
+        add_command(commands)
+    arguments = parser.parse_args(argv)
+    try:
+        arguments.run(arguments)
+    except DeviceError as error:  # may hold a compiler's log: kept as it is
+        return _fail(arguments, str(error))
+    except (ValueError, OSError) as error:
+        return _fail(arguments, " ".join(str(error).split()))
+    except KeyboardInterrupt:
+        _fail(arguments, "interrupted")
+        return 130  # what a shell reports after Ctrl-C
+    return 0
+
+
+def _fail(arguments, message):
+    print(f"clresample {arguments.command}: {message}", file=sys.stderr)
+    return 2
+
+
+COMMANDS = (add_resample, add_deblend, add_devices)

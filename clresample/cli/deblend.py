@@ -1,0 +1,251 @@
+"""Several instruments' images of one patch of sky to a catalogue: `clresample deblend`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from . import options as cli_options
+
+# iterations of the fit whose residuals are searched for more sources: structure is there by then
+FIRST_LOOK = 30
+
+DESCRIPTION = """\
+Fit one scene of sources to the images of all instruments at once, each with its
+own pixels, orientation and PSF. SCENE.toml names images, PSFs, weights and zero
+points, and a catalogue of positions or how to detect sources."""
+
+EPILOG = """\
+in DIR   catalogue.fits, catalogue.ecsv  fluxes with errors, positions, shapes, flags
+         result.fits                     models, residuals, spectra, covariances
+         deblended.png                   observed, model, residual of each instrument
+
+example  clresample deblend --example trial
+         clresample deblend trial/scene.toml -o trial/out
+
+The first writes simulated Euclid and Rubin images with a commented scene file that
+shows every key. Options given here go before those of the scene file."""
+
+OUTPUTS = "catalogue.fits", "catalogue.ecsv", "result.fits", "deblended.png"
+
+
+def add_deblend(commands):
+    """Add `clresample deblend`."""
+    parser = commands.add_parser(
+        "deblend",
+        help="fit blended sources to several instruments' images",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("scene", metavar="SCENE.toml", nargs="?", help="what to fit")
+    files = parser.add_argument_group("files")
+    files.add_argument("-o", "--output", metavar="DIR", help="folder to write into")
+    files.add_argument("--overwrite", action="store_true", help="replace files that exist")
+    files.add_argument("--no-figure", action="store_true", help="write no deblended.png")
+    files.add_argument(
+        "--example", metavar="DIR", help="write a scene file with simulated images instead"
+    )
+    fit = parser.add_argument_group("fit")
+    fit.add_argument(
+        "--fit-shifts",
+        action="store_true",
+        help="let every observation but the first move by a constant shift",
+    )
+    fit.add_argument("--fit-sky", action="store_true", help="fit a constant in each channel")
+    fit.add_argument("--max-iter", metavar="N", type=_whole, help="most iterations")
+    fit.add_argument(
+        "--tol",
+        metavar="T",
+        type=_part,
+        help="stop when the loss falls by less than this part of itself",
+    )
+    fit.add_argument(
+        "--dtype",
+        choices=("float32", "float64"),
+        default="float32",
+        help="arithmetic of the fit (default %(default)s)",
+    )
+    cli_options.add_device_option(fit)
+    fit.add_argument("--quiet", action="store_true", help="no progress bar, no notes")
+    parser.set_defaults(run=run)
+
+
+def run(arguments):
+    """Read, detect, fit, write. Raises ValueError or OSError, one line, for what cannot be used."""
+    if arguments.example is not None:
+        return _run_example(arguments)
+    if arguments.scene is None or arguments.output is None:
+        missing = "SCENE.toml" if arguments.scene is None else "-o DIR"
+        raise ValueError(f"{missing} is missing: deblend SCENE.toml -o DIR, or --example DIR")
+    from ..device.device import get_device
+    from ..files.results import write_catalogue, write_result
+    from ..files.scene import read_scene
+    from ..measurement.catalogue import catalogue
+    from ..measurement.quality import summary
+
+    started = time.perf_counter()
+    paths = _outputs(arguments)
+    scene = read_scene(arguments.scene)
+    device = get_device(arguments.device)
+    given = {
+        key: value for key in ("max_iter", "tol") if (value := getattr(arguments, key)) is not None
+    }
+    given |= {key: True for key in ("fit_shifts", "fit_sky") if getattr(arguments, key)}
+    settings = replace(scene.settings, **given)
+    if not arguments.quiet:
+        for note in scene.notes:
+            _note(note)
+    result = _fit(arguments, scene, settings, device)
+    table = catalogue(result, magnitudes=result.observations[0].zero_points is not None)
+
+    paths[0].parent.mkdir(parents=True, exist_ok=True)
+    more = {"overwrite": arguments.overwrite}
+    for path in paths[:2]:
+        write_catalogue(path, table, **more)
+    write_result(paths[2], result, device=device.name, inputs=scene.inputs, **more)
+    if not arguments.no_figure:
+        from ..files.plot_deblended import plot_deblended
+
+        plot_deblended(paths[3], result, title=", ".join(o.name for o in result.observations))
+    _report(arguments, result, summary(result), device, time.perf_counter() - started)
+    for path in paths:
+        print(path)
+    if result.status == "interrupted":
+        raise KeyboardInterrupt  # the best state so far is written; the shell is told all the same
+
+
+def _outputs(arguments):
+    """Paths of all files to write, none of which is in the way."""
+    from ..files.whole_file import FileError, check_output
+
+    folder = Path(arguments.output)
+    if folder.exists() and not folder.is_dir():
+        raise FileError(f"{folder}: is a file, not a folder to write into")
+    paths = [folder / name for name in OUTPUTS[: 3 if arguments.no_figure else 4]]
+    if folder.is_dir():
+        for path in paths:
+            check_output(path, overwrite=arguments.overwrite)
+    if not arguments.no_figure:
+        from ..files.panels import import_figure
+
+        try:
+            import_figure()
+        except ImportError as error:
+            raise ValueError(f"{error}; or give --no-figure") from error
+    return paths
+
+
+def _fit(arguments, scene, settings, device):
+    """The fit; before it, where sources or shifts are to be found, a short one to find them in."""
+    given = {"frame": scene.frame, "device": device, "dtype": np.dtype(arguments.dtype)}
+    sources, looking = scene.sources, scene.sources is None
+    if looking:
+        sources = _detect(arguments, scene, device)
+    if settings.max_iter and (settings.fit_shifts or (looking and scene.passes > 1)):
+        first = replace(settings, max_iter=min(FIRST_LOOK, settings.max_iter))
+        result = _deblend(arguments, "first look", scene.observations, sources, first, given)
+        if result.status == "interrupted":
+            return result
+        given["shifts"] = result.shifts
+        if looking and scene.passes > 1:
+            from ..measurement.detection import detect_more
+
+            sources += detect_more(result, threshold=scene.threshold, device=device).sources
+    return _deblend(arguments, "fit", scene.observations, sources, settings, given)
+
+
+def _detect(arguments, scene, device):
+    from ..measurement.detection import detect
+
+    try:
+        found = detect(scene.observations, scene.frame, threshold=scene.threshold, device=device)
+    except ImportError as error:
+        raise ValueError(f"{arguments.scene}: {error}; or give a catalogue in [sources]") from error
+    if not found.sources:
+        raise ValueError(
+            f"{arguments.scene}: no source above {scene.threshold:g} sigma; lower threshold in "
+            "[detection], or give a catalogue in [sources]"
+        )
+    return found.sources
+
+
+def _deblend(arguments, what, observations, sources, settings, given):
+    from tqdm import tqdm
+
+    from ..deblending.batch import deblend
+
+    # disable=None: no bar where standard error is no terminal
+    with tqdm(
+        total=settings.max_iter,
+        desc=what,
+        unit="it",
+        leave=False,
+        disable=True if arguments.quiet else None,
+    ) as bar:
+
+        def progress(n_steps, losses):
+            bar.update(n_steps - bar.n)
+            bar.set_postfix(loss=f"{float(losses[0]):.4g}", refresh=False)
+
+        return deblend(observations, sources, settings=settings, progress=progress, **given)
+
+
+def _report(arguments, result, found, device, took):
+    lost = found["n_sources"] - found["n_fitted"]
+    print(
+        f"{found['n_fitted']} sources in {len(result.channels)} channels"
+        + (f", {lost} outside the frame" if lost else "")
+        + f": {found['status']} after {found['n_iterations']} iterations, {took:.1f} s on "
+        f"{device.name}"
+    )
+    for label, o in zip(found["shifts"], result.observations, strict=True):
+        values = "  ".join(f"{c} {found['chi2'][c]:.3f}" for c in o.channels)
+        shift = ""
+        if any(found["shifts"][label]):
+            y, x = found["shifts"][label]
+            shift = f"; shifted by ({y:+.3f}, {x:+.3f}) model pixels (y, x)"
+        print(f"chi2 per pixel, {label}: {values}{shift}")
+    if not arguments.quiet:
+        for message in found["messages"]:
+            _note(message)
+
+
+def _run_example(arguments):
+    if arguments.scene is not None or arguments.output is not None:
+        raise ValueError("--example DIR takes neither SCENE.toml nor -o")
+    from .example import write_example
+
+    try:
+        paths = write_example(arguments.example, overwrite=arguments.overwrite)
+    except ImportError as error:
+        raise ValueError(f"--example: {error}") from error
+    for path in paths:
+        print(path)
+    print(f"next: clresample deblend {paths[0]} -o {Path(arguments.example) / 'out'}")
+
+
+def _note(message):
+    print(f"clresample deblend: note: {message}", file=sys.stderr)
+
+
+def _whole(text):
+    number = int(text) if text.isdecimal() else -1
+    if number < 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number from 0")
+    return number
+
+
+def _part(text):
+    try:
+        number = float(text)
+    except ValueError:
+        number = -1
+    if not 0 <= number < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number from 0 to 1")
+    return number

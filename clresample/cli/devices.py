@@ -1,0 +1,49 @@
+"""The table of OpenCL devices: `clresample devices`."""
+
+from __future__ import annotations
+
+from ..device.device import get_device
+from ..device.discovery import format_size, list_devices
+from .options import add_device_option
+
+COLUMNS = ("platform", "device", "kind", "OpenCL", "units", "memory", "largest buffer", "fp64")
+
+
+def add_devices(commands):
+    """Add `clresample devices`."""
+    parser = commands.add_parser(
+        "devices",
+        help="list the OpenCL devices",
+        description="List the OpenCL devices; * marks the one that would be used. "
+        "fp64 is found by building a kernel in double precision.",
+    )
+    add_device_option(parser)
+    parser.set_defaults(run=_run_devices)
+
+
+def _run_devices(arguments):
+    print(format_table(list_devices(arguments.device)))
+    get_device(arguments.device)  # a choice that fits none is told after the table
+
+
+def format_table(devices):
+    """The DeviceInfo rows as aligned text."""
+    rows = [("", "#", *COLUMNS)]
+    for info in devices:
+        rows.append(
+            (
+                "*" if info.chosen else "",
+                str(info.index),
+                info.platform,
+                info.name,
+                info.kind,
+                info.version.removeprefix("OpenCL "),
+                str(info.compute_units),
+                format_size(info.memory),
+                format_size(info.max_alloc),
+                {True: "yes", False: "no", None: "?"}[info.fp64],
+            )
+        )
+    widths = [max(map(len, column)) for column in zip(*rows)]
+    lines = ("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
+    return "\n".join(lines)

@@ -1,0 +1,101 @@
+"""Morphologies to start from, read off the images: as the paper's deblender does it, from all
+instruments.
+
+For each source the sharpest instrument that sees it above 5 sigma: its channels combined by their
+signal-to-noise, brought to the model frame by Whittaker-Shannon interpolation, cut to what is
+symmetric about the source, made monotone, and zeroed where it drowns in the noise.  A source that
+none sees so well takes what all instruments together show.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..device.device import get_device
+from ..resampling.resampler import Resampler
+from ..sky.frame import model_frame
+from ..sky.sources import Extended
+from .blend import Blend
+from .solver.boxes import Boxes
+from .solver.constraints import Chain, MaxNorm, Monotone, Positivity
+
+# [sigma] of the brightest pixel, for an instrument to see a source, and for a pixel to count as
+# light
+SEEN, LIGHT = 5.0, 1.0
+# [model px] half side of a morphology: boxes are cut to the light afterwards
+RADIUS_PX = 30
+
+
+def with_image_profiles(blend: Blend, *, device=None) -> Blend:
+    """The blend with a `profile` for each extended source of one component that has none.
+
+    Raises ValueError where `model_frame` does.
+    """
+    device = get_device(device)
+    frame = blend.frame or model_frame(blend.observations)
+    positions = frame.place(blend.sources)
+    inside = frame.inside(positions)
+    views = [_in_frame(o, frame, device) for o in blend.observations]
+    order = np.argsort([_sharpness(o) for o in blend.observations], kind="stable")
+    sources = list(blend.sources)
+    for i in np.flatnonzero(inside):
+        source = sources[i]
+        if isinstance(source, Extended) and source.n_components == 1 and source.profile is None:
+            profile = _profile(frame.shape, positions[i], [views[k] for k in order], device)
+            sources[i] = replace(source, profile=profile)
+    return replace(blend, sources=tuple(sources), frame=frame)
+
+
+def _sharpness(observation):
+    """Width [arcsec] of an observation's sharpest PSF, from its effective number of pixels."""
+    n_pixels = 1 / (observation.psf.images**2).sum(axis=(1, 2)).max()
+    scale_arcsec = observation.psf.spacing * np.mean(observation.grid.pixel_scale_arcsec)
+    return np.sqrt(n_pixels) * scale_arcsec
+
+
+def _in_frame(observation, frame, device):
+    """Signal-to-noise images (C, Ny, Nx) of an observation on the model's pixels, 0 if unseen."""
+    root = np.sqrt(observation.weights)
+    op = Resampler(observation.grid, observation.psf, frame.grid, observation.psf, device=device)
+    return op.forward(observation.data * root)
+
+
+def _profile(shape, position, views, device):
+    """One source's profile (Ny, Nx), max = 1, from signal-to-noise images, sharpest first."""
+    center = np.clip(np.floor(position + 0.5).astype(int), 0, np.array(shape) - 1)
+    low = np.maximum(center - RADIUS_PX, 0)
+    high = np.minimum(center + RADIUS_PX + 1, shape)
+    part = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    combined = [_combine(view[(slice(None), *part)], center - low) for view in views]
+    seen = [image for image in combined if image[tuple(center - low)] > SEEN]
+    image = seen[0] if seen else _combine(np.array(combined), center - low)
+    image = np.minimum(image, _mirror(image, center - low))
+    image[image < LIGHT] = 0
+    image[tuple(center - low)] = max(image[tuple(center - low)], LIGHT)
+
+    boxes = Boxes(np.zeros(1, int), low[None], np.array([image.shape]), (center - low)[None])
+    morph = device.put(boxes.pack([image]))
+    Chain(Positivity(), Monotone(), MaxNorm()).prox(morph, boxes.put(device))
+    out = np.zeros(shape)
+    out[part] = boxes.unpack(device.get(morph))[0]
+    return out
+
+
+def _combine(images, center):
+    """Images in units of their noise (C, ny, nx), summed to the best signal at the centre."""
+    signal = np.maximum(images[(slice(None), *center)], 0)
+    if not signal.any():
+        signal = np.ones(len(images))
+    return np.tensordot(signal, images, 1) / np.linalg.norm(signal)
+
+
+def _mirror(image, center):
+    """The image turned by 180 degrees about a pixel; its own value where the mirror is outside."""
+    out = image.copy()
+    y, x = np.indices(image.shape)
+    y, x = 2 * center[0] - y, 2 * center[1] - x
+    there = (y >= 0) & (y < image.shape[0]) & (x >= 0) & (x < image.shape[1])
+    out[there] = image[y[there], x[there]]
+    return out

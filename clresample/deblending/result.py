@@ -1,0 +1,109 @@
+"""What a fit leaves behind for one blend: plain arrays, from which everything else is measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..sky.frame import Frame
+from ..sky.observation import Observation
+from ..sky.sources import Source
+
+
+@dataclass(frozen=True, eq=False)
+class Component:
+    """One spectrum times one morphology.
+
+    source: index of the source it belongs to
+    origin (2,) [px]: (y, x) of the box's first pixel in the model frame; the box lies inside it
+    morphology (ny, nx) [1]: max = 1, under the model's PSF
+    spectrum (C,) [counts]: flux per model pixel where the morphology is 1, over all channels of all
+        observations in their order, each in its own observation's counts
+    covariance of all spectra: see Result.covariance
+    """
+
+    source: int
+    origin: tuple[int, int]
+    morphology: np.ndarray
+    spectrum: np.ndarray
+
+    @property
+    def flux(self) -> np.ndarray:
+        """Total flux (C,) [counts] in the box."""
+        return self.spectrum * self.morphology.sum()
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """The fitted model of one blend.
+
+    observations, frame, sources: what was fitted; components (n): in the order of the sources
+    rendered: per observation (n, Co, My, Mx) [1], each component's morphology on its pixels under
+        its PSF: spectrum times this is the model of the data
+    sky (C,) [counts]: constant background per channel, 0 where it was not fitted
+    covariance (C, n, n) [counts^2]: of the spectra of one channel over all components, inverse of
+        the normal matrix with morphologies fixed (and sky free where it was); infinite variance for
+        components without coverage
+    shifts (n_observations, 2) [model px]: fitted offsets of the observations' pixels
+    losses (n_iterations + 1,): half chi2 (plus priors) before each iteration and at the end
+    status: "converged", "iteration limit", "diverged", "interrupted" or "failed: ..."
+    messages: what the user should know, a line each; seconds: wall time by stage
+    """
+
+    observations: tuple[Observation, ...]
+    frame: Frame
+    sources: tuple[Source, ...]
+    components: tuple[Component, ...]
+    rendered: tuple[np.ndarray, ...]
+    sky: np.ndarray
+    covariance: np.ndarray
+    shifts: np.ndarray
+    losses: np.ndarray
+    status: str
+    messages: tuple[str, ...] = ()
+    seconds: dict = field(default_factory=dict)
+
+    @property
+    def converged(self) -> bool:
+        return self.status == "converged"
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names (C,) of all channels, in the order of the spectra."""
+        return tuple(name for o in self.observations for name in o.channels)
+
+    def channel_slices(self) -> list[slice]:
+        """For each observation, its part of a spectrum."""
+        ends = np.cumsum([len(o.channels) for o in self.observations])
+        return [
+            slice(end - len(o.channels), end)
+            for o, end in zip(self.observations, ends, strict=True)
+        ]
+
+    def source_model(self, i_source, i_observation=None) -> np.ndarray:
+        """One source (C, Ny, Nx) in the model frame, or (Co, My, Mx) as an observation sees it."""
+        parts = [(i, c) for i, c in enumerate(self.components) if c.source == i_source]
+        if i_observation is None:
+            model = np.zeros((len(self.channels), *self.frame.shape))
+            for _, c in parts:
+                (y, x), (ny, nx) = c.origin, c.morphology.shape
+                model[:, y : y + ny, x : x + nx] += c.spectrum[:, None, None] * c.morphology
+            return model
+        channels = self.channel_slices()[i_observation]
+        unit = self.rendered[i_observation]
+        zero = np.zeros(self.observations[i_observation].data.shape)
+        return sum((c.spectrum[channels, None, None] * unit[i] for i, c in parts), zero)
+
+    def model(self, i_observation) -> np.ndarray:
+        """All sources and the sky (Co, My, Mx) [counts] as an observation sees them."""
+        channels = self.channel_slices()[i_observation]
+        n_channels = channels.stop - channels.start
+        spectra = np.array([c.spectrum[channels] for c in self.components]).reshape(-1, n_channels)
+        image = np.einsum("nc,ncyx->cyx", spectra, self.rendered[i_observation])
+        return image + self.sky[channels, None, None]
+
+    def residual(self, i_observation) -> np.ndarray:
+        """Data minus model (Co, My, Mx) [counts]; NaN where the data have no weight."""
+        o = self.observations[i_observation]
+        return np.where(o.weights > 0, o.data - self.model(i_observation), np.nan)

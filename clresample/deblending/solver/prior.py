@@ -1,0 +1,32 @@
+"""The prior of morphologies: structure about a smooth profile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is expected of a morphology: S = base + alpha sqrt(base) K z, z unit normal.
+
+    The structure of galaxies is made of clumps, whose number, and so the variance, follows light.
+
+    alpha: scatter of the brightest pixel about its expected profile, relative
+    correlation_px [model px]: Gaussian sigma of the kernel K that correlates neighbours
+    """
+
+    alpha: float = 0.1
+    correlation_px: float = 2.0
+
+    def amplitude(self, base) -> np.ndarray:
+        """Scatter of a profile's pixels: alpha sqrt(base); 0 where a star's rings are negative."""
+        return self.alpha * np.sqrt(np.maximum(base, 0))
+
+    @property
+    def taps(self) -> np.ndarray:
+        """K along one axis (2 radius + 1), cut at 3 sigma, so that K z has unit variance."""
+        radius = int(np.ceil(3 * self.correlation_px))
+        k = np.exp(-0.5 * (np.arange(-radius, radius + 1) / self.correlation_px) ** 2)
+        return k / np.linalg.norm(k)

@@ -1,0 +1,78 @@
+"""Every number that depends on the device: tiles, group sizes, memory of one launch.
+
+Measured on CPUs through PoCL; the values for other devices follow from their documents and are the
+first to measure on a GPU. Kernels get theirs as macros, so none is written twice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """Sizes for one device and floating type; `Tuning.of` chooses them.
+
+    tile: macros of contract.cl: VW columns a vector, NV vectors and MR rows a work-item owns,
+        WGX x WGY work-items a group. Larger tiles load less for each product, until they spill
+    row_loops: one work-item takes a whole row of pixels, as a CPU's vector unit wants it; else one
+        takes a pixel
+    sum_group: work-items that share one sum over a box or one sweep: 1 needs no barrier
+    line_group: work-items of a group along an image row where a kernel has no loop of its own.
+        Left to choose, CPU runtimes take another number for every image size and build the kernel
+        anew for each, 0.1 to 0.3 s
+    group_bytes: intermediate matrices of one launch of the operator
+    slab_bytes: shifted model of one slab of the paper's scheme
+    n_scenes: scenes fitted side by side
+    """
+
+    tile: dict[str, int]
+    row_loops: bool
+    sum_group: int
+    line_group: int
+    group_bytes: int
+    slab_bytes: int
+    n_scenes: int
+
+    @classmethod
+    def of(cls, device, dtype=np.float32) -> Tuning:
+        """The sizes for a Device and float32 or float64."""
+        if device.kind == "CPU":
+            return cls(
+                tile=_cpu_tile(device, np.dtype(dtype)),
+                row_loops=True,
+                sum_group=1,
+                line_group=32,
+                group_bytes=4 << 20,  # in the cache, where they are read back at speed
+                slab_bytes=2 << 20,  # what one core has in its cache
+                n_scenes=32,  # more leave the cache, fewer do not hide the launches
+            )
+        return cls(
+            # a 16-byte load, and a square of 64 work-items that every GPU allows
+            tile={"VW": 4 if np.dtype(dtype) == np.float32 else 2, "NV": 1, "MR": 8}
+            | {"WGX": 8, "WGY": 8},
+            row_loops=False,
+            sum_group=64,
+            line_group=32,  # one warp
+            group_bytes=1 << 30,  # the whole batch in flight
+            slab_bytes=256 << 20,
+            n_scenes=1024,
+        )
+
+    def local_size(self, n_axes):
+        """Group of a kernel with one work-item a row, pixel or item; None: the driver chooses.
+
+        Groups of one on CPUs: left to choose, their runtimes take another size for every box and
+        build each kernel anew for it, 0.6 s in all; a GPU's drivers build once.
+        """
+        return (1,) * n_axes if self.row_loops else None
+
+
+def _cpu_tile(device, dtype) -> dict[str, int]:
+    """Eight rows of two vectors use the 32 registers of AVX-512 and load little for each product;
+    elsewhere, and in PoCL's code for AMD hosts of any kind, 16 registers hold six rows of one."""
+    wide = device.cl.native_vector_width_float >= 16 and "AMD" not in device.name
+    rows = {"NV": 2, "MR": 8} if wide else {"NV": 1, "MR": 6}
+    return {"VW": 16 if dtype == np.float32 else 8, **rows, "WGX": 1, "WGY": 1}

@@ -1,0 +1,88 @@
+"""Pictures of images side by side on one sky: asinh-stretched panels, residuals, a scale bar."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from .panels import RESIDUAL_SIGMAS, Panel, noise_level, save_panels, stretch_limits
+
+
+class Comparison(NamedTuple):
+    """How a rendered image agrees with an observed one: observed = scale * rendered + level.
+
+    correlation: Pearson's, over `mask` (My, Mx): pixels one PSF width inside the coverage
+    residual (My, Mx): observed - scale * rendered - level, NaN outside the coverage
+    """
+
+    correlation: float
+    scale: float
+    level: float
+    residual: np.ndarray
+    mask: np.ndarray
+
+
+def compare(rendered, observed, covered, width_px):
+    """Fit one flux scale and one sky level, the units of two instruments being what they are.
+
+    rendered, observed (My, Mx); covered (My, Mx) bool
+    width_px [px]: what lies nearer to the edge of the coverage lacks light from outside
+    Returns None where fewer than three pixels compare, or one image is constant.
+    """
+    inside = distance_transform_edt(np.pad(covered, 1))[1:-1, 1:-1] > width_px
+    mask = inside & np.isfinite(observed)
+    x, y = (image[mask].astype(np.float64) for image in (rendered, observed))
+    if x.size < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:
+        return None
+    scale, level = np.polyfit(x, y, 1)
+    residual = np.where(covered, observed - scale * rendered - level, np.nan)
+    return Comparison(float(np.corrcoef(x, y)[0, 1]), scale, level, residual, mask)
+
+
+def fwhm_px(psf):
+    """Width [px] of the first band's core: diameter of the disc above half its maximum."""
+    image = psf.images[0]
+    return 2 * np.sqrt(np.count_nonzero(image > image.max() / 2) / np.pi) * psf.spacing
+
+
+def plot_resampled(path, image, reference, result, covered, psf_out, *, names, title=""):
+    """Draw the first band of an image, of its resampling and, if the bands match, of the reference.
+
+    image, reference: as `read_image` returns them; result (C, My, Mx), covered (My, Mx)
+    names (2,): what the image and the reference are called; title: above the row
+    Returns the Comparison, or None.
+    """
+    rows, columns = (np.flatnonzero(covered.any(axis=axis)) for axis in (1, 0))
+    box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    grid = reference.grid.cutout(rows[0], columns[0], covered[box].shape)
+    rendered = np.where(covered, result[0], np.nan)
+    scales = image.grid.pixel_scale_arcsec, grid.pixel_scale_arcsec
+    seen = f"{names[0]} as {names[1]} sees it"
+    panels = [
+        Panel(image.data[0], image.grid, names[0], f"{scales[0]:.3g}″ pixels"),
+        Panel(rendered[box], grid, seen, f"{scales[1]:.3g}″ pixels"),
+    ]
+    comparison = None
+    if len(reference.data) == len(result):
+        comparison = compare(result[0], reference.data[0], covered, fwhm_px(psf_out))
+    if comparison:
+        limits = stretch_limits(reference.data[0][box])
+        same = tuple(
+            np.subtract(limits, (comparison.level, 0, comparison.level)) / comparison.scale
+        )
+        panels[1] = Panel(rendered[box], grid, seen, panels[1].note, limits=same)
+        sigma = noise_level(comparison.residual[comparison.mask])[1]
+        panels += [
+            Panel(reference.data[0][box], grid, names[1], "as observed", limits=limits),
+            Panel(
+                comparison.residual[box],
+                grid,
+                "difference",
+                f"correlation {comparison.correlation:.4f}; colours: ±{RESIDUAL_SIGMAS} sigma",
+                residual=RESIDUAL_SIGMAS * sigma,
+            ),
+        ]
+    save_panels(path, panels, like=grid, title=title)
+    return comparison

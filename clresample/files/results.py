@@ -1,0 +1,270 @@
+"""Fitted blends to FITS files and back, bit by bit; catalogues to ECSV."""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+from astropy.table import QTable, Table
+from astropy.wcs import WCSHDO_EFMT, WCSHDO_P17, WCSHDO_all
+from astropy.wcs.wcs import WCSHDO_SIP
+
+from ..deblending.result import Component, Result
+from ..measurement.catalogue import MEANINGS, catalogue
+from ..sky.frame import Frame
+from ..sky.grid import Grid
+from ..sky.observation import Observation
+from ..sky.psf import PSF
+from ..sky.psf_checks import PSFWarning
+from ..sky.sources import Extended, Point, Source
+from .fits import add_provenance, celestial_header, open_fits, to_ascii
+from .whole_file import FileError, check_output, replace_file
+
+FORMAT = 1  # of the files; raised when an older reader would misread them
+KINDS = {kind.__name__: kind for kind in (Source, Point, Extended)}
+KEPT = ("name", "channels", "zero_points", "n_bad", "messages")  # of an observation, as JSON
+BOX = ("source", "y", "x", "n_y", "n_x")
+# every WCS card with the 17 digits that give back the same float64
+RELAX = WCSHDO_all | WCSHDO_SIP | WCSHDO_P17 | WCSHDO_EFMT
+
+
+def write_result(path, result, *, overwrite=False, device=None, inputs=None):
+    """Write a fitted blend to FITS, whole or not at all.
+
+    HDUs that are read back: ABOUT (keys and JSON: sources, names, status, messages, ...),
+    COMPONENTS (boxes), SPECTRA (n, C), MORPHOLOGIES (one after the other), SKY, COVARIANCE, SHIFTS,
+    LOSSES, MODELPSF, and per observation, numbered from 1: DATA, WEIGHTS, PSF, RENDERED. For the
+    reader of the file: CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all sources in the model frame, and
+    per observation MODEL and RESIDUAL. All images have their WCS; a flat sky is put at
+    RA = Dec = 0.
+
+    overwrite: replace a file that exists
+    device: name of the OpenCL device; inputs: {what: file}; both for the header
+
+    Raises FileError when the file exists or cannot be written.
+    """
+    path = Path(path)
+    check_output(path, overwrite=overwrite)
+    primary = fits.PrimaryHDU()
+    primary.header["CLSTATUS"] = (to_ascii(" ".join(result.status.split())), "how the fit ended")
+    dtype = result.rendered[0].dtype
+    add_provenance(primary.header, dtype, device, inputs or {}, None)
+    boxes = [(c.source, *c.origin, *c.morphology.shape) for c in result.components]
+    flat = [np.ravel(c.morphology) for c in result.components]
+    spectra = [c.spectrum for c in result.components]
+    hdus = [
+        primary,
+        _table(catalogue(result), "CATALOGUE"),
+        _flag_table(),
+        _about_table(_about(result)),
+        fits.BinTableHDU(Table(np.array(boxes, int).reshape(-1, 5), names=BOX), name="COMPONENTS"),
+        _image("SPECTRA", np.array(spectra) if spectra else np.zeros((0, len(result.channels)))),
+        _image("MORPHOLOGIES", np.concatenate(flat) if flat else np.zeros(0)),
+    ]
+    for name in ("sky", "covariance", "shifts", "losses"):
+        hdus.append(_image(name.upper(), getattr(result, name)))
+    hdus.append(_image("MODELPSF", result.frame.psf.images))
+    shape = (len(result.channels), *result.frame.shape)
+    scene = sum((result.source_model(i) for i in range(len(result.sources))), np.zeros(shape))
+    cards, tables = _placed(result.frame.grid, 0)
+    hdus += [_image("SCENE", scene, cards), *tables]
+    for i, o in enumerate(result.observations):
+        cards, tables = _placed(o.grid, i + 1)
+        for k, channel in enumerate(o.channels):
+            cards[f"BAND{k + 1}"] = (to_ascii(channel), f"plane {k + 1}")
+        hdus += [_image("DATA", o.data, cards, i), _image("WEIGHTS", o.weights, cards, i), *tables]
+        if result.components:
+            hdus.append(_image("MODEL", result.model(i), cards, i))
+            hdus.append(_image("RESIDUAL", result.residual(i), cards, i))
+        hdus.append(_image("RENDERED", result.rendered[i], None, i))
+        hdus.append(_image("PSF", o.psf.images, None, i))
+    replace_file(path, fits.HDUList(hdus))
+
+
+def read_result(path) -> Result:
+    """The blend that `write_result` wrote, equal to the last bit.
+
+    Raises FileError for what is not there, not FITS, damaged, or not such a file.
+    """
+    with open_fits(path) as hdus:
+        if "ABOUT" not in hdus or "COMPONENTS" not in hdus:
+            raise FileError(f"{path}: holds no fitted blend (no HDU ABOUT with COMPONENTS)")
+        about = {row["key"]: json.loads(row["value"]) for row in hdus["ABOUT"].data}
+        if about["format"] > FORMAT:
+            raise FileError(f"{path}: has format {about['format']}, this version reads {FORMAT}")
+        numbers = range(len(about["observations"]))
+        frame = Frame(
+            _grid(path, hdus["SCENE"], about["frame"], hdus),
+            _psf(_array(hdus["MODELPSF"]), about["frame"]),
+        )
+        return Result(
+            observations=tuple(
+                _observation(path, hdus, i, about["observations"][i]) for i in numbers
+            ),
+            frame=frame,
+            sources=tuple(_source(path, **source) for source in about["sources"]),
+            components=_components(hdus),
+            rendered=tuple(_array(hdus["RENDERED", i + 1]) for i in numbers),
+            status=about["status"],
+            messages=tuple(about["messages"]),
+            seconds=about["seconds"],
+            **{key: _array(hdus[key.upper()]) for key in ("sky", "covariance", "shifts", "losses")},
+        )
+
+
+def write_catalogue(path, table, *, overwrite=False):
+    """Write a catalogue, whole or not at all: as ECSV or, by the file's name, as FITS.
+
+    table: of `measure.catalogue`; path: ends in .ecsv, .fits or .fits.gz
+
+    Raises FileError when the file exists or cannot be written, ValueError for other endings.
+    """
+    path = Path(path)
+    if not path.name.endswith((".ecsv", ".fits", ".fits.gz")):
+        raise ValueError(f"path is {path.name}, a catalogue ends in .ecsv, .fits or .fits.gz")
+    check_output(path, overwrite=overwrite)
+    if not path.name.endswith(".ecsv"):
+        hdus = [fits.PrimaryHDU(), _table(table, "CATALOGUE"), _flag_table()]
+        return replace_file(path, fits.HDUList(hdus))
+    part = path.with_name(f".part-{os.getpid()}-{path.name}")
+    try:
+        table.write(part, format="ascii.ecsv", overwrite=True)
+        os.replace(part, path)
+    except OSError as error:
+        raise FileError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _about(result):
+    return {
+        "format": FORMAT,
+        "status": result.status,
+        "messages": result.messages,
+        "seconds": result.seconds,
+        "sources": [
+            # without what fits start from (Extended.profile): the morphologies came of it
+            {"kind": type(s).__name__}
+            | {f.name: getattr(s, f.name) for f in fields(s) if f.compare}
+            for s in result.sources
+        ],
+        "frame": _placing(result.frame.grid, result.frame.psf),
+        "observations": [
+            {key: getattr(o, key) for key in KEPT} | _placing(o.grid, o.psf)
+            for o in result.observations
+        ],
+    }
+
+
+def _placing(grid, psf):
+    """What images and WCS do not say of a grid and a PSF."""
+    flat = {"jacobian": grid.jacobian, "origin": grid.origin} if grid.wcs is None else None
+    return {"flat": flat, "spacing": psf.spacing, "center": psf.center}
+
+
+def _about_table(about):
+    # JSON writes float64 with the digits that give it back, and anything else than ASCII escaped
+    values = [json.dumps(value, default=lambda array: array.tolist()) for value in about.values()]
+    return fits.BinTableHDU(Table([list(about), values], names=("key", "value")), name="ABOUT")
+
+
+def _flag_table():
+    rows = [(flag.name, flag.value, meaning) for flag, meaning in MEANINGS.items()]
+    return fits.BinTableHDU(Table(rows=rows, names=("flag", "value", "meaning")), name="FLAGS")
+
+
+def _table(table, name):
+    """FITS knows ASCII only."""
+    table = QTable(table, names=[to_ascii(column) for column in table.colnames])
+    table["name"] = [to_ascii(value) for value in table["name"]]
+    hdu = fits.table_to_hdu(table)
+    hdu.name = name
+    return hdu
+
+
+def _image(name, array, cards=None, i=0):
+    """An image HDU, number i + 1 of its name; what is empty is told in the header."""
+    array = np.asarray(array)
+    hdu = fits.ImageHDU(array if array.size else None, cards, name=name, ver=i + 1)
+    if not array.size:
+        hdu.header["EMPTY"] = (json.dumps([array.dtype.name, *array.shape]), "type and shape")
+    return hdu
+
+
+def _array(hdu):
+    if "EMPTY" in hdu.header:
+        dtype, *shape = json.loads(hdu.header["EMPTY"])
+        return np.zeros(shape, dtype)
+    return np.array(hdu.data, dtype=hdu.data.dtype.newbyteorder("="))
+
+
+def _placed(grid, number):
+    """WCS cards that give back the same float64, and HDUs of look-up tables numbered apart."""
+    placed = grid.to_wcs().to_fits(relax=RELAX)
+    for hdu in placed:
+        for k, card in enumerate(list(hdu.header.cards)):
+            value = card.value
+            if isinstance(value, float) and fits.Card.fromstring(str(card)).value != value:
+                del hdu.header[k]
+                hdu.header.insert(k, fits.Card.fromstring(f"{card.keyword:8}= {value:.17G}"))
+    cards = placed[0].header
+    for axis in (1, 2):
+        for key in (f"DP{axis}.EXTVER", f"D2IM{axis}.EXTVER"):
+            if key in cards:
+                cards[key] += 2 * number
+    for hdu in placed[1:]:
+        hdu.ver += 2 * number
+    return cards, placed[1:]
+
+
+def _grid(path, hdu, about, hdus):
+    shape, flat = hdu.shape[-2:], about["flat"]
+    if flat is not None:
+        return Grid(shape, None, np.array(flat["jacobian"], float), np.array(flat["origin"], float))
+    return Grid.from_wcs(celestial_header(path, hdu.header, hdus), shape)
+
+
+def _psf(images, about):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PSFWarning)  # told when it was made
+        psf = PSF(images, spacing=about["spacing"], center=about["center"])
+    images.flags.writeable = False
+    object.__setattr__(psf, "images", images)  # sums of 1 to rounding: not to be divided by again
+    return psf
+
+
+def _observation(path, hdus, i, about):
+    data = hdus["DATA", i + 1]
+    observation = Observation(
+        _array(data),
+        _psf(_array(hdus["PSF", i + 1]), about),
+        _grid(path, data, about, hdus),
+        weights=_array(hdus["WEIGHTS", i + 1]),
+        **{key: about[key] for key in ("channels", "zero_points", "name")},
+    )
+    # of the first making
+    object.__setattr__(observation, "n_bad", about["n_bad"])
+    object.__setattr__(observation, "messages", tuple(about["messages"]))
+    return observation
+
+
+def _source(path, *, kind, **given):
+    if kind not in KINDS:
+        raise FileError(f"{path}: a source is a {kind}, this version knows {', '.join(KINDS)}")
+    return KINDS[kind](**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})
+
+
+def _components(hdus):
+    spectra, flat = _array(hdus["SPECTRA"]), _array(hdus["MORPHOLOGIES"])
+    components, end = [], 0
+    for row, spectrum in zip(hdus["COMPONENTS"].data, spectra, strict=True):
+        source, y, x, n_y, n_x = (int(row[key]) for key in BOX)
+        start, end = end, end + n_y * n_x
+        morphology = flat[start:end].reshape(n_y, n_x).copy()
+        components.append(Component(source, (y, x), morphology, spectrum.copy()))
+    return tuple(components)

@@ -1,0 +1,159 @@
+"""The keys of a scene file, what each takes, and how a mistake in one is told."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from dataclasses import dataclass
+
+
+class SceneError(ValueError):
+    """A scene file that cannot be used: one line with the file, the table and the key."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a key takes: `fits` says whether a value is one, `text` says it to the user."""
+
+    text: str
+    fits: object
+
+
+def _number(value):
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _many(fits):
+    return lambda value: isinstance(value, list) and len(value) > 0 and all(map(fits, value))
+
+
+def _text(value):
+    return isinstance(value, str) and bool(value.strip())
+
+
+def _whole(value):
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _either(*kinds):
+    return lambda value: any(fits(value) for fits in kinds)
+
+
+def _above(value):
+    return _number(value) and value > 0
+
+
+TEXT = Rule("a text", _text)
+FILE = Rule("the name of a file", _text)
+HDU = Rule('a number from 0, "NAME" or "NAME,VERSION"', _either(_whole, _text))
+BANDS = Rule(
+    "numbers from 0 or names of the file's bands, one or a list",
+    _either(_whole, _text, _many(_either(_whole, _text))),
+)
+NUMBERS = Rule("a number, or a list with one for each channel", _either(_number, _many(_number)))
+PLANES = Rule(
+    "the name of a file, a number, or a list with one for each channel",
+    _either(_text, _above, _many(_above)),
+)
+SWITCH = Rule("true or false", lambda value: isinstance(value, bool))
+POSITIVE = Rule("a number above 0", _above)
+
+TABLES = {
+    "observation": {
+        "name": TEXT,
+        "image": FILE,
+        "hdu": HDU,
+        "bands": BANDS,
+        "channels": Rule("a list of names", _many(_text)),
+        "psf": FILE,
+        "psf_hdu": HDU,
+        "psf_bands": BANDS,
+        "psf_center": Rule(
+            '"middle", "core" or [y, x]',
+            lambda value: (
+                value in ("middle", "core") or (_many(_number)(value) and len(value) == 2)
+            ),
+        ),
+        "psf_spacing": POSITIVE,
+        "weight": PLANES,
+        "weight_hdu": HDU,
+        "variance": PLANES,
+        "variance_hdu": HDU,
+        "mask": FILE,
+        "mask_hdu": HDU,
+        "zero_point": NUMBERS,
+    },
+    "sources": {
+        "catalogue": FILE,
+        "format": TEXT,
+        **dict.fromkeys(("ra", "dec", "y", "x", "name", "type", "components"), TEXT),
+    },
+    "detection": {
+        "threshold": POSITIVE,
+        "passes": Rule("1, or 2 to look at the residuals too", lambda value: value in (1, 2)),
+    },
+    "frame": {
+        "like": TEXT,
+        "footprint": Rule(
+            '"union" or "intersection"', lambda value: value in ("union", "intersection")
+        ),
+        "psf_sigma_px": POSITIVE,
+    },
+    "fit": {
+        "max_iter": Rule("a whole number, 0 or more", _whole),
+        "tol": Rule("a number from 0 to 1", lambda value: _number(value) and 0 <= value < 1),
+        "monotone": SWITCH,
+        "structure_px": POSITIVE,
+        "fit_shifts": SWITCH,
+        "fit_sky": SWITCH,
+    },
+}
+NEEDED = {"observation": ("name", "image", "psf"), "sources": ("catalogue",)}
+
+
+def parse(path):
+    """The tables of a scene file, each key checked; [frame] and [fit] are there in any case.
+
+    Raises SceneError.
+    """
+    try:
+        with open(path, "rb") as file:
+            tables = tomllib.load(file)
+    except OSError as error:
+        raise SceneError(f"{path}: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path}: not TOML ({error})") from error
+    _allowed(path, tables, TABLES, "table")
+    if not _many(lambda value: isinstance(value, dict))(tables.get("observation")):
+        raise SceneError(f"{path}: observation is missing: one [[observation]] per instrument")
+    for name in TABLES:
+        for i, table in enumerate(
+            tables.get(name, [])
+            if name == "observation"
+            else [tables[name]]
+            if name in tables
+            else []
+        ):
+            where = f"{path}: {name} {i + 1}" if name == "observation" else f"{path}: {name}"
+            if not isinstance(table, dict):
+                raise SceneError(f"{where} is {table!r}, must be a table, [{name}]")
+            _allowed(where, table, TABLES[name], "key")
+            for key in NEEDED.get(name, ()):
+                if key not in table:
+                    raise SceneError(
+                        f"{where}: {key} is missing, it takes {TABLES[name][key].text}"
+                    )
+            for key, value in table.items():
+                if not TABLES[name][key].fits(value):
+                    raise SceneError(
+                        f"{where}: {key} is {value!r}, it takes {TABLES[name][key].text}"
+                    )
+    if "sources" in tables and "detection" in tables:
+        raise SceneError(f"{path}: sources and detection are both given: a scene takes one")
+    return {"frame": {}, "fit": {}} | tables
+
+
+def _allowed(where, given, known, what):
+    for key in given:
+        if key not in known:
+            raise SceneError(f"{where}: {what} {key} is unknown; allowed are {', '.join(known)}")

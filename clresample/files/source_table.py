@@ -1,0 +1,101 @@
+"""Lists of sources, in any format that astropy reads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from astropy.table import Table
+
+from ..sky.sources import Extended, Point
+
+KINDS = {"point": Point, "extended": Extended}
+# columns by what they hold, and the name that is taken without another in the scene file
+COLUMNS = ("ra", "dec", "y", "x", "name", "type", "components")
+
+
+def read_sources(path, columns=None) -> tuple:
+    """Sources of a table: `ra` and `dec`, or `y` and `x`, and what else it says of each.
+
+    path: a file that `astropy.table.Table.read` takes
+    columns: {what: column's name} for ra, dec [deg, or the column's own unit], y, x [model px,
+        counted from 0], name, type ("point" or "extended"), components (how many spectra an
+        extended source has); and format: astropy's name of it. Without, columns of these names
+
+    Sources without a type are extended, with one component.
+    Raises ValueError, one line that names file, column and row.
+    """
+    columns, path = columns or {}, Path(path)
+    table = _read(path, columns.get("format"))
+    found = {}
+    for what in COLUMNS:
+        name = columns.get(what, what)
+        if name in table.colnames:
+            found[what] = table[name]
+        elif what in columns:
+            raise ValueError(
+                f"{what} is {name!r}, {path} has the columns {', '.join(table.colnames)}"
+            )
+    if not len(table):
+        raise ValueError(f"{path}: holds no source")
+    asked = {what for what in columns if what in COLUMNS[:4]}
+    pairs = [
+        pair
+        for pair in (("ra", "dec"), ("y", "x"))
+        if all(one in found for one in pair) and (not asked or asked & set(pair))
+    ]
+    if not pairs:
+        raise ValueError(
+            f"{path}: has neither the columns ra and dec nor y and x, but "
+            f"{', '.join(table.colnames)}; name them with ra = ..., dec = ..."
+        )
+    sky = pairs[0] == ("ra", "dec")
+    unit = "deg" if sky else "pix"
+    values = [_numbers(path, what, found[what], unit) for what in pairs[0]]
+    position = "sky_deg" if sky else "position_px"
+    sources = []
+    for i, where in enumerate(zip(*values, strict=True)):
+        try:
+            sources.append(_source(found, i, {position: tuple(map(float, where))}))
+        except ValueError as error:
+            raise ValueError(f"{path}: row {i + 1}: {error}") from error
+    return tuple(sources)
+
+
+def _read(path, name):
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file")
+    try:
+        return Table.read(path, format=name)
+    except Exception as error:  # whatever a reader makes of a file that is not its own
+        reason = str(error).strip().split("\n")[0]
+        raise ValueError(
+            f"{path}: no table that astropy can read ({reason}); format = ... says which it is"
+        ) from error
+
+
+def _numbers(path, what, column, unit):
+    """float64, in a unit where the column has one; masked rows are NaN."""
+    try:
+        if column.unit is not None:
+            column = (
+                column.to(unit) if not hasattr(column, "mask") else column.filled(np.nan).to(unit)
+            )
+        values = getattr(column, "value", column)
+        return np.ma.filled(np.ma.asarray(values, dtype=float), np.nan)
+    except Exception as error:  # of units and numbers, by astropy and NumPy
+        raise ValueError(f"{path}: column {what} is no position in {unit} ({error})") from error
+
+
+def _source(found, i, given):
+    if "name" in found and found["name"][i] is not np.ma.masked:
+        given["name"] = str(found["name"][i])
+    kind = str(found["type"][i]).strip().lower() if "type" in found else "extended"
+    if kind not in KINDS:
+        raise ValueError(f"type is {kind!r}, it takes {' or '.join(KINDS)}")
+    if kind == "extended" and "components" in found:
+        n_components = float(found["components"][i])
+        if n_components != int(n_components):
+            raise ValueError(f"components is {n_components}, it takes a whole number")
+        given["n_components"] = int(n_components)
+    return KINDS[kind](**given)

@@ -1,0 +1,145 @@
+"""A fitted model turned into a catalogue: fluxes with errors, positions, shapes, chi2 and flags."""
+
+from __future__ import annotations
+
+from enum import IntFlag
+
+import numpy as np
+from astropy import units as u
+from astropy.table import QTable
+from astropy.wcs.utils import wcs_to_celestial_frame
+
+from ..sky.footprint import Footprint, open_edge
+from ..sky.observation import ZERO_POINT_UJY
+from .photometry import flux_scale, fluxes
+from .quality import box_chi2, fitted_sources, labels
+from .shapes import local_axes, moments, shape
+
+# of a morphology's peak: fainter light at the edge of what was seen makes no flux wrong by more
+# than a few percent, and noise in the wings of bright sources stays under it
+EDGE_LIGHT = 0.01
+
+
+class Flag(IntFlag):
+    """What is remarkable about a source: a catalogue's `flags` are sums of these (MEANINGS)."""
+
+    EDGE = 1
+    NOT_CONVERGED = 2
+    ZERO_FLUX = 4
+    NO_COVERAGE = 8
+    OUTSIDE = 16
+    MASKED = 32
+
+    @classmethod
+    def _missing_(cls, value):
+        return super()._missing_(int(value))  # tables hold NumPy's whole numbers, enum takes int
+
+
+MEANINGS = {
+    Flag.EDGE: "over 1 % of a morphology's peak at the frame's edge, or beside sky that none saw",
+    Flag.NOT_CONVERGED: "the blend's fit ended for another reason than convergence",
+    Flag.ZERO_FLUX: "the flux in a channel that determines it is at its limit, zero",
+    Flag.NO_COVERAGE: "a channel's image does not hold the centre, or determines no flux",
+    Flag.OUTSIDE: "outside the frame, thus not fitted: nothing is measured",
+    Flag.MASKED: "the centre is on a pixel without weight in a channel whose image holds it",
+}
+
+
+def catalogue(result, *, magnitudes=False) -> QTable:
+    """One row per source, in the order of `result.sources`, with units.
+
+    name; position as given: on the sky (`ra`, `dec` or what the frame's WCS calls them [deg];
+    `y_sky`, `x_sky` [arcsec] if flat) and `y`, `x` [model px]; flags: sums of `Flag`; snr: signal
+    to noise of all channels together,
+
+        snr = sqrt( sum_c flux_c^2 / variance_c ),     about sqrt(C) for no source at all
+
+    y_centroid, x_centroid and the same on the sky; size, e1, e2, angle: see `shapes.shape`, those
+    of the model under the model's PSF, not deconvolved, components weighted by their flux (of all
+    channels, each in units of its error); per channel flux_* and flux_err_* [uJy where observations
+    have zero points, else counts], errors from `fluxes`, and with `magnitudes` also mag_* and
+    mag_err_* (AB) of positive fluxes; per observation chi2_*: chi2 per pixel with weight on the
+    source's box, all its channels and all sources' models together. NaN is: not measured.
+    """
+    flux, covariance = fluxes(result)
+    error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).T)  # (S, C)
+    footprints = [Footprint.of(result, i) for i in range(len(result.observations))]
+    table = QTable()
+    table["name"] = [s.name or str(i) for i, s in enumerate(result.sources)]
+    positions = result.frame.place(result.sources)
+    _add_positions(table, result.frame.grid, positions, "")
+    table["flags"] = _flags(result, flux, error, positions, footprints)
+    table["flags"].info.description = ", ".join(f"{flag.value} {flag.name}" for flag in Flag)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        table["snr"] = np.sqrt(np.nansum((flux / error) ** 2, axis=1))
+    table["snr"][~fitted_sources(result)] = np.nan
+    _add_shapes(table, result, error)
+    scale, unit = flux_scale(result)
+    for i, channel in enumerate(result.channels):
+        table[f"flux_{channel}"] = flux[:, i] * scale[i] * unit[i]
+        table[f"flux_err_{channel}"] = error[:, i] * scale[i] * unit[i]
+        if magnitudes and unit[i] == u.uJy:
+            _add_magnitudes(table, channel, flux[:, i] * scale[i], error[:, i] * scale[i])
+    for i, label in enumerate(labels(result)):
+        table[f"chi2_{label}"] = box_chi2(result, i, footprints[i])
+    return table
+
+
+def _add_positions(table, grid, positions, suffix):
+    """Columns of (S, 2) [model px], also on the sky."""
+    sky = grid.sky(*positions.T)
+    names, unit = ("y_sky", "x_sky"), u.arcsec
+    if grid.wcs is not None:
+        names, unit = (grid.wcs.wcs.lngtyp.lower(), grid.wcs.wcs.lattyp.lower()), u.deg
+        table.meta["frame"] = wcs_to_celestial_frame(grid.wcs).name
+    for name, values in zip(names, sky, strict=True):
+        table[name + suffix] = values * unit
+    for name, values in zip("yx", positions.T, strict=True):
+        table[name + suffix] = values * u.pix
+
+
+def _add_shapes(table, result, error):
+    """Columns of centroids and second moments, (S, C) errors weighting a source's channels."""
+    n_sources = len(result.sources)
+    centroids, sizes = np.full((n_sources, 2), np.nan), np.full((n_sources, 4), np.nan)
+    for s in np.flatnonzero(fitted_sources(result)):
+        parts = [c for c in result.components if c.source == s]
+        good = np.isfinite(error[s]) & (error[s] > 0)
+        weight = np.where(good, 1 / np.where(good, error[s], 1.0), 0.0)
+        light = np.array([weight @ c.flux for c in parts])
+        centroids[s], second = moments(parts, light)
+        if np.isfinite(centroids[s]).all():
+            axes = local_axes(result.frame.grid, centroids[s])
+            sizes[s] = shape(axes @ second @ axes.T)
+    _add_positions(table, result.frame.grid, centroids, "_centroid")
+    table["size"] = sizes[:, 0] * u.arcsec
+    table["e1"], table["e2"] = sizes[:, 1], sizes[:, 2]
+    table["angle"] = sizes[:, 3] * u.deg
+
+
+def _add_magnitudes(table, channel, flux_ujy, error_ujy):
+    flux_ujy = np.where(flux_ujy > 0, flux_ujy, np.nan)
+    table[f"mag_{channel}"] = (ZERO_POINT_UJY - 2.5 * np.log10(flux_ujy)) * u.mag
+    table[f"mag_err_{channel}"] = 2.5 / np.log(10) * error_ujy / flux_ujy * u.mag
+
+
+def _flags(result, flux, error, positions, footprints):
+    """Bit masks (S,) of `Flag`."""
+    fitted = fitted_sources(result)
+    flags = np.zeros(len(fitted), dtype=np.int32)
+    if result.status != "converged":
+        flags |= Flag.NOT_CONVERGED
+    flags[~fitted] |= Flag.OUTSIDE
+    flags[((flux <= 0) & np.isfinite(error)).any(axis=1)] |= Flag.ZERO_FLUX
+    flags[fitted & ~np.isfinite(error).all(axis=1)] |= Flag.NO_COVERAGE
+    for footprint in footprints:
+        held = footprint.holds(positions)
+        flags[fitted & ~held] |= Flag.NO_COVERAGE
+        flags[fitted & held & ~footprint.weighted(positions).all(axis=0)] |= Flag.MASKED
+    edge = open_edge(footprints, result.frame.shape)
+    for c in result.components:
+        (y, x), (n_y, n_x) = c.origin, c.morphology.shape
+        bright = c.morphology > EDGE_LIGHT * c.morphology.max(initial=0.0)
+        if (bright & edge[y : y + n_y, x : x + n_x]).any():
+            flags[c.source] |= Flag.EDGE
+    return flags

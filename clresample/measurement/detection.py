@@ -1,0 +1,192 @@
+"""Where the sources are: detection with `sep` on signal-to-noise images in the model frame.
+
+For a point of unit flux at x the best linear estimate of one channel, the matched filter, is
+
+    n(x) = [P1 * R^T w d](x),    v(x) = [P1 * R^T w](x) |P2|^2,    signal to noise = n / sqrt(v)
+
+with R the operator from the model frame, P1 the model's PSF and P2 the observed one. R P1 is P2 at
+x: n is the sum of P2 w d over all observed pixels, wherever they lie, and v its variance where the
+weights change little over the PSF. Channels are added as for a spectrum of equal signal to noise in
+all of them, so that an instrument of coarse pixels counts as much as a sharp one of its depth.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import fftconvolve
+
+from ..deblending.spectra import MODEL_ERROR
+from ..resampling.cache import cached_resampler
+from ..sky.frame import Frame, model_frame
+from ..sky.noise import MIN_PIXELS
+from ..sky.observation import Observation
+from ..sky.sources import Extended
+
+# [sigma] of the combined image: white noise reaches it once in two million independent pixels
+THRESHOLD = 5.0
+# [FWHM^2] of one piece above the threshold: smaller ones are no image of the PSF, but noise on top
+# of what is just under it
+MIN_AREA = 0.25
+# sep's deblending: levels between a threshold and a peak, and the part of an object's light that a
+# branch must hold to be an object of its own; both are SExtractor's habits
+N_LEVELS, MIN_CONTRAST = 32, 0.005
+HALF_NORMAL = 0.6745  # median of |x| for x of unit normal scatter
+# of a channel's largest weight: a point with less lies on what was masked or not seen
+LEAST_WEIGHT = 0.1
+# of the wider PSF's FWHM: nearer to a source already found, a peak is that source again
+SAME_SOURCE = 0.7
+ALL = "all"  # the name of the combined image
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """What `detect` found.
+
+    sources: Extended, brightest first; frame: Frame that their positions belong to
+    peaks (S,): signal to noise of each in the image that found it
+    found_in (S,): name of that image: an observation's, or "all"
+    image (Ny, Nx): signal to noise of all observations together, 0 where nothing was seen
+    """
+
+    sources: tuple[Extended, ...]
+    frame: Frame
+    peaks: np.ndarray
+    found_in: tuple[str, ...]
+    image: np.ndarray
+
+
+def detect(observations, frame=None, *, threshold=THRESHOLD, device=None) -> Detection:
+    """Find sources in all observations together, and in each alone.
+
+    The sharpest image tells neighbours apart, the combined one reaches faintest. Sources are taken
+    from the observations, the sharpest first, and at last from all together; a peak within 0.7 FWHM
+    (of that image's PSF) of a source that an earlier image found is that source again.
+
+    observations: see `check_observations`; frame: None = `model_frame` of them
+    threshold [sigma]: least signal to noise of a peak
+    Raises ValueError for a threshold that is not positive; ImportError, with what to install,
+    without `sep`.
+    """
+    return _search(observations, frame or model_frame(observations), threshold, device, [])
+
+
+def detect_more(result, *, threshold=THRESHOLD, device=None) -> Detection:
+    """Find what a fit has left over: sources too faint beside others to be told before.
+
+    The residuals are searched as `detect` does; where the model is bright its own errors are noise,
+    1 / w + (0.15 model)^2.
+
+    result: a fitted blend; its sources are not among those returned, nor peaks as near to them
+    """
+    left = []
+    for i, o in enumerate(result.observations):
+        sky = result.sky[result.channel_slices()[i], None, None]
+        error = MODEL_ERROR * (result.model(i) - sky)
+        weights = o.weights / (1 + o.weights * error**2)
+        data = np.nan_to_num(result.residual(i))
+        left.append(
+            Observation(
+                data,
+                o.psf,
+                o.grid,
+                weights=weights,
+                channels=o.channels,
+                zero_points=o.zero_points,
+                name=o.name,
+            )
+        )
+    known = result.frame.place(result.sources)
+    return _search(left, result.frame, threshold, device, list(known))
+
+
+def _search(observations, frame, threshold, device, known):
+    if not 0 < threshold < math.inf:
+        raise ValueError(f"threshold must be a positive number of sigmas, not {threshold}")
+    sep = _import_sep()
+    images = [_signal_to_noise(o, frame, device) for o in observations]
+    widths = np.array([_fwhm_px(o, frame) for o in observations])
+    n_channels = np.array([len(o.channels) for o in observations])
+    everything = np.einsum("o,oyx->yx", np.sqrt(n_channels / n_channels.sum()), images)
+    order = np.argsort(widths, kind="stable")
+    searched = [(images[i], widths[i], widths[i], observations[i].label) for i in order]
+    if len(observations) > 1:
+        searched.append((everything, widths.min(), widths.max(), ALL))
+    found = []  # position, peak, label
+    for image, narrow, wide, label in searched:
+        before = known + [position for position, _, _ in found]
+        for position, peak in _peaks(sep, image, threshold, MIN_AREA * narrow**2):
+            if all(np.hypot(*(position - other)) > SAME_SOURCE * wide for other in before):
+                found.append((position, peak, label))
+    found.sort(key=lambda one: -one[1])
+    return Detection(
+        sources=tuple(Extended(position_px=tuple(map(float, p))) for p, _, _ in found),
+        frame=frame,
+        peaks=np.array([peak for _, peak, _ in found]),
+        found_in=tuple(label for _, _, label in found),
+        image=everything,
+    )
+
+
+def _import_sep():
+    try:
+        import sep
+    except ImportError as error:
+        raise ImportError(
+            "detection needs sep, which is not installed: pip install 'clresample[detect]'"
+        ) from error
+    return sep
+
+
+def _signal_to_noise(observation, frame, device):
+    """One observation's channels together (Ny, Nx), of unit scatter where there is no source."""
+    op = cached_resampler(frame, observation.grid, observation.psf, dtype=np.float32, device=device)
+    weights = observation.weights * op.covered
+    unit = np.sqrt(weights.max(axis=(1, 2), keepdims=True))  # whitened: float32 holds any counts
+    unit[unit == 0] = 1
+    weights = weights / unit**2
+    spread = [
+        fftconvolve(image, frame.psf.images[0], mode="same")
+        for image in np.concatenate(
+            [
+                op.adjoint((weights * observation.data * unit).astype(np.float32)),
+                op.adjoint(weights.astype(np.float32)),
+            ]
+        ).astype(np.float64)
+    ]
+    total, n_seen = np.zeros(frame.shape), np.zeros(frame.shape)
+    psf = observation.psf
+    area = (psf.images**2).sum(axis=(1, 2)) / psf.spacing**2
+    for n, v, power in zip(spread, spread[len(spread) // 2 :], area):
+        seen = v > LEAST_WEIGHT * v.max(initial=0)
+        total[seen] += n[seen] / np.sqrt(v[seen] * power)
+        n_seen += seen
+    image = total / np.sqrt(np.maximum(n_seen, 1))
+    dark = -image[image < 0]
+    if dark.size >= MIN_PIXELS:  # what is under the sky is noise, which may be correlated
+        image /= max(1.0, np.median(dark) / HALF_NORMAL)
+    return image
+
+
+def _fwhm_px(observation, frame):
+    """Width [model px] of an observation's sharpest PSF: diameter of its disc above half peak."""
+    psf = observation.psf
+    n = min(np.count_nonzero(image > image.max() / 2) for image in psf.images)
+    scale = observation.grid.pixel_scale_arcsec / frame.grid.pixel_scale_arcsec
+    return 2 * math.sqrt(n / math.pi) * psf.spacing * scale
+
+
+def _peaks(sep, image, threshold, area):
+    """Positions (y, x) and heights of the objects in a signal-to-noise image, brightest first."""
+    objects = sep.extract(
+        np.ascontiguousarray(image),
+        threshold,
+        minarea=max(1, int(area)),
+        filter_kernel=None,
+        deblend_nthresh=N_LEVELS,
+        deblend_cont=MIN_CONTRAST,
+    )
+    found = [(np.array([o["ypeak"], o["xpeak"]], float), float(o["peak"])) for o in objects]
+    return sorted(found, key=lambda one: -one[1])

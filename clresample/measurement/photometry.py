@@ -1,0 +1,84 @@
+"""Fluxes of the sources of a result: of the models, or of the data they share."""
+
+from __future__ import annotations
+
+import numpy as np
+from astropy import units as u
+
+from .quality import fitted_sources
+
+# of a channel's brightest model pixel: under it, rounding of float32 renderings (1e-6), not light,
+# decides which source a pixel belongs to
+TRACE = 1e-5
+
+
+def fluxes(result):
+    """Fluxes of all sources and their covariances, from the full normal matrix.
+
+        F_s = sum_i A_i |S_i|,  cov(F_s, F_t) = sum_ij |S_i| cov(A_i, A_j) |S_j|,  |S| = sum of S
+
+    over the components i of s and j of t.
+
+    returns flux (S, C) [counts]: NaN for a source without components; covariance (C, S, S)
+        [counts^2]: the variance is infinite where a channel does not determine a flux, and for
+        sources without components
+    """
+    sums = np.zeros((len(result.sources), len(result.components)))
+    for i, component in enumerate(result.components):
+        sums[component.source, i] = component.morphology.sum(dtype=np.float64)
+    flux = sums @ spectra_of(result)
+    flux[~fitted_sources(result)] = np.nan
+    known = np.isfinite(np.diagonal(result.covariance, axis1=1, axis2=2))  # (C, n)
+    both = known[:, :, None] & known[:, None, :]
+    summed = sums @ np.where(both, result.covariance, 0.0) @ sums.T
+    # a component that is zero everywhere adds nothing, not even ignorance
+    lost = (~known) @ (sums != 0).T | ~fitted_sources(result)
+    i_channel, i_source = np.nonzero(lost)
+    summed[i_channel, i_source] = summed[i_channel, :, i_source] = 0.0
+    summed[i_channel, i_source, i_source] = np.inf
+    return flux, summed
+
+
+def redistribute(result, i_observation) -> np.ndarray:
+    """Each source's share of the observed data: flux re-distribution.
+
+        share_s = (data - sky) max(m_s, 0) / sum_t max(m_t, 0)
+
+    m_s being the model of s on the observed pixels. The shares of a pixel add up to its data
+    without the sky, unless all models are fainter there than 1e-5 of the channel's brightest model
+    pixel: such pixels are nobody's, and all shares are 0.
+
+    returns (S, Co, My, Mx) [counts]: NaN where the data have no weight
+    Source: the deblender of SDSS (R. Lupton), with fitted models as its templates.
+    """
+    observation = result.observations[i_observation]
+    channels = result.channel_slices()[i_observation]
+    shares = np.zeros((len(result.sources), *observation.data.shape))
+    spectra = spectra_of(result)[:, channels]
+    for i, component in enumerate(result.components):
+        shares[component.source] += spectra[i, :, None, None] * result.rendered[i_observation][i]
+    np.maximum(shares, 0.0, out=shares)
+    total = shares.sum(axis=0)
+    lit = total > TRACE * total.max(axis=(1, 2), keepdims=True)
+    ratio = np.zeros_like(total)
+    data = observation.data - np.asarray(result.sky)[channels, None, None]
+    np.divide(data, total, out=ratio, where=lit)
+    shares *= ratio
+    shares[:, observation.weights <= 0] = np.nan
+    return shares
+
+
+def spectra_of(result):
+    """(n, C) [counts]; no components are (0, C)."""
+    spectra = [c.spectrum for c in result.components]
+    return np.array(spectra, dtype=np.float64).reshape(-1, len(result.channels))
+
+
+def flux_scale(result):
+    """Per channel, what turns counts into the catalogue's unit, and that unit."""
+    scale, unit = [], []
+    for o in result.observations:
+        given = o.flux_scale is not None
+        scale += list(o.flux_scale) if given else [1.0] * len(o.channels)
+        unit += [u.uJy if given else u.ct] * len(o.channels)
+    return scale, unit

@@ -1,0 +1,85 @@
+"""How well a result fits its data: chi2 of channels and sources, and their labels."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..sky.footprint import Footprint
+
+
+def summary(result) -> dict:
+    """What became of the blend as a whole, in plain values that JSON can hold.
+
+    status, messages, seconds as in `Result`; n_sources, n_fitted (inside the frame), n_components,
+    n_iterations, losses; chi2 {channel: per pixel with a weight on the frame, NaN without any},
+    n_pixels {channel}, sky {channel} [counts], shifts {observation: (y, x) [model px]}
+    """
+    chi2, n_pixels = {}, {}
+    for i, observation in enumerate(result.observations):
+        used = Footprint.of(result, i).used
+        terms = chi2_terms(result, i, used)
+        for channel, one, where in zip(observation.channels, terms, used, strict=True):
+            n_pixels[channel] = int(where.sum())
+            chi2[channel] = float(one[where].mean()) if where.any() else float("nan")
+    return {
+        "status": result.status,
+        "messages": list(result.messages),
+        "n_sources": len(result.sources),
+        "n_fitted": int(fitted_sources(result).sum()),
+        "n_components": len(result.components),
+        "n_iterations": max(len(result.losses) - 1, 0),
+        "losses": [float(loss) for loss in result.losses],
+        "chi2": chi2,
+        "n_pixels": n_pixels,
+        "sky": dict(zip(result.channels, map(float, result.sky), strict=True)),
+        "shifts": {
+            label: [float(s) for s in shift]
+            for label, shift in zip(labels(result), result.shifts, strict=True)
+        },
+        "seconds": {stage: float(t) for stage, t in result.seconds.items()},
+    }
+
+
+def labels(result) -> list[str]:
+    """A name for each observation, unique: its own, numbered where it has none or shares it."""
+    names = [o.name or "observation" for o in result.observations]
+    return [
+        name if names.count(name) == 1 and o.name else f"{name}{i}"
+        for i, (name, o) in enumerate(zip(names, result.observations, strict=True))
+    ]
+
+
+def fitted_sources(result):
+    """Which sources (S,) have a component."""
+    fitted = np.zeros(len(result.sources), dtype=bool)
+    fitted[[c.source for c in result.components]] = True
+    return fitted
+
+
+def chi2_terms(result, i_observation, used):
+    """Weighted squared residuals (Co, My, Mx), 0 where not used."""
+    o = result.observations[i_observation]
+    if result.components:
+        residual = o.data - result.model(i_observation)
+    else:
+        channels = result.channel_slices()[i_observation]
+        residual = o.data - np.asarray(result.sky)[channels, None, None]
+    return np.where(used, o.weights * residual**2, 0.0)
+
+
+def box_chi2(result, i_observation, footprint):
+    """Chi2 per pixel (S,) on the pixels whose centre lies in a box of the source."""
+    terms = chi2_terms(result, i_observation, footprint.used).sum(axis=0)
+    counts = footprint.used.sum(axis=0)
+    y, x = np.moveaxis(footprint.positions, -1, 0)
+    chi2 = np.full(len(result.sources), np.nan)
+    for s in range(len(result.sources)):
+        inside = np.zeros(counts.shape, dtype=bool)
+        for c in result.components:
+            if c.source == s:
+                (y0, x0), (n_y, n_x) = np.array(c.origin) - 0.5, c.morphology.shape
+                inside |= (y >= y0) & (y < y0 + n_y) & (x >= x0) & (x < x0 + n_x)
+        n = counts[inside].sum()
+        if n:
+            chi2[s] = terms[inside].sum() / n
+    return chi2

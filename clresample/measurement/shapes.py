@@ -1,0 +1,84 @@
+"""Centroids and second moments of morphologies, in pixels and on the sky."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..sky.grid import ARCSEC
+
+
+def moments(components, light):
+    """Centroid and second moments of a source's components, weighted by their light.
+
+        c = sum_x x I(x) / sum_x I(x),   Q = sum_x (x - c)(x - c)^T I(x) / sum_x I(x)
+
+    components (k): with `origin` and `morphology`; light (k,): share of each in I, any unit; where
+        there is no light at all, components count alike
+    returns c (2,) [px] and Q (2, 2) [px^2], rows and columns (y, x); NaN where every morphology is
+        zero, or the light no number
+    """
+    if not np.any(light):
+        light = np.ones(len(components))
+    parts = []
+    for component, weight in zip(components, light, strict=True):
+        morphology = np.asarray(component.morphology, dtype=np.float64)
+        if morphology.any():
+            parts.append((weight, *_moments(morphology, component.origin)))
+    if not parts:
+        return np.full(2, np.nan), np.full((2, 2), np.nan)
+    weights, centroids, seconds = (np.array(values) for values in zip(*parts, strict=True))
+    weights = weights / weights.sum()
+    centroid = weights @ centroids
+    away = centroids - centroid
+    seconds = seconds + away[:, :, None] * away[:, None, :]
+    return centroid, np.tensordot(weights, seconds, 1)
+
+
+def _moments(image, origin):
+    y, x = (np.arange(n) + o for n, o in zip(image.shape, origin, strict=True))
+    rows, columns, total = image.sum(axis=1), image.sum(axis=0), image.sum()
+    c_y, c_x = rows @ y / total, columns @ x / total
+    y, x = y - c_y, x - c_x
+    cross = y @ image @ x
+    return np.array([c_y, c_x]), np.array([[rows @ y**2, cross], [cross, columns @ x**2]]) / total
+
+
+def local_axes(grid, pixel):
+    """How a step of one pixel goes on the sky: (2, 2) [arcsec/px], rows (north, east).
+
+    Columns are (y, x). North is that of the WCS's own frame; on a flat sky it is +y, and east is
+    -x, as in `Grid.to_wcs`.
+
+    pixel (2,) [px]: (y, x), where on the grid
+    """
+    if grid.wcs is None:
+        return grid.jacobian * [[1.0], [-1.0]]
+    n, m = np.asarray(pixel)[:, None] + [[0, -0.5, 0.5, 0, 0], [0, 0, 0, -0.5, 0.5]]
+    lon, lat = np.radians(grid.sky(n, m))
+    v = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+    steps = np.stack([v[:, 2] - v[:, 1], v[:, 4] - v[:, 3]], axis=1)
+    lon, lat = lon[0], lat[0]
+    north = [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)]
+    east = [-np.sin(lon), np.cos(lon), 0.0]
+    return np.array([north, east]) @ steps / ARCSEC
+
+
+def shape(second):
+    """Size, ellipticity and angle of second moments Q, rows and columns (north, east).
+
+        size = sqrt((Q_nn + Q_ee) / 2),   e1 = (Q_nn - Q_ee) / (Q_nn + Q_ee),
+        e2 = 2 Q_ne / (Q_nn + Q_ee),      angle = atan2(e2, e1) / 2
+
+    so that an ellipse of half-axes a and b has |e| = (a^2 - b^2) / (a^2 + b^2), e1 > 0 when
+    stretched north - south and e2 > 0 when stretched north-east - south-west.
+
+    second (2, 2) [arcsec^2]
+    returns size [arcsec], e1, e2, angle of the long axis, east of north [deg], in [0, 180); a
+        single pixel has size 0 and no ellipticity (NaN)
+    """
+    (nn, ne), (_, ee) = second
+    total = nn + ee
+    if not total > 0:
+        return np.sqrt(total), np.nan, np.nan, np.nan
+    e1, e2 = (nn - ee) / total, 2 * ne / total
+    return np.sqrt(total / 2), e1, e2, np.degrees(np.arctan2(e2, e1)) / 2 % 180

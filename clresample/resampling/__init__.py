@@ -1,0 +1,5 @@
+"""The operator R: a model image on another instrument's pixels and PSF, and its adjoint.
+
+A Plan (float64, host) holds the tables of one geometry; an executor (device) applies them; a
+Resampler joins both. Imports `device` and `sky`.
+"""

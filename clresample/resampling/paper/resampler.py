@@ -1,0 +1,226 @@
+"""The paper's own factorised operator, beside ours: same inputs, same outputs, its cost."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ...device.contraction import Matrix
+from ...sky.grid import Grid
+from ...sky.psf import PSF
+from ..linop import LinOp
+from ..plan import count_bands
+from ..transfer import wrap_radius
+from .factors import Factors, Images, lanes, trigonometric
+from .sincs import sinc_difference, sinc_table
+
+
+class PaperResampler(LinOp):
+    """Resampling and PSF-difference convolution as one product of two factors, O(N^2 M^2).
+
+        I2(i, l) = sum_u F^i(u) P^l(u)                X = i a + l b + t, the columns a, b of A
+        F^i(u) = I1(i a + t - u),    P^l(u) = Pd(l b + u)
+
+    grid_in, grid_out (Grid): pixels of the model and of the observation
+    psf_in (1 or C bands), psf_out (1 or C bands): their PSFs, each in its own grid's pixels
+    dtype, device, shift, tolerance_px, the images, `covered` and `kind`: as for `Resampler`
+    report: as there; n_terms, the length of the sum over u; model_axis, the observed axis along i
+
+    P2 is interpolated to the model's grid by sincs (eq. `psf_interp`). These, and those of aligned
+    grids, end at the padded grid's edge: the difference to `Resampler`, see docs/schemes.md.
+    Raises ValueError for distorted mappings, grids that do not overlap and bands that do not match;
+    DeviceError where a factor does not fit on the device.
+    Source: eqs. `compact_sinc_sep`, `fast_reconvampling`, `rotation`, `psf_interp`.
+    """
+
+    def __init__(
+        self,
+        grid_in: Grid,
+        psf_in: PSF,
+        grid_out: Grid,
+        psf_out: PSF,
+        *,
+        dtype=np.float32,
+        device=None,
+        shift=(0.0, 0.0),
+        tolerance_px=1e-4,
+    ):
+        mapping = grid_out.map_to(grid_in, tolerance_px=tolerance_px)
+        self._setup(mapping, psf_in, psf_out, dtype, device, shift)
+
+    @classmethod
+    def from_mapping(
+        cls, mapping, psf_in: PSF, psf_out: PSF, *, dtype=np.float32, device=None, shift=(0.0, 0.0)
+    ) -> PaperResampler:
+        """The operator of a mapping, observed pixels -> model pixels, instead of two grids."""
+        op = cls.__new__(cls)
+        op._setup(mapping, psf_in, psf_out, dtype, device, shift)
+        return op
+
+    def _setup(self, mapping, psf_in, psf_out, dtype, device, shift):
+        if mapping.kind == "distorted":
+            raise ValueError(
+                f"grid_out departs from an affine mapping by {mapping.departure_px:.2g} px of "
+                "grid_in, more than tolerance_px: the shifts need one matrix for all pixels, "
+                "Resampler does not"
+            )
+        n_bands = count_bands(mapping, psf_in, psf_out)
+        super().__init__(device, dtype, (n_bands, *mapping.shape_in), (n_bands, *mapping.shape_out))
+        self.kind, self.covered = mapping.kind, mapping.covered
+        radius = wrap_radius(psf_out, mapping.matrix)
+        # nothing wraps, the kernel lies in the grid whole, and K is odd
+        n_fft = tuple(
+            2 * math.ceil((max(n, r) + r - 1) / 2) + 1
+            for n, r in zip(mapping.shape_in, radius, strict=True)
+        )
+        d, self.report = sinc_difference(self.device, mapping.matrix, psf_in, psf_out, n_fft)
+        self._spectra = np.broadcast_to(d, (n_bands, *n_fft))
+        factors = AlignedFactors if self.kind == "aligned" else RotatedFactors
+        choices = [factors(self.device, self.dtype, mapping, n_fft, axis) for axis in (0, 1)]
+        self._factors = min(choices, key=lambda choice: choice.cost)
+        self._factors.prepare()
+        self.report |= {
+            "wrap_radius_px": radius,
+            "n_fft": n_fft,
+            "n_terms": self._factors.n_terms,
+            "model_axis": self._factors.axis,
+        }
+        self.shift = shift
+
+    @property
+    def shift(self):
+        """Offset (2,) [model px] by which every observed pixel is moved."""
+        return self._shift
+
+    @shift.setter
+    def shift(self, shift):
+        shift = np.asarray(shift, np.float64)
+        if shift.shape not in ((), (2,)) or not np.isfinite(shift).all():
+            raise ValueError(f"shift is {shift}, must be (2,) finite numbers")
+        self._shift = np.broadcast_to(shift, 2).copy()
+        self._shift.flags.writeable = False  # a change must come through this setter
+        self._factors.set_spectra(self._spectra, self._shift)
+
+    def _forward(self, x, out):
+        self._run(self._factors.forward, x, out)
+
+    def _adjoint(self, y, out):
+        self._run(self._factors.adjoint, y, out)
+
+    def _run(self, chain, source, target):
+        batch, n_bands = source.shape[:2]
+        group = min(self._factors.group, batch)
+        self._factors.reserve(group)
+        for start in range(0, batch, group):
+            for band in range(n_bands):
+                ends = (Images.of(array, start, band) for array in (source, target))
+                chain(*ends, band, min(group, batch - start))
+
+
+class AlignedFactors(Factors):
+    """Eq. `compact_sinc_sep`: inner index (y, nu_x), y a model row, x the axis that is shifted.
+
+    F = I1^(y, nu_x) exp(2 pi i nu_x X_i),    P = sum_ym Pd^(nu_x, y_m) sinc(Y_l - y - y_m)
+    """
+
+    name = "line"
+
+    @staticmethod
+    def model_axes(mapping, axis):
+        x = axis if mapping.matrix[0, 0] != 0 else 1 - axis
+        return 1 - x, x
+
+    def units(self):
+        return self.n_y, 2 * self.h_x, 0
+
+    def set_spectra(self, d, shift):
+        """Both factors' tables from D (C, Ky, Kx), every observed pixel moved by `shift`."""
+        (y, x), matrix = self.axes, self.mapping.matrix
+        t = self.mapping.offset + shift
+        wave = self._wave(self.k_x, matrix[x, self.axis] * np.arange(self.n_i) + t[x])
+        self.waves = wave, wave  # a line's kernels use the second alone
+        p = np.fft.fftshift(np.fft.ifft(d, axis=1 + y), axes=1 + y).swapaxes(1 + y, 2)
+        p = p[:, : self.h_x] * np.where(np.arange(self.h_x) == 0, 1, 2)[:, None] / self.k_x
+        p = self._table(np.stack([p.real, -p.imag], axis=2).reshape(len(d), 2 * self.h_x, -1))
+        positions = matrix[y, 1 - self.axis] * np.arange(self.n_l) + t[y]
+        self.kernels = [[] for _ in d]
+        for slab in self.slabs:
+            n_sincs = slab.n_units + self.k_y - 1  # y + y_m: each row of the model one further on
+            sincs = self.device.zeros((n_sincs, self.l_pad), self.dtype)
+            sinc_table(
+                self.device, positions, slab.first - self.k_y // 2, n_sincs, sincs, 1, self.l_pad
+            )
+            for i, kernels in enumerate(self.kernels):
+                kernel = self._new_kernel(slab)
+                self.plain(
+                    self.unit_rows,
+                    self.n_l,
+                    self.k_y,
+                    slab.n_units,
+                    Matrix(p.buffer, p.ld, offset=i * p.stride),
+                    Matrix(sincs.base_data, self.l_pad, self.l_pad),
+                    Matrix(kernel.base_data, self.l_pad, self.unit_rows * self.l_pad),
+                )
+                kernels.append(self._both_ways(kernel))
+
+    def analyse(self, x: Images, n):
+        return self._columns(x, n)
+
+    def synthesise(self, z, x: Images, n):
+        self._from_columns(z, x, n)
+
+
+class RotatedFactors(Factors):
+    """Eq. `fast_reconvampling` for any affine mapping: inner index (nu_y, nu_x) with nu_y >= 0.
+
+    F = I1^(nu) exp(2 pi i nu.(i a + t)),    P = D(nu) exp(2 pi i nu.(l b))
+    """
+
+    name = "plane"
+
+    @staticmethod
+    def model_axes(mapping, axis):
+        return 0, 1
+
+    def units(self):
+        return self.h_y, 4 * self.h_x, 2 * self.h_y
+
+    def prepare(self):
+        super().prepare()
+        in_y = trigonometric(self.n_y, self.k_y)
+        self.in_y, self.in_y_t = self._table(in_y), self._table(in_y.T)
+
+    def set_spectra(self, d, shift):
+        """Both factors' tables from D (C, Ky, Kx), every observed pixel moved by `shift`."""
+        a, b = self.mapping.matrix[:, self.axis], self.mapping.matrix[:, 1 - self.axis]
+        t, k = self.mapping.offset + shift, (self.k_y, self.k_x)
+        steps_i, steps_l = np.arange(self.n_i), np.arange(self.n_l)
+        self.waves = [self._wave(k[j], a[j] * steps_i + t[j]) for j in (0, 1)]
+        # conj(P), so that the sum of products is the real part: conj(D) and the opposite steps
+        waves = [self._wave(k[j], -b[j] * steps_l) for j in (0, 1)]
+        d = d[:, : self.h_y].conj() / (self.k_y * self.k_x)
+        d[:, 1:] *= 2  # -nu as well
+        plus, minus = d[:, :, : self.h_x], d[:, :, -np.arange(self.h_x)]
+        weight = np.where(np.arange(self.h_x) == 0, 0.25, 0.5)  # nu_x = 0 is in both
+        self.kernels = []
+        for p, m in zip(plus * weight, minus * weight, strict=True):
+            sums = np.empty((self.h_y, 2, self.h_x, 2))  # as the model's: CC, CS; SC, SS
+            sums[:, 0, :, 0], sums[:, 0, :, 1] = p.real + m.real, m.imag - p.imag
+            sums[:, 1, :, 0], sums[:, 1, :, 1] = -p.imag - m.imag, m.real - p.real
+            z, kernels = self._table(sums.reshape(2 * self.h_y, -1)), []
+            for slab in self.slabs:
+                kernel = self._new_kernel(slab)
+                self._shift(self.shift, slab, z, waves, kernel, lanes(self.n_l), self.l_pad, 1)
+                kernels.append(self._both_ways(kernel))
+            self.kernels.append(kernels)
+
+    def analyse(self, x: Images, n):
+        z = self._scratch("spectra")
+        self.plain(self.z_rows, 2 * self.h_x, self.n_y, n, self.in_y_t, self._columns(x, n), z)
+        return z
+
+    def synthesise(self, z, x: Images, n):
+        half = self._scratch("half")
+        self.plain(self.n_y, 2 * self.h_x, self.z_rows, n, self.in_y, z, half)
+        self._from_columns(half, x, n)

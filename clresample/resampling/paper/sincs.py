@@ -1,0 +1,94 @@
+"""Sinc interpolation on the device, and the paper's difference kernel that is built with it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ...device.contraction import Contraction, Matrix, padded
+from ...sky.psf import PSF
+from ..transfer import DIVISION_FLOOR
+
+# Positions at which a PSF is interpolated at once: three tables of 48 float64 each, 36 MiB.
+POSITIONS = 1 << 15
+# Relative slack on the edges of bands, above the rounding of A^T nu in float64.
+BAND_SLACK = 1e-12
+
+
+def sinc_table(device, positions, first, n, table, step_p, step_i):
+    """Queue table[p, i] = sinc(positions[p] - first - i), i < n; see kernels/sinc.cl.
+
+    positions (P,) [px]; table: device array, element (p, i) at p * step_p + i * step_i
+    """
+    whole = np.rint(positions)
+    part = device.put(positions - whole, table.dtype)
+    whole = device.put(whole.astype(np.int32))
+    kernel = device.kernel("sinc.cl", "sinc", dtype=table.dtype)
+    kernel.set_scalar_arg_dtypes([np.int32, None, None, None, np.int32, np.int32])
+    kernel.set_args(first, whole.base_data, part.base_data, table.base_data, step_p, step_i)
+    device.launch(kernel, (n, len(positions)))
+
+
+def interpolate_psf(device, matrix, psf: PSF, n_fft, fine=1):
+    """The observed PSF on the model's pixels, in float64 where the device has it.
+
+        P2i(x) = sum_o P2[o] sinc(q_y - o_y) sinc(q_x - o_x),    q = A^-1 x / spacing + center
+
+    matrix (2, 2): A; n_fft (2,) [model px]: size K of the grid around x = 0
+    fine: points per model pixel and axis, x = (j - n // 2) / fine for n = fine * K
+    returns (C, fine Ky, fine Kx). Source: eq. `psf_interp`.
+    """
+    dtype = np.dtype(np.float64 if device.has_fp64 else np.float32)
+    axes = [(np.arange(fine * k) - fine * k // 2) / fine for k in n_fft]
+    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    q = x @ np.linalg.inv(matrix).T / psf.spacing
+    (n_y, n_x), n_pad = psf.images.shape[1:], padded(psf.images.shape[2])
+    along_y, along_x = Contraction(device, dtype), device.kernel("warp.cl", "rowdot", dtype=dtype)
+    i = np.int32
+    along_x.set_scalar_arg_dtypes([i, i, i, i, None, np.uint64, None, None])
+    result, n_block = np.empty((psf.n_bands, len(q))), min(POSITIONS, len(q))
+    rows, columns, sums, values = (
+        device.zeros(shape, dtype)
+        for shape in ((n_block, n_y), (n_block, n_pad), (n_block, n_pad), (n_block,))
+    )
+    for band, image in enumerate(psf.images):
+        samples = device.put(np.pad(image, ((0, 0), (0, n_pad - n_x))), dtype)
+        samples = Matrix(samples.base_data, n_pad)
+        for start in range(0, len(q), n_block):
+            block = q[start : start + n_block] + psf.center[band]
+            n = len(block)
+            sinc_table(device, block[:, 0], 0, n_y, rows, n_y, 1)
+            sinc_table(device, block[:, 1], 0, n_x, columns, n_pad, 1)
+            tall = Matrix(rows.base_data, n_y), samples, Matrix(sums.base_data, n_pad)
+            along_y(n, n_x, n_y, 1, *tall)
+            along_x.set_args(n, n_pad, 1, 1, values.base_data, 0, sums.base_data, columns.base_data)
+            device.launch(along_x, (n, 1))
+            result[band, start : start + n] = device.get(values)[:n]
+    return result.reshape(-1, *(fine * k for k in n_fft))
+
+
+def sinc_difference(device, matrix, psf_in: PSF, psf_out: PSF, n_fft):
+    """D = F[P2i] conj(F[P1]) / max(|F[P1]|, DIVISION_FLOOR)^2 in FFT order, and a report.
+
+    The transform of the sincs is a rectangle: D is 0 beyond the observed PSF's band, where only the
+    sincs' cut at the padded grid's edge would be divided by a vanishing F[P1]. Where that band
+    reaches past the model's Nyquist frequency, P2i is taken on a finer grid and does not fold back.
+
+    returns D (C, Ky, Kx) complex; max_gain, floored_power (C,) as in spectrum.Plan
+    """
+    reach = 0.5 / psf_out.spacing * np.abs(np.linalg.inv(matrix)).sum(axis=0).max()
+    fine = max(1, math.ceil(reach + 0.5 - BAND_SLACK))
+    p2 = np.fft.ifftshift(interpolate_psf(device, matrix, psf_out, n_fft, fine), axes=(1, 2))
+    index = [np.rint(np.fft.fftfreq(k) * k).astype(int) for k in n_fft]
+    p2 = np.fft.fft2(p2)[:, index[0][:, None], index[1]] / (fine * psf_out.spacing) ** 2
+    nu = [i / k for i, k in zip(index, n_fft, strict=True)]
+    f = np.abs(np.tensordot(matrix.T, np.stack(np.meshgrid(*nu, indexing="ij")), 1)).max(axis=0)
+    p2 = np.where(f <= (1 + BAND_SLACK) / (2 * psf_out.spacing), p2, 0)
+    p1 = psf_in.spectrum(*nu)  # P1 is sampled on the model's pixels: this is its FFT
+    size = np.abs(p1)
+    d = p2 * p1.conj() / np.maximum(size, DIVISION_FLOOR) ** 2
+    power = np.abs(p2) ** 2
+    floored = (power * (size < DIVISION_FLOOR)).sum(axis=(1, 2)) / power.sum(axis=(1, 2))
+    gain = np.abs(d).max(axis=(1, 2)) / abs(np.linalg.det(matrix))
+    return d, {"max_gain": gain, "floored_power": floored}

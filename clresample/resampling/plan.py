@@ -1,0 +1,251 @@
+"""The resampling operator worked out in float64: band, difference spectrum and factor tables.
+
+With X = A p + t the position of observed pixel p in model pixels and nu = kappa / K,
+
+    I2(X) = K^-2 sum_nu D(nu) F(nu) exp(+2 pi i nu.X),    F(nu) = sum_k I1(x_k) exp(-2 pi i nu.x_k)
+    D(nu) = |det A| P2^(A^T nu) / P1^(nu)
+
+which is eq. `reconvampling2D` of the paper summed over the band that the observed PSF can carry.
+Images are real, so the sum runs over nu_y >= 0, nu_x >= 0 with the pair D(+,+), D(+,-), and every
+exponential is a (cos, sin) pair of real table rows: a plan is a list of real matrices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..sky.mapping import Mapping
+from ..sky.psf import PSF
+from .gridding import KaiserBessel, LineTaps, transpose_taps
+from .transfer import transfer_function, wrap_radius
+
+
+@dataclass(frozen=True)
+class Precision:
+    """What a floating-point type deserves: where the band ends, how lines are interpolated."""
+
+    band_tolerance: float  # |D| / max |D| below which a frequency is dropped
+    window: KaiserBessel
+
+    @classmethod
+    def of(cls, dtype) -> Precision:
+        if np.dtype(dtype) == np.float32:
+            return cls(3e-8, KaiserBessel(10, 1.5))  # window error 1e-8
+        return cls(1e-16, KaiserBessel(16, 2.0))  # window error 4e-16
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Tables of one observation; rows 2i, 2i+1 of a table are the cos and sin parts of frequency i.
+
+    kind: "aligned" | "affine" | "distorted"
+    identity: same pixels and PSF, so that without a shift the operator returns its input
+    nu (Hy,), (Hx,) [cycles per model px]: frequencies >= 0 of the two table axes
+    axes: the model axis of each table axis; (1, 0) where the observed rows run along the model's y
+    d_plus, d_minus (C, Hy, Hx) complex: D(+,+), D(+,-) times K^-2 and the half-plane weights
+    in_y (2Hy, Ny), in_x (2Hx, Nx): transforms of the model
+    out_y, out_x: aligned (My, 2Hy), (2Hx, Mx); affine (L, 2Hy), (2Hx, J); distorted (P, 2Hy),
+        (P, 2Hx)
+    twist (Hy, J) [rad], lines: affine only
+    report: wrap_radius_px, n_fft (K), n_frequencies, max_gain (C,) = max |D| / |det A|,
+        floored_power (C,) = share of the observed PSF's power where the division was floored
+    """
+
+    kind: str
+    mapping: Mapping
+    n_bands: int
+    identity: bool
+    nu: tuple[np.ndarray, np.ndarray]
+    axes: tuple[int, int]
+    d_plus: np.ndarray
+    d_minus: np.ndarray
+    in_y: np.ndarray
+    in_x: np.ndarray
+    out_y: np.ndarray
+    out_x: np.ndarray
+    twist: np.ndarray | None = None
+    lines: LineTaps | None = None
+    report: dict = field(default_factory=dict)
+
+    def shifted(self, shift) -> tuple[np.ndarray, np.ndarray]:
+        """Spectra of the operator with every observed pixel moved by `shift` (2,) [model px]."""
+        phase_y, phase_x = (np.exp(2j * np.pi * self.nu[i] * shift[self.axes[i]]) for i in (0, 1))
+        phase_y = phase_y[:, None]
+        return self.d_plus * (phase_y * phase_x), self.d_minus * (phase_y * phase_x.conj())
+
+
+def make_plan(
+    mapping: Mapping, psf_in: PSF, psf_out: PSF, *, precision: Precision, extent=None
+) -> Plan:
+    """Tables that take a model to the observed pixels and PSF of `mapping`.
+
+    mapping: observed pixels -> model pixels
+    psf_in (1 or C bands), psf_out (C bands): PSF samples of the model and of the observation
+    extent (2,) [model px]: from its first pixel on, what of the model holds light, and sets the
+        frequencies; None = all of it
+    raises ValueError for incompatible band counts or a PSF with no light in the band.
+    """
+    n_bands = count_bands(mapping, psf_in, psf_out)
+    radius = wrap_radius(psf_out, mapping.matrix)
+    n_fft = tuple(_odd(n + h) for n, h in zip(extent or mapping.shape_in, radius, strict=True))
+    nu_y, nu_x = (
+        np.arange(_half_count(mapping.matrix, psf_out.spacing, i, n_fft[i])) / n_fft[i]
+        for i in (0, 1)
+    )
+    d, report = transfer_function(mapping.matrix, psf_in, psf_out, nu_y, nu_x)
+    d = np.broadcast_to(d, (n_bands,) + d.shape[1:])
+
+    strong = np.abs(d) > precision.band_tolerance * np.abs(d).max(axis=(1, 2), keepdims=True)
+    h_y = int(np.flatnonzero(strong.any(axis=(0, 2)))[-1]) + 1
+    columns = np.flatnonzero(strong.any(axis=(0, 1))) - (len(nu_x) - 1)
+    h_x = int(np.abs(columns).max()) + 1
+    d = np.where(strong, d, 0)[:, :h_y, len(nu_x) - h_x : len(nu_x) + h_x - 1]
+    nu_y, nu_x = nu_y[:h_y], nu_x[:h_x]
+
+    center = (np.array(mapping.shape_in) - 1) / 2
+    axes = (0, 1)
+    if mapping.kind == "affine":
+        tables, d = _line_tables(mapping, (nu_y, nu_x), d, center, precision.window)
+    elif mapping.kind == "distorted":
+        tables = _distorted_tables(mapping, (nu_y, nu_x), center)
+    d = d * (2 / (n_fft[0] * n_fft[1]))
+    d[:, 0] *= 0.5
+    d[:, :, h_x - 1] *= 0.5
+    nu, d_plus, d_minus = (nu_y, nu_x), d[:, :, h_x - 1 :], d[:, :, h_x - 1 :: -1]
+    if mapping.kind == "aligned":
+        if mapping.matrix[0, 0] == 0:
+            axes, nu = (1, 0), (nu_x, nu_y)
+            d_plus, d_minus = d_plus.swapaxes(1, 2), d_minus.swapaxes(1, 2).conj()
+        tables = _aligned_tables(mapping, nu, axes, center)
+    in_y, in_x = (
+        _waves(nu[i], np.arange(mapping.shape_in[axes[i]]) - center[axes[i]]).T for i in (0, 1)
+    )
+    report |= {"wrap_radius_px": radius, "n_fft": n_fft, "n_frequencies": (h_y, h_x)}
+    return Plan(
+        mapping.kind,
+        mapping,
+        n_bands,
+        is_identity(mapping, psf_in, psf_out),
+        nu,
+        axes,
+        d_plus,
+        d_minus,
+        in_y,
+        in_x,
+        report=report,
+        **tables,
+    )
+
+
+def count_bands(mapping: Mapping, psf_in: PSF, psf_out: PSF) -> int:
+    """Bands of an operator between two PSFs of 1 or C bands.
+
+    raises ValueError for numbers of bands that do not agree, and for grids that do not overlap.
+    """
+    n_bands = max(psf_in.n_bands, psf_out.n_bands)
+    for name, psf in (("psf_in", psf_in), ("psf_out", psf_out)):
+        if psf.n_bands not in (1, n_bands):
+            raise ValueError(
+                f"{name} has {psf.n_bands} bands but the other PSF has {n_bands}: "
+                "give one band or as many as the other"
+            )
+    if not mapping.covered.any():
+        raise ValueError(
+            "the grids do not overlap: no pixel of the observation "
+            f"{mapping.shape_out} lies on the model {mapping.shape_in}"
+        )
+    return n_bands
+
+
+def is_identity(mapping: Mapping, psf_in: PSF, psf_out: PSF) -> bool:
+    """Same pixels and the same PSF: D = 1 and the operator must return its input bit for bit."""
+    return (
+        mapping.kind == "aligned"
+        and mapping.shape_in == mapping.shape_out
+        and np.array_equal(mapping.matrix, np.eye(2))
+        and not np.any(mapping.offset)
+        and psf_in.spacing == psf_out.spacing
+        and np.array_equal(psf_in.images, psf_out.images)
+        and np.array_equal(psf_in.center, psf_out.center)
+    )
+
+
+def _odd(x: float) -> int:
+    n = int(np.ceil(x))
+    return n + 1 - n % 2
+
+
+def _half_count(matrix, spacing: float, axis: int, n_fft: int) -> int:
+    """Frequencies kappa >= 0 inside the bounding box of |A^T nu|_inf <= 1/(2 spacing)."""
+    reach = np.abs(np.linalg.inv(matrix).T[axis]).sum() * 0.5 / spacing
+    return min(int(np.floor(reach * n_fft * (1 + 1e-12))), (n_fft - 1) // 2) + 1
+
+
+def _waves(nu, x) -> np.ndarray:
+    """Columns 2i, 2i+1: cos and sin of 2 pi nu_i x (..., 2 len(nu)) for positions x (...)."""
+    angle = 2 * np.pi * np.asarray(x)[..., None] * nu
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1).reshape(*angle.shape[:-1], -1)
+
+
+def _aligned_tables(mapping: Mapping, nu, axes, center):
+    """Waves at the observed rows and columns, zero where the model does not cover them."""
+    tables = []
+    for i in (0, 1):
+        axis = axes[i]
+        x = mapping.matrix[axis, i] * np.arange(mapping.shape_out[i]) + mapping.offset[axis]
+        covered = mapping.covered.any(axis=1 - i)
+        tables.append(_waves(nu[i], x - center[axis]) * covered[:, None])
+    return {"out_y": tables[0], "out_x": tables[1].T}
+
+
+def _distorted_tables(mapping: Mapping, nu, center):
+    """Waves at every observed pixel, with the pixel's own area; zero where it is not covered."""
+    scale = mapping.covered * (1.0 if mapping.area is None else mapping.area)
+    y, x = np.moveaxis(mapping.positions, -1, 0)
+    return {
+        "out_y": _waves(nu[0], y.ravel() - center[0]) * scale.reshape(-1, 1),
+        "out_x": _waves(nu[1], x.ravel() - center[1]),
+    }
+
+
+def _line_tables(mapping: Mapping, nu, d, center, window: KaiserBessel):
+    """Observed rows (or columns) as lines y = y0 + r x through the model, and pass 2 along them.
+
+    Along a line a plane wave has the single frequency nu_x + r nu_y; columns finer than its Nyquist
+    spacing by window.oversampling carry it, divided by the window's transform.  Returns
+    (tables, d).
+    """
+    slope = np.abs(mapping.matrix[1]) / np.linalg.norm(mapping.matrix, axis=0)
+    by_row = slope[1] >= slope[0]
+    i_line, i_step = (0, 1) if by_row else (1, 0)
+    (a, b), (c, e) = mapping.matrix[:, [i_line, i_step]]
+    n_lines, n_steps = mapping.shape_out[i_line], mapping.shape_out[i_step]
+    r = b / e
+    t_y, t_x = mapping.offset - center
+    covered = mapping.covered if by_row else mapping.covered.T
+
+    nu_x_both = np.concatenate([-nu[1][:0:-1], nu[1]])
+    along = nu_x_both + r * nu[0][:, None]
+    nu_max = max(np.abs(along[(d != 0).any(axis=0)]).max(), np.finfo(float).tiny ** 0.5)
+    spacing = min(1 / (2 * nu_max * window.oversampling), float(max(mapping.shape_in)))
+    d = d / window.transform(along * spacing)
+
+    x = c * np.arange(n_lines)[:, None] + e * np.arange(n_steps) + t_x
+    x_first, x_last = x[covered].min(), x[covered].max()
+    u = (x - x_first) / spacing + window.n_taps / 2
+    n_columns = int(np.ceil((x_last - x_first) / spacing)) + window.n_taps + 1
+    columns = x_first + (np.arange(n_columns) - window.n_taps / 2) * spacing
+
+    below = np.floor(u - window.n_taps / 2)
+    start = np.where(covered, below.astype(int) + 1, 0)
+    weight = window.taps(u - window.n_taps / 2 - below) * covered[:, :, None]
+    start_t, weight_t = transpose_taps(start, weight, covered, n_columns)
+    y0 = (a - r * c) * np.arange(n_lines) + t_y - r * t_x
+    return {
+        "out_y": _waves(nu[0], y0),
+        "out_x": _waves(nu[1], columns).T,
+        "twist": 2 * np.pi * np.outer(nu[0], r * columns),
+        "lines": LineTaps(bool(by_row), start, weight.swapaxes(1, 2), start_t, weight_t),
+    }, d

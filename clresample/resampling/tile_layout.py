@@ -1,0 +1,229 @@
+"""Tiles of a frame: how large they should be, where they lie, which of them share an operator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from ..sky.extent import intersection
+from ..sky.grid import Grid
+from ..sky.mapping import Mapping
+from ..sky.psf import PSF
+from .plan import Precision, make_plan
+from .transfer import wrap_radius
+
+KINDS = ("aligned", "affine", "distorted")  # from the cheapest on
+TRIAL_PX = 32  # [observed px] side of the tile that shows which frequencies the band holds
+# A window reaches half the wrap radius beyond its tile at full weight, then falls to zero over the
+# other half, or over TAPER_PX [model px]: cut sharply, an image rings through the tile.
+FLAT, TAPER_PX = 0.5, 24
+# [observed px] sides to choose from, 8 to 16384
+SIDES = np.unique(np.rint(8 * 2 ** (np.arange(45) / 4)).astype(int))
+# What a tile costs besides its arithmetic, as the flops of that time: launches and the tables of
+# its shift (1 ms, where PoCL does 40 Gflop/s); each pixel's way out of the frame and back (2 ns).
+FLOPS_TILE, FLOPS_PIXEL = 4e7, 80
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One tile of the observed frame.
+
+    origin (2,) [observed px]: its first pixel
+    place (2,) [model px]: its window's first pixel; rarely whole
+    mask (My, Mx) bool: the pixels it gives to the frame; each pixel has one giver
+    """
+
+    origin: tuple[int, int]
+    place: np.ndarray
+    mask: np.ndarray
+
+
+@dataclass(frozen=True)
+class Group:
+    """Tiles that share one operator, from a window of the model to a tile, wherever these lie.
+
+    taper (Ny,), (Nx,): weights of the window's rows and columns
+    """
+
+    mapping: Mapping
+    taper: tuple[np.ndarray, np.ndarray]
+    tiles: list[Tile]
+
+
+def make_groups(
+    grid_in: Grid,
+    psf_in: PSF,
+    grid_out: Grid,
+    psf_out: PSF,
+    *,
+    precision: Precision,
+    tolerance_px: float,
+    memory: int,
+) -> list[Group]:
+    """Tiles that give every observed pixel on the model once, in groups that share an operator.
+
+    grid_in, psf_in: the model's; grid_out, psf_out: the observation's
+    tolerance_px [model px]: how far a pixel may be from where the WCS puts it
+    memory [bytes]: what one group's operator may take on its device
+
+    Raises ValueError for grids that do not overlap, band counts that do not match, and a memory
+    that is too small for the smallest tile.
+    """
+    region = intersection([grid_in, grid_out], like=grid_out)
+    corner = np.rint(region.map_to(grid_out).at(0, 0)).astype(int)
+    shape = tuple(min(n, TRIAL_PX) for n in region.shape)
+    middle = [(n - m) // 2 for n, m in zip(region.shape, shape, strict=True)]
+    trial = region.cutout(*middle, shape).map_to(grid_in, tolerance_px)
+    radius = np.array(wrap_radius(psf_out, trial.matrix))
+    margin = np.ceil(radius * FLAT + np.maximum(radius * (1 - FLAT), TAPER_PX)).astype(int)
+    sizes = Sizes(trial, margin, psf_in, psf_out, precision)
+    kind = trial.kind
+    while True:
+        shape = sizes.choose(kind, region.shape, memory)
+        worst, tiles = _lay(region, grid_in, shape, kind, tolerance_px)
+        if worst == kind:
+            break
+        kind = worst  # which deserves another size
+    groups = []
+    for start, mapping, mask in tiles:
+        group, place = _find(groups, mapping, margin, margin - radius * FLAT, tolerance_px)
+        origin = tuple(int(a + b) for a, b in zip(corner, start, strict=True))
+        group.tiles.append(Tile(origin, place, mask))
+    if not groups:
+        raise ValueError(
+            f"grids do not overlap: no pixel of the observation {grid_out.shape} lies on the model "
+            f"{grid_in.shape}"
+        )
+    return groups
+
+
+class Sizes:
+    """What tiles of any size cost, from one small plan.
+
+    trial: mapping of a small tile; margin (2,) [model px] of every window
+    """
+
+    def __init__(self, trial: Mapping, margin, psf_in: PSF, psf_out: PSF, precision: Precision):
+        kind = "affine" if trial.kind == "distorted" else trial.kind
+        window = window_of(replace(trial, kind=kind, positions=None, area=None), margin)
+        plan = make_plan(window, psf_in, psf_out, precision=precision)
+        n_fft = plan.report["n_fft"]
+        self.n_bands, self.itemsize = plan.n_bands, 4 if precision == Precision.of("f4") else 8
+        self.scale = np.abs(trial.matrix).sum(axis=1).max()
+        self.border = 2 * int(margin.max()) + 2
+        self.pad = max(k - n for k, n in zip(n_fft, window.shape_in, strict=True))
+        # the band's edge, known to one frequency of the small plan
+        n_frequencies = plan.report["n_frequencies"]
+        self.band = max((h + 1) / k for h, k in zip(n_frequencies, n_fft, strict=True))
+        self.columns, self.taps, self.taps_back = 0.0, 0, 0
+        if kind == "affine":
+            self.taps, self.taps_back = plan.lines.weight.shape[1], plan.lines.weight_t.shape[1]
+            reach = np.abs(trial.matrix) @ np.subtract(trial.shape_out, 1)
+            self.columns = (plan.out_x.shape[1] - self.taps) / max(reach.min(), 1)
+
+    def cost(self, kind, m):
+        """Arithmetic [flops] of a tile of m x m observed pixels, and device memory [bytes]."""
+        n = int(np.ceil(self.scale * (m - 1))) + self.border
+        k = 2 * (int(self.band * (n + self.pad)) + 1)
+        wide = k + 16  # rows are padded
+        flops = n * n * k + n * k * k
+        tables = 4 * n * wide
+        spectra = wide * (max(n, m) + k) + k * k
+        if kind == "aligned":
+            flops += m * k * k + m * m * k
+            tables += 4 * m * wide
+        elif kind == "affine":
+            j = int(self.columns * self.scale * m) + self.taps + 16
+            flops += k * k * j + m * k * j + m * m * self.taps
+            tables += 2 * m * k + 4 * j * wide
+            tables += m * (m * (self.taps + 1) + j * (self.taps_back + 2))
+            spectra += (k + m) * j
+        else:
+            flops += m * m * k * (k + 1)
+            tables += 3 * m * m * wide
+            spectra += m * m * wide
+        images = 2 * (n * n + m * m)  # both ways
+        time = 2 * self.n_bands * flops + FLOPS_TILE + FLOPS_PIXEL * self.n_bands * (n * n + m * m)
+        return time, self.itemsize * (tables + self.n_bands * (spectra + images))
+
+    def choose(self, kind, shape, memory):
+        """Tile shape (My, Mx) [observed px] of the quickest frame of this shape within `memory`."""
+        best = None
+        for side in SIDES:
+            counts = [-(-n // side) for n in shape]
+            tile = tuple(-(-n // count) for n, count in zip(shape, counts, strict=True))
+            time, n_bytes = self.cost(kind, max(tile))
+            if n_bytes > memory:
+                break
+            if best is None or counts[0] * counts[1] * time < best[0]:
+                best = counts[0] * counts[1] * time, tile
+        if best is None:
+            raise ValueError(
+                f"memory is {memory} bytes, but tiles of {max(tile)} pixels a side need {n_bytes}"
+            )
+        return best[1]
+
+
+def window_of(mapping: Mapping, margin) -> Mapping:
+    """The mapping, affine, between the same tile and the middle of a window that holds it.
+
+    The window leaves `margin` (2,) [model px] on every side, and half a pixel for a shift.
+    """
+    middle = np.subtract(mapping.shape_out, 1) / 2
+    reach = np.abs(mapping.matrix) @ (2 * middle)
+    shape = np.ceil(reach).astype(int) + 2 * margin + 2
+    offset = (shape - 1) / 2 - mapping.matrix @ middle
+    return replace(mapping, shape_in=tuple(int(n) for n in shape), offset=offset)
+
+
+def _lay(region, grid_in, shape, kind, tolerance_px):
+    """Kind of a region's tiles; unless it is worse than `kind`: their starts, mappings, masks."""
+    tiles = []
+    for first in product(*(range(0, n, m) for n, m in zip(region.shape, shape, strict=True))):
+        # the last tiles of a row or column overlap those before
+        start = [min(i, n - m) for i, n, m in zip(first, region.shape, shape, strict=True)]
+        mapping = region.cutout(*start, shape).map_to(grid_in, tolerance_px)
+        mask = mapping.covered
+        mask[: first[0] - start[0]] = False
+        mask[:, : first[1] - start[1]] = False
+        if mask.any():
+            if KINDS.index(mapping.kind) > KINDS.index(kind):
+                return mapping.kind, []
+            tiles.append((start, mapping, mask))
+    return kind, tiles
+
+
+def _find(groups, mapping, margin, width, tolerance_px):
+    """The first group whose operator serves a tile, or a new one; and the tile's place in it."""
+    middle = np.subtract(mapping.shape_out, 1) / 2
+    if mapping.kind == "distorted":
+        inside = mapping.positions[mapping.covered]
+        low = np.floor(inside.min(axis=0)).astype(int) - margin
+        shape = np.ceil(inside.max(axis=0)).astype(int) + margin - low + 1
+        window = mapping.window(low, tuple(int(n) for n in shape), (0, 0), mapping.shape_out)
+        groups.append(Group(window, _taper(window.shape_in, width), []))
+        return groups[-1], low.astype(float)
+    for group in groups:
+        if group.mapping.kind != mapping.kind:
+            continue
+        turn = mapping.matrix - group.mapping.matrix
+        moved = max(np.hypot(*(turn @ (middle * corner))) for corner in ((1, 1), (1, -1)))
+        if moved + mapping.departure_px <= tolerance_px:
+            break
+    else:
+        window = window_of(mapping, margin)
+        group = Group(window, _taper(window.shape_in, width), [])
+        groups.append(group)
+    window = group.mapping
+    return group, mapping.matrix @ middle + mapping.offset - window.matrix @ middle - window.offset
+
+
+def _taper(shape, width):
+    """Weights along each axis: 1 inside, down to 0 over `width` (2,) [px], smooth to order 3."""
+    tapers = []
+    for n, w in zip(shape, width, strict=True):
+        u = np.minimum((np.minimum(np.arange(n), np.arange(n)[::-1]) + 0.5) / w, 1)
+        tapers.append(u**4 * (35 - 84 * u + 70 * u**2 - 20 * u**3))
+    return tapers[0], tapers[1]

@@ -1,0 +1,1 @@
+"""Simulated surveys, galaxies and scenes, with their truth. Imports `sky` alone."""

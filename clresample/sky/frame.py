@@ -1,0 +1,113 @@
+"""The model's own pixels and PSF, on which every source lives."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from .extent import boxes_meet, intersection, overlap, union
+from .grid import Grid
+from .observation import check_observations
+from .psf import PSF
+
+# [sigma] half-width of the model PSF's image: what lies beyond is under 1e-16 of the light
+REACH = 8.5
+# relative difference of two pixel scales that counts as none: header digits, not pixels
+SAME_SCALE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Pixels and PSF of the model.
+
+    grid: Grid of the model's pixels (Ny, Nx)
+    psf: PSF of one band in these pixels, pixel response included; see `model_frame`
+    """
+
+    grid: Grid
+    psf: PSF
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(Ny, Nx) [px]."""
+        return self.grid.shape
+
+    def place(self, sources) -> np.ndarray:
+        """Positions (S, 2) [px] of the sources: (y, x); NaN where the projection has no place."""
+        return np.array([source.pixel(self.grid) for source in sources]).reshape(-1, 2)
+
+    def inside(self, positions) -> np.ndarray:
+        """Which positions (..., 2) [px] lie on a pixel of the frame: -1/2 <= x < N - 1/2.
+
+        The edge belongs to one pixel only, floor(x + 1/2). A source that is not inside is told and
+        not fitted: of its light the frame would hold a part at best, and its centre, from which a
+        morphology falls, not at all. One inside is fitted however near to the edge, with what the
+        frame holds of it.
+
+        returns (...) bool; False for NaN
+        """
+        positions = np.asarray(positions, dtype=np.float64)
+        return ((positions >= -0.5) & (positions < np.array(self.shape) - 0.5)).all(axis=-1)
+
+
+def model_frame(observations, *, grid=None, psf_sigma_px=0.8, shared=False) -> Frame:
+    """Frame on the finest pixels among the observations, with a Gaussian PSF.
+
+    observations: what will be fitted; see `check_observations`
+    grid: Grid to take as it is; None = the pixels and orientation of the observation with the
+        smallest pixel (of equal ones the first), as many as needed
+    psf_sigma_px [model px]: standard deviation of the PSF before its convolution with the pixel
+    shared: cover only what all observations see (the intersection of their footprints), instead of
+        what any of them sees (the union)
+
+    Footprints are upright boxes in the frame's pixels: the union reaches to the corners of a
+    rotated observation, so parts of the frame may be seen by none, and the intersection of rotated
+    ones may do so too. Observed pixels outside the frame have no model and must get no weight
+    (`Resampler.covered`).
+
+    Raises ValueError for a grid that is flat where observations have a WCS or the reverse, where
+    an observation overlaps none of the others, or not the frame, and for what `check_observations`
+    finds.
+    """
+    check_observations(observations)
+    if not 0 < psf_sigma_px < math.inf:
+        raise ValueError(f"psf_sigma_px must be a positive number of pixels, not {psf_sigma_px}")
+    if grid is None:
+        scales = np.array([o.grid.pixel_scale_arcsec for o in observations])
+        like = observations[int(np.argmax(scales <= (1 + SAME_SCALE) * scales.min()))].grid
+        _check_connected(observations, like)
+        extent = intersection if shared else union
+        grid = extent([o.grid for o in observations], like=like)
+    for observation in observations:
+        if (observation.grid.wcs is None) != (grid.wcs is None):
+            kind, other = ("flat", "placed by a WCS")[:: 1 if grid.wcs is None else -1]
+            raise ValueError(
+                f"grid is {kind}, observation {observation.label!r} {other}: "
+                "give both a WCS (Grid.to_wcs)"
+            )
+        if not overlap(observation.grid, grid):
+            raise ValueError(
+                f"observation {observation.label!r} does not overlap the model frame: "
+                f"none of its {observation.grid.shape} pixels lies on the frame's "
+                f"{grid.shape}"
+            )
+    # the pixel adds its own variance, 1/12, to the Gaussian's
+    radius = math.ceil(REACH * math.sqrt(psf_sigma_px**2 + 1 / 12))
+    return Frame(grid, PSF.gaussian(psf_sigma_px, n_pixels=2 * radius + 1))
+
+
+def _check_connected(observations, like):
+    """Every observation overlaps another, and no group of them stands apart: one patch of sky."""
+    near, far = [observations[0]], list(observations[1:])
+    while far:
+        met = [o for o in far if any(boxes_meet(o.grid, n.grid, like) for n in near)]
+        if not met:
+            raise ValueError(
+                f"observation {far[0].label!r} does not overlap "
+                f"{', '.join(repr(o.label) for o in near)}: these are not images of "
+                "one patch of sky"
+            )
+        near += met
+        far = [o for o in far if o not in met]

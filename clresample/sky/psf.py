@@ -1,0 +1,250 @@
+"""Point-spread functions as samples, and their exact spectrum at any frequency."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+from .psf_checks import CORE_TOLERANCE, EDGE_TOLERANCE, PSFWarning, core_of
+
+# relative slack on the band's edge, above the rounding of A^T nu in float64
+BAND_SLACK = 1e-12
+# [complex numbers] one block of the general transform's tables: 16 MiB, near the cache's size
+BLOCK = 1 << 20
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class PSF:
+    """PSF images of one instrument, each band divided by its own sum.
+
+    images (C, ny, nx) [1]: samples, pixel response included; a single (ny, nx) image is one band
+    spacing [px]: distance of two samples in pixels of the PSF's grid; 0.5 = 2x oversampled
+    center (C, 2) [samples]: (y, x) array coordinates of each band's centre. Given as None: the
+        geometric centre (n-1)/2; as "core": the centroid of each band's core; else (2,) or (C, 2)
+
+    Raises ValueError for wrong shapes, NaN or infinite samples, and sums that are not positive.
+    Warns (PSFWarning) what `report` says.
+    """
+
+    images: np.ndarray
+    spacing: float
+    center: np.ndarray
+
+    def __init__(self, images, *, spacing=1.0, center=None):
+        images = np.array(images, dtype=np.float64)
+        if images.ndim == 2:
+            images = images[None]
+        if images.ndim != 3 or 0 in images.shape:
+            raise ValueError(f"images must be (C, ny, nx) or (ny, nx), not {images.shape}")
+        if not (np.isfinite(spacing) and spacing > 0):
+            raise ValueError(f"spacing must be a positive number of pixels, not {spacing}")
+        for i_band, image in enumerate(images):
+            n_bad = np.count_nonzero(~np.isfinite(image))
+            if n_bad:
+                raise ValueError(f"images: band {i_band} has {n_bad} NaN or infinite samples")
+            # a sum that cancels to rounding is no normalisation
+            if not image.sum() > 1e-12 * np.abs(image).sum():
+                raise ValueError(f"images: band {i_band} has the sum {image.sum():.3g}, not > 0")
+        images /= images.sum(axis=(1, 2), keepdims=True)
+        self._set(images, float(spacing), _center(images, center))
+        for message in self.report():
+            warnings.warn(message, PSFWarning, stacklevel=2)
+
+    def _set(self, images, spacing, center):
+        for array in (images, center):
+            array.flags.writeable = False
+        object.__setattr__(self, "images", images)
+        object.__setattr__(self, "spacing", spacing)
+        object.__setattr__(self, "center", center)
+
+    @classmethod
+    def gaussian(cls, sigma_px, *, n_pixels=41, pixel=True, n_bands=1, spacing=1.0):
+        """Round Gaussian, integrated over pixels by error functions unless `pixel` is False.
+
+        sigma_px [px]: standard deviation, one number or one per band
+        n_pixels [samples]: size of the image, one number or (ny, nx)
+        pixel: convolve with the (square, unit) pixel of the grid the PSF belongs to
+        n_bands: number of bands when sigma_px is one number
+        spacing [px]: distance of two samples
+
+        Raises ValueError for a sigma that is not positive.
+        """
+        sigmas = np.atleast_1d(np.asarray(sigma_px, dtype=np.float64))
+        if sigmas.ndim != 1 or not (np.isfinite(sigmas) & (sigmas > 0)).all():
+            raise ValueError(f"sigma_px must be positive numbers, not {sigma_px}")
+        if sigmas.size == 1:
+            sigmas = np.repeat(sigmas, n_bands)
+        elif n_bands not in (1, sigmas.size):
+            raise ValueError(f"sigma_px has {sigmas.size} bands, n_bands is {n_bands}")
+        n_y, n_x = np.broadcast_to(n_pixels, 2)
+        profile = _pixel_gaussian if pixel else _gaussian
+        axes = [[profile(n, spacing, sigma) for n in (n_y, n_x)] for sigma in sigmas]
+        return cls(np.stack([np.outer(y, x) for y, x in axes]), spacing=spacing)
+
+    @property
+    def n_bands(self):
+        return self.images.shape[0]
+
+    def __getitem__(self, i_band):
+        return self.select(i_band)
+
+    def select(self, bands):
+        """The PSF of some bands only: a number, a slice, or a sequence of numbers."""
+        if isinstance(bands, (int, np.integer)):
+            bands = [bands]
+        psf = object.__new__(PSF)
+        try:
+            psf._set(self.images[bands].copy(), self.spacing, self.center[bands].copy())
+        except IndexError:
+            raise ValueError(f"bands {bands} of a PSF that has {self.n_bands}") from None
+        return psf
+
+    def spectrum(self, nu_y, nu_x, matrix=None):
+        """Fourier transform of the samples, straight at the frequencies f = A^T nu.
+
+            P^(f) = sum_s P[s] exp(-2 pi i f.(s - center) spacing),  0 where |f|_inf > 1/(2 spacing)
+
+        nu_y (Ky,), nu_x (Kx,) [cycles per pixel]: frequencies, axis by axis, of the other grid
+        matrix (2, 2): A, from this PSF's pixels to those of the other grid; None = identity
+        returns (C, Ky, Kx) complex128
+
+        Raises ValueError for a matrix that is not (2, 2). Source: eq. `psf_diff`, at frequencies
+        instead of pixels, so that no PSF image is ever interpolated.
+        """
+        matrix = np.eye(2) if matrix is None else np.asarray(matrix, dtype=np.float64)
+        if matrix.shape != (2, 2):
+            raise ValueError(f"matrix must be (2, 2), not {matrix.shape}")
+        nu_y, nu_x = (np.asarray(nu, dtype=np.float64).ravel() for nu in (nu_y, nu_x))
+        (a, b), (c, d) = matrix
+        limit = (1 + BAND_SLACK) / (2 * self.spacing)
+        outside = np.abs(a * nu_y[:, None] + c * nu_x) > limit
+        outside |= np.abs(b * nu_y[:, None] + d * nu_x) > limit
+        result = np.empty((self.n_bands, nu_y.size, nu_x.size), dtype=np.complex128)
+        # bands that share a centre share the exponentials
+        centers, i_center = np.unique(self.center, axis=0, return_inverse=True)
+        for i, center in enumerate(centers):
+            bands = np.flatnonzero(i_center.ravel() == i)
+            result[bands] = _transform(self, bands, center, nu_y, nu_x, matrix)
+        result[:, outside] = 0
+        return result
+
+    def core(self):
+        """Centroid of each band's core: Gaussian-weighted, from the brightest sample on.
+
+        returns (C, 2) [samples]: (y, x) array coordinates
+        """
+        return np.stack([core_of(image) for image in self.images])
+
+    def edge_light(self):
+        """Light beyond the edge, as a fraction of the light inside, for a wing falling as r^-3.
+
+            L = 2 pi R^2 I(R),   I: mean of the outermost ring, R = (sqrt(ny nx) - 1)/2 its radius
+
+        returns (C,): negative where the ring's mean is
+        """
+        n_y, n_x = self.images.shape[1:]
+        ring = np.ones((n_y, n_x), dtype=bool)
+        ring[1:-1, 1:-1] = False
+        radius = (math.sqrt(n_y * n_x) - 1) / 2
+        return 2 * math.pi * radius**2 * self.images[:, ring].mean(axis=1)
+
+    def report(self):
+        """What a user should know of this PSF: list of sentences, with figures.
+
+        A core more than 0.25 samples off the centre along an axis, and more than 5 % of the light
+        (either sign) beyond the edge, by `edge_light`.
+        """
+        messages = []
+        cores = self.core()
+        off = cores - self.center
+        far = np.abs(off).max(axis=1)
+        if far.max() > CORE_TOLERANCE:
+            i = int(far.argmax())
+            messages.append(
+                f"PSF core off the centre, {_bands(far > CORE_TOLERANCE)}: in band {i} it is at "
+                f"(y, x) = ({cores[i, 0]:.2f}, {cores[i, 1]:.2f}), ({off[i, 0]:+.2f}, "
+                f"{off[i, 1]:+.2f}) samples from ({self.center[i, 0]:g}, {self.center[i, 1]:g}), "
+                'and shifts the result by as much; center="core" takes the core'
+            )
+        light = self.edge_light()
+        cut = np.abs(light) > EDGE_TOLERANCE
+        if cut.any():
+            i = int(np.abs(light).argmax())
+            n_y, n_x = self.images.shape[1:]
+            messages.append(
+                f"PSF light cut at the edge of the {n_y} x {n_x} image, {_bands(cut)}: in band {i} "
+                f"about {100 * light[i]:.1f} % lies beyond; a larger image, or one without "
+                "background, is needed"
+            )
+        return messages
+
+
+def _bands(chosen):
+    """The bands of a mask, in words."""
+    numbers = np.flatnonzero(chosen)
+    return f"band{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"
+
+
+def _center(images, center):
+    """(C, 2) centres from what the user gave."""
+    n_bands, n_y, n_x = images.shape
+    if isinstance(center, str):
+        if center != "core":
+            raise ValueError(f'center must be "core", (2,) or (C, 2) numbers, not "{center}"')
+        return np.stack([core_of(image) for image in images])
+    if center is None:
+        center = ((n_y - 1) / 2, (n_x - 1) / 2)
+    center = np.asarray(center, dtype=np.float64)
+    if center.shape not in ((2,), (n_bands, 2)) or not np.isfinite(center).all():
+        raise ValueError(f"center must be (2,) or ({n_bands}, 2) finite numbers, not {center}")
+    return np.broadcast_to(center, (n_bands, 2)).copy()
+
+
+def _offsets(n, spacing):
+    return (np.arange(n) - (n - 1) / 2) * spacing
+
+
+def _gaussian(n, spacing, sigma):
+    return np.exp(-0.5 * (_offsets(n, spacing) / sigma) ** 2)
+
+
+def _pixel_gaussian(n, spacing, sigma):
+    """Integral over the unit pixel; erfc of |u| keeps the digits of the wings."""
+    width = math.sqrt(2) * sigma
+    offsets = np.abs(_offsets(n, spacing))
+    return np.array([math.erfc((u - 0.5) / width) - math.erfc((u + 0.5) / width) for u in offsets])
+
+
+def _waves(frequencies, positions):
+    """exp(-2 pi i f u) as (F, U); whole cycles go before the product with 2 pi rounds them."""
+    cycles = np.multiply.outer(frequencies, positions)
+    cycles -= np.rint(cycles)
+    return np.exp(-2j * np.pi * cycles)
+
+
+def _transform(psf, bands, center, nu_y, nu_x, matrix):
+    """Sum over the samples of `bands`, all centred at `center`: (bands, Ky, Kx)."""
+    images = psf.images[bands]
+    n_y, n_x = images.shape[1:]
+    u = (np.arange(n_y) - center[0]) * psf.spacing
+    v = (np.arange(n_x) - center[1]) * psf.spacing
+    (a, b), (c, d) = matrix
+    # f.(u, v) = nu_y (a u + b v) + nu_x (c u + d v)
+    if b == c == 0:
+        return _waves(nu_y, a * u) @ images @ _waves(nu_x, d * v).T
+    if a == d == 0:
+        return _waves(nu_y, b * v) @ images.transpose(0, 2, 1) @ _waves(nu_x, c * u).T
+    waves_yu, waves_yv = _waves(nu_y, a * u), _waves(nu_y, b * v)
+    waves_xu, waves_xv = _waves(nu_x, c * u), _waves(nu_x, d * v)
+    result = np.zeros((len(bands), nu_y.size, nu_x.size), dtype=np.complex128)
+    n_rows = max(1, BLOCK // (n_x * (nu_y.size + nu_x.size)))
+    for i in range(0, n_y, n_rows):
+        rows = slice(i, i + n_rows)
+        left = (waves_yu[:, rows, None] * waves_yv[:, None]).reshape(nu_y.size, -1)
+        right = (waves_xu[:, rows, None] * waves_xv[:, None]).reshape(nu_x.size, -1)
+        for k in range(len(bands)):
+            result[k] += left @ (right * images[k, rows].ravel()).T
+    return result

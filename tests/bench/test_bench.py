@@ -1,0 +1,111 @@
+"""The benchmarks on a tiny configuration: rows, record, one-line answers to bad options."""
+
+import json
+
+import pytest
+from helpers.checkout import run_python
+
+ROW = {
+    "from", "to", "n_model", "n_obs", "angle_deg", "batch", "ours_ms", "ours_both_ms",
+    "ours_device_ms", "galsim_ms", "galsim_sinc_ms", "ratio", "ours_sdr", "galsim_sdr",
+    "galsim_sinc_sdr", "galsim_formula_sdr", "setup_ms", "gflop",
+}  # fmt: skip
+RECORD = {"date", "device", "platform", "machine", "python", "threads", "clresample", "numpy"}
+
+
+def run(module, *options):
+    result = run_python("-m", f"bench.{module}", *options)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def test_render(tmp_path):
+    pytest.importorskip("galsim")
+    file = tmp_path / "render.json"
+    text = run(
+        "render", "--sizes", "20", "30", "--pairs", "EUCLID-RUBIN", "hst-hst",
+        "--galaxies", "1", "--seconds", "0.01", "--json", str(file),
+    )  # fmt: skip
+    found = json.loads(file.read_text())
+    rows = found["rows"]
+    assert all(row.keys() == ROW for row in rows)
+    assert found["record"].keys() >= RECORD
+    assert "OMP_NUM_THREADS=1" in found["record"]["threads"]
+    cases = {(r["from"], r["to"], r["n_model"], r["angle_deg"], r["batch"]) for r in rows}
+    assert len(cases) == len(rows) == 2 * 2 * 2 * 2  # pairs, sizes, angles, batches
+    for row in rows:
+        assert row["ratio"] == pytest.approx(row["galsim_ms"] / row["ours_ms"])
+        assert row["n_obs"] == row["n_model"] // (2 if row["to"] == "RUBIN" else 1)
+        assert row["ours_sdr"] > row["galsim_sdr"] - 0.5  # dB: stamps this small cut the galaxies
+        if row["to"] == "HST" and row["angle_deg"] == 0:
+            assert row["ours_sdr"] > 70  # dB: the identity, as the truth rounded to float32
+    assert set(found["summary"]) == {
+        "ratio", "ratio in batches of 64", "forward + adjoint over forward",
+        "30 degrees over aligned",
+    }  # fmt: skip
+    assert "EUCLID-RUBIN ratio" in text
+    assert list(tmp_path.iterdir()) == [file]  # no half-written file is left
+
+
+def test_quick_has_every_pair_and_the_main_sizes():
+    from bench import common, render
+
+    options = render.parser().parse_args(["--quick"])
+    planned = {
+        (pair, n, angle, batch)
+        for pair, n, angles, batches in render.plan(options)
+        for angle in angles
+        for batch in batches
+    }
+    assert {case[0] for case in planned} == set(common.survey_pairs())
+    assert len(common.survey_pairs()) == 15
+    for n_model in (50, 100, 200, 400):
+        assert (("EUCLID", "RUBIN"), n_model, 0.0, 1) in planned
+
+
+def test_contract(tmp_path):
+    file = tmp_path / "contract.json"
+    run("contract", "--seconds", "0.001", "--json", str(file))
+    found = json.loads(file.read_text())
+    assert found["record"].keys() >= RECORD
+    for row in found["rows"]:
+        assert row.keys() == {"shape", "batch", "dtype", "ours_gflops", "numpy_gflops", "ratio"}
+        assert row["ratio"] == pytest.approx(row["ours_gflops"] / row["numpy_gflops"])
+    assert ([256, 256, 256], 8, "float32") in [
+        (row["shape"], row["batch"], row["dtype"]) for row in found["rows"]
+    ]
+
+
+@pytest.mark.parametrize(
+    ("module", "options", "words"),
+    [
+        ("render", ("--sizes", "0"), "0 is not above 0"),
+        ("render", ("--sizes", "1", "--pairs", "EUCLID-RUBIN"), "no observed pixel"),
+        ("render", ("--quick", "--sizes", "20"), "leave --sizes out"),
+        ("render", ("--pairs", "RUBIN-HST"), "RUBIN-HST is not FROM-TO"),
+        ("render", ("--galaxies", "few"), "few"),
+        ("render", ("--catalogue", "nowhere"), "nowhere"),
+        ("render", ("--fast",), "--fast"),
+        ("contract", ("--json", "."), "--json ."),
+        ("contract", ("--json", "nowhere/x.json"), "nowhere"),
+        ("contract", ("--seconds", "nan"), "nan"),
+    ],
+)
+def test_bad_options_get_one_line(module, options, words):
+    result = run_python("-m", f"bench.{module}", *options)
+    assert result.returncode == 2
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1
+    assert words in result.stderr
+
+
+def test_json_is_written_whole_or_not_at_all(tmp_path):
+    from bench.common import write_json
+
+    file = tmp_path / "x.json"
+    write_json(file, {"rows": [1.0, float("inf"), {"a": float("nan")}]})
+    assert json.loads(file.read_text()) == {"rows": [1.0, None, {"a": None}]}
+    with pytest.raises(TypeError):
+        write_json(file, {"rows": object()})
+    assert json.loads(file.read_text())["rows"][0] == 1.0
+    assert list(tmp_path.iterdir()) == [file]

@@ -1,0 +1,135 @@
+"""The benchmarks of deblending on a few scenes: rows, summaries, runs that go on, bad options."""
+
+import json
+
+import numpy as np
+import pytest
+from helpers.checkout import run_python
+
+pytest.importorskip("galsim")
+
+SHORT = ("--scenes", "1", "--max-iter", "10")
+ROW = {
+    "seed", "view", "angle_deg", "mirrored", "mode", "batch", "n_sources", "iterations",
+    "ms_per_iteration", "galsim_ms", "ratio", "wall_s", "wall_again_s", "seconds", "sdr",
+    "sdr_median", "chi2", "chi2_by_instrument", "converged",
+}  # fmt: skip
+BATCH_ROW = {
+    "mode", "batch", "n_sources", "iterations", "ms_per_iteration", "galsim_ms", "ratio", "wall_s",
+    "scenes_per_second", "sdr", "sdr_median", "chi2", "converged", "n_converged",
+}  # fmt: skip
+
+
+def run(module, *options):
+    result = run_python("-m", f"bench.{module}", *options)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def test_deblend(tmp_path):
+    file = tmp_path / "deblend.json"
+    text = run(
+        "deblend", *SHORT, "--seed", "2", "--views", "upright", "turned", "--batches", "1", "2",
+        "--json", str(file),
+    )  # fmt: skip
+    found = json.loads(file.read_text())
+    singles = [row for row in found["rows"] if "view" in row]
+    batches = [row for row in found["rows"] if "view" not in row]
+    assert all(row.keys() == ROW for row in singles)
+    assert all(row.keys() == BATCH_ROW for row in batches)
+    assert [(r["view"], r["mode"]) for r in singles] == [
+        (view, mode) for view in ("upright", "turned") for mode in ("rubin", "euclid", "joint")
+    ]
+    assert [(r["batch"], len(r["sdr"])) for r in batches] == [
+        (n, n * singles[0]["n_sources"]) for n in (1, 2)
+    ]
+    for row in found["rows"]:
+        assert row["ratio"] == pytest.approx(row["ms_per_iteration"] / row["galsim_ms"])
+        assert 0 < row["iterations"] <= 10 * row["batch"]
+        assert row["sdr_median"] == pytest.approx(np.median(row["sdr"]))
+        assert 0.8 < row["chi2"] < 2
+    joint = singles[2]
+    assert joint["chi2_by_instrument"].keys() == {"Euclid", "Rubin"}
+    summary = found["summary"]
+    assert summary["upright"]["galaxies"] == joint["n_sources"]
+    assert summary["upright"]["sdr joint [dB]"] == pytest.approx(joint["sdr_median"])
+    assert summary["turned"]["sdr euclid against upright [dB]"] == pytest.approx(0, abs=1e-3)
+    assert "joint over the better single [share]" in text
+
+
+def test_joint_goes_on_where_it_ended(tmp_path):
+    options = ("--processes", "1", "--folder", str(tmp_path))
+    run("joint", "--scenes", "1", *options)
+    one = (tmp_path / "joint.jsonl").read_text()
+    text = run("joint", "--scenes", "2", *options)
+    two = (tmp_path / "joint.jsonl").read_text()
+    assert two.startswith(one)
+    assert two.count("\n") == 3  # settings and two scenes
+    found = json.loads((tmp_path / "joint.json").read_text())
+    counts = [len(json.loads(line)[1]["euclid_mag"]) for line in two.splitlines()[1:]]
+    assert found["n_galaxies"] == sum(counts) == np.sum(found["maps"]["number"])
+    assert found["starts"].keys() == {"own", "sersic"}
+    for finding in found["findings"]:
+        assert finding["found"].endswith(".")
+        assert finding["found"] in text
+        assert finding["figure"] is None or (tmp_path / finding["figure"]).is_file()
+
+
+def galaxies(n, gain, rng):
+    """Magnitudes and SDRs of n galaxies; joint is better than the better survey by `gain`."""
+    table = {name: rng.uniform(20, 29, n) for name in ("euclid_mag", "rubin_mag")}
+    table["own-euclid"], table["own-rubin"] = 30 - table["euclid_mag"], 30 - table["rubin_mag"]
+    better = np.maximum(table["own-euclid"], table["own-rubin"])
+    table["own-joint"] = better + gain + 0.1 * rng.standard_normal(n)
+    return table
+
+
+@pytest.mark.parametrize(("gain", "verdict"), [(1.0, True), (0.0, None), (-3.0, False)])
+def test_findings_say_what_the_numbers_say(gain, verdict):
+    from bench import joint_findings
+
+    table = galaxies(600, gain, np.random.default_rng(3))
+    maps = joint_findings.bin_galaxies(table, ["own"])
+    assert maps["number"].shape == (6, 6)
+    assert maps["number"].sum() == 600
+    inside = (table["euclid_mag"] < 21.5) & (table["rubin_mag"] >= 27.5)
+    difference = (table["own-joint"] - table["own-rubin"])[inside]
+    assert maps["gain"]["own-rubin"][0, -1] == pytest.approx(difference.mean())
+    error = difference.std(ddof=1) / np.sqrt(inside.sum())
+    assert maps["error"]["own-rubin"][0, -1] == pytest.approx(error)
+    numbers = joint_findings.summarise(table, maps, ["own"])
+    found = joint_findings.joint(maps, ["own"], numbers)
+    gains = next(f for f in found if f.title.startswith("Where joint"))
+    assert gains.holds is verdict
+    assert ("it gains for galaxies bright in both" in gains.found) == (gain > 0)
+    assert ("it loses" in gains.found) == (gain < 0)
+
+
+def test_sersic_profiles_are_found():
+    from bench import sersic
+
+    y, x = np.indices((61, 64)) - np.array([30.3, 33.8])[:, None, None]
+    image = 5 * np.exp(-0.5 * ((y / 4) ** 2 + (x / 2) ** 2) ** (1 / 1.6))
+    found = sersic.fit(image, np.array([30.0, 33.0]))
+    assert np.abs(found / found.max() - image / image.max()).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("module", "options", "words"),
+    [
+        ("deblend", ("--scenes", "0"), "0 is not above 0"),
+        ("deblend", ("--seed", "-1"), "-1 is below 0"),
+        ("deblend", ("--views", "upside-down"), "upside-down"),
+        ("deblend", ("--max-iter", "few"), "few"),
+        ("deblend", ("--catalogue", "nowhere"), "nowhere"),
+        ("deblend", ("--json", "."), "--json ."),
+        ("joint", ("--scenes", "none"), "none"),
+        ("joint", ("--catalogue", "nowhere", "--folder", "."), "nowhere"),
+    ],
+)
+def test_bad_options_get_one_line(module, options, words):
+    result = run_python("-m", f"bench.{module}", *options)
+    assert result.returncode == 2
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1
+    assert words in result.stderr

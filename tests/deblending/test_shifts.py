@@ -1,0 +1,124 @@
+"""Shifts between observations are found during a fit, alone and in batches."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from clresample.deblending.batch import deblend, deblend_many
+from clresample.deblending.blend import Blend
+from clresample.deblending.settings import Settings
+from clresample.deblending.shifts import shift_steps
+from clresample.resampling.cache import cached_resampler
+from clresample.sky.frame import model_frame
+from clresample.sky.grid import Grid
+from clresample.sky.observation import Observation
+from clresample.sky.psf import PSF
+from clresample.sky.sources import Extended
+
+SHARP, BLURRED = Grid.flat((60, 66), 0.1), Grid.flat((34, 36), 0.2, angle_deg=15)
+
+
+def blend(shift, *, seed=0, noise=1.0):
+    """Two lopsided galaxies; the blurred image is moved by `shift` (2,) [model px]."""
+    rng = np.random.default_rng(seed)
+    y, x = np.indices(SHARP.shape)
+    scene = sum(
+        flux * np.exp(-((y - a) ** 2 + (x - b) ** 2) / (2 * size**2)) / (2 * np.pi * size**2)
+        for a, b, flux, size in ((25, 25, 9e3, 2), (28, 31, 4e3, 4), (40, 45, 6e3, 2.5))
+    )
+    blank = [
+        Observation(
+            np.zeros((n, *grid.shape)),
+            PSF.gaussian(1.5, n_pixels=31),
+            grid,
+            weights=noise**-2,
+            channels=tuple(names),
+            name=names,
+        )
+        for n, grid, names in ((1, SHARP, "V"), (2, BLURRED, "gr"))
+    ]
+    frame = model_frame(blank, grid=SHARP)
+    made = []
+    for o, move in zip(blank, (np.zeros(2), shift), strict=True):
+        op = cached_resampler(frame, o.grid, o.psf, dtype=np.float64, private=True)
+        op.shift = move
+        data = op.render(scene) + rng.normal(0, noise, o.data.shape)
+        made.append(
+            Observation(data, o.psf, o.grid, weights=o.weights, channels=o.channels, name=o.name)
+        )
+    sources = Extended(position_px=(25, 25)), Extended(position_px=(40, 45))
+    return Blend(tuple(made), sources, frame)
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (0.6, -0.4), (-2.5, 3.0)])
+def test_a_shift_is_found(device, shift):
+    b = blend(shift)
+    given = {"frame": b.frame, "device": device}
+    settings = Settings(fit_shifts=True, max_iter=40)
+    first = deblend(b.observations, b.sources, settings=settings, **given)
+    assert not first.shifts[0].any()
+    # profiles started from images that disagree: of a large shift, some percent stay in them
+    np.testing.assert_allclose(first.shifts[1], shift, atol=0.05, rtol=0.04)
+    again = deblend(b.observations, b.sources, shifts=first.shifts, settings=settings, **given)
+    np.testing.assert_allclose(again.shifts[1], shift, atol=0.03)
+    fixed = deblend(b.observations, b.sources, shifts=again.shifts, **given)
+    np.testing.assert_array_equal(fixed.shifts, again.shifts)
+    for i in (0, 1):
+        assert np.nanmean(fixed.residual(i) ** 2) < 1.15
+
+
+@pytest.mark.parametrize("shifts", [np.zeros(2), [(0, 0), (np.nan, 0)]])
+def test_shifts_that_cannot_be_are_refused(shifts):
+    b = blend((0, 0))
+    with pytest.raises(ValueError, match=r"shifts is .* must be \(2, 2\) finite numbers"):
+        deblend(b.observations, b.sources, frame=b.frame, shifts=shifts)
+
+
+def test_without_being_asked_nothing_moves(device):
+    b = blend((1.2, -0.8))
+    result = deblend(
+        b.observations, b.sources, frame=b.frame, device=device, settings=Settings(max_iter=30)
+    )
+    assert not result.shifts.any()
+
+
+def test_batches_find_the_shifts_of_single_fits(device):
+    blends = [blend(shift, seed=i) for i, shift in enumerate([(0.5, 0.5), (-1, 1), (2, 0)])]
+    settings = Settings(fit_shifts=True, max_iter=60)
+    together = deblend_many(blends, settings=settings, device=device)
+    for b, result in zip(blends, together, strict=True):
+        alone = deblend(b.observations, b.sources, frame=b.frame, settings=settings, device=device)
+        np.testing.assert_allclose(result.shifts, alone.shifts, atol=2e-3)
+
+
+def test_the_step_is_the_shift_of_a_right_model(device):
+    """For a model that is right but for the shift, a first step goes all the way."""
+    shift = np.array([0.15, -0.1])
+    b = blend(shift, noise=1e-2)
+    problem = truth(b, device)
+    np.testing.assert_allclose(shift_steps(problem)[1], shift, atol=0.01)
+    problem.weights[1] = 0 * problem.weights[1]
+    assert np.abs(shift_steps(problem)[1]).max() < 1e-3
+
+
+def truth(b, device):
+    """What `shift_steps` reads of a problem whose model is right."""
+    y, x = np.indices(SHARP.shape)
+    galaxies = ((25, 25, 9e3, 2), (28, 31, 4e3, 4), (40, 45, 6e3, 2.5))
+    morphs = [np.exp(-((y - a) ** 2 + (x - c) ** 2) / (2 * s**2)) for a, c, _, s in galaxies]
+    peaks = np.array([flux / (2 * np.pi * s**2) for _, _, flux, s in galaxies])
+    return SimpleNamespace(
+        shape=SHARP.shape,
+        extent=SHARP.shape,
+        ops=[
+            cached_resampler(b.frame, o.grid, o.psf, dtype=np.float64, device=device)
+            for o in b.observations
+        ],
+        data=[o.data for o in b.observations],
+        weights=[o.weights for o in b.observations],
+        origin=np.zeros((3, 2), int),
+        morph=morphs,
+        spectra=np.repeat(peaks[:, None], 3, axis=1),
+        sky=np.zeros(3),
+    )

@@ -1,0 +1,213 @@
+"""The contraction kernel against NumPy: shapes, strides, batches, epilogues, tiles, long sums."""
+
+import numpy as np
+import pytest
+
+from clresample.device import contraction as contract
+from clresample.device.contraction import Contraction, Matrix, padded
+
+TYPES = (np.float32, np.float64)
+every_type = pytest.mark.parametrize("dtype", TYPES, ids=lambda t: t.__name__)
+
+
+@pytest.fixture(params=["device's", "CPU", "wide CPU", "GPU", "pairs"])
+def tile(request, monkeypatch):
+    """Register tiles of other devices than the one at hand; any device must run them all."""
+    if request.param != "device's":
+        group, size = (8, 8) if request.param in ("GPU", "pairs") else (1, 1)
+        vector, vectors, rows = {
+            "CPU": (8, 1, 6),
+            "wide CPU": (16, 2, 8),
+            "GPU": (4, 1, 8),
+            "pairs": (2, 3, 8),
+        }[request.param]
+        chosen = {"VW": vector, "NV": vectors, "MR": rows, "WGX": group, "WGY": size}
+        monkeypatch.setattr(contract, "_tile", lambda device, dtype: chosen)
+
+
+def random(*shape, seed=0):
+    return np.random.default_rng([seed, *shape]).normal(size=shape)
+
+
+def put_right(device, b, dtype):
+    """(B, k, n) matrices on the device, columns padded with zeros."""
+    host = np.zeros((*b.shape[:-1], padded(b.shape[-1])))
+    host[..., : b.shape[-1]] = b
+    return device.put(host, dtype)
+
+
+def check(found, truth, dtype):
+    """Two rounded factors and a rounded sum of random signs: 4 units of the type, relative L2."""
+    error = np.linalg.norm(found - truth) / np.linalg.norm(truth)
+    assert error <= 4 * np.finfo(dtype).eps, f"error {error:.1e}"
+
+
+def need(device, dtype):
+    if dtype == np.float64 and not device.has_fp64:
+        pytest.skip(f"{device.name} has no float64")
+
+
+@every_type
+@pytest.mark.parametrize("shape", [(1, 1, 1), (7, 16, 5), (8, 17, 1), (23, 40, 130)], ids=str)
+def test_product(device, tile, shape, dtype):
+    need(device, dtype)
+    m, n, k = shape
+    a, b = random(3, m, k), random(3, k, n)
+    right = put_right(device, b, dtype)
+    n_pad = right.shape[-1]
+    result = device.put(np.full((3, m + 2, n_pad), 7.0), dtype)
+    Contraction(device, dtype)(
+        m, n, k, 3, Matrix(device.put(a, dtype).base_data, k, m * k),
+        Matrix(right.base_data, n_pad, k * n_pad),
+        Matrix(result.base_data, n_pad, (m + 2) * n_pad),
+    )  # fmt: skip
+    found = device.get(result)
+    check(found[:, :m, :n], a @ b, dtype)
+    assert not found[:, :m, n:].any()  # whole vectors, zero beyond n
+    assert (found[:, m:] == 7).all()  # and nothing beyond m
+
+
+@every_type
+def test_one_right_factor_for_all_and_tables_shared_by_bands(device, dtype):
+    need(device, dtype)
+    m, n, k, n_bands = 5, 19, 11, 3
+    a, b = random(6, m, k), random(1, k, n)
+    left, right = device.put(a, dtype), put_right(device, b, dtype)
+    n_pad = right.shape[-1]
+    result = device.empty((6, m, n_pad), dtype)
+    target = Matrix(result.base_data, n_pad, m * n_pad)
+    product = Contraction(device, dtype)
+    product(m, n, k, 6, Matrix(left.base_data, k, m * k), Matrix(right.base_data, n_pad), target)
+    check(device.get(result)[..., :n], a @ b, dtype)
+    # scene 0 has tables a[0], b[0] for its three bands, scene 1 has a[1], b[1]
+    b = random(2, k, n)
+    right = put_right(device, b, dtype)
+    product(m, n, k, 6, Matrix(left.base_data, k, m * k, n_bands),
+            Matrix(right.base_data, n_pad, k * n_pad, n_bands), target)  # fmt: skip
+    check(device.get(result)[..., :n], np.repeat(a[:2] @ b, n_bands, axis=0), dtype)
+
+
+@every_type
+def test_a_callers_arrays_read_and_written_transposed(device, tile, dtype):
+    need(device, dtype)
+    m, n, k = 13, 21, 10
+    images, b = random(4, k, m), random(1, k, n)
+    source, right = device.put(images, dtype), put_right(device, b, dtype)
+    result = device.put(np.full((5, n, m), 7.0), dtype)
+    # from the second image on, into the second place on: offsets in elements
+    Contraction(device, dtype, strided=True, ragged=True)(
+        m, n, k, 3, Matrix(source.base_data, 1, k * m, step=m, offset=k * m),
+        Matrix(right.base_data, right.shape[-1]),
+        Matrix(result.base_data, 1, n * m, step=m, offset=n * m),
+    )  # fmt: skip
+    found = device.get(result)
+    check(found[1:4], (images[1:].swapaxes(1, 2) @ b).swapaxes(1, 2), dtype)
+    assert (found[[0, 4]] == 7).all()
+
+
+@every_type
+def test_a_callers_rows_of_any_length(device, dtype):
+    need(device, dtype)
+    m, n, k = 9, 18, 4
+    a, b = random(2, m, k), random(1, k, n)
+    right = put_right(device, b, dtype)
+    result = device.put(np.full((2, m, n + 3), 7.0), dtype)
+    Contraction(device, dtype, ragged=True)(
+        m, n, k, 2, Matrix(device.put(a, dtype).base_data, k, m * k),
+        Matrix(right.base_data, right.shape[-1]),
+        Matrix(result.base_data, n + 3, m * (n + 3), offset=1),
+    )  # fmt: skip
+    found = device.get(result)
+    check(found[..., 1:-2], a @ b, dtype)
+    assert (found[..., [0, -2, -1]] == 7).all()
+
+
+def mixed(quads, d_plus, d_minus):
+    """Cos and sin sums (..., 2Hy, 2Hx) to complex amplitudes, times D, and back."""
+    cc, cs, sc, ss = (quads[..., i::2, j::2] for i in (0, 1) for j in (0, 1))
+    plus, minus = d_plus * (cc - ss - 1j * (cs + sc)), d_minus * (cc + ss + 1j * (cs - sc))
+    result = np.empty_like(quads)
+    result[..., 0::2, 0::2] = (plus + minus).real
+    result[..., 0::2, 1::2] = (minus - plus).imag
+    result[..., 1::2, 0::2] = -(plus + minus).imag
+    result[..., 1::2, 1::2] = (minus - plus).real
+    return result
+
+
+@every_type
+@pytest.mark.parametrize("adjoint", [False, True])
+@pytest.mark.parametrize("n_tables", [1, 2])
+def test_mix_multiplies_by_the_spectra(device, tile, n_tables, adjoint, dtype):
+    need(device, dtype)
+    h_y, h_x, k, n_bands, batch = 5, 11, 7, 3, 6
+    a, b = random(1, 2 * h_y, k), random(batch, k, 2 * h_x)
+    d = random(2, n_tables, n_bands, h_y, h_x) + 1j * random(2, n_tables, n_bands, h_y, h_x, seed=1)
+    right = put_right(device, b, dtype)
+    n_pad = right.shape[-1]
+    planes = np.zeros((n_tables, n_bands, h_y, 4, n_pad // 2))
+    planes[..., :h_x] = np.stack([d[0].real, d[0].imag, d[1].real, d[1].imag], axis=-2)
+    tables = device.put(planes, dtype)
+    result = device.empty((batch, 2 * h_y, n_pad), dtype)
+    band = h_y * 2 * n_pad
+    Contraction(device, dtype, epilogue="MIX", adjoint=adjoint)(
+        2 * h_y, 2 * h_x, k, batch, Matrix(device.put(a, dtype).base_data, k),
+        Matrix(right.base_data, n_pad, k * n_pad), Matrix(result.base_data, n_pad, 2 * h_y * n_pad),
+        (tables.base_data, n_bands * band if n_tables > 1 else 0, band), n_bands,
+    )  # fmt: skip
+    d = np.broadcast_to(d, (2, 2, n_bands, h_y, h_x)).reshape(2, batch, h_y, h_x)
+    truth = mixed(a @ b, *(d.conj() if adjoint else d))
+    check(device.get(result)[..., : 2 * h_x], truth, dtype)
+    # conjugate spectra are the transpose
+    x, y = random(batch, 2 * h_y, 2 * h_x, seed=2), random(batch, 2 * h_y, 2 * h_x, seed=3)
+    np.testing.assert_allclose((mixed(x, *d) * y).sum(), (x * mixed(y, *d.conj())).sum())
+
+
+@every_type
+@pytest.mark.parametrize("adjoint", [False, True])
+def test_twist_rotates_cos_and_sin_rows(device, adjoint, dtype):
+    need(device, dtype)
+    h_y, n, k = 5, 21, 9
+    a, b, angle = random(3, 2 * h_y, k), random(3, k, n), random(h_y, n)
+    right = put_right(device, b, dtype)
+    n_pad = right.shape[-1]
+    planes = np.zeros((h_y, 2, n_pad))
+    planes[..., :n] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    result = device.empty((3, 2 * h_y, n_pad), dtype)
+    Contraction(device, dtype, epilogue="TWIST", adjoint=adjoint)(
+        2 * h_y, n, k, 3, Matrix(device.put(a, dtype).base_data, k, 2 * h_y * k),
+        Matrix(right.base_data, n_pad, k * n_pad), Matrix(result.base_data, n_pad, 2 * h_y * n_pad),
+        (device.put(planes, dtype).base_data, 0, 0), 1,
+    )  # fmt: skip
+    rows = a @ b
+    turned = (rows[:, 0::2] - 1j * rows[:, 1::2]) * np.exp((-1j if adjoint else 1j) * angle)
+    truth = np.stack([turned.real, -turned.imag], axis=2).reshape(rows.shape)
+    check(device.get(result)[..., :n], truth, dtype)
+
+
+def test_long_sums_keep_their_accuracy(device, monkeypatch):
+    # positive terms: the running sum, and with it each rounding, grows with k
+    k = 40_000
+    a, b = (np.abs(random(*shape)).astype(np.float32) for shape in ((8, k), (k, 16)))
+    left, right = device.put(a), device.put(b)
+    result = device.empty((8, 16), np.float32)
+
+    def error():
+        Contraction(device, np.float32)(
+            8, 16, k, 1, Matrix(left.base_data, k), Matrix(right.base_data, 16),
+            Matrix(result.base_data, 16),
+        )  # fmt: skip
+        truth = a.astype(float) @ b.astype(float)
+        return np.linalg.norm(device.get(result) - truth) / np.linalg.norm(truth)
+
+    # two sums of 200 terms each: sqrt(200 + 200) roundings of 3e-8, halved by their random signs
+    assert error() < 6e-7
+    monkeypatch.setattr(contract, "SUM_BLOCK", k)
+    assert error() > 1e-6
+
+
+def test_a_wrong_product_is_seen():
+    truth = random(4, 4)
+    with pytest.raises(AssertionError, match="error"):
+        check(truth * (1 + 2e-6), truth, np.float32)
+    with pytest.raises(AssertionError, match="error"):
+        check(np.roll(truth, 1, axis=0), truth, np.float64)

@@ -1,0 +1,230 @@
+"""Devices at work: memory, kernels, and the errors that a user can meet on the way."""
+
+import gc
+
+import numpy as np
+import pyopencl as cl
+import pytest
+from helpers.checkout import ROOT, run_python
+
+from clresample import DeviceError, list_devices
+from clresample.device import device as device_module, discovery as discover, program
+
+POCL = "Portable Computing Language"
+SCALE = """#include "common.h"
+#ifndef OFFSET
+#define OFFSET 0
+#endif
+__kernel void scale(__global const REAL *x, __global REAL *out)
+{
+    const size_t i = get_global_id(0);
+    out[i] = 2 * x[i] + OFFSET;
+}
+"""
+BROKEN = """__kernel void early(__global float *x) { x[0] = absent; }
+#include "common.h"
+__kernel void late(__global REAL *x) { x[0] = missing; }
+"""
+
+
+@pytest.fixture
+def kernels(tmp_path, monkeypatch):
+    """A folder of kernels of our own, with the project's common.h."""
+    common = (ROOT / "kernels" / "common.h").read_text()
+    for file, source in {"common.h": common, "scale.cl": SCALE, "broken.cl": BROKEN}.items():
+        (tmp_path / file).write_text(source)
+    monkeypatch.setattr(program, "kernels_folder", lambda: tmp_path)
+    program.read_kernel.cache_clear()
+    yield tmp_path
+    program.read_kernel.cache_clear()
+
+
+def pocl():
+    """The first PoCL platform; the test is skipped where there is none."""
+    for platform in cl.get_platforms():
+        if platform.name == POCL:
+            return platform
+    pytest.skip("no PoCL here: its settings cannot be tried")
+
+
+def two_devices():
+    """The setting under which PoCL offers two devices; their names changed in version 4."""
+    version = pocl().version.split("PoCL ")[1]
+    return "basic pthread" if int(version.split(".")[0]) < 4 else "cpu-minimal cpu"
+
+
+def error_of(status):
+    """A pyopencl error of the given status, as a driver would cause it."""
+    code = getattr(cl.status_code, status, -9999)
+    record = cl._cl._ErrorRecord(msg=status, code=code, routine="test")
+    return cl.RuntimeError(record)
+
+
+# ---- memory ----
+
+
+@pytest.mark.smoke
+def test_arrays_there_and_back(device):
+    values = np.random.default_rng(3).normal(size=(3, 8, 5))
+    for given in (values, values[::2, ::-1, 1:], values.astype(">f4"), values[:0], values[0, 0, 0]):
+        back = device.get(device.put(given))
+        assert back.shape == np.shape(given)
+        assert back.dtype == np.asarray(given).dtype.newbyteorder("=")
+        np.testing.assert_array_equal(back, given)
+    np.testing.assert_array_equal(
+        device.get(device.put(values, np.float32)), values.astype(np.float32)
+    )
+    np.testing.assert_array_equal(device.get(device.zeros((2, 0, 4), np.int32)), 0)
+    np.testing.assert_array_equal(device.get(device.zeros(7, np.float32)), 0)
+
+
+def test_zeros_in_pieces(device, monkeypatch):
+    monkeypatch.setattr(device_module, "FILL_BYTES", 64)
+    np.testing.assert_array_equal(device.get(device.zeros(100, np.float32)), 0)
+
+
+def test_memory_in_use_is_given_back(device):
+    gc.collect()
+    before = device.in_use
+    array = device.zeros((100, 10), np.float32)
+    assert device.in_use == before + 4000
+    view = array[10:]
+    del array
+    assert device.in_use == before + 4000  # the view keeps it
+    del view
+    assert device.in_use == before
+
+
+def test_an_impossible_size_names_both_sizes(device):
+    n_bytes = device.max_alloc + 4
+    with pytest.raises(DeviceError) as refusal:
+        device.empty(n_bytes // 4, np.float32)
+    for size in (n_bytes, device.memory, device.max_alloc):
+        assert discover.format_size(size) in str(refusal.value)
+    with pytest.raises(DeviceError, match="an array needs"):
+        device.empty((1 << 40, 1 << 40), np.float32)
+
+
+def test_a_full_device_says_so(device, monkeypatch):
+    monkeypatch.setattr(device, "in_use", device.memory - 100)
+    with pytest.raises(DeviceError, match="of it in use"):
+        device.empty(26, np.float32)
+
+
+@pytest.mark.parametrize("status", ["MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_HOST_MEMORY"])
+def test_a_refused_allocation_names_both_sizes(device, monkeypatch, status):
+    def refuse(*_):
+        raise error_of(status)
+
+    monkeypatch.setattr(device_module, "_buffer_type", lambda: refuse)
+    with pytest.raises(DeviceError, match=r"an array needs 4 KiB; .* in one buffer"):
+        device.empty(1024, np.float32)
+
+
+class Lost:
+    """A queue that answers every call with the same status."""
+
+    def __init__(self, status):
+        self.status = status
+
+    def finish(self):
+        raise error_of(self.status)
+
+
+@pytest.mark.parametrize("status", ["DEVICE_NOT_AVAILABLE", "OUT_OF_RESOURCES", "-9999"])
+def test_a_lost_device_says_what_to_do(device, monkeypatch, status):
+    monkeypatch.setattr(device, "queue", Lost(status))
+    with pytest.raises(DeviceError, match=rf"no longer answers \({status}\): start again"):
+        device.finish()
+
+
+def test_our_own_mistakes_stay_as_they_are(device, monkeypatch):
+    monkeypatch.setattr(device, "queue", Lost("INVALID_KERNEL_ARGS"))
+    with pytest.raises(cl.Error, match="INVALID_KERNEL_ARGS"):
+        device.finish()
+
+
+# ---- kernels ----
+
+
+def test_double_precision_is_found(device):
+    if device.platform != POCL:
+        pytest.skip("whether this device has double precision is not known beforehand")
+    assert device.has_fp64
+    assert all(info.fp64 for info in list_devices() if info.platform == POCL)
+
+
+@pytest.mark.smoke
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_kernel_in_either_precision(device, kernels, dtype):
+    if dtype == np.float64 and not device.has_fp64:
+        with pytest.raises(DeviceError, match="no double precision: use float32"):
+            device.kernel("scale.cl", "scale", dtype=dtype)
+        return
+    x = np.linspace(0, 1, 130).astype(dtype)
+    array, out = device.put(x), device.zeros(130, dtype)
+    for offset, expected in ((None, 2 * x), (3, 2 * x + 3)):
+        kernel = device.kernel("scale.cl", "scale", dtype=dtype, OFFSET=offset)
+        kernel.set_args(array.data, out.data)
+        device.launch(kernel, (130,))
+        np.testing.assert_allclose(device.get(out), expected, rtol=np.finfo(dtype).eps)
+    device.finish()
+
+
+def test_equal_requests_share_a_program_and_not_a_kernel(device, kernels):
+    a, b = (device.kernel("scale.cl", "scale", OFFSET=5, FAST=True) for _ in range(2))
+    assert a.program == b.program
+    assert a is not b
+    assert device.kernel("scale.cl", "scale", OFFSET=6, FAST=True).program != a.program
+
+
+def test_a_failed_build_shows_the_compilers_log(device, kernels):
+    with pytest.raises(DeviceError) as failure:
+        device.kernel("broken.cl", "late", SIDE=7)
+    message = str(failure.value)
+    assert f"broken.cl does not build on {device.name}" in message
+    assert "'SIDE': 7" in message
+    assert "missing" in message
+    assert "CLRESAMPLE_DEVICE" in message
+    if device.platform == POCL:  # the lines of the file, not of what was compiled
+        assert "broken.cl:1:" in message
+        assert "broken.cl:3:" in message
+
+
+def test_dtype_is_one_of_two(device):
+    with pytest.raises(ValueError, match="dtype is int32; .* float32 or float64"):
+        device.kernel("contract.cl", "contract", dtype=np.int32)
+
+
+# ---- under PoCL's settings ----
+
+INTERLEAVED = """
+import numpy as np
+from clresample import get_device, list_devices
+devices = [get_device(info.index) for info in list_devices() if "Portable" in info.platform]
+assert len(devices) == 2 and devices[0] is not devices[1], devices
+values = np.arange(1000, dtype=np.float32)
+arrays = [device.put((i + 1) * values) for i, device in enumerate(devices)]
+doubled = [2 * array for array in arrays]
+for i, (device, array) in enumerate(zip(devices, doubled)):
+    assert array.context == device.context
+    assert (device.get(array) == 2 * (i + 1) * values).all()
+"""
+
+
+def test_two_devices_at_once():
+    answer = run_python("-c", INTERLEAVED, POCL_DEVICES=two_devices())
+    assert answer.returncode == 0, answer.stderr
+
+
+@pytest.mark.parametrize("setting", ["two devices", "small groups"])
+def test_kernels_under_other_settings(setting):
+    pocl()
+    environment = (
+        {"POCL_DEVICES": two_devices()}
+        if setting == "two devices"
+        else {"POCL_MAX_WORK_GROUP_SIZE": "64"}
+    )
+    tests = str(ROOT / "tests")
+    answer = run_python("-m", "pytest", "-q", "-x", "-m", "smoke", tests, **environment)
+    assert answer.returncode == 0, answer.stdout

@@ -1,0 +1,263 @@
+"""Scene files: what they give, and each mistake told by its key with what is allowed."""
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.io import fits
+from astropy.table import QTable, Table
+
+from clresample.deblending.solver.constraints import Chain, Positivity
+from clresample.files.fits import write_fits
+from clresample.files.scene import read_scene
+from clresample.files.scene_keys import SceneError
+from clresample.files.source_table import read_sources
+from clresample.sky.grid import Grid
+from clresample.sky.psf import PSF
+from clresample.sky.sources import Extended, Point
+
+GRID = Grid.flat((30, 34), 0.1).to_wcs(ra_deg=150.0, dec_deg=2.0)
+ONE = """
+[[observation]]
+name = "cam"
+image = "image.fits"
+psf = "psf.fits"
+"""
+CUBE = """
+[[observation]]
+name = "cube"
+image = "cube.fits"
+psf = "psf3.fits"
+"""
+SOURCES = """
+[sources]
+catalogue = "sources.csv"
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Images with noise 2, PSFs, weights and catalogues."""
+    path = tmp_path_factory.mktemp("scene")
+    rng = np.random.default_rng(0)
+    grid = Grid.from_wcs(GRID, (30, 34))
+    image, cube = rng.normal(0, 2, (30, 34)), rng.normal(0, 2, (3, 30, 34))
+    write_fits(path / "image.fits", image, grid)
+    write_fits(path / "cube.fits", cube, grid, bands="gri")
+    write_fits(
+        path / "away.fits",
+        image,
+        Grid.from_wcs(Grid.flat((30, 34), 0.1).to_wcs(ra_deg=151.0, dec_deg=2.0), (30, 34)),
+    )
+    fits.PrimaryHDU(PSF.gaussian(1.4, n_pixels=21).images[0]).writeto(path / "psf.fits")
+    fits.PrimaryHDU(PSF.gaussian([1.4, 1.5, 1.6], n_pixels=21).images).writeto(path / "psf3.fits")
+    fits.PrimaryHDU(PSF.gaussian([1.4, 1.5], n_pixels=21).images).writeto(path / "psf2.fits")
+    weight = np.full((3, 30, 34), 0.25)
+    weight[:, :5] = 0
+    mask = np.zeros((30, 34), np.int16)
+    mask[20:, 30:] = 4
+    fits.HDUList(
+        [fits.PrimaryHDU(), fits.ImageHDU(weight, name="WHT"), fits.ImageHDU(mask, name="DQ")]
+    ).writeto(path / "more.fits")
+    ra, dec = grid.sky(np.array([10.0, 20.0]), np.array([12.0, 22.0]))
+    Table({"ra": ra, "dec": dec}).write(path / "sources.csv")
+    Table({"ra": ra, "dec": dec, "type": ["point", "blob"]}).write(path / "types.csv")
+    Table({"y": [10.0, np.nan], "x": [12.0, 3.0]}).write(path / "nan.csv")
+    Table({"a": [1.0]}).write(path / "columns.csv")
+    Table({"ra": ra[:0], "dec": dec[:0]}).write(path / "empty.ecsv")
+    (path / "no_table.csv").write_bytes(bytes(range(256)))
+    QTable(
+        {
+            "RA": ra * u.deg,
+            "DE": (dec * u.deg).to(u.arcmin),
+            "id": ["a", "b"],
+            "class": ["Point", "extended"],
+            "n": [1, 2],
+        }
+    ).write(path / "full.fits")
+    return path
+
+
+def scene(folder, text):
+    path = folder / "scene.toml"
+    path.write_text(text)
+    return read_scene(path)
+
+
+def test_the_least_that_a_scene_needs(folder):
+    found = scene(folder, ONE)
+    (o,) = found.observations
+    assert (o.name, o.channels, o.zero_points) == ("cam", ("cam",), None)
+    assert abs(o.weights[0, 0, 0] ** -0.5 - 2) < 0.2
+    assert found.sources is None and found.passes == 2
+    assert any("estimated" in note for note in found.notes)
+    assert found.frame.shape == (30, 34)
+
+
+def test_every_key_is_used(folder):
+    found = scene(
+        folder,
+        """
+[[observation]]
+name = "cube"
+image = "cube.fits"
+hdu = 0
+bands = ["i", "g"]
+channels = ["red", "blue"]
+psf = "psf3.fits"
+psf_hdu = 0
+psf_bands = [2, 0]
+psf_center = [10, 10]
+psf_spacing = 0.5
+weight = "more.fits"
+weight_hdu = "WHT"
+mask = "more.fits"
+mask_hdu = "DQ"
+zero_point = [27, 26.5]
+[sources]
+catalogue = "full.fits"
+format = "fits"
+ra = "RA"
+dec = "DE"
+name = "id"
+type = "class"
+components = "n"
+[frame]
+like = "cube"
+footprint = "intersection"
+psf_sigma_px = 0.7
+[fit]
+max_iter = 7
+tol = 0.01
+monotone = false
+structure_px = 1.5
+fit_shifts = true
+fit_sky = true
+""",
+    )
+    (o,) = found.observations
+    cube = fits.getdata(folder / "cube.fits")
+    np.testing.assert_array_equal(o.data, cube[[2, 0]])
+    assert o.channels == ("red", "blue") and list(o.zero_points) == [27, 26.5]
+    assert o.psf.spacing == 0.5
+    np.testing.assert_allclose(o.psf.images, PSF.gaussian([1.6, 1.4], n_pixels=21).images)
+    assert not o.weights[:, :5].any() and not o.weights[:, 20:, 30:].any()
+    assert (o.weights[:, 5:20] == 0.25).all()
+    point, extended = found.sources
+    assert isinstance(point, Point) and isinstance(extended, Extended)
+    assert (point.name, extended.n_components) == ("a", 2)
+    np.testing.assert_allclose(found.frame.place(found.sources), [(10, 12), (20, 22)], atol=1e-6)
+    s = found.settings
+    assert (s.max_iter, s.tol, s.fit_shifts, s.fit_sky) == (7, 0.01, True, True)
+    assert s.prior.correlation_px == 1.5 and str(s.constraints) == str(Chain(Positivity()))
+    assert set(found.inputs) == {
+        "scene",
+        "sources",
+        "image of cube",
+        "PSF of cube",
+        "weight of cube",
+        "mask of cube",
+    }
+
+
+def test_bands_of_the_image_choose_those_of_the_psf(folder):
+    (o,) = scene(folder, CUBE + "bands = [1, 2]\nvariance = [4, 5]").observations
+    assert o.channels == ("r", "i")
+    np.testing.assert_allclose(o.psf.images, PSF.gaussian([1.5, 1.6], n_pixels=21).images)
+    np.testing.assert_allclose(o.weights[:, 0, 0], [1 / 4, 1 / 5])
+
+
+@pytest.mark.parametrize(
+    "text, told",
+    [
+        ("", "observation is missing"),
+        ("observation = 3", "observation is missing"),
+        ("x = [", "not TOML"),
+        (
+            "[sauces]\n" + ONE,
+            "table sauces is unknown; allowed are observation, sources, detection",
+        ),
+        ("fit = 3\n" + ONE, "fit is 3, must be a table"),
+        (ONE + 'imgae = "x"', "observation 1: key imgae is unknown; allowed are name, image, hdu"),
+        (
+            '[[observation]]\nname = "cam"',
+            "observation 1: image is missing, it takes the name of a",
+        ),
+        (ONE + "hdu = 1.5", "hdu is 1.5, it takes a number from 0"),
+        (ONE + "hdu = 3", "observation 1 (cam): "),
+        (ONE + 'hdu = "SCI"', "no HDU SCI (HDUs: 0 PRIMARY)"),
+        (ONE + "bands = 4", "no band 4 (bands: 0)"),
+        (ONE + 'bands = ["z"]', "no band z"),
+        (ONE + 'channels = "V"', "channels is 'V', it takes a list of names"),
+        (ONE + 'channels = ["V", "I"]', "channels has 2 names, data have 1 channels"),
+        (
+            ONE + 'psf_center = "left"',
+            'psf_center is \'left\', it takes "middle", "core" or [y, x]',
+        ),
+        (ONE + "psf_spacing = 0", "psf_spacing is 0, it takes a number above 0"),
+        (ONE + 'zero_point = "AB"', "zero_point is 'AB', it takes a number, or a list"),
+        (ONE + "zero_point = [25, 26]", "zero_point must be one finite number or 1"),
+        (ONE + "variance = -1", "variance is -1, it takes the name of a file, a number"),
+        (ONE + "variance = [1, 2]", "variance has the shape (2,)"),
+        (ONE + "variance = 1\nweight = 1", "weight and variance are both given"),
+        (ONE + 'weight_hdu = "WHT"', "weight_hdu is given, but weight names no file"),
+        (ONE + 'weight = "none.fits"', "none.fits: no such file"),
+        (ONE + 'weight = "image.fits"', "weight_hdu must say which HDU"),
+        (ONE + 'weight = "psf.fits"', "weight has the shape (21, 21), data (1, 30, 34)"),
+        (CUBE.replace("psf3", "psf2"), "psf has 2 bands, the image 3"),
+        (ONE.replace("image.fits", "none.fits"), "none.fits: no such file"),
+        (ONE.replace("image.fits", "psf.fits"), "has no celestial WCS"),
+        (ONE.replace("psf.fits", "scene.toml"), "not a FITS file"),
+        (
+            ONE
+            + ONE.replace("image", "away").replace("away =", "image =").replace('"cam"', '"far"'),
+            "does not overlap",
+        ),
+        (ONE + ONE, "given twice"),
+        (ONE + 'channels = ["a"]' + ONE + 'channels = ["b"]', "names must be unique"),
+        (ONE + "zero_point = 25" + CUBE, "'cam' has zero_point, 'cube' has none"),
+        (ONE + '[frame]\nlike = "HST"', "like is 'HST', it takes the name of an observation: cam"),
+        (
+            ONE + '[frame]\nfootprint = "all"',
+            'footprint is \'all\', it takes "union" or "intersection"',
+        ),
+        (ONE + "[frame]\npsf_sigma_px = 0", "psf_sigma_px is 0, it takes a number above 0"),
+        (ONE + "[fit]\nmax_iter = -1", "max_iter is -1, it takes a whole number"),
+        (ONE + "[fit]\nmax_iter = true", "max_iter is True, it takes a whole number"),
+        (ONE + "[fit]\ntol = 1.0", "tol is 1.0, it takes a number from 0 to 1"),
+        (ONE + "[fit]\nfit_shifts = 1", "fit_shifts is 1, it takes true or false"),
+        (ONE + "[detection]\npasses = 3", "passes is 3, it takes 1, or 2"),
+        (ONE + "[detection]\nthreshold = 0", "threshold is 0, it takes a number above 0"),
+        (ONE + SOURCES + "[detection]", "sources and detection are both given"),
+        (ONE + "[sources]", "sources: catalogue is missing"),
+        (ONE + SOURCES.replace("sources.csv", "no.csv"), "no.csv: no such file"),
+        (ONE + SOURCES.replace("sources.csv", "no_table.csv"), "no table that astropy can read"),
+        (ONE + SOURCES + 'format = "nothing"', "no table that astropy can read"),
+        (ONE + SOURCES + 'ra = "RAJ"', "ra is 'RAJ', "),
+        (ONE + SOURCES.replace("sources.csv", "columns.csv"), "has neither the columns ra and dec"),
+        (ONE + SOURCES.replace("sources.csv", "empty.ecsv"), "holds no source"),
+        (
+            ONE + SOURCES.replace("sources.csv", "types.csv"),
+            "row 2: type is 'blob', it takes point or",
+        ),
+        (ONE + SOURCES.replace("sources.csv", "nan.csv"), "row 2: position_px is"),
+    ],
+)
+def test_mistakes_are_told_by_key(folder, text, told):
+    with pytest.raises(SceneError) as error:
+        scene(folder, text)
+    message = str(error.value)
+    assert told in message and "scene.toml" in message and "\n" not in message
+
+
+def test_a_scene_that_is_not_there(tmp_path):
+    with pytest.raises(SceneError, match=r"none\.toml: No such file"):
+        read_scene(tmp_path / "none.toml")
+
+
+def test_pixels_are_taken_where_they_are_asked_for(folder, tmp_path):
+    Table({"ra": [150.0], "dec": [2.0], "y": [4.0], "x": [5.0], "row": [6.0]}).write(
+        tmp_path / "both.ecsv"
+    )
+    (on_sky,) = read_sources(tmp_path / "both.ecsv")
+    (on_pixels,) = read_sources(tmp_path / "both.ecsv", {"y": "row"})
+    assert on_sky.sky_deg == (150.0, 2.0) and on_pixels.position_px == (6.0, 5.0)

@@ -1,0 +1,157 @@
+"""Small simulated scenes, made by the library itself, for the tests of the fit."""
+
+import numpy as np
+
+from clresample.deblending.batch import deblend
+from clresample.deblending.blend import Blend
+from clresample.deblending.profiles import moment, point, profile
+from clresample.deblending.solver.problem import Problem
+from clresample.resampling.cache import cached_resampler
+from clresample.resampling.resampler import Resampler
+from clresample.sky.frame import Frame
+from clresample.sky.grid import Grid
+from clresample.sky.observation import Observation
+from clresample.sky.psf import PSF
+from clresample.sky.sources import Extended, Point
+
+SHAPE = (30, 36)
+MODEL_PSF = PSF.gaussian(0.8, n_pixels=19)
+SHARP, BLURRED = PSF.gaussian(0.9, n_pixels=19), PSF.gaussian(1.1, n_pixels=15, n_bands=2)
+# A galaxy and a smaller one: (y, x) [px], flux in (v, g, r) [counts], sigma [px]; sigma 0 = a star
+GALAXIES = (((13.2, 12.1), (30, 20, 40), 2.0), ((16.0, 23.3), (25, 60, 50), 1.4))
+
+BRIGHT = tuple((p, tuple(2 * np.array(f)), s) for p, f, s in GALAXIES)
+FLUX = (100.0, 80.0, 90.0)
+
+
+def grids(shape=SHAPE, angle=25):
+    """Sharp pixels upright, and pixels of twice the size, turned."""
+    half = shape[0] // 2, shape[1] // 2
+    return Grid.flat(shape, 0.1), Grid.flat(half, 0.2, angle_deg=angle)
+
+
+def truth(objects, shape=SHAPE):
+    """Model (3, Ny, Nx) [counts] of objects as in GALAXIES."""
+    model = np.zeros((3, *shape))
+    for position, flux, sigma in objects:
+        if sigma:
+            parameters = np.array([np.log(sigma), 0.2, -0.1, np.log(5.0)])
+            image = profile(parameters, position, shape, moment(MODEL_PSF))[0]
+        else:
+            image = point(MODEL_PSF, position, shape)[0]
+        model += np.array(flux)[:, None, None] * image
+    return model
+
+
+def observe(
+    objects=GALAXIES,
+    *,
+    shape=SHAPE,
+    angle=25,
+    noise=0.05,
+    seed=0,
+    psfs=(SHARP, BLURRED),
+    shift=(0, 0),
+    sky=(0, 0, 0),
+    unit=1.0,
+):
+    """Observations "e" (v) and "r" (g, r) of objects, the second moved by `shift` [model px]."""
+    rng, model, found = np.random.default_rng(seed), truth(objects, shape), []
+    for k, (grid, psf) in enumerate(zip(grids(shape, angle), psfs, strict=True)):
+        part = (slice(0, 1), slice(1, 3))[k]
+        op = Resampler(
+            Grid.flat(shape, 0.1),
+            MODEL_PSF,
+            grid,
+            psf,
+            dtype=np.float64,
+            shift=shift if k else (0, 0),
+        )
+        data = op.forward(model[part]) + np.array(sky)[part, None, None]
+        data += noise * rng.normal(size=data.shape)
+        found.append(
+            Observation(
+                unit * data,
+                psf,
+                grid,
+                weights=(unit * noise) ** -2,
+                channels=(("v",), ("g", "r"))[k],
+                name="er"[k],
+            )
+        )
+    return tuple(found)
+
+
+def sources(objects=GALAXIES):
+    return tuple(
+        Extended(position_px=p) if sigma else Point(position_px=p) for p, _, sigma in objects
+    )
+
+
+def frame(shape=SHAPE):
+    return Frame(Grid.flat(shape, 0.1), MODEL_PSF)
+
+
+def blend(objects=GALAXIES, **given):
+    shape = given.get("shape", SHAPE)
+    return Blend(observe(objects, **given), sources(objects), frame(shape))
+
+
+def fit(b, device, **given):
+    return deblend(b.observations, b.sources, frame=b.frame, device=device, **given)
+
+
+def same(one, other):
+    """Two results have the same components, to float32's rounding."""
+    for a, b in zip(one.components, other.components, strict=True):
+        np.testing.assert_allclose(a.morphology, b.morphology, atol=1e-6)
+        np.testing.assert_allclose(a.spectrum, b.spectrum, rtol=1e-5)
+
+
+def chi2(result):
+    """Per pixel with a weight."""
+    parts = [result.residual(i) * np.sqrt(o.weights) for i, o in enumerate(result.observations)]
+    return np.nanmean(np.concatenate([p.ravel() for p in parts]) ** 2)
+
+
+BOXES = ((2, 3, 11, 14), (0, 0, 9, 8), (19, 27, 11, 9), (29, 35, 1, 1), (4, 0, 7, 36))
+
+
+def problem(
+    device, dtype=np.float64, *, boxes=BOXES[:3], seed=0, psfs=(SHARP, BLURRED), fixed=(), **given
+):
+    """A problem of random data, spectra and morphologies in boxes (y0, x0, ny, nx)."""
+    rng, home = np.random.default_rng(seed), frame()
+    ops = [
+        cached_resampler(home, grid, psf, dtype=dtype, device=device)
+        for grid, psf in zip(grids(), psfs, strict=True)
+    ]
+    n = len(boxes)
+    shapes = np.array(boxes)[:, 2:]
+    base = [rng.uniform(0.2, 1, tuple(s)) for s in shapes]
+    field = [0.1 * rng.normal(size=m.shape) for m in base]
+    weights = [rng.uniform(0.5, 1.5, op.shape_out) * op.covered for op in ops]
+    for w in weights:
+        w[:, 3, 2:5] = 0
+    spectra = rng.uniform(0.5, 2, (n, 3))
+    return Problem(
+        **{
+            "shape": home.shape,
+            "extent": home.shape,
+            "ops": ops,
+            "data": [rng.normal(0, 3, op.shape_out) for op in ops],
+            "weights": weights,
+            "origin": np.array(boxes)[:, :2],
+            "center": shapes // 2,
+            "base": base,
+            "field": field,
+            "morph": [b * (1 + 0.1 * f) for b, f in zip(base, field, strict=True)],
+            "fixed": np.isin(np.arange(n), fixed),
+            "spectra": spectra,
+            "scale": rng.uniform(0.1, 0.3, (n, 3)),
+            "sky": rng.normal(size=3),
+            "damping": rng.uniform(0, 20, n),
+            "fit_sky": True,
+        }
+        | given
+    )

@@ -1,0 +1,143 @@
+"""Detection: signal to noise in the model frame, neighbours told apart, what a fit leaves over."""
+
+import sys
+
+import numpy as np
+import pytest
+from helpers.blends import gaussian
+
+from clresample.deblending.batch import deblend
+from clresample.deblending.profiles import point
+from clresample.deblending.settings import Settings
+from clresample.measurement.detection import detect, detect_more
+from clresample.resampling.cache import cached_resampler
+from clresample.sky.frame import model_frame
+from clresample.sky.grid import Grid
+from clresample.sky.observation import Observation
+from clresample.sky.psf import PSF
+from clresample.sky.sources import Extended
+
+pytest.importorskip("sep")
+SHARP, BLURRED = Grid.flat((80, 90), 0.1), Grid.flat((44, 50), 0.2, angle_deg=20)
+
+
+def instruments(sources, *, seed=3, size=1.2, sharp_noise=1.0, blurred_noise=1.0):
+    """A sharp image of one channel, a blurred one of two; sources (y, x, flux, blurred flux)."""
+    rng = np.random.default_rng(seed)
+    blank = [
+        Observation(
+            np.zeros((n, *grid.shape)),
+            PSF.gaussian(sigma, n_pixels=31),
+            grid,
+            weights=1.0,
+            channels=names,
+            name=name,
+        )
+        for n, grid, sigma, names, name in (
+            (1, SHARP, 1.5, ("V",), "sharp"),
+            (2, BLURRED, 1.7, ("g", "r"), "blurred"),
+        )
+    ]
+    frame = model_frame(blank, grid=SHARP)
+    scenes = np.zeros((2, *frame.shape))
+    for y, x, *fluxes in sources:
+        if size:
+            image = gaussian(frame.shape, (y, x), np.eye(2) * size**2)
+            image /= image.sum()
+        else:
+            image = point(frame.psf, (y, x), frame.shape)[0]
+        scenes += np.array(fluxes)[:, None, None] * image
+    made = []
+    for o, scene, noise in zip(blank, scenes, (sharp_noise, blurred_noise), strict=True):
+        op = cached_resampler(frame, o.grid, o.psf, dtype=np.float32)
+        data = op.render(scene.astype(np.float32)) + rng.normal(0, noise, o.data.shape)
+        made.append(
+            Observation(data, o.psf, o.grid, weights=noise**-2, channels=o.channels, name=o.name)
+        )
+    return made, frame
+
+
+def nearest(found, y, x):
+    return min(np.hypot(s.position_px[0] - y, s.position_px[1] - x) for s in found.sources)
+
+
+def test_peak_is_the_matched_filters_signal_to_noise():
+    flux = 300.0
+    (sharp, _), frame = instruments([(40, 45, flux, 0)], size=0, sharp_noise=1)
+    found = detect([sharp], frame)
+    assert [s.position_px for s in found.sources] == [(40, 45)]
+    expected = flux * np.sqrt((sharp.psf.images[0] ** 2).sum())
+    assert abs(found.peaks[0] - expected) < 3  # sigma of its own noise
+
+
+def test_noise_alone_has_unit_scatter_and_holds_no_source():
+    for seed in range(4):
+        observations, frame = instruments([], seed=seed)
+        found = detect(observations, frame)
+        assert not found.sources
+        assert abs(found.image[10:-10, 10:-10].std() - 1) < 0.12
+
+
+def test_correlated_noise_holds_no_source_either():
+    from scipy.ndimage import gaussian_filter
+
+    (sharp, _), frame = instruments([])
+    data = gaussian_filter(sharp.data, (0, 1.5, 1.5))
+    data /= data.std()
+    found = detect([Observation(data, sharp.psf, sharp.grid, weights=1.0)], frame)
+    assert not found.sources
+
+
+def test_sources_of_either_instrument_and_close_pairs():
+    sources = [(40, 30, 400, 0), (40, 37, 400, 800), (20, 70, 0, 500), (62, 60, 60, 120)]
+    observations, frame = instruments(sources)
+    found = detect(observations, frame)
+    assert len(found.sources) == 4
+    assert all(nearest(found, y, x) < 2.5 for y, x, *_ in sources)
+    assert set(found.found_in) >= {"sharp", "blurred"}
+    assert list(found.peaks) == sorted(found.peaks, reverse=True)
+
+
+def test_the_combination_reaches_fainter_than_each():
+    sources = [(40, 45, 27, 22)]
+    observations, frame = instruments(sources)
+    alone = [detect([o], frame).sources for o in observations]
+    both = detect(observations, frame)
+    assert not any(alone) and both.found_in == ("all",)
+    assert nearest(both, 40, 45) < 3
+
+
+def test_unseen_sky_and_bad_pixels_are_no_sources():
+    (sharp, blurred), frame = instruments([(40, 45, 300, 300)])
+    data, weights = sharp.data.copy(), sharp.weights.copy()
+    data[:, 10:20, 10:20] = 1e6
+    weights[:, 10:20, 10:20] = 0
+    sharp = Observation(data, sharp.psf, sharp.grid, weights=weights, name="sharp")
+    found = detect([sharp, blurred], frame)
+    assert len(found.sources) == 1 and nearest(found, 40, 45) < 2
+
+
+def test_what_a_fit_leaves_over_is_found(device):
+    sources = [(40, 40, 20000, 20000), (40, 52, 120, 120)]
+    observations, frame = instruments(sources)
+    first = [Extended(position_px=(40, 40))]
+    result = deblend(
+        observations, first, frame=frame, device=device, settings=Settings(max_iter=20)
+    )
+    more = detect_more(result, device=device)
+    assert nearest(more, 40, 52) < 3
+    assert all(np.hypot(s.position_px[0] - 40, s.position_px[1] - 40) > 2 for s in more.sources)
+
+
+@pytest.mark.parametrize("threshold", [0, -1, float("nan"), float("inf")])
+def test_threshold_must_be_positive(threshold):
+    observations, frame = instruments([])
+    with pytest.raises(ValueError, match="threshold"):
+        detect(observations, frame, threshold=threshold)
+
+
+def test_without_sep_it_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "sep", None)
+    observations, frame = instruments([])
+    with pytest.raises(ImportError, match="clresample\\[detect\\]"):
+        detect(observations, frame)
