@@ -59,9 +59,9 @@ def test_deblend(tmp_path):
 
 def test_joint_goes_on_where_it_ended(tmp_path):
     options = ("--processes", "1", "--folder", str(tmp_path))
-    run("joint", "--scenes", "1", *options)
+    run("paper.joint", "--scenes", "1", *options)
     one = (tmp_path / "joint.jsonl").read_text()
-    text = run("joint", "--scenes", "2", *options)
+    text = run("paper.joint", "--scenes", "2", *options)
     two = (tmp_path / "joint.jsonl").read_text()
     assert two.startswith(one)
     assert two.count("\n") == 3  # settings and two scenes
@@ -86,7 +86,7 @@ def galaxies(n, gain, rng):
 
 @pytest.mark.parametrize(("gain", "verdict"), [(1.0, True), (0.0, None), (-3.0, False)])
 def test_findings_say_what_the_numbers_say(gain, verdict):
-    from bench import joint_findings
+    from bench.paper import joint_findings
 
     table = galaxies(600, gain, np.random.default_rng(3))
     maps = joint_findings.bin_galaxies(table, ["own"])
@@ -106,7 +106,7 @@ def test_findings_say_what_the_numbers_say(gain, verdict):
 
 
 def test_sersic_profiles_are_found():
-    from bench import sersic
+    from bench.paper import sersic
 
     y, x = np.indices((61, 64)) - np.array([30.3, 33.8])[:, None, None]
     image = 5 * np.exp(-0.5 * ((y / 4) ** 2 + (x / 2) ** 2) ** (1 / 1.6))
@@ -123,8 +123,8 @@ def test_sersic_profiles_are_found():
         ("deblend", ("--max-iter", "few"), "few"),
         ("deblend", ("--catalogue", "nowhere"), "nowhere"),
         ("deblend", ("--json", "."), "--json ."),
-        ("joint", ("--scenes", "none"), "none"),
-        ("joint", ("--catalogue", "nowhere", "--folder", "."), "nowhere"),
+        ("paper.joint", ("--scenes", "none"), "none"),
+        ("paper.joint", ("--catalogue", "nowhere", "--folder", "."), "nowhere"),
     ],
 )
 def test_bad_options_get_one_line(module, options, words):

@@ -26,11 +26,11 @@ def folder(tmp_path_factory):
     pytest.importorskip("matplotlib")
     folder = tmp_path_factory.mktemp("report")
     pairs = ("--pairs", "EUCLID-RUBIN", "RUBIN-RUBIN", "--processes", 1, "--folder", folder)
-    run("accuracy", "--galaxies", 1, *pairs)
-    run("accuracy", "--galaxies", 2, *pairs)
+    run("paper.accuracy", "--galaxies", 1, *pairs)
+    run("paper.accuracy", "--galaxies", 2, *pairs)
     pairs = ("--pairs", "HST-RUBIN", "EUCLID-RUBIN")
-    run("timing", "--sizes", 20, 30, *pairs, "--seconds", 0.01, "--folder", folder)
-    run("report", "--folder", folder)
+    run("paper.timing", "--sizes", 20, 30, *pairs, "--seconds", 0.01, "--folder", folder)
+    run("paper.report", "--folder", folder)
     return folder
 
 
@@ -128,7 +128,7 @@ def accuracy_numbers(sinc=50.0, wins=0.0, wide=45.0, spread=11.0):
     ],
 )
 def test_verdicts_follow_the_numbers(change, failing):
-    from bench.accuracy_findings import findings
+    from bench.paper.accuracy_findings import findings
 
     found = findings("accuracy", **accuracy_numbers(**change))
     assert tuple(f.title for f in found if f.holds is False) == failing
@@ -136,7 +136,7 @@ def test_verdicts_follow_the_numbers(change, failing):
 
 
 def test_fits_of_times():
-    from bench.timing_findings import findings, line_fit, slope
+    from bench.paper.timing_findings import findings, line_fit, slope
 
     sizes = [50, 100, 200, 400]
     assert slope(sizes, [9.0] + [1e-8 * n**4 for n in sizes[1:]]) == pytest.approx(4)
@@ -160,7 +160,8 @@ def test_fits_of_times():
 
 
 def test_a_log_goes_on_after_an_interruption(tmp_path):
-    from bench.common import BadOption, Log
+    from bench.harness.options import BadOption
+    from bench.harness.records import Log
 
     path = tmp_path / "run.jsonl"
     log = Log(path, {"device": "A"})
@@ -179,13 +180,13 @@ def test_a_log_goes_on_after_an_interruption(tmp_path):
 @pytest.mark.parametrize(
     ("module", "options", "words"),
     [
-        ("accuracy", ("--printed", "--wide"), "leave --printed out"),
-        ("accuracy", ("--galaxies", "0"), "0 is not above 0"),
-        ("accuracy", ("--processes", "none"), "none"),
-        ("timing", ("--pairs", "RUBIN-HST"), "RUBIN-HST is not FROM-TO"),
-        ("timing", ("--sizes", "1", "--pairs", "EUCLID-RUBIN"), "no observed pixel"),
-        ("timing", ("--folder", "Makefile"), "--folder Makefile"),
-        ("report", ("--folder", "docs"), "no results"),
+        ("paper.accuracy", ("--printed", "--wide"), "leave --printed out"),
+        ("paper.accuracy", ("--galaxies", "0"), "0 is not above 0"),
+        ("paper.accuracy", ("--processes", "none"), "none"),
+        ("paper.timing", ("--pairs", "RUBIN-HST"), "RUBIN-HST is not FROM-TO"),
+        ("paper.timing", ("--sizes", "1", "--pairs", "EUCLID-RUBIN"), "no observed pixel"),
+        ("paper.timing", ("--folder", "Makefile"), "--folder Makefile"),
+        ("paper.report", ("--folder", "docs"), "no results"),
     ],
 )
 def test_bad_options_get_one_line(module, options, words):

@@ -11,7 +11,7 @@ from clresample import Resampler
 from clresample.simulation.galaxies import draw, import_galsim, open_catalogue, random_galaxy
 from clresample.simulation.surveys import Survey
 
-from .common import BadOption, data_folder
+from .options import BadOption, data_folder
 
 # Sigma of the Gaussian that band-limits a galaxy before it is drawn [model pixels].
 SMOOTHING_PX = 2.0
@@ -96,6 +96,15 @@ class Case:
             return observed.drawImage(image, method="no_pixel").array
 
         return render
+
+
+def check_observed(case):
+    """Raise BadOption for a case whose model stamp holds no whole observed pixel."""
+    if case.n_obs == 0:
+        raise BadOption(
+            f"--sizes {case.n_model}: no observed pixel from {case.survey_in.name} to "
+            f"{case.survey_out.name}"
+        )
 
 
 def _jacobian(grid):

@@ -1,6 +1,6 @@
 """The report: every figure beside the paper's statement and what was found here.
 
-    python -m bench.report [--folder FOLDER]
+    python -m bench.paper.report [--folder FOLDER]
 
 Each benchmark of the paper writes FOLDER/NAME.json, NAME as in `SECTIONS`, and its figures:
 
@@ -15,7 +15,8 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 
-from . import common
+from ..harness import records
+from ..harness.options import BadOption, Parser, run
 
 SECTIONS = {
     "accuracy": "Section 5: accuracy",
@@ -52,7 +53,7 @@ class Finding:
 def save(folder, name, record, findings, **numbers):
     """Write FOLDER/NAME.json: the record, the findings, and the numbers they were made from."""
     content = {"record": record, "findings": [asdict(f) for f in findings], **numbers}
-    common.write_json(folder / f"{name}.json", content)
+    records.write_json(folder / f"{name}.json", content)
 
 
 def load(folder):
@@ -105,17 +106,17 @@ def _table(rows):
 def main(options):
     results = load(options.folder)
     if not results:
-        raise common.BadOption(f"--folder {options.folder} holds no results yet")
+        raise BadOption(f"--folder {options.folder} holds no results yet")
     path = options.folder / "report.md"
-    common.write_text(path, markdown(results))
+    records.write_text(path, markdown(results))
     print(f"{path}: {', '.join(results)}")
 
 
 def parser():
-    parser = common.Parser("bench.report", description=__doc__.splitlines()[0])
+    parser = Parser("bench.paper.report", description=__doc__.splitlines()[0])
     parser.add_folder()
     return parser
 
 
 if __name__ == "__main__":
-    common.run(main, parser())
+    run(main, parser())

@@ -1,6 +1,6 @@
 """Section 6 of the paper: galaxies of blended scenes, fitted to either survey alone and to both.
 
-    python -m bench.joint [--scenes N] [--folder FOLDER]
+    python -m bench.paper.joint [--scenes N] [--folder FOLDER]
 
 A scene holds 1 to 10 galaxies as in the paper's table.  Three modes: Rubin's six bands alone,
 Euclid's alone, both together; all models live on Euclid's pixels, those of the truth.  Two starts:
@@ -22,7 +22,10 @@ from tqdm import tqdm
 from clresample.deblending.batch import deblend_many
 from clresample.deblending.settings import Settings
 
-from . import common, figures, joint_findings, report, scenes, sersic
+from ..harness import records, scenes
+from ..harness.clock import in_processes, on_one_thread
+from ..harness.options import Parser, positive, run
+from . import figures, joint_findings, report, sersic
 
 STARTS = ("own", "sersic")
 CHUNK = 8  # scenes simulated, fitted side by side and kept together: some seconds
@@ -74,7 +77,7 @@ def run_scenes(options, log):
     tasks = [(options.catalogue, chunk) for chunk in chunks]
     there = options.scenes - len(missing)
     with tqdm(total=options.scenes, initial=there, unit=" scenes", desc="joint") as bar:
-        for (_, seeds), parts in common.in_processes(measure, tasks, options.processes):
+        for (_, seeds), parts in in_processes(measure, tasks, options.processes):
             for seed, part in zip(seeds, parts, strict=True):
                 log.append((seed,), part)
             bar.update(len(seeds))
@@ -134,13 +137,13 @@ def draw(folder, maps):
 
 def main(options):
     sky = open_scenes(options.catalogue)
-    threads, fit = common.on_one_thread(), Settings()
-    record = common.record(threads) | {
+    threads, fit = on_one_thread(), Settings()
+    record = records.record(threads) | {
         "settings": f"at most {fit.max_iter} iterations, tol {fit.tol:g}, {fit.prior}",
         "scenes": sky.name,
     }
     kept = ("clresample", "galsim", "device", "settings", "scenes")
-    log = common.Log(options.folder / "joint.jsonl", {name: record[name] for name in kept})
+    log = records.Log(options.folder / "joint.jsonl", {name: record[name] for name in kept})
     run_scenes(options, log)
     galaxies, n_failed = collect(log)
     record["scenes"] = f"{len(log.done)} of {sky.name}"
@@ -154,10 +157,10 @@ def main(options):
 
 
 def parser():
-    parser = common.Parser("bench.joint", description=__doc__.splitlines()[0])
+    parser = Parser("bench.paper.joint", description=__doc__.splitlines()[0])
     parser.add_argument(
         "--scenes",
-        type=common.positive(int),
+        type=positive(int),
         default=200,
         metavar="N",
         help="how many scenes there shall be in all; the paper has 2315 (%(default)s)",
@@ -169,4 +172,4 @@ def parser():
 
 
 if __name__ == "__main__":
-    common.run(main, parser())
+    run(main, parser())

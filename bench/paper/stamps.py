@@ -12,7 +12,7 @@ from clresample.resampling.paper.resampler import PaperResampler
 from clresample.simulation.galaxies import draw
 from clresample.simulation.sdr import sdr
 
-from .cases import Case, Galaxies
+from ..harness.cases import Case, Galaxies
 
 N_OBS = 60  # [pixels] side of the observed stamp, the paper's
 METHODS = ("ours", "ours64", "paper", "quintic", "sinc")

@@ -18,7 +18,7 @@ from clresample.sky.frame import model_frame
 from clresample.sky.sources import Extended
 
 from .cases import Case, Galaxies
-from .common import data_folder
+from .options import data_folder
 
 # Each mode's instruments; the model always lives on Euclid's pixels, those of the truth.
 MODES = {"rubin": ("rubin",), "euclid": ("euclid",), "joint": ("euclid", "rubin")}

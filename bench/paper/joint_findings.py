@@ -6,8 +6,8 @@ import numpy as np
 
 from clresample.simulation.scenes import MAGNITUDE_RANGE
 
+from ..harness.scenes import MODES
 from .report import Finding
-from .scenes import MODES
 
 SINGLES = tuple(mode for mode in MODES if mode != "joint")
 TITLES = {"rubin": "Rubin alone", "euclid": "Euclid alone"}
