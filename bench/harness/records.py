@@ -63,6 +63,11 @@ def write_json(path, content):
     write_text(path, json.dumps(_finite(content), indent=1, allow_nan=False) + "\n")
 
 
+def read_json(path):
+    """Read what `write_json` wrote; null, an infinite or undefined number, becomes NaN."""
+    return _numbers(json.loads(path.read_text(encoding="utf-8")))
+
+
 def write_text(path, text):
     """Write a file whole or not at all."""
     part = path.with_name(path.name + ".part")
@@ -109,6 +114,14 @@ class Log:
         line = json.dumps(_finite(content), allow_nan=False) + "\n"
         with self.path.open("ab", buffering=0) as file:
             file.write(line.encode())
+
+
+def _numbers(value):
+    if isinstance(value, dict):
+        return {name: _numbers(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_numbers(item) for item in value]
+    return math.nan if value is None else value
 
 
 def _finite(value):

@@ -19,7 +19,6 @@ from ..harness import records
 from ..harness.clock import in_processes, on_one_thread
 from ..harness.options import BadOption, Parser, run, survey_pairs, survey_table
 from . import figures, report
-from .accuracy_findings import findings
 from .stamps import METHODS, N_OBS, drawn, edge_light, measure, open_galaxies, renderers, stamp
 
 CHUNK = 25  # galaxies measured and kept together: about a second
@@ -231,7 +230,7 @@ def main(options):
     run_chunks(cases, options, log)
     found = {case: collect(case, options.galaxies, log) for case in cases}
     numbers = evaluate(options.folder, name, found, surveys, galaxies)
-    report.save(options.folder, name, record, findings(name, **numbers), **numbers)
+    report.save(options.folder, name, record, **numbers)
 
 
 def parser():

@@ -25,7 +25,8 @@ from clresample.deblending.settings import Settings
 from ..harness import records, scenes
 from ..harness.clock import in_processes, on_one_thread
 from ..harness.options import Parser, positive, run
-from . import figures, joint_findings, report, sersic
+from . import figures, report, sersic
+from .joint_bins import SINGLES, bin_galaxies, summarise
 
 STARTS = ("own", "sersic")
 CHUNK = 8  # scenes simulated, fitted side by side and kept together: some seconds
@@ -111,14 +112,13 @@ def draw(folder, maps):
             [Map(f"{titles[m]}, SDR [dB]", mean[m], limits=limits) for m in scenes.MODES],
             **axes,
         )
-        singles = [m for m in scenes.MODES if m != "joint"]
-        gains = [maps["gain"][f"{start}-{m}"] for m in singles]
-        errors = [maps["error"][f"{start}-{m}"] for m in singles]
+        gains = [maps["gain"][f"{start}-{m}"] for m in SINGLES]
+        errors = [maps["error"][f"{start}-{m}"] for m in SINGLES]
         figures.heat_maps(
             folder / f"joint-single_vs_joint-{start}.png",
             [
                 Map(f"joint minus {titles[m]} [dB]", gain, diverging=True)
-                for m, gain in zip(singles, gains, strict=True)
+                for m, gain in zip(SINGLES, gains, strict=True)
             ],
             **axes,
         )
@@ -127,7 +127,7 @@ def draw(folder, maps):
             [
                 *(
                     Map(f"its standard error, {titles[m]} [dB]", error, ".2f")
-                    for m, error in zip(singles, errors, strict=True)
+                    for m, error in zip(SINGLES, errors, strict=True)
                 ),
                 number,
             ],
@@ -147,13 +147,10 @@ def main(options):
     run_scenes(options, log)
     galaxies, n_failed = collect(log)
     record["scenes"] = f"{len(log.done)} of {sky.name}"
-    maps = joint_findings.bin_galaxies(galaxies, STARTS)
+    maps = bin_galaxies(galaxies, STARTS)
     draw(options.folder, maps)
-    numbers = joint_findings.summarise(galaxies, maps, STARTS) | {"n_failed": n_failed}
-    found = joint_findings.joint(maps, STARTS, numbers)
-    report.save(options.folder, "joint", record, found, **numbers)
-    for finding in found:
-        print(f"{finding.title}: {finding.found}")
+    numbers = summarise(galaxies, maps, STARTS) | {"n_failed": n_failed}
+    report.save(options.folder, "joint", record, **numbers)
 
 
 def parser():

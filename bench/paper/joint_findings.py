@@ -1,149 +1,102 @@
-"""Galaxies of the joint fits by magnitude, and what they say about the paper's statements."""
+"""What the joint fits say about section 6."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from clresample.simulation.scenes import MAGNITUDE_RANGE
-
 from ..harness.scenes import MODES
-from .report import Finding
+from .finding import Claim, Finding
+from .joint_bins import BRIGHT, REGIONS, SINGLES
 
-SINGLES = tuple(mode for mode in MODES if mode != "joint")
+NAMES = {"rubin": "Rubin", "euclid": "Euclid", "joint": "joint"}
 TITLES = {"rubin": "Rubin alone", "euclid": "Euclid alone"}
-START_NAMES = {
-    "own": "starting from nothing but positions",
-    "sersic": "starting from Sersic fits to the truth, as the paper does",
-}
-# Bins a side: as many as leave this many galaxies to a bin.
-N_BINS, GALAXIES_PER_BIN = (9, 6, 3), 12
-# Bins with fewer galaxies have a mean, but no say.
+# Bins with fewer galaxies have a mean, but their differences do not count.
 FEWEST = 5
-# Standard errors by which a difference counts.
+# Standard errors beyond which a difference counts as certain.
 CERTAIN = 2.0
-# [mag] A galaxy is called bright in a survey up to the middle of the range.
-BRIGHT = sum(MAGNITUDE_RANGE) / 2
-REGIONS = {
-    "bright in both": (True, True),
-    "bright in Euclid only": (True, False),
-    "bright in Rubin only": (False, True),
-    "faint in both": (False, False),
-}
 VIRTUALLY_ALL = 0.9  # of the bins
+ORDER_OF_MAGNITUDE = 10.0  # [dB] the residual's norm ten times smaller
 OVER_EUCLID, OVER_BETTER = 0.70, 0.50  # shares of the galaxies that joint fits are asked to win
 MEDIANS = {"euclid": 5.7, "joint": 7.0}  # [dB] asked of fits without knowledge of the truth
 
-
-def bin_galaxies(galaxies, starts):
-    """Means in bins of Euclid's magnitude (rows) and of the brightest in Rubin (columns).
-
-    galaxies: name -> (n,): euclid_mag, rubin_mag, and SDRs of every start-mode
-    returns edges (n + 1,), number (n, n), mean {start-mode: (n, n)}, and of joint minus each single
-        mode gain and error, its standard error, {start-mode: (n, n)}; NaN where there is none
-    """
-    n_galaxies = len(galaxies["euclid_mag"])
-    wanted = [n for n in N_BINS if n_galaxies >= GALAXIES_PER_BIN * n * n]
-    n_bins = wanted[0] if wanted else N_BINS[-1]
-    edges = np.linspace(*MAGNITUDE_RANGE, n_bins + 1)
-    row, column = (
-        np.clip(np.searchsorted(edges, galaxies[name], "right") - 1, 0, n_bins - 1)
-        for name in ("euclid_mag", "rubin_mag")
+BRIGHTNESS = Claim(
+    "fig:sdr_per_mag",
+    "SDR by magnitude",
+    "A survey alone is most accurate for sources that are bright in it, both together for sources "
+    "that are bright in either.",
+    "in every such group",
+)
+DIFFERENCE = {
+    mode: Claim(
+        "fig:single_vs_joint",
+        f"Joint minus {title}",
+        f"Modelling both surveys together is more accurate than {title} in nearly every bin of "
+        "magnitude.",
+        "virtually all bins",
     )
-    cell = row * n_bins + column
-
-    def table(values):
-        return np.bincount(cell, values, n_bins**2).reshape(n_bins, n_bins)
-
-    number = table(np.ones(n_galaxies))
-
-    def mean_and_error(values):
-        with np.errstate(invalid="ignore", divide="ignore"):
-            mean = table(values) / number
-            variance = table((values - mean.ravel()[cell]) ** 2) / (number - 1)
-            return mean, np.where(number > 1, np.sqrt(variance / number), np.nan)
-
-    maps = {"edges": edges, "number": number, "mean": {}, "gain": {}, "error": {}}
-    for start in starts:
-        for mode in MODES:
-            maps["mean"][f"{start}-{mode}"] = mean_and_error(galaxies[f"{start}-{mode}"])[0]
-        for mode in SINGLES:
-            gain = galaxies[f"{start}-joint"] - galaxies[f"{start}-{mode}"]
-            name = f"{start}-{mode}"
-            maps["gain"][name], maps["error"][name] = mean_and_error(gain)
-    return maps
-
-
-def summarise(galaxies, maps, starts):
-    """Numbers of the run for its JSON: medians, shares, means by region, and the maps."""
-    bright = [galaxies[name] <= BRIGHT for name in ("euclid_mag", "rubin_mag")]
-    summary = {"n_galaxies": len(bright[0]), "starts": {}}
-    for start in starts:
-        sdr = {mode: galaxies[f"{start}-{mode}"] for mode in MODES}
-        better = np.maximum(sdr["euclid"], sdr["rubin"])
-        gains = {mode: sdr["joint"] - sdr[mode] for mode in SINGLES}
-        gains["better"] = sdr["joint"] - better
-        found = {
-            "median": {mode: float(np.median(values)) for mode, values in sdr.items()},
-            "wins": {name: float((gain > 0).mean()) for name, gain in gains.items()},
-            "gain": {name: _mean(gain) for name, gain in gains.items()},
-            "regions": {},
-        }
-        for name, (in_euclid, in_rubin) in REGIONS.items():
-            here = (bright[0] == in_euclid) & (bright[1] == in_rubin)
-            found["regions"][name] = {
-                "n": int(here.sum()),
-                "mean": {mode: _mean(values[here])["mean"] for mode, values in sdr.items()},
-                "gain": {name: _mean(gain[here]) for name, gain in gains.items()},
-            }
-        summary["starts"][start] = found
-    plain = {name: maps[name].tolist() for name in ("edges", "number")}
-    for kind in ("mean", "gain", "error"):
-        plain[kind] = {name: np.round(m, 3).tolist() for name, m in maps[kind].items()}
-    return summary | {"maps": plain}
+    for mode, title in TITLES.items()
+}
+LARGEST = Claim(
+    "fig:single_vs_joint",
+    "The largest gain",
+    "Where one survey sees a source much brighter than the other, joint modelling gains up to an "
+    "order of magnitude over the other alone.",
+    f"{ORDER_OF_MAGNITUDE:g} dB",
+)
+GAIN = Claim(
+    "",
+    "Where joint modelling gains",
+    "Joint modelling is more accurate than the better survey alone, which only the truth can name.",
+    "above 0 dB",
+)
+UNKNOWN_TRUTH = Claim(
+    "",
+    "Accuracy without knowledge of the truth but positions",
+    "Fits that start from positions alone reach these median SDRs, and joint ones beat Euclid "
+    f"alone for {OVER_EUCLID:.0%} of the galaxies and the better survey alone for "
+    f"{OVER_BETTER:.0%}.",
+    ", ".join(f"{NAMES[mode]} {value:g} dB" for mode, value in MEDIANS.items())
+    + f"; {OVER_EUCLID:.0%}, {OVER_BETTER:.0%}",
+)
 
 
-def _mean(values):
-    """Mean and its standard error; null where there are too few."""
-    n = len(values)
-    return {
-        "mean": float(values.mean()) if n else np.nan,
-        "error": float(values.std(ddof=1) / np.sqrt(n)) if n > 1 else np.nan,
+def findings(start, numbers):
+    """Findings of section 6 for the fits of one start; the numbers are those of `summarise`."""
+    maps = {
+        kind: {name: np.array(table, float) for name, table in numbers["maps"][kind].items()}
+        for kind in ("gain", "error")
     }
-
-
-def joint(maps, starts, numbers):
-    """Findings of section 6, from the maps and the numbers of `summarise`."""
-    found = []
-    for start in starts:
-        of_start = numbers["starts"][start]
-        found.append(_where_bright(start, of_start))
-        found += [_difference(start, mode, maps, of_start) for mode in SINGLES]
-        found.append(_gains(start, of_start))
-    return [*found, _wins(numbers)]
+    maps |= {name: np.array(numbers["maps"][name]) for name in ("edges", "number")}
+    of_start = numbers["starts"][start]
+    found = [
+        _where_bright(start, of_start),
+        *(_difference(start, mode, maps, of_start) for mode in SINGLES),
+        _largest(start, maps, numbers["starts"]),
+        _gains(start, of_start),
+    ]
+    return [*found, _unknown_truth(numbers)] if start == "own" else found
 
 
 def _where_bright(start, found):
     means = {name: region["mean"] for name, region in found["regions"].items()}
     alone = means["bright in Euclid only"], means["bright in Rubin only"]
-    own_best = alone[0]["euclid"] > alone[0]["rubin"] and alone[1]["rubin"] > alone[1]["euclid"]
-    in_any = all(
+    own_best = alone[0]["euclid"] > alone[0]["rubin"], alone[1]["rubin"] > alone[1]["euclid"]
+    in_any = [
         means[name]["joint"] > means["faint in both"]["joint"]
         for name in REGIONS
         if name != "faint in both"
-    )
+    ]
     text = "; ".join(
         f"{name}: Rubin {mean['rubin']:.1f}, Euclid {mean['euclid']:.1f}, joint "
         f"{mean['joint']:.1f} dB"
         for name, mean in means.items()
     )
     return Finding(
-        "fig:sdr_per_mag",
-        f"SDR by magnitude, {START_NAMES[start]}",
-        "Each survey alone is most accurate where sources are bright in it; joint modelling is "
-        "accurate where they are bright in any.",
+        BRIGHTNESS,
+        f"{sum(own_best)} of 2 groups alone; {sum(in_any)} of 3 together",
         f"Mean SDRs of galaxies (bright: up to magnitude {BRIGHT:g}): {text}.",
-        own_best and in_any,
-        f"joint-sdr_per_mag-{start}.png",
+        all(own_best) and all(in_any),
+        figure=f"joint-sdr_per_mag-{start}.png",
     )
 
 
@@ -155,25 +108,63 @@ def _difference(start, mode, maps, found):
     n, n_better = counted.sum(), better.sum()
     n_worse = (sure & (gain < 0)).sum()
     mean = found["gain"][mode]
-    edges = [f"{low:g} - {high:g}" for low, high in zip(maps["edges"][:-1], maps["edges"][1:])]
-    table = [["Euclid / Rubin [mag]", *edges]]
-    for edge, *columns in zip(edges, gain, error, number):
-        cells = [
-            "" if not n_here else f"{g:+.1f} ± {e:.1f} ({n_here:.0f})"
-            for g, e, n_here in zip(*columns)
-        ]
-        table.append([edge, *cells])
     return Finding(
-        "fig:single_vs_joint",
-        f"Joint minus {TITLES[mode]}, {START_NAMES[start]}",
-        "Virtually all bins of magnitude show joint modelling to be more accurate.",
+        DIFFERENCE[mode],
+        f"{n_better} of {n} bins",
         f"Joint modelling is better in {n_better} of {n} bins that hold {FEWEST} galaxies or more, "
         f"beyond {CERTAIN:g} standard errors in {(sure & better).sum()}, and worse beyond them in "
-        f"{n_worse}; over all galaxies by {mean['mean']:.2f} ± {mean['error']:.2f} dB. The table "
-        "gives the mean difference [dB], its standard error and the number of galaxies.",
+        f"{n_worse}; over all galaxies it gains {mean['mean']:+.2f} ± {mean['error']:.2f} dB.",
         bool(n_better >= VIRTUALLY_ALL * n) if n else None,
-        f"joint-single_vs_joint-{start}.png",
-        table,
+        more="The table gives the mean difference [dB], its standard error and the number of "
+        "galaxies.",
+        figure=f"joint-single_vs_joint-{start}.png",
+        table=_difference_table(maps["edges"], gain, error, number),
+    )
+
+
+def _difference_table(edges, gain, error, number):
+    names = [f"{low:g} - {high:g}" for low, high in zip(edges[:-1], edges[1:])]
+    table = [["Euclid / Rubin [mag]", *names]]
+    for name, *columns in zip(names, gain, error, number):
+        cells = [
+            "" if not n_here else f"{g:+.2f} ± {e:.2f} ({n_here:.0f})"
+            for g, e, n_here in zip(*columns)
+        ]
+        table.append([name, *cells])
+    return table
+
+
+def _largest(start, maps, starts):
+    """The largest mean gains, and what a start from the truth leaves to gain."""
+    counted, edges = maps["number"] >= FEWEST, maps["edges"]
+    largest, texts = [], []
+    for mode in SINGLES:
+        gain = np.where(counted, maps["gain"][f"{start}-{mode}"], -np.inf)
+        row, column = np.unravel_index(gain.argmax(), gain.shape)
+        largest.append(gain[row, column])
+        texts.append(
+            f"{gain[row, column]:.1f} dB over {TITLES[mode]} (magnitude {edges[row]:g} to "
+            f"{edges[row + 1]:g} in Euclid, {edges[column]:g} to {edges[column + 1]:g} in Rubin)"
+        )
+    known = bool(counted.any())
+    return Finding(
+        LARGEST,
+        " and ".join(f"{gain:.1f} dB" for gain in largest) if known else "too few galaxies",
+        f"The largest mean gains of a bin are {' and '.join(texts)}{_head_start(start, starts)}."
+        if known
+        else f"No bin holds {FEWEST} galaxies.",
+        bool(max(largest) >= ORDER_OF_MAGNITUDE) if known else None,
+    )
+
+
+def _head_start(start, starts):
+    if start != "sersic" or "own" not in starts:
+        return ""
+    region = "bright in Euclid only"
+    here, own = (starts[name]["regions"][region]["mean"]["rubin"] for name in ("sersic", "own"))
+    return (
+        f"; a start fitted to the truth knows what a survey does not see: for galaxies {region}, "
+        f"Rubin alone makes {here:.1f} dB from it and {own:.1f} dB from positions alone"
     )
 
 
@@ -189,41 +180,37 @@ def _gains(start, found):
         if region["n"] < FEWEST:
             continue
         sure = abs(gain["mean"]) > CERTAIN * gain["error"]
-        verdict = "gains" if gain["mean"] > 0 else "loses"
-        group = groups[verdict if sure else "makes no certain difference"]
+        outcome = "gains" if gain["mean"] > 0 else "loses"
+        group = groups[outcome if sure else "makes no certain difference"]
         group.append(f"{name} ({difference} dB, n = {region['n']})")
     text = "; ".join(
-        f"it {verdict} for galaxies {', '.join(names)}"
-        for verdict, names in groups.items()
+        f"it {outcome} for galaxies {', '.join(names)}"
+        for outcome, names in groups.items()
         if names
     )
     mean, over = found["gain"]["better"], found["gain"]
+    over_all = f"{mean['mean']:+.2f} ± {mean['error']:.2f} dB"
     return Finding(
-        "",
-        f"Where joint modelling gains, {START_NAMES[start]}",
-        "Where joint modelling gains over the better survey alone, and where it does not.",
-        f"Against the better survey of each galaxy, which only the truth can tell: {text}. Over "
-        f"all galaxies {mean['mean']:+.2f} ± {mean['error']:.2f} dB; against a survey chosen "
-        f"beforehand {over['rubin']['mean']:+.2f} dB (Rubin) and {over['euclid']['mean']:+.2f} dB "
-        "(Euclid).",
+        GAIN,
+        over_all,
+        f"Against the better survey of each galaxy, {text or 'there are too few to say'}.",
         bool(mean["mean"] > 0) if abs(mean["mean"]) > CERTAIN * mean["error"] else None,
-        f"joint-errors-{start}.png",
-        table,
+        more=f"Over all galaxies {over_all}; against a survey chosen beforehand "
+        f"{over['rubin']['mean']:+.2f} dB (Rubin) and {over['euclid']['mean']:+.2f} dB (Euclid).",
+        figure=f"joint-errors-{start}.png",
+        table=table,
     )
 
 
-def _wins(numbers):
+def _unknown_truth(numbers):
     found = numbers["starts"]["own"]
     median, wins = found["median"], found["wins"]
     return Finding(
-        "",
-        "Accuracy without knowledge of the truth but positions",
-        "Median SDR at least "
-        + ", ".join(f"{value:g} dB {mode}" for mode, value in MEDIANS.items())
-        + f"; joint better than Euclid alone for {OVER_EUCLID:.0%} of the galaxies, and than the "
-        f"better survey alone for {OVER_BETTER:.0%}.",
+        UNKNOWN_TRUTH,
+        ", ".join(f"{NAMES[mode]} {median[mode]:.2f} dB" for mode in MEDIANS)
+        + f"; {wins['euclid']:.1%}, {wins['better']:.1%}",
         f"Over {numbers['n_galaxies']} galaxies the medians are "
-        + ", ".join(f"{value:.2f} dB {mode}" for mode, value in median.items())
+        + ", ".join(f"{NAMES[mode]} {value:.2f} dB" for mode, value in median.items())
         + f"; joint is better than Euclid alone for {wins['euclid']:.1%}, than Rubin alone for "
         f"{wins['rubin']:.1%}, than the better of both for {wins['better']:.1%}.",
         all(median[mode] >= value for mode, value in MEDIANS.items())

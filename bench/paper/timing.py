@@ -24,7 +24,7 @@ from ..harness.cases import Case, Galaxies, check_observed
 from ..harness.clock import interleaved_ms, on_one_thread
 from ..harness.options import Parser, run, survey_pairs, survey_table
 from . import figures, report
-from .timing_findings import PAPER_FIT, findings, line_fit
+from .timing_findings import PAPER_FIT, line_fit, means
 
 SIZES = (20, 30, 50, 70, 100, 150, 200)  # [model pixels a side], the paper's
 MAIN_PAIR, MAIN_SIZES, ANGLES_DEG = ("EUCLID", "RUBIN"), (50, 100, 200, 300, 400), (0.0, 30.0)
@@ -97,15 +97,6 @@ def measure_schemes(surveys, sizes, galaxies, seconds):
     ]
 
 
-def means(rows, kind):
-    """Sizes, and mean times [ms] by method over the pairs of each size."""
-    sizes = sorted({row["n_model"] for row in rows})
-    return sizes, {
-        name: [float(np.mean([r[kind][name] for r in rows if r["n_model"] == n])) for n in sizes]
-        for name in rows[0][kind]
-    }
-
-
 def main(options):
     cases, galaxies = plan(options), Galaxies(options.catalogue)
     for case in cases.values():
@@ -139,8 +130,7 @@ def main(options):
     figures.time_ratios(options.folder / "timing-time_ratios.png", rows, fits, PAPER_FIT)
     figures.absolute_timings(options.folder / "timing-absolute_timings.png", sizes, running, setups)
     figures.schemes(options.folder / "timing-schemes.png", schemes)
-    found = list(findings(rows, schemes, sizes, running))
-    report.save(options.folder, "timing", record, found, rows=rows, schemes=schemes)
+    report.save(options.folder, "timing", record, rows=rows, schemes=schemes)
 
 
 def parser():

@@ -98,15 +98,3 @@ def test_bad_options_get_one_line(module, options, words):
     assert result.stdout == ""
     assert result.stderr.count("\n") == 1
     assert words in result.stderr
-
-
-def test_json_is_written_whole_or_not_at_all(tmp_path):
-    from bench.harness.records import write_json
-
-    file = tmp_path / "x.json"
-    write_json(file, {"rows": [1.0, float("inf"), {"a": float("nan")}]})
-    assert json.loads(file.read_text()) == {"rows": [1.0, None, {"a": None}]}
-    with pytest.raises(TypeError):
-        write_json(file, {"rows": object()})
-    assert json.loads(file.read_text())["rows"][0] == 1.0
-    assert list(tmp_path.iterdir()) == [file]
