@@ -31,9 +31,9 @@ from .harness.options import Parser, positive, run, seed
 VIEWS = {"upright": (0.0, False), "turned": (30.0, False), "mirrored": (0.0, True)}
 BATCHES = (1, 4, 16, 64)
 N_SCENES, N_QUICK = 24, 6
-# GalSim renders before and after each batch.
+# GalSim renders before and after each batch; the batch is compared with their median time.
 N_TICKS = 10
-# [s] --quick leaves out batches that would not end by then
+# [s] --quick leaves out batches that would end later, so that it takes less than a minute
 QUICK_SECONDS = 42.0
 COST_COLUMNS = (
     ("mode", 6, ""),
@@ -63,7 +63,12 @@ BATCH_COLUMNS = (
 
 
 class Pace:
-    """Times a fit's iterations from its progress calls, with a GalSim render between them."""
+    """Times a fit's iterations from its progress calls, with a GalSim render at each call.
+
+    clock: `GalSimClock` that renders
+    steps_s [s]: time of an iteration between two calls, the renders left out
+    paused_s [s]: time of all renders, to be taken off the fit's
+    """
 
     def __init__(self, clock):
         self.clock, self.steps_s, self.paused_s = clock, [], 0.0
@@ -256,9 +261,11 @@ def parser():
         action="store_true",
         help=f"{N_QUICK} scenes, upright only, and batches that fit into the time",
     )
-    parser.add_argument("--scenes", type=positive(int), metavar="N", help=f"how many ({N_SCENES})")
     parser.add_argument(
-        "--seed", type=seed, default=0, metavar="S", help="of the first scene (%(default)s)"
+        "--scenes", type=positive(int), metavar="N", help=f"how many scenes ({N_SCENES})"
+    )
+    parser.add_argument(
+        "--seed", type=seed, default=0, metavar="S", help="seed of the first scene (%(default)s)"
     )
     parser.add_argument(
         "--views",

@@ -32,8 +32,8 @@ from .harness.options import BadOption, Parser, run, survey_pairs, survey_table
 
 SIZES = (20, 30, 50, 70, 100, 150, 200, 256, 400)  # [model pixels a side]
 ANGLE_DEG = 30.0
-BATCH = 64
-N_SETUPS = 3
+BATCH = 64  # stamps rendered by one call, in the rows of batches
+N_SETUPS = 3  # whose mean is setup_ms
 MAIN_PAIR = ("EUCLID", "RUBIN")
 COLUMNS = (
     ("from", 6, ""),

@@ -13,7 +13,8 @@ from clresample.simulation.surveys import Survey
 
 from .options import BadOption, data_folder
 
-# Sigma of the Gaussian that band-limits a galaxy before it is drawn [model pixels].
+# [model pixels] Sigma of the Gaussian that band-limits a galaxy before it is drawn, so that the
+# model stamp's pixels can hold it.
 SMOOTHING_PX = 2.0
 # GalSim pads an image to this many times its size; its sinc kernel, which never ends, is given that
 # period too (left to itself it asks for FFTs of 49152 x 49152).
@@ -116,7 +117,9 @@ class Galaxies:
     """Galaxies for SDRs: the first of a COSMOS catalogue, or parametric ones where there is none.
 
     folder: of the catalogue; None looks in CLRESAMPLE_DATA and in the data folder by the checkout
-    name: what the record says they are
+    name: "COSMOS" or "parametric", for the record
+
+    Raises BadOption where the folder holds no catalogue.
     """
 
     def __init__(self, folder=None):

@@ -33,8 +33,8 @@ class Parser(argparse.ArgumentParser):
             type=Path,
             default=REPORT,
             metavar="FOLDER",
-            help="of the report: results go there, and an interrupted run continues from there "
-            "(bench/report)",
+            help="the report's: results are written there, and an interrupted run goes on from "
+            "what is there (bench/report)",
         )
 
     def add_sizes(self, sizes):
@@ -147,7 +147,7 @@ def data_folder():
 
 
 def run(main, parser):
-    """Run `main(options)`; what a user can mend is answered in one line, with exit status 2."""
+    """Run `main(options)`; a user's mistake is answered in one line, with exit status 2."""
     options = parser.parse_args()
     json_file, folder = (getattr(options, name, None) for name in ("json", "folder"))
     try:

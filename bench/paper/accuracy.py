@@ -21,10 +21,11 @@ from ..harness.options import BadOption, Parser, run, survey_pairs, survey_table
 from . import figures, report
 from .stamps import METHODS, N_OBS, drawn, edge_light, measure, open_galaxies, renderers, stamp
 
-CHUNK = 25  # galaxies measured and kept together: about a second
-FIELD_ARCSEC = 24.0  # of the wide drawings: from here on results of COSMOS galaxies stay the same
+CHUNK = 25  # galaxies measured and logged together: about a second, lost by an interruption
+# [arcsec] side of the wide drawings; larger ones change no result of a COSMOS galaxy
+FIELD_ARCSEC = 24.0
 PADDINGS = (1.0, 1.25, 1.5, 2.0)  # side of the model stamp over that of the observed stamp's sky
-N_WORST = 3
+N_WORST = 3  # galaxies whose stamps are padded, and whose images are drawn
 VISUAL_PAIRS = (("HST", "RUBIN"), ("EUCLID", "EUCLID"), ("EUCLID", "RUBIN"))
 
 
@@ -80,7 +81,7 @@ def summarise(case, found):
 
 
 def worst_cases(found, galaxies):
-    """The galaxies that GalSim's default renders best against ours: (case, galaxy), each once."""
+    """The galaxies in which ours does worst against GalSim's default: (case, galaxy), each once."""
     n_rows = galaxies.catalogue.nobjects if galaxies.catalogue else np.inf
     margins = [
         (margin, i, case)
@@ -131,7 +132,7 @@ def images(case, i, galaxies):
 
 
 def draw_maps(folder, name, pairs):
-    """The figures SDR, SDR_diff and SDR_sinc, from summaries of survey pairs."""
+    """Draw the figures SDR, SDR_diff and SDR_sinc, from summaries of survey pairs."""
     names = list(survey_table(False))
 
     def table(value):
@@ -175,7 +176,10 @@ def draw_maps(folder, name, pairs):
 
 
 def draw_examples(folder, name, found, chosen, surveys, galaxies):
-    """The figures visual, of a galaxy of median SDR, and visual_edge; what the first shows."""
+    """Draw the figures visual, of a galaxy of median SDR, and visual_edge, of the worst.
+
+    returns titles and SDRs [dB] of the first
+    """
     worst = [images(case, i, galaxies) for case, i in chosen]
     figures.resampled(folder / f"{name}-visual_edge.png", worst)
     reference = found[list(found)[-1]]["ours"]
@@ -188,7 +192,7 @@ def draw_examples(folder, name, found, chosen, surveys, galaxies):
 
 
 def evaluate(folder, name, found, surveys, galaxies):
-    """Draw all figures; the numbers from which the findings are made."""
+    """Draw all figures; return the numbers from which the findings are made."""
     pairs = [summarise(case, columns) for case, columns in found.items()]
     draw_maps(folder, name, pairs)
     # where both surveys are the same, ours cannot lose

@@ -29,7 +29,7 @@ from . import figures, report, sersic
 from .joint_bins import SINGLES, bin_galaxies, summarise
 
 STARTS = ("own", "sersic")
-CHUNK = 8  # scenes simulated, fitted side by side and kept together: some seconds
+CHUNK = 8  # scenes fitted side by side and logged together: some seconds
 
 
 @functools.cache
@@ -93,7 +93,7 @@ def collect(log):
 
 
 def draw(folder, maps):
-    """The figures sdr_per_mag and single_vs_joint, and what is behind the second, of each start."""
+    """Draw sdr_per_mag and single_vs_joint, and the errors of the second, for each start."""
     edges = [f"{low:g}" for low in maps["edges"][:-1]]
     axes = {
         "rows": edges,

@@ -90,7 +90,7 @@ def summarise(galaxies, maps, starts):
 
 
 def _mean(values):
-    """Mean and its standard error; null where there are too few."""
+    """Mean and its standard error; NaN where there are too few values."""
     n = len(values)
     return {
         "mean": float(values.mean()) if n else np.nan,

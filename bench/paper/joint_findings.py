@@ -169,7 +169,7 @@ def _head_start(start, starts):
 
 
 def _gains(start, found):
-    """The sentence on where joint modelling gains over the better survey alone, and where not."""
+    """Where joint modelling gains over the better survey alone, and where it does not."""
     groups = {"gains": [], "makes no certain difference": [], "loses": []}
     table = [["mean SDR [dB]", "galaxies", *map(str.capitalize, MODES), "joint minus the better"]]
     for name, region in found["regions"].items():

@@ -75,7 +75,7 @@ def draw_stamp(galaxy, survey, n_pixels, field_arcsec):
 
 
 def edge_light(image):
-    """Norm of the outermost pixels over that of all: what is cut off there goes on outside."""
+    """Norm of the outermost pixels over that of all: how bright the light is that the edge cuts."""
     edge = image.copy()
     edge[1:-1, 1:-1] = 0
     return np.linalg.norm(edge) / np.linalg.norm(image)
