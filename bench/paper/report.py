@@ -92,7 +92,8 @@ PAPER = """\
 
 In the paper's setting: survey parameters from the notebooks behind its figures, stamps drawn as
 they are, and fits that start from Sersic profiles fitted to the truth. Where the paper gives no
-number, its words stand for one. Labels such as `fig:SDR` are those of the paper's LaTeX source."""
+number, its words stand for one. Labels such as `fig:SDR` are those of the paper's LaTeX source. Its
+times with the full matrix R (section 3) are not measured again."""
 ELSEWHERE = """\
 ### The same statements in other settings
 
