@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 
 from clresample import DeviceError
+from clresample.files.whole_file import FileError
 from clresample.simulation.surveys import NOTEBOOK_SURVEYS, PAPER_SURVEYS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -156,7 +157,7 @@ def run(main, parser):
         if folder:
             _make_folder(folder)
         main(options)
-    except (BadOption, DeviceError, ImportError) as error:
+    except (BadOption, DeviceError, FileError, ImportError) as error:
         parser.error(" ".join(str(error).split()))
 
 

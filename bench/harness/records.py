@@ -10,6 +10,7 @@ import platform
 from importlib.metadata import version
 
 from clresample import __version__, get_device
+from clresample.files.whole_file import whole_file
 
 from .options import BadOption
 
@@ -69,13 +70,9 @@ def read_json(path):
 
 
 def write_text(path, text):
-    """Write a file whole or not at all."""
-    part = path.with_name(path.name + ".part")
-    try:
+    """Write a file whole or not at all. Raises FileError where it cannot be written."""
+    with whole_file(path) as part:
         part.write_text(text, encoding="utf-8")
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 class Log:

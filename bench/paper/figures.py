@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +14,7 @@ from clresample.files.panels import (
     stretch,
     stretch_limits,
 )
+from clresample.files.whole_file import whole_file
 
 DPI = 110  # dots per inch: a page's width in about 100 kB
 INK, FAINT, BLANK = "#20242c", "#c9ced8", "#f1f3f6"
@@ -252,15 +252,11 @@ def _figure(n_y, n_x, width, height):
 
 
 def save(path, figure):
-    """Write a PNG of up to 256 colours, whole or not at all."""
+    """Write a PNG of 256 colours, white among them, whole or not at all. Raises FileError."""
     from PIL import Image  # comes with matplotlib
 
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png", facecolor="white")
-    part = path.with_name(f".part-{os.getpid()}-{path.name}")
-    try:
-        few = Image.open(drawn).convert("RGB").quantize(256, dither=Image.Dither.NONE)
+    few = Image.open(drawn).convert("RGB").quantize(256, dither=Image.Dither.NONE)
+    with whole_file(path) as part:
         few.save(part, format="png", optimize=True)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
