@@ -28,12 +28,12 @@ paper-full: GALAXIES_MORE = 10000
 paper-full: SECONDS = 5
 paper-full: SCENES = 2315
 paper paper-full: $(STAMP)
-	$(RUN) bench.accuracy --galaxies $(GALAXIES)
-	$(RUN) bench.accuracy --wide --galaxies $(GALAXIES_MORE)
-	$(RUN) bench.accuracy --printed --galaxies $(GALAXIES_MORE)
-	$(RUN) bench.timing --seconds $(SECONDS)
-	$(RUN) bench.joint --scenes $(SCENES)
-	$(RUN) bench.report
+	$(RUN) bench.paper.accuracy --galaxies $(GALAXIES)
+	$(RUN) bench.paper.accuracy --wide --galaxies $(GALAXIES_MORE)
+	$(RUN) bench.paper.accuracy --printed --galaxies $(GALAXIES_MORE)
+	$(RUN) bench.paper.timing --seconds $(SECONDS)
+	$(RUN) bench.paper.joint --scenes $(SCENES)
+	$(RUN) bench.paper.report
 
 clean:
 	rm -rf $(VENV) dist .pytest_cache .ruff_cache

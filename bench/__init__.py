@@ -1,1 +1,13 @@
-"""Benchmarks and evidence, run from a checkout: `python -m bench.render` and its neighbours."""
+"""Measurements beside the library, each a command with one line of answer to a bad option.
+
+render     `python -m bench.render`: time and accuracy of a resampling, ours beside GalSim's
+contract   `python -m bench.contract`: the matrix product on the device beside NumPy's
+deblend    `python -m bench.deblend`: time and accuracy of fits to simulated blends
+paper/     the figures and statements of the paper, recomputed, and the report on them
+harness/   what these commands share
+report/    results of the last run of paper/: report.md, its figures, and its numbers as JSON
+
+A command measures the checkout that it is run from: `python -m` puts the working directory before
+whatever is installed.  To compare two checkouts, run the same command with `--json` in each of
+them by turns.
+"""

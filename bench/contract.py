@@ -14,8 +14,10 @@ from clresample import get_device
 from clresample.device.contraction import Contraction, Matrix, padded
 from clresample.simulation.surveys import NOTEBOOK_SURVEYS
 
-from . import common
-from .cases import Case
+from .harness import records
+from .harness.cases import Case
+from .harness.clock import interleaved_ms, on_one_thread
+from .harness.options import Parser, run
 
 YARDSTICKS = (((60, 256, 256), 8), ((60, 256, 256), 64), ((256, 256, 256), 8))
 OPERATOR_SIZES = ((100, 1), (100, 64), (200, 1), (200, 64), (400, 1))  # (N, batch)
@@ -58,9 +60,7 @@ def measure(shape, batch, dtype, seconds):
         contract(m, n, k, batch, left, right, result)
         device.finish()
 
-    ms = common.interleaved_ms(
-        {"ours": ours, "numpy": lambda: np.matmul(a, b, out=c)}, seconds=seconds
-    )
+    ms = interleaved_ms({"ours": ours, "numpy": lambda: np.matmul(a, b, out=c)}, seconds=seconds)
     gflops = {name: 2e-6 * batch * m * k * n / t for name, t in ms.items()}
     return {
         "shape": list(shape),
@@ -73,29 +73,29 @@ def measure(shape, batch, dtype, seconds):
 
 
 def main(options):
-    threads = common.on_one_thread()
-    record = common.record(threads)
-    common.print_record(record)
+    threads = on_one_thread()
+    record = records.record(threads)
+    records.print_record(record)
     products = list(YARDSTICKS)
     for n_model, batch in OPERATOR_SIZES:
         products += [(shape, batch) for shape in operator_shapes(n_model)]
     dtypes = ["float32", "float64"] if get_device().has_fp64 else ["float32"]
-    common.print_head(COLUMNS)
+    records.print_head(COLUMNS)
     rows = []
     for dtype in dtypes:
         for shape, batch in products:
             rows.append(measure(shape, batch, dtype, options.seconds))
-            common.print_row(COLUMNS, rows[-1])
+            records.print_row(COLUMNS, rows[-1])
     if options.json is not None:
-        common.write_json(options.json, {"record": record, "rows": rows})
+        records.write_json(options.json, {"record": record, "rows": rows})
 
 
 def parser():
-    parser = common.Parser("bench.contract", description=__doc__.splitlines()[0])
+    parser = Parser("bench.contract", description=__doc__.splitlines()[0])
     parser.add_seconds(0.3, "row")
     parser.add_json()
     return parser
 
 
 if __name__ == "__main__":
-    common.run(main, parser())
+    run(main, parser())

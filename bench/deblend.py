@@ -24,14 +24,16 @@ import numpy as np
 from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.settings import Settings
 
-from . import common, scenes
+from .harness import records, scenes
+from .harness.clock import on_one_thread
+from .harness.options import Parser, positive, run, seed
 
 VIEWS = {"upright": (0.0, False), "turned": (30.0, False), "mirrored": (0.0, True)}
 BATCHES = (1, 4, 16, 64)
 N_SCENES, N_QUICK = 24, 6
-# GalSim renders before and after each batch.
+# GalSim renders before and after each batch; the batch is compared with their median time.
 N_TICKS = 10
-# [s] --quick leaves out batches that would not end by then
+# [s] --quick leaves out batches that would end later, so that it takes less than a minute
 QUICK_SECONDS = 42.0
 COST_COLUMNS = (
     ("mode", 6, ""),
@@ -61,7 +63,12 @@ BATCH_COLUMNS = (
 
 
 class Pace:
-    """Times a fit's iterations from its progress calls, with a GalSim render between them."""
+    """Times a fit's iterations from its progress calls, with a GalSim render at each call.
+
+    clock: `GalSimClock` that renders
+    steps_s [s]: time of an iteration between two calls, the renders left out
+    paused_s [s]: time of all renders, to be taken off the fit's
+    """
 
     def __init__(self, clock):
         self.clock, self.steps_s, self.paused_s = clock, [], 0.0
@@ -168,36 +175,9 @@ def summarise(rows):
     for view, found in views.items():
         modes = {m: [r for r in found if r["mode"] == m] for m in scenes.MODES}
         modes = {mode: some for mode, some in modes.items() if some}
-        sdr = {mode: np.concatenate([r["sdr"] for r in some]) for mode, some in modes.items()}
-        figures = {f"sdr {mode} [dB]": float(np.median(s)) for mode, s in sdr.items()}
-        if len(sdr) == len(scenes.MODES):
-            better = np.maximum(sdr["euclid"], sdr["rubin"])
-            figures["joint over euclid [share]"] = float((sdr["joint"] > sdr["euclid"]).mean())
-            figures["joint over the better single [share]"] = float((sdr["joint"] > better).mean())
-            figures["joint gain over euclid [dB]"] = float(np.mean(sdr["joint"] - sdr["euclid"]))
-        for name in ("ratio", "wall_s", "wall_again_s", "chi2", "iterations"):
-            for mode, some in modes.items():
-                figures[f"{name} {mode}"] = float(np.median([r[name] for r in some]))
-        for mode, some in modes.items():
-            figures[f"converged {mode} [share]"] = float(np.mean([r["converged"] for r in some]))
-        summary[view] = {"galaxies": len(next(iter(sdr.values()))), **figures}
-        if view == "upright" or "upright" not in views:
-            continue
-        before = {(r["seed"], r["mode"]): r for r in views["upright"]}
-        for mode, some in modes.items():
-            gains = [np.subtract(r["sdr"], before[r["seed"], mode]["sdr"]) for r in some]
-            figures = {
-                f"sdr {mode} against upright [dB]": float(np.median(np.concatenate(gains))),
-                f"time {mode} against upright": float(
-                    np.median(
-                        [
-                            r["ms_per_iteration"] / before[r["seed"], mode]["ms_per_iteration"]
-                            for r in some
-                        ]
-                    )
-                ),
-            }
-            summary[view] |= figures
+        summary[view] = _figures_of(modes)
+        if view != "upright" and "upright" in views:
+            summary[view] |= _against(views["upright"], modes)
     batches = [row for row in rows if "scenes_per_second" in row]
     if batches:
         summary["ratio per scene in batches"] = {str(r["batch"]): r["ratio"] for r in batches}
@@ -205,56 +185,87 @@ def summarise(rows):
     return summary
 
 
+def _figures_of(modes):
+    """Medians and shares of one view; modes: name -> rows."""
+    sdr = {mode: np.concatenate([r["sdr"] for r in some]) for mode, some in modes.items()}
+    figures = {"galaxies": len(next(iter(sdr.values())))}
+    figures |= {f"sdr {mode} [dB]": float(np.median(s)) for mode, s in sdr.items()}
+    if len(sdr) == len(scenes.MODES):
+        better = np.maximum(sdr["euclid"], sdr["rubin"])
+        figures["joint over euclid [share]"] = float((sdr["joint"] > sdr["euclid"]).mean())
+        figures["joint over the better single [share]"] = float((sdr["joint"] > better).mean())
+        figures["joint gain over euclid [dB]"] = float(np.mean(sdr["joint"] - sdr["euclid"]))
+    for name in ("ratio", "wall_s", "wall_again_s", "chi2", "iterations"):
+        for mode, some in modes.items():
+            figures[f"{name} {mode}"] = float(np.median([r[name] for r in some]))
+    for mode, some in modes.items():
+        figures[f"converged {mode} [share]"] = float(np.mean([r["converged"] for r in some]))
+    return figures
+
+
+def _against(upright, modes):
+    """Accuracy and time of another view's rows by mode, against the same scenes upright."""
+    before = {(r["seed"], r["mode"]): r for r in upright}
+    figures = {}
+    for mode, some in modes.items():
+        pairs = [(r, before[r["seed"], mode]) for r in some]
+        gains = np.concatenate([np.subtract(r["sdr"], b["sdr"]) for r, b in pairs])
+        times = [r["ms_per_iteration"] / b["ms_per_iteration"] for r, b in pairs]
+        figures[f"sdr {mode} against upright [dB]"] = float(np.median(gains))
+        figures[f"time {mode} against upright"] = float(np.median(times))
+    return figures
+
+
 def main(options):
     began = time.perf_counter()
     sky = scenes.Scenes(options.catalogue)
-    threads = common.on_one_thread()
+    threads = on_one_thread()
     settings = Settings(max_iter=options.max_iter)
     n_scenes = options.scenes or (N_QUICK if options.quick else N_SCENES)
-    record = common.record(threads) | {
+    record = records.record(threads) | {
         "scenes": f"{n_scenes} from seed {options.seed}; {sky.name}",
         "settings": f"at most {settings.max_iter} iterations, tol {settings.tol:g}",
     }
-    common.print_record(record)
+    records.print_record(record)
     views = options.views or (["upright"] if options.quick else list(VIEWS))
     clock, rng = scenes.GalSimClock(), np.random.default_rng(0)
     for mode in scenes.MODES:  # the kernels are built before anything is timed
         fit_row(sky.take(options.seed), mode, clock, Settings(max_iter=5), rng)
     rows, upright = [], []
-    common.print_head(COLUMNS)
-    for seed in range(options.seed, options.seed + n_scenes):
+    records.print_head(COLUMNS)
+    for i in range(options.seed, options.seed + n_scenes):
         for view in views:
             angle_deg, flip = VIEWS[view]
-            scene = sky.take(seed, angle_deg=angle_deg, flip=flip)
+            scene = sky.take(i, angle_deg=angle_deg, flip=flip)
             if view == views[0]:
                 upright.append(scene)
             for mode in scenes.MODES:
                 rows.append(fit_row(scene, mode, clock, settings, rng))
                 rows[-1] |= {"view": view, "angle_deg": angle_deg, "mirrored": flip}
-                common.print_row(COLUMNS, rows[-1])
-    common.print_head(BATCH_COLUMNS)
+                records.print_row(COLUMNS, rows[-1])
+    records.print_head(BATCH_COLUMNS)
     deadline = began + QUICK_SECONDS if options.quick else None
     for row in batch_rows(upright, options, clock, settings, deadline):
         rows.append(row)
-        common.print_row(BATCH_COLUMNS, row)
+        records.print_row(BATCH_COLUMNS, row)
     summary = summarise(rows)
-    common.print_summary(summary)
+    records.print_summary(summary)
     if options.json is not None:
-        common.write_json(options.json, {"record": record, "summary": summary, "rows": rows})
+        records.write_json(options.json, {"record": record, "summary": summary, "rows": rows})
 
 
 def parser():
-    parser = common.Parser("bench.deblend", description=__doc__.splitlines()[0])
+    parser = Parser("bench.deblend", description=__doc__.splitlines()[0])
     parser.add_argument(
         "--quick",
         action="store_true",
         help=f"{N_QUICK} scenes, upright only, and batches that fit into the time",
     )
     parser.add_argument(
-        "--scenes", type=common.positive(int), metavar="N", help=f"how many ({N_SCENES})"
+        "--scenes", type=positive(int), metavar="N", help=f"how many scenes ({N_SCENES})"
     )
     parser.add_argument(
-        "--seed", type=common.seed, default=0, metavar="S", help="of the first scene (%(default)s)"
+        "--seed", type=seed, default=0, metavar="S", help="seed of the first scene (%(default)s)"
     )
     parser.add_argument(
         "--views",
@@ -265,14 +276,14 @@ def parser():
     parser.add_argument(
         "--batches",
         nargs="*",
-        type=common.positive(int),
+        type=positive(int),
         default=BATCHES,
         metavar="N",
         help=f"scenes fitted side by side ({' '.join(map(str, BATCHES))})",
     )
     parser.add_argument(
         "--max-iter",
-        type=common.positive(int),
+        type=positive(int),
         default=Settings().max_iter,
         metavar="N",
         help="most iterations of a fit (%(default)s)",
@@ -283,4 +294,4 @@ def parser():
 
 
 if __name__ == "__main__":
-    common.run(main, parser())
+    run(main, parser())

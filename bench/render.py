@@ -25,13 +25,15 @@ import numpy as np
 
 from clresample.simulation.sdr import sdr
 
-from . import common
-from .cases import Case, Galaxies
+from .harness import records
+from .harness.cases import Case, Galaxies, check_observed
+from .harness.clock import interleaved_ms, on_one_thread
+from .harness.options import BadOption, Parser, run, survey_pairs, survey_table
 
 SIZES = (20, 30, 50, 70, 100, 150, 200, 256, 400)  # [model pixels a side]
 ANGLE_DEG = 30.0
-BATCH = 64
-N_SETUPS = 3
+BATCH = 64  # stamps rendered by one call, in the rows of batches
+N_SETUPS = 3  # whose mean is setup_ms
 MAIN_PAIR = ("EUCLID", "RUBIN")
 COLUMNS = (
     ("from", 6, ""),
@@ -55,7 +57,7 @@ COLUMNS = (
 
 def plan(options):
     """What to measure in turn: (pair, n_model, angles, batches), the main pair first."""
-    pairs = options.pairs or sorted(common.survey_pairs(), key=lambda pair: pair != MAIN_PAIR)
+    pairs = options.pairs or sorted(survey_pairs(), key=lambda pair: pair != MAIN_PAIR)
     if not options.quick:
         sizes = options.sizes or SIZES
         return [(pair, n, (0.0, ANGLE_DEG), (1, BATCH)) for pair in pairs for n in sizes]
@@ -133,7 +135,7 @@ def measure(contests, batches, seconds):
             for i, contest in enumerate(contests)
             for name, call in contest.calls(batch).items()
         }
-        times = common.interleaved_ms(calls, seconds=seconds * len(contests))
+        times = interleaved_ms(calls, seconds=seconds * len(contests))
         for i, contest in enumerate(contests):
             yield contest.row(batch, {name: ms for (j, name), ms in times.items() if j == i})
 
@@ -182,29 +184,26 @@ def summarise(rows):
 
 def main(options):
     if options.quick and options.sizes:
-        raise common.BadOption("--quick has its own sizes: leave --sizes out")
-    surveys = common.surveys(options.printed)
+        raise BadOption("--quick has its own sizes: leave --sizes out")
+    surveys = survey_table(options.printed)
     for (name_in, name_out), n_model, _, _ in plan(options):
-        if Case(surveys[name_in], surveys[name_out], n_model).n_obs == 0:
-            raise common.BadOption(
-                f"--sizes {n_model}: no observed pixel from {name_in} to {name_out}"
-            )
+        check_observed(Case(surveys[name_in], surveys[name_out], n_model))
     galaxies = Galaxies(options.catalogue)
-    threads = common.on_one_thread()
-    record = common.record(threads) | {
+    threads = on_one_thread()
+    record = records.record(threads) | {
         "surveys": "printed table" if options.printed else "notebooks",
         "galaxies": f"{options.galaxies} {galaxies.name}",
         "times": "per stamp, without set-up; ours_ms and galsim_ms from NumPy array to NumPy array",
     }
-    common.print_record(record)
-    common.print_head(COLUMNS)
+    records.print_record(record)
+    records.print_head(COLUMNS)
     rows = []
     for (name_in, name_out), n_model, angles, batches in plan(options):
         cases = [Case(surveys[name_in], surveys[name_out], n_model, angle) for angle in angles]
         contests = [Contest(case, galaxies, options.galaxies) for case in cases]
         for row in measure(contests, batches, options.seconds):
             rows.append(row)
-            common.print_row(COLUMNS, row)
+            records.print_row(COLUMNS, row)
     summary = summarise(rows)
     for name, figures in summary.items():
         print(
@@ -212,11 +211,11 @@ def main(options):
             + ", ".join(f"{key}: {value:.2f}" for key, value in figures.items())
         )
     if options.json is not None:
-        common.write_json(options.json, {"record": record, "summary": summary, "rows": rows})
+        records.write_json(options.json, {"record": record, "summary": summary, "rows": rows})
 
 
 def parser():
-    parser = common.Parser("bench.render", description=__doc__.splitlines()[0])
+    parser = Parser("bench.render", description=__doc__.splitlines()[0])
     parser.add_argument(
         "--quick",
         action="store_true",
@@ -231,4 +230,4 @@ def parser():
 
 
 if __name__ == "__main__":
-    common.run(main, parser())
+    run(main, parser())

@@ -17,17 +17,18 @@ from astropy.wcs import WCS
 from .. import __version__
 from ..sky.grid import Grid
 from ..sky.psf import PSF
-from .whole_file import FileError, check_output, replace_file
+from .whole_file import FileError, check_output, whole_file
 
-# cards that only a third axis has
+# header cards that describe a third axis
 THIRD_AXIS = re.compile(r"(NAXIS|CTYPE|CUNIT|CRPIX|CRVAL|CDELT|CROTA)3|(PC|CD)(3_\d|\d_3)")
 
 
 class Image(NamedTuple):
     """What `read_image` returns.
 
-    data (C, Ny, Nx): native float32 or float64; grid: Grid; header: the image's FITS header;
-    bands: names of the C bands, their numbers where the header has none
+    data (C, Ny, Nx) [the file's unit]: native float32 or float64; grid: Grid of (Ny, Nx)
+    header: the image's FITS header; bands: names of the C bands, their numbers where the header
+        has none
     """
 
     data: np.ndarray
@@ -48,8 +49,8 @@ def read_image(path, *, hdu=None, bands=None):
     bands: numbers (from 0) or names, one or several; None = all. Names are those of the cards
         BAND1, BAND2, ..., and of a 2-D image BAND or FILTER
 
-    Raises FileError (a ValueError, one line that names the file) for what is not there, not FITS,
-    damaged, not an image, or without a celestial WCS.
+    Raises FileError (a ValueError, one line that names the file) for a file, HDU or band that does
+    not exist, and for one that is not FITS, damaged, not an image, or without a celestial WCS.
     """
     with open_fits(path) as hdus:
         chosen = choose_hdu(path, hdus, hdu)
@@ -57,7 +58,7 @@ def read_image(path, *, hdu=None, bands=None):
         wcs = celestial_header(path, header, hdus)
         if not wcs.has_celestial:
             raise FileError(f"{path}: HDU {_label(hdus, chosen)} has no celestial WCS")
-        # data axes run against FITS axes; the band axis is the one that is not on the sky
+        # array axes count in the opposite order to FITS axes; the band axis is not on the sky
         rest = sorted({0, 1, 2} - {wcs.wcs.lng, wcs.wcs.lat})
         if len(rest) != 1 or (data.ndim == 2 and rest != [2]):
             raise FileError(f"{path}: the celestial axes of its WCS are not axes of the image")
@@ -74,9 +75,9 @@ def read_image(path, *, hdu=None, bands=None):
 def read_psf(path, *, hdu=None, bands=None, spacing=1.0, center=None):
     """PSF of a FITS image or cube; no WCS is needed.
 
-    hdu, bands: as in `read_image`; spacing, center: as in `PSF`
+    hdu, bands: as in `read_image`; spacing [px], center [samples]: as in `PSF`
 
-    Raises FileError as `read_image` does, and for samples that are no PSF.
+    Raises FileError as `read_image` does, and for samples that `PSF` refuses. Warns as `PSF` does.
     """
     with open_fits(path) as hdus:
         chosen = choose_hdu(path, hdus, hdu)
@@ -109,7 +110,8 @@ def write_fits(
     bands: names of the C bands, into the cards BAND1, BAND2, ...
     coverage (Ny, Nx) or (C, Ny, Nx) bool: pixels that the input covers, into an HDU COVERAGE
     unit: BUNIT of the data, flux per pixel
-    device: name of the OpenCL device; inputs: {what: file}; shift_px (2,): (y, x) shift applied
+    device: name of the OpenCL device; inputs: {what: file}
+    shift_px (2,) [input px]: (y, x) shift applied
     overwrite: replace a file that exists
 
     Raises FileError when it exists or cannot be written, ValueError for shapes that disagree.
@@ -136,19 +138,25 @@ def write_fits(
         covered = coverage.astype(np.uint8)
         hdus.append(fits.ImageHDU(covered, placed[0].header, name="COVERAGE"))
         hdus[-1].header["COMMENT"] = "1 where the input image covers the pixel's centre, else 0"
-    replace_file(path, fits.HDUList(hdus + list(placed[1:])))
+    write_hdus(path, hdus + list(placed[1:]))
+
+
+def write_hdus(path, hdus):
+    """Write HDUs with their checksums, whole or not at all. Raises FileError."""
+    with whole_file(path) as part:
+        fits.HDUList(hdus).writeto(part, checksum=True, overwrite=True)
 
 
 @contextmanager
 def open_fits(path):
-    """The HDUs of a file; whatever a bad one provokes becomes a FileError of one line."""
+    """The HDUs of a FITS file, within a `with`; every error on reading is a FileError."""
     path = Path(path)
     if path.is_dir():
         raise FileError(f"{path}: is a directory, not a FITS file")
     if not path.exists():
         raise FileError(f"{path}: no such file")
-    # kept back: astropy's remarks on headers it has repaired are no news to the user of an image
-    with warnings.catch_warnings(record=True) as remarks:
+    # astropy warns of every header that it repairs: recorded here and not shown
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", AstropyWarning)
         try:
             with fits.open(path, memmap=False) as hdus:
@@ -157,7 +165,7 @@ def open_fits(path):
             raise
         except Exception as error:  # a damaged file may provoke any exception in astropy
             reason = " ".join(str(error).split()) or type(error).__name__
-            cut = any("truncated" in str(remark.message) for remark in remarks)
+            cut = any("truncated" in str(warning.message) for warning in caught)
             what = "truncated" if cut else "not a FITS file, or damaged"
             raise FileError(f"{path}: {what} ({reason})") from error
 
@@ -192,7 +200,7 @@ def choose_hdu(path, hdus, hdu):
 
 
 def read_pixels(path, hdu):
-    """The data of an image HDU, whole."""
+    """The data of an image HDU. Raises FileError where some of its pixels are missing."""
     data = hdu.data
     if data is None or data.shape != hdu.shape:
         raise FileError(f"{path}: truncated, the pixels of HDU {hdu.name} are not all there")
@@ -213,7 +221,7 @@ def celestial_header(path, header, hdus):
     for cards in [header] if coupled else [first, header]:
         try:
             wcs = WCS(cards, hdus)
-        except Exception as error:  # of wcslib, by the dozen
+        except Exception as error:  # wcslib has dozens of its own kinds
             problem = error
         else:
             if wcs.has_celestial or cards is header:
@@ -223,7 +231,7 @@ def celestial_header(path, header, hdus):
 
 
 def to_native(data):
-    """C-contiguous native float: float32 where it holds every value, else float64."""
+    """C-contiguous native floats: float32 where it holds every value, else float64."""
     dtype = np.result_type(data.dtype.newbyteorder("="), np.float32)
     return np.ascontiguousarray(data, dtype=dtype)
 
@@ -236,13 +244,13 @@ def _band_names(header, n_bands):
 
 
 def choose_bands(path, names, bands):
-    """Indices of the bands asked for by number or name."""
+    """Indices of the bands asked for by number or name; FileError for one that is not there."""
     if bands is None:
         return list(range(len(names)))
     chosen = []
     for band in [bands] if isinstance(bands, str | int | np.integer) else bands:
         text = str(band)
-        # a name that is there goes before a number
+        # a band of that name is taken before the band of that number
         i = names.index(text) if text in names else int(text) if text.isdigit() else -1
         if not 0 <= i < len(names):
             there = ", ".join(
@@ -261,7 +269,7 @@ def to_ascii(text):
 
 
 def add_provenance(header, dtype, device, inputs, shift_px):
-    """Cards that say what made a file, when, where and of what."""
+    """Add cards with the software, date, arithmetic, OpenCL device, shift and input files."""
     header["CREATOR"] = (f"clresample {__version__}", "software")
     header["DATE"] = (datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "written, UTC")
     header["CLDTYPE"] = (str(dtype), "arithmetic of the operator")

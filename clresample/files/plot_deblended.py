@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import io
-import os
-from pathlib import Path
-
 import numpy as np
 
 from ..measurement.quality import labels, summary
-from .panels import DPI, FRAME, INK, PAPER, RESIDUAL_COLOURS, SKY_COLOURS, import_figure
+from .panels import GAP, INK, PAPER, add_panel, dark_sheet, show_image, write_png
 
 PANEL_INCHES = 3.2
-ABOVE, BELOW, GAP = 0.62, 0.28, 0.06  # inches for the title, each row's line, and between panels
-KNEE_SIGMAS = 2.0  # where the asinh stretch turns from linear to logarithmic
+ABOVE, BELOW = 0.62, 0.28  # [inch] for the titles, and for the line below each row
+KNEE_SIGMAS = 2.0  # [sigma] where the asinh stretch turns from linear to logarithmic
 BRIGHT_QUANTILE = 0.999  # of the model's pixels: shown as white
-RESIDUAL_SIGMAS = 6.0  # a residual's colours end here
-FEW = 40  # as many sources are numbered; of more only the places are marked
+RESIDUAL_SIGMAS = 6.0  # at which a residual's colours end
+FEW = 40  # up to so many sources are numbered; of more, only the places are marked
 MARK = "#7fe3ff"
-N_COLOURS = 256  # of the file, chosen to cover all hues: a quarter of the size of a file of all
+COLUMNS = "observed", "model", "residual"
 
 
 def plot_deblended(path, result, *, title=""):
@@ -28,39 +24,33 @@ def plot_deblended(path, result, *, title=""):
     the highest signal to noise as blue, green and red. Residuals are in units of the noise.
 
     path: the file, written whole or not at all; result: a fitted blend; title: above the rows
-    Raises ImportError, with what to install, without matplotlib.
+
+    Raises ImportError, with what to install, without matplotlib; FileError where the file cannot be
+    written.
     """
-    figure_class = import_figure()
     n_y, n_x = result.frame.shape
     width, height = PANEL_INCHES, PANEL_INCHES * n_y / n_x
     n_rows = len(result.observations)
-    size = 3 * (width + GAP) + GAP, ABOVE + n_rows * (height + BELOW)
-    figure = figure_class(figsize=size, dpi=DPI, facecolor=PAPER)
-    figure.text(
-        GAP / size[0], 1 - 0.09 / size[1], title, color=INK, fontsize=11, weight="bold", va="top"
-    )
+    figure = dark_sheet(3 * (width + GAP) + GAP, ABOVE + n_rows * (height + BELOW), title)
     chi2 = summary(result)["chi2"]
     for i, (label, o) in enumerate(zip(labels(result), result.observations, strict=True)):
         chosen = _shown(result, i)
-        panels = _pictures(result, i, chosen)
         names = [o.channels[c] for c in chosen]
         how = f"{', '.join(names)} as blue, green, red" if len(names) == 3 else names[0]
         mean = np.nanmean([chi2[channel] for channel in o.channels])
         notes = how, "", f"±{RESIDUAL_SIGMAS:g} sigma; chi2 per pixel {mean:.2f}"
         top = ABOVE + i * (height + BELOW)
-        for k, (image, note) in enumerate(zip(panels, notes, strict=True)):
-            left = GAP + k * (width + GAP)
-            box = (left / size[0], 1 - (top + height) / size[1], width / size[0], height / size[1])
-            axes = figure.add_axes(box, facecolor=PAPER)
-            _show(axes, image, o.grid, result.frame.grid, residual=k == 2)
+        for k, (image, note) in enumerate(zip(_pictures(result, i, chosen), notes, strict=True)):
+            axes = add_panel(figure, GAP + k * (width + GAP), top, width, height)
+            show_image(axes, image, o.grid, result.frame.grid, residual=k == 2)
             _mark(axes, result, numbers=k == 1)
             if i == 0:
-                axes.set_title(("observed", "model", "residual")[k], color=INK, fontsize=10, pad=5)
+                axes.set_title(COLUMNS[k], color=INK, fontsize=10, pad=5)
             if k == 0:
                 axes.set_ylabel(label, color=INK, fontsize=9, labelpad=-12)
                 axes.yaxis.label.set_bbox({"facecolor": PAPER, "edgecolor": "none", "pad": 1.5})
             axes.set_xlabel(note, color=INK, fontsize=8, labelpad=3)
-    _write_png(Path(path), figure)
+    write_png(path, figure)
 
 
 def _shown(result, i_observation):
@@ -110,31 +100,6 @@ def _pictures(result, i_observation, chosen):
     return *out, np.moveaxis(grey, 0, -1)[..., ::-1]
 
 
-def _show(axes, image, grid, like, *, residual):
-    """An image in the place and orientation that it has on `like`."""
-    from matplotlib.transforms import Affine2D
-
-    mapping = grid.map_to(like)
-    (a, b), (c, d) = mapping.matrix  # rows (y, x), columns (n, m)
-    t_y, t_x = mapping.offset
-    n_y, n_x = grid.shape
-    axes.imshow(
-        image,
-        cmap=RESIDUAL_COLOURS if residual else SKY_COLOURS,
-        vmin=-1 if residual else 0,
-        vmax=1,
-        origin="lower",
-        interpolation="nearest",
-        extent=(-0.5, n_x - 0.5, -0.5, n_y - 0.5),
-        transform=Affine2D.from_values(d, b, c, a, t_x, t_y) + axes.transData,
-    )
-    axes.set(
-        xlim=(-0.5, like.shape[1] - 0.5), ylim=(-0.5, like.shape[0] - 0.5), xticks=[], yticks=[]
-    )
-    for spine in axes.spines.values():
-        spine.set_color(FRAME)
-
-
 def _mark(axes, result, *, numbers):
     """Crosses at the sources; as many as can be read are named."""
     from matplotlib.patheffects import withStroke
@@ -155,19 +120,3 @@ def _mark(axes, result, *, numbers):
                 fontsize=7,
                 path_effects=[withStroke(linewidth=1.2, foreground="black")],
             )
-
-
-def _write_png(path, figure):
-    """A PNG of few colours, under another name first: the file is whole or absent."""
-    from PIL import Image  # comes with matplotlib
-
-    drawn = io.BytesIO()
-    figure.savefig(drawn, format="png", facecolor=PAPER)
-    part = path.with_name(f".part-{os.getpid()}-{path.name}")
-    try:
-        few = Image.open(drawn).convert("RGB")
-        few = few.quantize(N_COLOURS, Image.Quantize.MAXCOVERAGE, kmeans=4, dither=0)
-        few.save(part, format="png", optimize=True)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import warnings
 from dataclasses import fields
 from pathlib import Path
@@ -22,8 +21,8 @@ from ..sky.observation import Observation
 from ..sky.psf import PSF
 from ..sky.psf_checks import PSFWarning
 from ..sky.sources import Extended, Point, Source
-from .fits import add_provenance, celestial_header, open_fits, to_ascii
-from .whole_file import FileError, check_output, replace_file
+from .fits import add_provenance, celestial_header, open_fits, to_ascii, write_hdus
+from .whole_file import FileError, check_output, whole_file
 
 FORMAT = 1  # of the files; raised when an older reader would misread them
 KINDS = {kind.__name__: kind for kind in (Source, Point, Extended)}
@@ -83,7 +82,7 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
             hdus.append(_image("RESIDUAL", result.residual(i), cards, i))
         hdus.append(_image("RENDERED", result.rendered[i], None, i))
         hdus.append(_image("PSF", o.psf.images, None, i))
-    replace_file(path, fits.HDUList(hdus))
+    write_hdus(path, hdus)
 
 
 def read_result(path) -> Result:
@@ -130,15 +129,9 @@ def write_catalogue(path, table, *, overwrite=False):
     check_output(path, overwrite=overwrite)
     if not path.name.endswith(".ecsv"):
         hdus = [fits.PrimaryHDU(), _table(table, "CATALOGUE"), _flag_table()]
-        return replace_file(path, fits.HDUList(hdus))
-    part = path.with_name(f".part-{os.getpid()}-{path.name}")
-    try:
+        return write_hdus(path, hdus)
+    with whole_file(path) as part:
         table.write(part, format="ascii.ecsv", overwrite=True)
-        os.replace(part, path)
-    except OSError as error:
-        raise FileError(f"{path}: cannot be written ({error.strerror or error})") from error
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _about(result):

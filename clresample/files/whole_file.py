@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -11,7 +12,10 @@ class FileError(ValueError):
 
 
 def check_output(path, *, overwrite=False):
-    """Raise FileError where `write_fits` could not write; ask before a long computation."""
+    """Raise FileError where a file could not be written; ask before a long computation.
+
+    path: the file; overwrite: whether one that exists may be replaced
+    """
     path = Path(path)
     if path.is_dir():
         raise FileError(f"{path}: is a directory, not a file to write")
@@ -21,11 +25,23 @@ def check_output(path, *, overwrite=False):
         raise FileError(f"{path}: the folder {path.parent} does not exist")
 
 
-def replace_file(path, hdus):
-    """Write under another name in the same folder, then rename: the file is whole or absent."""
-    part = path.with_name(f".part-{os.getpid()}-{path.name}")  # astropy needs the suffix, .gz too
+@contextmanager
+def whole_file(path):
+    """The path to write a file under, renamed to `path` once the block has ended.
+
+        with whole_file("out.txt") as part:
+            part.write_text("...")
+
+    The other name lies in the same folder and keeps the ending of `path`, by which some writers
+    choose a format or a compression. A block that fails leaves neither a new file nor a changed
+    one: an older file of the name `path` stays as it was.
+
+    Raises FileError for an OSError, such as a full disk, and passes on every other exception.
+    """
+    path = Path(path)
+    part = path.with_name(f".part-{os.getpid()}-{path.name}")
     try:
-        hdus.writeto(part, checksum=True, overwrite=True)
+        yield part
         os.replace(part, path)
     except OSError as error:
         raise FileError(f"{path}: cannot be written ({error.strerror or error})") from error

@@ -48,7 +48,8 @@ def test_render(tmp_path):
 
 
 def test_quick_has_every_pair_and_the_main_sizes():
-    from bench import common, render
+    from bench import render
+    from bench.harness.options import survey_pairs
 
     options = render.parser().parse_args(["--quick"])
     planned = {
@@ -57,8 +58,8 @@ def test_quick_has_every_pair_and_the_main_sizes():
         for angle in angles
         for batch in batches
     }
-    assert {case[0] for case in planned} == set(common.survey_pairs())
-    assert len(common.survey_pairs()) == 15
+    assert {case[0] for case in planned} == set(survey_pairs())
+    assert len(survey_pairs()) == 15
     for n_model in (50, 100, 200, 400):
         assert (("EUCLID", "RUBIN"), n_model, 0.0, 1) in planned
 
@@ -97,15 +98,3 @@ def test_bad_options_get_one_line(module, options, words):
     assert result.stdout == ""
     assert result.stderr.count("\n") == 1
     assert words in result.stderr
-
-
-def test_json_is_written_whole_or_not_at_all(tmp_path):
-    from bench.common import write_json
-
-    file = tmp_path / "x.json"
-    write_json(file, {"rows": [1.0, float("inf"), {"a": float("nan")}]})
-    assert json.loads(file.read_text()) == {"rows": [1.0, None, {"a": None}]}
-    with pytest.raises(TypeError):
-        write_json(file, {"rows": object()})
-    assert json.loads(file.read_text())["rows"][0] == 1.0
-    assert list(tmp_path.iterdir()) == [file]

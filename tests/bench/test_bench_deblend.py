@@ -58,10 +58,13 @@ def test_deblend(tmp_path):
 
 
 def test_joint_goes_on_where_it_ended(tmp_path):
+    from bench.harness.records import read_json
+    from bench.paper import joint_findings
+
     options = ("--processes", "1", "--folder", str(tmp_path))
-    run("joint", "--scenes", "1", *options)
+    run("paper.joint", "--scenes", "1", *options)
     one = (tmp_path / "joint.jsonl").read_text()
-    text = run("joint", "--scenes", "2", *options)
+    text = run("paper.joint", "--scenes", "2", *options)
     two = (tmp_path / "joint.jsonl").read_text()
     assert two.startswith(one)
     assert two.count("\n") == 3  # settings and two scenes
@@ -69,44 +72,15 @@ def test_joint_goes_on_where_it_ended(tmp_path):
     counts = [len(json.loads(line)[1]["euclid_mag"]) for line in two.splitlines()[1:]]
     assert found["n_galaxies"] == sum(counts) == np.sum(found["maps"]["number"])
     assert found["starts"].keys() == {"own", "sersic"}
-    for finding in found["findings"]:
-        assert finding["found"].endswith(".")
-        assert finding["found"] in text
-        assert finding["figure"] is None or (tmp_path / finding["figure"]).is_file()
-
-
-def galaxies(n, gain, rng):
-    """Magnitudes and SDRs of n galaxies; joint is better than the better survey by `gain`."""
-    table = {name: rng.uniform(20, 29, n) for name in ("euclid_mag", "rubin_mag")}
-    table["own-euclid"], table["own-rubin"] = 30 - table["euclid_mag"], 30 - table["rubin_mag"]
-    better = np.maximum(table["own-euclid"], table["own-rubin"])
-    table["own-joint"] = better + gain + 0.1 * rng.standard_normal(n)
-    return table
-
-
-@pytest.mark.parametrize(("gain", "verdict"), [(1.0, True), (0.0, None), (-3.0, False)])
-def test_findings_say_what_the_numbers_say(gain, verdict):
-    from bench import joint_findings
-
-    table = galaxies(600, gain, np.random.default_rng(3))
-    maps = joint_findings.bin_galaxies(table, ["own"])
-    assert maps["number"].shape == (6, 6)
-    assert maps["number"].sum() == 600
-    inside = (table["euclid_mag"] < 21.5) & (table["rubin_mag"] >= 27.5)
-    difference = (table["own-joint"] - table["own-rubin"])[inside]
-    assert maps["gain"]["own-rubin"][0, -1] == pytest.approx(difference.mean())
-    error = difference.std(ddof=1) / np.sqrt(inside.sum())
-    assert maps["error"]["own-rubin"][0, -1] == pytest.approx(error)
-    numbers = joint_findings.summarise(table, maps, ["own"])
-    found = joint_findings.joint(maps, ["own"], numbers)
-    gains = next(f for f in found if f.title.startswith("Where joint"))
-    assert gains.holds is verdict
-    assert ("it gains for galaxies bright in both" in gains.found) == (gain > 0)
-    assert ("it loses" in gains.found) == (gain < 0)
+    for start in found["starts"]:
+        for finding in joint_findings.findings(start, read_json(tmp_path / "joint.json")):
+            assert finding.found.endswith(".")
+            assert finding.found in text
+            assert finding.figure is None or (tmp_path / finding.figure).is_file()
 
 
 def test_sersic_profiles_are_found():
-    from bench import sersic
+    from bench.paper import sersic
 
     y, x = np.indices((61, 64)) - np.array([30.3, 33.8])[:, None, None]
     image = 5 * np.exp(-0.5 * ((y / 4) ** 2 + (x / 2) ** 2) ** (1 / 1.6))
@@ -123,8 +97,8 @@ def test_sersic_profiles_are_found():
         ("deblend", ("--max-iter", "few"), "few"),
         ("deblend", ("--catalogue", "nowhere"), "nowhere"),
         ("deblend", ("--json", "."), "--json ."),
-        ("joint", ("--scenes", "none"), "none"),
-        ("joint", ("--catalogue", "nowhere", "--folder", "."), "nowhere"),
+        ("paper.joint", ("--scenes", "none"), "none"),
+        ("paper.joint", ("--catalogue", "nowhere", "--folder", "."), "nowhere"),
     ],
 )
 def test_bad_options_get_one_line(module, options, words):

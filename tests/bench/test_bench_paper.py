@@ -1,11 +1,11 @@
-"""The paper's evidence on a tiny configuration: resumed runs, findings from numbers, the report."""
+"""The paper's evidence on a tiny configuration: runs that are resumed, and their report."""
 
 import json
 
-import numpy as np
 import pytest
 from helpers.checkout import run_python
 
+TIMING = ("--sizes", 20, 30, "--pairs", "HST-RUBIN", "EUCLID-RUBIN", "--seconds", 0.01)
 METHODS = ("ours", "ours64", "paper", "quintic", "sinc")
 
 
@@ -26,11 +26,10 @@ def folder(tmp_path_factory):
     pytest.importorskip("matplotlib")
     folder = tmp_path_factory.mktemp("report")
     pairs = ("--pairs", "EUCLID-RUBIN", "RUBIN-RUBIN", "--processes", 1, "--folder", folder)
-    run("accuracy", "--galaxies", 1, *pairs)
-    run("accuracy", "--galaxies", 2, *pairs)
-    pairs = ("--pairs", "HST-RUBIN", "EUCLID-RUBIN")
-    run("timing", "--sizes", 20, 30, *pairs, "--seconds", 0.01, "--folder", folder)
-    run("report", "--folder", folder)
+    run("paper.accuracy", "--galaxies", 1, *pairs)
+    run("paper.accuracy", "--galaxies", 2, *pairs)
+    run("paper.timing", *TIMING, "--folder", folder)
+    run("paper.report", "--folder", folder)
     return folder
 
 
@@ -73,119 +72,62 @@ def test_timing(folder):
     for row in found["rows"]:
         assert set(row["ms"]) == set(row["setup_ms"]) == {"ours", "paper", "quintic", "sinc"}
         assert min(row["ms"].values()) > 0
-    assert found["findings"][-1]["holds"] is None  # no slope from sizes below 100
 
 
 def test_report_shows_every_figure_beside_its_statement(folder):
+    from bench.paper import report
+
     text = (folder / "report.md").read_text()
-    figures = {f["figure"] for n in ("accuracy", "timing") for f in load(folder, n)["findings"]}
-    figures.discard(None)
+    results = report.load(folder)
+    assert results.keys() == {"accuracy", "timing"}
+    found = [f for s in report.SECTIONS if s.name in results for f in s.findings(results[s.name])]
+    figures = {finding.figure for finding in found} - {None}
     assert {path.name for path in folder.glob("*.png")} == figures
-    for name in ("accuracy", "timing"):
-        for finding in load(folder, name)["findings"]:
-            assert finding["claim"] in text
-            assert finding["found"] in text
-            assert finding["figure"] is None or f"({finding['figure']})" in text
+    for finding in found:
+        assert text.count(finding.claim.text) >= 2  # in the table, in the details
+        assert text.count(finding.found) >= 2
+        assert finding.figure is None or f"({finding.figure})" in text
     for label in ("SDR", "SDR_diff", "SDR_sinc", "visual", "visual_edge", "time_ratios(M)"):
         assert f"`fig:{label}`" in text
     assert not list(folder.glob(".part*"))
 
 
-def accuracy_numbers(sinc=50.0, wins=0.0, wide=45.0, spread=11.0):
-    """Numbers of a run of two pairs in which every statement holds, but for what is given."""
-    mean = {"ours": 50.0, "ours64": 50.0, "paper": 50.0, "quintic": 40.0, "sinc": sinc}
-    same = {"ours": 76.0, "ours64": np.inf, "paper": 70.0, "quintic": 41.0, "sinc": 60.0}
-    pairs = [
-        {
-            "from": "EUCLID",
-            "to": to,
-            "n_model": 118,
-            "n_galaxies": 9,
-            "mean": values,
-            "std": dict.fromkeys(METHODS, spread),
-            "exact": {name: value == np.inf for name, value in values.items()},
-            "quintic_wins": wins,
-        }
-        for to, values in (("RUBIN", mean), ("EUCLID", same))
-    ]
-    rows = [
-        {"n_model": n, "edge": 1e-4, "ours": s, "quintic": 41.0} for n, s in ((118, 40), (236, 60))
-    ]
-    worst = {"from": "EUCLID", "to": "RUBIN", "galaxy": 3, "edge_rank": 0.9, "padded": rows}
-    worst["wide"] = {"ours": wide, "quintic": 41.0}
-    visual = [{"title": "EUCLID → RUBIN", "ours": 50.0, "quintic": 40.0}]
-    return {"pairs": pairs, "worst": [worst], "edge_correlation": -0.5, "visual": visual}
+def test_a_run_says_what_it_found(folder):
+    text = run("paper.timing", *TIMING, "--folder", folder)  # all of it is in the log
+    assert "Section 4: speed: Time beside GalSim's sinc: " in text
+    assert "Growth of both schemes with N: Not decided." in text  # no slope from sizes below 100
 
 
-@pytest.mark.parametrize(
-    ("change", "failing"),
-    [
-        ({}, ()),
-        ({"spread": 1.0}, ("Scatter of the SDR",)),
-        ({"sinc": 50.2}, ("Off the diagonal, in float32", "Off the diagonal, in float64")),
-        ({"wins": 0.02}, ("Where GalSim's default wins",)),
-        ({"wide": 65.0}, ("Why: light at the stamp's edge, light folded in, and padding",)),
-    ],
-)
-def test_verdicts_follow_the_numbers(change, failing):
-    from bench.accuracy_findings import findings
+def test_the_committed_report_is_made_from_the_numbers_beside_it():
+    from bench.harness.options import REPORT
+    from bench.paper import report
 
-    found = findings("accuracy", **accuracy_numbers(**change))
-    assert tuple(f.title for f in found if f.holds is False) == failing
-    assert all(isinstance(f.holds, bool) for f in found)
-
-
-def test_fits_of_times():
-    from bench.timing_findings import findings, line_fit, slope
-
-    sizes = [50, 100, 200, 400]
-    assert slope(sizes, [9.0] + [1e-8 * n**4 for n in sizes[1:]]) == pytest.approx(4)
-    assert slope(sizes[:2], [1, 2]) is None
-    rows = [
-        {"n_obs": m, "ms": {"quintic": 2.0, "paper": 2 * (0.048 * m - 0.17), "ours": 0.1 + m / 1e3}}
-        for m in (10, 50, 100)
-    ]
-    assert line_fit(rows, "paper") == (pytest.approx((-0.17, 0.048)), pytest.approx(1))
-    means = {"ours": [1.0] * 2, "paper": [2.0, 9.0], "quintic": [3.0] * 2, "sinc": [4.0, 10.0]}
-    for power, holds in ((4, True), (3, False)):
-        times = {
-            "ours": [n**2 for n in sizes],
-            "paper": [n**power for n in sizes],
-            "products": sizes,
-        }
-        schemes = [{"angle_deg": 0.0, "n_model": sizes, **times}]
-        *rest, last = findings(rows, schemes, [100, 200], means)
-        assert [f.holds for f in rest] == [True, True]
-        assert last.holds is holds
-
-
-def test_a_log_goes_on_after_an_interruption(tmp_path):
-    from bench.common import BadOption, Log
-
-    path = tmp_path / "run.jsonl"
-    log = Log(path, {"device": "A"})
-    log.append(("x", 1), [1.0, float("nan")])
-    log.append(("x", 2), {"ms": 3})
-    with path.open("ab") as file:
-        file.write(b'[["x", 3], [1.')  # the power went
-    log = Log(path, {"device": "A"})
-    assert log.done == {("x", 1): [1.0, None], ("x", 2): {"ms": 3}}
-    log.append(("x", 3), 4)
-    assert Log(path, {"device": "A"}).done["x", 3] == 4
-    with pytest.raises(BadOption, match="device A, not B"):
-        Log(path, {"device": "B"})
+    results = report.load(REPORT)
+    assert results.keys() == {section.name for section in report.SECTIONS}
+    text = report.markdown(results)
+    assert text == (REPORT / "report.md").read_text()
+    # the paper's statements first, our own targets under their own heading
+    first, second = (text.index(f"\n## {name}") for name in ("The paper's st", "Our own targets"))
+    assert 0 < first < second
+    assert "Off the diagonal, in float32" not in text[:second]
+    for line in text.splitlines():
+        if "Does not hold" in line:
+            reasons = ("we are better", "another setting", "another start", "we fall short")
+            assert any(f"Does not hold: {reason}" in line for reason in reasons) or any(
+                f"Does not hold: the statement is about {reason}" in line for reason in reasons
+            )
 
 
 @pytest.mark.parametrize(
     ("module", "options", "words"),
     [
-        ("accuracy", ("--printed", "--wide"), "leave --printed out"),
-        ("accuracy", ("--galaxies", "0"), "0 is not above 0"),
-        ("accuracy", ("--processes", "none"), "none"),
-        ("timing", ("--pairs", "RUBIN-HST"), "RUBIN-HST is not FROM-TO"),
-        ("timing", ("--sizes", "1", "--pairs", "EUCLID-RUBIN"), "no observed pixel"),
-        ("timing", ("--folder", "Makefile"), "--folder Makefile"),
-        ("report", ("--folder", "docs"), "no results"),
+        ("paper.accuracy", ("--printed", "--wide"), "leave --printed out"),
+        ("paper.accuracy", ("--galaxies", "0"), "0 is not above 0"),
+        ("paper.accuracy", ("--processes", "none"), "none"),
+        ("paper.timing", ("--pairs", "RUBIN-HST"), "RUBIN-HST is not FROM-TO"),
+        ("paper.timing", ("--sizes", "1", "--pairs", "EUCLID-RUBIN"), "no observed pixel"),
+        ("paper.timing", ("--folder", "Makefile"), "--folder Makefile"),
+        ("paper.report", ("--folder", "docs"), "no results"),
     ],
 )
 def test_bad_options_get_one_line(module, options, words):

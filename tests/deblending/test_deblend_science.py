@@ -81,7 +81,7 @@ def test_flux_errors_of_blended_stars_are_honest():
 def fitted():
     """SDRs [dB] and chi2 of six scenes fitted, by view of Rubin's pixels and mode."""
     pytest.importorskip("galsim")
-    from bench import scenes
+    from bench.harness import scenes
     from clresample.simulation.scenes import simulate_scene
 
     sdr, chi2 = {}, {}
@@ -118,7 +118,7 @@ def test_the_angle_and_the_parity_of_pixels_do_not_matter(fitted, view):
 def test_a_source_that_only_rubin_sees_starts_right():
     """Low-resolution data count when a fit starts, beside a source that both see."""
     pytest.importorskip("galsim")
-    from bench import scenes
+    from bench.harness import scenes
     from clresample.simulation.galaxies import random_galaxy
     from clresample.simulation.scenes import SMOOTHING_ARCSEC, SimulatedScene, observe
     from clresample.simulation.surveys import EUCLID_VIS, RUBIN_UGRIZY

@@ -1,6 +1,6 @@
 """Section 4 of the paper: times of ours, the paper's scheme and GalSim on the paper's grid.
 
-    python -m bench.timing [--seconds S] [--printed] [--pairs FROM-TO ...] [--folder FOLDER]
+    python -m bench.paper.timing [--seconds S] [--printed] [--pairs FROM-TO ...] [--folder FOLDER]
 
 Stamps of 20 to 200 model pixels a side, from every survey to all of larger pixels, aligned; then
 both schemes on one pair up to 400 pixels, turned as well, all sizes in turn.  Times are medians of
@@ -19,9 +19,12 @@ from tqdm import tqdm
 
 from clresample.resampling.paper.resampler import PaperResampler
 
-from . import common, figures, report
-from .cases import Case, Galaxies
-from .timing_findings import PAPER_FIT, findings, line_fit
+from ..harness import records
+from ..harness.cases import Case, Galaxies, check_observed
+from ..harness.clock import interleaved_ms, on_one_thread
+from ..harness.options import Parser, run, survey_pairs, survey_table
+from . import figures, report
+from .timing_findings import PAPER_FIT, line_fit, means
 
 SIZES = (20, 30, 50, 70, 100, 150, 200)  # [model pixels a side], the paper's
 MAIN_PAIR, MAIN_SIZES, ANGLES_DEG = ("EUCLID", "RUBIN"), (50, 100, 200, 300, 400), (0.0, 30.0)
@@ -30,8 +33,8 @@ N_SETUPS = 3  # of each method; the first compiles and does not count
 
 def plan(options):
     """Cases to time, by pair and size: the paper's grid."""
-    surveys = common.surveys(options.printed)
-    pairs = options.pairs or [pair for pair in common.survey_pairs() if pair[0] != pair[1]]
+    surveys = survey_table(options.printed)
+    pairs = options.pairs or [pair for pair in survey_pairs() if pair[0] != pair[1]]
     sizes = options.sizes or SIZES
     return {(*pair, n): Case(*(surveys[name] for name in pair), n) for pair in pairs for n in sizes}
 
@@ -63,7 +66,7 @@ def measure(case, galaxies, seconds):
             calls[name]()
             times.append(time.perf_counter() - start)
         first_ms[name] = 1e3 * float(np.median(times[1:]))
-    ms = common.interleaved_ms(calls, seconds=seconds)
+    ms = interleaved_ms(calls, seconds=seconds)
     return {"ms": ms, "setup_ms": {n: max(0.0, first_ms[n] - ms[n]) for n in ms}}
 
 
@@ -82,7 +85,7 @@ def measure_schemes(surveys, sizes, galaxies, seconds):
         calls[angle, n_model, "ours"] = functools.partial(ours, image)
         calls[angle, n_model, "paper"] = functools.partial(paper, image)
         products[angle, n_model] = paper.report["n_terms"] * case.n_obs**2
-    ms = common.interleaved_ms(calls, seconds=seconds * len(calls))
+    ms = interleaved_ms(calls, seconds=seconds * len(calls))
     return [
         {
             "angle_deg": angle,
@@ -94,24 +97,12 @@ def measure_schemes(surveys, sizes, galaxies, seconds):
     ]
 
 
-def means(rows, kind):
-    """Sizes, and mean times [ms] by method over the pairs of each size."""
-    sizes = sorted({row["n_model"] for row in rows})
-    return sizes, {
-        name: [float(np.mean([r[kind][name] for r in rows if r["n_model"] == n])) for n in sizes]
-        for name in rows[0][kind]
-    }
-
-
 def main(options):
     cases, galaxies = plan(options), Galaxies(options.catalogue)
-    for (name_in, name_out, n_model), case in cases.items():
-        if case.n_obs == 0:
-            raise common.BadOption(
-                f"--sizes {n_model}: no observed pixel from {name_in} to {name_out}"
-            )
-    threads = common.on_one_thread()
-    record = common.record(threads) | {
+    for case in cases.values():
+        check_observed(case)
+    threads = on_one_thread()
+    record = records.record(threads) | {
         "surveys": "printed table" if options.printed else "notebooks",
         "times": "one image of one band, NumPy to NumPy, medians of interleaved calls",
     }
@@ -119,13 +110,13 @@ def main(options):
         key: record[key]
         for key in ("clresample", "galsim", "device", "machine", "threads", "surveys")
     }
-    log = common.Log(options.folder / "timing.jsonl", settings | {"seconds": options.seconds})
+    log = records.Log(options.folder / "timing.jsonl", settings | {"seconds": options.seconds})
     for key, case in tqdm(cases.items(), desc="timing", unit=" cases"):
         if key not in log.done:
             log.append(key, measure(case, galaxies, options.seconds))
     sizes = options.sizes or MAIN_SIZES
     if (key := ("schemes", *sizes)) not in log.done:
-        surveys = common.surveys(options.printed)
+        surveys = survey_table(options.printed)
         log.append(key, measure_schemes(surveys, sizes, galaxies, options.seconds))
     schemes = log.done[key]
     rows = [
@@ -139,12 +130,11 @@ def main(options):
     figures.time_ratios(options.folder / "timing-time_ratios.png", rows, fits, PAPER_FIT)
     figures.absolute_timings(options.folder / "timing-absolute_timings.png", sizes, running, setups)
     figures.schemes(options.folder / "timing-schemes.png", schemes)
-    found = list(findings(rows, schemes, sizes, running))
-    report.save(options.folder, "timing", record, found, rows=rows, schemes=schemes)
+    report.save(options.folder, "timing", record, rows=rows, schemes=schemes)
 
 
 def parser():
-    parser = common.Parser("bench.timing", description=__doc__.splitlines()[0])
+    parser = Parser("bench.paper.timing", description=__doc__.splitlines()[0])
     parser.add_sizes(SIZES)
     parser.add_seconds(1.0, "case")
     parser.add_surveys()
@@ -154,4 +144,4 @@ def parser():
 
 
 if __name__ == "__main__":
-    common.run(main, parser())
+    run(main, parser())

@@ -18,7 +18,7 @@ from clresample.sky.frame import model_frame
 from clresample.sky.sources import Extended
 
 from .cases import Case, Galaxies
-from .common import data_folder
+from .options import data_folder
 
 # Each mode's instruments; the model always lives on Euclid's pixels, those of the truth.
 MODES = {"rubin": ("rubin",), "euclid": ("euclid",), "joint": ("euclid", "rubin")}
@@ -30,8 +30,8 @@ NUDGE = 1e-9
 class Scenes:
     """Scenes by their seed, of COSMOS galaxies with CatSim colours where the data folder has them.
 
-    folder: of the COSMOS galaxies; see `cases.Galaxies`
-    name: what the record says they are
+    folder: of the COSMOS galaxies; None looks for it as `cases.Galaxies` does
+    name: galaxies and colours, for the record
     """
 
     def __init__(self, folder=None):
@@ -64,7 +64,7 @@ def blend(scene, mode, *, profiles=None):
 
 
 def as_new(scene, rng):
-    """The same scene with PSFs that no operator was made for yet, the same to 1e-9."""
+    """The same scene with PSFs changed by 1e-9: no operator was made for them yet."""
 
     def nudged(image):
         noise = rng.standard_normal(image.psf.images.shape)
@@ -110,7 +110,10 @@ def iterations(result):
 
 
 class GalSimClock:
-    """Times one GalSim quintic render, EUCLID -> RUBIN at N = 118, whenever it is asked."""
+    """Times GalSim quintic renders of one stamp, EUCLID -> RUBIN at N = 118.
+
+    Fits are compared with it: what slows the machine down for a while slows both.
+    """
 
     N_MODEL = 118
 
@@ -122,15 +125,17 @@ class GalSimClock:
         self.times_s = []
 
     def tick(self):
+        """Time one render."""
         start = time.perf_counter()
         self._render(self._stamp)
         self.times_s.append(time.perf_counter() - start)
 
     def ticks(self, n):
+        """Time `n` renders."""
         for _ in range(n):
             self.tick()
 
     def take_ms(self):
-        """Median [ms] of the renders since it was last asked."""
+        """Median [ms] of the renders since the last call."""
         times, self.times_s = self.times_s, []
         return float(np.median(times)) * 1e3

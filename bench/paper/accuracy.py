@@ -1,6 +1,6 @@
 """Section 5 of the paper: how near resampled galaxies come to those that GalSim draws directly.
 
-    python -m bench.accuracy [--galaxies N] [--printed | --wide] [--folder FOLDER]
+    python -m bench.paper.accuracy [--galaxies N] [--printed | --wide] [--folder FOLDER]
 
 Every galaxy is drawn on the observed stamp of 60 x 60 pixels, the truth, and on a model stamp of
 the same sky, from which ours (float32 and float64), the paper's scheme (float32) and GalSim
@@ -15,14 +15,17 @@ from tqdm import tqdm
 
 from clresample.simulation.sdr import sdr
 
-from . import common, figures, report
-from .accuracy_findings import findings
+from ..harness import records
+from ..harness.clock import in_processes, on_one_thread
+from ..harness.options import BadOption, Parser, run, survey_pairs, survey_table
+from . import figures, report
 from .stamps import METHODS, N_OBS, drawn, edge_light, measure, open_galaxies, renderers, stamp
 
-CHUNK = 25  # galaxies measured and kept together: about a second
-FIELD_ARCSEC = 24.0  # of the wide drawings: from here on results of COSMOS galaxies stay the same
+CHUNK = 25  # galaxies measured and logged together: about a second, lost by an interruption
+# [arcsec] side of the wide drawings; larger ones change no result of a COSMOS galaxy
+FIELD_ARCSEC = 24.0
 PADDINGS = (1.0, 1.25, 1.5, 2.0)  # side of the model stamp over that of the observed stamp's sky
-N_WORST = 3
+N_WORST = 3  # galaxies whose stamps are padded, and whose images are drawn
 VISUAL_PAIRS = (("HST", "RUBIN"), ("EUCLID", "EUCLID"), ("EUCLID", "RUBIN"))
 
 
@@ -41,7 +44,7 @@ def run_chunks(cases, options, log):
     total = sum(stop - start for _, start, stop in chunks)
     there = total - sum(stop - start for *_, start, stop in missing)
     with tqdm(total=total, initial=there, unit=" stamps", desc="accuracy") as bar:
-        for task, rows in common.in_processes(measure, missing, options.processes):
+        for task, rows in in_processes(measure, missing, options.processes):
             case, _, start, stop = task
             log.append(key(case, start), rows)
             bar.update(stop - start)
@@ -78,7 +81,7 @@ def summarise(case, found):
 
 
 def worst_cases(found, galaxies):
-    """The galaxies that GalSim's default renders best against ours: (case, galaxy), each once."""
+    """The galaxies in which ours does worst against GalSim's default: (case, galaxy), each once."""
     n_rows = galaxies.catalogue.nobjects if galaxies.catalogue else np.inf
     margins = [
         (margin, i, case)
@@ -129,8 +132,8 @@ def images(case, i, galaxies):
 
 
 def draw_maps(folder, name, pairs):
-    """The figures SDR, SDR_diff and SDR_sinc, from summaries of survey pairs."""
-    names = list(common.surveys(False))
+    """Draw the figures SDR, SDR_diff and SDR_sinc, from summaries of survey pairs."""
+    names = list(survey_table(False))
 
     def table(value):
         values = np.full((len(names), len(names)), np.nan)
@@ -173,7 +176,10 @@ def draw_maps(folder, name, pairs):
 
 
 def draw_examples(folder, name, found, chosen, surveys, galaxies):
-    """The figures visual, of a galaxy of median SDR, and visual_edge; what the first shows."""
+    """Draw the figures visual, of a galaxy of median SDR, and visual_edge, of the worst.
+
+    returns titles and SDRs [dB] of the first
+    """
     worst = [images(case, i, galaxies) for case, i in chosen]
     figures.resampled(folder / f"{name}-visual_edge.png", worst)
     reference = found[list(found)[-1]]["ours"]
@@ -186,7 +192,7 @@ def draw_examples(folder, name, found, chosen, surveys, galaxies):
 
 
 def evaluate(folder, name, found, surveys, galaxies):
-    """Draw all figures; the numbers from which the findings are made."""
+    """Draw all figures; return the numbers from which the findings are made."""
     pairs = [summarise(case, columns) for case, columns in found.items()]
     draw_maps(folder, name, pairs)
     # where both surveys are the same, ours cannot lose
@@ -208,12 +214,12 @@ def evaluate(folder, name, found, surveys, galaxies):
 
 def main(options):
     if options.printed and options.wide:
-        raise common.BadOption("--wide has the notebooks' parameters: leave --printed out")
+        raise BadOption("--wide has the notebooks' parameters: leave --printed out")
     name = "accuracy" + "-printed" * options.printed + "-wide" * options.wide
     field_arcsec = FIELD_ARCSEC * options.wide
-    surveys, galaxies = common.surveys(options.printed), open_galaxies(options.catalogue)
-    threads = common.on_one_thread()
-    record = common.record(threads) | {
+    surveys, galaxies = survey_table(options.printed), open_galaxies(options.catalogue)
+    threads = on_one_thread()
+    record = records.record(threads) | {
         "surveys": "printed table" if options.printed else "notebooks",
         "drawing": f"of {field_arcsec:g} arcsec, cut" if options.wide else "of the stamps alone",
         "galaxies": f"{options.galaxies} {galaxies.name}, turned and flipped at random",
@@ -222,17 +228,17 @@ def main(options):
         key: record[key] for key in ("clresample", "galsim", "device", "surveys", "drawing")
     }
     settings |= {"galaxies": galaxies.name, "stamp": N_OBS}
-    log = common.Log(options.folder / f"{name}.jsonl", settings)
-    pairs = options.pairs or common.survey_pairs()
+    log = records.Log(options.folder / f"{name}.jsonl", settings)
+    pairs = options.pairs or survey_pairs()
     cases = [stamp(surveys, pair, field_arcsec=field_arcsec) for pair in pairs]
     run_chunks(cases, options, log)
     found = {case: collect(case, options.galaxies, log) for case in cases}
     numbers = evaluate(options.folder, name, found, surveys, galaxies)
-    report.save(options.folder, name, record, findings(name, **numbers), **numbers)
+    report.save(options.folder, name, record, **numbers)
 
 
 def parser():
-    parser = common.Parser("bench.accuracy", description=__doc__.splitlines()[0])
+    parser = Parser("bench.paper.accuracy", description=__doc__.splitlines()[0])
     parser.add_surveys()
     parser.add_galaxies(1000)
     parser.add_argument(
@@ -246,4 +252,4 @@ def parser():
 
 
 if __name__ == "__main__":
-    common.run(main, parser())
+    run(main, parser())

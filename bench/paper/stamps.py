@@ -12,7 +12,7 @@ from clresample.resampling.paper.resampler import PaperResampler
 from clresample.simulation.galaxies import draw
 from clresample.simulation.sdr import sdr
 
-from .cases import Case, Galaxies
+from ..harness.cases import Case, Galaxies
 
 N_OBS = 60  # [pixels] side of the observed stamp, the paper's
 METHODS = ("ours", "ours64", "paper", "quintic", "sinc")
@@ -75,7 +75,7 @@ def draw_stamp(galaxy, survey, n_pixels, field_arcsec):
 
 
 def edge_light(image):
-    """Norm of the outermost pixels over that of all: what is cut off there goes on outside."""
+    """Norm of the outermost pixels over that of all: how bright the light is that the edge cuts."""
     edge = image.copy()
     edge[1:-1, 1:-1] = 0
     return np.linalg.norm(edge) / np.linalg.norm(image)

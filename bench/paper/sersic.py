@@ -15,8 +15,12 @@ from scipy.optimize import least_squares
 REACH_PX = 30
 # Gaussian sigma [px] and index where each fit starts
 START_SIGMA_PX, START_INDEX = 3.5, 0.7
+# Bounds of the index, from flatter than a Gaussian to steeper than an elliptical galaxy, and of the
+# Gaussian sigma [px], from the model's PSF to two thirds of the pixels fitted
 INDICES = (0.3, 6.0)
 SIGMAS_PX = (0.8, 20.0)
+# Bound of each shear component; with both there, 1 - g1^2 - g2^2 is negative and replaced
+MAX_SHEAR, LEAST_DETERMINANT = 0.9, 1e-3
 # [px] how far the profile's centre may lie from the given one
 SHIFT_PX = 5.0
 
@@ -24,7 +28,7 @@ SHIFT_PX = 5.0
 def fit(image, position):
     """The Sersic profile (Ny, Nx) that is nearest to an image in least squares, its amplitude too.
 
-    image (Ny, Nx); position (2,) [px]: (y, x) where the galaxy is
+    image (Ny, Nx): the galaxy alone; position (2,) [px]: its (y, x)
     """
     middle = np.round(position).astype(int)
     low = np.maximum(middle - REACH_PX, 0)
@@ -38,8 +42,8 @@ def fit(image, position):
         return ((amplitude * model - target) / scale).ravel()
 
     start = [0, 0, np.log(START_SIGMA_PX), 0, 0, np.log(START_INDEX)]
-    widest = [SHIFT_PX, SHIFT_PX, np.log(SIGMAS_PX[1]), 0.9, 0.9, np.log(INDICES[1])]
-    least = [-SHIFT_PX, -SHIFT_PX, np.log(SIGMAS_PX[0]), -0.9, -0.9, np.log(INDICES[0])]
+    widest = [SHIFT_PX, SHIFT_PX, np.log(SIGMAS_PX[1]), MAX_SHEAR, MAX_SHEAR, np.log(INDICES[1])]
+    least = [-SHIFT_PX, -SHIFT_PX, np.log(SIGMAS_PX[0]), -MAX_SHEAR, -MAX_SHEAR, np.log(INDICES[0])]
     found = least_squares(residual, start, bounds=(least, widest), xtol=1e-4, ftol=1e-6)
     return _profile(found.x, position, image.shape)
 
@@ -50,7 +54,7 @@ def _profile(parameters, position, shape):
     dy, dx = np.arange(shape[0]) - position[0] - y, np.arange(shape[1]) - position[1] - x
     # the square root of C^-1 is symmetric, of determinant 1 / sigma^2
     root = np.array([[1 + g1, g2], [g2, 1 - g1]]) / np.exp(log_sigma)
-    root /= np.sqrt(max(1 - g1**2 - g2**2, 1e-3))
+    root /= np.sqrt(max(1 - g1**2 - g2**2, LEAST_DETERMINANT))
     u = root[0, 0] * dy[:, None] + root[0, 1] * dx
     v = root[1, 0] * dy[:, None] + root[1, 1] * dx
     return np.exp(-0.5 * (u**2 + v**2) ** (0.5 * np.exp(-log_index)))

@@ -1,6 +1,6 @@
 """Section 6 of the paper: galaxies of blended scenes, fitted to either survey alone and to both.
 
-    python -m bench.joint [--scenes N] [--folder FOLDER]
+    python -m bench.paper.joint [--scenes N] [--folder FOLDER]
 
 A scene holds 1 to 10 galaxies as in the paper's table.  Three modes: Rubin's six bands alone,
 Euclid's alone, both together; all models live on Euclid's pixels, those of the truth.  Two starts:
@@ -22,10 +22,14 @@ from tqdm import tqdm
 from clresample.deblending.batch import deblend_many
 from clresample.deblending.settings import Settings
 
-from . import common, figures, joint_findings, report, scenes, sersic
+from ..harness import records, scenes
+from ..harness.clock import in_processes, on_one_thread
+from ..harness.options import Parser, positive, run
+from . import figures, report, sersic
+from .joint_bins import SINGLES, bin_galaxies, summarise
 
 STARTS = ("own", "sersic")
-CHUNK = 8  # scenes simulated, fitted side by side and kept together: some seconds
+CHUNK = 8  # scenes fitted side by side and logged together: some seconds
 
 
 @functools.cache
@@ -74,7 +78,7 @@ def run_scenes(options, log):
     tasks = [(options.catalogue, chunk) for chunk in chunks]
     there = options.scenes - len(missing)
     with tqdm(total=options.scenes, initial=there, unit=" scenes", desc="joint") as bar:
-        for (_, seeds), parts in common.in_processes(measure, tasks, options.processes):
+        for (_, seeds), parts in in_processes(measure, tasks, options.processes):
             for seed, part in zip(seeds, parts, strict=True):
                 log.append((seed,), part)
             bar.update(len(seeds))
@@ -89,7 +93,7 @@ def collect(log):
 
 
 def draw(folder, maps):
-    """The figures sdr_per_mag and single_vs_joint, and what is behind the second, of each start."""
+    """Draw sdr_per_mag and single_vs_joint, and the errors of the second, for each start."""
     edges = [f"{low:g}" for low in maps["edges"][:-1]]
     axes = {
         "rows": edges,
@@ -108,14 +112,13 @@ def draw(folder, maps):
             [Map(f"{titles[m]}, SDR [dB]", mean[m], limits=limits) for m in scenes.MODES],
             **axes,
         )
-        singles = [m for m in scenes.MODES if m != "joint"]
-        gains = [maps["gain"][f"{start}-{m}"] for m in singles]
-        errors = [maps["error"][f"{start}-{m}"] for m in singles]
+        gains = [maps["gain"][f"{start}-{m}"] for m in SINGLES]
+        errors = [maps["error"][f"{start}-{m}"] for m in SINGLES]
         figures.heat_maps(
             folder / f"joint-single_vs_joint-{start}.png",
             [
                 Map(f"joint minus {titles[m]} [dB]", gain, diverging=True)
-                for m, gain in zip(singles, gains, strict=True)
+                for m, gain in zip(SINGLES, gains, strict=True)
             ],
             **axes,
         )
@@ -124,7 +127,7 @@ def draw(folder, maps):
             [
                 *(
                     Map(f"its standard error, {titles[m]} [dB]", error, ".2f")
-                    for m, error in zip(singles, errors, strict=True)
+                    for m, error in zip(SINGLES, errors, strict=True)
                 ),
                 number,
             ],
@@ -134,30 +137,27 @@ def draw(folder, maps):
 
 def main(options):
     sky = open_scenes(options.catalogue)
-    threads, fit = common.on_one_thread(), Settings()
-    record = common.record(threads) | {
+    threads, fit = on_one_thread(), Settings()
+    record = records.record(threads) | {
         "settings": f"at most {fit.max_iter} iterations, tol {fit.tol:g}, {fit.prior}",
         "scenes": sky.name,
     }
     kept = ("clresample", "galsim", "device", "settings", "scenes")
-    log = common.Log(options.folder / "joint.jsonl", {name: record[name] for name in kept})
+    log = records.Log(options.folder / "joint.jsonl", {name: record[name] for name in kept})
     run_scenes(options, log)
     galaxies, n_failed = collect(log)
     record["scenes"] = f"{len(log.done)} of {sky.name}"
-    maps = joint_findings.bin_galaxies(galaxies, STARTS)
+    maps = bin_galaxies(galaxies, STARTS)
     draw(options.folder, maps)
-    numbers = joint_findings.summarise(galaxies, maps, STARTS) | {"n_failed": n_failed}
-    found = joint_findings.joint(maps, STARTS, numbers)
-    report.save(options.folder, "joint", record, found, **numbers)
-    for finding in found:
-        print(f"{finding.title}: {finding.found}")
+    numbers = summarise(galaxies, maps, STARTS) | {"n_failed": n_failed}
+    report.save(options.folder, "joint", record, **numbers)
 
 
 def parser():
-    parser = common.Parser("bench.joint", description=__doc__.splitlines()[0])
+    parser = Parser("bench.paper.joint", description=__doc__.splitlines()[0])
     parser.add_argument(
         "--scenes",
-        type=common.positive(int),
+        type=positive(int),
         default=200,
         metavar="N",
         help="how many scenes there shall be in all; the paper has 2315 (%(default)s)",
@@ -169,4 +169,4 @@ def parser():
 
 
 if __name__ == "__main__":
-    common.run(main, parser())
+    run(main, parser())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +14,7 @@ from clresample.files.panels import (
     stretch,
     stretch_limits,
 )
+from clresample.files.whole_file import whole_file
 
 DPI = 110  # dots per inch: a page's width in about 100 kB
 INK, FAINT, BLANK = "#20242c", "#c9ced8", "#f1f3f6"
@@ -26,6 +26,7 @@ NAMES = {
     "sinc": "GalSim sinc",
 }
 COLOURS = {"ours": "#1769aa", "paper": "#e07b1a", "quintic": "#3a9158", "sinc": "#8a5fb0"}
+# of the worst cases; `accuracy` has as many
 CASE_COLOURS = ("#1769aa", "#c23b4e", "#20242c")
 MARKERS = {"ours": "o", "paper": "s", "quintic": "^", "sinc": "v"}
 
@@ -48,7 +49,11 @@ class Map:
 
 
 def heat_maps(path, maps, *, rows, columns, row_label, column_label):
-    """Maps side by side, of the same rows and columns: names of these, and what they are."""
+    """Draw maps side by side.
+
+    maps: list of `Map`; rows, columns: their names, the same for all; row_label, column_label:
+        what they are
+    """
     n_y, n_x = len(rows), len(columns)
     figure, axes = _figure(1, len(maps), 0.62 * n_x + 1.1, 0.62 * n_y + 0.9)
     for ax, item in zip(axes[0], maps):
@@ -91,7 +96,7 @@ class Images:
 
 
 def resampled(path, cases):
-    """Truths, estimates and residuals as in the paper: two columns for each of the cases."""
+    """Draw truths, estimates and residuals as in the paper, two columns for each of `Images`."""
     size = 3.3 * len(cases), 5.3  # inches
     figure = import_figure()(figsize=size, dpi=DPI, layout="constrained")
     for case, part in zip(cases, figure.subfigures(1, len(cases), squeeze=False, wspace=0.02)[0]):
@@ -121,7 +126,7 @@ def _sky(ax, image, limits, title):
 
 
 def edges(path, margin, edge, worst):
-    """What light at the stamp's edge does, and what padding does to the worst cases.
+    """Draw what light at the stamp's edge does, and what padding does to the worst cases.
 
     margin [dB], edge: ours above GalSim's default, and relative light in the edge, per stamp
     worst: rows of `accuracy.padded`
@@ -153,7 +158,7 @@ def edges(path, margin, edge, worst):
 
 
 def time_ratios(path, rows, fits, paper):
-    """Times over GalSim's default against M: the paper's scheme and ours, with straight lines.
+    """Draw times over GalSim's default against M: the paper's scheme and ours, with straight lines.
 
     rows: of `timing`, one pair and size each; fits: scheme -> (intercept, slope); paper: likewise
     """
@@ -184,7 +189,7 @@ def time_ratios(path, rows, fits, paper):
 
 
 def absolute_timings(path, sizes, means, setups):
-    """Mean times [ms] of every method against N, and of their set-up; name -> values by size."""
+    """Draw mean times [ms] of every method against N, and of its set-up: name -> values by size."""
     figure, axes = _figure(1, 2, 4.6, 3.7)
     for ax, times, title in zip(
         axes[0], (means, setups), ("one image, mean over survey pairs", "set-up, once")
@@ -198,7 +203,7 @@ def absolute_timings(path, sizes, means, setups):
 
 
 def schemes(path, rows):
-    """Both schemes' times [ms] and their ratio against N; rows: as `timing` writes them."""
+    """Draw both schemes' times [ms] and their ratio against N; rows: as `timing` writes them."""
     figure, axes = _figure(1, 2, 4.6, 3.7)
     left, right = axes[0]
     for row, style in zip(rows, ("-", "--")):
@@ -247,15 +252,11 @@ def _figure(n_y, n_x, width, height):
 
 
 def save(path, figure):
-    """Write a PNG of up to 256 colours, whole or not at all."""
+    """Write a PNG of 256 colours, white among them, whole or not at all. Raises FileError."""
     from PIL import Image  # comes with matplotlib
 
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png", facecolor="white")
-    part = path.with_name(f".part-{os.getpid()}-{path.name}")
-    try:
-        few = Image.open(drawn).convert("RGB").quantize(256, dither=Image.Dither.NONE)
+    few = Image.open(drawn).convert("RGB").quantize(256, dither=Image.Dither.NONE)
+    with whole_file(path) as part:
         few.save(part, format="png", optimize=True)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)

@@ -11,9 +11,10 @@ from clresample import Resampler
 from clresample.simulation.galaxies import draw, import_galsim, open_catalogue, random_galaxy
 from clresample.simulation.surveys import Survey
 
-from .common import BadOption, data_folder
+from .options import BadOption, data_folder
 
-# Sigma of the Gaussian that band-limits a galaxy before it is drawn [model pixels].
+# [model pixels] Sigma of the Gaussian that band-limits a galaxy before it is drawn, so that the
+# model stamp's pixels can hold it.
 SMOOTHING_PX = 2.0
 # GalSim pads an image to this many times its size; its sinc kernel, which never ends, is given that
 # period too (left to itself it asks for FFTs of 49152 x 49152).
@@ -98,6 +99,15 @@ class Case:
         return render
 
 
+def check_observed(case):
+    """Raise BadOption for a case whose model stamp holds no whole observed pixel."""
+    if case.n_obs == 0:
+        raise BadOption(
+            f"--sizes {case.n_model}: no observed pixel from {case.survey_in.name} to "
+            f"{case.survey_out.name}"
+        )
+
+
 def _jacobian(grid):
     (y_row, y_col), (x_row, x_col) = grid.jacobian  # [arcsec/px]
     return import_galsim().JacobianWCS(x_col, x_row, y_col, y_row)
@@ -107,7 +117,9 @@ class Galaxies:
     """Galaxies for SDRs: the first of a COSMOS catalogue, or parametric ones where there is none.
 
     folder: of the catalogue; None looks in CLRESAMPLE_DATA and in the data folder by the checkout
-    name: what the record says they are
+    name: "COSMOS" or "parametric", for the record
+
+    Raises BadOption where the folder holds no catalogue.
     """
 
     def __init__(self, folder=None):

@@ -1,0 +1,10 @@
+"""What all benchmarks share.
+
+options   the commands' options and their one-line answers; surveys and survey pairs
+clock     one thread for each side, timing by turns, worker processes
+records   what a run leaves: its record, tables on the screen, JSON, a log to go on from
+cases     stamps of one sky in two surveys, rendered by the operator and by GalSim
+scenes    simulated blends of Euclid and Rubin, and how well they were fitted
+
+Imports clresample only.
+"""

@@ -1,0 +1,79 @@
+"""Time on one thread: environment, calls by turns, worker processes."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+
+import numpy as np
+
+from clresample import get_device
+
+# Calls of a fast function for each call of the slowest.  Its median is then one of many, yet a
+# round stays short: a machine that slows down meanwhile slows all functions of the round alike.
+MAX_REPEATS = 20
+
+
+def on_one_thread():
+    """Start this command anew with one thread for each side, unless it was started so.
+
+    NumPy's and FFT libraries read these variables when they are loaded.  PoCL's simplest device
+    runs kernels in the calling thread: "basic", called "cpu-minimal" from version 4 on.  GalSim
+    draws on one thread by default.
+
+    returns the variables as text, for the record
+    """
+    pocl = re.search(r"pocl (\d+)", get_device().cl.platform.version, re.IGNORECASE)
+    wanted = {
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "MKL_NUM_THREADS": "1",
+        "POCL_DEVICES": "basic" if pocl is None or int(pocl[1]) < 4 else "cpu-minimal",
+        "CL_CONFIG_CPU_TBB_NUM_WORKERS": "1",  # Intel's CPU runtime
+    }
+    if any(os.environ.get(name) != value for name, value in wanted.items()):
+        command = [sys.executable, *sys.orig_argv[1:]]
+        os.execve(sys.executable, command, {**os.environ, **wanted})
+    return " ".join(f"{name}={value}" for name, value in wanted.items())
+
+
+def in_processes(function, tasks, n_processes):
+    """Pairs (task, function(*task)) in the order in which worker processes finish them."""
+    pool = ProcessPoolExecutor(n_processes, mp_context=get_context("spawn"))
+    try:
+        futures = {pool.submit(function, *task): task for task in tasks}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def interleaved_ms(functions, *, seconds, least=5):
+    """Median time [ms] of one call of each function, all called in turn for `seconds`.
+
+    functions: name -> callable.  Each is called twice before, to compile and allocate and to see
+        how long it takes.  In a round the fast ones are called several times; what disturbs the
+        machine disturbs them all alike.
+    least: calls of each function, even where they take longer than `seconds`
+    """
+    for function in functions.values():
+        function()
+    once = {name: _seconds(function) for name, function in functions.items()}
+    slowest = max(once.values())
+    times = {name: [] for name in functions}
+    end = time.perf_counter() + seconds
+    while min(map(len, times.values())) < least or time.perf_counter() < end:
+        for name, function in functions.items():
+            for _ in range(max(1, min(MAX_REPEATS, int(slowest / once[name])))):
+                times[name].append(_seconds(function))
+    return {name: float(np.median(t)) * 1e3 for name, t in times.items()}
+
+
+def _seconds(function):
+    start = time.perf_counter()
+    function()
+    return time.perf_counter() - start

@@ -1,0 +1,131 @@
+"""What a run leaves behind: its record, tables on the screen, JSON, and a log to go on from."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import math
+import os
+import platform
+from importlib.metadata import version
+
+from clresample import __version__, get_device
+from clresample.files.whole_file import whole_file
+
+from .options import BadOption
+
+
+def record(threads):
+    """Where and when: device, versions, date, and how each side was held to one thread."""
+    device = get_device()
+    return {
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "device": device.name,
+        "platform": f"{device.platform}, {device.cl.platform.version}",
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}",
+        "load": f"{os.getloadavg()[0]:.1f} processes wanted a core, mean of the last minute",
+        "python": platform.python_version(),
+        "clresample": __version__,
+        **{name: version(name) for name in ("numpy", "pyopencl", "galsim")},
+        "threads": threads,
+    }
+
+
+def print_head(columns):
+    """Print the names of a table's columns, each (field, width, format of numbers)."""
+    print("  ".join(name.rjust(width) for name, width, _ in columns), flush=True)
+
+
+def print_row(columns, row):
+    """Print one line of the table; what is not a number is printed as it is."""
+    cells = []
+    for name, width, form in columns:
+        is_number = isinstance(row[name], (int, float))
+        cells.append((format(row[name], form) if is_number else str(row[name])).rjust(width))
+    print("  ".join(cells), flush=True)
+
+
+def print_record(record):
+    """Print a record, one name and value on each line."""
+    for name, value in record.items():
+        print(f"{name}: {value}")
+
+
+def print_summary(summary):
+    """Print groups of figures {group: {name: value}}, one figure on each line."""
+    for group, figures in summary.items():
+        print(f"{group}:")
+        for name, value in figures.items():
+            print(f"  {name}: {value:.3f}" if isinstance(value, float) else f"  {name}: {value}")
+
+
+def write_json(path, content):
+    """Write JSON whole or not at all; infinite and undefined numbers become null."""
+    write_text(path, json.dumps(_finite(content), indent=1, allow_nan=False) + "\n")
+
+
+def read_json(path):
+    """Read what `write_json` wrote; null, an infinite or undefined number, becomes NaN."""
+    return _numbers(json.loads(path.read_text(encoding="utf-8")))
+
+
+def write_text(path, text):
+    """Write a file whole or not at all. Raises FileError where it cannot be written."""
+    with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+class Log:
+    """What a run has found so far, one line of JSON for each part; the next run goes on from it.
+
+    path: the file
+    settings: what all parts of it share; a file made with others is refused by `BadOption`
+    done: parts by their keys; of a part that was appended twice, the later one
+    """
+
+    def __init__(self, path, settings):
+        self.path, self.done = path, {}
+        text = path.read_bytes() if path.exists() else b""
+        whole = text[: text.rfind(b"\n") + 1]
+        if len(whole) < len(text):  # the run ended in the middle of a line
+            os.truncate(path, len(whole))
+        if not whole:
+            self._append(settings)
+            return
+        found, *parts = map(json.loads, whole.splitlines())
+        for name, value in settings.items():
+            if found.get(name) != value:
+                raise BadOption(
+                    f"{path} comes from a run with {name} {found.get(name)}, not {value}: "
+                    "remove it or name another --folder"
+                )
+        for key, part in parts:
+            self.done[tuple(key)] = part
+
+    def append(self, key, part):
+        """Keep a part, `key` being a tuple of strings and numbers; its line is written at once."""
+        self._append([key, part])
+        self.done[key] = part
+
+    def _append(self, content):
+        line = json.dumps(_finite(content), allow_nan=False) + "\n"
+        with self.path.open("ab", buffering=0) as file:
+            file.write(line.encode())
+
+
+def _numbers(value):
+    if isinstance(value, dict):
+        return {name: _numbers(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_numbers(item) for item in value]
+    return math.nan if value is None else value
+
+
+def _finite(value):
+    if isinstance(value, dict):
+        return {name: _finite(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
