@@ -181,7 +181,7 @@ def _table(table, name):
 
 
 def _image(name, array, cards=None, i=0):
-    """An image HDU, number i + 1 of its name; what is empty is told in the header."""
+    """An image HDU, number i + 1 of its name; an empty array is described in its header."""
     array = np.asarray(array)
     hdu = fits.ImageHDU(array if array.size else None, cards, name=name, ver=i + 1)
     if not array.size:
