@@ -91,7 +91,6 @@ class SimulatedScene:
     profiles (S): GalSim objects at unit flux, smoothed, centred on the origin
     galaxies (S): rows of the catalogue, or None for parametric galaxies
     positions_arcsec (S, 2) [arcsec]: (y, x) on the flat sky
-    positions_deg (S, 2) [deg]: right ascension and declination, or None for a flat sky
     """
 
     seed: int
@@ -100,12 +99,17 @@ class SimulatedScene:
     profiles: tuple
     galaxies: tuple | None
     positions_arcsec: np.ndarray
-    positions_deg: np.ndarray | None
 
     @property
     def images(self):
         """(rubin, euclid)."""
         return self.rubin, self.euclid
+
+    @property
+    def positions_deg(self):
+        """Right ascension and declination (S, 2) [deg] of the sources; None on a flat sky."""
+        grid = self.euclid.grid
+        return None if grid.wcs is None else grid.sky(*self.euclid.positions_px.T).T
 
 
 def observe(survey, grid, profiles, positions_arcsec, magnitudes, rng, *, center_deg=None):
@@ -220,7 +224,6 @@ def simulate_scene(
         profiles=profiles,
         galaxies=None if catalogue is None else galaxies,
         positions_arcsec=np.array(positions),
-        positions_deg=None if center_deg is None else euclid.grid.sky(*euclid.positions_px.T).T,
     )
 
 
