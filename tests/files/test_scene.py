@@ -193,7 +193,10 @@ def test_bands_of_the_image_choose_those_of_the_psf(folder):
         ),
         (ONE + "psf_spacing = 0", "psf_spacing is 0, it takes a number above 0"),
         (ONE + 'zero_point = "AB"', "zero_point is 'AB', it takes a number, or a list"),
-        (ONE + "zero_point = [25, 26]", "zero_point must be one finite number or 1"),
+        (
+            ONE + "zero_point = [25, 26]",
+            "zero_point has 2 numbers, it takes one for",
+        ),
         (ONE + "variance = -1", "variance is -1, it takes the name of a file, a number"),
         (ONE + "variance = [1, 2]", "variance has the shape (2,)"),
         (ONE + "variance = 1\nweight = 1", "weight and variance are both given"),
