@@ -66,11 +66,12 @@ def environment(folder, tmp_path_factory):
     return home
 
 
-def test_wheel_and_sdist_hold_the_kernels(folder):
+def test_wheel_and_sdist_hold_the_kernels_and_the_example(folder):
     (wheel,) = folder.glob("*.whl")
     names = zipfile.ZipFile(wheel).namelist()
     assert sorted(n.split("/")[-1] for n in names if n.startswith("clresample/kernels/")) == KERNELS
     assert any(n.endswith("licenses/LICENSE") for n in names)
+    assert "clresample/cli/example.toml" in names
     (sdist,) = folder.glob("*.tar.gz")
     top = f"clresample-{clresample.__version__}"
     with tarfile.open(sdist) as archive:

@@ -36,7 +36,7 @@ def main(argv=None):
     arguments = parser.parse_args(argv)
     try:
         arguments.run(arguments)
-    except DeviceError as error:  # may hold a compiler's log: kept as it is
+    except DeviceError as error:  # may hold a compiler's log: its lines are kept
         return _fail(arguments, str(error))
     except (ValueError, OSError) as error:
         return _fail(arguments, " ".join(str(error).split()))

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import argparse
-import sys
+import os
 import time
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
+from .options import (
+    add_device_option,
+    add_dtype_option,
+    check_matplotlib,
+    fraction,
+    note,
+    say,
+    whole,
+)
 
-from . import options as cli_options
-
-# iterations of the fit whose residuals are searched for more sources: structure is there by then
+# iterations of the fit whose residuals are searched for more sources: by then the sources that were
+# found are fitted to a few percent; more would find the same ones later
 FIRST_LOOK = 30
 
 DESCRIPTION = """\
@@ -29,7 +36,7 @@ example  clresample deblend --example trial
          clresample deblend trial/scene.toml -o trial/out
 
 The first writes simulated Euclid and Rubin images with a commented scene file that
-shows every key. Options given here go before those of the scene file."""
+shows every key. Options given here replace those of the scene file."""
 
 OUTPUTS = "catalogue.fits", "catalogue.ecsv", "result.fits", "deblended.png"
 
@@ -58,21 +65,16 @@ def add_deblend(commands):
         help="let every observation but the first move by a constant shift",
     )
     fit.add_argument("--fit-sky", action="store_true", help="fit a constant in each channel")
-    fit.add_argument("--max-iter", metavar="N", type=_whole, help="most iterations")
+    fit.add_argument("--max-iter", metavar="N", type=whole, help="largest number of iterations")
     fit.add_argument(
         "--tol",
         metavar="T",
-        type=_part,
+        type=fraction,
         help="stop when the loss falls by less than this part of itself",
     )
-    fit.add_argument(
-        "--dtype",
-        choices=("float32", "float64"),
-        default="float32",
-        help="arithmetic of the fit (default %(default)s)",
-    )
-    cli_options.add_device_option(fit)
-    fit.add_argument("--quiet", action="store_true", help="no progress bar, no notes")
+    add_dtype_option(fit, "arithmetic of the fit")
+    add_device_option(fit)
+    fit.add_argument("--quiet", action="store_true", help="no progress, no notes")
     parser.set_defaults(run=run)
 
 
@@ -83,45 +85,37 @@ def run(arguments):
     if arguments.scene is None or arguments.output is None:
         missing = "SCENE.toml" if arguments.scene is None else "-o DIR"
         raise ValueError(f"{missing} is missing: deblend SCENE.toml -o DIR, or --example DIR")
-    from ..device.device import get_device
-    from ..files.results import write_catalogue, write_result
-    from ..files.scene import read_scene
-    from ..measurement.catalogue import catalogue
-    from ..measurement.quality import summary
-
     started = time.perf_counter()
     paths = _outputs(arguments)
+    _progress(arguments, f"reading {arguments.scene}")
+    # Read by NumPy's linear algebra when NumPy is imported. Its matrices are small here: threads
+    # wait for each other and for the OpenCL device's own, up to 0.1 s a product on a busy CPU.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from ..device.device import get_device
+    from ..files.scene import read_scene
+    from ..measurement.quality import summary
+
     scene = read_scene(arguments.scene)
     device = get_device(arguments.device)
-    given = {
-        key: value for key in ("max_iter", "tol") if (value := getattr(arguments, key)) is not None
-    }
-    given |= {key: True for key in ("fit_shifts", "fit_sky") if getattr(arguments, key)}
-    settings = replace(scene.settings, **given)
     if not arguments.quiet:
-        for note in scene.notes:
-            _note(note)
-    result = _fit(arguments, scene, settings, device)
-    table = catalogue(result, magnitudes=result.observations[0].zero_points is not None)
-
-    paths[0].parent.mkdir(parents=True, exist_ok=True)
-    more = {"overwrite": arguments.overwrite}
-    for path in paths[:2]:
-        write_catalogue(path, table, **more)
-    write_result(paths[2], result, device=device.name, inputs=scene.inputs, **more)
-    if not arguments.no_figure:
-        from ..files.plot_deblended import plot_deblended
-
-        plot_deblended(paths[3], result, title=", ".join(o.name for o in result.observations))
+        for message in scene.notes:
+            note(arguments, message)
+    result = _fit(arguments, scene, device)
+    _write(arguments, result, scene.inputs, device, paths)
     _report(arguments, result, summary(result), device, time.perf_counter() - started)
     for path in paths:
         print(path)
     if result.status == "interrupted":
-        raise KeyboardInterrupt  # the best state so far is written; the shell is told all the same
+        raise KeyboardInterrupt  # the best state is written; the exit status is that of Ctrl-C
+
+
+def _progress(arguments, message):
+    if not arguments.quiet:
+        say(arguments, message)
 
 
 def _outputs(arguments):
-    """Paths of all files to write, none of which is in the way."""
+    """Paths of all files to write. Raises FileError where one of them cannot be written."""
     from ..files.whole_file import FileError, check_output
 
     folder = Path(arguments.output)
@@ -132,21 +126,21 @@ def _outputs(arguments):
         for path in paths:
             check_output(path, overwrite=arguments.overwrite)
     if not arguments.no_figure:
-        from ..files.panels import import_figure
-
-        try:
-            import_figure()
-        except ImportError as error:
-            raise ValueError(f"{error}; or give --no-figure") from error
+        check_matplotlib(OUTPUTS[3], "; or give --no-figure")
     return paths
 
 
-def _fit(arguments, scene, settings, device):
+def _fit(arguments, scene, device):
     """The fit; before it, where sources or shifts are to be found, a short one to find them in."""
+    import numpy as np
+
+    settings = _settings(arguments, scene.settings)
     given = {"frame": scene.frame, "device": device, "dtype": np.dtype(arguments.dtype)}
     sources, looking = scene.sources, scene.sources is None
     if looking:
         sources = _detect(arguments, scene, device)
+    seen = ", ".join(f"{o.name} ({' '.join(o.channels)})" for o in scene.observations)
+    _progress(arguments, f"fitting {len(sources)} sources to {seen} on {device.name}")
     if settings.max_iter and (settings.fit_shifts or (looking and scene.passes > 1)):
         first = replace(settings, max_iter=min(FIRST_LOOK, settings.max_iter))
         result = _deblend(arguments, "first look", scene.observations, sources, first, given)
@@ -156,8 +150,19 @@ def _fit(arguments, scene, settings, device):
         if looking and scene.passes > 1:
             from ..measurement.detection import detect_more
 
-            sources += detect_more(result, threshold=scene.threshold, device=device).sources
+            more = detect_more(result, threshold=scene.threshold, device=device).sources
+            _progress(arguments, f"{len(more)} more sources found in the residuals")
+            sources += more
     return _deblend(arguments, "fit", scene.observations, sources, settings, given)
+
+
+def _settings(arguments, settings):
+    """The scene file's settings with those of the command line in their place."""
+    given = {
+        key: value for key in ("max_iter", "tol") if (value := getattr(arguments, key)) is not None
+    }
+    given |= {key: True for key in ("fit_shifts", "fit_sky") if getattr(arguments, key)}
+    return replace(settings, **given)
 
 
 def _detect(arguments, scene, device):
@@ -196,7 +201,25 @@ def _deblend(arguments, what, observations, sources, settings, given):
         return deblend(observations, sources, settings=settings, progress=progress, **given)
 
 
+def _write(arguments, result, inputs, device, paths):
+    """Write the catalogue twice, the result and, where `paths` has a fourth, the figure."""
+    from ..files.results import write_catalogue, write_result
+    from ..measurement.catalogue import catalogue
+
+    table = catalogue(result, magnitudes=result.observations[0].zero_points is not None)
+    paths[0].parent.mkdir(parents=True, exist_ok=True)
+    more = {"overwrite": arguments.overwrite}
+    for path in paths[:2]:
+        write_catalogue(path, table, **more)
+    write_result(paths[2], result, device=device.name, inputs=inputs, **more)
+    if not arguments.no_figure:
+        from ..files.plot_deblended import plot_deblended
+
+        plot_deblended(paths[3], result, title=", ".join(o.name for o in result.observations))
+
+
 def _report(arguments, result, found, device, took):
+    """Print how the fit ended and each channel's chi2; what the user should know, as notes."""
     lost = found["n_sources"] - found["n_fitted"]
     print(
         f"{found['n_fitted']} sources in {len(result.channels)} channels"
@@ -213,7 +236,7 @@ def _report(arguments, result, found, device, took):
         print(f"chi2 per pixel, {label}: {values}{shift}")
     if not arguments.quiet:
         for message in found["messages"]:
-            _note(message)
+            note(arguments, message)
 
 
 def _run_example(arguments):
@@ -228,24 +251,3 @@ def _run_example(arguments):
     for path in paths:
         print(path)
     print(f"next: clresample deblend {paths[0]} -o {Path(arguments.example) / 'out'}")
-
-
-def _note(message):
-    print(f"clresample deblend: note: {message}", file=sys.stderr)
-
-
-def _whole(text):
-    number = int(text) if text.isdecimal() else -1
-    if number < 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number from 0")
-    return number
-
-
-def _part(text):
-    try:
-        number = float(text)
-    except ValueError:
-        number = -1
-    if not 0 <= number < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number from 0 to 1")
-    return number

@@ -1,4 +1,4 @@
-"""`python -m clresample.demo`: galaxies seen by Euclid and Rubin, deblended and resampled.
+"""`python -m clresample.cli.demo`: galaxies seen by Euclid and Rubin, deblended and resampled.
 
 Six blended galaxies are simulated, then fitted to both telescopes' images at once and to each
 alone, and compared with the truth. Writes deblended.png, the catalogue, and the joint fit with its
@@ -26,10 +26,9 @@ from ..simulation.sdr import sdr
 from ..sky.frame import model_frame
 from ..sky.sources import Extended
 from . import demo_resample
+from .pointing import ANGLE_DEG, CENTER_DEG
 
 SEED, N_SOURCES = 2, 6
-ANGLE_DEG = 20.0  # of Rubin's pixels against Euclid's
-CENTER_DEG = 150.1, 2.2  # right ascension, declination
 MODES = {"Rubin": ("Rubin",), "Euclid": ("Euclid",), "joint": ("Euclid", "Rubin")}
 
 
@@ -104,7 +103,7 @@ def _report(scene, fitted, device):
 def main(argv=None):
     """Run the demonstration; returns the exit status."""
     parser = argparse.ArgumentParser(
-        prog="python -m clresample.demo", description=__doc__.split("\n")[0]
+        prog="python -m clresample.cli.demo", description=__doc__.split("\n")[0]
     )
     parser.add_argument(
         "folder", nargs="?", default="demo", help="where to write (default %(default)s)"
@@ -114,7 +113,7 @@ def main(argv=None):
     try:
         run(arguments.folder, device=arguments.device)
     except (DeviceError, ImportError, OSError, ValueError) as error:
-        print(f"clresample.demo: {error}", file=sys.stderr)
+        print(f"clresample.cli.demo: {error}", file=sys.stderr)
         return 2
     return 0
 

@@ -18,12 +18,11 @@ from ..simulation.galaxies import draw, random_galaxy
 from ..simulation.sdr import sdr
 from ..simulation.surveys import EUCLID_VIS, RUBIN_UGRIZY
 from ..sky.grid import Grid
+from .pointing import ANGLE_DEG, CENTER_DEG
 
 SEED = 20
 N_GALAXIES, BRIGHTEST, FAINTEST = 40, 19.5, 24.5  # magnitudes, more faint ones than bright
 N_PIXELS = 110  # of Rubin, a side
-ANGLE_DEG = 20.0  # of Rubin's pixels against Euclid's
-CENTER_DEG = 150.1, 2.2  # right ascension, declination
 BAND = RUBIN_UGRIZY.bands.index("i")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from ..device.device import get_device
 from ..device.discovery import format_size, list_devices
 from .options import add_device_option
 
@@ -18,12 +17,15 @@ def add_devices(commands):
         "fp64 is found by building a kernel in double precision.",
     )
     add_device_option(parser)
-    parser.set_defaults(run=_run_devices)
+    parser.set_defaults(run=run)
 
 
-def _run_devices(arguments):
+def run(arguments):
+    """Print the table. Raises DeviceError, after the table, for a choice that fits no device."""
+    from ..device.device import get_device
+
     print(format_table(list_devices(arguments.device)))
-    get_device(arguments.device)  # a choice that fits none is told after the table
+    get_device(arguments.device)
 
 
 def format_table(devices):

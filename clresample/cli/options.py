@@ -1,10 +1,12 @@
-"""Options that subcommands share, and the values they take."""
+"""Options that subcommands share, the values they take, and the lines that subcommands print."""
 
 from __future__ import annotations
 
 import argparse
+import sys
+from importlib.util import find_spec
 
-SIZES = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30}  # powers of 1024, as memory is sold
+SIZES = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30}  # [bytes] powers of 1024, as for memory
 
 
 def add_device_option(parser):
@@ -15,6 +17,34 @@ def add_device_option(parser):
         help="index, platform:device or part of a name; without it CLRESAMPLE_DEVICE, then "
         "PYOPENCL_CTX, then the first GPU, then the first CPU",
     )
+
+
+def add_dtype_option(parser, what):
+    """Add `--dtype`, the floating type of `what`."""
+    parser.add_argument(
+        "--dtype",
+        choices=("float32", "float64"),
+        default="float32",
+        help=f"{what} (default %(default)s)",
+    )
+
+
+def note(arguments, message):
+    """Print what the user should know on standard error."""
+    say(arguments, f"note: {message}")
+
+
+def say(arguments, message):
+    """Print a line of progress on standard error."""
+    print(f"clresample {arguments.command}: {message}", file=sys.stderr, flush=True)
+
+
+def check_matplotlib(option, way_out=""):
+    """Raise ValueError where `option` needs matplotlib and it is not there; it is not imported."""
+    if find_spec("matplotlib") is None:
+        from ..files.panels import NO_MATPLOTLIB
+
+        raise ValueError(f"{option}: {NO_MATPLOTLIB}{way_out}")
 
 
 def size(text):
@@ -51,10 +81,30 @@ def center(text):
 
 def positive(text):
     """A number above zero."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = 0
+    number = _number(text)
     if not 0 < number < float("inf"):
         raise argparse.ArgumentTypeError(f"{text!r} is no number above 0")
     return number
+
+
+def fraction(text):
+    """A number from 0 to below 1."""
+    number = _number(text)
+    if not 0 <= number < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number from 0 to 1")
+    return number
+
+
+def whole(text):
+    """A whole number from 0."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number from 0")
+    return int(text)
+
+
+def _number(text):
+    """The number that a text holds, NaN where it holds none."""
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 import warnings
 from pathlib import Path
 
-import numpy as np
+from .options import (
+    add_device_option,
+    add_dtype_option,
+    center,
+    check_matplotlib,
+    names,
+    note,
+    positive,
+    size,
+)
 
-from . import options as cli_options
-
-# |D|, the factor by which the difference kernel raises noise: told above, refused above. Equal PSFs
-# have 1; a hundred times the noise is no image any more.
-GAIN_TOLD, GAIN_REFUSED = 2.0, 100.0
-# Light beyond the edge of a PSF image by its own wings (`PSF.edge_light`); a flat image has 1.6.
+# |D|, the factor by which the difference kernel raises noise: warned of above the first, refused
+# above the second. Equal PSFs have 1; in an image with a hundred times the noise nothing is seen.
+GAIN_WARNED, GAIN_REFUSED = 2.0, 100.0
+# Light beyond the edge of a PSF image by its own wings (`PSF.edge_light`), as a part of the light
+# inside: above this the image is refused. Good ones have 0.02 to 0.05, an evenly bright one 1.6.
 EDGE_REFUSED = 0.5
 
 DESCRIPTION = """\
@@ -48,56 +55,66 @@ def add_resample(commands):
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("image", metavar="IN.fits", help="image or cube to resample")
-    files = parser.add_argument_group("files")
-    files.add_argument("--psf", required=True, metavar="P.fits", help="PSF of IN, in its pixels")
-    files.add_argument(
+    _add_files(parser.add_argument_group("files"))
+    _add_parts(parser.add_argument_group("parts of the files"))
+    _add_psfs(parser.add_argument_group("PSFs"))
+    _add_ways(parser.add_argument_group("how"))
+    parser.set_defaults(run=run)
+
+
+def _add_files(group):
+    group.add_argument("--psf", required=True, metavar="P.fits", help="PSF of IN, in its pixels")
+    group.add_argument(
         "--like", required=True, metavar="REF.fits", help="image whose pixels to take"
     )
-    files.add_argument(
+    group.add_argument(
         "--psf-like", required=True, metavar="Q.fits", help="PSF of REF, in its pixels"
     )
-    files.add_argument("-o", "--output", required=True, metavar="OUT.fits", help="file to write")
-    files.add_argument("--overwrite", action="store_true", help="replace OUT and PNG if they exist")
-    files.add_argument(
+    group.add_argument("-o", "--output", required=True, metavar="OUT.fits", help="file to write")
+    group.add_argument("--overwrite", action="store_true", help="replace OUT and PNG if they exist")
+    group.add_argument(
         "--plot", metavar="PNG", help="also draw IN and OUT, and beside REF where its bands match"
     )
 
-    parts = parser.add_argument_group("parts of the files")
+
+def _add_parts(group):
     for prefix, name in (("", "IN"), ("psf-", "P"), ("like-", "REF"), ("psf-like-", "Q")):
-        parts.add_argument(f"--{prefix}hdu", metavar="HDU", help=f"HDU of {name}")
+        group.add_argument(f"--{prefix}hdu", metavar="HDU", help=f"HDU of {name}")
         drawn = ", to draw" if name == "REF" else ""
-        parts.add_argument(
+        group.add_argument(
             f"--{prefix}band",
             metavar="BANDS",
-            type=cli_options.names,
+            type=names,
             help=f"bands of {name}{drawn}; all by default",
         )
 
-    psfs = parser.add_argument_group("PSFs")
+
+def _add_psfs(group):
     for prefix, name in (("psf-", "P"), ("psf-like-", "Q")):
-        psfs.add_argument(
+        group.add_argument(
             f"--{prefix}spacing",
             metavar="PX",
-            type=cli_options.positive,
+            type=positive,
             default=1.0,
             help=f"distance of {name}'s samples in pixels: 0.5 if oversampled twice (default 1)",
         )
-        psfs.add_argument(
+        group.add_argument(
             f"--{prefix}center",
             metavar="WHERE",
-            type=cli_options.center,
+            type=center,
             help=f"centre of {name}: middle (of the array, default), core, or Y,X from 0",
         )
-    psfs.add_argument(
+    group.add_argument(
         "--max-gain",
         metavar="G",
-        type=cli_options.positive,
+        type=positive,
         default=GAIN_REFUSED,
         help="refuse PSFs that need sharpening by more than this (default %(default)g)",
     )
 
-    how = parser.add_argument_group("how")
-    how.add_argument(
+
+def _add_ways(group):
+    group.add_argument(
         "--shift",
         nargs=2,
         type=float,
@@ -105,82 +122,52 @@ def add_resample(commands):
         metavar=("DY", "DX"),
         help="move every output pixel by so many pixels of IN, where the two WCS disagree",
     )
-    how.add_argument(
+    group.add_argument(
         "--nan", type=float, metavar="VALUE", help="put VALUE for NaN and infinite pixels of IN"
     )
-    how.add_argument(
-        "--dtype",
-        choices=("float32", "float64"),
-        default="float32",
-        help="arithmetic and output (default %(default)s)",
-    )
-    cli_options.add_device_option(how)
-    how.add_argument(
+    add_dtype_option(group, "arithmetic and output")
+    add_device_option(group)
+    group.add_argument(
         "--memory",
         metavar="SIZE",
-        type=cli_options.size,
+        type=size,
         help="device memory to stay within, as 512M or 2G; larger frames go through in tiles "
         "(default: 1G, or a quarter of the device's)",
     )
-    parser.set_defaults(run=run)
 
 
 def run(arguments):
     """Read, resample, write. Raises ValueError or OSError, one line, for what cannot be used."""
-    from ..files.fits import read_image, write_fits
-    from ..files.whole_file import check_output
-    from ..resampling.resampler import FLOORED_POWER
-    from ..resampling.tiled import TiledResampler
-
-    check_output(arguments.output, overwrite=arguments.overwrite)
     inputs = {
         "image": arguments.image,
         "its PSF": arguments.psf,
         "pixels of": arguments.like,
         "PSF of these": arguments.psf_like,
     }
-    _check_distinct(arguments, inputs.values())
-    if arguments.plot:
-        _check_plot(arguments, check_output)
+    _check_outputs(arguments, inputs.values())
+    from ..files.fits import read_image, write_fits
 
     image = read_image(arguments.image, hdu=arguments.hdu, bands=arguments.band)
     pixels = _finite(arguments, image)
     reference = read_image(arguments.like, hdu=arguments.like_hdu, bands=arguments.like_band)
-    psf_in = _psf(arguments, "psf", len(pixels))
-    psf_out = _psf(arguments, "psf_like", len(pixels))
+    psfs = [_psf(arguments, which, len(pixels)) for which in ("psf", "psf_like")]
     unit = image.header.get("BUNIT")
     if unit and ("sr" in unit.lower() or "arcsec" in unit.lower()):
-        _note(f"{arguments.image}: BUNIT is {unit}, but pixels are taken as flux per pixel")
+        note(
+            arguments, f"{arguments.image}: BUNIT is {unit}, but pixels are taken as flux per pixel"
+        )
 
     started = time.perf_counter()
-    try:
-        op = TiledResampler(
-            image.grid,
-            psf_in,
-            reference.grid,
-            psf_out,
-            dtype=arguments.dtype,
-            device=arguments.device,
-            shift=arguments.shift,
-            memory=arguments.memory,
-        )
-    except ValueError as error:
-        raise ValueError(f"{arguments.image} as {arguments.like}: {error}") from error
-    _check_gain(arguments, op.report["max_gain"])
-    floored = float(op.report["floored_power"].max())
-    if floored > FLOORED_POWER:
-        _note(f"{floored:.2%} of {arguments.psf_like}'s power lies beyond {arguments.psf}: floored")
+    op = _operator(arguments, image.grid, reference.grid, psfs)
     result = op(pixels)
     took = time.perf_counter() - started
-    covered = op.covered
     written = result if len(result) > 1 else result[0]
-    named = any(not band.isdigit() for band in image.bands)
     write_fits(
         arguments.output,
         written,
         reference.grid,
-        bands=image.bands if named else None,
-        coverage=covered,
+        bands=None if all(band.isdigit() for band in image.bands) else image.bands,
+        coverage=op.covered,
         unit=unit,
         device=op.device.name,
         inputs=inputs,
@@ -189,42 +176,76 @@ def run(arguments):
     )
     print(
         f"{arguments.output}: {' x '.join(map(str, written.shape))} pixels, "
-        f"{100 * covered.mean():.3g} % covered; {op.kind} grids, {op.n_tiles} "
+        f"{100 * op.covered.mean():.3g} % covered; {op.kind} grids, {op.n_tiles} "
         f"tile{'s' * (op.n_tiles > 1)}, {took:.2f} s on {op.device.name}"
     )
     if arguments.plot:
         from ..files.plot_resampled import plot_resampled
 
-        names = Path(arguments.image).name, Path(arguments.like).name
-        plot_resampled(arguments.plot, image, reference, result, covered, psf_out, names=names)
+        files = Path(arguments.image).name, Path(arguments.like).name
+        plot_resampled(arguments.plot, image, reference, result, op.covered, psfs[1], names=files)
         print(arguments.plot)
 
 
-def _note(message):
-    print(f"clresample resample: note: {message}", file=sys.stderr)
+def _check_outputs(arguments, inputs):
+    """Raise ValueError where OUT or PNG cannot be written, or is a file that is read."""
+    from ..files.whole_file import check_output
 
-
-def _check_distinct(arguments, inputs):
-    """Writing over what is read is never meant."""
-    for output in filter(None, (arguments.output, arguments.plot)):
+    outputs = [path for path in (arguments.output, arguments.plot) if path]
+    for output in outputs:
         for path in inputs:
             if Path(output).exists() and Path(path).exists() and Path(output).samefile(path):
                 raise ValueError(f"{output}: is one of the inputs, and is kept")
-    if arguments.plot and Path(arguments.plot).absolute() == Path(arguments.output).absolute():
+        check_output(output, overwrite=arguments.overwrite)
+    if len({Path(output).absolute() for output in outputs}) < len(outputs):
         raise ValueError(f"{arguments.plot}: is both the image and the picture to write")
+    if arguments.plot:
+        check_matplotlib("--plot")
 
 
-def _check_plot(arguments, check_output):
-    from ..files.panels import import_figure
+def _operator(arguments, grid_in, grid_out, psfs):
+    """The TiledResampler; its gain and its floored power are checked, and noted where they count.
 
-    check_output(arguments.plot, overwrite=arguments.overwrite)
+    Raises ValueError for grids that do not overlap, too little memory and too much gain.
+    """
+    from ..resampling.resampler import FLOORED_POWER
+    from ..resampling.tiled import TiledResampler
+
     try:
-        import_figure()
-    except ImportError as error:
-        raise ValueError(f"--plot: {error}") from error
+        op = TiledResampler(
+            grid_in,
+            psfs[0],
+            grid_out,
+            psfs[1],
+            dtype=arguments.dtype,
+            device=arguments.device,
+            shift=arguments.shift,
+            memory=arguments.memory,
+        )
+    except ValueError as error:
+        raise ValueError(f"{arguments.image} as {arguments.like}: {error}") from error
+    gain = float(op.report["max_gain"].max())
+    message = (
+        f"{arguments.psf} is wider than {arguments.psf_like} can show: sharpening it raises noise "
+        f"up to {gain:.3g} times"
+    )
+    if gain > arguments.max_gain:
+        raise ValueError(f"{message}, more than --max-gain {arguments.max_gain:g}")
+    if gain > GAIN_WARNED:
+        note(arguments, message)
+    floored = float(op.report["floored_power"].max())
+    if floored > FLOORED_POWER:
+        note(
+            arguments,
+            f"{floored:.2%} of {arguments.psf_like}'s power lies beyond {arguments.psf}: floored",
+        )
+    return op
 
 
 def _finite(arguments, image):
+    """The image's pixels; NaN and infinite ones have the value of --nan, or are refused."""
+    import numpy as np
+
     if image.n_bad and arguments.nan is None:
         raise ValueError(
             f"{arguments.image}: {image.n_bad} of {image.data.size} pixels are NaN or infinite, "
@@ -236,40 +257,28 @@ def _finite(arguments, image):
 
 
 def _psf(arguments, which, n_bands):
-    """PSF `which` ("psf" or "psf_like") with as many bands as the image; its warnings told."""
+    """PSF `which` ("psf" or "psf_like") with as many bands as the image; its warnings as notes."""
     from ..files.fits import read_psf
 
     option = "--" + which.replace("_", "-")
-    path, hdu, bands, spacing, center = (
+    path, hdu, bands, spacing, where = (
         getattr(arguments, which + part) for part in ("", "_hdu", "_band", "_spacing", "_center")
     )
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        psf = read_psf(path, hdu=hdu, bands=bands, spacing=spacing, center=center)
+        psf = read_psf(path, hdu=hdu, bands=bands, spacing=spacing, center=where)
     light = psf.edge_light().max()
     if light > EDGE_REFUSED:
         raise ValueError(
             f"{path}: too wide for its {psf.images.shape[1]} x {psf.images.shape[2]} image, or no "
             f"PSF: by the light at its edge, another {100 * light:.0f} % lies beyond"
         )
-    for warning in told:
+    for warning in caught:
         message = str(warning.message).replace('center="core"', f"{option}-center core")
-        _note(f"{path}: {message}")
+        note(arguments, f"{path}: {message}")
     if psf.n_bands not in (1, n_bands):
         raise ValueError(
             f"{path}: has {psf.n_bands} bands, {arguments.image} {n_bands}: choose with --band and "
             f"{option}-band"
         )
     return psf.select([0] * n_bands) if psf.n_bands == 1 else psf
-
-
-def _check_gain(arguments, gains):
-    gain = float(gains.max())
-    message = (
-        f"{arguments.psf} is wider than {arguments.psf_like} can show: sharpening it raises noise "
-        f"up to {gain:.3g} times"
-    )
-    if gain > arguments.max_gain:
-        raise ValueError(f"{message}, more than --max-gain {arguments.max_gain:g}")
-    if gain > GAIN_TOLD:
-        _note(message)

@@ -23,6 +23,7 @@ MAD = 1.4826  # standard deviation of Gaussian noise over its median absolute de
 # and as near to the drawing; sparser samples lose the colour of thin lines.
 N_COLOURS, SAMPLE_STEP = 256, 4
 KMEANS_ROUNDS = 4  # that move the colours to the means of the pixels they stand for
+NO_MATPLOTLIB = "pictures need matplotlib, which is not installed: pip install 'clresample[plot]'"
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +75,7 @@ def import_figure():
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ImportError(
-            "pictures need matplotlib, which is not installed: pip install 'clresample[plot]'"
-        ) from error
+        raise ImportError(NO_MATPLOTLIB) from error
     return Figure
 
 

@@ -25,11 +25,12 @@ class Comparison(NamedTuple):
 
 
 def compare(rendered, observed, covered, width_px):
-    """Fit one flux scale and one sky level, the units of two instruments being what they are.
+    """Fit one flux scale and one sky level: two instruments count in different units.
 
     rendered, observed (My, Mx); covered (My, Mx) bool
-    width_px [px]: what lies nearer to the edge of the coverage lacks light from outside
-    Returns None where fewer than three pixels compare, or one image is constant.
+    width_px [px]: nearer to the edge of the coverage, pixels are left out: they lack the light of
+        sources outside
+    returns Comparison, or None where fewer than three pixels compare, or one image is constant.
     """
     inside = distance_transform_edt(np.pad(covered, 1))[1:-1, 1:-1] > width_px
     mask = inside & np.isfinite(observed)
@@ -51,8 +52,12 @@ def plot_resampled(path, image, reference, result, covered, psf_out, *, names, t
     """Draw the first band of an image, of its resampling and, if the bands match, of the reference.
 
     image, reference: as `read_image` returns them; result (C, My, Mx), covered (My, Mx)
-    names (2,): what the image and the reference are called; title: above the row
-    Returns the Comparison, or None.
+    psf_out: the reference's PSF; names (2,): of the image and of the reference, for the titles
+    title: above the row
+    returns Comparison, or None where there is none
+
+    Raises ImportError, with what to install, without matplotlib; FileError where the file cannot be
+    written.
     """
     rows, columns = (np.flatnonzero(covered.any(axis=axis)) for axis in (1, 0))
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)

@@ -28,6 +28,7 @@ FORMAT = 1  # of the files; raised when an older reader would misread them
 KINDS = {kind.__name__: kind for kind in (Source, Point, Extended)}
 KEPT = ("name", "channels", "zero_points", "n_bad", "messages")  # of an observation, as JSON
 BOX = ("source", "y", "x", "n_y", "n_x")
+ARRAYS = ("sky", "covariance", "shifts", "losses")
 # every WCS card with the 17 digits that give back the same float64
 RELAX = WCSHDO_all | WCSHDO_SIP | WCSHDO_P17 | WCSHDO_EFMT
 
@@ -35,14 +36,14 @@ RELAX = WCSHDO_all | WCSHDO_SIP | WCSHDO_P17 | WCSHDO_EFMT
 def write_result(path, result, *, overwrite=False, device=None, inputs=None):
     """Write a fitted blend to FITS, whole or not at all.
 
-    HDUs that are read back: ABOUT (keys and JSON: sources, names, status, messages, ...),
+    HDUs that `read_result` reads: ABOUT (keys and JSON: sources, names, status, messages, ...),
     COMPONENTS (boxes), SPECTRA (n, C), MORPHOLOGIES (one after the other), SKY, COVARIANCE, SHIFTS,
-    LOSSES, MODELPSF, and per observation, numbered from 1: DATA, WEIGHTS, PSF, RENDERED. For the
-    reader of the file: CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all sources in the model frame, and
+    LOSSES, MODELPSF, and per observation, numbered from 1: DATA, WEIGHTS, PSF, RENDERED.
+    For other programs: CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all sources in the model frame, and
     per observation MODEL and RESIDUAL. All images have their WCS; a flat sky is put at
     RA = Dec = 0.
 
-    overwrite: replace a file that exists
+    result: of `deblend`; overwrite: replace a file that exists
     device: name of the OpenCL device; inputs: {what: file}; both for the header
 
     Raises FileError when the file exists or cannot be written.
@@ -51,44 +52,54 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
     check_output(path, overwrite=overwrite)
     primary = fits.PrimaryHDU()
     primary.header["CLSTATUS"] = (to_ascii(" ".join(result.status.split())), "how the fit ended")
-    dtype = result.rendered[0].dtype
-    add_provenance(primary.header, dtype, device, inputs or {}, None)
+    add_provenance(primary.header, result.rendered[0].dtype, device, inputs or {}, None)
+    hdus = [primary, _table(catalogue(result), "CATALOGUE"), _flag_table(), *_fit_hdus(result)]
+    for i in range(len(result.observations)):
+        hdus += _observation_hdus(result, i)
+    write_hdus(path, hdus)
+
+
+def _fit_hdus(result):
+    """HDUs of the fit as a whole, ABOUT to SCENE."""
     boxes = [(c.source, *c.origin, *c.morphology.shape) for c in result.components]
     flat = [np.ravel(c.morphology) for c in result.components]
     spectra = [c.spectrum for c in result.components]
-    hdus = [
-        primary,
-        _table(catalogue(result), "CATALOGUE"),
-        _flag_table(),
+    shape = (len(result.channels), *result.frame.shape)
+    scene = sum((result.source_model(i) for i in range(len(result.sources))), np.zeros(shape))
+    cards, tables = _placed(result.frame.grid, 0)
+    return [
         _about_table(_about(result)),
         fits.BinTableHDU(Table(np.array(boxes, int).reshape(-1, 5), names=BOX), name="COMPONENTS"),
         _image("SPECTRA", np.array(spectra) if spectra else np.zeros((0, len(result.channels)))),
         _image("MORPHOLOGIES", np.concatenate(flat) if flat else np.zeros(0)),
+        *(_image(name.upper(), getattr(result, name)) for name in ARRAYS),
+        _image("MODELPSF", result.frame.psf.images),
+        _image("SCENE", scene, cards),
+        *tables,
     ]
-    for name in ("sky", "covariance", "shifts", "losses"):
-        hdus.append(_image(name.upper(), getattr(result, name)))
-    hdus.append(_image("MODELPSF", result.frame.psf.images))
-    shape = (len(result.channels), *result.frame.shape)
-    scene = sum((result.source_model(i) for i in range(len(result.sources))), np.zeros(shape))
-    cards, tables = _placed(result.frame.grid, 0)
-    hdus += [_image("SCENE", scene, cards), *tables]
-    for i, o in enumerate(result.observations):
-        cards, tables = _placed(o.grid, i + 1)
-        for k, channel in enumerate(o.channels):
-            cards[f"BAND{k + 1}"] = (to_ascii(channel), f"plane {k + 1}")
-        hdus += [_image("DATA", o.data, cards, i), _image("WEIGHTS", o.weights, cards, i), *tables]
-        if result.components:
-            hdus.append(_image("MODEL", result.model(i), cards, i))
-            hdus.append(_image("RESIDUAL", result.residual(i), cards, i))
-        hdus.append(_image("RENDERED", result.rendered[i], None, i))
-        hdus.append(_image("PSF", o.psf.images, None, i))
-    write_hdus(path, hdus)
+
+
+def _observation_hdus(result, i):
+    """HDUs of observation i, DATA to PSF."""
+    o = result.observations[i]
+    cards, tables = _placed(o.grid, i + 1)
+    for k, channel in enumerate(o.channels):
+        cards[f"BAND{k + 1}"] = (to_ascii(channel), f"plane {k + 1}")
+    images = {"DATA": o.data, "WEIGHTS": o.weights}
+    more = {"MODEL": result.model(i), "RESIDUAL": result.residual(i)} if result.components else {}
+    return [
+        *(_image(name, image, cards, i) for name, image in images.items()),
+        *tables,
+        *(_image(name, image, cards, i) for name, image in more.items()),
+        _image("RENDERED", result.rendered[i], None, i),
+        _image("PSF", o.psf.images, None, i),
+    ]
 
 
 def read_result(path) -> Result:
-    """The blend that `write_result` wrote, equal to the last bit.
+    """The blend that `write_result` wrote to a file, equal to the last bit.
 
-    Raises FileError for what is not there, not FITS, damaged, or not such a file.
+    Raises FileError for a file that does not exist, is not FITS, is damaged, or holds no blend.
     """
     with open_fits(path) as hdus:
         if "ABOUT" not in hdus or "COMPONENTS" not in hdus:
@@ -112,14 +123,14 @@ def read_result(path) -> Result:
             status=about["status"],
             messages=tuple(about["messages"]),
             seconds=about["seconds"],
-            **{key: _array(hdus[key.upper()]) for key in ("sky", "covariance", "shifts", "losses")},
+            **{key: _array(hdus[key.upper()]) for key in ARRAYS},
         )
 
 
 def write_catalogue(path, table, *, overwrite=False):
     """Write a catalogue, whole or not at all: as ECSV or, by the file's name, as FITS.
 
-    table: of `measure.catalogue`; path: ends in .ecsv, .fits or .fits.gz
+    path: ends in .ecsv, .fits or .fits.gz; table: of `catalogue`
 
     Raises FileError when the file exists or cannot be written, ValueError for other endings.
     """
@@ -172,7 +183,7 @@ def _flag_table():
 
 
 def _table(table, name):
-    """FITS knows ASCII only."""
+    """A table as an HDU; other characters than ASCII, which FITS does not have, become "?"."""
     table = QTable(table, names=[to_ascii(column) for column in table.colnames])
     table["name"] = [to_ascii(value) for value in table["name"]]
     hdu = fits.table_to_hdu(table)
@@ -181,7 +192,7 @@ def _table(table, name):
 
 
 def _image(name, array, cards=None, i=0):
-    """An image HDU, number i + 1 of its name; what is empty is told in the header."""
+    """An image HDU, number i + 1 of its name; an empty array is described in its header."""
     array = np.asarray(array)
     hdu = fits.ImageHDU(array if array.size else None, cards, name=name, ver=i + 1)
     if not array.size:
@@ -197,7 +208,10 @@ def _array(hdu):
 
 
 def _placed(grid, number):
-    """WCS cards that give back the same float64, and HDUs of look-up tables numbered apart."""
+    """WCS cards that give back the same float64, and HDUs of look-up tables.
+
+    number: of the grid in the file, which sets the version numbers of its tables apart
+    """
     placed = grid.to_wcs().to_fits(relax=RELAX)
     for hdu in placed:
         for k, card in enumerate(list(hdu.header.cards)):

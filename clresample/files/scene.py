@@ -1,10 +1,11 @@
-"""SCENE.toml: what a deblending starts from, read with every mistake told by its key.
+"""SCENE.toml: what a deblending starts from, read so that every mistake is named by its key.
 
     [[observation]]                 one table per instrument
     [sources] or [detection]        a catalogue, or how to look for sources
     [frame], [fit]                  optional
 
-`scenekeys.TABLES` lists every key with what is allowed; paths are relative to the file's folder.
+`scene_keys.TABLES` lists every key with what is allowed, cli/example.toml shows each with a
+comment. Paths are relative to the file's folder.
 """
 
 from __future__ import annotations
@@ -35,7 +36,6 @@ from .fits import (
 )
 from .scene_keys import SceneError, parse
 from .source_table import read_sources
-from .whole_file import FileError
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,14 +74,15 @@ def read_scene(path) -> SceneFile:
     inputs, notes, observations = {"scene": path}, [], []
     for i, table in enumerate(tables["observation"]):
         where = f"{path}: observation {i + 1} ({table['name']})"
-        observations.append(_observation(where, path.parent, table, inputs, notes))
+        try:
+            observations.append(_observation(path.parent, table, inputs, notes))
+        except ValueError as error:
+            raise SceneError(f"{where}: {error}") from error
     try:
         check_observations(observations)
-        frame = _frame(path, tables["frame"], observations)
-    except SceneError:
-        raise
+        frame = _frame(tables["frame"], observations)
     except ValueError as error:
-        raise SceneError(f"{path}: {_by_key(error)}") from error
+        raise SceneError(f"{path}: {error}") from error
     sources = None
     if "sources" in tables:
         inputs["sources"] = path.parent / tables["sources"]["catalogue"]
@@ -102,66 +103,72 @@ def read_scene(path) -> SceneFile:
     )
 
 
-def _observation(where, folder, table, inputs, notes):
-    if "weight" in table and "variance" in table:
-        raise SceneError(f"{where}: weight and variance are both given: an observation takes one")
-    for key in ("weight", "variance", "mask"):
-        if f"{key}_hdu" in table and not isinstance(table.get(key), str):
-            raise SceneError(f"{where}: {key}_hdu is given, but {key} names no file")
+def _observation(folder, table, inputs, notes):
+    """The Observation of one table; adds its files to `inputs` and its messages to `notes`."""
     name = table["name"]
-    inputs[f"image of {name}"] = path = folder / table["image"]
+    inputs[f"image of {name}"] = folder / table["image"]
     inputs[f"PSF of {name}"] = folder / table["psf"]
-    try:
-        image = read_image(path, hdu=table.get("hdu"))
-        chosen = choose_bands(path, image.bands, table.get("bands"))
-        bands = Bands(len(image.data), chosen)
-        given = {}
-        for key, argument in (("weight", "weights"), ("variance", "variance"), ("mask", "mask")):
-            if key not in table:
-                continue
-            value = table[key]
-            if isinstance(value, str):
-                inputs[f"{key} of {name}"] = folder / value
-                value = _planes(folder / value, table, key, bands)
-                value = (np.nan_to_num(value) != 0) if key == "mask" else value
-            given[argument] = value
-        psf = _psf(folder / table["psf"], table, bands, notes)
-        n_channels, names = len(chosen), [image.bands[i] for i in chosen]
-        channels = table.get("channels")
-        if channels is None and not any(band.isdigit() for band in names):
-            channels = names
-        if channels is None:
-            channels = [name] if n_channels == 1 else [f"{name}{i}" for i in range(n_channels)]
-        observation = Observation(
-            image.data[chosen],
-            psf,
-            image.grid,
-            channels=channels,
-            name=name,
-            zero_points=table.get("zero_point"),
-            **given,
+    image = read_image(folder / table["image"], hdu=table.get("hdu"))
+    chosen = choose_bands(folder / table["image"], image.bands, table.get("bands"))
+    bands = Bands(len(image.data), chosen)
+    data = image.data[chosen]
+    given = _weighting(folder, table, bands, data.shape, inputs)
+    zero_points = table.get("zero_point")
+    if isinstance(zero_points, list) and len(zero_points) != len(chosen):
+        raise ValueError(
+            f"zero_point has {len(zero_points)} numbers, it takes one for all channels, or one for "
+            f"each of {len(chosen)}"
         )
-    except FileError as error:
-        raise SceneError(f"{where}: {error}") from error
-    except ValueError as error:
-        raise SceneError(f"{where}: {_by_key(error)}") from error
+    observation = Observation(
+        data,
+        _psf(folder / table["psf"], table, bands, notes),
+        image.grid,
+        channels=table.get("channels") or _channels(name, [image.bands[i] for i in chosen]),
+        name=name,
+        zero_points=zero_points,
+        **given,
+    )
     notes += [f"{name}: {message}" for message in observation.messages]
     return observation
 
 
+def _channels(name, bands):
+    """Names of the channels: those of the bands, or the observation's, numbered if several."""
+    if not any(band.isdigit() for band in bands):
+        return bands
+    return [name] if len(bands) == 1 else [f"{name}{i}" for i in range(len(bands))]
+
+
+def _weighting(folder, table, bands, shape, inputs):
+    """Weights, variance and mask, as Observation takes them; those that are files are read."""
+    if "weight" in table and "variance" in table:
+        raise ValueError("weight and variance are both given: an observation takes one")
+    given = {}
+    for key, argument in (("weight", "weights"), ("variance", "variance"), ("mask", "mask")):
+        value = table.get(key)
+        if f"{key}_hdu" in table and not isinstance(value, str):
+            raise ValueError(f"{key}_hdu is given, but {key} names no file")
+        if isinstance(value, str):
+            inputs[f"{key} of {table['name']}"] = folder / value
+            value = _planes(folder / value, table, key, bands)
+        if value is None:
+            continue
+        value = np.asarray(value)
+        if value.shape not in ((), shape[:1], shape[1:], shape):
+            raise ValueError(f"{key} has the shape {value.shape}, data {shape}")
+        given[argument] = np.nan_to_num(value) != 0 if key == "mask" else value
+    return given
+
+
 def _settings(table):
-    """`monotone = false`: morphologies of any form, not negative; structure_px is the prior's."""
+    """`monotone = false` leaves morphologies any form that is not negative; `structure_px` is the
+    prior's correlation length."""
     given, default = dict(table), Settings()
     if not given.pop("monotone", True):
         given["constraints"] = Chain(Positivity())
     if "structure_px" in given:
         given["prior"] = replace(default.prior, correlation_px=given.pop("structure_px"))
     return replace(default, **given)
-
-
-def _by_key(error):
-    """An error's text with the file's keys in place of arguments' names."""
-    return str(error).replace("zero_points", "zero_point").replace("weights has", "weight has")
 
 
 def _planes(path, table, key, bands):
@@ -177,7 +184,7 @@ def _planes(path, table, key, bands):
 
 def _psf(path, table, bands, notes):
     center = table.get("psf_center", "middle")
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", PSFWarning)
         psf = read_psf(
             path,
@@ -193,22 +200,21 @@ def _psf(path, table, bands, notes):
             f"psf has {psf.n_bands} bands, the image {len(bands.chosen)}: choose with bands and "
             "psf_bands"
         )
-    messages = dict.fromkeys(str(warning.message) for warning in told)
+    messages = dict.fromkeys(str(warning.message) for warning in caught)
     notes += [f"{table['name']}: {m.replace('center=', 'psf_center = ')}" for m in messages]
     return psf
 
 
-def _frame(path, table, observations):
+def _frame(table, observations):
     grid, like = None, table.get("like")
     names = [o.name for o in observations]
     if len(set(names)) < len(names):
-        raise SceneError(f"{path}: observation names must be unique, not {', '.join(names)}")
+        raise ValueError(f"observation names must be unique, not {', '.join(names)}")
     shared = table.get("footprint") == "intersection"
     if like is not None:
         if like not in names:
-            raise SceneError(
-                f"{path}: frame: like is {like!r}, it takes the name of an "
-                f"observation: {', '.join(names)}"
+            raise ValueError(
+                f"frame: like is {like!r}, it takes the name of an observation: {', '.join(names)}"
             )
         grid = (intersection if shared else union)(
             [o.grid for o in observations], like=observations[names.index(like)].grid

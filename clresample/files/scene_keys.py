@@ -1,4 +1,4 @@
-"""The keys of a scene file, what each takes, and how a mistake in one is told."""
+"""The keys of a scene file, what each takes, and the error for each mistake in one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class SceneError(ValueError):
 
 @dataclass(frozen=True)
 class Rule:
-    """What a key takes: `fits` says whether a value is one, `text` says it to the user."""
+    """What a key takes: `text` describes it to the user, `fits(value)` says whether it is one."""
 
     text: str
     fits: object
@@ -112,8 +112,9 @@ NEEDED = {"observation": ("name", "image", "psf"), "sources": ("catalogue",)}
 
 
 def parse(path):
-    """The tables of a scene file, each key checked; [frame] and [fit] are there in any case.
+    """The tables of a scene file, each key checked; [frame] and [fit] are always among them.
 
+    returns {table: {key: value}}, and for "observation" a list of such dicts
     Raises SceneError.
     """
     try:
@@ -124,33 +125,37 @@ def parse(path):
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise SceneError(f"{path}: not TOML ({error})") from error
     _allowed(path, tables, TABLES, "table")
-    if not _many(lambda value: isinstance(value, dict))(tables.get("observation")):
+    observations = tables.get("observation")
+    if not _many(lambda value: isinstance(value, dict))(observations):
         raise SceneError(f"{path}: observation is missing: one [[observation]] per instrument")
-    for name in TABLES:
-        for i, table in enumerate(
-            tables.get(name, [])
-            if name == "observation"
-            else [tables[name]]
-            if name in tables
-            else []
-        ):
-            where = f"{path}: {name} {i + 1}" if name == "observation" else f"{path}: {name}"
-            if not isinstance(table, dict):
-                raise SceneError(f"{where} is {table!r}, must be a table, [{name}]")
-            _allowed(where, table, TABLES[name], "key")
-            for key in NEEDED.get(name, ()):
-                if key not in table:
-                    raise SceneError(
-                        f"{where}: {key} is missing, it takes {TABLES[name][key].text}"
-                    )
-            for key, value in table.items():
-                if not TABLES[name][key].fits(value):
-                    raise SceneError(
-                        f"{where}: {key} is {value!r}, it takes {TABLES[name][key].text}"
-                    )
+    for i, table in enumerate(observations):
+        _check_table(f"{path}: observation {i + 1}", "observation", table)
+    for name, table in tables.items():
+        if name != "observation":
+            _check_table(f"{path}: {name}", name, table)
+    with_zero_point = ["zero_point" in table for table in observations]
+    if len(set(with_zero_point)) > 1:
+        one, other = (observations[with_zero_point.index(has)]["name"] for has in (True, False))
+        raise SceneError(
+            f"{path}: observation {one!r} has zero_point, {other!r} has none: give all or none"
+        )
     if "sources" in tables and "detection" in tables:
         raise SceneError(f"{path}: sources and detection are both given: a scene takes one")
     return {"frame": {}, "fit": {}} | tables
+
+
+def _check_table(where, name, table):
+    """Raise SceneError unless a table holds what TABLES says of those of its name."""
+    rules = TABLES[name]
+    if not isinstance(table, dict):
+        raise SceneError(f"{where} is {table!r}, must be a table, [{name}]")
+    _allowed(where, table, rules, "key")
+    for key in NEEDED.get(name, ()):
+        if key not in table:
+            raise SceneError(f"{where}: {key} is missing, it takes {rules[key].text}")
+    for key, value in table.items():
+        if not rules[key].fits(value):
+            raise SceneError(f"{where}: {key} is {value!r}, it takes {rules[key].text}")
 
 
 def _allowed(where, given, known, what):

@@ -10,19 +10,20 @@ from astropy.table import Table
 from ..sky.sources import Extended, Point
 
 KINDS = {"point": Point, "extended": Extended}
-# columns by what they hold, and the name that is taken without another in the scene file
+# what columns may hold; each is looked for under this name unless the scene file gives another
 COLUMNS = ("ra", "dec", "y", "x", "name", "type", "components")
 
 
 def read_sources(path, columns=None) -> tuple:
-    """Sources of a table: `ra` and `dec`, or `y` and `x`, and what else it says of each.
+    """Sources of a table: their positions `ra` and `dec` or `y` and `x`, names, types, components.
 
     path: a file that `astropy.table.Table.read` takes
     columns: {what: column's name} for ra, dec [deg, or the column's own unit], y, x [model px,
         counted from 0], name, type ("point" or "extended"), components (how many spectra an
-        extended source has); and format: astropy's name of it. Without, columns of these names
+        extended source has); and format: astropy's name of it. What is left out is looked for
+        under its own name
+    returns a tuple of Point and Extended; sources without a type are extended, with one component
 
-    Sources without a type are extended, with one component.
     Raises ValueError, one line that names file, column and row.
     """
     columns, path = columns or {}, Path(path)
@@ -67,7 +68,7 @@ def _read(path, name):
         raise ValueError(f"{path}: no such file")
     try:
         return Table.read(path, format=name)
-    except Exception as error:  # whatever a reader makes of a file that is not its own
+    except Exception as error:  # readers raise any exception on a file of another format
         reason = str(error).strip().split("\n")[0]
         raise ValueError(
             f"{path}: no table that astropy can read ({reason}); format = ... says which it is"
@@ -75,7 +76,7 @@ def _read(path, name):
 
 
 def _numbers(path, what, column, unit):
-    """float64, in a unit where the column has one; masked rows are NaN."""
+    """Values of a column (n,) float64, in `unit` where it has a unit; masked rows are NaN."""
     try:
         if column.unit is not None:
             column = (
@@ -83,7 +84,7 @@ def _numbers(path, what, column, unit):
             )
         values = getattr(column, "value", column)
         return np.ma.filled(np.ma.asarray(values, dtype=float), np.nan)
-    except Exception as error:  # of units and numbers, by astropy and NumPy
+    except Exception as error:  # astropy and NumPy raise several on texts and other units
         raise ValueError(f"{path}: column {what} is no position in {unit} ({error})") from error
 
 

@@ -9,19 +9,19 @@ from astropy import units as u
 from astropy.table import QTable
 from astropy.wcs.utils import wcs_to_celestial_frame
 
-from ..sky.footprint import Footprint, open_edge
+from ..sky.footprint import open_edge
 from ..sky.observation import ZERO_POINT_UJY
 from .photometry import flux_scale, fluxes
-from .quality import box_chi2, fitted_sources, labels
+from .quality import box_chi2, fitted_sources, footprints, labels
 from .shapes import local_axes, moments, shape
 
-# of a morphology's peak: fainter light at the edge of what was seen makes no flux wrong by more
-# than a few percent, and noise in the wings of bright sources stays under it
+# of a morphology's peak: light at the edge of what was seen is flagged when it is brighter. Fainter
+# light makes no flux wrong by more than a few percent; lower, noise in the wings is flagged too
 EDGE_LIGHT = 0.01
 
 
 class Flag(IntFlag):
-    """What is remarkable about a source: a catalogue's `flags` are sums of these (MEANINGS)."""
+    """What limits a source's measurement: `flags` of a catalogue are sums of these (MEANINGS)."""
 
     EDGE = 1
     NOT_CONVERGED = 2
@@ -32,11 +32,11 @@ class Flag(IntFlag):
 
     @classmethod
     def _missing_(cls, value):
-        return super()._missing_(int(value))  # tables hold NumPy's whole numbers, enum takes int
+        return super()._missing_(int(value))  # tables hold NumPy's integers, enum takes Python's
 
 
 MEANINGS = {
-    Flag.EDGE: "over 1 % of a morphology's peak at the frame's edge, or beside sky that none saw",
+    Flag.EDGE: "over 1 % of a morphology's peak at the frame's edge, or beside unobserved sky",
     Flag.NOT_CONVERGED: "the blend's fit ended for another reason than convergence",
     Flag.ZERO_FLUX: "the flux in a channel that determines it is at its limit, zero",
     Flag.NO_COVERAGE: "a channel's image does not hold the centre, or determines no flux",
@@ -46,29 +46,34 @@ MEANINGS = {
 
 
 def catalogue(result, *, magnitudes=False) -> QTable:
-    """One row per source, in the order of `result.sources`, with units.
+    """The catalogue of a fitted blend: one row per source, columns with units.
 
-    name; position as given: on the sky (`ra`, `dec` or what the frame's WCS calls them [deg];
-    `y_sky`, `x_sky` [arcsec] if flat) and `y`, `x` [model px]; flags: sums of `Flag`; snr: signal
-    to noise of all channels together,
-
-        snr = sqrt( sum_c flux_c^2 / variance_c ),     about sqrt(C) for no source at all
-
-    y_centroid, x_centroid and the same on the sky; size, e1, e2, angle: see `shapes.shape`, those
-    of the model under the model's PSF, not deconvolved, components weighted by their flux (of all
-    channels, each in units of its error); per channel flux_* and flux_err_* [uJy where observations
-    have zero points, else counts], errors from `fluxes`, and with `magnitudes` also mag_* and
-    mag_err_* (AB) of positive fluxes; per observation chi2_*: chi2 per pixel with weight on the
-    source's box, all its channels and all sources' models together. NaN is: not measured.
+    result: a fitted blend; magnitudes: add the columns of magnitudes
+    returns QTable (S rows, in the order of `result.sources`); what was not measured is NaN:
+        name: the source's own, or its number
+        ra, dec [deg], or what the frame's WCS calls them; y_sky, x_sky [arcsec] on a flat sky; and
+            y, x [model px]: position as given
+        flags: sum of `Flag`
+        snr: signal to noise of all C channels together, sqrt(sum_c flux_c^2 / variance_c), which
+            is about sqrt(C) where there is no source
+        *_centroid: the same positions, of the fitted light
+        size [arcsec], e1, e2, angle [deg]: see `shapes.shape`. They are those of the model under
+            the model's PSF, not deconvolved; a source's components are weighted by their flux, that
+            of all channels, each in units of its error
+        flux_*, flux_err_* per channel [uJy where observations have zero points, else counts]: see
+            `fluxes`
+        mag_*, mag_err_* per channel [mag, AB]: where the flux is positive
+        chi2_* per observation: mean chi2 of the pixels with weight in the source's box, of all
+            channels and with all sources' models
     """
     flux, covariance = fluxes(result)
     error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).T)  # (S, C)
-    footprints = [Footprint.of(result, i) for i in range(len(result.observations))]
+    seen = footprints(result)
     table = QTable()
     table["name"] = [s.name or str(i) for i, s in enumerate(result.sources)]
     positions = result.frame.place(result.sources)
     _add_positions(table, result.frame.grid, positions, "")
-    table["flags"] = _flags(result, flux, error, positions, footprints)
+    table["flags"] = _flags(result, flux, error, positions, seen)
     table["flags"].info.description = ", ".join(f"{flag.value} {flag.name}" for flag in Flag)
     with np.errstate(divide="ignore", invalid="ignore"):
         table["snr"] = np.sqrt(np.nansum((flux / error) ** 2, axis=1))
@@ -81,7 +86,7 @@ def catalogue(result, *, magnitudes=False) -> QTable:
         if magnitudes and unit[i] == u.uJy:
             _add_magnitudes(table, channel, flux[:, i] * scale[i], error[:, i] * scale[i])
     for i, label in enumerate(labels(result)):
-        table[f"chi2_{label}"] = box_chi2(result, i, footprints[i])
+        table[f"chi2_{label}"] = box_chi2(result, i, seen[i])
     return table
 
 

@@ -7,8 +7,8 @@ from astropy import units as u
 
 from .quality import fitted_sources
 
-# of a channel's brightest model pixel: under it, rounding of float32 renderings (1e-6), not light,
-# decides which source a pixel belongs to
+# of a channel's brightest model pixel: where all models are fainter, a pixel is shared by none.
+# There the rounding of float32 renderings (1e-6), not light, would decide whose it is
 TRACE = 1e-5
 
 
@@ -19,6 +19,7 @@ def fluxes(result):
 
     over the components i of s and j of t.
 
+    result: a fitted blend
     returns flux (S, C) [counts]: NaN for a source without components; covariance (C, S, S)
         [counts^2]: the variance is infinite where a channel does not determine a flux, and for
         sources without components
@@ -31,7 +32,7 @@ def fluxes(result):
     known = np.isfinite(np.diagonal(result.covariance, axis1=1, axis2=2))  # (C, n)
     both = known[:, :, None] & known[:, None, :]
     summed = sums @ np.where(both, result.covariance, 0.0) @ sums.T
-    # a component that is zero everywhere adds nothing, not even ignorance
+    # a component that is zero everywhere adds no flux, and no variance even where it is unknown
     lost = (~known) @ (sums != 0).T | ~fitted_sources(result)
     i_channel, i_source = np.nonzero(lost)
     summed[i_channel, i_source] = summed[i_channel, :, i_source] = 0.0
@@ -46,8 +47,9 @@ def redistribute(result, i_observation) -> np.ndarray:
 
     m_s being the model of s on the observed pixels. The shares of a pixel add up to its data
     without the sky, unless all models are fainter there than 1e-5 of the channel's brightest model
-    pixel: such pixels are nobody's, and all shares are 0.
+    pixel: there all shares are 0.
 
+    result: a fitted blend; i_observation: number of the observation
     returns (S, Co, My, Mx) [counts]: NaN where the data have no weight
     Source: the deblender of SDSS (R. Lupton), with fitted models as its templates.
     """
@@ -69,7 +71,7 @@ def redistribute(result, i_observation) -> np.ndarray:
 
 
 def spectra_of(result):
-    """(n, C) [counts]; no components are (0, C)."""
+    """Spectra (n, C) [counts] of all n components; (0, C) without any."""
     spectra = [c.spectrum for c in result.components]
     return np.array(spectra, dtype=np.float64).reshape(-1, len(result.channels))
 

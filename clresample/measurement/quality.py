@@ -8,15 +8,19 @@ from ..sky.footprint import Footprint
 
 
 def summary(result) -> dict:
-    """What became of the blend as a whole, in plain values that JSON can hold.
+    """How the fit of a whole blend ended, in plain values that JSON can hold.
 
-    status, messages, seconds as in `Result`; n_sources, n_fitted (inside the frame), n_components,
-    n_iterations, losses; chi2 {channel: per pixel with a weight on the frame, NaN without any},
-    n_pixels {channel}, sky {channel} [counts], shifts {observation: (y, x) [model px]}
+    result: a fitted blend
+    returns a dict: status, messages, seconds as in `Result`; n_sources, n_fitted (inside the
+        frame), n_components, n_iterations, losses; chi2 {channel: per pixel with a weight on the
+        frame, NaN without any}, n_pixels {channel: number of these pixels}, sky {channel} [counts],
+        shifts {observation: (y, x)} [model px]
     """
     chi2, n_pixels = {}, {}
-    for i, observation in enumerate(result.observations):
-        used = Footprint.of(result, i).used
+    for i, (observation, footprint) in enumerate(
+        zip(result.observations, footprints(result), strict=True)
+    ):
+        used = footprint.used
         terms = chi2_terms(result, i, used)
         for channel, one, where in zip(observation.channels, terms, used, strict=True):
             n_pixels[channel] = int(where.sum())
@@ -38,6 +42,11 @@ def summary(result) -> dict:
         },
         "seconds": {stage: float(t) for stage, t in result.seconds.items()},
     }
+
+
+def footprints(result) -> list[Footprint]:
+    """Where each observation's pixels lie in the model frame."""
+    return [Footprint.of(result, i) for i in range(len(result.observations))]
 
 
 def labels(result) -> list[str]:

@@ -91,7 +91,6 @@ class SimulatedScene:
     profiles (S): GalSim objects at unit flux, smoothed, centred on the origin
     galaxies (S): rows of the catalogue, or None for parametric galaxies
     positions_arcsec (S, 2) [arcsec]: (y, x) on the flat sky
-    positions_deg (S, 2) [deg]: right ascension and declination, or None for a flat sky
     """
 
     seed: int
@@ -100,11 +99,17 @@ class SimulatedScene:
     profiles: tuple
     galaxies: tuple | None
     positions_arcsec: np.ndarray
-    positions_deg: np.ndarray | None
 
     @property
     def images(self):
+        """(rubin, euclid)."""
         return self.rubin, self.euclid
+
+    @property
+    def positions_deg(self):
+        """Right ascension and declination (S, 2) [deg] of the sources; None on a flat sky."""
+        grid = self.euclid.grid
+        return None if grid.wcs is None else grid.sky(*self.euclid.positions_px.T).T
 
 
 def observe(survey, grid, profiles, positions_arcsec, magnitudes, rng, *, center_deg=None):
@@ -119,6 +124,7 @@ def observe(survey, grid, profiles, positions_arcsec, magnitudes, rng, *, center
     magnitudes (S, C) [mag]: of each source in each band
     rng: `numpy.random.Generator` of the noise
     center_deg (2,) [deg]: put the flat sky's origin there, and give the image a celestial WCS
+    returns SimulatedImage
 
     Raises ValueError for numbers of sources or bands that do not agree.
     """
@@ -170,22 +176,24 @@ def simulate_scene(
     n_pixels=60,
     center_deg=None,
 ):
-    """A blend of galaxies as Euclid (VIS) and Rubin (ugrizy) see it. The same seed, the same scene.
+    """A blend of galaxies as Euclid (VIS) and Rubin (ugrizy) see it; one seed gives one scene.
 
     Positions are uniform in the central two thirds of the stamp, VIS magnitudes uniform in 20 - 29;
     a row of colours is shifted so that its brightest Rubin band is uniform in 20 - 29. Galaxies,
     positions and magnitudes do not change with the angle and the flip, nor do the first sources
-    with n_sources.
+    with n_sources. Needs GalSim (the extra `sim`).
 
     seed: a whole number
     n_sources: how many galaxies; None draws 1 to 10
     catalogue: folder or open catalogue of COSMOS galaxies; None for bulge + disk + knots
-    colours: table, or path of one, with columns u_ab ... y_ab; None for power-law spectra
+    colours: table, or path of one, with columns u_ab ... y_ab [mag]; None for power-law spectra
     angle_deg [deg], flip: turn Rubin's grid, mirror it; Euclid's stays
     n_pixels: Rubin pixels a side; Euclid has as many as the same sky holds
     center_deg (2,) [deg]: right ascension and declination of the centre; grids then have a WCS
+    returns SimulatedScene: images with noise [counts], and the truth behind them
 
-    Raises ValueError for fewer than one source, or a table without the columns.
+    Raises ValueError for fewer than one source, a folder without a catalogue, or a table without
+    the columns or without a finite row; ImportError, with what to install, without GalSim.
     Source: section `Sect:real_images`, Table `tab:sim_param`.
     """
     streams = np.random.SeedSequence(seed).spawn(4)
@@ -197,43 +205,43 @@ def simulate_scene(
     if catalogue is not None:
         catalogue = open_catalogue(catalogue)
     rows = None if colours is None else _colour_rows(colours, RUBIN_UGRIZY.bands)
-    rubin_grid = RUBIN_UGRIZY.grid(n_pixels, angle_deg=angle_deg, flip=flip)
     n_euclid = EUCLID_VIS.n_same_sky(n_pixels, RUBIN_UGRIZY)
     half_arcsec = CENTRAL_FRACTION * n_euclid * EUCLID_VIS.pixel_scale_arcsec / 2
-
-    galaxies, profiles, positions, vis, ugrizy = [], [], [], [], []
-    for stream in streams[3].spawn(n_sources):
-        rng = np.random.default_rng(stream)
-        positions.append(rng.uniform(-half_arcsec, half_arcsec, 2))
-        vis.append(rng.uniform(*MAGNITUDE_RANGE, 1))
-        row = _power_law_colours(rng) if rows is None else rows[rng.integers(len(rows))]
-        ugrizy.append(row - row.min() + rng.uniform(*MAGNITUDE_RANGE))
-        if catalogue is not None:
-            galaxies.append(int(rng.integers(catalogue.nobjects)))
-        profiles.append(
-            random_galaxy(
-                rng,
-                catalogue=catalogue,
-                i_galaxy=galaxies[-1] if galaxies else None,
-                smoothing_arcsec=SMOOTHING_ARCSEC,
-            )
-        )
+    drawn = [
+        _random_source(np.random.default_rng(stream), half_arcsec, catalogue, rows)
+        for stream in streams[3].spawn(n_sources)
+    ]
+    profiles, galaxies, positions, vis, ugrizy = zip(*drawn, strict=True)
     sky = {"center_deg": center_deg}
     euclid_grid = EUCLID_VIS.grid(n_euclid)
+    rubin_grid = RUBIN_UGRIZY.grid(n_pixels, angle_deg=angle_deg, flip=flip)
     euclid = observe(EUCLID_VIS, euclid_grid, profiles, positions, vis, euclid_rng, **sky)
     rubin = observe(RUBIN_UGRIZY, rubin_grid, profiles, positions, ugrizy, rubin_rng, **sky)
-    positions_deg = None
-    if center_deg is not None:
-        positions_deg = euclid.grid.sky(*euclid.positions_px.T).T
     return SimulatedScene(
         seed=seed,
         euclid=euclid,
         rubin=rubin,
-        profiles=tuple(profiles),
-        galaxies=tuple(galaxies) or None,
+        profiles=profiles,
+        galaxies=None if catalogue is None else galaxies,
         positions_arcsec=np.array(positions),
-        positions_deg=positions_deg,
     )
+
+
+def _random_source(rng, half_arcsec, catalogue, rows):
+    """One galaxy: its profile, row of the catalogue, position [arcsec], magnitudes of both surveys.
+
+    half_arcsec [arcsec]: positions lie within as much of the centre, in y and in x
+    catalogue: open, or None; rows (n, 6) [mag]: colours to choose from, or None
+    """
+    position = rng.uniform(-half_arcsec, half_arcsec, 2)
+    vis = rng.uniform(*MAGNITUDE_RANGE, 1)
+    row = _power_law_colours(rng) if rows is None else rows[rng.integers(len(rows))]
+    ugrizy = row - row.min() + rng.uniform(*MAGNITUDE_RANGE)
+    i_galaxy = None if catalogue is None else int(rng.integers(catalogue.nobjects))
+    profile = random_galaxy(
+        rng, catalogue=catalogue, i_galaxy=i_galaxy, smoothing_arcsec=SMOOTHING_ARCSEC
+    )
+    return profile, i_galaxy, position, vis, ugrizy
 
 
 def _colour_rows(colours, bands):

@@ -46,9 +46,9 @@ def changed(example, name, old, new):
 
 
 def one_line(capsys):
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1 and told.startswith("clresample deblend: ")
-    return told
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1 and text.startswith("clresample deblend: ")
+    return text
 
 
 def test_example_and_output_are_complete(example, output):
@@ -86,12 +86,16 @@ def test_report_names_files_chi2_and_shifts(example, tmp_path, capsys):
     out = tmp_path / "deep" / "out"
     scene = example / "scene.toml"
     assert deblend(scene, out, "--fit-shifts", "--fit-sky", "--max-iter", 12, "--no-figure") == 0
-    printed = capsys.readouterr().out
+    written = capsys.readouterr()
+    printed = written.out
     assert "6 sources in 7 channels: " in printed and "chi2 per pixel, Euclid: VIS" in printed
     assert "model pixels (y, x)" in printed
     assert sorted(p.name for p in out.iterdir()) == sorted(OUTPUTS[:3])
     assert all(str(out / name) in printed for name in OUTPUTS[:3])
     assert read_result(out / "result.fits").sky.any()
+    reading, fitting = written.err.splitlines()
+    assert reading == f"clresample deblend: reading {scene}"
+    assert "fitting 6 sources to Euclid (VIS), Rubin (u g r i z y) on " in fitting
 
 
 def test_sources_are_detected_without_a_catalogue(example, tmp_path, capsys):
@@ -136,7 +140,7 @@ def test_interrupted_runs_write_the_best_so_far(example, tmp_path, capsys, monke
 
 
 @pytest.mark.parametrize(
-    "arguments, told",
+    "arguments, message",
     [
         ([], "SCENE.toml is missing"),
         (["scene.toml"], "-o DIR is missing"),
@@ -149,18 +153,18 @@ def test_interrupted_runs_write_the_best_so_far(example, tmp_path, capsys, monke
         (["scene.toml", "--example", "new"], "--example DIR takes neither"),
     ],
 )
-def test_wrong_arguments_are_told(example, monkeypatch, capsys, arguments, told):
+def test_wrong_arguments_are_refused(example, monkeypatch, capsys, arguments, message):
     monkeypatch.chdir(example)
     try:
         status = main(["deblend", *arguments])
     except SystemExit as stop:
         status = stop.code
-    assert status == 2 and told in capsys.readouterr().err
+    assert status == 2 and message in capsys.readouterr().err
     assert not (example / "new").exists()
 
 
 @pytest.mark.parametrize(
-    "old, new, told",
+    "old, new, message",
     [
         ('name = "Euclid"', 'nome = "Euclid"', "key nome is unknown"),
         ('image = "rubin.fits"', 'image = "none.fits"', "observation 2 (Rubin): "),
@@ -174,22 +178,22 @@ def test_wrong_arguments_are_told(example, monkeypatch, capsys, arguments, told)
         ),
     ],
 )
-def test_mistakes_in_the_scene_leave_nothing_behind(example, capsys, old, new, told):
+def test_mistakes_in_the_scene_leave_nothing_behind(example, capsys, old, new, message):
     Table({"ra": [151.0], "dec": [2.2]}).write(example / "away.csv", overwrite=True)
     path = changed(example, "wrong.toml", old, new)
     assert deblend(path, example / "new", "--quiet") == 2
-    assert told in one_line(capsys)
+    assert message in one_line(capsys)
     assert not (example / "new").exists()
 
 
-@pytest.mark.parametrize("module, told", [("matplotlib", "--no-figure"), ("sep", "[sources]")])
-def test_what_is_not_installed_is_told(example, capsys, monkeypatch, module, told):
+@pytest.mark.parametrize("module, message", [("matplotlib", "--no-figure"), ("sep", "[sources]")])
+def test_what_is_not_installed_is_named(example, capsys, monkeypatch, module, message):
     monkeypatch.setitem(sys.modules, module, None)
     if module == "matplotlib":
         monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     path = changed(example, "detect.toml", '[sources]\ncatalogue = "sources.ecsv"', "[detection]")
     assert deblend(path, example / "new", "--quiet") == 2
-    assert told in one_line(capsys)
+    assert message in one_line(capsys)
     assert not (example / "new").exists()
 
 

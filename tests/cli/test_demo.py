@@ -42,7 +42,7 @@ def test_demo_writes_what_it_names(tmp_path, capsys):
     assert np.median(joint) > max(np.median(rubin), np.median(euclid)) and np.median(joint) > 14
 
 
-def test_demo_tells_what_is_missing(tmp_path, capsys, monkeypatch):
+def test_demo_names_what_is_missing(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "galsim", None)
     assert demo.main([str(tmp_path)]) == 2
     assert "pip install 'clresample[sim]'" in capsys.readouterr().err

@@ -240,7 +240,7 @@ def test_channels_that_differ_in_case_only_keep_their_columns(tmp_path):
     assert found["flux_R"][0] == 2 * found["flux_r"][0]
 
 
-# what is wrong is told in one line, and nothing is half-written
+# what is wrong is reported in one line, and nothing is half-written
 
 
 def test_a_file_is_whole_or_absent(tmp_path, monkeypatch):
@@ -271,7 +271,7 @@ def test_other_endings_are_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_files_of_other_kinds_are_told(tmp_path):
+def test_files_of_other_kinds_are_refused(tmp_path):
     path = tmp_path / "blend.fits"
     with pytest.raises(FileError, match="no such file"):
         read_result(path)
@@ -280,7 +280,7 @@ def test_files_of_other_kinds_are_told(tmp_path):
         read_result(path)
 
 
-def test_damaged_and_newer_files_are_told(tmp_path, monkeypatch):
+def test_damaged_and_newer_files_are_refused(tmp_path, monkeypatch):
     path = tmp_path / "blend.fits"
     result = blend([round_component(0, (30, 35), (1, 2))])
     write_result(path, result)

@@ -1,4 +1,4 @@
-"""Scene files: what they give, and each mistake told by its key with what is allowed."""
+"""Scene files: what they give, and each mistake reported by its key with what is allowed."""
 
 import numpy as np
 import pytest
@@ -31,6 +31,43 @@ psf = "psf3.fits"
 SOURCES = """
 [sources]
 catalogue = "sources.csv"
+"""
+EVERY_KEY = """
+[[observation]]
+name = "cube"
+image = "cube.fits"
+hdu = 0
+bands = ["i", "g"]
+channels = ["red", "blue"]
+psf = "psf3.fits"
+psf_hdu = 0
+psf_bands = [2, 0]
+psf_center = [10, 10]
+psf_spacing = 0.5
+weight = "more.fits"
+weight_hdu = "WHT"
+mask = "more.fits"
+mask_hdu = "DQ"
+zero_point = [27, 26.5]
+[sources]
+catalogue = "full.fits"
+format = "fits"
+ra = "RA"
+dec = "DE"
+name = "id"
+type = "class"
+components = "n"
+[frame]
+like = "cube"
+footprint = "intersection"
+psf_sigma_px = 0.7
+[fit]
+max_iter = 7
+tol = 0.01
+monotone = false
+structure_px = 1.5
+fit_shifts = true
+fit_sky = true
 """
 
 
@@ -94,46 +131,7 @@ def test_the_least_that_a_scene_needs(folder):
 
 
 def test_every_key_is_used(folder):
-    found = scene(
-        folder,
-        """
-[[observation]]
-name = "cube"
-image = "cube.fits"
-hdu = 0
-bands = ["i", "g"]
-channels = ["red", "blue"]
-psf = "psf3.fits"
-psf_hdu = 0
-psf_bands = [2, 0]
-psf_center = [10, 10]
-psf_spacing = 0.5
-weight = "more.fits"
-weight_hdu = "WHT"
-mask = "more.fits"
-mask_hdu = "DQ"
-zero_point = [27, 26.5]
-[sources]
-catalogue = "full.fits"
-format = "fits"
-ra = "RA"
-dec = "DE"
-name = "id"
-type = "class"
-components = "n"
-[frame]
-like = "cube"
-footprint = "intersection"
-psf_sigma_px = 0.7
-[fit]
-max_iter = 7
-tol = 0.01
-monotone = false
-structure_px = 1.5
-fit_shifts = true
-fit_sky = true
-""",
-    )
+    found = scene(folder, EVERY_KEY)
     (o,) = found.observations
     cube = fits.getdata(folder / "cube.fits")
     np.testing.assert_array_equal(o.data, cube[[2, 0]])
@@ -167,7 +165,7 @@ def test_bands_of_the_image_choose_those_of_the_psf(folder):
 
 
 @pytest.mark.parametrize(
-    "text, told",
+    "text, message",
     [
         ("", "observation is missing"),
         ("observation = 3", "observation is missing"),
@@ -195,7 +193,10 @@ def test_bands_of_the_image_choose_those_of_the_psf(folder):
         ),
         (ONE + "psf_spacing = 0", "psf_spacing is 0, it takes a number above 0"),
         (ONE + 'zero_point = "AB"', "zero_point is 'AB', it takes a number, or a list"),
-        (ONE + "zero_point = [25, 26]", "zero_point must be one finite number or 1"),
+        (
+            ONE + "zero_point = [25, 26]",
+            "zero_point has 2 numbers, it takes one for",
+        ),
         (ONE + "variance = -1", "variance is -1, it takes the name of a file, a number"),
         (ONE + "variance = [1, 2]", "variance has the shape (2,)"),
         (ONE + "variance = 1\nweight = 1", "weight and variance are both given"),
@@ -242,11 +243,11 @@ def test_bands_of_the_image_choose_those_of_the_psf(folder):
         (ONE + SOURCES.replace("sources.csv", "nan.csv"), "row 2: position_px is"),
     ],
 )
-def test_mistakes_are_told_by_key(folder, text, told):
+def test_mistakes_are_reported_by_key(folder, text, message):
     with pytest.raises(SceneError) as error:
         scene(folder, text)
-    message = str(error.value)
-    assert told in message and "scene.toml" in message and "\n" not in message
+    line = str(error.value)
+    assert message in line and "scene.toml" in line and "\n" not in line
 
 
 def test_a_scene_that_is_not_there(tmp_path):

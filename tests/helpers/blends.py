@@ -10,6 +10,7 @@ from clresample.sky.psf import PSF
 from clresample.sky.sources import Extended
 
 SCALE = 0.1  # [arcsec/px]
+MIDDLE = (30.0, 35.0)  # [px] about the middle of the frame of `blend`
 
 
 def gaussian(shape, center, covariance):
@@ -80,3 +81,20 @@ def blend(components, *, observations=None, sources=None, grid=None, **given):
         components=tuple(components),
         **(fields | given),
     )
+
+
+def two_sources(**given):
+    """A bulge and a disk about one centre, and a neighbour."""
+    return blend(
+        [
+            round_component(0, (30, 28), (2.0, 1.0)),
+            round_component(0, (30, 28), (0.5, 3.0), n=31, sigma=2.5),
+            round_component(1, (30, 44), (1.0, 4.0)),
+        ],
+        **given,
+    )
+
+
+def one_source(center=MIDDLE, **given):
+    """A round Gaussian of two channels."""
+    return blend([round_component(0, center, (1, 1))], **given)

@@ -1,4 +1,4 @@
-"""Detection: signal to noise in the model frame, neighbours told apart, what a fit leaves over."""
+"""Detection: signal to noise in the model frame, close neighbours, what a fit leaves over."""
 
 import sys
 
@@ -9,7 +9,7 @@ from helpers.blends import gaussian
 from clresample.deblending.batch import deblend
 from clresample.deblending.profiles import point
 from clresample.deblending.settings import Settings
-from clresample.measurement.detection import detect, detect_more
+from clresample.measurement.detection import _convolved, detect, detect_more
 from clresample.resampling.cache import cached_resampler
 from clresample.sky.frame import model_frame
 from clresample.sky.grid import Grid
@@ -127,6 +127,17 @@ def test_what_a_fit_leaves_over_is_found(device):
     more = detect_more(result, device=device)
     assert nearest(more, 40, 52) < 3
     assert all(np.hypot(s.position_px[0] - 40, s.position_px[1] - 40) > 2 for s in more.sources)
+
+
+@pytest.mark.parametrize("shape", [(50, 52), (17, 40), (9, 3), (64, 81)])
+@pytest.mark.parametrize("psf", [(17, 17), (8, 5)])
+def test_the_convolution_is_scipys_to_the_last_bit(shape, psf):
+    from scipy.signal import fftconvolve
+
+    rng = np.random.default_rng(4)
+    image, kernel = rng.normal(size=shape), rng.random(psf)
+    expected = fftconvolve(image, kernel, mode="same")
+    np.testing.assert_array_equal(_convolved(image, kernel), expected)
 
 
 @pytest.mark.parametrize("threshold", [0, -1, float("nan"), float("inf")])

@@ -86,7 +86,7 @@ def test_psf_widths_are_those_of_the_table():
     np.testing.assert_allclose(variance_px, sigmas_px**2 + pixel_variance_px, rtol=1e-9)
 
 
-def test_survey_mistakes_are_told():
+def test_survey_mistakes_are_refused():
     with pytest.raises(ValueError, match="psf_sigma_arcsec has 2 entries for 1 bands"):
         Survey("x", 0.1, ("a",), (0.1, 0.2))
     with pytest.raises(ValueError, match="pixel_scale_arcsec is 0"):
@@ -172,7 +172,7 @@ def test_real_galaxies(galsim, data):
         random_galaxy(rng, catalogue=catalogue, i_galaxy=60)
 
 
-def test_galaxy_mistakes_are_told(galsim, tmp_path):
+def test_galaxy_mistakes_are_refused(galsim, tmp_path):
     with pytest.raises(ValueError, match=r"holds no galaxy catalogue.*does not exist"):
         open_catalogue(tmp_path)
     with pytest.raises(ValueError, match="smoothing_arcsec is -1"):
@@ -280,7 +280,7 @@ def test_colours_from_a_table(galsim, data):
     assert len(scene.galaxies) == 2
 
 
-def test_scene_mistakes_are_told(galsim):
+def test_scene_mistakes_are_refused(galsim):
     with pytest.raises(ValueError, match="n_sources is 0"):
         simulate_scene(1, n_sources=0)
     with pytest.raises(ValueError, match="colours has no column u_ab; it has a"):

@@ -1,0 +1,62 @@
+"""What a command waits for: the modules that it imports, read off after it ran."""
+
+import pytest
+from helpers.checkout import run_python
+
+# Each takes a tenth of a second or more, some half a second.
+SLOW = {"numpy", "scipy", "astropy", "pyopencl", "matplotlib", "PIL", "galsim", "sep", "tqdm"}
+# Parts of these that a fit with a catalogue has no use for.
+UNUSED = {
+    "scipy.signal",
+    "scipy.stats",
+    "scipy.interpolate",
+    "scipy.integrate",
+    "matplotlib.pyplot",
+    "galsim",
+    "sep",
+}
+RUN = """
+import sys
+from clresample.cli import main
+try:
+    status = main(sys.argv[1:])
+except SystemExit as stop:
+    status = stop.code
+print("modules:", *sys.modules)
+sys.exit(status)
+"""
+
+
+def imported(*arguments):
+    """Names of all modules that `clresample ARGUMENTS` imports."""
+    answer = run_python("-c", RUN, *map(str, arguments))
+    assert answer.returncode == 0, answer.stderr
+    return set(answer.stdout.split("modules:")[1].split())
+
+
+def test_help_imports_nothing_slow():
+    for arguments in (["--help"], ["deblend", "--help"], ["resample", "--help"]):
+        assert not imported(*arguments) & SLOW
+
+
+def test_devices_imports_opencl_and_numpy_only():
+    assert imported("devices") & SLOW == {"numpy", "pyopencl"}
+
+
+@pytest.mark.parametrize("figure", [True, False])
+def test_a_fit_imports_what_it_uses(tmp_path, figure):
+    pytest.importorskip("galsim")
+    imported("deblend", "--example", tmp_path)
+    arguments = ["deblend", tmp_path / "scene.toml", "-o", tmp_path / "out", "--max-iter", 3]
+    if figure:
+        pytest.importorskip("matplotlib")
+    else:
+        arguments.append("--no-figure")
+    found = imported(*arguments)
+    assert not found & UNUSED
+    assert {"matplotlib", "PIL"} <= found if figure else not found & {"matplotlib", "PIL"}
+
+
+def test_a_slow_import_is_seen():
+    answer = run_python("-c", "import scipy.signal, sys; print(*sys.modules)")
+    assert set(answer.stdout.split()) & UNUSED

@@ -1,0 +1,117 @@
+"""Fluxes, their covariances and shares of the data, against closed forms."""
+
+import numpy as np
+from astropy import units as u
+from helpers.blends import (
+    MIDDLE,
+    SCALE,
+    blend,
+    observe,
+    round_component,
+    two_sources,
+)
+
+from clresample.measurement.catalogue import Flag, catalogue
+from clresample.measurement.photometry import fluxes, redistribute
+from clresample.sky.grid import Grid
+
+
+def test_fluxes_add_up_over_components_with_their_covariances():
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(2, 3, 3))
+    covariance = root @ root.transpose(0, 2, 1)
+    result = two_sources(covariance=covariance)
+    flux, found = fluxes(result)
+    a, b, c = (component.morphology.sum() for component in result.components)
+    np.testing.assert_allclose(flux, [[2 * a + 0.5 * b, a + 3 * b], [c, 4 * c]], rtol=1e-14)
+    v = covariance
+    np.testing.assert_allclose(
+        found[:, 0, 0],
+        a**2 * v[:, 0, 0] + b**2 * v[:, 1, 1] + 2 * a * b * v[:, 0, 1],
+        rtol=1e-13,
+    )
+    np.testing.assert_allclose(found[:, 0, 1], a * c * v[:, 0, 2] + b * c * v[:, 1, 2], rtol=1e-12)
+    np.testing.assert_allclose(found, found.transpose(0, 2, 1), rtol=1e-12)
+    table = catalogue(result)
+    np.testing.assert_allclose(table["flux_err_r"].value, np.sqrt([found[1, 0, 0], found[1, 1, 1]]))
+    snr = np.sqrt((flux**2 / np.diagonal(found, axis1=1, axis2=2).T).sum(axis=1))
+    np.testing.assert_allclose(table["snr"], snr, rtol=1e-13)
+
+
+def test_a_gaussians_flux_and_error_are_the_closed_ones():
+    # variance A of a spectrum of one Gaussian in white noise: 1 / sum w S^2 = 1 / (w pi sigma^2)
+    weight, sigma = 4.0, 1.5
+    variance = 1 / (weight * np.pi * sigma**2)
+    covariance = variance * np.ones((2, 1, 1))
+    table = catalogue(blend([round_component(0, MIDDLE, (3.0, 5.0))], covariance=covariance))
+    np.testing.assert_allclose(table["flux_r"].value, 5 * 2 * np.pi * sigma**2, rtol=1e-7)
+    np.testing.assert_allclose(
+        table["flux_err_r"].value, 2 * np.sqrt(np.pi / weight) * sigma, rtol=1e-7
+    )
+    assert table["flux_r"].unit == u.ct
+
+
+def test_zero_points_bring_fluxes_into_one_system():
+    grid = Grid.flat((60, 70), SCALE)
+    observations = (
+        observe(grid, ("g", "r"), zero_points=[23.9, 28.9], name="one"),
+        observe(grid, ("i",), zero_points=21.4, name="two"),
+    )
+    result = blend([round_component(0, MIDDLE, (1, 1, 0))], observations=observations)
+    table = catalogue(result, magnitudes=True)
+    counts = result.components[0].morphology.sum()
+    for channel, scale, flux in (("g", 1, 1), ("r", 0.01, 1), ("i", 10, 0)):
+        assert table[f"flux_{channel}"].unit == table[f"flux_err_{channel}"].unit == u.uJy
+        found = [table[f"flux_{channel}"].value[0], table[f"flux_err_{channel}"].value[0]]
+        np.testing.assert_allclose(found, [flux * scale * counts, scale * counts], rtol=1e-13)
+    magnitude = table["flux_r"].to(u.ABmag).value
+    np.testing.assert_allclose(table["mag_r"].value, magnitude, atol=1e-12)
+    np.testing.assert_allclose(table["mag_err_g"].value, 1.0857362, rtol=1e-7)
+    assert np.isnan(table["mag_i"]).all()
+    assert "mag_g" not in catalogue(result).colnames
+    assert "mag_g" not in catalogue(two_sources(), magnitudes=True).colnames
+
+
+def test_channels_that_determine_no_flux_have_infinite_errors():
+    covariance = np.tile(np.eye(3) + 0.1, (2, 1, 1))
+    covariance[0, 1] = covariance[0, :, 1] = np.nan
+    covariance[0, 1, 1] = np.inf
+    result = two_sources(covariance=covariance)
+    table = catalogue(result)
+    assert np.isinf(table["flux_err_g"][0])
+    assert np.isfinite([table["flux_err_g"][1].value, table["flux_err_r"][0].value]).all()
+    assert list(table["flags"]) == [Flag.NO_COVERAGE, 0]
+    a, b, c = (component.morphology.sum() for component in result.components)
+    error = np.sqrt(1.1 * (a**2 + b**2) + 0.2 * a * b)
+    np.testing.assert_allclose(table["snr"][0], (a + 3 * b) / error, rtol=1e-13)
+    np.testing.assert_allclose(fluxes(result)[1][0], [[np.inf, 0], [0, 1.1 * c**2]])
+
+
+def test_shares_add_up_to_the_data_in_the_models_proportions():
+    rng = np.random.default_rng(5)
+    data = rng.normal(5, 1, (2, 60, 70))
+    weights = np.ones(data.shape)
+    weights[0, 30, 30] = 0
+    grid = Grid.flat((60, 70), SCALE)
+    sky = np.array([0.5, -0.5])
+    observations = [observe(grid, ("g", "r"), data=data, weights=weights)]
+    result = two_sources(observations=observations, sky=sky)
+    shares = redistribute(result, 0)
+    assert np.isnan(shares[:, 0, 30, 30]).all() and np.isnan(shares).sum() == 2
+    total = np.array([result.source_model(i, 0) for i in range(2)]).sum(axis=0)
+    lit = (total > 1e-5 * total.max(axis=(1, 2), keepdims=True)) & (weights > 0)
+    above = data - sky[:, None, None]
+    np.testing.assert_allclose(shares.sum(axis=0)[lit], above[lit], rtol=1e-12)
+    assert not np.nan_to_num(shares[:, ~lit]).any() and (~lit).sum() > 1000
+    np.testing.assert_allclose(
+        shares[1, 1, 30, 40] / shares[0, 1, 30, 40],
+        result.source_model(1, 0)[1, 30, 40] / result.source_model(0, 0)[1, 30, 40],
+        rtol=1e-12,
+    )
+
+
+def test_rounding_below_zero_gets_no_share():
+    result = two_sources(observations=[observe(Grid.flat((60, 70), SCALE), ("g", "r"), data=1.0)])
+    result.rendered[0][2, :, 30, 28] = -1e-7
+    shares = redistribute(result, 0)
+    assert (shares >= 0).all() and shares[0, 0, 30, 28] == 1
