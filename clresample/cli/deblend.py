@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import os
+import threading
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -100,6 +102,8 @@ def run(arguments):
     if not arguments.quiet:
         for message in scene.notes:
             note(arguments, message)
+    if not arguments.no_figure:
+        threading.Thread(target=_import_drawing, daemon=True).start()
     result = _fit(arguments, scene, device)
     _write(arguments, result, scene.inputs, device, paths)
     _report(arguments, result, summary(result), device, time.perf_counter() - started)
@@ -199,6 +203,14 @@ def _deblend(arguments, what, observations, sources, settings, given):
             bar.set_postfix(loss=f"{float(losses[0]):.4g}", refresh=False)
 
         return deblend(observations, sources, settings=settings, progress=progress, **given)
+
+
+def _import_drawing():
+    """Import what draws the figure, 0.2 s of Python, while a fit waits for the device."""
+    with suppress(ImportError):  # raised again, and reported, when the figure is drawn
+        from matplotlib.backends import backend_agg  # noqa: F401
+
+        from ..files import plot_deblended  # noqa: F401
 
 
 def _write(arguments, result, inputs, device, paths):
