@@ -71,7 +71,8 @@ def read_scene(path) -> SceneFile:
     """
     path = Path(path)
     tables = parse(path)
-    inputs, notes, observations = {"scene": path}, [], []
+    inputs, observations = {"scene": path}, []
+    notes: list[str] = []
     for i, table in enumerate(tables["observation"]):
         where = f"{path}: observation {i + 1} ({table['name']})"
         try:
