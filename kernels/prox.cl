@@ -13,7 +13,9 @@
  * Boundary: nothing outside a box is read. Launch: n * WG work-items, groups of WG, one a source.
  *
  * The monotone sweep goes by levels l = 2 max(|dy|,|dx|) + min(|dy|,|dx|): every neighbour nearer
- * to the centre has a smaller level, so the pixels of one level are independent.
+ * to the centre has a smaller level, so the pixels of one level are independent. A neighbour that
+ * is not nearer has weight 0 and may be of the same level, which other work-items write: it must
+ * not be read at all. 0 times an infinity is NaN, and a bound that is NaN bounds nothing.
  */
 #include "common.h"
 #include "boxes.h"
@@ -157,19 +159,22 @@ static REAL monotone(ARGUMENTS)
                 const int long_stride = octant & 4 ? nx : 1, short_stride = octant & 4 ? 1 : nx;
                 const int in = octant & 1 ? long_stride : -long_stride;
                 const int out = octant & 2 ? -short_stride : short_stride;
+                /* weight 0: another neighbour in place of one that may be of this level */
+                const int diagonal = w_diagonal > 0 ? in - out : in;
+                const int wide = w_wide > 0 ? in + out : in;
                 const int at = y * nx + x_, side = octant & 4 ? x_ : y;
                 const int n_side = octant & 4 ? nx : ny, t = octant & 2 ? -1 : 1;
                 const bool has_wide = side + t >= 0 && side + t < n_side;
                 const bool has_diagonal = side - t >= 0 && side - t < n_side;
                 REAL most = w_in * x[at + in];
                 if (has_diagonal && has_wide) {
-                    most += w_diagonal * x[at + in - out] + w_wide * x[at + in + out];
+                    most += w_diagonal * x[at + diagonal] + w_wide * x[at + wide];
                     most = part * (most + w_side * x[b > 0 ? at - out : at + in]);
                 } else {
                     REAL norm = w_in + w_side;
                     most += w_side * x[b > 0 ? at - out : at + in];
-                    most += has_diagonal ? w_diagonal * x[at + in - out] : (REAL)0;
-                    most += has_wide ? w_wide * x[at + in + out] : (REAL)0;
+                    most += has_diagonal ? w_diagonal * x[at + diagonal] : (REAL)0;
+                    most += has_wide ? w_wide * x[at + wide] : (REAL)0;
                     norm += (has_diagonal ? w_diagonal : (REAL)0) + (has_wide ? w_wide : (REAL)0);
                     most *= keep / norm;
                 }

@@ -37,6 +37,27 @@ def test_monotone_is_the_sequential_sweep(device, boxes, weights, gradient, dtyp
         assert ref.monotone_violation(got, center, weights, gradient).max() <= eps(dtype, image)
 
 
+@pytest.mark.parametrize("group", [1, 64])
+@pytest.mark.parametrize("weights", KINDS)
+def test_pixels_of_one_level_do_not_see_each_other(device, weights, group, monkeypatch):
+    """Work-items of a group write a level's pixels at the same time: a NaN in any of them reaches
+    none of the others, though neighbours of weight 0 lie among them."""
+    tune(monkeypatch, sum_group=group)
+    shape, center = (9, 11), (4, 4)
+    box, sweep = Boxes([0], [[0, 0]], [shape], [center]), Monotone(weights=weights)
+    y, x = np.indices(shape) - np.array(center)[:, None, None]
+    levels = level(y, x)
+    image = np.random.default_rng(4).uniform(0.5, 1.5, shape).astype(np.float32)
+    (clean,) = apply(device, sweep, box, [image])
+    assert (clean < image).sum() > 40
+    for planted in zip(*np.nonzero(levels), strict=True):
+        broken = image.copy()
+        broken[planted] = np.nan
+        (found,) = apply(device, sweep, box, [broken])
+        same = (levels <= levels[planted]) & ~np.isnan(broken)
+        np.testing.assert_array_equal(found[same], clean[same])
+
+
 def test_groups_of_a_gpu(device, boxes, monkeypatch):
     """64 work-items a source with barriers, whatever the device, answer as one work-item does."""
     images = morphologies(boxes, np.float32)
