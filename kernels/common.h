@@ -8,7 +8,7 @@
  * AT(type, p) is the value of that type at address p: AT(const VEC(4), p) reads p[0] .. p[3].
  * SUM8(p) adds p[0] .. p[7] in pairs: eight running sums vectorise, and round less than one.
  */
-#ifndef REAL
+#ifndef REAL         /* float or double */
 #define REAL float
 #endif
 #ifdef USE_DOUBLE

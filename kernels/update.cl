@@ -32,10 +32,10 @@
 #include "boxes.h"
 #include "group.h"
 
-#ifndef B1           /* decay of the first moment, and of the second */
+#ifndef B1           /* part of the first moment that an iteration keeps */
 #define B1 0.9
 #endif
-#ifndef B2
+#ifndef B2           /* part of the second moment that an iteration keeps */
 #define B2 0.999
 #endif
 #ifndef EPSILON      /* far below a unit-normal variable's gradient, above float32's underflow */

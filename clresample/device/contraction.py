@@ -7,10 +7,11 @@ from typing import NamedTuple
 
 from .tuning import Tuning
 
-# Columns of device matrices are padded with zeros to a multiple of this, the widest vector used.
+# Columns of device matrices are padded with zeros to a multiple of this, the widest OpenCL vector.
 COLUMN_PAD = 16
-# Fewest terms summed at a stretch; the root of k balances the rounding of the stretches and of
-# their sum. At 16 the float32 operator is twice as accurate as without, for 6 % of its time.
+# Terms summed at a stretch, before the stretches are summed: this many, or sqrt(k) of k terms if
+# that is more, so that stretches and their sum round alike. One sum of all terms would take 6 %
+# less time and leave the float32 operator half as accurate.
 SUM_BLOCK = 16
 
 

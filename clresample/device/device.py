@@ -124,8 +124,8 @@ class Device:
         defines: macros; True defines the bare name, False and None leave it out
         DeviceError: the file does not build here (with the compiler's log), or no float64
         """
-        kernel, buffers = self._programs.kernel(file, name, dtype, defines)
-        return Launcher(self, kernel, buffers, self._lock, local_size)
+        kernel, is_buffer = self._programs.kernel(file, name, dtype, defines)
+        return Launcher(self, kernel, is_buffer, self._lock, local_size)
 
     def kernel(self, file, name, *, dtype=np.float32, **defines):
         """A fresh pyopencl.Kernel."""

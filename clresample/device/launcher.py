@@ -20,12 +20,15 @@ class Launcher:
     one number by itself takes 6 us. So nothing remembers what an earlier launch has set, and all
     launchers of one build share its pyopencl.Kernel, which takes 0.2 ms to make; `lock` keeps other
     threads away between setting and queueing.
+
+    is_buffer {name: bool}: the kernel's arguments in its order
+    local_size: work-items of a group along each axis of a launch; None leaves it to the driver
     """
 
-    def __init__(self, device, kernel, buffers, lock, local_size=None):
+    def __init__(self, device, kernel, is_buffer, lock, local_size=None):
         self.device, self.kernel, self.local_size = device, kernel, local_size
-        self._buffers, self._lock = buffers, lock
-        self._bound = dict.fromkeys(buffers, UNSET)  # in the kernel's order
+        self._is_buffer, self._lock = is_buffer, lock
+        self._bound = dict.fromkeys(is_buffer, UNSET)  # in the kernel's order
 
     def bind(self, **arguments):
         """Give arguments that stay; returns the launcher. ValueError for an unknown name."""
@@ -43,16 +46,16 @@ class Launcher:
             try:
                 self.kernel.set_args(*values)
             except Exception as error:
-                unset = [n for n, v in zip(self._buffers, values, strict=True) if v is UNSET]
+                unset = [n for n, v in zip(self._bound, values, strict=True) if v is UNSET]
                 if not unset:
-                    error.add_note(f"arguments of {self!r}: {', '.join(self._buffers)}")
+                    error.add_note(f"arguments of {self!r}: {', '.join(self._bound)}")
                     raise
                 raise ValueError(f"{self!r} was not given {', '.join(unset)}") from error
             self.device.launch(self.kernel, global_size, self.local_size)
 
     def _merged(self, arguments):
         for name, value in arguments.items():
-            if self._buffers.get(name) and hasattr(value, "base_data"):
+            if self._is_buffer.get(name) and hasattr(value, "base_data"):
                 if value.offset:
                     raise ValueError(
                         f"{name} of {self!r} starts at byte {value.offset} of its buffer: kernels "

@@ -95,8 +95,8 @@ class Programs:
                 self._programs[build] = self._built(file, dtype, defines)
             kernel, types = cl.Kernel(self._programs[build], name), SCALARS | {"REAL": dtype.type}
             kernel.set_scalar_arg_dtypes([types.get(type_) for _, type_ in arguments])
-            buffers = {argument: type_ is None for argument, type_ in arguments}
-            self._kernels[build, name] = kernel, buffers
+            is_buffer = {argument: type_ is None for argument, type_ in arguments}
+            self._kernels[build, name] = kernel, is_buffer
         return self._kernels[build, name]
 
     def _built(self, file, dtype, defines):

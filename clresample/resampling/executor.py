@@ -65,12 +65,13 @@ class Executor:
     def reserve(self, n_images):
         """Make room for the intermediates of `n_images` images at a time."""
         if self.n_reserved != n_images:
+            self.n_reserved = 0  # until all is bound: an interruption leaves nothing half done
             self.scratch = {
                 name: self.device.empty((n_images, rows, ld), self.dtype)
                 for name, (rows, ld) in self.scratch_shapes().items()
             }
-            self.n_reserved = n_images
             self.bind()
+            self.n_reserved = n_images
 
     def set_transfer(self, transfer):
         """Upload the transfer functions: a pair D(+,+), D(+,-) (C, Hy, Hx) for each plan."""
@@ -82,7 +83,7 @@ class Executor:
         self.device.upload(host, self.transfer)
 
     def bind(self):
-        """The products of both ends, on the scratch that is there."""
+        """Bind the products of the model's end to the scratch that is there."""
         half, z = self.matrix("half", self.n_y), self.matrix("frequencies")
         model = ImageBatch.shaped(*self.plans[0].mapping.shape_in).matrix(self.axes)
         # `spread`: an image is transformed once for all bands

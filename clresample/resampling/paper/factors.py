@@ -69,8 +69,8 @@ class Factors:
 
         shift (2,) [model px]: moves every observed pixel
         """
-        self.waves, self.kernels = self.make_kernels(d, shift)
         self.bound = {}
+        self.waves, self.kernels = self.make_kernels(d, shift)
 
     def reserve(self, n):
         """Make room for the intermediates of `n` images at a time."""
@@ -86,11 +86,11 @@ class Factors:
         self.scratch, self.bound = {}, {}  # frees the old ones first
         for name, shape in shapes.items():
             self.scratch[name] = self.device.zeros(shape, self.dtype)
-        self.scratch["n"] = n
         self.bind()
+        self.scratch["n"] = n
 
     def bind(self):
-        """The products between the model and its row sums, on the scratch that is there."""
+        """Bind the products between the model and its row sums to the scratch that is there."""
         image = ImageBatch.shaped(*self.mapping.shape_in, every=len(self.kernels))
         image, half, k = image.matrix(self.axes), self.matrix("half"), 2 * self.h_x
         self.to_half = self.strided.bind(self.n_y, k, self.n_x, image, self.in_x, half)
