@@ -54,10 +54,10 @@ def measure(shape, batch, dtype, seconds):
         for array in (a_device, b_device, c_device)
     )
     b, c = np.ascontiguousarray(b[:, :, :n]), np.empty((batch, m, n), dtype)
-    contract = Contraction(device, dtype)
+    product = Contraction(device, dtype).bind(m, n, k, left, right, result)
 
     def ours():
-        contract(m, n, k, batch, left, right, result)
+        product(batch)
         device.finish()
 
     ms = interleaved_ms({"ours": ours, "numpy": lambda: np.matmul(a, b, out=c)}, seconds=seconds)

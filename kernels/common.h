@@ -5,8 +5,10 @@
  * some drivers' build caches do not notice a changed include.
  *
  * VEC(n) is the vector type of n REALs: VEC(4) is float4 or double4.
+ * AT(type, p) is the value of that type at address p: AT(const VEC(4), p) reads p[0] .. p[3].
+ * SUM8(p) adds p[0] .. p[7] in pairs: eight running sums vectorise, and round less than one.
  */
-#ifndef REAL
+#ifndef REAL         /* float or double */
 #define REAL float
 #endif
 #ifdef USE_DOUBLE
@@ -15,3 +17,7 @@
 #define VEC_PASTE(type, n) type##n
 #define VEC_EXPAND(type, n) VEC_PASTE(type, n)
 #define VEC(n) VEC_EXPAND(REAL, n)
+#define AT(type, p) (*(__global type *)(p))
+#define SUM8(p) \
+    ((((p)[0] + (p)[1]) + ((p)[2] + (p)[3])) + (((p)[4] + (p)[5]) + ((p)[6] + (p)[7])))
+#define SQRT_HALF ((REAL)0.70710678118654752440)

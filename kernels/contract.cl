@@ -1,14 +1,30 @@
 /* Tiled matrix contraction, with the point-wise stages of the resampling operator folded in.
  *
- *   C[b] = A[b] . B[b]                      A (m, k), B (k, n), C (m, n), row-major
+ *   C[b] = A[b] . B[b],  A (m, k), B (k, n), C (m, n), row-major
  *
- * One work-item owns a tile of C in registers, MR rows x NV vectors of VW columns: B is read as
- * aligned vectors, A as scalars that broadcast.  No local memory, no barrier, no builtin.
+ *                                   NV VW
+ *                              +----+----+-------+
+ *                              |    |    |       |
+ *                            k |    | B  |       |     ld n_pad
+ *                              |    |    |       |
+ *               k              +----+----+-------+
+ *          +---------+         +----+----+-------+
+ *          |         |         |    |    |       |
+ *       MR +---------+      MR +----#====#       |     one work-item owns this tile of C:
+ *          |    A    |         |    #    #       |     MR rows, NV vectors of VW columns
+ *          +---------+         +----#====#       |
+ *        m |         |       m |                 |     ld n_pad, or any if RAGGED
+ *          +---------+         +-----------------+
+ *                                   n <= n_pad
  *
- * Layout: n_pad = n rounded up to VW; a tile that reaches beyond works on its first vector again.  B always has ld n_pad with zeros in the padding; so has C,
- *   unless RAGGED, when C is a caller's array: element (i, j) at i * ldc + j * step_c, any alignment.
- *   A is any array: element (i, l) at i * lda + l, or at i * lda + l * step_a if STRIDED, so that it
- *   may be read transposed.
+ * The tile is kept in registers: B is read as aligned vectors, A as scalars that broadcast.  No
+ * local memory, no barrier, no builtin.
+ *
+ * Layout: n_pad = n rounded up to a multiple of 16, so to whole vectors; a tile that reaches beyond
+ *   works on its first vector again.  B always has ld n_pad with zeros in the padding; so has C,
+ *   unless RAGGED, when C is a caller's array: element (i, j) at i * ld_c + j * step_c, any
+ *   alignment.  A is any array: element (i, l) at i * ld_a + l, or at i * ld_a + l * step_a if
+ *   STRIDED, so that it may be read transposed.
  * Batch: item b uses A + (b / div_a) * stride_a and likewise for B, so a table that all bands of a
  *   scene share has div = n_bands, one that every scene shares has stride 0.
  * Terms are summed in stretches of `block` and the stretches' sums in a second set of registers:
@@ -17,9 +33,9 @@
  *
  * Epilogue, at most one of (rows 2i, 2i+1 hold the cos and sin parts of row frequency i):
  *   MIX    columns 2j, 2j+1 hold cos and sin of column frequency j.  The quad (CC, CS, SC, SS) is a
- *          pair of complex amplitudes at (+nu_y, +nu_x) and (+nu_y, -nu_x); each is multiplied by its
- *          spectrum D and turned back into a quad.  E: spectra (n_bands, k_y, 4, n_pad / 2), planes
- *          Re D(+,+), Im D(+,+), Re D(+,-), Im D(+,-).  SIGN -1 conjugates D: the adjoint.
+ *          pair of complex amplitudes at (+nu_y, +nu_x) and (+nu_y, -nu_x); each is multiplied by
+ *          its transfer function D and turned back into a quad.  E: D (n_bands, k_y, 4, n_pad / 2),
+ *          planes Re D(+,+), Im D(+,+), Re D(+,-), Im D(+,-).  SIGN -1 conjugates D: the adjoint.
  *   TWIST  rotates each (cos, sin) row pair by the angle of E: (k_y, 2, n_pad), planes cos and sin.
  *          SIGN -1 turns the other way: the adjoint.
  *   E of item b starts at (b / n_bands) * stride_e + (b % n_bands) * band_e.
@@ -37,13 +53,25 @@
 #ifndef MR          /* rows a work-item owns; even, so that (cos, sin) pairs stay together */
 #define MR 6
 #endif
-#ifndef WGX
+#ifndef WGX         /* work-items of a group along the columns of C */
 #define WGX 1
 #endif
-#ifndef WGY
+#ifndef WGY         /* work-items of a group along the rows of C */
 #define WGY 1
 #endif
-#ifndef SIGN
+#ifndef STRIDED     /* 1: A's columns lie step_a apart; 0: they are adjacent, step_a is not read */
+#define STRIDED 0
+#endif
+#ifndef RAGGED      /* 1: C is a caller's array, stored element by element; 0: padded, by vectors */
+#define RAGGED 0
+#endif
+#ifndef MIX         /* 1: multiply by the transfer function */
+#define MIX 0
+#endif
+#ifndef TWIST       /* 1: rotate (cos, sin) row pairs */
+#define TWIST 0
+#endif
+#ifndef SIGN        /* of MIX's or TWIST's angles: 1 forward, -1 adjoint */
 #define SIGN 1
 #endif
 
@@ -66,21 +94,20 @@
 #define ODD(v) (v).s1
 #endif
 
-#ifdef STRIDED
+#if STRIDED
 #define STEP_A (size_t)step_a
 #else
 #define STEP_A 1
 #endif
 
-#define AT(type, p) (*(__global type *)(p))
 #define UNROLL(i, n) _Pragma("unroll") for (int i = 0; i < (n); ++i)
 
 __kernel __attribute__((reqd_work_group_size(WGX, WGY, 1)))
 void contract(const int m, const int n, const int n_pad, const int k, const int block,
-              __global const REAL *restrict A, const ulong offset_a, const int lda,
+              __global const REAL *restrict A, const ulong offset_a, const int ld_a,
               const int step_a, const int stride_a, const int div_a,
               __global const REAL *restrict B, const int stride_b, const int div_b,
-              __global REAL *restrict C, const ulong offset_c, const int ldc, const int step_c,
+              __global REAL *restrict C, const ulong offset_c, const int ld_c, const int step_c,
               const int stride_c,
               __global const REAL *restrict E, const int stride_e, const int band_e,
               const int n_bands)
@@ -97,7 +124,7 @@ void contract(const int m, const int n, const int n_pad, const int k, const int 
     int column[NV];
     WIDE acc[MR][NV];
     UNROLL(v, NV) column[v] = j0 + v * VW < n_pad ? j0 + v * VW : j0;
-    UNROLL(i, MR) row[i] = A + (size_t)(i0 + i < m ? i0 + i : m - 1) * lda;
+    UNROLL(i, MR) row[i] = A + (size_t)(i0 + i < m ? i0 + i : m - 1) * ld_a;
     UNROLL(i, MR) UNROLL(v, NV) acc[i][v] = (WIDE)(0);
     for (int l0 = 0; l0 < k; l0 += block) {
         const int l1 = l0 + block < k ? l0 + block : k;
@@ -110,7 +137,7 @@ void contract(const int m, const int n, const int n_pad, const int k, const int 
         UNROLL(i, MR) UNROLL(v, NV) acc[i][v] += part[i][v];
     }
 
-#if defined(MIX)
+#if MIX
     E += (size_t)(b / n_bands) * stride_e + (size_t)(b % n_bands) * band_e;
     UNROLL(h, MR / 2) UNROLL(v, NV) {
         const int i = 2 * h;
@@ -128,7 +155,7 @@ void contract(const int m, const int n, const int n_pad, const int k, const int 
         EVEN(acc[i + 1][v]) = -(gpi + gmi);
         ODD(acc[i + 1][v]) = gmr - gpr;
     }
-#elif defined(TWIST)
+#elif TWIST
     E += (size_t)(b / n_bands) * stride_e;
     UNROLL(h, MR / 2) UNROLL(v, NV) {
         const int i = 2 * h;
@@ -143,13 +170,13 @@ void contract(const int m, const int n, const int n_pad, const int k, const int 
 
     UNROLL(i, MR) UNROLL(v, NV) {
         if (i0 + i >= m) break;
-#ifdef RAGGED
-        __global REAL *c = C + (size_t)(i0 + i) * ldc + (size_t)column[v] * step_c;
+#if RAGGED
+        __global REAL *c = C + (size_t)(i0 + i) * ld_c + (size_t)column[v] * step_c;
         const REAL *lane = (const REAL *)&acc[i][v];
         for (int j = 0; j < VW; ++j)
             if (column[v] + j < n) c[(size_t)j * step_c] = lane[j];
 #else
-        AT(WIDE, C + (size_t)(i0 + i) * ldc + column[v]) = acc[i][v];
+        AT(WIDE, C + (size_t)(i0 + i) * ld_c + column[v]) = acc[i][v];
 #endif
     }
 }

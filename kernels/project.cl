@@ -6,36 +6,42 @@
  *   new <- max(0, v + tau B z)                one ascent; tau_i = 1 / (|B| |B|^T 1)_i
  *   v   <- new + beta (new - l),  l <- new    momentum, dropped when (B z).(new - l) < 0
  *
- * until |new - l| < tolerance |y| or n_iterations; then x <- max(0, y - B^T l). l stays for next time.
+ * until |new - l| < tolerance |y| or n_iterations; then x <- max(0, y - B^T l). l stays for the
+ * next launch.
  *
- * Layout: a source of ny x nx pixels has a plane of (ny+2) x P elements, P = nx+2, its pixels inside a
- * rim of zeros, filled up to a multiple of 16; plane s begins at 16 pads[s]. So neighbour d of pixel i
- * is i + WAY(d), in the order (-1,-1) (-1,0) (-1,1) (0,-1) (0,1) (1,-1) (1,0) (1,1).
- *   w (8 planes a source, at 8 * 16 pads[s]): weights of the neighbours, times 1 - g; 0 on the rim
- *   tau, y, l, v, z, g (1 plane a source); x, table, active as in prox.cl
+ * Layout: a source of ny x nx pixels has a plane of (ny+2) x P elements, P = nx+2, its pixels
+ * inside a rim of zeros, filled up to a multiple of ALIGN; plane s begins at ALIGN pads[s].
+ *
+ *              P = nx + 2
+ *      +---+-----------+---+
+ *      | 0 | 0  0  0  0| 0 |         neighbour d of pixel i is i + WAY(d), d in the order
+ *      +---+-----------+---+
+ *      | 0 |  pixels   | 0 | ny         0 1 2
+ *      | 0 |           | 0 |            3 i 4
+ *      +---+-----------+---+            5 6 7
+ *      | 0 | 0  0  0  0| 0 |
+ *      +---+-----------+---+
+ *
+ *   w (8 planes a source, at 8 ALIGN pads[s]): weights of the neighbours, times 1 - g; 0 on the rim
+ *   tau, y, l, v, z, g, move (1 plane a source); x, table, active as in prox.cl
  *   values (2, S): the kind of weights (1 angle, 2 flat, 3 nearest, 0 leaves the source alone), g
  *
  * Launch: n * WG work-items in groups of WG, one a source. WG 1 has no barrier and suits CPUs.
  */
 #include "common.h"
-#ifndef WG
-#define WG 1
+#include "boxes.h"
+#include "group.h"
+
+#ifndef CHECK_EVERY /* iterations between looks at the sums, which cost about half an iteration */
+#define CHECK_EVERY 4
 #endif
-#ifndef CHECK_EVERY
-#define CHECK_EVERY 4 /* iterations between looks at the sums: they cost about half an iteration */
-#endif
-#if WG > 1
-#define SYNC() barrier(CLK_GLOBAL_MEM_FENCE | CLK_LOCAL_MEM_FENCE)
-#else
-#define SYNC()
-#endif
-#define SQRT_HALF ((REAL)0.70710678118654752440)
+
 #define HEAD \
     const int s = active[get_group_id(0)], lid = get_local_id(0); \
-    __global const int *box = table + 8 * (size_t)s; \
-    const int ny = box[3], nx = box[4], P = nx + 2, begin = P + 1, end = (ny + 1) * P - 1; \
-    const int n = ((ny + 2) * P + 15) / 16 * 16; \
-    const size_t base = (size_t)pads[s] * 16;
+    __global const int *box = BOX(s); \
+    const int ny = box[NY], nx = box[NX], P = nx + 2, begin = P + 1, end = (ny + 1) * P - 1; \
+    const int n = ((ny + 2) * P + ALIGN - 1) / ALIGN * ALIGN; \
+    const size_t base = (size_t)pads[s] * ALIGN;
 /* All pixels, and the rim at the ends of rows, where w, tau and y are 0. */
 #define FOR_INSIDE(i) for (int i = begin + lid; i < end; i += WG)
 #define WAY(d) (((d) + ((d) > 3)) / 3 * P - P + ((d) + ((d) > 3)) % 3 - 1)
@@ -48,7 +54,7 @@ void project_weights(__global REAL *restrict w, __global REAL *restrict tau,
                      __global const REAL *values, const int n_sources)
 {
     HEAD
-    const int cy = box[5], cx = box[6], kind = (int)values[s];
+    const int cy = box[CY], cx = box[CX], kind = (int)values[s];
     const REAL keep = 1 - values[n_sources + s];
     w += 8 * base;
     tau += base;
@@ -89,21 +95,30 @@ void project_weights(__global REAL *restrict w, __global REAL *restrict tau,
     }
 }
 
-/* z <- max(lower, y - B^T v) */
-static void image(__global REAL *restrict z, __global const REAL *restrict y,
-                  __global const REAL *restrict v, __global const REAL *restrict w, const int n,
-                  const int P, const int begin, const int end, const int positive, const int lid)
+/* Before a loop of one work-item over neighbouring pixels: vectorised wherever its buffers do not
+ * overlap, although compilers would have to look at more pairs of pointers than they do unasked.
+ * The projection is 2 to 3 times quicker for it on CPUs. */
+#if WG > 1
+#define VECTORISE
+#else
+#define VECTORISE _Pragma("clang loop vectorize(enable)")
+#endif
+
+/* z <- max(0, y - B^T v), or y - B^T v unless `positive` */
+static void image(__global REAL *z, __global const REAL *y, __global const REAL *v,
+                  __global const REAL *w, const int n, const int P, const int begin, const int end,
+                  const int positive, const int lid)
 {
-    FOR_INSIDE(i) {
+    VECTORISE FOR_INSIDE(i) {
 #define CHILD(d) +w[d * n + i - WAY(d)] * v[i - WAY(d)]
         const REAL value = y[i] - v[i] ALL_WAYS(CHILD);
         z[i] = positive && value < 0 ? (REAL)0 : value;
     }
 }
 
-/* The sums over a group of a[i] b[i]. */
-static REAL dot_(__global const REAL *restrict a, __global const REAL *restrict b, const int n,
-                 const int lid, __local REAL *share)
+/* The sum over a group of a[i] b[i]. */
+static REAL inner(__global const REAL *a, __global const REAL *b, const int n, const int lid,
+                  __local REAL *share)
 {
     REAL sum[4] = {0, 0, 0, 0};
     for (int i = 4 * lid; i < n; i += 4 * WG) {
@@ -112,29 +127,21 @@ static REAL dot_(__global const REAL *restrict a, __global const REAL *restrict 
         sum[2] += a[i + 2] * b[i + 2];
         sum[3] += a[i + 3] * b[i + 3];
     }
-    REAL total = (sum[0] + sum[1]) + (sum[2] + sum[3]);
-#if WG > 1
-    SYNC();
-    share[lid] = total;
-    SYNC();
-    total = 0;
-    for (int k = 0; k < WG; ++k) total += share[k];
-#endif
-    return total;
+    return group_sum((sum[0] + sum[1]) + (sum[2] + sum[3]), lid, share);
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
 void project(__global REAL *restrict x, __global const int *table, __global const int *pads,
              __global const int *active, __global const REAL *restrict w,
-             __global const REAL *restrict tau, __global REAL *restrict y, __global REAL *restrict l,
-             __global REAL *restrict v, __global REAL *restrict z, __global REAL *restrict g,
-             __global REAL *restrict move, __global const REAL *values, const int positive,
-             const int n_iterations, const REAL tolerance)
+             __global const REAL *restrict tau, __global REAL *restrict y,
+             __global REAL *restrict l, __global REAL *restrict v, __global REAL *restrict z,
+             __global REAL *restrict g, __global REAL *restrict move, __global const REAL *values,
+             const int positive, const int n_iterations, const REAL tolerance)
 {
     __local REAL share[WG];
     HEAD
     if (values[s] == 0) return;
-    x += (size_t)box[7] * 16;
+    x += BEGIN(box);
     w += 8 * base;
     tau += base;
     y += base;
@@ -146,7 +153,7 @@ void project(__global REAL *restrict x, __global const int *table, __global cons
     for (int i = lid; i < ny * nx; i += WG) y[(i / nx + 1) * P + 1 + i % nx] = x[i];
     FOR_INSIDE(i) v[i] = l[i];
     SYNC();
-    const REAL small = tolerance * tolerance * dot_(y, y, n, lid, share);
+    const REAL small = tolerance * tolerance * inner(y, y, n, lid, share);
     REAL momentum = 1;
     for (int k = 1; k <= n_iterations; ++k) {
         const REAL next = (1 + sqrt(1 + 4 * momentum * momentum)) / 2;
@@ -166,8 +173,8 @@ void project(__global REAL *restrict x, __global const int *table, __global cons
         }
         SYNC();
         if (k % CHECK_EVERY == 0) {
-            if (dot_(g, move, n, lid, share) < 0) momentum = 1;
-            if (dot_(move, move, n, lid, share) <= small) break;
+            if (inner(g, move, n, lid, share) < 0) momentum = 1;
+            if (inner(move, move, n, lid, share) <= small) break;
         }
     }
     image(z, y, l, w, n, P, begin, end, positive, lid);

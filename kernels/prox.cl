@@ -4,34 +4,29 @@
  *   chain_factor  the same, and factor[s] = product of the scales that the normalisations took out,
  *                 times what was there unless this is the first launch
  *
- * STEP0 .. STEP7 name functions of this file (-D STEP0=positivity ...); the last ones may be missing.
- *   x       flat buffer: source s owns ny*nx elements, row by row, from 16 * table[s][7]
- *   table   (S, 8) int: scene, y0, x0, ny, nx, cy, cx, offset / 16
+ * STEP0 .. STEP7 name functions of this file (-D STEP0=positivity ...); the last may be missing.
+ *   x, table: the morphologies and their boxes, see boxes.h
  *   active  (n) int: sources to treat; the others cost nothing
  *   values  (N_STEPS, 2, S) REAL: two parameters per step and source, named at each function
  *   step    of the gradient descent, multiplies penalties
  *
  * Boundary: nothing outside a box is read. Launch: n * WG work-items, groups of WG, one a source.
- * WG 1 has no barrier at all and suits CPUs; a GPU takes 64.
  *
- * The monotone sweep goes by levels l = 2 max(|dy|,|dx|) + min(|dy|,|dx|): every neighbour nearer to
- * the centre has a smaller level, so the pixels of one level are independent.
+ * The monotone sweep goes by levels l = 2 max(|dy|,|dx|) + min(|dy|,|dx|): every neighbour nearer
+ * to the centre has a smaller level, so the pixels of one level are independent. A neighbour that
+ * is not nearer has weight 0 and may be of the same level, which other work-items write: it must
+ * not be read at all. 0 times an infinity is NaN, and a bound that is NaN bounds nothing.
  */
 #include "common.h"
-#ifndef WG
-#define WG 1
+#include "boxes.h"
+#include "group.h"
+
+#ifndef OCTANTS     /* octants of a pixel for one work-item, which share the weights: 1, 2, 4, 8 */
+#define OCTANTS (WG > 1 ? 1 : 8)
 #endif
-#if WG > 1
-#define SYNC() barrier(CLK_GLOBAL_MEM_FENCE | CLK_LOCAL_MEM_FENCE)
-#else
-#define SYNC()
-#endif
-#ifndef OCTANTS
-#define OCTANTS (WG > 1 ? 1 : 8) /* octants of a pixel for one work-item: they share the weights */
-#endif
-#define SQRT_HALF ((REAL)0.70710678118654752440)
+
 #define ARGUMENTS \
-    __global REAL *restrict x, const int ny, const int nx, const int cy, const int cx, \
+    __global REAL *x, const int ny, const int nx, const int cy, const int cx, \
     const REAL p, const REAL q, const REAL step, const int lid, __local REAL *share
 #define FOR_PIXELS(i) for (int i = lid; i < ny * nx; i += WG)
 
@@ -80,8 +75,8 @@ static REAL symmetry(ARGUMENTS)
     return 1;
 }
 
-/* Divide by the total of the WG partial results in share, if positive. Returns the divisor. */
-static REAL divide(__global REAL *restrict x, const int n, const REAL total, const int lid)
+/* Divide by `total`, if positive. Returns the divisor. */
+static REAL divide(__global REAL *x, const int n, const REAL total, const int lid)
 {
     if (!(total > 0)) return 1;
     for (int i = lid; i < n; i += WG) x[i] = x[i] / total;
@@ -100,12 +95,7 @@ static REAL max_norm(ARGUMENTS)
         }
     REAL best = most[0];
     for (int k = 1; k < 4; ++k) best = most[k] > best ? most[k] : best;
-#if WG > 1
-    share[lid] = best;
-    SYNC();
-    for (int k = 0; k < WG; ++k) best = share[k] > best ? share[k] : best;
-    SYNC();
-#endif
+    best = group_max(best, lid, share);
     return divide(x, n, p != 0 ? best : (REAL)0, lid);
 }
 
@@ -120,14 +110,7 @@ static REAL sum_norm(ARGUMENTS)
         sum[2] += i + 2 < n ? x[i + 2] : (REAL)0;
         sum[3] += i + 3 < n ? x[i + 3] : (REAL)0;
     }
-    REAL total = (sum[0] + sum[1]) + (sum[2] + sum[3]);
-#if WG > 1
-    share[lid] = total;
-    SYNC();
-    total = 0;
-    for (int k = 0; k < WG; ++k) total += share[k];
-    SYNC();
-#endif
+    const REAL total = group_sum((sum[0] + sum[1]) + (sum[2] + sum[3]), lid, share);
     return divide(x, n, p != 0 ? total : (REAL)0, lid);
 }
 
@@ -135,7 +118,7 @@ static REAL sum_norm(ARGUMENTS)
  * p: 0 leaves the source alone, 1 angle, 2 flat, 3 nearest. q: the minimal gradient g.
  *
  * A pixel is a >= b >= 0 steps from the centre along its long and short axis, in one of 8 octants
- * (bit 1: long axis negative, 2: short axis negative, 4: the long axis is y). Its nearer neighbours:
+ * (bit 1: long axis negative, 2: short axis negative, 4: the long axis is y). Those nearer:
  *   (a-1, b) always;  (a-1, b-1) if b > 0 or a > 1;  (a, b-1) if b > 0;  (a-1, b+1) if a > b + 1.
  * Only (a-1, b+1), and (a-1, b-1) at b = 0, can leave the box: by the short axis.
  */
@@ -176,19 +159,22 @@ static REAL monotone(ARGUMENTS)
                 const int long_stride = octant & 4 ? nx : 1, short_stride = octant & 4 ? 1 : nx;
                 const int in = octant & 1 ? long_stride : -long_stride;
                 const int out = octant & 2 ? -short_stride : short_stride;
+                /* weight 0: another neighbour in place of one that may be of this level */
+                const int diagonal = w_diagonal > 0 ? in - out : in;
+                const int wide = w_wide > 0 ? in + out : in;
                 const int at = y * nx + x_, side = octant & 4 ? x_ : y;
                 const int n_side = octant & 4 ? nx : ny, t = octant & 2 ? -1 : 1;
                 const bool has_wide = side + t >= 0 && side + t < n_side;
                 const bool has_diagonal = side - t >= 0 && side - t < n_side;
                 REAL most = w_in * x[at + in];
                 if (has_diagonal && has_wide) {
-                    most += w_diagonal * x[at + in - out] + w_wide * x[at + in + out];
+                    most += w_diagonal * x[at + diagonal] + w_wide * x[at + wide];
                     most = part * (most + w_side * x[b > 0 ? at - out : at + in]);
                 } else {
                     REAL norm = w_in + w_side;
                     most += w_side * x[b > 0 ? at - out : at + in];
-                    most += has_diagonal ? w_diagonal * x[at + in - out] : (REAL)0;
-                    most += has_wide ? w_wide * x[at + in + out] : (REAL)0;
+                    most += has_diagonal ? w_diagonal * x[at + diagonal] : (REAL)0;
+                    most += has_wide ? w_wide * x[at + wide] : (REAL)0;
                     norm += (has_diagonal ? w_diagonal : (REAL)0) + (has_wide ? w_wide : (REAL)0);
                     most *= keep / norm;
                 }
@@ -206,7 +192,7 @@ static REAL monotone(ARGUMENTS)
                values[(2 * (k) + 1) * (size_t)n_sources + s], step, lid, share); \
     SYNC();
 
-static REAL run(__global REAL *restrict x, const int ny, const int nx, const int cy, const int cx,
+static REAL run(__global REAL *x, const int ny, const int nx, const int cy, const int cx,
                 __global const REAL *values, const int n_sources, const int s, const REAL step,
                 const int lid, __local REAL *share)
 {
@@ -241,15 +227,17 @@ static REAL run(__global REAL *restrict x, const int ny, const int nx, const int
 #define HEAD \
     __local REAL share[WG]; \
     const int s = active[get_group_id(0)], lid = get_local_id(0); \
-    __global const int *box = table + 8 * (size_t)s; \
-    x += (size_t)box[7] * 16;
+    __global const int *box = BOX(s); \
+    x += BEGIN(box);
+#define RUN_ALL \
+    run(x, box[NY], box[NX], box[CY], box[CX], values, n_sources, s, step, lid, share)
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
 void chain(__global REAL *restrict x, __global const int *table, __global const int *active,
            __global const REAL *values, const int n_sources, const REAL step)
 {
     HEAD
-    run(x, box[3], box[4], box[5], box[6], values, n_sources, s, step, lid, share);
+    RUN_ALL;
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
@@ -258,7 +246,6 @@ void chain_factor(__global REAL *restrict x, __global const int *table, __global
                   __global REAL *factor, const int first)
 {
     HEAD
-    const REAL scale =
-        run(x, box[3], box[4], box[5], box[6], values, n_sources, s, step, lid, share);
+    const REAL scale = RUN_ALL;
     if (lid == 0) factor[s] = first ? scale : factor[s] * scale;
 }

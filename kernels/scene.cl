@@ -1,8 +1,8 @@
 /* A batch of scenes: models from sources, residuals from models, gradients from residuals.
  *
  * Sources are sorted by scene; those of scene b are first[b] .. first[b + 1] - 1.
- *   table     (S, 8) int: scene, y0, x0, ny, nx, cy, cx, offset / 16; boxes lie inside the frame
- *   morph     flat buffer: source s owns ny * nx elements, row by row, from 16 * table[s][7]
+ *   morph, d_morph, table: morphologies, their gradients and their boxes, see boxes.h; boxes lie
+ *             inside the frame
  *   spectra   (S, C): all channels of all observations; an observation has n_bands from `channel`
  *   model     (B, n_bands, ny_frame, nx_frame), image, data, weights (B, n_bands, my, mx)
  *   sky       (B, C)
@@ -17,23 +17,16 @@
  * gather_spectra  dA[s, channel + c] = sum_yx S_s[y, x] G[b, c, y0 + y, x0 + x]
  *             launch: (WG, n_bands, S), groups of (WG, 1, 1)
  *
- * X is 1 where a work-item walks a whole row (ROWS: CPUs, whose compilers vectorise the loop), else the
- * width of the widest row.
+ * X is 1 where a work-item walks a whole row (ROWS of group.h), else the width of the widest row.
  */
 #include "common.h"
-#ifndef WG
-#define WG 1
-#endif
-#ifdef ROWS
-#define FOR_X(x, low, high) for (int x = (low); x < (high); ++x)
-#else
-#define FOR_X(x, low, high) \
-    for (int x = (low) + (int)get_global_id(0); x < (high); x += (int)get_global_size(0))
-#endif
-#define BOX(s) \
-    const int y0 = table[8 * (s) + 1], x0 = table[8 * (s) + 2]; \
-    const int ny = table[8 * (s) + 3], nx = table[8 * (s) + 4]; \
-    const size_t offset = (size_t)table[8 * (s) + 7] * 16;
+#include "boxes.h"
+#include "group.h"
+
+#define HEAD(s) \
+    __global const int *box = BOX(s); \
+    const int y0 = box[Y0], x0 = box[X0], ny = box[NY], nx = box[NX]; \
+    const size_t offset = BEGIN(box);
 
 __kernel void compose(__global const int *restrict first, __global const int *restrict table,
                       __global const REAL *restrict morph,
@@ -43,27 +36,27 @@ __kernel void compose(__global const int *restrict first, __global const int *re
 {
     const int y = (int)get_global_id(1), c = (int)get_global_id(2) % n_bands;
     const int b = (int)get_global_id(2) / n_bands;
-    __global REAL *restrict row = model + (((size_t)b * n_bands + c) * ny_frame + y) * nx_frame;
-    FOR_X(x, 0, nx_frame) row[x] = 0;
+    __global REAL *row = model + (((size_t)b * n_bands + c) * ny_frame + y) * nx_frame;
+    FOR_X(x, nx_frame) row[x] = 0;
     for (int s = first[b]; s < first[b + 1]; ++s) {
-        BOX(s)
+        HEAD(s)
         if (y < y0 || y >= y0 + ny) continue;
         const REAL a = spectra[(size_t)s * n_channels + channel + c];
-        __global const REAL *restrict m = morph + offset + (size_t)(y - y0) * nx;
-#ifdef ROWS
+        __global const REAL *m = morph + offset + (size_t)(y - y0) * nx;
+#if ROWS
         for (int x = 0; x < nx; ++x) row[x0 + x] += a * m[x];
 #else
-        for (int x = (int)get_global_id(0); x < nx_frame; x += (int)get_global_size(0))
+        FOR_X(x, nx_frame)
             if (x >= x0 && x < x0 + nx) row[x] += a * m[x - x0];
 #endif
     }
 }
 
 __kernel void residual(const int n_channels, const int channel, const int n_bands, const int my,
-                       const int mx, const int row0, const int n_rows, __global const REAL *restrict data,
-                       __global const REAL *restrict weights, __global const REAL *restrict sky,
-                       __global REAL *restrict image, __global REAL *restrict loss,
-                       __global REAL *restrict pull)
+                       const int mx, const int row0, const int n_rows,
+                       __global const REAL *restrict data, __global const REAL *restrict weights,
+                       __global const REAL *restrict sky, __global REAL *restrict image,
+                       __global REAL *restrict loss, __global REAL *restrict pull)
 {
     const int y = (int)get_global_id(0), c = (int)get_global_id(1), b = (int)get_global_id(2);
     const size_t i = (((size_t)b * n_bands + c) * my + y) * mx;
@@ -96,46 +89,41 @@ __kernel void gather_morph(__global const int *restrict active, __global const i
                            const int nx_frame, const int add, __global REAL *restrict d_morph)
 {
     const int s = active[get_global_id(2)], y = (int)get_global_id(1);
-    BOX(s)
+    HEAD(s)
     if (y >= ny) return;
-    const int b = table[8 * s];
-    __global REAL *restrict out = d_morph + offset + (size_t)y * nx;
-    if (!add) FOR_X(x, 0, nx) out[x] = 0;
+    const int b = box[SCENE];
+    __global REAL *out = d_morph + offset + (size_t)y * nx;
+    if (!add) FOR_X(x, nx) out[x] = 0;
     for (int c = 0; c < n_bands; ++c) {
         const REAL a = spectra[(size_t)s * n_channels + channel + c];
-        __global const REAL *restrict g =
+        __global const REAL *g =
             gradient + (((size_t)b * n_bands + c) * ny_frame + y0 + y) * nx_frame + x0;
-        FOR_X(x, 0, nx) out[x] += a * g[x];
+        FOR_X(x, nx) out[x] += a * g[x];
     }
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
 void gather_spectra(__global const int *restrict table, __global const REAL *restrict gradient,
-                    __global const REAL *restrict morph, const int n_channels, const int channel, const int n_bands,
-                    const int ny_frame, const int nx_frame, __global REAL *restrict d_spectra)
+                    __global const REAL *restrict morph, const int n_channels, const int channel,
+                    const int n_bands, const int ny_frame, const int nx_frame,
+                    __global REAL *restrict d_spectra)
 {
+    __local REAL share[WG];
     const int lid = (int)get_local_id(0), c = (int)get_global_id(1), s = (int)get_global_id(2);
-    BOX(s)
-    const int b = table[8 * s];
-    __global const REAL *restrict g =
+    HEAD(s)
+    const int b = box[SCENE];
+    __global const REAL *g =
         gradient + (((size_t)b * n_bands + c) * ny_frame + y0) * nx_frame + x0;
     REAL total = 0;
     for (int y = lid; y < ny; y += WG) {
-        __global const REAL *restrict m = morph + offset + (size_t)y * nx;
+        __global const REAL *m = morph + offset + (size_t)y * nx;
         REAL part[8] = {0, 0, 0, 0, 0, 0, 0, 0};
         int x = 0;
         for (; x + 8 <= nx; x += 8)
             for (int k = 0; k < 8; ++k) part[k] += m[x + k] * g[(size_t)y * nx_frame + x + k];
         for (; x < nx; ++x) part[0] += m[x] * g[(size_t)y * nx_frame + x];
-        total += ((part[0] + part[1]) + (part[2] + part[3]))
-               + ((part[4] + part[5]) + (part[6] + part[7]));
+        total += SUM8(part);
     }
-#if WG > 1
-    __local REAL share[WG];
-    share[lid] = total;
-    barrier(CLK_LOCAL_MEM_FENCE);
-    if (lid == 0)
-        for (int k = 1; k < WG; ++k) total += share[k];
-#endif
+    total = group_sum(total, lid, share);
     if (lid == 0) d_spectra[(size_t)s * n_channels + channel + c] = total;
 }

@@ -1,32 +1,52 @@
 /* Shifts by complex exponentials, and the two ends of the contraction that follows them.
  *
- *   shift_line    G[(y, k), n] = F(y, nu_k) w_x[k, n]                      F: spectra along x alone
- *   shift_plane   G[(l, k, +-), n] = F(nu_l, +-nu_k) w_y[l, n] w_x[k, n]^(+-1)      F: 2-D spectra
- *                 w[k, n] = exp(2 pi i nu_k X_n): displacement X of step n along one unrotated axis
+ *   shift_line    G[(y, k), n] = F(y, nu_k) w_x[k, n]           F: model transformed along x alone
+ *   shift_plane   G[(l, k, +-), n] = F(nu_l, +-nu_k) w_y[l, n] w_x[k, n]^(+-1)    F: along y and x
+ *                 w[k, n] = exp(2 pi i nu_k X_n): displacement X of step n along one model axis
  *   unshift_*     the adjoints: sums over n, from G back to F
  *
- *   Z   spectra F as real sums.  Line: row y, columns 2k, 2k+1 = the sums with cos and sin,
+ *   Z   frequencies F as real sums.  Line: row y, columns 2k, 2k+1 = the sums with cos and sin,
  *       F = C - iS.  Plane: rows 2l, 2l+1 too: (CC, CS; SC, SS), F(+,+) = CC - SS - i(CS + SC),
  *       F(+,-) = CC + SS + i(CS - SC).  Item b at b * stride_z; rows ld_z apart.
  *   w   (n_k, 2, n_cols): planes cos and sin, zero beyond the last step
- *   G   real and imaginary parts as rows of length ld: line row 2 (y h_x + k) + (re, im); plane row
- *       4 (l h_x + k) + (re+, im+, re-, im-).  Item b owns the columns from b * n_cols.
- *   Rows y or l run from `first` to first + n_units - 1, and G starts at the first.
+ *   G   real and imaginary parts as rows, each unit's below the unit's before; item b owns the
+ *       columns from b * n_cols:
+ *
+ *               0          n_cols       2 n_cols        ld
+ *               +------------+------------+-- ... ------+
+ *     unit 0    |   item 0   |   item 1   |             |    rows of a unit
+ *               |            |            |             |      line   2k: re, im; k < h_x
+ *               +------------+------------+-- ... ------+      plane  4k: re+, im+, re-, im-
+ *     unit 1    |            |            |             |    a unit is a model row y (line) or a
+ *               +------------+------------+-- ... ------+    row frequency l (plane)
+ *
+ *   Units run from `first` to first + n_units - 1, and G starts at the first.
  *   n_cols is a multiple of LANES, ld of 16.
  *   Launch: shift (n_cols / LANES, h_x, n_units * n_items), unshift (h_x, n_units * n_items).
  *
- *   collect  out[b, pixel] = sum over chunks of part[chunk, l, b * n_cols + i]; 0 where not covered
- *            launch (n_i, n_l, n_items); pixel = l * step_l + i * step_i
- *   spread   part[l, b * n_cols + i] = y[b, pixel] where covered, else 0, the adjoint of one chunk
+ *   collect  pixels[b, p] = sum over chunks of part[chunk, l, b * n_cols + i]; 0 where not covered
+ *            launch (n_i, n_l, n_items); p = l * step_l + i * step_i
+ *   spread   part[l, b * n_cols + i] = pixels[b, p] where covered, else 0, the adjoint of one chunk
  *            launch (ld, n_l); columns that are no pixel's become 0
+ *   pixels: image b from offset + b * stride on;  covered: of each pixel p, 1 or 0
  */
 #include "common.h"
 
+#ifndef LANES       /* columns of G that a work-item takes at a time: 4, 8 or 16 */
 #define LANES 8
+#endif
+
 #define WIDE VEC(LANES)
-#define AT(p) (*(__global WIDE *)(p))
-#define SEE(p) (*(__global const WIDE *)(p))
-#define SUM(v) ((((v).s0 + (v).s1) + ((v).s2 + (v).s3)) + (((v).s4 + (v).s5) + ((v).s6 + (v).s7)))
+#define READ(p) AT(const WIDE, p)
+#define WRITE(p) AT(WIDE, p)
+#define SUM4(v) (((v).s0 + (v).s1) + ((v).s2 + (v).s3))
+#if LANES == 4
+#define SUM(v) SUM4(v)
+#elif LANES == 8
+#define SUM(v) (SUM4((v).lo) + SUM4((v).hi))
+#else
+#define SUM(v) ((SUM4((v).lo.lo) + SUM4((v).lo.hi)) + (SUM4((v).hi.lo) + SUM4((v).hi.hi)))
+#endif
 
 __kernel void shift_line(const int h_x, const int n_units, const int first,
                          __global const REAL *restrict Z, const int stride_z, const int ld_z,
@@ -39,9 +59,9 @@ __kernel void shift_line(const int h_x, const int n_units, const int first,
     w_x += (size_t)2 * k * n_cols + j;
     G += (size_t)2 * (unit * h_x + k) * ld + b * n_cols + j;
     const REAL c = Z[0], s = Z[1];
-    const WIDE cx = SEE(w_x), sx = SEE(w_x + n_cols);
-    AT(G) = c * cx + s * sx;
-    AT(G + ld) = c * sx - s * cx;
+    const WIDE cx = READ(w_x), sx = READ(w_x + n_cols);
+    WRITE(G) = c * cx + s * sx;
+    WRITE(G + ld) = c * sx - s * cx;
 }
 
 __kernel void unshift_line(const int h_x, const int n_units, const int first,
@@ -56,8 +76,8 @@ __kernel void unshift_line(const int h_x, const int n_units, const int first,
     G += (size_t)2 * (unit * h_x + k) * ld + b * n_cols;
     WIDE c = (WIDE)(0), s = (WIDE)(0);
     for (int j = 0; j < n_cols; j += LANES) {
-        const WIDE cx = SEE(w_x + j), sx = SEE(w_x + n_cols + j);
-        const WIDE re = SEE(G + j), im = SEE(G + ld + j);
+        const WIDE cx = READ(w_x + j), sx = READ(w_x + n_cols + j);
+        const WIDE re = READ(G + j), im = READ(G + ld + j);
         c += re * cx + im * sx;
         s += re * sx - im * cx;
     }
@@ -78,12 +98,12 @@ __kernel void shift_plane(const int h_x, const int n_units, const int first,
     G += (size_t)4 * (unit * h_x + k) * ld + b * n_cols + j;
     const REAL pr = Z[0] - Z[ld_z + 1], pi = -(Z[1] + Z[ld_z]);       /* F(+,+) */
     const REAL mr = Z[0] + Z[ld_z + 1], mi = Z[1] - Z[ld_z];          /* F(+,-) */
-    const WIDE cy = SEE(w_y), sy = SEE(w_y + n_cols), cx = SEE(w_x), sx = SEE(w_x + n_cols);
+    const WIDE cy = READ(w_y), sy = READ(w_y + n_cols), cx = READ(w_x), sx = READ(w_x + n_cols);
     const WIDE cc = cy * cx, ss = sy * sx, sc = sy * cx, cs = cy * sx;
-    AT(G) = pr * (cc - ss) - pi * (sc + cs);
-    AT(G + ld) = pr * (sc + cs) + pi * (cc - ss);
-    AT(G + (size_t)2 * ld) = mr * (cc + ss) - mi * (sc - cs);
-    AT(G + (size_t)3 * ld) = mr * (sc - cs) + mi * (cc + ss);
+    WRITE(G) = pr * (cc - ss) - pi * (sc + cs);
+    WRITE(G + ld) = pr * (sc + cs) + pi * (cc - ss);
+    WRITE(G + (size_t)2 * ld) = mr * (cc + ss) - mi * (sc - cs);
+    WRITE(G + (size_t)3 * ld) = mr * (sc - cs) + mi * (cc + ss);
 }
 
 __kernel void unshift_plane(const int h_x, const int n_units, const int first,
@@ -99,11 +119,11 @@ __kernel void unshift_plane(const int h_x, const int n_units, const int first,
     G += (size_t)4 * (unit * h_x + k) * ld + b * n_cols;
     WIDE pr = (WIDE)(0), pi = (WIDE)(0), mr = (WIDE)(0), mi = (WIDE)(0);
     for (int j = 0; j < n_cols; j += LANES) {
-        const WIDE cy = SEE(w_y + j), sy = SEE(w_y + n_cols + j);
-        const WIDE cx = SEE(w_x + j), sx = SEE(w_x + n_cols + j);
+        const WIDE cy = READ(w_y + j), sy = READ(w_y + n_cols + j);
+        const WIDE cx = READ(w_x + j), sx = READ(w_x + n_cols + j);
         const WIDE cc = cy * cx, ss = sy * sx, sc = sy * cx, cs = cy * sx;
-        const WIDE re_p = SEE(G + j), im_p = SEE(G + ld + j);
-        const WIDE re_m = SEE(G + (size_t)2 * ld + j), im_m = SEE(G + (size_t)3 * ld + j);
+        const WIDE re_p = READ(G + j), im_p = READ(G + ld + j);
+        const WIDE re_m = READ(G + (size_t)2 * ld + j), im_m = READ(G + (size_t)3 * ld + j);
         pr += re_p * (cc - ss) + im_p * (sc + cs);
         pi += im_p * (cc - ss) - re_p * (sc + cs);
         mr += re_m * (cc + ss) + im_m * (sc - cs);
@@ -118,27 +138,27 @@ __kernel void unshift_plane(const int h_x, const int n_units, const int first,
 
 __kernel void collect(const int n_chunks, const int n_cols, const int ld,
                       __global const REAL *restrict part, __global const uchar *restrict covered,
-                      __global REAL *restrict out, const ulong offset, const int stride,
+                      __global REAL *restrict pixels, const ulong offset, const int stride,
                       const int step_l, const int step_i)
 {
     const int i = (int)get_global_id(0), l = (int)get_global_id(1), b = (int)get_global_id(2);
     const size_t step = (size_t)get_global_size(1) * ld;
-    const size_t pixel = (size_t)l * step_l + (size_t)i * step_i;
+    const size_t p = (size_t)l * step_l + (size_t)i * step_i;
     part += (size_t)l * ld + (size_t)b * n_cols + i;
     REAL sum = 0;
     for (int chunk = 0; chunk < n_chunks; ++chunk) sum += part[chunk * step];
-    out[offset + (size_t)b * stride + pixel] = covered[pixel] ? sum : (REAL)0;
+    pixels[offset + (size_t)b * stride + p] = covered[p] ? sum : (REAL)0;
 }
 
-__kernel void spread(const int n_items, const int n_i, const int n_cols,
+__kernel void spread(const int n_items, const int n_i, const int n_cols, const int ld,
                      __global REAL *restrict part, __global const uchar *restrict covered,
-                     __global const REAL *restrict y, const ulong offset, const int stride,
+                     __global const REAL *restrict pixels, const ulong offset, const int stride,
                      const int step_l, const int step_i)
 {
     const int j = (int)get_global_id(0), l = (int)get_global_id(1);
     const int b = j / n_cols, i = j % n_cols;
-    const size_t pixel = (size_t)l * step_l + (size_t)i * step_i;
+    const size_t p = (size_t)l * step_l + (size_t)i * step_i;
     REAL value = 0;
-    if (b < n_items && i < n_i && covered[pixel]) value = y[offset + (size_t)b * stride + pixel];
-    part[(size_t)l * get_global_size(0) + j] = value;
+    if (b < n_items && i < n_i && covered[p]) value = pixels[offset + (size_t)b * stride + p];
+    part[(size_t)l * ld + j] = value;
 }

@@ -2,10 +2,10 @@
  *
  *   table[p, i] = sinc(x_p - (first + i)),   sinc(x) = sin(pi x) / (pi x)
  *
- *   whole (n_positions) int, part (n_positions) REAL: x_p = whole_p + part_p, |part_p| <= 1/2, split by
- *       the host in float64.  sin(pi (x_p - i)) = (-1)^(whole_p - i) sin(pi part_p) needs no further
- *       reduction of the argument, so float32 tables are accurate at any distance.
- *   table: element (p, i) at p * step_p + i * step_i, so that positions may run along rows or columns
+ *   whole (n_positions) int, part (n_positions) REAL: x_p = whole_p + part_p, |part_p| <= 1/2,
+ *       split by the host in float64.  sin(pi (x_p - i)) = (-1)^(whole_p - i) sin(pi part_p)
+ *       needs no further reduction of the argument, so float32 tables are accurate at any distance.
+ *   table: element (p, i) at p * step_p + i * step_i: positions may run along rows or columns
  *
  * Boundary: writes these elements only; padding is the caller's.
  * Launch: (n_integers, n_positions).

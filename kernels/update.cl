@@ -3,9 +3,10 @@
  *   m <- B1 m + (1 - B1) g,  v <- B2 v + (1 - B2) g^2,  h <- max(h, v)
  *   x <- x - rate (m / (1 - B1^t)) / (sqrt(h / (1 - B2^t)) + e)
  *
- * A morphology with a prior is S = base + amp o (K z): base its expected profile, amp how far it may
- * depart, K the correlation kernel (separable taps (2 RADIUS + 1), symmetric), z unit normal.  The
- * variable is z, its gradient K (amp o dS) + z; constraints act on S.  Without a prior it is S itself.
+ * A morphology with a prior is S = base + amp o (K z): base its expected profile, amp how far it
+ * may depart, K the correlation kernel (separable taps (2 RADIUS + 1), symmetric), z, here `field`,
+ * unit normal.  The variable is z, its gradient K (amp o dS) + z; constraints act on S.  Without a
+ * prior the variable is S itself.
  *
  * blur        scratch = K_x v,  v = amp o dS where S > 0 (WEIGH: the gradient), or z
  * step_field  z <- AMSGrad with g = K_y scratch + z
@@ -22,40 +23,40 @@
  *             never of one whose loss is NaN; launch: (X, tallest box, S)
  * rescale     A[s, c] *= factor[s]: what a normalisation took out of a morphology; launch: (S * C)
  *
- * e = EPSILON + rate damping[s] for morphologies: no step is longer than gradient / damping, a bound
- * on the curvature; EPSILON for spectra, whose units are those of their errors.
+ * e = EPSILON + rate damping[s] for morphologies: no step is longer than gradient / damping, where
+ * damping is a bound on the curvature; EPSILON for spectra, whose units are those of their errors.
  * t1 = 1 / (1 - B1^t), t2 = 1 / (1 - B2^t) come from the host.
- * table, morph, first: as in scene.cl; all flat buffers share one layout.
+ * table, morph, first: as in scene.cl; all flat buffers share the layout of boxes.h.
  */
 #include "common.h"
-#ifndef B1
+#include "boxes.h"
+#include "group.h"
+
+#ifndef B1           /* part of the first moment that an iteration keeps */
 #define B1 0.9
 #endif
-#ifndef B2
+#ifndef B2           /* part of the second moment that an iteration keeps */
 #define B2 0.999
 #endif
-#ifndef EPSILON      /* far below a unit-normal variable's gradient, far above float32's underflow */
+#ifndef EPSILON      /* far below a unit-normal variable's gradient, above float32's underflow */
 #define EPSILON 1e-8
 #endif
 #ifndef SKY_RATE     /* of a Newton step: sources and sky exchange light, a full one overshoots */
 #define SKY_RATE 0.5
 #endif
-#ifndef RADIUS
+#ifndef RADIUS       /* taps of K on either side of its middle one */
 #define RADIUS 6
 #endif
-#ifdef ROWS
-#define FOR_X(x, n) for (int x = 0; x < (n); ++x)
-#else
-#define FOR_X(x, n) for (int x = (int)get_global_id(0); x < (n); x += (int)get_global_size(0))
-#endif
+
 #define ROW \
     const int s = active[get_global_id(2)], y = (int)get_global_id(1); \
-    const int ny = table[8 * s + 3], nx = table[8 * s + 4]; \
+    __global const int *box = BOX(s); \
+    const int ny = box[NY], nx = box[NX]; \
     if (y >= ny) return; \
-    const size_t box = (size_t)table[8 * s + 7] * 16, row = box + (size_t)y * nx;
+    const size_t begin = BEGIN(box), row = begin + (size_t)y * nx;
 
-/* sqrt(x), x >= 0, from plain arithmetic so that loops vectorise everywhere: a first guess of 1 / sqrt
- * from the exponent, then Newton's steps, each of which doubles the digits from 5 bits on. */
+/* sqrt(x), x >= 0, from plain arithmetic so that loops vectorise everywhere: a first guess of
+ * 1 / sqrt from the exponent, then Newton's steps, each of which doubles the digits from 5 bits. */
 static REAL root(const REAL x)
 {
 #ifdef USE_DOUBLE
@@ -70,9 +71,8 @@ static REAL root(const REAL x)
     return x * y;
 }
 
-static REAL amsgrad(const REAL g, __global REAL *restrict m, __global REAL *restrict v,
-                    __global REAL *restrict h, const size_t i, const REAL e, const REAL t1,
-                    const REAL t2)
+static REAL amsgrad(const REAL g, __global REAL *m, __global REAL *v, __global REAL *h,
+                    const size_t i, const REAL e, const REAL t1, const REAL t2)
 {
     const REAL mi = (REAL)B1 * m[i] + (REAL)(1 - B1) * g;
     const REAL vi = (REAL)B2 * v[i] + (REAL)(1 - B2) * g * g;
@@ -90,8 +90,8 @@ __kernel void blur(__global const int *restrict active, __global const int *rest
                    __global REAL *restrict scratch)
 {
     ROW
-    __global const REAL *restrict source = v + row;
-#ifdef ROWS
+    __global const REAL *source = v + row;
+#if ROWS
     if (weigh) {                       /* once a pixel rather than once a tap */
         for (int x = 0; x < nx; ++x)
             weighed[row + x] = morph[row + x] > 0 ? amp[row + x] * v[row + x] : (REAL)0;
@@ -119,16 +119,15 @@ __kernel void blur(__global const int *restrict active, __global const int *rest
 }
 
 /* K_y scratch of one row into `out`. */
-static void blur_y(__global const REAL *restrict taps, __global const REAL *restrict scratch,
-                   const size_t box, const int y, const int ny, const int nx,
-                   __global REAL *restrict out)
+static void blur_y(__global const REAL *taps, __global const REAL *scratch, const size_t begin,
+                   const int y, const int ny, const int nx, __global REAL *out)
 {
-    const size_t row = box + (size_t)y * nx;
+    const size_t row = begin + (size_t)y * nx;
     FOR_X(x, nx) out[row + x] = 0;
     for (int t = -RADIUS; t <= RADIUS; ++t) {
         if (y + t < 0 || y + t >= ny) continue;
         const REAL k = taps[t + RADIUS];
-        __global const REAL *restrict in = scratch + box + (size_t)(y + t) * nx;
+        __global const REAL *in = scratch + begin + (size_t)(y + t) * nx;
         FOR_X(x, nx) out[row + x] += k * in[x];
     }
 }
@@ -143,7 +142,7 @@ __kernel void step_field(__global const int *restrict active, __global const int
 {
     ROW
     const REAL e = (REAL)EPSILON + rate * damping[s];
-    blur_y(taps, scratch, box, y, ny, nx, gradient);
+    blur_y(taps, scratch, begin, y, ny, nx, gradient);
     FOR_X(x, nx) {
         const size_t i = row + x;
         field[i] -= rate * amsgrad(gradient[i] + field[i], m, v, h, i, e, t1, t2);
@@ -156,7 +155,7 @@ __kernel void form(__global const int *restrict active, __global const int *rest
                    __global REAL *restrict morph)
 {
     ROW
-    blur_y(taps, scratch, box, y, ny, nx, morph);
+    blur_y(taps, scratch, begin, y, ny, nx, morph);
     FOR_X(x, nx) morph[row + x] = base[row + x] + amp[row + x] * morph[row + x];
 }
 
@@ -206,13 +205,14 @@ __kernel void losses(__global const int *restrict first, __global const int *res
     for (int r = 0; r < n_rows; ++r) total += rows[(size_t)b * n_rows + r];
     if (prior)
         for (int s = first[b]; s < first[b + 1]; ++s) {
-            const size_t box = (size_t)table[8 * s + 7] * 16;
-            const int n = table[8 * s + 3] * table[8 * s + 4];
+            __global const int *box = BOX(s);
+            __global const REAL *z = field + BEGIN(box);
+            const int n = box[NY] * box[NX];
             REAL part[8] = {0, 0, 0, 0, 0, 0, 0, 0};
             int i = 0;
             for (; i + 8 <= n; i += 8)
-                for (int k = 0; k < 8; ++k) part[k] += field[box + i + k] * field[box + i + k];
-            for (; i < n; ++i) part[0] += field[box + i] * field[box + i];
+                for (int k = 0; k < 8; ++k) part[k] += z[i + k] * z[i + k];
+            for (; i < n; ++i) part[0] += z[i] * z[i];
             for (int k = 0; k < 8; ++k) total += (REAL)0.5 * part[k];
         }
     out[(size_t)i_loss * get_global_size(0) + b] = total;
@@ -228,7 +228,7 @@ __kernel void keep(__global const int *restrict active, __global const int *rest
                    __global REAL *restrict kept_spectra, __global REAL *restrict kept_sky)
 {
     ROW
-    const int b = table[8 * s];
+    const int b = box[SCENE];
     if (!(loss[b] == best[b])) return;
     FOR_X(x, nx) kept_field[row + x] = field[row + x];
     FOR_X(x, nx) kept_morph[row + x] = morph[row + x];

@@ -1,17 +1,18 @@
 /* Stages of the operator for grids that are rotated, sheared or distorted against each other.
  *
- * gather   out[b, l, p] = sum_t weight[l, t, p] * in[b, l, start[l, p] + t]
- *          One line at a time, both ways: from the columns of pass 1 to the observed pixels of a line
- *          (forward), and back (adjoint, with the transposed tables).
- *   in, out: element (b, l, p) at offset + b * stride + l * ld + p * step, so that lines may be rows
- *            or columns of an observed image.
+ * gather   target[b, l, p] = sum_t weight[l, t, p] * source[b, l, start[l, p] + t]
+ *          One line at a time, both ways: from the columns of pass 1 to the observed pixels of a
+ *          line (forward), and back (adjoint, with the transposed tables).
+ *   source, target: element (b, l, p) at offset + b * stride + l * ld + p * step, so that lines
+ *            may be rows or columns of an observed image.
  *   start (n_tables, n_lines, n_out), weight (n_tables, n_lines, N_TAPS, n_out)
  *   Taps of weight 0 stand for "outside" and may read any element of the line.
  *   Launch: (n_out rounded up to the local size, n_lines, batch).
  *
  * rowdot   y[b, p] = sum_x T[b, p, x] * E[p, x]          launch: (n_positions rounded up, batch)
  * rowscale T[b, p, x] = y[b, p] * E[p, x]                launch: (n_pad, n_positions, batch)
- *          The two ends of the any-position path: each observed pixel p has its own table row E[p].
+ *          The two ends of the executor for any positions: each observed pixel p has a table row
+ *          E[p] of its own.
  *   E (n_tables, n_positions, n_pad), T (batch, n_positions, n_pad): zero in the padding
  *
  * Item b uses table b / n_bands, or table 0 where there is only one.
@@ -23,22 +24,24 @@
 #endif
 
 __kernel void gather(const int n_out, const int n_lines, const int n_bands, const int n_tables,
-                     __global const REAL *restrict in, const ulong in_offset, const int in_stride,
-                     const int in_ld, const int in_step,
-                     __global REAL *restrict out, const ulong out_offset, const int out_stride,
-                     const int out_ld, const int out_step,
+                     __global const REAL *restrict source, const ulong source_offset,
+                     const int source_stride, const int source_ld, const int source_step,
+                     __global REAL *restrict target, const ulong target_offset,
+                     const int target_stride, const int target_ld, const int target_step,
                      __global const int *restrict start, __global const REAL *restrict weight)
 {
     const int p = (int)get_global_id(0), l = (int)get_global_id(1), b = (int)get_global_id(2);
     if (p >= n_out) return;
     const size_t i_line = (size_t)(n_tables > 1 ? b / n_bands : 0) * n_lines + l;
     weight += i_line * N_TAPS * n_out + p;
-    in += in_offset + (size_t)b * in_stride + (size_t)l * in_ld
-        + (size_t)start[i_line * n_out + p] * in_step;
+    source += source_offset + (size_t)b * source_stride + (size_t)l * source_ld
+            + (size_t)start[i_line * n_out + p] * source_step;
     REAL sum = 0;
 #pragma unroll
-    for (int t = 0; t < N_TAPS; ++t) sum += weight[(size_t)t * n_out] * in[(size_t)t * in_step];
-    out[out_offset + (size_t)b * out_stride + (size_t)l * out_ld + (size_t)p * out_step] = sum;
+    for (int t = 0; t < N_TAPS; ++t)
+        sum += weight[(size_t)t * n_out] * source[(size_t)t * source_step];
+    target += target_offset + (size_t)b * target_stride + (size_t)l * target_ld;
+    target[(size_t)p * target_step] = sum;
 }
 
 __kernel void rowdot(const int n_positions, const int n_pad, const int n_bands, const int n_tables,
@@ -53,12 +56,11 @@ __kernel void rowdot(const int n_positions, const int n_pad, const int n_bands, 
     REAL part[8] = {0, 0, 0, 0, 0, 0, 0, 0};       /* independent sums, so that they vectorise */
     for (int x = 0; x < n_pad; x += 8)
         for (int i = 0; i < 8; ++i) part[i] += T[x + i] * E[x + i];
-    y[y_offset + (size_t)b * n_positions + p] = ((part[0] + part[1]) + (part[2] + part[3]))
-                                              + ((part[4] + part[5]) + (part[6] + part[7]));
+    y[y_offset + (size_t)b * n_positions + p] = SUM8(part);
 }
 
-__kernel void rowscale(const int n_positions, const int n_pad, const int n_bands, const int n_tables,
-                       __global const REAL *restrict y, const ulong y_offset,
+__kernel void rowscale(const int n_positions, const int n_pad, const int n_bands,
+                       const int n_tables, __global const REAL *restrict y, const ulong y_offset,
                        __global REAL *restrict T, __global const REAL *restrict E)
 {
     const int x = (int)get_global_id(0), p = (int)get_global_id(1), b = (int)get_global_id(2);

@@ -1,16 +1,17 @@
-"""Batched matrix products on the device: the contraction that every path is made of."""
+"""Batched matrix products on the device: the contraction that every executor is made of."""
 
 from __future__ import annotations
 
 import math
 from typing import NamedTuple
 
-import numpy as np
+from .tuning import Tuning
 
-# Columns of device matrices are padded with zeros to a multiple of this, the widest vector used.
+# Columns of device matrices are padded with zeros to a multiple of this, the widest OpenCL vector.
 COLUMN_PAD = 16
-# Fewest terms summed at a stretch; the root of k balances the rounding of the stretches and of
-# their sum. At 16 the float32 operator is twice as accurate as without, for 6 % of its time.
+# Terms summed at a stretch, before the stretches are summed: this many, or sqrt(k) of k terms if
+# that is more, so that stretches and their sum round alike. One sum of all terms would take 6 %
+# less time and leave the float32 operator half as accurate.
 SUM_BLOCK = 16
 
 
@@ -22,7 +23,8 @@ def padded(n: int) -> int:
 class Matrix(NamedTuple):
     """A batch of matrices in device memory; item b starts at offset + (b // div) * stride.
 
-    buffer: OpenCL buffer; offset, ld, stride [elements]: start, distance of rows, of items
+    buffer: OpenCL buffer, or None where each call of a Product gives one
+    offset, ld, stride [elements]: start, distance of rows, of items
     step [elements]: distance of columns (only of a strided left factor, and of a ragged result)
     """
 
@@ -34,91 +36,122 @@ class Matrix(NamedTuple):
     offset: int = 0
 
 
+class ImageBatch(NamedTuple):
+    """Images of a caller's device array, image b at offset + b * stride in `buffer`.
+
+    offset, stride, ld [elements]: start, distance of images, of their rows
+    """
+
+    buffer: object
+    offset: int
+    stride: int
+    ld: int
+
+    @classmethod
+    def of(cls, array, first=0, every=1) -> ImageBatch:
+        """Images first, first + every, ... of a pyopencl array (..., Ny, Nx), in its order."""
+        n_y, n_x = array.shape[-2:]
+        offset = array.offset // array.dtype.itemsize + first * n_y * n_x
+        return cls(array.base_data, offset, every * n_y * n_x, n_x)
+
+    @classmethod
+    def shaped(cls, n_y, n_x, every=1) -> ImageBatch:
+        """Every `every`-th of many images (n_y, n_x), of an array that is not there yet."""
+        return cls(None, 0, every * n_y * n_x, n_x)
+
+    def matrix(self, axes=(0, 1)) -> Matrix:
+        """The images as matrices, transposed where `axes` is (1, 0)."""
+        ld, step = (self.ld, 1) if axes == (0, 1) else (1, self.ld)
+        return Matrix(self.buffer, ld, self.stride, step=step, offset=self.offset)
+
+
 class Contraction:
     """C[b] = A[b] . B[b], with an optional point-wise stage on the result; see kernels/contract.cl.
 
-    epilogue: None, "MIX" (difference spectra) or "TWIST" (rotation of cos and sin rows)
+    epilogue: None, "MIX" (transfer functions) or "TWIST" (rotation of cos and sin rows)
     adjoint: conjugate the epilogue
     ragged: C is a caller's array, of any strides; otherwise its rows are padded with zeros
     strided: A's columns may be any distance apart; otherwise they are adjacent
     """
 
     def __init__(self, device, dtype, *, epilogue=None, adjoint=False, ragged=False, strided=False):
-        self.device = device
-        self.tile = _tile(device, np.dtype(dtype))
-        defines = {epilogue: True} if epilogue else {}
-        self.kernel = device.kernel(
-            "contract.cl",
-            "contract",
-            dtype=dtype,
-            SIGN=-1 if adjoint else 1,
-            RAGGED=ragged,
-            STRIDED=strided,
-            **self.tile,
-            **defines,
-        )
-        i, size = np.int32, np.uint64
-        self.kernel.set_scalar_arg_dtypes(
-            [i, i, i, i, i, None, size, i, i, i, i, None, i, i, None, size, i, i, i, None, i, i, i]
-        )
+        self.device, self.dtype = device, dtype
+        self.tile = Tuning.of(device, dtype).tile
+        self.defines = {"SIGN": -1 if adjoint else 1, "RAGGED": ragged, "STRIDED": strided}
+        self.defines |= self.tile | ({epilogue: True} if epilogue else {})
 
-    def __call__(self, m, n, k, batch, a: Matrix, b: Matrix, c: Matrix, e=None, n_bands=1):
-        """Queue the product of `batch` (m, k) matrices A with (k, n) matrices B into C.
+    def bind(self, m, n, k, a: Matrix, b: Matrix, c: Matrix, e=None, n_bands=1) -> Product:
+        """The products of (m, k) matrices A with (k, n) matrices B into C.
 
         e (buffer, stride, band stride): tables of the epilogue, shared by `n_bands` items
         """
-        if (
-            e is None
-            and b.stride == 0
-            and a.step == 1
-            and a.stride == m * a.ld
-            and a.div == 1
-            and c.step == 1
-            and c.stride == m * c.ld
-        ):
-            m, batch = m * batch, 1  # one right factor for all: their rows are one tall matrix
-        n_pad = padded(n)
         buffer_e, stride_e, band_e = e or (None, 0, 0)
-        self.kernel.set_args(
-            m,
-            n,
-            n_pad,
-            k,
-            max(SUM_BLOCK, math.isqrt(k)),
-            a.buffer,
-            a.offset,
-            a.ld,
-            a.step,
-            a.stride,
-            a.div,
-            b.buffer,
-            b.stride,
-            b.div,
-            c.buffer,
-            c.offset,
-            c.ld,
-            c.step,
-            c.stride,
-            buffer_e,
-            stride_e,
-            band_e,
-            n_bands,
-        )
         tile = self.tile
-        x, y = -(-n_pad // (tile["NV"] * tile["VW"])), -(-m // tile["MR"])
-        x, y = -(-x // tile["WGX"]) * tile["WGX"], -(-y // tile["WGY"]) * tile["WGY"]
-        self.device.launch(self.kernel, (x, y, batch), (tile["WGX"], tile["WGY"], 1))
+        launch = self.device.launcher(
+            "contract.cl",
+            "contract",
+            dtype=self.dtype,
+            local_size=(tile["WGX"], tile["WGY"], 1),
+            **self.defines,
+        ).bind(
+            m=m,
+            n=n,
+            n_pad=padded(n),
+            k=k,
+            block=max(SUM_BLOCK, math.isqrt(k)),
+            A=a.buffer,
+            offset_a=a.offset,
+            ld_a=a.ld,
+            step_a=a.step,
+            stride_a=a.stride,
+            div_a=a.div,
+            B=b.buffer,
+            stride_b=b.stride,
+            div_b=b.div,
+            C=c.buffer,
+            offset_c=c.offset,
+            ld_c=c.ld,
+            step_c=c.step,
+            stride_c=c.stride,
+            E=buffer_e,
+            stride_e=stride_e,
+            band_e=band_e,
+            n_bands=n_bands,
+        )
+        # one right factor for all: the rows of all items are those of one tall matrix
+        whole_a = a.step == 1 and a.stride == m * a.ld and a.div == 1
+        tall = e is None and b.stride == 0 and whole_a and c.step == 1 and c.stride == m * c.ld
+        return Product(launch, tile, m, padded(n), tall)
 
 
-def _tile(device, dtype) -> dict:
-    """Register tile of a work-item, measured on CPUs; for GPUs four floats (one 16-byte load) and a
-    square of 64 work-items.
+class Product:
+    """A contraction with all its matrices bound; `Contraction.bind` makes it.
 
-    Eight rows of two vectors use the 32 registers of AVX-512 and load little for each product;
-    elsewhere, and in PoCL's code for AMD hosts of any kind, 16 registers hold six rows of one.
+    tall: the items of a batch are stacked into one matrix of m rows each
     """
-    if device.kind != "CPU":
-        return {"VW": 4 if dtype == np.float32 else 2, "NV": 1, "MR": 8, "WGX": 8, "WGY": 8}
-    wide = device.cl.native_vector_width_float >= 16 and "AMD" not in device.name
-    rows = {"NV": 2, "MR": 8} if wide else {"NV": 1, "MR": 6}
-    return {"VW": 16 if dtype == np.float32 else 8, **rows, "WGX": 1, "WGY": 1}
+
+    def __init__(self, launch, tile, m, n_pad, tall):
+        self.launch, self.m, self.tall = launch, m, tall
+        self.rows, self.group_rows = tile["MR"], tile["WGY"]
+        self.n_x = _whole(-(-n_pad // (tile["NV"] * tile["VW"])), tile["WGX"])
+
+    def __call__(self, batch, *, a=None, c=None):
+        """Queue `batch` products.
+
+        a, c (ImageBatch): the left factor and the result of this call, strides as they are bound
+        """
+        given, m = {}, self.m
+        if a is not None:
+            given["A"], given["offset_a"] = a.buffer, a.offset
+        if c is not None:
+            given["C"], given["offset_c"] = c.buffer, c.offset
+        if self.tall:
+            m, batch = m * batch, 1
+            given["m"] = m
+        n_y = _whole(-(-m // self.rows), self.group_rows)
+        self.launch((self.n_x, n_y, batch), **given)
+
+
+def _whole(n, group):
+    """`n` work-items rounded up to whole groups."""
+    return -(-n // group) * group

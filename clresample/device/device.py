@@ -1,4 +1,4 @@
-"""One OpenCL device: its choice, its memory, its kernels, and readable errors.
+"""One OpenCL device: its memory, its kernels, and what is copied and launched there.
 
 pyopencl is imported when a device is first asked for, never before.
 """
@@ -8,30 +8,20 @@ from __future__ import annotations
 import functools
 import gc
 import math
+import threading
 import weakref
 
 import numpy as np
 
-from .discovery import DeviceError, builds_fp64, choose, format_size, kind_of, load_pyopencl
-from .launcher import Launcher, signature
-from .program import build_log, define_line, read_kernel
+from .discovery import builds_fp64, choose, kind_of, load_pyopencl
+from .errors import FULL, explained, status_of, too_large
+from .launcher import Launcher
+from .program import Programs
 
 __all__ = ["Device", "get_device"]
 
 # NVIDIA and AMD mishandle fills of 2 GiB and more: zero memory in pieces [bytes].
 FILL_BYTES = 1 << 30
-# Status codes after which the device or its queue no longer answers.
-# -9999 is NVIDIA's own code for an illegal access, after which its context is dead.
-LOST = {
-    "DEVICE_NOT_AVAILABLE",
-    "OUT_OF_RESOURCES",
-    "INVALID_COMMAND_QUEUE",
-    "INVALID_CONTEXT",
-    "INVALID_DEVICE",
-    "EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST",
-    "-9999",
-}
-FULL = {"MEM_OBJECT_ALLOCATION_FAILURE", "INVALID_BUFFER_SIZE", "OUT_OF_HOST_MEMORY"}
 
 
 class Device:
@@ -39,7 +29,7 @@ class Device:
 
     context, queue, cl: pyopencl's Context, CommandQueue and Device
     name, platform, kind: what the driver calls it; kind is "GPU", "CPU", "ACCELERATOR" or "OTHER"
-    compute_units, max_group: counts
+    compute_units: their number
     memory, max_alloc, in_use [bytes]: all of it, the largest buffer, what arrays made here hold
     """
 
@@ -52,11 +42,10 @@ class Device:
         self.compute_units = cl_device.max_compute_units
         self.memory = cl_device.global_mem_size
         self.max_alloc = cl_device.max_mem_alloc_size
-        self.max_group = cl_device.max_work_group_size
         self.in_use = 0
         self._enqueue = cl.enqueue_nd_range_kernel
         self._error = cl.Error
-        self._programs = {}
+        self._programs, self._lock = Programs(self), threading.Lock()
         self.context = self._call(cl.Context, [cl_device])
         self.queue = self._call(cl.CommandQueue, self.context, cl_device)
 
@@ -77,7 +66,7 @@ class Device:
         shape = (int(shape),) if np.ndim(shape) == 0 else tuple(map(int, shape))
         n_bytes = math.prod(shape, start=dtype.itemsize)
         if n_bytes > self.memory:
-            raise self._too_large(n_bytes)
+            raise too_large(self, n_bytes)
         return self._call(pyopencl.array.Array, self.queue, shape, dtype, allocator=self._allocate)
 
     def zeros(self, shape, dtype):
@@ -127,26 +116,21 @@ class Device:
         """The values of a pyopencl array as a NumPy array, once all that was queued is done."""
         return self._call(array.get, self.queue)
 
-    def kernel(self, file, name, *, dtype=np.float32, **defines):
-        """A fresh pyopencl.Kernel `name` from kernels/`file`; equal requests share one program.
+    def launcher(self, file, name, *, dtype=np.float32, local_size=None, **defines):
+        """A Launcher of kernel `name` in kernels/`file`, no argument bound yet.
 
+        dtype: float32 or float64, which REAL stands for
+        local_size: work-items of a group along each axis; None leaves it to the driver
         defines: macros; True defines the bare name, False and None leave it out
         DeviceError: the file does not build here (with the compiler's log), or no float64
         """
-        import pyopencl as cl
+        kernel, is_buffer = self._programs.kernel(file, name, dtype, defines)
+        return Launcher(self, kernel, is_buffer, self._lock, local_size)
 
-        dtype = np.dtype(dtype)
-        if dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
-            raise ValueError(f"dtype is {dtype}; kernels are built for float32 or float64")
-        key = (file, dtype, tuple(sorted(defines.items())))
-        if key not in self._programs:
-            self._programs[key] = self._build(file, dtype, defines)
-        return cl.Kernel(self._programs[key], name)
-
-    def launcher(self, file, name, *, dtype=np.float32, local_size=None, **defines):
-        """A Launcher of `kernel(file, name, ...)`, whose arguments go by their names."""
-        kernel = self.kernel(file, name, dtype=dtype, **defines)
-        return Launcher(self, kernel, signature(file, name), dtype, local_size)
+    def kernel(self, file, name, *, dtype=np.float32, **defines):
+        """A fresh pyopencl.Kernel."""
+        shared, _ = self._programs.kernel(file, name, dtype, defines)
+        return load_pyopencl().Kernel(shared.program, name)
 
     def launch(self, kernel, global_size, local_size=None):
         """Queue a kernel whose arguments are set; sizes (x, y, z) as OpenCL counts them."""
@@ -161,35 +145,10 @@ class Device:
         try:
             return function(*arguments, **options)
         except self._error as error:
-            message = self._explain(_status(error))
-            if message is None:  # a mistake of our own stays as it is
+            meant = explained(self, error)
+            if meant is None:
                 raise
-            raise DeviceError(message) from error
-
-    def _build(self, file, dtype, defines):
-        import pyopencl as cl
-
-        if dtype == np.float64:
-            if not self.has_fp64:
-                raise DeviceError(
-                    f"{self.name} has no double precision: use float32, or another device "
-                    "(`clresample devices` lists them)"
-                )
-            defines = {**defines, "REAL": "double", "USE_DOUBLE": True}
-        else:
-            defines = {**defines, "REAL": "float"}
-        lines = [define_line(key, value) for key, value in defines.items()]
-        source = "\n".join([*filter(None, lines), f'#line 1 "{file}"', read_kernel(file)])
-        program = cl.Program(self.context, source)
-        try:
-            return program.build(options=["-cl-std=CL1.2"])
-        except cl.Error as error:
-            raise DeviceError(
-                f"{file} does not build on {self.name} ({self.platform}) with "
-                f"{defines}; the compiler says:\n{build_log(error)}\n"
-                "Update the driver, or choose another device with CLRESAMPLE_DEVICE "
-                "(`clresample devices` lists them)"
-            ) from error
+            raise meant from error
 
     def _allocate(self, n_bytes):
         # Some CPU runtimes promise more memory than there is, and the process dies on writing it:
@@ -199,12 +158,12 @@ class Device:
         if self.in_use + n_bytes > self.memory:
             gc.collect()  # arrays in reference cycles are still counted
         if n_bytes > min(self.max_alloc, self.memory - self.in_use):
-            raise self._too_large(n_bytes)
+            raise too_large(self, n_bytes)
         try:
             buffer = _buffer_type()(self.context, cl.mem_flags.READ_WRITE, n_bytes)
         except self._error as error:
-            if _status(error) in FULL:
-                raise self._too_large(n_bytes) from error
+            if status_of(error) in FULL:
+                raise too_large(self, n_bytes) from error
             raise
         self.in_use += n_bytes
         weakref.finalize(buffer, self._freed, n_bytes).atexit = False
@@ -212,27 +171,6 @@ class Device:
 
     def _freed(self, n_bytes):
         self.in_use -= n_bytes
-
-    def _too_large(self, n_bytes):
-        return DeviceError(
-            f"an array needs {format_size(n_bytes)}; {self.name} has {format_size(self.memory)}, "
-            f"{format_size(self.in_use)} of it in use, and takes {format_size(self.max_alloc)} in "
-            "one buffer: use smaller batches or tiles, or free other arrays"
-        )
-
-    def _explain(self, status):
-        if status in FULL:
-            return (
-                f"{self.name} is out of memory ({status}; it has {format_size(self.memory)}): use "
-                "smaller batches or tiles, or free other arrays"
-            )
-        if status in LOST:
-            return (
-                f"{self.name} ({self.platform}) no longer answers ({status}): start again, look "
-                "at the driver's log for a reset or a time limit on kernels, use smaller "
-                "batches, or choose another device with CLRESAMPLE_DEVICE"
-            )
-        return None
 
 
 @functools.cache
@@ -257,10 +195,3 @@ def get_device(choice=None):
 @functools.cache
 def _open(cl_device):
     return Device(cl_device)
-
-
-def _status(error):
-    """The name of an OpenCL error's status, or its number where it has none."""
-    code = getattr(error, "code", None)
-    names = vars(load_pyopencl().status_code)
-    return next((n for n, c in names.items() if n.isupper() and c == code), str(code))

@@ -1,4 +1,4 @@
-"""Kernel sources as text: where they lie, their includes, macros and build logs."""
+"""Kernel sources: where they lie, what they declare, and what is built of them for a device."""
 
 from __future__ import annotations
 
@@ -6,7 +6,13 @@ import functools
 import re
 from pathlib import Path
 
-from .discovery import DeviceError
+import numpy as np
+
+from .discovery import DeviceError, load_pyopencl
+from .errors import no_double, not_built
+
+# Types of scalar arguments; REAL is the floating type of a build. Whatever else is a buffer.
+SCALARS = {"int": np.int32, "uint": np.uint32, "long": np.int64, "ulong": np.uint64}
 
 
 def kernels_folder():
@@ -30,10 +36,78 @@ def read_kernel(file):
     return re.sub(r'^#include "(.+)"$', paste, source, flags=re.MULTILINE)
 
 
-def define_line(name, value):
-    if value is None or value is False:
-        return None
-    return f"#define {name} {1 if value is True else value}"
+def source_of(file, dtype, defines):
+    """What is compiled for kernels/`file`: its macros, a line each, and its text.
+
+    dtype: float32 or float64, which REAL stands for
+    defines: macros; True defines the bare name, False and None leave it out
+    """
+    double = np.dtype(dtype) == np.float64
+    defines = {**defines, "REAL": "double" if double else "float", "USE_DOUBLE": double}
+    lines = [
+        f"#define {name} {1 if value is True else value}"
+        for name, value in defines.items()
+        if value is not None and value is not False
+    ]
+    return "\n".join([*lines, f'#line 1 "{file}"', read_kernel(file)])
+
+
+def signature(file, name):
+    """The arguments of kernel `name` in kernels/`file`: ((name, type), ...) in their order.
+
+    type: of SCALARS, "REAL", or None for a buffer
+    ValueError: there is no such kernel, or an argument has another type
+    """
+    text = re.sub(r"/\*.*?\*/", " ", read_kernel(file), flags=re.DOTALL)
+    found = re.search(rf"__kernel\b[^;{{]*?\bvoid\s+{name}\s*\((.*?)\)\s*\{{", text, re.DOTALL)
+    if found is None:
+        raise ValueError(f"kernels/{file} has no kernel {name}")
+    arguments = []
+    for declaration in found[1].split(","):
+        words = re.findall(r"\w+", declaration)
+        scalar = None if "*" in declaration else words[-2]
+        if scalar not in (None, "REAL", *SCALARS):
+            raise ValueError(f"{name} of kernels/{file}: argument type {scalar} is not known")
+        arguments.append((words[-1], scalar))
+    return tuple(arguments)
+
+
+class Programs:
+    """What was built for one device so far: equal requests share one program and one kernel."""
+
+    def __init__(self, device):
+        self.device = device
+        self._programs, self._kernels = {}, {}
+
+    def kernel(self, file, name, dtype, defines):
+        """A pyopencl.Kernel that knows its scalars' types, and {argument: whether it is a buffer}.
+
+        DeviceError: the file does not build here (with the compiler's log), or no float64
+        ValueError: dtype is another, or the file has no such kernel
+        """
+        dtype, cl = np.dtype(dtype), load_pyopencl()
+        if dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
+            raise ValueError(f"dtype is {dtype}; kernels are built for float32 or float64")
+        build = file, dtype, tuple(sorted(defines.items()))
+        if (build, name) not in self._kernels:
+            arguments = signature(file, name)
+            if build not in self._programs:
+                self._programs[build] = self._built(file, dtype, defines)
+            kernel, types = cl.Kernel(self._programs[build], name), SCALARS | {"REAL": dtype.type}
+            kernel.set_scalar_arg_dtypes([types.get(type_) for _, type_ in arguments])
+            is_buffer = {argument: type_ is None for argument, type_ in arguments}
+            self._kernels[build, name] = kernel, is_buffer
+        return self._kernels[build, name]
+
+    def _built(self, file, dtype, defines):
+        device, cl = self.device, load_pyopencl()
+        if dtype == np.float64 and not device.has_fp64:
+            raise no_double(device)
+        program = cl.Program(device.context, source_of(file, dtype, defines))
+        try:
+            return program.build(options=["-cl-std=CL1.2"])
+        except cl.Error as error:
+            raise not_built(device, file, defines, build_log(error)) from error
 
 
 def build_log(error):

@@ -23,42 +23,57 @@ class Tuning:
     line_group: work-items of a group along an image row where a kernel has no loop of its own.
         Left to choose, CPU runtimes take another number for every image size and build the kernel
         anew for each, 0.1 to 0.3 s
-    group_bytes: intermediate matrices of one launch of the operator
-    slab_bytes: shifted model of one slab of the paper's scheme
-    n_scenes: scenes fitted side by side
+    lanes: columns that a work-item of shift.cl takes at a time, one vector: 4, 8 or 16
+    group_bytes [bytes]: intermediate matrices of one launch of the operator; more images than fit
+        go in several launches
+    slab_bytes [bytes]: shifted model of one slab of the paper's scheme
+    chunk_terms: terms that a work-item of the paper's contraction sums; 16 columns of so many stay
+        in a core's cache, where they are read again for each row
+    n_scenes: scenes fitted side by side; more hide the launches better, and need more memory
+    memory [bytes]: of the device for one frame in tiles, unless a caller says otherwise. With less,
+        tiles are smaller and overlap more; most instruments' quickest tiles take less than 1 GiB
     """
 
     tile: dict[str, int]
     row_loops: bool
     sum_group: int
     line_group: int
+    lanes: int
     group_bytes: int
     slab_bytes: int
+    chunk_terms: int
     n_scenes: int
+    memory: int
 
     @classmethod
     def of(cls, device, dtype=np.float32) -> Tuning:
         """The sizes for a Device and float32 or float64."""
+        shared = {
+            "line_group": 32,  # one warp of a GPU
+            "lanes": 8,
+            "chunk_terms": 1024,
+            "memory": min(1 << 30, device.memory // 4),
+        }
         if device.kind == "CPU":
             return cls(
                 tile=_cpu_tile(device, np.dtype(dtype)),
                 row_loops=True,
                 sum_group=1,
-                line_group=32,
                 group_bytes=4 << 20,  # in the cache, where they are read back at speed
                 slab_bytes=2 << 20,  # what one core has in its cache
                 n_scenes=32,  # more leave the cache, fewer do not hide the launches
+                **shared,
             )
         return cls(
             # a 16-byte load, and a square of 64 work-items that every GPU allows
             tile={"VW": 4 if np.dtype(dtype) == np.float32 else 2, "NV": 1, "MR": 8}
             | {"WGX": 8, "WGY": 8},
             row_loops=False,
-            sum_group=64,
-            line_group=32,  # one warp
+            sum_group=64,  # what every GPU allows
             group_bytes=1 << 30,  # the whole batch in flight
             slab_bytes=256 << 20,
             n_scenes=1024,
+            **shared,
         )
 
     def local_size(self, n_axes):

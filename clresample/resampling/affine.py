@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..device.contraction import Contraction, Matrix, padded
-from .executor import GROUP, Executor, Images, whole_groups
+from ..device.contraction import Contraction, ImageBatch, Matrix, padded
+from .executor import Executor
 
 
 class AffineExecutor(Executor):
-    """Any affine mapping in two passes: columns of the model to lines, then along each line."""
+    """Any affine mapping in two passes: columns of the model to lines, then along each line.
+
+    Observed rows, or columns, are L lines through the model; J equidistant columns cross them.
+    Sx (kx, J), Sy (L, ky): waves at the columns, and where the lines cut the model's middle column
+    twist: multiplies column frequencies by exp(-i angle), angle (Hy, J), which shears the lines
+    gather: from the J columns of a line to its observed pixels; see LineTaps
+    """
 
     def __init__(self, device, dtype, plans):
         self.by_row = plans[0].lines.by_row
-        n_rows, n_steps = plans[0].mapping.shape_out
+        n_rows, n_steps = self.shape_out = plans[0].mapping.shape_out
         self.n_rows, self.n_steps = (n_rows, n_steps) if self.by_row else (n_steps, n_rows)
         self.n_columns = max(p.out_x.shape[1] for p in plans)
         self.n_pad = padded(self.n_columns)
@@ -28,7 +34,7 @@ class AffineExecutor(Executor):
         self.to_pixels = Gather(
             self, [p.start for p in lines], [p.weight for p in lines], self.n_columns, self.n_steps
         )
-        self.to_columns = Gather(
+        self.from_pixels = Gather(
             self, [p.start_t for p in lines], [p.weight_t for p in lines], self.n_steps, self.n_pad
         )
 
@@ -38,82 +44,91 @@ class AffineExecutor(Executor):
             "lines": (self.n_rows, self.n_pad),
         }
 
-    def forward(self, x: Images, y: Images, n, spread=False):
-        self.analyse(x, n, spread)
-        z, turned, g = (self._scratch(name) for name in ("spectrum", "turned", "lines"))
-        self.twist(
-            self.k_y, self.n_columns, self.k_x, n, z, self.out_x, turned, self._turn(), self.n_bands
+    def bind(self):
+        super().bind()
+        n_y, n_x, turn = self.n_rows, self.n_columns, (self.turn.buffer, self.turn.stride, 0)
+        z, turned, lines = (self.matrix(name) for name in ("frequencies", "turned", "lines"))
+        self.to_columns = self.twist.bind(
+            self.k_y, n_x, self.k_x, z, self.out_x, turned, turn, self.n_bands
         )
-        self.plain(self.n_rows, self.n_columns, self.k_y, n, self.out_y, turned, g)
-        self.to_pixels(g, self._lines_of(y), n)
+        self.to_lines = self.plain.bind(n_y, n_x, self.k_y, self.out_y, turned, lines)
+        self.from_lines = self.twist_adjoint.bind(
+            self.k_y, n_x, n_y, self.out_y_t, lines, turned, turn, self.n_bands
+        )
+        self.from_columns = self.to_frequencies(self.mix_adjoint, n_x, turned, self.out_x_t)
 
-    def adjoint(self, y: Images, x: Images, n):
-        turned, g = self._scratch("turned"), self._scratch("lines")
-        self.to_columns(self._lines_of(y), g, n)
-        self.twist_adjoint(
-            self.k_y,
-            self.n_columns,
-            self.n_rows,
-            n,
-            self.out_y_t,
-            g,
-            turned,
-            self._turn(),
-            self.n_bands,
-        )
-        self.to_spectrum(self.mix_adjoint, self.n_columns, turned, self.out_x_t, n)
+    def forward(self, x: ImageBatch, y: ImageBatch, n, spread=False):
+        """I2 = gather(G),  G = Sy twist(Z Sx),  Z = D o (Ty I1 Tx).
+
+        x (n, Ny, Nx): the model I1 of each band; where `spread`, (n / n_bands, Ny, Nx)
+        G (n, L, J): the lines at equidistant columns
+        y (n, My, Mx): the observation I2 of each band, overwritten
+        """
+        self.analyse(x, n, spread)
+        self.to_columns(n)
+        self.to_lines(n)
+        self.to_pixels(self.matrix("lines"), self._lines_of(y), n)
+
+    def adjoint(self, y: ImageBatch, x: ImageBatch, n):
+        """I1 = Ty^T Z Tx^T,  Z = conj(D) o (twist^T(Sy^T G) Sx^T),  G = gather^T(I2).
+
+        y (n, My, Mx): I2; x (n, Ny, Nx): I1, overwritten
+        """
+        self.from_pixels(self._lines_of(y), self.matrix("lines"), n)
+        self.from_lines(n)
+        self.from_columns(n)
         self.synthesise(x, n)
 
-    def _turn(self):
-        return self.turn.buffer, self.turn.stride, 0
-
-    def _lines_of(self, y: Images) -> Matrix:
+    def _lines_of(self, y: ImageBatch) -> Matrix:
         return y.matrix((0, 1) if self.by_row else (1, 0))
 
 
 class Gather:
     """Sparse sums along lines, out[l, p] = sum_t weight[l, t, p] in[l, start[l, p] + t].
 
-    starts, weights: one for each plan; n_in, n_out: elements of a line on either side
+    starts, weights: one (L, P), (L, taps, P) for each plan; n_in, n_out: elements of a line on
+        either side, at least those of any plan
     """
 
-    def __init__(self, path: Executor, starts, weights, n_in, n_out):
-        self.device, self.n_rows, self.n_out = path.device, path.n_rows, n_out
-        self.n_bands, self.n_plans = path.n_bands, len(path.plans)
-        n_taps = max(w.shape[1] for w in weights)
-        n_lines = path.n_rows
+    def __init__(self, executor: Executor, starts, weights, n_in, n_out):
+        n_taps, n_lines = max(w.shape[1] for w in weights), executor.n_rows
         start = np.zeros((len(starts), n_lines, n_out), np.int32)
-        weight = np.zeros((len(starts), n_lines, n_taps, n_out), path.dtype)
+        weight = np.zeros((len(starts), n_lines, n_taps, n_out), executor.dtype)
         for i, (s, w) in enumerate(zip(starts, weights, strict=True)):
             # with more taps than its own, a plan's last ones would read beyond the line
             back = np.maximum(s - (n_in - n_taps), 0)
             taps = back[:, None] + np.arange(w.shape[1])[:, None]
             start[i, :, : s.shape[1]] = s - back
             np.put_along_axis(weight[i, :, :, : w.shape[2]], taps, w, axis=1)
-        self.start, self.weight = path.device.put(start), path.device.put(weight)
-        self.kernel = path.device.kernel("warp.cl", "gather", dtype=path.dtype, N_TAPS=n_taps)
-        i, size = np.int32, np.uint64
-        self.kernel.set_scalar_arg_dtypes(
-            [i, i, i, i, None, size, i, i, i, None, size, i, i, i, None, None]
+        device = executor.device
+        self.launch = device.launcher(
+            "warp.cl",
+            "gather",
+            dtype=executor.dtype,
+            local_size=(executor.tuning.line_group, 1, 1),
+            N_TAPS=n_taps,
+        ).bind(
+            n_out=n_out,
+            n_lines=n_lines,
+            n_bands=executor.n_bands,
+            n_tables=len(executor.plans),
+            start=device.put(start),
+            weight=device.put(weight),
         )
+        self.size = executor.whole_groups(n_out), n_lines
 
     def __call__(self, source: Matrix, target: Matrix, n):
-        self.kernel.set_args(
-            self.n_out,
-            self.n_rows,
-            self.n_bands,
-            self.n_plans,
-            source.buffer,
-            source.offset,
-            source.stride,
-            source.ld,
-            source.step,
-            target.buffer,
-            target.offset,
-            target.stride,
-            target.ld,
-            target.step,
-            self.start.base_data,
-            self.weight.base_data,
+        """Queue the sums of `n` images: rows of source[b] into rows of target[b]."""
+        self.launch(
+            (*self.size, n),
+            source=source.buffer,
+            source_offset=source.offset,
+            source_stride=source.stride,
+            source_ld=source.ld,
+            source_step=source.step,
+            target=target.buffer,
+            target_offset=target.offset,
+            target_stride=target.stride,
+            target_ld=target.ld,
+            target_step=target.step,
         )
-        self.device.launch(self.kernel, (whole_groups(self.n_out), self.n_rows, n), (GROUP, 1, 1))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from ..device.contraction import padded
-from .executor import Executor, Images
+from ..device.contraction import ImageBatch, padded
+from .executor import Executor
 
 
 class AlignedExecutor(Executor):
-    """Grids whose axes are parallel, crossed or mirrored: four thin products each way."""
+    """Grids whose axes are parallel, crossed or mirrored: four thin products each way.
+
+    Sy (My, ky), Sx (kx, Mx): waves at the observed rows and columns
+    """
 
     def __init__(self, device, dtype, plans):
         self.n_rows, self.n_columns = plans[0].mapping.shape_out
@@ -15,14 +18,31 @@ class AlignedExecutor(Executor):
         self.out_x = self._table([p.out_x for p in plans], self.k_x, padded(self.n_columns))
         self.out_x_t = self._table([p.out_x.T for p in plans], self.n_columns, self.k_pad)
 
-    def forward(self, x: Images, y: Images, n, spread=False):
-        self.analyse(x, n, spread)
-        half, z = self._scratch("half", self.n_rows), self._scratch("spectrum")
-        self.plain(self.n_rows, self.k_x, self.k_y, n, self.out_y, z, half)
-        self.ragged(self.n_rows, self.n_columns, self.k_x, n, half, self.out_x, y.matrix())
+    def bind(self):
+        super().bind()
+        n_y, n_x = self.n_rows, self.n_columns
+        half, z = self.matrix("half", n_y), self.matrix("frequencies")
+        observed = ImageBatch.shaped(n_y, n_x).matrix()
+        self.to_rows = self.plain.bind(n_y, self.k_x, self.k_y, self.out_y, z, half)
+        self.to_pixels = self.ragged.bind(n_y, n_x, self.k_x, half, self.out_x, observed)
+        self.from_pixels = self.plain.bind(n_y, self.k_x, n_x, observed, self.out_x_t, half)
+        self.from_rows = self.to_frequencies(self.mix_adjoint, n_y, self.out_y_t, half)
 
-    def adjoint(self, y: Images, x: Images, n):
-        half = self._scratch("half", self.n_rows)
-        self.plain(self.n_rows, self.k_x, self.n_columns, n, y.matrix(), self.out_x_t, half)
-        self.to_spectrum(self.mix_adjoint, self.n_rows, self.out_y_t, half, n)
+    def forward(self, x: ImageBatch, y: ImageBatch, n, spread=False):
+        """I2 = Sy Z Sx,  Z = D o (Ty I1 Tx).
+
+        x (n, Ny, Nx): the model I1 of each band; where `spread`, (n / n_bands, Ny, Nx)
+        y (n, My, Mx): the observation I2 of each band, overwritten
+        """
+        self.analyse(x, n, spread)
+        self.to_rows(n)
+        self.to_pixels(n, c=y)
+
+    def adjoint(self, y: ImageBatch, x: ImageBatch, n):
+        """I1 = Ty^T Z Tx^T,  Z = conj(D) o (Sy^T I2 Sx^T).
+
+        y (n, My, Mx): I2; x (n, Ny, Nx): I1, overwritten
+        """
+        self.from_pixels(n, a=y)
+        self.from_rows(n)
         self.synthesise(x, n)

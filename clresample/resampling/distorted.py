@@ -4,47 +4,56 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
-from ..device.contraction import COLUMN_PAD, Matrix
-from .executor import GROUP, Executor, Images, whole_groups
+from ..device.contraction import COLUMN_PAD, ImageBatch
+from .executor import Executor
 
 
 class DistortedExecutor(Executor):
-    """Any positions: the spectral sum straight at each observed pixel."""
+    """Any positions: the sum over frequencies straight at each of the P = My Mx observed pixels.
+
+    Sy (P, ky), Sx (P, kx): waves at the pixels, Sy times the pixel's area
+    """
 
     def __init__(self, device, dtype, plans):
         self.n_rows = math.prod(plans[0].mapping.shape_out)
         super().__init__(device, dtype, plans)
         self.out_x = self._table([p.out_x for p in plans], self.n_rows, self.k_pad)
-        self.rowdot = device.kernel("warp.cl", "rowdot", dtype=dtype)
-        self.rowscale = device.kernel("warp.cl", "rowscale", dtype=dtype)
-        scalars = [np.int32, np.int32, np.int32, np.int32]
-        for kernel in (self.rowdot, self.rowscale):
-            kernel.set_scalar_arg_dtypes([*scalars, None, np.uint64, None, None])
-
-    def forward(self, x: Images, y: Images, n, spread=False):
-        self.analyse(x, n, spread)
-        half, z = self._scratch("half", self.n_rows), self._scratch("spectrum")
-        self.plain(self.n_rows, self.k_x, self.k_y, n, self.out_y, z, half)
-        self._ends(self.rowdot, y, half)
-        self.device.launch(self.rowdot, (whole_groups(self.n_rows), n), (GROUP, 1))
-
-    def adjoint(self, y: Images, x: Images, n):
-        half = self._scratch("half", self.n_rows)
-        self._ends(self.rowscale, y, half)
-        self.device.launch(self.rowscale, (self.k_pad, self.n_rows, n), (COLUMN_PAD, 1, 1))
-        self.to_spectrum(self.mix_adjoint, self.n_rows, self.out_y_t, half, n)
-        self.synthesise(x, n)
-
-    def _ends(self, kernel, y: Images, half: Matrix):
-        kernel.set_args(
-            self.n_rows,
-            self.k_pad,
-            self.n_bands,
-            len(self.plans),
-            y.buffer,
-            y.offset,
-            half.buffer,
-            self.out_x.buffer,
+        group = self.tuning.line_group
+        self.rowdot, self.rowscale = (
+            device.launcher("warp.cl", name, dtype=dtype, local_size=local_size)
+            for name, local_size in (("rowdot", (group, 1)), ("rowscale", (COLUMN_PAD, 1, 1)))
         )
+
+    def bind(self):
+        super().bind()
+        half, z = self.matrix("half", self.n_rows), self.matrix("frequencies")
+        self.to_rows = self.plain.bind(self.n_rows, self.k_x, self.k_y, self.out_y, z, half)
+        self.from_rows = self.to_frequencies(self.mix_adjoint, self.n_rows, self.out_y_t, half)
+        for launch in (self.rowdot, self.rowscale):
+            launch.bind(
+                n_positions=self.n_rows,
+                n_pad=self.k_pad,
+                n_bands=self.n_bands,
+                n_tables=len(self.plans),
+                T=half.buffer,
+                E=self.out_x.buffer,
+            )
+
+    def forward(self, x: ImageBatch, y: ImageBatch, n, spread=False):
+        """I2[p] = sum_x (Sy Z)[p, x] Sx[p, x],  Z = D o (Ty I1 Tx).
+
+        x (n, Ny, Nx): the model I1 of each band; where `spread`, (n / n_bands, Ny, Nx)
+        y (n, P): the observation I2 of each band, overwritten
+        """
+        self.analyse(x, n, spread)
+        self.to_rows(n)
+        self.rowdot((self.whole_groups(self.n_rows), n), y=y.buffer, y_offset=y.offset)
+
+    def adjoint(self, y: ImageBatch, x: ImageBatch, n):
+        """I1 = Ty^T Z Tx^T,  Z = conj(D) o (Sy^T T),  T[p, x] = I2[p] Sx[p, x].
+
+        y (n, P): I2; x (n, Ny, Nx): I1, overwritten
+        """
+        self.rowscale((self.k_pad, self.n_rows, n), y=y.buffer, y_offset=y.offset)
+        self.from_rows(n)
+        self.synthesise(x, n)

@@ -1,10 +1,15 @@
 """What the executors of all geometries share: from a model to its frequencies and back.
 
-    forward   Z = D o (Ty I Tx)            both axes to frequencies, then the difference spectra
+    forward   Z = D o (Ty I1 Tx)           both axes to frequencies, then the transfer function
               aligned    I2 = Sy Z Sx
-              affine     g = Sy twist(Z Sx),  I2 = gather(g) along each line
+              affine     G = Sy twist(Z Sx),  I2 = gather(G) along each line
               distorted  I2[p] = sum_x (Sy Z)[p, x] Sx[p, x]
     adjoint   the same factors transposed, in reverse order
+
+    I1 (Ny, Nx), I2 (My, Mx): one band of the model and of the observation
+    Ty (ky, Ny), Tx (Nx, kx): cos and sin waves at the model's pixels; ky = 2 Hy, kx = 2 Hx
+    Z (ky, kx): the frequencies; D o multiplies them by the transfer function, see contract.cl's MIX
+    Sy, Sx: waves at the observed rows, columns, lines or pixels
 
 All matrices are real: rows or columns 2i, 2i+1 are the cos and sin parts of frequency i.
 """
@@ -12,42 +17,24 @@ All matrices are real: rows or columns 2i, 2i+1 are the cos and sin parts of fre
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from ..device.contraction import Contraction, Matrix, padded
-
-# Work-items of a group along a line.  Left to choose, CPU runtimes pick another number for every
-# image size and build the kernel anew for each, 0.1 to 0.3 s; and 32 is one GPU warp.
-GROUP = 32
-
-
-class Images(NamedTuple):
-    """`count` images of a caller, item b at offset + b * stride in `buffer` [elements]."""
-
-    buffer: object
-    offset: int
-    shape: tuple[int, int]
-
-    @property
-    def stride(self):
-        return self.shape[0] * self.shape[1]
-
-    def matrix(self, axes=(0, 1)) -> Matrix:
-        """The images as matrices, transposed where `axes` is (1, 0)."""
-        ld, step = (self.shape[1], 1) if axes == (0, 1) else (1, self.shape[1])
-        return Matrix(self.buffer, ld, self.stride, step=step, offset=self.offset)
+from ..device.contraction import Contraction, ImageBatch, Matrix, padded
+from ..device.tuning import Tuning
 
 
 class Executor:
-    """What the three paths share: the model's two axes and the difference spectra.
+    """What the three executors share: the model's two axes and the transfer function.
 
     plans: one for all items of a batch, or one for each item; smaller ones are padded with zeros
+    axes: the model axes taken as rows and columns of I1
+    Subclasses: n_rows (rows of Sy), scratch_shapes, bind, forward, adjoint
     """
 
     def __init__(self, device, dtype, plans):
         self.device, self.dtype, self.plans = device, dtype, plans
+        self.tuning = Tuning.of(device, dtype)
         first = plans[0]
         self.n_bands = first.n_bands
         self.axes = first.axes
@@ -61,75 +48,91 @@ class Executor:
         self.in_x_t = self._table([p.in_x.T for p in plans], self.n_x, self.k_pad)
         self.out_y = self._table([p.out_y for p in plans], self.n_rows, self.k_y)
         self.out_y_t = self._table([p.out_y.T for p in plans], self.k_y, self.n_rows)
-        self.spectra = device.empty((len(plans), self.n_bands, self.h_y, 4, self.k_pad // 2), dtype)
+        shape = len(plans), self.n_bands, self.h_y, 4, self.k_pad // 2
+        self.transfer = device.empty(shape, dtype)
         self.plain = Contraction(device, dtype)
-        self.first = Contraction(device, dtype, strided=self.axes != (0, 1))
+        self.strided = Contraction(device, dtype, strided=self.axes != (0, 1))
         self.ragged = Contraction(device, dtype, ragged=True)
         self.mix = Contraction(device, dtype, epilogue="MIX")
         self.mix_adjoint = Contraction(device, dtype, epilogue="MIX", adjoint=True)
-        self.scratch = {}
+        self.n_reserved, self.scratch = 0, {}
 
-    # rows and row length of the intermediate matrices, per image: name -> (rows, ld)
     def scratch_shapes(self):
+        """Intermediate matrices of one image: {name: (rows, elements of a row)}."""
         n_half = max(self.n_y, self.n_rows)
-        return {"half": (n_half, self.k_pad), "spectrum": (self.k_y, self.k_pad)}
+        return {"half": (n_half, self.k_pad), "frequencies": (self.k_y, self.k_pad)}
 
     def reserve(self, n_images):
         """Make room for the intermediates of `n_images` images at a time."""
-        if self.scratch.get("n_images", 0) != n_images:
-            self.scratch = {"n_images": n_images} | {
+        if self.n_reserved != n_images:
+            self.n_reserved = 0  # until all is bound: an interruption leaves nothing half done
+            self.scratch = {
                 name: self.device.empty((n_images, rows, ld), self.dtype)
                 for name, (rows, ld) in self.scratch_shapes().items()
             }
+            self.bind()
+            self.n_reserved = n_images
 
-    def set_spectra(self, spectra):
-        """Upload D(+,+), D(+,-): one pair (C, Hy, Hx) for each plan."""
-        host = np.zeros(self.spectra.shape, self.dtype)
-        for item, (d_plus, d_minus) in zip(host, spectra, strict=True):
+    def set_transfer(self, transfer):
+        """Upload the transfer functions: a pair D(+,+), D(+,-) (C, Hy, Hx) for each plan."""
+        host = np.zeros(self.transfer.shape, self.dtype)
+        for item, (d_plus, d_minus) in zip(host, transfer, strict=True):
             planes = (d_plus.real, d_plus.imag, d_minus.real, d_minus.imag)
             for i, plane in enumerate(planes):
                 item[:, : plane.shape[1], i, : plane.shape[2]] = plane
-        self.device.upload(host, self.spectra)
+        self.device.upload(host, self.transfer)
 
-    def analyse(self, images: Images, n, spread=False):
-        """Z = D o (Ty I Tx) for `n` images, into scratch "spectrum".
+    def bind(self):
+        """Bind the products of the model's end to the scratch that is there."""
+        half, z = self.matrix("half", self.n_y), self.matrix("frequencies")
+        model = ImageBatch.shaped(*self.plans[0].mapping.shape_in).matrix(self.axes)
+        # `spread`: an image is transformed once for all bands
+        once, shared = self.in_x_t._replace(div=1), half._replace(div=self.n_bands)
+        self.in_columns, self.in_columns_once = (
+            self.strided.bind(self.n_y, self.k_x, self.n_x, model, in_x_t, half)
+            for in_x_t in (self.in_x_t, once)
+        )
+        self.in_rows, self.in_rows_shared = (
+            self.to_frequencies(self.mix, self.n_y, self.in_y, right) for right in (half, shared)
+        )
+        self.back_rows = self.plain.bind(self.n_y, self.k_x, self.k_y, self.in_y_t, z, half)
+        self.back_columns = self.ragged.bind(self.n_y, self.n_x, self.k_x, half, self.in_x, model)
+
+    def to_frequencies(self, mix: Contraction, k, left: Matrix, right: Matrix):
+        """The product Z = D o (left right), left (ky, k), right (k, kx); `mix` may conjugate D."""
+        z, d = self.matrix("frequencies"), self.tables(self.transfer)
+        return mix.bind(self.k_y, self.k_x, k, left, right, z, d, self.n_bands)
+
+    def analyse(self, x: ImageBatch, n, spread=False):
+        """Z = D o (Ty I1 Tx) for `n` images, into scratch "frequencies".
 
         spread: the images are n / n_bands, each of which is seen in every band
         """
-        half = self._scratch("half", self.n_y)
-        in_x_t = self.in_x_t._replace(div=1) if spread else self.in_x_t
-        self.first(
-            self.n_y,
-            self.k_x,
-            self.n_x,
-            n // self.n_bands if spread else n,
-            images.matrix(self.axes),
-            in_x_t,
-            half,
-        )
         if spread:
-            half = half._replace(div=self.n_bands)
-        self.to_spectrum(self.mix, self.n_y, self.in_y, half, n)
+            self.in_columns_once(n // self.n_bands, a=x)
+            self.in_rows_shared(n)
+        else:
+            self.in_columns(n, a=x)
+            self.in_rows(n)
 
-    def to_spectrum(self, mix: Contraction, k, left: Matrix, right: Matrix, n):
-        """Z = D o (left right) over k terms, into scratch "spectrum"; `mix` may conjugate D."""
-        mix(
-            self.k_y,
-            self.k_x,
-            k,
-            n,
-            left,
-            right,
-            self._scratch("spectrum"),
-            self._epilogue(self.spectra),
-            self.n_bands,
-        )
+    def synthesise(self, x: ImageBatch, n):
+        """I1 = Ty^T Z Tx^T of `n` images, Z in scratch "frequencies": the end of every adjoint."""
+        self.back_rows(n)
+        self.back_columns(n, c=x)
 
-    def synthesise(self, images: Images, n):
-        """I = Ty^T Z Tx^T of `n` images, from scratch "spectrum": the model end of the adjoint."""
-        half, z = self._scratch("half", self.n_y), self._scratch("spectrum")
-        self.plain(self.n_y, self.k_x, self.k_y, n, self.in_y_t, z, half)
-        self.ragged(self.n_y, self.n_x, self.k_x, n, half, self.in_x, images.matrix(self.axes))
+    def matrix(self, name, rows=None) -> Matrix:
+        """Intermediate matrices, with all their rows or the first ones of each."""
+        array = self.scratch[name]
+        return Matrix(array.base_data, array.shape[2], (rows or array.shape[1]) * array.shape[2])
+
+    def tables(self, array):
+        """Tables (plans, bands, ...) of an epilogue as `Contraction.bind` takes them."""
+        stride = math.prod(array.shape[1:]) if len(self.plans) > 1 else 0
+        return array.base_data, stride, math.prod(array.shape[2:])
+
+    def whole_groups(self, n):
+        """`n` pixels of a line rounded up to whole groups of work-items."""
+        return -(-n // self.tuning.line_group) * self.tuning.line_group
 
     def _table(self, tables, *shape) -> Matrix:
         """Host tables, one per plan, zero-padded to a common shape, on the device."""
@@ -138,15 +141,3 @@ class Executor:
             item[tuple(slice(n) for n in table.shape)] = table
         stride = math.prod(shape) if len(tables) > 1 else 0
         return Matrix(self.device.put(host).base_data, shape[-1], stride, div=self.n_bands)
-
-    def _scratch(self, name, rows=None) -> Matrix:
-        array = self.scratch[name]
-        return Matrix(array.base_data, array.shape[2], (rows or array.shape[1]) * array.shape[2])
-
-    def _epilogue(self, array):
-        stride = math.prod(array.shape[1:]) if len(self.plans) > 1 else 0
-        return array.base_data, stride, math.prod(array.shape[2:])
-
-
-def whole_groups(n):
-    return -(-n // GROUP) * GROUP

@@ -8,22 +8,18 @@ import warnings
 
 import numpy as np
 
+from ..device.contraction import ImageBatch
 from ..sky.grid import Grid
 from ..sky.psf import PSF
 from ..sky.psf_checks import PSFWarning
 from .affine import AffineExecutor
 from .aligned import AlignedExecutor
 from .distorted import DistortedExecutor
-from .executor import Images
 from .linop import LinOp
 from .plan import Plan, Precision, make_plan
 from .transfer import DIVISION_FLOOR
 
 PATHS = {"aligned": AlignedExecutor, "affine": AffineExecutor, "distorted": DistortedExecutor}
-# Intermediate matrices of one launch group [bytes]: in a CPU's cache they are read back at speed; a
-# GPU wants the whole batch in flight.
-GROUP_BYTES = {"CPU": 4 << 20}
-GROUP_BYTES_OTHER = 1 << 30
 # Amplification |D| / |det A| worth telling, above the few per cent of PSFs that nearly agree, and
 # the share of the observed PSF's power that the floor of the division may take untold.
 NOISY_GAIN, FLOORED_POWER = 2.0, 1e-3
@@ -114,7 +110,7 @@ class Resampler(LinOp):
         self.plans, self.kind = plans, first.kind
         self._path = PATHS[first.kind](self.device, self.dtype, plans)
         per_image = sum(rows * ld for rows, ld in self._path.scratch_shapes().values())
-        budget = GROUP_BYTES.get(self.device.kind, GROUP_BYTES_OTHER)
+        budget = self._path.tuning.group_bytes
         self._group = max(1, budget // (per_image * self.dtype.itemsize * first.n_bands))
         self.shift = shift
 
@@ -131,7 +127,8 @@ class Resampler(LinOp):
         self._shift = np.broadcast_to(shift, expected).copy()
         self._shift.flags.writeable = False  # a change must come through this setter
         self._identity = all(p.identity for p in self.plans) and not self._shift.any()
-        self._path.set_spectra([p.shifted(s) for p, s in zip(self.plans, self._shift, strict=True)])
+        transfer = [p.shifted(s) for p, s in zip(self.plans, self._shift, strict=True)]
+        self._path.set_transfer(transfer)
 
     @property
     def covered(self):
@@ -178,7 +175,11 @@ class Resampler(LinOp):
         self._path.reserve(group * n_bands)
         for start in range(0, batch, group):
             n = min(group, batch - start) * n_bands
-            chain(_images(source, start, shape_source), _images(target, start, shape_target), n)
+            chain(
+                ImageBatch.of(source, start * math.prod(shape_source[:-2])),
+                ImageBatch.of(target, start * math.prod(shape_target[:-2])),
+                n,
+            )
 
 
 def noise_warnings(report):
@@ -196,8 +197,3 @@ def noise_warnings(report):
             f"than {DIVISION_FLOOR:g} of its light: the division is floored there"
         )
     return told
-
-
-def _images(array, start, shape) -> Images:
-    offset = array.offset // array.dtype.itemsize + start * math.prod(shape)
-    return Images(array.base_data, offset, shape[1:])

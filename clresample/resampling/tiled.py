@@ -7,15 +7,13 @@ from dataclasses import replace
 import numpy as np
 from tqdm import tqdm
 
+from ..device.tuning import Tuning
 from ..sky.grid import Grid
 from ..sky.psf import PSF
 from .linop import LinOp
 from .plan import Precision, is_identity, make_plan
 from .resampler import Resampler
 from .tile_layout import KINDS, make_groups
-
-# [bytes] of device memory unless told otherwise; the quickest tiles of most instruments take less
-MEMORY = 1 << 30
 
 
 class TiledResampler(LinOp):
@@ -60,7 +58,7 @@ class TiledResampler(LinOp):
     ):
         n_bands = max(psf_in.n_bands, psf_out.n_bands)
         super().__init__(device, dtype, (n_bands, *grid_in.shape), (n_bands, *grid_out.shape))
-        self.memory = min(MEMORY, self.device.memory // 4) if memory is None else memory
+        self.memory = Tuning.of(self.device, dtype).memory if memory is None else memory
         self.shift, self.progress = shift, progress
         self.psf_in, self.psf_out, self.precision = psf_in, psf_out, Precision.of(dtype)
         self.groups = make_groups(

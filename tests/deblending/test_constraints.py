@@ -3,9 +3,9 @@ and is a prox or a projection where it says so."""
 
 import numpy as np
 import pytest
-from scipy.optimize import nnls
+from helpers.morphologies import DTYPES, apply, eps, many_boxes, morphologies
 
-from clresample.deblending.solver import prox_launches, reference_prox as ref
+from clresample.deblending.solver import reference_prox as ref
 from clresample.deblending.solver.boxes import Boxes
 from clresample.deblending.solver.constraints import (
     L0,
@@ -21,37 +21,10 @@ from clresample.deblending.solver.constraints import (
 )
 from clresample.testing import check_prox
 
-# Odd, even, non-square, thin, one pixel; centres in the middle, off it, on edges and in corners.
-SHAPES = [(21, 21), (12, 17), (17, 12), (9, 9), (8, 13), (1, 1), (1, 7), (6, 1), (2, 2), (30, 5)]
-CENTERS = [(10, 10), (5, 8), (9, 3), (0, 4), (7, 12), (0, 0), (0, 2), (5, 0), (1, 0), (29, 2)]
-KINDS = [MonotoneWeights.ANGLE, MonotoneWeights.FLAT, MonotoneWeights.NEAREST]
-DTYPES = [np.float32, np.float64]
-
 
 @pytest.fixture
 def boxes():
-    n = len(SHAPES)
-    return Boxes(np.arange(n) // 3, np.full((n, 2), -4), np.array(SHAPES), np.array(CENTERS))
-
-
-def morphologies(boxes, dtype, seed=5):
-    """A galaxy with a neighbour in noise for each box."""
-    rng = np.random.default_rng(seed)
-    images = []
-    for shape, center in zip(boxes.shape, boxes.center, strict=True):
-        y, x = np.indices(shape) - center[:, None, None]
-        image = np.exp(-np.hypot(y, 1.3 * x + 0.2 * y) / 3) + 0.5 * np.exp(-np.hypot(y - 5, x - 4))
-        images.append((image + 0.1 * rng.normal(size=shape)).astype(dtype))
-    return images
-
-
-def apply(device, prox, boxes, images, dtype=np.float32, **options):
-    """What the operator makes of images on the device."""
-    if dtype == np.float64 and not device.has_fp64:
-        pytest.skip(f"{device.name} has no double precision")
-    flat = device.put(boxes.pack(images, dtype=dtype))
-    prox.prox(flat, boxes.put(device), **options)
-    return boxes.unpack(device.get(flat))
+    return many_boxes()
 
 
 def alone(device, prox, shape, center, dtype=np.float64, step=1.0):
@@ -87,65 +60,6 @@ def test_answers_as_the_reference(device, boxes, case, dtype):
     for image, center, got in zip(images, boxes.center, found, strict=True):
         # A few roundings a pixel, in sums of a few hundred pixels.
         np.testing.assert_allclose(got, reference(image, center), rtol=0, atol=eps(dtype, image))
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("gradient", [0, 0.1])
-@pytest.mark.parametrize("weights", KINDS)
-def test_monotone_is_the_sequential_sweep(device, boxes, weights, gradient, dtype):
-    images = morphologies(boxes, dtype)
-    prox = Monotone(weights=weights, gradient=gradient)
-    found = apply(device, prox, boxes, images, dtype)
-    for image, center, got in zip(images, boxes.center, found, strict=True):
-        want = ref.monotone_sweep(image, center, weights, gradient)
-        np.testing.assert_allclose(got, want, rtol=0, atol=eps(dtype, image))
-        assert ref.monotone_violation(got, center, weights, gradient).max() <= eps(dtype, image)
-
-
-def eps(dtype, image):
-    return 16 * np.finfo(dtype).eps * max(1, abs(image).max())
-
-
-def test_groups_of_a_gpu(device, boxes, monkeypatch):
-    """64 work-items a source with barriers, whatever the device, answer as one work-item does."""
-    images = morphologies(boxes, np.float32)
-    for prox in (
-        lambda: Chain(Symmetry(), Monotone(gradient=0.1), SumNorm(), MaxNorm()),
-        lambda: MonotoneProjection(weights=MonotoneWeights.FLAT),
-    ):
-        monkeypatch.setattr(prox_launches, "GROUP", {device.kind: 64})
-        many = apply(device, prox(), boxes, images)
-        monkeypatch.setattr(prox_launches, "GROUP", {device.kind: 1})
-        for a, b in zip(many, apply(device, prox(), boxes, images), strict=True):
-            np.testing.assert_allclose(a, b, rtol=0, atol=3e-6)
-
-
-@pytest.mark.parametrize("weights", KINDS)
-def test_level_order_is_safe(weights):
-    """Every neighbour that counts has a smaller level, and lies nearer to the centre."""
-    shape, center = (23, 31), (9, 20)
-    y, x = np.indices(shape) - np.array(center)[:, None, None]
-    w = ref.monotone_weights(shape, center, weights)
-    for weight, (dy, dx) in zip(w, ref.NEIGHBOURS, strict=True):
-        assert (level(y + dy, x + dx) < level(y, x))[weight > 0].all()
-        assert (np.hypot(y + dy, x + dx) < np.hypot(y, x))[weight > 0].all()
-    total = w.sum(0)
-    assert total[center] == 0
-    np.testing.assert_allclose(np.delete(total.ravel(), 9 * 31 + 20), 1)
-
-
-def level(y, x):
-    return 2 * np.maximum(abs(y), abs(x)) + np.minimum(abs(y), abs(x))
-
-
-def test_weights_by_hand():
-    """At (dy, dx) = (0, 3), in the order of NEIGHBOURS: west, and north-west and south-west."""
-    w = {kind: ref.monotone_weights((9, 9), (4, 4), kind)[:, 4, 7] for kind in KINDS}
-    np.testing.assert_allclose(w[MonotoneWeights.FLAT], np.array([1, 0, 0, 1, 0, 1, 0, 0]) / 3)
-    np.testing.assert_allclose(w[MonotoneWeights.NEAREST], [0, 0, 0, 1, 0, 0, 0, 0])
-    root = 0.5**0.5
-    want = np.array([root, 0, 0, 1, 0, root, 0, 0]) / (1 + 2 * root)
-    np.testing.assert_allclose(w[MonotoneWeights.ANGLE], want)
 
 
 PROXES = {
@@ -227,64 +141,6 @@ def test_check_sees_expansion_alone():
         check_prox(*args, np.random.default_rng(2))
 
 
-def exact_projection(y, center, weights, gradient, positive):
-    """By the dual, min |B^T l (- m) - y| with l, m >= 0, solved by active sets: exact, and slow."""
-    n = y.size
-    rows = [
-        ref.monotone_violation(unit.reshape(y.shape), center, weights, gradient).ravel()
-        for unit in np.eye(n)
-    ]  # column j of B is B e_j, so this is B^T
-    matrix = np.array(rows)
-    if positive:
-        matrix = np.hstack([matrix, -np.eye(n)])
-    dual, _ = nnls(matrix, y.ravel())
-    return (y.ravel() - matrix @ dual).reshape(y.shape)
-
-
-@pytest.mark.parametrize("positive", [False, True])
-@pytest.mark.parametrize("weights", KINDS)
-def test_projection_is_exact(device, boxes, weights, positive):
-    """Reference against active sets, device against reference."""
-    images = morphologies(boxes, np.float64)
-    prox = MonotoneProjection(
-        weights=weights, gradient=0.05, positive=positive, n_iterations=5000, tolerance=1e-7
-    )
-    found = apply(device, prox, boxes, images, np.float32)
-    for image, center, got in zip(images, boxes.center, found, strict=True):
-        want, bound = ref.monotone_projection(image, center, weights, 0.05, positive=positive)
-        assert bound <= 1e-7 * np.linalg.norm(image)
-        # float32, and an iteration that stops some 100 moves of 1e-7 before the end
-        assert np.linalg.norm(got - want) <= 2e-5 * np.linalg.norm(image)
-        if image.size < 100:
-            exact = exact_projection(image, center, weights, 0.05, positive)
-            np.testing.assert_allclose(want, exact, rtol=0, atol=1e-6)
-
-
-def test_projection_as_given_is_near(device):
-    """The default iterations and tolerance reach the error that the class states, in much noise."""
-    box = Boxes([0], [[0, 0]], [[41, 41]])
-    y, x = np.indices((41, 41)) - 20
-    noise = np.random.default_rng(8).normal(size=(41, 41))
-    image = (np.exp(-np.hypot(y, 1.3 * x + 0.2 * y) / 4) + 0.2 * noise).astype(np.float32)
-    want, _ = ref.monotone_projection(image.astype(float), (20, 20), tolerance=1e-5)
-    (found,) = apply(device, MonotoneProjection(), box, [image])
-    assert np.linalg.norm(found - want) <= 1e-4 * np.linalg.norm(image)
-
-
-def test_projection_goes_on_where_it_stopped(device, boxes):
-    """Many short calls on the same image end where one long call does."""
-    images = morphologies(boxes, np.float32)
-    short = MonotoneProjection(n_iterations=8, tolerance=1e-7)
-    placed = boxes.put(device)
-    for _ in range(100):
-        flat = device.put(boxes.pack(images))
-        short.prox(flat, placed)
-    found = boxes.unpack(device.get(flat))
-    whole = apply(device, MonotoneProjection(n_iterations=5000, tolerance=1e-7), boxes, images)
-    for a, b in zip(found, whole, strict=True):
-        assert np.linalg.norm(a - b) <= 1e-4 * np.linalg.norm(b) + 1e-6
-
-
 @pytest.mark.parametrize(
     "prox", [Chain(Positivity(), Monotone()), MonotoneProjection(n_iterations=3), MaxNorm()]
 )
@@ -313,7 +169,7 @@ def test_parameters_per_source(device, boxes):
 
 
 def test_factors_keep_the_model(device, boxes):
-    """What was divided out is told, over both launches of a chain with a projection inside."""
+    """What was divided out is returned, over both launches of a chain with a projection inside."""
     images = [abs(image) + 0.1 for image in morphologies(boxes, np.float32)]
     images[3][:] = 0
     for prox in (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.scenes import BOXES, problem
 
-from clresample.deblending.solver import prox_launches, reference_scene as ref
+from clresample.deblending.solver import reference_scene as ref
 from clresample.deblending.solver.constraints import Chain, MaxNorm, Monotone, Positivity
 from clresample.deblending.solver.engine import BETA1, DAMPING, HISTORY, Engine
 from clresample.deblending.solver.prior import Prior
@@ -34,7 +34,6 @@ def build(request, device, monkeypatch):
         if device.kind != "CPU":
             pytest.skip("this device's own")
         monkeypatch.setattr(device, "kind", "GPU")
-        monkeypatch.setattr(prox_launches, "GROUP", {})
     return device
 
 

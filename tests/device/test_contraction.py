@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from helpers.tuning import tune
 
 from clresample.device import contraction as contract
-from clresample.device.contraction import Contraction, Matrix, padded
+from clresample.device.contraction import Contraction, ImageBatch, Matrix, padded
 
 TYPES = (np.float32, np.float64)
 every_type = pytest.mark.parametrize("dtype", TYPES, ids=lambda t: t.__name__)
@@ -22,7 +23,7 @@ def tile(request, monkeypatch):
             "pairs": (2, 3, 8),
         }[request.param]
         chosen = {"VW": vector, "NV": vectors, "MR": rows, "WGX": group, "WGY": size}
-        monkeypatch.setattr(contract, "_tile", lambda device, dtype: chosen)
+        tune(monkeypatch, tile=chosen)
 
 
 def random(*shape, seed=0):
@@ -56,11 +57,11 @@ def test_product(device, tile, shape, dtype):
     right = put_right(device, b, dtype)
     n_pad = right.shape[-1]
     result = device.put(np.full((3, m + 2, n_pad), 7.0), dtype)
-    Contraction(device, dtype)(
-        m, n, k, 3, Matrix(device.put(a, dtype).base_data, k, m * k),
+    Contraction(device, dtype).bind(
+        m, n, k, Matrix(device.put(a, dtype).base_data, k, m * k),
         Matrix(right.base_data, n_pad, k * n_pad),
         Matrix(result.base_data, n_pad, (m + 2) * n_pad),
-    )  # fmt: skip
+    )(3)  # fmt: skip
     found = device.get(result)
     check(found[:, :m, :n], a @ b, dtype)
     assert not found[:, :m, n:].any()  # whole vectors, zero beyond n
@@ -76,14 +77,14 @@ def test_one_right_factor_for_all_and_tables_shared_by_bands(device, dtype):
     n_pad = right.shape[-1]
     result = device.empty((6, m, n_pad), dtype)
     target = Matrix(result.base_data, n_pad, m * n_pad)
-    product = Contraction(device, dtype)
-    product(m, n, k, 6, Matrix(left.base_data, k, m * k), Matrix(right.base_data, n_pad), target)
+    bind = Contraction(device, dtype).bind
+    bind(m, n, k, Matrix(left.base_data, k, m * k), Matrix(right.base_data, n_pad), target)(6)
     check(device.get(result)[..., :n], a @ b, dtype)
     # scene 0 has tables a[0], b[0] for its three bands, scene 1 has a[1], b[1]
     b = random(2, k, n)
     right = put_right(device, b, dtype)
-    product(m, n, k, 6, Matrix(left.base_data, k, m * k, n_bands),
-            Matrix(right.base_data, n_pad, k * n_pad, n_bands), target)  # fmt: skip
+    bind(m, n, k, Matrix(left.base_data, k, m * k, n_bands),
+         Matrix(right.base_data, n_pad, k * n_pad, n_bands), target)(6)  # fmt: skip
     check(device.get(result)[..., :n], np.repeat(a[:2] @ b, n_bands, axis=0), dtype)
 
 
@@ -95,11 +96,11 @@ def test_a_callers_arrays_read_and_written_transposed(device, tile, dtype):
     source, right = device.put(images, dtype), put_right(device, b, dtype)
     result = device.put(np.full((5, n, m), 7.0), dtype)
     # from the second image on, into the second place on: offsets in elements
-    Contraction(device, dtype, strided=True, ragged=True)(
-        m, n, k, 3, Matrix(source.base_data, 1, k * m, step=m, offset=k * m),
+    Contraction(device, dtype, strided=True, ragged=True).bind(
+        m, n, k, Matrix(source.base_data, 1, k * m, step=m, offset=k * m),
         Matrix(right.base_data, right.shape[-1]),
         Matrix(result.base_data, 1, n * m, step=m, offset=n * m),
-    )  # fmt: skip
+    )(3)  # fmt: skip
     found = device.get(result)
     check(found[1:4], (images[1:].swapaxes(1, 2) @ b).swapaxes(1, 2), dtype)
     assert (found[[0, 4]] == 7).all()
@@ -112,14 +113,46 @@ def test_a_callers_rows_of_any_length(device, dtype):
     a, b = random(2, m, k), random(1, k, n)
     right = put_right(device, b, dtype)
     result = device.put(np.full((2, m, n + 3), 7.0), dtype)
-    Contraction(device, dtype, ragged=True)(
-        m, n, k, 2, Matrix(device.put(a, dtype).base_data, k, m * k),
+    Contraction(device, dtype, ragged=True).bind(
+        m, n, k, Matrix(device.put(a, dtype).base_data, k, m * k),
         Matrix(right.base_data, right.shape[-1]),
         Matrix(result.base_data, n + 3, m * (n + 3), offset=1),
-    )  # fmt: skip
+    )(2)  # fmt: skip
     found = device.get(result)
     check(found[..., 1:-2], a @ b, dtype)
     assert (found[..., [0, -2, -1]] == 7).all()
+
+
+@every_type
+@pytest.mark.parametrize("axes", [(0, 1), (1, 0)], ids=["rows", "columns"])
+def test_one_product_for_many_callers(device, axes, dtype):
+    """Bound to shapes, each call names its images: every third from the second on, and all."""
+    need(device, dtype)
+    shape, k = (9, 7), 4
+    m, n = (shape[axis] for axis in axes)
+    images, b, c = random(8, *shape), random(1, n, k), random(1, k, n)
+    source, target = device.put(images, dtype), device.put(np.full((4, *shape), 7.0), dtype)
+    half = device.empty((8, m, padded(k)), dtype)
+    middle = Matrix(half.base_data, padded(k), m * padded(k))
+    b_device, c_device = (
+        Matrix(put_right(device, a, dtype).base_data, padded(a.shape[2])) for a in (b, c)
+    )
+    observed = ImageBatch.shaped(*shape).matrix(axes)
+    out_of = Contraction(device, dtype, ragged=True).bind(m, n, k, middle, c_device, observed)
+    for every, first in ((3, 1), (1, 0)):
+        model = ImageBatch.shaped(*shape, every=every).matrix(axes)
+        into = Contraction(device, dtype, strided=axes != (0, 1)).bind(
+            m, k, n, model, b_device, middle
+        )
+        view = source[first:].reshape(8 - first, *shape)  # may start inside its buffer
+        for batch in (ImageBatch.of(source, first, every), ImageBatch.of(view, 0, every)):
+            into(2, a=batch)
+            out_of(2, c=ImageBatch.of(target, 1))
+            chosen = images[first::every][:2]
+            truth = (chosen if axes == (0, 1) else chosen.swapaxes(1, 2)) @ b @ c
+            found = device.get(target)
+            check(found[1:3], truth if axes == (0, 1) else truth.swapaxes(1, 2), dtype)
+            assert (found[[0, 3]] == 7).all()
 
 
 def mixed(quads, d_plus, d_minus):
@@ -149,11 +182,11 @@ def test_mix_multiplies_by_the_spectra(device, tile, n_tables, adjoint, dtype):
     tables = device.put(planes, dtype)
     result = device.empty((batch, 2 * h_y, n_pad), dtype)
     band = h_y * 2 * n_pad
-    Contraction(device, dtype, epilogue="MIX", adjoint=adjoint)(
-        2 * h_y, 2 * h_x, k, batch, Matrix(device.put(a, dtype).base_data, k),
+    Contraction(device, dtype, epilogue="MIX", adjoint=adjoint).bind(
+        2 * h_y, 2 * h_x, k, Matrix(device.put(a, dtype).base_data, k),
         Matrix(right.base_data, n_pad, k * n_pad), Matrix(result.base_data, n_pad, 2 * h_y * n_pad),
         (tables.base_data, n_bands * band if n_tables > 1 else 0, band), n_bands,
-    )  # fmt: skip
+    )(batch)  # fmt: skip
     d = np.broadcast_to(d, (2, 2, n_bands, h_y, h_x)).reshape(2, batch, h_y, h_x)
     truth = mixed(a @ b, *(d.conj() if adjoint else d))
     check(device.get(result)[..., : 2 * h_x], truth, dtype)
@@ -173,11 +206,11 @@ def test_twist_rotates_cos_and_sin_rows(device, adjoint, dtype):
     planes = np.zeros((h_y, 2, n_pad))
     planes[..., :n] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     result = device.empty((3, 2 * h_y, n_pad), dtype)
-    Contraction(device, dtype, epilogue="TWIST", adjoint=adjoint)(
-        2 * h_y, n, k, 3, Matrix(device.put(a, dtype).base_data, k, 2 * h_y * k),
+    Contraction(device, dtype, epilogue="TWIST", adjoint=adjoint).bind(
+        2 * h_y, n, k, Matrix(device.put(a, dtype).base_data, k, 2 * h_y * k),
         Matrix(right.base_data, n_pad, k * n_pad), Matrix(result.base_data, n_pad, 2 * h_y * n_pad),
         (device.put(planes, dtype).base_data, 0, 0), 1,
-    )  # fmt: skip
+    )(3)  # fmt: skip
     rows = a @ b
     turned = (rows[:, 0::2] - 1j * rows[:, 1::2]) * np.exp((-1j if adjoint else 1j) * angle)
     truth = np.stack([turned.real, -turned.imag], axis=2).reshape(rows.shape)
@@ -192,10 +225,10 @@ def test_long_sums_keep_their_accuracy(device, monkeypatch):
     result = device.empty((8, 16), np.float32)
 
     def error():
-        Contraction(device, np.float32)(
-            8, 16, k, 1, Matrix(left.base_data, k), Matrix(right.base_data, 16),
+        Contraction(device, np.float32).bind(
+            8, 16, k, Matrix(left.base_data, k), Matrix(right.base_data, 16),
             Matrix(result.base_data, 16),
-        )  # fmt: skip
+        )(1)  # fmt: skip
         truth = a.astype(float) @ b.astype(float)
         return np.linalg.norm(device.get(result) - truth) / np.linalg.norm(truth)
 

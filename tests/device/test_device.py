@@ -8,35 +8,9 @@ import pytest
 from helpers.checkout import ROOT, run_python
 
 from clresample import DeviceError, list_devices
-from clresample.device import device as device_module, discovery as discover, program
+from clresample.device import device as device_module, discovery as discover
 
 POCL = "Portable Computing Language"
-SCALE = """#include "common.h"
-#ifndef OFFSET
-#define OFFSET 0
-#endif
-__kernel void scale(__global const REAL *x, __global REAL *out)
-{
-    const size_t i = get_global_id(0);
-    out[i] = 2 * x[i] + OFFSET;
-}
-"""
-BROKEN = """__kernel void early(__global float *x) { x[0] = absent; }
-#include "common.h"
-__kernel void late(__global REAL *x) { x[0] = missing; }
-"""
-
-
-@pytest.fixture
-def kernels(tmp_path, monkeypatch):
-    """A folder of kernels of our own, with the project's common.h."""
-    common = (ROOT / "kernels" / "common.h").read_text()
-    for file, source in {"common.h": common, "scale.cl": SCALE, "broken.cl": BROKEN}.items():
-        (tmp_path / file).write_text(source)
-    monkeypatch.setattr(program, "kernels_folder", lambda: tmp_path)
-    program.read_kernel.cache_clear()
-    yield tmp_path
-    program.read_kernel.cache_clear()
 
 
 def pocl():
@@ -155,32 +129,18 @@ def test_double_precision_is_found(device):
 
 
 @pytest.mark.smoke
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_a_kernel_in_either_precision(device, kernels, dtype):
-    if dtype == np.float64 and not device.has_fp64:
-        with pytest.raises(DeviceError, match="no double precision: use float32"):
-            device.kernel("scale.cl", "scale", dtype=dtype)
-        return
-    x = np.linspace(0, 1, 130).astype(dtype)
-    array, out = device.put(x), device.zeros(130, dtype)
-    for offset, expected in ((None, 2 * x), (3, 2 * x + 3)):
-        kernel = device.kernel("scale.cl", "scale", dtype=dtype, OFFSET=offset)
-        kernel.set_args(array.data, out.data)
-        device.launch(kernel, (130,))
-        np.testing.assert_allclose(device.get(out), expected, rtol=np.finfo(dtype).eps)
+def test_macros_make_another_build(device, kernels):
+    x = np.linspace(0, 1, 130).astype(np.float32)
+    array, out = device.put(x), device.zeros(130, np.float32)
+    for offset, expected in ((None, 2 * x), (3, 2 * x + 3), (False, 2 * x), (True, 2 * x + 1)):
+        device.launcher("scale.cl", "scale", OFFSET=offset)((130,), x=array, out=out)
+        np.testing.assert_allclose(device.get(out), expected, rtol=np.finfo(np.float32).eps)
     device.finish()
-
-
-def test_equal_requests_share_a_program_and_not_a_kernel(device, kernels):
-    a, b = (device.kernel("scale.cl", "scale", OFFSET=5, FAST=True) for _ in range(2))
-    assert a.program == b.program
-    assert a is not b
-    assert device.kernel("scale.cl", "scale", OFFSET=6, FAST=True).program != a.program
 
 
 def test_a_failed_build_shows_the_compilers_log(device, kernels):
     with pytest.raises(DeviceError) as failure:
-        device.kernel("broken.cl", "late", SIDE=7)
+        device.launcher("broken.cl", "late", SIDE=7)
     message = str(failure.value)
     assert f"broken.cl does not build on {device.name}" in message
     assert "'SIDE': 7" in message
@@ -189,11 +149,6 @@ def test_a_failed_build_shows_the_compilers_log(device, kernels):
     if device.platform == POCL:  # the lines of the file, not of what was compiled
         assert "broken.cl:1:" in message
         assert "broken.cl:3:" in message
-
-
-def test_dtype_is_one_of_two(device):
-    with pytest.raises(ValueError, match="dtype is int32; .* float32 or float64"):
-        device.kernel("contract.cl", "contract", dtype=np.int32)
 
 
 # ---- under PoCL's settings ----

@@ -18,10 +18,11 @@ from helpers.geometries import (
     psfs,
     turn,
 )
+from helpers.tuning import tune
 
 from clresample import DeviceError
 from clresample.resampling import reference
-from clresample.resampling.paper import factors, sincs, slabs
+from clresample.resampling.paper import factors, sincs
 from clresample.resampling.paper.resampler import PaperResampler
 from clresample.resampling.resampler import Resampler
 from clresample.resampling.transfer import WRAP_TOLERANCE
@@ -176,8 +177,7 @@ def test_a_batch_is_its_items_one_by_one(device, geometry):
 def test_slabs_and_chunks_change_nothing_but_rounding(device, geometry, monkeypatch):
     mapping, (x, y) = GEOMETRIES[geometry](), (noise((2, 31, 26)), noise((2, 13, 18)))
     whole = split(device, mapping, *psfs())
-    monkeypatch.setattr(slabs, "CHUNK", 100)
-    monkeypatch.setitem(factors.SLAB_BYTES, device.kind, 1 << 15)
+    tune(monkeypatch, chunk_terms=100, slab_bytes=1 << 15)
     cut = split(device, mapping, *psfs())
     assert len(cut._factors.slabs) > 3 and cut._factors.slabs[0].n_chunks > 3
     assert distance(cut(x), whole(x)) < 1e-6
@@ -251,18 +251,19 @@ def test_a_fault_is_seen(device, fault, geometry, monkeypatch):
     check(op, mapping, *SAMPLED.values(), images, 0)
     check_adjoint(op, rng)
     if fault == "wave":  # the model shifted by a hundredth of a pixel: consistent, but wrong
-        parts.set_spectra(op._spectra, np.array([0.01, 0]))
+        parts.set_transfer(op._spectra, np.array([0.01, 0]))
     elif fault == "kernel":  # a term of the kernel's spectrum by a thousandth
         d = np.array(op._spectra)
         d[:, 1, 1] *= 1.001
-        parts.set_spectra(d, op.shift)
+        parts.set_transfer(d, op.shift)
     elif fault == "transpose":  # forward and adjoint with different kernels
         kernel = parts.kernels[0][0][0]
         kernel[...] = 1.00001 * kernel
     elif fault == "mask":  # forward pixels outside the model
-        parts.covered = device.put(np.ones(mapping.shape_out, np.uint8))
+        parts.pixels.covered = device.put(np.ones(mapping.shape_out, np.uint8))
     elif fault == "sum":  # the model's lowest frequencies, or first row, taken for the next
         parts.slabs[0].first += 1
+    parts.bound.clear()  # what was bound to the right ones
     with pytest.raises(AssertionError):
         check(op, mapping, *SAMPLED.values(), images, 0)
         check_adjoint(op, rng)

@@ -6,14 +6,15 @@ import math
 
 import numpy as np
 
-from ...device.contraction import Matrix
+from ...device.contraction import ImageBatch, Matrix
 from ...sky.grid import Grid
 from ...sky.psf import PSF
 from ..linop import LinOp
 from ..plan import count_bands
 from ..transfer import wrap_radius
-from .factors import Factors, Images, lanes, trigonometric
+from .factors import Factors
 from .sincs import sinc_difference, sinc_table
+from .tables import both_ways, trigonometric
 
 
 class PaperResampler(LinOp):
@@ -100,7 +101,7 @@ class PaperResampler(LinOp):
             raise ValueError(f"shift is {shift}, must be (2,) finite numbers")
         self._shift = np.broadcast_to(shift, 2).copy()
         self._shift.flags.writeable = False  # a change must come through this setter
-        self._factors.set_spectra(self._spectra, self._shift)
+        self._factors.set_transfer(self._spectra, self._shift)
 
     def _forward(self, x, out):
         self._run(self._factors.forward, x, out)
@@ -114,7 +115,8 @@ class PaperResampler(LinOp):
         self._factors.reserve(group)
         for start in range(0, batch, group):
             for band in range(n_bands):
-                ends = (Images.of(array, start, band) for array in (source, target))
+                first = start * n_bands + band
+                ends = (ImageBatch.of(array, first, n_bands) for array in (source, target))
                 chain(*ends, band, min(group, batch - start))
 
 
@@ -134,41 +136,42 @@ class AlignedFactors(Factors):
     def units(self):
         return self.n_y, 2 * self.h_x, 0
 
-    def set_spectra(self, d, shift):
-        """Both factors' tables from D (C, Ky, Kx), every observed pixel moved by `shift`."""
+    def make_kernels(self, d, shift):
+        """The waves of the steps i, and the factors P of each band and slab; see set_transfer."""
         (y, x), matrix = self.axes, self.mapping.matrix
         t = self.mapping.offset + shift
-        wave = self._wave(self.k_x, matrix[x, self.axis] * np.arange(self.n_i) + t[x])
-        self.waves = wave, wave  # a line's kernels use the second alone
+        wave = self.wave(self.k_x, matrix[x, self.axis] * np.arange(self.n_i) + t[x])
         p = np.fft.fftshift(np.fft.ifft(d, axis=1 + y), axes=1 + y).swapaxes(1 + y, 2)
         p = p[:, : self.h_x] * np.where(np.arange(self.h_x) == 0, 1, 2)[:, None] / self.k_x
-        p = self._table(np.stack([p.real, -p.imag], axis=2).reshape(len(d), 2 * self.h_x, -1))
+        p = self.table(np.stack([p.real, -p.imag], axis=2).reshape(len(d), 2 * self.h_x, -1))
         positions = matrix[y, 1 - self.axis] * np.arange(self.n_l) + t[y]
-        self.kernels = [[] for _ in d]
+        kernels = [[] for _ in d]
         for slab in self.slabs:
             n_sincs = slab.n_units + self.k_y - 1  # y + y_m: each row of the model one further on
             sincs = self.device.zeros((n_sincs, self.l_pad), self.dtype)
             sinc_table(
                 self.device, positions, slab.first - self.k_y // 2, n_sincs, sincs, 1, self.l_pad
             )
-            for i, kernels in enumerate(self.kernels):
-                kernel = self._new_kernel(slab)
-                self.plain(
+            for i, slabs in enumerate(kernels):
+                kernel = self.device.zeros((slab.n_rows, self.l_pad), self.dtype)
+                self.plain.bind(
                     self.unit_rows,
                     self.n_l,
                     self.k_y,
-                    slab.n_units,
                     Matrix(p.buffer, p.ld, offset=i * p.stride),
                     Matrix(sincs.base_data, self.l_pad, self.l_pad),
                     Matrix(kernel.base_data, self.l_pad, self.unit_rows * self.l_pad),
-                )
-                kernels.append(self._both_ways(kernel))
+                )(slab.n_units)
+                slabs.append(both_ways(self.device, kernel, self.n_l))
+        return (wave, wave), kernels  # a line's kernels use the second wave alone
 
-    def analyse(self, x: Images, n):
-        return self._columns(x, n)
+    def analyse(self, x: ImageBatch, n):
+        """Cos and sin sums of each model row (n, Ny, 2 Hx), into scratch "half"."""
+        self.to_half(n, a=x)
 
-    def synthesise(self, z, x: Images, n):
-        self._from_columns(z, x, n)
+    def synthesise(self, x: ImageBatch, n):
+        """The adjoint of `analyse`."""
+        self.from_half(n, c=x)
 
 
 class RotatedFactors(Factors):
@@ -189,38 +192,47 @@ class RotatedFactors(Factors):
     def prepare(self):
         super().prepare()
         in_y = trigonometric(self.n_y, self.k_y)
-        self.in_y, self.in_y_t = self._table(in_y), self._table(in_y.T)
+        self.in_y, self.in_y_t = self.table(in_y), self.table(in_y.T)
 
-    def set_spectra(self, d, shift):
-        """Both factors' tables from D (C, Ky, Kx), every observed pixel moved by `shift`."""
+    def make_kernels(self, d, shift):
+        """The waves of the steps i, and the factors P of each band and slab; see set_transfer."""
         a, b = self.mapping.matrix[:, self.axis], self.mapping.matrix[:, 1 - self.axis]
         t, k = self.mapping.offset + shift, (self.k_y, self.k_x)
         steps_i, steps_l = np.arange(self.n_i), np.arange(self.n_l)
-        self.waves = [self._wave(k[j], a[j] * steps_i + t[j]) for j in (0, 1)]
+        waves_i = [self.wave(k[j], a[j] * steps_i + t[j]) for j in (0, 1)]
         # conj(P), so that the sum of products is the real part: conj(D) and the opposite steps
-        waves = [self._wave(k[j], -b[j] * steps_l) for j in (0, 1)]
+        waves_l = [self.wave(k[j], -b[j] * steps_l) for j in (0, 1)]
         d = d[:, : self.h_y].conj() / (self.k_y * self.k_x)
         d[:, 1:] *= 2  # -nu as well
         plus, minus = d[:, :, : self.h_x], d[:, :, -np.arange(self.h_x)]
         weight = np.where(np.arange(self.h_x) == 0, 0.25, 0.5)  # nu_x = 0 is in both
-        self.kernels = []
+        kernels = []
         for p, m in zip(plus * weight, minus * weight, strict=True):
             sums = np.empty((self.h_y, 2, self.h_x, 2))  # as the model's: CC, CS; SC, SS
             sums[:, 0, :, 0], sums[:, 0, :, 1] = p.real + m.real, m.imag - p.imag
             sums[:, 1, :, 0], sums[:, 1, :, 1] = -p.imag - m.imag, m.real - p.real
-            z, kernels = self._table(sums.reshape(2 * self.h_y, -1)), []
+            z = self.table(sums.reshape(2 * self.h_y, -1))
+            kernels.append([])
+            n_cols = self.whole_lanes(self.n_l)
             for slab in self.slabs:
-                kernel = self._new_kernel(slab)
-                self._shift(self.shift, slab, z, waves, kernel, lanes(self.n_l), self.l_pad, 1)
-                kernels.append(self._both_ways(kernel))
-            self.kernels.append(kernels)
+                kernel = self.device.zeros((slab.n_rows, self.l_pad), self.dtype)
+                shift, _ = self.shifts.bind(slab, z, waves_l, kernel, n_cols, self.l_pad, 1)
+                shift()
+                kernels[-1].append(both_ways(self.device, kernel, self.n_l))
+        return waves_i, kernels
 
-    def analyse(self, x: Images, n):
-        z = self._scratch("spectra")
-        self.plain(self.z_rows, 2 * self.h_x, self.n_y, n, self.in_y_t, self._columns(x, n), z)
-        return z
+    def bind(self):
+        super().bind()
+        half, z, k = self.matrix("half"), self.matrix("frequencies"), 2 * self.h_x
+        self.to_frequencies = self.plain.bind(self.z_rows, k, self.n_y, self.in_y_t, half, z)
+        self.from_frequencies = self.plain.bind(self.n_y, k, self.z_rows, self.in_y, z, half)
 
-    def synthesise(self, z, x: Images, n):
-        half = self._scratch("half")
-        self.plain(self.n_y, 2 * self.h_x, self.z_rows, n, self.in_y, z, half)
-        self._from_columns(half, x, n)
+    def analyse(self, x: ImageBatch, n):
+        """Cos and sin sums along both axes (n, 2 Hy, 2 Hx), into scratch "frequencies"."""
+        self.to_half(n, a=x)
+        self.to_frequencies(n)
+
+    def synthesise(self, x: ImageBatch, n):
+        """The adjoint of `analyse`."""
+        self.from_frequencies(n)
+        self.from_half(n, c=x)

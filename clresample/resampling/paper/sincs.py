@@ -24,10 +24,16 @@ def sinc_table(device, positions, first, n, table, step_p, step_i):
     whole = np.rint(positions)
     part = device.put(positions - whole, table.dtype)
     whole = device.put(whole.astype(np.int32))
-    kernel = device.kernel("sinc.cl", "sinc", dtype=table.dtype)
-    kernel.set_scalar_arg_dtypes([np.int32, None, None, None, np.int32, np.int32])
-    kernel.set_args(first, whole.base_data, part.base_data, table.base_data, step_p, step_i)
-    device.launch(kernel, (n, len(positions)))
+    launch = device.launcher("sinc.cl", "sinc", dtype=table.dtype)
+    launch(
+        (n, len(positions)),
+        first=first,
+        whole=whole,
+        part=part,
+        table=table,
+        step_p=step_p,
+        step_i=step_i,
+    )
 
 
 def interpolate_psf(device, matrix, psf: PSF, n_fft, fine=1):
@@ -44,14 +50,13 @@ def interpolate_psf(device, matrix, psf: PSF, n_fft, fine=1):
     x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     q = x @ np.linalg.inv(matrix).T / psf.spacing
     (n_y, n_x), n_pad = psf.images.shape[1:], padded(psf.images.shape[2])
-    along_y, along_x = Contraction(device, dtype), device.kernel("warp.cl", "rowdot", dtype=dtype)
-    i = np.int32
-    along_x.set_scalar_arg_dtypes([i, i, i, i, None, np.uint64, None, None])
+    along_y, along_x = Contraction(device, dtype), device.launcher("warp.cl", "rowdot", dtype=dtype)
     result, n_block = np.empty((psf.n_bands, len(q))), min(POSITIONS, len(q))
     rows, columns, sums, values = (
         device.zeros(shape, dtype)
         for shape in ((n_block, n_y), (n_block, n_pad), (n_block, n_pad), (n_block,))
     )
+    along_x.bind(n_pad=n_pad, n_bands=1, n_tables=1, y=values, y_offset=0, T=sums, E=columns)
     for band, image in enumerate(psf.images):
         samples = device.put(np.pad(image, ((0, 0), (0, n_pad - n_x))), dtype)
         samples = Matrix(samples.base_data, n_pad)
@@ -61,9 +66,8 @@ def interpolate_psf(device, matrix, psf: PSF, n_fft, fine=1):
             sinc_table(device, block[:, 0], 0, n_y, rows, n_y, 1)
             sinc_table(device, block[:, 1], 0, n_x, columns, n_pad, 1)
             tall = Matrix(rows.base_data, n_y), samples, Matrix(sums.base_data, n_pad)
-            along_y(n, n_x, n_y, 1, *tall)
-            along_x.set_args(n, n_pad, 1, 1, values.base_data, 0, sums.base_data, columns.base_data)
-            device.launch(along_x, (n, 1))
+            along_y.bind(n, n_x, n_y, *tall)(1)
+            along_x((n, 1), n_positions=n)
             result[band, start : start + n] = device.get(values)[:n]
     return result.reshape(-1, *(fine * k for k in n_fft))
 

@@ -1,0 +1,53 @@
+/* Work-items that share one box, and loops over the pixels of a row.
+ *
+ * WG work-items make a group, one group a source: they share its pixels, and meet at SYNC(). With
+ * WG 1 there is no barrier at all, which suits CPUs; a GPU takes 64.
+ * FOR_X runs over a row of n pixels: all of them in one work-item (ROWS), or those of this one.
+ */
+#ifndef WG          /* work-items of a group */
+#define WG 1
+#endif
+#ifndef ROWS        /* 1: a work-item walks whole rows, which compilers for CPUs vectorise */
+#define ROWS 0
+#endif
+
+#if WG > 1
+#define SYNC() barrier(CLK_GLOBAL_MEM_FENCE | CLK_LOCAL_MEM_FENCE)
+#else
+#define SYNC()
+#endif
+
+#if ROWS
+#define FOR_X(x, n) for (int x = 0; x < (n); ++x)
+#else
+#define FOR_X(x, n) for (int x = (int)get_global_id(0); x < (n); x += (int)get_global_size(0))
+#endif
+
+/* The sum of a group's values, in the order of its work-items and the same for each of them.
+ * share: WG elements; all work-items must come here, with their lid = get_local_id(0). */
+static REAL group_sum(const REAL value, const int lid, __local REAL *share)
+{
+    REAL total = value;
+#if WG > 1
+    SYNC();                                  /* the values of an earlier sum have been read */
+    share[lid] = value;
+    SYNC();
+    total = share[0];
+    for (int k = 1; k < WG; ++k) total += share[k];
+#endif
+    return total;
+}
+
+/* The largest of a group's values, likewise. */
+static REAL group_max(const REAL value, const int lid, __local REAL *share)
+{
+    REAL most = value;
+#if WG > 1
+    SYNC();
+    share[lid] = value;
+    SYNC();
+    most = share[0];
+    for (int k = 1; k < WG; ++k) most = share[k] > most ? share[k] : most;
+#endif
+    return most;
+}

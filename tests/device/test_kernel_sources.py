@@ -1,0 +1,90 @@
+"""What every kernel source keeps to, so that it builds anywhere and can be read alone."""
+
+import re
+
+import numpy as np
+import pytest
+from helpers.checkout import ROOT
+
+from clresample.deblending.solver.boxes import COLUMNS
+from clresample.device.tuning import Tuning
+
+FILES = {path.name: path.read_text() for path in sorted((ROOT / "kernels").iterdir())}
+MAX_COLUMNS = 100
+# Set by the host for each build, see common.h; steps of a chain, which may be missing.
+NO_DEFAULT = {"USE_DOUBLE", *(f"STEP{k}" for k in range(8))}
+
+every_file = pytest.mark.parametrize("file", FILES)
+
+
+def code(text):
+    """A source without its comments."""
+    return re.sub(r"/\*.*?\*/", " ", text, flags=re.DOTALL)
+
+
+def stray_restricts(text):
+    """`restrict` that is not on an argument of a kernel: Oclgrind cannot build it."""
+    return re.sub(r"__kernel\b[^;{]*?\([^{]*?\)\s*\{", "", code(text)).count("restrict")
+
+
+def without_default(text):
+    """Macros that decide what is compiled, and have no value of their own."""
+    asked = re.findall(r"^#\s*(?:if|elif|ifdef)\b(.*)$", code(text), re.MULTILINE)
+    asked = {name for line in asked for name in re.findall(r"[A-Z][A-Z0-9_]+", line)}
+    return asked - set(re.findall(r"^#ifndef (\w+)", text, re.MULTILINE)) - NO_DEFAULT
+
+
+@every_file
+def test_lines_fit_a_page(file):
+    assert not [line for line in FILES[file].splitlines() if len(line) > MAX_COLUMNS]
+
+
+@every_file
+def test_restrict_is_on_kernels_own_arguments(file):
+    assert not stray_restricts(FILES[file])
+
+
+@every_file
+def test_every_macro_has_a_value_of_its_own(file):
+    text = FILES[file] + "".join(FILES[name] for name in re.findall(r'"(.+\.h)"', FILES[file]))
+    assert not without_default(text)
+
+
+@every_file
+def test_every_default_says_what_it_is(file):
+    lines = re.findall(r"^#ifndef .*$", FILES[file], re.MULTILINE)
+    assert all(re.fullmatch(r"#ifndef \w+\s+/\* .+ \*/", line) for line in lines)
+
+
+def test_columns_are_those_of_the_table():
+    names = re.search(r"enum \{ (.*?), N_COLUMNS \}", FILES["boxes.h"])[1].split(", ")
+    assert [name.lower() for name in names] == [column.split(" /")[0] for column in COLUMNS]
+
+
+def test_no_column_is_a_bare_number():
+    for file, text in FILES.items():
+        if '"boxes.h"' in text:
+            assert not re.search(r"\bbox\[\d|\btable\[|\* 16\b|/ 16\b", code(text)), file
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("kind", ["CPU", "GPU"])
+def test_sizes_are_macros_that_kernels_take(device, monkeypatch, kind, dtype):
+    monkeypatch.setattr(device, "kind", kind)
+    tuning = Tuning.of(device, dtype)
+    for name, size in tuning.tile.items():
+        assert f"#ifndef {name} " in FILES["contract.cl"]
+        assert size >= 1
+    assert tuning.tile["MR"] % 2 == 0  # (cos, sin) pairs stay together
+    assert 16 % tuning.tile["VW"] == 0  # columns are padded to 16
+    assert tuning.tile["WGX"] * tuning.tile["WGY"] <= 64  # what every GPU allows
+    assert tuning.lanes in (4, 8, 16)
+    assert tuning.memory <= device.memory // 4
+    assert tuning.local_size(3) == ((1, 1, 1) if kind == "CPU" else None)
+
+
+def test_faults_are_seen():
+    assert stray_restricts("static void f(__global int *restrict x) {}")
+    assert not stray_restricts("__kernel void f(__global int *restrict x)\n{ g(x); }")
+    assert without_default("#if FAST\n#endif") == {"FAST"}
+    assert not without_default("#ifndef FAST /* quick */\n#define FAST 0\n#endif\n#if FAST\n#endif")
