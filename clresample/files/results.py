@@ -167,7 +167,7 @@ def _about(result):
 
 def _placing(grid, psf):
     """What images and WCS do not say of a grid and a PSF."""
-    flat = {"jacobian": grid.jacobian, "origin": grid.origin} if grid.wcs is None else None
+    flat = {"jacobian": grid.jacobian, "origin": grid.origin} if grid.is_flat else None
     return {"flat": flat, "spacing": psf.spacing, "center": psf.center}
 
 
@@ -232,7 +232,7 @@ def _placed(grid, number):
 def _grid(path, hdu, about, hdus):
     shape, flat = hdu.shape[-2:], about["flat"]
     if flat is not None:
-        return Grid(shape, None, np.array(flat["jacobian"], float), np.array(flat["origin"], float))
+        return Grid.from_jacobian(shape, flat["jacobian"], flat["origin"])
     return Grid.from_wcs(celestial_header(path, hdu.header, hdus), shape)
 
 

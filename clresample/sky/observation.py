@@ -166,7 +166,7 @@ def check_observations(observations):
             first[channel] = observation
     for what, have in (
         ("zero_points", [o.zero_points is not None for o in observations]),
-        ("a WCS", [o.grid.wcs is not None for o in observations]),
+        ("a WCS", [not o.grid.is_flat for o in observations]),
     ):
         if len(set(have)) > 1:
             of, rest = (observations[have.index(there)].label for there in (True, False))

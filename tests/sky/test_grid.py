@@ -139,7 +139,7 @@ def test_what_is_no_grid():
             Grid.flat(shape, 1.0)
     with pytest.raises(ValueError, match="grid_in is placed by a WCS and this grid flat"):
         Grid.flat((4, 4), 1.0).map_to(grid_of(header(MODEL), MODEL))
-    thin = Grid((4, 4), None, np.array([[1.0, 1.0], [1.0, 1.0 + 1e-14]]), np.zeros(2))
+    thin = Grid.from_jacobian((4, 4), [[1.0, 1.0], [1.0, 1.0 + 1e-14]], (0, 0))
     with pytest.raises(ValueError, match="singular"):
         thin.map_to(Grid.flat((4, 4), 1.0))
 
