@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import warnings
 from dataclasses import fields
 from pathlib import Path
 
@@ -19,7 +18,6 @@ from ..sky.frame import Frame
 from ..sky.grid import Grid
 from ..sky.observation import Observation
 from ..sky.psf import PSF
-from ..sky.psf_checks import PSFWarning
 from ..sky.sources import Extended, Point, Source
 from .fits import add_provenance, celestial_header, open_fits, to_ascii, write_hdus
 from .whole_file import FileError, check_output, whole_file
@@ -237,27 +235,18 @@ def _grid(path, hdu, about, hdus):
 
 
 def _psf(images, about):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PSFWarning)  # told when it was made
-        psf = PSF(images, spacing=about["spacing"], center=about["center"])
-    images.flags.writeable = False
-    object.__setattr__(psf, "images", images)  # sums of 1 to rounding: not to be divided by again
-    return psf
+    return PSF.restore(images, spacing=about["spacing"], center=about["center"])
 
 
 def _observation(path, hdus, i, about):
     data = hdus["DATA", i + 1]
-    observation = Observation(
+    return Observation.restore(
         _array(data),
         _psf(_array(hdus["PSF", i + 1]), about),
         _grid(path, data, about, hdus),
         weights=_array(hdus["WEIGHTS", i + 1]),
-        **{key: about[key] for key in ("channels", "zero_points", "name")},
+        **{key: about[key] for key in KEPT},
     )
-    # of the first making
-    object.__setattr__(observation, "n_bad", about["n_bad"])
-    object.__setattr__(observation, "messages", tuple(about["messages"]))
-    return observation
 
 
 def _source(path, *, kind, **given):
