@@ -52,7 +52,7 @@ class PSF:
                 raise ValueError(f"images: band {i_band} has the sum {image.sum():.3g}, not > 0")
         images /= images.sum(axis=(1, 2), keepdims=True)
         self._set(images, float(spacing), _center(images, center))
-        for message in self.report():
+        for message in self.warnings():
             warnings.warn(message, PSFWarning, stacklevel=2)
 
     def _set(self, images, spacing, center):
@@ -126,7 +126,7 @@ class PSF:
             raise ValueError(f"bands {bands} of a PSF that has {self.n_bands}") from None
         return PSF.restore(images, spacing=self.spacing, center=center)
 
-    def spectrum(self, nu_y, nu_x, matrix=None):
+    def otf(self, nu_y, nu_x, matrix=None):
         """Optical transfer function: the samples' transform at any frequencies f = A^T nu.
 
             P^(f) = sum_s P[s] exp(-2 pi i f.(s - center) spacing),  0 where |f|_inf > 1/(2 spacing)
@@ -166,7 +166,7 @@ class PSF:
         """Light beyond the edge (C,), as a fraction of the light inside; see `psf_checks`."""
         return edge_light(self.images)
 
-    def report(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """What a user should know of this PSF, a sentence each; see `psf_checks.psf_warnings`."""
         return psf_warnings(self.images, self.center)
 

@@ -84,7 +84,7 @@ def test_the_psf_is_a_gaussian_with_its_pixel(sigma):
     nu = np.array([0.1])
     expected = np.exp(-2 * (np.pi * sigma * 0.1) ** 2) * np.sinc(0.1)
     aliased = np.exp(-2 * (np.pi * sigma * 0.9) ** 2)
-    assert abs(psf.spectrum(nu, np.zeros(1))[0, 0, 0] - expected) <= 1.01 * aliased + 1e-14
+    assert abs(psf.otf(nu, np.zeros(1))[0, 0, 0] - expected) <= 1.01 * aliased + 1e-14
 
 
 def test_observations_that_do_not_meet_are_named():

@@ -41,7 +41,7 @@ def test_flat_grids():
 def test_flat_mapping_is_exact(flip):
     grid_in, grid_out = Grid.flat((50, 60), 0.1), Grid.flat((20, 20), 0.2, flip=flip)
     mapping = grid_out.map_to(grid_in)
-    assert (mapping.kind, mapping.departure_px) == ("aligned", 0)
+    assert (mapping.geometry, mapping.departure_px) == ("aligned", 0)
     np.testing.assert_array_equal(mapping.matrix, np.diag([2, -2 if flip else 2]))
     np.testing.assert_allclose(mapping.at(9.5, 9.5), (24.5, 29.5), atol=1e-13)
     quarter = Grid.flat((20, 20), 0.2, angle_deg=-90, flip=flip).map_to(grid_in)
@@ -103,7 +103,7 @@ def test_union_holds_every_pixel_on_the_sky():
     whole = union(grids, like=like)
     for grid in grids:
         assert grid.map_to(whole).covered.all()
-    assert like.map_to(whole).kind == "aligned"
+    assert like.map_to(whole).geometry == "aligned"
     shared = intersection(grids, like=like)
     assert shared.map_to(like).covered.all()
 

@@ -1,4 +1,4 @@
-"""The PSF's spectrum against its definition and against analytic transforms, and what is told."""
+"""The PSF's OTF against its definition and analytic transforms, its width, and its warnings."""
 
 import math
 import warnings
@@ -45,11 +45,11 @@ def matrices():
 @pytest.mark.parametrize("spacing", [1.0, 0.5, 0.4])
 @pytest.mark.parametrize("shape", [(9, 9), (8, 13), (1, 1), (12, 6)], ids=str)
 @pytest.mark.parametrize("matrix", [pytest.param(m, id=name) for name, m in matrices()])
-def test_spectrum_is_its_definition(matrix, shape, spacing):
+def test_the_otf_is_its_definition(matrix, shape, spacing):
     rng = np.random.default_rng(5)
     images = rng.random((3, *shape))
     psf = quiet(images, spacing=spacing, center=[(1.0, 2.0), (1.0, 2.0), (3.3, -0.4)])
-    found = psf.spectrum(NU_Y, NU_X, matrix)
+    found = psf.otf(NU_Y, NU_X, matrix)
     assert found.dtype == np.complex128
     # sums of a few hundred terms that add up to 1 in float64
     np.testing.assert_allclose(found, term_by_term(psf, NU_Y, NU_X, matrix), atol=1e-13)
@@ -60,15 +60,15 @@ def test_many_samples_go_in_blocks(monkeypatch):
     rng = np.random.default_rng(6)
     psf = quiet(rng.random((2, 21, 10)))
     matrix = rng.normal(size=(2, 2))
-    whole = psf.spectrum(NU_Y, NU_X, matrix)
+    whole = psf.otf(NU_Y, NU_X, matrix)
     monkeypatch.setattr("clresample.sky.psf.BLOCK", 1600)  # three rows of ten samples at a time
-    np.testing.assert_allclose(psf.spectrum(NU_Y, NU_X, matrix), whole, atol=1e-15)
+    np.testing.assert_allclose(psf.otf(NU_Y, NU_X, matrix), whole, atol=1e-15)
 
 
 def test_no_matrix_is_the_identity():
     psf = PSF.gaussian(1.2)
-    np.testing.assert_array_equal(psf.spectrum(NU_Y, NU_X), psf.spectrum(NU_Y, NU_X, np.eye(2)))
-    assert abs(psf.spectrum([0.0], [0.0])[0, 0, 0] - 1) < 1e-15
+    np.testing.assert_array_equal(psf.otf(NU_Y, NU_X), psf.otf(NU_Y, NU_X, np.eye(2)))
+    assert abs(psf.otf([0.0], [0.0])[0, 0, 0] - 1) < 1e-15
 
 
 @pytest.mark.parametrize("spacing", [1.0, 0.5])
@@ -76,10 +76,10 @@ def test_band_ends_where_the_samples_do(spacing):
     psf = quiet(np.ones((1, 3, 3)), spacing=spacing)
     limit = 0.5 / spacing
     nu = np.array([-1.01, -1, 0, 1, 1.01]) * limit
-    carried = psf.spectrum(nu, nu)[0] != 0
+    carried = psf.otf(nu, nu)[0] != 0
     np.testing.assert_array_equal(carried, np.outer(abs(nu) <= limit, abs(nu) <= limit))
     matrix = np.array([[0.0, 2.0], [1.0, 0.0]])  # f = (nu_x, 2 nu_y)
-    carried = psf.spectrum(nu / 2, nu, matrix)[0] != 0
+    carried = psf.otf(nu / 2, nu, matrix)[0] != 0
     np.testing.assert_array_equal(carried, np.outer(abs(nu) <= limit, abs(nu) <= limit))
 
 
@@ -95,14 +95,14 @@ def test_gaussian_is_the_analytic_one(angle, n_pixels):
     round_one = np.exp(-2 * (np.pi * sigma) ** 2 * (f_y**2 + f_x**2))
     for pixel, truth in ((False, round_one), (True, round_one * np.sinc(f_y) * np.sinc(f_x))):
         psf = PSF.gaussian(sigma, n_pixels=n_pixels, pixel=pixel)
-        np.testing.assert_allclose(psf.spectrum(nu, nu, matrix)[0], truth, atol=1e-13)
+        np.testing.assert_allclose(psf.otf(nu, nu, matrix)[0], truth, atol=1e-13)
 
 
 def test_oversampled_gaussian_is_the_same_gaussian():
     fine = PSF.gaussian(2.1, n_pixels=243, spacing=0.25)
     nu = np.linspace(-0.3, 0.3, 9)
-    truth = PSF.gaussian(2.1, n_pixels=61).spectrum(nu, nu)
-    np.testing.assert_allclose(fine.spectrum(nu, nu), truth, atol=1e-13)
+    truth = PSF.gaussian(2.1, n_pixels=61).otf(nu, nu)
+    np.testing.assert_allclose(fine.otf(nu, nu), truth, atol=1e-13)
 
 
 def test_a_centre_is_a_phase():
@@ -112,8 +112,8 @@ def test_a_centre_is_a_phase():
     shift = 0.5 * (there.center[0] - here.center[0])
     f = np.tensordot(matrix.T, np.stack(np.meshgrid(NU_Y, NU_X, indexing="ij")), 1)
     phase = np.exp(2j * np.pi * np.tensordot(shift, f, 1))
-    found = there.spectrum(NU_Y, NU_X, matrix)[0]
-    np.testing.assert_allclose(found, phase * here.spectrum(NU_Y, NU_X, matrix)[0], atol=1e-14)
+    found = there.otf(NU_Y, NU_X, matrix)[0]
+    np.testing.assert_allclose(found, phase * here.otf(NU_Y, NU_X, matrix)[0], atol=1e-14)
 
 
 def test_each_band_is_normalised_by_itself():
@@ -163,8 +163,8 @@ def test_a_core_off_the_centre_is_told_once_with_figures():
     assert len(told) == 1
     for figure in ("bands 0, 1", "(10.00, 10.00)", "(+0.50, +0.50)", "(9.5, 9.5)"):
         assert figure in str(told[0].message)
-    assert PSF(image, center=(10, 10)).report() == []
-    assert PSF(image, center="core").report() == []
+    assert PSF(image, center=(10, 10)).warnings() == []
+    assert PSF(image, center="core").warnings() == []
 
 
 def test_light_cut_at_the_edge_is_told():
@@ -224,4 +224,4 @@ def test_what_is_no_gaussian():
     with pytest.raises(ValueError, match="2 bands"):
         PSF.gaussian([1.0, 2.0], n_bands=3)
     with pytest.raises(ValueError, match="matrix"):
-        PSF.gaussian(1.0).spectrum(NU_Y, NU_X, np.eye(3))
+        PSF.gaussian(1.0).otf(NU_Y, NU_X, np.eye(3))
