@@ -117,7 +117,9 @@ class GridOperator(LinOp):
     def shift(self, shift):
         shift, expected = np.asarray(shift, np.float64), (self._n_geometries, 2)
         if shift.shape not in ((), (2,), expected) or not np.isfinite(shift).all():
-            raise ValueError(f"shift is {shift}, must be (2,) or {expected} finite numbers")
+            raise ValueError(
+                f"shift is {shift.tolist()}, must be (2,) or {expected} finite numbers"
+            )
         self._shift = np.broadcast_to(shift, expected).copy()
         self._shift.flags.writeable = False  # a change must come through this setter
         self._use_shift()

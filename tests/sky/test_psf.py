@@ -8,6 +8,7 @@ import pytest
 
 from clresample.sky.psf import PSF
 from clresample.sky.psf_checks import PSFWarning
+from clresample.sky.waves import cos_sin_columns, phases
 
 NU_Y, NU_X = np.arange(-16, 17) / 33, np.arange(0, 20) / 39
 
@@ -137,6 +138,45 @@ def test_select_bands():
         psf.select(3)
 
 
+def test_restore_keeps_every_bit():
+    rng = np.random.default_rng(10)
+    first = quiet(rng.random((2, 7, 9)) * 1e3, spacing=0.3, center=(1.1, 2 + 1e-9))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # a core so far off its centre was warned of before
+        again = PSF.restore(first.images, spacing=first.spacing, center=first.center.tolist())
+    np.testing.assert_array_equal(again.images, first.images)
+    np.testing.assert_array_equal(again.center, first.center)
+    assert again.spacing == first.spacing and again.images is not first.images
+    with pytest.raises(ValueError, match="read-only"):
+        again.center[0, 0] = 1
+
+
+@pytest.mark.parametrize("spacing", [1.0, 0.25])
+def test_fwhm_of_gaussians(spacing):
+    sigmas = np.array([1.5, 3.0, 6.0])
+    psf = PSF.gaussian(sigmas, n_pixels=int(60 / spacing) + 1, spacing=spacing)
+    # the pixel adds 1/12 to the variance; samples are counted, to one or two along the edge
+    truth = 2 * np.sqrt(2 * math.log(2) * (sigmas**2 + 1 / 12))
+    np.testing.assert_allclose(psf.fwhm_px, truth, atol=0.3 * spacing)
+    assert psf.fwhm_px.shape == (3,)
+    one = quiet([[1.0]])
+    assert one.fwhm_px[0] == pytest.approx(2 / math.sqrt(math.pi))
+
+
+def test_whole_cycles_are_taken_off_before_they_are_rounded():
+    nu, x = np.array([0.25, 1 / 3]), np.array([4e6 + 1, 3e6])
+    angle = phases(nu, x)
+    assert angle.shape == (2, 2)
+    np.testing.assert_allclose(
+        np.abs(angle), np.abs([[np.pi / 2, 0], [2 * np.pi / 3, 0]]), atol=2e-9
+    )
+    assert np.abs(np.cos(2 * np.pi * nu[0] * x[0])) > 1e-10 > np.abs(np.cos(angle[0, 0]))
+    columns = cos_sin_columns(angle)
+    assert columns.shape == (2, 4)
+    np.testing.assert_array_equal(columns[:, ::2], np.cos(angle))
+    np.testing.assert_array_equal(columns[:, 1::2], np.sin(angle))
+
+
 def test_integer_and_foreign_endian_images():
     image = np.outer([1, 2, 1], [1, 2, 1])
     for dtype in (np.int16, ">f4", ">f8", np.uint8):
@@ -155,19 +195,19 @@ def test_core_is_found_to_a_hundredth(sigma, shift):
     np.testing.assert_array_equal(psf.center[0], core)
 
 
-def test_a_core_off_the_centre_is_told_once_with_figures():
+def test_a_core_off_the_centre_is_warned_of_once_with_figures():
     y = np.arange(20) - 10.0  # the core at n/2: the usual slip
     image = np.exp(-0.5 * (y[:, None] ** 2 + y**2) / 2)
-    with pytest.warns(PSFWarning) as told:
+    with pytest.warns(PSFWarning) as warned:
         PSF(np.stack([image, image]))
-    assert len(told) == 1
+    assert len(warned) == 1
     for figure in ("bands 0, 1", "(10.00, 10.00)", "(+0.50, +0.50)", "(9.5, 9.5)"):
-        assert figure in str(told[0].message)
+        assert figure in str(warned[0].message)
     assert PSF(image, center=(10, 10)).warnings() == []
     assert PSF(image, center="core").warnings() == []
 
 
-def test_light_cut_at_the_edge_is_told():
+def test_light_cut_at_the_edge_is_warned_of():
     with pytest.warns(PSFWarning, match=r"cut at the edge of the 41 x 41 image, band 1"):
         PSF.gaussian([2.0, 10.0])
     with pytest.warns(PSFWarning, match="cut at the edge"):
