@@ -178,12 +178,15 @@ class Adjoint(LinOp):
         self.op = op
 
     def _apply(self, *call):
-        return self.op._apply(*call)  # on the device or on the host, as the operator itself
+        """On the device or on the host, as the operator itself does it."""
+        return self.op._apply(*call)
 
     def _forward(self, x, out):
+        """The operator's adjoint."""
         self.op._adjoint(x, out)
 
     def _adjoint(self, y, out):
+        """The operator itself."""
         self.op._forward(y, out)
 
 

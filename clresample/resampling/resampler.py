@@ -53,6 +53,7 @@ class Resampler(GridOperator):
         return op
 
     def _prepare(self, mapping, psf_in, psf_out, dtype, device):
+        """The plan of a mapping, with its warnings, and its tables on the device."""
         plan = make_plan(mapping, psf_in, psf_out, precision=Precision.of(dtype))
         for message in noise_warnings(plan.certificate):
             warnings.warn(message, PSFWarning, stacklevel=3)
@@ -69,6 +70,7 @@ class Resampler(GridOperator):
         self._group = max(1, budget // (per_image * self.dtype.itemsize * n_bands))
 
     def _use_shift(self):
+        """Upload D with the phases of the shift."""
         self._identity = all(p.identity for p in self.plans) and not self._shift.any()
         pairs = zip(self.plans, self._shift, strict=True)
         self._executor.set_spectra([plan.shifted(shift) for plan, shift in pairs])
@@ -101,9 +103,11 @@ class Resampler(GridOperator):
         )
 
     def _forward(self, x, out):
+        """I2 of device arrays: x (B, C, Ny, Nx), out (B, C, My, Mx)."""
         self._run(self._executor.forward, x, out, self.shape_in, self.shape_out)
 
     def _adjoint(self, y, out):
+        """R^T y of device arrays: y (B, C, My, Mx), out (B, C, Ny, Nx)."""
         self._run(self._executor.adjoint, y, out, self.shape_out, self.shape_in)
 
     def _run(self, chain, source, target, shape_source, shape_target, identity=True):

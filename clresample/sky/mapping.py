@@ -6,14 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-# [px] what evaluating two WCS in float64 may leave (up to 1e-8 seen at 0.01 arcsec); under it,
-# a mapping by whole pixels is one
+# [px] what evaluating two WCS in float64 may leave (up to 1e-8 seen at 0.01 arcsec): mappings this
+# near to whole pixels are taken for these, and centres this near to an edge lie on it
 NOISE_PX = 1e-6
-# points per axis at which two WCS are compared: SIP and TPV polynomials are of order 9 at most
+# points per axis at which two WCS are compared: SIP and TPV polynomials are of order 9 at most,
+# which half as many would follow; more only cost time
 N_LATTICE = 33
-# [px] positions evaluated at once, 8 MiB per axis
+# [px] positions evaluated at once, 8 MiB per axis: larger blocks only take more memory
 BLOCK = 1 << 20
-# |det A| / |A|^2 under which the float64 inverse of A keeps no digit of a pixel
+# |det A| / |A|^2 under which A counts as singular: its float64 inverse keeps no digit of a pixel
 SINGULAR = 1e-10
 
 
@@ -102,7 +103,10 @@ class Mapping:
 
 
 def lattice(low, shape):
-    """Positions (n, m) over a box of pixels, from outer edge to outer edge, corners included."""
+    """Positions n, m (N, M) over a box of pixels, from outer edge to outer edge.
+
+    low, shape (2,) [px]: its first pixel, and its size; N_LATTICE points per axis, fewer if small
+    """
     axes = [
         np.linspace(start - 0.5, start + n - 0.5, min(n + 1, N_LATTICE))
         for start, n in zip(low, shape, strict=True)
@@ -192,13 +196,14 @@ def _decide(points, true, tolerance_px, matrix=None):
 
 
 def _centred(points, true, matrix):
-    """The offset that leaves equal errors either way along each axis, and the largest distance."""
+    """The offset (2,) [px] with equal errors either way on each axis, and the largest distance."""
     rest = true - points @ matrix.T
     offset = (rest.max(axis=0) + rest.min(axis=0)) / 2
     return offset, _departure(points, true, matrix, offset)
 
 
 def _departure(points, true, matrix, offset):
+    """Largest distance [px] of points (L, 2) mapped by A and t from true (L, 2)."""
     return float(np.hypot(*(true - points @ matrix.T - offset).T).max())
 
 

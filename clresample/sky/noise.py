@@ -68,8 +68,9 @@ def sigma_below_zero(image) -> float | None:
 
         sigma = median |x| / 0.674  over x < 0
 
-    For images that are mostly sources, which would raise `background`: nothing of a source is
-    negative. Half of the pixels tell less, and a level that is not zero goes in.
+    For images that are mostly sources, which raise what `background` finds: no pixel of a source is
+    negative. Of pure noise it has the larger error, from half of the pixels, and a sky level that
+    is not zero enters it.
 
     image (...); None where fewer than 32 pixels are negative
     """

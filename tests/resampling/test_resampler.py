@@ -197,7 +197,7 @@ def test_a_shift_is_a_moved_grid(device, geometry):
         op.shift[0] = 3.0
 
 
-def test_a_psf_that_is_too_wide_is_floored_and_told(device):
+def test_a_psf_that_is_too_wide_is_floored(device):
     # transforms of the model's PSF under 1e-20 where the observation still has 1e-2 of its light
     wide, narrow = PSF.gaussian(4.0), PSF.gaussian(0.8)
     for matrix in (turn(0, 1.0), turn(30, 1.0)):
@@ -211,12 +211,12 @@ def test_a_psf_that_is_too_wide_is_floored_and_told(device):
     np.testing.assert_array_equal(fine.floored_power, 0)
 
 
-def test_amplified_noise_and_a_floored_division_are_told(device):
+def test_amplified_noise_and_a_floored_division_are_warned_of(device):
     grid, wide, narrow = Grid.flat((20, 21), 0.1), PSF.gaussian(4.0), PSF.gaussian(0.8)
-    with pytest.warns(PSFWarning) as told:
+    with pytest.warns(PSFWarning) as warned:
         Resampler(grid, wide, grid, narrow, device=device)
-    assert any("amplifies some frequencies" in str(w.message) for w in told)
-    assert any("the division is floored" in str(w.message) for w in told)
+    assert any("amplifies some frequencies" in str(w.message) for w in warned)
+    assert any("the division is floored" in str(w.message) for w in warned)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         Resampler(grid, narrow, grid, wide, device=device)

@@ -46,7 +46,7 @@ def test_mapping_is_that_of_the_two_wcs(name, cards, model):
     assert error < (1e-7 if distorted else 1e-4)
     np.testing.assert_array_equal(mapping.covered, inside)
 
-    # a looser tolerance takes the affine fit, and tells what it leaves
+    # a looser tolerance takes the affine fit, and states what it leaves
     affine = grid_out.map_to(grid_in, tolerance_px=10.0)
     assert affine.geometry in ("affine", "aligned")
     departure = np.hypot(*(affine.at(*np.indices(OBSERVED)) - true)[inside].T).max()

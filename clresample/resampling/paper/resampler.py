@@ -32,6 +32,7 @@ class PaperResampler(GridOperator):
     """
 
     def _prepare(self, mapping, psf_in, psf_out, dtype, device):
+        """The transfer function, and the factors of the association that costs less."""
         if mapping.geometry == "distorted":
             raise ValueError(
                 f"grid_out departs from an affine mapping by {mapping.departure_px:.2g} px of "
@@ -59,12 +60,15 @@ class PaperResampler(GridOperator):
         self.n_terms, self.model_axis = self._factors.n_terms, self._factors.axis
 
     def _use_shift(self):
+        """Both factors' tables anew."""
         self._factors.set_spectra(self._transfer, self._shift[0])
 
     def _forward(self, x, out):
+        """I2 of device arrays: x (B, C, Ny, Nx), out (B, C, My, Mx)."""
         self._run(self._factors.forward, x, out)
 
     def _adjoint(self, y, out):
+        """The transpose of device arrays: y (B, C, My, Mx), out (B, C, Ny, Nx)."""
         self._run(self._factors.adjoint, y, out)
 
     def _run(self, chain, source, target):
