@@ -51,13 +51,19 @@ class OperatorCache:
         device, dtype = get_device(device), np.dtype(dtype)
         mapping = grid.map_to(frame.grid)
         key = _key(mapping, frame.psf, psf, dtype, extent)
-        make = functools.partial(make_plan, precision=Precision.of(dtype), extent=extent)
+
+        def plan():
+            precision = Precision.of(dtype)
+            return make_plan(mapping, frame.psf, psf, precision=precision, extent=extent)
+
+        def operator():
+            plans = [_find(self._plans, key, plan, self.plan_bytes)]
+            return Resampler.from_plans(plans, dtype=dtype, device=device)
+
         with self._lock:
-            plan = _find(self._plans, key, lambda: make(mapping, frame.psf, psf), self.plan_bytes)
-            build = functools.partial(Resampler.from_plans, [plan], dtype=dtype, device=device)
             if private:
-                return build()
-            return _find(self._operators, (key, device), build, self.device_bytes)
+                return operator()
+            return _find(self._operators, (key, device), operator, self.device_bytes)
 
     @property
     def n_plans(self) -> int:
