@@ -32,6 +32,8 @@ class GridOperator(LinOp):
     """
 
     _n_geometries = 1
+    _mappings: list[Mapping]
+    _certificates: list[Certificate]
 
     def __init__(
         self,

@@ -105,7 +105,8 @@ def make_plan(
     """
     n_bands = count_bands(mapping, psf_in, psf_out)
     radius = wrap_radius(psf_out, mapping.matrix)
-    n_fft = tuple(_odd(n + h) for n, h in zip(extent or mapping.shape_in, radius, strict=True))
+    extent = mapping.shape_in if extent is None else extent
+    n_fft = _odd(extent[0] + radius[0]), _odd(extent[1] + radius[1])
     nu, d, max_gain, floored_power = _band(mapping.matrix, psf_in, psf_out, n_fft, precision)
     d = np.broadcast_to(d, (n_bands,) + d.shape[1:])
     n_frequencies = h_y, h_x = len(nu[0]), len(nu[1])
@@ -228,7 +229,7 @@ def _aligned_tables(mapping: Mapping, nu, axes, center):
 def _distorted_tables(mapping: Mapping, nu, center):
     """Waves at every observed pixel, with the pixel's own area; zero where it is not covered."""
     scale = mapping.covered * (1.0 if mapping.area is None else mapping.area)
-    y, x = np.moveaxis(mapping.positions, -1, 0)
+    y, x = np.moveaxis(mapping.at(*np.indices(mapping.shape_out)), -1, 0)
     return {
         "out_y": _waves(nu[0], y.ravel() - center[0]) * scale.reshape(-1, 1),
         "out_x": _waves(nu[1], x.ravel() - center[1]),

@@ -82,7 +82,7 @@ def open_edge(footprints, shape) -> np.ndarray:
     through others without one, and the neighbours of these. Masked pixels within an image, single
     or in patches, are no edge.
     """
-    points = np.stack(np.indices(shape), axis=-1)
+    points = np.stack([*np.indices(shape)], axis=-1)
     seen = np.zeros(shape, dtype=bool)
     for footprint in footprints:
         seen |= footprint.weighted(points).any(axis=0)

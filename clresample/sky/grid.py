@@ -31,7 +31,7 @@ class Grid(ABC):
     placing: str
 
     @staticmethod
-    def from_wcs(wcs, shape) -> WcsGrid:
+    def from_wcs(wcs, shape) -> Grid:
         """Grid of an image with a celestial WCS: CD, PC, CROTA, SIP, TPV, cubes, either parity.
 
         wcs: astropy WCS; of more than two axes, the celestial ones are taken
@@ -55,7 +55,7 @@ class Grid(ABC):
         return grid
 
     @staticmethod
-    def flat(shape, scale_arcsec, *, angle_deg=0, flip=False, center_arcsec=(0, 0)) -> FlatGrid:
+    def flat(shape, scale_arcsec, *, angle_deg=0, flip=False, center_arcsec=(0, 0)) -> Grid:
         """Grid on a flat sky: J = R(angle) diag(scale_y, +-scale_x).
 
         shape (Ny, Nx) [px]
@@ -76,7 +76,7 @@ class Grid(ABC):
         return FlatGrid(shape, jacobian, center - jacobian @ ((np.array(shape) - 1) / 2))
 
     @staticmethod
-    def from_jacobian(shape, jacobian, origin) -> FlatGrid:
+    def from_jacobian(shape, jacobian, origin) -> Grid:
         """Grid on a flat sky with any Jacobian: (y, x) = J (n, m) + origin.
 
         shape (Ny, Nx) [px]

@@ -64,7 +64,7 @@ class PSF:
         object.__setattr__(self, "center", center)
 
     @classmethod
-    def gaussian(cls, sigma_px, *, n_pixels=41, pixel=True, n_bands=1, spacing=1.0):
+    def gaussian(cls, sigma_px, *, n_pixels=41, pixel=True, n_bands=1, spacing=1.0) -> PSF:
         """Round Gaussian, integrated over pixels by error functions unless `pixel` is False.
 
         sigma_px [px]: standard deviation, one number or one per band
@@ -126,7 +126,7 @@ class PSF:
             raise ValueError(f"bands {bands} of a PSF that has {self.n_bands}") from None
         return PSF.restore(images, spacing=self.spacing, center=center)
 
-    def otf(self, nu_y, nu_x, matrix=None):
+    def otf(self, nu_y, nu_x, matrix=None) -> np.ndarray:
         """Optical transfer function: the samples' transform at any frequencies f = A^T nu.
 
             P^(f) = sum_s P[s] exp(-2 pi i f.(s - center) spacing),  0 where |f|_inf > 1/(2 spacing)

@@ -88,11 +88,11 @@ def make_groups(
         if worst == geometry:
             break
         geometry = worst  # its tiles cost more, so that another size is the quickest
-    groups = []
+    groups: list[Group] = []
     for start, mapping, mask in tiles:
         group, place = _find(groups, mapping, margin, margin - radius * FLAT, tolerance_px)
-        origin = tuple(int(a + b) for a, b in zip(corner, start, strict=True))
-        group.tiles.append(Tile(origin, place, mask))
+        y, x = (int(a + b) for a, b in zip(corner, start, strict=True))
+        group.tiles.append(Tile((y, x), place, mask))
     if not groups:
         raise ValueError(
             f"grids do not overlap: no pixel of the observation {grid_out.shape} lies on the model "
@@ -124,7 +124,7 @@ class Sizes:
         n_frequencies = plan.certificate.n_frequencies
         self.band = max((h + 1) / k for h, k in zip(n_frequencies, n_fft, strict=True))
         self.columns, self.taps, self.taps_back = 0.0, 0, 0
-        if geometry == "affine":
+        if plan.lines is not None:
             self.taps, self.taps_back = plan.lines.weight.shape[1], plan.lines.weight_t.shape[1]
             reach = np.abs(trial.matrix) @ np.subtract(trial.shape_out, 1)
             self.columns = (plan.out_x.shape[1] - self.taps) / max(reach.min(), 1)

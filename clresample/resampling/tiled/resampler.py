@@ -15,7 +15,7 @@ from ..grid_operator import GridOperator
 from ..linop import HostOp, LinOp
 from ..plan import Precision, is_identity, make_plan
 from ..resampler import Resampler
-from .layout import GEOMETRIES, make_groups
+from .layout import GEOMETRIES, Group, make_groups
 
 # [bytes] of device memory unless a caller says otherwise: more than the quickest tiles of most
 # instruments take
@@ -167,21 +167,22 @@ class TileOperators:
 
     def __init__(self, psf_in: PSF, psf_out: PSF, dtype, device):
         self.psf_in, self.psf_out, self.dtype, self.device = psf_in, psf_out, dtype, device
-        self._group, self._op = None, None
+        self._group: Group | None = None
+        self._op: Resampler | None = None
 
-    def of(self, group) -> Resampler:
+    def of(self, group: Group) -> Resampler:
         """The operator from a window of the group to its tile, without the tile's shift."""
-        if self._group is not group:
-            self._group, self._op = None, None
+        if self._op is None or self._group is not group:
+            self._group, self._op = None, None  # frees the memory first
             precision = Precision.of(self.dtype)
             plan = make_plan(group.mapping, self.psf_in, self.psf_out, precision=precision)
             y, x = (group.taper[axis] for axis in plan.axes)
             plan = replace(plan, in_y=plan.in_y * y, in_x=plan.in_x * x)
-            op = Resampler.from_plans([plan], dtype=self.dtype, device=self.device)
-            self._group, self._op = group, op
+            self._op = Resampler.from_plans([plan], dtype=self.dtype, device=self.device)
+            self._group = group
         return self._op
 
-    def copy(self, group) -> bool:
+    def copy(self, group: Group) -> bool:
         """Whether the group's pixels and PSFs are the same: a tile is its window's middle."""
         shape = group.mapping.shape_out
         mapping = replace(group.mapping, shape_in=shape, offset=np.zeros(2))
