@@ -26,7 +26,7 @@ _ROOMS = {
     # the operator and its variants
     "resampling": {
         "resampler": ("Resampler",),
-        "tiled": ("TiledResampler",),
+        "tiled.resampler": ("TiledResampler",),
         "paper.resampler": ("PaperResampler",),
     },
     # fits of scenes to observations
@@ -89,7 +89,7 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from .measurement.quality import summary as summary
     from .resampling.paper.resampler import PaperResampler as PaperResampler
     from .resampling.resampler import Resampler as Resampler
-    from .resampling.tiled import TiledResampler as TiledResampler
+    from .resampling.tiled.resampler import TiledResampler as TiledResampler
     from .simulation.scenes import simulate_scene as simulate_scene
     from .sky.frame import Frame as Frame, model_frame as model_frame
     from .sky.grid import Grid as Grid

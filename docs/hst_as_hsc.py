@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 
 from clresample import Resampler
 from clresample.files.fits import read_image, read_psf
-from clresample.files.plot_resampled import compare, fwhm_px, plot_resampled
+from clresample.files.plot_resampled import compare, plot_resampled
 
 HERE = Path(__file__).resolve().parent
 DATA = Path(os.environ.get("CLRESAMPLE_DATA") or HERE.parents[1] / "shared" / "data") / "hst_hsc"
@@ -30,7 +30,7 @@ def main():
 
     def distance(shift):
         op.shift = shift
-        width = fwhm_px(psf_hsc)
+        width = psf_hsc.fwhm_px[0]
         return -compare(op(hst.data)[0], hsc.data[0], op.covered, width).correlation
 
     start = {"initial_simplex": [(0, 0), (1, 0), (0, 1)], "xatol": 0.01, "fatol": 1e-6}

@@ -84,7 +84,7 @@ def measure_schemes(surveys, sizes, galaxies, seconds):
         ours, paper = case.operator(), case.operator(PaperResampler)
         calls[angle, n_model, "ours"] = functools.partial(ours, image)
         calls[angle, n_model, "paper"] = functools.partial(paper, image)
-        products[angle, n_model] = paper.report["n_terms"] * case.n_obs**2
+        products[angle, n_model] = paper.n_terms * case.n_obs**2
     ms = interleaved_ms(calls, seconds=seconds * len(calls))
     return [
         {

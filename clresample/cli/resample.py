@@ -176,7 +176,7 @@ def run(arguments):
     )
     print(
         f"{arguments.output}: {' x '.join(map(str, written.shape))} pixels, "
-        f"{100 * op.covered.mean():.3g} % covered; {op.kind} grids, {op.n_tiles} "
+        f"{100 * op.covered.mean():.3g} % covered; {op.geometry} grids, {op.n_tiles} "
         f"tile{'s' * (op.n_tiles > 1)}, {took:.2f} s on {op.device.name}"
     )
     if arguments.plot:
@@ -208,8 +208,8 @@ def _operator(arguments, grid_in, grid_out, psfs):
 
     Raises ValueError for grids that do not overlap, too little memory and too much gain.
     """
-    from ..resampling.resampler import FLOORED_POWER
-    from ..resampling.tiled import TiledResampler
+    from ..resampling.tiled.resampler import TiledResampler
+    from ..resampling.transfer import FLOORED_POWER
 
     try:
         op = TiledResampler(
@@ -224,7 +224,7 @@ def _operator(arguments, grid_in, grid_out, psfs):
         )
     except ValueError as error:
         raise ValueError(f"{arguments.image} as {arguments.like}: {error}") from error
-    gain = float(op.report["max_gain"].max())
+    gain = float(op.certificate.max_gain.max())
     message = (
         f"{arguments.psf} is wider than {arguments.psf_like} can show: sharpening it raises noise "
         f"up to {gain:.3g} times"
@@ -233,7 +233,7 @@ def _operator(arguments, grid_in, grid_out, psfs):
         raise ValueError(f"{message}, more than --max-gain {arguments.max_gain:g}")
     if gain > GAIN_WARNED:
         note(arguments, message)
-    floored = float(op.report["floored_power"].max())
+    floored = float(op.certificate.floored_power.max())
     if floored > FLOORED_POWER:
         note(
             arguments,

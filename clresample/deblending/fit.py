@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..resampling.resampler import noise_warnings
+from ..resampling.transfer import noise_warnings
 from ..sky.frame import Frame, model_frame
 from ..sky.observation import check_observations
 from ..sky.sources import Point
@@ -59,7 +59,7 @@ class Fit:
             self.views.append(view)
             self.units.append(unit)
         for o, view in zip(blend.observations, self.views, strict=True):
-            self.messages += [f"{o.label}: {line}" for line in noise_warnings(view.op.report)]
+            self.messages += [f"{o.label}: {line}" for line in noise_warnings(view.op.certificate)]
         if not any(view.root.any() for view in self.views):
             raise ValueError("no observed pixel on the model frame has a weight")
         self.unit = np.concatenate(self.units)

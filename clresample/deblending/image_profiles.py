@@ -49,10 +49,8 @@ def with_image_profiles(blend: Blend, *, device=None) -> Blend:
 
 
 def _sharpness(observation):
-    """Width [arcsec] of an observation's sharpest PSF, from its effective number of pixels."""
-    n_pixels = 1 / (observation.psf.images**2).sum(axis=(1, 2)).max()
-    scale_arcsec = observation.psf.spacing * np.mean(observation.grid.pixel_scale_arcsec)
-    return np.sqrt(n_pixels) * scale_arcsec
+    """Width [arcsec] of an observation's sharpest PSF."""
+    return observation.psf.fwhm_px.min() * observation.grid.pixel_scale_arcsec
 
 
 def _in_frame(observation, frame, device):

@@ -86,4 +86,4 @@ def point(psf: PSF, position, shape, *, slopes=True):
 def _spectrum(psf, n_fft):
     """P^ of the first band (n_fft, n_fft) in the order of the FFT."""
     nu = np.fft.fftfreq(n_fft)
-    return psf.spectrum(nu, nu)[0]
+    return psf.otf(nu, nu)[0]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..sky.extent import shared_part
 from .solver.problem import Problem
 
 # A box holds what reaches this part of the noise: the profile, or the structure that the prior
@@ -107,7 +108,6 @@ def _moved(array, origin, low, high, fill):
     """The array of a box at `origin`, in the box from `low` to `high`; new pixels from `fill`."""
     y, x = (slice(a, b) for a, b in zip(low, high, strict=True))
     out = np.zeros(high - low, array.dtype) if fill is None else fill[y, x].astype(array.dtype)
-    first, last = np.maximum(low, origin), np.minimum(high, np.array(origin) + array.shape)
-    to = tuple(slice(a, b) for a, b in zip(first - low, last - low, strict=True))
-    out[to] = array[tuple(slice(a, b) for a, b in zip(first - origin, last - origin, strict=True))]
+    here, there = shared_part(low, high - low, origin, array.shape)
+    out[here] = array[there]
     return out

@@ -84,13 +84,13 @@ def whitened_view(frame, padded, observation, pad, device, dtype, *, private):
 
 def covered_part(op, frame):
     """Observed pixels (My, Mx) whose centre lies on the frame itself, not on its padding."""
-    return replace(op.plans[0].mapping, shape_in=frame.shape).covered
+    return replace(op.mapping, shape_in=frame.shape).covered
 
 
 def pixel_noise(views):
     """Noise (C,) of one model pixel per channel, in the views' units."""
     noise = []
     for view in views:
-        area = abs(np.linalg.det(view.op.plans[0].mapping.matrix))
+        area = abs(np.linalg.det(view.op.mapping.matrix))
         noise += [1 / np.sqrt(area)] * view.data.shape[0]
     return np.array(noise)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..sky.grid import Grid
+from ..sky.noise import background
 from .whole_file import whole_file
 
 PANEL_INCHES, DPI = 2.75, 160  # a row of four panels fills a page's width
@@ -17,7 +18,6 @@ BAR_FRACTION = 0.3  # of a panel's width: the scale bar is shorter
 # of the pixels: shown as white, so that one hot pixel does not darken the others
 BRIGHT_QUANTILE = 0.9995
 RESIDUAL_SIGMAS = 10  # [sigma of its background] at which a residual's colours end
-MAD = 1.4826  # standard deviation of Gaussian noise over its median absolute deviation
 # Colours of a PNG: a third of the size of a file of all colours, with differences of 3 of 256 rms.
 # They are chosen from every fourth pixel of every fourth row, 7 times faster than from all pixels
 # and as near to the drawing; sparser samples lose the colour of thin lines.
@@ -44,20 +44,9 @@ class Panel:
     residual: float | None = None
 
 
-def noise_level(image):
-    """Median and standard deviation of the background, by the median absolute deviation.
-
-    For pictures: defined for any image with a finite pixel, 0 for a constant one. `noise_sigma`,
-    which refuses such images, clips sources away and is what weights are made of.
-    """
-    pixels = image[np.isfinite(image)]
-    median = float(np.median(pixels))
-    return median, MAD * float(np.median(np.abs(pixels - median)))
-
-
 def stretch_limits(image):
     """(black, knee, white) of an asinh stretch: linear in the noise, logarithmic in the light."""
-    median, sigma = noise_level(image)
+    median, sigma = background(image)
     white = float(np.nanquantile(image, BRIGHT_QUANTILE))
     # without noise, or where most is empty: three decades of light, of the level if all is flat
     knee = max(3 * sigma, (white - median) / 1000) or max(abs(median), 1) / 1000

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from .panels import RESIDUAL_SIGMAS, Panel, noise_level, save_panels, stretch_limits
+from ..sky.noise import background
+from .panels import RESIDUAL_SIGMAS, Panel, save_panels, stretch_limits
 
 
 class Comparison(NamedTuple):
@@ -42,12 +43,6 @@ def compare(rendered, observed, covered, width_px):
     return Comparison(float(np.corrcoef(x, y)[0, 1]), scale, level, residual, mask)
 
 
-def fwhm_px(psf):
-    """Width [px] of the first band's core: diameter of the disc above half its maximum."""
-    image = psf.images[0]
-    return 2 * np.sqrt(np.count_nonzero(image > image.max() / 2) / np.pi) * psf.spacing
-
-
 def plot_resampled(path, image, reference, result, covered, psf_out, *, names, title=""):
     """Draw the first band of an image, of its resampling and, if the bands match, of the reference.
 
@@ -71,14 +66,14 @@ def plot_resampled(path, image, reference, result, covered, psf_out, *, names, t
     ]
     comparison = None
     if len(reference.data) == len(result):
-        comparison = compare(result[0], reference.data[0], covered, fwhm_px(psf_out))
+        comparison = compare(result[0], reference.data[0], covered, psf_out.fwhm_px[0])
     if comparison:
         limits = stretch_limits(reference.data[0][box])
         same = tuple(
             np.subtract(limits, (comparison.level, 0, comparison.level)) / comparison.scale
         )
         panels[1] = Panel(rendered[box], grid, seen, panels[1].note, limits=same)
-        sigma = noise_level(comparison.residual[comparison.mask])[1]
+        sigma = background(comparison.residual[comparison.mask])[1]
         panels += [
             Panel(reference.data[0][box], grid, names[1], "as observed", limits=limits),
             Panel(

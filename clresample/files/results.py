@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import warnings
 from dataclasses import fields
 from pathlib import Path
 
@@ -19,7 +18,6 @@ from ..sky.frame import Frame
 from ..sky.grid import Grid
 from ..sky.observation import Observation
 from ..sky.psf import PSF
-from ..sky.psf_checks import PSFWarning
 from ..sky.sources import Extended, Point, Source
 from .fits import add_provenance, celestial_header, open_fits, to_ascii, write_hdus
 from .whole_file import FileError, check_output, whole_file
@@ -167,7 +165,7 @@ def _about(result):
 
 def _placing(grid, psf):
     """What images and WCS do not say of a grid and a PSF."""
-    flat = {"jacobian": grid.jacobian, "origin": grid.origin} if grid.wcs is None else None
+    flat = {"jacobian": grid.jacobian, "origin": grid.origin} if grid.is_flat else None
     return {"flat": flat, "spacing": psf.spacing, "center": psf.center}
 
 
@@ -232,32 +230,23 @@ def _placed(grid, number):
 def _grid(path, hdu, about, hdus):
     shape, flat = hdu.shape[-2:], about["flat"]
     if flat is not None:
-        return Grid(shape, None, np.array(flat["jacobian"], float), np.array(flat["origin"], float))
+        return Grid.from_jacobian(shape, flat["jacobian"], flat["origin"])
     return Grid.from_wcs(celestial_header(path, hdu.header, hdus), shape)
 
 
 def _psf(images, about):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PSFWarning)  # told when it was made
-        psf = PSF(images, spacing=about["spacing"], center=about["center"])
-    images.flags.writeable = False
-    object.__setattr__(psf, "images", images)  # sums of 1 to rounding: not to be divided by again
-    return psf
+    return PSF.restore(images, spacing=about["spacing"], center=about["center"])
 
 
 def _observation(path, hdus, i, about):
     data = hdus["DATA", i + 1]
-    observation = Observation(
+    return Observation.restore(
         _array(data),
         _psf(_array(hdus["PSF", i + 1]), about),
         _grid(path, data, about, hdus),
         weights=_array(hdus["WEIGHTS", i + 1]),
-        **{key: about[key] for key in ("channels", "zero_points", "name")},
+        **{key: about[key] for key in KEPT},
     )
-    # of the first making
-    object.__setattr__(observation, "n_bad", about["n_bad"])
-    object.__setattr__(observation, "messages", tuple(about["messages"]))
-    return observation
 
 
 def _source(path, *, kind, **given):

@@ -94,7 +94,7 @@ def _add_positions(table, grid, positions, suffix):
     """Columns of (S, 2) [model px], also on the sky."""
     sky = grid.sky(*positions.T)
     names, unit = ("y_sky", "x_sky"), u.arcsec
-    if grid.wcs is not None:
+    if not grid.is_flat:
         names, unit = (grid.wcs.wcs.lngtyp.lower(), grid.wcs.wcs.lattyp.lower()), u.deg
         table.meta["frame"] = wcs_to_celestial_frame(grid.wcs).name
     for name, values in zip(names, sky, strict=True):

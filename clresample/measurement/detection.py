@@ -24,7 +24,7 @@ import numpy as np
 from ..deblending.spectra import MODEL_ERROR
 from ..resampling.cache import cached_resampler
 from ..sky.frame import Frame, model_frame
-from ..sky.noise import MIN_PIXELS
+from ..sky.noise import sigma_below_zero
 from ..sky.observation import Observation
 from ..sky.sources import Extended
 
@@ -36,7 +36,6 @@ MIN_AREA = 0.25
 # sep's deblending: levels between a threshold and a peak, and the part of an object's light that a
 # branch must hold to be an object of its own; both are SExtractor's defaults
 N_LEVELS, MIN_CONTRAST = 32, 0.005
-HALF_NORMAL = 0.6745  # median of |x| for x of unit normal scatter
 # of a channel's largest variance v: a point with less lies on pixels that are masked or not seen
 LEAST_WEIGHT = 0.1
 # of the wider PSF's FWHM: nearer to a source that is found, a peak counts as that source
@@ -180,10 +179,8 @@ def _signal_to_noise(observation, frame, device):
         total[seen] += n[seen] / np.sqrt(v[seen] * power)
         n_seen += seen
     image = total / np.sqrt(np.maximum(n_seen, 1))
-    dark = -image[image < 0]
-    if dark.size >= MIN_PIXELS:  # negative pixels are noise; correlated noise has more scatter
-        image /= max(1.0, np.median(dark) / HALF_NORMAL)
-    return image
+    # negative pixels are noise; correlated noise has more scatter
+    return image / max(1.0, sigma_below_zero(image) or 1.0)
 
 
 def _convolved(image, psf):
@@ -202,11 +199,9 @@ def _convolved(image, psf):
 
 
 def _fwhm_px(observation, frame):
-    """Width [model px] of an observation's sharpest PSF: diameter of its disc above half peak."""
-    psf = observation.psf
-    n = min(np.count_nonzero(image > image.max() / 2) for image in psf.images)
+    """Width [model px] of an observation's sharpest PSF."""
     scale = observation.grid.pixel_scale_arcsec / frame.grid.pixel_scale_arcsec
-    return 2 * math.sqrt(n / math.pi) * psf.spacing * scale
+    return observation.psf.fwhm_px.min() * scale
 
 
 def _peaks(sep, image, threshold, area):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..sky.grid import ARCSEC
+from ..sky.wcs import ARCSEC
 
 
 def moments(components, light):
@@ -51,7 +51,7 @@ def local_axes(grid, pixel):
 
     pixel (2,) [px]: (y, x), where on the grid
     """
-    if grid.wcs is None:
+    if grid.is_flat:
         return grid.jacobian * [[1.0], [-1.0]]
     n, m = np.asarray(pixel)[:, None] + [[0, -0.5, 0.5, 0, 0], [0, 0, 0, -0.5, 0.5]]
     lon, lat = np.radians(grid.sky(n, m))

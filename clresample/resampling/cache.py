@@ -1,9 +1,11 @@
-"""Operators from a model frame to observations, made once for each geometry."""
+"""Plans and operators that are made once for each geometry and found again."""
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import threading
+from collections import OrderedDict
 
 import numpy as np
 
@@ -11,68 +13,124 @@ from ..device.device import get_device
 from ..sky.frame import Frame
 from ..sky.grid import Grid
 from ..sky.psf import PSF
-from .plan import Plan, Precision, make_plan
+from .plan import Precision, make_plan
 from .resampler import Resampler
 
-# Geometries kept: those of one survey tile's epochs and bands; plans take a few MB each.
-N_PLANS, N_OPERATORS = 256, 32
+# [bytes] For blends of 50 to 200 pixels plans take 0.1 to 4 MB each and operators twice that, so
+# that hundreds are kept: those of one survey tile's epochs and bands. With less room its fits make
+# them anew (10 to 100 ms each); with more, memory is held that is never read again.
+PLAN_BYTES, DEVICE_BYTES = 512 << 20, 256 << 20
 
 
-class _Recipe:
-    """What a plan is made of, equal to another of the same bytes."""
+class OperatorCache:
+    """Resamplers by what they are made of, and the plans behind them, bounded in bytes.
 
-    def __init__(self, mapping, psf_in, psf_out, dtype, extent):
-        self.mapping, self.psf_in, self.psf_out = mapping, psf_in, psf_out
-        self.precision, self.extent = Precision.of(dtype), extent
-        digest = hashlib.sha256()
-        parts = [mapping.matrix, mapping.offset, mapping.positions, mapping.area]
-        for psf in (psf_in, psf_out):
-            parts += [psf.images, psf.center, np.float64(psf.spacing)]
-        for part in parts:
-            digest.update(b"-" if part is None else np.ascontiguousarray(part).tobytes())
-        self.key = (
-            mapping.kind,
-            mapping.shape_in,
-            mapping.shape_out,
-            extent,
-            np.dtype(dtype).str,
-            tuple(p.images.shape for p in (psf_in, psf_out)),
-            digest.digest(),
-        )
+    plan_bytes [bytes]: host memory that plans may hold
+    device_bytes [bytes]: device memory that operators may hold, with their intermediates as large
+        as their last batch made them; what was asked for longest ago goes first, and the newest
+        stays however large it is
 
-    def __hash__(self):
-        return hash(self.key)
+    Safe to share between threads; the operators themselves are not.
+    """
 
-    def __eq__(self, other):
-        return self.key == other.key
+    def __init__(self, *, plan_bytes=PLAN_BYTES, device_bytes=DEVICE_BYTES):
+        self.plan_bytes, self.device_bytes = plan_bytes, device_bytes
+        self._plans, self._operators = OrderedDict(), OrderedDict()
+        self._lock = threading.RLock()
+
+    def resampler(
+        self, frame: Frame, grid: Grid, psf: PSF, *, dtype, device=None, extent=None, private=False
+    ) -> Resampler:
+        """The Resampler from `frame` to `grid` and `psf`; asked twice it is the same object.
+
+        extent (2,) [px]: what of the frame holds light, the rest is padding; None = all of it
+        private: an operator of the caller's own, whose shift may be set, on the same plan
+
+        Raises ValueError as Resampler does.
+        """
+        device, dtype = get_device(device), np.dtype(dtype)
+        mapping = grid.map_to(frame.grid)
+        key = _key(mapping, frame.psf, psf, dtype, extent)
+
+        def plan():
+            precision = Precision.of(dtype)
+            return make_plan(mapping, frame.psf, psf, precision=precision, extent=extent)
+
+        def operator():
+            plans = [_find(self._plans, key, plan, self.plan_bytes)]
+            return Resampler.from_plans(plans, dtype=dtype, device=device)
+
+        with self._lock:
+            if private:
+                return operator()
+            return _find(self._operators, (key, device), operator, self.device_bytes)
+
+    @property
+    def n_plans(self) -> int:
+        """How many plans are held."""
+        return len(self._plans)
+
+    @property
+    def n_operators(self) -> int:
+        """How many operators are held."""
+        return len(self._operators)
+
+    def clear(self):
+        """Forget all plans and operators; those in use elsewhere live on."""
+        with self._lock:
+            self._plans.clear()
+            self._operators.clear()
 
 
-@functools.lru_cache(maxsize=N_PLANS)
-def _plan(recipe: _Recipe) -> Plan:
-    return make_plan(
-        recipe.mapping,
-        recipe.psf_in,
-        recipe.psf_out,
-        precision=recipe.precision,
-        extent=recipe.extent,
-    )
-
-
-@functools.lru_cache(maxsize=N_OPERATORS)
-def _operator(recipe: _Recipe, dtype, device) -> Resampler:
-    return Resampler.from_plans([_plan(recipe)], dtype=dtype, device=device)
+@functools.cache
+def default_cache() -> OperatorCache:
+    """The cache of everyone who brings none."""
+    return OperatorCache()
 
 
 def cached_resampler(
-    frame: Frame, grid: Grid, psf: PSF, *, dtype, device=None, extent=None, private=False
+    frame: Frame,
+    grid: Grid,
+    psf: PSF,
+    *,
+    dtype,
+    device=None,
+    extent=None,
+    private=False,
+    cache: OperatorCache | None = None,
 ) -> Resampler:
-    """The Resampler from `frame` to `grid` and `psf`; asked twice it is the same object.
+    """`OperatorCache.resampler` of a cache, or of the default one."""
+    cache = default_cache() if cache is None else cache
+    return cache.resampler(
+        frame, grid, psf, dtype=dtype, device=device, extent=extent, private=private
+    )
 
-    extent (2,) [px]: what of the frame holds light, the rest is padding; None = all of it
-    private: an operator of the caller's own, whose shift may be set, on the same plan
-    """
-    recipe = _Recipe(grid.map_to(frame.grid), frame.psf, psf, dtype, extent)
-    device, dtype = get_device(device), np.dtype(dtype)
-    if private:
-        return Resampler.from_plans([_plan(recipe)], dtype=dtype, device=device)
-    return _operator(recipe, dtype, device)
+
+def _key(mapping, psf_in, psf_out, dtype, extent):
+    """What a plan is made of: equal for equal bytes."""
+    digest = hashlib.sha256()
+    parts = [mapping.matrix, mapping.offset, mapping.positions, mapping.area]
+    for psf in (psf_in, psf_out):
+        parts += [psf.images, psf.center, np.float64(psf.spacing)]
+    for part in parts:
+        digest.update(b"-" if part is None else np.ascontiguousarray(part).tobytes())
+    return (
+        mapping.geometry,
+        mapping.shape_in,
+        mapping.shape_out,
+        None if extent is None else tuple(extent),
+        dtype.str,
+        tuple(psf.images.shape for psf in (psf_in, psf_out)),
+        digest.digest(),
+    )
+
+
+def _find(entries, key, make, n_bytes):
+    """The entry of a key, made if there is none; then the oldest beyond `n_bytes` are dropped."""
+    if key not in entries:
+        entries[key] = make()
+        held = sum(entry.n_bytes for entry in entries.values())
+        while held > n_bytes and len(entries) > 1:
+            held -= entries.popitem(last=False)[1].n_bytes
+    entries.move_to_end(key)
+    return entries[key]

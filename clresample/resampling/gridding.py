@@ -6,17 +6,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# Terms of the Chebyshev series for one unit of the window: from 14 on, rounding (1e-14) is all that
-# is left.
+# Terms of the Chebyshev series of one tap: 14 leave an error of 1e-14, float64's own rounding here;
+# more only cost time.
 SERIES_TERMS = 16
 
 
 @dataclass(frozen=True)
 class KaiserBessel:
-    """Kaiser-Bessel window of `n_taps` columns, which lie `oversampling` x closer than Nyquist's.
+    """Kaiser-Bessel window: interpolates a band-limited line from samples on finer columns.
 
-    phi(u) = I0(beta sqrt(1 - (2u/W)^2)) / I0(beta),   phi^(f) = W sinh(b) / (b I0(beta)),
-    b^2 = beta^2 - (pi W f)^2.  Relative error exp(-pi W sqrt(1 - 1/oversampling)).
+        phi(u) = I0(beta sqrt(1 - (2u/W)^2)) / I0(beta),   |u| <= W/2, else 0
+        phi^(f) = W sinh(b) / (b I0(beta)),   b^2 = beta^2 - (pi W f)^2
+
+    n_taps: W, columns that a pixel is interpolated from
+    oversampling: how many times closer the columns lie than Nyquist's spacing
+    Relative error of the interpolation: exp(-pi W sqrt(1 - 1/oversampling)).
     """
 
     n_taps: int
@@ -24,9 +28,11 @@ class KaiserBessel:
 
     @property
     def beta(self) -> float:
+        """The shape for which the main lobe of phi^ ends where the band's first alias begins."""
         return np.pi * self.n_taps * (1 - 0.5 / self.oversampling)
 
     def __call__(self, u):
+        """phi(u) (...) at distances u (...) [columns]."""
         inside = np.clip(1 - (2 * u / self.n_taps) ** 2, 0, None)
         return np.i0(self.beta * np.sqrt(inside)) / np.i0(self.beta) * (inside > 0)
 
@@ -44,17 +50,21 @@ class KaiserBessel:
         return np.polynomial.chebyshev.chebvander(2 * fraction - 1, SERIES_TERMS - 1) @ series
 
     def transform(self, f):
+        """phi^(f) (...) at frequencies f (...) [cycles/column]."""
         b = np.sqrt((self.beta**2 - (np.pi * self.n_taps * f) ** 2).clip(1e-300))
         return self.n_taps * np.sinh(b) / (b * np.i0(self.beta))
 
 
 @dataclass(frozen=True)
 class LineTaps:
-    """Observed pixels as straight lines through the model: pass 2 of the affine path.
+    """Observed pixels as straight lines through the model: pass 2 of the affine geometry.
 
-    forward:  out[l, q] = sum_t weight[l, t, q] g[l, start[l, q] + t]
-    adjoint:  g[l, j] = sum_t weight_t[l, t, j] out[l, start_t[l, j] + t]
+        forward   out[l, q] = sum_t weight[l, t, q] g[l, start[l, q] + t]
+        adjoint   g[l, j] = sum_t weight_t[l, t, j] out[l, start_t[l, j] + t]
+
     by_row: lines are rows of the observed image (position q = column) or its columns (q = row)
+    start (L, Q), start_t (L, J): first of the columns, or pixels, that are summed
+    weight (L, W, Q), weight_t (L, W', J) [1]: 0 for pixels that the model does not cover
     """
 
     by_row: bool
@@ -67,7 +77,8 @@ class LineTaps:
 def transpose_taps(start, weight, covered, n_columns):
     """The same sparse lines read the other way: for each column, the observed pixels it feeds.
 
-    start (L, q), weight (L, q, taps) -> start (L, J), weight (L, taps back, J)
+    start (L, Q), weight (L, Q, W): of the way forward; covered (L, Q) bool
+    returns start_t (L, J), weight_t (L, W', J) for J = n_columns
     """
     n_lines, n_steps, n_taps = weight.shape
     line, step = np.nonzero(covered)

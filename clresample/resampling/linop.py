@@ -1,4 +1,4 @@
-"""Linear operators on device arrays: one forward, one adjoint, NumPy in and out where wanted."""
+"""Linear operators: one forward, one adjoint, on device arrays or NumPy arrays in and out."""
 
 from __future__ import annotations
 
@@ -28,14 +28,32 @@ class LinOp:
         self._staged = {}
 
     def forward(self, x, out=None):
-        """A x.  x (B,) + shape_in -> (B,) + shape_out, into `out` (of x's kind) if given."""
+        """A x.  x (B,) + shape_in -> (B,) + shape_out, into `out` (of x's kind) if given.
+
+        Raises ValueError for shapes that do not fit, complex x, device arrays of another dtype,
+        layout or context, and an `out` that is on the host where x is on the device or the reverse.
+        """
         return self._apply(self._forward, "x", x, out, self.shape_in, self.shape_out)
 
     def adjoint(self, y, out=None):
-        """A^T y.  y (B,) + shape_out -> (B,) + shape_in, into `out` (of y's kind) if given."""
+        """A^T y.  y (B,) + shape_out -> (B,) + shape_in, into `out` (of y's kind) if given.
+
+        Raises ValueError as `forward` does.
+        """
         return self._apply(self._adjoint, "y", y, out, self.shape_out, self.shape_in)
 
     __call__ = __matmul__ = forward
+
+    def forward_into(self, x, out):
+        """Queue out = A x without any check: for loops that call it with the same arrays.
+
+        x (B,) + shape_in, out (B,) + shape_out: C-contiguous arrays of `dtype` on `device`
+        """
+        self._forward(x, out)
+
+    def adjoint_into(self, y, out):
+        """Queue out = A^T y without any check; y (B,) + shape_out, out (B,) + shape_in."""
+        self._adjoint(y, out)
 
     @property
     def T(self) -> LinOp:
@@ -54,51 +72,43 @@ class LinOp:
         )
 
     def _forward(self, x, out):
+        """out = A x on device arrays (B,) + shape_in and (B,) + shape_out."""
         raise NotImplementedError
 
     def _adjoint(self, y, out):
+        """out = A^T y on device arrays (B,) + shape_out and (B,) + shape_in."""
         raise NotImplementedError
 
     def _apply(self, run, name, x, out, shape_x, shape_out):
-        single = shape_x[0] == 1 == shape_out[0] and len(shape_x) == len(shape_out) == 3
+        """`run`, one of the two above, on an array `x` of a caller, who calls it `name`."""
         on_device = hasattr(x, "base_data")
         if not on_device:
             x = np.asarray(x)
             if np.iscomplexobj(x):
                 raise ValueError(f"{name} is {x.dtype}, the operator is real ({self.dtype})")
-        shape = tuple(x.shape)
-        if shape == shape_x:
-            batch, shape_result = 1, shape_out
-        elif len(shape) == len(shape_x) + 1 and shape[1:] == shape_x and shape[0] > 0:
-            batch, shape_result = shape[0], (shape[0], *shape_out)
-        elif single and shape == shape_x[1:]:
-            batch, shape_result = 1, shape_out[1:]
-        else:
-            raise ValueError(f"{name} has shape {shape}, expected {shape_x} or (B,) + {shape_x}")
+        batch, shape_result = _match_shape(name, tuple(x.shape), shape_x, shape_out)
         if out is not None:
-            if on_device != hasattr(out, "base_data") or not hasattr(out, "shape"):
-                raise ValueError(
-                    f"out is a {_kind(out)}, but {name} a {_kind(x)}: both must be "
-                    "NumPy arrays or both pyopencl arrays"
-                )
-            if tuple(out.shape) != shape_result:
-                raise ValueError(f"out has shape {tuple(out.shape)}, expected {shape_result}")
-        batched_x, batched_out = (batch, *shape_x), (batch, *shape_out)
+            _check_out(name, x, out, on_device, shape_result)
+        go = self._on_device if on_device else self._through_host
+        return go(run, name, x, out, (batch, *shape_x), (batch, *shape_out), shape_result)
 
-        if on_device:
-            x = self._checked(name, x)
-            out = (
-                self.device.empty(shape_result, self.dtype)
-                if out is None
-                else self._checked("out", out)
-            )
-            others = {a.queue for a in (x, out)} - {None, self.device.queue}
-            for queue in others:  # of the caller, who may still write or read there
-                queue.finish()
-            run(_shaped(x, batched_x), _shaped(out, batched_out))
-            if others:
-                self.device.finish()
-            return out
+    def _on_device(self, run, name, x, out, batched_x, batched_out, shape_result):
+        """`run` on a caller's device arrays, straight from and to their memory."""
+        x = self._checked(name, x)
+        if out is None:
+            out = self.device.empty(shape_result, self.dtype)
+        else:
+            out = self._checked("out", out)
+        others = {a.queue for a in (x, out)} - {None, self.device.queue}
+        for queue in others:  # of the caller, who may still write or read there
+            queue.finish()
+        run(_shaped(x, batched_x), _shaped(out, batched_out))
+        if others:
+            self.device.finish()
+        return out
+
+    def _through_host(self, run, name, x, out, batched_x, batched_out, shape_result):
+        """`run` on a caller's NumPy arrays, through device arrays that are kept for the next."""
         x_device, out_device = self._staging(name, batched_x, batched_out)
         self.device.upload(np.ascontiguousarray(x, dtype=self.dtype), x_device)
         run(x_device, out_device)
@@ -111,6 +121,7 @@ class LinOp:
         return out
 
     def _checked(self, name, array):
+        """A caller's device array, as the kernels take it; ValueError for others."""
         if array.dtype != self.dtype:
             raise ValueError(f"{name} has dtype {array.dtype}, the operator has {self.dtype}")
         if not array.flags.c_contiguous:
@@ -136,13 +147,27 @@ class LinOp:
         return self._staged[name][1:]
 
 
-def _kind(array):
-    return f"{type(array).__module__}.{type(array).__name__}"
+class HostOp(LinOp):
+    """A linear operator whose arrays are too large for the device: they stay on the host.
 
+    Subclasses implement `_forward` and `_adjoint` on NumPy arrays (B,) + shape of `dtype`.
+    """
 
-def _shaped(array, shape):
-    """The array, or a view: pyopencl takes 15 us to make one, even of the same shape."""
-    return array if array.shape == shape else array.reshape(shape)
+    def _on_device(self, run, name, *call):
+        """Refused: there is no way in for device arrays."""
+        raise ValueError(f"{name} is on the device: {type(self).__name__} takes NumPy arrays")
+
+    def _through_host(self, run, name, x, out, batched_x, batched_out, shape_result):
+        """`run` on a caller's NumPy arrays, copied only where dtype or layout ask for it."""
+        x = np.ascontiguousarray(x, dtype=self.dtype).reshape(batched_x)
+        direct = out is not None and out.dtype == self.dtype and out.flags.c_contiguous
+        direct = direct and not np.may_share_memory(x, out)
+        result = out if direct else np.empty(shape_result, self.dtype)
+        run(x, result.reshape(batched_out))
+        if out is None or direct:
+            return result
+        out[...] = result
+        return out
 
 
 class Adjoint(LinOp):
@@ -153,10 +178,49 @@ class Adjoint(LinOp):
         self.op = op
 
     def _apply(self, *call):
-        return self.op._apply(*call)  # frames in tiles stay on the host this way round too
+        """On the device or on the host, as the operator itself does it."""
+        return self.op._apply(*call)
 
     def _forward(self, x, out):
+        """The operator's adjoint."""
         self.op._adjoint(x, out)
 
     def _adjoint(self, y, out):
+        """The operator itself."""
         self.op._forward(y, out)
+
+
+def _match_shape(name, shape, shape_x, shape_out):
+    """Number of items in a caller's array of this shape, and the shape of its result.
+
+    shape_x, shape_out: of one item
+    """
+    if shape == shape_x:
+        return 1, shape_out
+    if len(shape) == len(shape_x) + 1 and shape[1:] == shape_x and shape[0] > 0:
+        return shape[0], (shape[0], *shape_out)
+    one_band = shape_x[0] == 1 == shape_out[0] and len(shape_x) == len(shape_out) == 3
+    if one_band and shape == shape_x[1:]:
+        return 1, shape_out[1:]
+    raise ValueError(f"{name} has shape {shape}, expected {shape_x} or (B,) + {shape_x}")
+
+
+def _check_out(name, x, out, on_device, shape):
+    """ValueError unless `out` is an array of x's kind and of the expected shape."""
+    if on_device != hasattr(out, "base_data") or not hasattr(out, "shape"):
+        raise ValueError(
+            f"out is a {_kind(out)}, but {name} a {_kind(x)}: both must be "
+            "NumPy arrays or both pyopencl arrays"
+        )
+    if tuple(out.shape) != shape:
+        raise ValueError(f"out has shape {tuple(out.shape)}, expected {shape}")
+
+
+def _kind(array):
+    """Full name of an array's class, for messages."""
+    return f"{type(array).__module__}.{type(array).__name__}"
+
+
+def _shaped(array, shape):
+    """The array, or a view: pyopencl takes 15 us to make one, even of the same shape."""
+    return array if array.shape == shape else array.reshape(shape)

@@ -1,4 +1,4 @@
-"""The resampling operator worked out in float64: band, difference spectrum and factor tables.
+"""The resampling operator worked out in float64: band, transfer function and factor tables.
 
 With X = A p + t the position of observed pixel p in model pixels and nu = kappa / K,
 
@@ -12,25 +12,31 @@ exponential is a (cos, sin) pair of real table rows: a plan is a list of real ma
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..sky.mapping import Mapping
 from ..sky.psf import PSF
+from ..sky.waves import cos_sin_columns
 from .gridding import KaiserBessel, LineTaps, transpose_taps
-from .transfer import transfer_function, wrap_radius
+from .transfer import Certificate, transfer_function, wrap_radius
 
 
 @dataclass(frozen=True)
 class Precision:
-    """What a floating-point type deserves: where the band ends, how lines are interpolated."""
+    """How exact a plan is made: to the rounding of the floating-point type that it serves.
 
-    band_tolerance: float  # |D| / max |D| below which a frequency is dropped
+    band_tolerance [1]: |D| / max |D| below which a frequency is dropped
+    window: by which pixels are interpolated along lines; see KaiserBessel for its error
+    """
+
+    band_tolerance: float
     window: KaiserBessel
 
     @classmethod
     def of(cls, dtype) -> Precision:
+        """For float32 or float64."""
         if np.dtype(dtype) == np.float32:
             return cls(3e-8, KaiserBessel(10, 1.5))  # window error 1e-8
         return cls(1e-16, KaiserBessel(16, 2.0))  # window error 4e-16
@@ -40,7 +46,7 @@ class Precision:
 class Plan:
     """Tables of one observation; rows 2i, 2i+1 of a table are the cos and sin parts of frequency i.
 
-    kind: "aligned" | "affine" | "distorted"
+    mapping: observed pixels -> model pixels; its geometry decides which tables there are
     identity: same pixels and PSF, so that without a shift the operator returns its input
     nu (Hy,), (Hx,) [cycles per model px]: frequencies >= 0 of the two table axes
     axes: the model axis of each table axis; (1, 0) where the observed rows run along the model's y
@@ -49,14 +55,12 @@ class Plan:
     out_y, out_x: aligned (My, 2Hy), (2Hx, Mx); affine (L, 2Hy), (2Hx, J); distorted (P, 2Hy),
         (P, 2Hx)
     twist (Hy, J) [rad], lines: affine only
-    report: wrap_radius_px, n_fft (K), n_frequencies, max_gain (C,) = max |D| / |det A|,
-        floored_power (C,) = share of the observed PSF's power where the division was floored
     """
 
-    kind: str
     mapping: Mapping
     n_bands: int
     identity: bool
+    certificate: Certificate
     nu: tuple[np.ndarray, np.ndarray]
     axes: tuple[int, int]
     d_plus: np.ndarray
@@ -67,10 +71,21 @@ class Plan:
     out_x: np.ndarray
     twist: np.ndarray | None = None
     lines: LineTaps | None = None
-    report: dict = field(default_factory=dict)
+
+    @property
+    def geometry(self) -> str:
+        """The mapping's: "aligned" | "affine" | "distorted"."""
+        return self.mapping.geometry
+
+    @property
+    def n_bytes(self) -> int:
+        """Host memory of the tables and the mapping [bytes]."""
+        parts = [self, self.mapping] + ([self.lines] if self.lines is not None else [])
+        values = (value for part in parts for value in vars(part).values())
+        return sum(value.nbytes for value in values if isinstance(value, np.ndarray))
 
     def shifted(self, shift) -> tuple[np.ndarray, np.ndarray]:
-        """Spectra of the operator with every observed pixel moved by `shift` (2,) [model px]."""
+        """D(+,+), D(+,-) with every observed pixel moved by `shift` (2,) [model px]."""
         phase_y, phase_x = (np.exp(2j * np.pi * self.nu[i] * shift[self.axes[i]]) for i in (0, 1))
         phase_y = phase_y[:, None]
         return self.d_plus * (phase_y * phase_x), self.d_minus * (phase_y * phase_x.conj())
@@ -85,64 +100,75 @@ def make_plan(
     psf_in (1 or C bands), psf_out (C bands): PSF samples of the model and of the observation
     extent (2,) [model px]: from its first pixel on, what of the model holds light, and sets the
         frequencies; None = all of it
-    raises ValueError for incompatible band counts or a PSF with no light in the band.
+
+    Raises ValueError for incompatible band counts, no overlap, or a PSF without light in the band.
     """
     n_bands = count_bands(mapping, psf_in, psf_out)
     radius = wrap_radius(psf_out, mapping.matrix)
-    n_fft = tuple(_odd(n + h) for n, h in zip(extent or mapping.shape_in, radius, strict=True))
-    nu_y, nu_x = (
-        np.arange(_half_count(mapping.matrix, psf_out.spacing, i, n_fft[i])) / n_fft[i]
-        for i in (0, 1)
-    )
-    d, report = transfer_function(mapping.matrix, psf_in, psf_out, nu_y, nu_x)
+    extent = mapping.shape_in if extent is None else extent
+    n_fft = _odd(extent[0] + radius[0]), _odd(extent[1] + radius[1])
+    nu, d, max_gain, floored_power = _band(mapping.matrix, psf_in, psf_out, n_fft, precision)
     d = np.broadcast_to(d, (n_bands,) + d.shape[1:])
+    n_frequencies = h_y, h_x = len(nu[0]), len(nu[1])
 
-    strong = np.abs(d) > precision.band_tolerance * np.abs(d).max(axis=(1, 2), keepdims=True)
-    h_y = int(np.flatnonzero(strong.any(axis=(0, 2)))[-1]) + 1
-    columns = np.flatnonzero(strong.any(axis=(0, 1))) - (len(nu_x) - 1)
-    h_x = int(np.abs(columns).max()) + 1
-    d = np.where(strong, d, 0)[:, :h_y, len(nu_x) - h_x : len(nu_x) + h_x - 1]
-    nu_y, nu_x = nu_y[:h_y], nu_x[:h_x]
-
-    center = (np.array(mapping.shape_in) - 1) / 2
-    axes = (0, 1)
-    if mapping.kind == "affine":
-        tables, d = _line_tables(mapping, (nu_y, nu_x), d, center, precision.window)
-    elif mapping.kind == "distorted":
-        tables = _distorted_tables(mapping, (nu_y, nu_x), center)
+    center, axes = (np.array(mapping.shape_in) - 1) / 2, (0, 1)
+    if mapping.geometry == "affine":
+        tables, d = _line_tables(mapping, nu, d, center, precision.window)
+    elif mapping.geometry == "distorted":
+        tables = _distorted_tables(mapping, nu, center)
     d = d * (2 / (n_fft[0] * n_fft[1]))
     d[:, 0] *= 0.5
     d[:, :, h_x - 1] *= 0.5
-    nu, d_plus, d_minus = (nu_y, nu_x), d[:, :, h_x - 1 :], d[:, :, h_x - 1 :: -1]
-    if mapping.kind == "aligned":
+    d_plus, d_minus = d[:, :, h_x - 1 :], d[:, :, h_x - 1 :: -1]
+    if mapping.geometry == "aligned":
         if mapping.matrix[0, 0] == 0:
-            axes, nu = (1, 0), (nu_x, nu_y)
+            axes, nu = (1, 0), nu[::-1]
             d_plus, d_minus = d_plus.swapaxes(1, 2), d_minus.swapaxes(1, 2).conj()
         tables = _aligned_tables(mapping, nu, axes, center)
     in_y, in_x = (
         _waves(nu[i], np.arange(mapping.shape_in[axes[i]]) - center[axes[i]]).T for i in (0, 1)
     )
-    report |= {"wrap_radius_px": radius, "n_fft": n_fft, "n_frequencies": (h_y, h_x)}
     return Plan(
-        mapping.kind,
-        mapping,
-        n_bands,
-        is_identity(mapping, psf_in, psf_out),
-        nu,
-        axes,
-        d_plus,
-        d_minus,
-        in_y,
-        in_x,
-        report=report,
+        mapping=mapping,
+        n_bands=n_bands,
+        identity=is_identity(mapping, psf_in, psf_out),
+        certificate=Certificate(radius, n_fft, n_frequencies, max_gain, floored_power),
+        nu=nu,
+        axes=axes,
+        d_plus=d_plus,
+        d_minus=d_minus,
+        in_y=in_y,
+        in_x=in_x,
         **tables,
     )
+
+
+def _band(matrix, psf_in: PSF, psf_out: PSF, n_fft, precision: Precision):
+    """The frequencies that are summed, D at them, max_gain and floored_power (see Certificate).
+
+    returns nu (Hy,), (Hx,) [cycles per model px] >= 0, D (C, Hy, 2 Hx - 1) for nu_y >= 0 and nu_x
+        from -max to +max and 0 where it is under the band's tolerance; max_gain, floored_power (C,)
+    """
+    nu_y, nu_x = (
+        np.arange(_half_count(matrix, psf_out.spacing, i, n_fft[i])) / n_fft[i] for i in (0, 1)
+    )
+    both = np.concatenate([-nu_x[:0:-1], nu_x])
+    d, max_gain, floored_power = transfer_function(
+        psf_in.otf(nu_y, both), psf_out.otf(nu_y, both, matrix)
+    )
+    d = abs(np.linalg.det(matrix)) * d
+    strong = np.abs(d) > precision.band_tolerance * np.abs(d).max(axis=(1, 2), keepdims=True)
+    h_y = int(np.flatnonzero(strong.any(axis=(0, 2)))[-1]) + 1
+    columns = np.flatnonzero(strong.any(axis=(0, 1))) - (len(nu_x) - 1)
+    h_x = int(np.abs(columns).max()) + 1
+    d = np.where(strong, d, 0)[:, :h_y, len(nu_x) - h_x : len(nu_x) + h_x - 1]
+    return (nu_y[:h_y], nu_x[:h_x]), d, max_gain, floored_power
 
 
 def count_bands(mapping: Mapping, psf_in: PSF, psf_out: PSF) -> int:
     """Bands of an operator between two PSFs of 1 or C bands.
 
-    raises ValueError for numbers of bands that do not agree, and for grids that do not overlap.
+    Raises ValueError for numbers of bands that do not agree, and for grids that do not overlap.
     """
     n_bands = max(psf_in.n_bands, psf_out.n_bands)
     for name, psf in (("psf_in", psf_in), ("psf_out", psf_out)):
@@ -162,7 +188,7 @@ def count_bands(mapping: Mapping, psf_in: PSF, psf_out: PSF) -> int:
 def is_identity(mapping: Mapping, psf_in: PSF, psf_out: PSF) -> bool:
     """Same pixels and the same PSF: D = 1 and the operator must return its input bit for bit."""
     return (
-        mapping.kind == "aligned"
+        mapping.geometry == "aligned"
         and mapping.shape_in == mapping.shape_out
         and np.array_equal(mapping.matrix, np.eye(2))
         and not np.any(mapping.offset)
@@ -173,6 +199,7 @@ def is_identity(mapping: Mapping, psf_in: PSF, psf_out: PSF) -> bool:
 
 
 def _odd(x: float) -> int:
+    """The smallest odd number that is not less."""
     n = int(np.ceil(x))
     return n + 1 - n % 2
 
@@ -185,8 +212,7 @@ def _half_count(matrix, spacing: float, axis: int, n_fft: int) -> int:
 
 def _waves(nu, x) -> np.ndarray:
     """Columns 2i, 2i+1: cos and sin of 2 pi nu_i x (..., 2 len(nu)) for positions x (...)."""
-    angle = 2 * np.pi * np.asarray(x)[..., None] * nu
-    return np.stack([np.cos(angle), np.sin(angle)], axis=-1).reshape(*angle.shape[:-1], -1)
+    return cos_sin_columns(2 * np.pi * np.asarray(x)[..., None] * nu)
 
 
 def _aligned_tables(mapping: Mapping, nu, axes, center):
@@ -203,7 +229,7 @@ def _aligned_tables(mapping: Mapping, nu, axes, center):
 def _distorted_tables(mapping: Mapping, nu, center):
     """Waves at every observed pixel, with the pixel's own area; zero where it is not covered."""
     scale = mapping.covered * (1.0 if mapping.area is None else mapping.area)
-    y, x = np.moveaxis(mapping.positions, -1, 0)
+    y, x = np.moveaxis(mapping.at(*np.indices(mapping.shape_out)), -1, 0)
     return {
         "out_y": _waves(nu[0], y.ravel() - center[0]) * scale.reshape(-1, 1),
         "out_x": _waves(nu[1], x.ravel() - center[1]),

@@ -1,9 +1,9 @@
-"""The operator in NumPy float64, written from its definitions: what every path must answer.
+"""The operator in NumPy float64, written from its definitions: what every executor must answer.
 
 With A the Jacobian and X the positions of the observed pixels in model pixels, nu = kappa / K:
 
     D(nu)  = |det A| P2^(A^T nu) / P1^(nu)
-    I2(X)  = K^-2 sum_nu D(nu) F[I1](nu) exp(2 pi i nu.X)                          spectral_sum
+    I2(X)  = K^-2 sum_nu D(nu) F[I1](nu) exp(2 pi i nu.X)                         frequency_sum
     I2(X)  = sum_k I1(x_k) sum_m Pd(x_m) sinc(X - x_k - x_m),  Pd = F^-1[D]         dense_matrix
 
 Nothing is left out, separated or interpolated here; only for small images.
@@ -16,7 +16,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from .transfer import DIVISION_FLOOR
 
-__all__ = ["dense_matrix", "difference_kernel", "resample", "spectral_sum", "spectrum_ratio"]
+__all__ = ["dense_matrix", "difference_kernel", "resample", "frequency_sum", "otf_ratio"]
 
 
 def resample(images, mapping, psf_in, psf_out, n_fft):
@@ -27,16 +27,16 @@ def resample(images, mapping, psf_in, psf_out, n_fft):
     """
     positions = mapping.at(*np.indices(mapping.shape_out))
     scale = mapping.covered * (1.0 if mapping.area is None else mapping.area)
-    return scale * spectral_sum(images, positions, mapping.matrix, psf_in, psf_out, n_fft)
+    return scale * frequency_sum(images, positions, mapping.matrix, psf_in, psf_out, n_fft)
 
 
-def spectral_sum(images, positions, matrix, psf_in, psf_out, n_fft):
+def frequency_sum(images, positions, matrix, psf_in, psf_out, n_fft):
     """I2(X) = K^-2 sum_nu D(nu) F[I1](nu) exp(2 pi i nu.X), summed for each position by itself.
 
     images (..., C, Ny, Nx) [flux/px]; positions (*P, 2) [model px]: any X; matrix (2, 2): A
     returns (..., C, *P): flux in an observed pixel of area |det A| at X
     """
-    nu_y, nu_x, d = spectrum_ratio(matrix, psf_in, psf_out, n_fft)
+    nu_y, nu_x, d = otf_ratio(matrix, psf_in, psf_out, n_fft)
     n_y, n_x = np.shape(images)[-2:]
     f = _wave(nu_y, -np.arange(n_y)) @ images @ _wave(-np.arange(n_x), nu_x)
     z = d * f / (n_fft[0] * n_fft[1])
@@ -69,12 +69,12 @@ def difference_kernel(matrix, psf_in, psf_out, n_fft):
     returns (C, Ky, Kx). Source: the quotient below eq. `psf_interp`, times |det A|, the ratio of
     pixel areas.
     """
-    nu_y, nu_x, d = spectrum_ratio(matrix, psf_in, psf_out, n_fft)
+    nu_y, nu_x, d = otf_ratio(matrix, psf_in, psf_out, n_fft)
     m_y, m_x = (np.arange(k) - k // 2 for k in n_fft)
     return (_wave(m_y, nu_y) @ d @ _wave(nu_x, m_x)).real / (n_fft[0] * n_fft[1])
 
 
-def spectrum_ratio(matrix, psf_in, psf_out, n_fft):
+def otf_ratio(matrix, psf_in, psf_out, n_fft):
     """D on both halves of both axes, nu = -(K-1)/2K ... (K-1)/2K: (nu_y, nu_x, D (C, Ky, Kx)).
 
     Where |P1^| is under DIVISION_FLOOR, D = |det A| P2^ conj(P1^) / DIVISION_FLOOR^2.
@@ -83,7 +83,7 @@ def spectrum_ratio(matrix, psf_in, psf_out, n_fft):
     if n_fft[0] % 2 == 0 or n_fft[1] % 2 == 0:
         raise ValueError(f"n_fft is {tuple(n_fft)}, both must be odd")
     nu_y, nu_x = ((np.arange(k) - k // 2) / k for k in n_fft)
-    p1, p2 = psf_in.spectrum(nu_y, nu_x), psf_out.spectrum(nu_y, nu_x, matrix)
+    p1, p2 = psf_in.otf(nu_y, nu_x), psf_out.otf(nu_y, nu_x, matrix)
     size = np.maximum(np.abs(p1), DIVISION_FLOOR)
     return nu_y, nu_x, abs(np.linalg.det(matrix)) * p2 * p1.conj() / size**2
 

@@ -1,9 +1,11 @@
-"""The transfer function D between two PSFs, and how far its kernel reaches.
+"""The transfer function D between two PSFs, how far its kernel reaches, and what it does to noise.
 
 D(nu) = |det A| P2^(A^T nu) / P1^(nu)
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,18 +13,67 @@ from ..sky.psf import PSF
 
 # Light of the observed PSF beyond the wrap radius, as a fraction; images drawn by FFT ring at 1e-6.
 WRAP_TOLERANCE = 1e-5
-# A Gaussian reaches that at 4.9 sigma, and the sharp edge of the band rings beyond: half as much
-# again (7.4 sigma, 1e-12 of the light) keeps what wraps below 4e-7 of an image, 0.06 dB at 58 dB.
+# The radius is larger by this factor than where the light ends (4.9 sigma of a Gaussian), since the
+# band's sharp edge makes the kernel ring beyond. At 1.5 (7.4 sigma, 1e-12 of a Gaussian's light)
+# what wraps stays under 4e-7 of an image, 0.06 dB at 58 dB; larger factors only add frequencies.
 WRAP_MARGIN = 1.5
 # |P1^| below which the division is floored: 1e-6 of a point source's light per frequency, ten times
 # the rounding of a PSF stored in float32.
 DIVISION_FLOOR = 1e-6
+# Amplification |D| / |det A| from which on a user is warned: PSFs that nearly agree stay a few per
+# cent above 1. Share of the observed PSF's power that the floor may take without a warning.
+NOISY_GAIN, FLOORED_POWER = 2.0, 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Certificate:
+    """What the set-up of an operator found.
+
+    wrap_radius_px (2,) [model px]: reach (y, x) of the observed PSF, by which the model is padded
+    n_fft (2,): K, the padded length of each axis; frequencies are kappa / K
+    n_frequencies (2,): frequencies >= 0 of each axis that are summed
+    max_gain (C,) [1]: largest |D| / |det A|, by which noise of that frequency is multiplied
+    floored_power (C,) [1]: share of the observed PSF's power where |P1^| was floored
+    """
+
+    wrap_radius_px: tuple[float, float]
+    n_fft: tuple[int, int]
+    n_frequencies: tuple[int, int]
+    max_gain: np.ndarray
+    floored_power: np.ndarray
+
+    def __repr__(self):
+        (r_y, r_x), (k_y, k_x), (h_y, h_x) = self.wrap_radius_px, self.n_fft, self.n_frequencies
+        return (
+            f"Certificate(wraps at {r_y:.1f}, {r_x:.1f} px; K = {k_y}, {k_x}; "
+            f"{h_y} x {h_x} frequencies; gain <= {self.max_gain.max():.3g}; "
+            f"{self.floored_power.max():.2%} of the power floored)"
+        )
+
+
+def noise_warnings(certificate: Certificate) -> list[str]:
+    """What a user should know of a difference kernel that does more than blur, a line each."""
+    gain, floored = certificate.max_gain.max(), certificate.floored_power.max()
+    lines = []
+    if gain > NOISY_GAIN:
+        lines.append(
+            f"the difference kernel amplifies some frequencies {gain:.3g} times, and noise "
+            "with them: the model's PSF is wider there than the observation's"
+        )
+    if floored > FLOORED_POWER:
+        lines.append(
+            f"{floored:.2%} of the observed PSF's power lies where the model's carries less "
+            f"than {DIVISION_FLOOR:g} of its light: the division is floored there"
+        )
+    return lines
 
 
 def wrap_radius(psf: PSF, matrix) -> tuple[float, float]:
     """Distance (y, x) [model px] beyond which the observed PSF holds no light worth wrapping.
 
     K >= N + radius keeps what leaves one edge of the model from coming in at the other.
+
+    psf: the observed one; matrix (2, 2) [model px / observed px]: A
     """
     y, x = (
         np.abs(np.arange(n) - psf.center[:, i, None]) * psf.spacing
@@ -40,18 +91,19 @@ def wrap_radius(psf: PSF, matrix) -> tuple[float, float]:
     return float(radius[0]), float(radius[1])
 
 
-def transfer_function(matrix, psf_in: PSF, psf_out: PSF, nu_y, nu_x):
-    """D on nu_y >= 0 and nu_x from -max to +max, and a report of what the division had to do.
+def transfer_function(otf_in, otf_out):
+    """D / |det A| = P2^ / P1^ from both OTFs, and what the division had to do.
 
-    D = |det A| P2^ conj(P1^) / max(|P1^|, floor)^2: the exact ratio wherever the model's PSF
+    Computed as P2^ conj(P1^) / max(|P1^|, floor)^2: the exact ratio wherever the model's PSF
     carries more than DIVISION_FLOOR, falling to zero with |P1^| below it.
+
+    otf_in, otf_out (C or 1, Ky, Kx) complex: P1^(nu), P2^(A^T nu); D itself if P2^ comes times
+        |det A|, as in the paper's scheme
+    returns the ratio (C, Ky, Kx), its largest size (C,), and the share (C,) of P2^'s power where
+        the division was floored
     """
-    both = np.concatenate([-nu_x[:0:-1], nu_x])
-    p1 = psf_in.spectrum(nu_y, both)
-    p2 = psf_out.spectrum(nu_y, both, matrix)
-    size = np.abs(p1)
-    ratio = p2 * p1.conj() / np.maximum(size, DIVISION_FLOOR) ** 2
-    power = np.abs(p2) ** 2
+    size = np.abs(otf_in)
+    ratio = otf_out * otf_in.conj() / np.maximum(size, DIVISION_FLOOR) ** 2
+    power = np.abs(otf_out) ** 2
     floored = (power * (size < DIVISION_FLOOR)).sum(axis=(1, 2)) / power.sum(axis=(1, 2))
-    report = {"max_gain": np.abs(ratio).max(axis=(1, 2)), "floored_power": floored}
-    return abs(np.linalg.det(matrix)) * ratio, report
+    return ratio, np.abs(ratio).max(axis=(1, 2)), floored

@@ -118,7 +118,7 @@ def draw(galaxy, grid, *, psf_sigma_arcsec=0.0, position_arcsec=(0.0, 0.0)):
 
     Raises ValueError for a grid with a celestial WCS.
     """
-    if grid.jacobian is None:
+    if not grid.is_flat:
         raise ValueError("grid has a celestial WCS; galaxies are drawn on flat grids (Grid.flat)")
     galsim = import_galsim()
     y, x = position_arcsec

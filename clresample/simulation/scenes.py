@@ -109,7 +109,7 @@ class SimulatedScene:
     def positions_deg(self):
         """Right ascension and declination (S, 2) [deg] of the sources; None on a flat sky."""
         grid = self.euclid.grid
-        return None if grid.wcs is None else grid.sky(*self.euclid.positions_px.T).T
+        return None if grid.is_flat else grid.sky(*self.euclid.positions_px.T).T
 
 
 def observe(survey, grid, profiles, positions_arcsec, magnitudes, rng, *, center_deg=None):

@@ -12,9 +12,10 @@ from .grid import Grid
 from .observation import check_observations
 from .psf import PSF
 
-# [sigma] half-width of the model PSF's image: what lies beyond is under 1e-16 of the light
+# [sigma] half-width of the model PSF's image: less than 1e-16 of the light lies beyond, float64's
+# rounding; larger images only cost time
 REACH = 8.5
-# relative difference of two pixel scales that counts as none: header digits, not pixels
+# relative difference of two pixel scales that counts as none: digits of a header leave as much
 SAME_SCALE = 1e-6
 
 
@@ -41,10 +42,10 @@ class Frame:
     def inside(self, positions) -> np.ndarray:
         """Which positions (..., 2) [px] lie on a pixel of the frame: -1/2 <= x < N - 1/2.
 
-        The edge belongs to one pixel only, floor(x + 1/2). A source that is not inside is told and
-        not fitted: of its light the frame would hold a part at best, and its centre, from which a
-        morphology falls, not at all. One inside is fitted however near to the edge, with what the
-        frame holds of it.
+        The edge belongs to one pixel only, floor(x + 1/2). A fit leaves out a source that is not
+        inside and reports it: the frame does not hold its centre, from which morphologies fall, and
+        a part of its light at best. A source inside is fitted, however near to the edge, with the
+        light that the frame holds of it.
 
         returns (...) bool; False for NaN
         """
@@ -81,11 +82,10 @@ def model_frame(observations, *, grid=None, psf_sigma_px=0.8, shared=False) -> F
         extent = intersection if shared else union
         grid = extent([o.grid for o in observations], like=like)
     for observation in observations:
-        if (observation.grid.wcs is None) != (grid.wcs is None):
-            kind, other = ("flat", "placed by a WCS")[:: 1 if grid.wcs is None else -1]
+        if observation.grid.is_flat != grid.is_flat:
             raise ValueError(
-                f"grid is {kind}, observation {observation.label!r} {other}: "
-                "give both a WCS (Grid.to_wcs)"
+                f"grid is {grid.placing}, observation {observation.label!r} "
+                f"{observation.grid.placing}: give both a WCS (Grid.to_wcs)"
             )
         if not overlap(observation.grid, grid):
             raise ValueError(

@@ -1,42 +1,37 @@
-"""Pixel grids on the sky: from any celestial WCS or laid flat, and their boxes and cutouts."""
+"""Pixel grids on the sky: placed by any celestial WCS or laid flat, with their cutouts."""
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
-from astropy.coordinates import SkyCoord
 from astropy.wcs import WCS
 from astropy.wcs.utils import wcs_to_celestial_frame
 
-from .mapping import map_affine, map_positions
-from .wcs import pixels_at, shifted_wcs
-
-__all__ = ["Grid"]
-
-ARCSEC = math.radians(1 / 3600)  # [rad]
+from .mapping import Mapping, map_affine, map_positions
+from .wcs import convert, pixel_scale, pixels_at, shifted_wcs, tangent_wcs, world_at
 
 
-@dataclass(frozen=True, eq=False)
-class Grid:
-    """Pixels of one image, placed either by a celestial WCS or flat, by a Jacobian and an origin.
+class Grid(ABC):
+    """Pixels of one image and where they lie on the sky.
 
     shape (Ny, Nx) [px]
-    wcs: astropy WCS of the two celestial axes; None for a flat grid
-    jacobian (2, 2) [arcsec/px]: rows (y, x) of the flat sky, columns (n, m) = (row, column)
-    origin (2,) [arcsec]: (y, x) of pixel (0, 0) on the flat sky
+    is_flat: whether the sky is a plane, with positions (y, x) [arcsec]; else they are longitude and
+        latitude [deg] of a celestial WCS
+    placing: the same in words, for messages
 
-    Make one with `Grid.from_wcs` or `Grid.flat`.
+    Make one with `Grid.from_wcs`, `Grid.flat` or `Grid.from_jacobian`. Positions in pixels are
+    (n, m) = (row, column) or (y, x), whole at the centre of a pixel.
     """
 
-    shape: tuple
-    wcs: WCS | None = None
-    jacobian: np.ndarray | None = None
-    origin: np.ndarray | None = None
+    shape: tuple[int, int]
+    is_flat: bool
+    placing: str
 
-    @classmethod
-    def from_wcs(cls, wcs, shape):
+    @staticmethod
+    def from_wcs(wcs, shape) -> Grid:
         """Grid of an image with a celestial WCS: CD, PC, CROTA, SIP, TPV, cubes, either parity.
 
         wcs: astropy WCS; of more than two axes, the celestial ones are taken
@@ -51,7 +46,7 @@ class Grid:
         try:
             wcs = wcs.celestial if wcs.naxis > 2 else wcs.deepcopy()
             wcs_to_celestial_frame(wcs)
-            grid = cls(shape, wcs)
+            grid = WcsGrid(shape, wcs)
             scale = grid.pixel_scale_arcsec
         except Exception as error:  # wcslib raises a dozen kinds, RuntimeError among them
             raise ValueError(f"wcs cannot be used: {' '.join(str(error).split())}") from error
@@ -59,8 +54,8 @@ class Grid:
             raise ValueError(f"wcs cannot be used: its central pixel has the size {scale} arcsec")
         return grid
 
-    @classmethod
-    def flat(cls, shape, scale_arcsec, *, angle_deg=0, flip=False, center_arcsec=(0, 0)):
+    @staticmethod
+    def flat(shape, scale_arcsec, *, angle_deg=0, flip=False, center_arcsec=(0, 0)) -> Grid:
         """Grid on a flat sky: J = R(angle) diag(scale_y, +-scale_x).
 
         shape (Ny, Nx) [px]
@@ -78,77 +73,60 @@ class Grid:
         cos, sin = _cos_sin(angle_deg)
         jacobian = np.array([[cos, sin], [-sin, cos]]) * scale * (1, -1 if flip else 1)
         center = np.asarray(center_arcsec, dtype=np.float64)
-        return cls(shape, None, jacobian, center - jacobian @ ((np.array(shape) - 1) / 2))
+        return FlatGrid(shape, jacobian, center - jacobian @ ((np.array(shape) - 1) / 2))
+
+    @staticmethod
+    def from_jacobian(shape, jacobian, origin) -> Grid:
+        """Grid on a flat sky with any Jacobian: (y, x) = J (n, m) + origin.
+
+        shape (Ny, Nx) [px]
+        jacobian (2, 2) [arcsec/px]: rows (y, x) of the sky, columns (n, m)
+        origin (2,) [arcsec]: (y, x) of pixel (0, 0)
+
+        Raises ValueError for other shapes, and numbers that are not finite.
+        """
+        jacobian, origin = np.array(jacobian, np.float64), np.array(origin, np.float64)
+        for name, array, expected in (("jacobian", jacobian, (2, 2)), ("origin", origin, (2,))):
+            if array.shape != expected or not np.isfinite(array).all():
+                raise ValueError(f"{name} is {array.tolist()}, must be {expected} finite numbers")
+        return FlatGrid(_shape(shape), jacobian, origin)
 
     @property
-    def pixel_scale_arcsec(self):
-        """Root of the central pixel's area [arcsec], from the WCS evaluated around it."""
-        if self.wcs is None:
-            return math.sqrt(abs(np.linalg.det(self.jacobian)))
-        n, m = (np.array(self.shape) - 1) / 2
-        half = np.array([-0.5, 0.5])
-        n, m = np.concatenate([n + half, [n, n]]), np.concatenate([[m, m], m + half])
-        lon, lat = np.radians(self._world(n, m))
-        v = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
-        return math.sqrt(np.linalg.norm(np.cross(v[:, 1] - v[:, 0], v[:, 3] - v[:, 2]))) / ARCSEC
+    @abstractmethod
+    def pixel_scale_arcsec(self) -> float:
+        """Root of the central pixel's area [arcsec]."""
 
-    def sky(self, n, m):
+    @abstractmethod
+    def sky(self, n, m) -> np.ndarray:
         """Sky at pixel positions: (y, x) [arcsec] if flat, else (longitude, latitude) [deg].
 
-        n, m: rows and columns, any shapes that broadcast; the centre of a pixel is whole
-        returns (2, ...)
+        n, m: rows and columns, any shapes that broadcast
+        returns (2, ...); NaN where a projection holds no sky
         """
-        n, m = np.broadcast_arrays(np.asarray(n, dtype=np.float64), np.asarray(m, dtype=np.float64))
-        if self.wcs is None:
-            return np.tensordot(self.jacobian, np.stack([n, m]), 1) + _column(self.origin, n.ndim)
-        return self._world(n, m)
 
-    def pixel(self, a, b):
+    @abstractmethod
+    def pixel(self, a, b) -> np.ndarray:
         """Pixel positions at points of the sky, the inverse of `sky`.
 
         a, b: y and x [arcsec] if flat, else longitude and latitude [deg] in the WCS's own frame
             (right ascension and declination if that is equatorial); any shapes that broadcast
         returns (..., 2) [px]: (y, x); NaN where the projection holds no such point
         """
-        a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
-        if self.wcs is None:
-            inverse = np.linalg.inv(self.jacobian)
-            return (np.stack([a, b], axis=-1) - self.origin) @ inverse.T
-        return pixels_at(self.wcs, a.ravel(), b.ravel()).reshape(a.shape + (2,))
 
-    def map_to(self, grid_in, tolerance_px=1e-4):
-        """Mapping of this grid's pixels into those of `grid_in`: X = A p + t, or one by one.
+    @abstractmethod
+    def positions_in(self, other: Grid, n, m) -> np.ndarray:
+        """Pixels (n, m) of this grid in those of another one of its kind, exactly.
 
-        Both WCS are evaluated, celestial frames (ICRS, FK5, galactic, ...) converted; A and t are
-        fitted where `grid_in` covers this grid. What the fit leaves decides the kind.
-
-        grid_in: the model's grid; WCS or flat as this one is
-        tolerance_px [model px]: largest departure that counts as none
-
-        Raises ValueError when one grid is flat and the other not, when no pixel has a place in
-        `grid_in`'s projection, and for a singular Jacobian.
+        n, m: rows and columns, any shapes that broadcast
+        returns (..., 2) [px of `other`]: (y, x); NaN where there is no such place
         """
-        self._check_like(grid_in, "grid_in")
-        if self.wcs is None:
-            matrix, offset = _flat_affine(self, grid_in)
-            return map_affine(matrix, offset, grid_in.shape, self.shape, tolerance_px)
-        return map_positions(
-            lambda n, m: positions(self, grid_in, n, m),
-            lambda n, m: positions(grid_in, self, n, m),
-            grid_in.shape,
-            self.shape,
-            tolerance_px,
-        )
 
-    def cutout(self, y0, x0, shape):
-        """Grid of the pixels from (y0, x0) on; they may lie outside this one."""
-        shape = _shape(shape)
-        if self.wcs is None:
-            origin = self.origin + self.jacobian @ (y0, x0)
-            return Grid(shape, None, self.jacobian, origin)
-        return Grid(shape, shifted_wcs(self.wcs, y0, x0))
+    @abstractmethod
+    def cutout(self, y0, x0, shape) -> Grid:
+        """Grid of the `shape` (Ny, Nx) pixels from (y0, x0) on; they may lie outside this one."""
 
-    def to_wcs(self, *, ra_deg=0.0, dec_deg=0.0):
+    @abstractmethod
+    def to_wcs(self, *, ra_deg=0.0, dec_deg=0.0) -> WCS:
         """The WCS; for a flat grid a gnomonic one (ICRS) that touches the sky at (y, x) = (0, 0).
 
         x grows to the west there (east is left, north up), so that two flat grids placed at the
@@ -156,59 +134,146 @@ class Grid:
 
         ra_deg, dec_deg [deg]: where (0, 0) lies; of no effect on a grid that has a WCS
         """
-        if self.wcs is not None:
-            return self.wcs.deepcopy()
-        wcs = WCS(naxis=2)
-        wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
-        wcs.wcs.cunit = ["deg", "deg"]
-        wcs.wcs.radesys = "ICRS"
-        wcs.wcs.crval = [ra_deg, dec_deg]
-        n, m = np.linalg.solve(self.jacobian, -self.origin)
-        wcs.wcs.crpix = [m + 1, n + 1]
-        # rows (west, north) of columns (m, n), west counted as minus right ascension
-        wcs.wcs.cd = self.jacobian[::-1, ::-1] * [[-1], [1]] / 3600
-        wcs.wcs.set()
-        return wcs
 
-    def _check_like(self, other, name):
-        if (self.wcs is None) != (other.wcs is None):
-            kinds = ["flat" if grid.wcs is None else "placed by a WCS" for grid in (self, other)]
+    @abstractmethod
+    def _map_to(self, grid_in, tolerance_px):
+        """`map_to` of grids known to be of one kind."""
+
+    def map_to(self, grid_in: Grid, tolerance_px=1e-4) -> Mapping:
+        """Mapping of this grid's pixels into those of `grid_in`: X = A p + t, or one by one.
+
+        Both WCS are evaluated, celestial frames (ICRS, FK5, galactic, ...) converted; A and t are
+        fitted where `grid_in` covers this grid. What the fit leaves decides the geometry.
+
+        grid_in: the model's grid; WCS or flat as this one is
+        tolerance_px [model px]: largest departure that counts as none
+
+        Raises ValueError when one grid is flat and the other not, when no pixel has a place in
+        `grid_in`'s projection, and for a singular Jacobian.
+        """
+        self.check_like(grid_in, "grid_in")
+        return self._map_to(grid_in, tolerance_px)
+
+    def check_like(self, other: Grid, name):
+        """Raise ValueError, calling the other grid `name`, where one is flat and one is not."""
+        if self.is_flat != other.is_flat:
             raise ValueError(
-                f"{name} is {kinds[1]} and this grid {kinds[0]}: give both a WCS (Grid.to_wcs)"
+                f"{name} is {other.placing} and this grid {self.placing}: "
+                "give both a WCS (Grid.to_wcs)"
             )
 
-    def _world(self, n, m):
-        """(2, ...) longitude and latitude [deg]; NaN where there is none."""
-        world = np.array(self.wcs.all_pix2world(np.ravel(m), np.ravel(n), 0))
-        return world[[self.wcs.wcs.lng, self.wcs.wcs.lat]].reshape((2,) + np.shape(n))
 
+@dataclass(frozen=True, eq=False)
+class FlatGrid(Grid):
+    """Pixels on a flat sky: (y, x) = J (n, m) + origin.
 
-def positions(grid_from, grid_to, n, m):
-    """Pixels (n, m) of grid_from in those of grid_to: (..., 2), (y, x); NaN where there is none."""
-    if grid_from.wcs is None:
-        matrix, offset = _flat_affine(grid_from, grid_to)
+    shape (Ny, Nx) [px]
+    jacobian (2, 2) [arcsec/px]: J, rows (y, x) of the flat sky, columns (n, m) = (row, column)
+    origin (2,) [arcsec]: (y, x) of pixel (0, 0) on the flat sky
+    """
+
+    shape: tuple[int, int]
+    jacobian: np.ndarray
+    origin: np.ndarray
+    is_flat, placing = True, "flat"
+
+    @property
+    def pixel_scale_arcsec(self):
+        """sqrt |det J| [arcsec]."""
+        return math.sqrt(abs(np.linalg.det(self.jacobian)))
+
+    def sky(self, n, m):
+        """(y, x) [arcsec] at pixels (n, m): J (n, m) + origin, (2, ...)."""
+        n, m = _float_arrays(n, m)
+        origin = self.origin.reshape((2,) + (1,) * n.ndim)
+        return np.tensordot(self.jacobian, np.stack([n, m]), 1) + origin
+
+    def pixel(self, a, b):
+        """Pixels (..., 2) at (y, x) = (a, b) [arcsec]: J^-1 ((a, b) - origin)."""
+        inverse = np.linalg.inv(self.jacobian)
+        return (np.stack(_float_arrays(a, b), axis=-1) - self.origin) @ inverse.T
+
+    def positions_in(self, other, n, m):
+        """A (n, m) + t (..., 2), with A and t from the two Jacobians and origins."""
+        matrix, offset = self._affine_to(other)
         return np.stack(np.broadcast_arrays(n, m), axis=-1) @ matrix.T + offset
-    world = grid_from._world(*np.broadcast_arrays(n, m))
-    good = np.isfinite(world).all(axis=0)
-    result = np.full(good.shape + (2,), np.nan)
-    if not good.any():
+
+    def cutout(self, y0, x0, shape):
+        """The same Jacobian, the origin at pixel (y0, x0)."""
+        return FlatGrid(_shape(shape), self.jacobian, self.origin + self.jacobian @ (y0, x0))
+
+    def to_wcs(self, *, ra_deg=0.0, dec_deg=0.0):
+        """A gnomonic WCS (ICRS) that touches the flat sky at (y, x) = (0, 0)."""
+        return tangent_wcs(self.jacobian, self.origin, ra_deg, dec_deg)
+
+    def _map_to(self, grid_in, tolerance_px):
+        """Aligned or affine, exactly."""
+        matrix, offset = self._affine_to(grid_in)
+        return map_affine(matrix, offset, grid_in.shape, self.shape, tolerance_px)
+
+    def _affine_to(self, other):
+        """A (2, 2) and t (2,) from these pixels to those of another flat grid."""
+        matrix = np.linalg.solve(other.jacobian, self.jacobian)
+        return matrix, np.linalg.solve(other.jacobian, self.origin - other.origin)
+
+
+@dataclass(frozen=True, eq=False)
+class WcsGrid(Grid):
+    """Pixels placed by a celestial WCS.
+
+    shape (Ny, Nx) [px]
+    wcs: astropy WCS of the two celestial axes
+    """
+
+    shape: tuple[int, int]
+    wcs: WCS
+    is_flat, placing = False, "placed by a WCS"
+
+    @property
+    def pixel_scale_arcsec(self):
+        """Root of the central pixel's area [arcsec], from the WCS evaluated around it."""
+        return pixel_scale(self.wcs, *(np.array(self.shape) - 1) / 2)
+
+    def sky(self, n, m):
+        """Longitude and latitude (2, ...) [deg] at pixels (n, m)."""
+        return world_at(self.wcs, *_float_arrays(n, m))
+
+    def pixel(self, a, b):
+        """Pixels (..., 2) at longitudes a and latitudes b [deg]."""
+        a, b = _float_arrays(a, b)
+        return pixels_at(self.wcs, a.ravel(), b.ravel()).reshape(a.shape + (2,))
+
+    def positions_in(self, other, n, m):
+        """Both WCS evaluated point by point (..., 2), their celestial frames converted."""
+        world = world_at(self.wcs, *np.broadcast_arrays(n, m))
+        good = np.isfinite(world).all(axis=0)
+        result = np.full(good.shape + (2,), np.nan)
+        if good.any():
+            lon, lat = convert(self.wcs, other.wcs, *world[:, good])
+            result[good] = pixels_at(other.wcs, lon, lat)
         return result
-    lon, lat = world[:, good]
-    frames = [wcs_to_celestial_frame(grid.wcs) for grid in (grid_from, grid_to)]
-    if not frames[0].is_equivalent_frame(frames[1]):
-        sky = SkyCoord(lon, lat, unit="deg", frame=frames[0]).transform_to(frames[1]).spherical
-        lon, lat = sky.lon.deg, sky.lat.deg
-    result[good] = pixels_at(grid_to.wcs, lon, lat)
-    return result
 
+    def cutout(self, y0, x0, shape):
+        """The same WCS with its reference pixel, and those of its distortions, moved."""
+        return WcsGrid(_shape(shape), shifted_wcs(self.wcs, y0, x0))
 
-def _flat_affine(grid_from, grid_to):
-    """A and t from pixels of one flat grid to those of another."""
-    matrix = np.linalg.solve(grid_to.jacobian, grid_from.jacobian)
-    return matrix, np.linalg.solve(grid_to.jacobian, grid_from.origin - grid_to.origin)
+    def to_wcs(self, *, ra_deg=0.0, dec_deg=0.0):
+        """A copy of the WCS; ra_deg and dec_deg are of no effect."""
+        return self.wcs.deepcopy()
+
+    def _map_to(self, grid_in, tolerance_px):
+        """The simplest geometry that agrees with both WCS within tolerance_px."""
+        return map_positions(
+            lambda n, m: self.positions_in(grid_in, n, m),
+            lambda n, m: grid_in.positions_in(self, n, m),
+            grid_in.shape,
+            self.shape,
+            tolerance_px,
+        )
 
 
 def _shape(shape):
+    """(Ny, Nx) as a tuple of int. Raises ValueError for anything else."""
     shape = tuple(int(n) for n in shape)
     if len(shape) != 2 or min(shape) < 1:
         raise ValueError(f"shape must be (Ny, Nx), each at least 1 pixel, not {shape}")
@@ -223,5 +288,6 @@ def _cos_sin(angle_deg):
     return math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
 
 
-def _column(vector, n_dim):
-    return vector.reshape((2,) + (1,) * n_dim)
+def _float_arrays(a, b):
+    """Both as float64 arrays of their common shape."""
+    return np.broadcast_arrays(np.asarray(a, np.float64), np.asarray(b, np.float64))

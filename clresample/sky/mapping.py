@@ -6,14 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-# [px] what evaluating two WCS in float64 may leave (up to 1e-8 seen at 0.01 arcsec); under it,
-# a mapping by whole pixels is one
+# [px] what evaluating two WCS in float64 may leave (up to 1e-8 seen at 0.01 arcsec): mappings this
+# near to whole pixels are taken for these, and centres this near to an edge lie on it
 NOISE_PX = 1e-6
-# points per axis at which two WCS are compared: SIP and TPV polynomials are of order 9 at most
+# points per axis at which two WCS are compared: SIP and TPV polynomials are of order 9 at most,
+# which half as many would follow; more only cost time
 N_LATTICE = 33
-# [px] positions evaluated at once, 8 MiB per axis
+# [px] positions evaluated at once, 8 MiB per axis: larger blocks only take more memory
 BLOCK = 1 << 20
-# |det A| / |A|^2 under which the float64 inverse of A keeps no digit of a pixel
+# |det A| / |A|^2 under which A counts as singular: its float64 inverse keeps no digit of a pixel
 SINGULAR = 1e-10
 
 
@@ -24,7 +25,7 @@ class Mapping:
     shape_in (Ny, Nx), shape_out (My, Mx) [px]: model, observed
     matrix (2, 2) [model px / observed px]: A, rows (y, x), columns (n, m)
     offset (2,) [model px]: t
-    kind: "aligned" (A exactly diagonal or anti-diagonal), "affine" or "distorted"
+    geometry: "aligned" (A exactly diagonal or anti-diagonal), "affine" or "distorted"
     departure_px [model px]: largest distance of the true mapping from A p + t
     positions (My, Mx, 2) [model px]: (y, x) when distorted, else None; pixels without a place in
         the model's projection are put outside the model
@@ -35,7 +36,7 @@ class Mapping:
     shape_out: tuple
     matrix: np.ndarray
     offset: np.ndarray
-    kind: str
+    geometry: str
     departure_px: float
     positions: np.ndarray | None = None
     area: np.ndarray | None = None
@@ -43,7 +44,7 @@ class Mapping:
     def at(self, n, m):
         """Positions (..., 2) [model px] of observed pixels; whole ones inside when distorted."""
         n, m = np.broadcast_arrays(n, m)
-        if self.kind == "distorted":
+        if self.geometry == "distorted":
             return self.positions[n, m]
         return np.stack([n, m], axis=-1) @ self.matrix.T + self.offset
 
@@ -54,7 +55,7 @@ class Mapping:
         Centres on the very edge count, whatever the last digits of two WCS make of them.
         """
         low, high = -0.5 - NOISE_PX, np.array(self.shape_in) - 0.5 + NOISE_PX
-        if self.kind == "distorted":
+        if self.geometry == "distorted":
             return ((self.positions >= low) & (self.positions <= high)).all(axis=-1)
         n, m = (np.arange(n, dtype=np.float64) for n in self.shape_out)
         inside = np.ones(self.shape_out, dtype=bool)
@@ -80,7 +81,7 @@ class Mapping:
             shape_out=tuple(out_shape),
             offset=self.matrix @ (y0, x0) + self.offset - in_origin,
         )
-        if self.kind != "distorted":
+        if self.geometry != "distorted":
             return cut
         if min(y0, x0) < 0 or y0 + n_y > self.shape_out[0] or x0 + n_x > self.shape_out[1]:
             raise ValueError(
@@ -95,14 +96,17 @@ class Mapping:
         points = np.argwhere(covered).astype(np.float64)
         if not _spans(points):
             return cut
-        kind, matrix, offset, departure = _decide(points, cut.positions[covered], tolerance_px)
-        if kind == "distorted":
+        geometry, matrix, offset, departure = _decide(points, cut.positions[covered], tolerance_px)
+        if geometry == "distorted":
             return cut
-        return Mapping(cut.shape_in, cut.shape_out, matrix, offset, kind, departure)
+        return Mapping(cut.shape_in, cut.shape_out, matrix, offset, geometry, departure)
 
 
 def lattice(low, shape):
-    """Positions (n, m) over a box of pixels, from outer edge to outer edge, corners included."""
+    """Positions n, m (N, M) over a box of pixels, from outer edge to outer edge.
+
+    low, shape (2,) [px]: its first pixel, and its size; N_LATTICE points per axis, fewer if small
+    """
     axes = [
         np.linspace(start - 0.5, start + n - 0.5, min(n + 1, N_LATTICE))
         for start, n in zip(low, shape, strict=True)
@@ -111,7 +115,7 @@ def lattice(low, shape):
 
 
 def map_affine(matrix, offset, shape_in, shape_out, tolerance_px):
-    """Mapping of the smallest sufficient kind for X(p) = A p + t, exact unless it is snapped.
+    """Mapping of the simplest sufficient geometry for X(p) = A p + t, exact unless it is snapped.
 
     matrix (2, 2), offset (2,): A and t; shape_in, shape_out (2,) [px]: model, observed
 
@@ -119,14 +123,14 @@ def map_affine(matrix, offset, shape_in, shape_out, tolerance_px):
     """
     points = np.stack(lattice((0, 0), shape_out), axis=-1).reshape(-1, 2)
     true = points @ matrix.T + offset
-    kind, snapped, shift, departure = _decide(points, true, tolerance_px, matrix)
+    geometry, snapped, shift, departure = _decide(points, true, tolerance_px, matrix)
     if (snapped == matrix).all() and (shift != np.rint(shift)).any():
         shift, departure = offset, 0.0
-    return Mapping(shape_in, shape_out, snapped, shift, kind, departure)
+    return Mapping(shape_in, shape_out, snapped, shift, geometry, departure)
 
 
 def map_positions(forward, backward, shape_in, shape_out, tolerance_px):
-    """Mapping of the smallest sufficient kind for the true positions `forward(n, m)`.
+    """Mapping of the simplest sufficient geometry for the true positions `forward(n, m)`.
 
     forward, backward: functions of broadcast (n, m), observed to model and back, to (..., 2)
         positions, NaN where there is none
@@ -142,9 +146,9 @@ def map_positions(forward, backward, shape_in, shape_out, tolerance_px):
     points = np.stack([n, m], axis=-1)[good]
     if not _spans(points):
         raise ValueError("grids do not overlap: grid_in's projection holds none of these pixels")
-    kind, matrix, offset, departure = _decide(points, true[good], tolerance_px)
-    if kind != "distorted" and good.all():
-        return Mapping(shape_in, shape_out, matrix, offset, kind, departure)
+    geometry, matrix, offset, departure = _decide(points, true[good], tolerance_px)
+    if geometry != "distorted" and good.all():
+        return Mapping(shape_in, shape_out, matrix, offset, geometry, departure)
     positions, area = _evaluate(forward, shape_in, shape_out, abs(np.linalg.det(matrix)))
     return Mapping(shape_in, shape_out, matrix, offset, "distorted", departure, positions, area)
 
@@ -169,7 +173,7 @@ def _spans(points):
 
 
 def _decide(points, true, tolerance_px, matrix=None):
-    """Kind, matrix, offset, departure of the simplest mapping of points (L, 2) to true (L, 2)."""
+    """Geometry, matrix, offset, departure of the simplest mapping from points to true (L, 2)."""
     tolerance_px = max(tolerance_px, NOISE_PX)
     if matrix is None:
         middle = (points.max(axis=0) + points.min(axis=0)) / 2
@@ -192,13 +196,14 @@ def _decide(points, true, tolerance_px, matrix=None):
 
 
 def _centred(points, true, matrix):
-    """The offset that leaves equal errors either way along each axis, and the largest distance."""
+    """The offset (2,) [px] with equal errors either way on each axis, and the largest distance."""
     rest = true - points @ matrix.T
     offset = (rest.max(axis=0) + rest.min(axis=0)) / 2
     return offset, _departure(points, true, matrix, offset)
 
 
 def _departure(points, true, matrix, offset):
+    """Largest distance [px] of points (L, 2) mapped by A and t from true (L, 2)."""
     return float(np.hypot(*(true - points @ matrix.T - offset).T).max())
 
 

@@ -1,4 +1,4 @@
-"""The noise of an image, estimated from its background."""
+"""The noise of images: weights from what a user gives, or estimated from the background."""
 
 from __future__ import annotations
 
@@ -13,42 +13,178 @@ CLIP = 3.0
 MAX_ROUNDS = 50
 # pixels that a noise estimate takes at least: the error of their MAD is a fifth of it
 MIN_PIXELS = 32
+# median |x| of a unit Gaussian, whole and cut at CLIP
+HALF_WIDTH = NormalDist().inv_cdf(0.75)
+HALF_WIDTH_CUT = NormalDist().inv_cdf(0.5 + math.erf(CLIP / math.sqrt(2)) / 4)
+
+
+def background(image, mask=None) -> tuple[float, float]:
+    """Level and standard deviation of an image's background, sources clipped away.
+
+        level = median x,  sigma = MAD / q,  MAD = median |x - level| over |x - level| <= 3 sigma
+
+    iterated, with q = 0.672 the MAD of a unit Gaussian cut at 3 sigma. Unbiased for white noise;
+    sigma is too large by 2 % where faint wings of sources fill 3 % of the pixels, by a third where
+    they fill half, by 30 to 50 % on a 48 x 58 cutout of a real blend. Of correlated noise it is the
+    scatter of single pixels; 0 where more than half of the pixels have one value.
+
+    image (Ny, Nx); mask (Ny, Nx): True = ignore; NaN and infinite pixels are ignored too
+    """
+    values = _usable(image, mask)
+    level = np.median(values)
+    sigma = np.median(np.abs(values - level)) / HALF_WIDTH
+    for _ in range(MAX_ROUNDS):
+        level = np.median(values)
+        distance = np.abs(values - level)
+        kept = distance <= CLIP * sigma
+        sigma = np.median(distance[kept]) / HALF_WIDTH_CUT
+        if kept.all():
+            break
+        values = values[kept]
+    return float(level), float(sigma)
 
 
 def noise_sigma(image, mask=None) -> float:
-    """Standard deviation of an image's background, sources clipped away.
-
-        sigma = MAD / q,   MAD = median |x - median x|  over |x - median x| <= 3 sigma, iterated
-
-    with q = 0.672 the same quantity of a unit Gaussian cut at 3 sigma. Unbiased for white noise;
-    too large by 2 % where faint wings of sources fill 3 % of the pixels, by a third where they fill
-    half, by 30 to 50 % on a 48 x 58 cutout of a real blend: there, better give the noise.
-    Of correlated noise it is the scatter of single pixels.
+    """The scatter of an image's background, as `background` finds it, where that can be trusted.
 
     image (Ny, Nx); mask (Ny, Nx): True = ignore; NaN and infinite pixels are ignored too
     Raises ValueError for fewer than 32 pixels, and where more than half of them have one value.
     """
-    image = np.asarray(image, dtype=np.float64)
-    good = np.isfinite(image)
-    if mask is not None:
-        good &= ~np.asarray(mask, dtype=bool)
-    values = image[good]
-    if values.size < MIN_PIXELS:
+    n_usable = _usable(image, mask).size
+    if n_usable < MIN_PIXELS:
         raise ValueError(
-            f"{values.size} pixels are left to estimate the noise from, {MIN_PIXELS} are needed"
+            f"{n_usable} pixels are left to estimate the noise from, {MIN_PIXELS} are needed"
         )
-    sigma = np.median(np.abs(values - np.median(values))) / NormalDist().inv_cdf(0.75)
-    inside = math.erf(CLIP / math.sqrt(2))
-    quantile = NormalDist().inv_cdf(0.5 + inside / 4)
-    for _ in range(MAX_ROUNDS):
-        distance = np.abs(values - np.median(values))
-        kept = distance <= CLIP * sigma
-        sigma = np.median(distance[kept]) / quantile
-        if kept.all():
-            break
-        values = values[kept]
+    _, sigma = background(image, mask)
     if not sigma > 0:
         raise ValueError(
             "more than half of the pixels have the same value: no noise can be estimated from them"
         )
-    return float(sigma)
+    return sigma
+
+
+def sigma_below_zero(image) -> float | None:
+    """Scatter of an image that is zero where nothing is, from its negative pixels alone.
+
+        sigma = median |x| / 0.674  over x < 0
+
+    For images that are mostly sources, which raise what `background` finds: no pixel of a source is
+    negative. Of pure noise it has the larger error, from half of the pixels, and a sky level that
+    is not zero enters it.
+
+    image (...); None where fewer than 32 pixels are negative
+    """
+    below = image[image < 0]
+    return float(np.median(-below)) / HALF_WIDTH if below.size >= MIN_PIXELS else None
+
+
+def _usable(image, mask):
+    """The pixels (n,) float64 of an image that are finite and not masked."""
+    image = np.asarray(image, dtype=np.float64)
+    good = np.isfinite(image)
+    if mask is not None:
+        good &= ~np.asarray(mask, dtype=bool)
+    return image[good]
+
+
+def weights_from(data, bad, weights, variance, mask, channels):
+    """Weights (C, Ny, Nx), `n_bad` and messages of an Observation, from what its user gave.
+
+    data (C, Ny, Nx) float64; bad (C, Ny, Nx) bool: pixels where they are NaN or infinite
+    weights, variance, mask: as in Observation, None where they are not given
+    channels (C,): names
+
+    Raises ValueError where Observation does, for these.
+    """
+    if weights is not None and variance is not None:
+        raise ValueError("weights and variance are both given: an observation takes one")
+    masked, messages = _mask_of(mask, data.shape), []
+    if weights is not None:
+        weights, no_weight = _checked_weights(weights, data.shape)
+    elif variance is not None:
+        weights, no_weight = _inverse(variance, data.shape)
+    else:
+        weights, messages = _estimated(data, bad | masked, channels)
+        no_weight = np.zeros_like(bad)
+    n_bad = int(np.count_nonzero(~masked & (no_weight | (bad & (weights > 0)))))
+    weights = np.where(bad | masked, 0.0, weights)
+    if n_bad:
+        messages.append(
+            f"{n_bad} of {data.size} pixels have weight 0: no usable data, weight or variance"
+        )
+    messages += [
+        f"channel {channel} has no pixel with a weight"
+        for channel, seen in zip(channels, weights.any(axis=(1, 2)), strict=True)
+        if not seen
+    ]
+    return weights, n_bad, messages
+
+
+def numbers(name, values):
+    """The values as float64. Raises ValueError, naming them, for what is no array of numbers."""
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be an array of real numbers: {error}") from None
+
+
+def _spread(name, values, shape):
+    """Numbers given for each pixel, channel or all at once: (C, Ny, Nx)."""
+    if values.shape == shape[:1]:
+        return np.broadcast_to(values[:, None, None], shape)
+    if values.shape not in ((), shape[1:], shape):
+        raise ValueError(f"{name} has the shape {values.shape}, data {shape}")
+    return np.broadcast_to(values, shape)
+
+
+def _mask_of(mask, shape):
+    """The mask (C, Ny, Nx) bool, True = ignore; all False where none is given."""
+    if mask is None:
+        return np.zeros(shape, dtype=bool)
+    values = np.asarray(mask)
+    if values.shape not in (shape[1:], shape):
+        raise ValueError(f"mask has the shape {values.shape}, data {shape}")
+    if values.dtype != bool and not np.isin(values, (0, 1)).all():
+        odd = values[~np.isin(values, (0, 1))].flat[0]
+        raise ValueError(
+            f"mask must be True (ignore) or False, not {odd}: choose the bits that spoil a pixel"
+        )
+    return np.broadcast_to(values.astype(bool), shape)
+
+
+def _checked_weights(weights, shape):
+    """Weights (C, Ny, Nx), and where they were NaN."""
+    weights = _spread("weights", numbers("weights", weights), shape)
+    for wrong, what in ((weights < 0, "negative"), (np.isinf(weights), "infinite")):
+        if wrong.any():
+            raise ValueError(
+                f"weights has {np.count_nonzero(wrong)} {what} values, the first at "
+                f"(channel, y, x) = {tuple(np.argwhere(wrong)[0].tolist())}: "
+                "a weight is an inverse variance, 0 to ignore a pixel"
+            )
+    lost = np.isnan(weights)
+    return np.where(lost, 0.0, weights), lost
+
+
+def _inverse(variance, shape):
+    """Weights (C, Ny, Nx) from variances, and where these were no variance."""
+    variance = _spread("variance", numbers("variance", variance), shape)
+    good = variance >= np.finfo(np.float64).tiny  # the inverse of less may overflow
+    return np.divide(1.0, variance, out=np.zeros(shape), where=good), ~good
+
+
+def _estimated(data, ignored, channels):
+    """Weights (C, Ny, Nx) from each channel's own background, and messages on the estimate."""
+    weights, messages = np.ones(data.shape), []
+    for i, channel in enumerate(channels):
+        if ignored[i].all():
+            continue  # no pixel of it will keep its weight
+        try:
+            sigma = noise_sigma(data[i], ignored[i])
+        except ValueError as error:
+            raise ValueError(f"channel {channel}: {error}; give weights or variance") from None
+        weights[i] = sigma**-2
+        messages.append(
+            f"noise of channel {channel} estimated from the background: sigma = {sigma:.4g} counts"
+        )
+    return weights, messages

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .grid import Grid
-from .noise import noise_sigma
+from .noise import numbers, weights_from
 from .psf import PSF
 
 # [mag] AB magnitude of 1 uJy
@@ -71,63 +71,42 @@ class Observation:
         zero_points=None,
         name=None,
     ):
-        data = _numbers("data", data)
-        if data.ndim == 2:
-            data = data[None]
-        if data.ndim != 3 or 0 in data.shape:
-            raise ValueError(f"data must be (C, Ny, Nx) or (Ny, Nx), not {data.shape}")
-        if data.shape[1:] != tuple(grid.shape):
-            raise ValueError(f"data has images of {data.shape[1:]} pixels, grid has {grid.shape}")
-        n_channels = len(data)
-        if psf.n_bands not in (1, n_channels):
-            raise ValueError(
-                f"psf has {psf.n_bands} bands, data have {n_channels} channels: "
-                "give one band, or one for each channel"
-            )
-        if psf.n_bands != n_channels:
-            psf = psf.select([0] * n_channels)
-        channels = _channels(channels, name, n_channels)
-        if zero_points is not None:
-            zero_points = _per_channel("zero_points", zero_points, n_channels)
-
+        data = _images(data, grid)
+        psf = _of_each_channel(psf, len(data))
         bad = ~np.isfinite(data)
-        masked = _mask(mask, data.shape)
-        if weights is not None and variance is not None:
-            raise ValueError("weights and variance are both given: an observation takes one")
-        messages = []
-        if weights is not None:
-            weights, no_weight = _weights(weights, data.shape)
-        elif variance is not None:
-            weights, no_weight = _inverse(variance, data.shape)
-        else:
-            weights, messages = _estimated(data, bad | masked, channels)
-            no_weight = np.zeros_like(bad)
-        n_bad = int(np.count_nonzero(~masked & (no_weight | (bad & (weights > 0)))))
-        weights = np.where(bad | masked, 0.0, weights)
-        if n_bad:
-            messages.append(
-                f"{n_bad} of {data.size} pixels have weight 0: no usable data, weight or variance"
-            )
-        messages += [
-            f"channel {channel} has no pixel with a weight"
-            for channel, seen in zip(channels, weights.any(axis=(1, 2)), strict=True)
-            if not seen
-        ]
-        data = np.where(bad, 0.0, data)
-        for array in (data, weights):
-            array.flags.writeable = False
-        for key, value in {
-            "data": data,
-            "psf": psf,
-            "grid": grid,
-            "weights": weights,
-            "channels": channels,
-            "zero_points": zero_points,
-            "name": name,
-            "n_bad": n_bad,
-            "messages": tuple(messages),
-        }.items():
+        channels = _channels(channels, name, len(data))
+        if zero_points is not None:
+            zero_points = _per_channel("zero_points", zero_points, len(data))
+        weights, n_bad, messages = weights_from(data, bad, weights, variance, mask, channels)
+        self._set(
+            data=np.where(bad, 0.0, data),
+            psf=psf,
+            grid=grid,
+            weights=weights,
+            channels=channels,
+            zero_points=zero_points,
+            name=name,
+            n_bad=n_bad,
+            messages=tuple(messages),
+        )
+
+    def _set(self, **values):
+        """The fields, images made read-only."""
+        for key, value in values.items():
+            if key in ("data", "weights"):
+                value.flags.writeable = False
             object.__setattr__(self, key, value)
+
+    @classmethod
+    def restore(cls, data, psf, grid, *, weights, n_bad, messages, **given) -> Observation:
+        """An observation as it was made once: `n_bad` and `messages` are what was found then.
+
+        data, psf, grid, weights and given (channels, zero_points, name): as read back from it
+        Raises ValueError as the constructor does.
+        """
+        observation = cls(data, psf, grid, weights=weights, **given)
+        observation._set(n_bad=int(n_bad), messages=tuple(messages))
+        return observation
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -166,22 +145,39 @@ def check_observations(observations):
             first[channel] = observation
     for what, have in (
         ("zero_points", [o.zero_points is not None for o in observations]),
-        ("a WCS", [o.grid.wcs is not None for o in observations]),
+        ("a WCS", [not o.grid.is_flat for o in observations]),
     ):
         if len(set(have)) > 1:
             of, rest = (observations[have.index(there)].label for there in (True, False))
             raise ValueError(f"observation {of!r} has {what}, {rest!r} has none: give all or none")
 
 
-def _numbers(name, values):
-    """As float64."""
-    try:
-        return np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be an array of real numbers: {error}") from None
+def _images(data, grid):
+    """Data (C, Ny, Nx) float64 of as many pixels as the grid has."""
+    data = numbers("data", data)
+    if data.ndim == 2:
+        data = data[None]
+    if data.ndim != 3 or 0 in data.shape:
+        raise ValueError(f"data must be (C, Ny, Nx) or (Ny, Nx), not {data.shape}")
+    if data.shape[1:] != tuple(grid.shape):
+        raise ValueError(f"data has images of {data.shape[1:]} pixels, grid has {grid.shape}")
+    return data
+
+
+def _of_each_channel(psf, n_channels):
+    """The PSF with one band for each channel; a single one serves all."""
+    if psf.n_bands == n_channels:
+        return psf
+    if psf.n_bands != 1:
+        raise ValueError(
+            f"psf has {psf.n_bands} bands, data have {n_channels} channels: "
+            "give one band, or one for each channel"
+        )
+    return psf.select([0] * n_channels)
 
 
 def _channels(channels, name, n_channels):
+    """Channel names (C,), numbered after the instrument where none are given."""
     if channels is None:
         return tuple(f"{name or 'channel'}{i}" for i in range(n_channels))
     channels = (channels,) if isinstance(channels, str) else tuple(channels)
@@ -195,7 +191,8 @@ def _channels(channels, name, n_channels):
 
 
 def _per_channel(name, values, n_channels):
-    values = _numbers(name, values)
+    """Finite numbers (C,), from one for each channel or one for all."""
+    values = numbers(name, values)
     if values.shape not in ((), (n_channels,)) or not np.isfinite(values).all():
         raise ValueError(
             f"{name} must be one finite number or {n_channels}, one for each channel, not {values}"
@@ -203,64 +200,3 @@ def _per_channel(name, values, n_channels):
     values = np.broadcast_to(values, n_channels).copy()
     values.flags.writeable = False
     return values
-
-
-def _spread(name, values, shape):
-    """Numbers given for each pixel, channel or all at once: (C, Ny, Nx)."""
-    if values.shape == shape[:1]:
-        return np.broadcast_to(values[:, None, None], shape)
-    if values.shape not in ((), shape[1:], shape):
-        raise ValueError(f"{name} has the shape {values.shape}, data {shape}")
-    return np.broadcast_to(values, shape)
-
-
-def _mask(mask, shape):
-    if mask is None:
-        return np.zeros(shape, dtype=bool)
-    values = np.asarray(mask)
-    if values.shape not in (shape[1:], shape):
-        raise ValueError(f"mask has the shape {values.shape}, data {shape}")
-    if values.dtype != bool and not np.isin(values, (0, 1)).all():
-        odd = values[~np.isin(values, (0, 1))].flat[0]
-        raise ValueError(
-            f"mask must be True (ignore) or False, not {odd}: choose the bits that spoil a pixel"
-        )
-    return np.broadcast_to(values.astype(bool), shape)
-
-
-def _weights(weights, shape):
-    """Weights (C, Ny, Nx), and where they were NaN."""
-    weights = _spread("weights", _numbers("weights", weights), shape)
-    for wrong, what in ((weights < 0, "negative"), (np.isinf(weights), "infinite")):
-        if wrong.any():
-            raise ValueError(
-                f"weights has {np.count_nonzero(wrong)} {what} values, the first at "
-                f"(channel, y, x) = {tuple(np.argwhere(wrong)[0].tolist())}: "
-                "a weight is an inverse variance, 0 to ignore a pixel"
-            )
-    lost = np.isnan(weights)
-    return np.where(lost, 0.0, weights), lost
-
-
-def _inverse(variance, shape):
-    """Weights (C, Ny, Nx) from variances, and where these were no variance."""
-    variance = _spread("variance", _numbers("variance", variance), shape)
-    good = variance >= np.finfo(np.float64).tiny  # the inverse of less may overflow
-    return np.divide(1.0, variance, out=np.zeros(shape), where=good), ~good
-
-
-def _estimated(data, ignored, channels):
-    """Weights (C, Ny, Nx) from each channel's own background, and what to tell about it."""
-    weights, messages = np.ones(data.shape), []
-    for i, channel in enumerate(channels):
-        if ignored[i].all():
-            continue  # no pixel of it will keep its weight
-        try:
-            sigma = noise_sigma(data[i], ignored[i])
-        except ValueError as error:
-            raise ValueError(f"channel {channel}: {error}; give weights or variance") from None
-        weights[i] = sigma**-2
-        messages.append(
-            f"noise of channel {channel} estimated from the background: sigma = {sigma:.4g} counts"
-        )
-    return weights, messages

@@ -1,4 +1,4 @@
-"""Point-spread functions as samples, and their exact spectrum at any frequency."""
+"""Point-spread functions as samples, and their transform (OTF), exact at any frequency."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .psf_checks import CORE_TOLERANCE, EDGE_TOLERANCE, PSFWarning, core_of
+from .psf_checks import PSFWarning, core_of, edge_light, fwhm, psf_warnings
+from .waves import phases
 
 # relative slack on the band's edge, above the rounding of A^T nu in float64
 BAND_SLACK = 1e-12
-# [complex numbers] one block of the general transform's tables: 16 MiB, near the cache's size
+# [complex numbers] one block of the general transform's tables: 16 MiB, near the cache's size;
+# larger ones are read back from memory, smaller ones make many small products
 BLOCK = 1 << 20
 
 
@@ -26,7 +28,7 @@ class PSF:
         geometric centre (n-1)/2; as "core": the centroid of each band's core; else (2,) or (C, 2)
 
     Raises ValueError for wrong shapes, NaN or infinite samples, and sums that are not positive.
-    Warns (PSFWarning) what `report` says.
+    Warns (PSFWarning) of what `warnings` lists.
     """
 
     images: np.ndarray
@@ -50,10 +52,11 @@ class PSF:
                 raise ValueError(f"images: band {i_band} has the sum {image.sum():.3g}, not > 0")
         images /= images.sum(axis=(1, 2), keepdims=True)
         self._set(images, float(spacing), _center(images, center))
-        for message in self.report():
+        for message in self.warnings():
             warnings.warn(message, PSFWarning, stacklevel=2)
 
     def _set(self, images, spacing, center):
+        """The three fields, arrays made read-only."""
         for array in (images, center):
             array.flags.writeable = False
         object.__setattr__(self, "images", images)
@@ -61,7 +64,7 @@ class PSF:
         object.__setattr__(self, "center", center)
 
     @classmethod
-    def gaussian(cls, sigma_px, *, n_pixels=41, pixel=True, n_bands=1, spacing=1.0):
+    def gaussian(cls, sigma_px, *, n_pixels=41, pixel=True, n_bands=1, spacing=1.0) -> PSF:
         """Round Gaussian, integrated over pixels by error functions unless `pixel` is False.
 
         sigma_px [px]: standard deviation, one number or one per band
@@ -84,26 +87,47 @@ class PSF:
         axes = [[profile(n, spacing, sigma) for n in (n_y, n_x)] for sigma in sigmas]
         return cls(np.stack([np.outer(y, x) for y, x in axes]), spacing=spacing)
 
-    @property
-    def n_bands(self):
-        return self.images.shape[0]
+    @classmethod
+    def restore(cls, images, *, spacing, center) -> PSF:
+        """The PSF whose `images`, `spacing` and `center` these are, bit for bit.
 
-    def __getitem__(self, i_band):
-        return self.select(i_band)
-
-    def select(self, bands):
-        """The PSF of some bands only: a number, a slice, or a sequence of numbers."""
-        if isinstance(bands, (int, np.integer)):
-            bands = [bands]
-        psf = object.__new__(PSF)
-        try:
-            psf._set(self.images[bands].copy(), self.spacing, self.center[bands].copy())
-        except IndexError:
-            raise ValueError(f"bands {bands} of a PSF that has {self.n_bands}") from None
+        images (C, ny, nx) are taken as they are, not divided by their sums again; nothing is
+        checked or warned about: that was done when the PSF was first made.
+        """
+        psf = object.__new__(cls)
+        images, center = np.array(images, np.float64), np.array(center, np.float64)
+        psf._set(images, float(spacing), center)
         return psf
 
-    def spectrum(self, nu_y, nu_x, matrix=None):
-        """Fourier transform of the samples, straight at the frequencies f = A^T nu.
+    @property
+    def n_bands(self) -> int:
+        """C."""
+        return self.images.shape[0]
+
+    @property
+    def fwhm_px(self) -> np.ndarray:
+        """Width (C,) [px]: diameter of the disc that the samples above half of the peak fill."""
+        return np.array([fwhm(image) for image in self.images]) * self.spacing
+
+    def __getitem__(self, bands) -> PSF:
+        """`select`."""
+        return self.select(bands)
+
+    def select(self, bands) -> PSF:
+        """The PSF of some bands only: a number, a slice, or a sequence of numbers.
+
+        Raises ValueError for a band that it does not have.
+        """
+        if isinstance(bands, (int, np.integer)):
+            bands = [bands]
+        try:
+            images, center = self.images[bands], self.center[bands]
+        except IndexError:
+            raise ValueError(f"bands {bands} of a PSF that has {self.n_bands}") from None
+        return PSF.restore(images, spacing=self.spacing, center=center)
+
+    def otf(self, nu_y, nu_x, matrix=None) -> np.ndarray:
+        """Optical transfer function: the samples' transform at any frequencies f = A^T nu.
 
             P^(f) = sum_s P[s] exp(-2 pi i f.(s - center) spacing),  0 where |f|_inf > 1/(2 spacing)
 
@@ -131,65 +155,24 @@ class PSF:
         result[:, outside] = 0
         return result
 
-    def core(self):
+    def core(self) -> np.ndarray:
         """Centroid of each band's core: Gaussian-weighted, from the brightest sample on.
 
         returns (C, 2) [samples]: (y, x) array coordinates
         """
         return np.stack([core_of(image) for image in self.images])
 
-    def edge_light(self):
-        """Light beyond the edge, as a fraction of the light inside, for a wing falling as r^-3.
+    def edge_light(self) -> np.ndarray:
+        """Light beyond the edge (C,), as a fraction of the light inside; see `psf_checks`."""
+        return edge_light(self.images)
 
-            L = 2 pi R^2 I(R),   I: mean of the outermost ring, R = (sqrt(ny nx) - 1)/2 its radius
-
-        returns (C,): negative where the ring's mean is
-        """
-        n_y, n_x = self.images.shape[1:]
-        ring = np.ones((n_y, n_x), dtype=bool)
-        ring[1:-1, 1:-1] = False
-        radius = (math.sqrt(n_y * n_x) - 1) / 2
-        return 2 * math.pi * radius**2 * self.images[:, ring].mean(axis=1)
-
-    def report(self):
-        """What a user should know of this PSF: list of sentences, with figures.
-
-        A core more than 0.25 samples off the centre along an axis, and more than 5 % of the light
-        (either sign) beyond the edge, by `edge_light`.
-        """
-        messages = []
-        cores = self.core()
-        off = cores - self.center
-        far = np.abs(off).max(axis=1)
-        if far.max() > CORE_TOLERANCE:
-            i = int(far.argmax())
-            messages.append(
-                f"PSF core off the centre, {_bands(far > CORE_TOLERANCE)}: in band {i} it is at "
-                f"(y, x) = ({cores[i, 0]:.2f}, {cores[i, 1]:.2f}), ({off[i, 0]:+.2f}, "
-                f"{off[i, 1]:+.2f}) samples from ({self.center[i, 0]:g}, {self.center[i, 1]:g}), "
-                'and shifts the result by as much; center="core" takes the core'
-            )
-        light = self.edge_light()
-        cut = np.abs(light) > EDGE_TOLERANCE
-        if cut.any():
-            i = int(np.abs(light).argmax())
-            n_y, n_x = self.images.shape[1:]
-            messages.append(
-                f"PSF light cut at the edge of the {n_y} x {n_x} image, {_bands(cut)}: in band {i} "
-                f"about {100 * light[i]:.1f} % lies beyond; a larger image, or one without "
-                "background, is needed"
-            )
-        return messages
-
-
-def _bands(chosen):
-    """The bands of a mask, in words."""
-    numbers = np.flatnonzero(chosen)
-    return f"band{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"
+    def warnings(self) -> list[str]:
+        """What a user should know of this PSF, a sentence each; see `psf_checks.psf_warnings`."""
+        return psf_warnings(self.images, self.center)
 
 
 def _center(images, center):
-    """(C, 2) centres from what the user gave."""
+    """Centres (C, 2) [samples] from what the user gave."""
     n_bands, n_y, n_x = images.shape
     if isinstance(center, str):
         if center != "core":
@@ -204,29 +187,29 @@ def _center(images, center):
 
 
 def _offsets(n, spacing):
+    """Positions (n,) [px] of samples about the middle of their axis."""
     return (np.arange(n) - (n - 1) / 2) * spacing
 
 
 def _gaussian(n, spacing, sigma):
+    """A Gaussian at the samples (n,); sigma and spacing [px]."""
     return np.exp(-0.5 * (_offsets(n, spacing) / sigma) ** 2)
 
 
 def _pixel_gaussian(n, spacing, sigma):
-    """Integral over the unit pixel; erfc of |u| keeps the digits of the wings."""
+    """Its integral over the unit pixel around each (n,); erfc of |u| keeps the wings' digits."""
     width = math.sqrt(2) * sigma
     offsets = np.abs(_offsets(n, spacing))
     return np.array([math.erfc((u - 0.5) / width) - math.erfc((u + 0.5) / width) for u in offsets])
 
 
 def _waves(frequencies, positions):
-    """exp(-2 pi i f u) as (F, U); whole cycles go before the product with 2 pi rounds them."""
-    cycles = np.multiply.outer(frequencies, positions)
-    cycles -= np.rint(cycles)
-    return np.exp(-2j * np.pi * cycles)
+    """exp(-2 pi i f u) as (F, U)."""
+    return np.exp(-1j * phases(frequencies, positions))
 
 
 def _transform(psf, bands, center, nu_y, nu_x, matrix):
-    """Sum over the samples of `bands`, all centred at `center`: (bands, Ky, Kx)."""
+    """`otf` of some bands, all centred at `center`, without the band's edge: (bands, Ky, Kx)."""
     images = psf.images[bands]
     n_y, n_x = images.shape[1:]
     u = (np.arange(n_y) - center[0]) * psf.spacing

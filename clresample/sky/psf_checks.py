@@ -1,4 +1,4 @@
-"""What can be wrong with a PSF image that can be used all the same, and its warning."""
+"""What is measured of PSF images, and the warnings about images that hardly mean what they say."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import numpy as np
 
 # [samples] half of what confusing the centre n/2 with (n-1)/2 gives, well above centroid errors
 CORE_TOLERANCE = 0.25
-# light beyond the image's edge worth telling; by this rule, good HST and HSC images have 2 to 5 %
+# share of the light beyond the image's edge from which on a PSF is warned about; by `edge_light`,
+# good HST and HSC images have 2 to 5 %
 EDGE_TOLERANCE = 0.05
 
 
@@ -16,12 +17,24 @@ class PSFWarning(UserWarning):
     """A PSF image that can be used, but hardly means what it says."""
 
 
+def fwhm(image):
+    """Width [samples] of a PSF image (ny, nx): diameter of the disc of its samples over half peak.
+
+    Counted, not fitted: exact to about a sample, for any shape of the core, and without noise as
+    long as that stays under half of the peak.
+    """
+    return 2 * math.sqrt(_n_above_half(image) / math.pi)
+
+
 def core_of(image):
-    """Fixed point c of sum_s w(s - c) P[s] (s - c) = 0, w a Gaussian as wide as the core."""
+    """Centroid of the core of an image (ny, nx), Gaussian-weighted: (2,) [samples], (y, x).
+
+    The fixed point c of sum_s w(s - c) P[s] (s - c) = 0, w a Gaussian as wide as the core, from the
+    brightest sample on; this sample where the steps leave its neighbourhood, as they do in noise.
+    """
     peak = np.unravel_index(np.argmax(image), image.shape)
     # sigma of a round core with as many samples above half its maximum; one sample at least
-    n_half = np.count_nonzero(image > 0.5 * image[peak])
-    sigma = max(math.sqrt(n_half / math.pi / (2 * math.log(2))), 1.0)
+    sigma = max(math.sqrt(_n_above_half(image) / math.pi / (2 * math.log(2))), 1.0)
     core = np.array(peak, dtype=np.float64)
     for _ in range(50):  # a Gaussian core halves its error at least once per step
         y, x = (np.arange(n) - c for n, c in zip(image.shape, core, strict=True))
@@ -32,6 +45,65 @@ def core_of(image):
         if not (np.abs(core + step - peak) <= 2 * sigma).all():
             return np.array(peak, dtype=np.float64)  # noise, not a core: the brightest sample
         core += step
-        if np.abs(step).max() < 1e-6:  # samples; far below anything that is told
+        if np.abs(step).max() < 1e-6:  # samples; far below CORE_TOLERANCE
             break
     return core
+
+
+def _n_above_half(image):
+    """Number of samples above half of the brightest one; one at least where it is positive."""
+    return np.count_nonzero(image > 0.5 * image.max())
+
+
+def edge_light(images):
+    """Light beyond the edge, as a fraction of the light inside, for a wing falling as r^-3.
+
+        L = 2 pi R^2 I(R),   I: mean of the outermost ring, R = (sqrt(ny nx) - 1)/2 its radius
+
+    images (C, ny, nx): of unit sum
+    returns (C,): negative where the ring's mean is
+    """
+    n_y, n_x = images.shape[1:]
+    ring = np.ones((n_y, n_x), dtype=bool)
+    ring[1:-1, 1:-1] = False
+    radius = (math.sqrt(n_y * n_x) - 1) / 2
+    return 2 * math.pi * radius**2 * images[:, ring].mean(axis=1)
+
+
+def psf_warnings(images, center) -> list[str]:
+    """What a user should know of PSF images: a sentence each, with figures.
+
+    A core more than 0.25 samples off the centre along an axis, and more than 5 % of the light
+    (either sign) beyond the edge, by `edge_light`.
+
+    images (C, ny, nx): of unit sum; center (C, 2) [samples]: (y, x), where they are said to be
+    """
+    messages = []
+    cores = np.stack([core_of(image) for image in images])
+    off = cores - center
+    far = np.abs(off).max(axis=1)
+    if far.max() > CORE_TOLERANCE:
+        i = int(far.argmax())
+        messages.append(
+            f"PSF core off the centre, {_bands(far > CORE_TOLERANCE)}: in band {i} it is at "
+            f"(y, x) = ({cores[i, 0]:.2f}, {cores[i, 1]:.2f}), ({off[i, 0]:+.2f}, "
+            f"{off[i, 1]:+.2f}) samples from ({center[i, 0]:g}, {center[i, 1]:g}), "
+            'and shifts the result by as much; center="core" takes the core'
+        )
+    light = edge_light(images)
+    cut = np.abs(light) > EDGE_TOLERANCE
+    if cut.any():
+        i = int(np.abs(light).argmax())
+        n_y, n_x = images.shape[1:]
+        messages.append(
+            f"PSF light cut at the edge of the {n_y} x {n_x} image, {_bands(cut)}: in band {i} "
+            f"about {100 * light[i]:.1f} % lies beyond; a larger image, or one without "
+            "background, is needed"
+        )
+    return messages
+
+
+def _bands(chosen):
+    """The bands of a mask (C,), in words."""
+    numbers = np.flatnonzero(chosen)
+    return f"band{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"

@@ -1,12 +1,45 @@
-"""Astropy WCS beyond its own methods: the inverse that never raises, and WCS of cutouts."""
+"""What grids need of astropy's WCS beyond its own methods.
+
+Longitudes come before latitudes here, whatever the order of a header's axes, and the inverse gives
+NaN where astropy's raises.
+"""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
-from astropy.wcs import DistortionLookupTable, NoConvergence, Sip
+from astropy.coordinates import SkyCoord
+from astropy.wcs import WCS, DistortionLookupTable, NoConvergence, Sip
+from astropy.wcs.utils import wcs_to_celestial_frame
 
 # [px] the iterated inverse of SIP and look-up tables stops here, well under NOISE_PX
 INVERSE_PX = 1e-8
+ARCSEC = math.radians(1 / 3600)  # [rad]
+
+
+def world_at(wcs, n, m):
+    """Longitude and latitude (2, ...) [deg] of the pixels n, m (...); NaN where there is none."""
+    world = np.array(wcs.all_pix2world(np.ravel(m), np.ravel(n), 0))
+    return world[[wcs.wcs.lng, wcs.wcs.lat]].reshape((2,) + np.shape(n))
+
+
+def pixel_scale(wcs, n, m):
+    """Root of the area [arcsec] of the pixel at (n, m), from the WCS evaluated around it."""
+    half = np.array([-0.5, 0.5])
+    n, m = np.concatenate([n + half, [n, n]]), np.concatenate([[m, m], m + half])
+    lon, lat = np.radians(world_at(wcs, n, m))
+    v = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+    return math.sqrt(np.linalg.norm(np.cross(v[:, 1] - v[:, 0], v[:, 3] - v[:, 2]))) / ARCSEC
+
+
+def convert(wcs_from, wcs_to, lon, lat):
+    """Points lon, lat (L,) [deg] of one WCS's celestial frame in that of another: (lon, lat)."""
+    frames = [wcs_to_celestial_frame(wcs) for wcs in (wcs_from, wcs_to)]
+    if frames[0].is_equivalent_frame(frames[1]):
+        return lon, lat
+    sky = SkyCoord(lon, lat, unit="deg", frame=frames[0]).transform_to(frames[1]).spherical
+    return sky.lon.deg, sky.lat.deg
 
 
 def pixels_at(wcs, lon, lat):
@@ -24,6 +57,24 @@ def pixels_at(wcs, lon, lat):
     return pixels[:, ::-1]
 
 
+def tangent_wcs(jacobian, origin, ra_deg, dec_deg):
+    """A flat sky as a tangent plane: gnomonic, ICRS, (y, x) = (0, 0) at (ra, dec) [deg].
+
+    jacobian (2, 2) [arcsec/px], origin (2,) [arcsec]: of a FlatGrid
+    """
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    wcs.wcs.cunit = ["deg", "deg"]
+    wcs.wcs.radesys = "ICRS"
+    wcs.wcs.crval = [ra_deg, dec_deg]
+    n, m = np.linalg.solve(jacobian, -origin)
+    wcs.wcs.crpix = [m + 1, n + 1]
+    # rows (west, north) of columns (m, n), west counted as minus right ascension
+    wcs.wcs.cd = jacobian[::-1, ::-1] * [[-1], [1]] / 3600
+    wcs.wcs.set()
+    return wcs
+
+
 def shifted_wcs(wcs, y0, x0):
     """The same WCS for an array that starts at (y0, x0)."""
     wcs = wcs.deepcopy()
@@ -35,8 +86,8 @@ def shifted_wcs(wcs, y0, x0):
     for name in ("cpdis1", "cpdis2", "det2im1", "det2im2"):
         table = getattr(wcs, name)
         if table is not None:
-            place = tuple(np.array(table.crval) - shift)
-            moved = DistortionLookupTable(table.data, tuple(table.crpix), place, tuple(table.cdelt))
+            crval = tuple(np.array(table.crval) - shift)
+            moved = DistortionLookupTable(table.data, tuple(table.crpix), crval, tuple(table.cdelt))
             setattr(wcs, name, moved)
     wcs.wcs.set()
     return wcs

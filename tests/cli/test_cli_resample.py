@@ -175,5 +175,5 @@ def test_grids_are_of_the_reference(files):
     assert resample() == 0
     mapping = read_image("out.fits").grid.map_to(read_image("ref.fits").grid)
     assert isinstance(read_image("out.fits").grid, Grid)
-    assert mapping.kind == "aligned"
+    assert mapping.geometry == "aligned"
     np.testing.assert_array_equal(mapping.offset, 0)

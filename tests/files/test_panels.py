@@ -3,15 +3,16 @@
 import numpy as np
 import pytest
 
-from clresample.files.panels import Panel, noise_level, save_panels, stretch, stretch_limits
+from clresample.files.panels import Panel, save_panels, stretch, stretch_limits
 from clresample.files.plot_resampled import compare
 from clresample.sky.grid import Grid
+from clresample.sky.noise import background
 
 
-def test_noise_level_ignores_sources_and_gaps():
+def test_background_ignores_sources_and_gaps():
     image = np.random.default_rng(0).normal(3, 2, (200, 200))
     image[:5], image[5:10] = np.nan, 1e4
-    median, sigma = noise_level(image)
+    median, sigma = background(image)
     assert abs(median - 3) < 0.2 and abs(sigma - 2) < 0.2
 
 

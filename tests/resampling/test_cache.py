@@ -10,8 +10,8 @@ from helpers.scenes import BLURRED, SHAPE, SHARP, blend, frame, grids
 
 from clresample.deblending.batch import deblend
 from clresample.deblending.settings import Settings
-from clresample.resampling import cache as operators
-from clresample.resampling.cache import N_OPERATORS, N_PLANS, cached_resampler
+from clresample.resampling import cache as cache_module
+from clresample.resampling.cache import OperatorCache, cached_resampler, default_cache
 from clresample.sky.frame import Frame
 from clresample.sky.grid import Grid
 from clresample.sky.psf import PSF
@@ -20,11 +20,9 @@ from clresample.sky.psf import PSF
 @pytest.fixture(autouse=True)
 def emptied():
     """No operators from other tests, and none for them."""
-    for cache in (operators._plan, operators._operator):
-        cache.cache_clear()
+    default_cache().clear()
     yield
-    for cache in (operators._plan, operators._operator):
-        cache.cache_clear()
+    default_cache().clear()
 
 
 def make(device, *, home=None, grid=None, psf=SHARP, dtype=np.float32, **given):
@@ -37,7 +35,7 @@ def test_the_same_geometry_is_the_same_operator(device):
     first = make(device)
     again = PSF(SHARP.images.copy()), Grid.flat(SHAPE, 0.1), frame()
     assert make(device, psf=again[0], grid=again[1], home=again[2]) is first
-    assert operators._plan.cache_info().misses == 1
+    assert (default_cache().n_plans, default_cache().n_operators) == (1, 1)
 
 
 @pytest.mark.parametrize(
@@ -86,32 +84,73 @@ def test_padding_keeps_the_frequencies_and_so_the_answer(device):
         assert np.abs(bare.render(padded) - alone.render(image))[:, there].max() > 3e-5
 
 
-def test_a_second_fit_of_a_geometry_makes_no_plan(device):
+def test_a_second_fit_of_a_geometry_makes_no_plan(device, monkeypatch):
+    made, make_plan = [], cache_module.make_plan
+    monkeypatch.setattr(
+        cache_module, "make_plan", lambda *a, **k: made.append(a) or make_plan(*a, **k)
+    )
     given = {"settings": Settings(max_iter=2), "device": device}
-    for seed, made in ((0, 2), (1, 2)):
+    for seed in (0, 1):
         b = blend(seed=seed)
         deblend(b.observations, b.sources, frame=b.frame, **given)
-        assert operators._plan.cache_info().misses == made
-        assert operators._operator.cache_info().misses == made
+        assert len(made) == default_cache().n_operators == 2
     shifted = Settings(max_iter=2, fit_shifts=True)  # operators of its own, on the same plans
     deblend(b.observations, b.sources, frame=b.frame, settings=shifted, device=device)
-    assert operators._plan.cache_info().misses == 2
+    assert len(made) == default_cache().n_operators == 2
+
+
+def test_a_cache_of_the_caller_s_own(device):
+    mine, other = OperatorCache(), OperatorCache()
+    op = make(device, cache=mine)
+    assert make(device, cache=mine) is op
+    assert op is not make(device, cache=other) is not make(device)
+    assert mine.n_plans == mine.n_operators == default_cache().n_operators == 1
+    mine.clear()
+    assert make(device, cache=mine) is not op
+
+
+def test_what_was_asked_for_longest_ago_goes_first(device):
+    first = make(device)
+    room = OperatorCache(plan_bytes=5 * first.plans[0].n_bytes // 2, device_bytes=first.n_bytes)
+    psfs = [PSF.gaussian(0.9 + 1e-3 * i, n_pixels=19) for i in range(3)]
+    a, b = (make(device, psf=psf, cache=room) for psf in psfs[:2])
+    assert (room.n_plans, room.n_operators) == (2, 1)
+    assert make(device, psf=psfs[1], cache=room) is b
+    again = make(device, psf=psfs[0], cache=room)
+    assert again is not a and again.plans[0] is a.plans[0]
+    make(device, psf=psfs[2], cache=room)
+    assert make(device, psf=psfs[0], cache=room).plans[0] is a.plans[0]
+    assert make(device, psf=psfs[1], cache=room).plans[0] is not b.plans[0]
+    # one that exceeds the bound by itself is kept all the same
+    tiny = OperatorCache(plan_bytes=0, device_bytes=0)
+    assert make(device, cache=tiny) is make(device, cache=tiny)
+
+
+def test_operators_count_what_they_hold_on_the_device(device):
+    before = device.in_use
+    op = make(device)
+    assert 0.3 < (device.in_use - before) / op.n_bytes < 2
+    small = op.n_bytes
+    op(np.zeros((64, *op.shape_in)))
+    assert op.n_bytes > small + 64 * np.prod(op.shape_in) * op.dtype.itemsize
+    assert 0.3 < (device.in_use - before) / op.n_bytes < 2
 
 
 def test_caches_are_bounded(device, monkeypatch):
     """More geometries than are kept: the device's memory stops growing."""
-    monkeypatch.setattr(operators, "make_plan", lambda *a, **k: None)
     monkeypatch.setattr(
-        operators.Resampler,
-        "from_plans",
-        lambda *a, **k: SimpleNamespace(memory=device.empty(1000, np.float32)),
+        cache_module, "make_plan", lambda *a, **k: SimpleNamespace(n_bytes=100, mapping=None)
     )
-    held = []
-    for i in range(N_PLANS + 20):
-        make(device, home=frame(), psf=PSF.gaussian(0.9 + 1e-6 * i, n_pixels=11))
+    monkeypatch.setattr(
+        cache_module.Resampler,
+        "from_plans",
+        lambda *a, **k: SimpleNamespace(n_bytes=4000, memory=device.empty(1000, np.float32)),
+    )
+    small, held = OperatorCache(plan_bytes=3000, device_bytes=40_000), []
+    for i in range(60):
+        make(device, home=frame(), psf=PSF.gaussian(0.9 + 1e-6 * i, n_pixels=11), cache=small)
         if i % 20 == 19:
             gc.collect()
             held.append(device.in_use)
-    assert operators._plan.cache_info().currsize == N_PLANS
-    assert operators._operator.cache_info().currsize == N_OPERATORS
-    assert len(set(held[2:])) == 1
+    assert (small.n_plans, small.n_operators) == (30, 10)
+    assert len(set(held)) == 1

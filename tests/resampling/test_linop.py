@@ -159,7 +159,7 @@ def test_out_is_written_and_returned(device):
     assert distance(op.adjoint(truth, out=np.empty_like(x)), op.adjoint(truth)) == 0
 
 
-def test_wrong_arrays_are_told(device):
+def test_wrong_arrays_are_refused(device):
     op = build(device)
     x = noise(op.shape_in)
     on_device = device.put(x)

@@ -32,7 +32,7 @@ from clresample.sky.psf_checks import PSFWarning
 from clresample.testing import check_adjoint, dense
 
 every_type = pytest.mark.parametrize("dtype", TYPES, ids=lambda t: t.__name__)
-AFFINE = [name for name, make in GEOMETRIES.items() if make().kind != "distorted"]
+AFFINE = [name for name, make in GEOMETRIES.items() if make().geometry != "distorted"]
 PATHS = [name for name in ONE_OF_EACH if name in AFFINE]
 
 
@@ -74,7 +74,7 @@ def allowed(mapping, psf_in, psf_out, n_fft):
     A sinc that ends at K/2 smooths the step e that |D| makes at its band's edge: by e/2 at most at
     the edge itself, by e / (2 pi K x) at a distance x (galaxies: 0.1); P2's sincs and the model's.
     """
-    d = np.abs(reference.spectrum_ratio(mapping.matrix, psf_in, psf_out, n_fft)[2])
+    d = np.abs(reference.otf_ratio(mapping.matrix, psf_in, psf_out, n_fft)[2])
     on = np.pad(d, ((0, 0), (1, 1), (1, 1))) > 0
     inner = on[:, :-2, 1:-1] & on[:, 2:, 1:-1] & on[:, 1:-1, :-2] & on[:, 1:-1, 2:]
     step = (d * ~inner).max() / d.max()
@@ -83,7 +83,7 @@ def allowed(mapping, psf_in, psf_out, n_fft):
 
 def check(op, mapping, psf_in, psf_out, images, extra):
     images = np.asarray(images).astype(op.dtype)
-    truth = reference.resample(images, mapping, psf_in, psf_out, op.report["n_fft"])
+    truth = reference.resample(images, mapping, psf_in, psf_out, op.certificate.n_fft)
     error = distance(op(images), truth)
     limit = TOLERANCE[op.dtype.type] + extra
     assert error <= limit, f"relative error {error:.1e}, allowed {limit:.1e}"
@@ -94,8 +94,8 @@ def check(op, mapping, psf_in, psf_out, images, extra):
 def test_every_geometry(device, geometry, dtype):
     mapping, pair = GEOMETRIES[geometry](), psfs()
     op = split(device, mapping, *pair, dtype)
-    assert op.kind == mapping.kind
-    for_noise, for_galaxies = allowed(mapping, *pair, op.report["n_fft"])
+    assert op.geometry == mapping.geometry
+    for_noise, for_galaxies = allowed(mapping, *pair, op.certificate.n_fft)
     check(op, mapping, *pair, noise((2, *op.shape_in)), for_noise)
     check(op, mapping, *pair, galaxies(op.shape_in[1:]), for_galaxies)
     check_adjoint(op, np.random.default_rng(4), batch=(2,))
@@ -110,7 +110,7 @@ def test_forward_and_adjoint_are_the_dense_matrix(device, geometry, dtype):
     psf_in, psf_out = SAMPLED["psf_in"], sampled([1.6, 2.0])
     op = split(device, mapping, psf_in, psf_out, dtype)
     positions = mapping.at(*np.indices(mapping.shape_out))
-    n_fft = [3 * k for k in op.report["n_fft"]]
+    n_fft = [3 * k for k in op.certificate.n_fft]
     truth = reference.dense_matrix((8, 7), positions, mapping.matrix, psf_in, psf_out, n_fft)
     blocks = np.zeros((2, 30, 2, 56))  # bands do not mix
     blocks[0, :, 0], blocks[1, :, 1] = truth * mapping.covered.reshape(-1, 1)
@@ -127,7 +127,7 @@ def test_any_psf(device, pair, geometry, dtype):
         pair = PSF_PAIRS[pair]()
     mapping = GEOMETRIES[geometry]()
     op = split(device, mapping, *pair, dtype)
-    for_noise, for_galaxies = allowed(mapping, *pair, op.report["n_fft"])
+    for_noise, for_galaxies = allowed(mapping, *pair, op.certificate.n_fft)
     check(op, mapping, *pair, noise(op.shape_in), for_noise)
     images = np.resize(galaxies(op.shape_in[1:]), op.shape_in)
     check(op, mapping, *pair, images, for_galaxies + WRAP_TOLERANCE)
@@ -141,7 +141,7 @@ def test_any_size(device, shape_in, shape_out, dtype):
     for matrix in (turn(0, 0.9), turn(90, 0.9), turn(30, 0.9), turn(70, 0.9)):
         mapping = affine(matrix, shape_in, shape_out)
         op = split(device, mapping, **SAMPLED, dtype=dtype)
-        for_noise, _ = allowed(mapping, *SAMPLED.values(), op.report["n_fft"])
+        for_noise, _ = allowed(mapping, *SAMPLED.values(), op.certificate.n_fft)
         check(op, mapping, *SAMPLED.values(), noise(op.shape_in), for_noise)
         # several images: one observed pixel alone may cancel to rounding
         check_adjoint(op, np.random.default_rng(6), batch=(8,))
@@ -189,12 +189,12 @@ def test_either_axis_may_shift_the_model_and_the_cheaper_does(device, angle, mon
     for shape_out, axis in (((10, 32), 0), ((32, 10), 1)):
         mapping = affine(turn(angle), (40, 40), shape_out)
         cheap = split(device, mapping, **SAMPLED)
-        assert cheap.report["model_axis"] == axis
+        assert cheap.model_axis == axis
         x = noise(cheap.shape_in)
         with monkeypatch.context() as patch:
             patch.setattr(factors, "SHIFT_COST", -(10**6))  # turns the order round
             dear = split(device, mapping, **SAMPLED)
-        assert dear.report["model_axis"] == 1 - axis
+        assert dear.model_axis == 1 - axis
         assert distance(dear(x), cheap(x)) < TOLERANCE[np.float32]
 
 
@@ -251,11 +251,11 @@ def test_a_fault_is_seen(device, fault, geometry, monkeypatch):
     check(op, mapping, *SAMPLED.values(), images, 0)
     check_adjoint(op, rng)
     if fault == "wave":  # the model shifted by a hundredth of a pixel: consistent, but wrong
-        parts.set_transfer(op._spectra, np.array([0.01, 0]))
+        parts.set_transfer(op._transfer, np.array([0.01, 0]))
     elif fault == "kernel":  # a term of the kernel's spectrum by a thousandth
-        d = np.array(op._spectra)
+        d = np.array(op._transfer)
         d[:, 1, 1] *= 1.001
-        parts.set_transfer(d, op.shift)
+        parts.set_transfer(d, op.shift[0])
     elif fault == "transpose":  # forward and adjoint with different kernels
         kernel = parts.kernels[0][0][0]
         kernel[...] = 1.00001 * kernel

@@ -6,7 +6,7 @@ from astropy.wcs import WCS
 
 from clresample.device.device import Device, get_device
 from clresample.resampling.resampler import Resampler
-from clresample.resampling.tiled import TiledResampler
+from clresample.resampling.tiled.resampler import TiledResampler
 from clresample.simulation.surveys import NOTEBOOK_SURVEYS
 from clresample.sky.grid import Grid
 from clresample.sky.psf import PSF
@@ -56,7 +56,7 @@ def test_tiles_give_the_answer_of_one_tile(names, place, tolerance):
     tiled = TiledResampler(*setting, dtype=np.float64, shift=(0.3, -1.7), memory=2 * SMALL)
     x = field(*setting[:2], np.random.default_rng(1))
     assert tiled.n_tiles > 3 and len(tiled.groups) == 1
-    assert tiled.kind == one.kind
+    assert tiled.geometry == one.geometry
     np.testing.assert_array_equal(tiled.covered, one.covered)
     result = tiled(x)
     assert distance(result, one(x)) < tolerance
@@ -169,7 +169,7 @@ def test_slight_distortion_is_affine_tile_by_tile():
     x = field(*setting[:2], np.random.default_rng(7))
     tiled = TiledResampler(*setting, dtype=np.float64, memory=2 * SMALL)
     exact = Resampler(*setting, dtype=np.float64, tolerance_px=1e-8)
-    assert (tiled.kind, exact.kind) == ("affine", "distorted")
+    assert (tiled.geometry, exact.geometry) == ("affine", "distorted")
     assert len(tiled.groups) < tiled.n_tiles  # neighbours share an operator
     np.testing.assert_array_equal(tiled.covered, exact.covered)
     # tolerance_px is 1e-4 px, and the images change by their own size over 1.6 px
@@ -185,7 +185,7 @@ def test_strong_distortion_is_followed_pixel_by_pixel():
     tiled = TiledResampler(
         grid_in, one.psf(), grid_out, two.psf(), dtype=np.float64, memory=2 * SMALL
     )
-    assert tiled.kind == "distorted" and tiled.n_tiles > 3
+    assert tiled.geometry == "distorted" and tiled.n_tiles > 3
     result = tiled(x)
     for group in tiled.groups[:3]:
         (y0, x0), shape = group.tiles[0].origin, tiled.tile_shape

@@ -201,7 +201,7 @@ def test_sources_do_not_depend_on_geometry_or_number(galsim, scene):
     np.testing.assert_array_equal(straight.positions_arcsec, scene.positions_arcsec[:2])
     np.testing.assert_array_equal(straight.rubin.magnitudes, scene.rubin.magnitudes[:2])
     np.testing.assert_array_equal(straight.euclid.truth, scene.euclid.truth[:2])
-    assert straight.positions_deg is None and straight.euclid.grid.wcs is None
+    assert straight.positions_deg is None and straight.euclid.grid.is_flat
 
 
 def test_shapes_and_flux_budget(scene):

@@ -18,7 +18,7 @@ def test_locate_inverts_the_mapping_of_a_distorted_image():
     shifts = np.array([[0.4, -1.3]])
     result = one_source(grid=grid, observations=[observe(seen, ("g", "r"))], shifts=shifts)
     footprint = Footprint.of(result, 0)
-    assert footprint.mapping.kind == "distorted"
+    assert footprint.mapping.geometry == "distorted"
     truth = np.array([[20.0, 22.0], [8.3, 30.6], [25.2, 11.9]])
     points = grid.pixel(*seen.sky(*truth.T)) + [0.4, -1.3]
     np.testing.assert_allclose(footprint.locate(points), truth, atol=0.01)

@@ -84,7 +84,7 @@ def test_the_psf_is_a_gaussian_with_its_pixel(sigma):
     nu = np.array([0.1])
     expected = np.exp(-2 * (np.pi * sigma * 0.1) ** 2) * np.sinc(0.1)
     aliased = np.exp(-2 * (np.pi * sigma * 0.9) ** 2)
-    assert abs(psf.spectrum(nu, np.zeros(1))[0, 0, 0] - expected) <= 1.01 * aliased + 1e-14
+    assert abs(psf.otf(nu, np.zeros(1))[0, 0, 0] - expected) <= 1.01 * aliased + 1e-14
 
 
 def test_observations_that_do_not_meet_are_named():
@@ -114,7 +114,7 @@ def test_the_other_side_of_the_sky_is_named():
             model_frame([here, there], **options)
 
 
-def test_boxes_that_meet_only_at_a_corner_are_told():
+def test_boxes_that_meet_only_at_a_corner_are_refused():
     # a square turned by 45 degrees leaves the corners of its bounding box empty
     turned = observe(Grid.flat((40, 40), 0.1, angle_deg=45), "turned")
     corner = observe(Grid.flat((8, 8), 0.09, center_arcsec=(2.5, 2.5)), "corner")

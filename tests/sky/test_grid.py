@@ -41,7 +41,7 @@ def test_flat_grids():
 def test_flat_mapping_is_exact(flip):
     grid_in, grid_out = Grid.flat((50, 60), 0.1), Grid.flat((20, 20), 0.2, flip=flip)
     mapping = grid_out.map_to(grid_in)
-    assert (mapping.kind, mapping.departure_px) == ("aligned", 0)
+    assert (mapping.geometry, mapping.departure_px) == ("aligned", 0)
     np.testing.assert_array_equal(mapping.matrix, np.diag([2, -2 if flip else 2]))
     np.testing.assert_allclose(mapping.at(9.5, 9.5), (24.5, 29.5), atol=1e-13)
     quarter = Grid.flat((20, 20), 0.2, angle_deg=-90, flip=flip).map_to(grid_in)
@@ -103,7 +103,7 @@ def test_union_holds_every_pixel_on_the_sky():
     whole = union(grids, like=like)
     for grid in grids:
         assert grid.map_to(whole).covered.all()
-    assert like.map_to(whole).kind == "aligned"
+    assert like.map_to(whole).geometry == "aligned"
     shared = intersection(grids, like=like)
     assert shared.map_to(like).covered.all()
 
@@ -125,9 +125,9 @@ def test_central_pixel_scale_is_the_sky_s():
 )
 def test_what_is_no_celestial_wcs(cards, match):
     wcs = WCS(fits.Header(cards))
-    with pytest.raises(ValueError, match=match) as told:
+    with pytest.raises(ValueError, match=match) as raised:
         Grid.from_wcs(wcs, OBSERVED)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(raised.value)
 
 
 def test_what_is_no_grid():
@@ -139,7 +139,7 @@ def test_what_is_no_grid():
             Grid.flat(shape, 1.0)
     with pytest.raises(ValueError, match="grid_in is placed by a WCS and this grid flat"):
         Grid.flat((4, 4), 1.0).map_to(grid_of(header(MODEL), MODEL))
-    thin = Grid((4, 4), None, np.array([[1.0, 1.0], [1.0, 1.0 + 1e-14]]), np.zeros(2))
+    thin = Grid.from_jacobian((4, 4), [[1.0, 1.0], [1.0, 1.0 + 1e-14]], (0, 0))
     with pytest.raises(ValueError, match="singular"):
         thin.map_to(Grid.flat((4, 4), 1.0))
 
@@ -170,3 +170,40 @@ def test_pixel_of_a_flat_grid_and_of_no_place():
     # so far from the image, the polynomials of SIP have no inverse (the last grid's)
     assert np.isnan(grid_of(cards, MODEL).pixel(RA, [DEC, DEC + 60])[1]).all()
     assert grid_of(cards, MODEL).pixel([], []).shape == (0, 2)
+
+
+def test_the_two_kinds():
+    flat, placed = Grid.flat((4, 7), 0.5, angle_deg=20), grid_of(header(MODEL), MODEL)
+    assert isinstance(flat, Grid) and isinstance(placed, Grid)
+    assert (flat.is_flat, flat.placing) == (True, "flat")
+    assert (placed.is_flat, placed.placing) == (False, "placed by a WCS")
+    for grid in (flat, placed):
+        cutout = grid.cutout(1, 2, (2, 3))
+        assert type(cutout) is type(grid) and cutout.shape == (2, 3)
+        n, m = np.indices(cutout.shape)
+        np.testing.assert_allclose(
+            cutout.positions_in(grid, n, m), np.stack([n + 1, m + 2], axis=-1), atol=1e-8
+        )
+    flat.check_like(flat.cutout(0, 0, (1, 1)), "other")
+    for one, other in ((flat, placed), (placed, flat)):
+        with pytest.raises(
+            ValueError, match=f"there is {other.placing} and this grid {one.placing}"
+        ):
+            one.check_like(other, "there")
+
+
+def test_a_flat_grid_from_its_jacobian():
+    grid = Grid.flat((4, 7), (0.5, 0.3), angle_deg=30, flip=True, center_arcsec=(1.0, -2.0))
+    again = Grid.from_jacobian(grid.shape, grid.jacobian.tolist(), grid.origin.tolist())
+    for name in ("shape", "jacobian", "origin"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(grid, name))
+    for jacobian, origin, match in (
+        (np.eye(3), (0, 0), r"jacobian is .*\(2, 2\)"),
+        (np.diag([1, np.nan]), (0, 0), "jacobian is .*finite"),
+        (np.eye(2), (0, 0, 0), r"origin is .*\(2,\)"),
+        (np.eye(2), (np.inf, 0), "origin is .*finite"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            Grid.from_jacobian((4, 4), jacobian, origin)
+    with pytest.raises(ValueError, match="shape"):
+        Grid.from_jacobian((0, 4), np.eye(2), (0, 0))

@@ -1,10 +1,9 @@
-"""Observations: every way of giving the noise, what is checked, and the noise estimate."""
+"""Observations: every way of giving the noise, and what is checked."""
 
 import numpy as np
 import pytest
 
 from clresample.sky.grid import Grid
-from clresample.sky.noise import noise_sigma
 from clresample.sky.observation import Observation, check_observations
 from clresample.sky.psf import PSF
 
@@ -88,7 +87,7 @@ def test_bad_pixels_get_no_weight_and_are_counted(given):
 
 
 @pytest.mark.parametrize("given", [{}, {"weights": 1.0}, {"variance": 1.0}])
-def test_a_channel_without_a_pixel_is_told(given):
+def test_a_channel_without_a_pixel_is_reported(given):
     data = noise()
     data[1] = np.nan
     observation = observe(data, channels=("g", "r", "i"), **given)
@@ -118,31 +117,7 @@ def test_noise_is_estimated_and_said_where_nothing_is_given():
         assert f"channel{i} estimated" in message and f"sigma = {estimated[i]:.4g}" in message
 
 
-def test_noise_sigma_is_unbiased_for_white_noise():
-    # enough pixels to see the 0.4 % that cutting at 3 sigma takes from the MAD
-    image = noise((1600, 1600), sigma=3.0)
-    assert noise_sigma(image) == pytest.approx(3.0, rel=TOLERANCE / 1600)
-
-
-@pytest.mark.parametrize(("share", "bias"), [(0.03, 0.02), (0.1, 0.03), (0.5, 0.3)])
-def test_noise_sigma_hardly_sees_sources(share, bias):
-    image = noise((300, 300)).ravel()
-    n = int(share * image.size)
-    image[:n] += np.random.default_rng(1).exponential(10.0, n)
-    image[:20] = 1e9
-    image[20:25] = np.nan
-    sigma = noise_sigma(image.reshape(300, 300))
-    assert 1 - 0.01 < sigma < 1 + bias
-    assert noise_sigma(-7 * image.reshape(300, 300) + 3) == pytest.approx(7 * sigma)
-
-
-def test_noise_that_cannot_be_estimated():
-    with pytest.raises(ValueError, match="31 pixels are left.*32 are needed"):
-        noise_sigma(noise((1, 31)))
-    padded = noise((40, 40))
-    padded[:21] = 0
-    with pytest.raises(ValueError, match="same value"):
-        noise_sigma(padded)
+def test_noise_that_cannot_be_estimated_names_its_channel():
     data = noise()
     data[1] = 4
     with pytest.raises(ValueError, match="channel r: .*same value.*give weights or variance"):
@@ -181,9 +156,9 @@ def test_zero_points_become_microjansky():
     ],
 )
 def test_what_is_no_observation(options, match):
-    with pytest.raises(ValueError, match=match) as told:
+    with pytest.raises(ValueError, match=match) as raised:
         observe(**options)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(raised.value)
 
 
 def test_what_cannot_be_fitted_together():
@@ -208,3 +183,21 @@ def test_what_cannot_be_fitted_together():
 
 def _on_the_sky(grid):
     return Grid.from_wcs(grid.to_wcs(), grid.shape)
+
+
+def test_an_observation_is_restored_with_what_was_found_then():
+    data = noise()
+    data[0, 0, 0] = np.nan
+    first = observe(data, channels=("g", "r", "i"), zero_points=27, name="A")
+    assert first.n_bad == 1 and len(first.messages) == 4  # three estimates, one bad pixel
+    kept = {key: getattr(first, key) for key in ("channels", "zero_points", "name")}
+    found = {"n_bad": first.n_bad, "messages": list(first.messages)}
+    again = Observation.restore(first.data, first.psf, GRID, weights=first.weights, **found, **kept)
+    for name in ("data", "weights", "zero_points"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
+    assert again.psf is first.psf and again.messages == first.messages and again.n_bad == 1
+    assert (again.channels, again.name) == (first.channels, "A")
+    with pytest.raises(ValueError, match="channels has 2 names"):
+        Observation.restore(
+            first.data, first.psf, GRID, weights=1, **found, **kept | {"channels": ("g", "r")}
+        )

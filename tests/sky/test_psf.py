@@ -1,4 +1,4 @@
-"""The PSF's spectrum against its definition and against analytic transforms, and what is told."""
+"""The PSF's OTF against its definition and analytic transforms, its width, and its warnings."""
 
 import math
 import warnings
@@ -8,6 +8,7 @@ import pytest
 
 from clresample.sky.psf import PSF
 from clresample.sky.psf_checks import PSFWarning
+from clresample.sky.waves import cos_sin_columns, phases
 
 NU_Y, NU_X = np.arange(-16, 17) / 33, np.arange(0, 20) / 39
 
@@ -45,11 +46,11 @@ def matrices():
 @pytest.mark.parametrize("spacing", [1.0, 0.5, 0.4])
 @pytest.mark.parametrize("shape", [(9, 9), (8, 13), (1, 1), (12, 6)], ids=str)
 @pytest.mark.parametrize("matrix", [pytest.param(m, id=name) for name, m in matrices()])
-def test_spectrum_is_its_definition(matrix, shape, spacing):
+def test_the_otf_is_its_definition(matrix, shape, spacing):
     rng = np.random.default_rng(5)
     images = rng.random((3, *shape))
     psf = quiet(images, spacing=spacing, center=[(1.0, 2.0), (1.0, 2.0), (3.3, -0.4)])
-    found = psf.spectrum(NU_Y, NU_X, matrix)
+    found = psf.otf(NU_Y, NU_X, matrix)
     assert found.dtype == np.complex128
     # sums of a few hundred terms that add up to 1 in float64
     np.testing.assert_allclose(found, term_by_term(psf, NU_Y, NU_X, matrix), atol=1e-13)
@@ -60,15 +61,15 @@ def test_many_samples_go_in_blocks(monkeypatch):
     rng = np.random.default_rng(6)
     psf = quiet(rng.random((2, 21, 10)))
     matrix = rng.normal(size=(2, 2))
-    whole = psf.spectrum(NU_Y, NU_X, matrix)
+    whole = psf.otf(NU_Y, NU_X, matrix)
     monkeypatch.setattr("clresample.sky.psf.BLOCK", 1600)  # three rows of ten samples at a time
-    np.testing.assert_allclose(psf.spectrum(NU_Y, NU_X, matrix), whole, atol=1e-15)
+    np.testing.assert_allclose(psf.otf(NU_Y, NU_X, matrix), whole, atol=1e-15)
 
 
 def test_no_matrix_is_the_identity():
     psf = PSF.gaussian(1.2)
-    np.testing.assert_array_equal(psf.spectrum(NU_Y, NU_X), psf.spectrum(NU_Y, NU_X, np.eye(2)))
-    assert abs(psf.spectrum([0.0], [0.0])[0, 0, 0] - 1) < 1e-15
+    np.testing.assert_array_equal(psf.otf(NU_Y, NU_X), psf.otf(NU_Y, NU_X, np.eye(2)))
+    assert abs(psf.otf([0.0], [0.0])[0, 0, 0] - 1) < 1e-15
 
 
 @pytest.mark.parametrize("spacing", [1.0, 0.5])
@@ -76,10 +77,10 @@ def test_band_ends_where_the_samples_do(spacing):
     psf = quiet(np.ones((1, 3, 3)), spacing=spacing)
     limit = 0.5 / spacing
     nu = np.array([-1.01, -1, 0, 1, 1.01]) * limit
-    carried = psf.spectrum(nu, nu)[0] != 0
+    carried = psf.otf(nu, nu)[0] != 0
     np.testing.assert_array_equal(carried, np.outer(abs(nu) <= limit, abs(nu) <= limit))
     matrix = np.array([[0.0, 2.0], [1.0, 0.0]])  # f = (nu_x, 2 nu_y)
-    carried = psf.spectrum(nu / 2, nu, matrix)[0] != 0
+    carried = psf.otf(nu / 2, nu, matrix)[0] != 0
     np.testing.assert_array_equal(carried, np.outer(abs(nu) <= limit, abs(nu) <= limit))
 
 
@@ -95,14 +96,14 @@ def test_gaussian_is_the_analytic_one(angle, n_pixels):
     round_one = np.exp(-2 * (np.pi * sigma) ** 2 * (f_y**2 + f_x**2))
     for pixel, truth in ((False, round_one), (True, round_one * np.sinc(f_y) * np.sinc(f_x))):
         psf = PSF.gaussian(sigma, n_pixels=n_pixels, pixel=pixel)
-        np.testing.assert_allclose(psf.spectrum(nu, nu, matrix)[0], truth, atol=1e-13)
+        np.testing.assert_allclose(psf.otf(nu, nu, matrix)[0], truth, atol=1e-13)
 
 
 def test_oversampled_gaussian_is_the_same_gaussian():
     fine = PSF.gaussian(2.1, n_pixels=243, spacing=0.25)
     nu = np.linspace(-0.3, 0.3, 9)
-    truth = PSF.gaussian(2.1, n_pixels=61).spectrum(nu, nu)
-    np.testing.assert_allclose(fine.spectrum(nu, nu), truth, atol=1e-13)
+    truth = PSF.gaussian(2.1, n_pixels=61).otf(nu, nu)
+    np.testing.assert_allclose(fine.otf(nu, nu), truth, atol=1e-13)
 
 
 def test_a_centre_is_a_phase():
@@ -112,8 +113,8 @@ def test_a_centre_is_a_phase():
     shift = 0.5 * (there.center[0] - here.center[0])
     f = np.tensordot(matrix.T, np.stack(np.meshgrid(NU_Y, NU_X, indexing="ij")), 1)
     phase = np.exp(2j * np.pi * np.tensordot(shift, f, 1))
-    found = there.spectrum(NU_Y, NU_X, matrix)[0]
-    np.testing.assert_allclose(found, phase * here.spectrum(NU_Y, NU_X, matrix)[0], atol=1e-14)
+    found = there.otf(NU_Y, NU_X, matrix)[0]
+    np.testing.assert_allclose(found, phase * here.otf(NU_Y, NU_X, matrix)[0], atol=1e-14)
 
 
 def test_each_band_is_normalised_by_itself():
@@ -137,6 +138,45 @@ def test_select_bands():
         psf.select(3)
 
 
+def test_restore_keeps_every_bit():
+    rng = np.random.default_rng(10)
+    first = quiet(rng.random((2, 7, 9)) * 1e3, spacing=0.3, center=(1.1, 2 + 1e-9))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # a core so far off its centre was warned of before
+        again = PSF.restore(first.images, spacing=first.spacing, center=first.center.tolist())
+    np.testing.assert_array_equal(again.images, first.images)
+    np.testing.assert_array_equal(again.center, first.center)
+    assert again.spacing == first.spacing and again.images is not first.images
+    with pytest.raises(ValueError, match="read-only"):
+        again.center[0, 0] = 1
+
+
+@pytest.mark.parametrize("spacing", [1.0, 0.25])
+def test_fwhm_of_gaussians(spacing):
+    sigmas = np.array([1.5, 3.0, 6.0])
+    psf = PSF.gaussian(sigmas, n_pixels=int(60 / spacing) + 1, spacing=spacing)
+    # the pixel adds 1/12 to the variance; samples are counted, to one or two along the edge
+    truth = 2 * np.sqrt(2 * math.log(2) * (sigmas**2 + 1 / 12))
+    np.testing.assert_allclose(psf.fwhm_px, truth, atol=0.3 * spacing)
+    assert psf.fwhm_px.shape == (3,)
+    one = quiet([[1.0]])
+    assert one.fwhm_px[0] == pytest.approx(2 / math.sqrt(math.pi))
+
+
+def test_whole_cycles_are_taken_off_before_they_are_rounded():
+    nu, x = np.array([0.25, 1 / 3]), np.array([4e6 + 1, 3e6])
+    angle = phases(nu, x)
+    assert angle.shape == (2, 2)
+    np.testing.assert_allclose(
+        np.abs(angle), np.abs([[np.pi / 2, 0], [2 * np.pi / 3, 0]]), atol=2e-9
+    )
+    assert np.abs(np.cos(2 * np.pi * nu[0] * x[0])) > 1e-10 > np.abs(np.cos(angle[0, 0]))
+    columns = cos_sin_columns(angle)
+    assert columns.shape == (2, 4)
+    np.testing.assert_array_equal(columns[:, ::2], np.cos(angle))
+    np.testing.assert_array_equal(columns[:, 1::2], np.sin(angle))
+
+
 def test_integer_and_foreign_endian_images():
     image = np.outer([1, 2, 1], [1, 2, 1])
     for dtype in (np.int16, ">f4", ">f8", np.uint8):
@@ -155,19 +195,19 @@ def test_core_is_found_to_a_hundredth(sigma, shift):
     np.testing.assert_array_equal(psf.center[0], core)
 
 
-def test_a_core_off_the_centre_is_told_once_with_figures():
+def test_a_core_off_the_centre_is_warned_of_once_with_figures():
     y = np.arange(20) - 10.0  # the core at n/2: the usual slip
     image = np.exp(-0.5 * (y[:, None] ** 2 + y**2) / 2)
-    with pytest.warns(PSFWarning) as told:
+    with pytest.warns(PSFWarning) as warned:
         PSF(np.stack([image, image]))
-    assert len(told) == 1
+    assert len(warned) == 1
     for figure in ("bands 0, 1", "(10.00, 10.00)", "(+0.50, +0.50)", "(9.5, 9.5)"):
-        assert figure in str(told[0].message)
-    assert PSF(image, center=(10, 10)).report() == []
-    assert PSF(image, center="core").report() == []
+        assert figure in str(warned[0].message)
+    assert PSF(image, center=(10, 10)).warnings() == []
+    assert PSF(image, center="core").warnings() == []
 
 
-def test_light_cut_at_the_edge_is_told():
+def test_light_cut_at_the_edge_is_warned_of():
     with pytest.warns(PSFWarning, match=r"cut at the edge of the 41 x 41 image, band 1"):
         PSF.gaussian([2.0, 10.0])
     with pytest.warns(PSFWarning, match="cut at the edge"):
@@ -224,4 +264,4 @@ def test_what_is_no_gaussian():
     with pytest.raises(ValueError, match="2 bands"):
         PSF.gaussian([1.0, 2.0], n_bands=3)
     with pytest.raises(ValueError, match="matrix"):
-        PSF.gaussian(1.0).spectrum(NU_Y, NU_X, np.eye(3))
+        PSF.gaussian(1.0).otf(NU_Y, NU_X, np.eye(3))

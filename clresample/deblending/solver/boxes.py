@@ -10,6 +10,8 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
+from ...sky.extent import shared_part
+
 # Elements between possible starts of boxes: the widest OpenCL vector, one 64-byte cache line of
 # float32. Offsets are stored in these units, so that int32 reaches 2^35 elements.
 ALIGN = 16
@@ -108,13 +110,11 @@ class Boxes:
                 f"here are {len(self)} of scenes {self.scene}"
             )
         out = np.zeros(boxes_new.size, flat.dtype)
-        low = np.maximum(self.origin, boxes_new.origin)
-        high = np.minimum(self.origin + self.shape, boxes_new.origin + boxes_new.shape)
         pairs = zip(self.unpack(flat), boxes_new.unpack(out), strict=True)
         for i_source, (old, new) in enumerate(pairs):
-            if (high[i_source] > low[i_source]).all():
-                to = _window(low[i_source], high[i_source], boxes_new.origin[i_source])
-                new[to] = old[_window(low[i_source], high[i_source], self.origin[i_source])]
+            origins = self.origin[i_source], boxes_new.origin[i_source]
+            there, here = shared_part(origins[0], old.shape, origins[1], new.shape)
+            new[here] = old[there]
         return out
 
     def put(self, device):
@@ -177,7 +177,3 @@ def _refuse(bad, message, values, others=None):
         i_source = int(np.argmax(bad))
         more = () if others is None else (tuple(others[i_source].tolist()),)
         raise ValueError(message.format(values[i_source].tolist(), i_source, *more))
-
-
-def _window(low, high, origin):
-    return tuple(slice(a, b) for a, b in zip(low - origin, high - origin, strict=True))

@@ -114,7 +114,7 @@ class Engine:
                     [o.plans[0] for o in ops],
                     dtype=self.dtype,
                     device=self.device,
-                    shift=np.concatenate([o.shift for o in ops]),
+                    shift=np.stack([o.shift for o in ops]),
                 )
             self.ops.append(op)
             self.data.append(put(np.stack([p.data[i] for p in problems])))
@@ -171,7 +171,7 @@ class Engine:
                     *geometry,
                     self.models[j],
                 ),
-                lambda op=op, j=j: op._forward(self.models[j], self.images[j]),
+                lambda op=op, j=j: op.forward_into(self.models[j], self.images[j]),
                 kernel(
                     "scene.cl",
                     "residual",
@@ -190,7 +190,7 @@ class Engine:
                     self.rows_loss,
                     self.rows_pull,
                 ),
-                lambda op=op, j=j: op._adjoint(self.images[j], self.models[j]),
+                lambda op=op, j=j: op.adjoint_into(self.images[j], self.models[j]),
                 kernel(
                     "scene.cl",
                     "gather_spectra",

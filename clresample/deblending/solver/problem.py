@@ -66,7 +66,8 @@ class Problem:
             self.fit_sky,
             self.n_steps,
             tuple(
-                (op.kind, op.plans[0].axes, op.shape_out) + _lines(op.plans[0]) for op in self.ops
+                (op.geometry, op.plans[0].axes, op.shape_out) + _lines(op.plans[0])
+                for op in self.ops
             ),
         )
 

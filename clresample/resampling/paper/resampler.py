@@ -7,26 +7,23 @@ import math
 import numpy as np
 
 from ...device.contraction import ImageBatch, Matrix
-from ...sky.grid import Grid
-from ...sky.psf import PSF
-from ..linop import LinOp
+from ..grid_operator import GridOperator
 from ..plan import count_bands
-from ..transfer import wrap_radius
+from ..transfer import Certificate, wrap_radius
 from .factors import Factors
-from .sincs import sinc_difference, sinc_table
+from .sincs import sinc_table, sinc_transfer
 from .tables import both_ways, trigonometric
 
 
-class PaperResampler(LinOp):
+class PaperResampler(GridOperator):
     """Resampling and PSF-difference convolution as one product of two factors, O(N^2 M^2).
 
         I2(i, l) = sum_u F^i(u) P^l(u)                X = i a + l b + t, the columns a, b of A
         F^i(u) = I1(i a + t - u),    P^l(u) = Pd(l b + u)
 
-    grid_in, grid_out (Grid): pixels of the model and of the observation
-    psf_in (1 or C bands), psf_out (1 or C bands): their PSFs, each in its own grid's pixels
-    dtype, device, shift, tolerance_px, the images, `covered` and `kind`: as for `Resampler`
-    report: as there; n_terms, the length of the sum over u; model_axis, the observed axis along i
+    grid_in, psf_in, grid_out, psf_out, dtype, device, shift, tolerance_px, and what can be read
+    back: see GridOperator
+    n_terms: length of the sum over u; model_axis: the observed axis along i, 0 (y) or 1 (x)
 
     P2 is interpolated to the model's grid by sincs (eq. `psf_interp`). These, and those of aligned
     grids, end at the padded grid's edge: the difference to `Resampler`, see docs/schemes.md.
@@ -35,81 +32,48 @@ class PaperResampler(LinOp):
     Source: eqs. `compact_sinc_sep`, `fast_reconvampling`, `rotation`, `psf_interp`.
     """
 
-    def __init__(
-        self,
-        grid_in: Grid,
-        psf_in: PSF,
-        grid_out: Grid,
-        psf_out: PSF,
-        *,
-        dtype=np.float32,
-        device=None,
-        shift=(0.0, 0.0),
-        tolerance_px=1e-4,
-    ):
-        mapping = grid_out.map_to(grid_in, tolerance_px=tolerance_px)
-        self._setup(mapping, psf_in, psf_out, dtype, device, shift)
-
-    @classmethod
-    def from_mapping(
-        cls, mapping, psf_in: PSF, psf_out: PSF, *, dtype=np.float32, device=None, shift=(0.0, 0.0)
-    ) -> PaperResampler:
-        """The operator of a mapping, observed pixels -> model pixels, instead of two grids."""
-        op = cls.__new__(cls)
-        op._setup(mapping, psf_in, psf_out, dtype, device, shift)
-        return op
-
-    def _setup(self, mapping, psf_in, psf_out, dtype, device, shift):
-        if mapping.kind == "distorted":
+    def _prepare(self, mapping, psf_in, psf_out, dtype, device):
+        """The transfer function, and the factors of the association that costs less."""
+        if mapping.geometry == "distorted":
             raise ValueError(
                 f"grid_out departs from an affine mapping by {mapping.departure_px:.2g} px of "
                 "grid_in, more than tolerance_px: the shifts need one matrix for all pixels, "
                 "Resampler does not"
             )
         n_bands = count_bands(mapping, psf_in, psf_out)
-        super().__init__(device, dtype, (n_bands, *mapping.shape_in), (n_bands, *mapping.shape_out))
-        self.kind, self.covered = mapping.kind, mapping.covered
+        self._begin(device, dtype, n_bands, [mapping])
         radius = wrap_radius(psf_out, mapping.matrix)
         # nothing wraps, the kernel lies in the grid whole, and K is odd
         n_fft = tuple(
             2 * math.ceil((max(n, r) + r - 1) / 2) + 1
             for n, r in zip(mapping.shape_in, radius, strict=True)
         )
-        d, self.report = sinc_difference(self.device, mapping.matrix, psf_in, psf_out, n_fft)
-        self._spectra = np.broadcast_to(d, (n_bands, *n_fft))
-        factors = AlignedFactors if self.kind == "aligned" else RotatedFactors
+        d, max_gain, floored_power = sinc_transfer(
+            self.device, mapping.matrix, psf_in, psf_out, n_fft
+        )
+        n_frequencies = tuple((k + 1) // 2 for k in n_fft)
+        self._certificates = [Certificate(radius, n_fft, n_frequencies, max_gain, floored_power)]
+        self._transfer = np.broadcast_to(d, (n_bands, *n_fft))
+        factors = AlignedFactors if self.geometry == "aligned" else RotatedFactors
         choices = [factors(self.device, self.dtype, mapping, n_fft, axis) for axis in (0, 1)]
         self._factors = min(choices, key=lambda choice: choice.cost)
         self._factors.prepare()
-        self.report |= {
-            "wrap_radius_px": radius,
-            "n_fft": n_fft,
-            "n_terms": self._factors.n_terms,
-            "model_axis": self._factors.axis,
-        }
-        self.shift = shift
+        self.n_terms, self.model_axis = self._factors.n_terms, self._factors.axis
 
-    @property
-    def shift(self):
-        """Offset (2,) [model px] by which every observed pixel is moved."""
-        return self._shift
-
-    @shift.setter
-    def shift(self, shift):
-        shift = np.asarray(shift, np.float64)
-        if shift.shape not in ((), (2,)) or not np.isfinite(shift).all():
-            raise ValueError(f"shift is {shift}, must be (2,) finite numbers")
-        self._shift = np.broadcast_to(shift, 2).copy()
-        self._shift.flags.writeable = False  # a change must come through this setter
-        self._factors.set_transfer(self._spectra, self._shift)
+    def _use_shift(self):
+        """Both factors' tables anew."""
+        self._factors.set_transfer(self._transfer, self._shift[0])
 
     def _forward(self, x, out):
+        """I2 of device arrays: x (B, C, Ny, Nx), out (B, C, My, Mx)."""
         self._run(self._factors.forward, x, out)
 
     def _adjoint(self, y, out):
+        """The transpose of device arrays: y (B, C, My, Mx), out (B, C, Ny, Nx)."""
         self._run(self._factors.adjoint, y, out)
 
     def _run(self, chain, source, target):
+        """Queue one way of the factors, `chain`, band by band on groups of items (B, C, Ny, Nx)."""
         batch, n_bands = source.shape[:2]
         group = min(self._factors.group, batch)
         self._factors.reserve(group)

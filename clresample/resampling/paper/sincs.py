@@ -1,4 +1,4 @@
-"""Sinc interpolation on the device, and the paper's difference kernel that is built with it."""
+"""Sinc interpolation on the device, and the paper's transfer function that is made with it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from ...device.contraction import Contraction, Matrix, padded
 from ...sky.psf import PSF
-from ..transfer import DIVISION_FLOOR
+from ..transfer import transfer_function
 
 # Positions at which a PSF is interpolated at once: three tables of 48 float64 each, 36 MiB.
 POSITIONS = 1 << 15
@@ -72,14 +72,15 @@ def interpolate_psf(device, matrix, psf: PSF, n_fft, fine=1):
     return result.reshape(-1, *(fine * k for k in n_fft))
 
 
-def sinc_difference(device, matrix, psf_in: PSF, psf_out: PSF, n_fft):
-    """D = F[P2i] conj(F[P1]) / max(|F[P1]|, DIVISION_FLOOR)^2 in FFT order, and a report.
+def sinc_transfer(device, matrix, psf_in: PSF, psf_out: PSF, n_fft):
+    """D = F[P2i] / F[P1] in FFT order, floored as `transfer_function` does it.
 
     The transform of the sincs is a rectangle: D is 0 beyond the observed PSF's band, where only the
     sincs' cut at the padded grid's edge would be divided by a vanishing F[P1]. Where that band
     reaches past the model's Nyquist frequency, P2i is taken on a finer grid and does not fold back.
 
-    returns D (C, Ky, Kx) complex; max_gain, floored_power (C,) as in spectrum.Plan
+    matrix (2, 2): A; n_fft (2,) [model px]: K
+    returns D (C, Ky, Kx) complex; max_gain, floored_power (C,) as in Certificate
     """
     reach = 0.5 / psf_out.spacing * np.abs(np.linalg.inv(matrix)).sum(axis=0).max()
     fine = max(1, math.ceil(reach + 0.5 - BAND_SLACK))
@@ -89,10 +90,6 @@ def sinc_difference(device, matrix, psf_in: PSF, psf_out: PSF, n_fft):
     nu = [i / k for i, k in zip(index, n_fft, strict=True)]
     f = np.abs(np.tensordot(matrix.T, np.stack(np.meshgrid(*nu, indexing="ij")), 1)).max(axis=0)
     p2 = np.where(f <= (1 + BAND_SLACK) / (2 * psf_out.spacing), p2, 0)
-    p1 = psf_in.spectrum(*nu)  # P1 is sampled on the model's pixels: this is its FFT
-    size = np.abs(p1)
-    d = p2 * p1.conj() / np.maximum(size, DIVISION_FLOOR) ** 2
-    power = np.abs(p2) ** 2
-    floored = (power * (size < DIVISION_FLOOR)).sum(axis=(1, 2)) / power.sum(axis=(1, 2))
-    gain = np.abs(d).max(axis=(1, 2)) / abs(np.linalg.det(matrix))
-    return d, {"max_gain": gain, "floored_power": floored}
+    # P1 is sampled on the model's pixels, so that its OTF is its FFT; P2i has the factor |det A|
+    d, gain, floored_power = transfer_function(psf_in.otf(*nu), p2)
+    return d, gain / abs(np.linalg.det(matrix)), floored_power

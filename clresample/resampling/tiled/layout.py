@@ -7,15 +7,17 @@ from itertools import product
 
 import numpy as np
 
-from ..sky.extent import intersection
-from ..sky.grid import Grid
-from ..sky.mapping import Mapping
-from ..sky.psf import PSF
-from .plan import Precision, make_plan
-from .transfer import wrap_radius
+from ...sky.extent import intersection
+from ...sky.grid import Grid
+from ...sky.mapping import Mapping
+from ...sky.psf import PSF
+from ..plan import Precision, make_plan
+from ..transfer import wrap_radius
 
-KINDS = ("aligned", "affine", "distorted")  # from the cheapest on
-TRIAL_PX = 32  # [observed px] side of the tile that shows which frequencies the band holds
+GEOMETRIES = ("aligned", "affine", "distorted")  # from the cheapest on
+# [observed px] side of the tile that shows which frequencies the band holds: a larger one knows the
+# band's edge, one frequency in a hundred here, better, and takes longer
+TRIAL_PX = 32
 # A window reaches half the wrap radius beyond its tile at full weight, then falls to zero over the
 # other half, or over TAPER_PX [model px]: cut sharply, an image rings through the tile.
 FLAT, TAPER_PX = 0.5, 24
@@ -79,18 +81,18 @@ def make_groups(
     radius = np.array(wrap_radius(psf_out, trial.matrix))
     margin = np.ceil(radius * FLAT + np.maximum(radius * (1 - FLAT), TAPER_PX)).astype(int)
     sizes = Sizes(trial, margin, psf_in, psf_out, precision)
-    kind = trial.kind
+    geometry = trial.geometry
     while True:
-        shape = sizes.choose(kind, region.shape, memory)
-        worst, tiles = _lay(region, grid_in, shape, kind, tolerance_px)
-        if worst == kind:
+        shape = sizes.choose(geometry, region.shape, memory)
+        worst, tiles = _lay(region, grid_in, shape, geometry, tolerance_px)
+        if worst == geometry:
             break
-        kind = worst  # which deserves another size
-    groups = []
+        geometry = worst  # its tiles cost more, so that another size is the quickest
+    groups: list[Group] = []
     for start, mapping, mask in tiles:
         group, place = _find(groups, mapping, margin, margin - radius * FLAT, tolerance_px)
-        origin = tuple(int(a + b) for a, b in zip(corner, start, strict=True))
-        group.tiles.append(Tile(origin, place, mask))
+        y, x = (int(a + b) for a, b in zip(corner, start, strict=True))
+        group.tiles.append(Tile((y, x), place, mask))
     if not groups:
         raise ValueError(
             f"grids do not overlap: no pixel of the observation {grid_out.shape} lies on the model "
@@ -102,59 +104,63 @@ def make_groups(
 class Sizes:
     """What tiles of any size cost, from one small plan.
 
+    Small tiles spend their time on the margins of their windows, large ones on matrix products that
+    grow as the cube of a side, and no larger one may exceed the memory. Which size is the quickest
+    depends on both pixel scales, both PSFs and the geometry: tens to hundreds of pixels.
+
     trial: mapping of a small tile; margin (2,) [model px] of every window
     """
 
     def __init__(self, trial: Mapping, margin, psf_in: PSF, psf_out: PSF, precision: Precision):
-        kind = "affine" if trial.kind == "distorted" else trial.kind
-        window = window_of(replace(trial, kind=kind, positions=None, area=None), margin)
+        geometry = "affine" if trial.geometry == "distorted" else trial.geometry
+        window = window_of(replace(trial, geometry=geometry, positions=None, area=None), margin)
         plan = make_plan(window, psf_in, psf_out, precision=precision)
-        n_fft = plan.report["n_fft"]
+        n_fft = plan.certificate.n_fft
         self.n_bands, self.itemsize = plan.n_bands, 4 if precision == Precision.of("f4") else 8
         self.scale = np.abs(trial.matrix).sum(axis=1).max()
         self.border = 2 * int(margin.max()) + 2
         self.pad = max(k - n for k, n in zip(n_fft, window.shape_in, strict=True))
         # the band's edge, known to one frequency of the small plan
-        n_frequencies = plan.report["n_frequencies"]
+        n_frequencies = plan.certificate.n_frequencies
         self.band = max((h + 1) / k for h, k in zip(n_frequencies, n_fft, strict=True))
         self.columns, self.taps, self.taps_back = 0.0, 0, 0
-        if kind == "affine":
+        if plan.lines is not None:
             self.taps, self.taps_back = plan.lines.weight.shape[1], plan.lines.weight_t.shape[1]
             reach = np.abs(trial.matrix) @ np.subtract(trial.shape_out, 1)
             self.columns = (plan.out_x.shape[1] - self.taps) / max(reach.min(), 1)
 
-    def cost(self, kind, m):
-        """Arithmetic [flops] of a tile of m x m observed pixels, and device memory [bytes]."""
+    def cost(self, geometry, m):
+        """Time [flops] of a tile of m x m observed pixels, and its device memory [bytes]."""
         n = int(np.ceil(self.scale * (m - 1))) + self.border
         k = 2 * (int(self.band * (n + self.pad)) + 1)
         wide = k + 16  # rows are padded
         flops = n * n * k + n * k * k
         tables = 4 * n * wide
-        spectra = wide * (max(n, m) + k) + k * k
-        if kind == "aligned":
+        frequencies = wide * (max(n, m) + k) + k * k
+        if geometry == "aligned":
             flops += m * k * k + m * m * k
             tables += 4 * m * wide
-        elif kind == "affine":
+        elif geometry == "affine":
             j = int(self.columns * self.scale * m) + self.taps + 16
             flops += k * k * j + m * k * j + m * m * self.taps
             tables += 2 * m * k + 4 * j * wide
             tables += m * (m * (self.taps + 1) + j * (self.taps_back + 2))
-            spectra += (k + m) * j
+            frequencies += (k + m) * j
         else:
             flops += m * m * k * (k + 1)
             tables += 3 * m * m * wide
-            spectra += m * m * wide
+            frequencies += m * m * wide
         images = 2 * (n * n + m * m)  # both ways
         time = 2 * self.n_bands * flops + FLOPS_TILE + FLOPS_PIXEL * self.n_bands * (n * n + m * m)
-        return time, self.itemsize * (tables + self.n_bands * (spectra + images))
+        return time, self.itemsize * (tables + self.n_bands * (frequencies + images))
 
-    def choose(self, kind, shape, memory):
+    def choose(self, geometry, shape, memory):
         """Tile shape (My, Mx) [observed px] of the quickest frame of this shape within `memory`."""
         best = None
         for side in SIDES:
             counts = [-(-n // side) for n in shape]
             tile = tuple(-(-n // count) for n, count in zip(shape, counts, strict=True))
-            time, n_bytes = self.cost(kind, max(tile))
+            time, n_bytes = self.cost(geometry, max(tile))
             if n_bytes > memory:
                 break
             if best is None or counts[0] * counts[1] * time < best[0]:
@@ -178,8 +184,11 @@ def window_of(mapping: Mapping, margin) -> Mapping:
     return replace(mapping, shape_in=tuple(int(n) for n in shape), offset=offset)
 
 
-def _lay(region, grid_in, shape, kind, tolerance_px):
-    """Kind of a region's tiles; unless it is worse than `kind`: their starts, mappings, masks."""
+def _lay(region, grid_in, shape, geometry, tolerance_px):
+    """The geometry that a region's tiles need; where none needs more than `geometry`: the tiles.
+
+    returns one of GEOMETRIES, and for each tile its first pixel, mapping and mask
+    """
     tiles = []
     for first in product(*(range(0, n, m) for n, m in zip(region.shape, shape, strict=True))):
         # the last tiles of a row or column overlap those before
@@ -189,16 +198,16 @@ def _lay(region, grid_in, shape, kind, tolerance_px):
         mask[: first[0] - start[0]] = False
         mask[:, : first[1] - start[1]] = False
         if mask.any():
-            if KINDS.index(mapping.kind) > KINDS.index(kind):
-                return mapping.kind, []
+            if GEOMETRIES.index(mapping.geometry) > GEOMETRIES.index(geometry):
+                return mapping.geometry, []
             tiles.append((start, mapping, mask))
-    return kind, tiles
+    return geometry, tiles
 
 
 def _find(groups, mapping, margin, width, tolerance_px):
     """The first group whose operator serves a tile, or a new one; and the tile's place in it."""
     middle = np.subtract(mapping.shape_out, 1) / 2
-    if mapping.kind == "distorted":
+    if mapping.geometry == "distorted":
         inside = mapping.positions[mapping.covered]
         low = np.floor(inside.min(axis=0)).astype(int) - margin
         shape = np.ceil(inside.max(axis=0)).astype(int) + margin - low + 1
@@ -206,7 +215,7 @@ def _find(groups, mapping, margin, width, tolerance_px):
         groups.append(Group(window, _taper(window.shape_in, width), []))
         return groups[-1], low.astype(float)
     for group in groups:
-        if group.mapping.kind != mapping.kind:
+        if group.mapping.geometry != mapping.geometry:
             continue
         turn = mapping.matrix - group.mapping.matrix
         moved = max(np.hypot(*(turn @ (middle * corner))) for corner in ((1, 1), (1, -1)))

@@ -1,0 +1,132 @@
+"""What all operators from one pixel grid to another have: mapping, coverage, shift, certificate."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..sky.grid import Grid
+from ..sky.mapping import Mapping
+from ..sky.psf import PSF
+from .linop import LinOp
+from .transfer import Certificate
+
+
+class GridOperator(LinOp):
+    """A linear operator from images on one pixel grid to images on another.
+
+    grid_in, grid_out (Grid): pixels of the model and of the observation
+    psf_in (1 or C bands), psf_out (1 or C bands): their PSFs, each in its own grid's pixels
+    dtype: float32, or float64 where the device has it
+    device: as `get_device` takes it; None = the default one
+    shift (2,) [model px]: moves every observed pixel; may be set again at any time
+    tolerance_px [model px]: departures up to this count as none when the geometry is chosen
+
+    Images are flux per pixel, (C, Ny, Nx) or (B, C, Ny, Nx). Observed pixels whose centre the
+    model does not cover come out as 0.
+
+    An operator whose items have a geometry each (`Resampler.from_plans`) gives `mapping` and
+    `certificate` as lists, `covered` as (n, My, Mx) and `shift` as (n, 2); all others one of each.
+
+    Raises ValueError for grids that do not overlap and for band counts that do not match.
+    Subclasses implement `_prepare` and `_use_shift`, beside `_forward` and `_adjoint`.
+    """
+
+    _n_geometries = 1
+    _mappings: list[Mapping]
+    _certificates: list[Certificate]
+
+    def __init__(
+        self,
+        grid_in: Grid,
+        psf_in: PSF,
+        grid_out: Grid,
+        psf_out: PSF,
+        *,
+        dtype=np.float32,
+        device=None,
+        shift=(0.0, 0.0),
+        tolerance_px=1e-4,
+    ):
+        mapping = grid_out.map_to(grid_in, tolerance_px=tolerance_px)
+        self._prepare(mapping, psf_in, psf_out, dtype, device)
+        self.shift = shift
+
+    @classmethod
+    def from_mapping(
+        cls,
+        mapping: Mapping,
+        psf_in: PSF,
+        psf_out: PSF,
+        *,
+        dtype=np.float32,
+        device=None,
+        shift=(0.0, 0.0),
+    ):
+        """The operator of a mapping, observed pixels -> model pixels, instead of two grids."""
+        op = cls.__new__(cls)
+        op._prepare(mapping, psf_in, psf_out, dtype, device)
+        op.shift = shift
+        return op
+
+    def _prepare(self, mapping, psf_in, psf_out, dtype, device):
+        """Everything but the shift, from a mapping; calls `_begin` first."""
+        raise NotImplementedError
+
+    def _use_shift(self):
+        """Bring what the device holds in line with `_shift` (n, 2)."""
+        raise NotImplementedError
+
+    def _begin(self, device, dtype, n_bands, mappings):
+        """The operator's shapes, from a mapping for each geometry; all alike in their shapes.
+
+        Whoever calls it also sets `_certificates`, one for each of them.
+        """
+        shapes = ((n_bands, *shape) for shape in (mappings[0].shape_in, mappings[0].shape_out))
+        LinOp.__init__(self, device, dtype, *shapes)
+        self._mappings, self._n_geometries = list(mappings), len(mappings)
+
+    @property
+    def mapping(self) -> Mapping:
+        """Where the observed pixels lie in the model's."""
+        return _one_or_all(self._mappings)
+
+    @property
+    def geometry(self) -> str:
+        """The simplest that holds within tolerance_px: "aligned", "affine" or "distorted"."""
+        return self._mappings[0].geometry
+
+    @property
+    def covered(self) -> np.ndarray:
+        """Observed pixels (My, Mx) bool whose centre lies on the model."""
+        masks = [mapping.covered for mapping in self._mappings]
+        return masks[0] if len(masks) == 1 else np.stack(masks)
+
+    @property
+    def certificate(self) -> Certificate:
+        """What the set-up found of the transfer function and its kernel."""
+        return _one_or_all(self._certificates)
+
+    @property
+    def shift(self) -> np.ndarray:
+        """Offset (2,) [model px] by which every observed pixel is moved; read-only.
+
+        Set it to one number, (2,), or (n, 2) for n geometries. Raises ValueError for other shapes
+        and for numbers that are not finite.
+        """
+        return self._shift[0] if len(self._shift) == 1 else self._shift
+
+    @shift.setter
+    def shift(self, shift):
+        shift, expected = np.asarray(shift, np.float64), (self._n_geometries, 2)
+        if shift.shape not in ((), (2,), expected) or not np.isfinite(shift).all():
+            raise ValueError(
+                f"shift is {shift.tolist()}, must be (2,) or {expected} finite numbers"
+            )
+        self._shift = np.broadcast_to(shift, expected).copy()
+        self._shift.flags.writeable = False  # a change must come through this setter
+        self._use_shift()
+
+
+def _one_or_all(values):
+    """The only one of a list, or the list."""
+    return values[0] if len(values) == 1 else values

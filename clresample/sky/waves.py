@@ -1,0 +1,20 @@
+"""Angles and cos/sin tables of plane waves, as PSFs and operators need them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def phases(frequencies, positions):
+    """2 pi f u (F, U) [rad] for f (F,) [cycles/px], u (U,) [px], whole cycles taken off.
+
+    They go before the product with 2 pi, which would round as many digits away as they have.
+    """
+    cycles = np.multiply.outer(frequencies, positions)
+    cycles -= np.rint(cycles)
+    return 2 * np.pi * cycles
+
+
+def cos_sin_columns(angle):
+    """Tables of waves: cos and sin of the angles (..., H) [rad] in columns 2i, 2i+1: (..., 2H)."""
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1).reshape(*angle.shape[:-1], -1)

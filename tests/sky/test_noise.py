@@ -1,0 +1,77 @@
+"""The background's level and scatter, and what they make of sources, gaps and correlated noise."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from clresample.sky.noise import background, noise_sigma, sigma_below_zero
+
+# relative error of a MAD from n pixels of Gaussian noise, 1.17 / sqrt(2 n), at 5 sigma
+TOLERANCE = 5 * 1.17 / np.sqrt(2)
+
+
+def noise(shape, sigma=1.0, seed=0):
+    return np.random.default_rng(seed).normal(scale=sigma, size=shape)
+
+
+def test_noise_sigma_is_unbiased_for_white_noise():
+    # enough pixels to see the 0.4 % that cutting at 3 sigma takes from the MAD
+    image = noise((1600, 1600), 3.0)
+    assert noise_sigma(image) == pytest.approx(3.0, rel=TOLERANCE / 1600)
+
+
+@pytest.mark.parametrize(("share", "bias"), [(0.03, 0.02), (0.1, 0.03), (0.5, 0.3)])
+def test_noise_sigma_hardly_sees_sources(share, bias):
+    image = noise((300, 300)).ravel()
+    n = int(share * image.size)
+    image[:n] += np.random.default_rng(1).exponential(10.0, n)
+    image[:20] = 1e9
+    image[20:25] = np.nan
+    sigma = noise_sigma(image.reshape(300, 300))
+    assert 1 - 0.01 < sigma < 1 + bias
+    assert noise_sigma(-7 * image.reshape(300, 300) + 3) == pytest.approx(7 * sigma)
+
+
+def test_noise_that_cannot_be_estimated():
+    with pytest.raises(ValueError, match="31 pixels are left.*32 are needed"):
+        noise_sigma(noise((1, 31)))
+    padded = noise((40, 40))
+    padded[:21] = 0
+    with pytest.raises(ValueError, match="same value"):
+        noise_sigma(padded)
+
+
+def test_background_is_level_and_scatter():
+    image = 7.0 + noise((400, 400), 0.5)
+    image[:40] += 100  # a tenth is light
+    image[40, :20] = np.nan
+    level, sigma = background(image)
+    assert level == pytest.approx(7, abs=0.02) and sigma == pytest.approx(0.5, rel=0.03)
+    assert sigma == noise_sigma(image)
+    masked = background(image, np.arange(400)[:, None] * np.ones(400) < 40)
+    # without the light, the error of a median and of a MAD from 144 000 pixels
+    np.testing.assert_allclose(masked, (7, 0.5), atol=0.5 * TOLERANCE / 380)
+
+
+def test_background_of_what_has_none():
+    assert background(np.full((5, 5), 3.0)) == (3.0, 0.0)
+    assert background(np.array([[1.0, np.nan], [np.inf, 1.0]])) == (1.0, 0.0)
+    image = np.zeros((40, 40))
+    image[:10] = 5
+    assert background(image) == (0.0, 0.0)
+
+
+def test_the_scatter_below_zero_knows_nothing_of_sources():
+    image = noise((300, 300), 2.0)
+    assert sigma_below_zero(image) == pytest.approx(2, rel=TOLERANCE * np.sqrt(2) / 300)
+    bright = image.copy()
+    # two thirds are source, of all brightnesses
+    bright[:200] = np.abs(bright[:200]) + np.random.default_rng(1).exponential(50, (200, 300))
+    assert sigma_below_zero(bright) == pytest.approx(2, rel=0.03)
+    assert noise_sigma(bright) > 1.2 * sigma_below_zero(bright)  # which is why it is there
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert sigma_below_zero(np.abs(image)) is None
+        assert sigma_below_zero(-np.abs(image[:1, :31])) is None
+    assert sigma_below_zero(-np.abs(image[:1, :32])) > 0
