@@ -14,7 +14,7 @@ __version__ = "0.1.0"
 
 # Each room's public names and the module that defines them; imported when first used, so that the
 # command line answers at once and no OpenCL driver is touched before it is needed.
-_ROOMS = {
+_ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
     # the sky: pixels, PSFs, images, sources
     "sky": {
         "grid": ("Grid",),

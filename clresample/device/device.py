@@ -181,7 +181,7 @@ def _buffer_type():
     return Buffer
 
 
-def get_device(choice=None):
+def get_device(choice=None) -> Device:
     """The chosen device; asked twice it is the same object.
 
     choice: None, a Device, an index, "platform:device" (each an index or part of a name), or part

@@ -32,6 +32,8 @@ class Executor:
     Subclasses: n_rows (rows of Sy), scratch_shapes, bind, forward, adjoint
     """
 
+    n_rows: int
+
     def __init__(self, device, dtype, plans):
         self.device, self.dtype, self.plans = device, dtype, plans
         self.tuning = Tuning.of(device, dtype)

@@ -10,6 +10,8 @@ grid has pixels; it is worked off in slabs, so that a slab of F is read back fro
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from ...device.contraction import Contraction, ImageBatch, Matrix, padded
 from ...device.tuning import Tuning
 from .launches import Pixels, Shifts, SlabLaunches
@@ -29,6 +31,10 @@ class Factors:
         synthesise between the model I1 and its frequencies: scratch "frequencies", or "half"
         where z_rows is 0
     """
+
+    name: str
+    analyse: Callable[[ImageBatch, int], None]
+    synthesise: Callable[[ImageBatch, int], None]
 
     def __init__(self, device, dtype, mapping, n_fft, axis):
         self.device, self.dtype, self.mapping = device, dtype, mapping
