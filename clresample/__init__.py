@@ -35,7 +35,7 @@ _ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
         "blend": ("Blend", "Failure"),
         "settings": ("Settings",),
         "solver.prior": ("Prior",),
-        "solver.problem": ("StepSizes",),
+        "solver.amsgrad": ("StepSizes",),
         "image_profiles": ("with_image_profiles",),
         "result": ("Result",),
     },
@@ -74,8 +74,8 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from .deblending.image_profiles import with_image_profiles as with_image_profiles
     from .deblending.result import Result as Result
     from .deblending.settings import Settings as Settings
+    from .deblending.solver.amsgrad import StepSizes as StepSizes
     from .deblending.solver.prior import Prior as Prior
-    from .deblending.solver.problem import StepSizes as StepSizes
     from .device.device import Device as Device, get_device as get_device
     from .device.discovery import DeviceError as DeviceError, list_devices as list_devices
     from .files.results import (

@@ -6,6 +6,7 @@ import argparse
 import os
 import threading
 import time
+import warnings
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -188,15 +189,20 @@ def _deblend(arguments, what, observations, sources, settings, given):
     from tqdm import tqdm
 
     from ..deblending.batch import deblend
+    from ..sky.sources import SourceWarning
 
     # disable=None: no bar where standard error is no terminal
-    with tqdm(
-        total=settings.max_iter,
-        desc=what,
-        unit="it",
-        leave=False,
-        disable=True if arguments.quiet else None,
-    ) as bar:
+    with (
+        warnings.catch_warnings(),
+        tqdm(
+            total=settings.max_iter,
+            desc=what,
+            unit="it",
+            leave=False,
+            disable=True if arguments.quiet else None,
+        ) as bar,
+    ):
+        warnings.simplefilter("ignore", SourceWarning)  # the result's messages are printed
 
         def progress(n_steps, losses):
             bar.update(n_steps - bar.n)

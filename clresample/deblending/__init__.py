@@ -1,5 +1,6 @@
 """Blends to results: a scene of sources fitted to all instruments' images at once.
 
-From `batch.deblend` a blend goes through a Fit (views of its observations, starting profiles, the
-iterations of `solver`) to a Result. Imports `resampling`, `device` and `sky`.
+`batch.deblend` makes a Fit of a Blend: its observations become WhitenedViews (view.py), its sources
+start from smooth profiles (start.py), `iterate` runs the iterations of the room `solver/`, and the
+Fit returns a Result. Imports `resampling`, `device` and `sky`.
 """

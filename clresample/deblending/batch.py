@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
+import warnings
 from collections import defaultdict
 
 import numpy as np
 
 from ..device.device import get_device
 from ..device.discovery import DeviceError
+from ..device.tuning import Tuning
+from ..sky.sources import SourceWarning
 from .blend import INTERRUPTED, Blend, Failure
 from .fit import Fit
 from .iterate import iterate
 from .result import Result
 from .settings import Settings
 
-# Ragged batches: frames and observations are padded to multiples of this [px].
+# [px] Blends of several sizes have their frames and observations padded to multiples of this, so
+# that they share batches: smaller ones make more batches, larger ones more padding to compute.
 PAD_PX = 16
-# Device memory of one group of scenes [bytes], unless told otherwise.
+# [bytes] Device memory of the scenes of one batch, by default.
 MEMORY = 1 << 30
 # What can go wrong with one blend and is no reason to give up the others.
 ERRORS = (ValueError, ArithmeticError, DeviceError, MemoryError, np.linalg.LinAlgError)
-# Scenes fitted side by side: enough to hide the launches, few enough for a CPU's cache.
-SCENES = {"CPU": 32}
-SCENES_ELSEWHERE = 1024
 
 
 def deblend(
@@ -43,14 +45,17 @@ def deblend(
     observations, sources, frame, shifts: see Blend; settings: see Settings
     progress: called every few iterations with their number so far and the loss (1,)
     raises ValueError for what `check_observations`, `model_frame` and `Source` refuse, and when no
-    source lies inside the frame. Ctrl-C ends the fit with the best state so far.
+    source lies inside the frame. Warns (SourceWarning) of sources far from any light. Ctrl-C ends
+    the fit with the best state so far.
     """
     blend = Blend(tuple(observations), tuple(sources), frame, shifts)
     settings = settings or Settings()
     device = get_device(device)
     fit = Fit(blend, settings, device, dtype, pad=1)
-    (done,) = iterate([fit], settings, device, dtype, progress)
-    return done.result()
+    if len(fit.dark):
+        _warn_dark([fit.dark], "")
+    iterate([fit], settings, device, dtype, progress)
+    return fit.result()
 
 
 def deblend_many(
@@ -64,69 +69,98 @@ def deblend_many(
     returns a Result for each blend, in their order, or a Failure: it does not harm the others.
         Ctrl-C ends the fits of the group that runs with the best state so far; what was done before
         comes back, and Failures with the status "interrupted" for the rest
+    Warns once (SourceWarning) of all sources far from any light; results' messages name them.
     """
-    settings, device = settings or Settings(), get_device(device)
-    blends = list(blends)
-    out: list[Result | Failure | None] = [None] * len(blends)
-    pad = PAD_PX if len({_sizes(b) for b in blends}) > 1 else 1
-    limit = SCENES.get(device.kind, SCENES_ELSEWHERE)
-    waiting = defaultdict(list)
-    n_done = 0
-
-    def count(n):
-        nonlocal n_done
-        n_done += n
-        if progress is not None:
-            progress(n_done)
-
-    def run(group):
-        for i, done in _try(group, settings, device, dtype):
-            out[i] = done
-        count(len(group))
-        if any(fit.status == INTERRUPTED for _, fit in group):
-            raise KeyboardInterrupt
-
-    try:
-        for i, blend in enumerate(blends):
-            try:
-                fit = Fit(blend, settings, device, dtype, pad=pad)
-            except ERRORS as error:
-                out[i] = Failure(blend, f"failed: {error}")
-                count(1)
-                continue
-            group = waiting[fit.problem.signature]
-            group.append((i, fit))
-            if len(group) >= limit or sum(f.bytes for _, f in group) + fit.bytes > memory:
-                run(waiting.pop(fit.problem.signature))
-        while waiting:
-            run(waiting.popitem()[1])
-    except KeyboardInterrupt:
-        pass  # those without a result are told so
+    many = _ManyFits(list(blends), settings or Settings(), get_device(device), dtype, memory)
+    with contextlib.suppress(KeyboardInterrupt):  # the results of what was not done say so
+        many.run(progress or (lambda n_done: None))
+    if many.dark:
+        _warn_dark(many.dark, " of blends that were fitted together")
     return [
         Failure(blend, INTERRUPTED) if done is None else done
-        for blend, done in zip(blends, out, strict=True)
+        for blend, done in zip(many.blends, many.done, strict=True)
     ]
 
 
-def _try(group, settings, device, dtype):
-    """Yield (index, Result or Failure) of a group of fits; one by one where all at once fails."""
-    try:
-        iterate([fit for _, fit in group], settings, device, dtype)
-    except ERRORS as error:
-        if len(group) == 1:
-            yield group[0][0], Failure(group[0][1].blend, f"failed: {error}")
-            return
-        for item in group:
-            yield from _try([item], settings, device, dtype)
-            if item[1].status == INTERRUPTED:
-                return
-        return
-    for i, fit in group:
+class _ManyFits:
+    """Blends on their way through groups of fits that share a batch.
+
+    done: for each blend its Result or Failure, None before that
+    dark: indices of sources far from any light, an array for each blend that has some
+    """
+
+    def __init__(self, blends, settings, device, dtype, memory):
+        self.blends, self.settings, self.device, self.dtype = blends, settings, device, dtype
+        self.memory, self.n_most = memory, Tuning.of(device, dtype).n_scenes
+        self.done: list[Result | Failure | None] = [None] * len(blends)
+        self.dark = []
+
+    def run(self, progress):
+        """Fit them all; raises KeyboardInterrupt when the group that runs was interrupted."""
+        waiting, n_done = defaultdict(list), 0
+        for n in self._groups_done(waiting):
+            n_done += n
+            progress(n_done)
+
+    def _groups_done(self, waiting):
+        """Fit group after group as they fill up; yields how many blends that has done."""
+        pad = PAD_PX if len({_sizes(b) for b in self.blends}) > 1 else 1
+        for i, blend in enumerate(self.blends):
+            try:
+                fit = Fit(blend, self.settings, self.device, self.dtype, pad=pad)
+            except ERRORS as error:
+                self.done[i] = Failure(blend, f"failed: {error}")
+                yield 1
+                continue
+            if len(fit.dark):
+                self.dark.append(fit.dark)
+            group = waiting[fit.scene.signature]
+            group.append((i, fit))
+            full = sum(f.scene.n_bytes for _, f in group) + fit.scene.n_bytes > self.memory
+            if full or len(group) >= self.n_most:
+                yield from self._fit(waiting.pop(fit.scene.signature))
+        while waiting:
+            yield from self._fit(waiting.popitem()[1])
+
+    def _fit(self, group):
+        """Fit a group, a list of (index, Fit); yields its length."""
+        for i, done in self._try(group):
+            self.done[i] = done
+        yield len(group)
+        if any(fit.status == INTERRUPTED for _, fit in group):
+            raise KeyboardInterrupt
+
+    def _try(self, group):
+        """Yield (index, Result or Failure) of a group; one by one where all at once fails."""
         try:
-            yield i, fit.result()
+            iterate([fit for _, fit in group], self.settings, self.device, self.dtype)
         except ERRORS as error:
-            yield i, Failure(fit.blend, f"failed: {error}")
+            if len(group) == 1:
+                yield group[0][0], Failure(group[0][1].blend, f"failed: {error}")
+                return
+            for item in group:
+                yield from self._try([item])
+                if item[1].status == INTERRUPTED:
+                    return
+            return
+        for i, fit in group:
+            try:
+                yield i, fit.result()
+            except ERRORS as error:
+                yield i, Failure(fit.blend, f"failed: {error}")
 
 
 def _sizes(blend):
+    """The shapes of a blend's images and of its frame."""
     return tuple(o.data.shape for o in blend.observations), blend.frame and blend.frame.shape
+
+
+def _warn_dark(dark, where):
+    """Warn the caller of `deblend` or `deblend_many` of sources far from any light."""
+    n = sum(map(len, dark))
+    warnings.warn(
+        f"{n} source{'s lie' if n > 1 else ' lies'} far from any light{where}: see the messages of "
+        "the result",
+        SourceWarning,
+        stacklevel=3,
+    )

@@ -1,4 +1,4 @@
-"""One patch of sky to deblend, and what stands for it where that failed."""
+"""One patch of sky to deblend (Blend), and what a batch returns where that failed (Failure)."""
 
 from __future__ import annotations
 
@@ -21,13 +21,25 @@ class Blend:
     observations: at least one Observation; sources: Point and Extended
     frame: the model's Frame; None = `model_frame` of the observations
     shifts (n_observations, 2) [model px]: of the observations' pixels, where known; a fit of shifts
-        starts from them. What moved by more than a pixel is best fitted again from there
+        starts from them. Where a fit finds a shift of more than a pixel, a second one that starts
+        from it finds the rest: the first one's profiles came from images that disagreed
     """
 
     observations: tuple[Observation, ...]
     sources: tuple[Source, ...]
     frame: Frame | None = None
     shifts: np.ndarray | None = None
+
+    def known_shifts(self) -> np.ndarray:
+        """Shifts (n_observations, 2) [model px], 0 where none are given.
+
+        ValueError: they are not as many, or not finite.
+        """
+        expected = len(self.observations), 2
+        shifts = np.zeros(expected) if self.shifts is None else np.asarray(self.shifts, float)
+        if shifts.shape != expected or not np.isfinite(shifts).all():
+            raise ValueError(f"shifts is {shifts.tolist()}, must be {expected} finite numbers")
+        return shifts
 
 
 @dataclass(frozen=True)

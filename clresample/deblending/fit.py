@@ -1,39 +1,72 @@
-"""One blend on its way from data to result: views of its observations, start, problem, result."""
+"""One blend on its way from data to result: views of its observations, start, scene, result."""
 
 from __future__ import annotations
 
-import functools
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..resampling.transfer import noise_warnings
+from ..sky.extent import box_slices
 from ..sky.frame import Frame, model_frame
 from ..sky.observation import check_observations
 from ..sky.sources import Point
+from .blend import INTERRUPTED
 from .resize import box_around
 from .result import Component, Result
+from .shifts import shift_steps
 from .solver.curvature import damping
-from .solver.problem import Problem
+from .solver.scene import Scene, State
 from .spectra import solve_spectra
-from .start import start
-from .view import covered_part, pixel_noise, whitened_view
+from .start import LIGHT_SIGMAS, start
+from .view import whitened_view
 
-# Spectrum steps come in units of the flux's error plus this part of the flux.
+# A spectrum's step size counts in errors of the flux plus this part of the flux: bright sources,
+# whose errors are far smaller than what a changing morphology does to their flux, can follow it.
 SPECTRUM_PART = 0.02
+# Least power sum |u|^2 of a component's whitened image u in a channel, whose root is the inverse of
+# its spectrum's error; and the error from which on the channel holds nothing of the component, so
+# that its spectrum is not stepped there. A covered component has errors of 1e6 at most.
+LEAST_POWER, UNSEEN = 1e-30, 1e14
+# The stopping rule compares the best loss with the best one this many iterations ago: losses of
+# single iterations scatter, and a smaller number would take a pause for the end.
+PATIENCE = 15
+# A loss this many times the best one, or NaN, is a divergence.
+DIVERGED = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Best:
+    """The lowest loss so far, and what it belongs to."""
+
+    loss: float
+    scene: Scene | None
+    state: State | None
+    shifts: np.ndarray
 
 
 class Fit:
-    """One blend on its way from data to result."""
+    """One blend on its way from data to result.
+
+    blend, settings, frame: what is fitted, how, and on which Frame
+    sources: the blend's, with positions in the frame's pixels where an observation's were given
+    fitted (n,): indices of those inside the frame; dark (n_dark,): of those far from any light
+    views: the observations as WhitenedViews, whose operators hold the observations' shifts
+    start, profiles (n, Ny, Nx): the StartingPoint, and its profiles over the frame with max = 1
+    noise (C,): of one model pixel, in the views' units; unit (C,) [counts]: of these
+    scene, state: Scene and State, as of the start or of where `settle` left them
+    losses, status, messages, seconds: see Result
+    """
 
     def __init__(self, blend, settings, device, dtype, *, pad):
         began = time.perf_counter()
         self.blend, self.settings = blend, settings
-        check_observations(blend.observations)
-        self.frame = blend.frame or model_frame(blend.observations)
-        _check_profiles(blend.sources, self.frame)
-        positions = self.frame.place(blend.sources)
+        self.frame = _frame_of(blend)
+        shifts = blend.known_shifts()
+        positions = self.frame.place(blend.sources, blend.observations, shifts)
+        pairs = zip(blend.sources, positions, strict=True)
+        self.sources = tuple(source.on_frame(position) for source, position in pairs)
         inside = self.frame.inside(positions)
         self.messages = [
             f"source {i} at {p} [px] lies outside the model frame {self.frame.shape}"
@@ -46,105 +79,108 @@ class Fit:
                 f"none of the {len(positions)} sources lies inside the model frame "
                 f"{self.frame.shape}"
             )
-        self.shifts = _shifts(blend)
-        private = settings.fit_shifts or self.shifts.any()
-        self.padded = _padded_frame(self.frame, pad)
-        self.views, self.units = [], []
-        for o in blend.observations:
-            view, unit = whitened_view(
-                self.frame, self.padded, o, pad, device, dtype, private=private
-            )
-            if private:
-                view.op.shift = self.shifts[len(self.views)]
-            self.views.append(view)
-            self.units.append(unit)
+        padded, private = _padded_frame(self.frame, pad), settings.fit_shifts or shifts.any()
+        self.views = [
+            whitened_view(self.frame, padded, o, pad, device, dtype, private=private)
+            for o in blend.observations
+        ]
+        if private:
+            self._shift(shifts)
         for o, view in zip(blend.observations, self.views, strict=True):
             self.messages += [f"{o.label}: {line}" for line in noise_warnings(view.op.certificate)]
         if not any(view.root.any() for view in self.views):
             raise ValueError("no observed pixel on the model frame has a weight")
-        self.unit = np.concatenate(self.units)
-        self.losses, self.status = [], "iteration limit"
-        self.best = np.inf, None, self.shifts  # the lowest loss, its Problem and shifts
-        sources = [blend.sources[i] for i in self.fitted]
+        self.unit = np.concatenate([view.unit for view in self.views])
+        sources = [self.sources[i] for i in self.fitted]
         self.start = start(
             self.frame, sources, positions[inside], self.views, fit_sky=settings.fit_sky
         )
-        self.problem = self._problem(sources)
+        self.dark = self.fitted[self.start.dark]
+        self.messages += [_dark_message(i, positions[i]) for i in self.dark]
+        self.profiles = _peak_of_one(self.start.profiles)
+        self.noise = np.concatenate([view.pixel_noise for view in self.views])
+        self.scene, self.state = _start_scene(self, padded.shape)
+        self.losses, self.status = [], "iteration limit"
+        self._best = _Best(np.inf, None, None, self.shifts)
         self.seconds = {"setup": time.perf_counter() - began}
 
-    def _problem(self, sources):
-        begin, views = self.start, self.views
-        peak = begin.base.max(axis=(1, 2), keepdims=True)
-        self.base = base = begin.base / np.where(peak > 0, peak, 1)
-        self.noise = pixel_noise(views)
-        units = [v.render(base) for v in views]
-        spectra, sky, _ = solve_spectra(units, views, self.settings.fit_sky)
-        noise = 1 / np.sqrt(
-            np.maximum(np.concatenate([(u**2).sum(axis=2) for u in units], axis=1), 1e-30)
-        )
-        origin, center, morphs = [], [], []
-        for i, image in enumerate(base):
-            brightness = (spectra[i] / self.noise).max()
-            low, size, middle = box_around(image, begin.positions[begin.source[i]], brightness)
-            origin.append(low)
-            center.append(middle)
-            morphs.append(image[low[0] : low[0] + size[0], low[1] : low[1] + size[1]].copy())
-        seen = noise < 1e14
-        problem = Problem(
-            shape=self.padded.shape,
-            extent=self.frame.shape,
-            ops=[v.op for v in views],
-            data=[v.data for v in views],
-            weights=[v.root**2 for v in views],
-            origin=np.array(origin),
-            center=np.array(center),
-            base=morphs,
-            field=[np.zeros_like(m) for m in morphs],
-            morph=[m.copy() for m in morphs],
-            fixed=np.array([isinstance(sources[i], Point) for i in begin.source]),
-            spectra=spectra,
-            scale=np.where(seen, noise + SPECTRUM_PART * spectra, 0),
-            sky=sky,
-            fit_sky=self.settings.fit_sky,
-        )
-        return replace(problem, damping=damping(problem, self.settings.prior))
+    @property
+    def shifts(self) -> np.ndarray:
+        """Present shifts (n_observations, 2) [model px] of the observations' pixels."""
+        return np.array([view.op.shift for view in self.views])
 
-    @functools.cached_property
-    def bytes(self):
-        """Device memory of the scene in a batch, roughly."""
-        pixels = sum(2 * np.prod(o.shape_in) + 4 * np.prod(o.shape_out) for o in self.problem.ops)
-        return int(8 * (pixels + 12 * sum(m.size for m in self.problem.morph)))
+    def _shift(self, shifts):
+        """Move the observations' pixels to these shifts."""
+        for view, shift in zip(self.views, shifts, strict=True):
+            view.op.shift = shift
+
+    def move(self, scene, state):
+        """Shift the observations to where the model, as it is by now, fits each of them best."""
+        self._shift(self.shifts + shift_steps(scene, state))
+
+    def stopped(self, losses) -> bool:
+        """Take the losses (n,) of the last iterations; whether the fit ends here, and why."""
+        self.losses.extend(losses.tolist())
+        reason = stop_reason(self.losses, len(losses), self.settings.tol)
+        self.status = reason or self.status
+        return reason is not None
+
+    def interrupt(self):
+        """Note that the fit ends because the user wants it to."""
+        self.status = INTERRUPTED
+
+    def note_seconds(self, stage, seconds):
+        """Take down how long a stage has taken."""
+        self.seconds[stage] = seconds
+
+    def remember(self, loss, scene, state):
+        """Keep a state, at the present shifts, if its loss is the lowest so far."""
+        if loss < self._best.loss:
+            self._best = _Best(float(loss), scene, state, self.shifts)
+
+    def settle(self, loss, scene, state):
+        """End here, with the present state, or with the best one where that is better; the present
+        one, if it was interrupted, may be half-way through an iteration."""
+        best = self._best
+        if self.status != INTERRUPTED and loss <= best.loss:
+            self.scene, self.state = scene, state
+        elif best.state is not None:
+            loss, self.scene, self.state = best.loss, best.scene, best.state
+            if not np.array_equal(best.shifts, self.shifts):
+                self._shift(best.shifts)
+        else:
+            return
+        self.losses.append(float(loss))
 
     def result(self) -> Result:
         """Everything back in the data's own units, spectra solved for the final morphologies."""
-        began, p, n = time.perf_counter(), self.problem, len(self.problem.spectra)
-        morphs = np.zeros((n, *p.shape))
-        for full, (y, x), m in zip(morphs, p.origin, p.morph, strict=True):
-            peak = m.max() if m.max() > 0 else 1.0
-            full[y : y + m.shape[0], x : x + m.shape[1]] = m / peak
+        began, scene, n = time.perf_counter(), self.scene, len(self.state.spectra)
+        morphs = np.zeros((n, *scene.shape))
+        pairs = zip(scene.origin, self.state.morph, strict=True)
+        boxes = [box_slices(low, m.shape) for low, m in pairs]
+        for full, box, m in zip(morphs, boxes, self.state.morph, strict=True):
+            full[box] = m / (m.max() if m.max() > 0 else 1.0)
         observed = [v.observe(morphs) for v in self.views]
         units = [v.whiten(images) for v, images in zip(self.views, observed, strict=True)]
         spectra, sky, covariance = solve_spectra(units, self.views, self.settings.fit_sky)
-        components = []
-        for i, ((y, x), m) in enumerate(zip(p.origin, p.morph, strict=True)):
-            part = morphs[i, y : y + m.shape[0], x : x + m.shape[1]]
-            components.append(
-                Component(
-                    int(self.fitted[self.start.source[i]]),
-                    (int(y), int(x)),
-                    part,
-                    spectra[i] * self.unit,
-                )
+        components = [
+            Component(
+                int(self.fitted[self.start.source[i]]),
+                (int(scene.origin[i][0]), int(scene.origin[i][1])),
+                morphs[i][box],
+                spectra[i] * self.unit,
             )
+            for i, box in enumerate(boxes)
+        ]
         rendered = []
         for view, o, images in zip(self.views, self.blend.observations, observed, strict=True):
-            images = images.astype(np.float64) * covered_part(view.op, self.frame)
+            images = images.astype(np.float64) * view.covered
             rendered.append(images[..., : o.data.shape[1], : o.data.shape[2]])
         self.seconds["result"] = time.perf_counter() - began
         return Result(
             observations=self.blend.observations,
             frame=self.frame,
-            sources=self.blend.sources,
+            sources=self.sources,
             components=tuple(components),
             rendered=tuple(rendered),
             sky=sky * self.unit,
@@ -157,25 +193,85 @@ class Fit:
         )
 
 
-def _check_profiles(sources, frame):
-    for i, source in enumerate(sources):
+def _frame_of(blend) -> Frame:
+    """The blend's frame, or one made for its observations, which are checked on the way."""
+    if blend.frame is None:
+        frame = model_frame(blend.observations)
+    else:
+        check_observations(blend.observations)
+        frame = blend.frame
+    for i, source in enumerate(blend.sources):
         profile = getattr(source, "profile", None)
         if profile is not None and np.shape(profile) != frame.shape:
             raise ValueError(
                 f"profile of source {i} has the shape {np.shape(profile)}, "
                 f"the model frame {frame.shape}"
             )
-
-
-def _shifts(blend):
-    """Shifts (n_observations, 2) [model px] that a blend comes with."""
-    expected = len(blend.observations), 2
-    shifts = np.zeros(expected) if blend.shifts is None else np.asarray(blend.shifts, float)
-    if shifts.shape != expected or not np.isfinite(shifts).all():
-        raise ValueError(f"shifts is {shifts.tolist()}, must be {expected} finite numbers")
-    return shifts
+    return frame
 
 
 def _padded_frame(frame, pad):
+    """The frame with its sides grown to multiples of `pad`, from the same first pixel on."""
     shape = tuple(-(-n // pad) * pad for n in frame.shape)
     return frame if shape == frame.shape else Frame(frame.grid.cutout(0, 0, shape), frame.psf)
+
+
+def _peak_of_one(profiles):
+    """Profiles (n, Ny, Nx) with max = 1; dark ones as they are."""
+    peak = profiles.max(axis=(1, 2), keepdims=True)
+    return profiles / np.where(peak > 0, peak, 1)
+
+
+def _start_scene(fit, shape) -> tuple[Scene, State]:
+    """The scene of a fit on a padded frame of this shape, and its state at the start."""
+    begin, views, profiles = fit.start, fit.views, fit.profiles
+    units = [v.render(profiles) for v in views]
+    spectra, sky, _ = solve_spectra(units, views, fit.settings.fit_sky)
+    power = np.concatenate([(u**2).sum(axis=2) for u in units], axis=1)
+    error = 1 / np.sqrt(np.maximum(power, LEAST_POWER))
+    boxes = [
+        box_around(image, begin.positions[i_source], (spectrum / fit.noise).max())
+        for image, i_source, spectrum in zip(profiles, begin.source, spectra, strict=True)
+    ]
+    morphs = [
+        image[box_slices(low, size)].copy()
+        for image, (low, size, _) in zip(profiles, boxes, strict=True)
+    ]
+    scene = Scene(
+        shape=shape,
+        extent=fit.frame.shape,
+        ops=[v.op for v in views],
+        data=[v.data for v in views],
+        weights=[v.root**2 for v in views],
+        origin=np.array([low for low, _, _ in boxes]),
+        center=np.array([center for _, _, center in boxes]),
+        profile=morphs,
+        fixed=np.array([isinstance(fit.sources[fit.fitted[i]], Point) for i in begin.source]),
+        scale=np.where(error < UNSEEN, error + SPECTRUM_PART * spectra, 0),
+        fit_sky=fit.settings.fit_sky,
+    )
+    latent = [np.zeros_like(m) for m in morphs]
+    state = State(latent, [m.copy() for m in morphs], spectra, sky)
+    return replace(scene, damping=damping(scene, state, fit.settings.prior)), state
+
+
+def _dark_message(i_source, position):
+    """What to say of a source far from any light."""
+    y, x = position
+    return (
+        f"source {i_source} at (y, x) = ({y:.1f}, {x:.1f}) [px] in the model frame lies far from "
+        f"any light: no image shows {LIGHT_SIGMAS:g} sigma there or beside it"
+    )
+
+
+def stop_reason(losses, n_new, tol) -> str | None:
+    """The stopping rule: "diverged", "converged", or None to go on.
+
+    losses: of all iterations so far, of which the last n_new are new; tol: see Settings
+    """
+    best = np.nanmin(losses) if np.isfinite(losses[-n_new:]).all() else np.nan
+    if np.isnan(best) or losses[-1] > DIVERGED * best:
+        return "diverged"
+    if len(losses) > PATIENCE and min(losses[:-PATIENCE]) - best < tol * best:
+        return "converged"
+    return None

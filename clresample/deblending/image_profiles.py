@@ -1,10 +1,9 @@
-"""Morphologies to start from, read off the images: as the paper's deblender does it, from all
-instruments.
+"""Morphologies to start from, read off all instruments' images, as the paper's deblender does.
 
 For each source the sharpest instrument that sees it above 5 sigma: its channels combined by their
 signal-to-noise, brought to the model frame by Whittaker-Shannon interpolation, cut to what is
-symmetric about the source, made monotone, and zeroed where it drowns in the noise.  A source that
-none sees so well takes what all instruments together show.
+symmetric about the source, made monotone, and set to 0 where it is under the noise. A source that
+no instrument sees above 5 sigma takes what all of them together show.
 """
 
 from __future__ import annotations
@@ -21,10 +20,11 @@ from .blend import Blend
 from .solver.boxes import Boxes
 from .solver.constraints import Chain, MaxNorm, Monotone, Positivity
 
-# [sigma] of the brightest pixel, for an instrument to see a source, and for a pixel to count as
-# light
+# [sigma] What an instrument shows at a source's centre from which on its image is taken: below, the
+# noise would shape the morphology. And what a pixel needs to count as light.
 SEEN, LIGHT = 5.0, 1.0
-# [model px] half side of a morphology: boxes are cut to the light afterwards
+# [model px] Half side of the part of the images that is looked at; light beyond is left out. A
+# larger one costs time, the fit's boxes are cut to the light afterwards.
 RADIUS_PX = 30
 
 
@@ -35,7 +35,7 @@ def with_image_profiles(blend: Blend, *, device=None) -> Blend:
     """
     device = get_device(device)
     frame = blend.frame or model_frame(blend.observations)
-    positions = frame.place(blend.sources)
+    positions = frame.place(blend.sources, blend.observations, blend.known_shifts())
     inside = frame.inside(positions)
     views = [_in_frame(o, frame, device) for o in blend.observations]
     order = np.argsort([_sharpness(o) for o in blend.observations], kind="stable")

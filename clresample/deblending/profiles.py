@@ -1,10 +1,13 @@
 """Smooth profiles on model pixels: what a source looks like before its own structure is fitted.
 
+A source has one Shape for each of its components: a Galaxy, a Given profile or a Star. A shape is
+drawn from a few parameters theta (n,), which `start` fits to the data.
+
     S(x) = (1 + q / (2 beta))^(-beta - 1),   q = (x - c)^T C^-1 (x - c)
     C = sigma^2 [[1 + e1, e2], [e2, 1 - e1]] + C_psf      rows and columns (y, x)
 
 beta -> infinity is a Gaussian, small beta has wings; C_psf is the model PSF's own second moment, so
-that sigma -> 0 is a star.  Point sources are the model's PSF itself, interpolated by its band.
+that sigma -> 0 is as wide as a star. Stars are the model's PSF itself, interpolated by its band.
 """
 
 from __future__ import annotations
@@ -14,9 +17,20 @@ import functools
 import numpy as np
 
 from ..sky.psf import PSF
+from ..sky.sources import Extended, Point
 
-# Spectra of the model's PSF that are kept: stars of one frame share one, of 1 MB at 256 pixels.
-N_SPECTRA = 8
+# OTFs of model PSFs that are kept: the stars of one frame share one, of 1 MB at 256 pixels.
+N_OTFS = 8
+# What is expected of a galaxy before its images are looked at: Gaussian sigma 0.25" (half-light
+# radius 0.3") with a scatter of 0.4 in its logarithm, as in deep fields; ellipticity 0.26 per
+# component (Leauthaud et al. 2007); wings between exponential and Gaussian.
+SIZE_ARCSEC, SIZE_SCATTER = 0.25, 0.4
+ELLIPTICITY_SCATTER = 0.26
+WINGS, WINGS_SCATTER = 5.0, 0.7
+# Several components of a source start this far apart in ln(size), as a bulge and a disk do.
+COMPONENT_SPREAD = 1.0
+# [px] scatter of a free star's position about the one given
+STAR_SCATTER_PX = 0.5
 
 
 def covariance(parameters, psf_moment):
@@ -74,16 +88,93 @@ def point(psf: PSF, position, shape, *, slopes=True):
     n_fft += 1 - n_fft % 2
     nu = np.fft.fftfreq(n_fft)
     shift_y, shift_x = (np.exp(-2j * np.pi * nu * p) for p in position)
-    spectrum = _spectrum(psf, n_fft) * shift_y[:, None] * shift_x
-    spectra = [spectrum]
+    transform = _otf(psf, n_fft) * shift_y[:, None] * shift_x
+    transforms = [transform]
     if slopes:
         slope = -2j * np.pi * nu
-        spectra += [slope[:, None] * spectrum, slope * spectrum]
-    return np.fft.ifft2(spectra).real[:, : shape[0], : shape[1]].copy()
+        transforms += [slope[:, None] * transform, slope * transform]
+    return np.fft.ifft2(transforms).real[:, : shape[0], : shape[1]].copy()
 
 
-@functools.lru_cache(maxsize=N_SPECTRA)
-def _spectrum(psf, n_fft):
+@functools.lru_cache(maxsize=N_OTFS)
+def _otf(psf, n_fft):
     """P^ of the first band (n_fft, n_fft) in the order of the FFT."""
     nu = np.fft.fftfreq(n_fft)
     return psf.otf(nu, nu)[0]
+
+
+class Shape:
+    """What a component looks like.
+
+    mean, scatter (n,): what is expected of theta
+    draw(theta, position): (1 + n, Ny, Nx), the profile of unit integral for a source at a position
+        (2,) [px], and its slopes by theta
+    """
+
+    mean = scatter = np.zeros(0)
+
+    def draw(self, theta, position):
+        """The profile and its slopes."""
+        raise NotImplementedError
+
+    def place(self, theta, position):
+        """Where the component is (2,) [px]: where its source was given to be."""
+        return position
+
+
+class Galaxy(Shape):
+    """A smooth elliptical profile; theta = (ln sigma [px], g1, g2, ln beta), see profiles.py.
+
+    frame: the model's Frame; i_component of n_components: of its source, from compact to wide
+    widened: how much larger than usual it is expected to be
+    """
+
+    def __init__(self, frame, i_component=0, n_components=1, *, widened=1.0):
+        scale_arcsec = float(np.mean(frame.grid.pixel_scale_arcsec))
+        spread = COMPONENT_SPREAD * (i_component - (n_components - 1) / 2)
+        size = np.log(SIZE_ARCSEC / scale_arcsec) + spread + np.log(widened)
+        self.shape, self._psf_moment = frame.shape, moment(frame.psf)
+        self.mean = np.array([size, 0, 0, np.log(WINGS)])
+        self.scatter = np.array([SIZE_SCATTER, *[ELLIPTICITY_SCATTER] * 2, WINGS_SCATTER])
+
+    def draw(self, theta, position):
+        """The profile and its four slopes, (5, Ny, Nx)."""
+        return profile(theta, position, self.shape, self._psf_moment)
+
+
+class Given(Shape):
+    """A profile (Ny, Nx) that comes with the source; no parameters."""
+
+    def __init__(self, image):
+        self.image = np.asarray(image) / np.sum(image)
+
+    def draw(self, theta, position):
+        """The profile (1, Ny, Nx)."""
+        return self.image[None]
+
+
+class Star(Shape):
+    """The model's PSF; theta (2,) [px] = how far off the given position it is, if free."""
+
+    def __init__(self, frame, *, free):
+        self.shape, self.psf, self.free = frame.shape, frame.psf, free
+        self.mean = np.zeros(2 if free else 0)
+        self.scatter = np.full(len(self.mean), STAR_SCATTER_PX)
+
+    def draw(self, theta, position):
+        """The PSF and, if free, its two slopes, (3, Ny, Nx); else (1, Ny, Nx)."""
+        return point(self.psf, self.place(theta, position), self.shape, slopes=self.free)
+
+    def place(self, theta, position):
+        """Where the star is (2,) [px]: off its source's position by theta, if free."""
+        return position + theta if self.free else position
+
+
+def components_of(source, frame):
+    """The components of a Source, at least one."""
+    if isinstance(source, Point):
+        return [Star(frame, free=source.free)]
+    if isinstance(source, Extended) and source.profile is not None:
+        return [Given(source.profile)]
+    n = source.n_components if isinstance(source, Extended) else 1
+    return [Galaxy(frame, i, n) for i in range(n)]

@@ -7,78 +7,98 @@ from dataclasses import replace
 import numpy as np
 
 from ..sky.extent import shared_part
-from .solver.problem import Problem
+from .solver.scene import Scene, State
 
-# A box holds what reaches this part of the noise: the profile, or the structure that the prior
-# allows about it (alpha = 0.1 of the root of the light); as a part of the peak, within bounds.
-BOX_NOISE, BOX_FAINTEST, BOX_BRIGHTEST = 0.1, 1e-7, 5e-3
+# A box holds the pixels where the source is brighter than this part of the noise of a model pixel;
+# smaller values make larger boxes, which cost time and hold no more light that is seen.
+BOX_NOISE = 0.1
+# Least and largest threshold, as parts of the profile's peak: a star of any brightness ends where
+# its PSF's float32 does; the box of a source that is hardly seen still holds its profile.
+BOX_FAINTEST, BOX_BRIGHTEST = 1e-7, 5e-3
+# [px] Boxes reach at least this far from their centre, however faint the source.
 SMALLEST_RADIUS_PX = 5
-# [px] by which a side grows where light reaches it, and from which on trimming is worth the move
+# [px] by which a side grows where light reaches it, and the least by which one is trimmed: each
+# change of a box makes a new engine.
 GROW_PX, TRIM_PX = 8, 4
-# A box grows when its edge is this much brighter than a tenth of the noise.
+# A side grows when a pixel of its edge is brighter than this many times BOX_NOISE.
 GROW_AT = 4.0
 
 
 def box_threshold(brightness):
-    """Part of the peak above which a pixel is worth its place; the peak is `brightness` sigma."""
+    """Part of a profile's peak down to which its pixels belong into its box.
+
+    brightness: the peak over the noise of a model pixel. A pixel belongs there if the profile
+    reaches BOX_NOISE of the noise, or if the structure does that the prior allows about it: with
+    alpha = 0.1 that is 0.1 sqrt(profile) of the peak, so the profile's part is brightness^-2
+    """
     brightness = max(brightness, 1.0)
     return np.clip(min(BOX_NOISE / brightness, brightness**-2), BOX_FAINTEST, BOX_BRIGHTEST)
 
 
-def box_around(base, position, brightness):
+def box_around(profile, position, brightness):
     """Box of one profile: origin (2,) and shape (2,) inside the frame, and its centre pixel (2,).
 
-    base (Ny, Nx): profile; position (2,) [px]; brightness: its peak over the noise of a model
-    pixel, in the channel that sees it best
+    profile (Ny, Nx): over the frame; position (2,) [px]; brightness: its peak over the noise of a
+    model pixel, in the channel that sees it best
     """
-    threshold = box_threshold(brightness) * base.max()
-    pixel = np.clip(np.floor(np.asarray(position) + 0.5).astype(int), 0, np.array(base.shape) - 1)
-    lit = base > threshold
+    threshold = box_threshold(brightness) * profile.max()
+    top = np.array(profile.shape) - 1
+    pixel = np.clip(np.floor(np.asarray(position) + 0.5).astype(int), 0, top)
+    lit = profile > threshold
     low, high = np.zeros(2, int), np.zeros(2, int)
     for axis in (0, 1):
         along = np.flatnonzero(lit.any(axis=1 - axis))
         first, last = (along[0], along[-1]) if len(along) else (pixel[axis], pixel[axis])
         low[axis] = max(min(first, pixel[axis] - SMALLEST_RADIUS_PX), 0)
-        high[axis] = min(max(last, pixel[axis] + SMALLEST_RADIUS_PX), base.shape[axis] - 1)
+        high[axis] = min(max(last, pixel[axis] + SMALLEST_RADIUS_PX), top[axis])
     return low, high - low + 1, pixel - low
 
 
-def resized(problem: Problem, base, noise) -> Problem:
-    """The problem in boxes that fit its present morphologies; itself where all of them do.
+def resized(scene: Scene, state: State, profiles, noise) -> tuple[Scene, State]:
+    """Scene and state in boxes that fit the present morphologies; themselves where all of them do.
 
-    base (S, Ny, Nx) [1]: expected profiles over the frame, max = 1; noise (C,): of a model pixel
-    The solver's state moves along: new pixels start at the profile, with no moments.
+    profiles (S, Ny, Nx) [1]: expected profiles over the frame, max = 1; noise (C,): of a model
+    pixel. What the state holds of a box moves along: new pixels start at the profile, with z and
+    all that the update remembers at 0.
     """
-    boxes = [_box(problem, i, base, noise) for i in range(len(problem.morph))]
-    if all(_same(problem, i, box) for i, box in enumerate(boxes)):
-        return problem
+    boxes = [_box(scene, state, i, profiles[i], noise) for i in range(len(state.morph))]
+    if all(_same(scene, i, box) for i, box in enumerate(boxes)):
+        return scene, state
 
     def move(arrays, fill=None):
+        """Arrays of all sources in their new boxes."""
         return [
             _moved(a, o, low, high, None if fill is None else fill[i])
-            for i, (a, o, (low, high)) in enumerate(zip(arrays, problem.origin, boxes, strict=True))
+            for i, (a, o, (low, high)) in enumerate(zip(arrays, scene.origin, boxes, strict=True))
         ]
 
-    moments = problem.moments_morph
-    return replace(
-        problem,
-        origin=np.array([low for low, _ in boxes]),
-        center=problem.center + problem.origin - np.array([low for low, _ in boxes]),
-        base=move(problem.base, base),
-        morph=move(problem.morph, base),
-        field=move(problem.field),
-        moments_morph=None if moments is None else [move(m) for m in moments],
+    origin, memory = np.array([low for low, _ in boxes]), state.memory
+    if memory is not None:
+        memory = replace(memory, morph=[move(arrays) for arrays in memory.morph])
+    return (
+        replace(
+            scene,
+            origin=origin,
+            center=scene.center + scene.origin - origin,
+            profile=move(scene.profile, profiles),
+        ),
+        replace(
+            state,
+            morph=move(state.morph, profiles),
+            latent=move(state.latent),
+            memory=memory,
+        ),
     )
 
 
-def _box(problem, i, base, noise):
+def _box(scene, state, i, profile, noise):
     """First and one-past-last pixel (2,) of the box that source i should have."""
-    morph, low = problem.morph[i], np.array(problem.origin[i])
+    morph, low = state.morph[i], np.array(scene.origin[i])
     high = low + morph.shape
-    if problem.fixed[i]:
+    if scene.fixed[i]:
         return low, high
-    brightness = (problem.spectra[i] * morph.max() / noise).max()
-    wanted, size, _ = box_around(base[i], low + problem.center[i], brightness)
+    brightness = (state.spectra[i] * morph.max() / noise).max()
+    wanted, size, _ = box_around(profile, low + scene.center[i], brightness)
     light = BOX_NOISE / max(brightness, 1e-30) * morph.max()
     new_low, new_high = low.copy(), high.copy()
     for axis in (0, 1):
@@ -91,17 +111,17 @@ def _box(problem, i, base, noise):
         elif first - low[axis] >= TRIM_PX:
             new_low[axis] = first
         if along[-1] > GROW_AT * light:
-            new_high[axis] = min(high[axis] + GROW_PX, problem.extent[axis])
+            new_high[axis] = min(high[axis] + GROW_PX, scene.extent[axis])
         elif high[axis] - last >= TRIM_PX:
             new_high[axis] = last
     return new_low, new_high
 
 
-def _same(problem, i, box):
+def _same(scene, i, box):
+    """Whether source i has this box already."""
     low, high = box
-    return np.array_equal(low, problem.origin[i]) and np.array_equal(
-        high - low, problem.morph[i].shape
-    )
+    shape = scene.profile[i].shape
+    return np.array_equal(low, scene.origin[i]) and np.array_equal(high - low, shape)
 
 
 def _moved(array, origin, low, high, fill):

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
+from ..sky.footprint import Footprint
 from ..sky.frame import Frame
 from ..sky.observation import Observation
 from ..sky.sources import Source
+from .solver.scene_model import compose
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,7 +23,8 @@ class Component:
     morphology (ny, nx) [1]: max = 1, under the model's PSF
     spectrum (C,) [counts]: flux per model pixel where the morphology is 1, over all channels of all
         observations in their order, each in its own observation's counts
-    covariance of all spectra: see Result.covariance
+
+    The covariance of all spectra is Result.covariance.
     """
 
     source: int
@@ -38,7 +42,8 @@ class Component:
 class Result:
     """The fitted model of one blend.
 
-    observations, frame, sources: what was fitted; components (n): in the order of the sources
+    observations, frame, sources: what was fitted; sources that were given in an observation's
+        pixels have their position in the frame's now; components (n): in the order of the sources
     rendered: per observation (n, Co, My, Mx) [1], each component's morphology on its pixels under
         its PSF: spectrum times this is the model of the data
     sky (C,) [counts]: constant background per channel, 0 where it was not fitted
@@ -66,12 +71,21 @@ class Result:
 
     @property
     def converged(self) -> bool:
+        """Whether the fit ended because its loss did not fall any further."""
         return self.status == "converged"
 
     @property
     def channels(self) -> tuple[str, ...]:
         """Names (C,) of all channels, in the order of the spectra."""
         return tuple(name for o in self.observations for name in o.channels)
+
+    @cached_property
+    def footprints(self) -> tuple[Footprint, ...]:
+        """Where each observation's pixels lie in the frame, at its fitted shift."""
+        return tuple(
+            Footprint(o, o.grid.map_to(self.frame.grid), np.asarray(shift, np.float64))
+            for o, shift in zip(self.observations, self.shifts, strict=True)
+        )
 
     def channel_slices(self) -> list[slice]:
         """For each observation, its part of a spectrum."""
@@ -85,11 +99,9 @@ class Result:
         """One source (C, Ny, Nx) in the model frame, or (Co, My, Mx) as an observation sees it."""
         parts = [(i, c) for i, c in enumerate(self.components) if c.source == i_source]
         if i_observation is None:
-            model = np.zeros((len(self.channels), *self.frame.shape))
-            for _, c in parts:
-                (y, x), (ny, nx) = c.origin, c.morphology.shape
-                model[:, y : y + ny, x : x + nx] += c.spectrum[:, None, None] * c.morphology
-            return model
+            spectra = np.array([c.spectrum for _, c in parts]).reshape(-1, len(self.channels))
+            origin, morphs = [c.origin for _, c in parts], [c.morphology for _, c in parts]
+            return compose(self.frame.shape, origin, morphs, spectra)
         channels = self.channel_slices()[i_observation]
         unit = self.rendered[i_observation]
         zero = np.zeros(self.observations[i_observation].data.shape)

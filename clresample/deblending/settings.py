@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from .solver.amsgrad import StepSizes
 from .solver.constraints import Chain, MaxNorm, Monotone, Positivity, SumNorm
 from .solver.prior import Prior
-from .solver.problem import StepSizes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,7 +19,7 @@ class Settings:
         morphologies themselves, by the constraints alone
     constraints: Chain of proximal operators on the morphologies: non-negative, and monotone by the
         sweep
-    rates: the solver's steps
+    step_sizes: the solver's StepSizes
     fit_shifts: let each observation but the first move by a constant shift
     fit_sky: fit a constant per channel
     """
@@ -28,7 +28,7 @@ class Settings:
     tol: float = 1e-5
     prior: Prior | None = Prior()
     constraints: Chain = field(default_factory=lambda: Chain(Positivity(), Monotone()))
-    rates: StepSizes = StepSizes()
+    step_sizes: StepSizes = StepSizes()
     fit_shifts: bool = False
     fit_sky: bool = False
 
@@ -37,7 +37,7 @@ class Settings:
             raise ValueError(f"max_iter is {self.max_iter}, must be 0 or more")
         if not 0 <= self.tol < 1:
             raise ValueError(f"tol is {self.tol}, must be at least 0 and under 1")
-        scaling = [p for p in self.constraints._steps() if isinstance(p, MaxNorm | SumNorm)]
+        scaling = [p for p in self.constraints.steps() if isinstance(p, MaxNorm | SumNorm)]
         if self.prior is not None and scaling:
             raise ValueError(
                 f"constraints hold {scaling[0]!r}, but with a prior the profiles set the "

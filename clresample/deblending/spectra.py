@@ -5,10 +5,14 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import nnls
 
-# Part of its light by which a model without a galaxy's own structure is wrong.
+# Error of a smooth profile, as a part of the light in a pixel: what galaxies' own structure, spiral
+# arms or clumps, adds to it. Larger values let faint neighbours absorb less of that structure, and
+# make bright sources count for less.
 MODEL_ERROR = 0.15
-# Sources exactly on top of each other share their light, stars evenly, galaxies as their profiles
-# came out: a ridge on the scaled normal matrix.
+# Added to the diagonal of the normal matrix, which is scaled to a diagonal of 1. Without it the
+# matrix of two sources with equal profiles, two stars in one place, is singular; with it they get
+# equal parts of their light. It changes the flux of a source apart from others by this part of it;
+# a larger one would share light between neighbours that the data can tell apart.
 RIDGE = 1e-8
 
 

@@ -5,8 +5,8 @@ every instrument, so that a source that only one of them sees still starts right
 
     min  sum_pixels w (d - sum_s A_s R S_s)^2 + sum ((theta - mean) / scatter)^2,     A >= 0
 
-Smooth profiles leave a tenth of a bright galaxy's light unexplained; the weights know it,
-1/w = sigma^2 + (MODEL_ERROR * model)^2, or spiral arms would be taken for faint neighbours.
+Smooth profiles leave a tenth of a bright galaxy's light unexplained. The weights allow for it,
+1/w = sigma^2 + (MODEL_ERROR * model)^2: without, spiral arms would be taken for faint neighbours.
 """
 
 from __future__ import annotations
@@ -16,42 +16,38 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..sky.frame import Frame
-from ..sky.sources import Extended, Point
-from .profiles import moment, point, profile
+from .profiles import Galaxy, components_of
 from .spectra import MODEL_ERROR, RIDGE, solve_spectra
 from .view import WhitenedView
 
-# What galaxies are before anyone looks: Gaussian sigma 0.25" (half-light radius 0.3") with a
-# scatter of 0.4 in its logarithm, as in deep fields; ellipticity 0.26 per component (Leauthaud et
-# al. 2007); wings between exponential and Gaussian.
-SIZE_ARCSEC, SIZE_SCATTER = 0.25, 0.4
-ELLIPTICITY_SCATTER = 0.26
-WINGS, WINGS_SCATTER = 5.0, 0.7
-# Several components of a source start this far apart in ln(size), a bulge and a disk.
-COMPONENT_SPREAD = 1.0
-# A star's position is known to this [px].
-STAR_SCATTER_PX = 0.5
-# Gauss-Newton: longest step of a parameter, iterations, and the part of chi2 that ends them when
-# it is all that one gains
-LONGEST_STEP, N_ITERATIONS, ENOUGH = 0.7, 10, 1e-3
+# Longest step of a parameter: far from the minimum the quadratic model of chi2 promises too much.
+LONGEST_STEP = 0.7
+# Most steps, and the part of chi2 that ends them when one of them gains no more than it.
+N_STEPS, ENOUGH = 10, 1e-3
+# Levenberg-Marquardt: damping of the first step as a part of the normal matrix's diagonal, what it
+# is divided by after a step that gains, multiplied by after one that does not, and where it ends.
+FIRST_DAMPING, LESS, MORE, MOST_DAMPING = 1e-2, 3, 10, 1e3
+# [sigma] What counts as light at a source: noise alone reaches it once in 740 times, what `detect`
+# finds has 5. A source is far from any light where neither its expected profile at its position
+# shows that, nor a galaxy NEARBY times larger than expected does, 1.5" in sigma: a source that is
+# too faint by itself, but beside others, is probably meant.
+LIGHT_SIGMAS, NEARBY = 3.0, 6.0
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class StartingPoint:
     """Components of a scene before their own structure is fitted.
 
     source (n): the source of each component
-    base (n, Ny, Nx): profiles over the frame, unit integral
-    spectra (n, C), sky (C,) [counts]: total fluxes and constants, by the weights that know of the
-        model error
-    positions (S, 2) [px]
+    profiles (n, Ny, Nx): over the frame, unit integral
+    positions (S, 2) [px]: of the sources, free stars where they were found
+    dark (S,): bool, whether a source is far from any light, see `_is_dark`
     """
 
     source: np.ndarray
-    base: np.ndarray
-    spectra: np.ndarray
-    sky: np.ndarray
+    profiles: np.ndarray
     positions: np.ndarray
+    dark: np.ndarray
 
 
 def start(
@@ -59,60 +55,102 @@ def start(
 ) -> StartingPoint:
     """Fit profiles and free stars; see the module's text.
 
-    sources (S), positions (S, 2) [px]: those inside the frame
+    sources (S), positions (S, 2) [px]: those inside the frame; fit_sky: also a level per channel
     """
     fit = _ProfileFit(frame, sources, positions, views, fit_sky)
-    fit.run()
-    return fit.start()
+    first, best = fit.run()
+    dark = _is_dark(first.snr)
+    if dark.any():
+        wide = Galaxy(frame, widened=NEARBY)
+        images = [wide.draw(wide.mean, p)[:1] for p in fit.positions[dark]]
+        units = [view.render(np.concatenate(images)) for view in views]
+        dark[dark] = _is_dark(_signal_to_noise(units, views, first.sky))
+    return StartingPoint(
+        np.array(fit.source),
+        np.array([images[0] for images in fit.images(best.theta)]),
+        fit.places(best.theta),
+        dark,
+    )
+
+
+def _signal_to_noise(units, views, sky):
+    """Signal to noise (n, C) of all light but the sky's through n filters: <u, d> / |u|, 0 where
+    the filter sees nothing.
+
+    units: per view, whitened images u (n, Co, P); sky (C,)
+    """
+    found, channel = [], 0
+    for unit, view in zip(units, views, strict=True):
+        for c in range(unit.shape[1]):
+            light = ((view.data[c] - sky[channel]) * view.root[c]).ravel()
+            size = np.sqrt((unit[:, c] ** 2).sum(axis=1))
+            out = np.zeros(len(size))
+            found.append(np.divide(unit[:, c] @ light, size, out=out, where=size > 0))
+            channel += 1
+    return np.array(found).T
+
+
+def _is_dark(snr):
+    """Where (n,) there is no light, from its signal to noise (n, C).
+
+    Neither in any channel nor in all that see the place together, each with the same weight: that
+    finds what is faint in each of many channels.
+    """
+    n_seen = np.maximum(np.count_nonzero(snr, axis=1), 1)
+    together = snr.sum(axis=1) / np.sqrt(n_seen)
+    return np.maximum(snr.max(axis=1), together) < LIGHT_SIGMAS
+
+
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    """The fit at some theta, to first order.
+
+    theta (n,), spectra (n_components, C), sky (C,): where
+    snr (S, C): signal to noise of all light as the sources see it, see `_signal_to_noise`; of
+        several components of a source that which sees most
+    chi2: with the prior of theta; normal (n, n), right (n,): of the Gauss-Newton step, the spectra
+        eliminated, normal step = right
+    """
+
+    theta: np.ndarray
+    spectra: np.ndarray
+    sky: np.ndarray
+    snr: np.ndarray
+    chi2: float
+    normal: np.ndarray
+    right: np.ndarray
 
 
 class _ProfileFit:
+    """The least-squares problem of all components' parameters theta together.
+
+    components (n), source (n): what is drawn, and the source each belongs to
+    positions (S, 2) [px]: as given; mean, scatter: of theta, one component's after the other's
+    """
+
     def __init__(self, frame, sources, positions, views, fit_sky):
-        self.frame, self.views, self.fit_sky = frame, views, fit_sky
-        self.psf_moment = moment(frame.psf)
+        self.views, self.fit_sky = views, fit_sky
         self.positions = np.array(positions, dtype=np.float64)
-        self.kinds, self.source, self.given, mean, scatter = [], [], {}, [], []
-        scale = float(np.mean(frame.grid.pixel_scale_arcsec))
-        for i, source in enumerate(sources):
-            count = source.n_components if isinstance(source, Extended) else 1
-            for k in range(count):
-                self.source.append(i)
-                if isinstance(source, Point):
-                    self.kinds.append("star" if source.free else "fixed")
-                    n = 2 if source.free else 0
-                    mean.append(np.zeros(n))
-                    scatter.append(np.full(n, STAR_SCATTER_PX))
-                elif source.profile is not None:
-                    self.kinds.append("given")
-                    self.given[i] = np.asarray(source.profile) / np.sum(source.profile)
-                    mean.append(np.zeros(0))
-                    scatter.append(np.zeros(0))
-                else:
-                    self.kinds.append("galaxy")
-                    size = np.log(SIZE_ARCSEC / scale) + COMPONENT_SPREAD * (k - (count - 1) / 2)
-                    mean.append(np.array([size, 0, 0, np.log(WINGS)]))
-                    scatter.append(
-                        np.array([SIZE_SCATTER, *[ELLIPTICITY_SCATTER] * 2, WINGS_SCATTER])
-                    )
-        self.counts = [len(m) for m in mean]
-        self.mean, self.scatter = np.concatenate(mean), np.concatenate(scatter)
+        pairs = [(i, c) for i, source in enumerate(sources) for c in components_of(source, frame)]
+        self.source, self.components = [i for i, _ in pairs], [c for _, c in pairs]
+        self.counts = [len(c.mean) for c in self.components]
+        self.mean = np.concatenate([c.mean for c in self.components])
+        self.scatter = np.concatenate([c.scatter for c in self.components])
 
     def images(self, theta):
         """Per component, (1 + its parameters, Ny, Nx): the profile and its slopes."""
-        shape, out = self.frame.shape, []
-        for kind, source, part in zip(self.kinds, self.source, self._parts(theta), strict=True):
-            position = self.positions[source]
-            if kind == "galaxy":
-                out.append(profile(part, position, shape, self.psf_moment))
-            elif kind == "given":
-                out.append(self.given[source][None])
-            else:
-                moved = position + (part if kind == "star" else 0)
-                out.append(point(self.frame.psf, moved, shape, slopes=kind == "star"))
-        return out
+        parts = zip(self.components, self._parts(theta), self.source, strict=True)
+        return [c.draw(part, self.positions[source]) for c, part, source in parts]
 
-    def linearise(self, theta):
-        """At theta: spectra, chi2, and its normal equations with the spectra eliminated."""
+    def places(self, theta):
+        """Positions (S, 2) [px] of the sources at theta."""
+        positions = self.positions.copy()
+        for c, part, source in zip(self.components, self._parts(theta), self.source, strict=True):
+            positions[source] = c.place(part, self.positions[source])
+        return positions
+
+    def linearise(self, theta) -> _Linearised:
+        """Spectra, chi2, and its normal equations with the spectra eliminated, at theta."""
         images = self.images(theta)
         rendered = [view.render(np.concatenate(images)) for view in self.views]
         heads = np.cumsum([0, *(len(i) for i in images)])[:-1]
@@ -124,15 +162,7 @@ class _ProfileFit:
             models = self._models(units, spectra, sky)
             spectra, sky, _ = solve_spectra(units, self.views, self.fit_sky, models)
         models = self._models(units, spectra, sky)
-        n = len(theta)
-        state = {
-            "spectra": spectra,
-            "sky": sky,
-            "theta": theta,
-            "chi2": 0.0,
-            "normal": np.zeros((n, n)),
-            "right": np.zeros(n),
-        }
+        equations = _NormalEquations(len(theta))
         channel = 0
         for i, view in enumerate(self.views):
             for c in range(rendered[i].shape[1]):
@@ -140,50 +170,36 @@ class _ProfileFit:
                 columns = a[owner, None] * rendered[i][slopes, c]
                 weight = 1 / (1 + (MODEL_ERROR * models[i][c]) ** 2)
                 residual = (view.data[c] * view.root[c]).ravel() - models[i][c]
-                state["chi2"] += float(weight @ residual**2)
                 lit = units[i][a > 0, c]
                 if self.fit_sky:
                     lit = np.concatenate([lit, [view.root[c].ravel()]])
-                _accumulate(state, columns, lit, weight, residual)
+                equations.add_channel(columns, lit, weight, residual)
                 channel += 1
-        pull = (self.mean - theta) / self.scatter
-        state["chi2"] += float(pull @ pull)
-        state["normal"] += np.diag(self.scatter**-2.0)
-        state["right"] += pull / self.scatter
-        return state
+        equations.add_prior((self.mean - theta) / self.scatter, self.scatter)
+        snr = np.full((len(self.positions), len(sky)), -np.inf)
+        np.maximum.at(snr, self.source, _signal_to_noise(units, self.views, sky))
+        e = equations
+        return _Linearised(theta, spectra, sky, snr, e.chi2, e.normal, e.right)
 
-    def run(self):
-        """Levenberg-Marquardt; the last accepted state is kept."""
-        damping, best = 1e-2, self.linearise(self.mean)
-        for _ in range(N_ITERATIONS if len(self.mean) else 0):
-            matrix = best["normal"] + damping * np.diag(np.diag(best["normal"]))
-            step = np.linalg.solve(matrix, best["right"])
+    def run(self) -> tuple[_Linearised, _Linearised]:
+        """Levenberg-Marquardt: where it began, at the mean, and the last step that gained."""
+        damping, first = FIRST_DAMPING, self.linearise(self.mean)
+        best = first
+        for _ in range(N_STEPS if len(self.mean) else 0):
+            matrix = best.normal + damping * np.diag(np.diag(best.normal))
+            step = np.linalg.solve(matrix, best.right)
             step = np.clip(step, -LONGEST_STEP, LONGEST_STEP)
-            new = self.linearise(best["theta"] + step)
-            gain = best["chi2"] - new["chi2"]
+            new = self.linearise(best.theta + step)
+            gain = best.chi2 - new.chi2
             if gain > 0:
-                best, damping = new, damping / 3
-                if gain < ENOUGH * new["chi2"]:
+                best, damping = new, damping / LESS
+                if gain < ENOUGH * new.chi2:
                     break
             else:
-                damping *= 10
-                if damping > 1e3:
+                damping *= MORE
+                if damping > MOST_DAMPING:
                     break
-        self.best = best
-
-    def start(self):
-        theta = self.best["theta"]
-        images = [i[0] for i in self.images(theta)]
-        for kind, source, part in zip(self.kinds, self.source, self._parts(theta), strict=True):
-            if kind == "star":
-                self.positions[source] += part
-        return StartingPoint(
-            np.array(self.source),
-            np.array(images),
-            self.best["spectra"],
-            self.best["sky"],
-            self.positions,
-        )
+        return first, best
 
     def _parts(self, theta):
         """The parameters of each component."""
@@ -200,17 +216,34 @@ class _ProfileFit:
         return out
 
 
-def _accumulate(state, columns, lit, weight, residual):
-    """Add one channel's normal equations, its spectra (the rows `lit`) eliminated."""
-    weighted = columns * weight
-    state["normal"] += weighted @ columns.T
-    state["right"] += weighted @ residual
-    if not len(lit):
-        return
-    lit_weighted = lit * weight
-    inner = lit_weighted @ lit.T
-    inner += RIDGE * np.trace(inner) * np.eye(len(inner))
-    cross = lit_weighted @ columns.T
-    solved = np.linalg.solve(inner, cross)
-    state["normal"] -= cross.T @ solved
-    state["right"] -= solved.T @ (lit_weighted @ residual)
+class _NormalEquations:
+    """chi2 and the normal equations of n parameters, summed channel by channel."""
+
+    def __init__(self, n):
+        self.chi2, self.normal, self.right = 0.0, np.zeros((n, n)), np.zeros(n)
+
+    def add_channel(self, columns, lit, weight, residual):
+        """One channel's part, its spectra eliminated.
+
+        columns (n, P): slopes of the model by the parameters; lit (L, P): by the spectra (and the
+        sky) that are free; weight, residual (P,)
+        """
+        self.chi2 += float(weight @ residual**2)
+        weighted = columns * weight
+        self.normal += weighted @ columns.T
+        self.right += weighted @ residual
+        if not len(lit):
+            return
+        lit_weighted = lit * weight
+        inner = lit_weighted @ lit.T
+        inner += RIDGE * np.trace(inner) * np.eye(len(inner))
+        cross = lit_weighted @ columns.T
+        solved = np.linalg.solve(inner, cross)
+        self.normal -= cross.T @ solved
+        self.right -= solved.T @ (lit_weighted @ residual)
+
+    def add_prior(self, pull, scatter):
+        """The parameters' own expectation: pull (n,) = (mean - theta) / scatter."""
+        self.chi2 += float(pull @ pull)
+        self.normal += np.diag(scatter**-2.0)
+        self.right += pull / scatter

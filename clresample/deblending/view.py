@@ -8,8 +8,10 @@ import numpy as np
 
 from ..resampling.cache import cached_resampler
 from ..resampling.resampler import Resampler
+from ..sky.mapping import Mapping
 
-# Light this far under the brightest is none: float32 would keep it as denormals, 20 times slower.
+# Pixels of a model under this part of its brightest one count as 0 when it is rendered: of the
+# model's light they hold nothing, but float32 keeps them as denormals, 20 times slower.
 DARK = 1e-20
 
 
@@ -17,14 +19,39 @@ DARK = 1e-20
 class WhitenedView:
     """One observation ready to be fitted: its operator and whitened data.
 
-    op: model frame -> observation
-    root (Co, My, Mx): square root of the weights, 0 where the model does not cover
-    data (Co, My, Mx): the observation's data
+    op: model frame, padded where scenes share a batch -> observation, padded alike
+    mapping: the op's, with the frame itself, without its padding, as the model
+    covered (My, Mx): bool, whose centre lies on the frame itself
+    unit (Co,) [counts]: noise of a typical pixel of each channel, in which data and model count
+    root (Co, My, Mx) [1 / unit]: square root of the weights, 0 where the frame does not cover
+    data (Co, My, Mx) [unit]: the observation's data
     """
 
     op: Resampler
+    mapping: Mapping
+    covered: np.ndarray
+    unit: np.ndarray
     root: np.ndarray
     data: np.ndarray
+
+    @classmethod
+    def of(cls, op, frame, data, weights):
+        """The view of an observation's data and weights (Co, My, Mx) on a model Frame.
+
+        op: of the frame, or of a larger one that starts at the same pixel: what lies beyond the
+            frame itself gets no weight
+        """
+        unit = np.array([_typical_noise(channel) for channel in weights])
+        mapping = replace(op.mapping, shape_in=frame.shape)
+        covered = mapping.covered
+        root = np.sqrt(weights) * unit[:, None, None] * covered
+        return cls(op, mapping, covered, unit, root, data / unit[:, None, None])
+
+    @property
+    def pixel_noise(self) -> np.ndarray:
+        """Noise (Co,) [unit] of one model pixel, if it were observed with the same exposure."""
+        area = abs(np.linalg.det(self.mapping.matrix))
+        return np.full(len(self.data), 1 / np.sqrt(area))
 
     def observe(self, images):
         """Unit-spectrum images (n, Co, My, Mx) of model images (n, Ny, Nx).
@@ -45,16 +72,11 @@ class WhitenedView:
         return self.whiten(self.observe(images))
 
 
-def _padded(images, shape):
-    """Images (..., Ny, Nx) with zeros beyond, up to the last two of `shape`."""
-    more = [(0, n - m) for n, m in zip(shape[-2:], images.shape[-2:], strict=True)]
-    return np.pad(images, [(0, 0)] * (images.ndim - 2) + more)
+def whitened_view(frame, padded, observation, pad, device, dtype, *, private) -> WhitenedView:
+    """The view of an Observation on a frame that is `padded`, itself padded to multiples of `pad`.
 
-
-def whitened_view(frame, padded, observation, pad, device, dtype, *, private):
-    """An observation in units of its channels' noise, padded, and these units (Co,).
-
-    Pixels beyond the frame itself have no weight, though they may lie on the padded one.
+    private: with an operator of its own, which may be shifted; else one that equal observations
+        share
     """
     shape = tuple(-(-n // pad) * pad for n in observation.data.shape[1:])
     grid = observation.grid
@@ -69,28 +91,17 @@ def whitened_view(frame, padded, observation, pad, device, dtype, *, private):
         extent=frame.shape,
         private=private,
     )
-    low = [(0, 0)] + [(0, n - m) for n, m in zip(shape, observation.data.shape[1:], strict=True)]
-    data, weights = np.pad(observation.data, low), np.pad(observation.weights, low)
+    data, weights = _padded(observation.data, shape), _padded(observation.weights, shape)
+    return WhitenedView.of(op, frame, data, weights)
+
+
+def _typical_noise(weights):
+    """Median noise of the pixels that have a weight; 1 where none has."""
     seen = weights > 0
-    unit = np.array(
-        [
-            1 / np.sqrt(np.median(w[s])) if s.any() else 1.0
-            for w, s in zip(weights, seen, strict=True)
-        ]
-    )
-    root = np.sqrt(weights) * unit[:, None, None] * covered_part(op, frame)
-    return WhitenedView(op, root, data / unit[:, None, None]), unit
+    return 1 / np.sqrt(np.median(weights[seen])) if seen.any() else 1.0
 
 
-def covered_part(op, frame):
-    """Observed pixels (My, Mx) whose centre lies on the frame itself, not on its padding."""
-    return replace(op.mapping, shape_in=frame.shape).covered
-
-
-def pixel_noise(views):
-    """Noise (C,) of one model pixel per channel, in the views' units."""
-    noise = []
-    for view in views:
-        area = abs(np.linalg.det(view.op.mapping.matrix))
-        noise += [1 / np.sqrt(area)] * view.data.shape[0]
-    return np.array(noise)
+def _padded(images, shape):
+    """Images (..., Ny, Nx) with zeros beyond, up to the last two of `shape`."""
+    more = [(0, n - m) for n, m in zip(shape[-2:], images.shape[-2:], strict=True)]
+    return np.pad(images, [(0, 0)] * (images.ndim - 2) + more)

@@ -42,7 +42,7 @@ def plot_deblended(path, result, *, title=""):
         top = ABOVE + i * (height + BELOW)
         for k, (image, note) in enumerate(zip(_pictures(result, i, chosen), notes, strict=True)):
             axes = add_panel(figure, GAP + k * (width + GAP), top, width, height)
-            show_image(axes, image, o.grid, result.frame.grid, residual=k == 2)
+            show_image(axes, image, result.footprints[i].mapping, residual=k == 2)
             _mark(axes, result, numbers=k == 1)
             if i == 0:
                 axes.set_title(COLUMNS[k], color=INK, fontsize=10, pad=5)

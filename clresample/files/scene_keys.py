@@ -86,7 +86,7 @@ TABLES = {
     "sources": {
         "catalogue": FILE,
         "format": TEXT,
-        **dict.fromkeys(("ra", "dec", "y", "x", "name", "type", "components"), TEXT),
+        **dict.fromkeys(("ra", "dec", "y", "x", "observation", "name", "type", "components"), TEXT),
     },
     "detection": {
         "threshold": POSITIVE,

@@ -11,17 +11,17 @@ from ..sky.sources import Extended, Point
 
 KINDS = {"point": Point, "extended": Extended}
 # what columns may hold; each is looked for under this name unless the scene file gives another
-COLUMNS = ("ra", "dec", "y", "x", "name", "type", "components")
+COLUMNS = ("ra", "dec", "y", "x", "name", "type", "components", "observation")
 
 
 def read_sources(path, columns=None) -> tuple:
     """Sources of a table: their positions `ra` and `dec` or `y` and `x`, names, types, components.
 
     path: a file that `astropy.table.Table.read` takes
-    columns: {what: column's name} for ra, dec [deg, or the column's own unit], y, x [model px,
-        counted from 0], name, type ("point" or "extended"), components (how many spectra an
-        extended source has); and format: astropy's name of it. What is left out is looked for
-        under its own name
+    columns: {what: column's name} for ra, dec [deg, or the column's own unit], y, x [px, counted
+        from 0], observation (in whose pixels y and x count; none or "" = in the model's), name,
+        type ("point" or "extended"), components (how many spectra an extended source has); and
+        format: astropy's name of it. What is left out is looked for under its own name
     returns a tuple of Point and Extended; sources without a type are extended, with one component
 
     Raises ValueError, one line that names file, column and row.
@@ -91,6 +91,9 @@ def _numbers(path, what, column, unit):
 def _source(found, i, given):
     if "name" in found and found["name"][i] is not np.ma.masked:
         given["name"] = str(found["name"][i])
+    if "observation" in found and "position_px" in given:
+        where = found["observation"][i]
+        given["observation"] = None if where is np.ma.masked else str(where).strip() or None
     kind = str(found["type"][i]).strip().lower() if "type" in found else "extended"
     if kind not in KINDS:
         raise ValueError(f"type is {kind!r}, it takes {' or '.join(KINDS)}")

@@ -12,7 +12,7 @@ from astropy.wcs.utils import wcs_to_celestial_frame
 from ..sky.footprint import open_edge
 from ..sky.observation import ZERO_POINT_UJY
 from .photometry import flux_scale, fluxes
-from .quality import box_chi2, fitted_sources, footprints, labels
+from .quality import box_chi2, fitted_sources, labels
 from .shapes import local_axes, moments, shape
 
 # of a morphology's peak: light at the edge of what was seen is flagged when it is brighter. Fainter
@@ -68,12 +68,11 @@ def catalogue(result, *, magnitudes=False) -> QTable:
     """
     flux, covariance = fluxes(result)
     error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).T)  # (S, C)
-    seen = footprints(result)
     table = QTable()
     table["name"] = [s.name or str(i) for i, s in enumerate(result.sources)]
     positions = result.frame.place(result.sources)
     _add_positions(table, result.frame.grid, positions, "")
-    table["flags"] = _flags(result, flux, error, positions, seen)
+    table["flags"] = _flags(result, flux, error, positions, result.footprints)
     table["flags"].info.description = ", ".join(f"{flag.value} {flag.name}" for flag in Flag)
     with np.errstate(divide="ignore", invalid="ignore"):
         table["snr"] = np.sqrt(np.nansum((flux / error) ** 2, axis=1))
@@ -86,7 +85,7 @@ def catalogue(result, *, magnitudes=False) -> QTable:
         if magnitudes and unit[i] == u.uJy:
             _add_magnitudes(table, channel, flux[:, i] * scale[i], error[:, i] * scale[i])
     for i, label in enumerate(labels(result)):
-        table[f"chi2_{label}"] = box_chi2(result, i, seen[i])
+        table[f"chi2_{label}"] = box_chi2(result, i, result.footprints[i])
     return table
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..sky.footprint import Footprint
-
 
 def summary(result) -> dict:
     """How the fit of a whole blend ended, in plain values that JSON can hold.
@@ -18,7 +16,7 @@ def summary(result) -> dict:
     """
     chi2, n_pixels = {}, {}
     for i, (observation, footprint) in enumerate(
-        zip(result.observations, footprints(result), strict=True)
+        zip(result.observations, result.footprints, strict=True)
     ):
         used = footprint.used
         terms = chi2_terms(result, i, used)
@@ -42,11 +40,6 @@ def summary(result) -> dict:
         },
         "seconds": {stage: float(t) for stage, t in result.seconds.items()},
     }
-
-
-def footprints(result) -> list[Footprint]:
-    """Where each observation's pixels lie in the model frame."""
-    return [Footprint.of(result, i) for i in range(len(result.observations))]
 
 
 def labels(result) -> list[str]:

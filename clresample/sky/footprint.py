@@ -28,13 +28,6 @@ class Footprint:
     mapping: Mapping
     shift: np.ndarray
 
-    @classmethod
-    def of(cls, result, i_observation):
-        """Footprint of one observation of a fitted blend, at its fitted shift."""
-        observation = result.observations[i_observation]
-        mapping = observation.grid.map_to(result.frame.grid)
-        return cls(observation, mapping, np.asarray(result.shifts[i_observation], np.float64))
-
     @cached_property
     def used(self) -> np.ndarray:
         """Pixels (C, My, Mx) that a fit looks at: those with a weight, on the frame."""

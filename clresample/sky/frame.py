@@ -35,9 +35,14 @@ class Frame:
         """(Ny, Nx) [px]."""
         return self.grid.shape
 
-    def place(self, sources) -> np.ndarray:
-        """Positions (S, 2) [px] of the sources: (y, x); NaN where the projection has no place."""
-        return np.array([source.pixel(self.grid) for source in sources]).reshape(-1, 2)
+    def place(self, sources, observations=(), shifts=None) -> np.ndarray:
+        """Positions (S, 2) [px] of the sources: (y, x); NaN where the projection has no place.
+
+        observations: those in whose pixels sources may be given; shifts (n_observations, 2)
+        [model px] of them: see `Source.pixel`
+        """
+        found = [source.pixel(self.grid, observations, shifts) for source in sources]
+        return np.array(found).reshape(-1, 2)
 
     def inside(self, positions) -> np.ndarray:
         """Which positions (..., 2) [px] lie on a pixel of the frame: -1/2 <= x < N - 1/2.

@@ -2,24 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 
+class SourceWarning(UserWarning):
+    """A source where the images show nothing: its position is probably not what was meant."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """A source at one position, given on the sky or in model pixels.
+    """A source at one position, given on the sky, in an observation's or in the model's pixels.
 
     sky_deg (2,) [deg]: right ascension and declination (for a flat sky: y, x [arcsec])
-    position_px (2,) [px]: (y, x) in the model frame; exactly one of the two is given
+    position_px (2,) [px]: (y, x), the centre of the first pixel at (0, 0); exactly one of the two
+        is given
+    observation: the name of the Observation whose pixels position_px counts (its label, where it
+        has no name); None = those of the model frame. By default that is the union of all
+        footprints (see `model_frame`), of which few users know the first pixel: give the frame
+        too, or the observation's name
     name: how the catalogue calls it; None numbers it
 
-    Raises ValueError where not exactly one finite position is given.
+    Raises ValueError where not exactly one finite position is given, and for an observation beside
+    sky_deg.
     """
 
     sky_deg: tuple[float, float] | None = None
     position_px: tuple[float, float] | None = None
+    observation: str | None = None
     name: str | None = None
 
     def __post_init__(self):
@@ -32,17 +43,60 @@ class Source:
         position = np.asarray(getattr(self, name), dtype=np.float64)
         if position.shape != (2,) or not np.isfinite(position).all():
             raise ValueError(f"{name} is {getattr(self, name)}, it takes two finite numbers")
+        if self.observation is not None and self.position_px is None:
+            raise ValueError(
+                f"observation is {self.observation!r}, but the position is on the sky: "
+                "it goes with position_px"
+            )
 
-    def pixel(self, grid) -> np.ndarray:
-        """Position (2,) [px]: (y, x) on the model's grid."""
-        if self.position_px is not None:
+    def pixel(self, grid, observations=(), shifts=None) -> np.ndarray:
+        """Position (2,) [px]: (y, x) on the model's grid; NaN where its projection holds none.
+
+        observations: among which `observation` is looked up
+        shifts (n_observations, 2) [model px]: of their pixels, None = none
+        ValueError: `observation` names none of them, or more than one
+        """
+        if self.sky_deg is not None:
+            return grid.pixel(*self.sky_deg)
+        if self.observation is None:
             return np.asarray(self.position_px, dtype=np.float64)
-        return grid.pixel(*self.sky_deg)
+        i = self._named(observations)
+        observations[i].grid.check_like(grid, "frame")
+        y, x = np.asarray(self.position_px, dtype=np.float64)
+        position = observations[i].grid.positions_in(grid, y, x)
+        return position if shifts is None else position + shifts[i]
+
+    def on_frame(self, position) -> Source:
+        """This source with its position (2,) [px] in the model frame, if an observation's it was.
+
+        ValueError: the position is not finite: the frame's projection holds no such point.
+        """
+        if self.observation is None:
+            return self
+        if not np.isfinite(position).all():
+            raise ValueError(
+                f"position_px {self.position_px} of observation {self.observation!r} has no place "
+                "in the model frame's projection"
+            )
+        y, x = map(float, position)
+        return replace(self, position_px=(y, x), observation=None)
+
+    def _named(self, observations):
+        """Index of the one observation of this name or label."""
+        found = [i for i, o in enumerate(observations) if self.observation in (o.name, o.label)]
+        if len(found) == 1:
+            return found[0]
+        labels = ", ".join(repr(o.label) for o in observations) or "none"
+        how_many = "no observation has" if not found else f"{len(found)} observations have"
+        raise ValueError(
+            f"a source's observation is {self.observation!r}, but {how_many} this name: "
+            f"given are {labels}"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Point(Source):
-    """A star: the model's PSF at the position, one spectrum.
+    """A star: the model's PSF at the position, one spectrum. For the position see `Source`.
 
     free: let the position move by a sub-pixel shift in the fit
     """
@@ -53,6 +107,8 @@ class Point(Source):
 @dataclass(frozen=True, kw_only=True)
 class Extended(Source):
     """A galaxy: `n_components` morphologies about one centre, each with a spectrum of its own.
+
+    For the position see `Source`.
 
     profile (Ny, Nx) [1]: what its one morphology is expected to look like under the model's PSF, on
         the frame's pixels, non-negative; None = a smooth profile fitted to the data

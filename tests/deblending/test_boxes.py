@@ -26,18 +26,6 @@ def test_boxes_do_not_overlap(boxes):
     np.testing.assert_array_equal(boxes.table[:, 5:7], CENTERS)
 
 
-def test_boxes_move_with_their_values(boxes):
-    rng = np.random.default_rng(4)
-    images = [rng.random(shape, np.float32) for shape in boxes.shape]
-    grown = Boxes(boxes.scene, boxes.origin - 2, boxes.shape + 5, boxes.center + 2)
-    flat = boxes.pack(images)
-    moved = boxes.move(flat, grown)
-    for image, new in zip(images, grown.unpack(moved), strict=True):
-        np.testing.assert_array_equal(new[2:-3, 2:-3], image)
-    assert np.isclose(moved.sum(), flat.sum(), rtol=1e-5)
-    np.testing.assert_array_equal(grown.move(moved, boxes), flat)
-
-
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [

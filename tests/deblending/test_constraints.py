@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from helpers.morphologies import DTYPES, apply, eps, many_boxes, morphologies
 
-from clresample.deblending.solver import reference_prox as ref
+from clresample.deblending.solver import reference as ref
 from clresample.deblending.solver.boxes import Boxes
 from clresample.deblending.solver.constraints import (
     L0,

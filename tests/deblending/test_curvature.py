@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers.scenes import BOXES, GALAXIES, blend, fit, problem
+from helpers.scenes import GALAXIES, blend, fit
+from helpers.solver import BOXES, changed, posed
 
 from clresample import get_device
 from clresample.deblending.settings import Settings
@@ -14,24 +15,24 @@ from clresample.deblending.solver.prior import Prior
 @pytest.mark.parametrize("prior", [Prior(), None])
 def test_damping_bounds_the_hessian_and_is_no_larger_than_it_must_be(prior, monkeypatch):
     monkeypatch.setattr(module, "NOISE_GRADIENT", np.inf)  # the bound alone
-    p = problem(get_device(), boxes=BOXES[:1])
-    base = p.base[0]
+    scene, state = posed(get_device(), boxes=BOXES[:1])
+    profile = scene.profile[0]
     columns = []
-    for unit in np.eye(base.size):
-        image = module._spread(unit.reshape(base.shape), base, prior)
-        (pull,) = module._pull(p, module._model(p, [image]), prior, rest=False)
+    for unit in np.eye(profile.size):
+        image = module._spread(unit.reshape(profile.shape), profile, prior)
+        (pull,) = module._pull(scene, state, [image], prior, rest=False)
         columns.append(pull.ravel())
-    hessian = np.array(columns) + (prior is not None) * np.eye(base.size)
+    hessian = np.array(columns) + (prior is not None) * np.eye(profile.size)
     largest = np.linalg.eigvalsh((hessian + hessian.T) / 2)[-1]
-    bound = damping(p, prior)[0]
+    bound = damping(scene, state, prior)[0]
     assert largest <= bound <= 3 * largest
 
 
 def test_damping_falls_where_the_start_is_far_from_the_data():
-    p = problem(get_device(), boxes=BOXES[:1])
-    near = damping(p, Prior())[0]
-    p.data = [d + 1e4 for d in p.data]
-    assert damping(p, Prior())[0] < 1e-3 * near
+    scene, state = posed(get_device(), boxes=BOXES[:1])
+    near = damping(scene, state, Prior())[0]
+    far = changed(scene, state, data=[d + 1e4 for d in scene.data])
+    assert damping(*far, Prior())[0] < 1e-3 * near
 
 
 @pytest.mark.parametrize("flux", [10, 100])

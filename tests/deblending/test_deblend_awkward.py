@@ -35,7 +35,7 @@ def test_a_source_at_the_very_edge(device, position):
     assert result.components[0].flux[0] > 20 and chi2(result) < 1.3
 
 
-def test_a_source_outside_is_told_and_left_out(device):
+def test_a_source_outside_is_reported_and_left_out(device):
     b = blend()
     more = (b.sources[0], Extended(position_px=(15, 35.6)), b.sources[1])
     result = deblend(b.observations, more, frame=b.frame, device=device, settings=EXACT)
@@ -49,7 +49,7 @@ def test_a_source_outside_is_told_and_left_out(device):
 
 
 def test_no_sources_at_all(device):
-    """Nothing to fit is a mistake that is told, or a result without components."""
+    """Nothing to fit is a mistake that is named, or a result without components."""
     b = blend()
     try:
         result = deblend(b.observations, [], frame=b.frame, device=device)
@@ -60,7 +60,7 @@ def test_no_sources_at_all(device):
 
 
 def test_a_source_on_masked_pixels(device):
-    """Its core unseen by all, wings and the other instrument's pixels tell of it."""
+    """Its core unseen by all, its wings and the other instrument's pixels show it."""
     b = blend(BRIGHT)
     masked = []
     for o, (y, x), r in zip(b.observations, ((13, 12), (6, 6)), (1, 0), strict=True):

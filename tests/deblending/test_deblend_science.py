@@ -133,7 +133,7 @@ def test_a_source_that_only_rubin_sees_starts_right():
     rubin = observe(RUBIN_UGRIZY, RUBIN_UGRIZY.grid(n_rubin), profiles, positions, ugrizy, rng)
     scene = SimulatedScene(
         seed=0, euclid=euclid, rubin=rubin, profiles=tuple(profiles), galaxies=None,
-        positions_arcsec=positions, positions_deg=None,
+        positions_arcsec=positions,
     )  # fmt: skip
     assert (euclid.truth[0] * euclid.counts[0]).max() < 0.1 * EUCLID_VIS.noise_sigma[0]
 

@@ -6,7 +6,7 @@ from helpers.morphologies import DTYPES, KINDS, apply, eps, many_boxes, morpholo
 from helpers.tuning import tune
 from scipy.optimize import nnls
 
-from clresample.deblending.solver import reference_prox as ref
+from clresample.deblending.solver import reference as ref
 from clresample.deblending.solver.boxes import Boxes
 from clresample.deblending.solver.constraints import (
     Chain,

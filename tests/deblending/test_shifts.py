@@ -1,7 +1,5 @@
 """Shifts between observations are found during a fit, alone and in batches."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -9,6 +7,7 @@ from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.blend import Blend
 from clresample.deblending.settings import Settings
 from clresample.deblending.shifts import shift_steps
+from clresample.deblending.solver.scene import Scene, State
 from clresample.resampling.cache import cached_resampler
 from clresample.sky.frame import model_frame
 from clresample.sky.grid import Grid
@@ -96,19 +95,19 @@ def test_the_step_is_the_shift_of_a_right_model(device):
     """For a model that is right but for the shift, a first step goes all the way."""
     shift = np.array([0.15, -0.1])
     b = blend(shift, noise=1e-2)
-    problem = truth(b, device)
-    np.testing.assert_allclose(shift_steps(problem)[1], shift, atol=0.01)
-    problem.weights[1] = 0 * problem.weights[1]
-    assert np.abs(shift_steps(problem)[1]).max() < 1e-3
+    scene, state = truth(b, device)
+    np.testing.assert_allclose(shift_steps(scene, state)[1], shift, atol=0.01)
+    scene.weights[1] = 0 * scene.weights[1]
+    assert np.abs(shift_steps(scene, state)[1]).max() < 1e-3
 
 
 def truth(b, device):
-    """What `shift_steps` reads of a problem whose model is right."""
+    """A Scene and State whose model is right."""
     y, x = np.indices(SHARP.shape)
     galaxies = ((25, 25, 9e3, 2), (28, 31, 4e3, 4), (40, 45, 6e3, 2.5))
     morphs = [np.exp(-((y - a) ** 2 + (x - c) ** 2) / (2 * s**2)) for a, c, _, s in galaxies]
     peaks = np.array([flux / (2 * np.pi * s**2) for _, _, flux, s in galaxies])
-    return SimpleNamespace(
+    scene = Scene(
         shape=SHARP.shape,
         extent=SHARP.shape,
         ops=[
@@ -118,7 +117,10 @@ def truth(b, device):
         data=[o.data for o in b.observations],
         weights=[o.weights for o in b.observations],
         origin=np.zeros((3, 2), int),
-        morph=morphs,
-        spectra=np.repeat(peaks[:, None], 3, axis=1),
-        sky=np.zeros(3),
+        center=np.array([(25, 25), (28, 31), (40, 45)]),
+        profile=morphs,
+        fixed=np.zeros(3, bool),
+        scale=np.ones((3, 3)),
     )
+    spectra = np.repeat(peaks[:, None], 3, axis=1)
+    return scene, State([0 * m for m in morphs], morphs, spectra, np.zeros(3))

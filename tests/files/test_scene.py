@@ -262,3 +262,14 @@ def test_pixels_are_taken_where_they_are_asked_for(folder, tmp_path):
     (on_sky,) = read_sources(tmp_path / "both.ecsv")
     (on_pixels,) = read_sources(tmp_path / "both.ecsv", {"y": "row"})
     assert on_sky.sky_deg == (150.0, 2.0) and on_pixels.position_px == (6.0, 5.0)
+
+
+def test_pixels_may_be_those_of_an_observation(folder, tmp_path):
+    """A column names it; positions on the sky need none."""
+    columns = {"y": [4.0, 5.0], "x": [5.0, 6.0], "image": ["cam", ""], "ra": [1.0] * 2}
+    Table(columns | {"dec": [2.0] * 2}).write(tmp_path / "list.ecsv")
+    found = read_sources(tmp_path / "list.ecsv", {"y": "y", "observation": "image"})
+    assert [s.observation for s in found] == ["cam", None]
+    assert found[0].position_px == (4.0, 5.0)
+    on_sky = read_sources(tmp_path / "list.ecsv", {"ra": "ra", "observation": "image"})
+    assert [s.observation for s in on_sky] == [None, None]

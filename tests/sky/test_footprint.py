@@ -7,7 +7,7 @@ from helpers.blends import (
 )
 from helpers.headers import SIP, grid_of, header
 
-from clresample.sky.footprint import Footprint, open_edge
+from clresample.sky.footprint import open_edge
 
 
 def test_locate_inverts_the_mapping_of_a_distorted_image():
@@ -17,7 +17,7 @@ def test_locate_inverts_the_mapping_of_a_distorted_image():
     seen = grid_of(cards, (40, 44))
     shifts = np.array([[0.4, -1.3]])
     result = one_source(grid=grid, observations=[observe(seen, ("g", "r"))], shifts=shifts)
-    footprint = Footprint.of(result, 0)
+    (footprint,) = result.footprints
     assert footprint.mapping.geometry == "distorted"
     truth = np.array([[20.0, 22.0], [8.3, 30.6], [25.2, 11.9]])
     points = grid.pixel(*seen.sky(*truth.T)) + [0.4, -1.3]
@@ -29,5 +29,4 @@ def test_locate_inverts_the_mapping_of_a_distorted_image():
 def test_the_open_edge_of_a_frame_that_is_all_seen_is_its_border():
     expected = np.ones((60, 70), bool)
     expected[1:-1, 1:-1] = False
-    footprint = Footprint.of(one_source(), 0)
-    np.testing.assert_array_equal(open_edge([footprint], (60, 70)), expected)
+    np.testing.assert_array_equal(open_edge(one_source().footprints, (60, 70)), expected)

@@ -10,8 +10,6 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
-from ...sky.extent import shared_part
-
 # Elements between possible starts of boxes: the widest OpenCL vector, one 64-byte cache line of
 # float32. Offsets are stored in these units, so that int32 reaches 2^35 elements.
 ALIGN = 16
@@ -99,24 +97,6 @@ class Boxes:
             for start, (ny, nx) in zip(self.offset, self.shape.tolist(), strict=True)
         ]
 
-    def move(self, flat, boxes_new):
-        """The same values in other boxes of the same sources: cropped, and zero where they grew.
-
-        flat (size,): values in these boxes; returns (boxes_new.size,) of the same type
-        """
-        if not np.array_equal(self.scene, boxes_new.scene):
-            raise ValueError(
-                f"boxes_new holds other sources: {len(boxes_new)} of scenes {boxes_new.scene}, "
-                f"here are {len(self)} of scenes {self.scene}"
-            )
-        out = np.zeros(boxes_new.size, flat.dtype)
-        pairs = zip(self.unpack(flat), boxes_new.unpack(out), strict=True)
-        for i_source, (old, new) in enumerate(pairs):
-            origins = self.origin[i_source], boxes_new.origin[i_source]
-            there, here = shared_part(origins[0], old.shape, origins[1], new.shape)
-            new[here] = old[there]
-        return out
-
     def put(self, device):
         """The boxes with their table on a device."""
         return DeviceBoxes(self, device)
@@ -173,6 +153,7 @@ def _integers(name, values, n_dim):
 
 
 def _refuse(bad, message, values, others=None):
+    """ValueError for the first source of `bad` (S,): message with its values and its index."""
     if bad.any():
         i_source = int(np.argmax(bad))
         more = () if others is None else (tuple(others[i_source].tolist()),)

@@ -9,7 +9,7 @@ factor (S,): device array of morphs' type or None; what the normalisations divid
     source by (1 without one): multiply the spectrum by it, and the model stays
 
 Parameters are numbers, or arrays (S,) with one value per source. The NumPy references are in
-reference_prox.py; sources: Parikh & Boyd 2014, Melchior et al. 2018 (arXiv:1802.10157) and 2019
+reference.py; sources: Parikh & Boyd 2014, Melchior et al. 2018 (arXiv:1802.10157) and 2019
 (arXiv:1910.10094).
 """
 
@@ -50,14 +50,18 @@ class MonotoneWeights(enum.IntEnum):
 
 
 class Prox:
-    """An operator; what is done is set by `_launches`, compiled once per boxes and type."""
+    """An operator; what is done is set by `_launches`, compiled once per boxes and type.
+
+    parameters: by name, as they were given
+    name (of those that are steps): of the step in prox.cl
+    """
 
     def __init__(self, **parameters):
-        self._parameters = parameters
+        self.parameters = parameters
         self._bound = weakref.WeakKeyDictionary()
 
     def __repr__(self):
-        values = ", ".join(f"{name}={value!r}" for name, value in self._parameters.items())
+        values = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
         return f"{type(self).__name__}({values})"
 
     def prox(self, morphs, boxes, *, step=1.0, active=None, factor=None):
@@ -81,16 +85,17 @@ class Prox:
         for i_launch, launch in enumerate(bound[morphs.dtype]):
             launch(morphs, active, step, factor, i_launch == 0)
 
-    def _steps(self):
+    def steps(self):
         """The operators that are one step of prox.cl each, or stand alone."""
         return [self]
 
-    def _values(self):
+    def values(self):
         """The two parameters of the step, each {its name: number or (S,)} or empty."""
         return {"on": 1}, {}
 
     def _launches(self, boxes, dtype):
-        return [FusedSteps(self._steps(), boxes, dtype)]
+        """What is launched, in order, for boxes and morphologies of a type."""
+        return [FusedSteps(self.steps(), boxes, dtype)]
 
 
 class Positivity(Prox):
@@ -110,8 +115,9 @@ class L1(Prox):
     def __init__(self, strength):
         super().__init__(strength=strength)
 
-    def _values(self):
-        return {"strength": _at_least_0("strength", self._parameters["strength"])}, {}
+    def values(self):
+        """The threshold for a step of 1."""
+        return {"strength": _at_least_0("strength", self.parameters["strength"])}, {}
 
 
 class L0(L1):
@@ -136,8 +142,9 @@ class Symmetry(Prox):
     def __init__(self, strength=1.0):
         super().__init__(strength=strength)
 
-    def _values(self):
-        return {"strength": _at_least_0("strength", self._parameters["strength"], 1)}, {}
+    def values(self):
+        """The share of the antisymmetric part that is taken off."""
+        return {"strength": _at_least_0("strength", self.parameters["strength"], 1)}, {}
 
 
 class MaxNorm(Prox):
@@ -157,7 +164,7 @@ class Monotone(Prox):
 
     j runs over the neighbours (of 8) nearer to the centre. A heuristic, not a projection: it only
     lowers pixels, so noise biases it low; MonotoneProjection projects onto the same images.
-    weights: a Weights, or (S,) of them; gradient: g, number or (S,), 0 <= g < 1
+    weights: of MonotoneWeights, one or (S,); gradient: g, number or (S,), 0 <= g < 1
     """
 
     name = "monotone"
@@ -165,11 +172,12 @@ class Monotone(Prox):
     def __init__(self, *, weights=MonotoneWeights.ANGLE, gradient=0.0):
         super().__init__(weights=weights, gradient=gradient)
 
-    def _values(self):
-        weights = np.asarray(self._parameters["weights"])
+    def values(self):
+        """How neighbours are weighed, and the least relative fall per pixel."""
+        weights = np.asarray(self.parameters["weights"])
         if not np.isin(weights, list(MonotoneWeights)).all():
             raise ValueError(f"weights is {weights}, it takes {[str(w) for w in MonotoneWeights]}")
-        gradient = self._parameters["gradient"]
+        gradient = self.parameters["gradient"]
         return {"weights": weights}, {"gradient": _at_least_0("gradient", gradient, 1)}
 
 
@@ -197,14 +205,15 @@ class MonotoneProjection(Monotone):
         tolerance=1e-5,
     ):
         super().__init__(weights=weights, gradient=gradient)
-        self._parameters |= {
+        self.parameters |= {
             "positive": positive,
             "n_iterations": n_iterations,
             "tolerance": tolerance,
         }
 
     def _launches(self, boxes, dtype):
-        sweep = Monotone(weights=self._parameters["weights"], gradient=self._parameters["gradient"])
+        """The projection, and a sweep that makes its answer exactly monotone."""
+        sweep = Monotone(weights=self.parameters["weights"], gradient=self.parameters["gradient"])
         return [ProjectionLaunch(self, boxes, dtype), FusedSteps([sweep], boxes, dtype)]
 
 
@@ -218,12 +227,14 @@ class Chain(Prox):
     def __repr__(self):
         return f"Chain({', '.join(map(repr, self._proxes))})"
 
-    def _steps(self):
-        return list(itertools.chain.from_iterable(prox._steps() for prox in self._proxes))
+    def steps(self):
+        """The steps of all of them, in order."""
+        return list(itertools.chain.from_iterable(prox.steps() for prox in self._proxes))
 
     def _launches(self, boxes, dtype):
+        """As few launches as there are projections and runs of steps between them."""
         launches = []
-        for alone, steps in itertools.groupby(self._steps(), _stands_alone):
+        for alone, steps in itertools.groupby(self.steps(), _stands_alone):
             if alone:
                 launches += [launch for s in steps for launch in s._launches(boxes, dtype)]
             else:
@@ -236,10 +247,12 @@ class Chain(Prox):
 
 
 def _stands_alone(prox):
+    """Whether an operator is no step of prox.cl, but a kernel of its own."""
     return isinstance(prox, MonotoneProjection)
 
 
 def _at_least_0(name, value, most=np.inf):
+    """A parameter as an array; ValueError unless it lies between 0 and `most`."""
     value = np.asarray(value)
     if not ((value >= 0) & (value <= most)).all():
         raise ValueError(f"{name} is {value}, it must lie between 0 and {most}")

@@ -9,20 +9,23 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Prior:
-    """What is expected of a morphology: S = base + alpha sqrt(base) K z, z unit normal.
+    """What is expected of a morphology: S = p + alpha sqrt(p) K z, z unit normal.
 
-    The structure of galaxies is made of clumps, whose number, and so the variance, follows light.
+    p is the smooth profile that is expected. The structure of galaxies is made of clumps, whose
+    number, and so the variance, follows the light: hence the root.
 
-    alpha: scatter of the brightest pixel about its expected profile, relative
-    correlation_px [model px]: Gaussian sigma of the kernel K that correlates neighbours
+    alpha [1]: scatter of the brightest pixel about its expected value, relative to it; larger ones
+        let more of the noise into the morphology
+    correlation_px [model px]: Gaussian sigma of the kernel K that correlates neighbours; larger
+        ones keep the structure smoother
     """
 
     alpha: float = 0.1
     correlation_px: float = 2.0
 
-    def amplitude(self, base) -> np.ndarray:
-        """Scatter of a profile's pixels: alpha sqrt(base); 0 where a star's rings are negative."""
-        return self.alpha * np.sqrt(np.maximum(base, 0))
+    def amplitude(self, profile) -> np.ndarray:
+        """Scatter of a profile's pixels: alpha sqrt(p); 0 where a star's rings are negative."""
+        return self.alpha * np.sqrt(np.maximum(profile, 0))
 
     @property
     def taps(self) -> np.ndarray:

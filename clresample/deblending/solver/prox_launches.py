@@ -58,7 +58,7 @@ class ProjectionLaunch:
         given |= {name: device.zeros(size, dtype) for name in ("y", "l", "v", "g", "move")}
         self.project = device.launcher("project.cl", "project", **macros).bind(
             **given,
-            **{name: prox._parameters[name] for name in ("positive", "n_iterations", "tolerance")},
+            **{name: prox.parameters[name] for name in ("positive", "n_iterations", "tolerance")},
         )
 
     def __call__(self, morphs, active, step, factor, first):
@@ -69,7 +69,7 @@ class ProjectionLaunch:
 def parameter_table(prox, n_sources):
     """The step's two parameters per source (2, S)."""
     table = np.zeros((2, n_sources))
-    for row, named in zip(table, prox._values(), strict=True):
+    for row, named in zip(table, prox.values(), strict=True):
         for name, value in named.items():
             if np.shape(value) not in ((), (n_sources,)):
                 raise ValueError(f"{name} has shape {np.shape(value)} for {n_sources} sources")

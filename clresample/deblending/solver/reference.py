@@ -1,8 +1,13 @@
-"""The proximal operators in NumPy, written from their definitions: what the kernels must answer.
+"""The solver's kernels in NumPy, written from their definitions: what they must answer in tests.
 
-Every function takes one image x (Ny, Nx) and returns a new one of the same type. Where a `center`
-is asked for it is the pixel (cy, cx). Sources: Parikh & Boyd 2014 for the proximal operators;
-Melchior et al. 2018 (arXiv:1802.10157) for the monotone sweep and the symmetry.
+First the iteration of one scene (scene.cl, update.cl), in float64: S sources with arrays (ny, nx),
+C channels. The model itself and the gathering of its gradients are in scene_model.py, which the
+library uses too.
+
+Then the constraints (prox.cl, project.cl): every function takes one image x (Ny, Nx) and returns a
+new one of the same type. Where a `center` is asked for it is the pixel (cy, cx). Sources: Parikh &
+Boyd 2014 for the proximal operators; Melchior et al. 2018 (arXiv:1802.10157) for the monotone sweep
+and the symmetry; Melchior et al. 2019 (arXiv:1910.10094) for proximal AMSGrad.
 """
 
 from __future__ import annotations
@@ -11,22 +16,48 @@ import numpy as np
 
 from .constraints import MonotoneWeights
 
-__all__ = [
-    "NEIGHBOURS",
-    "l0",
-    "l1",
-    "max_norm",
-    "monotone_projection",
-    "monotone_sweep",
-    "monotone_violation",
-    "monotone_weights",
-    "positivity",
-    "sum_norm",
-    "symmetry",
-]
-
 # The 8 neighbours of a pixel (dy, dx), in row order.
 NEIGHBOURS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
+
+
+def residual(image, data, weights, sky):
+    """w r (C, My, Mx) with r = image + sky - data; loss 1/2 sum w r^2; pull (C,) = sum w r."""
+    r = image + sky[:, None, None] - data
+    return weights * r, 0.5 * (weights * r**2).sum(), (weights * r).sum(axis=(1, 2))
+
+
+def blur(image, taps):
+    """K image: `taps` along both axes, zero beyond the image's edges."""
+    for axis in (0, 1):
+        out, radius, n = np.zeros(image.shape), len(taps) // 2, image.shape[axis]
+        for t, k in zip(range(-radius, radius + 1), taps, strict=True):
+            i = np.arange(max(0, -t), min(n, n - t))
+            if axis == 0:
+                out[i] += k * image[i + t]
+            else:
+                out[:, i] += k * image[:, i + t]
+        image = out
+    return image
+
+
+def form(profile, amplitude, latent, taps):
+    """S = profile + amplitude o K z."""
+    return profile + amplitude * blur(latent, taps)
+
+
+def latent_gradient(d_morph, morph, amplitude, latent, taps):
+    """dL/dz = K (amplitude o dS where S > 0) + z."""
+    return blur(np.where(morph > 0, amplitude * d_morph, 0), taps) + latent
+
+
+def amsgrad(gradient, moments, i_step, *, beta1=0.9, beta2=0.999, epsilon=1e-8):
+    """Direction of step i_step = 1, 2, ..., x <- x - rate direction, and the moments (m, v, h)."""
+    m, v, h = moments
+    m = beta1 * m + (1 - beta1) * gradient
+    v = beta2 * v + (1 - beta2) * gradient**2
+    h = np.maximum(h, v)
+    size = np.sqrt(h / (1 - beta2**i_step)) + epsilon
+    return m / (1 - beta1**i_step) / size, (m, v, h)
 
 
 def positivity(x):
@@ -74,8 +105,8 @@ def symmetry(x, center, strength=1.0):
 def monotone_weights(shape, center, weights=MonotoneWeights.ANGLE):
     """Weights w (8, Ny, Nx) of the neighbours (order NEIGHBOURS) that are nearer to the centre.
 
-    They are those of boxes.Weights, and sum to 1 over the neighbours inside the image, to 0 at the
-    centre.
+    weights: one of MonotoneWeights
+    They sum to 1 over the neighbours inside the image, to 0 at the centre.
     """
     y = np.arange(shape[0])[:, None] - center[0]
     x = np.arange(shape[1])[None, :] - center[1]
@@ -150,6 +181,7 @@ def monotone_projection(
     lower = 0 if positive else -np.inf
 
     def image(dual):
+        """The image that belongs to a dual variable."""
         return np.maximum(target - _columns(w, dual, -1), lower)
 
     dual = ahead = np.zeros(y.shape)

@@ -1,0 +1,192 @@
+"""One step of proximal AMSGrad (Melchior et al. 2019) on all scenes of a batch.
+
+    m <- B1 m + (1 - B1) g,  v <- B2 v + (1 - B2) g^2,  h <- max(h, v)
+    x <- prox(x - step (m / (1 - B1^t)) / (sqrt(h / (1 - B2^t)) + e))
+
+x is z where there is a prior, with g = K (amplitude o dS) + z and S = profile + amplitude o K z,
+else S itself; then the spectra and the sky levels. Kernels in update.cl.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .scene import Memory
+
+# Decay of the moments of gradients and of their squares (Reddi et al. 2018's defaults, as in the
+# paper's solver): an average over the last 10 and the last 1000 iterations.
+BETA1, BETA2 = 0.9, 0.999
+# Part of `Scene.damping` by which steps are damped. That is a bound on the curvature, twice the
+# largest one there is in most scenes (see curvature.py), so all of it would make steps shorter than
+# they need be; with none, steps of one length for all pixels would take a bright source far from a
+# start that fits.
+DAMPING = 0.3
+DECAY = {"B1": BETA1, "B2": BETA2}  # as macros
+N_MOMENTS = 3  # m, v, h
+
+
+@dataclass(frozen=True)
+class StepSizes:
+    """Lengths of the solver's first steps; larger ones are faster, and less steady near the end.
+
+    latent: of z, in units of the prior's scatter; morphology: of S where there is no prior, in
+    units of its maximum, 1; spectrum: in units of `Scene.scale`, a flux's error and 2 % of the flux
+    """
+
+    latent: float = 0.1
+    morphology: float = 0.01
+    spectrum: float = 0.1
+
+
+class AMSGrad:
+    """The steps of one batch. What `Engine` asks of an update: to be made so, `step`, `memories`.
+
+    buffers: the batch, whose latent, morph, spectra and sky are stepped along d_morph, d_spectra
+    gradient: its Gradient, for the sky; states: the scenes' States, for what they remember
+    chain: constraints on the morphologies, applied after every step
+    prior: the Prior of extended sources, or None; step_sizes: StepSizes
+    """
+
+    def __init__(self, buffers, gradient, states, *, chain, prior, step_sizes):
+        self.buffers, self.chain, self.n_steps = buffers, chain, states[0].n_steps
+        b = buffers
+        if states[0].memory is None:
+            self._m_morph = [b.zeros_flat() for _ in range(N_MOMENTS)]
+            self._m_spectra = [b.zeros_like_spectra() for _ in range(N_MOMENTS)]
+        else:
+            memory = [s.memory for s in states]
+            self._m_morph = [b.flat([m.morph[k] for m in memory]) for k in range(N_MOMENTS)]
+            self._m_spectra = [
+                b.put(np.concatenate([m.spectra[k] for m in memory])) for k in range(N_MOMENTS)
+            ]
+        self.factor = b.put(np.ones(b.n_sources))
+        if prior is None:
+            self._morph = _MorphologyStep(b, self._m_morph, self.factor, step_sizes)
+        else:
+            self._morph = _LatentStep(b, self._m_morph, prior, step_sizes)
+        self._spectra = b.launcher("update.cl", "step_spectra", 1, **DECAY).bind(
+            gradient=b.d_spectra,
+            scale=b.scale,
+            spectra=b.spectra,
+            rate=step_sizes.spectrum,
+            **_named(self._m_spectra),
+        )
+        self._sky = _sky_step(b, gradient) if b.scenes[0].fit_sky else None
+
+    def step(self):
+        """Queue one step along the gradients that were queued before."""
+        b = self.buffers
+        self.n_steps += 1
+        t1, t2 = (1 / (1 - beta**self.n_steps) for beta in (BETA1, BETA2))
+        self._spectra((b.spectra.size,), t1=t1, t2=t2)
+        if self._sky is not None:
+            self._sky((b.sky.size,))
+        if not b.n_free:
+            return
+        self._morph.step(t1, t2)
+        self.chain.prox(
+            b.morph, b.boxes, step=self._morph.step_size, active=b.free, factor=self.factor
+        )
+        self._morph.after_constraints()
+
+    def memories(self) -> list[Memory]:
+        """Each scene's moments, back on the host."""
+        b = self.buffers
+        morph = zip(*(b.unpack(a) for a in self._m_morph), strict=True)
+        spectra = zip(*(b.split(b.device.get(a)) for a in self._m_spectra), strict=True)
+        return [Memory(list(m), np.stack(s)) for m, s in zip(morph, spectra, strict=True)]
+
+
+class _LatentStep:
+    """Steps z along K (amplitude o dS) + z, and forms S = profile + amplitude o K z of it."""
+
+    def __init__(self, buffers, moments, prior, step_sizes):
+        b, self.step_size = buffers, step_sizes.latent
+        self._size = b.row_width, b.tallest, b.n_free
+        common = {"active": b.free, "table": b.boxes.table, "taps": b.put(prior.taps)}
+        options = {"RADIUS": len(prior.taps) // 2} | DECAY
+        blurred, weighed = b.zeros_flat(), b.zeros_flat()  # K along x, and what is blurred
+        kernels = ("blur", "step_field", "blur", "form")
+        self._blur_gradient, self._step, self._blur_latent, self._form = (
+            b.launcher("update.cl", name, 3, **options).bind(**common) for name in kernels
+        )
+        for blur, values, weigh in (
+            (self._blur_gradient, b.d_morph, True),
+            (self._blur_latent, b.latent, False),
+        ):
+            blur.bind(v=values, weigh=weigh, amp=b.amplitude, morph=b.morph)
+            blur.bind(weighed=weighed, scratch=blurred)
+        self._step.bind(
+            damping=_damping(b),
+            scratch=blurred,
+            field=b.latent,
+            gradient=b.d_morph,
+            rate=self.step_size,
+            **_named(moments),
+        )
+        self._form.bind(scratch=blurred, base=b.profile, amp=b.amplitude, morph=b.morph)
+
+    def step(self, t1, t2):
+        """Queue a step; t1, t2 = 1 / (1 - B^t) of both moments."""
+        self._blur_gradient(self._size)
+        self._step(self._size, t1=t1, t2=t2)
+        self._blur_latent(self._size)
+        self._form(self._size)
+
+    def after_constraints(self):
+        """Nothing: no constraint beside a prior changes a morphology's scale (see Settings)."""
+
+
+class _MorphologyStep:
+    """Steps S itself along dS; what a normalisation divides it by multiplies its spectrum."""
+
+    def __init__(self, buffers, moments, factor, step_sizes):
+        b, self.step_size = buffers, step_sizes.morphology
+        self._size, self._n_spectra = (b.row_width, b.tallest, b.n_free), b.spectra.size
+        self._step = b.launcher("update.cl", "step_morph", 3, **DECAY).bind(
+            active=b.free,
+            table=b.boxes.table,
+            damping=_damping(b),
+            gradient=b.d_morph,
+            morph=b.morph,
+            rate=self.step_size,
+            **_named(moments),
+        )
+        self._rescale = b.launcher("update.cl", "rescale", 1, **DECAY).bind(
+            factor=factor, n_channels=b.n_channels, spectra=b.spectra
+        )
+
+    def step(self, t1, t2):
+        """Queue a step; t1, t2 = 1 / (1 - B^t) of both moments."""
+        self._step(self._size, t1=t1, t2=t2)
+
+    def after_constraints(self):
+        """Queue the spectra's part of a normalisation."""
+        self._rescale((self._n_spectra,))
+
+
+def _sky_step(buffers, gradient):
+    """The kernel that moves sky levels by a part of a Newton step; launch: (B * C)."""
+    totals = [w.sum(axis=(1, 2)) for s in buffers.scenes for w in s.weights]
+    total = np.concatenate(totals)
+    inverse = np.divide(1, total, where=total > 0, out=np.zeros_like(total))
+    return buffers.launcher("update.cl", "step_sky", 1, **DECAY).bind(
+        n_channels=buffers.n_channels,
+        n_rows=gradient.rows[-1],
+        row0=buffers.device.put(gradient.rows, np.int32),
+        pull=gradient.rows_pull,
+        inverse=buffers.put(inverse),
+        sky=buffers.sky,
+    )
+
+
+def _damping(buffers):
+    """Gradients (S,) under which steps are shorter than the step sizes, on the device."""
+    return buffers.put(DAMPING * np.concatenate([s.damping for s in buffers.scenes]))
+
+
+def _named(moments):
+    """The three moments by their names in update.cl."""
+    return dict(zip("mvh", moments, strict=True))

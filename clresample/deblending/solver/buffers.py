@@ -1,0 +1,116 @@
+"""A batch of scenes on the device: what is uploaded, and how states come back."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...device.tuning import Tuning
+from .boxes import ALIGN, Boxes
+from .scene import State
+
+
+class Buffers:
+    """The arrays of B scenes of one signature, with S sources in all, on one device.
+
+    scenes, device, dtype, tuning: Scenes, Device, NumPy type, Tuning
+    first (B + 1,): int32, the first source of each scene
+    boxes, host_boxes: of all sources, with and without their table on the device
+    free (n_free,): int32, the sources whose morphology is fitted; everyone's are in boxes
+    profile, amplitude, latent, morph, d_morph (boxes.size,): flat, laid out by the boxes: expected
+        morphologies, the scatter that the prior allows about them (0 without one), z, S, dL/dS
+    spectra, d_spectra, scale (S, C); sky (B, C)
+    row_width, tallest [px]: work-items along a row of a box, and rows of the tallest one
+    """
+
+    def __init__(self, scenes, states, device, dtype, prior):
+        self.scenes, self.device, self.dtype = scenes, device, np.dtype(dtype)
+        self.tuning = Tuning.of(device, dtype)
+        counts = [len(s.origin) for s in scenes]
+        self._ends = np.cumsum(counts)
+        self.first = device.put(np.concatenate([[0], self._ends]), np.int32)
+        self.host_boxes = Boxes(
+            np.repeat(np.arange(len(scenes)), counts),
+            np.concatenate([s.origin for s in scenes]),
+            np.array([m.shape for s in scenes for m in s.profile]),
+            np.concatenate([s.center for s in scenes]),
+        )
+        self.boxes = self.host_boxes.put(device)
+        free = np.flatnonzero(~np.concatenate([s.fixed for s in scenes]))
+        self.n_free = len(free)
+        self.free = device.put(free if self.n_free else [0], np.int32)
+        self.tallest = int(self.host_boxes.shape[:, 0].max())
+        self.row_width = 1 if self.tuning.row_loops else int(self.host_boxes.shape[:, 1].max())
+
+        self.profile = self.flat([s.profile for s in scenes])
+        amplitude = prior.amplitude if prior else np.zeros_like
+        self.amplitude = self.flat([[amplitude(p) for p in s.profile] for s in scenes])
+        self.scale = self.put(np.concatenate([s.scale for s in scenes]))
+        self.latent = self.flat([s.latent for s in states])
+        self.morph = self.flat([s.morph for s in states])
+        self.spectra = self.put(np.concatenate([s.spectra for s in states]))
+        self.sky = self.put(np.array([s.sky for s in states]))
+        self.d_morph, self.d_spectra = self.zeros_flat(), self.zeros_like_spectra()
+
+    @property
+    def n_sources(self) -> int:
+        """S, of all scenes."""
+        return len(self.host_boxes)
+
+    @property
+    def n_channels(self) -> int:
+        """C, of all observations of a scene."""
+        return self.spectra.shape[1]
+
+    @property
+    def iterated(self):
+        """What the iterations change, on the device: latent, morph, spectra, sky."""
+        return self.latent, self.morph, self.spectra, self.sky
+
+    def put(self, values):
+        """Values on the device, in the batch's floating type."""
+        return self.device.put(values, self.dtype)
+
+    def flat(self, morphs):
+        """Arrays (ny, nx) of each source of each scene, on the device as one flat buffer."""
+        return self.put(
+            self.host_boxes.pack([m for scene in morphs for m in scene], dtype=self.dtype)
+        )
+
+    def zeros_flat(self):
+        """A flat buffer of zeros, laid out by the boxes."""
+        return self.device.zeros(self.host_boxes.size, self.dtype)
+
+    def zeros_like_spectra(self):
+        """Zeros (S, C)."""
+        return self.device.zeros(self.spectra.shape, self.dtype)
+
+    def launcher(self, file, name, n_axes, *, local_size=None, **defines):
+        """A Launcher of a kernel with `n_axes` launch axes, built for this device's tuning.
+
+        defines: more macros; local_size: None takes the tuning's
+        """
+        return self.device.launcher(
+            file,
+            name,
+            dtype=self.dtype,
+            local_size=local_size or self.tuning.local_size(n_axes),
+            ROWS=self.tuning.row_loops,
+            ALIGN=ALIGN,
+            **defines,
+        )
+
+    def split(self, rows):
+        """Arrays (S, ...) of all sources, one part for each scene."""
+        return np.split(rows, self._ends[:-1])
+
+    def unpack(self, flat):
+        """A flat device buffer on the host: for each scene, its sources' arrays (ny, nx)."""
+        arrays, starts = self.host_boxes.unpack(self.device.get(flat)), [0, *self._ends]
+        return [arrays[a:b] for a, b in zip(starts, self._ends, strict=False)]
+
+    def states(self, iterated, memories, n_steps) -> list[State]:
+        """States of all scenes from device arrays like `iterated`, back on the host."""
+        latent, morph, spectra, sky = iterated
+        spectra, sky = (self.device.get(a).astype(float) for a in (spectra, sky))
+        parts = self.unpack(latent), self.unpack(morph), self.split(spectra), sky, memories
+        return [State(*part, n_steps=n_steps) for part in zip(*parts, strict=True)]

@@ -1,0 +1,123 @@
+"""The loss of a batch of scenes and its gradients, on the device.
+
+    L = 1/2 sum_o |sqrt(w_o) (R_o M + sky - d_o)|^2 + 1/2 |z|^2,      M_c = sum_s A[s, c] S_s
+    G_o = R_o^T w_o (R_o M + sky - d_o)
+    dS_s = sum_c A[s, c] G_c on the box,   dA[s, c] = <S_s, G_c>,   dsky_c = sum of w_o (...)
+
+|z|^2 is the prior's, and its gradient is added where z is stepped (amsgrad.py). The model is
+rendered by `compose` of operators.py and the operators R_o; kernels in scene.cl and update.cl.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...resampling.resampler import Resampler
+from .operators import MorphologyOperator, SpectraOperator
+
+
+class Gradient:
+    """Queues model, residual, gradients and loss of a batch at its present state.
+
+    buffers: the batch; d_morph and d_spectra of it are overwritten
+    with_prior: whether the loss has the term of z
+    rows (C + 1,): observed rows of all channels up to each, the columns of:
+    rows_loss, rows_pull (B, n_rows): 1/2 sum w r^2 and sum w r of each observed row, whose sums
+        over a channel's rows are its loss and dL/dsky
+    best (B,): lowest loss of each scene among those computed with i_loss = 0, infinite before
+    """
+
+    def __init__(self, buffers, with_prior):
+        self.buffers, scenes = buffers, buffers.scenes
+        heights = [op.shape_out[1] for op in scenes[0].ops for _ in range(op.shape_out[0])]
+        self.rows = np.concatenate([[0], np.cumsum(heights)])
+        shape = len(scenes), int(self.rows[-1])
+        self.rows_loss, self.rows_pull = (
+            buffers.device.empty(shape, buffers.dtype) for _ in range(2)
+        )
+        self.best = buffers.put(np.full(len(scenes), np.inf))
+        self.observations = [_ObservedBatch(self, i) for i in range(len(scenes[0].ops))]
+        self._losses = buffers.launcher("update.cl", "losses", 1).bind(
+            first=buffers.first,
+            table=buffers.boxes.table,
+            n_rows=shape[1],
+            rows=self.rows_loss,
+            prior=with_prior,
+            field=buffers.latent,
+            best=self.best,
+        )
+
+    def __call__(self, losses, i_loss):
+        """Queue it all; losses[i_loss] of losses (n, B), on the device, are the scenes' losses."""
+        for observed in self.observations:
+            observed.queue()
+        self._losses((len(self.buffers.scenes),), out=losses, i_loss=i_loss)
+
+    def follow_shifts(self):
+        """Take over the shifts that the scenes' own operators have by now."""
+        for observed in self.observations:
+            observed.follow_shifts()
+
+
+class _ObservedBatch:
+    """One observation of every scene of a batch: data, operator and buffers for its images.
+
+    model (B, Co, Ny, Nx): M, and then its gradient G; image (B, Co, My, Mx): R M, then w r
+    """
+
+    def __init__(self, gradient, i_observation):
+        buffers = self.buffers = gradient.buffers
+        scenes, device, i = buffers.scenes, buffers.device, i_observation
+        self._ops = [scene.ops[i] for scene in scenes]
+        self.op = self._common(self._ops)
+        n, channel = len(scenes), scenes[0].channels()[i].start
+        n_bands, my, mx = self.op.shape_out
+        self.model = device.empty((n, *self.op.shape_in), buffers.dtype)
+        self.image = device.empty((n, *self.op.shape_out), buffers.dtype)
+        self.add, self._residual_size = i > 0, (my, n_bands, n)
+        self.by_morph = MorphologyOperator(buffers, i)
+        self.by_spectra = SpectraOperator(buffers, i)
+        self._residual = buffers.launcher(
+            "scene.cl", "residual", 3, WG=buffers.tuning.sum_group
+        ).bind(
+            n_channels=buffers.n_channels,
+            channel=channel,
+            n_bands=n_bands,
+            my=my,
+            mx=mx,
+            row0=gradient.rows[channel],
+            n_rows=gradient.rows[-1],
+            data=buffers.put(np.stack([s.data[i] for s in scenes])),
+            weights=buffers.put(np.stack([s.weights[i] for s in scenes])),
+            sky=buffers.sky,
+            image=self.image,
+            loss=gradient.rows_loss,
+            pull=gradient.rows_pull,
+        )
+
+    def _common(self, ops):
+        """The scenes' operator where they share it, else one of all their plans."""
+        if all(op is ops[0] for op in ops):
+            return ops[0]
+        return Resampler.from_plans(
+            [op.plans[0] for op in ops],
+            dtype=self.buffers.dtype,
+            device=self.buffers.device,
+            shift=np.stack([op.shift for op in ops]),
+        )
+
+    def queue(self):
+        """Queue the model, its residual and what that adds to the gradients."""
+        b = self.buffers
+        self.by_morph.compose(b.morph, b.spectra, self.model)
+        self.op.forward_into(self.model, self.image)
+        self._residual(self._residual_size)
+        self.op.adjoint_into(self.image, self.model)
+        self.by_spectra.gather(self.model, b.d_spectra)
+        if b.n_free:
+            self.by_morph.gather(self.model, b.d_morph, b.free, add=self.add)
+
+    def follow_shifts(self):
+        """Shift the batch's operator as the scenes' own ones are."""
+        if self.op is not self._ops[0]:
+            self.op.shift = np.stack([op.shift for op in self._ops])

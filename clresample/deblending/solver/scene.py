@@ -1,0 +1,100 @@
+"""One scene to fit, on the host: what stays (Scene) and what the iterations change (State)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...resampling.resampler import Resampler
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What stays of one scene while its boxes do: data, operators, boxes, expected profiles.
+
+    S sources, C channels of all observations in their order, Co of observation o.
+
+    shape (Ny, Nx) [px]: model frame
+    extent (Ny, Nx) [px]: the part of it, from its first pixel on, that is not padding
+    ops: one Resampler per observation, each at its observation's present shift
+    data, weights: per observation (Co, My, Mx)
+    origin, center (S, 2) [px]: first pixel of each box in the frame, which holds all of the box,
+        and the pixel of the box about which the morphology falls
+    profile (S): arrays (ny, nx) [1]: expected morphology, max = 1
+    fixed (S,): bool, the morphology stays as it is
+    scale (S, C): what counts as one step of each spectrum, in the unit of the data
+    damping (S,): gradients under which steps are shorter than the step sizes; see
+        `curvature.damping`
+    fit_sky: whether the sky level of each channel is free
+    """
+
+    shape: tuple[int, int]
+    extent: tuple[int, int]
+    ops: list[Resampler]
+    data: list[np.ndarray]
+    weights: list[np.ndarray]
+    origin: np.ndarray
+    center: np.ndarray
+    profile: list[np.ndarray]
+    fixed: np.ndarray
+    scale: np.ndarray
+    damping: np.ndarray | None = None
+    fit_sky: bool = False
+
+    def channels(self) -> list[slice]:
+        """For each observation, its part of the channels."""
+        ends = np.cumsum([op.shape_out[0] for op in self.ops]).tolist()
+        return [slice(end - op.shape_out[0], end) for op, end in zip(self.ops, ends, strict=True)]
+
+    @property
+    def n_bytes(self) -> int:
+        """Device memory [bytes] that the scene takes in a batch, roughly: all numbers as float64,
+        two model and four observed images per channel, twelve arrays for each box."""
+        pixels = sum(2 * np.prod(o.shape_in) + 4 * np.prod(o.shape_out) for o in self.ops)
+        return int(8 * (pixels + 12 * sum(m.size for m in self.profile)))
+
+    @property
+    def signature(self):
+        """Scenes of equal signature can share a batch: frames, observed shapes, kernels to run."""
+        return (
+            self.shape,
+            self.fit_sky,
+            tuple(
+                (op.geometry, op.plans[0].axes, op.shape_out) + _lines(op.plans[0])
+                for op in self.ops
+            ),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """What an update remembers from step to step: k arrays like the morphologies and the spectra.
+
+    morph (k): each S arrays (ny, nx), in the boxes; spectra (k, S, C)
+    """
+
+    morph: list[list[np.ndarray]]
+    spectra: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """What the iterations change of one scene.
+
+    latent, morph (S): arrays (ny, nx): z (see Prior; of no use without one) and S
+    spectra (S, C): A, and sky (C,), in the unit of the data
+    memory: of the update, None before its first step; n_steps: iterations done so far
+    """
+
+    latent: list[np.ndarray]
+    morph: list[np.ndarray]
+    spectra: np.ndarray
+    sky: np.ndarray
+    memory: Memory | None = None
+    n_steps: int = 0
+
+
+def _lines(plan):
+    """Which way an affine plan's lines run: operators of a batch must agree in it."""
+    return (plan.lines.by_row,) if plan.lines is not None else ()
