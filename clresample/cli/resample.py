@@ -145,7 +145,12 @@ def run(arguments):
         "PSF of these": arguments.psf_like,
     }
     _check_outputs(arguments, inputs.values())
-    from ..files.fits import read_image, write_fits
+    from ..device.contraction import operator_programs
+    from ..device.device import get_device
+
+    device = get_device(arguments.device)
+    device.build_ahead(operator_programs(device, arguments.dtype))
+    from ..files.fits import read_image, write_fits  # a quarter of a second of astropy
 
     image = read_image(arguments.image, hdu=arguments.hdu, bands=arguments.band)
     pixels = _finite(arguments, image)
@@ -158,7 +163,7 @@ def run(arguments):
         )
 
     started = time.perf_counter()
-    op = _operator(arguments, image.grid, reference.grid, psfs)
+    op = _operator(arguments, device, image.grid, reference.grid, psfs)
     result = op(pixels)
     took = time.perf_counter() - started
     written = result if len(result) > 1 else result[0]
@@ -203,7 +208,7 @@ def _check_outputs(arguments, inputs):
         check_matplotlib("--plot")
 
 
-def _operator(arguments, grid_in, grid_out, psfs):
+def _operator(arguments, device, grid_in, grid_out, psfs):
     """The TiledResampler; its gain and its floored power are checked, and noted where they count.
 
     Raises ValueError for grids that do not overlap, too little memory and too much gain.
@@ -218,7 +223,7 @@ def _operator(arguments, grid_in, grid_out, psfs):
             grid_out,
             psfs[1],
             dtype=arguments.dtype,
-            device=arguments.device,
+            device=device,
             shift=arguments.shift,
             memory=arguments.memory,
         )

@@ -132,6 +132,10 @@ class Device:
         shared, _ = self._programs.kernel(file, name, dtype, defines)
         return load_pyopencl().Kernel(shared.program, name)
 
+    def build_ahead(self, requests):
+        """Start to build programs, (file, dtype, {macro: value}) each; `launcher` waits for them."""
+        self._programs.build_ahead(requests)
+
     def launch(self, kernel, global_size, local_size=None):
         """Queue a kernel whose arguments are set; sizes (x, y, z) as OpenCL counts them."""
         return self._call(self._enqueue, self.queue, kernel, global_size, local_size)
