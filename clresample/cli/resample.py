@@ -264,13 +264,14 @@ def _finite(arguments, image):
 def _psf(arguments, which, n_bands):
     """PSF `which` ("psf" or "psf_like") with as many bands as the image; its warnings as notes."""
     from ..files.fits import read_psf
+    from ..sky.psf_checks import PSFWarning
 
     option = "--" + which.replace("_", "-")
     path, hdu, bands, spacing, where = (
         getattr(arguments, which + part) for part in ("", "_hdu", "_band", "_spacing", "_center")
     )
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PSFWarning)  # printed below, with the name of the option
         psf = read_psf(path, hdu=hdu, bands=bands, spacing=spacing, center=where)
     light = psf.edge_light().max()
     if light > EDGE_REFUSED:
@@ -278,8 +279,7 @@ def _psf(arguments, which, n_bands):
             f"{path}: too wide for its {psf.images.shape[1]} x {psf.images.shape[2]} image, or no "
             f"PSF: by the light at its edge, another {100 * light:.0f} % lies beyond"
         )
-    for warning in caught:
-        message = str(warning.message).replace('center="core"', f"{option}-center core")
+    for message in psf.warnings(core=f"{option}-center core"):
         note(arguments, f"{path}: {message}")
     if psf.n_bands not in (1, n_bands):
         raise ValueError(
