@@ -83,19 +83,18 @@ def add_panel(figure, left, top, width, height):
     return figure.add_axes(box, facecolor=PAPER)
 
 
-def show_image(axes, image, grid, like, *, residual=False):
+def show_image(axes, image, mapping, *, residual=False):
     """Draw an image in the place and orientation that it has on other pixels.
 
-    image (Ny, Nx): 0 ... 1 in the colours of the sky, or -1 ... 1 in those of a residual; or
-        (Ny, Nx, 3) red, green and blue of 0 ... 1
-    grid: the image's pixels; like: the Grid that fills the axes
+    image (My, Mx): 0 ... 1 in the colours of the sky, or -1 ... 1 in those of a residual; or
+        (My, Mx, 3) red, green and blue of 0 ... 1
+    mapping: of its pixels to those (Ny, Nx) that fill the axes
     """
     from matplotlib.transforms import Affine2D
 
-    mapping = grid.map_to(like)
     (a, b), (c, d) = mapping.matrix  # rows (y, x), columns (n, m)
     t_y, t_x = mapping.offset
-    n_y, n_x = grid.shape
+    (m_y, m_x), (n_y, n_x) = mapping.shape_out, mapping.shape_in
     axes.imshow(
         image,
         cmap=RESIDUAL_COLOURS if residual else SKY_COLOURS,
@@ -103,12 +102,10 @@ def show_image(axes, image, grid, like, *, residual=False):
         vmax=1,
         origin="lower",
         interpolation="nearest",
-        extent=(-0.5, n_x - 0.5, -0.5, n_y - 0.5),
+        extent=(-0.5, m_x - 0.5, -0.5, m_y - 0.5),
         transform=Affine2D.from_values(d, b, c, a, t_x, t_y) + axes.transData,
     )
-    axes.set(
-        xlim=(-0.5, like.shape[1] - 0.5), ylim=(-0.5, like.shape[0] - 0.5), xticks=[], yticks=[]
-    )
+    axes.set(xlim=(-0.5, n_x - 0.5), ylim=(-0.5, n_y - 0.5), xticks=[], yticks=[])
     for spine in axes.spines.values():
         spine.set_color(EDGE)
 
@@ -145,7 +142,8 @@ def save_panels(path, panels, *, like: Grid, title=""):
             image = stretch(panel.image, panel.limits or stretch_limits(panel.image))
         else:
             image = panel.image / panel.residual
-        show_image(axes, image, panel.grid, like, residual=panel.residual is not None)
+        mapping = panel.grid.map_to(like)
+        show_image(axes, image, mapping, residual=panel.residual is not None)
         axes.set_title(panel.title, color=INK, fontsize=10, pad=5)
         axes.set_xlabel(panel.note, color=INK, fontsize=8, labelpad=5)
         if i == 0:
