@@ -94,17 +94,20 @@ def run(arguments):
     # Read by NumPy's linear algebra when NumPy is imported. Its matrices are small here: threads
     # wait for each other and for the OpenCL device's own, up to 0.1 s a product on a busy CPU.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from ..device.contraction import operator_programs
     from ..device.device import get_device
-    from ..files.scene import read_scene
+
+    device = get_device(arguments.device)
+    device.build_ahead(operator_programs(device, arguments.dtype))
+    from ..files.scene import read_scene  # half a second of astropy and scipy
     from ..measurement.quality import summary
 
     scene = read_scene(arguments.scene)
-    device = get_device(arguments.device)
     if not arguments.quiet:
         for message in scene.notes:
             note(arguments, message)
     if not arguments.no_figure:
-        threading.Thread(target=_import_drawing, daemon=True).start()
+        threading.Thread(target=_import_drawing).start()
     result = _fit(arguments, scene, device)
     _write(arguments, result, scene.inputs, device, paths)
     _report(arguments, result, summary(result), device, time.perf_counter() - started)

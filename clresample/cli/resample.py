@@ -145,7 +145,12 @@ def run(arguments):
         "PSF of these": arguments.psf_like,
     }
     _check_outputs(arguments, inputs.values())
-    from ..files.fits import read_image, write_fits
+    from ..device.contraction import operator_programs
+    from ..device.device import get_device
+
+    device = get_device(arguments.device)
+    device.build_ahead(operator_programs(device, arguments.dtype))
+    from ..files.fits import read_image, write_fits  # a quarter of a second of astropy
 
     image = read_image(arguments.image, hdu=arguments.hdu, bands=arguments.band)
     pixels = _finite(arguments, image)
@@ -158,7 +163,7 @@ def run(arguments):
         )
 
     started = time.perf_counter()
-    op = _operator(arguments, image.grid, reference.grid, psfs)
+    op = _operator(arguments, device, image.grid, reference.grid, psfs)
     result = op(pixels)
     took = time.perf_counter() - started
     written = result if len(result) > 1 else result[0]
@@ -203,7 +208,7 @@ def _check_outputs(arguments, inputs):
         check_matplotlib("--plot")
 
 
-def _operator(arguments, grid_in, grid_out, psfs):
+def _operator(arguments, device, grid_in, grid_out, psfs):
     """The TiledResampler; its gain and its floored power are checked, and noted where they count.
 
     Raises ValueError for grids that do not overlap, too little memory and too much gain.
@@ -218,7 +223,7 @@ def _operator(arguments, grid_in, grid_out, psfs):
             grid_out,
             psfs[1],
             dtype=arguments.dtype,
-            device=arguments.device,
+            device=device,
             shift=arguments.shift,
             memory=arguments.memory,
         )
@@ -259,13 +264,14 @@ def _finite(arguments, image):
 def _psf(arguments, which, n_bands):
     """PSF `which` ("psf" or "psf_like") with as many bands as the image; its warnings as notes."""
     from ..files.fits import read_psf
+    from ..sky.psf_checks import PSFWarning
 
     option = "--" + which.replace("_", "-")
     path, hdu, bands, spacing, where = (
         getattr(arguments, which + part) for part in ("", "_hdu", "_band", "_spacing", "_center")
     )
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PSFWarning)  # printed below, with the name of the option
         psf = read_psf(path, hdu=hdu, bands=bands, spacing=spacing, center=where)
     light = psf.edge_light().max()
     if light > EDGE_REFUSED:
@@ -273,8 +279,7 @@ def _psf(arguments, which, n_bands):
             f"{path}: too wide for its {psf.images.shape[1]} x {psf.images.shape[2]} image, or no "
             f"PSF: by the light at its edge, another {100 * light:.0f} % lies beyond"
         )
-    for warning in caught:
-        message = str(warning.message).replace('center="core"', f"{option}-center core")
+    for message in psf.warnings(core=f"{option}-center core"):
         note(arguments, f"{path}: {message}")
     if psf.n_bands not in (1, n_bands):
         raise ValueError(

@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 from .tuning import Tuning
 
+FILE = "contract.cl"
+EPILOGUES = ("MIX", "TWIST")
 # Columns of device matrices are padded with zeros to a multiple of this, the widest OpenCL vector.
 COLUMN_PAD = 16
 # Terms summed at a stretch, before the stretches are summed: this many, or sqrt(k) of k terms if
@@ -88,7 +90,7 @@ class Contraction:
         buffer_e, stride_e, band_e = e or (None, 0, 0)
         tile = self.tile
         launch = self.device.launcher(
-            "contract.cl",
+            FILE,
             "contract",
             dtype=self.dtype,
             local_size=(tile["WGX"], tile["WGY"], 1),
@@ -122,6 +124,18 @@ class Contraction:
         whole_a = a.step == 1 and a.stride == m * a.ld and a.div == 1
         tall = e is None and b.stride == 0 and whole_a and c.step == 1 and c.stride == m * c.ld
         return Product(launch, tile, m, padded(n), tall)
+
+
+def operator_programs(device, dtype):
+    """The contractions of an operator between images turned against each other.
+
+    returns [(file, dtype, macros)], as `Device.build_ahead` takes them
+    """
+    variants = [{}, {"ragged": True}]
+    variants += [
+        {"epilogue": name, "adjoint": adjoint} for name in EPILOGUES for adjoint in (False, True)
+    ]
+    return [(FILE, dtype, Contraction(device, dtype, **variant).defines) for variant in variants]
 
 
 class Product:

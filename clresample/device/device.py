@@ -43,8 +43,7 @@ class Device:
         self.memory = cl_device.global_mem_size
         self.max_alloc = cl_device.max_mem_alloc_size
         self.in_use = 0
-        self._enqueue = cl.enqueue_nd_range_kernel
-        self._error = cl.Error
+        self._enqueue, self._error = cl.enqueue_nd_range_kernel, cl.Error
         self._programs, self._lock = Programs(self), threading.Lock()
         self.context = self._call(cl.Context, [cl_device])
         self.queue = self._call(cl.CommandQueue, self.context, cl_device)
@@ -131,6 +130,10 @@ class Device:
         """A fresh pyopencl.Kernel."""
         shared, _ = self._programs.kernel(file, name, dtype, defines)
         return load_pyopencl().Kernel(shared.program, name)
+
+    def build_ahead(self, requests):
+        """Start to build programs, (file, dtype, {macro: value}) each, in a thread."""
+        self._programs.build_ahead(requests)
 
     def launch(self, kernel, global_size, local_size=None):
         """Queue a kernel whose arguments are set; sizes (x, y, z) as OpenCL counts them."""

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import functools
 import re
+import threading
+from concurrent.futures import Future
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -88,16 +91,43 @@ class Programs:
         dtype, cl = np.dtype(dtype), load_pyopencl()
         if dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
             raise ValueError(f"dtype is {dtype}; kernels are built for float32 or float64")
-        build = file, dtype, tuple(sorted(defines.items()))
+        build = _request(file, dtype, defines)
         if (build, name) not in self._kernels:
             arguments = signature(file, name)
-            if build not in self._programs:
-                self._programs[build] = self._built(file, dtype, defines)
-            kernel, types = cl.Kernel(self._programs[build], name), SCALARS | {"REAL": dtype.type}
+            program = self._program(file, dtype, defines)
+            kernel, types = cl.Kernel(program, name), SCALARS | {"REAL": dtype.type}
             kernel.set_scalar_arg_dtypes([types.get(type_) for _, type_ in arguments])
             is_buffer = {argument: type_ is None for argument, type_ in arguments}
             self._kernels[build, name] = kernel, is_buffer
         return self._kernels[build, name]
+
+    def build_ahead(self, requests):
+        """Start to build programs in a thread; `kernel` waits for one that is being built.
+
+        requests: (file, dtype, defines), as `kernel` takes them. One that does not build raises
+        its error when `kernel` asks for it again.
+        """
+
+        def build():
+            for file, dtype, defines in requests:
+                if not threading.main_thread().is_alive():
+                    break  # Python waits for this thread to end
+                with suppress(DeviceError):
+                    self._program(file, np.dtype(dtype), defines)
+
+        threading.Thread(target=build).start()
+
+    def _program(self, file, dtype, defines):
+        """A program, built by the first thread that asks for it; the others wait."""
+        build, mine = _request(file, dtype, defines), Future()
+        program = self._programs.setdefault(build, mine)
+        if program is mine:
+            try:
+                mine.set_result(self._built(file, dtype, defines))
+            except BaseException as error:
+                del self._programs[build]
+                mine.set_exception(error)
+        return program.result()
 
     def _built(self, file, dtype, defines):
         device, cl = self.device, load_pyopencl()
@@ -108,6 +138,11 @@ class Programs:
             return program.build(options=["-cl-std=CL1.2"])
         except cl.Error as error:
             raise not_built(device, file, defines, build_log(error)) from error
+
+
+def _request(file, dtype, defines):
+    """What tells one program from another."""
+    return file, np.dtype(dtype), tuple(sorted(defines.items()))
 
 
 def build_log(error):

@@ -86,15 +86,15 @@ def add_panel(figure, left, top, width, height):
 def show_image(axes, image, mapping, *, residual=False):
     """Draw an image in the place and orientation that it has on other pixels.
 
-    image (Ny, Nx): 0 ... 1 in the colours of the sky, or -1 ... 1 in those of a residual; or
-        (Ny, Nx, 3) red, green and blue of 0 ... 1
-    mapping: of the image's pixels to those that fill the axes
+    image (My, Mx): 0 ... 1 in the colours of the sky, or -1 ... 1 in those of a residual; or
+        (My, Mx, 3) red, green and blue of 0 ... 1
+    mapping: of its pixels to those (Ny, Nx) that fill the axes
     """
     from matplotlib.transforms import Affine2D
 
     (a, b), (c, d) = mapping.matrix  # rows (y, x), columns (n, m)
     t_y, t_x = mapping.offset
-    (n_y, n_x), like = mapping.shape_out, mapping.shape_in
+    (m_y, m_x), (n_y, n_x) = mapping.shape_out, mapping.shape_in
     axes.imshow(
         image,
         cmap=RESIDUAL_COLOURS if residual else SKY_COLOURS,
@@ -102,10 +102,10 @@ def show_image(axes, image, mapping, *, residual=False):
         vmax=1,
         origin="lower",
         interpolation="nearest",
-        extent=(-0.5, n_x - 0.5, -0.5, n_y - 0.5),
+        extent=(-0.5, m_x - 0.5, -0.5, m_y - 0.5),
         transform=Affine2D.from_values(d, b, c, a, t_x, t_y) + axes.transData,
     )
-    axes.set(xlim=(-0.5, like[1] - 0.5), ylim=(-0.5, like[0] - 0.5), xticks=[], yticks=[])
+    axes.set(xlim=(-0.5, n_x - 0.5), ylim=(-0.5, n_y - 0.5), xticks=[], yticks=[])
     for spine in axes.spines.values():
         spine.set_color(EDGE)
 

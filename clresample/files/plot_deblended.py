@@ -34,6 +34,7 @@ def plot_deblended(path, result, *, title=""):
     figure = dark_sheet(3 * (width + GAP) + GAP, ABOVE + n_rows * (height + BELOW), title)
     chi2 = summary(result)["chi2"]
     for i, (label, o) in enumerate(zip(labels(result), result.observations, strict=True)):
+        mapping = result.footprints[i].mapping
         chosen = _shown(result, i)
         names = [o.channels[c] for c in chosen]
         how = f"{', '.join(names)} as blue, green, red" if len(names) == 3 else names[0]
@@ -42,7 +43,7 @@ def plot_deblended(path, result, *, title=""):
         top = ABOVE + i * (height + BELOW)
         for k, (image, note) in enumerate(zip(_pictures(result, i, chosen), notes, strict=True)):
             axes = add_panel(figure, GAP + k * (width + GAP), top, width, height)
-            show_image(axes, image, result.footprints[i].mapping, residual=k == 2)
+            show_image(axes, image, mapping, residual=k == 2)
             _mark(axes, result, numbers=k == 1)
             if i == 0:
                 axes.set_title(COLUMNS[k], color=INK, fontsize=10, pad=5)

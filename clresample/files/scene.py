@@ -184,9 +184,10 @@ def _planes(path, table, key, bands):
 
 
 def _psf(path, table, bands, notes):
+    """The PSF of the bands that are taken; adds its warnings to `notes`."""
     center = table.get("psf_center", "middle")
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", PSFWarning)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PSFWarning)  # taken below, with the name of the key
         psf = read_psf(
             path,
             hdu=table.get("psf_hdu"),
@@ -194,6 +195,7 @@ def _psf(path, table, bands, notes):
             spacing=table.get("psf_spacing", 1.0),
             center=None if center == "middle" else center,
         )
+    notes += [f"{table['name']}: {text}" for text in psf.warnings(core='psf_center = "core"')]
     if psf.n_bands == bands.n_all and "psf_bands" not in table:
         psf = psf.select(bands.chosen)
     if psf.n_bands not in (1, len(bands.chosen)):
@@ -201,8 +203,6 @@ def _psf(path, table, bands, notes):
             f"psf has {psf.n_bands} bands, the image {len(bands.chosen)}: choose with bands and "
             "psf_bands"
         )
-    messages = dict.fromkeys(str(warning.message) for warning in caught)
-    notes += [f"{table['name']}: {m.replace('center=', 'psf_center = ')}" for m in messages]
     return psf
 
 

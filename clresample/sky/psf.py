@@ -166,9 +166,9 @@ class PSF:
         """Light beyond the edge (C,), as a fraction of the light inside; see `psf_checks`."""
         return edge_light(self.images)
 
-    def warnings(self) -> list[str]:
+    def warnings(self, core='center="core"') -> list[str]:
         """What a user should know of this PSF, a sentence each; see `psf_checks.psf_warnings`."""
-        return psf_warnings(self.images, self.center)
+        return psf_warnings(self.images, self.center, core)
 
 
 def _center(images, center):

@@ -70,13 +70,14 @@ def edge_light(images):
     return 2 * math.pi * radius**2 * images[:, ring].mean(axis=1)
 
 
-def psf_warnings(images, center) -> list[str]:
+def psf_warnings(images, center, core='center="core"') -> list[str]:
     """What a user should know of PSF images: a sentence each, with figures.
 
     A core more than 0.25 samples off the centre along an axis, and more than 5 % of the light
     (either sign) beyond the edge, by `edge_light`.
 
     images (C, ny, nx): of unit sum; center (C, 2) [samples]: (y, x), where they are said to be
+    core: how the reader of the message makes the core the centre
     """
     messages = []
     cores = np.stack([core_of(image) for image in images])
@@ -88,7 +89,7 @@ def psf_warnings(images, center) -> list[str]:
             f"PSF core off the centre, {_bands(far > CORE_TOLERANCE)}: in band {i} it is at "
             f"(y, x) = ({cores[i, 0]:.2f}, {cores[i, 1]:.2f}), ({off[i, 0]:+.2f}, "
             f"{off[i, 1]:+.2f}) samples from ({center[i, 0]:g}, {center[i, 1]:g}), "
-            'and shifts the result by as much; center="core" takes the core'
+            f"and shifts the result by as much; {core} takes the core"
         )
     light = edge_light(images)
     cut = np.abs(light) > EDGE_TOLERANCE

@@ -250,6 +250,16 @@ def test_mistakes_are_reported_by_key(folder, text, message):
     assert message in line and "scene.toml" in line and "\n" not in line
 
 
+def test_a_psf_off_its_centre_is_noted_by_its_key(folder):
+    moved = np.pad(fits.getdata(folder / "psf.fits"), ((4, 0), (0, 2)))
+    fits.writeto(folder / "moved.fits", moved)
+    off = scene(folder, ONE.replace("psf.fits", "moved.fits"))
+    (note,) = [note for note in off.notes if "PSF core off the centre" in note]
+    assert note.startswith("cam: ") and 'psf_center = "core" takes the core' in note
+    right = scene(folder, ONE.replace("psf.fits", "moved.fits") + 'psf_center = "core"')
+    assert not any("PSF" in note for note in right.notes)
+
+
 def test_a_scene_that_is_not_there(tmp_path):
     with pytest.raises(SceneError, match=r"none\.toml: No such file"):
         read_scene(tmp_path / "none.toml")
