@@ -94,10 +94,12 @@ class AlignedFactors(Factors):
 
     @staticmethod
     def model_axes(mapping, axis):
+        """The model axes of rows and columns: columns are those that the steps i move along."""
         x = axis if mapping.matrix[0, 0] != 0 else 1 - axis
         return 1 - x, x
 
     def units(self):
+        """Model rows as units, of a cos and a sin for each frequency; no 2-D transform."""
         return self.n_y, 2 * self.h_x, 0
 
     def make_kernels(self, d, shift):
@@ -148,12 +150,15 @@ class RotatedFactors(Factors):
 
     @staticmethod
     def model_axes(mapping, axis):
+        """The model axes of rows and columns: as they are."""
         return 0, 1
 
     def units(self):
+        """Frequencies nu_y as units, of four products of cos and sin for each nu_x."""
         return self.h_y, 4 * self.h_x, 2 * self.h_y
 
     def prepare(self):
+        """Also the transform along the model's columns."""
         super().prepare()
         in_y = trigonometric(self.n_y, self.k_y)
         self.in_y, self.in_y_t = self.table(in_y), self.table(in_y.T)
@@ -180,12 +185,13 @@ class RotatedFactors(Factors):
             n_cols = self.whole_lanes(self.n_l)
             for slab in self.slabs:
                 kernel = self.device.zeros((slab.n_rows, self.l_pad), self.dtype)
-                shift, _ = self.shifts.bind(slab, z, waves_l, kernel, n_cols, self.l_pad, 1)
-                shift()
+                launch, _ = self.shifts.bind(slab, z, waves_l, kernel, n_cols, self.l_pad, 1)
+                launch()
                 kernels[-1].append(both_ways(self.device, kernel, self.n_l))
         return waves_i, kernels
 
     def bind(self):
+        """Also the products between row sums and frequencies."""
         super().bind()
         half, z, k = self.matrix("half"), self.matrix("frequencies"), 2 * self.h_x
         self.to_frequencies = self.plain.bind(self.z_rows, k, self.n_y, self.in_y_t, half, z)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...device.contraction import Matrix, padded
+from ...sky.waves import cos_sin_columns, phases
 
 
 def wave(k, x, n_columns):
@@ -13,8 +14,7 @@ def wave(k, x, n_columns):
     k: length of the padded axis, which has h = (k + 1) // 2 frequencies kappa >= 0
     x [px]: displacements along that axis
     """
-    cycles = np.multiply.outer(np.arange((k + 1) // 2) / k, x)
-    angle = 2 * np.pi * (cycles - np.rint(cycles))
+    angle = phases(np.arange((k + 1) // 2) / k, x)
     planes = np.zeros((len(angle), 2, n_columns))
     planes[:, 0, : len(x)], planes[:, 1, : len(x)] = np.cos(angle), np.sin(angle)
     return planes
@@ -22,8 +22,8 @@ def wave(k, x, n_columns):
 
 def trigonometric(n, k):
     """cos and sin of 2 pi kappa x / k in columns 2 kappa, 2 kappa + 1, for x = 0 ... n - 1."""
-    angle = 2 * np.pi / k * (np.arange(n)[:, None] * np.arange((k + 1) // 2) % k)
-    return np.stack([np.cos(angle), np.sin(angle)], axis=2).reshape(n, -1)
+    # whole pixels: whole cycles are taken off in integers, exactly
+    return cos_sin_columns(2 * np.pi / k * (np.arange(n)[:, None] * np.arange((k + 1) // 2) % k))
 
 
 def device_matrix(device, dtype, host) -> Matrix:
