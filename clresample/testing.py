@@ -1,4 +1,4 @@
-"""Checks that an operator is what it says it is; each raises AssertionError with the figures."""
+"""Checks of adjoints and proximal operators; each raises AssertionError with the figures."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@
  * Source s owns the elements BEGIN .. BEGIN + ny * nx - 1 of each flat buffer, row by row. Boxes
  * begin at multiples of ALIGN elements; the elements between two boxes are never read.
  */
-#ifndef ALIGN       /* elements; the host gives its own, so that the two cannot differ */
+#ifndef ALIGN       /* elements; the host defines it as solver/boxes.py has it */
 #define ALIGN 16
 #endif
 

@@ -15,7 +15,8 @@
  * The monotone sweep goes by levels l = 2 max(|dy|,|dx|) + min(|dy|,|dx|): every neighbour nearer
  * to the centre has a smaller level, so the pixels of one level are independent. A neighbour that
  * is not nearer has weight 0 and may be of the same level, which other work-items write: it must
- * not be read at all. 0 times an infinity is NaN, and a bound that is NaN bounds nothing.
+ * not be read at all. 0 times an infinity would be NaN, and comparing with a bound
+ * of NaN is never true, so that the pixel would stay as it is.
  */
 #include "common.h"
 #include "boxes.h"

@@ -11,7 +11,7 @@
  *             launch: (X, ny_frame, B * n_bands)
  * residual    r = image + sky - data, image <- w r, loss[b, row] = 1/2 sum_x w r^2,
  *             pull[b, row] = sum_x w r;  row = c * my + y of this observation, from `row0` on
- *             launch: (my, n_bands, B): one work-item a row, so that a sum has one owner
+ *             launch: (my, n_bands, B): one work-item a row, which writes that row's sums
  * gather_morph    dS_s[y, x] (+)= sum_c spectra[s, channel + c] G[b, c, y0 + y, x0 + x]
  *             for the sources listed in `active`; launch: (X, tallest box, len(active))
  * gather_spectra  dA[s, channel + c] = sum_yx S_s[y, x] G[b, c, y0 + y, x0 + x]

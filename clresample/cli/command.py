@@ -1,8 +1,8 @@
 """The command `clresample`: one function per subcommand adds its parser and names what runs.
 
 A subcommand's function takes argparse's subparsers, adds its own, and calls
-`parser.set_defaults(run=...)`; `run(arguments)` raises ValueError, OSError or DeviceError for what
-the user can mend, which becomes one line on standard error and exit status 2.
+`parser.set_defaults(run=...)`; `run(arguments)` raises ValueError, OSError or DeviceError for a
+mistake in files or arguments, which becomes one line on standard error and exit status 2.
 """
 
 from __future__ import annotations

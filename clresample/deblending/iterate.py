@@ -1,4 +1,4 @@
-"""The loop of a batch of fits: steps, stops, shifts, boxes that follow their light."""
+"""The loop of a batch of fits: steps, stops, shifts, and boxes resized to the light they hold."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Which OpenCL devices there are, and which of them a choice means.
+"""Which OpenCL devices there are, and which one is meant by a user's choice such as "GPU" or "0:1".
 
-pyopencl is imported when this is first asked, never before.
+pyopencl is imported when devices are first looked for, never before.
 """
 
 from __future__ import annotations

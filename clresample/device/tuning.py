@@ -1,7 +1,7 @@
-"""Every number that depends on the device: tiles, group sizes, memory of one launch.
+"""Sizes that depend on the device: tiles, group sizes, memory of one launch.
 
 Measured on CPUs through PoCL; the values for other devices follow from their documents and are the
-first to measure on a GPU. Kernels get theirs as macros, so none is written twice.
+first to measure on a GPU. Kernels get these sizes as macros; none is written in a kernel too.
 """
 
 from __future__ import annotations

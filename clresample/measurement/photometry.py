@@ -1,4 +1,4 @@
-"""Fluxes of the sources of a result: of the models, or of the data they share."""
+"""Fluxes of a result's sources: of their models, or of the data divided among the models."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plans and operators that are made once for each geometry and found again."""
+"""A store of plans and operators: one of equal geometry and PSFs is made once and used again."""
 
 from __future__ import annotations
 

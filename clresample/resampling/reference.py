@@ -1,4 +1,4 @@
-"""The operator in NumPy float64, written from its definitions: what every executor must answer.
+"""The operator in NumPy float64, written from its definitions; the tests compare executors with it.
 
 With A the Jacobian and X the positions of the observed pixels in model pixels, nu = kappa / K:
 

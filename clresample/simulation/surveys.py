@@ -1,8 +1,8 @@
 """The surveys of the paper: pixels, PSFs, and magnitudes turned into counts and noise.
 
 Three tables: what the paper prints for its five surveys (`PAPER_SURVEYS`), what its notebooks use
-for them (`NOTEBOOK_SURVEYS`: two entries of the printed table look like widths at half maximum
-under a sigma heading), and the two instruments of its blended scenes (`EUCLID_VIS`,
+for them (`NOTEBOOK_SURVEYS`: two entries in the printed table's column of sigmas look like full
+widths at half maximum), and the two instruments of its blended scenes (`EUCLID_VIS`,
 `RUBIN_UGRIZY`).
 """
 

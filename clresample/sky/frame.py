@@ -1,4 +1,4 @@
-"""The model's own pixels and PSF, on which every source lives."""
+"""The model's own pixels and PSF, in which all sources are described."""
 
 from __future__ import annotations
 

@@ -147,7 +147,8 @@ def _mask_of(mask, shape):
     if values.dtype != bool and not np.isin(values, (0, 1)).all():
         odd = values[~np.isin(values, (0, 1))].flat[0]
         raise ValueError(
-            f"mask must be True (ignore) or False, not {odd}: choose the bits that spoil a pixel"
+            f"mask must be True (ignore) or False, not {odd}: of a mask with bits, "
+            "select those to ignore, for example mask & 5 > 0"
         )
     return np.broadcast_to(values.astype(bool), shape)
 

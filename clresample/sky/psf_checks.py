@@ -1,4 +1,4 @@
-"""What is measured of PSF images, and the warnings about images that hardly mean what they say."""
+"""What is measured of PSF images: width, core, light beyond the edge; and the warning about it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ EDGE_TOLERANCE = 0.05
 
 
 class PSFWarning(UserWarning):
-    """A PSF image that can be used, but hardly means what it says."""
+    """A PSF image that can be used, but whose centre, edge or ratio to another is suspect."""
 
 
 def fwhm(image):

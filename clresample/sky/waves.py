@@ -8,7 +8,8 @@ import numpy as np
 def phases(frequencies, positions):
     """2 pi f u (F, U) [rad] for f (F,) [cycles/px], u (U,) [px], whole cycles taken off.
 
-    They go before the product with 2 pi, which would round as many digits away as they have.
+    Whole cycles are taken off before the product with 2 pi: with them, that product would round
+    away as many digits as they have.
     """
     cycles = np.multiply.outer(frequencies, positions)
     cycles -= np.rint(cycles)

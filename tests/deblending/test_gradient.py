@@ -116,7 +116,7 @@ def test_operators_are_matrices_of_the_scene(device):
     y, x = BOXES[3][:2]
     np.testing.assert_allclose(columns[:, y, x], state.morph[0][0, 0] * np.eye(3)[1:], rtol=1e-6)
     assert np.count_nonzero(columns) == 2
-    with pytest.raises(ValueError, match="2 items are given, SpectraOperator takes one"):
+    with pytest.raises(ValueError, match="batch of 2 items is given; SpectraOperator takes one"):
         op.forward(np.zeros((2, 1, 3)))
 
 

@@ -2,7 +2,7 @@
 
 The Hessian of the loss by z (by S without a prior) is H = K amplitude A R^T w R A amplitude K, plus
 1 with a prior. Its entries are hardly ever negative, so its largest eigenvalue is at most its
-largest row sum, which is the largest pixel of what it makes of an image of ones.
+largest row sum, which is the largest pixel of H applied to an image of ones.
 
 In simulated Euclid + Rubin scenes this bound is twice the largest eigenvalue (median; 1.4 to 11
 times). It is 60 times H along a single pixel (1.6 to 150 times), since so many pixels are blurred

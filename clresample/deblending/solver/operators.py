@@ -46,7 +46,10 @@ class SceneOperator(LinOp):
     def _refuse_batch(self, x):
         """The kernels know one buffer of each kind: the scenes of a batch are inside an item."""
         if len(x) != 1:
-            raise ValueError(f"{len(x)} items are given, {type(self).__name__} takes one")
+            raise ValueError(
+                f"a batch of {len(x)} items is given; {type(self).__name__} takes one, which holds "
+                "all scenes"
+            )
 
     def compose(self, morph, spectra, model):
         """Queue model = sum_s A S_s: flat morphologies, spectra (S, C) -> model."""

@@ -1,4 +1,4 @@
-"""The solver's kernels in NumPy, written from their definitions: what they must answer in tests.
+"""The solver's kernels in NumPy, written from their definitions; the tests compare kernels with it.
 
 First the iteration of one scene (scene.cl, update.cl), in float64: S sources with arrays (ny, nx),
 C channels. The model itself and the gathering of its gradients are in scene_model.py, which the

@@ -11,7 +11,9 @@ from ...resampling.resampler import Resampler
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What stays of one scene while its boxes do: data, operators, boxes, expected profiles.
+    """What no iteration changes of one scene: data, operators, boxes, expected profiles.
+
+    Fitted shifts change the operators, and boxes that follow their light make another Scene.
 
     S sources, C channels of all observations in their order, Co of observation o.
 

@@ -1,6 +1,6 @@
 """The scene on the host in NumPy: M_c = sum_s A[s, c] S_s, each morphology in its box.
 
-What the kernels of scene.cl do on the device; here for what is done once or seldom.
+The kernels of scene.cl do the same on the device; this serves what is needed once or seldom.
 """
 
 from __future__ import annotations

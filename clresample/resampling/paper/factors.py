@@ -4,8 +4,9 @@
 
 Both factors are band-limited, so that a sum over the pixels u of the padded grid is exact, and by
 Parseval's theorem u may as well be a frequency: there a shift is a complex exponential, and the
-inverse transform of every shifted image falls away.  The inner index stays as long as the padded
-grid has pixels; it is worked off in slabs, so that a slab of F is read back from the cache.
+inverse transform of every shifted image falls away.  The inner index u still takes as many
+values as the padded grid has pixels. They are done slab by slab, so that a slab of F is read back
+from the cache.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The paper's own factorised operator, beside ours: same inputs, same outputs, its cost."""
+"""The paper's own factorised operator: same inputs and outputs as Resampler, at its higher cost."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class PaperResampler(GridOperator):
         if mapping.geometry == "distorted":
             raise ValueError(
                 f"grid_out departs from an affine mapping by {mapping.departure_px:.2g} px of "
-                "grid_in, more than tolerance_px: the shifts need one matrix for all pixels, "
-                "Resampler does not"
+                "grid_in, more than tolerance_px: the paper's shifts need one matrix for all "
+                "pixels; use Resampler, which does not"
             )
         n_bands = count_bands(mapping, psf_in, psf_out)
         self._begin(device, dtype, n_bands, [mapping])

@@ -1,4 +1,4 @@
 """Frames of any size in device memory of a stated size, tile by tile.
 
-Imports `sky` and the modules of `resampling`.
+Imports `device`, `sky` and the modules of `resampling`.
 """
