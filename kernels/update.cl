@@ -3,25 +3,25 @@
  *   m <- B1 m + (1 - B1) g,  v <- B2 v + (1 - B2) g^2,  h <- max(h, v)
  *   x <- x - rate (m / (1 - B1^t)) / (sqrt(h / (1 - B2^t)) + e)
  *
- * A morphology with a prior is S = base + amp o (K z): base its expected profile, amp how far it
- * may depart, K the correlation kernel (separable taps (2 RADIUS + 1), symmetric), z, here `field`,
- * unit normal.  The variable is z, its gradient K (amp o dS) + z; constraints act on S.  Without a
- * prior the variable is S itself.
+ * A morphology with a prior is S = P + W o (K z): P its expected `profile`, W the `amplitude` by
+ * which it may depart, K the correlation kernel (separable taps (2 RADIUS + 1), symmetric), z its
+ * unit-normal `latent` image.  The variable is z, its gradient K (W o dS) + z; constraints act on
+ * S.  Without a prior the variable is S itself.
  *
- * blur        scratch = K_x v,  v = amp o dS where S > 0 (WEIGH: the gradient), or z
- * step_field  z <- AMSGrad with g = K_y scratch + z
- * form        S = base + amp o K_y scratch
- * step_morph  S <- AMSGrad with g = dS
- *             launch of these: (X, tallest box, len(active)); for the sources listed in `active`
- * step_spectra   A <- max(0, AMSGrad in units of `scale` with g = scale o dA); launch: (n)
- * step_sky       sky <- sky - SKY_RATE sum(w r) / sum(w); launch: (B * C)
- *             pull (B, n_rows): sum of w r of each observed row; channel c has rows
- *             row0[c] .. row0[c + 1] - 1
- * losses      out[i_loss, b] = sum of loss rows + 1/2 sum_s |z_s|^2; launch: (B)
- *             best[b] = the lowest of those with i_loss = 0
- * keep        kept_* <- field, morph, spectra, sky of the scenes whose loss[b] is best[b], and so
- *             never of one whose loss is NaN; launch: (X, tallest box, S)
- * rescale     A[s, c] *= factor[s]: what a normalisation took out of a morphology; launch: (S * C)
+ * blur         scratch = K_x v,  v = W o dS where S > 0 (weigh: the gradient), or z
+ * step_latent  z <- AMSGrad with g = K_y scratch + z
+ * form         S = P + W o K_y scratch
+ * step_morph   S <- AMSGrad with g = dS
+ *              launch of these: (X, tallest box, len(active)); for the sources listed in `active`
+ * step_spectra A <- max(0, AMSGrad in units of `scale` with g = scale o dA); launch: (S * C)
+ * step_sky     sky <- sky - SKY_RATE sum(w r) / sum(w); launch: (B * C)
+ *              pull (B, n_rows): sum of w r of each observed row; channel c has rows
+ *              row0[c] .. row0[c + 1] - 1;  inverse (B, C): 1 / sum(w)
+ * losses       out[i_loss, b] = sum of loss rows + 1/2 sum_s |z_s|^2; launch: (B)
+ *              best[b] = the lowest of those with i_loss = 0
+ * keep         kept_* <- latent, morph, spectra, sky of the scenes whose loss[b] is best[b], and so
+ *              never of one whose loss is NaN; launch: (X, tallest box, S)
+ * rescale      A[s, c] *= factor[s]: what a normalisation took out of a morphology; launch: (S * C)
  *
  * e = EPSILON + rate damping[s] for morphologies: no step is longer than gradient / damping, where
  * damping is a bound on the curvature; EPSILON for spectra, whose units are those of their errors.
@@ -85,7 +85,7 @@ static REAL amsgrad(const REAL g, __global REAL *m, __global REAL *v, __global R
 
 __kernel void blur(__global const int *restrict active, __global const int *restrict table,
                    __global const REAL *restrict taps, const int weigh,
-                   __global const REAL *restrict v, __global const REAL *restrict amp,
+                   __global const REAL *restrict v, __global const REAL *restrict amplitude,
                    __global const REAL *restrict morph, __global REAL *restrict weighed,
                    __global REAL *restrict scratch)
 {
@@ -94,7 +94,7 @@ __kernel void blur(__global const int *restrict active, __global const int *rest
 #if ROWS
     if (weigh) {                       /* once a pixel rather than once a tap */
         for (int x = 0; x < nx; ++x)
-            weighed[row + x] = morph[row + x] > 0 ? amp[row + x] * v[row + x] : (REAL)0;
+            weighed[row + x] = morph[row + x] > 0 ? amplitude[row + x] * v[row + x] : (REAL)0;
         source = weighed + row;
     }
     for (int x = 0; x < nx; ++x) scratch[row + x] = 0;
@@ -109,7 +109,7 @@ __kernel void blur(__global const int *restrict active, __global const int *rest
         for (int t = -RADIUS; t <= RADIUS; ++t) {
             const int i = x + t;
             if (i < 0 || i >= nx) continue;
-            const REAL u = weigh ? (morph[row + i] > 0 ? amp[row + i] * source[i] : (REAL)0)
+            const REAL u = weigh ? (morph[row + i] > 0 ? amplitude[row + i] * source[i] : (REAL)0)
                                  : source[i];
             sum += taps[t + RADIUS] * u;
         }
@@ -132,31 +132,31 @@ static void blur_y(__global const REAL *taps, __global const REAL *scratch, cons
     }
 }
 
-__kernel void step_field(__global const int *restrict active, __global const int *restrict table,
-                         __global const REAL *restrict damping,
-                         __global const REAL *restrict taps, __global const REAL *restrict scratch,
-                         __global REAL *restrict field, __global REAL *restrict m,
-                         __global REAL *restrict v, __global REAL *restrict h,
-                         __global REAL *restrict gradient,
-                         const REAL rate, const REAL t1, const REAL t2)
+__kernel void step_latent(__global const int *restrict active, __global const int *restrict table,
+                          __global const REAL *restrict damping,
+                          __global const REAL *restrict taps,
+                          __global const REAL *restrict scratch, __global REAL *restrict latent,
+                          __global REAL *restrict m, __global REAL *restrict v,
+                          __global REAL *restrict h, __global REAL *restrict gradient,
+                          const REAL rate, const REAL t1, const REAL t2)
 {
     ROW
     const REAL e = (REAL)EPSILON + rate * damping[s];
     blur_y(taps, scratch, begin, y, ny, nx, gradient);
     FOR_X(x, nx) {
         const size_t i = row + x;
-        field[i] -= rate * amsgrad(gradient[i] + field[i], m, v, h, i, e, t1, t2);
+        latent[i] -= rate * amsgrad(gradient[i] + latent[i], m, v, h, i, e, t1, t2);
     }
 }
 
 __kernel void form(__global const int *restrict active, __global const int *restrict table,
                    __global const REAL *restrict taps, __global const REAL *restrict scratch,
-                   __global const REAL *restrict base, __global const REAL *restrict amp,
+                   __global const REAL *restrict profile, __global const REAL *restrict amplitude,
                    __global REAL *restrict morph)
 {
     ROW
     blur_y(taps, scratch, begin, y, ny, nx, morph);
-    FOR_X(x, nx) morph[row + x] = base[row + x] + amp[row + x] * morph[row + x];
+    FOR_X(x, nx) morph[row + x] = profile[row + x] + amplitude[row + x] * morph[row + x];
 }
 
 __kernel void step_morph(__global const int *restrict active, __global const int *restrict table,
@@ -197,7 +197,7 @@ __kernel void step_sky(const int n_channels, const int n_rows, __global const in
 
 __kernel void losses(__global const int *restrict first, __global const int *restrict table,
                      const int n_rows, __global const REAL *restrict rows, const int prior,
-                     __global const REAL *restrict field, __global REAL *restrict out,
+                     __global const REAL *restrict latent, __global REAL *restrict out,
                      __global REAL *restrict best, const int i_loss)
 {
     const int b = (int)get_global_id(0);
@@ -206,7 +206,7 @@ __kernel void losses(__global const int *restrict first, __global const int *res
     if (prior)
         for (int s = first[b]; s < first[b + 1]; ++s) {
             __global const int *box = BOX(s);
-            __global const REAL *z = field + BEGIN(box);
+            __global const REAL *z = latent + BEGIN(box);
             const int n = box[NY] * box[NX];
             REAL part[8] = {0, 0, 0, 0, 0, 0, 0, 0};
             int i = 0;
@@ -222,15 +222,15 @@ __kernel void losses(__global const int *restrict first, __global const int *res
 __kernel void keep(__global const int *restrict active, __global const int *restrict table,
                    __global const int *restrict first, const int n_channels,
                    __global const REAL *restrict loss, __global const REAL *restrict best,
-                   __global const REAL *restrict field, __global const REAL *restrict morph,
+                   __global const REAL *restrict latent, __global const REAL *restrict morph,
                    __global const REAL *restrict spectra, __global const REAL *restrict sky,
-                   __global REAL *restrict kept_field, __global REAL *restrict kept_morph,
+                   __global REAL *restrict kept_latent, __global REAL *restrict kept_morph,
                    __global REAL *restrict kept_spectra, __global REAL *restrict kept_sky)
 {
     ROW
     const int b = box[SCENE];
     if (!(loss[b] == best[b])) return;
-    FOR_X(x, nx) kept_field[row + x] = field[row + x];
+    FOR_X(x, nx) kept_latent[row + x] = latent[row + x];
     FOR_X(x, nx) kept_morph[row + x] = morph[row + x];
     if (y > 0 || get_global_id(0) > 0) return;
     for (int c = 0; c < n_channels; ++c) {

@@ -126,11 +126,6 @@ class Device:
         kernel, is_buffer = self._programs.kernel(file, name, dtype, defines)
         return Launcher(self, kernel, is_buffer, self._lock, local_size)
 
-    def kernel(self, file, name, *, dtype=np.float32, **defines):
-        """A fresh pyopencl.Kernel."""
-        shared, _ = self._programs.kernel(file, name, dtype, defines)
-        return load_pyopencl().Kernel(shared.program, name)
-
     def build_ahead(self, requests):
         """Start to build programs, (file, dtype, {macro: value}) each, in a thread."""
         self._programs.build_ahead(requests)

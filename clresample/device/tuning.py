@@ -29,6 +29,9 @@ class Tuning:
     slab_bytes [bytes]: shifted model of one slab of the paper's scheme
     chunk_terms: terms that a work-item of the paper's contraction sums; 16 columns of so many stay
         in a core's cache, where they are read again for each row
+    tile_flops, pixel_flops: what a tile of a frame costs beside its arithmetic, as the arithmetic
+        that takes as long: launches and the tables of its shift; each pixel's way out of the frame
+        and back. Larger values make larger tiles
     n_scenes: scenes fitted side by side; more hide the launches better, and need more memory
     memory [bytes]: of the device for one frame in tiles, unless a caller says otherwise. With less,
         tiles are smaller and overlap more; most instruments' quickest tiles take less than 1 GiB
@@ -42,6 +45,8 @@ class Tuning:
     group_bytes: int
     slab_bytes: int
     chunk_terms: int
+    tile_flops: float
+    pixel_flops: float
     n_scenes: int
     memory: int
 
@@ -52,6 +57,8 @@ class Tuning:
             "line_group": 32,  # one warp of a GPU
             "lanes": 8,
             "chunk_terms": 1024,
+            "tile_flops": 4e7,  # 1 ms, where PoCL does 40 Gflop/s
+            "pixel_flops": 80.0,  # 2 ns
             "memory": min(1 << 30, device.memory // 4),
         }
         if device.kind == "CPU":

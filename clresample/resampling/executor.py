@@ -29,7 +29,8 @@ class Executor:
 
     plans: one for all items of a batch, or one for each item; smaller ones are padded with zeros
     axes: the model axes taken as rows and columns of I1
-    Subclasses: n_rows (rows of Sy), scratch_shapes, bind, forward, adjoint
+    n_rows: rows of Sy, set by a subclass before it calls this __init__
+    Subclasses add to scratch_shapes and bind, and implement forward and adjoint
     """
 
     n_rows: int
@@ -99,6 +100,14 @@ class Executor:
         )
         self.back_rows = self.plain.bind(self.n_y, self.k_x, self.k_y, self.in_y_t, z, half)
         self.back_columns = self.ragged.bind(self.n_y, self.n_x, self.k_x, half, self.in_x, model)
+
+    def forward(self, x: ImageBatch, y: ImageBatch, n, spread=False):
+        """I2 from I1: x (n, Ny, Nx), or (n / n_bands, Ny, Nx) where `spread`, to y (n, My, Mx)."""
+        raise NotImplementedError
+
+    def adjoint(self, y: ImageBatch, x: ImageBatch, n):
+        """The adjoint of `forward`: y (n, My, Mx) to x (n, Ny, Nx)."""
+        raise NotImplementedError
 
     def to_frequencies(self, mix: Contraction, k, left: Matrix, right: Matrix):
         """The product Z = D o (left right), left (ky, k), right (k, kx); `mix` may conjugate D."""

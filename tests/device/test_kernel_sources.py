@@ -83,6 +83,13 @@ def test_sizes_are_macros_that_kernels_take(device, monkeypatch, kind, dtype):
     assert tuning.local_size(3) == ((1, 1, 1) if kind == "CPU" else None)
 
 
+@pytest.mark.parametrize("words", [r"set_args?\(", "set_scalar_arg_dtypes", r"device\.kind\b"])
+def test_one_room_sets_arguments_and_asks_for_the_kind_of_device(words):
+    """Arguments go by name, and what depends on the device is in Tuning."""
+    files = (ROOT / "clresample").rglob("*.py")
+    assert {path.parent.name for path in files if re.search(words, path.read_text())} == {"device"}
+
+
 def test_faults_are_seen():
     assert stray_restricts("static void f(__global int *restrict x) {}")
     assert not stray_restricts("__kernel void f(__global int *restrict x)\n{ g(x); }")

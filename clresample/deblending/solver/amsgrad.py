@@ -108,7 +108,7 @@ class _LatentStep:
         common = {"active": b.free, "table": b.boxes.table, "taps": b.put(prior.taps)}
         options = {"RADIUS": len(prior.taps) // 2} | DECAY
         blurred, weighed = b.zeros_flat(), b.zeros_flat()  # K along x, and what is blurred
-        kernels = ("blur", "step_field", "blur", "form")
+        kernels = ("blur", "step_latent", "blur", "form")
         self._blur_gradient, self._step, self._blur_latent, self._form = (
             b.launcher("update.cl", name, 3, **options).bind(**common) for name in kernels
         )
@@ -116,17 +116,17 @@ class _LatentStep:
             (self._blur_gradient, b.d_morph, True),
             (self._blur_latent, b.latent, False),
         ):
-            blur.bind(v=values, weigh=weigh, amp=b.amplitude, morph=b.morph)
+            blur.bind(v=values, weigh=weigh, amplitude=b.amplitude, morph=b.morph)
             blur.bind(weighed=weighed, scratch=blurred)
         self._step.bind(
             damping=_damping(b),
             scratch=blurred,
-            field=b.latent,
+            latent=b.latent,
             gradient=b.d_morph,
             rate=self.step_size,
             **_named(moments),
         )
-        self._form.bind(scratch=blurred, base=b.profile, amp=b.amplitude, morph=b.morph)
+        self._form.bind(scratch=blurred, profile=b.profile, amplitude=b.amplitude, morph=b.morph)
 
     def step(self, t1, t2):
         """Queue a step; t1, t2 = 1 / (1 - B^t) of both moments."""

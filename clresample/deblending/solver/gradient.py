@@ -43,7 +43,7 @@ class Gradient:
             n_rows=shape[1],
             rows=self.rows_loss,
             prior=with_prior,
-            field=buffers.latent,
+            latent=buffers.latent,
             best=self.best,
         )
 

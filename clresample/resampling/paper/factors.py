@@ -11,8 +11,6 @@ from the cache.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from ...device.contraction import Contraction, ImageBatch, Matrix, padded
 from ...device.tuning import Tuning
 from .launches import Pixels, Shifts, SlabLaunches
@@ -28,14 +26,11 @@ class Factors:
     z_rows: rows of the model's 2-D transform, if there is one
     waves: buffers of the exponentials of the steps i along both model axes
     kernels[band][slab]: the factor P (rows of the slab, l_pad) and its transpose (l, rows)
-    Subclasses: name (of the kernels in shift.cl), model_axes, units, make_kernels, and analyse,
-        synthesise between the model I1 and its frequencies: scratch "frequencies", or "half"
-        where z_rows is 0
+    Subclasses: name (of the kernels in shift.cl), model_axes, units, make_kernels, analyse and
+        synthesise
     """
 
     name: str
-    analyse: Callable[[ImageBatch, int], None]
-    synthesise: Callable[[ImageBatch, int], None]
 
     def __init__(self, device, dtype, mapping, n_fft, axis):
         self.device, self.dtype, self.mapping = device, dtype, mapping
@@ -91,8 +86,7 @@ class Factors:
             "part": (n_chunks, self.n_l, ld),
         }
         self.scratch, self.bound = {}, {}  # frees the old ones first
-        for name, shape in shapes.items():
-            self.scratch[name] = self.device.zeros(shape, self.dtype)
+        self.scratch = {name: self.device.zeros(s, self.dtype) for name, s in shapes.items()}
         self.bind()
         self.scratch["n"] = n
 
@@ -126,6 +120,14 @@ class Factors:
             slab.product_t(1)
             slab.unshift()
         self.synthesise(x, n)
+
+    def analyse(self, x: ImageBatch, n):
+        """The frequencies of I1, into scratch "frequencies", or "half" where z_rows is 0."""
+        raise NotImplementedError
+
+    def synthesise(self, x: ImageBatch, n):
+        """The adjoint of `analyse`."""
+        raise NotImplementedError
 
     def _launches(self, band, n):
         """SlabLaunches of every slab, and Pixels' (collect, spread); bound once for `n` images."""

@@ -7,6 +7,7 @@ from itertools import product
 
 import numpy as np
 
+from ...device.tuning import Tuning
 from ...sky.extent import intersection
 from ...sky.grid import Grid
 from ...sky.mapping import Mapping
@@ -23,9 +24,6 @@ TRIAL_PX = 32
 FLAT, TAPER_PX = 0.5, 24
 # [observed px] sides to choose from, 8 to 16384
 SIDES = np.unique(np.rint(8 * 2 ** (np.arange(45) / 4)).astype(int))
-# What a tile costs besides its arithmetic, as the flops of that time: launches and the tables of
-# its shift (1 ms, where PoCL does 40 Gflop/s); each pixel's way out of the frame and back (2 ns).
-FLOPS_TILE, FLOPS_PIXEL = 4e7, 80
 
 
 @dataclass(frozen=True)
@@ -62,13 +60,15 @@ def make_groups(
     *,
     precision: Precision,
     tolerance_px: float,
+    tuning: Tuning,
     memory: int,
 ) -> list[Group]:
     """Tiles that give every observed pixel on the model once, in groups that share an operator.
 
     grid_in, psf_in: the model's; grid_out, psf_out: the observation's
     tolerance_px [model px]: how far a pixel may be from where the WCS puts it
-    memory [bytes]: what one group's operator may take on its device
+    tuning: what tiles cost on the device beside their arithmetic
+    memory [bytes]: what one group's operator may take there
 
     Raises ValueError for grids that do not overlap, band counts that do not match, and a memory
     that is too small for the smallest tile.
@@ -80,7 +80,7 @@ def make_groups(
     trial = region.cutout(*middle, shape).map_to(grid_in, tolerance_px)
     radius = np.array(wrap_radius(psf_out, trial.matrix))
     margin = np.ceil(radius * FLAT + np.maximum(radius * (1 - FLAT), TAPER_PX)).astype(int)
-    sizes = Sizes(trial, margin, psf_in, psf_out, precision)
+    sizes = Sizes(trial, margin, psf_in, psf_out, precision, tuning)
     geometry = trial.geometry
     while True:
         shape = sizes.choose(geometry, region.shape, memory)
@@ -109,13 +109,15 @@ class Sizes:
     depends on both pixel scales, both PSFs and the geometry: tens to hundreds of pixels.
 
     trial: mapping of a small tile; margin (2,) [model px] of every window
+    precision, tuning: of the operators and of their device
     """
 
-    def __init__(self, trial: Mapping, margin, psf_in: PSF, psf_out: PSF, precision: Precision):
+    def __init__(self, trial: Mapping, margin, psf_in: PSF, psf_out: PSF, precision, tuning):
         geometry = "affine" if trial.geometry == "distorted" else trial.geometry
         window = window_of(replace(trial, geometry=geometry, positions=None, area=None), margin)
         plan = make_plan(window, psf_in, psf_out, precision=precision)
         n_fft = plan.certificate.n_fft
+        self.tuning = tuning
         self.n_bands, self.itemsize = plan.n_bands, 4 if precision == Precision.of("f4") else 8
         self.scale = np.abs(trial.matrix).sum(axis=1).max()
         self.border = 2 * int(margin.max()) + 2
@@ -151,7 +153,8 @@ class Sizes:
             tables += 3 * m * m * wide
             frequencies += m * m * wide
         images = 2 * (n * n + m * m)  # both ways
-        time = 2 * self.n_bands * flops + FLOPS_TILE + FLOPS_PIXEL * self.n_bands * (n * n + m * m)
+        staged = self.tuning.pixel_flops * self.n_bands * (n * n + m * m)
+        time = 2 * self.n_bands * flops + self.tuning.tile_flops + staged
         return time, self.itemsize * (tables + self.n_bands * (frequencies + images))
 
     def choose(self, geometry, shape, memory):

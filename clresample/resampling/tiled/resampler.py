@@ -61,7 +61,8 @@ class TiledResampler(HostOp, GridOperator):
         n_bands = max(psf_in.n_bands, psf_out.n_bands)
         shapes = (n_bands, *grid_in.shape), (n_bands, *grid_out.shape)
         LinOp.__init__(self, device, dtype, *shapes)
-        self.memory = Tuning.of(self.device, dtype).memory if memory is None else memory
+        tuning = Tuning.of(self.device, dtype)
+        self.memory = tuning.memory if memory is None else memory
         self.grid_in, self.grid_out, self.tolerance_px = grid_in, grid_out, tolerance_px
         self.groups = make_groups(
             grid_in,
@@ -70,6 +71,7 @@ class TiledResampler(HostOp, GridOperator):
             psf_out,
             precision=Precision.of(dtype),
             tolerance_px=tolerance_px,
+            tuning=tuning,
             memory=self.memory,
         )
         self._operators = TileOperators(psf_in, psf_out, self.dtype, self.device)
