@@ -20,11 +20,11 @@
  * The tile is kept in registers: B is read as aligned vectors, A as scalars that broadcast.  No
  * local memory, no barrier, no builtin.
  *
- * Layout: n_pad = n rounded up to a multiple of 16, so to whole vectors; where a tile reaches beyond
- *   n_pad, its vectors there do the first one's work again.  B always has ld n_pad with zeros in
- *   the padding; so has C, unless RAGGED, when C is a caller's array: element (i, j) at i * ld_c + j * step_c, any
- *   alignment.  A is any array: element (i, l) at i * ld_a + l, or at i * ld_a + l * step_a if
- *   STRIDED, so that it may be read transposed.
+ * Layout: n_pad = n rounded up to a multiple of 16, so to whole vectors; where a tile reaches
+ *   beyond n_pad, its vectors there do the first one's work again.  B always has ld n_pad with
+ *   zeros in the padding; so has C, unless RAGGED, when C is a caller's array: element (i, j) at i
+ *   * ld_c + j * step_c, any alignment.  A is any array: element (i, l) at i * ld_a + l, or at i *
+ *   ld_a + l * step_a if STRIDED, so that it may be read transposed.
  * Batch: item b uses A + (b / div_a) * stride_a and likewise for B, so a table that all bands of a
  *   scene share has div = n_bands, one that every scene shares has stride 0.
  * Terms are summed in stretches of `block` and the stretches' sums in a second set of registers:

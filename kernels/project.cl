@@ -95,9 +95,9 @@ void project_weights(__global REAL *restrict w, __global REAL *restrict tau,
     }
 }
 
-/* Before a loop of one work-item over neighbouring pixels: vectorised wherever its buffers do not
- * overlap. Compilers check only so many pairs of pointers for overlap by themselves, fewer than this
- * loop has; with the pragma the projection is 2 to 3 times quicker on CPUs. */
+/* Before a loop of one work-item over neighbouring pixels: vectorised wherever its buffers do
+ * not overlap. Compilers check only so many pairs of pointers for overlap by themselves, fewer
+ * than this loop has; with the pragma the projection is 2 to 3 times quicker on CPUs. */
 #if WG > 1
 #define VECTORISE
 #else
