@@ -29,7 +29,8 @@ N_MOMENTS = 3  # m, v, h
 
 @dataclass(frozen=True)
 class StepSizes:
-    """Lengths of the solver's first steps; larger ones are faster, and less steady near the end.
+    """Lengths of the solver's steps where nothing damps them: larger ones come near the end sooner
+    and are less steady there.
 
     latent: of z, in units of the prior's scatter; morphology: of S where there is no prior, in
     units of its maximum, 1; spectrum: in units of `Scene.scale`, a flux's error and 2 % of the flux
