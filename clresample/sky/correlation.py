@@ -16,8 +16,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import binary_dilation, gaussian_filter
-from scipy.signal import fftconvolve
+from scipy.ndimage import binary_dilation, convolve, gaussian_filter
+
+from .psf import PSF
 
 # Lags that are estimated from an image [px]: drizzle and Lanczos kernels end within 5 pixels.
 MAX_LAG_PX = 8
@@ -134,8 +135,8 @@ class NoiseCorrelation:
     def filtered(self, images):
         """w * images (..., Ny, Nx), zero beyond the edge."""
         images = np.asarray(images, dtype=np.float64)
-        kernel = self.filter.reshape((1,) * (images.ndim - 2) + self.filter.shape)
-        return fftconvolve(images, kernel, mode="same", axes=(-2, -1))
+        taps = self.filter.reshape((1,) * (images.ndim - 2) + self.filter.shape)
+        return convolve(images, taps, mode="constant")
 
     def reached(self, weights):
         """Pixels (..., Ny, Nx) that w mixes with none that has no weight, nor with the outside."""
@@ -231,3 +232,66 @@ def _lit(noise, seen):
     sigma = 1.4826 * np.median(np.abs(level - middle)) if level.size else 1.0
     lit = seen & (smooth - middle > BLANK_SIGMAS * max(sigma, 1e-300))
     return binary_dilation(lit, iterations=BLANK_GROW_PX)
+
+
+def filtered_psf(psf: PSF, filters) -> tuple[PSF, np.ndarray]:
+    """The PSF of images that were convolved with filters, and the filters' sums (C,).
+
+    filters: C arrays (2r + 1, 2r + 1) [1], taps one pixel of the PSF's grid apart, one a band
+    returns the PSF, larger by the filters and again of unit sum
+
+    Raises ValueError where a pixel is no whole number of samples.
+    """
+    step = round(1 / psf.spacing)
+    if abs(step * psf.spacing - 1) > 1e-9:
+        raise ValueError(
+            f"spacing of the PSF is {psf.spacing} px: a filter on whole pixels needs samples that "
+            "are 1, 1/2, 1/3 ... px apart"
+        )
+    n_y, n_x = psf.images.shape[1:]
+    reach = step * max(f.shape[0] // 2 for f in filters)
+    images = np.zeros((psf.n_bands, n_y + 2 * reach, n_x + 2 * reach))
+    for image, taps, wide in zip(psf.images, filters, images, strict=True):
+        start = reach - step * (taps.shape[0] // 2)
+        for (i, j), tap in np.ndenumerate(taps):
+            y, x = start + step * i, start + step * j
+            wide[y : y + n_y, x : x + n_x] += tap * image
+    sums = images.sum(axis=(1, 2))
+    images /= sums[:, None, None]
+    return PSF.restore(images, spacing=psf.spacing, center=psf.center + reach), sums
+
+
+def noise_of_channels(noise, data, weights, channels):
+    """Correlations (C,) of an observation's channels, or None where all is white; and messages.
+
+    noise: None, "estimate", a NoiseCorrelation or its autocorrelation for all channels, or a
+        sequence of C of these; data, weights (C, Ny, Nx)
+
+    Raises ValueError for another number of them, and as NoiseCorrelation and its `estimate` do.
+    """
+    if noise is None:
+        return None, []
+    one = isinstance(noise, (str, NoiseCorrelation)) or np.ndim(noise) == 2
+    given = [noise] * len(data) if one else list(noise)
+    if len(given) != len(data):
+        raise ValueError(f"noise has {len(given)} correlations, data have {len(data)} channels")
+    found, messages = [], []
+    for correlation, image, weight, channel in zip(given, data, weights, channels, strict=True):
+        if isinstance(correlation, str):
+            if correlation != "estimate":
+                raise ValueError(
+                    f'noise is {correlation!r}, it takes a NoiseCorrelation, an array or "estimate"'
+                )
+            try:
+                correlation = NoiseCorrelation.estimate(image, weight)
+            except ValueError as error:
+                raise ValueError(f"channel {channel}: {error}") from None
+            messages.append(
+                f"noise of channel {channel} estimated from blank sky: {correlation!r}; for white "
+                "noise, errors of a source of sigma 2 px would be too small by the factor "
+                f"{correlation.error_factor(2.0):.2f}"
+            )
+        elif correlation is not None and not isinstance(correlation, NoiseCorrelation):
+            correlation = NoiseCorrelation(correlation)
+        found.append(correlation or NoiseCorrelation(np.ones((1, 1))))
+    return tuple(found), messages

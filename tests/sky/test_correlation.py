@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
+from clresample.resampling.resampler import Resampler
 from clresample.sky.correlation import NoiseCorrelation
+from clresample.sky.grid import Grid
+from clresample.sky.observation import Observation
+from clresample.sky.psf import PSF
 
 N = 160  # [px] a side: large enough for the correlation to be known to 2 %
 
@@ -126,3 +130,52 @@ def test_what_is_no_autocorrelation_is_refused(array, words):
 def test_too_little_sky_is_refused():
     with pytest.raises(ValueError, match="1000 are needed"):
         NoiseCorrelation.estimate(np.zeros((20, 20)), np.ones((20, 20)))
+
+
+def seen_through(spacing, noise, rng):
+    """A star with correlated noise of known correlation, on 80 x 80 pixels."""
+    grid, psf = Grid.flat((80, 80), 0.2), PSF.gaussian(1.4, spacing=spacing, n_pixels=61)
+    fine = Resampler(grid, PSF.gaussian(0.8), grid, psf, dtype=np.float64)
+    point = np.zeros((1, 80, 80))
+    point[0] = PSF.gaussian(0.8, n_pixels=(81, 81)).images[0][:80, :80]
+    return fine(500 * point) + noise[:, :80, :80], psf, grid
+
+
+@pytest.mark.parametrize("spacing", [1.0, 0.5])
+def test_the_white_observation_is_the_same_light_with_white_noise(spacing):
+    correlated = NoiseCorrelation(correlation(KERNELS["drizzle"]))
+    images = noise(KERNELS["drizzle"], np.random.default_rng(5), 1)
+    clean, psf, grid = seen_through(spacing, 0 * images, None)
+    o = Observation(clean + images[:, :80, :80], psf, grid, weights=1.0, noise=correlated)
+    white = o.white
+    model = Resampler(grid, PSF.gaussian(0.8), grid, white.psf, dtype=np.float64)
+    point = np.zeros((1, 80, 80))
+    point[0] = PSF.gaussian(0.8, n_pixels=(81, 81)).images[0][:80, :80]
+    inside = white.weights > 0
+    seen = Observation(clean, psf, grid, weights=1.0, noise=correlated).white.data
+    assert np.abs((model(500 * point) - seen)[inside]).max() < 1e-6 * seen.max()
+    chi2 = o.chi2_map(o.data - clean)
+    assert np.nanmean(chi2) == pytest.approx(1, abs=0.06)
+    assert np.isnan(chi2[0, 0]).all()
+    assert Observation(clean, psf, grid, weights=1.0).white.noise is None
+
+
+def test_noise_of_an_observation_is_checked():
+    grid, psf = Grid.flat((20, 20), 0.2), PSF.gaussian(1.4)
+    data = np.zeros((2, 20, 20))
+    with pytest.raises(ValueError, match="noise has 3 correlations, data have 2"):
+        Observation(data, psf, grid, weights=1.0, noise=[None] * 3)
+    with pytest.raises(ValueError, match="'guess'"):
+        Observation(data, psf, grid, weights=1.0, noise="guess")
+    with pytest.raises(ValueError, match="channel channel0: noise correlation: .* needed"):
+        Observation(data, psf, grid, weights=1.0, noise="estimate")
+    with pytest.raises(ValueError, match="is 0.7 px"):
+        odd = PSF.gaussian(1.4, spacing=0.7)
+        wide = NoiseCorrelation(correlation(KERNELS["drizzle"]))
+        _ = Observation(data, odd, grid, weights=1.0, noise=wide).white
+
+
+def test_an_estimate_is_reported():
+    images = noise(KERNELS["drizzle"], np.random.default_rng(6))
+    o = Observation(images, PSF.gaussian(1.4), Grid.flat((N, N), 0.2), noise="estimate")
+    assert any("estimated from blank sky" in m and "2." in m for m in o.messages)
