@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from .correlation import NoiseCorrelation, filtered_psf, noise_of_channels
 from .grid import Grid
 from .noise import numbers, weights_from
 from .psf import PSF
@@ -30,18 +32,19 @@ class Observation:
     mask (C, Ny, Nx) or (Ny, Nx): True = ignore this pixel; may come with either of the two or alone
     channels (C,): names, unique over all instruments; None numbers them after `name`
     zero_points (C,) or one number [mag]: AB magnitude of one count
+    noise: correlation of the noise of neighbouring pixels, in drizzled, resampled and stacked
+        images: a NoiseCorrelation, or its autocorrelation (2L + 1, 2L + 1), for all channels, or C
+        of these, or "estimate" from blank sky. None = white. Weights stay those of single pixels
     name: of the instrument, for messages
 
     With neither weights nor variance the noise is estimated, channel by channel, from the scatter
     of the background (`noise_sigma`), and `messages` says so. That is one number for the whole
-    image: it leaves out the sources' own photon noise, and in resampled or stacked images, whose
-    noise is correlated between pixels, it is the scatter of single pixels, from which chi2 comes
-    out too small and flux errors too optimistic.
+    image, and leaves out the sources' own photon noise.
 
     Read back: data and weights (C, Ny, Nx) float64, psf of C bands, grid, channels, zero_points
-    (C,) or None, name, n_bad = number of unmasked pixels whose weight became 0 because their data
-    were NaN or infinite, their weight NaN, or their variance NaN or not positive, messages = what
-    the user should know.
+    (C,) or None, noise (C,) or None, name, n_bad = number of unmasked pixels whose weight became 0
+    because their data were NaN or infinite, their weight NaN, or their variance NaN or not
+    positive, messages = what the user should know.
 
     Raises ValueError for shapes that disagree, negative or infinite weights, masks that are not
     made of 0 and 1, channel names that are not unique, both weights and variance, and where the
@@ -54,6 +57,7 @@ class Observation:
     weights: np.ndarray
     channels: tuple[str, ...]
     zero_points: np.ndarray | None
+    noise: tuple[NoiseCorrelation, ...] | None
     name: str | None
     n_bad: int
     messages: tuple[str, ...]
@@ -69,6 +73,7 @@ class Observation:
         mask=None,
         channels=None,
         zero_points=None,
+        noise=None,
         name=None,
     ):
         data = _images(data, grid)
@@ -78,13 +83,17 @@ class Observation:
         if zero_points is not None:
             zero_points = _per_channel("zero_points", zero_points, len(data))
         weights, n_bad, messages = weights_from(data, bad, weights, variance, mask, channels)
+        data = np.where(bad, 0.0, data)
+        noise, found = noise_of_channels(noise, data, weights, channels)
+        messages += found
         self._set(
-            data=np.where(bad, 0.0, data),
+            data=data,
             psf=psf,
             grid=grid,
             weights=weights,
             channels=channels,
             zero_points=zero_points,
+            noise=noise,
             name=name,
             n_bad=n_bad,
             messages=tuple(messages),
@@ -117,6 +126,37 @@ class Observation:
     def label(self) -> str:
         """What messages call this observation: its name, or else its channels."""
         return self.name or f"with channels {', '.join(self.channels)}"
+
+    @cached_property
+    def white(self) -> Observation:
+        """The same light seen with white noise: what is fitted where noise is correlated.
+
+        Data and PSF are convolved with each channel's whitening filter; a constant stays, and
+        pixels nearer to a mask or to the edge than the filter's radius have weight 0. Itself where
+        noise is white.
+        """
+        if self.noise is None:
+            return self
+        psf, sums = filtered_psf(self.psf, [n.filter for n in self.noise])
+        data = np.stack([n.filtered(d) / s for n, d, s in zip(self.noise, self.data, sums)])
+        weights = np.stack(
+            [n.reached(w) * w * s**2 for n, w, s in zip(self.noise, self.weights, sums)]
+        )
+        names = {"channels": self.channels, "zero_points": self.zero_points, "name": self.name}
+        return Observation(data, psf, self.grid, weights=weights, **names)
+
+    def chi2_map(self, residual) -> np.ndarray:
+        """Weighted squared residuals (C, Ny, Nx) of expectation 1; NaN where nothing is known.
+
+        residual (C, Ny, Nx) [counts]: data minus model; whitened here where noise is correlated
+        """
+        weights = self.weights
+        if self.noise is not None:
+            filtered, weights = [], self.white.weights
+            for n, r in zip(self.noise, residual, strict=True):
+                filtered.append(n.filtered(r) / (n.filter.sum() * np.sqrt(n.variance)))
+            residual = np.stack(filtered)
+        return np.where(weights > 0, weights * np.square(residual), np.nan)
 
     @property
     def flux_scale(self) -> np.ndarray | None:
