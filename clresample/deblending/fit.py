@@ -20,7 +20,7 @@ from .solver.curvature import damping
 from .solver.scene import Scene, State
 from .spectra import solve_spectra
 from .start import LIGHT_SIGMAS, start
-from .view import whitened_view
+from .view import as_taken, whitened_view
 
 # A spectrum's step size counts in errors of the flux plus this part of the flux: bright sources,
 # whose errors are far smaller than what a changing morphology does to their flux, can follow it.
@@ -174,8 +174,10 @@ class Fit:
         ]
         rendered = []
         for view, o, images in zip(self.views, self.blend.observations, observed, strict=True):
-            images = images.astype(np.float64) * view.covered
-            rendered.append(images[..., : o.data.shape[1], : o.data.shape[2]])
+            if o.noise is not None:
+                images = as_taken(o, view, self.frame, morphs)
+            images = images[..., : o.data.shape[1], : o.data.shape[2]]
+            rendered.append(images.astype(np.float64) * view.covered[: o.shape[1], : o.shape[2]])
         self.seconds["result"] = time.perf_counter() - began
         return Result(
             observations=self.blend.observations,

@@ -75,9 +75,12 @@ class WhitenedView:
 def whitened_view(frame, padded, observation, pad, device, dtype, *, private) -> WhitenedView:
     """The view of an Observation on a frame that is `padded`, itself padded to multiples of `pad`.
 
+    Correlated noise is made white first (Observation.white).
+
     private: with an operator of its own, which may be shifted; else one that equal observations
         share
     """
+    observation = observation.white
     shape = tuple(-(-n // pad) * pad for n in observation.data.shape[1:])
     grid = observation.grid
     if shape != observation.data.shape[1:]:
@@ -93,6 +96,25 @@ def whitened_view(frame, padded, observation, pad, device, dtype, *, private) ->
     )
     data, weights = _padded(observation.data, shape), _padded(observation.weights, shape)
     return WhitenedView.of(op, frame, data, weights)
+
+
+def as_taken(observation, view, frame, morphs) -> np.ndarray:
+    """Unit-spectrum images (n, Co, My, Mx) of morphologies with the Observation's own PSF.
+
+    Its view, where noise is correlated, has the PSF of the white observation instead.
+    morphs (n, Ny, Nx): on the frame, or on a padded one
+    """
+    op = cached_resampler(
+        frame,
+        observation.grid,
+        observation.psf,
+        dtype=view.op.dtype,
+        device=view.op.device,
+        private=True,
+    )
+    op.shift = view.op.shift
+    n_y, n_x = frame.shape
+    return op.render(np.ascontiguousarray(morphs[:, :n_y, :n_x], op.dtype))
 
 
 def _typical_noise(weights):

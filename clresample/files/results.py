@@ -157,7 +157,9 @@ def _about(result):
         ],
         "frame": _placing(result.frame.grid, result.frame.psf),
         "observations": [
-            {key: getattr(o, key) for key in KEPT} | _placing(o.grid, o.psf)
+            {key: getattr(o, key) for key in KEPT}
+            | {"noise": o.noise and [n.autocorrelation.tolist() for n in o.noise]}
+            | _placing(o.grid, o.psf)
             for o in result.observations
         ],
     }
@@ -245,6 +247,7 @@ def _observation(path, hdus, i, about):
         _psf(_array(hdus["PSF", i + 1]), about),
         _grid(path, data, about, hdus),
         weights=_array(hdus["WEIGHTS", i + 1]),
+        noise=about.get("noise"),
         **{key: about[key] for key in KEPT},
     )
 

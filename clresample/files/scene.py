@@ -145,6 +145,13 @@ def _weighting(folder, table, bands, shape, inputs):
     if "weight" in table and "variance" in table:
         raise ValueError("weight and variance are both given: an observation takes one")
     given = {}
+    noise = table.get("noise")
+    if noise not in (None, "estimate"):
+        inputs[f"noise of {table['name']}"] = folder / noise
+        with open_fits(folder / noise) as hdus:
+            noise = to_native(read_pixels(folder / noise, choose_hdu(folder / noise, hdus, None)))
+    if noise is not None:
+        given["noise"] = noise
     for key, argument in (("weight", "weights"), ("variance", "variance"), ("mask", "mask")):
         value = table.get(key)
         if f"{key}_hdu" in table and not isinstance(value, str):

@@ -82,6 +82,9 @@ TABLES = {
         "mask": FILE,
         "mask_hdu": HDU,
         "zero_point": NUMBERS,
+        "noise": Rule(
+            '"estimate", or the name of a file with the autocorrelation of the noise', _text
+        ),
     },
     "sources": {
         "catalogue": FILE,

@@ -156,6 +156,7 @@ def _import_sep():
 
 def _signal_to_noise(observation, frame, device):
     """One observation's channels together (Ny, Nx), of unit scatter where there is no source."""
+    observation = observation.white
     op = cached_resampler(frame, observation.grid, observation.psf, dtype=np.float32, device=device)
     weights = observation.weights * op.covered
     # in units of the noise, so that float32 holds data of any scale

@@ -66,7 +66,7 @@ def chi2_terms(result, i_observation, used):
     else:
         channels = result.channel_slices()[i_observation]
         residual = o.data - np.asarray(result.sky)[channels, None, None]
-    return np.where(used, o.weights * residual**2, 0.0)
+    return np.where(used, o.chi2_map(residual), 0.0)
 
 
 def box_chi2(result, i_observation, footprint):

@@ -30,8 +30,8 @@ class Footprint:
 
     @cached_property
     def used(self) -> np.ndarray:
-        """Pixels (C, My, Mx) that a fit looks at: those with a weight, on the frame."""
-        return (self.observation.weights > 0) & self.mapping.covered
+        """Pixels (C, My, Mx) that a fit looks at: on the frame, with a weight in white noise."""
+        return (self.observation.white.weights > 0) & self.mapping.covered
 
     @cached_property
     def positions(self) -> np.ndarray:

@@ -151,12 +151,14 @@ class Observation:
         residual (C, Ny, Nx) [counts]: data minus model; whitened here where noise is correlated
         """
         weights = self.weights
-        if self.noise is not None:
+        if self.noise is None:
+            squares = residual**2
+        else:
             filtered, weights = [], self.white.weights
             for n, r in zip(self.noise, residual, strict=True):
                 filtered.append(n.filtered(r) / (n.filter.sum() * np.sqrt(n.variance)))
-            residual = np.stack(filtered)
-        return np.where(weights > 0, weights * np.square(residual), np.nan)
+            squares = np.stack(filtered) ** 2
+        return np.where(weights > 0, weights * squares, np.nan)
 
     @property
     def flux_scale(self) -> np.ndarray | None:
