@@ -18,6 +18,10 @@ from clresample import get_device
 MAX_REPEATS = 20
 
 
+# What libraries read when they are loaded: one thread each beside OpenCL's.
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
 def on_one_thread():
     """Start this command anew with one thread for each side, unless it was started so.
 
@@ -28,13 +32,25 @@ def on_one_thread():
     returns the variables as text, for the record
     """
     pocl = re.search(r"pocl (\d+)", get_device().cl.platform.version, re.IGNORECASE)
-    wanted = {
-        "OMP_NUM_THREADS": "1",
-        "OPENBLAS_NUM_THREADS": "1",
-        "MKL_NUM_THREADS": "1",
-        "POCL_DEVICES": "basic" if pocl is None or int(pocl[1]) < 4 else "cpu-minimal",
-        "CL_CONFIG_CPU_TBB_NUM_WORKERS": "1",  # Intel's CPU runtime
-    }
+    return _start_with(
+        ONE_THREAD
+        | {
+            "POCL_DEVICES": "basic" if pocl is None or int(pocl[1]) < 4 else "cpu-minimal",
+            "CL_CONFIG_CPU_TBB_NUM_WORKERS": "1",  # Intel's CPU runtime
+        }
+    )
+
+
+def on_all_cores():
+    """Start this command anew with OpenCL on all cores, as a user has it, and the rest on one.
+
+    On matrices as small as a fit's, threads of NumPy's libraries wait for each other and OpenCL's.
+    """
+    return _start_with(ONE_THREAD) + ", OpenCL on all cores"
+
+
+def _start_with(wanted):
+    """Start this command anew under these variables, unless it has them; returns them as text."""
     if any(os.environ.get(name) != value for name, value in wanted.items()):
         command = [sys.executable, *sys.orig_argv[1:]]
         os.execve(sys.executable, command, {**os.environ, **wanted})

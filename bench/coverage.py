@@ -1,0 +1,209 @@
+"""Error bars of simulated galaxies' catalogues: how often they hold the truth.
+
+    python -m bench.coverage [--quick] [--scenes N] [--json FILE]
+
+A row is one quantity of the galaxies of one kind, fitted in one mode, in one bin of signal to noise
+(true flux over reported error; of all bands together for what belongs to the galaxy) or in all:
+
+mode        joint, euclid or rubin
+galaxies    parametric: bulge, disk and knots; cosmos: real ones whose light is not clearly negative
+quantity    flux, and those of colour, position, size, ellipticity whose errors a catalogue has
+n           values; of a flux one for each galaxy and band
+coverage    share of |estimate - truth| < error: 0.683 where errors are right and normal
+error       standard error of that share over scenes, whose galaxies and bands hang together
+width       robust width of (estimate - truth) / error, 1.4826 MAD: 1 where errors are right
+bias        median of estimate / truth - 1 for flux and size, of (estimate - truth) / error for the
+            rest
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections import Counter, defaultdict
+
+import numpy as np
+from tqdm import tqdm
+
+from clresample import Settings, deblend_many
+from clresample.simulation.scenes import simulate_scene
+
+from .harness import records, scenes, truth
+from .harness.clock import in_processes, on_one_thread
+from .harness.options import BadOption, Parser, positive, run, seed
+
+GALAXIES = ("parametric", "cosmos")
+EDGES = (3.0, 10.0, 30.0, 100.0, 300.0, np.inf)  # signal to noise
+# Scenes of each mode: so many that the standard error of a flux bin's coverage is under 0.015.
+# Euclid has one band, Rubin six.
+N_SCENES = {"joint": 450, "euclid": 1200, "rubin": 450}
+N_QUICK = 10
+# The seeds before these serve to choose constants and to report the accuracy of fits.
+FIRST_SEED = 300
+CHUNK = 5  # scenes fitted side by side: some seconds
+# Share of negative light from which a COSMOS galaxy is left out, as no model that is positive can
+# have its flux. Half of the catalogue's galaxies have over 1 %, from the noise of HST's images.
+NEGATIVE = 0.02
+COLUMNS = (
+    ("mode", 6, ""),
+    ("galaxies", 10, ""),
+    ("quantity", 11, ""),
+    ("snr_low", 7, "g"),
+    ("snr_high", 8, "g"),
+    ("n", 6, "d"),
+    ("coverage", 8, ".3f"),
+    ("error", 6, ".3f"),
+    ("width", 6, ".2f"),
+    ("bias", 8, ".4f"),
+)
+
+
+@functools.cache
+def _cosmos(folder):
+    return scenes.Scenes(folder)
+
+
+def measure(galaxies, mode, folder, seeds, negative=NEGATIVE):
+    """What `truth.compare` finds in scenes of these seeds, and how their fits ended.
+
+    returns [{quantity: (4, n)}, ...], one for each scene that could be fitted; [status, ...]
+    """
+    parametric = galaxies == "parametric"
+    found = [simulate_scene(i) if parametric else _cosmos(folder).take(i) for i in seeds]
+    results = deblend_many([scenes.blend(scene, mode) for scene in found])
+    values = []
+    for scene, result in zip(found, results, strict=True):
+        if not result.status.startswith("failed"):
+            keep = parametric | (truth.negative_light(scene) < negative)
+            values.append(truth.compare(result, scene, mode, keep=keep))
+    return values, [result.status for result in results]
+
+
+def rows_of(mode, galaxies, values):
+    """Rows of one mode and kind of galaxies; values: of `measure`, all chunks in one list."""
+    for quantity in truth.QUANTITIES:
+        found = [one[quantity] for one in values if quantity in one]
+        if not found:
+            continue
+        i_scene = np.repeat(np.arange(len(found)), [v.shape[1] for v in found])
+        snr, estimate, true, error = np.concatenate(found, axis=1)
+        bins = [*itertools.pairwise(EDGES), (EDGES[0], EDGES[-1])]
+        for low, high in bins:
+            here = (snr >= low) & (snr < high)
+            pull = (estimate - true)[here] / error[here]
+            relative = (estimate - true)[here] / true[here]
+            row = {"mode": mode, "galaxies": galaxies, "quantity": quantity}
+            row |= {"snr_low": low, "snr_high": high, "n": int(here.sum())}
+            bias = relative if quantity in truth.RELATIVE else pull
+            yield row | _statistics(pull, bias, i_scene[here])
+
+
+def _statistics(pull, bias, i_scene):
+    if not len(pull):
+        return dict.fromkeys(("coverage", "error", "width", "bias"), np.nan)
+    held = np.abs(pull) < 1
+    share = held.mean()
+    excess = np.bincount(i_scene, held - share)  # of each scene over what is expected of it
+    return {
+        "coverage": float(share),
+        "error": float(np.sqrt((excess**2).sum()) / len(pull)),
+        "width": float(1.4826 * np.median(np.abs(pull - np.median(pull)))),
+        "bias": float(np.median(bias)),
+    }
+
+
+def fitted(wanted, n_scenes, options):
+    """Fit all scenes of `wanted`, pairs (galaxies, mode).
+
+    yields, once all scenes of a pair are done: galaxies, mode, the values of its scenes in the
+        order of their seeds, and how many fits ended in which way
+    """
+    tasks = [
+        (galaxies, mode, options.catalogue, range(start, min(start + CHUNK, end)), options.negative)
+        for galaxies, mode in wanted
+        for end in [options.seed + n_scenes[mode]]
+        for start in range(options.seed, end, CHUNK)
+    ]
+    missing = Counter(task[:2] for task in tasks)
+    values, ends = defaultdict(dict), defaultdict(Counter)
+    total = sum(n_scenes[mode] for _, mode in wanted)
+    with tqdm(total=total, unit=" scenes", desc="coverage", disable=None) as bar:
+        for task, (found, statuses) in in_processes(measure, tasks, options.processes):
+            kind, seeds = task[:2], task[3]
+            values[kind][seeds.start] = found
+            ends[kind].update(statuses)
+            bar.update(len(seeds))
+            missing[kind] -= 1
+            if not missing[kind]:
+                ordered = [one for _, chunk in sorted(values.pop(kind).items()) for one in chunk]
+                yield *kind, ordered, ends[kind]
+
+
+def main(options):
+    galaxies = [name for name in GALAXIES if name in options.galaxies]
+    if "cosmos" in galaxies and scenes.Galaxies(options.catalogue).catalogue is None:
+        galaxies.remove("cosmos")
+    if not galaxies:
+        raise BadOption("--galaxies cosmos: there is no catalogue of them, name one by --catalogue")
+    threads = on_one_thread()
+    n_scenes = {m: options.scenes or (N_QUICK if options.quick else N_SCENES[m]) for m in N_SCENES}
+    counts = ", ".join(f"{n_scenes[mode]} {mode}" for mode in options.modes)
+    record = records.record(threads) | {
+        "scenes": f"{counts}; from seed {options.seed}; {' and '.join(galaxies)} galaxies",
+        "settings": f"{Settings()}",
+        "left out": f"COSMOS galaxies with {options.negative:.1%} of negative light or more",
+    }
+    records.print_record(record)
+    rows, summary = [], {"how fits ended": {}}
+    records.print_head(COLUMNS)
+    wanted = list(itertools.product(galaxies, options.modes))
+    for kind, mode, values, ends in fitted(wanted, n_scenes, options):
+        for row in rows_of(mode, kind, values):
+            rows.append(row)
+            records.print_row(COLUMNS, row)
+        summary["how fits ended"][f"{kind}, {mode}"] = dict(ends)
+    records.print_summary(summary)
+    if options.json is not None:
+        records.write_json(options.json, {"record": record, "summary": summary, "rows": rows})
+
+
+def parser():
+    parser = Parser("bench.coverage", description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help=f"{N_QUICK} scenes of each")
+    parser.add_argument(
+        "--scenes",
+        type=positive(int),
+        metavar="N",
+        help="how many scenes of each mode and kind of galaxies "
+        f"({', '.join(f'{n} {mode}' for mode, n in N_SCENES.items())})",
+    )
+    parser.add_argument(
+        "--seed",
+        type=seed,
+        default=FIRST_SEED,
+        metavar="S",
+        help="seed of the first scene (%(default)s)",
+    )
+    parser.add_argument("--modes", nargs="+", choices=N_SCENES, default=tuple(N_SCENES))
+    parser.add_argument(
+        "--galaxies",
+        nargs="+",
+        choices=GALAXIES,
+        default=GALAXIES,
+        help="which; without a catalogue of COSMOS galaxies only parametric ones (both)",
+    )
+    parser.add_argument(
+        "--negative",
+        type=positive(float),
+        default=NEGATIVE,
+        metavar="SHARE",
+        help="of a COSMOS galaxy's light: with more than this it is left out (%(default)s)",
+    )
+    parser.add_catalogue()
+    parser.add_processes()
+    parser.add_json()
+    return parser
+
+
+if __name__ == "__main__":
+    run(main, parser())
