@@ -3,6 +3,10 @@
 render     `python -m bench.render`: time and accuracy of a resampling, ours beside GalSim's
 contract   `python -m bench.contract`: the matrix product on the device beside NumPy's
 deblend    `python -m bench.deblend`: time and accuracy of fits to simulated blends
+settings   `python -m bench.settings`: accuracy with the default settings beside others
+coverage   `python -m bench.coverage`: how often the errors of simulated galaxies hold the truth
+throughput `python -m bench.throughput`: core-seconds of a source, and blends of many sources
+real       `python -m bench.real`: chi2 and structured residuals of real scenes, by default settings
 paper/     the figures and statements of the paper, recomputed, and the report on them
 harness/   what these commands share
 report/    results of the last run of paper/: report.md, its figures, and its numbers as JSON

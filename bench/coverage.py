@@ -3,7 +3,8 @@
     python -m bench.coverage [--quick] [--scenes N] [--json FILE]
 
 A row is one quantity of the galaxies of one kind, fitted in one mode, in one bin of signal to noise
-(true flux over reported error; of all bands together for what belongs to the galaxy) or in all:
+(true flux over reported error; of all bands together for what belongs to the galaxy) or in all bins
+together, from 3 on; a bin without an upper end has snr_high = null in the JSON:
 
 mode        joint, euclid or rubin
 galaxies    parametric: bulge, disk and knots; cosmos: real ones whose light is not clearly negative

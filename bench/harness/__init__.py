@@ -5,6 +5,9 @@ clock     one thread for each side, timing by turns, worker processes
 records   what a run leaves: its record, tables on the screen, JSON, a log to go on from
 cases     stamps of one sky in two surveys, rendered by the operator and by GalSim
 scenes    simulated blends of Euclid and Rubin, and how well they were fitted
+crowded   single simulated blends of many galaxies
+truth     what a catalogue says of simulated galaxies, beside the truth and in units of its errors
+residuals structure that a fit has left in its residuals
 
 Imports clresample only.
 """

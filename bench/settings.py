@@ -1,0 +1,177 @@
+"""Accuracy of simulated scenes' models with several settings, each in all modes, side by side.
+
+    python -m bench.settings [--quick] [--scenes N] [--settings NAME ...] [--json FILE]
+
+settings   default; prior: Settings(prior=Prior()), one strength and scale of structure for all
+           sources; paper: Settings(prior=None), the constraints alone
+mode       rubin, euclid or joint, all judged on Euclid's pixels
+median, mean   [dB] SDR of the galaxies' models against their truth, both of unit sum
+worse      share of galaxies more than 0.5 dB under the better single survey: of the joint fits
+below      [dB] mean SDR minus the mean of the better of both single surveys
+against    [dB] mean of the differences from the first settings, galaxy by galaxy
+error      [dB] its standard error over scenes, whose galaxies hang together
+converged  share of the fits; iterations: their median; seconds: processor time of a scene
+
+The same scenes and noise for all; fits of many scenes side by side.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from tqdm import tqdm
+
+from clresample import Prior, Settings, deblend_many
+
+from .harness import records, scenes
+from .harness.clock import in_processes, on_one_thread
+from .harness.options import Parser, positive, run, seed
+
+SETTINGS = {
+    "default": Settings(),
+    "prior": Settings(prior=Prior()),
+    "paper": Settings(prior=None),
+}
+N_SCENES, N_QUICK = 120, 8
+CHUNK = 4  # scenes fitted side by side: some seconds
+WORSE_DB = 0.5
+COLUMNS = (
+    ("settings", 8, ""),
+    ("mode", 6, ""),
+    ("n", 4, "d"),
+    ("median", 6, ".2f"),
+    ("mean", 6, ".2f"),
+    ("worse", 5, ".3f"),
+    ("below", 6, ".2f"),
+    ("against", 7, ".3f"),
+    ("error", 5, ".3f"),
+    ("chi2", 5, ".3f"),
+    ("converged", 9, ".2f"),
+    ("iterations", 10, ".0f"),
+    ("seconds", 7, ".3f"),
+)
+
+
+def measure(name, mode, folder, seeds):
+    """For each scene, fitted with some settings in one mode: SDRs, chi2, how the fit ended."""
+    sky = scenes.Scenes(folder)
+    found = [sky.take(i) for i in seeds]
+    blends = [scenes.blend(scene, mode) for scene in found]
+    began = time.process_time()
+    results = deblend_many(blends, settings=SETTINGS[name])
+    seconds = (time.process_time() - began) / len(found)
+    return [
+        {"sdr": [float("nan")] * len(scene.profiles), "status": result.status}
+        if result.status.startswith("failed")
+        else {
+            "sdr": scenes.scores(result, scene),
+            "status": result.status,
+            "chi2": scenes.chi2_of_all(result),
+            "iterations": scenes.iterations(result),
+            "seconds": seconds,
+        }
+        for scene, result in zip(found, results, strict=True)
+    ]
+
+
+def rows_of(parts):
+    """Rows of {(settings, mode): [what `measure` returns of each scene]}, without failed fits."""
+    names = dict.fromkeys(name for name, _ in parts)
+    sdr = {key: np.concatenate([p["sdr"] for p in some]) for key, some in parts.items()}
+    i_scene = np.repeat(*_lengths(next(iter(parts.values()))))
+    for name in names:
+        singles = [sdr[name, mode] for mode in scenes.MODES if mode != "joint"]
+        better = np.maximum(*singles)
+        for mode in scenes.MODES:
+            some, found = parts[name, mode], sdr[name, mode]
+            fitted = [p for p in some if "chi2" in p]
+            gain = found - sdr[next(iter(names)), mode]
+            yield {
+                "settings": name,
+                "mode": mode,
+                "n": int(np.isfinite(found).sum()),
+                "median": float(np.nanmedian(found)),
+                "mean": float(np.nanmean(found)),
+                "worse": float((found < better - WORSE_DB).mean()),
+                "below": float(np.nanmean(found) - np.nanmean(better)),
+                "against": float(np.nanmean(gain)),
+                "error": _error(gain, i_scene),
+                "converged": float(np.mean([p["status"] == "converged" for p in some])),
+            } | {
+                key: float(form([p[key] for p in fitted]))
+                for key, form in (
+                    ("chi2", np.mean),
+                    ("iterations", np.median),
+                    ("seconds", np.mean),
+                )
+            }
+
+
+def _lengths(parts):
+    """Indices of the scenes, and how many galaxies each has."""
+    return np.arange(len(parts)), [len(p["sdr"]) for p in parts]
+
+
+def _error(values, i_scene):
+    """Standard error of a mean over scenes, whose galaxies hang together."""
+    good = np.isfinite(values)
+    excess = np.bincount(i_scene[good], values[good] - values[good].mean())
+    return float(np.sqrt((excess**2).sum()) / good.sum())
+
+
+def main(options):
+    threads = on_one_thread()
+    n_scenes = options.scenes or (N_QUICK if options.quick else N_SCENES)
+    record = records.record(threads) | {
+        "scenes": f"{n_scenes} from seed {options.seed}; {scenes.Scenes(options.catalogue).name}",
+        "settings": "; ".join(f"{name} = {SETTINGS[name]}" for name in options.settings),
+    }
+    records.print_record(record)
+    seeds = range(options.seed, options.seed + n_scenes)
+    tasks = [
+        (name, mode, options.catalogue, seeds[i : i + CHUNK])
+        for name in options.settings
+        for mode in scenes.MODES
+        for i in range(0, n_scenes, CHUNK)
+    ]
+    parts = {task[:2]: {} for task in tasks}
+    with tqdm(total=len(tasks) * CHUNK, unit=" fits", desc="settings", disable=None) as bar:
+        for task, found in in_processes(measure, tasks, options.processes):
+            parts[task[:2]] |= dict(zip(task[-1], found, strict=True))
+            bar.update(CHUNK)
+    parts = {key: [found[i] for i in seeds] for key, found in parts.items()}
+    rows = list(rows_of(parts))
+    records.print_head(COLUMNS)
+    for row in rows:
+        records.print_row(COLUMNS, row)
+    if options.json is not None:
+        fits = {f"{name}, {mode}": some for (name, mode), some in parts.items()}
+        records.write_json(options.json, {"record": record, "rows": rows, "fits": fits})
+
+
+def parser():
+    parser = Parser("bench.settings", description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help=f"{N_QUICK} scenes")
+    parser.add_argument(
+        "--scenes", type=positive(int), metavar="N", help=f"how many scenes ({N_SCENES})"
+    )
+    parser.add_argument(
+        "--seed", type=seed, default=0, metavar="S", help="seed of the first scene (%(default)s)"
+    )
+    parser.add_argument(
+        "--settings",
+        nargs="+",
+        choices=SETTINGS,
+        default=("default", "prior"),
+        metavar="NAME",
+        help=f"which, of {', '.join(SETTINGS)} (default prior)",
+    )
+    parser.add_catalogue()
+    parser.add_processes()
+    parser.add_json()
+    return parser
+
+
+if __name__ == "__main__":
+    run(main, parser())

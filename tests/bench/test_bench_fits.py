@@ -1,0 +1,224 @@
+"""The benchmarks of accuracy, errors and cost on the smallest configurations: rows, failures."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.checkout import run_python
+
+pytest.importorskip("galsim")
+
+RECORD = {"date", "device", "platform", "machine", "python", "threads", "clresample", "numpy"}
+COVERAGE = {
+    "mode", "galaxies", "quantity", "snr_low", "snr_high", "n", "coverage", "error", "width",
+    "bias",
+}  # fmt: skip
+THROUGHPUT = {
+    "what", "n_scenes", "n_sources", "n_model", "core_s_per_source", "wall_s", "galsim_ms",
+    "renders_per_source", "iterations", "chi2", "peak_gb", "base_gb", "stage", "status",
+}  # fmt: skip
+REAL = {
+    "scene", "band", "chi2", "status", "seconds", "core_s", "iterations", "n_sources", "residual",
+    "source", "flagged", "n_unflagged", "stages",
+}  # fmt: skip
+SETTINGS = {
+    "settings", "mode", "n", "median", "mean", "worse", "below", "against", "error", "chi2",
+    "converged", "iterations", "seconds",
+}  # fmt: skip
+
+
+def run(folder, module, *options):
+    """Rows that a benchmark writes."""
+    file = folder / f"{module}.json"
+    result = run_python("-m", f"bench.{module}", *map(str, options), "--json", str(file))
+    assert result.returncode == 0, result.stderr
+    found = json.loads(file.read_text())
+    assert found["record"].keys() >= RECORD
+    return found["rows"]
+
+
+def test_coverage(tmp_path):
+    rows = run(
+        tmp_path, "coverage", "--scenes", 1, "--modes", "euclid", "rubin",
+        "--galaxies", "parametric", "--processes", 1,
+    )  # fmt: skip
+    assert all(row.keys() == COVERAGE for row in rows)
+    fluxes = [row for row in rows if row["quantity"] == "flux"]
+    assert [(r["mode"], r["snr_low"]) for r in fluxes] == [
+        (mode, low) for mode in ("euclid", "rubin") for low in (3, 10, 30, 100, 300, 3)
+    ]
+    for mode in ("euclid", "rubin"):
+        *bins, whole = (row for row in fluxes if row["mode"] == mode)
+        assert whole["snr_high"] is None
+        assert whole["n"] == sum(row["n"] for row in bins)
+
+
+def test_coverage_of_right_errors_is_that_of_a_normal_distribution():
+    from bench.coverage import rows_of
+
+    rng = np.random.default_rng(0)
+    snr = rng.uniform(3, 30, (400, 20))
+    true = rng.uniform(5, 10, snr.shape)
+    error = true / snr
+    estimate = 1.01 * true + error * rng.standard_normal(snr.shape)
+    values = [{"flux": np.stack(one)} for one in zip(snr, estimate, true, error, strict=True)]
+    rows = {(r["snr_low"], r["snr_high"]): r for r in rows_of("joint", "parametric", values)}
+    whole = rows[3, np.inf]
+    assert whole["n"] == 8000
+    assert whole["coverage"] == pytest.approx(0.68, abs=0.02)
+    assert whole["error"] == pytest.approx(np.sqrt(0.68 * 0.32 / 8000), rel=0.2)
+    assert whole["width"] == pytest.approx(1, abs=0.04)
+    assert whole["bias"] == pytest.approx(0.01, abs=0.004)
+    assert rows[100, 300]["n"] == 0
+    # galaxies of a scene that all err alike say as little as one of them
+    alike = [{"flux": np.repeat(v["flux"][:, :1], 20, axis=1)} for v in values]
+    *_, found = rows_of("joint", "parametric", alike)
+    assert found["error"] == pytest.approx(np.sqrt(0.68 * 0.32 / 400), rel=0.2)
+
+
+def test_values_with_errors_are_found_by_their_columns(monkeypatch):
+    from astropy import units as u
+    from astropy.table import QTable
+
+    from bench.harness import truth
+    from clresample.simulation.scenes import simulate_scene
+
+    scene = simulate_scene(0, n_sources=2, n_pixels=40)
+    n_lit = 10 ** (-0.4 * (scene.euclid.magnitudes[:, 0] - 23.9))
+    table = QTable({"flux_VIS": n_lit * 1.1 * u.uJy, "flux_err_VIS": n_lit / 10 * u.uJy})
+    table["y_centroid"] = scene.euclid.positions_px[:, 0] * u.pix
+    table["y_centroid_err"] = [0.5, np.nan] * u.pix
+    table["size"] = [1, 1] * u.arcsec  # without errors
+    monkeypatch.setattr(truth, "catalogue", lambda _: table)
+    found = truth.compare(None, scene, "euclid")
+    assert found.keys() == {"flux", "position"}
+    np.testing.assert_allclose(found["flux"][0], 10)
+    np.testing.assert_allclose(found["flux"][1] - found["flux"][2], found["flux"][3])
+    assert found["position"].shape == (4, 1)  # the one that has an error
+    assert abs(found["position"][1] - found["position"][2]) < 3  # px: knots move the centroid
+    kept = truth.compare(None, scene, "euclid", keep=np.array([True, False]))
+    assert kept["flux"].shape == (4, 1)
+
+
+def test_a_structured_residual_is_measured_in_sigmas_and_given_to_its_source():
+    from bench.harness import scenes
+    from bench.harness.residuals import worst_residuals
+    from clresample import Observation, Settings, deblend
+    from clresample.simulation.scenes import simulate_scene
+
+    scene = simulate_scene(3, n_sources=2, n_pixels=40)
+    blend = scenes.blend(scene, "euclid")
+    result = deblend(
+        blend.observations, blend.sources, frame=blend.frame, settings=Settings(max_iter=2)
+    )
+    o = result.observations[0]
+    psf, sigma = o.psf.images[0], 1 / np.sqrt(o.weights[0, 0, 0])
+    y, x = np.rint(scene.euclid.positions_px[1]).astype(int)
+    half = psf.shape[0] // 2
+    bump = np.zeros(o.data.shape[1:])
+    bump[y - 3 : y + 4, x - 3 : x + 4] = psf[half - 3 : half + 4, half - 3 : half + 4]
+    data = result.model(0) - 8 * sigma * bump / np.sqrt((psf**2).sum())
+    left = Observation(data, o.psf, o.grid, weights=o.weights, channels=o.channels, name=o.name)
+    found = worst_residuals(replace(result, observations=(left,)), 0)
+    assert found.shape == (2, 1)
+    assert found[1, 0] == pytest.approx(8, rel=0.02)
+    assert not found[0, 0] > 4
+
+
+def test_real(data, tmp_path):
+    rows = run(tmp_path, "real", "--only", "hsc_blend", "cosmos", "--galaxies", 1)
+    assert all(row.keys() == REAL for row in rows)
+    assert [row["band"] for row in rows] == ["g", "r", "i", "z", "y", "F814W"]
+    assert [row["n_sources"] for row in rows] == [7] * 5 + [1]
+    assert min(row["chi2"] for row in rows) > 0.5
+    for row in rows:
+        assert row["residual"] > 0
+        assert 0 <= row["source"] < row["n_sources"]
+
+
+def test_real_scene_files_hold_nothing_but_defaults(data, tmp_path):
+    from bench.real import scene_files
+    from clresample import Settings
+    from clresample.files.scene import read_scene
+
+    paths = scene_files(data, tmp_path)
+    assert paths.keys() == {"hst_hsc", "hst", "hsc"}
+    joint = read_scene(paths["hst_hsc"])
+    assert [o.name for o in joint.observations] == ["HST", "HSC"]
+    assert joint.settings.fit_shifts
+    assert str(replace(joint.settings, fit_shifts=False, fit_sky=False)) == str(Settings())
+    assert joint.sources is None
+    assert not read_scene(paths["hst"]).settings.fit_shifts
+
+
+def test_throughput(tmp_path):
+    rows = run(tmp_path, "throughput", "--scenes", 1, "--blends", 20, "--limit", 0.1)
+    assert all(row.keys() == THROUGHPUT for row in rows)
+    assert [row["what"] for row in rows] == ["shared", "own", "blend"]
+    for row in rows[:2]:
+        assert row["core_s_per_source"] > 0
+        assert row["renders_per_source"] == pytest.approx(
+            row["core_s_per_source"] / row["galsim_ms"] * 1e3
+        )
+        assert row["stage"].keys() >= {"setup", "fit", "result", "catalogue"}
+        assert sum(row["stage"].values()) <= 1.01 * row["wall_s"]
+        assert 0 < row["base_gb"] <= row["peak_gb"]
+    assert rows[2]["status"] == "over 0.1 s"
+    assert rows[2]["core_s_per_source"] is None
+
+
+def test_a_blend_without_memory_is_a_row():
+    from bench import throughput
+
+    options = throughput.parser().parse_args(["--memory", "0.02"])
+    row = throughput.blend_apart(20, options, limit_s=100)
+    assert row["status"].startswith("failed: ")
+    assert row["n_model"] == 256
+
+
+def test_crowded_blend_holds_its_light():
+    from bench.harness.crowded import crowded_blend
+
+    blend = crowded_blend(1, 4, 100)
+    assert [o.shape for o in blend.observations] == [(1, 100, 100), (6, 50, 50)]
+    assert blend.frame.inside(blend.frame.place(blend.sources)).all()
+    for o in blend.observations:
+        level = np.median(o.data, axis=(1, 2)) * np.sqrt(o.weights[:, 0, 0])
+        assert np.abs(level).max() < 1
+        assert (o.data.max(axis=(1, 2)) * np.sqrt(o.weights[:, 0, 0])).max() > 10
+
+
+def test_settings(tmp_path):
+    rows = run(
+        tmp_path, "settings", "--scenes", 1, "--processes", 1, "--settings", "default", "paper"
+    )  # fmt: skip
+    assert all(row.keys() == SETTINGS for row in rows)
+    assert [(r["settings"], r["mode"]) for r in rows] == [
+        (name, mode) for name in ("default", "paper") for mode in ("rubin", "euclid", "joint")
+    ]
+    for row in rows[:3]:
+        assert row["against"] == 0
+    for row in rows:
+        assert 0 <= row["worse"] <= 1
+
+
+@pytest.mark.parametrize(
+    ("module", "options", "words"),
+    [
+        ("coverage", ("--scenes", "0"), "0 is not above 0"),
+        ("coverage", ("--modes", "hst"), "hst"),
+        ("coverage", ("--catalogue", "nowhere"), "nowhere"),
+        ("throughput", ("--blends", "7"), "7"),
+        ("throughput", ("--limit", "-1"), "-1 is not above 0"),
+        ("settings", ("--settings", "best"), "best"),
+        ("real", ("--galaxies", "many"), "many"),
+        ("real", ("--only", "m87"), "--only"),
+        ("real", ("--json", "."), "--json ."),
+    ],
+)
+def test_bad_options_get_one_line(module, options, words):
+    result = run_python("-m", f"bench.{module}", *options)
+    assert result.returncode == 2
+    assert result.stderr.count("\n") == 1
+    assert words in result.stderr
