@@ -26,6 +26,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -78,7 +79,9 @@ def timed(what, blends, clock):
     wall_s, core_s = ended - wall_s, time.process_time() - core_s
     clock.ticks(N_TICKS)
     galsim_ms = clock.take_ms()
-    stage = {name: sum(r.seconds[name] for r in results) for name in results[0].seconds}
+    stage = Counter()
+    for result in results:
+        stage.update(result.seconds)
     converged = sum(result.converged for result in results)
     return {
         "what": what,
@@ -93,7 +96,7 @@ def timed(what, blends, clock):
         "chi2": float(np.mean([scenes.chi2_of_all(r) for r in results])),
         "peak_gb": _peak_gb(),
         "base_gb": base_gb,
-        "stage": stage | {"catalogue": ended - began},
+        "stage": {**stage, "catalogue": ended - began},
         "status": results[0].status if len(results) == 1 else f"{converged} converged",
     }
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
+from astropy import units as u
 
 from clresample import catalogue
 from clresample.measurement.shapes import local_axes, moments, shape
@@ -88,7 +89,7 @@ def _error(table, name):
     """Errors of a column (S,), by either way of naming them; None where there are none."""
     for column in (f"{name}_err", name.replace("_", "_err_", 1)):
         if column != name and column in table.colnames:
-            return np.asarray(table[column].to_value(table[name].unit), float)
+            return u.Quantity(table[column]).to_value(u.Quantity(table[name]).unit)
     return None
 
 

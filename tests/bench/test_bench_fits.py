@@ -89,12 +89,14 @@ def test_values_with_errors_are_found_by_their_columns(monkeypatch):
     table = QTable({"flux_VIS": n_lit * 1.1 * u.uJy, "flux_err_VIS": n_lit / 10 * u.uJy})
     table["y_centroid"] = scene.euclid.positions_px[:, 0] * u.pix
     table["y_centroid_err"] = [0.5, np.nan] * u.pix
+    table["e1"], table["e1_err"] = [0.1, 0.2], [0.3, 0.3]
     table["size"] = [1, 1] * u.arcsec  # without errors
     monkeypatch.setattr(truth, "catalogue", lambda _: table)
     found = truth.compare(None, scene, "euclid")
-    assert found.keys() == {"flux", "position"}
+    assert found.keys() == {"flux", "position", "ellipticity"}
     np.testing.assert_allclose(found["flux"][0], 10)
     np.testing.assert_allclose(found["flux"][1] - found["flux"][2], found["flux"][3])
+    np.testing.assert_allclose(found["ellipticity"][3], 0.3)
     assert found["position"].shape == (4, 1)  # the one that has an error
     assert abs(found["position"][1] - found["position"][2]) < 3  # px: knots move the centroid
     kept = truth.compare(None, scene, "euclid", keep=np.array([True, False]))
