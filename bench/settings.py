@@ -17,6 +17,8 @@ The same scenes and noise for all; fits of many scenes side by side.
 
 from __future__ import annotations
 
+import functools
+import itertools
 import time
 
 import numpy as np
@@ -53,26 +55,39 @@ COLUMNS = (
 )
 
 
-def measure(name, mode, folder, seeds):
-    """For each scene, fitted with some settings in one mode: SDRs, chi2, how the fit ended."""
-    sky = scenes.Scenes(folder)
-    found = [sky.take(i) for i in seeds]
-    blends = [scenes.blend(scene, mode) for scene in found]
-    began = time.process_time()
-    results = deblend_many(blends, settings=SETTINGS[name])
-    seconds = (time.process_time() - began) / len(found)
-    return [
-        {"sdr": [float("nan")] * len(scene.profiles), "status": result.status}
-        if result.status.startswith("failed")
-        else {
-            "sdr": scenes.scores(result, scene),
-            "status": result.status,
-            "chi2": scenes.chi2_of_all(result),
-            "iterations": scenes.iterations(result),
-            "seconds": seconds,
-        }
-        for scene, result in zip(found, results, strict=True)
-    ]
+@functools.cache
+def _open_scenes(folder):
+    return scenes.Scenes(folder)
+
+
+def measure(names, folder, seeds):
+    """Scenes fitted with several settings in all modes: SDRs, chi2, how the fits ended.
+
+    returns {(settings, mode): [dictionary of each scene]}
+    """
+    found = [_open_scenes(folder).take(i) for i in seeds]
+    parts = {}
+    for name, mode in itertools.product(names, scenes.MODES):
+        blends = [scenes.blend(scene, mode) for scene in found]
+        began = time.process_time()
+        results = deblend_many(blends, settings=SETTINGS[name])
+        seconds = (time.process_time() - began) / len(found)
+        parts[name, mode] = [
+            _scores(scene, result) | {"seconds": seconds}
+            for scene, result in zip(found, results, strict=True)
+        ]
+    return parts
+
+
+def _scores(scene, result):
+    if result.status.startswith("failed"):
+        return {"sdr": [float("nan")] * len(scene.profiles), "status": result.status}
+    return {
+        "sdr": scenes.scores(result, scene),
+        "status": result.status,
+        "chi2": scenes.chi2_of_all(result),
+        "iterations": scenes.iterations(result),
+    }
 
 
 def rows_of(parts):
@@ -129,18 +144,15 @@ def main(options):
     }
     records.print_record(record)
     seeds = range(options.seed, options.seed + n_scenes)
-    tasks = [
-        (name, mode, options.catalogue, seeds[i : i + CHUNK])
-        for name in options.settings
-        for mode in scenes.MODES
-        for i in range(0, n_scenes, CHUNK)
-    ]
-    parts = {task[:2]: {} for task in tasks}
-    with tqdm(total=len(tasks) * CHUNK, unit=" fits", desc="settings", disable=None) as bar:
-        for task, found in in_processes(measure, tasks, options.processes):
-            parts[task[:2]] |= dict(zip(task[-1], found, strict=True))
-            bar.update(CHUNK)
-    parts = {key: [found[i] for i in seeds] for key, found in parts.items()}
+    chunks = [seeds[i : i + CHUNK] for i in range(0, n_scenes, CHUNK)]
+    tasks = [(options.settings, options.catalogue, chunk) for chunk in chunks]
+    done = {}
+    with tqdm(total=n_scenes, unit=" scenes", desc="settings", disable=None) as bar:
+        for (*_, chunk), found in in_processes(measure, tasks, options.processes):
+            done[chunk.start] = found
+            bar.update(len(chunk))
+    keys = itertools.product(options.settings, scenes.MODES)
+    parts = {key: [one for _, found in sorted(done.items()) for one in found[key]] for key in keys}
     rows = list(rows_of(parts))
     records.print_head(COLUMNS)
     for row in rows:

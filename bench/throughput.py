@@ -14,13 +14,14 @@ galsim_ms           processor time of one GalSim quintic render of one band, EUC
                     N = 118, as a clock: median of renders before and after
 renders_per_source  core_s_per_source in such renders
 stage               seconds of wall time by stage, as results have them, and of catalogues
-peak_gb             largest memory of the process, with what Python and the images take: base_gb
+peak_gb             largest memory of the process so far, with Python and the images: before, base_gb
 status              share of converged fits; of a blend how it ended, or why it did not
 """
 
 from __future__ import annotations
 
 import json
+import re
 import resource
 import subprocess
 import sys
@@ -103,7 +104,10 @@ def timed(what, blends, clock):
 
 def _peak_gb():
     """Largest memory that this process has held so far [GB]."""
-    unit = 1 if sys.platform == "darwin" else 1024  # getrusage counts bytes there, else KiB
+    status = Path("/proc/self/status")  # getrusage says of a new process what its parent held
+    if status.is_file():
+        return int(re.search(r"VmHWM:\s*(\d+) kB", status.read_text())[1]) * 1024 / 1e9
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes there, else KiB
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
 
 
