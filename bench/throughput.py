@@ -14,7 +14,7 @@ galsim_ms           processor time of one GalSim quintic render of one band, EUC
                     N = 118, as a clock: median of renders before and after
 renders_per_source  core_s_per_source in such renders
 stage               seconds of wall time by stage, as results have them, and of catalogues
-peak_gb             largest memory of the process so far, with Python and the images: before, base_gb
+peak_gb             largest memory of the process so far, all included; before the row: base_gb
 status              share of converged fits; of a blend how it ended, or why it did not
 """
 
