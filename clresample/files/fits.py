@@ -259,7 +259,7 @@ def choose_bands(path, names, bands):
             raise FileError(f"{path}: no band {band} (bands: {there})")
         chosen.append(i)
     if not chosen:
-        raise FileError(f"{path}: bands is an empty list, the file has {len(names)}")
+        raise FileError(f"{path}: bands is empty, none of the {len(names)} in the file is chosen")
     return chosen
 
 
