@@ -26,7 +26,7 @@ from collections import Counter, defaultdict
 import numpy as np
 from tqdm import tqdm
 
-from clresample import Settings, deblend_many
+from clresample import Settings
 from clresample.simulation.scenes import simulate_scene
 
 from .harness import records, scenes, truth
@@ -71,7 +71,7 @@ def measure(galaxies, mode, folder, seeds, negative=NEGATIVE):
     """
     parametric = galaxies == "parametric"
     found = [simulate_scene(i) if parametric else _cosmos(folder).take(i) for i in seeds]
-    results = deblend_many([scenes.blend(scene, mode) for scene in found])
+    results = scenes.fit([scenes.blend(scene, mode) for scene in found])
     values = []
     for scene, result in zip(found, results, strict=True):
         if not result.status.startswith("failed"):

@@ -24,7 +24,7 @@ import time
 import numpy as np
 from tqdm import tqdm
 
-from clresample import Prior, Settings, deblend_many
+from clresample import Prior, Settings
 
 from .harness import records, scenes
 from .harness.clock import in_processes, on_one_thread
@@ -70,7 +70,7 @@ def measure(names, folder, seeds):
     for name, mode in itertools.product(names, scenes.MODES):
         blends = [scenes.blend(scene, mode) for scene in found]
         began = time.process_time()
-        results = deblend_many(blends, settings=SETTINGS[name])
+        results = scenes.fit(blends, settings=SETTINGS[name])
         seconds = (time.process_time() - began) / len(found)
         parts[name, mode] = [
             _scores(scene, result) | {"seconds": seconds}

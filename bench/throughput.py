@@ -32,7 +32,7 @@ from pathlib import Path
 
 import numpy as np
 
-from clresample import catalogue, deblend_many
+from clresample import catalogue
 
 from .harness import records, scenes
 from .harness.clock import on_all_cores
@@ -70,7 +70,7 @@ def timed(what, blends, clock):
     base_gb = _peak_gb()
     clock.ticks(N_TICKS)
     wall_s, core_s = time.perf_counter(), time.process_time()
-    results = deblend_many(blends)
+    results = scenes.fit(blends)
     for result in results:
         if result.status.startswith("failed"):
             raise RuntimeError(result.status)
@@ -133,7 +133,7 @@ def blend_row(options):
     n_sources = options.blend
     limit = int(options.memory * 1e9)
     resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
-    deblend_many([crowded_blend(WARM_SEED, *WARM_BLEND)])
+    scenes.fit([crowded_blend(WARM_SEED, *WARM_BLEND)])
     blend = crowded_blend(options.seed, n_sources, BLENDS[n_sources])
     return timed("blend", [blend], scenes.GalSimClock(timer=time.process_time))
 
@@ -169,7 +169,7 @@ def rows_of(options):
     sky, clock = scenes.Scenes(options.catalogue), scenes.GalSimClock(timer=time.process_time)
     seeds = range(options.seed, options.seed + options.scenes)
     for what, make in {"shared": shared_blends, "own": own_blends}.items():
-        deblend_many(make(sky, (WARM_SEED, WARM_SEED + 1)))
+        scenes.fit(make(sky, (WARM_SEED, WARM_SEED + 1)))
         yield timed(what, make(sky, seeds), clock)
     for n_sources in options.blends:
         yield blend_apart(n_sources, options, options.limit)

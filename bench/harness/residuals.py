@@ -6,7 +6,6 @@ import numpy as np
 from scipy.signal import fftconvolve
 
 from clresample import PSF
-from clresample.sky.footprint import Footprint
 
 # Least number of sky pixels that say how much correlated noise adds up under the filter.
 MIN_PIXELS = 400
@@ -24,7 +23,7 @@ def worst_residuals(result, i_observation):
     hold it.  Correlated noise adds up under the filter: where a channel has 400 pixels of sky,
     those with less than one sigma of model, t is divided by its robust scatter there, if over 1.
     """
-    observation, footprint = result.observations[i_observation], Footprint.of(result, i_observation)
+    observation, footprint = result.observations[i_observation], result.footprints[i_observation]
     weights = np.where(footprint.used, observation.weights, 0.0)
     filtered = _filtered(np.nan_to_num(result.residual(i_observation)), weights, _psf(observation))
     models = np.stack([result.source_model(s, i_observation) for s in range(len(result.sources))])

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import time
+import warnings
 from dataclasses import replace
 
 import numpy as np
 from astropy.table import Table
 
-from clresample import PSF
+from clresample import PSF, deblend_many
 from clresample.deblending.blend import Blend
 from clresample.measurement.quality import summary
 from clresample.simulation.scenes import simulate_scene
 from clresample.simulation.sdr import sdr
 from clresample.simulation.surveys import NOTEBOOK_SURVEYS
 from clresample.sky.frame import model_frame
-from clresample.sky.sources import Extended
+from clresample.sky.sources import Extended, SourceWarning
 
 from .cases import Case, Galaxies
 from .options import data_folder
@@ -59,6 +60,13 @@ def blend(scene, mode, *, profiles=None):
         for position, profile in zip(scene.euclid.positions_px, profiles, strict=True)
     )
     return Blend(observations, sources, model_frame(observations, grid=scene.euclid.grid))
+
+
+def fit(blends, **options):
+    """`deblend_many`; simulated sources under the noise are expected, and not warned of."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SourceWarning)
+        return deblend_many(blends, **options)
 
 
 def as_new(scene, rng):

@@ -109,7 +109,7 @@ def test_a_structured_residual_is_measured_in_sigmas_and_given_to_its_source():
     from clresample import Observation, Settings, deblend
     from clresample.simulation.scenes import simulate_scene
 
-    scene = simulate_scene(3, n_sources=2, n_pixels=40)
+    scene = simulate_scene(5, n_sources=2, n_pixels=40)
     blend = scenes.blend(scene, "euclid")
     result = deblend(
         blend.observations, blend.sources, frame=blend.frame, settings=Settings(max_iter=2)
