@@ -17,7 +17,7 @@ chi2          per pixel with a weight
 status        how the fit ended
 seconds       wall time, from files or arrays to the catalogue, detection included;
 core_s        processor time, of all threads
-residual      [sigma] the largest of any source, filtered with the PSF (`harness.residuals`)
+residual      [sigma] the largest of any source, filtered with the PSF (`measurement.residuals`)
 source        that source's number
 flagged       whether the catalogue flags it as a misfit; null where the library has no such flag
 n_unflagged   sources with a residual over 5 sigma in this band that are not flagged
@@ -40,12 +40,12 @@ from scipy.ndimage import gaussian_filter
 from clresample import PSF, Extended, Flag, Grid, Observation, catalogue, deblend, summary
 from clresample.cli.command import main as clresample
 from clresample.files.results import read_result
+from clresample.measurement.residuals import worst_residuals
 from clresample.simulation.galaxies import import_galsim, open_catalogue
 
 from .harness import records
 from .harness.clock import on_all_cores
 from .harness.options import ROOT, BadOption, Parser, data_folder, positive, run
-from .harness.residuals import worst_residuals
 
 STRUCTURED = 5.0  # [sigma] A residual above this is no noise.
 N_COSMOS = 12

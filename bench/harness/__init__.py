@@ -7,7 +7,6 @@ cases     stamps of one sky in two surveys, rendered by the operator and by GalS
 scenes    simulated blends of Euclid and Rubin, and how well they were fitted
 crowded   single simulated blends of many galaxies
 truth     what a catalogue says of simulated galaxies, beside the truth and in units of its errors
-residuals structure that a fit has left in its residuals
 
 Imports clresample only.
 """

@@ -41,6 +41,8 @@ example  clresample deblend --example trial
 The first writes simulated Euclid and Rubin images with a commented scene file that
 shows every key. Options given here replace those of the scene file."""
 
+# Misfitted sources that the report names; the catalogue flags all of them.
+FEW = 10
 OUTPUTS = "catalogue.fits", "catalogue.ecsv", "result.fits", "deblended.png"
 
 
@@ -248,6 +250,13 @@ def _report(arguments, result, found, device, took):
         + f": {found['status']} after {found['n_iterations']} iterations, {took:.1f} s on "
         f"{device.name}"
     )
+    if found["misfits"]:
+        n, those = len(found["misfits"]), ", ".join(map(str, found["misfits"][:FEW]))
+        more = f" and {n - FEW} more" if n > FEW else ""
+        print(
+            f"{n} of {found['n_fitted']} sources leave residuals over 5 sigma (flag MISFIT): "
+            f"{those}{more}"
+        )
     for label, o in zip(found["shifts"], result.observations, strict=True):
         values = "  ".join(f"{c} {found['chi2'][c]:.3f}" for c in o.channels)
         shift = ""

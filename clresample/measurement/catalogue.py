@@ -13,6 +13,7 @@ from ..sky.footprint import open_edge
 from ..sky.observation import ZERO_POINT_UJY
 from .photometry import flux_scale, fluxes
 from .quality import box_chi2, fitted_sources, labels
+from .residuals import MISFIT_SIGMAS, worst_residuals
 from .shapes import local_axes, moments, shape
 
 # of a morphology's peak: light at the edge of what was seen is flagged when it is brighter. Fainter
@@ -29,6 +30,7 @@ class Flag(IntFlag):
     NO_COVERAGE = 8
     OUTSIDE = 16
     MASKED = 32
+    MISFIT = 64
 
     @classmethod
     def _missing_(cls, value):
@@ -42,6 +44,7 @@ MEANINGS = {
     Flag.NO_COVERAGE: "a channel's image does not hold the centre, or determines no flux",
     Flag.OUTSIDE: "outside the frame, thus not fitted: nothing is measured",
     Flag.MASKED: "the centre is on a pixel without weight in a channel whose image holds it",
+    Flag.MISFIT: "the model leaves a residual of over 5 sigma somewhere on the source in a channel",
 }
 
 
@@ -65,6 +68,8 @@ def catalogue(result, *, magnitudes=False) -> QTable:
         mag_*, mag_err_* per channel [mag, AB]: where the flux is positive
         chi2_* per observation: mean chi2 of the pixels with weight in the source's box, of all
             channels and with all sources' models
+        residual_* per channel [sigma]: the largest residual on the source once filtered with the
+            PSF, see `residuals.worst_residuals`; over 5 the source is flagged MISFIT
     """
     flux, covariance = fluxes(result)
     error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).T)  # (S, C)
@@ -86,6 +91,11 @@ def catalogue(result, *, magnitudes=False) -> QTable:
             _add_magnitudes(table, channel, flux[:, i] * scale[i], error[:, i] * scale[i])
     for i, label in enumerate(labels(result)):
         table[f"chi2_{label}"] = box_chi2(result, i, result.footprints[i])
+    worst = [worst_residuals(result, i) for i in range(len(result.observations))]
+    worst = np.concatenate(worst, axis=1)
+    for channel, values in zip(result.channels, worst.T, strict=True):
+        table[f"residual_{channel}"] = values
+    table["flags"][(np.nan_to_num(worst) > MISFIT_SIGMAS).any(axis=1)] |= Flag.MISFIT
     return table
 
 

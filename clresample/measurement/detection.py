@@ -27,6 +27,7 @@ from ..sky.frame import Frame, model_frame
 from ..sky.noise import sigma_below_zero
 from ..sky.observation import Observation
 from ..sky.sources import Extended
+from .residuals import convolved
 
 # [sigma] of the combined image: white noise reaches it once in two million independent pixels
 THRESHOLD = 5.0
@@ -164,7 +165,7 @@ def _signal_to_noise(observation, frame, device):
     unit[unit == 0] = 1
     weights = weights / unit**2
     spread = [
-        _convolved(image, frame.psf.images[0])
+        convolved(image, frame.psf.images[0])
         for image in np.concatenate(
             [
                 op.adjoint((weights * observation.data * unit).astype(np.float32)),
@@ -182,21 +183,6 @@ def _signal_to_noise(observation, frame, device):
     image = total / np.sqrt(np.maximum(n_seen, 1))
     # negative pixels are noise; correlated noise has more scatter
     return image / max(1.0, sigma_below_zero(image) or 1.0)
-
-
-def _convolved(image, psf):
-    """An image (Ny, Nx) convolved with a PSF (ny, nx), zeros being assumed beyond its edges.
-
-    The same to the last bit as scipy.signal.fftconvolve(mode="same"), whose import takes half a
-    second.
-    """
-    from scipy import fft  # 0.05 s, which fits of a catalogue need not wait for
-
-    full = [n + k - 1 for n, k in zip(image.shape, psf.shape, strict=True)]
-    size = [fft.next_fast_len(n, real=True) for n in full]
-    product = fft.rfft2(image, size) * fft.rfft2(psf, size)
-    y, x = ((k - 1) // 2 for k in psf.shape)
-    return fft.irfft2(product, size)[y : y + image.shape[0], x : x + image.shape[1]]
 
 
 def _fwhm_px(observation, frame):

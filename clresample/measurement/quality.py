@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from .residuals import misfits
+
 
 def summary(result) -> dict:
     """How the fit of a whole blend ended, in plain values that JSON can hold.
@@ -12,7 +14,8 @@ def summary(result) -> dict:
     returns a dict: status, messages, seconds as in `Result`; n_sources, n_fitted (inside the
         frame), n_components, n_iterations, losses; chi2 {channel: per pixel with a weight on the
         frame, NaN without any}, n_pixels {channel: number of these pixels}, sky {channel} [counts],
-        shifts {observation: (y, x)} [model px]
+        shifts {observation: (y, x)} [model px]; misfits, the numbers of the sources with a residual
+        over 5 sigma (`residuals.misfits`); good, whether the fit converged and there is none
     """
     chi2, n_pixels = {}, {}
     for i, (observation, footprint) in enumerate(
@@ -23,8 +26,11 @@ def summary(result) -> dict:
         for channel, one, where in zip(observation.channels, terms, used, strict=True):
             n_pixels[channel] = int(where.sum())
             chi2[channel] = float(one[where].mean()) if where.any() else float("nan")
+    misfitted = np.flatnonzero(misfits(result)).tolist() if result.components else []
     return {
         "status": result.status,
+        "good": result.converged and not misfitted,
+        "misfits": misfitted,
         "messages": list(result.messages),
         "n_sources": len(result.sources),
         "n_fitted": int(fitted_sources(result).sum()),

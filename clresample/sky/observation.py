@@ -38,17 +38,14 @@ class Observation:
     name: of the instrument, for messages
 
     With neither weights nor variance the noise is estimated, channel by channel, from the scatter
-    of the background (`noise_sigma`), and `messages` says so. That is one number for the whole
-    image, and leaves out the sources' own photon noise.
+    of the background (`noise_sigma`), and reported: one number, without sources' photon noise.
 
-    Read back: data and weights (C, Ny, Nx) float64, psf of C bands, grid, channels, zero_points
-    (C,) or None, noise (C,) or None, name, n_bad = number of unmasked pixels whose weight became 0
-    because their data were NaN or infinite, their weight NaN, or their variance NaN or not
-    positive, messages = what the user should know.
+    Read back: data and weights (C, Ny, Nx) float64, psf of C bands, zero_points and noise (C,) or
+    None, n_bad = number of unmasked pixels whose weight became 0 because their data, weight or
+    variance is none, messages = what the user should know.
 
-    Raises ValueError for shapes that disagree, negative or infinite weights, masks that are not
-    made of 0 and 1, channel names that are not unique, both weights and variance, and where the
-    noise cannot be estimated.
+    Raises ValueError for shapes that disagree, negative or infinite weights, masks not made of 0
+    and 1, channel names that are not unique, weights beside variance, noise that cannot be found.
     """
 
     data: np.ndarray
@@ -110,12 +107,11 @@ class Observation:
     def restore(cls, data, psf, grid, *, weights, n_bad, messages, **given) -> Observation:
         """An observation as it was made once: `n_bad` and `messages` are what was found then.
 
-        data, psf, grid, weights and given (channels, zero_points, name): as read back from it
-        Raises ValueError as the constructor does.
+        All others as read back from it. Raises ValueError as the constructor does.
         """
-        observation = cls(data, psf, grid, weights=weights, **given)
-        observation._set(n_bad=int(n_bad), messages=tuple(messages))
-        return observation
+        restored = cls(data, psf, grid, weights=weights, **given)
+        restored._set(n_bad=int(n_bad), messages=tuple(messages))
+        return restored
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -129,21 +125,27 @@ class Observation:
 
     @cached_property
     def white(self) -> Observation:
-        """The same light seen with white noise: what is fitted where noise is correlated.
+        """The same light with white noise, which is what is fitted; itself where noise is white.
 
         Data and PSF are convolved with each channel's whitening filter; a constant stays, and
-        pixels nearer to a mask or to the edge than the filter's radius have weight 0. Itself where
-        noise is white.
+        pixels nearer to a mask or to the edge than the filter's radius have weight 0.
         """
         if self.noise is None:
             return self
         psf, sums = filtered_psf(self.psf, [n.filter for n in self.noise])
-        data = np.stack([n.filtered(d) / s for n, d, s in zip(self.noise, self.data, sums)])
+        data = self.as_white(self.data)
         weights = np.stack(
             [n.reached(w) * w * s**2 for n, w, s in zip(self.noise, self.weights, sums)]
         )
-        names = {"channels": self.channels, "zero_points": self.zero_points, "name": self.name}
+        names = {key: getattr(self, key) for key in ("channels", "zero_points", "name")}
         return Observation(data, psf, self.grid, weights=weights, **names)
+
+    def as_white(self, images) -> np.ndarray:
+        """Images (C, Ny, Nx) of this observation as they are in `white`."""
+        if self.noise is None:
+            return images
+        pairs = zip(self.noise, images, strict=True)
+        return np.stack([n.filtered(image) / n.filter.sum() for n, image in pairs])
 
     def chi2_map(self, residual) -> np.ndarray:
         """Weighted squared residuals (C, Ny, Nx) of expectation 1; NaN where nothing is known.
@@ -154,10 +156,9 @@ class Observation:
         if self.noise is None:
             squares = residual**2
         else:
-            filtered, weights = [], self.white.weights
-            for n, r in zip(self.noise, residual, strict=True):
-                filtered.append(n.filtered(r) / (n.filter.sum() * np.sqrt(n.variance)))
-            squares = np.stack(filtered) ** 2
+            variance = np.array([n.variance for n in self.noise])
+            squares = self.as_white(residual) ** 2 / variance[:, None, None]
+            weights = self.white.weights
         return np.where(weights > 0, weights * squares, np.nan)
 
     @property

@@ -103,31 +103,6 @@ def test_values_with_errors_are_found_by_their_columns(monkeypatch):
     assert kept["flux"].shape == (4, 1)
 
 
-def test_a_structured_residual_is_measured_in_sigmas_and_given_to_its_source():
-    from bench.harness import scenes
-    from bench.harness.residuals import worst_residuals
-    from clresample import Observation, Settings, deblend
-    from clresample.simulation.scenes import simulate_scene
-
-    scene = simulate_scene(5, n_sources=2, n_pixels=40)
-    blend = scenes.blend(scene, "euclid")
-    result = deblend(
-        blend.observations, blend.sources, frame=blend.frame, settings=Settings(max_iter=2)
-    )
-    o = result.observations[0]
-    psf, sigma = o.psf.images[0], 1 / np.sqrt(o.weights[0, 0, 0])
-    y, x = np.rint(scene.euclid.positions_px[1]).astype(int)
-    half = psf.shape[0] // 2
-    bump = np.zeros(o.data.shape[1:])
-    bump[y - 3 : y + 4, x - 3 : x + 4] = psf[half - 3 : half + 4, half - 3 : half + 4]
-    data = result.model(0) - 8 * sigma * bump / np.sqrt((psf**2).sum())
-    left = Observation(data, o.psf, o.grid, weights=o.weights, channels=o.channels, name=o.name)
-    found = worst_residuals(replace(result, observations=(left,)), 0)
-    assert found.shape == (2, 1)
-    assert found[1, 0] == pytest.approx(8, rel=0.02)
-    assert not found[0, 0] > 4
-
-
 def test_real(data, tmp_path):
     rows = run(tmp_path, "real", "--only", "hsc_blend", "cosmos", "--galaxies", 1)
     assert all(row.keys() == REAL for row in rows)

@@ -9,7 +9,8 @@ from helpers.blends import gaussian
 from clresample.deblending.batch import deblend
 from clresample.deblending.profiles import point
 from clresample.deblending.settings import Settings
-from clresample.measurement.detection import _convolved, detect, detect_more
+from clresample.measurement.detection import detect, detect_more
+from clresample.measurement.residuals import convolved
 from clresample.resampling.cache import cached_resampler
 from clresample.sky.frame import model_frame
 from clresample.sky.grid import Grid
@@ -137,7 +138,7 @@ def test_the_convolution_is_scipys_to_the_last_bit(shape, psf):
     rng = np.random.default_rng(4)
     image, kernel = rng.normal(size=shape), rng.random(psf)
     expected = fftconvolve(image, kernel, mode="same")
-    np.testing.assert_array_equal(_convolved(image, kernel), expected)
+    np.testing.assert_array_equal(convolved(image, kernel), expected)
 
 
 @pytest.mark.parametrize("threshold", [0, -1, float("nan"), float("inf")])

@@ -1,0 +1,68 @@
+"""Structured residuals: measured in sigmas, given to the source they lie on, flagged, reported."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clresample import PSF, Extended, Frame, Grid, Observation, Resampler, Settings, deblend
+from clresample.measurement.catalogue import Flag, catalogue
+from clresample.measurement.quality import summary
+from clresample.measurement.residuals import misfits, worst_residuals
+
+POSITIONS = [(16.0, 14.0), (28.0, 31.0)]
+GRID, FRAME_PSF, SEEN = Grid.flat((46, 44), 0.1), PSF.gaussian(0.8), PSF.gaussian([1.3, 1.5])
+SIGMA = 2.0  # [counts] noise of a pixel
+
+
+@pytest.fixture(scope="module")
+def result():
+    """Two round galaxies in two channels, fitted where there is no noise at all."""
+    y, x = np.indices(GRID.shape)
+    model = sum(np.exp(-((y - a) ** 2 + (x - b) ** 2) / (2 * 2.0**2)) for a, b in POSITIONS)
+    data = Resampler(GRID, FRAME_PSF, GRID, SEEN, dtype=np.float64)(np.stack([90 * model] * 2))
+    seen = Observation(data, SEEN, GRID, weights=SIGMA**-2, channels=["g", "r"])
+    sources = [Extended(position_px=p) for p in POSITIONS]
+    return deblend([seen], sources, frame=Frame(GRID, FRAME_PSF), settings=Settings(max_iter=20))
+
+
+def left_over(result, *, bump, noise=0.0, seed=0):
+    """The result, had a point source of `bump` sigma been missed on source 1 in channel r."""
+    o, rng = result.observations[0], np.random.default_rng(seed)
+    psf = SEEN.images[1]
+    point = np.zeros(o.shape)
+    point[1, 28 - 20 : 28 + 18, 31 - 20 : 31 + 13] = psf[:38, :33]
+    data = result.model(0) + bump * SIGMA * point / np.sqrt((psf**2).sum())
+    data = data + noise * rng.normal(size=o.shape)
+    seen = Observation(data, o.psf, o.grid, weights=o.weights, channels=o.channels)
+    return replace(result, observations=(seen,))
+
+
+def test_a_residual_is_measured_in_sigmas_and_given_to_its_source(result):
+    found = worst_residuals(left_over(result, bump=-8), 0)
+    assert found.shape == (2, 2)
+    assert found[1, 1] == pytest.approx(8, rel=0.03)
+    assert found[1, 0] < 0.5 and found[0].max() < 3  # the other channel, the other source
+
+
+def test_it_is_flagged_and_the_fit_is_not_called_good(result):
+    found = left_over(result, bump=8)
+    table = catalogue(found)
+    assert (table["flags"] & Flag.MISFIT != 0).tolist() == [False, True]
+    assert table["residual_r"][1] == pytest.approx(8, rel=0.03)
+    assert misfits(found).tolist() == [False, True]
+    ended = summary(replace(found, status="converged"))
+    assert ended["misfits"] == [1] and not ended["good"]
+    assert summary(replace(left_over(result, bump=0), status="converged"))["good"]
+
+
+def test_noise_alone_is_not_flagged(result):
+    flagged = [misfits(left_over(result, bump=0, noise=SIGMA, seed=i)) for i in range(40)]
+    assert np.mean(flagged) < 0.05
+    worst = [worst_residuals(left_over(result, bump=0, noise=SIGMA, seed=i), 0) for i in range(40)]
+    assert 2 < np.median(worst) < 4  # the largest of some hundred independent draws
+
+
+def test_noise_larger_than_stated_does_not_flag_everything(result):
+    found = left_over(result, bump=0, noise=3 * SIGMA)
+    assert not misfits(found).any()
