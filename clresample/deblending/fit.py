@@ -250,6 +250,7 @@ def _start_scene(fit, shape) -> tuple[Scene, State]:
         profile=morphs,
         fixed=np.array([isinstance(fit.sources[fit.fitted[i]], Point) for i in begin.source]),
         scale=np.where(error < UNSEEN, error + SPECTRUM_PART * spectra, 0),
+        power=power,
         fit_sky=fit.settings.fit_sky,
     )
     latent = [np.zeros_like(m) for m in morphs]

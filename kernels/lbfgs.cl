@@ -1,0 +1,244 @@
+/* Projected L-BFGS for a batch of scenes: all vectors stay on the device, decisions are the host's.
+ *
+ * A vector holds the variables of all scenes.  Chunks of it belong to one scene each:
+ *   chunks    (n, 4) int: scene, first element, length, whether its variables are at least 0
+ *   ring_s, ring_y (SLOTS, size)  changes of x and of g in earlier iterations, one of each in a slot; a
+ *             scene uses its first slots[b]; its slot spare[b] takes what a trial turns out to change
+ *   mode      (B) what to do with each scene: one of the modes below
+ * x, g: where a scene is, and the gradient there; x_new, g_new: the same for its trial; d: the direction
+ * h: the inverse of the curvature's diagonal.  A variable is held where x <= 0 must not fall further:
+ * bounded, x <= 0 and g > 0.  P g is g where variables are free and 0 where they are held.
+ *
+ * change    s = x_new - x and y = g_new - g into the spare slots, and for each chunk the sums
+ *           s_k . P g_new, y_k . h P g_new, s_k . y, y_k . h y of each slot k, and g . s
+ *           out (n, 4 SLOTS + 1);  scenes at rest stay as they are
+ * gram      s_k . y_l and y_k . h y_l of all slots, out (n, 2 SLOTS SLOTS)
+ * step      NEXT: x, g <- x_new, g_new and d = P (h scale (sum_k a_k y_k - P g) - sum_k c_k s_k)
+ *           AGAIN: the same d from the x and g that are there; TRY: d as it is
+ *           then x_new = x + length d, at least 0 where bounded;  STAY: x_new = x
+ *           coefficients (B, 2 SLOTS + 2): a, c, scale, length
+ * reweigh   after new strengths of the prior: h = 1 / (precision + curvature light), and
+ *           g_new += change x_new, y_k += change s_k in every slot; launch: (WG, n_scales, n_free)
+ *           weights (S, n_scales, 3): precision, curvature, change
+ * take      spectra and sky levels out of x_new;  launch: (n_spectra + n_sky)
+ * give      their gradients into g_new: pull[b, row] summed over the rows row0[c] .. row0[c + 1] - 1
+ *           launch: as take
+ * launch of change, gram, advance: (WG, n chunks), groups of (WG, 1)
+ */
+#include "common.h"
+#ifndef WG
+#define WG 1
+#endif
+#ifndef SLOTS
+#define SLOTS 21
+#endif
+#define REST 0
+#define NEXT 1
+#define AGAIN 2
+#define TRY 3
+#define STAY 4
+/* Elements that a work-item takes at a time; 16 sums run side by side where it has a whole row. */
+#ifdef ROWS
+#define LANES 16
+#define BLOCK 256
+#else
+#define LANES 1
+#define BLOCK 1
+#endif
+#define CHUNK \
+    const int lid = (int)get_local_id(0), chunk = (int)get_global_id(1); \
+    const int b = chunks[4 * chunk], n = chunks[4 * chunk + 2]; \
+    const int bounded = chunks[4 * chunk + 3]; \
+    const size_t first = (size_t)chunks[4 * chunk + 1];
+
+#if WG > 1
+#define HEAD __local REAL share[WG];
+#define PUT(total, to) \
+    share[lid] = total; \
+    barrier(CLK_LOCAL_MEM_FENCE); \
+    if (lid == 0) { \
+        total = 0; \
+        for (int m = 0; m < WG; ++m) total += share[m]; \
+        to = total; \
+    } \
+    barrier(CLK_LOCAL_MEM_FENCE);
+#else
+#define HEAD
+#define PUT(total, to) to = total;
+#endif
+
+/* sum_i u_i v_i over this work-item's part of a chunk */
+static REAL dot_of(__global const REAL *u, __global const REAL *v, const int n,
+                   const int lid)
+{
+    REAL part[LANES], total = 0;
+    for (int l = 0; l < LANES; ++l) part[l] = 0;
+    int i = lid * LANES;
+    for (; i + LANES <= n; i += WG * LANES)
+        for (int l = 0; l < LANES; ++l) part[l] += u[i + l] * v[i + l];
+    for (; i < n; ++i) total += u[i] * v[i];
+    for (int l = 0; l < LANES; ++l) total += part[l];
+    return total;
+}
+
+__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
+void change(__global const int *restrict chunks, __global const int *restrict mode,
+            __global const int *restrict slots, __global const int *restrict spare,
+            const ulong size, __global const REAL *restrict x, __global const REAL *restrict x_new,
+            __global const REAL *restrict g, __global const REAL *restrict g_new,
+            __global const REAL *restrict h, __global REAL *ring_s, __global REAL *ring_y,
+            __global REAL *restrict projected, __global REAL *restrict weighed_g,
+            __global REAL *restrict weighed_y, __global REAL *restrict out)
+{
+    HEAD
+    CHUNK
+    if (mode[b] == REST) return;
+    const size_t at = spare[b] * (size_t)size + first;
+    for (int i = lid; i < n; i += WG) {
+        const REAL gi = g_new[first + i], yi = gi - g[first + i];
+        const REAL p = bounded && x_new[first + i] <= 0 && gi > 0 ? (REAL)0 : gi;
+        ring_s[at + i] = x_new[first + i] - x[first + i];
+        ring_y[at + i] = yi;
+        projected[first + i] = p;
+        weighed_g[first + i] = h[first + i] * p;
+        weighed_y[first + i] = h[first + i] * yi;
+    }
+#if WG > 1
+    barrier(CLK_GLOBAL_MEM_FENCE);
+#endif
+    __global REAL *restrict to = out + (size_t)chunk * (4 * SLOTS + 1);
+    __global const REAL *y = ring_y + at;
+    for (int k = 0; k < slots[b]; ++k) {
+        __global const REAL *sk = ring_s + k * (size_t)size + first;
+        __global const REAL *yk = ring_y + k * (size_t)size + first;
+        REAL sg = dot_of(sk, projected + first, n, lid), yg = dot_of(yk, weighed_g + first, n, lid);
+        REAL sy = dot_of(sk, y, n, lid), yy = dot_of(yk, weighed_y + first, n, lid);
+        PUT(sg, to[4 * k])
+        PUT(yg, to[4 * k + 1])
+        PUT(sy, to[4 * k + 2])
+        PUT(yy, to[4 * k + 3])
+    }
+    REAL slope = dot_of(g + first, ring_s + at, n, lid);
+    PUT(slope, to[4 * SLOTS])
+}
+
+__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
+void gram(__global const int *restrict chunks, __global const int *restrict mode,
+          __global const int *restrict slots, const ulong size, __global const REAL *restrict h,
+          __global const REAL *restrict ring_s, __global const REAL *restrict ring_y,
+          __global REAL *restrict weighed_y, __global REAL *restrict out)
+{
+    HEAD
+    CHUNK
+    if (mode[b] == REST) return;
+    __global REAL *restrict to = out + (size_t)chunk * (2 * SLOTS * SLOTS);
+    for (int l = 0; l < slots[b]; ++l) {
+        __global const REAL *restrict yl = ring_y + l * (size_t)size + first;
+        for (int i = lid; i < n; i += WG) weighed_y[first + i] = h[first + i] * yl[i];
+#if WG > 1
+        barrier(CLK_GLOBAL_MEM_FENCE);
+#endif
+        for (int k = 0; k < slots[b]; ++k) {
+            REAL sy = dot_of(ring_s + k * (size_t)size + first, yl, n, lid);
+            REAL yy = dot_of(ring_y + k * (size_t)size + first, weighed_y + first, n, lid);
+            PUT(sy, to[2 * (k * SLOTS + l)])
+            PUT(yy, to[2 * (k * SLOTS + l) + 1])
+        }
+#if WG > 1
+        barrier(CLK_GLOBAL_MEM_FENCE);
+#endif
+    }
+}
+
+__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
+void advance(__global const int *restrict chunks, __global const int *restrict mode,
+          __global const int *restrict slots, __global const REAL *restrict coefficients,
+          const ulong size, __global const REAL *restrict h, __global const REAL *restrict ring_s,
+          __global const REAL *restrict ring_y, __global const REAL *restrict g_new,
+          __global REAL *restrict x, __global REAL *restrict g, __global REAL *restrict d,
+          __global REAL *restrict x_new)
+{
+    CHUNK
+    const int now = mode[b];
+    if (now == REST) return;
+    __global const REAL *restrict a = coefficients + b * (2 * SLOTS + 2), *restrict c = a + SLOTS;
+    const REAL scale = a[2 * SLOTS], length = a[2 * SLOTS + 1];
+    for (int i0 = lid * BLOCK; i0 < n; i0 += WG * BLOCK) {
+        const int m = n - i0 < BLOCK ? n - i0 : BLOCK;
+        const size_t at = first + i0;
+        if (now == NEXT)
+            for (int i = 0; i < m; ++i) {
+                x[at + i] = x_new[at + i];
+                g[at + i] = g_new[at + i];
+            }
+        if (now == NEXT || now == AGAIN) {
+            REAL q[BLOCK];
+            for (int i = 0; i < m; ++i)
+                q[i] = bounded && x[at + i] <= 0 && g[at + i] > 0 ? (REAL)0 : -g[at + i];
+            for (int k = 0; k < slots[b]; ++k) {
+                const REAL ak = a[k];
+                __global const REAL *restrict y = ring_y + k * (size_t)size + at;
+                if (ak != 0) for (int i = 0; i < m; ++i) q[i] += ak * y[i];
+            }
+            for (int i = 0; i < m; ++i) q[i] *= scale * h[at + i];
+            for (int k = 0; k < slots[b]; ++k) {
+                const REAL ck = c[k];
+                __global const REAL *restrict s = ring_s + k * (size_t)size + at;
+                if (ck != 0) for (int i = 0; i < m; ++i) q[i] -= ck * s[i];
+            }
+            for (int i = 0; i < m; ++i)
+                d[at + i] = bounded && x[at + i] <= 0 && g[at + i] > 0 ? (REAL)0 : q[i];
+        }
+        for (int i = 0; i < m; ++i) {
+            const REAL to = now == STAY ? x[at + i] : x[at + i] + length * d[at + i];
+            x_new[at + i] = bounded && to < 0 ? (REAL)0 : to;
+        }
+    }
+}
+
+__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
+void reweigh(__global const int *restrict active, __global const int *restrict table,
+             __global const int *restrict planes, __global const REAL *restrict weights,
+             __global const int *restrict slots, const ulong size,
+             __global const REAL *restrict light, __global const REAL *restrict x_new,
+             __global const REAL *restrict ring_s, __global REAL *restrict g_new,
+             __global REAL *restrict ring_y, __global REAL *restrict h)
+{
+    const int lid = (int)get_local_id(0), j = (int)get_global_id(1), n_scales = (int)get_global_size(1);
+    const int i_plane = active[get_global_id(2)] * n_scales + j;
+    const int b = table[8 * active[get_global_id(2)]], n = planes[2 * i_plane + 1];
+    const size_t first = (size_t)planes[2 * i_plane];
+    const REAL precision = weights[3 * i_plane], curvature = weights[3 * i_plane + 1];
+    const REAL more = weights[3 * i_plane + 2];
+    for (size_t i = first + lid; i < first + n; i += WG) {
+        h[i] = 1 / (precision + curvature * light[i]);
+        g_new[i] += more * x_new[i];
+    }
+    if (more != 0)
+        for (int k = 0; k < slots[b]; ++k)
+            for (size_t i = first + lid; i < first + n; i += WG)
+                ring_y[k * (size_t)size + i] += more * ring_s[k * (size_t)size + i];
+}
+
+__kernel void take(const int n_latents, const int n_spectra, __global const REAL *restrict x_new,
+                   __global REAL *restrict spectra, __global REAL *restrict sky)
+{
+    const int i = (int)get_global_id(0);
+    const REAL value = x_new[(size_t)n_latents + i];
+    if (i < n_spectra) spectra[i] = value;
+    else sky[i - n_spectra] = value;
+}
+
+__kernel void give(const int n_latents, const int n_spectra, const int n_channels, const int n_rows,
+                   __global const int *restrict row0, __global const REAL *restrict pull,
+                   __global const REAL *restrict d_spectra, __global REAL *restrict g_new)
+{
+    const int i = (int)get_global_id(0), k = i - n_spectra;
+    REAL sum = 0;
+    if (i < n_spectra) sum = d_spectra[i];
+    else {
+        __global const REAL *restrict rows = pull + (size_t)(k / n_channels) * n_rows;
+        for (int r = row0[k % n_channels]; r < row0[k % n_channels + 1]; ++r) sum += rows[r];
+    }
+    g_new[(size_t)n_latents + i] = sum;
+}
