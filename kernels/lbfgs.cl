@@ -2,12 +2,12 @@
  *
  * A vector holds the variables of all scenes.  Chunks of it belong to one scene each:
  *   chunks    (n, 4) int: scene, first element, length, whether its variables are at least 0
- *   ring_s, ring_y (SLOTS, size)  changes of x and of g in earlier iterations, one of each in a slot; a
- *             scene uses its first slots[b]; its slot spare[b] takes what a trial turns out to change
+ *   ring_s, ring_y (SLOTS, size)  changes of x and of g in earlier iterations, one of each in a
+ *             slot; a scene uses its first slots[b]; slot spare[b] takes what a trial changes
  *   mode      (B) what to do with each scene: one of the modes below
- * x, g: where a scene is, and the gradient there; x_new, g_new: the same for its trial; d: the direction
- * h: the inverse of the curvature's diagonal.  A variable is held where x <= 0 must not fall further:
- * bounded, x <= 0 and g > 0.  P g is g where variables are free and 0 where they are held.
+ * x, g: where a scene is, and the gradient there; x_new, g_new: those of its trial; d: the direction
+ * h: the inverse of the curvature's diagonal.  A variable is held where x <= 0 must not fall: bounded,
+ * x <= 0 and g > 0.  P g is g where variables are free and 0 where they are held.
  *
  * change    s = x_new - x and y = g_new - g into the spare slots, and for each chunk the sums
  *           s_k . P g_new, y_k . h P g_new, s_k . y, y_k . h y of each slot k, and g . s
@@ -21,15 +21,14 @@
  *           g_new += change x_new, y_k += change s_k in every slot; launch: (WG, n_scales, n_free)
  *           weights (S, n_scales, 3): precision, curvature, change
  * take      spectra and sky levels out of x_new;  launch: (n_spectra + n_sky)
- * give      their gradients into g_new: pull[b, row] summed over the rows row0[c] .. row0[c + 1] - 1
+ * give      their gradients into g_new: pull[b, row] summed over rows row0[c] .. row0[c + 1] - 1
  *           launch: as take
  * launch of change, gram, advance: (WG, n chunks), groups of (WG, 1)
  */
 #include "common.h"
-#ifndef WG
-#define WG 1
-#endif
-#ifndef SLOTS
+#include "boxes.h"
+#include "group.h"
+#ifndef SLOTS       /* of the ring: pairs that are remembered, and the spare one */
 #define SLOTS 21
 #endif
 #define REST 0
@@ -38,7 +37,7 @@
 #define TRY 3
 #define STAY 4
 /* Elements that a work-item takes at a time; 16 sums run side by side where it has a whole row. */
-#ifdef ROWS
+#if ROWS
 #define LANES 16
 #define BLOCK 256
 #else
@@ -51,21 +50,12 @@
     const int bounded = chunks[4 * chunk + 3]; \
     const size_t first = (size_t)chunks[4 * chunk + 1];
 
-#if WG > 1
-#define HEAD __local REAL share[WG];
-#define PUT(total, to) \
-    share[lid] = total; \
-    barrier(CLK_LOCAL_MEM_FENCE); \
-    if (lid == 0) { \
-        total = 0; \
-        for (int m = 0; m < WG; ++m) total += share[m]; \
-        to = total; \
-    } \
-    barrier(CLK_LOCAL_MEM_FENCE);
-#else
-#define HEAD
-#define PUT(total, to) to = total;
-#endif
+/* A group's sum into the table of sums. */
+#define PUT(value, to) \
+    { \
+        const REAL total = group_sum(value, lid, share); \
+        if (lid == 0) to = total; \
+    }
 
 /* sum_i u_i v_i over this work-item's part of a chunk */
 static REAL dot_of(__global const REAL *u, __global const REAL *v, const int n,
@@ -90,7 +80,7 @@ void change(__global const int *restrict chunks, __global const int *restrict mo
             __global REAL *restrict projected, __global REAL *restrict weighed_g,
             __global REAL *restrict weighed_y, __global REAL *restrict out)
 {
-    HEAD
+    __local REAL share[WG];
     CHUNK
     if (mode[b] == REST) return;
     const size_t at = spare[b] * (size_t)size + first;
@@ -103,23 +93,18 @@ void change(__global const int *restrict chunks, __global const int *restrict mo
         weighed_g[first + i] = h[first + i] * p;
         weighed_y[first + i] = h[first + i] * yi;
     }
-#if WG > 1
-    barrier(CLK_GLOBAL_MEM_FENCE);
-#endif
-    __global REAL *restrict to = out + (size_t)chunk * (4 * SLOTS + 1);
+    SYNC();
+    __global REAL *to = out + (size_t)chunk * (4 * SLOTS + 1);
     __global const REAL *y = ring_y + at;
     for (int k = 0; k < slots[b]; ++k) {
         __global const REAL *sk = ring_s + k * (size_t)size + first;
         __global const REAL *yk = ring_y + k * (size_t)size + first;
-        REAL sg = dot_of(sk, projected + first, n, lid), yg = dot_of(yk, weighed_g + first, n, lid);
-        REAL sy = dot_of(sk, y, n, lid), yy = dot_of(yk, weighed_y + first, n, lid);
-        PUT(sg, to[4 * k])
-        PUT(yg, to[4 * k + 1])
-        PUT(sy, to[4 * k + 2])
-        PUT(yy, to[4 * k + 3])
+        PUT(dot_of(sk, projected + first, n, lid), to[4 * k])
+        PUT(dot_of(yk, weighed_g + first, n, lid), to[4 * k + 1])
+        PUT(dot_of(sk, y, n, lid), to[4 * k + 2])
+        PUT(dot_of(yk, weighed_y + first, n, lid), to[4 * k + 3])
     }
-    REAL slope = dot_of(g + first, ring_s + at, n, lid);
-    PUT(slope, to[4 * SLOTS])
+    PUT(dot_of(g + first, ring_s + at, n, lid), to[4 * SLOTS])
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
@@ -128,25 +113,20 @@ void gram(__global const int *restrict chunks, __global const int *restrict mode
           __global const REAL *restrict ring_s, __global const REAL *restrict ring_y,
           __global REAL *restrict weighed_y, __global REAL *restrict out)
 {
-    HEAD
+    __local REAL share[WG];
     CHUNK
     if (mode[b] == REST) return;
-    __global REAL *restrict to = out + (size_t)chunk * (2 * SLOTS * SLOTS);
+    __global REAL *to = out + (size_t)chunk * (2 * SLOTS * SLOTS);
     for (int l = 0; l < slots[b]; ++l) {
-        __global const REAL *restrict yl = ring_y + l * (size_t)size + first;
+        __global const REAL *yl = ring_y + l * (size_t)size + first;
         for (int i = lid; i < n; i += WG) weighed_y[first + i] = h[first + i] * yl[i];
-#if WG > 1
-        barrier(CLK_GLOBAL_MEM_FENCE);
-#endif
+        SYNC();
         for (int k = 0; k < slots[b]; ++k) {
-            REAL sy = dot_of(ring_s + k * (size_t)size + first, yl, n, lid);
-            REAL yy = dot_of(ring_y + k * (size_t)size + first, weighed_y + first, n, lid);
-            PUT(sy, to[2 * (k * SLOTS + l)])
-            PUT(yy, to[2 * (k * SLOTS + l) + 1])
+            const size_t other = k * (size_t)size + first;
+            PUT(dot_of(ring_s + other, yl, n, lid), to[2 * (k * SLOTS + l)])
+            PUT(dot_of(ring_y + other, weighed_y + first, n, lid), to[2 * (k * SLOTS + l) + 1])
         }
-#if WG > 1
-        barrier(CLK_GLOBAL_MEM_FENCE);
-#endif
+        SYNC();
     }
 }
 
@@ -161,7 +141,7 @@ void advance(__global const int *restrict chunks, __global const int *restrict m
     CHUNK
     const int now = mode[b];
     if (now == REST) return;
-    __global const REAL *restrict a = coefficients + b * (2 * SLOTS + 2), *restrict c = a + SLOTS;
+    __global const REAL *a = coefficients + b * (2 * SLOTS + 2), *c = a + SLOTS;
     const REAL scale = a[2 * SLOTS], length = a[2 * SLOTS + 1];
     for (int i0 = lid * BLOCK; i0 < n; i0 += WG * BLOCK) {
         const int m = n - i0 < BLOCK ? n - i0 : BLOCK;
@@ -177,13 +157,13 @@ void advance(__global const int *restrict chunks, __global const int *restrict m
                 q[i] = bounded && x[at + i] <= 0 && g[at + i] > 0 ? (REAL)0 : -g[at + i];
             for (int k = 0; k < slots[b]; ++k) {
                 const REAL ak = a[k];
-                __global const REAL *restrict y = ring_y + k * (size_t)size + at;
+                __global const REAL *y = ring_y + k * (size_t)size + at;
                 if (ak != 0) for (int i = 0; i < m; ++i) q[i] += ak * y[i];
             }
             for (int i = 0; i < m; ++i) q[i] *= scale * h[at + i];
             for (int k = 0; k < slots[b]; ++k) {
                 const REAL ck = c[k];
-                __global const REAL *restrict s = ring_s + k * (size_t)size + at;
+                __global const REAL *s = ring_s + k * (size_t)size + at;
                 if (ck != 0) for (int i = 0; i < m; ++i) q[i] -= ck * s[i];
             }
             for (int i = 0; i < m; ++i)
@@ -204,9 +184,10 @@ void reweigh(__global const int *restrict active, __global const int *restrict t
              __global const REAL *restrict ring_s, __global REAL *restrict g_new,
              __global REAL *restrict ring_y, __global REAL *restrict h)
 {
-    const int lid = (int)get_local_id(0), j = (int)get_global_id(1), n_scales = (int)get_global_size(1);
+    const int lid = (int)get_local_id(0);
+    const int j = (int)get_global_id(1), n_scales = (int)get_global_size(1);
     const int i_plane = active[get_global_id(2)] * n_scales + j;
-    const int b = table[8 * active[get_global_id(2)]], n = planes[2 * i_plane + 1];
+    const int b = BOX(active[get_global_id(2)])[SCENE], n = planes[2 * i_plane + 1];
     const size_t first = (size_t)planes[2 * i_plane];
     const REAL precision = weights[3 * i_plane], curvature = weights[3 * i_plane + 1];
     const REAL more = weights[3 * i_plane + 2];
@@ -237,7 +218,7 @@ __kernel void give(const int n_latents, const int n_spectra, const int n_channel
     REAL sum = 0;
     if (i < n_spectra) sum = d_spectra[i];
     else {
-        __global const REAL *restrict rows = pull + (size_t)(k / n_channels) * n_rows;
+        __global const REAL *rows = pull + (size_t)(k / n_channels) * n_rows;
         for (int r = row0[k % n_channels]; r < row0[k % n_channels + 1]; ++r) sum += rows[r];
     }
     g_new[(size_t)n_latents + i] = sum;

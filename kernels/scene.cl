@@ -86,7 +86,7 @@ __kernel void residual(const int n_channels, const int channel, const int n_band
 __kernel void square(const int n_bands, const int my, const int mx, __global REAL *restrict image)
 {
     const int y = (int)get_global_id(0), c = (int)get_global_id(1), b = (int)get_global_id(2);
-    __global REAL *restrict row = image + (((size_t)b * n_bands + c) * my + y) * mx;
+    __global REAL *row = image + (((size_t)b * n_bands + c) * my + y) * mx;
     for (int x = 0; x < mx; ++x) row[x] *= row[x];
 }
 
