@@ -5,24 +5,26 @@
  *   ring_s, ring_y (SLOTS, size)  changes of x and of g in earlier iterations, one of each in a
  *             slot; a scene uses its first slots[b]; slot spare[b] takes what a trial changes
  *   mode      (B) what to do with each scene: one of the modes below
- * x, g: where a scene is, and the gradient there; x_new, g_new: those of its trial; d: the direction
- * h: the inverse of the curvature's diagonal.  A variable is held where x <= 0 must not fall: bounded,
+ * x, g: where a scene is, and the gradient there; x_new, g_new: those of its trial; d: direction
+ * h: the inverse of the curvature's diagonal.  A variable is held where it must not fall: bounded,
  * x <= 0 and g > 0.  P g is g where variables are free and 0 where they are held.
  *
  * change    s = x_new - x and y = g_new - g into the spare slots, and for each chunk the sums
  *           s_k . P g_new, y_k . h P g_new, s_k . y, y_k . h y of each slot k, and g . s
  *           out (n, 4 SLOTS + 1);  scenes at rest stay as they are
  * gram      s_k . y_l and y_k . h y_l of all slots, out (n, 2 SLOTS SLOTS)
- * step      NEXT: x, g <- x_new, g_new and d = P (h scale (sum_k a_k y_k - P g) - sum_k c_k s_k)
+ * advance   NEXT: x, g <- x_new, g_new and d = P (h scale (sum_k a_k y_k - P g) - sum_k c_k s_k)
  *           AGAIN: the same d from the x and g that are there; TRY: d as it is
  *           then x_new = x + length d, at least 0 where bounded;  STAY: x_new = x
  *           coefficients (B, 2 SLOTS + 2): a, c, scale, length
  * reweigh   after new strengths of the prior: h = 1 / (precision + curvature light), and
  *           g_new += change x_new, y_k += change s_k in every slot; launch: (WG, n_scales, n_free)
  *           weights (S, n_scales, 3): precision, curvature, change
- * take      spectra and sky levels out of x_new;  launch: (n_spectra + n_sky)
+ * take      spectra and sky levels out of x;  launch: (n_spectra + n_sky)
  * give      their gradients into g_new: pull[b, row] summed over rows row0[c] .. row0[c + 1] - 1
  *           launch: as take
+ * move      values[row, first + i] = values_from[row, source + i] of each chunk, the source of each
+ *           given; launch: (WG, n chunks, rows)
  * launch of change, gram, advance: (WG, n chunks), groups of (WG, 1)
  */
 #include "common.h"
@@ -201,11 +203,11 @@ void reweigh(__global const int *restrict active, __global const int *restrict t
                 ring_y[k * (size_t)size + i] += more * ring_s[k * (size_t)size + i];
 }
 
-__kernel void take(const int n_latents, const int n_spectra, __global const REAL *restrict x_new,
+__kernel void take(const int n_latents, const int n_spectra, __global const REAL *restrict x,
                    __global REAL *restrict spectra, __global REAL *restrict sky)
 {
     const int i = (int)get_global_id(0);
-    const REAL value = x_new[(size_t)n_latents + i];
+    const REAL value = x[(size_t)n_latents + i];
     if (i < n_spectra) spectra[i] = value;
     else sky[i - n_spectra] = value;
 }
@@ -222,4 +224,16 @@ __kernel void give(const int n_latents, const int n_spectra, const int n_channel
         for (int r = row0[k % n_channels]; r < row0[k % n_channels + 1]; ++r) sum += rows[r];
     }
     g_new[(size_t)n_latents + i] = sum;
+}
+
+__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
+void move(__global const int *restrict chunks, __global const int *restrict source,
+          const ulong size, const ulong size_from, __global const REAL *restrict values_from,
+          __global REAL *restrict values)
+{
+    const int lid = (int)get_local_id(0), chunk = (int)get_global_id(1);
+    const size_t row = get_global_id(2), n = chunks[4 * chunk + 2];
+    __global REAL *to = values + row * size + chunks[4 * chunk + 1];
+    __global const REAL *from = values_from + row * size_from + source[chunk];
+    for (size_t i = lid; i < n; i += WG) to[i] = from[i];
 }

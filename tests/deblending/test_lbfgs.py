@@ -8,7 +8,8 @@ from clresample.deblending.solver.buffers import Buffers
 from clresample.deblending.solver.learned.pairs import Pairs
 from clresample.deblending.solver.learned.prior import LearnedPrior
 from clresample.deblending.solver.learned.structure import Latents
-from clresample.deblending.solver.learned.vectors import AGAIN, NEXT, REST, STAY, TRY, Vectors
+from clresample.deblending.solver.learned.steps import AGAIN, NEXT, REST, STAY, TRY, Steps
+from clresample.deblending.solver.learned.vectors import Vectors
 
 N_PAIRS = 4
 
@@ -91,7 +92,8 @@ class Made:
         self.pairs = Pairs(3, N_PAIRS)
         self.pairs.used[:] = 5, 2, 5
         self.pairs._order[:] = np.arange(5)
-        v.follow(self.pairs)
+        self.steps = Steps(v)
+        self.steps.follow(self.pairs)
 
     def get(self, name):
         return self.device.get(getattr(self.v, name)).astype(float)
@@ -104,9 +106,8 @@ class Made:
 def test_inner_products_are_those_of_each_scene(build, dtype):
     m = Made(build, dtype)
     x, g, h, s, y = (m.host[k] for k in ("x", "g", "h", "s", "y"))
-    m.v.set_mode([TRY, TRY, REST])
-    m.v.change()
-    sums, slope = m.v.sums()
+    live = np.array([True, True, False])
+    sums, slope = m.steps.change(live)
     s, y, on = s.copy(), y.copy(), m.scene < 2
     s[0, on], y[0, on] = (m.host["x_new"] - x)[on], (m.host["g_new"] - g)[on]
     close(m.get("s"), s, dtype)
@@ -125,7 +126,7 @@ def test_inner_products_are_those_of_each_scene(build, dtype):
             found = (sums[i, k] - [w[part].sum() for w in wanted]) / scale
             close(1 + found, np.ones(4), dtype)
         assert slope[i] == pytest.approx((g * s[0])[part].sum(), rel=1e-3)
-    sy, yy = m.v.gram()
+    sy, yy = m.steps.gram(live)
     for i, used in ((0, 5), (1, 2)):
         part = m.scene == i
         found = sy[i, :used, :used], yy[i, :used, :used]
@@ -144,7 +145,7 @@ def test_a_step_does_what_its_scene_asks_for(build, dtype, mode):
     a[1, 2:] = c[1, 2:] = 0
     scale, length = rng.uniform(0.5, 1, (2, 3))
     modes = np.array([mode, mode, REST])
-    m.v.advance(modes, a, c, scale, length)
+    m.steps.advance(modes, a, c, scale, length)
     x, g, d, h = (m.host[k] for k in ("x", "g", "d", "h"))
     if mode == NEXT:
         x, g = m.host["x_new"], m.host["g_new"]
@@ -165,7 +166,7 @@ def test_other_strengths_reach_every_vector(build, dtype):
     m = Made(build, dtype)
     light = np.random.default_rng(2).uniform(1, 2, m.latents.size)
     weights = np.random.default_rng(3).uniform(1, 2, (len(m.b.host_boxes), 3, 3))
-    m.v.reweigh(m.b.put(light), weights)
+    m.steps.reweigh(m.b.put(light), weights)
     h, g, y = m.host["h"].copy(), m.host["g_new"].copy(), m.host["y"].copy()
     for i, planes in enumerate(m.latents.planes()):
         used = m.pairs.used[m.b.host_boxes.scene[i]]
@@ -181,7 +182,7 @@ def test_other_strengths_reach_every_vector(build, dtype):
 
 def test_spectra_and_sky_go_there_and_back(build):
     m = Made(build, np.float64)
-    m.v.take()
+    m.v.take(m.v.x_new)
     tail = m.host["x_new"][m.latents.size :]
     both = np.concatenate([build.get(a).ravel() for a in (m.b.spectra, m.b.sky)])
     np.testing.assert_array_equal(both, tail)
@@ -192,3 +193,21 @@ def test_spectra_and_sky_go_there_and_back(build):
     m.v.give(m.b.put(pull), build.put(rows, np.int32))
     wanted = np.concatenate([d_spectra.ravel(), np.add.reduceat(pull, rows[:-1], 1).ravel()])
     close(m.get("g_new")[m.latents.size :], wanted, np.float64)
+
+
+def test_a_part_of_a_batch_goes_on_alone(build):
+    """Scenes 2 and 0, in this order, with all their vectors."""
+    m = Made(build, np.float32)
+    keep = np.array([2, 0])
+    scenes, states = map(list, zip(*ragged(build, np.float32), strict=True))
+    prior = LearnedPrior()
+    b = Buffers([scenes[i] for i in keep], [states[i] for i in keep], build, np.float32, prior)
+    latents = Latents(b.host_boxes, build.get(b.free)[: b.n_free], prior.steps)
+    other = Vectors(b, latents, N_PAIRS + 1)
+    other.copy_from(m.v, keep)
+    for name in Vectors.NAMES:
+        found, wanted = build.get(getattr(other, name)), build.get(getattr(m.v, name))
+        parts = [wanted[..., a:b] for kind in range(3) for a, b in m.v.parts()[keep, kind]]
+        np.testing.assert_array_equal(found, np.concatenate(parts, axis=-1))
+    pairs = m.pairs.take_scenes(keep)
+    assert pairs.used.tolist() == [5, 5]

@@ -17,7 +17,7 @@ LEAST_CURVATURE = 1e-6
 class Pairs:
     """Pairs (s, y) of B scenes in SLOTS slots each, one of them spare for the next pair.
 
-    spare (B,): the slot that takes the next pair; used (B,): slots 0 .. used - 1 hold pairs or are
+    used (B,): slots 0 .. used - 1 hold pairs or are
         spare, so that kernels need not look at the others
     """
 
@@ -30,8 +30,16 @@ class Pairs:
         self._valid = np.zeros(shape[:2], bool)
         self.used = np.ones(n_scenes, int)
 
+    def take_scenes(self, keep):
+        """Those of the scenes `keep` (n,) alone."""
+        new = Pairs(len(keep), self.n_slots - 1)
+        for name in ("_sy", "_yy", "_order", "_valid", "used"):
+            setattr(new, name, getattr(self, name)[keep])
+        return new
+
     @property
     def spare(self):
+        """The slot (B,) that takes each scene's next pair."""
         return self._order[:, 0]
 
     @property

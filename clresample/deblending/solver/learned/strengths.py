@@ -11,25 +11,34 @@ from .response import Response
 class Strengths:
     """Present strengths of a batch's sources, learned from their evidence.
 
+    past: other Strengths and the scenes (n,) of theirs that go on here, which are all
+
     values (S, J): alpha, at the prior's start; of fixed sources without meaning
     precision (S, J): alpha^-2 on the device; light: a vector on the device, see lbfgs.cl
     """
 
-    def __init__(self, buffers, gradient, latents, prior):
+    def __init__(self, buffers, gradient, latents, prior, *, past=None):
         b = self.buffers = buffers
-        self.values = np.tile(np.array(prior.strengths, float), (b.n_sources, 1))
-        self.precision = b.put(self.values**-2)
         self._scene = b.host_boxes.scene
         self._free = b.device.get(b.free)[: b.n_free]
         self._response = Response(b, gradient)
-        self._evidence, light = self._prepare(prior, latents)
-        self.light = b.put(latents.pack(light))
-        self._curvature = np.zeros_like(self.values)
+        if past is None:
+            self.values = np.tile(np.array(prior.strengths, float), (b.n_sources, 1))
+            self._curvature = np.zeros_like(self.values)
+            self._evidence, self._light = self._prepare(prior)
+        else:
+            other, keep = past
+            kept = np.concatenate([np.flatnonzero(other._scene == i) for i in keep])
+            self.values, self._curvature = other.values[kept], other._curvature[kept]
+            self._evidence = [other._evidence[i] for i in kept]
+            self._light = [other._light[i] for i in kept]
+        self.precision = b.put(self.values**-2)
+        self.light = b.put(latents.pack(self._light))
 
-    def _prepare(self, prior, latents):
+    def _prepare(self, prior):
         """Each free source's SourceEvidence, and its light [s][j] about its coefficients."""
         profiles = [p for s in self.buffers.scenes for p in s.profile]
-        spectra, evidence = Spectra(prior), {}
+        spectra, evidence = Spectra(prior), [None] * len(profiles)
         light = [[np.zeros(0)] * len(prior.steps) for _ in profiles]
         answers, pixels = self._response.to_pixels()
         pairs = zip(answers, pixels, strict=True)
