@@ -114,9 +114,16 @@ class Fit:
         for view, shift in zip(self.views, shifts, strict=True):
             view.op.shift = shift
 
-    def move(self, scene, state):
-        """Shift the observations to where the model, as it is by now, fits each of them best."""
-        self._shift(self.shifts + shift_steps(scene, state))
+    def move(self, scene, state, least_px=0.0) -> bool:
+        """Shift the observations to where the model, as it is by now, fits each of them best.
+
+        Returns whether they have moved: not where none would by more than least_px [model px].
+        """
+        steps = shift_steps(scene, state)
+        moved = bool((np.abs(steps) > least_px).any())
+        if moved:
+            self._shift(self.shifts + steps)
+        return moved
 
     def stopped(self, losses) -> bool:
         """Take the losses (n,) of the last iterations; whether the fit ends here, and why."""
@@ -124,6 +131,14 @@ class Fit:
         reason = stop_reason(self.losses, len(losses), self.settings.tol)
         self.status = reason or self.status
         return reason is not None
+
+    def note_loss(self, loss):
+        """Take down the loss of an iteration."""
+        self.losses.append(float(loss))
+
+    def end(self, scene, state, status=None):
+        """End here, with this state; the status stays where none is given."""
+        self.scene, self.state, self.status = scene, state, status or self.status
 
     def interrupt(self):
         """Note that the fit ends because the user wants it to."""
@@ -255,6 +270,8 @@ def _start_scene(fit, shape) -> tuple[Scene, State]:
     )
     latent = [np.zeros_like(m) for m in morphs]
     state = State(latent, [m.copy() for m in morphs], spectra, sky)
+    if fit.settings.learns:
+        return scene, state
     return replace(scene, damping=damping(scene, state, fit.settings.prior)), state
 
 

@@ -7,8 +7,8 @@ from helpers.solver import close, every_type, ragged
 from clresample.deblending.solver.buffers import Buffers
 from clresample.deblending.solver.learned.pairs import Pairs
 from clresample.deblending.solver.learned.prior import LearnedPrior
-from clresample.deblending.solver.learned.structure import Latents
 from clresample.deblending.solver.learned.steps import AGAIN, NEXT, REST, STAY, TRY, Steps
+from clresample.deblending.solver.learned.structure import Latents
 from clresample.deblending.solver.learned.vectors import Vectors
 
 N_PAIRS = 4

@@ -5,10 +5,10 @@ import pytest
 from helpers.learned import Source
 from helpers.solver import close, every_type, ragged
 
+from clresample.deblending.solver.boxes import Boxes
 from clresample.deblending.solver.buffers import Buffers
 from clresample.deblending.solver.learned.prior import LearnedPrior
 from clresample.deblending.solver.learned.structure import Latents, Structure, coarse
-from clresample.deblending.solver.boxes import Boxes
 
 PRIORS = LearnedPrior(), LearnedPrior(scales_px=(1.0, 6.5), strengths=(0.1, 0.1))
 
@@ -21,9 +21,7 @@ def made(build, dtype, prior, seed=0):
     scenes, states = map(list, zip(*ragged(build, dtype), strict=True))
     b = Buffers(scenes, states, build, dtype, prior)
     structure = Structure(b, prior)
-    z = [
-        [rng.normal(0, 0.3, shape) for shape in shapes] for shapes in structure.latents.shape
-    ]
+    z = [[rng.normal(0, 0.3, shape) for shape in shapes] for shapes in structure.latents.shape]
     profiles = [p for s in scenes for p in s.profile]
     free = ~np.concatenate([s.fixed for s in scenes])
     return b, structure, z, profiles, free

@@ -29,9 +29,7 @@ class Source:
 
     def structure(self, z):
         """u of coefficients z (J): arrays."""
-        return self.amp * sum(
-            ky @ zj @ kx.T for zj, (ky, kx) in zip(z, self.axes, strict=True)
-        )
+        return self.amp * sum(ky @ zj @ kx.T for zj, (ky, kx) in zip(z, self.axes, strict=True))
 
     def morph(self, z):
         """S."""
@@ -41,6 +39,5 @@ class Source:
         """dL/dz_j + precision_j z_j from dL/dS."""
         q = self.amp * gauged(np.where(morph > 0, d_morph, 0), self.profile)
         return [
-            ky.T @ q @ kx + p * zj
-            for p, zj, (ky, kx) in zip(precision, z, self.axes, strict=True)
+            ky.T @ q @ kx + p * zj for p, zj, (ky, kx) in zip(precision, z, self.axes, strict=True)
         ]

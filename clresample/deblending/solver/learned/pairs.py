@@ -1,8 +1,8 @@
 """What L-BFGS remembers of each scene of a batch, on the host: inner products of its vectors.
 
-    s_k, y_k: changes of the variables and of the gradient; H0 = scale h, h a diagonal
-    d = -H g by the two loops (Nocedal & Wright 2006, algorithm 7.4), which need of the vectors only
-    s_i . y_j, y_i . h y_j, s_i . g and y_i . h g:   d = H0 (sum_k a_k y_k - g) - sum_k c_k s_k
+s_k, y_k: changes of the variables and of the gradient; H0 = scale h, h a diagonal
+d = -H g by the two loops (Nocedal & Wright 2006, algorithm 7.4), which need of the vectors only
+s_i . y_j, y_i . h y_j, s_i . g and y_i . h g:   d = H0 (sum_k a_k y_k - g) - sum_k c_k s_k
 """
 
 from __future__ import annotations

@@ -31,7 +31,11 @@ class Progress:
 
     def __init__(self, n_scenes, enough):
         n, self.enough = n_scenes, enough
-        self.live, self.converged, self.failed = np.ones(n, bool), np.zeros(n, bool), np.zeros(n, bool)
+        self.live, self.converged, self.failed = (
+            np.ones(n, bool),
+            np.zeros(n, bool),
+            np.zeros(n, bool),
+        )
         self.loss = np.full(n, np.inf)
         self.n_iterations, self.n_rounds = np.zeros(n, int), np.zeros(n, int)
         self.settled = np.zeros(n, bool)  # strengths

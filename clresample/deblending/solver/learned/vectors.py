@@ -1,6 +1,6 @@
 """The variables of a batch of scenes as vectors on the device: where each scene's part lies.
 
-    x = (z of all free sources, A (S, C), sky (B, C))
+x = (z of all free sources, A (S, C), sky (B, C))
 """
 
 from __future__ import annotations
@@ -33,9 +33,7 @@ class Vectors:
         self.chunks = self._chunks()
         self.chunk_table = b.device.put(self.chunks, np.int32)
         names = {"n_latents": latents.size, "n_spectra": self.n_spectra}
-        self._take = b.launcher("lbfgs.cl", "take", 1).bind(
-            **names, spectra=b.spectra, sky=b.sky
-        )
+        self._take = b.launcher("lbfgs.cl", "take", 1).bind(**names, spectra=b.spectra, sky=b.sky)
         self._give = b.launcher("lbfgs.cl", "give", 1).bind(
             **names, n_channels=b.n_channels, d_spectra=b.d_spectra, g_new=self.g_new
         )
@@ -60,7 +58,10 @@ class Vectors:
     def start(self, spectra, sky, inverse_curvature):
         """Put x and the first trial there: z = 0, spectra (S, C), sky (B, C); and h of both."""
         nothing = np.zeros(self.latents.size)
-        for parts, vectors in (((spectra, sky), (self.x, self.x_new)), (inverse_curvature, [self.h])):
+        for parts, vectors in (
+            ((spectra, sky), (self.x, self.x_new)),
+            (inverse_curvature, [self.h]),
+        ):
             flat = np.concatenate([nothing, *(np.ravel(p) for p in parts)])
             for vector in vectors:
                 self.buffers.device.upload(flat.astype(self.buffers.dtype), vector)
