@@ -116,7 +116,7 @@ class _ManyFits:
                 self.dark.append(fit.dark)
             group = waiting[fit.scene.signature]
             group.append((i, fit))
-            full = sum(f.scene.n_bytes for _, f in group) + fit.scene.n_bytes > self.memory
+            full = sum(f.n_bytes for _, f in group) + fit.n_bytes > self.memory
             if full or len(group) >= self.n_most:
                 yield from self._fit(waiting.pop(fit.scene.signature))
         while waiting:

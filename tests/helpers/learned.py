@@ -1,4 +1,4 @@
-"""Structure at several scales written down plainly in NumPy float64: what structure.cl must give."""
+"""Structure at several scales plainly in NumPy float64: what structure.cl must give."""
 
 import numpy as np
 

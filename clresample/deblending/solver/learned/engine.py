@@ -19,7 +19,7 @@ from .pairs import Pairs
 from .progress import Progress
 from .steps import REST, STAY, Steps
 from .strengths import Strengths
-from .structure import Structure
+from .structure import Structure, coarse
 from .vectors import Vectors
 
 # Pairs of changes that a scene remembers: 10 take 10 to 20 % more iterations, 40 hardly fewer.
@@ -135,6 +135,13 @@ class LearnedEngine:
         nothing = np.zeros((len(self.scenes), N_PAIRS + 1))
         mode = np.where(moved, STAY, REST)
         self.steps.advance(mode, nothing, nothing, nothing[:, 0], nothing[:, 0])
+
+
+def vector_bytes(scene, prior) -> int:
+    """Device memory [bytes] of the scene's vectors in a batch, roughly: of float64, those of the
+    ring, nine others and the light."""
+    n = sum(coarse(p.shape, step).prod() for p in scene.profile for step in prior.steps)
+    return int(8 * (2 * (N_PAIRS + 1) + 10) * (n + scene.power.size))
 
 
 def _inverse_curvature(scenes):

@@ -87,7 +87,8 @@ class Progress:
         self._drops[due] = np.inf
 
     def look_again(self, which):
-        """The loss of the scenes `which` (B,) is another one now: their next trial is where they are."""
+        """Of the scenes `which` (B,) the loss is another one now: their next trial is where they
+        are."""
         self._fresh |= which
         self._bare &= ~which
         self._drops[which] = np.inf

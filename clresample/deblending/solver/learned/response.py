@@ -32,11 +32,13 @@ class Response:
 
     def to_pixels(self):
         """R_c^T w R_c of one pixel per scene and channel, near the middle of what is covered, w the
-        median weight: answers (B, C, Ny, Nx) and pixels (B, C, 2)."""
+        median weight: B answers (C, Ny, Nx) without padding, and pixels (B, C, 2)."""
         b, answers, pixels = self.buffers, [], []
         for i, o in enumerate(self._observations):
             covered = b.device.get(self.weights[i])
-            at = np.array([_middle(scene) for scene in covered])
+            at = np.array(
+                [_middle(_unpadded(*pair)) for pair in zip(b.scenes, covered, strict=True)]
+            )
             impulse = np.zeros(covered.shape, b.dtype)
             for scene, (y, x) in zip(impulse, at, strict=True):
                 scene[:, y, x] = 1
@@ -46,7 +48,9 @@ class Response:
             level = [[_median(w) for w in s.weights[i]] for s in b.scenes]
             answers.append(b.device.get(o.model) * np.array(level)[:, :, None, None])
             pixels.append(np.repeat(at[:, None], covered.shape[1], axis=1))
-        return np.concatenate(answers, axis=1), np.concatenate(pixels, axis=1)
+        answers = np.concatenate(answers, axis=1)
+        pairs = zip(b.scenes, answers, strict=True)
+        return [_unpadded(*pair) for pair in pairs], np.concatenate(pixels, axis=1)
 
     def misfit(self, spectra):
         """chi2 per pixel (S,) where each source's light is, <A^2 S, R^T w^2 r^2> / <A^2 S, R^T w>,
@@ -65,6 +69,11 @@ class Response:
         for o, image in zip(self._observations, images, strict=True):
             o.by_spectra.gather(image, self._pulls)
         return (np.square(spectra) * b.device.get(self._pulls)).sum(1)
+
+
+def _unpadded(scene, images):
+    """The part of images (..., Ny, Nx) that is not padding of their scene's frame."""
+    return images[..., : scene.extent[0], : scene.extent[1]]
 
 
 def _middle(weights):

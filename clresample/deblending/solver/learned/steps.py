@@ -88,7 +88,8 @@ class Steps:
         return np.add.reduceat(values, self._first_chunks, axis=0)
 
     def advance(self, mode, a, c, scale, length):
-        """Queue the next trials: mode (B,) of REST, NEXT, ...; a, c (B, slots), scale, length (B,)."""
+        """Queue the next trials: mode (B,) of REST, NEXT, ...; a, c (B, slots); scale, length
+        (B,)."""
         b = self._buffers
         self._set_mode(mode)
         table = np.concatenate([a, c, scale[:, None], length[:, None]], axis=1)

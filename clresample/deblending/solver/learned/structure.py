@@ -14,7 +14,7 @@ from ..boxes import ALIGN
 
 
 def coarse(n_pixels, step):
-    """Coefficients along a side of `n_pixels`, one every `step`: from its first to past its last."""
+    """Coefficients along a side of `n_pixels`, one every `step`, from its first to past its last."""
     return (np.asarray(n_pixels) + step - 2) // step + 1
 
 
@@ -86,7 +86,7 @@ class Structure:
         rows = self.latents.shape[:, :, 0].sum(1)
         width = -(-b.host_boxes.shape[:, 1] // ALIGN) * ALIGN + 2 * margin + ALIGN
         scratch = np.concatenate([[0], np.cumsum(rows * width)])  # spread has fewer rows
-        line = b.device.zeros(int(scratch[-1]) if b.tuning.row_loops else 1, b.dtype)
+        line = b.device.zeros(max(int(scratch[-1]), 1) if b.tuning.row_loops else 1, b.dtype)
         start = np.stack([self.latents.start, scratch[:-1]], axis=1) // ALIGN
         power = np.array([(p * p).sum() for s in b.scenes for p in s.profile])
         inverse = np.divide(1, power, where=power > 0, out=np.zeros_like(power))

@@ -57,17 +57,17 @@ class Vectors:
 
     def start(self, spectra, sky, inverse_curvature):
         """Put x and the first trial there: z = 0, spectra (S, C), sky (B, C); and h of both."""
-        nothing = np.zeros(self.latents.size)
-        for parts, vectors in (
-            ((spectra, sky), (self.x, self.x_new)),
-            (inverse_curvature, [self.h]),
-        ):
-            flat = np.concatenate([nothing, *(np.ravel(p) for p in parts)])
-            for vector in vectors:
-                self.buffers.device.upload(flat.astype(self.buffers.dtype), vector)
+        upload, nothing = self.buffers.device.upload, np.zeros(self.latents.size)
+        there, h = (
+            np.concatenate([nothing, *map(np.ravel, parts)]).astype(self.buffers.dtype)
+            for parts in ((spectra, sky), inverse_curvature)
+        )
+        upload(there, self.x)
+        upload(there, self.x_new)
+        upload(h, self.h)
 
     def copy_from(self, other, keep):
-        """Take the values of the scenes `keep` (n,) of other Vectors, which are all that are here."""
+        """Take the values of scenes `keep` (n,) of other Vectors, which are all that are here."""
         shift = (other.parts()[keep] - self.parts())[:, :, 0]
         scene, first = self.chunks[:, 0], self.chunks[:, 1]
         kind = np.digitize(first, [self.latents.size, self.latents.size + self.n_spectra])
