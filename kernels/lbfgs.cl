@@ -38,9 +38,9 @@
 #define AGAIN 2
 #define TRY 3
 #define STAY 4
-/* Elements that a work-item takes at a time; 16 sums run side by side where it has a whole row. */
+/* Sums that run side by side, and elements taken at a time, where a work-item has whole rows. */
 #if ROWS
-#define LANES 16
+#define LANES 8
 #define BLOCK 256
 #else
 #define LANES 1
@@ -52,26 +52,28 @@
     const int bounded = chunks[4 * chunk + 3]; \
     const size_t first = (size_t)chunks[4 * chunk + 1];
 
-/* A group's sum into the table of sums. */
-#define PUT(value, to) \
+/* LANES running sums, and PUT: their total over a group into the table of sums. */
+#define SUMS(name) \
+    REAL name[LANES]; \
+    for (int l = 0; l < LANES; ++l) name[l] = 0;
+#define PUT(name, to) \
     { \
-        const REAL total = group_sum(value, lid, share); \
+        REAL mine = 0; \
+        for (int l = 0; l < LANES; ++l) mine += name[l]; \
+        const REAL total = group_sum(mine, lid, share); \
         if (lid == 0) to = total; \
     }
-
-/* sum_i u_i v_i over this work-item's part of a chunk */
-static REAL dot_of(__global const REAL *u, __global const REAL *v, const int n,
-                   const int lid)
-{
-    REAL part[LANES], total = 0;
-    for (int l = 0; l < LANES; ++l) part[l] = 0;
-    int i = lid * LANES;
-    for (; i + LANES <= n; i += WG * LANES)
-        for (int l = 0; l < LANES; ++l) part[l] += u[i + l] * v[i + l];
-    for (; i < n; ++i) total += u[i] * v[i];
-    for (int l = 0; l < LANES; ++l) total += part[l];
-    return total;
-}
+/* BODY for every element of this work-item: i, its lane l. */
+#define FOR_LANES(n, BODY) \
+    for (int i0 = lid * LANES; i0 + LANES <= (n); i0 += WG * LANES) \
+        for (int l = 0; l < LANES; ++l) { \
+            const int i = i0 + l; \
+            BODY \
+        } \
+    for (int i = (n) / LANES * LANES + lid; i < (n); i += WG) { \
+        const int l = 0; \
+        BODY \
+    }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
 void change(__global const int *restrict chunks, __global const int *restrict mode,
@@ -97,16 +99,31 @@ void change(__global const int *restrict chunks, __global const int *restrict mo
     }
     SYNC();
     __global REAL *to = out + (size_t)chunk * (4 * SLOTS + 1);
-    __global const REAL *y = ring_y + at;
+    __global const REAL *p = projected + first, *hg = weighed_g + first, *hy = weighed_y + first;
+    __global const REAL *y = ring_y + at, *s = ring_s + at, *before = g + first;
     for (int k = 0; k < slots[b]; ++k) {
         __global const REAL *sk = ring_s + k * (size_t)size + first;
         __global const REAL *yk = ring_y + k * (size_t)size + first;
-        PUT(dot_of(sk, projected + first, n, lid), to[4 * k])
-        PUT(dot_of(yk, weighed_g + first, n, lid), to[4 * k + 1])
-        PUT(dot_of(sk, y, n, lid), to[4 * k + 2])
-        PUT(dot_of(yk, weighed_y + first, n, lid), to[4 * k + 3])
+        SUMS(s_g)
+        SUMS(y_g)
+        SUMS(s_y)
+        SUMS(y_y)
+        FOR_LANES(n, {
+            const REAL si = sk[i];
+            const REAL yi = yk[i];
+            s_g[l] += si * p[i];
+            y_g[l] += yi * hg[i];
+            s_y[l] += si * y[i];
+            y_y[l] += yi * hy[i];
+        })
+        PUT(s_g, to[4 * k])
+        PUT(y_g, to[4 * k + 1])
+        PUT(s_y, to[4 * k + 2])
+        PUT(y_y, to[4 * k + 3])
     }
-    PUT(dot_of(g + first, ring_s + at, n, lid), to[4 * SLOTS])
+    SUMS(slope)
+    FOR_LANES(n, { slope[l] += before[i] * s[i]; })
+    PUT(slope, to[4 * SLOTS])
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
@@ -119,14 +136,22 @@ void gram(__global const int *restrict chunks, __global const int *restrict mode
     CHUNK
     if (mode[b] == REST) return;
     __global REAL *to = out + (size_t)chunk * (2 * SLOTS * SLOTS);
-    for (int l = 0; l < slots[b]; ++l) {
-        __global const REAL *yl = ring_y + l * (size_t)size + first;
+    __global const REAL *hy = weighed_y + first;
+    for (int m = 0; m < slots[b]; ++m) {
+        __global const REAL *yl = ring_y + m * (size_t)size + first;
         for (int i = lid; i < n; i += WG) weighed_y[first + i] = h[first + i] * yl[i];
         SYNC();
         for (int k = 0; k < slots[b]; ++k) {
-            const size_t other = k * (size_t)size + first;
-            PUT(dot_of(ring_s + other, yl, n, lid), to[2 * (k * SLOTS + l)])
-            PUT(dot_of(ring_y + other, weighed_y + first, n, lid), to[2 * (k * SLOTS + l) + 1])
+            __global const REAL *sk = ring_s + k * (size_t)size + first;
+            __global const REAL *yk = ring_y + k * (size_t)size + first;
+            SUMS(s_y)
+            SUMS(y_y)
+            FOR_LANES(n, {
+                s_y[l] += sk[i] * yl[i];
+                y_y[l] += yk[i] * hy[i];
+            })
+            PUT(s_y, to[2 * (k * SLOTS + m)])
+            PUT(y_y, to[2 * (k * SLOTS + m) + 1])
         }
         SYNC();
     }
