@@ -116,15 +116,13 @@ class Fit:
             view.op.shift = shift
 
     def move(self, scene, state, least_px=0.0) -> bool:
-        """Shift the observations to where the model, as it is by now, fits each of them best.
-
-        Returns whether they have moved: not where none would by more than least_px [model px].
-        """
+        """Shift the observations to where the model, as it is by now, fits each of them best,
+        unless none would move by more than least_px [model px]; whether they have moved."""
         steps = shift_steps(scene, state)
-        moved = bool((np.abs(steps) > least_px).any())
-        if moved:
-            self._shift(self.shifts + steps)
-        return moved
+        if not (np.abs(steps) > least_px).any():
+            return False
+        self._shift(self.shifts + steps)
+        return True
 
     def stopped(self, losses) -> bool:
         """Take the losses (n,) of the last iterations; whether the fit ends here, and why."""
@@ -277,9 +275,9 @@ def _start_scene(fit, shape) -> tuple[Scene, State]:
     )
     latent = [np.zeros_like(m) for m in morphs]
     state = State(latent, [m.copy() for m in morphs], spectra, sky)
-    if fit.settings.learns:
-        return scene, state
-    return replace(scene, damping=damping(scene, state, fit.settings.prior)), state
+    if not fit.settings.learns:
+        scene = replace(scene, damping=damping(scene, state, fit.settings.prior))
+    return scene, state
 
 
 def _dark_message(i_source, position):
