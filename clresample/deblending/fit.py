@@ -17,7 +17,6 @@ from .resize import box_around
 from .result import Component, Result
 from .shifts import shift_steps
 from .solver.curvature import damping
-from .solver.learned.engine import vector_bytes
 from .solver.scene import Scene, State
 from .spectra import solve_spectra
 from .start import LIGHT_SIGMAS, start
@@ -130,12 +129,6 @@ class Fit:
         reason = stop_reason(self.losses, len(losses), self.settings.tol)
         self.status = reason or self.status
         return reason is not None
-
-    @property
-    def n_bytes(self) -> int:
-        """Device memory [bytes] that the fit takes in a batch, roughly."""
-        more = vector_bytes(self.scene, self.settings.prior) if self.settings.learns else 0
-        return self.scene.n_bytes + more
 
     def note_loss(self, loss):
         """Take down the loss of an iteration."""

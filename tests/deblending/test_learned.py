@@ -19,12 +19,12 @@ from clresample.sky.sources import Point
 SHORT = Settings(max_iter=12, enough=0)
 
 
-def made(device, pairs, dtype=np.float64, prior=LearnedPrior(), enough=1.0):
+def made(device, pairs, dtype=np.float64, enough=1.0):
     if dtype == np.float64 and not device.has_fp64:
         pytest.skip(f"{device.name} has no double precision")
     pairs = [(with_power(scene), state) for scene, state in pairs]
     some, states = map(list, zip(*pairs, strict=True))
-    return LearnedEngine(some, states, device, dtype, prior, enough)
+    return LearnedEngine(some, states, device, dtype, LearnedPrior(), enough)
 
 
 def with_power(scene):
@@ -145,13 +145,12 @@ def test_a_fit_ends_when_little_is_left_to_gain(device, plain):
 def test_the_iteration_limit_is_kept(device):
     for max_iter in (0, 1, 7):
         seen = []
+
+        def note(n, loss, seen=seen):
+            seen.append((n, loss.shape))
+
         settings = Settings(max_iter=max_iter, enough=0)
-        result = scenes.fit(
-            blend(),
-            device,
-            settings=settings,
-            progress=lambda n, loss: seen.append((n, loss.shape)),
-        )
+        result = scenes.fit(blend(), device, settings=settings, progress=note)
         assert result.status == "iteration limit"
         assert len(result.losses) <= max_iter + 1 and np.isfinite(chi2(result))
         assert seen == [(n, (1,)) for n in (5, 7) if n <= max_iter] or max_iter == 1

@@ -1,14 +1,14 @@
 """How strong the structure of each source is at each scale, by the evidence of its own data.
 
 Near a source with profile b and spectrum A the data's curvature by structure at frequency nu is
-b t(nu), t = sum_c A_c^2 T_c, T_c the transform of R_c^T w R_c's answer to one pixel. With k_j(nu) the
-power spectrum of K_j, of mean 1, scale j has
+b t(nu), t = sum_c A_c^2 T_c, T_c the transform of R_c^T w R_c's answer to one pixel. With k_j(nu)
+the power spectrum of K_j, of mean 1, scale j has
 
     gamma_j = sum_x mean_nu [ alpha_j^2 k_j b t / (1 + b t sum_i alpha_i^2 k_i) ]
 
 determined parameters, and MacKay's (1992) fixed point under a hyperprior about alpha0 is
 
-    alpha_j^2 <- (|z_j|^2 / max(1, chi2_s) + m alpha0_j^2) / (gamma_j + m),     m = weight / seen_j^2
+    alpha_j^2 <- (|z_j|^2 / max(1, chi2_s) + m alpha0_j^2) / (gamma_j + m),   m = weight / seen_j^2
 
 chi2_s is chi2 per pixel where the source's light is: misfit that no structure can take up is not
 taken for structure. seen_j is the share of scale j's power that the data show at the profile's
@@ -34,7 +34,7 @@ LEAST_SEEN = 1e-3  # so that m stays a number where the data show nothing
 STEP = 4.0
 # Where strengths end: structure of 0.1 % is none, and of 100 % the profile means nothing.
 STRENGTHS = 1e-3, 1.0
-# The preconditioner's light is the profile blurred by so many sigma of each scale, and its curvature
+# The preconditioner's light is the profile blurred by so many sigma of each scale, its curvature
 # the mean of t with weights P^POWER, P being k_j broadened by the source's extent: between the true
 # diagonal (1), and the curvature of the smoothest structure (2). Other values take up to 4 times
 # as many iterations, on simulations or on bright real galaxies.
@@ -145,7 +145,7 @@ def blurred_light(profile, sigma, step):
 
 
 def _pixels_at(values, levels):
-    """Pixels (n levels) that stand for `values` in sums of a function interpolated between levels."""
+    """Pixels (n levels) that stand for `values` in sums of a function interpolated between."""
     low = np.clip(np.searchsorted(levels, values) - 1, 0, len(levels) - 2)
     part = np.clip((values - levels[low]) / (levels[low + 1] - levels[low]), 0, 1)
     count = np.bincount(low, 1 - part, len(levels))

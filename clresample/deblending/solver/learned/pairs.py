@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-# A pair is kept if s . y exceeds this part of y . h y, which is about 1 where the diagonal h says what
-# the curvature is: far below that the sums of float32 hold rounding alone.
+# A pair is kept if s . y exceeds this part of y . h y. It is about all of it where the diagonal h
+# says what the curvature is; far below that the sums of float32 hold rounding alone.
 LEAST_CURVATURE = 1e-6
 
 

@@ -43,8 +43,8 @@ class Response:
             for scene, (y, x) in zip(impulse, at, strict=True):
                 scene[:, y, x] = 1
             b.device.upload(impulse, o.model)
-            o.op.forward(o.model, out=o.image)
-            o.op.adjoint(o.image, out=o.model)
+            o.op.forward_into(o.model, o.image)
+            o.op.adjoint_into(o.image, o.model)
             level = [[_median(w) for w in s.weights[i]] for s in b.scenes]
             answers.append(b.device.get(o.model) * np.array(level)[:, :, None, None])
             pixels.append(np.repeat(at[:, None], covered.shape[1], axis=1))
@@ -59,7 +59,7 @@ class Response:
         for o, square in zip(self._observations, self._squares, strict=True):
             n_bands, my, _ = o.op.shape_out
             square((my, n_bands, len(b.scenes)))
-            o.op.adjoint(o.image, out=o.model)
+            o.op.adjoint_into(o.image, o.model)
         found = self._pull(spectra, [o.model for o in self._observations])
         return found / np.maximum(self._pull(spectra, self.weights), 1e-30)
 

@@ -14,7 +14,7 @@ from ..boxes import ALIGN
 
 
 def coarse(n_pixels, step):
-    """Coefficients along a side of `n_pixels`, one every `step`, from its first to past its last."""
+    """Coefficients along a side of `n_pixels`: one every `step`, to its last pixel or past it."""
     return (np.asarray(n_pixels) + step - 2) // step + 1
 
 
