@@ -72,7 +72,7 @@ class Made:
         self.latents = Latents(b.host_boxes, build.get(b.free)[: b.n_free], prior.steps)
         self.v = v = Vectors(b, self.latents, N_PAIRS + 1)
         self.host, self.device = {}, build
-        for name in ("x", "x_new", "g", "g_new", "d", "h", "s", "y"):
+        for name in Vectors.NAMES:
             array = getattr(v, name)
             self.host[name] = rng.normal(size=array.shape).astype(dtype).astype(float)
             build.upload(self.host[name].astype(dtype), array)
@@ -93,7 +93,10 @@ class Made:
         self.pairs.used[:] = 5, 2, 5
         self.pairs._order[:] = np.arange(5)
         self.steps = Steps(v)
-        self.steps.follow(self.pairs)
+        self.follow([TRY, TRY, REST])
+
+    def follow(self, mode):
+        self.steps.follow(self.pairs, np.array(mode))
 
     def get(self, name):
         return self.device.get(getattr(self.v, name)).astype(float)
@@ -106,8 +109,7 @@ class Made:
 def test_inner_products_are_those_of_each_scene(build, dtype):
     m = Made(build, dtype)
     x, g, h, s, y = (m.host[k] for k in ("x", "g", "h", "s", "y"))
-    live = np.array([True, True, False])
-    sums, slope = m.steps.change(live)
+    sums, slope, energy = m.steps.change()
     s, y, on = s.copy(), y.copy(), m.scene < 2
     s[0, on], y[0, on] = (m.host["x_new"] - x)[on], (m.host["g_new"] - g)[on]
     close(m.get("s"), s, dtype)
@@ -126,7 +128,9 @@ def test_inner_products_are_those_of_each_scene(build, dtype):
             found = (sums[i, k] - [w[part].sum() for w in wanted]) / scale
             close(1 + found, np.ones(4), dtype)
         assert slope[i] == pytest.approx((g * s[0])[part].sum(), rel=1e-3)
-    sy, yy = m.steps.gram(live)
+        wanted = (m.host["precision"] * m.host["x_new"] ** 2)[part].sum()
+        assert energy[i] == pytest.approx(wanted, rel=1e-3)
+    sy, yy = m.steps.gram()
     for i, used in ((0, 5), (1, 2)):
         part = m.scene == i
         found = sy[i, :used, :used], yy[i, :used, :used]
@@ -144,8 +148,8 @@ def test_a_step_does_what_its_scene_asks_for(build, dtype, mode):
     a[:, 4] = c[:, 4] = 0
     a[1, 2:] = c[1, 2:] = 0
     scale, length = rng.uniform(0.5, 1, (2, 3))
-    modes = np.array([mode, mode, REST])
-    m.steps.advance(modes, a, c, scale, length)
+    m.follow([mode, mode, REST])
+    m.steps.advance(a, c, scale, length)
     x, g, d, h = (m.host[k] for k in ("x", "g", "d", "h"))
     if mode == NEXT:
         x, g = m.host["x_new"], m.host["g_new"]
@@ -167,16 +171,18 @@ def test_other_strengths_reach_every_vector(build, dtype):
     light = np.random.default_rng(2).uniform(1, 2, m.latents.size)
     weights = np.random.default_rng(3).uniform(1, 2, (len(m.b.host_boxes), 3, 3))
     m.steps.reweigh(m.b.put(light), weights)
-    h, g, y = m.host["h"].copy(), m.host["g_new"].copy(), m.host["y"].copy()
+    names = "h", "g_new", "y", "precision"
+    h, g, y, stiff = (m.host[name].copy() for name in names)
     for i, planes in enumerate(m.latents.planes()):
         used = m.pairs.used[m.b.host_boxes.scene[i]]
         for j, (first, length) in enumerate(planes):
             part = slice(first, first + length)
             precision, curvature, change = weights[i, j]
+            stiff[part] = precision
             h[part] = 1 / (precision + curvature * light[part])
             g[part] += change * m.host["x_new"][part]
             y[:used, part] += change * m.host["s"][:used, part]
-    for name, wanted in (("h", h), ("g_new", g), ("y", y)):
+    for name, wanted in zip(names, (h, g, y, stiff), strict=True):
         close(m.get(name), wanted, dtype)
 
 

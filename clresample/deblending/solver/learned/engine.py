@@ -17,7 +17,7 @@ from ..gradient import Gradient
 from ..scene import State
 from .pairs import Pairs
 from .progress import Progress
-from .steps import REST, STAY, Steps
+from .steps import REST, STAY, TRY, Steps
 from .strengths import Strengths
 from .structure import Structure, coarse
 from .vectors import Vectors
@@ -53,7 +53,7 @@ class LearnedEngine:
             self.strengths = Strengths(b, self._gradient, latents, prior)
             spectra, sky = np.concatenate([s.spectra for s in states]), [s.sky for s in states]
             v.start(spectra, sky, _inverse_curvature(scenes))
-            self.steps.follow(self.pairs)
+            self._rest_others(self.progress.live)
             self.steps.reweigh(self.strengths.light, self.strengths.weights(spectra))
         else:
             engine, keep = past
@@ -62,7 +62,7 @@ class LearnedEngine:
                 b, self._gradient, latents, prior, past=(engine.strengths, keep)
             )
             v.copy_from(engine.vectors, keep)
-            self.steps.follow(self.pairs)
+            self._rest_others(self.progress.live)
 
     def take(self, keep):
         """An engine of the scenes `keep` (n,) alone, which go on as if nothing had happened."""
@@ -82,43 +82,48 @@ class LearnedEngine:
         returns accepted (B,): scenes whose progress.loss is new
         """
         p = self.progress
-        sums, slope, loss, energies = self._evaluate()
+        sums, slope, loss = self._evaluate()
         accepted, stepped = p.judge(loss, slope)
         new = np.flatnonzero(stepped)
         self.pairs.take(new, sums[new, :, 2], sums[new, :, 3])
-        self.steps.follow(self.pairs)
         due = p.due(accepted)
         if due.any():
-            sums = self._learn(due, energies)
+            sums = self._learn(due)
         mode, length, bare = p.next(accepted)
         self.pairs.forget(bare)
         a, c, scale = self.pairs.coefficients(sums[:, :, 0], sums[:, :, 1])
-        self.steps.advance(mode, a, c, scale, length)
+        self.steps.follow(self.pairs, mode)
+        self.steps.advance(a, c, scale, length)
         return accepted
 
     def _evaluate(self):
-        """Inner products, slopes, losses and energies at the trials."""
+        """Inner products, slopes and losses at the trials."""
         v, gradient = self.vectors, self._gradient
         self.structure.form(v.x_new)
         v.take(v.x_new)
         gradient.queue()
         self.structure.gradient(v.x_new, self.strengths.precision, v.g_new)
         v.give(gradient.rows_pull, self._row0)
-        self.structure.energy(v.x_new)
-        sums, slope = self.steps.change(self.progress.live)
-        energies = self.device.get(self.structure.energies).astype(np.float64)
+        sums, slope, energy = self.steps.change()
         rows = self.device.get(gradient.rows_loss).sum(1, dtype=np.float64)
-        return sums, slope, rows + self.strengths.loss(energies), energies
+        return sums, slope, rows + 0.5 * energy
 
-    def _learn(self, due, energies):
+    def _learn(self, due):
         """New strengths of the scenes `due` (B,), and all that follows; other inner products."""
+        self.structure.energy(self.vectors.x_new)
+        energies = self.device.get(self.structure.energies).astype(np.float64)
         spectra = self.device.get(self.buffers.spectra).astype(np.float64)
         moved, weights, change = self.strengths.learn(due, energies, spectra)
+        self._rest_others(self.progress.live)
         self.steps.reweigh(self.strengths.light, weights)
-        sy, yy = self.steps.gram(due)
+        sy, yy = self.steps.gram()
         self.pairs.renew(due, sy[due], yy[due])
         self.progress.learned(due, moved, change)
-        return self.steps.change(self.progress.live)[0]  # its s and y go into spare slots
+        return self.steps.change()[0]  # its s and y go into spare slots
+
+    def _rest_others(self, live):
+        """Let only the scenes `live` (B,) take part in what is queued next."""
+        self.steps.follow(self.pairs, np.where(live, TRY, REST))
 
     def states(self) -> list[State]:
         """The scenes' present states, back on the host."""
@@ -133,8 +138,9 @@ class LearnedEngine:
         self.progress.look_again(moved)
         self.pairs.forget(moved)
         nothing = np.zeros((len(self.scenes), N_PAIRS + 1))
-        mode = np.where(moved, STAY, REST)
-        self.steps.advance(mode, nothing, nothing, nothing[:, 0], nothing[:, 0])
+        self.steps.follow(self.pairs, np.where(moved, STAY, REST))
+        self.steps.advance(nothing, nothing, nothing[:, 0], nothing[:, 0])
+        self._rest_others(self.progress.live)
 
 
 def vector_bytes(scene, prior) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-# What `Steps.advance` does with a scene; the same numbers in lbfgs.cl.
+# What the kernels do with a scene; the same numbers in lbfgs.cl.
 REST, NEXT, AGAIN, TRY, STAY = range(5)
 
 
@@ -20,13 +20,13 @@ class Steps:
         self._n_slots, self._n_chunks = n_slots, len(v.chunks)
         self._first_chunks = np.flatnonzero(np.diff(v.chunks[:, 0], prepend=-1))
         n = len(b.scenes)
-        self._used, self._spare, self._mode = (b.device.put(np.zeros(n), np.int32) for _ in "usm")
+        self._plan = b.device.put(np.zeros((n, 3)), np.int32)
         self._coefficients = b.put(np.zeros((n, 2 * n_slots + 2)))
-        self._sums = b.put(np.zeros((self._n_chunks, 4 * n_slots + 1)))
+        self._sums = b.put(np.zeros((self._n_chunks, 4 * n_slots + 2)))
         self._gram_sums = None  # large, and of use only where strengths are learned
         scratch = [b.device.zeros(v.size, b.dtype) for _ in range(3)]
-        ring = {"slots": self._used, "size": v.size, "h": v.h, "ring_s": v.s, "ring_y": v.y}
-        shared = ring | {"chunks": v.chunk_table, "mode": self._mode}
+        ring = {"plan": self._plan, "size": v.size, "h": v.h, "ring_s": v.s, "ring_y": v.y}
+        shared = ring | {"chunks": v.chunk_table}
         trial = {"x": v.x, "x_new": v.x_new, "g": v.g, "g_new": v.g_new}
         group = b.tuning.sum_group
 
@@ -37,7 +37,7 @@ class Steps:
         self._change = launcher("change").bind(
             **shared,
             **trial,
-            spare=self._spare,
+            precision=v.precision,
             projected=scratch[0],
             weighed_g=scratch[1],
             weighed_y=scratch[2],
@@ -55,30 +55,30 @@ class Steps:
             planes=b.device.put(planes.reshape(-1, 2), np.int32),
             x_new=v.x_new,
             g_new=v.g_new,
+            precision=v.precision,
         )
         self._size = group, self._n_chunks
         self._reweigh_size = group, planes.shape[1], b.n_free
 
-    def follow(self, pairs):
-        """Take over which slots of the ring the Pairs use by now."""
-        upload = self._buffers.device.upload
-        upload(pairs.used.astype(np.int32), self._used)
-        upload(np.ascontiguousarray(pairs.spare, np.int32), self._spare)
+    def follow(self, pairs, mode):
+        """What all that is queued next does with each scene, mode (B,) of REST, NEXT, ..., and
+        which slots of the ring the Pairs use by now."""
+        plan = np.stack([mode, pairs.used, pairs.spare], axis=1)
+        self._buffers.device.upload(np.ascontiguousarray(plan, np.int32), self._plan)
 
-    def change(self, live):
-        """What the trials of the scenes `live` (B,) change: s and y into the spare slots, and
-        s_k . P g, y_k . h P g, s_k . y, y_k . h y (B, slots, 4), g . s (B,) of these scenes."""
-        self._set_mode(np.where(live, TRY, REST))
+    def change(self):
+        """What trials change: s and y into the spare slots, and s_k . P g, y_k . h P g, s_k . y,
+        y_k . h y (B, slots, 4), g . s (B,), x_new . precision x_new (B,); of scenes at rest, what
+        there was."""
         self._change(self._size)
         sums = self._by_scene(self._sums)
-        return sums[:, :-1].reshape(len(sums), self._n_slots, 4), sums[:, -1]
+        return sums[:, :-2].reshape(len(sums), self._n_slots, 4), sums[:, -2], sums[:, -1]
 
-    def gram(self, live):
-        """s_k . y_l and y_k . h y_l (B, slots, slots) of all slots of the scenes `live` (B,)."""
+    def gram(self):
+        """s_k . y_l and y_k . h y_l (B, slots, slots) of all slots."""
         n = self._n_slots
         if self._gram_sums is None:
             self._gram_sums = self._buffers.put(np.zeros((self._n_chunks, 2 * n * n)))
-        self._set_mode(np.where(live, TRY, REST))
         self._gram(self._size, out=self._gram_sums)
         sums = self._by_scene(self._gram_sums).reshape(-1, n, n, 2)
         return sums[..., 0], sums[..., 1]
@@ -87,18 +87,12 @@ class Steps:
         values = self._buffers.device.get(sums).astype(np.float64)
         return np.add.reduceat(values, self._first_chunks, axis=0)
 
-    def advance(self, mode, a, c, scale, length):
-        """Queue the next trials: mode (B,) of REST, NEXT, ...; a, c (B, slots); scale, length
-        (B,)."""
+    def advance(self, a, c, scale, length):
+        """Queue the next trials: a, c (B, slots), scale, length (B,)."""
         b = self._buffers
-        self._set_mode(mode)
         table = np.concatenate([a, c, scale[:, None], length[:, None]], axis=1)
         b.device.upload(np.ascontiguousarray(table, b.dtype), self._coefficients)
         self._advance(self._size)
-
-    def _set_mode(self, mode):
-        """What the next kernels do with each scene."""
-        self._buffers.device.upload(np.ascontiguousarray(mode, np.int32), self._mode)
 
     def reweigh(self, light, weights):
         """Queue h, g_new and y of other strengths; weights (S, J, 3), see lbfgs.cl."""

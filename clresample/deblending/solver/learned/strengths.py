@@ -51,10 +51,6 @@ class Strengths:
             ]
         return evidence, light
 
-    def loss(self, energies):
-        """The prior's part of the losses (B,), 1/2 sum |z_sj|^2 / alpha_sj^2; energies (S, J)."""
-        return self._by_scene(0.5 * (energies * self.values**-2).sum(1))
-
     def weights(self, spectra, due=None, change=0.0):
         """For `Vectors.reweigh` (S, J, 3): precision, curvature, change.
 

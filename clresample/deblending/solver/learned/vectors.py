@@ -14,10 +14,10 @@ class Vectors:
     buffers: the batch; latents: its Latents; n_slots: of the ring of pairs
     size: elements of a vector; n_spectra, n_sky: its last ones
     chunks (n, 4): scene, first element, length, whether its variables are at least 0; by scene
-    x, x_new, g, g_new, d, h (size,): see lbfgs.cl; s, y (n_slots, size)
+    x, x_new, g, g_new, d, h, precision (size,): see lbfgs.cl; s, y (n_slots, size)
     """
 
-    NAMES = "x", "x_new", "g", "g_new", "d", "h", "s", "y"
+    NAMES = "x", "x_new", "g", "g_new", "d", "h", "precision", "s", "y"
 
     def __init__(self, buffers, latents, n_slots):
         b = self.buffers = buffers
@@ -26,8 +26,8 @@ class Vectors:
         self.size = latents.size + self.n_spectra + self.n_sky
         if self.size > np.iinfo(np.int32).max:
             raise ValueError(f"a batch of {self.size} variables is too large: use less memory")
-        self.x, self.x_new, self.g, self.g_new, self.d, self.h = (
-            b.device.zeros(self.size, b.dtype) for _ in range(6)
+        self.x, self.x_new, self.g, self.g_new, self.d, self.h, self.precision = (
+            b.device.zeros(self.size, b.dtype) for _ in range(7)
         )
         self.s, self.y = (b.device.zeros((n_slots, self.size), b.dtype) for _ in range(2))
         self.chunks = self._chunks()
