@@ -35,6 +35,7 @@ _ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
         "blend": ("Blend", "Failure"),
         "settings": ("Settings",),
         "solver.prior": ("Prior",),
+        "solver.learned.prior": ("LearnedPrior",),
         "solver.amsgrad": ("StepSizes",),
         "image_profiles": ("with_image_profiles",),
         "result": ("Result",),
@@ -75,6 +76,7 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from .deblending.result import Result as Result
     from .deblending.settings import Settings as Settings
     from .deblending.solver.amsgrad import StepSizes as StepSizes
+    from .deblending.solver.learned.prior import LearnedPrior as LearnedPrior
     from .deblending.solver.prior import Prior as Prior
     from .device.device import Device as Device, get_device as get_device
     from .device.discovery import DeviceError as DeviceError, list_devices as list_devices

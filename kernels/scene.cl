@@ -12,6 +12,7 @@
  * residual    r = image + sky - data, image <- w r, loss[b, row] = 1/2 sum_x w r^2,
  *             pull[b, row] = sum_x w r;  row = c * my + y of this observation, from `row0` on
  *             launch: (my, n_bands, B): one work-item a row, which writes that row's sums
+ * square      image <- image^2;  launch: as residual
  * gather_morph    dS_s[y, x] (+)= sum_c spectra[s, channel + c] G[b, c, y0 + y, x0 + x]
  *             for the sources listed in `active`; launch: (X, tallest box, len(active))
  * gather_spectra  dA[s, channel + c] = sum_yx S_s[y, x] G[b, c, y0 + y, x0 + x]
@@ -80,6 +81,13 @@ __kernel void residual(const int n_channels, const int channel, const int n_band
     const size_t row = (size_t)b * n_rows + row0 + c * my + y;
     loss[row] = (REAL)0.5 * total;
     pull[row] = total_pull;
+}
+
+__kernel void square(const int n_bands, const int my, const int mx, __global REAL *restrict image)
+{
+    const int y = (int)get_global_id(0), c = (int)get_global_id(1), b = (int)get_global_id(2);
+    __global REAL *row = image + (((size_t)b * n_bands + c) * my + y) * mx;
+    for (int x = 0; x < mx; ++x) row[x] *= row[x];
 }
 
 __kernel void gather_morph(__global const int *restrict active, __global const int *restrict table,

@@ -17,6 +17,7 @@ from .fit import Fit
 from .iterate import iterate
 from .result import Result
 from .settings import Settings
+from .solver.learned.engine import vector_bytes
 
 # [px] Blends of several sizes have their frames and observations padded to multiples of this, so
 # that they share batches: smaller ones make more batches, larger ones more padding to compute.
@@ -116,7 +117,7 @@ class _ManyFits:
                 self.dark.append(fit.dark)
             group = waiting[fit.scene.signature]
             group.append((i, fit))
-            full = sum(f.scene.n_bytes for _, f in group) + fit.scene.n_bytes > self.memory
+            full = sum(_n_bytes(f) for _, f in group) + _n_bytes(fit) > self.memory
             if full or len(group) >= self.n_most:
                 yield from self._fit(waiting.pop(fit.scene.signature))
         while waiting:
@@ -148,6 +149,12 @@ class _ManyFits:
                 yield i, fit.result()
             except ERRORS as error:
                 yield i, Failure(fit.blend, f"failed: {error}")
+
+
+def _n_bytes(fit):
+    """Device memory [bytes] that a fit takes in a batch, roughly."""
+    learns, prior = fit.settings.learns, fit.settings.prior
+    return fit.scene.n_bytes + (vector_bytes(fit.scene, prior) if learns else 0)
 
 
 def _sizes(blend):

@@ -114,9 +114,14 @@ class Fit:
         for view, shift in zip(self.views, shifts, strict=True):
             view.op.shift = shift
 
-    def move(self, scene, state):
-        """Shift the observations to where the model, as it is by now, fits each of them best."""
-        self._shift(self.shifts + shift_steps(scene, state))
+    def move(self, scene, state, least_px=0.0) -> bool:
+        """Shift the observations to where the model, as it is by now, fits each of them best,
+        unless none would move by more than least_px [model px]; whether they have moved."""
+        steps = shift_steps(scene, state)
+        if not (np.abs(steps) > least_px).any():
+            return False
+        self._shift(self.shifts + steps)
+        return True
 
     def stopped(self, losses) -> bool:
         """Take the losses (n,) of the last iterations; whether the fit ends here, and why."""
@@ -124,6 +129,14 @@ class Fit:
         reason = stop_reason(self.losses, len(losses), self.settings.tol)
         self.status = reason or self.status
         return reason is not None
+
+    def note_loss(self, loss):
+        """Take down the loss of an iteration."""
+        self.losses.append(float(loss))
+
+    def end(self, scene, state, status=None):
+        """End here, with this state; the status stays where none is given."""
+        self.scene, self.state, self.status = scene, state, status or self.status
 
     def interrupt(self):
         """Note that the fit ends because the user wants it to."""
@@ -250,11 +263,14 @@ def _start_scene(fit, shape) -> tuple[Scene, State]:
         profile=morphs,
         fixed=np.array([isinstance(fit.sources[fit.fitted[i]], Point) for i in begin.source]),
         scale=np.where(error < UNSEEN, error + SPECTRUM_PART * spectra, 0),
+        power=power,
         fit_sky=fit.settings.fit_sky,
     )
     latent = [np.zeros_like(m) for m in morphs]
     state = State(latent, [m.copy() for m in morphs], spectra, sky)
-    return replace(scene, damping=damping(scene, state, fit.settings.prior)), state
+    if not fit.settings.learns:
+        scene = replace(scene, damping=damping(scene, state, fit.settings.prior))
+    return scene, state
 
 
 def _dark_message(i_source, position):

@@ -8,6 +8,7 @@ import numpy as np
 
 from .resize import resized
 from .solver.engine import Engine
+from .solver.learned.engine import LearnedEngine
 
 # [iterations] between two looks at the losses: each waits for the device, but fits stop only there.
 CHECK = 5
@@ -17,6 +18,9 @@ MOVE = 10
 # Part of a batch's fits that have stopped by when the others go on in a smaller batch: making that
 # costs some iterations, and until then the stopped ones are still computed.
 REPACK = 0.25
+# [model px] A fit under a LearnedPrior whose observations would all move by less stays where it is:
+# each shift makes its solver forget. A hundredth of a pixel changes no flux by 0.01 %.
+LEAST_MOVE_PX = 0.01
 # [iterations] between two adjustments of the boxes to the light they hold; each makes a new batch.
 RESIZE = 40
 
@@ -25,11 +29,11 @@ def iterate(fits, settings, device, dtype, progress=None):
     """Run the fits of one signature until each has stopped; they keep their final states."""
     began, running = time.perf_counter(), None
     try:
-        running = _Running(fits, settings, device, dtype)
-        for _ in range(0, settings.max_iter, CHECK):
+        running = (_Learning if settings.learns else _Running)(fits, settings, device, dtype)
+        while running.n_steps < settings.max_iter:
             losses = running.run()
             if progress is not None:
-                progress(running.engine.n_steps, losses[-1])
+                progress(running.n_steps, losses[-1])
             if not running.live.any():
                 break
             running.shift()
@@ -57,10 +61,15 @@ class _Running:
             states or [f.state for f in self.fits],
             device,
             dtype,
-            chain=settings.constraints,
+            chain=settings.chain,
             prior=settings.prior,
             step_sizes=settings.step_sizes,
         )
+
+    @property
+    def n_steps(self) -> int:
+        """Iterations done so far."""
+        return self.engine.n_steps
 
     def going(self):
         """The fits that have not stopped."""
@@ -119,3 +128,81 @@ class _Running:
         self.remember(self.live)
         scenes, states = map(list, zip(*pairs, strict=True))
         return _Running(self.going(), self.settings, self.device, self.dtype, scenes, states)
+
+
+class _Learning:
+    """The fits of one engine under a LearnedPrior, on their way; else as _Running.
+
+    Boxes stay as they are: structure fades at their edges, as the profile does that they follow.
+    """
+
+    def __init__(self, fits, settings, device, dtype, engine=None):
+        self.fits, self.settings, self.device, self.dtype = list(fits), settings, device, dtype
+        self.engine = engine or LearnedEngine(
+            [f.scene for f in fits],
+            [f.state for f in fits],
+            device,
+            dtype,
+            settings.prior,
+            settings.enough,
+        )
+
+    @property
+    def live(self):
+        """The fits (B,) that have not stopped."""
+        return self.engine.progress.live
+
+    @property
+    def n_steps(self) -> int:
+        """Trials so far, each of which is an iteration or a step that was too long."""
+        return max(int(self.engine.progress.n_rounds.max()) - 1, 0)
+
+    def going(self):
+        """The fits that have not stopped."""
+        return [f for f, on in zip(self.fits, self.live, strict=True) if on]
+
+    def run(self):
+        """Some iterations, after which fits may have stopped; their losses (1, B)."""
+        engine, live = self.engine, self.live.copy()
+        n_steps = min(self.n_steps + CHECK, self.settings.max_iter)
+        while self.n_steps < n_steps and self.live.any():
+            for i in np.flatnonzero(engine.round()):
+                self.fits[i].note_loss(engine.progress.loss[i])
+        if self.settings.fit_shifts:
+            self._move(live & engine.progress.converged)
+        over = self.live if self.n_steps >= self.settings.max_iter else np.zeros_like(live)
+        stop = (live & ~self.live) | over
+        if stop.any():
+            self.settle(stop)
+            engine.progress.live &= ~over
+        return engine.progress.loss[None]
+
+    def shift(self):
+        """Shift the observations, where that is asked for and due."""
+        if self.settings.fit_shifts and self.n_steps % MOVE == 0:
+            self._move(self.live)
+
+    def _move(self, which):
+        """Shift the observations of the fits (B,), also of converged ones, which then go on."""
+        if not which.any():
+            return
+        states, moved = self.engine.states(), np.zeros(len(self.fits), bool)
+        for i in np.flatnonzero(which):
+            moved[i] = self.fits[i].move(self.engine.scenes[i], states[i], LEAST_MOVE_PX)
+        if moved.any():
+            self.engine.follow_shifts(moved)
+
+    def settle(self, stop):
+        """Leave the fits (B,) that stop here with their present state."""
+        states, p = self.engine.states(), self.engine.progress
+        for i in np.flatnonzero(stop):
+            status = "diverged" if p.failed[i] else "converged" if p.converged[i] else None
+            self.fits[i].end(self.engine.scenes[i], states[i], status)
+
+    def repacked(self) -> _Learning:
+        """What goes on: itself, or a smaller batch where enough fits have stopped."""
+        if (~self.live).mean() < REPACK:
+            return self
+        keep = np.flatnonzero(self.live)
+        fits, engine = [self.fits[i] for i in keep], self.engine.take(keep)
+        return _Learning(fits, self.settings, self.device, self.dtype, engine)

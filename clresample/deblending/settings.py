@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from .solver.amsgrad import StepSizes
 from .solver.constraints import Chain, MaxNorm, Monotone, Positivity, SumNorm
+from .solver.learned.prior import LearnedPrior
 from .solver.prior import Prior
 
 
@@ -13,21 +14,29 @@ from .solver.prior import Prior
 class Settings:
     """How a fit goes.
 
-    max_iter: most iterations; tol: a fit ends when its best loss falls by less than this part of
-        itself over 15 iterations
-    prior: the Prior of extended sources' morphologies about their smooth profiles; None fits the
-        morphologies themselves, by the constraints alone
-    constraints: Chain of proximal operators on the morphologies: non-negative, and monotone by the
-        sweep
-    step_sizes: the solver's StepSizes
+    max_iter: most iterations
+    prior: what is expected of extended sources' morphologies about their smooth profiles, which
+        also chooses the solver. LearnedPrior: structure at several scales, as strong as each
+        source's data say, by L-BFGS. Prior: structure of one scale and strength; None: the
+        morphologies themselves, by the constraints alone; both by the adaptive proximal gradients
+        of Melchior et al. (2019)
+    enough: with a LearnedPrior a fit has converged when its loss, half of chi2, fell by less than
+        this over 5 iterations. 1 leaves 94 % of fluxes within 0.2 and 99 % within 0.5 sigma of
+        where they would end; 0.25 takes a third more iterations
+    tol: with others it has when its best loss fell by less than this part of itself over 15
+    constraints: with others, Chain of proximal operators on the morphologies; None: non-negative,
+        and monotone by the sweep. With a LearnedPrior they are non-negative and nothing else: on
+        simulated galaxies a monotone morphology gains nothing, and real ones are none
+    step_sizes: with others, their StepSizes
     fit_shifts: let each observation but the first move by a constant shift
     fit_sky: fit a constant per channel
     """
 
     max_iter: int = 300
+    prior: LearnedPrior | Prior | None = LearnedPrior()
+    enough: float = 1.0
     tol: float = 1e-5
-    prior: Prior | None = Prior()
-    constraints: Chain = field(default_factory=lambda: Chain(Positivity(), Monotone()))
+    constraints: Chain | None = None
     step_sizes: StepSizes = StepSizes()
     fit_shifts: bool = False
     fit_sky: bool = False
@@ -35,11 +44,32 @@ class Settings:
     def __post_init__(self):
         if self.max_iter < 0:
             raise ValueError(f"max_iter is {self.max_iter}, must be 0 or more")
+        if not self.enough >= 0:
+            raise ValueError(f"enough is {self.enough}, must be 0 or more")
         if not 0 <= self.tol < 1:
             raise ValueError(f"tol is {self.tol}, must be at least 0 and under 1")
-        scaling = [p for p in self.constraints.steps() if isinstance(p, MaxNorm | SumNorm)]
+        steps = self.chain.steps()
+        scaling = [p for p in steps if isinstance(p, MaxNorm | SumNorm)]
         if self.prior is not None and scaling:
             raise ValueError(
                 f"constraints hold {scaling[0]!r}, but with a prior the profiles set the "
                 "scale of the morphologies: leave it out, or give prior=None"
             )
+        others = [p for p in steps if not isinstance(p, Positivity)]
+        if self.learns and others:
+            raise ValueError(
+                f"constraints hold {others[0]!r}, but with a LearnedPrior morphologies are "
+                "non-negative and nothing else: leave it out, or give prior=Prior()"
+            )
+
+    @property
+    def learns(self) -> bool:
+        """Whether the prior is a LearnedPrior."""
+        return isinstance(self.prior, LearnedPrior)
+
+    @property
+    def chain(self) -> Chain:
+        """The constraints, or those that go with the prior where none are given."""
+        if self.constraints is not None:
+            return self.constraints
+        return Chain(Positivity()) if self.learns else Chain(Positivity(), Monotone())

@@ -32,6 +32,8 @@ class Tuning:
     tile_flops, pixel_flops: what a tile of a frame costs beside its arithmetic, as the arithmetic
         that takes as long: launches and the tables of its shift; each pixel's way out of the frame
         and back. Larger values make larger tiles
+    vector_chunk: elements of a vector that one sum of lbfgs.cl runs over; on CPUs what stays in the
+        first cache with all that it is multiplied by
     n_scenes: scenes fitted side by side; more hide the launches better, and need more memory
     memory [bytes]: of the device for one frame in tiles, unless a caller says otherwise. With less,
         tiles are smaller and overlap more; most instruments' quickest tiles take less than 1 GiB
@@ -47,6 +49,7 @@ class Tuning:
     chunk_terms: int
     tile_flops: float
     pixel_flops: float
+    vector_chunk: int
     n_scenes: int
     memory: int
 
@@ -68,6 +71,7 @@ class Tuning:
                 sum_group=1,
                 group_bytes=4 << 20,  # in the cache, where they are read back at speed
                 slab_bytes=2 << 20,  # what one core has in its cache
+                vector_chunk=512,
                 n_scenes=32,  # more leave the cache, fewer do not hide the launches
                 **shared,
             )
@@ -79,6 +83,7 @@ class Tuning:
             sum_group=64,  # what every GPU allows
             group_bytes=1 << 30,  # the whole batch in flight
             slab_bytes=256 << 20,
+            vector_chunk=4096,  # some for each work-item of a group
             n_scenes=1024,
             **shared,
         )

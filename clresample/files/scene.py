@@ -11,7 +11,7 @@ comment. Paths are relative to the file's folder.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from ..deblending.settings import Settings
 from ..deblending.solver.constraints import Chain, Positivity
+from ..deblending.solver.prior import Prior
 from ..measurement.detection import THRESHOLD
 from ..sky.extent import intersection, union
 from ..sky.frame import Frame, model_frame
@@ -169,14 +170,16 @@ def _weighting(folder, table, bands, shape, inputs):
 
 
 def _settings(table):
-    """`monotone = false` leaves morphologies any form that is not negative; `structure_px` is the
-    prior's correlation length."""
-    given, default = dict(table), Settings()
-    if not given.pop("monotone", True):
+    """`monotone = true` and `structure_px`, the correlation length, ask for the Prior of one scale
+    and its solver; `monotone = false` leaves morphologies any form that is not negative."""
+    given = dict(table)
+    monotone = given.pop("monotone", None)
+    if monotone or "structure_px" in given:
+        length = given.pop("structure_px", Prior().correlation_px)
+        given["prior"] = Prior(correlation_px=length)
+    if monotone is False:
         given["constraints"] = Chain(Positivity())
-    if "structure_px" in given:
-        given["prior"] = replace(default.prior, correlation_px=given.pop("structure_px"))
-    return replace(default, **given)
+    return Settings(**given)
 
 
 def _planes(path, table, key, bands):

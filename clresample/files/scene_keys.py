@@ -105,6 +105,7 @@ TABLES = {
     "fit": {
         "max_iter": Rule("a whole number, 0 or more", _whole),
         "tol": Rule("a number from 0 to 1", lambda value: _number(value) and 0 <= value < 1),
+        "enough": POSITIVE,
         "monotone": SWITCH,
         "structure_px": POSITIVE,
         "fit_shifts": SWITCH,

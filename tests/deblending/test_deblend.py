@@ -12,6 +12,7 @@ from clresample.deblending.fit import PATIENCE
 from clresample.deblending.iterate import CHECK
 from clresample.deblending.settings import Settings
 from clresample.deblending.solver.constraints import Chain, MaxNorm, Monotone, Positivity, SumNorm
+from clresample.deblending.solver.prior import Prior
 from clresample.measurement.catalogue import catalogue
 from clresample.measurement.quality import summary
 from clresample.resampling.resampler import Resampler
@@ -109,7 +110,7 @@ def test_the_iteration_limit_is_kept(device, max_iter):
     result = fit(
         blend(),
         device,
-        settings=Settings(max_iter=max_iter, tol=0),
+        settings=Settings(prior=Prior(), max_iter=max_iter, tol=0),
         progress=lambda n, loss: seen.append((n, loss.shape)),
     )
     assert len(result.losses) == max_iter + 1

@@ -14,13 +14,14 @@ from clresample.deblending.fit import Fit
 from clresample.deblending.result import Result
 from clresample.deblending.settings import Settings
 from clresample.deblending.solver.engine import Engine
+from clresample.deblending.solver.prior import Prior
 from clresample.device.discovery import DeviceError
 from clresample.sky.frame import Frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.sources import Extended
 
-SETTINGS = Settings(max_iter=30, tol=0)
+SETTINGS = Settings(prior=Prior(), max_iter=30, tol=0)
 
 
 def fit(b, device, settings=SETTINGS, **given):

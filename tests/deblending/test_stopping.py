@@ -12,6 +12,7 @@ from clresample.deblending.iterate import CHECK
 from clresample.deblending.settings import Settings
 from clresample.deblending.solver.amsgrad import StepSizes
 from clresample.deblending.solver.engine import Engine
+from clresample.deblending.solver.prior import Prior
 from clresample.sky.sources import Extended
 
 
@@ -37,13 +38,13 @@ def test_the_stopping_rule(before, now, status):
 
 
 def starts(device, b, **given):
-    return fit(b, device, settings=Settings(max_iter=0, **given))
+    return fit(b, device, settings=Settings(**({"prior": Prior()} | given), max_iter=0))
 
 
 @pytest.mark.parametrize("prior", [True, False])
 @pytest.mark.parametrize("rate", [1e3, 1e30, 1e38])
 def test_divergence_gives_the_best_state(device, rate, prior):
-    given = {"step_sizes": StepSizes(rate, rate, rate)} | ({} if prior else {"prior": None})
+    given = {"step_sizes": StepSizes(rate, rate, rate)} | {"prior": Prior() if prior else None}
     result = fit(blend(), device, settings=Settings(**given))
     assert result.status == "diverged" and not result.converged
     same(result, starts(device, blend(), **given))
@@ -62,11 +63,13 @@ def test_a_nan_gives_the_best_state(device, monkeypatch, when):
             self.device.upload(np.full(spectra.shape, np.nan, np.float32), spectra)
 
     monkeypatch.setattr(Engine, "step", broken)
-    result = fit(blend(BRIGHT), device, settings=Settings(max_iter=50, tol=0))
+    result = fit(blend(BRIGHT), device, settings=Settings(prior=Prior(), max_iter=50, tol=0))
     assert result.status == "diverged" and 0.8 < chi2(result) < 1.2
     monkeypatch.undo()
     before = (when - 1) // CHECK * CHECK
-    same(result, fit(blend(BRIGHT), device, settings=Settings(max_iter=before, tol=0)))
+    same(
+        result, fit(blend(BRIGHT), device, settings=Settings(prior=Prior(), max_iter=before, tol=0))
+    )
     assert np.isfinite(result.losses[-1])
 
 
@@ -74,7 +77,8 @@ def test_rising_losses_give_the_best_state(device):
     """Sources where no light is: the fit ends no worse than it ever was."""
     b = blend()
     wrong = (Extended(position_px=(-0.5, 12.1)), Extended(position_px=(29.4, 35.4)))
-    result = deblend(b.observations, wrong, frame=b.frame, device=device)
+    settings = Settings(prior=Prior())
+    result = deblend(b.observations, wrong, frame=b.frame, device=device, settings=settings)
     assert result.losses[-1] <= result.losses[:-1:CHECK].min()
 
 
@@ -97,7 +101,7 @@ def interrupt_call(monkeypatch, where, when):
 def test_ctrl_c_gives_the_best_state(device, monkeypatch, where, when, sizes):
     """However far an iteration has come, and be the state half-way through it a better one."""
     interrupt_call(monkeypatch, where, when)
-    settings = Settings(max_iter=60, tol=0, step_sizes=sizes)
+    settings = Settings(prior=Prior(), max_iter=60, tol=0, step_sizes=sizes)
     result = fit(blend(BRIGHT), device, settings=settings)
     assert result.status == "interrupted" and not result.converged
     monkeypatch.undo()
@@ -116,7 +120,7 @@ def test_ctrl_c_while_an_engine_is_made(device, monkeypatch, when):
     """The first one, or one for boxes of other sizes."""
     interrupt_call(monkeypatch, "__init__", when)
     monkeypatch.setattr("clresample.deblending.iterate.resized", lambda s, p, *_: (replace(s), p))
-    result = fit(blend(BRIGHT), device, settings=Settings(max_iter=60, tol=0))
+    result = fit(blend(BRIGHT), device, settings=Settings(prior=Prior(), max_iter=60, tol=0))
     assert result.status == "interrupted" and 0.85 < chi2(result) < 1.1
     if not when:
         same(result, starts(device, blend(BRIGHT)))

@@ -49,9 +49,13 @@ class Gradient:
 
     def __call__(self, losses, i_loss):
         """Queue it all; losses[i_loss] of losses (n, B), on the device, are the scenes' losses."""
+        self.queue()
+        self._losses((len(self.buffers.scenes),), out=losses, i_loss=i_loss)
+
+    def queue(self):
+        """Queue everything but the losses' sums: gradients, rows_loss and rows_pull."""
         for observed in self.observations:
             observed.queue()
-        self._losses((len(self.buffers.scenes),), out=losses, i_loss=i_loss)
 
     def follow_shifts(self):
         """Take over the shifts that the scenes' own operators have by now."""

@@ -26,6 +26,7 @@ class Scene:
     profile (S): arrays (ny, nx) [1]: expected morphology, max = 1
     fixed (S,): bool, the morphology stays as it is
     scale (S, C): what counts as one step of each spectrum, in the unit of the data
+    power (S, C): sum w (R p)^2 of each profile p, the curvature of the loss by its spectrum
     damping (S,): gradients under which steps are shorter than the step sizes; see
         `curvature.damping`
     fit_sky: whether the sky level of each channel is free
@@ -41,6 +42,7 @@ class Scene:
     profile: list[np.ndarray]
     fixed: np.ndarray
     scale: np.ndarray
+    power: np.ndarray | None = None
     damping: np.ndarray | None = None
     fit_sky: bool = False
 

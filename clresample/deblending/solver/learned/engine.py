@@ -1,0 +1,164 @@
+"""Runs a batch of scenes under the prior that learns: rounds of trials, strengths, stops.
+
+    L = 1/2 sum_o |sqrt(w_o) (R_o M + sky - d_o)|^2 + 1/2 sum_sj |z_sj|^2 / alpha_sj^2
+
+A round costs one pair of operators for the whole batch. Each scene then does what its own loss
+asks for: it accepts its trial and takes a new direction, or goes back and takes a shorter step. The
+host decides, from sums of rows and chunks that are added in float64: a float32 loss of 3e5 is known
+to 0.05, a twentieth of what ends a fit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..buffers import Buffers
+from ..gradient import Gradient
+from ..scene import State
+from .pairs import Pairs
+from .progress import Progress
+from .steps import REST, STAY, TRY, Steps
+from .strengths import Strengths
+from .structure import Structure, coarse
+from .vectors import Vectors
+
+# Pairs of changes that a scene remembers: 10 take 10 to 20 % more iterations, 40 hardly fewer.
+N_PAIRS = 20
+# Part of the largest power of a source in any channel under which a channel holds nothing of it.
+UNSEEN = 1e-14
+
+
+class LearnedEngine:
+    """A batch of scenes of one signature on the device, under a LearnedPrior.
+
+    scenes, states: of the scenes at their start: structure begins at 0, on the profiles
+    enough: a scene has converged when its loss fell by less than this over 5 iterations
+    past: another engine and the indices (n,) of its scenes that go on here, which are `scenes`
+
+    progress: the scenes' Progress; strengths: their sources' Strengths
+    """
+
+    def __init__(self, scenes, states, device, dtype, prior, enough, *, past=None):
+        self.scenes, self._states, self.device, self.prior = scenes, states, device, prior
+        b = self.buffers = Buffers(scenes, states, device, dtype, prior)
+        self._gradient = Gradient(b, with_prior=False)
+        self.structure = Structure(b, prior)
+        latents = self.structure.latents
+        v = self.vectors = Vectors(b, latents, N_PAIRS + 1)
+        self.steps = Steps(v)
+        self._row0 = device.put(self._gradient.rows, np.int32)
+        if past is None:
+            self.progress = Progress(len(scenes), enough)
+            self.pairs = Pairs(len(scenes), N_PAIRS)
+            self.strengths = Strengths(b, self._gradient, latents, prior)
+            spectra, sky = np.concatenate([s.spectra for s in states]), [s.sky for s in states]
+            v.start(spectra, sky, _inverse_curvature(scenes))
+            self._rest_others(self.progress.live)
+            self.steps.reweigh(self.strengths.light, self.strengths.weights(spectra))
+        else:
+            engine, keep = past
+            self.progress, self.pairs = engine.progress.take(keep), engine.pairs.take_scenes(keep)
+            self.strengths = Strengths(
+                b, self._gradient, latents, prior, past=(engine.strengths, keep)
+            )
+            v.copy_from(engine.vectors, keep)
+            self._rest_others(self.progress.live)
+
+    def take(self, keep):
+        """An engine of the scenes `keep` (n,) alone, which go on as if nothing had happened."""
+        return LearnedEngine(
+            [self.scenes[i] for i in keep],
+            [self._states[i] for i in keep],
+            self.device,
+            self.buffers.dtype,
+            self.prior,
+            self.progress.enough,
+            past=(self, keep),
+        )
+
+    def round(self):
+        """One pair of operators: try every live scene's trial, decide, and queue the next ones.
+
+        returns accepted (B,): scenes whose progress.loss is new
+        """
+        p = self.progress
+        sums, slope, loss = self._evaluate()
+        accepted, stepped = p.judge(loss, slope)
+        new = np.flatnonzero(stepped)
+        self.pairs.take(new, sums[new, :, 2], sums[new, :, 3])
+        due = p.due(accepted)
+        if due.any():
+            sums = self._learn(due)
+        mode, length, bare = p.next(accepted)
+        self.pairs.forget(bare)
+        a, c, scale = self.pairs.coefficients(sums[:, :, 0], sums[:, :, 1])
+        self.steps.follow(self.pairs, mode)
+        self.steps.advance(a, c, scale, length)
+        return accepted
+
+    def _evaluate(self):
+        """Inner products, slopes and losses at the trials."""
+        v, gradient = self.vectors, self._gradient
+        self.structure.form(v.x_new)
+        v.take(v.x_new)
+        gradient.queue()
+        self.structure.gradient(v.x_new, self.strengths.precision, v.g_new)
+        v.give(gradient.rows_pull, self._row0)
+        sums, slope, energy = self.steps.change()
+        rows = self.device.get(gradient.rows_loss).sum(1, dtype=np.float64)
+        return sums, slope, rows + 0.5 * energy
+
+    def _learn(self, due):
+        """New strengths of the scenes `due` (B,), and all that follows; other inner products."""
+        self.structure.energy(self.vectors.x_new)
+        energies = self.device.get(self.structure.energies).astype(np.float64)
+        spectra = self.device.get(self.buffers.spectra).astype(np.float64)
+        moved, weights, change = self.strengths.learn(due, energies, spectra)
+        self._rest_others(self.progress.live)
+        self.steps.reweigh(self.strengths.light, weights)
+        sy, yy = self.steps.gram()
+        self.pairs.renew(due, sy[due], yy[due])
+        self.progress.learned(due, moved, change)
+        return self.steps.change()[0]  # its s and y go into spare slots
+
+    def _rest_others(self, live):
+        """Let only the scenes `live` (B,) take part in what is queued next."""
+        self.steps.follow(self.pairs, np.where(live, TRY, REST))
+
+    def states(self) -> list[State]:
+        """The scenes' present states, back on the host."""
+        b, v = self.buffers, self.vectors
+        self.structure.form(v.x)
+        v.take(v.x)
+        return b.states(b.iterated, [None] * len(self.scenes), int(self.progress.n_rounds.max()))
+
+    def follow_shifts(self, moved):
+        """Take over the shifts that the operators of the scenes `moved` (B,) have by now."""
+        self._gradient.follow_shifts()
+        self.progress.look_again(moved)
+        self.pairs.forget(moved)
+        nothing = np.zeros((len(self.scenes), N_PAIRS + 1))
+        self.steps.follow(self.pairs, np.where(moved, STAY, REST))
+        self.steps.advance(nothing, nothing, nothing[:, 0], nothing[:, 0])
+        self._rest_others(self.progress.live)
+
+
+def vector_bytes(scene, prior) -> int:
+    """Device memory [bytes] of the scene's vectors in a batch, roughly: of float64, those of the
+    ring, nine others and the light."""
+    n = sum(coarse(p.shape, step).prod() for p in scene.profile for step in prior.steps)
+    return int(8 * (2 * (N_PAIRS + 1) + 10) * (n + scene.power.size))
+
+
+def _inverse_curvature(scenes):
+    """1 / (sum w (R S)^2) of every spectrum (S, C) and 1 / sum w of every sky level (B, C); 0 where
+    nothing is seen, and of sky levels that are not fitted."""
+    power = np.concatenate([s.power for s in scenes])
+    seen = power > UNSEEN * power.max(initial=0)
+    total = np.array([np.concatenate([w.sum((1, 2)) for w in s.weights]) for s in scenes])
+    free = (total > 0) & np.array([s.fit_sky for s in scenes])[:, None]
+    return _inverse(power, seen), _inverse(total, free)
+
+
+def _inverse(values, where):
+    return np.divide(1, values, where=where, out=np.zeros(values.shape))

@@ -1,0 +1,120 @@
+"""How far each scene of a batch has come, and what it does next: the decisions of L-BFGS."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .steps import AGAIN, NEXT, REST, STAY, TRY
+
+# A trial is accepted if the loss falls by this part of what the slope promises.
+ARMIJO = 1e-4
+# Shortest and longest next step after a trial that was not accepted, as parts of it; trials before
+# the memory is dropped, and after that before a scene is left where it is.
+SHRINK = 0.1, 0.5
+TRIALS = 8
+# [rounds] Strengths are learned after FIRST, earlier ones being still far from their structure, and
+# then EVERY so many, until none of a scene's moves by more than SETTLED in its logarithm.
+FIRST, EVERY, SETTLED = 16, 8, 0.1
+# A fit has converged when its strengths have settled and its loss fell by less than `enough` over
+# so many iterations.
+PATIENCE = 5
+
+
+class Progress:
+    """Arrays over the scenes of a batch (B,).
+
+    live: those that go on; converged, failed: those that have come to their end, failed ones
+        because the loss of their start is no number
+    loss: of the last accepted trial; n_iterations: accepted trials, the start not counted
+    n_rounds: of each scene, trials so far
+    """
+
+    def __init__(self, n_scenes, enough):
+        n, self.enough = n_scenes, enough
+        self.live, self.converged, self.failed = (
+            np.ones(n, bool),
+            np.zeros(n, bool),
+            np.zeros(n, bool),
+        )
+        self.loss = np.full(n, np.inf)
+        self.n_iterations, self.n_rounds = np.zeros(n, int), np.zeros(n, int)
+        self.settled = np.zeros(n, bool)  # strengths
+        self._due = np.full(n, FIRST)
+        self._fresh = np.ones(n, bool)  # the trial is where the scene is, with another loss
+        self._bare = np.zeros(n, bool)  # without pairs since a direction that led nowhere
+        self._length, self._trials = np.ones(n), np.zeros(n, int)
+        self._drops = np.full((n, PATIENCE), np.inf)
+
+    def take(self, keep):
+        """That of the scenes `keep` (n,) alone."""
+        new = Progress(len(keep), self.enough)
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                setattr(new, name, value[keep])
+        return new
+
+    def judge(self, loss, slope):
+        """Whether each scene's trial of this loss is accepted: (B,), and which of these have a step
+        behind them that says something of the curvature. slope (B,): g . (x_new - x)"""
+        self.n_rounds += self.live
+        finite = np.isfinite(loss)
+        self.failed |= self.live & self._fresh & ~finite
+        self.live &= ~self.failed
+        with np.errstate(invalid="ignore"):
+            lower = (slope < 0) & (loss <= self.loss + ARMIJO * slope)
+            shrink = -slope / (2 * np.maximum(loss - self.loss - slope, 1e-30))
+        self._shrink = np.clip(np.where(np.isfinite(shrink), shrink, 0), *SHRINK)
+        self._uphill = ~(slope < 0)
+        accepted = self.live & finite & (lower | self._fresh)
+        stepped = accepted & ~self._fresh
+        self._drops[stepped] = np.roll(self._drops[stepped], 1, axis=1)
+        self._drops[stepped, 0] = (self.loss - loss)[stepped]
+        self.n_iterations += stepped
+        self.loss[accepted] = loss[accepted]
+        self._fresh &= ~accepted
+        return accepted, stepped
+
+    def due(self, accepted):
+        """Which scenes (B,) learn their strengths now."""
+        return accepted & ~self.settled & (self.n_rounds >= self._due)
+
+    def learned(self, due, moved, change):
+        """Take down what the scenes `due` have learned: moved (B,), largest change of a logarithm
+        of a strength; change (B,) of their losses."""
+        self.loss += np.where(due, change, 0)
+        self.settled |= due & (moved < SETTLED)
+        self._due[due] = self.n_rounds[due] + EVERY
+        self._drops[due] = np.inf
+
+    def look_again(self, which):
+        """Of the scenes `which` (B,) the loss is another one now: their next trial is where they
+        are."""
+        self._fresh |= which
+        self._bare &= ~which
+        self._drops[which] = np.inf
+        self.converged &= ~which
+        self.live |= which
+
+    def next(self, accepted):
+        """Mode (B,) and length (B,) of each scene's next step, and which drop their pairs (B,)."""
+        self.converged |= accepted & self.settled & (self._drops.sum(1) < self.enough)
+        self.live &= ~self.converged
+        refused = self.live & ~accepted
+        self._trials = np.where(refused, self._trials + 1, 0)
+        self._length = np.where(refused, self._length * self._shrink, 1.0)
+        lost = refused & (self._uphill | (self._trials >= TRIALS))
+        bare, stuck = lost & ~self._bare, lost & self._bare
+        self._length[bare], self._trials[bare] = 1.0, 0
+        self._bare = (self._bare & ~accepted) | bare
+        # No step lowers the loss: all that its rounding lets see has been reached. Strengths are
+        # learned from here, or the fit has converged.
+        self.converged |= stuck & self.settled
+        self.live &= ~self.converged
+        stuck &= self.live
+        self._due[stuck] = 0
+        self._fresh |= stuck
+        mode = np.full(len(accepted), REST)
+        for which, what in ((refused, TRY), (bare, AGAIN), (stuck, STAY), (accepted, NEXT)):
+            mode[which] = what
+        mode[~self.live & ~accepted] = REST
+        return mode, self._length, bare

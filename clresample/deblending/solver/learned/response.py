@@ -1,0 +1,90 @@
+"""What the operators of a batch say to the evidence: answers to one pixel, weights and misfit where
+sources lie."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+class Response:
+    """The operators of a batch's Gradient, asked about noise and misfit rather than gradients.
+
+    buffers, gradient: the batch and its Gradient, whose model and image buffers are overwritten
+    weights: per observation R^T w (B, Co, Ny, Nx) on the device
+    """
+
+    def __init__(self, buffers, gradient):
+        self.buffers, self._observations = buffers, gradient.observations
+        self._pulls = buffers.zeros_like_spectra()
+        self._squares = [
+            buffers.launcher("scene.cl", "square", 3, WG=buffers.tuning.sum_group).bind(
+                n_bands=o.op.shape_out[0],
+                my=o.op.shape_out[1],
+                mx=o.op.shape_out[2],
+                image=o.image,
+            )
+            for o in self._observations
+        ]
+        self.weights = []
+        for i, o in enumerate(self._observations):
+            weights = buffers.put(np.stack([s.weights[i] for s in buffers.scenes]))
+            self.weights.append(o.op.adjoint(weights))
+
+    def to_pixels(self):
+        """R_c^T w R_c of one pixel per scene and channel, near the middle of what is covered, w the
+        median weight: B answers (C, Ny, Nx) without padding, and pixels (B, C, 2)."""
+        b, answers, pixels = self.buffers, [], []
+        for i, o in enumerate(self._observations):
+            covered = b.device.get(self.weights[i])
+            at = np.array(
+                [_middle(_unpadded(*pair)) for pair in zip(b.scenes, covered, strict=True)]
+            )
+            impulse = np.zeros(covered.shape, b.dtype)
+            for scene, (y, x) in zip(impulse, at, strict=True):
+                scene[:, y, x] = 1
+            b.device.upload(impulse, o.model)
+            o.op.forward_into(o.model, o.image)
+            o.op.adjoint_into(o.image, o.model)
+            level = [[_median(w) for w in s.weights[i]] for s in b.scenes]
+            answers.append(b.device.get(o.model) * np.array(level)[:, :, None, None])
+            pixels.append(np.repeat(at[:, None], covered.shape[1], axis=1))
+        answers = np.concatenate(answers, axis=1)
+        pairs = zip(b.scenes, answers, strict=True)
+        return [_unpadded(*pair) for pair in pairs], np.concatenate(pixels, axis=1)
+
+    def misfit(self, spectra):
+        """chi2 per pixel (S,) where each source's light is, <A^2 S, R^T w^2 r^2> / <A^2 S, R^T w>,
+        of the residuals w r that are in the image buffers; spectra (S, C)."""
+        b = self.buffers
+        for o, square in zip(self._observations, self._squares, strict=True):
+            n_bands, my, _ = o.op.shape_out
+            square((my, n_bands, len(b.scenes)))
+            o.op.adjoint_into(o.image, o.model)
+        found = self._pull(spectra, [o.model for o in self._observations])
+        return found / np.maximum(self._pull(spectra, self.weights), 1e-30)
+
+    def _pull(self, spectra, images):
+        """<A^2 S, image> (S,) of images like the models."""
+        b = self.buffers
+        for o, image in zip(self._observations, images, strict=True):
+            o.by_spectra.gather(image, self._pulls)
+        return (np.square(spectra) * b.device.get(self._pulls)).sum(1)
+
+
+def _unpadded(scene, images):
+    """The part of images (..., Ny, Nx) that is not padding of their scene's frame."""
+    return images[..., : scene.extent[0], : scene.extent[1]]
+
+
+def _middle(weights):
+    """The pixel (y, x) at the centroid of images (Co, Ny, Nx) of weight."""
+    image = np.maximum(weights.sum(0, dtype=np.float64), 0)
+    total = max(image.sum(), 1e-30)
+    along = [image.sum(1 - axis) @ np.arange(n) / total for axis, n in enumerate(image.shape)]
+    return np.round(along).astype(int)
+
+
+def _median(weights):
+    """The median of what is above 0; 0 where nothing is."""
+    seen = weights[weights > 0]
+    return float(np.median(seen)) if seen.size else 0.0

@@ -1,0 +1,84 @@
+"""The strengths of structure of all sources of a batch, and what the solver needs of them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .evidence import SourceEvidence, Spectra, blurred_light
+from .response import Response
+
+
+class Strengths:
+    """Present strengths of a batch's sources, learned from their evidence.
+
+    past: other Strengths and the scenes (n,) of theirs that go on here, which are all
+
+    values (S, J): alpha, at the prior's start; of fixed sources without meaning
+    precision (S, J): alpha^-2 on the device; light: a vector on the device, see lbfgs.cl
+    """
+
+    def __init__(self, buffers, gradient, latents, prior, *, past=None):
+        b = self.buffers = buffers
+        self._scene = b.host_boxes.scene
+        self._free = b.device.get(b.free)[: b.n_free]
+        self._response = Response(b, gradient)
+        if past is None:
+            self.values = np.tile(np.array(prior.strengths, float), (b.n_sources, 1))
+            self._curvature = np.zeros_like(self.values)
+            self._evidence, self._light = self._prepare(prior)
+        else:
+            other, keep = past
+            kept = np.concatenate([np.flatnonzero(other._scene == i) for i in keep])
+            self.values, self._curvature = other.values[kept], other._curvature[kept]
+            self._evidence = [other._evidence[i] for i in kept]
+            self._light = [other._light[i] for i in kept]
+        self.precision = b.put(self.values**-2)
+        self.light = b.put(latents.pack(self._light))
+
+    def _prepare(self, prior):
+        """Each free source's SourceEvidence, and its light [s][j] about its coefficients."""
+        profiles = [p for s in self.buffers.scenes for p in s.profile]
+        spectra, evidence = Spectra(prior), [None] * len(profiles)
+        light = [[np.zeros(0)] * len(prior.steps) for _ in profiles]
+        answers, pixels = self._response.to_pixels()
+        pairs = zip(answers, pixels, strict=True)
+        responses = [spectra.of_answers(*pair) for pair in pairs]
+        for s in self._free:
+            evidence[s] = SourceEvidence(spectra, prior, profiles[s], responses[self._scene[s]])
+            light[s] = [
+                blurred_light(profiles[s], sigma, step)
+                for sigma, step in zip(prior.scales_px, prior.steps, strict=True)
+            ]
+        return evidence, light
+
+    def weights(self, spectra, due=None, change=0.0):
+        """For `Vectors.reweigh` (S, J, 3): precision, curvature, change.
+
+        spectra (S, C): at which the curvature is taken anew, in the scenes `due` (B,) or in all
+        """
+        for s in self._free if due is None else self._free[due[self._scene[self._free]]]:
+            self._curvature[s] = self._evidence[s].curvature(spectra[s])
+        precision = self.values**-2
+        return np.stack([precision, self._curvature, precision * 0 + change], axis=2)
+
+    def learn(self, due, energies, spectra):
+        """New strengths of the scenes `due` (B,), from the residuals in the image buffers.
+
+        energies (S, J): |z|^2; spectra (S, C)
+        returns moved (B,): largest change of a ln alpha; the weights; change (B,) of the losses
+        """
+        chi2, old = self._response.misfit(spectra), self.values.copy()
+        for s in self._free[due[self._scene[self._free]]]:
+            self.values[s] = self._evidence[s].learned(old[s], energies[s], spectra[s], chi2[s])
+        change = self.values**-2 - old**-2
+        self.buffers.device.upload(
+            np.ascontiguousarray(self.values**-2, self.buffers.dtype), self.precision
+        )
+        moved = np.zeros(len(due))
+        np.maximum.at(moved, self._scene, np.abs(np.log(self.values / old)).max(1))
+        loss = self._by_scene(0.5 * (energies * change).sum(1))
+        return moved, self.weights(spectra, due, change), loss
+
+    def _by_scene(self, values):
+        """Sums (B,) over the scenes' sources."""
+        return np.bincount(self._scene, values, len(self.buffers.scenes))

@@ -1,0 +1,90 @@
+"""The variables of a batch of scenes as vectors on the device: where each scene's part lies.
+
+x = (z of all free sources, A (S, C), sky (B, C))
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+class Vectors:
+    """The vectors of a batch that L-BFGS works on.
+
+    buffers: the batch; latents: its Latents; n_slots: of the ring of pairs
+    size: elements of a vector; n_spectra, n_sky: its last ones
+    chunks (n, 4): scene, first element, length, whether its variables are at least 0; by scene
+    x, x_new, g, g_new, d, h, precision (size,): see lbfgs.cl; s, y (n_slots, size)
+    """
+
+    NAMES = "x", "x_new", "g", "g_new", "d", "h", "precision", "s", "y"
+
+    def __init__(self, buffers, latents, n_slots):
+        b = self.buffers = buffers
+        self.latents, self.n_slots = latents, n_slots
+        self.n_spectra, self.n_sky = b.spectra.size, b.sky.size
+        self.size = latents.size + self.n_spectra + self.n_sky
+        if self.size > np.iinfo(np.int32).max:
+            raise ValueError(f"a batch of {self.size} variables is too large: use less memory")
+        self.x, self.x_new, self.g, self.g_new, self.d, self.h, self.precision = (
+            b.device.zeros(self.size, b.dtype) for _ in range(7)
+        )
+        self.s, self.y = (b.device.zeros((n_slots, self.size), b.dtype) for _ in range(2))
+        self.chunks = self._chunks()
+        self.chunk_table = b.device.put(self.chunks, np.int32)
+        names = {"n_latents": latents.size, "n_spectra": self.n_spectra}
+        self._take = b.launcher("lbfgs.cl", "take", 1).bind(**names, spectra=b.spectra, sky=b.sky)
+        self._give = b.launcher("lbfgs.cl", "give", 1).bind(
+            **names, n_channels=b.n_channels, d_spectra=b.d_spectra, g_new=self.g_new
+        )
+
+    def parts(self):
+        """Of each scene (B, 3, 2) first and one-past-last elements of z, spectra and sky."""
+        b, c = self.buffers, self.buffers.n_channels
+        source = b.device.get(b.first).astype(np.int64)
+        starts = np.append(self.latents.start, self.latents.size)
+        sky = self.latents.size + self.n_spectra
+        ends = starts[source], self.latents.size + source * c, sky + np.arange(len(source)) * c
+        return np.stack([np.stack([e[:-1], e[1:]], axis=1) for e in ends], axis=1)
+
+    def _chunks(self):
+        length, rows = self.buffers.tuning.vector_chunk, []
+        for i, parts in enumerate(self.parts()):
+            for k, (low, high) in enumerate(parts):
+                starts = np.arange(low, high, length)
+                rows += [(i, at, min(length, high - at), k == 1) for at in starts]
+        return np.array(rows)
+
+    def start(self, spectra, sky, inverse_curvature):
+        """Put x and the first trial there: z = 0, spectra (S, C), sky (B, C); and h of both."""
+        upload, nothing = self.buffers.device.upload, np.zeros(self.latents.size)
+        there, h = (
+            np.concatenate([nothing, *map(np.ravel, parts)]).astype(self.buffers.dtype)
+            for parts in ((spectra, sky), inverse_curvature)
+        )
+        upload(there, self.x)
+        upload(there, self.x_new)
+        upload(h, self.h)
+
+    def copy_from(self, other, keep):
+        """Take the values of scenes `keep` (n,) of other Vectors, which are all that are here."""
+        shift = (other.parts()[keep] - self.parts())[:, :, 0]
+        scene, first = self.chunks[:, 0], self.chunks[:, 1]
+        kind = np.digitize(first, [self.latents.size, self.latents.size + self.n_spectra])
+        source = self.buffers.device.put(first + shift[scene, kind], np.int32)
+        group = self.buffers.tuning.sum_group
+        move = self.buffers.launcher("lbfgs.cl", "move", 3, local_size=(group, 1, 1), WG=group)
+        move.bind(chunks=self.chunk_table, source=source, size=self.size, size_from=other.size)
+        for name in self.NAMES:
+            n_rows = self.n_slots if name in ("s", "y") else 1
+            size = group, len(self.chunks), n_rows
+            move(size, values_from=getattr(other, name), values=getattr(self, name))
+
+    def take(self, vector):
+        """Queue spectra and sky levels of a vector into the batch's buffers."""
+        self._take((self.n_spectra + self.n_sky,), x=vector)
+
+    def give(self, pull, rows):
+        """Queue the gradients of spectra and sky into g_new; pull (B, n), rows (C + 1,)."""
+        n_rows = pull.shape[1]
+        self._give((self.n_spectra + self.n_sky,), pull=pull, n_rows=n_rows, row0=rows)

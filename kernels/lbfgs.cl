@@ -1,0 +1,274 @@
+/* Projected L-BFGS for a batch of scenes: all vectors stay on the device, decisions are the host's.
+ *
+ * A vector holds the variables of all scenes.  Chunks of it belong to one scene each:
+ *   chunks    (n, 4) int: scene, first element, length, whether its variables are at least 0
+ *   ring_s, ring_y (SLOTS, size)  changes of x and of g in earlier iterations, one each in a slot
+ *   plan      (B, 3) int: MODE, what to do with the scene, one of the modes below; USED, how many
+ *             slots, from the first on; SPARE, the slot among them that takes what a trial changes
+ * x, g: where a scene is, and the gradient there; x_new, g_new: those of its trial; d: direction
+ * h: the inverse of the curvature's diagonal.  A variable is held where it must not fall: bounded,
+ * x <= 0 and g > 0.  P g is g where variables are free and 0 where they are held.
+ *
+ * change    s = x_new - x and y = g_new - g into the spare slots, and for each chunk the sums
+ *           s_k . P g_new, y_k . h P g_new, s_k . y, y_k . h y of each slot k, g . s and
+ *           x_new . precision x_new;  out (n, 4 SLOTS + 2);  scenes at rest stay as they are
+ * gram      s_k . y_l and y_k . h y_l of all slots, out (n, 2 SLOTS SLOTS)
+ * advance   NEXT: x, g <- x_new, g_new and d = P (h scale (sum_k a_k y_k - P g) - sum_k c_k s_k)
+ *           AGAIN: the same d from the x and g that are there; TRY: d as it is
+ *           then x_new = x + length d, at least 0 where bounded;  STAY: x_new = x
+ *           coefficients (B, 2 SLOTS + 2): a, c, scale, length
+ * reweigh   after new strengths of the prior: precision, h = 1 / (precision + curvature light),
+ *           g_new += change x_new, y_k += change s_k in every slot; launch: (WG, n_scales, n_free)
+ *           weights (S, n_scales, 3): precision, curvature, change
+ * take      spectra and sky levels out of x;  launch: (n_spectra + n_sky)
+ * give      their gradients into g_new: pull[b, row] summed over rows row0[c] .. row0[c + 1] - 1
+ *           launch: as take
+ * move      values[row, first + i] = values_from[row, source + i] of each chunk, the source of each
+ *           given; launch: (WG, n chunks, rows)
+ * launch of change, gram, advance: (WG, n chunks), groups of (WG, 1)
+ */
+#include "common.h"
+#include "boxes.h"
+#include "group.h"
+#ifndef SLOTS       /* of the ring: pairs that are remembered, and the spare one */
+#define SLOTS 21
+#endif
+#define PLAN(b, what) plan[3 * (b) + what]
+enum { MODE, USED, SPARE };
+#define REST 0
+#define NEXT 1
+#define AGAIN 2
+#define TRY 3
+#define STAY 4
+/* Sums that run side by side, and elements taken at a time, where a work-item has whole rows. */
+#if ROWS
+#define LANES 8
+#define BLOCK 256
+#else
+#define LANES 1
+#define BLOCK 1
+#endif
+#define CHUNK \
+    const int lid = (int)get_local_id(0), chunk = (int)get_global_id(1); \
+    const int b = chunks[4 * chunk], n = chunks[4 * chunk + 2]; \
+    const int bounded = chunks[4 * chunk + 3]; \
+    const size_t first = (size_t)chunks[4 * chunk + 1];
+
+/* LANES running sums, and PUT: their total over a group into the table of sums. */
+#define SUMS(name) \
+    REAL name[LANES]; \
+    for (int l = 0; l < LANES; ++l) name[l] = 0;
+#define PUT(name, to) \
+    { \
+        REAL mine = 0; \
+        for (int l = 0; l < LANES; ++l) mine += name[l]; \
+        const REAL total = group_sum(mine, lid, share); \
+        if (lid == 0) to = total; \
+    }
+/* BODY for every element of this work-item: i, its lane l. */
+#define FOR_LANES(n, BODY) \
+    for (int i0 = lid * LANES; i0 + LANES <= (n); i0 += WG * LANES) \
+        for (int l = 0; l < LANES; ++l) { \
+            const int i = i0 + l; \
+            BODY \
+        } \
+    for (int i = (n) / LANES * LANES + lid; i < (n); i += WG) { \
+        const int l = 0; \
+        BODY \
+    }
+
+__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
+void change(__global const int *restrict chunks, __global const int *restrict plan,
+            const ulong size, __global const REAL *restrict precision,
+            __global const REAL *restrict x, __global const REAL *restrict x_new,
+            __global const REAL *restrict g, __global const REAL *restrict g_new,
+            __global const REAL *restrict h, __global REAL *ring_s, __global REAL *ring_y,
+            __global REAL *restrict projected, __global REAL *restrict weighed_g,
+            __global REAL *restrict weighed_y, __global REAL *restrict out)
+{
+    __local REAL share[WG];
+    CHUNK
+    if (PLAN(b, MODE) == REST) return;
+    const size_t at = PLAN(b, SPARE) * (size_t)size + first;
+    for (int i = lid; i < n; i += WG) {
+        const REAL gi = g_new[first + i], yi = gi - g[first + i];
+        const REAL p = bounded && x_new[first + i] <= 0 && gi > 0 ? (REAL)0 : gi;
+        ring_s[at + i] = x_new[first + i] - x[first + i];
+        ring_y[at + i] = yi;
+        projected[first + i] = p;
+        weighed_g[first + i] = h[first + i] * p;
+        weighed_y[first + i] = h[first + i] * yi;
+    }
+    SYNC();
+    __global REAL *to = out + (size_t)chunk * (4 * SLOTS + 2);
+    __global const REAL *p = projected + first, *hg = weighed_g + first, *hy = weighed_y + first;
+    __global const REAL *y = ring_y + at, *s = ring_s + at, *before = g + first;
+    for (int k = 0; k < PLAN(b, USED); ++k) {
+        __global const REAL *sk = ring_s + k * (size_t)size + first;
+        __global const REAL *yk = ring_y + k * (size_t)size + first;
+        SUMS(s_g)
+        SUMS(y_g)
+        SUMS(s_y)
+        SUMS(y_y)
+        FOR_LANES(n, {
+            const REAL si = sk[i];
+            const REAL yi = yk[i];
+            s_g[l] += si * p[i];
+            y_g[l] += yi * hg[i];
+            s_y[l] += si * y[i];
+            y_y[l] += yi * hy[i];
+        })
+        PUT(s_g, to[4 * k])
+        PUT(y_g, to[4 * k + 1])
+        PUT(s_y, to[4 * k + 2])
+        PUT(y_y, to[4 * k + 3])
+    }
+    __global const REAL *weight = precision + first, *there = x_new + first;
+    SUMS(slope)
+    SUMS(energy)
+    FOR_LANES(n, {
+        slope[l] += before[i] * s[i];
+        energy[l] += weight[i] * there[i] * there[i];
+    })
+    PUT(slope, to[4 * SLOTS])
+    PUT(energy, to[4 * SLOTS + 1])
+}
+
+__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
+void gram(__global const int *restrict chunks, __global const int *restrict plan,
+          const ulong size, __global const REAL *restrict h,
+          __global const REAL *restrict ring_s, __global const REAL *restrict ring_y,
+          __global REAL *restrict weighed_y, __global REAL *restrict out)
+{
+    __local REAL share[WG];
+    CHUNK
+    if (PLAN(b, MODE) == REST) return;
+    __global REAL *to = out + (size_t)chunk * (2 * SLOTS * SLOTS);
+    __global const REAL *hy = weighed_y + first;
+    for (int m = 0; m < PLAN(b, USED); ++m) {
+        __global const REAL *yl = ring_y + m * (size_t)size + first;
+        for (int i = lid; i < n; i += WG) weighed_y[first + i] = h[first + i] * yl[i];
+        SYNC();
+        for (int k = 0; k < PLAN(b, USED); ++k) {
+            __global const REAL *sk = ring_s + k * (size_t)size + first;
+            __global const REAL *yk = ring_y + k * (size_t)size + first;
+            SUMS(s_y)
+            SUMS(y_y)
+            FOR_LANES(n, {
+                s_y[l] += sk[i] * yl[i];
+                y_y[l] += yk[i] * hy[i];
+            })
+            PUT(s_y, to[2 * (k * SLOTS + m)])
+            PUT(y_y, to[2 * (k * SLOTS + m) + 1])
+        }
+        SYNC();
+    }
+}
+
+__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
+void advance(__global const int *restrict chunks, __global const int *restrict plan,
+          __global const REAL *restrict coefficients, const ulong size,
+          __global const REAL *restrict h, __global const REAL *restrict ring_s,
+          __global const REAL *restrict ring_y, __global const REAL *restrict g_new,
+          __global REAL *restrict x, __global REAL *restrict g, __global REAL *restrict d,
+          __global REAL *restrict x_new)
+{
+    CHUNK
+    const int now = PLAN(b, MODE);
+    if (now == REST) return;
+    __global const REAL *a = coefficients + b * (2 * SLOTS + 2), *c = a + SLOTS;
+    const REAL scale = a[2 * SLOTS], length = a[2 * SLOTS + 1];
+    for (int i0 = lid * BLOCK; i0 < n; i0 += WG * BLOCK) {
+        const int m = n - i0 < BLOCK ? n - i0 : BLOCK;
+        const size_t at = first + i0;
+        if (now == NEXT)
+            for (int i = 0; i < m; ++i) {
+                x[at + i] = x_new[at + i];
+                g[at + i] = g_new[at + i];
+            }
+        if (now == NEXT || now == AGAIN) {
+            REAL q[BLOCK];
+            for (int i = 0; i < m; ++i)
+                q[i] = bounded && x[at + i] <= 0 && g[at + i] > 0 ? (REAL)0 : -g[at + i];
+            for (int k = 0; k < PLAN(b, USED); ++k) {
+                const REAL ak = a[k];
+                __global const REAL *y = ring_y + k * (size_t)size + at;
+                if (ak != 0) for (int i = 0; i < m; ++i) q[i] += ak * y[i];
+            }
+            for (int i = 0; i < m; ++i) q[i] *= scale * h[at + i];
+            for (int k = 0; k < PLAN(b, USED); ++k) {
+                const REAL ck = c[k];
+                __global const REAL *s = ring_s + k * (size_t)size + at;
+                if (ck != 0) for (int i = 0; i < m; ++i) q[i] -= ck * s[i];
+            }
+            for (int i = 0; i < m; ++i)
+                d[at + i] = bounded && x[at + i] <= 0 && g[at + i] > 0 ? (REAL)0 : q[i];
+        }
+        for (int i = 0; i < m; ++i) {
+            const REAL to = now == STAY ? x[at + i] : x[at + i] + length * d[at + i];
+            x_new[at + i] = bounded && to < 0 ? (REAL)0 : to;
+        }
+    }
+}
+
+__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
+void reweigh(__global const int *restrict active, __global const int *restrict table,
+             __global const int *restrict planes, __global const REAL *restrict weights,
+             __global const int *restrict plan, const ulong size,
+             __global const REAL *restrict light, __global const REAL *restrict x_new,
+             __global const REAL *restrict ring_s, __global REAL *restrict g_new,
+             __global REAL *restrict ring_y, __global REAL *restrict precision,
+             __global REAL *restrict h)
+{
+    const int lid = (int)get_local_id(0);
+    const int j = (int)get_global_id(1), n_scales = (int)get_global_size(1);
+    const int i_plane = active[get_global_id(2)] * n_scales + j;
+    const int b = BOX(active[get_global_id(2)])[SCENE], n = planes[2 * i_plane + 1];
+    const size_t first = (size_t)planes[2 * i_plane];
+    const REAL stiff = weights[3 * i_plane], curvature = weights[3 * i_plane + 1];
+    const REAL more = weights[3 * i_plane + 2];
+    for (size_t i = first + lid; i < first + n; i += WG) {
+        precision[i] = stiff;
+        h[i] = 1 / (stiff + curvature * light[i]);
+        g_new[i] += more * x_new[i];
+    }
+    if (more != 0)
+        for (int k = 0; k < PLAN(b, USED); ++k)
+            for (size_t i = first + lid; i < first + n; i += WG)
+                ring_y[k * (size_t)size + i] += more * ring_s[k * (size_t)size + i];
+}
+
+__kernel void take(const int n_latents, const int n_spectra, __global const REAL *restrict x,
+                   __global REAL *restrict spectra, __global REAL *restrict sky)
+{
+    const int i = (int)get_global_id(0);
+    const REAL value = x[(size_t)n_latents + i];
+    if (i < n_spectra) spectra[i] = value;
+    else sky[i - n_spectra] = value;
+}
+
+__kernel void give(const int n_latents, const int n_spectra, const int n_channels, const int n_rows,
+                   __global const int *restrict row0, __global const REAL *restrict pull,
+                   __global const REAL *restrict d_spectra, __global REAL *restrict g_new)
+{
+    const int i = (int)get_global_id(0), k = i - n_spectra;
+    REAL sum = 0;
+    if (i < n_spectra) sum = d_spectra[i];
+    else {
+        __global const REAL *rows = pull + (size_t)(k / n_channels) * n_rows;
+        for (int r = row0[k % n_channels]; r < row0[k % n_channels + 1]; ++r) sum += rows[r];
+    }
+    g_new[(size_t)n_latents + i] = sum;
+}
+
+__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
+void move(__global const int *restrict chunks, __global const int *restrict source,
+          const ulong size, const ulong size_from, __global const REAL *restrict values_from,
+          __global REAL *restrict values)
+{
+    const int lid = (int)get_local_id(0), chunk = (int)get_global_id(1);
+    const size_t row = get_global_id(2), n = chunks[4 * chunk + 2];
+    __global REAL *to = values + row * size + chunks[4 * chunk + 1];
+    __global const REAL *from = values_from + row * size_from + source[chunk];
+    for (size_t i = lid; i < n; i += WG) to[i] = from[i];
+}

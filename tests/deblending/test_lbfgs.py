@@ -1,0 +1,219 @@
+"""L-BFGS on the device: inner products, directions and steps as in NumPy."""
+
+import numpy as np
+import pytest
+from helpers.solver import close, every_type, ragged
+
+from clresample.deblending.solver.buffers import Buffers
+from clresample.deblending.solver.learned.pairs import Pairs
+from clresample.deblending.solver.learned.prior import LearnedPrior
+from clresample.deblending.solver.learned.steps import AGAIN, NEXT, REST, STAY, TRY, Steps
+from clresample.deblending.solver.learned.structure import Latents
+from clresample.deblending.solver.learned.vectors import Vectors
+
+N_PAIRS = 4
+
+
+def two_loops(g, pairs, h):
+    """-H g of pairs (s, y), oldest first (Nocedal & Wright 2006, algorithm 7.4)."""
+    q, past = g.copy(), []
+    for s, y in reversed(pairs):
+        a = (s @ q) / (s @ y)
+        past.append(a)
+        q -= a * y
+    if pairs:
+        s, y = pairs[-1]
+        q *= (s @ y) / (y @ (h * y))
+    r = h * q
+    for (s, y), a in zip(pairs, reversed(past), strict=True):
+        r += s * (a - (y @ r) / (s @ y))
+    return -r
+
+
+def test_pairs_give_the_direction_of_the_two_loops():
+    """Of scenes with other numbers of pairs, one of them without curvature, past a full ring."""
+    rng, n, n_scenes = np.random.default_rng(0), 12, 3
+    matrix = rng.normal(size=(n, n))
+    matrix = matrix @ matrix.T + np.eye(n)
+    pairs, h = Pairs(n_scenes, N_PAIRS), rng.uniform(0.5, 2, n)
+    kept = [[] for _ in range(n_scenes)]
+    s_ring, y_ring = np.zeros((2, n_scenes, pairs.n_slots, n))
+    for k in range(9):
+        taken = np.array([i for i in range(n_scenes) if k < (9, 3, 0)[i]], int)
+        s = rng.normal(size=(n_scenes, n))
+        y = s @ matrix * (-1 if k == 2 else 1)
+        for i in range(n_scenes):
+            s_ring[i, pairs.spare[i]], y_ring[i, pairs.spare[i]] = s[i], y[i]
+        sy, yy = np.einsum("bkn,bn->bk", s_ring, y), np.einsum("bkn,bn->bk", y_ring, h * y)
+        pairs.take(taken, sy[taken], yy[taken])
+        for i in taken:
+            kept[i] = (kept[i] + [(s[i], y[i])] * (k != 2))[-N_PAIRS:]
+        g = rng.normal(size=(n_scenes, n))
+        a, c, scale = pairs.coefficients(s_ring @ g[0], y_ring @ (h * g[0]))
+        y_part = np.einsum("bk,bkn->bn", a, y_ring) - g[0]
+        d = scale[:, None] * h * y_part - np.einsum("bk,bkn->bn", c, s_ring)
+        for i in range(n_scenes):
+            np.testing.assert_allclose(d[i], two_loops(g[0], kept[i], h), rtol=1e-9, atol=1e-9)
+    assert pairs.count.tolist() == [4, 2, 0]
+    pairs.forget(np.array([True, False, False]))
+    a, c, scale = pairs.coefficients(s_ring @ g[0], y_ring @ g[0])
+    assert not a[0].any() and not c[0].any() and scale[0] == 1
+
+
+class Made:
+    """Vectors of ragged scenes, filled with random numbers, and the same in NumPy."""
+
+    def __init__(self, build, dtype):
+        if dtype == np.float64 and not build.has_fp64:
+            pytest.skip(f"{build.name} has no double precision")
+        prior, rng = LearnedPrior(), np.random.default_rng(0)
+        scenes, states = map(list, zip(*ragged(build, dtype), strict=True))
+        self.b = b = Buffers(scenes, states, build, dtype, prior)
+        self.latents = Latents(b.host_boxes, build.get(b.free)[: b.n_free], prior.steps)
+        self.v = v = Vectors(b, self.latents, N_PAIRS + 1)
+        self.host, self.device = {}, build
+        for name in Vectors.NAMES:
+            array = getattr(v, name)
+            self.host[name] = rng.normal(size=array.shape).astype(dtype).astype(float)
+            build.upload(self.host[name].astype(dtype), array)
+        for name in ("x", "x_new"):  # some at their bound
+            array = self.host[name]
+            array[..., -v.n_spectra - v.n_sky :: 3] = 0
+            build.upload(array.astype(dtype), getattr(v, name))
+        self.scene = np.zeros(v.size, int)
+        self.bounded = np.zeros(v.size, bool)
+        seen = np.zeros(v.size, int)
+        for scene, first, length, bounded in v.chunks:
+            self.scene[first : first + length] = scene
+            self.bounded[first : first + length] = bounded
+            seen[first : first + length] += 1
+        assert (seen == 1).all()
+        assert self.bounded.sum() == v.n_spectra
+        self.pairs = Pairs(3, N_PAIRS)
+        self.pairs.used[:] = 5, 2, 5
+        self.pairs._order[:] = np.arange(5)
+        self.steps = Steps(v)
+        self.follow([TRY, TRY, REST])
+
+    def follow(self, mode):
+        self.steps.follow(self.pairs, np.array(mode))
+
+    def get(self, name):
+        return self.device.get(getattr(self.v, name)).astype(float)
+
+    def held(self, x, g):
+        return self.bounded & (x <= 0) & (g > 0)
+
+
+@every_type
+def test_inner_products_are_those_of_each_scene(build, dtype):
+    m = Made(build, dtype)
+    x, g, h, s, y = (m.host[k] for k in ("x", "g", "h", "s", "y"))
+    sums, slope, energy = m.steps.change()
+    s, y, on = s.copy(), y.copy(), m.scene < 2
+    s[0, on], y[0, on] = (m.host["x_new"] - x)[on], (m.host["g_new"] - g)[on]
+    close(m.get("s"), s, dtype)
+    close(m.get("y"), y, dtype)
+    free_g = np.where(m.held(m.host["x_new"], m.host["g_new"]), 0, m.host["g_new"])
+    for i, used in ((0, 5), (1, 2)):
+        part = m.scene == i
+        for k in range(used):
+            wanted = (
+                s[k] * free_g,
+                y[k] * h * free_g,
+                s[k] * y[0],
+                y[k] * h * y[0],
+            )
+            scale = [np.sqrt((w[part] ** 2).sum()) for w in wanted]
+            found = (sums[i, k] - [w[part].sum() for w in wanted]) / scale
+            close(1 + found, np.ones(4), dtype)
+        assert slope[i] == pytest.approx((g * s[0])[part].sum(), rel=1e-3)
+        wanted = (m.host["precision"] * m.host["x_new"] ** 2)[part].sum()
+        assert energy[i] == pytest.approx(wanted, rel=1e-3)
+    sy, yy = m.steps.gram()
+    for i, used in ((0, 5), (1, 2)):
+        part = m.scene == i
+        found = sy[i, :used, :used], yy[i, :used, :used]
+        wanted = s[:used, part] @ y[:used, part].T, (h * y)[:used, part] @ y[:used, part].T
+        for one, other in zip(found, wanted, strict=True):
+            close(one, other, dtype)
+
+
+@every_type
+@pytest.mark.parametrize("mode", [NEXT, AGAIN, TRY, STAY])
+def test_a_step_does_what_its_scene_asks_for(build, dtype, mode):
+    m = Made(build, dtype)
+    rng = np.random.default_rng(1)
+    a, c = rng.normal(size=(2, 3, 5))
+    a[:, 4] = c[:, 4] = 0
+    a[1, 2:] = c[1, 2:] = 0
+    scale, length = rng.uniform(0.5, 1, (2, 3))
+    m.follow([mode, mode, REST])
+    m.steps.advance(a, c, scale, length)
+    x, g, d, h = (m.host[k] for k in ("x", "g", "d", "h"))
+    if mode == NEXT:
+        x, g = m.host["x_new"], m.host["g_new"]
+    if mode in (NEXT, AGAIN):
+        held = m.held(x, g)
+        b = m.scene
+        q = np.einsum("kn,nk->n", m.host["y"], a[b]) - np.where(held, 0, g)
+        d = scale[b] * h * q - np.einsum("kn,nk->n", m.host["s"], c[b])
+        d = np.where(held, 0, d)
+    x_new = x if mode == STAY else x + length[m.scene] * d
+    x_new = np.where(m.bounded, np.maximum(x_new, 0), x_new)
+    for name, wanted in (("x", x), ("g", g), ("d", d), ("x_new", x_new)):
+        close(m.get(name), np.where(m.scene < 2, wanted, m.host[name]), dtype)
+
+
+@every_type
+def test_other_strengths_reach_every_vector(build, dtype):
+    m = Made(build, dtype)
+    light = np.random.default_rng(2).uniform(1, 2, m.latents.size)
+    weights = np.random.default_rng(3).uniform(1, 2, (len(m.b.host_boxes), 3, 3))
+    m.steps.reweigh(m.b.put(light), weights)
+    names = "h", "g_new", "y", "precision"
+    h, g, y, stiff = (m.host[name].copy() for name in names)
+    for i, planes in enumerate(m.latents.planes()):
+        used = m.pairs.used[m.b.host_boxes.scene[i]]
+        for j, (first, length) in enumerate(planes):
+            part = slice(first, first + length)
+            precision, curvature, change = weights[i, j]
+            stiff[part] = precision
+            h[part] = 1 / (precision + curvature * light[part])
+            g[part] += change * m.host["x_new"][part]
+            y[:used, part] += change * m.host["s"][:used, part]
+    for name, wanted in zip(names, (h, g, y, stiff), strict=True):
+        close(m.get(name), wanted, dtype)
+
+
+def test_spectra_and_sky_go_there_and_back(build):
+    m = Made(build, np.float64)
+    m.v.take(m.v.x_new)
+    tail = m.host["x_new"][m.latents.size :]
+    both = np.concatenate([build.get(a).ravel() for a in (m.b.spectra, m.b.sky)])
+    np.testing.assert_array_equal(both, tail)
+    rng = np.random.default_rng(4)
+    pull, d_spectra = rng.normal(size=(3, 10)), rng.normal(size=m.b.spectra.shape)
+    rows = np.array([0, 4, 7, 10])
+    build.upload(d_spectra, m.b.d_spectra)
+    m.v.give(m.b.put(pull), build.put(rows, np.int32))
+    wanted = np.concatenate([d_spectra.ravel(), np.add.reduceat(pull, rows[:-1], 1).ravel()])
+    close(m.get("g_new")[m.latents.size :], wanted, np.float64)
+
+
+def test_a_part_of_a_batch_goes_on_alone(build):
+    """Scenes 2 and 0, in this order, with all their vectors."""
+    m = Made(build, np.float32)
+    keep = np.array([2, 0])
+    scenes, states = map(list, zip(*ragged(build, np.float32), strict=True))
+    prior = LearnedPrior()
+    b = Buffers([scenes[i] for i in keep], [states[i] for i in keep], build, np.float32, prior)
+    latents = Latents(b.host_boxes, build.get(b.free)[: b.n_free], prior.steps)
+    other = Vectors(b, latents, N_PAIRS + 1)
+    other.copy_from(m.v, keep)
+    for name in Vectors.NAMES:
+        found, wanted = build.get(getattr(other, name)), build.get(getattr(m.v, name))
+        parts = [wanted[..., a:b] for kind in range(3) for a, b in m.v.parts()[keep, kind]]
+        np.testing.assert_array_equal(found, np.concatenate(parts, axis=-1))
+    pairs = m.pairs.take_scenes(keep)
+    assert pairs.used.tolist() == [5, 5]

@@ -1,0 +1,112 @@
+"""Structure at several scales on the device: as in NumPy, with a transpose that is one."""
+
+import numpy as np
+import pytest
+from helpers.learned import Source
+from helpers.solver import close, every_type, ragged
+
+from clresample.deblending.solver.boxes import Boxes
+from clresample.deblending.solver.buffers import Buffers
+from clresample.deblending.solver.learned.prior import LearnedPrior
+from clresample.deblending.solver.learned.structure import Latents, Structure, coarse
+
+PRIORS = LearnedPrior(), LearnedPrior(scales_px=(1.0, 6.5), strengths=(0.1, 0.1))
+
+
+def made(build, dtype, prior, seed=0):
+    """Structure of ragged scenes, with coefficients and gradients of random numbers."""
+    if dtype == np.float64 and not build.has_fp64:
+        pytest.skip(f"{build.name} has no double precision")
+    rng = np.random.default_rng(seed)
+    scenes, states = map(list, zip(*ragged(build, dtype), strict=True))
+    b = Buffers(scenes, states, build, dtype, prior)
+    structure = Structure(b, prior)
+    z = [[rng.normal(0, 0.3, shape) for shape in shapes] for shapes in structure.latents.shape]
+    profiles = [p for s in scenes for p in s.profile]
+    free = ~np.concatenate([s.fixed for s in scenes])
+    return b, structure, z, profiles, free
+
+
+@every_type
+@pytest.mark.parametrize("prior", PRIORS, ids=["three", "two"])
+def test_kernels_are_their_references(build, dtype, prior):
+    b, structure, z, profiles, free = made(build, dtype, prior)
+    rng = np.random.default_rng(1)
+    vector = b.put(structure.latents.pack(z))
+    before = b.host_boxes.unpack(build.get(b.morph))
+    structure.form(vector)
+    morphs = b.host_boxes.unpack(build.get(b.morph))
+    d_morph = [rng.normal(size=p.shape) for p in profiles]
+    build.upload(b.host_boxes.pack(d_morph, dtype=dtype), b.d_morph)
+    precision = rng.uniform(0, 2, (len(profiles), len(prior.steps)))
+    gradient = b.put(np.full(structure.latents.size, np.nan))
+    structure.gradient(vector, b.put(precision), gradient)
+    found = structure.latents.unpack(build.get(gradient))
+    structure.energy(vector)
+    energies = build.get(structure.energies)
+    for i, profile in enumerate(profiles):
+        if not free[i]:
+            np.testing.assert_array_equal(morphs[i], before[i])
+            continue
+        source = Source(profile, prior)
+        close(morphs[i], source.morph(z[i]), dtype)
+        wanted = source.gradient(d_morph[i], morphs[i], z[i], precision[i])
+        for j, part in enumerate(wanted):
+            close(found[i][j], part, dtype)
+            close(energies[i, j], (z[i][j] ** 2).sum(), dtype)
+    assert any((m == 0).any() for m in morphs)  # or the mask was not looked at
+
+
+def test_the_gradient_is_the_transpose(build):
+    """<S', dS> = <z', dL/dz>, where S is positive, and so linear, throughout."""
+    prior = LearnedPrior()
+    b, structure, z, profiles, free = made(build, np.float64, prior, seed=2)
+    z = [[1e-3 * zj for zj in scales] for scales in z]
+    vector, rng = b.put(structure.latents.pack(z)), np.random.default_rng(3)
+    structure.form(vector)
+    change = np.concatenate(
+        [(m - p).ravel() for m, p in zip(b.host_boxes.unpack(build.get(b.morph)), profiles)]
+    )
+    d_morph = [on * rng.normal(size=p.shape) for on, p in zip(free, profiles, strict=True)]
+    build.upload(b.host_boxes.pack(d_morph, dtype=np.float64), b.d_morph)
+    gradient = b.put(np.zeros(structure.latents.size))
+    nothing = b.put(np.zeros((len(profiles), 3)))
+    structure.gradient(vector, nothing, gradient)
+    left = change @ np.concatenate([d.ravel() for d in d_morph])
+    right = build.get(vector) @ build.get(gradient)
+    assert left == pytest.approx(right, rel=1e-9)
+
+
+def test_a_coarse_grid_reaches_past_the_last_pixel():
+    for n in range(1, 40):
+        for step in (1, 2, 4, 8):
+            k = coarse(n, step)
+            assert step * (k - 1) >= n - 1 > step * (k - 2)
+
+
+def test_coarse_grids_lose_nothing():
+    """The scatter of structure is that of the kernel on every pixel, up to 3 % anywhere."""
+    prior = LearnedPrior()
+    axes = Source(np.ones((81, 81)), prior).axes
+    for ky, _ in axes:
+        assert (ky**2).sum(1)[20:-20] == pytest.approx(1, abs=0.03)
+
+
+def test_vectors_hold_free_sources_alone():
+    boxes = Boxes(np.array([0, 0]), np.zeros((2, 2), int), np.array([[3, 5], [9, 9]]))
+    latents = Latents(boxes, np.array([1]), (1, 4))
+    assert latents.start.tolist() == [0, 0]
+    assert latents.size == 96  # 81 + 3 x 3, rounded up
+    z = [[np.zeros((0, 0))] * 2, [np.ones((9, 9)), np.full((3, 3), 2.0)]]
+    assert latents.unpack(latents.pack(z))[1][1].tolist() == [[2.0] * 3] * 3
+
+
+def test_a_prior_of_nonsense_is_refused():
+    for given in (
+        {"scales_px": (1.0,)},
+        {"strengths": (0.1, -1.0, 0.1)},
+        {"scales_px": (), "strengths": ()},
+        {"weight": 0.0},
+    ):
+        with pytest.raises(ValueError):
+            LearnedPrior(**given)
