@@ -91,8 +91,8 @@ def catalogue(result, *, magnitudes=False) -> QTable:
             _add_magnitudes(table, channel, flux[:, i] * scale[i], error[:, i] * scale[i])
     for i, label in enumerate(labels(result)):
         table[f"chi2_{label}"] = box_chi2(result, i, result.footprints[i])
-    worst = [worst_residuals(result, i) for i in range(len(result.observations))]
-    worst = np.concatenate(worst, axis=1)
+    per_observation = [worst_residuals(result, i) for i in range(len(result.observations))]
+    worst = np.concatenate(per_observation, axis=1)
     for channel, values in zip(result.channels, worst.T, strict=True):
         table[f"residual_{channel}"] = values
     table["flags"][(np.nan_to_num(worst) > MISFIT_SIGMAS).any(axis=1)] |= Flag.MISFIT
