@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..sky.frame import Frame
-from ..sky.observation import Observation
+from ..sky.frame import Frame, model_frame
+from ..sky.observation import Observation, check_observations
 from ..sky.sources import Source
 
 # Status of a fit that Ctrl-C ended.
@@ -40,6 +40,25 @@ class Blend:
         if shifts.shape != expected or not np.isfinite(shifts).all():
             raise ValueError(f"shifts is {shifts.tolist()}, must be {expected} finite numbers")
         return shifts
+
+    def made_frame(self) -> Frame:
+        """The frame, or one made for the observations, which are checked on the way.
+
+        ValueError: observations that do not go together, a profile of another shape than the frame.
+        """
+        if self.frame is None:
+            frame = model_frame(self.observations)
+        else:
+            check_observations(self.observations)
+            frame = self.frame
+        for i, source in enumerate(self.sources):
+            profile = getattr(source, "profile", None)
+            if profile is not None and np.shape(profile) != frame.shape:
+                raise ValueError(
+                    f"profile of source {i} has the shape {np.shape(profile)}, "
+                    f"the model frame {frame.shape}"
+                )
+        return frame
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ import numpy as np
 
 from ..resampling.transfer import noise_warnings
 from ..sky.extent import box_slices
-from ..sky.frame import Frame, model_frame
-from ..sky.observation import check_observations
+from ..sky.frame import Frame
 from ..sky.sources import Point
 from .blend import INTERRUPTED
+from .posterior.posterior import errors_of
 from .resize import box_around
 from .result import Component, Result
 from .shifts import shift_steps
@@ -57,12 +57,13 @@ class Fit:
     noise (C,): of one model pixel, in the views' units; unit (C,) [counts]: of these
     scene, state: Scene and State, as of the start or of where `settle` left them
     losses, status, messages, seconds: see Result
+    findings: what a LearnedPrior has learned, a Findings, or None
     """
 
     def __init__(self, blend, settings, device, dtype, *, pad):
         began = time.perf_counter()
         self.blend, self.settings = blend, settings
-        self.frame = _frame_of(blend)
+        self.frame = blend.made_frame()
         shifts = blend.known_shifts()
         positions = self.frame.place(blend.sources, blend.observations, shifts)
         pairs = zip(blend.sources, positions, strict=True)
@@ -100,7 +101,7 @@ class Fit:
         self.profiles = _peak_of_one(self.start.profiles)
         self.noise = np.concatenate([view.pixel_noise for view in self.views])
         self.scene, self.state = _start_scene(self, padded.shape)
-        self.losses, self.status = [], "iteration limit"
+        self.losses, self.status, self.findings = [], "iteration limit", None
         self._best = _Best(np.inf, None, None, self.shifts)
         self.seconds = {"setup": time.perf_counter() - began}
 
@@ -134,9 +135,10 @@ class Fit:
         """Take down the loss of an iteration."""
         self.losses.append(float(loss))
 
-    def end(self, scene, state, status=None):
+    def end(self, scene, state, findings, status=None):
         """End here, with this state; the status stays where none is given."""
         self.scene, self.state, self.status = scene, state, status or self.status
+        self.findings = findings
 
     def interrupt(self):
         """Note that the fit ends because the user wants it to."""
@@ -168,14 +170,16 @@ class Fit:
     def result(self) -> Result:
         """Everything back in the data's own units, spectra solved for the final morphologies."""
         began, scene, n = time.perf_counter(), self.scene, len(self.state.spectra)
-        morphs = np.zeros((n, *scene.shape))
+        morphs, peaks = np.zeros((n, *scene.shape)), [m.max() for m in self.state.morph]
+        peaks = np.array([peak if peak > 0 else 1.0 for peak in peaks])
         pairs = zip(scene.origin, self.state.morph, strict=True)
         boxes = [box_slices(low, m.shape) for low, m in pairs]
-        for full, box, m in zip(morphs, boxes, self.state.morph, strict=True):
-            full[box] = m / (m.max() if m.max() > 0 else 1.0)
+        for full, box, m, peak in zip(morphs, boxes, self.state.morph, peaks, strict=True):
+            full[box] = m / peak
         observed = [v.observe(morphs) for v in self.views]
         units = [v.whiten(images) for v, images in zip(self.views, observed, strict=True)]
-        spectra, sky, covariance = solve_spectra(units, self.views, self.settings.fit_sky)
+        solved = solve_spectra(units, self.views, self.settings.fit_sky)
+        spectra, sky, covariance = solved
         components = [
             Component(
                 int(self.fitted[self.start.source[i]]),
@@ -192,6 +196,8 @@ class Fit:
             images = images[..., : o.data.shape[1], : o.data.shape[2]]
             rendered.append(images.astype(np.float64) * view.covered[: o.shape[1], : o.shape[2]])
         self.seconds["result"] = time.perf_counter() - began
+        morphs = [c.morphology for c in components]
+        errors, draws = errors_of(self, morphs, peaks, units, solved)
         return Result(
             observations=self.blend.observations,
             frame=self.frame,
@@ -200,29 +206,14 @@ class Fit:
             rendered=tuple(rendered),
             sky=sky * self.unit,
             covariance=covariance * self.unit[:, None, None] ** 2,
+            errors=errors,
+            draws=draws,
             shifts=self.shifts,
             losses=np.array(self.losses),
             status=self.status,
             messages=tuple(self.messages),
             seconds=self.seconds,
         )
-
-
-def _frame_of(blend) -> Frame:
-    """The blend's frame, or one made for its observations, which are checked on the way."""
-    if blend.frame is None:
-        frame = model_frame(blend.observations)
-    else:
-        check_observations(blend.observations)
-        frame = blend.frame
-    for i, source in enumerate(blend.sources):
-        profile = getattr(source, "profile", None)
-        if profile is not None and np.shape(profile) != frame.shape:
-            raise ValueError(
-                f"profile of source {i} has the shape {np.shape(profile)}, "
-                f"the model frame {frame.shape}"
-            )
-    return frame
 
 
 def _padded_frame(frame, pad):

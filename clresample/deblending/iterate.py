@@ -195,9 +195,10 @@ class _Learning:
     def settle(self, stop):
         """Leave the fits (B,) that stop here with their present state."""
         states, p = self.engine.states(), self.engine.progress
+        findings = self.engine.findings(stop)
         for i in np.flatnonzero(stop):
             status = "diverged" if p.failed[i] else "converged" if p.converged[i] else None
-            self.fits[i].end(self.engine.scenes[i], states[i], status)
+            self.fits[i].end(self.engine.scenes[i], states[i], findings[i], status)
 
     def repacked(self) -> _Learning:
         """What goes on: itself, or a smaller batch where enough fits have stopped."""

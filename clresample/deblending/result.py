@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,6 +11,7 @@ from ..sky.footprint import Footprint
 from ..sky.frame import Frame
 from ..sky.observation import Observation
 from ..sky.sources import Source
+from .posterior.errors import Draws, Errors
 from .solver.scene_model import compose
 
 
@@ -50,6 +51,10 @@ class Result:
     covariance (C, n, n) [counts^2]: of the spectra of one channel over all components, inverse of
         the normal matrix with morphologies fixed (and sky free where it was); infinite variance for
         components without coverage
+    errors: of fits with a LearnedPrior, the Errors of fluxes, shapes and morphologies, marginal
+        over the morphologies, which `fluxes` and `catalogue` report. None where there are none: of
+        other priors, and where `messages` says so; then these report the covariance above
+    draws: what `sample` draws from; not stored in files
     shifts (n_observations, 2) [model px]: fitted offsets of the observations' pixels
     losses (n_iterations + 1,): half chi2 (plus priors) before each iteration and at the end
     status: "converged", "iteration limit", "diverged", "interrupted" or "failed: ..."
@@ -66,6 +71,8 @@ class Result:
     shifts: np.ndarray
     losses: np.ndarray
     status: str
+    errors: Errors | None = None
+    draws: Draws | None = None
     messages: tuple[str, ...] = ()
     seconds: dict = field(default_factory=dict)
 
@@ -119,3 +126,28 @@ class Result:
         """Data minus model (Co, My, Mx) [counts]; NaN where the data have no weight."""
         o = self.observations[i_observation]
         return np.where(o.weights > 0, o.data - self.model(i_observation), np.nan)
+
+    def sample(self, n, rng) -> list[tuple[Component, ...]]:
+        """Draw n sets of components from the posterior about the solution, as `errors` has it.
+
+        rng: NumPy Generator. Morphologies and spectra below 0 become 0, so that faint sources are
+        brighter in the mean; morphologies keep their scale, their maximum is no longer 1.
+        Settings.flux_floor is not in them.
+
+        Raises ValueError for results without draws: of other priors, without errors, or read from
+        a file.
+        """
+        if self.draws is None:
+            raise ValueError("this result has no posterior to draw from, see Result.draws")
+        return [self._drawn(rng) for _ in range(n)]
+
+    def _drawn(self, rng):
+        morphs, spectra = self.draws.draw(rng)
+        return tuple(
+            replace(
+                c,
+                morphology=np.maximum(c.morphology + m, np.minimum(c.morphology, 0)),
+                spectrum=np.maximum(c.spectrum + a, 0),
+            )
+            for c, m, a in zip(self.components, morphs, spectra, strict=True)
+        )

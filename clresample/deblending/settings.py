@@ -30,6 +30,12 @@ class Settings:
     step_sizes: with others, their StepSizes
     fit_shifts: let each observation but the first move by a constant shift
     fit_sky: fit a constant per channel
+    flux_floor: with a LearnedPrior, part of each flux added to its error in quadrature, the same
+        for all channels of a source: what no likelihood knows, the error of the model of bright
+        galaxies, their photons' own noise where the weights leave it out, and PSFs. Of simulated
+        parametric galaxies above signal to noise 300, in Euclid and Rubin together, the 68 %
+        intervals hold the truth in 61 % of cases without it, in 63 % with 0.001, in 70 % with
+        0.002. PSFs that are wrong by a percent, or galaxies unlike their profiles, need 0.01
     """
 
     max_iter: int = 300
@@ -40,6 +46,7 @@ class Settings:
     step_sizes: StepSizes = StepSizes()
     fit_shifts: bool = False
     fit_sky: bool = False
+    flux_floor: float = 0.0015
 
     def __post_init__(self):
         if self.max_iter < 0:
@@ -48,6 +55,8 @@ class Settings:
             raise ValueError(f"enough is {self.enough}, must be 0 or more")
         if not 0 <= self.tol < 1:
             raise ValueError(f"tol is {self.tol}, must be at least 0 and under 1")
+        if not 0 <= self.flux_floor < 1:
+            raise ValueError(f"flux_floor is {self.flux_floor}, must be at least 0 and under 1")
         steps = self.chain.steps()
         scaling = [p for p in steps if isinstance(p, MaxNorm | SumNorm)]
         if self.prior is not None and scaling:

@@ -42,12 +42,15 @@ class StartingPoint:
     profiles (n, Ny, Nx): over the frame, unit integral
     positions (S, 2) [px]: of the sources, free stars where they were found
     dark (S,): bool, whether a source is far from any light, see `_is_dark`
+    shapes (n): the components' Shapes; thetas (n): arrays of their parameters
     """
 
     source: np.ndarray
     profiles: np.ndarray
     positions: np.ndarray
     dark: np.ndarray
+    shapes: list
+    thetas: list
 
 
 def start(
@@ -70,6 +73,8 @@ def start(
         np.array([images[0] for images in fit.images(best.theta)]),
         fit.places(best.theta),
         dark,
+        fit.components,
+        fit.parts(best.theta),
     )
 
 
@@ -139,13 +144,13 @@ class _ProfileFit:
 
     def images(self, theta):
         """Per component, (1 + its parameters, Ny, Nx): the profile and its slopes."""
-        parts = zip(self.components, self._parts(theta), self.source, strict=True)
+        parts = zip(self.components, self.parts(theta), self.source, strict=True)
         return [c.draw(part, self.positions[source]) for c, part, source in parts]
 
     def places(self, theta):
         """Positions (S, 2) [px] of the sources at theta."""
         positions = self.positions.copy()
-        for c, part, source in zip(self.components, self._parts(theta), self.source, strict=True):
+        for c, part, source in zip(self.components, self.parts(theta), self.source, strict=True):
             positions[source] = c.place(part, self.positions[source])
         return positions
 
@@ -201,7 +206,7 @@ class _ProfileFit:
                     break
         return first, best
 
-    def _parts(self, theta):
+    def parts(self, theta):
         """The parameters of each component."""
         return np.split(theta, np.cumsum(self.counts)[:-1])
 

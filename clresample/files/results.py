@@ -12,6 +12,7 @@ from astropy.table import QTable, Table
 from astropy.wcs import WCSHDO_EFMT, WCSHDO_P17, WCSHDO_all
 from astropy.wcs.wcs import WCSHDO_SIP
 
+from ..deblending.posterior.errors import Errors
 from ..deblending.result import Component, Result
 from ..measurement.catalogue import MEANINGS, catalogue
 from ..sky.frame import Frame
@@ -26,6 +27,7 @@ FORMAT = 1  # of the files; raised when an older reader would misread them
 KINDS = {kind.__name__: kind for kind in (Source, Point, Extended)}
 KEPT = ("name", "channels", "zero_points", "n_bad", "messages")  # of an observation, as JSON
 BOX = ("source", "y", "x", "n_y", "n_x")
+ERRORS = {"FLUXCOV": "flux", "COLOURCOV": "colour", "MOMENTCOV": "moments"}  # HDUs of Errors
 ARRAYS = ("sky", "covariance", "shifts", "losses")
 # every WCS card with the 17 digits that give back the same float64
 RELAX = WCSHDO_all | WCSHDO_SIP | WCSHDO_P17 | WCSHDO_EFMT
@@ -36,7 +38,8 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
 
     HDUs that `read_result` reads: ABOUT (keys and JSON: sources, names, status, messages, ...),
     COMPONENTS (boxes), SPECTRA (n, C), MORPHOLOGIES (one after the other), SKY, COVARIANCE, SHIFTS,
-    LOSSES, MODELPSF, and per observation, numbered from 1: DATA, WEIGHTS, PSF, RENDERED.
+    LOSSES, where the result has errors FLUXCOV, COLOURCOV, MOMENTCOV and MORPHOLOGYERR (one after
+    the other), MODELPSF, and per observation, numbered from 1: DATA, WEIGHTS, PSF, RENDERED.
     For other programs: CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all sources in the model frame, and
     per observation MODEL and RESIDUAL. All images have their WCS; a flat sky is put at
     RA = Dec = 0.
@@ -71,9 +74,21 @@ def _fit_hdus(result):
         _image("SPECTRA", np.array(spectra) if spectra else np.zeros((0, len(result.channels)))),
         _image("MORPHOLOGIES", np.concatenate(flat) if flat else np.zeros(0)),
         *(_image(name.upper(), getattr(result, name)) for name in ARRAYS),
+        *_error_hdus(result.errors),
         _image("MODELPSF", result.frame.psf.images),
         _image("SCENE", scene, cards),
         *tables,
+    ]
+
+
+def _error_hdus(errors):
+    """HDUs of Errors, none without any."""
+    if errors is None:
+        return []
+    flat = [np.ravel(m) for m in errors.morphology]
+    return [
+        *(_image(name, getattr(errors, key)) for name, key in ERRORS.items()),
+        _image("MORPHOLOGYERR", np.concatenate(flat) if flat else np.zeros(0)),
     ]
 
 
@@ -95,7 +110,8 @@ def _observation_hdus(result, i):
 
 
 def read_result(path) -> Result:
-    """The blend that `write_result` wrote to a file, equal to the last bit.
+    """The blend that `write_result` wrote to a file, equal to the last bit but for Result.draws,
+    which files do not hold.
 
     Raises FileError for a file that does not exist, is not FITS, is damaged, or holds no blend.
     """
@@ -121,6 +137,7 @@ def read_result(path) -> Result:
             status=about["status"],
             messages=tuple(about["messages"]),
             seconds=about["seconds"],
+            errors=_errors(hdus),
             **{key: _array(hdus[key.upper()]) for key in ARRAYS},
         )
 
@@ -256,6 +273,19 @@ def _source(path, *, kind, **given):
     if kind not in KINDS:
         raise FileError(f"{path}: a source is a {kind}, this version knows {', '.join(KINDS)}")
     return KINDS[kind](**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})
+
+
+def _errors(hdus):
+    if "MORPHOLOGYERR" not in hdus:
+        return None
+    flat, maps = _array(hdus["MORPHOLOGYERR"]), []
+    for row in hdus["COMPONENTS"].data:
+        shape = int(row["n_y"]), int(row["n_x"])
+        end = shape[0] * shape[1]
+        maps.append(flat[:end].reshape(shape).copy())
+        flat = flat[end:]
+    arrays = {key: _array(hdus[name]) for name, key in ERRORS.items()}
+    return Errors(**arrays, morphology=tuple(maps))
 
 
 def _components(hdus):

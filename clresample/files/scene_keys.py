@@ -110,6 +110,7 @@ TABLES = {
         "structure_px": POSITIVE,
         "fit_shifts": SWITCH,
         "fit_sky": SWITCH,
+        "flux_floor": Rule("a number from 0 to 1", lambda value: _number(value) and 0 <= value < 1),
     },
 }
 NEEDED = {"observation": ("name", "image", "psf"), "sources": ("catalogue",)}

@@ -14,11 +14,15 @@ from ..sky.observation import ZERO_POINT_UJY
 from .photometry import flux_scale, fluxes
 from .quality import box_chi2, fitted_sources, labels
 from .residuals import MISFIT_SIGMAS, worst_residuals
-from .shapes import local_axes, moments, shape
+from .shapes import local_axes, moments, shape, shape_slopes
 
 # of a morphology's peak: light at the edge of what was seen is flagged when it is brighter. Fainter
 # light makes no flux wrong by more than a few percent; lower, noise in the wings is flagged too
 EDGE_LIGHT = 0.01
+
+# [deg] scatter of an angle that may have any value: no error is larger
+UNKNOWN_ANGLE_DEG = 180 / np.sqrt(12)
+SHAPE_UNITS = {"size": u.arcsec, "e1": 1, "e2": 1, "angle": u.deg}
 
 
 class Flag(IntFlag):
@@ -63,6 +67,9 @@ def catalogue(result, *, magnitudes=False) -> QTable:
         size [arcsec], e1, e2, angle [deg]: see `shapes.shape`. They are those of the model under
             the model's PSF, not deconvolved; a source's components are weighted by their flux, that
             of all channels, each in units of its error
+        *_centroid_err, size_err, e1_err, e2_err, angle_err: errors in the units of the values, to
+            first order; ra's in degrees of ra, angle_err at most 52 deg, that of an unknown angle.
+            NaN where the result has no Errors, and where the shape was not fitted, as stars'
         flux_*, flux_err_* per channel [uJy where observations have zero points, else counts]: see
             `fluxes`
         mag_*, mag_err_* per channel [mag, AB]: where the flux is positive
@@ -116,6 +123,7 @@ def _add_shapes(table, result, error):
     """Columns of centroids and second moments, (S, C) errors weighting a source's channels."""
     n_sources = len(result.sources)
     centroids, sizes = np.full((n_sources, 2), np.nan), np.full((n_sources, 4), np.nan)
+    shape_errors = sizes.copy()
     for s in np.flatnonzero(fitted_sources(result)):
         parts = [c for c in result.components if c.source == s]
         good = np.isfinite(error[s]) & (error[s] > 0)
@@ -125,10 +133,41 @@ def _add_shapes(table, result, error):
         if np.isfinite(centroids[s]).all():
             axes = local_axes(result.frame.grid, centroids[s])
             sizes[s] = shape(axes @ second @ axes.T)
+            if result.errors is not None:
+                moved = shape_slopes(second, axes)
+                shape_errors[s] = _scatter(moved, result.errors.moments[s, 2:, 2:])
     _add_positions(table, result.frame.grid, centroids, "_centroid")
-    table["size"] = sizes[:, 0] * u.arcsec
-    table["e1"], table["e2"] = sizes[:, 1], sizes[:, 2]
-    table["angle"] = sizes[:, 3] * u.deg
+    _add_position_errors(table, result, centroids)
+    shape_errors[:, 3] = np.minimum(shape_errors[:, 3], UNKNOWN_ANGLE_DEG)
+    for i, (name, unit) in enumerate(SHAPE_UNITS.items()):
+        table[name] = sizes[:, i] * unit
+        table[f"{name}_err"] = shape_errors[:, i] * unit
+
+
+def _scatter(slopes, covariance):
+    """Errors (n,) of quantities with slopes (n, k) by what has a covariance (k, k)."""
+    return np.sqrt(np.einsum("nk,kl,nl->n", slopes, covariance, slopes))
+
+
+def _add_position_errors(table, result, centroids):
+    """Columns of the errors of the fitted light's centroids (S, 2) [model px]."""
+    grid = result.frame.grid
+    names = ("y_sky", "x_sky") if grid.is_flat else table.colnames[1:3]
+    on_sky, errors = np.full((2, *centroids.shape), np.nan)
+    for s in np.flatnonzero(np.isfinite(centroids).all(1) & (result.errors is not None)):
+        covariance = result.errors.moments[s, :2, :2]
+        n, m = centroids[s, :, None] + [[0.5, -0.5, 0, 0], [0, 0, 0.5, -0.5]]
+        sky = np.array(grid.sky(n, m))
+        steps = np.stack([sky[:, 0] - sky[:, 1], sky[:, 2] - sky[:, 3]], axis=1)
+        if not grid.is_flat:  # right ascensions next to 0
+            steps[0] = (steps[0] + 180) % 360 - 180
+        errors[s] = np.sqrt(np.diag(covariance))
+        on_sky[s] = _scatter(steps, covariance)
+    unit = u.arcsec if grid.is_flat else u.deg
+    for i, name in enumerate(names):
+        table[f"{name}_centroid_err"] = on_sky[:, i] * unit
+    for i, name in enumerate("yx"):
+        table[f"{name}_centroid_err"] = errors[:, i] * u.pix
 
 
 def _add_magnitudes(table, channel, flux_ujy, error_ujy):

@@ -17,7 +17,8 @@ def fluxes(result):
 
         F_s = sum_i A_i |S_i|,  cov(F_s, F_t) = sum_ij |S_i| cov(A_i, A_j) |S_j|,  |S| = sum of S
 
-    over the components i of s and j of t.
+    over the components i of s and j of t: with morphologies fixed. Where the result has Errors, the
+    covariances are theirs, marginal over morphologies.
 
     result: a fitted blend
     returns flux (S, C) [counts]: NaN for a source without components; covariance (C, S, S)
@@ -31,7 +32,10 @@ def fluxes(result):
     flux[~fitted_sources(result)] = np.nan
     known = np.isfinite(np.diagonal(result.covariance, axis1=1, axis2=2))  # (C, n)
     both = known[:, :, None] & known[:, None, :]
-    summed = sums @ np.where(both, result.covariance, 0.0) @ sums.T
+    if result.errors is None:
+        summed = sums @ np.where(both, result.covariance, 0.0) @ sums.T
+    else:
+        summed = result.errors.flux.copy()
     # a component that is zero everywhere adds no flux, and no variance even where it is unknown
     lost = (~known) @ (sums != 0).T | ~fitted_sources(result)
     i_channel, i_source = np.nonzero(lost)

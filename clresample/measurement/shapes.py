@@ -82,3 +82,26 @@ def shape(second):
         return np.sqrt(total), np.nan, np.nan, np.nan
     e1, e2 = (nn - ee) / total, 2 * ne / total
     return np.sqrt(total / 2), e1, e2, np.degrees(np.arctan2(e2, e1)) / 2 % 180
+
+
+def shape_slopes(second, axes):
+    """How `shape` of axes Q axes^T changes with Q: (4, 3), by (Q_yy, Q_yx, Q_xx).
+
+    second (2, 2) [px^2]: Q; axes (2, 2) [arcsec/px]: see `local_axes`; NaN where the size is 0, and
+    in the angle's row where there is no ellipticity
+    """
+    (nn, ne), (_, ee) = axes @ second @ axes.T
+    total = nn + ee
+    if not total > 0:
+        return np.full((4, 3), np.nan)
+    (a, b), (c, d) = axes
+    turned = np.array([[a * a, 2 * a * b, b * b], [a * c, a * d + b * c, b * d],
+                       [c * c, 2 * c * d, d * d]])  # fmt: skip
+    size = np.array([1, 0, 1]) / (4 * np.sqrt(total / 2))
+    e1 = 2 * np.array([ee, 0, -nn]) / total**2
+    e2 = 2 * np.array([-ne, total, -ne]) / total**2
+    e = (nn - ee) / total, 2 * ne / total
+    power = e[0] ** 2 + e[1] ** 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        angle = np.degrees((e[0] * e2 - e[1] * e1) / (2 * power))
+    return np.array([size, e1, e2, angle]) @ turned

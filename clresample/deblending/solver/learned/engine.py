@@ -132,6 +132,15 @@ class LearnedEngine:
         v.take(v.x)
         return b.states(b.iterated, [None] * len(self.scenes), int(self.progress.n_rounds.max()))
 
+    def findings(self, which):
+        """Findings of the scenes `which` (B,) at their present states; None for the others."""
+        b = self.buffers
+        self.structure.energy(self.vectors.x)
+        self.vectors.take(self.vectors.x)
+        energies = self.device.get(self.structure.energies).astype(np.float64)
+        spectra = self.device.get(b.spectra).astype(np.float64)
+        return self.strengths.findings(which, energies, spectra)
+
     def follow_shifts(self, moved):
         """Take over the shifts that the operators of the scenes `moved` (B,) have by now."""
         self._gradient.follow_shifts()

@@ -2,10 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from .evidence import SourceEvidence, Spectra, blurred_light
 from .response import Response
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What was learned of one scene's n sources at J scales (n, J); of fixed ones without meaning.
+
+    strengths: alpha; energies: |z|^2; determined: parameters that the data determine, gamma
+    """
+
+    strengths: np.ndarray
+    energies: np.ndarray
+    determined: np.ndarray
 
 
 class Strengths:
@@ -78,6 +92,17 @@ class Strengths:
         np.maximum.at(moved, self._scene, np.abs(np.log(self.values / old)).max(1))
         loss = self._by_scene(0.5 * (energies * change).sum(1))
         return moved, self.weights(spectra, due, change), loss
+
+    def findings(self, which, energies, spectra):
+        """Findings of the scenes `which` (B,), None for the others; energies (S, J): |z|^2."""
+        determined = np.zeros_like(self.values)
+        for s in self._free[which[self._scene[self._free]]]:
+            determined[s] = self._evidence[s].determined(self.values[s], spectra[s])
+        parts = [self._scene == i if on else None for i, on in enumerate(which)]
+        return [
+            None if own is None else Findings(self.values[own], energies[own], determined[own])
+            for own in parts
+        ]
 
     def _by_scene(self, values):
         """Sums (B,) over the scenes' sources."""
