@@ -7,8 +7,10 @@ from astropy.coordinates import SkyCoord
 from helpers.blends import SCALE, blend, gaussian, round_component
 from helpers.headers import grid_of, header
 
+from clresample.deblending.posterior.errors import Errors
 from clresample.deblending.result import Component
 from clresample.measurement.catalogue import catalogue
+from clresample.measurement.shapes import shape, shape_slopes
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 25.0, 90.0, 160.0])
@@ -64,3 +66,38 @@ def test_components_weigh_in_moments_by_their_light_in_units_of_its_error():
     np.testing.assert_allclose(row["size"].value, SCALE * spread, rtol=1e-6)
     dark = [round_component(0, (30, x), (0, 0)) for x in (32, 38)]
     np.testing.assert_allclose(catalogue(blend(dark))["x_centroid"][0].value, 35, rtol=1e-12)
+
+
+def test_slopes_of_shapes_are_finite_differences():
+    second = np.array([[5.0, 0.7], [0.7, 3.0]])
+    axes = np.array([[0.1, 0.02], [-0.03, -0.12]])
+    found, e = shape_slopes(second, axes), 1e-5
+    for i, (a, b) in enumerate(((0, 0), (1, 0), (1, 1))):
+        change = np.zeros((2, 2))
+        change[a, b] = change[b, a] = e
+        up, down = (shape(axes @ (second + s * change) @ axes.T) for s in (1, -1))
+        np.testing.assert_allclose(found[:, i], np.subtract(up, down) / (2 * e), rtol=1e-5)
+    assert np.isnan(shape_slopes(np.zeros((2, 2)), axes)).all()
+
+
+@pytest.mark.parametrize("cards", [{}, {"CROTA2": 33.0}, {"ra": 0.0, "dec": 60.0}])
+def test_errors_of_positions_on_the_sky(cards):
+    """Those of the pixel position, in degrees of right ascension and of declination."""
+    grid = grid_of(header((60, 70), **cards), (60, 70))
+    component = round_component(0, (30, 34), [1.0, 2.0])
+    pixel = np.array([[0.04, 0.01], [0.01, 0.09]])
+    covariance = np.zeros((1, 5, 5))
+    covariance[0, :2, :2], covariance[0, 2:, 2:] = pixel, 0.01 * np.eye(3)
+    flux = np.ones((2, 1, 1))
+    errors = Errors(flux, np.ones((1, 2, 2)), covariance, (component.morphology,))
+    row = catalogue(blend([component], grid=grid, errors=errors))[0]
+    assert row["y_centroid_err"].value == pytest.approx(0.2)
+    assert row["x_centroid_err"].value == pytest.approx(0.3)
+    rng = np.random.default_rng(0)
+    drawn = rng.multivariate_normal([30, 34], pixel, 20000)
+    lon, lat = grid.sky(*drawn.T)
+    lon = (lon - lon[0] + 180) % 360 - 180
+    assert row["ra_centroid_err"].to_value("deg") == pytest.approx(np.std(lon), rel=0.03)
+    assert row["dec_centroid_err"].to_value("deg") == pytest.approx(np.std(lat), rel=0.03)
+    assert row["flux_err_g"].value == 1
+    assert row["angle_err"].value == pytest.approx(180 / np.sqrt(12))  # a round source's
