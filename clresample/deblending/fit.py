@@ -68,18 +68,8 @@ class Fit:
         positions = self.frame.place(blend.sources, blend.observations, shifts)
         pairs = zip(blend.sources, positions, strict=True)
         self.sources = tuple(source.on_frame(position) for source, position in pairs)
-        inside = self.frame.inside(positions)
-        self.messages = [
-            f"source {i} at {p} [px] lies outside the model frame {self.frame.shape}"
-            for i, p in enumerate(positions)
-            if not inside[i]
-        ]
+        inside, self.messages = _inside(self.frame, positions)
         self.fitted = np.flatnonzero(inside)
-        if not len(self.fitted):
-            raise ValueError(
-                f"none of the {len(positions)} sources lies inside the model frame "
-                f"{self.frame.shape}"
-            )
         padded, private = _padded_frame(self.frame, pad), settings.fit_shifts or shifts.any()
         self.views = [
             whitened_view(self.frame, padded, o, pad, device, dtype, private=private)
@@ -189,21 +179,15 @@ class Fit:
             )
             for i, box in enumerate(boxes)
         ]
-        rendered = []
-        for view, o, images in zip(self.views, self.blend.observations, observed, strict=True):
-            if o.noise is not None:
-                images = as_taken(o, view, self.frame, morphs)
-            images = images[..., : o.data.shape[1], : o.data.shape[2]]
-            rendered.append(images.astype(np.float64) * view.covered[: o.shape[1], : o.shape[2]])
+        rendered = _rendered(self, observed, morphs)
         self.seconds["result"] = time.perf_counter() - began
-        morphs = [c.morphology for c in components]
-        errors, draws = errors_of(self, morphs, peaks, units, solved)
+        errors, draws = errors_of(self, components, peaks, units, solved)
         return Result(
             observations=self.blend.observations,
             frame=self.frame,
             sources=self.sources,
             components=tuple(components),
-            rendered=tuple(rendered),
+            rendered=rendered,
             sky=sky * self.unit,
             covariance=covariance * self.unit[:, None, None] ** 2,
             errors=errors,
@@ -214,6 +198,29 @@ class Fit:
             messages=tuple(self.messages),
             seconds=self.seconds,
         )
+
+
+def _inside(frame, positions):
+    """Which positions (n,) lie inside the frame, and messages of the others; ValueError if none."""
+    inside, n = frame.inside(positions), len(positions)
+    if not inside.any():
+        raise ValueError(f"none of the {n} sources lies inside the model frame {frame.shape}")
+    return inside, [
+        f"source {i} at {p} [px] lies outside the model frame {frame.shape}"
+        for i, p in enumerate(positions)
+        if not inside[i]
+    ]
+
+
+def _rendered(fit, observed, morphs):
+    """See Result.rendered; observed: of morphs (n, Ny, Nx), as the views see them."""
+    rendered = []
+    for view, o, images in zip(fit.views, fit.blend.observations, observed, strict=True):
+        if o.noise is not None:
+            images = as_taken(o, view, fit.frame, morphs)
+        images = images[..., : o.data.shape[1], : o.data.shape[2]]
+        rendered.append(images.astype(np.float64) * view.covered[: o.shape[1], : o.shape[2]])
+    return tuple(rendered)
 
 
 def _padded_frame(frame, pad):

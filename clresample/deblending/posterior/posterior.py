@@ -135,12 +135,15 @@ class Posterior:
         return np.sqrt(np.maximum(variance, 0)).reshape(images.shape[1:])
 
 
-def errors_of(fit, morphs, peaks, units, solved):
-    """The Errors and Draws of a Fit that has ended, or None and None; see `posterior_of`.
+def errors_of(fit, components, peaks, units, solved):
+    """The Errors and Draws of a Fit that has ended with these Components, or None and None.
+
+    peaks, units, solved: see `posterior_of`
 
     Messages and seconds of it are taken down in the fit.
     """
     began = time.perf_counter()
+    morphs = [c.morphology for c in components]
     posterior, messages = posterior_of(fit, morphs, peaks, units, solved)
     fit.messages += messages
     if posterior is None:
