@@ -55,9 +55,8 @@ class Fit:
     views: the observations as WhitenedViews, whose operators hold the observations' shifts
     start, profiles (n, Ny, Nx): the StartingPoint, and its profiles over the frame with max = 1
     noise (C,): of one model pixel, in the views' units; unit (C,) [counts]: of these
-    scene, state: Scene and State, as of the start or of where `settle` left them
-    losses, status, messages, seconds: see Result
-    findings: what a LearnedPrior has learned, a Findings, or None
+    scene, state: Scene and State, as of the start or of where `settle` left them; findings: what a
+        LearnedPrior has learned by then, or None; losses, status, messages, seconds: see Result
     """
 
     def __init__(self, blend, settings, device, dtype, *, pad):
@@ -162,8 +161,7 @@ class Fit:
         began, scene, n = time.perf_counter(), self.scene, len(self.state.spectra)
         morphs, peaks = np.zeros((n, *scene.shape)), [m.max() for m in self.state.morph]
         peaks = np.array([peak if peak > 0 else 1.0 for peak in peaks])
-        pairs = zip(scene.origin, self.state.morph, strict=True)
-        boxes = [box_slices(low, m.shape) for low, m in pairs]
+        boxes = [box_slices(*pair) for pair in zip(scene.origin, map(np.shape, scene.profile))]
         for full, box, m, peak in zip(morphs, boxes, self.state.morph, peaks, strict=True):
             full[box] = m / peak
         observed = [v.observe(morphs) for v in self.views]
