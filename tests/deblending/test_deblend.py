@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.scenes import BRIGHT, blend, chi2, fit, frame, sources, truth
 
-from clresample.deblending import fit as fit_module
+from clresample.deblending import blend as blend_module
 from clresample.deblending.batch import deblend
 from clresample.deblending.fit import PATIENCE
 from clresample.deblending.iterate import CHECK
@@ -36,7 +36,7 @@ def test_galaxies_are_found(plain):
         error = np.linalg.norm(model - want, axis=(1, 2)) / np.linalg.norm(want, axis=(1, 2))
         assert error.max() < 0.05
     assert plain.covariance.shape == (3, 2, 2) and not plain.sky.any() and not plain.messages
-    assert set(plain.seconds) == {"setup", "fit", "result"}
+    assert set(plain.seconds) == {"setup", "fit", "result", "errors"}
 
 
 def test_observations_are_checked_and_mapped_once(device, monkeypatch):
@@ -51,7 +51,7 @@ def test_observations_are_checked_and_mapped_once(device, monkeypatch):
         mapped.append(self)
         return original(self, *arguments, **options)
 
-    for module in (fit_module, frame_module):
+    for module in (blend_module, frame_module):
         monkeypatch.setattr(module, "check_observations", check)
     b = blend(BRIGHT)
     for home in (b.frame, None):
