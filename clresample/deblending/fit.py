@@ -159,8 +159,8 @@ class Fit:
     def result(self) -> Result:
         """Everything back in the data's own units, spectra solved for the final morphologies."""
         began, scene, n = time.perf_counter(), self.scene, len(self.state.spectra)
-        morphs, peaks = np.zeros((n, *scene.shape)), [m.max() for m in self.state.morph]
-        peaks = np.array([peak if peak > 0 else 1.0 for peak in peaks])
+        morphs = np.zeros((n, *scene.shape))
+        peaks = np.array([m.max() if m.max() > 0 else 1.0 for m in self.state.morph])
         boxes = [box_slices(*pair) for pair in zip(scene.origin, map(np.shape, scene.profile))]
         for full, box, m, peak in zip(morphs, boxes, self.state.morph, peaks, strict=True):
             full[box] = m / peak

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...sky.extent import box_slices, shared_part
+from ..solver.learned.prior import LearnedPrior
+from ..solver.scene import Scene
 from .bumps import Bumps
 from .profile_modes import profile_modes
 
@@ -46,7 +48,7 @@ class Solution:
     prior: LearnedPrior
     """
 
-    scene: object
+    scene: Scene
     morphs: list
     peaks: np.ndarray
     spectra: np.ndarray
@@ -56,7 +58,7 @@ class Solution:
     positions: np.ndarray
     findings: object
     chi2: np.ndarray
-    prior: object
+    prior: LearnedPrior
 
     def strengths(self, i):
         """Strengths (J,) of component i's structure; see STRUCTURE_PX."""
