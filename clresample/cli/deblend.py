@@ -153,6 +153,13 @@ def _fit(arguments, scene, device):
     _progress(arguments, f"fitting {len(sources)} sources to {seen} on {device.name}")
     if settings.max_iter and (settings.fit_shifts or (looking and scene.passes > 1)):
         first = replace(settings, max_iter=min(FIRST_LOOK, settings.max_iter))
+        if looking and scene.passes > 1 and settings.learns:
+            from ..deblending.solver.constraints import Chain, Positivity
+            from ..deblending.solver.prior import Prior
+
+            # structure of a pixel alone leaves unknown neighbours' light in the residuals
+            small = Prior(correlation_px=1.0)
+            first = replace(first, prior=small, constraints=Chain(Positivity()))
         result = _deblend(arguments, "first look", scene.observations, sources, first, given)
         if result.status == "interrupted":
             return result

@@ -104,14 +104,9 @@ class Fit:
         for view, shift in zip(self.views, shifts, strict=True):
             view.op.shift = shift
 
-    def move(self, scene, state, least_px=0.0) -> bool:
-        """Shift the observations to where the model, as it is by now, fits each of them best,
-        unless none would move by more than least_px [model px]; whether they have moved."""
-        steps = shift_steps(scene, state)
-        if not (np.abs(steps) > least_px).any():
-            return False
-        self._shift(self.shifts + steps)
-        return True
+    def move(self, scene, state):
+        """Shift the observations to where the model, as it is by now, fits each of them best."""
+        self._shift(self.shifts + shift_steps(scene, state))
 
     def stopped(self, losses) -> bool:
         """Take the losses (n,) of the last iterations; whether the fit ends here, and why."""
@@ -120,14 +115,9 @@ class Fit:
         self.status = reason or self.status
         return reason is not None
 
-    def note_loss(self, loss):
-        """Take down the loss of an iteration."""
-        self.losses.append(float(loss))
-
-    def end(self, scene, state, findings, status=None):
-        """End here, with this state; the status stays where none is given."""
-        self.scene, self.state, self.status = scene, state, status or self.status
-        self.findings = findings
+    def end(self, scene, state, findings, status):
+        """End here, with this state."""
+        self.scene, self.state, self.findings, self.status = scene, state, findings, status
 
     def interrupt(self):
         """Note that the fit ends because the user wants it to."""

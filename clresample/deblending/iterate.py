@@ -7,6 +7,7 @@ import time
 import numpy as np
 
 from .resize import resized
+from .shifts import shift_steps
 from .solver.engine import Engine
 from .solver.learned.engine import LearnedEngine
 
@@ -19,8 +20,8 @@ MOVE = 10
 # costs some iterations, and until then the stopped ones are still computed.
 REPACK = 0.25
 # [model px] A fit under a LearnedPrior whose observations would all move by less stays where it is:
-# each shift makes its solver forget. A hundredth of a pixel changes no flux by 0.01 %.
-LEAST_MOVE_PX = 0.01
+# each shift makes its solver forget. So little changes no flux by 0.01 %.
+LEAST_MOVE_PX = 0.003
 # [iterations] between two adjustments of the boxes to the light they hold; each makes a new batch.
 RESIZE = 40
 
@@ -167,7 +168,7 @@ class _Learning:
         n_steps = min(self.n_steps + CHECK, self.settings.max_iter)
         while self.n_steps < n_steps and self.live.any():
             for i in np.flatnonzero(engine.round()):
-                self.fits[i].note_loss(engine.progress.loss[i])
+                self.fits[i].losses.append(float(engine.progress.loss[i]))
         if self.settings.fit_shifts:
             self._move(live & engine.progress.converged)
         over = self.live if self.n_steps >= self.settings.max_iter else np.zeros_like(live)
@@ -188,7 +189,10 @@ class _Learning:
             return
         states, moved = self.engine.states(), np.zeros(len(self.fits), bool)
         for i in np.flatnonzero(which):
-            moved[i] = self.fits[i].move(self.engine.scenes[i], states[i], LEAST_MOVE_PX)
+            scene, state = self.engine.scenes[i], states[i]
+            moved[i] = (np.abs(shift_steps(scene, state)) > LEAST_MOVE_PX).any()
+            if moved[i]:
+                self.fits[i].move(scene, state)
         if moved.any():
             self.engine.follow_shifts(moved)
 
@@ -197,8 +201,9 @@ class _Learning:
         states, p = self.engine.states(), self.engine.progress
         findings = self.engine.findings(stop)
         for i in np.flatnonzero(stop):
-            status = "diverged" if p.failed[i] else "converged" if p.converged[i] else None
-            self.fits[i].end(self.engine.scenes[i], states[i], findings[i], status)
+            f, ended = self.fits[i], "diverged" if p.failed[i] else "converged"
+            status = ended if p.failed[i] or p.converged[i] else f.status
+            f.end(self.engine.scenes[i], states[i], findings[i], status)
 
     def repacked(self) -> _Learning:
         """What goes on: itself, or a smaller batch where enough fits have stopped."""

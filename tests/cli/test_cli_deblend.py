@@ -124,16 +124,16 @@ def test_nothing_is_replaced_unasked(example, output, capsys):
 
 
 def test_interrupted_runs_write_the_best_so_far(example, tmp_path, capsys, monkeypatch):
-    from clresample.deblending.solver import engine
+    from clresample.deblending.solver.learned.engine import LearnedEngine
 
-    run = engine.Engine.run
+    one_round = LearnedEngine.round
 
-    def stop(self, n_steps):
-        if self.n_steps:
+    def stop(self):
+        if self.progress.n_rounds.max() > 5:
             raise KeyboardInterrupt
-        return run(self, n_steps)
+        return one_round(self)
 
-    monkeypatch.setattr(engine.Engine, "run", stop)
+    monkeypatch.setattr(LearnedEngine, "round", stop)
     assert deblend(example / "scene.toml", tmp_path / "out", "--no-figure") == 130
     assert "interrupted" in capsys.readouterr().out
     assert read_result(tmp_path / "out" / "result.fits").status == "interrupted"

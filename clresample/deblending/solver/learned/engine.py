@@ -48,7 +48,7 @@ class LearnedEngine:
         self.steps = Steps(v)
         self._row0 = device.put(self._gradient.rows, np.int32)
         if past is None:
-            self.progress = Progress(len(scenes), enough)
+            self.progress = Progress(len(scenes), enough, [_n_pixels(s) for s in scenes])
             self.pairs = Pairs(len(scenes), N_PAIRS)
             self.strengths = Strengths(b, self._gradient, latents, prior)
             spectra, sky = np.concatenate([s.spectra for s in states]), [s.sky for s in states]
@@ -150,6 +150,11 @@ class LearnedEngine:
         self.steps.follow(self.pairs, np.where(moved, STAY, REST))
         self.steps.advance(nothing, nothing, nothing[:, 0], nothing[:, 0])
         self._rest_others(self.progress.live)
+
+
+def _n_pixels(scene):
+    """Observed pixels of a scene that have a weight."""
+    return max(sum(np.count_nonzero(w) for w in scene.weights), 1)
 
 
 def vector_bytes(scene, prior) -> int:

@@ -16,12 +16,15 @@ TRIALS = 8
 # then EVERY so many, until none of a scene's moves by more than SETTLED in its logarithm.
 FIRST, EVERY, SETTLED = 16, 8, 0.1
 # A fit has converged when its strengths have settled and its loss fell by less than `enough` over
-# so many iterations.
+# so many iterations; by that times chi2 per pixel where that is above 1, since a model that misfits
+# so knows its fluxes less well by its root.
 PATIENCE = 5
 
 
 class Progress:
     """Arrays over the scenes of a batch (B,).
+
+    enough: see Settings; n_pixels (B,): observed, with a weight
 
     live: those that go on; converged, failed: those that have come to their end, failed ones
         because the loss of their start is no number
@@ -29,8 +32,8 @@ class Progress:
     n_rounds: of each scene, trials so far
     """
 
-    def __init__(self, n_scenes, enough):
-        n, self.enough = n_scenes, enough
+    def __init__(self, n_scenes, enough, n_pixels):
+        n, self.enough, self._n_pixels = n_scenes, enough, np.asarray(n_pixels, float)
         self.live, self.converged, self.failed = (
             np.ones(n, bool),
             np.zeros(n, bool),
@@ -47,7 +50,7 @@ class Progress:
 
     def take(self, keep):
         """That of the scenes `keep` (n,) alone."""
-        new = Progress(len(keep), self.enough)
+        new = Progress(len(keep), self.enough, self._n_pixels[keep])
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray):
                 setattr(new, name, value[keep])
@@ -97,7 +100,8 @@ class Progress:
 
     def next(self, accepted):
         """Mode (B,) and length (B,) of each scene's next step, and which drop their pairs (B,)."""
-        self.converged |= accepted & self.settled & (self._drops.sum(1) < self.enough)
+        chi2 = np.maximum(1, 2 * self.loss / self._n_pixels)
+        self.converged |= accepted & self.settled & (self._drops.sum(1) < self.enough * chi2)
         self.live &= ~self.converged
         refused = self.live & ~accepted
         self._trials = np.where(refused, self._trials + 1, 0)
