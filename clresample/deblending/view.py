@@ -59,8 +59,7 @@ class WhitenedView:
         Images smaller than the operator's frame are zero beyond.
         """
         images = _padded(images, self.op.shape_in).astype(self.op.dtype)
-        images[np.abs(images) < DARK * np.abs(images).max(initial=0)] = 0
-        return self.op.render(images)
+        return self.op.render(without_dark(images))
 
     def whiten(self, observed):
         """Observed images in units of their noise, (n, Co, My * Mx)."""
@@ -70,6 +69,12 @@ class WhitenedView:
     def render(self, images):
         """Whitened unit-spectrum images (n, Co, My * Mx) of model images (n, Ny, Nx)."""
         return self.whiten(self.observe(images))
+
+
+def without_dark(images):
+    """The images, in place, with DARK pixels set to 0."""
+    images[np.abs(images) < DARK * np.abs(images).max(initial=0)] = 0
+    return images
 
 
 def whitened_view(frame, padded, observation, pad, device, dtype, *, private) -> WhitenedView:

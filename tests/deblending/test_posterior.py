@@ -66,28 +66,13 @@ def test_blended_sources_exchange_light(device, monkeypatch):
 def test_the_normal_matrix_is_that_of_the_rendered_frame(device, monkeypatch, objects, fit_sky):
     """Where the boxes' reaches are the whole image; and close to it with the usual ones."""
     found, kept = [], capture(monkeypatch)
-    for reach in (room.REACH_FWHM, 100.0):
-        monkeypatch.setattr(room, "REACH_FWHM", reach)
+    for reach in (normal.REACH_FWHM, 100.0):
+        monkeypatch.setattr(normal, "REACH_FWHM", reach)
         settings = Settings(flux_floor=0, fit_sky=fit_sky)
         found.append(scenes.fit(blend(objects), device, settings=settings))
     for one, tolerance in zip(kept, (3e-2, 1e-4), strict=True):
         np.testing.assert_allclose(one.scaled, full_matrix(one), atol=tolerance)
     np.testing.assert_allclose(errors(found[0]), errors(found[1]), rtol=0.01)
-
-
-def test_sources_far_apart_share_renderings(device, monkeypatch):
-    far = ((20.0, 18.0), (60, 40, 80), 1.5), ((22.0, 111.0), (80, 50, 50), 1.4)
-    calls, kept = [], capture(monkeypatch)
-    chosen = normal._Rows._groups
-
-    def groups(rows):
-        calls.append(chosen(rows))
-        return calls[-1]
-
-    monkeypatch.setattr(normal._Rows, "_groups", groups)
-    scenes.fit(blend(far, shape=(40, 130)), device, settings=BARE)
-    assert calls == [[[0, 1]], [[0, 1]]]
-    np.testing.assert_allclose(kept[0].scaled, full_matrix(kept[0]), atol=3e-2)
 
 
 def gaussians(origin, shape, h):

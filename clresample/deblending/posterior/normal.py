@@ -1,8 +1,8 @@
 """The normal matrix of a scene about its solution: modes, spectra and sky in one.
 
-Each component's modes are rendered on the observed pixels that its box reaches, so that the cost
-follows the sources rather than the frame: components whose reaches do not meet in an observation
-share its renderings, and only those whose reaches meet have a block of the matrix together.
+Each component's modes are rendered from its box to the observed pixels that it reaches, by an
+operator of these alone, so that the cost follows the sources rather than the frame; components
+whose reaches meet have a block of the matrix together.
 """
 
 from __future__ import annotations
@@ -11,15 +11,51 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...resampling.plan import Precision, make_plan
+from ...resampling.resampler import Resampler
 from ...sky.extent import box_slices
+from ...sky.psf import PSF
+from ..view import WhitenedView, without_dark
 
 # [FWHM of the observation's PSF] How far about its box a component's light is followed: beyond lie
 # 1 % of a Moffat profile's light and 1e-4 of its square, which the matrix is made of.
 REACH_FWHM = 3.0
 # Added to the unit diagonal of the matrix, so that what neither data nor prior know has a number.
 RIDGE = 1e-9
-# [bytes] Model images of one call of an operator: 16 times as many take a tenth longer on a CPU.
-CHUNK = 1 << 22
+# [model px] Departure from an affine mapping that a box of a distorted one may have, as for frames.
+TOLERANCE_PX = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """An observation as the matrix needs it: its view, and what operators of boxes are made of.
+
+    psf_in, psf_out: PSFs of the model and of the view; reach_px [model px]: see REACH_FWHM
+    """
+
+    view: WhitenedView
+    psf_in: PSF
+    psf_out: PSF
+    reach_px: float
+
+    @classmethod
+    def of(cls, view, frame, observation):
+        """That of an Observation and its view."""
+        scale = np.sqrt(abs(np.linalg.det(view.mapping.matrix)))
+        reach = REACH_FWHM * float(observation.psf.fwhm_px.max()) * scale
+        return cls(view, frame.psf, observation.white.psf, reach)
+
+    def observe(self, images, origin, low, size):
+        """Unit-spectrum images (k, Co, ry, rx) on `size` observed pixels from `low` on, of images
+        (k, ny, nx) in a box of the frame from `origin` on."""
+        op, margin = self.view.op, int(np.ceil(self.reach_px)) + 1  # pixels off a model are 0
+        images = np.pad(images, ((0, 0), (margin, margin), (margin, margin)))
+        mapping = op.plans[0].mapping.window(
+            np.asarray(origin) - margin, images.shape[1:], low, size, tolerance_px=TOLERANCE_PX
+        )
+        plan = make_plan(mapping, self.psf_in, self.psf_out, precision=Precision.of(op.dtype))
+        boxed = Resampler.from_plans([plan], dtype=op.dtype, device=op.device, shift=op.shift)
+        return boxed.render(without_dark(images.astype(op.dtype)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,10 +87,10 @@ class Layout:
         return self.size - self.n_sky + c
 
 
-def normal_matrix(scene, views, reaches, morphs, modes, spectra, layout):
+def normal_matrix(scene, exposures, morphs, modes, spectra, layout):
     """J^T J + prior^-1 (N, N).
 
-    scene: Scene; views: WhitenedViews; reaches [model px]: of each view's PSF
+    scene: Scene; exposures: an Exposure of each observation
     morphs (n): arrays (ny, nx); modes (n): Modes; spectra (n, C), in the views' units
     """
     matrix = np.zeros((layout.size,) * 2)
@@ -63,15 +99,15 @@ def normal_matrix(scene, views, reaches, morphs, modes, spectra, layout):
         for m, s in zip(modes, morphs, strict=True)
     ]
     channels = scene.channels()
-    for view, reach, part in zip(views, reaches, channels, strict=True):
-        rows = _Rows(scene, view, reach, columns)
+    for exposure, part in zip(exposures, channels, strict=True):
+        rows, root = _Rows(scene, exposure, columns), exposure.view.root
         for i, j, c, gram in rows.products():
             block = _Block(layout, i, j, part.start + c)
             block.add(matrix, gram, spectra)
         if layout.n_sky:
             for c in range(part.stop - part.start):
                 at = layout.sky(part.start + c)
-                matrix[at, at] += (view.root[c] ** 2).sum()
+                matrix[at, at] += (root[c] ** 2).sum()
             for i, c, product in rows.levels():
                 at, channel = layout.sky(part.start + c), part.start + c
                 scaled = np.append(product[:-1] * spectra[i, channel], product[-1])
@@ -122,48 +158,18 @@ class _Rows:
     low, high (n, 2): the rectangles; images (n): (k_i + 1, Co, ry, rx), whitened; None where empty
     """
 
-    def __init__(self, scene, view, reach, columns):
-        self._root = view.root
-        self.low, self.high = _rectangles(scene, view, reach)
+    def __init__(self, scene, exposure, columns):
+        self._root = exposure.view.root
+        self.low, self.high = _rectangles(scene, exposure.view, exposure.reach_px)
         self.images = [None] * len(columns)
-        for group in self._groups():
-            longest = max(len(columns[i]) for i in group)
-            step = max(1, CHUNK // (4 * int(np.prod(scene.shape))))
-            parts = {i: [] for i in group}
-            for first in range(0, longest, step):
-                self._render(scene, view, group, columns, slice(first, first + step), parts)
-            for i in group:
-                self.images[i] = np.concatenate(parts[i])
-
-    def _render(self, scene, view, group, columns, part, parts):
-        """Append what is seen of the images `part` of a group's components to `parts`."""
-        n = max(len(columns[i][part]) for i in group)
-        stack = np.zeros((n, *scene.shape), np.float32)
-        for i in group:
-            images = columns[i][part]
-            box = box_slices(scene.origin[i], images.shape[1:])
-            stack[: len(images), *box] += images
-        seen = view.observe(stack)
-        for i in group:
-            cut = self._cut(i)
-            root = self._root[:, *cut].astype(np.float32)
-            parts[i].append(seen[: len(columns[i][part]), :, *cut] * root)
+        for i, images in enumerate(columns):
+            if (self.high[i] > self.low[i]).all():
+                cut = self.low[i], self.high[i] - self.low[i]
+                seen = exposure.observe(images, scene.origin[i], *cut)
+                self.images[i] = seen * self._root[:, *self._cut(i)].astype(seen.dtype)
 
     def _cut(self, i):
         return box_slices(self.low[i], self.high[i] - self.low[i])
-
-    def _groups(self):
-        """Lists of components whose rectangles do not meet; first come, first served."""
-        groups = []
-        for i in range(len(self.low)):
-            if (self.high[i] <= self.low[i]).any():
-                continue
-            home = next((g for g in groups if not any(self._meet(i, j) for j in g)), None)
-            if home is None:
-                groups.append([i])
-            else:
-                home.append(i)
-        return groups
 
     def _meet(self, i, j):
         low, high = np.maximum(self.low[i], self.low[j]), np.minimum(self.high[i], self.high[j])

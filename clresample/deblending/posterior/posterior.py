@@ -10,10 +10,10 @@ from scipy.linalg import solve_triangular
 from .errors import Draws, Errors
 from .modes import Solution
 from .moments import moments_of
-from .normal import REACH_FWHM, Layout, factor, normal_matrix
+from .normal import Exposure, Layout, factor, normal_matrix
 
-# Unknowns of a scene from which on its errors are those of fixed morphologies: 2000, of some 45
-# sources, make a matrix of 32 MB and a second of work, which grows with their third power.
+# Unknowns of a scene from which on its errors are those of fixed morphologies: 2000, of 30 to
+# 40 sources, make a matrix of 32 MB and a second of work, which grows with their third power.
 MOST_UNKNOWNS = 2000
 # Least error of a spectrum at fixed morphology, relative to it: smaller ones are rounding.
 LEAST_ERROR = 1e-9
@@ -26,7 +26,7 @@ class TooLargeError(ValueError):
 class Posterior:
     """The linear posterior about a solution.
 
-    solution: Solution; views: WhitenedViews; reaches [model px]: see `normal_matrix`
+    solution: Solution; exposures: an Exposure of each observation
     fit_sky: whether sky levels are unknowns too
 
     modes (n): Modes; layout: Layout; lower, scale: see `factor`
@@ -34,7 +34,7 @@ class Posterior:
     Raises TooLargeError, and LinAlgError where the matrix is not positive definite.
     """
 
-    def __init__(self, solution, views, reaches, *, fit_sky=False):
+    def __init__(self, solution, exposures, *, fit_sky=False):
         n, n_channels = solution.spectra.shape
         most = MOST_UNKNOWNS - (n + bool(fit_sky)) * n_channels
         self.solution, self.modes, count = solution, [], 0
@@ -47,8 +47,7 @@ class Posterior:
         self.layout = Layout(ends, n_channels, n_channels if fit_sky else 0)
         matrix = normal_matrix(
             solution.scene,
-            views,
-            reaches,
+            exposures,
             solution.morphs,
             self.modes,
             solution.spectra,
@@ -178,9 +177,10 @@ def posterior_of(fit, morphs, peaks, units, solved):
         _local_chi2(units, fit.views, spectra, sky),
         settings.prior,
     )
-    reaches = [_reach(o, v) for o, v in zip(fit.blend.observations, fit.views, strict=True)]
+    pairs = zip(fit.views, fit.blend.observations, strict=True)
+    exposures = [Exposure.of(view, fit.frame, o) for view, o in pairs]
     try:
-        return Posterior(solution, fit.views, reaches, fit_sky=settings.fit_sky), []
+        return Posterior(solution, exposures, fit_sky=settings.fit_sky), []
     except TooLargeError as error:
         why = str(error)
     except np.linalg.LinAlgError:
@@ -200,9 +200,3 @@ def _local_chi2(units, views, spectra, sky):
             seen = seen + a**2 * (unit[:, c] @ root)
             channel += 1
     return found / np.maximum(seen, 1e-30)
-
-
-def _reach(observation, view):
-    """How far [model px] about a box its light is followed in an observation."""
-    scale = np.sqrt(abs(np.linalg.det(view.mapping.matrix)))
-    return REACH_FWHM * float(observation.psf.fwhm_px.max()) * scale
