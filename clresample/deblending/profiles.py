@@ -137,9 +137,9 @@ class Galaxy(Shape):
         self.mean = np.array([size, 0, 0, np.log(WINGS)])
         self.scatter = np.array([SIZE_SCATTER, *[ELLIPTICITY_SCATTER] * 2, WINGS_SCATTER])
 
-    def draw(self, theta, position):
-        """The profile and its four slopes, (5, Ny, Nx)."""
-        return profile(theta, position, self.shape, self._psf_moment)
+    def draw(self, theta, position, shape=None):
+        """The profile and its four slopes, (5, Ny, Nx): on the frame, or on a box of a `shape`."""
+        return profile(theta, position, shape or self.shape, self._psf_moment)
 
 
 class Given(Shape):

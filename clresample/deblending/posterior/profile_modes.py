@@ -26,14 +26,15 @@ def profile_modes(shape, theta, position, profile, box):
         drawn = shape.draw(np.zeros(len(theta)), position)
         return drawn[1:, *box] / drawn[0].max(), shape.scatter
     if isinstance(shape, Galaxy):
-        drawn = shape.draw(theta, position)
+        size, low = profile.shape, [part.start for part in box]
+        drawn, position = shape.draw(theta, position - low, size), position - low
         steps = STEP_PX * np.eye(2)
         moved = [
-            (shape.draw(theta, position + d)[:1] - shape.draw(theta, position - d)[:1])
+            (shape.draw(theta, position + d, size) - shape.draw(theta, position - d, size))[:1]
             / (2 * STEP_PX)
             for d in steps
         ]
-        slopes = np.concatenate([drawn[1:], *moved])[:, *box] / drawn[0].max()
+        slopes = np.concatenate([drawn[1:], *moved]) / drawn[0].max()
         scatter = shape.scatter
     else:  # a given image
         slopes = np.stack([-_slope(profile, axis) for axis in (0, 1)])
