@@ -19,7 +19,6 @@ bias        median of estimate / truth - 1 for flux and size, of (estimate - tru
 
 from __future__ import annotations
 
-import functools
 import itertools
 from collections import Counter, defaultdict
 
@@ -59,18 +58,13 @@ COLUMNS = (
 )
 
 
-@functools.cache
-def _cosmos(folder):
-    return scenes.Scenes(folder)
-
-
 def measure(galaxies, mode, folder, seeds, negative=NEGATIVE):
     """What `truth.compare` finds in scenes of these seeds, and how their fits ended.
 
     returns [{quantity: (4, n)}, ...], one for each scene that could be fitted; [status, ...]
     """
     parametric = galaxies == "parametric"
-    found = [simulate_scene(i) if parametric else _cosmos(folder).take(i) for i in seeds]
+    found = [simulate_scene(i) if parametric else scenes.opened(folder).take(i) for i in seeds]
     results = scenes.fit([scenes.blend(scene, mode) for scene in found])
     values = []
     for scene, result in zip(found, results, strict=True):

@@ -17,7 +17,6 @@ The same scenes and noise for all; fits of many scenes side by side.
 
 from __future__ import annotations
 
-import functools
 import itertools
 import time
 
@@ -55,17 +54,12 @@ COLUMNS = (
 )
 
 
-@functools.cache
-def _open_scenes(folder):
-    return scenes.Scenes(folder)
-
-
 def measure(names, folder, seeds):
     """Scenes fitted with several settings in all modes: SDRs, chi2, how the fits ended.
 
     returns {(settings, mode): [dictionary of each scene]}
     """
-    found = [_open_scenes(folder).take(i) for i in seeds]
+    found = [scenes.opened(folder).take(i) for i in seeds]
     parts = {}
     for name, mode in itertools.product(names, scenes.MODES):
         blends = [scenes.blend(scene, mode) for scene in found]

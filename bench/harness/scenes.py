@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 import warnings
 from dataclasses import replace
@@ -45,6 +46,12 @@ class Scenes:
     def take(self, seed, **geometry):
         """`SimulatedScene` of a seed; geometry: angle_deg, flip, center_deg of `simulate_scene`."""
         return simulate_scene(seed, catalogue=self.catalogue, colours=self.colours, **geometry)
+
+
+@functools.cache
+def opened(folder):
+    """The Scenes of a catalogue folder, opened once in each process."""
+    return Scenes(folder)
 
 
 def blend(scene, mode, *, profiles=None):

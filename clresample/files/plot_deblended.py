@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..measurement.quality import labels, summary
+from ..measurement.quality import channel_chi2, labels
 from .panels import GAP, INK, PAPER, add_panel, dark_sheet, show_image, write_png
 
 PANEL_INCHES = 3.2
@@ -32,7 +32,7 @@ def plot_deblended(path, result, *, title=""):
     width, height = PANEL_INCHES, PANEL_INCHES * n_y / n_x
     n_rows = len(result.observations)
     figure = dark_sheet(3 * (width + GAP) + GAP, ABOVE + n_rows * (height + BELOW), title)
-    chi2 = summary(result)["chi2"]
+    chi2, _ = channel_chi2(result)
     for i, (label, o) in enumerate(zip(labels(result), result.observations, strict=True)):
         mapping = result.footprints[i].mapping
         chosen = _shown(result, i)

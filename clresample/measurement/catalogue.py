@@ -13,7 +13,7 @@ from ..sky.footprint import open_edge
 from ..sky.observation import ZERO_POINT_UJY
 from .photometry import flux_scale, fluxes
 from .quality import box_chi2, fitted_sources, labels
-from .residuals import MISFIT_SIGMAS, worst_residuals
+from .residuals import channel_residuals, misfits
 from .shapes import local_axes, moments, shape, shape_slopes
 
 # of a morphology's peak: light at the edge of what was seen is flagged when it is brighter. Fainter
@@ -98,11 +98,10 @@ def catalogue(result, *, magnitudes=False) -> QTable:
             _add_magnitudes(table, channel, flux[:, i] * scale[i], error[:, i] * scale[i])
     for i, label in enumerate(labels(result)):
         table[f"chi2_{label}"] = box_chi2(result, i, result.footprints[i])
-    per_observation = [worst_residuals(result, i) for i in range(len(result.observations))]
-    worst = np.concatenate(per_observation, axis=1)
+    worst = channel_residuals(result)
     for channel, values in zip(result.channels, worst.T, strict=True):
         table[f"residual_{channel}"] = values
-    table["flags"][(np.nan_to_num(worst) > MISFIT_SIGMAS).any(axis=1)] |= Flag.MISFIT
+    table["flags"][misfits(worst)] |= Flag.MISFIT
     return table
 
 

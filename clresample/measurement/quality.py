@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .residuals import misfits
+from .residuals import channel_residuals, misfits
 
 
 def summary(result) -> dict:
@@ -17,16 +17,8 @@ def summary(result) -> dict:
         shifts {observation: (y, x)} [model px]; misfits, the numbers of the sources with a residual
         over 5 sigma (`residuals.misfits`); good, whether the fit converged and there is none
     """
-    chi2, n_pixels = {}, {}
-    for i, (observation, footprint) in enumerate(
-        zip(result.observations, result.footprints, strict=True)
-    ):
-        used = footprint.used
-        terms = chi2_terms(result, i, used)
-        for channel, one, where in zip(observation.channels, terms, used, strict=True):
-            n_pixels[channel] = int(where.sum())
-            chi2[channel] = float(one[where].mean()) if where.any() else float("nan")
-    misfitted = np.flatnonzero(misfits(result)).tolist() if result.components else []
+    chi2, n_pixels = channel_chi2(result)
+    misfitted = np.flatnonzero(misfits(channel_residuals(result))).tolist()
     return {
         "status": result.status,
         "good": result.converged and not misfitted,
@@ -46,6 +38,21 @@ def summary(result) -> dict:
         },
         "seconds": {stage: float(t) for stage, t in result.seconds.items()},
     }
+
+
+def channel_chi2(result) -> tuple[dict, dict]:
+    """Chi2 per pixel with a weight on the frame, NaN without any, and the number of these pixels,
+    both by channel."""
+    chi2, n_pixels = {}, {}
+    for i, (observation, footprint) in enumerate(
+        zip(result.observations, result.footprints, strict=True)
+    ):
+        used = footprint.used
+        terms = chi2_terms(result, i, used)
+        for channel, one, where in zip(observation.channels, terms, used, strict=True):
+            n_pixels[channel] = int(where.sum())
+            chi2[channel] = float(one[where].mean()) if where.any() else float("nan")
+    return chi2, n_pixels
 
 
 def labels(result) -> list[str]:

@@ -47,10 +47,15 @@ def worst_residuals(result, i_observation):
     return found
 
 
-def misfits(result):
-    """Sources (S,) bool with a filtered residual over 5 sigma in any channel."""
+def channel_residuals(result):
+    """`worst_residuals` in all channels of all observations: (S, C) [sigma]."""
     found = [worst_residuals(result, i) for i in range(len(result.observations))]
-    return (np.nan_to_num(np.concatenate(found, axis=1)) > MISFIT_SIGMAS).any(axis=1)
+    return np.concatenate(found, axis=1)
+
+
+def misfits(residuals):
+    """Sources (S,) bool with one of these `channel_residuals` (S, C) over 5 sigma."""
+    return (np.nan_to_num(residuals) > MISFIT_SIGMAS).any(axis=1)
 
 
 def convolved(image, psf):

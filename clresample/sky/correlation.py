@@ -103,12 +103,13 @@ class NoiseCorrelation:
 
     @classmethod
     def from_realisations(cls, images, *, weights=None, max_lag_px=MAX_LAG_PX) -> NoiseCorrelation:
-        """From images (n, Ny, Nx) of noise alone; pixels without weight (n, Ny, Nx) are left out.
+        """From images (n, Ny, Nx), or one (Ny, Nx), of noise alone.
 
+        Pixels without weight (as many weights as pixels) are left out.
         Raises ValueError where fewer than 1000 pairs of pixels are left at some lag.
         """
-        images = np.atleast_3d(np.asarray(images, dtype=np.float64))
-        images = images if np.ndim(images) == 3 and images.shape[-1] > 1 else images[None, ..., 0]
+        images = np.asarray(images, dtype=np.float64)
+        images = images[None] if images.ndim == 2 else images
         weights = np.ones(images.shape) if weights is None else np.asarray(weights, float)
         weights = np.broadcast_to(weights, images.shape)
         noise = np.where(weights > 0, images, 0) * np.sqrt(weights)

@@ -8,7 +8,7 @@ import pytest
 from clresample import PSF, Extended, Frame, Grid, Observation, Resampler, Settings, deblend
 from clresample.measurement.catalogue import Flag, catalogue
 from clresample.measurement.quality import summary
-from clresample.measurement.residuals import misfits, worst_residuals
+from clresample.measurement.residuals import channel_residuals, misfits, worst_residuals
 
 POSITIONS = [(16.0, 14.0), (28.0, 31.0)]
 GRID, FRAME_PSF, SEEN = Grid.flat((46, 44), 0.1), PSF.gaussian(0.8), PSF.gaussian([1.3, 1.5])
@@ -50,14 +50,17 @@ def test_it_is_flagged_and_the_fit_is_not_called_good(result):
     table = catalogue(found)
     assert (table["flags"] & Flag.MISFIT != 0).tolist() == [False, True]
     assert table["residual_r"][1] == pytest.approx(8, rel=0.03)
-    assert misfits(found).tolist() == [False, True]
+    assert misfits(channel_residuals(found)).tolist() == [False, True]
     ended = summary(replace(found, status="converged"))
     assert ended["misfits"] == [1] and not ended["good"]
     assert summary(replace(left_over(result, bump=0), status="converged"))["good"]
 
 
 def test_noise_alone_is_not_flagged(result):
-    flagged = [misfits(left_over(result, bump=0, noise=SIGMA, seed=i)) for i in range(40)]
+    flagged = [
+        misfits(channel_residuals(left_over(result, bump=0, noise=SIGMA, seed=i)))
+        for i in range(40)
+    ]
     assert np.mean(flagged) < 0.05
     worst = [worst_residuals(left_over(result, bump=0, noise=SIGMA, seed=i), 0) for i in range(40)]
     assert 2 < np.median(worst) < 4  # the largest of some hundred independent draws
@@ -65,4 +68,4 @@ def test_noise_alone_is_not_flagged(result):
 
 def test_noise_larger_than_stated_does_not_flag_everything(result):
     found = left_over(result, bump=0, noise=3 * SIGMA)
-    assert not misfits(found).any()
+    assert not misfits(channel_residuals(found)).any()
