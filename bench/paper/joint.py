@@ -14,8 +14,6 @@ interrupted; more scenes add to those that are there.
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 from tqdm import tqdm
 
@@ -32,17 +30,12 @@ STARTS = ("own", "sersic")
 CHUNK = 8  # scenes fitted side by side and logged together: some seconds
 
 
-@functools.cache
-def open_scenes(folder):
-    return scenes.Scenes(folder)
-
-
 def measure(folder, seeds):
     """What the log keeps of some scenes: magnitudes and SDRs of their galaxies, one list each.
 
     A mode's SDRs are null where its fit failed.
     """
-    found = [open_scenes(folder).take(seed) for seed in seeds]
+    found = [scenes.opened(folder).take(seed) for seed in seeds]
     parts = [
         {
             "euclid_mag": np.round(scene.euclid.magnitudes.min(axis=1), 3).tolist(),
@@ -136,7 +129,7 @@ def draw(folder, maps):
 
 
 def main(options):
-    sky = open_scenes(options.catalogue)
+    sky = scenes.opened(options.catalogue)
     threads, fit = on_one_thread(), Settings()
     record = records.record(threads) | {
         "settings": f"at most {fit.max_iter} iterations, tol {fit.tol:g}, {fit.prior}",
