@@ -6,7 +6,7 @@ VENV ?= .venv
 STAMP = $(VENV)/made
 RUN = $(VENV)/bin/python -m
 
-.PHONY: demo test lint clean paper paper-full
+.PHONY: demo test lint clean paper paper-full dist test-install test-oldest
 
 demo: $(STAMP)
 	$(RUN) clresample.cli.demo $(ARGS)
@@ -35,6 +35,21 @@ paper paper-full: $(STAMP)
 	$(RUN) bench.paper.timing --seconds $(SECONDS)
 	$(RUN) bench.paper.joint --scenes $(SCENES)
 	$(RUN) bench.paper.report
+
+# Wheel and sdist in dist/, checked as a package index will check them.
+dist: $(STAMP)
+	rm -rf dist
+	$(RUN) build --outdir dist
+	$(RUN) twine check --strict dist/*
+
+# The wheel in a clean environment of each Python, far from the checkout: smoke tests, the command.
+PYTHONS ?= python3.11 python3.12 python3.13
+test-install: dist
+	for python in $(PYTHONS); do UV=$(VENV)/bin/uv tests/install/try_install.sh $$python newest dist/*.whl || exit 1; done
+
+# The same with the oldest dependencies that pyproject.toml allows.
+test-oldest: dist
+	UV=$(VENV)/bin/uv tests/install/try_install.sh $(PYTHON) oldest dist/*.whl
 
 clean:
 	rm -rf $(VENV) dist .pytest_cache .ruff_cache

@@ -1,6 +1,7 @@
 """Wheel and sdist carry the kernels; an installed wheel renders far away from the checkout."""
 
 import os
+import re
 import subprocess
 import sys
 import tarfile
@@ -90,6 +91,12 @@ def test_an_installed_wheel_renders(environment):
 def test_an_installed_command_finds_the_devices(environment):
     table = run(environment / "bin" / "clresample", "devices", cwd=environment.parent)
     assert "largest buffer" in table
+
+
+def test_the_citation_names_this_version_and_the_changelog_knows_it():
+    cited = re.search(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+    assert cited[1] == clresample.__version__
+    assert f"\n## {clresample.__version__} " in (ROOT / "CHANGELOG.md").read_text()
 
 
 def test_every_public_name_is_there():
