@@ -6,7 +6,7 @@ VENV ?= .venv
 STAMP = $(VENV)/made
 RUN = $(VENV)/bin/python -m
 
-.PHONY: demo test lint clean paper paper-full dist test-install test-oldest
+.PHONY: demo test lint clean paper paper-full dist test-install test-oldest test-adapters
 
 demo: $(STAMP)
 	$(RUN) clresample.cli.demo $(ARGS)
@@ -51,8 +51,19 @@ test-install: dist
 test-oldest: dist
 	UV=$(VENV)/bin/uv tests/install/try_install.sh $(PYTHON) oldest dist/*.whl
 
+# The bridges with the real JAX, PyTorch, scarlet2, GalSim, photutils and regions: 6 GB, of their own.
+test-adapters: VENV = .venv-adapters
+test-adapters: .venv-adapters/made
+	$(RUN) pytest tests/adapters $(ARGS)
+
+.venv-adapters/made: pyproject.toml
+	$(PYTHON) -m venv --without-pip .venv-adapters
+	$(PYTHON) -m pip --python .venv-adapters/bin/python install --quiet \
+	    --editable '.[pocl,jax,torch,scarlet2,galsim,photutils,regions,dev]'
+	touch $@
+
 clean:
-	rm -rf $(VENV) dist .pytest_cache .ruff_cache
+	rm -rf $(VENV) .venv-adapters dist .pytest_cache .ruff_cache
 
 # Without venv's own pip, which some systems package apart; the caller's pip installs into it.
 $(STAMP): pyproject.toml

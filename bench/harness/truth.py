@@ -19,8 +19,9 @@ import numpy as np
 from astropy import units as u
 
 from clresample import catalogue
-from clresample.measurement.shapes import local_axes, moments, shape
+from clresample.measurement.shapes import moments, shape
 from clresample.sky.observation import ZERO_POINT_UJY
+from clresample.sky.wcs import local_axes
 
 from .scenes import MODES
 

@@ -114,6 +114,24 @@ class Result:
         zero = np.zeros(self.observations[i_observation].data.shape)
         return sum((c.spectrum[channels, None, None] * unit[i] for i, c in parts), zero)
 
+    def as_galsim(self, i_source, channel):
+        """One source as GalSim sees it: galsim.InterpolatedImage, under the frame's PSF.
+
+        i_source: its number; channel: a name, or a number in the order of `channels`
+        returns the profile about the source's position [arcsec, u to the west, v to the north],
+            with its flux in that channel's counts; `galsim.Deconvolve` takes the frame's PSF off
+
+        Raises ImportError without GalSim; ValueError for a channel that there is not.
+        """
+        from ..adapters.galsim import profile_of
+
+        if isinstance(channel, str):
+            if channel not in self.channels:
+                raise ValueError(f"channel is {channel!r}, must be one of {self.channels}")
+            channel = self.channels.index(channel)
+        position = self.frame.place(self.sources)[i_source]
+        return profile_of(self.source_model(i_source)[channel], self.frame.grid, position)
+
     def model(self, i_observation) -> np.ndarray:
         """All sources and the sky (Co, My, Mx) [counts] as an observation sees them."""
         channels = self.channel_slices()[i_observation]

@@ -11,10 +11,11 @@ from astropy.wcs.utils import wcs_to_celestial_frame
 
 from ..sky.footprint import open_edge
 from ..sky.observation import ZERO_POINT_UJY
+from ..sky.wcs import local_axes
 from .photometry import flux_scale, fluxes
 from .quality import box_chi2, fitted_sources, labels
 from .residuals import channel_residuals, misfits
-from .shapes import local_axes, moments, shape, shape_slopes
+from .shapes import moments, shape, shape_slopes
 
 # of a morphology's peak: light at the edge of what was seen is flagged when it is brighter. Fainter
 # light makes no flux wrong by more than a few percent; lower, noise in the wings is flagged too

@@ -33,6 +33,26 @@ def pixel_scale(wcs, n, m):
     return math.sqrt(np.linalg.norm(np.cross(v[:, 1] - v[:, 0], v[:, 3] - v[:, 2]))) / ARCSEC
 
 
+def local_axes(grid, pixel):
+    """How a step of one pixel goes on the sky: (2, 2) [arcsec/px], rows (north, east).
+
+    Columns are (y, x). North is that of the WCS's own frame; on a flat sky it is +y, and east is
+    -x, as in `Grid.to_wcs`.
+
+    pixel (2,) [px]: (y, x), where on the grid
+    """
+    if grid.is_flat:
+        return grid.jacobian * [[1.0], [-1.0]]
+    n, m = np.asarray(pixel)[:, None] + [[0, -0.5, 0.5, 0, 0], [0, 0, 0, -0.5, 0.5]]
+    lon, lat = np.radians(grid.sky(n, m))
+    v = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+    steps = np.stack([v[:, 2] - v[:, 1], v[:, 4] - v[:, 3]], axis=1)
+    lon, lat = lon[0], lat[0]
+    north = [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)]
+    east = [-np.sin(lon), np.cos(lon), 0.0]
+    return np.array([north, east]) @ steps / ARCSEC
+
+
 def convert(wcs_from, wcs_to, lon, lat):
     """Points lon, lat (L,) [deg] of one WCS's celestial frame in that of another: (lon, lat)."""
     frames = [wcs_to_celestial_frame(wcs) for wcs in (wcs_from, wcs_to)]

@@ -1,0 +1,87 @@
+"""Operators as JAX functions: differentiable by their own adjoint, under jit, grad and vmap."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from .needed import needed
+
+
+def as_jax(op):
+    """The operator as a function of a JAX array.
+
+    Both directions run on the operator's OpenCL device, called back from JAX's CPU backend: arrays
+    cross the host once each way. Being linear, the operator is its own derivative, and its adjoint
+    is the reverse one; `jax.jvp`, `jax.vjp`, `jax.grad`, `jax.linear_transpose` and second
+    derivatives are exact. `jax.vmap` makes one launch of a batch, not many.
+
+    op: any LinOp (Resampler, TiledResampler, ...) of item shapes shape_in and shape_out
+    returns f(x): x (...,) + shape_in -> (...,) + shape_out, arrays of the operator's dtype
+
+    Raises ImportError without JAX; ValueError for a float64 operator where JAX holds float32 only
+    (`jax.config.update("jax_enable_x64", True)` first), and, when called, for other shapes.
+    """
+    jax = needed("jax", "jax")
+    if jax.dtypes.canonicalize_dtype(op.dtype) != op.dtype:
+        raise ValueError(
+            f"op computes in {op.dtype}, JAX holds {jax.dtypes.canonicalize_dtype(op.dtype)}: "
+            'call jax.config.update("jax_enable_x64", True), or make op with dtype=np.float32'
+        )
+    primitive = _primitive()
+
+    def apply(x):
+        x = jax.numpy.asarray(x, op.dtype)
+        if x.ndim < len(op.shape_in) or x.shape[x.ndim - len(op.shape_in) :] != op.shape_in:
+            raise ValueError(f"x has shape {x.shape}, expected (...,) + {op.shape_in}")
+        return primitive.bind(x, op=op, transposed=False)
+
+    return apply
+
+
+@functools.cache
+def _primitive():
+    """The JAX primitive: x -> A x, or A^T x where `transposed`, of an operator `op`."""
+    jax = needed("jax", "jax")
+    ad, batching, mlir = (
+        needed(f"jax.interpreters.{name}", "jax") for name in ("ad", "batching", "mlir")
+    )
+    p = needed("jax.extend.core", "jax").Primitive("clresample")
+
+    def called_back(x, *, op, transposed):
+        result = jax.ShapeDtypeStruct(_shapes(x, op, transposed)[1], op.dtype)
+        return jax.pure_callback(functools.partial(_on_host, op, transposed), result, x)
+
+    def transpose(y, _, *, op, transposed):
+        return [p.bind(y, op=op, transposed=not transposed)]
+
+    def batch(args, axes, **of):
+        return p.bind(jax.numpy.moveaxis(args[0], axes[0], 0), **of), 0
+
+    p.def_impl(jax.jit(called_back, static_argnames=("op", "transposed")))
+    p.def_abstract_eval(
+        lambda x, *, op, transposed: jax.core.ShapedArray(_shapes(x, op, transposed)[1], op.dtype)
+    )
+    ad.deflinear2(p, transpose)
+    batching.primitive_batchers[p] = batch
+    mlir.register_lowering(p, mlir.lower_fun(called_back, multiple_results=False))
+    return p
+
+
+def _shapes(x, op, transposed):
+    """Of one item of x, and of the result with all of x's leading axes."""
+    shape_x, shape_result = op.shape_in, op.shape_out
+    if transposed:
+        shape_x, shape_result = shape_result, shape_x
+    return shape_x, (*x.shape[: x.ndim - len(shape_x)], *shape_result)
+
+
+def _on_host(op, transposed, x):
+    """The operator on a host array, all leading axes as one batch."""
+    x = np.asarray(x)
+    shape_x, shape_result = _shapes(x, op, transposed)
+    if 0 in x.shape:
+        return np.zeros(shape_result, op.dtype)
+    run = op.adjoint if transposed else op.forward
+    return run(x.reshape(-1, *shape_x)).reshape(shape_result)
