@@ -6,7 +6,7 @@ VENV ?= .venv
 STAMP = $(VENV)/made
 RUN = $(VENV)/bin/python -m
 
-.PHONY: demo test lint clean paper paper-full dist test-install test-oldest test-adapters
+.PHONY: demo test lint clean paper paper-full dist test-install test-oldest test-adapters docs
 
 demo: $(STAMP)
 	$(RUN) clresample.cli.demo $(ARGS)
@@ -62,8 +62,19 @@ test-adapters: .venv-adapters/made
 	    --editable '.[pocl,jax,torch,scarlet2,galsim,photutils,regions,dev]'
 	touch $@
 
+# The pages, with every example executed, in docs/_build/html/index.html; a warning is an error.
+docs: .venv-docs/made
+	.venv-docs/bin/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo docs/_build/html/index.html
+
+.venv-docs/made: pyproject.toml
+	$(PYTHON) -m venv --without-pip .venv-docs
+	$(PYTHON) -m pip --python .venv-docs/bin/python install --quiet \
+	    --editable '.[pocl,sim,plot,detect,docs]'
+	touch $@
+
 clean:
-	rm -rf $(VENV) .venv-adapters dist .pytest_cache .ruff_cache
+	rm -rf $(VENV) .venv-adapters .venv-docs docs/_build dist .pytest_cache .ruff_cache
 
 # Without venv's own pip, which some systems package apart; the caller's pip installs into it.
 $(STAMP): pyproject.toml

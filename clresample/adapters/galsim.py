@@ -92,7 +92,7 @@ def profile_of(image, grid, position_px, *, interpolant="lanczos15"):
     image (Ny, Nx): flux per pixel of a band-limited model, as those of fits are
     grid: of the image; position_px (2,) [px]: (y, x) that becomes the profile's origin
     interpolant: GalSim's name of the one between pixels. "sinc" is exact, but GalSim 2.8 ends the
-        process by a segmentation fault where it draws one in real space beyond the image;
+        process by a segmentation fault where it draws one in real space;
         lanczos15 is within 1e-3 of the peak for images sampled as finely as models are
     returns galsim.InterpolatedImage, in arcsec on the tangent plane at that place
     """

@@ -1,0 +1,54 @@
+"""The documentation's sources: every public name is in it, every link leads somewhere.
+
+`make docs` executes the examples and fails on any of Sphinx's warnings; this is what can be seen
+without Sphinx, in a second.
+"""
+
+import re
+
+import pytest
+from helpers.checkout import ROOT
+
+import clresample
+
+DOCS = ROOT / "docs"
+PAGES = sorted(path for path in DOCS.rglob("*.md") if "_build" not in path.parts)
+TEXTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
+
+
+def links(text):
+    """What a Markdown text links to or shows, code blocks apart."""
+    prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    return re.findall(r"\]\(([^)\s]+)\)", prose)
+
+
+def toctree(text):
+    """The pages that a text's toctrees name."""
+    for block in re.findall(r"```\{toctree\}(.*?)```", text, flags=re.DOTALL):
+        yield from (line for line in block.splitlines() if line and not line.startswith(":"))
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_link_leads_somewhere(path):
+    for link in links(path.read_text()):
+        if not link.startswith(("http://", "https://", "#")):
+            assert (path.parent / link.partition("#")[0]).exists(), link
+
+
+def test_every_page_is_in_the_contents():
+    listed = {DOCS / "index.md"}
+    for path in PAGES:
+        listed |= {(path.parent / f"{name}.md") for name in toctree(path.read_text())}
+    assert set(PAGES) == listed
+
+
+def test_every_public_name_is_in_the_reference():
+    reference = (DOCS / "reference.md").read_text()
+    found = set(
+        re.findall(r"^\.\. auto(?:class|function):: ([A-Za-z_]+)$", reference, re.MULTILINE)
+    )
+    assert found == set(clresample.__all__)
+
+
+def test_a_broken_link_is_seen():
+    assert links("see [here](missing.md) and ```[x](y)```") == ["missing.md"]
