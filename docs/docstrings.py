@@ -1,4 +1,4 @@
-"""Sphinx extension: the package's docstrings, plain text with their own layout, as reStructuredText.
+"""Sphinx extension: docstrings, plain text with a layout of their own, as reStructuredText.
 
 What our docstrings do that reStructuredText would run together:
 
@@ -10,7 +10,9 @@ What our docstrings do that reStructuredText would run together:
 import re
 
 PARAMETER = re.compile(
-    r"^(?P<names>[\w*]+(?:, [\w*]+)*)(?P<kind>(?: \([^:]*\))?(?: \[[^\]:]*\])?)(?:: (?P<text>\S.*))?$"
+    r"^(?P<names>[\w*]+(?:, [\w*]+)*)"
+    r"(?P<kind>(?: \([^:]*\))?(?: \[[^\]:]*\])?)"
+    r"(?:: (?P<text>\S.*))?$"
 )
 SENTENCES = ("Raises", "Returns", "Source", "Sources", "Warns", "returns", "Words")
 
