@@ -58,13 +58,24 @@ COLUMNS = (
 )
 
 
-def measure(galaxies, mode, folder, seeds, negative=NEGATIVE):
+def make_scene(galaxies, folder, seed, noise=None):
+    """A `SimulatedScene` of one of GALAXIES.
+
+    folder: of the COSMOS galaxies; noise: function (scene, rng) -> the scene with other noise, a
+        module's own so that processes can be given it
+    """
+    scene = simulate_scene(seed) if galaxies == "parametric" else scenes.opened(folder).take(seed)
+    return scene if noise is None else noise(scene, np.random.default_rng(seed))
+
+
+def measure(galaxies, mode, folder, seeds, negative=NEGATIVE, noise=None):
     """What `truth.compare` finds in scenes of these seeds, and how their fits ended.
 
+    noise: see `make_scene`
     returns [{quantity: (4, n)}, ...], one for each scene that could be fitted; [status, ...]
     """
     parametric = galaxies == "parametric"
-    found = [simulate_scene(i) if parametric else scenes.opened(folder).take(i) for i in seeds]
+    found = [make_scene(galaxies, folder, seed, noise) for seed in seeds]
     results = scenes.fit([scenes.blend(scene, mode) for scene in found])
     values = []
     for scene, result in zip(found, results, strict=True):
