@@ -18,9 +18,9 @@ from ...resampling.transfer import transfer_function
 from ...sky.psf import PSF
 from ..view import WhitenedView, without_dark
 
-# [FWHM of the observation's PSF] How far about its box a component's light is followed: beyond lie
-# 1 % of a Moffat profile's light and 1e-4 of its square, which the matrix is made of.
-REACH_FWHM = 3.0
+# [FWHM of the observation's PSF] How far about its box a component's light is followed. Errors of
+# simulated Euclid and Rubin scenes differ by less than 1e-4 from those with 5, with 1 by 5e-4.
+REACH_FWHM = 1.5
 # |D| / max |D| under which a frequency is left out: of a source's information it holds the square.
 BAND = 1e-3
 # [px] Periods are multiples of it, and one: boxes of about one size share their transfer function.
