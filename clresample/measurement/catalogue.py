@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import IntFlag
+from itertools import pairwise
 
 import numpy as np
 from astropy import units as u
@@ -11,7 +12,7 @@ from astropy.wcs.utils import wcs_to_celestial_frame
 
 from ..sky.footprint import open_edge
 from ..sky.observation import ZERO_POINT_UJY
-from .photometry import flux_scale, fluxes
+from .photometry import channel_covariances, flux_scale, fluxes
 from .quality import box_chi2, fitted_sources, labels
 from .residuals import channel_residuals, misfits
 from .shapes import local_axes, moments, shape, shape_slopes
@@ -55,7 +56,7 @@ MEANINGS = {
 def catalogue(result, *, magnitudes=False) -> QTable:
     """The catalogue of a fitted blend: one row per source, columns with units.
 
-    result: a fitted blend; magnitudes: add the columns of magnitudes
+    result: a fitted blend; magnitudes: add the columns of magnitudes and colours
     returns QTable (S rows, in the order of `result.sources`); what was not measured is NaN:
         name: the source's own, or its number
         ra, dec [deg], or what the frame's WCS calls them; y_sky, x_sky [arcsec] on a flat sky; and
@@ -73,6 +74,9 @@ def catalogue(result, *, magnitudes=False) -> QTable:
         flux_*, flux_err_* per channel [uJy where observations have zero points, else counts]: see
             `fluxes`
         mag_*, mag_err_* per channel [mag, AB]: where the flux is positive
+        colour_A_B, colour_err_A_B [mag]: mag_A - mag_B of channels A, B next to each other; the
+            error from the covariance of the two fluxes, see `channel_covariances`, to first order:
+            of use where both are detected
         chi2_* per observation: mean chi2 of the pixels with weight in the source's box, of all
             channels and with all sources' models
         residual_* per channel [sigma]: the largest residual on the source once filtered with the
@@ -96,6 +100,8 @@ def catalogue(result, *, magnitudes=False) -> QTable:
         table[f"flux_err_{channel}"] = error[:, i] * scale[i] * unit[i]
         if magnitudes and unit[i] == u.uJy:
             _add_magnitudes(table, channel, flux[:, i] * scale[i], error[:, i] * scale[i])
+    if magnitudes:
+        _add_colours(table, result, flux)
     for i, label in enumerate(labels(result)):
         table[f"chi2_{label}"] = box_chi2(result, i, result.footprints[i])
     worst = channel_residuals(result)
@@ -173,6 +179,23 @@ def _add_magnitudes(table, channel, flux_ujy, error_ujy):
     flux_ujy = np.where(flux_ujy > 0, flux_ujy, np.nan)
     table[f"mag_{channel}"] = (ZERO_POINT_UJY - 2.5 * np.log10(flux_ujy)) * u.mag
     table[f"mag_err_{channel}"] = 2.5 / np.log(10) * error_ujy / flux_ujy * u.mag
+
+
+def _add_colours(table, result, flux):
+    """Columns of colours of neighbouring channels that have magnitudes; flux (S, C) [counts]."""
+    covariance, names = channel_covariances(result), result.channels
+    for i, (a, b) in enumerate(pairwise(names)):
+        if f"mag_{a}" not in table.colnames or f"mag_{b}" not in table.colnames:
+            continue
+        one, other = (np.where(flux[:, k] > 0, flux[:, k], np.nan) for k in (i, i + 1))
+        slopes = np.stack([1 / one, -1 / other], axis=1)  # of ln(flux ratio)
+        both = covariance[:, i : i + 2, i : i + 2]
+        with np.errstate(invalid="ignore"):  # infinite variances
+            error = np.sqrt(np.einsum("sa,sab,sb->s", slopes, both, slopes))
+        known = np.isfinite(both).all((1, 2))
+        table[f"colour_{a}_{b}"] = table[f"mag_{a}"] - table[f"mag_{b}"]
+        error = np.where(known, error, np.where(np.isfinite(slopes).all(1), np.inf, np.nan))
+        table[f"colour_err_{a}_{b}"] = 2.5 / np.log(10) * error * u.mag
 
 
 def _flags(result, flux, error, positions, footprints):

@@ -44,6 +44,23 @@ def fluxes(result):
     return flux, summed
 
 
+def channel_covariances(result):
+    """Covariances (S, C, C) [counts^2] of each source's fluxes between channels.
+
+    Morphologies that are not known move the fluxes of all channels together, so that colours are
+    known better than fluxes. Without Errors channels are independent. Settings.flux_floor is in it
+    as common to all channels. The variance is infinite as in `fluxes`.
+    """
+    variance = np.diagonal(fluxes(result)[1], axis1=1, axis2=2).T  # (S, C)
+    found = np.zeros((*variance.shape, variance.shape[1]))
+    if result.errors is not None:
+        both = np.isfinite(variance)[:, :, None] & np.isfinite(variance)[:, None, :]
+        found = np.where(both, result.errors.colour, 0.0)
+    i = np.arange(variance.shape[1])
+    found[:, i, i] = variance
+    return found
+
+
 def redistribute(result, i_observation) -> np.ndarray:
     """Each source's share of the observed data: flux re-distribution.
 

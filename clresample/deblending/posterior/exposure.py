@@ -74,7 +74,9 @@ class Exposure:
         z = z.reshape(-1, len(nu_x)) @ _waves(nu_x, self.x[low[1] : high[1]] - origin[1])
         z = z.reshape(len(nu_y), -1)
         wave_y = _waves(self.y[low[0] : high[0]] - origin[0], nu_y)
-        seen = np.concatenate([wave_y.real, -wave_y.imag], axis=1) @ np.concatenate([z.real, z.imag])
+        seen = np.concatenate([wave_y.real, -wave_y.imag], axis=1) @ np.concatenate(
+            [z.real, z.imag]
+        )
         seen = seen.reshape(len(wave_y), k, len(self.root), -1).transpose(1, 2, 0, 3)
         return seen * self.root[:, low[0] : high[0], low[1] : high[1]]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -114,11 +115,16 @@ class Solution:
         out[here] = np.linalg.norm(self.spectra[j]) / self.peaks[j] * profile[there]
         return out
 
+    @cached_property
+    def _boxes(self):
+        """First and one-past-last pixels (n, 2), (n, 2) of all boxes."""
+        return self.scene.origin, self.scene.origin + [p.shape for p in self.scene.profile]
+
     def _shared(self, i):
         """Where (ny, nx) component i may exchange light with another."""
-        own = self._light(i, i)
+        own, (low, high) = self._light(i, i), self._boxes
         shared = np.zeros(own.shape, bool)
-        for j in range(len(self.morphs)):
+        for j in np.flatnonzero(((low < high[i]) & (high > low[i])).all(1)):
             if j != i:
                 other = self._light(j, i)
                 shared |= (other > RATIO * own) & (other > FAINT) & (own > FAINT)

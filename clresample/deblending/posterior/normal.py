@@ -101,9 +101,7 @@ class _Sum:
 
     def run(self, origin, morphs, modes, spectra):
         """Add it."""
-        windows = [
-            self.exposure.window(at, m.shape) for at, m in zip(origin, morphs, strict=True)
-        ]
+        windows = [self.exposure.window(at, m.shape) for at, m in zip(origin, morphs, strict=True)]
         near: list[_Seen] = []
         for i in sorted(range(len(morphs)), key=lambda i: windows[i][0, 0]):
             low, high = windows[i]
