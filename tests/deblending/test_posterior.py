@@ -11,7 +11,7 @@ from scipy.signal import fftconvolve
 
 from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.posterior import exposure
-from clresample.deblending.posterior.bumps import Bumps
+from clresample.deblending.posterior.bumps import Bumps, uncorrelated
 from clresample.deblending.posterior.moments import moments_of
 from clresample.deblending.posterior.profile_modes import profile_modes
 from clresample.deblending.profiles import Galaxy, Given, Star
@@ -114,8 +114,14 @@ def test_bumps_are_convolutions_by_definition():
     np.testing.assert_allclose(
         bumps.images, np.sqrt(profile) * seen * scale[:, None, None], atol=1e-9
     )
-    expected = gram * scale[:, None] * scale + 1e-7 * np.eye(len(gram))
+    expected = gram * scale[:, None] * scale
     np.testing.assert_allclose(bumps.precision, expected, atol=1e-9)
+    # one number each: the same covariance of the pixels
+    own = uncorrelated(bumps.images, bumps.precision)
+    pixels = [images.reshape(len(images), -1) for images in (bumps.images, own)]
+    covariance = pixels[0].T @ np.linalg.pinv(bumps.precision, rcond=1e-8) @ pixels[0]
+    largest = np.abs(covariance).max()
+    np.testing.assert_allclose(pixels[1].T @ pixels[1], covariance, atol=1e-4 * largest)
 
 
 @pytest.mark.parametrize("kind", ["galaxy", "given", "star"])

@@ -6,7 +6,6 @@ import numpy as np
 
 from clresample.deblending.posterior import posterior as room
 from clresample.deblending.posterior.blocks import RIDGE
-from clresample.deblending.posterior.modes import Modes
 from clresample.deblending.posterior.normal import Layout
 from clresample.deblending.shifts import SCATTER_PX
 
@@ -47,7 +46,7 @@ def capture(monkeypatch):
 def full_matrix(kept, modes=None):
     """The normal matrix (N, N), of images rendered over the whole frame, node after node.
 
-    modes (n): other Modes than the posterior's
+    modes (n): other modes than the posterior's
     """
     p, scene = kept.posterior, kept.posterior.solution.scene
     modes = modes or p.modes
@@ -57,10 +56,10 @@ def full_matrix(kept, modes=None):
     images = []
     for i, m in enumerate(modes):
         box = tuple(
-            slice(o, o + n) for o, n in zip(scene.origin[i], m.images.shape[1:], strict=True)
+            slice(o, o + n) for o, n in zip(scene.origin[i], m.shape[1:], strict=True)
         )
         full = np.zeros((len(m) + 3, *scene.shape))
-        full[:-2, *box] = np.concatenate([m.images, p.solution.morphs[i][None]])
+        full[:-2, *box] = np.concatenate([m, p.solution.morphs[i][None]])
         full[-2:] = np.gradient(full[-3])
         images.append(full)
     matrix, channel = np.zeros((starts[-1] if n_common else starts[len(modes)],) * 2), 0
@@ -80,7 +79,7 @@ def full_matrix(kept, modes=None):
             matrix += j @ j.T
             channel += 1
     for at, m in zip(starts, modes, strict=False):
-        matrix[at : at + len(m), at : at + len(m)] += m.precision
+        matrix[at : at + len(m), at : at + len(m)] += np.eye(len(m))
     if layout.n_shifts:
         matrix[-layout.n_shifts :, -layout.n_shifts :] += np.eye(layout.n_shifts) / SCATTER_PX**2
     return matrix
@@ -94,7 +93,7 @@ def dense_error(kept, i):
     at = sum(len(m) + n_channels for m in modes[:i])
     slopes = np.zeros((n_channels, len(matrix)))
     k = len(modes[i])
-    slopes[:, at : at + k] = np.outer(s.spectra[i], modes[i].images.sum((1, 2)))
+    slopes[:, at : at + k] = np.outer(s.spectra[i], modes[i].sum((1, 2)))
     slopes[:, at + k : at + k + n_channels] = s.morphs[i].sum() * np.eye(n_channels)
     scale = np.sqrt(np.diag(matrix))
     lower = np.linalg.cholesky(scaled(matrix) + RIDGE * np.eye(len(matrix)))
@@ -114,9 +113,7 @@ def _dense_modes(posterior, i):
         covariance += a**2 * np.kron(rows, columns)
     root = np.linalg.cholesky(covariance).T.reshape(n, *profile.shape)
     images = s._gauged(i, np.sqrt(np.maximum(profile, 0)) * root) / s.peaks[i]
-    old = posterior.modes[i]
-    precision = np.diag(np.append(np.ones(n), np.diag(old.precision)[-n_slopes:]))
-    return Modes(np.concatenate([images, old.images[-n_slopes:]]), precision)
+    return np.concatenate([images, posterior.modes[i][-n_slopes:]])
 
 
 def _toeplitz(taps, n):

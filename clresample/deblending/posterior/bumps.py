@@ -23,8 +23,9 @@ MOST = 400
 LEAST_LIGHT = 1e-4
 # Part of a bump's peak that must lie where light is exchanged.
 REACHED = 0.8
-# Added to the unit diagonal of Q^-1, which overlapping bumps make almost singular.
-RIDGE = 1e-7
+# Eigenvalues of Q^-1, whose diagonal is 1, under which a combination of bumps is left out: those of
+# overlapping ones cancel, and what is left of them is rounding.
+LEAST_SHARE = 1e-6
 
 
 class Bumps:
@@ -54,7 +55,15 @@ class Bumps:
         scale = 1 / np.sqrt(np.maximum(np.diag(precision), 1e-30))
         self.images = np.sqrt(np.maximum(profile, 0)) * images * scale[:, None, None]
         precision = precision * scale[:, None] * scale
-        self.precision = 0.5 * (precision + precision.T) + RIDGE * np.eye(len(scale))
+        self.precision = 0.5 * (precision + precision.T)
+
+
+def uncorrelated(images, precision):
+    """Combinations (l, ny, nx) of images (k, ny, nx) whose coefficients scatter by 1, each on its
+    own, of those whose coefficients have the inverse covariance `precision` (k, k); l <= k."""
+    values, vectors = np.linalg.eigh(precision)
+    keep = values > LEAST_SHARE
+    return np.tensordot(vectors[:, keep].T / np.sqrt(values[keep])[:, None], images, 1)
 
 
 class _Axis:

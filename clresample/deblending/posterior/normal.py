@@ -56,11 +56,11 @@ def normal_matrix(scene, exposures, morphs, modes, spectra, layout) -> Blocks:
     """J^T J + prior^-1.
 
     scene: Scene; exposures: an Exposure of each observation
-    morphs (n): arrays (ny, nx); modes (n): Modes; spectra (n, C), in the views' units
+    morphs (n): arrays (ny, nx); modes (n): arrays (k, ny, nx); spectra (n, C), in the views' units
     """
     matrix = Blocks(layout.sizes)
     for i, m in enumerate(modes):
-        matrix.block(i, i)[: len(m), : len(m)] += m.precision
+        matrix.block(i, i)[: len(m), : len(m)] += np.eye(len(m))
     if layout.n_shifts:
         at = layout.n_sky + np.arange(layout.n_shifts)
         matrix.block(layout.common, layout.common)[at, at] += SCATTER_PX**-2
@@ -109,7 +109,7 @@ class _Sum:
             if not (high > low).all():
                 continue
             spectrum = spectra[i, self.channels].astype(np.float32)
-            one = self._seen(i, morphs[i], modes[i].images, spectrum, origin[i], low, high)
+            one = self._seen(i, morphs[i], modes[i], spectrum, origin[i], low, high)
             near.append(one)
             for other in near:
                 self._add(*((other, one) if other.i <= i else (one, other)))

@@ -24,7 +24,7 @@ class Posterior:
     fit_sky, fit_shifts: whether sky levels, and shifts of all observations but the first, are
         unknowns too
 
-    modes (n): Modes; layout: Layout; matrix: Blocks; factor: its Factor; covariance: Blocks of the
+    modes (n): arrays (k, ny, nx), see Solution.modes; layout: Layout; matrix: Blocks; factor: its Factor; covariance: Blocks of the
         inverse, for the same nodes
 
     Raises LinAlgError where the matrix is not positive definite.
@@ -82,7 +82,7 @@ class Posterior:
 
     def draws(self, unit) -> Draws:
         """What `Result.sample` draws from."""
-        return Draws([m.images.astype(np.float32) for m in self.modes], self.factor, unit)
+        return Draws([m.astype(np.float32) for m in self.modes], self.factor, unit)
 
     def _fluxes(self, owner, n_sources):
         """Fluxes (S, C), and each component's slopes (C, k + C) of its own by its unknowns."""
@@ -91,7 +91,7 @@ class Posterior:
         for i, (modes, morph) in enumerate(zip(self.modes, s.morphs, strict=True)):
             total = morph.sum()
             flux[owner[i]] += s.spectra[i] * total
-            by_mode = np.outer(s.spectra[i], modes.images.sum((1, 2)))
+            by_mode = np.outer(s.spectra[i], modes.sum((1, 2)))
             slopes.append(np.concatenate([by_mode, total * np.eye(len(by_mode))], axis=1))
         return flux, slopes
 
@@ -108,7 +108,7 @@ class Posterior:
             slopes = moments_of(s.scene.origin[own], [s.morphs[i] for i in own], light)
             rows = []
             for i, slope, part in zip(own, slopes, light, strict=True):
-                flat, images = slope.reshape(5, -1), self.modes[i].images
+                flat, images = slope.reshape(5, -1), self.modes[i]
                 by_mode = part * flat @ images.reshape(len(images), flat.shape[1]).T
                 by_light = flat @ s.morphs[i].ravel()
                 rows.append(np.concatenate([by_mode, by_light[:, None] * weight], axis=1))
@@ -124,7 +124,7 @@ class Posterior:
 
     def _map(self, i):
         """Standard deviation (ny, nx) of component i's morphology."""
-        images = self.modes[i].images
+        images = self.modes[i]
         k = len(images)
         if not k:
             return np.zeros(self.solution.morphs[i].shape)
