@@ -67,7 +67,8 @@ def catalogue(result, *, magnitudes=False) -> QTable:
         *_centroid: the same positions, of the fitted light
         size [arcsec], e1, e2, angle [deg]: see `shapes.shape`. They are those of the model under
             the model's PSF, not deconvolved; a source's components are weighted by their flux, that
-            of all channels, each in units of its error
+            of all channels, each in units of its error. Where the result has Errors, what the
+            smooth profile has beyond its box is counted
         *_centroid_err, size_err, e1_err, e2_err, angle_err: errors in the units of the values, to
             first order; ra's in degrees of ra, angle_err at most 52 deg, that of an unknown angle.
             NaN where the result has no Errors, and where the shape was not fitted, as stars'
@@ -130,11 +131,13 @@ def _add_shapes(table, result, error):
     centroids, sizes = np.full((n_sources, 2), np.nan), np.full((n_sources, 4), np.nan)
     shape_errors = sizes.copy()
     for s in np.flatnonzero(fitted_sources(result)):
-        parts = [c for c in result.components if c.source == s]
+        own = [i for i, c in enumerate(result.components) if c.source == s]
+        parts = [result.components[i] for i in own]
+        beyond = None if result.errors is None else result.errors.beyond[own]
         good = np.isfinite(error[s]) & (error[s] > 0)
         weight = np.where(good, 1 / np.where(good, error[s], 1.0), 0.0)
         light = np.array([weight @ c.flux for c in parts])
-        centroids[s], second = moments(parts, light)
+        centroids[s], second = moments(parts, light, beyond)
         if np.isfinite(centroids[s]).all():
             axes = local_axes(result.frame.grid, centroids[s])
             sizes[s] = shape(axes @ second @ axes.T)

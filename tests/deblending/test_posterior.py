@@ -137,7 +137,8 @@ def test_slopes_are_finite_differences(kind):
         )
     drawn = shape.draw(theta, position)[0]
     profile = (drawn / drawn.max())[box]
-    images, scatter = profile_modes(shape, theta, position, profile, box)
+    low = np.array([part.start for part in box])
+    images, scatter, far = profile_modes(shape, theta, position, profile, low)
     assert len(images) == len(scatter) == {"galaxy": 8, "given": 4, "star": 2}[kind]
     for i, d in enumerate(e * np.eye(len(theta))):
         change = shape.draw(theta + d, position)[0] - shape.draw(theta - d, position)[0]
@@ -148,6 +149,8 @@ def test_slopes_are_finite_differences(kind):
             np.testing.assert_allclose(
                 images[4 + i], change[box] / (2 * e) / drawn.max(), atol=1e-6
             )
+    if kind != "galaxy":
+        assert not far.sums.any()
     if kind != "star":
         np.testing.assert_allclose(images[-2:], [profile**2, profile**0.5])
         assert images[-4][5].sum() < 0 < images[-4][16].sum()  # moved to larger y: less light below
@@ -159,15 +162,42 @@ def test_slopes_of_moments_are_finite_differences():
     morphs = [rng.random((7, 9)), rng.random((6, 8))]
     change = [rng.normal(size=m.shape) for m in morphs]
 
+    sums = np.abs(rng.random((2, 6))) * [2, 10, 10, 100, 30, 100]
+    more = rng.normal(size=(2, 6))
+
     def at(e):
         moved = [m + e * d for m, d in zip(morphs, change, strict=True)]
         parts = [Component(0, tuple(o), m, np.ones(1)) for o, m in zip(origins, moved, strict=True)]
-        c, q = moments(parts, [a * m.sum() for a, m in zip(light, moved, strict=True)])
+        inside = [a * m.sum() for a, m in zip(light, moved, strict=True)]
+        c, q = moments(parts, inside, sums + e * more)
         return np.array([*c, q[0, 0], q[1, 0], q[1, 1]])
 
-    slopes = moments_of(origins, morphs, light)
+    slopes, by_sums = moments_of(origins, morphs, light, sums)
     found = sum(a * np.tensordot(s, d, 2) for a, s, d in zip(light, slopes, change, strict=True))
+    found = found + by_sums @ (light @ more)
     np.testing.assert_allclose(found, (at(1e-5) - at(-1e-5)) / 2e-5, rtol=1e-6)
+
+
+def test_what_lies_beyond_a_box_is_counted(device):
+    """Flux, place and size are those of the whole profile, wherever the box ends."""
+    home, position = scenes.frame(), np.array([13.3, 15.8])
+    shape, theta = Galaxy(home), np.array([0.9, 0.2, -0.1, 1.0])
+    whole = shape.draw(theta, position + 60, (150, 156))[0]
+    whole /= whole.max()
+    low = np.array([4, 6])
+    box = whole[64:84, 66:86]
+    _, _, far = profile_modes(shape, theta, position, box, low)
+    y, x = (np.arange(n) - 60.0 for n in whole.shape)
+    for k, (a, b) in enumerate(((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))):
+        wanted = (y**a @ whole @ x**b) - (y[64:84] ** a @ box @ x[66:86] ** b)
+        if a + b < 2:
+            assert far.sums[k] == pytest.approx(wanted, rel=0.25)
+    assert far.sums[0] > 0.01 * box.sum()
+    result = scenes.fit(blend(BRIGHT), device)
+    total = fluxes(result)[0]
+    for i, c in enumerate(result.components):
+        more = 1 + result.errors.beyond[i, 0] / c.morphology.sum()
+        np.testing.assert_allclose(total[i], c.flux * more)
 
 
 def test_draws_scatter_as_the_errors_say(fitted):

@@ -55,9 +55,7 @@ def full_matrix(kept, modes=None):
     n_common = layout.n_sky + layout.n_shifts
     images = []
     for i, m in enumerate(modes):
-        box = tuple(
-            slice(o, o + n) for o, n in zip(scene.origin[i], m.shape[1:], strict=True)
-        )
+        box = tuple(slice(o, o + n) for o, n in zip(scene.origin[i], m.shape[1:], strict=True))
         full = np.zeros((len(m) + 3, *scene.shape))
         full[:-2, *box] = np.concatenate([m, p.solution.morphs[i][None]])
         full[-2:] = np.gradient(full[-3])
@@ -112,7 +110,7 @@ def _dense_modes(posterior, i):
         rows, columns = (_toeplitz(twice, side) for side in profile.shape)
         covariance += a**2 * np.kron(rows, columns)
     root = np.linalg.cholesky(covariance).T.reshape(n, *profile.shape)
-    images = s._gauged(i, np.sqrt(np.maximum(profile, 0)) * root) / s.peaks[i]
+    images = s._gauged(i, np.sqrt(np.maximum(profile, 0)) * root)[0] / s.peaks[i]
     return np.concatenate([images, posterior.modes[i][-n_slopes:]])
 
 

@@ -25,12 +25,16 @@ class Errors:
         not fitted: all of stars at a given place, the second moments of free ones
     morphology (n): arrays (ny, nx) [1]: standard deviation of each component's morphology, at a
         fixed projection onto its smooth profile
+    beyond (n, 6) [1, px, px^2]: no error, but what belongs to the fluxes and moments: the sums of
+        each component's smooth profile beyond its box, times 1, y, x, y y, y x, x x of the frame,
+        where the morphology has its maximum 1
     """
 
     flux: np.ndarray
     colour: np.ndarray
     moments: np.ndarray
     morphology: tuple[np.ndarray, ...]
+    beyond: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)

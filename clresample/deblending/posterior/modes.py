@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ...sky.extent import box_slices, shared_part
+from ...sky.extent import shared_part
 from ..solver.learned.prior import LearnedPrior
 from ..solver.scene import Scene
 from .bumps import Bumps, uncorrelated
@@ -60,13 +60,13 @@ class Solution:
 
     def modes(self, i):
         """Modes (k, ny, nx) of component i, whose coefficients the prior expects to scatter by 1,
-        each on its own."""
+        each on its own; and its Beyond."""
         profile, scene = self.scene.profile[i], self.scene
-        box = box_slices(scene.origin[i], profile.shape)
-        slopes, scatter = profile_modes(
-            self.shapes[i], self.thetas[i], self.positions[i], profile, box
+        images, scatter, far = profile_modes(
+            self.shapes[i], self.thetas[i], self.positions[i], profile, scene.origin[i]
         )
-        images = scatter[:, None, None] * slopes
+        images = scatter[:, None, None] * images
+        far = far.scaled(np.append(1, scatter) / self.peaks[i])
         if not scene.fixed[i]:
             bumps = Bumps(
                 scene.origin[i], profile, self.strengths(i), self.prior.kernels(), self._shared(i)
@@ -74,14 +74,16 @@ class Solution:
             keep = self._change(i, bumps.images) > LEAST_CHANGE
             own = uncorrelated(bumps.images[keep], bumps.precision[np.ix_(keep, keep)])
             images = np.concatenate([own, images])
-        return self._gauged(i, images) / self.peaks[i]
+        images, along = self._gauged(i, images)
+        return images / self.peaks[i], far.gauged(along)
 
     def _gauged(self, i, images):
-        """Images without what lies along the profile, 0 where the morphology is at its bound."""
+        """Images without what lies along the profile, 0 where the morphology is at its bound; and
+        how much lay along it (k,)."""
         p = self.scene.profile[i]
         along = np.tensordot(images, p, 2) / max((p * p).sum(), 1e-30)
         images = images - along[:, None, None] * p
-        return images if self.scene.fixed[i] else np.where(self.morphs[i] > 0, images, 0)
+        return images if self.scene.fixed[i] else np.where(self.morphs[i] > 0, images, 0), along
 
     def _change(self, i, images):
         """What images (k, ny, nx) of scatter 1 change of flux and second moment [fixed errors]."""

@@ -24,7 +24,7 @@ class Posterior:
     fit_sky, fit_shifts: whether sky levels, and shifts of all observations but the first, are
         unknowns too
 
-    modes (n): arrays (k, ny, nx), see Solution.modes; layout: Layout; matrix: Blocks; factor: its Factor; covariance: Blocks of the
+    modes (n): arrays (k, ny, nx), beyond (n): see Solution.modes; layout: Layout; matrix: Blocks; factor: its Factor; covariance: Blocks of the
         inverse, for the same nodes
 
     Raises LinAlgError where the matrix is not positive definite.
@@ -33,7 +33,8 @@ class Posterior:
     def __init__(self, solution, exposures, *, fit_sky=False, fit_shifts=False):
         n, n_channels = solution.spectra.shape
         self.solution = solution
-        self.modes = [solution.modes(i) for i in range(n)]
+        pairs = [solution.modes(i) for i in range(n)]
+        self.modes, self.beyond = [m for m, _ in pairs], [far for _, far in pairs]
         self.layout = Layout(
             np.array([len(m) for m in self.modes]),
             n_channels,
@@ -78,6 +79,7 @@ class Posterior:
             colour * unit[:, None] * unit,
             self._moments(owner, n_sources, error),
             tuple(self._map(i) for i in range(len(self.modes))),
+            np.array([far.sums for far in self.beyond]),
         )
 
     def draws(self, unit) -> Draws:
@@ -89,9 +91,10 @@ class Posterior:
         s, slopes = self.solution, []
         flux = np.zeros((n_sources, self.layout.n_channels))
         for i, (modes, morph) in enumerate(zip(self.modes, s.morphs, strict=True)):
-            total = morph.sum()
+            far = self.beyond[i]
+            total = morph.sum() + far.sums[0]
             flux[owner[i]] += s.spectra[i] * total
-            by_mode = np.outer(s.spectra[i], modes.sum((1, 2)))
+            by_mode = np.outer(s.spectra[i], modes.sum((1, 2)) + far.slopes[0])
             slopes.append(np.concatenate([by_mode, total * np.eye(len(by_mode))], axis=1))
         return flux, slopes
 
@@ -105,12 +108,14 @@ class Posterior:
             n_modes = sum(len(self.modes[i]) for i in own)
             if not n_modes or not light.any():
                 continue
-            slopes = moments_of(s.scene.origin[own], [s.morphs[i] for i in own], light)
+            far = np.array([self.beyond[i].sums for i in own])
+            slopes, by_far = moments_of(s.scene.origin[own], [s.morphs[i] for i in own], light, far)
             rows = []
             for i, slope, part in zip(own, slopes, light, strict=True):
                 flat, images = slope.reshape(5, -1), self.modes[i]
-                by_mode = part * flat @ images.reshape(len(images), flat.shape[1]).T
-                by_light = flat @ s.morphs[i].ravel()
+                by_mode = flat @ images.reshape(len(images), flat.shape[1]).T
+                by_mode = part * (by_mode + by_far @ self.beyond[i].slopes)
+                by_light = flat @ s.morphs[i].ravel() + by_far @ self.beyond[i].sums
                 rows.append(np.concatenate([by_mode, by_light[:, None] * weight], axis=1))
             covariance = np.zeros((5, 5))
             for a, i in enumerate(own):
