@@ -3,12 +3,13 @@
     python -m bench.coverage [--quick] [--scenes N] [--json FILE]
 
 A row is one quantity of the galaxies of one kind, fitted in one mode, in one bin of signal to noise
-(true flux over reported error; of all bands together for what belongs to the galaxy) or in all bins
-together, from 3 on; a bin without an upper end has snr_high = null in the JSON:
+(true flux over reported error; of the fainter band for a colour, of all together for what else
+belongs to the galaxy) or in all bins together, from 3 on; a bin without an upper end has
+snr_high = null in the JSON:
 
 mode        joint, euclid or rubin
 galaxies    parametric: bulge, disk and knots; cosmos: real ones whose light is not clearly negative
-quantity    flux, and those of colour, position, size, ellipticity whose errors a catalogue has
+quantity    flux, colour (of neighbouring bands), position, size, ellipticity
 n           values; of a flux one for each galaxy and band
 coverage    share of |estimate - truth| < error: 0.683 where errors are right and normal
 error       standard error of that share over scenes, whose galaxies and bands hang together
@@ -58,13 +59,24 @@ COLUMNS = (
 )
 
 
-def measure(galaxies, mode, folder, seeds, negative=NEGATIVE):
+def make_scene(galaxies, folder, seed, noise=None):
+    """A `SimulatedScene` of one of GALAXIES.
+
+    folder: of the COSMOS galaxies; noise: function (scene, rng) -> the scene with other noise, a
+        module's own so that processes can be given it
+    """
+    scene = simulate_scene(seed) if galaxies == "parametric" else scenes.opened(folder).take(seed)
+    return scene if noise is None else noise(scene, np.random.default_rng(seed))
+
+
+def measure(galaxies, mode, folder, seeds, negative=NEGATIVE, noise=None):
     """What `truth.compare` finds in scenes of these seeds, and how their fits ended.
 
+    noise: see `make_scene`
     returns [{quantity: (4, n)}, ...], one for each scene that could be fitted; [status, ...]
     """
     parametric = galaxies == "parametric"
-    found = [simulate_scene(i) if parametric else scenes.opened(folder).take(i) for i in seeds]
+    found = [make_scene(galaxies, folder, seed, noise) for seed in seeds]
     results = scenes.fit([scenes.blend(scene, mode) for scene in found])
     values = []
     for scene, result in zip(found, results, strict=True):

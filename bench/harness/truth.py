@@ -2,7 +2,7 @@
 
 quantity      columns of the catalogue, each with a column of its error; truth
 flux          flux_CHANNEL [uJy]; that of the whole galaxy, also beyond the stamp
-colour        colour_A_B or colour_A-B [mag]; difference of the magnitudes
+colour        colour_A_B [mag]; difference of the magnitudes
 position      y_centroid, x_centroid [model px]; centroid of the galaxy's true model image
 size          size [arcsec]; from second moments of the same image
 ellipticity   e1, e2 [1]; likewise
@@ -35,10 +35,10 @@ def compare(result, scene, mode, *, keep=slice(None)):
 
     keep (S,): which galaxies count
     returns {quantity: (4, n)}, rows: signal to noise, estimate, truth, error. Signal to noise is
-        true flux over reported error: of the channel for a flux, of all channels together, squares
-        added, for what belongs to the galaxy.
+        true flux over reported error: of the channel for a flux, of the fainter one of two for a
+        colour, of all channels together, squares added, for what belongs to the galaxy.
     """
-    table = catalogue(result)
+    table = catalogue(result, magnitudes=True)
     truths = _truths(scene, mode, table.colnames)
     snr = {name: truths[name] / _error(table, name) for name in truths if name.startswith("flux_")}
     whole = np.sqrt(sum(np.where(np.isfinite(s), s, 0) ** 2 for s in snr.values()))
@@ -48,7 +48,12 @@ def compare(result, scene, mode, *, keep=slice(None)):
         if error is None:
             continue
         value = np.asarray(table[name], float)
-        values = np.stack([snr.get(name, whole), value, truth, error])
+        parts = name.split("_")[1:]
+        if _quantity(name) == "colour":
+            own = np.minimum(*(snr[f"flux_{channel}"] for channel in parts))
+        else:
+            own = snr.get(name, whole)
+        values = np.stack([own, value, truth, error])
         found[_quantity(name)].append(values[:, keep])
     joined = {name: np.concatenate(parts, axis=1) for name, parts in found.items() if parts}
     return {name: _measured(values) for name, values in joined.items()}
@@ -69,7 +74,7 @@ def _truths(scene, mode, columns):
     truths = {f"flux_{b}": 10 ** (-0.4 * (m - ZERO_POINT_UJY)) for b, m in magnitudes.items()}
     for a, of_a in magnitudes.items():
         for b, of_b in magnitudes.items():
-            truths |= {f"colour_{a}{sign}{b}": of_a - of_b for sign in "-_"}
+            truths[f"colour_{a}_{b}"] = of_a - of_b
     axes, found = local_axes(scene.euclid.grid, np.zeros(2)), []
     for image in scene.euclid.truth:
         centroid, second = moments([SimpleNamespace(origin=(0, 0), morphology=image)], np.ones(1))

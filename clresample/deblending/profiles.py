@@ -141,6 +141,14 @@ class Galaxy(Shape):
         """The profile and its four slopes, (5, Ny, Nx): on the frame, or on a box of a `shape`."""
         return profile(theta, position, shape or self.shape, self._psf_moment)
 
+    def place_slopes(self, theta, position, image):
+        """Slopes (2, ny, nx) by the position (y, x) [px] of `image`, what is drawn there."""
+        inverse, beta = np.linalg.inv(covariance(theta, self._psf_moment)[0]), np.exp(theta[3])
+        dy, dx = (np.arange(n) - p for n, p in zip(image.shape, position, strict=True))
+        along = np.tensordot(inverse, np.stack(np.broadcast_arrays(dy[:, None], dx)), 1)
+        q = dy[:, None] * along[0] + dx * along[1]
+        return 2 * image * (beta + 1) / (2 * beta + q) * along
+
 
 class Given(Shape):
     """A profile (Ny, Nx) that comes with the source; no parameters."""

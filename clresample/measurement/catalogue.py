@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import IntFlag
+from itertools import pairwise
 
 import numpy as np
 from astropy import units as u
@@ -12,7 +13,7 @@ from astropy.wcs.utils import wcs_to_celestial_frame
 from ..sky.footprint import open_edge
 from ..sky.observation import ZERO_POINT_UJY
 from ..sky.wcs import local_axes
-from .photometry import flux_scale, fluxes
+from .photometry import channel_covariances, flux_scale, fluxes
 from .quality import box_chi2, fitted_sources, labels
 from .residuals import channel_residuals, misfits
 from .shapes import moments, shape, shape_slopes
@@ -56,7 +57,7 @@ MEANINGS = {
 def catalogue(result, *, magnitudes=False) -> QTable:
     """The catalogue of a fitted blend: one row per source, columns with units.
 
-    result: a fitted blend; magnitudes: add the columns of magnitudes
+    result: a fitted blend; magnitudes: add the columns of magnitudes and colours
     returns QTable (S rows, in the order of `result.sources`); what was not measured is NaN:
         name: the source's own, or its number
         ra, dec [deg], or what the frame's WCS calls them; y_sky, x_sky [arcsec] on a flat sky; and
@@ -67,13 +68,17 @@ def catalogue(result, *, magnitudes=False) -> QTable:
         *_centroid: the same positions, of the fitted light
         size [arcsec], e1, e2, angle [deg]: see `shapes.shape`. They are those of the model under
             the model's PSF, not deconvolved; a source's components are weighted by their flux, that
-            of all channels, each in units of its error
+            of all channels, each in units of its error. Where the result has Errors, what the
+            smooth profile has beyond its box is counted
         *_centroid_err, size_err, e1_err, e2_err, angle_err: errors in the units of the values, to
             first order; ra's in degrees of ra, angle_err at most 52 deg, that of an unknown angle.
             NaN where the result has no Errors, and where the shape was not fitted, as stars'
         flux_*, flux_err_* per channel [uJy where observations have zero points, else counts]: see
             `fluxes`
         mag_*, mag_err_* per channel [mag, AB]: where the flux is positive
+        colour_A_B, colour_err_A_B [mag]: mag_A - mag_B of channels A, B next to each other; the
+            error from the covariance of the two fluxes, see `channel_covariances`, to first order:
+            of use where both are detected
         chi2_* per observation: mean chi2 of the pixels with weight in the source's box, of all
             channels and with all sources' models
         residual_* per channel [sigma]: the largest residual on the source once filtered with the
@@ -97,6 +102,8 @@ def catalogue(result, *, magnitudes=False) -> QTable:
         table[f"flux_err_{channel}"] = error[:, i] * scale[i] * unit[i]
         if magnitudes and unit[i] == u.uJy:
             _add_magnitudes(table, channel, flux[:, i] * scale[i], error[:, i] * scale[i])
+    if magnitudes:
+        _add_colours(table, result, flux)
     for i, label in enumerate(labels(result)):
         table[f"chi2_{label}"] = box_chi2(result, i, result.footprints[i])
     worst = channel_residuals(result)
@@ -125,11 +132,13 @@ def _add_shapes(table, result, error):
     centroids, sizes = np.full((n_sources, 2), np.nan), np.full((n_sources, 4), np.nan)
     shape_errors = sizes.copy()
     for s in np.flatnonzero(fitted_sources(result)):
-        parts = [c for c in result.components if c.source == s]
+        own = [i for i, c in enumerate(result.components) if c.source == s]
+        parts = [result.components[i] for i in own]
+        beyond = None if result.errors is None else result.errors.beyond[own]
         good = np.isfinite(error[s]) & (error[s] > 0)
         weight = np.where(good, 1 / np.where(good, error[s], 1.0), 0.0)
         light = np.array([weight @ c.flux for c in parts])
-        centroids[s], second = moments(parts, light)
+        centroids[s], second = moments(parts, light, beyond)
         if np.isfinite(centroids[s]).all():
             axes = local_axes(result.frame.grid, centroids[s])
             sizes[s] = shape(axes @ second @ axes.T)
@@ -174,6 +183,23 @@ def _add_magnitudes(table, channel, flux_ujy, error_ujy):
     flux_ujy = np.where(flux_ujy > 0, flux_ujy, np.nan)
     table[f"mag_{channel}"] = (ZERO_POINT_UJY - 2.5 * np.log10(flux_ujy)) * u.mag
     table[f"mag_err_{channel}"] = 2.5 / np.log(10) * error_ujy / flux_ujy * u.mag
+
+
+def _add_colours(table, result, flux):
+    """Columns of colours of neighbouring channels that have magnitudes; flux (S, C) [counts]."""
+    covariance, names = channel_covariances(result), result.channels
+    for i, (a, b) in enumerate(pairwise(names)):
+        if f"mag_{a}" not in table.colnames or f"mag_{b}" not in table.colnames:
+            continue
+        one, other = (np.where(flux[:, k] > 0, flux[:, k], np.nan) for k in (i, i + 1))
+        slopes = np.stack([1 / one, -1 / other], axis=1)  # of ln(flux ratio)
+        both = covariance[:, i : i + 2, i : i + 2]
+        with np.errstate(invalid="ignore"):  # infinite variances
+            error = np.sqrt(np.einsum("sa,sab,sb->s", slopes, both, slopes))
+        known = np.isfinite(both).all((1, 2))
+        table[f"colour_{a}_{b}"] = table[f"mag_{a}"] - table[f"mag_{b}"]
+        error = np.where(known, error, np.where(np.isfinite(slopes).all(1), np.inf, np.nan))
+        table[f"colour_err_{a}_{b}"] = 2.5 / np.log(10) * error * u.mag
 
 
 def _flags(result, flux, error, positions, footprints):

@@ -18,7 +18,8 @@ def fluxes(result):
         F_s = sum_i A_i |S_i|,  cov(F_s, F_t) = sum_ij |S_i| cov(A_i, A_j) |S_j|,  |S| = sum of S
 
     over the components i of s and j of t: with morphologies fixed. Where the result has Errors, the
-    covariances are theirs, marginal over morphologies.
+    covariances are theirs, marginal over morphologies, and |S| has what the smooth profile holds
+    beyond its box, where it is under the noise: a percent of the flux at signal to noise 10.
 
     result: a fitted blend
     returns flux (S, C) [counts]: NaN for a source without components; covariance (C, S, S)
@@ -28,6 +29,8 @@ def fluxes(result):
     sums = np.zeros((len(result.sources), len(result.components)))
     for i, component in enumerate(result.components):
         sums[component.source, i] = component.morphology.sum(dtype=np.float64)
+        if result.errors is not None:
+            sums[component.source, i] += result.errors.beyond[i, 0]
     flux = sums @ spectra_of(result)
     flux[~fitted_sources(result)] = np.nan
     known = np.isfinite(np.diagonal(result.covariance, axis1=1, axis2=2))  # (C, n)
@@ -42,6 +45,23 @@ def fluxes(result):
     summed[i_channel, i_source] = summed[i_channel, :, i_source] = 0.0
     summed[i_channel, i_source, i_source] = np.inf
     return flux, summed
+
+
+def channel_covariances(result):
+    """Covariances (S, C, C) [counts^2] of each source's fluxes between channels.
+
+    Morphologies that are not known move the fluxes of all channels together, so that colours are
+    known better than fluxes. Without Errors channels are independent. Settings.flux_floor is in it
+    as common to all channels. The variance is infinite as in `fluxes`.
+    """
+    variance = np.diagonal(fluxes(result)[1], axis1=1, axis2=2).T  # (S, C)
+    found = np.zeros((*variance.shape, variance.shape[1]))
+    if result.errors is not None:
+        both = np.isfinite(variance)[:, :, None] & np.isfinite(variance)[:, None, :]
+        found = np.where(both, result.errors.colour, 0.0)
+    i = np.arange(variance.shape[1])
+    found[:, i, i] = variance
+    return found
 
 
 def redistribute(result, i_observation) -> np.ndarray:

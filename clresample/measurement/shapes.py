@@ -5,23 +5,28 @@ from __future__ import annotations
 import numpy as np
 
 
-def moments(components, light):
+def moments(components, light, beyond=None):
     """Centroid and second moments of a source's components, weighted by their light.
 
         c = sum_x x I(x) / sum_x I(x),   Q = sum_x (x - c)(x - c)^T I(x) / sum_x I(x)
 
-    components (k): with `origin` and `morphology`; light (k,): share of each in I, any unit; where
-        there is no light at all, components count alike
+    components (k): with `origin` and `morphology`; light (k,): share of each in I, in its box, any
+        unit; where there is no light at all, components count alike
+    beyond (k, 6): sums over what each has beyond its box, see Errors.beyond; None: nothing
     returns c (2,) [px] and Q (2, 2) [px^2], rows and columns (y, x); NaN where every morphology is
         zero, or the light no number
     """
     if not np.any(light):
         light = np.ones(len(components))
+    beyond = np.zeros((len(components), 6)) if beyond is None else beyond
     parts = []
-    for component, weight in zip(components, light, strict=True):
+    for component, weight, more in zip(components, light, beyond, strict=True):
         morphology = np.asarray(component.morphology, dtype=np.float64)
         if morphology.any():
+            inside = morphology.sum()
             parts.append((weight, *_moments(morphology, component.origin)))
+            if more[0] > 0:
+                parts.append((weight * more[0] / inside, *_moments_of_sums(more)))
     if not parts:
         return np.full(2, np.nan), np.full((2, 2), np.nan)
     weights, centroids, seconds = (np.array(values) for values in zip(*parts, strict=True))
@@ -30,6 +35,12 @@ def moments(components, light):
     away = centroids - centroid
     seconds = seconds + away[:, :, None] * away[:, None, :]
     return centroid, np.tensordot(weights, seconds, 1)
+
+
+def _moments_of_sums(sums):
+    """Centroid and second moments about it, of sums (6,) as in `moments`."""
+    y, x, yy, yx, xx = sums[1:] / sums[0]
+    return np.array([y, x]), np.array([[yy - y * y, yx - y * x], [yx - y * x, xx - x * x]])
 
 
 def _moments(image, origin):

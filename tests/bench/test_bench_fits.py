@@ -91,7 +91,7 @@ def test_values_with_errors_are_found_by_their_columns(monkeypatch):
     table["y_centroid_err"] = [0.5, np.nan] * u.pix
     table["e1"], table["e1_err"] = [0.1, 0.2], [0.3, 0.3]
     table["size"] = [1, 1] * u.arcsec  # without errors
-    monkeypatch.setattr(truth, "catalogue", lambda _: table)
+    monkeypatch.setattr(truth, "catalogue", lambda _, magnitudes: table)
     found = truth.compare(None, scene, "euclid")
     assert found.keys() == {"flux", "position", "ellipticity"}
     np.testing.assert_allclose(found["flux"][0], 10)

@@ -10,8 +10,8 @@ from helpers.scenes import BRIGHT, blend
 from scipy.signal import fftconvolve
 
 from clresample.deblending.batch import deblend, deblend_many
-from clresample.deblending.posterior import normal, posterior as room
-from clresample.deblending.posterior.bumps import Bumps
+from clresample.deblending.posterior import exposure
+from clresample.deblending.posterior.bumps import Bumps, uncorrelated
 from clresample.deblending.posterior.moments import moments_of
 from clresample.deblending.posterior.profile_modes import profile_modes
 from clresample.deblending.profiles import Galaxy, Given, Star
@@ -61,17 +61,21 @@ def test_blended_sources_exchange_light(device, monkeypatch):
     assert correlation < -0.5
 
 
-@pytest.mark.parametrize("fit_sky", [False, True])
+@pytest.mark.parametrize("free", [{}, {"fit_sky": True, "fit_shifts": True}], ids=["", "free"])
 @pytest.mark.parametrize("objects", [BRIGHT, PAIR], ids=["apart", "blended"])
-def test_the_normal_matrix_is_that_of_the_rendered_frame(device, monkeypatch, objects, fit_sky):
-    """Where the boxes' reaches are the whole image; and close to it with the usual ones."""
+@pytest.mark.parametrize("angle", [0, 20])
+def test_the_normal_matrix_is_that_of_the_rendered_frame(device, monkeypatch, objects, free, angle):
+    """By the operators, on all pixels of whole frames; turned pixels are replaced by others."""
     found, kept = [], capture(monkeypatch)
-    for reach in (normal.REACH_FWHM, 100.0):
-        monkeypatch.setattr(normal, "REACH_FWHM", reach)
-        settings = Settings(flux_floor=0, fit_sky=fit_sky)
-        found.append(scenes.fit(blend(objects), device, settings=settings))
-    for one, tolerance in zip(kept, (3e-2, 1e-4), strict=True):
-        np.testing.assert_allclose(one.scaled, full_matrix(one), atol=tolerance)
+    for reach in (exposure.REACH_FWHM, 100.0):
+        monkeypatch.setattr(exposure, "REACH_FWHM", reach)
+        settings = Settings(flux_floor=0, **free)
+        found.append(scenes.fit(blend(objects, angle=angle), device, settings=settings))
+    for one, tolerance in zip(kept, (3e-2, 3e-2 if angle else 3e-3), strict=True):
+        wanted = full_matrix(one)
+        scale = np.sqrt(np.diag(wanted))
+        scale = scale[:, None] * scale
+        np.testing.assert_allclose(one.matrix / scale, wanted / scale, atol=tolerance)
     np.testing.assert_allclose(errors(found[0]), errors(found[1]), rtol=0.01)
 
 
@@ -110,8 +114,14 @@ def test_bumps_are_convolutions_by_definition():
     np.testing.assert_allclose(
         bumps.images, np.sqrt(profile) * seen * scale[:, None, None], atol=1e-9
     )
-    expected = gram * scale[:, None] * scale + 1e-7 * np.eye(len(gram))
+    expected = gram * scale[:, None] * scale
     np.testing.assert_allclose(bumps.precision, expected, atol=1e-9)
+    # one number each: the same covariance of the pixels
+    own = uncorrelated(bumps.images, bumps.precision)
+    pixels = [images.reshape(len(images), -1) for images in (bumps.images, own)]
+    covariance = pixels[0].T @ np.linalg.pinv(bumps.precision, rcond=1e-8) @ pixels[0]
+    largest = np.abs(covariance).max()
+    np.testing.assert_allclose(pixels[1].T @ pixels[1], covariance, atol=1e-4 * largest)
 
 
 @pytest.mark.parametrize("kind", ["galaxy", "given", "star"])
@@ -127,7 +137,8 @@ def test_slopes_are_finite_differences(kind):
         )
     drawn = shape.draw(theta, position)[0]
     profile = (drawn / drawn.max())[box]
-    images, scatter = profile_modes(shape, theta, position, profile, box)
+    low = np.array([part.start for part in box])
+    images, scatter, far = profile_modes(shape, theta, position, profile, low)
     assert len(images) == len(scatter) == {"galaxy": 8, "given": 4, "star": 2}[kind]
     for i, d in enumerate(e * np.eye(len(theta))):
         change = shape.draw(theta + d, position)[0] - shape.draw(theta - d, position)[0]
@@ -136,8 +147,10 @@ def test_slopes_are_finite_differences(kind):
         for i, d in enumerate(e * np.eye(2)):
             change = shape.draw(theta, position + d)[0] - shape.draw(theta, position - d)[0]
             np.testing.assert_allclose(
-                images[4 + i], change[box] / (2 * e) / drawn.max(), atol=2e-3
+                images[4 + i], change[box] / (2 * e) / drawn.max(), atol=1e-6
             )
+    if kind != "galaxy":
+        assert not far.sums.any()
     if kind != "star":
         np.testing.assert_allclose(images[-2:], [profile**2, profile**0.5])
         assert images[-4][5].sum() < 0 < images[-4][16].sum()  # moved to larger y: less light below
@@ -149,15 +162,42 @@ def test_slopes_of_moments_are_finite_differences():
     morphs = [rng.random((7, 9)), rng.random((6, 8))]
     change = [rng.normal(size=m.shape) for m in morphs]
 
+    sums = np.abs(rng.random((2, 6))) * [2, 10, 10, 100, 30, 100]
+    more = rng.normal(size=(2, 6))
+
     def at(e):
         moved = [m + e * d for m, d in zip(morphs, change, strict=True)]
         parts = [Component(0, tuple(o), m, np.ones(1)) for o, m in zip(origins, moved, strict=True)]
-        c, q = moments(parts, [a * m.sum() for a, m in zip(light, moved, strict=True)])
+        inside = [a * m.sum() for a, m in zip(light, moved, strict=True)]
+        c, q = moments(parts, inside, sums + e * more)
         return np.array([*c, q[0, 0], q[1, 0], q[1, 1]])
 
-    slopes = moments_of(origins, morphs, light)
+    slopes, by_sums = moments_of(origins, morphs, light, sums)
     found = sum(a * np.tensordot(s, d, 2) for a, s, d in zip(light, slopes, change, strict=True))
+    found = found + by_sums @ (light @ more)
     np.testing.assert_allclose(found, (at(1e-5) - at(-1e-5)) / 2e-5, rtol=1e-6)
+
+
+def test_what_lies_beyond_a_box_is_counted(device):
+    """Flux, place and size are those of the whole profile, wherever the box ends."""
+    home, position = scenes.frame(), np.array([13.3, 15.8])
+    shape, theta = Galaxy(home), np.array([0.9, 0.2, -0.1, 1.0])
+    whole = shape.draw(theta, position + 60, (150, 156))[0]
+    whole /= whole.max()
+    low = np.array([4, 6])
+    box = whole[64:84, 66:86]
+    _, _, far = profile_modes(shape, theta, position, box, low)
+    y, x = (np.arange(n) - 60.0 for n in whole.shape)
+    for k, (a, b) in enumerate(((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))):
+        wanted = (y**a @ whole @ x**b) - (y[64:84] ** a @ box @ x[66:86] ** b)
+        if a + b < 2:
+            assert far.sums[k] == pytest.approx(wanted, rel=0.25)
+    assert far.sums[0] > 0.01 * box.sum()
+    result = scenes.fit(blend(BRIGHT), device)
+    total = fluxes(result)[0]
+    for i, c in enumerate(result.components):
+        more = 1 + result.errors.beyond[i, 0] / c.morphology.sum()
+        np.testing.assert_allclose(total[i], c.flux * more)
 
 
 def test_draws_scatter_as_the_errors_say(fitted):
@@ -230,13 +270,6 @@ def test_other_priors_keep_errors_of_fixed_morphologies(device, prior):
     assert np.isnan(catalogue(result)["size_err"]).all()
     with pytest.raises(ValueError, match="draw"):
         result.sample(1, np.random.default_rng(0))
-
-
-def test_too_many_unknowns_are_reported(device, monkeypatch):
-    monkeypatch.setattr(room, "MOST_UNKNOWNS", 40)
-    result = scenes.fit(blend(BRIGHT), device)
-    assert result.errors is None and np.isfinite(errors(result)).all()
-    assert "fixed morphologies: more than 40 unknowns" in result.messages[-1]
 
 
 def test_a_channel_that_sees_nothing(device):

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from clresample.deblending.posterior import posterior as room
-from clresample.deblending.posterior.modes import Modes
-from clresample.deblending.posterior.normal import RIDGE, Layout, factor
+from clresample.deblending.posterior.blocks import RIDGE
+from clresample.deblending.posterior.normal import Layout
+from clresample.deblending.shifts import SCATTER_PX
 
 
 @dataclass(frozen=True)
@@ -18,9 +19,15 @@ class Kept:
     unit: np.ndarray
 
     @property
-    def scaled(self):
-        """Its normal matrix (N, N), of unit diagonal."""
-        return self.posterior.lower @ self.posterior.lower.T
+    def matrix(self):
+        """Its normal matrix (N, N), node after node."""
+        return self.posterior.matrix.dense()
+
+
+def scaled(matrix):
+    """A matrix with a diagonal of 1."""
+    scale = np.sqrt(np.diag(matrix))
+    return matrix / scale[:, None] / scale
 
 
 def capture(monkeypatch):
@@ -37,51 +44,57 @@ def capture(monkeypatch):
 
 
 def full_matrix(kept, modes=None):
-    """The normal matrix (N, N), of images rendered over the whole frame; scaled as `kept.scaled`.
+    """The normal matrix (N, N), of images rendered over the whole frame, node after node.
 
-    modes (n): other Modes than the posterior's; then not scaled
+    modes (n): other modes than the posterior's
     """
     p, scene = kept.posterior, kept.posterior.solution.scene
-    layout = p.layout
-    if modes is not None:
-        layout = Layout(np.cumsum([0, *map(len, modes)]), layout.n_channels, layout.n_sky)
-    images, at = [], []
-    for i, m in enumerate(modes or p.modes):
-        box = tuple(
-            slice(o, o + n) for o, n in zip(scene.origin[i], m.images.shape[1:], strict=True)
-        )
-        full = np.zeros((len(m) + 1, *scene.shape))
-        full[:, *box] = np.concatenate([m.images, p.solution.morphs[i][None]])
+    modes = modes or p.modes
+    layout = Layout(np.array([len(m) for m in modes]), *list(vars(p.layout).values())[1:])
+    starts = np.cumsum([0, *layout.sizes])
+    n_common = layout.n_sky + layout.n_shifts
+    images = []
+    for i, m in enumerate(modes):
+        box = tuple(slice(o, o + n) for o, n in zip(scene.origin[i], m.shape[1:], strict=True))
+        full = np.zeros((len(m) + 3, *scene.shape))
+        full[:-2, *box] = np.concatenate([m, p.solution.morphs[i][None]])
+        full[-2:] = np.gradient(full[-3])
         images.append(full)
-        at.append((layout.modes(i), layout.spectrum(i)))
-    matrix, channel = np.zeros((layout.size,) * 2), 0
-    for view in kept.views:
+    matrix, channel = np.zeros((starts[-1] if n_common else starts[len(modes)],) * 2), 0
+    for o, view in enumerate(kept.views):
         seen = [view.render(full) for full in images]
         for c in range(len(view.data)):
-            j = np.zeros((layout.size, view.root[c].size))
-            for i, (own, spectrum) in enumerate(at):
-                j[own] = p.solution.spectra[i, channel] * seen[i][:-1, c]
-                j[spectrum[channel]] = seen[i][-1, c]
+            j = np.zeros((len(matrix), view.root[c].size))
+            for i, at in enumerate(starts[: len(modes)]):
+                k = len(modes[i])
+                j[at : at + k] = p.solution.spectra[i, channel] * seen[i][:-3, c]
+                j[at + k + channel] = seen[i][-3, c]
+                if layout.n_shifts and o:
+                    to = starts[len(modes)] + layout.n_sky + 2 * (o - 1)
+                    j[to : to + 2] += p.solution.spectra[i, channel] * seen[i][-2:, c]
             if layout.n_sky:
-                j[layout.sky(channel)] = view.root[c].ravel()
+                j[starts[len(modes)] + channel] = view.root[c].ravel()
             matrix += j @ j.T
             channel += 1
-    for (own, _), m in zip(at, modes or p.modes, strict=True):
-        matrix[np.ix_(own, own)] += m.precision
-    if modes is not None:
-        return matrix, layout
-    return matrix / p.scale[:, None] / p.scale + RIDGE * np.eye(len(matrix))
+    for at, m in zip(starts, modes, strict=False):
+        matrix[at : at + len(m), at : at + len(m)] += np.eye(len(m))
+    if layout.n_shifts:
+        matrix[-layout.n_shifts :, -layout.n_shifts :] += np.eye(layout.n_shifts) / SCATTER_PX**2
+    return matrix
 
 
 def dense_error(kept, i):
     """Errors (C,) [counts] of component i's fluxes, the structure of every pixel unknown."""
     s = kept.posterior.solution
     modes = [_dense_modes(kept.posterior, j) for j in range(len(s.morphs))]
-    matrix, layout = full_matrix(kept, modes)
-    lower, scale = factor(matrix)
-    slopes = np.zeros((layout.n_channels, layout.size))
-    slopes[:, layout.modes(i)] = np.outer(s.spectra[i], modes[i].images.sum((1, 2)))
-    slopes[:, layout.spectrum(i)] = s.morphs[i].sum() * np.eye(layout.n_channels)
+    matrix, n_channels = full_matrix(kept, modes), len(kept.unit)
+    at = sum(len(m) + n_channels for m in modes[:i])
+    slopes = np.zeros((n_channels, len(matrix)))
+    k = len(modes[i])
+    slopes[:, at : at + k] = np.outer(s.spectra[i], modes[i].sum((1, 2)))
+    slopes[:, at + k : at + k + n_channels] = s.morphs[i].sum() * np.eye(n_channels)
+    scale = np.sqrt(np.diag(matrix))
+    lower = np.linalg.cholesky(scaled(matrix) + RIDGE * np.eye(len(matrix)))
     half = np.linalg.solve(lower, (slopes / scale).T)
     return np.linalg.norm(half, axis=0) * kept.unit
 
@@ -97,10 +110,8 @@ def _dense_modes(posterior, i):
         rows, columns = (_toeplitz(twice, side) for side in profile.shape)
         covariance += a**2 * np.kron(rows, columns)
     root = np.linalg.cholesky(covariance).T.reshape(n, *profile.shape)
-    images = s._gauged(i, np.sqrt(np.maximum(profile, 0)) * root) / s.peaks[i]
-    old = posterior.modes[i]
-    precision = np.diag(np.append(np.ones(n), np.diag(old.precision)[-n_slopes:]))
-    return Modes(np.concatenate([images, old.images[-n_slopes:]]), precision)
+    images = s._gauged(i, np.sqrt(np.maximum(profile, 0)) * root)[0] / s.peaks[i]
+    return np.concatenate([images, posterior.modes[i][-n_slopes:]])
 
 
 def _toeplitz(taps, n):

@@ -6,14 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .blocks import Factor
+
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Errors of one blend's sources, marginal over morphologies, neighbours and a fitted sky.
+    """Errors of one blend's sources, marginal over morphologies, neighbours, fitted sky and shifts.
 
     S sources, C channels of all observations, n components.
 
-    flux (C, S, S) [counts^2]: covariance of the fluxes of one channel, Settings.flux_floor included
+    flux (C, S, S) [counts^2]: covariance of the fluxes of one channel, Settings.flux_floor
+        included; 0 between sources that share no light, what a common sky or shift does to them
+        left out
     colour (S, C, C) [counts^2]: covariance of one source's fluxes; the floor is common to all its
         channels, so that it does not enter ratios of fluxes
     moments (S, 5, 5) [px, px^2]: covariance of a source's centroid (y, x) and second moments
@@ -21,12 +25,16 @@ class Errors:
         not fitted: all of stars at a given place, the second moments of free ones
     morphology (n): arrays (ny, nx) [1]: standard deviation of each component's morphology, at a
         fixed projection onto its smooth profile
+    beyond (n, 6) [1, px, px^2]: no error, but what belongs to the fluxes and moments: the sums of
+        each component's smooth profile beyond its box, times 1, y, x, y y, y x, x x of the frame,
+        where the morphology has its maximum 1
     """
 
     flux: np.ndarray
     colour: np.ndarray
     moments: np.ndarray
     morphology: tuple[np.ndarray, ...]
+    beyond: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,23 +42,19 @@ class Draws:
     """What draws from the posterior are made of.
 
     modes (n): (k_i, ny, nx), images of each component's modes
-    lower (N, N), scale (N,): H = (scale lower) (scale lower)^T over all modes' coefficients, then
-        the spectra (n, C), then the sky levels
+    factor: of the normal matrix, whose node i is component i, its modes and then its spectrum (C,)
     unit (C,) [counts]: in which spectra count there
     """
 
     modes: list[np.ndarray]
-    lower: np.ndarray
-    scale: np.ndarray
+    factor: Factor
     unit: np.ndarray
 
     def draw(self, rng):
         """Changes of the morphologies (n arrays) and of the spectra (n, C) [counts]."""
-        normal = rng.standard_normal(len(self.scale))
-        values = np.linalg.solve(self.lower.T, normal) / self.scale
-        ends = np.cumsum([0, *(len(m) for m in self.modes)])
-        pairs = zip(self.modes, ends, strict=False)
-        morphs = [np.tensordot(values[at : at + len(m)], m, 1) for m, at in pairs]
-        n, n_channels = len(self.modes), len(self.unit)
-        spectra = values[ends[-1] : ends[-1] + n * n_channels].reshape(n, n_channels)
-        return morphs, spectra * self.unit
+        found = self.factor.draw(rng.standard_normal(sum(self.factor.sizes)))
+        morphs, spectra = [], []
+        for values, images in zip(found, self.modes, strict=False):
+            morphs.append(np.tensordot(values[: len(images)], images, 1))
+            spectra.append(values[len(images) :] * self.unit)
+        return morphs, np.array(spectra)

@@ -1,15 +1,16 @@
-"""All modes of a scene's components: which there are, and what is expected of them."""
+"""A fitted scene, and all modes of its components: what their morphologies may still be."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from ...sky.extent import box_slices, shared_part
+from ...sky.extent import shared_part
 from ..solver.learned.prior import LearnedPrior
 from ..solver.scene import Scene
-from .bumps import Bumps
+from .bumps import Bumps, uncorrelated
 from .profile_modes import profile_modes
 
 # Bumps that the prior allows to change a flux or a second moment by less than this many errors at
@@ -23,17 +24,6 @@ RATIO, FAINT = 0.05, 0.3
 # is held near its centre, twice as large, with which positions (0.80 in 68 % intervals) and
 # ellipticities (0.74) are over-covered.
 STRUCTURE_PX, WEIGHT, STRENGTH = 2.0, 10.0, 0.05
-
-
-@dataclass(frozen=True, eq=False)
-class Modes:
-    """The modes of one component: images (k, ny, nx) and the inverse (k, k) of their covariance."""
-
-    images: np.ndarray
-    precision: np.ndarray
-
-    def __len__(self):
-        return len(self.images)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,32 +58,32 @@ class Solution:
         out[j] = np.sqrt(wanted / (found.determined[i, j] + WEIGHT))
         return out
 
-    def modes(self, i) -> Modes:
-        """The modes of component i."""
+    def modes(self, i):
+        """Modes (k, ny, nx) of component i, whose coefficients the prior expects to scatter by 1,
+        each on its own; and its Beyond."""
         profile, scene = self.scene.profile[i], self.scene
-        box = box_slices(scene.origin[i], profile.shape)
-        slopes, scatter = profile_modes(
-            self.shapes[i], self.thetas[i], self.positions[i], profile, box
+        images, scatter, far = profile_modes(
+            self.shapes[i], self.thetas[i], self.positions[i], profile, scene.origin[i]
         )
-        images, precision = slopes, np.diag(scatter**-2.0)
+        images = scatter[:, None, None] * images
+        far = far.scaled(np.append(1, scatter) / self.peaks[i])
         if not scene.fixed[i]:
             bumps = Bumps(
                 scene.origin[i], profile, self.strengths(i), self.prior.kernels(), self._shared(i)
             )
             keep = self._change(i, bumps.images) > LEAST_CHANGE
-            k = int(keep.sum())
-            images = np.concatenate([bumps.images[keep], slopes])
-            precision = np.zeros((len(images),) * 2)
-            precision[:k, :k] = bumps.precision[np.ix_(keep, keep)]
-            precision[k:, k:] = np.diag(scatter**-2.0)
-        return Modes(self._gauged(i, images) / self.peaks[i], precision)
+            own = uncorrelated(bumps.images[keep], bumps.precision[np.ix_(keep, keep)])
+            images = np.concatenate([own, images])
+        images, along = self._gauged(i, images)
+        return images / self.peaks[i], far.gauged(along)
 
     def _gauged(self, i, images):
-        """Images without what lies along the profile, 0 where the morphology is at its bound."""
+        """Images without what lies along the profile, 0 where the morphology is at its bound; and
+        how much lay along it (k,)."""
         p = self.scene.profile[i]
         along = np.tensordot(images, p, 2) / max((p * p).sum(), 1e-30)
         images = images - along[:, None, None] * p
-        return images if self.scene.fixed[i] else np.where(self.morphs[i] > 0, images, 0)
+        return images if self.scene.fixed[i] else np.where(self.morphs[i] > 0, images, 0), along
 
     def _change(self, i, images):
         """What images (k, ny, nx) of scatter 1 change of flux and second moment [fixed errors]."""
@@ -114,11 +104,16 @@ class Solution:
         out[here] = np.linalg.norm(self.spectra[j]) / self.peaks[j] * profile[there]
         return out
 
+    @cached_property
+    def _boxes(self):
+        """First and one-past-last pixels (n, 2), (n, 2) of all boxes."""
+        return self.scene.origin, self.scene.origin + [p.shape for p in self.scene.profile]
+
     def _shared(self, i):
         """Where (ny, nx) component i may exchange light with another."""
-        own = self._light(i, i)
+        own, (low, high) = self._light(i, i), self._boxes
         shared = np.zeros(own.shape, bool)
-        for j in range(len(self.morphs)):
+        for j in np.flatnonzero(((low < high[i]) & (high > low[i])).all(1)):
             if j != i:
                 other = self._light(j, i)
                 shared |= (other > RATIO * own) & (other > FAINT) & (own > FAINT)

@@ -5,25 +5,34 @@ from __future__ import annotations
 import numpy as np
 
 
-def moments_of(origins, morphs, light):
-    """Slopes (5, ny, nx) of (y, x, yy, yx, xx) by the pixels of I = sum_i light_i S_i, in each box.
+def moments_of(origins, morphs, light, beyond=None):
+    """Slopes of (y, x, yy, yx, xx) of I = sum_i light_i S_i by the pixels of each S_i / light_i.
 
     origins (k, 2) [px], morphs (k): arrays (ny, nx); light (k,), any unit
+    beyond (k, 6): sums over what lies beyond the boxes, see Beyond; None: nothing
+    returns k arrays (5, ny, nx), and (5, 6), by the sums over what lies beyond
     """
     at = [
         tuple(axis + o for axis, o in zip(np.indices(m.shape), origin, strict=True))
         for origin, m in zip(origins, morphs, strict=True)
     ]
-    total = sum(part * m.sum() for part, m in zip(light, morphs, strict=True))
-
-    def mean(values):
-        """Of values (k) in the boxes, weighted by I."""
-        triples = zip(values, morphs, light, strict=True)
-        return sum(part * (v * m).sum() for v, m, part in triples) / total
-
-    c_y, c_x = mean([y for y, _ in at]), mean([x for _, x in at])
-    away = [(y - c_y, x - c_x) for y, x in at]
-    seconds = [np.array([dy * dy, dy * dx, dx * dx]) for dy, dx in away]
-    centre = np.array([mean([s[i] for s in seconds]) for i in range(3)])
-    pairs = zip(away, seconds, strict=True)
-    return [np.stack([*d, *(s - centre[:, None, None])]) / total for d, s in pairs]
+    beyond = np.zeros((len(morphs), 6)) if beyond is None else beyond
+    sums = light @ beyond
+    for (y, x), m, part in zip(at, morphs, light, strict=True):
+        sums = sums + part * np.array([(v * m).sum() for v in (1, y, x, y * y, y * x, x * x)])
+    total, (y, x, yy, yx, xx) = sums[0], sums[1:] / sums[0]
+    centre = np.array([yy - y * y, yx - y * x, xx - x * x])
+    slopes = []
+    for own_y, own_x in at:
+        dy, dx = own_y - y, own_x - x
+        second = np.array([dy * dy, dy * dx, dx * dx]) - centre[:, None, None]
+        slopes.append(np.concatenate([[dy, dx], second]) / total)
+    q = y * y - centre[0], y * x - centre[1], x * x - centre[2]
+    by_sums = [
+        [-y, 1, 0, 0, 0, 0],
+        [-x, 0, 1, 0, 0, 0],
+        [q[0], -2 * y, 0, 1, 0, 0],
+        [q[1], -x, -y, 0, 1, 0],
+        [q[2], 0, -2 * x, 0, 0, 1],
+    ]
+    return slopes, np.array(by_sums) / total

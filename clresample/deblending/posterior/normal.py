@@ -1,8 +1,9 @@
-"""The normal matrix of a scene about its solution: modes, spectra and sky in one.
+"""The normal matrix of a scene about its solution: modes, spectra, sky and shifts in one.
 
-Each component's modes are rendered from its box to the observed pixels that it reaches, by an
-operator of these alone, so that the cost follows the sources rather than the frame; components
-whose reaches meet have a block of the matrix together.
+Each component's modes are rendered from its box to the pixels within its reach; components whose
+reaches meet have a block of the matrix together. Components come in the order of their rows, and
+what is rendered of one is dropped once no other can reach it: memory follows the sources that meet,
+rather than all.
 """
 
 from __future__ import annotations
@@ -11,206 +12,177 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...resampling.plan import Precision, make_plan
-from ...resampling.resampler import Resampler
 from ...sky.extent import box_slices
-from ...sky.psf import PSF
-from ..view import WhitenedView, without_dark
+from ..shifts import SCATTER_PX
+from .blocks import Blocks
 
-# [FWHM of the observation's PSF] How far about its box a component's light is followed: beyond lie
-# 1 % of a Moffat profile's light and 1e-4 of its square, which the matrix is made of.
-REACH_FWHM = 3.0
-# Added to the unit diagonal of the matrix, so that what neither data nor prior know has a number.
-RIDGE = 1e-9
-# [model px] Departure from an affine mapping that a box of a distorted one may have, as for frames.
-TOLERANCE_PX = 1e-4
-
-
-@dataclass(frozen=True, eq=False)
-class Exposure:
-    """An observation as the matrix needs it: its view, and what operators of boxes are made of.
-
-    psf_in, psf_out: PSFs of the model and of the view; reach_px [model px]: see REACH_FWHM
-    """
-
-    view: WhitenedView
-    psf_in: PSF
-    psf_out: PSF
-    reach_px: float
-
-    @classmethod
-    def of(cls, view, frame, observation):
-        """That of an Observation and its view."""
-        scale = np.sqrt(abs(np.linalg.det(view.mapping.matrix)))
-        reach = REACH_FWHM * float(observation.psf.fwhm_px.max()) * scale
-        return cls(view, frame.psf, observation.white.psf, reach)
-
-    def observe(self, images, origin, low, size):
-        """Unit-spectrum images (k, Co, ry, rx) on `size` observed pixels from `low` on, of images
-        (k, ny, nx) in a box of the frame from `origin` on."""
-        op, margin = self.view.op, int(np.ceil(self.reach_px)) + 1  # pixels off a model are 0
-        images = np.pad(images, ((0, 0), (margin, margin), (margin, margin)))
-        mapping = op.plans[0].mapping.window(
-            np.asarray(origin) - margin, images.shape[1:], low, size, tolerance_px=TOLERANCE_PX
-        )
-        plan = make_plan(mapping, self.psf_in, self.psf_out, precision=Precision.of(op.dtype))
-        boxed = Resampler.from_plans([plan], dtype=op.dtype, device=op.device, shift=op.shift)
-        return boxed.render(without_dark(images.astype(op.dtype)))
+# [1] Products of this size and more are summed in float64: in float32 they round to what the prior,
+# which is 1, says of a mode. A source of signal to noise 300 has products of 1e5.
+LARGE = 1e5
 
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where unknowns are: modes of all n components, then spectra (n, C), then sky levels (C or 0).
+    """Where unknowns are: a node for each of n components, its modes and then its spectrum (C,);
+    and one of all, of sky levels (C or 0) and shifts (n_observations - 1, 2) or none, if any.
 
-    ends (n + 1,): of the components' modes; n_channels, n_sky; size: of all
+    counts (n,): of the components' modes; n_channels, n_sky, n_shifts
     """
 
-    ends: np.ndarray
+    counts: np.ndarray
     n_channels: int
-    n_sky: int
+    n_sky: int = 0
+    n_shifts: int = 0
 
     @property
-    def size(self) -> int:
-        """N."""
-        return int(self.ends[-1]) + (len(self.ends) - 1) * self.n_channels + self.n_sky
+    def sizes(self):
+        """Of the nodes (n or n + 1,)."""
+        common = self.n_sky + self.n_shifts
+        return np.append(self.counts + self.n_channels, [common] if common else []).astype(int)
 
-    def modes(self, i):
-        """Unknowns (k,) that are the modes of component i."""
-        return np.arange(self.ends[i], self.ends[i + 1])
+    @property
+    def common(self):
+        """The number of the node of all."""
+        return len(self.counts)
 
-    def spectrum(self, i):
-        """Unknowns (C,) that are the spectrum of component i."""
-        return self.ends[-1] + i * self.n_channels + np.arange(self.n_channels)
-
-    def sky(self, c):
-        """The unknown that is the level of channel c."""
-        return self.size - self.n_sky + c
+    def shift(self, o):
+        """Unknowns (2,) of observation o's shift in the node of all; None where it has none."""
+        if not self.n_shifts or o == 0:
+            return None
+        return self.n_sky + 2 * (o - 1) + np.arange(2)
 
 
-def normal_matrix(scene, exposures, morphs, modes, spectra, layout):
-    """J^T J + prior^-1 (N, N).
+def normal_matrix(scene, exposures, morphs, modes, spectra, layout) -> Blocks:
+    """J^T J + prior^-1.
 
     scene: Scene; exposures: an Exposure of each observation
-    morphs (n): arrays (ny, nx); modes (n): Modes; spectra (n, C), in the views' units
+    morphs (n): arrays (ny, nx); modes (n): arrays (k, ny, nx); spectra (n, C), in the views' units
     """
-    matrix = np.zeros((layout.size,) * 2)
-    columns = [
-        np.concatenate([m.images, s[None]]).astype(np.float32)
-        for m, s in zip(modes, morphs, strict=True)
-    ]
-    channels = scene.channels()
-    for exposure, part in zip(exposures, channels, strict=True):
-        rows, root = _Rows(scene, exposure, columns), exposure.view.root
-        for i, j, c, gram in rows.products():
-            block = _Block(layout, i, j, part.start + c)
-            block.add(matrix, gram, spectra)
-        if layout.n_sky:
-            for c in range(part.stop - part.start):
-                at = layout.sky(part.start + c)
-                matrix[at, at] += (root[c] ** 2).sum()
-            for i, c, product in rows.levels():
-                at, channel = layout.sky(part.start + c), part.start + c
-                scaled = np.append(product[:-1] * spectra[i, channel], product[-1])
-                own = np.append(layout.modes(i), layout.spectrum(i)[channel])
-                matrix[at, own] += scaled
-                matrix[own, at] += scaled
+    matrix = Blocks(layout.sizes)
     for i, m in enumerate(modes):
-        own = layout.modes(i)
-        matrix[np.ix_(own, own)] += m.precision
+        matrix.block(i, i)[: len(m), : len(m)] += np.eye(len(m))
+    if layout.n_shifts:
+        at = layout.n_sky + np.arange(layout.n_shifts)
+        matrix.block(layout.common, layout.common)[at, at] += SCATTER_PX**-2
+    for o, (exposure, part) in enumerate(zip(exposures, scene.channels(), strict=True)):
+        _Sum(matrix, layout, exposure, o, part).run(scene.origin, morphs, modes, spectra)
     return matrix
 
 
-def factor(matrix):
-    """lower (N, N) and scale (N,) with matrix = (scale lower) (scale lower)^T, but for RIDGE."""
-    scale = np.sqrt(np.diag(matrix))
-    scale[scale == 0] = 1
-    lower = np.linalg.cholesky(matrix / scale[:, None] / scale + RIDGE * np.eye(len(scale)))
-    return lower, scale
-
-
 @dataclass(frozen=True, eq=False)
-class _Block:
-    """Where products of components i and j in one channel go."""
+class _Seen:
+    """What an observation sees of one component.
 
-    layout: Layout
-    i: int
-    j: int
-    channel: int
-
-    def add(self, matrix, gram, spectra):
-        """Add gram (k_i + 1, k_j + 1), of modes and morphologies, times what the model has of each:
-        modes come with a spectrum, spectra with the morphology."""
-        one, other = (np.append(spectra[s, self.channel] * np.ones(n - 1), 1)
-                      for s, n in zip((self.i, self.j), gram.shape, strict=True))  # fmt: skip
-        at, to = (
-            np.append(self.layout.modes(s), self.layout.spectrum(s)[self.channel])
-            for s in (self.i, self.j)
-        )
-        values = gram * one[:, None] * other
-        matrix[np.ix_(at, to)] += values
-        if self.i != self.j:
-            matrix[np.ix_(to, at)] += values.T
-
-
-class _Rows:
-    """What one observation sees of all components' images, each in a rectangle of its pixels.
-
-    low, high (n, 2): the rectangles; images (n): (k_i + 1, Co, ry, rx), whitened; None where empty
+    i: which; k: its modes; low, high (2,): its window
+    light (k or k + 2, C, ry, rx): of its modes, then of its slopes along y and x where a shift is
+        unknown, all times its spectrum; unit (C, ry, rx): of its morphology alone
     """
 
-    def __init__(self, scene, exposure, columns):
-        self._root = exposure.view.root
-        self.low, self.high = _rectangles(scene, exposure.view, exposure.reach_px)
-        self.images = [None] * len(columns)
-        for i, images in enumerate(columns):
-            if (self.high[i] > self.low[i]).all():
-                cut = self.low[i], self.high[i] - self.low[i]
-                seen = exposure.observe(images, scene.origin[i], *cut)
-                self.images[i] = seen * self._root[:, *self._cut(i)].astype(seen.dtype)
+    i: int
+    k: int
+    low: np.ndarray
+    high: np.ndarray
+    light: np.ndarray
+    unit: np.ndarray
 
-    def _cut(self, i):
-        return box_slices(self.low[i], self.high[i] - self.low[i])
-
-    def _meet(self, i, j):
-        low, high = np.maximum(self.low[i], self.low[j]), np.minimum(self.high[i], self.high[j])
-        return bool((high > low).all())
-
-    def products(self):
-        """(i, j, channel, products (k_i + 1, k_j + 1)) of all pairs i <= j that meet."""
-        n = len(self.images)
-        for i in range(n):
-            for j in range(i, n):
-                if self.images[i] is None or self.images[j] is None or not self._meet(i, j):
-                    continue
-                low = np.maximum(self.low[i], self.low[j])
-                size = np.minimum(self.high[i], self.high[j]) - low
-                one, other = (
-                    self.images[s][:, :, *box_slices(low - self.low[s], size)] for s in (i, j)
-                )
-                for c in range(one.shape[1]):
-                    a, b = (x[:, c].reshape(len(x), -1).astype(np.float64) for x in (one, other))
-                    yield i, j, c, a @ b.T
-
-    def levels(self):
-        """(i, channel, products (k_i + 1,)) of all components' images with a level of 1."""
-        for i, images in enumerate(self.images):
-            if images is not None:
-                root = self._root[:, *self._cut(i)]
-                sums = np.einsum("kcyx,cyx->ck", images.astype(np.float64), root)
-                for c, row in enumerate(sums):
-                    yield i, c, row
+    def within(self, low, high):
+        """light (k, C * P) and unit (C, P) from `low` to `high`."""
+        cut = box_slices(low - self.low, high - low)
+        light, unit = self.light[:, :, *cut], self.unit[:, *cut]
+        return light.reshape(len(light), unit.size), unit.reshape(len(unit), -1)
 
 
-def _rectangles(scene, view, reach):
-    """First and one-past-last observed pixels (n, 2) that lie within `reach` of each box."""
-    n, m = np.indices(view.mapping.shape_out)
-    at = view.mapping.at(n, m) + view.op.shift
-    low, high = np.zeros((2, len(scene.profile), 2), int)
-    for i, (origin, profile) in enumerate(zip(scene.origin, scene.profile, strict=True)):
-        near = ((at >= origin - reach) & (at <= origin + profile.shape + reach)).all(2)
-        near &= view.covered
-        for axis in (0, 1):
-            along = np.flatnonzero(near.any(1 - axis))
-            if len(along):
-                low[i, axis], high[i, axis] = along[0], along[-1] + 1
-    return low, high
+class _Sum:
+    """One observation's part of the matrix; channels: slice of all, observation `o`."""
+
+    def __init__(self, matrix, layout, exposure, o, channels):
+        self.matrix, self.layout, self.exposure = matrix, layout, exposure
+        self.channels, self.shift = channels, layout.shift(o)
+
+    def run(self, origin, morphs, modes, spectra):
+        """Add it."""
+        windows = [self.exposure.window(at, m.shape) for at, m in zip(origin, morphs, strict=True)]
+        near: list[_Seen] = []
+        for i in sorted(range(len(morphs)), key=lambda i: windows[i][0, 0]):
+            low, high = windows[i]
+            near = [one for one in near if one.high[0] > low[0]]
+            if not (high > low).all():
+                continue
+            spectrum = spectra[i, self.channels].astype(np.float32)
+            one = self._seen(i, morphs[i], modes[i], spectrum, origin[i], low, high)
+            near.append(one)
+            for other in near:
+                self._add(*((other, one) if other.i <= i else (one, other)))
+            if self.layout.n_sky:
+                self._add_level(one)
+        if self.layout.n_sky:
+            at = np.arange(self.channels.start, self.channels.stop)
+            common = self.matrix.block(self.layout.common, self.layout.common)
+            common[at, at] += np.square(self.exposure.root, dtype=np.float64).sum((1, 2))
+
+    def _seen(self, i, morph, images, spectrum, origin, low, high):
+        slopes = [morph[None]]
+        if self.shift is not None:
+            padded = np.pad(morph, 1, mode="edge")
+            slopes += [np.array(np.gradient(padded))[:, 1:-1, 1:-1]]
+        seen = self.exposure.observe(
+            np.concatenate([*slopes, images]).astype(np.float32), origin, low, high
+        )
+        n = sum(map(len, slopes))
+        light = np.concatenate([seen[n:], seen[1:n]]) * spectrum[:, None, None]
+        return _Seen(i, len(images), low, high, light, np.ascontiguousarray(seen[0]))
+
+    def _add(self, a, b):
+        """The products of two components, a.i <= b.i, where their windows meet."""
+        low, high = np.maximum(a.low, b.low), np.minimum(a.high, b.high)
+        if not (high > low).all():
+            return
+        (light_a, unit_a), (light_b, unit_b) = a.within(low, high), b.within(low, high)
+        largest = np.einsum("kp,kp->k", light_a, light_a).max(initial=0)
+        largest *= np.einsum("kp,kp->k", light_b, light_b).max(initial=0)
+        if largest > LARGE**2:
+            light_a, light_b = light_a.astype(np.float64), light_b.astype(np.float64)
+        n_channels, same = len(unit_a), a.i == b.i
+        modes = light_a @ light_b.T
+        by_b, by_a = _by_channel(light_a, unit_b), _by_channel(light_b, unit_a)  # (k, Co)
+        units = np.einsum("cp,cp->c", unit_a, unit_b, dtype=np.float64)
+        block = self.matrix.block(a.i, b.i)
+        block[: a.k, : b.k] += modes[: a.k, : b.k]
+        of_a, of_b = (s.k + np.arange(n_channels) + self.channels.start for s in (a, b))
+        block[: a.k, of_b] += by_b[: a.k]
+        block[of_a, : b.k] += by_a[: b.k].T
+        block[of_a, of_b] += units
+        if self.shift is None:
+            return
+        common, both = self.layout.common, self.matrix.block(self.layout.common, self.layout.common)
+        square = modes[a.k :, b.k :] if same else modes[a.k :, b.k :] + modes[a.k :, b.k :].T
+        both[np.ix_(self.shift, self.shift)] += square
+        for s, k, at, rows, ones in ((a, a.k, of_a, modes[: a.k, b.k :], by_a[b.k :].T),
+                                     (b, b.k, of_b, modes[a.k :, : b.k].T, by_b[a.k :].T)):  # fmt: skip
+            side = self.matrix.block(s.i, common)
+            side[:k, self.shift] += rows
+            side[np.ix_(at, self.shift)] += ones
+            if same:
+                break
+
+    def _add_level(self, one):
+        """The products of a component with a level of 1 in each channel."""
+        level = self.exposure.root[:, *box_slices(one.low, one.high - one.low)]
+        level = level.reshape(len(level), -1)
+        light, unit = one.within(one.low, one.high)
+        products = _by_channel(light, level)
+        at = np.arange(self.channels.start, self.channels.stop)
+        side = self.matrix.block(one.i, self.layout.common)
+        side[: one.k, at] += products[: one.k]
+        side[one.k + at, at] += np.einsum("cp,cp->c", unit, level, dtype=np.float64)
+        if self.shift is not None:
+            both, found = self.matrix.block(*[self.layout.common] * 2), products[one.k :]
+            both[np.ix_(self.shift, at)] += found
+            both[np.ix_(at, self.shift)] += found.T
+
+
+def _by_channel(light, unit):
+    """Products (k, C) of light (k, C * P) with each channel of unit (C, P)."""
+    n_channels, size = unit.shape
+    light = light.reshape(len(light), n_channels, size).transpose(1, 0, 2)
+    return (light @ unit[:, :, None].astype(light.dtype))[:, :, 0].T

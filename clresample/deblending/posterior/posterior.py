@@ -1,51 +1,47 @@
-"""A scene's errors: unknowns laid out, one factored normal matrix, and what is asked of it."""
+"""A scene's errors: one factored normal matrix of all unknowns, and what is asked of it."""
 
 from __future__ import annotations
 
 import time
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
+from .blocks import Factor
 from .errors import Draws, Errors
+from .exposure import Exposure
 from .modes import Solution
 from .moments import moments_of
-from .normal import Exposure, Layout, factor, normal_matrix
+from .normal import Layout, normal_matrix
 
-# Unknowns of a scene from which on its errors are those of fixed morphologies: 2000, of 30 to
-# 40 sources, make a matrix of 32 MB and a second of work, which grows with their third power.
-MOST_UNKNOWNS = 2000
 # Least error of a spectrum at fixed morphology, relative to it: smaller ones are rounding.
 LEAST_ERROR = 1e-9
-
-
-class TooLargeError(ValueError):
-    """A scene has more unknowns than MOST_UNKNOWNS."""
 
 
 class Posterior:
     """The linear posterior about a solution.
 
     solution: Solution; exposures: an Exposure of each observation
-    fit_sky: whether sky levels are unknowns too
+    fit_sky, fit_shifts: whether sky levels, and shifts of all observations but the first, are
+        unknowns too
 
-    modes (n): Modes; layout: Layout; lower, scale: see `factor`
+    modes (n): arrays (k, ny, nx), beyond (n): see Solution.modes; layout: Layout; matrix: Blocks; factor: its Factor; covariance: Blocks of the
+        inverse, for the same nodes
 
-    Raises TooLargeError, and LinAlgError where the matrix is not positive definite.
+    Raises LinAlgError where the matrix is not positive definite.
     """
 
-    def __init__(self, solution, exposures, *, fit_sky=False):
+    def __init__(self, solution, exposures, *, fit_sky=False, fit_shifts=False):
         n, n_channels = solution.spectra.shape
-        most = MOST_UNKNOWNS - (n + bool(fit_sky)) * n_channels
-        self.solution, self.modes, count = solution, [], 0
-        for i in range(n):
-            self.modes.append(solution.modes(i))
-            count += len(self.modes[-1])
-            if count > most:
-                raise TooLargeError(f"more than {MOST_UNKNOWNS} unknowns")
-        ends = np.cumsum([0, *map(len, self.modes)])
-        self.layout = Layout(ends, n_channels, n_channels if fit_sky else 0)
-        matrix = normal_matrix(
+        self.solution = solution
+        pairs = [solution.modes(i) for i in range(n)]
+        self.modes, self.beyond = [m for m, _ in pairs], [far for _, far in pairs]
+        self.layout = Layout(
+            np.array([len(m) for m in self.modes]),
+            n_channels,
+            n_channels if fit_sky else 0,
+            2 * (len(exposures) - 1) if fit_shifts else 0,
+        )
+        self.matrix = normal_matrix(
             solution.scene,
             exposures,
             solution.morphs,
@@ -53,18 +49,27 @@ class Posterior:
             solution.spectra,
             self.layout,
         )
-        self.lower, self.scale = factor(matrix)
+        self.factor = Factor(self.matrix)
+        self.covariance = self.factor.inverse()
 
     def errors(self, owner, n_sources, unit, flux_floor) -> Errors:
         """The Errors of sources, component i belonging to source owner[i] (n,).
 
         unit (C,) [counts]: of the spectra; flux_floor: see Settings
         """
-        flux, flux_rows = self._fluxes(owner, n_sources)
-        spread = self._half(flux_rows.reshape(-1, self.layout.size))
-        full = (spread.T @ spread).reshape(*flux.shape, *flux.shape)  # (S, C, S, C)
-        between = np.einsum("sctc->cst", full).copy()
-        colour = np.einsum("scsd->scd", full).copy()
+        flux, slopes = self._fluxes(owner, n_sources)
+        n_channels = len(unit)
+        between = np.zeros((n_channels, n_sources, n_sources))
+        colour = np.zeros((n_sources, n_channels, n_channels))
+        for (i, j), block in self.covariance.items():
+            if j == self.layout.common:
+                continue
+            found, s, t = slopes[i] @ block @ slopes[j].T, owner[i], owner[j]
+            between[:, s, t] += np.diag(found)
+            if i != j:
+                between[:, t, s] += np.diag(found)
+            if s == t:
+                colour[s] += found if i == j else found + found.T
         floor = flux_floor * flux
         between[:, np.arange(n_sources), np.arange(n_sources)] += floor.T**2
         colour += floor[:, :, None] * floor[:, None, :]
@@ -74,32 +79,28 @@ class Posterior:
             colour * unit[:, None] * unit,
             self._moments(owner, n_sources, error),
             tuple(self._map(i) for i in range(len(self.modes))),
+            np.array([far.sums for far in self.beyond]),
         )
 
     def draws(self, unit) -> Draws:
         """What `Result.sample` draws from."""
-        modes = [m.images.astype(np.float32) for m in self.modes]
-        return Draws(modes, self.lower, self.scale, unit)
-
-    def _half(self, rows):
-        """(N, r) whose columns' inner products are the covariance of rows (r, N) of slopes."""
-        return solve_triangular(self.lower, (rows / self.scale).T, lower=True)
+        return Draws([m.astype(np.float32) for m in self.modes], self.factor, unit)
 
     def _fluxes(self, owner, n_sources):
-        """Fluxes (S, C) and their slopes (S, C, N)."""
-        s, layout = self.solution, self.layout
-        flux = np.zeros((n_sources, layout.n_channels))
-        rows = np.zeros((*flux.shape, layout.size))
+        """Fluxes (S, C), and each component's slopes (C, k + C) of its own by its unknowns."""
+        s, slopes = self.solution, []
+        flux = np.zeros((n_sources, self.layout.n_channels))
         for i, (modes, morph) in enumerate(zip(self.modes, s.morphs, strict=True)):
-            total, channels = morph.sum(), np.arange(layout.n_channels)
+            far = self.beyond[i]
+            total = morph.sum() + far.sums[0]
             flux[owner[i]] += s.spectra[i] * total
-            rows[owner[i]][:, layout.modes(i)] += np.outer(s.spectra[i], modes.images.sum((1, 2)))
-            rows[owner[i], channels, layout.spectrum(i)] += total
-        return flux, rows
+            by_mode = np.outer(s.spectra[i], modes.sum((1, 2)) + far.slopes[0])
+            slopes.append(np.concatenate([by_mode, total * np.eye(len(by_mode))], axis=1))
+        return flux, slopes
 
     def _moments(self, owner, n_sources, error):
         """Covariances (S, 5, 5) of centroids and second moments; error (S, C): of the fluxes."""
-        s, layout, out = self.solution, self.layout, np.full((n_sources, 5, 5), np.nan)
+        s, out = self.solution, np.full((n_sources, 5, 5), np.nan)
         for source in np.unique(owner):
             own = np.flatnonzero(owner == source)
             weight = np.where(error[source] > 0, 1 / np.maximum(error[source], 1e-30), 0)
@@ -107,15 +108,20 @@ class Posterior:
             n_modes = sum(len(self.modes[i]) for i in own)
             if not n_modes or not light.any():
                 continue
-            slopes = moments_of(s.scene.origin[own], [s.morphs[i] for i in own], light)
-            rows = np.zeros((5, layout.size))
+            far = np.array([self.beyond[i].sums for i in own])
+            slopes, by_far = moments_of(s.scene.origin[own], [s.morphs[i] for i in own], light, far)
+            rows = []
             for i, slope, part in zip(own, slopes, light, strict=True):
-                modes = self.modes[i].images
-                rows[:, layout.modes(i)] = part * np.tensordot(slope, modes, ((1, 2), (1, 2)))
-                by_light = np.tensordot(slope, s.morphs[i], 2)
-                rows[:, layout.spectrum(i)] = by_light[:, None] * weight
-            half = self._half(rows)
-            covariance = half.T @ half
+                flat, images = slope.reshape(5, -1), self.modes[i]
+                by_mode = flat @ images.reshape(len(images), flat.shape[1]).T
+                by_mode = part * (by_mode + by_far @ self.beyond[i].slopes)
+                by_light = flat @ s.morphs[i].ravel() + by_far @ self.beyond[i].sums
+                rows.append(np.concatenate([by_mode, by_light[:, None] * weight], axis=1))
+            covariance = np.zeros((5, 5))
+            for a, i in enumerate(own):
+                for b, j in enumerate(own):
+                    block = self.covariance.block(min(i, j), max(i, j))
+                    covariance += rows[a] @ (block if i <= j else block.T) @ rows[b].T
             if s.scene.fixed[own].all():
                 covariance[2:] = covariance[:, 2:] = np.nan
             out[source] = covariance
@@ -123,14 +129,12 @@ class Posterior:
 
     def _map(self, i):
         """Standard deviation (ny, nx) of component i's morphology."""
-        images, own = self.modes[i].images, self.layout.modes(i)
-        if not len(images):
+        images = self.modes[i]
+        k = len(images)
+        if not k:
             return np.zeros(self.solution.morphs[i].shape)
-        rows = np.zeros((len(own), self.layout.size))
-        rows[np.arange(len(own)), own] = 1
-        half = self._half(rows)
-        flat = images.reshape(len(own), -1)
-        variance = ((half.T @ half @ flat) * flat).sum(0)
+        flat = images.reshape(k, -1)
+        variance = np.einsum("kp,kp->p", self.covariance.block(i, i)[:k, :k] @ flat, flat)
         return np.sqrt(np.maximum(variance, 0)).reshape(images.shape[1:])
 
 
@@ -180,9 +184,8 @@ def posterior_of(fit, morphs, peaks, units, solved):
     pairs = zip(fit.views, fit.blend.observations, strict=True)
     exposures = [Exposure.of(view, fit.frame, o) for view, o in pairs]
     try:
-        return Posterior(solution, exposures, fit_sky=settings.fit_sky), []
-    except TooLargeError as error:
-        why = str(error)
+        sky, shifts = settings.fit_sky, settings.fit_shifts
+        return Posterior(solution, exposures, fit_sky=sky, fit_shifts=shifts), []
     except np.linalg.LinAlgError:
         why = "their normal matrix is not positive definite"
     return None, [f"errors are those of fixed morphologies: {why}"]

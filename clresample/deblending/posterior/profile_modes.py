@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from ...sky.extent import box_slices
 from ..profiles import Galaxy, Star
 
 # [px] scatter of a catalogue's position. 0.5 makes the errors of faint sources' positions half as
@@ -13,35 +16,85 @@ POSITION_PX = 0.1
 # differ from the family of profiles. Without them the sizes of simulated bright galaxies lie within
 # their errors in 59 %, with them in 70 % of cases.
 CORE, HALO = 0.2, 0.05
-STEP_PX = 0.1  # of the difference quotients by position
 
 
-def profile_modes(shape, theta, position, profile, box):
-    """Slopes (k, ny, nx) of a component's profile in its box, and their prior scatter (k,).
+# A box ends where its profile is under the noise of a pixel. What lies beyond is followed for half
+# its side, at most FAR_PX, on every side: of a galaxy at signal to noise 10 it holds 1 % of the
+# light and 4 % of the size. There HALO is taken times FAR_HALO: with 0 the errors of sizes of
+# simulated galaxies hold the truth in 0.61, with 0.4 in 0.71, with 1 in 0.85 of cases.
+FAR_PX, FAR_HALO = 24, 0.4
+
+
+@dataclass(frozen=True, eq=False)
+class Beyond:
+    """What a component's profile has beyond its box.
+
+    sums (6,): of the profile times 1, y, x, y y, y x, x x [frame px], where its maximum is 1
+    slopes (6, k): of the sums by the coefficients of the modes
+    """
+
+    sums: np.ndarray
+    slopes: np.ndarray
+
+    @classmethod
+    def of(cls, images, low, margin):
+        """That of images (1 + k, ny, nx), the profile and its modes, about a box that ends
+        `margin` (2,) pixels inside them; low (2,) [frame px]: the first pixel of images."""
+        (m_y, m_x), (n_y, n_x) = margin, images.shape[1:]
+        outside = np.ones((n_y, n_x))
+        outside[m_y : n_y - m_y, m_x : n_x - m_x] = 0
+        y, x = np.arange(n_y) + low[0], np.arange(n_x) + low[1]
+        rows = np.stack([np.ones(n_y), y, y * y]) @ (images * outside)  # (1 + k, 3, nx)
+        found = rows @ np.stack([np.ones(n_x), x, x * x], axis=1)
+        sums = found[:, [0, 1, 0, 2, 1, 0], [0, 0, 1, 0, 1, 2]].T
+        return cls(sums[:, 0], sums[:, 1:])
+
+    @classmethod
+    def none(cls, k):
+        """Nothing, of a component with k modes."""
+        return cls(np.zeros(6), np.zeros((6, k)))
+
+    def scaled(self, scales):
+        """With the profile and its modes times scales (1 + k,)."""
+        return Beyond(self.sums * scales[0], self.slopes * scales[1:])
+
+    def gauged(self, along):
+        """That of more modes, which come before these, and of which `along` (k,) times the profile
+        was taken off."""
+        slopes = np.zeros((6, len(along)))
+        slopes[:, len(along) - self.slopes.shape[1] :] = self.slopes
+        return Beyond(self.sums, slopes - np.outer(self.sums, along))
+
+
+def profile_modes(shape, theta, position, profile, origin):
+    """Slopes (k, ny, nx) of a component's profile in its box, their prior scatter (k,), Beyond.
 
     shape: Shape, theta (n,): its parameters, position (2,) [px]: where in the frame
-    profile (ny, nx): with max = 1; box: slices of the frame
+    profile (ny, nx): with max = 1; origin (2,) [px]: of the box in the frame
     """
     if isinstance(shape, Star):
         drawn = shape.draw(np.zeros(len(theta)), position)
-        return drawn[1:, *box] / drawn[0].max(), shape.scatter
+        drawn = drawn[:, *box_slices(origin, profile.shape)] / drawn[0].max()
+        return drawn[1:], shape.scatter, Beyond.none(len(theta))
     if isinstance(shape, Galaxy):
-        size, low = profile.shape, [part.start for part in box]
-        drawn, position = shape.draw(theta, position - low, size), position - low
-        steps = STEP_PX * np.eye(2)
-        moved = [
-            (shape.draw(theta, position + d, size) - shape.draw(theta, position - d, size))[:1]
-            / (2 * STEP_PX)
-            for d in steps
-        ]
-        slopes = np.concatenate([drawn[1:], *moved]) / drawn[0].max()
-        scatter = shape.scatter
-    else:  # a given image
-        slopes = np.stack([-_slope(profile, axis) for axis in (0, 1)])
-        scatter = np.zeros(0)
+        margin = np.minimum(np.array(profile.shape) // 2, FAR_PX)
+        low, size = origin - margin, np.array(profile.shape) + 2 * margin
+        drawn = shape.draw(theta, position - low, tuple(size))
+        moved = shape.place_slopes(theta, position - low, drawn[0])
+        peak = drawn[0].max()
+        images = np.concatenate([drawn, moved, _core_and_halo(drawn[0] / peak) * peak]) / peak
+        near = images[1:, *box_slices(margin, profile.shape)].copy()
+        scatter = np.concatenate([shape.scatter, [POSITION_PX] * 2, [CORE, HALO]])
+        images[-2:] *= FAR_HALO
+        return near, scatter, Beyond.of(images, low, margin)
+    slopes = np.stack([-_slope(profile, axis) for axis in (0, 1)])  # of a given image
+    images = np.concatenate([slopes, _core_and_halo(profile)])
+    return images, np.array([POSITION_PX, POSITION_PX, CORE, HALO]), Beyond.none(len(images))
+
+
+def _core_and_halo(profile):
     light = np.maximum(profile, 0)
-    images = np.concatenate([slopes, [light**2, np.sqrt(light)]])
-    return images, np.concatenate([scatter, [POSITION_PX] * 2, [CORE, HALO]])
+    return np.stack([light**2, np.sqrt(light)])
 
 
 def _slope(image, axis):
