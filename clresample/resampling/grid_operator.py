@@ -122,9 +122,11 @@ class GridOperator(LinOp):
             raise ValueError(
                 f"shift is {shift.tolist()}, must be (2,) or {expected} finite numbers"
             )
-        self._shift = np.broadcast_to(shift, expected).copy()
-        self._shift.flags.writeable = False  # a change must come through this setter
-        self._use_shift()
+        shift = np.broadcast_to(shift, expected).copy()
+        shift.flags.writeable = False  # a change must come through this setter
+        with self._lock:
+            self._shift = shift
+            self._use_shift()
 
 
 def _one_or_all(values):

@@ -79,8 +79,9 @@ class Resampler(GridOperator):
         """Device memory of tables, intermediates and arrays for NumPy callers [bytes], roughly."""
         # each table in the operator's type, the way it is used forward and the way back
         tables = 2 * sum(plan.n_bytes for plan in self.plans) * self.dtype.itemsize // 8
-        held = [*self._executor.scratch.values()]
-        held += [array for staged in self._staged.values() for array in staged[1:]]
+        with self._lock:
+            held = [*self._executor.scratch.values()]
+            held += [array for staged in self._staged.values() for array in staged[1:]]
         return tables + sum(getattr(array, "nbytes", 0) for array in held)
 
     def render(self, x, out=None):
