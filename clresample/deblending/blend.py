@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..sky.frame import Frame, model_frame
+from ..sky.given.checks import instance, numbers
 from ..sky.observation import Observation, check_observations
 from ..sky.sources import Source
 
@@ -30,13 +31,22 @@ class Blend:
     frame: Frame | None = None
     shifts: np.ndarray | None = None
 
+    def check(self):
+        """Raise ValueError where an observation, a source or the frame is something else."""
+        for i, observation in enumerate(self.observations):
+            instance(f"observations[{i}]", observation, Observation)
+        for i, source in enumerate(self.sources):
+            instance(f"sources[{i}]", source, Source)
+        if self.frame is not None:
+            instance("frame", self.frame, Frame)
+
     def known_shifts(self) -> np.ndarray:
         """Shifts (n_observations, 2) [model px], 0 where none are given.
 
         ValueError: they are not as many, or not finite.
         """
         expected = len(self.observations), 2
-        shifts = np.zeros(expected) if self.shifts is None else np.asarray(self.shifts, float)
+        shifts = np.zeros(expected) if self.shifts is None else numbers("shifts", self.shifts)
         if shifts.shape != expected or not np.isfinite(shifts).all():
             raise ValueError(f"shifts is {shifts.tolist()}, must be {expected} finite numbers")
         return shifts
@@ -46,6 +56,7 @@ class Blend:
 
         ValueError: observations that do not go together, a profile of another shape than the frame.
         """
+        self.check()
         if self.frame is None:
             frame = model_frame(self.observations)
         else:

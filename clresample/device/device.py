@@ -51,6 +51,10 @@ class Device:
     def __repr__(self):
         return f"Device({self.platform}: {self.name})"
 
+    def __reduce__(self):
+        """Copied as itself; unpickled elsewhere, the device of the same platform and name there."""
+        return get_device, (f"{self.platform}:{self.name}",)
+
     @functools.cached_property
     def has_fp64(self):
         """True where a kernel in double precision builds."""

@@ -7,6 +7,7 @@ import threading
 import numpy as np
 
 from ..device.device import get_device
+from ..sky.given.checks import float_type, mask_of, real
 
 
 class LinOp:
@@ -27,11 +28,16 @@ class LinOp:
 
     def __init__(self, device, dtype, shape_in, shape_out):
         self.device = get_device(device)
-        self.dtype = np.dtype(dtype)
-        if self.dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
-            raise ValueError(f"dtype is {self.dtype}, allowed are float32 and float64")
+        self.dtype = float_type(dtype)
         self.shape_in, self.shape_out = tuple(shape_in), tuple(shape_out)
         self._staged, self._lock = {}, threading.RLock()
+
+    def __getstate__(self):
+        """Without what belongs to one process: copies have a lock and staging arrays of their own."""
+        return {k: v for k, v in self.__dict__.items() if k not in ("_staged", "_lock")}
+
+    def __setstate__(self, state):
+        self.__dict__.update(state, _staged={}, _lock=threading.RLock())
 
     def forward(self, x, out=None):
         """A x.  x (B,) + shape_in -> (B,) + shape_out, into `out` (of x's kind) if given.
@@ -91,9 +97,7 @@ class LinOp:
         """`run`, one of the two above, on an array `x` of a caller, who calls it `name`."""
         on_device = hasattr(x, "base_data")
         if not on_device:
-            x = np.asarray(x)
-            if np.iscomplexobj(x):
-                raise ValueError(f"{name} is {x.dtype}, the operator is real ({self.dtype})")
+            x = real(name, x)
         batch, shape_result = _match_shape(name, tuple(x.shape), shape_x, shape_out)
         if out is not None:
             _check_out(name, x, out, on_device, shape_result)
@@ -226,6 +230,14 @@ def _check_out(name, x, out, on_device, shape):
         )
     if tuple(out.shape) != shape:
         raise ValueError(f"out has shape {tuple(out.shape)}, expected {shape}")
+    if not on_device and (
+        out.dtype.kind != "f"
+        or not out.flags.writeable
+        or mask_of(out) is not None
+        or hasattr(out, "unit")
+    ):
+        kind = "read-only" if not out.flags.writeable else f"of type {out.dtype}"
+        raise ValueError(f"out is a {_kind(out)}, {kind}: it must be a plain array of floats")
 
 
 def _kind(array):
