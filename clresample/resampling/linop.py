@@ -33,7 +33,7 @@ class LinOp:
         self._staged, self._lock = {}, threading.RLock()
 
     def __getstate__(self):
-        """Without what belongs to one process: copies have a lock and staging arrays of their own."""
+        """Without what belongs to one process: lock and staging arrays, which copies make anew."""
         return {k: v for k, v in self.__dict__.items() if k not in ("_staged", "_lock")}
 
     def __setstate__(self, state):

@@ -46,9 +46,8 @@ class Observation(ReadOnly):
     None, n_bad = number of unmasked pixels whose weight became 0 because their data, weight or
     variance is none, messages = what the user should know.
 
-    Raises ValueError for shapes that disagree, negative or infinite weights, masks not made of 0
-    and 1, channel names not unique, weights beside variance, noise that cannot be found, complex
-    numbers, texts, dates, and numbers with a unit.
+    Raises ValueError for shapes that disagree, negative or infinite weights, masks not of 0 and 1,
+    names not unique, weights beside variance, noise not to be found, and what is no real number.
     """
 
     data: np.ndarray
