@@ -13,6 +13,10 @@ from ..sky.sources import Source
 
 # Status of a fit that Ctrl-C ended.
 INTERRUPTED = "interrupted"
+# What one fit takes at most. Its spectra are solved together, n^3 for n components: 2000 take
+# minutes. Arrays of components times pixels are held several at a time. A blend of 4096 pixels a
+# side has no neighbours that would need to be fitted at once.
+MOST_COMPONENTS, MOST_BYTES, MOST_PIXELS = 2000, 8 << 30, 1 << 24
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,29 @@ class Blend:
         if self.frame is not None:
             instance("frame", self.frame, Frame)
 
+    def _check_work(self, frame):
+        """Raise ValueError where a fit would take more than could be meant, before it begins."""
+        n_pixels = int(np.prod(frame.shape, dtype=float))
+        if n_pixels > MOST_PIXELS:
+            raise ValueError(
+                f"the model frame has {frame.shape[0]} x {frame.shape[1]} pixels, more than the "
+                f"{MOST_PIXELS} of one fit: are the WCS right? If so, cut the field into blends"
+            )
+        n = sum(getattr(source, "n_components", 1) for source in self.sources)
+        n_seen = max(int(np.count_nonzero(o.weights, axis=(1, 2)).max()) for o in self.observations)
+        if n > n_seen > 0:
+            raise ValueError(
+                f"{len(self.sources)} sources have {n} components, more than any channel has "
+                f"pixels with a weight ({n_seen}): each has a flux in each channel; give fewer"
+            )
+        n_bytes = 8 * n * (n_pixels + sum(o.data.size for o in self.observations))
+        if n > MOST_COMPONENTS or n_bytes > MOST_BYTES:
+            raise ValueError(
+                f"{len(self.sources)} sources with {n} components on {n_pixels} model pixels need "
+                f"{n_bytes / 2**30:.3g} GiB in one fit; it takes {MOST_COMPONENTS} components and "
+                f"{MOST_BYTES >> 30} GiB at most: cut the field into blends for deblend_many"
+            )
+
     def known_shifts(self) -> np.ndarray:
         """Shifts (n_observations, 2) [model px], 0 where none are given.
 
@@ -62,6 +89,7 @@ class Blend:
         else:
             check_observations(self.observations)
             frame = self.frame
+        self._check_work(frame)
         for i, source in enumerate(self.sources):
             profile = getattr(source, "profile", None)
             if profile is not None and np.shape(profile) != frame.shape:

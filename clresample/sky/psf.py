@@ -10,6 +10,7 @@ import numpy as np
 
 from .given.checks import ReadOnly, number, numbers
 from .psf_checks import PSFWarning, core_of, edge_light, fwhm, psf_warnings
+from .transforms.nufft import transform_at
 from .waves import phases
 
 # relative slack on the band's edge, above the rounding of A^T nu in float64
@@ -17,6 +18,10 @@ BAND_SLACK = 1e-12
 # [complex numbers] one block of the general transform's tables: 16 MiB, near the cache's size;
 # larger ones are read back from memory, smaller ones make many small products
 BLOCK = 1 << 20
+# [samples] PSF images from this size on are transformed by an FFT and interpolation where their
+# axes are turned: there the sum over all samples takes 26 us a frequency, the FFT 5; its error of
+# 3e-15 of the light is float64's rounding. Smaller images keep the sum, which has no window.
+LARGE = 256 * 256
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -225,6 +230,10 @@ def _transform(psf, bands, center, nu_y, nu_x, matrix):
         return _waves(nu_y, a * u) @ images @ _waves(nu_x, d * v).T
     if a == d == 0:
         return _waves(nu_y, b * v) @ images.transpose(0, 2, 1) @ _waves(nu_x, c * u).T
+    if images[0].size > LARGE:
+        f_y, f_x = (psf.spacing * (p * nu_y[:, None] + q * nu_x) for p, q in ((a, c), (b, d)))
+        turns = f_y * center[0] + f_x * center[1]
+        return transform_at(images, f_y, f_x) * np.exp(2j * np.pi * (turns - np.rint(turns)))
     waves_yu, waves_yv = _waves(nu_y, a * u), _waves(nu_y, b * v)
     waves_xu, waves_xv = _waves(nu_x, c * u), _waves(nu_x, d * v)
     result = np.zeros((len(bands), nu_y.size, nu_x.size), dtype=np.complex128)
