@@ -22,9 +22,6 @@ from .outputs import file_outputs
 # |D|, the factor by which the difference kernel raises noise: warned of above the first, refused
 # above the second. Equal PSFs have 1; in an image with a hundred times the noise nothing is seen.
 GAIN_WARNED, GAIN_REFUSED = 2.0, 100.0
-# Light beyond the edge of a PSF image by its own wings (`PSF.edge_light`), as a part of the light
-# inside: above this the image is refused. Good ones have 0.02 to 0.05, an evenly bright one 1.6.
-EDGE_REFUSED = 0.5
 
 DESCRIPTION = """\
 Show an image as another instrument would have seen it: on the pixels of REF and
@@ -265,7 +262,7 @@ def _finite(arguments, image):
 def _psf(arguments, which, n_bands):
     """PSF `which` ("psf" or "psf_like") with as many bands as the image; its warnings as notes."""
     from ..files.fits import read_psf
-    from ..sky.psf_checks import PSFWarning
+    from ..sky.psf_checks import PSFWarning, check_edge
 
     option = "--" + which.replace("_", "-")
     path, hdu, bands, spacing, where = (
@@ -274,12 +271,10 @@ def _psf(arguments, which, n_bands):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PSFWarning)  # printed below, with the name of the option
         psf = read_psf(path, hdu=hdu, bands=bands, spacing=spacing, center=where)
-    light = psf.edge_light().max()
-    if light > EDGE_REFUSED:
-        raise ValueError(
-            f"{path}: too wide for its {psf.images.shape[1]} x {psf.images.shape[2]} image, or no "
-            f"PSF: by the light at its edge, another {100 * light:.0f} % lies beyond"
-        )
+    try:
+        check_edge(psf.images)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     for message in psf.warnings(core=f"{option}-center core"):
         note(arguments, f"{path}: {message}")
     if psf.n_bands not in (1, n_bands):

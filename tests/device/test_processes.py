@@ -18,8 +18,8 @@ FORKED = """
 op, x = make(), np.ones((1, 20, 20))
 before = op(x)
 ways = {
-    "operator": lambda: op(x), "new": make, "device": get_device, "given": lambda: get_device(device),
-    "memory": lambda: device.put(x), "wait": device.finish,
+    "operator": lambda: op(x), "new": make, "memory": lambda: device.put(x), "wait": device.finish,
+    "device": get_device, "given": lambda: get_device(device),
 }
 if os.fork() == 0:
     signal.alarm(30)
