@@ -163,7 +163,7 @@ def run(arguments):
 
     started = time.perf_counter()
     op = _operator(arguments, device, image.grid, reference.grid, psfs)
-    result = _checked(arguments, op(pixels))
+    result = _resampled(arguments, op, pixels)
     took = time.perf_counter() - started
     written = result if len(result) > 1 else result[0]
     with whole_files(paths) as parts:
@@ -231,10 +231,12 @@ def _operator(arguments, device, grid_in, grid_out, psfs):
     return op
 
 
-def _checked(arguments, result):
+def _resampled(arguments, op, pixels):
     """The result. Raises ValueError where it has overflowed."""
     import numpy as np
 
+    with np.errstate(over="ignore"):  # NumPy's warning, of which more is said here
+        result = op(pixels)
     n_bad = int(np.count_nonzero(~np.isfinite(result)))
     if n_bad:
         raise ValueError(
