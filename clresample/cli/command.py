@@ -8,24 +8,36 @@ mistake in files or arguments, which becomes one line on standard error and exit
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
+import threading
+from contextlib import contextmanager
 
 from .. import __version__
 from ..device.discovery import DeviceError
 from .deblend import add_deblend
 from .devices import add_devices
+from .options import printable
 from .resample import add_resample
+
+# Of an error's line: some errors quote a whole file.
+MOST_CHARACTERS = 900
 
 
 class Parser(argparse.ArgumentParser):
     """Complains in one line, without the usage that `--help` gives."""
 
     def error(self, message):
-        self.exit(2, f"{self.prog}: {message}\n")
+        self.exit(2, f"{self.prog}: {printable(message, MOST_CHARACTERS)}\n")
 
 
 def main(argv=None):
     """Run `clresample` with these arguments (None: sys.argv's); returns the exit status."""
+    with _ended_as_interrupted():
+        return _run(argv)
+
+
+def _run(argv):
     parser = Parser(
         prog="clresample", description="Images between telescopes, on any OpenCL device."
     )
@@ -39,7 +51,7 @@ def main(argv=None):
     except DeviceError as error:  # may hold a compiler's log: its lines are kept
         return _fail(arguments, str(error))
     except (ValueError, OSError) as error:
-        return _fail(arguments, " ".join(str(error).split()))
+        return _fail(arguments, printable(" ".join(str(error).split()), MOST_CHARACTERS))
     except KeyboardInterrupt:
         _fail(arguments, "interrupted")
         return 130  # what a shell reports after Ctrl-C
@@ -49,6 +61,23 @@ def main(argv=None):
 def _fail(arguments, message):
     print(f"clresample {arguments.command}: {message}", file=sys.stderr)
     return 2
+
+
+@contextmanager
+def _ended_as_interrupted():
+    """The signal to end, SIGTERM, counts as Ctrl-C: fits end with what they have, no part stays."""
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    former = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL if former is None else former)
 
 
 COMMANDS = (add_resample, add_deblend, add_devices)

@@ -14,12 +14,13 @@ from pathlib import Path
 from .options import (
     add_device_option,
     add_dtype_option,
-    check_matplotlib,
     fraction,
     note,
+    printable,
     say,
     whole,
 )
+from .outputs import check_scene, folder_outputs
 
 # iterations of the fit whose residuals are searched for more sources: by then the sources that were
 # found are fitted to a few percent; more would find the same ones later
@@ -91,7 +92,7 @@ def run(arguments):
         missing = "SCENE.toml" if arguments.scene is None else "-o DIR"
         raise ValueError(f"{missing} is missing: deblend SCENE.toml -o DIR, or --example DIR")
     started = time.perf_counter()
-    paths = _outputs(arguments)
+    paths = folder_outputs(arguments, OUTPUTS[: 3 if arguments.no_figure else 4])
     _progress(arguments, f"reading {arguments.scene}")
     # Read by NumPy's linear algebra when NumPy is imported. Its matrices are small here: threads
     # wait for each other and for the OpenCL device's own, up to 0.1 s a product on a busy CPU.
@@ -105,6 +106,7 @@ def run(arguments):
     from ..measurement.quality import summary
 
     scene = read_scene(arguments.scene)
+    check_scene(arguments, scene, paths)
     if not arguments.quiet:
         for message in scene.notes:
             note(arguments, message)
@@ -114,7 +116,7 @@ def run(arguments):
     _write(arguments, result, scene.inputs, device, paths)
     _report(arguments, result, summary(result), device, time.perf_counter() - started)
     for path in paths:
-        print(path)
+        print(printable(path))
     if result.status == "interrupted":
         raise KeyboardInterrupt  # the best state is written; the exit status is that of Ctrl-C
 
@@ -122,22 +124,6 @@ def run(arguments):
 def _progress(arguments, message):
     if not arguments.quiet:
         say(arguments, message)
-
-
-def _outputs(arguments):
-    """Paths of all files to write. Raises FileError where one of them cannot be written."""
-    from ..files.whole_file import FileError, check_output
-
-    folder = Path(arguments.output)
-    if folder.exists() and not folder.is_dir():
-        raise FileError(f"{folder}: is a file, not a folder to write into")
-    paths = [folder / name for name in OUTPUTS[: 3 if arguments.no_figure else 4]]
-    if folder.is_dir():
-        for path in paths:
-            check_output(path, overwrite=arguments.overwrite)
-    if not arguments.no_figure:
-        check_matplotlib(OUTPUTS[3], "; or give --no-figure")
-    return paths
 
 
 def _fit(arguments, scene, device):
@@ -234,18 +220,18 @@ def _import_drawing():
 def _write(arguments, result, inputs, device, paths):
     """Write the catalogue twice, the result and, where `paths` has a fourth, the figure."""
     from ..files.results import write_catalogue, write_result
+    from ..files.whole_file import whole_files
     from ..measurement.catalogue import catalogue
 
     table = catalogue(result, magnitudes=result.observations[0].zero_points is not None)
-    paths[0].parent.mkdir(parents=True, exist_ok=True)
-    more = {"overwrite": arguments.overwrite}
-    for path in paths[:2]:
-        write_catalogue(path, table, **more)
-    write_result(paths[2], result, device=device.name, inputs=inputs, **more)
-    if not arguments.no_figure:
-        from ..files.plot_deblended import plot_deblended
+    with whole_files(paths) as parts:
+        for part in parts[:2]:
+            write_catalogue(part, table)
+        write_result(parts[2], result, device=device.name, inputs=inputs)
+        if not arguments.no_figure:
+            from ..files.plot_deblended import plot_deblended
 
-        plot_deblended(paths[3], result, title=", ".join(o.name for o in result.observations))
+            plot_deblended(parts[3], result, title=", ".join(o.name for o in result.observations))
 
 
 def _report(arguments, result, found, device, took):
@@ -286,5 +272,5 @@ def _run_example(arguments):
     except ImportError as error:
         raise ValueError(f"--example: {error}") from error
     for path in paths:
-        print(path)
+        print(printable(path))
     print(f"next: clresample deblend {paths[0]} -o {Path(arguments.example) / 'out'}")

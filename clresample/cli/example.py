@@ -15,7 +15,7 @@ from astropy.table import QTable
 
 from ..files.fits import write_fits, write_hdus
 from ..files.results import write_catalogue
-from ..files.whole_file import check_output, whole_file
+from ..files.whole_file import check_folder, check_output, whole_files
 from ..simulation.scenes import simulate_scene
 from .pointing import ANGLE_DEG, CENTER_DEG
 
@@ -38,14 +38,21 @@ def write_example(folder, *, overwrite=False) -> list[Path]:
     """
     folder = Path(folder)
     paths = {name: folder / name for name in FILES}
+    check_folder(folder)
     for path in paths.values() if folder.exists() else ():
         check_output(path, overwrite=overwrite)
     scene = simulate_scene(SEED, n_sources=N_SOURCES, angle_deg=ANGLE_DEG, center_deg=CENTER_DEG)
-    folder.mkdir(parents=True, exist_ok=True)
+    with whole_files(paths.values()) as parts:
+        _write(dict(zip(paths, parts, strict=True)), scene)
+    return list(paths.values())
+
+
+def _write(paths, scene):
+    """Write a simulated scene's files, by name under these paths."""
     for name, image in (("euclid", scene.euclid), ("rubin", scene.rubin)):
         bands, data = image.survey.bands, image.data.astype(np.float32)
         path = paths[f"{name}.fits"]
-        write_fits(path, data, image.grid, bands=bands, unit="count", overwrite=overwrite)
+        write_fits(path, data, image.grid, bands=bands, unit="count")
         psf = fits.PrimaryHDU(image.psf.images)
         for i, band in enumerate(bands):
             psf.header[f"BAND{i + 1}"] = band
@@ -53,7 +60,6 @@ def write_example(folder, *, overwrite=False) -> list[Path]:
     table = QTable()
     table["name"] = [f"galaxy {i + 1}" for i in range(len(scene.profiles))]
     table["ra"], table["dec"] = scene.positions_deg.T * u.deg
-    write_catalogue(paths["sources.ecsv"], table, overwrite=overwrite)
-    with whole_file(paths["scene.toml"]) as part:
-        part.write_bytes(resources.files(__package__).joinpath("example.toml").read_bytes())
-    return list(paths.values())
+    write_catalogue(paths["sources.ecsv"], table)
+    example = resources.files(__package__).joinpath("example.toml")
+    paths["scene.toml"].write_bytes(example.read_bytes())

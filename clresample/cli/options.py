@@ -36,7 +36,18 @@ def note(arguments, message):
 
 def say(arguments, message):
     """Print a line of progress on standard error."""
-    print(f"clresample {arguments.command}: {message}", file=sys.stderr, flush=True)
+    print(f"clresample {arguments.command}: {printable(message)}", file=sys.stderr, flush=True)
+
+
+def printable(text, most=None):
+    """A text for a terminal: control characters as their escapes, no more than `most` characters.
+
+    Of a longer one the middle is left out: the end often says what to do.
+    """
+    shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
+    if most is None or len(shown) <= most:
+        return shown
+    return f"{shown[: most // 2]} ... {shown[len(shown) - most // 2 :]}"
 
 
 def check_matplotlib(option, way_out=""):

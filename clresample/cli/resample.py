@@ -11,19 +11,17 @@ from .options import (
     add_device_option,
     add_dtype_option,
     center,
-    check_matplotlib,
     names,
     note,
     positive,
+    printable,
     size,
 )
+from .outputs import file_outputs
 
 # |D|, the factor by which the difference kernel raises noise: warned of above the first, refused
 # above the second. Equal PSFs have 1; in an image with a hundred times the noise nothing is seen.
 GAIN_WARNED, GAIN_REFUSED = 2.0, 100.0
-# Light beyond the edge of a PSF image by its own wings (`PSF.edge_light`), as a part of the light
-# inside: above this the image is refused. Good ones have 0.02 to 0.05, an evenly bright one 1.6.
-EDGE_REFUSED = 0.5
 
 DESCRIPTION = """\
 Show an image as another instrument would have seen it: on the pixels of REF and
@@ -144,13 +142,14 @@ def run(arguments):
         "pixels of": arguments.like,
         "PSF of these": arguments.psf_like,
     }
-    _check_outputs(arguments, inputs.values())
+    paths = file_outputs(arguments, inputs.values())
     from ..device.contraction import operator_programs
     from ..device.device import get_device
 
     device = get_device(arguments.device)
     device.build_ahead(operator_programs(device, arguments.dtype))
     from ..files.fits import read_image, write_fits  # a quarter of a second of astropy
+    from ..files.whole_file import whole_files
 
     image = read_image(arguments.image, hdu=arguments.hdu, bands=arguments.band)
     pixels = _finite(arguments, image)
@@ -164,48 +163,33 @@ def run(arguments):
 
     started = time.perf_counter()
     op = _operator(arguments, device, image.grid, reference.grid, psfs)
-    result = op(pixels)
+    result = _resampled(arguments, op, pixels)
     took = time.perf_counter() - started
     written = result if len(result) > 1 else result[0]
-    write_fits(
-        arguments.output,
-        written,
-        reference.grid,
-        bands=None if all(band.isdigit() for band in image.bands) else image.bands,
-        coverage=op.covered,
-        unit=unit,
-        device=op.device.name,
-        inputs=inputs,
-        shift_px=arguments.shift,
-        overwrite=arguments.overwrite,
-    )
+    with whole_files(paths) as parts:
+        write_fits(
+            parts[0],
+            written,
+            reference.grid,
+            bands=None if all(band.isdigit() for band in image.bands) else image.bands,
+            coverage=op.covered,
+            unit=unit,
+            device=op.device.name,
+            inputs=inputs,
+            shift_px=arguments.shift,
+        )
+        if arguments.plot:
+            from ..files.plot_resampled import plot_resampled
+
+            files = Path(arguments.image).name, Path(arguments.like).name
+            plot_resampled(parts[1], image, reference, result, op.covered, psfs[1], names=files)
     print(
-        f"{arguments.output}: {' x '.join(map(str, written.shape))} pixels, "
+        f"{printable(arguments.output)}: {' x '.join(map(str, written.shape))} pixels, "
         f"{100 * op.covered.mean():.3g} % covered; {op.geometry} grids, {op.n_tiles} "
         f"tile{'s' * (op.n_tiles > 1)}, {took:.2f} s on {op.device.name}"
     )
     if arguments.plot:
-        from ..files.plot_resampled import plot_resampled
-
-        files = Path(arguments.image).name, Path(arguments.like).name
-        plot_resampled(arguments.plot, image, reference, result, op.covered, psfs[1], names=files)
-        print(arguments.plot)
-
-
-def _check_outputs(arguments, inputs):
-    """Raise ValueError where OUT or PNG cannot be written, or is a file that is read."""
-    from ..files.whole_file import check_output
-
-    outputs = [path for path in (arguments.output, arguments.plot) if path]
-    for output in outputs:
-        for path in inputs:
-            if Path(output).exists() and Path(path).exists() and Path(output).samefile(path):
-                raise ValueError(f"{output}: is one of the inputs, and is kept")
-        check_output(output, overwrite=arguments.overwrite)
-    if len({Path(output).absolute() for output in outputs}) < len(outputs):
-        raise ValueError(f"{arguments.plot}: is both the image and the picture to write")
-    if arguments.plot:
-        check_matplotlib("--plot")
+        print(printable(arguments.plot))
 
 
 def _operator(arguments, device, grid_in, grid_out, psfs):
@@ -247,6 +231,22 @@ def _operator(arguments, device, grid_in, grid_out, psfs):
     return op
 
 
+def _resampled(arguments, op, pixels):
+    """The result. Raises ValueError where it has overflowed."""
+    import numpy as np
+
+    with np.errstate(over="ignore"):  # NumPy's warning, of which more is said here
+        result = op(pixels)
+    n_bad = int(np.count_nonzero(~np.isfinite(result)))
+    if n_bad:
+        raise ValueError(
+            f"{arguments.image}: {n_bad} of {result.size} resampled pixels are too large for "
+            f"{arguments.dtype}: divide the image by a power of ten"
+            + (", or use --dtype float64" if arguments.dtype == "float32" else "")
+        )
+    return result
+
+
 def _finite(arguments, image):
     """The image's pixels; NaN and infinite ones have the value of --nan, or are refused."""
     import numpy as np
@@ -264,7 +264,7 @@ def _finite(arguments, image):
 def _psf(arguments, which, n_bands):
     """PSF `which` ("psf" or "psf_like") with as many bands as the image; its warnings as notes."""
     from ..files.fits import read_psf
-    from ..sky.psf_checks import PSFWarning
+    from ..sky.psf_checks import PSFWarning, check_edge
 
     option = "--" + which.replace("_", "-")
     path, hdu, bands, spacing, where = (
@@ -273,12 +273,10 @@ def _psf(arguments, which, n_bands):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PSFWarning)  # printed below, with the name of the option
         psf = read_psf(path, hdu=hdu, bands=bands, spacing=spacing, center=where)
-    light = psf.edge_light().max()
-    if light > EDGE_REFUSED:
-        raise ValueError(
-            f"{path}: too wide for its {psf.images.shape[1]} x {psf.images.shape[2]} image, or no "
-            f"PSF: by the light at its edge, another {100 * light:.0f} % lies beyond"
-        )
+    try:
+        check_edge(psf.images)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     for message in psf.warnings(core=f"{option}-center core"):
         note(arguments, f"{path}: {message}")
     if psf.n_bands not in (1, n_bands):

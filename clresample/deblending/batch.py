@@ -11,6 +11,7 @@ import numpy as np
 from ..device.device import get_device
 from ..device.discovery import DeviceError
 from ..device.tuning import Tuning
+from ..sky.given.checks import float_type, instance
 from ..sky.sources import SourceWarning
 from .blend import INTERRUPTED, Blend, Failure
 from .fit import Fit
@@ -24,8 +25,9 @@ from .solver.learned.engine import vector_bytes
 PAD_PX = 16
 # [bytes] Device memory of the scenes of one batch, by default.
 MEMORY = 1 << 30
-# What can go wrong with one blend and is no reason to give up the others.
-ERRORS = (ValueError, ArithmeticError, DeviceError, MemoryError, np.linalg.LinAlgError)
+# What says by itself what went wrong with one blend; other errors are named by their kind as well.
+# None of them is a reason to give up the other blends.
+ERRORS = (ValueError, DeviceError, np.linalg.LinAlgError)
 
 
 def deblend(
@@ -49,8 +51,9 @@ def deblend(
     source lies inside the frame. Warns (SourceWarning) of sources far from any light. Ctrl-C ends
     the fit with the best state so far.
     """
-    blend = Blend(tuple(observations), tuple(sources), frame, shifts)
-    settings = settings or Settings()
+    given = (_listed("observations", observations), _listed("sources", sources))
+    blend = Blend(*given, frame, shifts)
+    settings, dtype = _checked(settings, dtype)
     device = get_device(device)
     fit = Fit(blend, settings, device, dtype, pad=1)
     if len(fit.dark):
@@ -72,7 +75,8 @@ def deblend_many(
         comes back, and Failures with the status "interrupted" for the rest
     Warns once (SourceWarning) of all sources far from any light; results' messages name them.
     """
-    many = _ManyFits(list(blends), settings or Settings(), get_device(device), dtype, memory)
+    settings, dtype = _checked(settings, dtype)
+    many = _ManyFits(list(blends), settings, get_device(device), dtype, memory)
     with contextlib.suppress(KeyboardInterrupt):  # the results of what was not done say so
         many.run(progress or (lambda n_done: None))
     if many.dark:
@@ -105,12 +109,13 @@ class _ManyFits:
 
     def _groups_done(self, waiting):
         """Fit group after group as they fill up; yields how many blends that has done."""
-        pad = PAD_PX if len({_sizes(b) for b in self.blends}) > 1 else 1
+        pad = PAD_PX if len({_sizes(b) for b in self.blends} - {None}) > 1 else 1
         for i, blend in enumerate(self.blends):
             try:
+                instance("blend", blend, Blend)
                 fit = Fit(blend, self.settings, self.device, self.dtype, pad=pad)
-            except ERRORS as error:
-                self.done[i] = Failure(blend, f"failed: {error}")
+            except Exception as error:
+                self.done[i] = _failure(blend, error)
                 yield 1
                 continue
             if len(fit.dark):
@@ -135,9 +140,9 @@ class _ManyFits:
         """Yield (index, Result or Failure) of a group; one by one where all at once fails."""
         try:
             iterate([fit for _, fit in group], self.settings, self.device, self.dtype)
-        except ERRORS as error:
+        except Exception as error:
             if len(group) == 1:
-                yield group[0][0], Failure(group[0][1].blend, f"failed: {error}")
+                yield group[0][0], _failure(group[0][1].blend, error)
                 return
             for item in group:
                 yield from self._try([item])
@@ -147,8 +152,8 @@ class _ManyFits:
         for i, fit in group:
             try:
                 yield i, fit.result()
-            except ERRORS as error:
-                yield i, Failure(fit.blend, f"failed: {error}")
+            except Exception as error:
+                yield i, _failure(fit.blend, error)
 
 
 def _n_bytes(fit):
@@ -157,8 +162,33 @@ def _n_bytes(fit):
     return fit.scene.n_bytes + (vector_bytes(fit.scene, prior) if learns else 0)
 
 
+def _checked(settings, dtype):
+    """Settings, the default ones for None, and the NumPy type. ValueError for anything else."""
+    return instance("settings", Settings() if settings is None else settings, Settings), float_type(
+        dtype
+    )
+
+
+def _listed(name, values):
+    """The values as a tuple. Raises ValueError for one alone."""
+    try:
+        return tuple(values)
+    except TypeError:
+        raise ValueError(f"{name} is {values!r:.80}, must be a sequence") from None
+
+
+def _failure(blend, error):
+    """The Failure of a blend that ended with an exception, which its status tells."""
+    kind = "" if isinstance(error, ERRORS) else f"{type(error).__name__}: "
+    return Failure(blend, f"failed: {kind}{error}")
+
+
 def _sizes(blend):
-    """The shapes of a blend's images and of its frame."""
+    """The shapes of a blend's images and of its frame; None of what is no blend."""
+    try:
+        blend.check()
+    except (ValueError, TypeError, AttributeError):
+        return None
     return tuple(o.data.shape for o in blend.observations), blend.frame and blend.frame.shape
 
 

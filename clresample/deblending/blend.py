@@ -7,11 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..sky.frame import Frame, model_frame
+from ..sky.given.checks import instance, numbers
 from ..sky.observation import Observation, check_observations
 from ..sky.sources import Source
 
 # Status of a fit that Ctrl-C ended.
 INTERRUPTED = "interrupted"
+# What one fit takes at most. Its spectra are solved together, n^3 for n components: 2000 take
+# minutes. Arrays of components times pixels are held several at a time. A blend of 4096 pixels a
+# side has no neighbours that would need to be fitted at once.
+MOST_COMPONENTS, MOST_BYTES, MOST_PIXELS = 2000, 8 << 30, 1 << 24
 
 
 @dataclass(frozen=True)
@@ -30,13 +35,45 @@ class Blend:
     frame: Frame | None = None
     shifts: np.ndarray | None = None
 
+    def check(self):
+        """Raise ValueError where an observation, a source or the frame is something else."""
+        for i, observation in enumerate(self.observations):
+            instance(f"observations[{i}]", observation, Observation)
+        for i, source in enumerate(self.sources):
+            instance(f"sources[{i}]", source, Source)
+        if self.frame is not None:
+            instance("frame", self.frame, Frame)
+
+    def _check_work(self, frame):
+        """Raise ValueError where a fit would take more than could be meant, before it begins."""
+        n_pixels = int(np.prod(frame.shape, dtype=float))
+        if n_pixels > MOST_PIXELS:
+            raise ValueError(
+                f"the model frame has {frame.shape[0]} x {frame.shape[1]} pixels, more than the "
+                f"{MOST_PIXELS} of one fit: are the WCS right? If so, cut the field into blends"
+            )
+        n = sum(getattr(source, "n_components", 1) for source in self.sources)
+        n_seen = max(int(np.count_nonzero(o.weights, axis=(1, 2)).max()) for o in self.observations)
+        if n > n_seen > 0:
+            raise ValueError(
+                f"{len(self.sources)} sources have {n} components, more than any channel has "
+                f"pixels with a weight ({n_seen}): each has a flux in each channel; give fewer"
+            )
+        n_bytes = 8 * n * (n_pixels + sum(o.data.size for o in self.observations))
+        if n > MOST_COMPONENTS or n_bytes > MOST_BYTES:
+            raise ValueError(
+                f"{len(self.sources)} sources with {n} components on {n_pixels} model pixels need "
+                f"{n_bytes / 2**30:.3g} GiB in one fit; it takes {MOST_COMPONENTS} components and "
+                f"{MOST_BYTES >> 30} GiB at most: cut the field into blends for deblend_many"
+            )
+
     def known_shifts(self) -> np.ndarray:
         """Shifts (n_observations, 2) [model px], 0 where none are given.
 
         ValueError: they are not as many, or not finite.
         """
         expected = len(self.observations), 2
-        shifts = np.zeros(expected) if self.shifts is None else np.asarray(self.shifts, float)
+        shifts = np.zeros(expected) if self.shifts is None else numbers("shifts", self.shifts)
         if shifts.shape != expected or not np.isfinite(shifts).all():
             raise ValueError(f"shifts is {shifts.tolist()}, must be {expected} finite numbers")
         return shifts
@@ -46,11 +83,13 @@ class Blend:
 
         ValueError: observations that do not go together, a profile of another shape than the frame.
         """
+        self.check()
         if self.frame is None:
             frame = model_frame(self.observations)
         else:
             check_observations(self.observations)
             frame = self.frame
+        self._check_work(frame)
         for i, source in enumerate(self.sources):
             profile = getattr(source, "profile", None)
             if profile is not None and np.shape(profile) != frame.shape:

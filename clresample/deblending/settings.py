@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from ..sky.given.checks import instance, number, whole
 from .solver.amsgrad import StepSizes
 from .solver.constraints import Chain, MaxNorm, Monotone, Positivity, SumNorm
 from .solver.learned.prior import LearnedPrior
@@ -50,14 +53,16 @@ class Settings:
     flux_floor: float = 0.0015
 
     def __post_init__(self):
-        if self.max_iter < 0:
-            raise ValueError(f"max_iter is {self.max_iter}, must be 0 or more")
-        if not self.enough >= 0:
-            raise ValueError(f"enough is {self.enough}, must be 0 or more")
-        if not 0 <= self.tol < 1:
-            raise ValueError(f"tol is {self.tol}, must be at least 0 and under 1")
-        if not 0 <= self.flux_floor < 1:
-            raise ValueError(f"flux_floor is {self.flux_floor}, must be at least 0 and under 1")
+        whole("max_iter", self.max_iter)
+        number("enough", self.enough, "0 or more", lambda x: x >= 0)
+        for name in ("tol", "flux_floor"):
+            number(name, getattr(self, name), "at least 0 and under 1", lambda x: 0 <= x < 1)
+        for name in ("fit_shifts", "fit_sky"):
+            instance(name, getattr(self, name), (bool, np.bool_))
+        for name, kind in (("prior", (LearnedPrior, Prior)), ("constraints", Chain)):
+            if getattr(self, name) is not None:
+                instance(name, getattr(self, name), kind)
+        instance("step_sizes", self.step_sizes, StepSizes)
         steps = self.chain.steps()
         scaling = [p for p in steps if isinstance(p, MaxNorm | SumNorm)]
         if self.prior is not None and scaling:

@@ -8,13 +8,14 @@ from __future__ import annotations
 import functools
 import gc
 import math
+import os
 import threading
 import weakref
 
 import numpy as np
 
 from .discovery import builds_fp64, choose, kind_of, load_pyopencl
-from .errors import FULL, explained, status_of, too_large
+from .errors import FULL, explained, forked, status_of, too_large
 from .launcher import Launcher
 from .program import Programs
 
@@ -42,7 +43,8 @@ class Device:
         self.compute_units = cl_device.max_compute_units
         self.memory = cl_device.global_mem_size
         self.max_alloc = cl_device.max_mem_alloc_size
-        self.in_use = 0
+        self.in_use, self._pid = 0, os.getpid()
+        _opened.add(self)
         self._enqueue, self._error = cl.enqueue_nd_range_kernel, cl.Error
         self._programs, self._lock = Programs(self), threading.Lock()
         self.context = self._call(cl.Context, [cl_device])
@@ -50,6 +52,10 @@ class Device:
 
     def __repr__(self):
         return f"Device({self.platform}: {self.name})"
+
+    def __reduce__(self):
+        """Copied as itself; unpickled elsewhere, the device of the same platform and name there."""
+        return get_device, (f"{self.platform}:{self.name}",)
 
     @functools.cached_property
     def has_fp64(self):
@@ -187,7 +193,30 @@ def get_device(choice=None) -> Device:
         PYOPENCL_CTX (pyopencl's form), and then takes the first GPU, or else the first CPU.
     DeviceError: there is no platform, or nothing fits the choice
     """
-    return choice if isinstance(choice, Device) else _open(choose(choice))
+    device = choice if isinstance(choice, Device) else _open(choose(choice))
+    if os.getpid() != device._pid:
+        raise forked(device)
+    return device
+
+
+_opened: weakref.WeakSet[Device] = weakref.WeakSet()
+
+
+def _refuse_in_child():
+    """In a forked process every use of a device that was open raises, at no cost to the parent.
+
+    A driver's threads do not live on in it: whatever asks them for an answer waits for ever.
+    """
+
+    def refuse(device):
+        raise forked(device)
+
+    for device in _opened:
+        device._call = lambda *_, device=device, **__: refuse(device)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_refuse_in_child)
 
 
 @functools.cache

@@ -6,6 +6,7 @@ pyopencl is imported when devices are first looked for, never before.
 from __future__ import annotations
 
 import os
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -144,6 +145,8 @@ def _found():
             continue
     if found:
         return found
+    if any("Portable Computing" in p.name for p in platforms) and (cause := unusable_cache()):
+        raise DeviceError(cause)
     what = "OpenCL platform" if not platforms else f"device on {platforms[0].name}"
     vendors = os.environ.get("OCL_ICD_VENDORS")
     if vendors and not Path(vendors).exists():
@@ -155,6 +158,30 @@ def _found():
         if vendors:
             way += f"; OCL_ICD_VENDORS={vendors} limits the search to that place"
     raise DeviceError(f"no {what} found: {way}")
+
+
+def unusable_cache():
+    """What hides PoCL's device although its driver is there; None where nothing is known to.
+
+    PoCL offers no device where it cannot write to its cache of built kernels.
+    """
+    if os.environ.get("POCL_DEVICES"):
+        return (
+            f"PoCL shows no device for POCL_DEVICES={os.environ['POCL_DEVICES']}: unset it, or set "
+            "it to cpu"
+        )
+    home = Path(os.environ.get("HOME") or "/tmp")
+    shared = Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache") / "pocl"
+    folder = Path(os.environ.get("POCL_CACHE_DIR") or shared)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        return (
+            f"PoCL cannot write to its cache of built kernels, {folder} ({error.strerror}): "
+            "set POCL_CACHE_DIR to a folder that can be written"
+        )
+    return None
 
 
 def load_pyopencl():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .discovery import DeviceError, format_size, load_pyopencl
+from .discovery import DeviceError, format_size, load_pyopencl, unusable_cache
 
 # Status codes after which the device or its queue no longer answers.
 # -9999 is NVIDIA's own code for an illegal access, after which its context is dead.
@@ -52,6 +52,14 @@ def too_large(device, n_bytes):
     )
 
 
+def forked(device):
+    """A DeviceError for a device that was opened before this process was forked."""
+    return DeviceError(
+        f"{device.name} was opened before this process was forked, and cannot answer here: start "
+        'processes with multiprocessing.get_context("spawn"), or fork before a device is used'
+    )
+
+
 def no_double(device):
     """A DeviceError for float64 on a device without it."""
     return DeviceError(
@@ -62,6 +70,8 @@ def no_double(device):
 
 def not_built(device, file, defines, log):
     """A DeviceError for a kernel file that does not compile; log: the compiler's own words."""
+    if "Portable Computing" in device.platform and (cause := unusable_cache()):
+        return DeviceError(f"{file} does not build: {cause}")
     return DeviceError(
         f"{file} does not build on {device.name} ({device.platform}) with "
         f"{defines}; the compiler says:\n{log}\n"

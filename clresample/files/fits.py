@@ -17,6 +17,7 @@ from astropy.wcs import WCS
 from .. import __version__
 from ..sky.grid import Grid
 from ..sky.psf import PSF
+from .names import to_ascii
 from .whole_file import FileError, check_output, whole_file
 
 # header cards that describe a third axis
@@ -127,7 +128,7 @@ def write_fits(
     hdus = [fits.PrimaryHDU(data, placed[0].header)]
     cards = hdus[0].header
     if unit:
-        cards["BUNIT"] = (unit, "flux per pixel")
+        cards["BUNIT"] = (to_ascii(unit), "flux per pixel")
     for i, name in enumerate(bands or ()):
         cards[f"BAND{i + 1}"] = (to_ascii(name), f"plane {i + 1}")
     add_provenance(cards, data.dtype, device, inputs or {}, shift_px)
@@ -155,6 +156,8 @@ def open_fits(path):
         raise FileError(f"{path}: is a directory, not a FITS file")
     if not path.exists():
         raise FileError(f"{path}: no such file")
+    if not path.is_file():  # reading it might never end
+        raise FileError(f"{path}: is no regular file, but a device, a pipe or a socket")
     # astropy warns of every header that it repairs: recorded here and not shown
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", AstropyWarning)
@@ -261,11 +264,6 @@ def choose_bands(path, names, bands):
     if not chosen:
         raise FileError(f"{path}: bands is empty, none of the {len(names)} in the file is chosen")
     return chosen
-
-
-def to_ascii(text):
-    """Text as FITS cards can hold it."""
-    return str(text).encode("ascii", "replace").decode()
 
 
 def add_provenance(header, dtype, device, inputs, shift_px):

@@ -20,7 +20,9 @@ from ..sky.grid import Grid
 from ..sky.observation import Observation
 from ..sky.psf import PSF
 from ..sky.sources import Extended, Point, Source
-from .fits import add_provenance, celestial_header, open_fits, to_ascii, write_hdus
+from .arrays import array_of, image_hdu
+from .fits import add_provenance, celestial_header, open_fits, write_hdus
+from .names import check_channels, to_ascii
 from .whole_file import FileError, check_output, whole_file
 
 FORMAT = 1  # of the files; raised when an older reader would misread them
@@ -46,8 +48,8 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
     LOSSES, where the result has errors FLUXCOV, COLOURCOV, MOMENTCOV, BEYOND and MORPHOLOGYERR
     (one after the other), MODELPSF, and per observation, numbered from 1: DATA, WEIGHTS, PSF, RENDERED.
     For other programs: CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all sources in the model frame, and
-    per observation MODEL and RESIDUAL. All images have their WCS; a flat sky is put at
-    RA = Dec = 0.
+    per observation MODEL and RESIDUAL, 0 where data have no weight. All images have their WCS; a
+    flat sky is put at RA = Dec = 0. For NaN and infinity see arrays.py.
 
     result: of `deblend`; overwrite: replace a file that exists
     device: name of the OpenCL device; inputs: {what: file}; both for the header
@@ -55,6 +57,7 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
     Raises FileError when the file exists or cannot be written.
     """
     path = Path(path)
+    check_channels(result.channels)
     check_output(path, overwrite=overwrite)
     primary = fits.PrimaryHDU()
     primary.header["CLSTATUS"] = (to_ascii(" ".join(result.status.split())), "how the fit ended")
@@ -76,12 +79,12 @@ def _fit_hdus(result):
     return [
         _about_table(_about(result)),
         fits.BinTableHDU(Table(np.array(boxes, int).reshape(-1, 5), names=BOX), name="COMPONENTS"),
-        _image("SPECTRA", np.array(spectra) if spectra else np.zeros((0, len(result.channels)))),
-        _image("MORPHOLOGIES", np.concatenate(flat) if flat else np.zeros(0)),
-        *(_image(name.upper(), getattr(result, name)) for name in ARRAYS),
+        image_hdu("SPECTRA", np.array(spectra) if spectra else np.zeros((0, len(result.channels)))),
+        image_hdu("MORPHOLOGIES", np.concatenate(flat) if flat else np.zeros(0)),
+        *(image_hdu(name.upper(), getattr(result, name)) for name in ARRAYS),
         *_error_hdus(result.errors),
-        _image("MODELPSF", result.frame.psf.images),
-        _image("SCENE", scene, cards),
+        image_hdu("MODELPSF", result.frame.psf.images),
+        image_hdu("SCENE", scene, cards),
         *tables,
     ]
 
@@ -92,8 +95,8 @@ def _error_hdus(errors):
         return []
     flat = [np.ravel(m) for m in errors.morphology]
     return [
-        *(_image(name, getattr(errors, key)) for name, key in ERRORS.items()),
-        _image("MORPHOLOGYERR", np.concatenate(flat) if flat else np.zeros(0)),
+        *(image_hdu(name, getattr(errors, key)) for name, key in ERRORS.items()),
+        image_hdu("MORPHOLOGYERR", np.concatenate(flat) if flat else np.zeros(0)),
     ]
 
 
@@ -104,14 +107,19 @@ def _observation_hdus(result, i):
     for k, channel in enumerate(o.channels):
         cards[f"BAND{k + 1}"] = (to_ascii(channel), f"plane {k + 1}")
     images = {"DATA": o.data, "WEIGHTS": o.weights}
-    more = {"MODEL": result.model(i), "RESIDUAL": result.residual(i)} if result.components else {}
+    more = {"MODEL": result.model(i), "RESIDUAL": _residual(result, i)} if result.components else {}
     return [
-        *(_image(name, image, cards, i) for name, image in images.items()),
+        *(image_hdu(name, image, cards, i) for name, image in images.items()),
         *tables,
-        *(_image(name, image, cards, i) for name, image in more.items()),
-        _image("RENDERED", result.rendered[i], None, i),
-        _image("PSF", o.psf.images, None, i),
+        *(image_hdu(name, image, cards, i) for name, image in more.items()),
+        image_hdu("RENDERED", result.rendered[i], None, i),
+        image_hdu("PSF", o.psf.images, None, i),
     ]
+
+
+def _residual(result, i):
+    """The residual of observation i; 0 where the data have no weight."""
+    return np.where(result.observations[i].weights > 0, result.residual(i), 0.0)
 
 
 def read_result(path) -> Result:
@@ -129,7 +137,7 @@ def read_result(path) -> Result:
         numbers = range(len(about["observations"]))
         frame = Frame(
             _grid(path, hdus["SCENE"], about["frame"], hdus),
-            _psf(_array(hdus["MODELPSF"]), about["frame"]),
+            _psf(array_of(hdus["MODELPSF"]), about["frame"]),
         )
         return Result(
             observations=tuple(
@@ -138,12 +146,12 @@ def read_result(path) -> Result:
             frame=frame,
             sources=tuple(_source(path, **source) for source in about["sources"]),
             components=_components(hdus),
-            rendered=tuple(_array(hdus["RENDERED", i + 1]) for i in numbers),
+            rendered=tuple(array_of(hdus["RENDERED", i + 1]) for i in numbers),
             status=about["status"],
             messages=tuple(about["messages"]),
             seconds=about["seconds"],
             errors=_errors(hdus),
-            **{key: _array(hdus[key.upper()]) for key in ARRAYS},
+            **{key: array_of(hdus[key.upper()]) for key in ARRAYS},
         )
 
 
@@ -213,22 +221,6 @@ def _table(table, name):
     return hdu
 
 
-def _image(name, array, cards=None, i=0):
-    """An image HDU, number i + 1 of its name; an empty array is described in its header."""
-    array = np.asarray(array)
-    hdu = fits.ImageHDU(array if array.size else None, cards, name=name, ver=i + 1)
-    if not array.size:
-        hdu.header["EMPTY"] = (json.dumps([array.dtype.name, *array.shape]), "type and shape")
-    return hdu
-
-
-def _array(hdu):
-    if "EMPTY" in hdu.header:
-        dtype, *shape = json.loads(hdu.header["EMPTY"])
-        return np.zeros(shape, dtype)
-    return np.array(hdu.data, dtype=hdu.data.dtype.newbyteorder("="))
-
-
 def _placed(grid, number):
     """WCS cards that give back the same float64, and HDUs of look-up tables.
 
@@ -265,10 +257,10 @@ def _psf(images, about):
 def _observation(path, hdus, i, about):
     data = hdus["DATA", i + 1]
     return Observation.restore(
-        _array(data),
-        _psf(_array(hdus["PSF", i + 1]), about),
+        array_of(data),
+        _psf(array_of(hdus["PSF", i + 1]), about),
         _grid(path, data, about, hdus),
-        weights=_array(hdus["WEIGHTS", i + 1]),
+        weights=array_of(hdus["WEIGHTS", i + 1]),
         noise=about.get("noise"),
         **{key: about[key] for key in KEPT},
     )
@@ -283,18 +275,18 @@ def _source(path, *, kind, **given):
 def _errors(hdus):
     if "MORPHOLOGYERR" not in hdus:
         return None
-    flat, maps = _array(hdus["MORPHOLOGYERR"]), []
+    flat, maps = array_of(hdus["MORPHOLOGYERR"]), []
     for row in hdus["COMPONENTS"].data:
         shape = int(row["n_y"]), int(row["n_x"])
         end = shape[0] * shape[1]
         maps.append(flat[:end].reshape(shape).copy())
         flat = flat[end:]
-    arrays = {key: _array(hdus[name]) for name, key in ERRORS.items()}
+    arrays = {key: array_of(hdus[name]) for name, key in ERRORS.items()}
     return Errors(**arrays, morphology=tuple(maps))
 
 
 def _components(hdus):
-    spectra, flat = _array(hdus["SPECTRA"]), _array(hdus["MORPHOLOGIES"])
+    spectra, flat = array_of(hdus["SPECTRA"]), array_of(hdus["MORPHOLOGIES"])
     components, end = [], 0
     for row, spectrum in zip(hdus["COMPONENTS"].data, spectra, strict=True):
         source, y, x, n_y, n_x = (int(row[key]) for key in BOX)

@@ -24,7 +24,7 @@ from ..measurement.detection import THRESHOLD
 from ..sky.extent import intersection, union
 from ..sky.frame import Frame, model_frame
 from ..sky.observation import Observation, check_observations
-from ..sky.psf_checks import PSFWarning
+from ..sky.psf_checks import PSFWarning, check_edge
 from ..sky.sources import Source
 from .fits import (
     choose_bands,
@@ -37,6 +37,7 @@ from .fits import (
 )
 from .scene_keys import SceneError, parse
 from .source_table import read_sources
+from .whole_file import FileError
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,6 +206,10 @@ def _psf(path, table, bands, notes):
             spacing=table.get("psf_spacing", 1.0),
             center=None if center == "middle" else center,
         )
+    try:
+        check_edge(psf.images)
+    except ValueError as error:
+        raise FileError(f"{path}: {error}") from error
     notes += [f"{table['name']}: {text}" for text in psf.warnings(core='psf_center = "core"')]
     if psf.n_bands == bands.n_all and "psf_bands" not in table:
         psf = psf.select(bands.chosen)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-import math
+import sys
 import tomllib
 from dataclasses import dataclass
+from pathlib import Path
+
+# Integers above this are no floats, nor is infinity.
+LARGEST = sys.float_info.max
 
 
 class SceneError(ValueError):
@@ -20,7 +24,9 @@ class Rule:
 
 
 def _number(value):
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    return abs(value) <= LARGEST  # of integers, which may be too large for a float, and not NaN
 
 
 def _many(fits):
@@ -122,12 +128,16 @@ def parse(path):
     returns {table: {key: value}}, and for "observation" a list of such dicts
     Raises SceneError.
     """
+    if Path(path).exists() and not Path(path).is_file():  # reading it might never end
+        raise SceneError(f"{path}: is no regular file")
     try:
         with open(path, "rb") as file:
             tables = tomllib.load(file)
+    except RecursionError:
+        raise SceneError(f"{path}: not a scene file (lists or tables nested too deeply)") from None
     except OSError as error:
         raise SceneError(f"{path}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:  # of TOML, of UTF-8, and of whole numbers of 5000 digits
         raise SceneError(f"{path}: not TOML ({error})") from error
     _allowed(path, tables, TABLES, "table")
     observations = tables.get("observation")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -83,9 +84,14 @@ def _numbers(path, what, column, unit):
                 column.to(unit) if not hasattr(column, "mask") else column.filled(np.nan).to(unit)
             )
         values = getattr(column, "value", column)
-        return np.ma.filled(np.ma.asarray(values, dtype=float), np.nan)
+        values = np.ma.filled(np.ma.asarray(values, dtype=float), np.nan)
     except Exception as error:  # astropy and NumPy raise several on texts and other units
         raise ValueError(f"{path}: column {what} is no position in {unit} ({error})") from error
+    if values.ndim != 1:
+        raise ValueError(
+            f"{path}: column {what} has {values.shape[1:]} values a row, a position takes one"
+        )
+    return values
 
 
 def _source(found, i, given):
@@ -98,8 +104,17 @@ def _source(found, i, given):
     if kind not in KINDS:
         raise ValueError(f"type is {kind!r}, it takes {' or '.join(KINDS)}")
     if kind == "extended" and "components" in found:
-        n_components = float(found["components"][i])
-        if n_components != int(n_components):
-            raise ValueError(f"components is {n_components}, it takes a whole number")
-        given["n_components"] = int(n_components)
+        given["n_components"] = _whole("components", found["components"][i])
     return KINDS[kind](**given)
+
+
+def _whole(what, value):
+    """The whole number that a table's cell holds, whatever its type. Raises ValueError."""
+    try:
+        number = float(value)
+        whole = int(number)
+    except (TypeError, ValueError, OverflowError):
+        number, whole = math.nan, 0
+    if number != whole:
+        raise ValueError(f"{what} is {value!s:.80}, it takes a whole number")
+    return whole

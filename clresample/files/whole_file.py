@@ -1,49 +1,261 @@
-"""Files that are whole or absent, whatever interrupts their writing."""
+"""Files that appear whole or not at all, one or several together, whatever interrupts the writing.
+
+All are written in a folder of their own beside their place, `.part-HOST-PID-xxxx`, brought to the
+disk, and then moved. Just before the first is moved the folder becomes `.done-HOST-PID-xxxx`: what
+a killed run left of the one kind is thrown away by the next run, of the other kind moved.
+"""
 
 from __future__ import annotations
 
 import os
-from contextlib import contextmanager
+import platform
+import re
+import secrets
+import shutil
+import signal
+import threading
+from contextlib import contextmanager, suppress
 from pathlib import Path
+
+# letters and digits of this machine's name: other machines' runs may be alive
+HOST = re.sub(r"[\W_]", "", platform.node())[:32] or "host"
+STAGE = re.compile(rf"\.(part|done)-{HOST}-(\d+)-\w+")
 
 
 class FileError(ValueError):
     """A file that cannot be read or written: one line that names it."""
 
 
-def check_output(path, *, overwrite=False):
+def check_output(path, *, overwrite=False, inputs=()):
     """Raise FileError where a file could not be written; ask before a long computation.
 
-    path: the file; overwrite: whether one that exists may be replaced
+    path: the file; overwrite: whether one that exists may be replaced; inputs: files that may not
+    be, under whatever name
     """
     path = Path(path)
-    if path.is_dir():
-        raise FileError(f"{path}: is a directory, not a file to write")
-    if path.exists() and not overwrite:
-        raise FileError(f"{path}: exists already, and is kept unless overwriting is asked for")
-    if not path.absolute().parent.is_dir():
-        raise FileError(f"{path}: the folder {path.parent} does not exist")
+    try:
+        if path.is_dir():
+            raise FileError(f"{path}: is a directory, not a file to write")
+        if path.is_symlink():
+            raise FileError(f"{path}: is a symbolic link, and is kept: name the file itself")
+        if path.exists():
+            for other in map(Path, inputs):
+                if other.exists() and path.samefile(other):
+                    raise FileError(f"{path}: is one of the inputs, and is kept")
+            if not path.is_file():
+                raise FileError(f"{path}: is a device, a pipe or a socket, and is kept")
+            if not overwrite:
+                raise FileError(
+                    f"{path}: exists already, and is kept unless overwriting is asked for"
+                )
+        if not path.absolute().parent.is_dir():
+            raise FileError(f"{path}: the folder {path.parent} does not exist")
+    except OSError as error:
+        raise FileError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def check_folder(folder):
+    """Raise FileError where nothing can be written into a folder, or where it could not be made.
+
+    It tries, in the folder or in the first one above that exists, and removes what it made there.
+    What runs on this machine that were killed have left there is cleared away.
+    """
+    folder = Path(folder)
+    try:
+        there = next(f for f in (folder.absolute(), *folder.absolute().parents) if f.exists())
+        if not there.is_dir():
+            raise FileError(f"{there}: is a file, not a folder to write into")
+        sweep(there)
+        _new_folder(there).rmdir()
+    except OSError as error:
+        raise FileError(f"{folder}: cannot be written ({error.strerror or error})") from error
 
 
 @contextmanager
 def whole_file(path):
-    """The path to write a file under, renamed to `path` once the block has ended.
+    """The path to write a file under, moved to `path` once the block has ended.
 
         with whole_file("out.txt") as part:
             part.write_text("...")
 
-    The other name lies in the same folder and keeps the ending of `path`, by which some writers
-    choose a format or a compression. A block that fails leaves neither a new file nor a changed
-    one: an older file of the name `path` stays as it was.
+    The other path has the name of `path`, by whose ending some writers choose a format or a
+    compression. A block that fails leaves neither a new file nor a changed one: an older file of
+    the name `path` stays as it was.
 
     Raises FileError for an OSError, such as a full disk, and passes on every other exception.
     """
-    path = Path(path)
-    part = path.with_name(f".part-{os.getpid()}-{path.name}")
+    with whole_files([path]) as parts:
+        yield parts[0]
+
+
+@contextmanager
+def whole_files(paths):
+    """Paths to write several files under; all of them appear together, or none does.
+
+    As `whole_file`. A folder that does not exist yet is made, and appears with all its files in it.
+    Where one exists already, files are moved in the order of `paths`; a run killed in the midst of
+    that is completed by the next `check_folder` or `whole_files` there.
+    """
+    paths = [Path(path) for path in paths]
+    outputs = _Outputs(dict.fromkeys(path.absolute().parent for path in paths))
     try:
-        yield part
-        os.replace(part, path)
+        outputs.open()
+        yield [outputs.stages[path.absolute().parent] / path.name for path in paths]
+        outputs.commit([path.absolute() for path in paths])
     except OSError as error:
-        raise FileError(f"{path}: cannot be written ({error.strerror or error})") from error
+        reason = error.strerror or error
+        raise FileError(f"{', '.join(map(str, paths))}: cannot be written ({reason})") from error
+    except FileError as error:  # of a writer, which knows the file under its other path
+        message = str(error)
+        for path in paths:
+            stage = outputs.stages.get(path.absolute().parent)
+            message = message.replace(f"{stage}{os.sep}{path.name}", str(path))
+        raise FileError(message) from error
     finally:
-        part.unlink(missing_ok=True)
+        outputs.close()
+
+
+class _Outputs:
+    """The folders in which outputs are written, each beside or in the folder it is meant for.
+
+    stages {folder: where its files are written}; made: folders that were made on the way
+    """
+
+    def __init__(self, folders):
+        self.folders, self.stages, self.made, self.old = list(folders), {}, [], {}
+
+    def open(self):
+        """Make them, after what killed runs left is cleared away."""
+        for folder in self.folders:
+            home = folder
+            if not folder.is_dir():
+                home = folder.parent
+                missing = [f for f in (home, *home.parents) if not f.exists()]
+                self.made += missing
+                home.mkdir(parents=True, exist_ok=True)
+            sweep(home)
+            self.stages[folder] = _new_folder(home)
+
+    def commit(self, paths):
+        """Bring all files to the disk, then move them; those moved go back where one cannot be."""
+        for stage in self.stages.values():
+            for file in stage.iterdir():
+                _to_disk(file)
+            _to_disk(stage)
+        with _unbroken():
+            moved = []
+            try:
+                for folder in self.folders:
+                    self._keep_old(folder, paths)
+                for path in paths:
+                    self._move(path, moved)
+            except BaseException:
+                for path in reversed(moved):
+                    self._move_back(path)
+                raise
+            self.made = []
+        for folder in self.folders:
+            _to_disk(folder)
+
+    def _keep_old(self, folder, paths):
+        """Second names of the files that will be replaced, and the mark that all is complete."""
+        if not folder.is_dir():
+            return
+        there = [p for p in paths if p.parent == folder and p.exists()]
+        if there:
+            self.old[folder] = _new_folder(folder)
+            for path in there:
+                with suppress(OSError):  # a file system without hard links
+                    os.link(path, self.old[folder] / path.name)
+        stage = self.stages[folder]
+        self.stages[folder] = stage.with_name(stage.name.replace(".part-", ".done-", 1))
+        os.rename(stage, self.stages[folder])
+
+    def _move(self, path, moved):
+        folder = path.parent
+        if not folder.is_dir():  # with all that lies in it
+            os.rename(self.stages[folder], folder)
+        elif (self.stages[folder] / path.name).exists():
+            os.replace(self.stages[folder] / path.name, path)
+        moved.append(path)
+
+    def _move_back(self, path):
+        old = self.old.get(path.parent, path.parent) / path.name
+        if path.parent in self.old and old.exists():
+            os.rename(old, path)
+        else:
+            path.unlink(missing_ok=True)
+
+    def close(self):
+        """Remove what is left of them."""
+        for stage in (*self.stages.values(), *self.old.values()):
+            shutil.rmtree(stage, ignore_errors=True)
+        for folder in self.made:
+            with suppress(OSError):
+                folder.rmdir()
+
+
+def sweep(folder):
+    """Clear away what this user's killed runs on this machine left in a folder."""
+    if os.name != "posix":  # elsewhere none can be asked whether it is alive
+        return
+    for entry in list(os.scandir(folder)):
+        found = STAGE.fullmatch(entry.name)
+        if not found or not entry.is_dir(follow_symlinks=False) or _alive(int(found[2])):
+            continue
+        if entry.stat(follow_symlinks=False).st_uid != os.getuid():
+            continue
+        with suppress(OSError):
+            if found[1] == "done":
+                for file in list(os.scandir(entry.path)):
+                    os.replace(file.path, Path(folder) / file.name)
+            shutil.rmtree(entry.path)
+
+
+def _alive(pid):
+    """Whether a process of this machine is alive."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        return True
+    return True
+
+
+def _new_folder(home):
+    """A folder of this run in another one, which nobody else can have made."""
+    folder = home / f".part-{HOST}-{os.getpid()}-{secrets.token_hex(8)}"
+    folder.mkdir()
+    return folder
+
+
+def _to_disk(path):
+    """Wait until a file or folder is on the disk, where the system can be asked for that."""
+    with suppress(OSError):
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+@contextmanager
+def _unbroken():
+    """Ctrl-C and the signal to end wait until the block, a few renames, has ended."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # Python's handlers run in the main thread
+        return
+    came, held = [], (signal.SIGINT, signal.SIGTERM)
+    former = {number: signal.getsignal(number) for number in held}
+    for number in held:
+        if former[number] is not None:
+            signal.signal(number, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in former.items():
+            if handler is not None:
+                signal.signal(number, handler)
+        for number in came[:1]:
+            signal.raise_signal(number)

@@ -30,7 +30,7 @@ class OperatorCache:
         as their last batch made them; what was asked for longest ago goes first, and the newest
         stays however large it is
 
-    Safe to share between threads; the operators themselves are not.
+    Safe to share between threads, as the operators are.
     """
 
     def __init__(self, *, plan_bytes=PLAN_BYTES, device_bytes=DEVICE_BYTES):

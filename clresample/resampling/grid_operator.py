@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..sky.given.checks import float_type, instance, numbers
 from ..sky.grid import Grid
 from ..sky.mapping import Mapping
 from ..sky.psf import PSF
@@ -47,6 +48,8 @@ class GridOperator(LinOp):
         shift=(0.0, 0.0),
         tolerance_px=1e-4,
     ):
+        check_parts((psf_in, psf_out), (grid_in, grid_out))
+        dtype = float_type(dtype)
         mapping = grid_out.map_to(grid_in, tolerance_px=tolerance_px)
         self._prepare(mapping, psf_in, psf_out, dtype, device)
         self.shift = shift
@@ -63,7 +66,9 @@ class GridOperator(LinOp):
         shift=(0.0, 0.0),
     ):
         """The operator of a mapping, observed pixels -> model pixels, instead of two grids."""
-        op = cls.__new__(cls)
+        instance("mapping", mapping, Mapping)
+        check_parts((psf_in, psf_out))
+        op, dtype = cls.__new__(cls), float_type(dtype)
         op._prepare(mapping, psf_in, psf_out, dtype, device)
         op.shift = shift
         return op
@@ -117,14 +122,23 @@ class GridOperator(LinOp):
 
     @shift.setter
     def shift(self, shift):
-        shift, expected = np.asarray(shift, np.float64), (self._n_geometries, 2)
+        shift, expected = numbers("shift", shift), (self._n_geometries, 2)
         if shift.shape not in ((), (2,), expected) or not np.isfinite(shift).all():
             raise ValueError(
                 f"shift is {shift.tolist()}, must be (2,) or {expected} finite numbers"
             )
-        self._shift = np.broadcast_to(shift, expected).copy()
-        self._shift.flags.writeable = False  # a change must come through this setter
-        self._use_shift()
+        shift = np.broadcast_to(shift, expected).copy()
+        shift.flags.writeable = False  # a change must come through this setter
+        with self._lock:
+            self._shift = shift
+            self._use_shift()
+
+
+def check_parts(psfs, grids=()):
+    """Raise ValueError where PSFs or grids of an operator, (in, out), are something else."""
+    for what, parts, kind in (("grid", grids, Grid), ("psf", psfs, PSF)):
+        for side, part in zip(("in", "out"), parts):
+            instance(f"{what}_{side}", part, kind)
 
 
 def _one_or_all(values):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 
 from ..device.device import get_device
+from ..sky.given.checks import float_type, mask_of, real
 
 
 class LinOp:
@@ -17,15 +20,24 @@ class LinOp:
     touch the host.  Where both sides have one band, (Ny, Nx) images may be given without the band
     axis.  Subclasses implement `_forward` and `_adjoint` on device arrays (B,) + shape; both
     overwrite `out` and leave their input alone.
+
+    Safe to use from several threads: intermediates and staging arrays are one set an operator, so
+    each call has the operator for itself between upload and download. Casting NumPy arrays to
+    `dtype` happens before that. Threads gain nothing by operators of their own but that casting.
     """
 
     def __init__(self, device, dtype, shape_in, shape_out):
         self.device = get_device(device)
-        self.dtype = np.dtype(dtype)
-        if self.dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
-            raise ValueError(f"dtype is {self.dtype}, allowed are float32 and float64")
+        self.dtype = float_type(dtype)
         self.shape_in, self.shape_out = tuple(shape_in), tuple(shape_out)
-        self._staged = {}
+        self._staged, self._lock = {}, threading.RLock()
+
+    def __getstate__(self):
+        """Without what belongs to one process: lock and staging arrays, which copies make anew."""
+        return {k: v for k, v in self.__dict__.items() if k not in ("_staged", "_lock")}
+
+    def __setstate__(self, state):
+        self.__dict__.update(state, _staged={}, _lock=threading.RLock())
 
     def forward(self, x, out=None):
         """A x.  x (B,) + shape_in -> (B,) + shape_out, into `out` (of x's kind) if given.
@@ -49,11 +61,13 @@ class LinOp:
 
         x (B,) + shape_in, out (B,) + shape_out: C-contiguous arrays of `dtype` on `device`
         """
-        self._forward(x, out)
+        with self._lock:
+            self._forward(x, out)
 
     def adjoint_into(self, y, out):
         """Queue out = A^T y without any check; y (B,) + shape_out, out (B,) + shape_in."""
-        self._adjoint(y, out)
+        with self._lock:
+            self._adjoint(y, out)
 
     @property
     def T(self) -> LinOp:
@@ -83,9 +97,7 @@ class LinOp:
         """`run`, one of the two above, on an array `x` of a caller, who calls it `name`."""
         on_device = hasattr(x, "base_data")
         if not on_device:
-            x = np.asarray(x)
-            if np.iscomplexobj(x):
-                raise ValueError(f"{name} is {x.dtype}, the operator is real ({self.dtype})")
+            x = real(name, x)
         batch, shape_result = _match_shape(name, tuple(x.shape), shape_x, shape_out)
         if out is not None:
             _check_out(name, x, out, on_device, shape_result)
@@ -102,22 +114,25 @@ class LinOp:
         others = {a.queue for a in (x, out)} - {None, self.device.queue}
         for queue in others:  # of the caller, who may still write or read there
             queue.finish()
-        run(_shaped(x, batched_x), _shaped(out, batched_out))
+        with self._lock:
+            run(_shaped(x, batched_x), _shaped(out, batched_out))
         if others:
             self.device.finish()
         return out
 
     def _through_host(self, run, name, x, out, batched_x, batched_out, shape_result):
         """`run` on a caller's NumPy arrays, through device arrays that are kept for the next."""
-        x_device, out_device = self._staging(name, batched_x, batched_out)
-        self.device.upload(np.ascontiguousarray(x, dtype=self.dtype), x_device)
-        run(x_device, out_device)
-        if out is None:
-            out = np.empty(shape_result, self.dtype)
-        if out.dtype == self.dtype and out.flags.c_contiguous:
-            self.device.download(out_device, out)
-        else:
-            out[...] = self.device.get(out_device).reshape(shape_result)
+        x = np.ascontiguousarray(x, dtype=self.dtype)
+        direct = out is None or (out.dtype == self.dtype and out.flags.c_contiguous)
+        result = np.empty(shape_result, self.dtype) if out is None or not direct else out
+        with self._lock:
+            x_device, out_device = self._staging(name, batched_x, batched_out)
+            self.device.upload(x, x_device)
+            run(x_device, out_device)
+            self.device.download(out_device, result)
+        if direct:
+            return result
+        out[...] = result
         return out
 
     def _checked(self, name, array):
@@ -163,7 +178,8 @@ class HostOp(LinOp):
         direct = out is not None and out.dtype == self.dtype and out.flags.c_contiguous
         direct = direct and not np.may_share_memory(x, out)
         result = out if direct else np.empty(shape_result, self.dtype)
-        run(x, result.reshape(batched_out))
+        with self._lock:
+            run(x, result.reshape(batched_out))
         if out is None or direct:
             return result
         out[...] = result
@@ -214,6 +230,14 @@ def _check_out(name, x, out, on_device, shape):
         )
     if tuple(out.shape) != shape:
         raise ValueError(f"out has shape {tuple(out.shape)}, expected {shape}")
+    if not on_device and (
+        out.dtype.kind != "f"
+        or not out.flags.writeable
+        or mask_of(out) is not None
+        or hasattr(out, "unit")
+    ):
+        kind = "read-only" if not out.flags.writeable else f"of type {out.dtype}"
+        raise ValueError(f"out is a {_kind(out)}, {kind}: it must be a plain array of floats")
 
 
 def _kind(array):

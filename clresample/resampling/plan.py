@@ -22,6 +22,10 @@ from ..sky.waves import cos_sin_columns
 from .gridding import KaiserBessel, LineTaps, transpose_taps
 from .transfer import Certificate, transfer_function, wrap_radius
 
+# [bytes] of the tables of one operator. Frames of 7000 pixels a side need so much, and take minutes
+# where tiles take seconds; a WCS that is wrong by orders of magnitude needs far more.
+MOST_BYTES = 8 << 30
+
 
 @dataclass(frozen=True)
 class Precision:
@@ -107,6 +111,7 @@ def make_plan(
     radius = wrap_radius(psf_out, mapping.matrix)
     extent = mapping.shape_in if extent is None else extent
     n_fft = _odd(extent[0] + radius[0]), _odd(extent[1] + radius[1])
+    _check_size(mapping, psf_out, n_fft, n_bands)
     nu, d, max_gain, floored_power = _band(mapping.matrix, psf_in, psf_out, n_fft, precision)
     d = np.broadcast_to(d, (n_bands,) + d.shape[1:])
     n_frequencies = h_y, h_x = len(nu[0]), len(nu[1])
@@ -141,6 +146,24 @@ def make_plan(
         in_x=in_x,
         **tables,
     )
+
+
+def _check_size(mapping, psf_out, n_fft, n_bands):
+    """Raise ValueError where a plan would take more than MOST_BYTES."""
+    k = [_half_count(mapping.matrix, psf_out.spacing, i, n_fft[i]) for i in (0, 1)]
+    n_bytes = 3 * 16 * n_bands * k[0] * 2 * k[1]  # D and both OTFs; then waves at the pixels
+    n_bytes += 16 * sum(n * h for n, h in zip(mapping.shape_in, k, strict=True))
+    n_out = mapping.shape_out
+    if mapping.geometry == "distorted":
+        n_out = [n_out[0] * n_out[1]] * 2
+    n_bytes += 16 * sum(n * h for n, h in zip(n_out, k, strict=True))
+    if n_bytes > MOST_BYTES:
+        size = float(np.sqrt(abs(np.linalg.det(mapping.matrix))))
+        raise ValueError(
+            f"an operator from {mapping.shape_in} to {mapping.shape_out} pixels, one {size:.3g} "
+            f"times the other's size, needs tables of {n_bytes / 2**30:.3g} GiB, more than "
+            f"{MOST_BYTES >> 30}: is the WCS right? If so, use smaller images, or TiledResampler"
+        )
 
 
 def _band(matrix, psf_in: PSF, psf_out: PSF, n_fft, precision: Precision):

@@ -9,6 +9,7 @@ import warnings
 import numpy as np
 
 from ..device.contraction import ImageBatch
+from ..sky.given.checks import float_type
 from ..sky.psf_checks import PSFWarning
 from .affine import AffineExecutor
 from .aligned import AlignedExecutor
@@ -46,6 +47,7 @@ class Resampler(GridOperator):
         Raises ValueError for plans that differ in these.
         """
         _check_alike(plans)
+        dtype = float_type(dtype)
         op = cls.__new__(cls)
         op._take(plans, dtype, device)
         op.shift = shift
@@ -74,13 +76,19 @@ class Resampler(GridOperator):
         pairs = zip(self.plans, self._shift, strict=True)
         self._executor.set_transfer([plan.shifted(shift) for plan, shift in pairs])
 
+    def __reduce__(self):
+        """Copied and pickled as its plans; the copy uploads them to the device of the same name."""
+        make = functools.partial(type(self).from_plans, dtype=self.dtype, device=self.device)
+        return functools.partial(make, shift=self._shift), (self.plans,)
+
     @property
     def n_bytes(self) -> int:
         """Device memory of tables, intermediates and arrays for NumPy callers [bytes], roughly."""
         # each table in the operator's type, the way it is used forward and the way back
         tables = 2 * sum(plan.n_bytes for plan in self.plans) * self.dtype.itemsize // 8
-        held = [*self._executor.scratch.values()]
-        held += [array for staged in self._staged.values() for array in staged[1:]]
+        with self._lock:
+            held = [*self._executor.scratch.values()]
+            held += [array for staged in self._staged.values() for array in staged[1:]]
         return tables + sum(getattr(array, "nbytes", 0) for array in held)
 
     def render(self, x, out=None):

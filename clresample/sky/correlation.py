@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import binary_dilation, convolve, gaussian_filter
 
+from .given.checks import ReadOnly, numbers
 from .psf import PSF
 
 # Lags that are estimated from an image [px]: drizzle and Lanczos kernels end within 5 pixels.
@@ -43,7 +44,7 @@ MIN_PAIRS = 1000
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class NoiseCorrelation:
+class NoiseCorrelation(ReadOnly):
     """Correlation of the noise of two pixels, the same all over an image.
 
     autocorrelation (2L + 1, 2L + 1) [1]: rho(dy, dx), symmetric, rho(0, 0) = 1; zero beyond
@@ -60,7 +61,7 @@ class NoiseCorrelation:
     variance: float
 
     def __init__(self, autocorrelation):
-        rho = np.array(autocorrelation, dtype=np.float64)
+        rho = numbers("autocorrelation", autocorrelation)
         if rho.ndim != 2 or rho.shape[0] % 2 == 0 or rho.shape[1] % 2 == 0:
             raise ValueError(
                 f"autocorrelation has the shape {rho.shape}, it takes odd numbers of lags a side, "

@@ -10,6 +10,7 @@ import numpy as np
 from astropy.wcs import WCS
 from astropy.wcs.utils import wcs_to_celestial_frame
 
+from .given.checks import arcseconds, image_shape, instance, number, numbers
 from .mapping import Mapping, map_affine, map_positions
 from .wcs import convert, pixel_scale, pixels_at, shifted_wcs, tangent_wcs, world_at
 
@@ -39,7 +40,7 @@ class Grid(ABC):
 
         Raises ValueError without a celestial part, or where it cannot be evaluated.
         """
-        shape = _shape(shape[-2:])
+        shape = image_shape(shape[-2:])
         if not wcs.has_celestial:
             axes = ", ".join(axis or "?" for axis in wcs.wcs.ctype)
             raise ValueError(f"wcs has no celestial axes (CTYPE: {axes})")
@@ -66,13 +67,13 @@ class Grid(ABC):
 
         Raises ValueError for a scale that is not positive.
         """
-        shape = _shape(shape)
-        scale = np.broadcast_to(np.asarray(scale_arcsec, dtype=np.float64), 2)
+        shape = image_shape(shape)
+        scale = arcseconds("scale_arcsec", scale_arcsec)
         if not (np.isfinite(scale) & (scale > 0)).all():
             raise ValueError(f"scale_arcsec must be positive, not {scale_arcsec}")
-        cos, sin = _cos_sin(angle_deg)
+        cos, sin = _cos_sin(number("angle_deg", angle_deg))
         jacobian = np.array([[cos, sin], [-sin, cos]]) * scale * (1, -1 if flip else 1)
-        center = np.asarray(center_arcsec, dtype=np.float64)
+        center = arcseconds("center_arcsec", center_arcsec)
         return FlatGrid(shape, jacobian, center - jacobian @ ((np.array(shape) - 1) / 2))
 
     @staticmethod
@@ -85,11 +86,11 @@ class Grid(ABC):
 
         Raises ValueError for other shapes, and numbers that are not finite.
         """
-        jacobian, origin = np.array(jacobian, np.float64), np.array(origin, np.float64)
+        jacobian, origin = numbers("jacobian", jacobian), numbers("origin", origin)
         for name, array, expected in (("jacobian", jacobian, (2, 2)), ("origin", origin, (2,))):
             if array.shape != expected or not np.isfinite(array).all():
                 raise ValueError(f"{name} is {array.tolist()}, must be {expected} finite numbers")
-        return FlatGrid(_shape(shape), jacobian, origin)
+        return FlatGrid(image_shape(shape), jacobian.copy(), origin.copy())
 
     @property
     @abstractmethod
@@ -151,8 +152,9 @@ class Grid(ABC):
         Raises ValueError when one grid is flat and the other not, when no pixel has a place in
         `grid_in`'s projection, and for a singular Jacobian.
         """
-        self.check_like(grid_in, "grid_in")
-        return self._map_to(grid_in, tolerance_px)
+        self.check_like(instance("grid_in", grid_in, Grid), "grid_in")
+        tolerance = number("tolerance_px", tolerance_px, "0 or more", lambda x: 0 <= x < math.inf)
+        return self._map_to(grid_in, tolerance)
 
     def check_like(self, other: Grid, name):
         """Raise ValueError, calling the other grid `name`, where one is flat and one is not."""
@@ -200,7 +202,7 @@ class FlatGrid(Grid):
 
     def cutout(self, y0, x0, shape):
         """The same Jacobian, the origin at pixel (y0, x0)."""
-        return FlatGrid(_shape(shape), self.jacobian, self.origin + self.jacobian @ (y0, x0))
+        return FlatGrid(image_shape(shape), self.jacobian, self.origin + self.jacobian @ (y0, x0))
 
     def to_wcs(self, *, ra_deg=0.0, dec_deg=0.0):
         """A gnomonic WCS (ICRS) that touches the flat sky at (y, x) = (0, 0)."""
@@ -255,7 +257,7 @@ class WcsGrid(Grid):
 
     def cutout(self, y0, x0, shape):
         """The same WCS with its reference pixel, and those of its distortions, moved."""
-        return WcsGrid(_shape(shape), shifted_wcs(self.wcs, y0, x0))
+        return WcsGrid(image_shape(shape), shifted_wcs(self.wcs, y0, x0))
 
     def to_wcs(self, *, ra_deg=0.0, dec_deg=0.0):
         """A copy of the WCS; ra_deg and dec_deg are of no effect."""
@@ -270,14 +272,6 @@ class WcsGrid(Grid):
             self.shape,
             tolerance_px,
         )
-
-
-def _shape(shape):
-    """(Ny, Nx) as a tuple of int. Raises ValueError for anything else."""
-    shape = tuple(int(n) for n in shape)
-    if len(shape) != 2 or min(shape) < 1:
-        raise ValueError(f"shape must be (Ny, Nx), each at least 1 pixel, not {shape}")
-    return shape
 
 
 def _cos_sin(angle_deg):

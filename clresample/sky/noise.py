@@ -7,6 +7,8 @@ from statistics import NormalDist
 
 import numpy as np
 
+from .given.checks import mask_of, numbers, split_mask
+
 # [sigma] pixels further from the median are sources: one in 370 of pure noise is lost
 CLIP = 3.0
 # each round drops at least one pixel; 3 to 8 rounds settle images that are half sources
@@ -98,7 +100,12 @@ def weights_from(data, bad, weights, variance, mask, channels):
     """
     if weights is not None and variance is not None:
         raise ValueError("weights and variance are both given: an observation takes one")
-    masked, messages = _mask_of(mask, data.shape), []
+    masked, messages = mask_from(mask, data.shape), []
+    weights, hidden = split_mask("weights", weights)
+    variance, unknown = split_mask("variance", variance)
+    for name, more in (("weights", hidden), ("variance", unknown)):
+        if more is not None:  # a masked weight is one that says: ignore this pixel
+            masked = masked | (_spread(name, more.astype(float), data.shape) > 0)
     if weights is not None:
         weights, no_weight = _checked_weights(weights, data.shape)
     elif variance is not None:
@@ -120,14 +127,6 @@ def weights_from(data, bad, weights, variance, mask, channels):
     return weights, n_bad, messages
 
 
-def numbers(name, values):
-    """The values as float64. Raises ValueError, naming them, for what is no array of numbers."""
-    try:
-        return np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be an array of real numbers: {error}") from None
-
-
 def _spread(name, values, shape):
     """Numbers given for each pixel, channel or all at once: (C, Ny, Nx)."""
     if values.shape == shape[:1]:
@@ -137,11 +136,13 @@ def _spread(name, values, shape):
     return np.broadcast_to(values, shape)
 
 
-def _mask_of(mask, shape):
+def mask_from(mask, shape):
     """The mask (C, Ny, Nx) bool, True = ignore; all False where none is given."""
     if mask is None:
         return np.zeros(shape, dtype=bool)
-    values = np.asarray(mask)
+    hidden, values = mask_of(mask), np.asarray(getattr(mask, "unmasked", mask))
+    if hidden is not None:  # what is masked in a mask is not known to be good
+        values = np.where(hidden, 1, values)
     if values.shape not in (shape[1:], shape):
         raise ValueError(f"mask has the shape {values.shape}, data {shape}")
     if values.dtype != bool and not np.isin(values, (0, 1)).all():

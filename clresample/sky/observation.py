@@ -8,8 +8,9 @@ from functools import cached_property
 import numpy as np
 
 from .correlation import NoiseCorrelation, filtered_psf, noise_of_channels
+from .given.checks import ReadOnly, instance, numbers, split_mask
 from .grid import Grid
-from .noise import numbers, weights_from
+from .noise import mask_from, weights_from
 from .psf import PSF
 
 # [mag] AB magnitude of 1 uJy
@@ -17,7 +18,7 @@ ZERO_POINT_UJY = 23.9
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class Observation:
+class Observation(ReadOnly):
     """Images of one instrument, one per channel, on one pixel grid.
 
         chi2 = sum weights (model - data)^2
@@ -29,7 +30,8 @@ class Observation:
     weights [counts^-2]: inverse variance, 0 = ignore this pixel; or, instead of it,
     variance [counts^2]: NaN, infinite, zero and negative ones mean: ignore this pixel. Weights and
         variances are (C, Ny, Nx), or (Ny, Nx) for all channels, (C,) or one number for all pixels
-    mask (C, Ny, Nx) or (Ny, Nx): True = ignore this pixel; may come with either of the two or alone
+    mask (C, Ny, Nx) or (Ny, Nx): True = ignore this pixel; may come with either of the two or
+        alone. Masks of masked arrays among data, weights and variance mean the same
     channels (C,): names, unique over all instruments; None numbers them after `name`
     zero_points (C,) or one number [mag]: AB magnitude of one count
     noise: correlation of the noise of neighbouring pixels, in drizzled, resampled and stacked
@@ -44,8 +46,8 @@ class Observation:
     None, n_bad = number of unmasked pixels whose weight became 0 because their data, weight or
     variance is none, messages = what the user should know.
 
-    Raises ValueError for shapes that disagree, negative or infinite weights, masks not made of 0
-    and 1, channel names that are not unique, weights beside variance, noise that cannot be found.
+    Raises ValueError for shapes that disagree, negative or infinite weights, masks not of 0 and 1,
+    names not unique, weights beside variance, noise not to be found, and what is no real number.
     """
 
     data: np.ndarray
@@ -73,12 +75,11 @@ class Observation:
         noise=None,
         name=None,
     ):
-        data = _images(data, grid)
+        data, mask = _images(data, instance("grid", grid, Grid), mask)
         psf = _of_each_channel(psf, len(data))
         bad = ~np.isfinite(data)
         channels = _channels(channels, name, len(data))
-        if zero_points is not None:
-            zero_points = _per_channel("zero_points", zero_points, len(data))
+        zero_points = _per_channel("zero_points", zero_points, len(data))
         weights, n_bad, messages = weights_from(data, bad, weights, variance, mask, channels)
         data = np.where(bad, 0.0, data)
         noise, found = noise_of_channels(noise, data, weights, channels)
@@ -195,8 +196,9 @@ def check_observations(observations):
             raise ValueError(f"observation {of!r} has {what}, {rest!r} has none: give all or none")
 
 
-def _images(data, grid):
-    """Data (C, Ny, Nx) float64 of as many pixels as the grid has."""
+def _images(data, grid, mask):
+    """Data (C, Ny, Nx) float64 of as many pixels as the grid has, and the mask with data's own."""
+    data, hidden = split_mask("data", data)
     data = numbers("data", data)
     if data.ndim == 2:
         data = data[None]
@@ -204,11 +206,12 @@ def _images(data, grid):
         raise ValueError(f"data must be (C, Ny, Nx) or (Ny, Nx), not {data.shape}")
     if data.shape[1:] != tuple(grid.shape):
         raise ValueError(f"data has images of {data.shape[1:]} pixels, grid has {grid.shape}")
-    return data
+    return data, mask if hidden is None else mask_from(mask, data.shape) | hidden
 
 
 def _of_each_channel(psf, n_channels):
     """The PSF with one band for each channel; a single one serves all."""
+    instance("psf", psf, PSF)
     if psf.n_bands == n_channels:
         return psf
     if psf.n_bands != 1:
@@ -234,7 +237,9 @@ def _channels(channels, name, n_channels):
 
 
 def _per_channel(name, values, n_channels):
-    """Finite numbers (C,), from one for each channel or one for all."""
+    """Finite numbers (C,), from one for each channel or one for all; None for None."""
+    if values is None:
+        return None
     values = numbers(name, values)
     if values.shape not in ((), (n_channels,)) or not np.isfinite(values).all():
         raise ValueError(

@@ -11,6 +11,8 @@ CORE_TOLERANCE = 0.25
 # share of the light beyond the image's edge from which on a PSF is warned about; by `edge_light`,
 # good HST and HSC images have 2 to 5 %
 EDGE_TOLERANCE = 0.05
+# The same share from which on the command refuses an image: an evenly bright one has 1.6.
+EDGE_REFUSED = 0.5
 
 
 class PSFWarning(UserWarning):
@@ -48,6 +50,16 @@ def core_of(image):
         if np.abs(step).max() < 1e-6:  # samples; far below CORE_TOLERANCE
             break
     return core
+
+
+def check_edge(images):
+    """Raise ValueError for images (C, ny, nx) of unit sum that are too small for their light."""
+    light = float(edge_light(images).max())
+    if light > EDGE_REFUSED:
+        raise ValueError(
+            f"too wide for its {images.shape[1]} x {images.shape[2]} image, or no PSF: by the "
+            f"light at its edge, another {100 * light:.0f} % lies beyond"
+        )
 
 
 def _n_above_half(image):

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from .given.checks import numbers, whole
+
 
 class SourceWarning(UserWarning):
     """A source where the images show nothing: its position is probably not what was meant."""
@@ -40,7 +42,10 @@ class Source:
                 f"not sky_deg={self.sky_deg} with position_px={self.position_px}"
             )
         name = "sky_deg" if self.position_px is None else "position_px"
-        position = np.asarray(getattr(self, name), dtype=np.float64)
+        given = getattr(self, name)
+        position = numbers(name, given, "deg" if name == "sky_deg" else None)
+        if hasattr(given, "unit") and position.shape == (2,):
+            object.__setattr__(self, name, tuple(map(float, position)))
         if position.shape != (2,) or not np.isfinite(position).all():
             raise ValueError(f"{name} is {getattr(self, name)}, it takes two finite numbers")
         if self.observation is not None and self.position_px is None:
@@ -119,15 +124,14 @@ class Extended(Source):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.n_components < 1:
-            raise ValueError(f"n_components is {self.n_components}, must be 1 or more")
+        whole("n_components", self.n_components, 1)
         if self.profile is None:
             return
         if self.n_components > 1:
             raise ValueError(
                 f"profile is given for n_components = {self.n_components}: it serves one component"
             )
-        profile = np.asarray(self.profile, dtype=np.float64)
+        profile = numbers("profile", self.profile)
         if profile.ndim != 2 or not (np.isfinite(profile) & (profile >= 0)).all():
             raise ValueError(
                 f"profile with shape {profile.shape} must be (Ny, Nx), finite and not negative"

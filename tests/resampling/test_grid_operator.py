@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from astropy import units as u
 from helpers.geometries import GEOMETRIES, distance, psfs
 
 from clresample.resampling.grid_operator import GridOperator
@@ -63,7 +64,9 @@ def test_complex_images_are_refused(device, kind):
     op = make(kind, device)
     x, y = np.ones(op.shape_in, complex), np.ones(op.shape_out, complex)
     for run, name, image in ((op.forward, "x", x), (op.adjoint, "y", y), (op.T.forward, "x", y)):
-        with pytest.raises(ValueError, match=f"{name} is complex128, the operator is real"):
+        with pytest.raises(
+            ValueError, match=f"{name} must be an array of real numbers, not of type complex128"
+        ):
             run(image)
 
 
@@ -156,3 +159,54 @@ def test_a_turned_grid_of_the_papers_scheme_says_what_it_costs(device):
     # both halves of nu_x, cos and sin, for nu_y >= 0
     assert op.n_terms == (k_y + 1) // 2 * 4 * ((k_x + 1) // 2)
     assert op.model_axis in (0, 1)
+
+
+@every_operator
+@pytest.mark.parametrize(
+    "given, said",
+    [
+        ({"grid_in": None}, r"grid_in is None \(NoneType\), must be Grid"),
+        ({"psf_in": None}, "psf_in is None"),
+        ({"grid_out": (3, 3)}, "grid_out is"),
+        ({"psf_out": np.eye(3)}, "psf_out is"),
+        ({"tolerance_px": np.nan}, "tolerance_px is nan"),
+        ({"tolerance_px": -1}, "tolerance_px is -1"),
+        ({"dtype": None}, "dtype is None, allowed are float32 and float64"),
+        ({"dtype": "nonsense"}, "dtype is 'nonsense'"),
+        ({"dtype": complex}, "dtype is .*complex"),
+        ({"shift": "a"}, "shift must be"),
+    ],
+)
+def test_parts_of_other_types_are_refused_by_name(device, kind, given, said):
+    parts = {
+        "grid_in": Grid.flat((12, 12), 0.1),
+        "psf_in": PSF.gaussian(1.0, n_pixels=11),
+        "grid_out": Grid.flat((6, 6), 0.2),
+        "psf_out": PSF.gaussian(1.0, n_pixels=11),
+        "device": device,
+    }
+    with pytest.raises(ValueError, match=said):
+        kind(**(parts | given))
+
+
+@every_operator
+def test_arrays_that_are_no_real_numbers_are_refused_by_name(device, kind):
+    op = make(kind, device)
+    x = np.ones(op.shape_in)
+    masked = np.ma.MaskedArray(x, False)
+    np.testing.assert_array_equal(op(masked), op(x))
+    masked[..., 0, 0] = np.ma.masked
+    for image, said in (
+        (masked, "x is masked at"),
+        (x * u.Jy, "x has the unit Jy"),
+        (x.astype("M8[s]"), "not of type datetime64"),
+        (x.astype(str), "not of type <U"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            op(image)
+    y = op(x)
+    fixed = y.copy()
+    fixed.flags.writeable = False
+    for out in (y.astype(int), y.astype(complex), fixed, np.ma.MaskedArray(y, False), y * u.Jy):
+        with pytest.raises(ValueError, match="out is a .*must be a plain array of floats"):
+            op(x, out=out)

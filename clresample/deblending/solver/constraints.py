@@ -60,6 +60,13 @@ class Prox:
         self.parameters = parameters
         self._bound = weakref.WeakKeyDictionary()
 
+    def __getstate__(self):
+        """Without what is bound to a device: copies bind it anew."""
+        return {**self.__dict__, "_bound": None}
+
+    def __setstate__(self, state):
+        self.__dict__.update(state, _bound=weakref.WeakKeyDictionary())
+
     def __repr__(self):
         values = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
         return f"{type(self).__name__}({values})"

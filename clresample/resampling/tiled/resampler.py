@@ -10,9 +10,10 @@ from tqdm import tqdm
 
 from ...device.tuning import Tuning
 from ...sky.extent import box_slices, shared_part
+from ...sky.given.checks import float_type
 from ...sky.grid import Grid
 from ...sky.psf import PSF
-from ..grid_operator import GridOperator
+from ..grid_operator import GridOperator, check_parts
 from ..linop import HostOp, LinOp
 from ..plan import Precision, is_identity, make_plan
 from ..resampler import Resampler
@@ -58,6 +59,8 @@ class TiledResampler(HostOp, GridOperator):
         memory=None,
         progress=True,
     ):
+        check_parts((psf_in, psf_out), (grid_in, grid_out))
+        dtype = float_type(dtype)
         n_bands = max(psf_in.n_bands, psf_out.n_bands)
         shapes = (n_bands, *grid_in.shape), (n_bands, *grid_out.shape)
         LinOp.__init__(self, device, dtype, *shapes)

@@ -1,0 +1,1 @@
+"""What users give, checked where it comes in: every refusal is a ValueError that names it."""

@@ -1,0 +1,1 @@
+"""Transforms of large images at frequencies that lie on no grid of theirs."""

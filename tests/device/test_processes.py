@@ -1,0 +1,77 @@
+"""A device in forked processes, and PoCL without a cache that it can write: said, not hung."""
+
+import os
+
+import pytest
+from helpers.checkout import run_python
+
+SET_UP = """
+import os, signal, sys
+import numpy as np
+from clresample import Grid, PSF, Resampler, get_device
+device = get_device()
+def make():
+    fine, coarse = Grid.flat((20, 20), 0.1), Grid.flat((9, 9), 0.2, angle_deg=10)
+    return Resampler(fine, PSF.gaussian(1.0, n_pixels=11), coarse, PSF.gaussian(1.0, n_pixels=11))
+"""
+FORKED = """
+op, x = make(), np.ones((1, 20, 20))
+before = op(x)
+ways = {
+    "operator": lambda: op(x), "new": make, "memory": lambda: device.put(x), "wait": device.finish,
+    "device": get_device, "given": lambda: get_device(device),
+}
+if os.fork() == 0:
+    signal.alarm(30)
+    try:
+        ways[sys.argv[1]]()
+    except Exception as error:
+        print(type(error).__name__, error, flush=True)
+    os._exit(0)
+os.wait()
+print("parent", np.array_equal(op(x), before))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no processes are forked here")
+@pytest.mark.parametrize("way", ["operator", "new", "device", "given", "memory", "wait"])
+def test_a_forked_process_is_told_so(way):
+    answer = run_python("-c", SET_UP + FORKED, way)
+    child, parent = answer.stdout.splitlines()
+    assert child.startswith("DeviceError ") and "before this process was forked" in child
+    assert "spawn" in child
+    assert parent == "parent True"
+
+
+def test_a_process_forked_before_is_fine():
+    """The device is opened in the child alone."""
+    opened = SET_UP.replace("device = get_device()\n", "if os.fork(): os.wait(); sys.exit()\n")
+    answer = run_python("-c", opened + "print(make()(np.ones((20, 20))).shape)")
+    assert answer.stdout == "(9, 9)\n"
+
+
+@pytest.mark.parametrize(
+    "variables, said",
+    [
+        ({"POCL_CACHE_DIR": "/dev/null/x"}, "cannot write to its cache of built kernels, /dev/nul"),
+        ({"XDG_CACHE_HOME": "/dev/null", "POCL_CACHE_DIR": ""}, "/dev/null/pocl (Not a directory)"),
+        ({"POCL_CACHE_DIR": "{file}"}, "{file} (File exists): set POCL_CACHE_DIR"),
+        ({"POCL_DEVICES": "nonsense"}, "PoCL shows no device for POCL_DEVICES=nonsense"),
+    ],
+)
+def test_a_cache_that_cannot_be_written_is_said(tmp_path, monkeypatch, variables, said):
+    file = tmp_path / "file"
+    file.write_text("")
+    platform = run_python("-c", "from clresample import *; print(get_device().platform)")
+    if "Portable Computing" not in platform.stdout:
+        pytest.skip("the CPU's OpenCL is not PoCL")
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value.replace("{file}", str(file)))
+    answer = run_python(
+        "-c",
+        "from clresample import DeviceError, get_device\n"
+        "try:\n get_device().launcher('warp.cl', 'gather', N_TAPS=7)\n"
+        "except DeviceError as error: print(error)",
+    )
+    assert said.replace("{file}", str(file)) in answer.stdout
+    assert "pip install" not in answer.stdout
