@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import argparse
 import sys
+import warnings
 
 from .. import __version__
 from ..device.discovery import DeviceError
+from ..device.remembered import DeviceWarning
 from .deblend import add_deblend
 from .devices import add_devices
+from .options import note
 from .resample import add_resample
 
 
@@ -35,7 +38,9 @@ def main(argv=None):
         add_command(commands)
     arguments = parser.parse_args(argv)
     try:
-        arguments.run(arguments)
+        with warnings.catch_warnings():
+            _show_in_one_line(arguments)
+            arguments.run(arguments)
     except DeviceError as error:  # may hold a compiler's log: its lines are kept
         return _fail(arguments, str(error))
     except (ValueError, OSError) as error:
@@ -44,6 +49,19 @@ def main(argv=None):
         _fail(arguments, "interrupted")
         return 130  # what a shell reports after Ctrl-C
     return 0
+
+
+def _show_in_one_line(arguments):
+    """Let a DeviceWarning appear as a note, without the line of source that warnings come with."""
+    shown = warnings.showwarning
+
+    def show(message, category, *rest, **more):
+        if issubclass(category, DeviceWarning):
+            note(arguments, str(message))
+        else:
+            shown(message, category, *rest, **more)
+
+    warnings.showwarning = show
 
 
 def _fail(arguments, message):

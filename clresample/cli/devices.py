@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from ..device.discovery import format_size, list_devices
-from .options import add_device_option
+from ..device.discovery import format_size, hints, list_devices
+from .options import add_device_option, note
 
 COLUMNS = ("platform", "device", "kind", "OpenCL", "units", "memory", "largest buffer", "fp64")
 
@@ -25,6 +25,8 @@ def run(arguments):
     from ..device.device import get_device
 
     print(format_table(list_devices(arguments.device)))
+    for hint in hints():
+        note(arguments, hint)
     get_device(arguments.device)
 
 

@@ -9,14 +9,26 @@ import functools
 import gc
 import math
 import threading
+import warnings
 import weakref
 
 import numpy as np
 
-from .discovery import builds_fp64, choose, kind_of, load_pyopencl
+from . import selftest
+from .discovery import (
+    DeviceError,
+    builds_fp64,
+    choose,
+    find_devices,
+    is_free,
+    kind_of,
+    load_pyopencl,
+    ranked,
+)
 from .errors import FULL, explained, status_of, too_large
 from .launcher import Launcher
 from .program import Programs
+from .remembered import DeviceWarning, Remembered
 
 __all__ = ["Device", "get_device"]
 
@@ -31,6 +43,7 @@ class Device:
     name, platform, kind: what the driver calls it; kind is "GPU", "CPU", "ACCELERATOR" or "OTHER"
     compute_units: their number
     memory, max_alloc, in_use [bytes]: all of it, the largest buffer, what arrays made here hold
+    remembered: what earlier runs have measured of this device
     """
 
     def __init__(self, cl_device):
@@ -42,7 +55,7 @@ class Device:
         self.compute_units = cl_device.max_compute_units
         self.memory = cl_device.global_mem_size
         self.max_alloc = cl_device.max_mem_alloc_size
-        self.in_use = 0
+        self.in_use, self.remembered = 0, Remembered(cl_device)
         self._enqueue, self._error = cl.enqueue_nd_range_kernel, cl.Error
         self._programs, self._lock = Programs(self), threading.Lock()
         self.context = self._call(cl.Context, [cl_device])
@@ -184,12 +197,39 @@ def get_device(choice=None) -> Device:
 
     choice: None, a Device, an index, "platform:device" (each an index or part of a name), or part
         of a device's or platform's name. None reads CLRESAMPLE_DEVICE (the same forms), then
-        PYOPENCL_CTX (pyopencl's form), and then takes the first GPU, or else the first CPU.
-    DeviceError: there is no platform, or nothing fits the choice
+        PYOPENCL_CTX (pyopencl's form), and then takes the first GPU, or else the first CPU;
+        simulators come last. CLRESAMPLE_ICD names a driver library to look for devices in.
+    A device renders a small image at its first use, which is compared with NumPy's. One that fails
+    is not used: another is taken, with a DeviceWarning, where none was named.
+    DeviceError: there is no platform, nothing fits the choice, or what was chosen fails that test
     """
-    return choice if isinstance(choice, Device) else _open(choose(choice))
+    if isinstance(choice, Device):
+        return choice
+    candidates = ranked(find_devices()) if is_free(choice) else [choose(choice)]
+    faults: list[str] = []
+    for candidate in candidates:
+        fault = _fault(candidate)
+        if fault is None:
+            for message in faults:
+                warnings.warn(f"{message}; {candidate.name} is used", DeviceWarning, stacklevel=2)
+            return _open(candidate)
+        faults.append(fault)
+    raise DeviceError(
+        "; ".join(faults) + ": update the driver, or choose another device (`clresample devices` "
+        "lists them)"
+    )
 
 
 @functools.cache
 def _open(cl_device):
     return Device(cl_device)
+
+
+@functools.cache
+def _fault(cl_device):
+    """Why a pyopencl device is not to be used, or None."""
+    try:
+        device = _open(cl_device)
+        return selftest.fault(device, device.remembered)
+    except (DeviceError, load_pyopencl().Error) as error:
+        return f"{cl_device.name.strip()} fails its self-test: {error}"
