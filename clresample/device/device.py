@@ -21,6 +21,7 @@ from .discovery import (
     choose,
     find_devices,
     is_free,
+    is_simulated,
     kind_of,
     load_pyopencl,
     ranked,
@@ -41,6 +42,7 @@ class Device:
 
     context, queue, cl: pyopencl's Context, CommandQueue and Device
     name, platform, kind: what the driver calls it; kind is "GPU", "CPU", "ACCELERATOR" or "OTHER"
+    simulated: it stands in for another device, see `is_simulated`
     compute_units: their number
     memory, max_alloc, in_use [bytes]: all of it, the largest buffer, what arrays made here hold
     remembered: what earlier runs have measured of this device
@@ -51,7 +53,7 @@ class Device:
         self.cl = cl_device
         self.name = cl_device.name.strip()
         self.platform = cl_device.platform.name.strip()
-        self.kind = kind_of(cl_device)
+        self.kind, self.simulated = kind_of(cl_device), is_simulated(cl_device)
         self.compute_units = cl_device.max_compute_units
         self.memory = cl_device.global_mem_size
         self.max_alloc = cl_device.max_mem_alloc_size

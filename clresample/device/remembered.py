@@ -70,6 +70,11 @@ class Remembered:
             raise
         self._content = everything
 
+    def forget(self, part, why):
+        """Ignore a part for the rest of this process, with a warning; the file stays as it is."""
+        if self._all().pop(part, None) is not None:
+            self.ignore(why)
+
     def ignore(self, why):
         """Warn, in one line, that what the file says is not used."""
         warnings.warn(f"{self.path} is ignored: {why}", DeviceWarning, stacklevel=2)

@@ -13,7 +13,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from .contraction import FILE, Contraction, Matrix, padded
+from .contraction import FILE, GROUP_FILE, Contraction, Matrix, padded
 from .program import read_kernel
 
 # [1] Largest relative error, L2. float32 on a sound device leaves 1e-7; a wrong driver, one that
@@ -30,7 +30,8 @@ def fault(device, remembered):
 
     remembered: the Remembered of the device
     """
-    kernels = hashlib.sha256(read_kernel(FILE).encode()).hexdigest()
+    sources = read_kernel(FILE) + read_kernel(GROUP_FILE)
+    kernels = hashlib.sha256(sources.encode()).hexdigest()
     if remembered.read(PART) == kernels:
         return None
     found, truth = render(device), reference()
