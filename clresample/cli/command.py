@@ -8,14 +8,17 @@ mistake in files or arguments, which becomes one line on standard error and exit
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import warnings
 
 from .. import __version__
 from ..device.discovery import DeviceError
+from ..device.profile import report
 from ..device.remembered import DeviceWarning
 from .deblend import add_deblend
 from .devices import add_devices
+from .machine.tune import add_tune
 from .options import note
 from .resample import add_resample
 
@@ -40,7 +43,10 @@ def main(argv=None):
     try:
         with warnings.catch_warnings():
             _show_in_one_line(arguments)
+            if getattr(arguments, "profile", False):
+                os.environ["CLRESAMPLE_PROFILE"] = "1"  # read when the device is opened
             arguments.run(arguments)
+            report()
     except DeviceError as error:  # may hold a compiler's log: its lines are kept
         return _fail(arguments, str(error))
     except (ValueError, OSError) as error:
@@ -69,4 +75,4 @@ def _fail(arguments, message):
     return 2
 
 
-COMMANDS = (add_resample, add_deblend, add_devices)
+COMMANDS = (add_resample, add_deblend, add_devices, add_tune)

@@ -17,6 +17,9 @@ def add_devices(commands):
         "fp64 is found by building a kernel in double precision.",
     )
     add_device_option(parser)
+    parser.add_argument(
+        "--bench", action="store_true", help="measure the chosen device, for about ten seconds"
+    )
     parser.set_defaults(run=run)
 
 
@@ -27,7 +30,13 @@ def run(arguments):
     print(format_table(list_devices(arguments.device)))
     for hint in hints():
         note(arguments, hint)
-    get_device(arguments.device)
+    device = get_device(arguments.device)
+    if arguments.bench:
+        from .machine.bench import bench_lines
+
+        print(f"\n{device.name}:")
+        for line in bench_lines(device):
+            print(f"  {line}", flush=True)
 
 
 def format_table(devices):

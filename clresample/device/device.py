@@ -28,6 +28,7 @@ from .discovery import (
 )
 from .errors import FULL, explained, status_of, too_large
 from .launcher import Launcher
+from .profile import started
 from .program import Programs
 from .remembered import DeviceWarning, Remembered
 
@@ -46,12 +47,12 @@ class Device:
     compute_units: their number
     memory, max_alloc, in_use [bytes]: all of it, the largest buffer, what arrays made here hold
     remembered: what earlier runs have measured of this device
+    profile: the times of all launches, where CLRESAMPLE_PROFILE was set; or None
     """
 
     def __init__(self, cl_device):
         cl = load_pyopencl()
-        self.cl = cl_device
-        self.name = cl_device.name.strip()
+        self.cl, self.name = cl_device, cl_device.name.strip()
         self.platform = cl_device.platform.name.strip()
         self.kind, self.simulated = kind_of(cl_device), is_simulated(cl_device)
         self.compute_units = cl_device.max_compute_units
@@ -61,7 +62,9 @@ class Device:
         self._enqueue, self._error = cl.enqueue_nd_range_kernel, cl.Error
         self._programs, self._lock = Programs(self), threading.Lock()
         self.context = self._call(cl.Context, [cl_device])
-        self.queue = self._call(cl.CommandQueue, self.context, cl_device)
+        self.profile = started(self.name)
+        timed = cl.command_queue_properties.PROFILING_ENABLE if self.profile else 0
+        self.queue = self._call(cl.CommandQueue, self.context, cl_device, properties=timed)
 
     def __repr__(self):
         return f"Device({self.platform}: {self.name})"
@@ -113,13 +116,8 @@ class Device:
 
     def copy(self, source, target):
         """Overwrite a device array with another of its size and dtype."""
-        self._copy(
-            target.base_data,
-            source.base_data,
-            byte_count=source.nbytes,
-            src_offset=source.offset,
-            dst_offset=target.offset,
-        )
+        places = {"src_offset": source.offset, "dst_offset": target.offset}
+        self._copy(target.base_data, source.base_data, byte_count=source.nbytes, **places)
 
     def _copy(self, target, source, **options):
         import pyopencl as cl

@@ -43,7 +43,7 @@ class Launcher:
         ValueError: a name that the kernel does not have, one that was never given, or an array
             that starts inside its buffer
         """
-        values = self._merged(arguments).values() if arguments else self._bound.values()
+        values = (self._merged(arguments) if arguments else self._bound).values()
         with self._lock:
             try:
                 self.kernel.set_args(*values)
@@ -56,7 +56,11 @@ class Launcher:
             local_size = self.local_size
             if local_size is not None:
                 global_size = tuple([-(-n // g) * g for n, g in zip(global_size, local_size)])
-            self.device.launch(self.kernel, global_size, local_size)
+            event = self.device.launch(self.kernel, global_size, local_size)
+        profile = self.device.profile
+        if profile is not None:
+            given = dict(zip(self._bound, values, strict=True))
+            profile.note(event, self.kernel.function_name, given, global_size)
 
     def _merged(self, arguments):
         for name, value in arguments.items():

@@ -70,6 +70,10 @@ class Remembered:
             raise
         self._content = everything
 
+    def suppose(self, part, content):
+        """Let a part read so for the rest of this process; the file stays as it is."""
+        self._all()[part] = content
+
     def forget(self, part, why):
         """Ignore a part for the rest of this process, with a warning; the file stays as it is."""
         if self._all().pop(part, None) is not None:

@@ -138,7 +138,7 @@ def _cpu_tile(device, dtype) -> dict[str, int]:
 
 # Sizes that `clresample tune` measures, and what each of them may be.
 TUNABLE = {
-    "tile": lambda tile: is_tile(tile),
+    "tile": lambda tile: is_tile(tile),  # defined below
     "row_choices": lambda rows: all(n in range(2, 17, 2) for n in rows),
     "group_bytes": lambda n: isinstance(n, int) and 1 << 16 <= n <= 1 << 34,
     "n_scenes": lambda n: isinstance(n, int) and 1 <= n <= 1 << 16,
@@ -160,16 +160,13 @@ def is_tile(tile):
 def tuned(device, dtype):
     """Sizes that `clresample tune` has kept for a device, its kind and a type: {name: size}."""
     kept = device.remembered.read(PART)
-    if not kept:
+    if kept is None:
         return {}
     try:
-        sizes = dict(kept[device.kind][np.dtype(dtype).name])
-        if all(TUNABLE[name](size) for name, size in sizes.items()):
+        sizes = dict(kept.get(device.kind, {}).get(np.dtype(dtype).name, {}))
+        if all(name in TUNABLE and TUNABLE[name](size) for name, size in sizes.items()):
             return {n: tuple(s) if n == "row_choices" else s for n, s in sizes.items()}
-    except KeyError:  # tuned as another kind, or for the other type
-        if all(isinstance(sizes, dict) for sizes in kept.values()):
-            return {}
-    except (TypeError, ValueError, AttributeError):
+    except (TypeError, ValueError, AttributeError, KeyError):
         pass
     device.remembered.forget(PART, "its sizes are none that `clresample tune` keeps")
     return {}
