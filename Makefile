@@ -6,13 +6,37 @@ VENV ?= .venv
 STAMP = $(VENV)/made
 RUN = $(VENV)/bin/python -m
 
-.PHONY: demo test lint clean paper paper-full dist test-install test-oldest test-adapters docs
+.PHONY: demo test test-on test-kernels-on grind lint clean paper paper-full dist test-install \
+    test-oldest test-adapters docs
+
+# What runs on one OpenCL device whatever the others are: operators, and the solver's kernels.
+KERNEL_TESTS = tests/device/test_contraction.py tests/device/test_launcher.py \
+    tests/device/test_selftest.py tests/resampling tests/deblending/test_engine.py \
+    tests/deblending/test_constraints.py tests/deblending/test_monotone.py \
+    tests/deblending/test_lbfgs.py tests/deblending/test_structure.py \
+    tests/deblending/test_gradient.py
 
 demo: $(STAMP)
 	$(RUN) clresample.cli.demo $(ARGS)
 
 test: $(STAMP)
 	$(RUN) pytest $(ARGS)
+
+# make test-on RUNTIME=pocl|pocl-debian|intel|rusticl [TESTS=...]: on that OpenCL runtime alone.
+# What it needs is fetched into .runtimes/; where that fails, it is skipped, and said so.
+RUNTIME ?= pocl
+TESTS ?= tests
+test-on: $(STAMP)
+	@PYTHON=$(PYTHON) tools/on_runtime.sh $(RUNTIME) $(RUN) pytest $(TESTS) $(ARGS) || \
+	    { status=$$?; [ $$status = 77 ] || exit $$status; }
+
+# Kernels' tests on one other runtime.
+test-kernels-on: TESTS = $(KERNEL_TESTS)
+test-kernels-on: test-on
+
+# Races and bad accesses of every kernel, found by a simulator; see tools/grind.sh.
+grind: $(STAMP)
+	tools/grind.sh $(VENV)/bin/python
 
 lint: $(STAMP)
 	$(RUN) ruff check .
@@ -74,7 +98,7 @@ docs: .venv-docs/made
 	touch $@
 
 clean:
-	rm -rf $(VENV) .venv-adapters .venv-docs docs/_build dist .pytest_cache .ruff_cache
+	rm -rf $(VENV) .venv-adapters .venv-docs .runtimes docs/_build dist .pytest_cache .ruff_cache
 
 # Without venv's own pip, which some systems package apart; the caller's pip installs into it.
 $(STAMP): pyproject.toml

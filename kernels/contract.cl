@@ -42,65 +42,14 @@
  *
  * Launch: global = (ceil(n_pad / (NV VW)), ceil(m / MR), batch), each rounded up to its local size.
  */
-#include "common.h"
+#include "contract.h"
 
-#ifndef VW          /* columns of a vector */
-#define VW 16
-#endif
-#ifndef NV          /* vectors a work-item owns in each row */
-#define NV 1
-#endif
-#ifndef MR          /* rows a work-item owns; even, so that (cos, sin) pairs stay together */
-#define MR 6
-#endif
-#ifndef WGX         /* work-items of a group along the columns of C */
-#define WGX 1
-#endif
-#ifndef WGY         /* work-items of a group along the rows of C */
-#define WGY 1
-#endif
-#ifndef STRIDED     /* 1: A's columns lie step_a apart; 0: they are adjacent, step_a is not read */
-#define STRIDED 0
-#endif
-#ifndef RAGGED      /* 1: C is a caller's array, stored element by element; 0: padded, by vectors */
-#define RAGGED 0
-#endif
-#ifndef MIX         /* 1: multiply by the transfer function */
-#define MIX 0
-#endif
-#ifndef TWIST       /* 1: rotate (cos, sin) row pairs */
-#define TWIST 0
-#endif
-#ifndef SIGN        /* of MIX's or TWIST's angles: 1 forward, -1 adjoint */
-#define SIGN 1
-#endif
-
-#define WIDE VEC(VW)
-#if VW == 16
-#define HALF VEC(8)
-#define EVEN(v) (v).s02468ace
-#define ODD(v) (v).s13579bdf
-#elif VW == 8
-#define HALF VEC(4)
-#define EVEN(v) (v).s0246
-#define ODD(v) (v).s1357
-#elif VW == 4
-#define HALF VEC(2)
-#define EVEN(v) (v).s02
-#define ODD(v) (v).s13
-#else
-#define HALF REAL
-#define EVEN(v) (v).s0
-#define ODD(v) (v).s1
-#endif
-
-#if STRIDED
-#define STEP_A (size_t)step_a
-#else
-#define STEP_A 1
-#endif
-
-#define UNROLL(i, n) _Pragma("unroll") for (int i = 0; i < (n); ++i)
+#define OWNED(i, v) (i0 + (i) < m)
+/* By the vector's address: on CPUs the vector leaves its register in one store. */
+#define STORE_LANES(sums, c, n_left) \
+    const REAL *lane = (const REAL *)&sums; \
+    for (int j = 0; j < VW; ++j) \
+        if (j < n_left) c[(size_t)j * step_c] = lane[j];
 
 __kernel __attribute__((reqd_work_group_size(WGX, WGY, 1)))
 void contract(const int m, const int n, const int n_pad, const int k, const int block,
@@ -137,46 +86,5 @@ void contract(const int m, const int n, const int n_pad, const int k, const int 
         UNROLL(i, MR) UNROLL(v, NV) acc[i][v] += part[i][v];
     }
 
-#if MIX
-    E += (size_t)(b / n_bands) * stride_e + (size_t)(b % n_bands) * band_e;
-    UNROLL(h, MR / 2) UNROLL(v, NV) {
-        const int i = 2 * h;
-        if (i0 + i >= m) break;
-        const WIDE c = acc[i][v], s = acc[i + 1][v];
-        __global const REAL *d = E + (size_t)(i0 / 2 + h) * 2 * n_pad + column[v] / 2;
-        const HALF pr = AT(const HALF, d), pi = SIGN * AT(const HALF, d + n_pad / 2);
-        const HALF mr = AT(const HALF, d + n_pad), mi = SIGN * AT(const HALF, d + n_pad / 2 * 3);
-        const HALF fpr = EVEN(c) - ODD(s), fpi = -(ODD(c) + EVEN(s));   /* F(+nu_y, +nu_x) */
-        const HALF fmr = EVEN(c) + ODD(s), fmi = ODD(c) - EVEN(s);      /* F(+nu_y, -nu_x) */
-        const HALF gpr = pr * fpr - pi * fpi, gpi = pr * fpi + pi * fpr;
-        const HALF gmr = mr * fmr - mi * fmi, gmi = mr * fmi + mi * fmr;
-        EVEN(acc[i][v]) = gpr + gmr;
-        ODD(acc[i][v]) = gmi - gpi;
-        EVEN(acc[i + 1][v]) = -(gpi + gmi);
-        ODD(acc[i + 1][v]) = gmr - gpr;
-    }
-#elif TWIST
-    E += (size_t)(b / n_bands) * stride_e;
-    UNROLL(h, MR / 2) UNROLL(v, NV) {
-        const int i = 2 * h;
-        if (i0 + i >= m) break;
-        const WIDE c = acc[i][v], s = acc[i + 1][v];
-        __global const REAL *t = E + (size_t)(i0 / 2 + h) * 2 * n_pad + column[v];
-        const WIDE cos_t = AT(const WIDE, t), sin_t = SIGN * AT(const WIDE, t + n_pad);
-        acc[i][v] = c * cos_t + s * sin_t;
-        acc[i + 1][v] = s * cos_t - c * sin_t;
-    }
-#endif
-
-    UNROLL(i, MR) UNROLL(v, NV) {
-        if (i0 + i >= m) break;
-#if RAGGED
-        __global REAL *c = C + (size_t)(i0 + i) * ld_c + (size_t)column[v] * step_c;
-        const REAL *lane = (const REAL *)&acc[i][v];
-        for (int j = 0; j < VW; ++j)
-            if (column[v] + j < n) c[(size_t)j * step_c] = lane[j];
-#else
-        AT(WIDE, C + (size_t)(i0 + i) * ld_c + column[v]) = acc[i][v];
-#endif
-    }
+#include "contract_end.h"
 }

@@ -22,10 +22,11 @@
  *
  *   Units run from `first` to first + n_units - 1, and G starts at the first.
  *   n_cols is a multiple of LANES, ld of 16.
- *   Launch: shift (n_cols / LANES, h_x, n_units * n_items), unshift (h_x, n_units * n_items).
+ *   Launch: shift (n_cols / LANES, h_x, n_units * n_items), unshift (h_x, n_units * n_items); the
+ *   first two axes, or the first, may be rounded up.
  *
  *   collect  pixels[b, p] = sum over chunks of part[chunk, l, b * n_cols + i]; 0 where not covered
- *            launch (n_i, n_l, n_items); p = l * step_l + i * step_i
+ *            launch (n_i rounded up, n_l, n_items); p = l * step_l + i * step_i
  *   spread   part[l, b * n_cols + i] = pixels[b, p] where covered, else 0, the adjoint of one chunk
  *            launch (ld, n_l); columns that are no pixel's become 0
  *   pixels: image b from offset + b * stride on;  covered: of each pixel p, 1 or 0
@@ -55,6 +56,7 @@ __kernel void shift_line(const int h_x, const int n_units, const int first,
 {
     const int j = (int)get_global_id(0) * LANES, k = (int)get_global_id(1);
     const int unit = (int)get_global_id(2) % n_units, b = (int)get_global_id(2) / n_units;
+    if (j >= n_cols || k >= h_x) return;
     Z += (size_t)b * stride_z + (size_t)(first + unit) * ld_z + 2 * k;
     w_x += (size_t)2 * k * n_cols + j;
     G += (size_t)2 * (unit * h_x + k) * ld + b * n_cols + j;
@@ -71,6 +73,7 @@ __kernel void unshift_line(const int h_x, const int n_units, const int first,
 {
     const int k = (int)get_global_id(0);
     const int unit = (int)get_global_id(1) % n_units, b = (int)get_global_id(1) / n_units;
+    if (k >= h_x) return;
     Z += (size_t)b * stride_z + (size_t)(first + unit) * ld_z + 2 * k;
     w_x += (size_t)2 * k * n_cols;
     G += (size_t)2 * (unit * h_x + k) * ld + b * n_cols;
@@ -92,6 +95,7 @@ __kernel void shift_plane(const int h_x, const int n_units, const int first,
 {
     const int j = (int)get_global_id(0) * LANES, k = (int)get_global_id(1);
     const int unit = (int)get_global_id(2) % n_units, b = (int)get_global_id(2) / n_units;
+    if (j >= n_cols || k >= h_x) return;
     Z += (size_t)b * stride_z + (size_t)2 * (first + unit) * ld_z + 2 * k;
     w_y += (size_t)2 * (first + unit) * n_cols + j;
     w_x += (size_t)2 * k * n_cols + j;
@@ -113,6 +117,7 @@ __kernel void unshift_plane(const int h_x, const int n_units, const int first,
 {
     const int k = (int)get_global_id(0);
     const int unit = (int)get_global_id(1) % n_units, b = (int)get_global_id(1) / n_units;
+    if (k >= h_x) return;
     Z += (size_t)b * stride_z + (size_t)2 * (first + unit) * ld_z + 2 * k;
     w_y += (size_t)2 * (first + unit) * n_cols;
     w_x += (size_t)2 * k * n_cols;
@@ -136,13 +141,14 @@ __kernel void unshift_plane(const int h_x, const int n_units, const int first,
     Z[ld_z + 1] = c - a;
 }
 
-__kernel void collect(const int n_chunks, const int n_cols, const int ld,
+__kernel void collect(const int n_chunks, const int n_i, const int n_cols, const int ld,
                       __global const REAL *restrict part, __global const uchar *restrict covered,
                       __global REAL *restrict pixels, const ulong offset, const int stride,
                       const int step_l, const int step_i)
 {
     const int i = (int)get_global_id(0), l = (int)get_global_id(1), b = (int)get_global_id(2);
     const size_t step = (size_t)get_global_size(1) * ld;
+    if (i >= n_i) return;
     const size_t p = (size_t)l * step_l + (size_t)i * step_i;
     part += (size_t)l * ld + (size_t)b * n_cols + i;
     REAL sum = 0;

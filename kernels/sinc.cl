@@ -8,7 +8,7 @@
  *   table: element (p, i) at p * step_p + i * step_i: positions may run along rows or columns
  *
  * Boundary: writes these elements only; padding is the caller's.
- * Launch: (n_integers, n_positions).
+ * Launch: (n_integers rounded up, n_positions).
  */
 #include "common.h"
 
@@ -34,11 +34,12 @@ static REAL sinc_near(const REAL t)
     return 1 - t / 6 * s;
 }
 
-__kernel void sinc(const int first, __global const int *restrict whole,
+__kernel void sinc(const int n_integers, const int first, __global const int *restrict whole,
                    __global const REAL *restrict part, __global REAL *restrict table,
                    const int step_p, const int step_i)
 {
     const int i = (int)get_global_id(0), p = (int)get_global_id(1);
+    if (i >= n_integers) return;
     const int distance = whole[p] - first - i;
     const REAL r = part[p], near = sinc_near(PI * r * (PI * r));
     const REAL far = (distance & 1 ? -near : near) * r / (distance + r + (distance == 0));

@@ -10,7 +10,7 @@
  *   Launch: (n_out rounded up to the local size, n_lines, batch).
  *
  * rowdot   y[b, p] = sum_x T[b, p, x] * E[p, x]          launch: (n_positions rounded up, batch)
- * rowscale T[b, p, x] = y[b, p] * E[p, x]                launch: (n_pad, n_positions, batch)
+ * rowscale T[b, p, x] = y[b, p] * E[p, x]                launch: (n_positions * n_pad, batch)
  *          The two ends of the executor for any positions: each observed pixel p has a table row
  *          E[p] of its own.
  *   E (n_tables, n_positions, n_pad), T (batch, n_positions, n_pad): zero in the padding
@@ -63,7 +63,9 @@ __kernel void rowscale(const int n_positions, const int n_pad, const int n_bands
                        const int n_tables, __global const REAL *restrict y, const ulong y_offset,
                        __global REAL *restrict T, __global const REAL *restrict E)
 {
-    const int x = (int)get_global_id(0), p = (int)get_global_id(1), b = (int)get_global_id(2);
+    /* pixels along the first axis: GPUs take at most 65,535 groups along the others */
+    const size_t i = get_global_id(0), p = i / n_pad, x = i % n_pad;
+    const int b = (int)get_global_id(1);
     const size_t i_table = n_tables > 1 ? b / n_bands : 0;
     T[((size_t)b * n_positions + p) * n_pad + x] =
         y[y_offset + (size_t)b * n_positions + p] * E[(i_table * n_positions + p) * n_pad + x];

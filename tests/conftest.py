@@ -1,15 +1,32 @@
-"""Fixtures: every OpenCL device of the machine, and the folder of real images."""
+"""Fixtures: every OpenCL device of the machine, and the folder of real images.
+
+Options: --as-gpu runs every device through the kernels as they are built for GPUs; --nan-buffers
+fills each new buffer of a device with NaN, so that a kernel that reads what nobody wrote is found.
+"""
 
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 # Before NumPy is loaded: on small matrices BLAS threads only wait for each other, and for PoCL's.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# What the user's own devices were tuned to is no matter of the tests. Processes that tests start
+# have the same folder; it is removed at the end.
+os.environ["CLRESAMPLE_CACHE"] = tempfile.mkdtemp(prefix="clresample-cache-")
 
+import numpy as np
 import pytest
 from helpers.checkout import ROOT
 
-from clresample import DeviceError, get_device, list_devices
+from clresample import Device, DeviceError, get_device, list_devices
+
+NO_DOUBLE = "has no double precision: use float32"
+
+
+def pytest_addoption(parser):
+    parser.addoption("--as-gpu", action="store_true", help="build kernels as for GPUs")
+    parser.addoption("--nan-buffers", action="store_true", help="fill new buffers with NaN")
 
 
 def pytest_generate_tests(metafunc):
@@ -22,10 +39,60 @@ def pytest_generate_tests(metafunc):
     metafunc.parametrize("device", found.values(), ids=found, indirect=True, scope="session")
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_pyfunc_call(pyfuncitem):
+    """Skip a test that asks a device for float64 which it does not have."""
+    try:
+        return (yield)
+    except DeviceError as error:
+        if NO_DOUBLE not in str(error) or _asks_for_single(pyfuncitem):
+            raise
+        pytest.skip(str(error))
+
+
+def _asks_for_single(item):
+    """True of a test whose parameters say float32: such a test has no use for float64."""
+    dtype = getattr(item, "callspec", None) and item.callspec.params.get("dtype")
+    return dtype is not None and np.dtype(dtype) == np.float32
+
+
 @pytest.fixture(scope="session")
 def device(request):
     """Each OpenCL device in turn."""
     return get_device(request.param)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def as_asked(request):
+    """What the options ask of all devices."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.config.getoption("--as-gpu"):
+            opened = Device.__init__
+
+            def as_gpu(self, cl_device):
+                opened(self, cl_device)
+                self.kind = "GPU"
+
+            patch.setattr(Device, "__init__", as_gpu)
+        if request.config.getoption("--nan-buffers"):
+            fill_with_nan(patch)
+        yield
+    shutil.rmtree(os.environ["CLRESAMPLE_CACHE"], ignore_errors=True)
+
+
+def fill_with_nan(patch):
+    """Let every new buffer of every device hold NaN, or the largest number of its type."""
+    empty = Device.empty
+
+    def filled(self, shape, dtype):
+        array = empty(self, shape, dtype)
+        kind = array.dtype.kind
+        value = np.nan if kind in "fc" else np.iinfo(array.dtype).max
+        if array.size:
+            self.upload(np.full(array.shape, value, array.dtype), array)
+        return array
+
+    patch.setattr(Device, "empty", filled)
 
 
 @pytest.fixture(scope="session")

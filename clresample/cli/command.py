@@ -8,16 +8,21 @@ mistake in files or arguments, which becomes one line on standard error and exit
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 import threading
+import warnings
 from contextlib import contextmanager
 
 from .. import __version__
 from ..device.discovery import DeviceError
+from ..device.profile import report
+from ..device.remembered import DeviceWarning
 from .deblend import add_deblend
 from .devices import add_devices
-from .options import printable
+from .machine.tune import add_tune
+from .options import note, printable
 from .resample import add_resample
 
 # Of an error's line: some errors quote a whole file.
@@ -47,7 +52,12 @@ def _run(argv):
         add_command(commands)
     arguments = parser.parse_args(argv)
     try:
-        arguments.run(arguments)
+        with warnings.catch_warnings():
+            _show_in_one_line(arguments)
+            if getattr(arguments, "profile", False):
+                os.environ["CLRESAMPLE_PROFILE"] = "1"  # read when the device is opened
+            arguments.run(arguments)
+            report()
     except DeviceError as error:  # may hold a compiler's log: its lines are kept
         return _fail(arguments, str(error))
     except (ValueError, OSError) as error:
@@ -56,6 +66,19 @@ def _run(argv):
         _fail(arguments, "interrupted")
         return 130  # what a shell reports after Ctrl-C
     return 0
+
+
+def _show_in_one_line(arguments):
+    """Let a DeviceWarning appear as a note, without the line of source that warnings come with."""
+    shown = warnings.showwarning
+
+    def show(message, category, *rest, **more):
+        if issubclass(category, DeviceWarning):
+            note(arguments, str(message))
+        else:
+            shown(message, category, *rest, **more)
+
+    warnings.showwarning = show
 
 
 def _fail(arguments, message):
@@ -80,4 +103,4 @@ def _ended_as_interrupted():
         signal.signal(signal.SIGTERM, signal.SIG_DFL if former is None else former)
 
 
-COMMANDS = (add_resample, add_deblend, add_devices)
+COMMANDS = (add_resample, add_deblend, add_devices, add_tune)

@@ -14,6 +14,7 @@ from pathlib import Path
 from .options import (
     add_device_option,
     add_dtype_option,
+    add_profile_option,
     fraction,
     note,
     printable,
@@ -80,6 +81,7 @@ def add_deblend(commands):
     )
     add_dtype_option(fit, "arithmetic of the fit")
     add_device_option(fit)
+    add_profile_option(fit)
     fit.add_argument("--quiet", action="store_true", help="no progress, no notes")
     parser.set_defaults(run=run)
 

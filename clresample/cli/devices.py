@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from ..device.discovery import format_size, list_devices
-from .options import add_device_option
+from ..device.discovery import format_size, hints, list_devices
+from .options import add_device_option, note
 
 COLUMNS = ("platform", "device", "kind", "OpenCL", "units", "memory", "largest buffer", "fp64")
 
@@ -17,6 +17,9 @@ def add_devices(commands):
         "fp64 is found by building a kernel in double precision.",
     )
     add_device_option(parser)
+    parser.add_argument(
+        "--bench", action="store_true", help="measure the chosen device, for about ten seconds"
+    )
     parser.set_defaults(run=run)
 
 
@@ -25,7 +28,15 @@ def run(arguments):
     from ..device.device import get_device
 
     print(format_table(list_devices(arguments.device)))
-    get_device(arguments.device)
+    for hint in hints():
+        note(arguments, hint)
+    device = get_device(arguments.device)
+    if arguments.bench:
+        from .machine.bench import bench_lines
+
+        print(f"\n{device.name}:")
+        for line in bench_lines(device):
+            print(f"  {line}", flush=True)
 
 
 def format_table(devices):

@@ -19,6 +19,15 @@ def add_device_option(parser):
     )
 
 
+def add_profile_option(parser):
+    """Add `--profile`, which sets CLRESAMPLE_PROFILE."""
+    parser.add_argument(
+        "--profile",
+        action="store_true",
+        help="print at the end how long each kernel took, on standard error",
+    )
+
+
 def add_dtype_option(parser, what):
     """Add `--dtype`, the floating type of `what`."""
     parser.add_argument(

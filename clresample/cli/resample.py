@@ -10,6 +10,7 @@ from pathlib import Path
 from .options import (
     add_device_option,
     add_dtype_option,
+    add_profile_option,
     center,
     names,
     note,
@@ -125,6 +126,7 @@ def _add_ways(group):
     )
     add_dtype_option(group, "arithmetic and output")
     add_device_option(group)
+    add_profile_option(group)
     group.add_argument(
         "--memory",
         metavar="SIZE",

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 from .tuning import Tuning
 
-FILE = "contract.cl"
+# The kernel of a tile in registers, for CPUs, and that of a group with local memory, for GPUs.
+FILE, GROUP_FILE = "contract.cl", "contract_group.cl"
 EPILOGUES = ("MIX", "TWIST")
 # Columns of device matrices are padded with zeros to a multiple of this, the widest OpenCL vector.
 COLUMN_PAD = 16
@@ -15,6 +16,8 @@ COLUMN_PAD = 16
 # that is more, so that stretches and their sum round alike. One sum of all terms would take 6 %
 # less time and leave the float32 operator half as accurate.
 SUM_BLOCK = 16
+# Terms that the kernel for groups sums in one go: a second sum takes half of a GPU's registers.
+ONE_SUM = 256
 
 
 def padded(n: int) -> int:
@@ -70,6 +73,8 @@ class ImageBatch(NamedTuple):
 class Contraction:
     """C[b] = A[b] . B[b], with an optional point-wise stage on the result; see kernels/contract.cl.
 
+    The kernel and its tile are Tuning's, by device, type and shape.
+
     epilogue: None, "MIX" (transfer functions) or "TWIST" (rotation of cos and sin rows)
     adjoint: conjugate the epilogue
     ragged: C is a caller's array, of any strides; otherwise its rows are padded with zeros
@@ -78,9 +83,16 @@ class Contraction:
 
     def __init__(self, device, dtype, *, epilogue=None, adjoint=False, ragged=False, strided=False):
         self.device, self.dtype = device, dtype
-        self.tile = Tuning.of(device, dtype).tile
-        self.defines = {"SIGN": -1 if adjoint else 1, "RAGGED": ragged, "STRIDED": strided}
-        self.defines |= self.tile | ({epilogue: True} if epilogue else {})
+        self.tuning = Tuning.of(device, dtype)
+        self.options = {"SIGN": -1 if adjoint else 1, "RAGGED": ragged, "STRIDED": strided}
+        self.options |= {epilogue: True} if epilogue else {}
+
+    def build(self, n_rows=None, n_terms=0):
+        """(file, macros) for matrices of so many rows and terms; those of most, where not given."""
+        tile = self.tuning.tile_for(n_rows) if n_rows else self.tuning.tile
+        if "KB" not in tile:
+            return FILE, self.options | tile
+        return GROUP_FILE, self.options | tile | {"TWO_SUMS": n_terms > ONE_SUM}
 
     def bind(self, m, n, k, a: Matrix, b: Matrix, c: Matrix, e=None, n_bands=1) -> Product:
         """The products of (m, k) matrices A with (k, n) matrices B into C.
@@ -88,13 +100,16 @@ class Contraction:
         e (buffer, stride, band stride): tables of the epilogue, shared by `n_bands` items
         """
         buffer_e, stride_e, band_e = e or (None, 0, 0)
-        tile = self.tile
+        # one right factor for all: the rows of all items are those of one tall matrix
+        whole_a = a.step == 1 and a.stride == m * a.ld and a.div == 1
+        tall = e is None and b.stride == 0 and whole_a and c.step == 1 and c.stride == m * c.ld
+        file, tile = self.build(None if tall else m, k)
         launch = self.device.launcher(
-            FILE,
-            "contract",
+            file,
+            file.removesuffix(".cl"),
             dtype=self.dtype,
             local_size=(tile["WGX"], tile["WGY"], 1),
-            **self.defines,
+            **tile,
         ).bind(
             m=m,
             n=n,
@@ -120,9 +135,6 @@ class Contraction:
             band_e=band_e,
             n_bands=n_bands,
         )
-        # one right factor for all: the rows of all items are those of one tall matrix
-        whole_a = a.step == 1 and a.stride == m * a.ld and a.div == 1
-        tall = e is None and b.stride == 0 and whole_a and c.step == 1 and c.stride == m * c.ld
         return Product(launch, tile, m, padded(n), tall)
 
 
@@ -135,7 +147,8 @@ def operator_programs(device, dtype):
     variants += [
         {"epilogue": name, "adjoint": adjoint} for name in EPILOGUES for adjoint in (False, True)
     ]
-    return [(FILE, dtype, Contraction(device, dtype, **variant).defines) for variant in variants]
+    builds = [Contraction(device, dtype, **variant).build() for variant in variants]
+    return [(file, dtype, macros) for file, macros in builds]
 
 
 class Product:

@@ -10,14 +10,28 @@ import gc
 import math
 import os
 import threading
+import warnings
 import weakref
 
 import numpy as np
 
-from .discovery import builds_fp64, choose, kind_of, load_pyopencl
+from . import selftest
+from .discovery import (
+    DeviceError,
+    builds_fp64,
+    choose,
+    find_devices,
+    is_free,
+    is_simulated,
+    kind_of,
+    load_pyopencl,
+    ranked,
+)
 from .errors import FULL, explained, forked, status_of, too_large
 from .launcher import Launcher
+from .profile import started
 from .program import Programs
+from .remembered import DeviceWarning, Remembered
 
 __all__ = ["Device", "get_device"]
 
@@ -30,25 +44,29 @@ class Device:
 
     context, queue, cl: pyopencl's Context, CommandQueue and Device
     name, platform, kind: what the driver calls it; kind is "GPU", "CPU", "ACCELERATOR" or "OTHER"
+    simulated: it stands in for another device, see `is_simulated`
     compute_units: their number
     memory, max_alloc, in_use [bytes]: all of it, the largest buffer, what arrays made here hold
+    remembered: what earlier runs have measured of this device
+    profile: the times of all launches, where CLRESAMPLE_PROFILE was set; or None
     """
 
     def __init__(self, cl_device):
         cl = load_pyopencl()
-        self.cl = cl_device
-        self.name = cl_device.name.strip()
+        self.cl, self.name = cl_device, cl_device.name.strip()
         self.platform = cl_device.platform.name.strip()
-        self.kind = kind_of(cl_device)
+        self.kind, self.simulated = kind_of(cl_device), is_simulated(cl_device)
         self.compute_units = cl_device.max_compute_units
         self.memory = cl_device.global_mem_size
         self.max_alloc = cl_device.max_mem_alloc_size
-        self.in_use, self._pid = 0, os.getpid()
-        _opened.add(self)
+        self.in_use, self.remembered = 0, Remembered(cl_device)
+        _opened[self] = os.getpid()
         self._enqueue, self._error = cl.enqueue_nd_range_kernel, cl.Error
         self._programs, self._lock = Programs(self), threading.Lock()
         self.context = self._call(cl.Context, [cl_device])
-        self.queue = self._call(cl.CommandQueue, self.context, cl_device)
+        self.profile = started(self.name)
+        timed = cl.command_queue_properties.PROFILING_ENABLE if self.profile else 0
+        self.queue = self._call(cl.CommandQueue, self.context, cl_device, properties=timed)
 
     def __repr__(self):
         return f"Device({self.platform}: {self.name})"
@@ -104,13 +122,8 @@ class Device:
 
     def copy(self, source, target):
         """Overwrite a device array with another of its size and dtype."""
-        self._copy(
-            target.base_data,
-            source.base_data,
-            byte_count=source.nbytes,
-            src_offset=source.offset,
-            dst_offset=target.offset,
-        )
+        places = {"src_offset": source.offset, "dst_offset": target.offset}
+        self._copy(target.base_data, source.base_data, byte_count=source.nbytes, **places)
 
     def _copy(self, target, source, **options):
         import pyopencl as cl
@@ -190,16 +203,38 @@ def get_device(choice=None) -> Device:
 
     choice: None, a Device, an index, "platform:device" (each an index or part of a name), or part
         of a device's or platform's name. None reads CLRESAMPLE_DEVICE (the same forms), then
-        PYOPENCL_CTX (pyopencl's form), and then takes the first GPU, or else the first CPU.
-    DeviceError: there is no platform, or nothing fits the choice
+        PYOPENCL_CTX (pyopencl's form), and then takes the first GPU, or else the first CPU;
+        simulators come last. CLRESAMPLE_ICD names a driver library to look for devices in.
+    A device renders a small image at its first use, which is compared with NumPy's. One that fails
+    is not used: another is taken, with a DeviceWarning, where none was named.
+    DeviceError: there is no platform, nothing fits the choice, or what was chosen fails that test
     """
-    device = choice if isinstance(choice, Device) else _open(choose(choice))
-    if os.getpid() != device._pid:
+    if isinstance(choice, Device):
+        return _of_this_process(choice)
+    candidates = ranked(find_devices()) if is_free(choice) else [choose(choice)]
+    faults: list[str] = []
+    for candidate in candidates:
+        fault = _fault(candidate)
+        if fault is None:
+            for message in faults:
+                warnings.warn(f"{message}; {candidate.name} is used", DeviceWarning, stacklevel=2)
+            return _of_this_process(_open(candidate))
+        faults.append(fault)
+    raise DeviceError(
+        "; ".join(faults) + ": update the driver, or choose another device (`clresample devices` "
+        "lists them)"
+    )
+
+
+# The process that opened each device.
+_opened: weakref.WeakKeyDictionary[Device, int] = weakref.WeakKeyDictionary()
+
+
+def _of_this_process(device):
+    """The device; DeviceError in a process that was forked after it was opened."""
+    if os.getpid() != _opened[device]:
         raise forked(device)
     return device
-
-
-_opened: weakref.WeakSet[Device] = weakref.WeakSet()
 
 
 def _refuse_in_child():
@@ -222,3 +257,13 @@ if hasattr(os, "register_at_fork"):
 @functools.cache
 def _open(cl_device):
     return Device(cl_device)
+
+
+@functools.cache
+def _fault(cl_device):
+    """Why a pyopencl device is not to be used, or None."""
+    try:
+        device = _open(cl_device)
+        return selftest.fault(device, device.remembered)
+    except (DeviceError, load_pyopencl().Error) as error:
+        return f"{cl_device.name.strip()} fails its self-test: {error}"

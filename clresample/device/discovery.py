@@ -5,13 +5,20 @@ pyopencl is imported when devices are first looked for, never before.
 
 from __future__ import annotations
 
+import functools
 import os
 import tempfile
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
+from .drivers import cure, fault_of, named_library, show_named_library, unseen
+
 # Order of preference when nothing is chosen; a kind that is not listed comes last.
 KINDS = ("GPU", "CPU", "ACCELERATOR")
+# Parts of the names of devices that stand in for others: simulators, and drivers that draw on the
+# CPU. They come last in the choice, whatever kind they say they are.
+SIMULATED = ("oclgrind", "simulator", "emulat", "llvmpipe", "softpipe", "swiftshader")
 # Compiles only where double is a type of 8 bytes, whatever the driver claims.
 FP64_PROBE = """
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
@@ -42,7 +49,7 @@ class DeviceInfo:
 
 def list_devices(choice=None):
     """Every OpenCL device as a DeviceInfo, the one `get_device(choice)` would take marked."""
-    found = _found()
+    found = find_devices()
     try:
         chosen = choose(choice)
     except DeviceError:  # nothing fits the choice: the table is what helps then
@@ -74,14 +81,19 @@ def format_size(n_bytes):
 
 def choose(choice):
     """The pyopencl device for a choice as `get_device` takes it."""
-    found = _found()
+    found = find_devices()
     if choice is not None:
         return _match(str(choice), found, "device")
     if os.environ.get("CLRESAMPLE_DEVICE"):
         return _match(os.environ["CLRESAMPLE_DEVICE"], found, "CLRESAMPLE_DEVICE")
     if os.environ.get("PYOPENCL_CTX"):
         return _match_pyopencl(os.environ["PYOPENCL_CTX"], found)
-    return min(found, key=_preference)
+    return ranked(found)[0]
+
+
+def is_free(choice):
+    """True where neither the caller's choice nor the environment names a device."""
+    return choice is None and not any(map(os.environ.get, ("CLRESAMPLE_DEVICE", "PYOPENCL_CTX")))
 
 
 def _match(choice, found, source):
@@ -96,7 +108,7 @@ def _match(choice, found, source):
         fits = fits or [d for d in found if text and text in d.platform.name.lower()]
     if not fits:
         raise _no_fit(source, choice, found)
-    return min(fits, key=_preference)
+    return ranked(fits)[0]
 
 
 def _match_pair(platform, device, found):
@@ -125,12 +137,47 @@ def _no_fit(source, choice, found):
     return DeviceError(f"{source} is {choice!r}, which fits no device; there are: {names}")
 
 
+def ranked(found):
+    """Devices in the order in which they are taken when nothing is chosen."""
+    return sorted(found, key=_preference)
+
+
 def _preference(device):
     kind = kind_of(device)
-    return not device.available, KINDS.index(kind) if kind in KINDS else len(KINDS)
+    place = KINDS.index(kind) if kind in KINDS else len(KINDS)
+    return not device.available, is_simulated(device), place
 
 
-def _found():
+def is_simulated(device):
+    """True of a simulator, or of a driver that draws on the CPU, by its name."""
+    names = f"{device.platform.name} {device.name}".lower()
+    return any(name in names for name in SIMULATED)
+
+
+def hints():
+    """Lines on GPU drivers of this machine that bring no device, each with its cure."""
+    try:
+        found = find_devices()
+    except DeviceError:
+        found = []
+    library = named_library()
+    if library:
+        fault = fault_of(library)
+        return [f"CLRESAMPLE_ICD={library} cannot be loaded: {fault}"] if fault else []
+    return [
+        f"{vendor}'s OpenCL driver is at {path}, where the OpenCL loader does not look: "
+        f"{cure(path)}"
+        for vendor, path in unseen(_served(found))
+    ]
+
+
+def _served(found):
+    """Names of the platforms and devices that are real GPUs."""
+    real = [d for d in found if kind_of(d) == "GPU" and not is_simulated(d)]
+    return [f"{d.platform.name} {d.platform.vendor} {d.name}" for d in real]
+
+
+def find_devices():
     """Every device of every platform, in the drivers' order; DeviceError where there is none."""
     cl = load_pyopencl()
     try:
@@ -157,6 +204,8 @@ def _found():
         way = "install your GPU's OpenCL driver, or the CPU runtime: pip install 'clresample[pocl]'"
         if vendors:
             way += f"; OCL_ICD_VENDORS={vendors} limits the search to that place"
+        for vendor, path in unseen([]):
+            way += f"; or, for {vendor}'s driver at {path}: {cure(path)}"
     raise DeviceError(f"no {what} found: {way}")
 
 
@@ -191,7 +240,20 @@ def load_pyopencl():
         raise DeviceError(
             f"pyopencl cannot be imported ({error}): pip install 'clresample[pocl]'"
         ) from error
+    _ignore_remarks(pyopencl)
+    try:
+        show_named_library()
+    except OSError as error:
+        raise DeviceError(
+            f"CLRESAMPLE_ICD names a driver library that is not there: {named_library()}"
+        ) from error
     return pyopencl
+
+
+@functools.cache
+def _ignore_remarks(cl):
+    """Leave out pyopencl's warnings of compilers that, as Intel's, remark on every build."""
+    warnings.filterwarnings("ignore", category=cl.CompilerWarning)
 
 
 def kind_of(device):

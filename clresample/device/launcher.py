@@ -38,10 +38,12 @@ class Launcher:
     def __call__(self, global_size, **arguments):
         """Queue the kernel on `global_size` (x, y, z), `arguments` in place of what is bound.
 
+        The size is rounded up to whole groups; kernels leave out the work-items beyond it.
+
         ValueError: a name that the kernel does not have, one that was never given, or an array
             that starts inside its buffer
         """
-        values = self._merged(arguments).values() if arguments else self._bound.values()
+        values = (self._merged(arguments) if arguments else self._bound).values()
         with self._lock:
             try:
                 self.kernel.set_args(*values)
@@ -51,7 +53,14 @@ class Launcher:
                     error.add_note(f"arguments of {self!r}: {', '.join(self._bound)}")
                     raise
                 raise ValueError(f"{self!r} was not given {', '.join(unset)}") from error
-            self.device.launch(self.kernel, global_size, self.local_size)
+            local_size = self.local_size
+            if local_size is not None:
+                global_size = tuple([-(-n // g) * g for n, g in zip(global_size, local_size)])
+            event = self.device.launch(self.kernel, global_size, local_size)
+        profile = self.device.profile
+        if profile is not None:
+            given = dict(zip(self._bound, values, strict=True))
+            profile.note(event, self.kernel.function_name, given, global_size)
 
     def _merged(self, arguments):
         for name, value in arguments.items():

@@ -6,7 +6,7 @@ first to measure on a GPU. Kernels get these sizes as macros; none is written in
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,13 +16,17 @@ class Tuning:
     """Sizes for one device and floating type; `Tuning.of` chooses them.
 
     tile: macros of contract.cl: VW columns a vector, NV vectors and MR rows a work-item owns,
-        WGX x WGY work-items a group. Larger tiles load less for each product, until they spill
+        WGX x WGY work-items a group. Larger tiles load less for each product, until they spill.
+        With KB, the terms of a slab in local memory, they are macros of contract_group.cl
+    row_choices: MR of a tile may be one of these instead, where a matrix then has fewer rows that
+        are computed and not stored
     row_loops: one work-item takes a whole row of pixels, as a CPU's vector unit wants it; else one
         takes a pixel
     sum_group: work-items that share one sum over a box or one sweep: 1 needs no barrier
     line_group: work-items of a group along an image row where a kernel has no loop of its own.
         Left to choose, CPU runtimes take another number for every image size and build the kernel
         anew for each, 0.1 to 0.3 s
+    tile_group, item_group: groups of kernels over a matrix, and over items that each have a loop
     lanes: columns that a work-item of shift.cl takes at a time, one vector: 4, 8 or 16
     group_bytes [bytes]: intermediate matrices of one launch of the operator; more images than fit
         go in several launches
@@ -40,9 +44,12 @@ class Tuning:
     """
 
     tile: dict[str, int]
+    row_choices: tuple[int, ...]
     row_loops: bool
     sum_group: int
     line_group: int
+    tile_group: tuple[int, int, int]
+    item_group: tuple[int, int]
     lanes: int
     group_bytes: int
     slab_bytes: int
@@ -55,7 +62,12 @@ class Tuning:
 
     @classmethod
     def of(cls, device, dtype=np.float32) -> Tuning:
-        """The sizes for a Device and float32 or float64."""
+        """The sizes for a Device and float32 or float64: those `clresample tune` kept, if any."""
+        return replace(cls.before(device, dtype), **tuned(device, dtype))
+
+    @classmethod
+    def before(cls, device, dtype=np.float32) -> Tuning:
+        """The sizes for a device of which nothing was measured."""
         shared = {
             "line_group": 32,  # one warp of a GPU
             "lanes": 8,
@@ -64,10 +76,15 @@ class Tuning:
             "pixel_flops": 80.0,  # 2 ns
             "memory": min(1 << 30, device.memory // 4),
         }
-        if device.kind == "CPU":
+        # Drivers that draw on the CPU compile as for a GPU: Mesa's gives wrong numbers where one
+        # work-item alone writes and reads again a whole box.
+        if device.kind == "CPU" and not device.simulated:
             return cls(
                 tile=_cpu_tile(device, np.dtype(dtype)),
+                row_choices=(),
                 row_loops=True,
+                tile_group=(8, 1, 1),  # fewer cost more in starting them, more are cut off
+                item_group=(1, 1),
                 sum_group=1,
                 group_bytes=4 << 20,  # in the cache, where they are read back at speed
                 slab_bytes=2 << 20,  # what one core has in its cache
@@ -76,10 +93,14 @@ class Tuning:
                 **shared,
             )
         return cls(
-            # a 16-byte load, and a square of 64 work-items that every GPU allows
-            tile={"VW": 4 if np.dtype(dtype) == np.float32 else 2, "NV": 1, "MR": 8}
-            | {"WGX": 8, "WGY": 8},
+            # 16-byte loads, and a square of 64 work-items that every GPU allows: 64 x 64 floats
+            # of the product, and two slabs of 8 KiB in local memory
+            tile={"VW": 4 if np.dtype(dtype) == np.float32 else 2, "NV": 2, "MR": 8}
+            | {"WGX": 8, "WGY": 8, "KB": 16},
+            row_choices=(6, 8, 10),  # 48, 64 or 80 rows a group; more spill
             row_loops=False,
+            tile_group=(8, 8, 1),
+            item_group=(32, 1),
             sum_group=64,  # what every GPU allows
             group_bytes=1 << 30,  # the whole batch in flight
             slab_bytes=256 << 20,
@@ -87,6 +108,16 @@ class Tuning:
             n_scenes=1024,
             **shared,
         )
+
+    def tile_for(self, n_rows) -> dict[str, int]:
+        """The tile for matrices of `n_rows`: of those allowed, the one that covers them best."""
+
+        def covered(rows):
+            group = rows * self.tile["WGY"]
+            return -(-n_rows // group) * group, -rows
+
+        choices = {*self.row_choices, self.tile["MR"]}
+        return self.tile | {"MR": min(choices, key=covered)}
 
     def local_size(self, n_axes):
         """Group of a kernel with one work-item a row, pixel or item; None: the driver chooses.
@@ -103,3 +134,39 @@ def _cpu_tile(device, dtype) -> dict[str, int]:
     wide = device.cl.native_vector_width_float >= 16 and "AMD" not in device.name
     rows = {"NV": 2, "MR": 8} if wide else {"NV": 1, "MR": 6}
     return {"VW": 16 if dtype == np.float32 else 8, **rows, "WGX": 1, "WGY": 1}
+
+
+# Sizes that `clresample tune` measures, and what each of them may be.
+TUNABLE = {
+    "tile": lambda tile: is_tile(tile),  # defined below
+    "row_choices": lambda rows: all(n in range(2, 17, 2) for n in rows),
+    "group_bytes": lambda n: isinstance(n, int) and 1 << 16 <= n <= 1 << 34,
+    "n_scenes": lambda n: isinstance(n, int) and 1 <= n <= 1 << 16,
+}
+PART = "sizes"
+
+
+def is_tile(tile):
+    """True of macros with which one of the contraction kernels builds on any device."""
+    names = {"VW", "NV", "MR", "WGX", "WGY"}
+    if not names <= set(tile) <= {*names, "KB"} or not all(type(n) is int for n in tile.values()):
+        return False
+    fits = tile["VW"] in (2, 4, 8, 16) and 1 <= tile["NV"] <= 8 and tile["MR"] in range(2, 17, 2)
+    slab = tile.get("KB", 64)
+    whole = slab in range(1, 65) and slab % tile["WGX"] == slab % tile["WGY"] == 0
+    return fits and whole and 1 <= tile["WGX"] * tile["WGY"] <= 256
+
+
+def tuned(device, dtype):
+    """Sizes that `clresample tune` has kept for a device, its kind and a type: {name: size}."""
+    kept = device.remembered.read(PART)
+    if kept is None:
+        return {}
+    try:
+        sizes = dict(kept.get(device.kind, {}).get(np.dtype(dtype).name, {}))
+        if all(name in TUNABLE and TUNABLE[name](size) for name, size in sizes.items()):
+            return {n: tuple(s) if n == "row_choices" else s for n, s in sizes.items()}
+    except (TypeError, ValueError, AttributeError, KeyError):
+        pass
+    device.remembered.forget(PART, "its sizes are none that `clresample tune` keeps")
+    return {}

@@ -21,7 +21,7 @@ class DistortedExecutor(Executor):
         group = self.tuning.line_group
         self.rowdot, self.rowscale = (
             device.launcher("warp.cl", name, dtype=dtype, local_size=local_size)
-            for name, local_size in (("rowdot", (group, 1)), ("rowscale", (COLUMN_PAD, 1, 1)))
+            for name, local_size in (("rowdot", (group, 1)), ("rowscale", (COLUMN_PAD, 1)))
         )
 
     def bind(self):
@@ -54,6 +54,6 @@ class DistortedExecutor(Executor):
 
         y (n, P): I2; x (n, Ny, Nx): I1, overwritten
         """
-        self.rowscale((self.k_pad, self.n_rows, n), y=y.buffer, y_offset=y.offset)
+        self.rowscale((self.k_pad * self.n_rows, n), y=y.buffer, y_offset=y.offset)
         self.from_rows(n)
         self.synthesise(x, n)

@@ -11,19 +11,21 @@ TYPES = (np.float32, np.float64)
 every_type = pytest.mark.parametrize("dtype", TYPES, ids=lambda t: t.__name__)
 
 
-@pytest.fixture(params=["device's", "CPU", "wide CPU", "GPU", "pairs"])
+TILES = {
+    "CPU": {"VW": 8, "NV": 1, "MR": 6, "WGX": 1, "WGY": 1},
+    "wide CPU": {"VW": 16, "NV": 2, "MR": 8, "WGX": 1, "WGY": 1},
+    "GPU": {"VW": 4, "NV": 1, "MR": 8, "WGX": 8, "WGY": 8},
+    "pairs": {"VW": 2, "NV": 3, "MR": 8, "WGX": 8, "WGY": 8},
+    "groups": {"VW": 4, "NV": 2, "MR": 8, "WGX": 8, "WGY": 8, "KB": 16},
+    "tall groups": {"VW": 2, "NV": 1, "MR": 6, "WGX": 4, "WGY": 16, "KB": 16},
+}
+
+
+@pytest.fixture(params=["device's", *TILES])
 def tile(request, monkeypatch):
     """Register tiles of other devices than the one at hand; any device must run them all."""
     if request.param != "device's":
-        group, size = (8, 8) if request.param in ("GPU", "pairs") else (1, 1)
-        vector, vectors, rows = {
-            "CPU": (8, 1, 6),
-            "wide CPU": (16, 2, 8),
-            "GPU": (4, 1, 8),
-            "pairs": (2, 3, 8),
-        }[request.param]
-        chosen = {"VW": vector, "NV": vectors, "MR": rows, "WGX": group, "WGY": size}
-        tune(monkeypatch, tile=chosen)
+        tune(monkeypatch, tile=TILES[request.param], row_choices=())
 
 
 def random(*shape, seed=0):

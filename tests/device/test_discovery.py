@@ -62,7 +62,7 @@ def fakes(monkeypatch):
         Fake("Big 100", two, "GPU"),
         Fake("gfx906:xnack-", two, "GPU"),
     ]
-    monkeypatch.setattr(discover, "_found", lambda: found)
+    monkeypatch.setattr(discover, "find_devices", lambda: found)
     for variable in ("CLRESAMPLE_DEVICE", "PYOPENCL_CTX"):
         monkeypatch.delenv(variable, raising=False)
     return found

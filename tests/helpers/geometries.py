@@ -23,6 +23,12 @@ TYPES = (np.float32, np.float64)
 TOLERANCE = {np.float32: 2e-6, np.float64: 1e-12}
 
 
+def tolerance(device, dtype):
+    """Of the paper's scheme: its PSFs are interpolated on the device, in float32 where it has no
+    float64, and their transfer function then has errors of a few 1e-6."""
+    return TOLERANCE[np.dtype(dtype).type] * (1 if device.has_fp64 else 5)
+
+
 def turn(angle_deg, scale=2.0, *, flip=False):
     """Jacobian of pixels `scale` times as large, turned, mirrored or not; exact at 90 degrees."""
     quarter, rest = divmod(angle_deg, 90)

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...device.contraction import Matrix, Product
+from ...device.contraction import COLUMN_PAD, Matrix, Product
+from ...device.tuning import Tuning
 
 
 class SlabLaunches(NamedTuple):
@@ -33,11 +34,17 @@ class Shifts:
 
     def __init__(self, device, dtype, name, h_x, lanes):
         self.h_x, self.lanes = h_x, lanes
+        tuning = Tuning.of(device, dtype)
         self.launchers = [
             functools.partial(
-                device.launcher, "shift.cl", f"{way}_{name}", dtype=dtype, LANES=lanes
+                device.launcher,
+                "shift.cl",
+                f"{way}_{name}",
+                dtype=dtype,
+                local_size=local_size,
+                LANES=lanes,
             )
-            for way in ("shift", "unshift")
+            for way, local_size in (("shift", tuning.tile_group), ("unshift", tuning.item_group))
         ]
 
     def bind(self, slab, z: Matrix, waves, g, n_cols, ld, n):
@@ -82,9 +89,12 @@ class Pixels:
         self.steps = {"step_l": steps[1 - axis], "step_i": steps[axis]}
         self.n_cols = n_cols
         self.covered = device.put(mapping.covered.astype(np.uint8))
+        group = Tuning.of(device, dtype).line_group
         self.launchers = [
-            functools.partial(device.launcher, "shift.cl", name, dtype=dtype, LANES=lanes)
-            for name in ("collect", "spread")
+            functools.partial(
+                device.launcher, "shift.cl", name, dtype=dtype, local_size=local_size, LANES=lanes
+            )
+            for name, local_size in (("collect", (group, 1, 1)), ("spread", (COLUMN_PAD, 1)))
         ]
 
     def bind(self, part, n_chunks, ld, n):
@@ -97,6 +107,8 @@ class Pixels:
         given = {"ld": ld, "part": part, "covered": self.covered, "n_cols": self.n_cols}
         collect, spread = (launcher().bind(**given, **self.steps) for launcher in self.launchers)
         return (
-            functools.partial(collect.bind(n_chunks=n_chunks), (self.n_i, self.n_l, n)),
+            functools.partial(
+                collect.bind(n_chunks=n_chunks, n_i=self.n_i), (self.n_i, self.n_l, n)
+            ),
             functools.partial(spread.bind(n_items=n, n_i=self.n_i), (ld, self.n_l)),
         )

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from ...device.contraction import Contraction, Matrix, padded
+from ...device.tuning import Tuning
 from ...sky.psf import PSF
 from ..transfer import transfer_function
 
@@ -24,9 +25,11 @@ def sinc_table(device, positions, first, n, table, step_p, step_i):
     whole = np.rint(positions)
     part = device.put(positions - whole, table.dtype)
     whole = device.put(whole.astype(np.int32))
-    launch = device.launcher("sinc.cl", "sinc", dtype=table.dtype)
+    group = Tuning.of(device, table.dtype).line_group
+    launch = device.launcher("sinc.cl", "sinc", dtype=table.dtype, local_size=(group, 1))
     launch(
         (n, len(positions)),
+        n_integers=n,
         first=first,
         whole=whole,
         part=part,
@@ -50,7 +53,8 @@ def interpolate_psf(device, matrix, psf: PSF, n_fft, fine=1):
     x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     q = x @ np.linalg.inv(matrix).T / psf.spacing
     (n_y, n_x), n_pad = psf.images.shape[1:], padded(psf.images.shape[2])
-    along_y, along_x = Contraction(device, dtype), device.launcher("warp.cl", "rowdot", dtype=dtype)
+    along_y, group = Contraction(device, dtype), Tuning.of(device, dtype).line_group
+    along_x = device.launcher("warp.cl", "rowdot", dtype=dtype, local_size=(group, 1))
     result, n_block = np.empty((psf.n_bands, len(q))), min(POSITIONS, len(q))
     rows, columns, sums, values = (
         device.zeros(shape, dtype)

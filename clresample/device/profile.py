@@ -1,0 +1,114 @@
+"""How long each kernel took, by OpenCL's own clocks: CLRESAMPLE_PROFILE=1, or --profile.
+
+A device that is opened while CLRESAMPLE_PROFILE is set times every launch. The table is printed on
+standard error when the process ends, or by the command at its end. Timing takes some microseconds
+a launch.
+"""
+
+from __future__ import annotations
+
+import atexit
+import math
+import os
+import sys
+from collections import defaultdict
+from dataclasses import dataclass
+
+# Launches whose events are kept before they are read: reading waits for the device.
+MOST_EVENTS = 2000
+COLUMNS = ("kernel", "calls", "seconds", "share", "GFLOP/s", "GB/s")
+
+
+@dataclass
+class Row:
+    """What the launches of one kernel took together.
+
+    flops: of the kernels whose arithmetic is known, 0 for others
+    n_bytes: the kernel's buffers, each counted once a launch: what it reads and writes at least,
+        where it runs through all of them
+    """
+
+    n_calls: int = 0
+    seconds: float = 0.0
+    flops: float = 0.0
+    n_bytes: int = 0
+
+
+class Profile:
+    """The launches of one device since it was opened, by kernel."""
+
+    def __init__(self, name):
+        self.name, self._rows, self._events = name, defaultdict(Row), []
+
+    def note(self, event, kernel, arguments, global_size):
+        """Keep a launch; arguments {name: value} as the kernel has them."""
+        buffers = {id(v): v for v in arguments.values() if hasattr(v, "size")}
+        work = flops(kernel, arguments, global_size), sum(b.size for b in buffers.values())
+        self._events.append((event, kernel, work))
+        if len(self._events) >= MOST_EVENTS:
+            self._read()
+
+    def rows(self):
+        """{kernel: Row} of all that was launched, once it is done; longest first."""
+        self._read()
+        return dict(sorted(self._rows.items(), key=lambda item: -item[1].seconds))
+
+    def table(self):
+        """The rows as text, with a line of sums; "" where nothing was launched."""
+        rows = self.rows()
+        total = sum(row.seconds for row in rows.values())
+        if not rows:
+            return ""
+        cells = [COLUMNS]
+        for kernel, row in rows.items():
+            rates = [f"{x / row.seconds / 1e9:.1f}" if x and row.seconds else "-"
+                     for x in (row.flops, row.n_bytes)]  # fmt: skip
+            share = f"{100 * row.seconds / total:.1f} %" if total else "-"
+            cells.append((kernel, str(row.n_calls), f"{row.seconds:.4f}", share, *rates))
+        n_calls = sum(row.n_calls for row in rows.values())
+        cells.append(("all", str(n_calls), f"{total:.4f}", "", "", ""))
+        widths = [max(map(len, column)) for column in zip(*cells)]
+        lines = [
+            "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip()
+            for row in cells
+        ]
+        return "\n".join([f"kernels on {self.name}:", *lines])
+
+    def _read(self):
+        events, self._events = self._events, []
+        for event, kernel, (n_flops, n_bytes) in events:
+            event.wait()
+            row = self._rows[kernel]
+            row.n_calls += 1
+            row.seconds += 1e-9 * (event.profile.end - event.profile.start)
+            row.flops += n_flops
+            row.n_bytes += n_bytes
+
+
+def flops(kernel, arguments, global_size):
+    """Floating-point operations of a launch; 0 where they are not known."""
+    if kernel.startswith("contract"):
+        return 2.0 * math.prod(int(arguments[name]) for name in "mnk") * global_size[2]
+    return 0.0
+
+
+_PROFILES: list[Profile] = []
+
+
+def started(name):
+    """A Profile for a device that is opened now; None where CLRESAMPLE_PROFILE does not ask."""
+    if os.environ.get("CLRESAMPLE_PROFILE", "0") in ("", "0"):
+        return None
+    if not _PROFILES:
+        atexit.register(report)
+    _PROFILES.append(Profile(name))
+    return _PROFILES[-1]
+
+
+def report():
+    """Print the tables of all devices that are profiled on standard error, and start them anew."""
+    for profile in _PROFILES:
+        table = profile.table()
+        if table:
+            print(table, file=sys.stderr, flush=True)
+        profile._rows.clear()

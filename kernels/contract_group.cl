@@ -1,0 +1,159 @@
+/* The contraction of contract.cl for GPUs: a group of work-items shares slabs of A and B.
+ *
+ *   C[b] = A[b] . B[b],  all arguments, layouts, batches and epilogues as in contract.cl
+ *
+ *                                        TN = WGX NV VW
+ *                                     +-------+------------+
+ *                                  KB | slab  |            |     in local memory, two of each:
+ *                                     +-------+    B       |     one is multiplied while the
+ *                                   k |       |            |     next is fetched
+ *               KB      k             +-------+------------+
+ *             +----+---------+        +-------+------------+
+ *   TM =      |slab|    A    |        | tile  |            |     one group owns this tile of C
+ *   WGY MR    +----+---------+        +-------+    C       |
+ *           m |              |      m |                    |
+ *
+ * A work-item owns MR neighbouring rows, and NV vectors of VW columns that lie WGX VW apart, so
+ * that neighbours read neighbouring vectors. A's slab is kept transposed: the rows of a work-item
+ * are read at once, and are the same for all work-items of a row of the group.
+ *
+ * Sums: one set of registers, all k terms in their order; with TWO_SUMS stretches of `block` terms,
+ *   rounded up to whole slabs, are summed first. What lies beyond k or m counts as zero.
+ *
+ * Launch: global = (ceil(n_pad / TN) WGX, ceil(m / TM) WGY, batch), groups of (WGX, WGY, 1).
+ */
+#include "contract.h"
+
+#ifndef KB          /* terms of a slab: a multiple of WGX and of WGY */
+#define KB 16
+#endif
+#ifndef TWO_SUMS    /* 1: sum stretches of `block` terms first: more registers, less rounding */
+#define TWO_SUMS 0
+#endif
+
+#define GROUP (WGX * WGY)
+#define TM (WGY * MR)
+#define VECTORS (WGX * NV)                   /* vectors of a row of B's slab */
+#define LD (TM + 4)                          /* elements of a column of A's slab */
+#define FETCH_A (TM * KB / GROUP)            /* elements of A's slab that a work-item fetches */
+#define FETCH_B (VECTORS * KB / GROUP)       /* vectors of B's slab, likewise */
+#if MR % 4 == 0
+#define ROWS_AT_ONCE 4
+#else
+#define ROWS_AT_ONCE 2
+#endif
+#define LEFT VEC(ROWS_AT_ONCE)
+#define OWNED(i, v) (i0 + (i) < m && column[v] < n_pad)
+
+/* Lane by lane: an address would have a GPU keep all sums in memory. */
+#define STORE_LANES(sums, c, n_left) EACH_LANE(STORE, sums, c, n_left)
+#define STORE(j, lane, sums, c, n_left) if (j < n_left) c[(size_t)j * step_c] = sums.lane;
+#define EACH_2(f, ...) f(0, s0, __VA_ARGS__) f(1, s1, __VA_ARGS__)
+#define EACH_4(f, ...) EACH_2(f, __VA_ARGS__) f(2, s2, __VA_ARGS__) f(3, s3, __VA_ARGS__)
+#define EACH_8(f, ...) \
+    EACH_4(f, __VA_ARGS__) f(4, s4, __VA_ARGS__) f(5, s5, __VA_ARGS__) \
+    f(6, s6, __VA_ARGS__) f(7, s7, __VA_ARGS__)
+#define EACH_PASTE(n) EACH_##n
+#define EACH_EXPAND(n) EACH_PASTE(n)
+#define EACH_LANE(f, ...) EACH_EXPAND(VW)(f, __VA_ARGS__)
+
+/* Neighbouring work-items fetch neighbouring elements of A: along its rows, or down its columns
+ * where it is read transposed. */
+#if STRIDED
+#define SLAB_ROW(t) ((t) % TM)
+#define SLAB_TERM(t) ((t) / TM)
+#else
+#define SLAB_ROW(t) ((t) / KB)
+#define SLAB_TERM(t) ((t) % KB)
+#endif
+
+#define FETCH(l0) \
+    UNROLL(f, FETCH_A) { \
+        const int t = f * GROUP + lid, i = top + SLAB_ROW(t), l = (l0) + SLAB_TERM(t); \
+        next_a[f] = i < m && l < k ? A[(size_t)i * ld_a + (size_t)l * STEP_A] : (REAL)0; \
+    } \
+    UNROLL(f, FETCH_B) { \
+        const int t = f * GROUP + lid, l = (l0) + t / VECTORS; \
+        const int j = first + t % VECTORS * VW; \
+        next_b[f] = l < k && j < n_pad ? AT(const WIDE, B + (size_t)l * n_pad + j) : (WIDE)(0); \
+    }
+
+__kernel __attribute__((reqd_work_group_size(WGX, WGY, 1)))
+void contract_group(const int m, const int n, const int n_pad, const int k, const int block,
+                    __global const REAL *restrict A, const ulong offset_a, const int ld_a,
+                    const int step_a, const int stride_a, const int div_a,
+                    __global const REAL *restrict B, const int stride_b, const int div_b,
+                    __global REAL *restrict C, const ulong offset_c, const int ld_c,
+                    const int step_c,
+                    const int stride_c,
+                    __global const REAL *restrict E, const int stride_e, const int band_e,
+                    const int n_bands)
+{
+    __local REAL slab_a[2][KB][LD] __attribute__((aligned(32)));
+    __local WIDE slab_b[2][KB][VECTORS];
+    const int lx = (int)get_local_id(0), ly = (int)get_local_id(1), lid = ly * WGX + lx;
+    const int top = (int)get_group_id(1) * TM, first = (int)get_group_id(0) * VECTORS * VW;
+    const int i0 = top + ly * MR, b = (int)get_global_id(2);
+    A += offset_a + (size_t)(b / div_a) * stride_a;
+    B += (size_t)(b / div_b) * stride_b;
+    C += offset_c + (size_t)b * stride_c;
+
+    REAL next_a[FETCH_A];
+    WIDE next_b[FETCH_B], acc[MR][NV];
+    int column[NV];
+    UNROLL(v, NV) column[v] = first + (v * WGX + lx) * VW;
+    UNROLL(i, MR) UNROLL(v, NV) acc[i][v] = (WIDE)(0);
+#if TWO_SUMS
+    WIDE part[MR][NV];
+    int terms = 0;
+    UNROLL(i, MR) UNROLL(v, NV) part[i][v] = (WIDE)(0);
+#define SUM part
+#else
+#define SUM acc
+#endif
+    FETCH(0)
+    for (int l0 = 0, slab = 0; l0 < k; l0 += KB, slab ^= 1) {
+        UNROLL(f, FETCH_A) {
+            const int t = f * GROUP + lid;
+            slab_a[slab][SLAB_TERM(t)][SLAB_ROW(t)] = next_a[f];
+        }
+        UNROLL(f, FETCH_B) {
+            const int t = f * GROUP + lid;
+            slab_b[slab][t / VECTORS][t % VECTORS] = next_b[f];
+        }
+        /* One barrier a slab: whoever writes this slab again has passed the next barrier, which
+         * all reach only after they have read it. */
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (l0 + KB < k) {
+            FETCH(l0 + KB)
+        }
+        for (int l = 0; l < KB; ++l) {
+            WIDE right[NV];
+            REAL left[MR];
+            UNROLL(v, NV) right[v] = slab_b[slab][l][v * WGX + lx];
+            UNROLL(h, MR / ROWS_AT_ONCE) {
+                const LEFT some =
+                    *(__local const LEFT *)&slab_a[slab][l][ly * MR + h * ROWS_AT_ONCE];
+                left[ROWS_AT_ONCE * h] = some.s0;
+                left[ROWS_AT_ONCE * h + 1] = some.s1;
+#if MR % 4 == 0
+                left[4 * h + 2] = some.s2;
+                left[4 * h + 3] = some.s3;
+#endif
+            }
+            UNROLL(i, MR) UNROLL(v, NV) SUM[i][v] += left[i] * right[v];
+        }
+#if TWO_SUMS
+        terms += KB;
+        if (terms >= block || l0 + KB >= k) {
+            UNROLL(i, MR) UNROLL(v, NV) {
+                acc[i][v] += part[i][v];
+                part[i][v] = (WIDE)(0);
+            }
+            terms = 0;
+        }
+#endif
+    }
+
+#include "contract_end.h"
+}

@@ -1,0 +1,122 @@
+"""Driver libraries that the loader does not see, and the one that CLRESAMPLE_ICD names."""
+
+import os
+import shlex
+from pathlib import Path
+
+import pyopencl as cl
+import pytest
+from helpers.checkout import run_python
+
+from clresample import DeviceError
+from clresample.device import discovery, drivers
+from clresample.device.discovery import hints
+
+NVIDIA = "libnvidia-opencl.so.1"
+PLATFORMS = "from clresample import list_devices; print(*[d.platform for d in list_devices()])"
+
+
+@pytest.fixture
+def machine(tmp_path, monkeypatch):
+    """A machine of no GPU driver but those that a test puts into the folder."""
+    monkeypatch.setattr(drivers, "FOLDERS", ())
+    monkeypatch.setattr(drivers.subprocess, "run", lambda *_, **__: type("R", (), {"stdout": ""}))
+    monkeypatch.setenv("LD_LIBRARY_PATH", f"relative:{tmp_path}")
+    monkeypatch.delenv("CLRESAMPLE_ICD", raising=False)
+    return tmp_path
+
+
+class Gpu:
+    """What is read of a pyopencl device that a real GPU's driver brings."""
+
+    type = cl.device_type.GPU
+    name = "H100"
+
+    def __init__(self, vendor):
+        self.platform = type("Platform", (), {"name": f"{vendor} CUDA", "vendor": f"{vendor} Corp"})
+
+
+@pytest.mark.parametrize("library", drivers.LIBRARIES)
+def test_a_driver_without_its_icd_file_is_named_with_its_cure(machine, library):
+    assert hints() == []
+    (machine / library).write_text("")
+    (hint,) = hints()
+    assert hint.startswith(drivers.LIBRARIES[library])
+    assert hint.endswith(f": export CLRESAMPLE_ICD={machine / library}")
+
+
+def test_nothing_is_said_of_a_driver_that_brings_its_gpu(machine, monkeypatch):
+    (machine / NVIDIA).write_text("")
+    monkeypatch.setattr(discovery, "find_devices", lambda: [Gpu("NVIDIA")])
+    assert hints() == []
+    monkeypatch.setattr(discovery, "find_devices", lambda: [Gpu("Intel")])
+    assert len(hints()) == 1
+
+
+def test_drivers_that_the_system_lists_are_found(machine, monkeypatch):
+    (machine / NVIDIA).write_text("")
+    monkeypatch.delenv("LD_LIBRARY_PATH")
+    listing = f"\t{NVIDIA} (libc6,x86-64) => {machine / NVIDIA}\n\tlibc.so.6 => /lib/libc.so.6\n"
+    answer = type("R", (), {"stdout": listing})
+    monkeypatch.setattr(drivers.subprocess, "run", lambda *_, **__: answer)
+    assert drivers.unseen([]) == [("NVIDIA", machine / NVIDIA)]
+
+
+def test_where_there_is_no_device_the_error_names_the_driver(machine, monkeypatch):
+    (machine / NVIDIA).write_text("")
+    monkeypatch.delenv("OCL_ICD_VENDORS", raising=False)
+    monkeypatch.setattr(cl, "get_platforms", lambda: [])
+    with pytest.raises(DeviceError, match=rf"for NVIDIA's driver at .*: export .*{NVIDIA}"):
+        discovery.find_devices()
+
+
+def test_the_command_gives_the_cure(tmp_path):
+    (tmp_path / "libamdocl64.so").write_text("")
+    answer = run_python("-m", "clresample.cli", "devices", LD_LIBRARY_PATH=_after(tmp_path))
+    assert answer.returncode == 0, answer.stderr
+    assert f"AMD's OpenCL driver is at {tmp_path}/libamdocl64.so" in answer.stderr
+
+
+def test_a_library_that_is_no_driver_is_named(tmp_path):
+    library = tmp_path / NVIDIA
+    library.write_text("no library")
+    answer = run_python("-m", "clresample.cli", "devices", CLRESAMPLE_ICD=str(library))
+    assert answer.returncode == 0, answer.stderr  # the other devices are there
+    assert f"CLRESAMPLE_ICD={library} cannot be loaded:" in answer.stderr
+    answer = run_python("-m", "clresample.cli", "devices", CLRESAMPLE_ICD=f"{library}.2")
+    assert answer.returncode == 2
+    assert answer.stderr.endswith(f"a driver library that is not there: {library}.2\n")
+
+
+def test_a_named_driver_is_seen_beside_the_others(tmp_path):
+    """PoCL, hidden by an empty folder of drivers, is found through CLRESAMPLE_ICD."""
+    folders = [Path(cl.__file__).parent / ".libs", Path(drivers.VENDORS)]
+    pocl = [p for f in folders for p in f.glob("libpocl*")] or [
+        Path(p.read_text().strip()) for f in folders for p in f.glob("pocl*.icd")
+    ]
+    if not pocl or os.environ.get("OCL_ICD_VENDORS"):
+        pytest.skip("no PoCL whose library is known")
+    before = run_python("-c", PLATFORMS).stdout.split("Portable")
+    after = run_python("-c", PLATFORMS, CLRESAMPLE_ICD=str(pocl[0]))
+    assert after.returncode == 0, after.stderr
+    assert len(after.stdout.split("Portable")) == len(before) + 1
+
+
+def test_what_the_loader_reads_anyway_is_kept(tmp_path, monkeypatch):
+    (tmp_path / "one.icd").write_text("libone.so\n")
+    (tmp_path / "libone.so").write_text("")
+    for vendors, expected in (
+        (tmp_path, {"one.icd": str(tmp_path / "libone.so")}),
+        (tmp_path / "one.icd", {"one.icd": str(tmp_path / "libone.so")}),
+        (tmp_path / "libone.so", {"given.icd": str(tmp_path / "libone.so")}),
+    ):
+        monkeypatch.setenv("OCL_ICD_VENDORS", str(vendors))
+        assert drivers._known() == expected
+
+
+def test_the_cure_is_one_line_for_a_shell():
+    assert shlex.split(drivers.cure(Path("/a/b.so"))) == ["export", "CLRESAMPLE_ICD=/a/b.so"]
+
+
+def _after(folder):
+    return f"{os.environ.get('LD_LIBRARY_PATH', '')}:{folder}"

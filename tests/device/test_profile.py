@@ -1,0 +1,88 @@
+"""The table of kernels' times, from the library and from the commands."""
+
+import re
+
+import numpy as np
+import pytest
+from helpers.checkout import run_python
+from helpers.resample_files import ARGUMENTS, write_files
+
+from clresample import PSF, Device, Grid, Resampler
+from clresample.device import profile as profiles
+
+RUN = """
+import numpy as np
+from clresample import PSF, Grid, Resampler
+op = Resampler(Grid.flat((40, 40), 0.1), PSF.gaussian(0.8), Grid.flat((20, 20), 0.2),
+               PSF.gaussian(1.5))
+op(np.ones((40, 40)))
+"""
+
+
+@pytest.fixture
+def profiled(device, monkeypatch):
+    """The same device opened anew with profiling."""
+    monkeypatch.setattr(profiles, "_PROFILES", [])
+    monkeypatch.setattr(profiles.atexit, "register", lambda _: None)
+    monkeypatch.setenv("CLRESAMPLE_PROFILE", "1")
+    return Device(device.cl)
+
+
+def test_every_launch_is_counted(profiled, monkeypatch):
+    monkeypatch.setattr(profiles, "MOST_EVENTS", 3)  # read in the middle
+    op = Resampler(
+        Grid.flat((40, 42), 0.1), PSF.gaussian(0.8), Grid.flat((20, 22), 0.2),
+        PSF.gaussian(1.5), device=profiled,
+    )  # fmt: skip
+    launches, launch = [], Device.launch
+    monkeypatch.setattr(Device, "launch", lambda self, *a: launches.append(a) or launch(self, *a))
+    for _ in range(3):
+        op(np.ones((40, 42)))
+    (row,) = profiled.profile.rows().values()
+    assert row.n_calls == len(launches) == 3 * 4
+    assert row.seconds > 0
+    plan = op.plans[0]
+    (k_y, n_y), (k_x, n_x) = plan.in_y.shape, plan.in_x.shape
+    flops = n_y * n_x * k_x + k_y * n_y * k_x + 20 * k_y * k_x + 20 * k_x * 22
+    assert row.flops == 3 * 2 * flops
+    table = profiled.profile.table()
+    assert re.search(rf"contract\w* +12 +{row.seconds:.4f} +100.0 % +\d", table)
+
+
+def test_seconds_are_those_of_the_device(profiled):
+    """Ten times the work takes longer, and all of it no longer than the clock on the wall."""
+    from time import perf_counter
+
+    began = perf_counter()
+    seconds = []
+    for n in (60, 600):
+        op = Resampler(
+            Grid.flat((n, n), 0.1), PSF.gaussian(0.8), Grid.flat((n // 2, n // 2), 0.2),
+            PSF.gaussian(1.5), device=profiled,
+        )  # fmt: skip
+        op(np.ones((n, n)))
+        profiled.finish()
+        seconds.append(sum(r.seconds for r in profiled.profile.rows().values()))
+    assert 2 * seconds[0] < seconds[1] < perf_counter() - began
+
+
+def test_without_being_asked_nothing_is_timed(device, monkeypatch):
+    monkeypatch.delenv("CLRESAMPLE_PROFILE", raising=False)
+    assert Device(device.cl).profile is None
+
+
+def test_the_table_comes_at_the_end_of_a_process():
+    answer = run_python("-c", RUN, CLRESAMPLE_PROFILE="1")
+    assert answer.returncode == 0, answer.stderr
+    assert "kernels on " in answer.stderr and "GFLOP/s" in answer.stderr
+    assert answer.stderr.count("\ncontract") == 1
+    assert run_python("-c", RUN, CLRESAMPLE_PROFILE="0").stderr == ""
+
+
+def test_a_command_prints_it_when_asked(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_files()
+    words = [part for name, value in ARGUMENTS.items() for part in (name, tmp_path / value)]
+    answer = run_python("-m", "clresample.cli", "resample", *map(str, words[1:]), "--profile")
+    assert answer.returncode == 0, answer.stderr
+    assert "kernels on " in answer.stderr and "\ncontract" in answer.stderr

@@ -1,0 +1,170 @@
+"""Runs every kernel in small shapes: under Oclgrind, which reports races and bad accesses.
+
+    python tools/grind.py [--as cpu|gpu] [--plant race|overrun]
+
+Every kernel of kernels/ must have been launched, as built for CPUs or for GPUs; one that was not is
+named, and the exit status is 1. Oclgrind writes what it finds on standard error and leaves the exit
+status alone: tools/grind.sh reads both. --plant adds a kernel with a fault that must be reported.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+import time
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from clresample import (  # noqa: E402
+    PSF,
+    Blend,
+    Extended,
+    Grid,
+    LearnedPrior,
+    Observation,
+    PaperResampler,
+    Point,
+    Prior,
+    Resampler,
+    Settings,
+    deblend_many,
+    get_device,
+)
+from clresample.deblending.solver.constraints import (  # noqa: E402
+    L0,
+    L1,
+    Chain,
+    MaxNorm,
+    Monotone,
+    MonotoneProjection,
+    Positivity,
+    SumNorm,
+    Symmetry,
+)
+from clresample.device import tuning  # noqa: E402
+from clresample.device.launcher import Launcher  # noqa: E402
+
+FAULTS = {
+    "race": "__kernel void race(__global float *x) { x[0] += get_global_id(0); }",
+    "overrun": "__kernel void overrun(__global float *x) { x[get_global_id(0) + 8] = 1; }",
+}
+# Terms of the paper's contraction for a work-item: small models have few, and are cut all the same.
+CHUNK_TERMS = 32
+
+
+def all_kernels():
+    """Names of all kernels of kernels/."""
+    texts = [path.read_text() for path in sorted((ROOT / "kernels").glob("*.cl"))]
+    return {name for text in texts for name in re.findall(r"__kernel\b[^;{]*?\bvoid\s+(\w+)", text)}
+
+
+def watch(device, kind):
+    """Build kernels as for `kind`; returns the set to which names of launched kernels are added."""
+    device.kind, device.simulated = kind.upper(), False
+    launched, launch = set(), Launcher.__call__
+
+    def noted(self, *arguments, **given):
+        launched.add(self.kernel.function_name)
+        launch(self, *arguments, **given)
+
+    Launcher.__call__ = noted
+    of = tuning.Tuning.of
+    tuning.Tuning.of = lambda *a: replace(of(*a), chunk_terms=CHUNK_TERMS)
+    return launched
+
+
+def resample(device):
+    """Operators of every geometry, forward and adjoint, with own tables for each of two scenes."""
+    fine, turned = Grid.flat((11, 12), 0.1), Grid.flat((6, 5), 0.2, angle_deg=25)
+    narrow, wide = PSF.gaussian(0.8, n_pixels=7), PSF.gaussian([1.1, 1.3], n_pixels=7)
+    for grid in (Grid.flat((6, 5), 0.2), turned, Grid.flat((5, 6), 0.2, angle_deg=115)):
+        for kind in (Resampler, PaperResampler):
+            op = kind(fine, narrow, grid, wide, device=device)
+            op.adjoint(op(np.ones(op.shape_in)))
+    from helpers.geometries import distorted, operator, turn
+
+    op = operator(device, distorted(turn(0), (11, 12), (4, 5)), narrow, wide)
+    op.adjoint(op(np.ones(op.shape_in)))
+
+
+def blends(n):
+    """Two galaxies and a star, seen by two instruments, the second of which is turned."""
+    rng = np.random.default_rng(5)
+    grids = Grid.flat((14, 14), 0.1), Grid.flat((8, 8), 0.2, angle_deg=15)
+    psfs = PSF.gaussian(0.8, n_pixels=7), PSF.gaussian([1.2, 1.4], n_pixels=7)
+    made = []
+    for _ in range(n):
+        observations = []
+        for i, (grid, psf) in enumerate(zip(grids, psfs)):
+            y, x = np.indices(grid.shape) - (grid.shape[0] - 1) / 2
+            light = np.exp(-np.hypot(y, x) / 2) + 0.01 * rng.standard_normal(
+                (psf.n_bands, *y.shape)
+            )
+            weights = np.full(light.shape, 1e4)
+            names = [f"{i}{band}" for band in range(psf.n_bands)]
+            observations.append(Observation(light, psf, grid, weights=weights, channels=names))
+        places = (6.5, 6.5), (4.0, 9.0)
+        sources = (*[Extended(position_px=p) for p in places], Point(position_px=(9.0, 4.0)))
+        made.append(Blend(tuple(observations), sources))
+    return made
+
+
+def fit(device):
+    """Fits of all kinds, of two scenes side by side, some iterations each."""
+    chain = Chain(Positivity(), L1(1e-3), L0(1e-3), Symmetry(0.5), Monotone(), MaxNorm())
+    for settings in (
+        Settings(prior=LearnedPrior(), max_iter=3),
+        Settings(prior=LearnedPrior(), max_iter=4, fit_sky=True),
+        Settings(prior=Prior(), max_iter=2),
+        Settings(prior=None, max_iter=2, constraints=chain),
+        Settings(prior=None, max_iter=2, constraints=Chain(MonotoneProjection(), SumNorm())),
+    ):
+        for result in deblend_many(blends(2), settings=settings, device=device):
+            if result.status.startswith("failed"):
+                raise SystemExit(f"grind: a fit {result.status}")
+
+
+def plant(device, fault):
+    """Launch a kernel with a fault."""
+    import pyopencl as cl
+
+    kernel = cl.Kernel(cl.Program(device.context, FAULTS[fault]).build(), fault)
+    kernel.set_args(device.zeros(8, np.float32).base_data)
+    device.launch(kernel, (8,), (8,))
+    device.finish()
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--as", dest="kind", choices=("cpu", "gpu"), default="gpu")
+    parser.add_argument("--plant", choices=FAULTS)
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore")
+    sys.path.insert(0, str(ROOT / "tests"))
+    began, device = time.perf_counter(), get_device()
+    if arguments.plant:
+        plant(device, arguments.plant)
+        return 0
+    launched = watch(device, arguments.kind)
+    for work in (resample, fit):
+        work(device)
+        device.finish()
+        print(f"grind: {work.__name__} after {time.perf_counter() - began:.0f} s", flush=True)
+    contraction = {"cpu": "contract_group", "gpu": "contract"}[arguments.kind]
+    missing = all_kernels() - launched - {contraction}
+    took = f"{time.perf_counter() - began:.0f} s on {device.name}"
+    print(f"grind: {len(launched)} kernels as on a {arguments.kind.upper()}, {took}")
+    if missing:
+        print(f"grind: never launched: {', '.join(sorted(missing))}")
+    return 1 if missing else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
