@@ -12,18 +12,28 @@ from helpers.checkout import ROOT
 
 ROOMS = {
     "device": (),
-    "sky": (),
-    "resampling": ("device", "sky"),
+    "drawing": (),
+    "sky": ("drawing",),
+    "resampling": ("device", "drawing", "sky"),
     "adapters": ("sky", "resampling"),
-    "deblending": ("device", "sky", "resampling", "adapters"),
+    "deblending": ("device", "drawing", "sky", "resampling", "adapters"),
     "measurement": ("sky", "resampling", "deblending"),
-    "files": ("sky", "deblending", "measurement"),
+    "files": ("drawing", "sky", "deblending", "measurement"),
     "simulation": ("sky",),
-    "cli": ("device", "sky", "resampling", "deblending", "measurement", "files", "simulation"),
+    "cli": (
+        "device",
+        "drawing",
+        "sky",
+        "resampling",
+        "deblending",
+        "measurement",
+        "files",
+        "simulation",
+    ),
 }
 # Rooms that work without any OpenCL driver.
 NUMPY_ONLY = ("sky", "simulation")
-MAX_LINES, MAX_CLASS, MAX_FUNCTION, MAX_FILES, MAX_FOLDERS = 300, 150, 60, 14, 9
+MAX_LINES, MAX_CLASS, MAX_FUNCTION, MAX_FILES, MAX_FOLDERS = 300, 150, 60, 14, 11
 
 PACKAGE = ROOT / "clresample"
 MODULES = {

@@ -7,13 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clresample.files.panels import (
-    RESIDUAL_COLOURS,
-    SKY_COLOURS,
-    import_figure,
-    stretch,
-    stretch_limits,
-)
+from clresample.drawing.sheet import RESIDUAL_COLOURS, SKY_COLOURS, import_figure, stretch
+from clresample.files.panels import stretch_limits
 from clresample.files.whole_file import whole_file
 
 DPI = 110  # dots per inch: a page's width in about 100 kB

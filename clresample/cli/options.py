@@ -62,7 +62,7 @@ def printable(text, most=None):
 def check_matplotlib(option, way_out=""):
     """Raise ValueError where `option` needs matplotlib and it is not there; it is not imported."""
     if find_spec("matplotlib") is None:
-        from ..files.panels import NO_MATPLOTLIB
+        from ..drawing.sheet import NO_MATPLOTLIB
 
         raise ValueError(f"{option}: {NO_MATPLOTLIB}{way_out}")
 

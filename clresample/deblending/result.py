@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ..drawing.shown import ShownResult
 from ..sky.footprint import Footprint
 from ..sky.frame import Frame
 from ..sky.observation import Observation
@@ -15,7 +16,7 @@ from .posterior.errors import Draws, Errors
 from .solver.scene_model import compose
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Component:
     """One spectrum times one morphology.
 
@@ -28,6 +29,10 @@ class Component:
     The covariance of all spectra is Result.covariance.
     """
 
+    def __repr__(self):
+        n_y, n_x = self.morphology.shape
+        return f"Component(of source {self.source}, {n_y} x {n_x} px from {tuple(self.origin)})"
+
     source: int
     origin: tuple[int, int]
     morphology: np.ndarray
@@ -39,8 +44,8 @@ class Component:
         return self.spectrum * self.morphology.sum()
 
 
-@dataclass(frozen=True, eq=False)
-class Result:
+@dataclass(frozen=True, eq=False, repr=False)
+class Result(ShownResult):
     """The fitted model of one blend.
 
     observations, frame, sources: what was fitted; sources that were given in an observation's

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..drawing.shown import ShownCertificate
 from ..sky.psf import PSF
 
 # Light of the observed PSF beyond the wrap radius, as a fraction; images drawn by FFT ring at 1e-6.
@@ -26,7 +27,7 @@ NOISY_GAIN, FLOORED_POWER = 2.0, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Certificate:
+class Certificate(ShownCertificate):
     """What the set-up of an operator found.
 
     wrap_radius_px (2,) [model px]: reach (y, x) of the observed PSF, by which the model is padded

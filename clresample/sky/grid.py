@@ -10,12 +10,13 @@ import numpy as np
 from astropy.wcs import WCS
 from astropy.wcs.utils import wcs_to_celestial_frame
 
+from ..drawing.shown import ShownGrid
 from .given.checks import arcseconds, image_shape, instance, number, numbers
 from .mapping import Mapping, map_affine, map_positions
 from .wcs import convert, pixel_scale, pixels_at, shifted_wcs, tangent_wcs, world_at
 
 
-class Grid(ABC):
+class Grid(ShownGrid, ABC):
     """Pixels of one image and where they lie on the sky.
 
     shape (Ny, Nx) [px]
@@ -165,7 +166,7 @@ class Grid(ABC):
             )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FlatGrid(Grid):
     """Pixels on a flat sky: (y, x) = J (n, m) + origin.
 
@@ -219,7 +220,7 @@ class FlatGrid(Grid):
         return matrix, np.linalg.solve(other.jacobian, self.origin - other.origin)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class WcsGrid(Grid):
     """Pixels placed by a celestial WCS.
 

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ..drawing.shown import ShownObservation
 from .correlation import NoiseCorrelation, filtered_psf, noise_of_channels
 from .given.checks import ReadOnly, instance, numbers, split_mask
 from .grid import Grid
@@ -17,8 +18,8 @@ from .psf import PSF
 ZERO_POINT_UJY = 23.9
 
 
-@dataclass(frozen=True, eq=False, init=False)
-class Observation(ReadOnly):
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class Observation(ReadOnly, ShownObservation):
     """Images of one instrument, one per channel, on one pixel grid.
 
         chi2 = sum weights (model - data)^2

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..drawing.shown import ShownPSF
 from .given.checks import ReadOnly, number, numbers
 from .psf_checks import PSFWarning, core_of, edge_light, fwhm, psf_warnings
 from .transforms.nufft import transform_at
@@ -24,8 +25,8 @@ BLOCK = 1 << 20
 LARGE = 256 * 256
 
 
-@dataclass(frozen=True, eq=False, init=False)
-class PSF(ReadOnly):
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class PSF(ReadOnly, ShownPSF):
     """PSF images of one instrument, each band divided by its own sum.
 
     images (C, ny, nx) [1]: samples, pixel response included; a single (ny, nx) image is one band

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from clresample.files.panels import Panel, save_panels, stretch, stretch_limits
+from clresample.drawing.sheet import stretch
+from clresample.files.panels import Panel, save_panels, stretch_limits
 from clresample.files.plot_resampled import compare
 from clresample.sky.grid import Grid
 from clresample.sky.noise import background

@@ -1,0 +1,61 @@
+"""Figures of PSFs and observations: one panel a band."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .sheet import GAP, INK, add_panel, dark_sheet, limits_of, scale_bar, stretch
+
+PANEL_INCHES, MOST_IN_A_ROW = 2.2, 6
+ABOVE, BELOW = 0.56, 0.32  # [inch] for a row's titles and notes
+PSF_DECADES = 4  # of brightness below a PSF's peak that are shown
+BRIGHT_QUANTILE = 0.999  # of an image's pixels: shown as white
+COLOURS = "inferno"
+
+
+def psf_sheet(psf, title=""):
+    """Every band of a PSF, in four decades of brightness; crosses mark the centres."""
+    figure, panels = _panels(psf.images.shape, title)
+    for k, (axes, image) in enumerate(zip(panels, psf.images, strict=True)):
+        floor = image.max() * 10.0**-PSF_DECADES
+        axes.imshow(np.log10(np.maximum(image, floor)), cmap=COLOURS, origin="lower")
+        axes.plot(*psf.center[k][::-1], "+", color="#7fe3ff", ms=9, mew=0.8)
+        _label(axes, f"band {k}", f"FWHM {psf.fwhm_px[k]:.2f} px")
+    return figure
+
+
+def observation_sheet(observation, title=""):
+    """Every channel of an observation, linear in the noise; pixels without weight are blank."""
+    o = observation
+    figure, panels = _panels(o.data.shape, title or o.name or "")
+    for k, (axes, image, weights) in enumerate(zip(panels, o.data, o.weights, strict=True)):
+        seen = weights > 0
+        level = float(np.median(image[seen])) if seen.any() else 0.0
+        sigma = float(np.median(weights[seen])) ** -0.5 if seen.any() else 1.0
+        shown = np.where(seen, image, np.nan)
+        white = float(np.nanquantile(shown, BRIGHT_QUANTILE)) if seen.any() else 1.0
+        axes.imshow(stretch(shown, limits_of(level, sigma, white)), cmap=COLOURS, origin="lower")
+        _label(axes, o.channels[k], f"noise {sigma:.3g} counts")
+        if k == 0:
+            scale_bar(axes, o.grid)
+    return figure
+
+
+def _panels(shape, title):
+    """A dark sheet with a panel for each of C images (C, Ny, Nx), six in a row."""
+    n, n_y, n_x = shape
+    n_rows, n_columns = -(-n // MOST_IN_A_ROW), min(n, MOST_IN_A_ROW)
+    width, height = PANEL_INCHES, PANEL_INCHES * n_y / n_x
+    row = ABOVE / 2 + height + BELOW
+    figure = dark_sheet(n_columns * (width + GAP) + GAP, ABOVE / 2 + n_rows * row, title)
+    places = [divmod(k, MOST_IN_A_ROW) for k in range(n)]
+    return figure, [
+        add_panel(figure, GAP + j * (width + GAP), ABOVE + i * row, width, height)
+        for i, j in places
+    ]
+
+
+def _label(axes, title, note):
+    axes.set(xticks=[], yticks=[])
+    axes.set_title(title, color=INK, fontsize=9, pad=4)
+    axes.set_xlabel(note, color=INK, fontsize=8, labelpad=3)

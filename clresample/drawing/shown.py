@@ -1,0 +1,142 @@
+"""How objects show themselves: a line at a prompt, a card in a notebook, a figure on request.
+
+Base classes without any state, one for each class that users meet.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .card import card, few
+from .deblended import deblended_sheet
+from .instruments import observation_sheet, psf_sheet
+
+
+class ShownGrid:
+    """A Grid's line and card."""
+
+    def __repr__(self):
+        place = "y {:.3f}, x {:.3f} arcsec" if self.is_flat else "{:.6f}, {:.6f} deg"
+        return f"Grid({_pixels(self)}, {self.placing}, centred on {place.format(*_middle(self))})"
+
+    def _repr_html_(self):
+        size = np.array(self.shape) * self.pixel_scale_arcsec
+        unit = "y, x [arcsec]" if self.is_flat else "longitude, latitude [deg]"
+        properties = {
+            "pixels": _pixels(self),
+            "size": f"{size[0]:.4g} x {size[1]:.4g} arcsec",
+            f"centre, {unit}": few(_middle(self), ".8g"),
+            "sky": self.placing,
+        }
+        return card("Grid", properties)
+
+
+class ShownPSF:
+    """A PSF's line, card and figure."""
+
+    def __repr__(self):
+        n_bands, n_y, n_x = self.images.shape
+        samples = f"{n_bands} of {n_y} x {n_x} samples, spacing {self.spacing:g} px"
+        return f"PSF({samples}, FWHM {few(self.fwhm_px)} px)"
+
+    def _repr_html_(self):
+        n_bands, n_y, n_x = self.images.shape
+        properties = {
+            "bands": n_bands,
+            "samples": f"{n_y} x {n_x}, {self.spacing:g} px apart",
+            "FWHM [px]": few(self.fwhm_px),
+            "centre (y, x) [samples]": few(self.center[0], ".5g"),
+        }
+        return card("PSF", properties, self.plot)
+
+    def plot(self, *, title=""):
+        """Every band, in four decades of brightness, crosses at the centres.
+
+        returns matplotlib Figure. Raises ImportError, with what to install, without matplotlib.
+        """
+        return psf_sheet(self, title)
+
+
+class ShownObservation:
+    """An Observation's line, card and figure."""
+
+    def __repr__(self):
+        return f"Observation({self.label}: {few(self.channels, '')}; {_pixels(self.grid)})"
+
+    def _repr_html_(self):
+        zero_points = self.zero_points
+        properties = {
+            "channels": " ".join(self.channels),
+            "pixels": _pixels(self.grid),
+            "without weight": f"{np.mean(self.weights == 0):.2%}",
+            "PSF, FWHM [px]": few(self.psf.fwhm_px),
+            "zero points [mag]": "none" if zero_points is None else few(zero_points, ".5g"),
+            "noise": "white" if self.noise is None else repr(self.noise[0]),
+        }
+        title = f"Observation {self.name or ''}"
+        return card(title, properties | _notes(self.messages), self.plot)
+
+    def plot(self, *, title=""):
+        """Every channel, linear in the noise and logarithmic above; masked pixels are blank.
+
+        returns matplotlib Figure. Raises ImportError, with what to install, without matplotlib.
+        """
+        return observation_sheet(self, title)
+
+
+class ShownResult:
+    """A Result's line, card and figure."""
+
+    def __repr__(self):
+        sources = f"{len(self.sources)} sources, {len(self.components)} components"
+        return f"Result({sources}, {few(self.channels, '')}: {_ending(self)})"
+
+    def _repr_html_(self):
+        n_y, n_x = self.frame.shape
+        properties = {
+            "sources": f"{len(self.sources)}, {len(self.components)} components",
+            "channels": " ".join(self.channels),
+            "model frame": f"{n_y} x {n_x} px of {self.frame.grid.pixel_scale_arcsec:.4g} arcsec",
+            "status": _ending(self),
+            "seconds": f"{sum(self.seconds.values()):.2f}",
+        }
+        return card("Result", properties | _notes(self.messages), self.plot)
+
+    def plot(self, *, title=""):
+        """Observed, model and residual of every observation, three channels in colour.
+
+        returns matplotlib Figure. Raises ImportError, with what to install, without matplotlib.
+        """
+        return deblended_sheet(self, title=title)
+
+
+class ShownCertificate:
+    """A Certificate's card."""
+
+    def _repr_html_(self):
+        properties = {
+            "light wraps at [model px]": few(self.wrap_radius_px),
+            "padded to": f"{self.n_fft[0]} x {self.n_fft[1]}",
+            "frequencies summed": f"{self.n_frequencies[0]} x {self.n_frequencies[1]}",
+            "largest gain of noise": few(self.max_gain),
+            "power floored": few(self.floored_power),
+        }
+        return card("Certificate", properties)
+
+
+def _pixels(grid):
+    n_y, n_x = grid.shape
+    return f"{n_y} x {n_x} px of {grid.pixel_scale_arcsec:.4g} arcsec"
+
+
+def _middle(grid):
+    """The sky at a grid's centre (2,)."""
+    return grid.sky(*(np.array(grid.shape) - 1) / 2)
+
+
+def _ending(result):
+    return f"{result.status} after {max(len(result.losses) - 1, 0)} iterations"
+
+
+def _notes(messages):
+    return {f"note {i}": text for i, text in enumerate(messages, 1)}

@@ -1,0 +1,89 @@
+"""What notebooks show: one line, a card, a figure; none of them holds a dump of arrays."""
+
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from clresample import PSF, Extended, Grid, Observation, Resampler, deblend
+
+FLAT = Grid.flat((24, 30), 0.2)
+GRI = PSF.gaussian([1.5, 1.6, 1.7], n_pixels=15)
+
+
+@pytest.fixture(scope="module")
+def result():
+    y, x = np.indices((24, 30))
+    light = 50 * np.exp(-0.5 * ((y - 12) ** 2 + (x - 14) ** 2) / 2.5**2)
+    data = light + np.random.default_rng(1).standard_normal((3, 24, 30))
+    mask = np.zeros((24, 30), bool)
+    mask[:4] = True
+    o = Observation(data, GRI, FLAT, variance=1.0, mask=mask, channels=list("gri"), name="<Rubin>")
+    return deblend([o], [Extended(sky_deg=tuple(FLAT.sky(12, 14)))])
+
+
+@pytest.fixture(scope="module")
+def objects(result):
+    grid = Grid.from_wcs(FLAT.to_wcs(ra_deg=10, dec_deg=5), FLAT.shape)
+    operator = Resampler(FLAT, GRI, Grid.flat((10, 10), 0.4), GRI)
+    return {"FLAT": FLAT, "Grid": grid, "PSF": GRI, "Observation": result.observations[0],
+            "Result": result, "Certificate": operator.certificate}  # fmt: skip
+
+
+NAMES = "FLAT", "Grid", "PSF", "Observation", "Result", "Certificate"
+
+
+class Tags(HTMLParser):
+    """Checks that tags close in order."""
+
+    def __init__(self):
+        super().__init__()
+        self.open = []
+
+    def handle_starttag(self, tag, attrs):
+        if tag != "img":
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_repr_is_one_line_without_arrays(objects, name):
+    text = repr(objects[name])
+    assert "\n" not in text and "array(" not in text
+    assert len(text) < 200
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_card_is_whole_html(objects, name):
+    text = objects[name]._repr_html_()
+    tags = Tags()
+    tags.feed(text)
+    assert not tags.open
+    assert "<Rubin>" not in text  # names are escaped
+
+
+@pytest.mark.parametrize("name", ["PSF", "Observation", "Result"])
+def test_figures_show_by_themselves(objects, name):
+    pytest.importorskip("matplotlib")
+    figure = objects[name].plot(title="a title")
+    png = figure._repr_png_()
+    assert png.startswith(b"\x89PNG")
+    assert "a title" in [text.get_text() for text in figure.texts]
+    assert re.search('src="data:image/png;base64,[A-Za-z0-9+/]{100}', objects[name]._repr_html_())
+
+
+def test_a_figure_has_a_panel_a_band(objects):
+    pytest.importorskip("matplotlib")
+    assert len(objects["PSF"].plot().axes) == 3
+    assert len(objects["Observation"].plot().axes) == 3
+    assert len(objects["Result"].plot().axes) == 3  # observed, model, residual
+
+
+def test_without_matplotlib_the_card_has_no_picture(objects, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
+    assert "<img" not in objects["PSF"]._repr_html_()
+    with pytest.raises(ImportError, match=r"clresample\[plot\]"):
+        objects["PSF"].plot()
