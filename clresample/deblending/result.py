@@ -155,7 +155,8 @@ class Result(ShownResult):
 
         rng: NumPy Generator. Morphologies and spectra below 0 become 0, so that faint sources are
         brighter in the mean; morphologies keep their scale, their maximum is no longer 1.
-        Settings.flux_floor is not in them.
+        Settings.flux_floor is not in them, nor is what lies beyond the boxes, which makes fluxes of
+        faint sources scatter by up to a tenth less than `errors` has it.
 
         Raises ValueError for results without draws: of other priors, without errors, or read from
         a file.

@@ -36,10 +36,12 @@ class Settings:
     fit_sky: fit a constant per channel
     flux_floor: with a LearnedPrior, part of each flux added to its error in quadrature, the same
         for all channels of a source: what no likelihood knows, the error of the model of bright
-        galaxies, their photons' own noise where the weights leave it out, and PSFs. Of simulated
-        parametric galaxies above signal to noise 300, in Euclid and Rubin together, the 68 %
-        intervals hold the truth in 61 % of cases without it, in 63 % with 0.001, in 70 % with
-        0.002. PSFs that are wrong by a percent, or galaxies unlike their profiles, need 0.01
+        galaxies, their photons' own noise where the weights leave it out, and PSFs. It is that of
+        a galaxy that is like its smooth profile, and grows with the square of the structure that
+        the data show, to a median of 0.6 % for bright galaxies of COSMOS. Of simulated parametric
+        galaxies above signal to noise 300 in Euclid and Rubin together, the 68 % intervals hold the truth in
+        0.68 of cases with 0.0005, in 0.72 with 0.0015, in 0.76 with 0.002.
+        PSFs that are wrong by a percent need 0.01
     """
 
     max_iter: int = 300

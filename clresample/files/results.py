@@ -29,12 +29,8 @@ FORMAT = 1  # of the files; raised when an older reader would misread them
 KINDS = {kind.__name__: kind for kind in (Source, Point, Extended)}
 KEPT = ("name", "channels", "zero_points", "n_bad", "messages")  # of an observation, as JSON
 BOX = ("source", "y", "x", "n_y", "n_x")
-ERRORS = {  # HDUs of Errors
-    "FLUXCOV": "flux",
-    "COLOURCOV": "colour",
-    "MOMENTCOV": "moments",
-    "BEYOND": "beyond",
-}
+# HDUs of Errors
+ERRORS = dict(FLUXCOV="flux", COLOURCOV="colour", MOMENTCOV="moments", BEYOND="beyond")
 ARRAYS = ("sky", "covariance", "shifts", "losses")
 # every WCS card with the 17 digits that give back the same float64
 RELAX = WCSHDO_all | WCSHDO_SIP | WCSHDO_P17 | WCSHDO_EFMT
@@ -46,7 +42,7 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
     HDUs that `read_result` reads: ABOUT (keys and JSON: sources, names, status, messages, ...),
     COMPONENTS (boxes), SPECTRA (n, C), MORPHOLOGIES (one after the other), SKY, COVARIANCE, SHIFTS,
     LOSSES, where the result has errors FLUXCOV, COLOURCOV, MOMENTCOV, BEYOND and MORPHOLOGYERR
-    (one after the other), MODELPSF, and per observation, numbered from 1: DATA, WEIGHTS, PSF, RENDERED.
+    (one after the other), MODELPSF, and per observation from 1 on: DATA, WEIGHTS, PSF, RENDERED.
     For other programs: CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all sources in the model frame, and
     per observation MODEL and RESIDUAL, 0 where data have no weight. All images have their WCS; a
     flat sky is put at RA = Dec = 0. For NaN and infinity see arrays.py.

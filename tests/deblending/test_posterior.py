@@ -201,14 +201,27 @@ def test_what_lies_beyond_a_box_is_counted(device):
 
 
 def test_draws_scatter_as_the_errors_say(fitted):
+    """But for what lies beyond the boxes, where draws end."""
     rng, found, centroids, pixels = np.random.default_rng(0), [], [], []
     for components in fitted.sample(500, rng):
         found.append([c.flux for c in components])
         centroids.append([moments([c], [1.0])[0] for c in components])
         pixels.append(components[0].morphology)
-    np.testing.assert_allclose(np.std(found, axis=0), errors(fitted), rtol=0.12)
-    wanted = np.sqrt(np.diagonal(fitted.errors.moments, axis1=1, axis2=2))[:, :2]
-    np.testing.assert_allclose(np.std(centroids, axis=0), wanted, rtol=0.15)
+    inverse = fitted.draws.factor.inverse()
+    for i, (c, modes) in enumerate(zip(fitted.components, fitted.draws.modes, strict=True)):
+        covariance, k = inverse.block(i, i), len(modes)
+        unit = np.diag(fitted.draws.unit)
+        by_unknown = [np.outer(c.spectrum, modes.sum((1, 2))), c.morphology.sum() * unit]
+        rows = np.concatenate(by_unknown, axis=1)
+        wanted = np.sqrt(np.diag(rows @ covariance @ rows.T))
+        np.testing.assert_allclose(np.std(found, axis=0)[i], wanted, rtol=0.12)
+        assert (wanted < 1.01 * errors(fitted)[i]).all() and (
+            wanted > 0.8 * errors(fitted)[i]
+        ).all()
+        slope = moments_of(np.array([c.origin]), [c.morphology], np.ones(1))[0][0][:2]
+        rows = np.tensordot(slope, modes, ((1, 2), (1, 2)))
+        wanted = np.sqrt(np.diag(rows @ covariance[:k, :k] @ rows.T))
+        np.testing.assert_allclose(np.std(centroids, axis=0)[i], wanted, rtol=0.15)
     bright = fitted.components[0].morphology > 0.3
     spread = np.std(pixels, axis=0)[bright]
     np.testing.assert_allclose(spread, fitted.errors.morphology[0][bright], rtol=0.2)
@@ -249,10 +262,15 @@ def test_stars(device):
     assert np.isfinite(errors(result)).all()
 
 
-def test_the_floor_is_added_in_quadrature_and_leaves_colours(device, fitted):
+def test_the_floor_is_added_in_quadrature_and_leaves_colours(device, fitted, monkeypatch):
+    """Times the square of how unlike smooth profiles the sources are, found to be near 1."""
+    kept = capture(monkeypatch)
     floored = scenes.fit(blend(BRIGHT), device, settings=Settings(flux_floor=0.01))
     flux = fluxes(fitted)[0]
-    np.testing.assert_allclose(errors(floored) ** 2, errors(fitted) ** 2 + (0.01 * flux) ** 2)
+    unlike = np.array([kept[0].posterior.solution.unlikeness(i) for i in (0, 1)])
+    assert ((unlike > 0.5) & (unlike < 1.5)).all()
+    floor = 0.01 * unlike[:, None] ** 2 * flux
+    np.testing.assert_allclose(errors(floored) ** 2, errors(fitted) ** 2 + floor**2, rtol=1e-6)
     for a, b, f in zip(fitted.errors.colour, floored.errors.colour, flux, strict=True):
         slope = np.array([1 / f[0], -1 / f[1], 0])  # of ln(f_0 / f_1)
         assert slope @ b @ slope == pytest.approx(slope @ a @ slope, rel=1e-6)

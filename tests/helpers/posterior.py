@@ -86,13 +86,15 @@ def full_matrix(kept, modes=None):
 def dense_error(kept, i):
     """Errors (C,) [counts] of component i's fluxes, the structure of every pixel unknown."""
     s = kept.posterior.solution
-    modes = [_dense_modes(kept.posterior, j) for j in range(len(s.morphs))]
+    found = [_dense_modes(kept.posterior, j) for j in range(len(s.morphs))]
+    modes, beyond = [m for m, _ in found], found[i][1]
     matrix, n_channels = full_matrix(kept, modes), len(kept.unit)
     at = sum(len(m) + n_channels for m in modes[:i])
     slopes = np.zeros((n_channels, len(matrix)))
+    total = s.morphs[i].sum() + kept.posterior.beyond[i].sums[0]
     k = len(modes[i])
-    slopes[:, at : at + k] = np.outer(s.spectra[i], modes[i].sum((1, 2)))
-    slopes[:, at + k : at + k + n_channels] = s.morphs[i].sum() * np.eye(n_channels)
+    slopes[:, at : at + k] = np.outer(s.spectra[i], modes[i].sum((1, 2)) + beyond)
+    slopes[:, at + k : at + k + n_channels] = total * np.eye(n_channels)
     scale = np.sqrt(np.diag(matrix))
     lower = np.linalg.cholesky(scaled(matrix) + RIDGE * np.eye(len(matrix)))
     half = np.linalg.solve(lower, (slopes / scale).T)
@@ -100,7 +102,8 @@ def dense_error(kept, i):
 
 
 def _dense_modes(posterior, i):
-    """Modes of component i: a normal number for each pixel, and its profile's own slopes."""
+    """Modes of component i: a normal number for each pixel, and its profile's own slopes; and by
+    how much each changes the light beyond its box (k,)."""
     s, n_slopes = posterior.solution, 8
     profile = s.scene.profile[i]
     n = profile.size
@@ -110,8 +113,10 @@ def _dense_modes(posterior, i):
         rows, columns = (_toeplitz(twice, side) for side in profile.shape)
         covariance += a**2 * np.kron(rows, columns)
     root = np.linalg.cholesky(covariance).T.reshape(n, *profile.shape)
-    images = s._gauged(i, np.sqrt(np.maximum(profile, 0)) * root)[0] / s.peaks[i]
-    return np.concatenate([images, posterior.modes[i][-n_slopes:]])
+    images, along = s._gauged(i, np.sqrt(np.maximum(profile, 0)) * root)
+    far = posterior.beyond[i]
+    beyond = np.concatenate([-far.sums[0] * along, far.slopes[0, -n_slopes:]])
+    return np.concatenate([images / s.peaks[i], posterior.modes[i][-n_slopes:]]), beyond
 
 
 def _toeplitz(taps, n):

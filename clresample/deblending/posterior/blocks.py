@@ -56,7 +56,7 @@ class Factor:
     def __init__(self, matrix: Blocks):
         self.sizes, n = matrix.sizes, len(matrix.sizes)
         self.scale = [_root(np.diag(matrix.block(i, i))) for i in range(n)]
-        near = [set() for _ in range(n)]
+        near: list[set[int]] = [set() for _ in range(n)]
         for i, j in list(dict(matrix.items())):
             if i != j:
                 near[i].add(j)
@@ -70,7 +70,8 @@ class Factor:
                 scaled[np.diag_indices(len(scaled))] += RIDGE
             late_first = place[i] >= place[j]
             rest[(i, j) if late_first else (j, i)] = scaled if late_first else scaled.T
-        self._lower, self._below = {}, {}
+        self._lower: dict[int, np.ndarray] = {}
+        self._below: dict[int, np.ndarray] = {}
         for v in self.order:
             self._eliminate(v, rest)
 
@@ -115,7 +116,7 @@ class Factor:
         matrix, in blocks.
         """
         place = {node: at for at, node in enumerate(self.order)}
-        found = {}
+        found: dict[tuple[int, int], np.ndarray] = {}
 
         def get(u, w):
             return found[u, w] if place[u] >= place[w] else found[w, u].T

@@ -51,7 +51,8 @@ class Exposure:
         reach = REACH_FWHM * float(observation.psf.fwhm_px.max()) * scale
         transfer = Transfer(view.mapping.matrix, frame.psf, observation.white.psf)
         make = _parallel if view.mapping.geometry == "aligned" else _spread
-        return cls(*make(view, min(scale, transfer.nyquist_px)), reach, transfer)
+        y, x, root = make(view, min(scale, transfer.nyquist_px))
+        return cls(y, x, root, reach, transfer)
 
     def window(self, origin, shape):
         """First and one-past-last row and column (2, 2) within reach of a box of the frame."""

@@ -154,16 +154,17 @@ class _Sum:
         block[of_a, of_b] += units
         if self.shift is None:
             return
-        common, both = self.layout.common, self.matrix.block(self.layout.common, self.layout.common)
+        common = self.layout.common
+        both = self.matrix.block(common, common)
         square = modes[a.k :, b.k :] if same else modes[a.k :, b.k :] + modes[a.k :, b.k :].T
         both[np.ix_(self.shift, self.shift)] += square
-        for s, k, at, rows, ones in ((a, a.k, of_a, modes[: a.k, b.k :], by_a[b.k :].T),
-                                     (b, b.k, of_b, modes[a.k :, : b.k].T, by_b[a.k :].T)):  # fmt: skip
-            side = self.matrix.block(s.i, common)
-            side[:k, self.shift] += rows
+        sides = [(a.i, modes[: a.k, b.k :], of_a, by_a[b.k :].T)]
+        if not same:
+            sides.append((b.i, modes[a.k :, : b.k].T, of_b, by_b[a.k :].T))
+        for i, rows, at, ones in sides:
+            side = self.matrix.block(i, common)
+            side[: len(rows), self.shift] += rows
             side[np.ix_(at, self.shift)] += ones
-            if same:
-                break
 
     def _add_level(self, one):
         """The products of a component with a level of 1 in each channel."""

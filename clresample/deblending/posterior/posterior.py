@@ -9,7 +9,7 @@ import numpy as np
 from .blocks import Factor
 from .errors import Draws, Errors
 from .exposure import Exposure
-from .modes import Solution
+from .modes import FLOOR, Solution
 from .moments import moments_of
 from .normal import Layout, normal_matrix
 
@@ -24,8 +24,8 @@ class Posterior:
     fit_sky, fit_shifts: whether sky levels, and shifts of all observations but the first, are
         unknowns too
 
-    modes (n): arrays (k, ny, nx), beyond (n): see Solution.modes; layout: Layout; matrix: Blocks; factor: its Factor; covariance: Blocks of the
-        inverse, for the same nodes
+    modes (n): arrays (k, ny, nx), beyond (n): see Solution.modes; layout: Layout; matrix: Blocks;
+        factor: its Factor; covariance: Blocks of the inverse, for the same nodes
 
     Raises LinAlgError where the matrix is not positive definite.
     """
@@ -70,7 +70,10 @@ class Posterior:
                 between[:, t, s] += np.diag(found)
             if s == t:
                 colour[s] += found if i == j else found + found.T
-        floor = flux_floor * flux
+        floor = np.zeros(flux.shape)
+        for i, slope in enumerate(slopes):
+            own = self.solution.spectra[i] * slope[0, -n_channels]  # its flux
+            floor[owner[i]] += flux_floor * self.solution.unlikeness(i) ** FLOOR * own
         between[:, np.arange(n_sources), np.arange(n_sources)] += floor.T**2
         colour += floor[:, :, None] * floor[:, None, :]
         error = np.sqrt(np.diagonal(colour, axis1=1, axis2=2))

@@ -66,12 +66,14 @@ class Beyond:
         return Beyond(self.sums, slopes - np.outer(self.sums, along))
 
 
-def profile_modes(shape, theta, position, profile, origin):
+def profile_modes(shape, theta, position, profile, origin, *, radial=1.0):
     """Slopes (k, ny, nx) of a component's profile in its box, their prior scatter (k,), Beyond.
 
     shape: Shape, theta (n,): its parameters, position (2,) [px]: where in the frame
     profile (ny, nx): with max = 1; origin (2,) [px]: of the box in the frame
+    radial: times CORE and HALO
     """
+    core_and_halo = radial * CORE, radial * HALO
     if isinstance(shape, Star):
         drawn = shape.draw(np.zeros(len(theta)), position)
         drawn = drawn[:, *box_slices(origin, profile.shape)] / drawn[0].max()
@@ -84,12 +86,12 @@ def profile_modes(shape, theta, position, profile, origin):
         peak = drawn[0].max()
         images = np.concatenate([drawn, moved, _core_and_halo(drawn[0] / peak) * peak]) / peak
         near = images[1:, *box_slices(margin, profile.shape)].copy()
-        scatter = np.concatenate([shape.scatter, [POSITION_PX] * 2, [CORE, HALO]])
+        scatter = np.concatenate([shape.scatter, [POSITION_PX] * 2, core_and_halo])
         images[-2:] *= FAR_HALO
         return near, scatter, Beyond.of(images, low, margin)
     slopes = np.stack([-_slope(profile, axis) for axis in (0, 1)])  # of a given image
     images = np.concatenate([slopes, _core_and_halo(profile)])
-    return images, np.array([POSITION_PX, POSITION_PX, CORE, HALO]), Beyond.none(len(images))
+    return images, np.array([POSITION_PX, POSITION_PX, *core_and_halo]), Beyond.none(len(images))
 
 
 def _core_and_halo(profile):
