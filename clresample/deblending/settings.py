@@ -39,8 +39,8 @@ class Settings:
         galaxies, their photons' own noise where the weights leave it out, and PSFs. It is that of
         a galaxy that is like its smooth profile, and grows with the square of the structure that
         the data show, to a median of 0.6 % for bright galaxies of COSMOS. Of simulated parametric
-        galaxies above signal to noise 300 in Euclid and Rubin together, the 68 % intervals hold the truth in
-        0.68 of cases with 0.0005, in 0.72 with 0.0015, in 0.76 with 0.002.
+        galaxies above signal to noise 300 in Euclid and Rubin together, the 68 % intervals hold the
+        truth in 0.68 of cases with 0.0005, in 0.72 with 0.0015, in 0.76 with 0.002.
         PSFs that are wrong by a percent need 0.01
     """
 

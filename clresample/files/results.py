@@ -30,7 +30,7 @@ KINDS = {kind.__name__: kind for kind in (Source, Point, Extended)}
 KEPT = ("name", "channels", "zero_points", "n_bad", "messages")  # of an observation, as JSON
 BOX = ("source", "y", "x", "n_y", "n_x")
 # HDUs of Errors
-ERRORS = dict(FLUXCOV="flux", COLOURCOV="colour", MOMENTCOV="moments", BEYOND="beyond")
+ERRORS = {"FLUXCOV": "flux", "COLOURCOV": "colour", "MOMENTCOV": "moments", "BEYOND": "beyond"}
 ARRAYS = ("sky", "covariance", "shifts", "losses")
 # every WCS card with the 17 digits that give back the same float64
 RELAX = WCSHDO_all | WCSHDO_SIP | WCSHDO_P17 | WCSHDO_EFMT

@@ -141,7 +141,7 @@ class Factor:
 
 
 def _root(diagonal):
-    scale = np.sqrt(diagonal)
+    scale = np.sqrt(np.maximum(diagonal, 0))
     return np.where(scale > 0, scale, 1)
 
 

@@ -1,0 +1,71 @@
+"""The sparse normal matrix of many sources, beside dense float64."""
+
+import numpy as np
+import pytest
+
+from clresample.deblending.posterior.blocks import RIDGE, Blocks, Factor
+
+
+def field(n_y, n_x, *, common=0, seed=0):
+    """A positive definite matrix of sources on a grid, each beside four others, of 1 to 4 unknowns,
+    and of a node of all where it has unknowns in common."""
+    rng = np.random.default_rng(seed)
+    n = n_y * n_x
+    sizes = np.append(rng.integers(1, 5, n), [common] if common else []).astype(int)
+    matrix = Blocks(sizes)
+    pairs = [(i, i + 1) for i in range(n) if (i + 1) % n_x] + [(i, i + n_x) for i in range(n - n_x)]
+    pairs += [(i, n) for i in range(n)] if common else []
+    for i, j in pairs:
+        rows = rng.normal(size=(sizes[i] + sizes[j] + 2, sizes[i] + sizes[j]))
+        rows *= 10.0 ** rng.integers(-2, 3)
+        both = rows.T @ rows
+        matrix.block(i, i)[:] += both[: sizes[i], : sizes[i]]
+        matrix.block(i, j)[:] += both[: sizes[i], sizes[i] :]
+        matrix.block(j, j)[:] += both[sizes[i] :, sizes[i] :]
+    return matrix
+
+
+@pytest.mark.parametrize("common", [0, 3])
+def test_the_inverse_is_the_dense_one_where_it_is_asked_for(common):
+    matrix = field(5, 4, common=common)
+    dense = matrix.dense()
+    scale = np.sqrt(np.diag(dense))
+    scaled = dense / scale[:, None] / scale + RIDGE * np.eye(len(dense))
+    wanted = np.linalg.inv(scaled) / scale[:, None] / scale
+    found = Factor(matrix).inverse()
+    ends = np.cumsum([0, *matrix.sizes])
+    blocks = dict(found.items())
+    assert blocks.keys() >= dict(matrix.items()).keys()
+    for (i, j), block in blocks.items():
+        expected = wanted[ends[i] : ends[i + 1], ends[j] : ends[j + 1]]
+        size = np.sqrt(np.outer(*(np.diag(wanted)[ends[k] : ends[k + 1]] for k in (i, j))))
+        np.testing.assert_allclose(block / size, expected / size, atol=1e-7)
+
+
+def test_draws_scatter_as_the_inverse_says():
+    """Exactly: draws of unit vectors are a root of it."""
+    matrix = field(3, 3, common=2)
+    factor, n = Factor(matrix), sum(matrix.sizes)
+    root = np.array([np.concatenate(factor.draw(unit)) for unit in np.eye(n)])
+    dense = matrix.dense()
+    scale = np.sqrt(np.diag(dense))
+    found = (root.T @ root) @ (dense + RIDGE * np.diag(scale**2))
+    np.testing.assert_allclose(found * scale[:, None] / scale, np.eye(n), atol=1e-6)
+
+
+def test_a_matrix_that_is_not_positive_definite_is_refused():
+    matrix = field(3, 3)
+    matrix.block(4, 4)[:] -= 10 * np.trace(matrix.block(4, 4)) * np.eye(matrix.sizes[4])
+    with pytest.raises(np.linalg.LinAlgError):
+        Factor(matrix)
+
+
+def test_memory_follows_the_number_of_sources():
+    """Twice as many in a field that is as deep take hardly more than twice as much."""
+    held = []
+    for n in (20, 40):
+        blocks = dict(Factor(field(n, 10)).inverse().items())
+        held.append(sum(block.size for block in blocks.values()))
+    assert held[1] < 2.2 * held[0]
+    whole = sum(field(40, 10).sizes) ** 2 / 2
+    assert held[1] < 0.15 * whole
