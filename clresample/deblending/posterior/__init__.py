@@ -2,13 +2,14 @@
 
 About the solution everything is linear, in units of the noise and per channel c,
 
-    d_c = sum_i R_c (dA_ic S_i + A_ic sum_k q_ik m_ik) + dsky_c + noise,       q_i ~ N(0, Q_i)
+    d_c = sum_i R_c (dA_ic S_i + A_ic sum_k q_ik m_ik) + dsky_c + dR_c/dt . dt + noise,   q ~ N(0, 1)
     H = J^T J + prior^-1,                                           var(f) = grad f^T H^-1 grad f
 
-with one matrix H a scene. modes.py makes the images m_ik, profile_modes.py those of the smooth
-profile; normal.py renders them and adds up H; posterior.py reads errors off it; errors.py is what a
-Result keeps. Imports solver and sky, the profiles and views of deblending, none of its fits.
+with one matrix H a scene, in blocks of sources that meet. modes.py makes the images m_ik, from
+bumps.py and profile_modes.py; exposure.py renders them from their boxes; normal.py adds up H and
+blocks.py factors and inverts it; posterior.py reads errors off it; errors.py is what a Result
+keeps. Imports solver and sky, the profiles and views of deblending, none of its fits.
 
 Not in these errors, since no likelihood knows it: errors of the PSFs, of the model in bright
-galaxies (Settings.flux_floor stands for both), of observations' shifts, and of the bounds at 0.
+galaxies (Settings.flux_floor stands for both), and of the bounds at 0.
 """
