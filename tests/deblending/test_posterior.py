@@ -110,11 +110,17 @@ def test_draws_scatter_as_the_errors_say(fitted):
 
 
 def test_errors_hold_the_truth(device):
-    """68 % of what is measured on 30 scenes of other noise: a smoke test, of 180 fluxes."""
+    """68 % of what is measured on 30 scenes of other noise: a smoke test, of 180 fluxes.
+
+    They scatter by no more than the errors, which hold the prior's pull as well: of six fluxes the
+    scatter of 30 is known to 13 %, its rms to 6 %.
+    """
     blends = [blend(BRIGHT, seed=seed) for seed in range(30)]
     pulls = {"flux": [], "y_centroid": [], "x_centroid": []}
+    found = []
     for result in deblend_many(blends, device=device):
         table = catalogue(result)
+        found.append((fluxes(result)[0], errors(result)))
         truth = np.array([flux for _, flux, _ in BRIGHT])
         pulls["flux"] += ((fluxes(result)[0] - truth) / errors(result)).ravel().tolist()
         for k, name in enumerate(("y_centroid", "x_centroid")):
@@ -123,6 +129,9 @@ def test_errors_hold_the_truth(device):
     for name, values in pulls.items():
         held = (np.abs(values) < 1).mean()
         assert 0.5 < held < 0.9, (name, held)
+    flux, error = np.swapaxes(found, 0, 1)
+    scatter = np.std(flux, axis=0) / np.sqrt(np.mean(error**2, axis=0))
+    assert 0.7 < np.sqrt(np.mean(scatter**2)) < 1.2
 
 
 def test_stars(device):

@@ -11,8 +11,9 @@ from helpers.blends import (
     two_sources,
 )
 
+from clresample.deblending.posterior.errors import Errors
 from clresample.measurement.catalogue import Flag, catalogue
-from clresample.measurement.photometry import fluxes, redistribute
+from clresample.measurement.photometry import channel_covariances, fluxes, redistribute
 from clresample.sky.grid import Grid
 
 
@@ -115,3 +116,25 @@ def test_rounding_below_zero_gets_no_share():
     result.rendered[0][2, :, 30, 28] = -1e-7
     shares = redistribute(result, 0)
     assert (shares >= 0).all() and shares[0, 0, 30, 28] == 1
+
+
+def test_colours_are_better_known_than_fluxes_that_err_together():
+    """Errors of colours against draws of the two fluxes; without Errors channels are apart."""
+    grid = Grid.flat((60, 70), SCALE)
+    zero_points = {"zero_points": [30.0, 31.0]}
+    component = round_component(0, MIDDLE, [100.0, 200.0])
+    covariance = np.array([[[25.0, 45.0], [45.0, 100.0]]])
+    flux = np.array([[[25.0]], [[100.0]]])
+    maps, beyond = (component.morphology,), np.zeros((1, 6))
+    known = Errors(flux, covariance, np.full((1, 5, 5), np.nan), maps, beyond)
+    observations = [observe(grid, ("g", "r"), **zero_points)]
+    total = component.flux
+    for errors, both in ((known, covariance[0]), (None, np.diag([25.0, 100.0]))):
+        apart = np.array([[[25.0]], [[100.0]]]) / component.morphology.sum() ** 2
+        result = blend([component], observations=observations, errors=errors, covariance=apart)
+        row = catalogue(result, magnitudes=True)[0]
+        drawn = np.random.default_rng(0).multivariate_normal(total, both, 20000)
+        colours = -2.5 * np.log10(drawn[:, 0] / drawn[:, 1])
+        assert abs(row["colour_g_r"].value - (np.median(colours) - 1.0)) < 0.01
+        np.testing.assert_allclose(row["colour_err_g_r"].value, colours.std(), rtol=0.03)
+        np.testing.assert_allclose(channel_covariances(result)[0], both, rtol=1e-10)

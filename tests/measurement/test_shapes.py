@@ -89,7 +89,8 @@ def test_errors_of_positions_on_the_sky(cards):
     covariance = np.zeros((1, 5, 5))
     covariance[0, :2, :2], covariance[0, 2:, 2:] = pixel, 0.01 * np.eye(3)
     flux = np.ones((2, 1, 1))
-    errors = Errors(flux, np.ones((1, 2, 2)), covariance, (component.morphology,))
+    maps = (component.morphology,)
+    errors = Errors(flux, np.ones((1, 2, 2)), covariance, maps, np.zeros((1, 6)))
     row = catalogue(blend([component], grid=grid, errors=errors))[0]
     assert row["y_centroid_err"].value == pytest.approx(0.2)
     assert row["x_centroid_err"].value == pytest.approx(0.3)

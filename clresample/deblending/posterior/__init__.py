@@ -2,7 +2,7 @@
 
 About the solution everything is linear, in units of the noise and per channel c,
 
-    d_c = sum_i R_c (dA_ic S_i + A_ic sum_k q_ik m_ik) + dsky_c + dR_c/dt . dt + noise,   q ~ N(0, 1)
+    d_c = sum_i R_c (dA_ic S_i + A_ic sum_k q_ik m_ik) + dsky_c + dR_c/dt . dt + noise,  q ~ N(0, 1)
     H = J^T J + prior^-1,                                           var(f) = grad f^T H^-1 grad f
 
 with one matrix H a scene, in blocks of sources that meet. modes.py makes the images m_ik, from

@@ -9,6 +9,7 @@ rather than all.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -85,6 +86,12 @@ class _Seen:
     light: np.ndarray
     unit: np.ndarray
 
+    @cached_property
+    def size(self):
+        """Largest root of the squares' sum of its light."""
+        flat = self.light.reshape(len(self.light), self.unit.size)
+        return np.sqrt(np.einsum("kp,kp->k", flat, flat).max(initial=0))
+
     def within(self, low, high):
         """light (k, C * P) and unit (C, P) from `low` to `high`."""
         cut = box_slices(low - self.low, high - low)
@@ -138,9 +145,7 @@ class _Sum:
         if not (high > low).all():
             return
         (light_a, unit_a), (light_b, unit_b) = a.within(low, high), b.within(low, high)
-        largest = np.einsum("kp,kp->k", light_a, light_a).max(initial=0)
-        largest *= np.einsum("kp,kp->k", light_b, light_b).max(initial=0)
-        if largest > LARGE**2:
+        if a.size * b.size > LARGE:
             light_a, light_b = light_a.astype(np.float64), light_b.astype(np.float64)
         n_channels, same = len(unit_a), a.i == b.i
         modes = light_a @ light_b.T
