@@ -3,6 +3,9 @@
  * WG work-items make a group, one group a source: they share its pixels, and meet at SYNC(). With
  * WG 1 there is no barrier at all, which suits CPUs; a GPU takes 64.
  * FOR_X runs over a row of n pixels: all of them in one work-item (ROWS), or those of this one.
+ * FOR_Y runs over those of n rows that are this work-item's, counted by a launch's second axis;
+ * FOR_I over those of n items, by its first.  Any launch covers all of them, none goes beyond: a
+ * launch is rounded up to whole groups.
  */
 #ifndef WG          /* work-items of a group */
 #define WG 1
@@ -22,6 +25,9 @@
 #else
 #define FOR_X(x, n) for (int x = (int)get_global_id(0); x < (n); x += (int)get_global_size(0))
 #endif
+
+#define FOR_Y(y, n) for (int y = (int)get_global_id(1); y < (n); y += (int)get_global_size(1))
+#define FOR_I(i, n) for (int i = (int)get_global_id(0); i < (n); i += (int)get_global_size(0))
 
 /* The sum of a group's values, in the order of its work-items and the same for each of them.
  * share: WG elements; all work-items must come here, with their lid = get_local_id(0). */

@@ -20,7 +20,7 @@
  * reweigh   after new strengths of the prior: precision, h = 1 / (precision + curvature light),
  *           g_new += change x_new, y_k += change s_k in every slot; launch: (WG, n_scales, n_free)
  *           weights (S, n_scales, 3): precision, curvature, change
- * take      spectra and sky levels out of x;  launch: (n_spectra + n_sky)
+ * take      spectra and sky levels out of x, n of them in all;  launch: any, see FOR_I of group.h
  * give      their gradients into g_new: pull[b, row] summed over rows row0[c] .. row0[c + 1] - 1
  *           launch: as take
  * move      values[row, first + i] = values_from[row, source + i] of each chunk, the source of each
@@ -238,27 +238,32 @@ void reweigh(__global const int *restrict active, __global const int *restrict t
                 ring_y[k * (size_t)size + i] += more * ring_s[k * (size_t)size + i];
 }
 
-__kernel void take(const int n_latents, const int n_spectra, __global const REAL *restrict x,
-                   __global REAL *restrict spectra, __global REAL *restrict sky)
+__kernel void take(const int n_latents, const int n_spectra, const int n,
+                   __global const REAL *restrict x, __global REAL *restrict spectra,
+                   __global REAL *restrict sky)
 {
-    const int i = (int)get_global_id(0);
-    const REAL value = x[(size_t)n_latents + i];
-    if (i < n_spectra) spectra[i] = value;
-    else sky[i - n_spectra] = value;
+    FOR_I(i, n) {
+        const REAL value = x[(size_t)n_latents + i];
+        if (i < n_spectra) spectra[i] = value;
+        else sky[i - n_spectra] = value;
+    }
 }
 
-__kernel void give(const int n_latents, const int n_spectra, const int n_channels, const int n_rows,
-                   __global const int *restrict row0, __global const REAL *restrict pull,
-                   __global const REAL *restrict d_spectra, __global REAL *restrict g_new)
+__kernel void give(const int n_latents, const int n_spectra, const int n, const int n_channels,
+                   const int n_rows, __global const int *restrict row0,
+                   __global const REAL *restrict pull, __global const REAL *restrict d_spectra,
+                   __global REAL *restrict g_new)
 {
-    const int i = (int)get_global_id(0), k = i - n_spectra;
-    REAL sum = 0;
-    if (i < n_spectra) sum = d_spectra[i];
-    else {
-        __global const REAL *rows = pull + (size_t)(k / n_channels) * n_rows;
-        for (int r = row0[k % n_channels]; r < row0[k % n_channels + 1]; ++r) sum += rows[r];
+    FOR_I(i, n) {
+        const int k = i - n_spectra;
+        REAL sum = 0;
+        if (i < n_spectra) sum = d_spectra[i];
+        else {
+            __global const REAL *rows = pull + (size_t)(k / n_channels) * n_rows;
+            for (int r = row0[k % n_channels]; r < row0[k % n_channels + 1]; ++r) sum += rows[r];
+        }
+        g_new[(size_t)n_latents + i] = sum;
     }
-    g_new[(size_t)n_latents + i] = sum;
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))

@@ -1,137 +1,252 @@
-/* A batch of scenes: models from sources, residuals from models, gradients from residuals.
+/* A batch of scenes: what each observation is shown of the sources, and how they are to change.
  *
- * Sources are sorted by scene; those of scene b are first[b] .. first[b + 1] - 1.
- *   morph, d_morph, table: morphologies, their gradients and their boxes, see boxes.h; boxes lie
- *             inside the frame
+ * Sources are sorted by scene; those of scene b are first[b] .. first[b + 1] - 1.  Each has an
+ * image in a box of its scene's frame.  The image is a morphology, or a morphology that was
+ * transformed along one or both axes; then the box is as wide as the frame, or all of it:
+ *   boxed, d_boxed, table: images, their gradients and their boxes, see boxes.h; boxes lie inside
+ *             the frame
  *   spectra   (S, C): all channels of all observations; an observation has n_bands from `channel`
- *   model     (B, n_bands, ny_frame, nx_frame), image, data, weights (B, n_bands, my, mx)
+ *   frame     (B, n_bands, ny_frame, nx_frame), image, data, weights (B, n_bands, my, mx)
  *   sky       (B, C)
  *
- * compose     model[b, c, y, x] = sum_s spectra[s, channel + c] S_s[y - y0, x - x0]
+ * compose     frame[b, c, y, x] = sum_s spectra[s, channel + c] boxed_s[y - y0, x - x0]
  *             launch: (X, ny_frame, B * n_bands)
+ * compose_frequencies  the same of images with both axes transformed, whose boxes are the frame,
+ *             times the transfer functions E, (B or 1, n_bands, ny_frame / 2, 4, nx_frame / 2) as
+ *             MIX of contract.cl has them; stride_e: elements from a scene's to the next
+ *             launch: (vectors of VW columns of a row, or 1 with ROWS, ny_frame / 2, B * n_bands)
  * residual    r = image + sky - data, image <- w r, loss[b, row] = 1/2 sum_x w r^2,
  *             pull[b, row] = sum_x w r;  row = c * my + y of this observation, from `row0` on
- *             launch: (my, n_bands, B): one work-item a row, which writes that row's sums
- * square      image <- image^2;  launch: as residual
- * gather_morph    dS_s[y, x] (+)= sum_c spectra[s, channel + c] G[b, c, y0 + y, x0 + x]
+ *             launch: (WG, my, B * n_bands), groups of (WG, 1, 1), which share a row
+ * square      image <- image^2;  launch: (X, my, B * n_bands)
+ * gather_morph    d_boxed_s[y, x] (+)= sum_c spectra[s, channel + c] frame[b, c, y0 + y, x0 + x]
  *             for the sources listed in `active`; launch: (X, tallest box, len(active))
- * gather_spectra  dA[s, channel + c] = sum_yx S_s[y, x] G[b, c, y0 + y, x0 + x]
+ * gather_spectra  dA[s, channel + c] = sum_yx boxed_s[y, x] frame[b, c, y0 + y, x0 + x]
  *             launch: (WG, n_bands, S), groups of (WG, 1, 1)
  *
- * X is 1 where a work-item walks a whole row (ROWS of group.h), else the width of the widest row.
+ * X is 1 where a work-item walks a whole row (ROWS of group.h), else at least the width of the
+ * widest row; of the second axis, which counts rows, any part or more than all may be launched.
  */
 #include "common.h"
 #include "boxes.h"
 #include "group.h"
+#ifndef VW          /* columns of a vector of compose_frequencies, which divide nx_frame */
+#define VW 16
+#endif
+#define LANES 16    /* sums that run side by side where a work-item has a whole row */
 
 #define HEAD(s) \
     __global const int *box = BOX(s); \
     const int y0 = box[Y0], x0 = box[X0], ny = box[NY], nx = box[NX]; \
     const size_t offset = BEGIN(box);
+#define ROW_OF(array, b, c, n_c, y, n_y, n_x) \
+    (array + ((((size_t)(b) * (n_c) + (c)) * (n_y)) + (y)) * (n_x))
 
 __kernel void compose(__global const int *restrict first, __global const int *restrict table,
-                      __global const REAL *restrict morph,
+                      __global const REAL *restrict boxed,
                       __global const REAL *restrict spectra, const int n_channels,
                       const int channel, const int n_bands, const int ny_frame, const int nx_frame,
-                      __global REAL *restrict model)
+                      __global REAL *restrict frame)
 {
-    const int y = (int)get_global_id(1), c = (int)get_global_id(2) % n_bands;
-    const int b = (int)get_global_id(2) / n_bands;
-    __global REAL *row = model + (((size_t)b * n_bands + c) * ny_frame + y) * nx_frame;
-    FOR_X(x, nx_frame) row[x] = 0;
-    for (int s = first[b]; s < first[b + 1]; ++s) {
-        HEAD(s)
-        if (y < y0 || y >= y0 + ny) continue;
-        const REAL a = spectra[(size_t)s * n_channels + channel + c];
-        __global const REAL *m = morph + offset + (size_t)(y - y0) * nx;
+    const int c = (int)get_global_id(2) % n_bands, b = (int)get_global_id(2) / n_bands;
+    FOR_Y(y, ny_frame) {
+        __global REAL *row = ROW_OF(frame, b, c, n_bands, y, ny_frame, nx_frame);
 #if ROWS
-        for (int x = 0; x < nx; ++x) row[x0 + x] += a * m[x];
+        for (int x = 0; x < nx_frame; ++x) row[x] = 0;
+        for (int s = first[b]; s < first[b + 1]; ++s) {
+            HEAD(s)
+            if (y < y0 || y >= y0 + ny) continue;
+            const REAL a = spectra[(size_t)s * n_channels + channel + c];
+            __global const REAL *m = boxed + offset + (size_t)(y - y0) * nx;
+            for (int x = 0; x < nx; ++x) row[x0 + x] += a * m[x];
+        }
 #else
-        FOR_X(x, nx_frame)
-            if (x >= x0 && x < x0 + nx) row[x] += a * m[x - x0];
+        FOR_X(x, nx_frame) {
+            REAL sum = 0;
+            for (int s = first[b]; s < first[b + 1]; ++s) {
+                HEAD(s)
+                if (y >= y0 && y < y0 + ny && x >= x0 && x < x0 + nx)
+                    sum += spectra[(size_t)s * n_channels + channel + c]
+                         * boxed[offset + (size_t)(y - y0) * nx + (x - x0)];
+            }
+            row[x] = sum;
+        }
 #endif
     }
 }
 
-__kernel void residual(const int n_channels, const int channel, const int n_bands, const int my,
-                       const int mx, const int row0, const int n_rows,
-                       __global const REAL *restrict data, __global const REAL *restrict weights,
-                       __global const REAL *restrict sky, __global REAL *restrict image,
-                       __global REAL *restrict loss, __global REAL *restrict pull)
+#define WIDE VEC(VW)
+#if VW == 16
+#define HALF VEC(8)
+#define EVEN(v) (v).s02468ace
+#define ODD(v) (v).s13579bdf
+#elif VW == 8
+#define HALF VEC(4)
+#define EVEN(v) (v).s0246
+#define ODD(v) (v).s1357
+#elif VW == 4
+#define HALF VEC(2)
+#define EVEN(v) (v).s02
+#define ODD(v) (v).s13
+#else
+#define HALF REAL
+#define EVEN(v) (v).s0
+#define ODD(v) (v).s1
+#endif
+
+__kernel void compose_frequencies(
+    __global const int *restrict first, __global const int *restrict table,
+    __global const REAL *restrict boxed, __global const REAL *restrict spectra,
+    const int n_channels, const int channel, const int n_bands, const int ny_frame,
+    const int nx_frame, __global const REAL *restrict E, const int stride_e,
+    __global REAL *restrict frame)
 {
-    const int y = (int)get_global_id(0), c = (int)get_global_id(1), b = (int)get_global_id(2);
-    const size_t i = (((size_t)b * n_bands + c) * my + y) * mx;
-    const REAL level = sky[(size_t)b * n_channels + channel + c];
-    REAL chi2[8] = {0, 0, 0, 0, 0, 0, 0, 0}, sum[8] = {0, 0, 0, 0, 0, 0, 0, 0};
-    for (int x0 = 0; x0 < mx; x0 += 8)
-        for (int k = 0; k < 8; ++k) {
-            const int x = x0 + k;
-            if (x < mx) {
-                const REAL r = image[i + x] + level - data[i + x], wr = weights[i + x] * r;
-                image[i + x] = wr;
-                chi2[k] += wr * r;
-                sum[k] += wr;
+    const int c = (int)get_global_id(2) % n_bands, b = (int)get_global_id(2) / n_bands;
+    FOR_Y(h, ny_frame / 2) {
+        __global REAL *row = ROW_OF(frame, b, c, n_bands, 2 * h, ny_frame, nx_frame);
+        __global const REAL *e =
+            E + (size_t)b * stride_e + (size_t)c * ny_frame * nx_frame + (size_t)h * 2 * nx_frame;
+        FOR_X(v, nx_frame / VW) {
+            const int x = v * VW;
+            WIDE cos_y = (WIDE)(0), sin_y = (WIDE)(0);
+            for (int s = first[b]; s < first[b + 1]; ++s) {
+                const REAL a = spectra[(size_t)s * n_channels + channel + c];
+                __global const REAL *u = boxed + BEGIN(BOX(s)) + (size_t)2 * h * nx_frame + x;
+                cos_y += a * AT(const WIDE, u);
+                sin_y += a * AT(const WIDE, u + nx_frame);
             }
+            __global const REAL *d = e + x / 2;
+            const HALF pr = AT(const HALF, d), pi = AT(const HALF, d + nx_frame / 2);
+            const HALF mr = AT(const HALF, d + nx_frame), mi = AT(const HALF, d + nx_frame / 2 * 3);
+            const HALF fpr = EVEN(cos_y) - ODD(sin_y), fpi = -(ODD(cos_y) + EVEN(sin_y));
+            const HALF fmr = EVEN(cos_y) + ODD(sin_y), fmi = ODD(cos_y) - EVEN(sin_y);
+            const HALF gpr = pr * fpr - pi * fpi, gpi = pr * fpi + pi * fpr;
+            const HALF gmr = mr * fmr - mi * fmi, gmi = mr * fmi + mi * fmr;
+            EVEN(cos_y) = gpr + gmr;
+            ODD(cos_y) = gmi - gpi;
+            EVEN(sin_y) = -(gpi + gmi);
+            ODD(sin_y) = gmr - gpr;
+            AT(WIDE, row + x) = cos_y;
+            AT(WIDE, row + nx_frame + x) = sin_y;
         }
-    REAL total = 0, total_pull = 0;
-    for (int k = 0; k < 8; ++k) {
-        total += chi2[k];
-        total_pull += sum[k];
-    }
-    const size_t row = (size_t)b * n_rows + row0 + c * my + y;
-    loss[row] = (REAL)0.5 * total;
-    pull[row] = total_pull;
-}
-
-__kernel void square(const int n_bands, const int my, const int mx, __global REAL *restrict image)
-{
-    const int y = (int)get_global_id(0), c = (int)get_global_id(1), b = (int)get_global_id(2);
-    __global REAL *row = image + (((size_t)b * n_bands + c) * my + y) * mx;
-    for (int x = 0; x < mx; ++x) row[x] *= row[x];
-}
-
-__kernel void gather_morph(__global const int *restrict active, __global const int *restrict table,
-                           __global const REAL *restrict gradient,
-                           __global const REAL *restrict spectra, const int n_channels,
-                           const int channel, const int n_bands, const int ny_frame,
-                           const int nx_frame, const int add, __global REAL *restrict d_morph)
-{
-    const int s = active[get_global_id(2)], y = (int)get_global_id(1);
-    HEAD(s)
-    if (y >= ny) return;
-    const int b = box[SCENE];
-    __global REAL *out = d_morph + offset + (size_t)y * nx;
-    if (!add) FOR_X(x, nx) out[x] = 0;
-    for (int c = 0; c < n_bands; ++c) {
-        const REAL a = spectra[(size_t)s * n_channels + channel + c];
-        __global const REAL *g =
-            gradient + (((size_t)b * n_bands + c) * ny_frame + y0 + y) * nx_frame + x0;
-        FOR_X(x, nx) out[x] += a * g[x];
     }
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
-void gather_spectra(__global const int *restrict table, __global const REAL *restrict gradient,
-                    __global const REAL *restrict morph, const int n_channels, const int channel,
+void residual(const int n_channels, const int channel, const int n_bands, const int my,
+              const int mx, const int row0, const int n_rows,
+              __global const REAL *restrict data, __global const REAL *restrict weights,
+              __global const REAL *restrict sky, __global REAL *restrict image,
+              __global REAL *restrict loss, __global REAL *restrict pull)
+{
+    __local REAL share[WG];
+    const int lid = (int)get_local_id(0);
+    const int c = (int)get_global_id(2) % n_bands, b = (int)get_global_id(2) / n_bands;
+    const REAL level = sky[(size_t)b * n_channels + channel + c];
+    FOR_Y(y, my) {
+        const size_t at = (((size_t)b * n_bands + c) * my + y) * mx;
+        __global const REAL *d = data + at, *w = weights + at;
+        __global REAL *row = image + at;
+        REAL total = 0, total_pull = 0;
+        int x = lid;
+#if ROWS
+        REAL chi2[LANES], sum[LANES];
+        for (int l = 0; l < LANES; ++l) chi2[l] = sum[l] = 0;
+        for (x = 0; x + LANES <= mx; x += LANES)
+            for (int l = 0; l < LANES; ++l) {
+                const REAL r = row[x + l] + level - d[x + l], wr = w[x + l] * r;
+                row[x + l] = wr;
+                chi2[l] += wr * r;
+                sum[l] += wr;
+            }
+        total = SUM8(chi2) + SUM8(chi2 + 8);
+        total_pull = SUM8(sum) + SUM8(sum + 8);
+#endif
+        for (; x < mx; x += WG) {
+            const REAL r = row[x] + level - d[x], wr = w[x] * r;
+            row[x] = wr;
+            total += wr * r;
+            total_pull += wr;
+        }
+        total = group_sum(total, lid, share);
+        total_pull = group_sum(total_pull, lid, share);
+        if (lid == 0) {
+            const size_t i = (size_t)b * n_rows + row0 + c * my + y;
+            loss[i] = (REAL)0.5 * total;
+            pull[i] = total_pull;
+        }
+    }
+}
+
+__kernel void square(const int my, const int mx, __global REAL *restrict image)
+{
+    FOR_Y(y, my) {
+        __global REAL *row = image + ((size_t)get_global_id(2) * my + y) * mx;
+        FOR_X(x, mx) row[x] *= row[x];
+    }
+}
+
+__kernel void gather_morph(__global const int *restrict active, __global const int *restrict table,
+                           __global const REAL *restrict frame,
+                           __global const REAL *restrict spectra, const int n_channels,
+                           const int channel, const int n_bands, const int ny_frame,
+                           const int nx_frame, const int add, __global REAL *restrict d_boxed)
+{
+    const int s = active[get_global_id(2)];
+    HEAD(s)
+    __global const REAL *a = spectra + (size_t)s * n_channels + channel;
+    const size_t band = (size_t)ny_frame * nx_frame;
+    FOR_Y(y, ny) {
+        __global REAL *out = d_boxed + offset + (size_t)y * nx;
+        __global const REAL *g =
+            ROW_OF(frame, box[SCENE], 0, n_bands, y0 + y, ny_frame, nx_frame) + x0;
+#if ROWS
+        int x = 0;
+        for (; x + LANES <= nx; x += LANES) {
+            REAL sum[LANES];
+            for (int l = 0; l < LANES; ++l) sum[l] = add ? out[x + l] : (REAL)0;
+            for (int c = 0; c < n_bands; ++c) {
+                const REAL ac = a[c];
+                for (int l = 0; l < LANES; ++l) sum[l] += ac * g[c * band + x + l];
+            }
+            for (int l = 0; l < LANES; ++l) out[x + l] = sum[l];
+        }
+        for (; x < nx; ++x) {
+#else
+        FOR_X(x, nx) {
+#endif
+            REAL sum = add ? out[x] : (REAL)0;
+            for (int c = 0; c < n_bands; ++c) sum += a[c] * g[c * band + x];
+            out[x] = sum;
+        }
+    }
+}
+
+__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
+void gather_spectra(__global const int *restrict table, __global const REAL *restrict frame,
+                    __global const REAL *restrict boxed, const int n_channels, const int channel,
                     const int n_bands, const int ny_frame, const int nx_frame,
                     __global REAL *restrict d_spectra)
 {
     __local REAL share[WG];
     const int lid = (int)get_local_id(0), c = (int)get_global_id(1), s = (int)get_global_id(2);
     HEAD(s)
-    const int b = box[SCENE];
-    __global const REAL *g =
-        gradient + (((size_t)b * n_bands + c) * ny_frame + y0) * nx_frame + x0;
+    __global const REAL *g = ROW_OF(frame, box[SCENE], c, n_bands, y0, ny_frame, nx_frame) + x0;
+    __global const REAL *m = boxed + offset;
     REAL total = 0;
-    for (int y = lid; y < ny; y += WG) {
-        __global const REAL *m = morph + offset + (size_t)y * nx;
-        REAL part[8] = {0, 0, 0, 0, 0, 0, 0, 0};
+#if ROWS
+    REAL part[LANES];
+    for (int l = 0; l < LANES; ++l) part[l] = 0;
+    for (int y = 0; y < ny; ++y, m += nx, g += nx_frame) {
         int x = 0;
-        for (; x + 8 <= nx; x += 8)
-            for (int k = 0; k < 8; ++k) part[k] += m[x + k] * g[(size_t)y * nx_frame + x + k];
-        for (; x < nx; ++x) part[0] += m[x] * g[(size_t)y * nx_frame + x];
-        total += SUM8(part);
+        for (; x + LANES <= nx; x += LANES)
+            for (int l = 0; l < LANES; ++l) part[l] += m[x + l] * g[x + l];
+        for (; x < nx; ++x) total += m[x] * g[x];
     }
+    total += SUM8(part) + SUM8(part + 8);
+#else
+    for (int i = lid; i < ny * nx; i += WG) total += m[i] * g[(size_t)(i / nx) * nx_frame + i % nx];
+#endif
     total = group_sum(total, lid, share);
     if (lid == 0) d_spectra[(size_t)s * n_channels + channel + c] = total;
 }

@@ -13,15 +13,16 @@
  * form         S = P + W o K_y scratch
  * step_morph   S <- AMSGrad with g = dS
  *              launch of these: (X, tallest box, len(active)); for the sources listed in `active`
- * step_spectra A <- max(0, AMSGrad in units of `scale` with g = scale o dA); launch: (S * C)
- * step_sky     sky <- sky - SKY_RATE sum(w r) / sum(w); launch: (B * C)
+ * step_spectra A <- max(0, AMSGrad in units of `scale` with g = scale o dA); for n = S C of them
+ * step_sky     sky <- sky - SKY_RATE sum(w r) / sum(w); for n = B C levels
  *              pull (B, n_rows): sum of w r of each observed row; channel c has rows
  *              row0[c] .. row0[c + 1] - 1;  inverse (B, C): 1 / sum(w)
- * losses       out[i_loss, b] = sum of loss rows + 1/2 sum_s |z_s|^2; launch: (B)
- *              best[b] = the lowest of those with i_loss = 0
+ * losses       out[i_loss, b] = sum of loss rows + 1/2 sum_s |z_s|^2
+ *              best[b] = the lowest of those with i_loss = 0; launch: (WG, B), groups of (WG, 1)
  * keep         kept_* <- latent, morph, spectra, sky of the scenes whose loss[b] is best[b], and so
  *              never of one whose loss is NaN; launch: (X, tallest box, S)
- * rescale      A[s, c] *= factor[s]: what a normalisation took out of a morphology; launch: (S * C)
+ * rescale      A[s, c] *= factor[s]: what a normalisation took out of a morphology; for n = S C
+ *              launch of these three: any (see FOR_I of group.h)
  *
  * e = EPSILON + rate damping[s] for morphologies: no step is longer than gradient / damping, where
  * damping is a bound on the curvature; EPSILON for spectra, whose units are those of their errors.
@@ -54,6 +55,7 @@
     const int ny = box[NY], nx = box[NX]; \
     if (y >= ny) return; \
     const size_t begin = BEGIN(box), row = begin + (size_t)y * nx;
+#define LANES 16     /* sums that run side by side where a work-item has a whole row */
 
 /* sqrt(x), x >= 0, from plain arithmetic so that loops vectorise everywhere: a first guess of
  * 1 / sqrt from the exponent, then Newton's steps, each of which doubles the digits from 5 bits. */
@@ -123,12 +125,24 @@ static void blur_y(__global const REAL *taps, __global const REAL *scratch, cons
                    const int y, const int ny, const int nx, __global REAL *out)
 {
     const size_t row = begin + (size_t)y * nx;
-    FOR_X(x, nx) out[row + x] = 0;
-    for (int t = -RADIUS; t <= RADIUS; ++t) {
-        if (y + t < 0 || y + t >= ny) continue;
-        const REAL k = taps[t + RADIUS];
-        __global const REAL *in = scratch + begin + (size_t)(y + t) * nx;
-        FOR_X(x, nx) out[row + x] += k * in[x];
+    const int low = y > RADIUS ? -RADIUS : -y, high = ny - 1 - y < RADIUS ? ny - 1 - y : RADIUS;
+    __global const REAL *k = taps + RADIUS;
+#if ROWS
+    int x = 0;
+    for (; x + LANES <= nx; x += LANES) {
+        REAL sum[LANES];
+        for (int l = 0; l < LANES; ++l) sum[l] = 0;
+        for (int t = low; t <= high; ++t)
+            for (int l = 0; l < LANES; ++l) sum[l] += k[t] * scratch[row + t * nx + x + l];
+        for (int l = 0; l < LANES; ++l) out[row + x + l] = sum[l];
+    }
+    for (; x < nx; ++x) {
+#else
+    FOR_X(x, nx) {
+#endif
+        REAL sum = 0;
+        for (int t = low; t <= high; ++t) sum += k[t] * scratch[row + t * nx + x];
+        out[row + x] = sum;
     }
 }
 
@@ -176,46 +190,58 @@ __kernel void step_morph(__global const int *restrict active, __global const int
 __kernel void step_spectra(__global const REAL *restrict gradient,
                            __global const REAL *restrict scale, __global REAL *restrict spectra,
                            __global REAL *restrict m, __global REAL *restrict v,
-                           __global REAL *restrict h, const REAL rate, const REAL t1, const REAL t2)
+                           __global REAL *restrict h, const REAL rate, const REAL t1, const REAL t2,
+                           const int n)
 {
-    const size_t i = get_global_id(0);
-    const REAL a = spectra[i]
-                 - rate * scale[i] * amsgrad(scale[i] * gradient[i], m, v, h, i,
-                                               (REAL)EPSILON, t1, t2);
-    spectra[i] = a < 0 ? (REAL)0 : a;
+    FOR_I(i, n) {
+        const REAL a = spectra[i]
+                     - rate * scale[i] * amsgrad(scale[i] * gradient[i], m, v, h, i,
+                                                   (REAL)EPSILON, t1, t2);
+        spectra[i] = a < 0 ? (REAL)0 : a;
+    }
 }
 
 __kernel void step_sky(const int n_channels, const int n_rows, __global const int *restrict row0,
                        __global const REAL *restrict pull, __global const REAL *restrict inverse,
-                       __global REAL *restrict sky)
+                       __global REAL *restrict sky, const int n)
 {
-    const int i = (int)get_global_id(0), b = i / n_channels, c = i % n_channels;
-    REAL sum = 0;
-    for (int r = row0[c]; r < row0[c + 1]; ++r) sum += pull[(size_t)b * n_rows + r];
-    sky[i] -= (REAL)SKY_RATE * sum * inverse[i];
+    FOR_I(i, n) {
+        const int b = i / n_channels, c = i % n_channels;
+        REAL sum = 0;
+        for (int r = row0[c]; r < row0[c + 1]; ++r) sum += pull[(size_t)b * n_rows + r];
+        sky[i] -= (REAL)SKY_RATE * sum * inverse[i];
+    }
 }
 
-__kernel void losses(__global const int *restrict first, __global const int *restrict table,
-                     const int n_rows, __global const REAL *restrict rows, const int prior,
-                     __global const REAL *restrict latent, __global REAL *restrict out,
-                     __global REAL *restrict best, const int i_loss)
+__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
+void losses(__global const int *restrict first, __global const int *restrict table,
+            const int n_rows, __global const REAL *restrict rows, const int prior,
+            __global const REAL *restrict latent, __global REAL *restrict out,
+            __global REAL *restrict best, const int i_loss)
 {
-    const int b = (int)get_global_id(0);
+    __local REAL share[WG];
+    const int lid = (int)get_local_id(0), b = (int)get_global_id(1);
     REAL total = 0;
-    for (int r = 0; r < n_rows; ++r) total += rows[(size_t)b * n_rows + r];
+    for (int r = lid; r < n_rows; r += WG) total += rows[(size_t)b * n_rows + r];
     if (prior)
         for (int s = first[b]; s < first[b + 1]; ++s) {
             __global const int *box = BOX(s);
             __global const REAL *z = latent + BEGIN(box);
             const int n = box[NY] * box[NX];
+#if ROWS
             REAL part[8] = {0, 0, 0, 0, 0, 0, 0, 0};
             int i = 0;
             for (; i + 8 <= n; i += 8)
                 for (int k = 0; k < 8; ++k) part[k] += z[i + k] * z[i + k];
             for (; i < n; ++i) part[0] += z[i] * z[i];
-            for (int k = 0; k < 8; ++k) total += (REAL)0.5 * part[k];
+            total += (REAL)0.5 * SUM8(part);
+#else
+            for (int i = lid; i < n; i += WG) total += (REAL)0.5 * z[i] * z[i];
+#endif
         }
-    out[(size_t)i_loss * get_global_size(0) + b] = total;
+    total = group_sum(total, lid, share);
+    if (lid > 0) return;
+    out[(size_t)i_loss * get_global_size(1) + b] = total;
     if (i_loss == 0 && total < best[b]) best[b] = total;
 }
 
@@ -241,8 +267,7 @@ __kernel void keep(__global const int *restrict active, __global const int *rest
 }
 
 __kernel void rescale(__global const REAL *restrict factor, const int n_channels,
-                      __global REAL *restrict spectra)
+                      __global REAL *restrict spectra, const int n)
 {
-    const size_t i = get_global_id(0);
-    spectra[i] *= factor[i / n_channels];
+    FOR_I(i, n) spectra[i] *= factor[i / n_channels];
 }

@@ -120,12 +120,13 @@ class Tuning:
         return self.tile | {"MR": min(choices, key=covered)}
 
     def local_size(self, n_axes):
-        """Group of a kernel with one work-item a row, pixel or item; None: the driver chooses.
+        """Group of a kernel with a work-item for each item (1 axis), or row or pixel (3 axes).
 
         Groups of one on CPUs: left to choose, their runtimes take another size for every box and
-        build each kernel anew for it, 0.6 s in all; a GPU's drivers build once.
+        build each kernel anew for it, 0.6 s in all. On GPUs neighbours in a row read together, and
+        two warps of 32 make a group that every GPU allows.
         """
-        return (1,) * n_axes if self.row_loops else None
+        return (1,) * n_axes if self.row_loops else {1: (64,), 3: (32, 2, 1)}[n_axes]
 
 
 def _cpu_tile(device, dtype) -> dict[str, int]:

@@ -1,10 +1,9 @@
-"""Loss and gradients on the device: kernels as their references, slopes as finite differences, the
-scene as operators under the dot test; on CPUs' builds and on GPUs'."""
+"""Loss and gradients on the device: kernels as their references, slopes as finite differences; on
+CPUs' builds and on GPUs'."""
 
 import numpy as np
 import pytest
 from helpers.solver import (
-    BOXES,
     PRIOR,
     changed,
     close,
@@ -17,22 +16,20 @@ from helpers.solver import (
 
 from clresample.deblending.solver import reference as ref
 from clresample.deblending.solver.amsgrad import BETA1
-from clresample.deblending.solver.operators import MorphologyOperator, SpectraOperator
-from clresample.deblending.solver.scene_model import compose
-from clresample.testing import check_adjoint, dense
+from clresample.deblending.solver.gradient import Gradient
 
 
+@pytest.mark.parametrize("depth", [0, 1, 2, None])
 @every_type
-def test_kernels_are_their_references(build, dtype):
+def test_kernels_are_their_references(build, dtype, depth):
+    """Whatever the stage at which spectra are applied."""
     pairs = ragged(build, dtype)
     e, found = engine(pairs, build, dtype), references(pairs, PRIOR)
     for r in found:
         r.gradient()
+    e._gradient = Gradient(e.buffers, with_prior=True, depth=depth)
     e.gradient(3)
-    observed = e._gradient.observations
     close(build.get(e.losses)[3], [r.loss for r in found], dtype)
-    models = [build.get(o.model) for o in observed]
-    close(np.concatenate(models, axis=1), [r.g for r in found], dtype)
     close(build.get(e.buffers.d_spectra), np.concatenate([r.d_spectra for r in found]), dtype)
     d_morph = e.buffers.host_boxes.unpack(build.get(e.buffers.d_morph))
     wanted = [d for r in found for d in r.d_morph]
@@ -41,83 +38,6 @@ def test_kernels_are_their_references(build, dtype):
         close(d_morph[i], wanted[i] if free[i] else 0 * wanted[i], dtype)
     pull = np.add.reduceat(build.get(e._gradient.rows_pull), e._gradient.rows[:-1], axis=1)
     close(pull, [r.pull for r in found], dtype)
-
-
-OPERATORS = pytest.mark.parametrize("kind", [MorphologyOperator, SpectraOperator])
-
-
-@OPERATORS
-@every_type
-def test_the_scene_composes_models(build, kind, dtype):
-    """Of each observation's bands, from what the buffers hold."""
-    pairs = ragged(build, dtype)
-    b = engine(pairs, build, dtype).buffers
-    x = build.get(b.morph if kind is MorphologyOperator else b.spectra)
-    for i, part in enumerate((slice(0, 1), slice(1, 3))):
-        model = kind(b, i).forward(x)
-        for found, (scene, state) in zip(model, pairs, strict=True):
-            wanted = compose(scene.shape, scene.origin, state.morph, state.spectra)
-            close(found, wanted[part], dtype)
-
-
-@OPERATORS
-@every_type
-def test_the_scenes_adjoints_pass_the_dot_test(build, kind, dtype):
-    b = engine(ragged(build, dtype), build, dtype).buffers
-    for i in (0, 1):
-        check_adjoint(kind(b, i), np.random.default_rng(i))
-
-
-class Forgetful(MorphologyOperator):
-    """Leaves out the fixed source, as the solver's own launch may: no adjoint any more."""
-
-    def _adjoint(self, y, out):
-        self.device.copy(self._zeros, out)
-        self.gather(y, out, self.buffers.free)
-
-
-class Doubled(MorphologyOperator):
-    """Adds its answer twice."""
-
-    def _adjoint(self, y, out):
-        super()._adjoint(y, out)
-        self.gather(y, out, self.buffers.boxes.everyone, add=True)
-
-
-class Stale(SpectraOperator):
-    """Takes morphologies of before."""
-
-    def __init__(self, buffers, i_observation):
-        super().__init__(buffers, i_observation)
-        self._gather.bind(morph=buffers.profile)
-
-
-class Shifted(SpectraOperator):
-    """Gathers from the channel before its own."""
-
-    def __init__(self, buffers, i_observation):
-        super().__init__(buffers, i_observation)
-        self._gather.bind(channel=self.channel - 1)
-
-
-@pytest.mark.parametrize("kind", [Forgetful, Doubled, Stale, Shifted])
-def test_the_dot_test_finds_a_broken_adjoint(device, kind):
-    b = engine(ragged(device, np.float32), device, np.float32).buffers
-    with pytest.raises(AssertionError, match=r"of \|Ax\|\|y\|"):
-        check_adjoint(kind(b, 1), np.random.default_rng(0))
-
-
-def test_operators_are_matrices_of_the_scene(device):
-    """Of one small scene, column by column; a batch of items is refused."""
-    scene, state = posed(device, np.float32, boxes=BOXES[3:4])
-    b = engine([(scene, state)], device, np.float32).buffers
-    op = SpectraOperator(b, 1)
-    columns = dense(op).reshape(2, *scene.shape, 3)
-    y, x = BOXES[3][:2]
-    np.testing.assert_allclose(columns[:, y, x], state.morph[0][0, 0] * np.eye(3)[1:], rtol=1e-6)
-    assert np.count_nonzero(columns) == 2
-    with pytest.raises(ValueError, match="batch of 2 items is given; SpectraOperator takes one"):
-        op.forward(np.zeros((2, 1, 3)))
 
 
 def losses_at(device, pair, prior=PRIOR):

@@ -72,6 +72,7 @@ class AMSGrad:
             scale=b.scale,
             spectra=b.spectra,
             rate=step_sizes.spectrum,
+            n=b.spectra.size,
             **_named(self._m_spectra),
         )
         self._sky = _sky_step(b, gradient) if b.scenes[0].fit_sky else None
@@ -81,9 +82,9 @@ class AMSGrad:
         b = self.buffers
         self.n_steps += 1
         t1, t2 = (1 / (1 - beta**self.n_steps) for beta in (BETA1, BETA2))
-        self._spectra((b.spectra.size,), t1=t1, t2=t2)
+        self._spectra(b.items(b.spectra.size), t1=t1, t2=t2)
         if self._sky is not None:
-            self._sky((b.sky.size,))
+            self._sky(b.items(b.sky.size))
         if not b.n_free:
             return
         self._morph.step(t1, t2)
@@ -105,7 +106,7 @@ class _LatentStep:
 
     def __init__(self, buffers, moments, prior, step_sizes):
         b, self.step_size = buffers, step_sizes.latent
-        self._size = b.row_width, b.tallest, b.n_free
+        self._size = b.box_rows(b.n_free)
         common = {"active": b.free, "table": b.boxes.table, "taps": b.put(prior.taps)}
         options = {"RADIUS": len(prior.taps) // 2} | DECAY
         blurred, weighed = b.zeros_flat(), b.zeros_flat()  # K along x, and what is blurred
@@ -145,7 +146,7 @@ class _MorphologyStep:
 
     def __init__(self, buffers, moments, factor, step_sizes):
         b, self.step_size = buffers, step_sizes.morphology
-        self._size, self._n_spectra = (b.row_width, b.tallest, b.n_free), b.spectra.size
+        self._size, self._spectra_size = b.box_rows(b.n_free), b.items(b.spectra.size)
         self._step = b.launcher("update.cl", "step_morph", 3, **DECAY).bind(
             active=b.free,
             table=b.boxes.table,
@@ -156,7 +157,7 @@ class _MorphologyStep:
             **_named(moments),
         )
         self._rescale = b.launcher("update.cl", "rescale", 1, **DECAY).bind(
-            factor=factor, n_channels=b.n_channels, spectra=b.spectra
+            factor=factor, n_channels=b.n_channels, spectra=b.spectra, n=b.spectra.size
         )
 
     def step(self, t1, t2):
@@ -165,7 +166,7 @@ class _MorphologyStep:
 
     def after_constraints(self):
         """Queue the spectra's part of a normalisation."""
-        self._rescale((self._n_spectra,))
+        self._rescale(self._spectra_size)
 
 
 def _sky_step(buffers, gradient):
@@ -180,6 +181,7 @@ def _sky_step(buffers, gradient):
         pull=gradient.rows_pull,
         inverse=buffers.put(inverse),
         sky=buffers.sky,
+        n=buffers.sky.size,
     )
 
 

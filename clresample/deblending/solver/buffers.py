@@ -8,6 +8,9 @@ from ...device.tuning import Tuning
 from .boxes import ALIGN, Boxes
 from .scene import State
 
+# Items that a work-item takes on CPUs: PoCL starts one in 50 ns, in which many numbers are stepped.
+ITEMS_EACH = 64
+
 
 class Buffers:
     """The arrays of B scenes of one signature, with S sources in all, on one device.
@@ -19,7 +22,6 @@ class Buffers:
     profile, amplitude, latent, morph, d_morph (boxes.size,): flat, laid out by the boxes: expected
         morphologies, the scatter that the prior allows about them (0 without one), z, S, dL/dS
     spectra, d_spectra, scale (S, C); sky (B, C)
-    row_width, tallest [px]: work-items along a row of a box, and rows of the tallest one
     """
 
     def __init__(self, scenes, states, device, dtype, prior):
@@ -38,8 +40,6 @@ class Buffers:
         free = np.flatnonzero(~np.concatenate([s.fixed for s in scenes]))
         self.n_free = len(free)
         self.free = device.put(free if self.n_free else [0], np.int32)
-        self.tallest = int(self.host_boxes.shape[:, 0].max())
-        self.row_width = 1 if self.tuning.row_loops else int(self.host_boxes.shape[:, 1].max())
 
         self.profile = self.flat([s.profile for s in scenes])
         amplitude = prior.amplitude if prior else np.zeros_like
@@ -95,9 +95,32 @@ class Buffers:
             dtype=self.dtype,
             local_size=local_size or self.tuning.local_size(n_axes),
             ROWS=self.tuning.row_loops,
+            WG=self.tuning.sum_group,
             ALIGN=ALIGN,
             **defines,
         )
+
+    def along_row(self, n):
+        """Work-items for rows of `n` pixels: one where it walks the row, else one a pixel."""
+        return 1 if self.tuning.row_loops else int(n)
+
+    def box_rows(self, n_boxes):
+        """A launch over the rows of `n_boxes` boxes, of which any may be the largest."""
+        tallest, widest = self.host_boxes.shape.max(0)
+        return self.sized(widest, tallest, n_boxes)
+
+    def items(self, n):
+        """A launch for `n` items, several a work-item on CPUs; see FOR_I of group.h."""
+        if self.tuning.row_loops:
+            return (-(-n // ITEMS_EACH),)
+        (group,) = self.tuning.local_size(1)
+        return (-(-n // group) * group,)
+
+    def sized(self, n_x, n_y, n_z):
+        """A launch over rows of n_x pixels, n_y of them, in whole groups of the tuning."""
+        group = self.tuning.local_size(3)
+        size = self.along_row(n_x), int(n_y), n_z
+        return tuple(-(-n // g) * g for n, g in zip(size, group, strict=True))
 
     def split(self, rows):
         """Arrays (S, ...) of all sources, one part for each scene."""

@@ -48,7 +48,7 @@ class Engine:
         )
         self.losses = device.empty((MOST_STEPS, len(scenes)), b.dtype)
         self._kept = [device.put(device.get(a)) for a in b.iterated]
-        self._keep_size = b.row_width, b.tallest, b.n_sources
+        self._keep_size = b.box_rows(b.n_sources)
         names = "latent", "morph", "spectra", "sky"
         self._keep = b.launcher("update.cl", "keep", 3).bind(
             active=b.boxes.everyone,

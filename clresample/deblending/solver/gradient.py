@@ -4,8 +4,8 @@
     G_o = R_o^T w_o (R_o M + sky - d_o)
     dS_s = sum_c A[s, c] G_c on the box,   dA[s, c] = <S_s, G_c>,   dsky_c = sum of w_o (...)
 
-|z|^2 is the prior's, and its gradient is added where z is stepped (amsgrad.py). The model is
-rendered by `compose` of operators.py and the operators R_o; kernels in scene.cl and update.cl.
+|z|^2 is the prior's, and its gradient is added where z is stepped (amsgrad.py). rendering/ has how
+R_o M and the gradients are computed; kernels in scene.cl, boxed.cl and update.cl.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...resampling.resampler import Resampler
-from .operators import MorphologyOperator, SpectraOperator
+from .rendering.choice import rendering
 
 
 class Gradient:
@@ -21,13 +21,15 @@ class Gradient:
 
     buffers: the batch; d_morph and d_spectra of it are overwritten
     with_prior: whether the loss has the term of z
+    depth: at which stage of rendering spectra are applied, see rendering/stages.py; None leaves it
+        to each observation's count
     rows (C + 1,): observed rows of all channels up to each, the columns of:
     rows_loss, rows_pull (B, n_rows): 1/2 sum w r^2 and sum w r of each observed row, whose sums
         over a channel's rows are its loss and dL/dsky
     best (B,): lowest loss of each scene among those computed with i_loss = 0, infinite before
     """
 
-    def __init__(self, buffers, with_prior):
+    def __init__(self, buffers, with_prior, depth=None):
         self.buffers, scenes = buffers, buffers.scenes
         heights = [op.shape_out[1] for op in scenes[0].ops for _ in range(op.shape_out[0])]
         self.rows = np.concatenate([[0], np.cumsum(heights)])
@@ -36,8 +38,10 @@ class Gradient:
             buffers.device.empty(shape, buffers.dtype) for _ in range(2)
         )
         self.best = buffers.put(np.full(len(scenes), np.inf))
-        self.observations = [_ObservedBatch(self, i) for i in range(len(scenes[0].ops))]
-        self._losses = buffers.launcher("update.cl", "losses", 1).bind(
+        self.observations = [_ObservedBatch(self, i, depth) for i in range(len(scenes[0].ops))]
+        group = buffers.tuning.sum_group
+        self._losses_size = group, len(scenes)
+        self._losses = buffers.launcher("update.cl", "losses", 2, local_size=(group, 1)).bind(
             first=buffers.first,
             table=buffers.boxes.table,
             n_rows=shape[1],
@@ -50,7 +54,7 @@ class Gradient:
     def __call__(self, losses, i_loss):
         """Queue it all; losses[i_loss] of losses (n, B), on the device, are the scenes' losses."""
         self.queue()
-        self._losses((len(self.buffers.scenes),), out=losses, i_loss=i_loss)
+        self._losses(self._losses_size, out=losses, i_loss=i_loss)
 
     def queue(self):
         """Queue everything but the losses' sums: gradients, rows_loss and rows_pull."""
@@ -66,23 +70,22 @@ class Gradient:
 class _ObservedBatch:
     """One observation of every scene of a batch: data, operator and buffers for its images.
 
-    model (B, Co, Ny, Nx): M, and then its gradient G; image (B, Co, My, Mx): R M, then w r
+    op: the operator; rendering: its Frames or Transformed; image (B, Co, My, Mx): R M, then w r
     """
 
-    def __init__(self, gradient, i_observation):
+    def __init__(self, gradient, i_observation, depth):
         buffers = self.buffers = gradient.buffers
         scenes, device, i = buffers.scenes, buffers.device, i_observation
         self._ops = [scene.ops[i] for scene in scenes]
         self.op = self._common(self._ops)
         n, channel = len(scenes), scenes[0].channels()[i].start
         n_bands, my, mx = self.op.shape_out
-        self.model = device.empty((n, *self.op.shape_in), buffers.dtype)
         self.image = device.empty((n, *self.op.shape_out), buffers.dtype)
-        self.add, self._residual_size = i > 0, (my, n_bands, n)
-        self.by_morph = MorphologyOperator(buffers, i)
-        self.by_spectra = SpectraOperator(buffers, i)
+        self.rendering = rendering(buffers, i, self.op, depth)
+        group = buffers.tuning.sum_group
+        self.add, self._residual_size = i > 0, (group, my, n * n_bands)
         self._residual = buffers.launcher(
-            "scene.cl", "residual", 3, WG=buffers.tuning.sum_group
+            "scene.cl", "residual", 3, local_size=(group, 1, 1), VW=buffers.tuning.tile["VW"]
         ).bind(
             n_channels=buffers.n_channels,
             channel=channel,
@@ -112,14 +115,14 @@ class _ObservedBatch:
 
     def queue(self):
         """Queue the model, its residual and what that adds to the gradients."""
-        b = self.buffers
-        self.by_morph.compose(b.morph, b.spectra, self.model)
-        self.op.forward_into(self.model, self.image)
+        b, shown = self.buffers, self.rendering
+        shown.transform(b.morph)
+        shown.render(b.spectra, self.image)
         self._residual(self._residual_size)
-        self.op.adjoint_into(self.image, self.model)
-        self.by_spectra.gather(self.model, b.d_spectra)
+        shown.collect(self.image)
+        shown.gather_spectra(b.d_spectra)
         if b.n_free:
-            self.by_morph.gather(self.model, b.d_morph, b.free, add=self.add)
+            shown.gather_morph(b.spectra, b.d_morph, b.free, add=self.add)
 
     def follow_shifts(self):
         """Shift the batch's operator as the scenes' own ones are."""

@@ -1,9 +1,10 @@
-"""The scene as linear operators: the model is linear in its morphologies and in its spectra.
+"""The scene as linear operators: an image of it is linear in its morphologies and in its spectra.
 
-    M[b, c] = sum_s A[s, c] S_s          the sources s of scene b, the bands c of one observation
+    I[b, c] = R_c M[b, c],   M[b, c] = sum_s A[s, c] S_s    sources s of scene b, an observation's
+                                                            channels c
 
-`MorphologyOperator` takes S to M at fixed A, `SpectraOperator` takes A to M at fixed S. Their
-adjoints turn a gradient by M into gradients by S and by A; kernels in scene.cl.
+`MorphologyOperator` takes S to I at fixed A, `SpectraOperator` takes A to I at fixed S. Their
+adjoints turn a gradient by I into gradients by S and by A. rendering/ has how it is computed.
 """
 
 from __future__ import annotations
@@ -14,34 +15,15 @@ from ...resampling.linop import LinOp
 
 
 class SceneOperator(LinOp):
-    """What both have: the model of one observation's bands for every scene of a batch.
+    """What both have: the images of one observation for every scene of a batch, (B, Co, My, Mx).
 
-    buffers: the batch; i_observation: which of its observations
-    model (B, Co, Ny, Nx): the operators' output, in the order of the batch's scenes
+    buffers: the batch; op: its operator of that observation; rendering: its Frames or Transformed
     """
 
-    def __init__(self, buffers, i_observation, shape_in):
-        scene = buffers.scenes[0]
-        part = scene.channels()[i_observation]
-        self.buffers, self.channel, self.n_bands = buffers, part.start, part.stop - part.start
-        shape_out = (len(buffers.scenes), self.n_bands, *scene.shape)
+    def __init__(self, buffers, op, rendering, shape_in):
+        self.buffers, self.rendering = buffers, rendering
+        shape_out = (len(buffers.scenes), *op.shape_out)
         super().__init__(buffers.device, buffers.dtype, shape_in, shape_out)
-        row_width = 1 if buffers.tuning.row_loops else scene.shape[1]
-        self._model_size = row_width, scene.shape[0], shape_out[0] * self.n_bands
-        self._compose = self._launcher("compose").bind(first=buffers.first)
-
-    def _launcher(self, name, local_size=None):
-        """A kernel of scene.cl that knows the table of the boxes and this observation's bands."""
-        b, (ny, nx) = self.buffers, self.shape_out[2:]
-        launcher = b.launcher("scene.cl", name, 3, local_size=local_size, WG=b.tuning.sum_group)
-        return launcher.bind(
-            table=b.boxes.table,
-            n_channels=b.n_channels,
-            channel=self.channel,
-            n_bands=self.n_bands,
-            ny_frame=ny,
-            nx_frame=nx,
-        )
 
     def _refuse_batch(self, x):
         """The kernels know one buffer of each kind: the scenes of a batch are inside an item."""
@@ -51,36 +33,26 @@ class SceneOperator(LinOp):
                 "all scenes"
             )
 
-    def compose(self, morph, spectra, model):
-        """Queue model = sum_s A S_s: flat morphologies, spectra (S, C) -> model."""
-        self._compose(self._model_size, morph=morph, spectra=spectra, model=model)
-
 
 class MorphologyOperator(SceneOperator):
-    """Morphologies to models at the batch's present spectra: (boxes.size,) -> (B, Co, Ny, Nx).
+    """Morphologies to images at the batch's present spectra: (boxes.size,) -> (B, Co, My, Mx).
 
-    dS_s = sum_c A[s, c] G[b, c] on the box            the adjoint; 0 between the boxes
+    dS_s = sum_c A[s, c] (R_c^T y_c) on the box       the adjoint; 0 between the boxes
     """
 
-    def __init__(self, buffers, i_observation):
-        super().__init__(buffers, i_observation, (buffers.host_boxes.size,))
-        self._gather = self._launcher("gather_morph").bind(spectra=buffers.spectra)
-
-    def gather(self, gradient, d_morph, active, *, add=False):
-        """Queue dS_s for the sources `active` (n,): written into d_morph, or added to it."""
-        size = self.buffers.row_width, self.buffers.tallest, active.size
-        self._gather(size, active=active, gradient=gradient, add=add, d_morph=d_morph)
+    def __init__(self, buffers, op, rendering):
+        super().__init__(buffers, op, rendering, (buffers.host_boxes.size,))
 
     def _forward(self, x, out):
-        """M = sum_s A S_s: morphologies (1, boxes.size) -> models (1, B, Co, Ny, Nx)."""
         self._refuse_batch(x)
-        self.compose(x, self.buffers.spectra, out)
+        self.rendering.transform(x)
+        self.rendering.render(self.buffers.spectra, out[0])
 
     def _adjoint(self, y, out):
-        """dS_s = sum_c A G on the boxes: gradients (1, B, Co, Ny, Nx) -> (1, boxes.size)."""
         self._refuse_batch(y)
         self.device.copy(self._zeros, out)  # no kernel writes to what lies between the boxes
-        self.gather(y, out, self.buffers.boxes.everyone)
+        self.rendering.collect(y[0])
+        self.rendering.gather_morph(self.buffers.spectra, out, self.buffers.boxes.everyone)
 
     @functools.cached_property
     def _zeros(self):
@@ -89,31 +61,25 @@ class MorphologyOperator(SceneOperator):
 
 
 class SpectraOperator(SceneOperator):
-    """Spectra to models at the batch's present morphologies: (S, C) -> (B, Co, Ny, Nx).
+    """Spectra to images at the batch's present morphologies: (S, C) -> (B, Co, My, Mx).
 
-    dA[s, c] = <S_s, G[b, c]>         the adjoint; 0 in the channels of other observations
+    dA[s, c] = <R_c S_s, y_c>         the adjoint; 0 in the channels of other observations
     """
 
-    def __init__(self, buffers, i_observation):
-        super().__init__(buffers, i_observation, buffers.spectra.shape)
-        group = buffers.tuning.sum_group
-        self._gather_size = group, self.n_bands, buffers.n_sources
-        self._gather = self._launcher("gather_spectra", (group, 1, 1)).bind(morph=buffers.morph)
-
-    def gather(self, gradient, d_spectra):
-        """Queue dA of this observation's channels into d_spectra (S, C)."""
-        self._gather(self._gather_size, gradient=gradient, d_spectra=d_spectra)
+    def __init__(self, buffers, op, rendering):
+        super().__init__(buffers, op, rendering, buffers.spectra.shape)
 
     def _forward(self, x, out):
-        """M = sum_s A S_s: spectra (1, S, C) -> models (1, B, Co, Ny, Nx)."""
         self._refuse_batch(x)
-        self.compose(self.buffers.morph, x, out)
+        self.rendering.transform(self.buffers.morph)
+        self.rendering.render(x, out[0])
 
     def _adjoint(self, y, out):
-        """dA = <S, G>: gradients (1, B, Co, Ny, Nx) -> (1, S, C)."""
         self._refuse_batch(y)
         self.device.copy(self._zeros, out)  # the channels of other observations
-        self.gather(y, out)
+        self.rendering.transform(self.buffers.morph)
+        self.rendering.collect(y[0])
+        self.rendering.gather_spectra(out)
 
     @functools.cached_property
     def _zeros(self):

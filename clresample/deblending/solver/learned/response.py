@@ -5,28 +5,26 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..rendering.composition import Composition
+
 
 class Response:
     """The operators of a batch's Gradient, asked about noise and misfit rather than gradients.
 
-    buffers, gradient: the batch and its Gradient, whose model and image buffers are overwritten
+    buffers, gradient: the batch and its Gradient, whose image buffers are overwritten
     weights: per observation R^T w (B, Co, Ny, Nx) on the device
     """
 
     def __init__(self, buffers, gradient):
         self.buffers, self._observations = buffers, gradient.observations
         self._pulls = buffers.zeros_like_spectra()
-        self._squares = [
-            buffers.launcher("scene.cl", "square", 3, WG=buffers.tuning.sum_group).bind(
-                n_bands=o.op.shape_out[0],
-                my=o.op.shape_out[1],
-                mx=o.op.shape_out[2],
-                image=o.image,
-            )
-            for o in self._observations
-        ]
-        self.weights = []
+        self._squares, self._frames, self.weights = [], [], []
         for i, o in enumerate(self._observations):
+            square = buffers.launcher("scene.cl", "square", 3, VW=buffers.tuning.tile["VW"])
+            _, my, mx = o.op.shape_out
+            self._squares.append(square.bind(my=my, mx=mx, image=o.image))
+            shape = o.op.shape_in[1:]
+            self._frames.append(Composition(buffers, i, buffers.host_boxes, shape))
             weights = buffers.put(np.stack([s.weights[i] for s in buffers.scenes]))
             self.weights.append(o.op.adjoint(weights))
 
@@ -42,11 +40,9 @@ class Response:
             impulse = np.zeros(covered.shape, b.dtype)
             for scene, (y, x) in zip(impulse, at, strict=True):
                 scene[:, y, x] = 1
-            b.device.upload(impulse, o.model)
-            o.op.forward_into(o.model, o.image)
-            o.op.adjoint_into(o.image, o.model)
+            answer = o.op.adjoint(o.op.forward(b.put(impulse)))
             level = [[_median(w) for w in s.weights[i]] for s in b.scenes]
-            answers.append(b.device.get(o.model) * np.array(level)[:, :, None, None])
+            answers.append(b.device.get(answer) * np.array(level)[:, :, None, None])
             pixels.append(np.repeat(at[:, None], covered.shape[1], axis=1))
         answers = np.concatenate(answers, axis=1)
         pairs = zip(b.scenes, answers, strict=True)
@@ -55,20 +51,16 @@ class Response:
     def misfit(self, spectra):
         """chi2 per pixel (S,) where each source's light is, <A^2 S, R^T w^2 r^2> / <A^2 S, R^T w>,
         of the residuals w r that are in the image buffers; spectra (S, C)."""
-        b = self.buffers
+        b, power = self.buffers, np.square(spectra)
         for o, square in zip(self._observations, self._squares, strict=True):
-            n_bands, my, _ = o.op.shape_out
-            square((my, n_bands, len(b.scenes)))
-            o.op.adjoint_into(o.image, o.model)
-        found = self._pull(spectra, [o.model for o in self._observations])
-        return found / np.maximum(self._pull(spectra, self.weights), 1e-30)
-
-    def _pull(self, spectra, images):
-        """<A^2 S, image> (S,) of images like the models."""
-        b = self.buffers
-        for o, image in zip(self._observations, images, strict=True):
-            o.by_spectra.gather(image, self._pulls)
-        return (np.square(spectra) * b.device.get(self._pulls)).sum(1)
+            n_bands, my, mx = o.op.shape_out
+            square(b.sized(mx, my, n_bands * len(b.scenes)))
+            o.rendering.collect(o.image)
+            o.rendering.gather_spectra(self._pulls)
+        found = (power * b.device.get(self._pulls)).sum(1)
+        for frames, weights in zip(self._frames, self.weights, strict=True):
+            frames.gather_spectra(weights, b.morph, self._pulls)
+        return found / np.maximum((power * b.device.get(self._pulls)).sum(1), 1e-30)
 
 
 def _unpadded(scene, images):

@@ -31,8 +31,7 @@ class Steps:
         group = b.tuning.sum_group
 
         def launcher(name, size=(group, 1)):
-            macros = {"WG": group, "SLOTS": n_slots}
-            return b.launcher("lbfgs.cl", name, len(size), local_size=size, **macros)
+            return b.launcher("lbfgs.cl", name, len(size), local_size=size, SLOTS=n_slots)
 
         self._change = launcher("change").bind(
             **shared,

@@ -96,7 +96,6 @@ class Structure:
         gauged = shared | {"inverse": b.put(inverse), "profile": b.profile, "morph": b.morph}
         group = b.tuning.sum_group
         launcher = b.launcher
-        macros["WG"] = group
         u = b.zeros_flat()
         self.energies = b.put(np.zeros((b.n_sources, self.n_scales)))
         self._spread = launcher("structure.cl", "spread", 3, **macros).bind(
@@ -114,8 +113,8 @@ class Structure:
         self._energy = launcher(
             "structure.cl", "energy", 3, local_size=(group, 1, 1), **macros
         ).bind(**placed, out=self.energies)
-        self._rows_size = b.row_width, b.tallest, b.n_free
-        self._coarse_size = b.row_width, int(rows.max()), b.n_free
+        self._rows_size = b.box_rows(b.n_free)
+        self._coarse_size = b.sized(b.host_boxes.shape[:, 1].max(), rows.max(), b.n_free)
         self._sources_size = group, b.n_free
         self._energy_size = group, self.n_scales, b.n_free
 

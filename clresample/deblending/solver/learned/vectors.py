@@ -33,6 +33,8 @@ class Vectors:
         self.chunks = self._chunks()
         self.chunk_table = b.device.put(self.chunks, np.int32)
         names = {"n_latents": latents.size, "n_spectra": self.n_spectra}
+        names["n"] = self.n_spectra + self.n_sky
+        self._numbers_size = b.items(names["n"])
         self._take = b.launcher("lbfgs.cl", "take", 1).bind(**names, spectra=b.spectra, sky=b.sky)
         self._give = b.launcher("lbfgs.cl", "give", 1).bind(
             **names, n_channels=b.n_channels, d_spectra=b.d_spectra, g_new=self.g_new
@@ -73,7 +75,7 @@ class Vectors:
         kind = np.digitize(first, [self.latents.size, self.latents.size + self.n_spectra])
         source = self.buffers.device.put(first + shift[scene, kind], np.int32)
         group = self.buffers.tuning.sum_group
-        move = self.buffers.launcher("lbfgs.cl", "move", 3, local_size=(group, 1, 1), WG=group)
+        move = self.buffers.launcher("lbfgs.cl", "move", 3, local_size=(group, 1, 1))
         move.bind(chunks=self.chunk_table, source=source, size=self.size, size_from=other.size)
         for name in self.NAMES:
             n_rows = self.n_slots if name in ("s", "y") else 1
@@ -82,9 +84,9 @@ class Vectors:
 
     def take(self, vector):
         """Queue spectra and sky levels of a vector into the batch's buffers."""
-        self._take((self.n_spectra + self.n_sky,), x=vector)
+        self._take(self._numbers_size, x=vector)
 
     def give(self, pull, rows):
         """Queue the gradients of spectra and sky into g_new; pull (B, n), rows (C + 1,)."""
         n_rows = pull.shape[1]
-        self._give((self.n_spectra + self.n_sky,), pull=pull, n_rows=n_rows, row0=rows)
+        self._give(self._numbers_size, pull=pull, n_rows=n_rows, row0=rows)

@@ -1,0 +1,49 @@
+"""One product of matrices for each source, of the size of its box: kernel boxed.cl."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ....device.contraction import SUM_BLOCK, padded
+
+# The columns of the kernel's table, each int64.
+COLUMNS = ["m", "n", "k", "begin_a", "ld_a", "step_a", "begin_b", "skip"]
+COLUMNS += ["begin_c", "ld_c", "step_c"]
+
+
+class BoxedProduct:
+    """C[s] = A[s] . B[s] for every source s of a batch, all at once.
+
+    buffers: the batch; ld_b: distance of B's rows
+    strided: A's columns lie step_a apart; ragged: C is stored element by element, n of them in a
+        row, else by vectors up to a multiple of 16
+    sizes: a value or an array (S,) for each of COLUMNS; step_a and step_c are 1 by default, skip 0
+    """
+
+    def __init__(self, buffers, ld_b, *, strided=False, ragged=False, **sizes):
+        b, sizes = buffers, {"step_a": 1, "step_c": 1, "skip": 0} | sizes
+        items = [np.broadcast_to(sizes[name], b.n_sources) for name in COLUMNS]
+        tile, m, width = b.tuning.tile, max(items[0]), max(items[1] + items[7])
+        group = tile["WGX"], tile["WGY"]
+        along = math.ceil(padded(int(width)) / (tile["VW"] * tile["NV"]))
+        tiles = b.along_row(along), int(m) / tile["MR"]
+        self._size = tuple(math.ceil(n / g) * g for n, g in zip(map(math.ceil, tiles), group))
+        self._launch = b.device.launcher(
+            "boxed.cl",
+            "boxed",
+            dtype=b.dtype,
+            local_size=(*group, 1),
+            STRIDED=strided,
+            RAGGED=ragged,
+            **tile,
+        ).bind(
+            items=b.device.put(np.stack(items, axis=1), np.int64),
+            block=max(SUM_BLOCK, math.isqrt(int(max(items[2])))),
+            ld_b=ld_b,
+        )
+
+    def __call__(self, a, b, c, active, *, add=False):
+        """Queue the products of the sources `active` (n,): C from A and B, added if ragged."""
+        self._launch((*self._size, active.size), A=a, B=b, C=c, active=active, add=add)

@@ -1,0 +1,104 @@
+/* Products of the sources' boxes with tables that all of them share: one for each source, of sizes
+ * and places of its own.
+ *
+ *   C[s] = A[s] . B[s],  A (m, k), B (k, n), C (m, n), for the sources listed in `active`
+ *
+ * items (S, N_COLUMNS) long, a row a source with the columns below: sizes, and in elements where
+ * A, B and C begin in their buffers, the distances of A's rows and columns, and of C's.  B's rows
+ * lie ld_b apart.
+ *   B is read as vectors: it begins at a multiple of 16 elements, as ld_b is one.  SKIP of its
+ *      columns come before the first that is wanted; they are computed and left out.
+ *   C is stored by vectors, up to a multiple of 16 columns, where B's zeros become C's; its first
+ *      element and its rows lie as B's do, and SKIP is 0.  If RAGGED, element by element, n of them
+ *      and no more; then `add` adds to what is there.
+ *
+ * A work-item owns MR rows and NV vectors of VW columns of C at a time, in registers, and sums
+ * terms in stretches of `block`: contract.cl has the picture, and why.
+ *
+ * Launch: (any number of work-items, which share the columns, ceil(most rows / MR), len(active)),
+ * each rounded up to its local size.  On CPUs one takes all columns: a tile of a small box takes
+ * no longer than the start of a work-item.
+ */
+#include "common.h"
+
+#ifndef VW          /* columns of a vector */
+#define VW 16
+#endif
+#ifndef NV          /* vectors a work-item owns in each row */
+#define NV 1
+#endif
+#ifndef MR          /* rows a work-item owns */
+#define MR 6
+#endif
+#ifndef WGX         /* work-items of a group along the columns of C */
+#define WGX 1
+#endif
+#ifndef WGY         /* work-items of a group along the rows of C */
+#define WGY 1
+#endif
+#ifndef STRIDED     /* 1: A's columns lie STEP_A apart; 0: they are adjacent */
+#define STRIDED 0
+#endif
+#ifndef RAGGED      /* 1: C is stored element by element; 0: by whole vectors */
+#define RAGGED 0
+#endif
+
+enum { M, N, K, BEGIN_A, LD_A, STEP_A, BEGIN_B, SKIP, BEGIN_C, LD_C, STEP_C, N_COLUMNS };
+
+#define WIDE VEC(VW)
+#define UNROLL(i, n) _Pragma("unroll") for (int i = 0; i < (n); ++i)
+
+__kernel __attribute__((reqd_work_group_size(WGX, WGY, 1)))
+void boxed(__global const int *restrict active, __global const long *restrict items,
+           const int block, __global const REAL *restrict A, __global const REAL *restrict B,
+           const int ld_b, __global REAL *restrict C, const int add)
+{
+    __global const long *item = items + (size_t)N_COLUMNS * active[get_global_id(2)];
+    const int m = (int)item[M], k = (int)item[K], skip = (int)item[SKIP];
+    const int end = skip + (int)item[N], n_pad = (end + 15) / 16 * 16;
+    const int i0 = (int)get_global_id(1) * MR;
+    if (i0 >= m) return;
+    A += item[BEGIN_A];
+    B += item[BEGIN_B];
+    C += item[BEGIN_C];
+#if STRIDED
+    const size_t step_a = (size_t)item[STEP_A];
+#else
+    const size_t step_a = 1;
+#endif
+    __global const REAL *row[MR];
+    UNROLL(i, MR) row[i] = A + (size_t)(i0 + i < m ? i0 + i : m - 1) * (size_t)item[LD_A];
+
+    for (int j0 = (int)get_global_id(0) * NV * VW; j0 < n_pad;
+         j0 += (int)get_global_size(0) * NV * VW) {
+        int column[NV];
+        WIDE acc[MR][NV];
+        UNROLL(v, NV) column[v] = j0 + v * VW < n_pad ? j0 + v * VW : j0;
+        UNROLL(i, MR) UNROLL(v, NV) acc[i][v] = (WIDE)(0);
+        for (int l0 = 0; l0 < k; l0 += block) {
+            const int l1 = l0 + block < k ? l0 + block : k;
+            WIDE part[MR][NV], right[NV];
+            UNROLL(i, MR) UNROLL(v, NV) part[i][v] = (WIDE)(0);
+            for (int l = l0; l < l1; ++l) {
+                UNROLL(v, NV) right[v] = AT(const WIDE, B + (size_t)l * ld_b + column[v]);
+                UNROLL(i, MR) UNROLL(v, NV) part[i][v] += row[i][l * step_a] * right[v];
+            }
+            UNROLL(i, MR) UNROLL(v, NV) acc[i][v] += part[i][v];
+        }
+        UNROLL(i, MR) UNROLL(v, NV) {
+            if (i0 + i >= m) break;
+#if RAGGED
+            __global REAL *c = C + (size_t)(i0 + i) * (size_t)item[LD_C];
+            const REAL *lane = (const REAL *)&acc[i][v];
+            for (int j = 0; j < VW; ++j) {
+                const int x = j0 + v * VW + j;
+                if (x < skip || x >= end) continue;
+                __global REAL *to = c + (size_t)(x - skip) * (size_t)item[STEP_C];
+                *to = add ? *to + lane[j] : lane[j];
+            }
+#else
+            AT(WIDE, C + (size_t)(i0 + i) * (size_t)item[LD_C] + column[v]) = acc[i][v];
+#endif
+        }
+    }
+}
