@@ -17,10 +17,6 @@
  * step_sky     sky <- sky - SKY_RATE sum(w r) / sum(w); for n = B C levels
  *              pull (B, n_rows): sum of w r of each observed row; channel c has rows
  *              row0[c] .. row0[c + 1] - 1;  inverse (B, C): 1 / sum(w)
- * losses       out[i_loss, b] = sum of loss rows + 1/2 sum_s |z_s|^2
- *              best[b] = the lowest of those with i_loss = 0; launch: (WG, B), groups of (WG, 1)
- * keep         kept_* <- latent, morph, spectra, sky of the scenes whose loss[b] is best[b], and so
- *              never of one whose loss is NaN; launch: (X, tallest box, S)
  * rescale      A[s, c] *= factor[s]: what a normalisation took out of a morphology; for n = S C
  *              launch of these three: any (see FOR_I of group.h)
  *
@@ -210,59 +206,6 @@ __kernel void step_sky(const int n_channels, const int n_rows, __global const in
         REAL sum = 0;
         for (int r = row0[c]; r < row0[c + 1]; ++r) sum += pull[(size_t)b * n_rows + r];
         sky[i] -= (REAL)SKY_RATE * sum * inverse[i];
-    }
-}
-
-__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
-void losses(__global const int *restrict first, __global const int *restrict table,
-            const int n_rows, __global const REAL *restrict rows, const int prior,
-            __global const REAL *restrict latent, __global REAL *restrict out,
-            __global REAL *restrict best, const int i_loss)
-{
-    __local REAL share[WG];
-    const int lid = (int)get_local_id(0), b = (int)get_global_id(1);
-    REAL total = 0;
-    for (int r = lid; r < n_rows; r += WG) total += rows[(size_t)b * n_rows + r];
-    if (prior)
-        for (int s = first[b]; s < first[b + 1]; ++s) {
-            __global const int *box = BOX(s);
-            __global const REAL *z = latent + BEGIN(box);
-            const int n = box[NY] * box[NX];
-#if ROWS
-            REAL part[8] = {0, 0, 0, 0, 0, 0, 0, 0};
-            int i = 0;
-            for (; i + 8 <= n; i += 8)
-                for (int k = 0; k < 8; ++k) part[k] += z[i + k] * z[i + k];
-            for (; i < n; ++i) part[0] += z[i] * z[i];
-            total += (REAL)0.5 * SUM8(part);
-#else
-            for (int i = lid; i < n; i += WG) total += (REAL)0.5 * z[i] * z[i];
-#endif
-        }
-    total = group_sum(total, lid, share);
-    if (lid > 0) return;
-    out[(size_t)i_loss * get_global_size(1) + b] = total;
-    if (i_loss == 0 && total < best[b]) best[b] = total;
-}
-
-__kernel void keep(__global const int *restrict active, __global const int *restrict table,
-                   __global const int *restrict first, const int n_channels,
-                   __global const REAL *restrict loss, __global const REAL *restrict best,
-                   __global const REAL *restrict latent, __global const REAL *restrict morph,
-                   __global const REAL *restrict spectra, __global const REAL *restrict sky,
-                   __global REAL *restrict kept_latent, __global REAL *restrict kept_morph,
-                   __global REAL *restrict kept_spectra, __global REAL *restrict kept_sky)
-{
-    ROW
-    const int b = box[SCENE];
-    if (!(loss[b] == best[b])) return;
-    FOR_X(x, nx) kept_latent[row + x] = latent[row + x];
-    FOR_X(x, nx) kept_morph[row + x] = morph[row + x];
-    if (y > 0 || get_global_id(0) > 0) return;
-    for (int c = 0; c < n_channels; ++c) {
-        const size_t i = (size_t)s * n_channels + c, j = (size_t)b * n_channels + c;
-        kept_spectra[i] = spectra[i];
-        if (s == first[b]) kept_sky[j] = sky[j];
     }
 }
 

@@ -54,6 +54,23 @@ class Resampler(GridOperator):
         op.shift = shift
         return op
 
+    @classmethod
+    def of_items(cls, ops: list[Resampler]) -> Resampler:
+        """The operator on batches whose item b is seen by ops[b]: theirs where they are one, else
+        one of all their plans, at their present shifts. ValueError where their layouts differ."""
+        if all(op is ops[0] for op in ops):
+            return ops[0]
+        shifts = np.stack([op.shift for op in ops])
+        plans = [op.plans[0] for op in ops]
+        return cls.from_plans(plans, dtype=ops[0].dtype, device=ops[0].device, shift=shifts)
+
+    @property
+    def layout(self):
+        """What operators have to have in common to serve one batch: see from_plans."""
+        plan = self.plans[0]
+        by_row = None if plan.lines is None else plan.lines.by_row
+        return self.geometry, plan.axes, self.shape_in, self.shape_out, by_row
+
     def _prepare(self, mapping, psf_in, psf_out, dtype, device):
         """The plan of a mapping, with its warnings, and its tables on the device."""
         plan = make_plan(mapping, psf_in, psf_out, precision=Precision.of(dtype))

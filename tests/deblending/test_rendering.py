@@ -4,8 +4,10 @@ under the dot test, and what is chosen; on CPUs' builds and on GPUs'."""
 import numpy as np
 import pytest
 from helpers.geometries import GEOMETRIES, ONE_OF_EACH, operator, psfs
+from helpers.scenes import blend, fit
 from helpers.solver import BOXES, CLOSE, PRIOR, changed, engine, every_type, posed
 
+from clresample.deblending.settings import Settings
 from clresample.deblending.solver.buffers import Buffers
 from clresample.deblending.solver.gradient import Gradient
 from clresample.deblending.solver.operators import MorphologyOperator, SpectraOperator
@@ -128,6 +130,25 @@ def test_gradients_are_the_same_at_every_depth(build, name):
     for other in found[1:]:
         for a, b in zip(found[0], other, strict=True):
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-13 * np.abs(a).max())
+
+
+@every_type
+def test_fits_are_the_same_at_every_depth(device, monkeypatch, dtype):
+    """To rounding, after 20 iterations, each of which builds on those before it."""
+    if dtype == np.float64 and not device.has_fp64:
+        pytest.skip(f"{device.name} has no double precision")
+    b, found = blend(), []
+    for depth in (0, 1, 2):
+        counts = [float(k != depth) for k in range(3)]
+        monkeypatch.setattr(choice, "flops", lambda *batch, counts=counts: counts)
+        settings = Settings(max_iter=20)
+        found.append(fit(b, device, settings=settings, dtype=dtype))
+    for other in found[1:]:
+        rtol = {np.float32: 1e-4, np.float64: 1e-11}[dtype]
+        np.testing.assert_allclose(other.losses, found[0].losses, rtol=rtol)
+        for k, o in enumerate(b.observations):
+            away = (other.model(k) - found[0].model(k)) * np.sqrt(o.weights)
+            assert np.abs(away).max() < {np.float32: 0.05, np.float64: 1e-8}[dtype]  # sigma
 
 
 class Forgetful(MorphologyOperator):

@@ -161,6 +161,10 @@ def test_items_with_their_own_geometry(device, geometry):
         # longer tables are padded with zeros, which add nothing but may regroup a sum
         assert distance(op(x)[i], single(x[i])) < 3e-7
         assert distance(op.adjoint(y)[i], single.adjoint(y[i])) < 3e-7
+    together = Resampler.of_items(singles)
+    assert (together(x) == op(x)).all()
+    assert len({single.layout for single in singles}) == 1
+    assert Resampler.of_items([op, op]) is op
     check_adjoint(op, np.random.default_rng(7), batch=(4,))
     assert op.covered.shape == (4, *op.shape_out[1:])
     with pytest.raises(ValueError, match="batch has 3 items, the operator 4 plans"):

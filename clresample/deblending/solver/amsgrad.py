@@ -67,7 +67,7 @@ class AMSGrad:
             self._morph = _MorphologyStep(b, self._m_morph, self.factor, step_sizes)
         else:
             self._morph = _LatentStep(b, self._m_morph, prior, step_sizes)
-        self._spectra = b.launcher("update.cl", "step_spectra", 1, **DECAY).bind(
+        self._spectra = _launcher(b, prior, "step_spectra", 1).bind(
             gradient=b.d_spectra,
             scale=b.scale,
             spectra=b.spectra,
@@ -75,7 +75,7 @@ class AMSGrad:
             n=b.spectra.size,
             **_named(self._m_spectra),
         )
-        self._sky = _sky_step(b, gradient) if b.scenes[0].fit_sky else None
+        self._sky = _sky_step(b, gradient, prior) if b.scenes[0].fit_sky else None
 
     def step(self):
         """Queue one step along the gradients that were queued before."""
@@ -108,11 +108,10 @@ class _LatentStep:
         b, self.step_size = buffers, step_sizes.latent
         self._size = b.box_rows(b.n_free)
         common = {"active": b.free, "table": b.boxes.table, "taps": b.put(prior.taps)}
-        options = {"RADIUS": len(prior.taps) // 2} | DECAY
         blurred, weighed = b.zeros_flat(), b.zeros_flat()  # K along x, and what is blurred
         kernels = ("blur", "step_latent", "blur", "form")
         self._blur_gradient, self._step, self._blur_latent, self._form = (
-            b.launcher("update.cl", name, 3, **options).bind(**common) for name in kernels
+            _launcher(b, prior, name, 3).bind(**common) for name in kernels
         )
         for blur, values, weigh in (
             (self._blur_gradient, b.d_morph, True),
@@ -147,7 +146,7 @@ class _MorphologyStep:
     def __init__(self, buffers, moments, factor, step_sizes):
         b, self.step_size = buffers, step_sizes.morphology
         self._size, self._spectra_size = b.box_rows(b.n_free), b.items(b.spectra.size)
-        self._step = b.launcher("update.cl", "step_morph", 3, **DECAY).bind(
+        self._step = _launcher(b, None, "step_morph", 3).bind(
             active=b.free,
             table=b.boxes.table,
             damping=_damping(b),
@@ -156,7 +155,7 @@ class _MorphologyStep:
             rate=self.step_size,
             **_named(moments),
         )
-        self._rescale = b.launcher("update.cl", "rescale", 1, **DECAY).bind(
+        self._rescale = _launcher(b, None, "rescale", 1).bind(
             factor=factor, n_channels=b.n_channels, spectra=b.spectra, n=b.spectra.size
         )
 
@@ -169,12 +168,18 @@ class _MorphologyStep:
         self._rescale(self._spectra_size)
 
 
-def _sky_step(buffers, gradient):
+def _launcher(buffers, prior, name, n_axes):
+    """A Launcher of a kernel of update.cl, all of one build."""
+    macros = DECAY | ({"RADIUS": len(prior.taps) // 2} if prior else {})
+    return buffers.launcher("update.cl", name, n_axes, **macros)
+
+
+def _sky_step(buffers, gradient, prior):
     """The kernel that moves sky levels by a part of a Newton step; launch: (B * C)."""
     totals = [w.sum(axis=(1, 2)) for s in buffers.scenes for w in s.weights]
     total = np.concatenate(totals)
     inverse = np.divide(1, total, where=total > 0, out=np.zeros_like(total))
-    return buffers.launcher("update.cl", "step_sky", 1, **DECAY).bind(
+    return _launcher(buffers, prior, "step_sky", 1).bind(
         n_channels=buffers.n_channels,
         n_rows=gradient.rows[-1],
         row0=buffers.device.put(gradient.rows, np.int32),

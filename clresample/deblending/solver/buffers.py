@@ -100,6 +100,10 @@ class Buffers:
             **defines,
         )
 
+    def scene_launcher(self, name, local_size=None):
+        """A Launcher of a kernel of scene.cl, all of one build."""
+        return self.launcher("scene.cl", name, 3, local_size=local_size, VW=self.tuning.tile["VW"])
+
     def along_row(self, n):
         """Work-items for rows of `n` pixels: one where it walks the row, else one a pixel."""
         return 1 if self.tuning.row_loops else int(n)

@@ -50,7 +50,7 @@ class Engine:
         self._kept = [device.put(device.get(a)) for a in b.iterated]
         self._keep_size = b.box_rows(b.n_sources)
         names = "latent", "morph", "spectra", "sky"
-        self._keep = b.launcher("update.cl", "keep", 3).bind(
+        self._keep = b.launcher("losses.cl", "keep", 3).bind(
             active=b.boxes.everyone,
             table=b.boxes.table,
             first=b.first,

@@ -5,10 +5,12 @@
     dS_s = sum_c A[s, c] G_c on the box,   dA[s, c] = <S_s, G_c>,   dsky_c = sum of w_o (...)
 
 |z|^2 is the prior's, and its gradient is added where z is stepped (amsgrad.py). rendering/ has how
-R_o M and the gradients are computed; kernels in scene.cl, boxed.cl and update.cl.
+R_o M and the gradients are computed; kernels in scene.cl, boxed.cl and losses.cl.
 """
 
 from __future__ import annotations
+
+import functools
 
 import numpy as np
 
@@ -39,22 +41,26 @@ class Gradient:
         )
         self.best = buffers.put(np.full(len(scenes), np.inf))
         self.observations = [_ObservedBatch(self, i, depth) for i in range(len(scenes[0].ops))]
-        group = buffers.tuning.sum_group
-        self._losses_size = group, len(scenes)
-        self._losses = buffers.launcher("update.cl", "losses", 2, local_size=(group, 1)).bind(
-            first=buffers.first,
-            table=buffers.boxes.table,
-            n_rows=shape[1],
-            rows=self.rows_loss,
-            prior=with_prior,
-            latent=buffers.latent,
-            best=self.best,
-        )
+        self._with_prior = with_prior
 
     def __call__(self, losses, i_loss):
         """Queue it all; losses[i_loss] of losses (n, B), on the device, are the scenes' losses."""
         self.queue()
-        self._losses(self._losses_size, out=losses, i_loss=i_loss)
+        self._losses((self.buffers.tuning.sum_group, len(self.best)), out=losses, i_loss=i_loss)
+
+    @functools.cached_property
+    def _losses(self):
+        """The kernel that sums them; the prior that learns does without."""
+        b, group = self.buffers, self.buffers.tuning.sum_group
+        return b.launcher("losses.cl", "losses", 2, local_size=(group, 1)).bind(
+            first=b.first,
+            table=b.boxes.table,
+            n_rows=self.rows[-1],
+            rows=self.rows_loss,
+            prior=self._with_prior,
+            latent=b.latent,
+            best=self.best,
+        )
 
     def queue(self):
         """Queue everything but the losses' sums: gradients, rows_loss and rows_pull."""
@@ -77,16 +83,14 @@ class _ObservedBatch:
         buffers = self.buffers = gradient.buffers
         scenes, device, i = buffers.scenes, buffers.device, i_observation
         self._ops = [scene.ops[i] for scene in scenes]
-        self.op = self._common(self._ops)
+        self.op = Resampler.of_items(self._ops)
         n, channel = len(scenes), scenes[0].channels()[i].start
         n_bands, my, mx = self.op.shape_out
         self.image = device.empty((n, *self.op.shape_out), buffers.dtype)
         self.rendering = rendering(buffers, i, self.op, depth)
         group = buffers.tuning.sum_group
         self.add, self._residual_size = i > 0, (group, my, n * n_bands)
-        self._residual = buffers.launcher(
-            "scene.cl", "residual", 3, local_size=(group, 1, 1), VW=buffers.tuning.tile["VW"]
-        ).bind(
+        self._residual = buffers.scene_launcher("residual", (group, 1, 1)).bind(
             n_channels=buffers.n_channels,
             channel=channel,
             n_bands=n_bands,
@@ -100,17 +104,6 @@ class _ObservedBatch:
             image=self.image,
             loss=gradient.rows_loss,
             pull=gradient.rows_pull,
-        )
-
-    def _common(self, ops):
-        """The scenes' operator where they share it, else one of all their plans."""
-        if all(op is ops[0] for op in ops):
-            return ops[0]
-        return Resampler.from_plans(
-            [op.plans[0] for op in ops],
-            dtype=self.buffers.dtype,
-            device=self.buffers.device,
-            shift=np.stack([op.shift for op in ops]),
         )
 
     def queue(self):

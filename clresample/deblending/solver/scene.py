@@ -64,10 +64,7 @@ class Scene:
         return (
             self.shape,
             self.fit_sky,
-            tuple(
-                (op.geometry, op.plans[0].axes, op.shape_out) + _lines(op.plans[0])
-                for op in self.ops
-            ),
+            tuple(op.layout for op in self.ops),
         )
 
 
@@ -97,8 +94,3 @@ class State:
     sky: np.ndarray
     memory: Memory | None = None
     n_steps: int = 0
-
-
-def _lines(plan):
-    """Which way an affine plan's lines run: operators of a batch must agree in it."""
-    return (plan.lines.by_row,) if plan.lines is not None else ()

@@ -20,7 +20,7 @@ class Response:
         self._pulls = buffers.zeros_like_spectra()
         self._squares, self._frames, self.weights = [], [], []
         for i, o in enumerate(self._observations):
-            square = buffers.launcher("scene.cl", "square", 3, VW=buffers.tuning.tile["VW"])
+            square = buffers.scene_launcher("square")
             _, my, mx = o.op.shape_out
             self._squares.append(square.bind(my=my, mx=mx, image=o.image))
             shape = o.op.shape_in[1:]

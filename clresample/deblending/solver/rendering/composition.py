@@ -30,7 +30,7 @@ class Composition:
         vector = b.tuning.tile["VW"]
 
         def launcher(name, local_size=None):
-            return b.launcher("scene.cl", name, 3, local_size=local_size, VW=vector).bind(**shared)
+            return b.scene_launcher(name, local_size).bind(**shared)
 
         if transfer is None:
             self._compose = launcher("compose")
