@@ -3,6 +3,8 @@ sources lie."""
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 from ..rendering.composition import Composition
@@ -18,15 +20,22 @@ class Response:
     def __init__(self, buffers, gradient):
         self.buffers, self._observations = buffers, gradient.observations
         self._pulls = buffers.zeros_like_spectra()
-        self._squares, self._frames, self.weights = [], [], []
+        self._squares, self._frames = [], []
         for i, o in enumerate(self._observations):
             square = buffers.scene_launcher("square")
             _, my, mx = o.op.shape_out
             self._squares.append(square.bind(my=my, mx=mx, image=o.image))
             shape = o.op.shape_in[1:]
             self._frames.append(Composition(buffers, i, buffers.host_boxes, shape))
-            weights = buffers.put(np.stack([s.weights[i] for s in buffers.scenes]))
-            self.weights.append(o.op.adjoint(weights))
+
+    @functools.cached_property
+    def weights(self):
+        """Made when first asked for: a batch whose strengths have settled does without."""
+        b, found = self.buffers, []
+        for i, o in enumerate(self._observations):
+            weights = b.put(np.stack([s.weights[i] for s in b.scenes]))
+            found.append(o.op.adjoint(weights))
+        return found
 
     def to_pixels(self):
         """R_c^T w R_c of one pixel per scene and channel, near the middle of what is covered, w the
