@@ -25,6 +25,9 @@ from .solver.learned.engine import vector_bytes
 PAD_PX = 16
 # [bytes] Device memory of the scenes of one batch, by default.
 MEMORY = 1 << 30
+# Components of the scenes of one batch: each is a group of work-items along the third axis of a
+# launch, of which GPUs take no more.
+MOST_SOURCES = 65_535
 # What says by itself what went wrong with one blend; other errors are named by their kind as well.
 # None of them is a reason to give up the other blends.
 ERRORS = (ValueError, DeviceError, np.linalg.LinAlgError)
@@ -123,6 +126,8 @@ class _ManyFits:
             group = waiting[fit.scene.signature]
             group.append((i, fit))
             full = sum(_n_bytes(f) for _, f in group) + _n_bytes(fit) > self.memory
+            n_sources = [len(f.scene.profile) for _, f in group]
+            full |= sum(n_sources) + n_sources[-1] > MOST_SOURCES
             if full or len(group) >= self.n_most:
                 yield from self._fit(waiting.pop(fit.scene.signature))
         while waiting:
