@@ -2,6 +2,7 @@
 
 render     `python -m bench.render`: time and accuracy of a resampling, ours beside GalSim's
 contract   `python -m bench.contract`: the matrix product on the device beside NumPy's
+stages     `python -m bench.stages`: an iteration with spectra before or after the transforms
 deblend    `python -m bench.deblend`: time and accuracy of fits to simulated blends
 settings   `python -m bench.settings`: accuracy with the default settings beside others
 coverage   `python -m bench.coverage`: how often the errors of simulated galaxies hold the truth

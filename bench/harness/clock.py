@@ -68,28 +68,29 @@ def in_processes(function, tasks, n_processes):
         pool.shutdown(cancel_futures=True)
 
 
-def interleaved_ms(functions, *, seconds, least=5):
+def interleaved_ms(functions, *, seconds, least=5, timer=time.perf_counter):
     """Median time [ms] of one call of each function, all called in turn for `seconds`.
 
     functions: name -> callable.  Each is called twice before, to compile and allocate and to see
         how long it takes.  In a round the fast ones are called several times; what disturbs the
         machine disturbs them all alike.
     least: calls of each function, even where they take longer than `seconds`
+    timer: what a call's time is taken by; time.process_time counts this process alone
     """
     for function in functions.values():
         function()
-    once = {name: _seconds(function) for name, function in functions.items()}
+    once = {name: _seconds(function, timer) for name, function in functions.items()}
     slowest = max(once.values())
     times = {name: [] for name in functions}
     end = time.perf_counter() + seconds
     while min(map(len, times.values())) < least or time.perf_counter() < end:
         for name, function in functions.items():
             for _ in range(max(1, min(MAX_REPEATS, int(slowest / once[name])))):
-                times[name].append(_seconds(function))
+                times[name].append(_seconds(function, timer))
     return {name: float(np.median(t)) * 1e3 for name, t in times.items()}
 
 
-def _seconds(function):
-    start = time.perf_counter()
+def _seconds(function, timer):
+    start = timer()
     function()
-    return time.perf_counter() - start
+    return timer() - start

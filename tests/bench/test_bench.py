@@ -77,6 +77,20 @@ def test_contract(tmp_path):
     ]
 
 
+def test_stages(tmp_path):
+    pytest.importorskip("galsim")
+    file = tmp_path / "stages.json"
+    run("stages", "--quick", "--seconds", "0.001", "--json", str(file))
+    found = json.loads(file.read_text())
+    assert found["record"].keys() >= RECORD
+    assert [(r["survey"], r["n_sources"]) for r in found["rows"]] == [
+        (survey, n) for n in (2, 9) for survey in ("Euclid", "Rubin")
+    ]
+    for row in found["rows"]:
+        assert len(row["ms"]) == len(row["mf"]) == 3
+        assert row["mf"][row["chosen"]] == min(row["mf"])
+
+
 @pytest.mark.parametrize(
     ("module", "options", "words"),
     [
@@ -90,6 +104,7 @@ def test_contract(tmp_path):
         ("contract", ("--json", "."), "--json ."),
         ("contract", ("--json", "nowhere/x.json"), "nowhere"),
         ("contract", ("--seconds", "nan"), "nan"),
+        ("stages", ("--seed", "few"), "few"),
     ],
 )
 def test_bad_options_get_one_line(module, options, words):
