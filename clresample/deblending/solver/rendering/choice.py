@@ -6,7 +6,7 @@ import numpy as np
 
 from .stages import Frames, Transformed
 
-# An operation of a boxed product takes as long as so many of a large one, since its tiles are cut by
+# An operation of a boxed product takes as long as so many of a large one, as its tiles are cut by
 # the box and its terms are few; and one of a sum over sources or bands, which loads all that it
 # multiplies. Fitted to processor times on one CPU with AVX-512 (1.7 and 12 on other scenes than
 # these): what is chosen then takes 8 % more than the fastest stage at most. With larger values
