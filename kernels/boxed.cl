@@ -19,34 +19,9 @@
  * each rounded up to its local size.  On CPUs one takes all columns: a tile of a small box takes
  * no longer than the start of a work-item.
  */
-#include "common.h"
+#include "contract.h"
 
-#ifndef VW          /* columns of a vector */
-#define VW 16
-#endif
-#ifndef NV          /* vectors a work-item owns in each row */
-#define NV 1
-#endif
-#ifndef MR          /* rows a work-item owns */
-#define MR 6
-#endif
-#ifndef WGX         /* work-items of a group along the columns of C */
-#define WGX 1
-#endif
-#ifndef WGY         /* work-items of a group along the rows of C */
-#define WGY 1
-#endif
-#ifndef STRIDED     /* 1: A's columns lie STEP_A apart; 0: they are adjacent */
-#define STRIDED 0
-#endif
-#ifndef RAGGED      /* 1: C is stored element by element; 0: by whole vectors */
-#define RAGGED 0
-#endif
-
-enum { M, N, K, BEGIN_A, LD_A, STEP_A, BEGIN_B, SKIP, BEGIN_C, LD_C, STEP_C, N_COLUMNS };
-
-#define WIDE VEC(VW)
-#define UNROLL(i, n) _Pragma("unroll") for (int i = 0; i < (n); ++i)
+enum { M, N, K, BEGIN_A, LD_A, NEXT_A, BEGIN_B, SKIP, BEGIN_C, LD_C, NEXT_C, N_COLUMNS };
 
 __kernel __attribute__((reqd_work_group_size(WGX, WGY, 1)))
 void boxed(__global const int *restrict active, __global const long *restrict items,
@@ -62,9 +37,7 @@ void boxed(__global const int *restrict active, __global const long *restrict it
     B += item[BEGIN_B];
     C += item[BEGIN_C];
 #if STRIDED
-    const size_t step_a = (size_t)item[STEP_A];
-#else
-    const size_t step_a = 1;
+    const long step_a = item[NEXT_A];
 #endif
     __global const REAL *row[MR];
     UNROLL(i, MR) row[i] = A + (size_t)(i0 + i < m ? i0 + i : m - 1) * (size_t)item[LD_A];
@@ -81,7 +54,7 @@ void boxed(__global const int *restrict active, __global const long *restrict it
             UNROLL(i, MR) UNROLL(v, NV) part[i][v] = (WIDE)(0);
             for (int l = l0; l < l1; ++l) {
                 UNROLL(v, NV) right[v] = AT(const WIDE, B + (size_t)l * ld_b + column[v]);
-                UNROLL(i, MR) UNROLL(v, NV) part[i][v] += row[i][l * step_a] * right[v];
+                UNROLL(i, MR) UNROLL(v, NV) part[i][v] += row[i][l * STEP_A] * right[v];
             }
             UNROLL(i, MR) UNROLL(v, NV) acc[i][v] += part[i][v];
         }
@@ -93,7 +66,7 @@ void boxed(__global const int *restrict active, __global const long *restrict it
             for (int j = 0; j < VW; ++j) {
                 const int x = j0 + v * VW + j;
                 if (x < skip || x >= end) continue;
-                __global REAL *to = c + (size_t)(x - skip) * (size_t)item[STEP_C];
+                __global REAL *to = c + (size_t)(x - skip) * (size_t)item[NEXT_C];
                 *to = add ? *to + lane[j] : lane[j];
             }
 #else

@@ -15,6 +15,7 @@
  *             times the transfer functions E, (B or 1, n_bands, ny_frame / 2, 4, nx_frame / 2) as
  *             MIX of contract.cl has them; stride_e: elements from a scene's to the next
  *             launch: (vectors of VW columns of a row, or 1 with ROWS, ny_frame / 2, B * n_bands)
+ *             VW divides nx_frame
  * residual    r = image + sky - data, image <- w r, loss[b, row] = 1/2 sum_x w r^2,
  *             pull[b, row] = sum_x w r;  row = c * my + y of this observation, from `row0` on
  *             launch: (WG, my, B * n_bands), groups of (WG, 1, 1), which share a row
@@ -27,12 +28,9 @@
  * X is 1 where a work-item walks a whole row (ROWS of group.h), else at least the width of the
  * widest row; of the second axis, which counts rows, any part or more than all may be launched.
  */
-#include "common.h"
+#include "contract.h"
 #include "boxes.h"
 #include "group.h"
-#ifndef VW          /* columns of a vector of compose_frequencies, which divide nx_frame */
-#define VW 16
-#endif
 #define LANES 16    /* sums that run side by side where a work-item has a whole row */
 
 #define HEAD(s) \
@@ -74,25 +72,6 @@ __kernel void compose(__global const int *restrict first, __global const int *re
 #endif
     }
 }
-
-#define WIDE VEC(VW)
-#if VW == 16
-#define HALF VEC(8)
-#define EVEN(v) (v).s02468ace
-#define ODD(v) (v).s13579bdf
-#elif VW == 8
-#define HALF VEC(4)
-#define EVEN(v) (v).s0246
-#define ODD(v) (v).s1357
-#elif VW == 4
-#define HALF VEC(2)
-#define EVEN(v) (v).s02
-#define ODD(v) (v).s13
-#else
-#define HALF REAL
-#define EVEN(v) (v).s0
-#define ODD(v) (v).s1
-#endif
 
 __kernel void compose_frequencies(
     __global const int *restrict first, __global const int *restrict table,

@@ -9,23 +9,23 @@ import numpy as np
 from ....device.contraction import SUM_BLOCK, padded
 
 # The columns of the kernel's table, each int64.
-COLUMNS = ["m", "n", "k", "begin_a", "ld_a", "step_a", "begin_b", "skip"]
-COLUMNS += ["begin_c", "ld_c", "step_c"]
+COLUMNS = ["m", "n", "k", "begin_a", "ld_a", "next_a", "begin_b", "skip"]
+COLUMNS += ["begin_c", "ld_c", "next_c"]
 
 
 class BoxedProduct:
     """C[s] = A[s] . B[s] for every source s of a batch, all at once.
 
     buffers: the batch; ld_b: distance of B's rows
-    strided: A's columns lie step_a apart; ragged: C is stored element by element, n of them in a
+    strided: A's columns lie next_a apart; ragged: C is stored element by element, n of them in a
         row, else by vectors up to a multiple of 16
-    sizes: a value or an array (S,) for each of COLUMNS; step_a and step_c are 1 by default, skip 0
+    sizes: a value or an array (S,) for each of COLUMNS; next_a and next_c are 1 by default, skip 0
     """
 
     def __init__(self, buffers, ld_b, *, strided=False, ragged=False, **sizes):
-        b, sizes = buffers, {"step_a": 1, "step_c": 1, "skip": 0} | sizes
+        b, sizes = buffers, {"next_a": 1, "next_c": 1, "skip": 0} | sizes
         items = [np.broadcast_to(sizes[name], b.n_sources) for name in COLUMNS]
-        tile, m, width = b.tuning.tile, max(items[0]), max(items[1] + items[7])
+        tile, m, width = _tile(b.tuning), max(items[0]), max(items[1] + items[7])
         group = tile["WGX"], tile["WGY"]
         along = math.ceil(padded(int(width)) / (tile["VW"] * tile["NV"]))
         tiles = b.along_row(along), int(m) / tile["MR"]
@@ -47,3 +47,11 @@ class BoxedProduct:
     def __call__(self, a, b, c, active, *, add=False):
         """Queue the products of the sources `active` (n,): C from A and B, added if ragged."""
         self._launch((*self._size, active.size), A=a, B=b, C=c, active=active, add=add)
+
+
+def _tile(tuning):
+    """Macros of the kernel: the contraction's where a work-item has a tile to itself; else groups
+    of 64 that own 32 rows and 16 vectors of a row, since boxes are lower than frames."""
+    if tuning.row_loops:
+        return tuning.tile
+    return {"VW": tuning.tile["VW"], "NV": 1, "MR": 8, "WGX": 16, "WGY": 4}

@@ -147,7 +147,7 @@ class _Boxes:
         own = self._buffers.host_boxes
         steps = own.shape[:, 1], 1
         ld, step = steps if self._axes == [0, 1] else steps[::-1]
-        return {f"begin_{letter}": own.offset, f"ld_{letter}": ld, f"step_{letter}": step}
+        return {f"begin_{letter}": own.offset, f"ld_{letter}": ld, f"next_{letter}": step}
 
     def _begin(self, table, elements):
         """First element of a table's part, (S,): that of the source's scene, `elements` on."""
