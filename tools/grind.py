@@ -37,6 +37,7 @@ from clresample import (  # noqa: E402
     deblend_many,
     get_device,
 )
+from clresample.deblending.solver.buffers import Buffers  # noqa: E402
 from clresample.deblending.solver.constraints import (  # noqa: E402
     L0,
     L1,
@@ -48,6 +49,7 @@ from clresample.deblending.solver.constraints import (  # noqa: E402
     SumNorm,
     Symmetry,
 )
+from clresample.deblending.solver.gradient import Gradient  # noqa: E402
 from clresample.device import tuning  # noqa: E402
 from clresample.device.launcher import Launcher  # noqa: E402
 
@@ -116,6 +118,17 @@ def blends(n):
     return made
 
 
+def render(device):
+    """Gradients of a scene with spectra applied at each stage, whichever a fit would choose."""
+    from helpers.solver import PRIOR, posed
+
+    scene, state = posed(device, np.float32, fixed=(1,))
+    for depth in (0, 1, 2):
+        buffers = Buffers([scene, scene], [state, state], device, np.float32, PRIOR)
+        Gradient(buffers, with_prior=False, depth=depth).queue()
+    device.finish()
+
+
 def fit(device):
     """Fits of all kinds, of two scenes side by side, some iterations each."""
     chain = Chain(Positivity(), L1(1e-3), L0(1e-3), Symmetry(0.5), Monotone(), MaxNorm())
@@ -153,7 +166,7 @@ def main():
         plant(device, arguments.plant)
         return 0
     launched = watch(device, arguments.kind)
-    for work in (resample, fit):
+    for work in (resample, render, fit):
         work(device)
         device.finish()
         print(f"grind: {work.__name__} after {time.perf_counter() - began:.0f} s", flush=True)
