@@ -12,14 +12,14 @@ exponential is a (cos, sin) pair of real table rows: a plan is a list of real ma
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..sky.mapping import Mapping
+from ..sky.mapping import Around, Mapping
 from ..sky.psf import PSF
-from ..sky.waves import cos_sin_columns
-from .gridding import KaiserBessel, LineTaps, transpose_taps
+from .gridding import KaiserBessel, LineTaps
+from .tables import aligned_tables, distorted_tables, line_tables, waves
 from .transfer import Certificate, transfer_function, wrap_radius
 
 # [bytes] of the tables of one operator. Frames of 7000 pixels a side need so much, and take minutes
@@ -54,11 +54,13 @@ class Plan:
     identity: same pixels and PSF, so that without a shift the operator returns its input
     nu (Hy,), (Hx,) [cycles per model px]: frequencies >= 0 of the two table axes
     axes: the model axis of each table axis; (1, 0) where the observed rows run along the model's y
+    psfs: of the model and of the observation
     d_plus, d_minus (C, Hy, Hx) complex: D(+,+), D(+,-) times K^-2 and the half-plane weights
     in_y (2Hy, Ny), in_x (2Hx, Nx): transforms of the model
     out_y, out_x: aligned (My, 2Hy), (2Hx, Mx); affine (L, 2Hy), (2Hx, J); distorted (P, 2Hy),
         (P, 2Hx)
     twist (Hy, J) [rad], lines: affine only
+    windows: plans that `window` has made, by what they were made for
     """
 
     mapping: Mapping
@@ -67,6 +69,7 @@ class Plan:
     certificate: Certificate
     nu: tuple[np.ndarray, np.ndarray]
     axes: tuple[int, int]
+    psfs: tuple[PSF, PSF] = field(repr=False, compare=False)
     d_plus: np.ndarray
     d_minus: np.ndarray
     in_y: np.ndarray
@@ -75,6 +78,7 @@ class Plan:
     out_x: np.ndarray
     twist: np.ndarray | None = None
     lines: LineTaps | None = None
+    windows: dict = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def geometry(self) -> str:
@@ -86,7 +90,25 @@ class Plan:
         """Host memory of the tables and the mapping [bytes]."""
         parts = [self, self.mapping] + ([self.lines] if self.lines is not None else [])
         values = (value for part in parts for value in vars(part).values())
-        return sum(value.nbytes for value in values if isinstance(value, np.ndarray))
+        own = sum(value.nbytes for value in values if isinstance(value, np.ndarray))
+        return own + sum(plan.n_bytes for plan in self.windows.values())
+
+    def window(self, shape, reach_px, precision: Precision) -> Plan:
+        """The plan of a box of the model, by what its light reaches of the observation.
+
+        One for all boxes of a shape: those observed pixels lie about the box's middle, and how far
+        off they are in truth is a shift of up to half an observed pixel. Not of distorted mappings,
+        which are another at each place.
+
+        shape (2,) [model px]: of the box; reach_px [model px]: how far its light is followed
+        """
+        key = tuple(shape), reach_px, precision
+        if key not in self.windows:
+            mapping = Around.box_of(self.mapping, shape, reach_px)
+            moved = np.abs(self.mapping.matrix).sum(axis=1) / 2
+            extent = tuple(np.array(shape) + mapping.reach_px + moved)
+            self.windows[key] = make_plan(mapping, *self.psfs, precision=precision, extent=extent)
+        return self.windows[key]
 
     def shifted(self, shift) -> tuple[np.ndarray, np.ndarray]:
         """D(+,+), D(+,-) with every observed pixel moved by `shift` (2,) [model px]."""
@@ -118,9 +140,9 @@ def make_plan(
 
     center, axes = (np.array(mapping.shape_in) - 1) / 2, (0, 1)
     if mapping.geometry == "affine":
-        tables, d = _line_tables(mapping, nu, d, center, precision.window)
+        tables, d = line_tables(mapping, nu, d, center, precision.window)
     elif mapping.geometry == "distorted":
-        tables = _distorted_tables(mapping, nu, center)
+        tables = distorted_tables(mapping, nu, center)
     d = d * (2 / (n_fft[0] * n_fft[1]))
     d[:, 0] *= 0.5
     d[:, :, h_x - 1] *= 0.5
@@ -129,9 +151,9 @@ def make_plan(
         if mapping.matrix[0, 0] == 0:
             axes, nu = (1, 0), nu[::-1]
             d_plus, d_minus = d_plus.swapaxes(1, 2), d_minus.swapaxes(1, 2).conj()
-        tables = _aligned_tables(mapping, nu, axes, center)
+        tables = aligned_tables(mapping, nu, axes, center)
     in_y, in_x = (
-        _waves(nu[i], np.arange(mapping.shape_in[axes[i]]) - center[axes[i]]).T for i in (0, 1)
+        waves(nu[i], np.arange(mapping.shape_in[axes[i]]) - center[axes[i]]).T for i in (0, 1)
     )
     return Plan(
         mapping=mapping,
@@ -144,6 +166,7 @@ def make_plan(
         d_minus=d_minus,
         in_y=in_y,
         in_x=in_x,
+        psfs=(psf_in, psf_out),
         **tables,
     )
 
@@ -231,70 +254,3 @@ def _half_count(matrix, spacing: float, axis: int, n_fft: int) -> int:
     """Frequencies kappa >= 0 inside the bounding box of |A^T nu|_inf <= 1/(2 spacing)."""
     reach = np.abs(np.linalg.inv(matrix).T[axis]).sum() * 0.5 / spacing
     return min(int(np.floor(reach * n_fft * (1 + 1e-12))), (n_fft - 1) // 2) + 1
-
-
-def _waves(nu, x) -> np.ndarray:
-    """Columns 2i, 2i+1: cos and sin of 2 pi nu_i x (..., 2 len(nu)) for positions x (...)."""
-    return cos_sin_columns(2 * np.pi * np.asarray(x)[..., None] * nu)
-
-
-def _aligned_tables(mapping: Mapping, nu, axes, center):
-    """Waves at the observed rows and columns, zero where the model does not cover them."""
-    tables = []
-    for i in (0, 1):
-        axis = axes[i]
-        x = mapping.matrix[axis, i] * np.arange(mapping.shape_out[i]) + mapping.offset[axis]
-        covered = mapping.covered.any(axis=1 - i)
-        tables.append(_waves(nu[i], x - center[axis]) * covered[:, None])
-    return {"out_y": tables[0], "out_x": tables[1].T}
-
-
-def _distorted_tables(mapping: Mapping, nu, center):
-    """Waves at every observed pixel, with the pixel's own area; zero where it is not covered."""
-    scale = mapping.covered * (1.0 if mapping.area is None else mapping.area)
-    y, x = np.moveaxis(mapping.at(*np.indices(mapping.shape_out)), -1, 0)
-    return {
-        "out_y": _waves(nu[0], y.ravel() - center[0]) * scale.reshape(-1, 1),
-        "out_x": _waves(nu[1], x.ravel() - center[1]),
-    }
-
-
-def _line_tables(mapping: Mapping, nu, d, center, window: KaiserBessel):
-    """Observed rows (or columns) as lines y = y0 + r x through the model, and pass 2 along them.
-
-    Along a line a plane wave has the single frequency nu_x + r nu_y; columns finer than its Nyquist
-    spacing by window.oversampling carry it, divided by the window's transform.  Returns
-    (tables, d).
-    """
-    slope = np.abs(mapping.matrix[1]) / np.linalg.norm(mapping.matrix, axis=0)
-    by_row = slope[1] >= slope[0]
-    i_line, i_step = (0, 1) if by_row else (1, 0)
-    (a, b), (c, e) = mapping.matrix[:, [i_line, i_step]]
-    n_lines, n_steps = mapping.shape_out[i_line], mapping.shape_out[i_step]
-    r = b / e
-    t_y, t_x = mapping.offset - center
-    covered = mapping.covered if by_row else mapping.covered.T
-
-    nu_x_both = np.concatenate([-nu[1][:0:-1], nu[1]])
-    along = nu_x_both + r * nu[0][:, None]
-    nu_max = max(np.abs(along[(d != 0).any(axis=0)]).max(), np.finfo(float).tiny ** 0.5)
-    spacing = min(1 / (2 * nu_max * window.oversampling), float(max(mapping.shape_in)))
-    d = d / window.transform(along * spacing)
-
-    x = c * np.arange(n_lines)[:, None] + e * np.arange(n_steps) + t_x
-    x_first, x_last = x[covered].min(), x[covered].max()
-    u = (x - x_first) / spacing + window.n_taps / 2
-    n_columns = int(np.ceil((x_last - x_first) / spacing)) + window.n_taps + 1
-    columns = x_first + (np.arange(n_columns) - window.n_taps / 2) * spacing
-
-    below = np.floor(u - window.n_taps / 2)
-    start = np.where(covered, below.astype(int) + 1, 0)
-    weight = window.taps(u - window.n_taps / 2 - below) * covered[:, :, None]
-    start_t, weight_t = transpose_taps(start, weight, covered, n_columns)
-    y0 = (a - r * c) * np.arange(n_lines) + t_y - r * t_x
-    return {
-        "out_y": _waves(nu[0], y0),
-        "out_x": _waves(nu[1], columns).T,
-        "twist": 2 * np.pi * np.outer(nu[0], r * columns),
-        "lines": LineTaps(bool(by_row), start, weight.swapaxes(1, 2), start_t, weight_t),
-    }, d
