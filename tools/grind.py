@@ -36,7 +36,9 @@ from clresample import (  # noqa: E402
     Settings,
     deblend_many,
     get_device,
+    model_frame,
 )
+from clresample.deblending.solver.boxes import Boxes  # noqa: E402
 from clresample.deblending.solver.constraints import (  # noqa: E402
     L0,
     L1,
@@ -94,41 +96,63 @@ def resample(device):
     op.adjoint(op(np.ones(op.shape_in)))
 
 
-def blends(n):
-    """Two galaxies and a star, seen by two instruments, the second of which is turned."""
+def blends(n, profile=None):
+    """Two galaxies and a star, seen by two instruments, the second of which is turned.
+
+    Each blend is brighter than the one before: their fits end after different numbers of steps.
+
+    profile: of the galaxies; None has one fitted, which takes most of a fit's time
+    """
     rng = np.random.default_rng(5)
     grids = Grid.flat((14, 14), 0.1), Grid.flat((8, 8), 0.2, angle_deg=15)
     psfs = PSF.gaussian(0.8, n_pixels=7), PSF.gaussian([1.2, 1.4], n_pixels=7)
     made = []
-    for _ in range(n):
+    for k in range(n):
         observations = []
         for i, (grid, psf) in enumerate(zip(grids, psfs)):
             y, x = np.indices(grid.shape) - (grid.shape[0] - 1) / 2
-            light = np.exp(-np.hypot(y, x) / 2) + 0.01 * rng.standard_normal(
-                (psf.n_bands, *y.shape)
-            )
+            light = (1 + 4 * k) * np.exp(-np.hypot(y, x) / 2)
+            light = light + 0.01 * rng.standard_normal((psf.n_bands, *y.shape))
             weights = np.full(light.shape, 1e4)
             names = [f"{i}{band}" for band in range(psf.n_bands)]
             observations.append(Observation(light, psf, grid, weights=weights, channels=names))
         places = (6.5, 6.5), (4.0, 9.0)
-        sources = (*[Extended(position_px=p) for p in places], Point(position_px=(9.0, 4.0)))
-        made.append(Blend(tuple(observations), sources))
+        galaxies = [Extended(position_px=place, profile=profile) for place in places]
+        sources = (*galaxies, Point(position_px=(9.0, 4.0)))
+        frame = model_frame(observations, grid=grids[0])
+        made.append(Blend(tuple(observations), sources, frame))
     return made
 
 
+CHAIN = Chain(Positivity(), L1(1e-3), L0(1e-3), Symmetry(0.5), Monotone(), MaxNorm())
+# All kinds of fits, some iterations each.
+FITS = (
+    Settings(prior=LearnedPrior(), max_iter=2),
+    Settings(prior=LearnedPrior(), max_iter=25, enough=20.0, fit_sky=True),
+    Settings(prior=Prior(), max_iter=2, fit_sky=True),
+    Settings(prior=None, max_iter=2, constraints=CHAIN),
+    Settings(prior=None, max_iter=2, constraints=Chain(MonotoneProjection(), SumNorm())),
+)
+
+
 def fit(device):
-    """Fits of all kinds, of two scenes side by side, some iterations each."""
-    chain = Chain(Positivity(), L1(1e-3), L0(1e-3), Symmetry(0.5), Monotone(), MaxNorm())
-    for settings in (
-        Settings(prior=LearnedPrior(), max_iter=3),
-        Settings(prior=LearnedPrior(), max_iter=4, fit_sky=True),
-        Settings(prior=Prior(), max_iter=2),
-        Settings(prior=None, max_iter=2, constraints=chain),
-        Settings(prior=None, max_iter=2, constraints=Chain(MonotoneProjection(), SumNorm())),
-    ):
-        for result in deblend_many(blends(2), settings=settings, device=device):
+    """FITS of three scenes side by side."""
+    y, x = np.indices((14, 14)) - 6.5
+    disc = np.exp(-np.hypot(y, x) / 2)
+    for settings in FITS:
+        began = time.perf_counter()
+        profile = None if settings is FITS[0] else disc
+        for result in deblend_many(blends(3, profile), settings=settings, device=device):
             if result.status.startswith("failed"):
                 raise SystemExit(f"grind: a fit {result.status}")
+        print(f"grind: fit in {time.perf_counter() - began:.0f} s", flush=True)
+
+
+def constrain(device):
+    """Constraints on morphologies of a caller's own."""
+    boxes = Boxes([0, 0], [[0, 0], [1, 2]], [[9, 8], [5, 7]]).put(device)
+    morphs = device.put(np.random.default_rng(3).standard_normal(boxes.boxes.size), np.float32)
+    CHAIN.prox(morphs, boxes)
 
 
 def plant(device, fault):
@@ -153,7 +177,7 @@ def main():
         plant(device, arguments.plant)
         return 0
     launched = watch(device, arguments.kind)
-    for work in (resample, fit):
+    for work in (resample, constrain, fit):
         work(device)
         device.finish()
         print(f"grind: {work.__name__} after {time.perf_counter() - began:.0f} s", flush=True)
