@@ -24,7 +24,7 @@ step() {
     {
         printf '\n## %s\n\n' "$title"
         [ "$status" = 0 ] || printf '**Failed, status %s (124: over %s s).**\n\n' "$status" "$limit"
-        printf '    $ %s\n\n' "$*"
+        printf '    $ %s\n\n' "$(printf '%s' "$*" | head -n 1)"
         tr '\r' '\n' <"$part" | grep -v '^ *$' | tail -n 60 | sed 's/^/    /'
         printf '\n%s s.\n' "$((SECONDS - began))"
     } >>"$report"

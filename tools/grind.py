@@ -104,21 +104,21 @@ def blends(n, profile=None):
     profile: of the galaxies; None has one fitted, which takes most of a fit's time
     """
     rng = np.random.default_rng(5)
-    grids = Grid.flat((14, 14), 0.1), Grid.flat((8, 8), 0.2, angle_deg=15)
-    psfs = PSF.gaussian(0.8, n_pixels=7), PSF.gaussian([1.2, 1.4], n_pixels=7)
+    grids = Grid.flat((10, 10), 0.1), Grid.flat((5, 6), 0.2, angle_deg=15)
+    psfs = PSF.gaussian(0.8, n_pixels=5), PSF.gaussian([1.0, 1.1], n_pixels=5)
     made = []
     for k in range(n):
         observations = []
         for i, (grid, psf) in enumerate(zip(grids, psfs)):
-            y, x = np.indices(grid.shape) - (grid.shape[0] - 1) / 2
-            light = (1 + 4 * k) * np.exp(-np.hypot(y, x) / 2)
+            y, x = np.indices(grid.shape) - (np.array(grid.shape)[:, None, None] - 1) / 2
+            light = 9.0 ** (k - 1) * np.exp(-np.hypot(y, x) / 2)
             light = light + 0.01 * rng.standard_normal((psf.n_bands, *y.shape))
             weights = np.full(light.shape, 1e4)
             names = [f"{i}{band}" for band in range(psf.n_bands)]
             observations.append(Observation(light, psf, grid, weights=weights, channels=names))
-        places = (6.5, 6.5), (4.0, 9.0)
+        places = (4.5, 4.5), (3.0, 6.5)
         galaxies = [Extended(position_px=place, profile=profile) for place in places]
-        sources = (*galaxies, Point(position_px=(9.0, 4.0)))
+        sources = (*galaxies, Point(position_px=(6.5, 3.0)))
         frame = model_frame(observations, grid=grids[0])
         made.append(Blend(tuple(observations), sources, frame))
     return made
@@ -137,7 +137,7 @@ FITS = (
 
 def fit(device):
     """FITS of three scenes side by side."""
-    y, x = np.indices((14, 14)) - 6.5
+    y, x = np.indices((10, 10)) - 4.5
     disc = np.exp(-np.hypot(y, x) / 2)
     for settings in FITS:
         began = time.perf_counter()
