@@ -25,6 +25,7 @@ sys.path.insert(0, str(ROOT))
 from clresample import (  # noqa: E402
     PSF,
     Blend,
+    Device,
     Extended,
     Grid,
     LearnedPrior,
@@ -62,21 +63,27 @@ CHUNK_TERMS = 32
 
 
 def all_kernels():
-    """Names of all kernels of kernels/."""
-    texts = [path.read_text() for path in sorted((ROOT / "kernels").glob("*.cl"))]
-    return {name for text in texts for name in re.findall(r"__kernel\b[^;{]*?\bvoid\s+(\w+)", text)}
+    """All kernels of kernels/: "file name" each."""
+    found = {path.name: path.read_text() for path in sorted((ROOT / "kernels").glob("*.cl"))}
+    head = re.compile(r"__kernel\b[^;{]*?\bvoid\s+(\w+)")
+    return {f"{file} {name}" for file, text in found.items() for name in head.findall(text)}
 
 
 def watch(device, kind):
     """Build kernels as for `kind`; returns the set to which names of launched kernels are added."""
     device.kind, device.simulated = kind.upper(), False
-    launched, launch = set(), Launcher.__call__
+    launched, launch, made = set(), Launcher.__call__, Device.launcher
+
+    def of_file(self, file, name, **options):
+        launcher = made(self, file, name, **options)
+        launcher.source = f"{file} {name}"
+        return launcher
 
     def noted(self, *arguments, **given):
-        launched.add(self.kernel.function_name)
+        launched.add(self.source)
         launch(self, *arguments, **given)
 
-    Launcher.__call__ = noted
+    Device.launcher, Launcher.__call__ = of_file, noted
     of = tuning.Tuning.of
     tuning.Tuning.of = lambda *a: replace(of(*a), chunk_terms=CHUNK_TERMS)
     return launched
@@ -181,8 +188,8 @@ def main():
         work(device)
         device.finish()
         print(f"grind: {work.__name__} after {time.perf_counter() - began:.0f} s", flush=True)
-    contraction = {"cpu": "contract_group", "gpu": "contract"}[arguments.kind]
-    missing = all_kernels() - launched - {contraction}
+    contraction = {"cpu": "contract_group.cl contract_group", "gpu": "contract.cl contract"}
+    missing = all_kernels() - launched - {contraction[arguments.kind]}
     took = f"{time.perf_counter() - began:.0f} s on {device.name}"
     print(f"grind: {len(launched)} kernels as on a {arguments.kind.upper()}, {took}")
     if missing:
