@@ -15,16 +15,16 @@ set -euo pipefail
 
 runtime=$1
 shift
-mkdir -p "${RUNTIMES:-.runtimes}"
-home=$(cd "${RUNTIMES:-.runtimes}" && pwd)/$runtime
-here=$(cd "$(dirname "$0")" && pwd)
-root=$home/root
-arch=$(uname -m)-linux-gnu
-
 skip() {
     echo "skipped: no runtime $runtime here: $*" >&2
     exit 77
 }
+
+mkdir -p "${RUNTIMES:-.runtimes}" 2>/dev/null || skip "${RUNTIMES:-.runtimes} cannot be written"
+home=$(cd "${RUNTIMES:-.runtimes}" && pwd)/$runtime
+here=$(cd "$(dirname "$0")" && pwd)
+root=$home/root
+arch=$(uname -m)-linux-gnu
 
 # unpack PACKAGE [NAMES]: a Debian package and what it needs beside what is installed here. Packages
 # whose names match the regular expression NAMES are left out.

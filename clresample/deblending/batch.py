@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import warnings
 from collections import defaultdict
 
@@ -11,6 +12,7 @@ import numpy as np
 from ..device.device import get_device
 from ..device.discovery import DeviceError
 from ..device.tuning import Tuning
+from ..device.workers import deal
 from ..sky.given.checks import float_type, instance
 from ..sky.sources import SourceWarning
 from .blend import INTERRUPTED, Blend, Failure
@@ -27,6 +29,8 @@ MEMORY = 1 << 30
 # Components of the scenes of one batch: each is a group of work-items along the third axis of a
 # launch, of which GPUs take no more.
 MOST_SOURCES = 65_535
+# Blends that one of several devices is given at a time, at most: what a full batch of a GPU holds.
+SCENES_A_PORTION = 1024
 # What says by itself what went wrong with one blend; other errors are named by their kind as well.
 # None of them is a reason to give up the other blends.
 ERRORS = (ValueError, DeviceError, np.linalg.LinAlgError)
@@ -73,6 +77,10 @@ def deblend_many(
 ) -> list[Result | Failure]:
     """Fit many blends side by side; each comes out as if it were fitted alone, to float accuracy.
 
+    device: see get_device; or a list of such choices: the blends are dealt to all of them by their
+        speed, each with a process of its own, so that a script that calls this must do so under
+        `if __name__ == "__main__":`. Results are those of one device. One that fails is named by a
+        DeviceWarning, and the others do its part
     blends: Blend, with sizes, sources, PSFs, WCS and instruments of their own
     memory [bytes]: of the device for one group of scenes
     progress: called with the number of blends done, after each group and each failure
@@ -82,14 +90,33 @@ def deblend_many(
     Warns once (SourceWarning) of all sources far from any light; results' messages name them.
     """
     settings, dtype = _checked(settings, dtype)
-    many = _ManyFits(list(blends), settings, get_device(device), dtype, memory)
+    blends, progress = list(blends), progress or (lambda n_done: None)
+    given = {"settings": settings, "dtype": dtype, "memory": memory}
+    # blends of one size keep it; those of several are padded, whoever fits them
+    given["pad"] = PAD_PX if len({_sizes(b) for b in blends} - {None}) > 1 else 1
+    if isinstance(device, (list, tuple)):
+        fit_some = functools.partial(_fit_all, **given)
+        pairs = deal(fit_some, blends, device, done=progress, most=SCENES_A_PORTION)
+    else:
+        pairs = _fit_all(blends, device=get_device(device), progress=progress, **given)
+    pairs = [
+        pair or (Failure(blend, INTERRUPTED), None)
+        for blend, pair in zip(blends, pairs, strict=True)
+    ]
+    dark = [sources for _, sources in pairs if sources is not None]
+    if dark:
+        _warn_dark(dark, " of blends that were fitted together")
+    return [result for result, _ in pairs]
+
+
+def _fit_all(blends, *, device, progress=lambda n_done: None, **given):
+    """(Result or Failure, sources far from any light or None) for each blend."""
+    many = _ManyFits(blends, device, **given)
     with contextlib.suppress(KeyboardInterrupt):  # the results of what was not done say so
-        many.run(progress or (lambda n_done: None))
-    if many.dark:
-        _warn_dark(many.dark, " of blends that were fitted together")
+        many.run(progress)
     return [
-        Failure(blend, INTERRUPTED) if done is None else done
-        for blend, done in zip(many.blends, many.done, strict=True)
+        (Failure(blend, INTERRUPTED) if done is None else done, many.dark.get(i))
+        for i, (blend, done) in enumerate(zip(blends, many.done, strict=True))
     ]
 
 
@@ -97,14 +124,14 @@ class _ManyFits:
     """Blends on their way through groups of fits that share a batch.
 
     done: for each blend its Result or Failure, None before that
-    dark: indices of sources far from any light, an array for each blend that has some
+    dark {blend: array}: indices of its sources far from any light, where it has some
     """
 
-    def __init__(self, blends, settings, device, dtype, memory):
+    def __init__(self, blends, device, *, settings, dtype, memory, pad):
         self.blends, self.settings, self.device, self.dtype = blends, settings, device, dtype
-        self.memory, self.n_most = memory, Tuning.of(device, dtype).n_scenes
+        self.pad, self.memory, self.n_most = pad, memory, Tuning.of(device, dtype).n_scenes
         self.done: list[Result | Failure | None] = [None] * len(blends)
-        self.dark = []
+        self.dark = {}
 
     def run(self, progress):
         """Fit them all; raises KeyboardInterrupt when the group that runs was interrupted."""
@@ -115,11 +142,10 @@ class _ManyFits:
 
     def _groups_done(self, waiting):
         """Fit group after group as they fill up; yields how many blends that has done."""
-        pad = PAD_PX if len({_sizes(b) for b in self.blends} - {None}) > 1 else 1
         for i, blend in enumerate(self.blends):
             try:
                 instance("blend", blend, Blend)
-                fit = Fit(blend, self.settings, self.device, self.dtype, pad=pad)
+                fit = Fit(blend, self.settings, self.device, self.dtype, pad=self.pad)
             except Exception as error:
                 self.done[i] = _failure(blend, error)
                 yield 1
@@ -144,7 +170,7 @@ class _ManyFits:
             (i, fit), *_ = group
             self.done[i] = _failure(fit.blend, error)
             return []
-        self.dark += [fit.dark for _, fit in group if len(fit.dark)]
+        self.dark |= {i: fit.dark for i, fit in group if len(fit.dark)}
         return group
 
     def _fit(self, group):

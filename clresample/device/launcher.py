@@ -27,6 +27,7 @@ class Launcher:
 
     def __init__(self, device, kernel, is_buffer, lock, local_size=None):
         self.device, self.kernel, self.local_size = device, kernel, local_size
+        self._whole_groups = local_size is not None and max(local_size) > 1
         self._is_buffer, self._lock = is_buffer, lock
         self._bound = dict.fromkeys(is_buffer, UNSET)  # in the kernel's order
 
@@ -53,10 +54,9 @@ class Launcher:
                     error.add_note(f"arguments of {self!r}: {', '.join(self._bound)}")
                     raise
                 raise ValueError(f"{self!r} was not given {', '.join(unset)}") from error
-            local_size = self.local_size
-            if local_size is not None:
-                global_size = tuple([-(-n // g) * g for n, g in zip(global_size, local_size)])
-            event = self.device.launch(self.kernel, global_size, local_size)
+            if self._whole_groups:
+                global_size = tuple([-(-n // g) * g for n, g in zip(global_size, self.local_size)])
+            event = self.device.launch(self.kernel, global_size, self.local_size)
         profile = self.device.profile
         if profile is not None:
             given = dict(zip(self._bound, values, strict=True))

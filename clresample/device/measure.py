@@ -42,10 +42,10 @@ def copy_rate(device, seconds=0.3):
 
 def launch_seconds(device, seconds=0.3):
     """Seconds that a launch costs of a kernel with next to nothing to do, one after the other."""
-    y, launch = device.zeros(16, np.float32), device.launcher("warp.cl", "rowscale")
+    y = device.zeros(16, np.float32)
+    launch = device.launcher("warp.cl", "rowscale", local_size=(16, 1))
     launch.bind(n_positions=1, n_pad=16, n_bands=1, n_tables=1, y=y, y_offset=0)
     launch.bind(T=device.zeros(16, np.float32), E=y)
-    launch.local_size = (16, 1)
 
     def run():
         for _ in range(N_LAUNCHES):

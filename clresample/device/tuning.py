@@ -10,6 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+# Groups of a launch along its second and third axis, which GPUs limit to so many: NVIDIA's compute
+# capabilities list it, Mesa's drivers have the same.
+MOST_GROUPS = 65535
+
 
 @dataclass(frozen=True)
 class Tuning:

@@ -9,6 +9,7 @@ import warnings
 import numpy as np
 
 from ..device.contraction import ImageBatch
+from ..device.tuning import MOST_GROUPS
 from ..sky.given.checks import float_type
 from ..sky.psf_checks import PSFWarning
 from .affine import AffineExecutor
@@ -86,7 +87,8 @@ class Resampler(GridOperator):
         self._executor = EXECUTORS[self.geometry](self.device, self.dtype, plans)
         per_image = sum(rows * ld for rows, ld in self._executor.scratch_shapes().values())
         budget = self._executor.tuning.group_bytes
-        self._group = max(1, budget // (per_image * self.dtype.itemsize * n_bands))
+        fit = budget // (per_image * self.dtype.itemsize * n_bands)
+        self._group = max(1, min(fit, MOST_GROUPS // n_bands))
 
     def _use_shift(self):
         """Upload D with the phases of the shift."""

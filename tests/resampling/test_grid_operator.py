@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 from astropy import units as u
-from helpers.geometries import GEOMETRIES, distance, psfs
+from helpers.geometries import GEOMETRIES, distance, operator, psfs
 
+from clresample.device.device import Device
+from clresample.resampling import resampler
 from clresample.resampling.grid_operator import GridOperator
 from clresample.resampling.paper.resampler import PaperResampler
 from clresample.resampling.resampler import Resampler
@@ -210,3 +212,23 @@ def test_arrays_that_are_no_real_numbers_are_refused_by_name(device, kind):
     for out in (y.astype(int), y.astype(complex), fixed, np.ma.MaskedArray(y, False), y * u.Jy):
         with pytest.raises(ValueError, match="out is a .*must be a plain array of floats"):
             op(x, out=out)
+
+
+def test_no_launch_has_more_groups_than_a_gpu_takes(device, monkeypatch):
+    """Batches larger than that, launched as on a GPU."""
+    launches, launch = [], Device.launch
+    monkeypatch.setattr(device, "kind", "GPU")
+    monkeypatch.setattr(resampler, "MOST_GROUPS", 7)
+
+    def seen(self, kernel, size, local):
+        launches.append([n // g for n, g in zip(size, local)])
+        return launch(self, kernel, size, local)
+
+    monkeypatch.setattr(Device, "launch", seen)
+    for mapping in (GEOMETRIES["mirrored"](), GEOMETRIES["distorted"]()):
+        op = operator(device, mapping, *psfs())
+        x = np.random.default_rng(3).standard_normal((11, *op.shape_in)).astype(np.float32)
+        y = op(x)
+        assert distance(y[10], op(x[10])) < 1e-6
+        op.adjoint(y)
+    assert max(groups[-1] for groups in launches) <= 7  # images, two bands each

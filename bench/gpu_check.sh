@@ -1,0 +1,65 @@
+#!/usr/bin/env bash
+# For the first time on a machine with a GPU: everything that is measured of a device, in one
+# Markdown report, in less than ten minutes.
+#
+#     bench/gpu_check.sh [REPORT.md]
+#
+# PYTHON is the interpreter that has clresample (default .venv/bin/python, as make makes it);
+# CLRESAMPLE_DEVICE and CLRESAMPLE_ICD choose the device, as always. A step that fails, or takes
+# longer than its limit, is named in the report, and the others go on; then the status is 1.
+set -uo pipefail
+cd "$(dirname "$0")/.."
+python=${PYTHON:-.venv/bin/python}
+report=${1:-gpu_check.md}
+part=$(mktemp)
+trap 'rm -f "$part"' EXIT
+failed=0
+
+# step TITLE SECONDS COMMAND ...: the command's output as a part of the report
+step() {
+    local title=$1 limit=$2 began=$SECONDS status=0
+    shift 2
+    echo "gpu_check: $title" >&2
+    timeout "$limit" "$@" >"$part" 2>&1 || status=$?
+    {
+        printf '\n## %s\n\n' "$title"
+        [ "$status" = 0 ] || printf '**Failed, status %s (124: over %s s).**\n\n' "$status" "$limit"
+        printf '    $ %s\n\n' "$(printf '%s' "$*" | head -n 1)"
+        tr '\r' '\n' <"$part" | grep -v '^ *$' | tail -n 60 | sed 's/^/    /'
+        printf '\n%s s.\n' "$((SECONDS - began))"
+    } >>"$report"
+    [ "$status" = 0 ] || failed=1
+}
+
+name=$("$python" -c 'from clresample import get_device; print(get_device())') || exit 1
+{
+    printf '# %s\n\n' "$name"
+    printf '%s, %s, commit %s.\n' "$(date -u +%Y-%m-%dT%H:%MZ)" "$(uname -sm)" \
+        "$(git rev-parse --short HEAD 2>/dev/null || echo unknown)"
+} >"$report"
+
+export PYTHONUNBUFFERED=1 OMP_NUM_THREADS=1
+step "Devices" 40 "$python" -m clresample.cli devices --bench
+step "Self-test" 30 "$python" -c '
+import numpy as np
+from clresample import get_device
+from clresample.device.selftest import ALLOWED, reference, render
+found, truth = render(get_device()), reference()
+error = np.linalg.norm(found - truth) / np.linalg.norm(truth)
+print(f"a small render in float32 against NumPy in float64: {error:.1e}, {ALLOWED:g} allowed")
+raise SystemExit(not error <= ALLOWED)'
+step "Kernel tests" 150 "$python" -m pytest -q -p no:cacheprovider tests/device/test_contraction.py \
+    tests/device/test_selftest.py tests/resampling/test_resampler.py \
+    tests/deblending/test_constraints.py tests/deblending/test_gradient.py
+step "Tuning" 100 "$python" -m clresample.cli tune
+step "Devices, tuned" 30 "$python" -m clresample.cli devices --bench
+step "Renders" 60 "$python" -m bench.render --quick
+step "Matrix products" 40 "$python" -m bench.contract
+step "Fits" 80 "$python" -m bench.throughput --quick
+step "Kernels of a fit" 30 env CLRESAMPLE_PROFILE=1 "$python" -c '
+from clresample import get_device
+from clresample.cli.machine.workload import blends, fit
+device = get_device()
+fit(blends(8, device), device)'
+echo "gpu_check: $report" >&2
+exit "$failed"

@@ -1,0 +1,181 @@
+"""Work dealt to several devices, a process each: OpenCL drivers share badly within one process.
+
+Each process is started anew (spawn), so a script that calls this must keep what it does itself
+under `if __name__ == "__main__":`, as Python's multiprocessing asks.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+import traceback
+import warnings
+from contextlib import suppress
+from multiprocessing import connection
+
+from .device import Device, get_device
+from .discovery import DeviceError, choose, find_devices
+from .remembered import DeviceWarning
+
+# Items of a device's first portion, before its speed is known.
+FIRST = 4
+# Part of what is left that is dealt at once, to all devices together: what remains evens out
+# devices that turn out slower or faster.
+SHARE = 0.5
+# [s] An interrupted process has so long to hand in what it has.
+PATIENCE_S = 60.0
+
+
+def deal(function, items, devices, *, done, most):
+    """Have several devices work through `items`; returns what they made, in the items' order.
+
+    function(items, device=) -> [result, ...]: picklable, as are items and results
+    devices: choices as `get_device` takes them, at least one; one named twice gets two processes
+    done: called with the number of items done, after each portion
+    most: items of a portion at most
+    returns a list of results; None for an item that no device could be asked for, because of Ctrl-C
+    Portions are dealt by measured speed. A device that cannot be opened, or whose process dies or
+    raises, is named by a DeviceWarning and its portion goes to the others.
+    ValueError: there are no devices; DeviceError: nothing fits a choice, or all devices have failed
+    """
+    if not devices:
+        raise ValueError("device is an empty list, must name at least one")
+    table = _Table(items, most)
+    workers = [_Worker(function, choice) for choice in devices]
+    faults: list[str] = []
+    try:
+        while table.open:
+            for worker in workers:
+                if not worker.portion:
+                    portion = table.take(worker, workers)
+                    worker.give(portion, [table.items[i] for i in portion])
+            if not workers:
+                raise DeviceError("; ".join(faults))
+            ready = connection.wait([w.pipe for w in workers if w.portion])
+            for worker in [w for w in workers if w.pipe in ready]:
+                fault = worker.collect(table)
+                if fault:
+                    faults.append(fault)
+                    table.waiting += worker.portion
+                    workers.remove(worker)
+                    worker.stop()
+                    if workers:
+                        left = ", ".join(w.name for w in workers)
+                        warnings.warn(f"{fault}; {left} goes on", DeviceWarning, stacklevel=3)
+            done(table.n_done)
+    except KeyboardInterrupt:
+        for worker in workers:
+            worker.interrupt()
+        for worker in workers:
+            worker.collect(table, patience_s=PATIENCE_S)
+    finally:
+        for worker in workers:
+            worker.stop()
+    return table.results
+
+
+class _Table:
+    """Items that wait, and results that are there.
+
+    waiting: indices of items; open: whether any item is not done
+    """
+
+    def __init__(self, items, most):
+        self.items, self.most, self.waiting = items, most, list(range(len(items)))
+        self.results, self.n_done = [None] * len(items), 0
+
+    @property
+    def open(self):
+        return self.n_done < len(self.items)
+
+    def take(self, worker, workers):
+        """The next portion for a worker: [index, ...], by its part of all known speed."""
+        if worker.speed:
+            known = [w.speed for w in workers if w.speed]
+            total = sum(known) + worker.speed * (len(workers) - len(known))
+            n = max(1, int(SHARE * len(self.waiting) * worker.speed / total))
+        else:
+            n = min(FIRST, -(-len(self.waiting) // len(workers)))
+        n = min(n, self.most)
+        portion, self.waiting = self.waiting[:n], self.waiting[n:]
+        return portion
+
+
+class _Worker:
+    """A process with one device.
+
+    portion: indices of the items it has; speed [items/s]: of its last portion, None before that
+    """
+
+    def __init__(self, function, choice):
+        self.name, index = _named(choice)
+        self.portion, self.speed = [], None
+        spawn = multiprocessing.get_context("spawn")
+        self.pipe, other = spawn.Pipe()
+        self.process = spawn.Process(target=_work, args=(function, index, other), daemon=True)
+        self.process.start()
+        other.close()
+
+    def give(self, portion, items):
+        """Send a portion, if there is one; a dead process is found when its answer is awaited."""
+        self.portion, self._began = portion, time.perf_counter()
+        if portion:
+            with suppress(OSError):
+                self.pipe.send(items)
+
+    def collect(self, table, patience_s=None):
+        """Take in what the process answers; returns a fault, or None."""
+        if not self.portion:
+            return None
+        try:
+            if patience_s is not None and not self.pipe.poll(patience_s):
+                return f"{self.name} does not answer"
+            results, fault = self.pipe.recv()
+        except (EOFError, OSError):
+            self.process.join(1)
+            return f"the process of {self.name} ended with status {self.process.exitcode}"
+        if fault:
+            return f"{self.name} failed: {fault}"
+        for i, result in zip(self.portion, results, strict=True):
+            table.results[i] = result
+        table.n_done += len(self.portion)
+        self.speed = len(self.portion) / max(time.perf_counter() - self._began, 1e-6)
+        self.portion = []
+        return None
+
+    def interrupt(self):
+        self.process.terminate()
+
+    def stop(self):
+        self.pipe.close()
+        self.process.join(1)
+        if self.process.is_alive():
+            self.process.kill()
+
+
+def _named(choice):
+    """A device's name and its index among all, which another process understands."""
+    cl_device = choice.cl if isinstance(choice, Device) else choose(choice)
+    return cl_device.name.strip(), find_devices().index(cl_device)
+
+
+def _work(function, index, pipe):
+    """What a process does: items in, results out, until nobody asks any more."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C: the parent decides, and terminates
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, interrupt)
+    with suppress(EOFError, OSError, KeyboardInterrupt):
+        while True:
+            items = pipe.recv()
+            try:
+                answer = function(items, device=get_device(index)), None
+            except Exception as error:
+                what = traceback.format_exception_only(error)[-1].strip()
+                answer = None, what
+            pipe.send(answer)
+    os._exit(0)  # leaves out the exit handlers of drivers, some of which wait for ever

@@ -1,0 +1,64 @@
+"""Blends dealt to two processes come out as from one device."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clresample import Extended, Settings, deblend_many, get_device, list_devices
+from clresample.cli.machine.workload import Renders, blends
+from clresample.deblending.blend import Failure
+
+SETTINGS = Settings(max_iter=6)
+
+
+def test_results_are_those_of_one_device(device):
+    given = blends(5, device)
+    outside = (Extended(position_px=(1e4, 1e4)),)
+    given[2] = replace(given[2], sources=outside)  # harms no other
+    done = []
+    together = deblend_many(given, settings=SETTINGS, device=[device, device], progress=done.append)
+    alone = deblend_many(given, settings=SETTINGS, device=device)
+    assert done[-1] == 5
+    assert [type(r) for r in together] == [type(r) for r in alone]
+    assert isinstance(together[2], Failure) and together[2].status == alone[2].status
+    for one, other in zip(together, alone):
+        if not isinstance(one, Failure):
+            assert one.status == other.status
+            np.testing.assert_allclose(one.losses, other.losses, rtol=1e-6)
+            for a, b in zip(one.components, other.components):
+                np.testing.assert_allclose(a.morphology, b.morphology, atol=1e-6)
+                np.testing.assert_allclose(a.spectrum, b.spectrum, rtol=1e-5)
+
+
+@pytest.fixture
+def unlike():
+    """One device of each name."""
+    found = {info.name: info.index for info in list_devices()}
+    if len(found) < 2:
+        pytest.skip("one device here")
+    return [get_device(index) for index in found.values()]
+
+
+def test_unlike_devices_agree(unlike):
+    given = blends(6, unlike[0])
+    together = deblend_many(given, settings=SETTINGS, device=unlike)
+    alone = deblend_many(given, settings=SETTINGS, device=unlike[0])
+    for one, other in zip(together, alone):
+        np.testing.assert_allclose(one.losses[-1], other.losses[-1], rtol=1e-3)
+
+
+def test_unlike_devices_work_side_by_side_in_one_process(unlike):
+    """Operators whose launches alternate, each with what the other renders."""
+    ops = [Renders(device).op for device in unlike]
+    x = np.random.default_rng(0).standard_normal(ops[0].shape_in)
+    truth = ops[0](x)
+    for _ in range(3):
+        arrays = [op.device.put(x, np.float32) for op in ops]
+        seen = [op(array) for op, array in zip(ops, arrays)]
+        back = [op.adjoint(array) for op, array in zip(ops, seen)]
+        for op, y, again in zip(ops, seen, back):
+            assert y.context == op.device.context
+            y, again = op.device.get(y), op.device.get(again)
+            assert np.linalg.norm(y - truth) < 1e-6 * np.linalg.norm(truth)
+            assert abs(np.vdot(again, x) - np.vdot(y, y)) < 1e-5 * np.vdot(y, y)

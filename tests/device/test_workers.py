@@ -1,0 +1,84 @@
+"""Work dealt to several devices: all of it done once, in order, whatever happens to one of them."""
+
+import os
+
+import pytest
+from helpers.portions import fails_on_seven, first_dies, slow, squares
+
+from clresample import DeviceError
+from clresample.device.remembered import DeviceWarning
+from clresample.device.workers import _Table, deal
+
+
+def dealt(function, items, devices, most=1000):
+    seen = []
+    return deal(function, items, devices, done=seen.append, most=most), seen
+
+
+def test_everything_is_done_once_and_in_order(device):
+    results, seen = dealt(squares, range(30), [device, device])
+    assert [square for square, _ in results] == [n * n for n in range(30)]
+    pids = {pid for _, pid in results}
+    assert len(pids) == 2 and os.getpid() not in pids
+    assert seen == sorted(seen) and seen[-1] == 30
+
+
+def test_an_error_is_raised_by_name_when_nobody_is_left(device):
+    with (
+        pytest.warns(DeviceWarning, match=r"failed: ArithmeticError: seven; .* goes on"),
+        pytest.raises(DeviceError, match=r"failed: ArithmeticError: seven; .*seven"),
+    ):
+        dealt(fails_on_seven, range(9), [device, device])
+
+
+def test_what_a_dead_process_had_is_done_by_the_others(device, tmp_path):
+    items = [(str(tmp_path), n) for n in range(12)]
+    with pytest.warns(DeviceWarning, match="ended with status 3; .* goes on"):
+        results, _ = dealt(first_dies, items, [device, device])
+    assert results == list(range(12))
+
+
+def test_without_items_or_devices(device):
+    assert dealt(squares, [], [device]) == ([], [])
+    with pytest.raises(ValueError, match="device is an empty list"):
+        dealt(squares, [1], [])
+    with pytest.raises(DeviceError, match="fits no device"):
+        dealt(squares, [1], [device, "no such device"])
+
+
+def test_ctrl_c_keeps_what_was_done(device):
+    def stop(n_done):
+        if n_done >= 4:
+            raise KeyboardInterrupt
+
+    results = deal(slow, list(range(40)), [device], done=stop, most=4)
+    assert results[:4] == [0, 1, 2, 3]
+    assert results[8:] == [None] * 32
+
+
+class Known:
+    """A worker of known speed."""
+
+    def __init__(self, speed):
+        self.speed = speed
+
+
+def test_portions_follow_the_speeds():
+    quick, slower, new = Known(90.0), Known(10.0), Known(None)
+    table = _Table(range(200), 1000)
+    assert len(table.take(quick, [quick, slower])) == 90
+    assert len(table.take(slower, [quick, slower])) == 5
+    assert len(table.take(new, [quick, slower, new])) == 4
+    assert len(_Table(range(200), 7).take(quick, [quick, slower])) == 7
+    last = _Table(range(1), 7)
+    assert last.take(slower, [quick, slower]) == [0] and last.waiting == []
+    assert last.take(quick, [quick, slower]) == []
+
+
+def test_portions_of_all_sizes_are_each_taken_once():
+    table, workers = _Table(range(50), 9), [Known(3.0), Known(1.0)]
+    taken = []
+    while table.waiting:
+        for worker in workers:
+            taken += table.take(worker, workers)
+    assert sorted(taken) == list(range(50))

@@ -1,0 +1,57 @@
+"""The scripts beside the package: runtimes to test on, and the run of every kernel."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+from helpers.checkout import ROOT
+
+sys.path.insert(0, str(ROOT / "tools"))
+import grind
+
+ON_RUNTIME = ROOT / "tools" / "on_runtime.sh"
+
+
+def on_runtime(*command, **environment):
+    return subprocess.run(
+        [ON_RUNTIME, *map(str, command)],
+        env={"PATH": "/usr/bin:/bin"} | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_what_cannot_be_fetched_is_skipped_and_said(tmp_path):
+    (tmp_path / "file").write_text("")
+    answer = on_runtime("rusticl", "true", RUNTIMES=str(tmp_path / "file"))
+    assert answer.returncode == 77
+    assert answer.stderr.startswith("skipped: no runtime rusticl here: ")
+    assert len(answer.stderr.splitlines()) == 1
+
+
+def test_an_unknown_runtime_names_those_there_are(tmp_path):
+    answer = on_runtime("cuda", "true", RUNTIMES=str(tmp_path))
+    assert answer.returncode == 2
+    assert answer.stderr.startswith("RUNTIME is cuda; there are pocl, ")
+
+
+def test_a_command_runs_as_it_is_and_keeps_its_status(tmp_path):
+    answer = on_runtime(
+        "pocl", "bash", "-c", "echo $PYOPENCL_NO_CACHE; exit 5", RUNTIMES=str(tmp_path)
+    )
+    assert (answer.returncode, answer.stdout) == (5, "1\n")
+
+
+def test_every_kernel_is_one_that_grind_looks_for():
+    text = "".join(path.read_text() for path in (ROOT / "kernels").glob("*.cl"))
+    assert len(grind.all_kernels()) == len(re.findall(r"^__kernel", text, re.MULTILINE)) > 30
+
+
+@pytest.mark.parametrize("fault", grind.FAULTS)
+def test_planted_faults_build(device, fault):
+    """Whether they are reported, tools/grind.sh asks of Oclgrind itself."""
+    import pyopencl as cl
+
+    cl.Kernel(cl.Program(device.context, grind.FAULTS[fault]).build(), fault)
