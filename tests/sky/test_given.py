@@ -176,3 +176,33 @@ def test_copies_are_as_read_only(way):
     ):
         with pytest.raises(ValueError, match="read-only"):
             array[...] = 0
+
+
+@pytest.mark.parametrize(
+    "given, said",
+    [
+        (
+            {"data": np.where(HIDDEN, 1e101, 1.0), "weights": 1e-99},
+            "data reach 1e.101 at .*2, 3",
+        ),
+        ({"weights": 1e120}, "weights reach 1e.120"),
+        ({"variance": 1e120, "weights": None}, "variances reach 1e.120"),
+        ({"data": np.where(HIDDEN, 1e13, 1.0)}, "data in units of their noise reach 1e.13"),
+    ],
+)
+def test_numbers_that_no_fit_can_bear_are_refused(given, said):
+    with pytest.raises(ValueError, match=said):
+        observed(**given)
+
+
+def test_such_numbers_do_no_harm_where_they_are_masked():
+    o = observed(np.where(HIDDEN, 1e300, IMAGE), mask=HIDDEN)
+    assert not o.weights[0, HIDDEN].any() and (o.weights[0, ~HIDDEN] == 1).all()
+
+
+def test_pixels_far_longer_than_wide_are_a_mistake():
+    wcs = GRID.to_wcs(ra_deg=10, dec_deg=20)
+    Grid.from_wcs(wcs, SHAPE)
+    wcs.wcs.cd = wcs.wcs.cd * (1, 200)
+    with pytest.raises(ValueError, match="central pixel is 200 times as long as wide"):
+        Grid.from_wcs(wcs, SHAPE)
