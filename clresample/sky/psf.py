@@ -21,7 +21,7 @@ BAND_SLACK = 1e-12
 BLOCK = 1 << 20
 # [samples] PSF images from this size on are transformed by an FFT and interpolation where their
 # axes are turned: there the sum over all samples takes 26 us a frequency, the FFT 5; its error of
-# 3e-15 of the light is float64's rounding. Smaller images keep the sum, which has no window.
+# 1e-14 of the light is near float64's rounding. Smaller images keep the sum, which has no window.
 LARGE = 256 * 256
 
 

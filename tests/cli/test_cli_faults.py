@@ -75,6 +75,14 @@ def test_tables_with_two_values_a_row(scene, capsys):
     assert "column ra has (2,) values a row, a position takes one" in refused(capsys)
 
 
+def test_tables_of_complex_numbers(scene, capsys):
+    table = Table({"ra": [1 + 1j, 2], "dec": [1.0, 2.0]})
+    table.write(scene / "sources.fits", overwrite=True)
+    change(scene, "sources.ecsv", "sources.fits")
+    assert deblend(scene) == 2
+    assert "column ra is no position in deg (its type is complex128)" in refused(capsys)
+
+
 @pytest.mark.parametrize("value", [1e400, "many", 1.5])
 def test_components_that_are_no_number(scene, capsys, value):
     table = Table.read(scene / "sources.ecsv")

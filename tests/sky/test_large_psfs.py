@@ -16,6 +16,7 @@ def moffat(n, center=None):
     return PSF((1 + (y**2 + 0.8 * x**2) / 16) ** -2.5, spacing=0.7, center=center)
 
 
+@pytest.mark.filterwarnings("ignore::clresample.sky.psf_checks.PSFWarning")
 @pytest.mark.parametrize("center", [None, (31.3, 28.9)])
 def test_both_ways_are_one(monkeypatch, center):
     psf = moffat(61, center)
