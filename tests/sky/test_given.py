@@ -206,3 +206,10 @@ def test_pixels_far_longer_than_wide_are_a_mistake():
     wcs.wcs.cd = wcs.wcs.cd * (1, 200)
     with pytest.raises(ValueError, match="central pixel is 200 times as long as wide"):
         Grid.from_wcs(wcs, SHAPE)
+
+
+@pytest.mark.filterwarnings("error")
+def test_signalling_nan_is_nan():
+    data = IMAGE.astype(np.float32)
+    data.view(np.uint32)[0, 0] = 0x7F800001  # as flipped bits leave it
+    assert observed(data).weights[0, 0, 0] == 0

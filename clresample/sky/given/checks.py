@@ -23,7 +23,8 @@ def numbers(name, values, unit=None) -> np.ndarray:
 
     Raises ValueError for complex numbers, texts, dates, masked values, and other units.
     """
-    return np.asarray(real(name, values, unit), dtype=np.float64)
+    with np.errstate(invalid="ignore"):  # NaN of damaged files may be of the kind that signals
+        return np.asarray(real(name, values, unit), dtype=np.float64)
 
 
 def real(name, values, unit=None) -> np.ndarray:
