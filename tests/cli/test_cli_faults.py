@@ -231,3 +231,15 @@ def test_signals_leave_all_or_nothing(scene, number):
     assert "Traceback" not in rest
     assert not (scene / "out").exists() or kept(scene / "out") == OF_FIT
     assert not [name for name in kept(scene) if name.startswith((".part-", ".done-"))]
+
+
+def test_ctrl_c_before_a_command_is_known(monkeypatch, capsys):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("clresample.cli.command.Parser.parse_args", interrupted)
+    from clresample.cli import main
+
+    assert main(["devices"]) == 130
+    assert refused(capsys) == "clresample: interrupted\n"
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL

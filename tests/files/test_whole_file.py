@@ -94,7 +94,7 @@ def listed(folder):
 
 @pytest.mark.parametrize("there", [False, True], ids=["new folder", "old folder"])
 def test_several_files_appear_together(tmp_path, there):
-    folder = tmp_path / "a" / "out"
+    folder = tmp_path / "b" / "a" / "out"
     if there:
         folder.mkdir(parents=True)
         (folder / "y").write_text("old")
@@ -114,7 +114,7 @@ def current_umask():
 
 @pytest.mark.parametrize("there", [False, True], ids=["new folder", "old folder"])
 def test_of_several_files_all_or_none_appear(tmp_path, monkeypatch, there):
-    folder = tmp_path / "a" / "out"
+    folder = tmp_path / "b" / "a" / "out"
     if there:
         folder.mkdir(parents=True)
         (folder / "x").write_text("old")
