@@ -116,6 +116,8 @@ def test_angles_with_a_unit_are_converted():
     "make, said",
     [
         (lambda: PSF(IMAGE**2, spacing="a"), "spacing must be an array of real numbers"),
+        (lambda: PSF(IMAGE**2, spacing=1e300), "spacing is 1e.300, must be .* from 0.001 to 1000"),
+        (lambda: PSF(IMAGE**2, spacing=1e-9), "spacing is 1e-09"),
         (lambda: PSF(IMAGE**2, spacing=[1, 2]), "spacing is .*positive number of pixels"),
         (lambda: PSF(IMAGE**2, center="b"), "center must be"),
         (lambda: PSF(None), "images must be .*None"),
