@@ -7,9 +7,10 @@ from decimal import Decimal
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.table import MaskedColumn
 from astropy.utils.masked import Masked
 
-from clresample.sky.given.checks import number, numbers, whole
+from clresample.sky.given.checks import float_type, number, numbers, whole
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
@@ -208,6 +209,28 @@ def test_pixels_far_longer_than_wide_are_a_mistake():
     wcs.wcs.cd = wcs.wcs.cd * (1, 200)
     with pytest.raises(ValueError, match="central pixel is 200 times as long as wide"):
         Grid.from_wcs(wcs, SHAPE)
+
+
+@pytest.mark.parametrize("mask", [False, True])
+def test_units_of_masked_arrays_are_refused_too(mask):
+    column = MaskedColumn(np.ones(8), mask=[mask] * 8, unit="adu")
+    with pytest.raises(ValueError, match="weights has the unit adu"):
+        observed(weights=column)
+
+
+def test_types_of_floats():
+    for name in ("f4", ">f8", np.float32, "float64"):
+        assert float_type(name) in (np.dtype(name),)
+    for name in (None, "f2", "f16", "i4", "i8", "c8", "M8[s]", "nonsense", 3):
+        with pytest.raises(ValueError, match="dtype is .* allowed are float32 and float64"):
+            float_type(name)
+
+
+def test_the_smallest_grid_and_half_a_pair():
+    assert Grid.flat((1, 1), (0.2, 0.3)).shape == (1, 1)
+    for pair in ((0.2, np.nan), (np.nan, 0.2)):
+        with pytest.raises(ValueError, match="scale_arcsec is"):
+            Grid.flat((1, 1), pair)
 
 
 @pytest.mark.filterwarnings("error")

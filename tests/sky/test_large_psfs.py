@@ -12,7 +12,7 @@ MATRIX = np.array([[1.4, 0.5], [-0.6, 1.3]])
 
 
 def moffat(n, center=None):
-    y, x = np.indices((n, n)) - (n - 1) / 2
+    y, x = np.indices((n, n - 8)) - np.reshape([(n - 1) / 2, (n - 9) / 2], (2, 1, 1))
     return PSF((1 + (y**2 + 0.8 * x**2) / 16) ** -2.5, spacing=0.7, center=center)
 
 
