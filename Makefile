@@ -6,8 +6,8 @@ VENV ?= .venv
 STAMP = $(VENV)/made
 RUN = $(VENV)/bin/python -m
 
-.PHONY: demo test test-on test-kernels-on grind lint clean paper paper-full dist test-install \
-    test-oldest test-adapters docs
+.PHONY: demo test test-on test-kernels-on grind lint mutants fuzz clean paper paper-full dist \
+    test-install test-oldest test-adapters docs
 
 # What runs on one OpenCL device whatever the others are: operators, and the solver's kernels.
 KERNEL_TESTS = tests/device/test_contraction.py tests/device/test_launcher.py \
@@ -42,6 +42,14 @@ lint: $(STAMP)
 	$(RUN) ruff check .
 	$(RUN) ruff format --check .
 	$(RUN) mypy
+
+# Do the tests of a module notice slips in it? MODULE=clresample/sky/noise.py ARGS='--n 40 --seed 1'
+mutants: $(STAMP)
+	$(RUN) tests.mutants $(MODULE) $(ARGS)
+
+# The property tests with thousands of examples instead of a few.
+fuzz: $(STAMP)
+	CLRESAMPLE_EXAMPLES=$(or $(EXAMPLES),2000) $(RUN) pytest tests/properties $(ARGS)
 
 # The paper's evidence, in bench/report/report.md; an interrupted run continues, a larger one adds.
 paper: GALAXIES = 600

@@ -39,7 +39,11 @@ class Parser(argparse.ArgumentParser):
 def main(argv=None):
     """Run `clresample` with these arguments (None: sys.argv's); returns the exit status."""
     with _ended_as_interrupted():
-        return _run(argv)
+        try:
+            return _run(argv)
+        except KeyboardInterrupt:  # before a command was known
+            print("clresample: interrupted", file=sys.stderr)
+            return 130
 
 
 def _run(argv):

@@ -24,7 +24,7 @@ class WhitenedView:
     covered (My, Mx): bool, whose centre lies on the frame itself
     unit (Co,) [counts]: noise of a typical pixel of each channel, in which data and model count
     root (Co, My, Mx) [1 / unit]: square root of the weights, 0 where the frame does not cover
-    data (Co, My, Mx) [unit]: the observation's data
+    data (Co, My, Mx) [unit]: the observation's data, 0 where root is
     """
 
     op: Resampler
@@ -45,7 +45,8 @@ class WhitenedView:
         mapping = replace(op.mapping, shape_in=frame.shape)
         covered = mapping.covered
         root = np.sqrt(weights) * unit[:, None, None] * covered
-        return cls(op, mapping, covered, unit, root, data / unit[:, None, None])
+        data = np.where(root > 0, data, 0.0) / unit[:, None, None]
+        return cls(op, mapping, covered, unit, root, data)
 
     @property
     def pixel_noise(self) -> np.ndarray:

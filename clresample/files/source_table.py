@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import warnings
 from pathlib import Path
 
 import numpy as np
 from astropy.table import Table
+from astropy.utils.exceptions import AstropyWarning
 
 from ..sky.sources import Extended, Point
 
@@ -68,7 +70,9 @@ def _read(path, name):
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     try:
-        return Table.read(path, format=name)
+        with warnings.catch_warnings():  # of types that ECSV does not know, and then reads
+            warnings.simplefilter("ignore", AstropyWarning)
+            return Table.read(path, format=name)
     except Exception as error:  # readers raise any exception on a file of another format
         reason = str(error).strip().split("\n")[0]
         raise ValueError(
@@ -84,6 +88,8 @@ def _numbers(path, what, column, unit):
                 column.to(unit) if not hasattr(column, "mask") else column.filled(np.nan).to(unit)
             )
         values = getattr(column, "value", column)
+        if np.asarray(values).dtype.kind in "cmM":
+            raise ValueError(f"its type is {np.asarray(values).dtype}")
         values = np.ma.filled(np.ma.asarray(values, dtype=float), np.nan)
     except Exception as error:  # astropy and NumPy raise several on texts and other units
         raise ValueError(f"{path}: column {what} is no position in {unit} ({error})") from error

@@ -68,7 +68,7 @@ def shape(second):
     (nn, ne), (_, ee) = second
     total = nn + ee
     if not total > 0:
-        return np.sqrt(total), np.nan, np.nan, np.nan
+        return np.sqrt(max(total, 0)), np.nan, np.nan, np.nan
     e1, e2 = (nn - ee) / total, 2 * ne / total
     return np.sqrt(total / 2), e1, e2, np.degrees(np.arctan2(e2, e1)) / 2 % 180
 

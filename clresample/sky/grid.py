@@ -13,7 +13,15 @@ from astropy.wcs.utils import wcs_to_celestial_frame
 from ..drawing.shown import ShownGrid
 from .given.checks import arcseconds, image_shape, instance, number, numbers
 from .mapping import Mapping, map_affine, map_positions
-from .wcs import convert, pixel_scale, pixels_at, shifted_wcs, tangent_wcs, world_at
+from .wcs import (
+    convert,
+    pixel_problem,
+    pixel_scale,
+    pixels_at,
+    shifted_wcs,
+    tangent_wcs,
+    world_at,
+)
 
 
 class Grid(ShownGrid, ABC):
@@ -48,13 +56,12 @@ class Grid(ShownGrid, ABC):
         try:
             wcs = wcs.celestial if wcs.naxis > 2 else wcs.deepcopy()
             wcs_to_celestial_frame(wcs)
-            grid = WcsGrid(shape, wcs)
-            scale = grid.pixel_scale_arcsec
+            problem = pixel_problem(wcs, shape)
         except Exception as error:  # wcslib raises a dozen kinds, RuntimeError among them
             raise ValueError(f"wcs cannot be used: {' '.join(str(error).split())}") from error
-        if not scale > 0:
-            raise ValueError(f"wcs cannot be used: its central pixel has the size {scale} arcsec")
-        return grid
+        if problem:
+            raise ValueError(f"wcs cannot be used: its central pixel {problem}")
+        return WcsGrid(shape, wcs)
 
     @staticmethod
     def flat(shape, scale_arcsec, *, angle_deg=0, flip=False, center_arcsec=(0, 0)) -> Grid:

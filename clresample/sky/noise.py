@@ -15,6 +15,11 @@ CLIP = 3.0
 MAX_ROUNDS = 50
 # pixels that a noise estimate takes at least: the error of their MAD is a fifth of it
 MIN_PIXELS = 32
+# Largest data, weights and variances: their squares are still far from float64's end.
+LARGEST = 1e100
+# [sigma] Largest signal to noise of a pixel: in float32, whose rounding is 1e5 sigma there, chi2
+# comes to its end soon after. Real images reach 1e4.
+MOST_SIGMAS = 1e12
 # median |x| of a unit Gaussian, whole and cut at CLIP
 HALF_WIDTH = NormalDist().inv_cdf(0.75)
 HALF_WIDTH_CUT = NormalDist().inv_cdf(0.5 + math.erf(CLIP / math.sqrt(2)) / 4)
@@ -115,6 +120,7 @@ def weights_from(data, bad, weights, variance, mask, channels):
         no_weight = np.zeros_like(bad)
     n_bad = int(np.count_nonzero(~masked & (no_weight | (bad & (weights > 0)))))
     weights = np.where(bad | masked, 0.0, weights)
+    _check_range(data, weights)
     if n_bad:
         messages.append(
             f"{n_bad} of {data.size} pixels have weight 0: no usable data, weight or variance"
@@ -125,6 +131,25 @@ def weights_from(data, bad, weights, variance, mask, channels):
         if not seen
     ]
     return weights, n_bad, messages
+
+
+def _check_range(data, weights):
+    """Raise ValueError where data or weights leave the numbers that a fit can be done in."""
+    light = np.where(weights > 0, np.abs(data), 0.0)
+    root, one = np.sqrt(weights), np.ones_like(weights)
+    inverse = np.divide(one, weights, out=np.zeros_like(weights), where=weights > 0)
+    for name, values, most in (
+        ("data", light, LARGEST),
+        ("weights", weights, LARGEST),
+        ("data in units of their noise", np.minimum(light, LARGEST) * root, MOST_SIGMAS),
+        ("variances", inverse, LARGEST),
+    ):
+        i = np.unravel_index(np.argmax(values), values.shape)
+        if not values[i] <= most:
+            raise ValueError(
+                f"{name} reach {values[i]:.3g} at (channel, y, x) = {tuple(map(int, i))}, more "
+                f"than {most:g}: mask such pixels, or take another unit"
+            )
 
 
 def _spread(name, values, shape):

@@ -16,12 +16,15 @@ from .waves import phases
 
 # relative slack on the band's edge, above the rounding of A^T nu in float64
 BAND_SLACK = 1e-12
+# [px] largest distance of two samples, and the inverse of the smallest: beyond lie mistakes of unit
+COARSEST = 1e3
+SPACINGS = f"a positive number of pixels, from {1 / COARSEST:g} to {COARSEST:g}"
 # [complex numbers] one block of the general transform's tables: 16 MiB, near the cache's size;
 # larger ones are read back from memory, smaller ones make many small products
 BLOCK = 1 << 20
 # [samples] PSF images from this size on are transformed by an FFT and interpolation where their
 # axes are turned: there the sum over all samples takes 26 us a frequency, the FFT 5; its error of
-# 3e-15 of the light is float64's rounding. Smaller images keep the sum, which has no window.
+# 1e-14 of the light is near float64's rounding. Smaller images keep the sum, which has no window.
 LARGE = 256 * 256
 
 
@@ -48,7 +51,7 @@ class PSF(ReadOnly, ShownPSF):
             images = images[None]
         if images.ndim != 3 or 0 in images.shape:
             raise ValueError(f"images must be (C, ny, nx) or (ny, nx), not {images.shape}")
-        spacing = number("spacing", spacing, "a positive number of pixels", _positive)
+        spacing = number("spacing", spacing, SPACINGS, lambda x: 1 / COARSEST <= x <= COARSEST)
         for i_band, image in enumerate(images):
             n_bad = np.count_nonzero(~np.isfinite(image))
             if n_bad:
@@ -176,10 +179,6 @@ class PSF(ReadOnly, ShownPSF):
     def warnings(self, core='center="core"') -> list[str]:
         """What a user should know of this PSF, a sentence each; see `psf_checks.psf_warnings`."""
         return psf_warnings(self.images, self.center, core)
-
-
-def _positive(x):
-    return 0 < x < math.inf
 
 
 def _center(images, center):

@@ -24,13 +24,36 @@ def world_at(wcs, n, m):
     return world[[wcs.wcs.lng, wcs.wcs.lat]].reshape((2,) + np.shape(n))
 
 
+# Length of a pixel over its width, at most: those of slit spectrographs have 10, beyond lie
+# mistakes in headers.
+MOST_ELONGATED = 100.0
+
+
 def pixel_scale(wcs, n, m):
     """Root of the area [arcsec] of the pixel at (n, m), from the WCS evaluated around it."""
+    y, x = _pixel_sides(wcs, n, m)
+    return math.sqrt(np.linalg.norm(np.cross(y, x))) / ARCSEC
+
+
+def pixel_problem(wcs, shape):
+    """What is wrong with the pixel in the middle of an image (Ny, Nx); None where nothing is."""
+    y, x = _pixel_sides(wcs, *(np.array(shape) - 1) / 2)
+    scale = math.sqrt(np.linalg.norm(np.cross(y, x))) / ARCSEC
+    if not scale > 0:
+        return f"has the size {scale} arcsec"
+    long, wide = np.linalg.svd(np.stack([y, x]), compute_uv=False)
+    if not long <= MOST_ELONGATED * wide:
+        return f"is {long / max(wide, np.finfo(float).tiny):.3g} times as long as wide"
+    return None
+
+
+def _pixel_sides(wcs, n, m):
+    """Sides of a pixel as vectors (3,) on the unit sphere, along the rows' and columns' numbers."""
     half = np.array([-0.5, 0.5])
     n, m = np.concatenate([n + half, [n, n]]), np.concatenate([[m, m], m + half])
     lon, lat = np.radians(world_at(wcs, n, m))
     v = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
-    return math.sqrt(np.linalg.norm(np.cross(v[:, 1] - v[:, 0], v[:, 3] - v[:, 2]))) / ARCSEC
+    return v[:, 1] - v[:, 0], v[:, 3] - v[:, 2]
 
 
 def local_axes(grid, pixel):

@@ -75,6 +75,14 @@ def test_tables_with_two_values_a_row(scene, capsys):
     assert "column ra has (2,) values a row, a position takes one" in refused(capsys)
 
 
+def test_tables_of_complex_numbers(scene, capsys):
+    table = Table({"ra": [1 + 1j, 2], "dec": [1.0, 2.0]})
+    table.write(scene / "sources.fits", overwrite=True)
+    change(scene, "sources.ecsv", "sources.fits")
+    assert deblend(scene) == 2
+    assert "column ra is no position in deg (its type is >c16)" in refused(capsys)
+
+
 @pytest.mark.parametrize("value", [1e400, "many", 1.5])
 def test_components_that_are_no_number(scene, capsys, value):
     table = Table.read(scene / "sources.ecsv")
@@ -223,3 +231,15 @@ def test_signals_leave_all_or_nothing(scene, number):
     assert "Traceback" not in rest
     assert not (scene / "out").exists() or kept(scene / "out") == OF_FIT
     assert not [name for name in kept(scene) if name.startswith((".part-", ".done-"))]
+
+
+def test_ctrl_c_before_a_command_is_known(monkeypatch, capsys):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("clresample.cli.command.Parser.parse_args", interrupted)
+    from clresample.cli import main
+
+    assert main(["devices"]) == 130
+    assert refused(capsys) == "clresample: interrupted\n"
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL

@@ -94,7 +94,7 @@ def listed(folder):
 
 @pytest.mark.parametrize("there", [False, True], ids=["new folder", "old folder"])
 def test_several_files_appear_together(tmp_path, there):
-    folder = tmp_path / "a" / "out"
+    folder = tmp_path / "b" / "a" / "out"
     if there:
         folder.mkdir(parents=True)
         (folder / "y").write_text("old")
@@ -114,7 +114,7 @@ def current_umask():
 
 @pytest.mark.parametrize("there", [False, True], ids=["new folder", "old folder"])
 def test_of_several_files_all_or_none_appear(tmp_path, monkeypatch, there):
-    folder = tmp_path / "a" / "out"
+    folder = tmp_path / "b" / "a" / "out"
     if there:
         folder.mkdir(parents=True)
         (folder / "x").write_text("old")
@@ -234,12 +234,15 @@ def test_what_others_are_writing_is_left_alone(tmp_path):
         for name in names:
             (tmp_path / name).mkdir()
         (tmp_path / f".part-{HOST}-{2**22 + 5}-0").symlink_to(tmp_path)
+        for k in range(20):
+            (tmp_path / f"file {k}").write_text("")
+            (tmp_path / f".part-{HOST}-{2**22 + 7}-{k}").mkdir()  # of the dead
         check_folder(tmp_path)
-        assert len(os.listdir(tmp_path)) == 4
+        assert len(os.listdir(tmp_path)) == 24
     finally:
         alive.communicate(b"\n")
     check_folder(tmp_path)
-    assert len(os.listdir(tmp_path)) == 3
+    assert len(os.listdir(tmp_path)) == 23
 
 
 def test_devices_pipes_links_and_inputs_are_kept(tmp_path):

@@ -70,3 +70,11 @@ def test_what_is_warned_of():
     (floored,) = noise_warnings(certificate(1, 0.25))
     assert "25.00%" in floored and "the division is floored" in floored
     assert len(noise_warnings(certificate(3, 0.25))) == 2
+
+
+def test_wrap_radius_of_turned_pixels_that_are_not_square():
+    """Observed displacements u of length r reach r |A_y| along the model's y, r |A_x| along x."""
+    psf = PSF.gaussian(1.5, n_pixels=61, pixel=False)
+    for matrix in ([[2.0, 1.0], [0.0, 0.5]], [[0.3, 1.9], [-0.6, 0.2]]):
+        y, x = wrap_radius(psf, np.array(matrix))
+        assert y / x == pytest.approx(np.hypot(*matrix[0]) / np.hypot(*matrix[1]))

@@ -7,9 +7,10 @@ from decimal import Decimal
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.table import MaskedColumn
 from astropy.utils.masked import Masked
 
-from clresample.sky.given.checks import number, numbers, whole
+from clresample.sky.given.checks import float_type, number, numbers, whole
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
@@ -116,6 +117,8 @@ def test_angles_with_a_unit_are_converted():
     "make, said",
     [
         (lambda: PSF(IMAGE**2, spacing="a"), "spacing must be an array of real numbers"),
+        (lambda: PSF(IMAGE**2, spacing=1e300), "spacing is 1e.300, must be .* from 0.001 to 1000"),
+        (lambda: PSF(IMAGE**2, spacing=1e-9), "spacing is 1e-09"),
         (lambda: PSF(IMAGE**2, spacing=[1, 2]), "spacing is .*positive number of pixels"),
         (lambda: PSF(IMAGE**2, center="b"), "center must be"),
         (lambda: PSF(None), "images must be .*None"),
@@ -176,3 +179,62 @@ def test_copies_are_as_read_only(way):
     ):
         with pytest.raises(ValueError, match="read-only"):
             array[...] = 0
+
+
+@pytest.mark.parametrize(
+    "given, said",
+    [
+        (
+            {"data": np.where(HIDDEN, 1e101, 1.0), "weights": 1e-99},
+            "data reach 1e.101 at .*2, 3",
+        ),
+        ({"weights": 1e120}, "weights reach 1e.120"),
+        ({"variance": 1e120, "weights": None}, "variances reach 1e.120"),
+        ({"data": np.where(HIDDEN, 1e13, 1.0)}, "data in units of their noise reach 1e.13"),
+    ],
+)
+def test_numbers_that_no_fit_can_bear_are_refused(given, said):
+    with pytest.raises(ValueError, match=said):
+        observed(**given)
+
+
+def test_such_numbers_do_no_harm_where_they_are_masked():
+    o = observed(np.where(HIDDEN, 1e300, IMAGE), mask=HIDDEN)
+    assert not o.weights[0, HIDDEN].any() and (o.weights[0, ~HIDDEN] == 1).all()
+
+
+def test_pixels_far_longer_than_wide_are_a_mistake():
+    wcs = GRID.to_wcs(ra_deg=10, dec_deg=20)
+    Grid.from_wcs(wcs, SHAPE)
+    wcs.wcs.cd = wcs.wcs.cd * (1, 200)
+    with pytest.raises(ValueError, match="central pixel is 200 times as long as wide"):
+        Grid.from_wcs(wcs, SHAPE)
+
+
+@pytest.mark.parametrize("mask", [False, True])
+def test_units_of_masked_arrays_are_refused_too(mask):
+    column = MaskedColumn(np.ones(8), mask=[mask] * 8, unit="adu")
+    with pytest.raises(ValueError, match="weights has the unit adu"):
+        observed(weights=column)
+
+
+def test_types_of_floats():
+    for name in ("f4", ">f8", np.float32, "float64"):
+        assert float_type(name) in (np.dtype(name),)
+    for name in (None, "f2", "f16", "i4", "i8", "c8", "M8[s]", "nonsense", 3):
+        with pytest.raises(ValueError, match="dtype is .* allowed are float32 and float64"):
+            float_type(name)
+
+
+def test_the_smallest_grid_and_half_a_pair():
+    assert Grid.flat((1, 1), (0.2, 0.3)).shape == (1, 1)
+    for pair in ((0.2, np.nan), (np.nan, 0.2)):
+        with pytest.raises(ValueError, match="scale_arcsec is"):
+            Grid.flat((1, 1), pair)
+
+
+@pytest.mark.filterwarnings("error")
+def test_signalling_nan_is_nan():
+    data = IMAGE.astype(np.float32)
+    data.view(np.uint32)[0, 0] = 0x7F800001  # as flipped bits leave it
+    assert observed(data).weights[0, 0, 0] == 0

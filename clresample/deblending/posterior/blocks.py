@@ -126,7 +126,8 @@ class Factor:
             own, later = half.T @ half, self._later[v]
             if later:
                 step = self._below[v] @ half
-                known = np.block([[get(u, w) for w in later] for u in later])
+                rows = [np.concatenate([get(u, w) for w in later], axis=1) for u in later]
+                known = np.concatenate(rows)  # np.block would take most of the time here
                 side = -known @ step
                 own -= step.T @ side
                 for u, part in zip(later, np.split(side, self._ends(v)[1:-1]), strict=True):

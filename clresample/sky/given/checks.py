@@ -23,7 +23,8 @@ def numbers(name, values, unit=None) -> np.ndarray:
 
     Raises ValueError for complex numbers, texts, dates, masked values, and other units.
     """
-    return np.asarray(real(name, values, unit), dtype=np.float64)
+    with np.errstate(invalid="ignore"):  # NaN of damaged files may be of the kind that signals
+        return np.asarray(real(name, values, unit), dtype=np.float64)
 
 
 def real(name, values, unit=None) -> np.ndarray:
@@ -86,13 +87,12 @@ def mask_of(values):
 def split_mask(name, values):
     """Values with what is masked in them filled by 0, and where that was; None = nowhere."""
     mask = mask_of(values)
-    if mask is None or not mask.any():
-        return values if mask is None else getattr(values, "unmasked", np.ma.getdata(values)), None
+    if mask is None:
+        return values, None
     values = without_unit(name, values)
-    plain = values.unmasked if hasattr(values, "unmasked") else np.ma.getdata(values)
-    plain = np.asarray(plain)
+    plain = np.asarray(values.unmasked if hasattr(values, "unmasked") else np.ma.getdata(values))
     check_real(name, plain)
-    return np.where(mask, 0, plain), mask
+    return (np.where(mask, 0, plain), mask) if mask.any() else (plain, None)
 
 
 def number(name, value, what="a finite number", fits=math.isfinite) -> float:

@@ -4,7 +4,7 @@
 
 The image is divided by the transform of a Kaiser-Bessel window, padded to twice its size and
 transformed; the window then interpolates between the grid's frequencies. What is left out folds
-back with the window's own side lobes, 3e-15 of sum |P| at TAPS = 16: float64's rounding. Cost per
+back with the window's own side lobes: with TAPS = 16, errors stay under 1e-14 of sum |P|. Cost per
 frequency TAPS^2, of the sum itself ny nx.
 
 Source: Dutt & Rokhlin 1993 (SIAM J. Sci. Comput. 14, 1368), with the window of Fessler & Sutton

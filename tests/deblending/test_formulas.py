@@ -1,0 +1,141 @@
+"""Single formulas of the fit against their values: slips in them hardly change where a fit ends."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.scenes import blend, fit, frame, observe, sources
+from helpers.solver import BOXES, changed, posed
+
+from clresample.deblending import iterate as iterate_module
+from clresample.deblending.fit import SPECTRUM_PART, Fit
+from clresample.deblending.profiles import SIZE_ARCSEC, components_of
+from clresample.deblending.settings import Settings
+from clresample.deblending.solver import curvature as curvature_module
+from clresample.deblending.solver.amsgrad import AMSGrad
+from clresample.deblending.solver.curvature import damping
+from clresample.deblending.solver.prior import Prior
+from clresample.deblending.spectra import MODEL_ERROR
+from clresample.deblending.start import _ProfileFit
+from clresample.deblending.view import whitened_view
+from clresample.sky.sources import Extended
+
+
+def seen(device, dtype=np.float32):
+    return [whitened_view(frame(), frame(), o, 1, device, dtype, private=True) for o in observe()]
+
+
+def test_noise_of_a_model_pixel(device):
+    """Of an observed pixel with four times the area: half of its noise, at the same exposure."""
+    sharp, coarse = seen(device)
+    np.testing.assert_allclose(sharp.pixel_noise, [1.0])
+    np.testing.assert_allclose(coarse.pixel_noise, [0.5, 0.5])
+
+
+def test_the_prior_bounds_the_curvature_of_faint_spectra(device):
+    scene, state = posed(device, boxes=BOXES[:1])
+    faint = replace(state, spectra=1e-12 * state.spectra)
+    assert damping(scene, faint, Prior())[0] == pytest.approx(1.0)
+
+
+def test_damping_falls_with_the_square_of_the_slope(device, monkeypatch):
+    """Twice as far from the data, so far that only this counts: a quarter."""
+    scene, state = posed(device, boxes=BOXES[:1])
+    found = []
+    for level in (1e4, 2e4):
+        far = changed(scene, state, data=[d + level for d in scene.data])
+        found.append(damping(*far, Prior())[0])
+    assert found[0] / found[1] == pytest.approx(4, rel=0.01)
+    assert curvature_module.NOISE_GRADIENT == 0.7
+    monkeypatch.setattr(curvature_module, "NOISE_GRADIENT", 1.4)
+    assert damping(*far, Prior())[0] == pytest.approx(4 * found[1])
+
+
+def test_the_sky_is_part_of_the_model_that_damps(device):
+    scene, state = posed(device, boxes=BOXES[:1])
+    level = 1e4 * np.ones_like(state.sky)
+    bright = [d + level[part, None, None] for part, d in zip(scene.channels(), scene.data)]
+    with_sky = damping(replace(scene, data=bright), replace(state, sky=state.sky + level), Prior())
+    np.testing.assert_allclose(with_sky, damping(scene, state, Prior()), rtol=1e-3)
+
+
+def test_scale_of_the_spectra_steps(device):
+    """A flux's error, and 2 % of the flux."""
+    f = Fit(blend(), Settings(), device, np.float32, pad=1)
+    error = 1 / np.sqrt(f.scene.power)
+    assert SPECTRUM_PART == 0.02 and (f.state.spectra > 20 * error).any()
+    np.testing.assert_allclose(f.scene.scale, error + 0.02 * f.state.spectra, rtol=1e-12)
+
+
+def test_sizes_of_several_components_lie_about_that_of_one():
+    (one,) = components_of(Extended(position_px=(3, 3)), frame())
+    two = components_of(Extended(position_px=(3, 3), n_components=2), frame())
+    three = components_of(Extended(position_px=(3, 3), n_components=3), frame())
+    sizes = [[c.mean[0] - one.mean[0] for c in several] for several in (two, three)]
+    assert one.mean[0] == pytest.approx(np.log(SIZE_ARCSEC / 0.1))
+    np.testing.assert_allclose(sorted(sizes[0]), (-0.5, 0.5), atol=1e-12)
+    np.testing.assert_allclose(sorted(sizes[1]), (-1, 0, 1), atol=1e-12)
+
+
+def test_chi2_of_profiles_allows_for_their_own_error(device):
+    """1 / w = 1 + (0.15 model)^2 in units of the noise."""
+    views = seen(device)
+    positions = np.array([s.position_px for s in sources()])
+    profiles = _ProfileFit(frame(), sources(), positions, views, fit_sky=True)
+    theta = profiles.mean + 0.2
+    found = profiles.linearise(theta)
+    heads = np.concatenate([images[:1] for images in profiles.images(theta)])
+    expected, channel = float((0.2**2 / profiles.scatter**2).sum()), 0
+    for view in views:
+        for image, root, data in zip(view.render(heads).swapaxes(0, 1), view.root, view.data):
+            model = found.spectra[:, channel] @ image + found.sky[channel] * root.ravel()
+            left = (data * root).ravel() - model
+            expected += (left**2 / (1 + (0.15 * model) ** 2)).sum()
+            channel += 1
+    assert MODEL_ERROR == 0.15
+    assert found.chi2 == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("fit_sky", [False, True])
+def test_normal_matrix_of_the_profiles(device, fit_sky, monkeypatch):
+    """Against chi2 itself: along the Gauss-Newton step it falls as the normal equations say."""
+    from clresample.deblending import spectra, start
+
+    for module in (start, spectra):
+        monkeypatch.setattr(module, "MODEL_ERROR", 0.0)  # weights that stay
+    if not device.has_fp64:
+        pytest.skip(f"{device.name} has no double precision")
+    views = seen(device, np.float64)
+    positions = np.array([s.position_px for s in sources()])
+    profiles = _ProfileFit(frame(), sources(), positions, views, fit_sky=fit_sky)
+    best = profiles.run()[1].theta
+    here = profiles.linearise(best)
+    step = 1e-3 * np.random.default_rng(2).normal(size=len(best))
+    sides = [profiles.linearise(best + sign * step).chi2 for sign in (1, -1)]
+    second = (sides[0] + sides[1] - 2 * here.chi2) / 2
+    assert second == pytest.approx(step @ here.normal @ step, rel=0.05)
+
+
+def test_a_fit_that_worsens_after_a_new_batch_ends_at_its_best(device, monkeypatch):
+    """The best state before its boxes were resized, which makes a new batch, is remembered."""
+    step, made = AMSGrad.step, []
+
+    def worse(self, *given):
+        step(self, *given)
+        if self.n_steps > 5:  # ever further from the data
+            spectra = self.buffers.spectra
+            values = self.buffers.device.get(spectra) * np.float32(1.03)
+            self.buffers.device.upload(values, spectra)
+
+    def resized(scene, state, *_):
+        made.append(scene)
+        return replace(scene), state
+
+    monkeypatch.setattr(AMSGrad, "step", worse)
+    monkeypatch.setattr(iterate_module, "RESIZE", 10)
+    monkeypatch.setattr(iterate_module, "resized", resized)
+    settings = Settings(prior=Prior(), max_iter=20, tol=0)
+    result = fit(blend(), device, settings=settings)
+    best = result.losses[:7].min()
+    assert made and result.losses[10] > 1.05 * best
+    assert result.losses[-1] <= best * (1 + 1e-6)

@@ -1,0 +1,88 @@
+"""Single formulas of detection: slips in them leave most detections as they are."""
+
+import numpy as np
+import pytest
+from helpers.blends import blend, in_frame, observe, round_component
+
+from clresample.measurement import detection as module
+from clresample.measurement.detection import ALL, detect, detect_more
+from clresample.sky.frame import model_frame
+from clresample.sky.grid import Grid
+from clresample.sky.observation import Observation
+from clresample.sky.psf import PSF
+
+pytest.importorskip("sep")
+GRID = Grid.flat((60, 60), 0.1)
+
+
+def point_source(psf, peak=30.0):
+    image = np.zeros(GRID.shape)
+    image[20:41, 25:46] = peak * PSF.gaussian(1.5, n_pixels=21).images[0]
+    rng = np.random.default_rng(5)
+    return Observation(image + rng.normal(0, 1, GRID.shape), psf, GRID, weights=1.0)
+
+
+def test_signal_to_noise_does_not_depend_on_the_psfs_sampling():
+    found = []
+    for spacing, n in ((1.0, 31), (0.5, 61)):
+        o = point_source(PSF.gaussian(1.5, n_pixels=n, spacing=spacing))
+        found.append(module._signal_to_noise(o, model_frame([o]), None))
+    np.testing.assert_allclose(found[1], found[0], atol=0.02 * np.abs(found[0]).max())
+
+
+def test_width_of_a_gaussian_on_coarser_pixels():
+    """In pixels of the frame, half as large: a Gaussian's FWHM is 2.355 sigma, to one sample."""
+    coarse = Observation(
+        np.zeros((30, 30)), PSF.gaussian(2.0, n_pixels=41), Grid.flat((30, 30), 0.2), weights=1.0
+    )
+    frame = model_frame([coarse], grid=GRID)
+    assert module._fwhm_px(coarse, frame) == pytest.approx(2.355 * 2 * 2, abs=1.2)
+
+
+def test_a_constant_sky_is_no_bright_model():
+    """Residual peaks have the same signal to noise whether a sky was fitted under them or not."""
+    component = round_component(0, (30, 30), (40.0, 20.0))
+    shape = (60, 70)
+    model = np.array([s * in_frame(component, shape) for s in component.spectrum])
+    extra = np.zeros(shape)
+    extra[10:31, 45:66] = 40 * PSF.gaussian(1.3, n_pixels=21).images[0]
+    noise = np.random.default_rng(1).normal(0, 1, (2, *shape))
+    found = []
+    for sky in (0.0, 1000.0):
+        seen = observe(Grid.flat(shape, 0.1), ("g", "r"), data=model + extra + noise + sky)
+        result = blend([component], observations=(seen,), sky=np.full(2, sky))
+        found.append(detect_more(result))
+    assert len(found[0].peaks)
+    np.testing.assert_allclose(found[1].peaks, found[0].peaks, rtol=1e-3)
+
+
+def two_widths():
+    sharp = Observation(
+        np.zeros(GRID.shape), PSF.gaussian(1.5, n_pixels=31), GRID, weights=1.0, name="sharp"
+    )
+    grid = Grid.flat((30, 30), 0.2)
+    wide = Observation(
+        np.zeros(grid.shape), PSF.gaussian(1.7, n_pixels=31), grid, weights=1.0, name="wide"
+    )
+    return [sharp, wide]
+
+
+@pytest.mark.parametrize("away, n", [(4.0, 1), (9.0, 2)])
+def test_a_peak_of_all_images_within_the_wider_psf_is_the_same_source(monkeypatch, away, n):
+    """FWHM 3.5 and 8 px: 4 px away counts as the source of the sharp image, 9 px do not."""
+    peaks = iter([[(np.array([30.0, 30.0]), 20.0)], [], [(np.array([30.0, 30.0 + away]), 9.0)]])
+    monkeypatch.setattr(module, "_peaks", lambda *_: next(peaks))
+    found = detect(two_widths(), model_frame(two_widths(), grid=GRID))
+    assert len(found.sources) == n
+    assert found.found_in == ("sharp", ALL)[:n]
+
+
+def test_beyond_the_border_of_an_image_nothing_is_seen():
+    """Where less than a tenth of a PSF's light lies on pixels, a hot pixel near by is no source."""
+    half = Grid.flat((60, 30), 0.1, center_arcsec=(0, -1.5))
+    data = np.zeros(half.shape)
+    data[30, 29] = 1e4
+    o = Observation(data, PSF.gaussian(2.0, n_pixels=31), half, weights=1.0)
+    image = module._signal_to_noise(o, model_frame([o], grid=GRID), None)
+    assert image[30, 29] > 100
+    assert not image[:, 29 + 6 :].any()  # 3 sigma: a thousandth of its light is inside
