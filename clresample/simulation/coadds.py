@@ -6,12 +6,15 @@ anew, exposure by exposure.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields, replace
+
 import numpy as np
 
 from ..sky.grid import Grid
 from ..sky.observation import Observation
 from .galaxies import draw
 from .mosaics import Mosaicking, drizzle, lanczos
+from .scenes import SimulatedImage, SimulatedScene
 
 # [deg] Pixels of exposures are turned against those of the mosaic, so that the sub-pixel phases,
 # of which the noise depends, change from pixel to pixel.
@@ -22,36 +25,58 @@ DITHERS_PX = (0.0, 0.0), (0.0, 0.5), (0.5, 0.0), (0.5, 0.5)
 PIXFRAC, SHRINK = 0.8, 0.7
 
 
-def resampled(image, *, noise="correlated", order=3, grid=None) -> Observation:
-    """A SimulatedImage with the noise that it has, Lanczos-resampled to another `Grid.flat`.
+@dataclass(frozen=True, eq=False)
+class MosaicImage(SimulatedImage):
+    """A SimulatedImage whose `observation` is a mosaic of the same sources.
+
+    mosaic: that Observation; grid, data and all others are those of the image without it
+    """
+
+    mosaic: Observation | None = None
+
+    def observation(self):
+        """The mosaic."""
+        return self.mosaic
+
+    def with_noise(self, rng):
+        """Refused: the noise of a mosaic is drawn with its exposures."""
+        raise ValueError("the noise of a mosaic comes of its exposures: make another mosaic")
+
+
+def resampled(image, *, noise="correlated", order=3, grid=None) -> MosaicImage:
+    """A SimulatedImage, light and noise as they are, Lanczos-resampled to another `Grid.flat`.
 
     noise: "correlated" states the noise's correlation, "white" leaves it out, as most do
-    grid: None has the image's pixel scale, upright, within the image
+    grid: None has the image's pixel scale, upright, on the same sky
     """
     grid = grid or _upright(image.grid, 1.0)
-    return _observation(image, lanczos(image.grid, grid, order), [image.data], noise)
+    return _mosaic(image, lanczos(image.grid, grid, order), [image.data], noise)
 
 
-def resampled_exposure(image, profiles, positions_arcsec, rng, *, noise="correlated"):
-    """The Observation of a scene's sources from one exposure, turned by 20 degrees, by Lanczos.
+def mosaic_scene(scene, rng, *, kind, noise="correlated") -> SimulatedScene:
+    """The scene with mosaics of newly drawn exposures in place of its images.
 
-    image: SimulatedImage, upright, of whose survey, exposure time and grid it is
-    profiles (S), positions_arcsec (S, 2): as in `scenes.observe`; rng: of the noise
+    rng: of the noise
+    kind: "lanczos", one exposure of each instrument, turned by 20 degrees and resampled to upright
+        pixels of its own size; or "drizzle", four dithered ones, turned as much and drizzled with
+        drops of 0.8 pixels to pixels of 0.7
+    noise: as for `resampled`
+
+    Raises ValueError for another kind, another noise, and scenes with a celestial WCS.
     """
-    (grid_in,) = _exposed(image.grid, DITHERS_PX[:1])
-    exposures = _expose(image, profiles, positions_arcsec, [grid_in], rng)
-    return _observation(image, lanczos(grid_in, image.grid), exposures, noise)
-
-
-def drizzled(image, profiles, positions_arcsec, rng, *, noise="correlated"):
-    """The Observation of a scene's sources drizzled from 4 dithered exposures to finer pixels.
-
-    Arguments as of `resampled_exposure`
-    """
-    grids = _exposed(image.grid, DITHERS_PX)
-    exposures = _expose(image, profiles, positions_arcsec, grids, rng)
-    mosaicking = drizzle(grids, _upright(image.grid, SHRINK), PIXFRAC)
-    return _observation(image, mosaicking, exposures, noise)
+    if kind not in ("lanczos", "drizzle"):
+        raise ValueError(f'kind is {kind!r}, it takes "lanczos" or "drizzle"')
+    images = {}
+    for name in ("euclid", "rubin"):
+        image = getattr(scene, name)
+        grids = _exposed(image.grid, DITHERS_PX if kind == "drizzle" else DITHERS_PX[:1])
+        exposures = _expose(image, scene.profiles, scene.positions_arcsec, grids, rng)
+        if kind == "drizzle":
+            mosaicking = drizzle(grids, _upright(image.grid, SHRINK), PIXFRAC)
+        else:
+            mosaicking = lanczos(grids[0], _upright(image.grid, 1.0))
+        images[name] = _mosaic(image, mosaicking, exposures, noise)
+    return replace(scene, **images)
 
 
 def _upright(grid, shrink):
@@ -88,13 +113,13 @@ def _expose(image, profiles, positions_arcsec, grids, rng):
     return exposures
 
 
-def _observation(image, mosaicking: Mosaicking, exposures, noise):
-    """The Observation of a mosaic; noise: "correlated" or "white"."""
+def _mosaic(image, mosaicking: Mosaicking, exposures, noise):
+    """The MosaicImage of an image; noise: "correlated" or "white"."""
     if noise not in ("correlated", "white"):
         raise ValueError(f'noise is {noise!r}, it takes "correlated" or "white"')
     variance = mosaicking.variance() * len(exposures)
     inverse = np.divide(1, variance, out=np.zeros(variance.shape), where=variance > 0)
-    return Observation(
+    mosaic = Observation(
         mosaicking.images(exposures),
         mosaicking.psf(image.psf),
         mosaicking.grid,
@@ -104,3 +129,5 @@ def _observation(image, mosaicking: Mosaicking, exposures, noise):
         noise=mosaicking.correlation() if noise == "correlated" else None,
         name=image.survey.name,
     )
+    kept = {field.name: getattr(image, field.name) for field in fields(SimulatedImage)}
+    return MosaicImage(**kept, mosaic=mosaic)
