@@ -57,9 +57,9 @@ def mosaic_scene(scene, rng, *, kind, noise="correlated") -> SimulatedScene:
     """The scene with mosaics of newly drawn exposures in place of its images.
 
     rng: of the noise
-    kind: "lanczos", one exposure of each instrument, turned by 20 degrees and resampled to upright
-        pixels of its own size; or "drizzle", four dithered ones, turned as much and drizzled with
-        drops of 0.8 pixels to pixels of 0.7
+    kind: how exposures, turned by 20 degrees, become upright pixels of 0.7 of their size:
+        "lanczos", one exposure of each instrument is interpolated; or "drizzle", four dithered ones
+        are drizzled with drops of 0.8 pixels
     noise: as for `resampled`
 
     Raises ValueError for another kind, another noise, and scenes with a celestial WCS.
@@ -70,11 +70,12 @@ def mosaic_scene(scene, rng, *, kind, noise="correlated") -> SimulatedScene:
     for name in ("euclid", "rubin"):
         image = getattr(scene, name)
         grids = _exposed(image.grid, DITHERS_PX if kind == "drizzle" else DITHERS_PX[:1])
+        finer = _upright(image.grid, SHRINK)
         exposures = _expose(image, scene.profiles, scene.positions_arcsec, grids, rng)
         if kind == "drizzle":
-            mosaicking = drizzle(grids, _upright(image.grid, SHRINK), PIXFRAC)
+            mosaicking = drizzle(grids, finer, PIXFRAC)
         else:
-            mosaicking = lanczos(grids[0], _upright(image.grid, 1.0))
+            mosaicking = lanczos(grids[0], finer)
         images[name] = _mosaic(image, mosaicking, exposures, noise)
     return replace(scene, **images)
 

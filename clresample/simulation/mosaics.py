@@ -2,7 +2,8 @@
 
 Both are linear. With the pixels d_k of all exposures, of noise sigma, a mosaic's pixels are
 
-    m_i = sum_k M_ik d_k,      variance_i = sigma^2 sum_k M_ik^2,      PSF(v) = < sum_k M_ik P(v - c_i + x_k) >
+    m_i = sum_k M_ik d_k,      variance_i = sigma^2 sum_k M_ik^2
+    PSF(v) = < sum_k M_ik P(v - c_i + x_k) >
 
 c_i and x_k being the centres of pixels and < > the mean over the mosaic. Neighbours share input
 pixels, and so their noise.
