@@ -10,7 +10,6 @@ import numpy as np
 from ..resampling.transfer import noise_warnings
 from ..sky.extent import box_slices
 from ..sky.frame import Frame
-from ..sky.sources import Point
 from .blend import INTERRUPTED
 from .posterior.posterior import errors_of
 from .resize import box_around
@@ -18,7 +17,7 @@ from .result import Component, Result
 from .shifts import shift_steps
 from .solver.curvature import damping
 from .solver.scene import Scene, State
-from .spectra import solve_spectra
+from .spectra import allow_for_psf_error, solve_spectra
 from .start import LIGHT_SIGMAS, start
 from .view import as_taken, whitened_view
 
@@ -83,11 +82,19 @@ class Fit:
         self.unit = np.concatenate([view.unit for view in self.views])
         sources = [self.sources[i] for i in self.fitted]
         self.start = start(
-            self.frame, sources, positions[inside], self.views, fit_sky=settings.fit_sky
+            self.frame,
+            sources,
+            positions[inside],
+            self.views,
+            fit_sky=settings.fit_sky,
+            psf_error=settings.psf_error,
         )
         self.dark = self.fitted[self.start.dark]
         self.messages += [_dark_message(i, positions[i]) for i in self.dark]
         self.profiles = _peak_of_one(self.start.profiles)
+        self.views = allow_for_psf_error(
+            self.views, self.start, settings.psf_error, settings.fit_sky
+        )
         self.noise = np.concatenate([view.pixel_noise for view in self.views])
         self.scene, self.state = _start_scene(self, padded.shape)
         self.losses, self.status, self.findings = [], "iteration limit", None
@@ -247,7 +254,7 @@ def _start_scene(fit, shape) -> tuple[Scene, State]:
         origin=np.array([low for low, _, _ in boxes]),
         center=np.array([center for _, _, center in boxes]),
         profile=morphs,
-        fixed=np.array([isinstance(fit.sources[fit.fitted[i]], Point) for i in begin.source]),
+        fixed=begin.points,
         scale=np.where(error < UNSEEN, error + SPECTRUM_PART * spectra, 0),
         power=power,
         fit_sky=fit.settings.fit_sky,

@@ -51,6 +51,7 @@ class Settings:
     fit_shifts: bool = False
     fit_sky: bool = False
     flux_floor: float = 0.0015
+    psf_error: float = 0.03
 
     def __post_init__(self):
         whole("max_iter", self.max_iter)

@@ -14,13 +14,74 @@ MODEL_ERROR = 0.15
 # equal parts of their light. It changes the flux of a source apart from others by this part of it;
 # a larger one would share light between neighbours that the data can tell apart.
 RIDGE = 1e-8
+# Times that the weights follow the point sources' light: once with the weights of the noise alone,
+# where a wrong PSF draws neighbours into a bright star's misfit, and once with the first ones.
+ROUNDS = 2
+# [sigma] Point sources whose PSF's error is nowhere more than this leave the weights as they are.
+FAINT = 0.05
 
 
-def solve_spectra(units, views, sky=False, model=None):
+def allow_for_psf_error(views, start, psf_error, sky=False):
+    """Views whose weights hold the error of the PSF in the light of bright point sources.
+
+        1/w = sigma^2 + psf_error^2 sum_s [ L_s^2 + (r . grad L_s)^2 ],      L_s = A_s R S_s
+
+    over the point sources s, r being the distance from s: L changes by -(2 L + r . grad L) epsilon
+    when the PSF grows by epsilon, so that its wings are less certain than its core. The spectra
+    are solved for beside all others', ROUNDS times; from then on the weights stay as they are.
+
+    start: StartingPoint; psf_error: see Settings; sky: whether levels are fitted too
+    """
+    points, positions = start.points, start.positions[start.source]
+    if not psf_error or not points.any():
+        return views
+    observed, allowing = [view.observe(start.profiles) for view in views], views
+    for _ in range(ROUNDS):
+        units = [view.whiten(o) for view, o in zip(allowing, observed, strict=True)]
+        spectra = solve_spectra(units, allowing, sky)[0][points]
+        parts = np.split(spectra, np.cumsum([o.shape[1] for o in observed])[:-1], axis=1)
+        light = [a[:, :, None, None] * o[points] for a, o in zip(parts, observed, strict=True)]
+        bright = _bright(views, light, psf_error)
+        if not bright.any():
+            return views
+        at = positions[points][bright]
+        allowing = [
+            view.allowing(psf_error * _change_with_width(view, images[bright], at))
+            for view, images in zip(views, light, strict=True)
+        ]
+    return allowing
+
+
+def _bright(views, light, psf_error):
+    """Which point sources (n,) are bright enough for the PSF's error; light: per view (n, ...)."""
+    most = [
+        np.abs(images * view.root).max(axis=(1, 2, 3))
+        for view, images in zip(views, light, strict=True)
+    ]
+    return psf_error * np.max(most, axis=0) > FAINT
+
+
+def _change_with_width(view, light, positions):
+    """Root of sum_s [L_s^2 + (r . grad L_s)^2] (Co, My, Mx) of images (n, Co, My, Mx) of sources at
+    positions (n, 2) [model px]."""
+    pixels = view.mapping.at(*np.indices(view.mapping.shape_out)) + view.op.shift
+    inverse = np.linalg.inv(view.mapping.matrix)
+    total = np.zeros(light.shape[1:])
+    for image, position in zip(light, positions, strict=True):
+        away = (pixels - position) @ inverse.T  # [observed px]
+        along = np.zeros(image.shape)
+        for axis in (0, 1):
+            if image.shape[1 + axis] > 1:
+                along += away[..., axis] * np.gradient(image, axis=1 + axis)
+        total += image.astype(np.float64) ** 2 + along**2
+    return np.sqrt(total)
+
+
+def solve_spectra(units, views, sky=False, errors=None):
     """Non-negative spectra (n, C) by weighted least squares over all components at once.
 
     units: per view, whitened unit-spectrum images (n, Co, P); sky: also a constant per channel
-    model: per view (Co, P) whitened, inflates the variance by (MODEL_ERROR model)^2
+    errors: per view (Co, P) whitened, of the model, whose squares add to the variance
     returns spectra (n, C), sky (C,), covariance (C, n, n): inverse normal matrix, sky marginalised
     """
     spectra, levels, covariances = [], [], []
@@ -30,7 +91,7 @@ def solve_spectra(units, views, sky=False, model=None):
             target = (view.data[c] * view.root[c]).ravel()
             if sky:
                 rows = np.concatenate([rows, [view.root[c].ravel()]])
-            weight = 1.0 if model is None else 1 / (1 + (MODEL_ERROR * model[i][c]) ** 2)
+            weight = 1.0 if errors is None else 1 / (1 + errors[i][c] ** 2)
             a, covariance = _non_negative(rows, target, weight, n_free=int(sky))
             spectra.append(a[: len(unit)])
             levels.append(a[-1] if sky else 0.0)

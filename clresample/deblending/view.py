@@ -47,6 +47,13 @@ class WhitenedView:
         root = np.sqrt(weights) * unit[:, None, None] * covered
         return cls(op, mapping, covered, unit, root, data / unit[:, None, None])
 
+    def allowing(self, error) -> WhitenedView:
+        """The same view with a model whose own error (Co, My, Mx) [unit] adds to the noise.
+
+        1/w = sigma^2 + error^2,  of pixels that have a weight
+        """
+        return replace(self, root=self.root / np.sqrt(1 + (self.root * error) ** 2))
+
     @property
     def pixel_noise(self) -> np.ndarray:
         """Noise (Co,) [unit] of one model pixel, if it were observed with the same exposure."""
