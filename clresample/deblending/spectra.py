@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import nnls
 
+from .profiles import point
+
 # Error of a smooth profile, as a part of the light in a pixel: what galaxies' own structure, spiral
 # arms or clumps, adds to it. Larger values let faint neighbours absorb less of that structure, and
 # make bright sources count for less.
@@ -32,28 +34,32 @@ def allow_for_psf_error(views, start, psf_error, sky=False):
 
     start: StartingPoint; psf_error: see Settings; sky: whether levels are fitted too
     """
-    points, positions = start.points, start.positions[start.source]
+    points = start.points
     if not psf_error or not points.any():
         return views
     observed, allowing = [view.observe(start.profiles) for view in views], views
     for _ in range(ROUNDS):
         units = [view.whiten(o) for view, o in zip(allowing, observed, strict=True)]
-        spectra = solve_spectra(units, allowing, sky)[0][points]
+        spectra = solve_spectra(units, allowing, sky)[0]
         parts = np.split(spectra, np.cumsum([o.shape[1] for o in observed])[:-1], axis=1)
-        light = [a[:, :, None, None] * o[points] for a, o in zip(parts, observed, strict=True)]
-        bright = _bright(views, light, psf_error)
-        if not bright.any():
+        light = [a[:, :, None, None] * o for a, o in zip(parts, observed, strict=True)]
+        bright = np.flatnonzero(points & _bright(views, light, psf_error))
+        if not len(bright):
             return views
-        at = positions[points][bright]
+        squares = [np.square(images[bright], dtype=np.float64).sum(axis=0) for images in light]
+        for i in bright:
+            changes = _changes_with_width(start.shapes[i], start.positions[start.source[i]], views)
+            for total, change, a in zip(squares, changes, parts, strict=True):
+                total += (a[i, :, None, None] * change) ** 2
         allowing = [
-            view.allowing(psf_error * _change_with_width(view, images[bright], at))
-            for view, images in zip(views, light, strict=True)
+            view.allowing(psf_error * np.sqrt(total))
+            for view, total in zip(views, squares, strict=True)
         ]
     return allowing
 
 
 def _bright(views, light, psf_error):
-    """Which point sources (n,) are bright enough for the PSF's error; light: per view (n, ...)."""
+    """Which components (n,) are bright enough for the PSF's error; light: per view (n, ...)."""
     most = [
         np.abs(images * view.root).max(axis=(1, 2, 3))
         for view, images in zip(views, light, strict=True)
@@ -61,20 +67,13 @@ def _bright(views, light, psf_error):
     return psf_error * np.max(most, axis=0) > FAINT
 
 
-def _change_with_width(view, light, positions):
-    """Root of sum_s [L_s^2 + (r . grad L_s)^2] (Co, My, Mx) of images (n, Co, My, Mx) of sources at
-    positions (n, 2) [model px]."""
-    pixels = view.mapping.at(*np.indices(view.mapping.shape_out)) + view.op.shift
-    inverse = np.linalg.inv(view.mapping.matrix)
-    total = np.zeros(light.shape[1:])
-    for image, position in zip(light, positions, strict=True):
-        away = (pixels - position) @ inverse.T  # [observed px]
-        along = np.zeros(image.shape)
-        for axis in (0, 1):
-            if image.shape[1 + axis] > 1:
-                along += away[..., axis] * np.gradient(image, axis=1 + axis)
-        total += image.astype(np.float64) ** 2 + along**2
-    return np.sqrt(total)
+def _changes_with_width(star, position, views):
+    """r . grad L (Co, My, Mx) per view, of a Star of unit flux at a position (2,) [model px]."""
+    slopes = point(star.psf, position, star.shape)[1:]  # by the position: minus the gradient
+    for view in views:
+        n, m = np.indices(view.mapping.shape_out)
+        away = view.mapping.at(n, m) + view.op.shift - position
+        yield np.einsum("acyx,yxa->cyx", view.observe(slopes), away)
 
 
 def solve_spectra(units, views, sky=False, errors=None):

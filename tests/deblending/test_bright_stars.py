@@ -121,9 +121,7 @@ def test_weights_hold_what_a_wider_psf_changes(device):
         expected = 0.03 * light * np.hypot(1, r2 / variance)
         inside = (view.root > 0) & (r2 < 9 * variance)
         found = np.sqrt(np.maximum(other.root[inside] ** -2 - view.root[inside] ** -2, 0))
-        # slopes are differences of neighbouring pixels, of a PSF of 1 pixel
-        assert np.abs(found - expected[inside]).max() < 0.25 * expected.max()
-        assert np.median(found / expected[inside]) == pytest.approx(1, abs=0.3)
+        assert np.abs(found - expected[inside]).max() < 0.03 * expected.max()
 
 
 def test_faint_stars_change_nothing(device):
