@@ -7,7 +7,9 @@ A row is one quantity of the galaxies of one kind, fitted in one mode, in one bi
 belongs to the galaxy) or in all bins together, from 3 on; a bin without an upper end has
 snr_high = null in the JSON:
 
-mode        joint, euclid or rubin
+mode        joint, euclid or rubin; joint-lanczos and joint-drizzle: parametric galaxies on mosaics
+            of pixels of 0.7, whose noise is correlated, which the fit is told; and the same with
+            "-as-white": it is not told
 galaxies    parametric: bulge, disk and knots; cosmos: real ones whose light is not clearly negative
 quantity    flux, colour (of neighbouring bands), position, size, ellipticity
 n           values; of a flux one for each galaxy and band
@@ -27,6 +29,7 @@ import numpy as np
 from tqdm import tqdm
 
 from clresample import Settings
+from clresample.simulation.coadds import mosaic_scene
 from clresample.simulation.scenes import simulate_scene
 
 from .harness import records, scenes, truth
@@ -37,8 +40,23 @@ GALAXIES = ("parametric", "cosmos")
 EDGES = (3.0, 10.0, 30.0, 100.0, 300.0, np.inf)  # signal to noise
 # Scenes of each mode: so many that the standard error of a flux bin's coverage is under 0.015.
 # Euclid has one band, Rubin six.
-N_SCENES = {"joint": 450, "euclid": 1200, "rubin": 450}
-N_QUICK = 10
+N_SCENES = {
+    "joint": 450,
+    "euclid": 1200,
+    "rubin": 450,
+    "joint-lanczos": 450,
+    "joint-drizzle": 450,
+    "joint-lanczos-as-white": 60,
+    "joint-drizzle-as-white": 60,
+}
+N_QUICK, N_QUICK_MOSAICS = 10, 3
+# How the images of scenes become mosaics, see `mosaic_scene`; in other modes they stay as taken.
+MOSAICS = {
+    "joint-lanczos": {"kind": "lanczos"},
+    "joint-drizzle": {"kind": "drizzle"},
+    "joint-lanczos-as-white": {"kind": "lanczos", "noise": "white"},
+    "joint-drizzle-as-white": {"kind": "drizzle", "noise": "white"},
+}
 # The seeds before these serve to choose constants and to report the accuracy of fits.
 FIRST_SEED = 300
 CHUNK = 5  # scenes fitted side by side: some seconds
@@ -46,7 +64,7 @@ CHUNK = 5  # scenes fitted side by side: some seconds
 # have its flux. Half of the catalogue's galaxies have over 1 %, from the noise of HST's images.
 NEGATIVE = 0.02
 COLUMNS = (
-    ("mode", 6, ""),
+    ("mode", 22, ""),
     ("galaxies", 10, ""),
     ("quantity", 11, ""),
     ("snr_low", 7, "g"),
@@ -59,24 +77,22 @@ COLUMNS = (
 )
 
 
-def make_scene(galaxies, folder, seed, noise=None):
-    """A `SimulatedScene` of one of GALAXIES.
-
-    folder: of the COSMOS galaxies; noise: function (scene, rng) -> the scene with other noise, a
-        module's own so that processes can be given it
-    """
+def make_scene(galaxies, mode, folder, seed):
+    """A `SimulatedScene` of one of GALAXIES; folder: of the COSMOS galaxies."""
     scene = simulate_scene(seed) if galaxies == "parametric" else scenes.opened(folder).take(seed)
-    return scene if noise is None else noise(scene, np.random.default_rng(seed))
+    if mode not in MOSAICS:
+        return scene
+    return mosaic_scene(scene, np.random.default_rng(seed), **MOSAICS[mode])
 
 
-def measure(galaxies, mode, folder, seeds, negative=NEGATIVE, noise=None):
+def measure(galaxies, mode, folder, seeds, negative=NEGATIVE):
     """What `truth.compare` finds in scenes of these seeds, and how their fits ended.
 
-    noise: see `make_scene`
     returns [{quantity: (4, n)}, ...], one for each scene that could be fitted; [status, ...]
     """
     parametric = galaxies == "parametric"
-    found = [make_scene(galaxies, folder, seed, noise) for seed in seeds]
+    found = [make_scene(galaxies, mode, folder, seed) for seed in seeds]
+    mode = mode.partition("-")[0]
     results = scenes.fit([scenes.blend(scene, mode) for scene in found])
     values = []
     for scene, result in zip(found, results, strict=True):
@@ -152,8 +168,11 @@ def main(options):
         galaxies.remove("cosmos")
     if not galaxies:
         raise BadOption("--galaxies cosmos: there is no catalogue of them, name one by --catalogue")
+    if galaxies == ["cosmos"] and not set(options.modes) - set(MOSAICS):
+        raise BadOption(f"--galaxies cosmos: {', '.join(options.modes)} have parametric ones only")
     threads = on_one_thread()
-    n_scenes = {m: options.scenes or (N_QUICK if options.quick else N_SCENES[m]) for m in N_SCENES}
+    quick = {mode: N_QUICK_MOSAICS if mode in MOSAICS else N_QUICK for mode in N_SCENES}
+    n_scenes = {m: options.scenes or (quick if options.quick else N_SCENES)[m] for m in N_SCENES}
     counts = ", ".join(f"{n_scenes[mode]} {mode}" for mode in options.modes)
     record = records.record(threads) | {
         "scenes": f"{counts}; from seed {options.seed}; {' and '.join(galaxies)} galaxies",
@@ -163,7 +182,8 @@ def main(options):
     records.print_record(record)
     rows, summary = [], {"how fits ended": {}}
     records.print_head(COLUMNS)
-    wanted = list(itertools.product(galaxies, options.modes))
+    pairs = itertools.product(galaxies, options.modes)
+    wanted = [(g, mode) for g, mode in pairs if g == "parametric" or mode not in MOSAICS]
     for kind, mode, values, ends in fitted(wanted, n_scenes, options):
         for row in rows_of(mode, kind, values):
             rows.append(row)
@@ -176,7 +196,11 @@ def main(options):
 
 def parser():
     parser = Parser("bench.coverage", description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help=f"{N_QUICK} scenes of each")
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help=f"{N_QUICK} scenes of each, {N_QUICK_MOSAICS} of mosaics",
+    )
     parser.add_argument(
         "--scenes",
         type=positive(int),
