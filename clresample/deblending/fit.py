@@ -10,16 +10,18 @@ import numpy as np
 from ..resampling.transfer import noise_warnings
 from ..sky.extent import box_slices
 from ..sky.frame import Frame
+from ..sky.sources import Point
 from .blend import INTERRUPTED
 from .posterior.posterior import errors_of
+from .profiles import Star
 from .resize import box_around
 from .result import Component, Result
 from .shifts import shift_steps
 from .solver.curvature import damping
 from .solver.scene import Scene, State
-from .spectra import allow_for_psf_error, solve_spectra
+from .spectra import solve_spectra
 from .start import LIGHT_SIGMAS, start
-from .view import as_taken, whitened_view
+from .view import allow_for_psf_error, as_taken, whitened_view
 
 # A spectrum's step size counts in errors of the flux plus this part of the flux: bright sources,
 # whose errors are far smaller than what a changing morphology does to their flux, can follow it.
@@ -82,19 +84,12 @@ class Fit:
         self.unit = np.concatenate([view.unit for view in self.views])
         sources = [self.sources[i] for i in self.fitted]
         self.start = start(
-            self.frame,
-            sources,
-            positions[inside],
-            self.views,
-            fit_sky=settings.fit_sky,
-            psf_error=settings.psf_error,
+            self.frame, sources, positions[inside], self.views, fit_sky=settings.fit_sky
         )
         self.dark = self.fitted[self.start.dark]
         self.messages += [_dark_message(i, positions[i]) for i in self.dark]
         self.profiles = _peak_of_one(self.start.profiles)
-        self.views = allow_for_psf_error(
-            self.views, self.start, settings.psf_error, settings.fit_sky
-        )
+        self.views = allow_for_psf_error(self.views, self._stars(), settings.psf_error)
         self.noise = np.concatenate([view.pixel_noise for view in self.views])
         self.scene, self.state = _start_scene(self, padded.shape)
         self.losses, self.status, self.findings = [], "iteration limit", None
@@ -105,6 +100,12 @@ class Fit:
     def shifts(self) -> np.ndarray:
         """Present shifts (n_observations, 2) [model px] of the observations' pixels."""
         return np.array([view.op.shift for view in self.views])
+
+    def _stars(self):
+        """The point sources as they start: each one's Star, place and spectrum."""
+        begin = self.start
+        rows = zip(begin.shapes, begin.positions[begin.source], begin.spectra, strict=True)
+        return [row for row in rows if isinstance(row[0], Star)]
 
     def _shift(self, shifts):
         """Move the observations' pixels to these shifts."""
@@ -254,7 +255,7 @@ def _start_scene(fit, shape) -> tuple[Scene, State]:
         origin=np.array([low for low, _, _ in boxes]),
         center=np.array([center for _, _, center in boxes]),
         profile=morphs,
-        fixed=begin.points,
+        fixed=np.array([isinstance(fit.sources[fit.fitted[i]], Point) for i in begin.source]),
         scale=np.where(error < UNSEEN, error + SPECTRUM_PART * spectra, 0),
         power=power,
         fit_sky=fit.settings.fit_sky,

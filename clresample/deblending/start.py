@@ -5,9 +5,8 @@ every instrument, so that a source that only one of them sees still starts right
 
     min  sum_pixels w (d - sum_s A_s R S_s)^2 + sum ((theta - mean) / scatter)^2,     A >= 0
 
-Smooth profiles leave a tenth of a bright galaxy's light unexplained, and PSFs that are wrong some
-of a star's. The weights allow for it, 1/w = sigma^2 + (MODEL_ERROR galaxies)^2 + (psf_error
-stars)^2: without, spiral arms would be taken for faint neighbours.
+Smooth profiles leave a tenth of a bright galaxy's light unexplained. The weights allow for it,
+1/w = sigma^2 + (MODEL_ERROR * model)^2: without, spiral arms would be taken for faint neighbours.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..sky.frame import Frame
-from .profiles import Galaxy, Star, components_of
+from .profiles import Galaxy, components_of
 from .spectra import MODEL_ERROR, RIDGE, solve_spectra
 from .view import WhitenedView
 
@@ -44,6 +43,7 @@ class StartingPoint:
     positions (S, 2) [px]: of the sources, free stars where they were found
     dark (S,): bool, whether a source is far from any light, see `_is_dark`
     shapes (n): the components' Shapes; thetas (n): arrays of their parameters
+    spectra (n, C): least squares for these profiles
     """
 
     source: np.ndarray
@@ -52,22 +52,17 @@ class StartingPoint:
     dark: np.ndarray
     shapes: list
     thetas: list
-
-    @property
-    def points(self) -> np.ndarray:
-        """Which components (n,) are point sources."""
-        return np.array([isinstance(shape, Star) for shape in self.shapes])
+    spectra: np.ndarray
 
 
 def start(
-    frame: Frame, sources, positions, views: list[WhitenedView], *, fit_sky=False, psf_error=0.0
+    frame: Frame, sources, positions, views: list[WhitenedView], *, fit_sky=False
 ) -> StartingPoint:
     """Fit profiles and free stars; see the module's text.
 
     sources (S), positions (S, 2) [px]: those inside the frame; fit_sky: also a level per channel
-    psf_error: see Settings
     """
-    fit = _ProfileFit(frame, sources, positions, views, fit_sky, psf_error)
+    fit = _ProfileFit(frame, sources, positions, views, fit_sky)
     first, best = fit.run()
     dark = _is_dark(first.snr)
     if dark.any():
@@ -82,6 +77,7 @@ def start(
         dark,
         fit.components,
         fit.parts(best.theta),
+        best.spectra,
     )
 
 
@@ -140,8 +136,8 @@ class _ProfileFit:
     positions (S, 2) [px]: as given; mean, scatter: of theta, one component's after the other's
     """
 
-    def __init__(self, frame, sources, positions, views, fit_sky, psf_error=0.0):
-        self.views, self.fit_sky, self.psf_error = views, fit_sky, psf_error
+    def __init__(self, frame, sources, positions, views, fit_sky):
+        self.views, self.fit_sky = views, fit_sky
         self.positions = np.array(positions, dtype=np.float64)
         pairs = [(i, c) for i, source in enumerate(sources) for c in components_of(source, frame)]
         self.source, self.components = [i for i, _ in pairs], [c for _, c in pairs]
@@ -171,16 +167,16 @@ class _ProfileFit:
         units = [r[heads] for r in rendered]
         spectra, sky, _ = solve_spectra(units, self.views, self.fit_sky)
         for _ in range(2):  # the weights follow the model
-            errors = self._errors(units, spectra, sky)
-            spectra, sky, _ = solve_spectra(units, self.views, self.fit_sky, errors)
-        models, errors = (f(units, spectra, sky) for f in (self._models, self._errors))
+            models = self._models(units, spectra, sky)
+            spectra, sky, _ = solve_spectra(units, self.views, self.fit_sky, models)
+        models = self._models(units, spectra, sky)
         equations = _NormalEquations(len(theta))
         channel = 0
         for i, view in enumerate(self.views):
             for c in range(rendered[i].shape[1]):
                 a = spectra[:, channel]
                 columns = a[owner, None] * rendered[i][slopes, c]
-                weight = 1 / (1 + errors[i][c] ** 2)
+                weight = 1 / (1 + (MODEL_ERROR * models[i][c]) ** 2)
                 residual = (view.data[c] * view.root[c]).ravel() - models[i][c]
                 lit = units[i][a > 0, c]
                 if self.fit_sky:
@@ -216,14 +212,6 @@ class _ProfileFit:
     def parts(self, theta):
         """The parameters of each component."""
         return np.split(theta, np.cumsum(self.counts)[:-1])
-
-    def _errors(self, units, spectra, sky):
-        """What is expected of the whitened models' errors (Co, P), per view."""
-        stars = np.array([isinstance(c, Star) for c in self.components])
-        galaxies = self._models(units, np.where(stars[:, None], 0, spectra), sky)
-        points = self._models(units, np.where(stars[:, None], spectra, 0), 0 * sky)
-        pairs = zip(galaxies, points, strict=True)
-        return [np.hypot(MODEL_ERROR * g, self.psf_error * p) for g, p in pairs]
 
     def _models(self, units, spectra, sky):
         """Whitened models (Co, P) per view."""
