@@ -133,11 +133,12 @@ def allow_for_psf_error(views, stars, psf_error) -> list[WhitenedView]:
             continue
         images = point(star.psf, place, star.shape)
         for i, (view, a) in enumerate(pairs):
-            light, *slopes = view.observe(images)  # slopes by the place: minus the gradient
+            seen = view.op.render(_padded(images, view.op.shape_in).astype(view.op.dtype))
+            light, *slopes = seen.astype(np.float64)  # slopes by the place: minus the gradient
             n, m = np.indices(view.mapping.shape_out)
             away = np.moveaxis(view.mapping.at(n, m) + view.op.shift - place, -1, 0)
             change = sum(r * slope for r, slope in zip(away, slopes, strict=True))
-            found = (a * light.astype(np.float64)) ** 2 + (a * change) ** 2
+            found = (a * light) ** 2 + (a * change) ** 2
             if psf_error * (np.sqrt(found) * view.root).max() > FAINT:
                 squares[i] = squares[i] + found
     return [
