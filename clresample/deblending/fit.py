@@ -13,7 +13,6 @@ from ..sky.frame import Frame
 from ..sky.sources import Point
 from .blend import INTERRUPTED
 from .posterior.posterior import errors_of
-from .profiles import Star
 from .resize import box_around
 from .result import Component, Result
 from .shifts import shift_steps
@@ -89,7 +88,7 @@ class Fit:
         self.dark = self.fitted[self.start.dark]
         self.messages += [_dark_message(i, positions[i]) for i in self.dark]
         self.profiles = _peak_of_one(self.start.profiles)
-        self.views = allow_for_psf_error(self.views, self._stars(), settings.psf_error)
+        self.views = allow_for_psf_error(self.views, self.start.stars(), settings.psf_error)
         self.noise = np.concatenate([view.pixel_noise for view in self.views])
         self.scene, self.state = _start_scene(self, padded.shape)
         self.losses, self.status, self.findings = [], "iteration limit", None
@@ -100,12 +99,6 @@ class Fit:
     def shifts(self) -> np.ndarray:
         """Present shifts (n_observations, 2) [model px] of the observations' pixels."""
         return np.array([view.op.shift for view in self.views])
-
-    def _stars(self):
-        """The point sources as they start: each one's Star, place and spectrum."""
-        begin = self.start
-        rows = zip(begin.shapes, begin.positions[begin.source], begin.spectra, strict=True)
-        return [row for row in rows if isinstance(row[0], Star)]
 
     def _shift(self, shifts):
         """Move the observations' pixels to these shifts."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..sky.frame import Frame
-from .profiles import Galaxy, components_of
+from .profiles import Galaxy, Star, components_of
 from .spectra import MODEL_ERROR, RIDGE, solve_spectra
 from .view import WhitenedView
 
@@ -53,6 +53,11 @@ class StartingPoint:
     shapes: list
     thetas: list
     spectra: np.ndarray
+
+    def stars(self):
+        """The point sources: each one's Star, place (2,) [px] and spectrum (C,), a list."""
+        rows = zip(self.shapes, self.positions[self.source], self.spectra, strict=True)
+        return [row for row in rows if isinstance(row[0], Star)]
 
 
 def start(
