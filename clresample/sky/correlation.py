@@ -30,8 +30,7 @@ POWER_FLOOR = 0.03
 # sigma) are as right, to this part, as the floor above lets them be: 1 to 5 pixels a side for
 # drizzle and Lanczos kernels, 7 where these halve the pixels. Errors of smaller ones may be larger.
 ERROR_TOLERANCE, SIGMAS_PX = 0.015, (0.8, 1.2, 2.0, 4.0)
-# The filter is fitted where such sources have their power, and with this weight everywhere.
-WEIGHT_ELSEWHERE = 0.1
+WEIGHT_ELSEWHERE = 0.1  # in the filter's fit, beside that of frequencies where these have power
 MAX_RADIUS_PX = 6  # of the largest filter tried, 13 x 13 pixels
 N_GRID = 64  # frequencies along each axis: far more than the filter's extent
 # Blank sky: no smoothed pixel of more than so many of its own sigmas, nor pixels so near to one.
