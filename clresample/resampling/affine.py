@@ -57,27 +57,21 @@ class AffineExecutor(Executor):
         )
         self.from_columns = self.to_frequencies(self.mix_adjoint, n_x, turned, self.out_x_t)
 
-    def forward(self, x: ImageBatch, y: ImageBatch, n, spread=False):
-        """I2 = gather(G),  G = Sy twist(Z Sx),  Z = D o (Ty I1 Tx).
+    def observe(self, y: ImageBatch, n):
+        """I2 = gather(G),  G = Sy twist(Z Sx).
 
-        x (n, Ny, Nx): the model I1 of each band; where `spread`, (n / n_bands, Ny, Nx)
         G (n, L, J): the lines at equidistant columns
         y (n, My, Mx): the observation I2 of each band, overwritten
         """
-        self.analyse(x, n, spread)
         self.to_columns(n)
         self.to_lines(n)
         self.to_pixels(self.matrix("lines"), self._lines_of(y), n)
 
-    def adjoint(self, y: ImageBatch, x: ImageBatch, n):
-        """I1 = Ty^T Z Tx^T,  Z = conj(D) o (twist^T(Sy^T G) Sx^T),  G = gather^T(I2).
-
-        y (n, My, Mx): I2; x (n, Ny, Nx): I1, overwritten
-        """
+    def collect(self, y: ImageBatch, n):
+        """Z = conj(D) o (twist^T(Sy^T G) Sx^T),  G = gather^T(I2);  y (n, My, Mx): I2"""
         self.from_pixels(self._lines_of(y), self.matrix("lines"), n)
         self.from_lines(n)
         self.from_columns(n)
-        self.synthesise(x, n)
 
     def _lines_of(self, y: ImageBatch) -> Matrix:
         return y.matrix((0, 1) if self.by_row else (1, 0))

@@ -28,21 +28,12 @@ class AlignedExecutor(Executor):
         self.from_pixels = self.plain.bind(n_y, self.k_x, n_x, observed, self.out_x_t, half)
         self.from_rows = self.to_frequencies(self.mix_adjoint, n_y, self.out_y_t, half)
 
-    def forward(self, x: ImageBatch, y: ImageBatch, n, spread=False):
-        """I2 = Sy Z Sx,  Z = D o (Ty I1 Tx).
-
-        x (n, Ny, Nx): the model I1 of each band; where `spread`, (n / n_bands, Ny, Nx)
-        y (n, My, Mx): the observation I2 of each band, overwritten
-        """
-        self.analyse(x, n, spread)
+    def observe(self, y: ImageBatch, n):
+        """I2 = Sy Z Sx;  y (n, My, Mx): the observation I2 of each band, overwritten"""
         self.to_rows(n)
         self.to_pixels(n, c=y)
 
-    def adjoint(self, y: ImageBatch, x: ImageBatch, n):
-        """I1 = Ty^T Z Tx^T,  Z = conj(D) o (Sy^T I2 Sx^T).
-
-        y (n, My, Mx): I2; x (n, Ny, Nx): I1, overwritten
-        """
+    def collect(self, y: ImageBatch, n):
+        """Z = conj(D) o (Sy^T I2 Sx^T);  y (n, My, Mx): I2"""
         self.from_pixels(n, a=y)
         self.from_rows(n)
-        self.synthesise(x, n)

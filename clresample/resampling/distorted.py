@@ -18,19 +18,15 @@ class DistortedExecutor(Executor):
         self.n_rows = math.prod(plans[0].mapping.shape_out)
         super().__init__(device, dtype, plans)
         self.out_x = self._table([p.out_x for p in plans], self.n_rows, self.k_pad)
-        group = self.tuning.line_group
-        self.rowdot, self.rowscale = (
-            device.launcher("warp.cl", name, dtype=dtype, local_size=local_size)
-            for name, local_size in (("rowdot", (group, 1)), ("rowscale", (COLUMN_PAD, 1)))
-        )
 
     def bind(self):
         super().bind()
         half, z = self.matrix("half", self.n_rows), self.matrix("frequencies")
         self.to_rows = self.plain.bind(self.n_rows, self.k_x, self.k_y, self.out_y, z, half)
         self.from_rows = self.to_frequencies(self.mix_adjoint, self.n_rows, self.out_y_t, half)
-        for launch in (self.rowdot, self.rowscale):
-            launch.bind(
+        group = self.tuning.line_group
+        self.rowdot, self.rowscale = (
+            self.device.launcher("warp.cl", name, dtype=self.dtype, local_size=local_size).bind(
                 n_positions=self.n_rows,
                 n_pad=self.k_pad,
                 n_bands=self.n_bands,
@@ -38,22 +34,15 @@ class DistortedExecutor(Executor):
                 T=half.buffer,
                 E=self.out_x.buffer,
             )
+            for name, local_size in (("rowdot", (group, 1)), ("rowscale", (COLUMN_PAD, 1)))
+        )
 
-    def forward(self, x: ImageBatch, y: ImageBatch, n, spread=False):
-        """I2[p] = sum_x (Sy Z)[p, x] Sx[p, x],  Z = D o (Ty I1 Tx).
-
-        x (n, Ny, Nx): the model I1 of each band; where `spread`, (n / n_bands, Ny, Nx)
-        y (n, P): the observation I2 of each band, overwritten
-        """
-        self.analyse(x, n, spread)
+    def observe(self, y: ImageBatch, n):
+        """I2[p] = sum_x (Sy Z)[p, x] Sx[p, x];  y (n, P): the observation I2 of each band"""
         self.to_rows(n)
         self.rowdot((self.whole_groups(self.n_rows), n), y=y.buffer, y_offset=y.offset)
 
-    def adjoint(self, y: ImageBatch, x: ImageBatch, n):
-        """I1 = Ty^T Z Tx^T,  Z = conj(D) o (Sy^T T),  T[p, x] = I2[p] Sx[p, x].
-
-        y (n, P): I2; x (n, Ny, Nx): I1, overwritten
-        """
+    def collect(self, y: ImageBatch, n):
+        """Z = conj(D) o (Sy^T T),  T[p, x] = I2[p] Sx[p, x];  y (n, P): I2"""
         self.rowscale((self.k_pad * self.n_rows, n), y=y.buffer, y_offset=y.offset)
         self.from_rows(n)
-        self.synthesise(x, n)

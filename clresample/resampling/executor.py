@@ -16,6 +16,7 @@ All matrices are real: rows or columns 2i, 2i+1 are the cos and sin parts of fre
 
 from __future__ import annotations
 
+import copy
 import math
 
 import numpy as np
@@ -30,7 +31,7 @@ class Executor:
     plans: one for all items of a batch, or one for each item; smaller ones are padded with zeros
     axes: the model axes taken as rows and columns of I1
     n_rows: rows of Sy, set by a subclass before it calls this __init__
-    Subclasses add to scratch_shapes and bind, and implement forward and adjoint
+    Subclasses add to scratch_shapes and bind, and implement observe and collect
     """
 
     n_rows: int
@@ -59,6 +60,13 @@ class Executor:
         self.mix = Contraction(device, dtype, epilogue="MIX")
         self.mix_adjoint = Contraction(device, dtype, epilogue="MIX", adjoint=True)
         self.n_reserved, self.scratch = 0, {}
+
+    def apart(self) -> Executor:
+        """An executor of the same tables on the device, with intermediates of its own: for callers
+        that work between its stages. A shift of either is one of both."""
+        other = copy.copy(self)
+        other.n_reserved, other.scratch = 0, {}
+        return other
 
     def scratch_shapes(self):
         """Intermediate matrices of one image: {name: (rows, elements of a row)}."""
@@ -103,10 +111,20 @@ class Executor:
 
     def forward(self, x: ImageBatch, y: ImageBatch, n, spread=False):
         """I2 from I1: x (n, Ny, Nx), or (n / n_bands, Ny, Nx) where `spread`, to y (n, My, Mx)."""
-        raise NotImplementedError
+        self.analyse(x, n, spread)
+        self.observe(y, n)
 
     def adjoint(self, y: ImageBatch, x: ImageBatch, n):
         """The adjoint of `forward`: y (n, My, Mx) to x (n, Ny, Nx)."""
+        self.collect(y, n)
+        self.synthesise(x, n)
+
+    def observe(self, y: ImageBatch, n):
+        """I2 of `n` images, y (n, My, Mx), from Z in scratch "frequencies"."""
+        raise NotImplementedError
+
+    def collect(self, y: ImageBatch, n):
+        """The adjoint of `observe`, and conj(D) o of that: y (n, My, Mx) into the same scratch."""
         raise NotImplementedError
 
     def to_frequencies(self, mix: Contraction, k, left: Matrix, right: Matrix):

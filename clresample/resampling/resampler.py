@@ -14,6 +14,7 @@ from ..sky.psf_checks import PSFWarning
 from .affine import AffineExecutor
 from .aligned import AlignedExecutor
 from .distorted import DistortedExecutor
+from .executor import Executor
 from .grid_operator import GridOperator
 from .plan import Plan, Precision, make_plan
 from .transfer import noise_warnings
@@ -80,6 +81,10 @@ class Resampler(GridOperator):
         """Copied and pickled as its plans; the copy uploads them to the device of the same name."""
         make = functools.partial(type(self).from_plans, dtype=self.dtype, device=self.device)
         return functools.partial(make, shift=self._shift), (self.plans,)
+
+    def executor(self) -> Executor:
+        """What computes it, with intermediates of its own; for callers that work between stages."""
+        return self._executor.apart()
 
     @property
     def n_bytes(self) -> int:

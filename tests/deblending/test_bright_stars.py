@@ -6,7 +6,7 @@ from helpers.scenes import BLURRED, GALAXIES, SHARP, blend, fit, frame, observe,
 
 from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.blend import Blend
-from clresample.deblending.fit import Fit
+from clresample.deblending.fit import Fit, begin
 from clresample.deblending.settings import Settings
 from clresample.deblending.solver.prior import Prior
 from clresample.measurement.catalogue import Flag, catalogue
@@ -102,6 +102,7 @@ def test_masked_cores(device):
 
 def views(scene, device, psf_error):
     made = Fit(scene, Settings(psf_error=psf_error), device, np.float32, pad=1)
+    begin([made])
     return made, made.views
 
 

@@ -61,14 +61,7 @@ class Scene:
     @property
     def signature(self):
         """Scenes of equal signature can share a batch: frames, observed shapes, kernels to run."""
-        return (
-            self.shape,
-            self.fit_sky,
-            tuple(
-                (op.geometry, op.plans[0].axes, op.shape_out) + _lines(op.plans[0])
-                for op in self.ops
-            ),
-        )
+        return signature_of(self.shape, self.fit_sky, self.ops)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +90,12 @@ class State:
     sky: np.ndarray
     memory: Memory | None = None
     n_steps: int = 0
+
+
+def signature_of(shape, fit_sky, ops):
+    """`Scene.signature` of scenes with these."""
+    found = ((op.geometry, op.plans[0].axes, op.shape_out) + _lines(op.plans[0]) for op in ops)
+    return shape, fit_sky, tuple(found)
 
 
 def _lines(plan):
