@@ -7,7 +7,9 @@ A row is one quantity of the galaxies of one kind, fitted in one mode, in one bi
 belongs to the galaxy) or in all bins together, from 3 on; a bin without an upper end has
 snr_high = null in the JSON:
 
-mode        joint, euclid or rubin
+mode        joint, euclid or rubin; joint-lanczos and joint-drizzle: parametric galaxies on mosaics
+            of pixels of 0.7, whose noise is correlated, which the fit is told; and the same with
+            "-as-white": it is not told
 galaxies    parametric: bulge, disk and knots; cosmos: real ones whose light is not clearly negative
 quantity    flux, colour (of neighbouring bands), position, size, ellipticity
 n           values; of a flux one for each galaxy and band
@@ -27,6 +29,7 @@ import numpy as np
 from tqdm import tqdm
 
 from clresample import Settings
+from clresample.simulation.coadds import mosaic_scene
 from clresample.simulation.scenes import simulate_scene
 
 from .harness import records, scenes, truth
@@ -38,14 +41,29 @@ MODES = "joint", "euclid", "rubin"
 EDGES = (3.0, 10.0, 30.0, 100.0, 300.0, np.inf)  # signal to noise
 # Scenes of each kind and mode. Of parametric galaxies so many that the standard error of a flux
 # bin's coverage is under 0.015: of 1000 fluxes above signal to noise 300, of which a scene has 2.5
-# together, 0.4 in Euclid, 2 in Rubin. Both kinds take a quarter of an hour on two cores.
+# together, 0.4 in Euclid, 2 in Rubin. All take half an hour on two cores.
 N_SCENES = {
-    "parametric": {"joint": 700, "euclid": 2500, "rubin": 950},
+    "parametric": {
+        "joint": 700,
+        "euclid": 2500,
+        "rubin": 950,
+        "joint-lanczos": 450,
+        "joint-drizzle": 450,
+        "joint-lanczos-as-white": 60,
+        "joint-drizzle-as-white": 60,
+    },
     "cosmos": {"joint": 120, "euclid": 300, "rubin": 120},
 }
-N_QUICK = 10
+N_QUICK, N_QUICK_MOSAICS = 10, 3
 # Constants were chosen on scenes of seeds before these.
 FIRST_SEED = 1000
+# How the images of scenes become mosaics, see `mosaic_scene`; in other modes they stay as taken.
+MOSAICS = {
+    "joint-lanczos": {"kind": "lanczos"},
+    "joint-drizzle": {"kind": "drizzle"},
+    "joint-lanczos-as-white": {"kind": "lanczos", "noise": "white"},
+    "joint-drizzle-as-white": {"kind": "drizzle", "noise": "white"},
+}
 CHUNK = 5  # scenes fitted side by side: some seconds
 # Share of negative light from which a COSMOS galaxy is left out, as no model that is positive can
 # have its flux: fluxes above signal to noise 100 come out too high by 0.1 % where it is under this,
@@ -53,7 +71,7 @@ CHUNK = 5  # scenes fitted side by side: some seconds
 # more, from the noise of HST's images.
 NEGATIVE = 0.005
 COLUMNS = (
-    ("mode", 6, ""),
+    ("mode", 22, ""),
     ("galaxies", 10, ""),
     ("quantity", 11, ""),
     ("snr_low", 7, "g"),
@@ -66,24 +84,22 @@ COLUMNS = (
 )
 
 
-def make_scene(galaxies, folder, seed, noise=None):
-    """A `SimulatedScene` of one of GALAXIES.
-
-    folder: of the COSMOS galaxies; noise: function (scene, rng) -> the scene with other noise, a
-        module's own so that processes can be given it
-    """
+def make_scene(galaxies, mode, folder, seed):
+    """A `SimulatedScene` of one of GALAXIES; folder: of the COSMOS galaxies."""
     scene = simulate_scene(seed) if galaxies == "parametric" else scenes.opened(folder).take(seed)
-    return scene if noise is None else noise(scene, np.random.default_rng(seed))
+    if mode not in MOSAICS:
+        return scene
+    return mosaic_scene(scene, np.random.default_rng(seed), **MOSAICS[mode])
 
 
-def measure(galaxies, mode, folder, seeds, negative=NEGATIVE, noise=None):
+def measure(galaxies, mode, folder, seeds, negative=NEGATIVE):
     """What `truth.compare` finds in scenes of these seeds, and how their fits ended.
 
-    noise: see `make_scene`
     returns [{quantity: (4, n)}, ...], one for each scene that could be fitted; [status, ...]
     """
     parametric = galaxies == "parametric"
-    found = [make_scene(galaxies, folder, seed, noise) for seed in seeds]
+    found = [make_scene(galaxies, mode, folder, seed) for seed in seeds]
+    mode = mode.partition("-")[0]
     results = scenes.fit([scenes.blend(scene, mode) for scene in found])
     values = []
     for scene, result in zip(found, results, strict=True):
@@ -159,10 +175,16 @@ def main(options):
         galaxies.remove("cosmos")
     if not galaxies:
         raise BadOption("--galaxies cosmos: there is no catalogue of them, name one by --catalogue")
+    if galaxies == ["cosmos"] and not set(options.modes) - set(MOSAICS):
+        raise BadOption(f"--galaxies cosmos: {', '.join(options.modes)} have parametric ones only")
     threads = on_one_thread()
-    n_all = options.scenes or (N_QUICK if options.quick else None)
-    n_scenes = {kind: {m: n_all or n for m, n in of.items()} for kind, of in N_SCENES.items()}
-    wanted = list(itertools.product(galaxies, options.modes))
+    quick = {m: N_QUICK_MOSAICS if m in MOSAICS else N_QUICK for m in N_SCENES["parametric"]}
+    n_scenes = {
+        kind: {m: options.scenes or (quick[m] if options.quick else n) for m, n in of.items()}
+        for kind, of in N_SCENES.items()
+    }
+    pairs = itertools.product(galaxies, options.modes)
+    wanted = [(kind, mode) for kind, mode in pairs if mode in N_SCENES[kind]]
     counts = ", ".join(f"{n_scenes[kind][mode]} {kind} {mode}" for kind, mode in wanted)
     record = records.record(threads) | {
         "scenes": f"{counts}; from seed {options.seed}",
@@ -184,7 +206,11 @@ def main(options):
 
 def parser():
     parser = Parser("bench.coverage", description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help=f"{N_QUICK} scenes of each")
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help=f"{N_QUICK} scenes of each, {N_QUICK_MOSAICS} of mosaics",
+    )
     parser.add_argument(
         "--scenes",
         type=positive(int),

@@ -19,6 +19,7 @@ _ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
     "sky": {
         "grid": ("Grid",),
         "psf": ("PSF",),
+        "correlation": ("NoiseCorrelation",),
         "observation": ("Observation",),
         "sources": ("Extended", "Point"),
         "frame": ("Frame", "model_frame"),
@@ -93,6 +94,7 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from .resampling.resampler import Resampler as Resampler
     from .resampling.tiled.resampler import TiledResampler as TiledResampler
     from .simulation.scenes import simulate_scene as simulate_scene
+    from .sky.correlation import NoiseCorrelation as NoiseCorrelation
     from .sky.frame import Frame as Frame, model_frame as model_frame
     from .sky.grid import Grid as Grid
     from .sky.observation import Observation as Observation

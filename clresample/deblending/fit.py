@@ -18,7 +18,7 @@ from .solver.learned.engine import vector_bytes
 from .solver.scene import Scene, State, signature_of
 from .start.first_scene import first_scene
 from .start.seen import Model, Seen, see
-from .start.start import LIGHT_SIGMAS, Patch, StartingPoint, start
+from .start.start import LIGHT_SIGMAS, Patch, StartingPoint, start, weighed
 from .view import view_as_taken, whitened_view
 
 # The stopping rule compares the best loss with the best one this many iterations ago: losses of
@@ -96,7 +96,8 @@ class Fit:
     def begin(self, point: StartingPoint, seconds):
         """Make the scene and its state from where it starts; seconds: that this took."""
         began = time.perf_counter()
-        self.start, self.dark = point, self.fitted[point.dark]
+        self.views, self.start = weighed(self.patch, point, self.settings)
+        self.dark = self.fitted[point.dark]
         self.messages += [_dark_message(i, self._positions[i]) for i in self.dark]
         self.scene, self.state = first_scene(self)
         self.seconds["setup"] += seconds + time.perf_counter() - began

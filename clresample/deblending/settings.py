@@ -42,6 +42,13 @@ class Settings:
         galaxies above signal to noise 300 in Euclid and Rubin together, the 68 % intervals hold the
         truth in 0.68 of cases with 0.0005, in 0.72 with 0.0015, in 0.76 with 0.002.
         PSFs that are wrong by a percent need 0.01
+    psf_error: part by which PSFs may be too narrow or too wide. That part of a bright point
+        source's light, more in its wings, adds to the noise of its pixels, so that what the PSF
+        does not explain of a star is not given to its neighbours. Weights follow the stars' light
+        as fitted at the start, and stay. Stars whose error is everywhere under 0.05 sigma change
+        nothing. Beside a star of signal to noise 1e4 whose PSF is 1 % too narrow it raises the SDR
+        of galaxies from 7.5 to 12.9 dB (12.9 with a right PSF, too), and their stated flux errors
+        by a quarter. Larger values help against worse PSFs, and cost more precision
     """
 
     max_iter: int = 300
@@ -53,11 +60,12 @@ class Settings:
     fit_shifts: bool = False
     fit_sky: bool = False
     flux_floor: float = 0.0015
+    psf_error: float = 0.03
 
     def __post_init__(self):
         whole("max_iter", self.max_iter)
         number("enough", self.enough, "0 or more", lambda x: x >= 0)
-        for name in ("tol", "flux_floor"):
+        for name in ("tol", "flux_floor", "psf_error"):
             number(name, getattr(self, name), "at least 0 and under 1", lambda x: 0 <= x < 1)
         for name in ("fit_shifts", "fit_sky"):
             instance(name, getattr(self, name), (bool, np.bool_))

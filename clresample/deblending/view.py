@@ -9,7 +9,10 @@ import numpy as np
 from ..resampling.cache import cached_resampler
 from ..resampling.resampler import Resampler
 from ..sky.mapping import Mapping
+from .profiles import point
 
+# [sigma] Stars whose PSF's error is nowhere more than this leave the weights as they are.
+FAINT = 0.05
 # Pixels of a model under this part of its brightest one count as 0 when it is rendered: of the
 # model's light they hold nothing, but float32 keeps them as denormals, 20 times slower.
 DARK = 1e-20
@@ -48,6 +51,13 @@ class WhitenedView:
         data = np.where(root > 0, data, 0.0) / unit[:, None, None]
         return cls(op, mapping, covered, unit, root, data)
 
+    def allowing(self, error) -> WhitenedView:
+        """The same view with a model whose own error (Co, My, Mx) [unit] adds to the noise.
+
+        1/w = sigma^2 + error^2,  of pixels that have a weight
+        """
+        return replace(self, root=self.root / np.sqrt(1 + (self.root * error) ** 2))
+
     @property
     def pixel_noise(self) -> np.ndarray:
         """Noise (Co,) [unit] of one model pixel, if it were observed with the same exposure."""
@@ -85,6 +95,40 @@ def whitened_view(frame, padded, observation, pad, device, dtype, *, private) ->
     )
     data, weights = _padded(observation.data, shape), _padded(observation.weights, shape)
     return WhitenedView.of(op, frame, data, weights)
+
+
+def allow_for_psf_error(views, stars, psf_error) -> list[WhitenedView]:
+    """Views whose weights hold the error of the PSF in the light of bright stars.
+
+        1/w = sigma^2 + psf_error^2 sum_s [ L_s^2 + (r . grad L_s)^2 ],      L_s = A_s R S_s
+
+    r being the distance from star s: L changes by -(2 L + r . grad L) epsilon when the PSF grows by
+    epsilon, so that its wings are less certain than its core.
+
+    stars: tuples of a Star, its place (2,) [model px] and its spectrum (C,) [unit]
+    """
+    ends = np.cumsum([0, *(len(view.data) for view in views)])
+    squares = [0.0] * len(views)
+    for star, place, spectrum in stars if psf_error else ():
+        parts = [spectrum[a:b, None, None] for a, b in zip(ends, ends[1:], strict=False)]
+        pairs = list(zip(views, parts, strict=True))
+        # no pixel holds more than all of its light
+        if all(psf_error * np.abs(a * view.root).max() < FAINT for view, a in pairs):
+            continue
+        images = point(star.psf, place, star.shape)
+        for i, (view, a) in enumerate(pairs):
+            seen = view.op.render(_padded(images, view.op.shape_in).astype(view.op.dtype))
+            light, *slopes = seen.astype(np.float64)  # slopes by the place: minus the gradient
+            n, m = np.indices(view.mapping.shape_out)
+            away = np.moveaxis(view.mapping.at(n, m) + view.op.shift - place, -1, 0)
+            change = sum(r * slope for r, slope in zip(away, slopes, strict=True))
+            found = (a * light) ** 2 + (a * change) ** 2
+            if psf_error * (np.sqrt(found) * view.root).max() > FAINT:
+                squares[i] = squares[i] + found
+    return [
+        view if np.isscalar(square) else view.allowing(psf_error * np.sqrt(square))
+        for view, square in zip(views, squares, strict=True)
+    ]
 
 
 def view_as_taken(observation, view, frame, padded) -> WhitenedView:

@@ -117,6 +117,7 @@ TABLES = {
         "fit_shifts": SWITCH,
         "fit_sky": SWITCH,
         "flux_floor": Rule("a number from 0 to 1", lambda value: _number(value) and 0 <= value < 1),
+        "psf_error": Rule("a number from 0 to 1", lambda value: _number(value) and 0 <= value < 1),
     },
 }
 NEEDED = {"observation": ("name", "image", "psf"), "sources": ("catalogue",)}

@@ -14,7 +14,7 @@ from ..sky.footprint import open_edge
 from ..sky.observation import ZERO_POINT_UJY
 from ..sky.wcs import local_axes
 from .photometry import channel_covariances, flux_scale, fluxes
-from .quality import box_chi2, fitted_sources, labels
+from .quality import box_chi2, fitted_sources, labels, masked_cores
 from .residuals import channel_residuals, misfits
 from .shapes import moments, shape, shape_slopes
 
@@ -37,6 +37,7 @@ class Flag(IntFlag):
     OUTSIDE = 16
     MASKED = 32
     MISFIT = 64
+    SATURATED = 128
 
     @classmethod
     def _missing_(cls, value):
@@ -50,6 +51,7 @@ MEANINGS = {
     Flag.NO_COVERAGE: "a channel's image does not hold the centre, or determines no flux",
     Flag.OUTSIDE: "outside the frame, thus not fitted: nothing is measured",
     Flag.MASKED: "the centre is on a pixel without weight in a channel whose image holds it",
+    Flag.SATURATED: "a point source with masked pixels in its core: its flux is that of its wings",
     Flag.MISFIT: "the model leaves a residual of over 5 sigma somewhere on the source in a channel",
 }
 
@@ -215,6 +217,7 @@ def _flags(result, flux, error, positions, footprints):
         held = footprint.holds(positions)
         flags[fitted & ~held] |= Flag.NO_COVERAGE
         flags[fitted & held & ~footprint.weighted(positions).all(axis=0)] |= Flag.MASKED
+    flags[masked_cores(result, positions)] |= Flag.SATURATED
     edge = open_edge(footprints, result.frame.shape)
     for c in result.components:
         (y, x), (n_y, n_x) = c.origin, c.morphology.shape

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..sky.sources import Point
 from .residuals import channel_residuals, misfits
+
+# [px] from a pixel's centre to its corners
+PIXEL_RADIUS = 0.5**0.5
 
 
 def summary(result) -> dict:
@@ -69,6 +73,25 @@ def fitted_sources(result):
     fitted = np.zeros(len(result.sources), dtype=bool)
     fitted[[c.source for c in result.components]] = True
     return fitted
+
+
+def masked_cores(result, positions):
+    """Point sources (S,) bool with a pixel without weight in their core in some channel.
+
+    The core is what lies within half of the PSF's FWHM of the position (S, 2) [model px], and the
+    pixel that holds it.
+    """
+    found = np.zeros(len(result.sources), dtype=bool)
+    points = [i for i, source in enumerate(result.sources) if isinstance(source, Point)]
+    for footprint in result.footprints if points else ():
+        observation = footprint.observation
+        scale = np.sqrt(abs(np.linalg.det(footprint.mapping.matrix)))  # [model px / px]
+        radius = scale * np.maximum(observation.psf.fwhm_px / 2, PIXEL_RADIUS)
+        masked = observation.weights == 0
+        for i in points:
+            distance = np.linalg.norm(footprint.positions - positions[i], axis=-1)
+            found[i] |= (masked & (distance <= radius[:, None, None])).any()
+    return found & fitted_sources(result)
 
 
 def chi2_terms(result, i_observation, used):

@@ -27,15 +27,12 @@ MAX_LAG_PX = 8
 # removed the signal there too; the error of a star's flux grows by under 2 % through it.
 POWER_FLOOR = 0.03
 # The filter is the smallest with which the flux errors of round sources of these sizes (Gaussian
-# sigma of their images) are right to this part: 5 x 5 pixels for drizzle and Lanczos kernels.
-# Smaller sources may get larger errors than they have.
+# sigma) are as right, to this part, as the floor above lets them be: 1 to 5 pixels a side for
+# drizzle and Lanczos kernels, 7 where these halve the pixels. Errors of smaller ones may be larger.
 ERROR_TOLERANCE, SIGMAS_PX = 0.015, (0.8, 1.2, 2.0, 4.0)
-# The filter is fitted where such sources have their power, and with this weight everywhere.
-WEIGHT_ELSEWHERE = 0.1
-# Largest filter tried [px]: of 2 x 6 + 1 pixels a side.
-MAX_RADIUS_PX = 6
-# Points of the frequency grid along each axis: far more than the filter's extent.
-N_GRID = 64
+WEIGHT_ELSEWHERE = 0.1  # in the filter's fit, beside that of frequencies where these have power
+MAX_RADIUS_PX = 6  # of the largest filter tried, 13 x 13 pixels
+N_GRID = 64  # frequencies along each axis: far more than the filter's extent
 # Blank sky: no smoothed pixel of more than so many of its own sigmas, nor pixels so near to one.
 # A lower limit cuts the peaks of correlated noise away and underestimates it.
 BLANK_SIGMAS, BLANK_GROW_PX = 3.5, 5
@@ -186,6 +183,7 @@ def _whitening(power):
     sources = np.exp(-((2 * np.pi * distance * np.reshape(SIGMAS_PX, (-1, 1, 1))) ** 2))
     u = (sources / sources.mean(axis=(1, 2), keepdims=True)).mean(axis=0) + WEIGHT_ELSEWHERE
     root = np.sqrt(np.maximum(power, POWER_FLOOR * power.max()))
+    wanted = _error_ratios(sources, root**-2, power)
     for radius in range(MAX_RADIUS_PX + 1):
         y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
         half = (y > 0) | ((y == 0) & (x >= 0))  # w is symmetric: one of each pair of taps
@@ -195,15 +193,19 @@ def _whitening(power):
         weighted = columns * u.reshape(-1, 1)
         taps = np.linalg.solve(weighted.T @ columns, weighted.sum(axis=0))
         response = (waves @ taps) ** 2
-        ratio = np.sqrt(
-            (sources * response**2 * power).sum(axis=(1, 2)) / (sources * response).sum(axis=(1, 2))
-        )
-        if (ratio <= 1 + ERROR_TOLERANCE).all() and (ratio[1:] >= 1 - ERROR_TOLERANCE).all():
+        excess = _error_ratios(sources, response, power) - wanted
+        if (excess <= ERROR_TOLERANCE).all() and (excess[1:] >= -ERROR_TOLERANCE).all():
             break
     w = np.zeros(half.shape)
     w[half] = taps
     w[~half] = w[::-1, ::-1][~half]
     return w, float((response * power).mean())
+
+
+def _error_ratios(sources, response, power):
+    """True over claimed flux errors (n,) of sources of power (n, N, N), |W|^2 being `response`."""
+    true = (sources * response**2 * power).sum(axis=(1, 2))
+    return np.sqrt(true / (sources * response).sum(axis=(1, 2)))
 
 
 def _correlate(noise, good, max_lag_px):
@@ -222,8 +224,7 @@ def _correlate(noise, good, max_lag_px):
     distance = np.hypot(*np.meshgrid(lags, lags, indexing="ij")) / max_lag_px
     taper = np.where(distance < 0.5, 1, np.cos(np.pi * (distance - 0.5).clip(0, 0.5)) ** 2)
     rho = rho / rho[max_lag_px, max_lag_px] * taper
-    limit = np.abs(rho).max(initial=0)
-    return rho if limit <= 1 else np.clip(rho, -1, 1)
+    return np.clip(rho, -1, 1)
 
 
 def _lit(noise, seen):

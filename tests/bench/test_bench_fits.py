@@ -22,6 +22,13 @@ REAL = {
     "scene", "band", "chi2", "status", "seconds", "core_s", "iterations", "n_sources", "residual",
     "source", "flagged", "n_unflagged", "stages",
 }  # fmt: skip
+NOISE = {
+    "recipe", "bands", "n", "median", "mean", "against", "coverage", "error", "width", "scatter",
+    "bias", "seconds",
+}  # fmt: skip
+STARS = {
+    "psf", "snr", "psf_error", "n", "sdr", "coverage", "typical", "worst", "stated", "star",
+}  # fmt: skip
 SETTINGS = {
     "settings", "mode", "n", "median", "mean", "worse", "below", "against", "error", "chi2",
     "converged", "iterations", "seconds",
@@ -199,3 +206,34 @@ def test_bad_options_get_one_line(module, options, words):
     assert result.returncode == 2
     assert result.stderr.count("\n") == 1
     assert words in result.stderr
+
+
+def test_noise(tmp_path):
+    rows = run(tmp_path, "noise", "--scenes", 1, "--processes", 1)
+    assert [(row["recipe"], row["bands"]) for row in rows] == [
+        (recipe, bands)
+        for recipe in ("native", "correlated", "white")
+        for bands in ("Euclid", "Rubin")
+    ]
+    assert all(row.keys() == NOISE for row in rows)
+    assert rows[0]["against"] == 0
+    assert len({row["n"] for row in rows if row["bands"] == "Rubin"}) == 1  # the same fluxes
+
+
+def test_stars(tmp_path):
+    rows = run(tmp_path, "stars", "--quick", "--scenes", 1, "--processes", 1)
+    assert all(row.keys() == STARS for row in rows)
+    assert [(row["psf"], row["psf_error"]) for row in rows] == [
+        (psf, error) for psf in ("right", "wider 3 %") for error in (0, 0.03)
+    ]
+    wrong, allowed = rows[2:]
+    assert allowed["worst"] < 0.5 * wrong["worst"]
+
+
+def test_mosaics_have_rows_of_their_own(tmp_path):
+    rows = run(
+        tmp_path, "coverage", "--scenes", 1, "--modes", "joint-lanczos", "--processes", 1,
+        "--galaxies", "parametric",
+    )  # fmt: skip
+    assert {row["mode"] for row in rows} == {"joint-lanczos"}
+    assert all(row.keys() == COVERAGE for row in rows)

@@ -79,6 +79,23 @@ def test_masked_is_the_centres_own_pixel():
         assert flags(one_source(observations=observations, sources=sources)) == [Flag(expected)]
 
 
+def test_saturated_is_a_star_with_masked_pixels_in_its_core():
+    grid = Grid.flat((60, 70), SCALE)
+    for source, away, expected in (
+        (Point, 0, Flag.SATURATED | Flag.MASKED),
+        (Point, 1, Flag.SATURATED),  # the PSF's FWHM is 3 px
+        (Point, 2, Flag(0)),
+        (Extended, 1, Flag(0)),
+    ):
+        weights = np.ones((2, 60, 70))
+        weights[1, 30, 36 + away] = 0
+        given = {
+            "observations": [observe(grid, ("g", "r"), weights=weights)],
+            "sources": (source(position_px=(30.0, 36.0)),),
+        }
+        assert flags(one_source(**given)) == [expected]
+
+
 def test_no_coverage_is_a_centre_off_an_image():
     full = observe(Grid.flat((60, 70), SCALE), ("g",))
     left = observe(Grid.flat((30, 17), 0.2, center_arcsec=(0, -1.8)), ("r",))  # to column 33

@@ -11,15 +11,15 @@ Smooth profiles leave a tenth of a bright galaxy's light unexplained. The weight
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ...resampling.gridding import KaiserBessel
 from ...resampling.plan import Precision
 from ...sky.frame import Frame
-from ..profiles import Galaxy, Given, components_of
-from ..view import WhitenedView
+from ..profiles import Galaxy, Given, Star, components_of
+from ..view import WhitenedView, allow_for_psf_error
 from .looking import looking_at
 from .profile_fit import ProfileFit
 from .slots import Component
@@ -76,6 +76,12 @@ class StartingPoint:
     def __len__(self):
         return len(self.shapes)
 
+    def stars(self):
+        """The point sources: each one's Star, place (2,) [px] and spectrum (C,), a list."""
+        spectra = self.spectra / self.peaks[:, None]
+        rows = zip(self.shapes, self.positions[self.source], spectra, strict=True)
+        return [row for row in rows if isinstance(row[0], Star)]
+
     def drawn(self, i, origin, size):
         """Component i's profile in a box of the frame, (ny, nx)."""
         image = self.shapes[i].cut(self.thetas[i], self.places[i], origin, size, slopes=False)
@@ -104,6 +110,32 @@ def start(patches: list[Patch], *, fit_sky=False) -> list[StartingPoint]:
     looking.look(np.arange(len(patches)), thetas, fit.brightness, slopes=False)
     looking.solve(0.0)
     return [_point(patch, looking, thetas, sources, b, dark[b]) for b, patch in enumerate(patches)]
+
+
+def weighed(patch, point: StartingPoint, settings):
+    """Views whose weights hold the PSF's error in bright stars, and the start under them."""
+    views = allow_for_psf_error(patch.views, point.stars(), settings.psf_error)
+    if all(new is old for new, old in zip(views, patch.views, strict=True)):
+        return patch.views, point
+    return views, _solved_again(replace(patch, views=views), point, settings.fit_sky)
+
+
+def _solved_again(patch, point, fit_sky):
+    """The same profiles, with other spectra, sky and power."""
+    pairs = enumerate(zip(point.shapes, point.places, strict=True))
+    components = [Component(0, i, shape, place, patch.frame.shape) for i, (shape, place) in pairs]
+    looking = looking_at([patch.views], components, PRECISION, TOLERANCE, fit_sky=fit_sky)
+    noise = np.concatenate([v.pixel_noise for v in patch.views])
+    brightness = (point.spectra / noise).max(axis=1)
+    looking.look(np.arange(1), point.thetas, brightness, slopes=False)
+    looking.solve(0.0)
+    power = np.diagonal(looking.normal[0], axis1=1, axis2=2)[:, : len(point)].T
+    return replace(
+        point,
+        spectra=looking.spectra * point.peaks[:, None],
+        sky=looking.sky[0].copy(),
+        power=power / point.peaks[:, None] ** 2,
+    )
 
 
 def _point(patch, looking, thetas, sources, b, dark):
