@@ -14,11 +14,10 @@ from ..device.tuning import Tuning
 from ..sky.given.checks import float_type, instance
 from ..sky.sources import SourceWarning
 from .blend import INTERRUPTED, Blend, Failure
-from .fit import Fit
+from .fit import Fit, begin, data_bytes, finish, scene_bytes
 from .iterate import iterate
 from .result import Result
 from .settings import Settings
-from .solver.learned.engine import vector_bytes
 
 # [px] Blends of several sizes have their frames and observations padded to multiples of this, so
 # that they share batches: smaller ones make more batches, larger ones more padding to compute.
@@ -59,10 +58,11 @@ def deblend(
     settings, dtype = _checked(settings, dtype)
     device = get_device(device)
     fit = Fit(blend, settings, device, dtype, pad=1)
+    begin([fit])
     if len(fit.dark):
         _warn_dark([fit.dark], "")
     iterate([fit], settings, device, dtype, progress)
-    return fit.result()
+    return fit.result(*finish([fit]))
 
 
 def deblend_many(
@@ -121,30 +121,56 @@ class _ManyFits:
                 self.done[i] = _failure(blend, error)
                 yield 1
                 continue
-            if len(fit.dark):
-                self.dark.append(fit.dark)
-            group = waiting[fit.scene.signature]
+            group = waiting[fit.signature]
             group.append((i, fit))
-            full = sum(_n_bytes(f) for _, f in group) + _n_bytes(fit) > self.memory
-            n_sources = [len(f.scene.profile) for _, f in group]
+            n_sources = [len(f.fitted) for _, f in group]
+            full = sum(data_bytes(f) for _, f in group) + data_bytes(fit) > self.memory
             full |= sum(n_sources) + n_sources[-1] > MOST_SOURCES
             if full or len(group) >= self.n_most:
-                yield from self._fit(waiting.pop(fit.scene.signature))
+                yield from self._fit(waiting.pop(fit.signature))
         while waiting:
             yield from self._fit(waiting.popitem()[1])
 
+    def _begin(self, group):
+        """Start a group of (index, Fit); those that could, one by one where all at once fails."""
+        try:
+            begin([fit for _, fit in group])
+        except Exception as error:
+            if len(group) > 1:
+                return [item for one in group for item in self._begin([one])]
+            (i, fit), *_ = group
+            self.done[i] = _failure(fit.blend, error)
+            return []
+        self.dark += [fit.dark for _, fit in group if len(fit.dark)]
+        return group
+
     def _fit(self, group):
         """Fit a group, a list of (index, Fit); yields its length."""
-        for i, done in self._try(group):
-            self.done[i] = done
-        yield len(group)
-        if any(fit.status == INTERRUPTED for _, fit in group):
-            raise KeyboardInterrupt
+        n = len(group)
+        for part in self._parts(self._begin(group)):
+            for i, done in self._try(part):
+                self.done[i] = done
+            if any(fit.status == INTERRUPTED for _, fit in part):
+                raise KeyboardInterrupt
+        yield n
+
+    def _parts(self, group):
+        """A group in parts that fit into the memory, now that the boxes are known."""
+        part, n_bytes = [], 0
+        for item in group:
+            if part and n_bytes + scene_bytes(item[1]) > self.memory:
+                yield part
+                part, n_bytes = [], 0
+            part.append(item)
+            n_bytes += scene_bytes(item[1])
+        if part:
+            yield part
 
     def _try(self, group):
         """Yield (index, Result or Failure) of a group; one by one where all at once fails."""
         try:
             iterate([fit for _, fit in group], self.settings, self.device, self.dtype)
+            seen = finish([fit for _, fit in group])
         except Exception as error:
             if len(group) == 1:
                 yield group[0][0], _failure(group[0][1].blend, error)
@@ -154,17 +180,11 @@ class _ManyFits:
                 if item[1].status == INTERRUPTED:
                     return
             return
-        for i, fit in group:
+        for (i, fit), own in zip(group, seen, strict=True):
             try:
-                yield i, fit.result()
+                yield i, fit.result(own)
             except Exception as error:
                 yield i, _failure(fit.blend, error)
-
-
-def _n_bytes(fit):
-    """Device memory [bytes] that a fit takes in a batch, roughly."""
-    learns, prior = fit.settings.learns, fit.settings.prior
-    return fit.scene.n_bytes + (vector_bytes(fit.scene, prior) if learns else 0)
 
 
 def _checked(settings, dtype):

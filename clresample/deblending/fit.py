@@ -3,32 +3,24 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..resampling.transfer import noise_warnings
-from ..sky.extent import box_slices
 from ..sky.frame import Frame
-from ..sky.sources import Point
 from .blend import INTERRUPTED
 from .posterior.posterior import errors_of
-from .resize import box_around
+from .rendered import Rendered
 from .result import Component, Result
 from .shifts import shift_steps
-from .solver.curvature import damping
-from .solver.scene import Scene, State
-from .spectra import solve_spectra
-from .start import LIGHT_SIGMAS, start
-from .view import as_taken, whitened_view
+from .solver.learned.engine import vector_bytes
+from .solver.scene import Scene, State, signature_of
+from .start.first_scene import first_scene
+from .start.seen import Model, Seen, see
+from .start.start import LIGHT_SIGMAS, Patch, StartingPoint, start
+from .view import view_as_taken, whitened_view
 
-# A spectrum's step size counts in errors of the flux plus this part of the flux: bright sources,
-# whose errors are far smaller than what a changing morphology does to their flux, can follow it.
-SPECTRUM_PART = 0.02
-# Least power sum |u|^2 of a component's whitened image u in a channel, whose root is the inverse of
-# its spectrum's error; and the error from which on the channel holds nothing of the component, so
-# that its spectrum is not stepped there. A covered component has errors of 1e6 at most.
-LEAST_POWER, UNSEEN = 1e-30, 1e14
 # The stopping rule compares the best loss with the best one this many iterations ago: losses of
 # single iterations scatter, and a smaller number would take a pause for the end.
 PATIENCE = 15
@@ -53,8 +45,9 @@ class Fit:
     sources: the blend's, with positions in the frame's pixels where an observation's were given
     fitted (n,): indices of those inside the frame; dark (n_dark,): of those far from any light
     views: the observations as WhitenedViews, whose operators hold the observations' shifts
-    start, profiles (n, Ny, Nx): the StartingPoint, and its profiles over the frame with max = 1
     noise (C,): of one model pixel, in the views' units; unit (C,) [counts]: of these
+    padded: the frame with its sides grown to those that a batch shares
+    start: the StartingPoint that `begin` was given; from then on
     scene, state: Scene and State, as of the start or of where `settle` left them; findings: what a
         LearnedPrior has learned by then, or None; losses, status, messages, seconds: see Result
     """
@@ -81,18 +74,32 @@ class Fit:
         if not any(view.root.any() for view in self.views):
             raise ValueError("no observed pixel on the model frame has a weight")
         self.unit = np.concatenate([view.unit for view in self.views])
-        sources = [self.sources[i] for i in self.fitted]
-        self.start = start(
-            self.frame, sources, positions[inside], self.views, fit_sky=settings.fit_sky
-        )
-        self.dark = self.fitted[self.start.dark]
-        self.messages += [_dark_message(i, positions[i]) for i in self.dark]
-        self.profiles = _peak_of_one(self.start.profiles)
         self.noise = np.concatenate([view.pixel_noise for view in self.views])
-        self.scene, self.state = _start_scene(self, padded.shape)
+        self.padded, self._positions, self.start = padded, positions, None
         self.losses, self.status, self.findings = [], "iteration limit", None
         self._best = _Best(np.inf, None, None, self.shifts)
         self.seconds = {"setup": time.perf_counter() - began}
+
+    @property
+    def patch(self) -> Patch:
+        """What its start is made from."""
+        i = self.fitted
+        return Patch(self.frame, [self.sources[k] for k in i], self._positions[i], self.views)
+
+    @property
+    def signature(self):
+        """Fits of equal signature start and iterate side by side; see Scene.signature."""
+        return signature_of(
+            self.padded.shape, self.settings.fit_sky, [view.op for view in self.views]
+        )
+
+    def begin(self, point: StartingPoint, seconds):
+        """Make the scene and its state from where it starts; seconds: that this took."""
+        began = time.perf_counter()
+        self.start, self.dark = point, self.fitted[point.dark]
+        self.messages += [_dark_message(i, self._positions[i]) for i in self.dark]
+        self.scene, self.state = first_scene(self)
+        self.seconds["setup"] += seconds + time.perf_counter() - began
 
     @property
     def shifts(self) -> np.ndarray:
@@ -146,38 +153,30 @@ class Fit:
             return
         self.losses.append(float(loss))
 
-    def result(self) -> Result:
-        """Everything back in the data's own units, spectra solved for the final morphologies."""
-        began, scene, n = time.perf_counter(), self.scene, len(self.state.spectra)
-        morphs = np.zeros((n, *scene.shape))
-        peaks = np.array([m.max() if m.max() > 0 else 1.0 for m in self.state.morph])
-        boxes = [box_slices(*pair) for pair in zip(scene.origin, map(np.shape, scene.profile))]
-        for full, box, m, peak in zip(morphs, boxes, self.state.morph, peaks, strict=True):
-            full[box] = m / peak
-        observed = [v.observe(morphs) for v in self.views]
-        units = [v.whiten(images) for v, images in zip(self.views, observed, strict=True)]
-        solved = solve_spectra(units, self.views, self.settings.fit_sky)
-        spectra, sky, covariance = solved
+    def result(self, seen: Seen) -> Result:
+        """Everything back in the data's own units; seen: by `finish`."""
+        began, scene, peaks = time.perf_counter(), self.scene, _peaks(self.state)
+        morphs = [m / peak for m, peak in zip(self.state.morph, peaks, strict=True)]
         components = [
             Component(
                 int(self.fitted[self.start.source[i]]),
                 (int(scene.origin[i][0]), int(scene.origin[i][1])),
-                morphs[i][box],
-                spectra[i] * self.unit,
+                morphs[i],
+                seen.spectra[i] * self.unit,
             )
-            for i, box in enumerate(boxes)
+            for i in range(len(morphs))
         ]
-        rendered = _rendered(self, observed, morphs)
-        self.seconds["result"] = time.perf_counter() - began
-        errors, draws = errors_of(self, components, peaks, units, solved)
+        rendered = _rendered(self, seen)
+        self.seconds["result"] += time.perf_counter() - began
+        errors, draws = errors_of(self, components, peaks, seen)
         return Result(
             observations=self.blend.observations,
             frame=self.frame,
             sources=self.sources,
             components=tuple(components),
             rendered=rendered,
-            sky=sky * self.unit,
-            covariance=covariance * self.unit[:, None, None] ** 2,
+            sky=seen.sky * self.unit,
+            covariance=seen.covariance * self.unit[:, None, None] ** 2,
             errors=errors,
             draws=draws,
             shifts=self.shifts,
@@ -186,6 +185,54 @@ class Fit:
             messages=tuple(self.messages),
             seconds=self.seconds,
         )
+
+
+def begin(fits):
+    """Start fits of one signature side by side."""
+    began = time.perf_counter()
+    points = start([fit.patch for fit in fits], fit_sky=fits[0].settings.fit_sky)
+    seconds = (time.perf_counter() - began) / len(fits)
+    for fit, point in zip(fits, points, strict=True):
+        fit.begin(point, seconds)
+
+
+def finish(fits) -> list[Seen]:
+    """What `Fit.result` takes of fits that have ended, of one signature, side by side."""
+    began = time.perf_counter()
+    found = see([_model(fit) for fit in fits], fit_sky=fits[0].settings.fit_sky)
+    for fit in fits:
+        fit.note_seconds("result", (time.perf_counter() - began) / len(fits))
+    return found
+
+
+def _model(fit) -> Model:
+    """A fit's morphologies as they are by now, max = 1, and what sees them."""
+    state, home = fit.state, (fit.frame, fit.padded)
+    pairs = zip(fit.views, fit.blend.observations, strict=True)
+    return Model(
+        fit.padded.shape,
+        fit.views,
+        [view_as_taken(o, v, *home) if o.noise is not None else None for v, o in pairs],
+        fit.scene.origin,
+        [m / peak for m, peak in zip(state.morph, _peaks(state), strict=True)],
+    )
+
+
+def _peaks(state):
+    """Largest values (n,) of the solver's morphologies; 1 of those that are 0."""
+    return np.array([m.max() if m.max() > 0 else 1.0 for m in state.morph])
+
+
+def data_bytes(fit) -> int:
+    """Device memory [bytes] that a fit's images take in a batch, roughly, whatever its sources."""
+    n = sum(2 * np.prod(v.op.shape_in) + 4 * np.prod(v.op.shape_out) for v in fit.views)
+    return int(8 * n)
+
+
+def scene_bytes(fit) -> int:
+    """Device memory [bytes] that a fit takes in a batch, roughly, once it has begun."""
+    learns, prior = fit.settings.learns, fit.settings.prior
+    return fit.scene.n_bytes + (vector_bytes(fit.scene, prior) if learns else 0)
 
 
 def _inside(frame, positions):
@@ -200,14 +247,16 @@ def _inside(frame, positions):
     ]
 
 
-def _rendered(fit, observed, morphs):
-    """See Result.rendered; observed: of morphs (n, Ny, Nx), as the views see them."""
+def _rendered(fit, seen):
+    """See Result.rendered: of an observation as it was taken, 0 where the frame does not cover."""
     rendered = []
-    for view, o, images in zip(fit.views, fit.blend.observations, observed, strict=True):
-        if o.noise is not None:
-            images = as_taken(o, view, fit.frame, morphs)
-        images = images[..., : o.data.shape[1], : o.data.shape[2]]
-        rendered.append(images.astype(np.float64) * view.covered[: o.shape[1], : o.shape[2]])
+    for view, o, here, bare in zip(
+        fit.views, fit.blend.observations, seen.observed, seen.bare, strict=True
+    ):
+        found = here if bare is None else bare
+        shape = len(found), *o.data.shape
+        images = [image * view.covered[found.window(i)] for i, image in enumerate(found.images)]
+        rendered.append(Rendered.cropped(shape, found.low, images))
     return tuple(rendered)
 
 
@@ -215,48 +264,6 @@ def _padded_frame(frame, pad):
     """The frame with its sides grown to multiples of `pad`, from the same first pixel on."""
     shape = tuple(-(-n // pad) * pad for n in frame.shape)
     return frame if shape == frame.shape else Frame(frame.grid.cutout(0, 0, shape), frame.psf)
-
-
-def _peak_of_one(profiles):
-    """Profiles (n, Ny, Nx) with max = 1; dark ones as they are."""
-    peak = profiles.max(axis=(1, 2), keepdims=True)
-    return profiles / np.where(peak > 0, peak, 1)
-
-
-def _start_scene(fit, shape) -> tuple[Scene, State]:
-    """The scene of a fit on a padded frame of this shape, and its state at the start."""
-    begin, views, profiles = fit.start, fit.views, fit.profiles
-    units = [v.render(profiles) for v in views]
-    spectra, sky, _ = solve_spectra(units, views, fit.settings.fit_sky)
-    power = np.concatenate([(u**2).sum(axis=2) for u in units], axis=1)
-    error = 1 / np.sqrt(np.maximum(power, LEAST_POWER))
-    boxes = [
-        box_around(image, begin.positions[i_source], (spectrum / fit.noise).max())
-        for image, i_source, spectrum in zip(profiles, begin.source, spectra, strict=True)
-    ]
-    morphs = [
-        image[box_slices(low, size)].copy()
-        for image, (low, size, _) in zip(profiles, boxes, strict=True)
-    ]
-    scene = Scene(
-        shape=shape,
-        extent=fit.frame.shape,
-        ops=[v.op for v in views],
-        data=[v.data for v in views],
-        weights=[v.root**2 for v in views],
-        origin=np.array([low for low, _, _ in boxes]),
-        center=np.array([center for _, _, center in boxes]),
-        profile=morphs,
-        fixed=np.array([isinstance(fit.sources[fit.fitted[i]], Point) for i in begin.source]),
-        scale=np.where(error < UNSEEN, error + SPECTRUM_PART * spectra, 0),
-        power=power,
-        fit_sky=fit.settings.fit_sky,
-    )
-    latent = [np.zeros_like(m) for m in morphs]
-    state = State(latent, [m.copy() for m in morphs], spectra, sky)
-    if not fit.settings.learns:
-        scene = replace(scene, damping=damping(scene, state, fit.settings.prior))
-    return scene, state
 
 
 def _dark_message(i_source, position):

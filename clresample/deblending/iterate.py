@@ -122,7 +122,7 @@ class _Running:
         pairs = [(engine.scenes[i], states[i]) for i in going]
         if resize:
             fits = [self.fits[i] for i in going]
-            pairs = [resized(*pair, f.profiles, f.noise) for f, pair in zip(fits, pairs)]
+            pairs = [resized(*pair, f.start, f.noise) for f, pair in zip(fits, pairs)]
         same = [scene is engine.scenes[i] for i, (scene, _) in zip(going, pairs)]
         if all(same) and len(going) == len(self.fits):
             return self

@@ -16,6 +16,7 @@ import functools
 
 import numpy as np
 
+from ..sky.extent import box_slices
 from ..sky.psf import PSF
 from ..sky.sources import Extended, Point
 
@@ -29,43 +30,64 @@ ELLIPTICITY_SCATTER = 0.26
 WINGS, WINGS_SCATTER = 5.0, 0.7
 # Several components of a source start this far apart in ln(size), as a bulge and a disk do.
 COMPONENT_SPREAD = 1.0
+# [px] A star is drawn up to this over the threshold, in parts of its peak: there the rings of one
+# between two pixels, thin lines along both axes, are a few times the threshold. Twice as much makes
+# boxes twice as large.
+RING_PX = 0.002
 # [px] scatter of a free star's position about the one given
 STAR_SCATTER_PX = 0.5
 
 
 def covariance(parameters, psf_moment):
-    """C (2, 2) [px^2] and its derivatives (3, 2, 2) by (ln sigma [px], g1, g2).
+    """C (..., 2, 2) [px^2] and its derivatives (..., 3, 2, 2) by (ln sigma [px], g1, g2).
 
+    parameters (..., 3 or more), psf_moment (..., 2, 2)
     e = g / sqrt(1 + g^2), so that |e| stays under 1
     """
-    log_sigma, g1, g2 = parameters[:3]
-    sigma2, root = np.exp(2 * log_sigma), np.sqrt(1 + g1**2 + g2**2)
-    shape = np.array([[[1, 0], [0, -1]], [[0, 1], [1, 0]]])
-    e = np.array([g1, g2]) / root
-    de = (np.eye(2) - np.outer(e, e)) / root  # de_i / dg_j
-    own = sigma2 * (np.eye(2) + np.tensordot(e, shape, 1))
-    slopes = np.array([2 * own, *(sigma2 * np.tensordot(de[:, j], shape, 1) for j in (0, 1))])
-    return own + psf_moment, slopes
+    parameters = np.asarray(parameters)
+    sigma2, g = np.exp(2 * parameters[..., 0])[..., None, None], parameters[..., 1:3]
+    root = np.sqrt(1 + (g**2).sum(axis=-1))[..., None]
+    shape = np.array([[[1.0, 0], [0, -1]], [[0, 1], [1, 0]]])
+    e = g / root
+    de = (np.eye(2) - e[..., :, None] * e[..., None, :]) / root[..., None]  # de_i / dg_j
+    own = sigma2 * (np.eye(2) + np.einsum("...k,kij->...ij", e, shape))
+    by_g = sigma2[..., None] * np.einsum("...kj,kab->...jab", de, shape)
+    return own + psf_moment, np.concatenate([2 * own[..., None, :, :], by_g], axis=-3)
 
 
-def profile(parameters, position, shape, psf_moment):
-    """Profile of unit integral and its derivatives by (ln sigma, g1, g2, ln beta), (5, ny, nx)."""
-    c, slopes = covariance(parameters, psf_moment)
+def galaxy_reach(parameters, psf_moment, threshold):
+    """How far (n, 2) [px] along y and x profiles of `covariance` are above a part of their peaks.
+
+    parameters (n, 4); psf_moment (n, 2, 2); threshold (n,)
+    """
+    c, beta = covariance(parameters, psf_moment)[0], np.exp(parameters[:, 3])
+    # beyond 1e12 the wings fill any frame
+    q = 2 * beta * np.minimum(np.expm1(-np.log(threshold) / (beta + 1)), 1e12)
+    return np.sqrt(q[:, None] * np.diagonal(c, axis1=1, axis2=2))
+
+
+def profile(parameters, position, shape, psf_moment, *, slopes=True):
+    """Profile of unit integral and its derivatives by (ln sigma, g1, g2, ln beta), (5, ny, nx); the
+    profile alone (1, ny, nx) without `slopes`."""
+    c, by_parameter = covariance(parameters, psf_moment)
     inverse, beta = np.linalg.inv(c), np.exp(parameters[3])
     dy, dx = (np.arange(n) - p for n, p in zip(shape, position, strict=True))
     dy = dy[:, None]
     u, v = (inverse[i, 0] * dy + inverse[i, 1] * dx for i in (0, 1))  # C^-1 x
     q = dy * u + dx * v
     s = np.exp(-(beta + 1) * np.log1p(q / (2 * beta))) / (2 * np.pi * np.sqrt(np.linalg.det(c)))
+    if not slopes:
+        return s[None]
     fall = (beta + 1) / (2 * beta + q)  # - d ln S / dq
     out = [s]
-    for dc in slopes:
+    for dc in by_parameter:
         dq = -(dc[0, 0] * u**2 + 2 * dc[0, 1] * u * v + dc[1, 1] * v**2)
         out.append(-s * (fall * dq + 0.5 * np.trace(inverse @ dc)))
     out.append(s * (q * fall - beta * np.log1p(q / (2 * beta))))
     return np.array(out)
 
 
+@functools.lru_cache(maxsize=N_OTFS)
 def moment(psf: PSF) -> np.ndarray:
     """Second moment (2, 2) [px^2] of the first band's image about its centre, rows (y, x)."""
     image = psf.images[0]
@@ -107,14 +129,23 @@ class Shape:
     """What a component looks like.
 
     mean, scatter (n,): what is expected of theta
-    draw(theta, position): (1 + n, Ny, Nx), the profile of unit integral for a source at a position
-        (2,) [px], and its slopes by theta
+    draw(theta, position, shape): (1 + n, Ny, Nx), the profile of unit integral for a source at a
+        position (2,) [px], and its slopes by theta: on the frame, or on a box of a `shape`
     """
 
     mean = scatter = np.zeros(0)
 
-    def draw(self, theta, position):
+    def draw(self, theta, position, shape=None):
         """The profile and its slopes."""
+        raise NotImplementedError
+
+    def cut(self, theta, position, origin, size, *, slopes=True):
+        """The same in a box of the frame, (1 + n, ny, nx); (1, ny, nx) without `slopes`."""
+        drawn = self.draw(theta, np.subtract(position, origin), tuple(size))
+        return drawn if slopes else drawn[:1]
+
+    def reach(self, theta, position, threshold):
+        """Middle (2,) and half size (2,) [px] of what is above a part of the peak."""
         raise NotImplementedError
 
     def place(self, theta, position):
@@ -133,17 +164,27 @@ class Galaxy(Shape):
         scale_arcsec = float(np.mean(frame.grid.pixel_scale_arcsec))
         spread = COMPONENT_SPREAD * (i_component - (n_components - 1) / 2)
         size = np.log(SIZE_ARCSEC / scale_arcsec) + spread + np.log(widened)
-        self.shape, self._psf_moment = frame.shape, moment(frame.psf)
+        self.shape, self.psf_moment = frame.shape, moment(frame.psf)
         self.mean = np.array([size, 0, 0, np.log(WINGS)])
         self.scatter = np.array([SIZE_SCATTER, *[ELLIPTICITY_SCATTER] * 2, WINGS_SCATTER])
 
     def draw(self, theta, position, shape=None):
-        """The profile and its four slopes, (5, Ny, Nx): on the frame, or on a box of a `shape`."""
-        return profile(theta, position, shape or self.shape, self._psf_moment)
+        """The profile and its four slopes, (5, Ny, Nx)."""
+        return profile(theta, position, shape or self.shape, self.psf_moment)
+
+    def cut(self, theta, position, origin, size, *, slopes=True):
+        """The same in a box of the frame."""
+        place = np.subtract(position, origin)
+        return profile(theta, place, tuple(size), self.psf_moment, slopes=slopes)
+
+    def reach(self, theta, position, threshold):
+        """Its ellipse where the profile falls to the threshold."""
+        half = galaxy_reach(np.array([theta]), self.psf_moment[None], np.array([threshold]))
+        return position, half[0]
 
     def place_slopes(self, theta, position, image):
         """Slopes (2, ny, nx) by the position (y, x) [px] of `image`, what is drawn there."""
-        inverse, beta = np.linalg.inv(covariance(theta, self._psf_moment)[0]), np.exp(theta[3])
+        inverse, beta = np.linalg.inv(covariance(theta, self.psf_moment)[0]), np.exp(theta[3])
         dy, dx = (np.arange(n) - p for n, p in zip(image.shape, position, strict=True))
         along = np.tensordot(inverse, np.stack(np.broadcast_arrays(dy[:, None], dx)), 1)
         q = dy[:, None] * along[0] + dx * along[1]
@@ -156,9 +197,27 @@ class Given(Shape):
     def __init__(self, image):
         self.image = np.asarray(image) / np.sum(image)
 
-    def draw(self, theta, position):
-        """The profile (1, Ny, Nx)."""
+    def draw(self, theta, position, shape=None):
+        """The profile (1, Ny, Nx), over the frame."""
         return self.image[None]
+
+    def cut(self, theta, position, origin, size, *, slopes=True):
+        """A part of it."""
+        return self.image[None, *box_slices(origin, size)]
+
+    @property
+    def peak(self) -> float:
+        """Its largest value."""
+        return float(self.image.max())
+
+    def reach(self, theta, position, threshold):
+        """The box of all pixels above the threshold."""
+        lit, ends = np.abs(self.image) > threshold * np.abs(self.image).max(), []
+        for axis in (0, 1):
+            along = np.flatnonzero(lit.any(axis=1 - axis))
+            ends.append((along[0], along[-1]))
+        low, high = np.array(ends).T
+        return (low + high) / 2, (high - low) / 2 + 1
 
 
 class Star(Shape):
@@ -169,9 +228,21 @@ class Star(Shape):
         self.mean = np.zeros(2 if free else 0)
         self.scatter = np.full(len(self.mean), STAR_SCATTER_PX)
 
-    def draw(self, theta, position):
+    def draw(self, theta, position, shape=None):
         """The PSF and, if free, its two slopes, (3, Ny, Nx); else (1, Ny, Nx)."""
-        return point(self.psf, self.place(theta, position), self.shape, slopes=self.free)
+        shape = shape or self.shape
+        return point(self.psf, self.place(theta, position), shape, slopes=self.free)
+
+    @property
+    def peak(self) -> float:
+        """The PSF's largest value."""
+        return float(self.psf.images[0].max())
+
+    def reach(self, theta, position, threshold):
+        """Its image, and the rings of an image cut at Nyquist's frequency: RING / x of the peak."""
+        half = max(self.psf.images.shape[1:]) * self.psf.spacing / 2
+        half = max(half, RING_PX / threshold)
+        return self.place(theta, position), np.full(2, half + 1)
 
     def place(self, theta, position):
         """Where the star is (2,) [px]: off its source's position by theta, if free."""

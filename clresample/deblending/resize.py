@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..sky.extent import shared_part
+from ..sky.extent import box_slices, shared_part
 from .solver.scene import Scene, State
 
 # A box holds the pixels where the source is brighter than this part of the noise of a model pixel;
@@ -54,16 +54,34 @@ def box_around(profile, position, brightness):
     return low, high - low + 1, pixel - low
 
 
-def resized(scene: Scene, state: State, profiles, noise) -> tuple[Scene, State]:
+def box_of(start, i, frame, brightness):
+    """`box_around` of a component that a start has found, and its profile there (ny, nx), max = 1.
+
+    start: StartingPoint; i: which component; frame (2,) [px]: the frame's shape
+    """
+    middle, half = start.reach(i, box_threshold(brightness))
+    place, top = start.positions[start.source[i]], np.array(frame)
+    low = np.minimum(middle - half, place - SMALLEST_RADIUS_PX) - 1
+    high = np.maximum(middle + half, place + SMALLEST_RADIUS_PX) + 2
+    low = np.maximum(low, 0).astype(int)
+    high = np.minimum(np.ceil(high), top).astype(int)
+    image = start.drawn(i, low, high - low)
+    inside, size, center = box_around(image, place - low, brightness)
+    return low + inside, size, center, image[box_slices(inside, size)]
+
+
+def resized(scene: Scene, state: State, start, noise) -> tuple[Scene, State]:
     """Scene and state in boxes that fit the present morphologies; themselves where all of them do.
 
-    profiles (S, Ny, Nx) [1]: expected profiles over the frame, max = 1; noise (C,): of a model
-    pixel. What the state holds of a box moves along: new pixels start at the profile, with z and
-    all that the update remembers at 0.
+    start: StartingPoint, whose profiles are expected; noise (C,): of a model pixel. What the state
+    holds of a box moves along: new pixels start at the profile, with z and all that the update
+    remembers at 0.
     """
-    boxes = [_box(scene, state, i, profiles[i], noise) for i in range(len(state.morph))]
+    boxes = [_box(scene, state, i, start, noise) for i in range(len(state.morph))]
     if all(_same(scene, i, box) for i, box in enumerate(boxes)):
         return scene, state
+
+    fill = [start.drawn(i, low, high - low) for i, (low, high) in enumerate(boxes)]
 
     def move(arrays, fill=None):
         """Arrays of all sources in their new boxes."""
@@ -80,25 +98,25 @@ def resized(scene: Scene, state: State, profiles, noise) -> tuple[Scene, State]:
             scene,
             origin=origin,
             center=scene.center + scene.origin - origin,
-            profile=move(scene.profile, profiles),
+            profile=move(scene.profile, fill),
         ),
         replace(
             state,
-            morph=move(state.morph, profiles),
+            morph=move(state.morph, fill),
             latent=move(state.latent),
             memory=memory,
         ),
     )
 
 
-def _box(scene, state, i, profile, noise):
+def _box(scene, state, i, start, noise):
     """First and one-past-last pixel (2,) of the box that source i should have."""
     morph, low = state.morph[i], np.array(scene.origin[i])
     high = low + morph.shape
     if scene.fixed[i]:
         return low, high
     brightness = (state.spectra[i] * morph.max() / noise).max()
-    wanted, size, _ = box_around(profile, low + scene.center[i], brightness)
+    wanted, size, *_ = box_of(start, i, scene.extent, brightness)
     light = BOX_NOISE / max(brightness, 1e-30) * morph.max()
     new_low, new_high = low.copy(), high.copy()
     for axis in (0, 1):
@@ -126,8 +144,7 @@ def _same(scene, i, box):
 
 def _moved(array, origin, low, high, fill):
     """The array of a box at `origin`, in the box from `low` to `high`; new pixels from `fill`."""
-    y, x = (slice(a, b) for a, b in zip(low, high, strict=True))
-    out = np.zeros(high - low, array.dtype) if fill is None else fill[y, x].astype(array.dtype)
+    out = np.zeros(high - low, array.dtype) if fill is None else fill.astype(array.dtype)
     here, there = shared_part(low, high - low, origin, array.shape)
     out[here] = array[there]
     return out

@@ -13,6 +13,7 @@ from ..sky.frame import Frame
 from ..sky.observation import Observation
 from ..sky.sources import Source
 from .posterior.errors import Draws, Errors
+from .rendered import Rendered, weighted_sum
 from .solver.scene_model import compose
 
 
@@ -51,7 +52,8 @@ class Result(ShownResult):
     observations, frame, sources: what was fitted; sources that were given in an observation's
         pixels have their position in the frame's now; components (n): in the order of the sources
     rendered: per observation (n, Co, My, Mx) [1], each component's morphology on its pixels under
-        its PSF: spectrum times this is the model of the data
+        its PSF: spectrum times this is the model of the data. An array, or a Rendered, which holds
+        each component only where its light reaches
     sky (C,) [counts]: constant background per channel, 0 where it was not fitted
     covariance (C, n, n) [counts^2]: of the spectra of one channel over all components, inverse of
         the normal matrix with morphologies fixed (and sky free where it was); infinite variance for
@@ -70,7 +72,7 @@ class Result(ShownResult):
     frame: Frame
     sources: tuple[Source, ...]
     components: tuple[Component, ...]
-    rendered: tuple[np.ndarray, ...]
+    rendered: tuple[np.ndarray | Rendered, ...]
     sky: np.ndarray
     covariance: np.ndarray
     shifts: np.ndarray
@@ -142,7 +144,7 @@ class Result(ShownResult):
         channels = self.channel_slices()[i_observation]
         n_channels = channels.stop - channels.start
         spectra = np.array([c.spectrum[channels] for c in self.components]).reshape(-1, n_channels)
-        image = np.einsum("nc,ncyx->cyx", spectra, self.rendered[i_observation])
+        image = weighted_sum(self.rendered[i_observation], spectra)
         return image + self.sky[channels, None, None]
 
     def residual(self, i_observation) -> np.ndarray:

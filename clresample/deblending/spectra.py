@@ -1,9 +1,8 @@
-"""Spectra of known morphologies: non-negative least squares over all sources at once."""
+"""Spectra of known morphologies: non-negative least squares of many problems at once."""
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import nnls
 
 # Error of a smooth profile, as a part of the light in a pixel: what galaxies' own structure, spiral
 # arms or clumps, adds to it. Larger values let faint neighbours absorb less of that structure, and
@@ -14,46 +13,63 @@ MODEL_ERROR = 0.15
 # equal parts of their light. It changes the flux of a source apart from others by this part of it;
 # a larger one would share light between neighbours that the data can tell apart.
 RIDGE = 1e-8
+# Rounds of exchanges of whole sets; problems that still change then exchange one at a time, which
+# ends for certain, and MOST rounds more are plenty.
+WHOLE, MOST = 10, 200
 
 
-def solve_spectra(units, views, sky=False, model=None):
-    """Non-negative spectra (n, C) by weighted least squares over all components at once.
-
-    units: per view, whitened unit-spectrum images (n, Co, P); sky: also a constant per channel
-    model: per view (Co, P) whitened, inflates the variance by (MODEL_ERROR model)^2
-    returns spectra (n, C), sky (C,), covariance (C, n, n): inverse normal matrix, sky marginalised
-    """
-    spectra, levels, covariances = [], [], []
-    for i, (view, unit) in enumerate(zip(views, units, strict=True)):
-        for c in range(unit.shape[1]):
-            rows = unit[:, c]
-            target = (view.data[c] * view.root[c]).ravel()
-            if sky:
-                rows = np.concatenate([rows, [view.root[c].ravel()]])
-            weight = 1.0 if model is None else 1 / (1 + (MODEL_ERROR * model[i][c]) ** 2)
-            a, covariance = _non_negative(rows, target, weight, n_free=int(sky))
-            spectra.append(a[: len(unit)])
-            levels.append(a[-1] if sky else 0.0)
-            covariances.append(covariance[: len(unit), : len(unit)])
-    return np.array(spectra).T, np.array(levels), np.array(covariances)
-
-
-def _non_negative(rows, target, weight, n_free=0):
-    """min |target - a rows|^2, a >= 0 but for the last n_free; and a's unconstrained covariance."""
-    normal = (rows * weight) @ rows.T
-    size = np.sqrt(np.diag(normal))
-    seen = size > 1e-12 * size.max(initial=0)
+def scaled(normal):
+    """Normal matrices (..., n, n) with a unit diagonal and RIDGE, their scales (..., n), and what
+    is seen (..., n): bool, not 0 beside the others."""
+    size = np.sqrt(np.maximum(np.diagonal(normal, axis1=-2, axis2=-1), 0))
+    seen = size > 1e-12 * size.max(axis=-1, keepdims=True, initial=0)
     scale = np.where(seen, size, 1)
-    normal = normal / scale[:, None] / scale + RIDGE * np.eye(len(rows))
-    lower = np.linalg.cholesky(normal)
-    right = np.linalg.solve(lower, (rows * weight) @ target / scale)
-    matrix = lower.T
-    if n_free:  # a free coefficient is the difference of two non-negative ones
-        matrix = np.concatenate([matrix, -matrix[:, -n_free:]], axis=1)
-    a = nnls(matrix, right)[0]
-    if n_free:
-        a = np.concatenate([a[: -2 * n_free], a[-2 * n_free : -n_free] - a[-n_free:]])
-    covariance = np.linalg.inv(normal) / scale[:, None] / scale
-    covariance[~seen, :] = covariance[:, ~seen] = 0
-    covariance[~seen, ~seen] = np.inf
-    return np.where(seen, a / scale, 0), covariance
+    out = normal / scale[..., None] / scale[..., None, :]
+    out *= (seen[..., None] & seen[..., None, :]) | np.eye(normal.shape[-1], dtype=bool)
+    out += (RIDGE + ~seen)[..., None] * np.eye(normal.shape[-1])
+    return out, scale, seen
+
+
+def non_negative(normal, right, free=None):
+    """x (M, n) >= 0 of the least 1/2 x N x - x r; 0 where N is.
+
+    normal N (M, n, n), right r (M, n); free (n,): bool, those that may be negative
+
+    Block principal pivoting (Kim and Park 2011): sets of unknowns at 0 and off it are exchanged
+    until both have the right signs; all problems side by side.
+    """
+    matrix, scale, seen = scaled(normal)
+    right = np.where(seen, right / scale, 0)
+    n_problems, n = right.shape
+    free = np.zeros(n, bool) if free is None else free
+    off, x = np.ones((n_problems, n), bool), np.zeros((n_problems, n))
+    rounding = 1e-10 * np.abs(right).max(axis=1, initial=0)[:, None]
+    going = np.arange(n_problems)
+    for i_round in range(WHOLE + MOST):
+        on = off[going]
+        found = np.linalg.solve(_masked(matrix[going], on), (right[going] * on)[..., None])[..., 0]
+        slope = np.einsum("mij,mj->mi", matrix[going], found) - right[going]
+        wrong = np.where(on, found < 0, slope < -rounding[going]) & ~free
+        x[going] = np.where(on, found, 0)
+        if i_round >= WHOLE:  # Murty: only the last of them, which cannot go round in circles
+            wrong &= np.arange(n) == n - 1 - np.argmax(wrong[:, ::-1], axis=1)[:, None]
+        off[going] ^= wrong
+        going = going[wrong.any(axis=1)]
+        if not len(going):
+            break
+    x[:, ~free] = np.maximum(x[:, ~free], 0)
+    return np.where(seen, x / scale, 0)
+
+
+def inverse(normal):
+    """Covariances (M, n, n): infinite variance of what is not seen, and none with others."""
+    matrix, scale, seen = scaled(normal)
+    out = np.linalg.inv(matrix) / scale[..., None] / scale[..., None, :]
+    out *= seen[..., None] & seen[..., None, :]
+    return out + np.where(~seen[..., None] & np.eye(normal.shape[-1], dtype=bool), np.inf, 0)
+
+
+def _masked(matrix, on):
+    """Matrices (M, n, n) with only the unknowns `on` (M, n); the others are 0 by 1 x = 0."""
+    both = on[:, :, None] & on[:, None, :]
+    return np.where(both, matrix, 0) + (~on)[:, :, None] * np.eye(matrix.shape[-1])

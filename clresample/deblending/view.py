@@ -53,23 +53,6 @@ class WhitenedView:
         area = abs(np.linalg.det(self.mapping.matrix))
         return np.full(len(self.data), 1 / np.sqrt(area))
 
-    def observe(self, images):
-        """Unit-spectrum images (n, Co, My, Mx) of model images (n, Ny, Nx).
-
-        Images smaller than the operator's frame are zero beyond.
-        """
-        images = _padded(images, self.op.shape_in).astype(self.op.dtype)
-        return self.op.render(without_dark(images))
-
-    def whiten(self, observed):
-        """Observed images in units of their noise, (n, Co, My * Mx)."""
-        out = observed * self.root
-        return out.reshape(*out.shape[:2], -1).astype(np.float64)
-
-    def render(self, images):
-        """Whitened unit-spectrum images (n, Co, My * Mx) of model images (n, Ny, Nx)."""
-        return self.whiten(self.observe(images))
-
 
 def without_dark(images):
     """The images, in place, with DARK pixels set to 0."""
@@ -103,23 +86,20 @@ def whitened_view(frame, padded, observation, pad, device, dtype, *, private) ->
     return WhitenedView.of(op, frame, data, weights)
 
 
-def as_taken(observation, view, frame, morphs) -> np.ndarray:
-    """Unit-spectrum images (n, Co, My, Mx) of morphologies with the Observation's own PSF.
-
-    Its view, where noise is correlated, has the PSF of the white observation instead.
-    morphs (n, Ny, Nx): on the frame, or on a padded one
-    """
+def view_as_taken(observation, view, frame, padded) -> WhitenedView:
+    """The view of an Observation on a frame that is `padded`, with the observation's own PSF; where
+    noise is correlated, the view has that of the white observation instead."""
     op = cached_resampler(
-        frame,
+        padded,
         observation.grid,
         observation.psf,
         dtype=view.op.dtype,
         device=view.op.device,
+        extent=frame.shape,
         private=True,
     )
     op.shift = view.op.shift
-    n_y, n_x = frame.shape
-    return op.render(np.ascontiguousarray(morphs[:, :n_y, :n_x], op.dtype))
+    return replace(view, op=op)
 
 
 def _typical_noise(weights):

@@ -108,7 +108,7 @@ def _observation_hdus(result, i):
         *(image_hdu(name, image, cards, i) for name, image in images.items()),
         *tables,
         *(image_hdu(name, image, cards, i) for name, image in more.items()),
-        image_hdu("RENDERED", result.rendered[i], None, i),
+        image_hdu("RENDERED", np.asarray(result.rendered[i]), None, i),
         image_hdu("PSF", o.psf.images, None, i),
     ]
 

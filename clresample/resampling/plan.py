@@ -12,11 +12,11 @@ exponential is a (cos, sin) pair of real table rows: a plan is a list of real ma
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..sky.mapping import Mapping
+from ..sky.mapping import Around, Mapping
 from ..sky.psf import PSF
 from ..sky.waves import cos_sin_columns
 from .gridding import KaiserBessel, LineTaps, transpose_taps
@@ -54,11 +54,13 @@ class Plan:
     identity: same pixels and PSF, so that without a shift the operator returns its input
     nu (Hy,), (Hx,) [cycles per model px]: frequencies >= 0 of the two table axes
     axes: the model axis of each table axis; (1, 0) where the observed rows run along the model's y
+    psfs: of the model and of the observation
     d_plus, d_minus (C, Hy, Hx) complex: D(+,+), D(+,-) times K^-2 and the half-plane weights
     in_y (2Hy, Ny), in_x (2Hx, Nx): transforms of the model
     out_y, out_x: aligned (My, 2Hy), (2Hx, Mx); affine (L, 2Hy), (2Hx, J); distorted (P, 2Hy),
         (P, 2Hx)
     twist (Hy, J) [rad], lines: affine only
+    windows: plans that `window` has made, by what they were made for
     """
 
     mapping: Mapping
@@ -67,6 +69,7 @@ class Plan:
     certificate: Certificate
     nu: tuple[np.ndarray, np.ndarray]
     axes: tuple[int, int]
+    psfs: tuple[PSF, PSF] = field(repr=False, compare=False)
     d_plus: np.ndarray
     d_minus: np.ndarray
     in_y: np.ndarray
@@ -75,6 +78,7 @@ class Plan:
     out_x: np.ndarray
     twist: np.ndarray | None = None
     lines: LineTaps | None = None
+    windows: dict = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def geometry(self) -> str:
@@ -86,7 +90,25 @@ class Plan:
         """Host memory of the tables and the mapping [bytes]."""
         parts = [self, self.mapping] + ([self.lines] if self.lines is not None else [])
         values = (value for part in parts for value in vars(part).values())
-        return sum(value.nbytes for value in values if isinstance(value, np.ndarray))
+        own = sum(value.nbytes for value in values if isinstance(value, np.ndarray))
+        return own + sum(plan.n_bytes for plan in self.windows.values())
+
+    def window(self, shape, reach_px, precision: Precision) -> Plan:
+        """The plan of a box of the model, by what its light reaches of the observation.
+
+        One for all boxes of a shape: those observed pixels lie about the box's middle, and how far
+        off they are in truth is a shift of up to half an observed pixel. Not of distorted mappings,
+        which are another at each place.
+
+        shape (2,) [model px]: of the box; reach_px [model px]: how far its light is followed
+        """
+        key = tuple(shape), reach_px, precision
+        if key not in self.windows:
+            mapping = Around.box_of(self.mapping, shape, reach_px)
+            moved = np.abs(self.mapping.matrix).sum(axis=1) / 2
+            extent = tuple(np.array(shape) + mapping.reach_px + moved)
+            self.windows[key] = make_plan(mapping, *self.psfs, precision=precision, extent=extent)
+        return self.windows[key]
 
     def shifted(self, shift) -> tuple[np.ndarray, np.ndarray]:
         """D(+,+), D(+,-) with every observed pixel moved by `shift` (2,) [model px]."""
@@ -144,6 +166,7 @@ def make_plan(
         d_minus=d_minus,
         in_y=in_y,
         in_x=in_x,
+        psfs=(psf_in, psf_out),
         **tables,
     )
 

@@ -76,6 +76,21 @@ def wrap_radius(psf: PSF, matrix) -> tuple[float, float]:
 
     psf: the observed one; matrix (2, 2) [model px / observed px]: A
     """
+    reach, image = _light_ends(psf, WRAP_TOLERANCE)
+    circle = np.linalg.norm(matrix, axis=1) * (WRAP_MARGIN * reach + psf.spacing)
+    radius = np.minimum(circle, np.abs(matrix) @ image)
+    return float(radius[0]), float(radius[1])
+
+
+def light_reach(psf: PSF, matrix, tolerance) -> float:
+    """Distance [model px] beyond which the observed PSF holds less than this part of its light."""
+    reach, image = _light_ends(psf, tolerance)
+    circle = np.linalg.norm(matrix, axis=1) * reach
+    return float(np.minimum(circle, np.abs(matrix) @ image).max())
+
+
+def _light_ends(psf, tolerance):
+    """Distance [px] beyond which lies this part of a PSF's light, and half its image (2,) [px]."""
     y, x = (
         np.abs(np.arange(n) - psf.center[:, i, None]) * psf.spacing
         for i, n in enumerate(psf.images.shape[1:])
@@ -84,12 +99,9 @@ def wrap_radius(psf: PSF, matrix) -> tuple[float, float]:
     light = np.abs(psf.images).reshape(psf.n_bands, -1)
     order = np.argsort(-distance, axis=1)
     beyond = np.take_along_axis(light, order, axis=1).cumsum(axis=1)
-    lit = beyond > WRAP_TOLERANCE * beyond[:, -1:]
+    lit = beyond > tolerance * beyond[:, -1:]
     reach = (np.take_along_axis(distance, order, axis=1) * lit).max()
-    circle = np.linalg.norm(matrix, axis=1) * (WRAP_MARGIN * reach + psf.spacing)
-    image = np.abs(matrix) @ (np.array([y.max(), x.max()]) + 0.5 * psf.spacing)
-    radius = np.minimum(circle, image)
-    return float(radius[0]), float(radius[1])
+    return reach, np.array([y.max(), x.max()]) + 0.5 * psf.spacing
 
 
 def transfer_function(otf_in, otf_out):

@@ -102,6 +102,55 @@ class Mapping:
         return Mapping(cut.shape_in, cut.shape_out, matrix, offset, geometry, departure)
 
 
+@dataclass(frozen=True, eq=False)
+class Around(Mapping):
+    """Observed pixels within `reach_px` [model px] of a model: those beyond it are covered too."""
+
+    reach_px: float = 0.0
+
+    @classmethod
+    def box_of(cls, mapping, shape, reach_px):
+        """The pixels about a box of this shape (2,) [px], its middle in theirs; not distorted.
+
+        Half a pixel more of them on each side, for boxes that lie by so much off that middle.
+        """
+        inverse = np.abs(np.linalg.inv(mapping.matrix))
+        size = np.ceil(inverse @ (np.array(shape) + 2 * reach_px)).astype(int) + 1
+        offset = (np.array(shape) - 1) / 2 - mapping.matrix @ ((size - 1) / 2)
+        return cls(
+            tuple(shape),
+            tuple(size.tolist()),
+            mapping.matrix,
+            offset,
+            mapping.geometry,
+            mapping.departure_px,
+            reach_px=reach_px + np.abs(mapping.matrix).sum() / 2,
+        )
+
+    @classmethod
+    def of(cls, mapping, shape, margin):
+        """A mapping to a model with this many pixels around a box of `shape`, as one to the box."""
+        positions = mapping.positions
+        return cls(
+            tuple(shape),
+            mapping.shape_out,
+            mapping.matrix,
+            mapping.offset - margin,
+            mapping.geometry,
+            mapping.departure_px,
+            None if positions is None else positions - margin,
+            mapping.area,
+            reach_px=margin,
+        )
+
+    @property
+    def covered(self):
+        """(My, Mx) bool: observed pixels whose centre lies within reach of the model."""
+        at = self.at(*np.indices(self.shape_out))
+        low, high = -0.5 - self.reach_px, np.array(self.shape_in) - 0.5 + self.reach_px
+        return ((at >= low) & (at <= high)).all(axis=-1)
+
+
 def lattice(low, shape):
     """Positions n, m (N, M) over a box of pixels, from outer edge to outer edge.
 

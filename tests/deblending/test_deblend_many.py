@@ -12,7 +12,7 @@ from helpers.tuning import tune
 from clresample.deblending import fit as fit_module
 from clresample.deblending.batch import deblend_many
 from clresample.deblending.blend import Blend
-from clresample.deblending.fit import Fit
+from clresample.deblending.fit import Fit, begin
 from clresample.deblending.iterate import _Running
 from clresample.deblending.result import Result
 from clresample.deblending.settings import Settings
@@ -150,7 +150,9 @@ def test_a_memory_budget_splits_groups(device, monkeypatch):
     settings = replace(SETTINGS, max_iter=5)
     together = deblend_many(blends, settings=settings, device=device)
     assert engines == [4]
-    one = Fit(blends[0], settings, device, np.float32, pad=1).scene.n_bytes
+    first = Fit(blends[0], settings, device, np.float32, pad=1)
+    begin([first])
+    one = first.scene.n_bytes
     for memory, sizes in ((1, [1] * 4), (2.5 * one, [2, 2]), (10 * one, [4])):
         engines.clear()
         results = deblend_many(blends, settings=settings, device=device, memory=memory)
@@ -162,6 +164,7 @@ def test_a_memory_budget_splits_groups(device, monkeypatch):
 def test_the_budget_counts_what_a_scene_takes(device):
     """Of the arrays of an engine on the device, within a factor of two."""
     fits = [Fit(blend(seed=i), SETTINGS, device, np.float32, pad=1) for i in range(8)]
+    begin(fits)
     gc.collect()
     before = device.in_use
     running = _Running(fits, SETTINGS, device, np.float32)

@@ -9,6 +9,8 @@ from clresample.deblending.posterior.blocks import RIDGE
 from clresample.deblending.posterior.normal import Layout
 from clresample.deblending.shifts import SCATTER_PX
 
+from .start import rendered
+
 
 @dataclass(frozen=True)
 class Kept:
@@ -62,7 +64,7 @@ def full_matrix(kept, modes=None):
         images.append(full)
     matrix, channel = np.zeros((starts[-1] if n_common else starts[len(modes)],) * 2), 0
     for o, view in enumerate(kept.views):
-        seen = [view.render(full) for full in images]
+        seen = [rendered(view, full) for full in images]
         for c in range(len(view.data)):
             j = np.zeros((len(matrix), view.root[c].size))
             for i, at in enumerate(starts[: len(modes)]):

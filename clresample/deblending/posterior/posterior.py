@@ -141,16 +141,16 @@ class Posterior:
         return np.sqrt(np.maximum(variance, 0)).reshape(images.shape[1:])
 
 
-def errors_of(fit, components, peaks, units, solved):
+def errors_of(fit, components, peaks, seen):
     """The Errors and Draws of a Fit that has ended with these Components, or None and None.
 
-    peaks, units, solved: see `posterior_of`
+    peaks, seen: see `posterior_of`
 
     Messages and seconds of it are taken down in the fit.
     """
     began = time.perf_counter()
     morphs = [c.morphology for c in components]
-    posterior, messages = posterior_of(fit, morphs, peaks, units, solved)
+    posterior, messages = posterior_of(fit, morphs, peaks, seen)
     fit.messages += messages
     if posterior is None:
         return None, None
@@ -160,16 +160,16 @@ def errors_of(fit, components, peaks, units, solved):
     return errors, posterior.draws(fit.unit)
 
 
-def posterior_of(fit, morphs, peaks, units, solved):
+def posterior_of(fit, morphs, peaks, seen):
     """The Posterior of a Fit that has ended, or None, and messages of why there is none.
 
     morphs (n): its components' morphologies with max = 1, peaks (n,): what they were divided by;
-    units, solved: see `solve_spectra`: what it took and returned
+    seen: Seen, of these
     """
     settings, scene = fit.settings, fit.scene
     if not settings.learns or fit.findings is None:
         return None, []
-    spectra, sky, covariance = solved
+    spectra, covariance = seen.spectra, seen.covariance
     variance = np.diagonal(covariance, axis1=1, axis2=2).T
     solution = Solution(
         scene,
@@ -181,7 +181,7 @@ def posterior_of(fit, morphs, peaks, units, solved):
         fit.start.thetas,
         fit.start.positions[fit.start.source],
         fit.findings,
-        _local_chi2(units, fit.views, spectra, sky),
+        _local_chi2(seen, fit.views),
         settings.prior,
     )
     pairs = zip(fit.views, fit.blend.observations, strict=True)
@@ -194,15 +194,17 @@ def posterior_of(fit, morphs, peaks, units, solved):
     return None, [f"errors are those of fixed morphologies: {why}"]
 
 
-def _local_chi2(units, views, spectra, sky):
+def _local_chi2(seen, views):
     """chi2 per pixel (n,) where each component's light is, by A^2 times its image."""
-    found, seen, channel = 0.0, 0.0, 0
-    for unit, view in zip(units, views, strict=True):
-        for c in range(unit.shape[1]):
-            root, a = view.root[c].ravel(), spectra[:, channel]
-            model = a @ unit[:, c] + sky[channel] * root
-            residual = view.data[c].ravel() * root - model
-            found = found + a**2 * (unit[:, c] @ (root * residual**2))
-            seen = seen + a**2 * (unit[:, c] @ root)
-            channel += 1
-    return found / np.maximum(seen, 1e-30)
+    found, light = np.zeros((2, len(seen.spectra)))
+    ends = np.cumsum([0, *(len(view.data) for view in views)])
+    for rendered, view, first in zip(seen.observed, views, ends[:-1], strict=True):
+        channels = slice(first, first + len(view.data))
+        model = rendered.total(seen.spectra[:, channels]) + seen.sky[channels, None, None]
+        weight, power = view.root**2, seen.spectra[:, channels] ** 2
+        chi2 = weight * (view.data - model) ** 2
+        for i, image in enumerate(rendered.images):
+            image = image * weight[:, *rendered.window(i)]
+            light[i] += power[i] @ image.sum((1, 2))
+            found[i] += power[i] @ (image * chi2[:, *rendered.window(i)]).sum((1, 2))
+    return found / np.maximum(light, 1e-30)

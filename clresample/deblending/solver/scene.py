@@ -61,11 +61,7 @@ class Scene:
     @property
     def signature(self):
         """Scenes of equal signature can share a batch: frames, observed shapes, kernels to run."""
-        return (
-            self.shape,
-            self.fit_sky,
-            tuple(op.layout for op in self.ops),
-        )
+        return signature_of(self.shape, self.fit_sky, self.ops)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,3 +90,8 @@ class State:
     sky: np.ndarray
     memory: Memory | None = None
     n_steps: int = 0
+
+
+def signature_of(shape, fit_sky, ops):
+    """`Scene.signature` of scenes with these."""
+    return shape, fit_sky, tuple(op.layout for op in ops)

@@ -1,0 +1,164 @@
+"""Components of a group of scenes as all observations see them, and the spectra that fit best."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...device.tuning import Tuning
+from ..spectra import inverse, non_negative
+from .sight import Sight
+from .slots import Slots, boxes_of, thresholds
+
+
+def looking_at(views, components, precision, tolerance, *, fit_sky) -> Looking:
+    """The Looking of components at observations.
+
+    views: of each scene, its WhitenedViews; precision, tolerance: see Sight
+    """
+    first = views[0]
+    device, dtype = first[0].op.device, first[0].op.dtype
+    tuning, ends = Tuning.of(device, dtype), np.cumsum([0, *(len(v.data) for v in first)])
+    sights = [
+        Sight(
+            [own[k] for own in views],
+            slice(int(ends[k]), int(ends[k + 1])),
+            device,
+            dtype,
+            tuning,
+            precision,
+            tolerance,
+        )
+        for k in range(len(first))
+    ]
+    return Looking(components, sights, len(views), device, dtype, tuning, fit_sky=fit_sky)
+
+
+class Looking:
+    """The components of a group of scenes at some parameters, as all observations see them.
+
+    components (N): all scenes' Components; sights: the observations; n_scenes: B; fit_sky
+
+    spectra (N, C), sky (B, C): of the last solution, in the views' units, for profiles of unit
+        integral
+    """
+
+    def __init__(self, components, sights, n_scenes, device, dtype, tuning, *, fit_sky):
+        self.components, self.sights, self.n_scenes = components, sights, n_scenes
+        self.device, self.dtype, self.tuning, self.fit_sky = device, dtype, tuning, fit_sky
+        self.scene = np.array([c.scene for c in components])
+        self.index = np.array([c.index for c in components])
+        self.n_most = int(self.index.max()) + 1
+        self.n_channels = sights[-1].channels.stop
+        self.spectra = np.zeros((len(components), self.n_channels))
+        self.sky = np.zeros((n_scenes, self.n_channels))
+        self._kept: dict = {}
+
+    def look(self, scenes, thetas, brightness, *, slopes, whiten=True):
+        """Draw and render the components of some scenes (k,).
+
+        thetas (N): arrays; brightness (N,): see `thresholds`; whiten: else `whiten` is to follow
+        """
+        self.scenes = np.asarray(scenes)
+        at = np.flatnonzero(np.isin(self.scene, self.scenes))
+        chosen, theta = [self.components[i] for i in at], [thetas[i] for i in at]
+        boxes = boxes_of(chosen, theta, thresholds(brightness[at]))
+        self.slots = Slots(chosen, theta, boxes, slopes=slopes)
+        self.at = at[self.slots.order]
+        self._row = np.full(self.n_scenes, -1)
+        self._row[self.scenes] = np.arange(len(self.scenes))
+        images = self.slots.draw(self.device, self.dtype, self.tuning, self._kept)
+        for sight in self.sights:
+            sight.see(self.slots, images)
+        self.pairs = [sight.pairs() for sight in self.sights]
+        if whiten:
+            self.whiten()
+
+    def whiten(self):
+        """Bring what is seen to units of the noise."""
+        for sight in self.sights:
+            sight.whiten()
+
+    @property
+    def rows(self):
+        """The row (slots,) among the scenes looked at of each slot's scene."""
+        return self._row[self.scene[self.at]]
+
+    def compare(self, error) -> np.ndarray:
+        """Compare the present solution with the data; chi2 (k,) of the scenes looked at."""
+        spectra = self.spectra[self.at]
+        self.sums = [
+            sight.compare(self.scenes, self.slots, spectra, self.sky, error)
+            for sight in self.sights
+        ]
+        return sum(sums[:, :, 0].sum(axis=1) for sums in self.sums)
+
+    def solve(self, error):
+        """Spectra and sky levels of the least squares, weights from the present solution.
+
+        error: part of the model that adds to the noise; 0: none of it
+        normal (k, C, n + 1, n + 1), right (k, C, n + 1): products of the scenes' components, and
+        then of a level of 1, with each other and with the data
+        """
+        self.compare(error)
+        n, rows = self.n_most, self.rows
+        normal = np.zeros((len(self.scenes), self.n_channels, n + 1, n + 1))
+        right = np.zeros(normal.shape[:3])
+        own = self.index[self.at]
+        for sight, (pairs, where), sums in zip(self.sights, self.pairs, self.sums, strict=True):
+            channels = np.arange(self.n_channels)[sight.channels]
+            gram, pull = sight.gram(pairs, where, 1)[..., 0, 0], sight.pull(1)[:, :, 0]
+            (i, j), c = own[pairs].T[:, :, None], channels[None]
+            b = rows[pairs[:, 0], None]
+            normal[b, c, i, j] = normal[b, c, j, i] = gram
+            right[rows[:, None], c, own[:, None]] = pull[..., 0]
+            normal[rows[:, None], c, own[:, None], n] = pull[..., 1]
+            normal[rows[:, None], c, n, own[:, None]] = pull[..., 1]
+            right[:, channels, n], normal[:, channels, n, n] = np.moveaxis(sums[..., 1:], -1, 0)
+        solution = self.solution()
+        right += np.einsum("kcij,kcj->kci", normal, solution)
+        self.normal, self.right = normal, right
+        found = self._non_negative()
+        self.spectra[self.at] = found[rows, :, own]
+        if self.fit_sky:
+            self.sky[self.scenes] = found[..., n]
+
+    def instead(self, components) -> Looking:
+        """The same observations with other components."""
+        device = self.device, self.dtype, self.tuning
+        return Looking(components, self.sights, self.n_scenes, *device, fit_sky=self.fit_sky)
+
+    def signal_to_noise(self, sky):
+        """Of all light but the sky's as each component's profile sees it: <u, d> / |u| (N, C), 0
+        where it sees nothing; sky (B, C)."""
+        spectra = np.zeros((len(self.slots), self.n_channels))
+        out = np.zeros((len(self.components), self.n_channels))
+        for sight, (pairs, where) in zip(self.sights, self.pairs, strict=True):
+            sight.compare(self.scenes, self.slots, spectra, sky, 0.0)
+            alone = pairs[:, 0] == pairs[:, 1]
+            size = np.zeros((len(self.slots), sight.n_bands))
+            size[pairs[alone, 0]] = np.sqrt(sight.gram(pairs[alone], where[alone], 1)[..., 0, 0])
+            light = sight.pull(1)[:, :, 0, 0]
+            found = np.divide(light, size, out=np.zeros_like(light), where=size > 0)
+            out[self.at, sight.channels] = found
+        return out
+
+    def solution(self):
+        """The present spectra and sky levels (k, C, n + 1)."""
+        out = np.zeros((len(self.scenes), self.n_channels, self.n_most + 1))
+        out[self.rows, :, self.index[self.at]] = self.spectra[self.at]
+        out[..., self.n_most] = self.sky[self.scenes]
+        return out
+
+    def _non_negative(self):
+        """The least squares (k, C, n) or, with the sky, (k, C, n + 1)."""
+        size = self.n_most + self.fit_sky
+        free = np.arange(size) >= self.n_most
+        normal = self.normal[..., :size, :size].reshape(-1, size, size)
+        found = non_negative(normal, self.right[..., :size].reshape(-1, size), free)
+        return found.reshape(len(self.scenes), self.n_channels, size)
+
+    def covariance(self, row):
+        """Of one scene's spectra (C, n, n), the sky levels unknown too if they are fitted."""
+        n = int((self.scene == self.scenes[row]).sum())
+        own = np.r_[0:n, self.n_most : self.n_most + self.fit_sky]
+        return inverse(self.normal[row][:, own[:, None], own])[:, :n, :n]

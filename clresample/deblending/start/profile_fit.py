@@ -1,0 +1,126 @@
+"""Levenberg-Marquardt on the shapes of all scenes of a group, each at its own pace."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..spectra import MODEL_ERROR
+from .equations import N_PARAMETERS, equations
+from .looking import Looking
+from .slots import peaks_of
+
+# Longest step of a parameter: far from the minimum the quadratic model of chi2 promises too much.
+LONGEST_STEP = 0.7
+# Most steps, and the part of chi2 that ends them when one of them gains no more than it.
+N_STEPS, ENOUGH = 10, 1e-3
+# Levenberg-Marquardt: damping of the first step as a part of the normal matrix's diagonal, what it
+# is divided by after a step that gains, multiplied by after one that does not, and where it ends.
+FIRST_DAMPING, LESS, MORE, MOST_DAMPING = 1e-2, 3, 10, 1e3
+# Solutions of the spectra at each step, the weights following the model: the first ones of all,
+# and those that begin with the spectra of the step before.
+FIRST_ROUNDS, ROUNDS = 2, 2
+
+
+class ProfileFit:
+    """The least-squares problems of B scenes' parameters theta (B, n, 4), padded with zeros.
+
+    looking: Looking; noise (B, C): of a model pixel
+
+    theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs
+    brightness (N,): of the components, see `thresholds`
+    """
+
+    def __init__(self, looking: Looking, noise):
+        self.looking, self.noise = looking, noise
+        shapes = [c.shape for c in looking.components]
+        self.counts = np.array([len(shape.mean) for shape in shapes])
+        self.at = looking.scene, looking.index
+        size = looking.n_scenes, looking.n_most, N_PARAMETERS
+        self.mean, self.scatter = np.zeros(size), np.ones(size)
+        for b, i, shape, n in zip(*self.at, shapes, self.counts, strict=True):
+            self.mean[b, i, :n], self.scatter[b, i, :n] = shape.mean, shape.scatter
+        self.theta, self.chi2 = self.mean.copy(), np.full(len(self.mean), np.inf)
+        self.brightness = np.zeros(len(shapes))
+        self.right = np.zeros((size[0], size[1] * size[2]))
+        self.normal = np.zeros((*self.right.shape, self.right.shape[1]))
+
+    def thetas(self, theta=None):
+        """Parameters (n,) of each component."""
+        theta = self.theta if theta is None else theta
+        return [t[:n] for t, n in zip(theta[self.at], self.counts, strict=True)]
+
+    def begin(self):
+        """Solve at the mean."""
+        looking, scenes = self.looking, np.arange(len(self.theta))
+        self._look(scenes, self.theta, slopes=False)
+        looking.solve(0.0)
+        self._measure_brightness(self.theta)
+        self._look(scenes, self.theta, slopes=True)
+        for _ in range(FIRST_ROUNDS):
+            looking.solve(MODEL_ERROR)
+        self.chi2 = self._chi2(scenes, self.theta)
+        self._take_equations(scenes)
+
+    def run(self):
+        """Step until all scenes have ended."""
+        live = np.array([(self.counts[self.looking.scene == b] > 0).any()
+                         for b in range(len(self.theta))])  # fmt: skip
+        damping = np.full(len(live), FIRST_DAMPING)
+        for i_step in range(N_STEPS):
+            scenes = np.flatnonzero(live)
+            if not len(scenes):
+                return
+            gain, trial = self._try(scenes, damping[scenes])
+            gained = gain > 0
+            damping[scenes] = np.where(gained, damping[scenes] / LESS, damping[scenes] * MORE)
+            enough = gained & (gain < ENOUGH * self.chi2[scenes])
+            live[scenes] = ~enough & (damping[scenes] <= MOST_DAMPING)
+            self.theta[scenes[gained]] = trial[scenes[gained]]
+            self._measure_brightness(self.theta)
+            further = scenes[gained & live[scenes]]
+            if len(further) and i_step < N_STEPS - 1:
+                self._look(further, self.theta, slopes=True)
+                self.looking.compare(MODEL_ERROR)
+                self._take_equations(further)
+
+    def _try(self, scenes, damping):
+        """Try a step of each of the scenes; what it gains (k,), spectra those of the better one,
+        and theta (B, n, 4) after it."""
+        looking, normal = self.looking, self.normal[scenes]
+        diagonal = np.diagonal(normal, axis1=1, axis2=2) * damping[:, None]
+        matrix = normal + diagonal[..., None] * np.eye(normal.shape[-1])
+        step = np.linalg.solve(matrix, self.right[scenes][..., None])
+        trial, before = self.theta.copy(), (looking.spectra.copy(), looking.sky.copy())
+        trial[scenes] += np.clip(step, -LONGEST_STEP, LONGEST_STEP).reshape(trial[scenes].shape)
+        self._look(scenes, trial, slopes=False)
+        for _ in range(ROUNDS):
+            looking.solve(MODEL_ERROR)
+        new = self._chi2(scenes, trial)
+        gain = self.chi2[scenes] - new
+        worse = scenes[~(gain > 0)]
+        back = np.isin(looking.scene, worse)
+        looking.spectra[back], looking.sky[worse] = before[0][back], before[1][worse]
+        self.chi2[scenes] = np.where(gain > 0, new, self.chi2[scenes])
+        return gain, trial
+
+    def _look(self, scenes, theta, *, slopes):
+        self.looking.look(scenes, self.thetas(theta), self.brightness, slopes=slopes)
+
+    def _chi2(self, scenes, theta):
+        """With the prior (k,)."""
+        pull = ((theta - self.mean) / self.scatter)[scenes]
+        return self.looking.compare(MODEL_ERROR) + (pull**2).sum(axis=(1, 2))
+
+    def _take_equations(self, scenes):
+        """Note the normal equations of some scenes, the prior among them."""
+        normal, right = equations(self.looking)
+        scatter, size = self.scatter[scenes].reshape(len(scenes), -1), right.shape[1]
+        pull = (self.mean - self.theta)[scenes].reshape(len(scenes), -1) / scatter
+        self.normal[scenes] = normal + (scatter**-2.0)[..., None] * np.eye(size)
+        self.right[scenes] = right + pull / scatter
+
+    def _measure_brightness(self, theta):
+        """Note the components' peaks over the noise of a model pixel, where they are best seen."""
+        looking = self.looking
+        best = (looking.spectra / self.noise[looking.scene]).max(axis=1)
+        self.brightness = best * peaks_of(looking.components, self.thetas(theta))

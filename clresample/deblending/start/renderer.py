@@ -1,0 +1,84 @@
+"""Images in boxes as an observation sees them, in windows that hold what their light reaches."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...device.contraction import ImageBatch, Matrix
+from ...resampling.resampler import EXECUTORS
+
+
+class Renderer:
+    """One plan of boxes on the device: images (n, ny, nx) to (n, C, wy, wx).
+
+    plan: `Plan.window`'s, of one place of a distorted mapping, or of a whole frame
+    executor: of the plan, with its transfer function; None makes one
+
+    A box is transformed once for all bands and all slots; the offset of each slot and the transfer
+    functions of the bands are multiplied in between (kernels/start.cl, turn).
+    """
+
+    def __init__(self, device, dtype, plan, executor=None):
+        self.plan, self.device, self.dtype = plan, device, np.dtype(dtype)
+        if executor is None:
+            executor = EXECUTORS[plan.geometry](device, dtype, [plan])
+            executor.set_transfer([(plan.d_plus, plan.d_minus)])
+        self.executor = e = executor
+        elements = sum(rows * ld for rows, ld in e.scratch_shapes().values()) * e.n_bands
+        self._n_bytes = (elements + e.k_y * e.k_pad) * self.dtype.itemsize
+        self._capacity = 0
+        tuning = e.tuning
+        self._width = 1 if tuning.row_loops else e.k_pad // 2
+        self._turn = device.launcher(
+            "start.cl",
+            "turn",
+            dtype=dtype,
+            local_size=tuning.local_size(3),
+            ROWS=tuning.row_loops,
+        ).bind(h_y=e.h_y, n_pad=e.k_pad, n_bands=e.n_bands, D=e.transfer)
+
+    @property
+    def size(self) -> int:
+        """Elements of one image as all bands see it."""
+        return self.executor.n_bands * int(np.prod(self.plan.mapping.shape_out))
+
+    def __call__(self, images, i_image, seen, i_seen, n, moves):
+        """Queue the images of slots that follow each other, n of each.
+
+        images, i_image: device array and the element of it where they begin; seen, i_seen: likewise
+            where they go; moves (slots, 2) [model px]: by which the slots' pixels are off the
+            plan's
+        """
+        e, count, (w_y, w_x) = self.executor, len(moves), self.plan.mapping.shape_out
+        group = min(count, max(1, e.tuning.group_bytes // (n * self._n_bytes)))
+        self._reserve(group * n)
+        phase = self.device.put(self._phases(moves), self.dtype)
+        for first in range(0, count, group):
+            m = min(group, count - first) * n
+            at, to = i_image + first * n * e.n_y * e.n_x, i_seen + first * n * self.size
+            e.in_columns_once(m, a=ImageBatch(images.base_data, at, e.n_y * e.n_x, e.n_x))
+            self._rows(m)
+            self._turn((self._width, e.h_y, m * e.n_bands), n=n, first=first, phase=phase)
+            e.observe(ImageBatch(seen.base_data, to, w_y * w_x, w_x), m * e.n_bands)
+
+    def _reserve(self, n_images):
+        """Make room for so many images at a time."""
+        if n_images <= self._capacity:
+            return
+        e, self._capacity = self.executor, n_images
+        e.reserve(n_images * e.n_bands)
+        plain = self.device.empty((n_images, e.k_y, e.k_pad), self.dtype)
+        z0 = Matrix(plain.base_data, e.k_pad, e.k_y * e.k_pad)
+        half = e.matrix("half", e.n_y)
+        self._rows = e.plain.bind(e.k_y, e.k_x, e.n_y, e.in_y._replace(div=1), half, z0)
+        self._turn.bind(z0=z0.buffer, z=e.matrix("frequencies").buffer)
+
+    def _phases(self, moves):
+        """cos and sin (slots, Hy + k_pad / 2, 2) of each slot's offset by row and by column."""
+        e, plan = self.executor, self.plan
+        out = np.zeros((len(moves), e.h_y + e.k_pad // 2, 2))
+        for nu, axis, first in zip(plan.nu, plan.axes, (0, e.h_y), strict=True):
+            angle = 2 * np.pi * moves[:, axis, None] * nu
+            part = out[:, first : first + len(nu)]
+            part[..., 0], part[..., 1] = np.cos(angle), np.sin(angle)
+        return out

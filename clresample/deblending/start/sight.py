@@ -1,0 +1,172 @@
+"""One observation of all scenes of a group: what it sees of slots, and sums over its pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...resampling.plan import Precision
+from .aim import Aim
+from .slots import Slots, ends_of
+
+FILE = "start.cl"
+
+
+class Sight:
+    """One observation of each of B scenes, and the slots that it sees at present.
+
+    views (B): WhitenedViews of equal shapes; channels: slice of all the scenes' channels
+    precision, tolerance: see Aim
+
+    n_elements: that were last seen; n_pixels: of all products so far
+    root (B, Co, My, Mx): on the device, as are data (times root), residual and weight
+    """
+
+    def __init__(self, views, channels, device, dtype, tuning, precision: Precision, tolerance):
+        self.views, self.channels, self.device, self.dtype = views, channels, device, dtype
+        self.tuning = tuning
+        shape = self.n_bands, self.my, self.mx = views[0].root.shape
+        shape = len(views), *shape
+        self.root = device.put(np.array([v.root for v in views]), dtype)
+        self.data = device.put(np.array([v.data * v.root for v in views]), dtype)
+        self.residual, self.weight = (device.empty(shape, dtype) for _ in range(2))
+        self.sums = device.empty((*shape[:3], 3), dtype)
+        self.aim = Aim(views, device, dtype, precision, tolerance)
+        self.n_elements = self.n_pixels = 0
+
+    def _launch(self, name, size, *, local_size=None, **arguments):
+        """Queue a kernel of start.cl; K of them: images of a slot that are summed."""
+        n_images = arguments.pop("K", 1)
+        sums = {"WG": self.tuning.sum_group, "K": n_images} if local_size else {}
+        launch = self.device.launcher(
+            FILE,
+            name,
+            dtype=self.dtype,
+            local_size=local_size or self.tuning.local_size(3),
+            ROWS=self.tuning.row_loops,
+            **sums,
+        )
+        launch(size, n_bands=self.n_bands, my=self.my, mx=self.mx, **arguments)
+
+    def see(self, slots: Slots, images):
+        """Render the slots' images, and keep what is seen of them."""
+        low, size, jobs = *np.zeros((2, len(slots), 2), int), []
+        for first, last, renderer, at, moves in self.aim.runs(slots):
+            low[first:last] = at
+            if renderer is not None:
+                size[first:last] = renderer.plan.mapping.shape_out
+                jobs.append((first, renderer, int(slots.n_images[first]), moves))
+        begin, n = ends_of(slots.n_images * self.n_bands * size.prod(axis=1))
+        self.place = np.column_stack([slots.scene, low, size, slots.n_images, begin])
+        self.place_on_device = self.device.put(self.place.astype(np.int32))
+        self.n_elements, self.seen = n, self.device.empty(n, self.dtype)
+        for first, renderer, n_images, moves in jobs:
+            at = int(slots.begin[first]), int(begin[first])
+            renderer(images, at[0], self.seen, at[1], n_images, moves)
+
+    def whiten(self):
+        """Bring what is seen to units of the noise."""
+        tallest, widest = self.place[:, 3:5].max(axis=0).tolist()
+        self._launch(
+            "whiten",
+            (1 if self.tuning.row_loops else widest, tallest, len(self.place)),
+            place=self.place_on_device,
+            root=self.root,
+            seen=self.seen,
+        )
+
+    def compare(self, scenes, slots, spectra, sky, error):
+        """Residuals and weights of some scenes (k,), and sums (k, Co, 3) over the pixels.
+
+        spectra (slots, C), sky (B, C): of the model; error: part of the model that adds to the
+        noise
+        """
+        by_scene = np.argsort(slots.scene, kind="stable")
+        ends = np.searchsorted(slots.scene[by_scene], [*scenes, len(self.views)])
+        counts = np.searchsorted(slots.scene[by_scene], scenes, side="right")
+        listed = [by_scene[a:b] for a, b in zip(ends[:-1], counts, strict=True)]
+        first = np.cumsum([0, *map(len, listed)])
+        put = self.device.put
+        launch = self.device.launcher(
+            FILE, "compare", dtype=self.dtype, local_size=self.tuning.local_size(3)
+        )
+        launch(
+            (self.my, self.n_bands, len(scenes)),
+            scenes=put(np.asarray(scenes, np.int32)),
+            first=put(first.astype(np.int32)),
+            listed=put(np.concatenate([*listed, [0]]).astype(np.int32)),
+            place=self.place_on_device,
+            n_bands=self.n_bands,
+            my=self.my,
+            mx=self.mx,
+            channel=self.channels.start,
+            n_channels=spectra.shape[1],
+            error=error,
+            spectra=put(spectra, self.dtype),
+            sky=put(sky, self.dtype),
+            root=self.root,
+            data=self.data,
+            seen=self.seen,
+            residual=self.residual,
+            weight=self.weight,
+            sums=self.sums,
+        )
+        return self.device.get(self.sums).astype(np.float64).sum(axis=2)[scenes]
+
+    def pairs(self):
+        """Slots (pairs, 2), a <= b, of one scene whose windows meet on the observation, and where:
+        first pixel and size (pairs, 4). A slot that sees none of it is not there."""
+        table = _pairs(self.place, (self.my, self.mx))
+        self.n_pixels += int(table[:, 4:].prod(axis=1).sum())
+        return table[:, :2], table[:, 2:]
+
+    def gram(self, pairs, where, n_images):
+        """Products (pairs, Co, K, K) of the pairs' images, under the present weights; K = n_images,
+        of which images that a slot does not have repeat its last."""
+        out = self.device.empty((len(pairs), self.n_bands, n_images, n_images), self.dtype)
+        if len(pairs):
+            group = self.tuning.sum_group
+            self._launch(
+                "gram",
+                (group, self.n_bands, len(pairs)),
+                local_size=(group, 1, 1),
+                K=n_images,
+                pairs=self.device.put(np.column_stack([pairs, where]).astype(np.int32)),
+                place=self.place_on_device,
+                seen=self.seen,
+                weight=self.weight,
+                out=out,
+            )
+        return self.device.get(out).astype(np.float64)
+
+    def pull(self, n_images):
+        """Products (slots, Co, K, 2) of the slots' images with the residual, and with the root."""
+        group, n = self.tuning.sum_group, len(self.place)
+        out = self.device.empty((n, self.n_bands, n_images, 2), self.dtype)
+        self._launch(
+            "pull",
+            (group, self.n_bands, n),
+            local_size=(group, 1, 1),
+            K=n_images,
+            place=self.place_on_device,
+            seen=self.seen,
+            weight=self.weight,
+            residual=self.residual,
+            root=self.root,
+            out=out,
+        )
+        return self.device.get(out).astype(np.float64)
+
+
+def _pairs(place, shape):
+    """`Sight.pairs` of windows on an observation of this shape, in one table (pairs, 6)."""
+    low = np.maximum(place[:, 1:3], 0)
+    high = np.minimum(place[:, 1:3] + place[:, 3:5], shape)
+    found = []
+    for scene in np.unique(place[:, 0]):
+        at = np.flatnonzero(place[:, 0] == scene)
+        both = np.maximum(low[at, None], low[at]), np.minimum(high[at, None], high[at])
+        meet = np.triu((both[1] > both[0]).all(axis=2))
+        i, j = np.nonzero(meet)
+        start = both[0][i, j]
+        found.append(np.column_stack([at[i], at[j], start, both[1][i, j] - start]))
+    return np.concatenate(found)

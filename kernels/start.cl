@@ -1,0 +1,273 @@
+/* The start of a fit: smooth profiles drawn in boxes, seen in windows, compared with the data.
+ *
+ * A slot is one component of one scene, with n images: its profile and, where asked for, the
+ * slopes of that by its parameters.
+ *
+ *         model frame                      one channel of an observation
+ *         +-----------------+              +------------------+
+ *         |   +-----+       |              |  +----------+    |   window (wy, wx) from (y0, x0) on,
+ *         |   | box |       |      R       |  |          |    |   all that the box's light reaches;
+ *         |   +-----+       |     --->     |  +----------+    |   may lie in part beyond the pixels
+ *         +-----------------+              +------------------+
+ *
+ *   place    (slots, N_PLACE) int: scene, y0, x0, wy, wx, n, and the element of `seen` where the
+ *            slot's images begin: (n, n_bands, wy, wx), row by row
+ *   root, data, residual, weight   (B, n_bands, my, mx): root of the weights, data times root
+ *
+ * draw     (slots, N_DRAW) int: ny, nx, n, first element of its images (n, ny, nx); n = 0: not
+ *          drawn here.  shape (slots, N_SHAPE), see the enum: profile and its slopes by
+ *          (ln sigma, g1, g2, ln beta), see profiles.py;  launch: (X, tallest box, slots)
+ * turn     z = D o phase o z0: n_bands spectra from one, each moved by its slot's own offset:
+ *          z0 (items, 2 h_y, n_pad), z (items * n_bands, 2 h_y, n_pad), quads as in contract.cl;
+ *          D as MIX has it; phase (slots, h_y + n_pad / 2, 2) cos and sin by row and by column;
+ *          item i belongs to slot first + i / n;  launch: (X, h_y, items * n_bands)
+ * whiten   seen <- seen root;  launch: (X, tallest window, slots)
+ * compare  model m = sky root + sum_slots A seen, residual r = data - m, weight w = 1 / (1 + (error
+ *          m)^2) where root is not 0; sums (B, n_bands, my, 3): of w r^2, w r root, w root^2;
+ *          launch: (my, n_bands, scenes), one work-item a row.  `listed`: the slots scene by scene,
+ *          those of scenes[k] from first[k] to first[k + 1]
+ * gram     out (pairs, n_bands, K, K) = sum over the pixels where both windows lie of w a_i b_j;
+ *          pairs (., 6) int: slots a, b, and the pixels: y, x, height, width; images beyond a
+ *          slot's n are its last again;  launch: (WG, n_bands, pairs), groups of (WG, 1, 1)
+ * pull     out (slots, n_bands, K, 2) = sums of w a_i r and w a_i root;  launch: as gram
+ *
+ * X is 1 where a work-item walks a whole row (ROWS of group.h), else the width of the widest row.
+ */
+#include "common.h"
+#include "group.h"
+#ifndef K           /* images of a slot: 1, or 5 with slopes */
+#define K 1
+#endif
+
+enum { SCENE, Y0, X0, WY, WX, N_IMAGES, BEGIN, N_PLACE };
+enum { DRAW_NY, DRAW_NX, DRAW_N, DRAW_BEGIN, N_DRAW };
+/* place in the box, C^-1, beta, 1 / (2 pi sqrt(det C)); dC (yy, yx, xx) and 1/2 tr(C^-1 dC) by each
+ * of three parameters */
+enum { CY, CX, I_YY, I_YX, I_XX, BETA, NORM, SLOPES, N_SHAPE = SLOPES + 12 };
+
+#define DARK ((REAL)1e-20)  /* of the peak; smaller values would be denormals, which are slow */
+
+__kernel void draw(__global const int *restrict table, __global const REAL *restrict shape,
+                   __global REAL *restrict images)
+{
+    const int s = (int)get_global_id(2), y = (int)get_global_id(1);
+    __global const int *t = table + N_DRAW * (size_t)s;
+    const int ny = t[DRAW_NY], nx = t[DRAW_NX], n = t[DRAW_N];
+    if (!n || y >= ny) return;
+    __global const REAL *p = shape + N_SHAPE * (size_t)s;
+    __global REAL *out = images + t[DRAW_BEGIN] + (size_t)y * nx;
+    const size_t one = (size_t)ny * nx;
+    const REAL dy = y - p[CY], cx = p[CX], yy = p[I_YY], yx = p[I_YX], xx = p[I_XX];
+    const REAL beta = p[BETA], norm = p[NORM];
+    FOR_X(x, nx) {
+        const REAL dx = x - cx, u = yy * dy + yx * dx, v = yx * dy + xx * dx, q = dy * u + dx * v;
+        const REAL l = log(1 + q / (2 * beta)), e = exp(-(beta + 1) * l);
+        const REAL s0 = e > DARK ? norm * e : 0;
+        out[x] = s0;
+        if (n > 1) {
+            const REAL fall = (beta + 1) / (2 * beta + q);
+            for (int k = 0; k < 3; ++k) {
+                const REAL a = p[SLOPES + 4 * k], b = p[SLOPES + 4 * k + 1];
+                const REAL c = p[SLOPES + 4 * k + 2], d = p[SLOPES + 4 * k + 3];
+                out[(k + 1) * one + x] = s0 * (fall * (a * u * u + 2 * b * u * v + c * v * v) - d);
+            }
+            out[4 * one + x] = s0 * (q * fall - beta * l);
+        }
+    }
+}
+
+__kernel void turn(const int h_y, const int n_pad, const int n_bands, const int n, const int first,
+                   __global const REAL *restrict z0, __global const REAL *restrict phase,
+                   __global const REAL *restrict D, __global REAL *restrict z)
+{
+    const int i = (int)get_global_id(1), band = (int)get_global_id(2) % n_bands;
+    const int item = (int)get_global_id(2) / n_bands, n_half = n_pad / 2;
+    __global const REAL *t = phase + (size_t)(first + item / n) * 2 * (h_y + n_half);
+    const REAL yr = t[2 * i], yi = t[2 * i + 1];
+    __global const REAL *along = t + 2 * h_y;
+    __global const REAL *d = D + ((size_t)band * h_y + i) * 4 * n_half;
+    __global const REAL *in = z0 + ((size_t)item * h_y + i) * 2 * n_pad;
+    __global REAL *out = z + ((size_t)get_global_id(2) * h_y + i) * 2 * n_pad;
+    FOR_X(j, n_half) {
+        const REAL cc = in[2 * j], cs = in[2 * j + 1];
+        const REAL sc = in[n_pad + 2 * j], ss = in[n_pad + 2 * j + 1];
+        const REAL xr = along[2 * j], xi = along[2 * j + 1];
+        const REAL fpr = cc - ss, fpi = -(cs + sc), fmr = cc + ss, fmi = cs - sc;
+        const REAL tpr = yr * xr - yi * xi, tpi = yr * xi + yi * xr;    /* at (+nu_y, +nu_x) */
+        const REAL tmr = yr * xr + yi * xi, tmi = yi * xr - yr * xi;    /* at (+nu_y, -nu_x) */
+        const REAL pr = d[j] * tpr - d[n_half + j] * tpi, pi = d[j] * tpi + d[n_half + j] * tpr;
+        const REAL mr = d[2 * n_half + j] * tmr - d[3 * n_half + j] * tmi;
+        const REAL mi = d[2 * n_half + j] * tmi + d[3 * n_half + j] * tmr;
+        const REAL gpr = pr * fpr - pi * fpi, gpi = pr * fpi + pi * fpr;
+        const REAL gmr = mr * fmr - mi * fmi, gmi = mr * fmi + mi * fmr;
+        out[2 * j] = gpr + gmr;
+        out[2 * j + 1] = gmi - gpi;
+        out[n_pad + 2 * j] = -(gpi + gmi);
+        out[n_pad + 2 * j + 1] = gmr - gpr;
+    }
+}
+
+__kernel void whiten(__global const int *restrict place, const int n_bands, const int my,
+                     const int mx, __global const REAL *restrict root, __global REAL *restrict seen)
+{
+    const int s = (int)get_global_id(2), y = (int)get_global_id(1);
+    __global const int *p = place + N_PLACE * (size_t)s;
+    const int wy = p[WY], wx = p[WX], y0 = p[Y0], x0 = p[X0], n = p[N_IMAGES];
+    if (y >= wy) return;
+    __global REAL *image = seen + p[BEGIN] + (size_t)y * wx;
+    const int inside = y0 + y >= 0 && y0 + y < my;
+    const int low = x0 < 0 ? -x0 : 0, high = x0 + wx < mx ? wx : mx - x0;
+    for (int k = 0; k < n; ++k)
+        for (int c = 0; c < n_bands; ++c) {
+            __global REAL *row = image + ((size_t)k * n_bands + c) * wy * wx;
+            if (inside) {
+                __global const REAL *r =
+                    root + (((size_t)p[SCENE] * n_bands + c) * my + y0 + y) * mx + x0;
+                FOR_X(x, wx) row[x] = x >= low && x < high ? row[x] * r[x] : 0;
+            } else {
+                FOR_X(x, wx) row[x] = 0;
+            }
+        }
+}
+
+__kernel void compare(__global const int *restrict scenes, __global const int *restrict first,
+                      __global const int *restrict listed, __global const int *restrict place,
+                      const int n_bands, const int my, const int mx, const int channel,
+                      const int n_channels, const REAL error,
+                      __global const REAL *restrict spectra, __global const REAL *restrict sky,
+                      __global const REAL *restrict root, __global const REAL *restrict data,
+                      __global const REAL *restrict seen, __global REAL *restrict residual,
+                      __global REAL *restrict weight, __global REAL *restrict sums)
+{
+    const int y = (int)get_global_id(0), c = (int)get_global_id(1), k = (int)get_global_id(2);
+    const int b = scenes[k];
+    const size_t line = ((size_t)b * n_bands + c) * my + y;
+    __global REAL *m = residual + line * mx, *w = weight + line * mx;
+    __global const REAL *r = root + line * mx, *d = data + line * mx;
+    const REAL level = sky[(size_t)b * n_channels + channel + c];
+    for (int x = 0; x < mx; ++x) m[x] = level * r[x];
+    for (int l = first[k]; l < first[k + 1]; ++l) {
+        const int s = listed[l];
+        __global const int *p = place + N_PLACE * (size_t)s;
+        const int wy = p[WY], wx = p[WX], row = y - p[Y0], x0 = p[X0];
+        if (row < 0 || row >= wy) continue;
+        const REAL a = spectra[(size_t)s * n_channels + channel + c];
+        if (a == 0) continue;
+        __global const REAL *u =
+            seen + p[BEGIN] + ((size_t)c * wy + row) * wx;
+        const int low = x0 < 0 ? -x0 : 0, high = x0 + wx < mx ? wx : mx - x0;
+        for (int x = low; x < high; ++x) m[x0 + x] += a * u[x];
+    }
+    REAL chi2[8] = {0, 0, 0, 0, 0, 0, 0, 0}, by_sky[8] = {0, 0, 0, 0, 0, 0, 0, 0};
+    REAL of_sky[8] = {0, 0, 0, 0, 0, 0, 0, 0};
+    for (int x0 = 0; x0 < mx; x0 += 8)
+        for (int i = 0; i < 8; ++i) {
+            const int x = x0 + i;
+            if (x < mx) {
+                const REAL part = error * m[x], rest = d[x] - m[x], weigh = 1 / (1 + part * part);
+                m[x] = rest;
+                w[x] = weigh;
+                chi2[i] += weigh * rest * rest;
+                by_sky[i] += weigh * rest * r[x];
+                of_sky[i] += weigh * r[x] * r[x];
+            }
+        }
+    sums[3 * line] = SUM8(chi2);
+    sums[3 * line + 1] = SUM8(by_sky);
+    sums[3 * line + 2] = SUM8(of_sky);
+}
+
+/* Image i of a slot in channel c, at a pixel of the observation; the last one beyond n. */
+#define ROW_OF(p, i) \
+    (seen + (p)[BEGIN] + \
+     (((size_t)((i) < (p)[N_IMAGES] ? (i) : (p)[N_IMAGES] - 1) * n_bands + c) * (p)[WY] \
+      + y0 + y - (p)[Y0]) * (p)[WX] + x0 - (p)[X0])
+
+__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
+void gram(__global const int *restrict pairs, __global const int *restrict place,
+          const int n_bands, const int my, const int mx, __global const REAL *restrict seen,
+          __global const REAL *restrict weight, __global REAL *restrict out)
+{
+    __local REAL share[WG];
+    const int lid = (int)get_local_id(0), c = (int)get_global_id(1);
+    const size_t pair = get_global_id(2);
+    __global const int *t = pairs + 6 * pair;
+    __global const int *p = place + N_PLACE * (size_t)t[0], *q = place + N_PLACE * (size_t)t[1];
+    const int y0 = t[2], x0 = t[3], height = t[4], width = t[5];
+    REAL total[K][K];
+    for (int i = 0; i < K; ++i) for (int j = 0; j < K; ++j) total[i][j] = 0;
+    for (int y = lid; y < height; y += WG) {
+        __global const REAL *w =
+            weight + (((size_t)p[SCENE] * n_bands + c) * my + y0 + y) * mx + x0;
+        __global const REAL *a[K], *b[K];
+        for (int i = 0; i < K; ++i) a[i] = ROW_OF(p, i);
+        for (int j = 0; j < K; ++j) b[j] = ROW_OF(q, j);
+        REAL sum[K][K][8];
+        for (int i = 0; i < K; ++i)
+            for (int j = 0; j < K; ++j)
+                for (int k = 0; k < 8; ++k) sum[i][j][k] = 0;
+        int x = 0;
+        for (; x + 8 <= width; x += 8)
+            for (int i = 0; i < K; ++i) {
+                REAL left[8];
+                for (int k = 0; k < 8; ++k) left[k] = a[i][x + k] * w[x + k];
+                for (int j = 0; j < K; ++j)
+                    for (int k = 0; k < 8; ++k) sum[i][j][k] += left[k] * b[j][x + k];
+            }
+        for (; x < width; ++x)
+            for (int i = 0; i < K; ++i)
+                for (int j = 0; j < K; ++j) sum[i][j][0] += a[i][x] * w[x] * b[j][x];
+        for (int i = 0; i < K; ++i)
+            for (int j = 0; j < K; ++j) total[i][j] += SUM8(sum[i][j]);
+    }
+    for (int i = 0; i < K; ++i)
+        for (int j = 0; j < K; ++j) {
+            const REAL all = group_sum(total[i][j], lid, share);
+            if (lid == 0) out[((pair * n_bands + c) * K + i) * K + j] = all;
+        }
+}
+
+__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
+void pull(__global const int *restrict place, const int n_bands, const int my, const int mx,
+          __global const REAL *restrict seen, __global const REAL *restrict weight,
+          __global const REAL *restrict residual, __global const REAL *restrict root,
+          __global REAL *restrict out)
+{
+    __local REAL share[WG];
+    const int lid = (int)get_local_id(0), c = (int)get_global_id(1);
+    const size_t s = get_global_id(2);
+    __global const int *p = place + N_PLACE * s;
+    const int y0 = p[Y0] > 0 ? p[Y0] : 0, x0 = p[X0] > 0 ? p[X0] : 0;
+    const int y1 = p[Y0] + p[WY] < my ? p[Y0] + p[WY] : my;
+    const int x1 = p[X0] + p[WX] < mx ? p[X0] + p[WX] : mx;
+    REAL by_data[K], by_root[K];
+    for (int i = 0; i < K; ++i) by_data[i] = by_root[i] = 0;
+    for (int y = lid; y < y1 - y0; y += WG) {
+        const size_t line = (((size_t)p[SCENE] * n_bands + c) * my + y0 + y) * mx + x0;
+        for (int i = 0; i < K; ++i) {
+            __global const REAL *a = ROW_OF(p, i);
+            REAL one[8] = {0, 0, 0, 0, 0, 0, 0, 0}, other[8] = {0, 0, 0, 0, 0, 0, 0, 0};
+            int x = 0;
+            for (; x + 8 <= x1 - x0; x += 8)
+                for (int k = 0; k < 8; ++k) {
+                    const REAL wa = weight[line + x + k] * a[x + k];
+                    one[k] += wa * residual[line + x + k];
+                    other[k] += wa * root[line + x + k];
+                }
+            for (; x < x1 - x0; ++x) {
+                const REAL wa = weight[line + x] * a[x];
+                one[0] += wa * residual[line + x];
+                other[0] += wa * root[line + x];
+            }
+            by_data[i] += SUM8(one);
+            by_root[i] += SUM8(other);
+        }
+    }
+    for (int i = 0; i < K; ++i) {
+        const REAL d = group_sum(by_data[i], lid, share), r = group_sum(by_root[i], lid, share);
+        if (lid == 0) {
+            out[2 * ((s * n_bands + c) * K + i)] = d;
+            out[2 * ((s * n_bands + c) * K + i) + 1] = r;
+        }
+    }
+}

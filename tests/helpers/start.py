@@ -1,0 +1,85 @@
+"""References of the start: whole frames, float64 sums, scipy's least squares."""
+
+import numpy as np
+import pytest
+from scipy.optimize import nnls
+
+from clresample.deblending.profiles import Given
+from clresample.deblending.spectra import inverse
+from clresample.deblending.start.start import Patch, StartingPoint, start
+from clresample.deblending.view import WhitenedView
+from clresample.resampling.cache import cached_resampler
+
+from .scenes import frame
+
+
+def rendered(view, images):
+    """Whitened unit-spectrum images (n, Co, My * Mx), float64, of model images (n, Ny, Nx)."""
+    padded = np.zeros((len(images), *view.op.shape_in[1:]), view.op.dtype)
+    padded[:, : images.shape[1], : images.shape[2]] = images
+    out = view.op.render(padded) * view.root
+    return out.reshape(*out.shape[:2], -1).astype(np.float64)
+
+
+def least_squares(units, views, sky=False):
+    """Spectra (n, C), sky (C,), covariance (C, n, n) of `rendered` images, by scipy's nnls."""
+    spectra, levels, covariances = [], [], []
+    for view, unit in zip(views, units, strict=True):
+        for c in range(unit.shape[1]):
+            rows, target = unit[:, c], (view.data[c] * view.root[c]).ravel()
+            if sky:  # a free coefficient is the difference of two non-negative ones
+                level = view.root[c].ravel()[None]
+                rows = np.concatenate([rows, level, -level])
+            size = np.maximum(np.linalg.norm(rows, axis=1), 1e-30)
+            a = nnls((rows / size[:, None]).T, target)[0] / size
+            spectra.append(a[: len(unit)])
+            levels.append(a[-2] - a[-1] if sky else 0.0)
+            own = rows[: len(rows) - sky]
+            covariances.append(inverse((own @ own.T)[None])[0, : len(unit), : len(unit)])
+    return np.array(spectra).T, np.array(levels), np.array(covariances)
+
+
+def started(frame, catalogue, positions, views, **given) -> StartingPoint:
+    """The start of one scene."""
+    return start([Patch(frame, list(catalogue), np.asarray(positions, float), views)], **given)[0]
+
+
+def profiles(point, shape):
+    """Profiles (n, Ny, Nx) of a StartingPoint over a frame, max = 1."""
+    return np.array([point.drawn(i, (0, 0), shape) for i in range(len(point))])
+
+
+def point_of(images, position):
+    """A StartingPoint of given images (n, Ny, Nx), all about one position."""
+    n = len(images)
+    shapes = [Given(image) for image in images]
+    return StartingPoint(
+        source=np.arange(n),
+        positions=np.array([position] * n, float),
+        dark=np.zeros(n, bool),
+        shapes=shapes,
+        thetas=[np.zeros(0)] * n,
+        places=np.array([position] * n, float),
+        peaks=np.array([shape.peak for shape in shapes]),
+        spectra=np.ones((n, 1)),
+        sky=np.zeros(1),
+        power=np.ones((n, 1)),
+    )
+
+
+def views(device, observations, dtype=np.float64):
+    if dtype == np.float64 and not device.has_fp64:
+        pytest.skip(f"{device.name} has no double precision")
+    found = []
+    for o in observations:
+        op = cached_resampler(frame(), o.grid, o.psf, dtype=dtype, device=device)
+        found.append(view(op, o))
+    return found
+
+
+def view(op, o, covered=None):
+    """An observation in its own units, with no weight where it is not covered."""
+    covered = op.covered if covered is None else covered
+    mapping = op.mapping
+    root = np.sqrt(o.weights) * covered
+    return WhitenedView(op, mapping, covered, np.ones(len(o.data)), root, o.data)
