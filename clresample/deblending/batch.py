@@ -146,13 +146,16 @@ class _ManyFits:
 
     def _fit(self, group):
         """Fit a group, a list of (index, Fit); yields its length."""
-        n = len(group)
+        n, interrupted = len(group), False
         for part in self._parts(self._begin(group)):
             for i, done in self._try(part):
                 self.done[i] = done
-            if any(fit.status == INTERRUPTED for _, fit in part):
-                raise KeyboardInterrupt
+            interrupted = any(fit.status == INTERRUPTED for _, fit in part)
+            if interrupted:
+                break
         yield n
+        if interrupted:
+            raise KeyboardInterrupt
 
     def _parts(self, group):
         """A group in parts that fit into the memory, now that the boxes are known."""

@@ -156,7 +156,7 @@ class Fit:
     def result(self, seen: Seen) -> Result:
         """Everything back in the data's own units; seen: by `finish`."""
         began, scene, peaks = time.perf_counter(), self.scene, _peaks(self.state)
-        morphs = [m / peak for m, peak in zip(self.state.morph, peaks, strict=True)]
+        morphs = _scaled(self.state)
         components = [
             Component(
                 int(self.fitted[self.start.source[i]]),
@@ -214,13 +214,18 @@ def _model(fit) -> Model:
         fit.views,
         [view_as_taken(o, v, *home) if o.noise is not None else None for v, o in pairs],
         fit.scene.origin,
-        [m / peak for m, peak in zip(state.morph, _peaks(state), strict=True)],
+        _scaled(state),
     )
 
 
 def _peaks(state):
     """Largest values (n,) of the solver's morphologies; 1 of those that are 0."""
     return np.array([m.max() if m.max() > 0 else 1.0 for m in state.morph])
+
+
+def _scaled(state):
+    """The morphologies (n) with max = 1, float64."""
+    return [m.astype(np.float64) / p for m, p in zip(state.morph, _peaks(state), strict=True)]
 
 
 def data_bytes(fit) -> int:

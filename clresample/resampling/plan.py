@@ -18,8 +18,8 @@ import numpy as np
 
 from ..sky.mapping import Around, Mapping
 from ..sky.psf import PSF
-from ..sky.waves import cos_sin_columns
-from .gridding import KaiserBessel, LineTaps, transpose_taps
+from .gridding import KaiserBessel, LineTaps
+from .tables import aligned_tables, distorted_tables, line_tables, waves
 from .transfer import Certificate, transfer_function, wrap_radius
 
 # [bytes] of the tables of one operator. Frames of 7000 pixels a side need so much, and take minutes
@@ -140,9 +140,9 @@ def make_plan(
 
     center, axes = (np.array(mapping.shape_in) - 1) / 2, (0, 1)
     if mapping.geometry == "affine":
-        tables, d = _line_tables(mapping, nu, d, center, precision.window)
+        tables, d = line_tables(mapping, nu, d, center, precision.window)
     elif mapping.geometry == "distorted":
-        tables = _distorted_tables(mapping, nu, center)
+        tables = distorted_tables(mapping, nu, center)
     d = d * (2 / (n_fft[0] * n_fft[1]))
     d[:, 0] *= 0.5
     d[:, :, h_x - 1] *= 0.5
@@ -151,9 +151,9 @@ def make_plan(
         if mapping.matrix[0, 0] == 0:
             axes, nu = (1, 0), nu[::-1]
             d_plus, d_minus = d_plus.swapaxes(1, 2), d_minus.swapaxes(1, 2).conj()
-        tables = _aligned_tables(mapping, nu, axes, center)
+        tables = aligned_tables(mapping, nu, axes, center)
     in_y, in_x = (
-        _waves(nu[i], np.arange(mapping.shape_in[axes[i]]) - center[axes[i]]).T for i in (0, 1)
+        waves(nu[i], np.arange(mapping.shape_in[axes[i]]) - center[axes[i]]).T for i in (0, 1)
     )
     return Plan(
         mapping=mapping,
@@ -254,70 +254,3 @@ def _half_count(matrix, spacing: float, axis: int, n_fft: int) -> int:
     """Frequencies kappa >= 0 inside the bounding box of |A^T nu|_inf <= 1/(2 spacing)."""
     reach = np.abs(np.linalg.inv(matrix).T[axis]).sum() * 0.5 / spacing
     return min(int(np.floor(reach * n_fft * (1 + 1e-12))), (n_fft - 1) // 2) + 1
-
-
-def _waves(nu, x) -> np.ndarray:
-    """Columns 2i, 2i+1: cos and sin of 2 pi nu_i x (..., 2 len(nu)) for positions x (...)."""
-    return cos_sin_columns(2 * np.pi * np.asarray(x)[..., None] * nu)
-
-
-def _aligned_tables(mapping: Mapping, nu, axes, center):
-    """Waves at the observed rows and columns, zero where the model does not cover them."""
-    tables = []
-    for i in (0, 1):
-        axis = axes[i]
-        x = mapping.matrix[axis, i] * np.arange(mapping.shape_out[i]) + mapping.offset[axis]
-        covered = mapping.covered.any(axis=1 - i)
-        tables.append(_waves(nu[i], x - center[axis]) * covered[:, None])
-    return {"out_y": tables[0], "out_x": tables[1].T}
-
-
-def _distorted_tables(mapping: Mapping, nu, center):
-    """Waves at every observed pixel, with the pixel's own area; zero where it is not covered."""
-    scale = mapping.covered * (1.0 if mapping.area is None else mapping.area)
-    y, x = np.moveaxis(mapping.at(*np.indices(mapping.shape_out)), -1, 0)
-    return {
-        "out_y": _waves(nu[0], y.ravel() - center[0]) * scale.reshape(-1, 1),
-        "out_x": _waves(nu[1], x.ravel() - center[1]),
-    }
-
-
-def _line_tables(mapping: Mapping, nu, d, center, window: KaiserBessel):
-    """Observed rows (or columns) as lines y = y0 + r x through the model, and pass 2 along them.
-
-    Along a line a plane wave has the single frequency nu_x + r nu_y; columns finer than its Nyquist
-    spacing by window.oversampling carry it, divided by the window's transform.  Returns
-    (tables, d).
-    """
-    slope = np.abs(mapping.matrix[1]) / np.linalg.norm(mapping.matrix, axis=0)
-    by_row = slope[1] >= slope[0]
-    i_line, i_step = (0, 1) if by_row else (1, 0)
-    (a, b), (c, e) = mapping.matrix[:, [i_line, i_step]]
-    n_lines, n_steps = mapping.shape_out[i_line], mapping.shape_out[i_step]
-    r = b / e
-    t_y, t_x = mapping.offset - center
-    covered = mapping.covered if by_row else mapping.covered.T
-
-    nu_x_both = np.concatenate([-nu[1][:0:-1], nu[1]])
-    along = nu_x_both + r * nu[0][:, None]
-    nu_max = max(np.abs(along[(d != 0).any(axis=0)]).max(), np.finfo(float).tiny ** 0.5)
-    spacing = min(1 / (2 * nu_max * window.oversampling), float(max(mapping.shape_in)))
-    d = d / window.transform(along * spacing)
-
-    x = c * np.arange(n_lines)[:, None] + e * np.arange(n_steps) + t_x
-    x_first, x_last = x[covered].min(), x[covered].max()
-    u = (x - x_first) / spacing + window.n_taps / 2
-    n_columns = int(np.ceil((x_last - x_first) / spacing)) + window.n_taps + 1
-    columns = x_first + (np.arange(n_columns) - window.n_taps / 2) * spacing
-
-    below = np.floor(u - window.n_taps / 2)
-    start = np.where(covered, below.astype(int) + 1, 0)
-    weight = window.taps(u - window.n_taps / 2 - below) * covered[:, :, None]
-    start_t, weight_t = transpose_taps(start, weight, covered, n_columns)
-    y0 = (a - r * c) * np.arange(n_lines) + t_y - r * t_x
-    return {
-        "out_y": _waves(nu[0], y0),
-        "out_x": _waves(nu[1], columns).T,
-        "twist": 2 * np.pi * np.outer(nu[0], r * columns),
-        "lines": LineTaps(bool(by_row), start, weight.swapaxes(1, 2), start_t, weight_t),
-    }, d

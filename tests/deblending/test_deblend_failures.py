@@ -77,10 +77,10 @@ def test_failures_of_the_device_and_of_results(device, monkeypatch):
             raise DeviceError("no memory for so many")
         original(self, scenes, *arguments, **options)
 
-    def third(self):
+    def third(self, seen):
         if self.blend is blends[2]:
             raise np.linalg.LinAlgError("Matrix is not positive definite")
-        return result(self)
+        return result(self, seen)
 
     monkeypatch.setattr(Engine, "__init__", small)
     monkeypatch.setattr(Fit, "result", third)
@@ -153,7 +153,7 @@ def test_ctrl_c_between_fits_loses_nothing(device, monkeypatch, where):
     original = getattr(Fit, where)
 
     def interrupted(self, *arguments, **options):
-        if (arguments[0] if arguments else self.blend) is blends[3]:
+        if (self.blend if where == "result" else arguments[0]) is blends[3]:
             raise KeyboardInterrupt
         return original(self, *arguments, **options)
 

@@ -17,11 +17,13 @@ class Aim:
     """Renderers for the boxes of slots, one observation of each of B scenes.
 
     views (B): WhitenedViews; precision: of the operators
-    tolerance: part of the PSF's light beyond windows; 0: as little as beyond those of whole frames
+    tolerance: part of the PSF's light beyond windows; 0: as little as beyond those of whole frames,
+        and these are seen by the view's own operator
     """
 
     def __init__(self, views, device, dtype, precision: Precision, tolerance):
         self.views, self.device, self.dtype, self.precision = views, device, dtype, precision
+        self._exact = not tolerance
         self._plans = plans = [v.op.plans[0] for v in views]
         self._alike = np.unique([id(v.op) for v in views], return_inverse=True)[1]
         self._distorted = np.array([p.geometry == "distorted" for p in plans])
@@ -33,9 +35,8 @@ class Aim:
         """Slots that share a plan: first, last + 1, their Renderer, or None where nothing is near,
         first pixels (m, 2) of their windows, and by how much (m, 2) [model px] the pixels are off
         the plan's."""
-        # on distorted pixels each place has its own plan, but for boxes that are the whole frame:
-        # these are seen by the view's own operator
-        whole = (slots.size == self.views[0].op.shape_in[1:]).all(axis=1)
+        # on distorted pixels each place has its own plan
+        whole = (slots.size == self.views[0].op.shape_in[1:]).all(axis=1) & self._exact
         alone = self._distorted[slots.scene] & ~whole
         key = np.where(alone, -1 - np.arange(len(slots)), self._alike[slots.scene])
         for first, last in slots.runs(key):

@@ -20,11 +20,12 @@ def equations(looking):
     cross = np.zeros((k, looking.n_channels, n + 1, n, p))
     rest = np.zeros((k, looking.n_channels, n + 1))
     known = np.arange(p) < (looking.slots.n_images - 1)[:, None]  # (slots, p)
-    for sight, (pairs, where), sums in zip(
+    for sight, (table, on_device), sums in zip(
         looking.sights, looking.pairs, looking.sums, strict=True
     ):
         c, channels = np.arange(looking.n_channels)[sight.channels][None], sight.channels
-        gram, pull = sight.gram(pairs, where, 1 + p), sight.pull(1 + p)
+        gram, pull = sight.gram(on_device, 1 + p), sight.pull(1 + p)
+        pairs = table[:, :2]
         a = looking.spectra[looking.at][:, channels]
         (i, j), b = own[pairs].T, rows[pairs[:, 0]]
         one, other = pairs.T

@@ -104,11 +104,11 @@ class Looking:
         normal = np.zeros((len(self.scenes), self.n_channels, n + 1, n + 1))
         right = np.zeros(normal.shape[:3])
         own = self.index[self.at]
-        for sight, (pairs, where), sums in zip(self.sights, self.pairs, self.sums, strict=True):
+        for sight, (table, pairs), sums in zip(self.sights, self.pairs, self.sums, strict=True):
             channels = np.arange(self.n_channels)[sight.channels]
-            gram, pull = sight.gram(pairs, where, 1)[..., 0, 0], sight.pull(1)[:, :, 0]
-            (i, j), c = own[pairs].T[:, :, None], channels[None]
-            b = rows[pairs[:, 0], None]
+            gram, pull = sight.gram(pairs, 1)[..., 0, 0], sight.pull(1)[:, :, 0]
+            (i, j), c = own[table[:, :2]].T[:, :, None], channels[None]
+            b = rows[table[:, 0], None]
             normal[b, c, i, j] = normal[b, c, j, i] = gram
             right[rows[:, None], c, own[:, None]] = pull[..., 0]
             normal[rows[:, None], c, own[:, None], n] = pull[..., 1]
@@ -132,11 +132,11 @@ class Looking:
         where it sees nothing; sky (B, C)."""
         spectra = np.zeros((len(self.slots), self.n_channels))
         out = np.zeros((len(self.components), self.n_channels))
-        for sight, (pairs, where) in zip(self.sights, self.pairs, strict=True):
+        for sight, (table, pairs) in zip(self.sights, self.pairs, strict=True):
             sight.compare(self.scenes, self.slots, spectra, sky, 0.0)
-            alone = pairs[:, 0] == pairs[:, 1]
+            alone = table[:, 0] == table[:, 1]
             size = np.zeros((len(self.slots), sight.n_bands))
-            size[pairs[alone, 0]] = np.sqrt(sight.gram(pairs[alone], where[alone], 1)[..., 0, 0])
+            size[table[alone, 0]] = np.sqrt(sight.gram(pairs, 1)[alone][..., 0, 0])
             light = sight.pull(1)[:, :, 0, 0]
             found = np.divide(light, size, out=np.zeros_like(light), where=size > 0)
             out[self.at, sight.channels] = found

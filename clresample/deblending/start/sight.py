@@ -32,6 +32,7 @@ class Sight:
         self.sums = device.empty((*shape[:3], 3), dtype)
         self.aim = Aim(views, device, dtype, precision, tolerance)
         self.n_elements = self.n_pixels = 0
+        self._listed = None  # of the scenes last compared, on the device
 
     def _launch(self, name, size, *, local_size=None, **arguments):
         """Queue a kernel of start.cl; K of them: images of a slot that are summed."""
@@ -58,6 +59,7 @@ class Sight:
         begin, n = ends_of(slots.n_images * self.n_bands * size.prod(axis=1))
         self.place = np.column_stack([slots.scene, low, size, slots.n_images, begin])
         self.place_on_device = self.device.put(self.place.astype(np.int32))
+        self._listed = None
         self.n_elements, self.seen = n, self.device.empty(n, self.dtype)
         for first, renderer, n_images, moves in jobs:
             at = int(slots.begin[first]), int(begin[first])
@@ -75,25 +77,24 @@ class Sight:
         )
 
     def compare(self, scenes, slots, spectra, sky, error):
-        """Residuals and weights of some scenes (k,), and sums (k, Co, 3) over the pixels.
+        """Residuals and weights of the scenes (k,) of the slots seen last, and sums (k, Co, 3) over
+        the pixels.
 
         spectra (slots, C), sky (B, C): of the model; error: part of the model that adds to the
         noise
         """
-        by_scene = np.argsort(slots.scene, kind="stable")
-        ends = np.searchsorted(slots.scene[by_scene], [*scenes, len(self.views)])
-        counts = np.searchsorted(slots.scene[by_scene], scenes, side="right")
-        listed = [by_scene[a:b] for a, b in zip(ends[:-1], counts, strict=True)]
-        first = np.cumsum([0, *map(len, listed)])
         put = self.device.put
+        if self._listed is None:
+            self._listed = [put(x.astype(np.int32)) for x in _listed(slots, scenes)]
+        scenes_on_device, first, listed = self._listed
         launch = self.device.launcher(
             FILE, "compare", dtype=self.dtype, local_size=self.tuning.local_size(3)
         )
         launch(
             (self.my, self.n_bands, len(scenes)),
-            scenes=put(np.asarray(scenes, np.int32)),
-            first=put(first.astype(np.int32)),
-            listed=put(np.concatenate([*listed, [0]]).astype(np.int32)),
+            scenes=scenes_on_device,
+            first=first,
+            listed=listed,
             place=self.place_on_device,
             n_bands=self.n_bands,
             my=self.my,
@@ -113,15 +114,16 @@ class Sight:
         return self.device.get(self.sums).astype(np.float64).sum(axis=2)[scenes]
 
     def pairs(self):
-        """Slots (pairs, 2), a <= b, of one scene whose windows meet on the observation, and where:
-        first pixel and size (pairs, 4). A slot that sees none of it is not there."""
+        """A table (pairs, 6) of slots a <= b of one scene whose windows meet on the observation, and
+        where: first pixel and size; NumPy's, and on the device. A slot that sees nothing is not
+        there."""
         table = _pairs(self.place, (self.my, self.mx))
         self.n_pixels += int(table[:, 4:].prod(axis=1).sum())
-        return table[:, :2], table[:, 2:]
+        return table, self.device.put(table.astype(np.int32))
 
-    def gram(self, pairs, where, n_images):
-        """Products (pairs, Co, K, K) of the pairs' images, under the present weights; K = n_images,
-        of which images that a slot does not have repeat its last."""
+    def gram(self, pairs, n_images):
+        """Products (pairs, Co, K, K) of pairs' images, under the present weights; K = n_images, of
+        which images that a slot does not have repeat its last. pairs: a table on the device"""
         out = self.device.empty((len(pairs), self.n_bands, n_images, n_images), self.dtype)
         if len(pairs):
             group = self.tuning.sum_group
@@ -130,7 +132,7 @@ class Sight:
                 (group, self.n_bands, len(pairs)),
                 local_size=(group, 1, 1),
                 K=n_images,
-                pairs=self.device.put(np.column_stack([pairs, where]).astype(np.int32)),
+                pairs=pairs,
                 place=self.place_on_device,
                 seen=self.seen,
                 weight=self.weight,
@@ -157,8 +159,18 @@ class Sight:
         return self.device.get(out).astype(np.float64)
 
 
+def _listed(slots, scenes):
+    """Scenes (k,), where each one's slots begin (k + 1,) in a list, and the list, not empty."""
+    by_scene = np.argsort(slots.scene, kind="stable")
+    begin, end = (
+        np.searchsorted(slots.scene[by_scene], scenes, side) for side in ("left", "right")
+    )
+    listed = [by_scene[a:b] for a, b in zip(begin, end, strict=True)]
+    return np.asarray(scenes), np.cumsum([0, *map(len, listed)]), np.concatenate([*listed, [0]])
+
+
 def _pairs(place, shape):
-    """`Sight.pairs` of windows on an observation of this shape, in one table (pairs, 6)."""
+    """`Sight.pairs` of windows on an observation of this shape."""
     low = np.maximum(place[:, 1:3], 0)
     high = np.minimum(place[:, 1:3] + place[:, 3:5], shape)
     found = []
