@@ -1,20 +1,27 @@
 """The start's normal equations, boxes and least squares, against whole frames, NumPy and scipy."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
+from helpers.geometries import GEOMETRIES, ONE_OF_EACH, operator
 from helpers.scenes import GALAXIES, SHAPE, frame, observe, sources
 from helpers.start import rendered, view, views
 from scipy.optimize import lsq_linear
 
+from clresample.deblending.profiles import Star
 from clresample.deblending.spectra import inverse, non_negative
 from clresample.deblending.start import profile_fit, start as start_module
 from clresample.deblending.start.equations import equations
 from clresample.deblending.start.looking import looking_at
 from clresample.deblending.start.profile_fit import ProfileFit
+from clresample.deblending.start.slots import Component
 from clresample.deblending.start.start import Patch
+from clresample.deblending.view import WhitenedView
 from clresample.resampling.cache import cached_resampler
 from clresample.resampling.plan import Precision
-from clresample.sky.extent import box_slices
+from clresample.sky.extent import box_slices, shared_part
+from clresample.sky.psf import PSF
 from clresample.sky.sources import Point
 
 FLUX = (100.0, 80.0, 90.0)
@@ -128,6 +135,53 @@ def reference(whole, v, looking, fit_sky):
             side = side + (columns * weight) @ rest - solved.T @ ((lit * weight) @ rest)
             channel += 1
     return matrix, side
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.37, -0.61)])
+@pytest.mark.parametrize("name", ONE_OF_EACH)
+def test_windows_show_what_the_whole_operator_shows(device, name, shift):
+    """Of every geometry: images in boxes, as the operator of the whole frame renders them."""
+    mapping, dtype = GEOMETRIES[name](), np.float64 if device.has_fp64 else np.float32
+    psf_in, psf_out = PSF.gaussian(1.3, n_pixels=15), PSF.gaussian([1.4, 1.5], n_pixels=21)
+    op = operator(device, mapping, psf_in, psf_out, dtype)
+    op.shift = shift
+    rng, shape = np.random.default_rng(0), op.shape_out
+    v = [view_of(op, np.ones(shape), rng.normal(size=shape))]
+    home = Home(mapping.shape_in, psf_in)
+    places = np.array([(0.4, 0.45), (0.7, 0.3)]) * mapping.shape_in
+    components = [
+        Component(0, i, Star(home, free=True), p, home.shape) for i, p in enumerate(places)
+    ]
+    looking = looking_at([v], components, Precision.of(dtype), 0.0, fit_sky=False)
+    thetas = [np.zeros(2)] * 2
+    looking.look([0], thetas, np.full(2, 1.0), slopes=True, whiten=False)
+    (sight,) = looking.sights
+    assert (looking.slots.size < home.shape).any()
+    seen = device.get(sight.seen)
+    for row, i in enumerate(looking.at):
+        _, y0, x0, wy, wx, n, begin = sight.place[row]
+        found = seen[begin : begin + n * sight.n_bands * wy * wx].reshape(n, -1, wy, wx)
+        box = box_slices(looking.slots.origin[row], looking.slots.size[row])
+        images = np.zeros((n, *home.shape))
+        images[:, *box] = components[i].shape.draw(thetas[i], places[i])[:, *box]
+        wanted = op.render(images.astype(dtype))
+        inside, there = shared_part((0, 0), shape[1:], (y0, x0), (wy, wx))
+        whole = np.zeros_like(wanted)
+        whole[:, :, *inside] = found[:, :, *there]
+        away = np.abs(np.where(op.covered, whole - wanted, 0)).max(axis=(1, 2, 3))
+        assert (away < 1e-3 * np.abs(wanted).max(axis=(1, 2, 3))).all()
+
+
+def view_of(op, root, data):
+    return WhitenedView(op, op.mapping, op.covered, np.ones(len(data)), root, data)
+
+
+@dataclass(frozen=True)
+class Home:
+    """Of a Frame, what a Star takes."""
+
+    shape: tuple
+    psf: PSF
 
 
 @pytest.mark.parametrize("n_scenes", [1, 2])
