@@ -108,10 +108,6 @@ class Resampler(GridOperator):
         """Whether it returns its input bit for bit: same pixels, same PSF, no shift."""
         return self._identity
 
-    def executor(self) -> Executor:
-        """What computes it, with intermediates of its own; for callers that work between stages."""
-        return self._executor.apart()
-
     @property
     def n_bytes(self) -> int:
         """Device memory of tables, intermediates and arrays for NumPy callers [bytes], roughly."""
