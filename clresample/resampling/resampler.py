@@ -101,14 +101,14 @@ class Resampler(GridOperator):
         make = functools.partial(type(self).from_plans, dtype=self.dtype, device=self.device)
         return functools.partial(make, shift=self._shift), (self.plans,)
 
+    def executor(self) -> Executor:
+        """What computes it, with intermediates of its own; for callers that work between stages."""
+        return self._executor.apart()
+
     @property
     def is_identity(self) -> bool:
         """Whether it returns its input bit for bit: same pixels, same PSF, no shift."""
         return self._identity
-
-    def executor(self) -> Executor:
-        """What computes it, with intermediates of its own; for callers that work between stages."""
-        return self._executor.apart()
 
     @property
     def n_bytes(self) -> int:

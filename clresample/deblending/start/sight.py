@@ -114,9 +114,9 @@ class Sight:
         return self.device.get(self.sums).astype(np.float64).sum(axis=2)[scenes]
 
     def pairs(self):
-        """A table (pairs, 6) of slots a <= b of one scene whose windows meet on the observation,
-        and where: first pixel and size; NumPy's, and on the device. A slot that sees nothing is
-        not there."""
+        """A table (pairs, 6) of slots a <= b of one scene whose windows meet on the pixels, and
+        where: first pixel and size; NumPy's, and on the device. A slot that sees nothing is not
+        there."""
         table = _pairs(self.place, (self.my, self.mx))
         self.n_pixels += int(table[:, 4:].prod(axis=1).sum())
         return table, self.device.put(table.astype(np.int32))
