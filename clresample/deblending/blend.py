@@ -52,7 +52,7 @@ class Blend:
                 f"the model frame has {frame.shape[0]} x {frame.shape[1]} pixels, more than the "
                 f"{MOST_PIXELS} of one fit: are the WCS right? If so, cut the field into blends"
             )
-        n = sum(getattr(source, "n_components", 1) for source in self.sources)
+        n = sum(getattr(source, "n_components", 1) or 1 for source in self.sources)
         n_seen = max(int(np.count_nonzero(o.weights, axis=(1, 2)).max()) for o in self.observations)
         if n > n_seen > 0:
             raise ValueError(

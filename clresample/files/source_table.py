@@ -23,9 +23,10 @@ def read_sources(path, columns=None) -> tuple:
     path: a file that `astropy.table.Table.read` takes
     columns: {what: column's name} for ra, dec [deg, or the column's own unit], y, x [px, counted
         from 0], observation (in whose pixels y and x count; none or "" = in the model's), name,
-        type ("point" or "extended"), components (how many spectra an extended source has); and
+        type ("point" or "extended"), components (how many spectra an extended source has; masked
+            = as many as the data show); and
         format: astropy's name of it. What is left out is looked for under its own name
-    returns a tuple of Point and Extended; sources without a type are extended, with one component
+    returns a tuple of Point and Extended; sources without a type are extended
 
     Raises ValueError, one line that names file, column and row.
     """
@@ -109,7 +110,8 @@ def _source(found, i, given):
     kind = str(found["type"][i]).strip().lower() if "type" in found else "extended"
     if kind not in KINDS:
         raise ValueError(f"type is {kind!r}, it takes {' or '.join(KINDS)}")
-    if kind == "extended" and "components" in found:
+    chosen = "components" in found and found["components"][i] is not np.ma.masked
+    if kind == "extended" and chosen:
         given["n_components"] = _whole("components", found["components"][i])
     return KINDS[kind](**given)
 

@@ -115,6 +115,8 @@ class Extended(Source):
 
     For the position see `Source`.
 
+    n_components: None = one, or two where the data show clearly that the galaxy's core has another
+        colour than the rest; this takes a fit with a LearnedPrior, others have one
     profile (Ny, Nx) [1]: what its one morphology is expected to look like under the model's PSF, on
         the frame's pixels, non-negative; None = a smooth profile fitted to the data
     """
