@@ -16,6 +16,7 @@ from ..device.workers import deal
 from ..sky.given.checks import float_type, instance
 from ..sky.sources import SourceWarning
 from .blend import INTERRUPTED, Blend, Failure
+from .components.second import with_second
 from .fit import Fit, begin, data_bytes, finish, scene_bytes
 from .iterate import iterate
 from .result import Result
@@ -69,6 +70,8 @@ def deblend(
     if len(fit.dark):
         _warn_dark([fit.dark], "")
     iterate([fit], settings, device, dtype, progress)
+    if fit.status != INTERRUPTED:
+        (fit,) = with_second([fit], settings, device, dtype, progress)
     return fit.result(*finish([fit]))
 
 
@@ -200,9 +203,12 @@ class _ManyFits:
 
     def _try(self, group):
         """Yield (index, Result or Failure) of a group; one by one where all at once fails."""
+        fits, run = [fit for _, fit in group], (self.settings, self.device, self.dtype)
         try:
-            iterate([fit for _, fit in group], self.settings, self.device, self.dtype)
-            seen = finish([fit for _, fit in group])
+            iterate(fits, *run)
+            if not any(fit.status == INTERRUPTED for fit in fits):
+                fits = with_second(fits, *run)
+            seen = finish(fits)
         except Exception as error:
             if len(group) == 1:
                 yield group[0][0], _failure(group[0][1].blend, error)
@@ -212,7 +218,7 @@ class _ManyFits:
                 if item[1].status == INTERRUPTED:
                     return
             return
-        for (i, fit), own in zip(group, seen, strict=True):
+        for (i, _), fit, own in zip(group, fits, seen, strict=True):
             try:
                 yield i, fit.result(own)
             except Exception as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,7 +69,7 @@ class Fit:
             for o in blend.observations
         ]
         if private:
-            self._shift(shifts)
+            self.shift(shifts)
         for o, view in zip(blend.observations, self.views, strict=True):
             self.messages += [f"{o.label}: {line}" for line in noise_warnings(view.op.certificate)]
         if not any(view.root.any() for view in self.views):
@@ -102,19 +103,29 @@ class Fit:
         self.scene, self.state = first_scene(self)
         self.seconds["setup"] += seconds + time.perf_counter() - began
 
+    def again(self, start) -> Fit:
+        """A fit of the same views, where the shifts are by now, from another StartingPoint."""
+        new = copy(self)
+        new.start = start
+        new.scene, new.state = first_scene(new)
+        new.losses, new.status, new.findings = [], "iteration limit", None
+        new.messages, new.seconds = list(self.messages), {}
+        new._best = _Best(np.inf, None, None, self.shifts)
+        return new
+
     @property
     def shifts(self) -> np.ndarray:
         """Present shifts (n_observations, 2) [model px] of the observations' pixels."""
         return np.array([view.op.shift for view in self.views])
 
-    def _shift(self, shifts):
+    def shift(self, shifts):
         """Move the observations' pixels to these shifts."""
         for view, shift in zip(self.views, shifts, strict=True):
             view.op.shift = shift
 
     def move(self, scene, state):
         """Shift the observations to where the model, as it is by now, fits each of them best."""
-        self._shift(self.shifts + shift_steps(scene, state))
+        self.shift(self.shifts + shift_steps(scene, state))
 
     def stopped(self, losses) -> bool:
         """Take the losses (n,) of the last iterations; whether the fit ends here, and why."""
@@ -149,7 +160,7 @@ class Fit:
         elif best.state is not None:
             loss, self.scene, self.state = best.loss, best.scene, best.state
             if not np.array_equal(best.shifts, self.shifts):
-                self._shift(best.shifts)
+                self.shift(best.shifts)
         else:
             return
         self.losses.append(float(loss))

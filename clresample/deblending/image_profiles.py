@@ -42,7 +42,9 @@ def with_image_profiles(blend: Blend, *, device=None) -> Blend:
     sources = list(blend.sources)
     for i in np.flatnonzero(inside):
         source = sources[i]
-        if isinstance(source, Extended) and source.n_components == 1 and source.profile is None:
+        if not isinstance(source, Extended) or source.n_components not in (None, 1):
+            continue
+        if source.profile is None:
             profile = _profile(frame.shape, positions[i], [views[k] for k in order], device)
             sources[i] = replace(source, profile=profile)
     return replace(blend, sources=tuple(sources), frame=frame)

@@ -255,5 +255,5 @@ def components_of(source, frame):
         return [Star(frame, free=source.free)]
     if isinstance(source, Extended) and source.profile is not None:
         return [Given(source.profile)]
-    n = source.n_components if isinstance(source, Extended) else 1
+    n = (source.n_components if isinstance(source, Extended) else None) or 1
     return [Galaxy(frame, i, n) for i in range(n)]

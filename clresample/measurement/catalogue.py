@@ -67,6 +67,8 @@ def catalogue(result, *, magnitudes=False) -> QTable:
         flags: sum of `Flag`
         snr: signal to noise of all C channels together, sqrt(sum_c flux_c^2 / variance_c), which
             is about sqrt(C) where there is no source
+        n_components: of morphology and spectrum, of which the source is the sum; two where the data
+            show that its core has another colour, see `Extended`
         *_centroid: the same positions, of the fitted light
         size [arcsec], e1, e2, angle [deg]: see `shapes.shape`. They are those of the model under
             the model's PSF, not deconvolved; a source's components are weighted by their flux, that
@@ -97,6 +99,7 @@ def catalogue(result, *, magnitudes=False) -> QTable:
     with np.errstate(divide="ignore", invalid="ignore"):
         table["snr"] = np.sqrt(np.nansum((flux / error) ** 2, axis=1))
     table["snr"][~fitted_sources(result)] = np.nan
+    table["n_components"] = _counts(result)
     _add_shapes(table, result, error)
     scale, unit = flux_scale(result)
     for i, channel in enumerate(result.channels):
@@ -113,6 +116,12 @@ def catalogue(result, *, magnitudes=False) -> QTable:
         table[f"residual_{channel}"] = values
     table["flags"][misfits(worst)] |= Flag.MISFIT
     return table
+
+
+def _counts(result):
+    """Components (S,) of each source."""
+    owner = np.array([c.source for c in result.components], int)
+    return np.bincount(owner, minlength=len(result.sources))
 
 
 def _add_positions(table, grid, positions, suffix):

@@ -121,15 +121,16 @@ class Extended(Source):
         the frame's pixels, non-negative; None = a smooth profile fitted to the data
     """
 
-    n_components: int = 1
+    n_components: int | None = None
     profile: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self):
         super().__post_init__()
-        whole("n_components", self.n_components, 1)
+        n_components = 1 if self.n_components is None else self.n_components
+        whole("n_components", n_components, 1)
         if self.profile is None:
             return
-        if self.n_components > 1:
+        if n_components > 1:
             raise ValueError(
                 f"profile is given for n_components = {self.n_components}: it serves one component"
             )

@@ -36,7 +36,7 @@ def test_galaxies_are_found(plain):
         error = np.linalg.norm(model - want, axis=(1, 2)) / np.linalg.norm(want, axis=(1, 2))
         assert error.max() < 0.05
     assert plain.covariance.shape == (3, 2, 2) and not plain.sky.any() and not plain.messages
-    assert set(plain.seconds) == {"setup", "fit", "result", "errors"}
+    assert set(plain.seconds) == {"setup", "fit", "components", "result", "errors"}
 
 
 def test_observations_are_checked_and_mapped_once(device, monkeypatch):

@@ -108,7 +108,8 @@ def test_two_components_of_one_source(device):
     disk, bulge = ((15.0, 18.0), (500, 1000, 200), 3.0), ((15.0, 18.0), (600, 100, 900), 1.0)
     b = blend((disk, bulge))
     both = Extended(position_px=(15, 18), n_components=2)
-    one = deblend(b.observations, [Extended(position_px=(15, 18))], frame=b.frame, device=device)
+    single = Extended(position_px=(15, 18), n_components=1)
+    one = deblend(b.observations, [single], frame=b.frame, device=device)
     two = deblend(b.observations, [both], frame=b.frame, device=device)
     assert [c.source for c in two.components] == [0, 0]
     np.testing.assert_allclose(sum(c.flux for c in two.components), (1100, 1100, 1100), rtol=0.03)

@@ -22,8 +22,8 @@ from .strengths import Strengths
 from .structure import Structure, coarse
 from .vectors import Vectors
 
-# Pairs of changes that a scene remembers: 10 take 10 to 20 % more iterations, 40 hardly fewer.
-N_PAIRS = 20
+# Pairs of changes that a scene remembers: 20 take 5 % more iterations, 10 another 10 to 20 %.
+N_PAIRS = 30
 # Part of the largest power of a source in any channel under which a channel holds nothing of it.
 UNSEEN = 1e-14
 
@@ -32,7 +32,8 @@ class LearnedEngine:
     """A batch of scenes of one signature on the device, under a LearnedPrior.
 
     scenes, states: of the scenes at their start: structure begins at 0, on the profiles
-    enough: a scene has converged when its loss fell by less than this over 5 iterations
+    enough: a scene has converged when its loss fell by less than this over some
+        iterations, see progress.py
     past: another engine and the indices (n,) of its scenes that go on here, which are `scenes`
 
     progress: the scenes' Progress; strengths: their sources' Strengths

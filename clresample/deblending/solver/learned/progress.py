@@ -18,7 +18,7 @@ FIRST, EVERY, SETTLED = 16, 8, 0.1
 # A fit has converged when its strengths have settled and its loss fell by less than `enough` over
 # so many iterations; by that times chi2 per pixel where that is above 1, since a model that misfits
 # so knows its fluxes less well by its root.
-PATIENCE = 5
+PATIENCE = 10
 
 
 class Progress:

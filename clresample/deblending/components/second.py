@@ -1,0 +1,122 @@
+"""Second components for sources with a gradient of colour, kept where the fit gains by them."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from ...sky.sources import Extended
+from ..blend import INTERRUPTED
+from ..iterate import iterate
+from ..start.start import Patch, start
+from .gradients import ask
+
+# What a second component must lower the loss by, for each number that it adds: a spectrum and a
+# profile's four. Half a unit each is what noise alone gives.
+LEAST_GAIN = 1.0
+N_PROFILE = 4
+
+
+def with_second(fits, settings, device, dtype, progress=None):
+    """What to keep of finished Fits: each itself, or a second one with more components.
+
+    fits: of one signature; settings, device, dtype: theirs; progress: see `deblend`
+    returns Fits, in the order of `fits`
+    """
+    kept, began = list(fits), time.perf_counter()
+    try:
+        again = _begun(fits)
+    except Exception as error:
+        _note(fits, error)
+        return kept
+    for fit in fits:
+        fit.note_seconds("components", (time.perf_counter() - began) / len(fits))
+    if not again:
+        return kept
+    shifts = {i: fits[i].shifts for i in again}
+    try:
+        iterate(list(again.values()), settings, device, dtype, _after(fits, progress))
+    except Exception as error:
+        _note([fits[i] for i in again], error)
+        for i, second in again.items():
+            second.shift(shifts[i])
+        return kept
+    for i, second in again.items():
+        if second.status != INTERRUPTED and _is_better(second, kept[i]):
+            kept[i] = _following(second, kept[i])
+            continue
+        second.shift(shifts[i])
+        if second.status == INTERRUPTED:
+            kept[i].interrupt()
+    return kept
+
+
+def _note(fits, error):
+    """Say in the messages of fits what kept them from second components."""
+    for fit in fits:
+        fit.messages.append(f"second components could not be fitted: {error}")
+
+
+def _begun(fits):
+    """{index: a Fit at its start} of the scenes with sources that clearly need two components."""
+    asked = {i: one for i, one in enumerate(ask(fits)) if one is not None and len(one.clear)}
+    if not asked:
+        return {}
+    points = start([_patch(fits[i], one) for i, one in asked.items()])
+    return {
+        i: fits[i].again(_joined(fits[i].start, point, one.clear))
+        for (i, one), point in zip(asked.items(), points, strict=True)
+    }
+
+
+def _patch(fit, asked):
+    """The Patch of the sources that need two components, all others' light taken off the data."""
+    chosen, begin = asked.clear, fit.start
+    spectra = fit.state.spectra.copy()
+    spectra[chosen] = 0
+    views = []
+    for view, seen, part in zip(fit.views, asked.observed, fit.scene.channels(), strict=True):
+        others = seen.total(spectra[:, part]) + fit.state.sky[part, None, None]
+        views.append(replace(view, data=view.data - others))
+    positions = begin.positions[begin.source[chosen]]
+    sources = [Extended(position_px=tuple(map(float, p)), n_components=2) for p in positions]
+    return Patch(fit.frame, sources, positions, views)
+
+
+def _joined(begin, point, chosen):
+    """A StartingPoint with the components of `point`, two each, in place of those `chosen` (k,)."""
+    order = []
+    for i in range(len(begin)):
+        own = 2 * np.flatnonzero(chosen == i)
+        order += [(point, own[0]), (point, own[0] + 1)] if len(own) else [(begin, i)]
+    source = [begin.source[chosen[k // 2]] if p is point else begin.source[k] for p, k in order]
+    parts = {
+        name: [getattr(p, name)[k] for p, k in order]
+        for name in ("shapes", "thetas", "places", "peaks", "spectra", "power")
+    }
+    arrays = {name: np.array(parts[name]) for name in ("places", "peaks", "spectra", "power")}
+    return replace(begin, source=np.array(source), **(parts | arrays))
+
+
+def _following(second, first):
+    """The second fit, with the time of both."""
+    for stage, seconds in first.seconds.items():
+        second.note_seconds(stage, seconds + second.seconds.get(stage, 0.0))
+    return second
+
+
+def _is_better(second, first):
+    """Whether more components lower the loss by more than their numbers cost."""
+    n_more = len(second.state.morph) - len(first.state.morph)
+    n_numbers = n_more * (N_PROFILE + first.state.spectra.shape[1])
+    return second.losses[-1] < first.losses[-1] - LEAST_GAIN * n_numbers
+
+
+def _after(fits, progress):
+    """`progress`, with the iterations of the first fits counted."""
+    if progress is None:
+        return None
+    n_first = max(len(fit.losses) for fit in fits)
+    return lambda n_steps, loss: progress(n_first + n_steps, loss)
