@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,16 +101,6 @@ class Fit:
         self.messages += [_dark_message(i, self._positions[i]) for i in self.dark]
         self.scene, self.state = first_scene(self)
         self.seconds["setup"] += seconds + time.perf_counter() - began
-
-    def again(self, start) -> Fit:
-        """A fit of the same views, where the shifts are by now, from another StartingPoint."""
-        new = copy(self)
-        new.start = start
-        new.scene, new.state = first_scene(new)
-        new.losses, new.status, new.findings = [], "iteration limit", None
-        new.messages, new.seconds = list(self.messages), {}
-        new._best = _Best(np.inf, None, None, self.shifts)
-        return new
 
     @property
     def shifts(self) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from ...sky.sources import Extended
 from ..blend import INTERRUPTED
 from ..iterate import iterate
+from ..start.first_scene import first_scene
 from ..start.start import Patch, start
 from .gradients import ask
 
@@ -66,9 +68,19 @@ def _begun(fits):
         return {}
     points = start([_patch(fits[i], one) for i, one in asked.items()])
     return {
-        i: fits[i].again(_joined(fits[i].start, point, one.clear))
+        i: _again(fits[i], _joined(fits[i].start, point, one.clear))
         for (i, one), point in zip(asked.items(), points, strict=True)
     }
+
+
+def _again(fit, point):
+    """A fit of the same views, where their shifts are by now, from another StartingPoint."""
+    new = copy(fit)
+    new.start = point
+    new.scene, new.state = first_scene(new)
+    new.losses, new.status, new.findings = [], "iteration limit", None
+    new.messages, new.seconds = list(fit.messages), {}
+    return new
 
 
 def _patch(fit, asked):
