@@ -120,10 +120,19 @@ def _following(second, first):
 
 
 def _is_better(second, first):
-    """Whether more components lower the loss by more than their numbers cost."""
+    """Whether more components lower the loss by more than their numbers cost, and fit the data
+    better: one component with stronger structure may do that, at a higher loss."""
+    if second.findings is None or _half_chi2(second) > _half_chi2(first):
+        return False
     n_more = len(second.state.morph) - len(first.state.morph)
     n_numbers = n_more * (N_PROFILE + first.state.spectra.shape[1])
     return second.losses[-1] < first.losses[-1] - LEAST_GAIN * n_numbers
+
+
+def _half_chi2(fit):
+    """The loss of a finished fit without what its structure costs."""
+    free, found = ~fit.scene.fixed, fit.findings
+    return fit.losses[-1] - 0.5 * (found.energies[free] / found.strengths[free] ** 2).sum()
 
 
 def _after(fits, progress):

@@ -38,7 +38,7 @@ STRENGTHS = 1e-3, 1.0
 # the mean of t with weights P^POWER, P being k_j broadened by the source's extent: between the true
 # diagonal (1), and the curvature of the smoothest structure (2). Other values take up to 4 times
 # as many iterations, on simulations or on bright real galaxies.
-WIDE, POWER = 3.0, 1.25
+WIDE, POWER = 3.0, 1.5
 
 
 class Spectra:

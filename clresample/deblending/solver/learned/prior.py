@@ -21,15 +21,14 @@ class LearnedPrior:
     scales_px [model px]: Gaussian sigmas of the kernels, ascending: the model PSF's own width,
         galaxies' clumps, their wings
     strengths [1]: typical scatter of the brightest pixel about its expected value, relative to it,
-        at each scale; equal ones for clumps and wings. With (0.1, 0.02) for these simulated
-        galaxies are 0.03 dB worse, and fits converge more slowly
+        at each scale; medians of fits to simulated galaxies
     weight [px]: determined pixels whose evidence counts as much as `strengths`: larger ones learn
         less from a source's own data. A faint galaxy determines 10 to 60 numbers, a bright blend
         of HSC thousands
     """
 
     scales_px: tuple[float, ...] = (0.8, 2.0, 5.0)
-    strengths: tuple[float, ...] = (0.005, 0.07, 0.07)
+    strengths: tuple[float, ...] = (0.005, 0.1, 0.02)
     weight: float = 100.0
 
     def __post_init__(self):
