@@ -1,0 +1,46 @@
+"""A field in tiles: where each is searched, and which sources belong to it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from ..box import Box
+
+
+class Tile(NamedTuple):
+    """One tile of the model's pixels.
+
+    core: Box whose sources are this tile's; the cores of all tiles fill the field once
+    outer: Box that is searched, the core and what is around it
+    """
+
+    number: int
+    core: Box
+    outer: Box
+
+
+def tiles_of(region, size, overlap) -> list[Tile]:
+    """The tiles of a Box of the model's pixels, row by row, of nearly equal size.
+
+    size [px]: largest side of a core. Larger tiles take more memory: each holds all instruments'
+        images as float64, about 100 bytes a pixel and channel
+    overlap [px]: by which the outer box is larger on each side, cut at the region's edge. It must
+        hold a source and what its detection depends on; an object that is cut by the outer edge
+        would be split otherwise than one seen whole
+
+    Raises ValueError for a size that is not positive, or an overlap below 0.
+    """
+    if not size >= 1 or not overlap >= 0:
+        raise ValueError(f"size {size} must be 1 px or more and overlap {overlap} 0 px or more")
+    rows, columns = (
+        _parts(a, b, size) for a, b in ((region.y0, region.y1), (region.x0, region.x1))
+    )
+    cores = [Box(y0, x0, y1, x1) for y0, y1 in rows for x0, x1 in columns]
+    return [Tile(i, core, core.grown(overlap).meet(region)) for i, core in enumerate(cores)]
+
+
+def _parts(start, end, size):
+    """Pairs (start, end) of equal parts of at most `size`, to a pixel."""
+    n = -(-(end - start) // size)
+    edges = [start + (end - start) * i // n for i in range(n + 1)]
+    return list(zip(edges[:-1], edges[1:], strict=True))
