@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from astropy.io import fits
 
-from ..files.whole_file import whole_file
+from ..files.whole_file import FileError, whole_file
 from .box import Box
 
 STRIP_PX = 512  # rows of a mosaic that are read and written at a time
@@ -15,7 +15,8 @@ def write_mosaics(folder, job, parts, last):
     """Write model_NAME.fits and residual_NAME.fits of every mosaic: cubes [counts] with its WCS.
 
     A model is the sum of all sources' models in the blends' cutouts; a residual is data minus it,
-    the background subtracted where it was, NaN where no pixel of the data is. Raises FileError.
+    the background subtracted where it was, NaN where the data are none or cannot be read.
+    Raises FileError where a file cannot be written.
     """
     paths = []
     for i_mosaic, mosaic in enumerate(job.mosaics):
@@ -48,11 +49,19 @@ def _write_cube(path, header, mosaic, model, residual):
         cards.set(f"NAXIS{axis}", n, after=f"NAXIS{axis - 1}" if axis > 1 else "NAXIS")
     with whole_file(path) as part:
         stream = fits.StreamingHDU(part, cards)
-        for c in range(len(mosaic.channels)):
+        for c, channel in enumerate(mosaic.channels):
             for y0 in range(0, model.shape[1], STRIP_PX):
                 box = Box(y0, 0, min(y0 + STRIP_PX, model.shape[1]), model.shape[2])
                 strip = model[c, *box.slices]
                 if residual:
-                    strip = mosaic.data(c, box) - strip
+                    strip = _read(channel, box) - strip
                 stream.write(np.ascontiguousarray(strip, dtype=">f4"))
         stream.close()
+
+
+def _read(channel, box):
+    """Pixels of a channel; NaN where they cannot be read, which the blends there say too."""
+    try:
+        return channel.read(box)
+    except FileError:
+        return np.full(box.shape, np.nan)

@@ -6,6 +6,7 @@ import warnings
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from astropy.io import fits
@@ -14,8 +15,16 @@ from ..files.whole_file import FileError
 from ..sky.grid import Grid
 from ..sky.observation import Observation
 from ..sky.psf_checks import PSFWarning
+from .background import Background
 from .box import Box
 from .psfs.psf_field import ConstantPSF, PSFField
+
+
+class Plane(Protocol):
+    """One plane (Ny, Nx) of an image."""
+
+    def read(self, box) -> np.ndarray:
+        """The pixels of a Box that lies on the image."""
 
 
 @dataclass(frozen=True)
@@ -85,17 +94,40 @@ class Channel:
         "rms" [counts], the standard deviation; 0, NaN and infinite ones mean: ignore this pixel
     mask: plane or None; mask_value: the bits that mean: ignore this pixel; None = any that is not 0
     zero_point [mag]: AB magnitude of one count; None = unknown
-    background: PlaneBackground that is subtracted, or None
+    background: Background that is subtracted, or None
     """
 
     name: str
-    data: object
-    weight: object = None
+    data: Plane
+    weight: Plane | None = None
     kind: str = "weight"
-    mask: object = None
+    mask: Plane | None = None
     mask_value: int | None = None
     zero_point: float | None = None
-    background: object = None
+    background: Background | None = None
+
+    def read(self, box) -> np.ndarray:
+        """Pixels (Ny, Nx) [counts] of a Box, float64, the background subtracted if there is one."""
+        data = np.asarray(self.data.read(box), dtype=np.float64)
+        return data if self.background is None else data - self.background.read(box)
+
+    def weights(self, box) -> np.ndarray:
+        """Inverse variances (Ny, Nx) [counts^-2] of a Box, 0 = ignore this pixel.
+
+        Raises ValueError for a channel without a plane of them.
+        """
+        if self.weight is None:
+            raise ValueError(f"weight of channel {self.name!r} is None, it takes a plane")
+        values = np.asarray(self.weight.read(box), dtype=np.float64)
+        if self.kind != "weight":
+            variance = values**2 if self.kind == "rms" else values
+            good = np.isfinite(variance) & (variance >= np.finfo(np.float64).tiny)
+            values = np.divide(1.0, variance, out=np.zeros(variance.shape), where=good)
+        bad = ~np.isfinite(values) | (values < 0)
+        if self.mask is not None:
+            flags = self.mask.read(box)
+            bad |= (flags != 0) if self.mask_value is None else _set(flags, self.mask_value)
+        return np.where(bad, 0.0, values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,29 +222,29 @@ class Mosaic:
             return Box(0, 0, 0, 0)
         return Box.around(there).grown(1).meet(whole)
 
-    def data(self, i_channel, box) -> np.ndarray:
-        """Pixels (Ny, Nx) [counts] of a channel on a Box, float64, without their background."""
-        return _data(self.channels[i_channel], box)
-
-    def observation(self, box, *, ignore=None, subtract=None, extra=None) -> Observation | None:
+    def observation(
+        self, box, *, ignore=None, subtract=None, extra=None, psf_box=None
+    ) -> Observation | None:
         """The Observation of a Box that lies on the mosaic; None where no pixel has a weight.
 
         ignore (Ny, Nx) bool: pixels that get no weight
         subtract (C, Ny, Nx) [counts]: light that is not to be fitted
         extra (C, Ny, Nx) [counts^2]: variance that is added to the pixels'
+        psf_box: Box in whose middle the PSF is taken; None = that of the pixels
         """
-        weights = np.stack([_weights(c, box) for c in self.channels])
+        weights = np.stack([c.weights(box) for c in self.channels])
         if ignore is not None:
             weights[:, ignore] = 0
         if not weights.any():
             return None
-        data = np.stack([_data(c, box) for c in self.channels])
+        data = np.stack([c.read(box) for c in self.channels])
         if subtract is not None:
             data = data - subtract
         if extra is not None:
             weights = weights / (1 + weights * extra)
         zero_points = [c.zero_point for c in self.channels]
-        middle = (np.array(box[:2]) + np.array(box[2:]) - 1) / 2
+        there = psf_box or box
+        middle = (np.array(there[:2]) + np.array(there[2:]) - 1) / 2
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", PSFWarning)  # said once, when the field is opened
             psf = self.psf.psf_at(*middle)
@@ -236,26 +268,6 @@ def _outline(shape):
     y = [rows, rows, np.full_like(columns, -0.5), np.full_like(columns, n_y - 0.5)]
     x = [np.full_like(rows, -0.5), np.full_like(rows, n_x - 0.5), columns, columns]
     return np.concatenate(y), np.concatenate(x)
-
-
-def _data(channel, box):
-    """Pixels [counts], float64, the background subtracted where there is one."""
-    data = np.asarray(channel.data.read(box), dtype=np.float64)
-    return data if channel.background is None else data - channel.background.read(box)
-
-
-def _weights(channel, box):
-    """Inverse variances [counts^-2], 0 = ignore this pixel."""
-    values = np.asarray(channel.weight.read(box), dtype=np.float64)
-    if channel.kind != "weight":
-        variance = values**2 if channel.kind == "rms" else values
-        good = np.isfinite(variance) & (variance >= np.finfo(np.float64).tiny)
-        values = np.divide(1.0, variance, out=np.zeros(variance.shape), where=good)
-    bad = ~np.isfinite(values) | (values < 0)
-    if channel.mask is not None:
-        flags = channel.mask.read(box)
-        bad |= (flags != 0) if channel.mask_value is None else _set(flags, channel.mask_value)
-    return np.where(bad, 0.0, values)
 
 
 def _set(flags, bits):

@@ -13,6 +13,7 @@ from .blends.plan import LARGEST_FIELD
 
 # [bytes] of one group of fits: more lets more blends share a batch
 MEMORY = 1 << 30
+LEAST_MEMORY = 1 << 26  # [bytes] what a single blend of some ten sources takes
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -26,7 +27,8 @@ class FieldOptions:
         that are known; None = search for them
     tile_px [model px]: largest side of a tile of the search; overlap_px: by which tiles overlap
     limits: of one fit; larger blends are cut
-    memory [bytes]: that a group of fits, and the search of a tile, may take
+    memory [bytes]: that a group of fits, and the search of a tile, may take in a worker; a run that
+        goes on keeps what it began with
     workers: processes; 0 = this one. limit_s [s]: longest time of a group, None = no limit
     device: as `get_device` takes it; field_number: of the ids, 0 to 8,388,607, see `source_ids`
     """
@@ -51,7 +53,7 @@ class FieldOptions:
             raise ValueError(f"field_number is {self.field_number}, must be 0 to {LARGEST_FIELD}")
         if self.workers < 0:
             raise ValueError(f"workers is {self.workers}, must be 0 or more")
-        if not self.memory >= 1 << 26:
+        if not self.memory >= LEAST_MEMORY:
             raise ValueError(f"memory is {self.memory} bytes, must be 64 MiB or more")
 
 

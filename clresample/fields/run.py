@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -54,7 +55,10 @@ def run_field(
     mosaics, folder = tuple(mosaics), Path(folder)
     seconds: dict[str, float] = {}
     reference = reference_of(mosaics)
-    work = open_folder(folder, mosaics, reference, options, resume, overwrite, progress)
+    inputs = tuple((about or {}).get("inputs", {}).values())
+    work, options = open_folder(
+        folder, mosaics, reference, options, resume, overwrite, progress, inputs
+    )
     region, clock = Box.of(reference.shape), _Clock(seconds)
     plan = planned(mosaics, reference, region, work, options, progress, clock)
     job = Job(
@@ -113,3 +117,11 @@ class _Clock:
     def stop(self, stage):
         now = time.perf_counter()
         self.seconds[stage], self.since = now - self.since, now
+
+
+def free_memory() -> int:
+    """Memory [bytes] of this machine that is free; 2 GiB where it does not say."""
+    try:
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (ValueError, OSError, AttributeError):
+        return 2 << 30

@@ -40,7 +40,8 @@ def pieces_of(light, inside, positions, limits, margin):
     returns territories int32, 0 = none, else 1 + number of the piece; numbers count from 0
     """
     at = np.clip(np.rint(positions).astype(int), 0, np.array(light.shape) - 1)
-    basins = _watershed(np.asarray(light, np.float32), inside, at)
+    light = np.asarray(light, np.float32)
+    basins = _watershed(light, inside | _at(inside.shape, at), at)
     owner = basins[at[:, 0], at[:, 1]] - 1  # two sources on one pixel share a basin
     n = int(basins.max())
     boxes = [None] * n
@@ -48,7 +49,7 @@ def pieces_of(light, inside, positions, limits, margin):
         boxes[i] = Box(slices[0].start, slices[1].start, slices[0].stop, slices[1].stop)
     counts = np.bincount(owner, minlength=n)
     piece = np.arange(n)
-    for a, b in _saddles(np.asarray(light, np.float32), basins):
+    for a, b in _saddles(light, basins):
         a, b = _root(piece, a), _root(piece, b)
         if a == b:
             continue
@@ -63,27 +64,59 @@ def pieces_of(light, inside, positions, limits, margin):
     return territory, number[owner]
 
 
+def _at(shape, pixels):
+    """True at pixels (S, 2) of an image."""
+    found = np.zeros(shape, bool)
+    found[pixels[:, 0], pixels[:, 1]] = True
+    return found
+
+
 def _watershed(light, inside, at):
-    """Basins (Ny, Nx) int32 of the sources at pixels (S, 2), numbered from 1 without gaps."""
-    # in 65,000 steps of brightness, the brightest lowest: what scipy's watershed takes
-    depth = np.where(inside, light, light[inside].min(initial=0.0))
-    depth = np.arcsinh(depth)
-    span = max(float(np.ptp(depth)), 1e-9)
-    levels = ((depth.max() - depth) / span * 65000).astype(np.uint16)
-    markers = np.zeros(light.shape, np.int32)
-    number = 0
-    for y, x in at:
-        if markers[y, x] == 0:
-            number += 1
-            markers[y, x] = number
-    markers[~inside & (markers == 0)] = -1
-    basins = ndimage.watershed_ift(levels, markers, structure=np.ones((3, 3), int))
-    return np.maximum(basins, 0)
+    """Basins (Ny, Nx) int32 of the sources at pixels (S, 2), numbered from 1 without gaps, 0
+    outside: each pixel belongs to the source from which the light falls to it."""
+    peaks, n_peaks = _hills(light, inside)
+    hills = peaks[at[:, 0], at[:, 1]] - 1
+    taken = np.zeros(n_peaks, bool)
+    taken[hills] = True
+    parent = np.arange(n_peaks)
+    for a, b in _saddles(light, peaks):
+        a, b = _root(parent, a), _root(parent, b)
+        if a != b and not (taken[a] and taken[b]):
+            parent[b], taken[a] = a, taken[a] or taken[b]
+    roots = np.array([_root(parent, i) for i in range(n_peaks)])
+    own = np.unique(roots[hills])
+    number = np.zeros(n_peaks, np.int32)
+    number[np.isin(roots, own)] = 1 + np.searchsorted(own, roots[np.isin(roots, own)])
+    return np.concatenate([[0], number]).astype(np.int32)[peaks]
+
+
+def _hills(light, inside):
+    """The hills of the light (Ny, Nx) int32, numbered from 1, 0 outside, and how many there are:
+    all pixels from which the steepest way up ends on the same peak."""
+    n_y, n_x = light.shape
+    rank = np.empty(light.size, np.int64)  # of equal pixels the later is higher: no plateaus
+    rank[np.argsort(light, axis=None, kind="stable")] = np.arange(light.size)
+    rank = np.pad(np.where(inside, rank.reshape(light.shape), -1), 1, constant_values=-1)
+    own = np.arange(light.size).reshape(light.shape)
+    best, up = rank[1:-1, 1:-1].copy(), own.copy()
+    for dy in (-1, 0, 1):
+        for dx in (-1, 0, 1):
+            there = rank[1 + dy : 1 + dy + n_y, 1 + dx : 1 + dx + n_x]
+            higher = inside & (there > best)
+            up[higher] = own[higher] + dy * n_x + dx
+            best[higher] = there[higher]
+    up = up.ravel()
+    while (up[up] != up).any():  # halves the ways each time
+        up = up[up]
+    tops, hill = np.unique(up[inside.ravel()], return_inverse=True)
+    found = np.zeros(light.shape, np.int32)
+    found[inside] = hill + 1
+    return found, len(tops)
 
 
 def _saddles(light, basins):
     """Pairs of basins (from 0) that touch, by the brightest light on their border, falling."""
-    found: dict[tuple[int, int], float] = {}
+    pairs, heights = [], []
     for first, second in (
         (np.s_[:-1, :], np.s_[1:, :]),
         (np.s_[:, :-1], np.s_[:, 1:]),
@@ -92,14 +125,17 @@ def _saddles(light, basins):
     ):
         a, b = basins[first], basins[second]
         touch = (a != b) & (a > 0) & (b > 0)
-        height = np.minimum(light[first], light[second])[touch]
-        pairs = np.sort(np.stack([a[touch], b[touch]], axis=1) - 1, axis=1)
-        for (i, j), h in zip(pairs.tolist(), height.tolist(), strict=True):
-            found[i, j] = max(found.get((i, j), -np.inf), h)
-    return sorted(found, key=lambda pair: (-found[pair], pair))
+        heights.append(np.minimum(light[first], light[second])[touch])
+        pairs.append(np.sort(np.stack([a[touch], b[touch]], axis=1) - 1, axis=1))
+    both, height = np.concatenate(pairs), np.concatenate(heights)
+    order = np.lexsort((both[:, 1], both[:, 0], -height))
+    _, first = np.unique(both[order], axis=0, return_index=True)
+    return both[order][np.sort(first)].tolist()
 
 
 def _root(parents, i):
+    """The root of i in a forest, whose ways are made shorter."""
     while parents[i] != i:
+        parents[i] = parents[parents[i]]
         i = parents[i]
     return i

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from ...measurement.detection import detect
+from ...files.whole_file import FileError
+from ...measurement.detection import detect, noise_scatter
 from ...sky.frame import model_frame
+from ..box import Box
 
 # [sigma] of the combined signal-to-noise image: pixels above it hold light of a source. At 2, what
 # is left out of a source's footprint is under the noise everywhere; lower, noise links sources that
@@ -17,6 +19,7 @@ LIGHT = 2.0
 # Peaks may lie on nothing else that is above LIGHT: those found by one instrument alone. They get a
 # footprint of this radius, in FWHM of the widest PSF.
 LEAST_RADIUS = 0.5
+SAMPLE_PX = 512  # [model px] side of the part of a field that shows how its noise scatters
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +38,12 @@ class Found:
     lit: np.ndarray
 
 
-def search(mosaics, reference, tile, *, threshold, device=None) -> Found:
+def search(mosaics, reference, tile, *, threshold, scatters=None, device=None) -> Found:
     """Search one tile in all mosaics together.
 
     mosaics: of the field; reference: Grid of the model's pixels; tile: Tile
     threshold [sigma]: least signal to noise of a peak
+    scatters {mosaic's name: scatter of its signal to noise}: see `scatters_of`; None = each tile's
 
     Raises FileError for pixels that cannot be read, ImportError without sep.
     """
@@ -49,7 +53,8 @@ def search(mosaics, reference, tile, *, threshold, device=None) -> Found:
         empty = np.zeros((n_y, n_x))
         return Found(np.zeros((0, 2)), np.zeros(0), empty.astype(np.float16), empty > 0)
     frame = model_frame(observations, grid=_cut(reference, tile.outer))
-    found = detect(observations, frame, threshold=threshold, device=device)
+    known = scatters and [scatters[o.name] for o in observations]
+    found = detect(observations, frame, threshold=threshold, scatters=known, device=device)
     positions = np.array([s.position_px for s in found.sources]).reshape(-1, 2)
     radius = footprint_radius(observations, frame)
     lit = grown_footprints(found.image > LIGHT, positions, radius)
@@ -60,14 +65,13 @@ def search(mosaics, reference, tile, *, threshold, device=None) -> Found:
     return Found(positions[own], found.peaks[own], light, lit[inner])
 
 
-def place(mosaics, reference, tile, positions, device=None) -> Found:
+def place(mosaics, reference, tile, positions, *, scatters=None, device=None) -> Found:
     """The Found of a tile for sources that a catalogue gives, positions (S, 2) [px of the field].
 
     Their light is seen as `search` sees it; peaks are the combined signal to noise there.
     """
-    outer = search(
-        mosaics, reference, tile._replace(core=tile.outer), threshold=1e30, device=device
-    )
+    whole, given = tile._replace(core=tile.outer), {"scatters": scatters, "device": device}
+    outer = search(mosaics, reference, whole, threshold=1e30, **given)
     own = tile.core.holds(positions)
     near = tile.outer.holds(positions)
     light = outer.light.astype(np.float64)
@@ -84,12 +88,36 @@ def place(mosaics, reference, tile, positions, device=None) -> Found:
     return Found(positions[own], peaks, outer.light[inner], lit[inner])
 
 
+def scatters_of(mosaics, reference, region, device=None) -> dict:
+    """{mosaic's name: scatter of its signal to noise without sources}, from the region's middle.
+
+    One number for the whole field, so that the same is found however it is divided into tiles.
+    """
+    middle = [(a + b) // 2 for a, b in zip(region[:2], region[2:], strict=True)]
+    box = Box(*middle, *middle).grown(SAMPLE_PX // 2).meet(region)
+    found = dict.fromkeys((mosaic.name for mosaic in mosaics), 1.0)
+    try:
+        observations = observations_on(mosaics, reference, box)
+    except FileError:  # its tile will say so
+        return found
+    if observations:
+        frame = model_frame(observations, grid=_cut(reference, box))
+        for o in observations:
+            found[o.name] = noise_scatter(o, frame, device=device)
+    return found
+
+
 def observations_on(mosaics, reference, box):
-    """The Observations of all mosaics on a Box of the model's pixels, those that see it."""
+    """The Observations of all mosaics on a Box of the model's pixels, those that see it.
+
+    Their PSFs are those of the mosaics' middles, so that signal to noise does not depend on the
+    Box. Where a PSF is wider than its filter by a tenth, that costs half a percent of it.
+    """
     grid, found = _cut(reference, box), []
     for mosaic in mosaics:
         there = mosaic.box_on(grid)
-        seen = mosaic.observation(there) if there.area else None
+        middle = Box.of(mosaic.grid.shape)
+        seen = mosaic.observation(there, psf_box=middle) if there.area else None
         if seen is not None and seen.grid.map_to(grid).covered.any():
             found.append(seen)
     return found

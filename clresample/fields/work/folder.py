@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,9 +14,15 @@ from ...files.whole_file import FileError, whole_file
 WORK = "work"  # folder of the parts inside the output folder
 
 
-def open_folder(folder, mosaics, reference, options, resume, overwrite, progress):
-    """The folder of the parts, made or taken up again. Raises FileError for that of another run."""
-    work, mine = folder / WORK, _fingerprint(mosaics, reference, options)
+def open_folder(folder, mosaics, reference, options, resume, overwrite, progress, inputs=()):
+    """The folder of the parts, made or taken up again, and the options, with the memory of the run
+    that goes on: it decides which blends are fitted side by side.
+
+    inputs: files whose sizes and times must be the same in a run that goes on
+
+    Raises FileError for the folder of another run.
+    """
+    work, mine = folder / WORK, _fingerprint(mosaics, reference, options, inputs)
     if overwrite and work.exists():
         shutil.rmtree(work)
     there = work / "run.json"
@@ -22,7 +30,7 @@ def open_folder(folder, mosaics, reference, options, resume, overwrite, progress
         if not resume:
             raise FileError(f"{folder}: holds a run already: --resume goes on, --overwrite forgets")
         before = json.loads(there.read_text())
-        other = [key for key in mine if before.get(key) != mine[key]]
+        other = [key for key in mine if key != "memory" and before.get(key) != mine[key]]
         if other:
             raise FileError(
                 f"{folder}: holds a run with another {other[0]}, {before.get(other[0])!r} and not "
@@ -31,17 +39,17 @@ def open_folder(folder, mosaics, reference, options, resume, overwrite, progress
         progress.say(f"going on with the run in {folder}")
         for left in work.glob(".part-*"):
             left.unlink()
-        return work
+        return work, replace(options, memory=before["memory"])
     try:
         work.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FileError(f"{work}: cannot be made ({error.strerror or error})") from error
     with whole_file(there) as part:
         part.write_text(json.dumps(mine, indent=1))
-    return work
+    return work, options
 
 
-def _fingerprint(mosaics, reference, options):
+def _fingerprint(mosaics, reference, options, inputs):
     """What a run that goes on must share with the one before, in values that JSON gives back."""
     positions = options.positions
     return {
@@ -56,4 +64,14 @@ def _fingerprint(mosaics, reference, options):
         "limits": [options.limits.sources, options.limits.pixels],
         "memory": options.memory,
         "field_number": options.field_number,
+        "inputs": {str(f): _size_and_time(f) for f in inputs},
     }
+
+
+def _size_and_time(path):
+    """[bytes, ns] of a file; None where it is not there."""
+    try:
+        found = os.stat(path)
+    except OSError:
+        return None
+    return [found.st_size, found.st_mtime_ns]

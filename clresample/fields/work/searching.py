@@ -11,7 +11,7 @@ from ...files.whole_file import whole_file
 from ...sky.grid import Grid
 from ..blends.link import link
 from ..blends.plan import Plan, make_plan
-from ..blends.search import Found, place, search
+from ..blends.search import Found, place, scatters_of, search
 from ..blends.tiles import tiles_of
 from .pool import run_tasks
 
@@ -31,6 +31,7 @@ class _Search:
     threshold: float
     device: object
     positions: np.ndarray | None
+    scatters: dict
 
 
 def planned(mosaics, reference, region, work, options, progress, clock):
@@ -80,10 +81,16 @@ def _searched(mosaics, reference, tiles, work, options, progress):
     positions = options.positions
     if positions is not None:
         positions = reference.pixel(*np.asarray(positions, float).reshape(-1, 2).T)
-    shared = _Search(mosaics, reference, work, options.threshold, options.device, positions)
     todo = [tile for tile in tiles if not _found_path(work, tile.number).exists()]
     progress.stage("search", len(tiles))
     progress.step(len(tiles) - len(todo))
+    if not todo:
+        return {}
+    region = tiles[0].core.join(tiles[-1].core)
+    scatters = scatters_of(mosaics, reference, region, options.device)
+    shared = _Search(
+        mosaics, reference, work, options.threshold, options.device, positions, scatters
+    )
     lost: dict[str, str] = {}
     tried: set[int] = set()
 
@@ -112,10 +119,11 @@ def _found_path(work, number):
 def _search_tile(shared, tile):
     """Search one tile and write what was found; returns the number of sources."""
     given = shared.mosaics, shared.reference, tile
+    more = {"scatters": shared.scatters, "device": shared.device}
     if shared.positions is None:
-        found = search(*given, threshold=shared.threshold, device=shared.device)
+        found = search(*given, threshold=shared.threshold, **more)
     else:
-        found = place(*given, shared.positions, shared.device)
+        found = place(*given, shared.positions, **more)
     with whole_file(_found_path(shared.folder, tile.number)) as part:
         np.savez(
             part,
