@@ -104,7 +104,7 @@ def write_field(folder, field) -> list[Path]:
     """Write a SimulatedField: an image and a PSF cube of each mosaic, field.toml, truth.ecsv.
 
     An image file has the HDUs SCI (cube of bands, tile-compressed without loss), RMS and MASK,
-    whose bit BADCOL (1) marks dead columns. Returns the paths, field.toml first.
+    whose bit BAD (1) marks dead columns. Returns the paths, field.toml first.
     """
     import numpy as np
     from astropy.io import fits
@@ -127,7 +127,7 @@ def write_field(folder, field) -> list[Path]:
         )
         tile = {"tile_shape": (1, 64, mosaic.data.shape[2])}
         mask = fits.ImageHDU(2 * mosaic.bad.astype(np.uint8), name="MASK")
-        mask.header["MP_BADCOL"] = (1, "bit of dead columns")
+        mask.header["MP_BAD"] = (1, "bit of dead columns")
         hdus = [
             fits.PrimaryHDU(),
             fits.CompImageHDU(mosaic.data, header, name="SCI", **lossless, **tile),
@@ -161,7 +161,7 @@ rms = "{name}.fits"
 rms_hdu = "RMS"
 mask = "{name}.fits"
 mask_hdu = "MASK"
-mask_bits = ["BADCOL"]
+mask_bits = ["BAD"]
 zero_point = [{points}]
 psf = "{name}_psf.fits"
 psf_format = "cube"

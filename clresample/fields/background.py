@@ -17,7 +17,8 @@ CELL_PX = 128
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """A surface through levels at the middles of cells: linear between them, flat beyond.
+    """A surface through levels at the middles of cells: linear between them, and on beyond the outer
+    ones as between the last two.
 
     levels (n_y, n_x) [counts]; cell (2,) [px]: their distance (y, x)
     """
@@ -28,11 +29,12 @@ class Background:
     def read(self, box) -> np.ndarray:
         """The surface [counts] on a Box."""
         axes = [
-            np.clip((np.arange(a, b) + 0.5) / cell - 0.5, 0, n - 1)
-            for a, b, cell, n in zip(box[:2], box[2:], self.cell, self.levels.shape, strict=True)
+            (np.arange(a, b) + 0.5) / cell + 0.5  # of the levels with one more on each side
+            for a, b, cell in zip(box[:2], box[2:], self.cell, strict=True)
         ]
         where = np.meshgrid(*axes, indexing="ij")
-        return ndimage.map_coordinates(self.levels, where, order=1, mode="nearest")
+        levels = np.pad(self.levels, 1, mode="reflect", reflect_type="odd")
+        return ndimage.map_coordinates(levels, where, order=1, mode="nearest")
 
 
 def find_background(read, good, shape) -> Background:
