@@ -46,7 +46,8 @@ class SimulatedField:
     """A field with its truth.
 
     mosaics: of Euclid and Rubin
-    truth: {column: array (S,)}: ra, dec [deg]; y, x [px of the first mosaic]; kind "galaxy" or
+    truth: {column: array (S,)}: ra, dec [deg]; y, x [px of the first mosaic]; snr, the signal to
+        noise of the best possible filter over all mosaics and channels; kind "galaxy" or
         "star"; host, the number of the source that it was put beside, -1 for none; mag_* and flux_*
         [mag, uJy] of each channel
     """
@@ -108,11 +109,15 @@ def simulate_field(
     reach = abs(np.cos(turns)) + abs(np.sin(turns))
     n_rubin = int(np.ceil(side * reach / RUBIN_UGRIZY.pixel_scale_arcsec))
     grids = EUCLID_VIS.grid(n_pixels), surveys[1].grid(n_rubin, angle_deg=angle_deg)
-    mosaics = tuple(
-        _mosaic(survey, grid, sources, rng, psf_variation, axis, bad_columns, center_deg)
-        for survey, grid, rng, axis in zip(surveys, grids, rngs, (1, 0), strict=True)
+    mosaics, powers = zip(
+        *(
+            _mosaic(survey, grid, sources, rng, psf_variation, axis, bad_columns, center_deg)
+            for survey, grid, rng, axis in zip(surveys, grids, rngs, (1, 0), strict=True)
+        ),
+        strict=True,
     )
-    return SimulatedField(mosaics, _truth(sources, surveys, grids[0], mosaics[0].grid))
+    truth = _truth(sources, surveys, grids[0], mosaics[0].grid)
+    return SimulatedField(mosaics, truth | {"snr": np.sqrt(sum(powers))})
 
 
 def _with_bands(survey, bands):
@@ -160,9 +165,9 @@ def _mosaic(survey, grid, sources, rng, variation, axis, n_bad, center_deg):
     data = np.zeros((survey.n_bands, *grid.shape))
     magnitudes = np.stack([sources.magnitudes(band) for band in survey.bands], axis=1)
     counts = survey.counts(magnitudes)
-    for s, profile in enumerate(sources.profiles):
-        _add(data, survey, grid, profile, sources, s, counts[s], variation, axis)
-    sigma = survey.noise_sigma
+    sigma, power = survey.noise_sigma, np.zeros(len(sources.profiles))
+    for s in range(len(power)):
+        power[s] = _add(data, survey, grid, sources, s, counts[s], variation, axis)
     data += sigma[:, None, None] * rng.standard_normal(data.shape)
     bad = np.zeros(grid.shape, bool)
     bad[:, rng.choice(grid.shape[1], n_bad, replace=False)] = True
@@ -171,9 +176,9 @@ def _mosaic(survey, grid, sources, rng, variation, axis, n_bad, center_deg):
     places = np.array([(y, x) for y in nodes[0] for x in nodes[1]])
     images = np.stack([_psf(survey, _width(grid, p, variation, axis)) for p in places])
     placed = Grid.from_wcs(grid.to_wcs(ra_deg=center_deg[0], dec_deg=center_deg[1]), grid.shape)
-    return SimulatedMosaic(
-        survey, placed, data.astype(np.float32), sigma, bad, places, images.astype(np.float32)
-    )
+    images = images.astype(np.float32)
+    mosaic = SimulatedMosaic(survey, placed, data.astype(np.float32), sigma, bad, places, images)
+    return mosaic, power
 
 
 def _width(grid, pixel, variation, axis):
@@ -186,21 +191,23 @@ def _psf(survey, width):
     return PSF.gaussian(sigmas, n_pixels=PSF_PIXELS).images
 
 
-def _add(data, survey, grid, profile, sources, s, counts, variation, axis):
-    """Draw a source on its stamp and add it to the mosaic."""
-    position = sources.positions[s]
+def _add(data, survey, grid, sources, s, counts, variation, axis):
+    """Draw a source on its stamp and add it to the mosaic; returns its squared signal to noise."""
+    profile, position, power = sources.profiles[s], sources.positions[s], 0.0
     pixel = np.linalg.solve(grid.jacobian, position - grid.origin)
     reach = next(half for limit, half in STAMP_ARCSEC if sources.mag_i[s] < limit)
     half = int(np.ceil(reach / survey.pixel_scale_arcsec))
     low = np.maximum(np.rint(pixel).astype(int) - half, 0)
     high = np.minimum(np.rint(pixel).astype(int) + half + 1, grid.shape)
     if (high <= low).any():
-        return
+        return power
     stamp = grid.cutout(*low, tuple(high - low))
     width = _width(grid, pixel, variation, axis)
     for c, sigma in enumerate(survey.psf_sigma_arcsec):
         image = draw(profile, stamp, psf_sigma_arcsec=width * sigma, position_arcsec=position)
         data[c, low[0] : high[0], low[1] : high[1]] += counts[c] * image
+        power += float(((counts[c] * image) ** 2).sum() / survey.noise_sigma[c] ** 2)
+    return power
 
 
 def _truth(sources, surveys, grid, placed):
