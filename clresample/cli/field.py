@@ -68,9 +68,24 @@ def add_field(commands):
         default=3600.0,
         help="seconds after which a worker is taken to hang (default %(default)g)",
     )
+    parser.add_argument(
+        "--part",
+        metavar="I/N",
+        type=_part,
+        help="only the I-th of N parts of the field, for job arrays: sources belong to the part "
+        "that holds their centre, so that the parts' catalogues together are that of the field",
+    )
     add_device_option(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
     parser.set_defaults(run=run)
+
+
+def _part(text):
+    """I/N as two whole numbers."""
+    i, _, n = text.partition("/")
+    if not (i.isdecimal() and n.isdecimal() and 1 <= int(i) <= int(n)):
+        raise argparse.ArgumentTypeError(f"{text!r} is no part such as 2/4")
+    return int(i), int(n)
 
 
 def run(arguments):
@@ -93,6 +108,7 @@ def run(arguments):
         workers=arguments.workers,
         device=arguments.device,
         limit_s=arguments.limit,
+        part=arguments.part,
         memory=arguments.memory or max(memory, LEAST_MEMORY),
     )
     progress = _progress(arguments)

@@ -26,7 +26,7 @@ THEN = ("n_blend", "pass", "peak", "snr")
 
 
 def finished(job, parts, last):
-    """The catalogue, sorted by id, and the table of fits, sorted by patch.
+    """The catalogue of the core, sorted by id, and the table of fits, sorted by patch.
 
     parts: PartFiles; last: {patch: index of the part with its last round}
     """
@@ -47,6 +47,8 @@ def finished(job, parts, last):
         )  # the most columns first, so that units are known
         table = _joined(tables)
         table = table[np.argsort(table["id"], kind="stable")]
+        at = np.stack([table["y"].value, table["x"].value], axis=1)
+        table = table[job.core.holds(at)]
     blends = vstack(fits) if fits else QTable()
     if fits:
         blends = blends[np.argsort(blends["patch"])]

@@ -33,8 +33,8 @@ class Model:
     spectrum: np.ndarray
 
 
-def write_models(path, job, parts, last):
-    """Write the models of all sources, sorted by their blends.
+def write_models(path, job, parts, last, ids):
+    """Write the models of the sources with these ids, sorted by their blends.
 
     HDUs: COMPONENTS, a row for each with COMPONENT_COLUMNS, offset being its first pixel in
     MORPHOLOGIES, and the spectrum; MORPHOLOGIES, one float32 array of all pixels.
@@ -46,7 +46,7 @@ def write_models(path, job, parts, last):
             continue
         pixels, their = part.array("MORPHOLOGIES"), part.array("SPECTRA")
         for k, row in enumerate(table):
-            if last.get(int(row["patch"])) == i:
+            if last.get(int(row["patch"])) == i and int(row["id"]) in ids:
                 start = int(row["offset"])
                 rows.append([int(row[name]) for name in COMPONENT_COLUMNS])
                 spectra.append(their[k])

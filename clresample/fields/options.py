@@ -25,6 +25,10 @@ class FieldOptions:
         residuals too
     positions (S, 2) [deg]: right ascension and declination (y, x [arcsec] on a flat sky) of sources
         that are known; None = search for them
+    part (i, n): run the i-th of n parts of the field (from 1) alone, for job arrays: its catalogue
+        has the sources whose centres lie in it; None = the whole
+    border_px [model px]: around the part, which is searched and fitted too. Blends that reach from
+        the part to beyond the border are fitted without what lies there
     tile_px [model px]: largest side of a tile of the search; overlap_px: by which tiles overlap
     limits: of one fit; larger blends are cut
     memory [bytes]: that a group of fits, and the search of a tile, may take in a worker; a run that
@@ -37,6 +41,8 @@ class FieldOptions:
     threshold: float = THRESHOLD
     passes: int = 2
     positions: np.ndarray | None = None
+    part: tuple[int, int] | None = None
+    border_px: int = 256
     tile_px: int = 1024
     overlap_px: int = 96
     limits: Limits = Limits()

@@ -55,7 +55,7 @@ def write_outputs(folder, job, parts, about, seconds) -> Outputs:
     paths = list(_write_catalogues(folder, table))
     notes = () if find_spec("pyarrow") else (NO_PARQUET,)
     paths.append(_write_ecsv(folder / "blends.ecsv", blends))
-    paths.append(write_models(folder / "models.fits", job, parts, last))
+    paths.append(write_models(folder / "models.fits", job, parts, last, set(table["id"].tolist())))
     paths += write_mosaics(folder, job, parts, last)
     status = Counter(str(s).split(":")[0] for s in blends["status"])
     paths.append(_write_provenance(folder / "provenance.json", job, about, seconds, status))

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..sky.grid import Grid
+from .blends.tiles import part_of
 from .box import Box
 from .options import FieldOptions, Progress
 from .outputs import Outputs, write_outputs
@@ -59,14 +60,17 @@ def run_field(
     work, options = open_folder(
         folder, mosaics, reference, options, resume, overwrite, progress, inputs
     )
-    region, clock = Box.of(reference.shape), _Clock(seconds)
-    plan = planned(mosaics, reference, region, work, options, progress, clock)
+    whole, clock = Box.of(reference.shape), _Clock(seconds)
+    core = whole if options.part is None else part_of(whole, *options.part)
+    region = core if options.part is None else core.grown(options.border_px).meet(whole)
+    plan = planned(mosaics, reference, region, core, work, options, progress, clock)
     job = Job(
         mosaics=mosaics,
         reference=reference,
         folder=work,
         plan=plan,
         corner=(region.y0, region.x0),
+        core=core,
         settings=options.settings,
         threshold=options.threshold,
         passes=options.passes,

@@ -87,20 +87,7 @@ def simulate_field(
 
     Raises ValueError for numbers out of range; ImportError, with what to install, without GalSim.
     """
-    for name, value, good in (
-        ("n_pixels", n_pixels, n_pixels >= 32),
-        ("density", density, density > 0),
-        ("faintest", faintest, faintest > BRIGHTEST),
-        ("clustering", clustering, 0 <= clustering <= 1),
-        ("stars", stars, 0 <= stars <= 1),
-        ("psf_variation", psf_variation, 0 <= psf_variation < 1),
-        ("bad_columns", bad_columns, bad_columns >= 0),
-    ):
-        if not good:
-            raise ValueError(f"{name} is {value}, out of its range")
-    unknown = [band for band in rubin_bands if band not in RUBIN_UGRIZY.bands]
-    if unknown or not rubin_bands:
-        raise ValueError(f"rubin_bands is {rubin_bands}, some of {RUBIN_UGRIZY.bands} are taken")
+    _check(n_pixels, density, faintest, clustering, stars, psf_variation, bad_columns, rubin_bands)
     source_rng, *rngs = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3))
     surveys = EUCLID_VIS, _with_bands(RUBIN_UGRIZY, rubin_bands)
     side = n_pixels * EUCLID_VIS.pixel_scale_arcsec
@@ -118,6 +105,24 @@ def simulate_field(
     )
     truth = _truth(sources, surveys, grids[0], mosaics[0].grid)
     return SimulatedField(mosaics, truth | {"snr": np.sqrt(sum(powers))})
+
+
+def _check(n_pixels, density, faintest, clustering, stars, psf_variation, bad_columns, rubin_bands):
+    """Raise ValueError for what `simulate_field` does not take."""
+    for name, value, good in (
+        ("n_pixels", n_pixels, n_pixels >= 32),
+        ("density", density, density > 0),
+        ("faintest", faintest, faintest > BRIGHTEST),
+        ("clustering", clustering, 0 <= clustering <= 1),
+        ("stars", stars, 0 <= stars <= 1),
+        ("psf_variation", psf_variation, 0 <= psf_variation < 1),
+        ("bad_columns", bad_columns, bad_columns >= 0),
+    ):
+        if not good:
+            raise ValueError(f"{name} is {value}, out of its range")
+    unknown = [band for band in rubin_bands if band not in RUBIN_UGRIZY.bands]
+    if unknown or not rubin_bands:
+        raise ValueError(f"rubin_bands is {rubin_bands}, some of {RUBIN_UGRIZY.bands} are taken")
 
 
 def _with_bands(survey, bands):

@@ -218,3 +218,26 @@ def test_mosaics_that_do_not_go_together_are_refused(sky, tmp_path):
     bare = replace(rubin, channels=tuple(replace(c, zero_point=None) for c in rubin.channels))
     with pytest.raises(ValueError, match="'Euclid' has zero points, 'Rubin' has none"):
         run_field([euclid, bare], tmp_path)
+
+
+def test_parts_of_a_field_together_are_the_field(done, sky, tmp_path):
+    folder, _ = done
+    whole, ids = table(folder), []
+    for i in (1, 2):
+        options = FieldOptions(part=(i, 2), border_px=110)
+        out = tmp_path / f"part{i}"
+        run_field(mosaics_of(sky), out, options=options)
+        rows = table(out)
+        ids += rows["id"].tolist()
+        _, a, b = np.intersect1d(rows["id"], whole["id"], return_indices=True)
+        change = (rows["flux_VIS"][a] - whole["flux_VIS"][b]) / whole["flux_err_VIS"][b]
+        assert np.abs(change).max() < 0.1
+        assert {m.id for m in read_models(out / "models.fits")} == set(rows["id"].tolist())
+        part, header = fits.getdata(out / "model_Euclid.fits", header=True)
+        n = sky.mosaics[0].data.shape[1]
+        assert 0 <= part.shape[2] - n // 2 <= 2 and "CRVAL1" in header
+        if i == 1:
+            half = np.s_[..., : n // 2]
+            model = fits.getdata(folder / "model_Euclid.fits")[half]
+            np.testing.assert_allclose(part[half], model, atol=1e-2 * model.max())
+    assert sorted(ids) == whole["id"].tolist()

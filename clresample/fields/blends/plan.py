@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 from scipy import ndimage
@@ -74,6 +74,17 @@ class Plan:
                 "lost": self.lost,
             }
         )
+
+    def only(self, core) -> Plan:
+        """The plan of what is needed for the sources in a Box: blends that have one there."""
+        inside = core.holds(self.positions)
+        parents = {p.parent for p in self.patches if inside[list(p.sources)].any()}
+
+        def kept(groups):
+            few = (tuple(n for n in g if self.patches[n].parent in parents) for g in groups)
+            return tuple(group for group in few if group)
+
+        return replace(self, groups=kept(self.groups), giants=kept(self.giants))
 
     @classmethod
     def from_json(cls, text) -> Plan:

@@ -88,11 +88,12 @@ def place(mosaics, reference, tile, positions, *, scatters=None, device=None) ->
     return Found(positions[own], peaks, outer.light[inner], lit[inner])
 
 
-def scatters_of(mosaics, reference, region, device=None) -> dict:
-    """{mosaic's name: scatter of its signal to noise without sources}, from the region's middle.
+def scatters_of(mosaics, reference, device=None) -> dict:
+    """{mosaic's name: scatter of its signal to noise without sources}, from the field's middle.
 
     One number for the whole field, so that the same is found however it is divided into tiles.
     """
+    region = Box.of(reference.shape)
     middle = [(a + b) // 2 for a, b in zip(region[:2], region[2:], strict=True)]
     box = Box(*middle, *middle).grown(SAMPLE_PX // 2).meet(region)
     found = dict.fromkeys((mosaic.name for mosaic in mosaics), 1.0)

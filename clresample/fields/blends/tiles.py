@@ -39,6 +39,25 @@ def tiles_of(region, size, overlap) -> list[Tile]:
     return [Tile(i, core, core.grown(overlap).meet(region)) for i, core in enumerate(cores)]
 
 
+def part_of(region, i, n) -> Box:
+    """The i-th of n parts (from 1) of a Box, in rows and columns as nearly square as n allows.
+
+    Raises ValueError for an i that is not 1 to n.
+    """
+    if not 1 <= i <= n:
+        raise ValueError(f"part is {i} of {n}, must be 1 to {n} of them")
+    n_rows = max(k for k in range(1, n + 1) if n % k == 0 and k * k <= n)
+    row, column = divmod(i - 1, n // n_rows)
+    y, x = (
+        [start + (end - start) * k // parts for k in range(parts + 1)]
+        for start, end, parts in (
+            (region.y0, region.y1, n_rows),
+            (region.x0, region.x1, n // n_rows),
+        )
+    )
+    return Box(y[row], x[column], y[row + 1], x[column + 1])
+
+
 def _parts(start, end, size):
     """Pairs (start, end) of equal parts of at most `size`, to a pixel."""
     n = -(-(end - start) // size)

@@ -77,6 +77,7 @@ FIELD_TABLES = {
         "number": COUNT,
         "tile_px": COUNT,
         "overlap_px": COUNT,
+        "border_px": COUNT,
         "max_sources": COUNT,
         "max_pixels": COUNT,
     },

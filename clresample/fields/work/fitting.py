@@ -19,6 +19,7 @@ from ...sky.grid import Grid
 from ..blends.patch import blend_of
 from ..blends.plan import Plan, source_ids
 from ..blends.search import nearest
+from ..box import Box
 from .part import Part, PartFile
 
 # What can go wrong with one patch and is no reason to give up the others.
@@ -32,6 +33,7 @@ class Job:
 
     mosaics, reference: of the field; folder: of its parts; plan: Plan
     corner (2,) [px]: (y, x) of the first pixel of labels.npy in the model's pixels
+    core: Box of the model's pixels whose sources are wanted
     settings: of the fits; threshold [sigma]: of the second pass; passes: 1, or 2 to search the
         residuals too; memory [bytes]: of the device; device: as `get_device` takes it
     field_number: of the ids
@@ -42,6 +44,7 @@ class Job:
     folder: Path
     plan: Plan
     corner: tuple[int, int]
+    core: Box
     settings: Settings = Settings()
     threshold: float = 5.0
     passes: int = 2

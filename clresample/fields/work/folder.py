@@ -59,6 +59,7 @@ def _fingerprint(mosaics, reference, options, inputs):
         "threshold": options.threshold,
         "passes": options.passes,
         "sources": None if positions is None else np.round(positions, 9).tolist(),
+        "part": options.part and [*options.part, options.border_px],
         "tile_px": options.tile_px,
         "overlap_px": options.overlap_px,
         "limits": [options.limits.sources, options.limits.pixels],

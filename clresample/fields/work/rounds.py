@@ -34,7 +34,8 @@ def fitted(job, options, progress):
             before = tuple(n for n, ps in names.items() if cut & set(ps))
         else:
             before = tuple(names)
-    return [PartFile(job.folder / f"{name}.fits") for name in parts]
+    # by round and group, in whichever order they ended: sums of models are the same to the last bit
+    return [PartFile(job.folder / f"{name}.fits") for name in sorted(parts)]
 
 
 def _fit_round(job, tasks, options, progress):

@@ -34,8 +34,11 @@ class _Search:
     scatters: dict
 
 
-def planned(mosaics, reference, region, work, options, progress, clock):
-    """The plan: that on disk, or a new one after the search of all tiles."""
+def planned(mosaics, reference, region, core, work, options, progress, clock):
+    """The plan: that on disk, or a new one after the search of all tiles.
+
+    region: Box of the model's pixels that is searched; core: Box of it whose sources are wanted
+    """
     path = work / "plan.json"
     if path.exists():
         return Plan.from_json(path.read_text())
@@ -67,7 +70,7 @@ def planned(mosaics, reference, region, work, options, progress, clock):
         memory=options.memory,
         n_channels=n_channels,
     )
-    plan = replace(plan, lost=lost)
+    plan = replace(plan.only(core), lost=lost)
     if hasattr(footprints.labels, "flush"):
         footprints.labels.flush()
     with whole_file(path) as part:
@@ -86,8 +89,7 @@ def _searched(mosaics, reference, tiles, work, options, progress):
     progress.step(len(tiles) - len(todo))
     if not todo:
         return {}
-    region = tiles[0].core.join(tiles[-1].core)
-    scatters = scatters_of(mosaics, reference, region, options.device)
+    scatters = scatters_of(mosaics, reference, options.device)
     shared = _Search(
         mosaics, reference, work, options.threshold, options.device, positions, scatters
     )
