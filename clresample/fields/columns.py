@@ -25,10 +25,11 @@ FIRST = ("id", "parent_id", "ra", "dec", "y_sky", "x_sky", "y", "x", "flags", "s
 THEN = ("n_blend", "pass", "peak", "snr")
 
 
-def finished(job, parts, last):
+def finished(job, parts, last, unsettled=()):
     """The catalogue of the core, sorted by id, and the table of fits, sorted by patch.
 
     parts: PartFiles; last: {patch: index of the part with its last round}
+    unsettled: parents of blends that were cut into pieces which did not settle
     """
     tables, fits = [], []
     for i, part in enumerate(parts):
@@ -49,6 +50,11 @@ def finished(job, parts, last):
         table = table[np.argsort(table["id"], kind="stable")]
         at = np.stack([table["y"].value, table["x"].value], axis=1)
         table = table[job.core.holds(at)]
+        moving = np.isin(table["parent_id"], np.array(sorted(unsettled), np.int64))
+        table["reason"] = [
+            f"{reason}, which had not settled" if one else str(reason)
+            for one, reason in zip(moving, table["reason"], strict=True)
+        ]
     blends = vstack(fits) if fits else QTable()
     if fits:
         blends = blends[np.argsort(blends["patch"])]

@@ -41,17 +41,18 @@ class Outputs:
     notes: tuple[str, ...] = ()
 
 
-def write_outputs(folder, job, parts, about, seconds) -> Outputs:
+def write_outputs(folder, job, parts, unsettled, about, seconds) -> Outputs:
     """Write all outputs of a field, each file whole or not at all.
 
     folder: to write into; job: Job; parts: PartFiles, those of later rounds last
+    unsettled: parents of cut blends whose pieces did not settle
     about: plain values for the provenance; seconds: wall time by stage so far
 
     catalogue.{parquet,fits,ecsv} hold nothing that another run of the same field would change:
     times are in blends.ecsv and provenance.json. Raises FileError.
     """
     last = _last_rounds(parts)
-    table, blends = finished(job, parts, last)
+    table, blends = finished(job, parts, last, unsettled)
     paths = list(_write_catalogues(folder, table))
     notes = () if find_spec("pyarrow") else (NO_PARQUET,)
     paths.append(_write_ecsv(folder / "blends.ecsv", blends))

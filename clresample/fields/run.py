@@ -78,10 +78,10 @@ def run_field(
         device=options.device,
         field_number=options.field_number,
     )
-    parts = fitted(job, options, progress)
+    parts, unsettled = fitted(job, options, progress)
     clock.stop("fit")
     progress.stage("write", 1)
-    outputs = write_outputs(folder, job, parts, about or {}, seconds)
+    outputs = write_outputs(folder, job, parts, unsettled, about or {}, seconds)
     clock.stop("write")
     failed = outputs.status.get("failed", 0)
     return FieldRun(outputs, seconds, failed, plan.lost)

@@ -1,28 +1,10 @@
 """A small simulated field and one run over it, which the tests of whole runs compare with."""
 
-import numpy as np
 import pytest
+from helpers.fields import mosaics_of
 
-from clresample import Mosaic, simulate_field
-from clresample.fields.psfs.sampled import PSFCube
+from clresample import simulate_field
 from clresample.fields.run import run_field
-
-
-def mosaics_of(field):
-    """The mosaics of a SimulatedField, in memory."""
-    return tuple(
-        Mosaic.of_arrays(
-            m.survey.name,
-            m.data,
-            m.grid,
-            PSFCube(m.psf_images, m.psf_positions),
-            weights=np.broadcast_to(m.noise_sigma[:, None, None] ** -2.0, m.data.shape),
-            channels=m.survey.bands,
-            zero_points=list(m.survey.zero_points_mag),
-            mask=m.bad,
-        )
-        for m in field.mosaics
-    )
 
 
 @pytest.fixture(scope="session")

@@ -63,13 +63,16 @@ class Group:
     """Patches that are fitted side by side, and the part that they leave.
 
     name: of the part; patches: numbers; round: 0, or which repetition of a cut blend's pieces
-    before: names of the parts of the round before, for the neighbours' light
+    before: names of the parts of the round before, for the neighbours' light; older: of the one
+        before that. The mean of the two is subtracted: where both sides of a border follow each
+        other's last model alone, light goes back and forth between them
     """
 
     name: str
     patches: tuple[int, ...]
     round: int = 0
     before: tuple[str, ...] = ()
+    older: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,14 +183,16 @@ def _on_patch(job, labels, patch, source):
 
 
 def _neighbours(job, group):
-    """{patch: {mosaic's name: [(Box, model)]}} of the round before; None in the first."""
+    """{patch: {mosaic's name: [(Box, model)]}} of the rounds before; None in the first."""
     if group.round == 0:
         return None
     wanted = {k for number in group.patches for k in job.plan.patches[number].siblings}
     found: dict[int, dict] = {}
-    for name in group.before:
+    share = 0.5 if group.older else 1.0
+    for name in group.before + group.older:
         for patch, i, box, model in PartFile(job.folder / f"{name}.fits").models(wanted):
-            found.setdefault(patch, {}).setdefault(job.mosaics[i].name, []).append((box, model))
+            models = found.setdefault(patch, {}).setdefault(job.mosaics[i].name, [])
+            models.append((box, share * model))
     return found
 
 
