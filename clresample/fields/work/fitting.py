@@ -154,7 +154,12 @@ def _fits(job, blends):
 
 
 def _second_look(job, labels, cuts, results):
-    """Fit those blends again in whose residuals there are more sources, with these."""
+    """Fit those blends again in whose residuals there are more sources, with these.
+
+    The residuals are those of the whole fit. A first look of 30 iterations without structure, as
+    `clresample deblend` takes, leaves bright galaxies' own structure in them: in simulated fields
+    15 % of all rows were clumps of it then, and no more true sources were found.
+    """
     device, again = get_device(job.device), {}
     for i, (cut, result) in enumerate(zip(cuts, results, strict=True)):
         if isinstance(result, Failure):
