@@ -69,9 +69,9 @@ def kill_at(process, seconds, what, rng):
     return True
 
 
-def disturbed(sky, out, expected, took_s, rng):
-    """One row: a run that is killed at random and ends."""
-    what, at = rng.choice(["run", "worker"]), rng.random()
+def disturbed(sky, out, expected, took_s, what, rng):
+    """One row: a run that is killed at random, or has its workers killed, and ends."""
+    at = rng.random()
     process, kills = start(sky, out), 0
     kills += kill_at(process, at * took_s, what, rng)
     parts = len(list((out / "work").glob("fit-*.fits")))
@@ -89,8 +89,7 @@ def disturbed(sky, out, expected, took_s, rng):
 
 
 def soak(times, seed_of_kills):
-    """Rows of so many runs."""
-    rng = random.Random(seed_of_kills)
+    """Rows of so many runs: whole runs and single workers are killed by turns."""
     with tempfile.TemporaryDirectory() as folder:
         sky, folder = Path(folder) / "sky", Path(folder)
         given = {"rubin_bands": ("i",), "clustering": 0.4, "psf_variation": 0.1}
@@ -101,7 +100,8 @@ def soak(times, seed_of_kills):
         took_s = time.monotonic() - began
         expected = (folder / "whole" / "catalogue.fits").read_bytes()
         for i in range(times):
-            yield disturbed(sky, folder / f"out{i}", expected, took_s, rng)
+            what, rng = ("run", "worker")[i % 2], random.Random(f"{seed_of_kills} {i}")
+            yield disturbed(sky, folder / f"out{i}", expected, took_s, what, rng)
 
 
 def main(options):

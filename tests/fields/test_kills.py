@@ -11,7 +11,7 @@ def test_killed_runs_end_with_the_same_catalogue():
     pytest.importorskip("sep")
     from bench.soak import soak
 
-    rows = list(soak(2, 1))
-    assert {row["what"] for row in rows} == {"run", "worker"}
-    assert sum(row["kills"] for row in rows) >= 2
+    rows = list(soak(2, 3))
+    assert [row["what"] for row in rows] == ["run", "worker"]
+    assert sum(row["kills"] for row in rows) >= 1  # a moment may come after the end
     assert all(row["same"] for row in rows)
