@@ -7,7 +7,7 @@ STAMP = $(VENV)/made
 RUN = $(VENV)/bin/python -m
 
 .PHONY: demo test test-on test-kernels-on grind lint mutants fuzz clean paper paper-full dist \
-    test-install test-oldest test-adapters docs
+    test-install test-oldest test-adapters docs soak
 
 # What runs on one OpenCL device whatever the others are: operators, and the solver's kernels.
 KERNEL_TESTS = tests/device/test_contraction.py tests/device/test_launcher.py \
@@ -50,6 +50,10 @@ mutants: $(STAMP)
 # The property tests with thousands of examples instead of a few.
 fuzz: $(STAMP)
 	CLRESAMPLE_EXAMPLES=$(or $(EXAMPLES),2000) $(RUN) pytest tests/properties $(ARGS)
+
+# Whole fields killed thirty times at random moments, half an hour.
+soak: $(STAMP)
+	$(RUN) bench.soak $(ARGS)
 
 # The paper's evidence, in bench/report/report.md; an interrupted run continues, a larger one adds.
 paper: GALAXIES = 600
@@ -112,5 +116,5 @@ clean:
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv --without-pip $(VENV)
 	$(PYTHON) -m pip --python $(VENV)/bin/python install --quiet \
-	    --editable '.[pocl,sim,plot,detect,dev]'
+	    --editable '.[pocl,sim,plot,field,dev]'
 	touch $@

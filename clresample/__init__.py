@@ -52,9 +52,16 @@ _ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
     "files": {
         "results": ("read_result", "write_catalogue", "write_result"),
     },
+    # whole fields, from mosaics to one catalogue
+    "fields": {
+        "mosaic": ("Mosaic",),
+        "options": ("FieldOptions",),
+        "run": ("run_field",),
+    },
     # scenes with their truth
     "simulation": {
         "scenes": ("simulate_scene",),
+        "field": ("simulate_field",),
     },
     # OpenCL devices
     "device": {
@@ -81,6 +88,9 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from .deblending.solver.prior import Prior as Prior
     from .device.device import Device as Device, get_device as get_device
     from .device.discovery import DeviceError as DeviceError, list_devices as list_devices
+    from .fields.mosaic import Mosaic as Mosaic
+    from .fields.options import FieldOptions as FieldOptions
+    from .fields.run import run_field as run_field
     from .files.results import (
         read_result as read_result,
         write_catalogue as write_catalogue,
@@ -93,6 +103,7 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from .resampling.paper.resampler import PaperResampler as PaperResampler
     from .resampling.resampler import Resampler as Resampler
     from .resampling.tiled.resampler import TiledResampler as TiledResampler
+    from .simulation.field import simulate_field as simulate_field
     from .simulation.scenes import simulate_scene as simulate_scene
     from .sky.correlation import NoiseCorrelation as NoiseCorrelation
     from .sky.frame import Frame as Frame, model_frame as model_frame

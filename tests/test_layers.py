@@ -20,6 +20,7 @@ ROOMS = {
     "measurement": ("sky", "resampling", "deblending"),
     "files": ("drawing", "sky", "deblending", "measurement"),
     "simulation": ("sky",),
+    "fields": ("device", "sky", "deblending", "measurement", "files"),
     "cli": (
         "device",
         "drawing",
@@ -29,6 +30,7 @@ ROOMS = {
         "measurement",
         "files",
         "simulation",
+        "fields",
     ),
 }
 # Rooms that work without any OpenCL driver.

@@ -1,8 +1,9 @@
 """The command `clresample`: one function per subcommand adds its parser and names what runs.
 
 A subcommand's function takes argparse's subparsers, adds its own, and calls
-`parser.set_defaults(run=...)`; `run(arguments)` raises ValueError, OSError or DeviceError for a
-mistake in files or arguments, which becomes one line on standard error and exit status 2.
+`parser.set_defaults(run=...)`; `run(arguments)` returns an exit status, None being 0. It raises
+ValueError, OSError or DeviceError for a mistake in files or arguments, which becomes one line on
+standard error and exit status 2.
 """
 
 from __future__ import annotations
@@ -21,9 +22,11 @@ from ..device.profile import report
 from ..device.remembered import DeviceWarning
 from .deblend import add_deblend
 from .devices import add_devices
+from .field import add_field
 from .machine.tune import add_tune
 from .options import note, printable
 from .resample import add_resample
+from .simulate import add_simulate
 
 # Of an error's line: some errors quote a whole file.
 MOST_CHARACTERS = 900
@@ -60,7 +63,7 @@ def _run(argv):
             _show_in_one_line(arguments)
             if getattr(arguments, "profile", False):
                 os.environ["CLRESAMPLE_PROFILE"] = "1"  # read when the device is opened
-            arguments.run(arguments)
+            status = arguments.run(arguments)
             report()
     except DeviceError as error:  # may hold a compiler's log: its lines are kept
         return _fail(arguments, str(error))
@@ -69,7 +72,7 @@ def _run(argv):
     except KeyboardInterrupt:
         _fail(arguments, "interrupted")
         return 130  # what a shell reports after Ctrl-C
-    return 0
+    return status or 0
 
 
 def _show_in_one_line(arguments):
@@ -107,4 +110,4 @@ def _ended_as_interrupted():
         signal.signal(signal.SIGTERM, signal.SIG_DFL if former is None else former)
 
 
-COMMANDS = (add_resample, add_deblend, add_devices, add_tune)
+COMMANDS = (add_resample, add_deblend, add_field, add_simulate, add_devices, add_tune)

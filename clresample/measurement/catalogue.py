@@ -93,7 +93,7 @@ def catalogue(result, *, magnitudes=False) -> QTable:
     table = QTable()
     table["name"] = [s.name or str(i) for i, s in enumerate(result.sources)]
     positions = result.frame.place(result.sources)
-    _add_positions(table, result.frame.grid, positions, "")
+    add_positions(table, result.frame.grid, positions, "")
     table["flags"] = _flags(result, flux, error, positions, result.footprints)
     table["flags"].info.description = ", ".join(f"{flag.value} {flag.name}" for flag in Flag)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -124,7 +124,7 @@ def _counts(result):
     return np.bincount(owner, minlength=len(result.sources))
 
 
-def _add_positions(table, grid, positions, suffix):
+def add_positions(table, grid, positions, suffix):
     """Columns of (S, 2) [model px], also on the sky."""
     sky = grid.sky(*positions.T)
     names, unit = ("y_sky", "x_sky"), u.arcsec
@@ -156,7 +156,7 @@ def _add_shapes(table, result, error):
             if result.errors is not None:
                 moved = shape_slopes(second, axes)
                 shape_errors[s] = _scatter(moved, result.errors.moments[s, 2:, 2:])
-    _add_positions(table, result.frame.grid, centroids, "_centroid")
+    add_positions(table, result.frame.grid, centroids, "_centroid")
     _add_position_errors(table, result, centroids)
     shape_errors[:, 3] = np.minimum(shape_errors[:, 3], UNKNOWN_ANGLE_DEG)
     for i, (name, unit) in enumerate(SHAPE_UNITS.items()):

@@ -62,7 +62,9 @@ class Detection:
     image: np.ndarray
 
 
-def detect(observations, frame=None, *, threshold=THRESHOLD, device=None) -> Detection:
+def detect(
+    observations, frame=None, *, threshold=THRESHOLD, scatters=None, device=None
+) -> Detection:
     """Find sources in all observations together, and in each alone.
 
     The sharpest image separates neighbours best, the combined one reaches the faintest sources. So
@@ -74,6 +76,8 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, device=None) -> Det
     frame: Frame to search and to place the sources in; None = `model_frame(observations)`
     threshold [sigma]: least signal to noise of a peak. 5 is reached by white noise once in two
         million independent pixels; lower thresholds find more noise
+    scatters (n_observations,): of the observations' signal to noise where there is no source, which
+        it is divided by; None = as `noise_scatter` finds them, so that each patch has its own
     device: as for `get_device`
     returns Detection; its sources can be given to `deblend` with its frame
 
@@ -81,7 +85,18 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, device=None) -> Det
     not fit together; ImportError, with what to install, without `sep`.
     Source: see the head of this module.
     """
-    return _search(observations, frame or model_frame(observations), threshold, device, [])
+    frame = frame or model_frame(observations)
+    return _search(observations, frame, threshold, device, [], scatters)
+
+
+def noise_scatter(observation, frame, *, device=None) -> float:
+    """Scatter of an observation's signal to noise where there is no source, at least 1.
+
+    More than 1 is noise that the weights do not tell of, such as that of correlated pixels.
+
+    observation: one; frame: Frame that it is searched in; device: as for `get_device`
+    """
+    return _scatter(_signal_to_noise(observation, frame, device))
 
 
 def detect_more(result, *, threshold=THRESHOLD, device=None) -> Detection:
@@ -116,12 +131,15 @@ def detect_more(result, *, threshold=THRESHOLD, device=None) -> Detection:
     return _search(left, result.frame, threshold, device, list(known))
 
 
-def _search(observations, frame, threshold, device, known):
+def _search(observations, frame, threshold, device, known, scatters=None):
     """Detection in the observations, without the known positions (y, x) [model px]."""
     if not 0 < threshold < math.inf:
         raise ValueError(f"threshold must be a positive number of sigmas, not {threshold}")
     sep = _import_sep()
     images = [_signal_to_noise(o, frame, device) for o in observations]
+    if scatters is None:
+        scatters = [_scatter(image) for image in images]
+    images = [image / scatter for image, scatter in zip(images, scatters, strict=True)]
     widths = np.array([_fwhm_px(o, frame) for o in observations])
     n_channels = np.array([len(o.channels) for o in observations])
     everything = np.einsum("o,oyx->yx", np.sqrt(n_channels / n_channels.sum()), images)
@@ -156,7 +174,7 @@ def _import_sep():
 
 
 def _signal_to_noise(observation, frame, device):
-    """One observation's channels together (Ny, Nx), of unit scatter where there is no source."""
+    """One observation's channels together (Ny, Nx); of unit scatter in white noise alone."""
     observation = observation.white
     op = cached_resampler(frame, observation.grid, observation.psf, dtype=np.float32, device=device)
     weights = observation.weights * op.covered
@@ -180,9 +198,13 @@ def _signal_to_noise(observation, frame, device):
         seen = v > LEAST_WEIGHT * v.max(initial=0)
         total[seen] += n[seen] / np.sqrt(v[seen] * power)
         n_seen += seen
-    image = total / np.sqrt(np.maximum(n_seen, 1))
-    # negative pixels are noise; correlated noise has more scatter
-    return image / max(1.0, sigma_below_zero(image) or 1.0)
+    return total / np.sqrt(np.maximum(n_seen, 1))
+
+
+def _scatter(image):
+    """Scatter of a signal-to-noise image: that of its negative pixels, which are noise, at least
+    1. Correlated noise has more."""
+    return max(1.0, sigma_below_zero(image) or 1.0)
 
 
 def _fwhm_px(observation, frame):

@@ -1,0 +1,185 @@
+"""Survey mosaics to one catalogue: `clresample field`."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+
+from .options import add_device_option, note, positive, say, size, whole
+
+DESCRIPTION = """\
+Find, fit and measure every source of a field: mosaics of any size, of several
+instruments, each with its own pixels, orientation and PSF. The field is searched
+in tiles, sources are linked into blends by their light, and blends are fitted in
+groups. What is finished stays on disk: --resume goes on after any interruption
+and ends with the same catalogue."""
+
+EPILOG = """\
+in DIR   catalogue.parquet, .fits, .ecsv   fluxes with errors, positions, shapes, flags
+         blends.ecsv                       fits: how they ended, sizes, seconds
+         models.fits                       every source's model, by blend
+         model_*.fits, residual_*.fits     mosaics
+         provenance.json                   versions, device, settings, input checksums
+         work/                             what --resume goes on from
+
+exit     0 all is done   1 done, but tiles are lost or fits set aside, each with its
+         reason   2 nothing could be done   130 interrupted: --resume goes on
+
+example  clresample simulate field -o sky
+         clresample field sky/field.toml -o sky/out"""
+
+# the largest group of fits that is asked for by default, as a part of the memory that is free
+MEMORY_PART = 8
+
+
+def add_field(commands):
+    """Add `clresample field`."""
+    parser = commands.add_parser(
+        "field",
+        help="one catalogue of whole mosaics",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("field", metavar="FIELD.toml", help="mosaics, and how they are run")
+    parser.add_argument("-o", "--output", metavar="DIR", required=True, help="to write into")
+    again = parser.add_mutually_exclusive_group()
+    again.add_argument("--resume", action="store_true", help="go on with the run in DIR")
+    again.add_argument("--overwrite", action="store_true", help="forget the run in DIR")
+    parser.add_argument(
+        "--workers",
+        metavar="N",
+        type=whole,
+        default=1,
+        help="processes that search and fit; 0 = this one (default %(default)s)",
+    )
+    parser.add_argument(
+        "--memory",
+        metavar="SIZE",
+        type=size,
+        help="that one worker's group of fits, or search of a tile, may take (default 1G, or an "
+        "eighth of the free memory for each worker where that is less)",
+    )
+    parser.add_argument(
+        "--limit",
+        metavar="S",
+        type=positive,
+        default=3600.0,
+        help="seconds after which a worker is taken to hang (default %(default)g)",
+    )
+    parser.add_argument(
+        "--part",
+        metavar="I/N",
+        type=_part,
+        help="only the I-th of N parts of the field, for job arrays: sources belong to the part "
+        "that holds their centre, so that the parts' catalogues together are that of the field",
+    )
+    add_device_option(parser)
+    parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
+    parser.set_defaults(run=run)
+
+
+def _part(text):
+    """I/N as two whole numbers."""
+    i, _, n = text.partition("/")
+    if not (i.isdecimal() and n.isdecimal() and 1 <= int(i) <= int(n)):
+        raise argparse.ArgumentTypeError(f"{text!r} is no part such as 2/4")
+    return int(i), int(n)
+
+
+def run(arguments):
+    """Read the field file, run the field, report. Returns the exit status."""
+    import os
+
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # as in `clresample deblend`
+    from ..fields.options import LEAST_MEMORY, MEMORY
+    from ..fields.reading.field_file import read_field
+    from ..fields.run import free_memory, run_field
+
+    started = time.perf_counter()
+    field = read_field(arguments.field)
+    if not arguments.quiet:
+        for text in field.notes:
+            note(arguments, text)
+    memory = min(MEMORY, free_memory() // (MEMORY_PART * max(arguments.workers, 1)))
+    options = replace(
+        field.options,
+        workers=arguments.workers,
+        device=arguments.device,
+        limit_s=arguments.limit,
+        part=arguments.part,
+        memory=arguments.memory or max(memory, LEAST_MEMORY),
+    )
+    progress = _progress(arguments)
+    try:
+        done = run_field(
+            field.mosaics,
+            arguments.output,
+            options=options,
+            resume=arguments.resume,
+            overwrite=arguments.overwrite,
+            progress=progress,
+            about={"inputs": field.inputs},
+        )
+    except ImportError as error:
+        raise ValueError(f"{arguments.field}: {error}") from error
+    finally:
+        progress.close()
+    return _report(arguments, done, time.perf_counter() - started)
+
+
+def _progress(arguments):
+    """A bar on a terminal: blends done, sources a second, time left."""
+    from tqdm import tqdm
+
+    from ..fields.options import Progress
+
+    class Bar(Progress):
+        def __init__(self):
+            self.bar = None
+
+        def stage(self, name, total):
+            self.close()
+            self.sources, self.began = 0, time.perf_counter()
+            self.bar = tqdm(
+                total=total,
+                desc=name,
+                unit="tile" if name == "search" else "blend",
+                leave=False,
+                disable=True if arguments.quiet else None,
+            )
+
+        def step(self, n, sources=0):
+            self.sources += sources
+            seconds = time.perf_counter() - self.began
+            self.bar.set_postfix_str(f"{self.sources / seconds:.1f} sources/s", refresh=False)
+            self.bar.update(n)
+
+        def say(self, text):
+            if not arguments.quiet:
+                tqdm.write("", end="")
+                say(arguments, text)
+
+        def close(self):
+            if self.bar is not None:
+                self.bar.close()
+
+    return Bar()
+
+
+def _report(arguments, done, took):
+    """Print what was done and the files; the exit status."""
+    out = done.outputs
+    ended = ", ".join(f"{n} {how}" for how, n in sorted(out.status.items()))
+    stages = ", ".join(f"{name} {s:.1f} s" for name, s in done.seconds.items())
+    print(f"{out.n_sources} sources in {out.n_blends} fits ({ended or 'none'})")
+    print(f"{took:.1f} s: {stages}")
+    for number, reason in done.lost.items():
+        print(f"tile {number} is lost: {reason}")
+    if not arguments.quiet:
+        for text in out.notes:
+            note(arguments, text)
+    for path in out.paths:
+        print(path)
+    return 1 if done.lost or done.failed else 0

@@ -1,0 +1,168 @@
+"""A field with its truth, in files to try `clresample field` on: `clresample simulate field`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from .options import names, note, positive, whole
+
+FILES = "field.toml", "truth.ecsv"
+DESCRIPTION = """\
+Write a simulated field of galaxies and stars as Euclid (VIS) and Rubin see it:
+mosaics with RMS, masks and PSFs that vary, field.toml for `clresample field`, and
+truth.ecsv. One seed gives one field."""
+
+
+def add_simulate(commands):
+    """Add `clresample simulate`."""
+    parser = commands.add_parser(
+        "simulate",
+        help="write a simulated field with its truth",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("what", choices=["field"], help="field: mosaics of two surveys")
+    parser.add_argument("-o", "--output", metavar="DIR", required=True, help="to write into")
+    parser.add_argument("--overwrite", action="store_true", help="replace files that exist")
+    sky = parser.add_argument_group("sky")
+    sky.add_argument("--seed", type=whole, default=0, help="(default %(default)s)")
+    sky.add_argument(
+        "--size", type=whole, default=512, metavar="PX", help="Euclid pixels a side (%(default)s)"
+    )
+    sky.add_argument(
+        "--density",
+        type=positive,
+        default=36.0,
+        metavar="N",
+        help="sources per square arcminute to i = 26 (%(default)s)",
+    )
+    for name, default, what in (
+        ("clustering", 0.2, "part of the sources beside another one"),
+        ("stars", 0.05, "part of the sources that are stars"),
+        ("psf-variation", 0.1, "by which part PSFs widen across the field"),
+    ):
+        sky.add_argument(
+            f"--{name}", type=_part, default=default, metavar="F", help=f"{what} (%(default)s)"
+        )
+    images = parser.add_argument_group("images")
+    images.add_argument(
+        "--bands",
+        type=names,
+        default=list("ugrizy"),
+        metavar="B,...",
+        help="of Rubin (default u,g,r,i,z,y)",
+    )
+    images.add_argument(
+        "--angle", type=float, default=12.0, metavar="DEG", help="of Rubin's pixels (%(default)s)"
+    )
+    images.add_argument(
+        "--bad-columns", type=whole, default=2, metavar="N", help="of each mosaic (%(default)s)"
+    )
+    parser.set_defaults(run=run)
+
+
+def _part(text):
+    """A number from 0 to 1."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = -1.0
+    if not 0 <= number <= 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number from 0 to 1")
+    return number
+
+
+def run(arguments):
+    """Simulate and write. Raises ValueError and FileError, one line, for what cannot be done."""
+    from ..files.whole_file import check_output
+    from ..simulation.field import simulate_field
+
+    folder = Path(arguments.output)
+    for name in FILES if folder.exists() else ():
+        check_output(folder / name, overwrite=arguments.overwrite)
+    try:
+        field = simulate_field(
+            arguments.seed,
+            n_pixels=arguments.size,
+            density=arguments.density,
+            rubin_bands=tuple(arguments.bands),
+            angle_deg=arguments.angle,
+            clustering=arguments.clustering,
+            stars=arguments.stars,
+            psf_variation=arguments.psf_variation,
+            bad_columns=arguments.bad_columns,
+        )
+    except ImportError as error:
+        raise ValueError(f"simulate: {error}") from error
+    for path in write_field(folder, field):
+        print(path)
+    note(arguments, f"next: clresample field {folder / FILES[0]} -o {folder / 'out'}")
+
+
+def write_field(folder, field) -> list[Path]:
+    """Write a SimulatedField: an image and a PSF cube of each mosaic, field.toml, truth.ecsv.
+
+    An image file has the HDUs SCI (cube of bands, tile-compressed without loss), RMS and MASK,
+    whose bit BAD (1) marks dead columns. Returns the paths, field.toml first.
+    """
+    import numpy as np
+    from astropy.io import fits
+    from astropy.table import Table
+
+    from ..files.fits import write_hdus
+    from ..files.whole_file import whole_file
+
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths, tables = [], []
+    lossless = {"compression_type": "GZIP_2", "quantize_level": 0}
+    for mosaic in field.mosaics:
+        name = mosaic.survey.name.lower()
+        header = mosaic.grid.to_wcs().to_header(relax=True)
+        for i, band in enumerate(mosaic.survey.bands):
+            header[f"BAND{i + 1}"] = band
+        rms = np.broadcast_to(
+            mosaic.noise_sigma[:, None, None].astype(np.float32), mosaic.data.shape
+        )
+        tile = {"tile_shape": (1, 64, mosaic.data.shape[2])}
+        mask = fits.ImageHDU(2 * mosaic.bad.astype(np.uint8), name="MASK")
+        mask.header["MP_BAD"] = (1, "bit of dead columns")
+        hdus = [
+            fits.PrimaryHDU(),
+            fits.CompImageHDU(mosaic.data, header, name="SCI", **lossless, **tile),
+            fits.CompImageHDU(np.array(rms), name="RMS", **lossless, **tile),
+            mask,
+        ]
+        write_hdus(folder / f"{name}.fits", hdus)
+        y, x = mosaic.psf_positions.T
+        places = fits.table_to_hdu(Table({"x": x, "y": y}))
+        places.name = "POSITIONS"
+        images = fits.ImageHDU(mosaic.psf_images, name="PSF")
+        write_hdus(folder / f"{name}_psf.fits", [fits.PrimaryHDU(), images, places])
+        paths += [folder / f"{name}.fits", folder / f"{name}_psf.fits"]
+        tables.append(_toml(mosaic, name))
+    with whole_file(folder / FILES[0]) as part:
+        part.write_text("\n".join(tables))
+    truth = Table(field.truth)
+    with whole_file(folder / FILES[1]) as part:
+        truth.write(part, format="ascii.ecsv", overwrite=True)
+    return [folder / FILES[0], *paths, folder / FILES[1]]
+
+
+def _toml(mosaic, name):
+    """The table of a mosaic in field.toml."""
+    points = ", ".join(f"{p:.6f}" for p in mosaic.survey.zero_points_mag)
+    return f"""[[mosaic]]
+name = "{mosaic.survey.name}"
+image = "{name}.fits"
+hdu = "SCI"
+rms = "{name}.fits"
+rms_hdu = "RMS"
+mask = "{name}.fits"
+mask_hdu = "MASK"
+mask_bits = ["BAD"]
+zero_point = [{points}]
+psf = "{name}_psf.fits"
+psf_format = "cube"
+"""

@@ -1,0 +1,239 @@
+"""What is to be done for a field: its sources, the fits to make, and in which groups."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field, replace
+
+import numpy as np
+from scipy import ndimage
+
+from ..box import Box, sized_up
+from .cut import Limits, pieces_of
+from .search import nearest
+
+# [model px] Sky around a blend's footprint in the box of its fit: it shows where the light ends.
+# More makes fits slower; less leaves wings without sky.
+MARGIN_PX = 8
+# [model px] Sides of these boxes are multiples of it, so that blends share batches: smaller ones
+# make more batches, larger ones more sky to compute.
+STEP_PX = 32
+# Bits of an id for each of a source's row and column, and of the field's number above them.
+POSITION_BITS = 20
+LARGEST_FIELD = (1 << 63 - 2 * POSITION_BITS) - 1
+
+
+@dataclass(frozen=True)
+class Patch:
+    """One fit: a blend, or a piece of one that is over the limits.
+
+    number: in the plan; its pixels have the label number + 1; parent: id of the blend
+    box: Box of the model's pixels that is fitted
+    sources: indices of the plan's sources; siblings: numbers of the other pieces of its blend whose
+        boxes meet this one
+    pieces: how many pieces its blend was cut into, 1 = not cut; n_blend: sources of the blend
+    """
+
+    number: int
+    parent: int
+    box: Box
+    sources: tuple[int, ...]
+    siblings: tuple[int, ...] = ()
+    pieces: int = 1
+    n_blend: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Sources (S), patches (P) and groups of patches that are fitted side by side.
+
+    positions (S, 2) [px]: (y, x) in the field's model pixels; ids (S,): int64; peaks (S,) [sigma]
+    groups: of patch numbers, those predicted to take longest first
+    giants: groups of pieces only, which are fitted again with their neighbours' light subtracted
+    lost: {tile's number: why it could not be searched}
+    """
+
+    positions: np.ndarray
+    ids: np.ndarray
+    peaks: np.ndarray
+    patches: tuple[Patch, ...]
+    groups: tuple[tuple[int, ...], ...]
+    giants: tuple[tuple[int, ...], ...] = ()
+    lost: dict = field(default_factory=dict)
+
+    def to_json(self) -> str:
+        """All of it, as `from_json` takes it; floats with the digits that give them back."""
+        return json.dumps(
+            {
+                "positions": self.positions.tolist(),
+                "ids": self.ids.tolist(),
+                "peaks": self.peaks.tolist(),
+                "patches": [asdict(patch) for patch in self.patches],
+                "groups": self.groups,
+                "giants": self.giants,
+                "lost": self.lost,
+            }
+        )
+
+    def only(self, core) -> Plan:
+        """The plan of what is needed for the sources in a Box: blends that have one there."""
+        inside = core.holds(self.positions)
+        parents = {p.parent for p in self.patches if inside[list(p.sources)].any()}
+
+        def kept(groups):
+            few = (tuple(n for n in g if self.patches[n].parent in parents) for g in groups)
+            return tuple(group for group in few if group)
+
+        return replace(self, groups=kept(self.groups), giants=kept(self.giants))
+
+    @classmethod
+    def from_json(cls, text) -> Plan:
+        """The plan that `to_json` wrote."""
+        about = json.loads(text)
+        patches = [
+            Patch(
+                **(p | {"box": Box(*p["box"])} | {k: tuple(p[k]) for k in ("sources", "siblings")})
+            )
+            for p in about["patches"]
+        ]
+        return cls(
+            np.array(about["positions"], float).reshape(-1, 2),
+            np.array(about["ids"], np.int64),
+            np.array(about["peaks"], float),
+            tuple(patches),
+            tuple(map(tuple, about["groups"])),
+            tuple(map(tuple, about["giants"])),
+            about["lost"],
+        )
+
+
+def source_ids(positions, field_number=0) -> np.ndarray:
+    """Ids (S,) int64 of sources at positions (S, 2) [px] of the field's model pixels.
+
+        id = (field number << 40) + (row << 20) + column
+
+    of the pixel that holds the source: the same in every run over the field, whole or in parts.
+    Rows and columns are those of the model's grid, 0 to 1,048,575; a source outside is counted at
+    the edge. Ids that are given already go to the next free column, in the order given.
+    """
+    most = (1 << POSITION_BITS) - 1
+    at = np.clip(nearest(positions).astype(np.int64), 0, most)
+    base = (int(field_number) << 2 * POSITION_BITS) + (at[:, 0] << POSITION_BITS)
+    ids, used = base + at[:, 1], set()
+    for i, one in enumerate(ids.tolist()):
+        while one in used:
+            one += 1
+        ids[i] = one
+        used.add(one)
+    return ids
+
+
+def make_plan(
+    positions,
+    peaks,
+    footprints,
+    region,
+    *,
+    limits=None,
+    field_number=0,
+    memory=None,
+    n_channels=1,
+    most=16,
+) -> Plan:
+    """Blends from sources and the labels of their light; giants cut; groups by predicted cost.
+
+    positions (S, 2) [px], peaks (S,) [sigma]; footprints: Footprints of `region`, whose labels are
+    renumbered here: label n + 1 is patch n's
+    memory [bytes]: that the fits of one group may take; None = no limit; n_channels: of all mosaics
+    most: blends in a group. More share a batch's cost, but are lost together with their worker
+    """
+    limits = limits or Limits()
+    ids = source_ids(positions, field_number)
+    labels, corner = footprints.labels, np.array(region[:2])
+    at = nearest(positions) - corner
+    at = np.clip(at, 0, np.array(labels.shape) - 1)
+    of_label: dict[int, list[int]] = {}
+    for s, label in enumerate(labels[at[:, 0], at[:, 1]].tolist()):
+        of_label.setdefault(label, []).append(s)
+    made: list[dict] = []
+    order = sorted((label for label in of_label if label), key=int)
+    pending = []
+    for label in order:
+        sources, box = of_label[label], footprints.boxes[label - 1]
+        brightest = max(sources, key=lambda s: (peaks[s], -s))
+        own = {"parent": int(ids[brightest]), "n_blend": len(sources)}
+        inner = box.within(region)
+        inside = labels[inner.slices] == label
+        over = len(sources) > limits.sources or box.grown(MARGIN_PX).area > limits.pixels
+        if not over or len(sources) == 1:
+            pending.append((inner, inside, len(made)))
+            made.append(own | {"box": box, "sources": tuple(sources)})
+            continue
+        light = footprints.light[inner.slices]
+        local = positions[sources] - box[:2]
+        territory, number = pieces_of(light, inside, local, limits, MARGIN_PX)
+        n_pieces = int(number.max()) + 1
+        for i in range(n_pieces):
+            part = territory == i + 1
+            where = ndimage.find_objects(part.astype(np.uint8))[0]
+            small = Box(where[0].start, where[1].start, where[0].stop, where[1].stop)
+            there = Box(*(np.array(small) + np.array([*box[:2], *box[:2]])).tolist())
+            pending.append((there.within(region), part[where], len(made)))
+            few = tuple(s for s, piece in zip(sources, number, strict=True) if piece == i)
+            made.append(own | {"box": there, "sources": few, "pieces": n_pieces})
+    labels[:] = 0
+    for inner, inside, i in pending:
+        labels[inner.slices][inside] = i + 1
+    patches = _patches(made)
+    groups = _groups(patches, patches, memory, n_channels, most)
+    giants = _groups(patches, [p for p in patches if p.pieces > 1], memory, n_channels, most)
+    return Plan(positions, ids, np.asarray(peaks), patches, groups, giants)
+
+
+def _patches(made):
+    """Patches with the boxes of their fits, and the other pieces that each of them meets."""
+    boxes = [sized_up(one["box"].grown(MARGIN_PX), STEP_PX) for one in made]
+    of_parent: dict[int, list[int]] = {}
+    for i, one in enumerate(made):
+        of_parent.setdefault(one["parent"], []).append(i)
+    patches = []
+    for i, one in enumerate(made):
+        others = [k for k in of_parent[one["parent"]] if k != i]
+        meet = tuple(k for k in others if boxes[i].meet(boxes[k]).area)
+        patches.append(Patch(i, **(one | {"box": boxes[i], "siblings": meet})))
+    return tuple(patches)
+
+
+def predicted_bytes(patch, n_channels) -> float:
+    """Memory [bytes] that a fit takes on device and host together, roughly.
+
+    Each source has its morphology, its gradients and directions (some 20 images of the model's
+    pixels) and its image in every channel, in float32; each channel some 10 more images.
+    """
+    images = 20 * len(patch.sources) + n_channels * (len(patch.sources) + 10)
+    return 4.0 * images * patch.box.area
+
+
+def predicted_cost(patch) -> float:
+    """What orders fits by their time: pixels times sources, and three more for what all share."""
+    return patch.box.area * (len(patch.sources) + 3.0)
+
+
+def _groups(patches, chosen, memory, n_channels, most):
+    """Numbers of patches in groups of one size of box, the largest first."""
+    of_shape: dict[tuple, list[Patch]] = {}
+    for patch in sorted(chosen, key=lambda p: (-predicted_cost(p), p.number)):
+        of_shape.setdefault(patch.box.shape, []).append(patch)
+    groups = []
+    for alike in of_shape.values():
+        group, n_bytes = [], 0.0
+        for patch in alike:
+            more = predicted_bytes(patch, n_channels)
+            if group and (len(group) >= most or (memory and n_bytes + more > memory)):
+                groups.append(group)
+                group, n_bytes = [], 0.0
+            group.append(patch)
+            n_bytes += more
+        groups.append(group)
+    groups.sort(key=lambda g: (-sum(map(predicted_cost, g)), g[0].number))
+    return tuple(tuple(p.number for p in group) for group in groups)

@@ -1,0 +1,155 @@
+"""Detection, tile by tile: sources and the light that links them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from ...files.whole_file import FileError
+from ...measurement.detection import detect, noise_scatter
+from ...sky.frame import model_frame
+from ..box import Box
+
+# [sigma] of the combined signal-to-noise image: pixels above it hold light of a source. At 2, what
+# is left out of a source's footprint is under the noise everywhere; lower, noise links sources that
+# do not touch; higher, faint wings are shared by two blends.
+LIGHT = 2.0
+# Peaks may lie on nothing else that is above LIGHT: those found by one instrument alone. They get a
+# footprint of this radius, in FWHM of the widest PSF.
+LEAST_RADIUS = 0.5
+SAMPLE_PX = 512  # [model px] side of the part of a field that shows how its noise scatters
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What the search of one tile has found.
+
+    positions (S, 2) [px]: (y, x) in the field's model pixels of sources in the core; peaks (S,)
+        [sigma]
+    light (Ny, Nx) [sigma]: float16, signal to noise of all instruments together, of the core
+    lit (Ny, Nx) bool: the core's pixels of footprints, grown by the PSF
+    """
+
+    positions: np.ndarray
+    peaks: np.ndarray
+    light: np.ndarray
+    lit: np.ndarray
+
+
+def search(mosaics, reference, tile, *, threshold, scatters=None, device=None) -> Found:
+    """Search one tile in all mosaics together.
+
+    mosaics: of the field; reference: Grid of the model's pixels; tile: Tile
+    threshold [sigma]: least signal to noise of a peak
+    scatters {mosaic's name: scatter of its signal to noise}: see `scatters_of`; None = each tile's
+
+    Raises FileError for pixels that cannot be read, ImportError without sep.
+    """
+    observations = observations_on(mosaics, reference, tile.outer)
+    n_y, n_x = tile.core.shape
+    if not observations:
+        empty = np.zeros((n_y, n_x))
+        return Found(np.zeros((0, 2)), np.zeros(0), empty.astype(np.float16), empty > 0)
+    frame = model_frame(observations, grid=_cut(reference, tile.outer))
+    known = scatters and [scatters[o.name] for o in observations]
+    found = detect(observations, frame, threshold=threshold, scatters=known, device=device)
+    positions = np.array([s.position_px for s in found.sources]).reshape(-1, 2)
+    radius = footprint_radius(observations, frame)
+    lit = grown_footprints(found.image > LIGHT, positions, radius)
+    positions = positions + tile.outer[:2]
+    own = tile.core.holds(positions)
+    inner = tile.core.within(tile.outer).slices
+    light = np.clip(found.image[inner], -100, 6e4).astype(np.float16)
+    return Found(positions[own], found.peaks[own], light, lit[inner])
+
+
+def place(mosaics, reference, tile, positions, *, scatters=None, device=None) -> Found:
+    """The Found of a tile for sources that a catalogue gives, positions (S, 2) [px of the field].
+
+    Their light is seen as `search` sees it; peaks are the combined signal to noise there.
+    """
+    whole, given = tile._replace(core=tile.outer), {"scatters": scatters, "device": device}
+    outer = search(mosaics, reference, whole, threshold=1e30, **given)
+    own = tile.core.holds(positions)
+    near = tile.outer.holds(positions)
+    light = outer.light.astype(np.float64)
+    at = nearest(positions[near]) - np.array(tile.outer[:2])
+    observations = observations_on(mosaics, reference, tile.outer)
+    inner = tile.core.within(tile.outer).slices
+    lit = np.zeros(light.shape, bool)
+    if observations:
+        frame = model_frame(observations, grid=_cut(reference, tile.outer))
+        radius = footprint_radius(observations, frame)
+        lit = grown_footprints(light > LIGHT, at, radius)
+    at = nearest(positions[own]) - np.array(tile.outer[:2])
+    peaks = light[at[:, 0], at[:, 1]]
+    return Found(positions[own], peaks, outer.light[inner], lit[inner])
+
+
+def scatters_of(mosaics, reference, device=None) -> dict:
+    """{mosaic's name: scatter of its signal to noise without sources}, from the field's middle.
+
+    One number for the whole field, so that the same is found however it is divided into tiles.
+    """
+    region = Box.of(reference.shape)
+    middle = [(a + b) // 2 for a, b in zip(region[:2], region[2:], strict=True)]
+    box = Box(*middle, *middle).grown(SAMPLE_PX // 2).meet(region)
+    found = dict.fromkeys((mosaic.name for mosaic in mosaics), 1.0)
+    try:
+        observations = observations_on(mosaics, reference, box)
+    except FileError:  # its tile will say so
+        return found
+    if observations:
+        frame = model_frame(observations, grid=_cut(reference, box))
+        for o in observations:
+            found[o.name] = noise_scatter(o, frame, device=device)
+    return found
+
+
+def observations_on(mosaics, reference, box):
+    """The Observations of all mosaics on a Box of the model's pixels, those that see it.
+
+    Their PSFs are those of the mosaics' middles, so that signal to noise does not depend on the
+    Box. Where a PSF is wider than its filter by a tenth, that costs half a percent of it.
+    """
+    grid, found = _cut(reference, box), []
+    for mosaic in mosaics:
+        there = mosaic.box_on(grid)
+        middle = Box.of(mosaic.grid.shape)
+        seen = mosaic.observation(there, psf_box=middle) if there.area else None
+        if seen is not None and seen.grid.map_to(grid).covered.any():
+            found.append(seen)
+    return found
+
+
+def footprint_radius(observations, frame) -> int:
+    """Radius [model px] by which footprints grow: half the FWHM of the widest PSF."""
+    scale = frame.grid.pixel_scale_arcsec
+    widths = [o.psf.fwhm_px.max() * o.grid.pixel_scale_arcsec / scale for o in observations]
+    return max(1, round(LEAST_RADIUS * max(widths)))
+
+
+def grown_footprints(bright, positions, radius):
+    """Pixels of the connected bright parts that hold a source, and discs about the sources, grown.
+
+    bright (Ny, Nx) bool; positions (S, 2) [px]; radius [px]
+    """
+    seeds = np.zeros(bright.shape, bool)
+    at = nearest(positions)
+    seeds[at[:, 0], at[:, 1]] = True
+    lit = ndimage.binary_propagation(seeds, np.ones((3, 3), bool), mask=bright | seeds)
+    if not lit.any():
+        return lit
+    return ndimage.distance_transform_edt(~lit) <= radius
+
+
+def nearest(positions) -> np.ndarray:
+    """Pixels (S, 2) int that hold positions (S, 2) [px]; the edge belongs to one of them only."""
+    return np.floor(np.asarray(positions).reshape(-1, 2) + 0.5).astype(int)
+
+
+def _cut(reference, box):
+    """The grid of a Box of the reference's pixels."""
+    return reference.cutout(box.y0, box.x0, box.shape)

@@ -1,0 +1,127 @@
+"""The catalogue of a field from its parts: one order of columns, units, descriptions."""
+
+from __future__ import annotations
+
+import numpy as np
+from astropy import units as u
+from astropy.table import QTable, vstack
+
+DESCRIPTIONS = {
+    "id": "of the source: field, row and column of the model's pixel that holds it",
+    "parent_id": "id of the brightest source that was detected in the same blend",
+    "flags": "sum of what limits the measurement: 1 EDGE, 2 NOT_CONVERGED, 4 ZERO_FLUX, "
+    "8 NO_COVERAGE, 16 OUTSIDE, 32 MASKED, 64 MISFIT",
+    "status": "how the fit ended",
+    "reason": "why it failed, or was cut",
+    "n_blend": "sources that were detected in the blend",
+    "pass": "1 = detected before the fit, 2 = in its residuals",
+    "peak": "signal to noise of the detection, all instruments together",
+    "snr": "signal to noise of the fluxes of all channels",
+    "y": "row of the detection in the model's pixels, from 0",
+    "x": "column of the detection in the model's pixels, from 0",
+    "size": "of the fitted light under the model's PSF",
+}
+FIRST = ("id", "parent_id", "ra", "dec", "y_sky", "x_sky", "y", "x", "flags", "status", "reason")
+THEN = ("n_blend", "pass", "peak", "snr")
+
+
+def finished(job, parts, last, unsettled=()):
+    """The catalogue of the core, sorted by id, and the table of fits, sorted by patch.
+
+    parts: PartFiles; last: {patch: index of the part with its last round}
+    unsettled: parents of blends that were cut into pieces which did not settle
+    """
+    tables, fits = [], []
+    for i, part in enumerate(parts):
+        mine = {patch for patch, k in last.items() if k == i}
+        patches, rows = part.table("PATCHES"), part.table("CATALOGUE")
+        n_rows, start = patches["n_sources"].tolist(), 0
+        for patch, n in zip(patches["patch"].tolist(), n_rows, strict=True):
+            if patch in mine and n:
+                tables.append(rows[start : start + n])
+            start += n
+        fits += [patches[k : k + 1] for k, p in enumerate(patches["patch"]) if int(p) in mine]
+    table = QTable()
+    if tables:
+        tables.sort(
+            key=lambda t: -len(t.colnames)
+        )  # the most columns first, so that units are known
+        table = _joined(tables)
+        table = table[np.argsort(table["id"], kind="stable")]
+        at = np.stack([table["y"].value, table["x"].value], axis=1)
+        table = table[job.core.holds(at)]
+        moving = np.isin(table["parent_id"], np.array(sorted(unsettled), np.int64))
+        table["reason"] = [
+            f"{reason}, which had not settled" if one else str(reason)
+            for one, reason in zip(moving, table["reason"], strict=True)
+        ]
+    blends = vstack(fits) if fits else QTable()
+    if fits:
+        blends = blends[np.argsort(blends["patch"])]
+        blends["seconds"] = blends["seconds"] * u.s
+    return _described(table[_order(job, table.colnames)] if tables else table), blends
+
+
+def _joined(tables):
+    """Tables one after the other; what a row does not have is NaN."""
+    names: dict[str, object] = {}
+    for table in tables:
+        for name in table.colnames:
+            names.setdefault(name, table[name])
+    for table in tables:
+        for name, like in names.items():
+            if name not in table.colnames:
+                unit = getattr(like, "unit", None)
+                empty = np.full(len(table), np.nan)
+                table[name] = empty if unit is None else empty * unit
+    for table in tables:
+        for name in ("status", "reason"):
+            text = np.asarray(table[name])
+            table[name] = [one.decode() if isinstance(one, bytes) else str(one) for one in text]
+    return vstack([_plain(table[list(names)]) for table in tables])
+
+
+def _plain(table):
+    """Masked values as NaN."""
+    for name in table.colnames:
+        column = table[name]
+        if hasattr(column, "mask") and np.any(column.mask):
+            filled = column.filled(np.nan)
+            table[name] = filled
+        elif hasattr(column, "unmasked"):
+            table[name] = column.unmasked
+    return table
+
+
+def _order(job, names):
+    """Names of columns: who and where, how it went, positions and shapes, then all channels."""
+    channels, labels = job.channels, [m.name for m in job.mosaics]
+    fluxes = [f"{key}_{c}" for c in channels for key in ("flux", "flux_err")]
+    quality = [f"chi2_{name}" for name in labels] + [f"residual_{c}" for c in channels]
+    fixed = [*FIRST, *THEN]
+    middle = [n for n in names if n not in {*fixed, *fluxes, *quality}]
+    return [n for n in [*fixed, *middle, *fluxes, *quality] if n in names]
+
+
+def _described(table):
+    """The table with descriptions of its columns."""
+    for name in table.colnames:
+        table[name].info.description = DESCRIPTIONS.get(name) or _description(name)
+    return table
+
+
+def _description(name):
+    """What a column is whose name holds a channel or an instrument, or an error's."""
+    for prefix, text in (
+        ("flux_err_", "error of the flux in {}"),
+        ("flux_", "total flux in {}"),
+        ("chi2_", "mean chi2 of the source's pixels in {}"),
+        ("residual_", "largest residual on the source in {}, in sigma"),
+    ):
+        if name.startswith(prefix):
+            return text.format(name.removeprefix(prefix))
+    if name.endswith("_err"):
+        return f"error of {name.removesuffix('_err')}"
+    if name.endswith("_centroid"):
+        return f"{name.removesuffix('_centroid')} of the fitted light's centroid"
+    return None

@@ -1,0 +1,275 @@
+"""One instrument's mosaic: images of any size, of which only what is asked for is read."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from astropy.io import fits
+
+from ..files.whole_file import FileError
+from ..sky.grid import Grid
+from ..sky.observation import Observation
+from ..sky.psf_checks import PSFWarning
+from .background import Background
+from .box import Box
+from .psfs.psf_field import ConstantPSF, PSFField
+
+
+class Plane(Protocol):
+    """One plane (Ny, Nx) of an image."""
+
+    def read(self, box) -> np.ndarray:
+        """The pixels of a Box that lies on the image."""
+
+
+@dataclass(frozen=True)
+class FilePlane:
+    """One plane (Ny, Nx) of an image HDU, plain or tile-compressed, read piece by piece.
+
+    path, hdu: file and number of the HDU; plane: index on the axis that is not on the sky, None
+        where the image has two axes
+    """
+
+    path: Path
+    hdu: int
+    plane: int | None = None
+
+    def read(self, box) -> np.ndarray:
+        """The pixels of a Box that lies on the image, native. Raises FileError."""
+        try:
+            hdu = _opened(str(self.path))[self.hdu]
+            rows, columns = box.slices
+            index = (rows, columns) if self.plane is None else (self.plane, rows, columns)
+            data = np.asarray(hdu.section[index])
+        except Exception as error:  # a damaged file may provoke any exception in astropy
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise FileError(f"{self.path}: HDU {self.hdu} cannot be read ({reason})") from error
+        if data.shape != box.shape:
+            raise FileError(
+                f"{self.path}: HDU {self.hdu} is truncated, {data.shape} pixels of {box.shape}"
+            )
+        return data.astype(data.dtype.newbyteorder("="), copy=False)
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayPlane:
+    """A plane that is in memory."""
+
+    array: np.ndarray
+
+    def read(self, box) -> np.ndarray:
+        """The pixels of a Box that lies on the image."""
+        return self.array[box.slices]
+
+
+@dataclass(frozen=True)
+class NumberPlane:
+    """The same number in every pixel."""
+
+    value: float
+
+    def read(self, box) -> np.ndarray:
+        """The pixels of a Box."""
+        return np.full(box.shape, self.value)
+
+
+@lru_cache(maxsize=64)
+def _opened(path):
+    """The HDUs of a file, which stay open: each process maps a file into its memory once."""
+    return fits.open(path, memmap=True, lazy_load_hdus=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """One band of a mosaic.
+
+    name: of the channel, unique over all mosaics
+    data [counts]: plane of the image
+    weight: plane, or None; kind: what it holds, "weight" [counts^-2], "variance" [counts^2] or
+        "rms" [counts], the standard deviation; 0, NaN and infinite ones mean: ignore this pixel
+    mask: plane or None; mask_value: the bits that mean: ignore this pixel; None = any that is not 0
+    zero_point [mag]: AB magnitude of one count; None = unknown
+    background: Background that is subtracted, or None
+    """
+
+    name: str
+    data: Plane
+    weight: Plane | None = None
+    kind: str = "weight"
+    mask: Plane | None = None
+    mask_value: int | None = None
+    zero_point: float | None = None
+    background: Background | None = None
+
+    def read(self, box) -> np.ndarray:
+        """Pixels (Ny, Nx) [counts] of a Box, float64, the background subtracted if there is one."""
+        data = np.asarray(self.data.read(box), dtype=np.float64)
+        return data if self.background is None else data - self.background.read(box)
+
+    def weights(self, box) -> np.ndarray:
+        """Inverse variances (Ny, Nx) [counts^-2] of a Box, 0 = ignore this pixel.
+
+        Raises ValueError for a channel without a plane of them.
+        """
+        if self.weight is None:
+            raise ValueError(f"weight of channel {self.name!r} is None, it takes a plane")
+        values = np.asarray(self.weight.read(box), dtype=np.float64)
+        if self.kind != "weight":
+            variance = values**2 if self.kind == "rms" else values
+            good = np.isfinite(variance) & (variance >= np.finfo(np.float64).tiny)
+            values = np.divide(1.0, variance, out=np.zeros(variance.shape), where=good)
+        bad = ~np.isfinite(values) | (values < 0)
+        if self.mask is not None:
+            flags = self.mask.read(box)
+            bad |= (flags != 0) if self.mask_value is None else _set(flags, self.mask_value)
+        return np.where(bad, 0.0, values)
+
+
+@dataclass(frozen=True, eq=False)
+class Mosaic:
+    """One instrument's mosaic of a field.
+
+    name: of the instrument; grid: Grid of (Ny, Nx) of all channels
+    channels: of Channel, at least one
+    psf: PSFField, or PSF, of one band or of one for each channel
+    noise: correlation of neighbouring pixels' noise, as in Observation, or None. An estimate is
+        made once, for the whole mosaic, by whoever makes the mosaic
+    """
+
+    name: str
+    grid: Grid
+    channels: tuple[Channel, ...]
+    psf: PSFField
+    noise: object = None
+
+    def __post_init__(self):
+        if not isinstance(self.psf, PSFField):
+            object.__setattr__(self, "psf", ConstantPSF(self.psf))
+        if not self.channels:
+            raise ValueError(f"channels of mosaic {self.name!r} is empty, at least one is needed")
+        if self.psf.n_bands not in (1, len(self.channels)):
+            raise ValueError(
+                f"psf of mosaic {self.name!r} has {self.psf.n_bands} bands, channels are "
+                f"{len(self.channels)}: give one band, or one for each channel"
+            )
+        known = [c.zero_point is not None for c in self.channels]
+        if any(known) and not all(known):
+            raise ValueError(
+                f"zero_point of channel {self.channels[known.index(False)].name!r} is missing: "
+                "give all or none"
+            )
+
+    @classmethod
+    def of_arrays(
+        cls,
+        name,
+        data,
+        grid,
+        psf,
+        *,
+        weights,
+        channels=None,
+        zero_points=None,
+        mask=None,
+        noise=None,
+    ) -> Mosaic:
+        """A mosaic of arrays in memory, as `Observation` takes them.
+
+        data, weights (C, Ny, Nx); mask (Ny, Nx) or (C, Ny, Nx): True = ignore this pixel
+        channels (C,): names; zero_points (C,) [mag]; psf: PSF or PSFField
+        Raises ValueError for shapes that disagree.
+        """
+        data = np.asarray(data)
+        data = data[None] if data.ndim == 2 else data
+        if data.ndim != 3 or data.shape[1:] != grid.shape:
+            raise ValueError(f"data has the shape {data.shape}, grid has {grid.shape} pixels")
+        weights = np.broadcast_to(weights, data.shape)
+        masks = None if mask is None else np.broadcast_to(mask, data.shape)
+        names = channels or [f"{name}{i}" for i in range(len(data))]
+        given = zero_points if zero_points is not None else [None] * len(data)
+        if len(names) != len(data) or len(given) != len(data):
+            raise ValueError(
+                f"channels has {len(names)} names and zero_points {len(given)} numbers, data have "
+                f"{len(data)} channels"
+            )
+        made = tuple(
+            Channel(
+                names[i],
+                ArrayPlane(data[i]),
+                ArrayPlane(weights[i]),
+                mask=None if masks is None else ArrayPlane(masks[i]),
+                zero_point=given[i],
+            )
+            for i in range(len(data))
+        )
+        return cls(name, grid, made, psf, noise)
+
+    def box_on(self, grid) -> Box:
+        """The pixels of this mosaic whose centres may lie on a grid: a Box on the mosaic.
+
+        Of area 0 where there are none.
+        """
+        edge = _outline(grid.shape)
+        there = grid.positions_in(self.grid, *edge)
+        there = there[np.isfinite(there).all(axis=-1)]
+        whole = Box.of(self.grid.shape)
+        if not len(there):
+            return Box(0, 0, 0, 0)
+        return Box.around(there).grown(1).meet(whole)
+
+    def observation(
+        self, box, *, ignore=None, subtract=None, extra=None, psf_box=None
+    ) -> Observation | None:
+        """The Observation of a Box that lies on the mosaic; None where no pixel has a weight.
+
+        ignore (Ny, Nx) bool: pixels that get no weight
+        subtract (C, Ny, Nx) [counts]: light that is not to be fitted
+        extra (C, Ny, Nx) [counts^2]: variance that is added to the pixels'
+        psf_box: Box in whose middle the PSF is taken; None = that of the pixels
+        """
+        weights = np.stack([c.weights(box) for c in self.channels])
+        if ignore is not None:
+            weights[:, ignore] = 0
+        if not weights.any():
+            return None
+        data = np.stack([c.read(box) for c in self.channels])
+        if subtract is not None:
+            data = data - subtract
+        if extra is not None:
+            weights = weights / (1 + weights * extra)
+        zero_points = [c.zero_point for c in self.channels]
+        there = psf_box or box
+        middle = (np.array(there[:2]) + np.array(there[2:]) - 1) / 2
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PSFWarning)  # said once, when the field is opened
+            psf = self.psf.psf_at(*middle)
+        return Observation(
+            data,
+            psf,
+            self.grid.cutout(box.y0, box.x0, box.shape),
+            weights=weights,
+            channels=tuple(c.name for c in self.channels),
+            zero_points=None if zero_points[0] is None else zero_points,
+            noise=self.noise,
+            name=self.name,
+        )
+
+
+def _outline(shape):
+    """Rows and columns [px] of points along the outer edge of an image, every 16 px at most."""
+    n_y, n_x = shape
+    rows = np.linspace(-0.5, n_y - 0.5, max(2, n_y // 16 + 2))
+    columns = np.linspace(-0.5, n_x - 0.5, max(2, n_x // 16 + 2))
+    y = [rows, rows, np.full_like(columns, -0.5), np.full_like(columns, n_y - 0.5)]
+    x = [np.full_like(rows, -0.5), np.full_like(rows, n_x - 0.5), columns, columns]
+    return np.concatenate(y), np.concatenate(x)
+
+
+def _set(flags, bits):
+    """Where any of the bits is set; flags of any integer type."""
+    return (np.asarray(flags).astype(np.int64) & bits) != 0

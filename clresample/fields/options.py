@@ -1,0 +1,81 @@
+"""How a field is run, and what it tells meanwhile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..deblending.settings import Settings
+from ..measurement.detection import THRESHOLD
+from .blends.cut import Limits
+from .blends.plan import LARGEST_FIELD
+
+# [bytes] of one group of fits: more lets more blends share a batch
+MEMORY = 1 << 30
+LEAST_MEMORY = 1 << 26  # [bytes] what a single blend of some ten sources takes
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FieldOptions:
+    """How a field is run.
+
+    settings: of the fits
+    threshold [sigma]: least signal to noise of a source; passes: 1, or 2 to search each blend's
+        residuals too
+    positions (S, 2) [deg]: right ascension and declination (y, x [arcsec] on a flat sky) of sources
+        that are known; None = search for them
+    part (i, n): run the i-th of n parts of the field (from 1) alone, for job arrays: its catalogue
+        has the sources whose centres lie in it; None = the whole
+    border_px [model px]: around the part, which is searched and fitted too. Blends that reach from
+        the part to beyond the border are fitted without what lies there
+    tile_px [model px]: largest side of a tile of the search; overlap_px: by which tiles overlap
+    limits: of one fit; larger blends are cut
+    memory [bytes]: that a group of fits, and the search of a tile, may take in a worker; a run that
+        goes on keeps what it began with
+    workers: processes; 0 = this one. limit_s [s]: longest time of a group, None = no limit
+    device: as `get_device` takes it; field_number: of the ids, 0 to 8,388,607, see `source_ids`
+    """
+
+    settings: Settings = Settings()
+    threshold: float = THRESHOLD
+    passes: int = 2
+    positions: np.ndarray | None = None
+    part: tuple[int, int] | None = None
+    border_px: int = 256
+    tile_px: int = 1024
+    overlap_px: int = 96
+    limits: Limits = Limits()
+    memory: int = MEMORY
+    workers: int = 0
+    limit_s: float | None = None
+    device: object = None
+    field_number: int = 0
+
+    def __post_init__(self):
+        if self.passes not in (1, 2):
+            raise ValueError(f"passes is {self.passes}, must be 1 or 2")
+        if not 0 <= self.field_number <= LARGEST_FIELD:
+            raise ValueError(f"field_number is {self.field_number}, must be 0 to {LARGEST_FIELD}")
+        if self.workers < 0:
+            raise ValueError(f"workers is {self.workers}, must be 0 or more")
+        if not self.memory >= LEAST_MEMORY:
+            raise ValueError(f"memory is {self.memory} bytes, must be 64 MiB or more")
+
+
+@dataclass(eq=False)
+class Progress:
+    """What a run tells while it goes: override what is wanted.
+
+    stage(name, total): a stage begins, of so many tiles or blends; step(n, sources): n of them are
+    done; say(text): what the user should know
+    """
+
+    def stage(self, name, total):
+        """A stage begins."""
+
+    def step(self, n, sources=0):
+        """Some of it is done."""
+
+    def say(self, text):
+        """What the user should know, a line."""

@@ -1,0 +1,154 @@
+"""What a field leaves: catalogues, blends, models by source, model and residual mosaics."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections import Counter
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+from astropy.table import QTable
+
+from .. import __version__
+from ..device.device import get_device
+from ..files.whole_file import whole_file
+from .columns import finished
+from .images import write_mosaics
+from .models import write_models
+
+NO_PARQUET = "no catalogue.parquet: pyarrow is not installed (pip install 'clresample[field]')"
+PACKAGES = "numpy", "scipy", "astropy", "pyopencl", "sep", "pyarrow"
+
+
+@dataclass(frozen=True, eq=False)
+class Outputs:
+    """What was written.
+
+    paths: of the files; n_sources, n_blends; status: how many fits ended how; notes: a line each
+    """
+
+    paths: tuple[Path, ...]
+    n_sources: int
+    n_blends: int
+    status: dict = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+def write_outputs(folder, job, parts, unsettled, about, seconds) -> Outputs:
+    """Write all outputs of a field, each file whole or not at all.
+
+    folder: to write into; job: Job; parts: PartFiles, those of later rounds last
+    unsettled: parents of cut blends whose pieces did not settle
+    about: plain values for the provenance; seconds: wall time by stage so far
+
+    catalogue.{parquet,fits,ecsv} hold nothing that another run of the same field would change:
+    times are in blends.ecsv and provenance.json. Raises FileError.
+    """
+    last = _last_rounds(parts)
+    table, blends = finished(job, parts, last, unsettled)
+    paths = list(_write_catalogues(folder, table))
+    notes = () if find_spec("pyarrow") else (NO_PARQUET,)
+    paths.append(_write_ecsv(folder / "blends.ecsv", blends))
+    paths.append(write_models(folder / "models.fits", job, parts, last, set(table["id"].tolist())))
+    paths += write_mosaics(folder, job, parts, last)
+    status = Counter(str(s).split(":")[0] for s in blends["status"])
+    paths.append(_write_provenance(folder / "provenance.json", job, about, seconds, status))
+    return Outputs(tuple(paths), len(table), len(blends), dict(status), notes)
+
+
+def _last_rounds(parts):
+    """{patch: index of the part with its last round}."""
+    last, n_round = {}, {}
+    for i, part in enumerate(parts):
+        rows = part.table("PATCHES")
+        for patch, one in zip(rows["patch"].tolist(), rows["round"].tolist(), strict=True):
+            if one >= n_round.get(patch, -1):
+                last[patch], n_round[patch] = i, one
+    return last
+
+
+def _write_catalogues(folder, table):
+    """The catalogue in all forms: Parquet where pyarrow is there, FITS, ECSV."""
+    if find_spec("pyarrow"):
+        with whole_file(folder / "catalogue.parquet") as part:
+            write_parquet(part, table)
+        yield folder / "catalogue.parquet"
+    with whole_file(folder / "catalogue.fits") as part:
+        hdu = fits.table_to_hdu(table)
+        hdu.name = "CATALOGUE"
+        for i, name in enumerate(table.colnames, start=1):
+            text = table[name].info.description
+            if text:  # as the Virtual Observatory's tools read it
+                hdu.header[f"TCOMM{i}"] = text[:68]
+        fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(part, overwrite=True)
+    yield folder / "catalogue.fits"
+    yield _write_ecsv(folder / "catalogue.ecsv", table)
+
+
+def _write_ecsv(path, table):
+    with whole_file(path) as part:
+        table.write(part, format="ascii.ecsv", overwrite=True)
+    return path
+
+
+def write_parquet(path, table: QTable):
+    """Write a table to Parquet, units and descriptions in the metadata of its columns."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    arrays, fields = [], []
+    for name in table.colnames:
+        column = table[name]
+        values = np.asarray(getattr(column, "value", column))
+        array = pa.array(values.tolist() if values.dtype.kind in "US" else values)
+        unit = str(column.unit) if getattr(column, "unit", None) is not None else ""
+        about = {"unit": unit, "description": column.info.description or ""}
+        arrays.append(array)
+        fields.append(pa.field(name, array.type, metadata={k: v for k, v in about.items() if v}))
+    meta = {str(k): str(v) for k, v in table.meta.items()} | {
+        "creator": f"clresample {__version__}"
+    }
+    parquet.write_table(pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=meta)), path)
+
+
+def _write_provenance(path, job, about, seconds, status):
+    """What made these files: versions, device, settings, inputs with their checksums, times."""
+    device = get_device(job.device)
+    packages = {}
+    for name in PACKAGES:
+        try:
+            packages[name] = version(name)
+        except PackageNotFoundError:
+            packages[name] = None
+    files = about.get("inputs", {})
+    found = {
+        "clresample": __version__,
+        "python": platform.python_version(),
+        "packages": packages,
+        "device": device.name,
+        "written": datetime.now(UTC).isoformat(timespec="seconds"),
+        "run": json.loads((job.folder / "run.json").read_text()),
+        "lost_tiles": job.plan.lost,
+        "fits": dict(status),
+        "seconds": seconds,
+        "inputs": {what: {"file": str(f), "sha256": _checksum(f)} for what, f in files.items()},
+    }
+    with whole_file(path) as part:
+        part.write_text(json.dumps(found, indent=1))
+    return path
+
+
+def _checksum(path):
+    """SHA-256 of a file, read piece by piece; None where it is there no longer."""
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return None

@@ -1,0 +1,67 @@
+"""What headers say of an image: its zero point, and the names of its mask's bits."""
+
+from __future__ import annotations
+
+import math
+
+NANOJANSKY, MICROJANSKY, NANOMAGGY = 31.4, 23.9, 22.5  # [mag] AB of one, to a millimagnitude
+JANSKY = 8.90  # [mag] AB of one: -2.5 log10(3631)
+# cards that hold an AB zero point: Euclid's MER, DES, SWarp's users, HSC
+ZERO_POINTS = "MAGZERO", "MAGZPT", "MAGZP", "PHOTZP", "ZEROPNT", "MAG_ZERO"
+BIT_PREFIX = "MP_"  # of Rubin's and HSC's masks: MP_SAT = 1 says that bit 1 is SAT
+STERADIAN_ARCSEC2 = (180 / math.pi * 3600) ** 2
+
+
+def zero_point(header, pixel_scale_arcsec) -> float | None:
+    """AB magnitude of one count [mag] by a header, or None where it does not say.
+
+    By BUNIT: nJy, uJy, Jy, nanomaggies, and MJy/sr with the pixels' area; by FLUXMAG0, the counts
+    of magnitude 0; by PHOTFLAM and PHOTPLAM of HST; by a card of ZERO_POINTS, taken as AB.
+    """
+    unit = str(header.get("BUNIT", "")).strip().lower().replace(" ", "")
+    named = {
+        "njy": NANOJANSKY,
+        "ujy": MICROJANSKY,
+        "microjy": MICROJANSKY,
+        "jy": JANSKY,
+        "nanomaggy": NANOMAGGY,
+        "nanomaggies": NANOMAGGY,
+        "nmgy": NANOMAGGY,
+    }
+    if unit in named:
+        return named[unit]
+    if unit == "mjy/sr":
+        area = header.get("PIXAR_SR") or pixel_scale_arcsec**2 / STERADIAN_ARCSEC2
+        return JANSKY - 2.5 * math.log10(1e6 * float(area))
+    if _positive(header, "FLUXMAG0"):
+        return 2.5 * math.log10(float(header["FLUXMAG0"]))
+    if _positive(header, "PHOTFLAM") and _positive(header, "PHOTPLAM"):
+        # Bohlin et al. 2011 (AJ 141, 173); of counts a second
+        flam, plam = float(header["PHOTFLAM"]), float(header["PHOTPLAM"])
+        return -2.5 * math.log10(flam) - 5 * math.log10(plam) - 2.408
+    for card in ZERO_POINTS:
+        if isinstance(header.get(card), int | float):
+            return float(header[card])
+    return None
+
+
+def mask_value(header, bits) -> int:
+    """The sum of 2^n over the bits to ignore, given by number or by name.
+
+    Raises ValueError for a name that the header does not have.
+    """
+    names = {
+        key.removeprefix(BIT_PREFIX): int(header[key]) for key in header if key[:3] == BIT_PREFIX
+    }
+    value = 0
+    for bit in [bits] if isinstance(bits, str | int) else bits:
+        if isinstance(bit, str) and bit not in names:
+            there = ", ".join(names) or f"none, as it has no cards {BIT_PREFIX}*"
+            raise ValueError(f"mask_bits has {bit!r}, the mask's header names {there}")
+        value |= 1 << (names[bit] if isinstance(bit, str) else bit)
+    return value
+
+
+def _positive(header, card):
+    value = header.get(card)
+    return isinstance(value, int | float) and value > 0

@@ -1,0 +1,298 @@
+"""One group of patches fitted: from the mosaics to a part on disk."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from astropy.table import QTable
+
+from ...deblending.batch import deblend_many
+from ...deblending.blend import INTERRUPTED, Blend, Failure
+from ...deblending.settings import Settings
+from ...device.device import get_device
+from ...measurement.catalogue import Flag, add_positions, catalogue
+from ...measurement.detection import detect_more
+from ...sky.grid import Grid
+from ..blends.patch import blend_of
+from ..blends.plan import Plan, source_ids
+from ..blends.search import nearest
+from ..box import Box
+from .part import Part, PartFile
+
+# What can go wrong with one patch and is no reason to give up the others.
+ERRORS = (ValueError, ArithmeticError, MemoryError, OSError, np.linalg.LinAlgError)
+POSITIONS = ("y", "x", "y_centroid", "x_centroid")  # columns in pixels of a fit's frame
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """What all groups of a field share.
+
+    mosaics, reference: of the field; folder: of its parts; plan: Plan
+    corner (2,) [px]: (y, x) of the first pixel of labels.npy in the model's pixels
+    core: Box of the model's pixels whose sources are wanted
+    settings: of the fits; threshold [sigma]: of the second pass; passes: 1, or 2 to search the
+        residuals too; memory [bytes]: of the device; device: as `get_device` takes it
+    field_number: of the ids
+    """
+
+    mosaics: tuple
+    reference: Grid
+    folder: Path
+    plan: Plan
+    corner: tuple[int, int]
+    core: Box
+    settings: Settings = Settings()
+    threshold: float = 5.0
+    passes: int = 2
+    memory: int = 1 << 30
+    device: object = None
+    field_number: int = 0
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names (C,) of all channels of all mosaics."""
+        return tuple(c.name for mosaic in self.mosaics for c in mosaic.channels)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Patches that are fitted side by side, and the part that they leave.
+
+    name: of the part; patches: numbers; round: 0, or which repetition of a cut blend's pieces
+    before: names of the parts of the round before, for the neighbours' light; older: of the one
+        before that. The mean of the two is subtracted: where both sides of a border follow each
+        other's last model alone, light goes back and forth between them
+    """
+
+    name: str
+    patches: tuple[int, ...]
+    round: int = 0
+    before: tuple[str, ...] = ()
+    older: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Cut:
+    """A patch with its blend and where its observations lie on the mosaics."""
+
+    patch: object
+    blend: Blend
+    boxes: dict
+    seconds: float
+
+
+def fit_group(job, group) -> dict:
+    """Fit a group and write its part. Returns {"sources", "patches", "failed", "seconds"}.
+
+    A patch that fails is in the part with its reason. Raises FileError where the part cannot be
+    written, KeyboardInterrupt after Ctrl-C, which leaves no part.
+    """
+    began = time.perf_counter()
+    labels = np.load(job.folder / "labels.npy", mmap_mode="r")
+    part, cuts = Part(), []
+    neighbours = _neighbours(job, group)
+    for number in group.patches:
+        patch, start = job.plan.patches[number], time.perf_counter()
+        try:
+            around = None if neighbours is None else _around(patch, neighbours)
+            blend, boxes = blend_of(
+                patch, job.plan, job.mosaics, job.reference, labels, job.corner, around
+            )
+        except ERRORS as error:
+            _set_aside(part, job, patch, group.round, f"failed: {_line(error)}")
+            continue
+        if not blend.observations:
+            _set_aside(part, job, patch, group.round, "failed: no pixel here has a weight")
+            continue
+        cuts.append(_Cut(patch, blend, boxes, time.perf_counter() - start))
+    results = _fits(job, [cut.blend for cut in cuts])
+    if job.passes > 1:
+        results = _second_look(job, labels, cuts, results)
+    for cut, result in zip(cuts, results, strict=True):
+        if isinstance(result, Failure):
+            if result.status == INTERRUPTED:
+                raise KeyboardInterrupt
+            _set_aside(part, job, cut.patch, group.round, _line(result.status))
+            continue
+        try:
+            _take(part, job, cut, result, group.round)
+        except ERRORS as error:
+            _set_aside(part, job, cut.patch, group.round, f"failed: {_line(error)}")
+    part.write(job.folder / f"{group.name}.fits")
+    failed = sum(str(row[3]).startswith("failed") for row in part.patches)
+    return {
+        "sources": sum(len(rows) for rows in part.rows),
+        "patches": len(part.patches),
+        "failed": failed,
+        "seconds": time.perf_counter() - began,
+    }
+
+
+def set_aside(job, group, reason) -> dict:
+    """Write the part of a group that could not be fitted, each source with the reason."""
+    part = Part()
+    for number in group.patches:
+        _set_aside(part, job, job.plan.patches[number], group.round, f"failed: {reason}")
+    part.write(job.folder / f"{group.name}.fits")
+    n = sum(len(rows) for rows in part.rows)
+    return {"sources": n, "patches": len(group.patches), "failed": len(group.patches), "seconds": 0}
+
+
+def _fits(job, blends):
+    """Results and Failures of blends; one that was interrupted ends all."""
+    if not blends:
+        return []
+    device = get_device(job.device)
+    results = deblend_many(blends, settings=job.settings, device=device, memory=job.memory)
+    if any(r.status == INTERRUPTED for r in results):
+        raise KeyboardInterrupt
+    return results
+
+
+def _second_look(job, labels, cuts, results):
+    """Fit those blends again in whose residuals there are more sources, with these.
+
+    The residuals are those of the whole fit. A first look of 30 iterations without structure, as
+    `clresample deblend` takes, leaves bright galaxies' own structure in them: in simulated fields
+    15 % of all rows were clumps of it then, and no more true sources were found.
+    """
+    device, again = get_device(job.device), {}
+    for i, (cut, result) in enumerate(zip(cuts, results, strict=True)):
+        if isinstance(result, Failure):
+            continue
+        try:
+            found = detect_more(result, threshold=job.threshold, device=device).sources
+        except ERRORS:
+            continue  # the fit stands as it is
+        new = [source for source in found if _on_patch(job, labels, cut.patch, source)]
+        if new:
+            places = np.array([s.position_px for s in new]) + cut.patch.box[:2]
+            ids = source_ids(places, job.field_number)
+            named = tuple(replace(s, name=str(n)) for s, n in zip(new, ids, strict=True))
+            again[i] = replace(cut.blend, sources=cut.blend.sources + named)
+    for i, result in zip(again, _fits(job, list(again.values())), strict=True):
+        if not isinstance(result, Failure):  # else what was fitted before stands
+            results[i] = result
+    return results
+
+
+def _on_patch(job, labels, patch, source):
+    """Whether a source lies on a pixel of the patch's own light."""
+    y, x = nearest(np.array(source.position_px) + patch.box[:2])[0] - np.array(job.corner)
+    inside = 0 <= y < labels.shape[0] and 0 <= x < labels.shape[1]
+    return bool(inside and labels[y, x] == patch.number + 1)
+
+
+def _neighbours(job, group):
+    """{patch: {mosaic's name: [(Box, model)]}} of the rounds before; None in the first."""
+    if group.round == 0:
+        return None
+    wanted = {k for number in group.patches for k in job.plan.patches[number].siblings}
+    found: dict[int, dict] = {}
+    share = 0.5 if group.older else 1.0
+    for name in group.before + group.older:
+        for patch, i, box, model in PartFile(job.folder / f"{name}.fits").models(wanted):
+            models = found.setdefault(patch, {}).setdefault(job.mosaics[i].name, [])
+            models.append((box, share * model))
+    return found
+
+
+def _around(patch, neighbours):
+    """{mosaic's name: [(Box, model)]} of a patch's siblings."""
+    found: dict[str, list] = {}
+    for sibling in patch.siblings:
+        for name, models in neighbours.get(sibling, {}).items():
+            found.setdefault(name, []).extend(models)
+    return found
+
+
+def _take(part, job, cut, result, n_round):
+    """Add a fitted patch to the part."""
+    patch, origin = cut.patch, np.array(cut.patch.box[:2])
+    rows = catalogue(result)
+    ids = np.array([int(name) for name in rows["name"]], np.int64)
+    rows.remove_column("name")
+    for name in POSITIONS:
+        shift = origin[0 if name[0] == "y" else 1]
+        rows[name] = rows[name] + shift * rows[name].unit
+    _add_columns(rows, ids, job, patch, result.status)
+    models = [
+        (job.mosaics.index(mosaic), box, result.model(i) - _sky(result, i))
+        for i, (mosaic, box) in enumerate(_mosaics_of(job, cut.boxes))
+    ]
+    part.rows.append(rows)
+    for c in result.components:
+        spectrum = _all_channels(job, result.channels, c.spectrum)
+        part.add_component(ids[c.source], patch, origin + c.origin, c.morphology, spectrum)
+    for model in models:
+        part.add_model(patch, *model)
+    seconds = cut.seconds + sum(result.seconds.values())
+    n_iterations = max(len(result.losses) - 1, 0)
+    part.patches.append(
+        (
+            patch.number,
+            patch.parent,
+            n_round,
+            result.status,
+            len(rows),
+            patch.box.area,
+            n_iterations,
+            seconds,
+        )
+    )
+
+
+def _sky(result, i):
+    """The fitted sky of an observation's channels (Co, 1, 1)."""
+    return result.sky[result.channel_slices()[i], None, None]
+
+
+def _mosaics_of(job, boxes):
+    return [(mosaic, boxes[mosaic.name]) for mosaic in job.mosaics if mosaic.name in boxes]
+
+
+def _all_channels(job, channels, values):
+    """Values of some channels among all (C,), NaN for the others."""
+    have = dict(zip(channels, values, strict=True))
+    return np.array([have.get(name, np.nan) for name in job.channels])
+
+
+def _set_aside(part, job, patch, n_round, status):
+    """Add a patch without a fit: its sources have their positions and the reason."""
+    sources = list(patch.sources)
+    rows = QTable()
+    positions, ids = job.plan.positions[sources], job.plan.ids[sources]
+    add_positions(rows, job.reference, positions, "")
+    rows["flags"] = np.full(len(sources), int(Flag.NOT_CONVERGED), np.int32)
+    _add_columns(rows, ids, job, patch, status)
+    part.rows.append(rows)
+    part.patches.append(
+        (patch.number, patch.parent, n_round, status, len(rows), patch.box.area, 0, 0.0)
+    )
+
+
+def _add_columns(rows, ids, job, patch, status):
+    """What a field's catalogue has beside that of a blend."""
+    n = len(ids)
+    peaks = dict(zip(job.plan.ids.tolist(), job.plan.peaks.tolist(), strict=True))
+    kind, _, reason = status.partition(": ")
+    if patch.pieces > 1:
+        cut = f"blend of {patch.n_blend} sources cut into {patch.pieces} pieces"
+        reason = f"{reason}; {cut}" if reason else cut
+    rows["id"] = ids
+    rows["parent_id"] = np.full(n, patch.parent, np.int64)
+    rows["peak"] = np.array([peaks.get(i, np.nan) for i in ids.tolist()])
+    rows["pass"] = np.array([1 if i in peaks else 2 for i in ids.tolist()], np.int16)
+    rows["n_blend"] = np.full(n, patch.n_blend, np.int32)
+    rows["status"] = [kind] * n
+    rows["reason"] = [reason] * n
+
+
+def _line(error):
+    """An error in one line of ASCII, as FITS tables hold it."""
+    text = error if isinstance(error, str) else f"{error or type(error).__name__}"
+    return " ".join(text.split()).encode("ascii", "replace").decode()[:190]

@@ -1,0 +1,78 @@
+"""The folder of a run: whose it is, and whether another may go on in it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from dataclasses import replace
+
+import numpy as np
+
+from ...files.whole_file import FileError, whole_file
+
+WORK = "work"  # folder of the parts inside the output folder
+
+
+def open_folder(folder, mosaics, reference, options, resume, overwrite, progress, inputs=()):
+    """The folder of the parts, made or taken up again, and the options, with the memory of the run
+    that goes on: it decides which blends are fitted side by side.
+
+    inputs: files whose sizes and times must be the same in a run that goes on
+
+    Raises FileError for the folder of another run.
+    """
+    work, mine = folder / WORK, _fingerprint(mosaics, reference, options, inputs)
+    if overwrite and work.exists():
+        shutil.rmtree(work)
+    there = work / "run.json"
+    if there.exists():
+        if not resume:
+            raise FileError(f"{folder}: holds a run already: --resume goes on, --overwrite forgets")
+        before = json.loads(there.read_text())
+        other = [key for key in mine if key != "memory" and before.get(key) != mine[key]]
+        if other:
+            raise FileError(
+                f"{folder}: holds a run with another {other[0]}, {before.get(other[0])!r} and not "
+                f"{mine[other[0]]!r}: --overwrite forgets it"
+            )
+        progress.say(f"going on with the run in {folder}")
+        for left in work.glob(".part-*"):
+            left.unlink()
+        return work, replace(options, memory=before["memory"])
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"{work}: cannot be made ({error.strerror or error})") from error
+    with whole_file(there) as part:
+        part.write_text(json.dumps(mine, indent=1))
+    return work, options
+
+
+def _fingerprint(mosaics, reference, options, inputs):
+    """What a run that goes on must share with the one before, in values that JSON gives back."""
+    positions = options.positions
+    return {
+        "mosaics": [[m.name, *m.grid.shape, *(c.name for c in m.channels)] for m in mosaics],
+        "corner": np.round(reference.sky(0, 0), 9).tolist(),
+        "settings": repr(options.settings),
+        "threshold": options.threshold,
+        "passes": options.passes,
+        "sources": None if positions is None else np.round(positions, 9).tolist(),
+        "part": options.part and [*options.part, options.border_px],
+        "tile_px": options.tile_px,
+        "overlap_px": options.overlap_px,
+        "limits": [options.limits.sources, options.limits.pixels],
+        "memory": options.memory,
+        "field_number": options.field_number,
+        "inputs": {str(f): _size_and_time(f) for f in inputs},
+    }
+
+
+def _size_and_time(path):
+    """[bytes, ns] of a file; None where it is not there."""
+    try:
+        found = os.stat(path)
+    except OSError:
+        return None
+    return [found.st_size, found.st_mtime_ns]

@@ -1,0 +1,144 @@
+"""The search of a field's tiles, and the plan of its fits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ...files.whole_file import whole_file
+from ...sky.grid import Grid
+from ..blends.link import link
+from ..blends.plan import Plan, make_plan
+from ..blends.search import Found, place, scatters_of, search
+from ..blends.tiles import tiles_of
+from .pool import run_tasks
+
+# [bytes] that searching a pixel of the model takes for each channel: data, weights, and their
+# float64 images on the model, twice
+SEARCH_BYTES = 120
+LEAST_TILE_PX = 64  # however little memory there is: smaller tiles are mostly overlap
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """What all tiles of a search share."""
+
+    mosaics: tuple
+    reference: Grid
+    folder: Path
+    threshold: float
+    device: object
+    positions: np.ndarray | None
+    scatters: dict
+
+
+def planned(mosaics, reference, region, core, work, options, progress, clock):
+    """The plan: that on disk, or a new one after the search of all tiles.
+
+    region: Box of the model's pixels that is searched; core: Box of it whose sources are wanted
+    """
+    path = work / "plan.json"
+    if path.exists():
+        return Plan.from_json(path.read_text())
+    n_channels = sum(len(m.channels) for m in mosaics)
+    outer = int((options.memory / (SEARCH_BYTES * (n_channels + 2))) ** 0.5)
+    size = max(LEAST_TILE_PX, min(options.tile_px, outer - 2 * options.overlap_px))
+    tiles = tiles_of(region, size, options.overlap_px)
+    lost = _searched(mosaics, reference, tiles, work, options, progress)
+    clock.stop("search")
+
+    def found(number):
+        if str(number) in lost:
+            shape = tiles[number].core.shape
+            return Found(np.zeros((0, 2)), np.zeros(0), np.zeros(shape), np.zeros(shape, bool))
+        return _read_found(work, number)
+
+    everything = [found(tile.number) for tile in tiles]
+    positions = np.concatenate([f.positions for f in everything])
+    peaks = np.concatenate([f.peaks for f in everything])
+    del everything
+    footprints = link(tiles, found, region, work)
+    plan = make_plan(
+        positions,
+        peaks,
+        footprints,
+        region,
+        limits=options.limits,
+        field_number=options.field_number,
+        memory=options.memory,
+        n_channels=n_channels,
+    )
+    plan = replace(plan.only(core), lost=lost)
+    if hasattr(footprints.labels, "flush"):
+        footprints.labels.flush()
+    with whole_file(path) as part:
+        part.write_text(plan.to_json())
+    clock.stop("link")
+    return plan
+
+
+def _searched(mosaics, reference, tiles, work, options, progress):
+    """Search the tiles that are not yet; {number: reason} of those that could not be."""
+    positions = options.positions
+    if positions is not None:
+        positions = reference.pixel(*np.asarray(positions, float).reshape(-1, 2).T)
+    todo = [tile for tile in tiles if not _found_path(work, tile.number).exists()]
+    progress.stage("search", len(tiles))
+    progress.step(len(tiles) - len(todo))
+    if not todo:
+        return {}
+    scatters = scatters_of(mosaics, reference, options.device)
+    shared = _Search(
+        mosaics, reference, work, options.threshold, options.device, positions, scatters
+    )
+    lost: dict[str, str] = {}
+    tried: set[int] = set()
+
+    def again(outcome):
+        if outcome.worker_died and outcome.task.number not in tried:
+            tried.add(outcome.task.number)
+            return [outcome.task]
+        return None
+
+    for outcome in run_tasks(
+        _search_tile, shared, todo, options.workers, limit_s=options.limit_s, again=again
+    ):
+        if outcome.reason is not None:
+            if outcome.reason.startswith("ImportError"):
+                raise ImportError(outcome.reason)
+            lost[str(outcome.task.number)] = outcome.reason
+            progress.say(f"tile {outcome.task.number} is lost: {outcome.reason}")
+        progress.step(1, outcome.value or 0)
+    return lost
+
+
+def _found_path(work, number):
+    return work / f"tile-{number:05d}.npz"
+
+
+def _search_tile(shared, tile):
+    """Search one tile and write what was found; returns the number of sources."""
+    given = shared.mosaics, shared.reference, tile
+    more = {"scatters": shared.scatters, "device": shared.device}
+    if shared.positions is None:
+        found = search(*given, threshold=shared.threshold, **more)
+    else:
+        found = place(*given, shared.positions, **more)
+    with whole_file(_found_path(shared.folder, tile.number)) as part:
+        np.savez(
+            part,
+            positions=found.positions,
+            peaks=found.peaks,
+            light=found.light,
+            lit=np.packbits(found.lit),
+        )
+    return len(found.positions)
+
+
+def _read_found(work, number):
+    with np.load(_found_path(work, number)) as file:
+        light = file["light"]
+        lit = np.unpackbits(file["lit"], count=light.size).reshape(light.shape).astype(bool)
+        return Found(file["positions"], file["peaks"], light, lit)

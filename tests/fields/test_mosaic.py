@@ -1,0 +1,117 @@
+"""Mosaics: only what is asked for is read, and an observation of it is the same as of the array."""
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from clresample import PSF, Grid
+from clresample.fields.box import Box, sized_up
+from clresample.fields.mosaic import ArrayPlane, Channel, FilePlane, Mosaic, NumberPlane
+from clresample.files.whole_file import FileError
+
+SHAPE = (60, 90)
+
+
+@pytest.fixture
+def image():
+    return np.random.default_rng(1).normal(10, 1, SHAPE).astype(np.float32)
+
+
+def grid(angle_deg=0.0, scale=0.1, shape=SHAPE):
+    flat = Grid.flat(shape, scale, angle_deg=angle_deg)
+    return Grid.from_wcs(flat.to_wcs(ra_deg=10.0, dec_deg=-30.0), shape)
+
+
+def channel(data, **given):
+    return Channel("a", ArrayPlane(data), given.pop("weight", NumberPlane(1.0)), **given)
+
+
+def test_plain_and_compressed_files_and_planes_of_cubes_read_as_the_array(tmp_path, image):
+    plain, packed = tmp_path / "plain.fits", tmp_path / "packed.fits"
+    fits.PrimaryHDU(np.stack([image, 2 * image])).writeto(plain)
+    lossless = {"compression_type": "GZIP_2", "quantize_level": 0}
+    hdu = fits.CompImageHDU(image, **lossless)
+    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(packed)
+    box = Box(7, 11, 40, 73)
+    for plane, expected in (
+        (FilePlane(plain, 0, 0), image),
+        (FilePlane(plain, 0, 1), 2 * image),
+        (FilePlane(packed, 1), image),
+    ):
+        found = plane.read(box)
+        np.testing.assert_array_equal(found, expected[box.slices])
+        assert found.dtype.isnative
+
+
+def test_a_cut_off_file_is_one_line_that_names_it(tmp_path, image):
+    path = tmp_path / "short.fits"
+    fits.PrimaryHDU(image).writeto(path)
+    path.write_bytes(path.read_bytes()[: 2880 + 4 * 20 * SHAPE[1]])
+    FilePlane(path, 0).read(Box(0, 0, 10, 10))  # what is there is read
+    with pytest.raises(FileError, match=r"short.fits: HDU 0 .*"):
+        FilePlane(path, 0).read(Box(30, 0, 50, 10))
+
+
+def test_weights_come_from_weights_variances_and_rms_and_bits_of_the_mask(image):
+    sigma = np.full(SHAPE, 2.0)
+    sigma[3, 4], sigma[3, 5], sigma[3, 6] = np.nan, 0, np.inf
+    flags = np.zeros(SHAPE, np.uint8)
+    flags[0, 0], flags[0, 1], flags[0, 2] = 1, 4, 6
+    for kind, plane in (("weight", sigma**-2.0), ("variance", sigma**2), ("rms", sigma)):
+        plane = np.where(np.isinf(plane) & (kind == "weight"), 0, plane)
+        made = channel(
+            image, weight=ArrayPlane(plane), kind=kind, mask=ArrayPlane(flags), mask_value=4
+        )
+        mosaic = Mosaic("m", grid(), (made,), PSF.gaussian(1.5))
+        weights = mosaic.observation(Box(0, 0, 10, 10)).weights[0]
+        dropped = [tuple(p) for p in np.argwhere(weights == 0)]
+        assert dropped == [(0, 1), (0, 2), (3, 4), (3, 5), (3, 6)]
+        assert np.allclose(weights[weights > 0], 0.25)
+
+
+def test_an_observation_is_the_box_with_its_own_wcs_and_psf(image):
+    whole, psf = grid(angle_deg=12.0), PSF.gaussian(1.5)
+    mosaic = Mosaic.of_arrays("m", image, whole, psf, weights=1.0, zero_points=[25.0])
+    box = Box(20, 30, 45, 80)
+    seen = mosaic.observation(box, subtract=np.ones((1, *box.shape)))
+    np.testing.assert_array_equal(seen.data[0], image[box.slices] - 1.0)
+    np.testing.assert_allclose(seen.grid.sky(3, 4), whole.sky(23, 34), atol=1e-12)
+    assert seen.zero_points.tolist() == [25.0]
+    nothing = mosaic.observation(box, ignore=np.ones(box.shape, bool))
+    assert nothing is None
+
+
+def test_the_box_on_a_grid_holds_all_its_pixels_and_few_others():
+    psf = PSF.gaussian(1.5)
+    wide = grid(angle_deg=30.0, scale=0.2, shape=(200, 200))
+    mosaic = Mosaic.of_arrays("m", np.zeros((200, 200)), wide, psf, weights=1.0)
+    patch = grid().cutout(10, 20, (32, 48))
+    box = mosaic.box_on(patch)
+    everywhere = wide.positions_in(patch, *np.indices(wide.shape))
+    inside = np.argwhere(Box.of(patch.shape).holds(everywhere))
+    assert len(inside) and Box(*box).holds(inside).all()
+    assert box.area < 3.5 * len(inside)
+    assert mosaic.box_on(grid().cutout(5000, 0, (32, 32))).area == 0
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"channels": ()}, "channels of mosaic 'm' is empty"),
+        ({"psf": PSF.gaussian([1.0, 2.0])}, "psf of mosaic 'm' has 2 bands, channels are 1"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(image, given, message):
+    whole = {"channels": (channel(image),), "psf": PSF.gaussian(1.0)} | given
+    with pytest.raises(ValueError, match=message):
+        Mosaic("m", grid(), **whole)
+
+
+def test_boxes():
+    a, b = Box(0, 0, 10, 20), Box(5, 15, 12, 30)
+    assert a.meet(b) == (5, 15, 10, 20) and a.join(b) == (0, 0, 12, 30)
+    assert a.meet(Box(20, 20, 30, 30)).area == 0
+    assert a.meet(b).within(b) == (0, 0, 5, 5)
+    assert sized_up(Box(10, 10, 41, 43), 32).shape == (32, 64)
+    assert sized_up(Box(10, 10, 41, 43), 32).meet(Box(10, 10, 41, 43)) == (10, 10, 41, 43)
+    assert a.holds([(-0.5, 0), (9.5, 0), (9.49, 19.4)]).tolist() == [True, False, True]

@@ -1,0 +1,120 @@
+"""Tiles, links, cuts, ids and groups: plain arrays, against what they must be."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from clresample.fields.blends.cut import Limits, pieces_of
+from clresample.fields.blends.link import link
+from clresample.fields.blends.plan import Plan, make_plan, source_ids
+from clresample.fields.blends.search import Found, grown_footprints
+from clresample.fields.blends.tiles import tiles_of
+from clresample.fields.box import Box
+
+
+def test_cores_of_tiles_fill_the_region_once():
+    region = Box(10, 20, 310, 525)
+    tiles = tiles_of(region, 128, 32)
+    count = np.zeros((600, 600), int)
+    for tile in tiles:
+        assert max(tile.core.shape) <= 128
+        assert tile.outer.meet(tile.core) == tile.core and region.meet(tile.outer) == tile.outer
+        count[tile.core.slices] += 1
+    assert (count[region.slices] == 1).all() and count.sum() == region.area
+    with pytest.raises(ValueError, match="size 0"):
+        tiles_of(region, 0, 3)
+
+
+@pytest.mark.parametrize("size", [37, 64, 200])
+def test_links_do_not_depend_on_tiles(size):
+    rng = np.random.default_rng(0)
+    lit = ndimage.gaussian_filter(rng.standard_normal((150, 130)), 3) > 0.03
+    region = Box(5, 7, 155, 137)
+    tiles = tiles_of(region, size, 10)
+
+    def found(number):
+        part = lit[tiles[number].core.within(region).slices]
+        return Found(np.zeros((0, 2)), np.zeros(0), part * 3.0, part)
+
+    footprints = link(tiles, found, region)
+    expected, n = ndimage.label(lit, np.ones((3, 3)))
+    pairs = np.unique(np.stack([footprints.labels, expected]).reshape(2, -1), axis=1)
+    assert pairs.shape[1] == n + 1  # one to one
+    for label in range(1, n + 1):
+        rows, columns = np.nonzero(footprints.labels == label)
+        box = Box(rows.min() + 5, columns.min() + 7, rows.max() + 6, columns.max() + 8)
+        assert footprints.boxes[label - 1] == box
+
+
+def test_a_footprint_is_what_is_connected_to_a_source_and_grown():
+    bright = np.zeros((40, 40), bool)
+    bright[5:10, 5:10] = bright[30:35, 30:35] = True
+    lit = grown_footprints(bright, np.array([(7.0, 7.0), (20.0, 3.0)]), 2)
+    assert lit[7, 11] and not lit[7, 12]  # grown by two pixels
+    assert not lit[32, 32]  # noise without a source
+    assert lit[20, 3] and lit[20, 5] and not lit[20, 6]  # a source in the dark
+
+
+def blobs(positions, heights, shape=(60, 200)):
+    y, x = np.indices(shape)
+    return sum(
+        h * np.exp(-((y - p) ** 2 + (x - q) ** 2) / 50)
+        for (p, q), h in zip(positions, heights, strict=True)
+    )
+
+
+def test_a_giant_parts_where_its_light_is_weakest():
+    positions = np.array([(30, 20), (30, 34), (30, 50), (30, 90), (30, 104), (30, 160)], float)
+    light = blobs(positions, [50, 20, 30, 40, 25, 60]) + 2.5
+    inside = np.ones(light.shape, bool)
+    territory, piece = pieces_of(light, inside, positions, Limits(sources=3), 8)
+    assert piece.tolist() == [0, 0, 0, 1, 1, 1]
+    assert (territory > 0).all()
+    for s, (y, x) in enumerate(positions.astype(int)):
+        assert territory[y, x] == piece[s] + 1
+    column = np.flatnonzero(np.diff(territory[30]))[0]
+    assert abs(column - light[30, 50:90].argmin() - 50) <= 2
+    _, whole = pieces_of(light, inside, positions, Limits(sources=10), 8)
+    assert set(whole) == {0}
+    _, small = pieces_of(light, inside, positions, Limits(sources=10, pixels=76 * 100), 8)
+    assert len(set(small)) > 1
+
+
+def plan_of(n=40, **given):
+    rng = np.random.default_rng(3)
+    region = Box(0, 0, 300, 400)
+    positions = rng.uniform(5, 295, (n, 2))
+    peaks = rng.uniform(5, 100, n)
+    light = np.zeros(region.shape)
+    for y, x in np.floor(positions + 0.5).astype(int):
+        light[y, x] = 10
+    lit = ndimage.distance_transform_edt(light == 0) < 20
+    found = Found(positions, peaks, ndimage.gaussian_filter(light, 4) * 100, lit)
+    footprints = link(tiles_of(region, 500, 0), lambda number: found, region)
+    return make_plan(positions, peaks, footprints, region, **given), footprints
+
+
+def test_every_source_is_in_one_patch_and_one_group_and_its_pixel_is_labelled():
+    plan, footprints = plan_of(limits=Limits(sources=6), memory=1 << 24, n_channels=3)
+    assert sorted(s for p in plan.patches for s in p.sources) == list(range(40))
+    assert sorted(n for g in plan.groups for n in g) == list(range(len(plan.patches)))
+    assert any(p.pieces > 1 for p in plan.patches)
+    assert all(len(p.sources) <= 6 for p in plan.patches)
+    assert all(n % 32 == 0 for p in plan.patches for n in p.box.shape)
+    for patch in plan.patches:
+        for y, x in np.floor(plan.positions[list(patch.sources)] + 0.5).astype(int):
+            assert footprints.labels[y, x] == patch.number + 1
+        for other in patch.siblings:
+            assert plan.patches[other].parent == patch.parent
+    pieces = {n for g in plan.giants for n in g}
+    assert pieces == {p.number for p in plan.patches if p.pieces > 1}
+    assert Plan.from_json(plan.to_json()).patches == plan.patches
+
+
+def test_ids_do_not_depend_on_the_run_and_say_where():
+    places = np.array([(3.4, 7.0), (3.2, 7.4), (1e6, 0.0)])
+    ids = source_ids(places, 5)
+    assert len(set(ids)) == 3
+    assert ids[0] == (5 << 40) + (3 << 20) + 7
+    assert source_ids(places[2:], 5)[0] == ids[2]
+    assert (source_ids(places, 6) != ids).all()

@@ -1,0 +1,149 @@
+"""FIELD.toml and headers: what is read, and one line for each mistake."""
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from clresample import PSF, Grid
+from clresample.cli import main
+from clresample.fields.background import find_background
+from clresample.fields.box import Box
+from clresample.fields.reading.field_file import read_field
+from clresample.fields.reading.headers import mask_value, zero_point
+from clresample.files.scene_keys import SceneError
+
+SHAPE = (300, 260)
+TOML = """
+[[mosaic]]
+name = "A"
+image = "a.fits"
+psf = "psf.fits"
+{more}
+"""
+
+
+@pytest.fixture
+def files(tmp_path):
+    """An image of noise 2 on a sloping sky of 100, its variance, a mask with named bits, a PSF."""
+    rng = np.random.default_rng(0)
+    flat = Grid.flat(SHAPE, 0.2)
+    header = flat.to_wcs(ra_deg=10, dec_deg=-30).to_header()
+    header["MAGZERO"], header["BAND"] = 25.5, "r"
+    slope = 0.02 * np.indices(SHAPE)[0]
+    image = rng.normal(100, 2, SHAPE) + slope
+    fits.PrimaryHDU(image.astype(np.float32), header).writeto(tmp_path / "a.fits")
+    fits.PrimaryHDU(np.full(SHAPE, 4.0, np.float32)).writeto(tmp_path / "var.fits")
+    flags = np.zeros(SHAPE, np.int32)
+    flags[5], flags[6] = 1 << 3, 1 << 5
+    mask = fits.PrimaryHDU(flags)
+    mask.header["MP_SAT"], mask.header["MP_CR"] = 3, 5
+    mask.writeto(tmp_path / "mask.fits")
+    fits.PrimaryHDU(PSF.gaussian(1.5).images).writeto(tmp_path / "psf.fits")
+    return tmp_path
+
+
+def field_of(folder, more="", rest=""):
+    path = folder / "field.toml"
+    path.write_text(TOML.format(more=more) + rest)
+    return read_field(path)
+
+
+def test_zero_point_band_variance_and_named_bits_are_found(files):
+    more = 'variance = "var.fits"\nmask = "mask.fits"\nmask_bits = ["SAT"]'
+    field = field_of(files, more)
+    (channel,) = field.mosaics[0].channels
+    assert (channel.name, channel.zero_point) == ("r", 25.5)
+    weights = channel.weights(Box(0, 0, 10, 10))
+    assert (weights[5] == 0).all() and np.allclose(weights[[4, 6]], 0.25)
+    assert set(field.inputs) >= {"field", "image of A", "mask 1 of A"}
+
+
+def test_noise_and_sky_are_estimated_where_they_are_asked_for(files):
+    field = field_of(files, 'background = "subtract"')
+    (channel,) = field.mosaics[0].channels
+    assert any("noise of channel r estimated" in note for note in field.notes)
+    box = Box(40, 40, 260, 220)
+    assert abs(channel.weights(box)[0, 0] ** -0.5 - 2) < 0.03
+    assert abs(np.mean(channel.read(box))) < 0.1
+    rows = channel.read(box).mean(axis=1)
+    assert abs(np.polyfit(np.arange(len(rows)), rows, 1)[0]) < 0.003  # a slope of 0.02 before
+
+
+def test_a_bright_galaxy_is_not_taken_for_sky():
+    rng = np.random.default_rng(1)
+    y, x = np.indices((512, 512))
+    galaxy = 500 * np.exp(-np.hypot(y - 250, x - 260) / 12)
+    image = rng.normal(7, 1, galaxy.shape) + galaxy
+    everywhere = lambda box: np.ones(box.shape, bool)  # noqa: E731
+    sky = find_background(lambda box: image[box.slices], everywhere, image.shape)
+    level = sky.read(Box(200, 200, 300, 300))
+    assert abs(level - 7).max() < 0.3
+
+
+def test_options_of_the_file(files):
+    rest = "[field]\nnumber = 7\ntile_px = 500\nmax_sources = 12\n[detection]\nthreshold = 4.5\n"
+    options = field_of(files, 'variance = "var.fits"', rest + "[fit]\nmax_iter = 9\n").options
+    assert (options.field_number, options.tile_px, options.threshold) == (7, 500, 4.5)
+    assert options.limits.sources == 12 and options.settings.max_iter == 9
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ("varianze = 1.0", "mosaic 1: key varianze is unknown"),
+        ("weight = 1.0\nrms = 2.0", "mosaic 1: weight and rms are given, a mosaic takes one"),
+        ("weight = -1.0", "mosaic 1: weight is -1.0, it takes"),
+        ('variance = "none.fits"', "none.fits: no such file"),
+        ('weight = 1.0\nmask = "mask.fits"\nmask_bits = ["BAD"]', "names SAT, CR"),
+        ('weight = 1.0\npsf_format = "cells"', "psf_cell_px is missing"),
+        ("weight = 1.0\nzero_point = [1.0, 2.0]", "zero_point has 2 numbers for 1 channels"),
+        ('weight = "a.fits"', "weight is in the image's own file"),
+    ],
+)
+def test_mistakes_are_one_line_that_names_the_key(files, more, message):
+    with pytest.raises(SceneError, match=message.replace("(", r"\(")) as caught:
+        field_of(files, more)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("cards", "expected"),
+    [
+        ({"BUNIT": "nJy"}, 31.4),
+        ({"BUNIT": "nanomaggies"}, 22.5),
+        ({"FLUXMAG0": 63095734448.0194}, 27.0),
+        ({"MAGZERO": 24.6}, 24.6),
+        ({"BUNIT": "MJy/sr", "PIXAR_SR": 1e-14}, 8.9 + 20.0),
+        # F814W of ACS: PHOTFLAM 7.03e-20, PHOTPLAM 8045: AB 25.94
+        ({"PHOTFLAM": 7.0332e-20, "PHOTPLAM": 8045.5}, 25.947),
+        ({"EXPTIME": 3.0}, None),
+    ],
+)
+def test_zero_points_of_headers(cards, expected):
+    found = zero_point(fits.Header(cards), 0.1)
+    assert found is None if expected is None else abs(found - expected) < 2e-3
+
+
+def test_bits_by_number_and_name():
+    header = fits.Header({"MP_SAT": 3})
+    assert mask_value(header, ["SAT", 0]) == 9
+    assert mask_value(header, 4) == 16
+
+
+def test_commands_from_simulation_to_catalogue_in_worker_processes(tmp_path, capsys):
+    pytest.importorskip("galsim")
+    pytest.importorskip("sep")
+    sky, out = tmp_path / "sky", tmp_path / "out"
+    size = ["--size", "160", "--density", "90", "--bands", "i", "--seed", "3"]
+    assert main(["simulate", "field", "-o", str(sky), *size]) == 0
+    assert main(["simulate", "field", "-o", str(sky)]) == 2  # kept
+    command = ["field", str(sky / "field.toml"), "-o", str(out), "--quiet"]
+    assert main([*command, "--workers", "2"]) == 0
+    printed = capsys.readouterr().out
+    assert "converged" in printed and str(out / "catalogue.fits") in printed
+    before = (out / "catalogue.fits").read_bytes()
+    assert main(command) == 2  # holds a run
+    assert main([*command, "--resume", "--workers", "0"]) == 0
+    assert (out / "catalogue.fits").read_bytes() == before
+    assert main([*command, "--overwrite", "--workers", "0"]) == 0
+    assert (out / "catalogue.fits").read_bytes() == before  # by workers or not

@@ -1,0 +1,244 @@
+"""Whole runs over a small field: what they leave, interrupted, in tiles, cut, with bad files."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import QTable
+from helpers.fields import mosaics_of
+
+from clresample import FieldOptions
+from clresample.fields.blends.cut import Limits
+from clresample.fields.models import read_models
+from clresample.fields.mosaic import FilePlane
+from clresample.fields.options import Progress
+from clresample.fields.run import run_field
+from clresample.files.whole_file import FileError
+
+
+def table(folder, name="catalogue"):
+    return QTable.read(folder / f"{name}.ecsv")
+
+
+def compared(folder, other):
+    """Differences of fluxes [errors] of the sources that two runs share, and how many they do not;
+    of those detected before the fit."""
+    a, b = table(folder), table(other)
+    a, b = a[a["pass"] == 1], b[b["pass"] == 1]
+    shared, i, j = np.intersect1d(a["id"], b["id"], return_indices=True)
+    differences = [
+        ((a[f"flux_{c}"][i] - b[f"flux_{c}"][j]) / a[f"flux_err_{c}"][i]).value
+        for c in ("VIS", "i")
+    ]
+    return np.array(differences), len(a) + len(b) - 2 * len(shared)
+
+
+def test_every_source_has_an_id_a_parent_a_status_and_the_truth_within_its_errors(done, sky):
+    folder, run = done
+    rows, blends = table(folder), table(folder, "blends")
+    assert run.outputs.n_sources == len(rows) > 5
+    assert len(set(rows["id"])) == len(rows) and (np.diff(rows["id"]) > 0).all()
+    assert set(rows["parent_id"]) <= set(rows["id"])
+    assert set(rows["status"]) == {"converged"}
+    assert blends["n_sources"].sum() == len(rows)
+    assert (blends["seconds"] > 0).all() and blends["seconds"].unit == "s"
+    y, x = sky.truth["y"], sky.truth["x"]
+    apart = np.hypot(rows["y"].value[:, None] - y, rows["x"].value[:, None] - x)
+    assert np.median(apart.min(axis=1)) < 1
+    alone = (rows["n_blend"] == 1) & (apart.min(axis=1) < 1.5)
+    near = np.sort(apart, axis=1)[:, 1] > 15
+    assert (alone & near).sum() >= 2
+    which = apart.argmin(axis=1)
+    for channel in ("VIS", "i"):
+        error = rows[f"flux_err_{channel}"].value
+        pulls = (rows[f"flux_{channel}"].value - sky.truth[f"flux_{channel}"][which]) / error
+        assert np.median(abs(pulls[alone & near])) < 2
+
+
+def test_the_three_catalogues_are_one_with_units_and_descriptions(done):
+    folder, _ = done
+    text, binary = table(folder), QTable.read(folder / "catalogue.fits")
+    assert text.colnames == binary.colnames
+    assert binary["flux_i"].unit == text["flux_i"].unit == "uJy"
+    assert "total flux in i" in text["flux_i"].info.description
+    np.testing.assert_array_equal(text["flux_i"], binary["flux_i"])
+    pq = pytest.importorskip("pyarrow.parquet")
+    columns = pq.read_table(folder / "catalogue.parquet")
+    assert columns.column_names == text.colnames
+    np.testing.assert_array_equal(columns["flux_i"], text["flux_i"].value)
+    about = columns.schema.field("flux_i").metadata
+    assert about[b"unit"] == b"uJy" and about[b"description"] == b"total flux in i"
+
+
+def test_one_blend_is_read_alone_and_models_add_up_to_the_mosaics(done, sky):
+    folder, _ = done
+    rows = table(folder)
+    parent = int(rows["parent_id"][0])
+    few = read_models(folder / "models.fits", parent)
+    members = rows["id"][rows["parent_id"] == parent]
+    assert {m.id for m in few} == set(members.tolist())
+    everything = read_models(folder / "models.fits")
+    assert len(everything) == len(rows)
+    for model in few:
+        same = next(m for m in everything if m.id == model.id)
+        np.testing.assert_array_equal(model.morphology, same.morphology)
+        assert abs(model.morphology.max() - 1) < 1e-5 and model.spectrum.shape == (2,)
+    with pytest.raises(FileError, match="no blend has the parent_id 1"):
+        read_models(folder / "models.fits", 1)
+    for mosaic in sky.mosaics:
+        name = mosaic.survey.name
+        model, header = fits.getdata(folder / f"model_{name}.fits", header=True)
+        residual = fits.getdata(folder / f"residual_{name}.fits")
+        np.testing.assert_allclose(model + residual, mosaic.data, rtol=1e-5, atol=1e-3)
+        assert header["BAND1"] == mosaic.survey.bands[0] and "CRVAL1" in header
+        # sources beyond the edge of Euclid, whose pixels are the model's, are not in the model
+        n, m = np.indices(mosaic.grid.shape)
+        at = mosaic.grid.positions_in(sky.mosaics[0].grid, n, m)
+        inner = ~mosaic.bad & ((at > 12) & (at < 180)).all(axis=-1)
+        left = residual[:, inner] / mosaic.noise_sigma[:, None]
+        assert 0.97 < 1.4826 * np.median(abs(left)) < 1.05
+        assert np.percentile(abs(left), 99.9) < 5
+
+
+class _Stop(Progress):
+    """Stops a run as Ctrl-C does, after so many groups of fits."""
+
+    def __init__(self, n):
+        self.name, self.left = "", n
+
+    def stage(self, name, total):
+        self.name = name
+
+    def step(self, n, sources=0):
+        if self.name == "fit" and n:
+            self.left -= 1
+            if self.left == 0:
+                raise KeyboardInterrupt
+
+
+def test_an_interrupted_run_goes_on_to_the_same_bytes(done, sky, tmp_path):
+    folder, _ = done
+    mosaics = mosaics_of(sky)
+    with pytest.raises(KeyboardInterrupt):
+        run_field(mosaics, tmp_path, progress=_Stop(1))
+    parts = sorted((tmp_path / "work").glob("fit-*.fits"))
+    assert len(parts) == 1 and not (tmp_path / "catalogue.fits").exists()
+    before = parts[0].stat().st_mtime_ns
+    with pytest.raises(FileError, match="--resume goes on"):
+        run_field(mosaics, tmp_path)
+    other = FieldOptions(threshold=6.0)
+    with pytest.raises(FileError, match=r"another threshold, 5.0 and not 6.0"):
+        run_field(mosaics, tmp_path, options=other, resume=True)
+    run_field(mosaics, tmp_path, resume=True)
+    assert parts[0].stat().st_mtime_ns == before  # what was done is not done again
+    for name in ("catalogue.fits", "catalogue.ecsv", "models.fits", "residual_Euclid.fits"):
+        assert (tmp_path / name).read_bytes() == (folder / name).read_bytes(), name
+
+
+def test_tiles_leave_no_seams(done, sky, tmp_path):
+    folder, _ = done
+    options = FieldOptions(tile_px=96, overlap_px=60)
+    run_field(mosaics_of(sky), tmp_path, options=options)
+    assert len(list((tmp_path / "work").glob("tile-*.npz"))) == 4
+    differences, n_others = compared(folder, tmp_path)
+    assert n_others == 0
+    assert np.abs(differences).max() < 0.1
+
+
+def test_a_blend_over_the_limits_is_cut_and_each_source_measured(done, sky, tmp_path):
+    folder, _ = done
+    rows = table(folder)
+    largest = int(rows["n_blend"].max())
+    assert largest >= 3
+    options = FieldOptions(limits=Limits(sources=largest - 1))
+    run_field(mosaics_of(sky), tmp_path, options=options)
+    cut = table(tmp_path)
+    assert set(cut["status"]) == {"converged"}
+    where = cut["n_blend"] == largest
+    reasons = {str(reason) for reason in cut["reason"][where]}
+    assert all("pieces" in reason for reason in reasons) and reasons
+    rounds = table(tmp_path, "blends")["round"]
+    assert rounds.min() == 0 and rounds.max() >= 1
+    differences, n_others = compared(folder, tmp_path)
+    assert n_others == 0 and np.median(np.abs(differences)) < 0.5
+
+
+def test_pixels_that_cannot_be_read_cost_their_blends_alone_with_a_reason(sky, tmp_path):
+    path = tmp_path / "euclid.fits"
+    euclid, rubin = mosaics_of(sky)
+    fits.PrimaryHDU(sky.mosaics[0].data[0]).writeto(path)
+    channel = replace(euclid.channels[0], data=FilePlane(path, 0))
+    mosaics = replace(euclid, channels=(channel,)), rubin
+    with pytest.raises(KeyboardInterrupt):
+        run_field(mosaics, tmp_path / "out", progress=_Stop(1))
+    n = sky.mosaics[0].data.shape[1]
+    path.write_bytes(path.read_bytes()[: 2880 + 4 * n * (n // 2)])
+    from clresample.fields.mosaic import _opened
+
+    _opened.cache_clear()
+    run = run_field(mosaics, tmp_path / "out", resume=True)
+    rows = table(tmp_path / "out")
+    failed = np.array([status == "failed" for status in rows["status"]])
+    assert run.failed and failed.any() and not failed.all()
+    assert all("euclid.fits" in str(reason) for reason in rows["reason"][failed])
+    assert np.isfinite(rows["ra"]).all() and np.isnan(rows["flux_i"][failed]).all()
+
+
+def test_known_sources_are_taken_where_they_are(done, sky, tmp_path):
+    folder, _ = done
+    rows = table(folder)
+    places = np.stack([rows["ra"].value, rows["dec"].value], axis=1)
+    options = FieldOptions(positions=places, passes=1)
+    run_field(mosaics_of(sky), tmp_path, options=options)
+    known = table(tmp_path)
+    np.testing.assert_array_equal(known["id"], rows["id"])
+    assert set(known["pass"]) == {1}
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"passes": 3}, "passes is 3"),
+        ({"field_number": -1}, "field_number is -1"),
+        ({"memory": 1000}, "memory is 1000 bytes"),
+        ({"workers": -1}, "workers is -1"),
+    ],
+)
+def test_options_out_of_range_are_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        FieldOptions(**given)
+
+
+def test_mosaics_that_do_not_go_together_are_refused(sky, tmp_path):
+    euclid, rubin = mosaics_of(sky)
+    with pytest.raises(ValueError, match="mosaics is empty"):
+        run_field([], tmp_path)
+    with pytest.raises(ValueError, match="names of mosaics must be unique"):
+        run_field([euclid, euclid], tmp_path)
+    bare = replace(rubin, channels=tuple(replace(c, zero_point=None) for c in rubin.channels))
+    with pytest.raises(ValueError, match="'Euclid' has zero points, 'Rubin' has none"):
+        run_field([euclid, bare], tmp_path)
+
+
+def test_parts_of_a_field_together_are_the_field(done, sky, tmp_path):
+    folder, _ = done
+    whole, ids = table(folder), []
+    for i in (1, 2):
+        options = FieldOptions(part=(i, 2), border_px=110)
+        out = tmp_path / f"part{i}"
+        run_field(mosaics_of(sky), out, options=options)
+        rows = table(out)
+        ids += rows["id"].tolist()
+        _, a, b = np.intersect1d(rows["id"], whole["id"], return_indices=True)
+        change = (rows["flux_VIS"][a] - whole["flux_VIS"][b]) / whole["flux_err_VIS"][b]
+        assert np.abs(change).max() < 0.1
+        assert {m.id for m in read_models(out / "models.fits")} == set(rows["id"].tolist())
+        part, header = fits.getdata(out / "model_Euclid.fits", header=True)
+        n = sky.mosaics[0].data.shape[1]
+        assert 0 <= part.shape[2] - n // 2 <= 2 and "CRVAL1" in header
+        if i == 1:
+            half = np.s_[..., : n // 2]
+            model = fits.getdata(folder / "model_Euclid.fits")[half]
+            np.testing.assert_allclose(part[half], model, atol=1e-2 * model.max())
+    assert sorted(ids) == whole["id"].tolist()
