@@ -31,7 +31,7 @@ STARS = {
 }  # fmt: skip
 SETTINGS = {
     "settings", "mode", "n", "median", "mean", "worse", "below", "against", "error", "chi2",
-    "converged", "iterations", "seconds",
+    "converged", "iterations", "seconds", "moved", "redrawn",
 }  # fmt: skip
 
 

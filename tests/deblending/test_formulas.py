@@ -4,19 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.scenes import blend, fit, frame, observe, sources
+from helpers.scenes import blend, fit, frame, observe
 from helpers.solver import BOXES, changed, posed
 
 from clresample.deblending import iterate as iterate_module
-from clresample.deblending.fit import SPECTRUM_PART, Fit
+from clresample.deblending.fit import Fit, begin
 from clresample.deblending.profiles import SIZE_ARCSEC, components_of
 from clresample.deblending.settings import Settings
 from clresample.deblending.solver import curvature as curvature_module
 from clresample.deblending.solver.amsgrad import AMSGrad
 from clresample.deblending.solver.curvature import damping
 from clresample.deblending.solver.prior import Prior
-from clresample.deblending.spectra import MODEL_ERROR
-from clresample.deblending.start import _ProfileFit
+from clresample.deblending.start.first_scene import SPECTRUM_PART
 from clresample.deblending.view import whitened_view
 from clresample.sky.sources import Extended
 
@@ -62,6 +61,7 @@ def test_the_sky_is_part_of_the_model_that_damps(device):
 def test_scale_of_the_spectra_steps(device):
     """A flux's error, and 2 % of the flux."""
     f = Fit(blend(), Settings(), device, np.float32, pad=1)
+    begin([f])
     error = 1 / np.sqrt(f.scene.power)
     assert SPECTRUM_PART == 0.02 and (f.state.spectra > 20 * error).any()
     np.testing.assert_allclose(f.scene.scale, error + 0.02 * f.state.spectra, rtol=1e-12)
@@ -75,45 +75,6 @@ def test_sizes_of_several_components_lie_about_that_of_one():
     assert one.mean[0] == pytest.approx(np.log(SIZE_ARCSEC / 0.1))
     np.testing.assert_allclose(sorted(sizes[0]), (-0.5, 0.5), atol=1e-12)
     np.testing.assert_allclose(sorted(sizes[1]), (-1, 0, 1), atol=1e-12)
-
-
-def test_chi2_of_profiles_allows_for_their_own_error(device):
-    """1 / w = 1 + (0.15 model)^2 in units of the noise."""
-    views = seen(device)
-    positions = np.array([s.position_px for s in sources()])
-    profiles = _ProfileFit(frame(), sources(), positions, views, fit_sky=True)
-    theta = profiles.mean + 0.2
-    found = profiles.linearise(theta)
-    heads = np.concatenate([images[:1] for images in profiles.images(theta)])
-    expected, channel = float((0.2**2 / profiles.scatter**2).sum()), 0
-    for view in views:
-        for image, root, data in zip(view.render(heads).swapaxes(0, 1), view.root, view.data):
-            model = found.spectra[:, channel] @ image + found.sky[channel] * root.ravel()
-            left = (data * root).ravel() - model
-            expected += (left**2 / (1 + (0.15 * model) ** 2)).sum()
-            channel += 1
-    assert MODEL_ERROR == 0.15
-    assert found.chi2 == pytest.approx(expected, rel=1e-6)
-
-
-@pytest.mark.parametrize("fit_sky", [False, True])
-def test_normal_matrix_of_the_profiles(device, fit_sky, monkeypatch):
-    """Against chi2 itself: along the Gauss-Newton step it falls as the normal equations say."""
-    from clresample.deblending import spectra, start
-
-    for module in (start, spectra):
-        monkeypatch.setattr(module, "MODEL_ERROR", 0.0)  # weights that stay
-    if not device.has_fp64:
-        pytest.skip(f"{device.name} has no double precision")
-    views = seen(device, np.float64)
-    positions = np.array([s.position_px for s in sources()])
-    profiles = _ProfileFit(frame(), sources(), positions, views, fit_sky=fit_sky)
-    best = profiles.run()[1].theta
-    here = profiles.linearise(best)
-    step = 1e-3 * np.random.default_rng(2).normal(size=len(best))
-    sides = [profiles.linearise(best + sign * step).chi2 for sign in (1, -1)]
-    second = (sides[0] + sides[1] - 2 * here.chi2) / 2
-    assert second == pytest.approx(step @ here.normal @ step, rel=0.05)
 
 
 def test_a_fit_that_worsens_after_a_new_batch_ends_at_its_best(device, monkeypatch):

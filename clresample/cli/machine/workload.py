@@ -12,7 +12,7 @@ import numpy as np
 
 from ...deblending.batch import deblend_many
 from ...deblending.blend import Blend
-from ...deblending.fit import Fit
+from ...deblending.fit import Fit, begin
 from ...deblending.iterate import iterate
 from ...deblending.settings import Settings
 from ...device.discovery import DeviceError
@@ -105,6 +105,7 @@ class Iterations:
             Fit(blend, self.settings, device, np.float32, pad=1)
             for blend in blends(N_SET_UP, device)
         ]
+        begin(self.fits)
         self.n = n
 
     def __call__(self):
