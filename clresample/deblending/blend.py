@@ -17,6 +17,9 @@ INTERRUPTED = "interrupted"
 # minutes. Arrays of components times pixels are held several at a time. A blend of 4096 pixels a
 # side has no neighbours that would need to be fitted at once.
 MOST_COMPONENTS, MOST_BYTES, MOST_PIXELS = 2000, 8 << 30, 1 << 24
+# [bytes] What a fit holds for each pixel of a component's box, here one of bright galaxies, and for
+# each pixel of the frame and the data: 60 sources at 512 px take 0.4 GB, 300 at 1024 px 1 GB.
+BYTES_A_BOX, BOX_PIXELS, BYTES_A_PIXEL = 40, 256 * 256, 100
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,8 @@ class Blend:
                 f"{len(self.sources)} sources have {n} components, more than any channel has "
                 f"pixels with a weight ({n_seen}): each has a flux in each channel; give fewer"
             )
-        n_bytes = 8 * n * (n_pixels + sum(o.data.size for o in self.observations))
+        n_bytes = BYTES_A_BOX * n * min(n_pixels, BOX_PIXELS)
+        n_bytes += BYTES_A_PIXEL * (n_pixels + sum(o.data.size for o in self.observations))
         if n > MOST_COMPONENTS or n_bytes > MOST_BYTES:
             raise ValueError(
                 f"{len(self.sources)} sources with {n} components on {n_pixels} model pixels need "
