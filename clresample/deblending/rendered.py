@@ -55,6 +55,13 @@ class Rendered:
         """Slices (y, x) of component i's window."""
         return box_slices(self.low[i], self.images[i].shape[1:])
 
+    def within(self, i, window):
+        """Component i's image (Co, ny, nx) on a window (slices y, x) that holds its own."""
+        image, start = self.images[i], [part.start for part in window]
+        out = np.zeros((self.shape[1], *(part.stop - part.start for part in window)), self.dtype)
+        out[:, *box_slices(self.low[i] - start, image.shape[1:])] = image
+        return out
+
     def total(self, spectra):
         """sum_i spectra[i] rendered[i], (Co, My, Mx); spectra (n, Co)."""
         out = np.zeros(self.shape[1:])

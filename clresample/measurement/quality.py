@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..sky.sources import Point
-from .residuals import channel_residuals, misfits
+from .residuals import channel_residuals, misfits, pixels_in_boxes
 
 # [px] from a pixel's centre to its corners
 PIXEL_RADIUS = 0.5**0.5
@@ -109,15 +109,9 @@ def box_chi2(result, i_observation, footprint):
     """Chi2 per pixel (S,) on the pixels whose centre lies in a box of the source."""
     terms = chi2_terms(result, i_observation, footprint.used).sum(axis=0)
     counts = footprint.used.sum(axis=0)
-    y, x = np.moveaxis(footprint.positions, -1, 0)
     chi2 = np.full(len(result.sources), np.nan)
-    for s in range(len(result.sources)):
-        inside = np.zeros(counts.shape, dtype=bool)
-        for c in result.components:
-            if c.source == s:
-                (y0, x0), (n_y, n_x) = np.array(c.origin) - 0.5, c.morphology.shape
-                inside |= (y >= y0) & (y < y0 + n_y) & (x >= x0) & (x < x0 + n_x)
-        n = counts[inside].sum()
+    for s, window, inside in pixels_in_boxes(result, i_observation, footprint.positions):
+        n = counts[window][inside].sum()
         if n:
-            chi2[s] = terms[inside].sum() / n
+            chi2[s] = terms[window][inside].sum() / n
     return chi2

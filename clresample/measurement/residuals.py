@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..deblending.rendered import Rendered
 from ..sky.noise import HALF_WIDTH
 
 # [sigma] of a filtered residual from which on a source is flagged as misfitted: among the 1e5
@@ -40,10 +41,9 @@ def worst_residuals(result, i_observation):
             image /= max(1.0, np.median(np.abs(image[sky])) / HALF_WIDTH)
     found = np.full((len(result.sources), len(weights)), np.nan)
     owner = _owners(result, i_observation, footprint.positions)
-    for s, c in np.ndindex(found.shape):
-        own = (owner[c] == s) & np.isfinite(filtered[c])
-        if own.any():
-            found[s, c] = np.abs(filtered[c][own]).max()
+    for c, image in enumerate(filtered):
+        own = (owner[c] >= 0) & np.isfinite(image)
+        np.fmax.at(found[:, c], owner[c][own], np.abs(image[own]))
     return found
 
 
@@ -97,14 +97,50 @@ def _owners(result, i_observation, positions):
     where none does."""
     shape = result.observations[i_observation].shape
     owner, most = np.full(shape, -1), np.full(shape, -np.inf)
-    for s in sorted({c.source for c in result.components}):
-        inside = np.zeros(shape[1:], bool)
-        for c in result.components:
-            if c.source == s:
-                low = np.array(c.origin) - 0.5
-                high = low + c.morphology.shape
-                inside |= ((positions >= low) & (positions < high)).all(axis=-1)
-        light = result.source_model(s, i_observation)
-        brighter = inside & (light > most)
-        owner[brighter], most[brighter] = s, light[brighter]
+    for s, window, inside in pixels_in_boxes(result, i_observation, positions):
+        light = _light(result, i_observation, s, window)
+        best, first = most[:, *window], owner[:, *window]  # views
+        brighter = inside & (light > best)
+        first[brighter], best[brighter] = s, light[brighter]
     return owner
+
+
+def pixels_in_boxes(result, i_observation, positions):
+    """The pixels whose centre lies in a box of a source, for each source that has components.
+
+    positions (My, Mx, 2) [model px]: of the observation's pixels
+    yields the source, a window (slices y, x) of the observation that holds them all, and where they
+        are in it (bool)
+    """
+    boxes = [(np.array(c.origin) - 0.5, c.morphology.shape) for c in result.components]
+    owners = np.array([c.source for c in result.components], int)
+    for s in np.unique(owners):
+        parts = np.flatnonzero(owners == s)
+        window = _window(result.rendered[i_observation], parts, positions.shape)
+        places, inside = positions[window], None
+        for low, size in (boxes[i] for i in parts):
+            one = ((places >= low) & (places < low + size)).all(axis=-1)
+            inside = one if inside is None else inside | one
+        yield s, window, inside
+
+
+def _window(rendered, parts, shape):
+    """A window that holds the light of some components, and so their boxes."""
+    if not isinstance(rendered, Rendered):
+        return slice(0, shape[0]), slice(0, shape[1])
+    windows = [rendered.window(i) for i in parts]
+    return tuple(
+        slice(min(w[k].start for w in windows), max(w[k].stop for w in windows)) for k in (0, 1)
+    )
+
+
+def _light(result, i_observation, source, window):
+    """One source's model (Co, ny, nx) on a window of an observation."""
+    channels = result.channel_slices()[i_observation]
+    rendered, total = result.rendered[i_observation], 0.0
+    boxed = isinstance(rendered, Rendered)
+    for i, c in enumerate(result.components):
+        if c.source == source:
+            image = rendered.within(i, window) if boxed else rendered[i][:, *window]
+            total = total + c.spectrum[channels, None, None] * image
+    return total
