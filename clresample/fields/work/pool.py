@@ -116,13 +116,17 @@ def _starter(function, context, n_workers):
         before = {name: os.environ.get(name) for name in environment}
         os.environ.update({k: v for k, v in environment.items() if before[k] is None})
         try:
-            process = processes.Process(target=_work, args=(theirs, function, context), daemon=True)
+            process = processes.Process(target=_work, args=(theirs, function), daemon=True)
             process.start()
         finally:
             for name, value in before.items():
                 if value is None:
                     os.environ.pop(name, None)
         theirs.close()
+        # Not as an argument of the process: what is larger than the system's buffer would wait for
+        # ever to be read by a process that was killed before it had read it.
+        with contextlib.suppress(OSError):  # of one that has died: seen when it gets a task
+            ours.send(context)
         return _Worker(process, ours)
 
     return start
@@ -167,11 +171,15 @@ def _end(worker):
         worker.process.join()
 
 
-def _work(pipe, function, context):
-    """A worker: tasks from the pipe, answers into it, until the other end is closed."""
+def _work(pipe, function):
+    """A worker: the context and tasks from the pipe, answers into it, until its end is closed."""
     import signal
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all; the parent ends its workers
+    try:
+        context = pipe.recv()
+    except (EOFError, OSError):
+        return
     while True:
         try:
             task = pipe.recv()
