@@ -13,6 +13,7 @@ from ..device.device import get_device
 from ..device.discovery import DeviceError
 from ..device.tuning import Tuning
 from ..device.workers import deal
+from ..drawing.bar import Bar
 from ..sky.given.checks import float_type, instance
 from ..sky.sources import SourceWarning
 from .blend import INTERRUPTED, Blend, Failure
@@ -86,14 +87,20 @@ def deblend_many(
         DeviceWarning, and the others do its part
     blends: Blend, with sizes, sources, PSFs, WCS and instruments of their own
     memory [bytes]: of the device for one group of scenes
-    progress: called with the number of blends done, after each group and each failure
+    progress: called with the number of blends done, after each group and each failure; True draws
+        a bar in terminals and notebooks, and prints a line now and then where nobody looks
     returns a Result for each blend, in their order, or a Failure: it does not harm the others.
         Ctrl-C ends the fits of the group that runs with the best state so far; what was done before
         comes back, and Failures with the status "interrupted" for the rest
     Warns once (SourceWarning) of all sources far from any light; results' messages name them.
     """
+    blends = list(blends)
+    if progress is True:
+        given = {"settings": settings, "device": device, "dtype": dtype, "memory": memory}
+        with Bar(len(blends), "blends") as bar:
+            return deblend_many(blends, progress=bar, **given)
     settings, dtype = _checked(settings, dtype)
-    blends, progress = list(blends), progress or (lambda n_done: None)
+    progress = progress or (lambda n_done: None)
     given = {"settings": settings, "dtype": dtype, "memory": memory}
     # blends of one size keep it; those of several are padded, whoever fits them
     given["pad"] = PAD_PX if len({_sizes(b) for b in blends} - {None}) > 1 else 1

@@ -219,3 +219,8 @@ def test_missing_instruments(device):
     assert [len(r.channels) for r in results] == [3, 2, 3, 2]
     for b, result in zip(blends, results, strict=True):
         alike(result, fit(b, device))
+
+
+def test_progress_true_tells_of_all(device, capsys):
+    deblend_many([blend(), blend()], device=device, progress=True)
+    assert "2 of 2 blends" in capsys.readouterr().err

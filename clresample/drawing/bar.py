@@ -1,0 +1,53 @@
+"""How far work has come: a bar in terminals and notebooks, a line now and then in logs."""
+
+from __future__ import annotations
+
+import sys
+import time
+import warnings
+
+# [s] Between two lines of a log.
+LINE_S = 30.0
+
+
+class Bar:
+    """Called with the number of items that are done; a context manager that ends its line.
+
+    total: number of all items; unit: what they are, in the plural
+    """
+
+    def __init__(self, total, unit):
+        self.total, self.unit = total, unit
+        self._began = self._said = time.monotonic()
+        self._bar = self._drawn() if _is_watched() else None
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        if self._bar is not None:
+            self._bar.close()
+
+    def __call__(self, n_done):
+        if self._bar is not None:
+            self._bar.update(n_done - self._bar.n)
+            return
+        now = time.monotonic()
+        if now - self._said >= LINE_S or n_done == self.total:
+            took = now - self._began
+            line = f"{n_done} of {self.total} {self.unit} after {took:.0f} s"
+            print(line, file=sys.stderr, flush=True)
+            self._said = now
+
+    def _drawn(self):
+        """tqdm's own choice between a notebook's bar and a terminal's."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of notebooks without widgets: they get text
+            from tqdm.auto import tqdm
+
+            return tqdm(total=self.total, unit=f" {self.unit}")
+
+
+def _is_watched():
+    """Whether someone looks: a terminal, or a notebook's kernel."""
+    return sys.stderr.isatty() or "ipykernel" in sys.modules
