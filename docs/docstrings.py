@@ -70,6 +70,7 @@ def restructured(lines):
                 "",
             ]
             continue
+        block = [line.replace("|", "\\|") for line in block]  # no substitution: an absolute value
         out += entries(block) or [*(line.strip() for line in block), ""]
     return out
 
