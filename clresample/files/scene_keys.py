@@ -23,43 +23,55 @@ class Rule:
     fits: object
 
 
-def _number(value):
+def is_number(value):
+    """Whether a value is a finite number, and a float can hold it."""
     if not isinstance(value, int | float) or isinstance(value, bool):
         return False
     return abs(value) <= LARGEST  # of integers, which may be too large for a float, and not NaN
 
 
-def _many(fits):
+def many(fits):
+    """Whether a value is a list of at least one, each of which fits."""
     return lambda value: isinstance(value, list) and len(value) > 0 and all(map(fits, value))
 
 
-def _text(value):
+def is_text(value):
+    """Whether a value is a text with more than blanks in it."""
     return isinstance(value, str) and bool(value.strip())
 
 
-def _whole(value):
+def is_whole(value):
+    """Whether a value is a whole number, 0 or more."""
     return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 
-def _either(*kinds):
+def either(*kinds):
+    """Whether a value fits one of several."""
     return lambda value: any(fits(value) for fits in kinds)
 
 
+def one_or_many(*kinds):
+    """Whether a value, or each of a list, fits one of several."""
+    return either(*kinds, many(either(*kinds)))
+
+
 def _above(value):
-    return _number(value) and value > 0
+    return is_number(value) and value > 0
 
 
-TEXT = Rule("a text", _text)
-FILE = Rule("the name of a file", _text)
-HDU = Rule('a number from 0, "NAME" or "NAME,VERSION"', _either(_whole, _text))
+TEXT = Rule("a text", is_text)
+FRACTION = Rule("a number from 0 to 1", lambda value: is_number(value) and 0 <= value < 1)
+COUNT = Rule("a whole number, 0 or more", is_whole)
+FILE = Rule("the name of a file", is_text)
+HDU = Rule('a number from 0, "NAME" or "NAME,VERSION"', either(is_whole, is_text))
 BANDS = Rule(
     "numbers from 0 or names of the file's bands, one or a list",
-    _either(_whole, _text, _many(_either(_whole, _text))),
+    one_or_many(is_whole, is_text),
 )
-NUMBERS = Rule("a number, or a list with one for each channel", _either(_number, _many(_number)))
+NUMBERS = Rule("a number, or a list with one for each channel", one_or_many(is_number))
 PLANES = Rule(
     "the name of a file, a number, or a list with one for each channel",
-    _either(_text, _above, _many(_above)),
+    either(is_text, _above, many(_above)),
 )
 SWITCH = Rule("true or false", lambda value: isinstance(value, bool))
 POSITIVE = Rule("a number above 0", _above)
@@ -70,14 +82,14 @@ TABLES = {
         "image": FILE,
         "hdu": HDU,
         "bands": BANDS,
-        "channels": Rule("a list of names", _many(_text)),
+        "channels": Rule("a list of names", many(is_text)),
         "psf": FILE,
         "psf_hdu": HDU,
         "psf_bands": BANDS,
         "psf_center": Rule(
             '"middle", "core" or [y, x]',
             lambda value: (
-                value in ("middle", "core") or (_many(_number)(value) and len(value) == 2)
+                value in ("middle", "core") or (many(is_number)(value) and len(value) == 2)
             ),
         ),
         "psf_spacing": POSITIVE,
@@ -89,7 +101,7 @@ TABLES = {
         "mask_hdu": HDU,
         "zero_point": NUMBERS,
         "noise": Rule(
-            '"estimate", or the name of a file with the autocorrelation of the noise', _text
+            '"estimate", or the name of a file with the autocorrelation of the noise', is_text
         ),
     },
     "sources": {
@@ -109,15 +121,15 @@ TABLES = {
         "psf_sigma_px": POSITIVE,
     },
     "fit": {
-        "max_iter": Rule("a whole number, 0 or more", _whole),
-        "tol": Rule("a number from 0 to 1", lambda value: _number(value) and 0 <= value < 1),
+        "max_iter": COUNT,
+        "tol": FRACTION,
         "enough": POSITIVE,
         "monotone": SWITCH,
         "structure_px": POSITIVE,
         "fit_shifts": SWITCH,
         "fit_sky": SWITCH,
-        "flux_floor": Rule("a number from 0 to 1", lambda value: _number(value) and 0 <= value < 1),
-        "psf_error": Rule("a number from 0 to 1", lambda value: _number(value) and 0 <= value < 1),
+        "flux_floor": FRACTION,
+        "psf_error": FRACTION,
     },
 }
 NEEDED = {"observation": ("name", "image", "psf"), "sources": ("catalogue",)}
@@ -129,26 +141,16 @@ def parse(path):
     returns {table: {key: value}}, and for "observation" a list of such dicts
     Raises SceneError.
     """
-    if Path(path).exists() and not Path(path).is_file():  # reading it might never end
-        raise SceneError(f"{path}: is no regular file")
-    try:
-        with open(path, "rb") as file:
-            tables = tomllib.load(file)
-    except RecursionError:
-        raise SceneError(f"{path}: not a scene file (lists or tables nested too deeply)") from None
-    except OSError as error:
-        raise SceneError(f"{path}: {error.strerror or error}") from error
-    except ValueError as error:  # of TOML, of UTF-8, and of whole numbers of 5000 digits
-        raise SceneError(f"{path}: not TOML ({error})") from error
-    _allowed(path, tables, TABLES, "table")
+    tables = read_tables(path, "scene file")
+    check_names(path, tables, TABLES, "table")
     observations = tables.get("observation")
-    if not _many(lambda value: isinstance(value, dict))(observations):
+    if not many(lambda value: isinstance(value, dict))(observations):
         raise SceneError(f"{path}: observation is missing: one [[observation]] per instrument")
     for i, table in enumerate(observations):
-        _check_table(f"{path}: observation {i + 1}", "observation", table)
+        check_table(f"{path}: observation {i + 1}", "observation", table, TABLES, NEEDED)
     for name, table in tables.items():
         if name != "observation":
-            _check_table(f"{path}: {name}", name, table)
+            check_table(f"{path}: {name}", name, table, TABLES, NEEDED)
     with_zero_point = ["zero_point" in table for table in observations]
     if len(set(with_zero_point)) > 1:
         one, other = (observations[with_zero_point.index(has)]["name"] for has in (True, False))
@@ -160,13 +162,31 @@ def parse(path):
     return {"frame": {}, "fit": {}} | tables
 
 
-def _check_table(where, name, table):
-    """Raise SceneError unless a table holds what TABLES says of those of its name."""
-    rules = TABLES[name]
+def read_tables(path, what) -> dict:
+    """The tables of a TOML file, unchecked; `what` it is called in messages. Raises SceneError."""
+    if Path(path).exists() and not Path(path).is_file():  # reading it might never end
+        raise SceneError(f"{path}: is no regular file")
+    try:
+        with open(path, "rb") as file:
+            return tomllib.load(file)
+    except RecursionError:
+        raise SceneError(f"{path}: not a {what} (lists or tables nested too deeply)") from None
+    except OSError as error:
+        raise SceneError(f"{path}: {error.strerror or error}") from error
+    except ValueError as error:  # of TOML, of UTF-8, and of whole numbers of 5000 digits
+        raise SceneError(f"{path}: not TOML ({error})") from error
+
+
+def check_table(where, name, table, tables, needed):
+    """Raise SceneError unless a table holds what the rules of its name say.
+
+    where: file and table, for messages; tables {name: {key: Rule}}; needed {name: keys}
+    """
+    rules = tables[name]
     if not isinstance(table, dict):
         raise SceneError(f"{where} is {table!r}, must be a table, [{name}]")
-    _allowed(where, table, rules, "key")
-    for key in NEEDED.get(name, ()):
+    check_names(where, table, rules, "key")
+    for key in needed.get(name, ()):
         if key not in table:
             raise SceneError(f"{where}: {key} is missing, it takes {rules[key].text}")
     for key, value in table.items():
@@ -174,7 +194,8 @@ def _check_table(where, name, table):
             raise SceneError(f"{where}: {key} is {value!r}, it takes {rules[key].text}")
 
 
-def _allowed(where, given, known, what):
+def check_names(where, given, known, what):
+    """Raise SceneError for a name that is not among those known; what: "table" or "key"."""
     for key in given:
         if key not in known:
             raise SceneError(f"{where}: {what} {key} is unknown; allowed are {', '.join(known)}")

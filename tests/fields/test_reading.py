@@ -10,6 +10,7 @@ from clresample.fields.background import find_background
 from clresample.fields.box import Box
 from clresample.fields.reading.field_file import read_field
 from clresample.fields.reading.headers import mask_value, zero_point
+from clresample.fields.reading.keys import parse_field
 from clresample.files.scene_keys import SceneError
 
 SHAPE = (300, 260)
@@ -147,3 +148,19 @@ def test_commands_from_simulation_to_catalogue_in_worker_processes(tmp_path, cap
     assert (out / "catalogue.fits").read_bytes() == before
     assert main([*command, "--overwrite", "--workers", "0"]) == 0
     assert (out / "catalogue.fits").read_bytes() == before  # by workers or not
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        ("x = " + "[" * 3000 + "]" * 3000, "nested too deeply"),
+        ("[[mosaic]]\nname = 'a'\nimage = 'a'\npsf = 'p'\nzero_point = nan", "zero_point is nan"),
+    ],
+)
+def test_a_field_file_is_checked_as_scene_files_are(tmp_path, text, said):
+    path = tmp_path / "field.toml"
+    path.write_text(text)
+    with pytest.raises(SceneError, match=said):
+        parse_field(path)
+    with pytest.raises(SceneError, match="no regular file"):
+        parse_field(tmp_path)

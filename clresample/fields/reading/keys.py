@@ -2,50 +2,41 @@
 
 from __future__ import annotations
 
-import tomllib
-from pathlib import Path
-
-from ...files.scene_keys import HDU, POSITIVE, TABLES, TEXT, Rule, SceneError
+from ...files.scene_keys import (
+    COUNT,
+    HDU,
+    NUMBERS,
+    POSITIVE,
+    TABLES,
+    TEXT,
+    Rule,
+    SceneError,
+    check_names,
+    check_table,
+    is_number,
+    is_text,
+    is_whole,
+    many,
+    one_or_many,
+    read_tables,
+)
 from ..psfs.read import FORMATS
 
-
-def _number(value):
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _whole(value):
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
-
-
-def _one_or_many(fits):
-    return lambda value: (
-        fits(value) or (isinstance(value, list) and len(value) > 0 and all(map(fits, value)))
-    )
-
-
-def _text(value):
-    return isinstance(value, str) and bool(value.strip())
-
-
-FILES = Rule("the name of a file, or a list with one for each channel", _one_or_many(_text))
-NUMBERS = Rule("a number, or a list with one for each channel", _one_or_many(_number))
+FILES = Rule("the name of a file, or a list with one for each channel", one_or_many(is_text))
 PLANES = Rule(
     "the name of a file, a number above 0, or a list with one for each channel",
-    _one_or_many(lambda value: _text(value) or (_number(value) and value > 0)),
+    one_or_many(is_text, POSITIVE.fits),
 )
 PAIR = Rule(
     "a number, or two: [y, x]",
-    lambda value: (
-        _number(value) or (isinstance(value, list) and len(value) == 2 and all(map(_number, value)))
-    ),
+    lambda value: is_number(value) or (many(is_number)(value) and len(value) == 2),
 )
-COUNT = Rule("a whole number, 0 or more", _whole)
 
 MOSAIC = {
     "name": TEXT,
     "image": FILES,
     "hdu": HDU,
-    "channels": Rule("a list of names", _one_or_many(_text)),
+    "channels": Rule("a list of names", one_or_many(is_text)),
     "weight": PLANES,
     "weight_hdu": HDU,
     "variance": PLANES,
@@ -56,7 +47,7 @@ MOSAIC = {
     "mask_hdu": HDU,
     "mask_bits": Rule(
         "a list of bits to ignore, by number from 0 or by the name in the mask's header",
-        _one_or_many(lambda value: _whole(value) or _text(value)),
+        one_or_many(is_whole, is_text),
     ),
     "zero_point": NUMBERS,
     "background": Rule(
@@ -94,45 +85,18 @@ def parse_field(path) -> dict:
 
     Raises SceneError, one line with the file, the table and the key.
     """
-    path = Path(path)
-    try:
-        with open(path, "rb") as file:
-            tables = tomllib.load(file)
-    except OSError as error:
-        raise SceneError(f"{path}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SceneError(f"{path}: not TOML ({error})") from error
-    _known(path, tables, FIELD_TABLES, "table")
+    tables = read_tables(path, "field file")
+    check_names(path, tables, FIELD_TABLES, "table")
     mosaics = tables.get("mosaic")
     if not isinstance(mosaics, list) or not mosaics:
         raise SceneError(f"{path}: mosaic is missing: one [[mosaic]] for each instrument")
     for i, table in enumerate(mosaics):
         where = f"{path}: mosaic {i + 1}"
-        _check(where, "mosaic", table)
+        check_table(where, "mosaic", table, FIELD_TABLES, NEEDED)
         given = [key for key in WEIGHTS if key in table]
         if len(given) > 1:
             raise SceneError(f"{where}: {' and '.join(given)} are given, a mosaic takes one")
     for name in FIELD_TABLES:
         if name != "mosaic" and name in tables:
-            _check(f"{path}: {name}", name, tables[name])
+            check_table(f"{path}: {name}", name, tables[name], FIELD_TABLES, NEEDED)
     return {name: tables.get(name, {}) for name in FIELD_TABLES} | {"mosaic": mosaics}
-
-
-def _check(where, name, table):
-    """Raise SceneError for a key that is unknown, missing, or holds what it does not take."""
-    rules = FIELD_TABLES[name]
-    if not isinstance(table, dict):
-        raise SceneError(f"{where} is {table!r}, must be a table, [{name}]")
-    _known(where, table, rules, "key")
-    for key in NEEDED.get(name, ()):
-        if key not in table:
-            raise SceneError(f"{where}: {key} is missing, it takes {rules[key].text}")
-    for key, value in table.items():
-        if not rules[key].fits(value):
-            raise SceneError(f"{where}: {key} is {value!r}, it takes {rules[key].text}")
-
-
-def _known(where, given, known, what):
-    for key in given:
-        if key not in known:
-            raise SceneError(f"{where}: {what} {key} is unknown; allowed are {', '.join(known)}")
