@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import functools
 
-import numpy as np
-
+from .batched import applied, shapes
 from .needed import needed
 
 
@@ -50,8 +49,8 @@ def _primitive():
     p = needed("jax.extend.core", "jax").Primitive("clresample")
 
     def called_back(x, *, op, transposed):
-        result = jax.ShapeDtypeStruct(_shapes(x, op, transposed)[1], op.dtype)
-        return jax.pure_callback(functools.partial(_on_host, op, transposed), result, x)
+        result = jax.ShapeDtypeStruct(shapes(x, op, transposed)[1], op.dtype)
+        return jax.pure_callback(functools.partial(applied, op, transposed), result, x)
 
     def transpose(y, _, *, op, transposed):
         return [p.bind(y, op=op, transposed=not transposed)]
@@ -61,27 +60,9 @@ def _primitive():
 
     p.def_impl(jax.jit(called_back, static_argnames=("op", "transposed")))
     p.def_abstract_eval(
-        lambda x, *, op, transposed: jax.core.ShapedArray(_shapes(x, op, transposed)[1], op.dtype)
+        lambda x, *, op, transposed: jax.core.ShapedArray(shapes(x, op, transposed)[1], op.dtype)
     )
     ad.deflinear2(p, transpose)
     batching.primitive_batchers[p] = batch
     mlir.register_lowering(p, mlir.lower_fun(called_back, multiple_results=False))
     return p
-
-
-def _shapes(x, op, transposed):
-    """Of one item of x, and of the result with all of x's leading axes."""
-    shape_x, shape_result = op.shape_in, op.shape_out
-    if transposed:
-        shape_x, shape_result = shape_result, shape_x
-    return shape_x, (*x.shape[: x.ndim - len(shape_x)], *shape_result)
-
-
-def _on_host(op, transposed, x):
-    """The operator on a host array, all leading axes as one batch."""
-    x = np.asarray(x)
-    shape_x, shape_result = _shapes(x, op, transposed)
-    if 0 in x.shape:
-        return np.zeros(shape_result, op.dtype)
-    run = op.adjoint if transposed else op.forward
-    return run(x.reshape(-1, *shape_x)).reshape(shape_result)

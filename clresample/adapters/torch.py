@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-
+from .batched import applied
 from .needed import needed
 
 
@@ -22,39 +21,24 @@ def as_torch(op):
     torch = needed("torch", "torch")
     dtype = getattr(torch, op.dtype.name)
 
-    def run(call, x, shape_x, shape_result):
-        lead = x.shape[: x.ndim - len(shape_x)]
-        items = np.ascontiguousarray(x.detach().cpu().numpy()).reshape(-1, *shape_x)
-        result = call(items) if len(items) else np.zeros((0, *shape_result), op.dtype)
-        return torch.from_numpy(result.reshape(*lead, *shape_result)).to(x.device)
-
-    class Forward(torch.autograd.Function):
-        """A x, whose derivative is the adjoint."""
+    class Applied(torch.autograd.Function):
+        """A x, or A^T x where `transposed`; the derivative of each is the other."""
 
         @staticmethod
-        def forward(ctx, x):
-            return run(op.forward, x, op.shape_in, op.shape_out)
+        def forward(ctx, x, transposed):
+            ctx.transposed = transposed
+            result = applied(op, transposed, x.detach().cpu().numpy())
+            return torch.from_numpy(result).to(x.device)
 
         @staticmethod
         def backward(ctx, y):
-            return Backward.apply(y)
-
-    class Backward(torch.autograd.Function):
-        """A^T y, whose derivative is the operator."""
-
-        @staticmethod
-        def forward(ctx, y):
-            return run(op.adjoint, y, op.shape_out, op.shape_in)
-
-        @staticmethod
-        def backward(ctx, x):
-            return Forward.apply(x)
+            return Applied.apply(y, not ctx.transposed), None
 
     def apply(x):
         if tuple(x.shape[x.ndim - len(op.shape_in) :]) != op.shape_in or x.ndim < len(op.shape_in):
             raise ValueError(f"x has shape {tuple(x.shape)}, expected (...,) + {op.shape_in}")
         if x.dtype != dtype:
             raise ValueError(f"x is {x.dtype}, the operator computes in {dtype}: convert one")
-        return Forward.apply(x)
+        return Applied.apply(x, False)
 
     return apply

@@ -1,0 +1,23 @@
+"""An operator, or its adjoint, on host arrays with any number of leading axes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def shapes(x, op, transposed):
+    """Of one item of x, and of the result with all of x's leading axes."""
+    shape_x, shape_result = op.shape_in, op.shape_out
+    if transposed:
+        shape_x, shape_result = shape_result, shape_x
+    return shape_x, (*x.shape[: x.ndim - len(shape_x)], *shape_result)
+
+
+def applied(op, transposed, x):
+    """A x, or A^T x where `transposed`, all leading axes of the array x as one batch."""
+    x = np.ascontiguousarray(x)
+    shape_x, shape_result = shapes(x, op, transposed)
+    if 0 in x.shape:
+        return np.zeros(shape_result, op.dtype)
+    run = op.adjoint if transposed else op.forward
+    return run(x.reshape(-1, *shape_x)).reshape(shape_result)
