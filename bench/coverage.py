@@ -34,7 +34,7 @@ from clresample.simulation.scenes import simulate_scene
 
 from .harness import records, scenes, truth
 from .harness.clock import in_processes, on_one_thread
-from .harness.options import BadOption, Parser, positive, run, seed
+from .harness.options import BadOption, Parser, positive, run
 
 GALAXIES = ("parametric", "cosmos")
 EDGES = (3.0, 10.0, 30.0, 100.0, 300.0, np.inf)  # signal to noise
@@ -218,13 +218,7 @@ def parser():
         help="how many scenes of each mode and kind of galaxies "
         f"({', '.join(f'{n} {m}' for m, n in N_SCENES['parametric'].items())}; a few of COSMOS)",
     )
-    parser.add_argument(
-        "--seed",
-        type=seed,
-        default=FIRST_SEED,
-        metavar="S",
-        help="seed of the first scene (%(default)s)",
-    )
+    parser.add_first_seed(FIRST_SEED)
     parser.add_argument("--modes", nargs="+", choices=MODES, default=MODES)
     parser.add_argument(
         "--galaxies",

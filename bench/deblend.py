@@ -26,7 +26,7 @@ from clresample.deblending.settings import Settings
 
 from .harness import records, scenes
 from .harness.clock import on_one_thread
-from .harness.options import Parser, positive, run, seed
+from .harness.options import Parser, positive, run
 
 VIEWS = {"upright": (0.0, False), "turned": (30.0, False), "mirrored": (0.0, True)}
 BATCHES = (1, 4, 16, 64)
@@ -264,9 +264,7 @@ def parser():
     parser.add_argument(
         "--scenes", type=positive(int), metavar="N", help=f"how many scenes ({N_SCENES})"
     )
-    parser.add_argument(
-        "--seed", type=seed, default=0, metavar="S", help="seed of the first scene (%(default)s)"
-    )
+    parser.add_first_seed(0)
     parser.add_argument(
         "--views",
         nargs="+",

@@ -33,7 +33,7 @@ from clresample.simulation.scenes import simulate_scene
 
 from .harness import records, scenes
 from .harness.clock import in_processes, on_one_thread
-from .harness.options import Parser, positive, run, seed
+from .harness.options import Parser, positive, run
 
 RECIPES = ("native", "correlated", "white")
 BANDS = {"Euclid": slice(0, 1), "Rubin": slice(1, 7)}
@@ -176,13 +176,7 @@ def parser():
     parser.add_argument(
         "--scenes", type=positive(int), metavar="N", help=f"how many scenes ({N_SCENES})"
     )
-    parser.add_argument(
-        "--seed",
-        type=seed,
-        default=FIRST_SEED,
-        metavar="S",
-        help="seed of the first scene (%(default)s)",
-    )
+    parser.add_first_seed(FIRST_SEED)
     parser.add_processes()
     parser.add_json()
     return parser

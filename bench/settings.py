@@ -32,7 +32,7 @@ from clresample.measurement.photometry import fluxes
 
 from .harness import records, scenes
 from .harness.clock import in_processes, on_one_thread
-from .harness.options import Parser, positive, run, seed
+from .harness.options import Parser, positive, run
 
 SETTINGS = {
     "default": Settings(),
@@ -208,9 +208,7 @@ def parser():
     parser.add_argument(
         "--scenes", type=positive(int), metavar="N", help=f"how many scenes ({N_SCENES})"
     )
-    parser.add_argument(
-        "--seed", type=seed, default=0, metavar="S", help="seed of the first scene (%(default)s)"
-    )
+    parser.add_first_seed(0)
     parser.add_argument(
         "--settings",
         nargs="+",

@@ -33,7 +33,7 @@ from clresample.simulation.sdr import sdr
 
 from .harness import records, scenes
 from .harness.clock import in_processes, on_one_thread
-from .harness.options import Parser, positive, run, seed
+from .harness.options import Parser, positive, run
 
 PSFS = {
     "right": (),
@@ -201,13 +201,8 @@ def parser():
     parser.add_argument(
         "--scenes", type=positive(int), metavar="N", help=f"how many of each ({N_SCENES})"
     )
-    parser.add_argument(
-        "--seed",
-        type=seed,
-        default=1000,  # the default psf_error was chosen on the scenes before these
-        metavar="S",
-        help="seed of the first scene (%(default)s)",
-    )
+    # the default psf_error was chosen on the scenes before these
+    parser.add_first_seed(1000)
     parser.add_processes()
     parser.add_json()
     return parser

@@ -37,7 +37,7 @@ from clresample import catalogue
 from .harness import records, scenes
 from .harness.clock import on_all_cores
 from .harness.crowded import crowded_blend
-from .harness.options import ROOT, Parser, positive, run, seed
+from .harness.options import ROOT, Parser, positive, run
 
 N_SCENES, N_QUICK = 32, 8
 # Sources of a blend, and its model's pixels a side.
@@ -233,9 +233,7 @@ def parser():
         metavar="GB",
         help="that the process of a blend may have (%(default)s)",
     )
-    parser.add_argument(
-        "--seed", type=seed, default=0, metavar="S", help="seed of the first scene (%(default)s)"
-    )
+    parser.add_first_seed(0)
     parser.add_catalogue()
     parser.add_json()
     return parser

@@ -90,6 +90,15 @@ class Parser(argparse.ArgumentParser):
             "data folder beside the checkout, or else parametric galaxies",
         )
 
+    def add_first_seed(self, default):
+        self.add_argument(
+            "--seed",
+            type=seed,
+            default=default,
+            metavar="S",
+            help="seed of the first scene (%(default)s)",
+        )
+
     def add_processes(self):
         self.add_argument(
             "--processes",
