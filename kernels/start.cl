@@ -82,6 +82,7 @@ __kernel void turn(const int h_y, const int n_pad, const int n_bands, const int 
 {
     const int i = (int)get_global_id(1), band = (int)get_global_id(2) % n_bands;
     const int item = (int)get_global_id(2) / n_bands, n_half = n_pad / 2;
+    if (i >= h_y) return;   /* launches are rounded up to whole groups */
     __global const REAL *t = phase + (size_t)(first + item / n) * 2 * (h_y + n_half);
     const REAL yr = t[2 * i], yi = t[2 * i + 1];
     __global const REAL *along = t + 2 * h_y;
@@ -140,6 +141,7 @@ __kernel void compare(__global const int *restrict scenes, __global const int *r
                       __global REAL *restrict weight, __global REAL *restrict sums)
 {
     const int y = (int)get_global_id(0), c = (int)get_global_id(1), k = (int)get_global_id(2);
+    if (y >= my || c >= n_bands) return;
     const int b = scenes[k];
     const size_t line = ((size_t)b * n_bands + c) * my + y;
     __global REAL *m = residual + line * mx, *w = weight + line * mx;
