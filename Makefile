@@ -7,14 +7,14 @@ STAMP = $(VENV)/made
 RUN = $(VENV)/bin/python -m
 
 .PHONY: demo test test-on test-kernels-on grind lint mutants fuzz clean paper paper-full dist \
-    test-install test-oldest test-adapters docs soak
+    test-as-gpu test-install test-oldest test-adapters docs soak
 
 # What runs on one OpenCL device whatever the others are: operators, and the solver's kernels.
 KERNEL_TESTS = tests/device/test_contraction.py tests/device/test_launcher.py \
     tests/device/test_selftest.py tests/resampling tests/deblending/test_engine.py \
     tests/deblending/test_constraints.py tests/deblending/test_monotone.py \
     tests/deblending/test_lbfgs.py tests/deblending/test_structure.py \
-    tests/deblending/test_gradient.py
+    tests/deblending/test_gradient.py tests/deblending/test_boxed_start.py
 
 demo: $(STAMP)
 	$(RUN) clresample.cli.demo $(ARGS)
@@ -33,6 +33,10 @@ test-on: $(STAMP)
 # Kernels' tests on one other runtime.
 test-kernels-on: TESTS = $(KERNEL_TESTS)
 test-kernels-on: test-on
+
+# Kernels' tests as kernels are built for GPUs, in buffers that show bad reads and writes.
+test-as-gpu: $(STAMP)
+	$(RUN) pytest $(KERNEL_TESTS) --as-gpu --nan-buffers --guard-buffers $(ARGS)
 
 # Races and bad accesses of every kernel, found by a simulator; see tools/grind.sh.
 grind: $(STAMP)

@@ -1,7 +1,8 @@
 """Fixtures: every OpenCL device of the machine, and the folder of real images.
 
 Options: --as-gpu runs every device through the kernels as they are built for GPUs; --nan-buffers
-fills each new buffer of a device with NaN, so that a kernel that reads what nobody wrote is found.
+fills each new buffer of a device with NaN, so that a kernel that reads what nobody wrote is found;
+--guard-buffers fails tests whose kernels write beyond the end of a buffer.
 """
 
 import os
@@ -17,6 +18,7 @@ os.environ["CLRESAMPLE_CACHE"] = tempfile.mkdtemp(prefix="clresample-cache-")
 
 import numpy as np
 import pytest
+from helpers.buffers import Guards, fill_with_nan
 from helpers.checkout import ROOT
 
 from clresample import Device, DeviceError, get_device, list_devices
@@ -27,6 +29,7 @@ NO_DOUBLE = "has no double precision: use float32"
 def pytest_addoption(parser):
     parser.addoption("--as-gpu", action="store_true", help="build kernels as for GPUs")
     parser.addoption("--nan-buffers", action="store_true", help="fill new buffers with NaN")
+    parser.addoption("--guard-buffers", action="store_true", help="find writes beyond buffers")
 
 
 def pytest_generate_tests(metafunc):
@@ -64,7 +67,7 @@ def device(request):
 
 @pytest.fixture(scope="session", autouse=True)
 def as_asked(request):
-    """What the options ask of all devices."""
+    """What the options ask of all devices; the Guards, where asked for."""
     with pytest.MonkeyPatch.context() as patch:
         if request.config.getoption("--as-gpu"):
             opened = Device.__init__
@@ -76,23 +79,16 @@ def as_asked(request):
             patch.setattr(Device, "__init__", as_gpu)
         if request.config.getoption("--nan-buffers"):
             fill_with_nan(patch)
-        yield
+        yield Guards(patch) if request.config.getoption("--guard-buffers") else None
     shutil.rmtree(os.environ["CLRESAMPLE_CACHE"], ignore_errors=True)
 
 
-def fill_with_nan(patch):
-    """Let every new buffer of every device hold NaN, or the largest number of its type."""
-    empty = Device.empty
-
-    def filled(self, shape, dtype):
-        array = empty(self, shape, dtype)
-        kind = array.dtype.kind
-        value = np.nan if kind in "fc" else np.iinfo(array.dtype).max
-        if array.size:
-            self.upload(np.full(array.shape, value, array.dtype), array)
-        return array
-
-    patch.setattr(Device, "empty", filled)
+@pytest.fixture(autouse=True)
+def within_buffers(as_asked):
+    """With --guard-buffers: no kernel wrote beyond the end of a buffer."""
+    yield
+    if as_asked is not None:
+        assert as_asked.overwritten() == [], "bytes of buffers that were written beyond their end"
 
 
 @pytest.fixture(scope="session")
