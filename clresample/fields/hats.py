@@ -43,9 +43,7 @@ def check_hats(grid):
     if grid.is_flat or names_of(grid.wcs) != ("ra", "dec"):
         raise ValueError(f"HATS needs right ascension and declination, the field is {grid.placing}")
     if not find_spec("pyarrow"):
-        raise ImportError(
-            "HATS needs pyarrow: pip install 'clresample[hats]'"
-        )
+        raise ImportError("HATS needs pyarrow: pip install 'clresample[hats]'")
     healpix_index([0.0], [0.0])
 
 
