@@ -57,6 +57,12 @@ _ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
         "mosaic": ("Mosaic",),
         "options": ("FieldOptions",),
         "run": ("run_field",),
+        "readers.euclid_mer": ("read_euclid_mer",),
+        "readers.hst": ("read_hst",),
+        "readers.jwst": ("read_jwst",),
+        "readers.legacy": ("read_legacy_survey",),
+        "readers.rubin_coadd": ("read_rubin_coadd",),
+        "readers.rubin_exposure": ("read_rubin_exposure",),
     },
     # scenes with their truth
     "simulation": {
@@ -90,6 +96,12 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from .device.discovery import DeviceError as DeviceError, list_devices as list_devices
     from .fields.mosaic import Mosaic as Mosaic
     from .fields.options import FieldOptions as FieldOptions
+    from .fields.readers.euclid_mer import read_euclid_mer as read_euclid_mer
+    from .fields.readers.hst import read_hst as read_hst
+    from .fields.readers.jwst import read_jwst as read_jwst
+    from .fields.readers.legacy import read_legacy_survey as read_legacy_survey
+    from .fields.readers.rubin_coadd import read_rubin_coadd as read_rubin_coadd
+    from .fields.readers.rubin_exposure import read_rubin_exposure as read_rubin_exposure
     from .fields.run import run_field as run_field
     from .files.results import (
         read_result as read_result,

@@ -17,6 +17,7 @@ and ends with the same catalogue."""
 
 EPILOG = """\
 in DIR   catalogue.parquet, .fits, .ecsv   fluxes with errors, positions, shapes, flags
+         hats/                             the catalogue for LSDB, with --hats
          blends.ecsv                       fits: how they ended, sizes, seconds
          models.fits                       every source's model, by blend
          model_*.fits, residual_*.fits     mosaics
@@ -75,6 +76,11 @@ def add_field(commands):
         help="only the I-th of N parts of the field, for job arrays: sources belong to the part "
         "that holds their centre, so that the parts' catalogues together are that of the field",
     )
+    parser.add_argument(
+        "--hats",
+        action="store_true",
+        help="write the catalogue as HATS too, which LSDB opens (extra hats)",
+    )
     add_device_option(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
     parser.set_defaults(run=run)
@@ -109,6 +115,7 @@ def run(arguments):
         device=arguments.device,
         limit_s=arguments.limit,
         part=arguments.part,
+        hats=arguments.hats,
         memory=arguments.memory or max(memory, LEAST_MEMORY),
     )
     progress = _progress(arguments)

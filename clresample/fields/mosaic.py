@@ -125,9 +125,15 @@ class Channel:
             values = np.divide(1.0, variance, out=np.zeros(variance.shape), where=good)
         bad = ~np.isfinite(values) | (values < 0)
         if self.mask is not None:
-            flags = self.mask.read(box)
-            bad |= (flags != 0) if self.mask_value is None else _set(flags, self.mask_value)
+            bad |= self.masked(box)
         return np.where(bad, 0.0, values)
+
+    def masked(self, box) -> np.ndarray:
+        """Which pixels (Ny, Nx) of a Box the mask excludes; a channel without one excludes none."""
+        if self.mask is None:
+            return np.zeros(box.shape, bool)
+        flags = self.mask.read(box)
+        return flags != 0 if self.mask_value is None else _set(flags, self.mask_value)
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,6 +34,7 @@ class FieldOptions:
     memory [bytes]: that a group of fits, and the search of a tile, may take in a worker; a run that
         goes on keeps what it began with
     workers: processes; 0 = this one. limit_s [s]: longest time of a group, None = no limit
+    hats: write the catalogue in the HATS layout too, into DIR/hats
     device: as `get_device` takes it; field_number: of the ids, 0 to 8,388,607, see `source_ids`
     """
 
@@ -49,6 +50,7 @@ class FieldOptions:
     memory: int = MEMORY
     workers: int = 0
     limit_s: float | None = None
+    hats: bool = False
     device: object = None
     field_number: int = 0
 

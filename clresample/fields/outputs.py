@@ -12,16 +12,16 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 
-import numpy as np
 from astropy.io import fits
-from astropy.table import QTable
 
 from .. import __version__
 from ..device.device import get_device
 from ..files.whole_file import whole_file
 from .columns import finished
+from .hats import write_hats
 from .images import write_mosaics
 from .models import write_models
+from .parquet import write_parquet
 
 NO_PARQUET = "no catalogue.parquet: pyarrow is not installed (pip install 'clresample[field]')"
 PACKAGES = "numpy", "scipy", "astropy", "pyopencl", "sep", "pyarrow"
@@ -41,12 +41,13 @@ class Outputs:
     notes: tuple[str, ...] = ()
 
 
-def write_outputs(folder, job, parts, unsettled, about, seconds) -> Outputs:
+def write_outputs(folder, job, parts, unsettled, about, seconds, hats=False) -> Outputs:
     """Write all outputs of a field, each file whole or not at all.
 
     folder: to write into; job: Job; parts: PartFiles, those of later rounds last
     unsettled: parents of cut blends whose pieces did not settle
     about: plain values for the provenance; seconds: wall time by stage so far
+    hats: write the catalogue in the HATS layout too, if it has rows
 
     catalogue.{parquet,fits,ecsv} hold nothing that another run of the same field would change:
     times are in blends.ecsv and provenance.json. Raises FileError.
@@ -55,6 +56,8 @@ def write_outputs(folder, job, parts, unsettled, about, seconds) -> Outputs:
     table, blends = finished(job, parts, last, unsettled)
     paths = list(_write_catalogues(folder, table))
     notes = () if find_spec("pyarrow") else (NO_PARQUET,)
+    if hats and len(table):
+        paths.append(write_hats(folder / "hats", table))
     paths.append(_write_ecsv(folder / "blends.ecsv", blends))
     paths.append(write_models(folder / "models.fits", job, parts, last, set(table["id"].tolist())))
     paths += write_mosaics(folder, job, parts, last)
@@ -96,26 +99,6 @@ def _write_ecsv(path, table):
     with whole_file(path) as part:
         table.write(part, format="ascii.ecsv", overwrite=True)
     return path
-
-
-def write_parquet(path, table: QTable):
-    """Write a table to Parquet, units and descriptions in the metadata of its columns."""
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    arrays, fields = [], []
-    for name in table.colnames:
-        column = table[name]
-        values = np.asarray(getattr(column, "value", column))
-        array = pa.array(values.tolist() if values.dtype.kind in "US" else values)
-        unit = str(column.unit) if getattr(column, "unit", None) is not None else ""
-        about = {"unit": unit, "description": column.info.description or ""}
-        arrays.append(array)
-        fields.append(pa.field(name, array.type, metadata={k: v for k, v in about.items() if v}))
-    meta = {str(k): str(v) for k, v in table.meta.items()} | {
-        "creator": f"clresample {__version__}"
-    }
-    parquet.write_table(pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=meta)), path)
 
 
 def _write_provenance(path, job, about, seconds, status):

@@ -12,6 +12,7 @@ import numpy as np
 from ..sky.grid import Grid
 from .blends.tiles import part_of
 from .box import Box
+from .hats import check_hats
 from .options import FieldOptions, Progress
 from .outputs import Outputs, write_outputs
 from .work.fitting import Job
@@ -50,12 +51,14 @@ def run_field(
     Python's processes. Ctrl-C ends the run; what is finished stays, for `resume`.
 
     Raises ValueError for mosaics that do not go together, FileError for a folder with another run,
-    and where nothing can be written; ImportError without sep.
+    and where nothing can be written; ImportError without sep, and without what HATS needs.
     """
     options, progress = options or FieldOptions(), progress or Progress()
     mosaics, folder = tuple(mosaics), Path(folder)
     seconds: dict[str, float] = {}
     reference = reference_of(mosaics)
+    if options.hats:
+        check_hats(reference)
     inputs = tuple((about or {}).get("inputs", {}).values())
     work, options = open_folder(
         folder, mosaics, reference, options, resume, overwrite, progress, inputs
@@ -81,7 +84,7 @@ def run_field(
     parts, unsettled = fitted(job, options, progress)
     clock.stop("fit")
     progress.stage("write", 1)
-    outputs = write_outputs(folder, job, parts, unsettled, about or {}, seconds)
+    outputs = write_outputs(folder, job, parts, unsettled, about or {}, seconds, options.hats)
     clock.stop("write")
     failed = outputs.status.get("failed", 0)
     return FieldRun(outputs, seconds, failed, plan.lost)

@@ -8,11 +8,10 @@ from itertools import pairwise
 import numpy as np
 from astropy import units as u
 from astropy.table import QTable
-from astropy.wcs.utils import wcs_to_celestial_frame
 
 from ..sky.footprint import open_edge
 from ..sky.observation import ZERO_POINT_UJY
-from ..sky.wcs import local_axes
+from ..sky.wcs import frame_of, local_axes, names_of
 from .photometry import channel_covariances, flux_scale, fluxes
 from .quality import box_chi2, fitted_sources, labels, masked_cores
 from .residuals import channel_residuals, misfits
@@ -129,8 +128,8 @@ def add_positions(table, grid, positions, suffix):
     sky = grid.sky(*positions.T)
     names, unit = ("y_sky", "x_sky"), u.arcsec
     if not grid.is_flat:
-        names, unit = (grid.wcs.wcs.lngtyp.lower(), grid.wcs.wcs.lattyp.lower()), u.deg
-        table.meta["frame"] = wcs_to_celestial_frame(grid.wcs).name
+        names, unit = names_of(grid.wcs), u.deg
+        table.meta["frame"] = frame_of(grid.wcs).name
     for name, values in zip(names, sky, strict=True):
         table[name + suffix] = values * unit
     for name, values in zip("yx", positions.T, strict=True):

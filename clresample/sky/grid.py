@@ -8,18 +8,18 @@ from dataclasses import dataclass
 
 import numpy as np
 from astropy.wcs import WCS
-from astropy.wcs.utils import wcs_to_celestial_frame
 
 from ..drawing.shown import ShownGrid
 from .given.checks import arcseconds, image_shape, instance, number, numbers
+from .interface.interface import Interface
 from .mapping import Mapping, map_affine, map_positions
 from .wcs import (
     convert,
-    pixel_problem,
     pixel_scale,
     pixels_at,
     shifted_wcs,
     tangent_wcs,
+    usable_wcs,
     world_at,
 )
 
@@ -44,24 +44,14 @@ class Grid(ShownGrid, ABC):
     def from_wcs(wcs, shape) -> Grid:
         """Grid of an image with a celestial WCS: CD, PC, CROTA, SIP, TPV, cubes, either parity.
 
-        wcs: astropy WCS; of more than two axes, the celestial ones are taken
+        wcs: astropy WCS, of whose axes the celestial ones are taken; or any object of two axes
+            with astropy's common interface (APE 14), such as a gwcs of JWST or Roman
         shape (..., Ny, Nx) [px]: the last two count
 
         Raises ValueError without a celestial part, or where it cannot be evaluated.
         """
         shape = image_shape(shape[-2:])
-        if not wcs.has_celestial:
-            axes = ", ".join(axis or "?" for axis in wcs.wcs.ctype)
-            raise ValueError(f"wcs has no celestial axes (CTYPE: {axes})")
-        try:
-            wcs = wcs.celestial if wcs.naxis > 2 else wcs.deepcopy()
-            wcs_to_celestial_frame(wcs)
-            problem = pixel_problem(wcs, shape)
-        except Exception as error:  # wcslib raises a dozen kinds, RuntimeError among them
-            raise ValueError(f"wcs cannot be used: {' '.join(str(error).split())}") from error
-        if problem:
-            raise ValueError(f"wcs cannot be used: its central pixel {problem}")
-        return WcsGrid(shape, wcs)
+        return WcsGrid(shape, usable_wcs(wcs, shape))
 
     @staticmethod
     def flat(shape, scale_arcsec, *, angle_deg=0, flip=False, center_arcsec=(0, 0)) -> Grid:
@@ -232,11 +222,11 @@ class WcsGrid(Grid):
     """Pixels placed by a celestial WCS.
 
     shape (Ny, Nx) [px]
-    wcs: astropy WCS of the two celestial axes
+    wcs: astropy WCS of the two celestial axes, or Interface
     """
 
     shape: tuple[int, int]
-    wcs: WCS
+    wcs: WCS | Interface
     is_flat, placing = False, "placed by a WCS"
 
     @property
@@ -268,7 +258,9 @@ class WcsGrid(Grid):
         return WcsGrid(image_shape(shape), shifted_wcs(self.wcs, y0, x0))
 
     def to_wcs(self, *, ra_deg=0.0, dec_deg=0.0):
-        """A copy of the WCS; ra_deg and dec_deg are of no effect."""
+        """A copy of the WCS, of an Interface its FITS approximation."""
+        if isinstance(self.wcs, Interface):
+            return self.wcs.to_fits(self.shape)
         return self.wcs.deepcopy()
 
     def _map_to(self, grid_in, tolerance_px):

@@ -1,4 +1,4 @@
-"""What grids need of astropy's WCS beyond its own methods.
+"""What grids need of a WCS, astropy's own or an Interface, beyond its own methods.
 
 Longitudes come before latitudes here, whatever the order of a header's axes, and the inverse gives
 NaN where astropy's raises.
@@ -12,14 +12,44 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.wcs import WCS, DistortionLookupTable, NoConvergence, Sip
 from astropy.wcs.utils import wcs_to_celestial_frame
+from astropy.wcs.wcsapi import BaseHighLevelWCS, BaseLowLevelWCS
+
+from .given.checks import instance
+from .interface.interface import Interface
 
 # [px] the iterated inverse of SIP and look-up tables stops here, well under NOISE_PX
 INVERSE_PX = 1e-8
 ARCSEC = math.radians(1 / 3600)  # [rad]
 
 
+def usable_wcs(wcs, shape):
+    """A copy of a WCS with its celestial axes only, an Interface unless it is astropy's own.
+
+    wcs: as `Grid.from_wcs` takes it; shape (Ny, Nx) [px]: of the image
+
+    Raises ValueError without celestial axes, or where it cannot be evaluated.
+    """
+    if not isinstance(wcs, WCS):
+        wcs = Interface.of(instance("wcs", wcs, (WCS, BaseLowLevelWCS, BaseHighLevelWCS)))
+    elif not wcs.has_celestial:
+        axes = ", ".join(axis or "?" for axis in wcs.wcs.ctype)
+        raise ValueError(f"wcs has no celestial axes (CTYPE: {axes})")
+    try:
+        if isinstance(wcs, WCS):
+            wcs = wcs.celestial if wcs.naxis > 2 else wcs.deepcopy()
+        frame_of(wcs)
+        problem = pixel_problem(wcs, shape)
+    except Exception as error:  # wcslib raises a dozen kinds, RuntimeError among them
+        raise ValueError(f"wcs cannot be used: {' '.join(str(error).split())}") from error
+    if problem:
+        raise ValueError(f"wcs cannot be used: its central pixel {problem}")
+    return wcs
+
+
 def world_at(wcs, n, m):
     """Longitude and latitude (2, ...) [deg] of the pixels n, m (...); NaN where there is none."""
+    if isinstance(wcs, Interface):
+        return wcs.world_at(n, m)
     world = np.array(wcs.all_pix2world(np.ravel(m), np.ravel(n), 0))
     return world[[wcs.wcs.lng, wcs.wcs.lat]].reshape((2,) + np.shape(n))
 
@@ -76,9 +106,21 @@ def local_axes(grid, pixel):
     return np.array([north, east]) @ steps / ARCSEC
 
 
+def frame_of(wcs):
+    """The celestial frame of a WCS, as astropy's coordinates have it."""
+    return wcs.frame if isinstance(wcs, Interface) else wcs_to_celestial_frame(wcs)
+
+
+def names_of(wcs):
+    """What a WCS calls longitude and latitude: "ra" and "dec", "glon" and "glat", ..."""
+    if isinstance(wcs, Interface):
+        return wcs.names
+    return wcs.wcs.lngtyp.lower(), wcs.wcs.lattyp.lower()
+
+
 def convert(wcs_from, wcs_to, lon, lat):
     """Points lon, lat (L,) [deg] of one WCS's celestial frame in that of another: (lon, lat)."""
-    frames = [wcs_to_celestial_frame(wcs) for wcs in (wcs_from, wcs_to)]
+    frames = [frame_of(wcs) for wcs in (wcs_from, wcs_to)]
     if frames[0].is_equivalent_frame(frames[1]):
         return lon, lat
     sky = SkyCoord(lon, lat, unit="deg", frame=frames[0]).transform_to(frames[1]).spherical
@@ -87,6 +129,8 @@ def convert(wcs_from, wcs_to, lon, lat):
 
 def pixels_at(wcs, lon, lat):
     """Pixels (L, 2), (y, x), at the points lon, lat (L,) [deg]; NaN where there is none."""
+    if isinstance(wcs, Interface):
+        return wcs.pixels_at(lon, lat)
     world = np.stack([lon, lat] if wcs.wcs.lng < wcs.wcs.lat else [lat, lon], axis=-1)
     try:
         pixels = wcs.all_world2pix(
@@ -120,6 +164,8 @@ def tangent_wcs(jacobian, origin, ra_deg, dec_deg):
 
 def shifted_wcs(wcs, y0, x0):
     """The same WCS for an array that starts at (y0, x0)."""
+    if isinstance(wcs, Interface):
+        return wcs.shifted(y0, x0)
     wcs = wcs.deepcopy()
     shift = np.array([x0, y0], dtype=np.float64)
     wcs.wcs.crpix = wcs.wcs.crpix - shift

@@ -32,16 +32,16 @@ def with_background(mosaic, table):
     return replace(mosaic, channels=tuple(channels))
 
 
-def _sample(mosaic):
-    """The Box in a mosaic's middle from which its noise is estimated."""
-    whole = Box.of(mosaic.grid.shape)
+def sample_box(grid):
+    """The Box in a mosaic's middle from which its noise is estimated. grid: of the mosaic"""
+    whole = Box.of(grid.shape)
     y, x = ((n - SAMPLE_PX) // 2 for n in whole.shape)
     return Box(y, x, y + SAMPLE_PX, x + SAMPLE_PX).meet(whole)
 
 
 def with_weights(mosaic, notes):
     """The mosaic with estimated weights where it has none."""
-    channels, box = [], _sample(mosaic)
+    channels, box = [], sample_box(mosaic.grid)
     for c in mosaic.channels:
         if c.weight is None:
             try:
@@ -63,7 +63,7 @@ def with_noise(mosaic, table, notes):
     """The mosaic with the correlation of its noise, estimated once from its middle."""
     if table.get("noise", "white") == "white":
         return mosaic
-    box, found = _sample(mosaic), []
+    box, found = sample_box(mosaic.grid), []
     for c in mosaic.channels:
         try:
             found.append(NoiseCorrelation.estimate(c.read(box), c.weights(box)))

@@ -52,7 +52,7 @@ def read_field(path) -> FieldFile:
         try:
             mosaics.append(read_mosaic(path.parent, table, inputs, notes))
         except ValueError as error:
-            where = f"{path}: mosaic {i + 1} ({table['name']})"
+            where = f"{path}: mosaic {i + 1} ({table.get('name', table.get('format'))})"
             raise SceneError(f"{where}: {error}") from error
     return FieldFile(tuple(mosaics), _options(path, tables, inputs), inputs, tuple(notes))
 

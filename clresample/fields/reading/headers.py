@@ -45,18 +45,32 @@ def zero_point(header, pixel_scale_arcsec) -> float | None:
     return None
 
 
-def mask_value(header, bits) -> int:
+def bit_names(header) -> dict[str, int]:
+    """The bits of a mask by name, as its header has them.
+
+    MP_SAT = 1 says that bit 1 is SAT (Rubin, HSC); MSKN0001 = 'SAT' with MSKM0001 = 2, its power of
+    two, says the same (lsst.images).
+    """
+    names = {}
+    for key in header:
+        if key[:3] == BIT_PREFIX:
+            names[key.removeprefix(BIT_PREFIX)] = int(header[key])
+        elif key[:4] == "MSKN" and f"MSKM{key[4:]}" in header:
+            names[str(header[key])] = int(header[f"MSKM{key[4:]}"]).bit_length() - 1
+    return names
+
+
+def mask_value(header, bits, known=None) -> int:
     """The sum of 2^n over the bits to ignore, given by number or by name.
 
-    Raises ValueError for a name that the header does not have.
+    known {name: bit}: of the format, None = those of the header
+    Raises ValueError for a name that neither has.
     """
-    names = {
-        key.removeprefix(BIT_PREFIX): int(header[key]) for key in header if key[:3] == BIT_PREFIX
-    }
+    names = bit_names(header) if known is None else known
     value = 0
     for bit in [bits] if isinstance(bits, str | int) else bits:
         if isinstance(bit, str) and bit not in names:
-            there = ", ".join(names) or f"none, as it has no cards {BIT_PREFIX}*"
+            there = ", ".join(names) or f"none, as it has no cards {BIT_PREFIX}* or MSKN*"
             raise ValueError(f"mask_bits has {bit!r}, the mask's header names {there}")
         value |= 1 << (names[bit] if isinstance(bit, str) else bit)
     return value

@@ -21,6 +21,7 @@ from ...files.scene_keys import (
     read_tables,
 )
 from ..psfs.read import FORMATS
+from ..readers.formats import READERS
 
 FILES = Rule("the name of a file, or a list with one for each channel", one_or_many(is_text))
 PLANES = Rule(
@@ -62,6 +63,13 @@ MOSAIC = {
     "psf_cell_px": PAIR,
     "psf_origin_px": PAIR,
 }
+SHARED = ("name", "channels", "mask_bits", "zero_point", "background", "noise")
+SURVEY = {  # a [[mosaic]] of a survey's files
+    "format": Rule(" or ".join(f'"{form}"' for form in READERS), lambda v: v in READERS),
+    "path": Rule("the name of a folder or a file, or a list of files", one_or_many(is_text)),
+    "bands": Rule("a list of the format's bands", one_or_many(is_text)),
+    **{key: MOSAIC[key] for key in (*SHARED, *(key for key in MOSAIC if key.startswith("psf")))},
+}
 FIELD_TABLES = {
     "mosaic": MOSAIC,
     "field": {
@@ -92,7 +100,10 @@ def parse_field(path) -> dict:
         raise SceneError(f"{path}: mosaic is missing: one [[mosaic]] for each instrument")
     for i, table in enumerate(mosaics):
         where = f"{path}: mosaic {i + 1}"
-        check_table(where, "mosaic", table, FIELD_TABLES, NEEDED)
+        if isinstance(table, dict) and "format" in table:
+            check_table(where, "mosaic", table, {"mosaic": SURVEY}, {"mosaic": ("path",)})
+        else:
+            check_table(where, "mosaic", table, FIELD_TABLES, NEEDED)
         given = [key for key in WEIGHTS if key in table]
         if len(given) > 1:
             raise SceneError(f"{where}: {' and '.join(given)} are given, a mosaic takes one")

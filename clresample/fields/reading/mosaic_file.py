@@ -13,6 +13,8 @@ from ...sky.psf_checks import PSFWarning
 from ..mosaic import Channel, FilePlane, Mosaic, NumberPlane
 from ..psfs.psf_field import BandPSFs
 from ..psfs.read import read_psf_field
+from ..readers.formats import read_survey
+from ..readers.found import SAME_PX, apart_px
 from .estimates import with_background, with_noise, with_weights
 from .headers import mask_value, zero_point
 from .keys import WEIGHTS
@@ -24,6 +26,8 @@ def read_mosaic(folder, table, inputs, notes) -> Mosaic:
     folder: that the files' names are relative to; table: of `parse_field`
     Raises FileError and ValueError, of one line, for what cannot be used.
     """
+    if "format" in table:
+        return _survey(folder, table, inputs, notes)
     name = table["name"]
     files = [folder / one for one in _listed(table["image"])]
     planes, headers, grid = _images(files, table.get("hdu"), name, inputs)
@@ -49,6 +53,19 @@ def read_mosaic(folder, table, inputs, notes) -> Mosaic:
     return with_noise(mosaic, table, notes)
 
 
+def _survey(folder, table, inputs, notes):
+    """The Mosaic of a table with a survey's files."""
+    keys = ("name", "bands", "channels", "mask_bits", "zero_point", "background", "noise")
+    given = {key: table[key] for key in keys if key in table}
+    if isinstance(given.get("channels"), str):
+        given["channels"] = [given["channels"]]
+    if "psf" in table:
+        about = {"name": table.get("name", table["format"])} | table
+        given["psf"] = lambda grid: _psf(folder, about, grid, inputs)
+    paths = [folder / one for one in _listed(table["path"])]
+    return read_survey(table["format"], paths, inputs=inputs, notes=notes, **given)
+
+
 def _listed(value):
     return list(value) if isinstance(value, list) else [value]
 
@@ -67,21 +84,12 @@ def _images(files, hdu, name, inputs):
             here = Grid.from_wcs(wcs, shape)
         if grid is None:
             grid = here
-        elif here.shape != grid.shape or _apart_px(here, grid) > 1e-3:
+        elif here.shape != grid.shape or apart_px(here, grid) > SAME_PX:
             raise FileError(f"{path}: lies on other pixels than {files[0]}: give it a [[mosaic]]")
         indices = [None] if len(shape) == 2 else range(shape[0])
         planes += [FilePlane(path, number, i) for i in indices]
         headers += [header] * len(indices)
     return planes, headers, grid
-
-
-def _apart_px(one, other):
-    """Largest distance [px] of the corners of two grids of one shape."""
-    n, m = (
-        np.array([0, 0, size - 1, size - 1.0])[order]
-        for size, order in zip(one.shape, ([0, 1, 2, 3], [0, 2, 1, 3]), strict=True)
-    )
-    return float(np.abs(one.positions_in(other, n, m) - np.stack([n, m], axis=-1)).max())
 
 
 def _names(name, headers, n):

@@ -1,0 +1,225 @@
+"""What a reader finds, what its user adds, and the Mosaic of both."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from ...files.fits import celestial_header, choose_hdu, open_fits
+from ...files.whole_file import FileError
+from ...sky.grid import Grid
+from ...sky.psf import PSF
+from ...sky.psf_checks import PSFWarning
+from ..mosaic import Channel, FilePlane, Mosaic, Plane
+from ..psfs.psf_field import BandPSFs, ConstantPSF, PSFField
+from ..reading.estimates import sample_box, with_background, with_noise, with_weights
+
+SAME_PX = 1e-3  # bands whose corners lie as near as this are on the same pixels
+# of the pixels in a mosaic's middle; with more of them masked the user is told
+MANY_MASKED = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """What the user of a reader may say; what is None is read, or is the format's own.
+
+    name: of the mosaic, unique in a field; bands: those to take, as the format calls them
+    channels (C,): what they are to be called, unique in a field
+    mask_bits: bits that mean: ignore this pixel, by number or name
+    zero_point [mag]: AB of one count, one number or C of them
+    psf: PSF or PSFField for all bands, a list with one for each, or a function that makes one of
+        the mosaic's Grid
+    background: "subtract", or "none" where it is subtracted already
+    noise: "estimate" its correlation, or "white"
+    inputs {what: file}, notes: filled with the files, and with what the user should know
+    """
+
+    name: str | None = None
+    bands: object = None
+    channels: object = None
+    mask_bits: object = None
+    zero_point: object = None
+    psf: object = None
+    background: str = "none"
+    noise: str | None = None
+    inputs: dict = field(default_factory=dict)
+    notes: list = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """One band of a mosaic, as a reader finds it.
+
+    band: the format's name of it; grid, data, weight, kind, mask, mask_value, zero_point: as in
+    Channel, None where the file does not say; psf: PSFField, or None
+    noise: NoiseCorrelation, or None; missing_zero_point, missing_psf: why there is none
+    files {what: file}
+    """
+
+    band: str
+    grid: Grid
+    data: FilePlane
+    weight: Plane
+    kind: str
+    mask: Plane | None = None
+    mask_value: int | None = None
+    zero_point: float | None = None
+    psf: PSFField | None = None
+    noise: object = None
+    missing_zero_point: str = "its header does not say"
+    missing_psf: str = "the format holds none"
+    files: dict = field(default_factory=dict)
+
+
+def paths_of(given) -> list[Path]:
+    """A path or several as a list of Path. Raises FileError for one that does not exist."""
+    paths = [Path(one) for one in (given if isinstance(given, list | tuple) else [given])]
+    for path in paths:
+        if not path.exists():
+            raise FileError(f"{path}: no such file or folder")
+    return paths
+
+
+def image_plane(path, hdu=None) -> tuple[FilePlane, tuple, object, Grid | None]:
+    """An image HDU of two axes: its plane, shape, header and Grid, None without a celestial WCS.
+
+    The primary header's cards count where the HDU's own header lacks them, as with INHERIT.
+    Raises FileError for a file without it.
+    """
+    with open_fits(path) as hdus:
+        chosen = choose_hdu(path, hdus, hdu)
+        if len(chosen.shape) != 2:
+            raise FileError(f"{path}: HDU {chosen.name} has {len(chosen.shape)} axes, must have 2")
+        number, shape = hdus.index(chosen), chosen.shape
+        header = hdus[0].header.copy()
+        header.extend(chosen.header, update=True)
+        wcs = celestial_header(path, chosen.header.copy(), hdus)
+        grid = Grid.from_wcs(wcs, shape) if wcs.has_celestial else None
+    return FilePlane(Path(path), number), shape, header, grid
+
+
+def placed(path, grid) -> Grid:
+    """The grid. Raises FileError where there is none."""
+    if grid is None:
+        raise FileError(f"{path}: has no celestial WCS")
+    return grid
+
+
+def assembled(survey, found, given, *, noise="white") -> Mosaic:
+    """The Mosaic of what a reader has found and its user given.
+
+    survey: its name where none is given; found: sequence of Found; given: Given
+    noise: what is done with its correlation unless the user says otherwise
+    Raises ValueError, one line that names it, for what is missing or does not go together.
+    """
+    found = _chosen(found, given.bands)
+    name = given.name or survey
+    grid = found[0].grid
+    for other in found[1:]:
+        if other.grid.shape != grid.shape or apart_px(other.grid, grid) > SAME_PX:
+            raise ValueError(
+                f"bands {found[0].band} and {other.band} lie on other pixels: give each a mosaic"
+            )
+    names = _one_for_each("channels", given.channels, found) or [one.band for one in found]
+    points = _zero_points(found, given)
+    psf = _psf(found, given, grid)
+    channels = tuple(
+        Channel(names[i], f.data, f.weight, f.kind, f.mask, f.mask_value, points[i])
+        for i, f in enumerate(found)
+    )
+    for one in found:
+        given.inputs.update({f"{what} of {name} {one.band}": f for what, f in one.files.items()})
+    mosaic = Mosaic(name, grid, channels, psf)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PSFWarning)
+        middle = psf.psf_at(*((np.array(grid.shape) - 1) / 2))
+    given.notes.extend(f"{name}: {text}" for text in middle.warnings())
+    _tell_of_masks(mosaic, given)
+    mosaic = with_background(mosaic, {"background": given.background})
+    mosaic = with_weights(mosaic, given.notes)
+    if given.noise is None and all(one.noise is not None for one in found):
+        return replace(mosaic, noise=tuple(one.noise for one in found))
+    return with_noise(mosaic, {"noise": given.noise or noise}, given.notes)
+
+
+def apart_px(one, other) -> float:
+    """Largest distance [px] of the corners of two grids of one shape."""
+    n, m = (
+        np.array([0, 0, size - 1, size - 1.0])[order]
+        for size, order in zip(one.shape, ([0, 1, 2, 3], [0, 2, 1, 3]), strict=True)
+    )
+    return float(np.abs(one.positions_in(other, n, m) - np.stack([n, m], axis=-1)).max())
+
+
+def _chosen(found, bands):
+    """Those of the bands asked for, in their order."""
+    if bands is None:
+        return list(found)
+    there = {one.band: one for one in found}
+    bands = [bands] if isinstance(bands, str) else list(bands)
+    for band in bands:
+        if band not in there:
+            raise ValueError(f"bands has {band!r}, there are {', '.join(there)}")
+    return [there[band] for band in bands]
+
+
+def _one_for_each(what, value, found):
+    """A list with one value for each band, or None."""
+    if value is None:
+        return None
+    values = list(value) if isinstance(value, list | tuple | np.ndarray) else [value]
+    if len(values) != len(found):
+        raise ValueError(f"{what} has {len(values)} values for {len(found)} bands")
+    return values
+
+
+def _zero_points(found, given):
+    if given.zero_point is not None:
+        one = np.ndim(given.zero_point) == 0
+        points = [given.zero_point] * len(found) if one else given.zero_point
+        return [float(p) for p in _one_for_each("zero_point", list(points), found)]
+    for one in found:
+        if one.zero_point is None:
+            raise ValueError(
+                f"zero_point of band {one.band} is missing, {one.missing_zero_point}: "
+                f"give zero_point ({one.data.path.name})"
+            )
+    return [one.zero_point for one in found]
+
+
+def _psf(found, given, grid):
+    """The PSFField given, else that of the bands."""
+    psf: Callable | object = given.psf
+    if callable(psf) and not isinstance(psf, PSF | PSFField):
+        psf = psf(grid)
+    if psf is not None and not isinstance(psf, list | tuple):
+        return psf if isinstance(psf, PSFField) else ConstantPSF(psf)
+    for one in found if psf is None else ():
+        if one.psf is None:
+            raise ValueError(
+                f"psf of band {one.band} is missing, {one.missing_psf}: "
+                f"give psf ({one.data.path.name})"
+            )
+    fields = [one.psf for one in found] if psf is None else _one_for_each("psf", psf, found)
+    fields = [one if isinstance(one, PSFField) else ConstantPSF(one) for one in fields]
+    return fields[0] if len(fields) == 1 else BandPSFs(fields)
+
+
+def _tell_of_masks(mosaic, given):
+    """A note where the mask takes much of the mosaic's middle and its bits were not chosen."""
+    if given.mask_bits is not None:
+        return
+    box = sample_box(mosaic.grid)
+    for channel in mosaic.channels:
+        if channel.mask is None:
+            continue
+        share = float(channel.masked(box).mean())
+        if share > MANY_MASKED:
+            given.notes.append(
+                f"{mosaic.name}: {share:.0%} of the pixels in the middle of channel "
+                f"{channel.name} are masked; mask_bits says which bits count"
+            )

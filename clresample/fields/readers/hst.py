@@ -1,0 +1,121 @@
+"""Drizzled images of the Hubble Space Telescope: HST's own products, or mosaics of a survey.
+
+One file a band:
+
+    *_drz.fits, *_drc.fits    HDUs SCI, WHT and CTX
+    *_sci.fits                the first image, and *_wht.fits beside it (*_sci_* and *_wht_* too)
+    *_flt.fits, *_flc.fits    HDUs SCI, ERR and DQ of one chip
+
+SCI or the primary header has the WCS, BUNIT, PHOTFLAM and PHOTPLAM (AB zero point of one count a
+second; counts of the whole exposure are told by a BUNIT without "/S", and EXPTIME) and FILTER, or
+FILTER1 and FILTER2. An ERR is the pixels' standard deviation. A WHT may be exposure time or
+inverse variance, in whatever scale: it is taken as proportional to the inverse variance, and the
+factor is that with which the blank sky in the mosaic's middle has unit scatter. Drizzling
+correlates the noise of neighbouring pixels: its correlation is estimated unless noise = "white".
+DQ: any bit means ignore, unless mask_bits are given.
+
+Source: the DrizzlePac Handbook, and the ACS and WFC3 data handbooks (STScI).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ...files.fits import open_fits
+from ...files.whole_file import FileError
+from ...sky.noise import noise_sigma
+from ..mosaic import Channel, Mosaic
+from ..reading.estimates import sample_box
+from ..reading.headers import mask_value, zero_point
+from .found import Found, Given, assembled, image_plane, paths_of, placed
+from .planes import Scaled
+
+CLEAR = "CLEAR", "N/A", "NONE", ""  # what filter wheels hold where they hold no filter
+
+
+def read_hst(path, **given) -> Mosaic:
+    """The Mosaic of drizzled images of HST.
+
+    path: one file, or a list with one for each band on the same pixels
+    given: see `Given`; bands are named by the filters, such as "F814W". The files hold no PSF
+
+    Raises ValueError, one line, for what is missing; FileError for what cannot be read.
+    """
+    known = Given(**given)
+    found = [_band(file, known) for file in paths_of(path)]
+    drizzled = all(one.kind == "weight" for one in found)
+    return assembled("HST", found, known, noise="estimate" if drizzled else "white")
+
+
+def _band(path, given):
+    """What is found in the file of one band."""
+    with open_fits(path) as hdus:
+        names = [hdu.name for hdu in hdus]
+    data, _, header, grid = image_plane(path, "SCI" if "SCI" in names else None)
+    grid = placed(path, grid)
+    band, files, mask, value = _filter(header, path), {"image": path}, None, None
+    if "ERR" in names:
+        weight, kind = image_plane(path, "ERR")[0], "rms"
+    else:
+        weight, kind = _weight(path, names, data, grid, band, files, given), "weight"
+    if "DQ" in names:
+        mask, _, flags, _ = image_plane(path, "DQ")
+        value = None if given.mask_bits is None else mask_value(flags, given.mask_bits)
+    point = zero_point(header, grid.pixel_scale_arcsec)
+    unit = str(header.get("BUNIT", "")).upper().replace(" ", "")
+    if point is not None and unit in ("ELECTRONS", "COUNTS", "DN", "ELECTRON"):
+        if not header.get("EXPTIME"):
+            raise ValueError(f"EXPTIME of {path.name} is missing, BUNIT is {unit}: give zero_point")
+        point += 2.5 * math.log10(float(header["EXPTIME"]))
+    return Found(
+        band,
+        grid,
+        data,
+        weight,
+        kind,
+        mask,
+        value,
+        point,
+        missing_zero_point="the header has no PHOTFLAM and PHOTPLAM",
+        missing_psf="files of HST hold none",
+        files=files,
+    )
+
+
+def _weight(path, names, data, grid, band, files, given):
+    """The plane of WHT, times what makes it inverse variances."""
+    if "WHT" in names:
+        plane = image_plane(path, "WHT")[0]
+    else:
+        beside = path.with_name("wht".join(path.name.rsplit("sci", 1)))
+        if "sci" not in path.name or not beside.exists():
+            raise ValueError(
+                f"weight of band {band} is missing: {path.name} has no HDU ERR or WHT, and no file "
+                "of weights (wht for sci in its name) lies beside it"
+            )
+        plane, shape, *_ = image_plane(beside)
+        if shape != grid.shape:
+            raise FileError(f"{beside}: has {shape} pixels, {path.name} {grid.shape}")
+        files["weight"] = beside
+    box = sample_box(grid)
+    pixels = Channel(band, data, plane)
+    weights = pixels.weights(box)
+    try:
+        sigma = noise_sigma(pixels.read(box) * np.sqrt(weights), weights == 0)
+    except ValueError as error:
+        raise FileError(f"{path}: scale of WHT: {error}") from error
+    given.notes.append(
+        f"{band}: WHT times {sigma**-2:.4g} taken as inverse variance, by the scatter of blank sky"
+    )
+    return Scaled(plane, sigma**-2)
+
+
+def _filter(header, path):
+    """The filter's name, by FILTER or the one of FILTER1 and FILTER2 that is no clear glass."""
+    for key in ("FILTER", "FILTER1", "FILTER2", "FILTNAM1"):
+        name = str(header.get(key, "")).strip()
+        if name.upper() not in CLEAR and not name.upper().startswith("CLEAR"):
+            return name
+    return path.name.split(".")[0]

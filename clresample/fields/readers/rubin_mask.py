@@ -1,0 +1,42 @@
+"""Masks of Rubin's and HSC's images: planes with names, in one HDU or several."""
+
+from __future__ import annotations
+
+from ...files.fits import open_fits
+from ..mosaic import FilePlane
+from ..reading.headers import bit_names, mask_value
+from .planes import AnyFlag
+
+# What a fit must not see: nothing was measured there, or not what fell on the pixel. Pixels that
+# were interpolated (INTRP, CR) hold a value of which the PSF knows; in coadds they are replaced by
+# other exposures.
+UNUSABLE = "NO_DATA", "BAD", "SAT", "SATURATED", "SUSPECT", "UNMASKEDNAN"
+
+
+def rubin_mask(path, bits, band, notes):
+    """The plane of pixels to ignore, by the HDUs MASK of a file; None where there are none.
+
+    bits: by name or number (of a file with one HDU of masks), None = those of UNUSABLE that the
+        header names
+    """
+    parts, planes = [], {}
+    with open_fits(path) as hdus:
+        for number, hdu in enumerate(hdus):
+            if hdu.name == "MASK" and hdu.is_image:
+                parts.append((FilePlane(path, number), bit_names(hdu.header)))
+        for _, names in parts:
+            planes |= names
+    if not parts:
+        notes.append(f"{band}: no HDU MASK in {path.name}: no pixel is masked")
+        return None
+    asked = [bits] if isinstance(bits, str | int) else bits
+    if asked is None:
+        asked = [name for name in UNUSABLE if name in planes]
+    elif len(parts) > 1 and any(isinstance(bit, int) for bit in asked):
+        raise ValueError(f"mask_bits has numbers, {path.name} has {len(parts)} masks: give names")
+    mask_value({}, [bit for bit in asked if isinstance(bit, str)], planes)  # names that none has
+    masks = []
+    for plane, names in parts:
+        own = [bit for bit in asked if isinstance(bit, int) or bit in names]
+        masks.append((plane, mask_value({}, own, names)))
+    return AnyFlag(tuple(masks))
