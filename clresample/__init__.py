@@ -57,6 +57,7 @@ _ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
         "mosaic": ("Mosaic",),
         "options": ("FieldOptions",),
         "run": ("run_field",),
+        "report.write": ("write_report",),
     },
     # scenes with their truth
     "simulation": {
@@ -90,6 +91,7 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from .device.discovery import DeviceError as DeviceError, list_devices as list_devices
     from .fields.mosaic import Mosaic as Mosaic
     from .fields.options import FieldOptions as FieldOptions
+    from .fields.report.write import write_report as write_report
     from .fields.run import run_field as run_field
     from .files.results import (
         read_result as read_result,
