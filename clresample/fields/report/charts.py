@@ -13,6 +13,7 @@ from .svg import SQUARE, Chart, Scale
 BIN_MAG = 0.5
 MOST_CHANNELS = 12  # with a chart of their own
 UJY_MAG = 23.9  # AB magnitude of one microjansky
+CLEAR = 5.0  # [errors] a flux that is surely there: a dotted line
 PULL_RANGE, PULL_BIN = 5.0, 0.5  # [errors]
 # bins of the true signal to noise, in equal steps of its logarithm
 SNR_EDGES = 10 ** np.arange(0.5, 3.01, 0.25)
@@ -81,10 +82,10 @@ def signal_to_noise(run):
         shown = "µJy" if unit == "uJy" else unit
         chart = Chart(
             Scale.over(flux[good], f"flux in {channel} [{shown}]", log=True),
-            Scale.over(ratio[good], "flux / its error", log=True),
+            Scale.over([*ratio[good], CLEAR], "flux / its error", log=True),
             f"Signal to noise against flux in {channel}, {good.sum()} sources",
         )
-        chart.path([chart.x.low, chart.x.high], [5, 5], "mark")
+        chart.path([chart.x.low, chart.x.high], [CLEAR, CLEAR], "mark")
         chart.points(flux[good], ratio[good])
         found.append((channel, chart.svg))
     return found

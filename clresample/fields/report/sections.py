@@ -153,7 +153,7 @@ def ramp_of_residuals():
 
 def _ramp(palette):
     return "".join(
-        f'<rect x="{i}" width="1.05" height="1" stroke="none" fill="rgb({r},{g},{b})"/>'
+        f'<rect x="{i}" width="1" height="1" fill="rgb({r},{g},{b})"/>'
         for i, (r, g, b) in enumerate(palette[1:].tolist())
     )
 
@@ -187,7 +187,8 @@ def truth_section(run, truth) -> str:
     n = int((truth.rows >= 0).sum())
     told = (
         f"{n} of {len(truth.rows)} true sources have a row within {FOUND_PX:g} model pixels; pulls "
-        "of correct errors scatter like the dashed normal distribution, median 0 and width 1."
+        "of correct errors scatter like the dashed normal distribution, median 0 and width 1. The "
+        "outermost bins hold all that is farther out."
     )
     figures = [
         (channel, svg, f"median {number(m, '.2f')}, width {number(w, '.2f')}, n = {k}")

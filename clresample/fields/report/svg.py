@@ -8,8 +8,8 @@ from html import escape
 
 import numpy as np
 
-WIDTH, HEIGHT = 340, 236  # [units of the drawing] the page scales it
-LEFT, RIGHT, TOP, BOTTOM = 52, 10, 10, 42  # for the labels
+WIDTH, HEIGHT = 284, 208  # [units of the drawing] the page scales it
+LEFT, RIGHT, TOP, BOTTOM = 50, 8, 10, 40  # for the labels
 SQUARE = WIDTH - LEFT - RIGHT + TOP + BOTTOM  # height at which both axes are as long
 # More points than this are shown as shaded cells: as single points they would be one blot.
 MOST_POINTS = 1200
