@@ -63,6 +63,7 @@ _ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
         "readers.legacy": ("read_legacy_survey",),
         "readers.rubin_coadd": ("read_rubin_coadd",),
         "readers.rubin_exposure": ("read_rubin_exposure",),
+        "report.write": ("write_report",),
     },
     # scenes with their truth
     "simulation": {
@@ -102,6 +103,7 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from .fields.readers.legacy import read_legacy_survey as read_legacy_survey
     from .fields.readers.rubin_coadd import read_rubin_coadd as read_rubin_coadd
     from .fields.readers.rubin_exposure import read_rubin_exposure as read_rubin_exposure
+    from .fields.report.write import write_report as write_report
     from .fields.run import run_field as run_field
     from .files.results import (
         read_result as read_result,

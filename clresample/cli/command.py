@@ -23,6 +23,7 @@ from ..device.remembered import DeviceWarning
 from .deblend import add_deblend
 from .devices import add_devices
 from .field import add_field
+from .fields.report import add_report
 from .machine.tune import add_tune
 from .options import note, printable
 from .resample import add_resample
@@ -110,4 +111,12 @@ def _ended_as_interrupted():
         signal.signal(signal.SIGTERM, signal.SIG_DFL if former is None else former)
 
 
-COMMANDS = (add_resample, add_deblend, add_field, add_simulate, add_devices, add_tune)
+COMMANDS = (
+    add_resample,
+    add_deblend,
+    add_field,
+    add_report,
+    add_simulate,
+    add_devices,
+    add_tune,
+)

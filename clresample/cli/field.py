@@ -6,7 +6,7 @@ import argparse
 import time
 from dataclasses import replace
 
-from .options import add_device_option, note, positive, say, size, whole
+from .options import add_device_option, note, positive, size, whole
 
 DESCRIPTION = """\
 Find, fit and measure every source of a field: mosaics of any size, of several
@@ -28,7 +28,8 @@ exit     0 all is done   1 done, but tiles are lost or fits set aside, each with
          reason   2 nothing could be done   130 interrupted: --resume goes on
 
 example  clresample simulate field -o sky
-         clresample field sky/field.toml -o sky/out"""
+         clresample field sky/field.toml -o sky/out
+         clresample report sky/out"""
 
 # the largest group of fits that is asked for by default, as a part of the memory that is free
 MEMORY_PART = 8
@@ -102,6 +103,7 @@ def run(arguments):
     from ..fields.options import LEAST_MEMORY, MEMORY
     from ..fields.reading.field_file import read_field
     from ..fields.run import free_memory, run_field
+    from .fields.progress import Live
 
     started = time.perf_counter()
     field = read_field(arguments.field)
@@ -118,7 +120,7 @@ def run(arguments):
         hats=arguments.hats,
         memory=arguments.memory or max(memory, LEAST_MEMORY),
     )
-    progress = _progress(arguments)
+    progress = Live(arguments)
     try:
         done = run_field(
             field.mosaics,
@@ -134,45 +136,6 @@ def run(arguments):
     finally:
         progress.close()
     return _report(arguments, done, time.perf_counter() - started)
-
-
-def _progress(arguments):
-    """A bar on a terminal: blends done, sources a second, time left."""
-    from tqdm import tqdm
-
-    from ..fields.options import Progress
-
-    class Bar(Progress):
-        def __init__(self):
-            self.bar = None
-
-        def stage(self, name, total):
-            self.close()
-            self.sources, self.began = 0, time.perf_counter()
-            self.bar = tqdm(
-                total=total,
-                desc=name,
-                unit="tile" if name == "search" else "blend",
-                leave=False,
-                disable=True if arguments.quiet else None,
-            )
-
-        def step(self, n, sources=0):
-            self.sources += sources
-            seconds = time.perf_counter() - self.began
-            self.bar.set_postfix_str(f"{self.sources / seconds:.1f} sources/s", refresh=False)
-            self.bar.update(n)
-
-        def say(self, text):
-            if not arguments.quiet:
-                tqdm.write("", end="")
-                say(arguments, text)
-
-        def close(self):
-            if self.bar is not None:
-                self.bar.close()
-
-    return Bar()
 
 
 def _report(arguments, done, took):

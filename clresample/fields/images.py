@@ -37,14 +37,18 @@ def write_mosaics(folder, job, parts, last):
         header = mosaic.grid.cutout(*here[:2], here.shape).to_wcs().to_header(relax=True)
         for i, channel in enumerate(mosaic.channels):
             header[f"BAND{i + 1}"] = channel.name
-        name = "".join(c if c.isalnum() or c in "-_" else "_" for c in mosaic.name)
         for what, left in (("model", False), ("residual", True)):
-            path = folder / f"{what}_{name}.fits"
+            path = folder / f"{what}_{file_name(mosaic.name)}.fits"
             _write_cube(path, header, mosaic, here, model, left)
             paths.append(path)
         del model
         scratch.unlink()
     return paths
+
+
+def file_name(name) -> str:
+    """A mosaic's name as a part of a file's: letters, digits, - and _ stay."""
+    return "".join(c if c.isalnum() or c in "-_" else "_" for c in name)
 
 
 def _write_cube(path, header, mosaic, here, model, residual):

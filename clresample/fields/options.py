@@ -70,7 +70,7 @@ class Progress:
     """What a run tells while it goes: override what is wanted.
 
     stage(name, total): a stage begins, of so many tiles or blends; step(n, sources): n of them are
-    done; say(text): what the user should know
+    done; say(text): what the user should know; dashboard(address): where workers can be watched
     """
 
     def stage(self, name, total):
@@ -81,3 +81,6 @@ class Progress:
 
     def say(self, text):
         """What the user should know, a line."""
+
+    def dashboard(self, address):
+        """The address of a page that shows what the workers do; told once, where there is one."""

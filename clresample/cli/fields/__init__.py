@@ -1,0 +1,1 @@
+"""What `clresample field` tells while it runs, and `clresample report` afterwards."""

@@ -1,0 +1,191 @@
+"""What the page's script reads: the frame, tiles, sources, and single sources in detail."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...measurement.catalogue import MEANINGS, Flag
+from ...sky.wcs import local_axes
+from .charts import fluxes, magnitudes
+from .html import EMPTY, number
+from .pyramid import LAYERS
+from .stamps import plain, positions, stamps_of
+
+OK, FLAGGED, FAILED = 0, 1, 2  # states of a source, as the script counts them
+MOST_SOURCES = 200_000  # on the field; of more, those of the highest signal to noise
+MOST_DETAILS = 5000  # sources with their measurements in the page
+FLUX_COLUMNS = "Channel", "Flux", "Error", "S/N", "Mag", "Residual"
+
+
+def order_of(run) -> np.ndarray:
+    """Rows of the catalogue, the highest signal to noise first, those without one last."""
+    if "snr" not in run.sources.colnames:
+        return np.arange(len(run.sources))
+    snr = plain(run.sources["snr"])
+    return np.argsort(np.where(np.isfinite(snr), -snr, np.inf), kind="stable")
+
+
+def states(run) -> np.ndarray:
+    """(S,) OK, FLAGGED or FAILED."""
+    found = np.zeros(len(run.sources), int)
+    if "flags" in run.sources.colnames:
+        found[np.nan_to_num(plain(run.sources["flags"])) != 0] = FLAGGED
+    if "status" in run.sources.colnames:
+        status = np.array([str(s) for s in run.sources["status"]], dtype=object)
+        found[np.array([s.startswith("failed") for s in status], bool)] = FAILED
+    return found
+
+
+def flag_names(value) -> str:
+    """Names of the flags in a sum, those without a name by their numbers."""
+    value = int(value)
+    names = [flag.name for flag in MEANINGS if value & flag]
+    rest = value & ~int(sum(MEANINGS))
+    return ", ".join([*map(str, names), *([str(rest)] if rest else [])]) or "none"
+
+
+def data_of(run, pyramids, budget, notes) -> dict:
+    """All that the script reads.
+
+    budget [bytes]: of the sources' pictures; notes: a list that gets what is missing
+    """
+    frame = run.instruments[0].grid if run.instruments else None
+    order = order_of(run)
+    if len(order) > MOST_SOURCES:
+        notes.append(
+            f"the field shows {MOST_SOURCES} sources of {len(order)}, those of the highest signal "
+            "to noise"
+        )
+        order = order[:MOST_SOURCES]
+    state, at = states(run)[order], positions(run)[order]
+    known = "snr" in run.sources.colnames
+    snr = plain(run.sources["snr"])[order] if known else np.full(len(order), np.nan)
+    # failed ones first, then those whose models misfit: what one wants to see
+    misfit = np.zeros(len(order), bool)
+    if "flags" in run.sources.colnames:
+        misfit = (np.nan_to_num(plain(run.sources["flags"]))[order].astype(int) & Flag.MISFIT) > 0
+    first = np.lexsort((np.arange(len(order)), ~misfit, state != FAILED))
+    stamps = {}
+    if frame is not None:
+        stamps = stamps_of(run, frame, order[first], budget, notes)
+    ids = _texts(run, "id", order)
+    return {
+        "frame": _frame(run, frame, at),
+        "instruments": [_instrument(pyramid) for pyramid in pyramids],
+        "sources": {
+            "id": ids,
+            "parent": _texts(run, "parent_id", order),
+            "x": [_short(v, 2) for v in at[:, 1]],
+            "y": [_short(v, 2) for v in at[:, 0]],
+            "state": state.tolist(),
+            "snr": [_short(v, 1) for v in snr],
+        },
+        "flux_columns": FLUX_COLUMNS,
+        "details": _details(run, order, first[:MOST_DETAILS], stamps),
+    }
+
+
+def _texts(run, name, order):
+    """A column of whole numbers as texts: scripts' numbers hold 53 bits."""
+    if name not in run.sources.colnames:
+        return []
+    return [str(int(v)) for v in np.asarray(run.sources[name])[order]]
+
+
+def _short(value, digits):
+    return round(float(value), digits) if np.isfinite(value) else None
+
+
+def _frame(run, frame, at):
+    """The pixels in which all is shown: the first instrument's, or those of the sources."""
+    offset = run.offset.tolist()
+    if frame is None:
+        good = at[np.isfinite(at).all(axis=1)]
+        shape = np.ceil(good.max(axis=0)) + 20 if len(good) else [100, 100]
+        return {"shape": [int(n) for n in shape], "scale": 1.0, "offset": offset, "sky": None}
+    middle = (np.array(frame.shape) - 1) / 2
+    flat = "y_sky" in run.sources.colnames
+    ra, dec = frame.sky(*middle)
+    names = ("RA", "Dec") if "ra" in run.sources.colnames else ("longitude", "latitude")
+    sky = {
+        "x": middle[1],
+        "y": middle[0],
+        "ra": float(ra),
+        "dec": float(dec),
+        "m": local_axes(frame, middle).tolist(),
+        "names": names,
+    }
+    return {
+        "shape": list(frame.shape),
+        "scale": float(frame.pixel_scale_arcsec),
+        "offset": offset,
+        "sky": None if flat else sky,
+    }
+
+
+def _instrument(pyramid):
+    names = [pyramid.instrument.channels[c] for c in pyramid.stretch.chosen]
+    how = f"{', '.join(names)} as blue, green, red" if len(names) == 3 else names[0]
+    return {
+        "name": pyramid.instrument.name,
+        "channels": pyramid.instrument.channels,
+        "colours": f"{how}, logarithmic above the noise",
+        "levels": pyramid.levels,
+        "layers": LAYERS,
+    }
+
+
+def _details(run, order, chosen, stamps):
+    """{place in `order`: facts, fluxes and pictures} of some sources."""
+    found, table = {}, run.sources
+    measured = list(fluxes(run))
+    for k in chosen.tolist():
+        row = int(order[k])
+        found[k] = {
+            "facts": _facts(table, row),
+            "fluxes": [
+                [
+                    channel,
+                    number(flux[row]),
+                    number(error[row], ".2g"),
+                    number(flux[row] / error[row] if error[row] > 0 else np.nan, ".3g"),
+                    number(magnitudes(flux[row], unit), ".2f"),
+                    number(_value(table, f"residual_{channel}", row), ".1f"),
+                ]
+                for channel, flux, error, unit in measured
+            ],
+        }
+        if row in stamps:
+            found[k]["stamps"] = stamps[row]
+    return found
+
+
+def _value(table, name, row):
+    return float(plain(table[name][row : row + 1])[0]) if name in table.colnames else np.nan
+
+
+def _facts(table, row):
+    """[what, text] of a source, for its panel."""
+    texts = [["Fit", f"{table['status'][row]}"]] if "status" in table.colnames else []
+    if "reason" in table.colnames and str(table["reason"][row]):
+        texts.append(["Reason", str(table["reason"][row])])
+    if "flags" in table.colnames:
+        texts.append(["Flags", flag_names(np.nan_to_num(_value(table, "flags", row)))])
+    for names, title, form in (
+        (("ra", "dec"), "RA, Dec [deg]", ".6f"),
+        (("y_sky", "x_sky"), "y, x [arcsec]", ".3f"),
+        (("y", "x"), "y, x [model px]", ".2f"),
+        (("snr",), "S/N, all channels", ".4g"),
+        (("size", "size_err"), "Size, error [arcsec]", ".3f"),
+        (("e1", "e2"), "e1, e2", ".3f"),
+        (("n_components",), "Components", ".0f"),
+        (("n_blend",), "Sources in its blend", ".0f"),
+        (("pass",), "Found in pass", ".0f"),
+    ):
+        if set(names) <= set(table.colnames):
+            texts.append([title, ", ".join(number(_value(table, n, row), form) for n in names)])
+    for name in table.colnames:
+        if name.startswith("chi2_"):
+            text = number(_value(table, name, row), ".2f")
+            texts.append([f"χ² per pixel, {name.removeprefix('chi2_')}", text])
+    return [[what, value or EMPTY] for what, value in texts]

@@ -1,0 +1,165 @@
+"""An instrument's images as tiles at several scales: what a page holds of a mosaic of any size."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..box import Box
+from .instrument import Instrument
+from .png import png
+from .shades import Stretch, residual_numbers, residual_palette, stretch_of
+
+TILE_PX = 256  # side of a tile: smaller ones are more to list, larger ones more to decode at once
+LAYERS = "data", "model", "residual"
+# [bytes] that a pixel of the three layers takes together, as base64: of noisy images of one channel
+# and of three. Where a finest level starts from; what it really takes decides.
+PIXEL_BYTES = {1: 1.3, 3: 2.6}
+CELLS = 96  # of the map of chi2 along the longer side, at most
+LEAST_CELL_PX = 8  # smaller cells scatter by over 20 % in one channel from the noise alone
+# [sigma^2] A pixel counts no more: one cosmic ray or star's core does not hide what a cell says.
+MOST_CHI2 = 36.0
+
+
+@dataclass(frozen=True, eq=False)
+class Pyramid:
+    """Tiles of one instrument.
+
+    instrument; stretch: of its light; finest: level of the finest tiles, 0 = the mosaic's pixels,
+        each level above has pixels twice as large
+    levels: dicts as the page reads them, the finest first
+    n_bytes: of all tiles
+    chi2 (My, Mx): mean of (residual / sigma)^2 in cells, NaN where there is no sky; cell_px
+    """
+
+    instrument: Instrument
+    stretch: Stretch
+    finest: int
+    levels: list
+    n_bytes: int
+    chi2: np.ndarray
+    cell_px: int
+
+
+def pyramid_of(instrument, frame, budget) -> Pyramid:
+    """Tiles of an instrument within a number of bytes: the finest levels are left out until they
+    fit; the coarsest, of one tile, always stays.
+
+    frame: Grid in whose pixels the page shows everything
+    """
+    shape = instrument.grid.shape
+    stretch = stretch_of(instrument.sample, instrument.sigma)
+    coarsest = max(0, int(np.ceil(np.log2(max(shape) / TILE_PX))))
+    area = 4 / 3 * shape[0] * shape[1] * PIXEL_BYTES[len(stretch.chosen)]
+    finest = int(np.clip(np.ceil(np.log2(max(area / max(budget, 1), 1)) / 2), 0, coarsest))
+    planes, chi2, cell = _read(instrument, stretch, finest)
+    levels = []
+    for level in range(finest, coarsest + 1):
+        if level > finest:
+            planes = [_halved(plane) for plane in planes]
+        levels.append(_tiles(planes, level, stretch, instrument.grid, frame))
+    sizes = [_size(level) for level in levels]
+    while len(levels) > 1 and sum(sizes) > budget:
+        levels, sizes, finest = levels[1:], sizes[1:], finest + 1
+    return Pyramid(instrument, stretch, finest, levels, sum(sizes), chi2, cell)
+
+
+def _read(instrument, stretch, level):
+    """[data (K, ny, nx), model (K, ny, nx), residual (1, ny, nx)] of a level, map of chi2, its
+    cells' side. The residual is the mean of all channels' in units of sigma, times their root."""
+    n_y, n_x = instrument.grid.shape
+    step, chosen = 2**level, list(stretch.chosen)
+    cell = LEAST_CELL_PX
+    while max(n_y, n_x) > CELLS * cell:
+        cell *= 2
+    rows = max(step, cell, TILE_PX)  # of a strip: a multiple of both, all being powers of 2
+    sigma = instrument.sigma[:, None, None]
+    strips, cells = [], []
+    with instrument.opened() as read:
+        for y0 in range(0, n_y, rows):
+            model, left = read(Box(y0, 0, min(y0 + rows, n_y), n_x))
+            left = np.where(instrument.dead(left), np.nan, left)
+            sigmas = left / sigma
+            part = [(model + left)[chosen], np.where(np.isfinite(left), model, np.nan)[chosen]]
+            part.append(sigmas.mean(axis=0, keepdims=True) * len(sigmas) ** 0.5)
+            strips.append([_averaged(plane, step) for plane in part])
+            squares = np.minimum(sigmas**2, MOST_CHI2).mean(axis=0, keepdims=True)
+            cells.append(_averaged(squares, cell)[0])
+    planes = [np.concatenate(few, axis=1) for few in zip(*strips, strict=True)]
+    return planes, np.concatenate(cells), cell
+
+
+def _averaged(planes, step):
+    """Means (C, ny, nx) of blocks of step x step pixels that are not NaN; NaN where all are."""
+    if step == 1:
+        return np.asarray(planes, np.float32)
+    good = np.isfinite(planes)
+    sums, counts = np.where(good, planes, 0).astype(np.float64), good.astype(np.float64)
+    for axis in (1, 2):
+        starts = np.arange(0, planes.shape[axis], step)
+        sums, counts = (np.add.reduceat(a, starts, axis=axis) for a in (sums, counts))
+    means = np.divide(sums, counts, out=np.full(sums.shape, np.nan), where=counts > 0)
+    return means.astype(np.float32)
+
+
+def _halved(planes):
+    return _averaged(planes, 2)
+
+
+def _tiles(planes, level, stretch, grid, frame):
+    """A level as the page reads it: {"scale", "places", and of each layer its tiles}.
+
+    Tiles are base64 of PNG; places are six numbers each that take a tile's pixels (column, row),
+    counted from its first corner, to (x, y) of the frame.
+    """
+    data, model, residual = planes
+    # of a mean of 4^level pixels the noise is smaller
+    shown = {
+        "data": stretch.shown(data),
+        "model": stretch.shown(model, noisy=False),
+        "residual": residual_numbers(residual[0] * 2.0**level),
+    }
+    found = {"scale": 2**level, "places": []} | {layer: [] for layer in LAYERS}
+    n_y, n_x = data.shape[1:]
+    for y0 in range(0, n_y, TILE_PX):
+        for x0 in range(0, n_x, TILE_PX):
+            here = np.s_[y0 : y0 + TILE_PX, x0 : x0 + TILE_PX]
+            images = {layer: image[here] for layer, image in shown.items()}
+            sides = images["data"].shape[:2]
+            place = placed(grid, frame, (y0, x0), sides, 2**level)
+            if place is None:
+                continue
+            found["places"].append([sides[1], sides[0], *place])
+            for layer, image in images.items():
+                palette = residual_palette() if layer == "residual" else None
+                found[layer].append(as_text(png(image, palette, smooth=layer == "model")))
+    return found
+
+
+def placed(grid, frame, corner, shape, scale):
+    """Six numbers that take (column, row) in a piece of an image to (x, y) of the frame's pixels.
+
+    grid: Grid of the image; corner (2,), shape (2,): first pixel (y, x) and size of the piece, in
+    pixels `scale` times as large as the grid's. (x, y) = (a u + c v + e, b u + d v + f) for the
+    column u and row v, 0 at the piece's outer corner; None where it has no place in the frame.
+    """
+    v, u = np.meshgrid(*(np.linspace(0, n, 3) for n in shape), indexing="ij")
+    rows, columns = ((c + w) * scale - 0.5 for c, w in zip(corner, (v, u), strict=True))
+    at = grid.positions_in(frame, rows, columns).reshape(-1, 2)
+    good = np.isfinite(at).all(axis=1)
+    if good.sum() < 4:
+        return None
+    design = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1)[good]
+    (ay, by, cy), (ax, bx, cx) = np.linalg.lstsq(design, at[good], rcond=None)[0].T
+    return [float(f"{value:.7g}") for value in (ax, ay, bx, by, cx, cy)]
+
+
+def as_text(data) -> str:
+    """Bytes as base64."""
+    return base64.b64encode(data).decode("ascii")
+
+
+def _size(level):
+    return sum(len(tile) for layer in LAYERS for tile in level[layer])

@@ -1,0 +1,113 @@
+"""A catalogue beside the truth of a simulated field: which source is which, and how far off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from astropy.table import QTable
+from scipy.spatial import cKDTree
+
+from ...files.whole_file import FileError
+from .folder import read_table
+from .stamps import plain
+
+# [px] A row is a true source's own when it lies as near; further off it is another one in most
+# fields, nearer the noise of faint sources' positions would lose them.
+FOUND_PX = 4.0
+EDGE_PX = 8.0  # true sources nearer to the field's edge are not counted: part of their light is out
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """True sources (T) beside the catalogue's rows (S).
+
+    path; table: columns flux_CHANNEL [uJy], snr where it is given
+    rows (T,): the catalogue's row that is its own, -1 for none
+    inner (T,) bool: well on the field, so that it could be found
+    """
+
+    path: Path
+    table: QTable
+    rows: np.ndarray
+    inner: np.ndarray
+
+    def pulls(self, run, channel):
+        """(flux - truth) / error of the sources found in a channel; empty where it has none."""
+        names = f"flux_{channel}", f"flux_err_{channel}"
+        if names[0] not in self.table.colnames or not set(names) <= set(run.sources.colnames):
+            return np.zeros(0)
+        if str(run.sources[names[0]].unit) != "uJy":
+            return np.zeros(0)
+        found = self.rows >= 0
+        flux, error = (plain(run.sources[name])[self.rows[found]] for name in names)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pulls = (flux - plain(self.table[names[0]])[found]) / error
+        return pulls[np.isfinite(pulls)]
+
+
+def truth_of(run, path, notes) -> Truth | None:
+    """The truth at a path, or that which lies in the run's folder or beside its inputs.
+
+    path: None = look for truth.ecsv; None is returned where there is none
+
+    Raises FileError where `path` is given and is no truth; of one that was found, a note tells.
+    """
+    places = [Path(path)] if path is not None else _places(run)
+    for place in places:
+        try:
+            if path is None and not place.is_file():
+                continue
+            return _read(run, place)
+        except FileError as error:
+            if path is not None:
+                raise
+            notes.append(str(error))
+    return None
+
+
+def _places(run):
+    """Where `clresample simulate field` leaves the truth: beside the files that were read."""
+    inputs = run.provenance.get("inputs") or run.settings.get("inputs") or {}
+    files = [v.get("file", "") if isinstance(v, dict) else k for k, v in inputs.items()]
+    folders = [run.folder, run.folder.absolute().parent, *(Path(str(f)).parent for f in files)]
+    return list(dict.fromkeys(folder / "truth.ecsv" for folder in folders))
+
+
+def _read(run, path):
+    table = read_table(path)
+    names = set(table.colnames)
+    if not {"y", "x"} <= names or not any(name.startswith("flux_") for name in names):
+        raise FileError(f"{path}: is no truth of a field: it needs y, x [px] and flux_CHANNEL")
+    true = np.stack([plain(table[c]) for c in ("y", "x")], axis=1)
+    rows = run.sources
+    at = np.stack([plain(rows[c]) for c in ("y", "x")], axis=1) if len(rows) else np.zeros((0, 2))
+    return Truth(Path(path), table, matched(at, true), _inner(run, true))
+
+
+def _inner(run, true):
+    """(T,) bool: on the first instrument's mosaic, away from its edge."""
+    if not run.instruments:
+        return np.ones(len(true), bool)
+    low = run.offset + EDGE_PX
+    high = run.offset + np.array(run.instruments[0].grid.shape) - 1 - EDGE_PX
+    return ((true > low) & (true < high)).all(axis=1)
+
+
+def matched(at, true):
+    """(T,) For each true position (T, 2) the row of `at` (S, 2) that is its own, or -1.
+
+    Pairs within FOUND_PX are taken in the order of their distance, each row and true source once.
+    """
+    found = np.full(len(true), -1)
+    good = np.flatnonzero(np.isfinite(at).all(axis=1))
+    if not len(good) or not len(true):
+        return found
+    pairs = cKDTree(true).sparse_distance_matrix(cKDTree(at[good]), FOUND_PX, output_type="ndarray")
+    taken = np.zeros(len(at), bool)
+    for k in np.lexsort((pairs["j"], pairs["i"], pairs["v"])):
+        t, row = pairs["i"][k], good[pairs["j"][k]]
+        if found[t] < 0 and not taken[row]:
+            found[t], taken[row] = row, True
+    return found

@@ -1,0 +1,221 @@
+"""The report of a run, written: one HTML page that needs nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from ...files.whole_file import FileError, check_folder, check_output, whole_file
+from ...sky.wcs import local_axes
+from ..box import Box
+from . import sections
+from .content import data_of
+from .folder import read_run
+from .html import page
+from .pyramid import pyramid_of
+from .truth import truth_of
+
+NAME = "report.html"
+# [bytes] of a page: browsers open it within a second or two, and mail still takes it. A field of
+# 4096 x 4096 pixels in two instruments fits with all its pixels.
+MOST_BYTES = 46 << 20
+LEAST_BYTES = 500_000  # tables and figures alone take some 200 kB
+# of the page, for pictures of single sources; tiles of the field get the rest that tables leave
+STAMPS_PART, TILES_PART = 0.25, 0.65
+
+FIELD = """<section id="field"><h2>The field</h2>
+<noscript><p class="about">Images need a script, which this browser does not run. All tables and
+figures below are there without it.</p></noscript>
+<div class="live"><div class="tools">
+<fieldset class="choice"><legend>Layer</legend>{layers}</fieldset>
+<fieldset class="choice"><legend>Instrument</legend>{instruments}</fieldset>
+<label class="check"><input type="checkbox" id="marks" checked> Mark sources</label></div>
+<div class="viewer"><div><div class="stage">
+<canvas id="sky" tabindex="0" role="application" aria-label="The field. Arrow keys move, plus and
+minus zoom, 0 shows all, 1 2 3 choose data, model, residual, Enter opens the source nearest to the
+middle."></canvas><div class="over readout" id="readout"></div>{compass}
+<div class="over scale"><span id="scale-text"></span><i id="scale-bar"></i></div>
+<div class="zoom"><button type="button" id="zoom-out" aria-label="Zoom out">−</button>
+<button type="button" id="zoom-in" aria-label="Zoom in">+</button>
+<button type="button" id="zoom-fit">All</button></div></div>
+<p class="legend"><span><svg viewBox="0 0 16 16"><circle cx="8" cy="8" r="6"/></svg>source</span>
+<span><svg viewBox="0 0 16 16"><path d="M2 2h12v12h-12z"/></svg>flagged</span>
+<span><svg viewBox="0 0 16 16"><path d="M2 2l12 12M14 2l-12 12"/></svg>fit failed</span>
+<span id="shown"></span><span id="ramp-residual" hidden>−6 σ<svg class="ramp" viewBox="0 0 41 1"
+preserveAspectRatio="none" role="img" aria-label="colours of residuals">{ramp}</svg>+6 σ</span></p>
+<p class="legend">Drag to move; click into the field, then turn the wheel to zoom; click on a source
+to see it. {reduced}</p></div>
+<div class="panel" id="source" aria-live="polite"><h3>No source chosen</h3><p class="about">Click on
+a source, or on its id in a table: data, model and residual in every channel appear here.</p></div>
+</div></div></section>"""
+
+
+@dataclass(frozen=True)
+class Report:
+    """What was written.
+
+    path: of the page; n_bytes; n_sources: of the catalogue; n_pictures: sources with pictures
+    notes: what is missing in it, a line each
+    """
+
+    path: Path
+    n_bytes: int
+    n_sources: int
+    n_pictures: int
+    notes: tuple[str, ...] = ()
+
+
+def write_report(
+    folder, path=None, *, truth=None, most_bytes=MOST_BYTES, overwrite=False
+) -> Report:
+    """Write the report of a run of `run_field`, finished or not: one HTML page.
+
+    The page holds the field's data, models and residuals as tiles to zoom into, every source of it
+    (of more than 200,000 those of the highest signal to noise), pictures of up to 2000 sources in
+    every channel, number counts, signal to noise, a map of chi2, pulls where the truth is known,
+    the slowest and the failed fits, and what made it. It loads nothing and needs no network.
+
+    folder: of the run, or of one part of a field
+    path: of the page; None = report.html in the folder, which is replaced
+    truth: table of the true sources (y, x [px of the model], flux_CHANNEL [uJy], and snr); None =
+        truth.ecsv in the folder, beside it or beside the run's inputs, if there is one
+    most_bytes: of the page. What does not fit is left out: the finest tiles first, and pictures of
+        sources after those that failed, misfit, or have the highest signal to noise
+    overwrite: replace the file at `path`
+
+    Raises FileError for a folder without a run, a catalogue or `truth` that cannot be read, and
+    where the page cannot be written; ValueError for a limit under 500 kB.
+    """
+    if not most_bytes >= LEAST_BYTES:
+        raise ValueError(f"most_bytes is {most_bytes}, must be {LEAST_BYTES} or more")
+    folder = Path(folder)
+    run = read_run(folder)
+    out = folder / NAME if path is None else Path(path)
+    check_folder(out.absolute().parent)
+    check_output(out, overwrite=overwrite or path is None, inputs=_inputs(folder, truth))
+    notes = list(run.notes)
+    known = truth_of(run, truth, notes)
+    pyramids = _pyramids(run, TILES_PART * most_bytes, notes)
+    data = data_of(run, pyramids, STAMPS_PART * most_bytes, notes)
+    n_pictures = sum("stamps" in one for one in data["details"].values())
+    if pyramids and n_pictures < len(run.sources):
+        notes.append(f"{n_pictures} of {len(run.sources)} sources have pictures in this page")
+    written = page(
+        f"{folder.absolute().name}: field report", _body(run, known, pyramids, notes), data
+    )
+    content = written.encode()
+    with whole_file(out) as part:
+        part.write_bytes(content)
+    return Report(out, len(content), len(run.sources), n_pictures, tuple(notes))
+
+
+def _inputs(folder, truth):
+    """Files that the page must not replace."""
+    return [*folder.glob("*.fits"), *folder.glob("*.ecsv"), *([truth] if truth else [])]
+
+
+def _pyramids(run, budget, notes):
+    """Tiles of all instruments; each gets its share of the bytes by its number of pixels."""
+    found = []
+    pixels = [np.prod(one.grid.shape, dtype=float) for one in run.instruments]
+    for one, n in zip(run.instruments, pixels, strict=True):
+        try:
+            found.append(pyramid_of(one, run.instruments[0].grid, budget * n / sum(pixels)))
+        except FileError as error:
+            notes.append(f"no images of {one.name}: {error}")
+    return found
+
+
+def area_of(run) -> float | None:
+    """[arcmin^2] of the sky that the first instrument has data of; None without images.
+
+    Found on every 16th row and column.
+    """
+    if not run.instruments:
+        return None
+    one = run.instruments[0]
+    n_y, n_x = one.grid.shape
+    seen = total = 0
+    try:
+        with one.opened() as read:
+            for y in range(0, n_y, 16):
+                row = read(Box(y, 0, y + 1, n_x))[1][:, 0, ::16]
+                seen, total = seen + int(np.isfinite(row).any(axis=0).sum()), total + row.shape[1]
+    except FileError:
+        return None
+    return n_y * n_x * one.grid.pixel_scale_arcsec**2 / 3600 * seen / total
+
+
+def _body(run, truth, pyramids, notes):
+    """All that is between the page's head and its script."""
+    area = area_of(run)
+    parts = {
+        "Field": _field(run, pyramids),
+        "Sources": sections.source_table(run),
+        "Counts": sections.photometry(run, truth, area),
+        "χ²": sections.chi2(run, pyramids),
+        "Truth": sections.truth_section(run, truth),
+        "Fits": sections.fits(run),
+        "Origin": sections.origin(run),
+    }
+    anchors = "field", "sources", "counts", "chi2", "truth", "fits", "origin"
+    links = "".join(
+        f'<a href="#{anchor}">{title}</a>'
+        for (title, text), anchor in zip(parts.items(), anchors, strict=True)
+        if text
+    )
+    return (
+        f'<div class="wrap">{sections.heading(run, area)}{sections.notices(run, notes)}</div>'
+        f'<nav class="bar" aria-label="Sections"><div class="wrap">{links}'
+        '<button type="button" id="theme" class="live" aria-label="Change colours">Dark</button>'
+        f'</div></nav><main class="wrap">{"".join(parts.values())}</main>'
+        '<footer class="wrap">Written by clresample report. This page loads nothing.</footer>'
+    )
+
+
+def _field(run, pyramids):
+    """The viewer, which a script fills."""
+    layers = "".join(
+        f'<label><input type="radio" name="layer" value="{layer}"{" checked" if not k else ""}>'
+        f"<span>{layer.capitalize()}</span></label>"
+        for k, layer in enumerate(("data", "model", "residual"))
+    )
+    instruments = "".join(
+        f'<label><input type="radio" name="instrument" value="{k}"{" checked" if not k else ""}>'
+        f"<span>{escape(pyramid.instrument.name)}</span></label>"
+        for k, pyramid in enumerate(pyramids)
+    )
+    coarse = [
+        f"{p.instrument.name} is shown in pixels of {2**p.finest} x {2**p.finest} of its own"
+        for p in pyramids
+        if p.finest
+    ]
+    return FIELD.format(
+        layers=layers,
+        instruments=instruments or "none",
+        compass=_compass(run),
+        ramp=sections.ramp_of_residuals(),
+        reduced=escape("; ".join(coarse) + ("." if coarse else "")),
+    )
+
+
+def _compass(run):
+    """Where north and east are, as arrows."""
+    if not run.instruments:
+        return ""
+    grid = run.instruments[0].grid
+    steps = np.linalg.inv(local_axes(grid, (np.array(grid.shape) - 1) / 2))  # px per arcsec
+    arrows = []
+    for (y, x), name in zip(steps.T, "NE", strict=True):
+        length = np.hypot(x, y)
+        u, v = x / length, -y / length
+        arrows.append(
+            f'<path d="M31 31L{31 + 17 * u:.1f} {31 + 17 * v:.1f}"/>'
+            f'<text x="{31 + 25 * u:.1f}" y="{35 + 25 * v:.1f}">{name}</text>'
+        )
+    return (
+        f'<svg class="over compass" viewBox="0 0 62 62" aria-hidden="true">{"".join(arrows)}</svg>'
+    )

@@ -1,0 +1,154 @@
+"""A headless Chromium that is driven over a pipe, by its own DevTools protocol."""
+
+import base64
+import contextlib
+import json
+import os
+import select
+import shutil
+import subprocess
+import time
+
+NAMES = "chromium", "chromium-browser", "google-chrome", "chrome"
+BROWSER = next(filter(None, map(shutil.which, NAMES)), None)
+OPTIONS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--remote-debugging-pipe",
+    "about:blank",
+)
+PATIENCE_S = 60.0  # for one answer: machines that run other tests beside are slow
+
+
+class Browser:
+    """One page in a browser of its own; a context manager.
+
+    folder: for the browser's profile; size: of the window [px]; dark: which colours the user likes
+    messages: errors and warnings of the console, and requests that left the machine
+    """
+
+    def __init__(self, folder, *, size=(1400, 1000), dark=False, script=True):
+        (theirs_in, self.out), (self.into, theirs_out) = os.pipe(), os.pipe()
+        words = [BROWSER, f"--user-data-dir={folder}", *OPTIONS]
+        self.process = subprocess.Popen(
+            ["sh", "-c", f'exec "$@" 3<&{theirs_in} 4>&{theirs_out}', "sh", *words],
+            pass_fds=(theirs_in, theirs_out),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        os.close(theirs_in)
+        os.close(theirs_out)
+        self.buffer, self.number, self.session, self.messages = b"", 0, None, []
+        target = self.ask("Target.createTarget", url="about:blank")["targetId"]
+        self.session = self.ask("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for room in ("Page", "Runtime", "Log", "Network"):
+            self.ask(f"{room}.enable")
+        width, height = size
+        self.ask(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
+        likes = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
+        self.ask("Emulation.setEmulatedMedia", features=likes)
+        if not script:
+            self.ask("Emulation.setScriptExecutionDisabled", value=True)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        with contextlib.suppress(OSError, AssertionError):
+            self.session = None
+            self.ask("Browser.close")
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(10)
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        os.close(self.out)
+        os.close(self.into)
+
+    def ask(self, method, **parameters):
+        """The answer to a request."""
+        self.number += 1
+        request = {"id": self.number, "method": method, "params": parameters}
+        if self.session:
+            request["sessionId"] = self.session
+        os.write(self.out, json.dumps(request).encode() + b"\0")
+        while True:
+            answer = self._next()
+            if answer.get("id") == self.number:
+                assert "error" not in answer, (method, answer["error"])
+                return answer["result"]
+            self._note(answer)
+
+    def _next(self):
+        end = time.monotonic() + PATIENCE_S
+        while b"\0" not in self.buffer:
+            ready, _, _ = select.select([self.into], [], [], max(0, end - time.monotonic()))
+            assert ready, "the browser does not answer"
+            piece = os.read(self.into, 1 << 16)
+            assert piece, "the browser has ended"
+            self.buffer += piece
+        text, _, self.buffer = self.buffer.partition(b"\0")
+        return json.loads(text)
+
+    def _note(self, event):
+        """Keep what a page should never do."""
+        given = event.get("params", {})
+        match event.get("method"):
+            case "Runtime.exceptionThrown":
+                self.messages.append(str(given["exceptionDetails"]))
+            case "Log.entryAdded" if given["entry"]["level"] in ("error", "warning"):
+                self.messages.append(given["entry"]["text"])
+            case "Runtime.consoleAPICalled" if given["type"] in ("error", "warning"):
+                self.messages.append(str(given["args"]))
+            case "Network.requestWillBeSent":
+                url = given["request"]["url"]
+                if not url.startswith(("file:", "data:", "about:")):
+                    self.messages.append(f"asks for {url}")
+
+    def open(self, path, anchor=""):
+        """Show a file."""
+        self.ask("Page.navigate", url=f"{path.absolute().as_uri()}{anchor}")
+
+    def value(self, expression):
+        """What an expression is in the page."""
+        answer = self.ask("Runtime.evaluate", expression=expression, returnByValue=True)
+        assert "exceptionDetails" not in answer, answer["exceptionDetails"]
+        return answer["result"].get("value")
+
+    def until(self, expression):
+        """Wait until an expression is true in the page; its value."""
+        end = time.monotonic() + PATIENCE_S
+        while not (found := self.value(expression)):
+            assert time.monotonic() < end, f"{expression} stays {found!r}"
+            time.sleep(0.05)
+        return found
+
+    def click(self, x, y):
+        """Press and release the mouse."""
+        for kind in ("mousePressed", "mouseReleased"):
+            self.mouse(kind, x, y, button="left", clickCount=1)
+
+    def mouse(self, kind, x, y, **more):
+        """One event of the mouse, at a place of the window."""
+        self.ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
+
+    def key(self, key, text=""):
+        """Press and release a key."""
+        more = {"text": text} if text else {}
+        for kind in ("keyDown", "keyUp"):
+            self.ask("Input.dispatchKeyEvent", type=kind, key=key, **(more if text else {}))
+
+    def picture(self):
+        """The window as the bytes of a PNG."""
+        return base64.b64decode(self.ask("Page.captureScreenshot", format="png")["data"])
