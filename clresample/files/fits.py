@@ -17,6 +17,7 @@ from astropy.wcs import WCS
 from .. import __version__
 from ..sky.grid import Grid
 from ..sky.psf import PSF
+from .compressed import check_tiles
 from .names import to_ascii
 from .whole_file import FileError, check_output, whole_file
 
@@ -188,6 +189,7 @@ def choose_hdu(path, hdus, hdu):
         chosen = next((one for one in hdus if _is_image(one)), None)
         if chosen is None:
             raise FileError(f"{path}: no HDU holds a 2-D or 3-D image (HDUs: {there})")
+        check_tiles(path, chosen)
         return chosen
     key = hdu
     if isinstance(hdu, str):
@@ -199,11 +201,13 @@ def choose_hdu(path, hdus, hdu):
         raise FileError(f"{path}: no HDU {hdu} (HDUs: {there})") from None
     if not _is_image(chosen):
         raise FileError(f"{path}: HDU {_label(hdus, chosen)} holds no 2-D or 3-D image")
+    check_tiles(path, chosen)
     return chosen
 
 
 def read_pixels(path, hdu):
     """The data of an image HDU. Raises FileError where some of its pixels are missing."""
+    check_tiles(path, hdu)
     data = hdu.data
     if data is None or data.shape != hdu.shape:
         raise FileError(f"{path}: truncated, the pixels of HDU {hdu.name} are not all there")
