@@ -1,29 +1,14 @@
-"""Mutations of one module, and whether its tests notice: `make mutants MODULE=FILE`.
-
-    python tests/mutants.py FILE [--n 20] [--seed 0] [--tests PATH ...] [--seconds 600]
-
-Each mutation changes one token as a slip of the pen would: a sign, a comparison, a factor, a
-number, min for max. The tests of the module's room run on a copy of the checkout with it; one that
-no test fails on is printed with its line. For Python and OpenCL C. What runs too long counts as
-killed; a mutation that changes nothing that can be seen has to be recognised by its reader.
-"""
+"""The mutations of a source file: one token changed, as a slip of the pen would change it."""
 
 from __future__ import annotations
 
-import argparse
+import ast
 import io
-import os
-import random
 import re
-import shutil
-import subprocess
-import sys
-import tempfile
-import time
 import tokenize
+from dataclasses import dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
 SWAPS = {
     "+": "-",
     "-": "+",
@@ -82,25 +67,64 @@ C_TOKENS = re.compile(
 )
 
 
-def mutations(path, text):
-    """Every mutation of a source: [(line, start, end, new text)]; offsets count characters."""
+C_SWAPS = {**SWAPS, "sqrt": "fabs", "abs": "(int)"}
+C_TYPES = {"REAL", "float", "double", "int", "uint", "long", "ulong", "char", "void"}
+
+
+@dataclass(frozen=True)
+class Mutation:
+    """`old` at character `start` of a file became `new`; `shown` is the file's line before it."""
+
+    path: Path
+    line: int
+    start: int
+    old: str
+    new: str
+    shown: str
+
+    @property
+    def change(self):
+        """What became of what."""
+        return f"{self.old} -> {self.new or 'nothing'}"
+
+    def applied(self, text):
+        """The file's text with it."""
+        return text[: self.start] + self.new + text[self.start + len(self.old) :]
+
+    def parses(self, text):
+        """False of Python that is none after it; C is left to the compiler."""
+        try:
+            return self.path.suffix != ".py" or bool(ast.parse(self.applied(text)))
+        except SyntaxError:
+            return False
+
+
+def mutations(path):
+    """Every Mutation of a source file."""
+    text = path.read_text(encoding="utf-8")
+    lines, swaps = text.splitlines(), SWAPS if path.suffix == ".py" else C_SWAPS
     found = []
     for line, start, old in _tokens(path, text):
         if re.fullmatch(r"\d+\.?\d*(?:[eE][-+]?\d+)?f?", old):
-            found.append((line, start, start + len(old), f"({old} + 1)"))
+            changed = [f"({old} + 1)"]
             if float(old.rstrip("f")) > 1:
-                found.append((line, start, start + len(old), f"({old} - 1)"))
-        elif old in SWAPS:
-            found.append((line, start, start + len(old), SWAPS[old]))
+                changed.append(f"({old} - 1)")
+        else:
+            changed = [swaps[old]] if old in swaps else []
+        shown = lines[line - 1].strip()
+        found += [Mutation(path, line, start, old, new, shown) for new in changed]
     return found
 
 
 def _tokens(path, text):
     """(line, offset, text) of every token that may be changed."""
     if path.suffix != ".py":
+        previous = ""
         for match in C_TOKENS.finditer(text):
-            if match.lastgroup != "skip":
+            pointer = match[0] == "*" and previous in C_TYPES
+            if match.lastgroup != "skip" and not pointer:
                 yield text.count("\n", 0, match.start()) + 1, match.start(), match[0]
+            previous = match[0]
         return
     starts = [0]
     for line in text.splitlines(keepends=True):
@@ -108,85 +132,10 @@ def _tokens(path, text):
     previous = ""
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
         if token.type in (tokenize.OP, tokenize.NAME, tokenize.NUMBER):
-            keyword_only = token.string == "*" and previous in ("(", ",")
-            imported = "import" in token.line or token.line.lstrip().startswith(("def ", "class "))
+            unpacked = token.string in ("*", "**") and previous in ("(", ",", "[", "{")
+            head = token.line.lstrip().startswith(("def ", "class ", "@"))
+            imported = "import" in token.line
             annotated = token.string == "|" and (":" in token.line or "->" in token.line)
-            if not (keyword_only or imported or annotated):
+            if not (unpacked or head or imported or annotated):
                 yield token.start[0], starts[token.start[0] - 1] + token.start[1], token.string
         previous = token.string
-
-
-def tests_of(path):
-    """Tests of a module's room, those named after it first."""
-    parts = path.relative_to(ROOT).parts
-    room = parts[1] if parts[0] == "clresample" and len(parts) > 2 else "resampling"
-    if parts[0] == "kernels":
-        used = {"scene", "update", "prox", "project", "structure", "lbfgs"}
-        room = "deblending" if path.stem in used else "resampling"
-    files = sorted((ROOT / "tests" / room).glob("test_*.py"))
-    return sorted(files, key=lambda file: path.stem not in file.stem)
-
-
-def copied(folder):
-    """The checkout's files, without what git ignores, in another folder."""
-    listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
-    names = subprocess.run(listed, cwd=ROOT, capture_output=True, check=True).stdout.split(b"\0")
-    for name in filter(None, map(os.fsdecode, names)):
-        if (ROOT / name).is_file():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(ROOT / name, folder / name)
-
-
-def survives(folder, tests, seconds):
-    """Whether the tests pass on the checkout in a folder."""
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
-    environment = {**os.environ, "PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
-    try:
-        done = subprocess.run(
-            command, cwd=folder, env=environment, capture_output=True, timeout=seconds, check=False
-        )
-    except subprocess.TimeoutExpired:
-        return False
-    return done.returncode == 0
-
-
-def main():
-    """Run the sample; the exit status says whether all mutations were killed."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("file", type=Path, help="module or kernel file to change")
-    parser.add_argument("--n", type=int, default=20, help="how many mutations (default 20)")
-    parser.add_argument("--seed", type=int, default=0, help="which ones")
-    parser.add_argument("--tests", nargs="*", help="tests that should notice")
-    parser.add_argument("--seconds", type=float, default=600, help="longest run of the tests")
-    options = parser.parse_args()
-    path = options.file.resolve()
-    text = path.read_text(encoding="utf-8")
-    possible = mutations(path, text)
-    sample = random.Random(options.seed).sample(possible, min(options.n, len(possible)))
-    tests = options.tests or [str(file.relative_to(ROOT)) for file in tests_of(path)]
-    with tempfile.TemporaryDirectory(prefix="mutants-") as name:
-        folder = Path(name)
-        copied(folder)
-        target = folder / path.relative_to(ROOT)
-        began = time.monotonic()
-        if not survives(folder, tests, options.seconds):
-            print(f"the tests fail without any mutation: {' '.join(tests)}")
-            return 2
-        seconds = min(options.seconds, 30 + 5 * (time.monotonic() - began))
-        alive = 0
-        for line, start, end, new in sorted(sample):
-            target.write_text(text[:start] + new + text[end:], encoding="utf-8")
-            survived = survives(folder, tests, seconds)
-            alive += survived
-            shown = text.splitlines()[line - 1].strip()
-            what = "SURVIVES" if survived else "killed"
-            change = f"{text[start:end]} -> {new or 'nothing'}"
-            print(f"{what:8}  {options.file}:{line}: {change}: {shown}", flush=True)
-    print(f"{len(sample) - alive} of {len(sample)} mutations killed, of {len(possible)} possible")
-    return 1 if alive else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
