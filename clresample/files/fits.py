@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import warnings
 from contextlib import contextmanager
@@ -164,6 +165,7 @@ def open_fits(path):
         warnings.simplefilter("always", AstropyWarning)
         try:
             with fits.open(path, memmap=False) as hdus:
+                _check_ends(path, hdus)
                 yield hdus
         except FileError:
             raise
@@ -172,6 +174,17 @@ def open_fits(path):
             cut = any("truncated" in str(warning.message) for warning in caught)
             what = "truncated" if cut else "not a FITS file, or damaged"
             raise FileError(f"{path}: {what} ({reason})") from error
+
+
+def _check_ends(path, hdus):
+    """Refuse an HDU whose data end before they begin: astropy would read it again without end."""
+    for i in itertools.count():
+        try:
+            hdu = hdus[i]  # the next header is read here
+        except IndexError:
+            return
+        if hdu.fileinfo()["datSpan"] < 0:
+            raise FileError(f"{path}: damaged, HDU {i} has data of a negative size")
 
 
 def _label(hdus, hdu):
