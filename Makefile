@@ -47,7 +47,7 @@ lint: $(STAMP)
 	$(RUN) ruff format --check .
 	$(RUN) mypy
 
-# Do the tests of a module notice slips in it? MODULE=clresample/sky/noise.py ARGS='--n 40 --seed 1'
+# Do the tests notice slips in a module, a room, the kernels? MODULE=clresample/sky ARGS='--n 100'
 mutants: $(STAMP)
 	$(RUN) tests.mutants $(MODULE) $(ARGS)
 

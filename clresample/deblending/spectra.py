@@ -62,9 +62,21 @@ def non_negative(normal, right, free=None):
 
 
 def inverse(normal):
-    """Covariances (M, n, n): infinite variance of what is not seen, and none with others."""
+    """Covariances (M, n, n): infinite variance of what is not seen, and none with others.
+
+    Where many sources lie in one place, rounding of `normal` can leave it with eigenvalues below
+    zero, and its inverse with variances that are too small, or negative: no variance is less than
+    with all other unknowns known. There eigenvalues are at least RIDGE.
+    """
     matrix, scale, seen = scaled(normal)
-    out = np.linalg.inv(matrix) / scale[..., None] / scale[..., None, :]
+    out = np.linalg.inv(matrix)
+    variance = np.diagonal(out, axis1=-2, axis2=-1)
+    wrong = ~(variance > 0.99).all(axis=-1)  # they are at least 1 / (1 + RIDGE)
+    if wrong.any():
+        values, vectors = np.linalg.eigh(matrix[wrong])
+        part = vectors / np.sqrt(np.maximum(values, RIDGE))[:, None, :]
+        out[wrong] = part @ part.swapaxes(1, 2)
+    out = out / scale[..., None] / scale[..., None, :]
     out *= seen[..., None] & seen[..., None, :]
     return out + np.where(~seen[..., None] & np.eye(normal.shape[-1], dtype=bool), np.inf, 0)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import warnings
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ from astropy.wcs import WCS
 from .. import __version__
 from ..sky.grid import Grid
 from ..sky.psf import PSF
+from .compressed import check_tiles
 from .names import to_ascii
 from .whole_file import FileError, check_output, whole_file
 
@@ -163,6 +165,7 @@ def open_fits(path):
         warnings.simplefilter("always", AstropyWarning)
         try:
             with fits.open(path, memmap=False) as hdus:
+                _check_ends(path, hdus)
                 yield hdus
         except FileError:
             raise
@@ -171,6 +174,17 @@ def open_fits(path):
             cut = any("truncated" in str(warning.message) for warning in caught)
             what = "truncated" if cut else "not a FITS file, or damaged"
             raise FileError(f"{path}: {what} ({reason})") from error
+
+
+def _check_ends(path, hdus):
+    """Refuse an HDU whose data end before they begin: astropy would read it again without end."""
+    for i in itertools.count():
+        try:
+            hdu = hdus[i]  # the next header is read here
+        except IndexError:
+            return
+        if hdu.fileinfo()["datSpan"] < 0:
+            raise FileError(f"{path}: damaged, HDU {i} has data of a negative size")
 
 
 def _label(hdus, hdu):
@@ -188,6 +202,7 @@ def choose_hdu(path, hdus, hdu):
         chosen = next((one for one in hdus if _is_image(one)), None)
         if chosen is None:
             raise FileError(f"{path}: no HDU holds a 2-D or 3-D image (HDUs: {there})")
+        check_tiles(path, chosen)
         return chosen
     key = hdu
     if isinstance(hdu, str):
@@ -199,11 +214,13 @@ def choose_hdu(path, hdus, hdu):
         raise FileError(f"{path}: no HDU {hdu} (HDUs: {there})") from None
     if not _is_image(chosen):
         raise FileError(f"{path}: HDU {_label(hdus, chosen)} holds no 2-D or 3-D image")
+    check_tiles(path, chosen)
     return chosen
 
 
 def read_pixels(path, hdu):
     """The data of an image HDU. Raises FileError where some of its pixels are missing."""
+    check_tiles(path, hdu)
     data = hdu.data
     if data is None or data.shape != hdu.shape:
         raise FileError(f"{path}: truncated, the pixels of HDU {hdu.name} are not all there")

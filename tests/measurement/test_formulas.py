@@ -1,0 +1,124 @@
+"""Single formulas of what is measured on a fit: slips in them leave most catalogues as they are."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.blends import MIDDLE, SCALE, blend, gaussian, observe, round_component, two_sources
+
+from clresample.deblending.result import Component
+from clresample.measurement.catalogue import Flag, catalogue
+from clresample.measurement.quality import box_chi2
+from clresample.measurement.residuals import worst_residuals
+from clresample.measurement.shapes import moments
+from clresample.sky.grid import Grid
+from clresample.sky.observation import Observation
+from clresample.sky.psf import PSF
+from clresample.sky.sources import Point
+
+GRID = Grid.flat((60, 70), SCALE)
+
+
+def sums_of(image):
+    """What Errors.beyond holds of an image (ny, nx): its sum, and those of it times y, x, ..."""
+    y, x = np.indices(image.shape)
+    return np.array([(image * part).sum() for part in (1, y, x, y * y, y * x, x * x)])
+
+
+def test_moments_have_what_lies_beyond_the_box():
+    """As of the whole image; its light is 0.7 in the box and 0.3 beyond."""
+    image = gaussian((40, 44), (18, 23), [[30, 8], [8, 20]])
+    image[:3] = 0  # pixels without light are no reason to leave the component out
+    image /= image.sum()
+    box = (slice(10, 27), slice(14, 31))
+    rest = image.copy()
+    rest[box] = 0
+    assert 0.1 < rest.sum() < 0.6
+    parts = [Component(0, (0, 0), image, np.ones(1))]
+    whole = moments(parts, np.ones(1))
+    parts = [Component(0, (10, 14), image[box], np.ones(1))]
+    found = moments(parts, np.ones(1), sums_of(rest)[None])
+    for one, other in zip(found, whole, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10)
+
+
+def test_channels_whose_error_is_infinite_do_not_weigh_in_moments():
+    """The first component shines in g, the second in r, whose fluxes nothing determines."""
+    parts = [round_component(0, (30, x), a) for x, a in ((32, (1.0, 0.0)), (38, (0.0, 1.0)))]
+    covariance = np.stack([np.eye(2), np.diag([np.inf, np.inf])])
+    row = catalogue(blend(parts, covariance=covariance))[0]
+    assert row["x_centroid"].value == pytest.approx(32, abs=1e-9)
+
+
+def test_chi2_is_of_the_boxes_of_all_components():
+    """Components of one source in boxes that do not meet."""
+    data = np.full((1, *GRID.shape), 5.0)
+    data[:, 5:16, 5:16], data[:, 40:51, 40:51] = 1.0, 3.0
+    parts = [round_component(0, (c, c), (0,), n=11) for c in (10, 45)]
+    result = blend(parts, observations=(observe(GRID, ("g",), data=data, weights=2.0),))
+    found = box_chi2(result, 0, result.footprints[0])
+    assert found[0] == pytest.approx(2.0 * (1 + 9) / 2)
+
+
+def test_colours_of_fluxes_under_one_unit():
+    seen = observe(GRID, ("g", "r"), weights=1e-12, zero_points=23.9)
+    parts = [round_component(0, MIDDLE, (0.02, 0.01))]
+    small = catalogue(blend(parts, observations=(seen,)), magnitudes=True)
+    assert 0 < small["flux_r"][0].value < 1
+    assert small["colour_g_r"][0].value == pytest.approx(-2.5 * np.log10(2))
+    assert np.isfinite(small["colour_err_g_r"][0].value)
+
+
+@pytest.mark.parametrize("away, flagged", [((0.6, 0.3), True), ((1.0, 0.0), False)])
+def test_a_core_is_no_less_than_the_pixel_that_holds_it(away, flagged):
+    """A PSF of 0.9 px: pixels within 0.71 px are the core."""
+    weights = np.ones((1, *GRID.shape))
+    weights[0, 30, 35] = 0
+    psf = PSF.gaussian(0.4, n_pixels=15)
+    seen = Observation(
+        np.zeros((1, *GRID.shape)), psf, GRID, weights=1e-12 * weights, channels=("g",)
+    )
+    where = (30 + away[0], 35 + away[1])
+    result = blend(
+        [round_component(0, where, (1,))],
+        observations=(seen,),
+        sources=(Point(position_px=where),),
+    )
+    assert bool(catalogue(result)["flags"][0] & Flag.SATURATED) == flagged
+
+
+def seen_alone(data, weights, grid=None):
+    """A faint source in data that hold much else."""
+    grid = Grid.flat(data.shape, SCALE) if grid is None else grid
+    psf = PSF.gaussian(1.2, n_pixels=9)
+    o = Observation(data[None], psf, grid, weights=weights[None], channels=("g",))
+    shape = tuple(min(n, 20) for n in data.shape)
+    part = Component(0, (0, 0), np.ones(shape), np.array([1e-9]))
+    return blend([part], observations=(o,), grid=Grid.flat(shape, SCALE))
+
+
+@pytest.mark.parametrize("n_masked, scaled", [(0, True), (1, False)])
+def test_four_hundred_pixels_of_sky_say_how_large_the_noise_is(n_masked, scaled):
+    rng = np.random.default_rng(4)
+    weights = np.ones(400)
+    weights[:n_masked] = 0
+    noise = rng.normal(0, 5, (20, 20))
+    worst = worst_residuals(seen_alone(noise, weights.reshape(20, 20)), 0)[0, 0]
+    assert (worst < 6) == scaled and worst > 1
+
+
+def test_residuals_beyond_the_frame_count_for_no_source():
+    """Data of 24 x 24 pixels about a frame of 20 x 20."""
+    data = np.full((24, 24), 1e6)
+    data[2:-2, 2:-2] = 0
+    assert worst_residuals(seen_alone(data, np.ones((24, 24))), 0)[0, 0] < 1e-3
+
+
+def test_a_flux_is_that_of_the_sources_own_components():
+    result = two_sources()
+    alone = replace(result, components=result.components[:2], covariance=np.ones((2, 2, 2)))
+    alone = replace(alone, rendered=tuple(r[:2] for r in result.rendered))
+    np.testing.assert_allclose(
+        catalogue(alone)["flux_g"][0].value, catalogue(result)["flux_g"][0].value
+    )
+    assert np.isnan(catalogue(alone)["flux_g"][1].value)

@@ -1,0 +1,1 @@
+"""Mutation testing of the package and its kernels: see __main__.py."""
