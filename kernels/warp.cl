@@ -7,7 +7,9 @@
  *            may be rows or columns of an observed image.
  *   start (n_tables, n_lines, n_out), weight (n_tables, n_lines, N_TAPS, n_out)
  *   Taps of weight 0 stand for "outside" and may read any element of the line.
- *   Launch: (n_out rounded up to the local size, n_lines, batch).
+ *   Launch: (n_out rounded up to the local size, n_lines, batch), or, where ROWS are set and a
+ *            work-item takes a line of all bands of a scene, whose taps it reads once for all of
+ *            them, (1, n_lines, batch / n_bands).
  *
  * rowdot   y[b, p] = sum_x T[b, p, x] * E[p, x]          launch: (n_positions rounded up, batch)
  * rowscale T[b, p, x] = y[b, p] * E[p, x]                launch: (n_positions * n_pad, batch)
@@ -22,6 +24,10 @@
 #ifndef N_TAPS      /* terms of a sum; a constant, so that the compiler unrolls it: twice as fast */
 #define N_TAPS 10
 #endif
+#ifndef ROWS        /* 1: a work-item walks a whole line, as a CPU's vector unit wants it */
+#define ROWS 0
+#endif
+#define LANES 16    /* pixels of a line taken at a time then: one vector of the widest CPUs */
 
 __kernel void gather(const int n_out, const int n_lines, const int n_bands, const int n_tables,
                      __global const REAL *restrict source, const ulong source_offset,
@@ -30,7 +36,38 @@ __kernel void gather(const int n_out, const int n_lines, const int n_bands, cons
                      const int target_stride, const int target_ld, const int target_step,
                      __global const int *restrict start, __global const REAL *restrict weight)
 {
-    const int p = (int)get_global_id(0), l = (int)get_global_id(1), b = (int)get_global_id(2);
+    const int l = (int)get_global_id(1);
+#if ROWS
+    const int k = (int)get_global_id(2);
+    const size_t i_line = (size_t)(n_tables > 1 ? k : 0) * n_lines + l;
+    start += i_line * n_out;
+    weight += i_line * N_TAPS * n_out;
+    source += source_offset + (size_t)k * n_bands * source_stride + (size_t)l * source_ld;
+    target += target_offset + (size_t)k * n_bands * target_stride + (size_t)l * target_ld;
+    int p0 = 0;
+    for (; p0 + LANES <= n_out; p0 += LANES) {
+        int at[LANES];
+        for (int i = 0; i < LANES; ++i) at[i] = start[p0 + i] * source_step;
+        for (int c = 0; c < n_bands; ++c) {
+            __global const REAL *in = source + (size_t)c * source_stride;
+            __global REAL *out = target + (size_t)c * target_stride + (size_t)p0 * target_step;
+            REAL sum[LANES];
+            for (int i = 0; i < LANES; ++i) sum[i] = 0;
+            for (int t = 0; t < N_TAPS; ++t)
+                for (int i = 0; i < LANES; ++i)
+                    sum[i] += weight[t * n_out + p0 + i] * in[at[i] + t * source_step];
+            for (int i = 0; i < LANES; ++i) out[(size_t)i * target_step] = sum[i];
+        }
+    }
+    for (int c = 0; c < n_bands; ++c, source += source_stride, target += target_stride)
+        for (int p = p0; p < n_out; ++p) {
+            REAL sum = 0;
+            for (int t = 0; t < N_TAPS; ++t)
+                sum += weight[t * n_out + p] * source[(start[p] + t) * source_step];
+            target[(size_t)p * target_step] = sum;
+        }
+#else
+    const int p = (int)get_global_id(0), b = (int)get_global_id(2);
     if (p >= n_out) return;
     const size_t i_line = (size_t)(n_tables > 1 ? b / n_bands : 0) * n_lines + l;
     weight += i_line * N_TAPS * n_out + p;
@@ -42,6 +79,7 @@ __kernel void gather(const int n_out, const int n_lines, const int n_bands, cons
         sum += weight[(size_t)t * n_out] * source[(size_t)t * source_step];
     target += target_offset + (size_t)b * target_stride + (size_t)l * target_ld;
     target[(size_t)p * target_step] = sum;
+#endif
 }
 
 __kernel void rowdot(const int n_positions, const int n_pad, const int n_bands, const int n_tables,

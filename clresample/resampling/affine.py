@@ -94,13 +94,14 @@ class Gather:
             taps = back[:, None] + np.arange(w.shape[1])[:, None]
             start[i, :, : s.shape[1]] = s - back
             np.put_along_axis(weight[i, :, :, : w.shape[2]], taps, w, axis=1)
-        device = executor.device
+        device, tuning = executor.device, executor.tuning
         self.launch = device.launcher(
             "warp.cl",
             "gather",
             dtype=executor.dtype,
-            local_size=(executor.tuning.line_group, 1, 1),
+            local_size=(1, 1, 1) if tuning.row_loops else (tuning.line_group, 1, 1),
             N_TAPS=n_taps,
+            ROWS=tuning.row_loops,
         ).bind(
             n_out=n_out,
             n_lines=n_lines,
@@ -109,12 +110,14 @@ class Gather:
             start=device.put(start),
             weight=device.put(weight),
         )
-        self.size = executor.whole_groups(n_out), n_lines
+        # where a work-item walks a line, it does so for all bands of a scene
+        self.bands_each = executor.n_bands if tuning.row_loops else 1
+        self.size = 1 if tuning.row_loops else executor.whole_groups(n_out), n_lines
 
     def __call__(self, source: Matrix, target: Matrix, n):
-        """Queue the sums of `n` images: rows of source[b] into rows of target[b]."""
+        """Queue the sums of `n` images, all bands of some scenes: rows of source[b] into target[b]."""
         self.launch(
-            (*self.size, n),
+            (*self.size, n // self.bands_each),
             source=source.buffer,
             source_offset=source.offset,
             source_stride=source.stride,
