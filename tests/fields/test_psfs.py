@@ -8,11 +8,12 @@ from astropy.io import fits
 from astropy.table import Table
 
 from clresample import PSF, Grid
-from clresample.fields.psfs.psf_field import BandPSFs, ConstantPSF, FunctionPSF
+from clresample.fields.psfs.psf_field import BandPSFs, ConstantPSF
 from clresample.fields.psfs.psfex import PSFExPSF
 from clresample.fields.psfs.read import read_psf_field
 from clresample.fields.psfs.sampled import PSFCells, PSFCube
 from clresample.files.whole_file import FileError
+from clresample.sky.varying.field import FunctionPSF
 
 N = 25
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from ...files.fits import choose_hdu, open_fits, read_pixels, read_psf
 from ...files.whole_file import FileError
-from .psf_field import ConstantPSF, PSFField
+from ...sky.varying.field import PSFField
+from .psf_field import ConstantPSF
 from .psfex import PSFExPSF
 from .sampled import PSFCells, PSFCube
 
