@@ -53,7 +53,7 @@ class Settings:
         from source to source where it varies by more. With 0.001 a star of signal to noise 1000
         is off by one sigma, all its pixels together, and no flux by more than about 0.1 %, less
         than flux_floor; measured PSFs are known to 0.2 to 1 %. Larger values take fewer terms, each
-        of which costs a few per cent of a fit; 0: each source's own PSF exactly
+        of which adds 10 to 20 % to a fit's time; 0: each source's own PSF exactly
     """
 
     max_iter: int = 500

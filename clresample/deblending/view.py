@@ -108,8 +108,7 @@ class Home:
         terms (S, C, T) or None, see WhitenedView; private: see `whitened_view`."""
         psf, n_terms, shares = observation.psf, 1, None
         if observation.psf_field is not None:
-            at = self.frame.grid.positions_in(observation.grid, *self.places.T)
-            basis = PSFBasis.of(observation.psf_field, at, self.psf_tolerance)
+            basis = PSFBasis.of(observation.psf_field, self._on(observation), self.psf_tolerance)
             psf, n_terms = basis.psf, basis.n_terms
             shares = basis.shares if n_terms > 1 else None
         return cached_resampler(
@@ -122,6 +121,13 @@ class Home:
             private=private,
             n_terms=n_terms,
         ), shares
+
+    def _on(self, observation):
+        """The places (S, 2) in an Observation's pixels; of those outside, the nearest on its image,
+        so that its PSF there takes no term of its own."""
+        at = self.frame.grid.positions_in(observation.grid, *self.places.T)
+        top = np.array(observation.data.shape[1:]) - 1
+        return np.clip(np.where(np.isfinite(at), at, top / 2), 0, top)
 
 
 def whitened_view(home, observation, pad, device, dtype, *, private) -> WhitenedView:
