@@ -24,6 +24,10 @@
  *             for the sources listed in `active`; launch: (X, tallest box, len(active))
  * gather_spectra  dA[s, channel + c] = sum_yx boxed_s[y, x] frame[b, c, y0 + y, x0 + x]
  *             launch: (WG, n_bands, S), groups of (WG, 1, 1)
+ * share       parts[s, c, t] = spectra[s, channel + c] shares[s, c, t], both (S, n_bands,
+ *             n_terms): a source's spectrum in each term of its PSF;  launch: (X, S, 1), rows
+ *             of n_bands
+ * unshare     spectra[s, channel + c] = sum_t shares[s, c, t] parts[s, c, t];  launch: the same
  *
  * X is 1 where a work-item walks a whole row (ROWS of group.h), else at least the width of the
  * widest row; of the second axis, which counts rows, any part or more than all may be launched.
@@ -228,4 +232,28 @@ void gather_spectra(__global const int *restrict table, __global const REAL *res
 #endif
     total = group_sum(total, lid, share);
     if (lid == 0) d_spectra[(size_t)s * n_channels + channel + c] = total;
+}
+
+__kernel void share(const int n_sources, const int n_bands, const int n_terms,
+                    const int n_channels, const int channel, __global const REAL *restrict shares,
+                    __global const REAL *restrict spectra, __global REAL *restrict parts)
+{
+    FOR_Y(s, n_sources) FOR_X(c, n_bands) {
+        const REAL a = spectra[(size_t)s * n_channels + channel + c];
+        const size_t at = ((size_t)s * n_bands + c) * n_terms;
+        for (int t = 0; t < n_terms; ++t) parts[at + t] = a * shares[at + t];
+    }
+}
+
+__kernel void unshare(const int n_sources, const int n_bands, const int n_terms,
+                      const int n_channels, const int channel,
+                      __global const REAL *restrict shares, __global const REAL *restrict parts,
+                      __global REAL *restrict spectra)
+{
+    FOR_Y(s, n_sources) FOR_X(c, n_bands) {
+        const size_t at = ((size_t)s * n_bands + c) * n_terms;
+        REAL sum = 0;
+        for (int t = 0; t < n_terms; ++t) sum += shares[at + t] * parts[at + t];
+        spectra[(size_t)s * n_channels + channel + c] = sum;
+    }
 }

@@ -19,7 +19,7 @@ from .solver.scene import Scene, State, signature_of
 from .start.first_scene import first_scene
 from .start.seen import Model, Seen, see
 from .start.start import LIGHT_SIGMAS, Patch, StartingPoint, start, weighed
-from .view import view_as_taken, whitened_view
+from .view import Home, view_as_taken, whitened_view
 
 # The stopping rule compares the best loss with the best one this many iterations ago: losses of
 # single iterations scatter, and a smaller number would take a pause for the end.
@@ -46,7 +46,7 @@ class Fit:
     fitted (n,): indices of those inside the frame; dark (n_dark,): of those far from any light
     views: the observations as WhitenedViews, whose operators hold the observations' shifts
     noise (C,): of one model pixel, in the views' units; unit (C,) [counts]: of these
-    padded: the frame with its sides grown to those that a batch shares
+    padded: the frame with its sides grown to those that a batch shares; home: Home
     start: the StartingPoint that `begin` was given; from then on
     scene, state: Scene and State, as of the start or of where `settle` left them; findings: what a
         LearnedPrior has learned by then, or None; losses, status, messages, seconds: see Result
@@ -62,9 +62,11 @@ class Fit:
         self.sources = tuple(source.on_frame(position) for source, position in pairs)
         inside, self.messages = _inside(self.frame, positions)
         self.fitted = np.flatnonzero(inside)
+        places, tolerance = positions[self.fitted], settings.psf_tolerance
         padded, private = _padded_frame(self.frame, pad), settings.fit_shifts or shifts.any()
+        self.home = Home(self.frame, padded, places, tolerance)
         self.views = [
-            whitened_view(self.frame, padded, o, pad, device, dtype, private=private)
+            whitened_view(self.home, o, pad, device, dtype, private=private)
             for o in blend.observations
         ]
         if private:
@@ -208,14 +210,14 @@ def finish(fits) -> list[Seen]:
 
 def _model(fit) -> Model:
     """A fit's morphologies as they are by now, max = 1, and what sees them."""
-    state, home = fit.state, (fit.frame, fit.padded)
     pairs = zip(fit.views, fit.blend.observations, strict=True)
     return Model(
         fit.padded.shape,
         fit.views,
-        [view_as_taken(o, v, *home) if o.noise is not None else None for v, o in pairs],
+        [view_as_taken(fit.home, o, v) if o.noise is not None else None for v, o in pairs],
+        fit.start.source,
         fit.scene.origin,
-        _scaled(state),
+        _scaled(fit.state),
     )
 
 

@@ -24,12 +24,13 @@ def shift_steps(scene, state) -> np.ndarray:
     scene: a Scene, its operators at their present shifts; state: its present State
     """
     n_y, n_x = scene.extent
-    light = compose(scene.shape, scene.origin, state.morph, state.spectra)[:, :n_y, :n_x]
     steps = []
     parts = zip(scene.channels(), scene.ops, scene.data, scene.weights, strict=True)
-    for part, op, data, weights in parts:
+    for i, (part, op, data, weights) in enumerate(parts):
+        spectra = scene.parts(i, state.spectra[:, part])
+        light = compose(scene.shape, scene.origin, state.morph, spectra)[:, :n_y, :n_x]
         images = np.zeros((3, *op.shape_in))
-        images[..., :n_y, :n_x] = (light[part], *np.gradient(light[part], axis=(1, 2)))
+        images[..., :n_y, :n_x] = (light, *np.gradient(light, axis=(1, 2)))
         seen, *slopes = op.forward(images.astype(op.dtype)).astype(np.float64)
         rest = weights * (data - seen - state.sky[part, None, None])
         normal = np.einsum("icyx,jcyx,cyx->ij", slopes, slopes, weights)

@@ -8,7 +8,9 @@ import numpy as np
 
 from ..resampling.cache import cached_resampler
 from ..resampling.resampler import Resampler
+from ..sky.frame import Frame
 from ..sky.mapping import Mapping
+from ..sky.varying.basis import PSFBasis
 from .profiles import point
 
 # [sigma] Stars whose PSF's error is nowhere more than this leave the weights as they are.
@@ -22,12 +24,15 @@ DARK = 1e-20
 class WhitenedView:
     """One observation ready to be fitted: its operator and whitened data.
 
-    op: model frame, padded where scenes share a batch -> observation, padded alike
+    op: model frame, padded where scenes share a batch -> observation, padded alike; of T terms, see
+        Plan, where the PSF varies over the scene's sources
     mapping: the op's, with the frame itself, without its padding, as the model
     covered (My, Mx): bool, whose centre lies on the frame itself
     unit (Co,) [counts]: noise of a typical pixel of each channel, in which data and model count
     root (Co, My, Mx) [1 / unit]: square root of the weights, 0 where the frame does not cover
     data (Co, My, Mx) [unit]: the observation's data, 0 where root is
+    shares (S, Co, T): of the op's terms in the PSF of each of the scene's sources; None where its
+        PSF is the same for all
     """
 
     op: Resampler
@@ -36,20 +41,21 @@ class WhitenedView:
     unit: np.ndarray
     root: np.ndarray
     data: np.ndarray
+    shares: np.ndarray | None = None
 
     @classmethod
-    def of(cls, op, frame, data, weights):
+    def of(cls, op, frame, data, weights, shares=None):
         """The view of an observation's data and weights (Co, My, Mx) on a model Frame.
 
         op: of the frame, or of a larger one that starts at the same pixel: what lies beyond the
-            frame itself gets no weight
+            frame itself gets no weight; shares: see the class
         """
         unit = np.array([_typical_noise(channel) for channel in weights])
         mapping = replace(op.mapping, shape_in=frame.shape)
         covered = mapping.covered
         root = np.sqrt(weights) * unit[:, None, None] * covered
         data = np.where(root > 0, data, 0.0) / unit[:, None, None]
-        return cls(op, mapping, covered, unit, root, data)
+        return cls(op, mapping, covered, unit, root, data, shares)
 
     def allowing(self, error) -> WhitenedView:
         """The same view with a model whose own error (Co, My, Mx) [unit] adds to the noise.
@@ -57,6 +63,19 @@ class WhitenedView:
         1/w = sigma^2 + error^2,  of pixels that have a weight
         """
         return replace(self, root=self.root / np.sqrt(1 + (self.root * error) ** 2))
+
+    def see(self, images, source) -> np.ndarray:
+        """Images (n, Ny, Nx) of the frame, padding left out or not, as all channels see them where
+        they are of a source, by its number: (n, Co, My, Mx) in the op's type."""
+        images = _padded(images, self.op.shape_in).astype(self.op.dtype)
+        if self.shares is None:
+            return self.op.render(images)
+        parts = self.shares[source].reshape(1, -1, 1, 1).astype(self.op.dtype)
+        return self.op.forward(images[:, None] * parts)
+
+    def of_sources(self, chosen) -> WhitenedView:
+        """The same view of a scene that has the sources `chosen` (k,) of this one alone."""
+        return self if self.shares is None else replace(self, shares=self.shares[chosen])
 
     @property
     def pixel_noise(self) -> np.ndarray:
@@ -71,8 +90,48 @@ def without_dark(images):
     return images
 
 
-def whitened_view(frame, padded, observation, pad, device, dtype, *, private) -> WhitenedView:
-    """The view of an Observation on a frame that is `padded`, itself padded to multiples of `pad`.
+@dataclass(frozen=True, eq=False)
+class Home:
+    """Where a scene's model lies.
+
+    frame: Frame; padded: the same with its sides grown to those that a batch shares
+    places (S, 2) [px]: of the scene's sources in it; psf_tolerance: see Settings
+    """
+
+    frame: Frame
+    padded: Frame
+    places: np.ndarray
+    psf_tolerance: float
+
+    def operator(self, observation, grid, device, dtype, *, private):
+        """The operator to a grid with an Observation's PSF at the places, and the shares of its
+        terms (S, C, T) or None, see WhitenedView; private: see `whitened_view`."""
+        psf, n_terms, shares = observation.psf, 1, None
+        if observation.psf_field is not None:
+            basis = PSFBasis.of(observation.psf_field, self._on(observation), self.psf_tolerance)
+            psf, n_terms = basis.psf, basis.n_terms
+            shares = basis.shares if n_terms > 1 else None
+        return cached_resampler(
+            self.padded,
+            grid,
+            psf,
+            dtype=dtype,
+            device=device,
+            extent=self.frame.shape,
+            private=private,
+            n_terms=n_terms,
+        ), shares
+
+    def _on(self, observation):
+        """The places (S, 2) in an Observation's pixels; of those outside, the nearest on its image,
+        so that its PSF there takes no term of its own."""
+        at = self.frame.grid.positions_in(observation.grid, *self.places.T)
+        top = np.array(observation.data.shape[1:]) - 1
+        return np.clip(np.where(np.isfinite(at), at, top / 2), 0, top)
+
+
+def whitened_view(home, observation, pad, device, dtype, *, private) -> WhitenedView:
+    """The view of an Observation on the frame of a Home, padded to multiples of `pad`.
 
     Correlated noise is made white first (Observation.white).
 
@@ -84,17 +143,9 @@ def whitened_view(frame, padded, observation, pad, device, dtype, *, private) ->
     grid = observation.grid
     if shape != observation.data.shape[1:]:
         grid = grid.cutout(0, 0, shape)
-    op = cached_resampler(
-        padded,
-        grid,
-        observation.psf,
-        dtype=dtype,
-        device=device,
-        extent=frame.shape,
-        private=private,
-    )
+    op, shares = home.operator(observation, grid, device, dtype, private=private)
     data, weights = _padded(observation.data, shape), _padded(observation.weights, shape)
-    return WhitenedView.of(op, frame, data, weights)
+    return WhitenedView.of(op, home.frame, data, weights, shares)
 
 
 def allow_for_psf_error(views, stars, psf_error) -> list[WhitenedView]:
@@ -105,11 +156,12 @@ def allow_for_psf_error(views, stars, psf_error) -> list[WhitenedView]:
     r being the distance from star s: L changes by -(2 L + r . grad L) epsilon when the PSF grows by
     epsilon, so that its wings are less certain than its core.
 
-    stars: tuples of a Star, its place (2,) [model px] and its spectrum (C,) [unit]
+    stars: tuples of a Star, the number of its source, its place (2,) [model px] and its spectrum
+        (C,) [unit]
     """
     ends = np.cumsum([0, *(len(view.data) for view in views)])
     squares = [0.0] * len(views)
-    for star, place, spectrum in stars if psf_error else ():
+    for star, source, place, spectrum in stars if psf_error else ():
         parts = [spectrum[a:b, None, None] for a, b in zip(ends, ends[1:], strict=False)]
         pairs = list(zip(views, parts, strict=True))
         # no pixel holds more than all of its light
@@ -117,7 +169,7 @@ def allow_for_psf_error(views, stars, psf_error) -> list[WhitenedView]:
             continue
         images = point(star.psf, place, star.shape)
         for i, (view, a) in enumerate(pairs):
-            seen = view.op.render(_padded(images, view.op.shape_in).astype(view.op.dtype))
+            seen = view.see(images, source)
             light, *slopes = seen.astype(np.float64)  # slopes by the place: minus the gradient
             n, m = np.indices(view.mapping.shape_out)
             away = np.moveaxis(view.mapping.at(n, m) + view.op.shift - place, -1, 0)
@@ -131,20 +183,13 @@ def allow_for_psf_error(views, stars, psf_error) -> list[WhitenedView]:
     ]
 
 
-def view_as_taken(observation, view, frame, padded) -> WhitenedView:
-    """The view of an Observation on a frame that is `padded`, with the observation's own PSF; where
+def view_as_taken(home, observation, view) -> WhitenedView:
+    """The view of an Observation on the frame of a Home, with the observation's own PSF; where
     noise is correlated, the view has that of the white observation instead."""
-    op = cached_resampler(
-        padded,
-        observation.grid,
-        observation.psf,
-        dtype=view.op.dtype,
-        device=view.op.device,
-        extent=frame.shape,
-        private=True,
-    )
+    device, dtype = view.op.device, view.op.dtype
+    op, shares = home.operator(observation, observation.grid, device, dtype, private=True)
     op.shift = view.op.shift
-    return replace(view, op=op)
+    return replace(view, op=op, shares=shares)
 
 
 def _typical_noise(weights):

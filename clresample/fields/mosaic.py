@@ -15,9 +15,10 @@ from ..files.whole_file import FileError
 from ..sky.grid import Grid
 from ..sky.observation import Observation
 from ..sky.psf_checks import PSFWarning
+from ..sky.varying.field import PSFField
 from .background import Background
 from .box import Box
-from .psfs.psf_field import ConstantPSF, PSFField
+from .psfs.psf_field import ConstantPSF
 
 
 class Plane(Protocol):
@@ -236,7 +237,8 @@ class Mosaic:
         ignore (Ny, Nx) bool: pixels that get no weight
         subtract (C, Ny, Nx) [counts]: light that is not to be fitted
         extra (C, Ny, Nx) [counts^2]: variance that is added to the pixels'
-        psf_box: Box in whose middle the PSF is taken; None = that of the pixels
+        psf_box: Box in whose middle the PSF is taken, as if it were the same everywhere; None = it
+            varies as the mosaic's does
         """
         weights = np.stack([c.weights(box) for c in self.channels])
         if ignore is not None:
@@ -249,21 +251,23 @@ class Mosaic:
         if extra is not None:
             weights = weights / (1 + weights * extra)
         zero_points = [c.zero_point for c in self.channels]
-        there = psf_box or box
-        middle = (np.array(there[:2]) + np.array(there[2:]) - 1) / 2
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", PSFWarning)  # said once, when the field is opened
-            psf = self.psf.psf_at(*middle)
-        return Observation(
-            data,
-            psf,
-            self.grid.cutout(box.y0, box.x0, box.shape),
-            weights=weights,
-            channels=tuple(c.name for c in self.channels),
-            zero_points=None if zero_points[0] is None else zero_points,
-            noise=self.noise,
-            name=self.name,
-        )
+            psf = self.psf.cutout(box.y0, box.x0) if psf_box is None else self._middle(psf_box)
+            return Observation(
+                data,
+                psf,
+                self.grid.cutout(box.y0, box.x0, box.shape),
+                weights=weights,
+                channels=tuple(c.name for c in self.channels),
+                zero_points=None if zero_points[0] is None else zero_points,
+                noise=self.noise,
+                name=self.name,
+            )
+
+    def _middle(self, box):
+        """The PSF in the middle of a Box."""
+        return self.psf.psf_at(*((np.array(box[:2]) + np.array(box[2:]) - 1) / 2))
 
 
 def _outline(shape):

@@ -39,22 +39,34 @@ class OperatorCache:
         self._lock = threading.RLock()
 
     def resampler(
-        self, frame: Frame, grid: Grid, psf: PSF, *, dtype, device=None, extent=None, private=False
+        self,
+        frame: Frame,
+        grid: Grid,
+        psf: PSF,
+        *,
+        dtype,
+        device=None,
+        extent=None,
+        private=False,
+        n_terms=1,
     ) -> Resampler:
         """The Resampler from `frame` to `grid` and `psf`; asked twice it is the same object.
 
         extent (2,) [px]: what of the frame holds light, the rest is padding; None = all of it
         private: an operator of the caller's own, whose shift may be set, on the same plan
+        n_terms: PSFs that psf has in turn for each band, see Plan
 
         Raises ValueError as Resampler does.
         """
         device, dtype = get_device(device), np.dtype(dtype)
         mapping = grid.map_to(frame.grid)
-        key = _key(mapping, frame.psf, psf, dtype, extent)
+        key = n_terms, _key(mapping, frame.psf, psf, dtype, extent)
 
         def plan():
             precision = Precision.of(dtype)
-            return make_plan(mapping, frame.psf, psf, precision=precision, extent=extent)
+            return make_plan(
+                mapping, frame.psf, psf, precision=precision, extent=extent, n_terms=n_terms
+            )
 
         def operator():
             plans = [_find(self._plans, key, plan, self.plan_bytes)]
@@ -97,12 +109,20 @@ def cached_resampler(
     device=None,
     extent=None,
     private=False,
+    n_terms=1,
     cache: OperatorCache | None = None,
 ) -> Resampler:
     """`OperatorCache.resampler` of a cache, or of the default one."""
     cache = default_cache() if cache is None else cache
     return cache.resampler(
-        frame, grid, psf, dtype=dtype, device=device, extent=extent, private=private
+        frame,
+        grid,
+        psf,
+        dtype=dtype,
+        device=device,
+        extent=extent,
+        private=private,
+        n_terms=n_terms,
     )
 
 

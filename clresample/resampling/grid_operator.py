@@ -25,6 +25,8 @@ class GridOperator(LinOp):
     Images are flux per pixel, (C, Ny, Nx) or (B, C, Ny, Nx). Observed pixels whose centre the
     model does not cover come out as 0.
 
+    n_terms: T images of the model that each band adds up, see Plan; shape_in has C * T of them then
+
     An operator whose items have a geometry each (`Resampler.from_plans`) gives `mapping` and
     `certificate` as lists, `covered` as (n, My, Mx) and `shift` as (n, 2); all others one of each.
 
@@ -81,13 +83,16 @@ class GridOperator(LinOp):
         """Bring what the device holds in line with `_shift` (n, 2)."""
         raise NotImplementedError
 
-    def _begin(self, device, dtype, n_bands, mappings):
+    def _begin(self, device, dtype, n_bands, mappings, n_terms=1):
         """The operator's shapes, from a mapping for each geometry; all alike in their shapes.
+
+        n_terms: images of the model that each band of the observation adds up
 
         Whoever calls it also sets `_certificates`, one for each of them.
         """
-        shapes = ((n_bands, *shape) for shape in (mappings[0].shape_in, mappings[0].shape_out))
-        LinOp.__init__(self, device, dtype, *shapes)
+        self.n_terms = n_terms
+        shape_in, shape_out = mappings[0].shape_in, mappings[0].shape_out
+        LinOp.__init__(self, device, dtype, (n_bands * n_terms, *shape_in), (n_bands, *shape_out))
         self._mappings, self._n_geometries = list(mappings), len(mappings)
 
     @property

@@ -55,7 +55,9 @@ class Plan:
     nu (Hy,), (Hx,) [cycles per model px]: frequencies >= 0 of the two table axes
     axes: the model axis of each table axis; (1, 0) where the observed rows run along the model's y
     psfs: of the model and of the observation
-    d_plus, d_minus (C, Hy, Hx) complex: D(+,+), D(+,-) times K^-2 and the half-plane weights
+    n_bands, n_terms: C bands of the observation, each of which adds up T images of the model, one
+        through each PSF of a PSFBasis; 1 where its PSF is the same everywhere
+    d_plus, d_minus (C * T, Hy, Hx) complex: D(+,+), D(+,-) times K^-2 and the half-plane weights
     in_y (2Hy, Ny), in_x (2Hx, Nx): transforms of the model
     out_y, out_x: aligned (My, 2Hy), (2Hx, Mx); affine (L, 2Hy), (2Hx, J); distorted (P, 2Hy),
         (P, 2Hx)
@@ -78,6 +80,7 @@ class Plan:
     out_x: np.ndarray
     twist: np.ndarray | None = None
     lines: LineTaps | None = None
+    n_terms: int = 1
     windows: dict = field(default_factory=dict, repr=False, compare=False)
 
     @property
@@ -107,7 +110,9 @@ class Plan:
             mapping = Around.box_of(self.mapping, shape, reach_px)
             moved = np.abs(self.mapping.matrix).sum(axis=1) / 2
             extent = tuple(np.array(shape) + mapping.reach_px + moved)
-            self.windows[key] = make_plan(mapping, *self.psfs, precision=precision, extent=extent)
+            self.windows[key] = make_plan(
+                mapping, *self.psfs, precision=precision, extent=extent, n_terms=self.n_terms
+            )
         return self.windows[key]
 
     def shifted(self, shift) -> tuple[np.ndarray, np.ndarray]:
@@ -118,12 +123,13 @@ class Plan:
 
 
 def make_plan(
-    mapping: Mapping, psf_in: PSF, psf_out: PSF, *, precision: Precision, extent=None
+    mapping: Mapping, psf_in: PSF, psf_out: PSF, *, precision: Precision, extent=None, n_terms=1
 ) -> Plan:
     """Tables that take a model to the observed pixels and PSF of `mapping`.
 
     mapping: observed pixels -> model pixels
     psf_in (1 or C bands), psf_out (C bands): PSF samples of the model and of the observation
+    n_terms: T, of which psf_out has so many in turn for each band that is observed; see Plan
     extent (2,) [model px]: from its first pixel on, what of the model holds light, and sets the
         frequencies; None = all of it
 
@@ -157,8 +163,8 @@ def make_plan(
     )
     return Plan(
         mapping=mapping,
-        n_bands=n_bands,
-        identity=is_identity(mapping, psf_in, psf_out),
+        n_bands=n_bands // n_terms,
+        identity=n_terms == 1 and is_identity(mapping, psf_in, psf_out),
         certificate=Certificate(radius, n_fft, n_frequencies, max_gain, floored_power),
         nu=nu,
         axes=axes,
@@ -167,6 +173,7 @@ def make_plan(
         in_y=in_y,
         in_x=in_x,
         psfs=(psf_in, psf_out),
+        n_terms=n_terms,
         **tables,
     )
 

@@ -81,8 +81,8 @@ class Resampler(GridOperator):
 
     def _take(self, plans, dtype, device):
         """Tables of all plans on the device."""
-        n_bands = plans[0].n_bands
-        self._begin(device, dtype, n_bands, [plan.mapping for plan in plans])
+        n_bands, mappings = plans[0].n_bands, [plan.mapping for plan in plans]
+        self._begin(device, dtype, n_bands, mappings, plans[0].n_terms)
         self.plans, self._certificates = plans, [plan.certificate for plan in plans]
         self._executor = EXECUTORS[self.geometry](self.device, self.dtype, plans)
         per_image = sum(rows * ld for rows, ld in self._executor.scratch_shapes().values())
@@ -123,8 +123,10 @@ class Resampler(GridOperator):
     def render(self, x, out=None):
         """One image seen in every band: x (Ny, Nx) -> (C, My, Mx), or batches of both.
 
-        Into `out` (of x's kind) if given. Raises ValueError as `forward` does.
+        Into `out` (of x's kind) if given. Raises ValueError as `forward` does, and with terms.
         """
+        if self.n_terms > 1:
+            raise ValueError(f"n_terms is {self.n_terms}, `render` takes operators of one term")
         return self._apply(self._render, "x", x, out, self.shape_in[1:], self.shape_out)
 
     def _render(self, x, out):
@@ -177,7 +179,7 @@ def _check_alike(plans):
         raise ValueError("plans is empty, at least one is needed")
     first = plans[0]
     for i, plan in enumerate(plans):
-        for name in ("geometry", "axes", "n_bands", "shape_in", "shape_out"):
+        for name in ("geometry", "axes", "n_bands", "n_terms", "shape_in", "shape_out"):
             found, expected = (
                 getattr(p.mapping if name.startswith("shape") else p, name) for p in (plan, first)
             )

@@ -8,11 +8,13 @@ from functools import cached_property
 import numpy as np
 
 from ..drawing.shown import ShownObservation
-from .correlation import NoiseCorrelation, filtered_psf, noise_of_channels
+from .correlation import NoiseCorrelation, noise_of_channels
 from .given.checks import ReadOnly, instance, numbers, split_mask
 from .grid import Grid
 from .noise import mask_from, weights_from
 from .psf import PSF
+from .varying.field import PSFField
+from .varying.made import RepeatedPSF, filtered
 
 # [mag] AB magnitude of 1 uJy
 ZERO_POINT_UJY = 23.9
@@ -26,7 +28,8 @@ class Observation(ReadOnly, ShownObservation):
 
     data (C, Ny, Nx) [counts per pixel]: background-subtracted images; (Ny, Nx) is one channel. Read
         back, they are float64 and hold 0 where they were NaN or infinite
-    psf: PSF of C bands, pixel response included; one band serves all channels
+    psf: PSF of C bands, pixel response included; one band serves all channels. Or a PSFField: fits
+        render each source with the PSF at its position
     grid: Grid of (Ny, Nx)
     weights [counts^-2]: inverse variance, 0 = ignore this pixel; or, instead of it,
     variance [counts^2]: NaN, infinite, zero and negative ones mean: ignore this pixel. Weights and
@@ -43,9 +46,9 @@ class Observation(ReadOnly, ShownObservation):
     With neither weights nor variance the noise is estimated, channel by channel, from the scatter
     of the background (`noise_sigma`), and reported: one number, without sources' photon noise.
 
-    Read back: data and weights (C, Ny, Nx) float64, psf of C bands, zero_points and noise (C,) or
-    None, n_bad = number of unmasked pixels whose weight became 0 because their data, weight or
-    variance is none, messages = what the user should know.
+    Read back: data and weights (C, Ny, Nx) float64, psf of C bands, that in the middle, psf_field
+    of C bands where it varies, else None, zero_points and noise (C,) or None, n_bad = number of
+    unmasked pixels whose weight became 0 because data, weight or variance is none, messages
 
     Raises ValueError for shapes that disagree, negative or infinite weights, masks not of 0 and 1,
     names not unique, weights beside variance, noise not to be found, and what is no real number.
@@ -53,6 +56,7 @@ class Observation(ReadOnly, ShownObservation):
 
     data: np.ndarray
     psf: PSF
+    psf_field: PSFField | None
     grid: Grid
     weights: np.ndarray
     channels: tuple[str, ...]
@@ -77,7 +81,7 @@ class Observation(ReadOnly, ShownObservation):
         name=None,
     ):
         data, mask = _images(data, instance("grid", grid, Grid), mask)
-        psf = _of_each_channel(psf, len(data))
+        psfs = _psfs_of(psf, data.shape)
         bad = ~np.isfinite(data)
         channels = _channels(channels, name, len(data))
         zero_points = _per_channel("zero_points", zero_points, len(data))
@@ -87,7 +91,7 @@ class Observation(ReadOnly, ShownObservation):
         messages += found
         self._set(
             data=data,
-            psf=psf,
+            **psfs,
             grid=grid,
             weights=weights,
             channels=channels,
@@ -107,10 +111,8 @@ class Observation(ReadOnly, ShownObservation):
 
     @classmethod
     def restore(cls, data, psf, grid, *, weights, n_bad, messages, **given) -> Observation:
-        """An observation as it was made once: `n_bad` and `messages` are what was found then.
-
-        All others as read back from it. Raises ValueError as the constructor does.
-        """
+        """An observation as it was made once, from what is read back; n_bad and messages are those
+        that were found then. Raises ValueError as the constructor does."""
         restored = cls(data, psf, grid, weights=weights, **given)
         restored._set(n_bad=int(n_bad), messages=tuple(messages))
         return restored
@@ -134,7 +136,7 @@ class Observation(ReadOnly, ShownObservation):
         """
         if self.noise is None:
             return self
-        psf, sums = filtered_psf(self.psf, [n.filter for n in self.noise])
+        psf, sums = filtered(self.psf, self.psf_field, [n.filter for n in self.noise])
         data = self.as_white(self.data)
         weights = np.stack(
             [n.reached(w) * w * s**2 for n, w, s in zip(self.noise, self.weights, sums)]
@@ -210,17 +212,23 @@ def _images(data, grid, mask):
     return data, mask if hidden is None else mask_from(mask, data.shape) | hidden
 
 
-def _of_each_channel(psf, n_channels):
-    """The PSF with one band for each channel; a single one serves all."""
-    instance("psf", psf, PSF)
-    if psf.n_bands == n_channels:
-        return psf
-    if psf.n_bands != 1:
+def _psfs_of(psf, shape):
+    """psf and psf_field of images (C, Ny, Nx), each of one band for each channel, a single one
+    serving all."""
+    n_channels = shape[0]
+    instance("psf", psf, (PSF, PSFField))
+    if psf.n_bands not in (1, n_channels):
         raise ValueError(
             f"psf has {psf.n_bands} bands, data have {n_channels} channels: "
             "give one band, or one for each channel"
         )
-    return psf.select([0] * n_channels)
+    if isinstance(psf, PSF):
+        psf = psf if psf.n_bands == n_channels else psf.select([0] * n_channels)
+        return {"psf": psf, "psf_field": None}
+    if psf.n_bands != n_channels:
+        psf = RepeatedPSF(psf, n_channels)
+    middle = psf.psf_at((shape[1] - 1) / 2, (shape[2] - 1) / 2)
+    return {"psf": middle, "psf_field": psf if psf.varies else None}
 
 
 def _channels(channels, name, n_channels):

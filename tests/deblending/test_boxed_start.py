@@ -150,7 +150,7 @@ def test_windows_show_what_the_whole_operator_shows(device, name, shift):
     home = Home(mapping.shape_in, psf_in)
     places = np.array([(0.4, 0.45), (0.7, 0.3)]) * mapping.shape_in
     components = [
-        Component(0, i, Star(home, free=True), p, home.shape) for i, p in enumerate(places)
+        Component(0, i, i, Star(home, free=True), p, home.shape) for i, p in enumerate(places)
     ]
     looking = looking_at([v], components, Precision.of(dtype), 0.0, fit_sky=False)
     thetas = [np.zeros(2)] * 2

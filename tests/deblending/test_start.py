@@ -49,7 +49,8 @@ def test_spectra_are_the_non_negative_least_squares(device, sky):
 
 def seen_by(v, images, **given):
     n = len(images)
-    model = Model(SHAPE, v, [None] * len(v), np.zeros((n, 2), int), list(images))
+    source = np.arange(n)
+    model = Model(SHAPE, v, [None] * len(v), source, np.zeros((n, 2), int), list(images))
     return see([model], **given)[0]
 
 

@@ -8,11 +8,14 @@ from astropy.io import fits
 from astropy.table import Table
 
 from clresample import PSF, Grid
-from clresample.fields.psfs.psf_field import BandPSFs, ConstantPSF, FunctionPSF
+from clresample.adapters.photutils import psf_of
+from clresample.fields.psfs.gridded import GriddedPSF
+from clresample.fields.psfs.psf_field import BandPSFs, ConstantPSF
 from clresample.fields.psfs.psfex import PSFExPSF
 from clresample.fields.psfs.read import read_psf_field
 from clresample.fields.psfs.sampled import PSFCells, PSFCube
 from clresample.files.whole_file import FileError
+from clresample.sky.varying.field import FunctionPSF
 
 N = 25
 
@@ -112,6 +115,101 @@ def test_psfex_polynomials_are_taken_at_pixels_that_count_from_one(tmp_path):
     np.testing.assert_array_equal(again.psf_at(3, 4).images, field.psf_at(3, 4).images)
     with pytest.raises(FileError, match="no such file"):
         PSFExPSF(tmp_path / "y.psf")
+
+
+def piff_file(path):
+    """A Piff file of Gaussians that widen along x, on pixels of 0.2 arcsec that count from 1."""
+    galsim, piff = pytest.importorskip("galsim"), pytest.importorskip("piff")
+    rng, wcs, stars = np.random.default_rng(0), galsim.PixelScale(0.2), []
+    for x, y in rng.uniform(30, 970, (20, 2)):
+        star = piff.Star.makeTarget(x=x, y=y, wcs=wcs, stamp_size=25)
+        profile = galsim.Gaussian(sigma=0.3 + 1e-4 * x)
+        profile.drawImage(star.image, center=galsim.PositionD(x, y))
+        star.data.weight = galsim.Image(
+            np.ones((25, 25)), xmin=star.image.xmin, ymin=star.image.ymin
+        )
+        stars.append(star)
+    model = piff.SimplePSF(piff.GSObjectModel(galsim.Gaussian(sigma=1.0)), piff.Polynomial(order=1))
+    model.fit(stars, {3: wcs}, None)
+    model.write(str(path))
+
+
+def test_piff_is_drawn_at_pixels_that_count_from_one(tmp_path, grid):
+    pytest.importorskip("piff")
+    path = tmp_path / "x.piff"
+    piff_file(path)
+    field = read_psf_field(path, "piff", grid, stamp_px=31)
+    for x in (99.0, 899.0):
+        psf = field.psf_at(500, x)
+        assert psf.images.shape == (1, 31, 31)
+        wanted = PSF.gaussian((0.3 + 1e-4 * (x + 1)) / 0.2, n_pixels=31).images
+        np.testing.assert_allclose(psf.images, wanted, atol=2e-4 * wanted.max())
+    again = pickle.loads(pickle.dumps(field))
+    np.testing.assert_array_equal(again.psf_at(3, 4).images, field.psf_at(3, 4).images)
+    with pytest.raises(FileError, match="chip is 7, the file has 3"):
+        read_psf_field(path, "piff", grid, detector=7)
+    with pytest.raises(ValueError, match="stamp_px is 30, must be an odd number"):
+        read_psf_field(path, "piff", grid, stamp_px=30)
+    (tmp_path / "bad.piff").write_text("no")
+    with pytest.raises(FileError, match="no Piff file"):
+        read_psf_field(tmp_path / "bad.piff", "piff", grid)
+
+
+class Gridded:
+    """What of photutils' GriddedPSFModel is read: PSFs on two rows and three columns."""
+
+    oversampling = np.array([2, 2])
+    grid_xypos = [(x, y) for x in (10.0, 50.0, 90.0) for y in (20.0, 80.0)]
+    data = np.stack([gaussian(2 * (1 + 0.01 * x + 0.002 * y), 41) for x, y in grid_xypos])
+
+
+def test_gridded_psfs_are_interpolated_along_rows_and_columns():
+    field = GriddedPSF.of_model(Gridded())
+    for image, (x, y) in zip(Gridded.data, Gridded.grid_xypos, strict=True):
+        np.testing.assert_allclose(field.psf_at(y, x).images[0], image, atol=1e-14)
+    assert field.psf_at(0, 0).spacing == 0.5
+    np.testing.assert_array_equal(field.psf_at(-5, 200).images, field.psf_at(20, 90).images)
+    corners = [field.psf_at(y, x).images for y in (20, 80) for x in (50, 90)]
+    mean = np.tensordot([0.1875, 0.0625, 0.5625, 0.1875], corners, 1)
+    np.testing.assert_allclose(field.psf_at(65, 60).images, mean, atol=1e-15)
+
+
+def test_gridded_psfs_that_make_no_grid_are_refused():
+    model = Gridded()
+    model.grid_xypos = [*Gridded.grid_xypos[:-1], (91.0, 80.0)]
+    with pytest.raises(ValueError, match="6 places for 6 PSFs, on 2 rows and 4 columns"):
+        GriddedPSF.of_model(model)
+    model.oversampling = (2, 4)
+    with pytest.raises(ValueError, match="oversampling is"):
+        GriddedPSF.of_model(model)
+    with pytest.raises(ValueError, match="model is int, must be a GriddedPSFModel"):
+        GriddedPSF.of_model(3)
+    with pytest.raises(ValueError, match=r"x is \[2.0, 1.0\]"):
+        GriddedPSF(np.ones((1, 2, 5, 5)), [0.0], [2.0, 1.0])
+
+
+def stdpsf_file(path):
+    """The PSFs of Gridded as STDPSF has them: four samples a pixel, positions in the header."""
+    order = sorted(range(6), key=lambda i: Gridded.grid_xypos[i][::-1])
+    hdu = fits.PrimaryHDU(np.stack([Gridded.data[i] for i in order]).astype(np.float32))
+    hdu.header.update({"NXPSFS": 3, "NYPSFS": 2, "INSTRUME": "ACS"})
+    hdu.header.update({f"IPSFX{i + 1:02}": int(x) + 1 for i, x in enumerate((10, 50, 90))})
+    hdu.header.update({f"JPSFY{i + 1:02}": int(y) + 1 for i, y in enumerate((20, 80))})
+    hdu.writeto(path)
+
+
+def test_photutils_reads_files_of_gridded_psfs(tmp_path, grid):
+    psf = pytest.importorskip("photutils.psf")
+    stdpsf_file(tmp_path / "STDPSF_WFC3UV_F814W.fits")
+    field = read_psf_field(tmp_path / "STDPSF_WFC3UV_F814W.fits", "gridded", grid)
+    model = psf.GriddedPSFModel.read(str(tmp_path / "STDPSF_WFC3UV_F814W.fits"))
+    for y, x in ((20.0, 50.0), (47.0, 33.0), (60.0, 88.0)):
+        wanted = psf_of(model, position_px=(y, x), n_pixels=41 / 4)
+        np.testing.assert_allclose(field.psf_at(y, x).images, wanted.images, atol=1e-6)
+        assert field.psf_at(y, x).spacing == wanted.spacing
+    (tmp_path / "bad.fits").write_text("no")
+    with pytest.raises(FileError, match="no file of gridded PSFs"):
+        read_psf_field(tmp_path / "bad.fits", "gridded", grid)
 
 
 def test_bands_of_fields_with_smaller_stamps_keep_their_centres():

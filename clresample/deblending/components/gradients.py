@@ -87,8 +87,9 @@ def _model(fit, which):
     """All morphologies of a fit, and after them the cores of the components `which` (k,)."""
     scene, morphs = fit.scene, list(fit.state.morph)
     cores = [morphs[i] * scene.profile[i] for i in which]
-    origin = np.concatenate([scene.origin, scene.origin[which]])
-    return Model(fit.padded.shape, fit.views, [None] * len(fit.views), origin, morphs + cores)
+    source, origin = (np.concatenate([of, of[which]]) for of in (fit.start.source, scene.origin))
+    bare = [None] * len(fit.views)
+    return Model(fit.padded.shape, fit.views, bare, source, origin, morphs + cores)
 
 
 def _asked(fit, which, seen):

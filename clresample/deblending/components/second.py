@@ -91,7 +91,8 @@ def _patch(fit, asked):
     views = []
     for view, seen, part in zip(fit.views, asked.observed, fit.scene.channels(), strict=True):
         others = seen.total(spectra[:, part]) + fit.state.sky[part, None, None]
-        views.append(replace(view, data=view.data - others))
+        own = view.of_sources(begin.source[chosen])
+        views.append(replace(own, data=view.data - others))
     positions = begin.positions[begin.source[chosen]]
     sources = [Extended(position_px=tuple(map(float, p)), n_components=2) for p in positions]
     return Patch(fit.frame, sources, positions, views)

@@ -36,6 +36,7 @@ class Exposure:
     y (My,), x (Mx,) [model px]: where they are, ascending
     root (C, My, Mx): square root of the weights
     reach_px [model px]: see REACH_FWHM; transfer: its Transfer
+    shares (n, C, T): of its terms in the PSF of each component, None where it has one
     """
 
     y: np.ndarray
@@ -43,16 +44,18 @@ class Exposure:
     root: np.ndarray
     reach_px: float
     transfer: Transfer
+    shares: np.ndarray | None
 
     @classmethod
-    def of(cls, view: WhitenedView, frame, observation):
-        """That of an Observation and its view on a Frame."""
+    def of(cls, view: WhitenedView, frame, observation, source):
+        """That of an Observation and its view on a Frame; source (n,): of each component."""
         scale = np.sqrt(abs(np.linalg.det(view.mapping.matrix)))
         reach = REACH_FWHM * float(observation.psf.fwhm_px.max()) * scale
-        transfer = Transfer(view.mapping.matrix, frame.psf, observation.white.psf)
+        transfer = Transfer(view.mapping.matrix, frame.psf, view.op.plans[0].psfs[1])
         make = _parallel if view.mapping.geometry == "aligned" else _spread
         y, x, root = make(view, min(scale, transfer.nyquist_px))
-        return cls(y, x, root, reach, transfer)
+        shares = None if view.shares is None else view.shares[source].astype(np.float32)
+        return cls(y, x, root, reach, transfer, shares)
 
     def window(self, origin, shape):
         """First and one-past-last row and column (2, 2) within reach of a box of the frame."""
@@ -62,11 +65,14 @@ class Exposure:
              for at, o, n in parts]
         ).T  # fmt: skip
 
-    def observe(self, images, origin, low, high):
-        """Whitened images (k, C, ry, rx) of images (k, ny, nx) in a box of the frame from `origin`
-        on, at the rows and columns from `low` to `high`; float32."""
+    def observe(self, images, i, origin, low, high):
+        """Whitened images (k, C, ry, rx) of component i's images (k, ny, nx) in a box of the frame
+        from `origin` on, at the rows and columns from `low` to `high`; float32."""
         k, n_y, n_x = images.shape
         nu_y, nu_x, d = self.transfer.at((n_y, n_x), self.reach_px)
+        if self.shares is not None:
+            parts = self.shares[i]
+            d = np.einsum("yctx,ct->ycx", d.reshape(len(nu_y), *parts.shape, -1), parts)
         images = without_dark(images.transpose(1, 0, 2).astype(np.float32))  # (ny, k, nx)
         wave_y = _waves(nu_y, -np.arange(n_y))  # (Hy, ny)
         parts = np.concatenate([wave_y.real, wave_y.imag]) @ images.reshape(n_y, -1)
@@ -84,7 +90,7 @@ class Exposure:
 
 @dataclass(frozen=True, eq=False)
 class Transfer:
-    """The transfer function of an observation at the frequencies that a box needs.
+    """The transfer function of an observation, C T bands, at the frequencies that a box needs.
 
     matrix (2, 2): of its mapping; psf_in, psf_out: of the model and the observation
     """
@@ -101,7 +107,7 @@ class Transfer:
         return 1 / (2 * max(abs(nu[0][-1]), abs(nu[1][-1]), 1 / BAND_PERIOD_PX))
 
     def at(self, shape, reach):
-        """Frequencies nu_y (Hy,) >= 0, nu_x (W,) and D (Hy, C, W) with the weights of a sum over
+        """Frequencies nu_y (Hy,) >= 0, nu_x (W,) and D (Hy, C T, W) with the weights of a sum over
         the half-plane, of a period at which a box does not see itself within `reach`."""
         sides = [int(np.ceil((n + 2 * reach) / PERIOD_PX)) * PERIOD_PX + 1 for n in shape]
         key = tuple(sides)

@@ -133,7 +133,7 @@ class _Sum:
             padded = np.pad(morph, 1, mode="edge")
             slopes += [np.array(np.gradient(padded))[:, 1:-1, 1:-1]]
         seen = self.exposure.observe(
-            np.concatenate([*slopes, images]).astype(np.float32), origin, low, high
+            np.concatenate([*slopes, images]).astype(np.float32), i, origin, low, high
         )
         n = sum(map(len, slopes))
         light = np.concatenate([seen[n:], seen[1:n]]) * spectrum[:, None, None]

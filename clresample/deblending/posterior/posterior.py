@@ -185,7 +185,7 @@ def posterior_of(fit, morphs, peaks, seen):
         settings.prior,
     )
     pairs = zip(fit.views, fit.blend.observations, strict=True)
-    exposures = [Exposure.of(view, fit.frame, o) for view, o in pairs]
+    exposures = [Exposure.of(view, fit.frame, o, fit.start.source) for view, o in pairs]
     try:
         sky, shifts = settings.fit_sky, settings.fit_shifts
         return Posterior(solution, exposures, fit_sky=sky, fit_shifts=shifts), []

@@ -46,15 +46,15 @@ def damping(scene, state, prior) -> np.ndarray:
 def _pull(scene, state, morphs, prior, *, rest):
     """What R^T w R makes of the model of `morphs`, or of its residual `rest`, by each source's
     variable: S arrays (ny, nx)."""
-    model = compose(scene.shape, scene.origin, morphs, state.spectra)
-    pulls, parts = [], zip(scene.channels(), scene.ops, scene.weights, scene.data, strict=True)
-    for part, op, weights, data in parts:
-        image = op.forward(model[part])
+    by_morph, parts = 0, zip(scene.channels(), scene.ops, scene.weights, scene.data, strict=True)
+    for i, (part, op, weights, data) in enumerate(parts):
+        spectra = scene.parts(i, state.spectra[:, part])
+        image = op.forward(compose(scene.shape, scene.origin, morphs, spectra))
         if rest:
             image = image + state.sky[part, None, None] - data
-        pulls.append(op.adjoint(weights * image))
-    pull = np.concatenate(pulls).astype(np.float64)
-    by_morph = gather_morph(pull, scene.origin, scene.profile, state.spectra)
+        pull = op.adjoint(weights * image).astype(np.float64)
+        own = gather_morph(pull, scene.origin, scene.profile, spectra)
+        by_morph = own if i == 0 else [a + b for a, b in zip(by_morph, own, strict=True)]
     pairs = zip(by_morph, scene.profile, strict=True)
     return [_gather(image, profile, prior) for image, profile in pairs]
 

@@ -26,6 +26,8 @@ class Scene:
     profile (S): arrays (ny, nx) [1]: expected morphology, max = 1
     fixed (S,): bool, the morphology stays as it is
     scale (S, C): what counts as one step of each spectrum, in the unit of the data
+    shares: per observation (S, Co, T), of its operator's terms in each component's PSF; None where
+        its PSF is the same for all
     power (S, C): sum w (R p)^2 of each profile p, the curvature of the loss by its spectrum
     damping (S,): gradients under which steps are shorter than the step sizes; see
         `curvature.damping`
@@ -42,6 +44,7 @@ class Scene:
     profile: list[np.ndarray]
     fixed: np.ndarray
     scale: np.ndarray
+    shares: list | None = None
     power: np.ndarray | None = None
     damping: np.ndarray | None = None
     fit_sky: bool = False
@@ -50,6 +53,17 @@ class Scene:
         """For each observation, its part of the channels."""
         ends = np.cumsum([op.shape_out[0] for op in self.ops]).tolist()
         return [slice(end - op.shape_out[0], end) for op, end in zip(self.ops, ends, strict=True)]
+
+    def shares_of(self, i):
+        """Observation i's shares (S, Co, T) or None."""
+        return self.shares[i] if self.shares else None
+
+    def parts(self, i, spectra):
+        """Spectra (S, Co) of observation i as its operator takes them, (S, Co T)."""
+        shares = self.shares_of(i)
+        if shares is None:
+            return spectra
+        return (spectra[:, :, None] * shares).reshape(len(spectra), -1)
 
     @property
     def n_bytes(self) -> int:

@@ -43,6 +43,14 @@ class Aim:
             aim = self._at_all if whole[first] else self._at_place if alone[first] else self._about
             yield first, last, *aim(slots, first, last)
 
+    def shares(self, slots, first, last):
+        """Shares (m, Co, T) of the operators' terms in the PSFs of slots' sources, None where there
+        is one term; see WhitenedView."""
+        if self.views[0].shares is None:
+            return None
+        rows = zip(slots.scene[first:last], slots.components[first:last], strict=True)
+        return np.array([self.views[b].shares[c.source] for b, c in rows])
+
     def _about(self, slots, first, last):
         """What `runs` says of slots whose plan is that of all boxes of their shape."""
         scene, origin = slots.scene[first], slots.origin[first:last]

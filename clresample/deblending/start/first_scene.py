@@ -41,6 +41,7 @@ def first_scene(fit) -> tuple[Scene, State]:
         profile=morphs,
         fixed=np.array([isinstance(fit.sources[fit.fitted[i]], Point) for i in begin.source]),
         scale=np.where(error < UNSEEN, error + SPECTRUM_PART * spectra, 0),
+        shares=[None if v.shares is None else v.shares[begin.source] for v in fit.views],
         power=power,
         fit_sky=fit.settings.fit_sky,
     )

@@ -15,7 +15,8 @@ class Renderer:
     executor: of the plan, with its transfer function; None makes one
 
     A box is transformed once for all bands and all slots; the offset of each slot and the transfer
-    functions of the bands are multiplied in between (kernels/start.cl, turn).
+    functions of the bands, of which each slot has its own sum of terms where the PSF varies, are
+    multiplied in between (kernels/start.cl, turn).
     """
 
     def __init__(self, device, dtype, plan, executor=None):
@@ -35,6 +36,7 @@ class Renderer:
             dtype=dtype,
             local_size=tuning.local_size(3),
             ROWS=tuning.row_loops,
+            TERMS=e.n_terms,
         ).bind(h_y=e.h_y, n_pad=e.k_pad, n_bands=e.n_bands, D=e.transfer)
 
     @property
@@ -42,17 +44,18 @@ class Renderer:
         """Elements of one image as all bands see it."""
         return self.executor.n_bands * int(np.prod(self.plan.mapping.shape_out))
 
-    def __call__(self, images, i_image, seen, i_seen, n, moves):
+    def __call__(self, images, i_image, seen, i_seen, n, moves, shares=None):
         """Queue the images of slots that follow each other, n of each.
 
         images, i_image: device array and the element of it where they begin; seen, i_seen: likewise
             where they go; moves (slots, 2) [model px]: by which the slots' pixels are off the
-            plan's
+            plan's; shares (slots, C, T): of the plan's terms, None where it has one
         """
         e, count, (w_y, w_x) = self.executor, len(moves), self.plan.mapping.shape_out
         group = min(count, max(1, e.tuning.group_bytes // (n * self._n_bytes)))
         self._reserve(group * n)
         phase = self.device.put(self._phases(moves), self.dtype)
+        self._turn.bind(shares=phase if shares is None else self.device.put(shares, self.dtype))
         for first in range(0, count, group):
             m = min(group, count - first) * n
             at, to = i_image + first * n * e.n_y * e.n_x, i_seen + first * n * self.size

@@ -27,12 +27,14 @@ class Model:
     frame (2,) [px]: its shape, padding included
     views: WhitenedViews; bare: others like them, or None where the view itself is as the
         observation was taken
+    source (n,): number of each one's source, by which views know its PSF
     origin (n, 2) [px], morphs (n): arrays (ny, nx), in boxes of the frame
     """
 
     frame: tuple[int, int]
     views: list[WhitenedView]
     bare: list
+    source: np.ndarray
     origin: np.ndarray
     morphs: list
 
@@ -85,9 +87,11 @@ def see(models: list[Model], *, fit_sky=False) -> list[Seen]:
     """
     components = []
     for b, model in enumerate(models):
-        for i, (origin, morph) in enumerate(zip(model.origin, model.morphs, strict=True)):
+        rows = zip(model.source, model.origin, model.morphs, strict=True)
+        for i, (source, origin, morph) in enumerate(rows):
             shape = _Cutout(morph, origin, model.frame)
-            components.append(Component(b, i, shape, np.asarray(origin, float), model.frame))
+            place = np.asarray(origin, float)
+            components.append(Component(b, i, int(source), shape, place, model.frame))
     looking = _looking(models, [m.views for m in models], components, fit_sky)
     scenes, thetas = np.arange(len(models)), [np.zeros(0)] * len(components)
     brightness = np.zeros(len(components))

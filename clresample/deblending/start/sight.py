@@ -55,15 +55,16 @@ class Sight:
             low[first:last] = at
             if renderer is not None:
                 size[first:last] = renderer.plan.mapping.shape_out
-                jobs.append((first, renderer, int(slots.n_images[first]), moves))
+                shares = self.aim.shares(slots, first, last)
+                jobs.append((first, renderer, int(slots.n_images[first]), moves, shares))
         begin, n = ends_of(slots.n_images * self.n_bands * size.prod(axis=1))
         self.place = np.column_stack([slots.scene, low, size, slots.n_images, begin])
         self.place_on_device = self.device.put(self.place.astype(np.int32))
         self._listed = None
         self.n_elements, self.seen = n, self.device.empty(n, self.dtype)
-        for first, renderer, n_images, moves in jobs:
+        for first, renderer, n_images, moves, shares in jobs:
             at = int(slots.begin[first]), int(begin[first])
-            renderer(images, at[0], self.seen, at[1], n_images, moves)
+            renderer(images, at[0], self.seen, at[1], n_images, moves, shares)
 
     def whiten(self):
         """Bring what is seen to units of the noise."""

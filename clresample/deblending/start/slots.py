@@ -26,12 +26,14 @@ FAINTEST, BRIGHTEST = 1e-6, 2e-3
 class Component:
     """One component of one scene.
 
-    scene: which; index: of the component in its scene; shape: Shape; position (2,) [px]
+    scene: which; index: of the component in its scene; source: number of its source there
+    shape: Shape; position (2,) [px]
     frame (2,) [px]: the frame's shape
     """
 
     scene: int
     index: int
+    source: int
     shape: object
     position: np.ndarray
     frame: tuple[int, int]

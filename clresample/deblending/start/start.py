@@ -77,9 +77,10 @@ class StartingPoint:
         return len(self.shapes)
 
     def stars(self):
-        """The point sources: each one's Star, place (2,) [px] and spectrum (C,), a list."""
+        """The point sources: each one's Star, the number of its source, its place (2,) [px] and
+        spectrum (C,), a list."""
         spectra = self.spectra / self.peaks[:, None]
-        rows = zip(self.shapes, self.positions[self.source], spectra, strict=True)
+        rows = zip(self.shapes, self.source, self.positions[self.source], spectra, strict=True)
         return [row for row in rows if isinstance(row[0], Star)]
 
     def drawn(self, i, origin, size):
@@ -122,8 +123,8 @@ def weighed(patch, point: StartingPoint, settings):
 
 def _solved_again(patch, point, fit_sky):
     """The same profiles, with other spectra, sky and power."""
-    pairs = enumerate(zip(point.shapes, point.places, strict=True))
-    components = [Component(0, i, shape, place, patch.frame.shape) for i, (shape, place) in pairs]
+    rows = enumerate(zip(point.source, point.shapes, point.places, strict=True))
+    components = [Component(0, i, *row, patch.frame.shape) for i, row in rows]
     looking = looking_at([patch.views], components, PRECISION, TOLERANCE, fit_sky=fit_sky)
     noise = np.concatenate([v.pixel_noise for v in patch.views])
     brightness = (point.spectra / noise).max(axis=1)
@@ -180,7 +181,7 @@ def _components(patches):
         for i, (source, position) in enumerate(zip(patch.sources, patch.positions, strict=True)):
             for shape in components_of(source, patch.frame):
                 place = np.array(position, dtype=np.float64)
-                components.append(Component(b, n, shape, place, patch.frame.shape))
+                components.append(Component(b, n, i, shape, place, patch.frame.shape))
                 sources.append(i)
                 n += 1
     return np.array(sources), components
@@ -203,7 +204,7 @@ def _dark(patches, sources, looking):
         for b, i in again:
             frame, position = patches[b].frame, np.array(patches[b].positions[i], float)
             shape = Galaxy(frame, widened=NEARBY)
-            wide.append(Component(b, int(count[b]), shape, position, frame.shape))
+            wide.append(Component(b, int(count[b]), i, shape, position, frame.shape))
             count[b] += 1
         around = looking.instead(wide)
         scenes = np.unique(around.scene)

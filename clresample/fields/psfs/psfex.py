@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ...files.whole_file import FileError
 from ...sky.psf import PSF
-from .psf_field import PSFField, finite
+from ...sky.varying.field import PSFField, finite
 
 
 @dataclass(frozen=True, eq=False, init=False)

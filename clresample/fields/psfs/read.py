@@ -1,4 +1,4 @@
-"""PSF fields of files: an image, a cube with positions, cells, PSFEx, Euclid's CATALOG-PSF."""
+"""PSF fields of files: images, cubes, cells, PSFEx, Piff, gridded PSFs, Euclid's CATALOG-PSF."""
 
 from __future__ import annotations
 
@@ -6,14 +6,28 @@ import numpy as np
 
 from ...files.fits import choose_hdu, open_fits, read_pixels, read_psf
 from ...files.whole_file import FileError
-from .psf_field import ConstantPSF, PSFField
+from ...sky.varying.field import PSFField
+from .gridded import read_gridded
+from .piff import STAMP_PX, PiffPSF
+from .psf_field import ConstantPSF
 from .psfex import PSFExPSF
 from .sampled import PSFCells, PSFCube
 
-FORMATS = ("image", "cube", "cells", "psfex", "euclid-mer")
+FORMATS = ("image", "cube", "cells", "psfex", "piff", "gridded", "euclid-mer")
 
 
-def read_psf_field(path, form, grid, *, hdu=None, spacing=1.0, center=None, **cells) -> PSFField:
+def read_psf_field(
+    path,
+    form,
+    grid,
+    *,
+    hdu=None,
+    spacing=1.0,
+    center=None,
+    stamp_px=STAMP_PX,
+    detector=None,
+    **cells,
+) -> PSFField:
     """The PSF field of a file.
 
     form: how it is kept
@@ -23,9 +37,13 @@ def read_psf_field(path, form, grid, *, hdu=None, spacing=1.0, center=None, **ce
         "cells": a FITS image (cells_y, cells_x, ny, nx) or (cells_y, cells_x, C, ny, nx), with
             cell_px and origin_px, see PSFCells
         "psfex": a PSFEx file
+        "piff": a Piff file
+        "gridded": a file that photutils' GriddedPSFModel reads, see `read_gridded`
         "euclid-mer": a CATALOG-PSF of Euclid's MER, see `read_mer_sheet`
     grid: of the mosaic; hdu: of the image, None = the first
-    spacing [px], center: of the samples, see PSF; those of PSFEx files are their own
+    spacing [px], center: of the samples, see PSF; those of PSFEx, Piff and gridded files are their
+        own; stamp_px [px]: side of Piff's stamps
+    detector: its number, of Piff and STDPSF files that hold several
 
     Raises FileError, one line that names the file, and ValueError for another form.
     """
@@ -36,6 +54,10 @@ def read_psf_field(path, form, grid, *, hdu=None, spacing=1.0, center=None, **ce
         return ConstantPSF(read_psf(path, hdu=hdu, **samples))
     if form == "psfex":
         return PSFExPSF(path)
+    if form == "piff":
+        return PiffPSF(path, chip=detector, stamp_px=stamp_px)
+    if form == "gridded":
+        return read_gridded(path, detector=detector)
     with open_fits(path) as hdus:
         try:
             if form == "euclid-mer":

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ...sky.psf import PSF
-from .psf_field import PSFField, finite
+from ...sky.varying.field import PSFField, finite
 
 
 @dataclass(frozen=True, eq=False)

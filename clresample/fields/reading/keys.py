@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ...files.scene_keys import (
     COUNT,
+    FRACTION,
     HDU,
     NUMBERS,
     POSITIVE,
@@ -60,6 +61,8 @@ MOSAIC = {
     "psf_format": Rule(" or ".join(f'"{form}"' for form in FORMATS), lambda v: v in FORMATS),
     "psf_hdu": HDU,
     "psf_spacing": POSITIVE,
+    "psf_stamp_px": COUNT,
+    "psf_detector": COUNT,
     "psf_cell_px": PAIR,
     "psf_origin_px": PAIR,
 }
@@ -82,7 +85,8 @@ FIELD_TABLES = {
     },
     "sources": {key: TABLES["sources"][key] for key in ("catalogue", "format", "ra", "dec")},
     "detection": TABLES["detection"],
-    "fit": {key: TABLES["fit"][key] for key in ("max_iter", "enough", "fit_sky", "flux_floor")},
+    "fit": {key: TABLES["fit"][key] for key in ("max_iter", "enough", "fit_sky", "flux_floor")}
+    | {"psf_tolerance": FRACTION},
 }
 NEEDED = {"mosaic": ("name", "image", "psf"), "sources": ("catalogue",)}
 WEIGHTS = "weight", "variance", "rms"

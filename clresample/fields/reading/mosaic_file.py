@@ -173,6 +173,9 @@ def _psf(folder, table, grid, inputs):
     """The PSFField of a table's files."""
     form, files = table.get("psf_format", "image"), _listed(table["psf"])
     given = {"hdu": table.get("psf_hdu"), "spacing": table.get("psf_spacing", 1.0)}
+    for key in ("stamp_px", "detector"):
+        if f"psf_{key}" in table:
+            given[key] = table[f"psf_{key}"]
     if form == "cells":
         if "psf_cell_px" not in table:
             raise ValueError('psf_cell_px is missing: psf_format = "cells" needs a cell\'s size')

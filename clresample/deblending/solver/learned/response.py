@@ -14,7 +14,8 @@ class Response:
     """The operators of a batch's Gradient, asked about noise and misfit rather than gradients.
 
     buffers, gradient: the batch and its Gradient, whose image buffers are overwritten
-    weights: per observation R^T w (B, Co, Ny, Nx) on the device
+    weights: per observation R^T w (B, Co T, Ny, Nx) on the device; T > 1 where the PSF varies, and
+        then that of the first term is in the middle of the scene
     """
 
     def __init__(self, buffers, gradient):
@@ -42,17 +43,17 @@ class Response:
         median weight: B answers (C, Ny, Nx) without padding, and pixels (B, C, 2)."""
         b, answers, pixels = self.buffers, [], []
         for i, o in enumerate(self._observations):
-            covered = b.device.get(self.weights[i])
+            covered, n_terms = b.device.get(self.weights[i]), o.op.n_terms
             at = np.array(
                 [_middle(_unpadded(*pair)) for pair in zip(b.scenes, covered, strict=True)]
             )
             impulse = np.zeros(covered.shape, b.dtype)
             for scene, (y, x) in zip(impulse, at, strict=True):
-                scene[:, y, x] = 1
-            answer = o.op.adjoint(o.op.forward(b.put(impulse)))
+                scene[::n_terms, y, x] = 1
+            answer = b.device.get(o.op.adjoint(o.op.forward(b.put(impulse))))[:, ::n_terms]
             level = [[_median(w) for w in s.weights[i]] for s in b.scenes]
-            answers.append(b.device.get(answer) * np.array(level)[:, :, None, None])
-            pixels.append(np.repeat(at[:, None], covered.shape[1], axis=1))
+            answers.append(answer * np.array(level)[:, :, None, None])
+            pixels.append(np.repeat(at[:, None], answer.shape[1], axis=1))
         answers = np.concatenate(answers, axis=1)
         pairs = zip(b.scenes, answers, strict=True)
         return [_unpadded(*pair) for pair in pairs], np.concatenate(pixels, axis=1)

@@ -19,14 +19,14 @@ def flops(buffers, op, executor) -> list[float]:
 
     What all of them do, from frequencies to the observation and back, is left out.
     """
-    e, n_images = executor, len(buffers.scenes) * op.shape_out[0]
+    e, n_images = executor, len(buffers.scenes) * op.shape_in[0]
     shape = buffers.host_boxes.shape[:, list(e.axes)].astype(float)
     rows, pixels = shape[:, 0].sum(), shape.prod(1).sum()
     first, second = n_images * e.n_y * e.n_x * e.k_pad, n_images * e.k_y * e.n_y * e.k_pad
     boxed = pixels * e.k_pad, rows * e.k_y * e.k_pad
     points = (
         1.5
-        * op.shape_out[0]
+        * op.shape_in[0]
         * np.array([pixels, rows * e.k_pad, buffers.n_sources * e.k_y * e.k_pad])
     )
     counts = first + second, BOXED * boxed[0] + second, BOXED * sum(boxed)

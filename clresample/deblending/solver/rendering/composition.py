@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 
 class Composition:
     """Sums over sources of one observation's frames, which any stage of rendering may have.
@@ -12,17 +14,27 @@ class Composition:
     buffers: the batch; i_observation: whose bands; boxes: Boxes of the boxed images in frames of
     shape (ny, nx); transfer (buffer, elements of a scene): where frames are frequencies, which
     `compose` then multiplies by it
+
+    Where the PSF varies, an observation of Co channels has Co * T frames, one for each of its
+    operator's terms, in which a source has its spectrum times its shares (Scene.shares):
+
+        frame[b, c, t] = sum_s A[s, c] shares[s, c, t] boxed_s
     """
 
     def __init__(self, buffers, i_observation, boxes, shape, transfer=None):
         b, (ny, nx) = buffers, shape
         part = b.scenes[0].channels()[i_observation]
-        n_bands = part.stop - part.start
+        n_bands, n_channels, channel = part.stop - part.start, b.n_channels, part.start
+        self._parts = None
+        if b.scenes[0].shares_of(i_observation) is not None:
+            self._parts = _Parts(b, i_observation, part)
+            n_bands = n_channels = self._parts.n_frames
+            channel = 0
         group, n_images = b.tuning.sum_group, len(b.scenes) * n_bands
         shared = {
             "table": b.device.put(boxes.table),
-            "n_channels": b.n_channels,
-            "channel": part.start,
+            "n_channels": n_channels,
+            "channel": channel,
             "n_bands": n_bands,
             "ny_frame": ny,
             "nx_frame": nx,
@@ -50,10 +62,14 @@ class Composition:
 
     def compose(self, boxed, spectra, frame):
         """Queue frame = sum_s A boxed_s, times the transfer function where there is one."""
+        if self._parts is not None:
+            spectra = self._parts.of(spectra)
         self._compose(self._compose_size, boxed=boxed, spectra=spectra, frame=frame)
 
     def gather_boxed(self, frame, spectra, d_boxed, active, *, add=False):
         """Queue d_boxed of the sources `active` (n,): written, or added to what is there."""
+        if self._parts is not None:
+            spectra = self._parts.of(spectra)
         self._morph(
             (*self._morph_size, active.size),
             active=active,
@@ -65,4 +81,45 @@ class Composition:
 
     def gather_spectra(self, frame, boxed, d_spectra):
         """Queue dA of this observation's channels into d_spectra (S, C)."""
-        self._spectra(self._spectra_size, frame=frame, boxed=boxed, d_spectra=d_spectra)
+        found = d_spectra if self._parts is None else self._parts.d_parts
+        self._spectra(self._spectra_size, frame=frame, boxed=boxed, d_spectra=found)
+        if self._parts is not None:
+            self._parts.gather(d_spectra)
+
+
+class _Parts:
+    """Spectra of one observation's terms, (S, Co * T): kernels/scene.cl, share and unshare.
+
+    buffers: the batch; i: which observation; channels: slice of all
+    """
+
+    def __init__(self, buffers, i, channels):
+        b = buffers
+        shares = np.concatenate([scene.shares_of(i) for scene in b.scenes])
+        n_sources, n_bands, n_terms = shares.shape
+        self.n_frames = n_bands * n_terms
+        self._spectra, self.d_parts = (
+            b.device.empty((n_sources, self.n_frames), b.dtype) for _ in range(2)
+        )
+        self._share, self._unshare = (
+            b.scene_launcher(name).bind(
+                n_terms=n_terms,
+                n_bands=n_bands,
+                n_channels=b.n_channels,
+                channel=channels.start,
+                shares=b.put(shares),
+            )
+            for name in ("share", "unshare")
+        )
+        self._size = b.sized(n_bands, n_sources, 1)
+        self._share.bind(n_sources=n_sources)
+        self._unshare.bind(n_sources=n_sources)
+
+    def of(self, spectra):
+        """Queue those of spectra (S, C), and return them."""
+        self._share(self._size, spectra=spectra, parts=self._spectra)
+        return self._spectra
+
+    def gather(self, d_spectra):
+        """Queue dA of this observation's channels into d_spectra (S, C), from `d_parts`."""
+        self._unshare(self._size, parts=self.d_parts, spectra=d_spectra)

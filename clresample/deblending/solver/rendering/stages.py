@@ -12,7 +12,8 @@ and backwards, Q_c being what the observation's residuals are there:
     depth 2    dS_s = Ty[:, rows_s]^T (sum_c A_sc Q_c) Tx[cols_s]^T,    dA_sc = <Z_s, Q_c>
 
 All three are the same sum, to rounding; choice.py says which takes least. Symbols as in
-resampling/executor.py.
+resampling/executor.py. Where the PSF varies, each Z_c is a sum over the operator's terms, and A_sc
+the part of the spectrum that a source has in each (composition.py).
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ class Transformed:
         else:
             boxes, shape = self._boxes.planes, (e.k_y, e.k_pad)
             transfer = e.tables(e.transfer)[:2]
-            self._boxed, self._frame = self._empty(boxes), e.scratch["frequencies"]
+            self._boxed, self._frame = self._empty(boxes), e.model_frequencies
         self._d_boxed = self._empty(boxes)
         self._composition = Composition(b, i_observation, boxes, shape, transfer)
 
@@ -95,13 +96,13 @@ class Transformed:
     def render(self, spectra, image):
         self._composition.compose(self._boxed, spectra, self._frame)
         if self.depth == 1:
-            self._executor.in_rows(self._n_images)
-        self._executor.observe(ImageBatch.of(image), self._n_images)
+            self._executor.in_rows(self._n_images * self._executor.n_terms)
+        self._executor.show(ImageBatch.of(image), self._n_images)
 
     def collect(self, image):
-        self._executor.collect(ImageBatch.of(image), self._n_images)
+        self._executor.take(ImageBatch.of(image), self._n_images)
         if self.depth == 1:
-            self._executor.back_rows(self._n_images)
+            self._executor.back_rows(self._n_images * self._executor.n_terms)
 
     def gather_spectra(self, d_spectra):
         self._composition.gather_spectra(self._frame, self._boxed, d_spectra)

@@ -1,0 +1,1 @@
+"""PSFs that vary over an image: what each answers, and the few PSFs that stand for many."""

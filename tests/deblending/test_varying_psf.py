@@ -1,0 +1,212 @@
+"""PSFs that vary from source to source of one blend: the solver's operators, whole fits, fluxes."""
+
+import pickle
+
+import numpy as np
+import pytest
+from helpers.geometries import GEOMETRIES, ONE_OF_EACH
+from helpers.solver import PRIOR, every_type, posed
+from helpers.varying import FLUXES, NOISE, SHAPE, observation, stars, widening
+
+from clresample import Blend, Extended, Point, Settings, catalogue, deblend, deblend_many
+from clresample.deblending.fit import Fit
+from clresample.deblending.solver.buffers import Buffers
+from clresample.deblending.solver.operators import MorphologyOperator, SpectraOperator
+from clresample.deblending.solver.rendering import choice
+from clresample.deblending.solver.scene_model import compose
+from clresample.resampling import reference
+from clresample.resampling.plan import Precision, make_plan
+from clresample.resampling.resampler import Resampler
+from clresample.sky.psf import PSF
+from clresample.testing import check_adjoint
+
+FRAME = 31, 26
+BOXES = (
+    ((2, 3, 11, 14), (0, 0, 9, 8), (20, 17, 11, 9)),
+    ((4, 0, 7, 26), (0, 0, 31, 26)),
+)
+WIDTHS = np.array([[1.4, 1.6, 1.5], [1.9, 1.7, 2.1]])
+MODEL_PSF = PSF.gaussian(0.8, n_pixels=15)
+every_depth = pytest.mark.parametrize("depth", [0, 1, 2])
+CORNERS = np.array([(12.3, 13.1), (13.6, 82.4), (58.2, 12.7), (57.4, 81.8)])
+
+
+def batch_of(device, geometry, dtype):
+    """Two scenes of one observation of two bands, three terms; buffers and their operator."""
+    if dtype == np.float64 and not device.has_fp64:
+        pytest.skip(f"{device.name} has no double precision")
+    plan = make_plan(
+        GEOMETRIES[geometry](),
+        MODEL_PSF,
+        PSF.gaussian(WIDTHS.ravel()),
+        precision=Precision.of(dtype),
+        n_terms=3,
+    )
+    op, pairs = Resampler.from_plans([plan], dtype=dtype, device=device), []
+    for i, boxes in enumerate(BOXES):
+        rng, n = np.random.default_rng(i), len(boxes)
+        shares = rng.normal(size=(n, 2, 3))
+        given = {
+            "shape": FRAME,
+            "extent": FRAME,
+            "ops": [op],
+            "data": [rng.normal(0, 3, op.shape_out)],
+            "weights": [rng.uniform(0.5, 1.5, op.shape_out)],
+            "scale": np.ones((n, 2)),
+            "spectra": rng.uniform(0.5, 2, (n, 2)),
+            "sky": np.zeros(2),
+            "shares": [shares],
+        }
+        pairs.append(posed(device, dtype, boxes=boxes, seed=i, **given))
+    scenes, states = map(list, zip(*pairs, strict=True))
+    return Buffers(scenes, states, device, dtype, PRIOR), op, pairs
+
+
+@every_type
+@every_depth
+@pytest.mark.parametrize("geometry", ONE_OF_EACH)
+def test_each_source_is_seen_through_its_own_psf(device, geometry, depth, dtype):
+    b, op, pairs = batch_of(device, geometry, dtype)
+    shown = MorphologyOperator(b, op, choice.rendering(b, 0, op, depth))
+    found = shown.forward(b.device.get(b.morph))
+    psf = PSF.gaussian(WIDTHS.ravel())
+    for (scene, state), image in zip(pairs, found, strict=True):
+        wanted = 0
+        for i, shares in enumerate(scene.shares[0]):  # source by source, in float64
+            spectra = np.repeat(state.spectra[i], 3)[None]
+            model = compose(FRAME, scene.origin[i : i + 1], state.morph[i : i + 1], spectra)
+            n_fft = op.certificate.n_fft
+            seen = reference.resample(model, op.mapping, MODEL_PSF, psf, n_fft)
+            wanted = wanted + (seen.reshape(2, 3, *seen.shape[1:]) * shares[:, :, None, None]).sum(
+                1
+            )
+        error = np.abs(image - wanted).max() / np.abs(wanted).max()
+        assert error < {np.float32: 3e-6, np.float64: 1e-12}[dtype]
+
+
+@every_type
+@every_depth
+@pytest.mark.parametrize("kind", [MorphologyOperator, SpectraOperator])
+def test_gradients_are_the_adjoint(device, kind, depth, dtype):
+    b, op, _ = batch_of(device, "30 degrees", dtype)
+    check_adjoint(
+        kind(b, op, choice.rendering(b, 0, op, depth)),
+        np.random.default_rng(1),
+        tolerance={np.float32: 3e-6, np.float64: 1e-12}[dtype],
+    )
+
+
+def test_the_dot_test_fails_where_the_way_back_takes_other_shares(device):
+    b, op, _ = batch_of(device, "30 degrees", np.float32)
+    shown = MorphologyOperator(b, op, choice.rendering(b, 0, op, 2))
+    parts, right = shown.rendering._composition._parts, shown._adjoint
+
+    def wrong(y, out):
+        parts._share.bind(shares=b.put(np.ones((5, 2, 3))))
+        right(y, out)
+
+    shown._adjoint = wrong
+    with pytest.raises(AssertionError, match="<Ax,y>"):
+        check_adjoint(shown, np.random.default_rng(1))
+
+
+def chi2(result):
+    residual = result.residual(0)
+    return np.nanmean(residual**2) / NOISE**2
+
+
+def points(places):
+    return [Point(position_px=tuple(map(float, p))) for p in places]
+
+
+def test_a_star_in_each_corner_has_its_own_psf(device):
+    data, exact = stars(CORNERS), Settings(psf_error=0)
+    own = deblend([observation(data)], points(CORNERS), settings=exact, device=device)
+    middle = widening((SHAPE[0] - 1) / 2, (SHAPE[1] - 1) / 2)
+    same = deblend([observation(data, middle)], points(CORNERS), settings=exact, device=device)
+    assert 0.97 < chi2(own) < 1.03
+    assert chi2(same) > 1.3
+    found, wrong = (_pulls(result) for result in (own, same))
+    assert np.abs(found).max() < 4
+    assert np.abs(wrong).max() > 20
+
+
+def _pulls(result):
+    """Fluxes (S, C) off the truth, in their errors."""
+    table = catalogue(result)
+    rows = [
+        (np.array(table[f"flux_{c}"]) - truth) / np.array(table[f"flux_err_{c}"])
+        for c, truth in zip("gr", FLUXES.T, strict=True)
+    ]
+    return np.array(rows).T
+
+
+@pytest.fixture(scope="module")
+def varied(device):
+    """Galaxies and a star fitted with a PSF that varies: the Result, and its Blend."""
+    rng = np.random.default_rng(4)
+    places = rng.uniform(15, 55, (5, 2)) * (1, 1.4)
+    sources = [Extended(position_px=tuple(map(float, p))) for p in places[:4]]
+    blend = Blend(
+        (observation(stars(places, fluxes=rng.uniform(2e3, 5e3, (5, 2)))),),
+        (*sources, *points(places[4:])),
+    )
+    return blend, deblend(blend.observations, blend.sources, device=device)
+
+
+def test_a_result_holds_each_component_through_the_psf_at_its_source(varied, device):
+    blend, result = varied
+    (o,), frame = blend.observations, result.frame
+    places = frame.place(blend.sources)
+    for i, c in enumerate(result.components):
+        there = frame.grid.positions_in(o.grid, *places[c.source])
+        op = Resampler(frame.grid, frame.psf, o.grid, widening(*there), device=device)
+        image = np.zeros(frame.shape, np.float32)
+        low, (n_y, n_x) = c.origin, c.morphology.shape
+        image[low[0] : low[0] + n_y, low[1] : low[1] + n_x] = c.morphology
+        found, wanted = np.asarray(result.rendered[0])[i], op.render(image)
+        norm = np.linalg.norm(wanted, axis=(1, 2))
+        off = np.linalg.norm(found - wanted, axis=(1, 2)) / norm
+        assert (off < Settings().psf_tolerance).all()
+        other = Resampler(frame.grid, frame.psf, o.grid, widening(36, 48), device=device)
+        if abs(there[1] - 48) > 15:  # far from the middle, its PSF is another one
+            assert (np.linalg.norm(found - other.render(image), axis=(1, 2)) > 3e-3 * norm).any()
+
+
+def test_it_is_fitted_side_by_side_as_alone_and_travels(varied, device):
+    blend, alone = varied
+    few = Blend(blend.observations, blend.sources[1:])
+    many = deblend_many([blend, few, blend], device=device)
+    for result in (many[0], many[2], pickle.loads(pickle.dumps(many[0]))):
+        np.testing.assert_allclose(result.losses[-1], alone.losses[-1], rtol=1e-3)
+        for one, other in zip(result.components, alone.components, strict=True):
+            np.testing.assert_allclose(one.flux, other.flux, rtol=3e-3)
+    assert len(many[1].components) == 4
+    assert observation(alone.observations[0].data).psf_field.varies
+
+
+def test_correlated_noise_keeps_each_source_s_psf(device):
+    data, kernel = stars(CORNERS), np.outer([0.25, 1, 0.25], [0.25, 1, 0.25])
+    smooth = observation(data, noise=kernel)  # data stay white: only what the model does counts
+    result = deblend([smooth], points(CORNERS), settings=Settings(psf_error=0), device=device)
+    fluxes = np.array([c.flux for c in result.components])
+    assert np.abs(fluxes / FLUXES - 1).max() < 0.01
+    plain = deblend(
+        [observation(data, widening(35.5, 47.5), noise=kernel)],
+        points(CORNERS),
+        settings=Settings(psf_error=0),
+        device=device,
+    )
+    assert np.abs(np.array([c.flux for c in plain.components]) / FLUXES - 1).max() > 0.02
+
+
+def test_a_psf_that_hardly_varies_takes_one_term(device):
+    data = stars(CORNERS)
+    settings = Settings(psf_tolerance=0.5, max_iter=5)
+    blend = Blend((observation(data),), tuple(points(CORNERS)))
+    for tolerance, n_terms in ((0.5, 1), (2e-3, 3), (0.0, 4)):
+        settings = Settings(psf_tolerance=tolerance)
+        fit = Fit(blend, settings, device, np.float32, pad=1)
+        assert fit.views[0].op.n_terms == n_terms
+    with pytest.raises(ValueError, match="psf_tolerance is -1"):
+        Settings(psf_tolerance=-1)
