@@ -21,8 +21,9 @@ from ... import __version__
 from ...device.device import get_device
 from ...device.discovery import DeviceError
 from ...files.whole_file import FileError
-from .pool import LOOK_S, reason_of, shared_threads
+from .pool import LOOK_S, reason_of
 from .seats import Seats
+from .share import shared_threads
 
 NO_DASK = "distributed is not installed (pip install 'clresample[dask]')"
 CONNECT_S = 30.0  # [s] within which the scheduler answers and its first worker is there
@@ -88,7 +89,7 @@ class Cluster:
         self.client.close()
 
     def run(self, work, context, tasks, again=None, stage=""):
-        """Yield the Outcome of every task, as `pool.run_tasks` does.
+        """Yield the Outcome of every task, as `Pool.run` does.
 
         Raises DeviceError when every worker's device fails, FileError when the scheduler is gone or
         no worker has come for long.

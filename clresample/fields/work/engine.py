@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from ...files.whole_file import whole_file
-from .pool import run_tasks
+from .pool import Pool
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Processes:
 
     n_workers: 0 = this process; at least one for each device
     devices: choices as `get_device` takes them, dealt to the workers by turns; empty = the default
-    limit_s [s], bound [bytes]: see `run_tasks`
+    limit_s [s], bound [bytes]: see `Pool`
     turns: (stage, Outcome) of every task so far that ended well, for whoever wants to see the time
     """
 
@@ -50,7 +50,7 @@ class Processes:
         self.devices = tuple(devices) or (None,)
         several = len(self.devices) > 1
         self.n_workers = max(n_workers, len(self.devices)) if several else n_workers
-        self.limit_s, self.bound = limit_s, bound
+        self.pool = Pool(self.n_workers, limit_s, bound)
         self.turns: list[tuple] = []
 
     @property
@@ -60,16 +60,16 @@ class Processes:
         return [(device, n) for device in self.devices]
 
     def run(self, work, context, tasks, again=None, stage=""):
-        """Yield the Outcome of every task, as `run_tasks` does."""
+        """Yield the Outcome of every task, as `Pool.run` does."""
         contexts = [replace(context, device=device) for device in self.devices]
-        given = {"limit_s": self.limit_s, "again": again, "bound": self.bound}
-        for outcome in run_tasks(work, contexts, tasks, self.n_workers, **given):
+        for outcome in self.pool.run(work, contexts, tasks, again):
             if outcome.reason is None:
                 self.turns.append((stage, outcome))
             yield outcome
 
     def close(self):
-        """End what was begun: workers end with each `run`."""
+        """End the processes."""
+        self.pool.close()
 
 
 def engine_of(options, progress):

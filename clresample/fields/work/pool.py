@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
-import sys
 import time
 import traceback
 from collections import deque
@@ -13,6 +12,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import wait
 
 from ...device.discovery import DeviceError
+from .share import hold_memory, shared_threads
 
 # [s] Between two looks at whether a worker takes too long.
 LOOK_S = 1.0
@@ -40,115 +40,136 @@ class Outcome:
 
 @dataclass(eq=False)
 class _Worker:
+    """run: whose function and context it has"""
+
     seat: int
     process: object
     pipe: object
+    run: object = None
     task: object = None
     since: float = 0.0
 
 
-def run_tasks(function, contexts, tasks, n_workers, *, limit_s=None, again=None, bound=None):
-    """Yield the Outcome of every task, as they end.
+class Pool:
+    """Worker processes, begun when there is work for them, alive until `close`.
 
-    function: called as function(context, task), in a module, so that a process can import it
-    contexts: worker k gets the one numbered k modulo their number, pickled
-    tasks: in the order in which they begin
-    n_workers: processes; 0 runs all in this one, where errors are reported but nothing that ends
-        a process is
+    n_workers: processes; 0 runs all in this one, where errors are reported but nothing that ends a
+        process is
     limit_s [s]: a task that takes longer is ended with its worker, which is replaced; None = none
-    again: called with the Outcome of a task that failed; returns the tasks to run in its place, or
-        None to let the Outcome stand. A failed task is yielded only where it stands
     bound [bytes]: private memory that a worker may take in all, held by the system; None = any
 
-    A worker with a DeviceError gets a new process and the task waits again, which counts as no
-    failure; at the next one in a row its seat stays empty, and the other workers go on. Raises
-    DeviceError when no seat is left. Ctrl-C and a generator that is closed end the workers.
+    A context manager, which closes it.
     """
-    waiting = deque(tasks)
-    again = again or (lambda outcome: None)
-    if n_workers == 0:
-        yield from _in_this_process(function, contexts[0], waiting, again)
-        return
-    workers: list[_Worker] = []
-    faults = dict.fromkeys(range(n_workers), 0)
-    start = _starter(function, contexts, n_workers, bound)
-    try:
-        while waiting or any(w.task is not None for w in workers):
-            free = sorted(faults.keys() - {w.seat for w in workers})
-            for seat in free[: max(0, len(waiting) + _busy(workers) - len(workers))]:
-                workers.append(start(seat))
-            for worker in workers:
-                if worker.task is None and waiting:
-                    worker.task, worker.since = waiting.popleft(), time.monotonic()
-                    with contextlib.suppress(OSError):  # of one that has died: seen below
-                        worker.pipe.send(worker.task)
-            for worker, outcome in _ended(workers, limit_s):
-                broken = (outcome.reason or "").startswith(DeviceError.__name__)
-                if outcome.worker_died or broken:
-                    workers.remove(worker)
-                    _end(worker)
-                else:
-                    worker.task, faults[worker.seat] = None, 0
-                if broken:
-                    _count(faults, worker.seat, outcome)
-                    waiting.appendleft(outcome.task)
-                    continue
-                more = again(outcome) if outcome.reason is not None else None
-                if more is None:
-                    yield outcome
-                else:
-                    waiting.extendleft(reversed(list(more)))
-    finally:
-        for worker in workers:
-            _end(worker)
 
+    def __init__(self, n_workers, limit_s=None, bound=None):
+        self.n_workers, self.limit_s = n_workers, limit_s
+        self._workers: list[_Worker] = []
+        self._faults = dict.fromkeys(range(n_workers), 0)
+        self._start = _starter(n_workers, bound)
 
-def _count(faults, seat, outcome):
-    """Count a device's error; the seat goes when there were too many, DeviceError with the last."""
-    faults[seat] += 1
-    if faults[seat] >= FAULTS:
-        del faults[seat]
-    if not faults:
-        raise DeviceError(outcome.reason.partition(": ")[2])
+    def __enter__(self):
+        return self
 
+    def __exit__(self, *_):
+        self.close()
 
-def _in_this_process(function, context, waiting, again):
-    """The tasks one after the other, without workers."""
-    while waiting:
-        task, began = waiting.popleft(), time.monotonic()
+    def close(self):
+        """End all workers, whatever they do."""
+        while self._workers:
+            _end(self._workers.pop())
+
+    def run(self, function, contexts, tasks, again=None):
+        """Yield the Outcome of every task, as they end.
+
+        function: called as function(context, task), in a module, so that a process can import it
+        contexts: worker k gets the one numbered k modulo their number, pickled
+        tasks: in the order in which they begin
+        again: called with the Outcome of a task that failed; returns the tasks to run in its place,
+            or None to let the Outcome stand. A failed task is yielded only where it stands
+
+        A worker with a DeviceError gets a new process and the task waits again, which counts as no
+        failure; at the next one in a row its seat stays empty, and the other workers go on. Raises
+        DeviceError when no seat is left. Ctrl-C, and a generator that is closed before its end, end
+        the workers.
+        """
+        waiting = deque(tasks)
+        again = again or (lambda outcome: None)
+        run = (function, contexts)  # its identity is that of this call
         try:
-            value, reason = function(context, task), None
-        except DeviceError:
+            while waiting or any(w.task is not None for w in self._workers):
+                for outcome in self._some(run, waiting):
+                    more = again(outcome) if outcome.reason is not None else None
+                    if more is None:
+                        yield outcome
+                    else:
+                        waiting.extendleft(reversed(list(more)))
+        except BaseException:
+            self.close()
             raise
-        except Exception as error:
-            value, reason = None, reason_of(error)
-        outcome = Outcome(task, value, reason, began=began, ended=time.monotonic())
-        more = again(outcome) if outcome.reason is not None else None
-        if more is None:
-            yield outcome
-        else:
-            waiting.extendleft(reversed(list(more)))
+
+    def _some(self, run, waiting):
+        """Give tasks to those without; the Outcomes of some that have ended since."""
+        if self.n_workers == 0:
+            return [_in_this_process(run[0], run[1][0], waiting.popleft())]
+        for worker in [w for w in self._workers if w.task is None and not w.process.is_alive()]:
+            self._workers.remove(worker)  # killed while it had nothing to do
+            _end(worker)
+        free = sorted(self._faults.keys() - {w.seat for w in self._workers})
+        busy = sum(worker.task is not None for worker in self._workers)
+        for seat in free[: max(0, len(waiting) + busy - len(self._workers))]:
+            self._workers.append(self._start(seat))
+        for worker in self._workers:
+            if worker.task is None and waiting:
+                _give(worker, run, waiting.popleft())
+        found = []
+        for worker, outcome in _ended(self._workers, self.limit_s):
+            broken = (outcome.reason or "").startswith(DeviceError.__name__)
+            if outcome.worker_died or broken:
+                self._workers.remove(worker)
+                _end(worker)
+            else:
+                worker.task, self._faults[worker.seat] = None, 0
+            if broken:
+                waiting.appendleft(outcome.task)
+                self._count(worker.seat, outcome)
+            else:
+                found.append(outcome)
+        return found
+
+    def _count(self, seat, outcome):
+        """Count a device's error; the seat goes when there were too many, DeviceError with the
+        last."""
+        self._faults[seat] += 1
+        if self._faults[seat] >= FAULTS:
+            del self._faults[seat]
+        if not self._faults:
+            raise DeviceError(outcome.reason.partition(": ")[2])
 
 
-def _busy(workers):
-    return sum(worker.task is not None for worker in workers)
+def _give(worker, run, task):
+    """Send a worker a task, and before its first one of a run what the tasks share."""
+    worker.task, worker.since = task, time.monotonic()
+    with contextlib.suppress(OSError):  # of one that has died: seen when its answer is awaited
+        if worker.run is not run:
+            function, contexts = run
+            worker.pipe.send((function, contexts[worker.seat % len(contexts)]))
+            worker.run = run
+        worker.pipe.send((None, task))
 
 
-def shared_threads(n_workers) -> dict:
-    """Environment of a worker that shares this machine's processor with so many, itself included.
-
-    NumPy's libraries get one thread, PoCL's CPU device its part of all, by the names of its older
-    and newer versions.
-    """
-    environment = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    if n_workers > 1:
-        n_threads = max(1, (os.cpu_count() or 1) // n_workers)
-        names = "POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT"
-        environment |= dict.fromkeys(names, str(n_threads))
-    return environment
+def _in_this_process(function, context, task):
+    """The Outcome of a task, without a worker. Raises DeviceError."""
+    began = time.monotonic()
+    try:
+        value, reason = function(context, task), None
+    except DeviceError:
+        raise
+    except Exception as error:
+        value, reason = None, reason_of(error)
+    return Outcome(task, value, reason, began=began, ended=time.monotonic())
 
 
-def _starter(function, contexts, n_workers, bound):
+def _starter(n_workers, bound):
     """What makes the worker of a seat. Each gets its part of the processor's threads."""
     processes = multiprocessing.get_context("spawn")
     environment = shared_threads(n_workers)
@@ -158,17 +179,13 @@ def _starter(function, contexts, n_workers, bound):
         before = {name: os.environ.get(name) for name in environment}
         os.environ.update({k: v for k, v in environment.items() if before[k] is None})
         try:
-            process = processes.Process(target=_work, args=(theirs, function, bound), daemon=True)
+            process = processes.Process(target=_work, args=(theirs, bound), daemon=True)
             process.start()
         finally:
             for name, value in before.items():
                 if value is None:
                     os.environ.pop(name, None)
         theirs.close()
-        # Not as an argument of the process: what is larger than the system's buffer would wait for
-        # ever to be read by a process that was killed before it had read it.
-        with contextlib.suppress(OSError):  # of one that has died: seen when it gets a task
-            ours.send(contexts[seat % len(contexts)])
         return _Worker(seat, process, ours)
 
     return start
@@ -220,23 +237,24 @@ def _end(worker):
         worker.process.join()
 
 
-def _work(pipe, function, bound):
-    """A worker: the context and tasks from the pipe, answers into it, until its end is closed."""
+def _work(pipe, bound):
+    """A worker: functions with their contexts and tasks from the pipe, answers into it, until its
+    end is closed."""
     import signal
 
     hold_memory(bound)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all; the parent ends its workers
-    try:
-        context = pipe.recv()
-    except (EOFError, OSError):
-        return
+    function = context = None
     while True:
         try:
-            task = pipe.recv()
+            given, what = pipe.recv()
         except (EOFError, OSError):
             return
+        if given is not None:
+            function, context = given, what
+            continue
         try:
-            answer = function(context, task), None
+            answer = function(context, what), None
         except KeyboardInterrupt:
             return
         except Exception as error:
@@ -245,21 +263,6 @@ def _work(pipe, function, bound):
             pipe.send(answer)
         except OSError:
             return
-
-
-def hold_memory(bound):
-    """Have the system refuse this process private memory beyond so many bytes, where it can.
-
-    What is refused is a MemoryError, or a device's, which costs a group of fits its batch: they are
-    fitted one by one. Files that are mapped do not count (RLIMIT_DATA of Linux).
-    """
-    if bound is None or not sys.platform.startswith("linux"):
-        return
-    import resource
-
-    _, most = resource.getrlimit(resource.RLIMIT_DATA)
-    if most == resource.RLIM_INFINITY or bound < most:
-        resource.setrlimit(resource.RLIMIT_DATA, (int(bound), most))
 
 
 def reason_of(error):
