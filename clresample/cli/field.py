@@ -64,6 +64,12 @@ def add_field(commands):
         "eighth of the free memory for each worker where that is less)",
     )
     parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="the workers of this dask.distributed scheduler search and fit, as tcp://HOST:8786; "
+        "they need this package and the mosaics' files",
+    )
+    parser.add_argument(
         "--limit",
         metavar="S",
         type=positive,
@@ -82,7 +88,7 @@ def add_field(commands):
         action="store_true",
         help="write the catalogue as HATS too, which LSDB opens (extra hats)",
     )
-    add_device_option(parser)
+    add_device_option(parser, several=True)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
     parser.set_defaults(run=run)
 
@@ -110,11 +116,14 @@ def run(arguments):
     if not arguments.quiet:
         for text in field.notes:
             note(arguments, text)
-    memory = min(MEMORY, free_memory() // (MEMORY_PART * max(arguments.workers, 1)))
+    devices = arguments.device.split(",") if arguments.device else []
+    workers = max(arguments.workers, len(devices)) if len(devices) > 1 else arguments.workers
+    memory = min(MEMORY, free_memory() // (MEMORY_PART * max(workers, 1)))
     options = replace(
         field.options,
-        workers=arguments.workers,
-        device=arguments.device,
+        workers=workers,
+        device=devices or None,
+        scheduler=arguments.scheduler,
         limit_s=arguments.limit,
         part=arguments.part,
         hats=arguments.hats,

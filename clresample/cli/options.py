@@ -9,13 +9,15 @@ from importlib.util import find_spec
 SIZES = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30}  # [bytes] powers of 1024, as for memory
 
 
-def add_device_option(parser):
-    """Add `--device`, whose value `get_device` takes as it is."""
+def add_device_option(parser, several=False):
+    """Add `--device`, whose value `get_device` takes as it is; several: or a list, by commas."""
     parser.add_argument(
         "--device",
         metavar="CHOICE",
-        help="index, platform:device or part of a name; without it CLRESAMPLE_DEVICE, then "
-        "PYOPENCL_CTX, then the first GPU, then the first CPU",
+        help="index, platform:device or part of a name"
+        + (", or several by commas, a process each" if several else "")
+        + "; without it CLRESAMPLE_DEVICE, then PYOPENCL_CTX, then the first GPU, then the first "
+        "CPU",
     )
 
 

@@ -13,6 +13,8 @@ from .blends.plan import LARGEST_FIELD
 
 # [bytes] of one group of fits: more lets more blends share a batch
 MEMORY = 1 << 30
+# [bytes] of a worker process: libraries, compiler and one small group take some 600 MiB
+LEAST_BOUND = 1 << 30
 LEAST_MEMORY = 1 << 26  # [bytes] what a single blend of some ten sources takes
 
 
@@ -33,9 +35,14 @@ class FieldOptions:
     limits: of one fit; larger blends are cut
     memory [bytes]: that a group of fits, and the search of a tile, may take in a worker; a run that
         goes on keeps what it began with
+    bound [bytes]: private memory that the system lets a worker process take in all (Linux); None =
+        what it has. What is refused costs a group its batch: it is fitted in halves, then alone
     workers: processes; 0 = this one. limit_s [s]: longest time of a group, None = no limit
     hats: write the catalogue in the HATS layout too, into DIR/hats
-    device: as `get_device` takes it; field_number: of the ids, 0 to 8,388,607, see `source_ids`
+    device: as `get_device` takes it, or a list: one worker process a device at least
+    scheduler: address of a `dask.distributed` scheduler, whose workers do the work instead; None =
+        this machine's
+    field_number: of the ids, 0 to 8,388,607, see `source_ids`
     """
 
     settings: Settings = Settings()
@@ -48,10 +55,12 @@ class FieldOptions:
     overlap_px: int = 96
     limits: Limits = Limits()
     memory: int = MEMORY
+    bound: int | None = None
     workers: int = 0
     limit_s: float | None = None
     hats: bool = False
     device: object = None
+    scheduler: str | None = None
     field_number: int = 0
 
     def __post_init__(self):
@@ -63,6 +72,17 @@ class FieldOptions:
             raise ValueError(f"workers is {self.workers}, must be 0 or more")
         if not self.memory >= LEAST_MEMORY:
             raise ValueError(f"memory is {self.memory} bytes, must be 64 MiB or more")
+        if self.bound is not None and not self.bound >= LEAST_BOUND:
+            raise ValueError(f"bound is {self.bound} bytes, must be 1 GiB or more")
+        if isinstance(self.device, (list, tuple)) and not self.device:
+            raise ValueError("device is an empty list, must name at least one")
+
+    @property
+    def devices(self) -> tuple:
+        """The choices of devices; empty where none was made."""
+        if isinstance(self.device, (list, tuple)):
+            return tuple(self.device)
+        return () if self.device is None else (self.device,)
 
 
 @dataclass(eq=False)

@@ -15,13 +15,13 @@ from pathlib import Path
 from astropy.io import fits
 
 from .. import __version__
-from ..device.device import get_device
 from ..files.whole_file import whole_file
 from .columns import finished
 from .hats import write_hats
 from .images import write_mosaics
 from .models import write_models
 from .parquet import write_parquet
+from .work.look import looked
 
 NO_PARQUET = "no catalogue.parquet: pyarrow is not installed (pip install 'clresample[field]')"
 PACKAGES = "numpy", "scipy", "astropy", "pyopencl", "sep", "pyarrow"
@@ -103,7 +103,6 @@ def _write_ecsv(path, table):
 
 def _write_provenance(path, job, about, seconds, status):
     """What made these files: versions, device, settings, inputs with their checksums, times."""
-    device = get_device(job.device)
     packages = {}
     for name in PACKAGES:
         try:
@@ -115,7 +114,7 @@ def _write_provenance(path, job, about, seconds, status):
         "clresample": __version__,
         "python": platform.python_version(),
         "packages": packages,
-        "device": device.name,
+        "device": ", ".join(looked(job.folder).devices),
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
         "run": json.loads((job.folder / "run.json").read_text()),
         "lost_tiles": job.plan.lost,

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import pickle
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,12 @@ from ..sky.grid import Grid
 from .blends.tiles import part_of
 from .box import Box
 from .hats import check_hats
-from .options import FieldOptions, Progress
+from .options import LEAST_MEMORY, FieldOptions, Progress
 from .outputs import Outputs, write_outputs
+from .work.engine import engine_of
 from .work.fitting import Job
 from .work.folder import open_folder
+from .work.look import looked, take_look
 from .work.rounds import fitted
 from .work.searching import planned
 
@@ -27,12 +30,14 @@ class FieldRun:
 
     outputs: paths and numbers, see Outputs; seconds: wall time by stage
     failed: fits that were set aside; lost: {tile: why it could not be searched}
+    turns: (stage, Outcome) of every task that the workers have done: who had it, and when
     """
 
     outputs: Outputs
     seconds: dict = field(default_factory=dict)
     failed: int = 0
     lost: dict = field(default_factory=dict)
+    turns: tuple = ()
 
 
 def run_field(
@@ -54,7 +59,7 @@ def run_field(
     and where nothing can be written; ImportError without sep, and without what HATS needs.
     """
     options, progress = options or FieldOptions(), progress or Progress()
-    mosaics, folder = tuple(mosaics), Path(folder)
+    mosaics, folder = _as_sent(mosaics), Path(folder)
     seconds: dict[str, float] = {}
     reference = reference_of(mosaics)
     if options.hats:
@@ -66,28 +71,34 @@ def run_field(
     whole, clock = Box.of(reference.shape), _Clock(seconds)
     core = whole if options.part is None else part_of(whole, *options.part)
     region = core if options.part is None else core.grown(options.border_px).meet(whole)
-    plan = planned(mosaics, reference, region, core, work, options, progress, clock)
-    job = Job(
-        mosaics=mosaics,
-        reference=reference,
-        folder=work,
-        plan=plan,
-        corner=(region.y0, region.x0),
-        core=core,
-        settings=options.settings,
-        threshold=options.threshold,
-        passes=options.passes,
-        memory=options.memory,
-        device=options.device,
-        field_number=options.field_number,
-    )
-    parts, unsettled = fitted(job, options, progress)
+    engine = engine_of(options, progress)
+    try:
+        take_look(mosaics, reference, work, engine)
+        least = min(options.memory, looked(work).memory)
+        options = replace(options, memory=max(LEAST_MEMORY, least))
+        plan = planned(mosaics, reference, region, core, work, options, engine, progress, clock)
+        job = Job(
+            mosaics=mosaics,
+            reference=reference,
+            folder=work,
+            plan=plan,
+            corner=(region.y0, region.x0),
+            core=core,
+            settings=options.settings,
+            threshold=options.threshold,
+            passes=options.passes,
+            memory=options.memory,
+            field_number=options.field_number,
+        )
+        parts, unsettled = fitted(job, engine, progress)
+    finally:
+        engine.close()
     clock.stop("fit")
     progress.stage("write", 1)
     outputs = write_outputs(folder, job, parts, unsettled, about or {}, seconds, options.hats)
     clock.stop("write")
     failed = outputs.status.get("failed", 0)
-    return FieldRun(outputs, seconds, failed, plan.lost)
+    return FieldRun(outputs, seconds, failed, plan.lost, tuple(engine.turns))
 
 
 def reference_of(mosaics) -> Grid:
@@ -113,6 +124,15 @@ def reference_of(mosaics) -> Grid:
             raise ValueError(f"mosaic {has!r} has {what}, {none!r} has none: give all or none")
     scales = [m.grid.pixel_scale_arcsec for m in mosaics]
     return mosaics[int(np.argmin(scales))].grid
+
+
+def _as_sent(mosaics):
+    """The mosaics with their grids as another process gets them.
+
+    A WCS is sent as a header, whose numbers are rounded to their last digits. Fits take another
+    way for that, to 1e-5 of a flux: so this process, which may fit too, works with the same.
+    """
+    return tuple(replace(m, grid=pickle.loads(pickle.dumps(m.grid))) for m in mosaics)
 
 
 class _Clock:

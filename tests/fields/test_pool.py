@@ -2,12 +2,14 @@
 
 import os
 import signal
+import sys
 import time
 from pathlib import Path
 
 import pytest
 
-from clresample.fields.work.pool import run_tasks
+from clresample import DeviceError
+from clresample.fields.work.pool import Pool
 
 
 def work(folder, task):
@@ -24,8 +26,13 @@ def work(folder, task):
     return task.upper()
 
 
+def ran(function, contexts, tasks, n_workers, again=None, **given):
+    with Pool(n_workers, **given) as pool:
+        return list(pool.run(function, contexts, tasks, again))
+
+
 def outcomes(folder, tasks, n_workers=2, **given):
-    return {o.task: o for o in run_tasks(work, str(folder), tasks, n_workers, **given)}
+    return {o.task: o for o in ran(work, [str(folder)], tasks, n_workers, **given)}
 
 
 @pytest.mark.parametrize("n_workers", [0, 1, 2])
@@ -56,3 +63,45 @@ def test_again_replaces_a_failed_task(tmp_path):
     assert set(found) == {"die once", "a", "b", "die"}
     assert found["die once"].value == "DIE ONCE"
     assert found["die"].value is None
+
+
+def on_device(device, task):
+    """A worker whose device is gone raises; the others work."""
+    time.sleep(0.2)
+    if device == "gone":
+        raise DeviceError(f"{device} no longer answers")
+    return device
+
+
+def test_a_device_that_is_gone_leaves_its_tasks_to_the_others():
+    found = ran(on_device, ["good", "gone"], range(6), 2)
+    assert sorted(o.task for o in found) == list(range(6))
+    assert all(o.value == "good" and o.reason is None for o in found)
+    with pytest.raises(DeviceError, match="gone no longer answers"):
+        ran(on_device, ["gone", "gone"], range(6), 2)
+
+
+def take(megabytes, task):
+    """Private memory of that size, written."""
+    return len(bytearray(task << 20))
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the system holds no memory")
+def test_the_system_holds_a_worker_to_its_memory():
+    found = ran(take, [0], [10, 4000], 1, bound=1 << 30)
+    small, large = sorted(found, key=lambda o: o.task)
+    assert small.value == 10 << 20
+    assert large.reason.startswith("MemoryError") and not large.worker_died
+
+
+def test_workers_live_on_from_one_run_to_the_next():
+    with Pool(2) as pool:
+        first = {o.value for o in pool.run(name_of_process, [None], range(8))}
+        second = {o.value for o in pool.run(name_of_process, ["other"], range(8))}
+    assert {pid for pid, _ in second} <= {pid for pid, _ in first}
+    assert {context for _, context in second} == {"other"}
+
+
+def name_of_process(context, task):
+    time.sleep(0.2)
+    return os.getpid(), context

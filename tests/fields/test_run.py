@@ -8,7 +8,7 @@ from astropy.io import fits
 from astropy.table import QTable
 from helpers.fields import mosaics_of
 
-from clresample import FieldOptions
+from clresample import FieldOptions, get_device
 from clresample.fields.blends.cut import Limits
 from clresample.fields.models import read_models
 from clresample.fields.mosaic import FilePlane
@@ -242,3 +242,13 @@ def test_parts_of_a_field_together_are_the_field(done, sky, tmp_path):
             model = fits.getdata(folder / "model_Euclid.fits")[half]
             np.testing.assert_allclose(part[half], model, atol=1e-2 * model.max())
     assert sorted(ids) == whole["id"].tolist()
+
+
+def test_several_devices_have_a_process_each_and_leave_the_same_bytes(done, sky, tmp_path):
+    folder, _ = done
+    name = get_device().name  # named twice, it gets two processes
+    run = run_field(mosaics_of(sky), tmp_path, options=FieldOptions(device=[name, name]))
+    assert {outcome.seat for stage, outcome in run.turns if stage == "fit"} == {0, 1}
+    assert (tmp_path / "catalogue.fits").read_bytes() == (folder / "catalogue.fits").read_bytes()
+    with pytest.raises(ValueError, match="device is an empty list"):
+        FieldOptions(device=[])

@@ -17,15 +17,34 @@ class Limits:
     sources: how many; pixels: of the model, in the box about the blend. Larger ones are fitted more
     exactly, as one scene, but take longer than in proportion: the errors' normal matrix grows with
     the square of the number of sources, its inverse with the cube
+    memory [bytes]: that it may take by prediction, see `fit_bytes`; None = any; n_channels: of all
+    mosaics, for that
     """
 
     sources: int = 40
     pixels: int = 400 * 400
+    memory: float | None = None
+    n_channels: int = 1
 
     def __post_init__(self):
         for name in ("sources", "pixels"):
             if not getattr(self, name) >= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, must be 1 or more")
+
+    def hold(self, n_sources, n_pixels) -> bool:
+        """Whether a fit of so many sources in a box of so many pixels is within them."""
+        n_bytes = fit_bytes(n_sources, n_pixels, self.n_channels)
+        few = n_sources <= self.sources and n_pixels <= self.pixels
+        return few and (self.memory is None or n_bytes <= self.memory)
+
+
+def fit_bytes(n_sources, n_pixels, n_channels) -> float:
+    """Memory [bytes] that a fit takes on device and host together, roughly.
+
+    Each source has its morphology, its gradients and directions (some 20 images of the model's
+    pixels) and its image in every channel, in float32; each channel some 10 more images.
+    """
+    return 4.0 * (20 * n_sources + n_channels * (n_sources + 10)) * n_pixels
 
 
 def pieces_of(light, inside, positions, limits, margin):
@@ -54,7 +73,7 @@ def pieces_of(light, inside, positions, limits, margin):
         if a == b:
             continue
         both = boxes[a].join(boxes[b])
-        if counts[a] + counts[b] > limits.sources or both.grown(margin).area > limits.pixels:
+        if not limits.hold(counts[a] + counts[b], both.grown(margin).area):
             continue
         piece[b], boxes[a] = a, both
         counts[a] += counts[b]

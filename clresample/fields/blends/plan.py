@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from ..box import Box, sized_up
-from .cut import Limits, pieces_of
+from .cut import Limits, fit_bytes, pieces_of
 from .search import nearest
 
 # [model px] Sky around a blend's footprint in the box of its fit: it shows where the light ends.
@@ -147,7 +147,7 @@ def make_plan(
     memory [bytes]: that the fits of one group may take; None = no limit; n_channels: of all mosaics
     most: blends in a group. More share a batch's cost, but are lost together with their worker
     """
-    limits = limits or Limits()
+    limits = replace(limits or Limits(), memory=memory, n_channels=n_channels)
     ids = source_ids(positions, field_number)
     labels, corner = footprints.labels, np.array(region[:2])
     at = nearest(positions) - corner
@@ -164,8 +164,7 @@ def make_plan(
         own = {"parent": int(ids[brightest]), "n_blend": len(sources)}
         inner = box.within(region)
         inside = labels[inner.slices] == label
-        over = len(sources) > limits.sources or box.grown(MARGIN_PX).area > limits.pixels
-        if not over or len(sources) == 1:
+        if limits.hold(len(sources), box.grown(MARGIN_PX).area) or len(sources) == 1:
             pending.append((inner, inside, len(made)))
             made.append(own | {"box": box, "sources": tuple(sources)})
             continue
@@ -173,12 +172,11 @@ def make_plan(
         local = positions[sources] - box[:2]
         territory, number = pieces_of(light, inside, local, limits, MARGIN_PX)
         n_pieces = int(number.max()) + 1
-        for i in range(n_pieces):
-            part = territory == i + 1
-            where = ndimage.find_objects(part.astype(np.uint8))[0]
+        for i, where in enumerate(ndimage.find_objects(territory)):
+            part = territory[where] == i + 1
             small = Box(where[0].start, where[1].start, where[0].stop, where[1].stop)
             there = Box(*(np.array(small) + np.array([*box[:2], *box[:2]])).tolist())
-            pending.append((there.within(region), part[where], len(made)))
+            pending.append((there.within(region), part, len(made)))
             few = tuple(s for s, piece in zip(sources, number, strict=True) if piece == i)
             made.append(own | {"box": there, "sources": few, "pieces": n_pieces})
     labels[:] = 0
@@ -205,13 +203,8 @@ def _patches(made):
 
 
 def predicted_bytes(patch, n_channels) -> float:
-    """Memory [bytes] that a fit takes on device and host together, roughly.
-
-    Each source has its morphology, its gradients and directions (some 20 images of the model's
-    pixels) and its image in every channel, in float32; each channel some 10 more images.
-    """
-    images = 20 * len(patch.sources) + n_channels * (len(patch.sources) + 10)
-    return 4.0 * images * patch.box.area
+    """Memory [bytes] of its fit, see `fit_bytes`."""
+    return fit_bytes(len(patch.sources), patch.box.area, n_channels)
 
 
 def predicted_cost(patch) -> float:

@@ -13,6 +13,7 @@ from ...deblending.batch import deblend_many
 from ...deblending.blend import INTERRUPTED, Blend, Failure
 from ...deblending.settings import Settings
 from ...device.device import get_device
+from ...device.discovery import DeviceError
 from ...measurement.catalogue import Flag, add_positions, catalogue
 from ...measurement.detection import detect_more
 from ...sky.grid import Grid
@@ -20,10 +21,11 @@ from ..blends.patch import blend_of
 from ..blends.plan import Plan, source_ids
 from ..blends.search import nearest
 from ..box import Box
-from .part import Part, PartFile
+from .part import Part
 
 # What can go wrong with one patch and is no reason to give up the others.
 ERRORS = (ValueError, ArithmeticError, MemoryError, OSError, np.linalg.LinAlgError)
+NO_ANSWER = "no longer answers"  # in the message of a device that is gone with all its memory
 POSITIONS = ("y", "x", "y_centroid", "x_centroid")  # columns in pixels of a fit's frame
 
 
@@ -58,23 +60,6 @@ class Job:
         return tuple(c.name for mosaic in self.mosaics for c in mosaic.channels)
 
 
-@dataclass(frozen=True)
-class Group:
-    """Patches that are fitted side by side, and the part that they leave.
-
-    name: of the part; patches: numbers; round: 0, or which repetition of a cut blend's pieces
-    before: names of the parts of the round before, for the neighbours' light; older: of the one
-        before that. The mean of the two is subtracted: where both sides of a border follow each
-        other's last model alone, light goes back and forth between them
-    """
-
-    name: str
-    patches: tuple[int, ...]
-    round: int = 0
-    before: tuple[str, ...] = ()
-    older: tuple[str, ...] = ()
-
-
 @dataclass(frozen=True, eq=False)
 class _Cut:
     """A patch with its blend and where its observations lie on the mosaics."""
@@ -85,22 +70,21 @@ class _Cut:
     seconds: float
 
 
-def fit_group(job, group) -> dict:
-    """Fit a group and write its part. Returns {"sources", "patches", "failed", "seconds"}.
+def fit_group(job, group, given) -> tuple[dict, bytes]:
+    """Fit a group: {"sources", "patches", "failed", "seconds"}, and its part as bytes.
 
-    A patch that fails is in the part with its reason. Raises FileError where the part cannot be
-    written, KeyboardInterrupt after Ctrl-C, which leaves no part.
+    given: Given of the group. A patch that fails is in the part with its reason. Raises
+    KeyboardInterrupt after Ctrl-C, DeviceError where the device no longer answers.
     """
     began = time.perf_counter()
-    labels = np.load(job.folder / "labels.npy", mmap_mode="r")
     part, cuts = Part(), []
-    neighbours = _neighbours(job, group)
     for number in group.patches:
         patch, start = job.plan.patches[number], time.perf_counter()
+        corner, labels = given.labels[number]
+        around = None if given.light is None else given.light[number]
         try:
-            around = None if neighbours is None else _around(patch, neighbours)
             blend, boxes = blend_of(
-                patch, job.plan, job.mosaics, job.reference, labels, job.corner, around
+                patch, job.plan, job.mosaics, job.reference, labels, corner, around
             )
         except ERRORS as error:
             _set_aside(part, job, patch, group.round, f"failed: {_line(error)}")
@@ -111,7 +95,7 @@ def fit_group(job, group) -> dict:
         cuts.append(_Cut(patch, blend, boxes, time.perf_counter() - start))
     results = _fits(job, [cut.blend for cut in cuts])
     if job.passes > 1:
-        results = _second_look(job, labels, cuts, results)
+        results = _second_look(job, given, cuts, results)
     for cut, result in zip(cuts, results, strict=True):
         if isinstance(result, Failure):
             if result.status == INTERRUPTED:
@@ -122,24 +106,24 @@ def fit_group(job, group) -> dict:
             _take(part, job, cut, result, group.round)
         except ERRORS as error:
             _set_aside(part, job, cut.patch, group.round, f"failed: {_line(error)}")
-    part.write(job.folder / f"{group.name}.fits")
-    failed = sum(str(row[3]).startswith("failed") for row in part.patches)
+    return _summary(part, time.perf_counter() - began), part.to_bytes()
+
+
+def set_aside(job, group, reason) -> tuple[dict, bytes]:
+    """As `fit_group` for a group that could not be fitted: each source with the reason."""
+    part = Part()
+    for number in group.patches:
+        _set_aside(part, job, job.plan.patches[number], group.round, f"failed: {_line(reason)}")
+    return _summary(part, 0.0), part.to_bytes()
+
+
+def _summary(part, seconds):
     return {
         "sources": sum(len(rows) for rows in part.rows),
         "patches": len(part.patches),
-        "failed": failed,
-        "seconds": time.perf_counter() - began,
+        "failed": sum(str(row[3]).startswith("failed") for row in part.patches),
+        "seconds": seconds,
     }
-
-
-def set_aside(job, group, reason) -> dict:
-    """Write the part of a group that could not be fitted, each source with the reason."""
-    part = Part()
-    for number in group.patches:
-        _set_aside(part, job, job.plan.patches[number], group.round, f"failed: {reason}")
-    part.write(job.folder / f"{group.name}.fits")
-    n = sum(len(rows) for rows in part.rows)
-    return {"sources": n, "patches": len(group.patches), "failed": len(group.patches), "seconds": 0}
 
 
 def _fits(job, blends):
@@ -150,10 +134,12 @@ def _fits(job, blends):
     results = deblend_many(blends, settings=job.settings, device=device, memory=job.memory)
     if any(r.status == INTERRUPTED for r in results):
         raise KeyboardInterrupt
+    if lost := next((r.status for r in results if NO_ANSWER in r.status), None):
+        raise DeviceError(lost.removeprefix("failed: "))
     return results
 
 
-def _second_look(job, labels, cuts, results):
+def _second_look(job, given, cuts, results):
     """Fit those blends again in whose residuals there are more sources, with these.
 
     The residuals are those of the whole fit. A first look of 30 iterations without structure, as
@@ -168,7 +154,7 @@ def _second_look(job, labels, cuts, results):
             found = detect_more(result, threshold=job.threshold, device=device).sources
         except ERRORS:
             continue  # the fit stands as it is
-        new = [source for source in found if _on_patch(job, labels, cut.patch, source)]
+        new = [source for source in found if _on_patch(given, cut.patch, source)]
         if new:
             places = np.array([s.position_px for s in new]) + cut.patch.box[:2]
             ids = source_ids(places, job.field_number)
@@ -180,34 +166,12 @@ def _second_look(job, labels, cuts, results):
     return results
 
 
-def _on_patch(job, labels, patch, source):
+def _on_patch(given, patch, source):
     """Whether a source lies on a pixel of the patch's own light."""
-    y, x = nearest(np.array(source.position_px) + patch.box[:2])[0] - np.array(job.corner)
+    corner, labels = given.labels[patch.number]
+    y, x = nearest(np.array(source.position_px) + patch.box[:2])[0] - np.array(corner)
     inside = 0 <= y < labels.shape[0] and 0 <= x < labels.shape[1]
     return bool(inside and labels[y, x] == patch.number + 1)
-
-
-def _neighbours(job, group):
-    """{patch: {mosaic's name: [(Box, model)]}} of the rounds before; None in the first."""
-    if group.round == 0:
-        return None
-    wanted = {k for number in group.patches for k in job.plan.patches[number].siblings}
-    found: dict[int, dict] = {}
-    share = 0.5 if group.older else 1.0
-    for name in group.before + group.older:
-        for patch, i, box, model in PartFile(job.folder / f"{name}.fits").models(wanted):
-            models = found.setdefault(patch, {}).setdefault(job.mosaics[i].name, [])
-            models.append((box, share * model))
-    return found
-
-
-def _around(patch, neighbours):
-    """{mosaic's name: [(Box, model)]} of a patch's siblings."""
-    found: dict[str, list] = {}
-    for sibling in patch.siblings:
-        for name, models in neighbours.get(sibling, {}).items():
-            found.setdefault(name, []).extend(models)
-    return found
 
 
 def _take(part, job, cut, result, n_round):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,6 @@ from astropy.io import fits
 from astropy.table import QTable, Table, vstack
 
 from ...files.fits import open_fits
-from ...files.whole_file import whole_file
 from ..box import Box
 
 PATCH_COLUMNS = {
@@ -60,8 +60,8 @@ class Part:
         self.pixels.append(np.ravel(model).astype(np.float32))
         self.n_pixels += model.size
 
-    def write(self, path):
-        """Write the file, whole or not at all. Raises FileError."""
+    def to_bytes(self) -> bytes:
+        """The file that PartFile reads."""
         hdus = [
             fits.PrimaryHDU(),
             _table(_stacked(self.rows), "CATALOGUE"),
@@ -77,8 +77,9 @@ class Part:
             _table(_whole(self.models, MODEL_COLUMNS), "MODELS"),
             _floats(self.pixels and np.concatenate(self.pixels), "PIXELS"),
         ]
-        with whole_file(path) as part:
-            fits.HDUList(hdus).writeto(part, overwrite=True)
+        file = BytesIO()
+        fits.HDUList(hdus).writeto(file)
+        return file.getvalue()
 
 
 def _stacked(tables):
@@ -124,10 +125,12 @@ class PartFile:
     def models(self, chosen=None):
         """(patch, mosaic, Box, model (C, Ny, Nx)) of its patches, or of those whose number is in
         `chosen`."""
-        index, pixels = self.table("MODELS"), self.array("PIXELS")
-        ends = [*index["offset"][1:], len(pixels)] if len(index) else []
-        for row, end in zip(index, ends, strict=True):
-            if chosen is None or row["patch"] in chosen:
-                box = Box(*(int(row[k]) for k in ("y0", "x0", "y1", "x1")))
-                image = pixels[row["offset"] : end].reshape(-1, *box.shape)
-                yield int(row["patch"]), int(row["mosaic"]), box, image
+        index = self.table("MODELS")
+        with open_fits(self.path) as hdus:
+            hdu = hdus["PIXELS"]
+            ends = [*index["offset"][1:], hdu.header.get("NAXIS1", 0)] if len(index) else []
+            for row, end in zip(index, ends, strict=True):
+                if chosen is None or row["patch"] in chosen:
+                    box = Box(*(int(row[k]) for k in ("y0", "x0", "y1", "x1")))
+                    image = np.array(hdu.section[int(row["offset"]) : int(end)], np.float32)
+                    yield int(row["patch"]), int(row["mosaic"]), box, image.reshape(-1, *box.shape)

@@ -11,8 +11,14 @@ from collections import deque
 from dataclasses import dataclass
 from multiprocessing.connection import wait
 
+from ...device.discovery import DeviceError
+from .share import hold_memory, shared_threads
+
 # [s] Between two looks at whether a worker takes too long.
 LOOK_S = 1.0
+# Device errors that follow each other, after each of which the worker gets a new process: one may
+# be a driver that was reset, at the second the device itself is taken to be gone.
+FAULTS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,114 +26,167 @@ class Outcome:
     """How a task ended: its value, or the reason why there is none.
 
     worker_died: the reason is that the process ended or hung, not an error that it reported
+    seat: which worker had it, from 0; began, ended [s]: by the monotonic clock
     """
 
     task: object
     value: object = None
     reason: str | None = None
     worker_died: bool = False
+    seat: int = 0
+    began: float = 0.0
+    ended: float = 0.0
 
 
 @dataclass(eq=False)
 class _Worker:
+    """run: whose function and context it has"""
+
+    seat: int
     process: object
     pipe: object
+    run: object = None
     task: object = None
     since: float = 0.0
 
 
-def run_tasks(function, context, tasks, n_workers, *, limit_s=None, again=None):
-    """Yield the Outcome of every task, as they end.
+class Pool:
+    """Worker processes, begun when there is work for them, alive until `close`.
 
-    function: called as function(context, task), in a module, so that a process can import it
-    context: the same for all tasks; pickled once for each worker
-    tasks: in the order in which they begin
-    n_workers: processes; 0 runs all in this one, where errors are reported but nothing that ends
-        a process is
+    n_workers: processes; 0 runs all in this one, where errors are reported but nothing that ends a
+        process is
     limit_s [s]: a task that takes longer is ended with its worker, which is replaced; None = none
-    again: called with the Outcome of a task that failed; returns the tasks to run in its place, or
-        None to let the Outcome stand. A failed task is yielded only where it stands
+    bound [bytes]: private memory that a worker may take in all, held by the system; None = any
 
-    Ctrl-C and a generator that is closed end the workers.
+    A context manager, which closes it.
     """
-    waiting = deque(tasks)
-    again = again or (lambda outcome: None)
-    if n_workers == 0:
-        yield from _in_this_process(function, context, waiting, again)
-        return
-    workers: list[_Worker] = []
-    start = _starter(function, context, n_workers)
-    try:
-        while waiting or any(w.task is not None for w in workers):
-            while len(workers) < n_workers and len(workers) < len(waiting) + _busy(workers):
-                workers.append(start())
-            for worker in workers:
-                if worker.task is None and waiting:
-                    worker.task, worker.since = waiting.popleft(), time.monotonic()
-                    with contextlib.suppress(OSError):  # of one that has died: seen below
-                        worker.pipe.send(worker.task)
-            for worker, outcome in _ended(workers, limit_s):
-                if outcome.worker_died:
-                    workers.remove(worker)
-                    _end(worker)
-                else:
-                    worker.task = None
-                more = again(outcome) if outcome.reason is not None else None
-                if more is None:
-                    yield outcome
-                else:
-                    waiting.extendleft(reversed(list(more)))
-    finally:
-        for worker in workers:
-            _end(worker)
 
+    def __init__(self, n_workers, limit_s=None, bound=None):
+        self.n_workers, self.limit_s = n_workers, limit_s
+        self._workers: list[_Worker] = []
+        self._faults = dict.fromkeys(range(n_workers), 0)
+        self._start = _starter(n_workers, bound)
 
-def _in_this_process(function, context, waiting, again):
-    """The tasks one after the other, without workers."""
-    while waiting:
-        task = waiting.popleft()
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+    def close(self):
+        """End all workers, whatever they do."""
+        while self._workers:
+            _end(self._workers.pop())
+
+    def run(self, function, contexts, tasks, again=None):
+        """Yield the Outcome of every task, as they end.
+
+        function: called as function(context, task), in a module, so that a process can import it
+        contexts: worker k gets the one numbered k modulo their number, pickled
+        tasks: in the order in which they begin
+        again: called with the Outcome of a task that failed; returns the tasks to run in its place,
+            or None to let the Outcome stand. A failed task is yielded only where it stands
+
+        A worker with a DeviceError gets a new process and the task waits again, which counts as no
+        failure; at the next one in a row its seat stays empty, and the other workers go on. Raises
+        DeviceError when no seat is left. Ctrl-C, and a generator that is closed before its end, end
+        the workers.
+        """
+        waiting = deque(tasks)
+        again = again or (lambda outcome: None)
+        run = (function, contexts)  # its identity is that of this call
         try:
-            outcome = Outcome(task, function(context, task))
-        except Exception as error:
-            outcome = Outcome(task, reason=_reason(error))
-        more = again(outcome) if outcome.reason is not None else None
-        if more is None:
-            yield outcome
-        else:
-            waiting.extendleft(reversed(list(more)))
+            while waiting or any(w.task is not None for w in self._workers):
+                for outcome in self._some(run, waiting):
+                    more = again(outcome) if outcome.reason is not None else None
+                    if more is None:
+                        yield outcome
+                    else:
+                        waiting.extendleft(reversed(list(more)))
+        except BaseException:
+            self.close()
+            raise
+
+    def _some(self, run, waiting):
+        """Give tasks to those without; the Outcomes of some that have ended since."""
+        if self.n_workers == 0:
+            return [_in_this_process(run[0], run[1][0], waiting.popleft())]
+        for worker in [w for w in self._workers if w.task is None and not w.process.is_alive()]:
+            self._workers.remove(worker)  # killed while it had nothing to do
+            _end(worker)
+        free = sorted(self._faults.keys() - {w.seat for w in self._workers})
+        busy = sum(worker.task is not None for worker in self._workers)
+        for seat in free[: max(0, len(waiting) + busy - len(self._workers))]:
+            self._workers.append(self._start(seat))
+        for worker in self._workers:
+            if worker.task is None and waiting:
+                _give(worker, run, waiting.popleft())
+        found = []
+        for worker, outcome in _ended(self._workers, self.limit_s):
+            broken = (outcome.reason or "").startswith(DeviceError.__name__)
+            if outcome.worker_died or broken:
+                self._workers.remove(worker)
+                _end(worker)
+            else:
+                worker.task, self._faults[worker.seat] = None, 0
+            if broken:
+                waiting.appendleft(outcome.task)
+                self._count(worker.seat, outcome)
+            else:
+                found.append(outcome)
+        return found
+
+    def _count(self, seat, outcome):
+        """Count a device's error; the seat goes when there were too many, DeviceError with the
+        last."""
+        self._faults[seat] += 1
+        if self._faults[seat] >= FAULTS:
+            del self._faults[seat]
+        if not self._faults:
+            raise DeviceError(outcome.reason.partition(": ")[2])
 
 
-def _busy(workers):
-    return sum(worker.task is not None for worker in workers)
+def _give(worker, run, task):
+    """Send a worker a task, and before its first one of a run what the tasks share."""
+    worker.task, worker.since = task, time.monotonic()
+    with contextlib.suppress(OSError):  # of one that has died: seen when its answer is awaited
+        if worker.run is not run:
+            function, contexts = run
+            worker.pipe.send((function, contexts[worker.seat % len(contexts)]))
+            worker.run = run
+        worker.pipe.send((None, task))
 
 
-def _starter(function, context, n_workers):
-    """What makes a worker. Each gets its part of the processor's threads."""
+def _in_this_process(function, context, task):
+    """The Outcome of a task, without a worker. Raises DeviceError."""
+    began = time.monotonic()
+    try:
+        value, reason = function(context, task), None
+    except DeviceError:
+        raise
+    except Exception as error:
+        value, reason = None, reason_of(error)
+    return Outcome(task, value, reason, began=began, ended=time.monotonic())
+
+
+def _starter(n_workers, bound):
+    """What makes the worker of a seat. Each gets its part of the processor's threads."""
     processes = multiprocessing.get_context("spawn")
-    n_threads = max(1, (os.cpu_count() or 1) // n_workers)
-    environment = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    if n_workers > 1:  # PoCL's CPU device, by the names of its older and newer versions
-        environment |= dict.fromkeys(
-            ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT"), str(n_threads)
-        )
+    environment = shared_threads(n_workers)
 
-    def start():
+    def start(seat):
         ours, theirs = processes.Pipe()
         before = {name: os.environ.get(name) for name in environment}
         os.environ.update({k: v for k, v in environment.items() if before[k] is None})
         try:
-            process = processes.Process(target=_work, args=(theirs, function), daemon=True)
+            process = processes.Process(target=_work, args=(theirs, bound), daemon=True)
             process.start()
         finally:
             for name, value in before.items():
                 if value is None:
                     os.environ.pop(name, None)
         theirs.close()
-        # Not as an argument of the process: what is larger than the system's buffer would wait for
-        # ever to be read by a process that was killed before it had read it.
-        with contextlib.suppress(OSError):  # of one that has died: seen when it gets a task
-            ours.send(context)
-        return _Worker(process, ours)
+        return _Worker(seat, process, ours)
 
     return start
 
@@ -136,29 +195,36 @@ def _ended(workers, limit_s):
     """Pairs (worker, Outcome) of tasks that have ended by now, after waiting for some."""
     busy = [worker for worker in workers if worker.task is not None]
     ready = set(wait([one for w in busy for one in (w.pipe, w.process.sentinel)], LOOK_S))
-    found = []
+    found, now = [], time.monotonic()
     for worker in busy:
         if worker.pipe in ready:
             try:
                 value, reason = worker.pipe.recv()
+                died = False
             except (EOFError, OSError):
-                found.append((worker, _dead(worker)))
-            else:
-                found.append((worker, Outcome(worker.task, value, reason)))
+                value, reason, died = None, _dead(worker), True
         elif worker.process.sentinel in ready:
-            found.append((worker, _dead(worker)))
-        elif limit_s is not None and time.monotonic() - worker.since > limit_s:
-            reason = f"its worker took over {limit_s:g} s and was ended"
-            found.append((worker, Outcome(worker.task, reason=reason, worker_died=True)))
+            value, reason, died = None, _dead(worker), True
+        elif limit_s is not None and now - worker.since > limit_s:
+            value, reason, died = None, took_too_long(limit_s), True
+        else:
+            continue
+        outcome = Outcome(worker.task, value, reason, died, worker.seat, worker.since, now)
+        found.append((worker, outcome))
     return found
 
 
+def took_too_long(limit_s):
+    """The reason of a task that was ended with its worker."""
+    return f"its worker took over {limit_s:g} s and was ended"
+
+
 def _dead(worker):
-    """The Outcome of the task of a worker whose process has ended."""
+    """The reason of the task of a worker whose process has ended."""
     worker.process.join(5)
     code = worker.process.exitcode
     how = f"signal {-code}" if code is not None and code < 0 else f"exit status {code}"
-    return Outcome(worker.task, reason=f"its worker ended with {how}", worker_died=True)
+    return f"its worker ended with {how}"
 
 
 def _end(worker):
@@ -171,33 +237,35 @@ def _end(worker):
         worker.process.join()
 
 
-def _work(pipe, function):
-    """A worker: the context and tasks from the pipe, answers into it, until its end is closed."""
+def _work(pipe, bound):
+    """A worker: functions with their contexts and tasks from the pipe, answers into it, until its
+    end is closed."""
     import signal
 
+    hold_memory(bound)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all; the parent ends its workers
-    try:
-        context = pipe.recv()
-    except (EOFError, OSError):
-        return
+    function = context = None
     while True:
         try:
-            task = pipe.recv()
+            given, what = pipe.recv()
         except (EOFError, OSError):
             return
+        if given is not None:
+            function, context = given, what
+            continue
         try:
-            answer = function(context, task), None
+            answer = function(context, what), None
         except KeyboardInterrupt:
             return
         except Exception as error:
-            answer = None, _reason(error)
+            answer = None, reason_of(error)
         try:
             pipe.send(answer)
         except OSError:
             return
 
 
-def _reason(error):
+def reason_of(error):
     """An error in one line, with the place where it was raised."""
     text = " ".join(str(error).split()) or "no message"
     last = traceback.extract_tb(error.__traceback__)[-1]

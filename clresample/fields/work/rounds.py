@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from ...files.whole_file import FileError
-from .fitting import Group, fit_group, set_aside
+from .engine import Work
+from .fitting import fit_group, set_aside
+from .given import Group, given
 from .part import PartFile
-from .pool import run_tasks
 
 # Most rounds in which a cut blend's pieces are fitted again, their neighbours' light subtracted.
 # The first takes the neighbours out; crowded pieces settle by the third or fourth.
@@ -20,88 +21,131 @@ ROUNDS = 4
 SETTLED = 0.3
 
 
-def fitted(job, options, progress):
+def part_path(job, group):
+    """Where the part of a group belongs."""
+    return job.folder / f"{group.name}.fits"
+
+
+FIT = Work(given, fit_group, part_path)
+
+
+def fitted(job, engine, progress):
     """Fit all groups that are not yet, round by round.
 
+    A cut blend's pieces are fitted again as long as a neighbour of theirs moves.
     returns the PartFiles, the last round's of each patch counting, and the parents of those cut
     blends whose pieces had not settled when the rounds ended
     """
     progress.stage("fit", len(job.plan.patches))
-    names = _fit_round(job, _tasks(0, job.plan.groups), options, progress)
-    parts, last = list(names), names
-    pending = {job.plan.patches[n].parent for group in job.plan.giants for n in group}
-    before: tuple[str, ...] = ()
+    tasks = [Group(_name(0, i), patches) for i, patches in enumerate(job.plan.groups)]
+    names = _fit_round(job, tasks, engine, progress)
+    parts, history = list(names), _Parts(job)
+    history.add(names)
+    pieces = {n for group in job.plan.giants for n in group}
+    pending = {n for n in pieces if job.plan.patches[n].siblings}
+    moved: set[int] = set()
     for n_round in range(1, ROUNDS + 1):
-        groups = _of_parents(job.plan, pending)
+        groups = [few for g in job.plan.giants if (few := tuple(n for n in g if n in pending))]
         if not groups:
             break
-        progress.stage(f"pieces, round {n_round}", sum(map(len, groups)))
-        mine = {number for group in groups for number in group}
-        older = before if n_round > 2 else ()  # of round 0, neighbours were in the data
-        before = tuple(sorted(name for name, patches in last.items() if mine & set(patches)))
-        names = _fit_round(job, _tasks(n_round, groups, before, older), options, progress)
-        pending = _unsettled(job, before, names)
-        parts, last = parts + list(names), names
+        progress.stage(f"pieces, round {n_round}", len(pending))
+        tasks = [
+            Group(_name(n_round, i), patches, n_round, history.light_about(patches))
+            for i, patches in enumerate(groups)
+        ]
+        names = _fit_round(job, tasks, engine, progress)
+        history.add(names)
+        moved = history.moved({n for patches in names.values() for n in patches})
+        pending = {n for n in pieces if moved.intersection(job.plan.patches[n].siblings)}
+        parts += names
     # by round and group, in whichever order they ended: sums of models are the same to the last bit
-    return [_file(job, name) for name in sorted(parts)], pending
+    unsettled = {job.plan.patches[n].parent for n in (moved if pending else ())}
+    return [_file(job, name) for name in sorted(parts)], unsettled
 
 
-def _tasks(n_round, groups, before=(), older=()):
-    return [
-        Group(f"fit-{n_round}-{i:06d}", patches, n_round, before, older)
-        for i, patches in enumerate(groups)
-    ]
+def _name(n_round, i):
+    return f"fit-{n_round}-{i:06d}"
 
 
 def _file(job, name):
     return PartFile(job.folder / f"{name}.fits")
 
 
-def _of_parents(plan, parents):
-    """The groups of pieces of these blends."""
-    few = (tuple(n for n in g if plan.patches[n].parent in parents) for g in plan.giants)
-    return tuple(group for group in few if group)
+class _Parts:
+    """In which parts a cut blend's pieces are, round by round."""
+
+    def __init__(self, job):
+        self.job, self.names = job, {}
+
+    def add(self, names):
+        """Add a round: {name: patches} of its parts."""
+        for name in sorted(names):
+            for patch in names[name]:
+                if self.job.plan.patches[patch].pieces > 1:
+                    self.names.setdefault(patch, []).append(name)
+
+    def light_about(self, patches):
+        """`Group.light` of some pieces: all their neighbours' last models.
+
+        From its third on, a neighbour's is the mean of its last two: where both sides of a border
+        follow each other's last model alone, light goes back and forth between them. Of its first,
+        their light was in the data.
+        """
+        found = []
+        wanted = {k for n in patches for k in self.job.plan.patches[n].siblings}
+        for patch in sorted(wanted):
+            *older, last = self.names[patch]
+            mean = len(older) >= 2
+            found.append((patch, last, 0.5 if mean else 1.0))
+            if mean:
+                found.append((patch, older[-1], 0.5))
+        return tuple(found)
+
+    def moved(self, patches):
+        """Those pieces with a flux that changed by over SETTLED errors since their fit before."""
+        old = self._fluxes([(n, self.names[n][-2]) for n in patches])
+        moved = set()
+        for source, (patch, flux, error) in self._fluxes(
+            [(n, self.names[n][-1]) for n in patches]
+        ).items():
+            if source not in old:
+                moved.add(patch)
+                continue
+            known = np.isfinite(error) & (error > 0)
+            change = np.abs(flux - old[source][1])[known]
+            if (change > SETTLED * error[known]).any():
+                moved.add(patch)
+        return moved
+
+    def _fluxes(self, pairs):
+        """{id: (patch, fluxes (C,), errors (C,))} of (patch, name of its part)."""
+        found, of_name = {}, {}
+        for patch, name in pairs:
+            of_name.setdefault(name, set()).add(patch)
+        for name, patches in of_name.items():
+            part = _file(self.job, name)
+            rows, components = part.table("CATALOGUE"), part.table("COMPONENTS")
+            where = dict(zip(components["id"].tolist(), components["patch"].tolist(), strict=True))
+            flux, error = (_columns(rows, kind, self.job) for kind in ("flux", "flux_err"))
+            for k, source in enumerate(rows["id"].tolist()):
+                if where.get(source) in patches:
+                    found[source] = where[source], flux[k], error[k]
+        return found
 
 
-def _unsettled(job, before, names):
-    """Parents of blends with a flux that changed by over SETTLED errors since the round before."""
-    old = _fluxes(job, before)
-    moved = set()
-    for source, (parent, flux, error) in _fluxes(job, names).items():
-        if source not in old:
-            moved.add(parent)
-            continue
-        change = np.abs(flux - old[source][1])[np.isfinite(error) & (error > 0)]
-        if (change > SETTLED * error[np.isfinite(error) & (error > 0)]).any():
-            moved.add(parent)
-    return moved
+def _columns(rows, kind, job):
+    """Columns of all channels that the rows have: (S, C)."""
+    names = [f"{kind}_{c}" for c in job.channels if f"{kind}_{c}" in rows.colnames]
+    columns = [np.asarray(getattr(rows[name], "value", rows[name]), float) for name in names]
+    return np.array(columns).reshape(len(names), len(rows)).T
 
 
-def _fluxes(job, names):
-    """{id: (parent, fluxes (C,), errors (C,))} of the cut blends' sources in some parts."""
-    cut = {p.parent for p in job.plan.patches if p.pieces > 1}
-    found = {}
-    for name in names:
-        rows = _file(job, name).table("CATALOGUE")
-        columns = [
-            [np.asarray(getattr(rows[key], "value", rows[key]), float) for key in keys]
-            for keys in (
-                [f"{kind}_{c}" for c in job.channels if f"{kind}_{c}" in rows.colnames]
-                for kind in ("flux", "flux_err")
-            )
-        ]
-        for k, (source, parent) in enumerate(zip(rows["id"], rows["parent_id"], strict=True)):
-            if int(parent) in cut:
-                values = [np.array([column[k] for column in kind]) for kind in columns]
-                found[int(source)] = (int(parent), *values)
-    return found
-
-
-def _fit_round(job, tasks, options, progress):
+def _fit_round(job, tasks, engine, progress):
     """Fit the groups of one round; {name: patches} of their parts."""
     names, todo = {}, []
+    there = _parts_of(job.folder)
     for task in tasks:
-        mine = _parts_of(job.folder, task)
+        mine = {name: ps for name, ps in there.items() if name.startswith(task.name)}
         names |= mine
         left = tuple(p for p in task.patches if p not in {q for ps in mine.values() for q in ps})
         progress.step(len(task.patches) - len(left))
@@ -127,22 +171,21 @@ def _fit_round(job, tasks, options, progress):
             for few in (group.patches[:half], group.patches[half:])
         ]
 
-    for outcome in run_tasks(
-        fit_group, job, todo, options.workers, limit_s=options.limit_s, again=again
-    ):
+    for outcome in engine.run(FIT, job, todo, again=again, stage="fit"):
         group, value = outcome.task, outcome.value
         if outcome.reason is not None:
-            value = set_aside(job, group, outcome.reason)
+            value, content = set_aside(job, group, outcome.reason)
+            FIT.keep(job, group, content)
             progress.say(f"{len(group.patches)} blends are set aside: {outcome.reason}")
         names[group.name] = group.patches
         progress.step(value["patches"], value["sources"])
     return names
 
 
-def _parts_of(folder, task):
-    """{name: patches} of the parts on disk that hold patches of a group, whole or split."""
+def _parts_of(folder):
+    """{name: patches} of the parts on disk."""
     found = {}
-    for path in sorted(folder.glob(f"{task.name}*.fits")):
+    for path in sorted(folder.glob("fit-*.fits")):
         patches = PartFile(path).table("PATCHES")["patch"]
         found[path.stem] = tuple(int(p) for p in patches)
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,10 @@ from ...files.whole_file import whole_file
 from ...sky.grid import Grid
 from ..blends.link import link
 from ..blends.plan import Plan, make_plan
-from ..blends.search import Found, place, scatters_of, search
+from ..blends.search import Found, place, search
 from ..blends.tiles import tiles_of
-from .pool import run_tasks
+from .engine import Work
+from .look import looked
 
 # [bytes] that searching a pixel of the model takes for each channel: data, weights, and their
 # float64 images on the model, twice
@@ -34,10 +36,11 @@ class _Search:
     scatters: dict
 
 
-def planned(mosaics, reference, region, core, work, options, progress, clock):
+def planned(mosaics, reference, region, core, work, options, engine, progress, clock):
     """The plan: that on disk, or a new one after the search of all tiles.
 
     region: Box of the model's pixels that is searched; core: Box of it whose sources are wanted
+    engine: who searches it
     """
     path = work / "plan.json"
     if path.exists():
@@ -46,7 +49,7 @@ def planned(mosaics, reference, region, core, work, options, progress, clock):
     outer = int((options.memory / (SEARCH_BYTES * (n_channels + 2))) ** 0.5)
     size = max(LEAST_TILE_PX, min(options.tile_px, outer - 2 * options.overlap_px))
     tiles = tiles_of(region, size, options.overlap_px)
-    lost = _searched(mosaics, reference, tiles, work, options, progress)
+    lost = _searched(mosaics, reference, tiles, work, options, engine, progress)
     clock.stop("search")
 
     def found(number):
@@ -79,7 +82,7 @@ def planned(mosaics, reference, region, core, work, options, progress, clock):
     return plan
 
 
-def _searched(mosaics, reference, tiles, work, options, progress):
+def _searched(mosaics, reference, tiles, work, options, engine, progress):
     """Search the tiles that are not yet; {number: reason} of those that could not be."""
     positions = options.positions
     if positions is not None:
@@ -89,10 +92,8 @@ def _searched(mosaics, reference, tiles, work, options, progress):
     progress.step(len(tiles) - len(todo))
     if not todo:
         return {}
-    scatters = scatters_of(mosaics, reference, options.device)
-    shared = _Search(
-        mosaics, reference, work, options.threshold, options.device, positions, scatters
-    )
+    scatters = looked(work).scatters
+    shared = _Search(mosaics, reference, work, options.threshold, None, positions, scatters)
     lost: dict[str, str] = {}
     tried: set[int] = set()
 
@@ -102,9 +103,7 @@ def _searched(mosaics, reference, tiles, work, options, progress):
             return [outcome.task]
         return None
 
-    for outcome in run_tasks(
-        _search_tile, shared, todo, options.workers, limit_s=options.limit_s, again=again
-    ):
+    for outcome in engine.run(SEARCH, shared, todo, again=again, stage="search"):
         if outcome.reason is not None:
             if outcome.reason.startswith("ImportError"):
                 raise ImportError(outcome.reason)
@@ -118,23 +117,34 @@ def _found_path(work, number):
     return work / f"tile-{number:05d}.npz"
 
 
-def _search_tile(shared, tile):
-    """Search one tile and write what was found; returns the number of sources."""
-    given = shared.mosaics, shared.reference, tile
+def _nothing(shared, tile):
+    """What the search of a tile needs from the run's folder."""
+
+
+def _search_tile(shared, tile, given):
+    """Search one tile: the number of sources, and what was found as bytes."""
+    known = shared.mosaics, shared.reference, tile
     more = {"scatters": shared.scatters, "device": shared.device}
     if shared.positions is None:
-        found = search(*given, threshold=shared.threshold, **more)
+        found = search(*known, threshold=shared.threshold, **more)
     else:
-        found = place(*given, shared.positions, **more)
-    with whole_file(_found_path(shared.folder, tile.number)) as part:
-        np.savez(
-            part,
-            positions=found.positions,
-            peaks=found.peaks,
-            light=found.light,
-            lit=np.packbits(found.lit),
-        )
-    return len(found.positions)
+        found = place(*known, shared.positions, **more)
+    file = BytesIO()
+    np.savez(
+        file,
+        positions=found.positions,
+        peaks=found.peaks,
+        light=found.light,
+        lit=np.packbits(found.lit),
+    )
+    return len(found.positions), file.getvalue()
+
+
+def _tile_path(shared, tile):
+    return _found_path(shared.folder, tile.number)
+
+
+SEARCH = Work(_nothing, _search_tile, _tile_path)
 
 
 def _read_found(work, number):

@@ -1,0 +1,264 @@
+"""How a field's time, memory and own cost go with workers, and with one giant blend.
+
+    python -m bench.scaling [--quick] [--json FILE]
+    python -m bench.scaling --giant 1500 --sizes 3000 --workers 2
+
+The same simulated field, its files on disk, is run by `run_field` with each number of workers in
+turn, each of which has one core: PoCL is held to one thread a worker. With --giant the field is the
+core of a cluster of galaxies: so many sources, at known places, under a smooth halo that joins all
+of their light to one blend, which is cut into pieces; the sky is fitted, which takes the halo up.
+
+wall_s, fit_s       of the run, and of its fits alone
+core_s              processor time of all processes; per source in core_s_per_source
+speed_up, fit_speed wall time with the fewest workers over that with these; of the fits alone
+own_cost            processor time of the process that deals the work while others search and fit,
+                    over that of all of them
+busy                time that workers spent in fits over workers times the fits' wall time
+tail_s              from the first worker without a task left to the end of the fits, all rounds
+peak_gb, largest_gb memory of all processes at once, and of the largest alone: resident, files that
+                    are mapped and shared libraries counted in each
+n_blends, pieces    of the plan; measured: sources with a finite flux in every channel
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+from astropy.table import QTable
+
+from clresample import FieldOptions, Settings, simulate_field
+from clresample.cli.simulate import write_field
+from clresample.fields.options import Progress
+from clresample.fields.reading.field_file import read_field
+from clresample.fields.run import run_field
+
+from .harness import records
+from .harness.clock import on_all_cores
+from .harness.options import Parser, positive, run, seed
+from .soak import children
+
+SIZES, QUICK_SIZES, GIANT_SIZES = (1024,), (256,), (3000,)
+BANDS, QUICK_BANDS = "ugrizy", "ri"
+LEAST_SNR = 5.0  # of sources whose places are given
+# Euclid's signal to noise of the halo's light in one pixel, in the corners; with all instruments it
+# is over the search's limit everywhere. In the middle it is some five times as bright.
+HALO_SIGMA = 1.5
+LOOK_S = 0.2
+COLUMNS = (
+    ("n_model", 7, "d"),
+    ("workers", 7, "d"),
+    ("n_sources", 9, "d"),
+    ("measured", 8, "d"),
+    ("n_blends", 8, "d"),
+    ("pieces", 6, "d"),
+    ("wall_s", 7, ".1f"),
+    ("fit_s", 7, ".1f"),
+    ("core_s_per_source", 17, ".3f"),
+    ("speed_up", 8, ".2f"),
+    ("fit_speed", 9, ".2f"),
+    ("own_cost", 8, ".4f"),
+    ("busy", 5, ".2f"),
+    ("tail_s", 6, ".1f"),
+    ("peak_gb", 7, ".2f"),
+    ("largest_gb", 10, ".2f"),
+    ("status", 20, ""),
+)
+
+
+class Memory(threading.Thread):
+    """Watches the resident memory [bytes] of this process and those that it started."""
+
+    def __init__(self):
+        super().__init__(daemon=True)
+        self.peak, self.largest, self.stop = 0, 0, threading.Event()
+
+    def run(self):
+        while not self.stop.wait(LOOK_S):
+            sizes = [resident(pid) for pid in (os.getpid(), *children(os.getpid()))]
+            self.peak, self.largest = max(self.peak, sum(sizes)), max(self.largest, *sizes)
+
+
+def resident(pid):
+    """Resident memory [bytes] of a process; 0 of one that has ended."""
+    try:
+        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    except (OSError, IndexError):
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+class Stages(Progress):
+    """Processor time [s] of this process when each stage began."""
+
+    def __init__(self):
+        self.began = {}
+
+    def stage(self, name, total):
+        self.began.setdefault(name, time.process_time())
+
+
+def halo_of(mosaic, n_pixels, survey_of_noise):
+    """Counts (C, Ny, Nx) of a halo about a field's middle, of one brightness in AB magnitudes.
+
+    survey_of_noise: in whose pixels HALO_SIGMA is meant
+    """
+    finest = survey_of_noise.pixel_scale_arcsec
+    corner = np.hypot(n_pixels, n_pixels) / 2 * finest
+    core = n_pixels / 3 * finest
+    y, x = np.indices(mosaic.grid.shape) - np.array(mosaic.grid.shape).reshape(2, 1, 1) / 2
+    radius = np.hypot(y, x) * mosaic.survey.pixel_scale_arcsec
+    shape = (1 + (corner / core) ** 2) / (1 + (radius / core) ** 2)
+    unit = float(survey_of_noise.counts(np.zeros((1, 1)))[0, 0])
+    magnitude = -2.5 * np.log10(HALO_SIGMA * survey_of_noise.noise_sigma[0] / unit)
+    area = (mosaic.survey.pixel_scale_arcsec / finest) ** 2
+    counts = mosaic.survey.counts(np.full((1, mosaic.survey.n_bands), magnitude))[0]
+    return area * counts[:, None, None] * shape
+
+
+def written(folder, size, options, bands):
+    """field.toml of a simulated field, and its FieldOptions beyond workers."""
+    given = {"rubin_bands": bands, "psf_variation": 0.1, "bad_columns": 2}
+    if options.giant is None:
+        field = simulate_field(options.seed, n_pixels=size, density=options.density, **given)
+        return write_field(folder, field)[0], {}
+    arcmin2 = (size * 0.1 / 60) ** 2
+    density = 1.1 * options.giant / arcmin2  # the faintest are left out
+    field = simulate_field(
+        options.seed, n_pixels=size, density=density, faintest=25.0, clustering=0.4, **given
+    )
+    for mosaic in field.mosaics:
+        mosaic.data[:] += halo_of(mosaic, size, field.mosaics[0].survey)
+    brightest = np.argsort(-field.truth["snr"])[: options.giant]
+    chosen = brightest[field.truth["snr"][brightest] > LEAST_SNR]
+    places = np.stack([field.truth["ra"], field.truth["dec"]], axis=1)[chosen]
+    own = {"positions": places, "passes": 1, "settings": Settings(fit_sky=True)}
+    return write_field(folder, field)[0], own
+
+
+def row_of(toml, out, size, workers, own):
+    """The row of one run, without what compares it with others."""
+    field, stages, memory = read_field(toml), Stages(), Memory()
+    memory.start()
+    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    start = time.process_time()
+    done = run_field(
+        field.mosaics, out, options=FieldOptions(workers=workers, **own), progress=stages
+    )
+    wall_s, own_s = time.perf_counter() - began, time.process_time() - start
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    memory.stop.set()
+    theirs_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    dealing_s = stages.began["write"] - stages.began["fit"]
+    table, blends = QTable.read(out / "catalogue.fits"), QTable.read(out / "blends.ecsv")
+    fluxes = [np.asarray(table[c]) for c in table.colnames if c.startswith("flux_")]
+    fluxes = [f for f in fluxes if f.dtype.kind == "f"]
+    fit_s, turns = done.seconds["fit"], [o for stage, o in done.turns if stage == "fit"]
+    return {
+        "n_model": size,
+        "workers": workers,
+        "n_sources": len(table),
+        "measured": int(np.isfinite(fluxes).all(axis=0).sum()),
+        "n_blends": len(set(blends["parent_id"].tolist())),
+        "pieces": len(blends),
+        "wall_s": wall_s,
+        "fit_s": fit_s,
+        "core_s": own_s + theirs_s,
+        "core_s_per_source": (own_s + theirs_s) / max(len(table), 1),
+        "own_cost": dealing_s / (dealing_s + theirs_s),
+        "busy": sum(o.ended - o.began for o in turns) / (workers * fit_s),
+        "tail_s": tail_of(turns, workers),
+        "peak_gb": memory.peak / 1e9,
+        "largest_gb": memory.largest / 1e9,
+        "stage": done.seconds,
+        "status": ", ".join(f"{n} {how}" for how, n in sorted(done.outputs.status.items())),
+    }
+
+
+def tail_of(turns, workers):
+    """Seconds from the first worker's last task to the last one's, of all rounds together."""
+    rounds: dict[int, dict] = {}
+    for outcome in turns:
+        ends = rounds.setdefault(outcome.task.round, {})
+        ends[outcome.seat] = max(ends.get(outcome.seat, 0.0), outcome.ended)
+    return sum(
+        max(ends.values()) - min(ends.values()) for ends in rounds.values() if len(ends) == workers
+    )
+
+
+def rows_of(size, options, bands):
+    """Yield the rows of one field, with each number of workers."""
+    with tempfile.TemporaryDirectory() as folder:
+        toml, own = written(Path(folder) / "sky", size, options, bands)
+        first = None
+        for workers in sorted(options.workers):
+            row = row_of(toml, Path(folder) / f"out{workers}", size, workers, own)
+            first = first or row
+            row["speed_up"] = first["wall_s"] / row["wall_s"]
+            row["fit_speed"] = first["fit_s"] / row["fit_s"]
+            yield row
+
+
+def main(options):
+    one = {"POCL_MAX_PTHREAD_COUNT": "1", "POCL_CPU_MAX_CU_COUNT": "1"}
+    os.environ.update(one)  # of the workers; this process runs nothing on a device
+    threads = on_all_cores()
+    bands = tuple(QUICK_BANDS if options.quick else BANDS)
+    usual = GIANT_SIZES if options.giant else QUICK_SIZES if options.quick else SIZES
+    what = f"{options.density:g} sources per square arcminute to i = 26"
+    if options.giant:
+        what = f"one blend of {options.giant} sources"
+    record = records.record(f"{threads}, one thread a worker") | {
+        "fields": f"seed {options.seed}, {what}, Euclid VIS and Rubin {''.join(bands)}"
+    }
+    records.print_record(record)
+    records.print_head(COLUMNS)
+    rows = []
+    for size in options.sizes or usual:
+        for row in rows_of(size, options, bands):
+            rows.append(row)
+            records.print_row(COLUMNS, row)
+            print("  " + ", ".join(f"{k} {s:.2f} s" for k, s in row["stage"].items()), flush=True)
+    if options.json is not None:
+        records.write_json(options.json, {"record": record, "rows": rows})
+
+
+def parser():
+    parser = Parser("bench.scaling", description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="256 pixels, two bands of Rubin")
+    parser.add_sizes(SIZES)
+    parser.add_argument(
+        "--workers",
+        nargs="+",
+        type=positive(int),
+        default=[1, 2],
+        metavar="N",
+        help="numbers of processes, by turns (1 2)",
+    )
+    parser.add_argument(
+        "--giant",
+        type=positive(int),
+        metavar="S",
+        help="one blend of so many sources instead of a field (3000 pixels a side)",
+    )
+    parser.add_argument(
+        "--density",
+        type=positive(float),
+        default=36.0,
+        metavar="N",
+        help="sources per square arcminute (%(default)s)",
+    )
+    parser.add_argument(
+        "--seed", type=seed, default=0, metavar="S", help="of the field (%(default)s)"
+    )
+    parser.add_json()
+    return parser
+
+
+if __name__ == "__main__":
+    run(main, parser())

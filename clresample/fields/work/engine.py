@@ -1,0 +1,82 @@
+"""Who does a field's work: processes of this machine or workers of a cluster, by one interface."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from ...files.whole_file import whole_file
+from .pool import Pool
+
+
+@dataclass(frozen=True)
+class Work:
+    """A kind of task in three steps, of which the second alone takes time, and no folder.
+
+    given: called as given(context, task), returns what the task needs from the run's folder
+    done: called as done(context, task, given), returns (value, content): a small value for whoever
+        asked, and the bytes of the file that the task leaves
+    path: called as path(context, task), returns where that file belongs
+
+    All are functions of modules, so that another process can import them. Called itself, it does
+    all three in turn and returns the value.
+    """
+
+    given: Callable
+    done: Callable
+    path: Callable
+
+    def __call__(self, context, task):
+        value, content = self.done(context, task, self.given(context, task))
+        self.keep(context, task, content)
+        return value
+
+    def keep(self, context, task, content):
+        """Write a task's file, whole or not at all. Raises FileError."""
+        with whole_file(self.path(context, task)) as part:
+            part.write_bytes(content)
+
+
+class Processes:
+    """Processes of this machine, or this process itself.
+
+    n_workers: 0 = this process; at least one for each device
+    devices: choices as `get_device` takes them, dealt to the workers by turns; empty = the default
+    limit_s [s], bound [bytes]: see `Pool`
+    turns: (stage, Outcome) of every task so far that ended well, for whoever wants to see the time
+    """
+
+    def __init__(self, n_workers, devices=(), limit_s=None, bound=None):
+        self.devices = tuple(devices) or (None,)
+        several = len(self.devices) > 1
+        self.n_workers = max(n_workers, len(self.devices)) if several else n_workers
+        self.pool = Pool(self.n_workers, limit_s, bound)
+        self.turns: list[tuple] = []
+
+    @property
+    def sharing(self) -> list[tuple]:
+        """Each device, and how many workers share it at most."""
+        n = -(-max(self.n_workers, 1) // len(self.devices))
+        return [(device, n) for device in self.devices]
+
+    def run(self, work, context, tasks, again=None, stage=""):
+        """Yield the Outcome of every task, as `Pool.run` does."""
+        contexts = [replace(context, device=device) for device in self.devices]
+        for outcome in self.pool.run(work, contexts, tasks, again):
+            if outcome.reason is None:
+                self.turns.append((stage, outcome))
+            yield outcome
+
+    def close(self):
+        """End the processes."""
+        self.pool.close()
+
+
+def engine_of(options, progress):
+    """The engine that FieldOptions ask for. Raises ImportError, ValueError for a cluster's."""
+    devices = options.devices
+    if options.scheduler is not None:
+        from .cluster import Cluster
+
+        return Cluster(options.scheduler, devices, options.limit_s, progress)
+    return Processes(options.workers, devices, options.limit_s, options.bound)

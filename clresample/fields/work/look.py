@@ -1,0 +1,84 @@
+"""The first look at a field, once: how its noise scatters, and what the devices hold."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from ...device.device import get_device
+from ...files.whole_file import FileError
+from ...sky.grid import Grid
+from ..blends.search import scatters_of
+from .engine import Work
+
+# A group of fits may take so much of its device's memory by prediction: predictions are rough, and
+# the driver, its kernels and the next group's data need room too.
+DEVICE_PART = 4
+FILE = "look.json"
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a run knows before it searches.
+
+    scatters {mosaic's name: scatter of its signal to noise}: see `scatters_of`
+    devices: names of those asked for; memory [bytes]: of the smallest, for one group
+    """
+
+    scatters: dict
+    devices: list
+    memory: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Field:
+    mosaics: tuple
+    reference: Grid
+    folder: Path
+    device: object = None
+
+
+def take_look(mosaics, reference, work, engine):
+    """Take the first look at a field, unless it was taken. Raises ImportError without sep."""
+    if (work / FILE).exists():
+        return
+    tried: list = []
+
+    def again(outcome):
+        tried.append(outcome)
+        return [outcome.task] if outcome.worker_died and len(tried) < 2 else None
+
+    field = _Field(mosaics, reference, work)
+    for outcome in engine.run(LOOK, field, [engine.sharing], again=again, stage="search"):
+        if outcome.reason is not None:
+            if outcome.reason.startswith(ImportError.__name__):
+                raise ImportError(outcome.reason)
+            raise FileError(f"{work.parent}: nothing can be searched ({outcome.reason})")
+
+
+def looked(work) -> Look:
+    """The first look that was taken."""
+    return Look(**json.loads((work / FILE).read_text()))
+
+
+def _given(field, sharing):
+    """What the look needs from the run's folder: nothing."""
+
+
+def _look(field, sharing, given):
+    """sharing: [(choice of a device, how many workers share it)]; None is the worker's own."""
+    devices = [(get_device(field.device if choice is None else choice), n) for choice, n in sharing]
+    look = Look(
+        scatters_of(field.mosaics, field.reference, devices[0][0]),
+        [device.name for device, _ in devices],
+        min(device.memory // (DEVICE_PART * n) for device, n in devices),
+    )
+    return None, json.dumps(asdict(look), indent=1).encode()
+
+
+def _path(field, sharing):
+    return field.folder / FILE
+
+
+LOOK = Work(_given, _look, _path)

@@ -1,0 +1,35 @@
+"""What a worker process may take of its machine: threads and memory."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+
+def shared_threads(n_workers) -> dict:
+    """Environment of a worker that shares this machine's processor with so many, itself included.
+
+    NumPy's libraries get one thread, PoCL's CPU device its part of all, by the names of its older
+    and newer versions.
+    """
+    environment = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    if n_workers > 1:
+        n_threads = max(1, (os.cpu_count() or 1) // n_workers)
+        names = "POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT"
+        environment |= dict.fromkeys(names, str(n_threads))
+    return environment
+
+
+def hold_memory(bound):
+    """Have the system refuse this process private memory beyond so many bytes, where it can.
+
+    What is refused is a MemoryError, or a device's, which costs a group of fits its batch: they are
+    fitted one by one. Files that are mapped do not count (RLIMIT_DATA of Linux).
+    """
+    if bound is None or not sys.platform.startswith("linux"):
+        return
+    import resource
+
+    _, most = resource.getrlimit(resource.RLIMIT_DATA)
+    if most == resource.RLIM_INFINITY or bound < most:
+        resource.setrlimit(resource.RLIMIT_DATA, (int(bound), most))

@@ -1,0 +1,92 @@
+"""Fields on the workers of a dask.distributed cluster: the same bytes, whatever dies."""
+
+import os
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from helpers.fields import mosaics_of
+
+from clresample import FieldOptions
+from clresample.fields.options import Progress
+from clresample.fields.run import run_field
+from clresample.fields.work.cluster import Cluster
+from clresample.fields.work.engine import Work
+
+distributed = pytest.importorskip("distributed")
+
+
+@pytest.fixture(scope="module")
+def scheduler():
+    """Two worker processes with a nanny each."""
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
+    ) as cluster:
+        yield cluster.scheduler_address
+
+
+class _Said(Progress):
+    def __init__(self):
+        self.lines = []
+
+    def say(self, text):
+        self.lines.append(text)
+
+
+def test_a_cluster_ends_with_the_bytes_of_one_process(done, sky, scheduler, tmp_path):
+    folder, _ = done
+    said = _Said()
+    options = FieldOptions(scheduler=scheduler)
+    run = run_field(mosaics_of(sky), tmp_path, options=options, progress=said)
+    assert any(line.startswith("dashboard: http") for line in said.lines)
+    assert len({outcome.seat for stage, outcome in run.turns if stage == "fit"}) == 2
+    for name in ("catalogue.fits", "models.fits", "residual_Euclid.fits"):
+        assert (tmp_path / name).read_bytes() == (folder / name).read_bytes(), name
+
+
+@dataclass(frozen=True)
+class Context:
+    folder: str
+    device: object = None
+
+
+def nothing(context, task):
+    return None
+
+
+def act(context, task, given):
+    """Tasks as words: what a worker may do."""
+    Path(context.folder, f"{task}-{time.monotonic_ns()}").touch()
+    if task == "raise":
+        raise ValueError("a bad blend")
+    if task == "die":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if task == "hang":
+        time.sleep(600)
+    return task.upper(), task.encode()
+
+
+def path_of(context, task):
+    return Path(context.folder) / f"{task}.txt"
+
+
+def test_workers_that_die_or_hang_cost_their_own_tasks_alone(scheduler, tmp_path):
+    cluster = Cluster(scheduler, (), 20.0, Progress())
+    tasks = ["a", "die", "b", "raise", "hang", "c", "d"]
+    try:
+        work, context = Work(nothing, act, path_of), Context(str(tmp_path))
+        found = {o.task: o for o in cluster.run(work, context, tasks)}
+    finally:
+        cluster.close()
+    assert [found[t].value for t in "abcd"] == list("ABCD")
+    assert all((tmp_path / f"{t}.txt").read_text() == t for t in "abcd")
+    assert found["die"].worker_died and found["hang"].worker_died
+    assert "over 20 s" in found["hang"].reason
+    assert found["raise"].reason.startswith("ValueError: a bad blend")
+
+
+def test_what_does_not_answer_is_named():
+    with pytest.raises(ValueError, match="scheduler 'tcp://127.0.0.1:1' does not answer"):
+        Cluster("tcp://127.0.0.1:1", (), None, Progress())
