@@ -8,6 +8,8 @@ from pathlib import Path
 from .options import names, note, positive, whole
 
 FILES = "field.toml", "truth.ecsv"
+TILE = 1  # number of the tile of Euclid's MER that a simulated field becomes
+CELL_PX = 150  # side of a cell of Rubin's coadds
 DESCRIPTION = """\
 Write a simulated field of galaxies and stars as Euclid (VIS) and Rubin see it:
 mosaics with RMS, masks and PSFs that vary, field.toml for `clresample field`, and
@@ -59,6 +61,13 @@ def add_simulate(commands):
     images.add_argument(
         "--bad-columns", type=whole, default=2, metavar="N", help="of each mosaic (%(default)s)"
     )
+    images.add_argument(
+        "--format",
+        choices=["plain", "survey"],
+        default="plain",
+        help="plain: FITS cubes with RMS, MASK and PSFs; survey: Euclid as a tile of MER, Rubin as "
+        "cell coadds, whose PSF is constant in a cell (%(default)s)",
+    )
     parser.set_defaults(run=run)
 
 
@@ -95,7 +104,8 @@ def run(arguments):
         )
     except ImportError as error:
         raise ValueError(f"simulate: {error}") from error
-    for path in write_field(folder, field):
+    write = write_field if arguments.format == "plain" else write_surveys
+    for path in write(folder, field):
         print(path)
     note(arguments, f"next: clresample field {folder / FILES[0]} -o {folder / 'out'}")
 
@@ -111,7 +121,6 @@ def write_field(folder, field) -> list[Path]:
     from astropy.table import Table
 
     from ..files.fits import write_hdus
-    from ..files.whole_file import whole_file
 
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -142,12 +151,78 @@ def write_field(folder, field) -> list[Path]:
         write_hdus(folder / f"{name}_psf.fits", [fits.PrimaryHDU(), images, places])
         paths += [folder / f"{name}.fits", folder / f"{name}_psf.fits"]
         tables.append(_toml(mosaic, name))
+    return _with_truth(folder, tables, paths, field)
+
+
+def _with_truth(folder, tables, paths, field):
+    """Write field.toml and truth.ecsv; all paths, field.toml first."""
+    from astropy.table import Table
+
+    from ..files.whole_file import whole_file
+
     with whole_file(folder / FILES[0]) as part:
         part.write_text("\n".join(tables))
     truth = Table(field.truth)
     with whole_file(folder / FILES[1]) as part:
         truth.write(part, format="ascii.ecsv", overwrite=True)
     return [folder / FILES[0], *paths, folder / FILES[1]]
+
+
+def write_surveys(folder, field) -> list[Path]:
+    """Write a SimulatedField as its surveys hand out their data, field.toml, truth.ecsv.
+
+    euclid/ holds a tile of MER, rubin/ a cell coadd for each band. Dead columns have the flag 1
+    there and NO_DATA here. Returns the paths, field.toml first.
+    """
+    import numpy as np
+
+    from ..fields.psfs.sampled import PSFCube
+    from ..fields.readers.writers import write_cell_coadd, write_mer_tile
+
+    folder, (euclid, rubin) = Path(folder), field.mosaics
+    for name in ("euclid", "rubin"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    paths = []
+    for i, (band, point) in enumerate(_bands(euclid)):
+        paths += write_mer_tile(
+            folder / "euclid",
+            TILE,
+            band,
+            euclid.data[i],
+            euclid.grid,
+            rms=np.full(euclid.grid.shape, euclid.noise_sigma[i], np.float32),
+            flags=euclid.bad.astype(np.uint8),
+            zero_point=point,
+            psfs=euclid.psf_images[:, i],
+            places=euclid.psf_positions,
+        )
+    for i, (band, point) in enumerate(_bands(rubin)):
+        psf = PSFCube(rubin.psf_images[:, i], rubin.psf_positions)
+        path = write_cell_coadd(
+            folder / "rubin" / f"coadd_{band}.fits",
+            band,
+            rubin.data[i],
+            rubin.grid,
+            variance=np.full(rubin.grid.shape, rubin.noise_sigma[i] ** 2),
+            mask={"NO_DATA": rubin.bad},
+            zero_point=point,
+            psf_at=lambda y, x, psf=psf: psf.psf_at(y, x).images[0],
+            cell_px=CELL_PX,
+        )
+        paths.append(path)
+    coadds = ", ".join(f'"rubin/coadd_{band}.fits"' for band in rubin.survey.bands)
+    # MER's noise is correlated, which is found unless it is said that this one's is not
+    tables = [
+        f'[[mosaic]]\nformat = "euclid-mer"\npath = "euclid"\nname = "{euclid.survey.name}"\n'
+        'noise = "white"\n',
+        f'[[mosaic]]\nformat = "rubin-coadd"\npath = [{coadds}]\nname = "{rubin.survey.name}"\n',
+    ]
+    return _with_truth(folder, tables, paths, field)
+
+
+def _bands(mosaic):
+    """Pairs of a band's name and its zero point [mag]."""
+    return zip(mosaic.survey.bands, mosaic.survey.zero_points_mag, strict=True)
 
 
 def _toml(mosaic, name):

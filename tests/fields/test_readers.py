@@ -6,6 +6,7 @@ from astropy.io import fits
 from helpers.survey_files import SHAPE, noise_image, psf_image, sky_grid, write_brick
 
 from clresample import PSF, read_euclid_mer, read_legacy_survey
+from clresample.cli import main
 from clresample.fields.box import Box
 from clresample.fields.psfs.sampled import PSFCube
 from clresample.fields.readers.formats import read_survey
@@ -190,3 +191,25 @@ def test_mistakes_in_a_survey_s_table(tmp_path, lines, message):
 def test_every_format_has_a_name():
     with pytest.raises(ValueError, match="format is 'fits', it takes euclid-mer, rubin-coadd"):
         read_survey("fits", "x")
+
+
+def test_a_simulated_field_is_the_same_in_the_surveys_formats(tmp_path):
+    pytest.importorskip("galsim")
+    size = ["--size", "128", "--density", "90", "--bands", "i,r", "--psf-variation", "0"]
+    for form in ("plain", "survey"):
+        command = ["simulate", "field", "-o", str(tmp_path / form), "--format", form]
+        assert main([*command, *size, "--bad-columns", "2"]) == 0
+    plain, survey = (read_field(tmp_path / form / "field.toml") for form in ("plain", "survey"))
+    for one, other in zip(plain.mosaics, survey.mosaics, strict=True):
+        box = Box.of(one.grid.shape)
+        assert one.name == other.name
+        for mine, theirs in zip(one.channels, other.channels, strict=True):
+            unit = 10 ** (0.4 * (theirs.zero_point - mine.zero_point))
+            assert mine.name == theirs.name
+            assert np.allclose(theirs.read(box), unit * mine.read(box), rtol=1e-5)
+            assert np.allclose(theirs.weights(box) * unit**2, mine.weights(box), rtol=1e-5)
+            assert (mine.weights(box) == 0).sum() == 2 * box.shape[0]
+        middle = (np.array(box.shape) - 1) / 2
+        seen = [mosaic.psf.psf_at(*middle).images for mosaic in (one, other)]
+        assert np.abs(seen[0] - seen[1]).max() < 1e-4 * seen[0].max()
+        assert np.allclose(one.grid.sky(*middle), other.grid.sky(*middle), atol=1e-9)
