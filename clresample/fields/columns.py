@@ -19,7 +19,25 @@ DESCRIPTIONS = {
     "snr": "signal to noise of the fluxes of all channels",
     "y": "row of the detection in the model's pixels, from 0",
     "x": "column of the detection in the model's pixels, from 0",
-    "size": "of the fitted light under the model's PSF",
+    "ra": "right ascension of the detection",
+    "dec": "declination of the detection",
+    "y_sky": "of the detection on the flat sky",
+    "x_sky": "of the detection on the flat sky",
+    "n_components": "of the source's model: 2 where its core has another colour",
+    "size": "of the fitted light under the model's PSF: root of the mean of its second moments",
+    "e1": "ellipticity of the fitted light: above 0 where it is stretched north - south",
+    "e2": "ellipticity of the fitted light: above 0 where it is stretched north-east - south-west",
+    "angle": "of the fitted light's long axis, east of north",
+}
+BLENDS = {  # of blends.ecsv
+    "patch": "number of the fit",
+    "parent_id": "id of the brightest source that was detected in the blend",
+    "round": "how often a piece of a cut blend was fitted again",
+    "status": "how the fit ended",
+    "n_sources": "that were fitted together",
+    "n_pixels": "of the model, about the blend",
+    "iterations": "of the fit",
+    "seconds": "of the fit, its share of a group's",
 }
 FIRST = ("id", "parent_id", "ra", "dec", "y_sky", "x_sky", "y", "x", "flags", "status", "reason")
 THEN = ("n_blend", "pass", "peak", "snr")
@@ -59,6 +77,8 @@ def finished(job, parts, last, unsettled=()):
     if fits:
         blends = blends[np.argsort(blends["patch"])]
         blends["seconds"] = blends["seconds"] * u.s
+        for name in set(BLENDS) & set(blends.colnames):
+            blends[name].info.description = BLENDS[name]
     return _described(table[_order(job, table.colnames)] if tables else table), blends
 
 

@@ -24,7 +24,10 @@ from .parquet import write_parquet
 from .work.look import looked
 
 NO_PARQUET = "no catalogue.parquet: pyarrow is not installed (pip install 'clresample[field]')"
-PACKAGES = "numpy", "scipy", "astropy", "pyopencl", "sep", "pyarrow"
+PACKAGES = (  # those whose numbers enter a catalogue, or whose formats are read and written
+    *("numpy", "scipy", "astropy", "pyopencl", "pocl-binary-distribution", "sep"),
+    *("pyarrow", "astropy-healpix", "galsim", "gwcs"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +116,7 @@ def _write_provenance(path, job, about, seconds, status):
     found = {
         "clresample": __version__,
         "python": platform.python_version(),
+        "system": platform.platform(),
         "packages": packages,
         "device": ", ".join(looked(job.folder).devices),
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
