@@ -230,16 +230,18 @@ class Mosaic:
         return Box.around(there).grown(1).meet(whole)
 
     def observation(
-        self, box, *, ignore=None, subtract=None, extra=None, psf_box=None
+        self, box=None, *, ignore=None, subtract=None, extra=None, psf_box=None
     ) -> Observation | None:
         """The Observation of a Box that lies on the mosaic; None where no pixel has a weight.
 
+        box: None = all of the mosaic
         ignore (Ny, Nx) bool: pixels that get no weight
         subtract (C, Ny, Nx) [counts]: light that is not to be fitted
         extra (C, Ny, Nx) [counts^2]: variance that is added to the pixels'
         psf_box: Box in whose middle the PSF is taken, as if it were the same everywhere; None = it
             varies as the mosaic's does
         """
+        box = box or Box.of(self.grid.shape)
         weights = np.stack([c.weights(box) for c in self.channels])
         if ignore is not None:
             weights[:, ignore] = 0
