@@ -213,3 +213,20 @@ def test_a_simulated_field_is_the_same_in_the_surveys_formats(tmp_path):
         seen = [mosaic.psf.psf_at(*middle).images for mosaic in (one, other)]
         assert np.abs(seen[0] - seen[1]).max() < 1e-4 * seen[0].max()
         assert np.allclose(one.grid.sky(*middle), other.grid.sky(*middle), atol=1e-9)
+
+
+def test_planes_on_other_pixels_and_too_little_sky_are_refused(tmp_path):
+    write_tile(tmp_path, bands=("VIS",))
+    path = next(tmp_path.glob("*RMS*"))
+    pixels = fits.getdata(path)
+    fits.writeto(path, pixels[:30], overwrite=True)
+    with pytest.raises(FileError, match=r"has \(30, 60\) pixels, its image \(70, 60\)"):
+        read_euclid_mer(tmp_path)
+    fits.writeto(path, pixels, overwrite=True)
+    path = next(tmp_path.glob("*FLAG*"))
+    fits.writeto(path, np.ones(SHAPE, np.int16) - (np.indices(SHAPE)[0] < 9), overwrite=True)
+    with pytest.raises(ValueError, match='noise: channel VIS.*give noise = "white"'):
+        read_euclid_mer(tmp_path)
+    notes = []
+    read_euclid_mer(tmp_path, noise="white", notes=notes)
+    assert any("87% of the pixels" in note and "mask_bits" in note for note in notes)

@@ -24,7 +24,7 @@ from ...files.whole_file import FileError
 from ..mosaic import Mosaic
 from ..psfs.read import read_psf_field
 from ..reading.headers import mask_value, zero_point
-from .found import Found, Given, assembled, image_plane, paths_of, placed
+from .found import Found, Given, assembled, files_at, image_plane, paths_of, placed, plane_on
 
 NAME = re.compile(
     r"EUC_MER_(BGSUB-MOSAIC|MOSAIC|CATALOG-PSF)-(.+?)(-RMS|-FLAG)?_TILE(\d+)([-_].*)?\.fits(\.gz)?"
@@ -47,11 +47,8 @@ def read_euclid_mer(path, **given) -> Mosaic:
 
 def _bands(paths, given):
     """{band: {kind: path}} of the tile."""
-    if len(paths) == 1 and paths[0].is_dir():
-        there, wanted = sorted(paths[0].iterdir()), None
-    else:
-        there = sorted({file for path in paths for file in path.parent.iterdir()})
-        wanted = set(paths)
+    there = files_at(paths)
+    wanted = None if len(paths) == 1 and paths[0].is_dir() else set(paths)
     files: dict[str, dict] = {}
     tiles = set()
     for file in there:
@@ -89,13 +86,10 @@ def _band(band, files, given):
         raise ValueError(f"rms of band {band} is missing: no EUC_MER_MOSAIC-{band}-RMS beside it")
     data, _, header, grid = image_plane(path)
     grid = placed(path, grid)
-    rms, shape, _, _ = image_plane(files[RMS])
-    for what, there in ((RMS, shape),):
-        if there != grid.shape:
-            raise FileError(f"{files[what]}: has {there} pixels, {path.name} {grid.shape}")
+    rms, _ = plane_on(grid, files[RMS])
     mask = value = None
     if FLAG in files:
-        mask, _, flags, _ = image_plane(files[FLAG])
+        mask, flags = plane_on(grid, files[FLAG])
         value = None if given.mask_bits is None else mask_value(flags, given.mask_bits)
     else:
         given.notes.append(f"{band}: no EUC_MER_MOSAIC-{band}-FLAG: no pixel is masked")

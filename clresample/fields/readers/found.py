@@ -84,6 +84,15 @@ def paths_of(given) -> list[Path]:
     return paths
 
 
+def files_at(paths) -> list[Path]:
+    """All files of the folders, and beside the files, of a list of paths, sorted by name."""
+    folders = {path if path.is_dir() else path.parent for path in paths}
+    try:
+        return sorted(file for folder in folders for file in folder.iterdir())
+    except OSError as error:
+        raise FileError(f"{error.filename}: cannot be read ({error.strerror})") from error
+
+
 def image_plane(path, hdu=None) -> tuple[FilePlane, tuple, object, Grid | None]:
     """An image HDU of two axes: its plane, shape, header and Grid, None without a celestial WCS.
 
@@ -100,6 +109,15 @@ def image_plane(path, hdu=None) -> tuple[FilePlane, tuple, object, Grid | None]:
         wcs = celestial_header(path, chosen.header.copy(), hdus)
         grid = Grid.from_wcs(wcs, shape) if wcs.has_celestial else None
     return FilePlane(Path(path), number), shape, header, grid
+
+
+def plane_on(grid, path, hdu=None) -> tuple[FilePlane, object]:
+    """A plane that belongs to an image, and its header. Raises FileError for other pixels."""
+    plane, shape, header, _ = image_plane(path, hdu)
+    if shape != grid.shape:
+        what = "" if hdu is None else f" HDU {hdu}"
+        raise FileError(f"{path}:{what} has {shape} pixels, its image {grid.shape}")
+    return plane, header
 
 
 def placed(path, grid) -> Grid:
@@ -143,7 +161,10 @@ def assembled(survey, found, given, *, noise="white") -> Mosaic:
     mosaic = with_weights(mosaic, given.notes)
     if given.noise is None and all(one.noise is not None for one in found):
         return replace(mosaic, noise=tuple(one.noise for one in found))
-    return with_noise(mosaic, {"noise": given.noise or noise}, given.notes)
+    try:
+        return with_noise(mosaic, {"noise": given.noise or noise}, given.notes)
+    except ValueError as error:
+        raise ValueError(f'noise: {error}: give noise = "white", or a larger image') from None
 
 
 def apart_px(one, other) -> float:

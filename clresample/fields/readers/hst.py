@@ -29,7 +29,7 @@ from ...sky.noise import noise_sigma
 from ..mosaic import Channel, Mosaic
 from ..reading.estimates import sample_box
 from ..reading.headers import mask_value, zero_point
-from .found import Found, Given, assembled, image_plane, paths_of, placed
+from .found import Found, Given, assembled, image_plane, paths_of, placed, plane_on
 from .planes import Scaled
 
 CLEAR = "CLEAR", "N/A", "NONE", ""  # what filter wheels hold where they hold no filter
@@ -57,11 +57,11 @@ def _band(path, given):
     grid = placed(path, grid)
     band, files, mask, value = _filter(header, path), {"image": path}, None, None
     if "ERR" in names:
-        weight, kind = image_plane(path, "ERR")[0], "rms"
+        weight, kind = plane_on(grid, path, "ERR")[0], "rms"
     else:
         weight, kind = _weight(path, names, data, grid, band, files, given), "weight"
     if "DQ" in names:
-        mask, _, flags, _ = image_plane(path, "DQ")
+        mask, flags = plane_on(grid, path, "DQ")
         value = None if given.mask_bits is None else mask_value(flags, given.mask_bits)
     point = zero_point(header, grid.pixel_scale_arcsec)
     unit = str(header.get("BUNIT", "")).upper().replace(" ", "")
@@ -87,7 +87,7 @@ def _band(path, given):
 def _weight(path, names, data, grid, band, files, given):
     """The plane of WHT, times what makes it inverse variances."""
     if "WHT" in names:
-        plane = image_plane(path, "WHT")[0]
+        plane, _ = plane_on(grid, path, "WHT")
     else:
         beside = path.with_name("wht".join(path.name.rsplit("sci", 1)))
         if "sci" not in path.name or not beside.exists():
@@ -95,9 +95,7 @@ def _weight(path, names, data, grid, band, files, given):
                 f"weight of band {band} is missing: {path.name} has no HDU ERR or WHT, and no file "
                 "of weights (wht for sci in its name) lies beside it"
             )
-        plane, shape, *_ = image_plane(beside)
-        if shape != grid.shape:
-            raise FileError(f"{beside}: has {shape} pixels, {path.name} {grid.shape}")
+        plane, _ = plane_on(grid, beside)
         files["weight"] = beside
     box = sample_box(grid)
     pixels = Channel(band, data, plane)

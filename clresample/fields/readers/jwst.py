@@ -25,7 +25,7 @@ from ...files.fits import open_fits
 from ...sky.grid import Grid
 from ..mosaic import FilePlane, Mosaic
 from ..reading.headers import zero_point
-from .found import Found, Given, assembled, image_plane, paths_of, placed
+from .found import Found, Given, assembled, image_plane, paths_of, placed, plane_on
 from .planes import AnyFlag, NoImage
 
 IS_FILTER = re.compile(r"F\d+\w+")
@@ -58,18 +58,18 @@ def _band(path, given):
         grid = Grid.from_wcs(wcs, shape)
     if "ERR" not in names:
         raise ValueError(f"rms of band {band} is missing: {path.name} has no HDU ERR")
+    grid = placed(path, grid)
     empty: list = []
     if context is not None:
         indices = range(n_contexts) if n_contexts else [None]
         empty.append((NoImage(tuple(FilePlane(path, context, i) for i in indices)), None))
     if "WHT" in names:
-        empty.append((NoImage((image_plane(path, "WHT")[0],)), None))
-    grid = placed(path, grid)
+        empty.append((NoImage((plane_on(grid, path, "WHT")[0],)), None))
     return Found(
         band,
         grid,
         data,
-        image_plane(path, "ERR")[0],
+        plane_on(grid, path, "ERR")[0],
         "rms",
         AnyFlag(tuple(empty)) if empty else None,
         zero_point=zero_point(header, grid.pixel_scale_arcsec),

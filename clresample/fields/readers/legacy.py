@@ -30,7 +30,7 @@ from ..mosaic import Mosaic
 from ..psfs.psf_field import ConstantPSF
 from ..psfs.sampled import PSFCube
 from ..reading.headers import NANOMAGGY, mask_value
-from .found import Found, Given, assembled, image_plane, paths_of, placed
+from .found import Found, Given, assembled, files_at, image_plane, paths_of, placed, plane_on
 
 NAME = re.compile(r"legacysurvey-(\w+)-(image|invvar|copsf|psfsize|maskbits)(?:-(\w+))?\.fits.*")
 BITS = (  # of maskbits, by their numbers
@@ -63,9 +63,8 @@ def read_legacy_survey(path, **given) -> Mosaic:
 def _files(paths):
     """{(kind, band): path} of the brick; the band of maskbits is None."""
     folder = len(paths) == 1 and paths[0].is_dir()
-    there = sorted({f for p in paths for f in (p if folder else p.parent).iterdir()})
     files, bricks = {}, set()
-    for file in there:
+    for file in files_at(paths):
         match = NAME.fullmatch(file.name)
         if match and (folder or match[2] != "image" or file in paths):
             files[match[2], match[3]] = file
@@ -86,10 +85,10 @@ def _band(band, files, given):
     grid = placed(path, grid)
     if ("invvar", band) not in files:
         raise ValueError(f"weight of band {band} is missing: no invvar-{band} beside {path.name}")
-    weight, *_ = image_plane(files["invvar", band])
+    weight, _ = plane_on(grid, files["invvar", band])
     mask = value = None
     if ("maskbits", None) in files:
-        mask, _, header, _ = image_plane(files["maskbits", None])
+        mask, header = plane_on(grid, files["maskbits", None])
         own = [n for n in (f"SATUR_{band.upper()}", f"ALLMASK_{band.upper()}") if n in BITS]
         bits = own if given.mask_bits is None else given.mask_bits
         value = mask_value(header, bits, {name: i for i, name in enumerate(BITS)})
@@ -120,7 +119,7 @@ def _psf(band, files, grid, given):
             return ConstantPSF(PSF(read_pixels(path, choose_hdu(path, hdus, None))))
     if ("psfsize", band) not in files:
         return None
-    widths, *_ = image_plane(files["psfsize", band])
+    widths, _ = plane_on(grid, files["psfsize", band])
     places = np.array(
         [
             (y, x)

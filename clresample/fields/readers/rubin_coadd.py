@@ -32,7 +32,7 @@ from ..mosaic import Channel, FilePlane, Mosaic
 from ..psfs.sampled import PSFCells
 from ..reading.estimates import sample_box
 from ..reading.headers import zero_point
-from .found import Found, Given, assembled, image_plane, paths_of, placed
+from .found import Found, Given, assembled, image_plane, paths_of, placed, plane_on
 from .rubin_mask import rubin_mask
 
 READS = 1  # version of the schemas; a file whose tree asks for a higher one is refused
@@ -59,7 +59,7 @@ def _band(path, given):
         noises = [i for i, hdu in enumerate(hdus) if hdu.name.startswith(NOISE)]
     data, _, header, grid = image_plane(path, "IMAGE")
     grid = placed(path, grid)
-    variance, *_ = image_plane(path, "VARIANCE")
+    variance, _ = plane_on(grid, path, "VARIANCE")
     try:
         bounds, first = tree["psf"]["bounds"], tree["image"]["yx0"]
         cell = [bounds["grid"]["cell_shape"][axis] for axis in "yx"]
@@ -68,7 +68,7 @@ def _band(path, given):
         raise FileError(f"{path}: its tree does not say where the PSF's cells lie") from error
     origin = np.array(start, float) - first - 0.5
     band = tree.get("band") or path.name.split(".")[0]
-    mask = rubin_mask(path, given.mask_bits, band, given.notes)
+    mask = rubin_mask(path, grid, given.mask_bits, band, given.notes)
     return Found(
         band,
         grid,

@@ -27,7 +27,7 @@ from ...files.fits import open_fits
 from ...files.whole_file import FileError
 from ..mosaic import Mosaic
 from ..reading.headers import NANOJANSKY, zero_point
-from .found import Found, Given, assembled, image_plane, paths_of, placed
+from .found import Found, Given, assembled, image_plane, paths_of, placed, plane_on
 from .rubin_mask import rubin_mask
 
 
@@ -56,8 +56,8 @@ def _band(path, given):
             f"{path}: no exposure, which has IMAGE, MASK and VARIANCE (HDUs: {', '.join(names)})"
         )
     data, _, header, grid = image_plane(path, "IMAGE" if named else 1)
-    variance, *_ = image_plane(path, "VARIANCE" if named else 3)
     grid = placed(path, grid)
+    variance, _ = plane_on(grid, path, "VARIANCE" if named else 3)
     band = label or str(header.get("BAND", header.get("FILTER", ""))).strip()
     band = band or path.name.split(".")[0]
     own = {key: header[key] for key in ("BUNIT", "PIXAR_SR") if key in header}
@@ -74,7 +74,7 @@ def _band(path, given):
         data,
         variance,
         "variance",
-        rubin_mask(path, given.mask_bits, band, given.notes),
+        rubin_mask(path, grid, given.mask_bits, band, given.notes),
         None,
         point,
         missing_zero_point="there is neither BUNIT of nJy nor PhotoCalib nor FLUXMAG0",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ...files.fits import open_fits
+from ...files.whole_file import FileError
 from ..mosaic import FilePlane
 from ..reading.headers import bit_names, mask_value
 from .planes import AnyFlag
@@ -13,9 +14,10 @@ from .planes import AnyFlag
 UNUSABLE = "NO_DATA", "BAD", "SAT", "SATURATED", "SUSPECT", "UNMASKEDNAN"
 
 
-def rubin_mask(path, bits, band, notes):
+def rubin_mask(path, grid, bits, band, notes):
     """The plane of pixels to ignore, by the HDUs MASK of a file; None where there are none.
 
+    grid: of the image
     bits: by name or number (of a file with one HDU of masks), None = those of UNUSABLE that the
         header names
     """
@@ -23,6 +25,8 @@ def rubin_mask(path, bits, band, notes):
     with open_fits(path) as hdus:
         for number, hdu in enumerate(hdus):
             if hdu.name == "MASK" and hdu.is_image:
+                if hdu.shape != grid.shape:
+                    raise FileError(f"{path}: MASK has {hdu.shape} pixels, IMAGE {grid.shape}")
                 parts.append((FilePlane(path, number), bit_names(hdu.header)))
         for _, names in parts:
             planes |= names
