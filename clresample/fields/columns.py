@@ -6,6 +6,8 @@ import numpy as np
 from astropy import units as u
 from astropy.table import QTable, vstack
 
+from .work.part import PATCH_COLUMNS
+
 DESCRIPTIONS = {
     "id": "of the source: field, row and column of the model's pixel that holds it",
     "parent_id": "id of the brightest source that was detected in the same blend",
@@ -40,6 +42,16 @@ BLENDS = {  # of blends.ecsv
     "seconds": "of the fit, its share of a group's",
 }
 FIRST = ("id", "parent_id", "ra", "dec", "y_sky", "x_sky", "y", "x", "flags", "status", "reason")
+# of a field without a source
+EMPTY = {
+    "id": np.zeros(0, np.int64),
+    "parent_id": np.zeros(0, np.int64),
+    "y": np.zeros(0) * u.pix,
+    "x": np.zeros(0) * u.pix,
+    "flags": np.zeros(0, np.int32),
+    "status": np.zeros(0, "U1"),
+    "reason": np.zeros(0, "U1"),
+}
 THEN = ("n_blend", "pass", "peak", "snr")
 
 
@@ -59,7 +71,7 @@ def finished(job, parts, last, unsettled=()):
                 tables.append(rows[start : start + n])
             start += n
         fits += [patches[k : k + 1] for k, p in enumerate(patches["patch"]) if int(p) in mine]
-    table = QTable()
+    table = QTable({name: EMPTY[name].copy() for name in FIRST if name in EMPTY})
     if tables:
         tables.sort(
             key=lambda t: -len(t.colnames)
@@ -73,12 +85,11 @@ def finished(job, parts, last, unsettled=()):
             f"{reason}, which had not settled" if one else str(reason)
             for one, reason in zip(moving, table["reason"], strict=True)
         ]
-    blends = vstack(fits) if fits else QTable()
-    if fits:
-        blends = blends[np.argsort(blends["patch"])]
-        blends["seconds"] = blends["seconds"] * u.s
-        for name in set(BLENDS) & set(blends.colnames):
-            blends[name].info.description = BLENDS[name]
+    blends = vstack(fits) if fits else QTable({n: np.zeros(0, t) for n, t in PATCH_COLUMNS.items()})
+    blends = blends[np.argsort(blends["patch"])]
+    blends["seconds"] = blends["seconds"] * u.s
+    for name in set(BLENDS) & set(blends.colnames):
+        blends[name].info.description = BLENDS[name]
     return _described(table[_order(job, table.colnames)] if tables else table), blends
 
 

@@ -56,7 +56,9 @@ def write_models(path, job, parts, last, ids):
     sizes = table[:, 5] * table[:, 6]
     table[:, 7] = np.cumsum(sizes) - sizes
     columns = Table(table, names=COMPONENT_COLUMNS)
-    columns["spectrum"] = np.array([spectra[k] for k in order]).reshape(len(order), -1)
+    columns["spectrum"] = np.array([spectra[k] for k in order]).reshape(
+        len(order), len(job.channels)
+    )
     primary, hdu = fits.PrimaryHDU(), fits.table_to_hdu(columns)
     primary.header["CLFORMAT"] = (FORMAT, "of this file")
     for i, name in enumerate(job.channels):

@@ -7,6 +7,7 @@ import os
 import select
 import shutil
 import subprocess
+import sys
 import time
 
 NAMES = "chromium", "chromium-browser", "google-chrome", "chrome"
@@ -21,6 +22,14 @@ OPTIONS = (
     "--remote-debugging-pipe",
     "about:blank",
 )
+# Chromium reads from 3 and writes to 4, whatever numbers the pipe's ends have here.
+WRAPPER = """
+import fcntl, os, sys
+ends = [fcntl.fcntl(int(n), fcntl.F_DUPFD, 10) for n in sys.argv[1:3]]
+os.dup2(ends[0], 3)
+os.dup2(ends[1], 4)
+os.execv(sys.argv[3], sys.argv[3:])
+"""
 PATIENCE_S = 60.0  # for one answer: machines that run other tests beside are slow
 
 
@@ -35,7 +44,7 @@ class Browser:
         (theirs_in, self.out), (self.into, theirs_out) = os.pipe(), os.pipe()
         words = [BROWSER, f"--user-data-dir={folder}", *OPTIONS]
         self.process = subprocess.Popen(
-            ["sh", "-c", f'exec "$@" 3<&{theirs_in} 4>&{theirs_out}', "sh", *words],
+            [sys.executable, "-c", WRAPPER, str(theirs_in), str(theirs_out), *words],
             pass_fds=(theirs_in, theirs_out),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -117,12 +126,14 @@ class Browser:
                     self.messages.append(f"asks for {url}")
 
     def open(self, path, anchor=""):
-        """Show a file."""
+        """Show a file, and wait until all of it is there."""
         self.ask("Page.navigate", url=f"{path.absolute().as_uri()}{anchor}")
+        self.until("document.readyState === 'complete' && location.protocol === 'file:'")
 
     def value(self, expression):
-        """What an expression is in the page."""
-        answer = self.ask("Runtime.evaluate", expression=expression, returnByValue=True)
+        """What an expression is in the page, or what its promise gives."""
+        how = {"returnByValue": True, "awaitPromise": True}
+        answer = self.ask("Runtime.evaluate", expression=expression, **how)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 

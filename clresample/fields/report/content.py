@@ -12,8 +12,9 @@ from .pyramid import LAYERS
 from .stamps import plain, positions, stamps_of
 
 OK, FLAGGED, FAILED = 0, 1, 2  # states of a source, as the script counts them
-MOST_SOURCES = 200_000  # on the field; of more, those of the highest signal to noise
-MOST_DETAILS = 5000  # sources with their measurements in the page
+SOURCE_BYTES, DETAIL_BYTES = 64, 1000  # [bytes] of a source on the field, of its measurements
+# of the page: places of sources, their measurements, their pictures
+SOURCES_PART, DETAILS_PART, STAMPS_PART = 0.2, 0.1, 0.25
 FLUX_COLUMNS = "Channel", "Flux", "Error", "S/N", "Mag", "Residual"
 
 
@@ -44,19 +45,19 @@ def flag_names(value) -> str:
     return ", ".join([*map(str, names), *([str(rest)] if rest else [])]) or "none"
 
 
-def data_of(run, pyramids, budget, notes) -> dict:
+def data_of(run, pyramids, most_bytes, notes) -> dict:
     """All that the script reads.
 
-    budget [bytes]: of the sources' pictures; notes: a list that gets what is missing
+    most_bytes: of the page; notes: a list that gets what is missing
     """
     frame = run.instruments[0].grid if run.instruments else None
     order = order_of(run)
-    if len(order) > MOST_SOURCES:
+    most = int(SOURCES_PART * most_bytes / SOURCE_BYTES)
+    if len(order) > most:
         notes.append(
-            f"the field shows {MOST_SOURCES} sources of {len(order)}, those of the highest signal "
-            "to noise"
+            f"the field shows {most} sources of {len(order)}, those of the highest signal to noise"
         )
-        order = order[:MOST_SOURCES]
+        order = order[:most]
     state, at = states(run)[order], positions(run)[order]
     known = "snr" in run.sources.colnames
     snr = plain(run.sources["snr"])[order] if known else np.full(len(order), np.nan)
@@ -67,13 +68,13 @@ def data_of(run, pyramids, budget, notes) -> dict:
     first = np.lexsort((np.arange(len(order)), ~misfit, state != FAILED))
     stamps = {}
     if frame is not None:
-        stamps = stamps_of(run, frame, order[first], budget, notes)
-    ids = _texts(run, "id", order)
+        stamps = stamps_of(run, frame, order[first], STAMPS_PART * most_bytes, notes)
+    detailed = first[: int(DETAILS_PART * most_bytes / DETAIL_BYTES)]
     return {
         "frame": _frame(run, frame, at),
         "instruments": [_instrument(pyramid) for pyramid in pyramids],
         "sources": {
-            "id": ids,
+            "id": _texts(run, "id", order),
             "parent": _texts(run, "parent_id", order),
             "x": [_short(v, 2) for v in at[:, 1]],
             "y": [_short(v, 2) for v in at[:, 0]],
@@ -81,7 +82,7 @@ def data_of(run, pyramids, budget, notes) -> dict:
             "snr": [_short(v, 1) for v in snr],
         },
         "flux_columns": FLUX_COLUMNS,
-        "details": _details(run, order, first[:MOST_DETAILS], stamps),
+        "details": _details(run, order, detailed, stamps),
     }
 
 

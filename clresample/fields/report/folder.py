@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from astropy.table import QTable, vstack
+from astropy.utils.exceptions import AstropyWarning
 
 from ...files.whole_file import FileError
 from ..images import file_name
@@ -123,11 +125,11 @@ def read_table(path) -> QTable:
     """A table of a FITS, ECSV or Parquet file, texts as str. Raises FileError."""
     if not Path(path).is_file():
         raise FileError(f"{path}: no such file")
+    form = {"format": "ascii.ecsv"} if str(path).endswith(".ecsv") else {}
     try:
-        if str(path).endswith(".ecsv"):
-            table = QTable.read(path, format="ascii.ecsv")
-        else:
-            table = QTable.read(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", AstropyWarning)  # of units and headers that it repairs
+            table = QTable.read(path, **form)
     except Exception as error:  # a damaged file may provoke any exception in astropy
         reason = " ".join(str(error).split()) or type(error).__name__
         raise FileError(f"{path}: cannot be read as a table ({reason})") from error

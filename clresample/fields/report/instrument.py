@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from astropy.io import fits
 
 from ...files.fits import celestial_header, open_fits
 from ...files.whole_file import FileError
@@ -45,10 +44,8 @@ class Instrument:
         with open_fits(self.model) as models, open_fits(self.residual) as residuals:
 
             def read(box):
-                found = [_section(hdus[0], box) for hdus in (models, residuals)]
-                if any(image.shape[1:] != box.shape for image in found):
-                    raise FileError(f"{self.residual}: truncated")
-                return found
+                given = (self.model, models), (self.residual, residuals)
+                return [_section(path, hdus, box) for path, hdus in given]
 
             yield read
 
@@ -86,8 +83,11 @@ def _instrument(name, model, residual):
         grid = Grid.from_wcs(celestial_header(residual, header, hdus), shape)
         rows = np.unique(np.linspace(0, shape[1] - 1, SAMPLE_ROWS).astype(int))
         left, light = (
-            np.stack([_section(one[0], Box(y, 0, y + 1, shape[2]))[:, 0] for y in rows], axis=1)
-            for one in (hdus, models)
+            np.stack(
+                [_section(path, one, Box(y, 0, y + 1, shape[2]))[:, 0] for y in rows.tolist()],
+                axis=1,
+            )
+            for path, one in ((residual, hdus), (model, models))
         )
     flat = left.reshape(len(left), -1)
     middle = np.array([np.nanmedian(c) if np.isfinite(c).any() else 0.0 for c in flat])
@@ -97,7 +97,14 @@ def _instrument(name, model, residual):
     return Instrument(name, channels, grid, model, residual, sigma, light.reshape(len(light), -1))
 
 
-def _section(hdu: fits.PrimaryHDU, box):
-    """Pixels (C, Ny, Nx) of a cube, float32, native; those alone are read."""
+def _section(path, hdus, box):
+    """Pixels (C, Ny, Nx) of a file's cube, float32, native; those alone are read."""
     rows, columns = box.slices
-    return np.asarray(hdu.section[:, rows, columns], np.float32)
+    try:
+        found = np.asarray(hdus[0].section[:, rows, columns], np.float32)
+    except Exception as error:  # of two open files each would take it for its own
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise FileError(f"{path}: its pixels cannot be read ({reason})") from error
+    if found.shape[1:] != box.shape:
+        raise FileError(f"{path}: truncated, {found.shape[1:]} pixels of {box.shape}")
+    return found

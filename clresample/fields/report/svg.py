@@ -164,8 +164,9 @@ def _round_steps(low, high):
 
 def _decades(low, high):
     """Powers of ten; between them 2 and 5 where there are few."""
-    first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
+    first, last = math.floor(math.log10(low)), math.floor(math.log10(high))
     every = max(1, math.ceil((last - first) / 7))
+    first -= first % every
     within = (1, 2, 5) if math.log10(high / low) < 2 else (1,)
     found = []
     for power in range(first, last + 1, every):

@@ -101,13 +101,15 @@ def matched(at, true):
     Pairs within FOUND_PX are taken in the order of their distance, each row and true source once.
     """
     found = np.full(len(true), -1)
-    good = np.flatnonzero(np.isfinite(at).all(axis=1))
-    if not len(good) or not len(true):
+    rows, known = (np.flatnonzero(np.isfinite(p).all(axis=1)) for p in (at, true))
+    if not len(rows) or not len(known):
         return found
-    pairs = cKDTree(true).sparse_distance_matrix(cKDTree(at[good]), FOUND_PX, output_type="ndarray")
+    near = cKDTree(true[known]).sparse_distance_matrix(
+        cKDTree(at[rows]), FOUND_PX, output_type="ndarray"
+    )
     taken = np.zeros(len(at), bool)
-    for k in np.lexsort((pairs["j"], pairs["i"], pairs["v"])):
-        t, row = pairs["i"][k], good[pairs["j"][k]]
+    for k in np.lexsort((near["j"], near["i"], near["v"])):
+        t, row = known[near["i"][k]], rows[near["j"][k]]
         if found[t] < 0 and not taken[row]:
             found[t], taken[row] = row, True
     return found

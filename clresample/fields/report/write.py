@@ -22,9 +22,9 @@ NAME = "report.html"
 # [bytes] of a page: browsers open it within a second or two, and mail still takes it. A field of
 # 4096 x 4096 pixels in two instruments fits with all its pixels.
 MOST_BYTES = 46 << 20
-LEAST_BYTES = 500_000  # tables and figures alone take some 200 kB
-# of the page, for pictures of single sources; tiles of the field get the rest that tables leave
-STAMPS_PART, TILES_PART = 0.25, 0.65
+TEXT_BYTES = 700_000  # [bytes] that tables and figures take at most, whatever the field
+LEAST_BYTES = 2_000_000
+TILES_PART = 0.4  # of what they leave, for tiles; for sources see content.py
 
 FIELD = """<section id="field"><h2>The field</h2>
 <noscript><p class="about">Images need a script, which this browser does not run. All tables and
@@ -73,21 +73,22 @@ def write_report(
 ) -> Report:
     """Write the report of a run of `run_field`, finished or not: one HTML page.
 
-    The page holds the field's data, models and residuals as tiles to zoom into, every source of it
-    (of more than 200,000 those of the highest signal to noise), pictures of up to 2000 sources in
-    every channel, number counts, signal to noise, a map of chi2, pulls where the truth is known,
-    the slowest and the failed fits, and what made it. It loads nothing and needs no network.
+    The page holds the field's data, models and residuals as tiles to zoom into, every source of it,
+    pictures of up to 2000 sources in every channel, number counts, signal to noise, a map of chi2,
+    pulls where the truth is known, the slowest and the failed fits, and what made it. It loads
+    nothing and needs no network.
 
     folder: of the run, or of one part of a field
     path: of the page; None = report.html in the folder, which is replaced
     truth: table of the true sources (y, x [px of the model], flux_CHANNEL [uJy], and snr); None =
         truth.ecsv in the folder, beside it or beside the run's inputs, if there is one
-    most_bytes: of the page. What does not fit is left out: the finest tiles first, and pictures of
-        sources after those that failed, misfit, or have the highest signal to noise
+    most_bytes: of the page. What does not fit is left out: the finest tiles; pictures of sources
+        after those that failed, misfit, or have the highest signal to noise; of more than 140,000
+        sources (by default) the faintest
     overwrite: replace the file at `path`
 
     Raises FileError for a folder without a run, a catalogue or `truth` that cannot be read, and
-    where the page cannot be written; ValueError for a limit under 500 kB.
+    where the page cannot be written; ValueError for a limit under 2 MB.
     """
     if not most_bytes >= LEAST_BYTES:
         raise ValueError(f"most_bytes is {most_bytes}, must be {LEAST_BYTES} or more")
@@ -98,8 +99,9 @@ def write_report(
     check_output(out, overwrite=overwrite or path is None, inputs=_inputs(folder, truth))
     notes = list(run.notes)
     known = truth_of(run, truth, notes)
-    pyramids = _pyramids(run, TILES_PART * most_bytes, notes)
-    data = data_of(run, pyramids, STAMPS_PART * most_bytes, notes)
+    most = most_bytes - TEXT_BYTES
+    pyramids = _pyramids(run, TILES_PART * most, notes)
+    data = data_of(run, pyramids, most, notes)
     n_pictures = sum("stamps" in one for one in data["details"].values())
     if pyramids and n_pictures < len(run.sources):
         notes.append(f"{n_pictures} of {len(run.sources)} sources have pictures in this page")
@@ -114,7 +116,8 @@ def write_report(
 
 def _inputs(folder, truth):
     """Files that the page must not replace."""
-    return [*folder.glob("*.fits"), *folder.glob("*.ecsv"), *([truth] if truth else [])]
+    names = "*.fits", "*.ecsv", "*.parquet", "*.json"
+    return [*(p for name in names for p in folder.glob(name)), *([truth] if truth else [])]
 
 
 def _pyramids(run, budget, notes):
