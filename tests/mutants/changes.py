@@ -135,7 +135,8 @@ def _tokens(path, text):
             unpacked = token.string in ("*", "**") and previous in ("(", ",", "[", "{")
             head = token.line.lstrip().startswith(("def ", "class ", "@"))
             imported = "import" in token.line
+            strict = previous == "=" and "strict=" + token.string in token.line
             annotated = token.string == "|" and (":" in token.line or "->" in token.line)
-            if not (unpacked or head or imported or annotated):
+            if not (unpacked or head or imported or annotated or strict):
                 yield token.start[0], starts[token.start[0] - 1] + token.start[1], token.string
         previous = token.string
