@@ -23,6 +23,7 @@ _ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
         "observation": ("Observation",),
         "sources": ("Extended", "Point"),
         "frame": ("Frame", "model_frame"),
+        "varying.field": ("FunctionPSF", "PSFField"),
     },
     # the operator and its variants
     "resampling": {
@@ -55,6 +56,7 @@ _ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
     # whole fields, from mosaics to one catalogue
     "fields": {
         "mosaic": ("Mosaic",),
+        "psfs.sampled": ("PSFCube",),
         "options": ("FieldOptions",),
         "run": ("run_field",),
         "readers.euclid_mer": ("read_euclid_mer",),
@@ -97,6 +99,7 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from .device.discovery import DeviceError as DeviceError, list_devices as list_devices
     from .fields.mosaic import Mosaic as Mosaic
     from .fields.options import FieldOptions as FieldOptions
+    from .fields.psfs.sampled import PSFCube as PSFCube
     from .fields.readers.euclid_mer import read_euclid_mer as read_euclid_mer
     from .fields.readers.hst import read_hst as read_hst
     from .fields.readers.jwst import read_jwst as read_jwst
@@ -125,6 +128,7 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from .sky.observation import Observation as Observation
     from .sky.psf import PSF as PSF
     from .sky.sources import Extended as Extended, Point as Point
+    from .sky.varying.field import FunctionPSF as FunctionPSF, PSFField as PSFField
 
 
 def __getattr__(name):

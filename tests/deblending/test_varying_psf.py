@@ -8,7 +8,18 @@ from helpers.geometries import GEOMETRIES, ONE_OF_EACH
 from helpers.solver import PRIOR, every_type, posed
 from helpers.varying import FLUXES, NOISE, SHAPE, observation, stars, widening
 
-from clresample import Blend, Extended, Point, Settings, catalogue, deblend, deblend_many
+from clresample import (
+    Blend,
+    Extended,
+    FunctionPSF,
+    Grid,
+    Observation,
+    Point,
+    Settings,
+    catalogue,
+    deblend,
+    deblend_many,
+)
 from clresample.deblending.fit import Fit
 from clresample.deblending.solver.buffers import Buffers
 from clresample.deblending.solver.operators import MorphologyOperator, SpectraOperator
@@ -129,6 +140,32 @@ def test_a_star_in_each_corner_has_its_own_psf(device):
     found, wrong = (_pulls(result) for result in (own, same))
     assert np.abs(found).max() < 4
     assert np.abs(wrong).max() > 20
+
+
+def test_stars_that_galsim_draws_with_their_local_psfs(device):
+    galsim = pytest.importorskip("galsim")
+
+    def profile(y, x):
+        width = 0.65 * (1 + 0.0015 * x + 0.001 * y)
+        return galsim.Moffat(beta=4, fwhm=width, trunc=3.5).shear(g1=4e-4 * x, g2=-0.02)
+
+    def local(y, x):
+        return PSF(profile(y, x).drawImage(nx=37, ny=37, scale=0.2).array)
+
+    data = np.random.default_rng(2).normal(0, NOISE, SHAPE)
+    for (y, x), flux in zip(CORNERS, (4e4, 2e4, 3e4, 5e4), strict=True):
+        image = galsim.ImageD(SHAPE[1], SHAPE[0], scale=0.2)
+        profile(y, x).withFlux(flux).drawImage(image, center=galsim.PositionD(x + 1, y + 1))
+        data += image.array
+    grid, found = Grid.flat(SHAPE, 0.2), {}
+    for name, psf in (("own", FunctionPSF(local)), ("middle", local(35.5, 47.5))):
+        o = Observation(data, psf, grid, variance=NOISE**2)
+        found[name] = deblend([o], points(CORNERS), settings=Settings(psf_error=0), device=device)
+    assert 0.95 < chi2(found["own"]) < 1.05
+    assert chi2(found["middle"]) > 3
+    fluxes = {k: np.array([c.flux[0] for c in r.components]) for k, r in found.items()}
+    assert np.abs(fluxes["own"] / (4e4, 2e4, 3e4, 5e4) - 1).max() < 4e-3
+    assert np.abs(fluxes["middle"] / (4e4, 2e4, 3e4, 5e4) - 1).max() > 2e-2
 
 
 def _pulls(result):

@@ -7,7 +7,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
-from clresample import PSF, Grid
+from clresample import PSF, FunctionPSF, Grid
 from clresample.adapters.photutils import psf_of
 from clresample.fields.psfs.gridded import GriddedPSF
 from clresample.fields.psfs.psf_field import BandPSFs, ConstantPSF
@@ -15,7 +15,6 @@ from clresample.fields.psfs.psfex import PSFExPSF
 from clresample.fields.psfs.read import read_psf_field
 from clresample.fields.psfs.sampled import PSFCells, PSFCube
 from clresample.files.whole_file import FileError
-from clresample.sky.varying.field import FunctionPSF
 
 N = 25
 

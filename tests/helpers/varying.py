@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from clresample import PSF, Grid, Observation
-from clresample.sky.varying.field import FunctionPSF
+from clresample import PSF, FunctionPSF, Grid, Observation
 
 SHAPE = 72, 96
 # Light of the bands of `stars` and what a pixel's noise is of it.
@@ -13,11 +12,6 @@ FLUXES, NOISE = np.array([[4e3, 7e3], [6e3, 3e3], [2e3, 5e3], [5e3, 4e3]]), 1.0
 def widening(y, x):
     """Two bands that widen along x, and one of them along y: by a quarter over 96 pixels."""
     return PSF.gaussian([1.5 + 0.004 * x, 1.6 + 0.002 * x + 0.003 * y], n_pixels=33)
-
-
-def narrow(y, x):
-    """One band, wider in one corner than in the others."""
-    return PSF.gaussian(1.05 + 2e-5 * x * y, n_pixels=21)
 
 
 def stamp(psf, band, place, shape):
