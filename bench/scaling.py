@@ -38,10 +38,10 @@ from clresample.fields.options import Progress
 from clresample.fields.reading.field_file import read_field
 from clresample.fields.run import run_field
 
+from .faults import children
 from .harness import records
 from .harness.clock import on_all_cores
 from .harness.options import Parser, positive, run, seed
-from .soak import children
 
 SIZES, QUICK_SIZES, GIANT_SIZES = (1024,), (256,), (3000,)
 BANDS, QUICK_BANDS = "ugrizy", "ri"

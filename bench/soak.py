@@ -1,21 +1,23 @@
-"""Killed again and again: whether a field ends with the same catalogue whatever dies on the way.
+"""Killed, starved, cut off: whether a field ends with the same catalogue whatever happens.
 
     python -m bench.soak [--times N] [--json FILE]
 
 A small simulated field is run once undisturbed. Then, each time in a new folder, the command or one
 of its workers is killed (SIGKILL) at a random moment; a run that was killed is resumed, and killed
-again with one chance in two. At the end its catalogue must be the undisturbed one, byte for byte.
+again with one chance in two. Four more runs follow, see bench/faults.py. At the end the catalogue
+must be the undisturbed one, byte for byte, or what `good` says of a run that must differ.
 
-killed     what: "run" or "worker"; at: part of the undisturbed run's time; kills: how many
-same       whether the catalogue is the same; parts: groups of fits that were on disk at the kill
+what       "run" or "worker": what was killed; "disk", "tile", "memory", "hang": see bench/faults.py
+at         when, as part of the undisturbed run's time
+kills      how often it was killed, or was ended by what it met
+parts      groups of fits that were on disk when that came
+same, good whether the catalogue is the same, and whether all is as it must be; about: what was seen
 """
 
 from __future__ import annotations
 
-import os
 import random
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -24,49 +26,22 @@ from pathlib import Path
 from clresample import simulate_field
 from clresample.cli.simulate import write_field
 
+from .faults import FAULTS, kill_at, parts_in, start
 from .harness import records
 from .harness.clock import on_all_cores
-from .harness.options import ROOT, Parser, positive, run, seed
+from .harness.options import Parser, run, seed
 
 TIMES = 30
 SIZE, DENSITY = 192, 120  # [px, arcmin^-2]: some ten sources, in fits of several sizes
-LOOK_S = 0.02
-COLUMNS = (("what", 6, ""), ("at", 5, ".2f"), ("kills", 5, "d"), ("parts", 5, "d"), ("same", 5, ""))
-
-
-def start(sky, out, *options):
-    """The command, begun."""
-    words = [sys.executable, "-m", "clresample.cli", "field", sky / "field.toml", "-o", out]
-    words += ["--workers", 2, "--quiet", *options]
-    return subprocess.Popen(
-        [str(word) for word in words],
-        cwd=ROOT,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-
-
-def children(pid):
-    """Processes that a process has started and that live."""
-    path = Path(f"/proc/{pid}/task/{pid}/children")
-    return [int(one) for one in path.read_text().split()] if path.exists() else []
-
-
-def kill_at(process, seconds, what, rng):
-    """Kill the process, or one of its children, after so many seconds; whether there was one."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end and process.poll() is None:
-        time.sleep(LOOK_S)
-    if process.poll() is not None:
-        return False
-    victims = [process.pid] if what == "run" else children(process.pid)
-    if not victims:
-        return False
-    try:
-        os.kill(rng.choice(victims), signal.SIGKILL)
-    except ProcessLookupError:
-        return False
-    return True
+COLUMNS = (
+    ("what", 6, ""),
+    ("at", 5, ".2f"),
+    ("kills", 5, "d"),
+    ("parts", 5, "d"),
+    ("same", 5, ""),
+    ("good", 5, ""),
+    ("about", 40, ""),
+)
 
 
 def disturbed(sky, out, expected, took_s, what, rng):
@@ -74,22 +49,22 @@ def disturbed(sky, out, expected, took_s, what, rng):
     at = rng.random()
     process, kills = start(sky, out), 0
     kills += kill_at(process, at * took_s, what, rng)
-    parts = len(list((out / "work").glob("fit-*.fits")))
+    parts = parts_in(out)
     status = process.wait()
     while status != 0:
         if status != -signal.SIGKILL:
             raise RuntimeError(f"exit status {status} after {kills} kills of a {what}")
-        begun = (out / "work" / "run.json").exists()
-        process = start(sky, out, *(["--resume"] if begun else []))
+        process = start(sky, out)
         if rng.random() < 0.5:
             kills += kill_at(process, rng.random() * took_s, "run", rng)
         status = process.wait()
     same = (out / "catalogue.fits").read_bytes() == expected
-    return {"what": what, "at": at, "kills": kills, "parts": parts, "same": same}
+    row = {"what": what, "at": at, "kills": kills, "parts": parts}
+    return row | {"same": same, "good": same, "about": ""}
 
 
-def soak(times, seed_of_kills):
-    """Rows of so many runs: whole runs and single workers are killed by turns."""
+def soak(times, seed_of_kills, faults=tuple(FAULTS)):
+    """Rows of so many runs that are killed, whole runs and single workers by turns; then faults."""
     with tempfile.TemporaryDirectory() as folder:
         sky, folder = Path(folder) / "sky", Path(folder)
         given = {"rubin_bands": ("i",), "clustering": 0.4, "psf_variation": 0.1}
@@ -102,6 +77,8 @@ def soak(times, seed_of_kills):
         for i in range(times):
             what, rng = ("run", "worker")[i % 2], random.Random(f"{seed_of_kills} {i}")
             yield disturbed(sky, folder / f"out{i}", expected, took_s, what, rng)
+        for what in faults:
+            yield {"what": what} | FAULTS[what](sky, folder / what, folder / "whole", took_s)
 
 
 def main(options):
@@ -115,16 +92,16 @@ def main(options):
         records.print_row(COLUMNS, row)
     if options.json is not None:
         records.write_json(options.json, {"record": record, "rows": rows})
-    differ = sum(not row["same"] for row in rows)
-    print(f"{len(rows)} runs, {sum(row['kills'] for row in rows)} kills, {differ} differ")
-    if differ:
+    bad = sum(not row["good"] for row in rows)
+    print(f"{len(rows)} runs, {sum(row['kills'] for row in rows)} kills, {bad} not as they must be")
+    if bad:
         sys.exit(1)
 
 
 def parser():
     parser = Parser("bench.soak", description=__doc__.splitlines()[0])
     parser.add_argument(
-        "--times", type=positive(int), default=TIMES, metavar="N", help="runs (%(default)s)"
+        "--times", type=seed, default=TIMES, metavar="N", help="runs that are killed (%(default)s)"
     )
     parser.add_argument(
         "--seed", type=seed, default=0, metavar="S", help="of the kills (%(default)s)"

@@ -60,8 +60,9 @@ def add_field(commands):
         "--memory",
         metavar="SIZE",
         type=size,
-        help="that one worker's group of fits, or search of a tile, may take (default 1G, or an "
-        "eighth of the free memory for each worker where that is less)",
+        help="private memory that a worker process may take, at least 1G, held by the system on "
+        "Linux; groups of fits are sized for it. Without it they take 1G by prediction, or an "
+        "eighth of the free memory where that is less, and a worker what it needs",
     )
     parser.add_argument(
         "--scheduler",
@@ -106,7 +107,7 @@ def run(arguments):
     import os
 
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # as in `clresample deblend`
-    from ..fields.options import LEAST_MEMORY, MEMORY
+    from ..fields.options import LEAST_MEMORY, MEMORY, group_memory
     from ..fields.reading.field_file import read_field
     from ..fields.run import free_memory, run_field
     from .fields.progress import Live
@@ -127,7 +128,8 @@ def run(arguments):
         limit_s=arguments.limit,
         part=arguments.part,
         hats=arguments.hats,
-        memory=arguments.memory or max(memory, LEAST_MEMORY),
+        bound=arguments.memory,
+        memory=group_memory(arguments.memory) if arguments.memory else max(memory, LEAST_MEMORY),
     )
     progress = Live(arguments)
     try:

@@ -7,6 +7,7 @@ from astropy.io import fits
 
 from ..files.whole_file import FileError, whole_file
 from .box import Box
+from .mapped import mapped_array
 
 STRIP_PX = 512  # rows of a mosaic that are read and written at a time
 
@@ -27,7 +28,7 @@ def write_mosaics(folder, job, parts, last):
             continue
         shape = len(mosaic.channels), *here.shape
         scratch = job.folder / f"model-{i_mosaic}.npy"
-        model = np.lib.format.open_memmap(scratch, "w+", np.float32, shape)
+        model = mapped_array(scratch, np.float32, shape)
         for i, part in enumerate(parts):
             chosen = {patch for patch, k in last.items() if k == i}
             for _, i_model, box, image in part.models(chosen):

@@ -85,6 +85,15 @@ class FieldOptions:
         return () if self.device is None else (self.device,)
 
 
+def group_memory(bound) -> int:
+    """Memory [bytes] of a group of fits by prediction, in a process that may take `bound` in all.
+
+    Half of what its libraries leave: predictions are rough, and a group's results are held beside
+    the device's memory.
+    """
+    return max(LEAST_MEMORY, min(MEMORY, (bound - LEAST_BOUND // 2) // 2))
+
+
 @dataclass(eq=False)
 class Progress:
     """What a run tells while it goes: override what is wanted.

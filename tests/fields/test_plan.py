@@ -118,3 +118,21 @@ def test_ids_do_not_depend_on_the_run_and_say_where():
     assert ids[0] == (5 << 40) + (3 << 20) + 7
     assert source_ids(places[2:], 5)[0] == ids[2]
     assert (source_ids(places, 6) != ids).all()
+
+
+def test_a_source_in_a_halo_over_the_limits_keeps_the_pixels_near_it():
+    positions = np.array([(150, 150), (150, 170), (40, 260)], float)
+    light = blobs(positions, [50, 20, 30], (300, 300)) + 3
+    light += 5 / (1 + np.hypot(*(np.indices(light.shape) - 150)) / 50)
+    inside = np.ones(light.shape, bool)
+    limits = Limits(sources=2, pixels=100 * 100)
+    territory, piece = pieces_of(light, inside, positions, limits, 8)
+    for number, box in enumerate(ndimage.find_objects(territory)):
+        n_y, n_x = (s.stop - s.start for s in box)
+        assert (n_y + 16) * (n_x + 16) <= limits.pixels
+        assert number in piece
+    for s, (y, x) in enumerate(positions.astype(int)):
+        assert territory[y, x] == piece[s] + 1
+    few = Limits(sources=2, memory=4 * 60 * 60 * (20 + 3 * 11), n_channels=3)
+    territory, _ = pieces_of(light, inside, positions, few, 8)
+    assert max(s.stop - s.start for box in ndimage.find_objects(territory) for s in box) <= 60 - 16

@@ -31,6 +31,13 @@ class Limits:
             if not getattr(self, name) >= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, must be 1 or more")
 
+    @property
+    def most_pixels(self) -> float:
+        """Of the box of a single source."""
+        if self.memory is None:
+            return self.pixels
+        return min(self.pixels, self.memory / fit_bytes(1, 1, self.n_channels))
+
     def hold(self, n_sources, n_pixels) -> bool:
         """Whether a fit of so many sources in a box of so many pixels is within them."""
         n_bytes = fit_bytes(n_sources, n_pixels, self.n_channels)
@@ -56,6 +63,8 @@ def pieces_of(light, inside, positions, limits, margin):
 
     light (Ny, Nx) [sigma]; inside (Ny, Nx) bool: the blend's pixels; positions (S, 2) [px] in these
     margin [px]: by which the box of a piece's fit is larger on each side
+    A single source whose own pixels are over the limits keeps those near it: the others are
+    nobody's, and sky in the pieces that hold them.
     returns territories int32, 0 = none, else 1 + number of the piece; numbers count from 0
     """
     at = np.clip(np.rint(positions).astype(int), 0, np.array(light.shape) - 1)
@@ -63,9 +72,9 @@ def pieces_of(light, inside, positions, limits, margin):
     basins = _watershed(light, inside | _at(inside.shape, at), at)
     owner = basins[at[:, 0], at[:, 1]] - 1  # two sources on one pixel share a basin
     n = int(basins.max())
-    boxes = [None] * n
-    for i, slices in enumerate(ndimage.find_objects(basins)):
-        boxes[i] = Box(slices[0].start, slices[1].start, slices[0].stop, slices[1].stop)
+    boxes = _boxes_within(
+        basins, dict(zip(owner.tolist(), at.tolist(), strict=True)), limits, margin
+    )
     counts = np.bincount(owner, minlength=n)
     piece = np.arange(n)
     for a, b in _saddles(light, basins):
@@ -81,6 +90,26 @@ def pieces_of(light, inside, positions, limits, margin):
     _, number = np.unique(roots, return_inverse=True)
     territory = np.concatenate([[0], number + 1])[basins].astype(np.int32)
     return territory, number[owner]
+
+
+def _boxes_within(basins, at, limits, margin):
+    """The Box of each basin, after those over the limits have lost what lies far from their source.
+
+    basins: (Ny, Nx), changed in place; at {basin, from 0: (y, x) of its source}
+    """
+    half = max(1, int(limits.most_pixels**0.5) // 2 - margin)
+    boxes = []
+    for i, (rows, columns) in enumerate(ndimage.find_objects(basins)):
+        box = Box(rows.start, columns.start, rows.stop, columns.stop)
+        if not limits.hold(1, box.grown(margin).area):
+            y, x = at[i]
+            near = Box(y - half, x - half, y + half, x + half).meet(box)
+            own = basins[box.slices] == i + 1
+            own[near.within(box).slices] = False
+            basins[box.slices][own] = 0
+            box = near
+        boxes.append(box)
+    return boxes
 
 
 def _at(shape, pixels):

@@ -8,6 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from ..box import Box
+from ..mapped import mapped_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,4 +91,4 @@ def _roots(n, pairs):
 def _image(folder, name, dtype, shape):
     if folder is None:
         return np.zeros(shape, dtype)
-    return np.lib.format.open_memmap(folder / f"{name}.npy", "w+", dtype, shape)
+    return mapped_array(folder / f"{name}.npy", dtype, shape)

@@ -1,0 +1,220 @@
+"""What `bench.soak` does to a field beside killing it.
+
+disk       the output folder is a small file system of its own, which fills up; each time it gets
+           twice the room, and the run goes on. Where none may be mounted, no file may be larger
+           than so much instead. The catalogue must be the same
+tile       one tile of Euclid's compressed image is damaged; the run is killed once as well. Sources
+           away from it must be those of the undisturbed run, fluxes within NEAR of their errors;
+           every source on it must have a reason, or its tile of the search be reported
+memory     the device has a tenth of this machine's memory, and a worker process a gigabyte at most.
+           Fits share other batches then: the same sources, their fluxes within NEAR of its errors
+hang       a worker is stopped (SIGSTOP) and never goes on. The catalogue must be the same
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+from astropy.table import QTable
+
+from .harness.options import ROOT
+
+LOOK_S = 0.02
+NEAR = 0.1  # [errors] of a flux: what batches of other sizes change is under a hundredth
+FIRST_ROOM = 128 << 10  # [bytes] of the file system that fills up
+HANGS_S = 30.0  # [s] after which a worker is taken to hang
+SMALL = {"POCL_MEMORY_LIMIT": str(max(1, os.sysconf("SC_PHYS_PAGES") * 4096 // 10 >> 30))}
+TILES = "\n[field]\ntile_px = 48\noverlap_px = 32\n"  # several tiles of the search in a small field
+
+
+def start(sky, out, *options, environment=None, before=None):
+    """The command, begun; it goes on where a run in this folder has begun."""
+    if (out / "work" / "run.json").exists():
+        options = *options, "--resume"
+    words = [sys.executable, "-m", "clresample.cli", "field", sky / "field.toml", "-o", out]
+    words += ["--workers", 2, "--quiet", *options]
+    return subprocess.Popen(
+        [str(word) for word in words],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        env={**os.environ, **(environment or {})},
+        preexec_fn=before,
+        text=True,
+    )
+
+
+def parts_in(out):
+    """Groups of fits that are on disk."""
+    return len(list((out / "work").glob("fit-*.fits")))
+
+
+def children(pid):
+    """Processes that a process has started and that live."""
+    path = Path(f"/proc/{pid}/task/{pid}/children")
+    return [int(one) for one in path.read_text().split()] if path.exists() else []
+
+
+def kill_at(process, seconds, what, rng, number=signal.SIGKILL):
+    """Send a signal to the process, or to one of its children, after so many seconds; whether there
+    was one."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end and process.poll() is None:
+        time.sleep(LOOK_S)
+    if process.poll() is not None:
+        return False
+    victims = [process.pid] if what == "run" else children(process.pid)
+    if not victims:
+        return False
+    try:
+        os.kill(rng.choice(victims), number)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def same_bytes(out, whole):
+    """Whether two runs have left the same catalogue."""
+    return (out / "catalogue.fits").read_bytes() == (whole / "catalogue.fits").read_bytes()
+
+
+def row_of(good, same, about, kills=0, parts=0, at=0.0):
+    return {"at": at, "kills": kills, "parts": parts, "same": same, "good": good, "about": about}
+
+
+def full_disk(sky, out, whole, took_s):
+    """A run on a disk that is full again and again."""
+    out.mkdir()
+    mounted = _mount(out, FIRST_ROOM)
+    room, n_full, parts = FIRST_ROOM, 0, []
+    try:
+        while True:
+            before = None if mounted else functools.partial(_limit_files, room)
+            process = start(sky, out, before=before)
+            _, said = process.communicate()
+            if process.returncode == 0:
+                break
+            if "cannot be written" not in said or process.returncode < 0:
+                raise RuntimeError(f"exit status {process.returncode} on a full disk: {said}")
+            n_full, room = n_full + 1, 2 * room
+            parts.append(parts_in(out))
+            if mounted:
+                subprocess.run(["mount", "-o", f"remount,size={room}", str(out)], check=True)
+        same = same_bytes(out, whole)
+    finally:
+        if mounted:
+            subprocess.run(["umount", str(out)], check=False)
+    how = "file system" if mounted else "no mount allowed: files"
+    about = f"{how} of up to {room >> 10} KiB"
+    return row_of(same and n_full > 0, same, about, n_full, max(parts, default=0))
+
+
+def _mount(folder, room):
+    """Whether a file system of so many bytes could be mounted on a folder."""
+    words = ["mount", "-t", "tmpfs", "-o", f"size={room}", "clresample-soak", str(folder)]
+    try:
+        return subprocess.run(words, capture_output=True, check=False).returncode == 0
+    except OSError:
+        return False
+
+
+def _limit_files(room):
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # an error of the write instead
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
+
+
+def damaged_tile(sky, out, whole, took_s):
+    """A run over a field with one damaged tile of Euclid's image, killed once."""
+    copy = out.with_name("damaged")
+    copy.mkdir()
+    for path in sky.iterdir():
+        (copy / path.name).write_bytes(path.read_bytes())
+    with open(copy / "field.toml", "a") as file:
+        file.write(TILES)
+    first, n_rows = damage(copy / "euclid.fits")
+    process = start(copy, out)
+    kills = kill_at(process, took_s * 0.6, "run", random.Random(0))
+    process.communicate()
+    parts = parts_in(out)
+    if kills:
+        process = start(copy, out)
+        process.communicate()
+    status = process.returncode
+    rows, clean = QTable.read(out / "catalogue.fits"), QTable.read(whole / "catalogue.fits")
+    lost = json.loads((out / "provenance.json").read_text())["lost_tiles"]
+    failed = np.array([str(s) == "failed" for s in rows["status"]], bool)
+    named = all("euclid.fits" in str(r) for r in [*rows["reason"][failed], *lost.values()])
+    away = np.abs(clean["y"].value - (first + n_rows / 2)) > n_rows / 2 + 64
+    missing, worst = compared(rows[~failed], clean[away])
+    about = f"{len(lost)} tiles lost, {failed.sum()} of {len(rows)} sources failed, "
+    about += f"{missing} of {away.sum()} away are missing, fluxes differ by {worst:.3f} errors"
+    good = status == 1 and named and bool(len(lost) or failed.any())
+    return row_of(good and missing == 0 and worst < NEAR, False, about, kills, parts, 0.6)
+
+
+def damage(path):
+    """Overwrite the last tile of a compressed image; its first row and number of rows [px]."""
+    with fits.open(path, disable_image_compression=True) as hdus:
+        header, begin = hdus["SCI"].header, hdus["SCI"].fileinfo()["datLoc"]
+        n_rows, n_all = header["ZTILE2"], header["ZNAXIS2"]
+        n_row_bytes, n_tiles = header["NAXIS1"], header["NAXIS2"]
+    # COMPRESSED_DATA is the first column: length and place in the heap of each tile, as 1PB or 1QB
+    wide = "Q" in header["TFORM1"]
+    with open(path, "r+b") as file:
+        file.seek(begin + (n_tiles - 1) * n_row_bytes)
+        size = 16 if wide else 8
+        length, offset = np.frombuffer(file.read(size), ">i8" if wide else ">i4").tolist()
+        file.seek(begin + header.get("THEAP", n_tiles * n_row_bytes) + offset)
+        file.write(b"\xff" * length)
+    first = (n_all - 1) // n_rows * n_rows
+    return first, n_all - first
+
+
+def compared(rows, clean):
+    """How many sources of a clean catalogue others do not have, and by how many errors the fluxes
+    of the rest differ at most."""
+    shared, i, j = np.intersect1d(rows["id"], clean["id"], return_indices=True)
+    worst = 0.0
+    for name in [c for c in clean.colnames if c.startswith("flux_err_")]:
+        flux = name.replace("_err", "")
+        change = np.abs(rows[flux][i].value - clean[flux][j].value) / clean[name][j].value
+        worst = max(worst, float(np.nanmax(change, initial=0.0)))
+    return len(clean) - len(shared), worst
+
+
+def small_device(sky, out, whole, took_s):
+    """A run on a device with a tenth of the memory, its processes held to a gigabyte."""
+    process = start(sky, out, "--memory", "1G", environment=SMALL)
+    _, said = process.communicate()
+    if process.returncode != 0:
+        return row_of(False, False, f"exit status {process.returncode}: {said.strip()[-80:]}")
+    rows, clean = (QTable.read(f / "catalogue.fits") for f in (out, whole))
+    missing, worst = compared(rows, clean)
+    about = f"{missing} missing, fluxes differ by {worst:.3f} errors"
+    good = missing == 0 and len(rows) == len(clean) and worst < NEAR
+    return row_of(good, same_bytes(out, whole), about)
+
+
+def hanging(sky, out, whole, took_s):
+    """A run one of whose workers stops and never goes on."""
+    process = start(sky, out, "--limit", max(HANGS_S, 2 * took_s))
+    stopped = kill_at(process, 0.5 * took_s, "worker", random.Random(0), signal.SIGSTOP)
+    parts = parts_in(out)
+    process.communicate()
+    same = process.returncode == 0 and same_bytes(out, whole)
+    about = "one worker stopped" if stopped else "the run had ended before a worker was stopped"
+    return row_of(same, same, about, int(stopped), parts, 0.5)
+
+
+FAULTS = {"disk": full_disk, "tile": damaged_tile, "memory": small_device, "hang": hanging}
