@@ -6,6 +6,7 @@ from helpers.blends import blend, in_frame, observe, round_component
 
 from clresample.measurement import detection as module
 from clresample.measurement.detection import ALL, detect, detect_more
+from clresample.measurement.signal import signal_of
 from clresample.sky.frame import model_frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
@@ -26,7 +27,7 @@ def test_signal_to_noise_does_not_depend_on_the_psfs_sampling():
     found = []
     for spacing, n in ((1.0, 31), (0.5, 61)):
         o = point_source(PSF.gaussian(1.5, n_pixels=n, spacing=spacing))
-        found.append(module._signal_to_noise(o, model_frame([o]), None))
+        found.append(signal_of(o, model_frame([o])).images[:, 0])
     np.testing.assert_allclose(found[1], found[0], atol=0.02 * np.abs(found[0]).max())
 
 
@@ -70,8 +71,9 @@ def two_widths():
 @pytest.mark.parametrize("away, n", [(4.0, 1), (9.0, 2)])
 def test_a_peak_of_all_images_within_the_wider_psf_is_the_same_source(monkeypatch, away, n):
     """FWHM 3.5 and 8 px: 4 px away counts as the source of the sharp image, 9 px do not."""
-    peaks = iter([[(np.array([30.0, 30.0]), 20.0)], [], [(np.array([30.0, 30.0 + away]), 9.0)]])
-    monkeypatch.setattr(module, "_peaks", lambda *_: next(peaks))
+    found = [(np.array([30.0, 30.0]), 20.0)], [], [(np.array([30.0, 30.0 + away]), 9.0)], []
+    peaks = iter(found)
+    monkeypatch.setattr(module, "_objects", lambda *_: (next(peaks), np.zeros(GRID.shape, int)))
     found = detect(two_widths(), model_frame(two_widths(), grid=GRID))
     assert len(found.sources) == n
     assert found.found_in == ("sharp", ALL)[:n]
@@ -83,6 +85,6 @@ def test_beyond_the_border_of_an_image_nothing_is_seen():
     data = np.zeros(half.shape)
     data[30, 29] = 1e4
     o = Observation(data, PSF.gaussian(2.0, n_pixels=31), half, weights=1.0)
-    image = module._signal_to_noise(o, model_frame([o], grid=GRID), None)
+    image = signal_of(o, model_frame([o], grid=GRID)).images[0, 0]
     assert image[30, 29] > 100
     assert not image[:, 29 + 6 :].any()  # 3 sigma: a thousandth of its light is inside
