@@ -106,8 +106,12 @@ class Executor:
         self.in_rows, self.in_rows_shared = (
             self.to_frequencies(self.mix, self.n_y, self.in_y, right) for right in (half, shared)
         )
-        self.back_rows = self.plain.bind(self.n_y, self.k_x, self.k_y, self.in_y_t, z, half)
-        self.back_columns = self.ragged.bind(self.n_y, self.n_x, self.k_x, half, self.in_x, model)
+        self.back_rows = self.plain.bind(
+            self.n_y, self.k_x, self.k_y, self.in_y_t, z, half, inward=False
+        )
+        self.back_columns = self.ragged.bind(
+            self.n_y, self.n_x, self.k_x, half, self.in_x, model, inward=False
+        )
 
     def forward(self, x: ImageBatch, y: ImageBatch, n, spread=False):
         """I2 from I1: x (n, Ny, Nx), or (n / n_bands, Ny, Nx) where `spread`, to y (n, My, Mx)."""
