@@ -13,7 +13,7 @@
  *      and no more; then `add` adds to what is there.
  *
  * A work-item owns MR rows and NV vectors of VW columns of C at a time, in registers, and sums
- * terms in stretches of `block`: contract.cl has the picture, and why.
+ * terms in stretches of `block` and the order `inward`: contract.cl has the picture, and why.
  *
  * Launch: (any number of work-items, which share the columns, ceil(most rows / MR), len(active)),
  * each rounded up to its local size.  On CPUs one takes all columns: a tile of a small box takes
@@ -25,8 +25,8 @@ enum { M, N, K, BEGIN_A, LD_A, NEXT_A, BEGIN_B, SKIP, BEGIN_C, LD_C, NEXT_C, N_C
 
 __kernel __attribute__((reqd_work_group_size(WGX, WGY, 1)))
 void boxed(__global const int *restrict active, __global const long *restrict items,
-           const int block, __global const REAL *restrict A, __global const REAL *restrict B,
-           const int ld_b, __global REAL *restrict C, const int add)
+           const int block, const int inward, __global const REAL *restrict A,
+           __global const REAL *restrict B, const int ld_b, __global REAL *restrict C, const int add)
 {
     __global const long *item = items + (size_t)N_COLUMNS * active[get_global_id(2)];
     const int m = (int)item[M], k = (int)item[K], skip = (int)item[SKIP];
@@ -47,17 +47,7 @@ void boxed(__global const int *restrict active, __global const long *restrict it
         int column[NV];
         WIDE acc[MR][NV];
         UNROLL(v, NV) column[v] = j0 + v * VW < n_pad ? j0 + v * VW : j0;
-        UNROLL(i, MR) UNROLL(v, NV) acc[i][v] = (WIDE)(0);
-        for (int l0 = 0; l0 < k; l0 += block) {
-            const int l1 = l0 + block < k ? l0 + block : k;
-            WIDE part[MR][NV], right[NV];
-            UNROLL(i, MR) UNROLL(v, NV) part[i][v] = (WIDE)(0);
-            for (int l = l0; l < l1; ++l) {
-                UNROLL(v, NV) right[v] = AT(const WIDE, B + (size_t)l * ld_b + column[v]);
-                UNROLL(i, MR) UNROLL(v, NV) part[i][v] += row[i][l * STEP_A] * right[v];
-            }
-            UNROLL(i, MR) UNROLL(v, NV) acc[i][v] += part[i][v];
-        }
+        SUM_TERMS(acc, row, B, ld_b, column, k, block, inward)
         UNROLL(i, MR) UNROLL(v, NV) {
             if (i0 + i >= m) break;
 #if RAGGED

@@ -28,7 +28,8 @@
  * Batch: item b uses A + (b / div_a) * stride_a and likewise for B, so a table that all bands of a
  *   scene share has div = n_bands, one that every scene shares has stride 0.
  * Terms are summed in stretches of `block` and the stretches' sums in a second set of registers:
- *   rounding then grows with the root of block + k / block, not of k.
+ *   rounding then grows with the root of block + k / block, not of k.  Their order: `inward`, see
+ *   contract.h.
  * Rows beyond m read row m - 1 again and are not stored.
  *
  * Epilogue, at most one of (rows 2i, 2i+1 hold the cos and sin parts of row frequency i):
@@ -53,6 +54,7 @@
 
 __kernel __attribute__((reqd_work_group_size(WGX, WGY, 1)))
 void contract(const int m, const int n, const int n_pad, const int k, const int block,
+              const int inward,
               __global const REAL *restrict A, const ulong offset_a, const int ld_a,
               const int step_a, const int stride_a, const int div_a,
               __global const REAL *restrict B, const int stride_b, const int div_b,
@@ -74,17 +76,7 @@ void contract(const int m, const int n, const int n_pad, const int k, const int 
     WIDE acc[MR][NV];
     UNROLL(v, NV) column[v] = j0 + v * VW < n_pad ? j0 + v * VW : j0;
     UNROLL(i, MR) row[i] = A + (size_t)(i0 + i < m ? i0 + i : m - 1) * ld_a;
-    UNROLL(i, MR) UNROLL(v, NV) acc[i][v] = (WIDE)(0);
-    for (int l0 = 0; l0 < k; l0 += block) {
-        const int l1 = l0 + block < k ? l0 + block : k;
-        WIDE part[MR][NV], right[NV];
-        UNROLL(i, MR) UNROLL(v, NV) part[i][v] = (WIDE)(0);
-        for (int l = l0; l < l1; ++l) {
-            UNROLL(v, NV) right[v] = AT(const WIDE, B + (size_t)l * n_pad + column[v]);
-            UNROLL(i, MR) UNROLL(v, NV) part[i][v] += row[i][l * STEP_A] * right[v];
-        }
-        UNROLL(i, MR) UNROLL(v, NV) acc[i][v] += part[i][v];
-    }
+    SUM_TERMS(acc, row, B, n_pad, column, k, block, inward)
 
 #include "contract_end.h"
 }

@@ -1,4 +1,11 @@
-/* What the kernels of contract.cl and contract_group.cl share: their sizes, and vectors of VW. */
+/* What the kernels of contract.cl, boxed.cl and contract_group.cl share: their sizes, vectors of VW,
+ * and the sums of a tile in registers.
+ *
+ * Order of the terms: the smallest first, so that roundings are those of small sums.
+ *   inward 1   of sums over pixels, whose light is brightest about the middle: blocks from both
+ *              ends in turn, each from its end towards the middle
+ *   inward 0   of sums over frequencies, which fall off: from the last term down to the first
+ */
 #include "common.h"
 
 #ifndef VW          /* columns of a vector */
@@ -58,3 +65,26 @@
 #endif
 
 #define UNROLL(i, n) _Pragma("unroll") for (int i = 0; i < (n); ++i)
+
+/* part[MR][NV] += row[i][l STEP_A] times the vectors at B + l ld_b + column[v]. */
+#define ADD_TERM(l, row, B, ld_b, column) \
+    UNROLL(v, NV) right[v] = AT(const WIDE, (B) + (size_t)(l) * (ld_b) + column[v]); \
+    UNROLL(i, MR) UNROLL(v, NV) part[i][v] += row[i][(l) * STEP_A] * right[v];
+
+/* sums[MR][NV] = the terms l < k, in blocks of `block` and in the order above. A loop for each
+ * direction: one with a step that is a variable takes 4 % longer. */
+#define SUM_TERMS(sums, row, B, ld_b, column, k, block, inward) \
+    UNROLL(i, MR) UNROLL(v, NV) sums[i][v] = (WIDE)(0); \
+    for (int turn = 0; turn * (block) < (k); ++turn) { \
+        const int rest = (k) - turn * (block), n_terms = rest < (block) ? rest : (block); \
+        const int gone = ((inward) ? turn / 2 : turn) * (block); \
+        WIDE part[MR][NV], right[NV]; \
+        UNROLL(i, MR) UNROLL(v, NV) part[i][v] = (WIDE)(0); \
+        if ((inward) && turn % 2 == 0) \
+            for (int l = gone; l < gone + n_terms; ++l) { ADD_TERM(l, row, B, ld_b, column) } \
+        else \
+            for (int l = (k) - 1 - gone; l >= (k) - gone - n_terms; --l) { \
+                ADD_TERM(l, row, B, ld_b, column) \
+            } \
+        UNROLL(i, MR) UNROLL(v, NV) sums[i][v] += part[i][v]; \
+    }

@@ -5,12 +5,13 @@
  * of a vector from c on, step_c apart, n_left of them at most.
  */
 #if MIX
-    E += (size_t)(b / n_bands) * stride_e + (size_t)(b % n_bands) * band_e;
+    __global const REAL *tables =
+        E + (size_t)(b / n_bands) * stride_e + (size_t)(b % n_bands) * band_e;
     UNROLL(h, MR / 2) UNROLL(v, NV) {
         const int i = 2 * h;
         if (!OWNED(i, v)) continue;
         const WIDE c = acc[i][v], s = acc[i + 1][v];
-        __global const REAL *d = E + (size_t)(i0 / 2 + h) * 2 * n_pad + column[v] / 2;
+        __global const REAL *d = tables + (size_t)(i0 / 2 + h) * 2 * n_pad + column[v] / 2;
         const HALF pr = AT(const HALF, d), pi = SIGN * AT(const HALF, d + n_pad / 2);
         const HALF mr = AT(const HALF, d + n_pad), mi = SIGN * AT(const HALF, d + n_pad / 2 * 3);
         const HALF fpr = EVEN(c) - ODD(s), fpi = -(ODD(c) + EVEN(s));   /* F(+nu_y, +nu_x) */
@@ -23,12 +24,12 @@
         ODD(acc[i + 1][v]) = gmr - gpr;
     }
 #elif TWIST
-    E += (size_t)(b / n_bands) * stride_e;
+    __global const REAL *tables = E + (size_t)(b / n_bands) * stride_e;
     UNROLL(h, MR / 2) UNROLL(v, NV) {
         const int i = 2 * h;
         if (!OWNED(i, v)) continue;
         const WIDE c = acc[i][v], s = acc[i + 1][v];
-        __global const REAL *t = E + (size_t)(i0 / 2 + h) * 2 * n_pad + column[v];
+        __global const REAL *t = tables + (size_t)(i0 / 2 + h) * 2 * n_pad + column[v];
         const WIDE cos_t = AT(const WIDE, t), sin_t = SIGN * AT(const WIDE, t + n_pad);
         acc[i][v] = c * cos_t + s * sin_t;
         acc[i + 1][v] = s * cos_t - c * sin_t;

@@ -17,8 +17,10 @@
  * that neighbours read neighbouring vectors. A's slab is kept transposed: the rows of a work-item
  * are read at once, and are the same for all work-items of a row of the group.
  *
- * Sums: one set of registers, all k terms in their order; with TWO_SUMS stretches of `block` terms,
- *   rounded up to whole slabs, are summed first. What lies beyond k or m counts as zero.
+ * Sums: one set of registers for all k terms, by slabs: the last one first, or from both ends in
+ *   turn if `inward`, as contract.h has it; within a slab from the last term down. With TWO_SUMS
+ *   stretches of `block` terms, rounded up to whole slabs, are summed first. What lies beyond k or
+ *   m counts as zero.
  *
  * Launch: global = (ceil(n_pad / TN) WGX, ceil(m / TM) WGY, batch), groups of (WGX, WGY, 1).
  */
@@ -67,6 +69,10 @@
 #define SLAB_TERM(t) ((t) % KB)
 #endif
 
+/* First term of the slab whose turn it is. */
+#define SLAB(turn) \
+    (KB * (!inward ? n_slabs - 1 - (turn) : (turn) % 2 == 0 ? (turn) / 2 : n_slabs - 1 - (turn) / 2))
+
 #define FETCH(l0) \
     UNROLL(f, FETCH_A) { \
         const int t = f * GROUP + lid, i = top + SLAB_ROW(t), l = (l0) + SLAB_TERM(t); \
@@ -80,6 +86,7 @@
 
 __kernel __attribute__((reqd_work_group_size(WGX, WGY, 1)))
 void contract_group(const int m, const int n, const int n_pad, const int k, const int block,
+                    const int inward,
                     __global const REAL *restrict A, const ulong offset_a, const int ld_a,
                     const int step_a, const int stride_a, const int div_a,
                     __global const REAL *restrict B, const int stride_b, const int div_b,
@@ -111,8 +118,9 @@ void contract_group(const int m, const int n, const int n_pad, const int k, cons
 #else
 #define SUM acc
 #endif
-    FETCH(0)
-    for (int l0 = 0, slab = 0; l0 < k; l0 += KB, slab ^= 1) {
+    const int n_slabs = (k + KB - 1) / KB;
+    FETCH(SLAB(0))
+    for (int turn = 0, slab = 0; turn < n_slabs; ++turn, slab ^= 1) {
         UNROLL(f, FETCH_A) {
             const int t = f * GROUP + lid;
             slab_a[slab][SLAB_TERM(t)][SLAB_ROW(t)] = next_a[f];
@@ -124,10 +132,10 @@ void contract_group(const int m, const int n, const int n_pad, const int k, cons
         /* One barrier a slab: whoever writes this slab again has passed the next barrier, which
          * all reach only after they have read it. */
         barrier(CLK_LOCAL_MEM_FENCE);
-        if (l0 + KB < k) {
-            FETCH(l0 + KB)
+        if (turn + 1 < n_slabs) {
+            FETCH(SLAB(turn + 1))
         }
-        for (int l = 0; l < KB; ++l) {
+        for (int l = KB - 1; l >= 0; --l) {
             WIDE right[NV];
             REAL left[MR];
             UNROLL(v, NV) right[v] = slab_b[slab][l][v * WGX + lx];
@@ -145,7 +153,7 @@ void contract_group(const int m, const int n, const int n_pad, const int k, cons
         }
 #if TWO_SUMS
         terms += KB;
-        if (terms >= block || l0 + KB >= k) {
+        if (terms >= block || turn + 1 == n_slabs) {
             UNROLL(i, MR) UNROLL(v, NV) {
                 acc[i][v] += part[i][v];
                 part[i][v] = (WIDE)(0);

@@ -26,12 +26,13 @@
  * whiten   seen <- seen root;  launch: (X, tallest window, slots)
  * compare  model m = sky root + sum_slots A seen, residual r = data - m, weight w = 1 / (1 + (error
  *          m)^2) where root is not 0; sums (B, n_bands, my, 3): of w r^2, w r root, w root^2;
- *          launch: (my, n_bands, scenes), one work-item a row.  `listed`: the slots scene by scene,
+ *          launch: (WG my, n_bands, scenes), a group a row.  `listed`: the slots scene by scene,
  *          those of scenes[k] from first[k] to first[k + 1]
  * gram     out (pairs, n_bands, K, K) = sum over the pixels where both windows lie of w a_i b_j;
  *          pairs (., 6) int: slots a, b, and the pixels: y, x, height, width; images beyond a
- *          slot's n are its last again;  launch: (WG, n_bands, pairs), groups of (WG, 1, 1)
- * pull     out (slots, n_bands, K, 2) = sums of w a_i r and w a_i root;  launch: as gram
+ *          slot's n are its last again;  launch: (WG pairs, n_bands), groups of (WG, 1): of pairs
+ *          there may be more than a GPU's groups along other axes
+ * pull     out (slots, n_bands, K, 2) = sums of w a_i r and w a_i root;  launch: (WG slots, n_bands)
  *
  * X is 1 where a work-item walks a whole row (ROWS of group.h), else the width of the widest row.
  */
@@ -151,40 +152,55 @@ __kernel void whiten(__global const int *restrict place, const int n_bands, cons
         }
 }
 
-__kernel void compare(__global const int *restrict scenes, __global const int *restrict first,
-                      __global const int *restrict listed, __global const int *restrict place,
-                      const int n_bands, const int my, const int mx, const int channel,
-                      const int n_channels, const REAL error,
-                      __global const REAL *restrict spectra, __global const REAL *restrict sky,
-                      __global const REAL *restrict root, __global const REAL *restrict data,
-                      __global const REAL *restrict seen, __global REAL *restrict residual,
-                      __global REAL *restrict weight, __global REAL *restrict sums)
+/* Of slot s in row y of channel c: the window's columns wx from x0 on, its flux a, and its image's
+ * row u; the next slot's turn where it has no light there. */
+#define SLOT(s) \
+    __global const int *p = place + N_PLACE * (size_t)(s); \
+    const int wy = p[WY], wx = p[WX], row = y - p[Y0], x0 = p[X0]; \
+    if (row < 0 || row >= wy) continue; \
+    const REAL a = spectra[(size_t)(s) * n_channels + channel + c]; \
+    if (a == 0) continue; \
+    __global const REAL *u = seen + p[BEGIN] + ((size_t)c * wy + row) * wx;
+
+__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
+void compare(__global const int *restrict scenes, __global const int *restrict first,
+             __global const int *restrict listed, __global const int *restrict place,
+             const int n_bands, const int my, const int mx, const int channel,
+             const int n_channels, const REAL error, __global const REAL *restrict spectra,
+             __global const REAL *restrict sky, __global const REAL *restrict root,
+             __global const REAL *restrict data, __global const REAL *restrict seen,
+             __global REAL *restrict residual, __global REAL *restrict weight,
+             __global REAL *restrict sums)
 {
-    const int y = (int)get_global_id(0), c = (int)get_global_id(1), k = (int)get_global_id(2);
-    if (y >= my || c >= n_bands) return;
-    const int b = scenes[k];
+    __local REAL share[WG];
+    const int lid = (int)get_local_id(0), y = (int)get_group_id(0);
+    const int c = (int)get_global_id(1), k = (int)get_global_id(2), b = scenes[k];
     const size_t line = ((size_t)b * n_bands + c) * my + y;
     __global REAL *m = residual + line * mx, *w = weight + line * mx;
     __global const REAL *r = root + line * mx, *d = data + line * mx;
     const REAL level = sky[(size_t)b * n_channels + channel + c];
+#if ROWS
     for (int x = 0; x < mx; ++x) m[x] = level * r[x];
     for (int l = first[k]; l < first[k + 1]; ++l) {
-        const int s = listed[l];
-        __global const int *p = place + N_PLACE * (size_t)s;
-        const int wy = p[WY], wx = p[WX], row = y - p[Y0], x0 = p[X0];
-        if (row < 0 || row >= wy) continue;
-        const REAL a = spectra[(size_t)s * n_channels + channel + c];
-        if (a == 0) continue;
-        __global const REAL *u =
-            seen + p[BEGIN] + ((size_t)c * wy + row) * wx;
+        SLOT(listed[l])
         const int low = x0 < 0 ? -x0 : 0, high = x0 + wx < mx ? wx : mx - x0;
         for (int x = low; x < high; ++x) m[x0 + x] += a * u[x];
     }
+#else
+    for (int x = lid; x < mx; x += WG) {
+        REAL sum = level * r[x];
+        for (int l = first[k]; l < first[k + 1]; ++l) {
+            SLOT(listed[l])
+            if (x >= x0 && x < x0 + wx) sum += a * u[x - x0];
+        }
+        m[x] = sum;
+    }
+#endif
     REAL chi2[8] = {0, 0, 0, 0, 0, 0, 0, 0}, by_sky[8] = {0, 0, 0, 0, 0, 0, 0, 0};
     REAL of_sky[8] = {0, 0, 0, 0, 0, 0, 0, 0};
-    for (int x0 = 0; x0 < mx; x0 += 8)
+    for (int at = ROWS ? 0 : lid; at < mx; at += ROWS ? 8 : 8 * WG)
         for (int i = 0; i < 8; ++i) {
-            const int x = x0 + i;
+            const int x = ROWS ? at + i : at + i * WG;
             if (x < mx) {
                 const REAL part = error * m[x], rest = d[x] - m[x], weigh = 1 / (1 + part * part);
                 m[x] = rest;
@@ -194,9 +210,13 @@ __kernel void compare(__global const int *restrict scenes, __global const int *r
                 of_sky[i] += weigh * r[x] * r[x];
             }
         }
-    sums[3 * line] = SUM8(chi2);
-    sums[3 * line + 1] = SUM8(by_sky);
-    sums[3 * line + 2] = SUM8(of_sky);
+    const REAL a = group_sum(SUM8(chi2), lid, share), e = group_sum(SUM8(by_sky), lid, share);
+    const REAL o = group_sum(SUM8(of_sky), lid, share);
+    if (lid == 0) {
+        sums[3 * line] = a;
+        sums[3 * line + 1] = e;
+        sums[3 * line + 2] = o;
+    }
 }
 
 /* Image i of a slot in channel c, at a pixel of the observation; the last one beyond n. */
@@ -212,7 +232,7 @@ void gram(__global const int *restrict pairs, __global const int *restrict place
 {
     __local REAL share[WG];
     const int lid = (int)get_local_id(0), c = (int)get_global_id(1);
-    const size_t pair = get_global_id(2);
+    const size_t pair = get_group_id(0);
     __global const int *t = pairs + 6 * pair;
     __global const int *p = place + N_PLACE * (size_t)t[0], *q = place + N_PLACE * (size_t)t[1];
     const int y0 = t[2], x0 = t[3], height = t[4], width = t[5];
@@ -257,7 +277,7 @@ void pull(__global const int *restrict place, const int n_bands, const int my, c
 {
     __local REAL share[WG];
     const int lid = (int)get_local_id(0), c = (int)get_global_id(1);
-    const size_t s = get_global_id(2);
+    const size_t s = get_group_id(0);
     __global const int *p = place + N_PLACE * s;
     const int y0 = p[Y0] > 0 ? p[Y0] : 0, x0 = p[X0] > 0 ? p[X0] : 0;
     const int y1 = p[Y0] + p[WY] < my ? p[Y0] + p[WY] : my;

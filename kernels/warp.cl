@@ -92,7 +92,7 @@ __kernel void rowdot(const int n_positions, const int n_pad, const int n_bands, 
     T += ((size_t)b * n_positions + p) * n_pad;
     E += (i_table * n_positions + p) * n_pad;
     REAL part[8] = {0, 0, 0, 0, 0, 0, 0, 0};       /* independent sums, so that they vectorise */
-    for (int x = 0; x < n_pad; x += 8)
+    for (int x = n_pad - 8; x >= 0; x -= 8)        /* low frequencies, the largest terms, last */
         for (int i = 0; i < 8; ++i) part[i] += T[x + i] * E[x + i];
     y[y_offset + (size_t)b * n_positions + p] = SUM8(part);
 }

@@ -49,9 +49,9 @@ class AffineExecutor(Executor):
         n_y, n_x, turn = self.n_rows, self.n_columns, (self.turn.buffer, self.turn.stride, 0)
         z, turned, lines = (self.matrix(name) for name in ("frequencies", "turned", "lines"))
         self.to_columns = self.twist.bind(
-            self.k_y, n_x, self.k_x, z, self.out_x, turned, turn, self.n_bands
+            self.k_y, n_x, self.k_x, z, self.out_x, turned, turn, self.n_bands, inward=False
         )
-        self.to_lines = self.plain.bind(n_y, n_x, self.k_y, self.out_y, turned, lines)
+        self.to_lines = self.plain.bind(n_y, n_x, self.k_y, self.out_y, turned, lines, inward=False)
         self.from_lines = self.twist_adjoint.bind(
             self.k_y, n_x, n_y, self.out_y_t, lines, turned, turn, self.n_bands
         )

@@ -23,8 +23,10 @@ class AlignedExecutor(Executor):
         n_y, n_x = self.n_rows, self.n_columns
         half, z = self.matrix("half", n_y), self.matrix("frequencies")
         observed = ImageBatch.shaped(n_y, n_x).matrix()
-        self.to_rows = self.plain.bind(n_y, self.k_x, self.k_y, self.out_y, z, half)
-        self.to_pixels = self.ragged.bind(n_y, n_x, self.k_x, half, self.out_x, observed)
+        self.to_rows = self.plain.bind(n_y, self.k_x, self.k_y, self.out_y, z, half, inward=False)
+        self.to_pixels = self.ragged.bind(
+            n_y, n_x, self.k_x, half, self.out_x, observed, inward=False
+        )
         self.from_pixels = self.plain.bind(n_y, self.k_x, n_x, observed, self.out_x_t, half)
         self.from_rows = self.to_frequencies(self.mix_adjoint, n_y, self.out_y_t, half)
 

@@ -22,7 +22,9 @@ class DistortedExecutor(Executor):
     def bind(self):
         super().bind()
         half, z = self.matrix("half", self.n_rows), self.matrix("frequencies")
-        self.to_rows = self.plain.bind(self.n_rows, self.k_x, self.k_y, self.out_y, z, half)
+        self.to_rows = self.plain.bind(
+            self.n_rows, self.k_x, self.k_y, self.out_y, z, half, inward=False
+        )
         self.from_rows = self.to_frequencies(self.mix_adjoint, self.n_rows, self.out_y_t, half)
         group = self.tuning.line_group
         self.rowdot, self.rowscale = (

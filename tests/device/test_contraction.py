@@ -240,6 +240,51 @@ def test_long_sums_keep_their_accuracy(device, monkeypatch):
     assert error() > 1e-6
 
 
+def test_a_tall_product_is_cut_where_a_launch_would_have_too_many_groups(device, monkeypatch):
+    monkeypatch.setattr(contract, "MOST_GROUPS", 4)
+    m, n, k, batch = 13, 17, 9, 11
+    a, b = random(batch + 1, m, k), random(1, k, n)
+    left, right = device.put(a, np.float32), put_right(device, b, np.float32)
+    n_pad = right.shape[-1]
+    result = device.put(np.full((batch, m, n_pad), 7.0), np.float32)
+    product = Contraction(device, np.float32).bind(
+        m, n, k, Matrix(None, k, m * k), Matrix(right.base_data, n_pad),
+        Matrix(result.base_data, n_pad, m * n_pad),
+    )  # fmt: skip
+    sizes = []
+    launch = product.launch
+    product.launch = lambda size, **given: (sizes.append(size), launch(size, **given))
+    product(batch, a=ImageBatch(left.base_data, m * k, m * k, k))
+    groups = [size[1] // product.group_rows for size in sizes]
+    assert len(groups) > 1 and max(groups) <= max(4, -(-m // product.rows))
+    check(device.get(result)[..., :n], a[1:] @ b, np.float32)
+
+
+@pytest.mark.parametrize("name", ["CPU", "groups"])
+def test_the_largest_terms_are_summed_last(device, monkeypatch, name):
+    # light about the middle of a row of pixels, and amplitudes that fall off with frequency
+    tune(monkeypatch, tile=TILES[name], row_choices=())
+    m, n, k = 64, 64, 96
+    waves = np.abs(random(k, n)).astype(np.float32)
+    right = device.put(waves)
+    result = device.empty((m, n), np.float32)
+
+    def error(terms, inward):
+        a = (terms * (1 + 0.1 * random(m, k, seed=1))).astype(np.float32)
+        left = device.put(a)
+        Contraction(device, np.float32).bind(
+            m, n, k, Matrix(left.base_data, k), Matrix(right.base_data, n),
+            Matrix(result.base_data, n), inward=inward,
+        )(1)  # fmt: skip
+        truth = a.astype(float) @ waves.astype(float)
+        return np.linalg.norm(device.get(result) - truth) / np.linalg.norm(truth)
+
+    at = np.arange(k)
+    pixels, frequencies = np.exp(-(((at - 47.5) / 8) ** 2) / 2), np.exp(-at / 8)
+    assert error(pixels, inward=True) < 0.9 * error(pixels, inward=False)
+    assert error(frequencies, inward=False) < 0.7 * error(frequencies, inward=True)
+
+
 def test_a_wrong_product_is_seen():
     truth = random(4, 4)
     with pytest.raises(AssertionError, match="error"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...device.contraction import ImageBatch, Matrix
+from ...device.tuning import MOST_GROUPS
 from ...resampling.resampler import EXECUTORS
 
 
@@ -52,7 +53,8 @@ class Renderer:
             plan's; shares (slots, C, T): of the plan's terms, None where it has one
         """
         e, count, (w_y, w_x) = self.executor, len(moves), self.plan.mapping.shape_out
-        group = min(count, max(1, e.tuning.group_bytes // (n * self._n_bytes)))
+        fit = min(e.tuning.group_bytes // (n * self._n_bytes), MOST_GROUPS // (n * e.n_bands))
+        group = min(count, max(1, fit))
         self._reserve(group * n)
         phase = self.device.put(self._phases(moves), self.dtype)
         self._turn.bind(shares=phase if shares is None else self.device.put(shares, self.dtype))

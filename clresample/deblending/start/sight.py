@@ -88,18 +88,15 @@ class Sight:
         if self._listed is None:
             self._listed = [put(x.astype(np.int32)) for x in _listed(slots, scenes)]
         scenes_on_device, first, listed = self._listed
-        launch = self.device.launcher(
-            FILE, "compare", dtype=self.dtype, local_size=self.tuning.local_size(3)
-        )
-        launch(
-            (self.my, self.n_bands, len(scenes)),
+        group = self.tuning.sum_group
+        self._launch(
+            "compare",
+            (group * self.my, self.n_bands, len(scenes)),
+            local_size=(group, 1, 1),
             scenes=scenes_on_device,
             first=first,
             listed=listed,
             place=self.place_on_device,
-            n_bands=self.n_bands,
-            my=self.my,
-            mx=self.mx,
             channel=self.channels.start,
             n_channels=spectra.shape[1],
             error=error,
@@ -130,8 +127,8 @@ class Sight:
             group = self.tuning.sum_group
             self._launch(
                 "gram",
-                (group, self.n_bands, len(pairs)),
-                local_size=(group, 1, 1),
+                (group * len(pairs), self.n_bands),
+                local_size=(group, 1),
                 K=n_images,
                 pairs=pairs,
                 place=self.place_on_device,
@@ -147,8 +144,8 @@ class Sight:
         out = self.device.empty((n, self.n_bands, n_images, 2), self.dtype)
         self._launch(
             "pull",
-            (group, self.n_bands, n),
-            local_size=(group, 1, 1),
+            (group * n, self.n_bands),
+            local_size=(group, 1),
             K=n_images,
             place=self.place_on_device,
             seen=self.seen,

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ....device.contraction import SUM_BLOCK, padded
+from ....device.contraction import padded, stretch
 
 # The columns of the kernel's table, each int64.
 COLUMNS = ["m", "n", "k", "begin_a", "ld_a", "next_a", "begin_b", "skip"]
@@ -19,10 +19,11 @@ class BoxedProduct:
     buffers: the batch; ld_b: distance of B's rows
     strided: A's columns lie next_a apart; ragged: C is stored element by element, n of them in a
         row, else by vectors up to a multiple of 16
+    inward: sums are over pixels, and not over frequencies; see Contraction.bind
     sizes: a value or an array (S,) for each of COLUMNS; next_a and next_c are 1 by default, skip 0
     """
 
-    def __init__(self, buffers, ld_b, *, strided=False, ragged=False, **sizes):
+    def __init__(self, buffers, ld_b, *, strided=False, ragged=False, inward=True, **sizes):
         b, sizes = buffers, {"next_a": 1, "next_c": 1, "skip": 0} | sizes
         items = [np.broadcast_to(sizes[name], b.n_sources) for name in COLUMNS]
         tile, m, width = _tile(b.tuning), max(items[0]), max(items[1] + items[7])
@@ -40,7 +41,8 @@ class BoxedProduct:
             **tile,
         ).bind(
             items=b.device.put(np.stack(items, axis=1), np.int64),
-            block=max(SUM_BLOCK, math.isqrt(int(max(items[2])))),
+            block=stretch(int(max(items[2]))),
+            inward=inward,
             ld_b=ld_b,
         )
 

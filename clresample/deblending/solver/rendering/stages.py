@@ -195,6 +195,7 @@ class _Boxes:
         return BoxedProduct(
             self._buffers,
             e.k_pad,
+            inward=False,
             m=self._rows,
             n=e.k_pad,
             k=e.k_y,
@@ -213,6 +214,7 @@ class _Boxes:
             self._buffers,
             padded(e.n_x),
             ragged=True,
+            inward=False,
             m=self._rows,
             n=self._columns,
             k=e.k_x,
