@@ -166,8 +166,12 @@ class Executor(OnDevice):
             for right in (half, shared)
         )
         in_y_t, in_x = self.in_y_t._replace(div=n), self.in_x._replace(div=n)
-        self.back_rows = self.plain.bind(self.n_y, self.k_x, self.k_y, in_y_t, z, half)
-        self.back_columns = self.ragged.bind(self.n_y, self.n_x, self.k_x, half, in_x, model)
+        self.back_rows = self.plain.bind(
+            self.n_y, self.k_x, self.k_y, in_y_t, z, half, inward=False
+        )
+        self.back_columns = self.ragged.bind(
+            self.n_y, self.n_x, self.k_x, half, in_x, model, inward=False
+        )
         if self.terms:
             self.terms.bind(self.scratch)
 
