@@ -7,7 +7,7 @@ STAMP = $(VENV)/made
 RUN = $(VENV)/bin/python -m
 
 .PHONY: demo test test-on test-kernels-on grind lint mutants fuzz clean paper paper-full dist \
-    test-as-gpu test-install test-oldest test-adapters docs soak
+    test-as-gpu test-install test-oldest test-adapters threads docs soak
 
 # What runs on one OpenCL device whatever the others are: operators, and the solver's kernels.
 KERNEL_TESTS = tests/device/test_contraction.py tests/device/test_launcher.py \
@@ -37,6 +37,11 @@ test-kernels-on: test-on
 # Kernels' tests as kernels are built for GPUs, in buffers that show bad reads and writes.
 test-as-gpu: $(STAMP)
 	$(RUN) pytest $(KERNEL_TESTS) --as-gpu --nan-buffers --guard-buffers $(ARGS)
+
+# Renders and fits in several threads against the same alone, on that runtime.
+threads: $(STAMP)
+	@PYTHON=$(PYTHON) tools/on_runtime.sh $(RUNTIME) $(VENV)/bin/python tools/threads.py $(ARGS) || \
+	    { status=$$?; [ $$status = 77 ] || exit $$status; }
 
 # Races and bad accesses of every kernel, found by a simulator; see tools/grind.sh.
 grind: $(STAMP)

@@ -88,3 +88,42 @@ def test_beyond_the_border_of_an_image_nothing_is_seen():
     image = signal_of(o, model_frame([o], grid=GRID)).images[0, 0]
     assert image[30, 29] > 100
     assert not image[:, 29 + 6 :].any()  # 3 sigma: a thousandth of its light is inside
+
+
+def signal_to_noise(observation, frame=None):
+    return module._signal_to_noise(observation, frame or model_frame([observation]), None)
+
+
+@pytest.mark.parametrize("unit", [1e15, 1e-15])
+def test_signal_to_noise_does_not_depend_on_the_unit_of_the_data(unit):
+    """Though its weights, and data times weights, are beyond float32."""
+    o = point_source(PSF.gaussian(1.5, n_pixels=31))
+    scaled = Observation(o.data * unit, o.psf, GRID, weights=o.weights / unit**2)
+    np.testing.assert_allclose(signal_to_noise(scaled), signal_to_noise(o), atol=1e-4)
+
+
+def test_sources_are_seen_in_pixels_much_larger_than_the_models():
+    """Each model pixel then has a hundredth of an observed pixel's weight."""
+    coarse = Grid.flat((12, 12), 1.0)
+    data = np.zeros(coarse.shape)
+    data[6, 6] = 100.0
+    o = Observation(data, PSF.gaussian(0.6, n_pixels=11), coarse, weights=1.0)
+    frame = model_frame([o], grid=Grid.flat((120, 120), 0.1))
+    assert signal_to_noise(o, frame).max() > 50
+
+
+def test_channels_of_pure_noise_add_up_to_unit_scatter():
+    rng = np.random.default_rng(2)
+    data = rng.normal(size=(4, 60, 60))
+    o = Observation(data, PSF.gaussian(1.5, n_pixels=31), GRID, weights=1.0, channels=list("abcd"))
+    assert np.std(signal_to_noise(o)[10:-10, 10:-10]) == pytest.approx(1, abs=0.3)
+
+
+@pytest.mark.parametrize("area, n", [(0.5, 1), (2.0, 0)])
+def test_an_object_has_as_many_pixels_as_it_has_to(area, n):
+    import sep
+
+    image = np.zeros((20, 20), np.float32)
+    image[10, 12] = 9
+    found = module._peaks(sep, image, 5.0, area)
+    assert [(tuple(place), peak) for place, peak in found] == [((10, 12), 9)][:n]

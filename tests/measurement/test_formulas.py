@@ -122,3 +122,29 @@ def test_a_flux_is_that_of_the_sources_own_components():
         catalogue(alone)["flux_g"][0].value, catalogue(result)["flux_g"][0].value
     )
     assert np.isnan(catalogue(alone)["flux_g"][1].value)
+
+
+def test_residuals_are_filtered_with_the_psf_as_it_lies():
+    """Of a PSF with a wing on one side, what looks like it counts more than its mirror image."""
+    image = np.zeros((9, 9))
+    image[4, 4], image[2, 7], image[3, 5] = 1, 0.6, 0.5
+    psf = PSF(image, center=(4, 4))
+    found = []
+    for seen in (psf.images[0], psf.images[0][::-1, ::-1]):
+        data = np.zeros((20, 20))
+        data[6:15, 6:15] = 30 * seen
+        o = Observation(data[None], psf, Grid.flat((20, 20), SCALE), weights=1.0, channels=("g",))
+        part = Component(0, (0, 0), np.ones((20, 20)), np.array([1e-9]))
+        result = blend([part], observations=(o,), grid=Grid.flat((20, 20), SCALE))
+        found.append(worst_residuals(result, 0)[0, 0])
+    power = np.sqrt((psf.images[0] ** 2).sum())
+    assert found[0] == pytest.approx(30 * power, rel=1e-6) and found[1] < 0.8 * found[0]
+
+
+def test_chi2_counts_the_first_rows_and_columns():
+    """A box in the corner of the frame, where all of the misfit is in row 0 and column 0."""
+    data = np.zeros((1, *GRID.shape))
+    data[:, 0, :5], data[:, 1:5, 0] = 3.0, 3.0
+    part = Component(0, (0, 0), np.ones((5, 5)), np.array([0.0]))
+    result = blend([part], observations=(observe(GRID, ("g",), data=data),))
+    assert box_chi2(result, 0, result.footprints[0])[0] == pytest.approx(9 * 9 / 25)

@@ -139,4 +139,5 @@ def _tokens(path, text):
             annotated = token.string == "|" and (":" in token.line or "->" in token.line)
             if not (unpacked or head or imported or annotated or strict):
                 yield token.start[0], starts[token.start[0] - 1] + token.start[1], token.string
-        previous = token.string
+        if token.type != tokenize.NL:
+            previous = token.string

@@ -51,8 +51,10 @@ class Covering:
                 print(f"recording {file}", flush=True)
                 raw = kept.with_suffix(".raw")
                 answer = serve({"arguments": [file], "seconds": 1800, "record": str(raw)})
-                if answer["status"] not in (0, 5):
-                    raise SystemExit(f"{file} fails without any mutation: {answer}")
+                if answer["status"] not in (0, 1, 5):
+                    raise SystemExit(f"{file} does not run without any mutation: {answer}")
+                if answer["status"] == 1:  # some do not like to be watched: they are left out
+                    print(f"fails while it is recorded: {answer['failed']}", flush=True)
                 tests = json.loads(raw.read_text())
                 kept.write_text(json.dumps(self._relative(tests)))
                 raw.unlink()

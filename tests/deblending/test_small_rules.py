@@ -1,0 +1,112 @@
+"""Single rules of the fit and its errors: slips in them cost time, or change a rare fit."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.scenes import blend
+
+from clresample.deblending.fit import Fit, begin
+from clresample.deblending.posterior.exposure import Transfer
+from clresample.deblending.settings import Settings
+from clresample.deblending.solver.learned.evidence import (
+    LEAST_SEEN,
+    SEEN_STRENGTH,
+    SourceEvidence,
+    Spectra,
+)
+from clresample.deblending.solver.learned.pairs import Pairs
+from clresample.deblending.solver.learned.prior import LearnedPrior
+from clresample.deblending.solver.learned.progress import Progress
+from clresample.deblending.spectra import RIDGE, scaled
+from clresample.sky.psf import PSF
+
+
+def test_the_share_of_a_scale_that_is_seen_is_its_definition():
+    """Of its power, what is over the noise where structure is a tenth of the peak."""
+    prior = LearnedPrior()
+    spectra = Spectra(prior)
+    y, x = np.indices((21, 21)) - 10
+    rng = np.random.default_rng(0)
+    response = 3 * rng.random((2, len(spectra.weight)))
+    evidence = SourceEvidence(spectra, prior, np.exp(-np.hypot(y, x) / 3), response)
+    spectrum = np.array([3.0, 1.0])
+    power = 9 * response[0] + response[1]
+    wanted = []
+    for k in spectra.k:
+        signal = SEEN_STRENGTH**2 * power * k
+        wanted.append((spectra.weight * k * signal / (1 + signal)).sum())
+    np.testing.assert_allclose(evidence.seen(spectrum), np.maximum(wanted, LEAST_SEEN))
+    assert LEAST_SEEN < min(wanted) < max(wanted) < 0.9
+
+
+def test_pairs_lie_in_the_slots_that_kernels_look_at():
+    """used: all pairs and the spare one are in slots before it; the oldest of a full ring goes."""
+    pairs, n = Pairs(2, 3), 0
+    for _ in range(6):
+        which = np.array([1])
+        slot = pairs.spare[1]
+        pairs.take(which, np.ones((1, 4)), np.ones((1, 4)))
+        n = min(n + 1, 3)
+        assert pairs.count.tolist() == [0, n]
+        held = {*np.flatnonzero(pairs._valid[1]), pairs.spare[1]}
+        assert slot in held and max(held) < pairs.used[1] and len(held) == n + 1
+    assert pairs.used.tolist() == [1, 4]
+
+
+def test_only_scenes_that_learn_have_another_loss():
+    progress = Progress(3, 0.01, [100, 100, 100])
+    progress.loss[:] = [50.0, 60.0, 70.0]
+    progress.n_rounds[:] = 7
+    due = np.array([False, True, False])
+    progress.learned(due, np.zeros(3), np.array([9.0, 4.0, np.nan]))
+    assert progress.loss.tolist() == [50, 64, 70]
+    assert progress.settled.tolist() == [False, True, False]
+
+
+def test_weights_of_a_scene_are_those_that_bright_stars_have_lowered(device):
+    one = Fit(blend(), Settings(), device, np.float32, pad=1)
+    one.views = [replace(view, root=0.5 * view.root) for view in one.views]
+    begin([one])
+    for weights, view in zip(one.scene.weights, one.views, strict=True):
+        np.testing.assert_allclose(weights, view.root**2)
+        assert 0 < weights.max() < 0.3
+
+
+def test_seconds_are_those_that_passed(device):
+    began = time.perf_counter()
+    one = Fit(blend(), Settings(), device, np.float32, pad=1)
+    begin([one])
+    assert 0 < sum(one.seconds.values()) <= time.perf_counter() - began
+
+
+def test_no_frequency_of_an_exposure_is_beyond_the_models_pixels():
+    """Of pixels as large as the model's, turned by 45 degrees, and of smaller ones."""
+    cos = np.sqrt(0.5)
+    for scale in (1.0, 0.6):
+        matrix = scale * np.array([[cos, cos], [-cos, cos]])
+        sharp = PSF.gaussian(0.3, n_pixels=15)
+        nu_y, nu_x, d = Transfer(matrix, sharp, sharp).at((11, 13), 4.0)
+        assert 0.4 < nu_y.max() <= 0.5 and 0.4 < np.abs(nu_x).max() <= 0.5
+        assert d.shape == (len(nu_y), 1, len(nu_x))
+
+
+def test_a_ridge_is_added_to_the_diagonal():
+    """Of what is seen a little; of what is not, so that it can be divided by."""
+    matrix, scale, seen = scaled(np.diag([4.0, 0.0]))
+    assert seen.tolist() == [True, False] and scale.tolist() == [2, 1]
+    np.testing.assert_allclose(np.diag(matrix), [1 + RIDGE, 1 + RIDGE], rtol=1e-15)
+    assert matrix[0, 1] == 0
+
+
+@pytest.mark.parametrize("refused", [1, 3])
+def test_trials_of_a_direction_are_counted_one_by_one(refused):
+    """A direction that leads nowhere is given up after the same number of trials as before."""
+    progress = Progress(1, 0.01, [100])
+    progress.loss[:], progress._fresh[:] = 10.0, False
+    for i in range(1, refused + 1):
+        accepted, _ = progress.judge(np.array([11.0]), np.array([-1.0]))
+        assert not accepted[0]
+        progress.next(accepted)
+        assert progress._trials[0] == i
