@@ -196,6 +196,25 @@ def _center(images, center):
     return np.broadcast_to(center, (n_bands, 2)).copy()
 
 
+def lit_part(psf, share) -> PSF:
+    """A PSF without outer rows and columns that hold no more than this share of any band's light:
+    by so much, at most, its transform changes. Not divided by its sum again."""
+    light = np.abs(psf.images)
+    light = light / light.sum(axis=(1, 2), keepdims=True)
+    (y0, y1), (x0, x1) = (_lit(light.sum(axis).max(axis=0), share / 4) for axis in (2, 1))
+    if (y1 - y0, x1 - x0) == light.shape[1:]:
+        return psf
+    images, center = psf.images[:, y0:y1, x0:x1], psf.center - (y0, x0)
+    return PSF.restore(images, spacing=psf.spacing, center=center)
+
+
+def _lit(light, share):
+    """First and one-past-last element of light (n,), beyond which lies no more than `share`."""
+    first = np.searchsorted(np.cumsum(light), share, side="right")
+    last = len(light) - np.searchsorted(np.cumsum(light[::-1]), share, side="right")
+    return (int(first), int(last)) if first < last else (0, len(light))
+
+
 def _offsets(n, spacing):
     """Positions (n,) [px] of samples about the middle of their axis."""
     return (np.arange(n) - (n - 1) / 2) * spacing

@@ -14,8 +14,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ...resampling.plan import FAINT
 from ...resampling.transfer import transfer_function
-from ...sky.psf import PSF
+from ...sky.psf import PSF, lit_part
 from ..view import WhitenedView, without_dark
 
 # [FWHM of the observation's PSF] How far about its box a component's light is followed. Errors of
@@ -122,9 +123,8 @@ class Transfer:
         # not beyond what the observation's own pixels carry
         inside = np.abs(np.linalg.inv(self.matrix).T).sum(1) * 0.5 / self.psf_out.spacing
         nu_y, nu_x = nu_y[nu_y <= inside[0]], nu_x[np.abs(nu_x) <= inside[1]]
-        d = transfer_function(
-            self.psf_in.otf(nu_y, nu_x), self.psf_out.otf(nu_y, nu_x, self.matrix)
-        )[0]
+        psf_in, psf_out = (lit_part(psf, FAINT * BAND) for psf in (self.psf_in, self.psf_out))
+        d = transfer_function(psf_in.otf(nu_y, nu_x), psf_out.otf(nu_y, nu_x, self.matrix))[0]
         strong = (np.abs(d) > BAND * np.abs(d).max(axis=(1, 2), keepdims=True)).any(0)
         n_y = int(np.flatnonzero(strong.any(1))[-1]) + 1
         n_x = int(np.abs(np.flatnonzero(strong.any(0)) - len(nu_x) // 2).max())
