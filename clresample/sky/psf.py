@@ -158,7 +158,9 @@ class PSF(ReadOnly, ShownPSF):
         outside |= np.abs(b * nu_y[:, None] + d * nu_x) > limit
         result = np.empty((self.n_bands, nu_y.size, nu_x.size), dtype=np.complex128)
         # bands that share a centre share the exponentials
-        centers, i_center = np.unique(self.center, axis=0, return_inverse=True)
+        centers, i_center = self.center[:1], np.zeros(self.n_bands, int)
+        if (self.center != centers).any():
+            centers, i_center = np.unique(self.center, axis=0, return_inverse=True)
         for i, center in enumerate(centers):
             bands = np.flatnonzero(i_center.ravel() == i)
             result[bands] = _transform(self, bands, center, nu_y, nu_x, matrix)
@@ -200,7 +202,7 @@ def lit_part(psf, share) -> PSF:
     """A PSF without outer rows and columns that hold no more than this share of any band's light:
     by so much, at most, its transform changes. Not divided by its sum again."""
     light = np.abs(psf.images)
-    light = light / light.sum(axis=(1, 2), keepdims=True)
+    light = light / np.maximum(light.sum(axis=(1, 2), keepdims=True), 1e-300)
     (y0, y1), (x0, x1) = (_lit(light.sum(axis).max(axis=0), share / 4) for axis in (2, 1))
     if (y1 - y0, x1 - x0) == light.shape[1:]:
         return psf
