@@ -16,8 +16,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..sky.extent import lit_part
 from ..sky.mapping import Around, Mapping
-from ..sky.psf import PSF, lit_part
+from ..sky.psf import PSF
 from .gridding import KaiserBessel, LineTaps
 from .tables import aligned_tables, distorted_tables, line_tables, waves
 from .transfer import Certificate, transfer_function, wrap_radius

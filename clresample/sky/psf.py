@@ -158,9 +158,7 @@ class PSF(ReadOnly, ShownPSF):
         outside |= np.abs(b * nu_y[:, None] + d * nu_x) > limit
         result = np.empty((self.n_bands, nu_y.size, nu_x.size), dtype=np.complex128)
         # bands that share a centre share the exponentials
-        centers, i_center = self.center[:1], np.zeros(self.n_bands, int)
-        if (self.center != centers).any():
-            centers, i_center = np.unique(self.center, axis=0, return_inverse=True)
+        centers, i_center = np.unique(self.center, axis=0, return_inverse=True)
         for i, center in enumerate(centers):
             bands = np.flatnonzero(i_center.ravel() == i)
             result[bands] = _transform(self, bands, center, nu_y, nu_x, matrix)
@@ -196,25 +194,6 @@ def _center(images, center):
     if center.shape not in ((2,), (n_bands, 2)) or not np.isfinite(center).all():
         raise ValueError(f"center must be (2,) or ({n_bands}, 2) finite numbers, not {center}")
     return np.broadcast_to(center, (n_bands, 2)).copy()
-
-
-def lit_part(psf, share) -> PSF:
-    """A PSF without outer rows and columns that hold no more than this share of any band's light:
-    by so much, at most, its transform changes. Not divided by its sum again."""
-    light = np.abs(psf.images)
-    light = light / np.maximum(light.sum(axis=(1, 2), keepdims=True), 1e-300)
-    (y0, y1), (x0, x1) = (_lit(light.sum(axis).max(axis=0), share / 4) for axis in (2, 1))
-    if (y1 - y0, x1 - x0) == light.shape[1:]:
-        return psf
-    images, center = psf.images[:, y0:y1, x0:x1], psf.center - (y0, x0)
-    return PSF.restore(images, spacing=psf.spacing, center=center)
-
-
-def _lit(light, share):
-    """First and one-past-last element of light (n,), beyond which lies no more than `share`."""
-    first = np.searchsorted(np.cumsum(light), share, side="right")
-    last = len(light) - np.searchsorted(np.cumsum(light[::-1]), share, side="right")
-    return (int(first), int(last)) if first < last else (0, len(light))
 
 
 def _offsets(n, spacing):

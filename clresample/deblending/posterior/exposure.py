@@ -17,7 +17,8 @@ import numpy as np
 
 from ...resampling.plan import FAINT
 from ...resampling.transfer import transfer_function
-from ...sky.psf import PSF, lit_part
+from ...sky.extent import lit_part
+from ...sky.psf import PSF
 from ..view import WhitenedView, without_dark
 
 # [FWHM of the observation's PSF] How far about its box a component's light is followed. Errors of
