@@ -1,6 +1,6 @@
 /* A batch of scenes: what each observation is shown of the sources, and how they are to change.
  *
- * Sources are sorted by scene; those of scene b are first[b] .. first[b + 1] - 1.  Each has an
+ * Those of scene b are order[first[b]] .. order[first[b + 1] - 1].  Each has an
  * image in a box of its scene's frame.  The image is a morphology, or a morphology that was
  * transformed along one or both axes; then the box is as wide as the frame, or all of it:
  *   boxed, d_boxed, table: images, their gradients and their boxes, see boxes.h; boxes lie inside
@@ -23,7 +23,8 @@
  * gather_morph    d_boxed_s[y, x] (+)= sum_c spectra[s, channel + c] frame[b, c, y0 + y, x0 + x]
  *             for the sources listed in `active`; launch: (X, tallest box, len(active))
  * gather_spectra  dA[s, channel + c] = sum_yx boxed_s[y, x] frame[b, c, y0 + y, x0 + x]
- *             launch: (WG, n_bands, S), groups of (WG, 1, 1)
+ *             for the sources listed in `active`
+ *             launch: (WG, n_bands, len(active)), groups of (WG, 1, 1)
  * share       parts[s, c, t] = spectra[s, channel + c] shares[s, c, t], both (S, n_bands,
  *             n_terms): a source's spectrum in each term of its PSF;  launch: (X, S, 1), rows
  *             of n_bands
@@ -44,8 +45,8 @@
 #define ROW_OF(array, b, c, n_c, y, n_y, n_x) \
     (array + ((((size_t)(b) * (n_c) + (c)) * (n_y)) + (y)) * (n_x))
 
-__kernel void compose(__global const int *restrict first, __global const int *restrict table,
-                      __global const REAL *restrict boxed,
+__kernel void compose(__global const int *restrict first, __global const int *restrict order,
+                      __global const int *restrict table, __global const REAL *restrict boxed,
                       __global const REAL *restrict spectra, const int n_channels,
                       const int channel, const int n_bands, const int ny_frame, const int nx_frame,
                       __global REAL *restrict frame)
@@ -55,7 +56,8 @@ __kernel void compose(__global const int *restrict first, __global const int *re
         __global REAL *row = ROW_OF(frame, b, c, n_bands, y, ny_frame, nx_frame);
 #if ROWS
         for (int x = 0; x < nx_frame; ++x) row[x] = 0;
-        for (int s = first[b]; s < first[b + 1]; ++s) {
+        for (int i = first[b]; i < first[b + 1]; ++i) {
+            const int s = order[i];
             HEAD(s)
             if (y < y0 || y >= y0 + ny) continue;
             const REAL a = spectra[(size_t)s * n_channels + channel + c];
@@ -65,7 +67,8 @@ __kernel void compose(__global const int *restrict first, __global const int *re
 #else
         FOR_X(x, nx_frame) {
             REAL sum = 0;
-            for (int s = first[b]; s < first[b + 1]; ++s) {
+            for (int i = first[b]; i < first[b + 1]; ++i) {
+                const int s = order[i];
                 HEAD(s)
                 if (y >= y0 && y < y0 + ny && x >= x0 && x < x0 + nx)
                     sum += spectra[(size_t)s * n_channels + channel + c]
@@ -78,7 +81,8 @@ __kernel void compose(__global const int *restrict first, __global const int *re
 }
 
 __kernel void compose_frequencies(
-    __global const int *restrict first, __global const int *restrict table,
+    __global const int *restrict first, __global const int *restrict order,
+    __global const int *restrict table,
     __global const REAL *restrict boxed, __global const REAL *restrict spectra,
     const int n_channels, const int channel, const int n_bands, const int ny_frame,
     const int nx_frame, __global const REAL *restrict E, const int stride_e,
@@ -92,7 +96,8 @@ __kernel void compose_frequencies(
         FOR_X(v, nx_frame / VW) {
             const int x = v * VW;
             WIDE cos_y = (WIDE)(0), sin_y = (WIDE)(0);
-            for (int s = first[b]; s < first[b + 1]; ++s) {
+            for (int i = first[b]; i < first[b + 1]; ++i) {
+                const int s = order[i];
                 const REAL a = spectra[(size_t)s * n_channels + channel + c];
                 __global const REAL *u = boxed + BEGIN(BOX(s)) + (size_t)2 * h * nx_frame + x;
                 cos_y += a * AT(const WIDE, u);
@@ -206,13 +211,15 @@ __kernel void gather_morph(__global const int *restrict active, __global const i
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
-void gather_spectra(__global const int *restrict table, __global const REAL *restrict frame,
+void gather_spectra(__global const int *restrict active, __global const int *restrict table,
+                    __global const REAL *restrict frame,
                     __global const REAL *restrict boxed, const int n_channels, const int channel,
                     const int n_bands, const int ny_frame, const int nx_frame,
                     __global REAL *restrict d_spectra)
 {
     __local REAL share[WG];
-    const int lid = (int)get_local_id(0), c = (int)get_global_id(1), s = (int)get_global_id(2);
+    const int lid = (int)get_local_id(0), c = (int)get_global_id(1);
+    const int s = active[get_global_id(2)];
     HEAD(s)
     __global const REAL *g = ROW_OF(frame, box[SCENE], c, n_bands, y0, ny_frame, nx_frame) + x0;
     __global const REAL *m = boxed + offset;

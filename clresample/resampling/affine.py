@@ -115,7 +115,7 @@ class Gather:
         self.size = 1 if tuning.row_loops else executor.whole_groups(n_out), n_lines
 
     def __call__(self, source: Matrix, target: Matrix, n):
-        """Queue the sums of `n` images, bands of some scenes: rows of source[b] into target[b]."""
+        """Queue the sums of `n` images, all bands of some scenes: rows of source to target."""
         self.launch(
             (*self.size, n // self.bands_each),
             source=source.buffer,

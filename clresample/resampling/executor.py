@@ -74,8 +74,8 @@ class OnDevice:
         return Matrix(array.base_data, array.shape[2], (rows or array.shape[1]) * array.shape[2])
 
     def tables(self, array):
-        """Tables (plans, bands, ...) of an epilogue as `Contraction.bind` takes them."""
-        stride = math.prod(array.shape[1:]) if len(self.plans) > 1 else 0
+        """Tables (plans or items, bands, ...) of an epilogue as `Contraction.bind` takes them."""
+        stride = math.prod(array.shape[1:]) if len(array) > 1 else 0
         return array.base_data, stride, math.prod(array.shape[2:])
 
     def whole_groups(self, n):
@@ -141,7 +141,10 @@ class Executor(OnDevice):
         return self.scratch["terms" if self.terms else "frequencies"]
 
     def set_transfer(self, transfer):
-        """Upload the transfer functions: a pair D(+,+), D(+,-) (C, Hy, Hx) for each plan."""
+        """Upload the transfer functions: a pair D(+,+), D(+,-) (C, Hy, Hx) for each plan; of a
+        batch that one plan serves, for each item, from before `apart` and `reserve` on."""
+        if len(transfer) != len(self.transfer):
+            self.transfer = self.device.empty((len(transfer), *self.transfer.shape[1:]), self.dtype)
         host = np.zeros(self.transfer.shape, self.dtype)
         for item, (d_plus, d_minus) in zip(host, transfer, strict=True):
             planes = (d_plus.real, d_plus.imag, d_minus.real, d_minus.imag)

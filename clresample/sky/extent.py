@@ -100,3 +100,22 @@ def shared_part(origin_a, shape_a, origin_b, shape_b):
 def box_slices(origin, shape):
     """The slices (y, x) of a box of `shape` (2,) [px] that starts at `origin` (2,) [px]."""
     return tuple(slice(int(start), int(start + n)) for start, n in zip(origin, shape, strict=True))
+
+
+def lit_part(psf, share):
+    """A PSF without the outer rows and columns that hold no more than this share of any band's
+    light: by so much, at most, its transform changes. Not divided by its sum again."""
+    light = np.abs(psf.images)
+    light = light / np.maximum(light.sum(axis=(1, 2), keepdims=True), 1e-300)
+    (y0, y1), (x0, x1) = (_lit(light.sum(axis).max(axis=0), share / 4) for axis in (2, 1))
+    if (y1 - y0, x1 - x0) == light.shape[1:]:
+        return psf
+    images, center = psf.images[:, y0:y1, x0:x1], psf.center - (y0, x0)
+    return psf.restore(images, spacing=psf.spacing, center=center)
+
+
+def _lit(light, share):
+    """First and one-past-last element of light (n,), beyond which lies no more than `share`."""
+    first = np.searchsorted(np.cumsum(light), share, side="right")
+    last = len(light) - np.searchsorted(np.cumsum(light[::-1]), share, side="right")
+    return (int(first), int(last)) if first < last else (0, len(light))

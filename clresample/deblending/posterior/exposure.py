@@ -10,11 +10,14 @@ band and a period of no more than errors need.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from ...resampling.plan import FAINT
 from ...resampling.transfer import transfer_function
+from ...sky.extent import lit_part
 from ...sky.psf import PSF
 from ..view import WhitenedView, without_dark
 
@@ -27,6 +30,8 @@ BAND = 1e-3
 PERIOD_PX = 8
 # [px] Period at which the band is looked for.
 BAND_PERIOD_PX = 65
+# Transfers that are kept, of 0.3 to 1 MB: those of all observations of a field's tile and more.
+MOST_TRANSFERS = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +56,9 @@ class Exposure:
         """That of an Observation and its view on a Frame; source (n,): of each component."""
         scale = np.sqrt(abs(np.linalg.det(view.mapping.matrix)))
         reach = REACH_FWHM * float(observation.psf.fwhm_px.max()) * scale
-        transfer = Transfer(view.mapping.matrix, frame.psf, view.op.plans[0].psfs[1])
+        matrix = view.mapping.matrix
+        psfs = (_Content(psf) for psf in (frame.psf, view.op.plans[0].psfs[1]))
+        transfer = _transfer(matrix.tobytes(), *psfs)
         make = _parallel if view.mapping.geometry == "aligned" else _spread
         y, x, root = make(view, min(scale, transfer.nyquist_px))
         shares = None if view.shares is None else view.shares[source].astype(np.float32)
@@ -88,6 +95,27 @@ class Exposure:
         return seen * self.root[:, low[0] : high[0], low[1] : high[1]]
 
 
+class _Content:
+    """A PSF that is equal to others of the same samples."""
+
+    def __init__(self, psf):
+        self.psf = psf
+        self._parts = psf.images.shape, psf.images.tobytes(), psf.center.tobytes(), psf.spacing
+        self._hash = hash(self._parts)
+
+    def __hash__(self):
+        return self._hash
+
+    def __eq__(self, other):
+        return self._parts == other._parts
+
+
+@functools.lru_cache(maxsize=MOST_TRANSFERS)
+def _transfer(matrix, psf_in, psf_out):
+    """The Transfer of a matrix, as bytes, and two PSFs: one for all fits of equal observations."""
+    return Transfer(np.frombuffer(matrix).reshape(2, 2), psf_in.psf, psf_out.psf)
+
+
 @dataclass(frozen=True, eq=False)
 class Transfer:
     """The transfer function of an observation, C T bands, at the frequencies that a box needs.
@@ -122,9 +150,8 @@ class Transfer:
         # not beyond what the observation's own pixels carry
         inside = np.abs(np.linalg.inv(self.matrix).T).sum(1) * 0.5 / self.psf_out.spacing
         nu_y, nu_x = nu_y[nu_y <= inside[0]], nu_x[np.abs(nu_x) <= inside[1]]
-        d = transfer_function(
-            self.psf_in.otf(nu_y, nu_x), self.psf_out.otf(nu_y, nu_x, self.matrix)
-        )[0]
+        psf_in, psf_out = (lit_part(psf, FAINT * BAND) for psf in (self.psf_in, self.psf_out))
+        d = transfer_function(psf_in.otf(nu_y, nu_x), psf_out.otf(nu_y, nu_x, self.matrix))[0]
         strong = (np.abs(d) > BAND * np.abs(d).max(axis=(1, 2), keepdims=True)).any(0)
         n_y = int(np.flatnonzero(strong.any(1))[-1]) + 1
         n_x = int(np.abs(np.flatnonzero(strong.any(0)) - len(nu_x) // 2).max())

@@ -16,7 +16,8 @@ class Buffers:
     """The arrays of B scenes of one signature, with S sources in all, on one device.
 
     scenes, device, dtype, tuning: Scenes, Device, NumPy type, Tuning
-    first (B + 1,): int32, the first source of each scene
+    everyone (n,): int32, the sources that are rendered, all of them
+    first (B + 1,), order (n,): int32, those by scene, and the first of each scene in that
     boxes, host_boxes: of all sources, with and without their table on the device
     free (n_free,): int32, the sources whose morphology is fitted; everyone's are in boxes
     profile, amplitude, latent, morph, d_morph (boxes.size,): flat, laid out by the boxes: expected
@@ -37,6 +38,7 @@ class Buffers:
             np.concatenate([s.center for s in scenes]),
         )
         self.boxes = self.host_boxes.put(device)
+        self.everyone = self.order = self.boxes.everyone
         free = np.flatnonzero(~np.concatenate([s.fixed for s in scenes]))
         self.n_free = len(free)
         self.free = device.put(free if self.n_free else [0], np.int32)

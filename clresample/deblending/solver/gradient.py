@@ -76,7 +76,8 @@ class Gradient:
 class _ObservedBatch:
     """One observation of every scene of a batch: data, operator and buffers for its images.
 
-    op: the operator; rendering: its Frames or Transformed; image (B, Co, My, Mx): R M, then w r
+    op: the operator; rendering: its Frames, Transformed or Windows
+    image (B, Co, My, Mx): R M, then w r
     """
 
     def __init__(self, gradient, i_observation, depth):
@@ -121,3 +122,4 @@ class _ObservedBatch:
         """Shift the batch's operator as the scenes' own ones are."""
         if self.op is not self._ops[0]:
             self.op.shift = np.stack([op.shift for op in self._ops])
+        self.rendering.follow_shifts()

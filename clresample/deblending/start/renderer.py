@@ -70,7 +70,9 @@ class Renderer:
         """Make room for so many images at a time."""
         if n_images <= self._capacity:
             return
-        e, self._capacity = self.executor, n_images
+        # twice as many at a time, as slots of this size come and go; no more than one launch takes
+        e, most = self.executor, self.executor.tuning.group_bytes // self._n_bytes
+        self._capacity = n_images = max(n_images, min(2 * self._capacity, most))
         e.reserve(n_images * e.n_bands)
         plain = self.device.empty((n_images, e.k_y, e.k_pad), self.dtype)
         z0 = Matrix(plain.base_data, e.k_pad, e.k_y * e.k_pad)

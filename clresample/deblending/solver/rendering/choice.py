@@ -1,10 +1,12 @@
-"""At which stage spectra are applied to the sources: where counted operations are fewest."""
+"""How an observation is rendered, and at which stage spectra are applied to the sources: where
+counted operations are fewest."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from .stages import Frames, Transformed
+from .windows import Groups, Windows, reach_of
 
 # An operation of a boxed product takes as long as so many of a large one, as its tiles are cut by
 # the box and its terms are few; and one of a sum over sources or bands, which loads all that it
@@ -12,6 +14,12 @@ from .stages import Frames, Transformed
 # these): what is chosen then takes 8 % more than the fastest stage at most. With larger values
 # sources stay in frames more often.
 BOXED, POINT = 1.9, 10.0
+# Cells along a side of a frame that are tried for windows, and what part of the operations they
+# must have at most: they are taken apart and put together again, and their count is an estimate.
+CELLS, GAIN = (2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32), 0.7
+# Sources with boxes so many times larger than the median's may get windows of their own, since the
+# largest box sets the frame of all groups.
+LARGE = np.array([1.3, 1.6, 2.0])
 
 
 def flops(buffers, op, executor) -> list[float]:
@@ -19,27 +27,99 @@ def flops(buffers, op, executor) -> list[float]:
 
     What all of them do, from frequencies to the observation and back, is left out.
     """
-    e, n_images = executor, len(buffers.scenes) * op.shape_in[0]
-    shape = buffers.host_boxes.shape[:, list(e.axes)].astype(float)
+    e, shape = executor, buffers.host_boxes.shape[:, list(executor.axes)]
+    frame = e.n_y, e.n_x, e.k_y, e.k_pad
+    return _counts(shape, len(buffers.scenes), op.shape_in[0], *frame)
+
+
+def _counts(shape, n_frames, n_bands, n_y, n_x, k_y, k_x):
+    """`flops` of boxes of `shape` (S, 2) in frames of (n_y, n_x) with k_y and k_x waves."""
+    shape, n_images = shape.astype(float), n_frames * n_bands
     rows, pixels = shape[:, 0].sum(), shape.prod(1).sum()
-    first, second = n_images * e.n_y * e.n_x * e.k_pad, n_images * e.k_y * e.n_y * e.k_pad
-    boxed = pixels * e.k_pad, rows * e.k_y * e.k_pad
-    points = (
-        1.5
-        * op.shape_in[0]
-        * np.array([pixels, rows * e.k_pad, buffers.n_sources * e.k_y * e.k_pad])
-    )
+    first, second = n_images * n_y * n_x * k_x, n_images * k_y * n_y * k_x
+    boxed = pixels * k_x, rows * k_y * k_x
+    points = 1.5 * n_bands * np.array([pixels, rows * k_x, len(shape) * k_y * k_x])
     counts = first + second, BOXED * boxed[0] + second, BOXED * sum(boxed)
     return [4 * (count + POINT * point) for count, point in zip(counts, points, strict=True)]
 
 
 def rendering(buffers, i_observation, op, depth=None):
-    """The Frames or Transformed of one observation of a batch.
+    """The Frames, Transformed or Windows of one observation of a batch.
 
-    depth: 0, 1 or 2; None takes that of the fewest operations
+    depth: 0, 1, 2, or 3 for windows; None takes that of the fewest operations
     """
+    parts = None
+    if depth is None and not op.is_identity:
+        counts = flops(buffers, op, op.executor())
+        depth = int(np.argmin(counts))
+        parts = _parts(buffers, op, counts[depth])
+    elif depth == 3:
+        everyone = np.arange(buffers.n_sources)
+        parts = [Groups(buffers.host_boxes, everyone, np.array(op.shape_in[1:]) / 2)]
+    if parts is not None:
+        return Windows(buffers, i_observation, op, parts, _in_frames)
+    return _in_frames(buffers, i_observation, op, depth or 0)
+
+
+def _in_frames(buffers, i_observation, op, depth=None):
+    """The Frames or Transformed of one observation."""
     if depth is None:
-        depth = 0 if op.is_identity else int(np.argmin(flops(buffers, op, op.executor())))
+        depth = int(np.argmin(flops(buffers, op, op.executor())))
     if depth == 0:
         return Frames(buffers, i_observation, op)
     return Transformed(buffers, i_observation, op, depth)
+
+
+def _parts(buffers, op, count):
+    """Groups of all sources whose windows take fewer operations than `count`, to which those from
+    frequencies to the observation are still to be added; None where there are none."""
+    plan, boxes = op.plans[0], buffers.host_boxes
+    if len(op.plans) > 1 or op.n_terms > 1 or op.geometry == "distorted":
+        return None
+    middling, side = np.median(boxes.shape, axis=0), np.array(op.shape_in[1:])
+    if (middling + 2 * reach_of(plan) > side / 2).any():
+        return None  # no frame of a group would be much smaller than the scenes' own
+    n_images, sides = len(buffers.scenes) * op.shape_out[0], boxes.shape.max(axis=1)
+    e = op.executor()
+    observed = _observed(plan, e.n_rows, e.n_columns, e.k_y, e.k_x)
+    least, found = GAIN * (count + 4 * n_images * observed), None
+    for limit in (np.inf, *(LARGE * np.median(sides))):
+        split = [np.flatnonzero(part) for part in (sides <= limit, sides > limit)]
+        best = [_best_groups(buffers, op, which) for which in split if len(which)]
+        total = sum(one for one, _ in best)
+        if total < least:
+            least, found = total, [groups for _, groups in best]
+    return found
+
+
+def _best_groups(buffers, op, which):
+    """Operations of one pair of the sources `which` (n,) in windows, and the Groups of fewest."""
+    boxes, side = buffers.host_boxes, np.array(op.shape_in[1:])
+    tried = [Groups(boxes, which, side / n_cells) for n_cells in CELLS]
+    counts = [_window_flops(boxes, op, groups) for groups in tried]
+    best = int(np.argmin(counts))
+    return counts[best], tried[best]
+
+
+def _window_flops(boxes, op, groups):
+    """Operations of one pair in windows, all of them, weighed as in `flops`; estimated from the
+    tables of the whole frame, whose frequencies and columns grow with its side."""
+    e, plan, n_bands = op.executor(), op.plans[0], op.shape_out[0]
+    axes, reach = list(e.axes), reach_of(plan)
+    n, side = groups.shape[axes], np.array([e.n_y, e.n_x])
+    k_y, k_x = np.array([e.k_y, e.k_x]) * (n + 2 * reach) / (side + reach)
+    seen = np.abs(np.linalg.inv(plan.mapping.matrix)) @ (groups.shape + 2 * reach)
+    n_rows, n_columns = seen
+    if plan.lines is not None:
+        n_rows = seen[0 if plan.lines.by_row else 1]
+        n_columns = e.n_columns * (n[1] + 2 * reach) / side[1]
+    observed = _observed(plan, n_rows, n_columns, k_y, k_x)
+    first = _counts(boxes.shape[groups.which][:, axes], len(groups), n_bands, *n, k_y, k_x)
+    return min(first) + 4 * len(groups) * n_bands * observed
+
+
+def _observed(plan, n_rows, n_columns, k_y, k_x):
+    """Products in an executor's `observe` of one image."""
+    if plan.lines is None:
+        return n_rows * k_x * (k_y + n_columns)
+    return k_y * n_columns * (k_x + n_rows)

@@ -51,14 +51,15 @@ class Composition:
             self._compose = launcher("compose_frequencies")
             self._compose.bind(E=transfer[0], stride_e=transfer[1])
             self._compose_size = b.sized(nx // vector, ny // 2, n_images)
-        self._compose.bind(first=b.first)
+        self._compose.bind(first=b.first, order=b.order)
         self._morph, self._spectra = (
             launcher("gather_morph"),
             launcher("gather_spectra", (group, 1, 1)),
         )
         tallest, widest = boxes.shape.max(0).tolist()
         self._morph_size = b.sized(widest, tallest, 1)[:2]
-        self._spectra_size = group, n_bands, len(boxes)
+        self._spectra.bind(active=b.everyone)
+        self._spectra_size = group, n_bands, b.everyone.size
 
     def compose(self, boxed, spectra, frame):
         """Queue frame = sum_s A boxed_s, times the transfer function where there is one."""

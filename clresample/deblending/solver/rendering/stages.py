@@ -63,6 +63,9 @@ class Frames:
         """Queue dS of the sources `active` (n,): written into d_morph, or added to it."""
         self._composition.gather_boxed(self._model, spectra, d_morph, active, add=add)
 
+    def follow_shifts(self):
+        """Nothing to do: what it has of the operator is the operator's own."""
+
 
 class Transformed:
     """Depth 1 or 2: each source's box transformed along one axis, or both; as Frames."""
@@ -89,9 +92,9 @@ class Transformed:
 
     def transform(self, morph):
         b, e = self.buffers, self._executor
-        self._boxes.to_lines(morph, e.in_x_t.buffer, self._lines, b.boxes.everyone)
+        self._boxes.to_lines(morph, e.in_x_t.buffer, self._lines, b.everyone)
         if self.depth == 2:
-            self._boxes.to_planes(e.in_y.buffer, self._lines, self._boxed, b.boxes.everyone)
+            self._boxes.to_planes(e.in_y.buffer, self._lines, self._boxed, b.everyone)
 
     def render(self, spectra, image):
         self._composition.compose(self._boxed, spectra, self._frame)
@@ -114,6 +117,9 @@ class Transformed:
             d_lines = self._lines  # of no more use once the planes are made of them
             self._boxes.from_planes(e.in_y_t.buffer, self._d_boxed, d_lines, active)
         self._boxes.from_lines(d_lines, e.in_x.buffer, d_morph, active, add=add)
+
+    def follow_shifts(self):
+        """Nothing to do, as for Frames."""
 
 
 class _Boxes:

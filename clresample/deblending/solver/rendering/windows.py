@@ -1,0 +1,203 @@
+"""One observation of large scenes, rendered in windows: neighbouring sources in one small frame.
+
+Products along whole frames grow with the cube of their side. Here sources are taken together by
+the cell of the frame in which their boxes' middles lie, each group in a frame of its own that
+holds their boxes, and is seen in a window that holds what its light reaches, as far as the model
+is padded for it (resampling/transfer.py). Windows overlap, and their sum is the observation's
+image; backwards, each window is cut out of that. Kernels in windows.cl.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+
+import numpy as np
+
+from ....device.contraction import ImageBatch
+from ....resampling.plan import Precision
+from ....resampling.resampler import EXECUTORS
+from ....resampling.transfer import wrap_radius
+from ..boxes import Boxes
+
+# [px] Groups' frames have sides of multiples of this, so that boxes that were resized find the
+# tables that were made before: a larger one computes more padding.
+ROUND_PX = 16
+
+
+class Groups:
+    """Sources of a batch by the cell of `cell` (2,) [px] in which their boxes' middles lie.
+
+    boxes: the batch's; which (n,): the sources that are meant
+    group (S,): of each source, 0 of those that are not meant; scene (G,): of each group; low (G, 2)
+    [px]: where its frame begins in that of its scene; shape (2,) [px]: of the groups' frames, one
+    for all
+    """
+
+    def __init__(self, boxes, which, cell):
+        origin, shape = boxes.origin[which], boxes.shape[which]
+        at = ((origin + 0.5 * shape) // np.asarray(cell)).astype(int)
+        keys = np.column_stack([boxes.scene[which], at])
+        cells, group = np.unique(keys, axis=0, return_inverse=True)
+        self.which, self.group = which, np.zeros(len(boxes), int)
+        self.group[which] = group = group.ravel()
+        self.scene = cells[:, 0]
+        self.low = np.full((len(cells), 2), np.iinfo(np.int64).max)
+        high = np.zeros((len(cells), 2), np.int64)
+        np.minimum.at(self.low, group, origin)
+        np.maximum.at(high, group, origin + shape)
+        self.shape = -(-(high - self.low).max(axis=0) // ROUND_PX) * ROUND_PX
+
+    def __len__(self):
+        return len(self.scene)
+
+    def buffers(self, buffers):
+        """The batch with a scene for each group: the same arrays, other boxes, and only the sources
+        that are meant."""
+        b, own = copy.copy(buffers), buffers.host_boxes
+        b.scenes = [buffers.scenes[i] for i in self.scene]
+        b.host_boxes = Boxes(self.group, own.origin - self.low[self.group], own.shape, own.center)
+        b.boxes = b.host_boxes.put(b.device)
+        b.everyone = b.device.put(self.which, np.int32)
+        group = self.group[self.which]
+        counts = np.bincount(group, minlength=len(self))
+        b.first = b.device.put(np.concatenate([[0], np.cumsum(counts)]), np.int32)
+        b.order = b.device.put(self.which[np.argsort(group, kind="stable")], np.int32)
+        return b
+
+
+def reach_of(plan):
+    """How far [model px] the light of a group is followed: as far as frames are padded for it."""
+    return max(wrap_radius(plan.psfs[1], plan.mapping.matrix))
+
+
+class WindowOperator:
+    """What sees the frames of `groups` as `op` sees the scenes' own: (G, C, ny, nx) to windows.
+
+    shape_in, shape_out (3,); low (G, 2): the windows' first pixels in the observation
+    """
+
+    is_identity = False
+
+    def __init__(self, op, groups):
+        plan, self.op, self._groups = op.plans[0], op, groups
+        shape = tuple(groups.shape.tolist())
+        self.plan = plan.window(shape, reach_of(plan), Precision.of(op.dtype))
+        self._executor = EXECUTORS[plan.geometry](op.device, op.dtype, [self.plan])
+        self.shape_in = plan.n_bands, *shape
+        self.shape_out = plan.n_bands, *self.plan.mapping.shape_out
+        self.place()
+
+    def place(self):
+        """Put the windows where the operator's present shift has them."""
+        mapping, small = self.op.plans[0].mapping, self.plan.mapping
+        off = mapping.offset + self.op.shift - self._groups.low - small.offset
+        self.low = np.rint(-off @ np.linalg.inv(mapping.matrix).T).astype(int)
+        moves = off + self.low @ mapping.matrix.T
+        self._executor.set_transfer([self.plan.shifted(move) for move in moves])
+
+    def executor(self):
+        """What computes it, with intermediates of its own."""
+        return self._executor.apart()
+
+    def forward_into(self, frames, windows):
+        """Queue windows = R frames, of all groups."""
+        self._run(self._executor.forward, frames, windows)
+
+    def adjoint_into(self, windows, frames):
+        """Queue frames = R^T windows, of all groups."""
+        self._run(self._executor.adjoint, windows, frames)
+
+    def _run(self, chain, source, target):
+        n = len(self._groups) * self.shape_in[0]
+        self._executor.reserve(n)
+        chain(ImageBatch.of(source), ImageBatch.of(target), n)
+
+
+class _Part:
+    """One set of Groups: their frames' rendering, and their windows of the observation."""
+
+    def __init__(self, buffers, i_observation, op, groups, make):
+        self.which, self.seen_by = groups.which, WindowOperator(op, groups)
+        self.inner = make(groups.buffers(buffers), i_observation, self.seen_by)
+        n_bands, w_y, w_x = self.seen_by.shape_out
+        m_y, m_x = op.shape_out[1:]
+        put = functools.partial(buffers.device.put, dtype=np.int32)
+        self.windows = buffers.device.empty((len(groups), n_bands, w_y, w_x), buffers.dtype)
+        self._low = put(self.seen_by.low)
+        shared = {"n_bands": n_bands, "my": m_y, "mx": m_x, "wy": w_y, "wx": w_x, "low": self._low}
+        shared["windows"] = self.windows
+        first = np.searchsorted(groups.scene, np.arange(len(buffers.scenes) + 1))
+        launcher = functools.partial(buffers.launcher, "windows.cl", n_axes=3)
+        self._assemble = launcher("assemble").bind(**shared, first=put(first))
+        self._cut = launcher("cut").bind(**shared, scene=put(groups.scene))
+        self._assemble_size = buffers.sized(m_x, m_y, len(buffers.scenes) * n_bands)
+        self._cut_size = buffers.sized(w_x, w_y, len(groups) * n_bands)
+
+    def render(self, spectra, image, add):
+        self.inner.render(spectra, self.windows)
+        self._assemble(self._assemble_size, image=image, add=add)
+
+    def collect(self, image):
+        self._cut(self._cut_size, image=image)
+        self.inner.collect(self.windows)
+
+    def follow_shifts(self):
+        self.seen_by.place()
+        self.seen_by.op.device.upload(self.seen_by.low.astype(np.int32), self._low)
+
+
+class Windows:
+    """Rendering in windows; methods as those of stages.Frames.
+
+    buffers: the batch; i_observation: of it; op: the batch's operator there, of one plan
+    parts: Groups, which have all sources together; each part has frames of its own size
+    make: what makes the rendering of their frames, as choice.rendering does
+    """
+
+    depth = 3
+
+    def __init__(self, buffers, i_observation, op, parts, make):
+        self.buffers = buffers
+        self.parts = [_Part(buffers, i_observation, op, groups, make) for groups in parts]
+        self._active: dict = {}
+
+    def transform(self, morph):
+        """Take these morphologies (boxes.size,) for all that is queued next."""
+        for part in self.parts:
+            part.inner.transform(morph)
+
+    def render(self, spectra, image):
+        """Queue the image (B, Co, My, Mx) of the morphologies with spectra (S, C)."""
+        for i, part in enumerate(self.parts):
+            part.render(spectra, image, i > 0)
+
+    def collect(self, image):
+        """Queue the way back of an image (B, Co, My, Mx), whose gradients are asked for next."""
+        for part in self.parts:
+            part.collect(image)
+
+    def gather_spectra(self, d_spectra):
+        """Queue dA of this observation's channels into d_spectra (S, C)."""
+        for part in self.parts:
+            part.inner.gather_spectra(d_spectra)
+
+    def gather_morph(self, spectra, d_morph, active, *, add=False):
+        """Queue dS of the sources `active` (n,): written into d_morph, or added to it."""
+        for part, own in zip(self.parts, self._own(active), strict=True):
+            if own is not None:
+                part.inner.gather_morph(spectra, d_morph, own, add=add)
+
+    def follow_shifts(self):
+        """Take over the shift that the operator has by now."""
+        for part in self.parts:
+            part.follow_shifts()
+
+    def _own(self, active):
+        """Of a device array of sources, the parts' own ones; None for a part that has none."""
+        if id(active) not in self._active:
+            device, given = self.buffers.device, self.buffers.device.get(active)
+            lists = [given[np.isin(given, part.which)] for part in self.parts]
+            arrays = [device.put(own, np.int32) if len(own) else None for own in lists]
+            self._active[id(active)] = active, arrays  # kept, so that no other has its id
+        return self._active[id(active)][1]
