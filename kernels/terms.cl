@@ -1,4 +1,5 @@
-/* Bands that add up T images of the model, one through each PSF of a basis, at the frequencies.
+/* Frequencies of images seen through several PSFs: sums over the terms of a basis, in bands that
+ * add up T images of the model, and in boxes of which each has its own sum.
  *
  *   z (n, 2 h_y, n_pad): of each of n images of the observation, n_bands of them for each plan
  *   terms (n, T, 2 h_y, n_pad): its parts.  Both hold quads as contract.cl has them
@@ -7,10 +8,19 @@
  * spread   terms[t] = conj(D_t) o z;  D (plans, n_bands, T, h_y, 4, n_pad / 2) as MIX has it,
  *          stride_d: elements from a plan's to the next
  *
+ * turn     z = D o phase o z0: n_bands spectra from one, each moved by its slot's own offset:
+ *          z0 (items, 2 h_y, n_pad), z (items * n_bands, 2 h_y, n_pad); D of one plan, TERMS of
+ *          each band, added up with the slot's shares (slots, n_bands, TERMS), which are not read where
+ *          there is one; phase (slots, h_y + n_pad / 2, 2) cos and sin by row and by column;
+ *          item i belongs to slot first + i / n;  launch: (X, h_y, items * n_bands)
+ *
  * Launch: (X, h_y, n); X is 1 where a work-item walks a whole row (ROWS of group.h), else n_pad / 2
  */
 #include "common.h"
 #include "group.h"
+#ifndef TERMS       /* of each band's transfer function, in turn */
+#define TERMS 1
+#endif
 
 __kernel void add(const int n_terms, const int h_y, const int n_pad,
                   __global const REAL *restrict terms, __global REAL *restrict z)
@@ -55,5 +65,52 @@ __kernel void spread(const int n_terms, const int h_y, const int n_pad, const in
                 out[n_pad + 1] = gmr - gpr;
             }
         }
+    }
+}
+
+__kernel void turn(const int h_y, const int n_pad, const int n_bands, const int n, const int first,
+                   __global const REAL *restrict z0, __global const REAL *restrict phase,
+                   __global const REAL *restrict D, __global const REAL *restrict shares,
+                   __global REAL *restrict z)
+{
+    const int i = (int)get_global_id(1), band = (int)get_global_id(2) % n_bands;
+    const int item = (int)get_global_id(2) / n_bands, n_half = n_pad / 2;
+    if (i >= h_y) return;   /* launches are rounded up to whole groups */
+    __global const REAL *t = phase + (size_t)(first + item / n) * 2 * (h_y + n_half);
+    const REAL yr = t[2 * i], yi = t[2 * i + 1];
+    __global const REAL *along = t + 2 * h_y;
+    __global const REAL *d = D + ((size_t)band * TERMS * h_y + i) * 4 * n_half;
+#if TERMS > 1
+    const size_t plane = (size_t)h_y * 4 * n_half;
+    __global const REAL *share = shares + ((size_t)(first + item / n) * n_bands + band) * TERMS;
+#endif
+    __global const REAL *in = z0 + ((size_t)item * h_y + i) * 2 * n_pad;
+    __global REAL *out = z + ((size_t)get_global_id(2) * h_y + i) * 2 * n_pad;
+    FOR_X(j, n_half) {
+        const REAL cc = in[2 * j], cs = in[2 * j + 1];
+        const REAL sc = in[n_pad + 2 * j], ss = in[n_pad + 2 * j + 1];
+        const REAL xr = along[2 * j], xi = along[2 * j + 1];
+        const REAL fpr = cc - ss, fpi = -(cs + sc), fmr = cc + ss, fmi = cs - sc;
+        const REAL tpr = yr * xr - yi * xi, tpi = yr * xi + yi * xr;    /* at (+nu_y, +nu_x) */
+        const REAL tmr = yr * xr + yi * xi, tmi = yi * xr - yr * xi;    /* at (+nu_y, -nu_x) */
+        REAL dpr = d[j], dpi = d[n_half + j], dmr = d[2 * n_half + j], dmi = d[3 * n_half + j];
+#if TERMS > 1
+        dpr *= share[0]; dpi *= share[0]; dmr *= share[0]; dmi *= share[0];
+        for (int t = 1; t < TERMS; ++t) {
+            __global const REAL *more = d + t * plane + j;
+            dpr += share[t] * more[0];
+            dpi += share[t] * more[n_half];
+            dmr += share[t] * more[2 * n_half];
+            dmi += share[t] * more[3 * n_half];
+        }
+#endif
+        const REAL pr = dpr * tpr - dpi * tpi, pi = dpr * tpi + dpi * tpr;
+        const REAL mr = dmr * tmr - dmi * tmi, mi = dmr * tmi + dmi * tmr;
+        const REAL gpr = pr * fpr - pi * fpi, gpi = pr * fpi + pi * fpr;
+        const REAL gmr = mr * fmr - mi * fmi, gmi = mr * fmi + mi * fmr;
+        out[2 * j] = gpr + gmr;
+        out[2 * j + 1] = gmi - gpi;
+        out[n_pad + 2 * j] = -(gpi + gmi);
+        out[n_pad + 2 * j + 1] = gmr - gpr;
     }
 }

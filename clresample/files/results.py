@@ -119,8 +119,9 @@ def _residual(result, i):
 
 
 def read_result(path) -> Result:
-    """The blend that `write_result` wrote to a file, equal to the last bit but for Result.draws,
-    which files do not hold.
+    """The blend that `write_result` wrote to a file, equal to the last bit but for Result.draws and
+    for PSFs that vary (Observation.psf_field), which files do not hold: psf is that in the middle,
+    `rendered` what each source's own made of it.
 
     Raises FileError for a file that does not exist, is not FITS, is damaged, or holds no blend.
     """

@@ -88,7 +88,7 @@ class Resampler(GridOperator):
         per_image = sum(rows * ld for rows, ld in self._executor.scratch_shapes().values())
         budget = self._executor.tuning.group_bytes
         fit = budget // (per_image * self.dtype.itemsize * n_bands)
-        self._group = max(1, min(fit, MOST_GROUPS // n_bands))
+        self._group = max(1, min(fit, MOST_GROUPS // (n_bands * self.n_terms)))
 
     def _use_shift(self):
         """Upload D with the phases of the shift."""

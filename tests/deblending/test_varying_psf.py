@@ -15,6 +15,7 @@ from clresample import (
     Grid,
     Observation,
     Point,
+    Prior,
     Settings,
     catalogue,
     deblend,
@@ -140,6 +141,48 @@ def test_a_star_in_each_corner_has_its_own_psf(device):
     found, wrong = (_pulls(result) for result in (own, same))
     assert np.abs(found).max() < 4
     assert np.abs(wrong).max() > 20
+
+
+@pytest.mark.parametrize(
+    "given",
+    [{"prior": Prior()}, {"prior": None}, {"fit_sky": True}, {"fit_shifts": True}],
+    ids=["prior", "free", "sky", "shifts"],
+)
+def test_every_kind_of_fit_follows_the_psf(device, given):
+    rng = np.random.default_rng(1)
+    again = rng.normal(0, NOISE, (2, *SHAPE)) + stars(CORNERS, noise=0)
+    second = observation(again, channels=("G", "R"))
+    sources = [Extended(position_px=tuple(map(float, p))) for p in CORNERS[:2]]
+    sources += points(CORNERS[2:])
+    settings = Settings(psf_error=0, **given)
+    pair = [observation(stars(CORNERS)), second]
+    result = deblend(pair, sources, settings=settings, device=device)
+    for i in (0, 1):
+        assert 0.95 < np.nanmean(result.residual(i) ** 2) / NOISE**2 < 1.05
+    table = catalogue(result)
+    found = np.stack([np.array(table[f"flux_{c}"]) for c in "grGR"], axis=1)
+    assert np.abs(found / np.tile(FLUXES, 2) - 1).max() < 0.05
+    if result.errors is not None:
+        error = np.stack([np.array(table[f"flux_err_{c}"]) for c in "grGR"], axis=1)
+        assert (np.abs(found - np.tile(FLUXES, 2)) / error).max() < 4.5
+
+
+def test_errors_cover_fluxes_all_over_a_blend(device):
+    n, rng = 25, np.random.default_rng(7)
+    pulls = {"own": [], "middle": []}
+    middle = widening((SHAPE[0] - 1) / 2, (SHAPE[1] - 1) / 2)
+    data = [stars(CORNERS, seed=seed) for seed in rng.integers(1, 10**6, n)]
+    for name, psf in (("own", None), ("middle", middle)):
+        blends = [Blend((observation(d, psf),), tuple(points(CORNERS))) for d in data]
+        settings = Settings(psf_error=0)
+        for result in deblend_many(blends, settings=settings, device=device):
+            pulls[name].append(_pulls(result))
+    own = np.array(pulls["own"])  # (n, S, C)
+    # their ripples end at the frame's edge, which takes 0.1 % off fluxes, and flux_floor allows it
+    assert 0.7 < own.std() < 1.1
+    assert np.abs(own.mean(axis=0)).max() < 1
+    assert 0.62 < (np.abs(own) < 1).mean() < 0.86
+    assert (np.abs(pulls["middle"]) < 1).mean() < 0.3
 
 
 def test_stars_that_galsim_draws_with_their_local_psfs(device):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from clresample import PSF, Grid
+from clresample import PSF, FunctionPSF, Grid
 from clresample.fields.box import Box, sized_up
 from clresample.fields.mosaic import ArrayPlane, Channel, FilePlane, Mosaic, NumberPlane
 from clresample.files.whole_file import FileError
@@ -50,6 +50,23 @@ def test_a_cut_off_file_is_one_line_that_names_it(tmp_path, image):
     FilePlane(path, 0).read(Box(0, 0, 10, 10))  # what is there is read
     with pytest.raises(FileError, match=r"short.fits: HDU 0 .*"):
         FilePlane(path, 0).read(Box(30, 0, 50, 10))
+
+
+def test_the_psf_of_a_cutout_varies_as_the_mosaic_s_does():
+    def widening(y, x):
+        return PSF.gaussian(1.5 + 0.01 * x + 0.003 * y)
+
+    data, grid = np.zeros((1, 60, 80)), Grid.flat((60, 80), 0.2)
+    mosaic = Mosaic.of_arrays("r", data, grid, FunctionPSF(widening), weights=1.0)
+    box = Box(10, 20, 41, 71)
+    o = mosaic.observation(box)
+    np.testing.assert_array_equal(o.psf.images, widening(25, 45).images)
+    np.testing.assert_array_equal(o.psf_field.psf_at(3, 4).images, widening(13, 24).images)
+    fixed = mosaic.observation(box, psf_box=Box.of(grid.shape))
+    np.testing.assert_array_equal(fixed.psf.images, widening(29.5, 39.5).images)
+    assert fixed.psf_field is None
+    same = Mosaic.of_arrays("r", data, grid, widening(0, 0), weights=1.0)
+    assert same.observation(box).psf_field is None
 
 
 def test_weights_come_from_weights_variances_and_rms_and_bits_of_the_mask(image):

@@ -83,9 +83,12 @@ def test_a_bright_galaxy_is_not_taken_for_sky():
 
 def test_options_of_the_file(files):
     rest = "[field]\nnumber = 7\ntile_px = 500\nmax_sources = 12\n[detection]\nthreshold = 4.5\n"
-    options = field_of(files, 'variance = "var.fits"', rest + "[fit]\nmax_iter = 9\n").options
+    options = field_of(
+        files, 'variance = "var.fits"', rest + "[fit]\nmax_iter = 9\npsf_tolerance = 0.01\n"
+    ).options
     assert (options.field_number, options.tile_px, options.threshold) == (7, 500, 4.5)
     assert options.limits.sources == 12 and options.settings.max_iter == 9
+    assert options.settings.psf_tolerance == 0.01
 
 
 @pytest.mark.parametrize(

@@ -30,19 +30,18 @@ def stamp(psf, band, place, shape):
     return image
 
 
-def stars(places, seed=0, *, fluxes=FLUXES):
+def stars(places, seed=0, *, fluxes=FLUXES, noise=NOISE):
     """An observation of two bands with a star at each place (S, 2) [px], each with its own PSF."""
     rng, data = np.random.default_rng(seed), np.zeros((2, *SHAPE))
     for place, flux in zip(places, fluxes, strict=True):
         psf = widening(*place)
         for band in (0, 1):
             data[band] += flux[band] * stamp(psf, band, place, SHAPE)
-    data += rng.normal(0, NOISE, data.shape)
-    return data
+    return data + noise * rng.normal(size=data.shape)
 
 
-def observation(data, psf=None, **given):
+def observation(data, psf=None, channels=("g", "r"), **given):
     """`data` as an Observation whose PSF varies as `widening`, or has that PSF."""
     psf = FunctionPSF(widening, 2) if psf is None else psf
     grid = Grid.flat(data.shape[1:], 0.2)
-    return Observation(data, psf, grid, variance=NOISE**2, channels=("g", "r"), **given)
+    return Observation(data, psf, grid, variance=NOISE**2, channels=channels, **given)

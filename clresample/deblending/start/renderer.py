@@ -17,7 +17,7 @@ class Renderer:
 
     A box is transformed once for all bands and all slots; the offset of each slot and the transfer
     functions of the bands, of which each slot has its own sum of terms where the PSF varies, are
-    multiplied in between (kernels/start.cl, turn).
+    multiplied in between (kernels/terms.cl, turn).
     """
 
     def __init__(self, device, dtype, plan, executor=None):
@@ -32,7 +32,7 @@ class Renderer:
         tuning = e.tuning
         self._width = 1 if tuning.row_loops else e.k_pad // 2
         self._turn = device.launcher(
-            "start.cl",
+            "terms.cl",
             "turn",
             dtype=dtype,
             local_size=tuning.local_size(3),
