@@ -18,7 +18,7 @@ def add_devices(commands):
     )
     add_device_option(parser)
     parser.add_argument(
-        "--bench", action="store_true", help="measure the chosen device, for about ten seconds"
+        "--bench", action="store_true", help="measure the chosen device, within ten seconds"
     )
     parser.set_defaults(run=run)
 

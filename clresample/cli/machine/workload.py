@@ -96,6 +96,14 @@ def fit(given, device, **settings):
     return results
 
 
+def iterate_once(blend, device):
+    """Start a fit of the blend and iterate a little: all kernels of a fit are then built."""
+    settings = Settings(max_iter=1)
+    fits = [Fit(blend, settings, device, np.float32, pad=1)]
+    begin(fits)
+    iterate(fits, settings, device, np.float32)
+
+
 class Iterations:
     """The iterations of `n` fits, so many side by side as Tuning says; they are set up once."""
 
