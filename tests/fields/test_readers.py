@@ -1,5 +1,7 @@
 """Readers of Euclid's MER and of the Legacy Surveys, and what all readers share."""
 
+import gzip
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -83,6 +85,18 @@ def test_what_a_tile_lacks_is_asked_for_in_one_line(tmp_path, lost, message):
     with pytest.raises(ValueError, match=message) as caught:
         read_euclid_mer(tmp_path)
     assert "\n" not in str(caught.value)
+
+
+def test_a_tile_packed_by_gzip(tmp_path):
+    write_tile(tmp_path, bands=("VIS",))
+    for path in tmp_path.iterdir():
+        path.with_name(path.name + ".gz").write_bytes(gzip.compress(path.read_bytes()))
+        path.unlink()
+    notes = []
+    mosaic = read_euclid_mer(tmp_path, noise="white", notes=notes)
+    box = Box(20, 10, 60, 50)
+    assert np.array_equal(mosaic.channels[0].read(box), noise_image(2.0)[box.slices])
+    assert any("read faster unpacked" in note for note in notes)
 
 
 def test_missing_zero_points_two_tiles_and_unknown_bands(tmp_path):

@@ -159,3 +159,22 @@ def test_what_an_exposure_lacks_is_asked_for(tmp_path):
     write_exposure(tmp_path / "v.fits", photocalib=2.0)
     read_rubin_exposure(tmp_path / "v.fits", psf=PSF(psf_image()), notes=notes)
     assert any("calibration varies" in note for note in notes)
+
+
+def test_a_masked_image_of_lsst_images_is_an_exposure(coadd):
+    mosaic = read_rubin_exposure(coadd, psf=PSF(psf_image()))
+    (channel,), (other,) = mosaic.channels, read_rubin_coadd(coadd).channels
+    assert channel.zero_point == 31.4
+    assert np.array_equal(channel.weights(WHOLE), other.weights(WHOLE))
+
+
+def test_the_package_reads_the_exposures_that_are_tested(tmp_path):
+    images = pytest.importorskip("lsst.images")
+    write_exposure(tmp_path / "e.fits", unit="nJy")
+    theirs = images.MaskedImage.read_legacy(str(tmp_path / "e.fits"))
+    mosaic = read_rubin_exposure(tmp_path / "e.fits", psf=PSF(psf_image()))
+    whole = Box.of(SHAPE)
+    assert np.array_equal(theirs.image.array, mosaic.channels[0].read(whole))
+    assert np.array_equal(theirs.variance.array, mosaic.channels[0].weight.read(whole))
+    unusable = theirs.mask.get("SATURATED") | theirs.mask.get("NO_DATA")
+    assert np.array_equal(unusable, mosaic.channels[0].masked(whole))

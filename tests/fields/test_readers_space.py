@@ -1,9 +1,14 @@
 """Readers of HST's drizzled images and of JWST's stage 3 images."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import QTable
 from astropy.wcs import WCS
+from astropy.wcs.wcsapi import SlicedLowLevelWCS
+from helpers.fields import mosaics_of
 from helpers.survey_files import (
     SHAPE,
     header_of,
@@ -14,7 +19,7 @@ from helpers.survey_files import (
     write_i2d,
 )
 
-from clresample import PSF, Grid, read_hst, read_jwst
+from clresample import PSF, FieldOptions, Grid, read_hst, read_jwst, run_field
 from clresample.fields.box import Box
 from clresample.sky.interface.interface import Interface
 
@@ -147,3 +152,22 @@ def test_the_gwcs_places_the_pixels(tmp_path):
         hdus["ASDF"].data["ASDF_METADATA"][:, :30] = 0
     read_jwst(tmp_path / "a.fits", psf=PSF_OF, noise="white", notes=notes)
     assert any("its gwcs cannot be read" in note for note in notes)
+
+
+def test_a_field_behind_the_interface_is_that_on_the_wcs(sky, tmp_path):
+    mosaics = mosaics_of(sky)[:1]
+    place = SlicedLowLevelWCS(mosaics[0].grid.wcs, Ellipsis)
+    behind = (replace(mosaics[0], grid=Grid.from_wcs(place, mosaics[0].grid.shape)),)
+    rows = []
+    for name, given in (("own", mosaics), ("behind", behind)):
+        run_field(given, tmp_path / name, options=FieldOptions(passes=1, workers=1))
+        rows.append(QTable.read(tmp_path / name / "catalogue.ecsv"))
+    own, other = rows
+    assert own["id"].tolist() == other["id"].tolist() and len(own) > 4
+    step = (own["flux_VIS"] - other["flux_VIS"]) / own["flux_err_VIS"]
+    assert np.abs(step).max() < 1e-2
+    for key in ("ra", "dec", "ra_centroid", "dec_centroid"):
+        assert np.abs((own[key] - other[key]).to_value("arcsec")).max() < 1e-3
+    model = fits.getheader(tmp_path / "behind" / "model_Euclid.fits")
+    there = Grid.from_wcs(WCS(model), mosaics[0].grid.shape)
+    assert np.abs(there.positions_in(mosaics[0].grid, 9.0, 150.0) - [9, 150]).max() < 1e-3

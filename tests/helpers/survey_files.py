@@ -114,14 +114,16 @@ def write_exposure(path, *, unit=None, fluxmag0=None, photocalib=None, names=Tru
     grid = sky_grid()
     flags = np.zeros(SHAPE, np.int32)
     flags[5], flags[6], flags[7] = 1 << 1, 1 << 5, 1 << 8  # SAT, DETECTED, NO_DATA
-    mask = header_of(grid, MP_SAT=1, MP_DETECTED=5, MP_NO_DATA=8)
     primary = fits.Header({"FILTER": "r"})
-    image = header_of(grid, **({"BUNIT": unit} if unit else {}))
+    offset = {"LTV1": 0.0, "LTV2": 0.0}
+    image = header_of(grid, **offset, **({"BUNIT": unit} if unit else {}))
+    variance = header_of(grid, **offset, **({"BUNIT": f"{unit}2"} if unit else {}))
+    mask = header_of(grid, **offset, MP_SAT=1, MP_DETECTED=5, MP_NO_DATA=8)
     hdus = [
         fits.PrimaryHDU(header=primary),
         fits.CompImageHDU(noise_image(3.0), image, name="IMAGE"),
         fits.CompImageHDU(flags, mask, name="MASK"),
-        fits.CompImageHDU(np.full(SHAPE, 9.0, np.float32), header_of(grid), name="VARIANCE"),
+        fits.CompImageHDU(np.full(SHAPE, 9.0, np.float32), variance, name="VARIANCE"),
     ]
     if not names:
         hdus[1:] = [fits.ImageHDU(hdu.data, hdu.header) for hdu in hdus[1:]]

@@ -157,6 +157,12 @@ def assembled(survey, found, given, *, noise="white") -> Mosaic:
         middle = psf.psf_at(*((np.array(grid.shape) - 1) / 2))
     given.notes.extend(f"{name}: {text}" for text in middle.warnings())
     _tell_of_masks(mosaic, given)
+    packed = sorted({str(f.data.path.name) for f in found if f.data.path.suffix == ".gz"})
+    if packed:
+        given.notes.append(
+            f"{name}: {', '.join(packed)}: each piece that is read unpacks the file from its "
+            "start; large ones are read faster unpacked"
+        )
     mosaic = with_background(mosaic, {"background": given.background})
     mosaic = with_weights(mosaic, given.notes)
     if given.noise is None and all(one.noise is not None for one in found):

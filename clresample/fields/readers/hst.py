@@ -93,7 +93,8 @@ def _weight(path, names, data, grid, band, files, given):
         if "sci" not in path.name or not beside.exists():
             raise ValueError(
                 f"weight of band {band} is missing: {path.name} has no HDU ERR or WHT, and no file "
-                "of weights (wht for sci in its name) lies beside it"
+                "of weights (wht for sci in its name) lies beside it; without format, image and "
+                "rms name any files"
             )
         plane, _ = plane_on(grid, beside)
         files["weight"] = beside
