@@ -184,13 +184,13 @@ def test_names_from_files_stay_texts(tmp_path):
 
 
 def test_a_page_stays_within_its_limit_and_says_what_it_left_out(tmp_path):
-    write_folder(tmp_path, n_sources=300, n_px=2048)
+    write_folder(tmp_path, n_sources=150, n_px=1400)
     full = write_report(tmp_path)
     least = write_report(tmp_path, tmp_path / "least.html", most_bytes=2_000_000)
-    assert full.n_bytes > 6_000_000 and full.n_pictures == 300
+    assert full.n_bytes > 4_000_000 and full.n_pictures == 150
     assert 800_000 < least.n_bytes <= 2_000_000
-    assert 0 < least.n_pictures < 300
-    assert f"{least.n_pictures} of 300 sources have pictures in this page" in least.notes
+    assert 0 < least.n_pictures < 150
+    assert f"{least.n_pictures} of 150 sources have pictures in this page" in least.notes
     data = json.loads(Elements(least.path.read_text()).scripts[0])
     assert data["instruments"][0]["levels"][0]["scale"] > 1
     assert "Euclid is shown in pixels of" in least.path.read_text()

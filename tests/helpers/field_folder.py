@@ -11,6 +11,7 @@ from clresample import Grid
 from clresample.simulation.surveys import EUCLID_VIS
 
 SIGMA = 2.0  # [counts] noise of a pixel of every channel
+REACH_PX = 20  # a source's light ends there, ten times its width
 INSTRUMENTS = {"Euclid": ("VIS",), "Rubin": ("g", "r", "i")}
 
 
@@ -104,10 +105,13 @@ def _fits_of(table, rng):
 def _write_images(folder, name, channels, grid, whole, at, flux, rng):
     """A Gaussian of two pixels for each source; residuals of noise alone."""
     there = whole.positions_in(grid, *at.T)
-    y, x = np.indices(grid.shape)
     model = np.zeros(grid.shape)
-    for (v, w), one in zip(there, flux, strict=True):
-        model += 20 * one * np.exp(-((y - v) ** 2 + (x - w) ** 2) / 8)
+    for place, one in zip(there, flux, strict=True):
+        low = np.clip(np.rint(place).astype(int) - REACH_PX, 0, grid.shape)
+        high = np.clip(low + 2 * REACH_PX + 1, 0, grid.shape)
+        y, x = np.ogrid[low[0] : high[0], low[1] : high[1]]
+        light = np.exp(-((y - place[0]) ** 2 + (x - place[1]) ** 2) / 8)
+        model[low[0] : high[0], low[1] : high[1]] += 20 * one * light
     model = np.broadcast_to(model, (len(channels), *grid.shape)).astype(np.float32)
     noise = (SIGMA * rng.standard_normal(model.shape)).astype(np.float32)
     header = grid.to_wcs().to_header(relax=True)

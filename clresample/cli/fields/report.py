@@ -43,7 +43,7 @@ def add_report(commands):
         "--max-size",
         metavar="SIZE",
         type=size,
-        help="of the page; what does not fit is left out, the finest images first (default 46M)",
+        help="of the page; what does not fit is left out, the finest images first (default 64M)",
     )
     parser.set_defaults(run=run)
 

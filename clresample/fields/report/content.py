@@ -45,8 +45,8 @@ def flag_names(value) -> str:
     return ", ".join([*map(str, names), *([str(rest)] if rest else [])]) or "none"
 
 
-def data_of(run, pyramids, most_bytes, notes) -> dict:
-    """All that the script reads.
+def data_of(run, most_bytes, notes) -> dict:
+    """All that the script reads but the instruments' tiles.
 
     most_bytes: of the page; notes: a list that gets what is missing
     """
@@ -72,7 +72,7 @@ def data_of(run, pyramids, most_bytes, notes) -> dict:
     detailed = first[: int(DETAILS_PART * most_bytes / DETAIL_BYTES)]
     return {
         "frame": _frame(run, frame, at),
-        "instruments": [_instrument(pyramid) for pyramid in pyramids],
+        "instruments": [],
         "sources": {
             "id": _texts(run, "id", order),
             "parent": _texts(run, "parent_id", order),
@@ -124,7 +124,8 @@ def _frame(run, frame, at):
     }
 
 
-def _instrument(pyramid):
+def instrument_data(pyramid) -> dict:
+    """What the script reads of an instrument."""
     names = [pyramid.instrument.channels[c] for c in pyramid.stretch.chosen]
     how = f"{', '.join(names)} as blue, green, red" if len(names) == 3 else names[0]
     return {

@@ -16,7 +16,7 @@ TILE_PX = 256  # side of a tile: smaller ones are more to list, larger ones more
 LAYERS = "data", "model", "residual"
 # [bytes] that a pixel of the three layers takes together, as base64: of noisy images of one channel
 # and of three. Where a finest level starts from; what it really takes decides.
-PIXEL_BYTES = {1: 1.3, 3: 2.6}
+PIXEL_BYTES = {1: 1.4, 3: 2.4}
 CELLS = 96  # of the map of chi2 along the longer side, at most
 LEAST_CELL_PX = 8  # smaller cells scatter by over 20 % in one channel from the noise alone
 # [sigma^2] A pixel counts no more: one cosmic ray or star's core does not hide what a cell says.
@@ -52,8 +52,9 @@ def pyramid_of(instrument, frame, budget) -> Pyramid:
     shape = instrument.grid.shape
     stretch = stretch_of(instrument.sample, instrument.sigma)
     coarsest = max(0, int(np.ceil(np.log2(max(shape) / TILE_PX))))
-    area = 4 / 3 * shape[0] * shape[1] * PIXEL_BYTES[len(stretch.chosen)]
-    finest = int(np.clip(np.ceil(np.log2(max(area / max(budget, 1), 1)) / 2), 0, coarsest))
+    # what is predicted may be a half too much: a level is not left out for that
+    more = max(full_bytes(instrument) / (1.5 * max(budget, 1)), 1)
+    finest = int(np.clip(np.ceil(np.log2(more) / 2), 0, coarsest))
     planes, chi2, cell = _read(instrument, stretch, finest)
     levels = []
     for level in range(finest, coarsest + 1):
@@ -64,6 +65,12 @@ def pyramid_of(instrument, frame, budget) -> Pyramid:
     while len(levels) > 1 and sum(sizes) > budget:
         levels, sizes, finest = levels[1:], sizes[1:], finest + 1
     return Pyramid(instrument, stretch, finest, levels, sum(sizes), chi2, cell)
+
+
+def full_bytes(instrument) -> float:
+    """[bytes] that an instrument's tiles take if none is left out, about."""
+    n_y, n_x = instrument.grid.shape
+    return 4 / 3 * n_y * n_x * PIXEL_BYTES[3 if len(instrument.channels) >= 3 else 1]
 
 
 def _read(instrument, stretch, level):
@@ -114,27 +121,23 @@ def _tiles(planes, level, stretch, grid, frame):
     Tiles are base64 of PNG; places are six numbers each that take a tile's pixels (column, row),
     counted from its first corner, to (x, y) of the frame.
     """
-    data, model, residual = planes
-    # of a mean of 4^level pixels the noise is smaller
-    shown = {
-        "data": stretch.shown(data),
-        "model": stretch.shown(model, noisy=False),
-        "residual": residual_numbers(residual[0] * 2.0**level),
-    }
     found = {"scale": 2**level, "places": []} | {layer: [] for layer in LAYERS}
-    n_y, n_x = data.shape[1:]
+    n_y, n_x = planes[0].shape[1:]
     for y0 in range(0, n_y, TILE_PX):
         for x0 in range(0, n_x, TILE_PX):
-            here = np.s_[y0 : y0 + TILE_PX, x0 : x0 + TILE_PX]
-            images = {layer: image[here] for layer, image in shown.items()}
-            sides = images["data"].shape[:2]
+            data, model, residual = (
+                plane[:, y0 : y0 + TILE_PX, x0 : x0 + TILE_PX] for plane in planes
+            )
+            sides = data.shape[1:]
             place = placed(grid, frame, (y0, x0), sides, 2**level)
             if place is None:
                 continue
             found["places"].append([sides[1], sides[0], *place])
-            for layer, image in images.items():
-                palette = residual_palette() if layer == "residual" else None
-                found[layer].append(as_text(png(image, palette, smooth=layer == "model")))
+            # of a mean of 4^level pixels the noise is smaller
+            left = png(residual_numbers(residual[0] * 2.0**level), residual_palette())
+            found["data"].append(as_text(png(stretch.shown(data))))
+            found["model"].append(as_text(png(stretch.shown(model, noisy=False), smooth=True)))
+            found["residual"].append(as_text(left))
     return found
 
 

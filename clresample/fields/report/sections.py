@@ -42,9 +42,6 @@ def heading(run, area_arcmin2) -> str:
     numbers.append((f"{int((state == FAILED).sum()):,}", "sources failed"))
     if area_arcmin2:
         numbers.append((f"{area_arcmin2:.3g}", "square arcminutes"))
-    if "seconds" in run.fits.colnames and len(run.sources):
-        each = plain(run.fits["seconds"]).sum() / len(run.sources)
-        numbers.append((f"{each:.2g} s", "of fitting per source"))
     inner = "".join(f"<div><dt>{escape(b)}</dt><dd>{escape(a)}</dd></div>" for a, b in numbers)
     name = "/".join(run.folder.absolute().parts[-2:])
     return (

@@ -51,6 +51,8 @@ class Stretch:
             grey = _shades(np.clip(level, 0, 1), noisy)
             grey[empty] = EMPTY[1]
             return grey
+        # colours only where there is light: those of the noise are no colours of anything
+        image = light + (image - light) * np.maximum(light, 0) / (np.maximum(light, 0) + knee)
         # one factor for all channels: colours survive
         colour = (image + knee) * (np.maximum(level, 0) / np.maximum(light + knee, knee / 4))
         colour = colour / np.maximum(1, colour.max(axis=0))

@@ -10,7 +10,7 @@ from ...files.whole_file import FileError
 from ..box import Box
 from .png import png
 from .pyramid import as_text, placed
-from .shades import KNEE_SIGMAS, NOISY_SHADES, residual_numbers, residual_palette
+from .shades import EMPTY, KNEE_SIGMAS, NOISY_SHADES, residual_numbers, residual_palette
 
 # [frame px] Half the side of a source's pictures: some sky is seen around the faintest, and the
 # largest still fit a page.
@@ -81,6 +81,7 @@ def _rows(instrument, read, frame, wanted):
     if not box.area:
         return
     models, left = read(box)
+    left = np.where(instrument.dead(left), np.nan, left)
     place = placed(instrument.grid, frame, box[:2], box.shape, 1)
     if place is None:
         return
@@ -98,8 +99,9 @@ def _rows(instrument, read, frame, wanted):
 
 
 def _grey(image, sigma, white):
-    """Shades (Ny, Nx) uint8 of an image [counts], black for no data."""
+    """Shades (Ny, Nx) uint8 of an image [counts], those of EMPTY for no data."""
     knee = KNEE_SIGMAS * sigma
     level = np.arcsinh((np.nan_to_num(image) + knee) / knee) / np.arcsinh((white + knee) / knee)
     steps = np.rint((NOISY_SHADES - 1) * np.clip(level, 0, 1))
-    return np.rint(steps * (255 / (NOISY_SHADES - 1))).astype(np.uint8)
+    shades = np.rint(steps * (255 / (NOISY_SHADES - 1))).astype(np.uint8)
+    return np.where(np.isfinite(image), shades, np.uint8(EMPTY[1]))

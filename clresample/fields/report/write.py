@@ -12,19 +12,18 @@ from ...files.whole_file import FileError, check_folder, check_output, whole_fil
 from ...sky.wcs import local_axes
 from ..box import Box
 from . import sections
-from .content import data_of
+from .content import data_of, instrument_data
 from .folder import read_run
-from .html import page
-from .pyramid import pyramid_of
+from .html import data_block, page
+from .pyramid import full_bytes, pyramid_of
 from .truth import truth_of
 
 NAME = "report.html"
-# [bytes] of a page: browsers open it within a second or two, and mail still takes it. A field of
-# 4096 x 4096 pixels in two instruments fits with all its pixels.
-MOST_BYTES = 46 << 20
+# [bytes] of a page: browsers open it within some seconds. 4096 x 4096 pixels beside Rubin's in
+# three bands are there with all their pixels, and pictures of their 1700 sources.
+MOST_BYTES = 64 << 20
 TEXT_BYTES = 700_000  # [bytes] that tables and figures take at most, whatever the field
 LEAST_BYTES = 2_000_000
-TILES_PART = 0.4  # of what they leave, for tiles; for sources see content.py
 
 FIELD = """<section id="field"><h2>The field</h2>
 <noscript><p class="about">Images need a script, which this browser does not run. All tables and
@@ -83,7 +82,7 @@ def write_report(
     truth: table of the true sources (y, x [px of the model], flux_CHANNEL [uJy], and snr); None =
         truth.ecsv in the folder, beside it or beside the run's inputs, if there is one
     most_bytes: of the page. What does not fit is left out: the finest tiles; pictures of sources
-        after those that failed, misfit, or have the highest signal to noise; of more than 140,000
+        after those that failed, misfit, or have the highest signal to noise; of more than 200,000
         sources (by default) the faintest
     overwrite: replace the file at `path`
 
@@ -100,8 +99,9 @@ def write_report(
     notes = list(run.notes)
     known = truth_of(run, truth, notes)
     most = most_bytes - TEXT_BYTES
-    pyramids = _pyramids(run, TILES_PART * most, notes)
-    data = data_of(run, pyramids, most, notes)
+    data = data_of(run, most, notes)
+    pyramids = _pyramids(run, most - len(data_block("", data)), notes)
+    data["instruments"] = [instrument_data(pyramid) for pyramid in pyramids]
     n_pictures = sum("stamps" in one for one in data["details"].values())
     if pyramids and n_pictures < len(run.sources):
         notes.append(f"{n_pictures} of {len(run.sources)} sources have pictures in this page")
@@ -121,12 +121,14 @@ def _inputs(folder, truth):
 
 
 def _pyramids(run, budget, notes):
-    """Tiles of all instruments; each gets its share of the bytes by its number of pixels."""
-    found = []
-    pixels = [np.prod(one.grid.shape, dtype=float) for one in run.instruments]
-    for one, n in zip(run.instruments, pixels, strict=True):
+    """Tiles of all instruments; each gets its share of the bytes by what it would take."""
+    found: list = []
+    wanted = [full_bytes(one) for one in run.instruments]
+    for k, one in enumerate(run.instruments):
+        left = budget - sum(pyramid.n_bytes for pyramid in found)
+        share = left * wanted[k] / sum(wanted[k:])  # with what those before did not take
         try:
-            found.append(pyramid_of(one, run.instruments[0].grid, budget * n / sum(pixels)))
+            found.append(pyramid_of(one, run.instruments[0].grid, share))
         except FileError as error:
             notes.append(f"no images of {one.name}: {error}")
     return found

@@ -60,7 +60,7 @@ class Cluster:
         except BaseException:
             self.close()
             raise
-        progress.say(f"dashboard: {self.client.dashboard_link}")
+        progress.dashboard(self.client.dashboard_link)
 
     def _check(self):
         """Refuse a cluster without workers, or whose workers cannot run our functions."""
