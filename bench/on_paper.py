@@ -64,11 +64,9 @@ def _short(value):
 
 
 def _bytes(value):
-    for unit in ("kB", "MB", "GB", "TB"):
-        value /= 1000
-        if value < 1000:
-            break
-    return f"{_short(value)} {unit}"
+    units = "kB", "MB", "GB", "TB"
+    power = next((p for p in range(1, 4) if value < 1000 ** (p + 1)), 4)
+    return f"{_short(value / 1000**power)} {units[power - 1]}"
 
 
 def main(options):
@@ -76,7 +74,8 @@ def main(options):
     table = arithmetic(measured(text))
     print(table, end="")
     if options.write:
-        PAGE.write_text(text.replace(between(text, "arithmetic"), table))
+        mark = "<!-- arithmetic -->\n"
+        PAGE.write_text(text.replace(mark + between(text, "arithmetic"), mark + table))
 
 
 def parser():
