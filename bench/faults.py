@@ -38,9 +38,10 @@ NEAR = 0.1  # [errors] of a flux: what batches of other sizes change is under a 
 FIRST_ROOM = 128 << 10  # [bytes] of the file system that fills up
 HANGS_S = 30.0  # [s] after which a worker is taken to hang
 SMALL = {"POCL_MEMORY_LIMIT": str(max(1, os.sysconf("SC_PHYS_PAGES") * 4096 // 10 >> 30))}
-# [px] field of five compressed tiles of Euclid's image, of which the last is damaged; searched in
-# tiles of its own that reach a little beyond. Blends that begin AWAY_PX from the damage do not see it
-TALL, AWAY_PX = 320, 80
+# [px] A field of six compressed tiles of Euclid's image, of which the last is damaged. The search's
+# own tiles that reach there are lost, two rows of 64 px; what lies AWAY_PX from the damage is in no
+# blend with what was lost.
+TALL, AWAY_PX = 384, 144
 TILES = "\n[field]\ntile_px = 64\noverlap_px = 16\n"
 
 
@@ -141,7 +142,7 @@ def _limit_files(room):
 
 
 def damaged_tile(sky, out, whole, took_s):
-    """A run over a field with one damaged tile of Euclid's image, killed once; beside one without."""
+    """A run over a field with one damaged tile of Euclid's image, killed once."""
     good, bad = out.with_name("good"), out.with_name("bad")
     for folder in (good, bad):
         given = {"rubin_bands": ("i",), "clustering": 0.4, "psf_variation": 0.1}
@@ -166,7 +167,9 @@ def damaged_tile(sky, out, whole, took_s):
     about = f"{len(lost)} tiles lost, {failed.sum()} of {len(rows)} sources failed, {missing} of "
     about += f"{away.sum()} away from it are missing, fluxes differ by {worst:.3f} errors"
     seen = process.returncode == 1 and named and bool(len(lost) or failed.any()) and away.any()
-    return row_of(bool(seen and missing == 0 and worst < NEAR), False, about, kills, parts, 0.6)
+    return row_of(
+        bool(seen and missing == 0 and worst < NEAR), False, about, int(kills), parts, 0.6
+    )
 
 
 def damage(path):
