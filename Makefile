@@ -60,7 +60,7 @@ mutants: $(STAMP)
 fuzz: $(STAMP)
 	CLRESAMPLE_EXAMPLES=$(or $(EXAMPLES),2000) $(RUN) pytest tests/properties $(ARGS)
 
-# Whole fields killed thirty times at random moments, half an hour.
+# Whole fields killed thirty times at random moments, starved and damaged, half an hour.
 soak: $(STAMP)
 	$(RUN) bench.soak $(ARGS)
 

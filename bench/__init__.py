@@ -7,7 +7,9 @@ deblend    `python -m bench.deblend`: time and accuracy of fits to simulated ble
 settings   `python -m bench.settings`: accuracy with the default settings beside others
 coverage   `python -m bench.coverage`: how often the errors of simulated galaxies hold the truth
 field      `python -m bench.field`: whole simulated mosaics to a catalogue, beside the truth
-soak       `python -m bench.soak`: fields whose processes are killed, to the same catalogue
+soak       `python -m bench.soak`: fields killed, starved and damaged, to the same catalogue
+scaling    `python -m bench.scaling`: a field by numbers of workers, and one blend of many sources
+on_paper   `python -m bench.on_paper`: what surveys take, by arithmetic from what was measured
 throughput `python -m bench.throughput`: core-seconds of a source, and blends of many sources
 real       `python -m bench.real`: chi2 and structured residuals of real scenes, by default settings
 paper/     the figures and statements of the paper, recomputed, and the report on them

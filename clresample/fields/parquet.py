@@ -15,6 +15,7 @@ def arrow_table(table):
     for name in table.colnames:
         column = table[name]
         values = np.asarray(getattr(column, "value", column))
+        values = values.astype(values.dtype.newbyteorder("="), copy=False)  # of FITS tables
         array = pa.array(values.tolist() if values.dtype.kind in "US" else values)
         unit = str(column.unit) if getattr(column, "unit", None) is not None else ""
         about = {"unit": unit, "description": column.info.description or ""}

@@ -140,7 +140,7 @@ def _search(observations, frame, threshold, device, known, scatters=None, beside
     if scatters is None:
         scatters = [signal.scatters() for signal in signals]
     for signal, scatter in zip(signals, scatters, strict=True):
-        signal.images[...] /= np.asarray(scatter, np.float32)[:, None, None, None]
+        signal.images[...] /= np.reshape(scatter, (-1, 1, 1, 1)).astype(np.float32)
     widths = np.array([_fwhm_px(o, frame) for o in observations])
     order = np.argsort(widths, kind="stable")
     everything, best = combined(signals)

@@ -1,4 +1,7 @@
-"""A run and a worker that are killed: `bench.soak` in small."""
+"""Runs that are killed, starved and damaged: `bench.soak` in small.
+
+Workers that hang are in test_pool.py and test_cluster.py.
+"""
 
 import sys
 
@@ -6,12 +9,12 @@ import pytest
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no SIGKILL")
-def test_killed_runs_end_with_the_same_catalogue():
+def test_disturbed_runs_end_with_the_same_catalogue():
     pytest.importorskip("galsim")
     pytest.importorskip("sep")
     from bench.soak import soak
 
-    rows = list(soak(2, 3))
-    assert [row["what"] for row in rows] == ["run", "worker"]
-    assert sum(row["kills"] for row in rows) >= 1  # a moment may come after the end
-    assert all(row["same"] for row in rows)
+    rows = list(soak(2, 3, ("disk", "tile")))
+    assert [row["what"] for row in rows] == ["run", "worker", "disk", "tile"]
+    assert sum(row["kills"] for row in rows[:2]) >= 1  # a moment may come after the end
+    assert all(row["good"] for row in rows), rows

@@ -2,11 +2,13 @@
 
 import os
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
+from helpers.checkout import ROOT
 
 from clresample import DeviceError
 from clresample.fields.work.pool import Pool
@@ -105,3 +107,42 @@ def test_workers_live_on_from_one_run_to_the_next():
 def name_of_process(context, task):
     time.sleep(0.2)
     return os.getpid(), context
+
+
+PARENT = """
+import os, sys
+sys.path[:0] = {paths!r}
+from test_pool import Pool, say_and_sleep
+if __name__ == "__main__":
+    with Pool(1) as pool:
+        list(pool.run(say_and_sleep, [{folder!r}], ["task"]))
+"""
+
+
+def say_and_sleep(folder, task):
+    Path(folder, "pid").write_text(str(os.getpid()))
+    time.sleep(600)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="no prctl")
+def test_workers_end_with_a_parent_that_is_killed(tmp_path):
+    script = tmp_path / "parent.py"
+    script.write_text(
+        PARENT.format(
+            paths=[str(ROOT), str(ROOT / "tests"), str(Path(__file__).parent)], folder=str(tmp_path)
+        )
+    )
+    parent = subprocess.Popen([sys.executable, str(script)], cwd=ROOT)
+    try:
+        end = time.monotonic() + 120
+        while not (tmp_path / "pid").exists() or not (tmp_path / "pid").read_text():
+            assert parent.poll() is None and time.monotonic() < end
+            time.sleep(0.05)
+        pid = int((tmp_path / "pid").read_text())
+    finally:
+        parent.kill()
+        parent.wait()
+    end = time.monotonic() + 30
+    while Path(f"/proc/{pid}").exists() and "Z" not in Path(f"/proc/{pid}/stat").read_text():
+        assert time.monotonic() < end
+        time.sleep(0.05)

@@ -6,6 +6,8 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import numpy as np
+
 from ...device.device import get_device
 from ...files.whole_file import FileError
 from ...sky.grid import Grid
@@ -69,8 +71,9 @@ def _given(field, sharing):
 def _look(field, sharing, given):
     """sharing: [(choice of a device, how many workers share it)]; None is the worker's own."""
     devices = [(get_device(field.device if choice is None else choice), n) for choice, n in sharing]
+    scatters = scatters_of(field.mosaics, field.reference, devices[0][0])
     look = Look(
-        scatters_of(field.mosaics, field.reference, devices[0][0]),
+        {name: np.asarray(scatter).tolist() for name, scatter in scatters.items()},
         [device.name for device, _ in devices],
         min(device.memory // (DEVICE_PART * n) for device, n in devices),
     )

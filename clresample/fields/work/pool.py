@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import wait
 
 from ...device.discovery import DeviceError
-from .share import hold_memory, shared_threads
+from .share import end_with, hold_memory, shared_threads
 
 # [s] Between two looks at whether a worker takes too long.
 LOOK_S = 1.0
@@ -179,7 +179,9 @@ def _starter(n_workers, bound):
         before = {name: os.environ.get(name) for name in environment}
         os.environ.update({k: v for k, v in environment.items() if before[k] is None})
         try:
-            process = processes.Process(target=_work, args=(theirs, bound), daemon=True)
+            process = processes.Process(
+                target=_work, args=(theirs, bound, os.getpid()), daemon=True
+            )
             process.start()
         finally:
             for name, value in before.items():
@@ -237,12 +239,13 @@ def _end(worker):
         worker.process.join()
 
 
-def _work(pipe, bound):
+def _work(pipe, bound, parent):
     """A worker: functions with their contexts and tasks from the pipe, answers into it, until its
     end is closed."""
     import signal
 
     hold_memory(bound)
+    end_with(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all; the parent ends its workers
     function = context = None
     while True:

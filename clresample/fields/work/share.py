@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import os
+import signal
 import sys
+
+PR_SET_PDEATHSIG = 1  # of prctl(2)
 
 
 def shared_threads(n_workers) -> dict:
@@ -33,3 +38,17 @@ def hold_memory(bound):
     _, most = resource.getrlimit(resource.RLIMIT_DATA)
     if most == resource.RLIM_INFINITY or bound < most:
         resource.setrlimit(resource.RLIMIT_DATA, (int(bound), most))
+
+
+def end_with(parent):
+    """Have the system end this process when its parent is killed, where it can (Linux).
+
+    Elsewhere it ends once its task has: until then it holds its memory beside those of a run that
+    goes on, and leaves the part that this run makes too.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    with contextlib.suppress(OSError, AttributeError):  # a C library without prctl
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL))
+    if os.getppid() != parent:  # it was killed before
+        os._exit(1)

@@ -1,0 +1,81 @@
+"""`bench.scaling`, `bench.faults` and `bench.on_paper`: what their figures count."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.io import fits
+from astropy.table import QTable
+from helpers.checkout import run_python
+
+from bench import faults, on_paper, scaling
+
+
+def turn(n_round, seat, began, ended):
+    return SimpleNamespace(task=SimpleNamespace(round=n_round), seat=seat, began=began, ended=ended)
+
+
+def test_the_tail_is_what_the_last_worker_did_alone():
+    turns = [turn(0, 0, 0, 5), turn(0, 1, 0, 3), turn(0, 0, 5, 9), turn(1, 0, 9, 12)]
+    turns += [turn(1, 1, 9, 10)]
+    assert scaling.tail_of(turns, 2) == (9 - 3) + (12 - 10)
+
+
+def test_a_halo_has_one_surface_brightness_in_all_instruments():
+    from clresample.simulation.surveys import EUCLID_VIS, RUBIN_UGRIZY
+
+    for survey, n in ((EUCLID_VIS, 100), (RUBIN_UGRIZY, 50)):
+        mosaic = SimpleNamespace(survey=survey, grid=survey.grid(n))
+        light = scaling.halo_of(mosaic, 100, EUCLID_VIS)
+        corner = light[0, 0, 0] / survey.pixel_scale_arcsec**2
+        mag = np.array(survey.zero_points_mag)[0] - 2.5 * np.log10(corner)
+        if survey is EUCLID_VIS:
+            first = mag
+            sigma = light[0, 0, 0] / survey.noise_sigma[0]
+            assert sigma == pytest.approx(scaling.HALO_SIGMA, rel=0.02)
+        assert mag == pytest.approx(first, abs=0.1)
+        assert light[0].max() > 4 * light[0, 0, 0]
+
+
+def test_one_tile_of_a_compressed_image_is_damaged_and_no_other(tmp_path):
+    path, image = tmp_path / "a.fits", np.arange(200 * 90, dtype=np.float32).reshape(1, 200, 90)
+    given = {"compression_type": "GZIP_2", "quantize_level": 0, "tile_shape": (1, 64, 90)}
+    hdus = [fits.PrimaryHDU(), fits.CompImageHDU(image, name="SCI", **given)]
+    fits.HDUList(hdus).writeto(path)
+    assert faults.damage(path) == (192, 8)
+    with fits.open(path) as hdus:
+        np.testing.assert_array_equal(hdus["SCI"].section[0, :192], image[0, :192])
+        with pytest.raises((OSError, ValueError, RuntimeError)):
+            hdus["SCI"].section[0, 190:200]
+
+
+def test_differences_are_counted_in_errors():
+    clean = QTable({"id": [1, 2, 3], "flux_i": [1.0, 2.0, 3.0] * u.uJy})
+    clean["flux_err_i"] = [0.1, 0.1, 0.1] * u.uJy
+    rows = clean[:2].copy()
+    rows["flux_i"][1] = 2.03 * u.uJy
+    missing, worst = faults.compared(rows, clean)
+    assert missing == 1 and worst == pytest.approx(0.3)
+
+
+def test_the_page_holds_what_follows_from_its_figures():
+    text = on_paper.PAGE.read_text()
+    figures = on_paper.measured(text)
+    assert on_paper.between(text, "arithmetic") == on_paper.arithmetic(figures)
+    twice = on_paper.arithmetic(figures | {"core-seconds a source": 1.0})
+    assert "| Rubin patch, 10' x 10' | 3,600 | 1 | 3,600 |" in twice
+
+
+def test_a_small_field_by_workers(tmp_path):
+    pytest.importorskip("galsim")
+    pytest.importorskip("sep")
+    given = ["--quick", "--sizes", "160", "--density", "90", "--seed", "3"]
+    # in a process of its own: a bench starts itself anew with its threads set
+    result = run_python("-m", "bench.scaling", *given, "--json", str(tmp_path / "rows.json"))
+    assert result.returncode == 0, result.stderr
+    one, two = json.loads((tmp_path / "rows.json").read_text())["rows"]
+    assert one.keys() == two.keys() >= {name for name, *_ in scaling.COLUMNS}
+    assert one["n_sources"] == two["n_sources"] == two["measured"] > 3
+    assert one["speed_up"] == 1 and 0 < two["own_cost"] < 1 and two["peak_gb"] > 0.1
