@@ -9,6 +9,7 @@ from scipy import ndimage
 
 from ...files.whole_file import FileError
 from ...measurement.detection import detect, noise_scatter
+from ...measurement.signal import WIDTHS_ARCSEC
 from ...sky.frame import model_frame
 from ..box import Box
 
@@ -43,7 +44,7 @@ def search(mosaics, reference, tile, *, threshold, scatters=None, device=None) -
 
     mosaics: of the field; reference: Grid of the model's pixels; tile: Tile
     threshold [sigma]: least signal to noise of a peak
-    scatters {mosaic's name: scatter of its signal to noise}: see `scatters_of`; None = each tile's
+    scatters {mosaic's name: scatters of its signal to noise}: see `scatters_of`; None = each tile's
 
     Raises FileError for pixels that cannot be read, ImportError without sep.
     """
@@ -89,14 +90,15 @@ def place(mosaics, reference, tile, positions, *, scatters=None, device=None) ->
 
 
 def scatters_of(mosaics, reference, device=None) -> dict:
-    """{mosaic's name: scatter of its signal to noise without sources}, from the field's middle.
+    """{mosaic's name: scatters of its signal to noise without sources}, from the field's middle.
 
-    One number for the whole field, so that the same is found however it is divided into tiles.
+    A list for each, as `noise_scatter` finds them: the same for the whole field, so that the same
+    is found however it is divided into tiles.
     """
     region = Box.of(reference.shape)
     middle = [(a + b) // 2 for a, b in zip(region[:2], region[2:], strict=True)]
     box = Box(*middle, *middle).grown(SAMPLE_PX // 2).meet(region)
-    found = dict.fromkeys((mosaic.name for mosaic in mosaics), 1.0)
+    found = {mosaic.name: [1.0] * len(WIDTHS_ARCSEC) for mosaic in mosaics}
     try:
         observations = observations_on(mosaics, reference, box)
     except FileError:  # its tile will say so
@@ -104,7 +106,7 @@ def scatters_of(mosaics, reference, device=None) -> dict:
     if observations:
         frame = model_frame(observations, grid=_cut(reference, box))
         for o in observations:
-            found[o.name] = noise_scatter(o, frame, device=device)
+            found[o.name] = noise_scatter(o, frame, device=device).tolist()
     return found
 
 

@@ -22,7 +22,7 @@ FILE = "look.json"
 class Look:
     """What a run knows before it searches.
 
-    scatters {mosaic's name: scatter of its signal to noise}: see `scatters_of`
+    scatters {mosaic's name: scatters of its signal to noise}: see `scatters_of`
     devices: names of those asked for; memory [bytes]: of the smallest, for one group
     """
 
