@@ -70,7 +70,7 @@ def _look(field, sharing, given):
     """sharing: [(choice of a device, how many workers share it)]; None is the worker's own."""
     devices = [(get_device(field.device if choice is None else choice), n) for choice, n in sharing]
     look = Look(
-        scatters_of(field.mosaics, field.reference, devices[0][0]),
+        scatters_of(field.mosaics, field.reference),
         [device.name for device, _ in devices],
         min(device.memory // (DEVICE_PART * n) for device, n in devices),
     )
