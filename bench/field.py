@@ -1,49 +1,56 @@
 """Whole fields: simulated mosaics to a catalogue by the command, compared with the truth.
 
     python -m bench.field [--quick] [--json FILE]
+    python -m bench.field --sizes 4096
+    python -m bench.field --search-only --sizes 1024 --fields 16 --seed 100
 
-A row is one field, run as a user does: simulated, written, `clresample field` in a process of its
-own with workers.
+A row is one size of field, run as a user does: simulated, written, `clresample field` in a process
+of its own with workers. With --fields N it is N fields of successive seeds together; with
+--search-only sources are searched and not fitted, in this process.
 
 n_truth, n_sources  sources with signal to noise over 5 in the truth, and rows of the catalogue;
                     signal to noise is that of the best possible filter over all channels
 completeness        share found of those at 20 - 100 with no neighbour within 8 model pixels; a
                     source is found where a catalogue row within 4 pixels is its own
 faint, bright       the same at 10 - 20, and over 100
-close               share found of those over 20 that have a neighbour within 8 pixels
-spurious            share of the rows within 5 pixels of nothing in the truth
+close               share found of those over 20 that have a neighbour within 8 pixels, whatever its
+                    brightness and however near: some pairs nobody could tell apart
+spurious            share of the rows that are no true source's own: nothing within 4 pixels, or
+                    only what another row has found
 flux_bias           median of (flux - truth) / truth of those found over 20 without neighbour, all
                     channels
 pull_width          of theirs (flux - truth) / error: 1.4826 MAD
 core_s_per_source   processor time of all processes over all rows
-wall_s, peak_gb     of the command; the memory is that of its largest process
+wall_s, peak_gb     of the command; the memory is that of all its processes together
 stage               seconds of wall time by stage
+n_pairs             fluxes judged of sources counted in `close` that were found, 60 at most: those
+                    that the truth has at 5 sigma of a point source's flux or more
+pairs, aperture_factor, forced_factor
+                    scatter (1.4826 MAD) of their flux over truth, and that of PSF-matched aperture
+                    photometry, and of forced profile photometry, over it (harness/photometry.py)
 """
 
 from __future__ import annotations
 
-import json
-import resource
-import subprocess
-import sys
 import tempfile
 import time
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
-from astropy.table import QTable
 
 from clresample import simulate_field
-from clresample.cli.simulate import write_field
 
-from .harness import records
+from .harness import photometry, records
 from .harness.clock import ONE_THREAD, on_all_cores
-from .harness.options import ROOT, Parser, positive, run, seed
+from .harness.judged import Judged, fluxes, robust, shares
+from .harness.options import Parser, positive, run, seed
+from .harness.runs import fitted, found_in
 
 SIZES, QUICK_SIZES = (1024, 2048), (384,)
 BANDS, QUICK_BANDS = "ugrizy", "ri"
-NEAR_PX, FOUND_PX, NOTHING_PX = 8.0, 4.0, 5.0
-EDGE_PX = 8  # sources so near to the edge are not judged: their light is not all there
+MOST_PAIRS = 60
+LEAST_FLUX = 5.0  # [sigma] of a point source's flux: fainter ones say how deep a band is
 COLUMNS = (
     ("n_model", 7, "d"),
     ("n_truth", 7, "d"),
@@ -55,6 +62,10 @@ COLUMNS = (
     ("spurious", 8, ".3f"),
     ("flux_bias", 9, ".4f"),
     ("pull_width", 10, ".3f"),
+    ("n_pairs", 7, "d"),
+    ("pairs", 6, ".3f"),
+    ("aperture_factor", 15, ".2f"),
+    ("forced_factor", 13, ".2f"),
     ("core_s_per_source", 17, ".3f"),
     ("wall_s", 7, ".1f"),
     ("peak_gb", 7, ".2f"),
@@ -62,126 +73,151 @@ COLUMNS = (
 )
 
 
-def matched(positions, truth):
-    """For each true position the row that is its own, within FOUND_PX, or -1.
+def compared(fields, channels):
+    """What several fields' catalogues are beside their truth.
 
-    Pairs are taken in the order of their distance, each row and each true source once.
+    fields: of (table, truth, n_model); channels: names
     """
-    found = np.full(len(truth), -1)
-    if not len(positions):
-        return found
-    apart = np.hypot(*(truth[:, None] - positions[None]).transpose(2, 0, 1))
-    near = np.argwhere(apart < FOUND_PX)
-    taken = set()
-    for t, row in near[np.argsort(apart[tuple(near.T)], kind="stable")]:
-        if found[t] < 0 and row not in taken:
-            found[t] = row
-            taken.add(row)
-    return found
-
-
-def compared(table, truth, channels, n_model):
-    """Completeness, spurious share, bias and pulls of a catalogue beside the truth."""
-    at = np.stack([table["y"].value, table["x"].value], axis=1)
-    true = np.stack([truth["y"], truth["x"]], axis=1)
-
-    def inner(places):
-        return ((places > EDGE_PX) & (places < n_model - 1 - EDGE_PX)).all(axis=1)
-
-    own, snr = matched(at, true), np.asarray(truth["snr"])
-    apart = np.hypot(*(true[:, None] - true[None]).transpose(2, 0, 1))
-    np.fill_diagonal(apart, np.inf)
-    # neighbours too faint to be seen do not count
-    apart[:, snr < 5] = np.inf
-    alone = apart.min(axis=1) > NEAR_PX
-
-    def share(chosen):
-        chosen = chosen & inner(true)
-        return float((own[chosen] >= 0).mean()) if chosen.any() else float("nan")
-
-    rows = at[inner(at)]
-    nearest = np.array([np.hypot(*(true - row).T).min() for row in rows])
-    judged = (own >= 0) & alone & (snr > 20) & inner(true)
-    flux, error, expected = (
-        np.concatenate(columns)
-        for columns in zip(
+    judged = [
+        Judged(np.stack([table["y"].value, table["x"].value], axis=1), truth, n_model)
+        for table, truth, n_model in fields
+    ]
+    flux, error, true = (
+        np.concatenate(some)
+        for some in zip(
             *(
-                (
-                    table[f"flux_{c}"].value[own[judged]],
-                    table[f"flux_err_{c}"].value[own[judged]],
-                    np.asarray(truth[f"flux_{c}"])[judged],
-                )
-                for c in channels
+                fluxes(table, truth, one.judged(), one.own, channels)
+                for one, (table, truth, _) in zip(judged, fields, strict=True)
             ),
             strict=True,
         )
     )
-    pulls = (flux - expected) / error
-    pulls = pulls[np.isfinite(pulls)]
+    return counted(judged) | {
+        "flux_bias": float(np.nanmedian((flux - true) / true)),
+        "pull_width": robust((flux - true) / error),
+    }
+
+
+def counted(judged):
+    """The figures of a search alone."""
     return {
-        "n_truth": int((snr > 5).sum()),
-        "n_sources": len(table),
-        "completeness": share(alone & (snr > 20) & (snr <= 100)),
-        "faint": share(alone & (snr > 10) & (snr <= 20)),
-        "bright": share(alone & (snr > 100)),
-        "close": share(~alone & (snr > 20)),
-        "spurious": float((nearest > NOTHING_PX).mean()) if len(rows) else float("nan"),
-        "flux_bias": float(np.nanmedian((flux - expected) / expected)),
-        "pull_width": float(1.4826 * np.median(np.abs(pulls - np.median(pulls)))),
+        "n_truth": int(sum((one.snr > 5).sum() for one in judged)),
+        "n_sources": sum(len(one.at) for one in judged),
+    } | shares(judged)
+
+
+def beside_others(fields, channels):
+    """Fluxes of close neighbours beside what others measure of them.
+
+    fields: of (table, SimulatedField, n_model)
+    """
+    ratios: dict[str, list] = {"ours": [], "aperture": [], "forced": []}
+    left = MOST_PAIRS
+    for table, field, n_model in fields:
+        one = Judged(np.stack([table["y"].value, table["x"].value], axis=1), field.truth, n_model)
+        chosen = np.flatnonzero(one.pairs())[:left]
+        left -= len(chosen)
+        if not len(chosen):
+            continue
+        flux, _, true = fluxes(table, field.truth, chosen, one.own, channels)
+        theirs = photometry.compared(field.mosaics, one.at, one.own[chosen], true)
+        deep = true > LEAST_FLUX * photometry.point_errors(field.mosaics)
+        ratios["ours"].append(np.where(deep, flux / true, np.nan))
+        for name, values in theirs.items():
+            ratios[name].append(np.where(deep, values, np.nan))
+    if not ratios["ours"]:
+        nothing = float("nan")
+        return {
+            "n_pairs": 0,
+            "pairs": nothing,
+            "aperture_factor": nothing,
+            "forced_factor": nothing,
+        }
+    together = {name: np.concatenate(some, axis=-2) for name, some in ratios.items()}
+    scatter = {name: photometry.least_scatter(some, robust) for name, some in together.items()}
+    return {
+        "n_pairs": int(np.isfinite(together["ours"]).sum()),
+        "pairs": scatter["ours"],
+        "aperture_factor": scatter["aperture"] / scatter["ours"],
+        "forced_factor": scatter["forced"] / scatter["ours"],
+    }
+
+
+def simulated(size, number, options):
+    return simulate_field(
+        options.seed + number,
+        n_pixels=size,
+        density=options.density,
+        faintest=options.faintest,
+        rubin_bands=tuple(QUICK_BANDS if options.quick else BANDS),
+        psf_variation=0.1,
+        bad_columns=2,
+    )
+
+
+def searched(size, options):
+    """The row of a search without fits."""
+    judged, core_s, wall_s = [], 0.0, 0.0
+    for number in range(options.fields):
+        field = simulated(size, number, options)
+        with tempfile.TemporaryDirectory() as folder:
+            core, wall = time.process_time(), time.perf_counter()
+            judged.append(Judged(found_in(field, Path(folder)), field.truth, size))
+            core_s += time.process_time() - core
+            wall_s += time.perf_counter() - wall
+    row = dict.fromkeys((name for name, *_ in COLUMNS), float("nan")) | counted(judged)
+    return row | {
+        "n_model": size,
+        "n_pairs": 0,
+        "core_s_per_source": core_s / max(row["n_sources"], 1),
+        "wall_s": wall_s,
+        "stage": {"search": wall_s},
+        "status": "not fitted",
     }
 
 
 def row_of(size, options):
-    """The row of one field."""
-    bands = tuple(QUICK_BANDS if options.quick else BANDS)
-    field = simulate_field(
-        options.seed,
-        n_pixels=size,
-        density=options.density,
-        rubin_bands=bands,
-        psf_variation=0.1,
-        bad_columns=2,
+    """The row of one size of field."""
+    fields, taken = [], []
+    for number in range(options.fields):
+        field = simulated(size, number, options)
+        table, took = fitted(field, options.workers)
+        fields.append((table, field, size))
+        taken.append(took)
+    channels = ("VIS", *(QUICK_BANDS if options.quick else BANDS))
+    row = compared([(table, field.truth, n) for table, field, n in fields], channels)
+    stage, fits = Counter(), Counter()
+    for took in taken:
+        stage.update(took["stage"])
+        fits.update(took["fits"])
+    return (
+        row
+        | beside_others(fields, channels)
+        | {
+            "n_model": size,
+            "core_s_per_source": sum(t["core_s"] for t in taken) / max(row["n_sources"], 1),
+            "wall_s": sum(t["wall_s"] for t in taken),
+            "peak_gb": max(t["peak_gb"] for t in taken),
+            "stage": dict(stage),
+            "status": ", ".join(f"{n} {how}" for how, n in sorted(fits.items())),
+        }
     )
-    with tempfile.TemporaryDirectory() as folder:
-        sky, out = Path(folder) / "sky", Path(folder) / "out"
-        toml = write_field(sky, field)[0]
-        command = [sys.executable, "-m", "clresample.cli", "field", toml, "-o", out, "--quiet"]
-        command += ["--workers", options.workers]
-        before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-        done = subprocess.run(
-            [str(word) for word in command], cwd=ROOT, capture_output=True, text=True, check=False
-        )
-        wall_s = time.perf_counter() - began
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        if done.returncode not in (0, 1):
-            raise RuntimeError(done.stderr.strip() or f"exit status {done.returncode}")
-        table = QTable.read(out / "catalogue.fits")
-        about = json.loads((out / "provenance.json").read_text())
-    core_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    fits = about["fits"]
-    return compared(table, field.truth, ("VIS", *bands), size) | {
-        "n_model": size,
-        "core_s_per_source": core_s / max(len(table), 1),
-        "wall_s": wall_s,
-        "peak_gb": after.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9,
-        "stage": about["seconds"],
-        "status": ", ".join(f"{n} {how}" for how, n in sorted(fits.items())),
-    }
 
 
 def main(options):
     threads = on_all_cores()
     sizes = options.sizes or (QUICK_SIZES if options.quick else SIZES)
     record = records.record(threads) | {
-        "fields": f"seed {options.seed}, {options.density:g} sources per square arcminute to "
-        f"i = 26, Euclid VIS and Rubin {QUICK_BANDS if options.quick else BANDS} at 12 degrees",
+        "fields": f"{options.fields} from seed {options.seed}, {options.density:g} sources per "
+        f"square arcminute to i = {options.faintest:g}, Euclid VIS and Rubin "
+        f"{QUICK_BANDS if options.quick else BANDS} at 12 degrees",
         "workers": f"{options.workers}, {' '.join(ONE_THREAD)} = 1 each",
     }
     records.print_record(record)
     records.print_head(COLUMNS)
     rows = []
     for size in sizes:
-        rows.append(row_of(size, options))
+        rows.append((searched if options.search_only else row_of)(size, options))
         records.print_row(COLUMNS, rows[-1])
         stages = rows[-1]["stage"].items()
         print("  " + ", ".join(f"{name} {s:.2f} s" for name, s in stages), flush=True)
@@ -201,6 +237,23 @@ def parser():
         default=36.0,
         metavar="N",
         help="sources per square arcminute (%(default)s)",
+    )
+    parser.add_argument(
+        "--faintest",
+        type=positive(float),
+        default=26.0,
+        metavar="MAG",
+        help="i magnitude of the faintest sources (%(default)s)",
+    )
+    parser.add_argument(
+        "--fields",
+        type=positive(int),
+        default=1,
+        metavar="N",
+        help="fields of each size, of successive seeds (%(default)s)",
+    )
+    parser.add_argument(
+        "--search-only", action="store_true", help="search for sources, without fits"
     )
     parser.add_argument(
         "--workers", type=positive(int), default=2, metavar="N", help="processes (%(default)s)"

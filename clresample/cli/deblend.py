@@ -136,7 +136,7 @@ def _fit(arguments, scene, device):
     given = {"frame": scene.frame, "device": device, "dtype": np.dtype(arguments.dtype)}
     sources, looking = scene.sources, scene.sources is None
     if looking:
-        sources = _detect(arguments, scene, device)
+        sources = _detect(arguments, scene)
     seen = ", ".join(f"{o.name} ({' '.join(o.channels)})" for o in scene.observations)
     _progress(arguments, f"fitting {len(sources)} sources to {seen} on {device.name}")
     if settings.max_iter and (settings.fit_shifts or (looking and scene.passes > 1)):
@@ -155,7 +155,7 @@ def _fit(arguments, scene, device):
         if looking and scene.passes > 1:
             from ..measurement.detection import detect_more
 
-            more = detect_more(result, threshold=scene.threshold, device=device).sources
+            more = detect_more(result, threshold=scene.threshold).sources
             _progress(arguments, f"{len(more)} more sources found in the residuals")
             sources += more
     return _deblend(arguments, "fit", scene.observations, sources, settings, given)
@@ -170,11 +170,11 @@ def _settings(arguments, settings):
     return replace(settings, **given)
 
 
-def _detect(arguments, scene, device):
+def _detect(arguments, scene):
     from ..measurement.detection import detect
 
     try:
-        found = detect(scene.observations, scene.frame, threshold=scene.threshold, device=device)
+        found = detect(scene.observations, scene.frame, threshold=scene.threshold)
     except ImportError as error:
         raise ValueError(f"{arguments.scene}: {error}; or give a catalogue in [sources]") from error
     if not found.sources:

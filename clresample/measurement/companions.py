@@ -94,12 +94,12 @@ def _top(before, at, after):
     return 0.0 if curved >= 0 else float(np.clip(0.5 * (before - after) / curved, -0.5, 0.5))
 
 
-def is_a_source(place, rest, model, image, channels, centres, fwhm):
+def is_a_source(place, rest, model, image, signals, centres, fwhm):
     """Whether a peak of what was left is a source of its own, as the head of this module says.
 
     place (2,) ints: (y, x) of the peak; rest, model, image (Ny, Nx) [sigma]: left over, models,
         what was searched
-    channels: (Co, Ny, Nx) [sigma] of each observation; centres (S, 2) [px]: of the sources
+    signals: Signal of each observation; centres (S, 2) [px]: of the sources
     fwhm [px]: of the searched image's PSF
     """
     at = tuple(place)
@@ -114,27 +114,27 @@ def is_a_source(place, rest, model, image, channels, centres, fwhm):
         return True
     # within one observation, of one PSF or nearly so: a clump is more compact than its galaxy
     near = centres[away < REACH_PX]
-    differs = sum(_other_colour(at, c, near, inside[host]) for c in channels if len(c) > 1)
+    differs = sum(
+        _other_colour(at, s.spectra, near, inside[host]) for s in signals if len(s.channels) > 1
+    )
     return bool(differs > OTHER_COLOUR)
 
 
-def _other_colour(at, channels, centres, host):
+def _other_colour(at, spectra, centres, host):
     """chi2, beyond its mean, by which the spectrum of what is left at a pixel differs from that of
-    the source it lies on, in one observation: its channels (C, Ny, Nx)."""
-    light = sum(_light_at(at, channels, centre) for centre in centres)
+    the source it lies on, in one observation: `spectra` of its Signal."""
+    light = sum(_light_at(at, spectra, centre) for centre in centres)
     noise = np.sqrt(2 + (MODEL_PART * light) ** 2)
-    rest = (channels[:, *at] - light) / noise
-    like = channels[:, *host] / noise
+    here, there = spectra(np.array([at, host]))
+    rest, like = (here - light) / noise, there / noise
     along = like @ rest
     return rest @ rest - along**2 / max(like @ like, 1e-12) - (len(rest) - 1)
 
 
-def _light_at(at, channels, centre):
+def _light_at(at, spectra, centre):
     """A source's own light (C,) at a pixel, by the same rule along the line from its centre."""
     step = np.array(at) - centre
     n = int(np.ceil(np.hypot(*step))) + 1
     along = np.linspace(0, 1, n)[:, None] * step
-    most = np.array(channels.shape[1:]) - 1
-    here, there = (np.clip(np.rint(centre + s * along).astype(int), 0, most) for s in (1, -1))
-    both = np.minimum(channels[:, here[:, 0], here[:, 1]], channels[:, there[:, 0], there[:, 1]])
-    return np.maximum(both.min(axis=1), 0)
+    both = [spectra(np.rint(centre + side * along).astype(int)) for side in (1, -1)]
+    return np.maximum(np.minimum(*both).min(axis=0), 0)

@@ -60,9 +60,7 @@ class Detection:
     image: np.ndarray
 
 
-def detect(
-    observations, frame=None, *, threshold=THRESHOLD, scatters=None, device=None
-) -> Detection:
+def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> Detection:
     """Find sources in all observations together, in each alone, and beside brighter ones.
 
     The sharpest image separates neighbours best, the combined one reaches the faintest sources. So
@@ -78,7 +76,6 @@ def detect(
     scatters (n_observations, n_widths): of the observations' signal to noise where there is no
         source, which it is divided by; None = as `noise_scatter` finds them, so that each patch has
         its own
-    device: as for `get_device`
     returns Detection; its sources can be given to `deblend` with its frame
 
     Raises ValueError for a threshold that is not a positive number, and for observations that do
@@ -86,27 +83,27 @@ def detect(
     Source: see the head of this module.
     """
     frame = frame or model_frame(observations)
-    return _search(observations, frame, threshold, device, [], scatters)
+    return _search(observations, frame, threshold, [], scatters)
 
 
-def noise_scatter(observation, frame, *, device=None) -> np.ndarray:
+def noise_scatter(observation, frame) -> np.ndarray:
     """Scatter (n_widths,) of an observation's signal to noise where there is no source, at least 1.
 
     More than 1 is noise that the weights do not tell of, such as that of correlated pixels.
 
-    observation: one; frame: Frame that it is searched in; device: as for `get_device`
+    observation: one; frame: Frame that it is searched in
     """
-    return signal_of(observation, frame, device).scatters()
+    return signal_of(observation, frame).scatters()
 
 
-def detect_more(result, *, threshold=THRESHOLD, device=None) -> Detection:
+def detect_more(result, *, threshold=THRESHOLD) -> Detection:
     """Find sources in a fit's residuals: those too faint beside others to be found before it.
 
     The residuals are searched as `detect` does, but for neighbours on flanks. Where the model is
     bright its own errors are larger than the noise: there the variance is 1 / w + (0.15 model)^2.
 
     result: a fitted blend
-    threshold [sigma], device: as for `detect`
+    threshold [sigma]: as for `detect`
     returns Detection in the frame of the fit, of new sources only: a peak within 0.7 FWHM of one of
         the fit's sources is left out
 
@@ -128,19 +125,18 @@ def detect_more(result, *, threshold=THRESHOLD, device=None) -> Detection:
             )
         )
     known = result.frame.place(result.sources)
-    return _search(left, result.frame, threshold, device, list(known), beside=False)
+    return _search(left, result.frame, threshold, list(known), beside=False)
 
 
-def _search(observations, frame, threshold, device, known, scatters=None, beside=True):
+def _search(observations, frame, threshold, known, scatters=None, beside=True):
     """Detection in the observations, without the known positions (y, x) [model px]."""
     if not 0 < threshold < math.inf:
         raise ValueError(f"threshold must be a positive number of sigmas, not {threshold}")
     sep = _import_sep()
-    signals = [signal_of(o, frame, device) for o in observations]
+    signals = [signal_of(o, frame) for o in observations]
     if scatters is None:
         scatters = [signal.scatters() for signal in signals]
-    for signal, scatter in zip(signals, scatters, strict=True):
-        signal.images[...] /= np.reshape(scatter, (-1, 1, 1, 1)).astype(np.float32)
+    signals = [one.over(scatter) for one, scatter in zip(signals, scatters, strict=True)]
     widths = np.array([_fwhm_px(o, frame) for o in observations])
     order = np.argsort(widths, kind="stable")
     everything, best = combined(signals)
@@ -174,7 +170,7 @@ def _search(observations, frame, threshold, device, known, scatters=None, beside
 def _companions(sep, signals, sharp, everything, places, threshold, fwhm):
     """Positions and heights of sources on the flanks of those at `places` (S, 2), in the sharpest
     observation, whose PSF has the width fwhm [px]."""
-    image, seen = signals[sharp].flat(), signals[sharp].seen.any(axis=0)
+    image, seen = signals[sharp].flat(), signals[sharp].n_seen > 0
     centres = np.array(
         [
             centred(image if image[tuple(p.astype(int))] > threshold else everything, p)
@@ -182,7 +178,6 @@ def _companions(sep, signals, sharp, everything, places, threshold, fwhm):
         ]
     )
     rest, model = left_over(image, seen, centres)
-    channels = [signal.images[0] for signal in signals]
     new = _new_peaks(
         sep,
         rest / noise_of(model),
@@ -195,7 +190,7 @@ def _companions(sep, signals, sharp, everything, places, threshold, fwhm):
     return [
         (place, float(rest[tuple(place.astype(int))]))
         for place, _ in new
-        if is_a_source(place.astype(int), rest, model, image, channels, centres, fwhm)
+        if is_a_source(place.astype(int), rest, model, image, signals, centres, fwhm)
     ]
 
 

@@ -1,15 +1,12 @@
-"""Signal to noise of observations in the model's pixels, under filters of several widths.
+"""Signal to noise of observations under filters of several widths, in the model's pixels.
 
 For light of unit flux at x, a point convolved with a Gaussian G, the best linear estimate in one
-channel, the matched filter, is
+channel is the matched filter: with weights w, data d and the PSF P, K = P * G,
 
-    n(x) = [G * P1 * R^T w d](x),    v(x) = [P1 * R^T w](x) |P2 * G|^2
+    n(x) = sum_q K(q - x) w(q) d(q),    v(x) = sum_q K(q - x)^2 w(q)
 
-and the signal to noise n / sqrt(v),
-
-with R the operator from the model frame, P1 the model's PSF and P2 the observed one, w the weights
-and d the data. R P1 is P2 at x: n is the sum of (P2 * G) w d over all observed pixels, wherever
-they lie, and v its variance where the weights change little over the PSF.
+and the signal to noise n / sqrt(v). It is found on the observation's own pixels; being as smooth as
+two PSFs, it is then interpolated (cubic splines) to the model's.
 
 Source: the matched filter, Zackay & Ofek 2017 (ApJ 836, 187); the sum of squares over bands,
 Szalay, Connolly & Szokoly 1999 (AJ 117, 68).
@@ -21,7 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..resampling.cache import cached_resampler
 from ..sky.noise import sigma_below_zero
 
 # [arcsec] Standard deviations of G: of points, of galaxies of the usual size in deep images (half
@@ -30,71 +26,101 @@ from ..sky.noise import sigma_below_zero
 WIDTHS_ARCSEC = (0.0, 0.2, 0.5)
 # of a channel's largest variance v: a point with less lies on pixels that are masked or not seen
 LEAST_WEIGHT = 0.1
+# of the same, below which float32 holds nothing of n any more
+NO_WEIGHT = 1e-5
 # [sigma^2] Sum of squares up to which its significance is tabulated; above, both grow alike
 TABLE_END, TABLE_STEP = 400.0, 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class Signal:
-    """One observation's signal to noise.
+    """One observation's signal to noise; of unit scatter in white noise.
 
-    images (W, C, Ny, Nx) [sigma]: float32, of each width and channel; of unit scatter in white
-        noise, 0 where a channel has not seen the sky
-    seen (C, Ny, Nx) bool: where it has
+    sums, squares (W, Ny, Nx): float32, in the model's pixels, of each width: the sum over channels
+        of the signal to noise, and that of the squares of what is positive; 0 where not seen
+    n_seen (Ny, Nx): how many channels have seen a pixel
+    channels (C, My, Mx) [sigma]: of the narrowest filter, on the observation's pixels
+    places (Ny, Nx, 2) [px]: of the model's pixels on these
     """
 
-    images: np.ndarray
-    seen: np.ndarray
+    sums: np.ndarray
+    squares: np.ndarray
+    n_seen: np.ndarray
+    channels: np.ndarray
+    places: np.ndarray
 
     def flat(self, width=0):
         """Channels together (Ny, Nx) [sigma], as of a spectrum of equal signal to noise in all."""
-        n_seen = self.seen.sum(axis=0)
-        return self.images[width].sum(axis=0) / np.sqrt(np.maximum(n_seen, 1))
+        return self.sums[width] / np.sqrt(np.maximum(self.n_seen, 1))
 
     def scatters(self):
         """Scatter (W,) of the channels together where there is no source, at least 1: that of the
         negative pixels, which are noise. Correlated noise has more."""
-        flats = (self.flat(w) for w in range(len(self.images)))
+        flats = (self.flat(w) for w in range(len(self.sums)))
         return np.array([max(1.0, sigma_below_zero(image) or 1.0) for image in flats])
 
+    def over(self, scatters):
+        """The same in units of these scatters (W,)."""
+        by = np.asarray(scatters, np.float32)[:, None, None]
+        return Signal(
+            self.sums / by, self.squares / by**2, self.n_seen, self.channels / by[0], self.places
+        )
 
-def signal_of(observation, frame, device=None) -> Signal:
+    def spectra(self, at):
+        """Signal to noise (n, C) [sigma] of the channels at pixels (n, 2) of the model, those
+        outside taken to its edge: that of the nearest observed pixel, 0 where there is none."""
+        at = np.clip(at, 0, np.array(self.n_seen.shape) - 1)
+        places = np.rint(self.places[at[:, 0], at[:, 1]]).astype(int)
+        shape = np.array(self.channels.shape[1:])
+        inside = ((places >= 0) & (places < shape)).all(axis=1)
+        places = np.clip(places, 0, shape - 1)
+        return np.where(inside, self.channels[:, places[:, 0], places[:, 1]], 0).T
+
+
+def signal_of(observation, frame) -> Signal:
     """The Signal of an observation in a frame, under the filters of `WIDTHS_ARCSEC`."""
     from scipy import fft
+    from scipy.ndimage import map_coordinates
 
     observation = observation.white
-    op = cached_resampler(frame, observation.grid, observation.psf, dtype=np.float32, device=device)
-    weights = observation.weights * op.covered
-    # in units of the noise, so that float32 holds data of any scale
-    unit = np.sqrt(weights.max(axis=(1, 2), keepdims=True))
-    unit[unit == 0] = 1
-    weights = weights / unit**2
-    n = op.adjoint((weights * observation.data * unit).astype(np.float32))
-    v = op.adjoint(weights.astype(np.float32))
-    sigmas = np.array(WIDTHS_ARCSEC) / frame.grid.pixel_scale_arcsec
+    places = frame.grid.map_to(observation.grid).at(*np.indices(frame.shape))
+    sigmas = np.array(WIDTHS_ARCSEC) / observation.grid.pixel_scale_arcsec
+    shape = observation.data.shape[1:]
     # zeros beyond the edges, wide enough for the PSF and four sigma of the widest filter
-    reach = max(frame.psf.images.shape[1:]) // 2 + int(4 * sigmas[-1])
-    size = [fft.next_fast_len(s + reach, real=True) for s in frame.shape]
-    nu_y, nu_x = np.fft.fftfreq(size[0]), np.fft.rfftfreq(size[1])
-    model_psf = frame.psf.otf(nu_y, nu_x)[0].astype(np.complex64)
-    inside = tuple(slice(s) for s in frame.shape)
-    images = np.zeros((len(sigmas), len(n), *frame.shape), np.float32)
-    seen = np.zeros(images.shape[1:], bool)
-    powers = _powers(observation, frame, sigmas)
-    for c in range(len(n)):
-        variance = fft.irfft2(fft.rfft2(v[c], size) * model_psf, size)[inside]
-        seen[c] = variance > LEAST_WEIGHT * variance.max(initial=0)
-        scale = np.zeros(frame.shape, np.float32)
-        scale[seen[c]] = 1 / np.sqrt(variance[seen[c]])
-        light = fft.rfft2(n[c], size) * model_psf
+    psf = observation.psf
+    reach = int(max(psf.images.shape[1:]) * psf.spacing) // 2 + int(4 * sigmas[-1]) + 1
+    size = [fft.next_fast_len(n + reach, real=True) for n in shape]
+    nu = np.fft.fftfreq(size[0]), np.fft.rfftfreq(size[1])
+    inside = tuple(slice(n) for n in shape)
+    totals = np.zeros((2, len(sigmas), *shape), np.float32)
+    channels, seen = np.zeros(observation.data.shape, np.float32), np.zeros(shape, np.int16)
+    for c, (data, weights) in enumerate(zip(observation.data, observation.weights, strict=True)):
+        unit = weights.max(initial=0) or 1.0  # so that float32 holds data of any scale
+        light = fft.rfft2((weights / unit**0.5 * data).astype(np.float32), size)
+        weight = fft.rfft2((weights / unit).astype(np.float32), size)
+        transfer = psf.select([c]).otf(*nu)[0].astype(np.complex64)
         for w, sigma in enumerate(sigmas):
-            if sigma:
-                filtered = light * _gaussian(nu_y, sigma)[:, None] * _gaussian(nu_x, sigma)
-            else:
-                filtered = light
-            image = fft.irfft2(filtered, size)[inside]
-            images[w, c] = image * scale / np.sqrt(powers[w, c])
-    return Signal(images, seen)
+            kernel = transfer * _gaussian(nu[0], sigma)[:, None] * _gaussian(nu[1], sigma)
+            power = fft.rfft2(fft.irfft2(kernel, size) ** 2)
+            variance = fft.irfft2(weight * power.conj(), size)[inside]
+            most = variance.max(initial=0)
+            some = variance > NO_WEIGHT * most
+            image = fft.irfft2(light * kernel.conj(), size)[inside]
+            image = np.where(some, image / np.sqrt(np.where(some, variance, 1)), 0)
+            totals[0, w] += image
+            totals[1, w] += np.maximum(image, 0) ** 2
+            if w == 0:
+                channels[c] = image
+                seen += variance > LEAST_WEIGHT * most
+    at = np.moveaxis(places, -1, 0)
+    n_seen = map_coordinates(seen, at, order=0)
+    found = np.zeros((2, len(sigmas), *frame.shape), np.float32)
+    for total, image in zip(
+        totals.reshape(-1, *shape), found.reshape(-1, *frame.shape), strict=True
+    ):
+        map_coordinates(total, at, order=3, output=image)
+        image[n_seen == 0] = 0
+    return Signal(found[0], np.maximum(found[1], 0), n_seen, channels, places)
 
 
 def combined(signals) -> tuple[np.ndarray, np.ndarray]:
@@ -107,15 +133,14 @@ def combined(signals) -> tuple[np.ndarray, np.ndarray]:
         very blue ones are in few bands. Both are in units in which noise alone is normal. Noise
         reaches 5 in the largest of them six times as often as in one: once in 3e5 resolved places
     """
-    n_seen = sum(s.seen.sum(axis=0) for s in signals)
+    n_seen = sum(s.n_seen for s in signals)
     root = np.sqrt(np.maximum(n_seen, 1))
-    first, best = None, None
+    flats = [sum(s.sums[w] for s in signals) / root for w in range(len(WIDTHS_ARCSEC))]
+    best = np.maximum.reduce(flats)
     for w in range(len(WIDTHS_ARCSEC)):
-        flat = sum(s.images[w].sum(axis=0) for s in signals) / root
-        squares = sum((np.maximum(s.images[w], 0) ** 2).sum(axis=0) for s in signals)
-        one = np.maximum(flat, significance(squares, n_seen))
-        first, best = (flat, one) if first is None else (first, np.maximum(best, one))
-    return first, best
+        squares = sum(s.squares[w] for s in signals)
+        best = np.maximum(best, significance(squares, n_seen))
+    return flats[0], best
 
 
 def significance(squares, n_channels) -> np.ndarray:
@@ -145,21 +170,3 @@ def significance(squares, n_channels) -> np.ndarray:
 def _gaussian(nu, sigma):
     """Transform of a Gaussian of `sigma` [px] at frequencies nu [1/px]."""
     return np.exp(-2 * (np.pi * sigma * nu) ** 2).astype(np.float32)
-
-
-def _powers(observation, frame, sigmas):
-    """|P2 * G|^2 (W, C) of the PSFs under Gaussians of `sigmas` [model px], per observed pixel."""
-    psf = observation.psf
-    step = observation.grid.pixel_scale_arcsec * psf.spacing / frame.grid.pixel_scale_arcsec
-    shape = [2 * n for n in psf.images.shape[1:]]
-    nu_y, nu_x = (np.fft.fftfreq(n) for n in shape)
-    power = np.abs(np.fft.fft2(psf.images, shape)) ** 2
-    area = (psf.images**2).sum(axis=(1, 2)) / psf.spacing**2
-    found = []
-    for sigma in sigmas / step:
-        gauss = np.exp(-4 * (np.pi * sigma) ** 2 * (nu_y[:, None] ** 2 + nu_x**2))
-        found.append(area * (power * gauss).sum(axis=(1, 2)) / power.sum(axis=(1, 2)))
-    powers = np.array(found)
-    if len(powers[0]) == 1:  # one PSF for all channels
-        powers = np.repeat(powers, observation.weights.shape[0], axis=1)
-    return powers

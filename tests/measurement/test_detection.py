@@ -125,7 +125,7 @@ def test_what_a_fit_leaves_over_is_found(device):
     result = deblend(
         observations, first, frame=frame, device=device, settings=Settings(max_iter=20)
     )
-    more = detect_more(result, device=device)
+    more = detect_more(result)
     assert nearest(more, 40, 52) < 3
     assert all(np.hypot(s.position_px[0] - 40, s.position_px[1] - 40) > 2 for s in more.sources)
 

@@ -9,6 +9,7 @@ from scipy import ndimage
 
 from ...files.whole_file import FileError
 from ...measurement.detection import detect, noise_scatter
+from ...measurement.signal import WIDTHS_ARCSEC
 from ...sky.frame import model_frame
 from ..box import Box
 
@@ -38,12 +39,12 @@ class Found:
     lit: np.ndarray
 
 
-def search(mosaics, reference, tile, *, threshold, scatters=None, device=None) -> Found:
+def search(mosaics, reference, tile, *, threshold, scatters=None) -> Found:
     """Search one tile in all mosaics together.
 
     mosaics: of the field; reference: Grid of the model's pixels; tile: Tile
     threshold [sigma]: least signal to noise of a peak
-    scatters {mosaic's name: scatter of its signal to noise}: see `scatters_of`; None = each tile's
+    scatters {mosaic's name: scatters of its signal to noise}: see `scatters_of`; None = each tile's
 
     Raises FileError for pixels that cannot be read, ImportError without sep.
     """
@@ -54,7 +55,7 @@ def search(mosaics, reference, tile, *, threshold, scatters=None, device=None) -
         return Found(np.zeros((0, 2)), np.zeros(0), empty.astype(np.float16), empty > 0)
     frame = model_frame(observations, grid=_cut(reference, tile.outer))
     known = scatters and [scatters[o.name] for o in observations]
-    found = detect(observations, frame, threshold=threshold, scatters=known, device=device)
+    found = detect(observations, frame, threshold=threshold, scatters=known)
     positions = np.array([s.position_px for s in found.sources]).reshape(-1, 2)
     radius = footprint_radius(observations, frame)
     lit = grown_footprints(found.image > LIGHT, positions, radius)
@@ -65,13 +66,13 @@ def search(mosaics, reference, tile, *, threshold, scatters=None, device=None) -
     return Found(positions[own], found.peaks[own], light, lit[inner])
 
 
-def place(mosaics, reference, tile, positions, *, scatters=None, device=None) -> Found:
+def place(mosaics, reference, tile, positions, *, scatters=None) -> Found:
     """The Found of a tile for sources that a catalogue gives, positions (S, 2) [px of the field].
 
     Their light is seen as `search` sees it; peaks are the combined signal to noise there.
     """
-    whole, given = tile._replace(core=tile.outer), {"scatters": scatters, "device": device}
-    outer = search(mosaics, reference, whole, threshold=1e30, **given)
+    whole = tile._replace(core=tile.outer)
+    outer = search(mosaics, reference, whole, threshold=1e30, scatters=scatters)
     own = tile.core.holds(positions)
     near = tile.outer.holds(positions)
     light = outer.light.astype(np.float64)
@@ -88,15 +89,16 @@ def place(mosaics, reference, tile, positions, *, scatters=None, device=None) ->
     return Found(positions[own], peaks, outer.light[inner], lit[inner])
 
 
-def scatters_of(mosaics, reference, device=None) -> dict:
-    """{mosaic's name: scatter of its signal to noise without sources}, from the field's middle.
+def scatters_of(mosaics, reference) -> dict:
+    """{mosaic's name: scatters of its signal to noise without sources}, from the field's middle.
 
-    One number for the whole field, so that the same is found however it is divided into tiles.
+    A list for each, as `noise_scatter` finds them: the same for the whole field, so that the same
+    is found however it is divided into tiles.
     """
     region = Box.of(reference.shape)
     middle = [(a + b) // 2 for a, b in zip(region[:2], region[2:], strict=True)]
     box = Box(*middle, *middle).grown(SAMPLE_PX // 2).meet(region)
-    found = dict.fromkeys((mosaic.name for mosaic in mosaics), 1.0)
+    found = {mosaic.name: [1.0] * len(WIDTHS_ARCSEC) for mosaic in mosaics}
     try:
         observations = observations_on(mosaics, reference, box)
     except FileError:  # its tile will say so
@@ -104,7 +106,7 @@ def scatters_of(mosaics, reference, device=None) -> dict:
     if observations:
         frame = model_frame(observations, grid=_cut(reference, box))
         for o in observations:
-            found[o.name] = noise_scatter(o, frame, device=device)
+            found[o.name] = noise_scatter(o, frame).tolist()
     return found
 
 

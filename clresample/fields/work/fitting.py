@@ -146,12 +146,12 @@ def _second_look(job, given, cuts, results):
     `clresample deblend` takes, leaves bright galaxies' own structure in them: in simulated fields
     15 % of all rows were clumps of it then, and no more true sources were found.
     """
-    device, again = get_device(job.device), {}
+    again = {}
     for i, (cut, result) in enumerate(zip(cuts, results, strict=True)):
         if isinstance(result, Failure):
             continue
         try:
-            found = detect_more(result, threshold=job.threshold, device=device).sources
+            found = detect_more(result, threshold=job.threshold).sources
         except ERRORS:
             continue  # the fit stands as it is
         new = [source for source in found if _on_patch(given, cut.patch, source)]

@@ -24,7 +24,7 @@ FILE = "look.json"
 class Look:
     """What a run knows before it searches.
 
-    scatters {mosaic's name: scatter of its signal to noise}: see `scatters_of`
+    scatters {mosaic's name: scatters of its signal to noise}: see `scatters_of`
     devices: names of those asked for; memory [bytes]: of the smallest, for one group
     """
 
@@ -71,7 +71,7 @@ def _given(field, sharing):
 def _look(field, sharing, given):
     """sharing: [(choice of a device, how many workers share it)]; None is the worker's own."""
     devices = [(get_device(field.device if choice is None else choice), n) for choice, n in sharing]
-    scatters = scatters_of(field.mosaics, field.reference, devices[0][0])
+    scatters = scatters_of(field.mosaics, field.reference)
     look = Look(
         {name: np.asarray(scatter).tolist() for name, scatter in scatters.items()},
         [device.name for device, _ in devices],

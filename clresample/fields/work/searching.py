@@ -124,11 +124,10 @@ def _nothing(shared, tile):
 def _search_tile(shared, tile, given):
     """Search one tile: the number of sources, and what was found as bytes."""
     known = shared.mosaics, shared.reference, tile
-    more = {"scatters": shared.scatters, "device": shared.device}
     if shared.positions is None:
-        found = search(*known, threshold=shared.threshold, **more)
+        found = search(*known, threshold=shared.threshold, scatters=shared.scatters)
     else:
-        found = place(*known, shared.positions, **more)
+        found = place(*known, shared.positions, scatters=shared.scatters)
     file = BytesIO()
     np.savez(
         file,

@@ -1,0 +1,49 @@
+"""Memory of a process and all that it has started, watched while they run."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+LOOK_S = 0.25  # [s] between two looks: what comes and goes faster is missed
+
+
+class TreeMemory(threading.Thread):
+    """Watches the memory of a process's tree: `peak` [bytes], 0 where the system does not tell.
+
+    Proportional set size: pages that several processes share are counted once in all.
+    """
+
+    def __init__(self, pid):
+        super().__init__(daemon=True)
+        self.pid, self.peak, self.over = pid, 0, threading.Event()
+
+    def run(self):
+        while not self.over.wait(LOOK_S):
+            self.peak = max(self.peak, sum(map(proportional, tree(self.pid))))
+
+    def stop(self):
+        """End the watch; returns the peak [bytes]."""
+        self.over.set()
+        self.join()
+        return self.peak
+
+
+def tree(pid):
+    """A process and all its descendants that live."""
+    found = [pid]
+    for one in found:
+        try:
+            found += map(int, Path(f"/proc/{one}/task/{one}/children").read_text().split())
+        except (OSError, ValueError):
+            continue
+    return found
+
+
+def proportional(pid):
+    """Proportional set size [bytes] of a process; 0 of one that has ended."""
+    try:
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    except OSError:
+        return 0
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("Pss:")), 0)

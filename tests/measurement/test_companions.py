@@ -1,0 +1,82 @@
+"""Neighbours on the flanks of brighter sources, and clumps that are none."""
+
+import numpy as np
+import pytest
+
+from clresample.measurement.companions import (
+    CLUMP,
+    centred,
+    is_a_source,
+    left_over,
+    noise_of,
+)
+from clresample.measurement.signal import Signal
+
+SHAPE = (121, 121)
+FWHM = 5.0  # [px] of a point in these images
+SEEN = np.ones(SHAPE, bool)
+
+
+def spot(place, height, sigma=FWHM / 2.355, ratio=1.0):
+    y, x = np.indices(SHAPE)
+    radius = (y - place[0]) ** 2 + ((x - place[1]) / ratio) ** 2
+    return (height * np.exp(-0.5 * radius / sigma**2)).astype(np.float32)
+
+
+def rest_of(image, *places, seen=SEEN):
+    return left_over(image, seen, np.array(places, float))
+
+
+def test_a_symmetric_source_leaves_little_and_its_model_is_its_light():
+    image = spot((60.3, 58.6), 500, sigma=6, ratio=1.6)
+    rest, model = rest_of(image, (60.3, 58.6))
+    assert np.abs(rest).max() < 0.02 * 500
+    assert (rest / noise_of(model)).max() < 5
+    np.testing.assert_allclose(model.sum(), image.sum(), rtol=0.05)
+
+
+def test_a_neighbour_on_the_flank_is_left_with_its_height():
+    host, other = spot((60, 60), 300, sigma=4), spot((60, 68), 40)
+    rest, model = rest_of(host + other, (60, 60))
+    peak = np.unravel_index(rest.argmax(), SHAPE)
+    assert np.hypot(peak[0] - 60, peak[1] - 68) < 1.5
+    assert rest.max() == pytest.approx(40, rel=0.15)
+    np.testing.assert_allclose(model[60, 40:60], host[60, 40:60], atol=8)
+
+
+def test_a_side_that_was_not_seen_is_told_by_the_other():
+    image = spot((60, 60), 300, sigma=4)
+    seen = SEEN.copy()
+    seen[:, 63:] = False
+    rest, model = rest_of(np.where(seen, image, 0), (60, 60), seen=seen)
+    assert not rest[~seen].any()
+    assert rest[seen].max() < 6 and model[60, 56] == pytest.approx(image[60, 56], rel=0.05)
+    assert not rest_of(np.zeros(SHAPE), (60, 80), seen=seen)[1].any()
+
+
+def judge(image, channels, place, centre=(60.0, 60.0)):
+    rest, model = rest_of(image, centre)
+    places = np.moveaxis(np.indices(SHAPE), 0, -1).astype(float)
+    signals = [Signal(channels[None, 0], channels[None, 0], SEEN.astype(int), channels, places)]
+    return is_a_source(np.array(place), rest, model, image, signals, np.array([centre]), FWHM)
+
+
+def test_a_clump_of_the_galaxys_colours_is_no_source_and_one_of_others_is():
+    galaxy, clump = spot((60, 60), 1000, sigma=5), spot((60, 71), 70)
+    same = np.stack([0.5 * (galaxy + clump), 0.5 * (galaxy + clump), 0.2 * (galaxy + clump)])
+    other = np.stack([0.5 * galaxy + 1.0 * clump, 0.5 * galaxy, 0.2 * galaxy])
+    assert not judge(galaxy + clump, same, (60, 71))
+    assert judge(galaxy + clump, other, (60, 71))
+
+
+def test_what_is_bright_beside_the_light_about_it_is_a_source_in_any_colour():
+    galaxy = spot((60, 60), 100, sigma=4)
+    for height, is_one in ((0.5 * CLUMP * 10, False), (1.5 * CLUMP * 10, True)):
+        image = galaxy + spot((60, 76), height)  # where there is next to no light: H = 100, m = 0
+        assert judge(image, np.stack([image, image]), (60, 76)) == is_one
+
+
+def test_centres_are_found_to_part_of_a_pixel():
+    image = spot((60.3, 58.8), 100)
+    np.testing.assert_allclose(centred(image, (60, 59)), (60.3, 58.8), atol=0.05)
+    np.testing.assert_array_equal(centred(image, (0, 59)), (0, 59))
