@@ -18,6 +18,7 @@ import numpy as np
 from . import selftest
 from .discovery import (
     DeviceError,
+    alone,
     builds_fp64,
     choose,
     find_devices,
@@ -48,6 +49,7 @@ class Device:
     compute_units: their number
     memory, max_alloc, in_use [bytes]: all of it, the largest buffer, what arrays made here hold
     remembered: what earlier runs have measured of this device
+    alone: context in which a thread has the device for itself, where its driver needs that
     profile: the times of all launches, where CLRESAMPLE_PROFILE was set; or None
     """
 
@@ -62,7 +64,7 @@ class Device:
         self.in_use, self.remembered = 0, Remembered(cl_device)
         _opened[self] = os.getpid()
         self._enqueue, self._error = cl.enqueue_nd_range_kernel, cl.Error
-        self._programs, self._lock = Programs(self), threading.Lock()
+        self._programs, self._lock, self.alone = Programs(self), threading.Lock(), alone(cl_device)
         self.context = self._call(cl.Context, [cl_device])
         self.profile = started(self.name)
         timed = cl.command_queue_properties.PROFILING_ENABLE if self.profile else 0

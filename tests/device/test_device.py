@@ -1,6 +1,8 @@
 """Devices at work: memory, kernels, and the errors that a user can meet on the way."""
 
 import gc
+import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pyopencl as cl
@@ -9,6 +11,7 @@ from helpers.checkout import ROOT, run_python
 
 from clresample import DeviceError, list_devices
 from clresample.device import device as device_module, discovery as discover
+from clresample.device.discovery import alone
 
 POCL = "Portable Computing Language"
 
@@ -183,3 +186,24 @@ def test_kernels_under_other_settings(setting):
     tests = str(ROOT / "tests")
     answer = run_python("-m", "pytest", "-q", "-x", "-m", "smoke", tests, **environment)
     assert answer.returncode == 0, answer.stdout
+
+
+@pytest.mark.parametrize(
+    "platform, one", [("rusticl", True), ("Portable Computing Language", False)]
+)
+def test_threads_wait_for_each_other_where_the_driver_needs_it(platform, one):
+    """Fits of one thread after the other on rusticl; elsewhere nobody waits."""
+    context = alone(SimpleNamespace(platform=SimpleNamespace(name=platform)))
+    entered = []
+
+    def other():
+        with context:
+            entered.append(True)
+
+    with context, context:  # the same thread may come again
+        thread = threading.Thread(target=other)
+        thread.start()
+        thread.join(0.3)
+        assert entered == ([] if one else [True])
+    thread.join()
+    assert entered == [True]

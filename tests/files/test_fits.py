@@ -168,14 +168,6 @@ def test_files_that_are_no_images(tmp_path, cube):
         assert "no HDU holds" in refusal(read_image, path)
 
 
-def test_data_of_a_negative_size_are_refused(tmp_path):
-    """The next header would begin where this one does: astropy reads it again and again."""
-    path = stored(tmp_path / "p.fits", np.ones((11, 11)))
-    negative = b"GCOUNT  =                   -5"
-    path.write_bytes(path.read_bytes().replace(b"EXTEND  =                    T", negative))
-    assert "damaged, HDU 0 has data of a negative size" in refusal(read_psf, path)
-
-
 def test_only_padding_missing_is_no_loss(tmp_path, cube):
     whole = cube.read_bytes()
     end = 2880 + PIXELS.nbytes

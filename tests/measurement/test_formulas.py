@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from helpers.blends import MIDDLE, SCALE, blend, gaussian, observe, round_component, two_sources
 
+from clresample.deblending.rendered import Rendered
 from clresample.deblending.result import Component
 from clresample.measurement.catalogue import Flag, catalogue
 from clresample.measurement.quality import box_chi2
-from clresample.measurement.residuals import worst_residuals
+from clresample.measurement.residuals import _window, worst_residuals
 from clresample.measurement.shapes import moments
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
@@ -148,3 +149,20 @@ def test_chi2_counts_the_first_rows_and_columns():
     part = Component(0, (0, 0), np.ones((5, 5)), np.array([0.0]))
     result = blend([part], observations=(observe(GRID, ("g",), data=data),))
     assert box_chi2(result, 0, result.footprints[0])[0] == pytest.approx(9 * 9 / 25)
+
+
+def test_moments_of_nothing_are_no_numbers():
+    dark = Component(0, (0, 0), np.zeros((3, 3)), np.ones(1))
+    centroid, second = moments([dark], np.ones(1))
+    assert centroid.shape == (2,) and second.shape == (2, 2)
+    assert np.isnan(centroid).all() and np.isnan(second).all()
+
+
+def test_a_window_holds_the_light_of_all_components():
+    """Of a source whose components shine apart from each other: the window spans them both."""
+    rendered = Rendered.cropped(
+        (2, 1, 40, 40), np.array([[3, 4], [20, 25]]), [np.ones((1, 6, 7)), np.ones((1, 8, 9))]
+    )
+    assert _window(rendered, [0, 1], (40, 40)) == (slice(3, 28), slice(4, 34))
+    assert _window(rendered, [1], (40, 40)) == (slice(20, 28), slice(25, 34))
+    assert _window(np.ones((2, 1, 40, 41)), [0, 1], (40, 41)) == (slice(0, 40), slice(0, 41))

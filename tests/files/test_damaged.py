@@ -1,4 +1,4 @@
-"""Images compressed by HCOMPRESS: astropy writes over memory where header and tiles disagree."""
+"""Files on which astropy writes over memory or never ends: refused before it reads pixels."""
 
 import numpy as np
 import pytest
@@ -51,3 +51,13 @@ def test_a_tile_at_the_end_that_is_too_large_is_refused(tmp_path):
     claim(path, "ZNAXIS2", 20)
     with pytest.raises(FileError, match="tile 1 is not of the 91 pixels"):
         read_image(path)
+
+
+def test_data_of_a_negative_size_are_refused(tmp_path):
+    """The next header would begin where this one does: astropy reads it again and again."""
+    path = tmp_path / "p.fits"
+    fits.PrimaryHDU(np.ones((11, 11))).writeto(path)
+    negative = b"GCOUNT  =                   -5"
+    path.write_bytes(path.read_bytes().replace(b"EXTEND  =                    T", negative))
+    with pytest.raises(FileError, match="damaged, HDU 0 has data of a negative size"):
+        read_psf(path)
