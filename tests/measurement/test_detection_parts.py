@@ -91,7 +91,8 @@ def test_beyond_the_border_of_an_image_nothing_is_seen():
 
 
 def signal_to_noise(observation, frame=None):
-    return module._signal_to_noise(observation, frame or model_frame([observation]), None)
+    """Of all channels together, under the narrowest filter."""
+    return signal_of(observation, frame or model_frame([observation])).flat()
 
 
 @pytest.mark.parametrize("unit", [1e15, 1e-15])
@@ -125,5 +126,14 @@ def test_an_object_has_as_many_pixels_as_it_has_to(area, n):
 
     image = np.zeros((20, 20), np.float32)
     image[10, 12] = 9
-    found = module._peaks(sep, image, 5.0, area)
+    found = module._new_peaks(sep, image, 5.0, area, [], 1.0)
     assert [(tuple(place), peak) for place, peak in found] == [((10, 12), 9)][:n]
+
+
+def test_the_brightest_peak_comes_first():
+    import sep
+
+    image = np.zeros((30, 30), np.float32)
+    for place, peak in (((5, 5), 9), ((20, 8), 30), ((12, 24), 15)):
+        image[place] = peak
+    assert [peak for _, peak in module._new_peaks(sep, image, 5.0, 1, [], 1.0)] == [30, 15, 9]
