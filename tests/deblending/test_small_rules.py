@@ -8,7 +8,7 @@ import pytest
 from helpers.scenes import blend
 
 from clresample.deblending.fit import Fit, begin
-from clresample.deblending.posterior.exposure import Transfer
+from clresample.deblending.posterior.exposure import Exposure, Transfer
 from clresample.deblending.settings import Settings
 from clresample.deblending.solver.learned.evidence import (
     LEAST_SEEN,
@@ -110,3 +110,25 @@ def test_trials_of_a_direction_are_counted_one_by_one(refused):
         assert not accepted[0]
         progress.next(accepted)
         assert progress._trials[0] == i
+
+
+def test_an_exposure_shows_what_the_operator_renders(device):
+    """On pixels parallel to the model's, to a part of 1e-3, as far as it follows the light."""
+    one = Fit(blend(), Settings(), device, np.float32, pad=1)
+    view, observation = one.views[0], one.blend.observations[0]
+    exposure = Exposure.of(view, one.frame, observation, np.zeros(1, int))
+    y, x = np.indices((13, 11))
+    image = np.exp(-((y - 6) ** 2 + (x - 5) ** 2) / (2 * 1.7**2))
+    whole = np.zeros(view.op.shape_in, np.float32)
+    origin = np.array([8, 9])
+    whole[:, 8:21, 9:20] = image
+    wanted = view.op(whole) * view.root
+    low, high = exposure.window(origin, image.shape)
+    reach = exposure.reach_px
+    for at, o, n, first, end in zip((exposure.y, exposure.x), origin, image.shape, low, high):
+        near = np.flatnonzero((at >= o - reach) & (at < o + n - 1 + reach))
+        assert (near[0], near[-1] + 1) == (first, end)
+    seen = exposure.observe(image[None], 0, origin, low, high)[0]
+    part = wanted[:, low[0] : high[0], low[1] : high[1]]
+    assert seen.shape == part.shape and min(part.shape[1:]) > 13
+    np.testing.assert_allclose(seen, part, atol=2e-3 * wanted.max())
