@@ -4,7 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
-from helpers.geometries import GEOMETRIES, ONE_OF_EACH
+from helpers.geometries import GEOMETRIES, ONE_OF_EACH, sky_grid
 from helpers.solver import PRIOR, every_type, posed
 from helpers.varying import FLUXES, NOISE, SHAPE, observation, stars, widening
 
@@ -21,7 +21,7 @@ from clresample import (
     deblend,
     deblend_many,
 )
-from clresample.deblending.fit import Fit
+from clresample.deblending.fit import Fit, begin
 from clresample.deblending.solver.buffers import Buffers
 from clresample.deblending.solver.operators import MorphologyOperator, SpectraOperator
 from clresample.deblending.solver.rendering import choice
@@ -29,6 +29,7 @@ from clresample.deblending.solver.scene_model import compose
 from clresample.resampling import reference
 from clresample.resampling.plan import Precision, make_plan
 from clresample.resampling.resampler import Resampler
+from clresample.sky.frame import Frame
 from clresample.sky.psf import PSF
 from clresample.testing import check_adjoint
 
@@ -165,6 +166,30 @@ def test_every_kind_of_fit_follows_the_psf(device, given):
     if result.errors is not None:
         error = np.stack([np.array(table[f"flux_err_{c}"]) for c in "grGR"], axis=1)
         assert (np.abs(found - np.tile(FLUXES, 2)) / error).max() < 4.5
+
+
+@pytest.mark.parametrize("given", [{"angle_deg": 25}, {"sip": 2e-4}], ids=["turned", "distorted"])
+def test_turned_and_distorted_pixels_see_each_source_s_psf(device, given):
+    sharp, bent = sky_grid((90, 110), 0.15), sky_grid((70, 84), 0.2, **given)
+    places = np.array([(25.0, 30.0), (27.0, 82.0), (66.0, 31.0), (64.0, 78.0)])
+    frame = Frame(sharp, MODEL_PSF)
+    model, fluxes = np.zeros((4, *sharp.shape)), FLUXES[:, :1] / 1e3
+    for image, (y, x) in zip(model, places.astype(int), strict=True):
+        image[y - 7 : y + 8, x - 7 : x + 8] = MODEL_PSF.images[0]
+    there, data = sharp.positions_in(bent, *places.T), 0
+    for image, flux, at in zip(model, fluxes, there, strict=True):
+        op = Resampler(sharp, MODEL_PSF, bent, widening(*at)[0], device=device)
+        data = data + flux * op.render(image.astype(np.float32))
+    field = FunctionPSF(lambda y, x: widening(y, x)[0])
+    o = Observation(data, field, bent, variance=1e-8)
+    blend = Blend((o,), tuple(points(places)), frame)
+    settings = Settings(psf_error=0, psf_tolerance=1e-5)
+    point = Fit(blend, settings, device, np.float32, pad=1)
+    assert point.views[0].op.geometry == ("distorted" if "sip" in given else "affine")
+    begin([point])  # in boxes, which have plans of their own
+    np.testing.assert_allclose(point.state.spectra * point.unit, fluxes * model.max(), rtol=3e-3)
+    result = deblend([o], blend.sources, frame=frame, settings=settings, device=device)
+    assert np.abs(result.residual(0)).max() < 1e-3 * data.max()
 
 
 def test_errors_cover_fluxes_all_over_a_blend(device):
