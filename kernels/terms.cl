@@ -10,8 +10,8 @@
  *
  * turn     z = D o phase o z0: n_bands spectra from one, each moved by its slot's own offset:
  *          z0 (items, 2 h_y, n_pad), z (items * n_bands, 2 h_y, n_pad); D of one plan, TERMS of
- *          each band, added up with the slot's shares (slots, n_bands, TERMS), which are not read where
- *          there is one; phase (slots, h_y + n_pad / 2, 2) cos and sin by row and by column;
+ *          each band, added up with the slot's shares (slots, n_bands, TERMS), which are not read
+ *          where there is one; phase (slots, h_y + n_pad / 2, 2) cos and sin by row and by column;
  *          item i belongs to slot first + i / n;  launch: (X, h_y, items * n_bands)
  *
  * Launch: (X, h_y, n); X is 1 where a work-item walks a whole row (ROWS of group.h), else n_pad / 2

@@ -1,11 +1,10 @@
-"""PSFs that vary from source to source of one blend: the solver's operators, whole fits, fluxes."""
+"""PSFs that vary from source to source of one blend: whole fits, fluxes, errors."""
 
 import pickle
 
 import numpy as np
 import pytest
-from helpers.geometries import GEOMETRIES, ONE_OF_EACH
-from helpers.solver import PRIOR, every_type, posed
+from helpers.geometries import sky_grid
 from helpers.varying import FLUXES, NOISE, SHAPE, observation, stars, widening
 
 from clresample import (
@@ -21,105 +20,13 @@ from clresample import (
     deblend,
     deblend_many,
 )
-from clresample.deblending.fit import Fit
-from clresample.deblending.solver.buffers import Buffers
-from clresample.deblending.solver.operators import MorphologyOperator, SpectraOperator
-from clresample.deblending.solver.rendering import choice
-from clresample.deblending.solver.scene_model import compose
-from clresample.resampling import reference
-from clresample.resampling.plan import Precision, make_plan
+from clresample.deblending.fit import Fit, begin
 from clresample.resampling.resampler import Resampler
+from clresample.sky.frame import Frame
 from clresample.sky.psf import PSF
-from clresample.testing import check_adjoint
 
-FRAME = 31, 26
-BOXES = (
-    ((2, 3, 11, 14), (0, 0, 9, 8), (20, 17, 11, 9)),
-    ((4, 0, 7, 26), (0, 0, 31, 26)),
-)
-WIDTHS = np.array([[1.4, 1.6, 1.5], [1.9, 1.7, 2.1]])
 MODEL_PSF = PSF.gaussian(0.8, n_pixels=15)
-every_depth = pytest.mark.parametrize("depth", [0, 1, 2])
 CORNERS = np.array([(12.3, 13.1), (13.6, 82.4), (58.2, 12.7), (57.4, 81.8)])
-
-
-def batch_of(device, geometry, dtype):
-    """Two scenes of one observation of two bands, three terms; buffers and their operator."""
-    if dtype == np.float64 and not device.has_fp64:
-        pytest.skip(f"{device.name} has no double precision")
-    plan = make_plan(
-        GEOMETRIES[geometry](),
-        MODEL_PSF,
-        PSF.gaussian(WIDTHS.ravel()),
-        precision=Precision.of(dtype),
-        n_terms=3,
-    )
-    op, pairs = Resampler.from_plans([plan], dtype=dtype, device=device), []
-    for i, boxes in enumerate(BOXES):
-        rng, n = np.random.default_rng(i), len(boxes)
-        shares = rng.normal(size=(n, 2, 3))
-        given = {
-            "shape": FRAME,
-            "extent": FRAME,
-            "ops": [op],
-            "data": [rng.normal(0, 3, op.shape_out)],
-            "weights": [rng.uniform(0.5, 1.5, op.shape_out)],
-            "scale": np.ones((n, 2)),
-            "spectra": rng.uniform(0.5, 2, (n, 2)),
-            "sky": np.zeros(2),
-            "shares": [shares],
-        }
-        pairs.append(posed(device, dtype, boxes=boxes, seed=i, **given))
-    scenes, states = map(list, zip(*pairs, strict=True))
-    return Buffers(scenes, states, device, dtype, PRIOR), op, pairs
-
-
-@every_type
-@every_depth
-@pytest.mark.parametrize("geometry", ONE_OF_EACH)
-def test_each_source_is_seen_through_its_own_psf(device, geometry, depth, dtype):
-    b, op, pairs = batch_of(device, geometry, dtype)
-    shown = MorphologyOperator(b, op, choice.rendering(b, 0, op, depth))
-    found = shown.forward(b.device.get(b.morph))
-    psf = PSF.gaussian(WIDTHS.ravel())
-    for (scene, state), image in zip(pairs, found, strict=True):
-        wanted = 0
-        for i, shares in enumerate(scene.shares[0]):  # source by source, in float64
-            spectra = np.repeat(state.spectra[i], 3)[None]
-            model = compose(FRAME, scene.origin[i : i + 1], state.morph[i : i + 1], spectra)
-            n_fft = op.certificate.n_fft
-            seen = reference.resample(model, op.mapping, MODEL_PSF, psf, n_fft)
-            wanted = wanted + (seen.reshape(2, 3, *seen.shape[1:]) * shares[:, :, None, None]).sum(
-                1
-            )
-        error = np.abs(image - wanted).max() / np.abs(wanted).max()
-        assert error < {np.float32: 3e-6, np.float64: 1e-12}[dtype]
-
-
-@every_type
-@every_depth
-@pytest.mark.parametrize("kind", [MorphologyOperator, SpectraOperator])
-def test_gradients_are_the_adjoint(device, kind, depth, dtype):
-    b, op, _ = batch_of(device, "30 degrees", dtype)
-    check_adjoint(
-        kind(b, op, choice.rendering(b, 0, op, depth)),
-        np.random.default_rng(1),
-        tolerance={np.float32: 3e-6, np.float64: 1e-12}[dtype],
-    )
-
-
-def test_the_dot_test_fails_where_the_way_back_takes_other_shares(device):
-    b, op, _ = batch_of(device, "30 degrees", np.float32)
-    shown = MorphologyOperator(b, op, choice.rendering(b, 0, op, 2))
-    parts, right = shown.rendering._composition._parts, shown._adjoint
-
-    def wrong(y, out):
-        parts._share.bind(shares=b.put(np.ones((5, 2, 3))))
-        right(y, out)
-
-    shown._adjoint = wrong
-    with pytest.raises(AssertionError, match="<Ax,y>"):
-        check_adjoint(shown, np.random.default_rng(1))
 
 
 def chi2(result):
@@ -165,6 +72,30 @@ def test_every_kind_of_fit_follows_the_psf(device, given):
     if result.errors is not None:
         error = np.stack([np.array(table[f"flux_err_{c}"]) for c in "grGR"], axis=1)
         assert (np.abs(found - np.tile(FLUXES, 2)) / error).max() < 4.5
+
+
+@pytest.mark.parametrize("given", [{"angle_deg": 25}, {"sip": 2e-4}], ids=["turned", "distorted"])
+def test_turned_and_distorted_pixels_see_each_source_s_psf(device, given):
+    sharp, bent = sky_grid((90, 110), 0.15), sky_grid((70, 84), 0.2, **given)
+    places = np.array([(25.0, 30.0), (27.0, 82.0), (66.0, 31.0), (64.0, 78.0)])
+    frame = Frame(sharp, MODEL_PSF)
+    model, fluxes = np.zeros((4, *sharp.shape)), FLUXES[:, :1] / 1e3
+    for image, (y, x) in zip(model, places.astype(int), strict=True):
+        image[y - 7 : y + 8, x - 7 : x + 8] = MODEL_PSF.images[0]
+    there, data = sharp.positions_in(bent, *places.T), 0
+    for image, flux, at in zip(model, fluxes, there, strict=True):
+        op = Resampler(sharp, MODEL_PSF, bent, widening(*at)[0], device=device)
+        data = data + flux * op.render(image.astype(np.float32))
+    field = FunctionPSF(lambda y, x: widening(y, x)[0])
+    o = Observation(data, field, bent, variance=1e-8)
+    blend = Blend((o,), tuple(points(places)), frame)
+    settings = Settings(psf_error=0, psf_tolerance=1e-5)
+    point = Fit(blend, settings, device, np.float32, pad=1)
+    assert point.views[0].op.geometry == ("distorted" if "sip" in given else "affine")
+    begin([point])  # in boxes, which have plans of their own
+    np.testing.assert_allclose(point.state.spectra * point.unit, fluxes * model.max(), rtol=3e-3)
+    result = deblend([o], blend.sources, frame=frame, settings=settings, device=device)
+    assert np.abs(result.residual(0)).max() < 1e-3 * data.max()
 
 
 def test_errors_cover_fluxes_all_over_a_blend(device):

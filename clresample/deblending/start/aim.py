@@ -89,7 +89,8 @@ class Aim:
             )
             around = Around.of(cut, shape, margin)
             extent = tuple((shape + reach).tolist())
-            return make_plan(around, *plan.psfs, precision=self.precision, extent=extent)
+            given = {"precision": self.precision, "n_terms": plan.n_terms}
+            return make_plan(around, *plan.psfs, extent=extent, **given)
 
         key = int(scene), *origin.tolist(), *shape.tolist()
         return self._renderer(key, at_place), low, view.op.shift[None]
