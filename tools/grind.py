@@ -147,7 +147,7 @@ def render(device):
     from helpers.solver import PRIOR, posed
 
     scene, state = posed(device, np.float32, fixed=(1,))
-    for depth in (0, 1, 2):
+    for depth in (0, 1, 2, 3):
         buffers = Buffers([scene, scene], [state, state], device, np.float32, PRIOR)
         Gradient(buffers, with_prior=False, depth=depth).queue()
     device.finish()
