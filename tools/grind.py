@@ -27,6 +27,7 @@ from clresample import (  # noqa: E402
     Blend,
     Device,
     Extended,
+    FunctionPSF,
     Grid,
     LearnedPrior,
     Observation,
@@ -39,6 +40,7 @@ from clresample import (  # noqa: E402
     get_device,
     model_frame,
 )
+from clresample.deblending.fit import Fit, begin  # noqa: E402
 from clresample.deblending.solver.boxes import Boxes  # noqa: E402
 from clresample.deblending.solver.buffers import Buffers  # noqa: E402
 from clresample.deblending.solver.constraints import (  # noqa: E402
@@ -53,6 +55,7 @@ from clresample.deblending.solver.constraints import (  # noqa: E402
     Symmetry,
 )
 from clresample.deblending.solver.gradient import Gradient  # noqa: E402
+from clresample.deblending.solver.learned.engine import LearnedEngine  # noqa: E402
 from clresample.device import tuning  # noqa: E402
 from clresample.device.launcher import Launcher  # noqa: E402
 
@@ -105,12 +108,13 @@ def resample(device):
     op.adjoint(op(np.ones(op.shape_in)))
 
 
-def blends(n, profile=None):
+def blends(n, profile=None, *, varying=False):
     """Two galaxies and a star, seen by two instruments, the second of which is turned.
 
     Each blend is brighter than the one before: their fits end after different numbers of steps.
 
     profile: of the galaxies; None has one fitted, which takes most of a fit's time
+    varying: the first instrument's PSF widens along x
     """
     rng = np.random.default_rng(5)
     grids = Grid.flat((10, 10), 0.1), Grid.flat((5, 6), 0.2, angle_deg=15)
@@ -124,7 +128,8 @@ def blends(n, profile=None):
             light = light + 0.01 * rng.standard_normal((psf.n_bands, *y.shape))
             weights = np.full(light.shape, 1e4)
             names = [f"{i}{band}" for band in range(psf.n_bands)]
-            observations.append(Observation(light, psf, grid, weights=weights, channels=names))
+            seen = FunctionPSF(_widening, 1) if varying and not i else psf
+            observations.append(Observation(light, seen, grid, weights=weights, channels=names))
         places = (4.5, 4.5), (3.0, 6.5)
         galaxies = [Extended(position_px=place, profile=profile) for place in places]
         sources = (*galaxies, Point(position_px=(6.5, 3.0)))
@@ -133,12 +138,16 @@ def blends(n, profile=None):
     return made
 
 
+def _widening(y, x):
+    return PSF.gaussian(0.8 + 0.02 * x, n_pixels=5)
+
+
 def render(device):
     """Gradients of a scene with spectra applied at each stage, whichever a fit would choose."""
     from helpers.solver import PRIOR, posed
 
     scene, state = posed(device, np.float32, fixed=(1,))
-    for depth in (0, 1, 2):
+    for depth in (0, 1, 2, 3):
         buffers = Buffers([scene, scene], [state, state], device, np.float32, PRIOR)
         Gradient(buffers, with_prior=False, depth=depth).queue()
     device.finish()
@@ -155,10 +164,33 @@ FITS = (
 )
 
 
+def _disc():
+    y, x = np.indices((10, 10)) - 4.5
+    return np.exp(-np.hypot(y, x) / 2)
+
+
+def leave(device):
+    """One of two scenes goes on alone."""
+    settings = Settings(prior=LearnedPrior())
+    fits = [Fit(b, settings, device, np.float32, pad=1) for b in blends(2, _disc())]
+    begin(fits)
+    scenes, states = [f.scene for f in fits], [f.state for f in fits]
+    engine = LearnedEngine(scenes, states, device, np.float32, settings.prior, 1.0)
+    engine.round()
+    engine.take([1]).round()
+
+
+def vary(device):
+    """A fit with a PSF that varies over the blend."""
+    settings = Settings(prior=Prior(), max_iter=1)
+    (result,) = deblend_many(blends(1, _disc(), varying=True), settings=settings, device=device)
+    if result.status.startswith("failed"):
+        raise SystemExit(f"grind: a fit {result.status}")
+
+
 def fit(device):
     """FITS of three scenes side by side."""
-    y, x = np.indices((10, 10)) - 4.5
-    disc = np.exp(-np.hypot(y, x) / 2)
+    disc = _disc()
     for settings in FITS:
         began = time.perf_counter()
         profile = None if settings is FITS[0] else disc
@@ -197,7 +229,7 @@ def main():
         plant(device, arguments.plant)
         return 0
     launched = watch(device, arguments.kind)
-    for work in (resample, render, constrain, fit):
+    for work in (resample, render, constrain, leave, vary, fit):
         work(device)
         device.finish()
         print(f"grind: {work.__name__} after {time.perf_counter() - began:.0f} s", flush=True)

@@ -13,6 +13,8 @@ trap 'rm -f "$log"' EXIT
 grind() {
     local status=0
     tools/on_runtime.sh oclgrind "$python" tools/grind.py "$@" 2>"$log" || status=$?
+    # its compiler counts the loops that it did not vectorise there: no report
+    sed -i -E '/^[0-9]+ warnings? generated\.$/d' "$log"
     if [ "$status" = 77 ]; then
         cat "$log" >&2
         exit 0

@@ -12,7 +12,7 @@ import numpy as np
 from ..device.device import get_device
 from ..device.discovery import DeviceError
 from ..device.tuning import Tuning
-from ..device.workers import deal
+from ..device.workers import ahead, deal
 from ..drawing.bar import Bar
 from ..sky.given.checks import float_type, instance
 from ..sky.sources import SourceWarning
@@ -87,7 +87,7 @@ def deblend_many(
         `if __name__ == "__main__":`. Results are those of one device. One that fails is named by a
         DeviceWarning, and the others do its part
     blends: Blend, with sizes, sources, PSFs, WCS and instruments of their own
-    memory [bytes]: of the device for one group of scenes
+    memory [bytes]: of the device for one group of scenes; GPUs hold the next group's data beside it
     progress: called with the number of blends done, after each group and each failure; True draws
         a bar in terminals and notebooks, and prints a line now and then where nobody looks
     returns a Result for each blend, in their order, or a Failure: it does not harm the others.
@@ -141,36 +141,46 @@ class _ManyFits:
 
     def __init__(self, blends, device, *, settings, dtype, memory, pad):
         self.blends, self.settings, self.device, self.dtype = blends, settings, device, dtype
-        self.pad, self.memory, self.n_most = pad, memory, Tuning.of(device, dtype).n_scenes
+        self.pad, self.memory, self.tuning = pad, memory, Tuning.of(device, dtype)
         self.done: list[Result | Failure | None] = [None] * len(blends)
         self.dark = {}
 
     def run(self, progress):
         """Fit them all; raises KeyboardInterrupt when the group that runs was interrupted."""
-        waiting, n_done = defaultdict(list), 0
-        for n in self._groups_done(waiting):
-            n_done += n
-            progress(n_done)
+        n_done, groups = 0, self._groups()
+        with contextlib.closing(ahead(groups) if self.tuning.ahead else groups) as begun:
+            for n, group in begun:
+                interrupted = self._fit(group)
+                del group  # before the next one is made
+                n_done += n
+                progress(n_done)
+                if interrupted:
+                    raise KeyboardInterrupt
 
-    def _groups_done(self, waiting):
-        """Fit group after group as they fill up; yields how many blends that has done."""
+    def _groups(self):
+        """Groups of (index, Fit) that have begun, as they fill up, each with the number of blends
+        that are done with it; empty where a blend has failed."""
+        waiting = defaultdict(list)
         for i, blend in enumerate(self.blends):
             try:
                 instance("blend", blend, Blend)
                 fit = Fit(blend, self.settings, self.device, self.dtype, pad=self.pad)
             except Exception as error:
                 self.done[i] = _failure(blend, error)
-                yield 1
+                yield 1, []
                 continue
             group = waiting[fit.signature]
             group.append((i, fit))
             n_sources = [len(f.fitted) for _, f in group]
             full = sum(data_bytes(f) for _, f in group) + data_bytes(fit) > self.memory
             full |= sum(n_sources) >= START_SOURCES or sum(n_sources) + n_sources[-1] > MOST_SOURCES
-            if full or len(group) >= self.n_most:
-                yield from self._fit(waiting.pop(fit.signature))
+            if full or len(group) >= self.tuning.n_scenes:
+                yield self._begun(waiting.pop(fit.signature))
         while waiting:
-            yield from self._fit(waiting.popitem()[1])
+            yield self._begun(waiting.popitem()[1])
+
+    def _begun(self, group):
+        return len(group), self._begin(group)
 
     def _begin(self, group):
         """Start a group of (index, Fit); those that could, one by one where all at once fails."""
@@ -186,17 +196,13 @@ class _ManyFits:
         return group
 
     def _fit(self, group):
-        """Fit a group, a list of (index, Fit); yields its length."""
-        n, interrupted = len(group), False
-        for part in self._parts(self._begin(group)):
+        """Fit a group of (index, Fit) that has begun; True where Ctrl-C has ended that."""
+        for part in self._parts(group):
             for i, done in self._try(part):
                 self.done[i] = done
-            interrupted = any(fit.status == INTERRUPTED for _, fit in part)
-            if interrupted:
-                break
-        yield n
-        if interrupted:
-            raise KeyboardInterrupt
+            if any(fit.status == INTERRUPTED for _, fit in part):
+                return True
+        return False
 
     def _parts(self, group):
         """A group in parts that fit into the memory, now that the boxes are known."""

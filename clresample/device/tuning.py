@@ -43,6 +43,8 @@ class Tuning:
     vector_chunk: elements of a vector that one sum of lbfgs.cl runs over; on CPUs what stays in the
         first cache with all that it is multiplied by
     n_scenes: scenes fitted side by side; more hide the launches better, and need more memory
+    ahead: a group of fits is prepared and uploaded by a second thread while another iterates; where
+        the device is the CPU itself, both would share its cores
     memory [bytes]: of the device for one frame in tiles, unless a caller says otherwise. With less,
         tiles are smaller and overlap more; most instruments' quickest tiles take less than 1 GiB
     """
@@ -62,6 +64,7 @@ class Tuning:
     pixel_flops: float
     vector_chunk: int
     n_scenes: int
+    ahead: bool
     memory: int
 
     @classmethod
@@ -94,6 +97,7 @@ class Tuning:
                 slab_bytes=2 << 20,  # what one core has in its cache
                 vector_chunk=512,
                 n_scenes=32,  # more leave the cache, fewer do not hide the launches
+                ahead=False,
                 **shared,
             )
         return cls(
@@ -110,6 +114,7 @@ class Tuning:
             slab_bytes=256 << 20,
             vector_chunk=4096,  # some for each work-item of a group
             n_scenes=1024,
+            ahead=not device.simulated,
             **shared,
         )
 

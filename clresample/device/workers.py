@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import queue
 import signal
+import threading
 import time
 import traceback
 import warnings
@@ -26,6 +28,47 @@ FIRST = 4
 SHARE = 0.5
 # [s] An interrupted process has so long to hand in what it has.
 PATIENCE_S = 60.0
+
+
+def ahead(items):
+    """The items of an iterator, the next one made by a thread while the last one is in use.
+
+    At most one lies ready and one is being made beside that which is in use. What the iterator
+    raises is raised here in its turn. Closed early, the thread ends with the item that it makes.
+    """
+    ready: queue.Queue = queue.Queue(maxsize=1)
+    stop = threading.Event()
+
+    def hand_over(kind, value):
+        while not stop.is_set():
+            with suppress(queue.Full):
+                ready.put((kind, value), timeout=0.1)
+                return
+
+    def make():
+        try:
+            for item in items:
+                hand_over("item", item)
+                if stop.is_set():
+                    return
+            hand_over("end", None)
+        except BaseException as error:
+            hand_over("error", error)
+
+    thread = threading.Thread(target=make, daemon=True)
+    thread.start()
+    try:
+        while True:
+            kind, value = ready.get()
+            if kind == "error":
+                raise value
+            if kind == "end":
+                return
+            yield value
+            del value  # its memory is for the next
+    finally:
+        stop.set()
+        thread.join()
 
 
 def deal(function, items, devices, *, done, most):

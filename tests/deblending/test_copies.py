@@ -14,6 +14,7 @@ from clresample.deblending.blend import Blend, Failure
 from clresample.deblending.result import Result
 from clresample.deblending.settings import Settings
 from clresample.deblending.solver.constraints import Chain, Monotone, Positivity
+from clresample.resampling.paper.resampler import PaperResampler
 from clresample.resampling.tiled.resampler import TiledResampler
 from clresample.sky.grid import Grid
 from clresample.sky.psf import PSF
@@ -36,6 +37,19 @@ def test_operators(device, geometry, way, dtype):
     np.testing.assert_array_equal(other(x), truth)
     np.testing.assert_array_equal(way(op.T).adjoint(x), truth)
     assert other.device is op.device
+    other.shift = 0  # a copy's shift is its own
+    np.testing.assert_array_equal(op(x), truth)
+
+
+@ways
+@pytest.mark.parametrize("angle", [0, 20])
+def test_the_papers_operator(device, way, angle):
+    fine, coarse = Grid.flat((12, 13), 0.1), Grid.flat((6, 7), 0.2, angle_deg=angle)
+    op = PaperResampler(fine, PSF.gaussian(0.8), coarse, PSF.gaussian(1.2), device=device)
+    op.shift = 0.3, -0.1
+    x = np.random.default_rng(0).normal(size=op.shape_in).astype(np.float32)
+    truth, other = op(x), way(op)
+    np.testing.assert_array_equal(other(x), truth)
     other.shift = 0  # a copy's shift is its own
     np.testing.assert_array_equal(op(x), truth)
 

@@ -197,6 +197,27 @@ def test_device_memory_stays_constant(device, monkeypatch):
     assert max(held[1:]) - min(held[1:]) == 0
 
 
+def test_groups_prepared_ahead_come_out_the_same(device, monkeypatch):
+    """A failure among them, and what Ctrl-C leaves: as where one group follows the other."""
+    blends = [blend(seed=i) for i in range(5)]
+    blends.insert(3, replace(blends[0], sources=()))
+    given = {"settings": replace(SETTINGS, max_iter=5), "device": device}
+    tune(monkeypatch, n_scenes=2, ahead=False)
+    alone, seen = deblend_many(blends, **given), []
+    tune(monkeypatch, n_scenes=2, ahead=True)
+    results = deblend_many(blends, progress=seen.append, **given)
+    assert seen == [2, 3, 5, 6] and results[3].status.startswith("failed")
+    for result, other in zip(results[:3] + results[4:], alone[:3] + alone[4:], strict=True):
+        np.testing.assert_array_equal(result.model(1), other.model(1))
+        np.testing.assert_array_equal(result.losses, other.losses)
+
+    def interrupt(n_done):
+        raise KeyboardInterrupt
+
+    status = [r.status for r in deblend_many(blends, progress=interrupt, **given)]
+    assert status[:2] == [r.status for r in alone[:2]] and status[-1] == "interrupted"
+
+
 def test_order_progress_and_nothing_to_do(device):
     blends = ragged()
     seen = []

@@ -1,13 +1,14 @@
 """Work dealt to several devices: all of it done once, in order, whatever happens to one of them."""
 
 import os
+import threading
 
 import pytest
 from helpers.portions import fails_on_seven, first_dies, slow, squares
 
 from clresample import DeviceError
 from clresample.device.remembered import DeviceWarning
-from clresample.device.workers import _Table, deal
+from clresample.device.workers import _Table, ahead, deal
 
 
 def dealt(function, items, devices, most=1000):
@@ -82,3 +83,38 @@ def test_portions_of_all_sizes_are_each_taken_once():
         for worker in workers:
             taken += table.take(worker, workers)
     assert sorted(taken) == list(range(50))
+
+
+def test_ahead_gives_the_items_in_order_and_at_most_two_beside_the_one_in_use():
+    made, threads = [], set()
+
+    def items():
+        for i in range(6):
+            threads.add(threading.current_thread())
+            made.append(i)
+            yield i
+
+    used = []
+    for i in ahead(items()):
+        used.append(i)
+        assert len(made) <= len(used) + 2
+    assert used == list(range(6)) and threading.current_thread() not in threads
+
+
+def test_ahead_raises_what_was_raised_in_its_turn():
+    def items():
+        yield 1
+        raise ValueError("two is missing")
+
+    given = ahead(items())
+    assert next(given) == 1
+    with pytest.raises(ValueError, match="two is missing"):
+        next(given)
+
+
+def test_ahead_ends_its_thread_when_it_is_closed():
+    before = threading.active_count()
+    endless = ahead(iter(int, 1))
+    assert next(endless) == 0 and threading.active_count() == before + 1
+    endless.close()
+    assert threading.active_count() == before

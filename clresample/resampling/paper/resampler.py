@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -40,7 +41,7 @@ class PaperResampler(GridOperator):
                 "grid_in, more than tolerance_px: the paper's shifts need one matrix for all "
                 "pixels; use Resampler, which does not"
             )
-        n_bands = count_bands(mapping, psf_in, psf_out)
+        n_bands, self._psfs = count_bands(mapping, psf_in, psf_out), (psf_in, psf_out)
         self._begin(device, dtype, n_bands, [mapping])
         radius = wrap_radius(psf_out, mapping.matrix)
         # nothing wraps, the kernel lies in the grid whole, and K is odd
@@ -63,6 +64,11 @@ class PaperResampler(GridOperator):
     def _use_shift(self):
         """Both factors' tables anew."""
         self._factors.set_transfer(self._transfer, self._shift[0])
+
+    def __reduce__(self):
+        """Copied and pickled as its mapping and PSFs; the copy makes its factors anew."""
+        make = functools.partial(type(self).from_mapping, dtype=self.dtype, device=self.device)
+        return functools.partial(make, shift=self._shift[0]), (self.mapping, *self._psfs)
 
     def _forward(self, x, out):
         """I2 of device arrays: x (B, C, Ny, Nx), out (B, C, My, Mx)."""
