@@ -79,6 +79,14 @@ def test_files_and_metadata(table, tmp_path):
     assert field.metadata == {b"unit": b"uJy", b"description": b"total flux in r"}
 
 
+def test_the_same_catalogue_gives_the_same_bytes(table, tmp_path):
+    both = [write_hats(tmp_path / name, table, most_rows=100) for name in "ab"]
+    files = [sorted(f.relative_to(d) for f in d.rglob("*") if f.is_file()) for d in both]
+    assert files[0] == files[1]
+    for name in files[0]:
+        assert (both[0] / name).read_bytes() == (both[1] / name).read_bytes()
+
+
 def test_an_older_one_is_replaced_and_other_folders_are_kept(table, tmp_path):
     write_hats(tmp_path / "hats", table)
     write_hats(tmp_path / "hats", table[:7])

@@ -139,6 +139,8 @@ def test_a_brick_with_its_own_psf_and_other_bits(tmp_path):
     mosaic = read_legacy_survey(tmp_path, mask_bits=["GALAXY"], bands=["r"], notes=notes)
     weights = mosaic.channels[0].weights(WHOLE)
     assert weights[[3, 4]].all() and not weights[5].any() and not notes
+    turned = read_legacy_survey(tmp_path, bands=["r", "g"])
+    assert [c.name for c in turned.channels] == ["r", "g"]
     assert np.allclose(mosaic.psf.psf_at(3, 3).images[0], PSF(psf_image()).images[0])
     with pytest.raises(ValueError, match="mask_bits has 'MOON', the mask's header names NPRIMARY"):
         read_legacy_survey(tmp_path, mask_bits=["MOON"])
@@ -151,6 +153,13 @@ def test_a_brick_with_its_own_psf_and_other_bits(tmp_path):
 def test_what_a_brick_lacks_is_asked_for(tmp_path, skip, message):
     write_brick(tmp_path, skip=(skip,))
     with pytest.raises(ValueError, match=message):
+        read_legacy_survey(tmp_path)
+
+
+def test_a_map_of_no_widths_is_refused(tmp_path):
+    write_brick(tmp_path, bands=("g",))
+    fits.writeto(next(tmp_path.glob("*psfsize*")), np.zeros(SHAPE), overwrite=True)
+    with pytest.raises(FileError, match="psfsize-g.fits.fz: holds no width above 0"):
         read_legacy_survey(tmp_path)
 
 

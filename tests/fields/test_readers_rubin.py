@@ -42,7 +42,7 @@ def test_a_coadd_of_lsst_images(coadd):
     assert np.allclose(weights[weights > 0], 1 / 400, rtol=1e-3)
     assert np.allclose(mosaic.grid.sky(49.0, 29.0), [10.0, -30.0], atol=1e-9)
     y, x = np.mgrid[-7:8, -7:8]
-    for row, column, sigma in ((10, 10, 1.5), (79, 30, 1.7), (39, 119, 1.7)):
+    for row, column, sigma in ((39.4, 10, 1.5), (39.6, 39.4, 1.7), (39, 79.6, 1.7)):
         image = np.exp(-(y**2 + x**2) / 2 / sigma**2)
         assert np.allclose(
             mosaic.psf.psf_at(row, column).images[0], PSF(image).images[0], atol=1e-5
