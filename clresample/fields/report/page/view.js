@@ -181,11 +181,13 @@ class View {
   }
 
   drawScale() {
-    const arcsec = DATA.frame.scale / this.zoom;  // of a screen pixel
-    const power = 10 ** Math.floor(Math.log10(130 * arcsec));
-    const length = [5, 2, 1].map((k) => k * power).find((s) => s <= 130 * arcsec) ?? power;
-    byId("scale-bar").style.width = `${length / arcsec}px`;
-    byId("scale-text").textContent = length >= 60 ? `${+(length / 60).toPrecision(2)}′` : `${+length.toPrecision(2)}″`;
+    const known = DATA.frame.scale !== null;  // else lengths are in the frame's pixels
+    const each = (known ? DATA.frame.scale : 1) / this.zoom;  // of a screen pixel
+    const power = 10 ** Math.floor(Math.log10(130 * each));
+    const length = [5, 2, 1].map((k) => k * power).find((s) => s <= 130 * each) ?? power;
+    const [value, unit] = !known ? [length, " px"] : length >= 60 ? [length / 60, "′"] : [length, "″"];
+    byId("scale-bar").style.width = `${length / each}px`;
+    byId("scale-text").textContent = `${+value.toPrecision(2)}${unit}`;
   }
 
   /* The source nearest to a point of the screen, within some pixels; -1 for none. */
