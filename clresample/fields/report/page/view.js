@@ -15,6 +15,7 @@ const colour = (name) => getComputedStyle(root).getPropertyValue(name).trim();
 const MARK = "#8fc2ff";  // the accent of dark pages: the sky is dark in both
 const pictures = new Map();  // text of a tile -> Image, the last used at the end
 const MOST_PICTURES = 400;
+const MOST_MARKS = 2500;  // at once, the brightest of those in view: more take seconds without a GPU
 
 /* The Image of a base64 text, decoded when first asked for; `then` is called once it is there. */
 function picture(text, then) {
@@ -153,15 +154,18 @@ class View {
 
   drawMarks() {
     const c = this.context, [w, h] = this.size, r = Math.min(Math.max(4 * this.zoom, 5), 15);
-    let n = 0;
-    const paths = STATES.map(() => new Path2D());
-    for (let i = 0; i < SOURCES.x.length; i += 1) {
-      const [u, v] = this.toScreen(SOURCES.x[i], SOURCES.y[i]);
-      if (!(u > -r && v > -r && u < w + r && v < h + r)) continue;
-      n += 1;
-      const path = paths[SOURCES.state[i]];
-      if (SOURCES.state[i] === 0) { path.moveTo(u + r, v); path.arc(u, v, r, 0, 7); }
-      else if (SOURCES.state[i] === 1) path.rect(u - r, v - r, 2 * r, 2 * r);
+    const paths = STATES.map(() => new Path2D()), seen = [];
+    for (const wanted of [(state) => state === 2, (state) => state !== 2]) {  // failed ones first
+      for (let i = 0; i < SOURCES.x.length && seen.length < MOST_MARKS; i += 1) {
+        if (!wanted(SOURCES.state[i])) continue;
+        const [u, v] = this.toScreen(SOURCES.x[i], SOURCES.y[i]);
+        if (u > -r && v > -r && u < w + r && v < h + r) seen.push([SOURCES.state[i], u, v]);
+      }
+    }
+    for (const [state, u, v] of seen) {
+      const path = paths[state];
+      if (state === 0) { path.moveTo(u + r, v); path.arc(u, v, r, 0, 7); }
+      else if (state === 1) path.rect(u - r, v - r, 2 * r, 2 * r);
       else { path.moveTo(u - r, v - r); path.lineTo(u + r, v + r); path.moveTo(u - r, v + r); path.lineTo(u + r, v - r); }
     }
     for (const [style, width] of [["#000a", 2.6], [MARK, 1.2]]) {
@@ -177,7 +181,7 @@ class View {
       c.arc(u, v, r + 5, 0, 7);
       c.stroke();
     }
-    return n;
+    return seen.length;
   }
 
   drawScale() {
