@@ -194,10 +194,11 @@ def truth_section(run, truth) -> str:
     parts = [text(told), charts(figures)]
     found = completeness(truth)
     if found is not None:
-        parts.append(f"<h3>Completeness</h3>{charts([('Sources found', found[0], '')])}")
-        rows = [[number(a, ".3g"), number(b, ".3g"), k, m] for a, b, k, m in found[1] if m]
+        rows = [[number(a, ".4g"), number(b, ".4g"), k, m] for a, b, k, m in found[1] if m]
         heads = [("S/N from", "", "n"), ("to", "", "n"), ("found", "", "n"), ("of", "", "n")]
-        parts.append(table(f"True sources over {EDGE_PX:g} px from the field's edge", heads, rows))
+        told = f"True sources over {EDGE_PX:g} px from the field's edge"
+        shares = charts([("Completeness", found[0], "")], table(told, heads, rows))
+        parts.append(shares)
     return section("truth", "Against the truth", *parts)
 
 
