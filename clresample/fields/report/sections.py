@@ -181,11 +181,11 @@ def truth_section(run, truth) -> str:
     """Pulls, and which true sources were found."""
     if truth is None:
         return ""
-    n = int((truth.rows >= 0).sum())
+    n = int((truth.rows[truth.inner] >= 0).sum())
     told = (
-        f"{n} of {len(truth.rows)} true sources have a row within {FOUND_PX:g} model pixels; pulls "
-        "of correct errors scatter like the dashed normal distribution, median 0 and width 1. The "
-        "outermost bins hold all that is farther out."
+        f"{n} of the {truth.inner.sum()} true sources over {EDGE_PX:g} pixels from the edge have a "
+        f"row within {FOUND_PX:g} pixels. Pulls of correct errors scatter like the dashed normal "
+        "distribution, median 0 and width 1. The outermost bins hold all that is farther out."
     )
     figures = [
         (channel, svg, f"median {number(m, '.2f')}, width {number(w, '.2f')}, n = {k}")
