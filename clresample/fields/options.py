@@ -112,4 +112,5 @@ class Progress:
         """What the user should know, a line."""
 
     def dashboard(self, address):
-        """The address of a page that shows what the workers do; told once, where there is one."""
+        """The address of a page that shows what the workers do, where there is one: a line."""
+        self.say(f"dashboard: {address}")

@@ -101,7 +101,7 @@ def test_a_click_on_a_source_shows_it_in_every_channel(browser, page):
     browser.until(f"{ROOT}.dataset.stamps === '12'")  # three of each of four channels
     text = browser.value("document.getElementById('source').innerText")
     assert all(f"\n{name}\n" in text for name in ("VIS", "g", "r", "i"))
-    assert f"{rows['flux_g'][order[2]].value:.4g}" in text
+    assert f"{rows['flux_g'][order[2]].value:.4g}" in text and "Flux [µJy]" in text
     flat = browser.value(
         "[...document.querySelectorAll('.stamps canvas')].map((c) => {"
         "const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;"
@@ -182,6 +182,7 @@ def test_a_page_without_images_marks_its_sources(tmp_path, page):
     with Browser(tmp_path / "profile") as browser:
         browser.open(write_report(folder).path)
         browser.until(f"({ROOT}.dataset.drawn ?? '') === '0 tiles, 12 marks'")
+        assert browser.value("document.getElementById('scale-text').textContent").endswith(" px")
         assert browser.value(f"{ROOT}.dataset.errors") == "0" and browser.messages == []
 
 

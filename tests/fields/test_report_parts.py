@@ -3,16 +3,20 @@
 import io
 import struct
 import zlib
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from astropy import units as u
+from astropy.table import QTable
 from helpers.field_folder import SIGMA, write_folder
 
 from clresample import Grid
 from clresample.fields.report import pyramid, shades
 from clresample.fields.report.charts import chi2_numbers, chi2_palette, magnitudes
 from clresample.fields.report.content import flag_names
-from clresample.fields.report.folder import read_run
+from clresample.fields.report.folder import Run, read_run
 from clresample.fields.report.html import data_block, number
 from clresample.fields.report.png import png
 from clresample.fields.report.svg import Chart, Scale
@@ -183,3 +187,13 @@ def test_numbers_flags_and_magnitudes_are_told():
     middle = chi2_palette()[chi2_numbers(np.array([[1.0]]))[0, 0]]
     np.testing.assert_array_equal(middle, [228, 228, 226])
     assert chi2_numbers(np.array([[np.nan, 1e9, 0.0]])).tolist() == [[0, 31, 1]]
+
+
+def test_a_part_of_a_flat_field_knows_where_it_begins():
+    whole = Grid.flat((300, 280), 0.1, angle_deg=7, center_arcsec=(3.0, -2.0))
+    placed = whole.cutout(20, 110, (280, 170)).to_wcs()
+    one = SimpleNamespace(grid=Grid.from_wcs(placed, (280, 170)))
+    settings = {"part": [2, 2, 64], "corner": whole.sky(0, 0).tolist()}
+    rows = QTable({"y_sky": [0.0] * u.arcsec, "x_sky": [0.0] * u.arcsec})
+    run = Run(Path("run"), rows, QTable(), (one,), settings=settings)
+    np.testing.assert_array_equal(run.offset, [20, 110])

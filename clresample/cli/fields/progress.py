@@ -8,7 +8,7 @@ import time
 from tqdm import tqdm
 
 from ...fields.options import Progress
-from ..options import printable, say
+from ..options import say
 
 # [s] Between two lines of a log: jobs of a day stay within a few thousand lines.
 LINE_S = 30.0
@@ -77,10 +77,6 @@ class Live(Progress):
         if not self.arguments.quiet:
             with tqdm.external_write_mode(file=sys.stderr):
                 say(self.arguments, text)
-
-    def dashboard(self, address):
-        """Where the workers can be watched in a browser."""
-        self.say(f"dashboard: {printable(address)}")
 
     def close(self):
         """Take the bar away."""

@@ -15,7 +15,6 @@ OK, FLAGGED, FAILED = 0, 1, 2  # states of a source, as the script counts them
 SOURCE_BYTES, DETAIL_BYTES = 64, 1000  # [bytes] of a source on the field, of its measurements
 # of the page: places of sources, their measurements, their pictures
 SOURCES_PART, DETAILS_PART, STAMPS_PART = 0.2, 0.1, 0.25
-FLUX_COLUMNS = "Channel", "Flux", "Error", "S/N", "Mag", "Residual"
 
 
 def order_of(run) -> np.ndarray:
@@ -81,9 +80,18 @@ def data_of(run, most_bytes, notes) -> dict:
             "state": state.tolist(),
             "snr": [_short(v, 1) for v in snr],
         },
-        "flux_columns": FLUX_COLUMNS,
+        "flux_columns": _flux_columns(run),
         "details": _details(run, order, detailed, stamps),
     }
+
+
+def _flux_columns(run):
+    """Titles of the fluxes' table, with their unit where all have one."""
+    units = {unit for *_, unit in fluxes(run)}
+    unit = units.pop().replace("uJy", "µJy") if len(units) == 1 else ""
+    system = "AB mag" if unit == "µJy" else "Mag"
+    flux = f"Flux [{unit}]" if unit else "Flux"
+    return ["Channel", flux, "Error", "S/N", system, "Residual [σ]"]
 
 
 def _texts(run, name, order):
@@ -103,7 +111,7 @@ def _frame(run, frame, at):
     if frame is None:
         good = at[np.isfinite(at).all(axis=1)]
         shape = np.ceil(good.max(axis=0)) + 20 if len(good) else [100, 100]
-        return {"shape": [int(n) for n in shape], "scale": 1.0, "offset": offset, "sky": None}
+        return {"shape": [int(n) for n in shape], "scale": None, "offset": offset, "sky": None}
     middle = (np.array(frame.shape) - 1) / 2
     flat = "y_sky" in run.sources.colnames
     ra, dec = frame.sky(*middle)

@@ -56,8 +56,8 @@ def _class(kind):
     return f' class="{kind}"' if kind else ""
 
 
-def charts(figures) -> str:
-    """Figures (title, svg, remark) beside each other."""
+def charts(figures, more="") -> str:
+    """Figures (title, svg, remark) beside each other, and HTML beside them."""
     return (
         '<div class="charts">'
         + "".join(
@@ -65,7 +65,7 @@ def charts(figures) -> str:
             f"{svg}</figure>"
             for title, svg, remark in figures
         )
-        + "</div>"
+        + f"{more}</div>"
     )
 
 

@@ -181,11 +181,11 @@ def truth_section(run, truth) -> str:
     """Pulls, and which true sources were found."""
     if truth is None:
         return ""
-    n = int((truth.rows >= 0).sum())
+    n = int((truth.rows[truth.inner] >= 0).sum())
     told = (
-        f"{n} of {len(truth.rows)} true sources have a row within {FOUND_PX:g} model pixels; pulls "
-        "of correct errors scatter like the dashed normal distribution, median 0 and width 1. The "
-        "outermost bins hold all that is farther out."
+        f"{n} of the {truth.inner.sum()} true sources over {EDGE_PX:g} pixels from the edge have a "
+        f"row within {FOUND_PX:g} pixels. Pulls of correct errors scatter like the dashed normal "
+        "distribution, median 0 and width 1. The outermost bins hold all that is farther out."
     )
     figures = [
         (channel, svg, f"median {number(m, '.2f')}, width {number(w, '.2f')}, n = {k}")
@@ -194,10 +194,11 @@ def truth_section(run, truth) -> str:
     parts = [text(told), charts(figures)]
     found = completeness(truth)
     if found is not None:
-        parts.append(f"<h3>Completeness</h3>{charts([('Sources found', found[0], '')])}")
-        rows = [[number(a, ".3g"), number(b, ".3g"), k, m] for a, b, k, m in found[1] if m]
+        rows = [[number(a, ".4g"), number(b, ".4g"), k, m] for a, b, k, m in found[1] if m]
         heads = [("S/N from", "", "n"), ("to", "", "n"), ("found", "", "n"), ("of", "", "n")]
-        parts.append(table(f"True sources over {EDGE_PX:g} px from the field's edge", heads, rows))
+        told = f"True sources over {EDGE_PX:g} px from the field's edge"
+        shares = charts([("Completeness", found[0], "")], table(told, heads, rows))
+        parts.append(shares)
     return section("truth", "Against the truth", *parts)
 
 

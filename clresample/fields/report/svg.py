@@ -9,7 +9,7 @@ from html import escape
 import numpy as np
 
 WIDTH, HEIGHT = 284, 208  # [units of the drawing] the page scales it
-LEFT, RIGHT, TOP, BOTTOM = 50, 8, 10, 40  # for the labels
+LEFT, RIGHT, TOP, BOTTOM = 50, 14, 10, 40  # for the labels
 SQUARE = WIDTH - LEFT - RIGHT + TOP + BOTTOM  # height at which both axes are as long
 # More points than this are shown as shaded cells: as single points they would be one blot.
 MOST_POINTS = 1200

@@ -29,8 +29,8 @@ FIELD = """<section id="field"><h2>The field</h2>
 <noscript><p class="about">Images need a script, which this browser does not run. All tables and
 figures below are there without it.</p></noscript>
 <div class="live"><div class="tools">
-<fieldset class="choice"><legend>Layer</legend>{layers}</fieldset>
-<fieldset class="choice"><legend>Instrument</legend>{instruments}</fieldset>
+<fieldset class="choice"{hidden}><legend>Layer</legend>{layers}</fieldset>
+<fieldset class="choice"{hidden}><legend>Instrument</legend>{instruments}</fieldset>
 <label class="check"><input type="checkbox" id="marks" checked> Mark sources</label></div>
 <div class="viewer"><div><div class="stage">
 <canvas id="sky" tabindex="0" role="application" aria-label="The field. Arrow keys move, plus and
@@ -200,7 +200,8 @@ def _field(run, pyramids):
     ]
     return FIELD.format(
         layers=layers,
-        instruments=instruments or "none",
+        instruments=instruments,
+        hidden="" if pyramids else " hidden",
         compass=_compass(run),
         ramp=sections.ramp_of_residuals(),
         reduced=escape("; ".join(coarse) + ("." if coarse else "")),

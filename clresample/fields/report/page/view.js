@@ -15,6 +15,7 @@ const colour = (name) => getComputedStyle(root).getPropertyValue(name).trim();
 const MARK = "#8fc2ff";  // the accent of dark pages: the sky is dark in both
 const pictures = new Map();  // text of a tile -> Image, the last used at the end
 const MOST_PICTURES = 400;
+const MOST_MARKS = 2500;  // at once, the brightest of those in view: more take seconds without a GPU
 
 /* The Image of a base64 text, decoded when first asked for; `then` is called once it is there. */
 function picture(text, then) {
@@ -153,15 +154,18 @@ class View {
 
   drawMarks() {
     const c = this.context, [w, h] = this.size, r = Math.min(Math.max(4 * this.zoom, 5), 15);
-    let n = 0;
-    const paths = STATES.map(() => new Path2D());
-    for (let i = 0; i < SOURCES.x.length; i += 1) {
-      const [u, v] = this.toScreen(SOURCES.x[i], SOURCES.y[i]);
-      if (!(u > -r && v > -r && u < w + r && v < h + r)) continue;
-      n += 1;
-      const path = paths[SOURCES.state[i]];
-      if (SOURCES.state[i] === 0) { path.moveTo(u + r, v); path.arc(u, v, r, 0, 7); }
-      else if (SOURCES.state[i] === 1) path.rect(u - r, v - r, 2 * r, 2 * r);
+    const paths = STATES.map(() => new Path2D()), seen = [];
+    for (const wanted of [(state) => state === 2, (state) => state !== 2]) {  // failed ones first
+      for (let i = 0; i < SOURCES.x.length && seen.length < MOST_MARKS; i += 1) {
+        if (!wanted(SOURCES.state[i])) continue;
+        const [u, v] = this.toScreen(SOURCES.x[i], SOURCES.y[i]);
+        if (u > -r && v > -r && u < w + r && v < h + r) seen.push([SOURCES.state[i], u, v]);
+      }
+    }
+    for (const [state, u, v] of seen) {
+      const path = paths[state];
+      if (state === 0) { path.moveTo(u + r, v); path.arc(u, v, r, 0, 7); }
+      else if (state === 1) path.rect(u - r, v - r, 2 * r, 2 * r);
       else { path.moveTo(u - r, v - r); path.lineTo(u + r, v + r); path.moveTo(u - r, v + r); path.lineTo(u + r, v - r); }
     }
     for (const [style, width] of [["#000a", 2.6], [MARK, 1.2]]) {
@@ -177,15 +181,17 @@ class View {
       c.arc(u, v, r + 5, 0, 7);
       c.stroke();
     }
-    return n;
+    return seen.length;
   }
 
   drawScale() {
-    const arcsec = DATA.frame.scale / this.zoom;  // of a screen pixel
-    const power = 10 ** Math.floor(Math.log10(130 * arcsec));
-    const length = [5, 2, 1].map((k) => k * power).find((s) => s <= 130 * arcsec) ?? power;
-    byId("scale-bar").style.width = `${length / arcsec}px`;
-    byId("scale-text").textContent = length >= 60 ? `${+(length / 60).toPrecision(2)}′` : `${+length.toPrecision(2)}″`;
+    const known = DATA.frame.scale !== null;  // else lengths are in the frame's pixels
+    const each = (known ? DATA.frame.scale : 1) / this.zoom;  // of a screen pixel
+    const power = 10 ** Math.floor(Math.log10(130 * each));
+    const length = [5, 2, 1].map((k) => k * power).find((s) => s <= 130 * each) ?? power;
+    const [value, unit] = !known ? [length, " px"] : length >= 60 ? [length / 60, "′"] : [length, "″"];
+    byId("scale-bar").style.width = `${length / each}px`;
+    byId("scale-text").textContent = `${+value.toPrecision(2)}${unit}`;
   }
 
   /* The source nearest to a point of the screen, within some pixels; -1 for none. */
