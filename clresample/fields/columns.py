@@ -94,7 +94,7 @@ def finished(job, parts, last, unsettled=()):
 
 
 def _joined(tables):
-    """Tables one after the other; what a row does not have is NaN."""
+    """Tables one after the other; what a row does not have is NaN, and 0 of whole numbers."""
     names: dict[str, object] = {}
     for table in tables:
         for name in table.colnames:
@@ -102,8 +102,8 @@ def _joined(tables):
     for table in tables:
         for name, like in names.items():
             if name not in table.colnames:
-                unit = getattr(like, "unit", None)
-                empty = np.full(len(table), np.nan)
+                unit, kind = getattr(like, "unit", None), like.dtype
+                empty = np.full(len(table), 0 if kind.kind in "iu" else np.nan, kind)
                 table[name] = empty if unit is None else empty * unit
     for table in tables:
         for name in ("status", "reason"):
@@ -113,12 +113,11 @@ def _joined(tables):
 
 
 def _plain(table):
-    """Masked values as NaN."""
+    """Masked values as NaN, and as 0 of whole numbers."""
     for name in table.colnames:
         column = table[name]
         if hasattr(column, "mask") and np.any(column.mask):
-            filled = column.filled(np.nan)
-            table[name] = filled
+            table[name] = column.filled(0 if column.dtype.kind in "iu" else np.nan)
         elif hasattr(column, "unmasked"):
             table[name] = column.unmasked
     return table

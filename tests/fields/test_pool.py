@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 from helpers.checkout import ROOT
 
-from clresample import DeviceError
+from clresample import DeviceError, FieldOptions
+from clresample.fields.options import Progress
+from clresample.fields.work.engine import engine_of
 from clresample.fields.work.pool import Pool
 
 
@@ -146,3 +148,16 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path):
     while Path(f"/proc/{pid}").exists() and "Z" not in Path(f"/proc/{pid}/stat").read_text():
         assert time.monotonic() < end
         time.sleep(0.05)
+
+
+def test_a_cluster_without_dask_is_refused_with_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ImportError, match=r"clresample\[dask\]"):
+        engine_of(FieldOptions(scheduler="tcp://127.0.0.1:8786"), Progress())
+
+
+def test_each_device_has_a_worker_at_least():
+    engine = engine_of(FieldOptions(device=["a", "b"], workers=3), Progress())
+    assert engine.n_workers == 3 and engine.sharing == [("a", 2), ("b", 2)]
+    assert engine_of(FieldOptions(device=["a", "b"]), Progress()).n_workers == 2
+    assert engine_of(FieldOptions(device="a"), Progress()).n_workers == 0

@@ -5,15 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from astropy.io import fits
-from astropy.table import QTable
+from astropy.table import QTable, vstack
 from helpers.fields import mosaics_of
 
 from clresample import FieldOptions, get_device
+from clresample.fields import columns, options, run
 from clresample.fields.blends.cut import Limits
 from clresample.fields.models import read_models
 from clresample.fields.mosaic import FilePlane
 from clresample.fields.options import Progress
 from clresample.fields.run import run_field
+from clresample.fields.work import look
 from clresample.files.whole_file import FileError
 
 
@@ -252,3 +254,26 @@ def test_several_devices_have_a_process_each_and_leave_the_same_bytes(done, sky,
     assert (tmp_path / "catalogue.fits").read_bytes() == (folder / "catalogue.fits").read_bytes()
     with pytest.raises(ValueError, match="device is an empty list"):
         FieldOptions(device=[])
+
+
+def test_groups_shrink_with_the_device_and_leave_the_same_sources(done, sky, tmp_path, monkeypatch):
+    folder, _ = done
+    device, small = get_device(), 3 << 20
+    monkeypatch.setattr(look, "DEVICE_PART", device.memory // small)
+    for module in (run, options):
+        monkeypatch.setattr(module, "LEAST_MEMORY", 1 << 20)
+    run_field(mosaics_of(sky), tmp_path)
+    n_groups, n_small = (len(list((f / "work").glob("fit-*"))) for f in (folder, tmp_path))
+    assert n_small > n_groups
+    differences, n_others = compared(folder, tmp_path)
+    assert n_others == 0 and np.abs(differences).max() < 0.05
+
+
+def test_sources_that_failed_leave_whole_numbers_whole():
+    ok, failed = QTable({"id": [1], "n": [2], "f": [1.5]}), QTable({"id": [3]})
+    for tables in ([ok, failed], [vstack([ok, failed])]):
+        for rows in tables:
+            rows["status"] = rows["reason"] = [""] * len(rows)
+        joined = columns._joined([rows.copy() for rows in tables])
+        assert joined["n"].dtype.kind == "i" and joined["n"].tolist() == [2, 0]
+        assert joined["f"][0] == 1.5 and np.isnan(joined["f"][1])
