@@ -23,11 +23,13 @@ pull_width          of theirs (flux - truth) / error: 1.4826 MAD
 core_s_per_source   processor time of all processes over all rows
 wall_s, peak_gb     of the command; the memory is that of all its processes together
 stage               seconds of wall time by stage
-n_pairs             fluxes judged of sources counted in `close` that were found, 60 at most: those
-                    that the truth has at 5 sigma of a point source's flux or more
+n_pairs             fluxes judged of sources found over 20 that are blended: a neighbour lies within
+                    16 pixels, two widths of Rubin's PSF. Of 60 sources at most, and those that the
+                    truth has at 5 sigma of a point source's flux or more
 pairs, aperture_factor, forced_factor
-                    scatter (1.4826 MAD) of their flux over truth, and that of PSF-matched aperture
+                    1.4826 median |flux / truth - 1| of theirs, and that of PSF-matched aperture
                     photometry, and of forced profile photometry, over it (harness/photometry.py)
+close_...           the same of those with a neighbour within 8 pixels alone, in the JSON file
 """
 
 from __future__ import annotations
@@ -43,13 +45,14 @@ from clresample import simulate_field
 
 from .harness import photometry, records
 from .harness.clock import ONE_THREAD, on_all_cores
-from .harness.judged import Judged, fluxes, robust, shares
+from .harness.judged import NEAR_PX, Judged, fluxes, robust, shares, typical
 from .harness.options import Parser, positive, run, seed
 from .harness.runs import fitted, found_in
 
 SIZES, QUICK_SIZES = (1024, 2048), (384,)
 BANDS, QUICK_BANDS = "ugrizy", "ri"
-MOST_PAIRS = 60
+MOST_PAIRS, BLENDED_PX = 60, 16.0
+N_SCALE, SCALE_SNR = 20, 50.0  # sources alone, of each field, that say what part apertures see
 LEAST_FLUX = 5.0  # [sigma] of a point source's flux: fainter ones say how deep a band is
 COLUMNS = (
     ("n_model", 7, "d"),
@@ -106,37 +109,30 @@ def counted(judged):
     } | shares(judged)
 
 
-def beside_others(fields, channels):
-    """Fluxes of close neighbours beside what others measure of them.
+def beside_others(fields, channels, most_px):
+    """Fluxes of sources with a neighbour within most_px beside what others measure of them.
 
     fields: of (table, SimulatedField, n_model)
     """
-    ratios: dict[str, list] = {"ours": [], "aperture": [], "forced": []}
-    left = MOST_PAIRS
+    ours, theirs, alone, n_left = [], [], [], MOST_PAIRS
     for table, field, n_model in fields:
         one = Judged(np.stack([table["y"].value, table["x"].value], axis=1), field.truth, n_model)
-        chosen = np.flatnonzero(one.pairs())[:left]
-        left -= len(chosen)
-        if not len(chosen):
-            continue
-        flux, _, true = fluxes(table, field.truth, chosen, one.own, channels)
-        theirs = photometry.compared(field.mosaics, one.at, one.own[chosen], true)
-        deep = true > LEAST_FLUX * photometry.point_errors(field.mosaics)
-        ratios["ours"].append(np.where(deep, flux / true, np.nan))
-        for name, values in theirs.items():
-            ratios[name].append(np.where(deep, values, np.nan))
-    if not ratios["ours"]:
-        nothing = float("nan")
-        return {
-            "n_pairs": 0,
-            "pairs": nothing,
-            "aperture_factor": nothing,
-            "forced_factor": nothing,
-        }
-    together = {name: np.concatenate(some, axis=-2) for name, some in ratios.items()}
-    scatter = {name: photometry.least_scatter(some, robust) for name, some in together.items()}
+        blended = np.flatnonzero(one.pairs(most_px=most_px))[:n_left]
+        n_left -= len(blended)
+        lone = np.flatnonzero(one.pairs(BLENDED_PX, np.inf) & (one.snr > SCALE_SNR))[:N_SCALE]
+        for chosen, found in ((blended, theirs), (lone, alone)):
+            flux, _, true = fluxes(table, field.truth, chosen, one.own, channels)
+            deep = true > LEAST_FLUX * photometry.point_errors(field.mosaics)
+            measured = photometry.compared(field.mosaics, one.at, one.own[chosen], true)
+            found.append({name: np.where(deep, m, np.nan) for name, m in measured.items()})
+            if found is theirs:
+                ours.append(np.where(deep, flux / true, np.nan))
+    scatter = {"ours": typical(np.concatenate(ours) - 1)}
+    for name in ("aperture", "forced"):
+        pairs, singles = (np.concatenate([m[name] for m in f], axis=-2) for f in (theirs, alone))
+        scatter[name] = photometry.least_scatter(pairs, singles, typical)
     return {
-        "n_pairs": int(np.isfinite(together["ours"]).sum()),
+        "n_pairs": int(np.isfinite(np.concatenate(ours)).sum()),
         "pairs": scatter["ours"],
         "aperture_factor": scatter["aperture"] / scatter["ours"],
         "forced_factor": scatter["forced"] / scatter["ours"],
@@ -192,7 +188,8 @@ def row_of(size, options):
         fits.update(took["fits"])
     return (
         row
-        | beside_others(fields, channels)
+        | beside_others(fields, channels, BLENDED_PX)
+        | {f"close_{k}": v for k, v in beside_others(fields, channels, NEAR_PX).items()}
         | {
             "n_model": size,
             "core_s_per_source": sum(t["core_s"] for t in taken) / max(row["n_sources"], 1),

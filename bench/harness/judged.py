@@ -33,8 +33,9 @@ class Judged:
 
     at (R, 2), true (S, 2) [model px]: rows and true sources; snr (S,): of the best possible filter
     n_model: pixels a side of the field
-    own (S,): row of each true source or -1; alone, inner (S,) bool: no neighbour within NEAR_PX of
-        SEEN_SNR or more; not at the edge
+    own (S,): row of each true source or -1
+    nearest (S,) [px]: its nearest neighbour of SEEN_SNR or more
+    alone, inner (S,) bool: no neighbour within NEAR_PX; not at the edge
     """
 
     def __init__(self, at, truth, n_model):
@@ -45,7 +46,8 @@ class Judged:
         apart = np.hypot(*(self.true[:, None] - self.true[None]).transpose(2, 0, 1))
         np.fill_diagonal(apart, np.inf)
         apart[:, self.snr < SEEN_SNR] = np.inf
-        self.alone = apart.min(axis=1, initial=np.inf) > NEAR_PX
+        self.nearest = apart.min(axis=1, initial=np.inf)
+        self.alone = self.nearest > NEAR_PX
         self.inner = self._inside(self.true)
 
     def _inside(self, places):
@@ -76,9 +78,10 @@ class Judged:
         """True sources (S,) bool whose fluxes are judged: found, over 20, without neighbour."""
         return (self.own >= 0) & self.alone & (self.snr > 20) & self.inner
 
-    def pairs(self):
-        """True sources (S,) bool with a neighbour within NEAR_PX that are found, over 20."""
-        return (self.own >= 0) & ~self.alone & (self.snr > 20) & self.inner
+    def pairs(self, least_px=0.0, most_px=NEAR_PX):
+        """True sources (S,) bool, found and over 20, whose nearest neighbour is so near."""
+        near = (self.nearest > least_px) & (self.nearest <= most_px)
+        return (self.own >= 0) & near & (self.snr > 20) & self.inner
 
 
 def shares(judged):
@@ -98,6 +101,13 @@ def fluxes(table, truth, chosen, own, channels):
         for kind in ("flux", "flux_err")
     )
     return *given, np.stack([np.asarray(truth[f"flux_{c}"])[chosen] for c in channels], axis=1)
+
+
+def typical(errors):
+    """1.4826 median |error| of the finite ones, NaN of none: their scatter about zero, which for a
+    normal distribution without bias is its standard deviation."""
+    errors = np.abs(np.asarray(errors)[np.isfinite(errors)])
+    return float(1.4826 * np.median(errors)) if errors.size else np.nan
 
 
 def robust(values):

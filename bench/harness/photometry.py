@@ -5,11 +5,13 @@ forced     profiles from the sharpest band, their fluxes in each band by least s
            band's PSF, all sources of a cutout at once (as TFIT, T-PHOT and tractor's forced mode)
 
 Both are given what only a simulation knows, in their favour: the apertures' radius is the one of
-RADII_ARCSEC with the least scatter, and each band's fluxes are scaled so that their median is the
-truth.
+RADII_ARCSEC with the least scatter, and each band's fluxes are scaled so that sources without a
+neighbour have the truth in their median.
 """
 
 from __future__ import annotations
+
+import warnings
 
 import numpy as np
 
@@ -187,9 +189,12 @@ def point_errors(mosaics):
     return np.concatenate(found)
 
 
-def least_scatter(ratios, robust):
-    """Robust scatter of flux over truth (J, C), or the least of several radii's (n, J, C), once
-    each channel is scaled to the truth in its median."""
-    stacks = ratios if ratios.ndim == 3 else ratios[None]
-    scaled = [r / np.nanmedian(r, axis=0) for r in stacks]
-    return min(robust(r) for r in scaled)
+def least_scatter(ratios, alone, scatter):
+    """Scatter of flux over truth (J, C), the least of several radii's (n, J, C), once each channel
+    is scaled so that sources without a neighbour, `alone` (K, C) or (n, K, C), have the truth in
+    their median."""
+    stacks, singles = (r if r.ndim == 3 else r[None] for r in (ratios, alone))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a channel without any is NaN
+        scales = [np.nanmedian(r, axis=0) for r in singles]
+    return min(scatter(r / by - 1) for r, by in zip(stacks, scales, strict=True))

@@ -94,6 +94,18 @@ def _top(before, at, after):
     return 0.0 if curved >= 0 else float(np.clip(0.5 * (before - after) / curved, -0.5, 0.5))
 
 
+def top_near(rest, place, radius):
+    """Position (2,) and height of the brightest that is left within `radius` [px] of a peak.
+
+    Peaks are searched in units of `noise_of`, which is larger towards the brighter source: they lie
+    outwards of the light's own top, by a pixel or so.
+    """
+    low = np.maximum(np.asarray(place) - radius, 0)
+    window = rest[low[0] : place[0] + radius + 1, low[1] : place[1] + radius + 1]
+    top = low + np.unravel_index(window.argmax(), window.shape)
+    return centred(rest, top), float(rest[tuple(top)])
+
+
 def is_a_source(place, rest, model, image, signals, centres, fwhm):
     """Whether a peak of what was left is a source of its own, as the head of this module says.
 

@@ -24,7 +24,7 @@ from ..deblending.spectra import MODEL_ERROR
 from ..sky.frame import Frame, model_frame
 from ..sky.observation import Observation
 from ..sky.sources import Extended
-from .companions import LEAST, centred, is_a_source, left_over, noise_of
+from .companions import LEAST, centred, is_a_source, left_over, noise_of, top_near
 from .signal import combined, signal_of
 
 # [sigma] of the combined image: white noise reaches it once in two million independent pixels
@@ -188,7 +188,7 @@ def _companions(sep, signals, sharp, everything, places, threshold, fwhm):
         own=False,
     )
     return [
-        (place, float(rest[tuple(place.astype(int))]))
+        top_near(rest, place.astype(int), round(fwhm / 2))
         for place, _ in new
         if is_a_source(place.astype(int), rest, model, image, signals, centres, fwhm)
     ]

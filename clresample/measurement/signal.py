@@ -28,6 +28,7 @@ WIDTHS_ARCSEC = (0.0, 0.2, 0.5)
 LEAST_WEIGHT = 0.1
 # of the same, below which float32 holds nothing of n any more
 NO_WEIGHT = 1e-5
+SAME_PX = 1e-3  # by which pixels of the model may lie beside observed ones and count as the same
 # [sigma^2] Sum of squares up to which its significance is tabulated; above, both grow alike
 TABLE_END, TABLE_STEP = 400.0, 0.25
 
@@ -113,12 +114,13 @@ def signal_of(observation, frame) -> Signal:
                 channels[c] = image
                 seen += variance > LEAST_WEIGHT * most
     at = np.moveaxis(places, -1, 0)
+    order = 0 if np.abs(places - np.rint(places)).max(initial=0) < SAME_PX else 3
     n_seen = map_coordinates(seen, at, order=0)
     found = np.zeros((2, len(sigmas), *frame.shape), np.float32)
     for total, image in zip(
         totals.reshape(-1, *shape), found.reshape(-1, *frame.shape), strict=True
     ):
-        map_coordinates(total, at, order=3, output=image)
+        map_coordinates(total, at, order=order, output=image)
         image[n_seen == 0] = 0
     return Signal(found[0], np.maximum(found[1], 0), n_seen, channels, places)
 

@@ -9,6 +9,7 @@ from clresample.measurement.companions import (
     is_a_source,
     left_over,
     noise_of,
+    top_near,
 )
 from clresample.measurement.signal import Signal
 
@@ -80,3 +81,16 @@ def test_centres_are_found_to_part_of_a_pixel():
     image = spot((60.3, 58.8), 100)
     np.testing.assert_allclose(centred(image, (60, 59)), (60.3, 58.8), atol=0.05)
     np.testing.assert_array_equal(centred(image, (0, 59)), (0, 59))
+
+
+def test_the_top_of_what_is_left_is_nearer_than_its_peak_in_units_of_the_noise():
+    image = spot((60, 60), 400, sigma=4) + spot((60.4, 67.2), 90)
+    rest, model = rest_of(image, (60, 60))
+    peak = np.unravel_index((rest / noise_of(model)).argmax(), SHAPE)
+    place, height = top_near(rest, peak, 2)
+    away, before = (np.hypot(*(np.array(p) - (60.4, 67.2))) for p in (place, peak))
+    assert away <= before and away < 1.2
+    assert height == rest.max() or height >= rest[peak]
+    corner = np.zeros(SHAPE)
+    corner[0, 1] = 3.0
+    assert top_near(corner, (1, 0), 2) == (pytest.approx((0, 1)), 3.0)
