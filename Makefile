@@ -125,5 +125,5 @@ clean:
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv --without-pip $(VENV)
 	$(PYTHON) -m pip --python $(VENV)/bin/python install --quiet \
-	    --editable '.[pocl,sim,plot,field,hats,jwst,dev]'
+	    --editable '.[pocl,sim,plot,field,hats,jwst,dask,dev]'
 	touch $@
