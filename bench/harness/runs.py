@@ -26,8 +26,10 @@ from .options import ROOT
 
 
 def found_in(field, folder):
-    """Positions (R, 2) [model px] that the search alone finds in a field's files."""
+    """Positions (R, 2) [model px] that the search alone finds in a field's files, and its processor
+    and wall time [s]."""
     mosaics = read_field(write_field(folder, field)[0]).mosaics
+    core, wall = time.process_time(), time.perf_counter()
     reference, options = reference_of(mosaics), FieldOptions()
     tiles = tiles_of(Box.of(reference.shape), options.tile_px, options.overlap_px)
     scatters = scatters_of(mosaics, reference)
@@ -35,7 +37,7 @@ def found_in(field, folder):
         search(mosaics, reference, tile, threshold=options.threshold, scatters=scatters).positions
         for tile in tiles
     ]
-    return np.concatenate(found)
+    return np.concatenate(found), time.process_time() - core, time.perf_counter() - wall
 
 
 def fitted(field, workers):
