@@ -26,7 +26,8 @@ enum { M, N, K, BEGIN_A, LD_A, NEXT_A, BEGIN_B, SKIP, BEGIN_C, LD_C, NEXT_C, N_C
 __kernel __attribute__((reqd_work_group_size(WGX, WGY, 1)))
 void boxed(__global const int *restrict active, __global const long *restrict items,
            const int block, const int inward, __global const REAL *restrict A,
-           __global const REAL *restrict B, const int ld_b, __global REAL *restrict C, const int add)
+           __global const REAL *restrict B, const int ld_b, __global REAL *restrict C,
+           const int add)
 {
     __global const long *item = items + (size_t)N_COLUMNS * active[get_global_id(2)];
     const int m = (int)item[M], k = (int)item[K], skip = (int)item[SKIP];

@@ -26,7 +26,8 @@
  *          pairs (., 6) int: slots a, b, and the pixels: y, x, height, width; images beyond a
  *          slot's n are its last again;  launch: (WG pairs, n_bands), groups of (WG, 1): of pairs
  *          there may be more than a GPU's groups along other axes
- * pull     out (slots, n_bands, K, 2) = sums of w a_i r and w a_i root;  launch: (WG slots, n_bands)
+ * pull     out (slots, n_bands, K, 2) = sums of w a_i r and w a_i root;
+ *          launch: (WG slots, n_bands)
  *
  * X is 1 where a work-item walks a whole row (ROWS of group.h), else the width of the widest row.
  */

@@ -1,7 +1,7 @@
 /* Windows of observations: what groups of sources are seen as, each in its own part of an image.
  *
- *   image     (B, n_bands, my, mx); windows (G, n_bands, wy, wx), of which window g shows the pixels
- *             from low[g] (y, x) on, in part or all of them outside of the image
+ *   image     (B, n_bands, my, mx); windows (G, n_bands, wy, wx), of which window g shows the
+ *             pixels from low[g] (y, x) on, in part or all of them outside of the image
  *   Groups are sorted by scene; those of scene b are first[b] .. first[b + 1] - 1.
  *
  * assemble  image[b, c, y, x] (+)= sum_g windows[g, c, y - low_y, x - low_x]
@@ -16,7 +16,8 @@
 
 __kernel void assemble(__global const int *restrict first, __global const int *restrict low,
                        const int n_bands, const int my, const int mx, const int wy, const int wx,
-                       const int add, __global const REAL *restrict windows, __global REAL *restrict image)
+                       const int add, __global const REAL *restrict windows,
+                       __global REAL *restrict image)
 {
     const int c = (int)get_global_id(2) % n_bands, b = (int)get_global_id(2) / n_bands;
     FOR_Y(y, my) {
