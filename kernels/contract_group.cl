@@ -71,8 +71,8 @@
 
 /* First term of the slab whose turn it is. */
 #define SLAB(turn) \
-    (KB * (inward && (turn) % 2 == 0 ? (turn) / 2 \
-           : n_slabs - 1 - (inward ? (turn) / 2 : (turn))))
+    (KB * (!inward ? n_slabs - 1 - (turn) \
+           : (turn) % 2 == 0 ? (turn) / 2 : n_slabs - 1 - (turn) / 2))
 
 #define FETCH(l0) \
     UNROLL(f, FETCH_A) { \

@@ -12,8 +12,8 @@ FILE, GROUP_FILE = "contract.cl", "contract_group.cl"
 EPILOGUES = ("MIX", "TWIST")
 # Columns of device matrices are padded with zeros to a multiple of this, the widest OpenCL vector.
 COLUMN_PAD = 16
-# Terms summed at a stretch, at most, before the stretches are summed. With 16, products take 10 %
-# longer on CPUs; with 256, 5 % less, and frames of 400 pixels are rounded half as much again.
+# Terms summed at a stretch, at most, before the stretches are summed. With 16, products take up to
+# 10 % longer on CPUs; with 256, 5 % less, and frames of 400 pixels are rounded half as much again.
 SUM_BLOCK = 64
 # Terms that the kernel for groups sums in one go: a second sum takes half of a GPU's registers.
 ONE_SUM = 256
