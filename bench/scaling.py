@@ -47,8 +47,9 @@ SIZES, QUICK_SIZES, GIANT_SIZES = (1024,), (256,), (3000,)
 BANDS, QUICK_BANDS = "ugrizy", "ri"
 LEAST_SNR = 5.0  # of sources whose places are given
 # Euclid's signal to noise of the halo's light in one pixel, in the corners; with all instruments it
-# is over the search's limit everywhere. In the middle it is some five times as bright.
-HALO_SIGMA = 1.5
+# is over the search's limit everywhere. Its core is a rich cluster's at redshift 0.3: in a piece
+# the halo is nearly flat, which the fitted sky takes up; in 3000 pixels it falls to a fifth.
+HALO_SIGMA, CORE_ARCSEC = 1.0, 100.0
 LOOK_S = 0.2
 COLUMNS = (
     ("n_model", 7, "d"),
@@ -110,10 +111,9 @@ def halo_of(mosaic, n_pixels, survey_of_noise):
     """
     finest = survey_of_noise.pixel_scale_arcsec
     corner = np.hypot(n_pixels, n_pixels) / 2 * finest
-    core = n_pixels / 3 * finest
     y, x = np.indices(mosaic.grid.shape) - np.array(mosaic.grid.shape).reshape(2, 1, 1) / 2
     radius = np.hypot(y, x) * mosaic.survey.pixel_scale_arcsec
-    shape = (1 + (corner / core) ** 2) / (1 + (radius / core) ** 2)
+    shape = (1 + (corner / CORE_ARCSEC) ** 2) / (1 + (radius / CORE_ARCSEC) ** 2)
     unit = float(survey_of_noise.counts(np.zeros((1, 1)))[0, 0])
     magnitude = -2.5 * np.log10(HALO_SIGMA * survey_of_noise.noise_sigma[0] / unit)
     area = (mosaic.survey.pixel_scale_arcsec / finest) ** 2
