@@ -1,12 +1,15 @@
 """The example's scene file: a real file, complete, and true to the simulated surveys."""
 
+import errno
 import tomllib
 from importlib import resources
 
 import numpy as np
 import pytest
 
+from clresample.cli import example
 from clresample.files.scene_keys import TABLES, parse
+from clresample.files.whole_file import FileError
 from clresample.simulation.surveys import EUCLID_VIS, RUBIN_UGRIZY
 
 TEXT = resources.files("clresample.cli").joinpath("example.toml").read_text()
@@ -46,3 +49,24 @@ def test_noise_and_zero_points_are_those_of_the_surveys():
     for table, survey in zip(observations, (EUCLID_VIS, RUBIN_UGRIZY), strict=True):
         np.testing.assert_allclose(table["variance"], survey.noise_sigma**2, rtol=1e-5)
         np.testing.assert_allclose(table["zero_point"], survey.zero_points_mag, atol=1e-4)
+
+
+@pytest.mark.parametrize("older", [False, True])
+def test_a_full_disk_leaves_no_half_of_it(tmp_path, monkeypatch, older):
+    """The disk is full at the second PSF: no new file is there, and older ones are as they were."""
+    folder, write = tmp_path / "example", example.write_hdus
+
+    def until_full(path, hdus):
+        if path.name == "rubin_psf.fits":
+            path.write_bytes(b"half of it")
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(path, hdus)
+
+    monkeypatch.setattr(example, "write_hdus", until_full)
+    if older:
+        folder.mkdir()
+        (folder / "rubin.fits").write_bytes(b"older")
+    with pytest.raises(FileError, match="No space left on device"):
+        example.write_example(folder, overwrite=True)
+    left = {path.name: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert left == ({"rubin.fits": b"older"} if older else {})
