@@ -16,12 +16,13 @@ from clresample.deblending.solver.amsgrad import AMSGrad
 from clresample.deblending.solver.curvature import damping
 from clresample.deblending.solver.prior import Prior
 from clresample.deblending.start.first_scene import SPECTRUM_PART
-from clresample.deblending.view import whitened_view
+from clresample.deblending.view import Home, whitened_view
 from clresample.sky.sources import Extended
 
 
 def seen(device, dtype=np.float32):
-    return [whitened_view(frame(), frame(), o, 1, device, dtype, private=True) for o in observe()]
+    home = Home(frame(), frame(), np.zeros((0, 2)), 0.0)
+    return [whitened_view(home, o, 1, device, dtype, private=True) for o in observe()]
 
 
 def test_noise_of_a_model_pixel(device):
