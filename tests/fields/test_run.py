@@ -258,7 +258,7 @@ def test_several_devices_have_a_process_each_and_leave_the_same_bytes(done, sky,
 
 def test_groups_shrink_with_the_device_and_leave_the_same_sources(done, sky, tmp_path, monkeypatch):
     folder, _ = done
-    device, small = get_device(), 3 << 20
+    device, small = get_device(), 8 << 20
     monkeypatch.setattr(look, "DEVICE_PART", device.memory // small)
     for module in (run, options):
         monkeypatch.setattr(module, "LEAST_MEMORY", 1 << 20)
