@@ -197,7 +197,6 @@ def test_settings(tmp_path):
         ("throughput", ("--limit", "-1"), "-1 is not above 0"),
         ("settings", ("--settings", "best"), "best"),
         ("real", ("--galaxies", "many"), "many"),
-        ("real", ("--only", "m87"), "--only"),
         ("real", ("--json", "."), "--json ."),
     ],
 )
@@ -206,6 +205,14 @@ def test_bad_options_get_one_line(module, options, words):
     assert result.returncode == 2
     assert result.stderr.count("\n") == 1
     assert words in result.stderr
+
+
+@pytest.mark.usefixtures("data")
+def test_scenes_that_are_not_there():
+    result = run_python("-m", "bench.real", "--only", "m87")
+    assert result.returncode == 2
+    assert result.stderr.count("\n") == 1
+    assert "--only" in result.stderr
 
 
 def test_noise(tmp_path):
