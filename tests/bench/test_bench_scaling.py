@@ -64,8 +64,9 @@ def test_the_page_holds_what_follows_from_its_figures():
     text = on_paper.PAGE.read_text()
     figures = on_paper.measured(text)
     assert on_paper.between(text, "arithmetic") == on_paper.arithmetic(figures)
-    twice = on_paper.arithmetic(figures | {"core-seconds a source": 1.0})
-    assert "| Rubin patch, 10' x 10' | 3,600 | 1 | 3,600 |" in twice
+    round_ones = {"core-seconds a source": 1.0, "sources a square arcminute": 36.0}
+    other = on_paper.arithmetic(figures | round_ones)
+    assert "| Rubin patch, 10' x 10' | 3,600 | 1 | 3,600 |" in other
 
 
 def test_a_small_field_by_workers(tmp_path):
