@@ -22,7 +22,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
@@ -31,6 +30,7 @@ from astropy.table import QTable
 from clresample import simulate_field
 from clresample.cli.simulate import write_field
 
+from .harness.memory import children
 from .harness.options import ROOT
 
 LOOK_S = 0.02
@@ -65,12 +65,6 @@ def start(sky, out, *options, environment=None, before=None):
 def parts_in(out):
     """Groups of fits that are on disk."""
     return len(list((out / "work").glob("fit-*.fits")))
-
-
-def children(pid):
-    """Processes that a process has started and that live."""
-    path = Path(f"/proc/{pid}/task/{pid}/children")
-    return [int(one) for one in path.read_text().split()] if path.exists() else []
 
 
 def kill_at(process, seconds, what, rng, number=signal.SIGKILL):

@@ -214,8 +214,7 @@ def main(options):
     for size in sizes:
         rows.append((searched if options.search_only else row_of)(size, options))
         records.print_row(COLUMNS, rows[-1])
-        stages = rows[-1]["stage"].items()
-        print("  " + ", ".join(f"{name} {s:.2f} s" for name, s in stages), flush=True)
+        records.print_stages(rows[-1])
     if options.json is not None:
         records.write_json(options.json, {"record": record, "rows": rows})
 
@@ -226,13 +225,7 @@ def parser():
         "--quick", action="store_true", help="one field of 384 pixels, two bands of Rubin"
     )
     parser.add_sizes(SIZES)
-    parser.add_argument(
-        "--density",
-        type=positive(float),
-        default=36.0,
-        metavar="N",
-        help="sources per square arcminute (%(default)s)",
-    )
+    parser.add_density()
     parser.add_argument(
         "--faintest",
         type=positive(float),

@@ -15,8 +15,8 @@ own_cost            processor time of the process that deals the work while othe
                     over that of all of them
 busy                time that workers spent in fits over workers times the fits' wall time
 tail_s              from the first worker without a task left to the end of the fits, all rounds
-peak_gb, largest_gb memory of all processes at once, and of the largest alone: resident, files that
-                    are mapped and shared libraries counted in each
+peak_gb, largest_gb memory of all processes at once, and of the largest alone; pages that several
+                    share are counted once in all
 n_blends, pieces    of the plan; measured: sources with a finite flux in every channel
 """
 
@@ -25,7 +25,6 @@ from __future__ import annotations
 import os
 import resource
 import tempfile
-import threading
 import time
 from pathlib import Path
 
@@ -38,9 +37,9 @@ from clresample.fields.options import Progress
 from clresample.fields.reading.field_file import read_field
 from clresample.fields.run import run_field
 
-from .faults import children
 from .harness import records
 from .harness.clock import on_all_cores
+from .harness.memory import TreeMemory
 from .harness.options import Parser, positive, run, seed
 
 SIZES, QUICK_SIZES, GIANT_SIZES = (1024,), (256,), (3000,)
@@ -50,7 +49,6 @@ LEAST_SNR = 5.0  # of sources whose places are given
 # is over the search's limit everywhere. Its core is a rich cluster's at redshift 0.3: in a piece
 # the halo is nearly flat, which the fitted sky takes up; in 3000 pixels it falls to a fifth.
 HALO_SIGMA, CORE_ARCSEC = 1.0, 100.0
-LOOK_S = 0.2
 COLUMNS = (
     ("n_model", 7, "d"),
     ("workers", 7, "d"),
@@ -70,28 +68,6 @@ COLUMNS = (
     ("largest_gb", 10, ".2f"),
     ("status", 20, ""),
 )
-
-
-class Memory(threading.Thread):
-    """Watches the resident memory [bytes] of this process and those that it started."""
-
-    def __init__(self):
-        super().__init__(daemon=True)
-        self.peak, self.largest, self.stop = 0, 0, threading.Event()
-
-    def run(self):
-        while not self.stop.wait(LOOK_S):
-            sizes = [resident(pid) for pid in (os.getpid(), *children(os.getpid()))]
-            self.peak, self.largest = max(self.peak, sum(sizes)), max(self.largest, *sizes)
-
-
-def resident(pid):
-    """Resident memory [bytes] of a process; 0 of one that has ended."""
-    try:
-        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    except (OSError, IndexError):
-        return 0
-    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 class Stages(Progress):
@@ -143,7 +119,7 @@ def written(folder, size, options, bands):
 
 def row_of(toml, out, size, workers, own):
     """The row of one run, without what compares it with others."""
-    field, stages, memory = read_field(toml), Stages(), Memory()
+    field, stages, memory = read_field(toml), Stages(), TreeMemory(os.getpid())
     memory.start()
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     start = time.process_time()
@@ -152,7 +128,7 @@ def row_of(toml, out, size, workers, own):
     )
     wall_s, own_s = time.perf_counter() - began, time.process_time() - start
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    memory.stop.set()
+    memory.stop()
     theirs_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     dealing_s = stages.began["write"] - stages.began["fit"]
     table, blends = QTable.read(out / "catalogue.fits"), QTable.read(out / "blends.ecsv")
@@ -223,7 +199,7 @@ def main(options):
         for row in rows_of(size, options, bands):
             rows.append(row)
             records.print_row(COLUMNS, row)
-            print("  " + ", ".join(f"{k} {s:.2f} s" for k, s in row["stage"].items()), flush=True)
+            records.print_stages(row)
     if options.json is not None:
         records.write_json(options.json, {"record": record, "rows": rows})
 
@@ -246,13 +222,7 @@ def parser():
         metavar="S",
         help="one blend of so many sources instead of a field (3000 pixels a side)",
     )
-    parser.add_argument(
-        "--density",
-        type=positive(float),
-        default=36.0,
-        metavar="N",
-        help="sources per square arcminute (%(default)s)",
-    )
+    parser.add_density()
     parser.add_argument(
         "--seed", type=seed, default=0, metavar="S", help="of the field (%(default)s)"
     )

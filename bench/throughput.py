@@ -196,7 +196,7 @@ def main(options):
         rows.append(row)
         records.print_row(COLUMNS, row)
         if row["stage"]:
-            print("  " + ", ".join(f"{name} {s:.2f} s" for name, s in row["stage"].items()))
+            records.print_stages(row)
     if options.json is not None:
         records.write_json(options.json, {"record": record, "rows": rows})
 

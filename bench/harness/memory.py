@@ -9,18 +9,20 @@ LOOK_S = 0.25  # [s] between two looks: what comes and goes faster is missed
 
 
 class TreeMemory(threading.Thread):
-    """Watches the memory of a process's tree: `peak` [bytes], 0 where the system does not tell.
+    """Watches the memory of a process's tree: `peak` [bytes] of all at once, `largest` of one
+    process, 0 where the system does not tell.
 
     Proportional set size: pages that several processes share are counted once in all.
     """
 
     def __init__(self, pid):
         super().__init__(daemon=True)
-        self.pid, self.peak, self.over = pid, 0, threading.Event()
+        self.pid, self.peak, self.largest, self.over = pid, 0, 0, threading.Event()
 
     def run(self):
         while not self.over.wait(LOOK_S):
-            self.peak = max(self.peak, sum(map(proportional, tree(self.pid))))
+            sizes = [proportional(pid) for pid in tree(self.pid)]
+            self.peak, self.largest = max(self.peak, sum(sizes)), max(self.largest, *sizes)
 
     def stop(self):
         """End the watch; returns the peak [bytes]."""
@@ -33,11 +35,16 @@ def tree(pid):
     """A process and all its descendants that live."""
     found = [pid]
     for one in found:
-        try:
-            found += map(int, Path(f"/proc/{one}/task/{one}/children").read_text().split())
-        except (OSError, ValueError):
-            continue
+        found += children(one)
     return found
+
+
+def children(pid):
+    """Processes that a process has started and that live."""
+    try:
+        return [int(one) for one in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    except OSError:
+        return []
 
 
 def proportional(pid):

@@ -99,6 +99,15 @@ class Parser(argparse.ArgumentParser):
             help="seed of the first scene (%(default)s)",
         )
 
+    def add_density(self):
+        self.add_argument(
+            "--density",
+            type=positive(float),
+            default=36.0,
+            metavar="N",
+            help="sources per square arcminute (%(default)s)",
+        )
+
     def add_processes(self):
         self.add_argument(
             "--processes",

@@ -45,6 +45,11 @@ def print_row(columns, row):
     print("  ".join(cells), flush=True)
 
 
+def print_stages(row):
+    """Print the seconds of a row's stages in one line below it."""
+    print("  " + ", ".join(f"{name} {s:.2f} s" for name, s in row["stage"].items()), flush=True)
+
+
 def print_record(record):
     """Print a record, one name and value on each line."""
     for name, value in record.items():
