@@ -105,6 +105,15 @@ def test_other_priors_have_one(device):
     assert counts(deblend(b.observations, b.sources, **given)) == [1, 1]
 
 
+def test_two_found_are_as_two_asked_for(two, device):
+    """The second fit begins where one begins that is told of both from the start."""
+    result, b, _ = two
+    known = (replace(b.sources[0], n_components=2), b.sources[1])
+    told = deblend(b.observations, known, frame=b.frame, device=device)
+    assert result.losses[0] == pytest.approx(told.losses[0], rel=1e-5)
+    assert result.losses[-1] == pytest.approx(told.losses[-1], abs=0.1)
+
+
 def test_what_gains_nothing_is_not_kept(device, monkeypatch):
     """The first fit comes back, as it was."""
     b, _ = blend()

@@ -12,6 +12,7 @@ from ...sky.sources import Extended
 from ..blend import INTERRUPTED
 from ..iterate import iterate
 from ..start.first_scene import first_scene
+from ..start.seen import Model, see
 from ..start.start import Patch, start
 from .gradients import ask
 
@@ -62,15 +63,40 @@ def _note(fits, error):
 
 
 def _begun(fits):
-    """{index: a Fit at its start} of the scenes with sources that clearly need two components."""
+    """{index: a Fit at its start} of the scenes with sources that clearly need two components.
+
+    Of two starts the one that fits the data better. A start of those sources alone, all others'
+    light taken off as the first fit left it, knows the others' structure, but their light may hold
+    what one component could not take. In a start of the whole scene profiles alone share the light.
+    """
     asked = {i: one for i, one in enumerate(ask(fits)) if one is not None and len(one.clear)}
     if not asked:
         return {}
-    points = start([_patch(fits[i], one) for i, one in asked.items()])
-    return {
-        i: _again(fits[i], _joined(fits[i].start, point, one.clear))
-        for (i, one), point in zip(asked.items(), points, strict=True)
-    }
+    alone = start([_alone(fits[i], one) for i, one in asked.items()])
+    together = start(
+        [_together(fits[i].patch, fits[i].start.source[one.clear]) for i, one in asked.items()],
+        fit_sky=fits[0].settings.fit_sky,
+    )
+    begun = [
+        [_again(fits[i], point) for point in (_joined(fits[i].start, own, one.clear), whole)]
+        for (i, one), own, whole in zip(asked.items(), alone, together, strict=True)
+    ]
+    misfits = np.reshape(_misfits([fit for pair in begun for fit in pair]), (-1, 2))
+    best = misfits.argmin(axis=1)
+    return {i: pair[k] for i, pair, k in zip(asked, begun, best, strict=True)}
+
+
+def _misfits(fits):
+    """chi2 (n,) of Fits of one signature where they are, with the best spectra."""
+    found = []
+    images = see([_model(fit) for fit in fits], fit_sky=fits[0].settings.fit_sky)
+    for fit, seen in zip(fits, images, strict=True):
+        chi2 = 0.0
+        for view, image, part in zip(fit.views, seen.observed, fit.scene.channels(), strict=True):
+            model = image.total(seen.spectra[:, part]) + seen.sky[part, None, None]
+            chi2 += ((view.root * (view.data - model)) ** 2).sum()
+        found.append(chi2)
+    return found
 
 
 def _again(fit, point):
@@ -83,7 +109,23 @@ def _again(fit, point):
     return new
 
 
-def _patch(fit, asked):
+def _model(fit):
+    """A Fit's morphologies as they are."""
+    bare = [None] * len(fit.views)
+    own = fit.start.source, fit.scene.origin, list(fit.state.morph)
+    return Model(fit.padded.shape, fit.views, bare, *own)
+
+
+def _together(patch, double):
+    """A Patch whose sources of the numbers `double` have two components each."""
+    sources = [
+        replace(source, n_components=2) if i in double else source
+        for i, source in enumerate(patch.sources)
+    ]
+    return replace(patch, sources=sources)
+
+
+def _alone(fit, asked):
     """The Patch of the sources that need two components, all others' light taken off the data."""
     chosen, begin = asked.clear, fit.start
     spectra = fit.state.spectra.copy()
