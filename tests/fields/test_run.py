@@ -15,7 +15,7 @@ from clresample.fields.models import read_models
 from clresample.fields.mosaic import FilePlane
 from clresample.fields.options import Progress
 from clresample.fields.run import run_field
-from clresample.fields.work import look
+from clresample.fields.work import fitting, look
 from clresample.files.whole_file import FileError
 
 
@@ -164,6 +164,23 @@ def test_a_blend_over_the_limits_is_cut_and_each_source_measured(done, sky, tmp_
     assert rounds.min() == 0 and rounds.max() >= 1
     differences, n_others = compared(folder, tmp_path)
     assert n_others == 0 and np.median(np.abs(differences)) < 0.5
+
+
+def test_later_rounds_keep_the_number_of_components(done, sky, tmp_path, monkeypatch):
+    """That an earlier one found; the first leaves it to the data."""
+    folder, _ = done
+    limits = Limits(sources=int(table(folder)["n_blend"].max()) - 1)
+    given, blend_of = [], fitting.blend_of
+
+    def noted(patch, *others):
+        blend, boxes = blend_of(patch, *others)
+        given.append((others[-2] is not None, [s.n_components for s in blend.sources]))
+        return blend, boxes
+
+    monkeypatch.setattr(fitting, "blend_of", noted)
+    run_field(mosaics_of(sky), tmp_path, options=FieldOptions(limits=limits, passes=1))
+    first, later = ([n for is_later, ns in given if is_later == k for n in ns] for k in (0, 1))
+    assert set(first) == {None} and later and None not in later
 
 
 def test_pixels_that_cannot_be_read_cost_their_blends_alone_with_a_reason(sky, tmp_path):

@@ -11,7 +11,7 @@ from ...sky.sources import Extended
 from ..box import Box
 
 
-def blend_of(patch, plan, mosaics, reference, labels, corner, neighbours=None):
+def blend_of(patch, plan, mosaics, reference, labels, corner, neighbours=None, components=None):
     """The Blend of a patch, and the Boxes on the mosaics that its observations were cut from.
 
     patch: Patch of plan: Plan; mosaics: of the field; reference: Grid of the model's pixels
@@ -19,13 +19,14 @@ def blend_of(patch, plan, mosaics, reference, labels, corner, neighbours=None):
     neighbours: {mosaic's name: list of (Box, model (C, Ny, Nx) [counts])}: light of the other
         pieces of the same blend, to be subtracted. None: their pixels are ignored, as those of all
         other blends are
+    components: {id: how many a source has}; of the others the data choose
 
     A patch that no mosaic sees gives a Blend without observations. Raises FileError for pixels that
     cannot be read.
     """
     grid = reference.cutout(patch.box.y0, patch.box.x0, patch.box.shape)
     foreign = _foreign(patch, labels, corner, neighbours is not None)
-    observations, boxes = [], {}
+    known, observations, boxes = components or {}, [], {}
     for mosaic in mosaics:
         box = mosaic.box_on(grid)
         if not box.area:
@@ -47,6 +48,7 @@ def blend_of(patch, plan, mosaics, reference, labels, corner, neighbours=None):
         Extended(
             position_px=tuple(map(float, plan.positions[s] - patch.box[:2])),
             name=str(plan.ids[s]),
+            n_components=known.get(int(plan.ids[s])),
         )
         for s in patch.sources
     )

@@ -84,7 +84,14 @@ def fit_group(job, group, given) -> tuple[dict, bytes]:
         around = None if given.light is None else given.light[number]
         try:
             blend, boxes = blend_of(
-                patch, job.plan, job.mosaics, job.reference, labels, corner, around
+                patch,
+                job.plan,
+                job.mosaics,
+                job.reference,
+                labels,
+                corner,
+                around,
+                dict(group.components),
             )
         except ERRORS as error:
             _set_aside(part, job, patch, group.round, f"failed: {_line(error)}")

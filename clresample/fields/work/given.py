@@ -17,12 +17,14 @@ class Group:
     name: of the part; patches: numbers; round: 0, or which repetition of a cut blend's pieces
     light: (patch, name of a part, share) for each model of a neighbour that is subtracted; the
         shares of a patch add up to 1
+    components: (id, how many) of those sources whose number of components an earlier round found
     """
 
     name: str
     patches: tuple[int, ...]
     round: int = 0
     light: tuple[tuple[int, str, float], ...] = ()
+    components: tuple[tuple[int, int], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -50,7 +50,13 @@ def fitted(job, engine, progress):
             break
         progress.stage(f"pieces, round {n_round}", len(pending))
         tasks = [
-            Group(_name(n_round, i), patches, n_round, history.light_about(patches))
+            Group(
+                _name(n_round, i),
+                patches,
+                n_round,
+                history.light_about(patches),
+                history.components_of(patches),
+            )
             for i, patches in enumerate(groups)
         ]
         names = _fit_round(job, tasks, engine, progress)
@@ -100,6 +106,19 @@ class _Parts:
             if mean:
                 found.append((patch, older[-1], 0.5))
         return tuple(found)
+
+    def components_of(self, patches):
+        """`Group.components` of some pieces, by their last fits.
+
+        Asked again in each round, a source on the edge would go to and fro.
+        """
+        found: dict[int, int] = {}
+        for name in sorted({self.names[patch][-1] for patch in patches}):
+            table = _file(self.job, name).table("COMPONENTS")
+            for source, patch in zip(table["id"].tolist(), table["patch"].tolist(), strict=True):
+                if patch in patches:
+                    found[source] = found.get(source, 0) + 1
+        return tuple(sorted(found.items()))
 
     def moved(self, patches):
         """Those pieces with a flux that changed by over SETTLED errors since their fit before."""
