@@ -20,7 +20,7 @@ ROOMS = {
     "measurement": ("sky", "resampling", "deblending"),
     "files": ("drawing", "sky", "deblending", "measurement"),
     "simulation": ("sky",),
-    "fields": ("device", "sky", "deblending", "measurement", "files"),
+    "fields": ("device", "sky", "resampling", "deblending", "measurement", "files"),
     "cli": (
         "device",
         "drawing",

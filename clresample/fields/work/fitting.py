@@ -16,6 +16,7 @@ from ...device.device import get_device
 from ...device.discovery import DeviceError
 from ...measurement.catalogue import Flag, add_positions, catalogue
 from ...measurement.detection import detect_more
+from ...resampling.cache import default_cache
 from ...sky.grid import Grid
 from ..blends.patch import blend_of
 from ..blends.plan import Plan, source_ids
@@ -77,6 +78,7 @@ def fit_group(job, group, given) -> tuple[dict, bytes]:
     KeyboardInterrupt after Ctrl-C, DeviceError where the device no longer answers.
     """
     began = time.perf_counter()
+    default_cache().clear()  # of the groups before, whose places and PSFs do not come again
     part, cuts = Part(), []
     for number in group.patches:
         patch, start = job.plan.patches[number], time.perf_counter()

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import wait
 
 from ...device.discovery import DeviceError
-from .share import end_with, hold_memory, shared_threads
+from .share import end_with, hold_memory, return_memory, shared_threads
 
 # [s] Between two looks at whether a worker takes too long.
 LOOK_S = 1.0
@@ -266,6 +266,8 @@ def _work(pipe, bound, parent):
             pipe.send(answer)
         except OSError:
             return
+        del answer, what
+        return_memory()
 
 
 def reason_of(error):

@@ -40,6 +40,17 @@ def hold_memory(bound):
         resource.setrlimit(resource.RLIMIT_DATA, (int(bound), most))
 
 
+def return_memory():
+    """Give what this process has freed back to the system, where the C library can (glibc).
+
+    By itself it keeps most for later, in pieces that the next task's arrays may not fit into: after
+    sixteen groups of a giant's pieces 1.7 GB were held, of which 0.25 GB were in use.
+    """
+    if sys.platform.startswith("linux"):
+        with contextlib.suppress(OSError, AttributeError):  # a C library without it
+            ctypes.CDLL(None).malloc_trim(0)
+
+
 def end_with(parent):
     """Have the system end this process when its parent is killed, where it can (Linux).
 
