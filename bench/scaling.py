@@ -45,10 +45,12 @@ from .harness.options import Parser, positive, run, seed
 SIZES, QUICK_SIZES, GIANT_SIZES = (1024,), (256,), (3000,)
 BANDS, QUICK_BANDS = "ugrizy", "ri"
 LEAST_SNR = 5.0  # of sources whose places are given
-# Euclid's signal to noise of the halo's light in one pixel, in the corners; with all instruments it
-# is over the search's limit everywhere. Its core is a rich cluster's at redshift 0.3: in a piece
-# the halo is nearly flat, which the fitted sky takes up; in 3000 pixels it falls to a fifth.
-HALO_SIGMA, CORE_ARCSEC = 1.0, 100.0
+# Euclid's signal to noise of the halo's light in one pixel, in the corners: 28.7 mag per square
+# arcsecond, 26.8 in the middle, as light between galaxies has it. In the search's filtered sum of
+# all instruments that is over the limit everywhere. Its core is a rich cluster's at redshift 0.3:
+# in a piece the halo is nearly flat, which the fitted sky takes up; in 3000 pixels it falls to a
+# fifth.
+HALO_SIGMA, CORE_ARCSEC = 0.1, 100.0
 COLUMNS = (
     ("n_model", 7, "d"),
     ("workers", 7, "d"),
