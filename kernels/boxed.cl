@@ -48,9 +48,9 @@ void boxed(__global const int *restrict active, __global const long *restrict it
         int column[NV];
         WIDE acc[MR][NV];
         UNROLL(v, NV) column[v] = j0 + v * VW < n_pad ? j0 + v * VW : j0;
-        SUM_TERMS(acc, row, B, ld_b, column, k, block, inward)
+        SUM_INSIDE(n_pad - j0, acc, row, B, ld_b, column, k, block, inward)
         UNROLL(i, MR) UNROLL(v, NV) {
-            if (i0 + i >= m) break;
+            if (i0 + i >= m || j0 + v * VW >= n_pad) continue;
 #if RAGGED
             __global REAL *c = C + (size_t)(i0 + i) * (size_t)item[LD_C];
             const REAL *lane = (const REAL *)&acc[i][v];

@@ -45,7 +45,7 @@
  */
 #include "contract.h"
 
-#define OWNED(i, v) (i0 + (i) < m)
+#define OWNED(i, v) (i0 + (i) < m && j0 + (v) * VW < n_pad)
 /* By the vector's address: on CPUs the vector leaves its register in one store. */
 #define STORE_LANES(sums, c, n_left) \
     const REAL *lane = (const REAL *)&sums; \
@@ -76,7 +76,7 @@ void contract(const int m, const int n, const int n_pad, const int k, const int 
     WIDE acc[MR][NV];
     UNROLL(v, NV) column[v] = j0 + v * VW < n_pad ? j0 + v * VW : j0;
     UNROLL(i, MR) row[i] = A + (size_t)(i0 + i < m ? i0 + i : m - 1) * ld_a;
-    SUM_TERMS(acc, row, B, n_pad, column, k, block, inward)
+    SUM_INSIDE(n_pad - j0, acc, row, B, n_pad, column, k, block, inward)
 
 #include "contract_end.h"
 }

@@ -66,25 +66,34 @@
 
 #define UNROLL(i, n) _Pragma("unroll") for (int i = 0; i < (n); ++i)
 
-/* part[MR][NV] += row[i][l STEP_A] times the vectors at B + l ld_b + column[v]. */
-#define ADD_TERM(l, row, B, ld_b, column) \
-    UNROLL(v, NV) right[v] = AT(const WIDE, (B) + (size_t)(l) * (ld_b) + column[v]); \
-    UNROLL(i, MR) UNROLL(v, NV) part[i][v] += row[i][(l) * STEP_A] * right[v];
+/* part[MR][nv] += row[i][l STEP_A] times the vectors at B + l ld_b + column[v], nv of them. */
+#define ADD_TERM(nv, l, row, B, ld_b, column) \
+    UNROLL(v, nv) right[v] = AT(const WIDE, (B) + (size_t)(l) * (ld_b) + column[v]); \
+    UNROLL(i, MR) UNROLL(v, nv) part[i][v] += row[i][(l) * STEP_A] * right[v];
 
-/* sums[MR][NV] = the terms l < k, in blocks of `block` and in the order above. A loop for each
+/* sums[MR][nv] = the terms l < k, in blocks of `block` and in the order above. A loop for each
  * direction: one with a step that is a variable takes 4 % longer. */
-#define SUM_TERMS(sums, row, B, ld_b, column, k, block, inward) \
-    UNROLL(i, MR) UNROLL(v, NV) sums[i][v] = (WIDE)(0); \
+#define SUM_TERMS(nv, sums, row, B, ld_b, column, k, block, inward) \
+    UNROLL(i, MR) UNROLL(v, nv) sums[i][v] = (WIDE)(0); \
     for (int turn = 0; turn * (block) < (k); ++turn) { \
         const int rest = (k) - turn * (block), n_terms = rest < (block) ? rest : (block); \
         const int gone = ((inward) ? turn / 2 : turn) * (block); \
-        WIDE part[MR][NV], right[NV]; \
-        UNROLL(i, MR) UNROLL(v, NV) part[i][v] = (WIDE)(0); \
+        WIDE part[MR][nv], right[nv]; \
+        UNROLL(i, MR) UNROLL(v, nv) part[i][v] = (WIDE)(0); \
         if ((inward) && turn % 2 == 0) \
-            for (int l = gone; l < gone + n_terms; ++l) { ADD_TERM(l, row, B, ld_b, column) } \
+            for (int l = gone; l < gone + n_terms; ++l) { ADD_TERM(nv, l, row, B, ld_b, column) } \
         else \
             for (int l = (k) - 1 - gone; l >= (k) - gone - n_terms; --l) { \
-                ADD_TERM(l, row, B, ld_b, column) \
+                ADD_TERM(nv, l, row, B, ld_b, column) \
             } \
-        UNROLL(i, MR) UNROLL(v, NV) sums[i][v] += part[i][v]; \
+        UNROLL(i, MR) UNROLL(v, nv) sums[i][v] += part[i][v]; \
+    }
+
+/* The same of a tile of NV vectors of which those from `inside` on count: of the last tile of a
+ * row, one alone is summed where it is the only one inside. */
+#define SUM_INSIDE(inside, sums, row, B, ld_b, column, k, block, inward) \
+    if (NV > 1 && (inside) <= VW) { \
+        SUM_TERMS(1, sums, row, B, ld_b, column, k, block, inward) \
+    } else { \
+        SUM_TERMS(NV, sums, row, B, ld_b, column, k, block, inward) \
     }
