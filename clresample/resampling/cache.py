@@ -20,6 +20,49 @@ from .resampler import Resampler
 # that hundreds are kept: those of one survey tile's epochs and bands. With less room its fits make
 # them anew (10 to 100 ms each); with more, memory is held that is never read again.
 PLAN_BYTES, DEVICE_BYTES = 512 << 20, 256 << 20
+# Part of all entries that is new before all are asked again for what they hold. A tenth costs each
+# new one ten such questions; a larger part finds out later that others have grown.
+GROWTH = 0.1
+
+
+class _Store:
+    """Entries by their keys, those asked for longest ago dropped beyond `most` bytes.
+
+    Entries grow while they are used, and to ask each of hundreds for its size at every new one
+    took longer than to make that: what they held when last asked counts, until so many new ones
+    have come as GROWTH of all.
+    """
+
+    def __init__(self, most):
+        self.most, self._entries = most, OrderedDict()
+        self._held, self._n_new = {}, 0
+
+    def __len__(self):
+        return len(self._entries)
+
+    def clear(self):
+        """Drop all."""
+        self._entries.clear()
+        self._held.clear()
+
+    def find(self, key, make):
+        """The entry of a key, made by `make()` if there is none."""
+        if key not in self._entries:
+            self._entries[key] = make()
+            self._held[key] = self._entries[key].n_bytes
+            self._n_new += 1
+            if self._n_new > GROWTH * len(self._entries):
+                self._held = {k: entry.n_bytes for k, entry in self._entries.items()}
+                self._n_new = 0
+            self._drop()
+        self._entries.move_to_end(key)
+        return self._entries[key]
+
+    def _drop(self):
+        held = sum(self._held.values())
+        while held > self.most and len(self._entries) > 1:
+            oldest, _ = self._entries.popitem(last=False)
+            held -= self._held.pop(oldest)
 
 
 class OperatorCache:
@@ -35,7 +78,7 @@ class OperatorCache:
 
     def __init__(self, *, plan_bytes=PLAN_BYTES, device_bytes=DEVICE_BYTES):
         self.plan_bytes, self.device_bytes = plan_bytes, device_bytes
-        self._plans, self._operators = OrderedDict(), OrderedDict()
+        self._plans, self._operators = _Store(plan_bytes), _Store(device_bytes)
         self._lock = threading.RLock()
 
     def resampler(
@@ -69,13 +112,13 @@ class OperatorCache:
             )
 
         def operator():
-            plans = [_find(self._plans, key, plan, self.plan_bytes)]
+            plans = [self._plans.find(key, plan)]
             return Resampler.from_plans(plans, dtype=dtype, device=device)
 
         with self._lock:
             if private:
                 return operator()
-            return _find(self._operators, (key, device), operator, self.device_bytes)
+            return self._operators.find((key, device), operator)
 
     @property
     def n_plans(self) -> int:
@@ -143,14 +186,3 @@ def _key(mapping, psf_in, psf_out, dtype, extent):
         tuple(psf.images.shape for psf in (psf_in, psf_out)),
         digest.digest(),
     )
-
-
-def _find(entries, key, make, n_bytes):
-    """The entry of a key, made if there is none; then the oldest beyond `n_bytes` are dropped."""
-    if key not in entries:
-        entries[key] = make()
-        held = sum(entry.n_bytes for entry in entries.values())
-        while held > n_bytes and len(entries) > 1:
-            held -= entries.popitem(last=False)[1].n_bytes
-    entries.move_to_end(key)
-    return entries[key]
