@@ -136,6 +136,27 @@ def test_operators_count_what_they_hold_on_the_device(device):
     assert 0.3 < (device.in_use - before) / op.n_bytes < 2
 
 
+def test_what_entries_have_grown_by_is_found_out():
+    """Not at once, but as soon as a tenth of the entries is new; each is asked a few times."""
+    asked, store = [], cache_module._Store(1000)
+
+    class Entry:
+        size = 10
+
+        @property
+        def n_bytes(self):
+            asked.append(self)
+            return self.size
+
+    first = [store.find(i, Entry) for i in range(50)]
+    assert len(asked) < 50 * (2 + 1 / cache_module.GROWTH) and len(store) == 50
+    for entry in first:
+        entry.size = 100
+    for i in range(50, 56):
+        store.find(i, Entry)
+    assert len(store) <= 16 and store.find(55, None) is not first[-1]
+
+
 def test_caches_are_bounded(device, monkeypatch):
     """More geometries than are kept: the device's memory stops growing."""
     monkeypatch.setattr(

@@ -145,8 +145,9 @@ def make_plan(
     positions (S, 2) [px], peaks (S,) [sigma]; footprints: Footprints of `region`, whose labels are
     renumbered here: label n + 1 is patch n's
     memory [bytes]: that the fits of one group may take; None = no limit; n_channels: of all mosaics
-    most: blends in a group, as many as a CPU fits side by side. More share a round's launches, which
-        take small blends more time than their arithmetic, but are lost together with their worker
+    most: blends in a group, as many as a CPU fits side by side. More share a round's launches,
+        which take longer than the arithmetic of small blends, but are lost together with their
+        worker
     """
     limits = replace(limits or Limits(), memory=memory, n_channels=n_channels)
     ids = source_ids(positions, field_number)
