@@ -19,6 +19,7 @@ from ..sky.varying.field import PSFField
 from .background import Background
 from .box import Box
 from .psfs.psf_field import ConstantPSF
+from .strips import STRIPS
 
 
 class Plane(Protocol):
@@ -44,9 +45,11 @@ class FilePlane:
         """The pixels of a Box that lies on the image, native. Raises FileError."""
         try:
             hdu = _opened(str(self.path))[self.hdu]
-            rows, columns = box.slices
-            index = (rows, columns) if self.plane is None else (self.plane, rows, columns)
-            data = np.asarray(hdu.section[index])
+            data = STRIPS.read(hdu, self.plane, box)
+            if data is None:
+                rows, columns = box.slices
+                index = (rows, columns) if self.plane is None else (self.plane, rows, columns)
+                data = np.asarray(hdu.section[index])
         except Exception as error:  # a damaged file may provoke any exception in astropy
             reason = " ".join(str(error).split()) or type(error).__name__
             raise FileError(f"{self.path}: HDU {self.hdu} cannot be read ({reason})") from error

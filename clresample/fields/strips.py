@@ -1,0 +1,76 @@
+"""Rows of compressed images kept decoded, since neighbouring cutouts lie in the same tiles."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+
+import numpy as np
+
+# [px] Rows that are kept together, in whole tiles: about the side of a small blend's cutout. Fewer
+# are more entries, more are decoded for a cutout that is the only one there.
+STRIP_PX = 64
+# [bytes] of all strips: those of ten planes of 4000 pixels a side along one row of blends. With
+# less each blend decodes its rows again, 1 ms a plane and 1000 columns.
+MOST_BYTES = 64 << 20
+# Part of them that the rows of one box may take; larger ones would drive out all others.
+LARGEST = 0.25
+BYTES = 4  # [bytes] of a pixel, of most images
+
+
+class Strips:
+    """Strips of planes, those read longest ago dropped beyond `most` bytes. Safe between threads.
+
+    Only of images whose tiles are as wide as they are, of which any cutout decodes whole rows.
+    """
+
+    def __init__(self, most=MOST_BYTES):
+        self.most, self.n_bytes = most, 0
+        self._kept: OrderedDict[tuple, np.ndarray] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def read(self, hdu, plane, box) -> np.ndarray | None:
+        """The pixels of a Box of an HDU's plane (its number, None where there is one); None where
+        strips would not help."""
+        n_rows = _rows_of(hdu)
+        if not n_rows or not box.area:
+            return None
+        numbers = range(box.y0 // n_rows, (box.y1 - 1) // n_rows + 1)
+        if len(numbers) * n_rows * hdu.shape[-1] * BYTES > LARGEST * self.most:
+            return None
+        with self._lock:
+            found = {i: self._kept[key] for i in numbers if (key := (hdu, plane, i)) in self._kept}
+            for i in found:
+                self._kept.move_to_end((hdu, plane, i))
+        missing = [i for i in numbers if i not in found]
+        if missing:
+            first = missing[0] * n_rows
+            rows = slice(first, min((missing[-1] + 1) * n_rows, hdu.shape[-2]))
+            index = (rows, slice(None)) if plane is None else (plane, rows, slice(None))
+            data = np.asarray(hdu.section[index])
+            for i in range(missing[0], missing[-1] + 1):
+                at = i * n_rows - first
+                found[i] = data[at : at + n_rows].copy()
+                self._keep((hdu, plane, i), found[i])
+        top = numbers[0] * n_rows
+        together = np.concatenate([found[i][:, box.x0 : box.x1] for i in numbers])
+        return together[box.y0 - top : box.y1 - top]
+
+    def _keep(self, key, strip):
+        with self._lock:
+            old = self._kept.pop(key, None)
+            self.n_bytes += strip.nbytes - (0 if old is None else old.nbytes)
+            self._kept[key] = strip
+            while self.n_bytes > self.most:
+                self.n_bytes -= self._kept.popitem(last=False)[1].nbytes
+
+
+def _rows_of(hdu):
+    """Rows of a strip of an HDU's images; 0 where its tiles are not as wide as the images."""
+    tile = getattr(hdu, "tile_shape", None)
+    if tile is None or tile[-1] < hdu.shape[-1]:
+        return 0
+    return int(tile[-2]) * max(1, STRIP_PX // int(tile[-2]))
+
+
+STRIPS = Strips()

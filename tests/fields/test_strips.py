@@ -1,0 +1,84 @@
+"""Decoded strips of compressed images: the pixels of the file, decoded once, within a bound."""
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from clresample.fields.box import Box
+from clresample.fields.mosaic import FilePlane, _opened
+from clresample.fields.strips import STRIP_PX, Strips
+
+SHAPE = 3, 150, 90
+
+
+@pytest.fixture
+def cube():
+    return np.random.default_rng(0).normal(size=SHAPE).astype(np.float32)
+
+
+@pytest.fixture(params=[(1, 1, 90), (1, 20, 90), (1, 100, 90), (3, 150, 90)], ids=str)
+def packed(request, tmp_path, cube):
+    """The cube in tiles of whole rows."""
+    path = tmp_path / "rows.fits"
+    lossless = {"compression_type": "GZIP_2", "quantize_level": 0}
+    fits.CompImageHDU(cube, tile_shape=request.param, **lossless).writeto(path)
+    with fits.open(path) as hdus:
+        yield hdus[1]
+
+
+BOXES = [(0, 0, 10, 10), (60, 5, 70, 90), (149, 0, 150, 1), (0, 0, 150, 90), (30, 7, 131, 44)]
+
+
+def test_strips_hold_the_pixels_of_the_file(packed, cube):
+    strips = Strips()
+    for plane in (2, 0):
+        for corners in [*BOXES, *BOXES[::-1]]:
+            box = Box(*corners)
+            np.testing.assert_array_equal(strips.read(packed, plane, box), cube[plane][box.slices])
+    assert strips.n_bytes == 2 * cube[0].nbytes
+
+
+def test_rows_are_decoded_once_and_the_oldest_go(packed, cube):
+    class Counted:
+        """An HDU that counts the rows it decodes."""
+
+        shape, tile_shape, n_rows = packed.shape, packed.tile_shape, 0
+
+        @property
+        def section(self):
+            return self
+
+        def __getitem__(self, index):
+            self.n_rows += index[1].stop - index[1].start
+            return packed.section[index]
+
+    hdu, strips = Counted(), Strips()
+    for corners in BOXES:
+        strips.read(hdu, 1, Box(*corners))
+    assert hdu.n_rows <= SHAPE[1] + STRIP_PX
+    few = Strips(most=8 * cube[0].nbytes)
+    for _ in range(5):  # more than there is room for
+        for plane in range(3):
+            found = few.read(Counted(), plane, Box(30, 7, 131, 44))
+            np.testing.assert_array_equal(found, cube[plane, 30:131, 7:44])
+            assert 0 < few.n_bytes <= few.most
+
+
+def test_large_boxes_are_left_to_the_file(packed):
+    assert Strips(most=100_000).read(packed, 0, Box(0, 0, 150, 90)) is None
+
+
+def test_images_in_cells_are_read_as_they_were(tmp_path, cube):
+    path = tmp_path / "cells.fits"
+    fits.CompImageHDU(cube[0], tile_shape=(30, 30)).writeto(path)
+    with fits.open(path) as hdus:
+        assert Strips().read(hdus[1], None, Box(0, 0, 9, 9)) is None
+
+
+def test_a_file_written_again_is_read_again(tmp_path, cube):
+    path, box = tmp_path / "again.fits", Box(3, 4, 50, 60)
+    for image in (cube[0], cube[1]):
+        lossless = {"compression_type": "GZIP_2", "quantize_level": 0}
+        fits.CompImageHDU(image, **lossless).writeto(path, overwrite=True)
+        _opened.cache_clear()
+        np.testing.assert_array_equal(FilePlane(path, 1).read(box), image[box.slices])
