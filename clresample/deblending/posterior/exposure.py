@@ -19,13 +19,18 @@ from ...resampling.plan import FAINT
 from ...resampling.transfer import transfer_function
 from ...sky.extent import lit_part
 from ...sky.psf import PSF
-from ..view import WhitenedView, without_dark
+from ..view import WhitenedView
 
 # [FWHM of the observation's PSF] How far about its box a component's light is followed. Errors of
 # simulated Euclid and Rubin scenes differ by less than 1e-4 from those with 5, with 1 by 5e-4.
 REACH_FWHM = 1.5
 # |D| / max |D| under which a frequency is left out: of a source's information it holds the square.
-BAND = 1e-3
+# Errors of simulated Euclid and Rubin scenes differ by less than 1e-3 from those with a tenth of
+# it.
+BAND = 1e-2
+# An observation is replaced by one of pixels as wide as its band allows where that is so many times
+# the width of its own.
+WIDER = 1.2
 # [px] Periods are multiples of it, and one: boxes of about one size share their transfer function.
 PERIOD_PX = 8
 # [px] Period at which the band is looked for.
@@ -59,8 +64,12 @@ class Exposure:
         matrix = view.mapping.matrix
         psfs = (_Content(psf) for psf in (frame.psf, view.op.plans[0].psfs[1]))
         transfer = _transfer(matrix.tobytes(), *psfs)
-        make = _parallel if view.mapping.geometry == "aligned" else _spread
-        y, x, root = make(view, min(scale, transfer.nyquist_px))
+        pixel = transfer.nyquist_px
+        if view.mapping.geometry == "aligned" and pixel < WIDER * scale:
+            y, x, root = _parallel(view)
+        else:
+            pixel = pixel if pixel > WIDER * scale else min(scale, pixel)
+            y, x, root = _spread(view, pixel)
         shares = None if view.shares is None else view.shares[source].astype(np.float32)
         return cls(y, x, root, reach, transfer, shares)
 
@@ -74,15 +83,18 @@ class Exposure:
 
     def observe(self, images, i, origin, low, high):
         """Whitened images (k, C, ry, rx) of component i's images (k, ny, nx) in a box of the frame
-        from `origin` on, at the rows and columns from `low` to `high`; float32."""
+        from `origin` on, at the rows and columns from `low` to `high`; float32, as these are.
+
+        images: see `without_dark`
+        """
         k, n_y, n_x = images.shape
         nu_y, nu_x, d = self.transfer.at((n_y, n_x), self.reach_px)
         if self.shares is not None:
             parts = self.shares[i]
             d = np.einsum("yctx,ct->ycx", d.reshape(len(nu_y), *parts.shape, -1), parts)
-        images = without_dark(images.transpose(1, 0, 2).astype(np.float32))  # (ny, k, nx)
+        columns = images.transpose(1, 0, 2).reshape(n_y, -1)  # (ny, k nx)
         wave_y = _waves(nu_y, -np.arange(n_y))  # (Hy, ny)
-        parts = np.concatenate([wave_y.real, wave_y.imag]) @ images.reshape(n_y, -1)
+        parts = np.concatenate([wave_y.real, wave_y.imag]) @ columns
         rows = (parts[: len(nu_y)] + 1j * parts[len(nu_y) :]).reshape(-1, n_x)
         z = (rows @ _waves(-np.arange(n_x), nu_x)).reshape(len(nu_y), k, 1, -1) * d[:, None]
         z = z.reshape(-1, len(nu_x)) @ _waves(nu_x, self.x[low[1] : high[1]] - origin[1])
@@ -131,8 +143,16 @@ class Transfer:
     @property
     def nyquist_px(self):
         """Pixels [model px] that resolve the band."""
-        nu = self._band((BAND_PERIOD_PX, BAND_PERIOD_PX))[:2]
-        return 1 / (2 * max(abs(nu[0][-1]), abs(nu[1][-1]), 1 / BAND_PERIOD_PX))
+        return 1 / (2 * self._edge.max())
+
+    @functools.cached_property
+    def _edge(self):
+        """Largest frequencies (2,) along y and x that are needed."""
+        # not beyond what the observation's own pixels carry
+        inside = np.abs(np.linalg.inv(self.matrix).T).sum(1) * 0.5 / self.psf_out.spacing
+        nu_y, nu_x, _ = self._band((BAND_PERIOD_PX, BAND_PERIOD_PX), inside)
+        # another period may have its last one half a step further
+        return np.minimum(inside, np.array([nu_y[-1], nu_x[-1]]) + 0.5 / BAND_PERIOD_PX)
 
     def at(self, shape, reach):
         """Frequencies nu_y (Hy,) >= 0, nu_x (W,) and D (Hy, C T, W) with the weights of a sum over
@@ -140,17 +160,20 @@ class Transfer:
         sides = [int(np.ceil((n + 2 * reach) / PERIOD_PX)) * PERIOD_PX + 1 for n in shape]
         key = tuple(sides)
         if key not in self._found:
-            self._found[key] = self._band(key)
+            self._found[key] = self._band(key, self._edge)
         return self._found[key]
 
-    def _band(self, period):
-        """See `at`."""
+    @functools.cached_property
+    def _lit(self):
+        """The parts of both PSFs that matter."""
+        return [lit_part(psf, FAINT * BAND) for psf in (self.psf_in, self.psf_out)]
+
+    def _band(self, period, inside):
+        """See `at`; of frequencies `inside` (2,)."""
         nu_y, nu_x = (np.arange(n // 2 + 1) / n for n in period)
         nu_x = np.concatenate([-nu_x[:0:-1], nu_x])
-        # not beyond what the observation's own pixels carry
-        inside = np.abs(np.linalg.inv(self.matrix).T).sum(1) * 0.5 / self.psf_out.spacing
         nu_y, nu_x = nu_y[nu_y <= inside[0]], nu_x[np.abs(nu_x) <= inside[1]]
-        psf_in, psf_out = (lit_part(psf, FAINT * BAND) for psf in (self.psf_in, self.psf_out))
+        psf_in, psf_out = self._lit
         d = transfer_function(psf_in.otf(nu_y, nu_x), psf_out.otf(nu_y, nu_x, self.matrix))[0]
         strong = (np.abs(d) > BAND * np.abs(d).max(axis=(1, 2), keepdims=True)).any(0)
         n_y = int(np.flatnonzero(strong.any(1))[-1]) + 1
@@ -166,7 +189,7 @@ def _waves(a, b):
     return np.exp(2j * np.pi * np.multiply.outer(a, b)).astype(np.complex64)
 
 
-def _parallel(view, _pixel):
+def _parallel(view):
     """Rows, columns and root weights of an observation whose axes are the model's."""
     mapping, root = view.mapping, view.root
     if mapping.matrix[0, 0] == 0:
@@ -191,24 +214,19 @@ def _spread(view, pixel):
     place = (at[good] / pixel).T + 1  # the first row lies a pixel before the frame
     low = np.clip(np.floor(place).astype(int), 0, [[n_y - 2], [n_x - 2]])
     part = np.clip(place - low, 0, 1)
+    flat = (low[0] * n_x + low[1] + np.array([[0], [1], [n_x], [n_x + 1]])).ravel()
+    rows, columns = (np.stack([1 - p, p]) for p in part)
+    share = (rows[:, None] * columns).reshape(4, -1)  # of a pixel, in the four about it
 
     def deposit(values):
-        out = np.zeros(n_y * n_x)
-        for dy, dx in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            share = (part[0] if dy else 1 - part[0]) * (part[1] if dx else 1 - part[1])
-            flat = (low[0] + dy) * n_x + low[1] + dx
-            out += np.bincount(flat, share * values, n_y * n_x)
-        return out
+        return np.bincount(flat, (share * values).ravel(), n_y * n_x)
 
     # without the ripples that two rasters make: mean weight times the density of pixels there
-    area = np.ones(good.shape) if mapping.area is None else mapping.area
-    count = deposit(np.ones(len(low[0])))
+    count = deposit(1.0)
     density = pixel**2 / abs(np.linalg.det(mapping.matrix))
     within = count > 0.5 * density
-    root = [
-        np.where(within, deposit(channel[good] ** 2 / np.maximum(area[good], 1e-6)), 0)
-        for channel in view.root
-    ]
+    area = 1.0 if mapping.area is None else np.maximum(mapping.area[good], 1e-6)
+    root = [np.where(within, deposit(channel[good] ** 2 / area), 0) for channel in view.root]
     root = np.sqrt(np.array(root) / np.maximum(count, 1e-9) * density)
     y, x = ((np.arange(n) - 1.0) * pixel for n in (n_y, n_x))
     return y, x, root.reshape(-1, n_y, n_x).astype(np.float32)

@@ -10,6 +10,7 @@ import numpy as np
 from ...sky.extent import shared_part
 from ..solver.learned.prior import LearnedPrior
 from ..solver.scene import Scene
+from ..view import without_dark
 from .bumps import Bumps, uncorrelated
 from .profile_modes import profile_modes
 
@@ -77,8 +78,8 @@ class Solution:
         return out
 
     def modes(self, i):
-        """Modes (k, ny, nx) of component i, whose coefficients the prior expects to scatter by 1,
-        each on its own; and its Beyond."""
+        """Images (1 + k, ny, nx), float32, of component i's morphology and of its modes, whose
+        coefficients the prior expects to scatter by 1, each on its own; and its Beyond."""
         profile, scene = self.scene.profile[i], self.scene
         images, scatter, far = profile_modes(
             self.shapes[i],
@@ -88,25 +89,36 @@ class Solution:
             scene.origin[i],
             radial=self.unlikeness(i) ** OTHERS,
         )
-        images = scatter[:, None, None] * images
-        far = far.scaled(np.append(1, scatter) / self.peaks[i])
+        scatter = scatter / self.peaks[i]
+        far = far.scaled(np.append(1 / self.peaks[i], scatter))
+        n_own, own = 0, None
         if not scene.fixed[i]:
             bumps = Bumps(
                 scene.origin[i], profile, self.strengths(i), self.prior.kernels(), self._shared(i)
             )
-            keep = self._change(i, bumps.images) > LEAST_CHANGE
-            own = uncorrelated(bumps.images[keep], bumps.precision[np.ix_(keep, keep)])
-            images = np.concatenate([own, images])
-        images, along = self._gauged(i, images)
-        return images / self.peaks[i], far.gauged(along)
+            keep = np.flatnonzero(self._change(i, bumps.images) > LEAST_CHANGE)
+            own = uncorrelated(bumps.precision[np.ix_(keep, keep)]) / self.peaks[i]
+            n_own = len(own)
+        seen = np.empty((1 + n_own + len(images), *profile.shape), np.float32)
+        seen[0], out = without_dark(self.morphs[i].copy()), seen[1:]
+        if n_own:
+            flat = bumps.images.reshape(len(bumps.images), profile.size)
+            flat = flat if len(keep) == len(flat) else flat[keep]
+            np.matmul(own.astype(np.float32), flat, out=out[:n_own].reshape(n_own, -1))
+        out[n_own:] = without_dark(scatter[:, None, None] * images)
+        far = far.gauged(self._gauge(i, out) * self.peaks[i])
+        return seen, far
 
-    def _gauged(self, i, images):
-        """Images without what lies along the profile, 0 where the morphology is at its bound; and
-        how much lay along it (k,)."""
-        p = self.scene.profile[i]
-        along = np.tensordot(images, p, 2) / max((p * p).sum(), 1e-30)
-        images = images - along[:, None, None] * p
-        return images if self.scene.fixed[i] else np.where(self.morphs[i] > 0, images, 0), along
+    def _gauge(self, i, images):
+        """Take off images, in place, what lies along the profile, and all of them where the
+        morphology is at its bound; returns how much lay along it (k,)."""
+        p = without_dark(self.scene.profile[i].astype(images.dtype))
+        along = images.reshape(len(images), p.size) @ p.ravel() / max((p * p).sum(), 1e-30)
+        images -= along[:, None, None] * p
+        inside = self.morphs[i] > 0
+        if not self.scene.fixed[i] and not inside.all():
+            images *= inside
+        return along.astype(np.float64)
 
     def _change(self, i, images):
         """What images (k, ny, nx) of scatter 1 change of flux and second moment [fixed errors]."""
@@ -116,7 +128,8 @@ class Solution:
         r2 = (y - (y * m).sum() / total) ** 2 + (x - (x * m).sum() / total) ** 2
         weight = 1 + r2 / max((r2 * m).sum() / total, 1e-9)
         significance = np.linalg.norm(self.spectra[i] / self.fixed_error[i])
-        return np.abs(np.tensordot(images, weight, 2)) / total * significance
+        change = images.reshape(len(images), m.size) @ weight.ravel().astype(np.float32)
+        return np.abs(change) / total * significance
 
     def _light(self, j, i):
         """Expected light of component j on i's box, all channels in quadrature [noise]."""

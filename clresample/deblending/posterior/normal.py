@@ -53,20 +53,21 @@ class Layout:
         return self.n_sky + 2 * (o - 1) + np.arange(2)
 
 
-def normal_matrix(scene, exposures, morphs, modes, spectra, layout) -> Blocks:
+def normal_matrix(scene, exposures, images, spectra, layout) -> Blocks:
     """J^T J + prior^-1.
 
     scene: Scene; exposures: an Exposure of each observation
-    morphs (n): arrays (ny, nx); modes (n): arrays (k, ny, nx); spectra (n, C), in the views' units
+    images (n): arrays (1 + k, ny, nx), float32, of morphologies and their modes
+    spectra (n, C), in the views' units
     """
     matrix = Blocks(layout.sizes)
-    for i, m in enumerate(modes):
-        matrix.block(i, i)[: len(m), : len(m)] += np.eye(len(m))
+    for i, k in enumerate(layout.counts):
+        matrix.block(i, i)[:k, :k] += np.eye(k)
     if layout.n_shifts:
         at = layout.n_sky + np.arange(layout.n_shifts)
         matrix.block(layout.common, layout.common)[at, at] += SCATTER_PX**-2
     for o, (exposure, part) in enumerate(zip(exposures, scene.channels(), strict=True)):
-        _Sum(matrix, layout, exposure, o, part).run(scene.origin, morphs, modes, spectra)
+        _Sum(matrix, layout, exposure, o, part).run(scene.origin, images, spectra)
     return matrix
 
 
@@ -92,10 +93,10 @@ class _Seen:
         flat = self.light.reshape(len(self.light), self.unit.size)
         return np.sqrt(np.einsum("kp,kp->k", flat, flat).max(initial=0))
 
-    def within(self, low, high):
-        """light (k, C * P) and unit (C, P) from `low` to `high`."""
+    def within(self, low, high, dtype=np.float32):
+        """light (k, C * P) of a type and unit (C, P) from `low` to `high`."""
         cut = box_slices(low - self.low, high - low)
-        light, unit = self.light[:, :, *cut], self.unit[:, *cut]
+        light, unit = self.light[:, :, *cut].astype(dtype, copy=False), self.unit[:, *cut]
         return light.reshape(len(light), unit.size), unit.reshape(len(unit), -1)
 
 
@@ -106,17 +107,18 @@ class _Sum:
         self.matrix, self.layout, self.exposure = matrix, layout, exposure
         self.channels, self.shift = channels, layout.shift(o)
 
-    def run(self, origin, morphs, modes, spectra):
+    def run(self, origin, images, spectra):
         """Add it."""
-        windows = [self.exposure.window(at, m.shape) for at, m in zip(origin, morphs, strict=True)]
+        pairs = zip(origin, images, strict=True)
+        windows = [self.exposure.window(at, m.shape[1:]) for at, m in pairs]
         near: list[_Seen] = []
-        for i in sorted(range(len(morphs)), key=lambda i: windows[i][0, 0]):
+        for i in sorted(range(len(images)), key=lambda i: windows[i][0, 0]):
             low, high = windows[i]
             near = [one for one in near if one.high[0] > low[0]]
             if not (high > low).all():
                 continue
             spectrum = spectra[i, self.channels].astype(np.float32)
-            one = self._seen(i, morphs[i], modes[i], spectrum, origin[i], low, high)
+            one = self._seen(i, images[i], spectrum, origin[i], low, high)
             near.append(one)
             for other in near:
                 self._add(*((other, one) if other.i <= i else (one, other)))
@@ -127,29 +129,28 @@ class _Sum:
             common = self.matrix.block(self.layout.common, self.layout.common)
             common[at, at] += np.square(self.exposure.root, dtype=np.float64).sum((1, 2))
 
-    def _seen(self, i, morph, images, spectrum, origin, low, high):
-        slopes = [morph[None]]
+    def _seen(self, i, images, spectrum, origin, low, high):
+        k = len(images) - 1
         if self.shift is not None:
-            padded = np.pad(morph, 1, mode="edge")
-            slopes += [np.array(np.gradient(padded))[:, 1:-1, 1:-1]]
-        seen = self.exposure.observe(
-            np.concatenate([*slopes, images]).astype(np.float32), i, origin, low, high
-        )
-        n = sum(map(len, slopes))
-        light = np.concatenate([seen[n:], seen[1:n]]) * spectrum[:, None, None]
-        return _Seen(i, len(images), low, high, light, np.ascontiguousarray(seen[0]))
+            padded = np.pad(images[0], 1, mode="edge")
+            images = np.concatenate([images, np.array(np.gradient(padded))[:, 1:-1, 1:-1]])
+        seen = self.exposure.observe(images, i, origin, low, high)
+        unit, light = seen[0].copy(), seen[1:]
+        light *= spectrum[:, None, None]
+        return _Seen(i, k, low, high, light, unit)
 
     def _add(self, a, b):
         """The products of two components, a.i <= b.i, where their windows meet."""
         low, high = np.maximum(a.low, b.low), np.minimum(a.high, b.high)
         if not (high > low).all():
             return
-        (light_a, unit_a), (light_b, unit_b) = a.within(low, high), b.within(low, high)
-        if a.size * b.size > LARGE:
-            light_a, light_b = light_a.astype(np.float64), light_b.astype(np.float64)
-        n_channels, same = len(unit_a), a.i == b.i
-        modes = light_a @ light_b.T
-        by_b, by_a = _by_channel(light_a, unit_b), _by_channel(light_b, unit_a)  # (k, Co)
+        dtype = np.float64 if a.size * b.size > LARGE else np.float32
+        light_a, unit_a = a.within(low, high, dtype)
+        same = a is b  # NumPy takes half the products where both factors are one array
+        light_b, unit_b = (light_a, unit_a) if same else b.within(low, high, dtype)
+        n_channels, modes = len(unit_a), light_a @ light_b.T
+        by_b = _by_channel(light_a, unit_b)  # (k, Co)
+        by_a = by_b if same else _by_channel(light_b, unit_a)
         units = np.einsum("cp,cp->c", unit_a, unit_b, dtype=np.float64)
         block = self.matrix.block(a.i, b.i)
         block[: a.k, : b.k] += modes[: a.k, : b.k]

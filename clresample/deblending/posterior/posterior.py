@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 
 import numpy as np
+from scipy.linalg.blas import strmm
 
 from .blocks import Factor
 from .errors import Draws, Errors
@@ -34,7 +35,8 @@ class Posterior:
         n, n_channels = solution.spectra.shape
         self.solution = solution
         pairs = [solution.modes(i) for i in range(n)]
-        self.modes, self.beyond = [m for m, _ in pairs], [far for _, far in pairs]
+        images, self.beyond = [m for m, _ in pairs], [far for _, far in pairs]
+        self.modes = [m[1:] for m in images]
         self.layout = Layout(
             np.array([len(m) for m in self.modes]),
             n_channels,
@@ -42,12 +44,7 @@ class Posterior:
             2 * (len(exposures) - 1) if fit_shifts else 0,
         )
         self.matrix = normal_matrix(
-            solution.scene,
-            exposures,
-            solution.morphs,
-            self.modes,
-            solution.spectra,
-            self.layout,
+            solution.scene, exposures, images, solution.spectra, self.layout
         )
         self.factor = Factor(self.matrix)
         self.covariance = self.factor.inverse()
@@ -87,7 +84,7 @@ class Posterior:
 
     def draws(self, unit) -> Draws:
         """What `Result.sample` draws from."""
-        return Draws([m.astype(np.float32) for m in self.modes], self.factor, unit)
+        return Draws(self.modes, self.factor, unit)
 
     def _fluxes(self, owner, n_sources):
         """Fluxes (S, C), and each component's slopes (C, k + C) of its own by its unknowns."""
@@ -116,7 +113,7 @@ class Posterior:
             rows = []
             for i, slope, part in zip(own, slopes, light, strict=True):
                 flat, images = slope.reshape(5, -1), self.modes[i]
-                by_mode = flat @ images.reshape(len(images), flat.shape[1]).T
+                by_mode = flat.astype(np.float32) @ images.reshape(len(images), flat.shape[1]).T
                 by_mode = part * (by_mode + by_far @ self.beyond[i].slopes)
                 by_light = flat @ s.morphs[i].ravel() + by_far @ self.beyond[i].sums
                 rows.append(np.concatenate([by_mode, by_light[:, None] * weight], axis=1))
@@ -136,9 +133,10 @@ class Posterior:
         k = len(images)
         if not k:
             return np.zeros(self.solution.morphs[i].shape)
-        flat = images.reshape(k, -1)
-        variance = np.einsum("kp,kp->p", self.covariance.block(i, i)[:k, :k] @ flat, flat)
-        return np.sqrt(np.maximum(variance, 0)).reshape(images.shape[1:])
+        root = np.linalg.cholesky(self.covariance.block(i, i)[:k, :k]).astype(np.float32)
+        # the transpose, since BLAS counts rows first
+        turned = strmm(1.0, root, images.reshape(k, -1).T, side=1, lower=1)
+        return np.sqrt(np.square(turned, out=turned).sum(1)).astype(float).reshape(images.shape[1:])
 
 
 def errors_of(fit, components, peaks, seen):
