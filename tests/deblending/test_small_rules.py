@@ -8,6 +8,7 @@ import pytest
 from helpers.scenes import blend
 
 from clresample.deblending.fit import Fit, begin
+from clresample.deblending.posterior import exposure
 from clresample.deblending.posterior.exposure import Exposure, Transfer
 from clresample.deblending.settings import Settings
 from clresample.deblending.solver.learned.evidence import (
@@ -132,3 +133,22 @@ def test_an_exposure_shows_what_the_operator_renders(device):
     part = wanted[:, low[0] : high[0], low[1] : high[1]]
     assert seen.shape == part.shape and min(part.shape[1:]) > 13
     np.testing.assert_allclose(seen, part, atol=2e-3 * wanted.max())
+
+
+@pytest.mark.parametrize("angle", [0, 20])
+def test_wider_pixels_hold_the_same_sums(device, monkeypatch, angle):
+    """Of an image's products with itself, pixels as wide as the band allows, and its own."""
+    one = Fit(blend(angle=angle), Settings(), device, np.float32, pad=1)
+    view, observation = one.views[1], one.blend.observations[1]
+    y, x = np.indices((13, 11))
+    image = np.exp(-((y - 6) ** 2 + (x - 5) ** 2) / (2 * 1.7**2)).astype(np.float32)
+    origin, sums, widths = np.array([8, 12]), [], []
+    for wider in (1e9, 0.1):
+        monkeypatch.setattr(exposure, "WIDER", wider)
+        found = Exposure.of(view, one.frame, observation, np.zeros(1, int))
+        low, high = found.window(origin, image.shape)
+        seen = found.observe(image[None], 0, origin, low, high)[0]
+        sums.append(np.square(seen).sum((1, 2)))
+        widths.append(found.x[1] - found.x[0])
+    assert widths[1] > 1.03 * widths[0]
+    np.testing.assert_allclose(sums[1], sums[0], rtol=0.01)

@@ -2,8 +2,9 @@
 
 Sums of products over the observed pixels are all that errors need. An image that the observation's
 band can carry has the same sum of squares on any pixels of equal density, as long as they resolve
-the band. So an observation that is turned or distorted is replaced by one along the model's axes,
-with its weights spread over it; one that is parallel to the model stays as it is. Then images are
+the band. So an observation that is turned or distorted, or has smaller pixels than its band needs,
+is replaced by one along the model's axes, with its weights spread over it; any other one, parallel
+to the model, stays as it is. Then images are
 rendered from their boxes by a few products with thin matrices, without a full frame, and with a
 band and a period of no more than errors need.
 """
@@ -29,7 +30,8 @@ REACH_FWHM = 1.5
 # it.
 BAND = 1e-2
 # An observation is replaced by one of pixels as wide as its band allows where that is so many times
-# the width of its own.
+# the width of its own: half as many pixels and less, for which 99 % of the errors of fluxes and
+# moments of simulated scenes change by less than 0.2 %.
 WIDER = 1.2
 # [px] Periods are multiples of it, and one: boxes of about one size share their transfer function.
 PERIOD_PX = 8
@@ -65,11 +67,9 @@ class Exposure:
         psfs = (_Content(psf) for psf in (frame.psf, view.op.plans[0].psfs[1]))
         transfer = _transfer(matrix.tobytes(), *psfs)
         pixel = transfer.nyquist_px
-        if view.mapping.geometry == "aligned" and pixel < WIDER * scale:
-            y, x, root = _parallel(view)
-        else:
-            pixel = pixel if pixel > WIDER * scale else min(scale, pixel)
-            y, x, root = _spread(view, pixel)
+        pixel = pixel if pixel > WIDER * scale else min(scale, pixel)
+        make = _parallel if view.mapping.geometry == "aligned" else _spread
+        y, x, root = make(view, pixel)
         shares = None if view.shares is None else view.shares[source].astype(np.float32)
         return cls(y, x, root, reach, transfer, shares)
 
@@ -189,8 +189,9 @@ def _waves(a, b):
     return np.exp(2j * np.pi * np.multiply.outer(a, b)).astype(np.complex64)
 
 
-def _parallel(view):
-    """Rows, columns and root weights of an observation whose axes are the model's."""
+def _parallel(view, pixel):
+    """Rows, columns and root weights of an observation whose axes are the model's; on pixels of a
+    side `pixel` [model px] over the model's frame where its own are smaller."""
     mapping, root = view.mapping, view.root
     if mapping.matrix[0, 0] == 0:
         root = root.swapaxes(1, 2)
@@ -201,32 +202,51 @@ def _parallel(view):
             steps, root.shape[1:], mapping.offset, view.op.shift, strict=True
         )
     ]
+    if pixel > np.abs(steps).max():
+        grid = [_lattice(n, pixel) for n in mapping.shape_in]
+        # of each of its rows and columns, the parts that its neighbours on the lattice take
+        to_y, to_x = (
+            np.maximum(1 - np.abs(to[:, None] - own) / pixel, 0)
+            for to, own in zip(grid, at, strict=True)
+        )
+        count = np.outer(to_y.sum(1), to_x.sum(1))
+        power = to_y @ root.astype(np.float64) ** 2 @ to_x.T
+        return *grid, _mean_root(power, count, pixel**2 / abs(np.prod(steps)))
     root = root[:, :: 1 if steps[0] > 0 else -1, :: 1 if steps[1] > 0 else -1]
     return np.sort(at[0]), np.sort(at[1]), np.ascontiguousarray(root, np.float32)
+
+
+def _lattice(n, pixel):
+    """Pixels of a side `pixel` over n of the frame, one before them and one after them."""
+    return (np.arange(int(np.ceil(n / pixel)) + 2) - 1.0) * pixel
+
+
+def _mean_root(power, count, density):
+    """Root weights (C, n_y, n_x) of pixels that took the weights `power` (C, n_y, n_x) of `count`
+    (n_y, n_x) others, where there are `density` on average: without the ripples that two rasters
+    make."""
+    mean = power / np.maximum(count, 1e-9) * density
+    return np.sqrt(np.where(count > 0.5 * density, mean, 0)).astype(np.float32)
 
 
 def _spread(view, pixel):
     """The same of any other, on pixels of a side `pixel` [model px] over the model's frame."""
     mapping = view.mapping
-    n_y, n_x = (int(np.ceil(n / pixel)) + 2 for n in mapping.shape_in)
+    y, x = (_lattice(n, pixel) for n in mapping.shape_in)
     at = mapping.at(*np.indices(mapping.shape_out)) + view.op.shift
     good = view.covered & (np.abs(at).max(2) < 2 * max(mapping.shape_in))
     place = (at[good] / pixel).T + 1  # the first row lies a pixel before the frame
-    low = np.clip(np.floor(place).astype(int), 0, [[n_y - 2], [n_x - 2]])
+    low = np.clip(np.floor(place).astype(int), 0, [[len(y) - 2], [len(x) - 2]])
     part = np.clip(place - low, 0, 1)
-    flat = (low[0] * n_x + low[1] + np.array([[0], [1], [n_x], [n_x + 1]])).ravel()
+    flat = (low[0] * len(x) + low[1] + np.array([[0], [1], [len(x)], [len(x) + 1]])).ravel()
     rows, columns = (np.stack([1 - p, p]) for p in part)
     share = (rows[:, None] * columns).reshape(4, -1)  # of a pixel, in the four about it
 
     def deposit(values):
-        return np.bincount(flat, (share * values).ravel(), n_y * n_x)
+        found = np.bincount(flat, (share * values).ravel(), len(y) * len(x))
+        return found.reshape(len(y), len(x))
 
-    # without the ripples that two rasters make: mean weight times the density of pixels there
-    count = deposit(1.0)
-    density = pixel**2 / abs(np.linalg.det(mapping.matrix))
-    within = count > 0.5 * density
     area = 1.0 if mapping.area is None else np.maximum(mapping.area[good], 1e-6)
-    root = [np.where(within, deposit(channel[good] ** 2 / area), 0) for channel in view.root]
-    root = np.sqrt(np.array(root) / np.maximum(count, 1e-9) * density)
-    y, x = ((np.arange(n) - 1.0) * pixel for n in (n_y, n_x))
-    return y, x, root.reshape(-1, n_y, n_x).astype(np.float32)
+    power = np.array([deposit(channel[good] ** 2 / area) for channel in view.root])
+    density = pixel**2 / abs(np.linalg.det(mapping.matrix))
+    return y, x, _mean_root(power, deposit(1.0), density)

@@ -7,7 +7,7 @@ import time
 import numpy as np
 from scipy.linalg.blas import strmm
 
-from .blocks import Factor
+from .blocks import RIDGE, Factor
 from .errors import Draws, Errors
 from .exposure import Exposure
 from .modes import FLOOR, Solution
@@ -133,7 +133,9 @@ class Posterior:
         k = len(images)
         if not k:
             return np.zeros(self.solution.morphs[i].shape)
-        root = np.linalg.cholesky(self.covariance.block(i, i)[:k, :k]).astype(np.float32)
+        covariance = self.covariance.block(i, i)[:k, :k]
+        ridge = np.diag(RIDGE * np.diag(covariance))  # more than its rounding
+        root = np.linalg.cholesky(covariance + ridge).astype(np.float32)
         # the transpose, since BLAS counts rows first
         turned = strmm(1.0, root, images.reshape(k, -1).T, side=1, lower=1)
         return np.sqrt(np.square(turned, out=turned).sum(1)).astype(float).reshape(images.shape[1:])
