@@ -141,3 +141,45 @@ def test_a_failed_fit_with_nan_is_still_a_catalogue():
     table = catalogue(blend([round_component(0, MIDDLE, (np.nan, 1))], status="failed: NaN"))
     assert table["flags"][0] & Flag.NOT_CONVERGED
     assert np.isnan(table["flux_g"][0]) and np.isnan(table["size"][0])
+
+
+def test_a_source_without_light_is_not_at_the_edge():
+    dark = round_component(0, (14, 35), (0, 0), n=29)
+    dark.morphology[:] = 0
+    sources = (Extended(position_px=(14.0, 35.0)),)
+    assert Flag.EDGE not in flags(blend([dark], sources=sources))[0]
+
+
+def test_columns_have_units():
+    """Positions and shapes as the docstring says; of channels with zero points uJy and mag."""
+    grid = Grid.flat((60, 70), SCALE)
+    observations = (
+        observe(grid, ("a", "b"), weights=1e-12, name="raw"),
+        observe(grid, ("g", "r", "i"), weights=1e-12, zero_points=25.0, name="cam"),
+    )
+    table = catalogue(
+        blend([round_component(0, MIDDLE, (1, 2, 3, 4, 5))], observations=observations),
+        magnitudes=True,
+    )
+    units = {name: table[name].unit for name in table.colnames if name not in ("name", "flags")}
+    for name in ("g", "r", "i"):
+        assert units.pop(f"flux_{name}") == units.pop(f"flux_err_{name}") == u.uJy
+        assert units.pop(f"mag_{name}") == units.pop(f"mag_err_{name}") == u.mag
+    for name in ("a", "b"):
+        assert units.pop(f"flux_{name}") == units.pop(f"flux_err_{name}") == u.ct
+    for name in ("g_r", "r_i"):  # not of those without zero points, nor between the two
+        assert units.pop(f"colour_{name}") == units.pop(f"colour_err_{name}") == u.mag
+    for name in ("y", "x"):
+        sky = f"{name}_sky"
+        assert {units.pop(name), units.pop(f"{name}_centroid")} == {u.pix}
+        assert {units.pop(sky), units.pop(f"{sky}_centroid")} == {u.arcsec}
+        assert units.pop(f"{name}_centroid_err") == u.pix
+        assert units.pop(f"{sky}_centroid_err") == u.arcsec
+    assert units.pop("size") == units.pop("size_err") == u.arcsec
+    assert units.pop("angle") == units.pop("angle_err") == u.deg
+    plain = {"snr", "n_components", "chi2_raw", "chi2_cam", "e1", "e2", "e1_err", "e2_err"}
+    plain |= {f"residual_{name}" for name in "abgri"}
+    assert set(units) == plain
+    assert all(units[name] in (None, u.dimensionless_unscaled) for name in plain)
+    magnitudes = 25 - 2.5 * np.log10(table["flux_g"].value / 10 ** ((23.9 - 25) / 2.5))
+    np.testing.assert_allclose(table["mag_g"].value, magnitudes)

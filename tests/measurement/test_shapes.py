@@ -102,3 +102,13 @@ def test_errors_of_positions_on_the_sky(cards):
     assert row["dec_centroid_err"].to_value("deg") == pytest.approx(np.std(lat), rel=0.03)
     assert row["flux_err_g"].value == 1
     assert row["angle_err"].value == pytest.approx(180 / np.sqrt(12))  # a round source's
+
+
+def test_a_single_pixel_has_size_0_and_no_ellipticity():
+    """Without any division by 0."""
+    with np.errstate(all="raise"):
+        size, *others = shape(np.zeros((2, 2)))
+        slopes = shape_slopes(np.zeros((2, 2)), np.eye(2))
+    assert size == 0 and np.isnan(others).all()
+    assert slopes.shape == (4, 3) and np.isnan(slopes).all()
+    assert shape(-np.eye(2))[0] == 0  # what rounding can leave

@@ -70,6 +70,8 @@ def test_significance_goes_on_beyond_its_table():
     assert sigmas[1] - sigmas[0] == pytest.approx(np.sqrt(401) - np.sqrt(399), rel=0.3)
     assert sigmas[2] == pytest.approx(100, rel=0.05)
     assert significance(np.array([50.0]), np.array([0]))[0] == 0
+    mixed = significance(np.array([50.0, 50.0, 50.0]), np.array([0, 1, 7]))
+    assert mixed[0] == 0 and mixed[1] > mixed[2] > 5
 
 
 def signal(each, seen):
@@ -101,6 +103,9 @@ def test_spectra_are_those_of_the_nearest_observed_pixels():
     np.testing.assert_array_equal(one.spectra(at), [(2, 8), (3, 9), (2, 8)])
     one.places[0, 2] = (0, 40)
     np.testing.assert_array_equal(one.spectra(at[:1]), [(0, 0)])
+    for beyond in ((2, 1), (-1, 1), (1, 3), (1, -1)):
+        one.places[0, 2] = beyond
+        np.testing.assert_array_equal(one.spectra(at[:1]), [(0, 0)])
 
 
 def test_in_units_of_the_scatter():

@@ -44,9 +44,10 @@ def sources(path):
 
 
 def equivalents():
-    """{(file, line's text, change)} of equivalent.toml."""
+    """{(file, line's text, change, place or None)} of equivalent.toml."""
     text = Path(__file__).with_name("equivalent.toml").read_text(encoding="utf-8")
-    return {(e["file"], e["line"], e["change"]) for e in tomllib.loads(text)["equivalent"]}
+    entries = tomllib.loads(text)["equivalent"]
+    return {(e["file"], e["line"], e["change"], e.get("place")) for e in entries}
 
 
 class Trial:
@@ -144,7 +145,8 @@ def main():
             file = str(mutation.path.relative_to(ROOT))
             if not mutation.parses(mutation.path.read_text(encoding="utf-8")):
                 continue
-            if (file, mutation.shown, mutation.change) in known:
+            same = file, mutation.shown, mutation.change
+            if {(*same, None), (*same, mutation.place)} & known:
                 what, why = "equivalent", ""
             else:
                 what, why = trial.outcome(mutation)

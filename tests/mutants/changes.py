@@ -6,6 +6,7 @@ import ast
 import io
 import re
 import tokenize
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,7 +74,8 @@ C_TYPES = {"REAL", "float", "double", "int", "uint", "long", "ulong", "char", "v
 
 @dataclass(frozen=True)
 class Mutation:
-    """`old` at character `start` of a file became `new`; `shown` is the file's line before it."""
+    """`old` at character `start` of a file became `new`; `shown` is the file's line before it, on
+    which this is number `place`, from 1, of equal changes."""
 
     path: Path
     line: int
@@ -81,6 +83,7 @@ class Mutation:
     old: str
     new: str
     shown: str
+    place: int
 
     @property
     def change(self):
@@ -103,7 +106,7 @@ def mutations(path):
     """Every Mutation of a source file."""
     text = path.read_text(encoding="utf-8")
     lines, swaps = text.splitlines(), SWAPS if path.suffix == ".py" else C_SWAPS
-    found = []
+    found, places = [], Counter()
     for line, start, old in _tokens(path, text):
         if re.fullmatch(r"\d+\.?\d*(?:[eE][-+]?\d+)?f?", old):
             changed = [f"({old} + 1)"]
@@ -112,7 +115,9 @@ def mutations(path):
         else:
             changed = [swaps[old]] if old in swaps else []
         shown = lines[line - 1].strip()
-        found += [Mutation(path, line, start, old, new, shown) for new in changed]
+        places[line, old] += 1
+        at = places[line, old]
+        found += [Mutation(path, line, start, old, new, shown, at) for new in changed]
     return found
 
 

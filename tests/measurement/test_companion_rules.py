@@ -1,0 +1,215 @@
+"""Single formulas of the search beside bright sources, on images and spectra made by hand."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from clresample.measurement import companions, detection
+from clresample.measurement.companions import centred, is_a_source, left_over, noise_of, top_near
+from clresample.measurement.signal import Signal
+
+
+def cone(shape, centre, height):
+    """height - distance, down to 0."""
+    y, x = np.indices(shape)
+    return np.maximum(height - np.hypot(y - centre[0], x - centre[1]), 0)
+
+
+def test_a_cone_is_all_of_one_source_and_its_light_ends_under_half_a_sigma():
+    image = cone((41, 43), (20, 22), 9.4)
+    rest, model = left_over(image, np.ones(image.shape, bool), np.array([[20.0, 22.0]]))
+    np.testing.assert_allclose(model + rest, image, atol=1e-6)
+    # rings at whole pixels between which cones are straight; a ring of 9 px has 0.4
+    radius = np.hypot(*(np.indices(image.shape) - np.array([20, 22])[:, None, None]))
+    np.testing.assert_allclose(model[radius <= 8], image[radius <= 8], atol=0.15)
+    assert not model[radius > 9].any() and model[20, 22 + 9] == pytest.approx(0.4, abs=1e-5)
+    assert not left_over(0.05 * image, image > -1, np.array([[20.0, 22.0]]))[1].any()
+
+
+@pytest.mark.parametrize("centre", [(65, 66), (65, 3), (128, 70)])
+def test_light_is_followed_for_sixty_pixels(centre):
+    """On all sides, as far as there are pixels; what lies behind an edge is told by the other."""
+    image = np.full((131, 133), 3.0)
+    _, model = left_over(image, np.ones(image.shape, bool), np.array([centre], float))
+    radius = np.hypot(*(np.indices(image.shape) - np.array(centre)[:, None, None]))
+    np.testing.assert_allclose(model[radius < 59.9], 3, rtol=1e-6)
+    assert not model[radius > 60.1].any()
+    on_axes = [(centre[0] + s, centre[1] + t) for s, t in ((60, 0), (-60, 0), (0, 60), (0, -60))]
+    for y, x in on_axes:
+        if 0 <= y < 131 and 0 <= x < 133:
+            assert model[y, x] == pytest.approx(3)
+
+
+def test_models_of_two_sources_add_up():
+    image = np.full((40, 40), 2.0)
+    rest, model = left_over(image, np.ones((40, 40), bool), np.array([[20.0, 20.0]] * 2))
+    np.testing.assert_allclose(model, 4, rtol=1e-6)
+    np.testing.assert_allclose(rest, -2, rtol=1e-6)
+
+
+def test_noise_of_what_is_left():
+    """The noise of two sides where there is light, and 5 % of that."""
+    np.testing.assert_allclose(
+        noise_of(np.array([0.0, 1.0, 2.0, 100.0])),
+        np.sqrt([1, 1 + 0.05**2, 2 + 0.1**2, 2 + 5**2]),
+    )
+
+
+@pytest.mark.parametrize("place", [(1, 1), (5, 6), (1, 5), (5, 1), (3, 3)])
+def test_tops_of_parabolas_beside_an_edge(place):
+    """Of an image of 7 x 8 pixels: all but the outermost are refined, exactly on a parabola."""
+    y, x = np.indices((7, 8))
+    top = np.add(place, (0.3, -0.2))
+    image = 50 - 2 * (y - top[0]) ** 2 - 3 * (x - top[1]) ** 2
+    np.testing.assert_allclose(centred(image, place), top, atol=1e-12)
+
+
+@pytest.mark.parametrize("place", [(0, 4), (6, 4), (3, 0), (3, 7)])
+def test_a_peak_on_an_edge_stays(place):
+    image = np.random.default_rng(0).random((7, 8))
+    np.testing.assert_array_equal(centred(image, place), place)
+
+
+def test_a_top_lies_within_half_a_pixel():
+    assert companions._top(0.0, 1.0, 1.0) == 0.5 and companions._top(1.0, 1.0, 0.0) == -0.5
+    assert companions._top(0.0, 1.0, 1.5) == 0.5 and companions._top(0.0, 1.0, 0.0) == 0.0
+    assert companions._top(1.0, 1.0, 1.0) == 0.0 and companions._top(2.0, 1.0, 3.0) == 0.0
+
+
+def test_the_top_is_looked_for_within_the_radius_and_no_further():
+    for away in ((0, 2), (2, 0), (-2, 0), (0, -2), (2, -2)):
+        image = np.zeros((15, 17))
+        image[7, 8], image[7 + away[0], 8 + away[1]] = 1.0, 5.0
+        near, height = top_near(image, (7, 8), 2)
+        assert height == 5 and tuple(near) == (7 + away[0], 8 + away[1])
+        near, height = top_near(image, (7, 8), 1)
+        assert height == 1 and np.hypot(*(near - (7, 8))) <= 0.5
+
+
+def spectra_signal(spectra):
+    """A stand-in for a Signal: `spectra` {pixel: signal to noise of its channels}, else 0."""
+    n = len(next(iter(spectra.values())))
+
+    def at(places):
+        return np.array([spectra.get(tuple(map(int, p)), np.zeros(n)) for p in places], float)
+
+    return SimpleNamespace(channels=range(n), spectra=at)
+
+
+@pytest.mark.parametrize("light, clump", [(0.0, 10.0), (3.0, 20.0)])
+def test_clumps_grow_with_the_root_of_peak_and_light(light, clump):
+    """Of a galaxy of 100 sigma: CLUMP and COLOURED times sqrt(100 (light + 1))."""
+    image, model, rest = np.zeros((3, 40, 40))
+    image[20, 8], model[20, 30] = 100.0, light
+    centres = np.array([[20.2, 7.9]])
+    other = [spectra_signal({(20, 30): (90.0, 0.0), (20, 8): (0.0, 100.0)})]
+    same = [spectra_signal({(20, 30): (9.0, 9.0), (20, 8): (90.0, 90.0)})]
+
+    def judged(height, signals):
+        rest[20, 30] = height * clump
+        return is_a_source(np.array([20, 30]), rest, model, image, signals, centres, 4.0)
+
+    assert [judged(h, same) for h in (0.449, 0.451)] == [False, True]
+    assert [judged(h, other) for h in (0.199, 0.201)] == [False, True]
+    assert not judged(0.3, [spectra_signal({(20, 30): (90.0,), (20, 8): (100.0,)})])
+
+
+def test_the_host_is_the_brightest_where_light_falls_by_e_a_fwhm():
+    """Of 1000 sigma at 30 px and of 50 at 8 px, FWHM 5: the nearer one; at 20 px the brighter.
+
+    Centres beyond the edges count as on them."""
+    signals = []
+    for place, host in (((20, 12), 50.0), ((20, 22), 1000.0)):
+        image, model, rest = np.zeros((3, 41, 43))
+        image[20, 42], image[20, 4] = 1000.0, 50.0
+        centres = np.array([[20.0, 42.9], [20.0, 4.0]])
+        for height, is_one in ((0.44, False), (0.46, True)):
+            rest[place] = height * np.sqrt(host)
+            found = is_a_source(np.array(place), rest, model, image, signals, centres, 5.0)
+            assert found == is_one
+
+
+def test_a_host_fainter_than_the_noise_counts_as_the_noise():
+    image, model, rest = np.zeros((3, 20, 20))
+    rest[10, 10] = 0.46
+    given = np.array([10, 10]), rest, model, image, [], np.array([[10.0, 5.0]]), 4.0
+    assert is_a_source(*given)
+    rest[10, 10] = 0.44
+    assert not is_a_source(*given)
+
+
+def test_spectra_differ_by_chi2_beyond_its_mean():
+    """Noise of two sides, sqrt(2); what is like the host's spectrum does not count."""
+    for here, wanted in (
+        ((6.0, 8.0, 0.0), -2.0),
+        ((0.0, 0.0, 10.0), 48.0),
+        ((3.0, 4.0, 6.0), 16.0),
+    ):
+        signal = spectra_signal({(5, 30): here, (5, 5): (30.0, 40.0, 0.0)})
+        found = companions._other_colour((5, 30), signal.spectra, [], (5, 5))
+        assert found == pytest.approx(wanted)
+    dark = spectra_signal({(5, 30): (0.0, 6.0)})
+    assert companions._other_colour((5, 30), dark.spectra, [], (5, 5)) == pytest.approx(17)
+
+
+def test_the_galaxys_own_light_is_taken_off_with_a_tenth_of_it_as_error():
+    """Along the line to the peak and behind the centre it has (100, 0)."""
+    flat = {(5, x): (100.0, 0.0) for x in range(61)}
+    flat[5, 40] = (100.0, 12.0)
+    signal = spectra_signal(flat)
+    found = companions._other_colour((5, 40), signal.spectra, [np.array([5.0, 25.0])], (5, 25))
+    assert found == pytest.approx(12**2 / 2 - 1)
+    flat[5, 40] = (130.0, 0.0)  # as a host of the other colour would see it
+    flat[5, 2] = (0.0, 50.0)
+    found = companions._other_colour((5, 40), signal.spectra, [np.array([5.0, 25.0])], (5, 2))
+    assert found == pytest.approx(30**2 / (2 + 10**2) - 1)
+
+
+def test_a_sources_light_is_the_least_on_the_way_and_on_its_mirror_image():
+    line = {(5, x): (50.0, 50.0) for x in range(41)}
+    line[5, 24], line[5, 13] = (20.0, 60.0), (40.0, 10.0)
+    line[5, 31], line[5, 9] = (1.0, 1.0), (2.0, -3.0)
+    signal = spectra_signal(line)
+    centre = np.array([5.0, 20.0])
+    np.testing.assert_allclose(companions._light_at((5, 23), signal.spectra, centre), (50, 50))
+    np.testing.assert_allclose(companions._light_at((5, 24), signal.spectra, centre), (20, 50))
+    np.testing.assert_allclose(companions._light_at((5, 30), signal.spectra, centre), (20, 10))
+    np.testing.assert_allclose(companions._light_at((5, 31), signal.spectra, centre), (1, 0))
+    np.testing.assert_allclose(companions._light_at((5, 20), signal.spectra, centre), (50, 50))
+
+
+def test_a_neighbour_on_a_flank_is_found_in_one_channel():
+    """At its own place and height, where the sharpest observation alone has seen the sky."""
+    sep = pytest.importorskip("sep")
+    y, x = np.indices((81, 83))
+
+    def spot(place, height, sigma):
+        away = (y - place[0]) ** 2 + (x - place[1]) ** 2
+        return (height * np.exp(-0.5 * away / sigma**2)).astype(np.float32)
+
+    image = spot((40, 38), 300, 4) + spot((40, 48), 60, 1.7)
+    places = np.moveaxis(np.indices(image.shape), 0, -1).astype(float)
+    signal = Signal(image[None], image[None] ** 2, np.ones(image.shape, int), image[None], places)
+    given = sep, [signal], 0, image, np.array([[40.0, 38.0]])
+    ((place, height),) = detection._companions(*given, 5.0, 4.0)
+    assert np.hypot(*(place - (40, 48))) < 0.7 and height == pytest.approx(60, rel=0.15)
+    assert detection._companions(*given, 100.0, 4.0) == []
+    assert detection._companions(*given, 5.0, 15.0) == []  # the same source, in so wide a PSF
+
+
+def test_companions_have_six_sigma_however_low_the_threshold(monkeypatch):
+    given = []
+
+    def searched(_sep, _image, threshold, area, known, apart, own):
+        given.append((threshold, area, len(known), apart, own))
+        return []
+
+    monkeypatch.setattr(detection, "_new_peaks", searched)
+    image = np.zeros((20, 20), np.float32)
+    places = np.moveaxis(np.indices(image.shape), 0, -1).astype(float)
+    signal = Signal(image[None], image[None], np.ones(image.shape, int), image[None], places)
+    for threshold in (2.0, 8.0):
+        where = np.array([[10.0, 10.0]])
+        detection._companions(None, [signal], 0, image, where, threshold, 4.0)
+    assert given == [(6, 4, 1, 0.7 * 4, False), (8, 4, 1, 0.7 * 4, False)]
