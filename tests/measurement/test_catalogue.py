@@ -82,13 +82,14 @@ def test_masked_is_the_centres_own_pixel():
 def test_saturated_is_a_star_with_masked_pixels_in_its_core():
     grid = Grid.flat((60, 70), SCALE)
     for source, away, expected in (
-        (Point, 0, Flag.SATURATED | Flag.MASKED),
-        (Point, 1, Flag.SATURATED),  # the PSF's FWHM is 3 px
-        (Point, 2, Flag(0)),
-        (Extended, 1, Flag(0)),
+        (Point, (0, 0), Flag.SATURATED | Flag.MASKED),
+        (Point, (0, 1), Flag.SATURATED),  # the PSF's FWHM is 3 px
+        (Point, (-1, 1), Flag.SATURATED),  # 1.4 px away
+        (Point, (0, 2), Flag(0)),
+        (Extended, (0, 1), Flag(0)),
     ):
         weights = np.ones((2, 60, 70))
-        weights[1, 30, 36 + away] = 0
+        weights[1, 30 + away[0], 36 + away[1]] = 0
         given = {
             "observations": [observe(grid, ("g", "r"), weights=weights)],
             "sources": (source(position_px=(30.0, 36.0)),),

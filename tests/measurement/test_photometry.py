@@ -138,3 +138,16 @@ def test_colours_are_better_known_than_fluxes_that_err_together():
         assert abs(row["colour_g_r"].value - (np.median(colours) - 1.0)) < 0.01
         np.testing.assert_allclose(row["colour_err_g_r"].value, colours.std(), rtol=0.03)
         np.testing.assert_allclose(channel_covariances(result)[0], both, rtol=1e-10)
+
+
+def test_fluxes_hold_what_lies_beyond_the_boxes():
+    """Of each component its own light there, the first of its sums."""
+    parts = [round_component(0, (30, 28), (2.0, 1.0)), round_component(1, (30, 44), (1.0, 4.0))]
+    beyond = np.arange(12.0).reshape(2, 6) + 3
+    maps = tuple(c.morphology for c in parts)
+    variance = np.tile(np.diag([4.0, 9.0]), (2, 1, 1))
+    errors = Errors(variance, np.ones((2, 2, 2)), np.full((2, 5, 5), np.nan), maps, beyond)
+    flux, found = fluxes(blend(parts, errors=errors))
+    a, b = (c.morphology.sum() for c in parts)
+    np.testing.assert_allclose(flux, [[2 * (a + 3), a + 3], [b + 9, 4 * (b + 9)]], rtol=1e-13)
+    np.testing.assert_array_equal(found, variance)

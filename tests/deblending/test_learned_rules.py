@@ -1,0 +1,315 @@
+"""Decisions of the solver that learns, each alone: accepted, shortened, given up, converged."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from clresample.deblending.solver.learned import progress as progress_module
+from clresample.deblending.solver.learned.engine import (
+    _inverse_curvature,
+    _n_pixels,
+    vector_bytes,
+)
+from clresample.deblending.solver.learned.evidence import (
+    LEAST_SEEN,
+    SourceEvidence,
+    Spectra,
+    _pixels_at,
+)
+from clresample.deblending.solver.learned.prior import LearnedPrior, gaussian
+from clresample.deblending.solver.learned.progress import EVERY, FIRST, PATIENCE, TRIALS, Progress
+from clresample.deblending.solver.learned.response import _median, _middle, _unpadded
+from clresample.deblending.solver.learned.steps import AGAIN, NEXT, REST, STAY, TRY
+
+
+def begun(*losses, enough=0.5, n_pixels=1000):
+    """Scenes whose starts have these losses."""
+    progress = Progress(len(losses), enough, [n_pixels] * len(losses))
+    accepted, stepped = progress.judge(np.array(losses, float), np.zeros(len(losses)))
+    assert accepted.all() and not stepped.any()
+    mode, length, bare = progress.next(accepted)
+    assert (mode == NEXT).all() and (length == 1).all() and not bare.any()
+    assert progress.n_iterations.tolist() == [0] * len(losses)
+    return progress
+
+
+def judged(progress, loss, slope):
+    """One round: accepted, stepped, mode, length, bare."""
+    found = progress.judge(np.array(loss, float), np.array(slope, float))
+    return *found, *progress.next(found[0])
+
+
+def test_a_start_without_a_loss_has_failed():
+    progress = Progress(3, 0.5, [10, 10, 10])
+    accepted, _ = progress.judge(np.array([5.0, np.nan, np.inf]), np.zeros(3))
+    assert accepted.tolist() == [True, False, False]
+    assert progress.failed.tolist() == [False, True, True]
+    assert progress.live.tolist() == [True, False, False]
+    assert progress.n_rounds.tolist() == [1, 1, 1]
+    assert progress.next(accepted)[0].tolist() == [NEXT, REST, REST]
+    progress.judge(np.array([5.0, 5.0, 5.0]), np.zeros(3))
+    assert progress.n_rounds.tolist() == [2, 1, 1]  # of those that go on
+
+
+def test_a_trial_must_gain_a_part_of_what_its_slope_promises():
+    """1e-4 of a slope of -100 from a loss of 10: 9.99, and no step is taken uphill."""
+    progress = begun(10, 10, 10, 10)
+    accepted, stepped, mode, length, bare = judged(
+        progress, [9.989, 9.991, 9.0, np.nan], [-100, -100, 1, -100]
+    )
+    assert accepted.tolist() == stepped.tolist() == [True, False, False, False]
+    assert progress.loss.tolist() == [9.989, 10, 10, 10]
+    assert progress.n_iterations.tolist() == [1, 0, 0, 0]
+    # the minimum of the parabola through the trial lies half-way; NaN asks for the shortest step
+    assert mode.tolist() == [NEXT, TRY, AGAIN, TRY] and bare.tolist() == [False, False, True, False]
+    np.testing.assert_allclose(length, [1, 0.5, 1, 0.1], rtol=1e-3)
+    assert not progress.failed.any()
+
+
+def test_steps_shrink_to_the_minimum_of_a_parabola_within_limits():
+    """Loss 10 with slope -4 and the trial's losses: 4 / (2 (loss - 10 + 4)) of the length."""
+    progress = begun(*[10] * 4)
+    *_, length, _ = judged(progress, [11, 16, 100, 10.01], [-4] * 4)
+    np.testing.assert_allclose(length, [4 / 10, 4 / 20, 0.1, 4 / 8.02], rtol=1e-6)
+    *_, length, _ = judged(progress, [11, 16, 100, 10.01], [-4] * 4)
+    np.testing.assert_allclose(length, np.array([4 / 10, 4 / 20, 0.1, 4 / 8.02]) ** 2, rtol=1e-6)
+    *_, length, _ = judged(progress, [5] * 4, [-4] * 4)
+    assert (length == 1).all()
+
+
+def test_a_direction_is_given_up_after_eight_trials_and_the_scene_after_eight_more():
+    """The memory is dropped first; then strengths are learned from here, or it has converged."""
+    progress = begun(10, 10)
+    progress.settled[:] = [False, True]
+    assert TRIALS == 8
+    for i in range(1, 17):
+        *_, mode, length, bare = judged(progress, [11, 11], [-1, -1])
+        if i == 8:
+            assert mode.tolist() == [AGAIN, AGAIN] and bare.all() and (length == 1).all()
+        elif i < 16:
+            assert mode.tolist() == [TRY, TRY] and not bare.any()
+            assert progress._trials.tolist() == [i % 8] * 2
+    assert mode.tolist() == [STAY, REST] and progress.converged.tolist() == [False, True]
+    assert progress.live.tolist() == [True, False]
+    accepted, stepped = progress.judge(np.array([12.0, 9.0]), np.array([0.0, -1.0]))
+    assert accepted.tolist() == [True, False] and not stepped.any()  # where it is already
+    assert progress.loss.tolist() == [12, 10]
+    assert progress.due(accepted).tolist() == [True, False]
+
+
+def test_a_step_uphill_drops_the_memory_at_once():
+    progress = begun(10)
+    *_, mode, length, bare = judged(progress, [11], [0.0])
+    assert mode[0] == AGAIN and bare[0] and length[0] == 1
+    *_, mode, length, bare = judged(progress, [9], [-1])
+    assert mode[0] == NEXT and not bare[0]
+    *_, mode, length, bare = judged(progress, [9.5], [1])  # again after a step that gained
+    assert mode[0] == AGAIN and bare[0]
+    *_, mode, length, bare = judged(progress, [9.5], [1])
+    assert mode[0] == STAY and not bare[0] and progress.live[0]
+
+
+@pytest.mark.parametrize("total, ends", [(0.45, True), (0.55, False)])
+@pytest.mark.parametrize("chi2", [0.5, 3.0])
+def test_a_fit_has_converged_when_ten_iterations_gain_too_little(total, ends, chi2):
+    """`enough`, times chi2 per pixel where that is above 1; once strengths have settled."""
+    loss = 0.5 * chi2 * 1000
+    start = loss + 10
+    progress = begun(start, start, enough=0.5)
+    progress.settled[0] = True
+    losses = np.linspace(start, loss, 2).tolist()
+    fall = total * max(chi2, 1) / PATIENCE
+    now = losses[1]
+    judged(progress, [now, now], [-1e-9] * 2)
+    for i in range(PATIENCE):
+        now -= fall
+        *_, mode, _, _ = judged(progress, [now, now], [-1e-9] * 2)
+        assert progress.live.all() or (i == PATIENCE - 1 and ends)
+    assert progress.converged.tolist() == [ends, False]
+    assert mode.tolist() == [NEXT, NEXT]  # a trial that was accepted is kept
+
+
+def test_strengths_are_learned_after_sixteen_rounds_and_then_every_eighth():
+    assert (FIRST, EVERY, progress_module.SETTLED) == (16, 8, 0.1)
+    progress, due = Progress(1, 0.5, [100]), []
+    for i in range(1, 41):
+        accepted, _ = progress.judge(np.array([1000.0 - i]), np.array([-1e-6]))
+        if progress.due(accepted)[0]:
+            due.append(i)
+            moved = 0.11 if i < 30 else 0.09
+            progress.learned(np.array([True]), np.array([moved]), np.array([0.25]))
+            assert progress.settled[0] == (moved < 0.1)
+            assert np.isinf(progress._drops[0]).all()
+        progress.next(accepted)
+    assert due == [16, 24, 32]
+
+
+def test_another_loss_is_looked_at_where_the_scene_is():
+    """Of scenes that have moved; converged ones go on."""
+    progress = begun(10, 10, 10)
+    progress.settled[:] = True
+    progress._drops[:] = 0
+    progress.next(np.array([True, True, False]))
+    assert progress.converged.tolist() == [True, True, False]
+    progress.look_again(np.array([True, False, True]))
+    assert progress.live.tolist() == [True, False, True]
+    assert progress.converged.tolist() == [False, True, False]
+    assert np.isinf(progress._drops[[0, 2]]).all() and not progress._drops[1].any()
+    accepted, stepped = progress.judge(np.array([20.0, 20.0, 20.0]), np.zeros(3))
+    assert accepted.tolist() == [True, False, True] and not stepped.any()
+
+
+def test_some_scenes_go_on_alone():
+    progress = begun(10, 20, 30)
+    progress.n_rounds[:] = [1, 2, 3]
+    part = progress.take(np.array([2, 0]))
+    assert part.loss.tolist() == [30, 10] and part.n_rounds.tolist() == [3, 1]
+    assert part._drops.shape == (2, PATIENCE) and part.enough == 0.5
+    part.loss[:] = 0
+    assert progress.loss.tolist() == [10, 20, 30]
+
+
+def test_scales_have_steps_and_radii_of_their_sigmas():
+    prior = LearnedPrior(scales_px=(0.5, 1.0, 1.9, 2.0, 5.0, 8.0), strengths=(0.1,) * 6)
+    assert prior.steps == (1, 1, 1, 2, 4, 8) and prior.radii == (2, 3, 6, 6, 15, 24)
+    for sigma, kernel in zip(prior.scales_px, prior.kernels(), strict=True):
+        r = len(kernel) // 2
+        wanted = np.exp(-0.5 * (np.arange(-r, r + 1) / sigma) ** 2)
+        np.testing.assert_allclose(kernel, wanted / np.sqrt((wanted**2).sum()))
+    assert gaussian(2.0, 6, unit_sum=True).sum() == pytest.approx(1)
+    np.testing.assert_array_equal(prior.amplitude(np.array([4.0, 0.0, -1.0])), [2, 0, 0])
+
+
+@pytest.mark.parametrize(
+    "given, words",
+    [
+        ({"scales_px": (1.0, 2.0), "strengths": (0.1,)}, "a number for each"),
+        ({"scales_px": (), "strengths": ()}, "at least one scale"),
+        ({"scales_px": ((1.0,),), "strengths": ((0.1,),)}, "a number for each"),
+        ({"scales_px": (0.0,), "strengths": (0.1,)}, "positive numbers only"),
+        ({"scales_px": (1.0, 2.0), "strengths": (0.1, 0.0)}, "positive numbers only"),
+        ({"weight": 0.0}, "positive numbers only"),
+        ({"weight": np.nan}, "positive numbers only"),
+    ],
+)
+def test_a_prior_that_makes_no_sense_is_refused(given, words):
+    with pytest.raises(ValueError, match=words):
+        LearnedPrior(**given)
+    assert LearnedPrior(scales_px=(0.5,), strengths=(1e-9,), weight=1e-3).weight == 1e-3
+
+
+def scene(weights, **given):
+    return SimpleNamespace(weights=weights, **given)
+
+
+def test_pixels_of_a_scene_are_those_with_a_weight():
+    first, second = np.ones((2, 3, 4)), np.zeros((1, 5, 5))
+    first[0, 0] = 0
+    second[0, 2, 2] = 1e-9
+    assert _n_pixels(scene([first, second])) == 24 - 4 + 1
+    assert _n_pixels(scene([0 * first])) == 1
+
+
+def test_curvature_is_left_out_where_nothing_is_seen():
+    power = np.array([[4.0, 1e-13], [1e-15, 0.0]])
+    weights = [np.full((1, 2, 2), 0.5), np.zeros((1, 3, 3))]
+    for fit_sky in (True, False):
+        spectra, sky = _inverse_curvature([scene(weights, power=power, fit_sky=fit_sky)])
+        np.testing.assert_allclose(spectra, [[0.25, 1e13], [0, 0]])
+        np.testing.assert_allclose(sky, [[0.5 * fit_sky, 0]])
+
+
+def test_memory_of_a_scenes_vectors():
+    """Forty-two of the ring and ten more, of 8 bytes each, and coefficients on every step-th
+    pixel."""
+    prior = LearnedPrior(scales_px=(1.0, 2.0), strengths=(0.1, 0.1))
+    one = scene([], profile=[np.zeros((7, 10)), np.zeros((1, 1))], power=np.zeros((2, 3)))
+    n = 7 * 10 + 4 * 6 + 1 + 1 + 6  # the last step ends on the last pixel or past it
+    assert vector_bytes(one, prior) == 8 * 52 * n
+
+
+def test_values_are_shared_between_the_levels_about_them():
+    levels = np.array([0.0, 1.0, 3.0])
+    found = _pixels_at(np.array([0.25, 1.0, 2.0, 3.0, -5.0, 9.0]), levels)
+    np.testing.assert_allclose(found, [0.75 + 1, 0.25 + 1 + 0.5, 0.5 + 1 + 1])
+    values = np.random.default_rng(0).uniform(0, 3, 50)
+    found = _pixels_at(values, levels)
+    assert found.sum() == pytest.approx(50) and found @ levels == pytest.approx(values.sum())
+
+
+def evidence(prior, *, level):
+    """Of a round profile on 15 x 17 pixels, seen alike at all frequencies."""
+    spectra = Spectra(prior)
+    y, x = np.indices((15, 17))
+    profile = np.exp(-np.hypot(y - 7, x - 8) / 3)
+    return SourceEvidence(spectra, prior, profile, np.full((1, len(spectra.weight)), level))
+
+
+def test_new_strengths_are_the_fixed_point_of_the_evidence():
+    """Of what is well seen, energies over determined numbers; within 4 of the old, 0.1 % to 100 %;
+    misfit makes energies smaller, and never larger."""
+    prior = LearnedPrior(scales_px=(1.0, 3.0), strengths=(0.02, 0.1), weight=10.0)
+    one, spectrum, old = evidence(prior, level=1e4), np.array([2.0]), np.array([0.05, 0.1])
+    seen, gamma = one.seen(spectrum), one.determined(old, spectrum)
+    assert (seen > 0.9).all() and (gamma > 5).all()
+    m, energies = 10 / seen**2, np.array([0.3, 0.5])
+    for chi2 in (0.2, 1.0, 3.0):
+        wanted = np.sqrt((energies / max(chi2, 1) + m * [0.02**2, 0.1**2]) / (gamma + m))
+        assert ((wanted > old / 4) & (wanted < 4 * old)).all()
+        np.testing.assert_allclose(one.learned(old, energies, spectrum, chi2), wanted)
+    np.testing.assert_allclose(one.learned(old, 1e9 * energies, spectrum, 1.0), 4 * old)
+    np.testing.assert_allclose(
+        one.learned(np.array([1e-3, 0.5]), np.array([0.0, 1e9]), spectrum, 1.0)[1], 1.0
+    )
+    tiny = LearnedPrior(scales_px=(1.0, 3.0), strengths=(1e-6, 1e-6), weight=10.0)
+    found = evidence(tiny, level=1e4).learned(np.full(2, 2e-3), np.zeros(2), spectrum, 1.0)
+    np.testing.assert_allclose(found, 1e-3)
+
+
+def test_what_is_not_seen_stays_as_it_was_expected():
+    prior = LearnedPrior(scales_px=(1.0,), strengths=(0.02,), weight=10.0)
+    dark = evidence(prior, level=0.0)
+    assert dark.seen(np.ones(1)).tolist() == [LEAST_SEEN] and LEAST_SEEN == 1e-3
+    assert dark.determined(np.array([0.02]), np.ones(1)).tolist() == [0]
+    found = dark.learned(np.array([0.02]), np.array([0.5]), np.ones(1), 1.0)
+    np.testing.assert_allclose(found, 0.02, rtol=1e-3)
+    assert dark.curvature(np.ones(1)).tolist() == [0]
+
+
+def test_curvature_of_what_is_seen_alike_at_all_frequencies_is_that():
+    """Weighted by P^1.5 over the mean of P^0.5: more than it where P is peaked."""
+    prior = LearnedPrior()
+    one = evidence(prior, level=5.0)
+    p, weight = one.spectra.broadened(prior.amplitude(np.ones((3, 3)))), one.spectra.weight
+    np.testing.assert_allclose(p @ weight, 1, rtol=1e-12)
+    p = one.spectra.broadened(
+        np.sqrt(np.exp(-np.hypot(*(np.indices((15, 17)) - np.array([7, 8])[:, None, None])) / 3))
+    )
+    wanted = 4 * 5 * (p**1.5 @ weight) / (p**0.5 @ weight)
+    np.testing.assert_allclose(one.curvature(np.array([2.0])), wanted, rtol=1e-10)
+
+
+def test_answers_are_taken_within_half_a_side_of_their_pixel():
+    """Of 64: what lies further away is none of it, and nothing beyond the image is missed."""
+    spectra = Spectra(LearnedPrior(scales_px=(1.0,), strengths=(0.1,)))
+    image = np.zeros((2, 90, 20))
+    image[:, 40, 3] = 2.0
+    image[0, 40 - 33], image[0, 40 + 32] = 7.0, 7.0
+    found = spectra.of_answers(image, [(40, 3)] * 2)
+    np.testing.assert_allclose(found, 2.0)
+    image[1, 40 + 31, 3] = image[1, 40 - 31, 3] = 0.5
+    nu = np.fft.fftfreq(64)
+    wanted = np.repeat(2 + np.cos(2 * np.pi * 31 * nu), 33)
+    np.testing.assert_allclose(spectra.of_answers(image, [(40, 3)] * 2)[1], wanted)
+
+
+def test_the_middle_of_what_was_seen():
+    weights = np.zeros((2, 9, 12))
+    weights[0, 2, 3], weights[1, 6, 9] = 1.0, 3.0
+    assert _middle(weights).tolist() == [5, 8]  # 5, 7.5
+    weights[0, 8, 11] = -5  # what rounding leaves below 0 does not count
+    assert _middle(weights).tolist() == [5, 8] and _middle(0 * weights).tolist() == [0, 0]
+    assert _median(np.array([[0.0, 1.0, 2.0, 9.0]])) == 2 and _median(np.zeros(3)) == 0
+    part = _unpadded(SimpleNamespace(extent=(5, 7)), np.zeros((3, 8, 9)))
+    assert part.shape == (3, 5, 7)
