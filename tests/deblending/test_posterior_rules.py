@@ -1,0 +1,304 @@
+"""Single rules of errors and of second components, on arrays made by hand."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from clresample.deblending.blend import INTERRUPTED
+from clresample.deblending.components import gradients, second
+from clresample.deblending.components.gradients import Asked, gain
+from clresample.deblending.posterior.errors import Draws
+from clresample.deblending.posterior.modes import STRENGTH, Solution
+from clresample.deblending.posterior.normal import Layout, _by_channel
+from clresample.deblending.posterior.posterior import _local_chi2
+from clresample.deblending.posterior.profile_modes import Beyond
+from clresample.deblending.rendered import Rendered
+from clresample.deblending.solver.learned.prior import LearnedPrior
+from clresample.sky.sources import Extended, Point
+
+PRIOR = LearnedPrior(scales_px=(0.8, 2.2, 5.0), strengths=(0.005, 0.1, 0.02))
+
+
+def solution(origin, profiles, *, spectra=None, fixed=(), chi2=1.0, peaks=1.0, **findings):
+    """Components in boxes, of which all else is as the profiles say."""
+    n = len(profiles)
+    scene = SimpleNamespace(
+        origin=np.array(origin), profile=profiles, fixed=np.isin(np.arange(n), fixed)
+    )
+    given = {"energies": np.ones((n, 3)), "determined": np.ones((n, 3))}
+    given |= {"strengths": np.tile([0.01, 0.05, 0.03], (n, 1))}
+    return Solution(
+        scene,
+        [p / peaks for p in profiles],
+        np.full(n, peaks),
+        np.full((n, 2), 10.0) if spectra is None else np.array(spectra, float),
+        np.full((n, 2), 0.5),
+        [None] * n,
+        [None] * n,
+        np.zeros((n, 2)),
+        SimpleNamespace(**(given | findings)),
+        np.full(n, chi2),
+        PRIOR,
+    )
+
+
+def spot(n=9, sigma=2.0):
+    y, x = np.indices((n, n)) - n // 2
+    return np.exp(-0.5 * (y**2 + x**2) / sigma**2)
+
+
+@pytest.mark.parametrize("chi2", [0.5, 4.0])
+def test_unlikeness_is_what_the_scale_next_to_two_pixels_shows(chi2):
+    """Under ten pixels' worth of 5 %; misfit makes it less, and 1 of stars."""
+    energies, determined = np.array([[9, 0.8, 9]] * 2), np.array([[1, 30, 1]] * 2)
+    one = solution(
+        [(0, 0)] * 2, [spot()] * 2, energies=energies, determined=determined, chi2=chi2, fixed=(1,)
+    )
+    wanted = np.sqrt((0.8 / max(chi2, 1) + 10 * 0.05**2) / 40) / 0.05
+    assert one.unlikeness(0) == pytest.approx(wanted) and one.unlikeness(1) == 1
+    assert STRENGTH == 0.05
+    np.testing.assert_allclose(
+        one.strengths(0), [0.01 * wanted**1.5, 0.05 * wanted, 0.03 * wanted**1.5]
+    )
+    np.testing.assert_array_equal(one.findings.strengths[0], [0.01, 0.05, 0.03])  # left as it is
+
+
+def test_modes_hold_nothing_along_the_profile():
+    """Nor where the morphology is 0, but of stars."""
+    rng, profile = np.random.default_rng(0), spot()
+    images = rng.normal(size=(4, 9, 9))
+    one = solution([(0, 0)] * 2, [profile] * 2, fixed=(1,))
+    one.morphs[0][3] = 0
+    own, along = one._gauged(0, images)
+    np.testing.assert_allclose(along, np.tensordot(images, profile, 2) / (profile**2).sum())
+    free, _ = one._gauged(1, images)
+    np.testing.assert_allclose(np.tensordot(free, profile, 2), 0, atol=1e-12)
+    np.testing.assert_allclose(own[:, 4:], free[:, 4:])
+    assert not own[:, 3].any() and free[:, 3].any()
+
+
+def test_what_bumps_change_counts_in_errors_of_flux_and_size():
+    """Light at the middle changes the flux by its part; at a distance r, also the size:
+    1 + r^2 / <r^2> times as much."""
+    profile = spot(21)
+    one = solution([(0, 0)], [profile], spectra=[[3.0, 4.0]])
+    images = np.zeros((3, 21, 21))
+    images[0, 10, 10] = images[1, 10, 14] = images[2, 7, 10] = 0.01
+    mean = 2 * 4.0  # of r^2 in a Gaussian of sigma 2
+    wanted = 0.01 / profile.sum() * 10 * np.array([1, 1 + 16 / mean, 1 + 9 / mean])
+    np.testing.assert_allclose(one._change(0, images), wanted, rtol=1e-3)
+    np.testing.assert_allclose(one._change(0, -images), one._change(0, images))
+
+
+def test_light_of_a_neighbour_on_a_box():
+    """All channels in quadrature; 0 where its own box does not reach."""
+    boxes = [np.full((4, 5), 0.5), np.full((3, 3), 1.0)]
+    one = solution([(2, 3), (4, 6)], boxes, spectra=[[3, 4], [6, 8]], peaks=2.0)
+    found = one._light(1, 0)
+    wanted = np.zeros((4, 5))
+    wanted[2:, 3:] = 10 / 2
+    np.testing.assert_allclose(found, wanted)
+    np.testing.assert_allclose(one._light(0, 0), 5 / 2 * 0.5)
+
+
+def test_light_is_exchanged_where_a_neighbour_has_a_part_of_it_and_both_are_seen():
+    """More than 5 % of the source's own; both above 0.3 of the noise; boxes that meet alone."""
+    own = np.ones((1, 6))
+    own[0, 5] = 0.02
+    other = np.array([[0.04, 0.06, 0.5, 0.5, 0.5, 0.5]])
+
+    def shared(level, *more):
+        spectra = [[level, 0], [level, 0]] + [[1e3, 0]] * len(more)
+        boxes = [own, other, *[np.ones((1, 1))] * len(more)]
+        return solution([(3, 3), (3, 3), *more], boxes, spectra=spectra)._shared(0).tolist()[0]
+
+    assert shared(100.0) == [False, True, True, True, True, True]
+    assert shared(10.0) == [False, True, True, True, True, False]  # its own 0.2 are not seen
+    assert shared(0.7) == [False, False, True, True, True, False]
+    assert shared(0.5) == [False] * 6
+    assert shared(0.5, (3, 3)) == [True] + [False] * 5
+    for beside in ((3, 2), (3, 9), (2, 3), (4, 3)):
+        assert shared(0.5, beside) == [False] * 6
+
+
+def test_sums_of_what_lies_beyond_a_box():
+    """Of a profile and its modes, in pixels of the frame; as scaled, and as gauged."""
+    rng = np.random.default_rng(2)
+    images, low, margin = rng.random((3, 8, 10)), np.array([5, -3]), (2, 3)
+    beyond = Beyond.of(images, low, margin)
+    outside = images.copy()
+    outside[:, 2:6, 3:7] = 0
+    y, x = np.indices((8, 10)) + low[:, None, None]
+    wanted = np.array([(outside * v).sum((1, 2)) for v in (1, y, x, y * y, y * x, x * x)])
+    np.testing.assert_allclose(beyond.sums, wanted[:, 0])
+    np.testing.assert_allclose(beyond.slopes, wanted[:, 1:])
+    twice = beyond.scaled(np.array([2.0, 3.0, 4.0]))
+    np.testing.assert_allclose(twice.sums, 2 * wanted[:, 0])
+    np.testing.assert_allclose(twice.slopes, wanted[:, 1:] * [3, 4])
+    along = np.array([0.1, 0.2, 0.3, 0.4])  # of two modes more, which come first
+    gauged = beyond.gauged(along)
+    expected = np.concatenate([np.zeros((6, 2)), wanted[:, 1:]], axis=1)
+    np.testing.assert_allclose(gauged.slopes, expected - np.outer(wanted[:, 0], along))
+    np.testing.assert_allclose(gauged.sums, wanted[:, 0])
+    assert Beyond.none(3).sums.shape == (6,) and Beyond.none(3).slopes.shape == (6, 3)
+
+
+def test_where_unknowns_lie():
+    counts = np.array([3, 0, 2])
+    plain = Layout(counts, 4)
+    assert plain.sizes.tolist() == [7, 4, 6] and plain.common == 3 and plain.shift(1) is None
+    full = Layout(counts, 4, n_sky=4, n_shifts=4)
+    assert full.sizes.tolist() == [7, 4, 6, 8] and full.shift(0) is None
+    assert full.shift(1).tolist() == [4, 5] and full.shift(2).tolist() == [6, 7]
+    assert Layout(counts, 4, n_shifts=2).shift(1).tolist() == [0, 1]
+
+
+def test_products_with_each_channel():
+    rng = np.random.default_rng(0)
+    light, unit = rng.normal(size=(3, 2 * 5)), rng.normal(size=(2, 5))
+    wanted = np.einsum("kcp,cp->kc", light.reshape(3, 2, 5), unit)
+    np.testing.assert_allclose(_by_channel(light, unit), wanted)
+
+
+def test_draws_are_numbers_times_modes_and_spectra_in_counts():
+    rng = np.random.default_rng(0)
+    modes = [rng.normal(size=(2, 3, 4)), np.zeros((0, 2, 2))]
+    values = [np.array([1.0, 2.0, 3.0, 4.0]), np.array([5.0, 6.0])]
+    asked = []
+    factor = SimpleNamespace(sizes=np.array([4, 2, 1]), draw=lambda x: asked.append(x) or values)
+    morphs, spectra = Draws(modes, factor, np.array([10.0, 100.0])).draw(rng)
+    assert asked[0].shape == (7,)
+    np.testing.assert_allclose(morphs[0], modes[0][0] + 2 * modes[0][1])
+    assert morphs[1].shape == (2, 2) and not morphs[1].any()
+    np.testing.assert_allclose(spectra, [[30, 400], [50, 600]])
+
+
+def test_chi2_is_that_where_a_components_light_is():
+    """By A^2 times its image; both of two observations count, sky included."""
+    seen, views, wanted = [], [], np.zeros((2, 2))
+    rng = np.random.default_rng(3)
+    spectra, sky = rng.random((2, 3)) + 0.5, rng.random(3)
+    for part in (slice(0, 1), slice(1, 3)):
+        n = part.stop - part.start
+        low = np.array([[1, 0], [4, 3]])
+        images = [rng.random((n, 3, 4)), rng.random((n, 4, 3))]
+        rendered = Rendered((2, n, 8, 7), low, images)
+        root, data = rng.random((n, 8, 7)), rng.normal(size=(n, 8, 7))
+        views.append(SimpleNamespace(root=root, data=data))
+        seen.append(rendered)
+        whole = np.asarray(rendered)
+        model = np.einsum("ic,icyx->cyx", spectra[:, part], whole) + sky[part, None, None]
+        chi2 = root**2 * (data - model) ** 2
+        light = spectra[:, part, None, None] ** 2 * whole * root**2
+        wanted += [(light * chi2).sum((1, 2, 3)), light.sum((1, 2, 3))]
+    found = _local_chi2(SimpleNamespace(spectra=spectra, sky=sky, observed=seen), views)
+    np.testing.assert_allclose(found, wanted[0] / wanted[1])
+
+
+def test_clear_gradients_have_odds_of_150_to_1():
+    asked = Asked(np.array([2, 5, 7]), np.array([4.99, 5.01, -np.inf]), [])
+    assert asked.clear.tolist() == [5]
+
+
+def fitted(spectra, sources=None, power=1.0, **given):
+    """A finished fit as `_candidates` sees it."""
+    n = len(spectra)
+    sources = [Extended(position_px=(1, 1))] * n if sources is None else sources
+    return SimpleNamespace(
+        **{
+            "settings": SimpleNamespace(learns=True),
+            "findings": 1,
+            "losses": [3.0, 2.0],
+            "fitted": np.arange(n),
+            "start": SimpleNamespace(source=np.arange(n)),
+            "blend": SimpleNamespace(sources=sources),
+            "state": SimpleNamespace(spectra=np.array(spectra, float)),
+            "scene": SimpleNamespace(power=np.full((n, 2), power)),
+        }
+        | given
+    )
+
+
+def test_who_is_asked_for_a_gradient():
+    """Sources above signal to noise 30 in more than one channel, whose components are open."""
+    spectra = [(24, 18.1), (24, 17.9), (90, 0), (90, 1)]
+    assert gradients._candidates(fitted(spectra)).tolist() == [0, 3]
+    assert gradients._candidates(fitted(spectra, power=0.25)).tolist() == [3]
+    kinds = [
+        Point(position_px=(1, 1)),
+        Extended(position_px=(1, 1), n_components=1),
+        Extended(position_px=(1, 1), profile=np.ones((3, 3))),
+        Extended(position_px=(1, 1)),
+    ]
+    assert gradients._candidates(fitted([(90, 90)] * 4, kinds)).tolist() == [3]
+    for given in (
+        {"settings": SimpleNamespace(learns=False)},
+        {"findings": None},
+        {"losses": [2.0, np.nan]},
+    ):
+        assert gradients._candidates(fitted(spectra, **given)).tolist() == []
+    assert gradients.ask([fitted(spectra, findings=None)] * 2) == [None, None]
+
+
+def test_a_gradient_needs_two_channels():
+    values, precision, spectrum = np.array([3.0, -3.0]), np.array([4.0, 4.0]), np.array([5.0, 5.0])
+    assert np.isfinite(gain(values, precision, spectrum))
+    assert gain(values, np.array([4.0, 0.0]), spectrum) == -np.inf
+    third = [np.append(a, v) for a, v in ((values, 9.0), (precision, 0.0), (spectrum, 1.0))]
+    assert gain(*third) == gain(values, precision, spectrum)  # one that sees nothing
+
+
+def ended(n, losses, *, energies=0.0, findings=True, fixed=()):
+    """A finished fit of n components in three channels."""
+    found = SimpleNamespace(energies=np.full((n, 2), energies), strengths=np.full((n, 2), 0.5))
+    return SimpleNamespace(
+        findings=found if findings else None,
+        state=SimpleNamespace(morph=[0] * n, spectra=np.zeros((n, 3))),
+        scene=SimpleNamespace(fixed=np.isin(np.arange(n), fixed)),
+        losses=losses,
+        status="converged",
+    )
+
+
+def test_more_components_must_lower_the_loss_by_what_their_numbers_cost():
+    """A unit each for three fluxes and a profile's four numbers; and fit the data better."""
+    one = ended(2, [200, 100.0])
+    assert second._is_better(ended(3, [150, 92.9]), one)
+    assert not second._is_better(ended(3, [150, 93.0]), one)
+    assert second._is_better(ended(4, [150, 85.9]), one)
+    assert not second._is_better(ended(4, [150, 86.1]), one)
+    assert not second._is_better(ended(3, [150, 50.0], findings=False), one)
+    # 20 of 100 are structure's: half of 0.25^-1 of two scales of two components
+    stiff = ended(2, [200, 100.0], energies=2.5)
+    assert second._half_chi2(stiff) == pytest.approx(80)
+    assert not second._is_better(ended(3, [150, 81.0]), stiff)
+    assert second._is_better(ended(3, [150, 80.0]), stiff)
+    assert second._half_chi2(ended(2, [1, 100.0], energies=2.5, fixed=(0,))) == pytest.approx(90)
+
+
+def test_the_second_fit_takes_the_place_of_the_chosen_components():
+    """Two each, in the order of the sources."""
+
+    def point(n, first):
+        fields = {name: np.arange(n) + first for name in ("peaks", "spectra", "power", "places")}
+        return fields | {"shapes": list("abcdef"[:n]), "thetas": [first] * n}
+
+    from clresample.deblending.start.start import StartingPoint
+
+    others = {"positions": np.zeros((3, 2)), "dark": np.zeros(3, bool), "sky": np.zeros(1)}
+    begin = StartingPoint(source=np.array([0, 2, 1]), **others, **point(3, 0))
+    found = StartingPoint(source=np.array([0, 0, 1, 1]), **others, **point(4, 10))
+    joined = second._joined(begin, found, np.array([2, 0]))
+    assert joined.source.tolist() == [0, 0, 2, 1, 1]
+    for name in ("peaks", "spectra", "power", "places"):
+        assert getattr(joined, name).tolist() == [12, 13, 1, 10, 11]
+    assert joined.shapes == list("cdbab") and joined.thetas == [10, 10, 0, 10, 10]
+
+
+def test_progress_goes_on_from_the_first_fits():
+    told = []
+    fits = [SimpleNamespace(losses=[1] * n) for n in (7, 12)]
+    second._after(fits, lambda n, loss: told.append((n, loss)))(5, 0.5)
+    assert told == [(17, 0.5)] and second._after(fits, None) is None
+    assert INTERRUPTED == "interrupted"
