@@ -11,15 +11,8 @@ from clresample.deblending.solver.learned.engine import (
     _n_pixels,
     vector_bytes,
 )
-from clresample.deblending.solver.learned.evidence import (
-    LEAST_SEEN,
-    SourceEvidence,
-    Spectra,
-    _pixels_at,
-)
 from clresample.deblending.solver.learned.prior import LearnedPrior, gaussian
 from clresample.deblending.solver.learned.progress import EVERY, FIRST, PATIENCE, TRIALS, Progress
-from clresample.deblending.solver.learned.response import _median, _middle, _unpadded
 from clresample.deblending.solver.learned.steps import AGAIN, NEXT, REST, STAY, TRY
 
 
@@ -48,7 +41,7 @@ def test_a_start_without_a_loss_has_failed():
     assert progress.live.tolist() == [True, False, False]
     assert progress.n_rounds.tolist() == [1, 1, 1]
     assert progress.next(accepted)[0].tolist() == [NEXT, REST, REST]
-    progress.judge(np.array([5.0, 5.0, 5.0]), np.zeros(3))
+    progress.judge(np.array([4.0, 5.0, 5.0]), np.array([-1.0, 0.0, 0.0]))
     assert progress.n_rounds.tolist() == [2, 1, 1]  # of those that go on
 
 
@@ -227,89 +220,3 @@ def test_memory_of_a_scenes_vectors():
     one = scene([], profile=[np.zeros((7, 10)), np.zeros((1, 1))], power=np.zeros((2, 3)))
     n = 7 * 10 + 4 * 6 + 1 + 1 + 6  # the last step ends on the last pixel or past it
     assert vector_bytes(one, prior) == 8 * 52 * n
-
-
-def test_values_are_shared_between_the_levels_about_them():
-    levels = np.array([0.0, 1.0, 3.0])
-    found = _pixels_at(np.array([0.25, 1.0, 2.0, 3.0, -5.0, 9.0]), levels)
-    np.testing.assert_allclose(found, [0.75 + 1, 0.25 + 1 + 0.5, 0.5 + 1 + 1])
-    values = np.random.default_rng(0).uniform(0, 3, 50)
-    found = _pixels_at(values, levels)
-    assert found.sum() == pytest.approx(50) and found @ levels == pytest.approx(values.sum())
-
-
-def evidence(prior, *, level):
-    """Of a round profile on 15 x 17 pixels, seen alike at all frequencies."""
-    spectra = Spectra(prior)
-    y, x = np.indices((15, 17))
-    profile = np.exp(-np.hypot(y - 7, x - 8) / 3)
-    return SourceEvidence(spectra, prior, profile, np.full((1, len(spectra.weight)), level))
-
-
-def test_new_strengths_are_the_fixed_point_of_the_evidence():
-    """Of what is well seen, energies over determined numbers; within 4 of the old, 0.1 % to 100 %;
-    misfit makes energies smaller, and never larger."""
-    prior = LearnedPrior(scales_px=(1.0, 3.0), strengths=(0.02, 0.1), weight=10.0)
-    one, spectrum, old = evidence(prior, level=1e4), np.array([2.0]), np.array([0.05, 0.1])
-    seen, gamma = one.seen(spectrum), one.determined(old, spectrum)
-    assert (seen > 0.9).all() and (gamma > 5).all()
-    m, energies = 10 / seen**2, np.array([0.3, 0.5])
-    for chi2 in (0.2, 1.0, 3.0):
-        wanted = np.sqrt((energies / max(chi2, 1) + m * [0.02**2, 0.1**2]) / (gamma + m))
-        assert ((wanted > old / 4) & (wanted < 4 * old)).all()
-        np.testing.assert_allclose(one.learned(old, energies, spectrum, chi2), wanted)
-    np.testing.assert_allclose(one.learned(old, 1e9 * energies, spectrum, 1.0), 4 * old)
-    np.testing.assert_allclose(
-        one.learned(np.array([1e-3, 0.5]), np.array([0.0, 1e9]), spectrum, 1.0)[1], 1.0
-    )
-    tiny = LearnedPrior(scales_px=(1.0, 3.0), strengths=(1e-6, 1e-6), weight=10.0)
-    found = evidence(tiny, level=1e4).learned(np.full(2, 2e-3), np.zeros(2), spectrum, 1.0)
-    np.testing.assert_allclose(found, 1e-3)
-
-
-def test_what_is_not_seen_stays_as_it_was_expected():
-    prior = LearnedPrior(scales_px=(1.0,), strengths=(0.02,), weight=10.0)
-    dark = evidence(prior, level=0.0)
-    assert dark.seen(np.ones(1)).tolist() == [LEAST_SEEN] and LEAST_SEEN == 1e-3
-    assert dark.determined(np.array([0.02]), np.ones(1)).tolist() == [0]
-    found = dark.learned(np.array([0.02]), np.array([0.5]), np.ones(1), 1.0)
-    np.testing.assert_allclose(found, 0.02, rtol=1e-3)
-    assert dark.curvature(np.ones(1)).tolist() == [0]
-
-
-def test_curvature_of_what_is_seen_alike_at_all_frequencies_is_that():
-    """Weighted by P^1.5 over the mean of P^0.5: more than it where P is peaked."""
-    prior = LearnedPrior()
-    one = evidence(prior, level=5.0)
-    p, weight = one.spectra.broadened(prior.amplitude(np.ones((3, 3)))), one.spectra.weight
-    np.testing.assert_allclose(p @ weight, 1, rtol=1e-12)
-    p = one.spectra.broadened(
-        np.sqrt(np.exp(-np.hypot(*(np.indices((15, 17)) - np.array([7, 8])[:, None, None])) / 3))
-    )
-    wanted = 4 * 5 * (p**1.5 @ weight) / (p**0.5 @ weight)
-    np.testing.assert_allclose(one.curvature(np.array([2.0])), wanted, rtol=1e-10)
-
-
-def test_answers_are_taken_within_half_a_side_of_their_pixel():
-    """Of 64: what lies further away is none of it, and nothing beyond the image is missed."""
-    spectra = Spectra(LearnedPrior(scales_px=(1.0,), strengths=(0.1,)))
-    image = np.zeros((2, 90, 20))
-    image[:, 40, 3] = 2.0
-    image[0, 40 - 33], image[0, 40 + 32] = 7.0, 7.0
-    found = spectra.of_answers(image, [(40, 3)] * 2)
-    np.testing.assert_allclose(found, 2.0)
-    image[1, 40 + 31, 3] = image[1, 40 - 31, 3] = 0.5
-    nu = np.fft.fftfreq(64)
-    wanted = np.repeat(2 + np.cos(2 * np.pi * 31 * nu), 33)
-    np.testing.assert_allclose(spectra.of_answers(image, [(40, 3)] * 2)[1], wanted)
-
-
-def test_the_middle_of_what_was_seen():
-    weights = np.zeros((2, 9, 12))
-    weights[0, 2, 3], weights[1, 6, 9] = 1.0, 3.0
-    assert _middle(weights).tolist() == [5, 8]  # 5, 7.5
-    weights[0, 8, 11] = -5  # what rounding leaves below 0 does not count
-    assert _middle(weights).tolist() == [5, 8] and _middle(0 * weights).tolist() == [0, 0]
-    assert _median(np.array([[0.0, 1.0, 2.0, 9.0]])) == 2 and _median(np.zeros(3)) == 0
-    part = _unpadded(SimpleNamespace(extent=(5, 7)), np.zeros((3, 8, 9)))
-    assert part.shape == (3, 5, 7)

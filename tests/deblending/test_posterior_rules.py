@@ -1,13 +1,10 @@
-"""Single rules of errors and of second components, on arrays made by hand."""
+"""Single rules of errors, on arrays made by hand."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from clresample.deblending.blend import INTERRUPTED
-from clresample.deblending.components import gradients, second
-from clresample.deblending.components.gradients import Asked, gain
 from clresample.deblending.posterior.errors import Draws
 from clresample.deblending.posterior.modes import STRENGTH, Solution
 from clresample.deblending.posterior.normal import Layout, _by_channel
@@ -15,7 +12,6 @@ from clresample.deblending.posterior.posterior import _local_chi2
 from clresample.deblending.posterior.profile_modes import Beyond
 from clresample.deblending.rendered import Rendered
 from clresample.deblending.solver.learned.prior import LearnedPrior
-from clresample.sky.sources import Extended, Point
 
 PRIOR = LearnedPrior(scales_px=(0.8, 2.2, 5.0), strengths=(0.005, 0.1, 0.02))
 
@@ -194,111 +190,3 @@ def test_chi2_is_that_where_a_components_light_is():
         wanted += [(light * chi2).sum((1, 2, 3)), light.sum((1, 2, 3))]
     found = _local_chi2(SimpleNamespace(spectra=spectra, sky=sky, observed=seen), views)
     np.testing.assert_allclose(found, wanted[0] / wanted[1])
-
-
-def test_clear_gradients_have_odds_of_150_to_1():
-    asked = Asked(np.array([2, 5, 7]), np.array([4.99, 5.01, -np.inf]), [])
-    assert asked.clear.tolist() == [5]
-
-
-def fitted(spectra, sources=None, power=1.0, **given):
-    """A finished fit as `_candidates` sees it."""
-    n = len(spectra)
-    sources = [Extended(position_px=(1, 1))] * n if sources is None else sources
-    return SimpleNamespace(
-        **{
-            "settings": SimpleNamespace(learns=True),
-            "findings": 1,
-            "losses": [3.0, 2.0],
-            "fitted": np.arange(n),
-            "start": SimpleNamespace(source=np.arange(n)),
-            "blend": SimpleNamespace(sources=sources),
-            "state": SimpleNamespace(spectra=np.array(spectra, float)),
-            "scene": SimpleNamespace(power=np.full((n, 2), power)),
-        }
-        | given
-    )
-
-
-def test_who_is_asked_for_a_gradient():
-    """Sources above signal to noise 30 in more than one channel, whose components are open."""
-    spectra = [(24, 18.1), (24, 17.9), (90, 0), (90, 1)]
-    assert gradients._candidates(fitted(spectra)).tolist() == [0, 3]
-    assert gradients._candidates(fitted(spectra, power=0.25)).tolist() == [3]
-    kinds = [
-        Point(position_px=(1, 1)),
-        Extended(position_px=(1, 1), n_components=1),
-        Extended(position_px=(1, 1), profile=np.ones((3, 3))),
-        Extended(position_px=(1, 1)),
-    ]
-    assert gradients._candidates(fitted([(90, 90)] * 4, kinds)).tolist() == [3]
-    for given in (
-        {"settings": SimpleNamespace(learns=False)},
-        {"findings": None},
-        {"losses": [2.0, np.nan]},
-    ):
-        assert gradients._candidates(fitted(spectra, **given)).tolist() == []
-    assert gradients.ask([fitted(spectra, findings=None)] * 2) == [None, None]
-
-
-def test_a_gradient_needs_two_channels():
-    values, precision, spectrum = np.array([3.0, -3.0]), np.array([4.0, 4.0]), np.array([5.0, 5.0])
-    assert np.isfinite(gain(values, precision, spectrum))
-    assert gain(values, np.array([4.0, 0.0]), spectrum) == -np.inf
-    third = [np.append(a, v) for a, v in ((values, 9.0), (precision, 0.0), (spectrum, 1.0))]
-    assert gain(*third) == gain(values, precision, spectrum)  # one that sees nothing
-
-
-def ended(n, losses, *, energies=0.0, findings=True, fixed=()):
-    """A finished fit of n components in three channels."""
-    found = SimpleNamespace(energies=np.full((n, 2), energies), strengths=np.full((n, 2), 0.5))
-    return SimpleNamespace(
-        findings=found if findings else None,
-        state=SimpleNamespace(morph=[0] * n, spectra=np.zeros((n, 3))),
-        scene=SimpleNamespace(fixed=np.isin(np.arange(n), fixed)),
-        losses=losses,
-        status="converged",
-    )
-
-
-def test_more_components_must_lower_the_loss_by_what_their_numbers_cost():
-    """A unit each for three fluxes and a profile's four numbers; and fit the data better."""
-    one = ended(2, [200, 100.0])
-    assert second._is_better(ended(3, [150, 92.9]), one)
-    assert not second._is_better(ended(3, [150, 93.0]), one)
-    assert second._is_better(ended(4, [150, 85.9]), one)
-    assert not second._is_better(ended(4, [150, 86.1]), one)
-    assert not second._is_better(ended(3, [150, 50.0], findings=False), one)
-    # 20 of 100 are structure's: half of 0.25^-1 of two scales of two components
-    stiff = ended(2, [200, 100.0], energies=2.5)
-    assert second._half_chi2(stiff) == pytest.approx(80)
-    assert not second._is_better(ended(3, [150, 81.0]), stiff)
-    assert second._is_better(ended(3, [150, 80.0]), stiff)
-    assert second._half_chi2(ended(2, [1, 100.0], energies=2.5, fixed=(0,))) == pytest.approx(90)
-
-
-def test_the_second_fit_takes_the_place_of_the_chosen_components():
-    """Two each, in the order of the sources."""
-
-    def point(n, first):
-        fields = {name: np.arange(n) + first for name in ("peaks", "spectra", "power", "places")}
-        return fields | {"shapes": list("abcdef"[:n]), "thetas": [first] * n}
-
-    from clresample.deblending.start.start import StartingPoint
-
-    others = {"positions": np.zeros((3, 2)), "dark": np.zeros(3, bool), "sky": np.zeros(1)}
-    begin = StartingPoint(source=np.array([0, 2, 1]), **others, **point(3, 0))
-    found = StartingPoint(source=np.array([0, 0, 1, 1]), **others, **point(4, 10))
-    joined = second._joined(begin, found, np.array([2, 0]))
-    assert joined.source.tolist() == [0, 0, 2, 1, 1]
-    for name in ("peaks", "spectra", "power", "places"):
-        assert getattr(joined, name).tolist() == [12, 13, 1, 10, 11]
-    assert joined.shapes == list("cdbab") and joined.thetas == [10, 10, 0, 10, 10]
-
-
-def test_progress_goes_on_from_the_first_fits():
-    told = []
-    fits = [SimpleNamespace(losses=[1] * n) for n in (7, 12)]
-    second._after(fits, lambda n, loss: told.append((n, loss)))(5, 0.5)
-    assert told == [(17, 0.5)] and second._after(fits, None) is None
-    assert INTERRUPTED == "interrupted"
