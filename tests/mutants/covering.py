@@ -43,6 +43,7 @@ class Covering:
         self.folder = folder
         self.ran = {}  # (file, line or kernel): tests
         self.seconds = {}  # of each test
+        self.width = {}  # of each test: how many places it runs
         shared = _digest([*sorted((ROOT / "clresample").rglob("*.py")), *_kernels(), *_helpers()])
         KEPT.mkdir(exist_ok=True)
         for file in files:
@@ -59,7 +60,7 @@ class Covering:
                 kept.write_text(json.dumps(self._relative(tests)))
                 raw.unlink()
             for test, found in json.loads(kept.read_text()).items():
-                self.seconds[test] = found["seconds"]
+                self.seconds[test], self.width[test] = found["seconds"], len(found["ran"])
                 for place in found["ran"]:
                     self.ran.setdefault(tuple(place), set()).add(test)
 
@@ -70,17 +71,21 @@ class Covering:
         return tests
 
     def tests(self, mutation):
-        """The tests that may notice a Mutation; one variant of each test before the next ones."""
+        """The tests that may notice a Mutation; one variant of each test before the next ones.
+
+        Quick ones come first, and those that run little else: they look at this alone.
+        """
         file = str(mutation.path.relative_to(ROOT))
         places = _kernel_places if file.startswith("kernels/") else _python_places
         near = set().union(*(self.ran.get(place, ()) for place in places(mutation, file)))
         if not near:  # of the file's lines: whichever tests run any
             near = set().union(*(tests for place, tests in self.ran.items() if place[0] == file))
         seen, order = {}, []
-        for test in sorted(near, key=lambda test: self.seconds[test]):
+        cost = {test: self.seconds[test] * self.width[test] for test in near}
+        for test in sorted(near, key=lambda test: (cost[test], test)):
             function = test.split("[")[0]
             seen[function] = seen.get(function, -1) + 1
-            order.append((seen[function], self.seconds[test], test))
+            order.append((seen[function], cost[test], test))
         return [test for _, _, test in sorted(order)]
 
 

@@ -6,6 +6,8 @@ import sys
 import threading
 import time
 
+import pytest
+
 
 class Recorder:
     """For each test that passes: its seconds, the lines of Python and the kernels that it ran.
@@ -53,6 +55,15 @@ class Recorder:
     def pytest_runtest_setup(self, item):
         self._ran.clear()
         self._began = time.perf_counter()
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_fixture_setup(self, fixturedef):
+        """What a session sets up once is none of the time of the test that is its first."""
+        began = time.perf_counter()
+        value = yield
+        if fixturedef.scope == "session":
+            self._began += time.perf_counter() - began
+        return value
 
     def pytest_runtest_logreport(self, report):
         if report.when == "call" and report.passed:

@@ -1,0 +1,105 @@
+"""Steps of the start's least squares on a valley of one parameter: gained, damped, ended."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from clresample.deblending.start import profile_fit
+from clresample.deblending.start.profile_fit import ProfileFit
+
+
+class Valley:
+    """Stands in for a Looking at one parameter a scene: chi2 = (theta - goal)^2 * steep + rest."""
+
+    def __init__(self, goals, steep, rest):
+        self.goals, self.steep, self.rest = np.array(goals), steep, rest
+        n = len(goals)
+        mean = np.zeros(4)
+        shape = SimpleNamespace(mean=mean, scatter=np.full(4, 1e6))
+        self.components = [SimpleNamespace(shape=shape) for _ in goals]
+        self.scene, self.index = np.arange(n), np.zeros(n, int)
+        self.n_scenes, self.n_most = n, 1
+        self.spectra, self.sky = np.ones((n, 1)), np.zeros((n, 1))
+        self.n_looks = np.zeros(n, int)
+
+    def look(self, scenes, thetas, _brightness, *, slopes):
+        self.scenes, self.now = np.asarray(scenes), np.array([t[0] for t in thetas])
+        if not slopes:
+            self.n_looks[self.scenes] += 1
+
+    def solve(self, _error):
+        self.spectra[self.scenes, 0] = self.now[self.scenes]
+
+    def away(self):
+        return self.now[self.scenes] - self.goals[self.scenes]
+
+    def compare(self, _error):
+        return self.steep * self.away() ** 2 + self.rest
+
+
+@pytest.fixture
+def valley(monkeypatch):
+    """Makes a ProfileFit of a Valley, whose equations promise `promise` times the way."""
+
+    def made(goals, steep=1e4, rest=100.0, promise=1.0):
+        looking = Valley(goals, steep, rest)
+
+        def equations(_looking):
+            k = len(looking.scenes)
+            normal, right = np.tile(np.eye(4), (k, 1, 1)), np.zeros((k, 4))
+            normal[:, 0, 0] = steep / promise
+            right[:, 0] = -steep * looking.away()
+            return normal, right
+
+        monkeypatch.setattr(profile_fit, "equations", equations)
+        monkeypatch.setattr(profile_fit, "peaks_of", lambda c, thetas: np.ones(len(c)))
+        fit = ProfileFit(looking, np.ones((len(goals), 1)))
+        fit.begin()
+        return fit, looking
+
+    return made
+
+
+def test_profiles_step_to_the_bottom_and_stop_there(valley):
+    """Each at its own pace, 0.7 at most at a time, until a step gains a part of 1e-3."""
+    fit, looking = valley([0.5, 1.9, 0.0])
+    np.testing.assert_allclose(fit.chi2, 100 + 1e4 * looking.goals**2)
+    before = looking.n_looks.copy()
+    fit.run()
+    np.testing.assert_allclose(fit.theta[:, 0, 0], looking.goals, atol=1e-3)
+    np.testing.assert_allclose(fit.chi2, 100, rtol=1e-3)
+    np.testing.assert_allclose(looking.spectra[:, 0], fit.theta[:, 0, 0])
+    # 0.7, 0.7, 0.5 and what the damping left; a scene at its end tries until damping is too large
+    assert (looking.n_looks - before)[0] < (looking.n_looks - before)[1] <= 6
+
+
+def test_a_step_that_gains_nothing_is_taken_back_and_damped(valley):
+    """Equations that promise three times the way: 10 times more each time, then 3 times less."""
+    fit, looking = valley([0.1], promise=3.0)
+    gains, real = [], fit._try
+
+    def tried(scenes, damping):
+        gain, trial = real(scenes, damping)
+        gains.append((float(damping[0]), bool(gain[0] > 0), float(fit.theta[0, 0, 0])))
+        assert looking.spectra[0, 0] == (trial[0, 0, 0] if gain[0] > 0 else fit.theta[0, 0, 0])
+        return gain, trial
+
+    fit._try = tried
+    fit.run()
+    damped, gained, at = zip(*gains, strict=True)
+    assert damped[:5] == pytest.approx([0.01, 0.1, 1, 1 / 3, 10 / 3])
+    assert gained[:5] == (False, False, True, False, True)
+    assert at[:4] == pytest.approx([0, 0, 0, 0.15]) and len(gains) <= 10
+    assert fit.chi2[0] == pytest.approx(100, abs=0.2)
+
+
+def test_brightness_is_that_of_the_channel_that_sees_a_peak_best(monkeypatch):
+    fit = object.__new__(ProfileFit)
+    fit.looking = SimpleNamespace(
+        spectra=np.array([[4.0, 9.0], [8.0, 1.0]]), scene=np.array([0, 1]), components=[0, 1]
+    )
+    fit.noise, fit.thetas = np.array([[1.0, 3.0], [2.0, 0.5]]), lambda theta: theta
+    monkeypatch.setattr(profile_fit, "peaks_of", lambda *_: np.array([0.5, 10.0]))
+    fit._measure_brightness(None)
+    assert fit.brightness.tolist() == [2, 40]

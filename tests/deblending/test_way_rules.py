@@ -1,0 +1,212 @@
+"""Rules of shifts, of rendering and of batches, each on few numbers or one small image."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers import scenes
+
+from clresample.deblending import iterate as iterate_module
+from clresample.deblending.profiles import Star
+from clresample.deblending.rendered import Rendered
+from clresample.deblending.shifts import SCATTER_PX, shift_steps
+from clresample.deblending.solver.boxes import Boxes
+from clresample.deblending.solver.rendering import choice
+from clresample.deblending.solver.rendering.windows import ROUND_PX, Groups
+from clresample.deblending.solver.scene import Scene, State
+from clresample.deblending.start.seen import WHOLE_PX, Model, see
+from clresample.deblending.start.slots import Component
+from clresample.deblending.start.start import _peak
+from clresample.deblending.view import Home, whitened_view
+from clresample.sky.frame import Frame
+from clresample.sky.grid import Grid
+from clresample.sky.observation import Observation
+from clresample.sky.psf import PSF
+
+SHIFT = np.array([0.15, -0.1])
+
+
+class Still:
+    """An operator of one channel that shows the model itself."""
+
+    dtype = np.dtype(np.float64)
+    shape_in = shape_out = (1, 40, 44)
+
+    def forward(self, image):
+        return image
+
+
+def moved(weight, sky=0.0, mask=False):
+    """Two images of a galaxy, the second moved by SHIFT; weight: of that."""
+    y, x = np.indices((40, 44))
+
+    def galaxy(dy, dx):
+        return np.exp(-0.5 * ((y - 19 - dy) ** 2 + (x - 22 - dx) ** 2) / 9)
+
+    weights = [np.ones((1, 40, 44)), np.full((1, 40, 44), weight)]
+    if mask:
+        weights[1][:, :20, :24] = 0
+    morph = galaxy(0, 0)
+    scene = Scene(
+        shape=(40, 44),
+        extent=(40, 44),
+        ops=[Still(), Still()],
+        data=[morph[None], galaxy(*-SHIFT)[None] + sky],
+        weights=weights,
+        origin=np.zeros((1, 2), int),
+        center=np.array([(19, 22)]),
+        profile=[morph],
+        fixed=np.zeros(1, bool),
+        scale=np.ones((1, 2)),
+    )
+    return scene, State([0 * morph], [morph], np.ones((1, 2)), np.array([0.0, sky]))
+
+
+def test_the_sky_and_masks_move_nothing():
+    """What the model and the sky explain is taken off before the slopes are asked."""
+    steps = shift_steps(*moved(1e4, sky=3.0, mask=True))
+    assert steps[0].tolist() == [0, 0]
+    np.testing.assert_allclose(steps[1], SHIFT, rtol=0.05)
+
+
+def test_shifts_of_what_holds_little_light_are_smaller():
+    """As expected to scatter by 2 px: by half where the data leave as much."""
+    assert SCATTER_PX == 2
+    power = np.pi / 2 * np.eye(2)  # of the slopes of such a galaxy
+    full = shift_steps(*moved(1e9))[1]
+    for weight in (1 / (4 * np.pi / 2), 0.02):
+        wanted = np.linalg.solve(weight * power + np.eye(2) / 4, weight * power @ full)
+        np.testing.assert_allclose(shift_steps(*moved(weight))[1], wanted, rtol=0.05)
+
+
+def test_a_sharp_stars_peak_is_of_its_profile_and_not_of_its_slopes():
+    home = Frame(Grid.flat((21, 23), 0.1), PSF.gaussian(0.35, n_pixels=15, pixel=False))
+    star, place = Star(home, free=True), np.array([10.4, 11.4])
+    drawn = star.draw(np.zeros(2), place)
+    assert drawn[1:].max() > drawn[0].max()
+    found = _peak(Component(0, 0, 0, star, place, home.shape), np.zeros(2), place)
+    assert found == pytest.approx(drawn[0].max(), rel=0.01)
+
+
+def test_morphologies_in_large_frames_are_seen_where_they_are(device):
+    """In windows of their boxes, which begin elsewhere along rows and columns; and their spectra
+    are found."""
+    psf, shape = PSF.gaussian(1.0, n_pixels=19), (170, 180)
+    grid = Grid.flat(shape, 0.1)
+    home = Frame(grid, scenes.MODEL_PSF)
+    y, x = np.indices((15, 13))
+    morph = np.exp(-0.5 * ((y - 7) ** 2 + (x - 6) ** 2) / 4)
+    origin = np.array([[20, 120], [130, 40]])
+    assert np.prod(shape) > WHOLE_PX
+    data = np.zeros((1, *shape))
+    blank = Observation(data, psf, grid, weights=4.0, channels=("g",))
+    place = Home(home, home, origin + [7, 6.0], 0.0)
+    view = whitened_view(place, blank, 1, device, np.float32, private=False)
+    whole = np.zeros((2, *shape), np.float32)
+    for image, (a, b) in zip(whole, origin, strict=True):
+        image[a : a + 15, b : b + 13] = morph
+    shown = view.op.render(whole)
+    light = 3 * shown[0] + 5 * shown[1] + 0.5
+    filled = SimpleNamespace(**{name: getattr(view, name) for name in ("op", "root", "shares")})
+    filled.mapping, filled.data, filled.covered = view.mapping, 2 * light, view.covered
+    for fit_sky in (True, False):
+        filled.data = 2 * (light - 0.5 * (not fit_sky))
+        model = Model(shape, [filled], [None], np.zeros(2, int), origin, [morph, morph])
+        (seen,) = see([model], fit_sky=fit_sky)
+        (rendered,) = seen.observed
+        assert isinstance(rendered, Rendered) and rendered.images[0].size < 0.2 * data.size
+        np.testing.assert_allclose(np.asarray(rendered), shown, atol=1e-4 * shown.max())
+        np.testing.assert_allclose(seen.spectra[:, 0], [6, 10], rtol=1e-3)
+        np.testing.assert_allclose(seen.sky, [1.0 * fit_sky], atol=1e-3)
+        assert seen.bare == (None,)
+
+
+def boxes_at(*places, scene=None, n=8):
+    count = len(places)
+    return Boxes(
+        np.zeros(count, int) if scene is None else np.array(scene),
+        np.array(places),
+        np.full((count, 2), n),
+    )
+
+
+def test_groups_are_of_the_cells_that_hold_the_middles_of_boxes():
+    """Of those that are meant, by scene; frames of one size, multiples of 16, about all of each."""
+    boxes = boxes_at((0, 0), (5, 9), (7, 12), (40, 3), (0, 0), (3, 3), scene=[0, 0, 0, 0, 1, 1])
+    groups = Groups(boxes, np.array([0, 1, 2, 3, 4]), np.array([10, 16]))
+    assert ROUND_PX == 16 and len(groups) == 4
+    assert groups.group.tolist() == [0, 0, 1, 2, 3, 0] and groups.scene.tolist() == [0, 0, 0, 1]
+    assert groups.low.tolist() == [[0, 0], [7, 12], [40, 3], [0, 0]]
+    assert groups.shape.tolist() == [16, 32]  # 13 x 17 pixels of the first
+    exact = Groups(boxes_at((0, 0), (8, 8)), np.arange(2), np.array([50, 50]))
+    assert exact.shape.tolist() == [16, 16] and exact.low.tolist() == [[0, 0]]
+
+
+def test_operations_are_counted_from_sizes():
+    """Products of matrices, four operations a term and pair; weighed sums at points beside them."""
+    shape, frame = np.array([[3, 5], [4, 2]]), (20, 30, 16, 48)
+    found = choice._counts(shape, 2, 3, *frame)
+    n_y, n_x, k_y, k_x = frame
+    rows, pixels, n_images = 7, 23, 6
+    second = n_images * k_y * n_y * k_x
+    wanted = [
+        n_images * n_y * n_x * k_x + second + choice.POINT * 1.5 * 3 * pixels,
+        choice.BOXED * pixels * k_x + second + choice.POINT * 1.5 * 3 * rows * k_x,
+        choice.BOXED * (pixels * k_x + rows * k_y * k_x) + choice.POINT * 1.5 * 3 * 2 * k_y * k_x,
+    ]
+    np.testing.assert_allclose(found, 4 * np.array(wanted))
+    plain, lines = SimpleNamespace(lines=None), SimpleNamespace(lines=1)
+    assert choice._observed(plain, 5, 7, 11, 13) == 5 * 11 * 13 + 5 * 13 * 7
+    assert choice._observed(lines, 5, 7, 11, 13) == 11 * 13 * 7 + 11 * 7 * 5
+
+
+def running(live, n_steps=5, resize=False):
+    """A batch of fits on their way, as `repacked` and `run` see it."""
+    one = object.__new__(iterate_module._Running)
+    one.live, one.fits = np.array(live), list("abcdefgh"[: len(live)])
+    one.engine = SimpleNamespace(n_steps=n_steps)
+    return one
+
+
+def test_a_batch_is_made_anew_when_a_quarter_has_stopped():
+    assert (iterate_module.REPACK, iterate_module.RESIZE) == (0.25, 40)
+    going = running([True] * 7 + [False])
+    assert going.repacked() is going and going.going() == list("abcdefg")
+    with pytest.raises(AttributeError):  # asks its engine for states
+        running([True, True, True, False]).repacked()
+    with pytest.raises(AttributeError):
+        running([True] * 8, n_steps=40).repacked()
+    one = object.__new__(iterate_module._Learning)
+    one.engine = SimpleNamespace(progress=SimpleNamespace(live=np.array([True] * 7 + [False])))
+    assert one.repacked() is one
+
+
+def test_learning_runs_five_rounds_at_a_time_and_no_more_than_it_may():
+    """The start is none of them."""
+    assert iterate_module.CHECK == 5
+    for max_iter, wanted in ((100, [6, 5, 5]), (7, [6, 2, 0])):
+        one, rounds = object.__new__(iterate_module._Learning), []
+        n = np.zeros(2, int)
+        progress = SimpleNamespace(
+            live=np.array([True, False]),
+            converged=np.zeros(2, bool),
+            n_rounds=n,
+            loss=np.array([3.0, 4.0]),
+        )
+
+        def go(n=n, rounds=rounds):
+            n[0] += 1
+            rounds.append(1)
+            return np.array([True, False])
+
+        one.engine = SimpleNamespace(progress=progress, round=go)
+        one.fits = [SimpleNamespace(losses=[]), SimpleNamespace(losses=[])]
+        one.settings = SimpleNamespace(max_iter=max_iter, fit_shifts=False)
+        settled = []
+        one.settle = lambda stop, settled=settled: settled.append(stop.tolist())
+        for k in wanted:
+            rounds.clear()
+            np.testing.assert_array_equal(one.run(), [[3, 4]])
+            assert len(rounds) == k
+        assert len(one.fits[0].losses) == sum(wanted) and one.fits[1].losses == []
+        assert settled == ([] if max_iter == 100 else [[True, False]])
