@@ -115,6 +115,16 @@ def test_clumps_grow_with_the_root_of_peak_and_light(light, clump):
     assert not judged(0.3, [spectra_signal({(20, 30): (90.0,), (20, 8): (100.0,)})])
 
 
+@pytest.mark.parametrize("beyond, is_one", [(11.8, False), (12.2, True)])
+def test_a_colour_is_another_from_twelve_beyond_its_mean_on(beyond, is_one):
+    """chi2 of what is left in one channel, of a host seen in the other alone: v^2 / 2 - 1."""
+    image, model, rest = np.zeros((3, 40, 40))
+    image[20, 8], rest[20, 30] = 100.0, 3.0
+    signal = spectra_signal({(20, 30): (np.sqrt(2 * (beyond + 1)), 0), (20, 8): (0.0, 100.0)})
+    given = rest, model, image, [signal], np.array([[20.0, 8.0]]), 4.0
+    assert is_a_source(np.array([20, 30]), *given) == is_one
+
+
 def test_the_host_is_the_brightest_where_light_falls_by_e_a_fwhm():
     """Of 1000 sigma at 30 px and of 50 at 8 px, FWHM 5: the nearer one; at 20 px the brighter.
 
