@@ -7,6 +7,7 @@ import pytest
 
 from clresample.deblending.components import gradients, second
 from clresample.deblending.components.gradients import Asked, gain
+from clresample.deblending.rendered import Rendered
 from clresample.deblending.start.start import StartingPoint
 from clresample.sky.sources import Extended, Point
 
@@ -62,6 +63,60 @@ def test_a_gradient_needs_two_channels():
     assert gain(values, np.array([4.0, 0.0]), spectrum) == -np.inf
     third = [np.append(a, v) for a, v in ((values, 9.0), (precision, 0.0), (spectrum, 1.0))]
     assert gain(*third) == gain(values, precision, spectrum)  # one that sees nothing
+
+
+@pytest.mark.parametrize("noise", [0.7, 3.0])
+def test_evidence_is_asked_of_whitened_residuals(noise):
+    """Two observations, three channels, two components and the core of the second: in units of the
+    noise, all of the model and the sky taken off; misfit where its light is makes it less certain,
+    and a flux under its error counts as that."""
+    rng, shape = np.random.default_rng(4), (9, 11)
+    spectra, sky = np.array([[3.0, 2.0, 1.0], [5.0, 1e-9, 4.0]]), np.array([0.5, -0.25, 0.125])
+    low, parts, views, observed = np.array([[0, 0], [2, 3], [2, 3]]), [], [], []
+    slope, power, chi2, light = np.zeros((3, 3)), np.zeros((3, 3)), 0.0, 0.0
+    for part in (slice(0, 1), slice(1, 3)):
+        parts.append(part)
+        n = part.stop - part.start
+        images = [rng.random((n, *size)) for size in ((6, 7), (5, 6), (5, 6))]
+        observed.append(Rendered((3, n, *shape), low, images))
+        whole = np.asarray(observed[-1])
+        root = rng.uniform(0.5, 1.5, (n, *shape))
+        model = np.einsum("ic,icyx->cyx", spectra[:, part], whole[:2]) + sky[part, None, None]
+        rest = noise * rng.normal(size=root.shape)
+        views.append(SimpleNamespace(root=root, data=model + rest / root))
+        whitened = whole * root
+        slope[:, part] = np.einsum("icyx,cyx->ic", whitened, rest)
+        power[:, part] = np.einsum("icyx,icyx->ic", whitened, whitened)
+        own = spectra[1, part, None, None] ** 2 * whole[1] * root**2
+        chi2, light = chi2 + (own * rest**2).sum(), light + own.sum()
+    covariance = np.array([np.linalg.inv(np.diag(power[:, c]) + 0.1) for c in range(3)])
+    fit = SimpleNamespace(
+        state=SimpleNamespace(spectra=spectra, sky=sky, morph=[0, 0]),
+        views=views,
+        scene=SimpleNamespace(channels=lambda: parts),
+    )
+    seen = SimpleNamespace(observed=observed, covariance=covariance)
+    asked = gradients._asked(fit, np.array([1]), seen)
+    core = np.einsum("cj,jc->c", covariance[:, 2], slope)
+    precision = 1 / covariance[:, 2, 2] / max(chi2 / light, 1)
+    flux = np.maximum(spectra[1], 1 / np.sqrt(power[1]))
+    assert asked.evidence == pytest.approx(gain(core, precision, flux), rel=1e-10)
+    assert asked.which.tolist() == [1] and (chi2 / light > 1) == (noise > 1)
+    for rendered, bare in zip(observed, asked.observed, strict=True):
+        np.testing.assert_array_equal(np.asarray(bare), np.asarray(rendered)[:2])
+
+
+def test_what_neighbours_leave_nothing_of_is_not_seen():
+    """A millionth of its own precision, and less."""
+    slope, power = np.ones((2, 2)), np.full((2, 2), 4.0)
+    covariance = np.zeros((2, 2, 2))
+    covariance[:, 1, 1] = 1 / (1.1 * 4e-6), 1 / (0.9 * 4e-6)
+    values, precision = gradients._eliminated(covariance, slope, power, 1)
+    np.testing.assert_allclose(precision, [[4.4e-6, 0]])
+    np.testing.assert_allclose(values, [[1 / 4.4e-6, 0]])
+    covariance[:, 1, 1] = np.inf, 0.25
+    values, precision = gradients._eliminated(covariance, slope, power, 1)
+    np.testing.assert_allclose([values[0], precision[0]], [[0, 0.25], [0, 4]])
 
 
 def ended(n, losses, *, energies=0.0, findings=True, fixed=()):

@@ -69,6 +69,8 @@ def test_steps_shrink_to_the_minimum_of_a_parabola_within_limits():
     np.testing.assert_allclose(length, np.array([4 / 10, 4 / 20, 0.1, 4 / 8.02]) ** 2, rtol=1e-6)
     *_, length, _ = judged(progress, [5] * 4, [-4] * 4)
     assert (length == 1).all()
+    *_, length, _ = judged(progress, [5.0001] * 4, [-0.0004] * 4)  # whatever the unit
+    np.testing.assert_allclose(length, 0.4, rtol=1e-6)
 
 
 def test_a_direction_is_given_up_after_eight_trials_and_the_scene_after_eight_more():

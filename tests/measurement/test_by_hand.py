@@ -43,6 +43,16 @@ def test_moments_have_what_lies_beyond_the_box():
         np.testing.assert_allclose(one, other, rtol=1e-10)
 
 
+def test_light_beyond_the_box_counts_wherever_it_lies():
+    """In row 0 of the frame, where its sum times y is 0."""
+    image, rest = np.zeros((3, 9)), np.zeros((6, 9))
+    image[1, 4], rest[0, 2] = 3.0, 1.0
+    parts = [Component(0, (2, 0), image, np.ones(1))]
+    centroid, second = moments(parts, np.ones(1), sums_of(rest)[None])
+    np.testing.assert_allclose(centroid, [3 * 3 / 4, (3 * 4 + 2) / 4])
+    np.testing.assert_allclose(second[0, 0], 3 / 4 * 1 / 4 * 9)
+
+
 def test_channels_whose_error_is_infinite_do_not_weigh_in_moments():
     """The first component shines in g, the second in r, whose fluxes nothing determines."""
     parts = [round_component(0, (30, x), a) for x, a in ((32, (1.0, 0.0)), (38, (0.0, 1.0)))]

@@ -97,6 +97,19 @@ def test_saturated_is_a_star_with_masked_pixels_in_its_core():
         assert flags(one_source(**given)) == [expected]
 
 
+def test_a_core_is_as_large_as_the_psf_of_larger_pixels():
+    """Of twice the size, a FWHM of 3 px: what is 1 px away is in it, 2 px are not."""
+    grid = Grid.flat((30, 35), 2 * SCALE)
+    for away, expected in (((1, 0), Flag.SATURATED), ((-1, 1), Flag.SATURATED), ((0, 2), Flag(0))):
+        weights = np.ones((2, 30, 35))
+        weights[1, 15 + away[0], 17 + away[1]] = 0
+        given = {
+            "observations": [observe(grid, ("g", "r"), weights=weights)],
+            "sources": (Point(position_px=(30.5, 34.5)),),
+        }
+        assert flags(one_source(**given)) == [expected]
+
+
 def test_no_coverage_is_a_centre_off_an_image():
     full = observe(Grid.flat((60, 70), SCALE), ("g",))
     left = observe(Grid.flat((30, 17), 0.2, center_arcsec=(0, -1.8)), ("r",))  # to column 33
@@ -108,6 +121,7 @@ def test_no_coverage_is_a_centre_off_an_image():
 
 def test_zero_flux_and_not_converged():
     assert flags(blend([round_component(0, MIDDLE, (1, 0))])) == [Flag.ZERO_FLUX]
+    assert flags(blend([round_component(0, MIDDLE, (1, 1e-6))])) == [Flag(0)]
     covariance = np.array([1, np.inf])[:, None, None]
     unseen = blend([round_component(0, MIDDLE, (1, 0))], covariance=covariance)
     assert flags(unseen) == [Flag.NO_COVERAGE]

@@ -73,7 +73,8 @@ def test_a_peak_on_an_edge_stays(place):
 
 def test_a_top_lies_within_half_a_pixel():
     assert companions._top(0.0, 1.0, 1.0) == 0.5 and companions._top(1.0, 1.0, 0.0) == -0.5
-    assert companions._top(0.0, 1.0, 1.5) == 0.5 and companions._top(0.0, 1.0, 0.0) == 0.0
+    assert companions._top(0.0, 1.0, 1.5) == 0.5 and companions._top(1.5, 1.0, 0.0) == -0.5
+    assert companions._top(0.0, 1.0, 0.0) == 0.0
     assert companions._top(1.0, 1.0, 1.0) == 0.0 and companions._top(2.0, 1.0, 3.0) == 0.0
 
 

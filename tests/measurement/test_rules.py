@@ -153,3 +153,20 @@ def test_what_an_object_is_and_what_a_known_source_hides():
     assert found(near, apart=4.9) == found([])
     assert found([*near, np.array([25.0, 35.0])], apart=5.0) == [(5, 30), (20, 10)]
     assert found([np.array([-3.0, 50.0])]) == found([])  # beyond the edges
+
+
+def test_a_faint_neighbour_of_a_bright_object_is_an_object_of_its_own():
+    """With half a percent of the light, beside a peak of thirty times its height; a shoulder of
+    0.05 % is none."""
+    sep = pytest.importorskip("sep")
+    y, x = np.indices((60, 60))
+
+    def spot(at, height, sigma):
+        return height * np.exp(-0.5 * ((y - at[0]) ** 2 + (x - at[1]) ** 2) / sigma**2)
+
+    bright = spot((30, 20), 3000, 5)
+    for height, n in ((100.0, 2), (9.0, 1)):
+        image = (bright + spot((30, 41), height, 1.8)).astype(np.float32)
+        objects, segments = detection._objects(sep, image, 5.0, 3)
+        assert len(objects) == n == segments.max()
+        assert tuple(objects[0][0]) == (30, 20) or tuple(objects[-1][0]) == (30, 20)

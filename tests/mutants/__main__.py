@@ -46,8 +46,11 @@ def sources(path):
 def equivalents():
     """{(file, line's text, change, place or None)} of equivalent.toml."""
     text = Path(__file__).with_name("equivalent.toml").read_text(encoding="utf-8")
-    entries = tomllib.loads(text)["equivalent"]
-    return {(e["file"], e["line"], e["change"], e.get("place")) for e in entries}
+    found = set()
+    for one in tomllib.loads(text)["equivalent"]:
+        changes = one["change"] if isinstance(one["change"], list) else [one["change"]]
+        found |= {(one["file"], one["line"], change, one.get("place")) for change in changes}
+    return found
 
 
 class Trial:
