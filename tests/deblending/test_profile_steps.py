@@ -94,6 +94,23 @@ def test_a_step_that_gains_nothing_is_taken_back_and_damped(valley):
     assert fit.chi2[0] == pytest.approx(100, abs=0.2)
 
 
+def test_a_scene_that_no_step_helps_is_left_when_damping_is_too_large(valley):
+    """After six of them, ten times shorter each time, to a thousandth of the first way."""
+    fit, looking = valley([0.1], promise=-3.0)
+    before = looking.n_looks.copy()
+    fit.run()
+    assert (looking.n_looks - before).tolist() == [6] and not fit.theta.any()
+    assert fit.chi2.tolist() == [200] and looking.spectra[0, 0] == 0
+    many, far = valley([90.0])
+    many.run()  # ten steps at most, each of 0.7
+    assert many.theta[0, 0, 0] == pytest.approx(7.0)
+    still, seen = valley([0.0])
+    still.counts[:] = 0  # a scene without parameters
+    before = seen.n_looks.copy()
+    still.run()
+    assert (seen.n_looks == before).all() and far.n_looks[0] == 11
+
+
 def test_brightness_is_that_of_the_channel_that_sees_a_peak_best(monkeypatch):
     fit = object.__new__(ProfileFit)
     fit.looking = SimpleNamespace(

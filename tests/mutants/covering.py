@@ -47,7 +47,7 @@ class Covering:
         shared = _digest([*sorted((ROOT / "clresample").rglob("*.py")), *_kernels(), *_helpers()])
         KEPT.mkdir(exist_ok=True)
         for file in files:
-            kept = KEPT / f"{_digest([ROOT / file], shared)}.json"
+            kept = KEPT / f"{_digest([folder / file], shared)}.json"
             if not kept.exists():
                 print(f"recording {file}", flush=True)
                 raw = kept.with_suffix(".raw")
