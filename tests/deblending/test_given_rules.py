@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 from helpers.blends import blend, observe, round_component
 
-from clresample.deblending.posterior import posterior as posterior_module
-from clresample.deblending.posterior.exposure import Exposure, Transfer, _parallel, _spread
 from clresample.deblending.settings import Settings
 from clresample.deblending.solver.constraints import (
     L0,
@@ -25,7 +23,6 @@ from clresample.deblending.solver.learned.prior import LearnedPrior
 from clresample.deblending.solver.prior import Prior
 from clresample.deblending.solver.prox_launches import parameter_table
 from clresample.sky.grid import Grid
-from clresample.sky.psf import PSF
 
 
 def test_defaults_are_those_of_the_docstring():
@@ -157,109 +154,3 @@ def test_a_source_is_the_sum_of_its_components():
     with pytest.raises(ValueError, match=r"channel is 'z', must be one of \('g', 'r', 'i'\)"):
         pytest.importorskip("galsim")
         result.as_galsim(0, "z")
-
-
-def exposure(y, x, reach):
-    return Exposure(np.array(y, float), np.array(x, float), None, reach, None, None)
-
-
-def test_a_window_holds_the_pixels_within_reach():
-    """Of a box of 3 x 2 pixels that starts at (4, 5): rows from 2 to 8 at a reach of 2."""
-    one = exposure(range(20), np.arange(0, 20, 0.5), 2.0)
-    assert one.window((4, 5), (3, 2)).tolist() == [[2, 6], [8, 16]]
-    assert exposure(range(20), range(20), 2.25).window((4, 5), (3, 2)).tolist() == [[2, 3], [9, 9]]
-    low, high = one.window((30, 5), (3, 2))
-    assert low[0] == high[0] == 20  # none
-
-
-@pytest.mark.parametrize(
-    "matrix", [((2, 0), (0, 1)), ((-2, 0), (0, 1)), ((0, 2), (-1, 0)), ((0, -2), (-1, 0))]
-)
-def test_parallel_pixels_keep_their_weights(matrix):
-    """Turned and mirrored: rows and columns of the model, ascending."""
-    matrix = np.array(matrix, float)
-    root = np.arange(24.0).reshape(2, 3, 4)
-    offset, shift = np.array([20.0, 30.0]), np.array([0.25, -0.5])
-    mapping = SimpleNamespace(matrix=matrix, offset=offset)
-    view = SimpleNamespace(mapping=mapping, root=root, op=SimpleNamespace(shift=shift))
-    y, x, found = _parallel(view, None)
-    assert (np.diff(y) > 0).all() and (np.diff(x) > 0).all()
-    for n in range(3):
-        for m in range(4):
-            place = matrix @ (n, m) + offset + shift
-            i, j = np.argmin(np.abs(y - place[0])), np.argmin(np.abs(x - place[1]))
-            np.testing.assert_allclose((y[i], x[j]), place)
-            np.testing.assert_array_equal(found[:, i, j], root[:, n, m])
-
-
-def test_weights_spread_over_the_model_keep_their_density():
-    """Of even weights turned by 30 degrees: what two pixels of noise 1 say, one of theirs does."""
-    c, s = 0.8 * np.cos(np.pi / 6), 0.8 * np.sin(np.pi / 6)
-    matrix = np.array([[c, -s], [s, c]])
-    n, shift = 60, np.array([0.3, -0.2])
-
-    class Mapping:
-        area, shape_in, shape_out = None, (24, 26), (n, n)
-
-        def __init__(self):
-            self.matrix = matrix
-
-        def at(self, a, b):
-            away = np.stack([a - n / 2, b - n / 2], axis=-1)
-            return away @ matrix.T + [12, 13] - shift
-
-    view = SimpleNamespace(
-        mapping=Mapping(),
-        covered=np.ones((n, n), bool),
-        root=np.full((1, n, n), 3.0),
-        op=SimpleNamespace(shift=shift),
-    )
-    for pixel in (0.8, 1.2):
-        y, x, root = _spread(view, pixel)
-        np.testing.assert_allclose(np.diff(y), pixel)
-        assert y[0] == x[0] == -pixel and y[-1] >= 24 and x[-1] >= 26
-        inner = root[0, 4:-4, 4:-4]  # within the frame, all of which is seen
-        np.testing.assert_allclose(inner, 3 * pixel / 0.8, rtol=1e-5)
-    half = view.root.copy()
-    n_y, m = np.indices((n, n))
-    half[0][view.mapping.at(n_y, m)[..., 0] + shift[0] < 12] = 0
-    y, _, root = _spread(SimpleNamespace(**{**vars(view), "root": half}), 0.8)
-    assert root[0, y < 10.5, 5:-5].max() == 0 and root[0, (y > 13.5) & (y < 22), 5:-5].min() > 2.9
-
-
-def test_periods_hold_a_box_and_what_its_light_reaches():
-    """Multiples of 8 px, and one; frequencies of half a plane, counted twice but for row 0."""
-    psf = PSF.gaussian(1.2, n_pixels=25)
-    transfer = Transfer(2.0 * np.eye(2), psf, psf)
-    nu_y, nu_x, d = transfer.at((11, 13), 4.0)
-    assert nu_y[1] == pytest.approx(1 / 25) and nu_x[len(nu_x) // 2 + 1] == pytest.approx(1 / 25)
-    assert transfer.at((17, 17), 4.0)[0][1] == pytest.approx(1 / 33)
-    assert transfer.at((16, 17), 4.0)[0][1] == pytest.approx(1 / 25)
-    middle = len(nu_x) // 2
-    assert nu_y[0] == 0 and nu_x[middle] == 0 and len(nu_x) % 2
-    # at frequency 0 all light of one pixel, 4 of the model's, over the period's square
-    assert d[0, 0, middle].real == pytest.approx(4 / 25**2, rel=1e-4)
-    assert np.abs(d[1, 0, middle]) > 1.2 * d[0, 0, middle].real
-    assert transfer.at((11, 13), 4.0)[2] is d  # kept
-
-
-def test_errors_at_fixed_morphologies_are_those_of_the_normal_matrix(monkeypatch):
-    """And no less than float64's rounding of the spectrum, 1e-9 of it."""
-    made = []
-    monkeypatch.setattr(posterior_module, "Posterior", lambda s, *_a, **_k: made.append(s))
-    monkeypatch.setattr(posterior_module, "_local_chi2", lambda *_: np.ones(2))
-    covariance = np.array([[[1e-8, 5.0], [5.0, 4.0]], [[0.0, 0], [0, -1e-20]]])
-    spectra = np.array([[3.0, 3.0], [1e6, 0.0]])
-    start = SimpleNamespace(source=np.array([0, 1]), shapes=0, thetas=0, positions=np.eye(2))
-    fit = SimpleNamespace(
-        settings=Settings(), scene=None, findings=1, views=[], start=start, frame=None
-    )
-    fit.blend = SimpleNamespace(observations=[])
-    seen = SimpleNamespace(spectra=spectra, covariance=covariance)
-    _, messages = posterior_module.posterior_of(fit, [], np.ones(2), seen)
-    assert messages == []
-    wanted = [[1e-4, 3e-9], [2.0, 1e-150]]
-    np.testing.assert_allclose(made[0].fixed_error, wanted)
-    assert posterior_module.posterior_of(
-        SimpleNamespace(settings=Settings(prior=None), scene=None, findings=1), [], 0, seen
-    ) == (None, [])

@@ -60,20 +60,6 @@ def test_unlikeness_is_what_the_scale_next_to_two_pixels_shows(chi2):
     np.testing.assert_array_equal(one.findings.strengths[0], [0.01, 0.05, 0.03])  # left as it is
 
 
-def test_modes_hold_nothing_along_the_profile():
-    """Nor where the morphology is 0, but of stars."""
-    rng, profile = np.random.default_rng(0), spot()
-    images = rng.normal(size=(4, 9, 9))
-    one = solution([(0, 0)] * 2, [profile] * 2, fixed=(1,))
-    one.morphs[0][3] = 0
-    own, along = one._gauged(0, images)
-    np.testing.assert_allclose(along, np.tensordot(images, profile, 2) / (profile**2).sum())
-    free, _ = one._gauged(1, images)
-    np.testing.assert_allclose(np.tensordot(free, profile, 2), 0, atol=1e-12)
-    np.testing.assert_allclose(own[:, 4:], free[:, 4:])
-    assert not own[:, 3].any() and free[:, 3].any()
-
-
 def test_what_bumps_change_counts_in_errors_of_flux_and_size():
     """Light at the middle changes the flux by its part; at a distance r, also the size:
     1 + r^2 / <r^2> times as much."""
