@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers import scenes
+from helpers.tuning import tune
 
 from clresample.deblending import iterate as iterate_module
 from clresample.deblending.profiles import Star
@@ -14,9 +15,10 @@ from clresample.deblending.solver.boxes import Boxes
 from clresample.deblending.solver.rendering import choice
 from clresample.deblending.solver.rendering.windows import ROUND_PX, Groups
 from clresample.deblending.solver.scene import Scene, State
+from clresample.deblending.start.looking import looking_at
 from clresample.deblending.start.seen import WHOLE_PX, Model, see
 from clresample.deblending.start.slots import Component
-from clresample.deblending.start.start import _peak
+from clresample.deblending.start.start import PRECISION, TOLERANCE, _peak
 from clresample.deblending.view import Home, whitened_view
 from clresample.sky.frame import Frame
 from clresample.sky.grid import Grid
@@ -119,6 +121,31 @@ def test_morphologies_in_large_frames_are_seen_where_they_are(device):
         np.testing.assert_allclose(seen.spectra[:, 0], [6, 10], rtol=1e-3)
         np.testing.assert_allclose(seen.sky, [1.0 * fit_sky], atol=1e-3)
         assert seen.bare == (None,)
+
+
+def test_slots_are_rendered_in_groups_of_what_the_memory_takes(device, monkeypatch):
+    """One at a time or all at once: the same is seen."""
+    home, position = scenes.frame(), np.array([14.0, 17.0])
+    star = Star(home, free=True)
+    places = [position + (k - 2) for k in range(5)]
+    chosen = [Component(0, k, k, star, place, home.shape) for k, place in enumerate(places)]
+    found = []
+    for n_bytes in (1, 1 << 30):
+        tune(monkeypatch, group_bytes=n_bytes)
+        views = [
+            whitened_view(
+                Home(home, home, np.array(places), 0.0), o, 1, device, np.float32, private=True
+            )
+            for o in scenes.observe()
+        ]
+        looking = looking_at([views], chosen, PRECISION, TOLERANCE, fit_sky=False)
+        looking.look([0], [np.zeros(2)] * 5, np.ones(5), slopes=True)
+        found.append([device.get(sight.seen) for sight in looking.sights])
+        for sight in looking.sights:
+            (renderer,) = sight.aim._renderers.values()
+            assert renderer._capacity == (3 if n_bytes == 1 else 15)  # images of a slot, or of all
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-6 * np.abs(one).max())
 
 
 def boxes_at(*places, scene=None, n=8):

@@ -67,6 +67,17 @@ def test_where_nothing_was_seen_there_is_no_signal():
     assert alone.sums[0, 30, 30] == pytest.approx(one, rel=1e-4)
 
 
+def test_channels_are_those_of_the_narrowest_filter():
+    rng = np.random.default_rng(6)
+    psf = PSF.gaussian([1.0, 2.0], n_pixels=31)
+    o = Observation(rng.normal(size=(2, 60, 60)), psf, GRID, weights=1.0, channels=("g", "r"))
+    signal = signal_of(o, model_frame([o]))
+    np.testing.assert_allclose(signal.channels.sum(axis=0), signal.sums[0], atol=1e-5)
+    squares = (np.maximum(signal.channels, 0) ** 2).sum(axis=0)
+    np.testing.assert_allclose(signal.squares[0], squares, atol=1e-4)
+    assert np.abs(signal.sums[1] - signal.sums[0]).max() > 0.1
+
+
 def test_filters_are_transforms_of_gaussians():
     x = np.arange(-32, 32)
     for sigma in (2.0, 4.0):
