@@ -160,6 +160,8 @@ def test_spectra_differ_by_chi2_beyond_its_mean():
         signal = spectra_signal({(5, 30): here, (5, 5): (30.0, 40.0, 0.0)})
         found = companions._other_colour((5, 30), signal.spectra, [], (5, 5))
         assert found == pytest.approx(wanted)
+    faint = spectra_signal({(5, 30): (6.0, 8.0, 0.0), (5, 5): (0.3, 0.4, 0.0)})
+    assert companions._other_colour((5, 30), faint.spectra, [], (5, 5)) == pytest.approx(-2)
     dark = spectra_signal({(5, 30): (0.0, 6.0)})
     assert companions._other_colour((5, 30), dark.spectra, [], (5, 5)) == pytest.approx(17)
 
@@ -207,6 +209,22 @@ def test_a_neighbour_on_a_flank_is_found_in_one_channel():
     assert np.hypot(*(place - (40, 48))) < 0.7 and height == pytest.approx(60, rel=0.15)
     assert detection._companions(*given, 100.0, 4.0) == []
     assert detection._companions(*given, 5.0, 15.0) == []  # the same source, in so wide a PSF
+
+
+def test_what_no_channel_has_seen_is_told_by_the_other_side(monkeypatch):
+    given = []
+
+    def left(image, seen, centres):
+        given.append(seen)
+        return np.zeros(image.shape), np.zeros(image.shape)
+
+    monkeypatch.setattr(detection, "left_over", left)
+    monkeypatch.setattr(detection, "_new_peaks", lambda *_, **__: [])
+    n_seen = np.array([[0, 1, 2]] * 3)
+    image = np.zeros((3, 3), np.float32)
+    signal = Signal(image[None], image[None], n_seen, image[None], np.zeros((3, 3, 2)))
+    detection._companions(None, [signal], 0, image, np.array([[1.0, 1.0]]), 5.0, 4.0)
+    assert given[0].tolist() == [[False, True, True]] * 3
 
 
 def test_companions_have_six_sigma_however_low_the_threshold(monkeypatch):
