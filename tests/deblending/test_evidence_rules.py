@@ -84,6 +84,7 @@ def test_answers_are_taken_within_half_a_side_of_their_pixel():
     image[0, 40 - 33], image[0, 40 + 32] = 7.0, 7.0
     found = spectra.of_answers(image, [(40, 3)] * 2)
     np.testing.assert_allclose(found, 2.0)
+    np.testing.assert_allclose(spectra.of_answers(image[:1, 2:60], [(38, 3)]), 2.0)
     image[1, 40 + 31, 3] = image[1, 40 - 31, 3] = 0.5
     nu = np.fft.fftfreq(64)
     wanted = np.repeat(2 + np.cos(2 * np.pi * 31 * nu), 33)

@@ -148,6 +148,10 @@ def test_work_is_bounded_before_it_begins():
     ):
         many._check_work(given.frame)
     Blend(given.observations, many.sources[1:])._check_work(given.frame)
+    weights = np.zeros((2, 60, 60))
+    weights[1] = 1  # one channel sees enough
+    half = SimpleNamespace(weights=weights, data=weights)
+    Blend((half,), many.sources)._check_work(given.frame)
     two = Extended(position_px=(3, 3), n_components=2)
     wide = SimpleNamespace(weights=np.ones((1, 60, 60)), data=np.zeros((1, 60, 60)))
     with pytest.raises(ValueError, match=r"1001 sources with 2002 components .* takes 2000 comp"):

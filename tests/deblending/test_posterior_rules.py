@@ -4,12 +4,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers import scenes
 
 from clresample.deblending.posterior.errors import Draws
 from clresample.deblending.posterior.modes import STRENGTH, Solution
 from clresample.deblending.posterior.normal import Layout, _by_channel
 from clresample.deblending.posterior.posterior import _local_chi2
-from clresample.deblending.posterior.profile_modes import Beyond
+from clresample.deblending.posterior.profile_modes import Beyond, profile_modes
+from clresample.deblending.profiles import Galaxy
 from clresample.deblending.rendered import Rendered
 from clresample.deblending.solver.learned.prior import LearnedPrior
 
@@ -124,6 +126,22 @@ def test_sums_of_what_lies_beyond_a_box():
     np.testing.assert_allclose(gauged.slopes, expected - np.outer(wanted[:, 0], along))
     np.testing.assert_allclose(gauged.sums, wanted[:, 0])
     assert Beyond.none(3).sums.shape == (6,) and Beyond.none(3).slopes.shape == (6, 3)
+
+
+@pytest.mark.parametrize("side, margin", [(20, 10), (21, 10), (49, 24), (80, 24)])
+def test_light_beyond_a_box_is_followed_for_half_its_side(side, margin):
+    """24 px at most; there halos are 0.4 times as large."""
+    shape, theta = Galaxy(scenes.frame()), np.array([2.5, 0.1, 0.2, 0.5])
+    position, low = np.array([60.3, 59.8]), np.array([60, 60]) - side // 2
+    size = side + 2 * margin
+    whole = shape.draw(theta, position - low + margin, (size, size))[0]
+    profile = whole[margin:-margin, margin:-margin]
+    _, _, far = profile_modes(shape, theta, position, profile / whole.max(), low)
+    rest = whole.sum() - profile.sum()
+    assert far.sums[0] == pytest.approx(rest / whole.max(), rel=1e-9)
+    halo = np.sqrt(whole / whole.max())
+    rest = halo.sum() - halo[margin:-margin, margin:-margin].sum()
+    assert far.slopes[0, -1] == pytest.approx(0.4 * rest, rel=1e-9)
 
 
 def test_where_unknowns_lie():

@@ -52,7 +52,7 @@ def test_pairs_lie_in_the_slots_that_kernels_look_at():
         n = min(n + 1, 3)
         assert pairs.count.tolist() == [0, n]
         held = {*np.flatnonzero(pairs._valid[1]), pairs.spare[1]}
-        assert slot in held and max(held) < pairs.used[1] and len(held) == n + 1
+        assert slot in held and max(held) < pairs.used[1] == len(held) == n + 1
     assert pairs.used.tolist() == [1, 4]
 
 

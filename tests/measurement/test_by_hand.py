@@ -118,6 +118,16 @@ def test_four_hundred_pixels_of_sky_say_how_large_the_noise_is(n_masked, scaled)
     assert (worst < 6) == scaled and worst > 1
 
 
+@pytest.mark.parametrize("light, scaled", [(0.9, True), (1.1, False)])
+def test_sky_is_where_the_model_has_less_than_one_sigma(light, scaled):
+    noise = np.random.default_rng(4).normal(0, 5, (20, 20))
+    weights = np.full((20, 20), 0.25)  # 2 counts of noise
+    result = seen_alone(noise + 2 * light, weights)
+    part = replace(result.components[0], spectrum=np.array([2 * light]))
+    worst = worst_residuals(replace(result, components=(part,)), 0)[0, 0]
+    assert (worst < 5) == scaled
+
+
 def test_residuals_beyond_the_frame_count_for_no_source():
     """Data of 24 x 24 pixels about a frame of 20 x 20."""
     data = np.full((24, 24), 1e6)

@@ -98,8 +98,8 @@ def test_saturated_is_a_star_with_masked_pixels_in_its_core():
 
 
 def test_a_core_is_as_large_as_the_psf_of_larger_pixels():
-    """Of twice the size, a FWHM of 3 px: what is 1 px away is in it, 2 px are not."""
-    grid = Grid.flat((30, 35), 2 * SCALE)
+    """Of twice the size, a FWHM of 3 px: what is 1 px away is in it, 2 px are not; mirrored."""
+    grid = Grid.flat((30, 35), 2 * SCALE, flip=True)
     for away, expected in (((1, 0), Flag.SATURATED), ((-1, 1), Flag.SATURATED), ((0, 2), Flag(0))):
         weights = np.ones((2, 30, 35))
         weights[1, 15 + away[0], 17 + away[1]] = 0
