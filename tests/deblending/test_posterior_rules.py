@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers import scenes
 
+from clresample.deblending.posterior.bumps import _gaussians
 from clresample.deblending.posterior.errors import Draws
 from clresample.deblending.posterior.modes import STRENGTH, Solution
 from clresample.deblending.posterior.normal import Layout, _by_channel
@@ -142,6 +143,14 @@ def test_light_beyond_a_box_is_followed_for_half_its_side(side, margin):
     halo = np.sqrt(whole / whole.max())
     rest = halo.sum() - halo[margin:-margin, margin:-margin].sum()
     assert far.slopes[0, -1] == pytest.approx(0.4 * rest, rel=1e-9)
+
+
+def test_bumps_stand_on_every_hth_pixel_of_the_frame_to_beyond_both_ends():
+    """Of a box of 23 pixels from 13 on: from the multiple of 8 before that at its first pixel."""
+    found = _gaussians(13, 23, 8)
+    centres = np.array([0, 8, 16, 24, 32, 40, 48]) - 13
+    wanted = np.exp(-0.5 * ((np.arange(23) - centres[:, None]) / 4) ** 2)
+    np.testing.assert_allclose(found, wanted)
 
 
 def test_where_unknowns_lie():

@@ -163,6 +163,9 @@ def test_the_sharpest_image_that_sees_a_source_shows_it(device):
     assert found[40, 41] == pytest.approx(np.exp(-0.5), rel=1e-5)
     found = profile(spot(4.9, 2.0), wide)
     assert found[40, 45] == pytest.approx(np.exp(-0.5), rel=1e-5)
+    beside = np.exp(-0.5 * ((y - 40) ** 2 + (x - 50) ** 2) / 4)[None]
+    found = profile(spot(50, 3.0) + 20 * beside)  # what one side alone shows is none of it
+    assert found[40, 50] < 0.01 and found[40, 28] < 0.01 and found[40, 42] > 0.5
     flat = profile(np.full((1, 90, 80), 8.0))
     assert flat[10:71, 9:70].min() == pytest.approx(1) and flat.sum() == pytest.approx(61**2)
     alone = profile(np.zeros((1, 90, 80)))
