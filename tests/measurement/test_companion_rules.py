@@ -27,6 +27,16 @@ def test_a_cone_is_all_of_one_source_and_its_light_ends_under_half_a_sigma():
     assert not left_over(0.05 * image, image > -1, np.array([[20.0, 22.0]]))[1].any()
 
 
+def test_a_turned_ellipse_is_all_of_one_source():
+    """Each ring keeps its direction: it is not mirrored."""
+    y, x = np.indices((91, 91)) - 45
+    u, v = 0.8 * y + 0.6 * x, -0.6 * y + 0.8 * x
+    image = 100 * np.exp(-0.5 * ((u / 9) ** 2 + (v / 4) ** 2))
+    rest, model = left_over(image, image > -1, np.array([[45.0, 45.0]]))
+    assert np.abs(rest).max() < 3 and model[53, 51] == pytest.approx(image[53, 51], rel=0.05)
+    assert model[53, 39] < 0.5 * model[53, 51]
+
+
 @pytest.mark.parametrize("centre", [(65, 66), (65, 3), (128, 70)])
 def test_light_is_followed_for_sixty_pixels(centre):
     """On all sides, as far as there are pixels; what lies behind an edge is told by the other."""

@@ -15,7 +15,7 @@ def _seconds():
 
 
 class Recorder:
-    """For each test that passes: its seconds of processor time, the lines of Python and the kernels that it ran.
+    """For each test that passes: its seconds, the lines of Python and the kernels that it ran.
 
     folder: of the package; lines of other files are not recorded
     """
