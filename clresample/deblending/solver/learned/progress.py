@@ -71,7 +71,7 @@ class Progress:
         accepted = self.live & finite & (lower | self._fresh)
         stepped = accepted & ~self._fresh
         self._drops[stepped] = np.roll(self._drops[stepped], 1, axis=1)
-        self._drops[stepped, 0] = (self.loss - loss)[stepped]
+        self._drops[stepped, 0] = self.loss[stepped] - loss[stepped]
         self.n_iterations += stepped
         self.loss[accepted] = loss[accepted]
         self._fresh &= ~accepted
