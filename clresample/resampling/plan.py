@@ -47,8 +47,8 @@ class Precision:
     def of(cls, dtype) -> Precision:
         """For float32 or float64."""
         if np.dtype(dtype) == np.float32:
-            return cls(3e-8, KaiserBessel(10, 1.5))  # window error 1e-8
-        return cls(1e-16, KaiserBessel(16, 2.0))  # window error 4e-16
+            return cls(3e-8, KaiserBessel(10, 1.5))  # window error 5e-7
+        return cls(1e-16, KaiserBessel(16, 2.0))  # window error 3e-14
 
 
 @dataclass(frozen=True)
