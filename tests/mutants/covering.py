@@ -70,7 +70,8 @@ class Covering:
         return tests
 
     def tests(self, mutation):
-        """The tests that may notice a Mutation; one variant of each test before the next ones."""
+        """The tests that may notice a Mutation; one variant of each test before the next ones,
+        where a build of kernels for groups of work-items counts as a test of its own."""
         file = str(mutation.path.relative_to(ROOT))
         places = _kernel_places if file.startswith("kernels/") else _python_places
         near = set().union(*(self.ran.get(place, ()) for place in places(mutation, file)))
@@ -78,7 +79,7 @@ class Covering:
             near = set().union(*(tests for place, tests in self.ran.items() if place[0] == file))
         seen, order = {}, []
         for test in sorted(near, key=lambda test: self.seconds[test]):
-            function = test.split("[")[0]
+            function = test.split("[")[0], "groups-" in test
             seen[function] = seen.get(function, -1) + 1
             order.append((seen[function], self.seconds[test], test))
         return [test for _, _, test in sorted(order)]
