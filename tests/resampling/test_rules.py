@@ -22,6 +22,7 @@ from clresample.device.tuning import Tuning
 from clresample.resampling import resampler as resampler_module
 from clresample.resampling.cache import OperatorCache
 from clresample.resampling.gridding import transpose_taps
+from clresample.resampling.paper.resampler import PaperResampler
 from clresample.resampling.paper.slabs import cut
 from clresample.resampling.paper.tables import trigonometric, wave
 from clresample.resampling.plan import Precision, _half_count, _odd, is_identity, make_plan
@@ -505,3 +506,23 @@ def test_waves_of_the_papers_scheme():
     assert table.shape == (6, 10)
     assert distance(table[:, 0::2], np.cos(angle)) < 1e-15 * 10
     np.testing.assert_allclose(table[:, 1::2], np.sin(angle), atol=1e-14)
+
+
+def test_slabs_fit_the_cache_and_the_largest_buffer(device, monkeypatch):
+    """But for a unit by which they may differ; they are no more than that takes. As many images go
+    together as fit with them."""
+    mapping, pair = GEOMETRIES["30 degrees"](), psfs()
+    found = PaperResampler.from_mapping(mapping, *pair, device=device)._factors
+    model, kernel = (found.n_terms * n * 4 for n in (found.n_cols, found.l_pad))  # [bytes]
+    for cache, largest in ((model // 5, 1 << 30), (1 << 30, kernel // 3), (3 * model, 1 << 30)):
+        with monkeypatch.context() as patch:
+            patch.setattr(found, "tuning", replace(found.tuning, slab_bytes=cache))
+            patch.setattr(device, "max_alloc", largest)
+            found.prepare()
+        most = max(slab.n_units for slab in found.slabs) - 1
+        assert most * found.unit_rows * found.n_cols * 4 <= cache
+        assert most * found.unit_rows * found.l_pad * 4 <= largest / 2
+        fewer = len(found.slabs) - 1
+        assert model > fewer * cache or kernel > fewer * (largest // 2)
+        one = max(slab.n_rows for slab in found.slabs) * found.n_cols * 4
+        assert found.group == max(1, cache // one)
