@@ -153,3 +153,50 @@ def test_thresholds_are_exclusive_and_inclusive_as_they_say(in_groups):
             np.testing.assert_array_equal(same, image)
 
     in_groups(check)
+
+
+def projected(y, center, weights, gradient, *, positive, n_iterations, tolerance, dual):
+    """What project.cl says it does, in float64; from a dual image on, the next one too."""
+    w = ref.monotone_weights(y.shape, center, weights) * (1 - gradient)
+    inside = np.ones(y.shape)
+    inside[tuple(center)] = 0
+    tau = inside / np.maximum(ref._rows(w, ref._columns(w, inside, 1), 1), 1)
+    low = 0 if positive else -np.inf
+    ahead, momentum = dual, 1.0
+    for k in range(1, n_iterations + 1):
+        z = np.maximum(y - ref._columns(w, ahead, -1), low)
+        ascent = ref._rows(w, z, -1)
+        new = np.maximum(0, ahead + tau * ascent)
+        before, momentum = momentum, (1 + np.sqrt(1 + 4 * momentum**2)) / 2
+        move = new - dual
+        ahead, dual = new + (before - 1) / momentum * move, new
+        if k % 4 == 0:
+            if (ascent * move).sum() < 0:
+                momentum = 1.0
+            if (move**2).sum() <= tolerance**2 * (y**2).sum():
+                break
+    return np.maximum(y - ref._columns(w, dual, -1), low), dual
+
+
+def test_projections_step_by_step(in_groups):
+    """Momentum, its end, and the end of the iteration; a second call goes on from the first."""
+    boxes = many_boxes()
+    images = morphologies(boxes, np.float32)
+
+    def check(device):
+        for n_iterations, tolerance, positive in ((1, 0, True), (7, 0, False), (30, 2e-2, True)):
+            given = {"n_iterations": n_iterations, "tolerance": tolerance, "positive": positive}
+            prox, placed = MonotoneProjection(gradient=0.05, **given), boxes.put(device)
+            duals = [np.zeros(image.shape) for image in images]
+            for _ in range(2):
+                flat = device.put(boxes.pack(images, dtype=np.float32))
+                prox.prox(flat, placed)
+                found = boxes.unpack(device.get(flat))
+                for i, (image, center) in enumerate(zip(images, boxes.center, strict=True)):
+                    wanted, duals[i] = projected(
+                        image.astype(float), center, KINDS[0], 0.05, dual=duals[i], **given
+                    )
+                    wanted = ref.monotone_sweep(wanted, center, KINDS[0], 0.05)  # feasible
+                    np.testing.assert_allclose(found[i], wanted, rtol=0, atol=2e-6)
+
+    in_groups(check)
