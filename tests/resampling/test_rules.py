@@ -337,6 +337,21 @@ def test_waves_are_interpolated_as_well_as_is_said(window):
     assert errors[2] > 30 * said
 
 
+def test_columns_are_as_far_apart_as_the_band_allows():
+    """Along a line the waves have frequencies nu_x + r nu_y, of which the corners hold nothing."""
+    for name in ("30 degrees", "60 degrees", "shear along y"):
+        mapping, precision = GEOMETRIES[name](), Precision.of(np.float32)
+        plan = make_plan(mapping, *psfs(), precision=precision)
+        r = np.divide(*mapping.matrix[:, 1 if plan.lines.by_row else 0])
+        along = [r * plan.nu[0][:, None] + sign * plan.nu[1] for sign in (1, -1)]
+        lit = [np.abs(d).any(axis=0) for d in (plan.d_plus, plan.d_minus)]
+        most = max(np.abs(f[on]).max() for f, on in zip(along, lit, strict=True))
+        assert most < 0.6 * np.abs(along).max()
+        turned = plan.out_x[2] + 1j * plan.out_x[3]  # the first frequency over 0
+        step = np.angle(turned[1:] / turned[:-1]) / (2 * np.pi * plan.nu[1][1])
+        np.testing.assert_allclose(step, 1 / (2 * most * precision.window.oversampling), rtol=1e-9)
+
+
 def test_lines_read_the_other_way_are_the_transpose():
     """Of any coverage: lines without a pixel, a pixel alone, columns that none feeds."""
     rng, n_columns, n_taps = np.random.default_rng(1), 23, 4
