@@ -4,6 +4,7 @@ import gc
 
 import numpy as np
 import pytest
+from helpers.buffers import Guards
 from helpers.solver import BOXES, PRIOR, PSFS, changed, engine, posed, ragged
 
 from clresample.deblending.solver.constraints import Chain, Positivity
@@ -42,6 +43,16 @@ def test_the_best_state_is_kept(build):
     e.run(3)
     assert e.final_losses()[2] < e.best_losses()[2]  # which is that of a state that is kept
     assert best[2] < losses[2]
+
+
+def test_nothing_is_written_beyond_the_buffers(build, monkeypatch):
+    """Of boxes that fill their part of a buffer to its last element, as the last one does."""
+    guards = Guards(monkeypatch)
+    pairs = [posed(build, np.float32, boxes=((2, 3, 11, 14), (0, 0, 8, 6), (10, 7, 16, 16)))]
+    for prior in (PRIOR, None):
+        e = engine(pairs, build, np.float32, prior=prior)
+        assert np.isfinite(e.run(3)).all()
+    assert guards.overwritten() == []
 
 
 def test_only_losses_come_back(device, monkeypatch):
