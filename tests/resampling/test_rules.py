@@ -1,8 +1,7 @@
-"""Rules that operators are made by, each by itself: bands, sizes, windows, tapers, coverage."""
+"""Rules that operators are made by, each by itself: bands, lengths, sums, memory, defaults."""
 
 from dataclasses import replace
 from itertools import product
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from helpers.geometries import (
     GEOMETRIES,
     ONE_OF_EACH,
     affine,
-    distance,
     operator,
     psfs,
     sky_grid,
@@ -21,31 +19,16 @@ from helpers.tuning import tune
 from clresample.device.tuning import Tuning
 from clresample.resampling import resampler as resampler_module
 from clresample.resampling.cache import OperatorCache
-from clresample.resampling.gridding import transpose_taps
-from clresample.resampling.paper.resampler import PaperResampler
-from clresample.resampling.paper.slabs import cut
-from clresample.resampling.paper.tables import trigonometric, wave
 from clresample.resampling.plan import Precision, _half_count, _odd, is_identity, make_plan
 from clresample.resampling.reference import otf_ratio
 from clresample.resampling.resampler import Resampler
-from clresample.resampling.tiled.layout import Sizes, _taper, make_groups, window_of
 from clresample.resampling.tiled.resampler import TiledResampler
-from clresample.resampling.transfer import light_reach, wrap_radius
+from clresample.resampling.transfer import wrap_radius
 from clresample.sky.frame import Frame
 from clresample.sky.grid import Grid
 from clresample.sky.psf import PSF
 
 pytestmark = pytest.mark.filterwarnings("ignore::clresample.sky.psf_checks.PSFWarning")
-WINDOWS = [Precision.of(dtype).window for dtype in (np.float32, np.float64)]
-WINDOW_ERRORS = 6e-7, 4e-14
-
-
-def small_psf(shape=(3, 5)):
-    """A PSF that is its whole image."""
-    return PSF(np.ones(shape) / np.prod(shape))
-
-
-# --- what a plan holds ---
 
 
 def test_an_operator_is_the_identity_only_where_everything_is_the_same():
@@ -265,279 +248,3 @@ def test_a_caches_operators_are_shared_and_of_one_term(device):
     op = cache.resampler(*given, dtype=np.float32, device=device)
     assert cache.resampler(*given, dtype=np.float32, device=device) is op
     assert op.n_terms == 1 and op.shape_in == (2, 20, 21)
-
-
-# --- how far light reaches ---
-
-
-@pytest.mark.parametrize("tolerance", [1e-2, 1e-4])
-def test_reach_of_a_gaussians_light(tolerance):
-    psf = PSF.gaussian(1.5, n_pixels=41, pixel=False)
-    reach = 1.5 * np.sqrt(2 * np.log(1 / tolerance))
-    for matrix, factor in ((np.diag([2.0, 0.5]), 2), (np.array([[0.0, 1.0], [3.0, 0.0]]), 3)):
-        assert light_reach(psf, matrix, tolerance) == pytest.approx(factor * reach, abs=1.1)
-    # of the brighter and the wider of two bands the wider counts
-    both = PSF.gaussian([1.5, 1.0], n_pixels=41, pixel=False)
-    assert light_reach(both, np.eye(2), tolerance) == light_reach(psf, np.eye(2), tolerance)
-
-
-def test_reach_ends_with_a_small_image():
-    """Half a sample beyond the last ones along an axis, or where its corner lies, if nearer."""
-    psf = small_psf()
-    corner = np.hypot(1, 2)
-    assert light_reach(psf, np.eye(2), 1e-5) == pytest.approx(corner)
-    assert light_reach(psf, np.diag([1.0, 3.0]), 1e-5) == pytest.approx(3 * corner)
-    assert light_reach(psf, np.diag([3.0, 1.0]), 1e-5) == pytest.approx(4.5)
-    assert wrap_radius(psf, np.diag([3.0, 1.0])) == pytest.approx((4.5, 2.5))
-    half = PSF(psf.images, spacing=0.5)
-    assert light_reach(half, np.eye(2), 1e-5) == pytest.approx(corner / 2)
-    assert wrap_radius(half, np.eye(2)) == pytest.approx((0.75, 1.25))
-
-
-def test_the_wrap_radius_is_half_as_far_again_as_the_light():
-    psf = PSF.gaussian(2.0, n_pixels=81, spacing=0.5, pixel=False)
-    for radius in wrap_radius(psf, np.eye(2)):
-        assert radius == pytest.approx(1.5 * light_reach(psf, np.eye(2), 1e-5) + 0.5)
-
-
-# --- lines ---
-
-
-@pytest.mark.parametrize("window", WINDOWS, ids=["float32", "float64"])
-def test_taps_are_the_window_and_its_transform_is_the_integral(window):
-    half = window.n_taps / 2
-    fraction = np.array([1e-9, 0.1, 0.5, 0.77, 1 - 1e-9])
-    wanted = window(fraction[:, None] + half - 1 - np.arange(window.n_taps))
-    np.testing.assert_allclose(window.taps(fraction), wanted, atol=3e-14)
-    assert window(0.0) == 1
-    np.testing.assert_array_equal(window(np.array([-half, half, half + 0.1])), 0)
-    u = (np.arange(4000) + 0.5) / 4000 * window.n_taps - half
-    for f in np.array([0.0, 0.1, 1 / (2 * window.oversampling)]):
-        integral = (window(u) * np.cos(2 * np.pi * f * u)).mean() * window.n_taps
-        assert window.transform(f) == pytest.approx(integral, rel=1e-5)
-
-
-@pytest.mark.parametrize("window", WINDOWS, ids=["float32", "float64"])
-def test_waves_are_interpolated_as_well_as_is_said(window):
-    """At the band's end, and better inside; beyond it the error is many times larger."""
-    b = np.pi * window.n_taps * np.sqrt(1 - 1 / window.oversampling)
-    said, rounding = 2 * b * np.exp(-b), 4e-14
-    assert 0.5 < said / WINDOW_ERRORS[WINDOWS.index(window)] < 1
-    n_taps, place = window.n_taps, np.random.default_rng(0).uniform(20, 30, 200)
-    first = np.floor(place - n_taps / 2).astype(int) + 1
-    column = first[:, None] + np.arange(n_taps)
-    weight = window(place[:, None] - column)
-    errors = []
-    for share in (0.5, 1.0, 1.5):
-        f = np.float64(share / (2 * window.oversampling))
-        found = (weight * np.exp(2j * np.pi * f * column)).sum(axis=1) / window.transform(f)
-        errors.append(np.abs(found - np.exp(2j * np.pi * f * place)).max())
-    assert errors[0] < 0.1 * said + rounding
-    assert 0.5 * said < errors[1] < 1.5 * said + rounding
-    assert errors[2] > 30 * said
-
-
-def test_columns_are_as_far_apart_as_the_band_allows():
-    """Along a line the waves have frequencies nu_x + r nu_y, of which the corners hold nothing."""
-    for name in ("30 degrees", "60 degrees", "shear along y"):
-        mapping, precision = GEOMETRIES[name](), Precision.of(np.float32)
-        plan = make_plan(mapping, *psfs(), precision=precision)
-        r = np.divide(*mapping.matrix[:, 1 if plan.lines.by_row else 0])
-        along = [r * plan.nu[0][:, None] + sign * plan.nu[1] for sign in (1, -1)]
-        lit = [np.abs(d).any(axis=0) for d in (plan.d_plus, plan.d_minus)]
-        most = max(np.abs(f[on]).max() for f, on in zip(along, lit, strict=True))
-        assert most < 0.6 * np.abs(along).max()
-        turned = plan.out_x[2] + 1j * plan.out_x[3]  # the first frequency over 0
-        step = np.angle(turned[1:] / turned[:-1]) / (2 * np.pi * plan.nu[1][1])
-        np.testing.assert_allclose(step, 1 / (2 * most * precision.window.oversampling), rtol=1e-9)
-
-
-def test_lines_read_the_other_way_are_the_transpose():
-    """Of any coverage: lines without a pixel, a pixel alone, columns that none feeds."""
-    rng, n_columns, n_taps = np.random.default_rng(1), 23, 4
-    for n_lines, n_steps, share in ((5, 7, 0.6), (3, 1, 1.0), (1, 9, 1.0), (4, 6, 0.1)):
-        start = np.sort(rng.integers(0, n_columns - n_taps + 1, (n_lines, n_steps)), axis=1)
-        covered = rng.uniform(size=start.shape) <= share
-        covered[0, 0] = True
-        weight = rng.normal(size=(*start.shape, n_taps)) * covered[..., None]
-        first, back = transpose_taps(start, weight, covered, n_columns)
-        n_back = back.shape[1]
-        assert first.min() >= 0 and first.max() + n_back <= n_steps
-        for line in range(n_lines):
-            forward, backward = np.zeros((n_steps, n_columns)), np.zeros((n_columns, n_steps))
-            for q, t in np.ndindex(n_steps, n_taps):
-                forward[q, start[line, q] + t] += weight[line, q, t]
-            for j, t in np.ndindex(n_columns, n_back):
-                backward[j, first[line, j] + t] += back[line, t, j]
-            np.testing.assert_array_equal(backward.T, forward)
-        # as few taps as the busiest column needs
-        used = [np.flatnonzero(column) for line in back.swapaxes(1, 2) for column in line]
-        assert max((ends[-1] for ends in used if len(ends)), default=0) == n_back - 1
-
-
-# --- tiles ---
-
-
-def test_a_taper_is_one_inside_and_falls_smoothly_to_zero():
-    y, x = _taper((40, 61), (8.0, 20.0))
-    assert (y.shape, x.shape) == ((40,), (61,))
-    for taper, width in ((y, 8), (x, 20)):
-        np.testing.assert_array_equal(taper, taper[::-1])
-        np.testing.assert_array_equal(taper[width:-width], 1)
-        edge = taper[:width]
-        assert (np.diff(edge) > 0).all() and 0 < edge[0] < 1e-2
-        np.testing.assert_allclose(edge + edge[::-1], 1)  # about the middle of its width
-        # smooth to order 3: it begins as the fourth power, 35 of it
-        u = (np.arange(2) + 0.5) / width
-        np.testing.assert_allclose(edge[:2], 35 * u**4, rtol=0.5)
-
-
-def test_a_window_leaves_its_margin_and_half_a_pixel():
-    for name, margin in (("30 degrees", (5, 9)), ("mirrored", (3, 3)), ("oblong pixels", (7, 4))):
-        mapping = GEOMETRIES[name]()
-        window = window_of(mapping, np.array(margin))
-        places = window.at(*np.indices(window.shape_out)).reshape(-1, 2)
-        low, high = places.min(axis=0), places.max(axis=0)
-        assert (low >= np.array(margin) + 0.5 - 1e-9).all()
-        np.testing.assert_allclose(low, np.array(window.shape_in) - 1 - high)  # in the middle
-        assert (low <= np.array(margin) + 1.0).all()
-
-
-def groups_of(device, grid_in, psf_in, grid_out, psf_out, *, memory, tolerance_px=1e-4):
-    return make_groups(
-        grid_in,
-        psf_in,
-        grid_out,
-        psf_out,
-        precision=Precision.of(np.float32),
-        tolerance_px=tolerance_px,
-        tuning=replace(Tuning.of(device, np.float32), tile_flops=0.0, pixel_flops=0.0),
-        memory=memory,
-    )
-
-
-def check_groups(groups, grid_in, grid_out, psf_out, tolerance_px):
-    """Windows that reach half the wrap radius, or more, beyond their tiles before they fall off
-    over as much, or 24 px; pixels within the tolerance of where they are; each given once."""
-    given = np.zeros(grid_out.shape, int)
-    for group in groups:
-        mapping = group.mapping
-        radius = np.array(wrap_radius(psf_out, mapping.matrix))
-        margin = radius / 2 + np.maximum(radius / 2, 24)
-        margins = [np.ceil(margin * off) for off in (0.998, 1, 1.002)]  # bent scales differ
-        places = mapping.at(*np.indices(mapping.shape_out))
-        inside, shift = places.reshape(-1, 2), 0.5
-        if mapping.geometry == "distorted":  # of that one tile, as far as there is a model
-            tile = grid_out.cutout(*group.tiles[0].origin, mapping.shape_out)
-            inside, shift = places[tile.map_to(grid_in, 0.0).covered], 0.0
-        for axis, taper in enumerate(group.taper):
-            x = np.arange(len(taper))
-            low, high = inside[:, axis].min(), inside[:, axis].max()
-            for beyond in (low, len(taper) - 1 - high):
-                rest = [beyond - n[axis] - shift for n in margins]
-                assert any(-1e-6 <= x < (0.5 if shift else 1) + 1e-6 for x in rest)
-            away = np.maximum(low - x, x - high)
-            assert (taper[away <= radius[axis] / 2] > 1 - 1e-6).all()
-            middle = away[np.abs(taper - 0.5).argmin()] - shift
-            wanted = (radius[axis] / 2 + margin[axis]) / 2
-            assert abs(middle - wanted) < 1.6
-        for tile in group.tiles:
-            (y, x), shape = tile.origin, tile.mask.shape
-            given[y : y + shape[0], x : x + shape[1]] += tile.mask
-            true = grid_out.cutout(y, x, shape).map_to(grid_in, 0.0)
-            true = true.at(*np.indices(shape))
-            off = np.hypot(*(places + tile.place - true)[tile.mask].T)
-            assert off.max() <= tolerance_px + 1e-9
-    np.testing.assert_array_equal(given, grid_out.map_to(grid_in).covered)
-
-
-def test_tiles_of_flat_frames(device):
-    grid_in = Grid.flat((200, 190), 0.1)
-    for sigma, angle in ((1.2, 20), (6.0, 0), (1.2, 90)):  # 6: radius wider than twice the taper
-        grid_out = Grid.flat((90, 95), 0.2, angle_deg=angle)
-        psf_in, psf_out = PSF.gaussian(1.5, n_pixels=25), PSF.gaussian(sigma, n_pixels=65)
-        groups = groups_of(device, grid_in, psf_in, grid_out, psf_out, memory=3 << 20)
-        assert len(groups) == 1 and (angle != 20 or len(groups[0].tiles) > 1)
-        check_groups(groups, grid_in, grid_out, psf_out, 1e-6)
-
-
-@pytest.mark.parametrize("sip, angle", [(2e-7, 0), (5e-8, 30), (5e-5, 10)])
-def test_tiles_of_bent_frames(device, sip, angle):
-    """Some tiles aligned and some affine; all of them affine; all of them distorted."""
-    grid_in, grid_out = sky_grid((150, 140), 0.1), sky_grid((120, 130), 0.12, angle, sip=sip)
-    psf_in, psf_out = PSF.gaussian(1.5, n_pixels=25), PSF.gaussian(1.4, n_pixels=25)
-    groups = groups_of(device, grid_in, psf_in, grid_out, psf_out, memory=1 << 20)
-    kinds = {group.mapping.geometry for group in groups}
-    n_tiles = sum(len(group.tiles) for group in groups)
-    if sip == 5e-5:
-        assert kinds == {"distorted"} and len(groups) == n_tiles
-    else:
-        assert kinds == ({"affine"} if angle else {"aligned", "affine"})
-        assert 1 < len(groups) < n_tiles
-    check_groups(groups, grid_in, grid_out, psf_out, 1e-4)
-
-
-def test_sides_are_the_longer_ones():
-    """Of windows, lengths and lines of pixels that are not square, at most by a few per cent."""
-    given, precision = (PSF.gaussian(0.9), PSF.gaussian([1.1, 1.3])), Precision.of(np.float32)
-    for matrix in ([[0.5, 0.1], [0.3, 3.0]], [[2.4, 0.3], [0.2, 0.7]], [[1.0, 2.5], [-1.2, 0.4]]):
-        for margin in ((14, 30), (30, 14)):
-            trial = affine(matrix, (90, 90), (32, 32))
-            sizes = Sizes(trial, np.array(margin), *given, precision, SimpleNamespace())
-            for m in (12, 60, 100):
-                window = window_of(affine(matrix, (90, 90), (m, m)), np.array(margin))
-                plan = make_plan(window, *given, precision=precision)
-                n, k, j = sizes.sides(m)
-                assert n >= max(window.shape_in)
-                assert k >= max(len(plan.in_y), len(plan.in_x))
-                assert j >= plan.out_x.shape[1]
-
-
-# --- the paper's scheme ---
-
-
-def test_slabs_take_every_unit_once_and_are_alike():
-    for n_units, unit_rows, n_slabs, chunk in ((17, 6, 4, 10), (5, 3, 9, 100), (8, 2, 1, 3)):
-        slabs = cut(n_units, unit_rows, n_slabs, chunk)
-        assert len(slabs) == min(n_slabs, n_units)
-        assert [s.first for s in slabs] == list(np.cumsum([0, *(s.n_units for s in slabs)])[:-1])
-        assert sum(s.n_units for s in slabs) == n_units
-        assert max(s.n_units for s in slabs) - min(s.n_units for s in slabs) <= 1
-        for s in slabs:
-            rows = s.n_units * unit_rows
-            assert s.chunk <= chunk and s.n_chunks == -(-rows // chunk)
-            assert rows <= s.n_rows == s.n_chunks * s.chunk < rows + s.n_chunks
-
-
-def test_waves_of_the_papers_scheme():
-    k, x = 9, np.array([0.3, -2.7, 1000.25])
-    planes = wave(k, x, 8)
-    angle = 2 * np.pi * np.arange(5)[:, None] * x / k
-    np.testing.assert_allclose(planes[:, 0, :3], np.cos(angle), atol=1e-12)
-    np.testing.assert_allclose(planes[:, 1, :3], np.sin(angle), atol=1e-12)
-    assert not planes[:, :, 3:].any()
-    angle = 2 * np.pi * np.arange(6)[:, None] * np.arange(5) / k
-    table = trigonometric(6, k)
-    assert table.shape == (6, 10)
-    assert distance(table[:, 0::2], np.cos(angle)) < 1e-15 * 10
-    np.testing.assert_allclose(table[:, 1::2], np.sin(angle), atol=1e-14)
-
-
-def test_slabs_fit_the_cache_and_the_largest_buffer(device, monkeypatch):
-    """But for a unit by which they may differ; they are no more than that takes. As many images go
-    together as fit with them."""
-    mapping, pair = GEOMETRIES["30 degrees"](), psfs()
-    found = PaperResampler.from_mapping(mapping, *pair, device=device)._factors
-    model, kernel = (found.n_terms * n * 4 for n in (found.n_cols, found.l_pad))  # [bytes]
-    for cache, largest in ((model // 5, 1 << 30), (1 << 30, kernel // 3), (3 * model, 1 << 30)):
-        with monkeypatch.context() as patch:
-            patch.setattr(found, "tuning", replace(found.tuning, slab_bytes=cache))
-            patch.setattr(device, "max_alloc", largest)
-            found.prepare()
-        most = max(slab.n_units for slab in found.slabs) - 1
-        assert most * found.unit_rows * found.n_cols * 4 <= cache
-        assert most * found.unit_rows * found.l_pad * 4 <= largest / 2
-        fewer = len(found.slabs) - 1
-        assert model > fewer * cache or kernel > fewer * (largest // 2)
-        one = max(slab.n_rows for slab in found.slabs) * found.n_cols * 4
-        assert found.group == max(1, cache // one)
