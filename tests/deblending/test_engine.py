@@ -45,6 +45,21 @@ def test_the_best_state_is_kept(build):
     assert best[2] < losses[2]
 
 
+def test_a_worse_state_between_better_ones_is_not_kept(build):
+    """Of the scene in the middle: no spectrum or sky level comes from beside it."""
+    e = engine(ragged(build, np.float64), build)
+    e.run(6)
+    good, losses = e.states(), e.run(1)[0]
+    spectra = np.concatenate([state.spectra for state in e.states()])
+    spectra[3] += 100
+    build.upload(spectra, e.buffers.spectra)
+    e.run(2)
+    best, kept = e.best_losses(), e.states(kept=True)
+    assert best[1] == losses[1] and best[0] < losses[0] and best[2] < losses[2]
+    np.testing.assert_array_equal(kept[1].spectra, good[1].spectra)
+    np.testing.assert_array_equal(kept[1].sky, good[1].sky)
+
+
 def test_nothing_is_written_beyond_the_buffers(build, monkeypatch):
     """Of boxes that fill their part of a buffer to its last element, as the last one does."""
     guards = Guards(monkeypatch)
