@@ -20,7 +20,8 @@ class KaiserBessel:
 
     n_taps: W, columns that a pixel is interpolated from
     oversampling: how many times closer the columns lie than Nyquist's spacing
-    Relative error of the interpolation: exp(-pi W sqrt(1 - 1/oversampling)).
+    Relative error of the interpolation: 2 b exp(-b) with b = pi W sqrt(1 - 1/oversampling) at the
+    band's end, and less inside.
     """
 
     n_taps: int

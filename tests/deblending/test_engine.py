@@ -4,6 +4,7 @@ import gc
 
 import numpy as np
 import pytest
+from helpers.buffers import Guards
 from helpers.solver import BOXES, PRIOR, PSFS, changed, engine, posed, ragged
 
 from clresample.deblending.solver.constraints import Chain, Positivity
@@ -42,6 +43,31 @@ def test_the_best_state_is_kept(build):
     e.run(3)
     assert e.final_losses()[2] < e.best_losses()[2]  # which is that of a state that is kept
     assert best[2] < losses[2]
+
+
+def test_a_worse_state_between_better_ones_is_not_kept(build):
+    """Of the scene in the middle: no spectrum or sky level comes from beside it."""
+    e = engine(ragged(build, np.float64), build)
+    e.run(6)
+    good, losses = e.states(), e.run(1)[0]
+    spectra = np.concatenate([state.spectra for state in e.states()])
+    spectra[3] += 100
+    build.upload(spectra, e.buffers.spectra)
+    e.run(2)
+    best, kept = e.best_losses(), e.states(kept=True)
+    assert best[1] == losses[1] and best[0] < losses[0] and best[2] < losses[2]
+    np.testing.assert_array_equal(kept[1].spectra, good[1].spectra)
+    np.testing.assert_array_equal(kept[1].sky, good[1].sky)
+
+
+def test_nothing_is_written_beyond_the_buffers(build, monkeypatch):
+    """Of boxes that fill their part of a buffer to its last element, as the last one does."""
+    guards = Guards(monkeypatch)
+    pairs = [posed(build, np.float32, boxes=((2, 3, 11, 14), (0, 0, 8, 6), (10, 7, 16, 16)))]
+    for prior in (PRIOR, None):
+        e = engine(pairs, build, np.float32, prior=prior)
+        assert np.isfinite(e.run(3)).all()
+    assert guards.overwritten() == []
 
 
 def test_only_losses_come_back(device, monkeypatch):

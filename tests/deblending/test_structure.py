@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.buffers import Guards
 from helpers.learned import Source
 from helpers.solver import close, every_type, ragged
 
@@ -55,6 +56,26 @@ def test_kernels_are_their_references(build, dtype, prior):
             close(found[i][j], part, dtype)
             close(energies[i, j], (z[i][j] ** 2).sum(), dtype)
     assert any((m == 0).any() for m in morphs)  # or the mask was not looked at
+
+
+def test_nothing_is_written_beyond_the_buffers(build, monkeypatch):
+    """Lines keep their margins of zeros: a second time the answers are the same."""
+    guards, rng = Guards(monkeypatch), np.random.default_rng(4)
+    for prior in PRIORS:
+        b, structure, z, profiles, _ = made(build, np.float32, prior)
+        vector, precision = b.put(structure.latents.pack(z)), b.put(np.ones((len(profiles), 3)))
+        d_morph = [rng.normal(size=p.shape) for p in profiles]
+        found = []
+        for _ in range(2):
+            build.upload(b.host_boxes.pack(d_morph, dtype=np.float32), b.d_morph)
+            gradient = b.put(np.zeros(structure.latents.size))
+            structure.form(vector)
+            structure.gradient(vector, precision, gradient)
+            structure.energy(vector)
+            found.append([build.get(a) for a in (b.morph, gradient, structure.energies)])
+        for one, again in zip(*found, strict=True):
+            np.testing.assert_array_equal(one, again)
+    assert guards.overwritten() == []
 
 
 def test_the_gradient_is_the_transpose(build):

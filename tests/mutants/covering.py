@@ -71,7 +71,8 @@ class Covering:
         return tests
 
     def tests(self, mutation):
-        """The tests that may notice a Mutation; one variant of each test before the next ones.
+        """The tests that may notice a Mutation; one variant of each test before the next ones,
+        where a build of kernels for groups of work-items counts as a test of its own.
 
         Quick ones come first, and those that run little else: they look at this alone.
         """
@@ -83,7 +84,7 @@ class Covering:
         seen, order = {}, []
         cost = {test: self.seconds[test] * self.width[test] for test in near}
         for test in sorted(near, key=lambda test: (cost[test], test)):
-            function = test.split("[")[0]
+            function = test.split("[")[0], "groups-" in test
             seen[function] = seen.get(function, -1) + 1
             order.append((seen[function], cost[test], test))
         return [test for _, _, test in sorted(order)]

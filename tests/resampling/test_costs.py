@@ -12,7 +12,7 @@ from clresample.resampling import plan as plan_module
 from clresample.resampling.paper.resampler import PaperResampler
 from clresample.resampling.plan import Precision
 from clresample.resampling.resampler import Resampler
-from clresample.resampling.tiled.layout import Sizes, window_of
+from clresample.resampling.tiled.layout import SIDES, Sizes, window_of
 from clresample.resampling.transfer import wrap_radius
 from clresample.sky.grid import Grid
 from clresample.sky.psf import PSF
@@ -31,7 +31,8 @@ def tile(geometry, m):
     mapping = distorted(matrix, (80, 80), (m, m))
     low = np.floor(mapping.positions.min(axis=(0, 1))).astype(int) - MARGIN
     shape = np.ceil(mapping.positions.max(axis=(0, 1))).astype(int) + MARGIN - low + 1
-    return mapping, mapping.window(low, tuple(map(int, shape)), (0, 0), mapping.shape_out)
+    side = int(shape.max())
+    return mapping, mapping.window(low, (side, side), (0, 0), mapping.shape_out)
 
 
 def flops_of(plan):
@@ -48,12 +49,13 @@ def flops_of(plan):
 
 @pytest.mark.parametrize("n_bands", [1, 3])
 @pytest.mark.parametrize("geometry", ["aligned", "affine", "distorted"])
-def test_tiles_take_what_they_are_said_to(device, geometry, n_bands):
-    """Said to be a sixth more arithmetic than is counted at most, and up to half more memory."""
+def test_tiles_take_what_they_are_said_to(device, as_asked, geometry, n_bands):
+    """From its operator's own sides: the bytes that the device counts, and the products of its
+    tables. From the sides that are expected of a tile: as much, or up to a sixth more."""
     tuning = replace(Tuning.of(device, np.float32), tile_flops=0.0, pixel_flops=0.0)
     given = PSF.gaussian(BANDS[:n_bands]), PSF.gaussian([b + 0.2 for b in BANDS[:n_bands]])
     sizes = Sizes(tile(geometry, 32)[0], MARGIN, *given, Precision.of(np.float32), tuning)
-    for m in (30, 60):
+    for m in (13, 60):
         window = tile(geometry, m)[1]
         op = None  # that of the other size is gone
         gc.collect()
@@ -61,36 +63,89 @@ def test_tiles_take_what_they_are_said_to(device, geometry, n_bands):
         op = Resampler.from_mapping(window, *given, device=device)
         op.adjoint(op(np.ones(op.shape_in, np.float32)))
         used, plan = device.in_use - before, op.plans[0]
-        time, memory = sizes.cost(geometry, m)
-        assert 1 <= time / (2 * n_bands * flops_of(plan)) < 1.17
-        assert 0.7 < used / memory <= 1
-        assert 0.9 < op.n_bytes / used < 1.35
-        n_pixels = np.prod(window.shape_in) + m * m
+        n, k, j = max(window.shape_in), len(plan.in_y), plan.out_x.shape[1]
+        time, memory = sizes.account(geometry, m, n, k, j)
+        assert time == pytest.approx(2 * n_bands * flops_of(plan), rel=1e-9)
+        if as_asked is None:  # guards of buffers count as memory
+            assert memory == pytest.approx(used, rel=2e-3)
+            assert 0.9 < op.n_bytes / used < 1.35
+        n_most, k_most, j_most = sizes.sides(m)
+        assert n <= n_most <= n + 1
+        assert k <= k_most <= 1.05 * k + 4
+        assert geometry != "affine" or j <= j_most <= 1.05 * j + 2
+        assert sizes.cost(geometry, m) == sizes.account(geometry, m, n_most, k_most, j_most)
+        assert 1 <= sizes.cost(geometry, m)[0] / time < 1.17
         sizes.tuning = replace(tuning, tile_flops=1e9, pixel_flops=1e3)
-        more = sizes.cost(geometry, m)[0] - time - 1e9
-        assert more == pytest.approx(1e3 * n_bands * n_pixels, rel=0.05)
+        more = sizes.account(geometry, m, n, k, j)[0] - time
+        assert more == 1e9 + 1e3 * n_bands * (n * n + m * m)
         sizes.tuning = tuning
+    doubled = replace(tuning, tile_flops=0.0)
+    exact = Sizes(tile(geometry, 32)[0], MARGIN, *given, Precision.of(np.float64), doubled)
+    assert exact.itemsize == 2 * sizes.itemsize
 
 
-@pytest.mark.parametrize("geometry", ["aligned", "30 degrees", "distorted"])
-def test_the_bound_on_tables_counts_what_a_plan_holds(monkeypatch, geometry):
+def test_the_quickest_tile_within_the_memory_is_chosen():
+    """Of all sides, whatever a tile costs; the tiles of a frame are as equal as can be."""
+    assert SIDES[0] == 8 and SIDES[-1] == 16384
+    assert (SIDES[1:] / SIDES[:-1]).max() <= 1.25
+    sizes = Sizes.__new__(Sizes)
+
+    def total(tile, shape, time):
+        return np.prod([-(-n // m) for n, m in zip(shape, tile, strict=True)]) * time(max(tile))
+
+    times = (lambda m: 1.0, lambda m: m**2.0, lambda m: 3e4 + m**3.0, lambda m: 1 / m**4)
+    for shape in ((100, 37), (37, 100), (1000, 900), (5, 3)):
+        tiles = [tuple(-(-n // -(-n // side)) for n in shape) for side in SIDES]
+        assert all(max(tile) <= side for tile, side in zip(tiles, SIDES, strict=True))
+        for time in times:
+            for memory in (8, 30, 61, 1 << 20):
+                sizes.cost = lambda geometry, m, time=time: (time(m), m)
+                tile = sizes.choose("affine", shape, memory)
+                allowed = [t for t in tiles if max(t) <= memory]
+                assert tile in allowed
+                assert total(tile, shape, time) == min(total(t, shape, time) for t in allowed)
+    sizes.cost = lambda geometry, m: (1.0, 1000 + m)
+    with pytest.raises(ValueError, match="memory is 900 bytes, but tiles of 8 pixels .* 1008"):
+        sizes.choose("affine", (160, 16), 900)
+
+
+def test_the_bound_on_tables_counts_what_a_plan_holds(monkeypatch):
+    """To the byte where all frequencies stay: three times D and, but for lines, the waves."""
+    precision, sample = Precision.of(np.float32), PSF([[1.0]])
+    for name in ("aligned", "distorted"):
+        mapping = GEOMETRIES[name]()
+        for shape in ((31, 26), (43, 120)):
+            mapping = replace(mapping, shape_in=shape)
+            plan = plan_module.make_plan(mapping, sample, sample, precision=precision)
+            held = sum(t.nbytes for t in (plan.in_y, plan.in_x, plan.out_y, plan.out_x))
+            held += 3 * (plan.d_plus.nbytes + plan.d_minus.nbytes)
+            monkeypatch.setattr(plan_module, "MOST_BYTES", held)
+            plan_module.make_plan(mapping, sample, sample, precision=precision)
+            monkeypatch.setattr(plan_module, "MOST_BYTES", held - 1)
+            with pytest.raises(ValueError, match=r"needs tables of \S+ GiB"):
+                plan_module.make_plan(mapping, sample, sample, precision=precision)
+            monkeypatch.undo()
+
+
+def test_the_bound_on_tables_counts_bands_and_lines(monkeypatch):
     """And up to 2.7 times as much: the transforms of both PSFs, which are freed again."""
-    mapping = GEOMETRIES[geometry]()
-    mapping = replace(mapping, shape_in=(310, 260)) if geometry == "aligned" else mapping
-    plan = plan_module.make_plan(mapping, *psfs(), precision=Precision.of(np.float32))
-    tables = plan.d_plus, plan.d_minus, plan.in_y, plan.in_x
-    out = (plan.out_y, plan.out_x) if mapping.geometry != "affine" else ()
-    held = sum(table.nbytes for table in (*tables, *out))
+    plan = plan_module.make_plan(
+        GEOMETRIES["30 degrees"](), *psfs(), precision=Precision.of(np.float32)
+    )
+    held = sum(table.nbytes for table in (plan.d_plus, plan.d_minus, plan.in_y, plan.in_x))
     monkeypatch.setattr(plan_module, "MOST_BYTES", 1)
     with pytest.raises(ValueError, match=r"needs tables of \S+ GiB") as error:
-        plan_module.make_plan(mapping, *psfs(), precision=Precision.of(np.float32))
+        plan_module.make_plan(
+            GEOMETRIES["30 degrees"](), *psfs(), precision=Precision.of(np.float32)
+        )
     said = float(str(error.value).split("tables of ")[1].split()[0]) * 2**30
     assert 1.15 < said / held < 2.7
 
 
 def test_a_plan_takes_eight_gib_at_most():
     """Of a WCS that makes the observed pixels a thousandth of the model's."""
-    with pytest.raises(ValueError, match=r"GiB, more than 8: is the WCS right"):
+    said = r"from \(20000, 20000\) to \(9, 9\) pixels, one 0.001 times .* GiB, more than 8: is the"
+    with pytest.raises(ValueError, match=said):
         psf = PSF.gaussian(1.0)
         Resampler(Grid.flat((20000, 20000), 0.1), psf, Grid.flat((9, 9), 1e-4), psf)
 

@@ -167,7 +167,7 @@ def test_slight_distortion_is_affine_tile_by_tile():
     grid_out = tan(two.pixel_scale_arcsec, (150, 160), angle_deg=3, sip=5e-8)
     setting = grid_in, one.psf(), grid_out, two.psf()
     x = field(*setting[:2], np.random.default_rng(7))
-    tiled = TiledResampler(*setting, dtype=np.float64, memory=2 * SMALL)
+    tiled = TiledResampler(*setting, dtype=np.float64, memory=SMALL // 2)
     exact = Resampler(*setting, dtype=np.float64, tolerance_px=1e-8)
     assert (tiled.geometry, exact.geometry) == ("affine", "distorted")
     assert len(tiled.groups) < tiled.n_tiles  # neighbours share an operator

@@ -7,6 +7,7 @@ from itertools import product
 
 import numpy as np
 
+from ...device.contraction import padded
 from ...device.tuning import Tuning
 from ...sky.extent import intersection
 from ...sky.grid import Grid
@@ -133,29 +134,37 @@ class Sizes:
 
     def cost(self, geometry, m):
         """Time [flops] of a tile of m x m observed pixels, and its device memory [bytes]."""
+        return self.account(geometry, m, *self.sides(m))
+
+    def sides(self, m):
+        """Of a tile of m x m observed pixels, at most: pixels n of a side of its window, waves k
+        that each axis has, and columns j that its lines cross."""
         n = int(np.ceil(self.scale * (m - 1))) + self.border
         k = 2 * (int(self.band * (n + self.pad)) + 1)
-        wide = k + 16  # rows are padded
+        return n, k, int(self.columns * self.scale * m) + self.taps + 1
+
+    def account(self, geometry, m, n, k, j):
+        """What `cost` says, from the sides of all matrices: those that the executors have."""
+        rows = m * m if geometry == "distorted" else m
+        wide, crossed = padded(k), padded(j)
         flops = n * n * k + n * k * k
-        tables = 4 * n * wide
-        frequencies = wide * (max(n, m) + k) + k * k
+        tables = 2 * n * k + k * padded(n) + n * wide + 2 * rows * k
+        each_band = (max(n, rows) + 2 * k) * wide + 2 * (n * n + m * m)  # images: both ways
         if geometry == "aligned":
             flops += m * k * k + m * m * k
-            tables += 4 * m * wide
+            tables += k * padded(m) + m * wide
         elif geometry == "affine":
-            j = int(self.columns * self.scale * m) + self.taps + 16
             flops += k * k * j + m * k * j + m * m * self.taps
-            tables += 2 * m * k + 4 * j * wide
-            tables += m * (m * (self.taps + 1) + j * (self.taps_back + 2))
-            frequencies += (k + m) * j
+            tables += 2 * k * crossed + j * wide
+            tables += m * m * (self.taps + 1) + m * crossed * (self.taps_back + 1)
+            each_band += (k + m) * crossed
         else:
-            flops += m * m * k * (k + 1)
-            tables += 3 * m * m * wide
-            frequencies += m * m * wide
-        images = 2 * (n * n + m * m)  # both ways
-        staged = self.tuning.pixel_flops * self.n_bands * (n * n + m * m)
-        time = 2 * self.n_bands * flops + self.tuning.tile_flops + staged
-        return time, self.itemsize * (tables + self.n_bands * (frequencies + images))
+            flops += rows * k * (k + 1)
+            tables += rows * wide
+        pixels = self.n_bands * (n * n + m * m)
+        time = 2 * self.n_bands * flops
+        time += self.tuning.tile_flops + self.tuning.pixel_flops * pixels
+        return time, self.itemsize * (tables + self.n_bands * each_band)
 
     def choose(self, geometry, shape, memory):
         """Tile shape (My, Mx) [observed px] of the quickest frame of this shape within `memory`."""
