@@ -18,7 +18,6 @@ import numpy as np
 from . import selftest
 from .discovery import (
     DeviceError,
-    alone,
     builds_fp64,
     choose,
     find_devices,
@@ -49,7 +48,6 @@ class Device:
     compute_units: their number
     memory, max_alloc, in_use [bytes]: all of it, the largest buffer, what arrays made here hold
     remembered: what earlier runs have measured of this device
-    alone: context in which a thread has the device for itself, where its driver needs that
     profile: the times of all launches, where CLRESAMPLE_PROFILE was set; or None
     """
 
@@ -64,7 +62,7 @@ class Device:
         self.in_use, self.remembered = 0, Remembered(cl_device)
         _opened[self] = os.getpid()
         self._enqueue, self._error = cl.enqueue_nd_range_kernel, cl.Error
-        self._programs, self._lock, self.alone = Programs(self), threading.Lock(), alone(cl_device)
+        self._programs, self._lock = Programs(self), threading.Lock()
         self.context = self._call(cl.Context, [cl_device])
         self.profile = started(self.name)
         timed = cl.command_queue_properties.PROFILING_ENABLE if self.profile else 0
@@ -130,11 +128,19 @@ class Device:
     def _copy(self, target, source, **options):
         import pyopencl as cl
 
-        self._call(cl.enqueue_copy, self.queue, target, source, **options)
+        event = self._call(cl.enqueue_copy, self.queue, target, source, **options)
+        if isinstance(target, np.ndarray) or isinstance(source, np.ndarray):
+            # Mesa's rusticl (22.3) comes back from a blocking copy before it is done where another
+            # thread, waiting for an event, has just sent it to the device: 15 of 24,000 reads in
+            # three threads. Its events tell truly.
+            self._call(event.wait)
 
     def get(self, array):
         """The values of a pyopencl array as a NumPy array, once all that was queued is done."""
-        return self._call(array.get, self.queue)
+        values = np.empty(array.shape, array.dtype)
+        if values.size:
+            self.download(array, values)
+        return values
 
     def launcher(self, file, name, *, dtype=np.float32, local_size=None, **defines):
         """A Launcher of kernel `name` in kernels/`file`, no argument bound yet.
@@ -155,9 +161,12 @@ class Device:
         """Queue a kernel whose arguments are set; sizes (x, y, z) as OpenCL counts them."""
         return self._call(self._enqueue, self.queue, kernel, global_size, local_size)
 
-    def finish(self):
-        """Wait until everything queued is done."""
-        self._call(self.queue.finish)
+    def finish(self, queue=None):
+        """Wait until everything queued is done, here or in another in-order queue."""
+        import pyopencl as cl
+
+        # by an event, as in `_copy`: clFinish of rusticl does not always wait either
+        self._call(self._call(cl.enqueue_marker, queue or self.queue).wait)
 
     def _call(self, function, *arguments, **options):
         """What a function of pyopencl returns; an error that a user can meet made readable."""
