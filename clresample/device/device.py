@@ -119,23 +119,16 @@ class Device:
 
     def upload(self, values, array):
         """Overwrite a device array with a C-contiguous NumPy array of its size and dtype."""
-        self._copy(array.base_data, values, dst_offset=array.offset)
+        _copy(self, array.base_data, values, dst_offset=array.offset)
 
     def download(self, array, values):
         """Overwrite a C-contiguous NumPy array with a device array, once all queued is done."""
-        self._copy(values, array.base_data, src_offset=array.offset)
+        _copy(self, values, array.base_data, src_offset=array.offset)
 
     def copy(self, source, target):
         """Overwrite a device array with another of its size and dtype."""
         places = {"src_offset": source.offset, "dst_offset": target.offset}
-        self._copy(target.base_data, source.base_data, byte_count=source.nbytes, **places)
-
-    def _copy(self, target, source, **options):
-        import pyopencl as cl
-
-        event = self._call(cl.enqueue_copy, self.queue, target, source, **options)
-        if isinstance(target, np.ndarray) or isinstance(source, np.ndarray):
-            self._call(event.wait)
+        _copy(self, target.base_data, source.base_data, byte_count=source.nbytes, **places)
 
     def get(self, array):
         """The values of a pyopencl array as a NumPy array, once all that was queued is done."""
@@ -200,6 +193,15 @@ class Device:
 
     def _freed(self, n_bytes):
         self.in_use -= n_bytes
+
+
+def _copy(device, target, source, **options):
+    """Queue a copy; one from or to the host is done when this comes back."""
+    import pyopencl as cl
+
+    event = device._call(cl.enqueue_copy, device.queue, target, source, **options)
+    if isinstance(target, np.ndarray) or isinstance(source, np.ndarray):
+        device._call(event.wait)
 
 
 @functools.cache
