@@ -66,15 +66,14 @@ def deblend(
     blend = Blend(*given, frame, shifts)
     settings, dtype = _checked(settings, dtype)
     device = get_device(device)
-    with device.alone:
-        fit = Fit(blend, settings, device, dtype, pad=1)
-        begin([fit])
-        if len(fit.dark):
-            _warn_dark([fit.dark], "")
-        iterate([fit], settings, device, dtype, progress)
-        if fit.status != INTERRUPTED:
-            (fit,) = with_second([fit], settings, device, dtype, progress)
-        return fit.result(*finish([fit]))
+    fit = Fit(blend, settings, device, dtype, pad=1)
+    begin([fit])
+    if len(fit.dark):
+        _warn_dark([fit.dark], "")
+    iterate([fit], settings, device, dtype, progress)
+    if fit.status != INTERRUPTED:
+        (fit,) = with_second([fit], settings, device, dtype, progress)
+    return fit.result(*finish([fit]))
 
 
 def deblend_many(
@@ -124,7 +123,7 @@ def _fit_all(blends, *, device, progress=lambda n_done: None, **given):
     """(Result or Failure, sources far from any light or None) for each blend."""
     many = _ManyFits(blends, device, **given)
     # the results of what was not done say so
-    with device.alone, contextlib.suppress(KeyboardInterrupt):
+    with contextlib.suppress(KeyboardInterrupt):
         many.run(progress)
     return [
         (Failure(blend, INTERRUPTED) if done is None else done, many.dark.get(i))

@@ -5,11 +5,9 @@ pyopencl is imported when devices are first looked for, never before.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import os
 import tempfile
-import threading
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +16,6 @@ from .drivers import cure, fault_of, named_library, show_named_library, unseen
 
 # Order of preference when nothing is chosen; a kind that is not listed comes last.
 KINDS = ("GPU", "CPU", "ACCELERATOR")
-# Parts of the names of platforms on which one fit runs at a time: in three threads fits gave wrong
-# numbers or crashed (Mesa 22.3), each of them alone did not.
-ONE_THREAD = ("rusticl",)
 # Parts of the names of devices that stand in for others: simulators, and drivers that draw on the
 # CPU. They come last in the choice, whatever kind they say they are.
 SIMULATED = ("oclgrind", "simulator", "emulat", "llvmpipe", "softpipe", "swiftshader")
@@ -157,12 +152,6 @@ def is_simulated(device):
     """True of a simulator, or of a driver that draws on the CPU, by its name."""
     names = f"{device.platform.name} {device.name}".lower()
     return any(name in names for name in SIMULATED)
-
-
-def alone(device):
-    """A context in which a thread has the device for itself, where its driver needs that."""
-    one = any(name in device.platform.name.lower() for name in ONE_THREAD)
-    return threading.RLock() if one else contextlib.nullcontext()
 
 
 def hints():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import re
 import warnings
 from contextlib import contextmanager
@@ -19,6 +18,7 @@ from .. import __version__
 from ..sky.grid import Grid
 from ..sky.psf import PSF
 from .compressed import check_tiles
+from .headers import check_headers
 from .names import to_ascii
 from .whole_file import FileError, check_output, whole_file
 
@@ -164,8 +164,8 @@ def open_fits(path):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", AstropyWarning)
         try:
+            check_headers(path)
             with fits.open(path, memmap=False) as hdus:
-                _check_ends(path, hdus)
                 yield hdus
         except FileError:
             raise
@@ -174,17 +174,6 @@ def open_fits(path):
             cut = any("truncated" in str(warning.message) for warning in caught)
             what = "truncated" if cut else "not a FITS file, or damaged"
             raise FileError(f"{path}: {what} ({reason})") from error
-
-
-def _check_ends(path, hdus):
-    """Refuse an HDU whose data end before they begin: astropy would read it again without end."""
-    for i in itertools.count():
-        try:
-            hdu = hdus[i]  # the next header is read here
-        except IndexError:
-            return
-        if hdu.fileinfo()["datSpan"] < 0:
-            raise FileError(f"{path}: damaged, HDU {i} has data of a negative size")
 
 
 def _label(hdus, hdu):

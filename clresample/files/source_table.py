@@ -11,6 +11,7 @@ from astropy.table import Table
 from astropy.utils.exceptions import AstropyWarning
 
 from ..sky.sources import Extended, Point
+from .headers import check_headers
 
 KINDS = {"point": Point, "extended": Extended}
 # what columns may hold; each is looked for under this name unless the scene file gives another
@@ -70,6 +71,7 @@ def read_sources(path, columns=None) -> tuple:
 def _read(path, name):
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
+    check_headers(path)
     try:
         with warnings.catch_warnings():  # of types that ECSV does not know, and then reads
             warnings.simplefilter("ignore", AstropyWarning)

@@ -113,7 +113,7 @@ class LinOp:
             out = self._checked("out", out)
         others = {a.queue for a in (x, out)} - {None, self.device.queue}
         for queue in others:  # of the caller, who may still write or read there
-            queue.finish()
+            self.device.finish(queue)
         with self._lock:
             run(_shaped(x, batched_x), _shaped(out, batched_out))
         if others:

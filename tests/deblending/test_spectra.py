@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 
 from clresample.deblending.spectra import RIDGE, inverse, non_negative, scaled
 
@@ -41,8 +42,6 @@ def test_no_variance_is_less_than_that_of_a_source_alone():
 @pytest.mark.parametrize("seed", range(5))
 def test_least_squares_meet_the_conditions_of_a_minimum(seed):
     """x >= 0, gradient 0 where x > 0 and not below 0 elsewhere; SciPy finds the same."""
-    from scipy.optimize import nnls
-
     rng = np.random.default_rng(seed)
     images = rng.normal(size=(4, 7, 30))
     data = rng.normal(size=(4, 30))
@@ -64,3 +63,38 @@ def test_free_unknowns_may_be_negative_and_what_is_not_seen_is_zero():
 def test_equal_sources_share_their_light():
     found = non_negative(np.ones((1, 2, 2)), np.full((1, 2), 6.0))
     np.testing.assert_allclose(found, [[3, 3]], rtol=1e-6)
+
+
+def crowded(n=120, n_pixels=90, n_free=1):
+    """Faint stars on each other in a small image, float32's rounding, the last ones a flat sky."""
+    rng = np.random.default_rng(8)
+    y, x = rng.uniform(0, 9, (2, n - n_free, 1))
+    row, column = np.divmod(np.arange(n_pixels), 9)
+    stars = np.exp(-((row - y) ** 2 + (column - x) ** 2) / 8)
+    images = np.concatenate([stars, np.ones((n_free, n_pixels))])
+    data = 100 * stars[::40].sum(axis=0) - 0.3 + rng.normal(0, 0.1, n_pixels)
+    normal = (images @ images.T).astype(np.float32).astype(float)
+    return images, data, normal, images @ data
+
+
+@pytest.mark.parametrize("n_free", [0, 1])
+def test_sources_that_cannot_be_told_apart_get_a_minimum_all_the_same(n_free):
+    """More of them than pixels: exchanges of whole sets go round in circles."""
+    images, data, normal, right = crowded(n_free=n_free)
+    free = np.arange(len(right)) >= len(right) - n_free
+    assert np.linalg.eigvalsh(scaled(normal)[0]).min() < 0
+    (found,) = non_negative(normal[None], right[None], free)
+    assert (found[~free] >= 0).all() and np.isfinite(found).all()
+    _, least = nnls(np.concatenate([images, -images[free]]).T, data)
+    assert np.linalg.norm(data - found @ images) == pytest.approx(least, rel=0.01)
+    if n_free:
+        assert found[-1] < 0
+
+
+def test_problems_that_settle_and_that_do_not_are_solved_together():
+    _, _, normal, right = crowded(n_free=0)
+    apart = np.eye(len(right)) * 4
+    found = non_negative(np.stack([apart, normal, apart]), np.stack([right, right, -right]))
+    np.testing.assert_allclose(found[0], right / 4, rtol=1e-7)
+    np.testing.assert_array_equal(found[1], non_negative(normal[None], right[None])[0])
+    assert not found[2].any()

@@ -1,8 +1,6 @@
 """Devices at work: memory, kernels, and the errors that a user can meet on the way."""
 
 import gc
-import threading
-from types import SimpleNamespace
 
 import numpy as np
 import pyopencl as cl
@@ -11,7 +9,6 @@ from helpers.checkout import ROOT, run_python
 
 from clresample import DeviceError, list_devices
 from clresample.device import device as device_module, discovery as discover
-from clresample.device.discovery import alone
 
 POCL = "Portable Computing Language"
 
@@ -90,33 +87,29 @@ def test_a_full_device_says_so(device, monkeypatch):
 
 @pytest.mark.parametrize("status", ["MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_HOST_MEMORY"])
 def test_a_refused_allocation_names_both_sizes(device, monkeypatch, status):
-    def refuse(*_):
-        raise error_of(status)
-
-    monkeypatch.setattr(device_module, "_buffer_type", lambda: refuse)
+    monkeypatch.setattr(device_module, "_buffer_type", lambda: lost(status))
     with pytest.raises(DeviceError, match=r"an array needs 4 KiB; .* in one buffer"):
         device.empty(1024, np.float32)
 
 
-class Lost:
-    """A queue that answers every call with the same status."""
+def lost(status):
+    """A function of pyopencl that fails with this status, whatever it is asked."""
 
-    def __init__(self, status):
-        self.status = status
+    def refuse(*_):
+        raise error_of(status)
 
-    def finish(self):
-        raise error_of(self.status)
+    return refuse
 
 
 @pytest.mark.parametrize("status", ["DEVICE_NOT_AVAILABLE", "OUT_OF_RESOURCES", "-9999"])
 def test_a_lost_device_says_what_to_do(device, monkeypatch, status):
-    monkeypatch.setattr(device, "queue", Lost(status))
+    monkeypatch.setattr(cl, "enqueue_marker", lost(status))
     with pytest.raises(DeviceError, match=rf"no longer answers \({status}\): start again"):
         device.finish()
 
 
 def test_our_own_mistakes_stay_as_they_are(device, monkeypatch):
-    monkeypatch.setattr(device, "queue", Lost("INVALID_KERNEL_ARGS"))
+    monkeypatch.setattr(cl, "enqueue_marker", lost("INVALID_KERNEL_ARGS"))
     with pytest.raises(cl.Error, match="INVALID_KERNEL_ARGS"):
         device.finish()
 
@@ -188,22 +181,39 @@ def test_kernels_under_other_settings(setting):
     assert answer.returncode == 0, answer.stdout
 
 
-@pytest.mark.parametrize(
-    "platform, one", [("rusticl", True), ("Portable Computing Language", False)]
-)
-def test_threads_wait_for_each_other_where_the_driver_needs_it(platform, one):
-    """Fits of one thread after the other on rusticl; elsewhere nobody waits."""
-    context = alone(SimpleNamespace(platform=SimpleNamespace(name=platform)))
-    entered = []
+def test_values_are_there_though_blocking_copies_come_back_early(device, monkeypatch):
+    """As in a driver whose blocking copies do not always wait, but whose events do."""
+    copy, events = cl.enqueue_copy, []
 
-    def other():
-        with context:
-            entered.append(True)
+    def early(*arguments, **options):
+        if any(isinstance(one, np.ndarray) for one in arguments):
+            options["is_blocking"] = False
+        events.append(copy(*arguments, **options))  # an event that is dropped is waited for
+        return events[-1]
 
-    with context, context:  # the same thread may come again
-        thread = threading.Thread(target=other)
-        thread.start()
-        thread.join(0.3)
-        assert entered == ([] if one else [True])
-    thread.join()
-    assert entered == [True]
+    n = 1 << 22
+    x, y = (device.zeros(n, np.float32) for _ in range(2))
+    source = "__kernel void slow(__global float *x) { const size_t i = get_global_id(0); " + (
+        "float s = 1; for (int k = 0; k < 300; ++k) s = 0.5f * s + 0.5f; x[i] = s; }"
+    )
+    slow = cl.Program(device.context, source).build().slow
+    monkeypatch.setattr(cl, "enqueue_copy", early)
+    for read in (device.get, lambda array: _read_into(device, array)):
+        device.copy(y, x)
+        slow(device.queue, (n,), None, x.base_data)
+        np.testing.assert_array_equal(read(x)[-1000:], 1)
+    values = np.full(n, 3, np.float32)
+    slow(device.queue, (n,), None, x.base_data)
+    device.upload(values, x)
+    values[:] = 5  # the host's memory is the caller's again
+    assert (device.get(x) == 3).all()
+    slow(device.queue, (n,), None, x.base_data)
+    last = cl.enqueue_marker(device.queue)
+    device.finish()
+    assert last.command_execution_status == cl.command_execution_status.COMPLETE
+
+
+def _read_into(device, array):
+    values = np.zeros(array.shape, array.dtype)
+    device.download(array, values)
+    return values

@@ -1,7 +1,10 @@
 """Files with anything in them: read as what they say, or refused in one line that names them."""
 
+import gzip
 import math
+import signal
 import warnings
+from contextlib import contextmanager
 
 import numpy as np
 from astropy.io import fits
@@ -154,6 +157,74 @@ def test_headers_with_any_cards(tmp_path_factory, cards):
     if np.isfinite(sky).all():
         back = image.grid.pixel(*sky)
         assert np.abs(back - 4).max() < 1e-4 or np.isnan(back).all()
+
+
+COUNTS = st.sampled_from(
+    ["NAXIS", "NAXIS1", "NAXIS2", "NAXIS3", "BITPIX", "PCOUNT", "GCOUNT", "TFIELDS", "GROUPS"]
+    + ["ZNAXIS", "ZNAXIS1", "ZTILE1", "ZIMAGE", "WCSAXES", "WCSAXESA", "A_ORDER", "BP_ORDER"]
+    + ["THEAP", "TFORM1", "TDIM1", "BSCALE", "BLANK", "XTENSION", "EXTEND", "END", "naxis1"]
+)
+CLAIM = st.one_of(
+    st.integers().map(str),
+    st.integers(0, 400).map(str),
+    st.sampled_from([10**k for k in range(3, 20)]).map(str),
+    st.sampled_from(["T", "F", "1E9", "'BINTABLE'", "'1PB(9)'", "'999999999E'", "-5", "", "NaN"]),
+)
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 2), st.integers(0, 30), COUNTS, CLAIM), min_size=1, max_size=3
+    ),
+    st.booleans(),
+)
+def test_headers_with_any_counts(tmp_path_factory, claims, zipped):
+    """Cards written over any card of any HDU: the image, a compressed one, a table."""
+    path = tmp_path_factory.mktemp("any") / "image.fits"
+    pixels = np.round(100 * gaussian(9, 1.0)).astype(np.int32)
+    hdus = [
+        fits.PrimaryHDU(pixels, header(9, 0.2)),
+        fits.CompImageHDU(pixels, compression_type="RICE_1"),
+        fits.BinTableHDU(Table({"y": [4.0], "x": [4.0]})),
+    ]
+    fits.HDUList(hdus).writeto(path)
+    with fits.open(path, disable_image_compression=True) as opened:
+        places = [hdu.fileinfo()["hdrLoc"] for hdu in opened]
+    raw = bytearray(path.read_bytes())
+    for hdu, number, key, value in claims:
+        there = raw.find(f"{key.upper():8}=".encode(), places[hdu])
+        at = there if there >= 0 and number % 2 else places[hdu] + 80 * number
+        raw[at : at + 80] = f"{key:8}= {value:>20}"[:80].ljust(80).encode()
+    path.write_bytes(gzip.compress(raw) if zipped else raw)
+    for read in (read_image, read_psf, read_sources):
+        with warnings.catch_warnings(), at_most_seconds(5):
+            warnings.simplefilter("ignore")
+            try:
+                read(path)
+            except ValueError as error:
+                one_line(error, "image.fits")
+
+
+class TooSlow(BaseException):
+    """No Exception: readers take those for a damaged file."""
+
+
+@contextmanager
+def at_most_seconds(most):
+    """Fails what takes more processor time than that, as soon as Python runs again."""
+
+    def stop(*_):
+        raise TooSlow
+
+    before = signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, most)
+    try:
+        yield
+    except TooSlow:
+        raise AssertionError(f"takes over {most} s of processor time") from None
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, before)
 
 
 @given(st.integers(0, 5000), st.binary(min_size=1, max_size=40), st.booleans())

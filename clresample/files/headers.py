@@ -1,0 +1,154 @@
+"""A look at the headers of a FITS file before astropy reads them.
+
+astropy (to 8.0 at least) believes some numbers in a header and counts up to them: with NAXIS =
+99999999999 or SIP polynomials of order 30000 it does not end, TFIELDS = 2000000000 takes all
+memory, and after data of a negative size it reads the same header again without end.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+import zipfile
+from contextlib import contextmanager
+
+from astropy.utils.data import get_readable_fileobj
+
+from .whole_file import FileError
+
+BLOCK, CARD = 2880, 80  # bytes
+# A header has at most so many cards, 8 MB: an end of it is not looked for in all of a large file.
+MOST_CARDS = 100_000
+# Least and most of what each card may hold. 999 axes and columns are the FITS standard's limits, 9
+# that of the names of SIP's coefficients; sizes and places in files are 64-bit integers.
+MOST_BYTES = 2**63 - 1
+LIMITS = {
+    r"Z?NAXIS|TFIELDS": (0, 999),
+    r"BITPIX": (-64, 64),
+    r"Z?NAXIS\d+|ZTILE\d+|[PG]COUNT": (0, MOST_BYTES),
+    r"WCSAXES[A-Z]?": (-math.inf, 999),
+    r"[AB]P?_ORDER": (-math.inf, 9),
+}
+NUMBER = re.compile(
+    rf"\s*(?:HIERARCH\s+)?({'|'.join(LIMITS)})\s*=\s*([^/]*)".encode(), re.IGNORECASE
+)
+FLAG = re.compile(rb"(GROUPS|ZIMAGE)\s*=\s*T")
+END = re.compile(rb"END([^A-Z0-9_-]|$)")
+
+
+def check_headers(path):
+    """Raise FileError where a header of a FITS file holds a number that no such file has.
+
+    All HDUs are looked at, of compressed files too. What is not FITS, or ends too early, passes:
+    astropy says so.
+    """
+    try:
+        with _opened(path) as file:
+            if file.read(6) == b"SIMPLE":
+                _check(path, file)
+    except FileError:
+        raise
+    except Exception:  # of the libraries that decompress, on what is cut or nothing of theirs
+        return
+
+
+def _check(path, file):
+    """Walk from header to header to the file's end. Raises FileError."""
+    place = 0
+    for number in itertools.count():
+        file.seek(place)
+        what = f"{path}: damaged, HDU {number}"
+        cards = _cards(what, file)
+        if cards is None:
+            return
+        place += -(-len(cards) * CARD // BLOCK) * BLOCK
+        place += -(-_n_bytes(what, *_values(what, cards)) // BLOCK) * BLOCK
+
+
+@contextmanager
+def _opened(path):
+    """The file's bytes, decompressed; of a ZIP file those of its first member, as in astropy."""
+    with open(path, "rb") as file:
+        is_archive = file.read(4) == b"PK\x03\x04"
+    if is_archive:
+        with zipfile.ZipFile(path) as archive, archive.open(archive.namelist()[0]) as file:
+            yield file
+    else:
+        with get_readable_fileobj(path, encoding="binary") as file:
+            yield file
+
+
+def _cards(what, file):
+    """The cards of the header that begins here, or None where the file ends before it does."""
+    cards = []
+    while len(cards) < MOST_CARDS:
+        block = file.read(BLOCK)
+        for i in range(0, len(block), CARD):
+            cards.append(block[i : i + CARD])
+            if END.match(cards[-1]):
+                return cards
+        if len(block) < BLOCK:
+            return None
+    raise FileError(f"{what} has a header of more than {MOST_CARDS} cards")
+
+
+def _values(what, cards):
+    """A header's numbers {keyword: value} and its flags. Raises FileError for absurd numbers."""
+    values, flags = {}, set()
+    for card in cards:
+        flag = FLAG.match(card)
+        if flag:
+            flags.add(flag[1].decode())
+        found = NUMBER.match(card)
+        if found is None:
+            continue
+        key, text = found[1].decode().upper(), found[2].decode("latin1").strip()
+        claim = f"{what} has {key} = {text[:40]}"
+        try:
+            least, most = next(limits for name, limits in LIMITS.items() if re.fullmatch(name, key))
+            # real numbers are taken, and made whole, for the sky alone
+            value = int(text) if least > -math.inf else float(text.upper().replace("D", "E"))
+        except ValueError:
+            raise FileError(f"{claim}, not a whole number") from None
+        if not least <= value <= most:
+            raise FileError(f"{claim}, not in {least} to {most}")
+        if values.setdefault(key, value) != value:
+            raise FileError(f"{claim} and {values[key]}")
+    return values, flags
+
+
+def _n_bytes(what, values, flags):
+    """Size of an HDU's data, less than MOST_BYTES. Raises FileError."""
+    shape = _axes(what, values, "NAXIS")
+    if "ZIMAGE" in flags:
+        _check_tiles(what, values)
+    if not shape:
+        return 0
+    if "GROUPS" in flags and shape[0] == 0:  # random groups say so by an axis of no pixel
+        shape = shape[1:]
+    n_pixels = values.get("GCOUNT", 1) * (values.get("PCOUNT", 0) + math.prod(shape))
+    n_bytes = abs(values.get("BITPIX", 8)) * n_pixels // 8
+    if n_bytes > MOST_BYTES:
+        raise FileError(f"{what} has {n_bytes:.1e} bytes of data by its header")
+    return n_bytes
+
+
+def _axes(what, values, key):
+    """The lengths of the axes that the card `key` counts. Raises FileError for one left out."""
+    names = [f"{key}{i + 1}" for i in range(values.get(key, 0))]
+    missing = [name for name in names if name not in values]
+    if missing:
+        raise FileError(f"{what} has no {missing[0]}")
+    return [values[name] for name in names]
+
+
+def _check_tiles(what, values):
+    """Raise FileError where an image is cut into more tiles than the table has rows for them."""
+    shape = _axes(what, values, "ZNAXIS")
+    # whole rows where the header does not say it
+    tiles = [values.get(f"ZTILE{i + 1}") or (1 if i else n) for i, n in enumerate(shape)]
+    n_tiles = math.prod(-(-n // max(1, tile)) for n, tile in zip(shape, tiles, strict=True))
+    n_rows = values.get("NAXIS2", 0)
+    if n_tiles > n_rows:
+        raise FileError(f"{what} holds {n_rows} tiles of an image of {n_tiles}")
