@@ -5,6 +5,9 @@ import pytest
 
 from clresample.measurement.companions import (
     CLUMP,
+    CLUMP_ARCSEC,
+    LEAST_CLUMP,
+    MOST_CLUMP,
     centred,
     is_a_source,
     left_over,
@@ -15,6 +18,7 @@ from clresample.measurement.signal import Signal
 
 SHAPE = (121, 121)
 FWHM = 5.0  # [px] of a point in these images
+SCALE = 0.1  # [arcsec] of their pixels
 SEEN = np.ones(SHAPE, bool)
 
 
@@ -55,11 +59,13 @@ def test_a_side_that_was_not_seen_is_told_by_the_other():
     assert not rest_of(np.zeros(SHAPE), (60, 80), seen=seen)[1].any()
 
 
-def judge(image, channels, place, centre=(60.0, 60.0)):
+def judge(image, channels, place, centre=(60.0, 60.0), scale=SCALE):
     rest, model = rest_of(image, centre)
     places = np.moveaxis(np.indices(SHAPE), 0, -1).astype(float)
     signals = [Signal(channels[None, 0], channels[None, 0], SEEN.astype(int), channels, places)]
-    return is_a_source(np.array(place), rest, model, image, signals, np.array([centre]), FWHM)
+    height = rest[tuple(place)]
+    centres = np.array([centre])
+    return is_a_source(np.array(place), height, model, image, signals, centres, FWHM, scale)
 
 
 def test_a_clump_of_the_galaxys_colours_is_no_source_and_one_of_others_is():
@@ -70,11 +76,16 @@ def test_a_clump_of_the_galaxys_colours_is_no_source_and_one_of_others_is():
     assert judge(galaxy + clump, other, (60, 71))
 
 
-def test_what_is_bright_beside_the_light_about_it_is_a_source_in_any_colour():
+@pytest.mark.parametrize(
+    "away_arcsec, part",
+    ((0.1, LEAST_CLUMP), (CLUMP_ARCSEC, CLUMP), (1.1 * CLUMP_ARCSEC, 1.1 * CLUMP), (3, MOST_CLUMP)),
+)
+def test_what_is_bright_beside_the_light_about_it_is_a_source_in_any_colour(away_arcsec, part):
     galaxy = spot((60, 60), 100, sigma=4)
-    for height, is_one in ((0.5 * CLUMP * 10, False), (1.5 * CLUMP * 10, True)):
+    for height, is_one in ((0.9 * part * 10, False), (1.1 * part * 10, True)):
         image = galaxy + spot((60, 76), height)  # where there is next to no light: H = 100, m = 0
-        assert judge(image, np.stack([image, image]), (60, 76)) == is_one
+        both = np.stack([image, image])
+        assert judge(image, both, (60, 76), scale=away_arcsec / 16) == is_one
 
 
 def test_centres_are_found_to_part_of_a_pixel():
