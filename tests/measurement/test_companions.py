@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
+from clresample.measurement import detection
 from clresample.measurement.companions import (
     CLUMP,
     CLUMP_ARCSEC,
     LEAST_CLUMP,
+    LEAST_WIDE,
     MOST_CLUMP,
     centred,
     is_a_source,
@@ -105,3 +107,28 @@ def test_the_top_of_what_is_left_is_nearer_than_its_peak_in_units_of_the_noise()
     corner = np.zeros(SHAPE)
     corner[0, 1] = 3.0
     assert top_near(corner, (1, 0), 2) == (pytest.approx((0, 1)), 3.0)
+
+
+def beside(narrow, wide, monkeypatch):
+    """Places of neighbours of the source at (60, 60), where two peaks are seen about (60, 72)."""
+    sums = np.stack([narrow, wide])
+    places = np.moveaxis(np.indices(SHAPE), 0, -1).astype(float)
+    signals = [Signal(sums, sums**2, SEEN.astype(int), narrow[None], places)]
+    peaks = [(np.array([60.0, x]), 9.0) for x in (71, 73)]
+    monkeypatch.setattr(detection, "_new_peaks", lambda *args, **more: peaks)
+    at = np.array([[60.0, 60.0]])
+    found = detection._companions(None, signals, 0, narrow, at, 5.0, FWHM, SCALE)
+    return [place for place, _ in found]
+
+
+def test_two_peaks_about_one_top_are_one_neighbour(monkeypatch):
+    image = spot((60, 60), 300, sigma=4) + spot((60, 72), 90)
+    (place,) = beside(image, image, monkeypatch)
+    assert np.hypot(*(place - (60, 72))) < 1
+
+
+def test_a_neighbour_is_seen_under_the_filter_of_small_galaxies_too(monkeypatch):
+    host = spot((60, 60), 300, sigma=4)
+    for height, n in ((0.9 * LEAST_WIDE, 0), (1.3 * LEAST_WIDE, 1)):
+        wide = host + spot((60, 72), height)
+        assert len(beside(host + spot((60, 72), 90), wide, monkeypatch)) == n
