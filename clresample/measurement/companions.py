@@ -9,11 +9,15 @@ is taken for the source's own, and the image less the sum of these is searched. 
 also be a clump of the galaxy itself. Two things tell: clumps are where the galaxy's light is, and
 have its colours. A peak h is a source of its own where
 
-    h >= CLUMP sqrt(H (m + 1)),   or   h >= COLOURED sqrt(H (m + 1)) and its spectrum is another
+    h >= c(r) sqrt(H (m + 1)),   or   h >= COLOURED sqrt(H (m + 1)) and its spectrum is another
 
-H being the galaxy's peak and m its light there, all in sigma. Clumps that hold some part of all
+H being the galaxy's peak and m its light there, all in sigma, r the distance from its centre and
+c(r) = CLUMP r / CLUMP_ARCSEC within LEAST_CLUMP and MOST_CLUMP. Clumps that hold some part of all
 the galaxy's light would ask for H, those that hold some part of the light about them for m; the
-mean of the two, sqrt(H m), tells neighbours from clumps better than either.
+mean of the two, sqrt(H m), tells neighbours from clumps better than either. Near the centre the
+symmetric light holds part of the neighbour's too, so that less of it is left than it has; far out a
+single clump, whose other side is empty, is left whole. Galaxies are also wider than clumps: under
+the filter of small galaxies, too, a neighbour is left.
 
 Source: the symmetry, Lupton et al. 2005 (SDSS's deblender) and Melchior et al. 2018 (Astronomy and
 Computing 24, 129).
@@ -23,15 +27,20 @@ from __future__ import annotations
 
 import numpy as np
 
-# Chosen on sixteen simulated fields of 1024 pixels (1700 sources) and reported on others, see
+# Chosen on forty simulated fields of 1024 pixels (4000 sources) and reported on others, see
 # docs/fields.md. Larger ones lose neighbours, smaller ones take clumps for sources.
-CLUMP, COLOURED = 0.45, 0.2
+CLUMP, LEAST_CLUMP, MOST_CLUMP, COLOURED = 0.45, 0.15, 0.75, 0.15
+# [arcsec] from its centre where a galaxy's clumps reach CLUMP: three half-light radii of the usual
+# galaxy in deep images. A larger one finds more neighbours and takes more clumps for sources
+CLUMP_ARCSEC = 0.8
 # [sigma^2] chi2 beyond its mean by which a residual's spectrum must differ from the galaxy's; and
 # the part of the galaxy's light there by which the model may be wrong in each channel
-OTHER_COLOUR, MODEL_PART = 12.0, 0.1
+OTHER_COLOUR, MODEL_PART = 8.0, 0.1
 # of the galaxy's light in the searched image: what symmetry leaves of a smooth one
 ASYMMETRY = 0.05
-LEAST = 6.0  # [sigma] a peak's height: two noisy sides are compared, and many places tried
+# [sigma] a peak's height, and its height under the filter of small galaxies: two noisy sides are
+# compared, and many places tried
+LEAST, LEAST_WIDE = 5.0, 6.0
 REACH_PX, N_ANGLES = 60, 32  # of a source's light, and directions in which it is followed
 LEAST_LIGHT = 0.5  # [sigma] where a source's own light ends
 UNSEEN = 1e30  # [sigma] a side that was not seen: the other one tells
@@ -106,13 +115,13 @@ def top_near(rest, place, radius):
     return centred(rest, top), float(rest[tuple(top)])
 
 
-def is_a_source(place, rest, model, image, signals, centres, fwhm):
+def is_a_source(place, height, model, image, signals, centres, fwhm, scale):
     """Whether a peak of what was left is a source of its own, as the head of this module says.
 
-    place (2,) ints: (y, x) of the peak; rest, model, image (Ny, Nx) [sigma]: left over, models,
-        what was searched
+    place (2,) ints: (y, x) of the peak; height [sigma]: of what is left there, as `top_near` says
+    model, image (Ny, Nx) [sigma]: models, what was searched
     signals: Signal of each observation; centres (S, 2) [px]: of the sources
-    fwhm [px]: of the searched image's PSF
+    fwhm [px]: of the searched image's PSF; scale [arcsec]: of a pixel
     """
     at = tuple(place)
     inside = np.clip(np.rint(centres).astype(int), 0, np.array(image.shape) - 1)
@@ -120,10 +129,11 @@ def is_a_source(place, rest, model, image, signals, centres, fwhm):
     away = np.hypot(*(centres - place).T)
     host = np.argmax(np.log(heights) - away / fwhm)  # brightest there, if light falls by e a FWHM
     clump = np.sqrt(max(heights[host], 1.0) * (model[at] + 1))
-    if rest[at] < COLOURED * clump:
-        return False
-    if rest[at] >= CLUMP * clump:
+    part = CLUMP * away[host] * scale / CLUMP_ARCSEC
+    if height >= np.clip(part, LEAST_CLUMP, MOST_CLUMP) * clump:
         return True
+    if height < COLOURED * clump:
+        return False
     # within one observation, of one PSF or nearly so: a clump is more compact than its galaxy
     near = centres[away < REACH_PX]
     differs = sum(

@@ -24,14 +24,25 @@ from ..deblending.spectra import MODEL_ERROR
 from ..sky.frame import Frame, model_frame
 from ..sky.observation import Observation
 from ..sky.sources import Extended
-from .companions import LEAST, centred, is_a_source, left_over, noise_of, top_near
-from .signal import combined, signal_of
+from .companions import (
+    LEAST,
+    LEAST_WIDE,
+    centred,
+    is_a_source,
+    left_over,
+    noise_of,
+    top_near,
+)
+from .signal import SMALL_GALAXY, combined, signal_of
 
 # [sigma] of the combined image: white noise reaches it once in two million independent pixels
 THRESHOLD = 5.0
 # [FWHM^2] least area of connected pixels above the threshold: smaller ones are not as wide as the
 # PSF, but noise on top of light just below the threshold
 MIN_AREA = 0.25
+# [FWHM^2] the same of what is left beside brighter sources: its area above the threshold is what a
+# noise that grows towards them leaves
+MIN_AREA_BESIDE = 0.125
 # sep's deblending: levels between a threshold and a peak, of equal ratio, and the part of an
 # object's light that a branch must hold to be an object of its own. SExtractor's 32 levels and
 # 0.005 lose the neighbours of bright galaxies, whose branch rises over few of the levels; a part
@@ -153,8 +164,9 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True):
     if beside and found:
         sharp = order[0]
         places = np.array([position for position, _, _ in found])
+        scale = frame.grid.pixel_scale_arcsec
         for position, peak in _companions(
-            sep, signals, sharp, everything, places, threshold, widths[sharp]
+            sep, signals, sharp, everything, places, threshold, widths[sharp], scale
         ):
             found.append((position, peak, observations[sharp].label))
     found.sort(key=lambda one: -one[1])
@@ -167,9 +179,9 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True):
     )
 
 
-def _companions(sep, signals, sharp, everything, places, threshold, fwhm):
+def _companions(sep, signals, sharp, everything, places, threshold, fwhm, scale):
     """Positions and heights of sources on the flanks of those at `places` (S, 2), in the sharpest
-    observation, whose PSF has the width fwhm [px]."""
+    observation, whose PSF has the width fwhm [px]; scale [arcsec]: of a pixel."""
     image, seen = signals[sharp].flat(), signals[sharp].n_seen > 0
     centres = np.array(
         [
@@ -178,20 +190,28 @@ def _companions(sep, signals, sharp, everything, places, threshold, fwhm):
         ]
     )
     rest, model = left_over(image, seen, centres)
+    wide, _ = left_over(signals[sharp].flat(SMALL_GALAXY), seen, centres)
     new = _new_peaks(
         sep,
         rest / noise_of(model),
         max(threshold, LEAST),
-        MIN_AREA * fwhm**2,
+        MIN_AREA_BESIDE * fwhm**2,
         list(places),
         SAME_SOURCE * fwhm,
         own=False,
     )
-    return [
-        top_near(rest, place.astype(int), round(fwhm / 2))
-        for place, _ in new
-        if is_a_source(place.astype(int), rest, model, image, signals, centres, fwhm)
-    ]
+    found: list = []
+    for place, _ in new:
+        at = place.astype(int)
+        top, height = top_near(rest, at, round(fwhm / 2))
+        # two peaks, one on either side of a top, are that one source
+        if any(np.hypot(*(top - p)) <= SAME_SOURCE * fwhm for p, _ in found):
+            continue
+        if top_near(wide, at, round(fwhm))[1] < LEAST_WIDE:
+            continue
+        if is_a_source(at, height, model, image, signals, centres, fwhm, scale):
+            found.append((top, height))
+    return found
 
 
 def _import_sep():

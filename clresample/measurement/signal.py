@@ -24,6 +24,7 @@ from ..sky.noise import sigma_below_zero
 # of their light within 0.25 arcsec) and of large faint ones. A galaxy between two of them loses
 # under a tenth of its signal to noise. Each more costs one transform a channel.
 WIDTHS_ARCSEC = (0.0, 0.2, 0.5)
+SMALL_GALAXY = 1  # which of them is that of galaxies of the usual size
 # of a channel's largest variance v: a point with less lies on pixels that are masked or not seen
 LEAST_WEIGHT = 0.1
 # of the same, below which float32 holds nothing of n any more

@@ -3,8 +3,13 @@
 import numpy as np
 import pytest
 
+from clresample.measurement import detection
 from clresample.measurement.companions import (
     CLUMP,
+    CLUMP_ARCSEC,
+    LEAST_CLUMP,
+    LEAST_WIDE,
+    MOST_CLUMP,
     centred,
     is_a_source,
     left_over,
@@ -15,6 +20,7 @@ from clresample.measurement.signal import Signal
 
 SHAPE = (121, 121)
 FWHM = 5.0  # [px] of a point in these images
+SCALE = 0.1  # [arcsec] of their pixels
 SEEN = np.ones(SHAPE, bool)
 
 
@@ -55,11 +61,13 @@ def test_a_side_that_was_not_seen_is_told_by_the_other():
     assert not rest_of(np.zeros(SHAPE), (60, 80), seen=seen)[1].any()
 
 
-def judge(image, channels, place, centre=(60.0, 60.0)):
+def judge(image, channels, place, centre=(60.0, 60.0), scale=SCALE):
     rest, model = rest_of(image, centre)
     places = np.moveaxis(np.indices(SHAPE), 0, -1).astype(float)
     signals = [Signal(channels[None, 0], channels[None, 0], SEEN.astype(int), channels, places)]
-    return is_a_source(np.array(place), rest, model, image, signals, np.array([centre]), FWHM)
+    height = rest[tuple(place)]
+    centres = np.array([centre])
+    return is_a_source(np.array(place), height, model, image, signals, centres, FWHM, scale)
 
 
 def test_a_clump_of_the_galaxys_colours_is_no_source_and_one_of_others_is():
@@ -70,11 +78,16 @@ def test_a_clump_of_the_galaxys_colours_is_no_source_and_one_of_others_is():
     assert judge(galaxy + clump, other, (60, 71))
 
 
-def test_what_is_bright_beside_the_light_about_it_is_a_source_in_any_colour():
+@pytest.mark.parametrize(
+    "away_arcsec, part",
+    ((0.1, LEAST_CLUMP), (CLUMP_ARCSEC, CLUMP), (1.1 * CLUMP_ARCSEC, 1.1 * CLUMP), (3, MOST_CLUMP)),
+)
+def test_what_is_bright_beside_the_light_about_it_is_a_source_in_any_colour(away_arcsec, part):
     galaxy = spot((60, 60), 100, sigma=4)
-    for height, is_one in ((0.5 * CLUMP * 10, False), (1.5 * CLUMP * 10, True)):
+    for height, is_one in ((0.9 * part * 10, False), (1.1 * part * 10, True)):
         image = galaxy + spot((60, 76), height)  # where there is next to no light: H = 100, m = 0
-        assert judge(image, np.stack([image, image]), (60, 76)) == is_one
+        both = np.stack([image, image])
+        assert judge(image, both, (60, 76), scale=away_arcsec / 16) == is_one
 
 
 def test_centres_are_found_to_part_of_a_pixel():
@@ -94,3 +107,28 @@ def test_the_top_of_what_is_left_is_nearer_than_its_peak_in_units_of_the_noise()
     corner = np.zeros(SHAPE)
     corner[0, 1] = 3.0
     assert top_near(corner, (1, 0), 2) == (pytest.approx((0, 1)), 3.0)
+
+
+def beside(narrow, wide, monkeypatch):
+    """Places of neighbours of the source at (60, 60), where two peaks are seen about (60, 72)."""
+    sums = np.stack([narrow, wide])
+    places = np.moveaxis(np.indices(SHAPE), 0, -1).astype(float)
+    signals = [Signal(sums, sums**2, SEEN.astype(int), narrow[None], places)]
+    peaks = [(np.array([60.0, x]), 9.0) for x in (71, 73)]
+    monkeypatch.setattr(detection, "_new_peaks", lambda *args, **more: peaks)
+    at = np.array([[60.0, 60.0]])
+    found = detection._companions(None, signals, 0, narrow, at, 5.0, FWHM, SCALE)
+    return [place for place, _ in found]
+
+
+def test_two_peaks_about_one_top_are_one_neighbour(monkeypatch):
+    image = spot((60, 60), 300, sigma=4) + spot((60, 72), 90)
+    (place,) = beside(image, image, monkeypatch)
+    assert np.hypot(*(place - (60, 72))) < 1
+
+
+def test_a_neighbour_is_seen_under_the_filter_of_small_galaxies_too(monkeypatch):
+    host = spot((60, 60), 300, sigma=4)
+    for height, n in ((0.9 * LEAST_WIDE, 0), (1.3 * LEAST_WIDE, 1)):
+        wide = host + spot((60, 72), height)
+        assert len(beside(host + spot((60, 72), 90), wide, monkeypatch)) == n
