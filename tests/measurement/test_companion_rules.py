@@ -110,29 +110,34 @@ def spectra_signal(spectra):
 
 @pytest.mark.parametrize("light, clump", [(0.0, 10.0), (3.0, 20.0)])
 def test_clumps_grow_with_the_root_of_peak_and_light(light, clump):
-    """Of a galaxy of 100 sigma: CLUMP and COLOURED times sqrt(100 (light + 1))."""
-    image, model, rest = np.zeros((3, 40, 40))
+    """Of a galaxy of 100 sigma: CLUMP and COLOURED times sqrt(100 (light + 1)), where pixels are so
+    large that the peak is 0.8 arcsec from its centre; further away more, up to MOST_CLUMP."""
+    image, model = np.zeros((2, 40, 40))
     image[20, 8], model[20, 30] = 100.0, light
     centres = np.array([[20.2, 7.9]])
     other = [spectra_signal({(20, 30): (90.0, 0.0), (20, 8): (0.0, 100.0)})]
     same = [spectra_signal({(20, 30): (9.0, 9.0), (20, 8): (90.0, 90.0)})]
 
-    def judged(height, signals):
-        rest[20, 30] = height * clump
-        return is_a_source(np.array([20, 30]), rest, model, image, signals, centres, 4.0)
+    def judged(height, signals, far=1.0):
+        scale = far * 0.8 / np.hypot(0.2, 22.1)
+        given = model, image, signals, centres, 4.0, scale
+        return is_a_source(np.array([20, 30]), height * clump, *given)
 
     assert [judged(h, same) for h in (0.449, 0.451)] == [False, True]
-    assert [judged(h, other) for h in (0.199, 0.201)] == [False, True]
+    assert [judged(h, same, 1.5) for h in (0.674, 0.676)] == [False, True]
+    assert [judged(h, same, 3.0) for h in (0.749, 0.751)] == [False, True]
+    assert [judged(h, same, 0.1) for h in (0.149, 0.151)] == [False, True]
+    assert [judged(h, other) for h in (0.149, 0.151)] == [False, True]
     assert not judged(0.3, [spectra_signal({(20, 30): (90.0,), (20, 8): (100.0,)})])
 
 
-@pytest.mark.parametrize("beyond, is_one", [(11.8, False), (12.2, True)])
-def test_a_colour_is_another_from_twelve_beyond_its_mean_on(beyond, is_one):
+@pytest.mark.parametrize("beyond, is_one", [(7.8, False), (8.2, True)])
+def test_a_colour_is_another_from_eight_beyond_its_mean_on(beyond, is_one):
     """chi2 of what is left in one channel, of a host seen in the other alone: v^2 / 2 - 1."""
-    image, model, rest = np.zeros((3, 40, 40))
-    image[20, 8], rest[20, 30] = 100.0, 3.0
+    image, model = np.zeros((2, 40, 40))
+    image[20, 8] = 100.0
     signal = spectra_signal({(20, 30): (np.sqrt(2 * (beyond + 1)), 0), (20, 8): (0.0, 100.0)})
-    given = rest, model, image, [signal], np.array([[20.0, 8.0]]), 4.0
+    given = 3.0, model, image, [signal], np.array([[20.0, 8.0]]), 4.0, 0.1
     assert is_a_source(np.array([20, 30]), *given) == is_one
 
 
@@ -142,22 +147,20 @@ def test_the_host_is_the_brightest_where_light_falls_by_e_a_fwhm():
     Centres beyond the edges count as on them."""
     signals = []
     for place, host in (((20, 12), 50.0), ((20, 22), 1000.0)):
-        image, model, rest = np.zeros((3, 41, 43))
+        image, model = np.zeros((2, 41, 43))
         image[20, 42], image[20, 4] = 1000.0, 50.0
         centres = np.array([[20.0, 42.9], [20.0, 4.0]])
-        for height, is_one in ((0.44, False), (0.46, True)):
-            rest[place] = height * np.sqrt(host)
-            found = is_a_source(np.array(place), rest, model, image, signals, centres, 5.0)
-            assert found == is_one
+        for part, is_one in ((0.74, False), (0.76, True)):
+            height = part * np.sqrt(host)
+            given = model, image, signals, centres, 5.0, 1.0
+            assert is_a_source(np.array(place), height, *given) == is_one
 
 
 def test_a_host_fainter_than_the_noise_counts_as_the_noise():
-    image, model, rest = np.zeros((3, 20, 20))
-    rest[10, 10] = 0.46
-    given = np.array([10, 10]), rest, model, image, [], np.array([[10.0, 5.0]]), 4.0
-    assert is_a_source(*given)
-    rest[10, 10] = 0.44
-    assert not is_a_source(*given)
+    image, model = np.zeros((2, 20, 20))
+    given = model, image, [], np.array([[10.0, 5.0]]), 4.0, 0.16
+    assert is_a_source(np.array([10, 10]), 0.46, *given)
+    assert not is_a_source(np.array([10, 10]), 0.44, *given)
 
 
 def test_spectra_differ_by_chi2_beyond_its_mean():
@@ -213,12 +216,13 @@ def test_a_neighbour_on_a_flank_is_found_in_one_channel():
 
     image = spot((40, 38), 300, 4) + spot((40, 48), 60, 1.7)
     places = np.moveaxis(np.indices(image.shape), 0, -1).astype(float)
-    signal = Signal(image[None], image[None] ** 2, np.ones(image.shape, int), image[None], places)
+    both = np.stack([image, image])  # under both filters that are asked
+    signal = Signal(both, both**2, np.ones(image.shape, int), image[None], places)
     given = sep, [signal], 0, image, np.array([[40.0, 38.0]])
-    ((place, height),) = detection._companions(*given, 5.0, 4.0)
+    ((place, height),) = detection._companions(*given, 5.0, 4.0, 0.1)
     assert np.hypot(*(place - (40, 48))) < 0.7 and height == pytest.approx(60, rel=0.15)
-    assert detection._companions(*given, 100.0, 4.0) == []
-    assert detection._companions(*given, 5.0, 15.0) == []  # the same source, in so wide a PSF
+    assert detection._companions(*given, 100.0, 4.0, 0.1) == []
+    assert detection._companions(*given, 5.0, 15.0, 0.1) == []  # the same source, in so wide a PSF
 
 
 def test_what_no_channel_has_seen_is_told_by_the_other_side(monkeypatch):
@@ -232,12 +236,13 @@ def test_what_no_channel_has_seen_is_told_by_the_other_side(monkeypatch):
     monkeypatch.setattr(detection, "_new_peaks", lambda *_, **__: [])
     n_seen = np.array([[0, 1, 2]] * 3)
     image = np.zeros((3, 3), np.float32)
-    signal = Signal(image[None], image[None], n_seen, image[None], np.zeros((3, 3, 2)))
-    detection._companions(None, [signal], 0, image, np.array([[1.0, 1.0]]), 5.0, 4.0)
+    both = np.stack([image, image])  # under both filters that are asked
+    signal = Signal(both, both, n_seen, image[None], np.zeros((3, 3, 2)))
+    detection._companions(None, [signal], 0, image, np.array([[1.0, 1.0]]), 5.0, 4.0, 0.1)
     assert given[0].tolist() == [[False, True, True]] * 3
 
 
-def test_companions_have_six_sigma_however_low_the_threshold(monkeypatch):
+def test_companions_have_five_sigma_however_low_the_threshold(monkeypatch):
     given = []
 
     def searched(_sep, _image, threshold, area, known, apart, own):
@@ -247,8 +252,9 @@ def test_companions_have_six_sigma_however_low_the_threshold(monkeypatch):
     monkeypatch.setattr(detection, "_new_peaks", searched)
     image = np.zeros((20, 20), np.float32)
     places = np.moveaxis(np.indices(image.shape), 0, -1).astype(float)
-    signal = Signal(image[None], image[None], np.ones(image.shape, int), image[None], places)
+    both = np.stack([image, image])  # under both filters that are asked
+    signal = Signal(both, both, np.ones(image.shape, int), image[None], places)
     for threshold in (2.0, 8.0):
         where = np.array([[10.0, 10.0]])
-        detection._companions(None, [signal], 0, image, where, threshold, 4.0)
-    assert given == [(6, 4, 1, 0.7 * 4, False), (8, 4, 1, 0.7 * 4, False)]
+        detection._companions(None, [signal], 0, image, where, threshold, 4.0, 0.1)
+    assert given == [(5, 2, 1, 0.7 * 4, False), (8, 2, 1, 0.7 * 4, False)]
