@@ -60,7 +60,7 @@ def ask(fits):
     going = [i for i, own in enumerate(which) if len(own)]
     out: list[Asked | None] = [None] * len(fits)
     if going:
-        models = [_model(fits[i], which[i]) for i in going]
+        models = [model_of(fits[i], which[i]) for i in going]
         found = see(models, fit_sky=fits[0].settings.fit_sky)
         for i, seen in zip(going, found, strict=True):
             out[i] = _asked(fits[i], which[i], seen)
@@ -83,9 +83,9 @@ def _is_free(source):
     return isinstance(source, Extended) and source.n_components is None and source.profile is None
 
 
-def _model(fit, which):
+def model_of(fit, which=()):
     """All morphologies of a fit, and after them the cores of the components `which` (k,)."""
-    scene, morphs = fit.scene, list(fit.state.morph)
+    scene, morphs, which = fit.scene, list(fit.state.morph), np.array(which, int)
     cores = [morphs[i] * scene.profile[i] for i in which]
     source, origin = (np.concatenate([of, of[which]]) for of in (fit.start.source, scene.origin))
     bare = [None] * len(fit.views)
@@ -93,7 +93,7 @@ def _model(fit, which):
 
 
 def _asked(fit, which, seen):
-    """What the images of `_model` as they are Seen say."""
+    """What the images of `model_of` as they are Seen say."""
     spectra, sky, n = fit.state.spectra, fit.state.sky, len(fit.state.morph)
     slope, power = np.zeros((2, n + len(which), len(sky)))
     chi2, light, bare = np.zeros(len(which)), np.zeros(len(which)), []

@@ -12,9 +12,9 @@ from ...sky.sources import Extended
 from ..blend import INTERRUPTED
 from ..iterate import iterate
 from ..start.first_scene import first_scene
-from ..start.seen import Model, see
+from ..start.seen import see
 from ..start.start import Patch, start
-from .gradients import ask
+from .gradients import ask, model_of
 
 # What a second component must lower the loss by, for each number that it adds: a spectrum and a
 # profile's four. Half a unit each is what noise alone gives.
@@ -89,7 +89,7 @@ def _begun(fits):
 def _misfits(fits):
     """chi2 (n,) of Fits of one signature where they are, with the best spectra."""
     found = []
-    images = see([_model(fit) for fit in fits], fit_sky=fits[0].settings.fit_sky)
+    images = see([model_of(fit) for fit in fits], fit_sky=fits[0].settings.fit_sky)
     for fit, seen in zip(fits, images, strict=True):
         chi2 = 0.0
         for view, image, part in zip(fit.views, seen.observed, fit.scene.channels(), strict=True):
@@ -107,13 +107,6 @@ def _again(fit, point):
     new.losses, new.status, new.findings = [], "iteration limit", None
     new.messages, new.seconds = list(fit.messages), {}
     return new
-
-
-def _model(fit):
-    """A Fit's morphologies as they are."""
-    bare = [None] * len(fit.views)
-    own = fit.start.source, fit.scene.origin, list(fit.state.morph)
-    return Model(fit.padded.shape, fit.views, bare, *own)
 
 
 def _together(patch, double):

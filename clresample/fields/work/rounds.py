@@ -114,8 +114,7 @@ class _Parts:
         """
         found: dict[int, int] = {}
         for name in sorted({self.names[patch][-1] for patch in patches}):
-            table = _file(self.job, name).table("COMPONENTS")
-            for source, patch in zip(table["id"].tolist(), table["patch"].tolist(), strict=True):
+            for source, patch in _owners(_file(self.job, name)):
                 if patch in patches:
                     found[source] = found.get(source, 0) + 1
         return tuple(sorted(found.items()))
@@ -143,13 +142,18 @@ class _Parts:
             of_name.setdefault(name, set()).add(patch)
         for name, patches in of_name.items():
             part = _file(self.job, name)
-            rows, components = part.table("CATALOGUE"), part.table("COMPONENTS")
-            where = dict(zip(components["id"].tolist(), components["patch"].tolist(), strict=True))
+            rows, where = part.table("CATALOGUE"), dict(_owners(part))
             flux, error = (_columns(rows, kind, self.job) for kind in ("flux", "flux_err"))
             for k, source in enumerate(rows["id"].tolist()):
                 if where.get(source) in patches:
                     found[source] = where[source], flux[k], error[k]
         return found
+
+
+def _owners(part):
+    """(id of the source, patch) of each component in a PartFile."""
+    table = part.table("COMPONENTS")
+    return list(zip(table["id"].tolist(), table["patch"].tolist(), strict=True))
 
 
 def _columns(rows, kind, job):
