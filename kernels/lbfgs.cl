@@ -2,36 +2,46 @@
  *
  * A vector holds the variables of all scenes.  Chunks of it belong to one scene each:
  *   chunks    (n, 4) int: scene, first element, length, whether its variables are at least 0
- *   ring_s, ring_y (SLOTS, size)  changes of x and of g in earlier iterations, one each in a slot
+ *   ring_s, ring_hy (SLOTS, size)  changes of x in earlier iterations, and of g times the inverse
+ *             of the curvature, one each in a slot
  *   plan      (B, 3) int: MODE, what to do with the scene, one of the modes below; USED, how many
  *             slots, from the first on; SPARE, the slot among them that takes what a trial changes
  * x, g: where a scene is, and the gradient there; x_new, g_new: those of its trial; d: direction
  * h: the inverse of the curvature's diagonal.  A variable is held where it must not fall: bounded,
  * x <= 0 and g > 0.  P g is g where variables are free and 0 where they are held.
+ * H: h, but for the variables of blocks, whose part of it is the sum of their blocks' full matrices
+ *   blocks    (n, 4) int: scene, variables m, the first of its indices, its matrix's first element
+ *             / ALIGN;  indices: of the variables;  matrices: (m, m) each, symmetric
  *
- * change    s = x_new - x and y = g_new - g into the spare slots, and for each chunk the sums
- *           s_k . P g_new, y_k . h P g_new, s_k . y, y_k . h y of each slot k, g . s and
- *           x_new . precision x_new;  out (n, 4 SLOTS + 2);  scenes at rest stay as they are
- * gram      s_k . y_l and y_k . h y_l of all slots, out (n, 2 SLOTS SLOTS)
- * advance   NEXT: x, g <- x_new, g_new and d = P (h scale (sum_k a_k y_k - P g) - sum_k c_k s_k)
- *           AGAIN: the same d from the x and g that are there; TRY: d as it is
+ * trial     s = x_new - x and h y into the spare slots, y = g_new - g, P g_new and h P g_new;
+ *           scenes at rest stay as they are, here and below
+ * invert    what blocks, which share no variable, say of H y and H P g_new, in place of what there
+ *           was or, with `more`, added to it; launch: (WG, n blocks), groups of (WG, 1)
+ * change    for each chunk the sums s_k . P g_new, H y_k . P g_new, s_k . y, H y_k . y of each slot
+ *           k, g . s and x_new . precision x_new;  out (n, 4 SLOTS + 2)
+ * advance   NEXT: x, g, hg <- x_new, g_new, H P g_new, and
+ *           d = P (scale (sum_k a_k H y_k - hg) - sum_k c_k s_k)
+ *           AGAIN: the same d from the x, g, hg that are there; TRY: d as it is
  *           then x_new = x + length d, at least 0 where bounded;  STAY: x_new = x
  *           coefficients (B, 2 SLOTS + 2): a, c, scale, length
  * reweigh   after new strengths of the prior: precision, h = 1 / (precision + curvature light),
- *           g_new += change x_new, y_k += change s_k in every slot; launch: (WG, n_scales, n_free)
+ *           g_new += change x_new; launch: (WG, n_scales, n_free)
  *           weights (S, n_scales, 3): precision, curvature, change
  * take      spectra and sky levels out of x, n of them in all;  launch: any, see FOR_I of group.h
  * give      their gradients into g_new: pull[b, row] summed over rows row0[c] .. row0[c + 1] - 1
  *           launch: as take
  * move      values[row, first + i] = values_from[row, source + i] of each chunk, the source of each
  *           given; launch: (WG, n chunks, rows)
- * launch of change, gram, advance: (WG, n chunks), groups of (WG, 1)
+ * launch of trial, change, advance: (WG, n chunks), groups of (WG, 1)
  */
 #include "common.h"
 #include "boxes.h"
 #include "group.h"
 #ifndef SLOTS       /* of the ring: pairs that are remembered, and the spare one */
 #define SLOTS 21
+#endif
+#ifndef MOST        /* variables of a block, at most */
+#define MOST 512
 #endif
 #define PLAN(b, what) plan[3 * (b) + what]
 enum { MODE, USED, SPARE };
@@ -78,15 +88,13 @@ enum { MODE, USED, SPARE };
     }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
-void change(__global const int *restrict chunks, __global const int *restrict plan,
-            const ulong size, __global const REAL *restrict precision,
-            __global const REAL *restrict x, __global const REAL *restrict x_new,
-            __global const REAL *restrict g, __global const REAL *restrict g_new,
-            __global const REAL *restrict h, __global REAL *ring_s, __global REAL *ring_y,
-            __global REAL *restrict projected, __global REAL *restrict weighed_g,
-            __global REAL *restrict weighed_y, __global REAL *restrict out)
+void trial(__global const int *restrict chunks, __global const int *restrict plan,
+           const ulong size, __global const REAL *restrict x, __global const REAL *restrict x_new,
+           __global const REAL *restrict g, __global const REAL *restrict g_new,
+           __global const REAL *restrict h, __global REAL *restrict ring_s,
+           __global REAL *restrict ring_hy, __global REAL *restrict y,
+           __global REAL *restrict projected, __global REAL *restrict hg_new)
 {
-    __local REAL share[WG];
     CHUNK
     if (PLAN(b, MODE) == REST) return;
     const size_t at = PLAN(b, SPARE) * (size_t)size + first;
@@ -94,29 +102,95 @@ void change(__global const int *restrict chunks, __global const int *restrict pl
         const REAL gi = g_new[first + i], yi = gi - g[first + i];
         const REAL p = bounded && x_new[first + i] <= 0 && gi > 0 ? (REAL)0 : gi;
         ring_s[at + i] = x_new[first + i] - x[first + i];
-        ring_y[at + i] = yi;
+        ring_hy[at + i] = h[first + i] * yi;
+        y[first + i] = yi;
         projected[first + i] = p;
-        weighed_g[first + i] = h[first + i] * p;
-        weighed_y[first + i] = h[first + i] * yi;
+        hg_new[first + i] = h[first + i] * p;
+    }
+}
+
+__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
+void invert(__global const int *restrict blocks, __global const int *restrict indices,
+            __global const REAL *restrict matrices, __global const int *restrict plan,
+            const ulong size, const int more, __global const REAL *restrict y,
+            __global const REAL *restrict projected, __global REAL *restrict ring_hy,
+            __global REAL *restrict hg_new)
+{
+    __local REAL ys[MOST], ps[MOST];
+    const int lid = (int)get_local_id(0), block = (int)get_global_id(1);
+    /* of a scene at rest no variables: PoCL's groups crash where one returns before a SYNC */
+    const int b = blocks[4 * block], m = PLAN(b, MODE) == REST ? 0 : blocks[4 * block + 1];
+    __global const int *index = indices + blocks[4 * block + 2];
+    __global const REAL *matrix = matrices + (size_t)blocks[4 * block + 3] * ALIGN;
+    __global REAL *hy = ring_hy + PLAN(b, SPARE) * (size_t)size;
+    for (int k = lid; k < m; k += WG) {
+        ys[k] = y[index[k]];
+        ps[k] = projected[index[k]];
     }
     SYNC();
+#if ROWS
+    for (int i = lid; i < m; i += WG) {     /* along rows, whose sums a compiler for CPUs splits */
+        __global const REAL *row = matrix + (size_t)i * m;
+        REAL of_y[LANES], of_p[LANES], sum_y = 0, sum_p = 0;
+        for (int l = 0; l < LANES; ++l) of_y[l] = of_p[l] = 0;
+        int k0 = 0;
+        for (; k0 + LANES <= m; k0 += LANES)
+            for (int l = 0; l < LANES; ++l) {
+                of_y[l] += row[k0 + l] * ys[k0 + l];
+                of_p[l] += row[k0 + l] * ps[k0 + l];
+            }
+        for (; k0 < m; ++k0) {
+            sum_y += row[k0] * ys[k0];
+            sum_p += row[k0] * ps[k0];
+        }
+        for (int l = 0; l < LANES; ++l) {
+            sum_y += of_y[l];
+            sum_p += of_p[l];
+        }
+        hy[index[i]] = more ? hy[index[i]] + sum_y : sum_y;
+        hg_new[index[i]] = more ? hg_new[index[i]] + sum_p : sum_p;
+    }
+#else
+    for (int i = lid; i < m; i += WG) {     /* down columns, where neighbours read neighbours */
+        REAL sum_y = 0, sum_p = 0;
+        for (int k = 0; k < m; ++k) {
+            const REAL value = matrix[(size_t)k * m + i];
+            sum_y += value * ys[k];
+            sum_p += value * ps[k];
+        }
+        hy[index[i]] = more ? hy[index[i]] + sum_y : sum_y;
+        hg_new[index[i]] = more ? hg_new[index[i]] + sum_p : sum_p;
+    }
+#endif
+}
+
+__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
+void change(__global const int *restrict chunks, __global const int *restrict plan,
+            const ulong size, __global const REAL *restrict precision,
+            __global const REAL *restrict x_new, __global const REAL *restrict g,
+            __global const REAL *restrict y, __global const REAL *restrict projected,
+            __global const REAL *restrict ring_s, __global const REAL *restrict ring_hy,
+            __global REAL *restrict out)
+{
+    __local REAL share[WG];
+    CHUNK
+    if (PLAN(b, MODE) == REST) return;
     __global REAL *to = out + (size_t)chunk * (4 * SLOTS + 2);
-    __global const REAL *p = projected + first, *hg = weighed_g + first, *hy = weighed_y + first;
-    __global const REAL *y = ring_y + at, *s = ring_s + at, *before = g + first;
+    __global const REAL *p = projected + first, *dg = y + first, *before = g + first;
     for (int k = 0; k < PLAN(b, USED); ++k) {
         __global const REAL *sk = ring_s + k * (size_t)size + first;
-        __global const REAL *yk = ring_y + k * (size_t)size + first;
+        __global const REAL *hyk = ring_hy + k * (size_t)size + first;
         SUMS(s_g)
         SUMS(y_g)
         SUMS(s_y)
         SUMS(y_y)
         FOR_LANES(n, {
             const REAL si = sk[i];
-            const REAL yi = yk[i];
+            const REAL hyi = hyk[i];
             s_g[l] += si * p[i];
-            y_g[l] += yi * hg[i];
-            s_y[l] += si * y[i];
-            y_y[l] += yi * hy[i];
+            y_g[l] += hyi * p[i];
+            s_y[l] += si * dg[i];
+            y_y[l] += hyi * dg[i];
         })
         PUT(s_g, to[4 * k])
         PUT(y_g, to[4 * k + 1])
@@ -124,6 +198,7 @@ void change(__global const int *restrict chunks, __global const int *restrict pl
         PUT(y_y, to[4 * k + 3])
     }
     __global const REAL *weight = precision + first, *there = x_new + first;
+    __global const REAL *s = ring_s + PLAN(b, SPARE) * (size_t)size + first;
     SUMS(slope)
     SUMS(energy)
     FOR_LANES(n, {
@@ -135,43 +210,12 @@ void change(__global const int *restrict chunks, __global const int *restrict pl
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
-void gram(__global const int *restrict chunks, __global const int *restrict plan,
-          const ulong size, __global const REAL *restrict h,
-          __global const REAL *restrict ring_s, __global const REAL *restrict ring_y,
-          __global REAL *restrict weighed_y, __global REAL *restrict out)
-{
-    __local REAL share[WG];
-    CHUNK
-    if (PLAN(b, MODE) == REST) return;
-    __global REAL *to = out + (size_t)chunk * (2 * SLOTS * SLOTS);
-    __global const REAL *hy = weighed_y + first;
-    for (int m = 0; m < PLAN(b, USED); ++m) {
-        __global const REAL *yl = ring_y + m * (size_t)size + first;
-        for (int i = lid; i < n; i += WG) weighed_y[first + i] = h[first + i] * yl[i];
-        SYNC();
-        for (int k = 0; k < PLAN(b, USED); ++k) {
-            __global const REAL *sk = ring_s + k * (size_t)size + first;
-            __global const REAL *yk = ring_y + k * (size_t)size + first;
-            SUMS(s_y)
-            SUMS(y_y)
-            FOR_LANES(n, {
-                s_y[l] += sk[i] * yl[i];
-                y_y[l] += yk[i] * hy[i];
-            })
-            PUT(s_y, to[2 * (k * SLOTS + m)])
-            PUT(y_y, to[2 * (k * SLOTS + m) + 1])
-        }
-        SYNC();
-    }
-}
-
-__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
 void advance(__global const int *restrict chunks, __global const int *restrict plan,
           __global const REAL *restrict coefficients, const ulong size,
-          __global const REAL *restrict h, __global const REAL *restrict ring_s,
-          __global const REAL *restrict ring_y, __global const REAL *restrict g_new,
-          __global REAL *restrict x, __global REAL *restrict g, __global REAL *restrict d,
-          __global REAL *restrict x_new)
+          __global const REAL *restrict ring_s, __global const REAL *restrict ring_hy,
+          __global const REAL *restrict g_new, __global const REAL *restrict hg_new,
+          __global REAL *restrict x, __global REAL *restrict g, __global REAL *restrict hg,
+          __global REAL *restrict d, __global REAL *restrict x_new)
 {
     CHUNK
     const int now = PLAN(b, MODE);
@@ -185,17 +229,17 @@ void advance(__global const int *restrict chunks, __global const int *restrict p
             for (int i = 0; i < m; ++i) {
                 x[at + i] = x_new[at + i];
                 g[at + i] = g_new[at + i];
+                hg[at + i] = hg_new[at + i];
             }
         if (now == NEXT || now == AGAIN) {
             REAL q[BLOCK];
-            for (int i = 0; i < m; ++i)
-                q[i] = bounded && x[at + i] <= 0 && g[at + i] > 0 ? (REAL)0 : -g[at + i];
+            for (int i = 0; i < m; ++i) q[i] = -hg[at + i];
             for (int k = 0; k < PLAN(b, USED); ++k) {
                 const REAL ak = a[k];
-                __global const REAL *y = ring_y + k * (size_t)size + at;
-                if (ak != 0) for (int i = 0; i < m; ++i) q[i] += ak * y[i];
+                __global const REAL *hy = ring_hy + k * (size_t)size + at;
+                if (ak != 0) for (int i = 0; i < m; ++i) q[i] += ak * hy[i];
             }
-            for (int i = 0; i < m; ++i) q[i] *= scale * h[at + i];
+            for (int i = 0; i < m; ++i) q[i] *= scale;
             for (int k = 0; k < PLAN(b, USED); ++k) {
                 const REAL ck = c[k];
                 __global const REAL *s = ring_s + k * (size_t)size + at;
@@ -212,18 +256,16 @@ void advance(__global const int *restrict chunks, __global const int *restrict p
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
-void reweigh(__global const int *restrict active, __global const int *restrict table,
+void reweigh(__global const int *restrict active,
              __global const int *restrict planes, __global const REAL *restrict weights,
-             __global const int *restrict plan, const ulong size,
              __global const REAL *restrict light, __global const REAL *restrict x_new,
-             __global const REAL *restrict ring_s, __global REAL *restrict g_new,
-             __global REAL *restrict ring_y, __global REAL *restrict precision,
+             __global REAL *restrict g_new, __global REAL *restrict precision,
              __global REAL *restrict h)
 {
     const int lid = (int)get_local_id(0);
     const int j = (int)get_global_id(1), n_scales = (int)get_global_size(1);
     const int i_plane = active[get_global_id(2)] * n_scales + j;
-    const int b = BOX(active[get_global_id(2)])[SCENE], n = planes[2 * i_plane + 1];
+    const int n = planes[2 * i_plane + 1];
     const size_t first = (size_t)planes[2 * i_plane];
     const REAL stiff = weights[3 * i_plane], curvature = weights[3 * i_plane + 1];
     const REAL more = weights[3 * i_plane + 2];
@@ -232,10 +274,6 @@ void reweigh(__global const int *restrict active, __global const int *restrict t
         h[i] = 1 / (stiff + curvature * light[i]);
         g_new[i] += more * x_new[i];
     }
-    if (more != 0)
-        for (int k = 0; k < PLAN(b, USED); ++k)
-            for (size_t i = first + lid; i < first + n; i += WG)
-                ring_y[k * (size_t)size + i] += more * ring_s[k * (size_t)size + i];
 }
 
 __kernel void take(const int n_latents, const int n_spectra, const int n,

@@ -13,7 +13,6 @@ from .blend import INTERRUPTED
 from .posterior.posterior import errors_of
 from .rendered import Rendered
 from .result import Component, Result
-from .shifts import shift_steps
 from .solver.learned.engine import vector_bytes
 from .solver.scene import Scene, State, signature_of
 from .start.first_scene import first_scene
@@ -80,6 +79,7 @@ class Fit:
         self.padded, self._positions, self.start = padded, positions, None
         self.losses, self.status, self.findings = [], "iteration limit", None
         self._best = _Best(np.inf, None, None, self.shifts)
+        self.last_steps = np.zeros_like(self.shifts)
         self.seconds = {"setup": time.perf_counter() - began}
 
     @property
@@ -113,10 +113,6 @@ class Fit:
         """Move the observations' pixels to these shifts."""
         for view, shift in zip(self.views, shifts, strict=True):
             view.op.shift = shift
-
-    def move(self, scene, state):
-        """Shift the observations to where the model, as it is by now, fits each of them best."""
-        self.shift(self.shifts + shift_steps(scene, state))
 
     def stopped(self, losses) -> bool:
         """Take the losses (n,) of the last iterations; whether the fit ends here, and why."""

@@ -7,7 +7,7 @@ import time
 import numpy as np
 
 from .resize import resized
-from .shifts import shift_steps
+from .shifts import ahead, shift_steps
 from .solver.engine import Engine
 from .solver.learned.engine import LearnedEngine
 
@@ -19,9 +19,9 @@ MOVE = 10
 # Part of a batch's fits that have stopped by when the others go on in a smaller batch: making that
 # costs some iterations, and until then the stopped ones are still computed.
 REPACK = 0.25
-# [model px] A fit under a LearnedPrior whose observations would all move by less stays where it is:
-# each shift makes its solver forget. So little changes no flux by 0.01 %.
-LEAST_MOVE_PX = 0.003
+# A fit under a LearnedPrior stays where it is if the next shift would lower its loss by less than
+# this part of `enough`.
+LEAST_GAIN = 0.5
 # [iterations] between two adjustments of the boxes to the light they hold; each makes a new batch.
 RESIZE = 40
 
@@ -110,7 +110,8 @@ class _Running:
         self.remember(self.live)
         states = self.engine.states()
         for i in np.flatnonzero(self.live):
-            self.fits[i].move(self.engine.scenes[i], states[i])
+            f = self.fits[i]
+            f.shift(f.shifts + shift_steps(self.engine.scenes[i], states[i])[0])
         self.engine.follow_shifts()
 
     def repacked(self) -> _Running:
@@ -189,10 +190,12 @@ class _Learning:
             return
         states, moved = self.engine.states(), np.zeros(len(self.fits), bool)
         for i in np.flatnonzero(which):
-            scene, state = self.engine.scenes[i], states[i]
-            moved[i] = (np.abs(shift_steps(scene, state)) > LEAST_MOVE_PX).any()
+            steps, gain = shift_steps(self.engine.scenes[i], states[i])
+            moved[i] = gain > LEAST_GAIN * self.settings.enough
             if moved[i]:
-                self.fits[i].move(scene, state)
+                f = self.fits[i]
+                f.shift(f.shifts + ahead(steps, f.last_steps))
+                f.last_steps = steps
         if moved.any():
             self.engine.follow_shifts(moved)
 

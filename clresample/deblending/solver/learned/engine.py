@@ -15,6 +15,7 @@ import numpy as np
 from ..buffers import Buffers
 from ..gradient import Gradient
 from ..scene import State
+from .inverse import MOST
 from .pairs import Pairs
 from .progress import Progress
 from .steps import REST, STAY, TRY, Steps
@@ -22,8 +23,8 @@ from .strengths import Strengths
 from .structure import Structure, coarse
 from .vectors import Vectors
 
-# Pairs of changes that a scene remembers: 10 take 10 to 20 % more iterations, 40 hardly fewer.
-N_PAIRS = 20
+# Pairs of changes that a scene remembers: 20 take no fewer iterations, 5 some more.
+N_PAIRS = 10
 # Part of the largest power of a source in any channel under which a channel holds nothing of it.
 UNSEEN = 1e-14
 
@@ -55,7 +56,8 @@ class LearnedEngine:
             spectra, sky = np.concatenate([s.spectra for s in states]), [s.sky for s in states]
             v.start(spectra, sky, _inverse_curvature(scenes))
             self._rest_others(self.progress.live)
-            self.steps.reweigh(self.strengths.light, self.strengths.weights(spectra))
+            weights = self.strengths.weights(spectra)
+            self.steps.reweigh(self.strengths.light, weights, self.strengths.blocks)
         else:
             engine, keep = past
             self.progress, self.pairs = engine.progress.take(keep), engine.pairs.take_scenes(keep)
@@ -64,6 +66,7 @@ class LearnedEngine:
             )
             v.copy_from(engine.vectors, keep)
             self._rest_others(self.progress.live)
+            self.steps.take_blocks(self.strengths.blocks)
 
     def take(self, keep):
         """An engine of the scenes `keep` (n,) alone, which go on as if nothing had happened."""
@@ -116,9 +119,8 @@ class LearnedEngine:
         spectra = self.device.get(self.buffers.spectra).astype(np.float64)
         moved, weights, change = self.strengths.learn(due, energies, spectra)
         self._rest_others(self.progress.live)
-        self.steps.reweigh(self.strengths.light, weights)
-        sy, yy = self.steps.gram()
-        self.pairs.renew(due, sy[due], yy[due])
+        self.steps.reweigh(self.strengths.light, weights, self.strengths.blocks)
+        self.pairs.forget(due)
         self.progress.learned(due, moved, change)
         return self.steps.change()[0]  # its s and y go into spare slots
 
@@ -146,7 +148,6 @@ class LearnedEngine:
         """Take over the shifts that the operators of the scenes `moved` (B,) have by now."""
         self._gradient.follow_shifts()
         self.progress.look_again(moved)
-        self.pairs.forget(moved)
         nothing = np.zeros((len(self.scenes), N_PAIRS + 1))
         self.steps.follow(self.pairs, np.where(moved, STAY, REST))
         self.steps.advance(nothing, nothing, nothing[:, 0], nothing[:, 0])
@@ -159,10 +160,11 @@ def _n_pixels(scene):
 
 
 def vector_bytes(scene, prior) -> int:
-    """Device memory [bytes] of the scene's vectors in a batch, roughly: of float64, those of the
-    ring, nine others and the light."""
-    n = sum(coarse(p.shape, step).prod() for p in scene.profile for step in prior.steps)
-    return int(8 * (2 * (N_PAIRS + 1) + 10) * (n + scene.power.size))
+    """Device memory [bytes] of the scene's vectors in a batch, roughly, of float64: both rings,
+    twelve others and the light; and its blocks, of a quarter of each source's coefficients."""
+    n = [sum(coarse(p.shape, step).prod() for step in prior.steps) for p in scene.profile]
+    blocks = sum(k / 4 * min(k / 4, 2 * MOST) for k in n)
+    return int(8 * ((2 * (N_PAIRS + 1) + 13) * (sum(n) + scene.power.size) + blocks))
 
 
 def _inverse_curvature(scenes):

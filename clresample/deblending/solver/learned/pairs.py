@@ -1,16 +1,17 @@
 """What L-BFGS remembers of each scene of a batch, on the host: inner products of its vectors.
 
-s_k, y_k: changes of the variables and of the gradient; H0 = scale h, h a diagonal
-d = -H g by the two loops (Nocedal & Wright 2006, algorithm 7.4), which need of the vectors only
-s_i . y_j, y_i . h y_j, s_i . g and y_i . h g:   d = H0 (sum_k a_k y_k - g) - sum_k c_k s_k
+s_k, y_k: changes of the variables and of the gradient; H: the inverse of the curvature as it is
+thought to be. d by the two loops from scale H (Nocedal & Wright 2006, algorithm 7.4), which need of
+the vectors only s_i . y_j, y_i . H y_j, s_i . g and y_i . H g:
+d = scale H (sum_k a_k y_k - g) - sum_k c_k s_k
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-# A pair is kept if s . y exceeds this part of y . h y. It is about all of it where the diagonal h
-# says what the curvature is; far below that the sums of float32 hold rounding alone.
+# A pair is kept if s . y exceeds this part of y . H y. It is about all of it where H says what the
+# curvature is; far below that the sums of float32 hold rounding alone.
 LEAST_CURVATURE = 1e-6
 
 
@@ -50,7 +51,7 @@ class Pairs:
     def take(self, which, sy, yy):
         """Keep the spare slots' pairs of the scenes `which` (n,), where they show curvature.
 
-        sy, yy (n, SLOTS): s_k . y and y_k . h y of every slot with the spare one
+        sy, yy (n, SLOTS): s_k . y and y_k . H y of every slot with the spare one
         """
         slot, i = self.spare[which], np.arange(len(which))
         self._sy[which, :, slot], self._yy[which, :, slot] = sy, yy
@@ -62,17 +63,12 @@ class Pairs:
         self._valid[kept, self.spare[kept]] = False
         self.used[kept] = np.minimum(self.used[kept] + 1, self.n_slots)
 
-    def renew(self, which, sy, yy):
-        """Other inner products (n, SLOTS, SLOTS) of the scenes `which`: y or h have changed."""
-        self._sy[which], self._yy[which] = sy, yy
-        self._valid[which] &= np.einsum("bkk->bk", sy) > 0
-
     def forget(self, which):
         """Drop all pairs of the scenes `which`."""
         self._valid[which] = False
 
     def coefficients(self, sg, yg):
-        """a, c (B, SLOTS) and scale (B,) of the direction, from s_k . g and y_k . h g."""
+        """a, c (B, SLOTS) and scale (B,) of the direction, from s_k . g and y_k . H g."""
         b = np.arange(len(sg))[:, None]
         order = self._order[:, 1:]
         valid = self._valid[b, order]

@@ -12,13 +12,15 @@ ARMIJO = 1e-4
 # the memory is dropped, and after that before a scene is left where it is.
 SHRINK = 0.1, 0.5
 TRIALS = 8
-# [rounds] Strengths are learned after FIRST, earlier ones being still far from their structure, and
-# then EVERY so many, until none of a scene's moves by more than SETTLED in its logarithm.
-FIRST, EVERY, SETTLED = 16, 8, 0.1
+# Strengths are learned where a scene's loss fell by less than NEAR times `enough` over the last
+# CALM iterations, so that its structure is near that of the present strengths; at the latest after
+# FIRST rounds, and then EVERY so many, until none moves by more than SETTLED in its logarithm.
+NEAR, CALM = 10.0, 3
+FIRST, EVERY, SETTLED = 16, 5, 0.1
 # A fit has converged when its strengths have settled and its loss fell by less than `enough` over
 # so many iterations; by that times chi2 per pixel where that is above 1, since a model that misfits
 # so knows its fluxes less well by its root.
-PATIENCE = 10
+PATIENCE = 6
 
 
 class Progress:
@@ -79,7 +81,8 @@ class Progress:
 
     def due(self, accepted):
         """Which scenes (B,) learn their strengths now."""
-        return accepted & ~self.settled & (self.n_rounds >= self._due)
+        calm = self._drops[:, :CALM].sum(1) < NEAR * self.enough * self._chi2()
+        return accepted & ~self.settled & (calm | (self.n_rounds >= self._due))
 
     def learned(self, due, moved, change):
         """Take down what the scenes `due` have learned: moved (B,), largest change of a logarithm
@@ -100,8 +103,8 @@ class Progress:
 
     def next(self, accepted):
         """Mode (B,) and length (B,) of each scene's next step, and which drop their pairs (B,)."""
-        chi2 = np.maximum(1, 2 * self.loss / self._n_pixels)
-        self.converged |= accepted & self.settled & (self._drops.sum(1) < self.enough * chi2)
+        enough = self.enough * self._chi2()
+        self.converged |= accepted & self.settled & (self._drops.sum(1) < enough)
         self.live &= ~self.converged
         refused = self.live & ~accepted
         self._trials = np.where(refused, self._trials + 1, 0)
@@ -122,3 +125,7 @@ class Progress:
             mode[which] = what
         mode[~self.live & ~accepted] = REST
         return mode, self._length, bare
+
+    def _chi2(self):
+        """chi2 per pixel (B,), at least 1."""
+        return np.maximum(1, 2 * self.loss / self._n_pixels)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..boxes import ALIGN
+from .inverse import MOST
+
 # What the kernels do with a scene; the same numbers in lbfgs.cl.
 REST, NEXT, AGAIN, TRY, STAY = range(5)
 
@@ -16,45 +19,58 @@ class Steps:
 
     def __init__(self, vectors):
         v, n_slots = vectors, vectors.n_slots
-        b = self._buffers = v.buffers
+        b, self._latents = v.buffers, v.latents
+        self._buffers = b
         self._n_slots, self._n_chunks = n_slots, len(v.chunks)
         self._first_chunks = np.flatnonzero(np.diff(v.chunks[:, 0], prepend=-1))
         n = len(b.scenes)
         self._plan = b.device.put(np.zeros((n, 3)), np.int32)
         self._coefficients = b.put(np.zeros((n, 2 * n_slots + 2)))
         self._sums = b.put(np.zeros((self._n_chunks, 4 * n_slots + 2)))
-        self._gram_sums = None  # large, and of use only where strengths are learned
-        scratch = [b.device.zeros(v.size, b.dtype) for _ in range(3)]
-        ring = {"plan": self._plan, "size": v.size, "h": v.h, "ring_s": v.s, "ring_y": v.y}
-        shared = ring | {"chunks": v.chunk_table}
-        trial = {"x": v.x, "x_new": v.x_new, "g": v.g, "g_new": v.g_new}
+        self._levels = []
+        y, projected, hg_new = (b.device.zeros(v.size, b.dtype) for _ in range(3))
+        shared = {"plan": self._plan, "size": v.size, "ring_s": v.s, "ring_hy": v.hy}
+        shared |= {"chunks": v.chunk_table, "x_new": v.x_new}
         group = b.tuning.sum_group
 
         def launcher(name, size=(group, 1)):
-            return b.launcher("lbfgs.cl", name, len(size), local_size=size, SLOTS=n_slots)
+            macros = {"SLOTS": n_slots, "MOST": MOST}
+            return b.launcher("lbfgs.cl", name, len(size), local_size=size, **macros)
 
-        self._change = launcher("change").bind(
+        self._trial = launcher("trial").bind(
             **shared,
-            **trial,
-            precision=v.precision,
-            projected=scratch[0],
-            weighed_g=scratch[1],
-            weighed_y=scratch[2],
-            out=self._sums,
+            x=v.x,
+            g=v.g,
+            g_new=v.g_new,
+            h=v.h,
+            y=y,
+            projected=projected,
+            hg_new=hg_new,
         )
-        self._gram = launcher("gram").bind(**shared, weighed_y=scratch[2])
+        self._invert = launcher("invert").bind(
+            plan=self._plan, size=v.size, ring_hy=v.hy, y=y, projected=projected, hg_new=hg_new
+        )
+        self._change = launcher("change").bind(
+            **shared, g=v.g, y=y, projected=projected, precision=v.precision, out=self._sums
+        )
         self._advance = launcher("advance").bind(
-            **shared, **trial, coefficients=self._coefficients, d=v.d
+            **shared,
+            x=v.x,
+            g=v.g,
+            g_new=v.g_new,
+            hg=v.hg,
+            hg_new=hg_new,
+            d=v.d,
+            coefficients=self._coefficients,
         )
         planes = v.latents.planes()
         self._reweigh = launcher("reweigh", (group, 1, 1)).bind(
-            **ring,
             active=b.free,
-            table=b.boxes.table,
             planes=b.device.put(planes.reshape(-1, 2), np.int32),
             x_new=v.x_new,
             g_new=v.g_new,
             precision=v.precision,
+            h=v.h,
         )
         self._size = group, self._n_chunks
         self._reweigh_size = group, planes.shape[1], b.n_free
@@ -66,21 +82,15 @@ class Steps:
         self._buffers.device.upload(np.ascontiguousarray(plan, np.int32), self._plan)
 
     def change(self):
-        """What trials change: s and y into the spare slots, and s_k . P g, y_k . h P g, s_k . y,
-        y_k . h y (B, slots, 4), g . s (B,), x_new . precision x_new (B,); of scenes at rest, what
+        """What trials change: s and H y into the spare slots, and s_k . P g, H y_k . P g, s_k . y,
+        H y_k . y (B, slots, 4), g . s (B,), x_new . precision x_new (B,); of scenes at rest, what
         there was."""
+        self._trial(self._size)
+        for size, given in self._levels:
+            self._invert(size, **given)
         self._change(self._size)
         sums = self._by_scene(self._sums)
         return sums[:, :-2].reshape(len(sums), self._n_slots, 4), sums[:, -2], sums[:, -1]
-
-    def gram(self):
-        """s_k . y_l and y_k . h y_l (B, slots, slots) of all slots."""
-        n = self._n_slots
-        if self._gram_sums is None:
-            self._gram_sums = self._buffers.put(np.zeros((self._n_chunks, 2 * n * n)))
-        self._gram(self._size, out=self._gram_sums)
-        sums = self._by_scene(self._gram_sums).reshape(-1, n, n, 2)
-        return sums[..., 0], sums[..., 1]
 
     def _by_scene(self, sums):
         values = self._buffers.device.get(sums).astype(np.float64)
@@ -93,7 +103,36 @@ class Steps:
         b.device.upload(np.ascontiguousarray(table, b.dtype), self._coefficients)
         self._advance(self._size)
 
-    def reweigh(self, light, weights):
-        """Queue h, g_new and y of other strengths; weights (S, J, 3), see lbfgs.cl."""
-        if self._buffers.n_free:
-            self._reweigh(self._reweigh_size, light=light, weights=self._buffers.put(weights))
+    def reweigh(self, light, weights, blocks):
+        """Queue h and g_new of other strengths, and take their blocks; light, weights, blocks: see
+        Strengths. Pairs of what went before are of no use after it."""
+        b = self._buffers
+        if b.n_free:
+            self._reweigh(self._reweigh_size, light=light, weights=b.put(weights))
+            self.take_blocks(blocks)
+
+    def take_blocks(self, blocks):
+        """Take the blocks of all sources (S)."""
+        b = self._buffers
+        start, scene = self._latents.start, b.host_boxes.scene
+        self._levels = []
+        for level in range(1 + max((own[0] for some in blocks for own in some), default=-1)):
+            listed = [
+                (scene[s], start[s] + places, matrix)
+                for s, some in enumerate(blocks)
+                for at, places, matrix in some
+                if at == level
+            ]
+            sizes = np.array([len(places) for _, places, _ in listed])
+            first = np.cumsum([0, *(-(-sizes * sizes // ALIGN))])
+            table = [[s for s, *_ in listed], sizes, np.cumsum([0, *sizes[:-1]]), first[:-1]]
+            matrices = np.zeros(first[-1] * ALIGN, b.dtype)
+            for at, (_, _, matrix) in zip(first * ALIGN, listed):
+                matrices[at : at + matrix.size] = matrix.ravel()
+            given = {
+                "blocks": b.device.put(np.stack(table, axis=1), np.int32),
+                "indices": b.device.put(np.concatenate([p for _, p, _ in listed]), np.int32),
+                "matrices": b.put(matrices),
+                "more": level > 0,
+            }
+            self._levels.append(((self._size[0], len(listed)), given))

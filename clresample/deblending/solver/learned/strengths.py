@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .evidence import SourceEvidence, Spectra, blurred_light
+from .inverse import SourceInverse
 from .response import Response
 
 
@@ -29,6 +30,7 @@ class Strengths:
 
     values (S, J): alpha, at the prior's start; of fixed sources without meaning
     precision (S, J): alpha^-2 on the device; light: a vector on the device, see lbfgs.cl
+    blocks (S): of each source, see `SourceInverse.blocks`; none of fixed ones
     """
 
     def __init__(self, buffers, gradient, latents, prior, *, past=None):
@@ -39,20 +41,25 @@ class Strengths:
         if past is None:
             self.values = np.tile(np.array(prior.strengths, float), (b.n_sources, 1))
             self._curvature = np.zeros_like(self.values)
-            self._evidence, self._light = self._prepare(prior)
+            self._evidence, self._inverses, self._light = self._prepare(prior)
+            self.blocks = [[] for _ in self.values]
         else:
             other, keep = past
             kept = np.concatenate([np.flatnonzero(other._scene == i) for i in keep])
             self.values, self._curvature = other.values[kept], other._curvature[kept]
             self._evidence = [other._evidence[i] for i in kept]
+            self._inverses = [other._inverses[i] for i in kept]
             self._light = [other._light[i] for i in kept]
+            self.blocks = [other.blocks[i] for i in kept]
         self.precision = b.put(self.values**-2)
         self.light = b.put(latents.pack(self._light))
 
     def _prepare(self, prior):
-        """Each free source's SourceEvidence, and its light [s][j] about its coefficients."""
+        """Each free source's SourceEvidence, SourceInverse and light [s][j] about its
+        coefficients."""
         profiles = [p for s in self.buffers.scenes for p in s.profile]
-        spectra, evidence = Spectra(prior), [None] * len(profiles)
+        spectra = Spectra(prior)
+        evidence, inverses = ([None] * len(profiles) for _ in range(2))
         light = [[np.zeros(0)] * len(prior.steps) for _ in profiles]
         answers, pixels = self._response.to_pixels()
         pairs = zip(answers, pixels, strict=True)
@@ -63,15 +70,18 @@ class Strengths:
                 blurred_light(profiles[s], sigma, step)
                 for sigma, step in zip(prior.scales_px, prior.steps, strict=True)
             ]
-        return evidence, light
+            inverses[s] = SourceInverse(evidence[s], profiles[s], light[s])
+        return evidence, inverses, light
 
     def weights(self, spectra, due=None, change=0.0):
         """For `Vectors.reweigh` (S, J, 3): precision, curvature, change.
 
-        spectra (S, C): at which the curvature is taken anew, in the scenes `due` (B,) or in all
+        spectra (S, C): at which the curvature is taken anew, blocks too, in the scenes `due` (B,)
+            or in all
         """
         for s in self._free if due is None else self._free[due[self._scene[self._free]]]:
             self._curvature[s] = self._evidence[s].curvature(spectra[s])
+            self.blocks[s] = self._inverses[s].blocks(self.values[s], spectra[s])
         precision = self.values**-2
         return np.stack([precision, self._curvature, precision * 0 + change], axis=2)
 

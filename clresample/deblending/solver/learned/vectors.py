@@ -14,10 +14,10 @@ class Vectors:
     buffers: the batch; latents: its Latents; n_slots: of the ring of pairs
     size: elements of a vector; n_spectra, n_sky: its last ones
     chunks (n, 4): scene, first element, length, whether its variables are at least 0; by scene
-    x, x_new, g, g_new, d, h, precision (size,): see lbfgs.cl; s, y (n_slots, size)
+    x, x_new, g, g_new, hg, d, h, precision (size,): see lbfgs.cl; s, hy (n_slots, size)
     """
 
-    NAMES = "x", "x_new", "g", "g_new", "d", "h", "precision", "s", "y"
+    NAMES = "x", "x_new", "g", "g_new", "hg", "d", "h", "precision", "s", "hy"
 
     def __init__(self, buffers, latents, n_slots):
         b = self.buffers = buffers
@@ -26,10 +26,10 @@ class Vectors:
         self.size = latents.size + self.n_spectra + self.n_sky
         if self.size > np.iinfo(np.int32).max:
             raise ValueError(f"a batch of {self.size} variables is too large: use less memory")
-        self.x, self.x_new, self.g, self.g_new, self.d, self.h, self.precision = (
-            b.device.zeros(self.size, b.dtype) for _ in range(7)
+        self.x, self.x_new, self.g, self.g_new, self.hg, self.d, self.h, self.precision = (
+            b.device.zeros(self.size, b.dtype) for _ in range(8)
         )
-        self.s, self.y = (b.device.zeros((n_slots, self.size), b.dtype) for _ in range(2))
+        self.s, self.hy = (b.device.zeros((n_slots, self.size), b.dtype) for _ in range(2))
         self.chunks = self._chunks()
         self.chunk_table = b.device.put(self.chunks, np.int32)
         names = {"n_latents": latents.size, "n_spectra": self.n_spectra}
@@ -78,7 +78,7 @@ class Vectors:
         move = self.buffers.launcher("lbfgs.cl", "move", 3, local_size=(group, 1, 1))
         move.bind(chunks=self.chunk_table, source=source, size=self.size, size_from=other.size)
         for name in self.NAMES:
-            n_rows = self.n_slots if name in ("s", "y") else 1
+            n_rows = self.n_slots if name in ("s", "hy") else 1
             size = group, len(self.chunks), n_rows
             move(size, values_from=getattr(other, name), values=getattr(self, name))
 

@@ -1,0 +1,183 @@
+"""The inverse of each source's curvature, in blocks of the coefficients that its data determine.
+
+Coefficients of neighbouring places and of several scales are about the same light, so that the
+curvature is far from a diagonal: L-BFGS that begins with one takes a hundred iterations and more
+for a bright galaxy, with these blocks ten to thirty. For a source of profile p and spectrum A
+
+    H = 1 / alpha^2 + U^T T U,    U = sqrt(p) o K_j less its part along p,    T = sum_c A_c^2 T_c
+
+T_c (evidence.py) is taken for that of the whole box. A source of many coefficients has a block for
+each part of its box, and added to these blocks of its coarser scales alone, which reach further:
+the inverse is then off by a factor of a few, and without them by thousands for its widest waves.
+What the blocks leave out, other sources,
+edges and the spectra, is left to L-BFGS. In NumPy on the host, at first and after strengths were
+learned.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.linalg import lapack
+
+from .evidence import N_FREQUENCIES
+
+# Coefficients of which the data say more than so many times what the prior does are in blocks. With
+# 3 the blocks take a tenth more of a fit's time, and it no fewer iterations; with 100, half as many
+# iterations more.
+WORTH = 10.0
+# Coefficients of a block, at most: its time goes with their third power, its memory with their
+# square; with fewer, fits of large sources take more iterations. Kernels hold two numbers of each
+# in local memory, of which devices have 32 KiB and more.
+MOST = 512
+# [px] Pixels are binned by as much as the steps of a block's finest scale, but by no more than
+# this: 2 changes single directions' curvature by up to 1.9, 4 by up to 5.
+COARSEST = 2
+# A block is made of the pixels where one of its coefficients has more than this part of its largest
+# value. Blocks stand until a strength or the spectrum has changed by CHANGE of itself.
+LEAST, CHANGE = 0.1, 0.1
+
+
+class SourceInverse:
+    """The blocks of one free source.
+
+    evidence: its SourceEvidence; profile (ny, nx); light [j]: about its coefficients (ny_j, nx_j),
+        see evidence.blurred_light
+    """
+
+    def __init__(self, evidence, profile, light):
+        self._evidence, self._light = evidence, light
+        self._profile = np.asarray(profile, np.float32)
+        self._root = evidence.prior.amplitude(self._profile)
+        self._power = (self._profile**2).sum()
+        self._at = self._blocks = None
+
+    def blocks(self, strengths, spectrum):
+        """Blocks near strengths (J,) and a spectrum (C,): of each its level, where its coefficients
+        (m,) are among all of the source's, scale by scale, and the inverse (m, m) of their part of
+        H. Those of one level have no coefficient in common, and what levels say is added."""
+        if self._at is None or self._moved(strengths, spectrum):
+            self._at = strengths.copy(), spectrum.copy()
+            self._blocks = list(self._made(*self._at))
+        return self._blocks
+
+    def _moved(self, strengths, spectrum):
+        before = self._at
+        more = np.abs(spectrum - before[1]).max() > CHANGE * np.abs(before[1]).max()
+        return more or np.abs(np.log(strengths / before[0])).max() > CHANGE
+
+    def _made(self, strengths, spectrum):
+        data = np.square(strengths) * self._evidence.curvature(spectrum)
+        heard = [np.argwhere(part * light > WORTH) for part, light in zip(data, self._light)]
+        scale = np.repeat(np.arange(len(heard)), [len(h) for h in heard])
+        rows = np.column_stack([scale, np.concatenate(heard)])
+        steps = np.array(self._evidence.prior.steps)
+        for level in range(len(heard)):
+            parts = _split(rows, rows[:, 1:] * steps[rows[:, :1]])
+            for own in parts:
+                curvature = self._curvature(own, spectrum)
+                yield level, self._places(own), _inverse(curvature, strengths[own[:, 0]] ** -2)
+            if len(parts) < 2:
+                return
+            rows = rows[rows[:, 0] > rows[:, 0].min()]
+
+    def _places(self, rows):
+        """Where coefficients (m, 3) of scale, y, x are among all of the source's."""
+        first = np.cumsum([0, *(light.size for light in self._light[:-1])])
+        width = np.array([light.shape[1] for light in self._light])
+        scale, y, x = rows.T
+        return first[scale] + y * width[scale] + x
+
+    def _curvature(self, rows, spectrum):
+        """U^T T U (m, m) of coefficients (m, 3), by scale, on binned pixels."""
+        prior, scales = self._evidence.prior, np.unique(rows[:, 0])
+        step = min(COARSEST, *(prior.steps[j] for j in scales))
+        reach = max(prior.radii[j] for j in scales)
+        at = rows[:, 1:] * np.array(prior.steps)[rows[:, :1]]
+        low = np.maximum(at.min(0) - reach, 0)
+        window = tuple(map(slice, low, np.minimum(at.max(0) + reach + 1, self._profile.shape)))
+        u = [self._seen(j, rows[rows[:, 0] == j, 1:], window, step) for j in scales]
+        u = np.concatenate(u)
+        size = np.abs(u)
+        near = (size > LEAST * size.max((1, 2), keepdims=True)).any(0)
+        y, x = (np.flatnonzero(near.any(axis)) for axis in (1, 0))
+        u = u[:, y[0] : y[-1] + 1, x[0] : x[-1] + 1]
+        between = _between(self._evidence.sharpness(spectrum), u.shape[1:], step)
+        u = u.reshape(len(rows), -1)
+        return u @ between @ u.T
+
+    def _seen(self, j, places, window, step):
+        """Columns of U, of scale j and places (m, 2), in a window of the box and binned."""
+        p = self._profile
+        (along_y, along_x), (y, x) = (
+            (_along(self._evidence.prior, j, n) for n in p.shape),
+            places.T,
+        )
+        first, of_x = np.unique(x, return_inverse=True)
+        rows = self._root[window][:, None] * along_x[first][:, window[1]]
+        rows = _binned(rows, 2, step)[:, of_x].swapaxes(0, 1)  # (m, ny, nx / step)
+        u = _binned(along_y[y][:, window[0], None] * rows, 1, step)
+        along = (along_y @ (p * self._root) @ along_x.T)[y, x] / self._power
+        return u - along[:, None, None] * _binned(_binned(p[window], 0, step), 1, step)
+
+
+@functools.lru_cache(maxsize=256)
+def _along(prior, j, n):
+    """K_j of each coefficient along a side of `n` pixels (n_j, n)."""
+    step, taps = prior.steps[j], prior.kernels()[j]
+    at = np.arange(0, n + step - 1, step)
+    lag = np.arange(n) - at[:, None] + len(taps) // 2
+    inside = (lag >= 0) & (lag < len(taps))
+    return (np.sqrt(step) * np.where(inside, taps[np.where(inside, lag, 0)], 0)).astype(np.float32)
+
+
+def _split(rows, places):
+    """Parts of rows (n, 3) at places (n, 2) [px], of at most MOST neighbours each, in order."""
+    if len(rows) <= MOST:
+        return [rows] if len(rows) else []
+    along = places[:, np.argmax(np.ptp(places, axis=0))]
+    first = np.zeros(len(rows), bool)
+    first[np.argsort(along, kind="stable")[: len(rows) // 2]] = True
+    return [part for half in (first, ~first) for part in _split(rows[half], places[half])]
+
+
+def _binned(values, axis, step):
+    """Sums of `step` neighbours each along an axis, with zeros beyond its end."""
+    if step == 1:
+        return values
+    values = np.moveaxis(values, axis, 0)
+    out = np.zeros((-(-len(values) // step), *values.shape[1:]), values.dtype)
+    for k in range(step):
+        part = values[k::step]
+        out[: len(part)] += part
+    return np.moveaxis(out, 0, axis)
+
+
+def _between(sharpness, shape, step):
+    """T (n, n) between the n pixels of images of a shape, each the mean over step x step of those
+    that sharpness (F,), see evidence.Spectra, is of."""
+    n = N_FREQUENCIES
+    phase = np.exp(2j * np.pi * np.fft.fftfreq(n)[:, None] * np.arange(step))
+    mean = np.abs(phase.mean(1)) ** 2
+    power = sharpness.reshape(n, n // 2 + 1) * mean[:, None] * mean[: n // 2 + 1]
+    lags = np.fft.irfft2(power, (n, n))
+    far = np.zeros([2 * side - 1 for side in shape], np.float32)
+    at = [np.arange(1 - side, side) for side in shape]
+    near = [np.flatnonzero(np.abs(a) * step < n // 2) for a in at]
+    y, x = (step * a[k] % n for a, k in zip(at, near, strict=True))
+    far[near[0][:, None], near[1]] = lags[y[:, None], x]
+    size = shape[0] * shape[1]
+    return sliding_window_view(far, shape)[::-1, ::-1].reshape(size, size)
+
+
+def _inverse(curvature, precision):
+    """The inverse (m, m) of curvature (m, m) + precision (m,), in float64 on the way."""
+    matrix = curvature.astype(np.float64)
+    matrix[np.diag_indices(len(matrix))] += precision
+    factor, info = lapack.dpotrf(matrix.T, lower=1, clean=0, overwrite_a=1)
+    if info:  # lags that T_c leaves out: the diagonal alone
+        return np.diag(1 / (curvature.diagonal() + precision))
+    inverse, _ = lapack.dpotri(factor, lower=1, overwrite_c=1)
+    return np.tril(inverse) + np.tril(inverse, -1).T

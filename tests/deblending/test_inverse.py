@@ -1,0 +1,149 @@
+"""The inverse curvature of sources' best determined coefficients, against NumPy in full."""
+
+import numpy as np
+import pytest
+
+from clresample.deblending.solver.learned import inverse
+from clresample.deblending.solver.learned.evidence import SourceEvidence, Spectra, blurred_light
+from clresample.deblending.solver.learned.inverse import SourceInverse
+from clresample.deblending.solver.learned.prior import LearnedPrior
+
+SPECTRUM = np.array([3.0, 1.0])
+
+
+def galaxy(ny, nx, sigma=4.0):
+    """A profile (ny, nx) with its peak beside the middle."""
+    y, x = np.arange(ny) - 0.45 * ny, np.arange(nx) - 0.55 * nx
+    return np.exp(-0.5 * (y[:, None] ** 2 + x**2) / sigma**2)
+
+
+def answers(widths=(1.0, 2.5)):
+    """R^T w R of one pixel in each channel: smooth, of the widths [px], and the pixel."""
+    lag = np.arange(-20, 21)
+    found = [np.outer(*2 * [np.exp(-0.25 * (lag / w) ** 2)]) * 50 for w in widths]
+    return np.array(found), np.full((len(widths), 2), 20)
+
+
+class Made:
+    """A galaxy's SourceInverse, and its curvature in full."""
+
+    def __init__(self, shape, strengths):
+        prior = self.prior = LearnedPrior()
+        self.profile = galaxy(*shape)
+        spectra = Spectra(prior)
+        found = answers()
+        response = spectra.of_answers(*found)
+        self.lags = np.tensordot(SPECTRUM**2, found[0], 1)
+        evidence = SourceEvidence(spectra, prior, self.profile, response)
+        light = [
+            blurred_light(self.profile, s, n)
+            for s, n in zip(prior.scales_px, prior.steps, strict=True)
+        ]
+        self.made = SourceInverse(evidence, self.profile, light)
+        self.strengths = np.array(strengths)
+        self.sizes = [a.shape for a in light]
+
+    def columns(self):
+        """U (ny nx, n) of all coefficients, by its definition."""
+        p, found = self.profile, []
+        for (ny, nx), step, taps in zip(
+            self.sizes, self.prior.steps, self.prior.kernels(), strict=True
+        ):
+            radius = len(taps) // 2
+            along = []
+            for n, side in zip((ny, nx), p.shape, strict=True):
+                full = np.zeros((n, side + 2 * radius + step))
+                for i in range(n):
+                    full[i, i * step : i * step + 2 * radius + 1] = taps
+                along.append(full[:, radius : radius + side])
+            for row in along[0]:
+                for column in along[1]:
+                    u = np.sqrt(p) * np.outer(row, column) * step
+                    found.append((u - p * (p * u).sum() / (p * p).sum()).ravel())
+        return np.array(found).T
+
+    def curvature(self):
+        """H (n, n) in full."""
+        ny, nx = self.profile.shape
+        far = np.zeros((2 * ny - 1, 2 * nx - 1))
+        middle = np.array(self.lags.shape) // 2
+        for i in range(1 - ny, ny):
+            for k in range(1 - nx, nx):
+                if abs(i) <= middle[0] and abs(k) <= middle[1]:
+                    far[i + ny - 1, k + nx - 1] = self.lags[i + middle[0], k + middle[1]]
+        y, x = np.divmod(np.arange(ny * nx), nx)
+        between = far[y[:, None] - y + ny - 1, x[:, None] - x + nx - 1]
+        u = self.columns()
+        precision = np.repeat(self.strengths**-2, [a * b for a, b in self.sizes])
+        return u.T @ between @ u + np.diag(precision)
+
+    def blocks(self):
+        return self.made.blocks(self.strengths, SPECTRUM)
+
+
+@pytest.mark.parametrize(
+    "strengths, error",
+    [((0.3, 0.1, 0.05), 0.001), ((0.003, 0.3, 0.05), 1.0), ((0.003, 0.01, 1.0), 0.5)],
+)
+def test_one_block_is_the_inverse_of_its_part_of_the_curvature(strengths, error):
+    """To the lags that T leaves out on every pixel; and to a factor of 2 on binned ones, where only
+    coarser scales are in it. Of a diagonal that factor is over 5000."""
+    made = Made((17, 20), strengths)
+    ((level, places, found),) = made.blocks()
+    assert level == 0 and len(places) == len(set(places)) > 10
+    curvature = made.curvature()[np.ix_(places, places)]
+    values = np.linalg.eigvals(found @ curvature).real
+    np.testing.assert_allclose(found, found.T, rtol=1e-12)
+    assert values.min() > 1 / (1 + error) and values.max() < 1 + error
+    diagonal = np.linalg.eigvals(curvature / curvature.diagonal()).real
+    assert diagonal.max() / diagonal.min() > 5000
+
+
+def test_coefficients_of_which_the_data_say_little_are_in_no_block():
+    made = Made((17, 20), (1e-5, 1e-5, 1e-5))
+    assert made.blocks() == []
+    made = Made((17, 20), (1e-5, 0.3, 1e-5))
+    ((_, places, _),) = made.blocks()
+    first = made.sizes[0][0] * made.sizes[0][1]
+    assert places.min() >= first and places.max() < first + made.sizes[1][0] * made.sizes[1][1]
+
+
+def test_large_sources_have_parts_and_wide_waves_across_them(monkeypatch):
+    """Parts share no coefficient; the coarser scales in a second level make the worst direction's
+    curvature right to a factor of a hundred, which is thousands without them."""
+    monkeypatch.setattr(inverse, "MOST", 150)
+    made = Made((26, 30), (0.3, 0.3, 0.3))
+    blocks = made.blocks()
+    curvature = made.curvature()
+    assert {level for level, *_ in blocks} > {0}
+    n = len(curvature)
+    total, worst = np.zeros((n, n)), []
+    for level in sorted({b[0] for b in blocks}):
+        seen = np.concatenate([places for at, places, _ in blocks if at == level])
+        assert len(seen) == len(set(seen))
+        for at, places, matrix in blocks:
+            assert len(places) <= 150
+            if at == level:
+                total[np.ix_(places, places)] += matrix
+        used = np.flatnonzero(total.diagonal())
+        values = np.linalg.eigvals((total @ curvature)[np.ix_(used, used)]).real
+        worst.append(values.max() / values.min())
+    assert worst[-1] < 0.1 * worst[0]
+
+
+def test_blocks_stand_until_something_has_changed():
+    made = Made((17, 20), (0.1, 0.1, 0.1))
+    first = made.blocks()
+    made.strengths = made.strengths * 1.05
+    assert made.blocks() is first
+    made.strengths = made.strengths * [1.2, 1, 1]
+    second = made.blocks()
+    assert second is not first
+    assert made.made.blocks(made.strengths, SPECTRUM * [1.01, 1.2]) is second
+    assert made.made.blocks(made.strengths, SPECTRUM * [1.2, 1]) is not second
+
+
+def test_a_curvature_that_is_no_sum_of_squares_leaves_its_diagonal():
+    curvature = np.array([[1.0, 3.0], [3.0, 1.0]], np.float32)
+    found = inverse._inverse(curvature, np.array([0.5, 1.0]))
+    np.testing.assert_allclose(found, np.diag([1 / 1.5, 1 / 2]))
