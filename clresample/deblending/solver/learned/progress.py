@@ -16,7 +16,7 @@ TRIALS = 8
 # CALM iterations, so that its structure is near that of the present strengths; at the latest after
 # FIRST rounds, and then EVERY so many, until none moves by more than SETTLED in its logarithm.
 NEAR, CALM = 10.0, 3
-FIRST, EVERY, SETTLED = 16, 5, 0.1
+FIRST, EVERY, SETTLED = 16, 8, 0.1
 # A fit has converged when its strengths have settled and its loss fell by less than `enough` over
 # so many iterations; by that times chi2 per pixel where that is above 1, since a model that misfits
 # so knows its fluxes less well by its root.
