@@ -9,7 +9,7 @@ from helpers import scenes
 from helpers.scenes import GALAXIES, alike, blend, chi2
 from helpers.tuning import tune
 
-from clresample.deblending import fit as fit_module
+from clresample.deblending import iterate as iterate_module
 from clresample.deblending.batch import deblend_many
 from clresample.deblending.blend import Blend
 from clresample.deblending.fit import Fit, begin
@@ -89,9 +89,9 @@ def test_the_best_state_has_its_own_shifts(device, monkeypatch):
     """A shift that makes everything worse is taken back with what came of it."""
 
     def astray(scene, state):
-        return np.array([(0.0, 0.0), (2.5, -2.0)])
+        return np.array([(0.0, 0.0), (2.5, -2.0)]), 0.0
 
-    monkeypatch.setattr(fit_module, "shift_steps", astray)
+    monkeypatch.setattr(iterate_module, "shift_steps", astray)
     settings = Settings(prior=Prior(), max_iter=15, tol=0, fit_shifts=True)
     blends = [blend(seed=i) for i in range(2)]
     for result in deblend_many(blends, settings=settings, device=device):

@@ -127,9 +127,9 @@ def test_a_fit_has_converged_when_ten_iterations_gain_too_little(total, ends, ch
 
 def test_strengths_are_learned_after_sixteen_rounds_and_then_every_eighth():
     assert (FIRST, EVERY, progress_module.SETTLED) == (16, 8, 0.1)
-    progress, due = Progress(1, 0.5, [100]), []
+    progress, due = Progress(1, 0.5, [10_000]), []
     for i in range(1, 41):
-        accepted, _ = progress.judge(np.array([1000.0 - i]), np.array([-1e-6]))
+        accepted, _ = progress.judge(np.array([1000.0 - 5 * i]), np.array([-1e-6]))
         if progress.due(accepted)[0]:
             due.append(i)
             moved = 0.11 if i < 30 else 0.09
@@ -138,6 +138,20 @@ def test_strengths_are_learned_after_sixteen_rounds_and_then_every_eighth():
             assert np.isinf(progress._drops[0]).all()
         progress.next(accepted)
     assert due == [16, 24, 32]
+
+
+def test_strengths_are_learned_at_once_where_little_is_left_to_gain():
+    """Where three iterations have gained less than ten times what ends a fit; and not again before
+    three more."""
+    progress, due, loss = Progress(1, 0.5, [100]), [], 50.0
+    for i, drop in enumerate([0, 9, 4, 2, 1, 0.5, 0.1, 0.1, 0.1, 0.1]):
+        loss -= drop
+        accepted, _ = progress.judge(np.array([loss]), np.array([-1e-6]))
+        if progress.due(accepted)[0]:
+            due.append(i)
+            progress.learned(np.array([True]), np.array([0.2]), np.zeros(1))
+        progress.next(accepted)
+    assert due == [5, 8]
 
 
 def test_another_loss_is_looked_at_where_the_scene_is():
@@ -216,9 +230,9 @@ def test_curvature_is_left_out_where_nothing_is_seen():
 
 
 def test_memory_of_a_scenes_vectors():
-    """Forty-two of the ring and ten more, of 8 bytes each, and coefficients on every step-th
-    pixel."""
+    """Twenty-two of the rings and thirteen more, of 8 bytes each, and coefficients on every step-th
+    pixel; a quarter of each source's with each other."""
     prior = LearnedPrior(scales_px=(1.0, 2.0), strengths=(0.1, 0.1))
     one = scene([], profile=[np.zeros((7, 10)), np.zeros((1, 1))], power=np.zeros((2, 3)))
     n = 7 * 10 + 4 * 6 + 1 + 1 + 6  # the last step ends on the last pixel or past it
-    assert vector_bytes(one, prior) == 8 * 52 * n
+    assert vector_bytes(one, prior) == int(8 * (35 * n + (94 / 4) ** 2 + (2 / 4) ** 2))

@@ -6,8 +6,9 @@ import pytest
 from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.blend import Blend
 from clresample.deblending.settings import Settings
-from clresample.deblending.shifts import shift_steps
+from clresample.deblending.shifts import ahead, shift_steps
 from clresample.deblending.solver.scene import Scene, State
+from clresample.deblending.solver.scene_model import compose
 from clresample.resampling.cache import cached_resampler
 from clresample.sky.frame import model_frame
 from clresample.sky.grid import Grid
@@ -96,9 +97,30 @@ def test_the_step_is_the_shift_of_a_right_model(device):
     shift = np.array([0.15, -0.1])
     b = blend(shift, noise=1e-2)
     scene, state = truth(b, device)
-    np.testing.assert_allclose(shift_steps(scene, state)[1], shift, atol=0.01)
+    steps, gain = shift_steps(scene, state)
+    np.testing.assert_allclose(steps[1], shift, atol=0.01)
+    before = misfit(scene, state)
+    scene.ops[1].shift = scene.ops[1].shift + steps[1]
+    assert before - misfit(scene, state) == pytest.approx(gain, rel=0.05)
     scene.weights[1] = 0 * scene.weights[1]
-    assert np.abs(shift_steps(scene, state)[1]).max() < 1e-3
+    assert np.abs(shift_steps(scene, state)[0]).max() < 1e-3
+
+
+def misfit(scene, state):
+    """Half of chi2."""
+    light = compose(scene.shape, scene.origin, state.morph, state.spectra)
+    parts = zip(scene.ops, scene.channels(), scene.data, scene.weights, strict=True)
+    return sum(0.5 * (w * (d - op(light[part])) ** 2).sum() for op, part, d, w in parts)
+
+
+def test_steps_that_fall_off_are_summed_up():
+    """A geometric series' limit in one step; no further than 5 steps, and not at all where they
+    point backwards."""
+    step = np.array([[0.0, 0.0], [0.3, -0.1]])
+    np.testing.assert_allclose(ahead(step, 2 * step), 2 * step)
+    np.testing.assert_allclose(ahead(step, 1.01 * step), 5 * step)
+    for last in (-step, 0 * step):
+        np.testing.assert_allclose(ahead(step, last), step)
 
 
 def truth(b, device):

@@ -35,8 +35,8 @@ class Vectors:
         names = {"n_latents": latents.size, "n_spectra": self.n_spectra}
         names["n"] = self.n_spectra + self.n_sky
         self._numbers_size = b.items(names["n"])
-        self._take = b.launcher("lbfgs.cl", "take", 1).bind(**names, spectra=b.spectra, sky=b.sky)
-        self._give = b.launcher("lbfgs.cl", "give", 1).bind(
+        self._take = b.launcher("vectors.cl", "take", 1).bind(**names, spectra=b.spectra, sky=b.sky)
+        self._give = b.launcher("vectors.cl", "give", 1).bind(
             **names, n_channels=b.n_channels, d_spectra=b.d_spectra, g_new=self.g_new
         )
 
@@ -75,7 +75,7 @@ class Vectors:
         kind = np.digitize(first, [self.latents.size, self.latents.size + self.n_spectra])
         source = self.buffers.device.put(first + shift[scene, kind], np.int32)
         group = self.buffers.tuning.sum_group
-        move = self.buffers.launcher("lbfgs.cl", "move", 3, local_size=(group, 1, 1))
+        move = self.buffers.launcher("vectors.cl", "move", 3, local_size=(group, 1, 1))
         move.bind(chunks=self.chunk_table, source=source, size=self.size, size_from=other.size)
         for name in self.NAMES:
             n_rows = self.n_slots if name in ("s", "hy") else 1
