@@ -131,6 +131,23 @@ def test_large_sources_have_parts_and_wide_waves_across_them(monkeypatch):
     assert worst[-1] < 0.1 * worst[0]
 
 
+def test_wide_waves_are_seen_on_coarser_pixels(monkeypatch):
+    """So that T between the pixels stays small, and the inverse right to a factor of a few."""
+    made, sizes = Made((40, 44), (0.003, 0.01, 1.0)), []
+    between = inverse._between
+
+    def watched(sharpness, shape, step):
+        sizes.append((shape[0] * shape[1], step))
+        return between(sharpness, shape, step)
+
+    monkeypatch.setattr(inverse, "_between", watched)
+    monkeypatch.setattr(inverse, "MOST_PIXELS", 200)
+    ((_, places, found),) = made.blocks()
+    values = np.linalg.eigvals(found @ made.curvature()[np.ix_(places, places)]).real
+    assert sizes[0][0] <= 200 and sizes[0][1] == 4
+    assert values.min() > 0.5 and values.max() < 10
+
+
 def test_blocks_stand_until_something_has_changed():
     made = Made((17, 20), (0.1, 0.1, 0.1))
     first = made.blocks()

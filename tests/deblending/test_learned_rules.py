@@ -141,7 +141,7 @@ def test_strengths_are_learned_after_sixteen_rounds_and_then_every_eighth():
 
 
 def test_strengths_are_learned_at_once_where_little_is_left_to_gain():
-    """Where three iterations have gained less than ten times what ends a fit; and not again before
+    """Where three iterations have gained less than 5; and not again before
     three more."""
     progress, due, loss = Progress(1, 0.5, [100]), [], 50.0
     for i, drop in enumerate([0, 9, 4, 2, 1, 0.5, 0.1, 0.1, 0.1, 0.1]):

@@ -8,10 +8,9 @@ for a bright galaxy, with these blocks ten to thirty. For a source of profile p 
 
 T_c (evidence.py) is taken for that of the whole box. A source of many coefficients has a block for
 each part of its box, and added to these blocks of its coarser scales alone, which reach further:
-the inverse is then off by a factor of a few, and without them by thousands for its widest waves.
-What the blocks leave out, other sources,
-edges and the spectra, is left to L-BFGS. In NumPy on the host, at first and after strengths were
-learned.
+the inverse is then off by a factor of a hundred, and without them by thousands, for its widest
+waves. What the blocks leave out, other sources, edges and the spectra, is left to L-BFGS. In NumPy
+on the host, at first and after strengths were learned.
 """
 
 from __future__ import annotations
@@ -33,8 +32,10 @@ WORTH = 10.0
 # in local memory, of which devices have 32 KiB and more.
 MOST = 512
 # [px] Pixels are binned by as much as the steps of a block's finest scale, but by no more than
-# this: 2 changes single directions' curvature by up to 1.9, 4 by up to 5.
-COARSEST = 2
+# this: 2 changes single directions' curvature by up to 1.9, 4 by up to 5. A block of wide waves over
+# a large box, of more binned pixels than MOST_PIXELS, has them coarser: T between them takes the
+# square of their number.
+COARSEST, MOST_PIXELS = 2, 3000
 # A block is made of the pixels where one of its coefficients has more than this part of its largest
 # value. Blocks stand until a strength or the spectrum has changed by CHANGE of itself.
 LEAST, CHANGE = 0.1, 0.1
@@ -69,6 +70,7 @@ class SourceInverse:
         return more or np.abs(np.log(strengths / before[0])).max() > CHANGE
 
     def _made(self, strengths, spectrum):
+        """Yield the blocks at these strengths and spectrum."""
         data = np.square(strengths) * self._evidence.curvature(spectrum)
         heard = [np.argwhere(part * light > WORTH) for part, light in zip(data, self._light)]
         scale = np.repeat(np.arange(len(heard)), [len(h) for h in heard])
@@ -97,7 +99,10 @@ class SourceInverse:
         reach = max(prior.radii[j] for j in scales)
         at = rows[:, 1:] * np.array(prior.steps)[rows[:, :1]]
         low = np.maximum(at.min(0) - reach, 0)
-        window = tuple(map(slice, low, np.minimum(at.max(0) + reach + 1, self._profile.shape)))
+        high = np.minimum(at.max(0) + reach + 1, self._profile.shape)
+        while (-(-(high - low) // step)).prod() > MOST_PIXELS:
+            step *= 2
+        window = tuple(map(slice, low, high))
         u = [self._seen(j, rows[rows[:, 0] == j, 1:], window, step) for j in scales]
         u = np.concatenate(u)
         size = np.abs(u)
@@ -110,11 +115,8 @@ class SourceInverse:
 
     def _seen(self, j, places, window, step):
         """Columns of U, of scale j and places (m, 2), in a window of the box and binned."""
-        p = self._profile
-        (along_y, along_x), (y, x) = (
-            (_along(self._evidence.prior, j, n) for n in p.shape),
-            places.T,
-        )
+        p, (y, x) = self._profile, places.T
+        along_y, along_x = (_along(self._evidence.prior, j, n) for n in p.shape)
         first, of_x = np.unique(x, return_inverse=True)
         rows = self._root[window][:, None] * along_x[first][:, window[1]]
         rows = _binned(rows, 2, step)[:, of_x].swapaxes(0, 1)  # (m, ny, nx / step)

@@ -12,10 +12,11 @@ ARMIJO = 1e-4
 # the memory is dropped, and after that before a scene is left where it is.
 SHRINK = 0.1, 0.5
 TRIALS = 8
-# Strengths are learned where a scene's loss fell by less than NEAR times `enough` over the last
-# CALM iterations, so that its structure is near that of the present strengths; at the latest after
-# FIRST rounds, and then EVERY so many, until none moves by more than SETTLED in its logarithm.
-NEAR, CALM = 10.0, 3
+# Strengths are learned where a scene's loss fell by less than NEAR, times chi2 per pixel where that
+# is above 1, over the last CALM iterations, so that its structure is near that of the present ones;
+# at the latest after FIRST rounds, and then EVERY so many, until none moves by more than SETTLED in
+# its logarithm.
+NEAR, CALM = 5.0, 3
 FIRST, EVERY, SETTLED = 16, 8, 0.1
 # A fit has converged when its strengths have settled and its loss fell by less than `enough` over
 # so many iterations; by that times chi2 per pixel where that is above 1, since a model that misfits
@@ -81,7 +82,7 @@ class Progress:
 
     def due(self, accepted):
         """Which scenes (B,) learn their strengths now."""
-        calm = self._drops[:, :CALM].sum(1) < NEAR * self.enough * self._chi2()
+        calm = self._drops[:, :CALM].sum(1) < NEAR * self._chi2()
         return accepted & ~self.settled & (calm | (self.n_rounds >= self._due))
 
     def learned(self, due, moved, change):
