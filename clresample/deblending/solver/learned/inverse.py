@@ -32,8 +32,8 @@ WORTH = 10.0
 # in local memory, of which devices have 32 KiB and more.
 MOST = 512
 # [px] Pixels are binned by as much as the steps of a block's finest scale, but by no more than
-# this: 2 changes single directions' curvature by up to 1.9, 4 by up to 5. A block of wide waves over
-# a large box, of more binned pixels than MOST_PIXELS, has them coarser: T between them takes the
+# this: 2 changes single directions' curvature by up to 1.9, 4 by up to 5. Blocks of wide waves over
+# large boxes, of more binned pixels than MOST_PIXELS, have them coarser: T between them takes the
 # square of their number.
 COARSEST, MOST_PIXELS = 2, 3000
 # A block is made of the pixels where one of its coefficients has more than this part of its largest
