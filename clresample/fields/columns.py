@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from astropy import units as u
-from astropy.table import QTable, vstack
+from astropy.table import QTable
 
+from ..measurement.columns import Columns
 from .work.part import PATCH_COLUMNS
 
 DESCRIPTIONS = {
@@ -63,21 +64,16 @@ def finished(job, parts, last, unsettled=()):
     """
     tables, fits = [], []
     for i, part in enumerate(parts):
-        mine = {patch for patch, k in last.items() if k == i}
-        patches, rows = part.table("PATCHES"), part.table("CATALOGUE")
-        n_rows, start = patches["n_sources"].tolist(), 0
-        for patch, n in zip(patches["patch"].tolist(), n_rows, strict=True):
-            if patch in mine and n:
-                tables.append(rows[start : start + n])
-            start += n
-        fits += [patches[k : k + 1] for k, p in enumerate(patches["patch"]) if int(p) in mine]
+        patches, rows = part.columns("PATCHES"), part.columns("CATALOGUE")
+        mine = np.array([last[patch] == i for patch in patches["patch"].tolist()], bool)
+        tables.append(rows.chosen(np.repeat(mine, patches["n_sources"])))
+        fits.append(patches.chosen(mine))
     table = QTable({name: EMPTY[name].copy() for name in FIRST if name in EMPTY})
+    tables = [rows for rows in tables if len(rows)]
     if tables:
-        tables.sort(
-            key=lambda t: -len(t.colnames)
-        )  # the most columns first, so that units are known
-        table = _joined(tables)
-        table = table[np.argsort(table["id"], kind="stable")]
+        tables.sort(key=lambda rows: -len(rows.values))  # so that the first one has their order
+        rows = Columns.joined(tables)
+        table = rows.chosen(np.argsort(rows["id"], kind="stable")).table()
         at = np.stack([table["y"].value, table["x"].value], axis=1)
         table = table[job.core.holds(at)]
         moving = np.isin(table["parent_id"], np.array(sorted(unsettled), np.int64))
@@ -85,42 +81,13 @@ def finished(job, parts, last, unsettled=()):
             f"{reason}, which had not settled" if one else str(reason)
             for one, reason in zip(moving, table["reason"], strict=True)
         ]
-    blends = vstack(fits) if fits else QTable({n: np.zeros(0, t) for n, t in PATCH_COLUMNS.items()})
-    blends = blends[np.argsort(blends["patch"])]
+    empty = Columns({name: np.zeros(0, kind) for name, kind in PATCH_COLUMNS.items()})
+    blends = Columns.joined(fits or [empty])
+    blends = blends.chosen(np.argsort(blends["patch"])).table()
     blends["seconds"] = blends["seconds"] * u.s
     for name in set(BLENDS) & set(blends.colnames):
         blends[name].info.description = BLENDS[name]
     return _described(table[_order(job, table.colnames)] if tables else table), blends
-
-
-def _joined(tables):
-    """Tables one after the other; what a row does not have is NaN, and 0 of whole numbers."""
-    names: dict[str, object] = {}
-    for table in tables:
-        for name in table.colnames:
-            names.setdefault(name, table[name])
-    for table in tables:
-        for name, like in names.items():
-            if name not in table.colnames:
-                unit, kind = getattr(like, "unit", None), like.dtype
-                empty = np.full(len(table), 0 if kind.kind in "iu" else np.nan, kind)
-                table[name] = empty if unit is None else empty * unit
-    for table in tables:
-        for name in ("status", "reason"):
-            text = np.asarray(table[name])
-            table[name] = [one.decode() if isinstance(one, bytes) else str(one) for one in text]
-    return vstack([_plain(table[list(names)]) for table in tables])
-
-
-def _plain(table):
-    """Masked values as NaN, and as 0 of whole numbers."""
-    for name in table.colnames:
-        column = table[name]
-        if hasattr(column, "mask") and np.any(column.mask):
-            table[name] = column.filled(0 if column.dtype.kind in "iu" else np.nan)
-        elif hasattr(column, "unmasked"):
-            table[name] = column.unmasked
-    return table
 
 
 def _order(job, names):

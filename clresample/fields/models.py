@@ -41,16 +41,17 @@ def write_models(path, job, parts, last, ids):
     """
     rows, spectra, flat = [], [], []
     for i, part in enumerate(parts):
-        table = part.table("COMPONENTS")
+        table = part.columns("COMPONENTS")
         if not len(table):
             continue
         pixels, their = part.array("MORPHOLOGIES"), part.array("SPECTRA")
-        for k, row in enumerate(table):
-            if last.get(int(row["patch"])) == i and int(row["id"]) in ids:
-                start = int(row["offset"])
-                rows.append([int(row[name]) for name in COMPONENT_COLUMNS])
-                spectra.append(their[k])
-                flat.append(pixels[start : start + int(row["n_y"] * row["n_x"])])
+        numbers = np.stack([table[name] for name in COMPONENT_COLUMNS], axis=1).tolist()
+        for row, spectrum in zip(numbers, their, strict=True):
+            source, _, patch, *_, n_y, n_x, start = row
+            if last.get(patch) == i and source in ids:
+                rows.append(row)
+                spectra.append(spectrum)
+                flat.append(pixels[start : start + n_y * n_x])
     order = sorted(range(len(rows)), key=lambda k: (rows[k][1], rows[k][0], k))
     table = np.array([rows[k] for k in order], np.int64).reshape(-1, len(COMPONENT_COLUMNS))
     sizes = table[:, 5] * table[:, 6]

@@ -19,7 +19,7 @@ from ..sky.varying.field import PSFField
 from .background import Background
 from .box import Box
 from .psfs.psf_field import ConstantPSF
-from .strips import STRIPS
+from .strips import STRIPS, section
 
 
 class Plane(Protocol):
@@ -47,9 +47,7 @@ class FilePlane:
             hdu = _opened(str(self.path))[self.hdu]
             data = STRIPS.read(hdu, self.plane, box)
             if data is None:
-                rows, columns = box.slices
-                index = (rows, columns) if self.plane is None else (self.plane, rows, columns)
-                data = np.asarray(hdu.section[index])
+                data = section(hdu, self.plane, box)
         except Exception as error:  # a damaged file may provoke any exception in astropy
             reason = " ".join(str(error).split()) or type(error).__name__
             raise FileError(f"{self.path}: HDU {self.hdu} cannot be read ({reason})") from error
@@ -115,9 +113,10 @@ class Channel:
         data = np.asarray(self.data.read(box), dtype=np.float64)
         return data if self.background is None else data - self.background.read(box)
 
-    def weights(self, box) -> np.ndarray:
+    def weights(self, box, masked=None) -> np.ndarray:
         """Inverse variances (Ny, Nx) [counts^-2] of a Box, 0 = ignore this pixel.
 
+        masked (Ny, Nx): what `masked` says of the Box, where it was asked before
         Raises ValueError for a channel without a plane of them.
         """
         if self.weight is None:
@@ -129,8 +128,13 @@ class Channel:
             values = np.divide(1.0, variance, out=np.zeros(variance.shape), where=good)
         bad = ~np.isfinite(values) | (values < 0)
         if self.mask is not None:
-            bad |= self.masked(box)
+            bad |= self.masked(box) if masked is None else masked
         return np.where(bad, 0.0, values)
+
+    @property
+    def mask_key(self):
+        """Equal for channels that ignore the same pixels."""
+        return self.mask, self.mask_value
 
     def masked(self, box) -> np.ndarray:
         """Which pixels (Ny, Nx) of a Box the mask excludes; a channel without one excludes none."""
@@ -233,7 +237,7 @@ class Mosaic:
         return Box.around(there).grown(1).meet(whole)
 
     def observation(
-        self, box=None, *, ignore=None, subtract=None, extra=None, psf_box=None
+        self, box=None, *, ignore=None, subtract=None, extra=None, psf_box=None, grid=None
     ) -> Observation | None:
         """The Observation of a Box that lies on the mosaic; None where no pixel has a weight.
 
@@ -243,9 +247,10 @@ class Mosaic:
         extra (C, Ny, Nx) [counts^2]: variance that is added to the pixels'
         psf_box: Box in whose middle the PSF is taken, as if it were the same everywhere; None = it
             varies as the mosaic's does
+        grid: Grid of the Box, where it was made before
         """
         box = box or Box.of(self.grid.shape)
-        weights = np.stack([c.weights(box) for c in self.channels])
+        weights = self._weights(box)
         if ignore is not None:
             weights[:, ignore] = 0
         if not weights.any():
@@ -262,13 +267,18 @@ class Mosaic:
             return Observation(
                 data,
                 psf,
-                self.grid.cutout(box.y0, box.x0, box.shape),
+                grid or self.grid.cutout(box.y0, box.x0, box.shape),
                 weights=weights,
                 channels=tuple(c.name for c in self.channels),
                 zero_points=None if zero_points[0] is None else zero_points,
                 noise=self.noise,
                 name=self.name,
             )
+
+    def _weights(self, box):
+        """Weights (C, Ny, Nx) of all channels on a Box; a mask that several share is read once."""
+        masked = {key: c.masked(box) for key, c in {c.mask_key: c for c in self.channels}.items()}
+        return np.stack([c.weights(box, masked[c.mask_key]) for c in self.channels])
 
     def _middle(self, box):
         """The PSF in the middle of a Box."""

@@ -12,6 +12,7 @@ from astropy.table import QTable
 from ..sky.footprint import open_edge
 from ..sky.observation import ZERO_POINT_UJY
 from ..sky.wcs import frame_of, local_axes, names_of
+from .columns import Columns
 from .photometry import channel_covariances, flux_scale, fluxes
 from .quality import box_chi2, fitted_sources, labels, masked_cores
 from .residuals import channel_residuals, misfits
@@ -23,7 +24,7 @@ EDGE_LIGHT = 0.01
 
 # [deg] scatter of an angle that may have any value: no error is larger
 UNKNOWN_ANGLE_DEG = 180 / np.sqrt(12)
-SHAPE_UNITS = {"size": u.arcsec, "e1": 1, "e2": 1, "angle": u.deg}
+SHAPE_UNITS = {"size": u.arcsec, "e1": None, "e2": None, "angle": u.deg}
 
 
 class Flag(IntFlag):
@@ -87,32 +88,38 @@ def catalogue(result, *, magnitudes=False) -> QTable:
         residual_* per channel [sigma]: the largest residual on the source once filtered with the
             PSF, see `residuals.worst_residuals`; over 5 the source is flagged MISFIT
     """
+    table = columns_of(result, magnitudes=magnitudes).table()
+    table["flags"].info.description = ", ".join(f"{flag.value} {flag.name}" for flag in Flag)
+    return table
+
+
+def columns_of(result, *, magnitudes=False) -> Columns:
+    """The same as `catalogue`, before it is a table."""
     flux, covariance = fluxes(result)
     error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).T)  # (S, C)
-    table = QTable()
-    table["name"] = [s.name or str(i) for i, s in enumerate(result.sources)]
+    table = Columns()
+    table.put("name", [s.name or str(i) for i, s in enumerate(result.sources)])
     positions = result.frame.place(result.sources)
     add_positions(table, result.frame.grid, positions, "")
-    table["flags"] = _flags(result, flux, error, positions, result.footprints)
-    table["flags"].info.description = ", ".join(f"{flag.value} {flag.name}" for flag in Flag)
+    table.put("flags", _flags(result, flux, error, positions, result.footprints))
     with np.errstate(divide="ignore", invalid="ignore"):
-        table["snr"] = np.sqrt(np.nansum((flux / error) ** 2, axis=1))
-    table["snr"][~fitted_sources(result)] = np.nan
-    table["n_components"] = _counts(result)
+        snr = np.sqrt(np.nansum((flux / error) ** 2, axis=1))
+    table.put("snr", np.where(fitted_sources(result), snr, np.nan))
+    table.put("n_components", _counts(result))
     _add_shapes(table, result, error)
     scale, unit = flux_scale(result)
     for i, channel in enumerate(result.channels):
-        table[f"flux_{channel}"] = flux[:, i] * scale[i] * unit[i]
-        table[f"flux_err_{channel}"] = error[:, i] * scale[i] * unit[i]
+        table.put(f"flux_{channel}", flux[:, i] * scale[i], unit[i])
+        table.put(f"flux_err_{channel}", error[:, i] * scale[i], unit[i])
         if magnitudes and unit[i] == u.uJy:
             _add_magnitudes(table, channel, flux[:, i] * scale[i], error[:, i] * scale[i])
     if magnitudes:
         _add_colours(table, result, flux)
     for i, label in enumerate(labels(result)):
-        table[f"chi2_{label}"] = box_chi2(result, i, result.footprints[i])
+        table.put(f"chi2_{label}", box_chi2(result, i, result.footprints[i]))
     worst = channel_residuals(result)
     for channel, values in zip(result.channels, worst.T, strict=True):
-        table[f"residual_{channel}"] = values
+        table.put(f"residual_{channel}", values)
     table["flags"][misfits(worst)] |= Flag.MISFIT
     return table
 
@@ -131,9 +138,9 @@ def add_positions(table, grid, positions, suffix):
         names, unit = names_of(grid.wcs), u.deg
         table.meta["frame"] = frame_of(grid.wcs).name
     for name, values in zip(names, sky, strict=True):
-        table[name + suffix] = values * unit
+        table.put(name + suffix, values, unit)
     for name, values in zip("yx", positions.T, strict=True):
-        table[name + suffix] = values * u.pix
+        table.put(name + suffix, values, u.pix)
 
 
 def _add_shapes(table, result, error):
@@ -159,8 +166,8 @@ def _add_shapes(table, result, error):
     _add_position_errors(table, result, centroids)
     shape_errors[:, 3] = np.minimum(shape_errors[:, 3], UNKNOWN_ANGLE_DEG)
     for i, (name, unit) in enumerate(SHAPE_UNITS.items()):
-        table[name] = sizes[:, i] * unit
-        table[f"{name}_err"] = shape_errors[:, i] * unit
+        table.put(name, sizes[:, i], unit)
+        table.put(f"{name}_err", shape_errors[:, i], unit)
 
 
 def _scatter(slopes, covariance):
@@ -171,7 +178,7 @@ def _scatter(slopes, covariance):
 def _add_position_errors(table, result, centroids):
     """Columns of the errors of the fitted light's centroids (S, 2) [model px]."""
     grid = result.frame.grid
-    names = ("y_sky", "x_sky") if grid.is_flat else table.colnames[1:3]
+    names = ("y_sky", "x_sky") if grid.is_flat else list(table.values)[1:3]
     on_sky, errors = np.full((2, *centroids.shape), np.nan)
     for s in np.flatnonzero(np.isfinite(centroids).all(1) & (result.errors is not None)):
         covariance = result.errors.moments[s, :2, :2]
@@ -184,22 +191,22 @@ def _add_position_errors(table, result, centroids):
         on_sky[s] = _scatter(steps, covariance)
     unit = u.arcsec if grid.is_flat else u.deg
     for i, name in enumerate(names):
-        table[f"{name}_centroid_err"] = on_sky[:, i] * unit
+        table.put(f"{name}_centroid_err", on_sky[:, i], unit)
     for i, name in enumerate("yx"):
-        table[f"{name}_centroid_err"] = errors[:, i] * u.pix
+        table.put(f"{name}_centroid_err", errors[:, i], u.pix)
 
 
 def _add_magnitudes(table, channel, flux_ujy, error_ujy):
     flux_ujy = np.where(flux_ujy > 0, flux_ujy, np.nan)
-    table[f"mag_{channel}"] = (ZERO_POINT_UJY - 2.5 * np.log10(flux_ujy)) * u.mag
-    table[f"mag_err_{channel}"] = 2.5 / np.log(10) * error_ujy / flux_ujy * u.mag
+    table.put(f"mag_{channel}", ZERO_POINT_UJY - 2.5 * np.log10(flux_ujy), u.mag)
+    table.put(f"mag_err_{channel}", 2.5 / np.log(10) * error_ujy / flux_ujy, u.mag)
 
 
 def _add_colours(table, result, flux):
     """Columns of colours of neighbouring channels that have magnitudes; flux (S, C) [counts]."""
     covariance, names = channel_covariances(result), result.channels
     for i, (a, b) in enumerate(pairwise(names)):
-        if f"mag_{a}" not in table.colnames or f"mag_{b}" not in table.colnames:
+        if f"mag_{a}" not in table or f"mag_{b}" not in table:
             continue
         one, other = (np.where(flux[:, k] > 0, flux[:, k], np.nan) for k in (i, i + 1))
         slopes = np.stack([1 / one, -1 / other], axis=1)  # of ln(flux ratio)
@@ -207,9 +214,9 @@ def _add_colours(table, result, flux):
         with np.errstate(invalid="ignore"):  # infinite variances
             error = np.sqrt(np.einsum("sa,sab,sb->s", slopes, both, slopes))
         known = np.isfinite(both).all((1, 2))
-        table[f"colour_{a}_{b}"] = table[f"mag_{a}"] - table[f"mag_{b}"]
+        table.put(f"colour_{a}_{b}", table[f"mag_{a}"] - table[f"mag_{b}"], u.mag)
         error = np.where(known, error, np.where(np.isfinite(slopes).all(1), np.inf, np.nan))
-        table[f"colour_err_{a}_{b}"] = 2.5 / np.log(10) * error * u.mag
+        table.put(f"colour_err_{a}_{b}", 2.5 / np.log(10) * error, u.mag)
 
 
 def _flags(result, flux, error, positions, footprints):

@@ -14,7 +14,9 @@ Szalay, Connolly & Szokoly 1999 (AJ 117, 68).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -32,6 +34,9 @@ NO_WEIGHT = 1e-5
 SAME_PX = 1e-3  # by which pixels of the model may lie beside observed ones and count as the same
 # [sigma^2] Sum of squares up to which its significance is tabulated; above, both grow alike
 TABLE_END, TABLE_STEP = 400.0, 0.25
+# [px] Images of several channels that are transformed at once: those of blends, for which each call
+# costs as much as its arithmetic. More would only take memory: a tile's channels go one by one.
+TOGETHER_PX = 1 << 17
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,33 +92,38 @@ def signal_of(observation, frame) -> Signal:
     observation = observation.white
     places = frame.grid.map_to(observation.grid).at(*np.indices(frame.shape))
     sigmas = np.array(WIDTHS_ARCSEC) / observation.grid.pixel_scale_arcsec
-    shape = observation.data.shape[1:]
+    n_channels, *shape = observation.data.shape
     # zeros beyond the edges, wide enough for the PSF and four sigma of the widest filter
     psf = observation.psf
     reach = int(max(psf.images.shape[1:]) * psf.spacing) // 2 + int(4 * sigmas[-1]) + 1
     size = [fft.next_fast_len(n + reach, real=True) for n in shape]
     nu = np.fft.fftfreq(size[0]), np.fft.rfftfreq(size[1])
-    inside = tuple(slice(n) for n in shape)
+    inside = (..., *(slice(n) for n in shape))
     totals = np.zeros((2, len(sigmas), *shape), np.float32)
     channels, seen = np.zeros(observation.data.shape, np.float32), np.zeros(shape, np.int16)
-    for c, (data, weights) in enumerate(zip(observation.data, observation.weights, strict=True)):
-        unit = weights.max(initial=0) or 1.0  # so that float32 holds data of any scale
+    step = max(1, TOGETHER_PX // math.prod(size))
+    for first in range(0, n_channels, step):
+        c = slice(first, first + step)
+        data, weights = observation.data[c], observation.weights[c]
+        unit = weights.max(axis=(1, 2), keepdims=True)
+        unit = np.where(unit > 0, unit, 1.0)  # so that float32 holds data of any scale
         light = fft.rfft2((weights / unit**0.5 * data).astype(np.float32), size)
         weight = fft.rfft2((weights / unit).astype(np.float32), size)
-        transfer = psf.select([c]).otf(*nu)[0].astype(np.complex64)
+        transfer = psf.select(c).otf(*nu).astype(np.complex64)
         for w, sigma in enumerate(sigmas):
             kernel = transfer * _gaussian(nu[0], sigma)[:, None] * _gaussian(nu[1], sigma)
             power = fft.rfft2(fft.irfft2(kernel, size) ** 2)
             variance = fft.irfft2(weight * power.conj(), size)[inside]
-            most = variance.max(initial=0)
+            most = variance.max(axis=(1, 2), keepdims=True, initial=0)
             some = variance > NO_WEIGHT * most
-            image = fft.irfft2(light * kernel.conj(), size)[inside]
-            image = np.where(some, image / np.sqrt(np.where(some, variance, 1)), 0)
-            totals[0, w] += image
-            totals[1, w] += np.maximum(image, 0) ** 2
+            images = fft.irfft2(light * kernel.conj(), size)[inside]
+            images = np.where(some, images / np.sqrt(np.where(some, variance, 1)), 0)
+            for image in images:  # added one by one, whatever the step
+                totals[0, w] += image
+                totals[1, w] += np.maximum(image, 0) ** 2
             if w == 0:
-                channels[c] = image
-                seen += variance > LEAST_WEIGHT * most
+                channels[c] = images
+                seen += (variance > LEAST_WEIGHT * most).sum(axis=0, dtype=np.int16)
     at = np.moveaxis(places, -1, 0)
     order = 0 if np.abs(places - np.rint(places)).max(initial=0) < SAME_PX else 3
     n_seen = map_coordinates(seen, at, order=0)
@@ -154,20 +164,26 @@ def significance(squares, n_channels) -> np.ndarray:
     squares (...): sum over channels of the squares of the signal to noise that is positive
     n_channels (...): integers, how many were added
     """
-    from scipy.special import binom, chdtrc, ndtri
-
     found = np.zeros(np.shape(squares), np.float32)
-    knots = np.arange(0, TABLE_END + TABLE_STEP, TABLE_STEP)
-    for n in np.unique(n_channels):
+    for n in np.unique(n_channels).tolist():
         if n == 0:
             continue
-        beyond = sum(binom(n, k) / 2.0**n * chdtrc(k, knots) for k in range(1, n + 1))
-        sigmas = -ndtri(np.maximum(beyond, 1e-300))
+        knots, sigmas = _table(n)
         at = n_channels == n
         q = np.asarray(squares)[at]
         above = sigmas[-1] + np.sqrt(np.maximum(q, TABLE_END)) - np.sqrt(TABLE_END)
         found[at] = np.where(q < TABLE_END, np.interp(q, knots, sigmas), above)
     return found
+
+
+@lru_cache(maxsize=64)
+def _table(n):
+    """Sums of squares, and the `significance` of each with n channels."""
+    from scipy.special import binom, chdtrc, ndtri
+
+    knots = np.arange(0, TABLE_END + TABLE_STEP, TABLE_STEP)
+    beyond = sum(binom(n, k) / 2.0**n * chdtrc(k, knots) for k in range(1, n + 1))
+    return knots, -ndtri(np.maximum(beyond, 1e-300))
 
 
 def _gaussian(nu, sigma):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import weakref
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
@@ -217,6 +218,9 @@ class FlatGrid(Grid):
         return matrix, np.linalg.solve(other.jacobian, self.origin - other.origin)
 
 
+LAST: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()  # see WcsGrid._map_to
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class WcsGrid(Grid):
     """Pixels placed by a celestial WCS.
@@ -264,14 +268,23 @@ class WcsGrid(Grid):
         return self.wcs.deepcopy()
 
     def _map_to(self, grid_in, tolerance_px):
-        """The simplest geometry that agrees with both WCS within tolerance_px."""
-        return map_positions(
+        """The simplest geometry that agrees with both WCS within tolerance_px.
+
+        The last one that holds no positions is kept: fits and what is measured of them ask for it.
+        """
+        other, tolerance, known = LAST.get(self, (lambda: None, None, None))
+        if other() is grid_in and tolerance == tolerance_px:
+            return known
+        mapping = map_positions(
             lambda n, m: self.positions_in(grid_in, n, m),
             lambda n, m: grid_in.positions_in(self, n, m),
             grid_in.shape,
             self.shape,
             tolerance_px,
         )
+        if mapping.positions is None:
+            LAST[self] = weakref.ref(grid_in), tolerance_px, mapping
+        return mapping
 
 
 def _cos_sin(angle_deg):

@@ -40,6 +40,7 @@ def blend_of(patch, plan, mosaics, reference, labels, corner, neighbours=None, c
             ignore=_foreign_pixels(cut, grid, foreign),
             subtract=light,
             extra=None if light is None else (MODEL_ERROR * light) ** 2,
+            grid=cut,
         )
         if seen is not None:
             observations.append(seen)

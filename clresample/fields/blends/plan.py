@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import ndimage
@@ -60,6 +61,11 @@ class Plan:
     groups: tuple[tuple[int, ...], ...]
     giants: tuple[tuple[int, ...], ...] = ()
     lost: dict = field(default_factory=dict)
+
+    @cached_property
+    def peak_of(self) -> dict[int, float]:
+        """{id: peak} [sigma] of all sources."""
+        return dict(zip(self.ids.tolist(), self.peaks.tolist(), strict=True))
 
     def to_json(self) -> str:
         """All of it, as `from_json` takes it; floats with the digits that give them back."""

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from astropy.table import QTable
 
 from ...deblending.batch import deblend_many
 from ...deblending.blend import INTERRUPTED, Blend, Failure
 from ...deblending.settings import Settings
 from ...device.device import get_device
 from ...device.discovery import DeviceError
-from ...measurement.catalogue import Flag, add_positions, catalogue
+from ...measurement.catalogue import Flag, add_positions, columns_of
+from ...measurement.columns import Columns
 from ...measurement.detection import detect_more
 from ...resampling.cache import default_cache
 from ...sky.grid import Grid
@@ -186,12 +186,10 @@ def _on_patch(given, patch, source):
 def _take(part, job, cut, result, n_round):
     """Add a fitted patch to the part."""
     patch, origin = cut.patch, np.array(cut.patch.box[:2])
-    rows = catalogue(result)
-    ids = np.array([int(name) for name in rows["name"]], np.int64)
-    rows.remove_column("name")
+    rows = columns_of(result)
+    ids = np.array([int(name) for name in rows.values.pop("name")], np.int64)
     for name in POSITIONS:
-        shift = origin[0 if name[0] == "y" else 1]
-        rows[name] = rows[name] + shift * rows[name].unit
+        rows.put(name, rows[name] + origin[0 if name[0] == "y" else 1])
     _add_columns(rows, ids, job, patch, result.status)
     models = [
         (job.mosaics.index(mosaic), box, result.model(i) - _sky(result, i))
@@ -237,10 +235,10 @@ def _all_channels(job, channels, values):
 def _set_aside(part, job, patch, n_round, status):
     """Add a patch without a fit: its sources have their positions and the reason."""
     sources = list(patch.sources)
-    rows = QTable()
+    rows = Columns()
     positions, ids = job.plan.positions[sources], job.plan.ids[sources]
     add_positions(rows, job.reference, positions, "")
-    rows["flags"] = np.full(len(sources), int(Flag.NOT_CONVERGED), np.int32)
+    rows.put("flags", np.full(len(sources), int(Flag.NOT_CONVERGED), np.int32))
     _add_columns(rows, ids, job, patch, status)
     part.rows.append(rows)
     part.patches.append(
@@ -251,18 +249,18 @@ def _set_aside(part, job, patch, n_round, status):
 def _add_columns(rows, ids, job, patch, status):
     """What a field's catalogue has beside that of a blend."""
     n = len(ids)
-    peaks = dict(zip(job.plan.ids.tolist(), job.plan.peaks.tolist(), strict=True))
+    peaks = job.plan.peak_of
     kind, _, reason = status.partition(": ")
     if patch.pieces > 1:
         cut = f"blend of {patch.n_blend} sources cut into {patch.pieces} pieces"
         reason = f"{reason}; {cut}" if reason else cut
-    rows["id"] = ids
-    rows["parent_id"] = np.full(n, patch.parent, np.int64)
-    rows["peak"] = np.array([peaks.get(i, np.nan) for i in ids.tolist()])
-    rows["pass"] = np.array([1 if i in peaks else 2 for i in ids.tolist()], np.int16)
-    rows["n_blend"] = np.full(n, patch.n_blend, np.int32)
-    rows["status"] = [kind] * n
-    rows["reason"] = [reason] * n
+    rows.put("id", ids)
+    rows.put("parent_id", np.full(n, patch.parent, np.int64))
+    rows.put("peak", np.array([peaks.get(i, np.nan) for i in ids.tolist()]))
+    rows.put("pass", np.array([1 if i in peaks else 2 for i in ids.tolist()], np.int16))
+    rows.put("n_blend", np.full(n, patch.n_blend, np.int32))
+    rows.put("status", np.full(n, kind))
+    rows.put("reason", np.full(n, reason))
 
 
 def _line(error):

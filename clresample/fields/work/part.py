@@ -7,22 +7,25 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+from astropy import units as u
 from astropy.io import fits
-from astropy.table import QTable, Table, vstack
 
 from ...files.fits import open_fits
+from ...measurement.columns import Columns
 from ..box import Box
 
 PATCH_COLUMNS = {
     "patch": np.int64,
     "parent_id": np.int64,
     "round": np.int64,
-    "status": "U200",
+    "status": "U",
     "n_sources": np.int64,
     "n_pixels": np.int64,
     "iterations": np.int64,
     "seconds": float,
 }
+META = "FRAME", "EXTNAME"  # cards of a table's header that its Columns know too
+FITS_FORMATS = {"int16": "I", "int32": "J", "int64": "K", "float32": "E", "float64": "D"}
 COMPONENT_COLUMNS = ("id", "parent_id", "patch", "y0", "x0", "n_y", "n_x", "offset")
 MODEL_COLUMNS = ("patch", "mosaic", "y0", "x0", "y1", "x1", "offset")
 
@@ -31,7 +34,7 @@ MODEL_COLUMNS = ("patch", "mosaic", "y0", "x0", "y1", "x1", "offset")
 class Part:
     """The results of a group of patches.
 
-    rows: QTables of sources, one for each patch; patches: rows of PATCH_COLUMNS
+    rows: Columns of sources, one for each patch; patches: rows of PATCH_COLUMNS
     components: rows of COMPONENT_COLUMNS, offsets counted in `flat`; spectra: (C,) of each
     flat: morphologies, flattened; models: rows of MODEL_COLUMNS, pixels: of these, flattened
     """
@@ -62,15 +65,15 @@ class Part:
 
     def to_bytes(self) -> bytes:
         """The file that PartFile reads."""
+        columns = zip(*self.patches, strict=True) if self.patches else [()] * len(PATCH_COLUMNS)
+        patches = {
+            name: np.array(values, kind)
+            for (name, kind), values in zip(PATCH_COLUMNS.items(), columns, strict=True)
+        }
         hdus = [
             fits.PrimaryHDU(),
-            _table(_stacked(self.rows), "CATALOGUE"),
-            _table(
-                Table(
-                    rows=self.patches, names=list(PATCH_COLUMNS), dtype=list(PATCH_COLUMNS.values())
-                ),
-                "PATCHES",
-            ),
+            _table(Columns.joined([rows for rows in self.rows if len(rows)]), "CATALOGUE"),
+            _table(Columns(patches), "PATCHES"),
             _table(_whole(self.components, COMPONENT_COLUMNS), "COMPONENTS"),
             _floats(self.spectra, "SPECTRA"),
             _floats(self.flat and np.concatenate(self.flat), "MORPHOLOGIES"),
@@ -82,18 +85,23 @@ class Part:
         return file.getvalue()
 
 
-def _stacked(tables):
-    tables = [table for table in tables if len(table)]
-    return vstack(tables, join_type="outer", metadata_conflicts="silent") if tables else QTable()
-
-
 def _whole(rows, names):
-    return Table(np.array(rows, np.int64).reshape(-1, len(names)), names=names)
+    values = np.array(rows, np.int64).reshape(-1, len(names))
+    return Columns(dict(zip(names, values.T, strict=True)))
 
 
-def _table(table, name):
-    hdu = fits.table_to_hdu(table) if table.colnames else fits.BinTableHDU()
-    hdu.name = name
+def _table(columns, name):
+    """The HDU of Columns; their meta are cards of its header."""
+    found = []
+    for key, values in columns.values.items():
+        form, unit = FITS_FORMATS.get(values.dtype.name), columns.units.get(key)
+        if form is None:  # text
+            values = np.char.encode(values, "ascii")
+            form = f"{max(1, values.dtype.itemsize)}A"
+        unit = None if unit is None else unit.to_string("fits")
+        found.append(fits.Column(key, form, unit, array=values))
+    hdu = fits.BinTableHDU.from_columns(found, name=name) if found else fits.BinTableHDU(name=name)
+    hdu.header.update(columns.meta)
     return hdu
 
 
@@ -108,11 +116,16 @@ class PartFile:
 
     path: Path
 
-    def table(self, name) -> QTable:
-        """The table of an HDU."""
+    def columns(self, name) -> Columns:
+        """The Columns of an HDU, native; none where it has none."""
         with open_fits(self.path) as hdus:
             hdu = hdus[name]
-            return QTable.read(hdu) if hdu.columns.names else QTable()
+            found = Columns(meta={k: hdu.header[k] for k in META if k in hdu.header})
+            for column in hdu.columns:
+                values = np.asarray(hdu.data[column.name])
+                unit = column.unit and u.Unit(column.unit, format="fits")
+                found.put(column.name, values.astype(values.dtype.newbyteorder("=")), unit)
+            return found
 
     def array(self, name) -> np.ndarray:
         """The pixels of an HDU, native; empty where it has none."""
@@ -125,12 +138,12 @@ class PartFile:
     def models(self, chosen=None):
         """(patch, mosaic, Box, model (C, Ny, Nx)) of its patches, or of those whose number is in
         `chosen`."""
-        index = self.table("MODELS")
+        index = self.columns("MODELS")
+        rows = np.stack([index[name] for name in MODEL_COLUMNS], axis=1).tolist()
         with open_fits(self.path) as hdus:
             hdu = hdus["PIXELS"]
-            ends = [*index["offset"][1:], hdu.header.get("NAXIS1", 0)] if len(index) else []
-            for row, end in zip(index, ends, strict=True):
-                if chosen is None or row["patch"] in chosen:
-                    box = Box(*(int(row[k]) for k in ("y0", "x0", "y1", "x1")))
-                    image = np.array(hdu.section[int(row["offset"]) : int(end)], np.float32)
-                    yield int(row["patch"]), int(row["mosaic"]), box, image.reshape(-1, *box.shape)
+            ends = [*index["offset"][1:].tolist(), hdu.header.get("NAXIS1", 0)] if rows else []
+            for (patch, mosaic, *corners, start), end in zip(rows, ends, strict=True):
+                if chosen is None or patch in chosen:
+                    image, box = np.array(hdu.section[start:end], np.float32), Box(*corners)
+                    yield patch, mosaic, box, image.reshape(-1, *box.shape)

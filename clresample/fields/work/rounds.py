@@ -142,7 +142,7 @@ class _Parts:
             of_name.setdefault(name, set()).add(patch)
         for name, patches in of_name.items():
             part = _file(self.job, name)
-            rows, where = part.table("CATALOGUE"), dict(_owners(part))
+            rows, where = part.columns("CATALOGUE"), dict(_owners(part))
             flux, error = (_columns(rows, kind, self.job) for kind in ("flux", "flux_err"))
             for k, source in enumerate(rows["id"].tolist()):
                 if where.get(source) in patches:
@@ -152,15 +152,14 @@ class _Parts:
 
 def _owners(part):
     """(id of the source, patch) of each component in a PartFile."""
-    table = part.table("COMPONENTS")
+    table = part.columns("COMPONENTS")
     return list(zip(table["id"].tolist(), table["patch"].tolist(), strict=True))
 
 
 def _columns(rows, kind, job):
     """Columns of all channels that the rows have: (S, C)."""
-    names = [f"{kind}_{c}" for c in job.channels if f"{kind}_{c}" in rows.colnames]
-    columns = [np.asarray(getattr(rows[name], "value", rows[name]), float) for name in names]
-    return np.array(columns).reshape(len(names), len(rows)).T
+    names = [f"{kind}_{c}" for c in job.channels if f"{kind}_{c}" in rows]
+    return np.array([rows[name] for name in names], float).reshape(len(names), len(rows)).T
 
 
 def _fit_round(job, tasks, engine, progress):
@@ -209,7 +208,7 @@ def _parts_of(folder):
     """{name: patches} of the parts on disk."""
     found = {}
     for path in sorted(folder.glob("fit-*.fits")):
-        patches = PartFile(path).table("PATCHES")["patch"]
+        patches = PartFile(path).columns("PATCHES")["patch"]
         found[path.stem] = tuple(int(p) for p in patches)
     return found
 
