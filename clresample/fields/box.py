@@ -7,6 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..sky.mapping import NOISE_PX
+
+# [px] by which equal pieces of sky may differ in size across an image, its distortion's effect
+SAME_PX = 0.01
+
 
 class Box(NamedTuple):
     """Rows y0 to y1 and columns x0 to x1 of an image, the ends not included."""
@@ -70,6 +75,37 @@ class Box(NamedTuple):
             raise ValueError("points has some that are not finite")
         low, high = np.floor(points.min(0) + 0.5), np.floor(points.max(0) + 0.5)
         return cls(int(low[0]), int(low[1]), int(high[0]) + 1, int(high[1]) + 1)
+
+
+def outline(shape):
+    """Rows and columns [px] of points along the outer edge of an image, every 16 px at most."""
+    n_y, n_x = shape
+    rows = np.linspace(-0.5, n_y - 0.5, max(2, n_y // 16 + 2))
+    columns = np.linspace(-0.5, n_x - 0.5, max(2, n_x // 16 + 2))
+    y = [rows, rows, np.full_like(columns, -0.5), np.full_like(columns, n_y - 0.5)]
+    x = [np.full_like(rows, -0.5), np.full_like(rows, n_x - 0.5), columns, columns]
+    return np.concatenate(y), np.concatenate(x)
+
+
+def box_within(points, margin, step, whole) -> Box:
+    """The pixels whose centres lie between points (n, 2) [px], (y, x), of the Box `whole`.
+
+    With `margin` more on each side, and more until the sides are multiples of `step`, both as far
+    as `whole` goes: where it ends on one side, they are taken on the other. So they have one shape
+    wherever in `whole` the points lie.
+    """
+    low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
+    sides = []
+    for a, b, start, end in zip(low, high, whole[:2], whole[2:], strict=True):
+        first, last = math.ceil(a - NOISE_PX), math.floor(b + NOISE_PX)
+        if max(first, start) > min(last, end - 1):
+            return Box(whole.y0, whole.x0, whole.y0, whole.x0)
+        n = max(last - first + 1, math.ceil(b - a - SAME_PX))
+        n = min(step * math.ceil(n / step), end - start)
+        first = min(max(first - (n - (last - first + 1)) // 2, start), end - n)
+        sides.append((first, first + n))
+    (y0, y1), (x0, x1) = sides
+    return Box(y0, x0, y1, x1)
 
 
 def sized_up(box, step) -> Box:

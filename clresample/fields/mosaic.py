@@ -17,7 +17,7 @@ from ..sky.observation import Observation
 from ..sky.psf_checks import PSFWarning
 from ..sky.varying.field import PSFField
 from .background import Background
-from .box import Box
+from .box import Box, outline
 from .psfs.psf_field import ConstantPSF
 from .strips import STRIPS, section
 
@@ -82,8 +82,11 @@ class NumberPlane:
 
 @lru_cache(maxsize=64)
 def _opened(path):
-    """The HDUs of a file, which stay open: each process maps a file into its memory once."""
-    return fits.open(path, memmap=True, lazy_load_hdus=True)
+    """The HDUs of a file, which stay open: each process maps a file into its memory once.
+
+    Asked for by memmap=True, astropy would refuse integers without a sign, as masks have them.
+    """
+    return fits.open(path, lazy_load_hdus=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,13 +231,15 @@ class Mosaic:
 
         Of area 0 where there are none.
         """
-        edge = _outline(grid.shape)
-        there = grid.positions_in(self.grid, *edge)
-        there = there[np.isfinite(there).all(axis=-1)]
-        whole = Box.of(self.grid.shape)
+        there = self.edge_of(grid)
         if not len(there):
             return Box(0, 0, 0, 0)
-        return Box.around(there).grown(1).meet(whole)
+        return Box.around(there).grown(1).meet(Box.of(self.grid.shape))
+
+    def edge_of(self, grid) -> np.ndarray:
+        """Points (n, 2) [px] along the outer edge of a grid, those that this mosaic has."""
+        there = grid.positions_in(self.grid, *outline(grid.shape))
+        return there[np.isfinite(there).all(axis=-1)]
 
     def observation(
         self, box=None, *, ignore=None, subtract=None, extra=None, psf_box=None, grid=None
@@ -283,16 +288,6 @@ class Mosaic:
     def _middle(self, box):
         """The PSF in the middle of a Box."""
         return self.psf.psf_at(*((np.array(box[:2]) + np.array(box[2:]) - 1) / 2))
-
-
-def _outline(shape):
-    """Rows and columns [px] of points along the outer edge of an image, every 16 px at most."""
-    n_y, n_x = shape
-    rows = np.linspace(-0.5, n_y - 0.5, max(2, n_y // 16 + 2))
-    columns = np.linspace(-0.5, n_x - 0.5, max(2, n_x // 16 + 2))
-    y = [rows, rows, np.full_like(columns, -0.5), np.full_like(columns, n_y - 0.5)]
-    x = [np.full_like(rows, -0.5), np.full_like(rows, n_x - 0.5), columns, columns]
-    return np.concatenate(y), np.concatenate(x)
 
 
 def _set(flags, bits):

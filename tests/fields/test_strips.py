@@ -6,7 +6,7 @@ from astropy.io import fits
 
 from clresample.fields.box import Box
 from clresample.fields.mosaic import FilePlane, _opened
-from clresample.fields.strips import STRIP_PX, Strips
+from clresample.fields.strips import STRIP_PX, Strips, section
 
 SHAPE = 3, 150, 90
 
@@ -82,3 +82,19 @@ def test_a_file_written_again_is_read_again(tmp_path, cube):
         fits.CompImageHDU(image, **lossless).writeto(path, overwrite=True)
         _opened.cache_clear()
         np.testing.assert_array_equal(FilePlane(path, 1).read(box), image[box.slices])
+
+
+@pytest.mark.parametrize("card", [None, "BZERO", "BSCALE", "BLANK"])
+def test_sections_of_plain_images_hold_the_pixels_of_the_file(tmp_path, card):
+    rng = np.random.default_rng(1)
+    pixels = rng.integers(0, 60000, SHAPE).astype(np.uint16 if card == "BZERO" else np.int16)
+    header = fits.Header({card: 2} if card in ("BSCALE", "BLANK") else {})
+    path = tmp_path / "plain.fits"
+    fits.HDUList([fits.PrimaryHDU(pixels, header), fits.ImageHDU(pixels[1])]).writeto(path)
+    with fits.open(path) as hdus, fits.open(path) as read:
+        for corners in BOXES:
+            box = Box(*corners)
+            for i, plane, image in ((0, 2, read[0].data[2]), (1, None, read[1].data)):
+                for got in (section(hdus[i], plane, box), FilePlane(path, i, plane).read(box)):
+                    assert got.shape == box.shape
+                    np.testing.assert_array_equal(got, image[box.slices])

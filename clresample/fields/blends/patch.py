@@ -8,7 +8,11 @@ from ...deblending.blend import Blend
 from ...deblending.spectra import MODEL_ERROR
 from ...sky.frame import model_frame
 from ...sky.sources import Extended
-from ..box import Box
+from ..box import Box, box_within
+
+# [px] Sides of the cutouts of fits are multiples of it, as the boxes of their models are of theirs:
+# smaller ones make more batches, larger ones more sky to compute.
+SIDE_PX = 4
 
 
 def blend_of(patch, plan, mosaics, reference, labels, corner, neighbours=None, components=None):
@@ -28,7 +32,7 @@ def blend_of(patch, plan, mosaics, reference, labels, corner, neighbours=None, c
     foreign = _foreign(patch, labels, corner, neighbours is not None)
     known, observations, boxes = components or {}, [], {}
     for mosaic in mosaics:
-        box = mosaic.box_on(grid)
+        box = fit_box(mosaic, grid)
         if not box.area:
             continue
         light = None
@@ -55,6 +59,20 @@ def blend_of(patch, plan, mosaics, reference, labels, corner, neighbours=None, c
     )
     frame = model_frame(observations, grid=grid) if observations else None
     return Blend(tuple(observations), sources, frame), boxes
+
+
+def fit_box(mosaic, grid) -> Box:
+    """The pixels of a mosaic whose centres lie on a grid: those that a fit in it looks at.
+
+    Where noise is correlated, one more on each side: the filter that makes it white leaves a
+    cutout's outer pixels without a weight. Grids of one shape have Boxes of one shape, so that
+    their fits share a batch without padding. Of area 0 where there are none.
+    """
+    there = mosaic.edge_of(grid)
+    if not len(there):
+        return Box(0, 0, 0, 0)
+    margin = 0 if mosaic.noise is None else 1
+    return box_within(there, margin, SIDE_PX, Box.of(mosaic.grid.shape))
 
 
 def _foreign(patch, labels, corner, siblings_too):

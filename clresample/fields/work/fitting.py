@@ -139,8 +139,15 @@ def _fits(job, blends):
     """Results and Failures of blends; one that was interrupted ends all."""
     if not blends:
         return []
-    device = get_device(job.device)
-    results = deblend_many(blends, settings=job.settings, device=device, memory=job.memory)
+    device, sizes = get_device(job.device), {}
+    for i, blend in enumerate(blends):
+        sizes.setdefault(tuple(o.shape for o in blend.observations), []).append(i)
+    results: list = [None] * len(blends)
+    for alike in sizes.values():  # all at once, those of one size would be padded too
+        few = [blends[i] for i in alike]
+        found = deblend_many(few, settings=job.settings, device=device, memory=job.memory)
+        for i, result in zip(alike, found, strict=True):
+            results[i] = result
     if any(r.status == INTERRUPTED for r in results):
         raise KeyboardInterrupt
     if lost := next((r.status for r in results if NO_ANSWER in r.status), None):

@@ -14,7 +14,7 @@ from ...files.fits import open_fits
 from ...measurement.columns import Columns
 from ..box import Box
 
-PATCH_COLUMNS = {
+PATCH_COLUMNS: dict[str, type | str] = {
     "patch": np.int64,
     "parent_id": np.int64,
     "round": np.int64,
