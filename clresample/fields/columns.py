@@ -64,7 +64,7 @@ def finished(job, parts, last, unsettled=()):
     """
     tables, fits = [], []
     for i, part in enumerate(parts):
-        patches, rows = part.columns("PATCHES"), part.columns("CATALOGUE")
+        patches, rows = part.read("PATCHES", "CATALOGUE")
         mine = np.array([last[patch] == i for patch in patches["patch"].tolist()], bool)
         tables.append(rows.chosen(np.repeat(mine, patches["n_sources"])))
         fits.append(patches.chosen(mine))

@@ -41,10 +41,7 @@ def write_models(path, job, parts, last, ids):
     """
     rows, spectra, flat = [], [], []
     for i, part in enumerate(parts):
-        table = part.columns("COMPONENTS")
-        if not len(table):
-            continue
-        pixels, their = part.array("MORPHOLOGIES"), part.array("SPECTRA")
+        table, pixels, their = part.read("COMPONENTS", "MORPHOLOGIES", "SPECTRA")
         numbers = np.stack([table[name] for name in COMPONENT_COLUMNS], axis=1).tolist()
         for row, spectrum in zip(numbers, their, strict=True):
             source, _, patch, *_, n_y, n_x, start = row

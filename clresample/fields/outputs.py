@@ -73,7 +73,7 @@ def _last_rounds(parts):
     """{patch: index of the part with its last round}."""
     last, n_round = {}, {}
     for i, part in enumerate(parts):
-        rows = part.columns("PATCHES")
+        (rows,) = part.read("PATCHES")
         for patch, one in zip(rows["patch"].tolist(), rows["round"].tolist(), strict=True):
             if one >= n_round.get(patch, -1):
                 last[patch], n_round[patch] = i, one

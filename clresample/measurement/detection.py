@@ -252,6 +252,8 @@ def _new_peaks(sep, image, threshold, area, known, apart, own=True):
 def _objects(sep, image, threshold, area):
     """sep's objects: (position (y, x), height) of each, and the number from 1 of that which holds a
     pixel (Ny, Nx), 0 = none."""
+    if not image.max(initial=0) > threshold:  # as most residuals: sep takes 1 ms to say so
+        return [], np.zeros(image.shape, np.int32)
     objects, segments = sep.extract(
         np.ascontiguousarray(image),
         threshold,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -98,9 +99,15 @@ def model_frame(observations, *, grid=None, psf_sigma_px=0.8, shared=False) -> F
                 f"none of its {observation.grid.shape} pixels lies on the frame's "
                 f"{grid.shape}"
             )
+    return Frame(grid, _model_psf(float(psf_sigma_px)))
+
+
+@lru_cache(maxsize=4)
+def _model_psf(sigma_px):
+    """The Gaussian of this standard deviation [model px] in model pixels."""
     # the pixel adds its own variance, 1/12, to the Gaussian's
-    radius = math.ceil(REACH * math.sqrt(psf_sigma_px**2 + 1 / 12))
-    return Frame(grid, PSF.gaussian(psf_sigma_px, n_pixels=2 * radius + 1))
+    radius = math.ceil(REACH * math.sqrt(sigma_px**2 + 1 / 12))
+    return PSF.gaussian(sigma_px, n_pixels=2 * radius + 1)
 
 
 def _check_connected(observations, like):

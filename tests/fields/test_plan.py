@@ -6,7 +6,7 @@ from scipy import ndimage
 
 from clresample.fields.blends.cut import Limits, pieces_of
 from clresample.fields.blends.link import link
-from clresample.fields.blends.plan import Plan, make_plan, source_ids
+from clresample.fields.blends.plan import STEP_PX, Plan, make_plan, source_ids
 from clresample.fields.blends.search import Found, grown_footprints
 from clresample.fields.blends.tiles import tiles_of
 from clresample.fields.box import Box
@@ -100,7 +100,7 @@ def test_every_source_is_in_one_patch_and_one_group_and_its_pixel_is_labelled():
     assert sorted(n for g in plan.groups for n in g) == list(range(len(plan.patches)))
     assert any(p.pieces > 1 for p in plan.patches)
     assert all(len(p.sources) <= 6 for p in plan.patches)
-    assert all(n % 32 == 0 for p in plan.patches for n in p.box.shape)
+    assert all(n % STEP_PX == 0 for p in plan.patches for n in p.box.shape)
     for patch in plan.patches:
         for y, x in np.floor(plan.positions[list(patch.sources)] + 0.5).astype(int):
             assert footprints.labels[y, x] == patch.number + 1

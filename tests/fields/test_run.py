@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from astropy.io import fits
-from astropy.table import QTable, vstack
+from astropy.table import QTable
 from helpers.fields import mosaics_of
 
 from clresample import FieldOptions, get_device
-from clresample.fields import columns, options, run
+from clresample.fields import options, run
 from clresample.fields.blends.cut import Limits
 from clresample.fields.models import read_models
 from clresample.fields.mosaic import FilePlane
@@ -275,7 +275,7 @@ def test_several_devices_have_a_process_each_and_leave_the_same_bytes(done, sky,
 
 def test_groups_shrink_with_the_device_and_leave_the_same_sources(done, sky, tmp_path, monkeypatch):
     folder, _ = done
-    device, small = get_device(), 8 << 20
+    device, small = get_device(), 3 << 20
     monkeypatch.setattr(look, "DEVICE_PART", device.memory // small)
     for module in (run, options):
         monkeypatch.setattr(module, "LEAST_MEMORY", 1 << 20)
@@ -284,13 +284,3 @@ def test_groups_shrink_with_the_device_and_leave_the_same_sources(done, sky, tmp
     assert n_small > n_groups
     differences, n_others = compared(folder, tmp_path)
     assert n_others == 0 and np.abs(differences).max() < 0.05
-
-
-def test_sources_that_failed_leave_whole_numbers_whole():
-    ok, failed = QTable({"id": [1], "n": [2], "f": [1.5]}), QTable({"id": [3]})
-    for tables in ([ok, failed], [vstack([ok, failed])]):
-        for rows in tables:
-            rows["status"] = rows["reason"] = [""] * len(rows)
-        joined = columns._joined([rows.copy() for rows in tables])
-        assert joined["n"].dtype.kind == "i" and joined["n"].tolist() == [2, 0]
-        assert joined["f"][0] == 1.5 and np.isnan(joined["f"][1])

@@ -18,7 +18,7 @@ from .search import nearest
 MARGIN_PX = 8
 # [model px] Sides of these boxes are multiples of it, so that blends share batches: smaller ones
 # make more batches, larger ones more sky to compute.
-STEP_PX = 32
+STEP_PX = 16
 # Bits of an id for each of a source's row and column, and of the field's number above them.
 POSITION_BITS = 20
 LARGEST_FIELD = (1 << 63 - 2 * POSITION_BITS) - 1

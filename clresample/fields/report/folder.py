@@ -181,7 +181,7 @@ def _so_far(work, notes):
     for path in sorted(work.glob("fit-*.fits")):
         part = PartFile(path)
         try:
-            patches, rows = part.columns("PATCHES").table(), part.columns("CATALOGUE").table()
+            patches, rows = (one.table() for one in part.read("PATCHES", "CATALOGUE"))
         except (FileError, KeyError) as error:
             notes.append(f"{path.name} cannot be read ({' '.join(str(error).split())})")
             continue

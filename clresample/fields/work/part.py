@@ -116,34 +116,38 @@ class PartFile:
 
     path: Path
 
-    def columns(self, name) -> Columns:
-        """The Columns of an HDU, native; none where it has none."""
+    def read(self, *names) -> list:
+        """What some HDUs hold, native: the Columns of a table, the pixels of an image; of those
+        that are empty none."""
         with open_fits(self.path) as hdus:
-            hdu = hdus[name]
-            found = Columns(meta={k: hdu.header[k] for k in META if k in hdu.header})
-            for column in hdu.columns:
-                values = np.asarray(hdu.data[column.name])
-                unit = column.unit and u.Unit(column.unit, format="fits")
-                found.put(column.name, values.astype(values.dtype.newbyteorder("=")), unit)
-            return found
-
-    def array(self, name) -> np.ndarray:
-        """The pixels of an HDU, native; empty where it has none."""
-        with open_fits(self.path) as hdus:
-            data = hdus[name].data
-            if data is None:
-                return np.zeros(0, np.float32)
-            return np.array(data, dtype=data.dtype.newbyteorder("="))
+            chosen = [hdus[name] for name in names]
+            return [_array(hdu) if hdu.is_image else _columns(hdu) for hdu in chosen]
 
     def models(self, chosen=None):
         """(patch, mosaic, Box, model (C, Ny, Nx)) of its patches, or of those whose number is in
         `chosen`."""
-        index = self.columns("MODELS")
-        rows = np.stack([index[name] for name in MODEL_COLUMNS], axis=1).tolist()
         with open_fits(self.path) as hdus:
-            hdu = hdus["PIXELS"]
+            index, hdu = _columns(hdus["MODELS"]), hdus["PIXELS"]
+            rows = np.stack([index[name] for name in MODEL_COLUMNS], axis=1).tolist()
             ends = [*index["offset"][1:].tolist(), hdu.header.get("NAXIS1", 0)] if rows else []
             for (patch, mosaic, *corners, start), end in zip(rows, ends, strict=True):
                 if chosen is None or patch in chosen:
                     image, box = np.array(hdu.section[start:end], np.float32), Box(*corners)
                     yield patch, mosaic, box, image.reshape(-1, *box.shape)
+
+
+def _columns(hdu):
+    """The Columns of a table's HDU, native."""
+    found = Columns(meta={k: hdu.header[k] for k in META if k in hdu.header})
+    for column in hdu.columns:
+        values = np.asarray(hdu.data[column.name])
+        unit = column.unit and u.Unit(column.unit, format="fits")
+        found.put(column.name, values.astype(values.dtype.newbyteorder("=")), unit)
+    return found
+
+
+def _array(hdu):
+    """The pixels of an image's HDU, native; empty where it has none."""
+    if hdu.data is None:
+        return np.zeros(0, np.float32)
+    return np.array(hdu.data, dtype=hdu.data.dtype.newbyteorder("="))

@@ -142,7 +142,7 @@ class _Parts:
             of_name.setdefault(name, set()).add(patch)
         for name, patches in of_name.items():
             part = _file(self.job, name)
-            rows, where = part.columns("CATALOGUE"), dict(_owners(part))
+            rows, where = part.read("CATALOGUE")[0], dict(_owners(part))
             flux, error = (_columns(rows, kind, self.job) for kind in ("flux", "flux_err"))
             for k, source in enumerate(rows["id"].tolist()):
                 if where.get(source) in patches:
@@ -152,7 +152,7 @@ class _Parts:
 
 def _owners(part):
     """(id of the source, patch) of each component in a PartFile."""
-    table = part.columns("COMPONENTS")
+    (table,) = part.read("COMPONENTS")
     return list(zip(table["id"].tolist(), table["patch"].tolist(), strict=True))
 
 
@@ -208,8 +208,8 @@ def _parts_of(folder):
     """{name: patches} of the parts on disk."""
     found = {}
     for path in sorted(folder.glob("fit-*.fits")):
-        patches = PartFile(path).columns("PATCHES")["patch"]
-        found[path.stem] = tuple(int(p) for p in patches)
+        (patches,) = PartFile(path).read("PATCHES")
+        found[path.stem] = tuple(patches["patch"].tolist())
     return found
 
 

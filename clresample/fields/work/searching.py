@@ -17,9 +17,9 @@ from ..blends.tiles import tiles_of
 from .engine import Work
 from .look import looked
 
-# [bytes] that searching a pixel of the model takes for each channel: data, weights, and their
-# float64 images on the model, twice
-SEARCH_BYTES = 120
+# [bytes] that searching a pixel of the model takes for each channel, and two more for all together:
+# of channels in the model's own pixels 132, 268 and 536 bytes a pixel were held for 1, 4 and 8
+SEARCH_BYTES = 60
 LEAST_TILE_PX = 64  # however little memory there is: smaller tiles are mostly overlap
 
 

@@ -1,0 +1,88 @@
+"""Parts on disk: what went in comes out, of sources that failed too."""
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.table import QTable
+
+from clresample.fields.blends.plan import Patch
+from clresample.fields.box import Box
+from clresample.fields.work.part import COMPONENT_COLUMNS, PATCH_COLUMNS, Part, PartFile
+from clresample.measurement.columns import Columns
+
+PATCH = Patch(number=7, parent=3 << 41, box=Box(5, 6, 25, 36), sources=(0,))
+
+
+@pytest.fixture
+def part():
+    ok, failed = Columns(meta={"frame": "icrs"}), Columns()
+    ok.put("ra", [1.5, -2.0], u.deg)
+    ok.put("flux", [np.inf, 3e-9], u.uJy)
+    ok.put("flags", np.array([64, 0], np.int32))
+    ok.put("n_components", np.array([1, 2]))
+    failed.put("ra", [7.0], u.deg)
+    failed.put("flags", np.array([2], np.int32))
+    for rows, status, reason in ((ok, "converged", ""), (failed, "failed", "no pixel")):
+        rows.put("id", np.arange(len(rows), dtype=np.int64) + (5 << 41))
+        rows.put("status", np.full(len(rows), status))
+        rows.put("reason", np.full(len(rows), reason))
+    made = Part(rows=[ok, Columns(), failed])
+    made.patches = [
+        (7, 3 << 41, 0, "converged", 2, 600, 20, 0.25),
+        (9, 1, 1, "failed: x", 1, 9, 0, 0.0),
+    ]
+    return made
+
+
+def read(part, tmp_path):
+    path = tmp_path / "fit-0-000000.fits"
+    path.write_bytes(part.to_bytes())
+    return PartFile(path), path
+
+
+def test_sources_that_failed_leave_whole_numbers_whole(part, tmp_path):
+    file, path = read(part, tmp_path)
+    (rows,) = file.read("CATALOGUE")
+    assert len(rows) == 3 and rows.meta == {"FRAME": "icrs", "EXTNAME": "CATALOGUE"}
+    assert rows.units == {"ra": u.deg, "flux": u.uJy}
+    assert rows["ra"].tolist() == [1.5, -2.0, 7.0]
+    np.testing.assert_array_equal(rows["flux"], [np.inf, 3e-9, np.nan])
+    assert rows["n_components"].tolist() == [1, 2, 0] and rows["flags"].tolist() == [64, 0, 2]
+    assert [rows[name].dtype.str for name in ("flags", "id", "flux")] == ["<i4", "<i8", "<f8"]
+    assert rows["id"].tolist() == [5 << 41, (5 << 41) + 1, 5 << 41]
+    assert rows["status"].tolist() == ["converged", "converged", "failed"]
+    assert rows["reason"].tolist() == ["", "", "no pixel"]
+    table = QTable.read(path, hdu="CATALOGUE")  # as any other program sees it
+    assert table["ra"].unit == u.deg and table["flux"].unit == u.uJy
+
+
+def test_patches_components_and_models_come_back(part, tmp_path):
+    morphology = np.arange(6.0).reshape(2, 3)
+    part.add_component(11, PATCH, np.array([8, 9]), morphology, np.array([1.0, np.nan]))
+    part.add_component(12, PATCH, np.array([1, 2]), 2 * morphology, np.array([3.0, 4.0]))
+    models = {0: np.full((1, 4, 5), 2.5), 1: np.arange(12.0).reshape(2, 2, 3)}
+    boxes = {0: Box(0, 1, 4, 6), 1: Box(7, 8, 9, 11)}
+    for i, model in models.items():
+        part.add_model(PATCH, i, boxes[i], model)
+    file, _ = read(part, tmp_path)
+    patches, components = file.read("PATCHES", "COMPONENTS")
+    assert list(patches.values) == list(PATCH_COLUMNS)
+    assert patches["patch"].tolist() == [7, 9] and patches["parent_id"].tolist() == [3 << 41, 1]
+    assert patches["status"].tolist() == ["converged", "failed: x"]
+    assert patches["seconds"].tolist() == [0.25, 0.0]
+    rows = np.stack([components[name] for name in COMPONENT_COLUMNS], axis=1).tolist()
+    assert rows == [[11, 3 << 41, 7, 8, 9, 2, 3, 0], [12, 3 << 41, 7, 1, 2, 2, 3, 6]]
+    spectra, morphologies = file.read("SPECTRA", "MORPHOLOGIES")
+    np.testing.assert_array_equal(spectra, [[1.0, np.nan], [3.0, 4.0]])
+    assert morphologies.tolist() == [*range(6), *range(0, 12, 2)]
+    found = list(file.models())
+    assert [(patch, i, box) for patch, i, box, _ in found] == [(7, i, boxes[i]) for i in (0, 1)]
+    for _, i, _, model in found:
+        np.testing.assert_array_equal(model, models[i])
+    assert list(file.models({8})) == []
+
+
+def test_an_empty_part_is_a_file_too(tmp_path):
+    file, _ = read(Part(), tmp_path)
+    assert [len(one) for one in file.read("CATALOGUE", "PATCHES", "PIXELS")] == [0, 0, 0]
+    assert list(file.models()) == []
