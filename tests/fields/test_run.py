@@ -10,6 +10,7 @@ from helpers.fields import mosaics_of
 
 from clresample import FieldOptions, get_device
 from clresample.fields import options, run
+from clresample.fields.blends import plan
 from clresample.fields.blends.cut import Limits
 from clresample.fields.models import read_models
 from clresample.fields.mosaic import FilePlane
@@ -273,9 +274,11 @@ def test_several_devices_have_a_process_each_and_leave_the_same_bytes(done, sky,
         FieldOptions(device=[])
 
 
-def test_groups_shrink_with_the_device_and_leave_the_same_sources(done, sky, tmp_path, monkeypatch):
-    folder, _ = done
-    device, small = get_device(), 3 << 20
+def test_groups_shrink_with_the_device_and_leave_the_same_sources(sky, tmp_path, monkeypatch):
+    monkeypatch.setattr(plan, "STEP_PX", 32)  # so that this small field has groups of several
+    folder, tmp_path = tmp_path / "all", tmp_path / "few"
+    run_field(mosaics_of(sky), folder)
+    device, small = get_device(), 8 << 20
     monkeypatch.setattr(look, "DEVICE_PART", device.memory // small)
     for module in (run, options):
         monkeypatch.setattr(module, "LEAST_MEMORY", 1 << 20)

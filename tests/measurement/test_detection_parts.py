@@ -137,3 +137,19 @@ def test_the_brightest_peak_comes_first():
     for place, peak in (((5, 5), 9), ((20, 8), 30), ((12, 24), 15)):
         image[place] = peak
     assert [peak for _, peak in module._new_peaks(sep, image, 5.0, 1, [], 1.0)] == [30, 15, 9]
+
+
+def test_an_image_below_the_threshold_is_not_searched(monkeypatch):
+    class NotAsked:
+        def extract(self, *_args, **_given):
+            raise AssertionError("sep was asked")
+
+    import sep
+
+    image = np.zeros((9, 12), np.float32)
+    image[4, 5:8] = 5.0
+    objects, segments = module._objects(NotAsked(), image, 5.0, 1)
+    assert objects == [] and segments.shape == image.shape and not segments.any()
+    image[4, 6] = np.float32(5.0001)
+    (found,), segments = module._objects(sep, image, 5.0, 1)
+    assert found[0].tolist() == [4, 6] and segments.sum() == 1

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from clresample import PSF, Extended, Frame, Grid, Observation, Resampler, Settings, deblend
+from clresample.measurement import residuals
 from clresample.measurement.catalogue import Flag, catalogue
 from clresample.measurement.quality import summary
 from clresample.measurement.residuals import channel_residuals, misfits, worst_residuals
@@ -69,3 +70,13 @@ def test_noise_alone_is_not_flagged(result):
 def test_noise_larger_than_stated_does_not_flag_everything(result):
     found = left_over(result, bump=0, noise=3 * SIGMA)
     assert not misfits(channel_residuals(found)).any()
+
+
+def test_channels_are_filtered_the_same_together_and_one_by_one(result, monkeypatch):
+    one = left_over(result, bump=8.0, noise=SIGMA)
+    found = []
+    for together in (1, 1 << 30):
+        monkeypatch.setattr(residuals, "TOGETHER_PX", together)
+        found.append(worst_residuals(one, 0))
+    np.testing.assert_array_equal(*found)
+    assert np.isfinite(found[0]).all()

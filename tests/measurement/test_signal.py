@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from clresample.measurement import signal as module
 from clresample.measurement.signal import WIDTHS_ARCSEC, Signal, combined, signal_of, significance
 from clresample.sky.frame import model_frame
 from clresample.sky.grid import Grid
@@ -112,3 +113,26 @@ def test_in_units_of_the_scatter():
     one = signal([[[6.0]], [[2.0]]], np.ones((2, 1, 1))).over([2.0, 1.0, 1.0])
     assert one.flat()[0, 0] == pytest.approx(4 / np.sqrt(2))
     assert one.squares[0, 0, 0] == 10 and one.channels[0, 0, 0] == 3
+
+
+@pytest.mark.parametrize("n_channels", [1, 5])
+def test_channels_are_the_same_together_and_one_by_one(monkeypatch, n_channels):
+    """To the last bit: tiles of a field go one by one, blends all at once."""
+    rng = np.random.default_rng(2)
+    data = (
+        rng.normal(0, 1, (n_channels, *BLURRED.shape))
+        * np.logspace(0, 6, n_channels)[:, None, None]
+    )
+    weights = rng.uniform(0, 2, data.shape) * (rng.random(data.shape) > 0.05)
+    weights[-1, :30] = 0
+    psf = PSF.gaussian(np.linspace(1.2, 2.0, n_channels), n_pixels=31)
+    one = Observation(data, psf, BLURRED, weights=weights)
+    frame = model_frame([one], grid=SHARP)
+    found = []
+    for together in (1, 3 * 120 * 120, 1 << 30):
+        monkeypatch.setattr(module, "TOGETHER_PX", together)
+        found.append(signal_of(one, frame))
+    for other in found[1:]:
+        for name in ("sums", "squares", "n_seen", "channels"):
+            np.testing.assert_array_equal(getattr(other, name), getattr(found[0], name))
+    assert np.isfinite(found[0].sums).all() and found[0].sums.any()

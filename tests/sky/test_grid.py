@@ -1,5 +1,7 @@
 """Grids flat and on the sky, their cutouts and boxes, and what is none."""
 
+import gc
+
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
@@ -20,7 +22,7 @@ from helpers.headers import (
 )
 
 from clresample.sky.extent import intersection, union
-from clresample.sky.grid import Grid
+from clresample.sky.grid import LAST, Grid
 
 
 def test_flat_grids():
@@ -207,3 +209,22 @@ def test_a_flat_grid_from_its_jacobian():
             Grid.from_jacobian((4, 4), jacobian, origin)
     with pytest.raises(ValueError, match="shape"):
         Grid.from_jacobian((0, 4), np.eye(2), (0, 0))
+
+
+def test_a_mapping_is_found_once_and_kept_no_longer_than_its_grids():
+    wcs = Grid.flat((40, 50), 0.2, angle_deg=30).to_wcs(ra_deg=10.0, dec_deg=20.0)
+    one, other = (
+        Grid.from_wcs(wcs, (40, 50)),
+        Grid.flat((64, 64), 0.1).to_wcs(ra_deg=10.0, dec_deg=20.0),
+    )
+    other = Grid.from_wcs(other, (64, 64))
+    first = one.map_to(other)
+    assert one.map_to(other) is first and other.map_to(one) is not first
+    assert one.map_to(other, 1e-3) is not first
+    again = Grid.from_wcs(wcs, (40, 50)).map_to(other)
+    assert again is not first
+    np.testing.assert_array_equal(again.matrix, first.matrix)
+    n_kept = len(LAST)
+    del one, other
+    gc.collect()
+    assert len(LAST) < n_kept
