@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from helpers.start import point_of
 
-from clresample.deblending.resize import _box, _moved, _same, box_around, box_threshold
+from clresample.deblending.resize import (
+    _box,
+    _moved,
+    _same,
+    box_around,
+    box_of,
+    box_threshold,
+)
 from clresample.deblending.solver.boxes import Boxes
 from clresample.deblending.spectra import inverse
 
@@ -31,6 +38,15 @@ def test_boxes_end_where_light_does():
     assert [*low, *(low + size)] == [0, 22, 21, 41] and [*centre] == [1, 16]
     low, size, centre = box_around(0 * profile, (90.0, -7.0), 1.0)  # nothing, outside
     assert [*low, *(low + size)] == [34, 0, 40, 6] and [*centre] == [5, 0]
+
+
+def test_boxes_of_a_start_hold_five_pixels_about_small_sources():
+    """Where its light ends before; as far as the frame goes."""
+    for place, wanted in (((25, 30), [20, 25, 31, 36]), ((3, 57), [0, 52, 9, 60])):
+        image = _spot((50, 60), place, 0.4)
+        low, size, centre, part = box_of(point_of(image[None], place), 0, (50, 60), 1.0)
+        assert [*low, *(low + size)] == wanted and [*(low + centre)] == [*place]
+        np.testing.assert_allclose(part, image[low[0] : wanted[2], low[1] : wanted[3]])
 
 
 def test_boxes_grow_and_shrink_by_their_edges():

@@ -9,6 +9,7 @@ from clresample.deblending.components import gradients, second
 from clresample.deblending.components.gradients import Asked, gain
 from clresample.deblending.rendered import Rendered
 from clresample.deblending.start.start import StartingPoint
+from clresample.deblending.view import WhitenedView
 from clresample.sky.sources import Extended, Point
 
 
@@ -117,6 +118,37 @@ def test_what_neighbours_leave_nothing_of_is_not_seen():
     covariance[:, 1, 1] = np.inf, 0.25
     values, precision = gradients._eliminated(covariance, slope, power, 1)
     np.testing.assert_allclose([values[0], precision[0]], [[0, 0.25], [0, 4]])
+
+
+def test_the_second_start_is_from_what_the_others_leave():
+    """Their light and the sky are taken off the data, in every channel of each observation."""
+    rng, shape = np.random.default_rng(6), (5, 4)
+    spectra, sky = rng.uniform(1, 2, (3, 3)), np.array([0.5, -0.25, 0.125])
+    parts, views, observed = [slice(0, 1), slice(1, 3)], [], []
+    begin = SimpleNamespace(source=np.array([0, 2, 1]), positions=rng.uniform(0, 4, (3, 2)))
+    for part in parts:
+        images = rng.random((3, part.stop - part.start, *shape))
+        observed.append(Rendered(images.shape, np.zeros((3, 2), int), list(images)))
+        data, root = rng.normal(size=images.shape[1:]), np.ones(images.shape[1:])
+        shares = rng.random((3, part.stop - part.start, 2))
+        views.append(WhitenedView(None, None, None, None, root, data, shares))
+    fit = SimpleNamespace(
+        state=SimpleNamespace(spectra=spectra, sky=sky),
+        scene=SimpleNamespace(channels=lambda: parts),
+        start=begin,
+        views=views,
+        frame="home",
+    )
+    patch = second._alone(fit, Asked(np.array([1]), np.array([9.0]), observed))
+    for view, own, images, part in zip(views, patch.views, observed, parts, strict=True):
+        others = np.einsum("ic,icyx->cyx", spectra[[0, 2], part], np.asarray(images)[[0, 2]])
+        np.testing.assert_allclose(own.data, view.data - others - sky[part, None, None])
+        np.testing.assert_array_equal(own.shares, view.shares[[2]])
+    (source,) = patch.sources
+    assert source.n_components == 2 and patch.frame == "home"
+    np.testing.assert_array_equal(patch.positions, begin.positions[[2]])
+    np.testing.assert_array_equal(source.position_px, begin.positions[2])
+    assert fit.state.spectra.all()  # the first fit's own stay
 
 
 def ended(n, losses, *, energies=0.0, findings=True, fixed=()):

@@ -136,6 +136,21 @@ def test_sizes_of_blends_are_told_apart():
     assert batch._sizes(Blend(given.observations, (3,))) is None
 
 
+def test_blends_of_one_size_keep_it_and_others_share_one(monkeypatch):
+    """Failures to be, which have no size, pad nobody."""
+    pads, small, large = [], scenes.blend(), scenes.blend(shape=(32, 37))
+
+    def fitted(blends, *, pad, **_):
+        pads.append(pad)
+        return [(Failure(b, "not asked"), None) for b in blends]
+
+    monkeypatch.setattr(batch, "_fit_all", fitted)
+    monkeypatch.setattr(batch, "get_device", lambda device: device)
+    for blends in ([small], [small, small], [small, 3], [small, large], []):
+        batch.deblend_many(blends, device="any")
+    assert pads == [1, 1, 1, batch.PAD_PX, 1]
+
+
 def test_work_is_bounded_before_it_begins():
     given = scenes.blend()
     home = SimpleNamespace(shape=(4096, 4097))

@@ -98,6 +98,8 @@ def test_weights_by_hand():
     root = 0.5**0.5
     want = np.array([root, 0, 0, 1, 0, root, 0, 0]) / (1 + 2 * root)
     np.testing.assert_allclose(w[MonotoneWeights.ANGLE], want)
+    edge = ref.monotone_weights((9, 9), (0, 4), MonotoneWeights.FLAT)[:, 0, 7]
+    np.testing.assert_allclose(edge, np.array([0, 0, 0, 1, 0, 1, 0, 0]) / 2)  # none from outside
 
 
 def exact_projection(y, center, weights, gradient, positive):

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from helpers import scenes
 
+from clresample.deblending.posterior import posterior
 from clresample.deblending.posterior.bumps import _gaussians
 from clresample.deblending.posterior.errors import Draws
 from clresample.deblending.posterior.modes import STRENGTH, Solution
 from clresample.deblending.posterior.normal import Layout, _by_channel
 from clresample.deblending.posterior.posterior import _local_chi2
 from clresample.deblending.posterior.profile_modes import Beyond, profile_modes
-from clresample.deblending.profiles import Galaxy
+from clresample.deblending.profiles import Galaxy, Given, Star
 from clresample.deblending.rendered import Rendered
 from clresample.deblending.solver.learned.prior import LearnedPrior
 
@@ -145,6 +146,22 @@ def test_light_beyond_a_box_is_followed_for_half_its_side(side, margin):
     assert far.slopes[0, -1] == pytest.approx(0.4 * rest, rel=1e-9)
 
 
+def test_how_far_profiles_and_places_may_be_off():
+    """A tenth of a pixel; of the peak 0.2 in the core and 0.05 in the halo, or a part of those; a
+    galaxy's parameters and a star's place as expected at the start."""
+    home, position = scenes.frame(), np.array([10.0, 11.0])
+    galaxy, star, box = Galaxy(home), Star(home, free=True), np.ones((9, 9))
+    kinds = [
+        (galaxy, galaxy.mean, [*galaxy.scatter, 0.1, 0.1]),
+        (Given(box), np.zeros(0), [0.1, 0.1]),
+    ]
+    for shape, theta, wanted in kinds:
+        for radial in (1.0, 0.5):
+            _, scatter, _ = profile_modes(shape, theta, position, box, [6, 7], radial=radial)
+            np.testing.assert_allclose(scatter, [*wanted, 0.2 * radial, 0.05 * radial])
+    assert profile_modes(star, np.zeros(2), position, box, [6, 7])[1] is star.scatter
+
+
 def test_bumps_stand_on_every_hth_pixel_of_the_frame_to_beyond_both_ends():
     """Of a box of 23 pixels from 13 on: from the multiple of 8 before that at its first pixel."""
     found = _gaussians(13, 23, 8)
@@ -161,6 +178,21 @@ def test_where_unknowns_lie():
     assert full.sizes.tolist() == [7, 4, 6, 8] and full.shift(0) is None
     assert full.shift(1).tolist() == [4, 5] and full.shift(2).tolist() == [6, 7]
     assert Layout(counts, 4, n_shifts=2).shift(1).tolist() == [0, 1]
+
+
+def test_unknowns_are_modes_spectra_sky_levels_and_shifts_of_all_but_the_first(monkeypatch):
+    """The first image of a component is its morphology, the others are its modes."""
+    monkeypatch.setattr(posterior, "normal_matrix", lambda *given: given[-1])
+    monkeypatch.setattr(posterior, "Factor", lambda _: SimpleNamespace(inverse=lambda: None))
+    images = [np.arange(k).reshape(k, 1, 1) for k in (1, 3)]
+    one = SimpleNamespace(
+        spectra=np.ones((2, 5)), scene=None, modes=lambda i: (images[i], Beyond.none(len(images)))
+    )
+    for sky, shifts in ((False, False), (True, False), (False, True), (True, True)):
+        made = posterior.Posterior(one, [0, 0, 0], fit_sky=sky, fit_shifts=shifts)
+        assert [m.ravel().tolist() for m in made.modes] == [[], [1, 2]]
+        assert made.layout.counts.tolist() == [0, 2] and made.layout.n_channels == 5
+        assert (made.layout.n_sky, made.layout.n_shifts) == (5 * sky, 4 * shifts)
 
 
 def test_products_with_each_channel():

@@ -12,11 +12,10 @@ from clresample.deblending.start.profile_fit import ProfileFit
 class Valley:
     """Stands in for a Looking at one parameter a scene: chi2 = (theta - goal)^2 * steep + rest."""
 
-    def __init__(self, goals, steep, rest):
+    def __init__(self, goals, steep, rest, mean=0.0, scatter=1e6):
         self.goals, self.steep, self.rest = np.array(goals), steep, rest
         n = len(goals)
-        mean = np.zeros(4)
-        shape = SimpleNamespace(mean=mean, scatter=np.full(4, 1e6))
+        shape = SimpleNamespace(mean=np.full(4, mean), scatter=np.full(4, scatter))
         self.components = [SimpleNamespace(shape=shape) for _ in goals]
         self.scene, self.index = np.arange(n), np.zeros(n, int)
         self.n_scenes, self.n_most = n, 1
@@ -42,8 +41,8 @@ class Valley:
 def valley(monkeypatch):
     """Makes a ProfileFit of a Valley, whose equations promise `promise` times the way."""
 
-    def made(goals, steep=1e4, rest=100.0, promise=1.0):
-        looking = Valley(goals, steep, rest)
+    def made(goals, steep=1e4, rest=100.0, promise=1.0, **expected):
+        looking = Valley(goals, steep, rest, **expected)
 
         def equations(_looking):
             k = len(looking.scenes)
@@ -109,6 +108,17 @@ def test_a_scene_that_no_step_helps_is_left_when_damping_is_too_large(valley):
     before = seen.n_looks.copy()
     still.run()
     assert (seen.n_looks == before).all() and far.n_looks[0] == 11
+
+
+def test_profiles_end_between_the_data_and_what_is_expected(valley):
+    """At the mean of both, each in units of its scatter; that of the data is 0.01 here."""
+    for scatter, share in ((0.01, 0.5), (0.02, 0.8), (0.005, 0.2)):
+        fit, _ = valley([0.5, -0.1], rest=1.0, mean=0.1, scatter=scatter)
+        fit.run()
+        away = np.array([0.4, -0.2])
+        np.testing.assert_allclose(fit.theta[:, 0, 0], 0.1 + share * away, atol=0.005)
+        np.testing.assert_allclose(fit.theta[:, 0, 1:], 0.1)
+        np.testing.assert_allclose(fit.chi2, 1 + 1e4 * (1 - share) * away**2, rtol=0.01)
 
 
 def test_brightness_is_that_of_the_channel_that_sees_a_peak_best(monkeypatch):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.scenes import blend
 
-from clresample.deblending.fit import Fit, begin
+from clresample.deblending.fit import Fit, begin, finish
 from clresample.deblending.posterior import exposure
 from clresample.deblending.posterior.exposure import Exposure, Transfer
 from clresample.deblending.settings import Settings
@@ -77,9 +77,14 @@ def test_weights_of_a_scene_are_those_that_bright_stars_have_lowered(device):
 
 def test_seconds_are_those_that_passed(device):
     began = time.perf_counter()
-    one = Fit(blend(), Settings(), device, np.float32, pad=1)
+    one = Fit(blend(), Settings(prior=None), device, np.float32, pad=1)
     begin([one])
     assert 0 < sum(one.seconds.values()) <= time.perf_counter() - began
+    (seen,) = finish([one])
+    shared = one.seconds["result"]
+    found = one.result(seen).seconds
+    assert 0 < shared < found["result"]
+    assert sum(found.values()) <= time.perf_counter() - began
 
 
 def test_no_frequency_of_an_exposure_is_beyond_the_models_pixels():

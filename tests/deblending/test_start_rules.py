@@ -138,6 +138,8 @@ def test_what_is_expected_of_galaxies():
     np.testing.assert_allclose(one.mean, [np.log(2.5), 0, 0, np.log(5)])
     assert ELLIPTICITY_SCATTER == 0.26 and COMPONENT_SPREAD == 1
     np.testing.assert_allclose(one.scatter, [0.4, 0.26, 0.26, 0.7])
+    free = Star(frame(), free=True)  # half a pixel about its place
+    assert free.mean.tolist() == [0, 0] and free.scatter.tolist() == [0.5, 0.5]
     wide = Galaxy(frame(), 1, 2, widened=6.0)
     assert wide.mean[0] == pytest.approx(np.log(2.5 * 6) + 0.5)
     kinds = [

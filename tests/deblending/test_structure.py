@@ -6,7 +6,7 @@ from helpers.buffers import Guards
 from helpers.learned import Source
 from helpers.solver import close, every_type, ragged
 
-from clresample.deblending.solver.boxes import Boxes
+from clresample.deblending.solver.boxes import ALIGN, Boxes
 from clresample.deblending.solver.buffers import Buffers
 from clresample.deblending.solver.learned.prior import LearnedPrior
 from clresample.deblending.solver.learned.structure import Latents, Structure, coarse
@@ -76,6 +76,21 @@ def test_nothing_is_written_beyond_the_buffers(build, monkeypatch):
         for one, again in zip(*found, strict=True):
             np.testing.assert_array_equal(one, again)
     assert guards.overwritten() == []
+
+
+def test_memory_is_that_of_a_line_for_each_row(build):
+    """Besides one array of all boxes: rows of coefficients, padded to vectors and by the kernels'
+    radii. Also where a kernel is a pixel longer than vectors."""
+    scenes, states = map(list, zip(*ragged(build, np.float32), strict=True))
+    for prior in (LearnedPrior(), LearnedPrior(scales_px=(1.3,), strengths=(0.1,))):
+        b = Buffers(scenes, states, build, np.float32, prior)
+        before = build.in_use
+        structure = Structure(b, prior)
+        used = (build.in_use - before) / 4
+        rows = structure.latents.shape[:, :, 0].sum(1)
+        line = b.host_boxes.shape[:, 1] + 2 * max(prior.radii) + 6 * ALIGN
+        assert used < b.zeros_flat().size + (rows * line).sum() + 8 * len(rows) + 1000
+    assert len(prior.kernels()[0]) == 9
 
 
 def test_the_gradient_is_the_transpose(build):

@@ -1,5 +1,6 @@
 """Rules of shifts, of rendering and of batches, each on few numbers or one small image."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -148,6 +149,40 @@ def test_slots_are_rendered_in_groups_of_what_the_memory_takes(device, monkeypat
         np.testing.assert_allclose(one, other, atol=1e-6 * np.abs(one).max())
 
 
+def a_star(device, shape):
+    """One in the middle of a small frame, where it is, and two views of it."""
+    home, place = scenes.frame(shape), np.array([9.0, 11.0])
+    at_home = Home(home, home, place[None], 0.0)
+    views = [
+        whitened_view(at_home, o, 1, device, np.float32, private=True)
+        for o in scenes.observe(shape=shape)
+    ]
+    return Component(0, 0, 0, Star(home, free=True), place, shape), place, views
+
+
+def test_signal_to_noise_is_zero_where_nothing_was_seen(device):
+    """<u, d> / |u| of what was, both in units of the noise."""
+    star, place, views = a_star(device, (20, 23))
+    views[1] = replace(views[1], root=0 * views[1].root)
+    looking = looking_at([views], [star], PRECISION, 0.0, fit_sky=False)
+    looking.look([0], [np.zeros(2)], np.ones(1), slopes=False)
+    found = looking.signal_to_noise(np.zeros((1, 3)))
+    u = views[0].root * views[0].see(star.shape.draw(np.zeros(2), place)[:1], 0)[0]
+    wanted = (u * views[0].root * views[0].data).sum() / np.linalg.norm(u)
+    np.testing.assert_allclose(found, [[wanted, 0, 0]], rtol=1e-3)
+
+
+def test_boxes_of_a_whole_frame_are_seen_through_the_observations_own_operator(device):
+    """Which is made already, whatever the frame's sides are."""
+    star, _, views = a_star(device, (20, 23))
+    looking = looking_at([views], [star], PRECISION, 0.0, fit_sky=False)
+    looking.look([0], [np.zeros(2)], np.ones(1), slopes=True)
+    assert looking.slots.size.tolist() == [[20, 23]]
+    for sight, view in zip(looking.sights, views, strict=True):
+        (renderer,) = sight.aim._renderers.values()
+        assert renderer.plan is view.op.plans[0]
+
+
 def boxes_at(*places, scene=None, n=8):
     count = len(places)
     return Boxes(
@@ -171,10 +206,10 @@ def test_groups_are_of_the_cells_that_hold_the_middles_of_boxes():
 
 def test_operations_are_counted_from_sizes():
     """Products of matrices, four operations a term and pair; weighed sums at points beside them."""
-    shape, frame = np.array([[3, 5], [4, 2]]), (20, 30, 16, 48)
+    shape, frame = np.array([[3, 5], [4, 3]]), (20, 30, 16, 48)
     found = choice._counts(shape, 2, 3, *frame)
     n_y, n_x, k_y, k_x = frame
-    rows, pixels, n_images = 7, 23, 6
+    rows, pixels, n_images = 7, 27, 6
     second = n_images * k_y * n_y * k_x
     wanted = [
         n_images * n_y * n_x * k_x + second + choice.POINT * 1.5 * 3 * pixels,
