@@ -10,6 +10,7 @@ from clresample.deblending import batch, fit as fit_module
 from clresample.deblending.batch import _ManyFits
 from clresample.deblending.blend import Blend, Failure
 from clresample.deblending.fit import DIVERGED, PATIENCE, data_bytes, stop_reason
+from clresample.deblending.solver.scene import Scene
 from clresample.sky.sources import Extended, SourceWarning
 
 
@@ -77,6 +78,17 @@ def fits(n, monkeypatch, *, sources=1, n_bytes=10, memory=1000, signatures=None,
     many.tuning = SimpleNamespace(n_scenes=n_scenes)
     many._begun = lambda group: [fit.number for _, fit in group]
     return list(many._groups())
+
+
+def test_memory_of_a_scene():
+    """Two models and four observed images a channel, twelve arrays a box, of eight bytes each."""
+    ops = [
+        SimpleNamespace(shape_in=(1, 4, 5), shape_out=(2, 3, 3)),
+        SimpleNamespace(shape_in=(2, 4, 5), shape_out=(2, 6, 7)),
+    ]
+    one = SimpleNamespace(ops=ops, profile=[np.zeros((3, 3)), np.zeros((2, 5))])
+    wanted = 8 * (2 * (20 + 40) + 4 * (18 + 84) + 12 * 19)
+    assert Scene.n_bytes.fget(one) == wanted
 
 
 def test_groups_fill_up():

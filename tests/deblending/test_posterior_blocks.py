@@ -42,6 +42,17 @@ def test_the_inverse_is_the_dense_one_where_it_is_asked_for(common):
         np.testing.assert_allclose(block / size, expected / size, atol=1e-7)
 
 
+def test_what_the_data_say_is_kept_and_what_nobody_knows_has_a_number():
+    """Of two unknowns of which the data know the sum alone, the sum keeps its error."""
+    matrix = Blocks([1, 2])
+    matrix.block(0, 0)[:], matrix.block(1, 1)[:] = 4.0, 25.0
+    found = Factor(matrix).inverse()
+    assert found.block(0, 0)[0, 0] == pytest.approx(1 / 4, rel=1e-7)
+    both = found.block(1, 1)
+    assert both.sum() == pytest.approx(4 / 100, rel=1e-5)
+    assert both[0, 0] > 1e6 / 25  # nothing is known of one of them alone
+
+
 def test_draws_scatter_as_the_inverse_says():
     """Exactly: draws of unit vectors are a root of it."""
     matrix = field(3, 3, common=2)

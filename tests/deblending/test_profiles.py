@@ -53,6 +53,17 @@ def test_a_star_is_the_psf():
     assert np.abs(corner[20:, 20:]).max() < 1e-12
 
 
+@pytest.mark.parametrize("sigma", [(9.0, 1.0), (1.0, 9.0)])
+def test_a_long_psf_does_not_come_back_on_the_other_side(sigma):
+    """Whichever of its sides is the longer one: beyond its last pixel there is nothing."""
+    along = [np.exp(-0.5 * (np.arange(-3 * s, 3 * s + 1) / s) ** 2) for s in sigma]
+    psf = PSF(np.outer(*along))
+    drawn = point(psf, (0.0, 0.0), (45, 45), slopes=False)[0]
+    height, width = (n // 2 + 1 for n in psf.images.shape[1:])
+    assert drawn[0, 0] == drawn.max() > 0.01
+    assert np.abs(drawn[height:]).max() < 1e-12 and np.abs(drawn[:, width:]).max() < 1e-12
+
+
 @pytest.mark.parametrize("position", PLACES[:2])
 def test_a_galaxy_is_what_its_parameters_say(position):
     """Unit integral; the second moments of a Gaussian where beta is large."""

@@ -138,6 +138,10 @@ def test_a_profile_read_off_images_is_symmetric_and_above_the_noise():
     mirrored = image_profiles._mirror(image, (1, 2))
     assert mirrored[0, 0] == image[2, 4] and mirrored[2, 4] == image[0, 0]
     assert mirrored[3, 2] == image[3, 2] and mirrored[1, 5] == image[1, 5]  # beyond the edge
+    mirrored = image_profiles._mirror(image, (3, 4))  # as near the far corner
+    assert mirrored[2, 3] == image[4, 5] and mirrored[4, 5] == image[2, 3]
+    np.testing.assert_array_equal(mirrored[:2], image[:2])
+    np.testing.assert_array_equal(mirrored[:, :3], image[:, :3])
     images = np.zeros((2, 3, 3))
     images[0, 1, 1], images[1, 1, 1], images[1, 0, 0] = 3.0, 4.0, 10.0
     found = image_profiles._combine(images, (1, 1))
