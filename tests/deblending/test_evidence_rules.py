@@ -76,6 +76,18 @@ def test_curvature_of_what_is_seen_alike_at_all_frequencies_is_that():
     np.testing.assert_allclose(one.curvature(np.array([2.0])), wanted, rtol=1e-10)
 
 
+def test_power_is_broadened_by_the_light_that_it_lies_in():
+    """Noise of a kernel's power times an amplitude has the convolution of both powers; mean 1."""
+    prior = LearnedPrior()
+    amplitude = np.random.default_rng(3).uniform(0, 1, (9, 12))
+    light = np.fft.fft2(np.abs(np.fft.fft2(amplitude, (64, 64))) ** 2)
+    for found, taps in zip(Spectra(prior).broadened(amplitude), prior.kernels(), strict=True):
+        along = np.abs(np.fft.fft(taps, 64)) ** 2
+        power = np.fft.ifft2(np.fft.fft2(np.outer(along, along)) * light).real
+        wanted = (power / power.mean())[:, :33].ravel()
+        np.testing.assert_allclose(found, wanted, atol=1e-9 * wanted.max())
+
+
 def test_answers_are_taken_within_half_a_side_of_their_pixel():
     """Of 64: what lies further away is none of it, and nothing beyond the image is missed."""
     spectra = Spectra(LearnedPrior(scales_px=(1.0,), strengths=(0.1,)))
