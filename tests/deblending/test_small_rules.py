@@ -56,6 +56,16 @@ def test_pairs_lie_in_the_slots_that_kernels_look_at():
     assert pairs.used.tolist() == [1, 4]
 
 
+@pytest.mark.parametrize("size", [1.0, 1e-9, 1e9])
+def test_pairs_that_show_curvature_are_kept_however_large_they_are(size):
+    """s . y above a millionth of y . h y, and above 0."""
+    pairs, shape = Pairs(4, 3), (4, 4)
+    sy = size * np.array([2e-6, 0.5e-6, -1.0, 1.0])[:, None]
+    yy = size * np.array([1.0, 1.0, 1.0, -1e-3])[:, None]  # below 0 by rounding alone
+    pairs.take(np.arange(4), np.broadcast_to(sy, shape), np.broadcast_to(yy, shape))
+    assert pairs.count.tolist() == [1, 0, 0, 1]
+
+
 def test_only_scenes_that_learn_have_another_loss():
     progress = Progress(3, 0.01, [100, 100, 100])
     progress.loss[:] = [50.0, 60.0, 70.0]
