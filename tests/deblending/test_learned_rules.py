@@ -7,6 +7,7 @@ import pytest
 
 from clresample.deblending.solver.learned import progress as progress_module
 from clresample.deblending.solver.learned.engine import (
+    LearnedEngine,
     _inverse_curvature,
     _n_pixels,
     vector_bytes,
@@ -152,6 +153,24 @@ def test_strengths_are_learned_at_once_where_little_is_left_to_gain():
             progress.learned(np.array([True]), np.array([0.2]), np.zeros(1))
         progress.next(accepted)
     assert due == [5, 8]
+
+
+@pytest.mark.parametrize("due", [(True, False), (False, True), (True, True), (False, False)])
+def test_a_scene_learns_when_it_is_due_though_others_are_not(due):
+    one, learned, sums = object.__new__(LearnedEngine), [], np.zeros((2, 3, 4))
+    one.progress = SimpleNamespace(
+        judge=lambda *_: (np.ones(2, bool), np.zeros(2, bool)),
+        due=lambda _: np.array(due),
+        next=lambda _: (None, None, None),
+    )
+    one.pairs = SimpleNamespace(
+        take=lambda *_: None, forget=lambda _: None, coefficients=lambda *_: (None, None, None)
+    )
+    one.steps = SimpleNamespace(follow=lambda *_: None, advance=lambda *_: None)
+    one._evaluate = lambda: (sums, None, None)
+    one._learn = lambda which: learned.append(tuple(which.tolist())) or sums
+    one.round()
+    assert learned == ([due] if any(due) else [])
 
 
 def test_another_loss_is_looked_at_where_the_scene_is():

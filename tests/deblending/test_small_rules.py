@@ -58,7 +58,7 @@ def test_pairs_lie_in_the_slots_that_kernels_look_at():
 
 @pytest.mark.parametrize("size", [1.0, 1e-9, 1e9])
 def test_pairs_that_show_curvature_are_kept_however_large_they_are(size):
-    """s . y above a millionth of y . h y, and above 0."""
+    """s . y above a millionth of y . H y, and above 0."""
     pairs, shape = Pairs(4, 3), (4, 4)
     sy = size * np.array([2e-6, 0.5e-6, -1.0, 1.0])[:, None]
     yy = size * np.array([1.0, 1.0, 1.0, -1e-3])[:, None]  # below 0 by rounding alone
