@@ -146,6 +146,19 @@ def test_light_beyond_a_box_is_followed_for_half_its_side(side, margin):
     assert far.slopes[0, -1] == pytest.approx(0.4 * rest, rel=1e-9)
 
 
+def test_light_beyond_a_box_is_that_of_a_morphology_of_maximum_1():
+    """Where structure has made the peak of a source twice that of its profile."""
+    shape, theta, place = Galaxy(scenes.frame()), np.array([1.5, 0, 0, 0.5]), np.array([10.3, 9.8])
+    whole = shape.draw(theta, place, (21, 21))[0]
+    box = whole[5:16, 5:16] / whole.max()
+    beyond = []
+    for peak in (1.0, 2.0):
+        one = solution([(5, 5)], [box], fixed=(0,), peaks=peak)
+        one.shapes[0], one.thetas[0], one.positions[0] = shape, theta, place
+        beyond.append(one.modes(0)[1].sums)
+    np.testing.assert_allclose(beyond[0], 2 * beyond[1])
+
+
 def test_how_far_profiles_and_places_may_be_off():
     """A tenth of a pixel; of the peak 0.2 in the core and 0.05 in the halo, or a part of those; a
     galaxy's parameters and a star's place as expected at the start."""
