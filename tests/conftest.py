@@ -52,12 +52,12 @@ def pytest_pyfunc_call(pyfuncitem):
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_fixture_setup(request):
+def pytest_runtest_setup(item):
     """And one of whose fixtures does."""
     try:
         return (yield)
     except DeviceError as error:
-        _skip_without_double(error, request.node)
+        _skip_without_double(error, item)
 
 
 def _skip_without_double(error, item):
