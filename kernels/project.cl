@@ -7,7 +7,10 @@
  *   v   <- new + beta (new - l),  l <- new    momentum, dropped when (B z).(new - l) < 0
  *
  * until |new - l| < tolerance |y| or n_iterations; then x <- max(0, y - B^T l). l stays for the
- * next launch.
+ * next projection.
+ *
+ * A launch does the iterations first + 1 .. last, and goes on where the one before it stopped: on
+ * most devices one launch does all n_iterations.
  *
  * Layout: a source of ny x nx pixels has a plane of (ny+2) x P elements, P = nx+2, its pixels
  * inside a rim of zeros, filled up to a multiple of ALIGN; plane s begins at ALIGN pads[s].
@@ -24,6 +27,7 @@
  *
  *   w (8 planes a source, at 8 ALIGN pads[s]): weights of the neighbours, times 1 - g; 0 on the rim
  *   tau, y, l, v, z, g, move (1 plane a source); x, table, active as in prox.cl
+ *   momenta (S): the momentum after a launch, at least 1; 0 of a source that has come to its end
  *   values (2, S): the kind of weights (1 angle, 2 flat, 3 nearest, 0 leaves the source alone), g
  *
  * Launch: n * WG work-items in groups of WG, one a source. WG 1 has no barrier and suits CPUs.
@@ -135,12 +139,14 @@ void project(__global REAL *restrict x, __global const int *table, __global cons
              __global const int *active, __global const REAL *restrict w,
              __global const REAL *restrict tau, __global REAL *restrict y,
              __global REAL *restrict l, __global REAL *restrict v, __global REAL *restrict z,
-             __global REAL *restrict g, __global REAL *restrict move, __global const REAL *values,
-             const int positive, const int n_iterations, const REAL tolerance)
+             __global REAL *restrict g, __global REAL *restrict move, __global REAL *restrict momenta,
+             __global const REAL *values, const int positive, const int first, const int last,
+             const REAL tolerance)
 {
     __local REAL share[WG];
     HEAD
-    if (values[s] == 0) return;
+    REAL momentum = first > 0 ? momenta[s] : (REAL)1;
+    if (values[s] == 0 || momentum == 0) return;
     x += BEGIN(box);
     w += 8 * base;
     tau += base;
@@ -150,12 +156,13 @@ void project(__global REAL *restrict x, __global const int *table, __global cons
     z += base;
     g += base;
     move += base;
-    for (int i = lid; i < ny * nx; i += WG) y[(i / nx + 1) * P + 1 + i % nx] = x[i];
-    FOR_INSIDE(i) v[i] = l[i];
+    if (first == 0) {
+        for (int i = lid; i < ny * nx; i += WG) y[(i / nx + 1) * P + 1 + i % nx] = x[i];
+        FOR_INSIDE(i) v[i] = l[i];
+    }
     SYNC();
     const REAL small = tolerance * tolerance * inner(y, y, n, lid, share);
-    REAL momentum = 1;
-    for (int k = 1; k <= n_iterations; ++k) {
+    for (int k = first + 1; k <= last && momentum > 0; ++k) {
         const REAL next = (1 + sqrt(1 + 4 * momentum * momentum)) / 2;
         const REAL beta = (momentum - 1) / next;
         momentum = next;
@@ -174,9 +181,10 @@ void project(__global REAL *restrict x, __global const int *table, __global cons
         SYNC();
         if (k % CHECK_EVERY == 0) {
             if (inner(g, move, n, lid, share) < 0) momentum = 1;
-            if (inner(move, move, n, lid, share) <= small) break;
+            if (inner(move, move, n, lid, share) <= small) momentum = 0;
         }
     }
+    if (lid == 0) momenta[s] = momentum;
     image(z, y, l, w, n, P, begin, end, positive, lid);
     SYNC();
     for (int i = lid; i < ny * nx; i += WG) x[i] = z[(i / nx + 1) * P + 1 + i % nx];

@@ -48,9 +48,22 @@ def pytest_pyfunc_call(pyfuncitem):
     try:
         return (yield)
     except DeviceError as error:
-        if NO_DOUBLE not in str(error) or _asks_for_single(pyfuncitem):
-            raise
-        pytest.skip(str(error))
+        _skip_without_double(error, pyfuncitem)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup(item):
+    """And one of whose fixtures does."""
+    try:
+        return (yield)
+    except DeviceError as error:
+        _skip_without_double(error, item)
+
+
+def _skip_without_double(error, item):
+    if NO_DOUBLE not in str(error) or _asks_for_single(item):
+        raise error
+    pytest.skip(str(error))
 
 
 def _asks_for_single(item):

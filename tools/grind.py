@@ -65,6 +65,8 @@ FAULTS = {
 }
 # Terms of the paper's contraction for a work-item: small models have few, and are cut all the same.
 CHUNK_TERMS = 32
+# Loops of a work-item in a launch: few enough that a projection takes several.
+LOOPS = 4000
 
 
 def all_kernels():
@@ -90,7 +92,7 @@ def watch(device, kind):
 
     Device.launcher, Launcher.__call__ = of_file, noted
     of = tuning.Tuning.of
-    tuning.Tuning.of = lambda *a: replace(of(*a), chunk_terms=CHUNK_TERMS)
+    tuning.Tuning.of = lambda *a: replace(of(*a), chunk_terms=CHUNK_TERMS, loops=LOOPS)
     return launched
 
 

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 
 # Launches whose events are kept before they are read: reading waits for the device.
 MOST_EVENTS = 2000
+# [s] No launch is that short: Mesa's llvmpipe says 1 ns of each, whatever it does.
+NO_TIME = 1e-8
 COLUMNS = ("kernel", "calls", "seconds", "share", "GFLOP/s", "GB/s")
 
 
@@ -54,18 +56,22 @@ class Profile:
         return dict(sorted(self._rows.items(), key=lambda item: -item[1].seconds))
 
     def table(self):
-        """The rows as text, with a line of sums; "" where nothing was launched."""
+        """The rows as text, with a line of sums; "" where nothing was launched. Calls alone where
+        the driver does not time its kernels."""
         rows = self.rows()
         total = sum(row.seconds for row in rows.values())
         if not rows:
             return ""
+        n_calls = sum(row.n_calls for row in rows.values())
+        if total < NO_TIME * n_calls:
+            calls = ", ".join(f"{kernel} {row.n_calls}" for kernel, row in rows.items())
+            return f"kernels on {self.name}, which does not time them; calls: {calls}"
         cells = [COLUMNS]
         for kernel, row in rows.items():
             rates = [f"{x / row.seconds / 1e9:.1f}" if x and row.seconds else "-"
                      for x in (row.flops, row.n_bytes)]  # fmt: skip
             share = f"{100 * row.seconds / total:.1f} %" if total else "-"
             cells.append((kernel, str(row.n_calls), f"{row.seconds:.4f}", share, *rates))
-        n_calls = sum(row.n_calls for row in rows.values())
         cells.append(("all", str(n_calls), f"{total:.4f}", "", "", ""))
         widths = [max(map(len, column)) for column in zip(*cells)]
         lines = [

@@ -13,6 +13,9 @@ import numpy as np
 # Groups of a launch along its second and third axis, which GPUs limit to so many: NVIDIA's compute
 # capabilities list it, Mesa's drivers have the same.
 MOST_GROUPS = 65535
+# Mesa's driver for CPUs, llvmpipe, counts the iterations of all loops of a work-item in a launch;
+# after 65,535 of them it ends every loop at once, and reports no error.
+LLVMPIPE_LOOPS = 65535
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,8 @@ class Tuning:
     n_scenes: scenes fitted side by side; more hide the launches better, and need more memory
     ahead: a group of fits is prepared and uploaded by a second thread while another iterates; where
         the device is the CPU itself, both would share its cores
+    loops: iterations of all its loops that a work-item may make in one launch; None where a device
+        has no such limit
     memory [bytes]: of the device for one frame in tiles, unless a caller says otherwise. With less,
         tiles are smaller and overlap more; most instruments' quickest tiles take less than 1 GiB
     """
@@ -65,6 +70,7 @@ class Tuning:
     vector_chunk: int
     n_scenes: int
     ahead: bool
+    loops: int | None
     memory: int
 
     @classmethod
@@ -81,10 +87,11 @@ class Tuning:
             "chunk_terms": 1024,
             "tile_flops": 4e7,  # 1 ms, where PoCL does 40 Gflop/s
             "pixel_flops": 80.0,  # 2 ns
+            "loops": LLVMPIPE_LOOPS if "llvmpipe" in device.name else None,
             "memory": min(1 << 30, device.memory // 4),
         }
-        # Drivers that draw on the CPU compile as for a GPU: Mesa's gives wrong numbers where one
-        # work-item alone writes and reads again a whole box.
+        # Drivers that draw on the CPU compile as for a GPU, with many work-items at a time; and a
+        # work-item that walks a whole box alone soon makes more loops than Mesa's allows.
         if device.kind == "CPU" and not device.simulated:
             return cls(
                 tile=_cpu_tile(device, np.dtype(dtype)),

@@ -3,6 +3,8 @@
 import pytest
 from helpers.resample_files import write_files
 
+from clresample import get_device
+
 
 @pytest.fixture
 def files(tmp_path, monkeypatch):
@@ -10,3 +12,10 @@ def files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_files()
     return tmp_path
+
+
+@pytest.fixture
+def double():
+    """Skip a test where the device that the command takes has no double precision."""
+    if not get_device().has_fp64:
+        pytest.skip(f"{get_device().name} has no double precision")

@@ -107,7 +107,7 @@ def test_sources_are_detected_without_a_catalogue(example, tmp_path, capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_double_precision(example, tmp_path):
+def test_double_precision(example, tmp_path, double):
     arguments = "--max-iter", 5, "--dtype", "float64", "--no-figure"
     assert deblend(example / "scene.toml", tmp_path / "out", *arguments) == 0
     assert read_result(tmp_path / "out" / "result.fits").rendered[0].dtype == np.float64

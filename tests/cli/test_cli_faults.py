@@ -194,7 +194,7 @@ def test_devices_links_and_pipes(files, capsys):
 
 
 @pytest.mark.filterwarnings("error")
-def test_images_that_overflow_are_refused(files, capsys):
+def test_images_that_overflow_are_refused(files, capsys, double):
     with fits.open("in.fits") as hdus:
         fits.PrimaryHDU(hdus[0].data.astype(float) * 1e39, hdus[0].header).writeto("huge.fits")
     assert resample(image="huge.fits") == 2

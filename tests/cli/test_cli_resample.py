@@ -12,7 +12,7 @@ from clresample.files.fits import read_image, read_psf
 from clresample.sky.grid import Grid
 
 
-def test_what_is_written(files, capsys):
+def test_what_is_written(files, capsys, double):
     assert resample("--shift", "0.25", "-1.5", "--dtype", "float64") == 0
     printed = capsys.readouterr()
     assert "out.fits: 40 x 30 pixels" in printed.out and printed.err == ""

@@ -8,8 +8,9 @@ from helpers.morphologies import KINDS, apply, eps, many_boxes, morphologies
 from helpers.tuning import tune
 from test_constraints import CASES
 
+from clresample import DeviceError
 from clresample.deblending.solver import reference as ref
-from clresample.deblending.solver.boxes import Boxes
+from clresample.deblending.solver.boxes import ALIGN, Boxes
 from clresample.deblending.solver.constraints import (
     L0,
     L1,
@@ -21,6 +22,7 @@ from clresample.deblending.solver.constraints import (
     SumNorm,
     Symmetry,
 )
+from clresample.deblending.solver.prox_launches import most_iterations
 
 GROUPS = 1, 64
 SHAPE, CENTER = (17, 19), (6, 11)  # more pixels than four for each work-item of a group
@@ -91,6 +93,54 @@ def test_projections_of_groups_are_those_of_one(in_groups):
     for one, many in zip(found[: len(KINDS)], found[len(KINDS) :], strict=True):
         for a, b in zip(one, many, strict=True):
             assert np.linalg.norm(a - b) <= 1e-4 * np.linalg.norm(a) + 1e-6
+
+
+@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize("n_iterations", [0, 30])
+def test_projections_in_many_launches_are_those_in_one(device, monkeypatch, group, n_iterations):
+    """A device that ends long loops gets few iterations a launch, and answers as any other; some
+    sources come to their end in an early launch, others in none."""
+    boxes = many_boxes()
+    images = morphologies(boxes, np.float32)
+    prox = {"n_iterations": n_iterations, "tolerance": 2e-2}
+    tune(monkeypatch, sum_group=group, loops=None)
+    whole = apply(device, MonotoneProjection(**prox), boxes, images)
+    largest = max(-(-(y + 2) * (x + 2) // ALIGN) * ALIGN for y, x in boxes.shape.tolist())
+    for loops in (65535, 8 * (largest // group + 2) + 2 * group, 20 * (largest // group + 2)):
+        tune(monkeypatch, loops=loops)
+        parts = apply(device, MonotoneProjection(**prox), boxes, images)
+        for a, b in zip(whole, parts, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_a_launch_of_the_projection_makes_no_more_loops_than_allowed(device):
+    """Counted one by one: each loop's iterations, and the look that ends it."""
+    for group, n, loops in ((1, 240, 65535), (64, 240, 4000), (64, 10624, 65535), (1, 16, 300)):
+        most, walk = most_iterations(device, n, group, loops), -(-n // group) + 1
+        inner = -(-n // (4 * group)) + 1 + (group if group > 1 else 0)
+
+        def made(turns, walk=walk, inner=inner):
+            return 4 * walk + inner + turns * (1 + 2 * walk) + turns // 4 * 2 * inner + 1
+
+        assert most >= 1 and made(most) <= loops
+        assert made(most + 9) > 0.9 * loops  # nor much less
+    with pytest.raises(DeviceError, match="after 65535 iterations, .* 700000 pixels: use smaller"):
+        most_iterations(device, 700_000, 64, 65535)
+
+
+def test_large_boxes_are_projected_to_their_end(device):
+    """With the groups that the device has: more loops than Mesa's llvmpipe allows one launch."""
+    box = Boxes([0], [[0, 0]], [[121, 119]], [[60, 55]])
+    y, x = np.indices((121, 119)) - np.array([60, 55])[:, None, None]
+    noise = np.random.default_rng(3).normal(size=y.shape)
+    image = (np.exp(-np.hypot(y, x) / 20) + 0.1 * noise).astype(np.float32)
+    given = {"n_iterations": 150, "tolerance": 0.0}
+    (found,) = apply(device, MonotoneProjection(**given), box, [image])
+    wanted, _ = projected(
+        image.astype(float), (60, 55), KINDS[0], 0, positive=True, dual=np.zeros(y.shape), **given
+    )
+    wanted = ref.monotone_sweep(wanted, (60, 55), KINDS[0], 0)
+    assert np.linalg.norm(found - wanted) <= 1e-4 * np.linalg.norm(wanted)
 
 
 def one_each():

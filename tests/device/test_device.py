@@ -210,7 +210,8 @@ def test_values_are_there_though_blocking_copies_come_back_early(device, monkeyp
     slow(device.queue, (n,), None, x.base_data)
     last = cl.enqueue_marker(device.queue)
     device.finish()
-    assert last.command_execution_status == cl.command_execution_status.COMPLETE
+    if "rusticl" not in device.platform:  # it marks what is done as done in no order
+        assert last.command_execution_status == cl.command_execution_status.COMPLETE
 
 
 def _read_into(device, array):

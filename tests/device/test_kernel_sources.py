@@ -81,6 +81,7 @@ def test_no_column_is_a_bare_number():
 @pytest.mark.parametrize("kind", ["CPU", "GPU"])
 def test_sizes_are_macros_that_kernels_take(device, monkeypatch, kind, dtype):
     monkeypatch.setattr(device, "kind", kind)
+    monkeypatch.setattr(device, "simulated", False)
     tuning = Tuning.of(device, dtype)
     for name, size in tuning.tile.items():
         assert f"#ifndef {name} " in whole(

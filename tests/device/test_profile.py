@@ -10,6 +10,9 @@ from helpers.resample_files import ARGUMENTS, write_files
 from clresample import PSF, Device, Grid, Resampler
 from clresample.device import profile as profiles
 
+# What a profile shows of the first kernel; and on llvmpipe, which says 1 ns of every kernel.
+TABLE = r":\nkernel [^\n]* GFLOP/s [^\n]*\ncontract"
+CALLS = r", which does not time them; calls: contract\w* \d+.*"
 RUN = """
 import numpy as np
 from clresample import PSF, Grid, Resampler
@@ -46,13 +49,19 @@ def test_every_launch_is_counted(profiled, monkeypatch):
     flops = n_y * n_x * k_x + k_y * n_y * k_x + 20 * k_y * k_x + 20 * k_x * 22
     assert row.flops == 3 * 2 * flops
     table = profiled.profile.table()
-    assert re.search(rf"contract\w* +12 +{row.seconds:.4f} +100.0 % +\d", table)
+    if "llvmpipe" not in profiled.name:  # which says 1 ns of every kernel
+        assert re.search(rf"contract\w* +12 +{row.seconds:.4f} +100.0 % +\d", table)
+    row.seconds = 12e-9
+    table = profiled.profile.table()
+    assert re.fullmatch(f"kernels on .*{CALLS}", table)
 
 
 def test_seconds_are_those_of_the_device(profiled):
     """Ten times the work takes longer, and all of it no longer than the clock on the wall."""
     from time import perf_counter
 
+    if "llvmpipe" in profiled.name:
+        pytest.skip("llvmpipe says 1 ns of every kernel")
     began = perf_counter()
     seconds = []
     for n in (60, 600):
@@ -74,8 +83,8 @@ def test_without_being_asked_nothing_is_timed(device, monkeypatch):
 def test_the_table_comes_at_the_end_of_a_process():
     answer = run_python("-c", RUN, CLRESAMPLE_PROFILE="1")
     assert answer.returncode == 0, answer.stderr
-    assert "kernels on " in answer.stderr and "GFLOP/s" in answer.stderr
-    assert answer.stderr.count("\ncontract") == 1
+    assert re.fullmatch(rf"kernels on .*({TABLE}.*|{CALLS})\n", answer.stderr, re.DOTALL)
+    assert answer.stderr.count("contract") == 1
     assert run_python("-c", RUN, CLRESAMPLE_PROFILE="0").stderr == ""
 
 
@@ -85,4 +94,4 @@ def test_a_command_prints_it_when_asked(tmp_path, monkeypatch):
     words = [part for name, value in ARGUMENTS.items() for part in (name, tmp_path / value)]
     answer = run_python("-m", "clresample.cli", "resample", *map(str, words[1:]), "--profile")
     assert answer.returncode == 0, answer.stderr
-    assert "kernels on " in answer.stderr and "\ncontract" in answer.stderr
+    assert re.search(rf"^kernels on .*({TABLE}|{CALLS})", answer.stderr)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from clresample import get_device
 from clresample.deblending.batch import deblend
 from clresample.deblending.blend import Blend
 from clresample.deblending.profiles import moment, point, profile
@@ -53,8 +54,10 @@ def observe(
     sky=(0, 0, 0),
     unit=1.0,
 ):
-    """Observations "e" (v) and "r" (g, r) of objects, the second moved by `shift` [model px]."""
+    """Observations "e" (v) and "r" (g, r) of objects, the second moved by `shift` [model px]; made
+    in float64 where the device has it."""
     rng, model, found = np.random.default_rng(seed), truth(objects, shape), []
+    dtype = np.float64 if get_device().has_fp64 else np.float32
     for k, (grid, psf) in enumerate(zip(grids(shape, angle), psfs, strict=True)):
         part = (slice(0, 1), slice(1, 3))[k]
         op = Resampler(
@@ -62,10 +65,10 @@ def observe(
             MODEL_PSF,
             grid,
             psf,
-            dtype=np.float64,
+            dtype=dtype,
             shift=shift if k else (0, 0),
         )
-        data = op.forward(model[part]) + np.array(sky)[part, None, None]
+        data = op.forward(model[part].astype(dtype)) + np.array(sky)[part, None, None]
         data += noise * rng.normal(size=data.shape)
         found.append(
             Observation(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...device.discovery import DeviceError
 from ...device.tuning import Tuning
 from .boxes import ALIGN
 
@@ -42,7 +43,8 @@ class ProjectionLaunch:
 
     def __init__(self, prox, boxes, dtype):
         device, n = boxes.device, len(boxes)
-        self.group = Tuning.of(device, dtype).sum_group
+        tuning = Tuning.of(device, dtype)
+        self.group, self.n_iterations = tuning.sum_group, prox.parameters["n_iterations"]
         planes = -(-(boxes.boxes.shape.astype(np.int64) + 2).prod(1) // ALIGN)
         size = int(planes.sum()) * ALIGN
         given = {
@@ -58,12 +60,39 @@ class ProjectionLaunch:
         given |= {name: device.zeros(size, dtype) for name in ("y", "l", "v", "g", "move")}
         self.project = device.launcher("project.cl", "project", **macros).bind(
             **given,
-            **{name: prox.parameters[name] for name in ("positive", "n_iterations", "tolerance")},
+            momenta=device.zeros(n, dtype),
+            **{name: prox.parameters[name] for name in ("positive", "tolerance")},
         )
+        self.most = self.n_iterations
+        if tuning.loops is not None:
+            self.most = most_iterations(device, int(planes.max()) * ALIGN, self.group, tuning.loops)
 
     def __call__(self, morphs, active, step, factor, first):
         """Queue the projection; it has no use for the last three."""
-        self.project((active.size * self.group,), x=morphs, active=active)
+        size, end = (active.size * self.group,), self.n_iterations
+        for begin in range(0, max(end, 1), max(self.most, 1)):
+            span = {"first": begin, "last": min(begin + self.most, end)}
+            self.project(size, x=morphs, active=active, **span)
+
+
+def most_iterations(device, n, group, loops):
+    """Iterations of the projection in one launch on a device that ends a work-item's loops after
+    `loops` of them; n: elements of the largest plane, group: work-items that share it.
+
+    DeviceError: not even one is possible
+    """
+    walk = -(-n // group) + 1  # one pass over the plane, and the look that ends it
+    # Image and dual, and each fourth time two sums: of four elements a step, then over the group.
+    # Before and after all turns one such sum and four passes.
+    inner = walk / 4 + 1 + group
+    turn, once = 1 + 2 * walk + 2 * inner / 4, 4 * walk + inner
+    most = int((loops - once) / turn)
+    if most < 1:
+        raise DeviceError(
+            f"{device.name} ends the loops of a kernel after {loops} iterations, too few for a "
+            f"projection of {n} pixels: use smaller boxes, or another device"
+        )
+    return most
 
 
 def parameter_table(prox, n_sources):
