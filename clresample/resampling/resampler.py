@@ -15,7 +15,8 @@ from ..sky.psf_checks import PSFWarning
 from .affine import AffineExecutor
 from .aligned import AlignedExecutor
 from .distorted import DistortedExecutor
-from .executor import Executor
+from .executor import Executor, OnDevice
+from .folded.executor import FoldedExecutor
 from .grid_operator import GridOperator
 from .plan import Plan, Precision, make_plan
 from .transfer import noise_warnings
@@ -85,16 +86,16 @@ class Resampler(GridOperator):
         self._begin(device, dtype, n_bands, mappings, plans[0].n_terms)
         self.plans, self._certificates = plans, [plan.certificate for plan in plans]
         self._executor = EXECUTORS[self.geometry](self.device, self.dtype, plans)
-        per_image = sum(rows * ld for rows, ld in self._executor.scratch_shapes().values())
-        budget = self._executor.tuning.group_bytes
-        fit = budget // (per_image * self.dtype.itemsize * n_bands)
-        self._group = max(1, min(fit, MOST_GROUPS // (n_bands * self.n_terms)))
+        self._folded: FoldedExecutor | None = None
+        self._folds = FoldedExecutor.serves(self.device, self.dtype, plans)
 
     def _use_shift(self):
         """Upload D with the phases of the shift."""
         self._identity = all(p.identity for p in self.plans) and not self._shift.any()
         pairs = zip(self.plans, self._shift, strict=True)
         self._executor.set_transfer([plan.shifted(shift) for plan, shift in pairs])
+        if self._folded is not None:
+            self._folded.set_shift(self._shift[0])
 
     def __reduce__(self):
         """Copied and pickled as its plans; the copy uploads them to the device of the same name."""
@@ -117,6 +118,7 @@ class Resampler(GridOperator):
         tables = 2 * sum(plan.n_bytes for plan in self.plans) * self.dtype.itemsize // 8
         with self._lock:
             held = [*self._executor.scratch.values()]
+            held += [] if self._folded is None else [*self._folded.scratch.values()]
             held += [array for staged in self._staged.values() for array in staged[1:]]
         return tables + sum(getattr(array, "nbytes", 0) for array in held)
 
@@ -132,6 +134,7 @@ class Resampler(GridOperator):
     def _render(self, x, out):
         """`render` on device arrays (B, Ny, Nx) and (B, C, My, Mx)."""
         self._run(
+            self._executor,
             functools.partial(self._executor.forward, spread=True),
             x,
             out,
@@ -142,14 +145,24 @@ class Resampler(GridOperator):
 
     def _forward(self, x, out):
         """I2 of device arrays: x (B, C, Ny, Nx), out (B, C, My, Mx)."""
-        self._run(self._executor.forward, x, out, self.shape_in, self.shape_out)
+        executor = self._whole()
+        self._run(executor, executor.forward, x, out, self.shape_in, self.shape_out)
 
     def _adjoint(self, y, out):
         """R^T y of device arrays: y (B, C, My, Mx), out (B, C, Ny, Nx)."""
-        self._run(self._executor.adjoint, y, out, self.shape_out, self.shape_in)
+        executor = self._whole()
+        self._run(executor, executor.adjoint, y, out, self.shape_out, self.shape_in)
 
-    def _run(self, chain, source, target, shape_source, shape_target, identity=True):
-        """Queue one way of the executor, `chain`, on as many items at a time as the cache holds.
+    def _whole(self) -> Executor | FoldedExecutor:
+        """What runs from pixels to pixels; a folded one is made when it is first asked for."""
+        if self._folds and self._folded is None:
+            folded = FoldedExecutor(self.device, self.plans[0])
+            folded.set_shift(self._shift[0])
+            self._folded = folded
+        return self._folded or self._executor
+
+    def _run(self, executor, chain, source, target, shape_source, shape_target, identity=True):
+        """Queue one way of an executor, `chain`, on as many items at a time as the cache holds.
 
         source, target: device arrays (B,) + shape; shape_*: of an item
         identity: whether an operator of the same pixels and PSFs may copy instead
@@ -162,8 +175,8 @@ class Resampler(GridOperator):
             return
         n_bands = self.plans[0].n_bands
         # per-item tables are counted from a launch's first item, so they go in one group
-        group = min(self._group, batch) if len(self.plans) == 1 else batch
-        self._executor.reserve(group * n_bands)
+        group = min(self._fit(executor), batch) if len(self.plans) == 1 else batch
+        executor.reserve(group * n_bands)
         for start in range(0, batch, group):
             n = min(group, batch - start) * n_bands
             chain(
@@ -171,6 +184,12 @@ class Resampler(GridOperator):
                 ImageBatch.of(target, start * math.prod(shape_target[:-2])),
                 n,
             )
+
+    def _fit(self, executor: OnDevice):
+        """Items whose intermediates the cache holds."""
+        n_images = self.plans[0].n_bands * self.n_terms
+        fit = executor.tuning.group_bytes // (executor.image_bytes * self.plans[0].n_bands)
+        return max(1, min(fit, MOST_GROUPS // n_images))
 
 
 def _check_alike(plans):
