@@ -125,7 +125,7 @@ class Contraction:
         ).bind(
             m=m,
             n=n,
-            n_pad=b.ld,
+            n_pad=padded(n),
             k=k,
             block=stretch(k),
             inward=inward,
@@ -149,7 +149,7 @@ class Contraction:
             n_bands=n_bands,
         )
         starts = (a.offset, a.stride, c.offset, c.stride)
-        return Product(launch, tile, m, b.ld, starts if tall else None)
+        return Product(launch, tile, m, padded(n), starts if tall else None)
 
 
 def operator_programs(device, dtype):
@@ -177,19 +177,16 @@ class Product:
         self.rows, self.group_rows = tile["MR"], tile["WGY"]
         self.n_x = _whole(-(-n_pad // (tile["NV"] * tile["VW"])), tile["WGX"])
 
-    def __call__(self, batch, *, a=None, c=None, div_a=None):
+    def __call__(self, batch, *, a=None, c=None):
         """Queue `batch` products.
 
         a, c (ImageBatch): the left factor and the result of this call, strides as they are bound
-        div_a: items of this call that share a left factor, where that depends on their number
         """
         given, m = {}, self.m
         if a is not None:
             given["A"], given["offset_a"] = a.buffer, a.offset
         if c is not None:
             given["C"], given["offset_c"] = c.buffer, c.offset
-        if div_a is not None:
-            given["div_a"] = div_a
         if not self.tall:
             self._launch(m, batch, given)
             return

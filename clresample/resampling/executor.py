@@ -46,12 +46,6 @@ class OnDevice:
         """Intermediate matrices of one image: {name: (rows, elements of a row)}."""
         raise NotImplementedError
 
-    @property
-    def image_bytes(self):
-        """Memory of one image's intermediates."""
-        sizes = (rows * ld for rows, ld in self.scratch_shapes().values())
-        return sum(sizes) * np.dtype(self.dtype).itemsize
-
     def bind(self):
         """Bind the products to the scratch that is there."""
         raise NotImplementedError

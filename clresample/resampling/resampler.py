@@ -15,7 +15,7 @@ from ..sky.psf_checks import PSFWarning
 from .affine import AffineExecutor
 from .aligned import AlignedExecutor
 from .distorted import DistortedExecutor
-from .executor import Executor, OnDevice
+from .executor import Executor
 from .folded.executor import FoldedExecutor
 from .grid_operator import GridOperator
 from .plan import Plan, Precision, make_plan
@@ -86,8 +86,12 @@ class Resampler(GridOperator):
         self._begin(device, dtype, n_bands, mappings, plans[0].n_terms)
         self.plans, self._certificates = plans, [plan.certificate for plan in plans]
         self._executor = EXECUTORS[self.geometry](self.device, self.dtype, plans)
-        self._folded: FoldedExecutor | None = None
+        per_image = sum(rows * ld for rows, ld in self._executor.scratch_shapes().values())
+        budget = self._executor.tuning.group_bytes
         self._folds = FoldedExecutor.serves(self.device, self.dtype, plans)
+        self._folded: FoldedExecutor | None = None
+        fit = budget // (per_image * self.dtype.itemsize * n_bands)
+        self._group = max(1, min(fit, MOST_GROUPS // (n_bands * self.n_terms)))
 
     def _use_shift(self):
         """Upload D with the phases of the shift."""
@@ -118,9 +122,9 @@ class Resampler(GridOperator):
         tables = 2 * sum(plan.n_bytes for plan in self.plans) * self.dtype.itemsize // 8
         with self._lock:
             held = [*self._executor.scratch.values()]
-            held += [] if self._folded is None else [*self._folded.scratch.values()]
             held += [array for staged in self._staged.values() for array in staged[1:]]
-        return tables + sum(getattr(array, "nbytes", 0) for array in held)
+            folded = 0 if self._folded is None else self._folded.n_bytes
+        return tables + folded + sum(getattr(array, "nbytes", 0) for array in held)
 
     def render(self, x, out=None):
         """One image seen in every band: x (Ny, Nx) -> (C, My, Mx), or batches of both.
@@ -133,63 +137,49 @@ class Resampler(GridOperator):
 
     def _render(self, x, out):
         """`render` on device arrays (B, Ny, Nx) and (B, C, My, Mx)."""
-        self._run(
-            self._executor,
-            functools.partial(self._executor.forward, spread=True),
-            x,
-            out,
-            (1, *x.shape[1:]),
-            self.shape_out,
-            identity=False,
-        )
+        self._run("forward", x, out, (1, *x.shape[1:]), self.shape_out, spread=True)
 
     def _forward(self, x, out):
         """I2 of device arrays: x (B, C, Ny, Nx), out (B, C, My, Mx)."""
-        executor = self._whole()
-        self._run(executor, executor.forward, x, out, self.shape_in, self.shape_out)
+        self._run("forward", x, out, self.shape_in, self.shape_out)
 
     def _adjoint(self, y, out):
         """R^T y of device arrays: y (B, C, My, Mx), out (B, C, Ny, Nx)."""
-        executor = self._whole()
-        self._run(executor, executor.adjoint, y, out, self.shape_out, self.shape_in)
+        self._run("adjoint", y, out, self.shape_out, self.shape_in)
 
     def _whole(self) -> Executor | FoldedExecutor:
-        """What runs from pixels to pixels; a folded one is made when it is first asked for."""
+        """What takes images all the way; a folded one is made where it is first asked for."""
         if self._folds and self._folded is None:
             folded = FoldedExecutor(self.device, self.plans[0])
             folded.set_shift(self._shift[0])
             self._folded = folded
         return self._folded or self._executor
 
-    def _run(self, executor, chain, source, target, shape_source, shape_target, identity=True):
-        """Queue one way of an executor, `chain`, on as many items at a time as the cache holds.
+    def _run(self, way, source, target, shape_source, shape_target, **options):
+        """Queue "forward" or "adjoint" on as many items at a time as the cache holds.
 
-        source, target: device arrays (B,) + shape; shape_*: of an item
-        identity: whether an operator of the same pixels and PSFs may copy instead
+        source, target: device arrays (B,) + shape; shape_*: of an item; options: of `way`
         """
         batch = source.shape[0]
         if len(self.plans) not in (1, batch):
             raise ValueError(f"the batch has {batch} items, the operator {len(self.plans)} plans")
-        if identity and self._identity:
+        if self._identity and not options:
             self.device.copy(source, target)
             return
+        executor = self._whole()
         n_bands = self.plans[0].n_bands
         # per-item tables are counted from a launch's first item, so they go in one group
-        group = min(self._fit(executor), batch) if len(self.plans) == 1 else batch
+        one = len(self.plans) == 1 and executor is self._executor
+        group = min(self._group, batch) if one else batch
         executor.reserve(group * n_bands)
         for start in range(0, batch, group):
             n = min(group, batch - start) * n_bands
-            chain(
+            getattr(executor, way)(
                 ImageBatch.of(source, start * math.prod(shape_source[:-2])),
                 ImageBatch.of(target, start * math.prod(shape_target[:-2])),
                 n,
+                **options,
             )
-
-    def _fit(self, executor: OnDevice):
-        """Items whose intermediates the cache holds."""
-        n_images = self.plans[0].n_bands * self.n_terms
-        fit = executor.tuning.group_bytes // (executor.image_bytes * self.plans[0].n_bands)
-        return max(1, min(fit, MOST_GROUPS // n_images))
 
 
 def _check_alike(plans):

@@ -1,214 +1,195 @@
 """The chain of aligned geometries in float64 between float32 images, at float32's cost.
 
 A product in float64 takes a CPU twice as long. Images in parts even and odd about their middles
-need half of the products, since a cos meets even parts alone and a sin odd ones; so a float32
-operator rounds its input and its output and nothing between. In float32 throughout, tables,
-intermediates and sums round some ten times more: 1e-7 of an image, more than what pixels cost.
+need half of the products, since a cos meets even parts alone and a sin odd ones. So a float32
+operator may round its input and its output and nothing between; in float32 throughout, tables,
+intermediates and sums are rounded too: 1e-7 of an image instead of 3e-8.
 
-    forward   Z = D o (Ty fold(I1) Tx),   I2 = unfold(Sy Z Sx),   each of the four parts by itself
+    forward   I2 = unfold(Sy (D o (Ty fold(I1) Tx)) Sx)
     adjoint   the same factors transposed, in reverse order
 
-D holds the observation's middle as a shift, so both sides have waves about their own middles.
+D holds the way from the model's middle to the observation's, and all waves are about the middles.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from ...device.contraction import Contraction, ImageBatch, Matrix
-from ..executor import OnDevice
+from ...device.contraction import ImageBatch
+from ...device.tuning import Tuning
 from ..plan import Plan
 from ..tables import waves
 
-# Columns of tables are padded to a multiple of this, or to whole vectors if those are wider.
-PAD = 8
+# [bytes] of float64 intermediates of one image, which one work-item takes through the whole chain:
+# what a core's second cache holds. Larger images are better shared among cores, product by product.
+MOST_BYTES = 2 << 20
 
 
-class FoldedExecutor(OnDevice):
-    """Forward and adjoint of one aligned Plan without terms; all inside it is float64.
+class FoldedExecutor:
+    """Forward and adjoint of one aligned Plan, as Executor has them; inside it is float64.
 
-    Images in and out are float32. `serves` says for which operators it is the better one.
+    Images on either side are float32. `serves` says for which operators it is made.
     """
 
     def __init__(self, device, plan: Plan):
-        super().__init__(device, np.float64, [plan])
-        self.pad = max(PAD, self.tuning.tile["VW"])
-        self.n_frequencies = len(plan.nu[0]), len(plan.nu[1])
-        self.h_pad = -(-self.n_frequencies[1] // self.pad) * self.pad
-        self.plain = Contraction(device, self.dtype)
+        self.plan, self.n_bands = plan, plan.n_bands
+        self.tuning = Tuning.of(device, np.float64)
+        self._device, self._vector = device, self.tuning.tile["VW"]
+        self.h_pad = self.whole_vectors(len(plan.nu[1]))
         mapping, axes = plan.mapping, plan.axes
         shape = tuple(mapping.shape_in[axis] for axis in axes)
-        rates = tuple(mapping.matrix[axes[i], i] for i in (0, 1))
+        tables = [table[:, n // 2 :].T for table, n in zip((plan.in_y, plan.in_x), shape)]
+        self._model = model = Side(self, shape, tables, [np.ones(n) for n in shape], axes)
+        off = [np.arange(n // 2, n) - (n - 1) / 2 for n in mapping.shape_out]
+        rates = [mapping.matrix[axes[i], i] for i in (0, 1)]
+        tables = [waves(nu, rate * x) for nu, rate, x in zip(plan.nu, rates, off)]
         lit = [mapping.covered.any(axis=1 - i) for i in (0, 1)]
-        self.model = Side(self, "model", shape, (1.0, 1.0), [np.ones(n) for n in shape], axes)
-        self.observed = Side(self, "observed", mapping.shape_out, rates, lit, (0, 1))
-        middle_out, middle_in = (
-            (np.array(n) - 1) / 2 for n in (mapping.shape_out, mapping.shape_in)
+        self._observed = observed = Side(self, mapping.shape_out, tables, lit, (0, 1))
+        middle_in, middle_out = (
+            (np.array(n) - 1) / 2 for n in (mapping.shape_in, mapping.shape_out)
         )
-        self.middle = mapping.matrix @ middle_out + mapping.offset - middle_in
-        h_y = self.n_frequencies[0]
-        self.transfer = device.empty((self.n_bands, h_y, 4, self.h_pad), self.dtype)
-        self.mix, self.mix_adjoint = (
-            self.launcher("multiply", SIGN=sign).bind(
-                h_y=h_y, h_pad=self.h_pad, n_bands=self.n_bands, D=self.transfer
-            )
-            for sign in (1, -1)
-        )
+        self._middle = mapping.matrix @ middle_out + mapping.offset - middle_in
+        self._transfer = device.empty((self.n_bands, len(plan.nu[0]), 4, self.h_pad), np.float64)
+        # one for each core, so that it stays in its cache
+        n_parts, n_lines, n_z = n_elements(plan, self.whole_vectors)
+        self.scratch = device.empty((device.compute_units, n_parts + n_lines + n_z), np.float64)
+        at = {"at_lines": n_parts, "at_z": n_parts + n_lines}
+        self._forward = self._bound(model, observed, 1, at)
+        self._adjoint = self._bound(observed, model, -1, at)
 
     @staticmethod
     def serves(device, dtype, plans) -> bool:
-        """Whether it is as fast as float32 there and rounds less: on CPUs with float64."""
+        """Whether it is as fast as float32 there, and rounds less: on CPUs, for small images."""
         cpu = device.kind == "CPU" and not device.simulated and device.has_fp64
-        plain = len(plans) == 1 and plans[0].n_terms == 1 and plans[0].geometry == "aligned"
-        return cpu and plain and np.dtype(dtype) == np.float32
+        if not cpu or np.dtype(dtype) != np.float32 or len(plans) > 1:
+            return False
+        plan = plans[0]
+        small = 8 * sum(n_elements(plan)) <= MOST_BYTES
+        return plan.geometry == "aligned" and plan.n_terms == 1 and small
 
-    def launcher(self, name, **macros):
-        """A kernel of fold.cl."""
-        return self.device.launcher(
-            "fold.cl",
-            name,
-            dtype=self.dtype,
-            local_size=self.tuning.local_size(3),
-            ROWS=self.tuning.row_loops,
-            **macros,
-        )
+    @property
+    def n_bytes(self) -> int:
+        """Device memory of tables and intermediates [bytes]."""
+        sides = self._model.n_bytes + self._observed.n_bytes
+        return sides + self._transfer.nbytes + self.scratch.nbytes
+
+    def whole_vectors(self, n):
+        """`n` columns rounded up to whole vectors."""
+        return -(-n // self._vector) * self._vector
 
     def set_shift(self, shift):
         """Upload D with every observed pixel moved by `shift` (2,) [model px]."""
-        host = np.zeros(self.transfer.shape, self.dtype)
-        d_plus, d_minus = self.plans[0].shifted(shift + self.middle)
+        host = np.zeros(self._transfer.shape)
+        d_plus, d_minus = self.plan.shifted(shift + self._middle)
         for i, plane in enumerate((d_plus.real, d_plus.imag, d_minus.real, d_minus.imag)):
             host[:, :, i, : plane.shape[2]] = plane
-        self.device.upload(host, self.transfer)
+        self._device.upload(host, self._transfer)
 
-    def scratch_shapes(self):
-        shapes = {"frequencies": (2 * self.n_frequencies[0], 2 * self.h_pad)}
-        return shapes | self.model.scratch_shapes() | self.observed.scratch_shapes()
-
-    def bind(self):
-        self.model.bind(self.scratch)
-        self.observed.bind(self.scratch)
-        for mix in (self.mix, self.mix_adjoint):
-            mix.bind(z=self.scratch["frequencies"])
-
-    def forward(self, x: ImageBatch, y: ImageBatch, n):
-        """I2 from I1: x (n, Ny, Nx) to y (n, My, Mx), both float32."""
-        self.model.analyse(x, n)
-        self.mix((1, self.n_frequencies[0], n), n=n)
-        self.observed.synthesise(y, n)
+    def forward(self, x: ImageBatch, y: ImageBatch, n, spread=False):
+        """I2 from I1: x (n, Ny, Nx), or (n / n_bands, Ny, Nx) if `spread`, to y (n, My, Mx)."""
+        self._queue(self._forward, x, y, n, self.n_bands if spread else 1)
 
     def adjoint(self, y: ImageBatch, x: ImageBatch, n):
         """The adjoint of `forward`: y (n, My, Mx) to x (n, Ny, Nx)."""
-        self.observed.analyse(y, n)
-        self.mix_adjoint((1, self.n_frequencies[0], n), n=n)
-        self.model.synthesise(x, n)
+        self._queue(self._adjoint, y, x, n, 1)
+
+    def reserve(self, n_images):
+        """Nothing: there are intermediates for each core, whatever the number of images."""
+
+    def _queue(self, way, source: ImageBatch, target: ImageBatch, n, n_seen):
+        """Queue one way to `n` images, `n_seen` of them from each that goes in."""
+        launch, source_axes, target_axes = way
+        given = {"n_sources": n // n_seen, "n_seen": n_seen}
+        for name, images, axes in (
+            ("source", source, source_axes),
+            ("target", target, target_axes),
+        ):
+            at = images.matrix(axes)
+            given |= {name: at.buffer, f"{name}_offset": at.offset, f"{name}_stride": at.stride}
+            given |= {f"{name}_ld": at.ld, f"{name}_step": at.step}
+        launch((min(n // n_seen, len(self.scratch)), 1, 1), **given)
+
+    def _bound(self, source: Side, target: Side, sign, at):
+        """The kernel of one way, and the axes of its images."""
+        launch = self._device.launcher(
+            "folded.cl",
+            "folded",
+            dtype=np.float64,
+            local_size=(1, 1, 1),
+            SIGN=sign,
+            SPACED=(1, 0) in (source.axes, target.axes),
+            **{name: self.tuning.tile[name] for name in ("VW", "NV", "MR")},
+        ).bind(
+            n_bands=self.n_bands,
+            h_y=len(self.plan.nu[0]),
+            h_x=len(self.plan.nu[1]),
+            h_pad=self.h_pad,
+            D=self._transfer,
+            scratch=self.scratch,
+            stride_scratch=self.scratch.shape[1],
+            **at,
+            **source.arguments(to_frequencies=True),
+            **{f"to_{name}": value for name, value in target.arguments(False).items()},
+        )
+        return launch, source.axes, target.axes
 
 
 class Side:
     """The images of one end of the operator, and waves about their middle.
 
-    folded: the executor; name: of its intermediates
+    folded: the executor
     shape (2,) [px]: along the tables' axes, which are the images' `axes`
-    rates (2,) [model px / px]: from a pixel to the next; lit (2 arrays): 1 of rows and columns that
-        count, else 0
+    tables (half_y, 2 Hy), (half_x, 2 Hx): waves at the pixels from the middle on, cos, sin in turn
+    lit (n_y,), (n_x,): 0 of rows and columns that do not count, else 1
     """
 
-    def __init__(self, folded: FoldedExecutor, name, shape, rates, lit, axes):
-        self._folded, self._name, self._axes = folded, name, axes
-        device = folded.device
+    def __init__(self, folded: FoldedExecutor, shape, tables, lit, axes):
+        self.axes, device = axes, folded._device
         half = [(n + 1) // 2 for n in shape]
-        self._half, self._n_pad = half, -(-half[1] // folded.pad) * folded.pad
-        off = [np.arange(m) + (0.0 if n % 2 else 0.5) for m, n in zip(half, shape)]
-        along_y, along_x = (waves(folded.plans[0].nu[i], rates[i] * off[i]) for i in (0, 1))
-        y, x = (np.stack([w[:, 0::2], w[:, 1::2]]) for w in (along_y, along_x))  # cos, sin
-        self._to_y, self._from_y = (
-            device.put(np.ascontiguousarray(w)) for w in (y.swapaxes(1, 2), y)
-        )
-        self._to_x = [device.put(_padded(w, folded.h_pad)) for w in x]
-        self._from_x = [device.put(_padded(w.T, self._n_pad)) for w in x]
-        weights = [device.put(_weights(n, m, on)) for n, m, on in zip(shape, half, lit)]
-        self._fold, self._unfold = (
-            folded.launcher(kernel, STRIDED=axes != (0, 1)).bind(
-                n_y=shape[0],
-                n_x=shape[1],
-                n_pad=self._n_pad,
-                weight_y=weights[0],
-                weight_x=weights[1],
-            )
-            for kernel in ("fold", "unfold")
-        )
+        y, x = (np.stack([wave[:, 0::2], wave[:, 1::2]]) for wave in tables)  # (2, half, H)
+        pad_x = folded.whole_vectors(half[1])
+        self._shared = {"n_y": shape[0], "n_x": shape[1], "pad_x": pad_x}
+        for name, *sizes in zip(("weight_y", "weight_x"), shape, half, lit):
+            self._shared[name] = device.put(_weights(*sizes))
+        x_t = x.swapaxes(1, 2)
+        self._to = device.put(_turned(y)), device.put(_padded(x, folded.h_pad))
+        self._from = device.put(y), device.put(_padded(x_t, pad_x))
 
-    def scratch_shapes(self):
-        """Intermediates of one image: its parts even and odd along x, and their spectra along x."""
-        half_y, n_pad = self._half[0], self._n_pad
-        parts = {f"{self._name} {part}": (2 * half_y, n_pad) for part in ("even", "odd")}
-        return parts | {f"{self._name} half": (2 * half_y, 2 * self._folded.h_pad)}
+    def arguments(self, to_frequencies):
+        """What the kernel takes of this side."""
+        wave_y, wave_x = self._to if to_frequencies else self._from
+        return self._shared | {"wave_y": wave_y, "wave_x": wave_x}
 
-    def bind(self, scratch):
-        """Bind kernels and products to the intermediates that are there."""
-        folded, (half_y, half_x), n_pad = self._folded, self._half, self._n_pad
-        (h_y, h_x), h_pad, plain = folded.n_frequencies, folded.h_pad, folded.plain
-        parts = [scratch[f"{self._name} {part}"] for part in ("even", "odd")]
-        for kernel in (self._fold, self._unfold):
-            kernel.bind(even=parts[0], odd=parts[1])
-        half = Matrix(scratch[f"{self._name} half"].base_data, 2 * h_pad, half_y * 2 * h_pad)
-        z = Matrix(scratch["frequencies"].base_data, 2 * h_pad, h_y * 2 * h_pad)
-        # of the even and of the odd part along x, whose spectra lie side by side
-        self._to_columns, self._from_columns = [], []
-        for i, part in enumerate(parts):
-            image, spectrum = (
-                Matrix(part.base_data, n_pad, half_y * n_pad),
-                half._replace(offset=i * h_pad),
-            )
-            to_x, from_x = self._to_x[i].base_data, self._from_x[i].base_data
-            self._to_columns.append(
-                plain.bind(half_y, h_x, half_x, image, Matrix(to_x, h_pad), spectrum, inward=False)
-            )
-            self._from_columns.append(
-                plain.bind(
-                    half_y, half_x, h_x, spectrum, Matrix(from_x, n_pad), image, inward=False
-                )
-            )
-        to_y = Matrix(self._to_y.base_data, half_y, h_y * half_y)
-        from_y = Matrix(self._from_y.base_data, h_y, half_y * h_y)
-        self._to_rows = plain.bind(h_y, 2 * h_pad, half_y, to_y, half, z, inward=False)
-        self._from_rows = plain.bind(half_y, 2 * h_pad, h_y, from_y, z, half, inward=False)
+    @property
+    def n_bytes(self) -> int:
+        """Device memory of the tables [bytes]."""
+        arrays = *self._to, *self._from, *self._shared.values()
+        return sum(getattr(array, "nbytes", 0) for array in arrays)
 
-    def analyse(self, images: ImageBatch, n):
-        """Scratch "frequencies" from `n` images."""
-        self._queue(self._fold, images, n)
-        for product in self._to_columns:
-            product(2 * n)
-        self._to_rows(2 * n, div_a=n)
 
-    def synthesise(self, images: ImageBatch, n):
-        """`n` images from scratch "frequencies": the transpose of `analyse`."""
-        self._from_rows(2 * n, div_a=n)
-        for product in self._from_columns:
-            product(2 * n)
-        self._queue(self._unfold, images, n)
-
-    def _queue(self, kernel, images: ImageBatch, n):
-        at = images.matrix(self._axes)
-        kernel(
-            (1, self._half[0], n),
-            n=n,
-            images=at.buffer,
-            offset=at.offset,
-            stride=at.stride,
-            ld=at.ld,
-            step=at.step,
-        )
+def n_elements(plan: Plan, whole_vectors=lambda n: n):
+    """Elements of one image's intermediates: its parts, their lines, and frequencies twice."""
+    mapping, (h_y, h_x) = plan.mapping, (len(nu) for nu in plan.nu)
+    shapes = [mapping.shape_out, tuple(mapping.shape_in[axis] for axis in plan.axes)]
+    half = [[(n + 1) // 2 for n in shape] for shape in shapes]
+    h_pad = whole_vectors(h_x)
+    parts = max(4 * y * whole_vectors(x) for y, x in half)
+    return parts, max(4 * y * h_pad for y, _ in half), 8 * h_y * h_pad
 
 
 def _weights(n, n_half, lit):
     """Weights (2, n_half) of the pixels after the middle of `n` and of their partners before it."""
-    lit = np.asarray(lit, float)
+    lit = np.asarray(lit, np.float64)
     after, before = lit[n // 2 :], lit[:n_half][::-1].copy()
     before[0] *= 1 - n % 2  # a middle pixel has no partner
     return np.stack([after, before])
 
 
-def _padded(table, n):
-    """A table with its rows zero-padded to `n` columns."""
-    return np.pad(table, ((0, 0), (0, n - table.shape[1])))
+def _turned(tables):
+    """Tables (2, a, b) as (2, b, a)."""
+    return np.ascontiguousarray(tables.swapaxes(1, 2))
+
+
+def _padded(tables, n):
+    """Tables (2, a, b) with their rows zero-padded to `n` columns."""
+    return np.pad(tables, ((0, 0), (0, 0), (0, n - tables.shape[2])))
