@@ -21,8 +21,8 @@ from ..plan import Plan
 from ..tables import waves
 
 # [bytes] of float64 intermediates of one image, which one work-item takes through the whole chain:
-# what a core's second cache holds. Larger images are better shared among cores, product by product.
-MOST_BYTES = 2 << 20
+# half of a core's second cache of 2 MiB. Larger images are better shared among cores, product by product.
+MOST_BYTES = 1 << 20
 
 
 class FoldedExecutor:
