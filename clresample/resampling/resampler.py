@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 import warnings
 
@@ -47,12 +46,18 @@ class Resampler(GridOperator):
             shapes and, when affine, in whether lines are rows
         shift (2,) or (len(plans), 2) [model px]
 
+        Sums of float32 are float32: round them as batches of one plan and of many do alike.
+
         Raises ValueError for plans that differ in these.
         """
         _check_alike(plans)
-        dtype = float_type(dtype)
-        op = cls.__new__(cls)
-        op._take(plans, dtype, device)
+        return cls._made(plans, dtype, device, shift, folds=False)
+
+    @classmethod
+    def _made(cls, plans, dtype, device, shift, folds):
+        """An operator of plans; folds: a single one may go through float64, see FoldedExecutor."""
+        op, dtype = cls.__new__(cls), float_type(dtype)
+        op._take(plans, dtype, device, folds)
         op.shift = shift
         return op
 
@@ -78,33 +83,30 @@ class Resampler(GridOperator):
         plan = make_plan(mapping, psf_in, psf_out, precision=Precision.of(dtype))
         for message in noise_warnings(plan.certificate):
             warnings.warn(message, PSFWarning, stacklevel=3)
-        self._take([plan], dtype, device)
+        self._take([plan], dtype, device, folds=True)
 
-    def _take(self, plans, dtype, device):
+    def _take(self, plans, dtype, device, folds):
         """Tables of all plans on the device."""
         n_bands, mappings = plans[0].n_bands, [plan.mapping for plan in plans]
         self._begin(device, dtype, n_bands, mappings, plans[0].n_terms)
         self.plans, self._certificates = plans, [plan.certificate for plan in plans]
         self._executor = EXECUTORS[self.geometry](self.device, self.dtype, plans)
-        per_image = sum(rows * ld for rows, ld in self._executor.scratch_shapes().values())
-        budget = self._executor.tuning.group_bytes
-        self._folds = FoldedExecutor.serves(self.device, self.dtype, plans)
-        self._folded: FoldedExecutor | None = None
-        fit = budget // (per_image * self.dtype.itemsize * n_bands)
-        self._group = max(1, min(fit, MOST_GROUPS // (n_bands * self.n_terms)))
+        folds = folds and FoldedExecutor.serves(self.device, self.dtype, plans[0])
+        self._whole = FoldedExecutor(self.device, plans[0]) if folds else self._executor
+        self._group = _images_at_once(self._executor) // n_bands or 1
 
     def _use_shift(self):
         """Upload D with the phases of the shift."""
         self._identity = all(p.identity for p in self.plans) and not self._shift.any()
         pairs = zip(self.plans, self._shift, strict=True)
-        self._executor.set_transfer([plan.shifted(shift) for plan, shift in pairs])
-        if self._folded is not None:
-            self._folded.set_shift(self._shift[0])
+        transfer = [plan.shifted(shift) for plan, shift in pairs]
+        for executor in {self._executor, self._whole}:
+            executor.set_transfer(transfer)
 
     def __reduce__(self):
         """Copied and pickled as its plans; the copy uploads them to the device of the same name."""
-        make = functools.partial(type(self).from_plans, dtype=self.dtype, device=self.device)
-        return functools.partial(make, shift=self._shift), (self.plans,)
+        folds = self._whole is not self._executor
+        return type(self)._made, (self.plans, self.dtype, self.device, self._shift, folds)
 
     def executor(self) -> Executor:
         """What computes it, with intermediates of its own; for callers that work between stages."""
@@ -121,10 +123,9 @@ class Resampler(GridOperator):
         # each table in the operator's type, the way it is used forward and the way back
         tables = 2 * sum(plan.n_bytes for plan in self.plans) * self.dtype.itemsize // 8
         with self._lock:
-            held = [*self._executor.scratch.values()]
+            held = [a for e in {self._executor, self._whole} for a in e.scratch.values()]
             held += [array for staged in self._staged.values() for array in staged[1:]]
-            folded = 0 if self._folded is None else self._folded.n_bytes
-        return tables + folded + sum(getattr(array, "nbytes", 0) for array in held)
+        return tables + sum(getattr(array, "nbytes", 0) for array in held)
 
     def render(self, x, out=None):
         """One image seen in every band: x (Ny, Nx) -> (C, My, Mx), or batches of both.
@@ -147,14 +148,6 @@ class Resampler(GridOperator):
         """R^T y of device arrays: y (B, C, My, Mx), out (B, C, Ny, Nx)."""
         self._run("adjoint", y, out, self.shape_out, self.shape_in)
 
-    def _whole(self) -> Executor | FoldedExecutor:
-        """What takes images all the way; a folded one is made where it is first asked for."""
-        if self._folds and self._folded is None:
-            folded = FoldedExecutor(self.device, self.plans[0])
-            folded.set_shift(self._shift[0])
-            self._folded = folded
-        return self._folded or self._executor
-
     def _run(self, way, source, target, shape_source, shape_target, **options):
         """Queue "forward" or "adjoint" on as many items at a time as the cache holds.
 
@@ -166,20 +159,27 @@ class Resampler(GridOperator):
         if self._identity and not options:
             self.device.copy(source, target)
             return
-        executor = self._whole()
         n_bands = self.plans[0].n_bands
-        # per-item tables are counted from a launch's first item, so they go in one group
-        one = len(self.plans) == 1 and executor is self._executor
-        group = min(self._group, batch) if one else batch
-        executor.reserve(group * n_bands)
+        # per-item tables are counted from a launch's first item, so they go in one group; so do
+        # images of a folded executor, which has intermediates for cores
+        grouped = len(self.plans) == 1 and self._whole is self._executor
+        group = min(self._group, batch) if grouped else batch
+        self._whole.reserve(group * n_bands)
         for start in range(0, batch, group):
             n = min(group, batch - start) * n_bands
-            getattr(executor, way)(
+            getattr(self._whole, way)(
                 ImageBatch.of(source, start * math.prod(shape_source[:-2])),
                 ImageBatch.of(target, start * math.prod(shape_target[:-2])),
                 n,
                 **options,
             )
+
+
+def _images_at_once(executor: Executor) -> int:
+    """Images, one for each band, whose intermediates the cache holds and a launch may have."""
+    per_image = sum(rows * ld for rows, ld in executor.scratch_shapes().values())
+    fit = executor.tuning.group_bytes // (per_image * np.dtype(executor.dtype).itemsize)
+    return min(fit, MOST_GROUPS // executor.n_terms)
 
 
 def _check_alike(plans):
