@@ -48,7 +48,7 @@ void boxed(__global const int *restrict active, __global const long *restrict it
         int column[NV];
         WIDE acc[MR][NV];
         UNROLL(v, NV) column[v] = j0 + v * VW < n_pad ? j0 + v * VW : j0;
-        SUM_INSIDE(n_pad - j0, acc, row, B, ld_b, column, k, block, inward)
+        SUM_INSIDE(n_pad - j0, MR, acc, row, B, ld_b, column, k, block, inward)
         UNROLL(i, MR) UNROLL(v, NV) {
             if (i0 + i >= m || j0 + v * VW >= n_pad) continue;
 #if RAGGED

@@ -18,7 +18,7 @@
  *                                   n <= n_pad
  *
  * The tile is kept in registers: B is read as aligned vectors, A as scalars that broadcast.  No
- * local memory, no barrier, no builtin.
+ * local memory, no barrier, no builtin.  A work-item takes RT such tiles, one below the other.
  *
  * Layout: n_pad = n rounded up to a multiple of 16, so to whole vectors; where a tile reaches
  *   beyond n_pad, its vectors there do the first one's work again.  B always has ld n_pad with
@@ -41,10 +41,13 @@
  *          SIGN -1 turns the other way: the adjoint.
  *   E of item b starts at (b / n_bands) * stride_e + (b % n_bands) * band_e.
  *
- * Launch: global = (ceil(n_pad / (NV VW)), ceil(m / MR), batch), each rounded up to its local size.
+ * Launch: global = (ceil(n_pad / (NV VW)), ceil(m / (MR RT)), batch), each rounded up to its local size.
  */
 #include "contract.h"
 
+#ifndef RT          /* tiles that a work-item owns, one below the other */
+#define RT 1
+#endif
 #define OWNED(i, v) (i0 + (i) < m && j0 + (v) * VW < n_pad)
 /* By the vector's address: on CPUs the vector leaves its register in one store. */
 #define STORE_LANES(sums, c, n_left) \
@@ -64,19 +67,22 @@ void contract(const int m, const int n, const int n_pad, const int k, const int 
               const int n_bands)
 {
     const int j0 = (int)get_global_id(0) * NV * VW;
-    const int i0 = (int)get_global_id(1) * MR;
+    const int top = (int)get_global_id(1) * MR * RT;
     const int b = (int)get_global_id(2);
-    if (j0 >= n_pad || i0 >= m) return;
+    if (j0 >= n_pad || top >= m) return;
     A += offset_a + (size_t)(b / div_a) * stride_a;
     B += (size_t)(b / div_b) * stride_b;
     C += offset_c + (size_t)b * stride_c;
 
-    __global const REAL *row[MR];
     int column[NV];
-    WIDE acc[MR][NV];
     UNROLL(v, NV) column[v] = j0 + v * VW < n_pad ? j0 + v * VW : j0;
-    UNROLL(i, MR) row[i] = A + (size_t)(i0 + i < m ? i0 + i : m - 1) * ld_a;
-    SUM_INSIDE(n_pad - j0, acc, row, B, n_pad, column, k, block, inward)
+    const int bottom = m - top < MR * RT ? m : top + MR * RT;
+    for (int i0 = top; i0 < bottom; i0 += MR) {
+        __global const REAL *row[MR];
+        WIDE acc[MR][NV];
+        UNROLL(i, MR) row[i] = A + (size_t)(i0 + i < m ? i0 + i : m - 1) * ld_a;
+        SUM_INSIDE(n_pad - j0, m - i0, acc, row, B, n_pad, column, k, block, inward)
 
 #include "contract_end.h"
+    }
 }

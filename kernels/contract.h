@@ -66,34 +66,42 @@
 
 #define UNROLL(i, n) _Pragma("unroll") for (int i = 0; i < (n); ++i)
 
-/* part[MR][nv] += row[i][l STEP_A] times the vectors at B + l ld_b + column[v], nv of them. */
-#define ADD_TERM(nv, l, row, B, ld_b, column) \
+/* part[mr][nv] += row[i][l STEP_A] times the vectors at B + l ld_b + column[v], nv of them. */
+#define ADD_TERM(mr, nv, l, row, B, ld_b, column) \
     UNROLL(v, nv) right[v] = AT(const WIDE, (B) + (size_t)(l) * (ld_b) + column[v]); \
-    UNROLL(i, MR) UNROLL(v, nv) part[i][v] += row[i][(l) * STEP_A] * right[v];
+    UNROLL(i, mr) UNROLL(v, nv) part[i][v] += row[i][(l) * STEP_A] * right[v];
 
-/* sums[MR][nv] = the terms l < k, in blocks of `block` and in the order above. A loop for each
+/* sums[mr][nv] = the terms l < k, in blocks of `block` and in the order above. A loop for each
  * direction: one with a step that is a variable takes 4 % longer. */
-#define SUM_TERMS(nv, sums, row, B, ld_b, column, k, block, inward) \
-    UNROLL(i, MR) UNROLL(v, nv) sums[i][v] = (WIDE)(0); \
+#define SUM_TERMS(mr, nv, sums, row, B, ld_b, column, k, block, inward) \
     for (int turn = 0; turn * (block) < (k); ++turn) { \
         const int rest = (k) - turn * (block), n_terms = rest < (block) ? rest : (block); \
         const int gone = ((inward) ? turn / 2 : turn) * (block); \
-        WIDE part[MR][nv], right[nv]; \
-        UNROLL(i, MR) UNROLL(v, nv) part[i][v] = (WIDE)(0); \
+        WIDE part[mr][nv], right[nv]; \
+        UNROLL(i, mr) UNROLL(v, nv) part[i][v] = (WIDE)(0); \
         if ((inward) && turn % 2 == 0) \
-            for (int l = gone; l < gone + n_terms; ++l) { ADD_TERM(nv, l, row, B, ld_b, column) } \
+            for (int l = gone; l < gone + n_terms; ++l) { \
+                ADD_TERM(mr, nv, l, row, B, ld_b, column) \
+            } \
         else \
             for (int l = (k) - 1 - gone; l >= (k) - gone - n_terms; --l) { \
-                ADD_TERM(nv, l, row, B, ld_b, column) \
+                ADD_TERM(mr, nv, l, row, B, ld_b, column) \
             } \
-        UNROLL(i, MR) UNROLL(v, nv) sums[i][v] += part[i][v]; \
+        if (turn == 0) { \
+            UNROLL(i, mr) UNROLL(v, nv) sums[i][v] = part[i][v]; \
+        } else { \
+            UNROLL(i, mr) UNROLL(v, nv) sums[i][v] += part[i][v]; \
+        } \
     }
 
-/* The same of a tile of NV vectors of which those from `inside` on count: of the last tile of a
- * row, one alone is summed where it is the only one inside. */
-#define SUM_INSIDE(inside, sums, row, B, ld_b, column, k, block, inward) \
+/* The same of a tile of MR rows and NV vectors of which the columns from `inside` on and the rows
+ * from `below` on count for nothing: of the last tile of a row, one vector alone is summed where it
+ * is the only one inside, and of the last of a column, two rows alone likewise. */
+#define SUM_INSIDE(inside, below, sums, row, B, ld_b, column, k, block, inward) \
     if (NV > 1 && (inside) <= VW) { \
-        SUM_TERMS(1, sums, row, B, ld_b, column, k, block, inward) \
+        SUM_TERMS(MR, 1, sums, row, B, ld_b, column, k, block, inward) \
+    } else if (MR > 2 && (below) <= 2) { \
+        SUM_TERMS(2, NV, sums, row, B, ld_b, column, k, block, inward) \
     } else { \
-        SUM_TERMS(NV, sums, row, B, ld_b, column, k, block, inward) \
+        SUM_TERMS(MR, NV, sums, row, B, ld_b, column, k, block, inward) \
     }

@@ -52,7 +52,7 @@ INLINE void multiply(const int m, const int n, const int k, __global const REAL 
         WIDE sums[MR][NV];
         UNROLL(v, NV) column[v] = j0 + v * VW < n ? j0 + v * VW : j0;
         UNROLL(i, MR) row[i] = A + (size_t)(i0 + i < m ? i0 + i : m - 1) * ld_a;
-        SUM_INSIDE(n - j0, sums, row, B, ld_b, column, k, k, 0)
+        SUM_INSIDE(n - j0, m - i0, sums, row, B, ld_b, column, k, k, 0)
         UNROLL(i, MR) UNROLL(v, NV)
             if (i0 + i < m && j0 + v * VW < n)
                 AT(WIDE, C + (size_t)(i0 + i) * ld_c + column[v]) = sums[i][v];

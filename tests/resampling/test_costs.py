@@ -10,7 +10,7 @@ from helpers.geometries import GEOMETRIES, affine, distorted, operator, psfs, tu
 from clresample.device.tuning import Tuning
 from clresample.resampling import plan as plan_module
 from clresample.resampling.paper.resampler import PaperResampler
-from clresample.resampling.plan import Precision
+from clresample.resampling.plan import Precision, make_plan
 from clresample.resampling.resampler import Resampler
 from clresample.resampling.tiled.layout import SIDES, Sizes, window_of
 from clresample.resampling.transfer import wrap_radius
@@ -60,9 +60,10 @@ def test_tiles_take_what_they_are_said_to(device, as_asked, geometry, n_bands):
         op = None  # that of the other size is gone
         gc.collect()
         before = device.in_use
-        op = Resampler.from_mapping(window, *given, device=device)
+        plan = make_plan(window, *given, precision=Precision.of(np.float32))
+        op = Resampler.from_plans([plan], device=device)
         op.adjoint(op(np.ones(op.shape_in, np.float32)))
-        used, plan = device.in_use - before, op.plans[0]
+        used = device.in_use - before
         n, k, j = max(window.shape_in), len(plan.in_y), plan.out_x.shape[1]
         time, memory = sizes.account(geometry, m, n, k, j)
         assert time == pytest.approx(2 * n_bands * flops_of(plan), rel=1e-9)
