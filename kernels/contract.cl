@@ -41,7 +41,8 @@
  *          SIGN -1 turns the other way: the adjoint.
  *   E of item b starts at (b / n_bands) * stride_e + (b % n_bands) * band_e.
  *
- * Launch: global = (ceil(n_pad / (NV VW)), ceil(m / (MR RT)), batch), each rounded up to its local size.
+ * Launch: global = (ceil(n_pad / (NV VW)), ceil(m / (MR RT)), batch), each rounded up to its
+ *   local size.
  */
 #include "contract.h"
 
