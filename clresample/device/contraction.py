@@ -99,11 +99,11 @@ class Contraction:
         self.options = {"SIGN": -1 if adjoint else 1, "RAGGED": ragged, "STRIDED": strided}
         self.options |= {epilogue: True} if epilogue else {}
 
-    def build(self, n_rows=None, n_terms=0):
-        """(file, macros) for matrices of so many rows and terms; those of most, where not given."""
+    def build(self, n_rows=None, n_terms=0, n_pad=0):
+        """(file, macros) for matrices of so many rows, terms and columns; of most, if not given."""
         tile = self.tuning.tile_for(n_rows) if n_rows else self.tuning.tile
         if "KB" not in tile:
-            return FILE, self.options | {"RT": ROW_TILES} | tile
+            return FILE, self.options | {"RT": ROW_TILES} | self.tuning.tile_for_columns(n_pad)
         return GROUP_FILE, self.options | tile | {"TWO_SUMS": n_terms > ONE_SUM}
 
     def bind(
@@ -119,7 +119,7 @@ class Contraction:
         # one right factor for all: the rows of all items are those of one tall matrix
         whole_a = a.step == 1 and a.stride == m * a.ld and a.div == 1
         tall = e is None and b.stride == 0 and whole_a and c.step == 1 and c.stride == m * c.ld
-        file, tile = self.build(None if tall else m, k)
+        file, tile = self.build(None if tall else m, k, padded(n))
         launch = self.device.launcher(
             file,
             file.removesuffix(".cl"),

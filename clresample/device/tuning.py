@@ -140,6 +140,13 @@ class Tuning:
         choices = {*self.row_choices, self.tile["MR"]}
         return self.tile | {"MR": min(choices, key=covered)}
 
+    def tile_for_columns(self, n_pad) -> dict[str, int]:
+        """The tile for rows of `n_pad` columns on CPUs: where two vectors at a time would leave one
+        alone, which uses half of the registers, five at a time if that leaves none."""
+        two = self.tile["NV"] == 2 and self.tile["MR"] == 8
+        whole = n_pad % (5 * self.tile["VW"]) == 0 and n_pad // self.tile["VW"] % 2
+        return self.tile | ({"NV": 5, "MR": 4} if two and whole else {})
+
     def local_size(self, n_axes):
         """Group of a kernel with a work-item for each item (1 axis), or row or pixel (3 axes).
 
