@@ -17,7 +17,7 @@
  *          E[p] of its own.
  *   E (n_tables, n_positions, n_pad), T (batch, n_positions, n_pad): zero in the padding
  *
- * Item b uses table b / n_bands, or table 0 where there is only one.
+ * Item b uses table b / n_bands, or table 0 where there is only one; in gather which[b / n_bands].
  */
 #include "common.h"
 
@@ -34,12 +34,13 @@ __kernel void gather(const int n_out, const int n_lines, const int n_bands, cons
                      const int source_stride, const int source_ld, const int source_step,
                      __global REAL *restrict target, const ulong target_offset,
                      const int target_stride, const int target_ld, const int target_step,
-                     __global const int *restrict start, __global const REAL *restrict weight)
+                     __global const int *restrict which, __global const int *restrict start,
+                     __global const REAL *restrict weight)
 {
     const int l = (int)get_global_id(1);
 #if ROWS
     const int k = (int)get_global_id(2);
-    const size_t i_line = (size_t)(n_tables > 1 ? k : 0) * n_lines + l;
+    const size_t i_line = (size_t)(n_tables > 1 ? which[k] : 0) * n_lines + l;
     start += i_line * n_out;
     weight += i_line * N_TAPS * n_out;
     source += source_offset + (size_t)k * n_bands * source_stride + (size_t)l * source_ld;
@@ -69,7 +70,7 @@ __kernel void gather(const int n_out, const int n_lines, const int n_bands, cons
 #else
     const int p = (int)get_global_id(0), b = (int)get_global_id(2);
     if (p >= n_out) return;
-    const size_t i_line = (size_t)(n_tables > 1 ? b / n_bands : 0) * n_lines + l;
+    const size_t i_line = (size_t)(n_tables > 1 ? which[b / n_bands] : 0) * n_lines + l;
     weight += i_line * N_TAPS * n_out + p;
     source += source_offset + (size_t)b * source_stride + (size_t)l * source_ld
             + (size_t)start[i_line * n_out + p] * source_step;

@@ -25,7 +25,7 @@ from typing import Self
 
 import numpy as np
 
-from ..device.contraction import Contraction, ImageBatch, Matrix, padded
+from ..device.contraction import Contraction, ImageBatch, Matrix, Own, padded
 from ..device.tuning import Tuning
 
 
@@ -34,35 +34,61 @@ class OnDevice:
 
     device, dtype, tuning, plans, n_bands: of the executor
     n_reserved: images that there is room for; scratch: the intermediates, by their names
-    Subclasses implement scratch_shapes and bind
+    which (items,): int32, on the device: the plan of each item; None where all are seen alike
+    Subclasses implement scratch_shapes, bind and bind_back
     """
 
     def __init__(self, device, dtype, plans):
         self.device, self.dtype, self.plans = device, dtype, plans
         self.tuning, self.n_bands = Tuning.of(device, dtype), plans[0].n_bands
         self.n_reserved, self.scratch = 0, {}
+        self.which = None
+        self._made = {}  # what only the adjoint reads, once it is asked for
+        self._bound_back = False
 
     def scratch_shapes(self):
         """Intermediate matrices of one image: {name: (rows, elements of a row)}."""
         raise NotImplementedError
 
     def bind(self):
-        """Bind the products to the scratch that is there."""
+        """Bind the products to the scratch that is there, those of the way forward at least."""
         raise NotImplementedError
+
+    def bind_back(self):
+        """Bind those of the adjoint, which many callers never ask for."""
+
+    def way_back(self):
+        """See that the products of the adjoint are bound."""
+        if not self._bound_back:
+            self.bind_back()
+            self._bound_back = True
+
+    def follow(self, which):
+        """Have the next items seen by these plans (items,), of `which` made as large as that."""
+        self.device.upload(np.ascontiguousarray(which, np.int32), self.which[: len(which)])
+
+    def made(self, name, make):
+        """What `make()` gives, made once for this executor and those `apart` from it."""
+        if name not in self._made:
+            self._made[name] = make()
+        return self._made[name]
 
     def apart(self) -> Self:
         """An executor of the same tables on the device, with intermediates of its own: for callers
         that work between its stages. A shift of either is one of both."""
         other = copy.copy(self)
-        other.n_reserved, other.scratch = 0, {}
+        other.n_reserved, other.scratch, other._bound_back = 0, {}, False
         return other
 
     def reserve(self, n_images):
         """Make room for the intermediates of `n_images` images at a time."""
         if self.n_reserved != n_images:
-            self.n_reserved = 0  # until all is bound: an interruption leaves nothing half done
+            # until all is bound: an interruption leaves nothing half done
+            self.n_reserved, self._bound_back = 0, False
+            # items of their own sizes leave the rest as it is, which sums may meet with weight 0
+            make = self.device.empty if self.which is None else self.device.zeros
             self.scratch = {
-                name: self.device.empty((n_images, rows, ld), self.dtype)
+                name: make((n_images, rows, ld), self.dtype)
                 for name, (rows, ld) in self.scratch_shapes().items()
             }
             self.bind()
@@ -82,13 +108,18 @@ class OnDevice:
         """`n` pixels of a line rounded up to whole groups of work-items."""
         return -(-n // self.tuning.line_group) * self.tuning.line_group
 
+    def own(self, **sizes) -> Own | None:
+        """The Own of products with these sizes of each plan; None where all items share them."""
+        return None if self.which is None else Own(self.which, **sizes)
+
     def _table(self, tables, *shape) -> Matrix:
         """Host tables, one per plan, zero-padded to a common shape, on the device."""
         host = np.zeros((len(tables), *shape), self.dtype)
         for item, table in zip(host, tables, strict=True):
             item[tuple(slice(n) for n in table.shape)] = table
         stride = math.prod(shape) if len(tables) > 1 else 0
-        return Matrix(self.device.put(host).base_data, shape[-1], stride, div=self.n_bands)
+        table = self.device.put(host).base_data
+        return Matrix(table, shape[-1], stride, div=self.n_bands, own=len(tables) > 1)
 
 
 class Executor(OnDevice):
@@ -97,10 +128,12 @@ class Executor(OnDevice):
     plans: one for all items of a batch, or one for each item; smaller ones are padded with zeros
     axes: the model axes taken as rows and columns of I1
     n_rows: rows of Sy, set by a subclass before it calls this __init__
+    k_ys, k_xs (plans,): ky and kx of each plan, of which k_y and k_x are the largest
     Subclasses add to scratch_shapes and bind, and implement observe and collect
     """
 
     n_rows: int
+    bounded = True  # whether products of an item end where the tables of its plan do
 
     def __init__(self, device, dtype, plans):
         super().__init__(device, dtype, plans)
@@ -110,12 +143,13 @@ class Executor(OnDevice):
         self.h_y, self.h_x = (max(len(p.nu[i]) for p in plans) for i in (0, 1))
         self.k_y, self.k_x = 2 * self.h_y, 2 * self.h_x
         self.k_pad = padded(self.k_x)
+        self.k_ys, self.k_xs = np.array([[self.k_y, self.k_x]] * len(plans)).T
+        if self.bounded and len(plans) > 1:
+            self.k_ys, self.k_xs = 2 * np.array([[len(nu) for nu in p.nu] for p in plans]).T
+            self.which = device.put(np.arange(len(plans)), np.int32)
         self.in_y = self._table([p.in_y for p in plans], self.k_y, self.n_y)
-        self.in_y_t = self._table([p.in_y.T for p in plans], self.n_y, self.k_y)
-        self.in_x = self._table([p.in_x for p in plans], self.k_x, padded(self.n_x))
         self.in_x_t = self._table([p.in_x.T for p in plans], self.n_x, self.k_pad)
         self.out_y = self._table([p.out_y for p in plans], self.n_rows, self.k_y)
-        self.out_y_t = self._table([p.out_y.T for p in plans], self.k_y, self.n_rows)
         shape = len(plans), self.n_bands * self.n_terms, self.h_y, 4, self.k_pad // 2
         self.transfer = device.empty(shape, dtype)
         self.terms = Terms(self) if self.n_terms > 1 else None
@@ -124,6 +158,21 @@ class Executor(OnDevice):
         self.ragged = Contraction(device, dtype, ragged=True)
         self.mix = Contraction(device, dtype, epilogue="MIX")
         self.mix_adjoint = Contraction(device, dtype, epilogue="MIX", adjoint=True)
+
+    @property
+    def in_y_t(self) -> Matrix:
+        """Ty^T of the adjoint."""
+        return self.made("in_y_t", lambda: self._transposed("in_y", self.n_y, self.k_y))
+
+    @property
+    def in_x(self) -> Matrix:
+        """Tx^T of the adjoint."""
+        shape, plans = (self.k_x, padded(self.n_x)), self.plans
+        return self.made("in_x", lambda: self._table([p.in_x for p in plans], *shape))
+
+    def _transposed(self, name, *shape):
+        """Tables of all plans on the device, transposed."""
+        return self._table([getattr(plan, name).T for plan in self.plans], *shape)
 
     def apart(self) -> Self:
         other = super().apart()
@@ -159,24 +208,45 @@ class Executor(OnDevice):
         model = ImageBatch.shaped(*self.plans[0].mapping.shape_in).matrix(self.axes)
         # `spread`: an image is transformed once for all bands
         once, shared = self.in_x_t._replace(div=1), half._replace(div=n)
+        k_y, k_x = self.k_ys, self.k_xs
         self.in_columns, self.in_columns_once = (
-            self.strided.bind(self.n_y, self.k_x, self.n_x, model, in_x_t, half)
+            self.strided.bind(
+                *(self.n_y, self.k_x, self.n_x),
+                *(model, in_x_t, half),
+                n_bands=in_x_t.div,
+                own=self.own(n=k_x),
+            )
             for in_x_t in (self.in_x_t._replace(div=n), once)
         )
-        d, in_y = self.tables(self.transfer), self.in_y._replace(div=n)
+        d, in_y, own = self.tables(self.transfer), self.in_y._replace(div=n), self.own(m=k_y, n=k_x)
         self.in_rows, self.in_rows_shared = (
-            self.mix.bind(self.k_y, self.k_x, self.n_y, in_y, right, z, d, n)
+            self.mix.bind(self.k_y, self.k_x, self.n_y, in_y, right, z, d, n, own=own)
             for right in (half, shared)
-        )
-        in_y_t, in_x = self.in_y_t._replace(div=n), self.in_x._replace(div=n)
-        self.back_rows = self.plain.bind(
-            self.n_y, self.k_x, self.k_y, in_y_t, z, half, inward=False
-        )
-        self.back_columns = self.ragged.bind(
-            self.n_y, self.n_x, self.k_x, half, in_x, model, inward=False
         )
         if self.terms:
             self.terms.bind(self.scratch)
+
+    def bind_back(self):
+        """Bind those of the adjoint."""
+        half, n = self.matrix("half", self.n_y), self.n_bands * self.n_terms
+        z = self.matrix("terms" if self.terms else "frequencies", self.k_y)
+        model = ImageBatch.shaped(*self.plans[0].mapping.shape_in).matrix(self.axes)
+        k_y, k_x = self.k_ys, self.k_xs
+        in_y_t, in_x = self.in_y_t._replace(div=n), self.in_x._replace(div=n)
+        self.back_rows = self.plain.bind(
+            *(self.n_y, self.k_x, self.k_y),
+            *(in_y_t, z, half),
+            n_bands=n,
+            inward=False,
+            own=self.own(n=k_x, k=k_y),
+        )
+        self.back_columns = self.ragged.bind(
+            *(self.n_y, self.n_x, self.k_x),
+            *(half, in_x, model),
+            n_bands=n,
+            inward=False,
+            own=self.own(k=k_x),
+        )
 
     def forward(self, x: ImageBatch, y: ImageBatch, n, spread=False):
         """I2 from I1: x (n T, Ny, Nx), or (n / n_bands, Ny, Nx) if `spread`, to y (n, My, Mx)."""
@@ -196,6 +266,7 @@ class Executor(OnDevice):
 
     def take(self, y: ImageBatch, n):
         """The adjoint of `show`, and conj(D) o of that: y (n, My, Mx) to `model_frequencies`."""
+        self.way_back()
         self.collect(y, n)
         if self.terms:
             self.terms.spread(n)
@@ -209,13 +280,14 @@ class Executor(OnDevice):
         its own: y (n, My, Mx) into the same scratch."""
         raise NotImplementedError
 
-    def to_frequencies(self, mix: Contraction, k, left: Matrix, right: Matrix):
+    def to_frequencies(self, mix: Contraction, k, left: Matrix, right: Matrix, own_k=None):
         """The product Z = D o (left right), left (ky, k), right (k, kx); `mix` may conjugate D.
-        Where there are terms, it is that without D."""
-        z, d = self.matrix("frequencies"), self.tables(self.transfer)
+        Where there are terms, it is that without D. own_k (plans,): k of each plan, if not all's"""
+        z, d, n = self.matrix("frequencies"), self.tables(self.transfer), self.n_bands
+        own = self.own(m=self.k_ys, n=self.k_xs, k=own_k)
         if self.terms:
-            return self.plain.bind(self.k_y, self.k_x, k, left, right, z)
-        return mix.bind(self.k_y, self.k_x, k, left, right, z, d, self.n_bands)
+            d, mix = None, self.plain
+        return mix.bind(self.k_y, self.k_x, k, left, right, z, d, n, own=own)
 
     def analyse(self, x: ImageBatch, n, spread=False):
         """Z = D o (Ty I1 Tx) for `n` images, into `model_frequencies`.

@@ -96,12 +96,12 @@ class Plan:
     @property
     def n_bytes(self) -> int:
         """Host memory of the tables and the mapping [bytes]."""
-        parts = [self, self.mapping] + ([self.lines] if self.lines is not None else [])
-        values = (value for part in parts for value in vars(part).values())
+        values = (value for part in (self, self.mapping) for value in vars(part).values())
         own = sum(value.nbytes for value in values if isinstance(value, np.ndarray))
-        return own + sum(plan.n_bytes for plan in self.windows.values())
+        lines = 0 if self.lines is None else self.lines.n_bytes
+        return own + lines + sum(plan.n_bytes for plan in self.windows.values())
 
-    def window(self, shape, reach_px, precision: Precision) -> Plan:
+    def window(self, shape, reach_px, precision: Precision, size=None) -> Plan:
         """The plan of a box of the model, by what its light reaches of the observation.
 
         One for all boxes of a shape: those observed pixels lie about the box's middle, and how far
@@ -109,10 +109,11 @@ class Plan:
         which are another at each place.
 
         shape (2,) [model px]: of the box; reach_px [model px]: how far its light is followed
+        size (2,) [observed px]: of the window, at least as many; see Around.box_of
         """
-        key = tuple(shape), reach_px, precision
+        key = tuple(shape), reach_px, precision, size
         if key not in self.windows:
-            mapping = Around.box_of(self.mapping, shape, reach_px)
+            mapping = Around.box_of(self.mapping, shape, reach_px, size)
             moved = np.abs(self.mapping.matrix).sum(axis=1) / 2
             extent = tuple(np.array(shape) + mapping.reach_px + moved)
             self.windows[key] = make_plan(

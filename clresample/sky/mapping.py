@@ -109,14 +109,17 @@ class Around(Mapping):
     reach_px: float = 0.0
 
     @classmethod
-    def box_of(cls, mapping, shape, reach_px):
+    def box_of(cls, mapping, shape, reach_px, size=None):
         """The pixels about a box of this shape (2,) [px], its middle in theirs; not distorted.
 
         Half a pixel more of them on each side, for boxes that lie by so much off that middle.
+
+        size (2,): of pixels, where there are to be more than that; the others are not covered
         """
-        inverse = np.abs(np.linalg.inv(mapping.matrix))
-        size = np.ceil(inverse @ (np.array(shape) + 2 * reach_px)).astype(int) + 1
-        offset = (np.array(shape) - 1) / 2 - mapping.matrix @ ((size - 1) / 2)
+        own = cls.size_about(mapping, shape, reach_px)
+        size = own if size is None else np.array(size)
+        before = (size - own) // 2
+        offset = (np.array(shape) - 1) / 2 - mapping.matrix @ (before + (own - 1) / 2)
         return cls(
             tuple(shape),
             tuple(size.tolist()),
@@ -126,6 +129,12 @@ class Around(Mapping):
             mapping.departure_px,
             reach_px=reach_px + np.abs(mapping.matrix).sum() / 2,
         )
+
+    @staticmethod
+    def size_about(mapping, shape, reach_px):
+        """How many pixels (2,) `box_of` takes."""
+        inverse = np.abs(np.linalg.inv(mapping.matrix))
+        return np.ceil(inverse @ (np.array(shape) + 2 * reach_px)).astype(int) + 1
 
     @classmethod
     def of(cls, mapping, shape, margin):

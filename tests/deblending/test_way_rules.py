@@ -142,8 +142,10 @@ def test_slots_are_rendered_in_groups_of_what_the_memory_takes(device, monkeypat
         looking.look([0], [np.zeros(2)] * 5, np.ones(5), slopes=True)
         found.append([device.get(sight.seen) for sight in looking.sights])
         for sight in looking.sights:
-            (renderer,) = sight.aim._renderers.values()
-            assert renderer._capacity == (3 if n_bytes == 1 else 15)  # images of a slot, or of all
+            (windows,) = sight.aim._renderers.values()
+            assert windows.renderer._capacity == (
+                3 if n_bytes == 1 else 15
+            )  # images of a slot, or of all
     for one, other in zip(*found, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-6 * np.abs(one).max())
 
