@@ -110,7 +110,10 @@ class Gather:
     """
 
     def __init__(self, executor: Executor, starts, weights, n_in, n_out):
+        device, tuning, by_pixel = executor.device, executor.tuning, executor.tuning.row_loops
         n_taps, n_lines = max(w.shape[1] for w in weights), executor.n_rows
+        if by_pixel:  # in fours, if a line has so many elements
+            n_taps = min(-(-n_taps // 4) * 4, n_in)
         start = np.zeros((len(starts), n_lines, n_out), np.int32)
         weight = np.zeros((len(starts), n_lines, n_taps, n_out), executor.dtype)
         for i, (s, w) in enumerate(zip(starts, weights, strict=True)):
@@ -119,7 +122,8 @@ class Gather:
             taps = back[:, None] + np.arange(w.shape[1])[:, None]
             start[i, :, : s.shape[1]] = s - back
             np.put_along_axis(weight[i, :, :, : w.shape[2]], taps, w, axis=1)
-        device, tuning = executor.device, executor.tuning
+        if by_pixel:
+            weight = np.ascontiguousarray(weight.swapaxes(2, 3))
         self.launch = device.launcher(
             "warp.cl",
             "gather",

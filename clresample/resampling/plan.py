@@ -117,7 +117,12 @@ class Plan:
             moved = np.abs(self.mapping.matrix).sum(axis=1) / 2
             extent = tuple(np.array(shape) + mapping.reach_px + moved)
             self.windows[key] = make_plan(
-                mapping, *self.psfs, precision=precision, extent=extent, n_terms=self.n_terms
+                mapping,
+                *self.psfs,
+                precision=precision,
+                extent=extent,
+                n_terms=self.n_terms,
+                radius=self.certificate.wrap_radius_px,
             )
         return self.windows[key]
 
@@ -129,7 +134,14 @@ class Plan:
 
 
 def make_plan(
-    mapping: Mapping, psf_in: PSF, psf_out: PSF, *, precision: Precision, extent=None, n_terms=1
+    mapping: Mapping,
+    psf_in: PSF,
+    psf_out: PSF,
+    *,
+    precision: Precision,
+    extent=None,
+    n_terms=1,
+    radius=None,
 ) -> Plan:
     """Tables that take a model to the observed pixels and PSF of `mapping`.
 
@@ -138,11 +150,12 @@ def make_plan(
     n_terms: T, of which psf_out has so many in turn for each band that is observed; see Plan
     extent (2,) [model px]: from its first pixel on, what of the model holds light, and sets the
         frequencies; None = all of it
+    radius (2,) [model px]: by which the model is padded; None = `wrap_radius`
 
     Raises ValueError for incompatible band counts, no overlap, or a PSF without light in the band.
     """
     n_bands = count_bands(mapping, psf_in, psf_out)
-    radius = wrap_radius(psf_out, mapping.matrix)
+    radius = wrap_radius(psf_out, mapping.matrix) if radius is None else radius
     extent = mapping.shape_in if extent is None else extent
     n_fft = _odd(extent[0] + radius[0]), _odd(extent[1] + radius[1])
     _check_size(mapping, psf_out, n_fft, n_bands)
