@@ -229,14 +229,21 @@ void gather_spectra(__global const int *restrict active, __global const int *res
     __global const REAL *m = boxed + offset;
     REAL total = 0;
 #if ROWS
-    REAL part[LANES];
-    for (int l = 0; l < LANES; ++l) part[l] = 0;
+    /* two vectors' sums at a time: one alone waits for its last addition */
+    REAL part[LANES], other[LANES];
+    for (int l = 0; l < LANES; ++l) part[l] = other[l] = 0;
     for (int y = 0; y < ny; ++y, m += nx, g += nx_frame) {
         int x = 0;
+        for (; x + 2 * LANES <= nx; x += 2 * LANES)
+            for (int l = 0; l < LANES; ++l) {
+                part[l] += m[x + l] * g[x + l];
+                other[l] += m[x + LANES + l] * g[x + LANES + l];
+            }
         for (; x + LANES <= nx; x += LANES)
             for (int l = 0; l < LANES; ++l) part[l] += m[x + l] * g[x + l];
         for (; x < nx; ++x) total += m[x] * g[x];
     }
+    for (int l = 0; l < LANES; ++l) part[l] += other[l];
     total += SUM8(part) + SUM8(part + 8);
 #else
     for (int i = lid; i < ny * nx; i += WG) total += m[i] * g[(size_t)(i / nx) * nx_frame + i % nx];

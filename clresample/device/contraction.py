@@ -130,33 +130,23 @@ class Contraction:
         return GROUP_FILE, self.options | tile | {"TWO_SUMS": n_terms > ONE_SUM}
 
     def bind(
-        self,
-        m,
-        n,
-        k,
-        a: Matrix,
-        b: Matrix,
-        c: Matrix,
-        e=None,
-        n_bands=1,
-        *,
-        inward=True,
-        own: Own | None = None,
+        self, m, n, k, a: Matrix, b: Matrix, c: Matrix, e=None, n_bands=1, *, inward=True, own=None
     ) -> Product:
         """The products of (m, k) matrices A with (k, n) matrices B into C.
 
         inward: the largest terms lie about the middle, as those of pixels do; otherwise they come
             first, as those of low frequencies. Small terms are summed first, to round less
         e (buffer, stride, band stride): tables of the epilogue, shared by `n_bands` items
-        own: of which m, n and k are the largest; what of C lies beyond an item's is not written
+        own: Own, of whose sizes m, n and k are the largest; C is not written beyond an item's
         """
         buffer_e, stride_e, band_e = e or (None, 0, 0)
         # one right factor for all: the rows of all items are those of one tall matrix
         whole_a = a.step == 1 and a.stride == m * a.ld and a.div == 1
         tall = e is None and b.stride == 0 and whole_a and c.step == 1 and c.stride == m * c.ld
         file, tile = self.build(None if tall else m, k)
-        tile = tile if own is None else tile | {"OWN": True}
-        sizes = None if own is None else self.device.put(own.sizes(m, n, k), np.int32)
+        tile = tile | {"OWN": own is not None}
+        which = own and own.which
+        sizes = own and self.device.put(own.sizes(m, n, k), np.int32)
         launch = self.device.launcher(
             file,
             file.removesuffix(".cl"),
@@ -188,7 +178,7 @@ class Contraction:
             stride_e=stride_e,
             band_e=band_e,
             n_bands=n_bands,
-            which=None if own is None else own.which,
+            which=which,
             own=sizes,
         )
         starts = (a.offset, a.stride, c.offset, c.stride)

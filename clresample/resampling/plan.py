@@ -145,13 +145,11 @@ def make_plan(
 ) -> Plan:
     """Tables that take a model to the observed pixels and PSF of `mapping`.
 
-    mapping: observed pixels -> model pixels
-    psf_in (1 or C bands), psf_out (C bands): PSF samples of the model and of the observation
+    mapping: observed pixels -> model pixels; psf_in (1 or C bands), psf_out (C bands): the PSFs
     n_terms: T, of which psf_out has so many in turn for each band that is observed; see Plan
     extent (2,) [model px]: from its first pixel on, what of the model holds light, and sets the
         frequencies; None = all of it
     radius (2,) [model px]: by which the model is padded; None = `wrap_radius`
-
     Raises ValueError for incompatible band counts, no overlap, or a PSF without light in the band.
     """
     n_bands = count_bands(mapping, psf_in, psf_out)

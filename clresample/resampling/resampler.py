@@ -73,42 +73,28 @@ class Resampler(GridOperator):
         return self.geometry, plan.axes, self.shape_in, self.shape_out, by_row
 
     def _prepare(self, mapping, psf_in, psf_out, dtype, device):
-        """The plan of a mapping, with its warnings, and its tables on the device at once."""
+        """The plan of a mapping, with its warnings, and its tables on the device."""
         plan = make_plan(mapping, psf_in, psf_out, precision=Precision.of(dtype))
         for message in noise_warnings(plan.certificate):
             warnings.warn(message, PSFWarning, stacklevel=3)
         self._take([plan], dtype, device)
-        self._shift = np.zeros((1, 2))
-        self._executor  # noqa: B018  made now, so that what does not fit is refused here
 
     def _take(self, plans, dtype, device):
-        """An operator of these plans."""
+        """Tables of all plans on the device."""
         n_bands, mappings = plans[0].n_bands, [plan.mapping for plan in plans]
         self._begin(device, dtype, n_bands, mappings, plans[0].n_terms)
         self.plans, self._certificates = plans, [plan.certificate for plan in plans]
-        self._uploaded = None
-
-    @property
-    def _executor(self) -> Executor:
-        """What computes it, made when first asked for: of operators that scenes bring to a batch,
-        only the one of all their plans ever computes."""
-        with self._lock:
-            if self._uploaded is None:
-                executor = EXECUTORS[self.geometry](self.device, self.dtype, self.plans)
-                executor.set_transfer(self._transfers())
-                self._uploaded = executor
-            return self._uploaded
-
-    def _transfers(self):
-        """Each plan's D with the phases of the shift."""
-        pairs = zip(self.plans, self._shift, strict=True)
-        return [plan.shifted(shift) for plan, shift in pairs]
+        self._executor = EXECUTORS[self.geometry](self.device, self.dtype, plans)
+        per_image = sum(rows * ld for rows, ld in self._executor.scratch_shapes().values())
+        budget = self._executor.tuning.group_bytes
+        fit = budget // (per_image * self.dtype.itemsize * n_bands)
+        self._group = max(1, min(fit, MOST_GROUPS // (n_bands * self.n_terms)))
 
     def _use_shift(self):
-        """Upload D with the phases of the shift, where it is on the device already."""
+        """Upload D with the phases of the shift."""
         self._identity = all(p.identity for p in self.plans) and not self._shift.any()
-        if self._uploaded is not None:
-            self._uploaded.set_transfer(self._transfers())
+        pairs = zip(self.plans, self._shift, strict=True)
+        self._executor.set_transfer([plan.shifted(shift) for plan, shift in pairs])
 
     def __reduce__(self):
         """Copied and pickled as its plans; the copy uploads them to the device of the same name."""
@@ -130,7 +116,7 @@ class Resampler(GridOperator):
         # each table in the operator's type, the way it is used forward and the way back
         tables = 2 * sum(plan.n_bytes for plan in self.plans) * self.dtype.itemsize // 8
         with self._lock:
-            held = [*self._uploaded.scratch.values()] if self._uploaded else []
+            held = [*self._executor.scratch.values()]
             held += [array for staged in self._staged.values() for array in staged[1:]]
         return tables + sum(getattr(array, "nbytes", 0) for array in held)
 
@@ -153,14 +139,6 @@ class Resampler(GridOperator):
             self.shape_out,
             identity=False,
         )
-
-    @property
-    def _group(self):
-        """Items that may go through the executor at a time."""
-        e, n_bands = self._executor, self.plans[0].n_bands
-        per_image = sum(rows * ld for rows, ld in e.scratch_shapes().values())
-        fit = e.tuning.group_bytes // (per_image * self.dtype.itemsize * n_bands)
-        return max(1, min(fit, MOST_GROUPS // (n_bands * self.n_terms)))
 
     def _forward(self, x, out):
         """I2 of device arrays: x (B, C, Ny, Nx), out (B, C, My, Mx)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -152,7 +153,7 @@ class Around(Mapping):
             reach_px=margin,
         )
 
-    @property
+    @functools.cached_property
     def covered(self):
         """(My, Mx) bool: observed pixels whose centre lies within reach of the model."""
         at = self.at(*np.indices(self.shape_out))

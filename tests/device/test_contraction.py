@@ -2,52 +2,13 @@
 
 import numpy as np
 import pytest
+from helpers.products import TILES, check, every_type, need, put_right, random, tile
 from helpers.tuning import tune
 
 from clresample.device import contraction as contract
-from clresample.device.contraction import Contraction, ImageBatch, Matrix, Own, padded
+from clresample.device.contraction import Contraction, ImageBatch, Matrix, padded
 
-TYPES = (np.float32, np.float64)
-every_type = pytest.mark.parametrize("dtype", TYPES, ids=lambda t: t.__name__)
-
-
-TILES = {
-    "CPU": {"VW": 8, "NV": 1, "MR": 6, "WGX": 1, "WGY": 1},
-    "wide CPU": {"VW": 16, "NV": 2, "MR": 8, "WGX": 1, "WGY": 1},
-    "GPU": {"VW": 4, "NV": 1, "MR": 8, "WGX": 8, "WGY": 8},
-    "pairs": {"VW": 2, "NV": 3, "MR": 8, "WGX": 8, "WGY": 8},
-    "groups": {"VW": 4, "NV": 2, "MR": 8, "WGX": 8, "WGY": 8, "KB": 16},
-    "tall groups": {"VW": 2, "NV": 1, "MR": 6, "WGX": 4, "WGY": 16, "KB": 16},
-}
-
-
-@pytest.fixture(params=["device's", *TILES])
-def tile(request, monkeypatch):
-    """Register tiles of other devices than the one at hand; any device must run them all."""
-    if request.param != "device's":
-        tune(monkeypatch, tile=TILES[request.param], row_choices=())
-
-
-def random(*shape, seed=0):
-    return np.random.default_rng([seed, *shape]).normal(size=shape)
-
-
-def put_right(device, b, dtype):
-    """(B, k, n) matrices on the device, columns padded with zeros."""
-    host = np.zeros((*b.shape[:-1], padded(b.shape[-1])))
-    host[..., : b.shape[-1]] = b
-    return device.put(host, dtype)
-
-
-def check(found, truth, dtype):
-    """Two rounded factors and a rounded sum of random signs: 4 units of the type, relative L2."""
-    error = np.linalg.norm(found - truth) / np.linalg.norm(truth)
-    assert error <= 4 * np.finfo(dtype).eps, f"error {error:.1e}"
-
-
-def need(device, dtype):
-    if dtype == np.float64 and not device.has_fp64:
-        pytest.skip(f"{device.name} has no float64")
+__all__ = ["tile"]  # a fixture
 
 
 @every_type
@@ -88,31 +49,6 @@ def test_one_right_factor_for_all_and_tables_shared_by_bands(device, dtype):
     bind(m, n, k, Matrix(left.base_data, k, m * k, n_bands),
          Matrix(right.base_data, n_pad, k * n_pad, n_bands), target)(6)  # fmt: skip
     check(device.get(result)[..., :n], np.repeat(a[:2] @ b, n_bands, axis=0), dtype)
-
-
-@every_type
-def test_items_with_tables_and_sizes_of_their_own(device, tile, dtype):
-    need(device, dtype)
-    n_bands, which, m, n, k = 2, [2, 0, 1, 2], [5, 13, 1], [40, 7, 16], [9, 30, 21]
-    tables, b = random(3, 13, 30), random(8, 30, 40)
-    for table, rows, terms in zip(tables, m, k, strict=True):
-        table[rows:] = table[:, terms:] = np.nan  # never read
-    right = put_right(device, b, dtype)
-    n_pad = right.shape[-1]
-    result = device.put(np.full((8, 13, n_pad), 7.0), dtype)
-    on_device = device.put(np.array(which), np.int32)
-    arguments = (
-        *(13, 40, 30, Matrix(device.put(tables, dtype).base_data, 30, 13 * 30, own=True)),
-        *(Matrix(right.base_data, n_pad, 30 * n_pad), Matrix(result.base_data, n_pad, 13 * n_pad)),
-    )
-    bind = Contraction(device, dtype).bind
-    bind(*arguments, n_bands=n_bands, own=Own(on_device, *map(np.array, (m, n, k))))(8)
-    found = device.get(result)
-    for item, right, t in zip(found, b, np.repeat(which, n_bands), strict=True):
-        check(item[: m[t], : n[t]], tables[t, : m[t], : k[t]] @ right[: k[t], : n[t]], dtype)
-        assert (item[m[t] :] == 7).all() and (item[:, padded(n[t]) :] == 7).all()
-    with pytest.raises(ValueError, match=r"own sizes .*40.*30.*\(13, 40, 30\)"):
-        bind(*arguments, own=Own(on_device, m=np.array([5, 14, 1])))
 
 
 @every_type
