@@ -102,6 +102,12 @@ class AffineExecutor(Executor):
         return y.matrix((0, 1) if self.by_row else (1, 0))
 
 
+def kept_taps(n_taps, n_in, tuning):
+    """Taps that are kept of each sum of n_taps along a line of n_in elements: where a work-item
+    walks a line, whole fours if the line has so many."""
+    return min(-(-n_taps // 4) * 4, n_in) if tuning.row_loops else n_taps
+
+
 class Gather:
     """Sparse sums along lines, out[l, p] = sum_t weight[l, t, p] in[l, start[l, p] + t].
 
@@ -111,9 +117,8 @@ class Gather:
 
     def __init__(self, executor: Executor, starts, weights, n_in, n_out):
         device, tuning, by_pixel = executor.device, executor.tuning, executor.tuning.row_loops
-        n_taps, n_lines = max(w.shape[1] for w in weights), executor.n_rows
-        if by_pixel:  # in fours, if a line has so many elements
-            n_taps = min(-(-n_taps // 4) * 4, n_in)
+        n_lines = executor.n_rows
+        n_taps = kept_taps(max(w.shape[1] for w in weights), n_in, tuning)
         start = np.zeros((len(starts), n_lines, n_out), np.int32)
         weight = np.zeros((len(starts), n_lines, n_taps, n_out), executor.dtype)
         for i, (s, w) in enumerate(zip(starts, weights, strict=True)):
