@@ -105,9 +105,13 @@ class Mapping:
 
 @dataclass(frozen=True, eq=False)
 class Around(Mapping):
-    """Observed pixels within `reach_px` [model px] of a model: those beyond it are covered too."""
+    """Observed pixels within `reach_px` [model px] of a model: those beyond it are covered too.
+
+    part: first row and column of the pixels that may be, and those behind the last; None: all
+    """
 
     reach_px: float = 0.0
+    part: tuple[int, int, int, int] | None = None
 
     @classmethod
     def box_of(cls, mapping, shape, reach_px, size=None):
@@ -129,6 +133,7 @@ class Around(Mapping):
             mapping.geometry,
             mapping.departure_px,
             reach_px=reach_px + np.abs(mapping.matrix).sum() / 2,
+            part=(*before.tolist(), *(before + own).tolist()),
         )
 
     @staticmethod
@@ -158,7 +163,11 @@ class Around(Mapping):
         """(My, Mx) bool: observed pixels whose centre lies within reach of the model."""
         at = self.at(*np.indices(self.shape_out))
         low, high = -0.5 - self.reach_px, np.array(self.shape_in) - 0.5 + self.reach_px
-        return ((at >= low) & (at <= high)).all(axis=-1)
+        inside = ((at >= low) & (at <= high)).all(axis=-1)
+        if self.part is not None:
+            y0, x0, y1, x1 = self.part
+            inside[:y0] = inside[y1:] = inside[:, :x0] = inside[:, x1:] = False
+        return inside
 
 
 def lattice(low, shape):

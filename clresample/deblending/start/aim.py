@@ -45,7 +45,7 @@ class Aim:
     tolerance: part of the PSF's light beyond windows; 0: as little as beyond those of whole frames,
         and these are seen with the views' own plans
 
-    Scenes whose plans are alike in layout share a renderer for each shape of boxes.
+    Scenes of one plan share a renderer for each shape of boxes.
     """
 
     def __init__(self, views, device, dtype, precision: Precision, tolerance):
@@ -95,8 +95,8 @@ class Aim:
         off = placed - origin - windows.offset[which]
         low = np.rint(-np.einsum("nij,nj->ni", self._inverse[scene], off))
         moves = off + np.einsum("nij,nj->ni", windows.matrix[which], low)
-        lit = np.concatenate([low + windows.before[which], windows.own[which]], axis=1)
-        return windows.renderer, which, low.astype(int), lit.astype(int), moves
+        lit = np.concatenate([low, windows.own[which]], axis=1).astype(int)
+        return windows.renderer, which, lit[:, :2] - windows.before[which], lit, moves
 
     def _windows(self, layout, members, shape):
         """The _Windows of the plans `members` for boxes of a shape, of one size for all scenes."""
@@ -169,7 +169,7 @@ class _Windows:
     """What renders boxes of one shape about their middle.
 
     members (P,): the plans of whole frames that they are windows of, ascending; renderer: of them
-    offset, matrix: of the windows' mappings (P, 2), (P, 2, 2)
+    offset, matrix: of mappings (P, 2), (P, 2, 2) that begin where the light does
     own (P, 2): pixels that each one's light reaches; before (P, 2): those in front of these
     """
 
@@ -179,14 +179,13 @@ class _Windows:
         self.offset = np.array([m.offset for m in mappings])
         self.matrix = np.array([m.matrix for m in mappings])
         self.before = (np.array(renderer.size) - self.own) // 2
+        self.offset = self.offset + np.einsum("nij,nj->ni", self.matrix, self.before)
 
 
 def _layout(plan: Plan):
-    """What plans have to have in common to be rendered together; distorted ones are alone."""
-    if plan.geometry == "distorted":
-        return id(plan)
-    by_row = None if plan.lines is None else plan.lines.by_row
-    return plan.geometry, plan.axes, plan.n_terms, by_row
+    """What plans have to have in common to be rendered together: they are one, so that a scene
+    starts beside others, to the last digits, as it does alone."""
+    return id(plan)
 
 
 def _reach(plan, tolerance):
