@@ -4,9 +4,9 @@
  *   C[s] = A[s] . B[s],  A (m, k), B (k, n), C (m, n), for the sources listed in `active`
  *
  * items (S, N_COLUMNS) long, a row a source with the columns below: sizes, and in elements where
- * A, B and C begin in their buffers, the distances of A's rows and columns, and of C's.  B's rows
- * lie ld_b apart.
- *   B is read as vectors: it begins at a multiple of 16 elements, as ld_b is one.  SKIP of its
+ * A, B and C begin in their buffers, the distances of A's rows and columns, of B's rows, and of
+ * C's rows and columns.
+ *   B is read as vectors: it begins at a multiple of 16 elements, as its LD_B is one.  SKIP of its
  *      columns come before the first that is wanted; they are computed and left out.
  *   C is stored by vectors, up to a multiple of 16 columns, where B's zeros become C's; its first
  *      element and its rows lie as B's do, and SKIP is 0.  If RAGGED, element by element, n of them
@@ -21,18 +21,17 @@
  */
 #include "contract.h"
 
-enum { M, N, K, BEGIN_A, LD_A, NEXT_A, BEGIN_B, SKIP, BEGIN_C, LD_C, NEXT_C, N_COLUMNS };
+enum { M, N, K, BEGIN_A, LD_A, NEXT_A, BEGIN_B, LD_B, SKIP, BEGIN_C, LD_C, NEXT_C, N_COLUMNS };
 
 __kernel __attribute__((reqd_work_group_size(WGX, WGY, 1)))
 void boxed(__global const int *restrict active, __global const long *restrict items,
            const int block, const int inward, __global const REAL *restrict A,
-           __global const REAL *restrict B, const int ld_b, __global REAL *restrict C,
-           const int add)
+           __global const REAL *restrict B, __global REAL *restrict C, const int add)
 {
     __global const long *item = items + (size_t)N_COLUMNS * active[get_global_id(2)];
     const int m = (int)item[M], k = (int)item[K], skip = (int)item[SKIP];
     const int end = skip + (int)item[N], n_pad = (end + 15) / 16 * 16;
-    const int i0 = (int)get_global_id(1) * MR;
+    const int i0 = (int)get_global_id(1) * MR, ld_b = (int)item[LD_B];
     if (i0 >= m) return;
     A += item[BEGIN_A];
     B += item[BEGIN_B];

@@ -40,6 +40,9 @@
  *   TWIST  rotates each (cos, sin) row pair by the angle of E: (k_y, 2, n_pad), planes cos and sin.
  *          SIGN -1 turns the other way: the adjoint.
  *   E of item b starts at (b / n_bands) * stride_e + (b % n_bands) * band_e.
+ * OWN: items have sizes and tables of their own, b those of t = which[b / n_bands]: own (tables, 3)
+ *   are m, n and k, none larger than the arguments, which set the layout. What of C lies beyond is
+ *   not written. A factor with div 0, and E, are those of t.
  *
  * Launch: global = (ceil(n_pad / (NV VW)), ceil(m / (MR RT)), batch), each rounded up to its
  *   local size.
@@ -49,7 +52,7 @@
 #ifndef RT          /* tiles that a work-item owns, one below the other */
 #define RT 1
 #endif
-#define OWNED(i, v) (i0 + (i) < m && j0 + (v) * VW < n_pad)
+#define OWNED(i, v) (i0 + (i) < m && j0 + (v) * VW < width)
 /* By the vector's address: on CPUs the vector leaves its register in one store. */
 #define STORE_LANES(sums, c, n_left) \
     const REAL *lane = (const REAL *)&sums; \
@@ -57,7 +60,7 @@
         if (j < n_left) c[(size_t)j * step_c] = lane[j];
 
 __kernel __attribute__((reqd_work_group_size(WGX, WGY, 1)))
-void contract(const int m, const int n, const int n_pad, const int k, const int block,
+void contract(int m, int n, const int n_pad, int k, const int block,
               const int inward,
               __global const REAL *restrict A, const ulong offset_a, const int ld_a,
               const int step_a, const int stride_a, const int div_a,
@@ -65,24 +68,26 @@ void contract(const int m, const int n, const int n_pad, const int k, const int 
               __global REAL *restrict C, const ulong offset_c, const int ld_c, const int step_c,
               const int stride_c,
               __global const REAL *restrict E, const int stride_e, const int band_e,
-              const int n_bands)
+              const int n_bands,
+              __global const int *restrict which, __global const int *restrict own)
 {
     const int j0 = (int)get_global_id(0) * NV * VW;
     const int top = (int)get_global_id(1) * MR * RT;
     const int b = (int)get_global_id(2);
-    if (j0 >= n_pad || top >= m) return;
-    A += offset_a + (size_t)(b / div_a) * stride_a;
-    B += (size_t)(b / div_b) * stride_b;
+    TAKE_OWN
+    if (j0 >= width || top >= m) return;
+    A += offset_a + TABLE(div_a) * stride_a;
+    B += TABLE(div_b) * stride_b;
     C += offset_c + (size_t)b * stride_c;
 
     int column[NV];
-    UNROLL(v, NV) column[v] = j0 + v * VW < n_pad ? j0 + v * VW : j0;
+    UNROLL(v, NV) column[v] = j0 + v * VW < width ? j0 + v * VW : j0;
     const int bottom = m - top < MR * RT ? m : top + MR * RT;
     for (int i0 = top; i0 < bottom; i0 += MR) {
         __global const REAL *row[MR];
         WIDE acc[MR][NV];
         UNROLL(i, MR) row[i] = A + (size_t)(i0 + i < m ? i0 + i : m - 1) * ld_a;
-        SUM_INSIDE(n_pad - j0, m - i0, acc, row, B, n_pad, column, k, block, inward)
+        SUM_INSIDE(width - j0, m - i0, acc, row, B, n_pad, column, k, block, inward)
 
 #include "contract_end.h"
     }

@@ -39,6 +39,24 @@
 #define SIGN 1
 #endif
 
+#ifndef OWN         /* 1: items have sizes and tables of their own, see contract.cl */
+#define OWN 0
+#endif
+
+/* Of an item b: the table that a factor reads, and `width`, its columns in whole vectors. */
+#if OWN
+#define TAKE_OWN \
+    const int table = which[b / n_bands]; \
+    m = own[3 * table]; \
+    n = own[3 * table + 1]; \
+    k = own[3 * table + 2]; \
+    const int width = (n + 15) / 16 * 16;
+#define TABLE(div) (size_t)((div) ? b / (div) : table)
+#else
+#define TAKE_OWN const int width = n_pad, table = b / n_bands;
+#define TABLE(div) (size_t)(b / (div))
+#endif
+
 #define WIDE VEC(VW)
 #if VW == 16
 #define HALF VEC(8)

@@ -6,7 +6,7 @@
  */
 #if MIX
     __global const REAL *tables =
-        E + (size_t)(b / n_bands) * stride_e + (size_t)(b % n_bands) * band_e;
+        E + (size_t)table * stride_e + (size_t)(b % n_bands) * band_e;
     UNROLL(h, MR / 2) UNROLL(v, NV) {
         const int i = 2 * h;
         if (!OWNED(i, v)) continue;
@@ -24,7 +24,7 @@
         ODD(acc[i + 1][v]) = gmr - gpr;
     }
 #elif TWIST
-    __global const REAL *tables = E + (size_t)(b / n_bands) * stride_e;
+    __global const REAL *tables = E + (size_t)table * stride_e;
     UNROLL(h, MR / 2) UNROLL(v, NV) {
         const int i = 2 * h;
         if (!OWNED(i, v)) continue;

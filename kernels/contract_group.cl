@@ -45,7 +45,7 @@
 #define ROWS_AT_ONCE 2
 #endif
 #define LEFT VEC(ROWS_AT_ONCE)
-#define OWNED(i, v) (i0 + (i) < m && column[v] < n_pad)
+#define OWNED(i, v) (i0 + (i) < m && column[v] < width)
 
 /* Lane by lane: an address would have a GPU keep all sums in memory. */
 #define STORE_LANES(sums, c, n_left) EACH_LANE(STORE, sums, c, n_left)
@@ -82,12 +82,12 @@
     UNROLL(f, FETCH_B) { \
         const int t = f * GROUP + lid, l = (l0) + t / VECTORS; \
         const int j = first + t % VECTORS * VW; \
-        next_b[f] = l < k && j < n_pad ? AT(const WIDE, B + (size_t)l * n_pad + j) : (WIDE)(0); \
+        next_b[f] = l < k && j < width ? AT(const WIDE, B + (size_t)l * n_pad + j) : (WIDE)(0); \
     }
 
 __kernel __attribute__((reqd_work_group_size(WGX, WGY, 1)))
-void contract_group(const int m, const int n, const int n_pad, const int k, const int block,
-                    const int inward,
+void contract_group(int m, int n, const int n_pad, int k,
+                    const int block, const int inward,
                     __global const REAL *restrict A, const ulong offset_a, const int ld_a,
                     const int step_a, const int stride_a, const int div_a,
                     __global const REAL *restrict B, const int stride_b, const int div_b,
@@ -95,15 +95,18 @@ void contract_group(const int m, const int n, const int n_pad, const int k, cons
                     const int step_c,
                     const int stride_c,
                     __global const REAL *restrict E, const int stride_e, const int band_e,
-                    const int n_bands)
+                    const int n_bands,
+                    __global const int *restrict which, __global const int *restrict own)
 {
     __local REAL slab_a[2][KB][LD] __attribute__((aligned(32)));
     __local WIDE slab_b[2][KB][VECTORS];
     const int lx = (int)get_local_id(0), ly = (int)get_local_id(1), lid = ly * WGX + lx;
     const int top = (int)get_group_id(1) * TM, first = (int)get_group_id(0) * VECTORS * VW;
     const int i0 = top + ly * MR, b = (int)get_global_id(2);
-    A += offset_a + (size_t)(b / div_a) * stride_a;
-    B += (size_t)(b / div_b) * stride_b;
+    TAKE_OWN
+    if (top >= m || first >= width) return;   /* all of a group */
+    A += offset_a + TABLE(div_a) * stride_a;
+    B += TABLE(div_b) * stride_b;
     C += offset_c + (size_t)b * stride_c;
 
     REAL next_a[FETCH_A];

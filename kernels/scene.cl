@@ -11,8 +11,9 @@
  *
  * compose     frame[b, c, y, x] = sum_s spectra[s, channel + c] boxed_s[y - y0, x - x0]
  *             launch: (X, ny_frame, B * n_bands)
- * compose_frequencies  the same of images with both axes transformed, whose boxes are the frame,
- *             times the transfer functions E, (B or 1, n_bands, ny_frame / 2, 4, nx_frame / 2) as
+ * compose_frequencies  the same of images with both axes transformed, whose boxes are the first
+ *             rows and columns of the frame, as many for all sources of a scene; the rest of its
+ *             frame is not written;  times the transfer functions E, (B or 1, n_bands, ny_frame / 2, 4, nx_frame / 2) as
  *             MIX of contract.cl has them; stride_e: elements from a scene's to the next
  *             launch: (vectors of VW columns of a row, or 1 with ROWS, ny_frame / 2, B * n_bands)
  *             VW divides nx_frame
@@ -89,19 +90,22 @@ __kernel void compose_frequencies(
     __global REAL *restrict frame)
 {
     const int c = (int)get_global_id(2) % n_bands, b = (int)get_global_id(2) / n_bands;
-    FOR_Y(h, ny_frame / 2) {
+    if (first[b] == first[b + 1]) return;
+    __global const int *box = BOX(order[first[b]]);
+    const int nx = box[NX], n_rows = box[NY] / 2;
+    FOR_Y(h, n_rows) {
         __global REAL *row = ROW_OF(frame, b, c, n_bands, 2 * h, ny_frame, nx_frame);
         __global const REAL *e =
             E + (size_t)b * stride_e + (size_t)c * ny_frame * nx_frame + (size_t)h * 2 * nx_frame;
-        FOR_X(v, nx_frame / VW) {
+        FOR_X(v, nx / VW) {
             const int x = v * VW;
             WIDE cos_y = (WIDE)(0), sin_y = (WIDE)(0);
             for (int i = first[b]; i < first[b + 1]; ++i) {
                 const int s = order[i];
                 const REAL a = spectra[(size_t)s * n_channels + channel + c];
-                __global const REAL *u = boxed + BEGIN(BOX(s)) + (size_t)2 * h * nx_frame + x;
+                __global const REAL *u = boxed + BEGIN(BOX(s)) + (size_t)2 * h * nx + x;
                 cos_y += a * AT(const WIDE, u);
-                sin_y += a * AT(const WIDE, u + nx_frame);
+                sin_y += a * AT(const WIDE, u + nx);
             }
             __global const REAL *d = e + x / 2;
             const HALF pr = AT(const HALF, d), pi = AT(const HALF, d + nx_frame / 2);
@@ -225,14 +229,21 @@ void gather_spectra(__global const int *restrict active, __global const int *res
     __global const REAL *m = boxed + offset;
     REAL total = 0;
 #if ROWS
-    REAL part[LANES];
-    for (int l = 0; l < LANES; ++l) part[l] = 0;
+    /* two vectors' sums at a time: one alone waits for its last addition */
+    REAL part[LANES], other[LANES];
+    for (int l = 0; l < LANES; ++l) part[l] = other[l] = 0;
     for (int y = 0; y < ny; ++y, m += nx, g += nx_frame) {
         int x = 0;
+        for (; x + 2 * LANES <= nx; x += 2 * LANES)
+            for (int l = 0; l < LANES; ++l) {
+                part[l] += m[x + l] * g[x + l];
+                other[l] += m[x + LANES + l] * g[x + LANES + l];
+            }
         for (; x + LANES <= nx; x += LANES)
             for (int l = 0; l < LANES; ++l) part[l] += m[x + l] * g[x + l];
         for (; x < nx; ++x) total += m[x] * g[x];
     }
+    for (int l = 0; l < LANES; ++l) part[l] += other[l];
     total += SUM8(part) + SUM8(part + 8);
 #else
     for (int i = lid; i < ny * nx; i += WG) total += m[i] * g[(size_t)(i / nx) * nx_frame + i % nx];

@@ -9,10 +9,11 @@
  *          stride_d: elements from a plan's to the next
  *
  * turn     z = D o phase o z0: n_bands spectra from one, each moved by its slot's own offset:
- *          z0 (items, 2 h_y, n_pad), z (items * n_bands, 2 h_y, n_pad); D of one plan, TERMS of
+ *          z0 (items, 2 h_y, n_pad), z (items * n_bands, 2 h_y, n_pad); D of its plan, TERMS of
  *          each band, added up with the slot's shares (slots, n_bands, TERMS), which are not read
  *          where there is one; phase (slots, h_y + n_pad / 2, 2) cos and sin by row and by column;
- *          item i belongs to slot first + i / n;  launch: (X, h_y, items * n_bands)
+ *          item i belongs to slot first + i / n, and where there are more plans than one its D is
+ *          that of which[i];  launch: (X, h_y, items * n_bands)
  *
  * Launch: (X, h_y, n); X is 1 where a work-item walks a whole row (ROWS of group.h), else n_pad / 2
  */
@@ -70,6 +71,7 @@ __kernel void spread(const int n_terms, const int h_y, const int n_pad, const in
 
 __kernel void turn(const int h_y, const int n_pad, const int n_bands, const int n, const int first,
                    __global const REAL *restrict z0, __global const REAL *restrict phase,
+                   const int n_plans, __global const int *restrict which,
                    __global const REAL *restrict D, __global const REAL *restrict shares,
                    __global REAL *restrict z)
 {
@@ -79,7 +81,8 @@ __kernel void turn(const int h_y, const int n_pad, const int n_bands, const int 
     __global const REAL *t = phase + (size_t)(first + item / n) * 2 * (h_y + n_half);
     const REAL yr = t[2 * i], yi = t[2 * i + 1];
     __global const REAL *along = t + 2 * h_y;
-    __global const REAL *d = D + ((size_t)band * TERMS * h_y + i) * 4 * n_half;
+    const size_t first_band = (size_t)(n_plans > 1 ? which[item] : 0) * n_bands;
+    __global const REAL *d = D + ((first_band + band) * TERMS * h_y + i) * 4 * n_half;
 #if TERMS > 1
     const size_t plane = (size_t)h_y * 4 * n_half;
     __global const REAL *share = shares + ((size_t)(first + item / n) * n_bands + band) * TERMS;

@@ -5,7 +5,8 @@
  *          line (forward), and back (adjoint, with the transposed tables).
  *   source, target: element (b, l, p) at offset + b * stride + l * ld + p * step, so that lines
  *            may be rows or columns of an observed image.
- *   start (n_tables, n_lines, n_out), weight (n_tables, n_lines, N_TAPS, n_out)
+ *   start (n_tables, n_lines, n_out), weight (n_tables, n_lines, N_TAPS, n_out) or, where ROWS are
+ *            set, (n_tables, n_lines, n_out, N_TAPS)
  *   Taps of weight 0 stand for "outside" and may read any element of the line.
  *   Launch: (n_out rounded up to the local size, n_lines, batch), or, where ROWS are set and a
  *            work-item takes a line of all bands of a scene, whose taps it reads once for all of
@@ -17,7 +18,7 @@
  *          E[p] of its own.
  *   E (n_tables, n_positions, n_pad), T (batch, n_positions, n_pad): zero in the padding
  *
- * Item b uses table b / n_bands, or table 0 where there is only one.
+ * Item b uses table b / n_bands, or table 0 where there is only one; in gather which[b / n_bands].
  */
 #include "common.h"
 
@@ -27,49 +28,62 @@
 #ifndef ROWS        /* 1: a work-item walks a whole line, as a CPU's vector unit wants it */
 #define ROWS 0
 #endif
-#define LANES 16    /* pixels of a line taken at a time then: one vector of the widest CPUs */
+#if ROWS && N_TAPS % 4 == 0
+/* Four neighbouring elements, which begin anywhere. */
+typedef REAL FOUR __attribute__((ext_vector_type(4), aligned(sizeof(REAL))));
+#define FOUR_AT(p) (*(__global const FOUR *)(p))
+#endif
 
 __kernel void gather(const int n_out, const int n_lines, const int n_bands, const int n_tables,
                      __global const REAL *restrict source, const ulong source_offset,
                      const int source_stride, const int source_ld, const int source_step,
                      __global REAL *restrict target, const ulong target_offset,
                      const int target_stride, const int target_ld, const int target_step,
-                     __global const int *restrict start, __global const REAL *restrict weight)
+                     __global const int *restrict which, __global const int *restrict start,
+                     __global const REAL *restrict weight)
 {
     const int l = (int)get_global_id(1);
 #if ROWS
     const int k = (int)get_global_id(2);
-    const size_t i_line = (size_t)(n_tables > 1 ? k : 0) * n_lines + l;
+    const size_t i_line = (size_t)(n_tables > 1 ? which[k] : 0) * n_lines + l;
     start += i_line * n_out;
     weight += i_line * N_TAPS * n_out;
     source += source_offset + (size_t)k * n_bands * source_stride + (size_t)l * source_ld;
     target += target_offset + (size_t)k * n_bands * target_stride + (size_t)l * target_ld;
-    int p0 = 0;
-    for (; p0 + LANES <= n_out; p0 += LANES) {
-        int at[LANES];
-        for (int i = 0; i < LANES; ++i) at[i] = start[p0 + i] * source_step;
-        for (int c = 0; c < n_bands; ++c) {
-            __global const REAL *in = source + (size_t)c * source_stride;
-            __global REAL *out = target + (size_t)c * target_stride + (size_t)p0 * target_step;
-            REAL sum[LANES];
-            for (int i = 0; i < LANES; ++i) sum[i] = 0;
-            for (int t = 0; t < N_TAPS; ++t)
-                for (int i = 0; i < LANES; ++i)
-                    sum[i] += weight[t * n_out + p0 + i] * in[at[i] + t * source_step];
-            for (int i = 0; i < LANES; ++i) out[(size_t)i * target_step] = sum[i];
+    for (int c = 0; c < n_bands; ++c, source += source_stride, target += target_stride) {
+        int p = 0;
+#if N_TAPS % 4 == 0
+        /* four pixels at a time, their taps side by side, where these are neighbours */
+        for (; source_step == 1 && p + 4 <= n_out; p += 4) {
+            FOUR sum[4];
+            for (int i = 0; i < 4; ++i) {
+                __global const REAL *in = source + start[p + i], *w = weight + (p + i) * N_TAPS;
+                sum[i] = FOUR_AT(w) * FOUR_AT(in);
+                for (int t = 4; t < N_TAPS; t += 4) sum[i] += FOUR_AT(w + t) * FOUR_AT(in + t);
+            }
+            const FOUR even = {sum[0].x, sum[1].x, sum[2].x, sum[3].x};
+            const FOUR odd = {sum[0].y, sum[1].y, sum[2].y, sum[3].y};
+            const FOUR third = {sum[0].z, sum[1].z, sum[2].z, sum[3].z};
+            const FOUR last = {sum[0].w, sum[1].w, sum[2].w, sum[3].w};
+            const FOUR all = (even + odd) + (third + last);
+            __global REAL *out = target + (size_t)p * target_step;
+            out[0] = all.x;
+            out[target_step] = all.y;
+            out[2 * target_step] = all.z;
+            out[3 * target_step] = all.w;
         }
-    }
-    for (int c = 0; c < n_bands; ++c, source += source_stride, target += target_stride)
-        for (int p = p0; p < n_out; ++p) {
+#endif
+        for (; p < n_out; ++p) {
             REAL sum = 0;
             for (int t = 0; t < N_TAPS; ++t)
-                sum += weight[t * n_out + p] * source[(start[p] + t) * source_step];
+                sum += weight[p * N_TAPS + t] * source[(start[p] + t) * source_step];
             target[(size_t)p * target_step] = sum;
         }
+    }
 #else
     const int p = (int)get_global_id(0), b = (int)get_global_id(2);
     if (p >= n_out) return;
-    const size_t i_line = (size_t)(n_tables > 1 ? b / n_bands : 0) * n_lines + l;
+    const size_t i_line = (size_t)(n_tables > 1 ? which[b / n_bands] : 0) * n_lines + l;
     weight += i_line * N_TAPS * n_out + p;
     source += source_offset + (size_t)b * source_stride + (size_t)l * source_ld
             + (size_t)start[i_line * n_out + p] * source_step;

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from .tuning import MOST_GROUPS, Tuning
 
 # The kernel of a tile in registers, for CPUs, and that of a group with local memory, for GPUs.
@@ -43,6 +45,7 @@ class Matrix(NamedTuple):
     buffer: OpenCL buffer, or None where each call of a Product gives one
     offset, ld, stride [elements]: start, distance of rows, of items
     step [elements]: distance of columns (only of a strided left factor, and of a ragged result)
+    own: item b starts at `which` of Own instead, where a product has that
     """
 
     buffer: object
@@ -51,6 +54,30 @@ class Matrix(NamedTuple):
     div: int = 1
     step: int = 1
     offset: int = 0
+    own: bool = False
+
+
+class Own(NamedTuple):
+    """Sizes and tables that the items of a batch have of their own.
+
+    which (batch / n_bands,): int32, on the device: the table of each n_bands items in turn
+    m, n, k (tables,): rows, columns and terms of each; None where all have those of the product
+    """
+
+    which: object
+    m: np.ndarray | None = None
+    n: np.ndarray | None = None
+    k: np.ndarray | None = None
+
+    def sizes(self, m, n, k):
+        """(tables, 3), of those of the product where none are given; ValueError for larger ones."""
+        found = [
+            most if own is None else own for own, most in zip(self[1:], (m, n, k), strict=True)
+        ]
+        table = np.stack(np.broadcast_arrays(*found), axis=1)
+        if (table > (m, n, k)).any():
+            raise ValueError(f"own sizes are up to {table.max(axis=0)}, the product's {(m, n, k)}")
+        return table
 
 
 class ImageBatch(NamedTuple):
@@ -107,19 +134,23 @@ class Contraction:
         return GROUP_FILE, self.options | tile | {"TWO_SUMS": n_terms > ONE_SUM}
 
     def bind(
-        self, m, n, k, a: Matrix, b: Matrix, c: Matrix, e=None, n_bands=1, *, inward=True
+        self, m, n, k, a: Matrix, b: Matrix, c: Matrix, e=None, n_bands=1, *, inward=True, own=None
     ) -> Product:
         """The products of (m, k) matrices A with (k, n) matrices B into C.
 
         inward: the largest terms lie about the middle, as those of pixels do; otherwise they come
             first, as those of low frequencies. Small terms are summed first, to round less
         e (buffer, stride, band stride): tables of the epilogue, shared by `n_bands` items
+        own: Own, of whose sizes m, n and k are the largest; C is not written beyond an item's
         """
         buffer_e, stride_e, band_e = e or (None, 0, 0)
         # one right factor for all: the rows of all items are those of one tall matrix
         whole_a = a.step == 1 and a.stride == m * a.ld and a.div == 1
         tall = e is None and b.stride == 0 and whole_a and c.step == 1 and c.stride == m * c.ld
         file, tile = self.build(None if tall else m, k, padded(n))
+        tile = tile | {"OWN": own is not None}
+        which = own and own.which
+        sizes = own and self.device.put(own.sizes(m, n, k), np.int32)
         launch = self.device.launcher(
             file,
             file.removesuffix(".cl"),
@@ -138,10 +169,10 @@ class Contraction:
             ld_a=a.ld,
             step_a=a.step,
             stride_a=a.stride,
-            div_a=a.div,
+            div_a=0 if own and a.own else a.div,
             B=b.buffer,
             stride_b=b.stride,
-            div_b=b.div,
+            div_b=0 if own and b.own else b.div,
             C=c.buffer,
             offset_c=c.offset,
             ld_c=c.ld,
@@ -151,6 +182,8 @@ class Contraction:
             stride_e=stride_e,
             band_e=band_e,
             n_bands=n_bands,
+            which=which,
+            own=sizes,
         )
         starts = (a.offset, a.stride, c.offset, c.stride)
         return Product(launch, tile, m, padded(n), starts if tall else None)

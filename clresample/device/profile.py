@@ -92,7 +92,8 @@ class Profile:
 
 
 def flops(kernel, arguments, global_size):
-    """Floating-point operations of a launch; 0 where they are not known."""
+    """Floating-point operations of a launch; 0 where they are not known. Items with sizes of their
+    own count as the largest, so that their rates are upper bounds."""
     if kernel.startswith("contract"):
         return 2.0 * math.prod(int(arguments[name]) for name in "mnk") * global_size[2]
     return 0.0

@@ -21,11 +21,11 @@ class AffineExecutor(Executor):
         self.by_row = plans[0].lines.by_row
         n_rows, n_steps = self.shape_out = plans[0].mapping.shape_out
         self.n_rows, self.n_steps = (n_rows, n_steps) if self.by_row else (n_steps, n_rows)
-        self.n_columns = max(p.out_x.shape[1] for p in plans)
+        self._columns = np.array([p.out_x.shape[1] for p in plans])
+        self.n_columns = int(self._columns.max())
         self.n_pad = padded(self.n_columns)
         super().__init__(device, dtype, plans)
         self.out_x = self._table([p.out_x for p in plans], self.k_x, self.n_pad)
-        self.out_x_t = self._table([p.out_x.T for p in plans], self.n_columns, self.k_pad)
         turns = [np.stack([np.cos(p.twist), np.sin(p.twist)], axis=1) for p in plans]
         self.turn = self._table(turns, self.h_y, 2, self.n_pad)
         self.twist = Contraction(device, dtype, epilogue="TWIST")
@@ -33,9 +33,6 @@ class AffineExecutor(Executor):
         lines = [p.lines for p in plans]
         self.to_pixels = Gather(
             self, [p.start for p in lines], [p.weight for p in lines], self.n_columns, self.n_steps
-        )
-        self.from_pixels = Gather(
-            self, [p.start_t for p in lines], [p.weight_t for p in lines], self.n_steps, self.n_pad
         )
 
     def scratch_shapes(self):
@@ -48,14 +45,42 @@ class AffineExecutor(Executor):
         super().bind()
         n_y, n_x, turn = self.n_rows, self.n_columns, (self.turn.buffer, self.turn.stride, 0)
         z, turned, lines = (self.matrix(name) for name in ("frequencies", "turned", "lines"))
+        k_y, k_x, j, n = self.k_ys, self.k_xs, self._columns, self.n_bands
         self.to_columns = self.twist.bind(
-            self.k_y, n_x, self.k_x, z, self.out_x, turned, turn, self.n_bands, inward=False
+            *(self.k_y, n_x, self.k_x),
+            *(z, self.out_x, turned, turn),
+            n,
+            inward=False,
+            own=self.own(m=k_y, n=j, k=k_x),
         )
-        self.to_lines = self.plain.bind(n_y, n_x, self.k_y, self.out_y, turned, lines, inward=False)
+        self.to_lines = self.plain.bind(
+            *(n_y, n_x, self.k_y),
+            *(self.out_y, turned, lines),
+            n_bands=n,
+            inward=False,
+            own=self.own(n=j, k=k_y),
+        )
+
+    def bind_back(self):
+        super().bind_back()
+        n_y, n_x, turn = self.n_rows, self.n_columns, (self.turn.buffer, self.turn.stride, 0)
+        turned, lines = self.matrix("turned"), self.matrix("lines")
+        k_y, j, n = self.k_ys, self._columns, self.n_bands
+        out_y_t = self.made("out_y_t", lambda: self._transposed("out_y", self.k_y, n_y))
+        out_x_t = self.made("out_x_t", lambda: self._transposed("out_x", n_x, self.k_pad))
+        self.from_pixels = self.made("from_pixels", self._gather_back)
         self.from_lines = self.twist_adjoint.bind(
-            self.k_y, n_x, n_y, self.out_y_t, lines, turned, turn, self.n_bands
+            *(self.k_y, n_x, n_y),
+            *(out_y_t, lines, turned, turn),
+            n,
+            own=self.own(m=k_y, n=j),
         )
-        self.from_columns = self.to_frequencies(self.mix_adjoint, n_x, turned, self.out_x_t)
+        self.from_columns = self.to_frequencies(self.mix_adjoint, n_x, turned, out_x_t, j)
+
+    def _gather_back(self):
+        lines = [p.lines for p in self.plans]
+        tables = [p.start_t for p in lines], [p.weight_t for p in lines]
+        return Gather(self, *tables, self.n_steps, self.n_pad)
 
     def observe(self, y: ImageBatch, n):
         """I2 = gather(G),  G = Sy twist(Z Sx).
@@ -65,16 +90,22 @@ class AffineExecutor(Executor):
         """
         self.to_columns(n)
         self.to_lines(n)
-        self.to_pixels(self.matrix("lines"), self._lines_of(y), n)
+        self.to_pixels(self.matrix("lines"), self._lines_of(y), n, self.which)
 
     def collect(self, y: ImageBatch, n):
         """Z = conj(D) o (twist^T(Sy^T G) Sx^T),  G = gather^T(I2);  y (n, My, Mx): I2"""
-        self.from_pixels(self._lines_of(y), self.matrix("lines"), n)
+        self.from_pixels(self._lines_of(y), self.matrix("lines"), n, self.which)
         self.from_lines(n)
         self.from_columns(n)
 
     def _lines_of(self, y: ImageBatch) -> Matrix:
         return y.matrix((0, 1) if self.by_row else (1, 0))
+
+
+def kept_taps(n_taps, n_in, tuning):
+    """Taps that are kept of each sum of n_taps along a line of n_in elements: where a work-item
+    walks a line, whole fours if the line has so many."""
+    return min(-(-n_taps // 4) * 4, n_in) if tuning.row_loops else n_taps
 
 
 class Gather:
@@ -85,7 +116,9 @@ class Gather:
     """
 
     def __init__(self, executor: Executor, starts, weights, n_in, n_out):
-        n_taps, n_lines = max(w.shape[1] for w in weights), executor.n_rows
+        device, tuning, by_pixel = executor.device, executor.tuning, executor.tuning.row_loops
+        n_lines = executor.n_rows
+        n_taps = kept_taps(max(w.shape[1] for w in weights), n_in, tuning)
         start = np.zeros((len(starts), n_lines, n_out), np.int32)
         weight = np.zeros((len(starts), n_lines, n_taps, n_out), executor.dtype)
         for i, (s, w) in enumerate(zip(starts, weights, strict=True)):
@@ -94,7 +127,8 @@ class Gather:
             taps = back[:, None] + np.arange(w.shape[1])[:, None]
             start[i, :, : s.shape[1]] = s - back
             np.put_along_axis(weight[i, :, :, : w.shape[2]], taps, w, axis=1)
-        device, tuning = executor.device, executor.tuning
+        if by_pixel:
+            weight = np.ascontiguousarray(weight.swapaxes(2, 3))
         self.launch = device.launcher(
             "warp.cl",
             "gather",
@@ -114,10 +148,14 @@ class Gather:
         self.bands_each = executor.n_bands if tuning.row_loops else 1
         self.size = 1 if tuning.row_loops else executor.whole_groups(n_out), n_lines
 
-    def __call__(self, source: Matrix, target: Matrix, n):
-        """Queue the sums of `n` images, all bands of some scenes: rows of source to target."""
+    def __call__(self, source: Matrix, target: Matrix, n, which):
+        """Queue the sums of `n` images, all bands of some scenes: rows of source to target.
+
+        which: the executor's
+        """
         self.launch(
             (*self.size, n // self.bands_each),
+            which=which,
             source=source.buffer,
             source_offset=source.offset,
             source_stride=source.stride,

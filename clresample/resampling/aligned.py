@@ -16,19 +16,38 @@ class AlignedExecutor(Executor):
         self.n_rows, self.n_columns = plans[0].mapping.shape_out
         super().__init__(device, dtype, plans)
         self.out_x = self._table([p.out_x for p in plans], self.k_x, padded(self.n_columns))
-        self.out_x_t = self._table([p.out_x.T for p in plans], self.n_columns, self.k_pad)
 
     def bind(self):
         super().bind()
         n_y, n_x = self.n_rows, self.n_columns
         half, z = self.matrix("half", n_y), self.matrix("frequencies")
         observed = ImageBatch.shaped(n_y, n_x).matrix()
-        self.to_rows = self.plain.bind(n_y, self.k_x, self.k_y, self.out_y, z, half, inward=False)
-        self.to_pixels = self.ragged.bind(
-            n_y, n_x, self.k_x, half, self.out_x, observed, inward=False
+        k_y, k_x, n = self.k_ys, self.k_xs, self.n_bands
+        self.to_rows = self.plain.bind(
+            *(n_y, self.k_x, self.k_y),
+            *(self.out_y, z, half),
+            n_bands=n,
+            inward=False,
+            own=self.own(n=k_x, k=k_y),
         )
-        self.from_pixels = self.plain.bind(n_y, self.k_x, n_x, observed, self.out_x_t, half)
-        self.from_rows = self.to_frequencies(self.mix_adjoint, n_y, self.out_y_t, half)
+        self.to_pixels = self.ragged.bind(
+            *(n_y, n_x, self.k_x),
+            *(half, self.out_x, observed),
+            n_bands=n,
+            inward=False,
+            own=self.own(k=k_x),
+        )
+
+    def bind_back(self):
+        super().bind_back()
+        n_y, n_x, n = self.n_rows, self.n_columns, self.n_bands
+        half, observed = self.matrix("half", n_y), ImageBatch.shaped(n_y, n_x).matrix()
+        out_y_t = self.made("out_y_t", lambda: self._transposed("out_y", self.k_y, n_y))
+        out_x_t = self.made("out_x_t", lambda: self._transposed("out_x", n_x, self.k_pad))
+        self.from_pixels = self.plain.bind(
+            n_y, self.k_x, n_x, observed, out_x_t, half, n_bands=n, own=self.own(n=self.k_xs)
+        )
+        self.from_rows = self.to_frequencies(self.mix_adjoint, n_y, out_y_t, half)
 
     def observe(self, y: ImageBatch, n):
         """I2 = Sy Z Sx;  y (n, My, Mx): the observation I2 of each band, overwritten"""

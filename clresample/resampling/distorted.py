@@ -14,6 +14,8 @@ class DistortedExecutor(Executor):
     Sy (P, ky), Sx (P, kx): waves at the pixels, Sy times the pixel's area
     """
 
+    bounded = False  # its sums along a pixel's row of tables run over all columns
+
     def __init__(self, device, dtype, plans):
         self.n_rows = math.prod(plans[0].mapping.shape_out)
         super().__init__(device, dtype, plans)
@@ -25,18 +27,24 @@ class DistortedExecutor(Executor):
         self.to_rows = self.plain.bind(
             self.n_rows, self.k_x, self.k_y, self.out_y, z, half, inward=False
         )
-        self.from_rows = self.to_frequencies(self.mix_adjoint, self.n_rows, self.out_y_t, half)
-        group = self.tuning.line_group
-        self.rowdot, self.rowscale = (
-            self.device.launcher("warp.cl", name, dtype=self.dtype, local_size=local_size).bind(
-                n_positions=self.n_rows,
-                n_pad=self.k_pad,
-                n_bands=self.n_bands,
-                n_tables=len(self.plans),
-                T=half.buffer,
-                E=self.out_x.buffer,
-            )
-            for name, local_size in (("rowdot", (group, 1)), ("rowscale", (COLUMN_PAD, 1)))
+        self.rowdot = self._rows("rowdot", (self.tuning.line_group, 1), half)
+
+    def bind_back(self):
+        super().bind_back()
+        half = self.matrix("half", self.n_rows)
+        out_y_t = self.made("out_y_t", lambda: self._transposed("out_y", self.k_y, self.n_rows))
+        self.from_rows = self.to_frequencies(self.mix_adjoint, self.n_rows, out_y_t, half)
+        self.rowscale = self._rows("rowscale", (COLUMN_PAD, 1), half)
+
+    def _rows(self, name, local_size, half):
+        """A kernel over the pixels' rows of tables."""
+        return self.device.launcher("warp.cl", name, dtype=self.dtype, local_size=local_size).bind(
+            n_positions=self.n_rows,
+            n_pad=self.k_pad,
+            n_bands=self.n_bands,
+            n_tables=len(self.plans),
+            T=half.buffer,
+            E=self.out_x.buffer,
         )
 
     def observe(self, y: ImageBatch, n):

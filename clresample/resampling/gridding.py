@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,7 +57,7 @@ class KaiserBessel:
         return self.n_taps * np.sinh(b) / (b * np.i0(self.beta))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LineTaps:
     """Observed pixels as straight lines through the model: pass 2 of the affine geometry.
 
@@ -66,13 +67,35 @@ class LineTaps:
     by_row: lines are rows of the observed image (position q = column) or its columns (q = row)
     start (L, Q), start_t (L, J): first of the columns, or pixels, that are summed
     weight (L, W, Q), weight_t (L, W', J) [1]: 0 for pixels that the model does not cover
+    covered (L, Q): bool, these; n_columns: J
     """
 
     by_row: bool
     start: np.ndarray
     weight: np.ndarray
-    start_t: np.ndarray
-    weight_t: np.ndarray
+    covered: np.ndarray
+    n_columns: int
+
+    @functools.cached_property
+    def _back(self):
+        weight = self.weight.swapaxes(1, 2)
+        return transpose_taps(self.start, weight, self.covered, self.n_columns)
+
+    @property
+    def n_bytes(self) -> int:
+        """Host memory of what there is so far [bytes]."""
+        parts = self.start, self.weight, self.covered, *vars(self).get("_back", ())
+        return sum(part.nbytes for part in parts)
+
+    @property
+    def start_t(self) -> np.ndarray:
+        """Worked out when first asked for: what only renders never does."""
+        return self._back[0]
+
+    @property
+    def weight_t(self) -> np.ndarray:
+        """As start_t."""
+        return self._back[1]
 
 
 def transpose_taps(start, weight, covered, n_columns):

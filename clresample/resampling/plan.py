@@ -96,12 +96,12 @@ class Plan:
     @property
     def n_bytes(self) -> int:
         """Host memory of the tables and the mapping [bytes]."""
-        parts = [self, self.mapping] + ([self.lines] if self.lines is not None else [])
-        values = (value for part in parts for value in vars(part).values())
+        values = (value for part in (self, self.mapping) for value in vars(part).values())
         own = sum(value.nbytes for value in values if isinstance(value, np.ndarray))
-        return own + sum(plan.n_bytes for plan in self.windows.values())
+        lines = 0 if self.lines is None else self.lines.n_bytes
+        return own + lines + sum(plan.n_bytes for plan in self.windows.values())
 
-    def window(self, shape, reach_px, precision: Precision) -> Plan:
+    def window(self, shape, reach_px, precision: Precision, size=None) -> Plan:
         """The plan of a box of the model, by what its light reaches of the observation.
 
         One for all boxes of a shape: those observed pixels lie about the box's middle, and how far
@@ -109,14 +109,20 @@ class Plan:
         which are another at each place.
 
         shape (2,) [model px]: of the box; reach_px [model px]: how far its light is followed
+        size (2,) [observed px]: of the window, at least as many; see Around.box_of
         """
-        key = tuple(shape), reach_px, precision
+        key = tuple(shape), reach_px, precision, size
         if key not in self.windows:
-            mapping = Around.box_of(self.mapping, shape, reach_px)
+            mapping = Around.box_of(self.mapping, shape, reach_px, size)
             moved = np.abs(self.mapping.matrix).sum(axis=1) / 2
             extent = tuple(np.array(shape) + mapping.reach_px + moved)
             self.windows[key] = make_plan(
-                mapping, *self.psfs, precision=precision, extent=extent, n_terms=self.n_terms
+                mapping,
+                *self.psfs,
+                precision=precision,
+                extent=extent,
+                n_terms=self.n_terms,
+                radius=self.certificate.wrap_radius_px,
             )
         return self.windows[key]
 
@@ -128,20 +134,26 @@ class Plan:
 
 
 def make_plan(
-    mapping: Mapping, psf_in: PSF, psf_out: PSF, *, precision: Precision, extent=None, n_terms=1
+    mapping: Mapping,
+    psf_in: PSF,
+    psf_out: PSF,
+    *,
+    precision: Precision,
+    extent=None,
+    n_terms=1,
+    radius=None,
 ) -> Plan:
     """Tables that take a model to the observed pixels and PSF of `mapping`.
 
-    mapping: observed pixels -> model pixels
-    psf_in (1 or C bands), psf_out (C bands): PSF samples of the model and of the observation
+    mapping: observed pixels -> model pixels; psf_in (1 or C bands), psf_out (C bands): the PSFs
     n_terms: T, of which psf_out has so many in turn for each band that is observed; see Plan
     extent (2,) [model px]: from its first pixel on, what of the model holds light, and sets the
         frequencies; None = all of it
-
+    radius (2,) [model px]: by which the model is padded; None = `wrap_radius`
     Raises ValueError for incompatible band counts, no overlap, or a PSF without light in the band.
     """
     n_bands = count_bands(mapping, psf_in, psf_out)
-    radius = wrap_radius(psf_out, mapping.matrix)
+    radius = wrap_radius(psf_out, mapping.matrix) if radius is None else radius
     extent = mapping.shape_in if extent is None else extent
     n_fft = _odd(extent[0] + radius[0]), _odd(extent[1] + radius[1])
     _check_size(mapping, psf_out, n_fft, n_bands)

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..sky.mapping import Mapping
 from ..sky.waves import cos_sin_columns
-from .gridding import KaiserBessel, LineTaps, transpose_taps
+from .gridding import KaiserBessel, LineTaps
 
 
 def waves(nu, x) -> np.ndarray:
@@ -66,11 +66,10 @@ def line_tables(mapping: Mapping, nu, d, center, window: KaiserBessel):
     below = np.floor(u - window.n_taps / 2)
     start = np.where(covered, below.astype(int) + 1, 0)
     weight = window.taps(u - window.n_taps / 2 - below) * covered[:, :, None]
-    start_t, weight_t = transpose_taps(start, weight, covered, n_columns)
     y0 = (a - r * c) * np.arange(n_lines) + t_y - r * t_x
     return {
         "out_y": waves(nu[0], y0),
         "out_x": waves(nu[1], columns).T,
         "twist": 2 * np.pi * np.outer(nu[0], r * columns),
-        "lines": LineTaps(bool(by_row), start, weight.swapaxes(1, 2), start_t, weight_t),
+        "lines": LineTaps(bool(by_row), start, weight.swapaxes(1, 2), covered, n_columns),
     }, d

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -104,19 +105,26 @@ class Mapping:
 
 @dataclass(frozen=True, eq=False)
 class Around(Mapping):
-    """Observed pixels within `reach_px` [model px] of a model: those beyond it are covered too."""
+    """Observed pixels within `reach_px` [model px] of a model: those beyond it are covered too.
+
+    part: first row and column of the pixels that may be, and those behind the last; None: all
+    """
 
     reach_px: float = 0.0
+    part: tuple[int, int, int, int] | None = None
 
     @classmethod
-    def box_of(cls, mapping, shape, reach_px):
+    def box_of(cls, mapping, shape, reach_px, size=None):
         """The pixels about a box of this shape (2,) [px], its middle in theirs; not distorted.
 
         Half a pixel more of them on each side, for boxes that lie by so much off that middle.
+
+        size (2,): of pixels, where there are to be more than that; the others are not covered
         """
-        inverse = np.abs(np.linalg.inv(mapping.matrix))
-        size = np.ceil(inverse @ (np.array(shape) + 2 * reach_px)).astype(int) + 1
-        offset = (np.array(shape) - 1) / 2 - mapping.matrix @ ((size - 1) / 2)
+        own = cls.size_about(mapping, shape, reach_px)
+        size = own if size is None else np.array(size)
+        before = (size - own) // 2
+        offset = (np.array(shape) - 1) / 2 - mapping.matrix @ (before + (own - 1) / 2)
         return cls(
             tuple(shape),
             tuple(size.tolist()),
@@ -125,7 +133,14 @@ class Around(Mapping):
             mapping.geometry,
             mapping.departure_px,
             reach_px=reach_px + np.abs(mapping.matrix).sum() / 2,
+            part=(*before.tolist(), *(before + own).tolist()),
         )
+
+    @staticmethod
+    def size_about(mapping, shape, reach_px):
+        """How many pixels (2,) `box_of` takes."""
+        inverse = np.abs(np.linalg.inv(mapping.matrix))
+        return np.ceil(inverse @ (np.array(shape) + 2 * reach_px)).astype(int) + 1
 
     @classmethod
     def of(cls, mapping, shape, margin):
@@ -143,12 +158,16 @@ class Around(Mapping):
             reach_px=margin,
         )
 
-    @property
+    @functools.cached_property
     def covered(self):
         """(My, Mx) bool: observed pixels whose centre lies within reach of the model."""
         at = self.at(*np.indices(self.shape_out))
         low, high = -0.5 - self.reach_px, np.array(self.shape_in) - 0.5 + self.reach_px
-        return ((at >= low) & (at <= high)).all(axis=-1)
+        inside = ((at >= low) & (at <= high)).all(axis=-1)
+        if self.part is not None:
+            y0, x0, y1, x1 = self.part
+            inside[:y0] = inside[y1:] = inside[:, :x0] = inside[:, x1:] = False
+        return inside
 
 
 def lattice(low, shape):

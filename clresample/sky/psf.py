@@ -158,9 +158,9 @@ class PSF(ReadOnly, ShownPSF):
         outside |= np.abs(b * nu_y[:, None] + d * nu_x) > limit
         result = np.empty((self.n_bands, nu_y.size, nu_x.size), dtype=np.complex128)
         # bands that share a centre share the exponentials
-        centers, i_center = np.unique(self.center, axis=0, return_inverse=True)
-        for i, center in enumerate(centers):
-            bands = np.flatnonzero(i_center.ravel() == i)
+        rows = [tuple(row) for row in self.center.tolist()]
+        for center in dict.fromkeys(rows):
+            bands = np.array([band for band, row in enumerate(rows) if row == center])
             result[bands] = _transform(self, bands, center, nu_y, nu_x, matrix)
         result[:, outside] = 0
         return result

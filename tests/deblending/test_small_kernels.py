@@ -151,25 +151,30 @@ def planes(d_plus, d_minus):
 
 @every_type
 @pytest.mark.parametrize("n_terms", [1, 3])
-def test_spectra_are_turned_by_their_slots_offsets(queue, n_terms, dtype):
-    """From one image of a slot to every band's, with the slot's own sum of the bands' terms."""
+@pytest.mark.parametrize("which", [None, [1, 0, 2, 2, 1, 0, 0, 1, 2]])
+def test_spectra_are_turned_by_their_slots_offsets(queue, which, n_terms, dtype):
+    """From one image of a slot to every band's, with the slot's own sum of the bands' terms, and
+    where there are several plans with the transfer functions of its own."""
     h_y, h_x, n_bands, n, first = 5, 16, 2, 3, 2
     slots, items = 5, 9  # of which those from `first` on, n items each
     z0 = random(items, 2 * h_y, 2 * h_x)
-    d = random(2, n_bands, n_terms, h_y, h_x) + 1j * random(2, n_bands, n_terms, h_y, h_x, seed=1)
+    n_plans = 1 if which is None else 3
+    shape = 2, n_plans, n_bands, n_terms, h_y, h_x
+    d = random(*shape) + 1j * random(*shape, seed=1)
+    which = np.zeros(items, np.int32) if which is None else np.array(which, np.int32)
     shares = random(slots, n_bands, n_terms) if n_terms > 1 else np.ones((slots, n_bands, 1))
     turn = np.exp(2j * np.pi * random(slots, h_y + h_x))
     found = queue(
         "terms.cl", "turn", (h_x, h_y + 1, items * n_bands), dtype, get="z",
         defines={"TERMS": n_terms}, h_y=h_y, n_pad=2 * h_x, n_bands=n_bands, n=n, first=first,
         z0=z0, phase=np.stack([turn.real, turn.imag], axis=-1), D=planes(*d), shares=shares,
-        z=np.full((items * n_bands, 2 * h_y, 2 * h_x), np.nan),
+        n_plans=n_plans, which=which, z=np.full((items * n_bands, 2 * h_y, 2 * h_x), np.nan),
     )  # fmt: skip
     plus, minus = amplitudes(z0)
     for item in range(items):
         slot = first + item // n
         y, x = turn[slot, :h_y, None], turn[slot, h_y:]
-        d_plus, d_minus = np.einsum("ct,pctyx->pcyx", shares[slot], d)
+        d_plus, d_minus = np.einsum("ct,pctyx->pcyx", shares[slot], d[:, which[item]])
         wanted = quads_of(d_plus * y * x * plus[item], d_minus * y * x.conj() * minus[item])
         close(found[item * n_bands : (item + 1) * n_bands], wanted, dtype)
 

@@ -77,6 +77,7 @@ class Posed:
         begin = np.cumsum(sizes) - sizes + 3  # anywhere
         seen = rng.normal(size=sizes.sum() + 5)
         s.place = np.column_stack([scene, low, size, n, begin])
+        s.lit = s.place[:, 1:5]
         s.place_on_device = build.put(s.place.astype(np.int32))
         s.seen = build.put(seen, dtype)
         self.slots = SimpleNamespace(scene=scene)

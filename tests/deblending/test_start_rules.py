@@ -200,7 +200,7 @@ def test_pairs_are_windows_of_one_scene_that_meet_on_the_pixels():
         (0, 9, 9, 5, 5),
         (0, 2, 2, 0, 3),
     ]
-    found = _pairs(np.array(place), (10, 11))
+    found = _pairs(np.array(place)[:, 0], np.array(place)[:, 1:], (10, 11))
     wanted = [
         (0, 0, 0, 0, 4, 5),  # cut at row 0
         (0, 1, 3, 4, 1, 1),

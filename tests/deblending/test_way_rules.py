@@ -144,8 +144,10 @@ def test_slots_are_rendered_in_groups_of_what_the_memory_takes(device, monkeypat
         looking.look([0], [np.zeros(2)] * 5, np.ones(5), slopes=True)
         found.append([device.get(sight.seen) for sight in looking.sights])
         for sight in looking.sights:
-            (renderer,) = sight.aim._renderers.values()
-            assert renderer._capacity == (3 if n_bytes == 1 else 15)  # images of a slot, or of all
+            (windows,) = sight.aim._renderers.values()
+            assert windows.renderer._capacity == (
+                3 if n_bytes == 1 else 15
+            )  # images of a slot, or of all
     for one, other in zip(*found, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-6 * np.abs(one).max())
 
@@ -222,16 +224,28 @@ def test_groups_are_of_the_cells_that_hold_the_middles_of_boxes():
 
 def test_operations_are_counted_from_sizes():
     """Products of matrices, four operations a term and pair; weighed sums at points beside them."""
-    shape, frame = np.array([[3, 5], [4, 3]]), (20, 30, 16, 48)
-    found = choice._counts(shape, 2, 3, *frame)
-    n_y, n_x, k_y, k_x = frame
-    rows, pixels, n_images = 7, 27, 6
+    shape, (n_y, n_x, k_y, k_x) = np.array([[3, 5], [4, 2]]), (20, 30, 16, 48)
+    of_frame, of_box = np.tile([k_y, k_x], (2, 1)), np.tile([k_y, k_x], (2, 1))
+    found = choice._counts(shape, 3, n_y, n_x, of_frame, of_box)
+    rows, pixels, n_images = 7, 23, 6
     second = n_images * k_y * n_y * k_x
     wanted = [
         n_images * n_y * n_x * k_x + second + choice.POINT * 1.5 * 3 * pixels,
         choice.BOXED * pixels * k_x + second + choice.POINT * 1.5 * 3 * rows * k_x,
         choice.BOXED * (pixels * k_x + rows * k_y * k_x) + choice.POINT * 1.5 * 3 * 2 * k_y * k_x,
     ]
+    np.testing.assert_allclose(found, 4 * np.array(wanted))
+    # each frame, and each box in it, has waves of its own
+    of_frame, of_box = np.array([[4, 32], [6, 16]]), np.array([[6, 16], [4, 32]])
+    first, second = 3 * 20 * 30 * (32 + 16), 3 * 20 * (4 * 32 + 6 * 16)
+    to_lines, to_planes = 15 * 16 + 8 * 32, 3 * 6 * 16 + 4 * 4 * 32
+    by_pixel, by_line, by_wave = 23, 3 * 16 + 4 * 32, 6 * 16 + 4 * 32
+    wanted = [
+        first + second + choice.POINT * 4.5 * by_pixel,
+        choice.BOXED * to_lines + second + choice.POINT * 4.5 * by_line,
+        choice.BOXED * (to_lines + to_planes) + choice.POINT * 4.5 * by_wave,
+    ]
+    found = choice._counts(shape, 3, 20, 30, of_frame, of_box)
     np.testing.assert_allclose(found, 4 * np.array(wanted))
     plain, lines = SimpleNamespace(lines=None), SimpleNamespace(lines=1)
     assert choice._observed(plain, 5, 7, 11, 13) == 5 * 11 * 13 + 5 * 13 * 7

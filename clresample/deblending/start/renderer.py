@@ -10,27 +10,35 @@ from ...resampling.resampler import EXECUTORS
 
 
 class Renderer:
-    """One plan of boxes on the device: images (n, ny, nx) to (n, C, wy, wx).
+    """Plans of boxes of one shape on the device: images (n, ny, nx) to (n, C, wy, wx).
 
-    plan: `Plan.window`'s, of one place of a distorted mapping, or of a whole frame
-    executor: of the plan, with its transfer function; None makes one
+    plans: `Plan.window`'s, alike in layout and window, of one place of a distorted mapping, or of a
+        whole frame
+    executor: of the plans, with their transfer functions; None makes one
+
+    size (2,) [px]: of the windows
 
     A box is transformed once for all bands and all slots; the offset of each slot and the transfer
     functions of the bands, of which each slot has its own sum of terms where the PSF varies, are
     multiplied in between (kernels/terms.cl, turn).
     """
 
-    def __init__(self, device, dtype, plan, executor=None):
-        self.plan, self.device, self.dtype = plan, device, np.dtype(dtype)
+    def __init__(self, device, dtype, plans, executor=None):
+        self.plans, self.device, self.dtype = plans, device, np.dtype(dtype)
+        self.size = plans[0].mapping.shape_out
         if executor is None:
-            executor = EXECUTORS[plan.geometry](device, dtype, [plan])
-            executor.set_transfer([(plan.d_plus, plan.d_minus)])
+            executor = EXECUTORS[plans[0].geometry](device, dtype, plans)
+            executor.set_transfer([(plan.d_plus, plan.d_minus) for plan in plans])
         self.executor = e = executor
         elements = sum(rows * ld for rows, ld in e.scratch_shapes().values()) * e.n_bands
         self._n_bytes = (elements + e.k_y * e.k_pad) * self.dtype.itemsize
         self._capacity = 0
         tuning = e.tuning
         self._width = 1 if tuning.row_loops else e.k_pad // 2
+        self._nu = [np.zeros((len(plans), n)) for n in (e.h_y, e.k_pad // 2)]
+        for i, plan in enumerate(plans):
+            for nu, own in zip(self._nu, plan.nu, strict=True):
+                nu[i, : len(own)] = own
         self._turn = device.launcher(
             "terms.cl",
             "turn",
@@ -38,29 +46,32 @@ class Renderer:
             local_size=tuning.local_size(3),
             ROWS=tuning.row_loops,
             TERMS=e.n_terms,
-        ).bind(h_y=e.h_y, n_pad=e.k_pad, n_bands=e.n_bands, D=e.transfer)
+        ).bind(h_y=e.h_y, n_pad=e.k_pad, n_bands=e.n_bands, n_plans=len(plans), D=e.transfer)
 
     @property
-    def size(self) -> int:
+    def n_elements(self) -> int:
         """Elements of one image as all bands see it."""
-        return self.executor.n_bands * int(np.prod(self.plan.mapping.shape_out))
+        return self.executor.n_bands * int(np.prod(self.size))
 
-    def __call__(self, images, i_image, seen, i_seen, n, moves, shares=None):
+    def __call__(self, images, i_image, seen, i_seen, n, which, moves, shares=None):
         """Queue the images of slots that follow each other, n of each.
 
         images, i_image: device array and the element of it where they begin; seen, i_seen: likewise
-            where they go; moves (slots, 2) [model px]: by which the slots' pixels are off the
-            plan's; shares (slots, C, T): of the plan's terms, None where it has one
+            where they go; which (slots,): index of each one's plan; moves (slots, 2) [model px]: by
+            which the slots' pixels are off the plan's; shares (slots, C, T): of the plan's terms,
+            None where it has one
         """
-        e, count, (w_y, w_x) = self.executor, len(moves), self.plan.mapping.shape_out
+        e, count, (w_y, w_x) = self.executor, len(moves), self.size
         fit = min(e.tuning.group_bytes // (n * self._n_bytes), MOST_GROUPS // (n * e.n_bands))
         group = min(count, max(1, fit))
         self._reserve(group * n)
-        phase = self.device.put(self._phases(moves), self.dtype)
+        phase = self.device.put(self._phases(which, moves), self.dtype)
         self._turn.bind(shares=phase if shares is None else self.device.put(shares, self.dtype))
         for first in range(0, count, group):
             m = min(group, count - first) * n
-            at, to = i_image + first * n * e.n_y * e.n_x, i_seen + first * n * self.size
+            at, to = i_image + first * n * e.n_y * e.n_x, i_seen + first * n * self.n_elements
+            if e.which is not None:
+                e.follow(np.repeat(which[first : first + group], n))
             e.in_columns_once(m, a=ImageBatch(images.base_data, at, e.n_y * e.n_x, e.n_x))
             self._rows(m)
             self._turn((self._width, e.h_y, m * e.n_bands), n=n, first=first, phase=phase)
@@ -73,19 +84,22 @@ class Renderer:
         # twice as many at a time, as slots of this size come and go; no more than one launch takes
         e, most = self.executor, self.executor.tuning.group_bytes // self._n_bytes
         self._capacity = n_images = max(n_images, min(2 * self._capacity, most))
+        if e.which is not None:
+            e.which = self.device.empty(n_images, np.int32)
         e.reserve(n_images * e.n_bands)
-        plain = self.device.empty((n_images, e.k_y, e.k_pad), self.dtype)
+        plain = self.device.zeros((n_images, e.k_y, e.k_pad), self.dtype)
         z0 = Matrix(plain.base_data, e.k_pad, e.k_y * e.k_pad)
-        half = e.matrix("half", e.n_y)
-        self._rows = e.plain.bind(e.k_y, e.k_x, e.n_y, e.in_y._replace(div=1), half, z0)
-        self._turn.bind(z0=z0.buffer, z=e.matrix("frequencies").buffer)
+        half, own = e.matrix("half", e.n_y), e.own(m=e.k_ys, n=e.k_xs)
+        in_y = e.in_y._replace(div=1)
+        self._rows = e.plain.bind(e.k_y, e.k_x, e.n_y, in_y, half, z0, own=own)
+        self._turn.bind(z0=z0.buffer, z=e.matrix("frequencies").buffer, which=e.which)
 
-    def _phases(self, moves):
+    def _phases(self, which, moves):
         """cos and sin (slots, Hy + k_pad / 2, 2) of each slot's offset by row and by column."""
-        e, plan = self.executor, self.plan
-        out = np.zeros((len(moves), e.h_y + e.k_pad // 2, 2))
-        for nu, axis, first in zip(plan.nu, plan.axes, (0, e.h_y), strict=True):
-            angle = 2 * np.pi * moves[:, axis, None] * nu
-            part = out[:, first : first + len(nu)]
-            part[..., 0], part[..., 1] = np.cos(angle), np.sin(angle)
-        return out
+        axes = self.plans[0].axes
+        angles = [
+            2 * np.pi * moves[:, axis, None] * nu[which]
+            for nu, axis in zip(self._nu, axes, strict=True)
+        ]
+        angle = np.concatenate(angles, axis=1)
+        return np.stack([np.cos(angle), np.sin(angle)], axis=-1)

@@ -134,10 +134,12 @@ def _taken(looking):
         for row in range(len(looking.at)):
             _, _, _, wy, wx, _, begin = sight.place[row]
             window = seen[begin : begin + sight.n_bands * wy * wx]
-            images[row] = window.reshape(sight.n_bands, wy, wx).astype(np.float64)
+            (y0, x0), (ny, nx) = sight.lit[row, :2] - sight.place[row, 1:3], sight.lit[row, 2:]
+            lit = window.reshape(sight.n_bands, wy, wx)[:, y0 : y0 + ny, x0 : x0 + nx]
+            images[row] = lit.astype(np.float64)
         for b, ends in enumerate(found):
             own = np.flatnonzero(looking.slots.scene == b)
             own = own[np.argsort(looking.at[own])]
             part = [images[k] for k in own]
-            ends.append(Rendered.cropped((len(own), *shape), sight.place[own, 1:3], part))
+            ends.append(Rendered.cropped((len(own), *shape), sight.lit[own, :2], part))
     return found

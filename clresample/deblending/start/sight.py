@@ -17,6 +17,7 @@ class Sight:
     views (B): WhitenedViews of equal shapes; channels: slice of all the scenes' channels
     precision, tolerance: see Aim
 
+    lit (slots, 4): first pixels and sizes of what the slots seen last light up
     n_elements: that were last seen; n_pixels: of all products so far
     root (B, Co, My, Mx): on the device, as are data (times root), residual and weight
     """
@@ -50,21 +51,23 @@ class Sight:
 
     def see(self, slots: Slots, images):
         """Render the slots' images, and keep what is seen of them."""
-        low, size, jobs = *np.zeros((2, len(slots), 2), int), []
-        for first, last, renderer, at, moves in self.aim.runs(slots):
-            low[first:last] = at
-            if renderer is not None:
-                size[first:last] = renderer.plan.mapping.shape_out
-                shares = self.aim.shares(slots, first, last)
-                jobs.append((first, renderer, int(slots.n_images[first]), moves, shares))
+        low, size = np.zeros((2, len(slots), 2), int)
+        self.lit, runs = np.zeros((len(slots), 4), int), []
+        for run in self.aim.runs(slots):
+            part = slice(run.first, run.last)
+            low[part], self.lit[part] = run.low, run.lit
+            if run.renderer is not None:
+                size[part] = run.renderer.size
+                runs.append(run)
         begin, n = ends_of(slots.n_images * self.n_bands * size.prod(axis=1))
         self.place = np.column_stack([slots.scene, low, size, slots.n_images, begin])
         self.place_on_device = self.device.put(self.place.astype(np.int32))
         self._listed = None
         self.n_elements, self.seen = n, self.device.empty(n, self.dtype)
-        for first, renderer, n_images, moves, shares in jobs:
-            at = int(slots.begin[first]), int(begin[first])
-            renderer(images, at[0], self.seen, at[1], n_images, moves, shares)
+        for run in runs:
+            at = int(slots.begin[run.first]), int(begin[run.first])
+            n, shares = int(slots.n_images[run.first]), self.aim.shares(slots, run.first, run.last)
+            run.renderer(images, at[0], self.seen, at[1], n, run.which, run.moves, shares)
 
     def whiten(self):
         """Bring what is seen to units of the noise."""
@@ -115,7 +118,7 @@ class Sight:
         """A table (pairs, 6) of slots a <= b of one scene whose windows meet on the pixels, and
         where: first pixel and size; NumPy's, and on the device. A slot that sees nothing is not
         there."""
-        table = _pairs(self.place, (self.my, self.mx))
+        table = _pairs(self.place[:, 0], self.lit, (self.my, self.mx))
         self.n_pixels += int(table[:, 4:].prod(axis=1).sum())
         return table, self.device.put(table.astype(np.int32))
 
@@ -167,13 +170,13 @@ def _listed(slots, scenes):
     return np.asarray(scenes), np.cumsum([0, *map(len, listed)]), np.concatenate([*listed, [0]])
 
 
-def _pairs(place, shape):
-    """`Sight.pairs` of windows on an observation of this shape."""
-    low = np.maximum(place[:, 1:3], 0)
-    high = np.minimum(place[:, 1:3] + place[:, 3:5], shape)
+def _pairs(scenes, lit, shape):
+    """`Sight.pairs` of slots of `scenes` (n,), `lit` (n, 4) on an observation of this shape."""
+    low = np.maximum(lit[:, :2], 0)
+    high = np.minimum(lit[:, :2] + lit[:, 2:], shape)
     found = []
-    for scene in np.unique(place[:, 0]):
-        at = np.flatnonzero(place[:, 0] == scene)
+    for scene in np.unique(scenes):
+        at = np.flatnonzero(scenes == scene)
         both = np.maximum(low[at, None], low[at]), np.minimum(high[at, None], high[at])
         meet = np.triu((both[1] > both[0]).all(axis=2))
         i, j = np.nonzero(meet)

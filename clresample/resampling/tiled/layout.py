@@ -13,6 +13,7 @@ from ...sky.extent import intersection
 from ...sky.grid import Grid
 from ...sky.mapping import Mapping
 from ...sky.psf import PSF
+from ..affine import kept_taps
 from ..plan import Precision, make_plan
 from ..transfer import wrap_radius
 
@@ -156,7 +157,9 @@ class Sizes:
         elif geometry == "affine":
             flops += k * k * j + m * k * j + m * m * self.taps
             tables += 2 * k * crossed + j * wide
-            tables += m * m * (self.taps + 1) + m * crossed * (self.taps_back + 1)
+            taps = kept_taps(self.taps, j, self.tuning)
+            taps_back = kept_taps(self.taps_back, m, self.tuning)
+            tables += m * m * (taps + 1) + m * crossed * (taps_back + 1)
             each_band += (k + m) * crossed
         else:
             flops += rows * k * (k + 1)

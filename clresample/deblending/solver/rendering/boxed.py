@@ -9,24 +9,24 @@ import numpy as np
 from ....device.contraction import padded, stretch
 
 # The columns of the kernel's table, each int64.
-COLUMNS = ["m", "n", "k", "begin_a", "ld_a", "next_a", "begin_b", "skip"]
+COLUMNS = ["m", "n", "k", "begin_a", "ld_a", "next_a", "begin_b", "ld_b", "skip"]
 COLUMNS += ["begin_c", "ld_c", "next_c"]
 
 
 class BoxedProduct:
     """C[s] = A[s] . B[s] for every source s of a batch, all at once.
 
-    buffers: the batch; ld_b: distance of B's rows
+    buffers: the batch
     strided: A's columns lie next_a apart; ragged: C is stored element by element, n of them in a
         row, else by vectors up to a multiple of 16
     inward: sums are over pixels, and not over frequencies; see Contraction.bind
     sizes: a value or an array (S,) for each of COLUMNS; next_a and next_c are 1 by default, skip 0
     """
 
-    def __init__(self, buffers, ld_b, *, strided=False, ragged=False, inward=True, **sizes):
+    def __init__(self, buffers, *, strided=False, ragged=False, inward=True, **sizes):
         b, sizes = buffers, {"next_a": 1, "next_c": 1, "skip": 0} | sizes
         items = [np.broadcast_to(sizes[name], b.n_sources) for name in COLUMNS]
-        tile, m, width = _tile(b.tuning), max(items[0]), max(items[1] + items[7])
+        tile, m, width = _tile(b.tuning), max(items[0]), max(items[1] + items[8])
         group = tile["WGX"], tile["WGY"]
         along = math.ceil(padded(int(width)) / (tile["VW"] * tile["NV"]))
         tiles = b.along_row(along), int(m) / tile["MR"]
@@ -43,7 +43,6 @@ class BoxedProduct:
             items=b.device.put(np.stack(items, axis=1), np.int64),
             block=stretch(int(max(items[2]))),
             inward=inward,
-            ld_b=ld_b,
         )
 
     def __call__(self, a, b, c, active, *, add=False):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ....device.contraction import padded
 from .stages import Frames, Transformed
 from .windows import Groups, Windows, reach_of
 
@@ -30,17 +31,20 @@ def flops(buffers, op, executor) -> list[float]:
     What all of them do, from frequencies to the observation and back, is left out.
     """
     e, shape = executor, buffers.host_boxes.shape[:, list(executor.axes)]
-    frame = e.n_y, e.n_x, e.k_y, e.k_pad
-    return _counts(shape, len(buffers.scenes), op.shape_in[0], *frame)
+    waves = np.stack([e.k_ys, padded(e.k_xs)], axis=1)
+    of_plan = np.arange(len(buffers.scenes)) % len(waves)  # one serves all scenes, or each has one
+    of_frame, of_box = waves[of_plan], waves[of_plan[buffers.host_boxes.scene]]
+    return _counts(shape, op.shape_in[0], e.n_y, e.n_x, of_frame, of_box)
 
 
-def _counts(shape, n_frames, n_bands, n_y, n_x, k_y, k_x):
-    """`flops` of boxes of `shape` (S, 2) in frames of (n_y, n_x) with k_y and k_x waves."""
-    shape, n_images = shape.astype(float), n_frames * n_bands
-    rows, pixels = shape[:, 0].sum(), shape.prod(1).sum()
-    first, second = n_images * n_y * n_x * k_x, n_images * k_y * n_y * k_x
-    boxed = pixels * k_x, rows * k_y * k_x
-    points = 1.5 * n_bands * np.array([pixels, rows * k_x, len(shape) * k_y * k_x])
+def _counts(shape, n_bands, n_y, n_x, of_frame, of_box):
+    """`flops` of boxes of `shape` (S, 2) in frames of (n_y, n_x) with so many waves along y and x,
+    of each frame (n_frames, 2), and of each box (S, 2)."""
+    shape, (k_y, k_x), (b_y, b_x) = shape.astype(float), of_frame.T, of_box.T
+    rows, pixels = shape[:, 0], shape.prod(1)
+    first, second = n_bands * n_y * n_x * k_x.sum(), n_bands * n_y * k_y @ k_x
+    boxed = pixels @ b_x, (rows * b_y) @ b_x
+    points = 1.5 * n_bands * np.array([pixels.sum(), rows @ b_x, b_y @ b_x])
     counts = first + second, BOXED * boxed[0] + second, BOXED * sum(boxed)
     return [4 * (count + POINT * point) for count, point in zip(counts, points, strict=True)]
 
@@ -116,7 +120,9 @@ def _window_flops(boxes, op, groups):
         n_rows = seen[0 if plan.lines.by_row else 1]
         n_columns = e.n_columns * (n[1] + 2 * reach) / side[1]
     observed = _observed(plan, n_rows, n_columns, k_y, k_x)
-    first = _counts(boxes.shape[groups.which][:, axes], len(groups), n_bands, *n, k_y, k_x)
+    shape, waves = boxes.shape[groups.which][:, axes], np.array([[k_y, k_x]])
+    alike = np.repeat(waves, len(groups), axis=0), np.repeat(waves, len(shape), axis=0)
+    first = _counts(shape, n_bands, *n, *alike)
     return min(first) + 4 * len(groups) * n_bands * observed
 
 

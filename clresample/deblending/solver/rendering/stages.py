@@ -136,18 +136,20 @@ class _Boxes:
             part[:, self._axes].astype(np.int64).T for part in (own.origin, own.shape)
         )
         self._buffers, self._executor = b, e
+        # frequencies of the sources' own scenes: elements of a row, and those that are not padding
+        self._k_y, self._k_x = (k[own.scene % len(k)] for k in (e.k_ys, e.k_xs))
+        self._wide = padded(self._k_x)
         zero = np.zeros(n, np.int32)
         self.lines = Boxes(
             own.scene,
             np.stack([self._row0, zero], axis=1),
-            np.stack([self._rows, zero + e.k_pad], axis=1),
+            np.stack([self._rows, self._wide], axis=1),
         )
 
     @functools.cached_property
     def planes(self):
-        e, n = self._executor, self._buffers.n_sources
-        scene = self._buffers.host_boxes.scene
-        return Boxes(scene, np.zeros((n, 2), np.int32), np.tile([e.k_y, e.k_pad], (n, 1)))
+        scene, shape = self._buffers.host_boxes.scene, np.stack([self._k_y, self._wide], axis=1)
+        return Boxes(scene, np.zeros_like(shape), shape)
 
     def _image(self, letter):
         """Where the morphologies lie, as matrix A or C of a product."""
@@ -166,15 +168,15 @@ class _Boxes:
         e = self._executor
         return BoxedProduct(
             self._buffers,
-            e.k_pad,
             strided=self._axes != [0, 1],
             m=self._rows,
-            n=e.k_pad,
+            n=self._wide,
             k=self._columns,
             **self._image("a"),
             begin_b=self._begin(e.in_x_t, self._column0 * e.k_pad),
+            ld_b=e.k_pad,
             begin_c=self.lines.offset,
-            ld_c=e.k_pad,
+            ld_c=self._wide,
         )
 
     @functools.cached_property
@@ -183,15 +185,15 @@ class _Boxes:
         e = self._executor
         return BoxedProduct(
             self._buffers,
-            e.k_pad,
-            m=e.k_y,
-            n=e.k_pad,
+            m=self._k_y,
+            n=self._wide,
             k=self._rows,
             begin_a=self._begin(e.in_y, self._row0),
             ld_a=e.n_y,
             begin_b=self.lines.offset,
+            ld_b=self._wide,
             begin_c=self.planes.offset,
-            ld_c=e.k_pad,
+            ld_c=self._wide,
         )
 
     @functools.cached_property
@@ -200,16 +202,16 @@ class _Boxes:
         e = self._executor
         return BoxedProduct(
             self._buffers,
-            e.k_pad,
             inward=False,
             m=self._rows,
-            n=e.k_pad,
-            k=e.k_y,
+            n=self._wide,
+            k=self._k_y,
             begin_a=self._begin(e.in_y_t, self._row0 * e.k_y),
             ld_a=e.k_y,
             begin_b=self.planes.offset,
+            ld_b=self._wide,
             begin_c=self.lines.offset,
-            ld_c=e.k_pad,
+            ld_c=self._wide,
         )
 
     @functools.cached_property
@@ -218,15 +220,15 @@ class _Boxes:
         e, aligned = self._executor, self._column0 // COLUMN_PAD * COLUMN_PAD
         return BoxedProduct(
             self._buffers,
-            padded(e.n_x),
             ragged=True,
             inward=False,
             m=self._rows,
             n=self._columns,
-            k=e.k_x,
+            k=self._k_x,
             begin_a=self.lines.offset,
-            ld_a=e.k_pad,
+            ld_a=self._wide,
             begin_b=self._begin(e.in_x, aligned),
+            ld_b=padded(e.n_x),
             skip=self._column0 - aligned,
             **self._image("c"),
         )

@@ -1,0 +1,50 @@
+"""Random matrices, tiles and the check of products, for tests of the contraction kernels."""
+
+import numpy as np
+import pytest
+
+from clresample.device.contraction import padded
+
+from .tuning import tune
+
+TYPES = (np.float32, np.float64)
+every_type = pytest.mark.parametrize("dtype", TYPES, ids=lambda t: t.__name__)
+
+
+TILES = {
+    "CPU": {"VW": 8, "NV": 1, "MR": 6, "WGX": 1, "WGY": 1},
+    "wide CPU": {"VW": 16, "NV": 2, "MR": 8, "WGX": 1, "WGY": 1},
+    "GPU": {"VW": 4, "NV": 1, "MR": 8, "WGX": 8, "WGY": 8},
+    "pairs": {"VW": 2, "NV": 3, "MR": 8, "WGX": 8, "WGY": 8},
+    "groups": {"VW": 4, "NV": 2, "MR": 8, "WGX": 8, "WGY": 8, "KB": 16},
+    "tall groups": {"VW": 2, "NV": 1, "MR": 6, "WGX": 4, "WGY": 16, "KB": 16},
+}
+
+
+@pytest.fixture(params=["device's", *TILES])
+def tile(request, monkeypatch):
+    """Register tiles of other devices than the one at hand; any device must run them all."""
+    if request.param != "device's":
+        tune(monkeypatch, tile=TILES[request.param], row_choices=())
+
+
+def random(*shape, seed=0):
+    return np.random.default_rng([seed, *shape]).normal(size=shape)
+
+
+def put_right(device, b, dtype):
+    """(B, k, n) matrices on the device, columns padded with zeros."""
+    host = np.zeros((*b.shape[:-1], padded(b.shape[-1])))
+    host[..., : b.shape[-1]] = b
+    return device.put(host, dtype)
+
+
+def check(found, truth, dtype):
+    """Two rounded factors and a rounded sum of random signs: 4 units of the type, relative L2."""
+    error = np.linalg.norm(found - truth) / np.linalg.norm(truth)
+    assert error <= 4 * np.finfo(dtype).eps, f"error {error:.1e}"
+
+
+def need(device, dtype):
+    if dtype == np.float64 and not device.has_fp64:
+        pytest.skip(f"{device.name} has no float64")
