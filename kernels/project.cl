@@ -139,7 +139,8 @@ void project(__global REAL *restrict x, __global const int *table, __global cons
              __global const int *active, __global const REAL *restrict w,
              __global const REAL *restrict tau, __global REAL *restrict y,
              __global REAL *restrict l, __global REAL *restrict v, __global REAL *restrict z,
-             __global REAL *restrict g, __global REAL *restrict move, __global REAL *restrict momenta,
+             __global REAL *restrict g, __global REAL *restrict move,
+             __global REAL *restrict momenta,
              __global const REAL *values, const int positive, const int first, const int last,
              const REAL tolerance)
 {

@@ -199,7 +199,7 @@ def operator_programs(device, dtype):
         {"epilogue": name, "adjoint": adjoint} for name in EPILOGUES for adjoint in (False, True)
     ]
     builds = [Contraction(device, dtype, **variant).build() for variant in variants]
-    return [(file, dtype, macros) for file, macros in builds]
+    return [(file, dtype, macros | {"OWN": False}) for file, macros in builds]
 
 
 class Product:

@@ -9,15 +9,16 @@ from helpers.scenes import GALAXIES, SHAPE, frame, observe, sources
 from helpers.start import rendered, view, views
 from scipy.optimize import lsq_linear
 
-from clresample.deblending.profiles import Star
+from clresample.deblending.profiles import Galaxy, Star
 from clresample.deblending.spectra import inverse, non_negative
 from clresample.deblending.start import profile_fit, start as start_module
 from clresample.deblending.start.equations import equations
 from clresample.deblending.start.looking import looking_at
 from clresample.deblending.start.profile_fit import ProfileFit
-from clresample.deblending.start.slots import Component
+from clresample.deblending.start.slots import Component, Slots, boxes_of
 from clresample.deblending.start.start import Patch
 from clresample.deblending.view import WhitenedView
+from clresample.device.tuning import Tuning
 from clresample.resampling.cache import cached_resampler
 from clresample.resampling.plan import Precision
 from clresample.sky.extent import box_slices, shared_part
@@ -232,3 +233,18 @@ def test_many_least_squares_at_once(n_free):
         assert rest < least * (1 + 1e-6) + 1e-9
     assert found[5, 4] == 0 and np.isinf(inverse(rows[5] @ rows[5].T)[4, 4])
     np.testing.assert_allclose(found[3, 1], found[3, 2], rtol=1e-4)
+
+
+def test_galaxies_in_boxes_of_other_sizes_are_drawn_together(device):
+    home, place = frame((70, 60)), np.array([33.2, 29.6])
+    thetas = [np.array([np.log(size), 0.2, -0.1, np.log(5)]) for size in (0.5, 3.0)]
+    chosen = [Component(0, k, k, Galaxy(home), place, home.shape) for k in range(2)]
+    boxes = boxes_of(chosen, thetas, np.full(2, 0.01))
+    slots = Slots(chosen, thetas, boxes, slopes=True)
+    assert slots.size[0].max() < slots.size[1].min()
+    images = device.get(slots.draw(device, np.float32, Tuning.of(device, np.float32), {}))
+    for k, c in enumerate(slots.components):
+        drawn = images[slots.begin[k] :][: 5 * slots.size[k].prod()].reshape(5, *slots.size[k])
+        wanted = c.shape.draw(slots.thetas[k], place - slots.origin[k], tuple(slots.size[k]))
+        for one, other in zip(drawn, wanted, strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-5 * np.abs(other).max())

@@ -117,16 +117,18 @@ def chi2(result):
 
 def alike(together, alone, dtype=np.float32):
     """Two results are equal, to what sums leave after 30 steps: each of these divides a gradient by
-    its own size, so the rounding of the smallest gradients makes steps of the usual length."""
+    its own size, so the rounding of the smallest gradients makes steps of the usual length. In
+    float64, to what starts leave: windows that several scenes share are larger, and hold 1e-8 more
+    of the light."""
     close = dtype == np.float64
     assert together.frame.shape == alone.frame.shape and together.status == alone.status
-    np.testing.assert_allclose(together.losses, alone.losses, rtol=1e-9 if close else 5e-4)
-    np.testing.assert_allclose(together.shifts, alone.shifts, atol=1e-8 if close else 1e-3)
-    np.testing.assert_allclose(together.sky, alone.sky, atol=1e-8 if close else 1e-3)
+    np.testing.assert_allclose(together.losses, alone.losses, rtol=1e-7 if close else 5e-4)
+    np.testing.assert_allclose(together.shifts, alone.shifts, atol=1e-6 if close else 1e-3)
+    np.testing.assert_allclose(together.sky, alone.sky, atol=1e-6 if close else 1e-3)
     for k, o in enumerate(alone.observations):
         assert together.model(k).shape == o.shape
         away = (together.model(k) - alone.model(k)) * np.sqrt(o.weights)
-        assert np.abs(away).max() < (1e-6 if close else 0.1)  # sigma
+        assert np.abs(away).max() < (1e-4 if close else 0.1)  # sigma
         # what one does not cover, the other does not either; a faint pixel may round to nothing
         dark = (together.model(k) == 0) != (alone.model(k) == 0)
         assert np.abs(away + alone.model(k) * np.sqrt(o.weights))[dark].max(initial=0) < 1e-3

@@ -45,7 +45,7 @@ class Aim:
     tolerance: part of the PSF's light beyond windows; 0: as little as beyond those of whole frames,
         and these are seen with the views' own plans
 
-    Scenes of one plan share a renderer for each shape of boxes.
+    Scenes whose plans are alike in layout share a renderer for each shape of boxes.
     """
 
     def __init__(self, views, device, dtype, precision: Precision, tolerance):
@@ -183,9 +183,11 @@ class _Windows:
 
 
 def _layout(plan: Plan):
-    """What plans have to have in common to be rendered together: they are one, so that a scene
-    starts beside others, to the last digits, as it does alone."""
-    return id(plan)
+    """What plans have to have in common to be rendered together; distorted ones are alone."""
+    if plan.geometry == "distorted":
+        return id(plan)
+    by_row = None if plan.lines is None else plan.lines.by_row
+    return plan.geometry, plan.axes, plan.n_terms, by_row
 
 
 def _reach(plan, tolerance):
