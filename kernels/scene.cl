@@ -14,8 +14,8 @@
  * compose_frequencies  the same of images with both axes transformed, whose boxes are the first
  *             rows and columns of the frame, as many for all sources of a scene; the rest of its
  *             frame is not written;  times the transfer functions E, (B or 1, n_bands,
- *             ny_frame / 2, 4, nx_frame / 2) as MIX of contract.cl has them; stride_e: elements from
- *             a scene's to the next
+ *             ny_frame / 2, 4, nx_frame / 2) as MIX of contract.cl has them; stride_e: elements
+ *             from a scene's to the next
  *             launch: (vectors of VW columns of a row, or 1 with ROWS, ny_frame / 2, B * n_bands)
  *             VW divides nx_frame
  * residual    r = image + sky - data, image <- w r, loss[b, row] = 1/2 sum_x w r^2,
