@@ -33,7 +33,7 @@
 #include "boxes.h"
 #include "group.h"
 #ifndef SLOTS       /* of the ring: pairs that are remembered, and the spare one */
-#define SLOTS 21
+#define SLOTS 11
 #endif
 #ifndef MOST        /* variables of a block, at most */
 #define MOST 512
@@ -113,7 +113,7 @@ void invert(__global const int *restrict blocks, __global const int *restrict in
 {
     __local REAL ys[MOST], ps[MOST];
     const int lid = (int)get_local_id(0), block = (int)get_global_id(1);
-    /* of a scene at rest no variables: PoCL's groups crash where one returns before a SYNC */
+    /* of a scene at rest no variables: PoCL crashes where a group returns before this SYNC */
     const int b = blocks[4 * block], m = PLAN(b, MODE) == REST ? 0 : blocks[4 * block + 1];
     __global const int *index = indices + blocks[4 * block + 2];
     __global const REAL *matrix = matrices + (size_t)blocks[4 * block + 3] * ALIGN;

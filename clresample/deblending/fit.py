@@ -46,6 +46,7 @@ class Fit:
     views: the observations as WhitenedViews, whose operators hold the observations' shifts
     noise (C,): of one model pixel, in the views' units; unit (C,) [counts]: of these
     padded: the frame with its sides grown to those that a batch shares; home: Home
+    last_steps (n_observations, 2) [model px]: what shifts were last asked for, before `ahead`
     start: the StartingPoint that `begin` was given; from then on
     scene, state: Scene and State, as of the start or of where `settle` left them; findings: what a
         LearnedPrior has learned by then, or None; losses, status, messages, seconds: see Result

@@ -20,7 +20,7 @@ MOVE = 10
 # costs some iterations, and until then the stopped ones are still computed.
 REPACK = 0.25
 # A fit under a LearnedPrior stays where it is if the next shift would lower its loss by less than
-# this part of `enough`.
+# this part of what ends it.
 LEAST_GAIN = 0.5
 # [iterations] between two adjustments of the boxes to the light they hold; each makes a new batch.
 RESIZE = 40
@@ -170,7 +170,7 @@ class _Learning:
         while self.n_steps < n_steps and self.live.any():
             for i in np.flatnonzero(engine.round()):
                 self.fits[i].losses.append(float(engine.progress.loss[i]))
-        if self.settings.fit_shifts:
+        if self.settings.fit_shifts and self.n_steps < self.settings.max_iter:
             self._move(live & engine.progress.converged)
         over = self.live if self.n_steps >= self.settings.max_iter else np.zeros_like(live)
         stop = (live & ~self.live) | over
@@ -189,9 +189,10 @@ class _Learning:
         if not which.any():
             return
         states, moved = self.engine.states(), np.zeros(len(self.fits), bool)
+        enough = self.settings.enough * self.engine.progress.chi2()
         for i in np.flatnonzero(which):
             steps, gain = shift_steps(self.engine.scenes[i], states[i])
-            moved[i] = gain > LEAST_GAIN * self.settings.enough
+            moved[i] = gain > LEAST_GAIN * enough[i]
             if moved[i]:
                 f = self.fits[i]
                 f.shift(f.shifts + ahead(steps, f.last_steps))

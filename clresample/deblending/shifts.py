@@ -22,7 +22,7 @@ SCATTER_PX = 2.0
 
 def shift_steps(scene, state) -> tuple[np.ndarray, float]:
     """By how much to move the observations (n_observations, 2) [model px], the first not at all,
-    and by how much that lowers half of chi2, to second order, where the model stays.
+    and by how much that lowers half of chi2, to second order, where the model fits the first.
 
     scene: a Scene, its operators at their present shifts; state: its present State
     """

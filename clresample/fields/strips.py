@@ -86,7 +86,8 @@ def section(hdu, plane, box):
     mapped file, but parts of rows one by one, 40 us each.
     """
     rows, columns = box.slices
-    whole = isinstance(hdu, PLAIN) and not SCALES.intersection(hdu.header)
+    plain = isinstance(hdu, PLAIN) and not isinstance(hdu, fits.CompImageHDU)
+    whole = plain and not SCALES.intersection(hdu.header)
     index = (rows, slice(None) if whole else columns)
     data = np.asarray(hdu.section[index if plane is None else (plane, *index)])
     return data[:, columns] if whole else data

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from astropy.table import QTable
 
-EMPTY = {"i": 0, "u": 0, "U": ""}  # of kinds of columns: what rows without a value hold
+EMPTY = {"i": 0, "u": 0, "b": False, "U": ""}  # of kinds of columns: what rows without a value hold
 
 
 class Columns:
@@ -38,7 +38,7 @@ class Columns:
     def chosen(self, which) -> Columns:
         """The rows of an index: a slice, numbers or bool."""
         rows = {name: values[which] for name, values in self.values.items()}
-        return Columns(rows, self.units, self.meta)
+        return Columns(rows, dict(self.units), dict(self.meta))
 
     @classmethod
     def joined(cls, several) -> Columns:

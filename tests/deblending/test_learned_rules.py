@@ -249,9 +249,9 @@ def test_curvature_is_left_out_where_nothing_is_seen():
 
 
 def test_memory_of_a_scenes_vectors():
-    """Twenty-two of the rings and thirteen more, of 8 bytes each, and coefficients on every step-th
-    pixel; a quarter of each source's with each other."""
+    """Twenty-two of the rings and twelve more, of 8 bytes each, and coefficients on every step-th
+    pixel; twice a quarter of each source's with each other."""
     prior = LearnedPrior(scales_px=(1.0, 2.0), strengths=(0.1, 0.1))
     one = scene([], profile=[np.zeros((7, 10)), np.zeros((1, 1))], power=np.zeros((2, 3)))
     n = 7 * 10 + 4 * 6 + 1 + 1 + 6  # the last step ends on the last pixel or past it
-    assert vector_bytes(one, prior) == int(8 * (35 * n + (94 / 4) ** 2 + (2 / 4) ** 2))
+    assert vector_bytes(one, prior) == int(8 * (34 * n + 2 * (94 / 4) ** 2 + 2 * (2 / 4) ** 2))

@@ -98,3 +98,20 @@ def test_sections_of_plain_images_hold_the_pixels_of_the_file(tmp_path, card):
                 for got in (section(hdus[i], plane, box), FilePlane(path, i, plane).read(box)):
                     assert got.shape == box.shape
                     np.testing.assert_array_equal(got, image[box.slices])
+
+
+def test_sections_of_compressed_images_take_their_own_tiles_alone(tmp_path, monkeypatch):
+    """Whole rows of them would be decoded across the image."""
+    path, taken = tmp_path / "packed.fits", []
+
+    class Watched:
+        def __getitem__(self, index):
+            taken.append(index)
+            return np.zeros([s.stop - s.start for s in index])
+
+    fits.CompImageHDU(np.zeros((40, 50), np.float32), tile_shape=(8, 8)).writeto(path)
+    monkeypatch.setattr(fits.CompImageHDU, "section", property(lambda _: Watched()))
+    box = Box(*BOXES[0])
+    with fits.open(path) as hdus:
+        assert section(hdus[1], None, box).shape == box.shape
+    assert taken == [box.slices]

@@ -106,6 +106,7 @@ def _again(fit, point):
     new.scene, new.state = first_scene(new)
     new.losses, new.status, new.findings = [], "iteration limit", None
     new.messages, new.seconds = list(fit.messages), {}
+    new.last_steps = np.zeros_like(fit.last_steps)
     return new
 
 

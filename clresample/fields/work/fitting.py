@@ -141,17 +141,18 @@ def _fits(job, blends):
         return []
     device, sizes = get_device(job.device), {}
     for i, blend in enumerate(blends):
-        sizes.setdefault(tuple(o.shape for o in blend.observations), []).append(i)
+        frame = blend.frame and blend.frame.shape
+        sizes.setdefault((frame, *(o.shape for o in blend.observations)), []).append(i)
     results: list = [None] * len(blends)
     for alike in sizes.values():  # all at once, those of one size would be padded too
         few = [blends[i] for i in alike]
         found = deblend_many(few, settings=job.settings, device=device, memory=job.memory)
+        if any(r.status == INTERRUPTED for r in found):
+            raise KeyboardInterrupt
+        if lost := next((r.status for r in found if NO_ANSWER in r.status), None):
+            raise DeviceError(lost.removeprefix("failed: "))
         for i, result in zip(alike, found, strict=True):
             results[i] = result
-    if any(r.status == INTERRUPTED for r in results):
-        raise KeyboardInterrupt
-    if lost := next((r.status for r in results if NO_ANSWER in r.status), None):
-        raise DeviceError(lost.removeprefix("failed: "))
     return results
 
 

@@ -161,10 +161,11 @@ def _n_pixels(scene):
 
 def vector_bytes(scene, prior) -> int:
     """Device memory [bytes] of the scene's vectors in a batch, roughly, of float64: both rings,
-    twelve others and the light; and its blocks, of a quarter of each source's coefficients."""
+    eleven others and the light; and twice its blocks, also
+    on the host, of a quarter of each source's coefficients."""
     n = [sum(coarse(p.shape, step).prod() for step in prior.steps) for p in scene.profile]
-    blocks = sum(k / 4 * min(k / 4, 2 * MOST) for k in n)
-    return int(8 * ((2 * (N_PAIRS + 1) + 13) * (sum(n) + scene.power.size) + blocks))
+    blocks = 2 * sum(k / 4 * min(k / 4, 2 * MOST) for k in n)
+    return int(8 * ((2 * (N_PAIRS + 1) + 12) * (sum(n) + scene.power.size) + blocks))
 
 
 def _inverse_curvature(scenes):

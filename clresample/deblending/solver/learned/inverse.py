@@ -106,7 +106,7 @@ class SourceInverse:
         u = [self._seen(j, rows[rows[:, 0] == j, 1:], window, step) for j in scales]
         u = np.concatenate(u)
         size = np.abs(u)
-        near = (size > LEAST * size.max((1, 2), keepdims=True)).any(0)
+        near = (size >= LEAST * size.max((1, 2), keepdims=True)).any(0)
         y, x = (np.flatnonzero(near.any(axis)) for axis in (1, 0))
         u = u[:, y[0] : y[-1] + 1, x[0] : x[-1] + 1]
         between = _between(self._evidence.sharpness(spectrum), u.shape[1:], step)
@@ -125,7 +125,7 @@ class SourceInverse:
         return u - along[:, None, None] * _binned(_binned(p[window], 0, step), 1, step)
 
 
-@functools.lru_cache(maxsize=256)
+@functools.lru_cache(maxsize=32)
 def _along(prior, j, n):
     """K_j of each coefficient along a side of `n` pixels (n_j, n)."""
     step, taps = prior.steps[j], prior.kernels()[j]

@@ -82,7 +82,7 @@ class Progress:
 
     def due(self, accepted):
         """Which scenes (B,) learn their strengths now."""
-        calm = self._drops[:, :CALM].sum(1) < NEAR * self._chi2()
+        calm = self._drops[:, :CALM].sum(1) < NEAR * self.chi2()
         return accepted & ~self.settled & (calm | (self.n_rounds >= self._due))
 
     def learned(self, due, moved, change):
@@ -104,7 +104,7 @@ class Progress:
 
     def next(self, accepted):
         """Mode (B,) and length (B,) of each scene's next step, and which drop their pairs (B,)."""
-        enough = self.enough * self._chi2()
+        enough = self.enough * self.chi2()
         self.converged |= accepted & self.settled & (self._drops.sum(1) < enough)
         self.live &= ~self.converged
         refused = self.live & ~accepted
@@ -127,6 +127,6 @@ class Progress:
         mode[~self.live & ~accepted] = REST
         return mode, self._length, bare
 
-    def _chi2(self):
+    def chi2(self):
         """chi2 per pixel (B,), at least 1."""
         return np.maximum(1, 2 * self.loss / self._n_pixels)

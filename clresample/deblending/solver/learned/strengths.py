@@ -74,7 +74,7 @@ class Strengths:
         return evidence, inverses, light
 
     def weights(self, spectra, due=None, change=0.0):
-        """For `Vectors.reweigh` (S, J, 3): precision, curvature, change.
+        """For `Steps.reweigh` (S, J, 3): precision, curvature, change.
 
         spectra (S, C): at which the curvature is taken anew, blocks too, in the scenes `due` (B,)
             or in all
