@@ -92,7 +92,7 @@ def see(models: list[Model], *, fit_sky=False) -> list[Seen]:
             shape = _Cutout(morph, origin, model.frame)
             place = np.asarray(origin, float)
             components.append(Component(b, i, int(source), shape, place, model.frame))
-    looking = _looking(models, [m.views for m in models], components, fit_sky)
+    looking = _looking([m.views for m in models], components, fit_sky)
     scenes, thetas = np.arange(len(models)), [np.zeros(0)] * len(components)
     brightness = np.zeros(len(components))
     looking.look(scenes, thetas, brightness, slopes=False, whiten=False)
@@ -102,7 +102,7 @@ def see(models: list[Model], *, fit_sky=False) -> list[Seen]:
     bare = [[None] * len(m.views) for m in models]
     others = [[b or v for b, v in zip(m.bare, m.views, strict=True)] for m in models]
     if any(b is not None for m in models for b in m.bare):
-        again = _looking(models, others, components, False)
+        again = _looking(others, components, False)
         again.look(scenes, thetas, brightness, slopes=False, whiten=False)
         bare = _taken(again)
     found = []
@@ -120,7 +120,7 @@ def see(models: list[Model], *, fit_sky=False) -> list[Seen]:
     return found
 
 
-def _looking(models, views, components, fit_sky):
+def _looking(views, components, fit_sky):
     precision = Precision.of(views[0][0].op.dtype)
     return looking_at(views, components, precision, 0.0, fit_sky=fit_sky)
 

@@ -191,8 +191,8 @@ def make_plan(
     for inner, inside, i in pending:
         labels[inner.slices][inside] = i + 1
     patches = _patches(made)
-    groups = _groups(patches, patches, memory, n_channels, most)
-    giants = _groups(patches, [p for p in patches if p.pieces > 1], memory, n_channels, most)
+    groups = _groups(patches, memory, n_channels, most)
+    giants = _groups([p for p in patches if p.pieces > 1], memory, n_channels, most)
     return Plan(positions, ids, np.asarray(peaks), patches, groups, giants)
 
 
@@ -220,10 +220,10 @@ def predicted_cost(patch) -> float:
     return patch.box.area * (len(patch.sources) + 3.0)
 
 
-def _groups(patches, chosen, memory, n_channels, most):
+def _groups(patches, memory, n_channels, most):
     """Numbers of patches in groups of one size of box, the largest first."""
     of_shape: dict[tuple, list[Patch]] = {}
-    for patch in sorted(chosen, key=lambda p: (-predicted_cost(p), p.number)):
+    for patch in sorted(patches, key=lambda p: (-predicted_cost(p), p.number)):
         of_shape.setdefault(patch.box.shape, []).append(patch)
     groups = []
     for alike in of_shape.values():
