@@ -131,7 +131,9 @@ def test_one_block_is_the_inverse_of_its_part_of_the_curvature(strengths, error)
     "shape, strengths, step, most_pixels",
     [
         ((17, 20), (0.003, 0.3, 0.05), 2, inverse.MOST_PIXELS),
-        ((17, 20), (0.003, 0.01, 1.0), 2, inverse.MOST_PIXELS),
+        ((17, 20), (0.003, 0.01, 1.0), 2, 9 * 10),
+        ((17, 20), (0.003, 0.01, 1.0), 4, 9 * 10 - 1),
+        ((40, 44), (1e-5, 1e-5, 0.018), 2, inverse.MOST_PIXELS),  # fewer than the window has rows
         ((40, 44), (0.003, 0.01, 1.0), 4, 200),
     ],
 )
@@ -141,15 +143,27 @@ def test_binned_pixels_hold_sums_of_structure_and_means_of_what_the_data_say(
     """The block is the inverse on such pixels, to what little light its window leaves out."""
     assert inverse.COARSEST == 2
     monkeypatch.setattr(inverse, "MOST_PIXELS", most_pixels)
+    monkeypatch.setattr(inverse, "WORTH", 10.0)
     made = Made(shape, strengths)
     ((_, places, found),) = made.blocks()
     low, high = between(found, made.binned(places, step))
     assert 0.99 < low and high < 1.04
 
 
+@pytest.mark.parametrize("more", [0, 1])
+def test_a_source_of_more_coefficients_than_a_block_holds_has_two(more, monkeypatch):
+    made = Made((17, 20), (1e-5, 0.3, 1e-5))
+    ((_, places, _),) = made.blocks()
+    monkeypatch.setattr(inverse, "MOST", len(places) - more)
+    made = Made((17, 20), (1e-5, 0.3, 1e-5))
+    parts = [own for level, own, _ in made.blocks() if level == 0]
+    assert len(parts) == 1 + more
+    assert sorted(np.concatenate(parts)) == sorted(places)
+
+
 def test_each_part_of_a_large_source_is_the_inverse_there(monkeypatch):
-    """Parts with the finest scale in them see each pixel; parts lie side by side, so that each has
-    all there is within it."""
+    """Parts with the finest scale in them see each pixel; parts lie side by side, none of them
+    long and narrow, so that each has all there is within it."""
     monkeypatch.setattr(inverse, "MOST", 150)
     made = Made((26, 30), (0.3, 0.1, 0.05))
     curvature, blocks = made.curvature(), made.blocks()
@@ -160,8 +174,9 @@ def test_each_part_of_a_large_source_is_the_inverse_there(monkeypatch):
         assert (places.min() < ends[1]) == (level == 0) and places.min() >= ends[level]
     assert {level for level, *_ in blocks} == {0, 1, 2}
     first = [places[places < ends[1]] for level, places, _ in blocks if level == 0]
-    areas = [np.prod([np.ptp(a) + 1 for a in np.divmod(p, made.sizes[0][1])]) for p in first]
-    assert all(a < 1.3 * len(p) + 10 for a, p in zip(areas, first, strict=True))
+    for own in first:
+        sides = np.ptp(np.divmod(own, made.sizes[0][1]), axis=1) + 1
+        assert sides.prod() < 1.7 * len(own) + 10 and sides.max() < 3 * sides.min()
 
 
 def test_what_the_data_say_of_neighbours_reaches_half_a_spectrum():
