@@ -77,6 +77,25 @@ def test_what_bumps_change_counts_in_errors_of_flux_and_size():
     np.testing.assert_allclose(one._change(0, -images), one._change(0, images))
 
 
+def test_modes_leave_the_spectrum_and_pixels_at_their_bound_alone():
+    """What lies along the profile is taken off; where a free morphology is 0 nothing changes."""
+    rng = np.random.default_rng(0)
+    one = solution([(0, 0)] * 2, [spot(), spot()], fixed=(1,))
+    for m in one.morphs:
+        m[2, 3] = m[5] = 0
+    profile = spot()
+    given = rng.normal(size=(3, 9, 9))
+    wanted = given - np.tensordot(given, profile, 2)[:, None, None] * profile / (profile**2).sum()
+    for i in range(2):
+        one.scene.profile[i] = profile
+        found = given.copy()
+        along = one._gauge(i, found)
+        np.testing.assert_allclose(along, np.tensordot(given, profile, 2) / (profile**2).sum())
+        inside = one.morphs[i] > 0
+        assert not inside.all()
+        np.testing.assert_allclose(found, wanted * (inside if i == 0 else 1), atol=1e-12)
+
+
 def test_light_of_a_neighbour_on_a_box():
     """All channels in quadrature; 0 where its own box does not reach."""
     boxes = [np.full((4, 5), 0.5), np.full((3, 3), 1.0)]
