@@ -179,6 +179,12 @@ def test_work_is_bounded_before_it_begins():
     weights[1] = 1  # one channel sees enough
     half = SimpleNamespace(weights=weights, data=weights)
     Blend((half,), many.sources)._check_work(given.frame)
+    dot = np.zeros((1, 60, 60))
+    one = SimpleNamespace(weights=dot, data=dot)
+    Blend((one,), many.sources)._check_work(given.frame)  # nothing is seen: nothing is fitted
+    dot[0, 5, 6] = 1
+    with pytest.raises(ValueError, match=r"2 components, more than .*\(1\)"):
+        Blend((one,), many.sources[:2])._check_work(given.frame)
     two = Extended(position_px=(3, 3), n_components=2)
     wide = SimpleNamespace(weights=np.ones((1, 60, 60)), data=np.zeros((1, 60, 60)))
     with pytest.raises(ValueError, match=r"1001 sources with 2002 components .* takes 2000 comp"):

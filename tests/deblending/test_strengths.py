@@ -1,5 +1,5 @@
 """A batch's strengths and what its operators say to them, source by source and in NumPy: misfit,
-answers to one pixel, what is learned by which scene."""
+answers to one pixel, what is learned by which scene; and how large its launches are."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import pytest
 from helpers.solver import ragged
 
 from clresample.deblending.solver import reference as ref
-from clresample.deblending.solver.buffers import Buffers
+from clresample.deblending.solver.buffers import ITEMS_EACH, Buffers
 from clresample.deblending.solver.gradient import Gradient
 from clresample.deblending.solver.learned.evidence import SourceEvidence, Spectra, blurred_light
 from clresample.deblending.solver.learned.prior import LearnedPrior
@@ -183,3 +183,20 @@ def test_scenes_that_go_on_alone_keep_their_strengths(build):
     for i, of in enumerate(kept):
         for one, other in zip(ours[i], theirs[of], strict=True):
             np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("n", [1, 63, 64, 65, 300])
+def test_launches_are_no_larger_than_they_must_be(build, n):
+    """A whole number of groups, or of work-items that take several each; the last one is needed."""
+    b = made(build)[2].buffers
+    (size,) = b.items(n)
+    if b.tuning.row_loops:
+        assert (size - 1) * ITEMS_EACH < n <= size * ITEMS_EACH
+    else:
+        (group,) = b.tuning.local_size(1)
+        assert size % group == 0 and size - group < n <= size
+    for found, group, wanted in zip(
+        b.sized(n, 5, 7), b.tuning.local_size(3), (b.along_row(n), 5, 7), strict=True
+    ):
+        assert found % group == 0 and found - group < wanted <= found
+    assert b.along_row(n) == (1 if b.tuning.row_loops else n)
