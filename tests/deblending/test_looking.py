@@ -1,0 +1,129 @@
+"""Components of several scenes as observations see them, and their spectra, each scene alone and in
+whole frames of float64."""
+
+import numpy as np
+import pytest
+from helpers.scenes import BRIGHT, frame, observe, sources
+from helpers.start import least_squares, rendered, views
+
+from clresample.deblending.start import start as start_module
+from clresample.deblending.start.looking import looking_at
+from clresample.deblending.start.start import Patch
+from clresample.resampling.plan import Precision
+
+SKY = (0.3, -0.2, 0.1)
+# Boxes end where profiles have fallen to 1e-6 of their peaks.
+CLOSE = 2e-3
+
+
+class Scenes:
+    """Three scenes of two, one and two galaxies, seen with their expected profiles."""
+
+    def __init__(self, device, fit_sky):
+        objects = BRIGHT, BRIGHT[1:], BRIGHT[::-1]
+        self.views = [
+            views(device, observe(some, seed=i, sky=SKY if fit_sky else (0, 0, 0)))
+            for i, some in enumerate(objects)
+        ]
+        self.fit_sky, found = fit_sky, []
+        for some, own in zip(objects, self.views, strict=True):
+            catalogue = sources(some)
+            places = np.array([s.position_px for s in catalogue], float)
+            found.append(Patch(frame(), list(catalogue), places, own))
+        self.patches = found
+        self.sources, components = start_module._components(found)
+        precision = Precision.of(np.float64)
+        self.looking = looking_at(self.views, components, precision, 0.0, fit_sky=fit_sky)
+        self.thetas = [c.shape.mean for c in components]
+
+    def look(self, scenes):
+        n = len(self.looking.components)
+        self.looking.look(scenes, self.thetas, np.full(n, 1e6), slopes=False)
+
+    def units(self, b):
+        """Whitened images of scene b's components over the whole frame, one array a view."""
+        pairs = zip(self.looking.components, self.thetas, strict=True)
+        images = [c.shape.draw(t, c.position)[0] for c, t in pairs if c.scene == b]
+        return [rendered(view, np.array(images)) for view in self.views[b]]
+
+    def model(self, b, spectra, sky):
+        """Whitened model and data (C pixels) of scene b, each an array a view."""
+        found, channel = [], 0
+        for unit, view in zip(self.units(b), self.views[b], strict=True):
+            for c in range(unit.shape[1]):
+                root = view.root[c].ravel()
+                model = spectra[:, channel] @ unit[:, c] + sky[channel] * root
+                found.append((unit[:, c], model, view.data[c].ravel() * root))
+                channel += 1
+        return found
+
+
+@pytest.mark.parametrize("fit_sky", [False, True])
+def test_each_scene_has_its_own_least_squares(device, fit_sky):
+    """Of those that are looked at: the others keep what they had."""
+    s = Scenes(device, fit_sky)
+    looking = s.looking
+    for scenes in ([0, 1, 2], [2, 1]):
+        looking.spectra[:], looking.sky[:] = 0, 0
+        looking.spectra[looking.scene == 0] = 7.0
+        s.look(scenes)
+        looking.solve(0.0)
+        for row, b in enumerate(scenes):
+            spectra, sky, covariance = least_squares(s.units(b), s.views[b], sky=fit_sky)
+            error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).T
+            own = looking.scene == b
+            assert np.abs((looking.spectra[own] - spectra) / error).max() < 0.1
+            np.testing.assert_allclose(looking.sky[b], sky, atol=2e-3)
+            scale = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+            found = looking.covariance(row) / scale[:, :, None] / scale[:, None]
+            wanted = covariance / scale[:, :, None] / scale[:, None]
+            np.testing.assert_allclose(found, wanted, atol=10 * CLOSE)
+    assert (looking.spectra[looking.scene == 0] == 7).all()
+
+
+@pytest.mark.parametrize("fit_sky", [False, True])
+def test_what_is_compared_and_how_clearly_each_is_seen(device, fit_sky):
+    """chi2 of any solution, weights with a part of the model in the noise; and u . d / |u|."""
+    s = Scenes(device, fit_sky)
+    looking, scenes = s.looking, np.array([2, 0])
+    s.look(scenes)
+    rng = np.random.default_rng(0)
+    looking.spectra[:] = rng.uniform(10, 60, looking.spectra.shape)
+    looking.sky[:] = rng.uniform(-1, 1, looking.sky.shape) * fit_sky
+    for error in (0.0, 0.05):
+        found = looking.compare(error)
+        for row, b in enumerate(scenes):
+            wanted = 0.0
+            for _, model, data in s.model(b, looking.spectra[looking.scene == b], looking.sky[b]):
+                wanted += ((data - model) ** 2 / (1 + (error * model) ** 2)).sum()
+            assert found[row] == pytest.approx(wanted, rel=CLOSE)
+    seen = looking.signal_to_noise(looking.sky)
+    assert not seen[looking.scene == 1].any()
+    for b in scenes:
+        own = np.flatnonzero(looking.scene == b)
+        nothing = np.zeros((len(own), 3))
+        for c, (unit, model, data) in enumerate(s.model(b, nothing, looking.sky[b])):
+            wanted = unit @ (data - model) / np.linalg.norm(unit, axis=1)
+            np.testing.assert_allclose(seen[own, c], wanted, rtol=CLOSE, atol=0.05)
+
+
+def test_the_present_solution_is_listed_by_scene(device):
+    s = Scenes(device, True)
+    s.look([2, 1])
+    looking = s.looking
+    looking.spectra[:] = np.arange(15).reshape(5, 3)
+    looking.sky[:] = -np.arange(9).reshape(3, 3)
+    found = looking.solution()
+    assert found.shape == (2, 3, 3)
+    np.testing.assert_array_equal(found[0, :, :2], looking.spectra[3:5].T)
+    np.testing.assert_array_equal(found[1, :, 0], looking.spectra[2])
+    assert not found[1, :, 1].any()
+    np.testing.assert_array_equal(found[..., 2], looking.sky[[2, 1]])
+
+
+def test_the_same_observations_can_show_other_components(device):
+    s = Scenes(device, True)
+    chosen = s.looking.components[2:3]
+    other = s.looking.instead(chosen)
+    assert other.sights is s.looking.sights and other.fit_sky and other.n_scenes == 3
+    assert other.spectra.shape == (1, 3) and other.components is chosen
