@@ -1,11 +1,14 @@
 """Components of several scenes as observations see them, and their spectra, each scene alone and in
 whole frames of float64."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from helpers.scenes import BRIGHT, frame, observe, sources
-from helpers.start import least_squares, rendered, views
+from helpers.scenes import BRIGHT, SHAPE, frame, observe, sources
+from helpers.start import least_squares, profiles, rendered, views
 
+from clresample.deblending.settings import Settings
 from clresample.deblending.start import start as start_module
 from clresample.deblending.start.looking import looking_at
 from clresample.deblending.start.start import Patch
@@ -127,3 +130,27 @@ def test_the_same_observations_can_show_other_components(device):
     other = s.looking.instead(chosen)
     assert other.sights is s.looking.sights and other.fit_sky and other.n_scenes == 3
     assert other.spectra.shape == (1, 3) and other.components is chosen
+
+
+@pytest.mark.parametrize("fit_sky", [False, True])
+def test_spectra_and_power_of_a_start_follow_the_weights(device, fit_sky):
+    """Those of profiles with maximum 1; under other weights the profiles stay."""
+    s = Scenes(device, fit_sky)
+    points = start_module.start(s.patches[:2], fit_sky=fit_sky)
+    patch, point = s.patches[0], points[0]
+    assert start_module.weighed(patch, point, Settings()) == (patch.views, point)  # no stars
+    half = [replace(view, root=view.root * (0.2 + np.random.default_rng(1).random(view.root.shape)))
+            for view in patch.views]  # fmt: skip
+    again = start_module._solved_again(replace(patch, views=half), point, fit_sky)
+    assert again.shapes is point.shapes and again.thetas is point.thetas
+    alone = points[1]
+    for found, own in ((point, patch.views), (again, half), (alone, s.views[1])):
+        units = [rendered(view, profiles(found, SHAPE)) for view in own]
+        spectra, sky, covariance = least_squares(units, own, sky=fit_sky)
+        error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).T
+        assert np.abs((found.spectra - spectra) / error).max() < 0.2
+        np.testing.assert_allclose(found.sky, sky, atol=5e-3)
+        power = np.concatenate([np.square(unit).sum(2) for unit in units], axis=1)
+        np.testing.assert_allclose(found.power, power, rtol=5 * CLOSE)
+        assert [len(found), len(found.peaks)] == [len(found.spectra)] * 2
+    assert np.abs(again.spectra / point.spectra - 1).max() > 1e-3
