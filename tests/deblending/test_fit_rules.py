@@ -215,3 +215,77 @@ def test_work_is_bounded_before_it_begins():
     gib = (40 * 1900 * 256**2 + 100 * (2048**2 + 36e6)) / 2**30
     with pytest.raises(ValueError, match=rf"need {gib:.3g} GiB in one fit; it takes .* 8 GiB"):
         Blend((big,), (two,) * 950)._check_work(large)
+
+
+class Named(SimpleNamespace):
+    """A fit that is no more than its name; those called bad fail together with all others."""
+
+    def result(self, seen):
+        if self.name == "late":
+            raise ValueError("no result")
+        return f"{self.name} {seen}"
+
+
+def many_of(names, monkeypatch, *, memory=100, **sizes):
+    """_ManyFits on their way and the group (index, Fit) of these names."""
+    many = object.__new__(_ManyFits)
+    many.blends, many.done, many.memory = list(names), [None] * len(names), memory
+    many.settings = many.device = many.dtype = None
+    many.dark = {}
+    group = [
+        (i, Named(name=name, blend=name, status="going", dark=[1] * (name == "dim")))
+        for i, name in enumerate(names)
+    ]
+
+    def stop(fits, *_):
+        if any(fit.name == "bad" for fit in fits):
+            raise ValueError("bad data")
+        if any(fit.name == "stop" for fit in fits):
+            for fit in fits:
+                fit.status = "interrupted"
+
+    calls = []
+    monkeypatch.setattr(batch, "begin", stop)
+    monkeypatch.setattr(batch, "iterate", stop)
+    monkeypatch.setattr(batch, "with_second", lambda fits, *_: calls.append(len(fits)) or fits)
+    monkeypatch.setattr(batch, "finish", lambda fits: [f"seen {len(fits)}"] * len(fits))
+    monkeypatch.setattr(batch, "scene_bytes", lambda fit: sizes.get(fit.name, 1))
+    return many, group, calls
+
+
+def test_scenes_are_fitted_in_parts_that_fit_into_the_memory(monkeypatch):
+    """As many as there is room for; one that is too large goes alone."""
+    given = {"a": 40, "b": 60, "c": 41, "d": 300, "e": 10}
+    many, group, _ = many_of("abcde", monkeypatch, **given)
+    parts = [[fit.name for _, fit in part] for part in many._parts(group)]
+    assert parts == [["a", "b"], ["c"], ["d"], ["e"]]
+    assert list(many._parts([])) == []
+
+
+def test_those_that_can_begin_though_others_cannot(monkeypatch):
+    many, group, _ = many_of(["a", "bad", "dim"], monkeypatch)
+    begun = many._begin(group)
+    assert [fit.name for _, fit in begun] == ["a", "dim"] and many.dark == {2: [1]}
+    assert [done is None for done in many.done] == [True, False, True]
+    assert many.done[1].blend == "bad" and "bad data" in many.done[1].status
+
+
+def test_one_that_fails_is_fitted_apart_from_the_others(monkeypatch):
+    many, group, seconds = many_of(["a", "bad", "late"], monkeypatch)
+    assert many._fit(group) is False
+    assert many.done[0] == "a seen 1" and seconds == [1, 1]
+    assert all(isinstance(done, Failure) for done in many.done[1:])
+    assert "bad data" in many.done[1].status and "no result" in many.done[2].status
+    many, group, seconds = many_of(["a", "b"], monkeypatch)
+    assert many._fit(group) is False and many.done == ["a seen 2", "b seen 2"] and seconds == [2]
+
+
+def test_nothing_more_is_begun_once_a_fit_was_interrupted(monkeypatch):
+    """No second components, and no later part."""
+    many, group, seconds = many_of(["a", "stop", "c"], monkeypatch, memory=2)
+    assert many._fit(group) is True
+    assert many.done == ["a seen 2", "stop seen 2", None] and seconds == []
+    many, group, seconds = many_of(["bad", "a", "stop", "c"], monkeypatch)
+    assert many._fit(group) is True  # one by one
+    assert isinstance(many.done[0], Failure) and many.done[1:] == ["a seen 1", "stop seen 1", None]
+    assert seconds == [1]
