@@ -236,6 +236,36 @@ def test_operations_are_counted_from_sizes():
     assert choice._observed(lines, 5, 7, 11, 13) == 11 * 13 * 7 + 11 * 7 * 5
 
 
+@pytest.mark.parametrize("axes", [(0, 1), (1, 0)])
+@pytest.mark.parametrize("lines", [None, True, False])
+def test_operations_in_windows_are_those_of_smaller_frames(axes, lines, monkeypatch):
+    """Frequencies and columns shrink with the frame and its reach; what is observed is what a
+    window shows, of pixels half as large along y and of a third along x."""
+    executor = SimpleNamespace(axes=axes, n_y=100, n_x=80, k_y=60, k_x=50, n_columns=70)
+    plan = SimpleNamespace(
+        lines=None if lines is None else SimpleNamespace(by_row=lines),
+        mapping=SimpleNamespace(matrix=np.diag([1 / 2, 1 / 3])),
+    )
+    reach = 5
+    monkeypatch.setattr(choice, "reach_of", lambda _: reach)
+    op = SimpleNamespace(executor=lambda: executor, plans=[plan], shape_out=(3, 9, 9))
+    boxes = boxes_at((9, 9), (0, 0), (3, 10), (40, 3), n=8)
+    groups = Groups(boxes, np.array([1, 2, 3]), np.array([10, 20]))
+    n_y, n_x = groups.shape[list(axes)]
+    assert len(groups) == 2 and groups.shape.tolist() == [16, 32]
+    k_y, k_x = 60 * (n_y + 2 * reach) / (100 + reach), 50 * (n_x + 2 * reach) / (80 + reach)
+    along_y, along_x = 2 * (16 + 2 * reach), 3 * (32 + 2 * reach)
+    if lines is None:
+        observed = along_y * k_x * (k_y + along_x)
+    else:
+        n_columns = 70 * (n_x + 2 * reach) / 80
+        observed = k_y * n_columns * (k_x + (along_y if lines else along_x))
+    waves = np.tile([k_y, k_x], (3, 1))
+    counts = choice._counts(np.full((3, 2), 8), 3, n_y, n_x, waves[:2], waves)
+    found = choice._window_flops(boxes, op, groups)
+    assert found == pytest.approx(min(counts) + 4 * 2 * 3 * observed)
+
+
 def running(live, n_steps=5, resize=False):
     """A batch of fits on their way, as `repacked` and `run` see it."""
     one = object.__new__(iterate_module._Running)
