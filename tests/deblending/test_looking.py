@@ -10,6 +10,7 @@ from helpers.start import least_squares, profiles, rendered, views
 
 from clresample.deblending.settings import Settings
 from clresample.deblending.start import start as start_module
+from clresample.deblending.start.aim import SIZE_PX
 from clresample.deblending.start.looking import looking_at
 from clresample.deblending.start.start import Patch
 from clresample.resampling.plan import Precision
@@ -20,13 +21,14 @@ CLOSE = 2e-3
 
 
 class Scenes:
-    """Three scenes of two, one and two galaxies, seen with their expected profiles."""
+    """Three scenes of two, one and two galaxies, seen with their expected profiles; the last one's
+    second observation is turned by another angle, so that windows in it have other sizes."""
 
     def __init__(self, device, fit_sky):
         objects = BRIGHT, BRIGHT[1:], BRIGHT[::-1]
         self.views = [
-            views(device, observe(some, seed=i, sky=SKY if fit_sky else (0, 0, 0)))
-            for i, some in enumerate(objects)
+            views(device, observe(some, seed=i, angle=angle, sky=SKY if fit_sky else (0, 0, 0)))
+            for i, (some, angle) in enumerate(zip(objects, (25, 25, 10), strict=True))
         ]
         self.fit_sky, found = fit_sky, []
         for some, own in zip(objects, self.views, strict=True):
@@ -39,9 +41,10 @@ class Scenes:
         self.looking = looking_at(self.views, components, precision, 0.0, fit_sky=fit_sky)
         self.thetas = [c.shape.mean for c in components]
 
-    def look(self, scenes):
+    def look(self, scenes, brightness=1e6):
+        """In boxes that reach as far as sources of this brightness are seen."""
         n = len(self.looking.components)
-        self.looking.look(scenes, self.thetas, np.full(n, 1e6), slopes=False)
+        self.looking.look(scenes, self.thetas, np.full(n, brightness), slopes=False)
 
     def units(self, b):
         """Whitened images of scene b's components over the whole frame, one array a view."""
@@ -154,3 +157,21 @@ def test_spectra_and_power_of_a_start_follow_the_weights(device, fit_sky):
         np.testing.assert_allclose(found.power, power, rtol=5 * CLOSE)
         assert [len(found), len(found.peaks)] == [len(found.spectra)] * 2
     assert np.abs(again.spectra / point.spectra - 1).max() > 1e-3
+
+
+def test_windows_of_scenes_seen_at_other_angles_are_of_one_size(device):
+    """That of the largest, rounded up; each holds what its own light reaches."""
+    s = Scenes(device, False)
+    s.look([0, 1, 2], brightness=1.0)
+    found = s.looking.sights[1].aim._renderers.values()
+    assert found
+    for windows in found:
+        (size,) = {tuple(plan.mapping.shape_out) for plan in windows.renderer.plans}
+        assert len(windows.renderer.plans) == 2
+        for n, own in zip(size, windows.own.max(0), strict=True):
+            assert n % SIZE_PX == 0 and n - SIZE_PX < own <= n
+    images = [s.looking.device.get(sight.seen) for sight in s.looking.sights]
+    s.look([2], brightness=1.0)
+    for sight, before in zip(s.looking.sights, images, strict=True):
+        alone = s.looking.device.get(sight.seen)
+        assert np.isclose(alone.sum(), before[-len(alone) :].sum(), rtol=1e-6)
