@@ -266,6 +266,51 @@ def test_operations_in_windows_are_those_of_smaller_frames(axes, lines, monkeypa
     assert found == pytest.approx(min(counts) + 4 * 2 * 3 * observed)
 
 
+def parts_of(monkeypatch, sides, cost, *, count=1000.0, n_plans=1, n_terms=1, geometry="affine"):
+    """The sources of each part that is rendered in windows, which cost as much as `cost` of their
+    indices says; None without windows. Frames of 200 pixels, 3 images of 25 operations more."""
+    executor = SimpleNamespace(n_rows=1, n_columns=2, k_y=3, k_x=4)
+    op = SimpleNamespace(
+        plans=[None] * n_plans,
+        n_terms=n_terms,
+        geometry=geometry,
+        shape_in=(3, 200, 200),
+        shape_out=(3, 9, 9),
+        executor=lambda: executor,
+    )
+    boxes = SimpleNamespace(shape=np.array([(n, n) for n in sides]))
+    monkeypatch.setattr(choice, "reach_of", lambda _: 30)
+    monkeypatch.setattr(
+        choice, "_observed", lambda *given: 25.0 if given[1:] == (1, 2, 3, 4) else 0
+    )
+    monkeypatch.setattr(
+        choice, "_best_groups", lambda b, o, which: (cost(which.tolist()), which.tolist())
+    )
+    buffers = SimpleNamespace(host_boxes=boxes, scenes=[0])
+    return choice._parts(buffers, op, count)
+
+
+def test_windows_are_taken_where_they_save_most(monkeypatch):
+    """For 0.4 of all operations at most; boxes far larger than the median's may have their own."""
+    assert choice.GAIN == 0.4 and choice.LARGE.tolist() == [1.3, 1.6, 2.0]
+    few, limit = [20] * 4, 0.4 * (1000 + 4 * 3 * 25)
+    everyone = [[0, 1, 2, 3]]
+    assert parts_of(monkeypatch, few, lambda _: limit - 1) == everyone
+    assert parts_of(monkeypatch, few, lambda _: limit + 1) is None
+    for given in ({"n_plans": 2}, {"n_terms": 2}, {"geometry": "distorted"}):
+        assert parts_of(monkeypatch, few, lambda _: 1.0, **given) is None
+    assert parts_of(monkeypatch, [40] * 3, lambda _: 1.0) == [[0, 1, 2]]  # 40 + 2 x 30 = 200 / 2
+    assert parts_of(monkeypatch, [41] * 3, lambda _: 1.0) is None
+    sides = [20] * 5 + [25, 31, 39, 41]
+    for n in (6, 7, 8):
+        costs = {n: 10.0, 9 - n: 20.0}
+        found = parts_of(monkeypatch, sides, lambda which, c=costs: c.get(len(which), 300.0))
+        assert found == [list(range(n)), list(range(n, 9))]
+    costs = {9: 100.0}
+    found = parts_of(monkeypatch, sides, lambda which: costs.get(len(which), 51.0))
+    assert found == [list(range(9))]
+
+
 def running(live, n_steps=5, resize=False):
     """A batch of fits on their way, as `repacked` and `run` see it."""
     one = object.__new__(iterate_module._Running)
