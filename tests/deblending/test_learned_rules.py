@@ -239,12 +239,14 @@ def test_pixels_of_a_scene_are_those_with_a_weight():
     assert _n_pixels(scene([0 * first])) == 1
 
 
-def test_curvature_is_left_out_where_nothing_is_seen():
-    power = np.array([[4.0, 1e-13], [1e-15, 0.0]])
+@pytest.mark.parametrize("unit", [1.0, 1e6])
+def test_curvature_is_left_out_where_nothing_is_seen(unit):
+    """Under 1e-14 of what the best seen source has in any channel, whatever the unit."""
+    power = unit * np.array([[4.0, 1e-13], [1e-15, 0.0]])
     weights = [np.full((1, 2, 2), 0.5), np.zeros((1, 3, 3))]
     for fit_sky in (True, False):
         spectra, sky = _inverse_curvature([scene(weights, power=power, fit_sky=fit_sky)])
-        np.testing.assert_allclose(spectra, [[0.25, 1e13], [0, 0]])
+        np.testing.assert_allclose(unit * spectra, [[0.25, 1e13], [0, 0]])
         np.testing.assert_allclose(sky, [[0.5 * fit_sky, 0]])
 
 
