@@ -40,7 +40,7 @@ def fitted(spectra, sources=None, power=1.0, **given):
 
 def test_who_is_asked_for_a_gradient():
     """Sources above signal to noise 30 in more than one channel, whose components are open."""
-    spectra = [(24, 18.1), (24, 17.9), (90, 0), (90, 1)]
+    spectra = [(24, 18.1), (24, 17.9), (90, 0), (90, 1), (24, 18)]
     assert gradients._candidates(fitted(spectra)).tolist() == [0, 3]
     assert gradients._candidates(fitted(spectra, power=0.25)).tolist() == [3]
     kinds = [
