@@ -21,6 +21,7 @@ from clresample.deblending.start.seen import WHOLE_PX, Model, see
 from clresample.deblending.start.slots import Component
 from clresample.deblending.start.start import PRECISION, TOLERANCE, _peak
 from clresample.deblending.view import Home, whitened_view
+from clresample.device.contraction import COLUMN_PAD
 from clresample.sky.frame import Frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
@@ -234,6 +235,25 @@ def test_operations_are_counted_from_sizes():
     plain, lines = SimpleNamespace(lines=None), SimpleNamespace(lines=1)
     assert choice._observed(plain, 5, 7, 11, 13) == 5 * 11 * 13 + 5 * 13 * 7
     assert choice._observed(lines, 5, 7, 11, 13) == 11 * 13 * 7 + 11 * 7 * 5
+
+
+@pytest.mark.parametrize("axes", [[0, 1], [1, 0]])
+def test_operations_are_those_of_an_executors_plans(axes, monkeypatch):
+    """One for all scenes, or one each; their waves along x are padded to whole vectors."""
+    monkeypatch.setattr(choice, "_counts", lambda *given: given)
+    boxes = SimpleNamespace(shape=np.array([[3, 5], [4, 2], [6, 7]]), scene=np.array([0, 0, 1]))
+    buffers = SimpleNamespace(host_boxes=boxes, scenes=[0, 1])
+    op = SimpleNamespace(shape_in=(3, 40, 50))
+    for k_ys, k_xs in (([11], [17]), ([11, 9], [17, 33])):
+        executor = SimpleNamespace(
+            axes=axes, n_y=40, n_x=50, k_ys=np.array(k_ys), k_xs=np.array(k_xs)
+        )
+        shape, *sizes, of_frame, of_box = choice.flops(buffers, op, executor)
+        np.testing.assert_array_equal(shape, boxes.shape[:, axes])
+        assert sizes == [3, 40, 50]
+        waves = np.stack([np.array(k_ys), -(-np.array(k_xs) // COLUMN_PAD) * COLUMN_PAD], axis=1)
+        np.testing.assert_array_equal(of_frame, waves[[0, -1]])
+        np.testing.assert_array_equal(of_box, waves[[0, 0, -1]])
 
 
 @pytest.mark.parametrize("axes", [(0, 1), (1, 0)])
