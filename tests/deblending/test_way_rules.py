@@ -16,6 +16,7 @@ from clresample.deblending.solver.boxes import Boxes
 from clresample.deblending.solver.rendering import choice
 from clresample.deblending.solver.rendering.windows import ROUND_PX, Groups
 from clresample.deblending.solver.scene import Scene, State
+from clresample.deblending.start import renderer as renderer_module
 from clresample.deblending.start.looking import looking_at
 from clresample.deblending.start.seen import WHOLE_PX, Model, see
 from clresample.deblending.start.slots import Component
@@ -126,14 +127,15 @@ def test_morphologies_in_large_frames_are_seen_where_they_are(device):
 
 
 def test_slots_are_rendered_in_groups_of_what_the_memory_takes(device, monkeypatch):
-    """One at a time or all at once: the same is seen."""
+    """One at a time or all at once: the same is seen. No more than a launch has groups for."""
     home, position = scenes.frame(), np.array([14.0, 17.0])
     star = Star(home, free=True)
     places = [position + (k - 2) for k in range(5)]
     chosen = [Component(0, k, k, star, place, home.shape) for k, place in enumerate(places)]
     found = []
-    for n_bytes in (1, 1 << 30):
+    for n_bytes, most in ((1, 65535), (1 << 30, 65535), (1 << 30, 2 * 3 * 2)):
         tune(monkeypatch, group_bytes=n_bytes)
+        monkeypatch.setattr(renderer_module, "MOST_GROUPS", most)
         views = [
             whitened_view(
                 Home(home, home, np.array(places), 0.0), o, 1, device, np.float32, private=True
@@ -143,13 +145,13 @@ def test_slots_are_rendered_in_groups_of_what_the_memory_takes(device, monkeypat
         looking = looking_at([views], chosen, PRECISION, TOLERANCE, fit_sky=False)
         looking.look([0], [np.zeros(2)] * 5, np.ones(5), slopes=True)
         found.append([device.get(sight.seen) for sight in looking.sights])
-        for sight in looking.sights:
+        for sight, n_bands in zip(looking.sights, (1, 2), strict=True):
             (windows,) = sight.aim._renderers.values()
-            assert windows.renderer._capacity == (
-                3 if n_bytes == 1 else 15
-            )  # images of a slot, or of all
-    for one, other in zip(*found, strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-6 * np.abs(one).max())
+            slots = 1 if n_bytes == 1 else min(5, most // (3 * n_bands))
+            assert windows.renderer._capacity == 3 * slots
+    for one, *others in zip(*found, strict=True):
+        for other in others:
+            np.testing.assert_allclose(one, other, atol=1e-6 * np.abs(one).max())
 
 
 def a_star(device, shape):
