@@ -59,9 +59,10 @@ def test_misfit_is_chi2_where_a_sources_light_is(build, unit):
     np.testing.assert_allclose(found, wanted, rtol=1e-8)
 
 
-def test_answers_to_a_pixel_are_those_of_the_operators(build):
+@pytest.mark.parametrize("unit", [1.0, 1e-6])
+def test_answers_to_a_pixel_are_those_of_the_operators(build, unit):
     """Of one near the middle of what is seen, each channel with its median weight."""
-    scenes, _, _, response = made(build)
+    scenes, _, _, response = made(build, unit)
     for scene, answers, pixels in zip(scenes, *response.to_pixels(), strict=True):
         wanted = []
         for op, weights in zip(scene.ops, scene.weights, strict=True):
