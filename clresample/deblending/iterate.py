@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 
+from .posterior.exchange import exchange_of
 from .resize import resized
 from .shifts import ahead, shift_steps
 from .solver.engine import Engine
@@ -22,6 +23,9 @@ REPACK = 0.25
 # A fit under a LearnedPrior stays where it is if the next shift would lower its loss by less than
 # this part of what ends it.
 LEAST_GAIN = 0.5
+# A fit that has converged takes a step of Exchange if that is expected to lower its loss by more
+# than this part of what ends it; MOST_EXCHANGES at most, of which most scenes need one or two.
+LEAST_EXCHANGE, MOST_EXCHANGES = 0.5, 3
 # [iterations] between two adjustments of the boxes to the light they hold; each makes a new batch.
 RESIZE = 40
 
@@ -136,18 +140,21 @@ class _Learning:
     """The fits of one engine under a LearnedPrior, on their way; else as _Running.
 
     Boxes stay as they are: structure fades at their edges, as the profile does that they follow.
+
+    exchanges (B): each fit's Exchange, once it has converged; n_exchanges (B,): steps that it has
+        taken by it
     """
 
-    def __init__(self, fits, settings, device, dtype, engine=None):
+    def __init__(self, fits, settings, device, dtype, past=None):
         self.fits, self.settings, self.device, self.dtype = list(fits), settings, device, dtype
-        self.engine = engine or LearnedEngine(
-            [f.scene for f in fits],
-            [f.state for f in fits],
-            device,
-            dtype,
-            settings.prior,
-            settings.enough,
-        )
+        if past is None:
+            self.exchanges, self.n_exchanges = [None] * len(fits), np.zeros(len(fits), int)
+            scenes, states = [f.scene for f in fits], [f.state for f in fits]
+            self.engine = LearnedEngine(
+                scenes, states, device, dtype, settings.prior, settings.enough
+            )
+        else:
+            self.engine, self.exchanges, self.n_exchanges = past
 
     @property
     def live(self):
@@ -172,6 +179,8 @@ class _Learning:
                 self.fits[i].losses.append(float(engine.progress.loss[i]))
         if self.settings.fit_shifts and self.n_steps < self.settings.max_iter:
             self._move(live & engine.progress.converged)
+        if self.n_steps < self.settings.max_iter:
+            self._exchange(live & engine.progress.converged)
         over = self.live if self.n_steps >= self.settings.max_iter else np.zeros_like(live)
         stop = (live & ~self.live) | over
         if stop.any():
@@ -200,6 +209,29 @@ class _Learning:
         if moved.any():
             self.engine.follow_shifts(moved)
 
+    def _exchange(self, which):
+        """Let those of the converged fits (B,) go on that may gain by what sources exchange."""
+        which = which & (self.n_exchanges < MOST_EXCHANGES)
+        if not which.any():
+            return
+        engine, n = self.engine, self.n_exchanges
+        new = which & (n == 0)
+        if new.any():
+            states, findings = engine.states(), engine.findings(new)
+            for i in np.flatnonzero(new):
+                given = engine.scenes[i], states[i], findings[i]
+                self.exchanges[i] = exchange_of(self.fits[i], *given)
+        slopes, steps = engine.slopes(which), {}
+        enough = LEAST_EXCHANGE * self.settings.enough * engine.progress.chi2()
+        for i in np.flatnonzero(which):
+            if self.exchanges[i] is not None:
+                *step, gain = self.exchanges[i].step(slopes[i])
+                if gain > enough[i]:
+                    steps[i] = step
+                    n[i] += 1
+        if steps:
+            engine.step(steps)
+
     def settle(self, stop):
         """Leave the fits (B,) that stop here with their present state."""
         states, p = self.engine.states(), self.engine.progress
@@ -214,5 +246,6 @@ class _Learning:
         if (~self.live).mean() < REPACK:
             return self
         keep = np.flatnonzero(self.live)
-        fits, engine = [self.fits[i] for i in keep], self.engine.take(keep)
-        return _Learning(fits, self.settings, self.device, self.dtype, engine)
+        fits, exchanges = ([some[i] for i in keep] for some in (self.fits, self.exchanges))
+        past = self.engine.take(keep), exchanges, self.n_exchanges[keep]
+        return _Learning(fits, self.settings, self.device, self.dtype, past)

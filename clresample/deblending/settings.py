@@ -58,7 +58,7 @@ class Settings:
 
     max_iter: int = 500
     prior: LearnedPrior | Prior | None = LearnedPrior()
-    enough: float = 0.5
+    enough: float = 0.2
     tol: float = 1e-5
     constraints: Chain | None = None
     step_sizes: StepSizes = StepSizes()

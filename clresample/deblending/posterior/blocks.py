@@ -97,9 +97,22 @@ class Factor:
     def _ends(self, v):
         return np.cumsum([0, *self.sizes[self._later[v]]]) if self._later[v] else np.zeros(1, int)
 
+    def solve(self, right):
+        """H^-1 of arrays (n), one for each node."""
+        parts = [r / s for r, s in zip(right, self.scale, strict=True)]
+        for v in self.order:
+            parts[v] = solve_triangular(self._lower[v], parts[v], lower=True)
+            ends = self._ends(v)
+            for a, u in enumerate(self._later[v]):
+                parts[u] = parts[u] - self._below[v][ends[a] : ends[a + 1]] @ parts[v]
+        return self._upwards(parts)
+
     def draw(self, normal):
         """H^-1/2 of numbers (N,), node after node: arrays (n) that scatter as the inverse says."""
-        parts = np.split(np.asarray(normal, float), np.cumsum(self.sizes)[:-1])
+        return self._upwards(np.split(np.asarray(normal, float), np.cumsum(self.sizes)[:-1]))
+
+    def _upwards(self, parts):
+        """The transposed factor's inverse of scaled arrays (n), unscaled."""
         out = [np.zeros(0)] * len(parts)
         for v in reversed(self.order):
             right = parts[v]
