@@ -44,6 +44,7 @@ def learning(n_rounds, *, live=None, converged=None, failed=None, **settings):
         live=~no if live is None else np.array(live),
         converged=no.copy() if converged is None else np.array(converged),
         failed=no.copy() if failed is None else np.array(failed),
+        settled=no.copy(),
         n_rounds=np.array(n_rounds),
         loss=np.arange(1.0, n + 1),
         chi2=lambda: np.array([1.0, 2.0, 4.0])[:n],
@@ -56,8 +57,56 @@ def learning(n_rounds, *, live=None, converged=None, failed=None, **settings):
         followed=[],
     )
     engine.follow_shifts = lambda moved: engine.followed.append(moved.tolist())
+    engine.slopes = lambda which: [f"slopes {i}" for i in range(n)]
     settings = SimpleNamespace(**({"max_iter": 100, "fit_shifts": False, "enough": 0.5} | settings))
-    return room._Learning([Told(c) for c in "abc"[:n]], settings, None, None, engine)
+    past = engine, [None] * n, np.tile([0, np.inf], (n, 1))
+    return room._Learning([Told(c) for c in "abc"[:n]], settings, None, None, past)
+
+
+@pytest.fixture(autouse=True)
+def no_exchange(monkeypatch):
+    """No sources share light."""
+    monkeypatch.setattr(room, "exchange_of", lambda *given: None)
+
+
+def test_steps_of_exchange_are_asked_for_in_time_and_again_where_the_last_one_gained(monkeypatch):
+    """Of settled fits after FIRST_EXCHANGE rounds and each EXCHANGE, of converged ones at once."""
+    made, steps = [], []
+
+    def exchange_of(fit, scene, state, findings):
+        made.append((fit.name, scene, state, findings))
+        gain = {"a": 0.2, "b": 0.6, "c": 0.9}[fit.name]
+        return SimpleNamespace(step=lambda slopes: (slopes, None, None, gain))
+
+    monkeypatch.setattr(room, "exchange_of", exchange_of)
+    one = learning([39, 39, 12], converged=[False, False, True], enough=1.0)
+    p, every = one.engine.progress, np.ones(3, bool)
+    one.engine.step = lambda given: steps.append({i: step[0] for i, step in given.items()})
+    one._exchange(every)
+    assert made == [("c", "scene 2", "state 2", "findings 2")] and not steps  # .9 of 2
+    p.n_rounds += 1
+    one._exchange(every)
+    assert len(made) == 1  # strengths have not settled
+    p.settled[:2] = True
+    one._exchange(every)
+    assert [name for name, *_ in made] == ["c", "a", "b"] and not steps
+    p.chi2 = lambda: np.array([0.5, 1.0, 1.0])
+    p.n_rounds += 20
+    one._exchange(every)
+    assert not steps  # the losses are what they were
+    p.loss = p.loss - 0.51
+    p.n_rounds -= 1
+    one._exchange(np.array([True, True, False]))
+    assert not steps  # too early
+    p.n_rounds += 1
+    one._exchange(np.array([True, True, False]))
+    assert steps == [{1: "slopes 1"}] and len(made) == 3
+    one._exchange(every)
+    assert steps[1:] == [{2: "slopes 2"}]
+    p.loss, p.converged = p.loss - 1, every
+    one.settings.max_iter = int(p.n_rounds.max()) - 1
+    one._exchange(every)
+    assert len(steps) == 2  # at the limit
 
 
 def test_fits_that_are_over_are_left_with_their_present_state():
