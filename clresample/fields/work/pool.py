@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import wait
 
 from ...device.discovery import DeviceError
+from ..strips import STRIPS
 from .share import end_with, hold_memory, keep_for_good, return_memory, shared_threads
 
 # [s] Between two looks at whether a worker takes too long.
@@ -246,6 +247,7 @@ def _work(pipe, bound, parent):
     import signal
 
     hold_memory(bound)
+    STRIPS.hold(bound)
     end_with(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all; the parent ends its workers
     function = context = kept = None
