@@ -136,7 +136,7 @@ def detect_more(result, *, threshold=THRESHOLD) -> Detection:
             )
         )
     known = result.frame.place(result.sources)
-    pixels = np.stack(np.indices(result.frame.shape), axis=-1)
+    pixels = np.stack([*np.indices(result.frame.shape)], axis=-1)
     places = [footprint.locate(pixels) for footprint in result.footprints]
     return _search(left, result.frame, threshold, list(known), beside=False, places=places)
 

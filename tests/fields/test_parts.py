@@ -81,6 +81,7 @@ def test_patches_components_and_models_come_back(part, tmp_path):
     for _, i, _, model in found:
         np.testing.assert_array_equal(model, models[i])
     assert list(file.models({8})) == []
+    assert [m[1] for m in file.models(mosaic=1)] == [m[1] for m in found if m[1] == 1]
 
 
 def test_an_empty_part_is_a_file_too(tmp_path):

@@ -99,17 +99,17 @@ class PartFile:
             chosen = [hdus[name] for name in names]
             return [_array(hdu) if hdu.is_image else _columns(hdu) for hdu in chosen]
 
-    def models(self, chosen=None):
+    def models(self, chosen=None, mosaic=None):
         """(patch, mosaic, Box, model (C, Ny, Nx)) of its patches, or of those whose number is in
-        `chosen`."""
+        `chosen`; on all mosaics, or on that with a number."""
         with open_fits(self.path) as hdus:
             index, hdu = _columns(hdus["MODELS"]), hdus["PIXELS"]
             rows = np.stack([index[name] for name in MODEL_COLUMNS], axis=1).tolist()
             ends = [*index["offset"][1:].tolist(), hdu.header.get("NAXIS1", 0)] if rows else []
-            for (patch, mosaic, *corners, start), end in zip(rows, ends, strict=True):
-                if chosen is None or patch in chosen:
+            for (patch, i_mosaic, *corners, start), end in zip(rows, ends, strict=True):
+                if (chosen is None or patch in chosen) and mosaic in (None, i_mosaic):
                     image, box = np.array(hdu.section[start:end], np.float32), Box(*corners)
-                    yield patch, mosaic, box, image.reshape(-1, *box.shape)
+                    yield patch, i_mosaic, box, image.reshape(-1, *box.shape)
 
 
 def _columns(hdu):
