@@ -21,6 +21,8 @@ SUM_BLOCK = 64
 # stay in its core's first cache. With 1 products take 3 to 8 % longer on AVX2, with 16 as long, and
 # a single image has fewer work-items for many cores.
 ROW_TILES = 8
+# Terms that a turn of its loop adds, KU of contract.h: stretches are a multiple of them.
+TERMS = 4
 # Terms that the kernel for groups sums in one go: a second sum takes half of a GPU's registers.
 ONE_SUM = 256
 
@@ -33,10 +35,11 @@ def padded(n: int) -> int:
 def stretch(k: int) -> int:
     """Terms of k that are summed at a stretch: a half of them, or as many for each end.
 
-    sqrt(k) if that is more than SUM_BLOCK, so that stretches and their sum round alike
+    sqrt(k) if that is more than SUM_BLOCK, so that stretches and their sum round alike. A multiple
+    of TERMS: the last one of each end alone has terms left that are added one by one
     """
     n_stretches = 2 * max(1, -(-k // (2 * SUM_BLOCK)))
-    return max(math.isqrt(k), -(-k // n_stretches))
+    return -(-max(math.isqrt(k), -(-k // n_stretches)) // TERMS) * TERMS
 
 
 class Matrix(NamedTuple):
@@ -130,7 +133,8 @@ class Contraction:
         """(file, macros) for matrices of so many rows, terms and columns; of most, if not given."""
         tile = self.tuning.tile_for(n_rows) if n_rows else self.tuning.tile
         if "KB" not in tile:
-            return FILE, self.options | {"RT": ROW_TILES} | self.tuning.tile_for_columns(n_pad)
+            own = {"RT": ROW_TILES, "READ_AHEAD": self.tuning.reads_ahead}
+            return FILE, self.options | own | self.tuning.tile_for_columns(n_pad)
         return GROUP_FILE, self.options | tile | {"TWO_SUMS": n_terms > ONE_SUM}
 
     def bind(
