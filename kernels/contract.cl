@@ -93,6 +93,7 @@ void contract(int m, int n, const int n_pad, int k, const int block,
 
     int column[NV];
     UNROLL(v, NV) column[v] = j0 + v * VW < width ? j0 + v * VW : j0;
+    const int terms = j0 < n ? k : 0;           /* beyond n all sums are zero */
     const int bottom = m - top < MR * RT ? m : top + MR * RT;
 #if READ_AHEAD
     const long next = j0 + NV * VW < width ? j0 + NV * VW : stride_b;
@@ -104,7 +105,7 @@ void contract(int m, int n, const int n_pad, int k, const int block,
         const long skipped = (i0 - top) / MR % KU * (long)n_pad;
 #endif
         UNROLL(i, MR) row[i] = A + (size_t)(i0 + i < m ? i0 + i : m - 1) * ld_a;
-        SUM_INSIDE(width - j0, m - i0, acc, row, B, n_pad, column, k, block, inward)
+        SUM_INSIDE(n - j0, m - i0, acc, row, B, n_pad, column, terms, block, inward)
 
 #include "contract_end.h"
     }

@@ -136,9 +136,11 @@
 
 /* The same of a tile of MR rows and NV vectors of which the columns from `inside` on and the rows
  * from `below` on count for nothing: of the last tile of a row, one vector alone is summed where it
- * is the only one inside, and of the last of a column, two rows alone likewise. */
+ * is the only one inside, and the others are zero; of the last of a column, two rows alone, and
+ * the others are left as they were. */
 #define SUM_INSIDE(inside, below, sums, row, B, ld_b, column, k, block, inward) \
     if (NV > 1 && (inside) <= VW) { \
+        UNROLL(i, MR) UNROLL(v, NV) sums[i][v] = (WIDE)(0); \
         SUM_TERMS(MR, 1, sums, row, B, ld_b, column, k, block, inward) \
     } else if (MR > 2 && (below) <= 2) { \
         SUM_TERMS(2, NV, sums, row, B, ld_b, column, k, block, inward) \

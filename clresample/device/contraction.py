@@ -129,12 +129,12 @@ class Contraction:
         self.options = {"SIGN": -1 if adjoint else 1, "RAGGED": ragged, "STRIDED": strided}
         self.options |= {epilogue: True} if epilogue else {}
 
-    def build(self, n_rows=None, n_terms=0, n_pad=0):
+    def build(self, n_rows=None, n_terms=0, n=0):
         """(file, macros) for matrices of so many rows, terms and columns; of most, if not given."""
         tile = self.tuning.tile_for(n_rows) if n_rows else self.tuning.tile
         if "KB" not in tile:
             own = {"RT": ROW_TILES, "READ_AHEAD": self.tuning.reads_ahead}
-            return FILE, self.options | own | self.tuning.tile_for_columns(n_pad)
+            return FILE, self.options | own | self.tuning.tile_for_columns(n, padded(n))
         return GROUP_FILE, self.options | tile | {"TWO_SUMS": n_terms > ONE_SUM}
 
     def bind(
@@ -151,7 +151,7 @@ class Contraction:
         # one right factor for all: the rows of all items are those of one tall matrix
         whole_a = a.step == 1 and a.stride == m * a.ld and a.div == 1
         tall = e is None and b.stride == 0 and whole_a and c.step == 1 and c.stride == m * c.ld
-        file, tile = self.build(None if tall else m, k, padded(n))
+        file, tile = self.build(None if tall else m, k, n)
         tile = tile | {"OWN": own is not None}
         which = own and own.which
         sizes = own and self.device.put(own.sizes(m, n, k), np.int32)
