@@ -9,14 +9,10 @@
  * x, g: where a scene is, and the gradient there; x_new, g_new: those of its trial; d: direction
  * h: the inverse of the curvature's diagonal.  A variable is held where it must not fall: bounded,
  * x <= 0 and g > 0.  P g is g where variables are free and 0 where they are held.
- * H: h, but for the variables of blocks, whose part of it is the sum of their blocks' full matrices
- *   blocks    (n, 4) int: scene, variables m, the first of its indices, its matrix's first element
- *             / ALIGN;  indices: of the variables;  matrices: (m, m) each, symmetric
+ * H: h, but for the variables of blocks, see invert.cl
  *
  * trial     s = x_new - x and h y into the spare slots, y = g_new - g, P g_new and h P g_new;
  *           scenes at rest stay as they are, here and below
- * invert    what blocks, which share no variable, say of H y and H P g_new, in place of what there
- *           was or, with `more`, added to it; launch: (WG, n blocks), groups of (WG, 1)
  * change    for each chunk the sums s_k . P g_new, H y_k . P g_new, s_k . y, H y_k . y of each slot
  *           k, g . s and x_new . precision x_new;  out (n, 4 SLOTS + 2)
  * advance   NEXT: x, g, hg <- x_new, g_new, H P g_new, and
@@ -34,9 +30,6 @@
 #include "group.h"
 #ifndef SLOTS       /* of the ring: pairs that are remembered, and the spare one */
 #define SLOTS 11
-#endif
-#ifndef MOST        /* variables of a block, at most */
-#define MOST 512
 #endif
 #define PLAN(b, what) plan[3 * (b) + what]
 enum { MODE, USED, SPARE };
@@ -102,61 +95,6 @@ void trial(__global const int *restrict chunks, __global const int *restrict pla
         projected[first + i] = p;
         hg_new[first + i] = h[first + i] * p;
     }
-}
-
-__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
-void invert(__global const int *restrict blocks, __global const int *restrict indices,
-            __global const REAL *restrict matrices, __global const int *restrict plan,
-            const ulong size, const int more, __global const REAL *restrict y,
-            __global const REAL *restrict projected, __global REAL *restrict ring_hy,
-            __global REAL *restrict hg_new)
-{
-    __local REAL ys[MOST], ps[MOST];
-    const int lid = (int)get_local_id(0), block = (int)get_global_id(1);
-    /* of a scene at rest no variables: PoCL crashes where a group returns before this SYNC */
-    const int b = blocks[4 * block], m = PLAN(b, MODE) == REST ? 0 : blocks[4 * block + 1];
-    __global const int *index = indices + blocks[4 * block + 2];
-    __global const REAL *matrix = matrices + (size_t)blocks[4 * block + 3] * ALIGN;
-    __global REAL *hy = ring_hy + PLAN(b, SPARE) * (size_t)size;
-    for (int k = lid; k < m; k += WG) {
-        ys[k] = y[index[k]];
-        ps[k] = projected[index[k]];
-    }
-    SYNC();
-#if ROWS
-    for (int i = lid; i < m; i += WG) {     /* along rows, whose sums a compiler for CPUs splits */
-        __global const REAL *row = matrix + (size_t)i * m;
-        REAL of_y[LANES], of_p[LANES], sum_y = 0, sum_p = 0;
-        for (int l = 0; l < LANES; ++l) of_y[l] = of_p[l] = 0;
-        int k0 = 0;
-        for (; k0 + LANES <= m; k0 += LANES)
-            for (int l = 0; l < LANES; ++l) {
-                of_y[l] += row[k0 + l] * ys[k0 + l];
-                of_p[l] += row[k0 + l] * ps[k0 + l];
-            }
-        for (; k0 < m; ++k0) {
-            sum_y += row[k0] * ys[k0];
-            sum_p += row[k0] * ps[k0];
-        }
-        for (int l = 0; l < LANES; ++l) {
-            sum_y += of_y[l];
-            sum_p += of_p[l];
-        }
-        hy[index[i]] = more ? hy[index[i]] + sum_y : sum_y;
-        hg_new[index[i]] = more ? hg_new[index[i]] + sum_p : sum_p;
-    }
-#else
-    for (int i = lid; i < m; i += WG) {     /* down columns, where neighbours read neighbours */
-        REAL sum_y = 0, sum_p = 0;
-        for (int k = 0; k < m; ++k) {
-            const REAL value = matrix[(size_t)k * m + i];
-            sum_y += value * ys[k];
-            sum_p += value * ps[k];
-        }
-        hy[index[i]] = more ? hy[index[i]] + sum_y : sum_y;
-        hg_new[index[i]] = more ? hg_new[index[i]] + sum_p : sum_p;
-    }
-#endif
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))

@@ -5,7 +5,7 @@ import pytest
 
 from clresample.deblending.solver.learned import inverse
 from clresample.deblending.solver.learned.evidence import SourceEvidence, Spectra, blurred_light
-from clresample.deblending.solver.learned.inverse import SourceInverse
+from clresample.deblending.solver.learned.inverse import Block, SourceInverse
 from clresample.deblending.solver.learned.prior import LearnedPrior
 
 SPECTRUM = np.array([3.0, 1.0])
@@ -22,6 +22,18 @@ def answers(widths=(1.0, 2.5)):
     lag = np.arange(-20, 21)
     found = [np.outer(*2 * [np.exp(-0.25 * (lag / w) ** 2)]) * 50 for w in widths]
     return np.array(found), np.full((len(widths), 2), 20)
+
+
+def whole(block):
+    """The inverse (m, m) that a Block stands for."""
+    m, n_rows = len(block.places), inverse.PANEL
+    root, at = np.zeros((-(-m // n_rows) * n_rows,) * 2), 0
+    for i in range(0, len(root), n_rows):
+        size = n_rows * (i + n_rows)
+        root[i : i + n_rows, : i + n_rows] = block.root[at : at + size].reshape(n_rows, -1)
+        at += size
+    assert at == block.root.size and not np.triu(root, 1).any()
+    return root[:m, :m].T @ root[:m, :m]
 
 
 class Made:
@@ -117,11 +129,11 @@ def test_one_block_is_the_inverse_of_its_part_of_the_curvature(strengths, error)
     """To the lags that T leaves out on every pixel; and to a factor of 2 on binned ones, where only
     coarser scales are in it. Of a diagonal that factor is over 5000."""
     made = Made((17, 20), strengths)
-    ((level, places, found),) = made.blocks()
-    assert level == 0 and len(places) == len(set(places)) > 10
+    (block,) = made.blocks()
+    places, found = block.places, whole(block)
+    assert block.level == 0 and len(places) == len(set(places)) > 10
     curvature = made.curvature()[np.ix_(places, places)]
     values = np.linalg.eigvals(found @ curvature).real
-    np.testing.assert_allclose(found, found.T, rtol=1e-12)
     assert values.min() > 1 / (1 + error) and values.max() < 1 + error
     diagonal = np.linalg.eigvals(curvature / curvature.diagonal()).real
     assert diagonal.max() / diagonal.min() > 5000
@@ -193,7 +205,7 @@ def test_coefficients_of_which_the_data_say_little_are_in_no_block():
     made = Made((17, 20), (1e-5, 1e-5, 1e-5))
     assert made.blocks() == []
     made = Made((17, 20), (1e-5, 0.3, 1e-5))
-    ((_, places, _),) = made.blocks()
+    places = np.concatenate([block.places for block in made.blocks()])
     first = made.sizes[0][0] * made.sizes[0][1]
     assert places.min() >= first and places.max() < first + made.sizes[1][0] * made.sizes[1][1]
 
@@ -205,16 +217,16 @@ def test_large_sources_have_parts_and_wide_waves_across_them(monkeypatch):
     made = Made((26, 30), (0.3, 0.3, 0.3))
     blocks = made.blocks()
     curvature = made.curvature()
-    assert {level for level, *_ in blocks} > {0}
+    assert {block.level for block in blocks} > {0}
     n = len(curvature)
     total, worst = np.zeros((n, n)), []
-    for level in sorted({b[0] for b in blocks}):
-        seen = np.concatenate([places for at, places, _ in blocks if at == level])
+    for level in sorted({block.level for block in blocks}):
+        seen = np.concatenate([block.places for block in blocks if block.level == level])
         assert len(seen) == len(set(seen))
-        for at, places, matrix in blocks:
-            assert len(places) <= 150
-            if at == level:
-                total[np.ix_(places, places)] += matrix
+        for block in blocks:
+            assert len(block.places) <= 150
+            if block.level == level:
+                total[np.ix_(block.places, block.places)] += whole(block)
         used = np.flatnonzero(total.diagonal())
         values = np.linalg.eigvals((total @ curvature)[np.ix_(used, used)]).real
         worst.append(values.max() / values.min())
@@ -232,7 +244,8 @@ def test_wide_waves_are_seen_on_coarser_pixels(monkeypatch):
 
     monkeypatch.setattr(inverse, "_between", watched)
     monkeypatch.setattr(inverse, "MOST_PIXELS", 200)
-    ((_, places, found),) = made.blocks()
+    (block,) = made.blocks()
+    places, found = block.places, whole(block)
     values = np.linalg.eigvals(found @ made.curvature()[np.ix_(places, places)]).real
     assert sizes[0][0] <= 200 and sizes[0][1] == 4
     assert values.min() > 0.5 and values.max() < 10
@@ -252,5 +265,11 @@ def test_blocks_stand_until_something_has_changed():
 
 def test_a_curvature_that_is_no_sum_of_squares_leaves_its_diagonal():
     curvature = np.array([[1.0, 3.0], [3.0, 1.0]], np.float32)
-    found = inverse._inverse(curvature, np.array([0.5, 1.0]))
-    np.testing.assert_allclose(found, np.diag([1 / 1.5, 1 / 2]))
+    block = Block(0, np.arange(2), inverse._root(curvature, np.array([0.5, 1.0])))
+    np.testing.assert_allclose(whole(block), np.diag([1 / 1.5, 1 / 2]), rtol=1e-6)
+
+
+def test_a_matrix_that_float32_cannot_factor_is_factored_in_float64():
+    curvature = np.full((2, 2), 2.0**30, np.float32)
+    block = Block(0, np.arange(2), inverse._root(curvature, np.full(2, 0.5)))
+    np.testing.assert_allclose(whole(block), [[1, -1], [-1, 1]], rtol=1e-5)

@@ -5,6 +5,7 @@ import pytest
 from helpers.solver import close, every_type, ragged
 
 from clresample.deblending.solver.buffers import Buffers
+from clresample.deblending.solver.learned.inverse import Block, _panels
 from clresample.deblending.solver.learned.pairs import Pairs
 from clresample.deblending.solver.learned.prior import LearnedPrior
 from clresample.deblending.solver.learned.steps import AGAIN, NEXT, REST, STAY, TRY, Steps
@@ -109,16 +110,17 @@ class Made:
         out = self.host["h"] * vector
         for s, some in enumerate(blocks):
             for level in range(2):
-                for at, places, matrix in some:
-                    where = self.latents.start[s] + places
-                    if at == level:
+                for block, matrix in some:
+                    where = self.latents.start[s] + block.places
+                    if block.level == level:
                         before = out[where] if level else 0
                         out[where] = before + matrix @ vector[where]
         return out
 
 
 def random_blocks(made, seed=5):
-    """Blocks of two levels for the first source that has coefficients, of one for the others."""
+    """Blocks of two levels, and the matrices they stand for, of the first source that has
+    coefficients; of one level for the others."""
     rng, blocks = np.random.default_rng(seed), []
     for n in made.latents.shape.prod(2).sum(1):
         found = []
@@ -126,8 +128,9 @@ def random_blocks(made, seed=5):
             if not n or (level == 2 and any(blocks)):
                 continue
             places = rng.permutation(np.array(places))[:40]
-            matrix = rng.normal(size=(len(places), len(places)))
-            found.append((int(level == 2), places, matrix @ matrix.T))
+            root = np.tril(rng.normal(size=(len(places), len(places)))).astype(np.float32)
+            block = Block(int(level == 2), places, _panels(root))
+            found.append((block, root.T.astype(float) @ root))
         blocks.append(found)
     return blocks
 
@@ -137,7 +140,7 @@ def random_blocks(made, seed=5):
 def test_inner_products_are_those_of_each_scene(build, dtype, with_blocks):
     m = Made(build, dtype)
     blocks = random_blocks(m) if with_blocks else [[] for _ in m.b.host_boxes.scene]
-    m.steps.take_blocks(blocks)
+    m.steps.take_blocks([[block for block, _ in some] for some in blocks])
     x, g, s, hy = (m.host[k] for k in ("x", "g", "s", "hy"))
     sums, slope, energy = m.steps.change()
     on = m.scene < 2
@@ -170,7 +173,7 @@ def test_a_step_does_what_its_scene_asks_for(build, dtype, mode):
     a[1, 2:] = c[1, 2:] = 0
     scale, length = rng.uniform(0.5, 1, (2, 3))
     blocks = random_blocks(m)
-    m.steps.take_blocks(blocks)
+    m.steps.take_blocks([[block for block, _ in some] for some in blocks])
     m.steps.change()
     x, g, hg, d, s, hy = (m.get(k) for k in ("x", "g", "hg", "d", "s", "hy"))
     m.follow([mode, mode, REST])
@@ -187,6 +190,44 @@ def test_a_step_does_what_its_scene_asks_for(build, dtype, mode):
     x_new = np.where(m.bounded, np.maximum(x_new, 0), x_new)
     for name, wanted in (("x", x), ("g", g), ("hg", hg), ("d", d), ("x_new", x_new)):
         close(m.get(name), np.where(m.scene < 2, wanted, m.host[name]), dtype)
+
+
+def test_only_new_roots_are_uploaded(build, monkeypatch):
+    """Blocks that stay keep their place; where room runs out, or is hardly used, all move."""
+    m = Made(build, np.float32)
+    shelf, uploads = m.steps.shelf, []
+    upload = m.b.device.upload
+    monkeypatch.setattr(
+        type(m.b.device), "upload", lambda d, v, a: uploads.append(v.size) or upload(v, a)
+    )
+
+    def made(value, m=20):
+        return Block(0, np.arange(m), _panels(np.full((m, m), float(value))))
+
+    def held():
+        """The value of each block on the device, if it is the same all over."""
+        flat, out = m.b.device.get(shelf.values), []
+        for block in blocks:
+            part = flat[shelf.first(block) :][: block.root.size]
+            np.testing.assert_array_equal(part, block.root)
+            out.append(part[0])
+        return out
+
+    blocks = [made(k) for k in range(1, 9)]
+    shelf.hold(blocks)
+    before, first = shelf.values, [shelf.first(b) for b in blocks]
+    blocks[3] = made(20)
+    uploads.clear()
+    shelf.hold(blocks)
+    assert len(uploads) == 1 and uploads[0] < 2 * blocks[3].root.size
+    assert shelf.values is before and held() == [1, 2, 3, 20, 5, 6, 7, 8]
+    assert [shelf.first(b) for b in blocks[4:]] == first[4:]
+    blocks = [made(k + 30) for k in range(8)]
+    shelf.hold(blocks)
+    assert shelf.values is not before and held() == list(range(30, 38))
+    before, blocks = shelf.values, blocks[2:4]
+    shelf.hold(blocks)
+    assert shelf.values.size < before.size and held() == [32, 33]
 
 
 @every_type

@@ -47,7 +47,7 @@ class LearnedEngine:
         self.structure = Structure(b, prior)
         latents = self.structure.latents
         v = self.vectors = Vectors(b, latents, N_PAIRS + 1)
-        self.steps = Steps(v)
+        self.steps = Steps(v, None if past is None else past[0].steps.shelf)
         self._row0 = device.put(self._gradient.rows, np.int32)
         if past is None:
             self.progress = Progress(len(scenes), enough, [_n_pixels(s) for s in scenes])
@@ -180,10 +180,10 @@ def _n_pixels(scene):
 
 def vector_bytes(scene, prior) -> int:
     """Device memory [bytes] of the scene's vectors in a batch, roughly, of float64: both rings,
-    eleven others and the light; and twice its blocks, also
-    on the host, of a quarter of each source's coefficients."""
+    eleven others and the light; and its blocks, half of
+    a matrix each, on the host too, of a quarter of each source's coefficients."""
     n = [sum(coarse(p.shape, step).prod() for step in prior.steps) for p in scene.profile]
-    blocks = 2 * sum(k / 4 * min(k / 4, 2 * MOST) for k in n)
+    blocks = 1.25 * sum(k / 4 * min(k / 4, 2 * MOST) for k in n)
     return int(8 * ((2 * (N_PAIRS + 1) + 12) * (sum(n) + scene.power.size) + blocks))
 
 

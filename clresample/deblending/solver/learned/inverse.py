@@ -15,6 +15,8 @@ on the host, at first and after strengths were learned.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import lapack
@@ -27,7 +29,7 @@ from .prior import kernel_rows
 # iterations more.
 WORTH = 10.0
 # Coefficients of a block, at most: its time goes with their third power, its memory with their
-# square; with fewer, fits of large sources take more iterations. Kernels hold two numbers of each
+# square; with fewer, fits of large sources take more iterations. Kernels hold four numbers of each
 # in local memory, of which devices have 32 KiB and more.
 MOST = 512
 # [px] Pixels are binned by as much as the steps of a block's finest scale, but by no more than
@@ -38,6 +40,22 @@ COARSEST, MOST_PIXELS = 2, 3000
 # A block is made of the pixels where one of its coefficients has more than this part of its largest
 # value. Blocks stand until a strength or the spectrum has changed by CHANGE of itself.
 LEAST, CHANGE = 0.1, 0.1
+# Rows of a root that are stored with one length, as many numbers as a CPU takes at a time.
+PANEL = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """The inverse W^T W of a part of H, of m coefficients.
+
+    level: see `SourceInverse.blocks`
+    places (m,): of the coefficients among all of the source's, scale by scale
+    root: W, lower triangular, in panels, see `_panels`
+    """
+
+    level: int
+    places: np.ndarray
+    root: np.ndarray
 
 
 class SourceInverse:
@@ -55,9 +73,8 @@ class SourceInverse:
         self._at = self._blocks = None
 
     def blocks(self, strengths, spectrum):
-        """Blocks near strengths (J,) and a spectrum (C,): of each its level, where its coefficients
-        (m,) are among all of the source's, scale by scale, and the inverse (m, m) of their part of
-        H. Those of one level have no coefficient in common, and what levels say is added."""
+        """The Blocks near strengths (J,) and a spectrum (C,). Those of one level have no
+        coefficient in common, and what levels say is added."""
         if self._at is None or self._moved(strengths, spectrum):
             self._at = strengths.copy(), spectrum.copy()
             self._blocks = list(self._made(*self._at))
@@ -79,7 +96,8 @@ class SourceInverse:
             parts = _split(rows, rows[:, 1:] * steps[rows[:, :1]])
             for own in parts:
                 curvature = self._curvature(own, spectrum)
-                yield level, self._places(own), _inverse(curvature, strengths[own[:, 0]] ** -2)
+                root = _root(curvature, strengths[own[:, 0]] ** -2)
+                yield Block(level, self._places(own), root)
             if len(parts) < 2:
                 return
             rows = rows[rows[:, 0] > rows[:, 0].min()]
@@ -163,12 +181,28 @@ def _between(sharpness, shape, step):
     return sliding_window_view(far, shape)[::-1, ::-1].reshape(size, size)
 
 
-def _inverse(curvature, precision):
-    """The inverse (m, m) of curvature (m, m) + precision (m,), in float64 on the way."""
-    matrix = curvature.astype(np.float64)
-    matrix[np.diag_indices(len(matrix))] += precision
-    factor, info = lapack.dpotrf(matrix.T, lower=1, clean=0, overwrite_a=1)
-    if info:  # lags that T_c leaves out: the diagonal alone
-        return np.diag(1 / (curvature.diagonal() + precision))
-    inverse, _ = lapack.dpotri(factor, lower=1, overwrite_c=1)
-    return np.tril(inverse) + np.tril(inverse, -1).T
+def _root(curvature, precision):
+    """W (m, m), lower triangular, W^T W being the inverse of curvature (m, m) + precision (m,), in
+    panels. A product of roots is positive definite whatever their rounding, so that float32 does:
+    only a matrix that it cannot factor is tried in float64."""
+    for dtype in (np.float32, np.float64):
+        matrix = curvature.astype(dtype)
+        matrix[np.diag_indices(len(matrix))] += precision
+        potrf, trtri = lapack.get_lapack_funcs(("potrf", "trtri"), (matrix,))
+        factor, info = potrf(matrix.T, lower=0, clean=1, overwrite_a=1)
+        if not info:
+            inverse, info = trtri(factor, lower=0, overwrite_c=1)
+        if not info:
+            return _panels(inverse.T)
+    # lags that T_c leaves out: the diagonal alone
+    return _panels(np.diag(1 / np.sqrt(curvature.diagonal() + precision)))
+
+
+def _panels(root):
+    """A lower triangular matrix (m, m), float32: each PANEL of its rows up to the diagonal of the
+    last one, one after the other, with zeros where the matrix has ended."""
+    m = -(-len(root) // PANEL) * PANEL
+    whole = np.zeros((m, m), np.float32)
+    whole[: len(root), : len(root)] = root
+    panels = [whole[i : i + PANEL, : i + PANEL].ravel() for i in range(0, m, PANEL)]
+    return np.concatenate(panels)

@@ -1,11 +1,12 @@
-"""Directions, steps and inner products of the Vectors of a batch: the kernels of lbfgs.cl."""
+"""Directions, steps and inner products of the Vectors of a batch: lbfgs.cl and invert.cl."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from ..boxes import ALIGN
-from .inverse import MOST
+from .inverse import MOST, PANEL
+from .shelf import Shelf
 
 # What the kernels do with a scene; the same numbers in lbfgs.cl.
 REST, NEXT, AGAIN, TRY, STAY = range(5)
@@ -15,9 +16,10 @@ class Steps:
     """L-BFGS on the Vectors of a batch; the decisions come as arrays over its scenes (B,).
 
     vectors: the Vectors
+    shelf: Shelf of blocks that these or other Steps have had; a new one for None
     """
 
-    def __init__(self, vectors):
+    def __init__(self, vectors, shelf=None):
         v, n_slots = vectors, vectors.n_slots
         b, self._latents = v.buffers, v.latents
         self._buffers = b
@@ -27,15 +29,14 @@ class Steps:
         self._plan = b.device.put(np.zeros((n, 3)), np.int32)
         self._coefficients = b.put(np.zeros((n, 2 * n_slots + 2)))
         self._sums = b.put(np.zeros((self._n_chunks, 4 * n_slots + 2)))
-        self._levels = []
+        self._levels, self.shelf = [], shelf or Shelf(b)
         y, projected, hg_new = (b.device.zeros(v.size, b.dtype) for _ in range(3))
         shared = {"plan": self._plan, "size": v.size, "ring_s": v.s, "ring_hy": v.hy}
         shared |= {"chunks": v.chunk_table, "x_new": v.x_new}
         group = b.tuning.sum_group
 
         def launcher(name, size=(group, 1)):
-            macros = {"SLOTS": n_slots, "MOST": MOST}
-            return b.launcher("lbfgs.cl", name, len(size), local_size=size, **macros)
+            return b.launcher("lbfgs.cl", name, len(size), local_size=size, SLOTS=n_slots)
 
         self._trial = launcher("trial").bind(
             **shared,
@@ -47,7 +48,8 @@ class Steps:
             projected=projected,
             hg_new=hg_new,
         )
-        self._invert = launcher("invert").bind(
+        size, macros = (group, 1), {"MOST": MOST, "PANEL": PANEL}
+        self._invert = b.launcher("invert.cl", "invert", 2, local_size=size, **macros).bind(
             plan=self._plan, size=v.size, ring_hy=v.hy, y=y, projected=projected, hg_new=hg_new
         )
         self._change = launcher("change").bind(
@@ -112,27 +114,22 @@ class Steps:
             self.take_blocks(blocks)
 
     def take_blocks(self, blocks):
-        """Take the blocks of all sources (S)."""
+        """Take the Blocks of all sources (S)."""
         b = self._buffers
         start, scene = self._latents.start, b.host_boxes.scene
         self._levels = []
-        for level in range(1 + max((own[0] for some in blocks for own in some), default=-1)):
-            listed = [
-                (scene[s], start[s] + places, matrix)
-                for s, some in enumerate(blocks)
-                for at, places, matrix in some
-                if at == level
-            ]
-            sizes = np.array([len(places) for _, places, _ in listed])
-            first = np.cumsum([0, *(-(-sizes * sizes // ALIGN))])
-            table = [[s for s, *_ in listed], sizes, np.cumsum([0, *sizes[:-1]]), first[:-1]]
-            matrices = np.zeros(first[-1] * ALIGN, b.dtype)
-            for at, (_, _, matrix) in zip(first * ALIGN, listed):
-                matrices[at : at + matrix.size] = matrix.ravel()
+        self.shelf.hold([block for some in blocks for block in some])
+        listed = [(s, block) for s, some in enumerate(blocks) for block in some]
+        for level in range(1 + max((block.level for _, block in listed), default=-1)):
+            own = [(s, block) for s, block in listed if block.level == level]
+            sizes = [len(block.places) for _, block in own]
+            first = [self.shelf.first(block) // ALIGN for _, block in own]
+            table = [[scene[s] for s, _ in own], sizes, np.cumsum([0, *sizes[:-1]]), first]
+            places = np.concatenate([start[s] + block.places for s, block in own])
             given = {
                 "blocks": b.device.put(np.stack(table, axis=1), np.int32),
-                "indices": b.device.put(np.concatenate([p for _, p, _ in listed]), np.int32),
-                "matrices": b.put(matrices),
+                "indices": b.device.put(places, np.int32),
+                "roots": self.shelf.values,
                 "more": level > 0,
             }
-            self._levels.append(((self._size[0], len(listed)), given))
+            self._levels.append(((self._size[0], len(own)), given))
