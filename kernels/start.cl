@@ -1,7 +1,7 @@
 /* The start of a fit: smooth profiles drawn in boxes, seen in windows, compared with the data.
  *
  * A slot is one component of one scene, with n images: its profile and, where asked for, the
- * slopes of that by its parameters.
+ * slopes of that by its parameters, which draw.cl has drawn.
  *
  *         model frame                      one channel of an observation
  *         +-----------------+              +------------------+
@@ -14,9 +14,6 @@
  *            slot's images begin: (n, n_bands, wy, wx), row by row
  *   root, data, residual, weight   (B, n_bands, my, mx): root of the weights, data times root
  *
- * draw     (slots, N_DRAW) int: ny, nx, n, first element of its images (n, ny, nx); n = 0: not
- *          drawn here.  shape (slots, N_SHAPE), see the enum: profile and its slopes by
- *          (ln sigma, g1, g2, ln beta), see profiles.py;  launch: (X, tallest box, slots)
  * whiten   seen <- seen root;  launch: (X, tallest window, slots)
  * compare  model m = sky root + sum_slots A seen, residual r = data - m, weight w = 1 / (1 + (error
  *          m)^2) where root is not 0; sums (B, n_bands, my, 3): of w r^2, w r root, w root^2;
@@ -38,42 +35,6 @@
 #endif
 
 enum { SCENE, Y0, X0, WY, WX, N_IMAGES, BEGIN, N_PLACE };
-enum { DRAW_NY, DRAW_NX, DRAW_N, DRAW_BEGIN, N_DRAW };
-/* place in the box, C^-1, beta, 1 / (2 pi sqrt(det C)); dC (yy, yx, xx) and 1/2 tr(C^-1 dC) by each
- * of three parameters */
-enum { CY, CX, I_YY, I_YX, I_XX, BETA, NORM, SLOPES, N_SHAPE = SLOPES + 12 };
-
-#define DARK ((REAL)1e-20)  /* of the peak; smaller values would be denormals, which are slow */
-
-__kernel void draw(__global const int *restrict table, __global const REAL *restrict shape,
-                   __global REAL *restrict images)
-{
-    const int s = (int)get_global_id(2), y = (int)get_global_id(1);
-    __global const int *t = table + N_DRAW * (size_t)s;
-    const int ny = t[DRAW_NY], nx = t[DRAW_NX], n = t[DRAW_N];
-    if (!n || y >= ny) return;
-    __global const REAL *p = shape + N_SHAPE * (size_t)s;
-    __global REAL *out = images + t[DRAW_BEGIN] + (size_t)y * nx;
-    const size_t one = (size_t)ny * nx;
-    const REAL dy = y - p[CY], cx = p[CX], yy = p[I_YY], yx = p[I_YX], xx = p[I_XX];
-    const REAL beta = p[BETA], norm = p[NORM];
-    FOR_X(x, nx) {
-        const REAL dx = x - cx, u = yy * dy + yx * dx, v = yx * dy + xx * dx, q = dy * u + dx * v;
-        const REAL l = log(1 + q / (2 * beta)), e = exp(-(beta + 1) * l);
-        const REAL s0 = e > DARK ? norm * e : 0;
-        out[x] = s0;
-        if (n > 1) {
-            const REAL fall = (beta + 1) / (2 * beta + q);
-            for (int k = 0; k < 3; ++k) {
-                const REAL a = p[SLOPES + 4 * k], b = p[SLOPES + 4 * k + 1];
-                const REAL c = p[SLOPES + 4 * k + 2], d = p[SLOPES + 4 * k + 3];
-                out[(k + 1) * one + x] = s0 * (fall * (a * u * u + 2 * b * u * v + c * v * v) - d);
-            }
-            out[4 * one + x] = s0 * (q * fall - beta * l);
-        }
-    }
-}
-
 __kernel void whiten(__global const int *restrict place, const int n_bands, const int my,
                      const int mx, __global const REAL *restrict root, __global REAL *restrict seen)
 {
@@ -170,6 +131,19 @@ void compare(__global const int *restrict scenes, __global const int *restrict f
      (((size_t)((i) < (p)[N_IMAGES] ? (i) : (p)[N_IMAGES] - 1) * n_bands + c) * (p)[WY] \
       + y0 + y - (p)[Y0]) * (p)[WX] + x0 - (p)[X0])
 
+/* What is done for each image j of the other slot, without an array of arrays, which compilers for
+ * CPUs keep out of registers. */
+#if K > 1
+#define EACH(DO) DO(0) DO(1) DO(2) DO(3) DO(4)
+#else
+#define EACH(DO) DO(0)
+#endif
+#define ZERO(j) REAL sum##j[8] = {0, 0, 0, 0, 0, 0, 0, 0};
+#define OTHER(j) __global const REAL *b##j = ROW_OF(q, j);
+#define MULTIPLY(j) for (int k = 0; k < 8; ++k) sum##j[k] += left[k] * b##j[x + k];
+#define MULTIPLY_ONE(j) sum##j[0] += one * b##j[x];
+#define TOTAL(j) total[i][j] = SUM8(sum##j);
+
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
 void gram(__global const int *restrict pairs, __global const int *restrict place,
           const int n_bands, const int my, const int mx, __global const REAL *restrict seen,
@@ -182,30 +156,25 @@ void gram(__global const int *restrict pairs, __global const int *restrict place
     __global const int *p = place + N_PLACE * (size_t)t[0], *q = place + N_PLACE * (size_t)t[1];
     const int y0 = t[2], x0 = t[3], height = t[4], width = t[5];
     REAL total[K][K];
-    for (int i = 0; i < K; ++i) for (int j = 0; j < K; ++j) total[i][j] = 0;
-    for (int y = lid; y < height; y += WG) {
-        __global const REAL *w =
-            weight + (((size_t)p[SCENE] * n_bands + c) * my + y0 + y) * mx + x0;
-        __global const REAL *a[K], *b[K];
-        for (int i = 0; i < K; ++i) a[i] = ROW_OF(p, i);
-        for (int j = 0; j < K; ++j) b[j] = ROW_OF(q, j);
-        REAL sum[K][K][8];
-        for (int i = 0; i < K; ++i)
-            for (int j = 0; j < K; ++j)
-                for (int k = 0; k < 8; ++k) sum[i][j][k] = 0;
-        int x = 0;
-        for (; x + 8 <= width; x += 8)
-            for (int i = 0; i < K; ++i) {
+    for (int i = 0; i < K; ++i) {       /* a row of the result at a time, in registers */
+        EACH(ZERO)
+        for (int y = lid; y < height; y += WG) {
+            __global const REAL *w =
+                weight + (((size_t)p[SCENE] * n_bands + c) * my + y0 + y) * mx + x0;
+            __global const REAL *a = ROW_OF(p, i);
+            EACH(OTHER)
+            int x = 0;
+            for (; x + 8 <= width; x += 8) {
                 REAL left[8];
-                for (int k = 0; k < 8; ++k) left[k] = a[i][x + k] * w[x + k];
-                for (int j = 0; j < K; ++j)
-                    for (int k = 0; k < 8; ++k) sum[i][j][k] += left[k] * b[j][x + k];
+                for (int k = 0; k < 8; ++k) left[k] = a[x + k] * w[x + k];
+                EACH(MULTIPLY)
             }
-        for (; x < width; ++x)
-            for (int i = 0; i < K; ++i)
-                for (int j = 0; j < K; ++j) sum[i][j][0] += a[i][x] * w[x] * b[j][x];
-        for (int i = 0; i < K; ++i)
-            for (int j = 0; j < K; ++j) total[i][j] += SUM8(sum[i][j]);
+            for (; x < width; ++x) {
+                const REAL one = a[x] * w[x];
+                EACH(MULTIPLY_ONE)
+            }
+        }
+        EACH(TOTAL)
     }
     for (int i = 0; i < K; ++i)
         for (int j = 0; j < K; ++j) {

@@ -258,8 +258,9 @@ def test_where_nothing_is_seen_of_any_source_there_is_no_curvature():
 
 def test_memory_of_a_scenes_vectors():
     """Twenty-two of the rings and twelve more, of 8 bytes each, and coefficients on every step-th
-    pixel; twice a quarter of each source's with each other."""
+    pixel; a quarter of each source's with each other, five quarters of it."""
     prior = LearnedPrior(scales_px=(1.0, 2.0), strengths=(0.1, 0.1))
     one = scene([], profile=[np.zeros((7, 10)), np.zeros((1, 1))], power=np.zeros((2, 3)))
     n = 7 * 10 + 4 * 6 + 1 + 1 + 6  # the last step ends on the last pixel or past it
-    assert vector_bytes(one, prior) == int(8 * (34 * n + 2 * (94 / 4) ** 2 + 2 * (2 / 4) ** 2))
+    blocks = 1.25 * ((94 / 4) ** 2 + (2 / 4) ** 2)
+    assert vector_bytes(one, prior) == int(8 * (34 * n + blocks))

@@ -158,11 +158,12 @@ class Slots:
         place = np.array([c.position for c in self.components])[at] - self.origin[at]
         tallest, widest = self.size[at].max(axis=0).tolist()
         launch = device.launcher(
-            "start.cl",
+            "draw.cl",
             "draw",
             dtype=dtype,
             local_size=tuning.local_size(3),
             ROWS=tuning.row_loops,
+            K=int(self.n_images[at].max()),
         )
         launch(
             (1 if tuning.row_loops else widest, tallest, len(table)),
@@ -173,7 +174,7 @@ class Slots:
 
 
 def _shapes(theta, place, moment):
-    """What kernels/start.cl's draw takes of galaxies: (n, N_SHAPE)."""
+    """What kernels/draw.cl takes of galaxies: (n, N_SHAPE)."""
     c, slopes = covariance(theta, moment)
     inverse = np.linalg.inv(c)
     traces = np.einsum("nij,nkji->nk", inverse, slopes) / 2
