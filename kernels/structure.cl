@@ -183,6 +183,17 @@ void unform(__global const int *restrict active, __global const int *restrict ta
     for (int i = lid; i < n; i += WG) d[i] = a[i] * ((m[i] > 0 ? d[i] : (REAL)0) - b[i] * less);
 }
 
+/* Eight coefficients of a row at a time, of a step that is known when this is compiled. */
+#define ALONG_ROW(STEP) \
+    for (; c + 8 <= cx; c += 8) { \
+        REAL sum[8] = {0, 0, 0, 0, 0, 0, 0, 0}; \
+        __global const REAL *from = row + STEP * c - radius; \
+        for (int t = 0; t <= 2 * radius; ++t) \
+            for (int l = 0; l < 8; ++l) sum[l] += k[t] * from[STEP * l + t]; \
+        for (int l = 0; l < 8; ++l) \
+            gradient[at + c + l] = sum[l] + weight * z[at + c + l]; \
+    }
+
 __kernel void condense(__global const int *restrict active, __global const int *restrict table,
                        __global const int *restrict start, __global const REAL *restrict taps,
                        __global const REAL *restrict q, __global const REAL *restrict precision,
@@ -227,7 +238,10 @@ __kernel void condense(__global const int *restrict active, __global const int *
         row[x] = sum;
     }
     for (int m = nx; m < LINE(nx) - MARGIN; ++m) row[m] = 0;
-    for (int c = 0; c < cx; ++c) {
+    int c = 0;
+    if (step == 1) ALONG_ROW(1)
+    if (step == 2) ALONG_ROW(2)
+    for (; c < cx; ++c) {
         REAL sum[8] = {0, 0, 0, 0, 0, 0, 0, 0};
         for (int t = 0; t <= 2 * radius; t += 8)
             for (int l = 0; l < 8; ++l) sum[l] += k[t + l] * row[step * c - radius + t + l];
