@@ -38,8 +38,9 @@ MOST = 512
 # square of their number.
 COARSEST, MOST_PIXELS = 2, 3000
 # A block is made of the pixels where one of its coefficients has more than this part of its largest
-# value. Blocks stand until a strength or the spectrum has changed by CHANGE of itself.
-LEAST, CHANGE = 0.1, 0.1
+# value. Blocks stand until a strength or the spectrum has changed by CHANGE of itself: with 0.1 a
+# fit takes a twentieth more time, and no fewer iterations; with 0.6, some more.
+LEAST, CHANGE = 0.1, 0.35
 # Rows of a root that are stored with one length, as many numbers as a CPU takes at a time.
 PANEL = 8
 
