@@ -44,12 +44,17 @@ class KaiserBessel:
         phi has no singularity inside: a Chebyshev series for each tap gives all its digits, 20
         times as fast as the Bessel function does.
         """
+        return np.polynomial.chebyshev.chebvander(2 * fraction - 1, SERIES_TERMS - 1) @ self._series
+
+    @functools.cached_property
+    def _series(self):
+        """Chebyshev coefficients (SERIES_TERMS, W) of phi at each tap."""
         node = (np.arange(SERIES_TERMS) + 0.5) * (np.pi / SERIES_TERMS)
         tap = np.arange(self.n_taps)
         samples = self((np.cos(node)[:, None] + 1) / 2 + self.n_taps / 2 - 1 - tap)
         series = np.cos(np.outer(np.arange(SERIES_TERMS), node)) @ samples * (2 / SERIES_TERMS)
         series[0] /= 2
-        return np.polynomial.chebyshev.chebvander(2 * fraction - 1, SERIES_TERMS - 1) @ series
+        return series
 
     def transform(self, f):
         """phi^(f) (...) at frequencies f (...) [cycles/column]."""

@@ -234,14 +234,30 @@ def _transform(psf, bands, center, nu_y, nu_x, matrix):
         f_y, f_x = (psf.spacing * (p * nu_y[:, None] + q * nu_x) for p, q in ((a, c), (b, d)))
         turns = f_y * center[0] + f_x * center[1]
         return transform_at(images, f_y, f_x) * np.exp(2j * np.pi * (turns - np.rint(turns)))
+    # the images are real: where nu_x has both signs, one of them follows from sums of the other
+    n_half = nu_x.size // 2 if nu_x.size % 2 and np.array_equal(nu_x, -nu_x[::-1]) else 0
+    nu_half = nu_x[n_half:]
     waves_yu, waves_yv = _waves(nu_y, a * u), _waves(nu_y, b * v)
-    waves_xu, waves_xv = _waves(nu_x, c * u), _waves(nu_x, d * v)
-    result = np.zeros((len(bands), nu_y.size, nu_x.size), dtype=np.complex128)
+    waves_xu, waves_xv = _waves(nu_half, c * u), _waves(nu_half, d * v)
+    sums = np.zeros((len(bands), 2, nu_y.size, 2, nu_half.size))  # of cos and sin by cos and sin
     n_rows = max(1, BLOCK // (n_x * (nu_y.size + nu_x.size)))
     for i in range(0, n_y, n_rows):
         rows = slice(i, i + n_rows)
-        left = (waves_yu[:, rows, None] * waves_yv[:, None]).reshape(nu_y.size, -1)
-        right = (waves_xu[:, rows, None] * waves_xv[:, None]).reshape(nu_x.size, -1)
+        left = _parts(waves_yu[:, rows, None] * waves_yv[:, None])
+        right = _parts(waves_xu[:, rows, None] * waves_xv[:, None])
         for k in range(len(bands)):
-            result[k] += left @ (right * images[k, rows].ravel()).T
+            sums[k] += (left @ (right * images[k, rows].ravel()).T).reshape(sums.shape[1:])
+    cos_cos, cos_sin, sin_cos, sin_sin = (sums[:, i, :, k] for i in (0, 1) for k in (0, 1))
+    result = np.empty((len(bands), nu_y.size, nu_x.size), dtype=np.complex128)
+    result.real[..., n_half:] = cos_cos - sin_sin
+    result.imag[..., n_half:] = cos_sin + sin_cos
+    if n_half:
+        result.real[..., :n_half] = (cos_cos + sin_sin)[..., :0:-1]
+        result.imag[..., :n_half] = (sin_cos - cos_sin)[..., :0:-1]
     return result
+
+
+def _parts(waves):
+    """Real and imaginary parts of waves (F, n, m), one below the other: (2F, n m)."""
+    flat = waves.reshape(len(waves), -1)
+    return np.concatenate([flat.real, flat.imag])

@@ -18,4 +18,7 @@ def phases(frequencies, positions):
 
 def cos_sin_columns(angle):
     """Tables of waves: cos and sin of the angles (..., H) [rad] in columns 2i, 2i+1: (..., 2H)."""
-    return np.stack([np.cos(angle), np.sin(angle)], axis=-1).reshape(*angle.shape[:-1], -1)
+    table = np.empty((*angle.shape, 2), angle.dtype)
+    np.cos(angle, out=table[..., 0])
+    np.sin(angle, out=table[..., 1])
+    return table.reshape(*angle.shape[:-1], -1)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...resampling.plan import Plan, Precision, make_plan
-from ...resampling.transfer import light_reach, wrap_radius
+from ...resampling.transfer import light_reach
 from ...sky.mapping import Around
 from .renderer import Renderer
 
@@ -193,5 +193,6 @@ def _layout(plan: Plan):
 def _reach(plan, tolerance):
     """How far [model px] the light of a box is followed; with no tolerance, as far as a plan's
     model is padded for it."""
-    psf, matrix = plan.psfs[1], plan.mapping.matrix
-    return light_reach(psf, matrix, tolerance) if tolerance else max(wrap_radius(psf, matrix))
+    if not tolerance:
+        return max(plan.certificate.wrap_radius_px)
+    return light_reach(plan.psfs[1], plan.mapping.matrix, tolerance)

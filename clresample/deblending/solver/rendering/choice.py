@@ -102,19 +102,23 @@ def _best_groups(buffers, op, which):
     """Operations of one pair of the sources `which` (n,) in windows, and the Groups of fewest."""
     boxes, side = buffers.host_boxes, np.array(op.shape_in[1:])
     tried = [Groups(boxes, which, side / n_cells) for n_cells in CELLS]
-    counts = [_window_flops(boxes, op, groups) for groups in tried]
+    inverse = np.abs(np.linalg.inv(op.plans[0].mapping.matrix))
+    counts = [_window_flops(boxes, op, groups, inverse) for groups in tried]
     best = int(np.argmin(counts))
     return counts[best], tried[best]
 
 
-def _window_flops(boxes, op, groups):
+def _window_flops(boxes, op, groups, inverse):
     """Operations of one pair in windows, all of them, weighed as in `flops`; estimated from the
-    tables of the whole frame, whose frequencies and columns grow with its side."""
+    tables of the whole frame, whose frequencies and columns grow with its side.
+
+    inverse (2, 2): of the mapping's matrix, without signs
+    """
     e, plan, n_bands = op.executor(), op.plans[0], op.shape_out[0]
     axes, reach = list(e.axes), reach_of(plan)
     n, side = groups.shape[axes], np.array([e.n_y, e.n_x])
     k_y, k_x = np.array([e.k_y, e.k_x]) * (n + 2 * reach) / (side + reach)
-    seen = np.abs(np.linalg.inv(plan.mapping.matrix)) @ (groups.shape + 2 * reach)
+    seen = inverse @ (groups.shape + 2 * reach)
     n_rows, n_columns = seen
     if plan.lines is not None:
         n_rows = seen[0 if plan.lines.by_row else 1]

@@ -17,7 +17,6 @@ import numpy as np
 from ....device.contraction import ImageBatch
 from ....resampling.plan import Precision
 from ....resampling.resampler import EXECUTORS
-from ....resampling.transfer import wrap_radius
 from ..boxes import Boxes
 
 # [px] Groups' frames have sides of multiples of this, so that boxes that were resized find the
@@ -68,7 +67,7 @@ class Groups:
 
 def reach_of(plan):
     """How far [model px] the light of a group is followed: as far as frames are padded for it."""
-    return max(wrap_radius(plan.psfs[1], plan.mapping.matrix))
+    return max(plan.certificate.wrap_radius_px)
 
 
 class WindowOperator:
