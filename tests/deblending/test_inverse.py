@@ -157,18 +157,18 @@ def test_binned_pixels_hold_sums_of_structure_and_means_of_what_the_data_say(
     monkeypatch.setattr(inverse, "MOST_PIXELS", most_pixels)
     monkeypatch.setattr(inverse, "WORTH", 10.0)
     made = Made(shape, strengths)
-    ((_, places, found),) = made.blocks()
-    low, high = between(found, made.binned(places, step))
+    (block,) = made.blocks()
+    low, high = between(whole(block), made.binned(block.places, step))
     assert 0.99 < low and high < 1.04
 
 
 @pytest.mark.parametrize("more", [0, 1])
 def test_a_source_of_more_coefficients_than_a_block_holds_has_two(more, monkeypatch):
     made = Made((17, 20), (1e-5, 0.3, 1e-5))
-    ((_, places, _),) = made.blocks()
+    (places,) = (block.places for block in made.blocks())
     monkeypatch.setattr(inverse, "MOST", len(places) - more)
     made = Made((17, 20), (1e-5, 0.3, 1e-5))
-    parts = [own for level, own, _ in made.blocks() if level == 0]
+    parts = [block.places for block in made.blocks() if block.level == 0]
     assert len(parts) == 1 + more
     assert sorted(np.concatenate(parts)) == sorted(places)
 
@@ -180,12 +180,13 @@ def test_each_part_of_a_large_source_is_the_inverse_there(monkeypatch):
     made = Made((26, 30), (0.3, 0.1, 0.05))
     curvature, blocks = made.curvature(), made.blocks()
     ends = np.cumsum([0, *(a * b for a, b in made.sizes)])
-    for level, places, found in blocks:
-        low, high = between(found, curvature[np.ix_(places, places)])
+    for block in blocks:
+        level, places = block.level, block.places
+        low, high = between(whole(block), curvature[np.ix_(places, places)])
         assert 0.98 < low and high < (1.2, 1.8, 1.3)[level]
         assert (places.min() < ends[1]) == (level == 0) and places.min() >= ends[level]
-    assert {level for level, *_ in blocks} == {0, 1, 2}
-    first = [places[places < ends[1]] for level, places, _ in blocks if level == 0]
+    assert {block.level for block in blocks} == {0, 1, 2}
+    first = [b.places[b.places < ends[1]] for b in blocks if b.level == 0]
     for own in first:
         sides = np.ptp(np.divmod(own, made.sizes[0][1]), axis=1) + 1
         assert sides.prod() < 1.7 * len(own) + 10 and sides.max() < 3 * sides.min()
@@ -196,8 +197,9 @@ def test_what_the_data_say_of_neighbours_reaches_half_a_spectrum():
     along = np.exp(-np.abs(np.arange(-32, 33)) / 40)
     found = np.array([50 * np.outer(along, along)] * 2), np.full((2, 2), 32)
     made = Made((32, 5), (0.3, 1e-5, 1e-5), found, sigma=20.0)
-    ((_, places, matrix),) = made.blocks()
-    low, high = between(matrix, made.curvature()[np.ix_(places, places)])
+    (block,) = made.blocks()
+    places = block.places
+    low, high = between(whole(block), made.curvature()[np.ix_(places, places)])
     assert len(places) > 150 and 0.99 < low and high < 1.01
 
 
