@@ -64,7 +64,7 @@ class Settings:
     step_sizes: StepSizes = StepSizes()
     fit_shifts: bool = False
     fit_sky: bool = False
-    flux_floor: float = 0.0015
+    flux_floor: float = 0.0005
     psf_error: float = 0.03
     psf_tolerance: float = 1e-3
 

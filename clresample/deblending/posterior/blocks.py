@@ -99,7 +99,21 @@ class Factor:
 
     def draw(self, normal):
         """H^-1/2 of numbers (N,), node after node: arrays (n) that scatter as the inverse says."""
-        parts = np.split(np.asarray(normal, float), np.cumsum(self.sizes)[:-1])
+        return self._back(np.split(np.asarray(normal, float), np.cumsum(self.sizes)[:-1]))
+
+    def solve(self, right):
+        """H^-1 right, arrays (n) of the nodes in and out."""
+        parts = [np.divide(r, s) for r, s in zip(right, self.scale, strict=True)]
+        for v in self.order:
+            parts[v] = solve_triangular(self._lower[v], parts[v], lower=True)
+            if self._later[v]:
+                taken = np.split(self._below[v] @ parts[v], self._ends(v)[1:-1])
+                for u, part in zip(self._later[v], taken, strict=True):
+                    parts[u] = parts[u] - part
+        return self._back(parts)
+
+    def _back(self, parts):
+        """Scaled L^-T of arrays (n)."""
         out = [np.zeros(0)] * len(parts)
         for v in reversed(self.order):
             right = parts[v]

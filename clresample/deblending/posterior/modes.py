@@ -42,6 +42,7 @@ class Solution:
     shapes, thetas, positions (n): the start's Shapes, parameters, places (2,) [px]
     findings: Findings; chi2 (n,): per pixel, where each component's light is
     prior: LearnedPrior
+    pulls (n): arrays (ny, nx), see bounds.py
     """
 
     scene: Scene
@@ -55,6 +56,7 @@ class Solution:
     findings: object
     chi2: np.ndarray
     prior: LearnedPrior
+    pulls: list
 
     def unlikeness(self, i):
         """Strength of component i's structure over that of a galaxy that is like its smooth
@@ -79,7 +81,8 @@ class Solution:
 
     def modes(self, i):
         """Images (1 + k, ny, nx), float32, of component i's morphology and of its modes, whose
-        coefficients the prior expects to scatter by 1, each on its own; and its Beyond."""
+        coefficients the prior expects to scatter by 1, each on its own; its Beyond; and what the
+        data pull of each mode (k,) where the bound at 0 holds the morphology."""
         profile, scene = self.scene.profile[i], self.scene
         images, scatter, far = profile_modes(
             self.shapes[i],
@@ -107,18 +110,21 @@ class Solution:
             np.matmul(own.astype(np.float32), flat, out=out[:n_own].reshape(n_own, -1))
         out[n_own:] = without_dark(scatter[:, None, None] * images)
         far = far.gauged(self._gauge(i, out) * self.peaks[i])
-        return seen, far
+        return seen, far, self._held(i, out)
 
     def _gauge(self, i, images):
-        """Take off images, in place, what lies along the profile, and all of them where the
-        morphology is at its bound; returns how much lay along it (k,)."""
+        """Take off images, in place, what lies along the profile; returns how much it was (k,)."""
         p = without_dark(self.scene.profile[i].astype(images.dtype))
         along = images.reshape(len(images), p.size) @ p.ravel() / max((p * p).sum(), 1e-30)
         images -= along[:, None, None] * p
-        inside = self.morphs[i] > 0
-        if not self.scene.fixed[i] and not inside.all():
-            images *= inside
         return along.astype(np.float64)
+
+    def _held(self, i, images):
+        """What the data pull of images (k, ny, nx) where the bound holds the morphology (k,)."""
+        held = self.morphs[i] <= 0
+        if self.scene.fixed[i] or not held.any():
+            return np.zeros(len(images))
+        return (images[:, held] @ self.pulls[i][held].astype(images.dtype)).astype(np.float64)
 
     def _change(self, i, images):
         """What images (k, ny, nx) of scatter 1 change of flux and second moment [fixed errors]."""

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.linalg.blas import strmm
 
 from .blocks import RIDGE, Factor
+from .bounds import pulls
 from .errors import Draws, Errors
 from .exposure import Exposure
 from .modes import FLOOR, Solution
@@ -27,6 +28,7 @@ class Posterior:
 
     modes (n): arrays (k, ny, nx), beyond (n): see Solution.modes; layout: Layout; matrix: Blocks;
         factor: its Factor; covariance: Blocks of the inverse, for the same nodes
+    released: arrays, for each node what its unknowns change by without the bound of bounds.py
 
     Raises LinAlgError where the matrix is not positive definite.
     """
@@ -34,8 +36,7 @@ class Posterior:
     def __init__(self, solution, exposures, *, fit_sky=False, fit_shifts=False):
         n, n_channels = solution.spectra.shape
         self.solution = solution
-        pairs = [solution.modes(i) for i in range(n)]
-        images, self.beyond = [m for m, _ in pairs], [far for _, far in pairs]
+        images, self.beyond, held = zip(*(solution.modes(i) for i in range(n)), strict=True)
         self.modes = [m[1:] for m in images]
         self.layout = Layout(
             np.array([len(m) for m in self.modes]),
@@ -48,6 +49,10 @@ class Posterior:
         )
         self.factor = Factor(self.matrix)
         self.covariance = self.factor.inverse()
+        right = [np.zeros(size) for size in self.layout.sizes]
+        for own, pull in zip(right, held, strict=False):
+            own[: len(pull)] = pull
+        self.released = self.factor.solve(right)
 
     def errors(self, owner, n_sources, unit, flux_floor) -> Errors:
         """The Errors of sources, component i belonging to source owner[i] (n,).
@@ -74,12 +79,18 @@ class Posterior:
         between[:, np.arange(n_sources), np.arange(n_sources)] += floor.T**2
         colour += floor[:, :, None] * floor[:, None, :]
         error = np.sqrt(np.diagonal(colour, axis1=1, axis2=2))
+        released = np.zeros(flux.shape)
+        for s, slope, change in zip(owner, slopes, self.released, strict=False):
+            released[s] += slope @ change
+        moments, moved = self._moments(owner, n_sources, error)
         return Errors(
             between * unit[:, None, None] ** 2,
             colour * unit[:, None] * unit,
-            self._moments(owner, n_sources, error),
+            moments,
             tuple(self._map(i) for i in range(len(self.modes))),
             np.array([far.sums for far in self.beyond]),
+            released * unit,
+            moved,
         )
 
     def draws(self, unit) -> Draws:
@@ -99,8 +110,9 @@ class Posterior:
         return flux, slopes
 
     def _moments(self, owner, n_sources, error):
-        """Covariances (S, 5, 5) of centroids and second moments; error (S, C): of the fluxes."""
-        s, out = self.solution, np.full((n_sources, 5, 5), np.nan)
+        """Covariances (S, 5, 5) of centroids and second moments, and what they change by (S, 5)
+        without the bound; error (S, C): of the fluxes."""
+        s, out, moved = self.solution, np.full((n_sources, 5, 5), np.nan), np.zeros((n_sources, 5))
         for source in np.unique(owner):
             own = np.flatnonzero(owner == source)
             weight = np.where(error[source] > 0, 1 / np.maximum(error[source], 1e-30), 0)
@@ -125,7 +137,8 @@ class Posterior:
             if s.scene.fixed[own].all():
                 covariance[2:] = covariance[:, 2:] = np.nan
             out[source] = covariance
-        return out
+            moved[source] = sum(row @ self.released[i] for i, row in zip(own, rows, strict=True))
+        return out, moved
 
     def _map(self, i):
         """Standard deviation (ny, nx) of component i's morphology."""
@@ -183,6 +196,7 @@ def posterior_of(fit, morphs, peaks, seen):
         fit.findings,
         _local_chi2(seen, fit.views),
         settings.prior,
+        pulls(scene, fit.views, fit.start.source, seen),
     )
     pairs = zip(fit.views, fit.blend.observations, strict=True)
     exposures = [Exposure.of(view, fit.frame, o, fit.start.source) for view, o in pairs]
