@@ -206,7 +206,7 @@ def slopes(function, n, step=1e-5):
 
 def test_errors_follow_from_the_covariance_of_all_unknowns():
     """Fluxes, colours, shapes and maps, by finite differences; in counts; with the floor, which
-    grows with the square of a component's structure."""
+    grows with the cube of a component's structure."""
     made, covariance = made_up(np.random.default_rng(0))
     n, unit, floor = len(covariance), np.array([10.0, 3.0]), 0.02
     errors = made.errors(OWNER, 2, unit, floor)
@@ -217,7 +217,7 @@ def test_errors_follow_from_the_covariance_of_all_unknowns():
     np.testing.assert_allclose(errors.released, wanted, rtol=1e-6)
     own = np.zeros((2, 2))
     for i, (morph, far, spectrum) in enumerate(shifted(made, np.zeros(n))):
-        own[OWNER[i]] += floor * (1.0 + i) ** 2 * spectrum * (morph.sum() + far[0])
+        own[OWNER[i]] += floor * (1.0 + i) ** 3 * spectrum * (morph.sum() + far[0])
     for c in range(2):
         wanted = full[:, c, :, c] + np.diag(own[:, c] ** 2)
         np.testing.assert_allclose(errors.flux[c], wanted * unit[c] ** 2, rtol=1e-5)

@@ -154,13 +154,13 @@ def test_stars(device):
 
 
 def test_the_floor_is_added_in_quadrature_and_leaves_colours(device, fitted, monkeypatch):
-    """Times the square of how unlike smooth profiles the sources are, found to be near 1."""
+    """Times the cube of how unlike smooth profiles the sources are, found to be near 1."""
     kept = capture(monkeypatch)
     floored = scenes.fit(blend(BRIGHT), device, settings=Settings(flux_floor=0.01))
     flux = fluxes(fitted)[0] - fitted.errors.released
     unlike = np.array([kept[0].posterior.solution.unlikeness(i) for i in (0, 1)])
     assert ((unlike > 0.5) & (unlike < 1.5)).all()
-    floor = 0.01 * unlike[:, None] ** 2 * flux
+    floor = 0.01 * unlike[:, None] ** 3 * flux
     np.testing.assert_allclose(errors(floored) ** 2, errors(fitted) ** 2 + floor**2, rtol=1e-6)
     for a, b, f in zip(fitted.errors.colour, floored.errors.colour, flux, strict=True):
         slope = np.array([1 / f[0], -1 / f[1], 0])  # of ln(f_0 / f_1)

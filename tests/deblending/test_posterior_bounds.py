@@ -87,4 +87,4 @@ def test_fluxes_of_bright_galaxies_are_not_biased_by_noise(device):
     released = np.array([r.errors.released[0] for r in results])
     assert (released < 0).mean() > 0.9
     bias, before = (((f.mean(0) - FLUX) / error).mean() for f in (found, found - released))
-    assert abs(bias) < 0.1 < before
+    assert before > 0.2 and abs(bias) < 0.5 * before, (bias, before)

@@ -9,7 +9,7 @@ from helpers import scenes
 from clresample.deblending.posterior import posterior
 from clresample.deblending.posterior.bumps import _gaussians
 from clresample.deblending.posterior.errors import Draws
-from clresample.deblending.posterior.modes import STRENGTH, Solution
+from clresample.deblending.posterior.modes import STRENGTH, Solution, power_of
 from clresample.deblending.posterior.normal import Layout, _by_channel
 from clresample.deblending.posterior.posterior import _local_chi2
 from clresample.deblending.posterior.profile_modes import Beyond, profile_modes
@@ -62,9 +62,10 @@ def test_unlikeness_is_what_the_scale_next_to_two_pixels_shows(chi2):
     assert one.unlikeness(0) == pytest.approx(wanted) and one.unlikeness(1) == 1
     assert STRENGTH == 0.05
     np.testing.assert_allclose(
-        one.strengths(0), [0.01 * wanted**1.5, 0.05 * wanted, 0.03 * wanted**1.5]
+        one.strengths(0), [0.01 * wanted**2.5, 0.05 * wanted, 0.03 * wanted**2.5]
     )
     np.testing.assert_array_equal(one.findings.strengths[0], [0.01, 0.05, 0.03])  # left as it is
+    assert [power_of(unlike, 2.0) for unlike in (0.5, 3.0, 7.0)] == [0.25, 9.0, 9.0]
 
 
 def test_what_bumps_change_counts_in_errors_of_flux_and_size():
@@ -163,7 +164,7 @@ def test_light_beyond_a_box_is_that_of_a_morphology_of_maximum_1():
 
 
 def test_how_far_profiles_and_places_may_be_off():
-    """A tenth of a pixel; of the peak 0.2 in the core and 0.03 in the halo, or a part of those; a
+    """A tenth of a pixel; of the peak 0.1 in the core and 0.02 in the halo, or a part of those; a
     galaxy's parameters and a star's place as expected at the start."""
     home, position = scenes.frame(), np.array([10.0, 11.0])
     galaxy, star, box = Galaxy(home), Star(home, free=True), np.ones((9, 9))
@@ -174,7 +175,7 @@ def test_how_far_profiles_and_places_may_be_off():
     for shape, theta, wanted in kinds:
         for radial in (1.0, 0.5):
             _, scatter, _ = profile_modes(shape, theta, position, box, [6, 7], radial=radial)
-            np.testing.assert_allclose(scatter, [*wanted, 0.2 * radial, 0.03 * radial])
+            np.testing.assert_allclose(scatter, [*wanted, 0.1 * radial, 0.02 * radial])
     assert profile_modes(star, np.zeros(2), position, box, [6, 7])[1] is star.scatter
 
 

@@ -11,7 +11,7 @@ from .blocks import RIDGE, Factor
 from .bounds import pulls
 from .errors import Draws, Errors
 from .exposure import Exposure
-from .modes import FLOOR, Solution
+from .modes import FLOOR, Solution, power_of
 from .moments import moments_of
 from .normal import Layout, normal_matrix
 
@@ -75,7 +75,8 @@ class Posterior:
         floor = np.zeros(flux.shape)
         for i, slope in enumerate(slopes):
             own = self.solution.spectra[i] * slope[0, -n_channels]  # its flux
-            floor[owner[i]] += flux_floor * self.solution.unlikeness(i) ** FLOOR * own
+            unlike = power_of(self.solution.unlikeness(i), FLOOR)
+            floor[owner[i]] += flux_floor * unlike * own
         between[:, np.arange(n_sources), np.arange(n_sources)] += floor.T**2
         colour += floor[:, :, None] * floor[:, None, :]
         error = np.sqrt(np.diagonal(colour, axis1=1, axis2=2))
