@@ -201,7 +201,8 @@ def test_unknowns_are_modes_spectra_sky_levels_and_shifts_of_all_but_the_first(m
     """The first image of a component is its morphology, the others are its modes."""
     monkeypatch.setattr(posterior, "normal_matrix", lambda *given: given[-1])
     asked = []
-    factor = SimpleNamespace(inverse=lambda: None, solve=asked.append)
+    known = SimpleNamespace(block=lambda i, j: np.diag([4.0, 0.25, 1, 1, 1, 1, 1]) / 2)
+    factor = SimpleNamespace(inverse=lambda: known, solve=asked.append)
     monkeypatch.setattr(posterior, "Factor", lambda _: factor)
     images = [np.arange(k).reshape(k, 1, 1) for k in (1, 3)]
     one = SimpleNamespace(
@@ -217,6 +218,8 @@ def test_unknowns_are_modes_spectra_sky_levels_and_shifts_of_all_but_the_first(m
         right = [part.tolist() for part in asked.pop()]
         n_common = [5 * sky + 4 * shifts] if sky or shifts else []
         assert right == [[0.0] * 5, [1.0, 2.0] + [0.0] * 5, *([0.0] * n for n in n_common)]
+    made._released([np.zeros(0), np.array([30.0, -40.0])])  # by sqrt(2000) errors
+    np.testing.assert_allclose(asked.pop()[1][:2], np.array([30, -40]) * 3 / np.sqrt(2000))
 
 
 def test_the_bound_holds_modes_where_there_is_no_light():

@@ -17,6 +17,10 @@ from .normal import Layout, normal_matrix
 
 # Least error of a spectrum at fixed morphology, relative to it: smaller ones are rounding.
 LEAST_ERROR = 1e-9
+# [sigma] How far one component is released from the bound at 0 at most. Noise holds 98 in 100
+# simulated galaxies back by less; galaxies with negative light, of which images of COSMOS have
+# much, by up to 600, and no morphology should take that to its neighbours.
+MOST_RELEASED = 3.0
 
 
 class Posterior:
@@ -49,10 +53,16 @@ class Posterior:
         )
         self.factor = Factor(self.matrix)
         self.covariance = self.factor.inverse()
+        self.released = self._released(held)
+
+    def _released(self, held):
+        """See the class; held (n): arrays (k,), what the data pull of each component's modes."""
         right = [np.zeros(size) for size in self.layout.sizes]
-        for own, pull in zip(right, held, strict=False):
-            own[: len(pull)] = pull
-        self.released = self.factor.solve(right)
+        for i, pull in enumerate(held):
+            k = len(pull)
+            steps = np.sqrt(pull @ self.covariance.block(i, i)[:k, :k] @ pull)
+            right[i][:k] = pull * min(1, MOST_RELEASED / max(steps, 1e-30))
+        return self.factor.solve(right)
 
     def errors(self, owner, n_sources, unit, flux_floor) -> Errors:
         """The Errors of sources, component i belonging to source owner[i] (n,).
