@@ -73,13 +73,13 @@ COLUMNS = (
 
 
 class Stages(Progress):
-    """Processor time [s] of this process when each stage began."""
+    """Processor time [s] of this process when each stage began, without that of the TreeMemory."""
 
-    def __init__(self):
-        self.began = {}
+    def __init__(self, memory):
+        self.memory, self.began = memory, {}
 
     def stage(self, name, total):
-        self.began.setdefault(name, time.process_time())
+        self.began.setdefault(name, time.process_time() - self.memory.spent_s)
 
 
 def halo_of(mosaic, n_pixels, survey_of_noise):
@@ -121,7 +121,8 @@ def written(folder, size, options, bands):
 
 def row_of(toml, out, size, workers, own):
     """The row of one run, without what compares it with others."""
-    field, stages, memory = read_field(toml), Stages(), TreeMemory(os.getpid())
+    field, memory = read_field(toml), TreeMemory(os.getpid())
+    stages = Stages(memory)
     memory.start()
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     start = time.process_time()
@@ -131,6 +132,7 @@ def row_of(toml, out, size, workers, own):
     wall_s, own_s = time.perf_counter() - began, time.process_time() - start
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     memory.stop()
+    own_s -= memory.spent_s
     theirs_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     dealing_s = stages.began["write"] - stages.began["fit"]
     table, blends = QTable.read(out / "catalogue.fits"), QTable.read(out / "blends.ecsv")

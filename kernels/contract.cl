@@ -30,6 +30,10 @@
  * Terms are summed in stretches of `block` and the stretches' sums in a second set of registers:
  *   rounding then grows with the root of block + k / block, not of k.  Their order: `inward`, see
  *   contract.h.
+ * READ_AHEAD: while a tile is multiplied, the columns of B that the next work-item reads are
+ *   fetched into the core's second cache, a row of each KU for each tile.  They lie a row of B
+ *   apart, which is slow to come from memory.  After the last columns of B come the first of the
+ *   next item's.
  * Rows beyond m read row m - 1 again and are not stored.
  *
  * Epilogue, at most one of (rows 2i, 2i+1 hold the cos and sin parts of row frequency i):
@@ -47,6 +51,13 @@
  * Launch: global = (ceil(n_pad / (NV VW)), ceil(m / (MR RT)), batch), each rounded up to its
  *   local size.
  */
+#ifndef READ_AHEAD  /* 1: fetch the next columns of B meanwhile, by a builtin of clang and GCC */
+#define READ_AHEAD 0
+#endif
+#if READ_AHEAD
+#define AHEAD(from, step) \
+    __builtin_prefetch((const void *)(size_t)((from) + next + (step) * skipped), 0, 2);
+#endif
 #include "contract.h"
 
 #ifndef RT          /* tiles that a work-item owns, one below the other */
@@ -82,12 +93,19 @@ void contract(int m, int n, const int n_pad, int k, const int block,
 
     int column[NV];
     UNROLL(v, NV) column[v] = j0 + v * VW < width ? j0 + v * VW : j0;
+    const int terms = j0 < n ? k : 0;           /* beyond n all sums are zero */
     const int bottom = m - top < MR * RT ? m : top + MR * RT;
+#if READ_AHEAD
+    const long next = j0 + NV * VW < width ? j0 + NV * VW : stride_b;
+#endif
     for (int i0 = top; i0 < bottom; i0 += MR) {
         __global const REAL *row[MR];
         WIDE acc[MR][NV];
+#if READ_AHEAD
+        const long skipped = (i0 - top) / MR % KU * (long)n_pad;
+#endif
         UNROLL(i, MR) row[i] = A + (size_t)(i0 + i < m ? i0 + i : m - 1) * ld_a;
-        SUM_INSIDE(width - j0, m - i0, acc, row, B, n_pad, column, k, block, inward)
+        SUM_INSIDE(n - j0, m - i0, acc, row, B, n_pad, column, terms, block, inward)
 
 #include "contract_end.h"
     }

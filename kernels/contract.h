@@ -39,6 +39,13 @@
 #define SIGN 1
 #endif
 
+#ifndef KU          /* terms that a turn of the loop adds: with 1, counting takes 6 % of the time */
+#define KU 4
+#endif
+#ifndef AHEAD       /* what a kernel reads ahead of a turn's terms, which begin at `from` in B */
+#define AHEAD(from, step)
+#endif
+
 #ifndef OWN         /* 1: items have sizes and tables of their own, see contract.cl */
 #define OWN 0
 #endif
@@ -84,39 +91,56 @@
 
 #define UNROLL(i, n) _Pragma("unroll") for (int i = 0; i < (n); ++i)
 
-/* part[mr][nv] += row[i][l STEP_A] times the vectors at B + l ld_b + column[v], nv of them. */
-#define ADD_TERM(mr, nv, l, row, B, ld_b, column) \
-    UNROLL(v, nv) right[v] = AT(const WIDE, (B) + (size_t)(l) * (ld_b) + column[v]); \
+/* part[mr][nv] += row[i][l STEP_A] times the vectors at from + column[v], nv of them. */
+#define ADD_TERM(mr, nv, l, row, from, column) \
+    UNROLL(v, nv) right[v] = AT(const WIDE, (from) + column[v]); \
     UNROLL(i, mr) UNROLL(v, nv) part[i][v] += row[i][(l) * STEP_A] * right[v];
 
-/* sums[mr][nv] = the terms l < k, in blocks of `block` and in the order above. A loop for each
- * direction: one with a step that is a variable takes 4 % longer. */
-#define SUM_TERMS(mr, nv, sums, row, B, ld_b, column, k, block, inward) \
-    for (int turn = 0; turn * (block) < (k); ++turn) { \
-        const int rest = (k) - turn * (block), n_terms = rest < (block) ? rest : (block); \
-        const int gone = ((inward) ? turn / 2 : turn) * (block); \
+/* sums[mr][nv] += the next stretch of `block` terms, or of those that remain: from l on, whose row
+ * of B is at `from`, upwards or downwards as `step` is 1 or -1. Both go on with the next stretch of
+ * that direction: found anew for each of them, they would take 6 % of the time. */
+#define ADD_STRETCH(mr, nv, sums, row, l, step, from, ld_b, column, block) { \
+        int n_terms = remain < (block) ? remain : (block); \
         WIDE part[mr][nv], right[nv]; \
         UNROLL(i, mr) UNROLL(v, nv) part[i][v] = (WIDE)(0); \
-        if ((inward) && turn % 2 == 0) \
-            for (int l = gone; l < gone + n_terms; ++l) { \
-                ADD_TERM(mr, nv, l, row, B, ld_b, column) \
+        remain -= n_terms; \
+        for (; n_terms >= KU; n_terms -= KU) { \
+            AHEAD(from, step) \
+            UNROLL(u, KU) { \
+                ADD_TERM(mr, nv, l + (step) * u, row, from + (step) * u * (long)(ld_b), column) \
             } \
-        else \
-            for (int l = (k) - 1 - gone; l >= (k) - gone - n_terms; --l) { \
-                ADD_TERM(mr, nv, l, row, B, ld_b, column) \
-            } \
-        if (turn == 0) { \
-            UNROLL(i, mr) UNROLL(v, nv) sums[i][v] = part[i][v]; \
-        } else { \
-            UNROLL(i, mr) UNROLL(v, nv) sums[i][v] += part[i][v]; \
+            l += (step) * KU; \
+            from += (step) * KU * (long)(ld_b); \
+        } \
+        for (; n_terms > 0; --n_terms) { \
+            ADD_TERM(mr, nv, l, row, from, column) \
+            l += (step); \
+            from += (step) * (long)(ld_b); \
+        } \
+        UNROLL(i, mr) UNROLL(v, nv) sums[i][v] += part[i][v]; \
+    }
+
+/* sums[mr][nv] = the terms l < k, in stretches of `block` and in the order above. A loop for each
+ * direction: one with a step that is a variable takes 4 % longer. */
+#define SUM_TERMS(mr, nv, sums, row, B, ld_b, column, k, block, inward) { \
+        int remain = (k); \
+        long up = 0, down = (k) - 1; \
+        __global const REAL *from_up = (B), *from_down = (B) + down * (ld_b); \
+        UNROLL(i, mr) UNROLL(v, nv) sums[i][v] = (WIDE)(0); \
+        while (remain > 0) { \
+            if (inward) \
+                ADD_STRETCH(mr, nv, sums, row, up, 1, from_up, ld_b, column, block) \
+            ADD_STRETCH(mr, nv, sums, row, down, -1, from_down, ld_b, column, block) \
         } \
     }
 
 /* The same of a tile of MR rows and NV vectors of which the columns from `inside` on and the rows
  * from `below` on count for nothing: of the last tile of a row, one vector alone is summed where it
- * is the only one inside, and of the last of a column, two rows alone likewise. */
+ * is the only one inside, and the others are zero; of the last of a column, two rows alone, and
+ * the others are left as they were. */
 #define SUM_INSIDE(inside, below, sums, row, B, ld_b, column, k, block, inward) \
     if (NV > 1 && (inside) <= VW) { \
+        UNROLL(i, MR) UNROLL(v, NV) sums[i][v] = (WIDE)(0); \
         SUM_TERMS(MR, 1, sums, row, B, ld_b, column, k, block, inward) \
     } else if (MR > 2 && (below) <= 2) { \
         SUM_TERMS(2, NV, sums, row, B, ld_b, column, k, block, inward) \

@@ -7,6 +7,7 @@ fills each new buffer of a device with NaN, so that a kernel that reads what nob
 
 import os
 import shutil
+import signal
 import tempfile
 from pathlib import Path
 
@@ -22,6 +23,9 @@ from helpers.buffers import Guards, fill_with_nan
 from helpers.checkout import ROOT
 
 from clresample import Device, DeviceError, get_device, list_devices
+
+# Shells start what runs in the background with Ctrl-C ignored, and children inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 NO_DOUBLE = "has no double precision: use float32"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from pathlib import Path
 
 LOOK_S = 0.25  # [s] between two looks: what comes and goes faster is missed
@@ -10,7 +11,7 @@ LOOK_S = 0.25  # [s] between two looks: what comes and goes faster is missed
 
 class TreeMemory(threading.Thread):
     """Watches the memory of a process's tree: `peak` [bytes] of all at once, `largest` of one
-    process, 0 where the system does not tell.
+    process, 0 where the system does not tell; `spent_s` [s]: processor time of watching.
 
     Proportional set size: pages that several processes share are counted once in all.
     """
@@ -18,11 +19,13 @@ class TreeMemory(threading.Thread):
     def __init__(self, pid):
         super().__init__(daemon=True)
         self.pid, self.peak, self.largest, self.over = pid, 0, 0, threading.Event()
+        self.spent_s = 0.0
 
     def run(self):
         while not self.over.wait(LOOK_S):
             sizes = [proportional(pid) for pid in tree(self.pid)]
             self.peak, self.largest = max(self.peak, sum(sizes)), max(self.largest, *sizes)
+            self.spent_s = time.thread_time()
 
     def stop(self):
         """End the watch; returns the peak [bytes]."""

@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 
+from .posterior.exchange import exchange_of
 from .resize import resized
 from .shifts import ahead, shift_steps
 from .solver.engine import Engine
@@ -22,6 +23,11 @@ REPACK = 0.25
 # A fit under a LearnedPrior stays where it is if the next shift would lower its loss by less than
 # this part of what ends it.
 LEAST_GAIN = 0.5
+# [iterations] When a fit whose strengths have settled takes a step of its Exchange: at first, and
+# between two; also where it has converged. Every 40 of them, bright scenes take a third longer.
+FIRST_EXCHANGE, EXCHANGE = 40, 20
+# It takes the step if its loss is expected to fall by more than this part of what ends it.
+LEAST_EXCHANGE = 0.5
 # [iterations] between two adjustments of the boxes to the light they hold; each makes a new batch.
 RESIZE = 40
 
@@ -136,18 +142,21 @@ class _Learning:
     """The fits of one engine under a LearnedPrior, on their way; else as _Running.
 
     Boxes stay as they are: structure fades at their edges, as the profile does that they follow.
+
+    exchanges (B): each fit's Exchange, or None; asked (B, 2): a fit's rounds and loss when that was
+        last looked at, 0 and infinite before
     """
 
-    def __init__(self, fits, settings, device, dtype, engine=None):
+    def __init__(self, fits, settings, device, dtype, past=None):
         self.fits, self.settings, self.device, self.dtype = list(fits), settings, device, dtype
-        self.engine = engine or LearnedEngine(
-            [f.scene for f in fits],
-            [f.state for f in fits],
-            device,
-            dtype,
-            settings.prior,
-            settings.enough,
-        )
+        if past is None:
+            self.exchanges, self.asked = [None] * len(fits), np.tile([0, np.inf], (len(fits), 1))
+            scenes, states = [f.scene for f in fits], [f.state for f in fits]
+            self.engine = LearnedEngine(
+                scenes, states, device, dtype, settings.prior, settings.enough
+            )
+        else:
+            self.engine, self.exchanges, self.asked = past
 
     @property
     def live(self):
@@ -170,6 +179,7 @@ class _Learning:
         while self.n_steps < n_steps and self.live.any():
             for i in np.flatnonzero(engine.round()):
                 self.fits[i].losses.append(float(engine.progress.loss[i]))
+            self._exchange(live)
         if self.settings.fit_shifts and self.n_steps < self.settings.max_iter:
             self._move(live & engine.progress.converged)
         over = self.live if self.n_steps >= self.settings.max_iter else np.zeros_like(live)
@@ -200,6 +210,32 @@ class _Learning:
         if moved.any():
             self.engine.follow_shifts(moved)
 
+    def _exchange(self, which):
+        """Let those of the fits (B,) whose time has come take a step of their Exchange, if it gains
+        enough; those that have converged then go on."""
+        engine, p = self.engine, self.engine.progress
+        enough = LEAST_EXCHANGE * self.settings.enough * p.chi2()
+        rounds, loss = self.asked.T
+        due = p.n_rounds >= np.maximum(rounds + EXCHANGE, FIRST_EXCHANGE)
+        which = which & (p.converged | (p.live & p.settled & due)) & (p.loss < loss - enough)
+        if not which.any() or self.n_steps >= self.settings.max_iter:
+            return
+        new = which & (rounds == 0)
+        self.asked[which] = np.stack([p.n_rounds, p.loss], axis=1)[which]
+        if new.any():
+            states, findings = engine.states(), engine.findings(new)
+            for i in np.flatnonzero(new):
+                given = engine.scenes[i], states[i], findings[i]
+                self.exchanges[i] = exchange_of(self.fits[i], *given)
+        slopes, steps = engine.slopes(which), {}
+        for i in np.flatnonzero(which):
+            if self.exchanges[i] is not None:
+                *step, gain = self.exchanges[i].step(slopes[i])
+                if gain > enough[i]:
+                    steps[i] = step
+        if steps:
+            engine.step(steps)
+
     def settle(self, stop):
         """Leave the fits (B,) that stop here with their present state."""
         states, p = self.engine.states(), self.engine.progress
@@ -214,5 +250,6 @@ class _Learning:
         if (~self.live).mean() < REPACK:
             return self
         keep = np.flatnonzero(self.live)
-        fits, engine = [self.fits[i] for i in keep], self.engine.take(keep)
-        return _Learning(fits, self.settings, self.device, self.dtype, engine)
+        fits, exchanges = ([some[i] for i in keep] for some in (self.fits, self.exchanges))
+        past = self.engine.take(keep), exchanges, self.asked[keep]
+        return _Learning(fits, self.settings, self.device, self.dtype, past)

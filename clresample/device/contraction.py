@@ -21,6 +21,8 @@ SUM_BLOCK = 64
 # stay in its core's first cache. With 1 products take 3 to 8 % longer on AVX2, with 16 as long, and
 # a single image has fewer work-items for many cores.
 ROW_TILES = 8
+# Terms that a turn of its loop adds, KU of contract.h: stretches are a multiple of them.
+TERMS = 4
 # Terms that the kernel for groups sums in one go: a second sum takes half of a GPU's registers.
 ONE_SUM = 256
 
@@ -33,10 +35,11 @@ def padded(n: int) -> int:
 def stretch(k: int) -> int:
     """Terms of k that are summed at a stretch: a half of them, or as many for each end.
 
-    sqrt(k) if that is more than SUM_BLOCK, so that stretches and their sum round alike
+    sqrt(k) if that is more than SUM_BLOCK, so that stretches and their sum round alike. A multiple
+    of TERMS: the last one of each end alone has terms left that are added one by one
     """
     n_stretches = 2 * max(1, -(-k // (2 * SUM_BLOCK)))
-    return max(math.isqrt(k), -(-k // n_stretches))
+    return -(-max(math.isqrt(k), -(-k // n_stretches)) // TERMS) * TERMS
 
 
 class Matrix(NamedTuple):
@@ -126,11 +129,12 @@ class Contraction:
         self.options = {"SIGN": -1 if adjoint else 1, "RAGGED": ragged, "STRIDED": strided}
         self.options |= {epilogue: True} if epilogue else {}
 
-    def build(self, n_rows=None, n_terms=0, n_pad=0):
+    def build(self, n_rows=None, n_terms=0, n=0):
         """(file, macros) for matrices of so many rows, terms and columns; of most, if not given."""
         tile = self.tuning.tile_for(n_rows) if n_rows else self.tuning.tile
         if "KB" not in tile:
-            return FILE, self.options | {"RT": ROW_TILES} | self.tuning.tile_for_columns(n_pad)
+            own = {"RT": ROW_TILES, "READ_AHEAD": self.tuning.reads_ahead}
+            return FILE, self.options | own | self.tuning.tile_for_columns(n, padded(n))
         return GROUP_FILE, self.options | tile | {"TWO_SUMS": n_terms > ONE_SUM}
 
     def bind(
@@ -147,7 +151,7 @@ class Contraction:
         # one right factor for all: the rows of all items are those of one tall matrix
         whole_a = a.step == 1 and a.stride == m * a.ld and a.div == 1
         tall = e is None and b.stride == 0 and whole_a and c.step == 1 and c.stride == m * c.ld
-        file, tile = self.build(None if tall else m, k, padded(n))
+        file, tile = self.build(None if tall else m, k, n)
         tile = tile | {"OWN": own is not None}
         which = own and own.which
         sizes = own and self.device.put(own.sizes(m, n, k), np.int32)

@@ -234,6 +234,8 @@ def unusable_cache():
 
 
 def load_pyopencl():
+    if os.environ.get("POCL_CACHE_DIR") == "":
+        del os.environ["POCL_CACHE_DIR"]  # an empty one ends the process in PoCL 3.1
     try:
         import pyopencl
     except ImportError as error:

@@ -31,9 +31,9 @@ def write_mosaics(folder, job, parts, last):
         model = mapped_array(scratch, np.float32, shape)
         for i, part in enumerate(parts):
             chosen = {patch for patch, k in last.items() if k == i}
-            for _, i_model, box, image in part.models(chosen):
+            for _, _, box, image in part.models(chosen, i_mosaic) if chosen else ():
                 both = box.meet(here)
-                if i_model == i_mosaic and both.area:
+                if both.area:
                     model[:, *both.within(here).slices] += image[:, *both.within(box).slices]
         header = mosaic.grid.cutout(*here[:2], here.shape).to_wcs().to_header(relax=True)
         for i, channel in enumerate(mosaic.channels):

@@ -125,13 +125,17 @@ class Channel:
         if self.weight is None:
             raise ValueError(f"weight of channel {self.name!r} is None, it takes a plane")
         values = np.asarray(self.weight.read(box), dtype=np.float64)
-        if self.kind != "weight":
+        if self.kind == "weight":
+            bad = ~np.isfinite(values) | (values < 0)
+        else:
             variance = values**2 if self.kind == "rms" else values
-            good = np.isfinite(variance) & (variance >= np.finfo(np.float64).tiny)
+            good = (variance >= np.finfo(np.float64).tiny) & (variance < np.inf)  # no NaN is
             values = np.divide(1.0, variance, out=np.zeros(variance.shape), where=good)
-        bad = ~np.isfinite(values) | (values < 0)
+            if self.mask is None:
+                return values
+            bad = ~good
         if self.mask is not None:
-            bad |= self.masked(box) if masked is None else masked
+            bad = bad | (self.masked(box) if masked is None else masked)
         return np.where(bad, 0.0, values)
 
     @property

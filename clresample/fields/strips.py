@@ -11,9 +11,12 @@ from astropy.io import fits
 # [px] Rows that are kept together, in whole tiles: about the side of a small blend's cutout. Fewer
 # are more entries, more are decoded for a cutout that is the only one there.
 STRIP_PX = 64
-# [bytes] of all strips: those of ten planes of 4000 pixels a side along one row of blends. With
-# less each blend decodes its rows again, 1 ms a plane and 1000 columns.
-MOST_BYTES = 64 << 20
+# [bytes] of all strips: a field of 4096 pixels a side, with six bands in pixels twice as large and
+# the errors of all, has 350 MB of them. The blends of a group lie all over a field. With 64 MB each
+# decoded its rows again: 7.6 GB of that field in all, at 160 MB a second a fifth of a run's time.
+MOST_BYTES = 384 << 20
+# Part of the memory that a process is bound to which they may take.
+PART = 0.1
 # Part of them that the rows of one box may take; larger ones would drive out all others.
 LARGEST = 0.25
 BYTES = 4  # [bytes] of a pixel, of most images
@@ -31,6 +34,10 @@ class Strips:
         self.most, self.n_bytes = most, 0
         self._kept: OrderedDict[tuple, np.ndarray] = OrderedDict()
         self._lock = threading.Lock()
+
+    def hold(self, bound):
+        """Keep within a part of the memory [bytes] that this process may take; None = any."""
+        self.most = MOST_BYTES if bound is None else min(MOST_BYTES, int(PART * bound))
 
     def read(self, hdu, plane, box) -> np.ndarray | None:
         """The pixels of a Box of an HDU's plane (its number, None where there is one); None where

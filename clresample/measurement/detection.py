@@ -136,15 +136,21 @@ def detect_more(result, *, threshold=THRESHOLD) -> Detection:
             )
         )
     known = result.frame.place(result.sources)
-    return _search(left, result.frame, threshold, list(known), beside=False)
+    pixels = np.stack([*np.indices(result.frame.shape)], axis=-1)
+    places = [footprint.locate(pixels) for footprint in result.footprints]
+    return _search(left, result.frame, threshold, list(known), beside=False, places=places)
 
 
-def _search(observations, frame, threshold, known, scatters=None, beside=True):
-    """Detection in the observations, without the known positions (y, x) [model px]."""
+def _search(observations, frame, threshold, known, scatters=None, beside=True, places=None):
+    """Detection in the observations, without the known positions (y, x) [model px].
+
+    places: of the frame's pixels on each observation, see `signal_of`; None = by their grids
+    """
     if not 0 < threshold < math.inf:
         raise ValueError(f"threshold must be a positive number of sigmas, not {threshold}")
     sep = _import_sep()
-    signals = [signal_of(o, frame) for o in observations]
+    at = places or [None] * len(observations)
+    signals = [signal_of(o, frame, one) for o, one in zip(observations, at, strict=True)]
     if scatters is None:
         scatters = [signal.scatters() for signal in signals]
     signals = [one.over(scatter) for one, scatter in zip(signals, scatters, strict=True)]

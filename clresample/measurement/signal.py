@@ -84,13 +84,16 @@ class Signal:
         return np.where(inside, self.channels[:, places[:, 0], places[:, 1]], 0).T
 
 
-def signal_of(observation, frame) -> Signal:
-    """The Signal of an observation in a frame, under the filters of `WIDTHS_ARCSEC`."""
+def signal_of(observation, frame, places=None) -> Signal:
+    """The Signal of an observation in a frame, under the filters of `WIDTHS_ARCSEC`.
+
+    places (Ny, Nx, 2) [px]: of the frame's pixels on the observation; None = by their grids
+    """
     from scipy import fft
-    from scipy.ndimage import map_coordinates
 
     observation = observation.white
-    places = frame.grid.map_to(observation.grid).at(*np.indices(frame.shape))
+    if places is None:
+        places = frame.grid.map_to(observation.grid).at(*np.indices(frame.shape))
     sigmas = np.array(WIDTHS_ARCSEC) / observation.grid.pixel_scale_arcsec
     n_channels, *shape = observation.data.shape
     # zeros beyond the edges, wide enough for the PSF and four sigma of the widest filter
@@ -124,16 +127,35 @@ def signal_of(observation, frame) -> Signal:
             if w == 0:
                 channels[c] = images
                 seen += (variance > LEAST_WEIGHT * most).sum(axis=0, dtype=np.int16)
-    at = np.moveaxis(places, -1, 0)
-    order = 0 if np.abs(places - np.rint(places)).max(initial=0) < SAME_PX else 3
-    n_seen = map_coordinates(seen, at, order=0)
-    found = np.zeros((2, len(sigmas), *frame.shape), np.float32)
-    for total, image in zip(
-        totals.reshape(-1, *shape), found.reshape(-1, *frame.shape), strict=True
-    ):
-        map_coordinates(total, at, order=order, output=image)
-        image[n_seen == 0] = 0
+    found, n_seen = _in_frame(totals.reshape(-1, *shape), seen, places)
+    found = found.reshape(2, len(sigmas), *frame.shape)
     return Signal(found[0], np.maximum(found[1], 0), n_seen, channels, places)
+
+
+def _in_frame(images, seen, places):
+    """Images (n, My, Mx), and how many channels have seen each pixel, at places (Ny, Nx, 2) [px].
+
+    Images are interpolated, 0 where nothing was seen; where all places are pixels they are taken.
+    """
+    from scipy.ndimage import map_coordinates
+
+    nearest = np.rint(places)
+    found = np.zeros((len(images), *places.shape[:2]), np.float32)
+    if np.abs(places - nearest).max(initial=0) < SAME_PX:
+        size = np.array(seen.shape)
+        inside = ((nearest >= 0) & (nearest < size)).all(axis=-1)
+        at = np.clip(nearest, 0, size - 1).astype(np.intp)
+        at = at[..., 0] * size[1] + at[..., 1]
+        n_seen = np.where(inside, seen.ravel()[at], 0)
+        for total, image in zip(images, found, strict=True):
+            image[n_seen > 0] = total.ravel()[at[n_seen > 0]]
+        return found, n_seen
+    at = np.moveaxis(places, -1, 0)
+    n_seen = map_coordinates(seen, at, order=0)
+    for total, image in zip(images, found, strict=True):
+        map_coordinates(total, at, order=3, output=image)
+        image[n_seen == 0] = 0
+    return found, n_seen
 
 
 def combined(signals) -> tuple[np.ndarray, np.ndarray]:

@@ -61,9 +61,21 @@ def test_a_fixed_morphology_stays(build):
     assert not np.array_equal(now.spectra, state.spectra)
 
 
-def test_a_sky_step_is_half_of_newtons(device):
-    """Alone with the data it leaves half of the residual's mean."""
+def test_the_sky_of_a_channel_without_weight_stays(device):
+    scene, state = posed(device)
+    scene, state = changed(scene, state, weights=[scene.weights[0], 0 * scene.weights[1]])
+    e = engine([(scene, state)], device)
+    e.run(2)
+    sky = e.states()[0].sky
+    np.testing.assert_array_equal(sky[1:], state.sky[1:])
+    assert np.isfinite(sky[0]) and sky[0] != state.sky[0]
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-6])
+def test_a_sky_step_is_half_of_newtons(device, unit):
+    """Alone with the data it leaves half of the residual's mean, however faint the weights."""
     scene, state = posed(device, spectra=np.zeros((3, 3)), scale=np.zeros((3, 3)))
+    scene, state = changed(scene, state, weights=[unit * w for w in scene.weights])
     e = engine([(scene, state)], device)
     e.run(1)
     flat = [

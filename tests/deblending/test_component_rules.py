@@ -40,7 +40,7 @@ def fitted(spectra, sources=None, power=1.0, **given):
 
 def test_who_is_asked_for_a_gradient():
     """Sources above signal to noise 30 in more than one channel, whose components are open."""
-    spectra = [(24, 18.1), (24, 17.9), (90, 0), (90, 1)]
+    spectra = [(24, 18.1), (24, 17.9), (90, 0), (90, 1), (24, 18)]
     assert gradients._candidates(fitted(spectra)).tolist() == [0, 3]
     assert gradients._candidates(fitted(spectra, power=0.25)).tolist() == [3]
     kinds = [
@@ -225,3 +225,74 @@ def test_progress_goes_on_from_the_first_fits():
     fits = [SimpleNamespace(losses=[1] * n) for n in (7, 12)]
     second._after(fits, lambda n, loss: told.append((n, loss)))(5, 0.5)
     assert told == [(17, 0.5)] and second._after(fits, None) is None
+
+
+def test_morphologies_are_followed_by_the_cores_that_are_asked_about():
+    """Each core is the morphology times its profile, where it lies and with its source's PSF."""
+    rng = np.random.default_rng(3)
+    morphs, profile = ([rng.random((3 + i, 4)) for i in range(3)] for _ in range(2))
+    fit = SimpleNamespace(
+        scene=SimpleNamespace(profile=profile, origin=np.array([[1, 2], [3, 4], [5, 6]])),
+        state=SimpleNamespace(morph=morphs),
+        start=SimpleNamespace(source=np.array([0, 0, 1])),
+        padded=SimpleNamespace(shape=(40, 41)),
+        views=["a", "b"],
+    )
+    model = gradients.model_of(fit, [2, 0])
+    assert model.frame == (40, 41) and model.views == ["a", "b"] and model.bare == [None, None]
+    assert model.source.tolist() == [0, 0, 1, 1, 0]
+    assert model.origin.tolist() == [[1, 2], [3, 4], [5, 6], [5, 6], [1, 2]]
+    assert model.morphs[:3] == morphs and len(model.morphs) == 5
+    np.testing.assert_array_equal(model.morphs[3], morphs[2] * profile[2])
+    np.testing.assert_array_equal(model.morphs[4], morphs[0] * profile[0])
+    assert len(gradients.model_of(fit).morphs) == 3
+
+
+def test_misfits_are_chi2_of_all_observations(monkeypatch):
+    rng, views, observed = np.random.default_rng(5), [], []
+    spectra, sky, wanted = rng.random((2, 3)), rng.random(3), 0.0
+    parts = slice(0, 1), slice(1, 3)
+    for part in parts:
+        images = rng.random((2, part.stop - part.start, 4, 5))
+        observed.append(Rendered(images.shape, np.zeros((2, 2), int), images))
+        root, data = rng.random((2, *images.shape[1:]))
+        views.append(SimpleNamespace(root=root, data=data))
+        model = np.einsum("ic,icyx->cyx", spectra[:, part], images) + sky[part, None, None]
+        wanted += (root**2 * (data - model) ** 2).sum()
+    fit = SimpleNamespace(
+        views=views,
+        scene=SimpleNamespace(channels=lambda: parts),
+        settings=SimpleNamespace(fit_sky=True),
+    )
+    seen = SimpleNamespace(observed=observed, spectra=spectra, sky=sky)
+    monkeypatch.setattr(second, "model_of", lambda one: one)
+    monkeypatch.setattr(second, "see", lambda models, fit_sky: [seen] * len(models))
+    assert second._misfits([fit, fit]) == pytest.approx([wanted, wanted])
+
+
+def test_of_two_starts_the_one_that_fits_better_is_taken(monkeypatch):
+    """Of scenes with clear gradients alone."""
+
+    def clear(*which):
+        return SimpleNamespace(clear=np.array(which, int))
+
+    asked = [None, clear(1), clear(), clear(0, 2)]
+    fits = [
+        SimpleNamespace(
+            name=i,
+            patch=f"patch {i}",
+            start=SimpleNamespace(source=np.array([4, 5, 6])),
+            settings=SimpleNamespace(fit_sky=True),
+        )
+        for i in range(4)
+    ]
+    monkeypatch.setattr(second, "ask", lambda fits: asked)
+    monkeypatch.setattr(second, "_alone", lambda fit, one: f"alone {fit.name}")
+    monkeypatch.setattr(second, "_together", lambda patch, double: f"{patch} {double.tolist()}")
+    monkeypatch.setattr(second, "start", lambda patches, fit_sky=False: patches)
+    monkeypatch.setattr(second, "_joined", lambda begin, own, which: f"joined {own}")
+    monkeypatch.setattr(second, "_again", lambda fit, point: (fit.name, point))
+    monkeypatch.setattr(second, "_misfits", lambda fits: [3.0, 2.0, 1.0, 4.0][: len(fits)])
+    assert second._begun(fits) == {1: (1, "patch 1 [5]"), 3: (3, "joined alone 3")}
+    asked[1] = asked[3] = None
+    assert second._begun(fits) == {}

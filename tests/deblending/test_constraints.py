@@ -217,3 +217,14 @@ def test_wrong_arrays_are_named(device, boxes):
         MaxNorm().prox(morphs, placed, factor=device.zeros(3, np.float32))
     with pytest.raises(ValueError, match="active names source 10"):
         MaxNorm().prox(morphs, placed, active=[10])
+
+
+@pytest.mark.parametrize("norm", [ref.max_norm, ref.sum_norm])
+def test_what_holds_no_light_is_not_scaled(norm):
+    for image in (np.zeros((2, 3), np.float32), -np.ones((2, 3), np.float32)):
+        scaled, factor = norm(image)
+        np.testing.assert_array_equal(scaled, image)
+        assert factor == 1 and scaled.dtype == np.float32
+    scaled, factor = norm(np.array([[1.0, 0.0], [2.0, 1.0]]))
+    np.testing.assert_allclose(scaled * factor, [[1, 0], [2, 1]])
+    assert factor == (2 if norm is ref.max_norm else 4)

@@ -66,7 +66,7 @@ def test_weights_spread_over_the_model_keep_their_density(monkeypatch):
     """Of even weights turned by 30 degrees: what two pixels of noise 1 say, one of theirs does."""
     c, s = 0.8 * np.cos(np.pi / 6), 0.8 * np.sin(np.pi / 6)
     matrix = np.array([[c, -s], [s, c]])
-    n, shift = 60, np.array([0.3, -0.2])
+    n, shift = 60, np.array([2.3, -1.7])
 
     class Mapping:
         area, shape_in, shape_out, geometry = None, (24, 26), (n, n), "affine"

@@ -9,7 +9,8 @@ from helpers import scenes
 from clresample.deblending import batch, fit as fit_module
 from clresample.deblending.batch import _ManyFits
 from clresample.deblending.blend import Blend, Failure
-from clresample.deblending.fit import DIVERGED, PATIENCE, data_bytes, stop_reason
+from clresample.deblending.fit import DIVERGED, PATIENCE, Fit, data_bytes, stop_reason
+from clresample.deblending.settings import Settings
 from clresample.deblending.solver.scene import Scene
 from clresample.sky.sources import Extended, SourceWarning
 
@@ -41,6 +42,22 @@ def test_sources_outside_the_frame_are_named():
         "source 3 at (y, x) = (1.3, 4.0) [px] in the model frame lies far from any light: no image "
         "shows 3 sigma there or beside it"
     )
+
+
+@pytest.mark.parametrize("fit_shifts", [False, True])
+@pytest.mark.parametrize("shifts", [None, ((0, 0), (0, 0.4)), ((0, 0), (0.2, -0.3))])
+def test_shifts_that_are_known_are_taken_by_operators_of_ones_own(device, shifts, fit_shifts):
+    """Others share theirs."""
+    given = scenes.blend()
+    given = Blend(given.observations, given.sources, given.frame, shifts)
+    one, other = (
+        Fit(given, Settings(fit_shifts=fit_shifts), device, np.float32, pad=1) for _ in range(2)
+    )
+    np.testing.assert_array_equal(one.shifts, np.zeros((2, 2)) if shifts is None else shifts)
+    shared = not fit_shifts and not np.any(one.shifts)
+    assert [a.op is b.op for a, b in zip(one.views, other.views, strict=True)] == [shared] * 2
+    one.shift(one.shifts + [(0, 0), (0.1, 0.1)])
+    assert np.array_equal(one.shifts, other.shifts) == shared
 
 
 def test_frames_are_padded_to_multiples():
@@ -179,6 +196,12 @@ def test_work_is_bounded_before_it_begins():
     weights[1] = 1  # one channel sees enough
     half = SimpleNamespace(weights=weights, data=weights)
     Blend((half,), many.sources)._check_work(given.frame)
+    dot = np.zeros((1, 60, 60))
+    one = SimpleNamespace(weights=dot, data=dot)
+    Blend((one,), many.sources)._check_work(given.frame)  # nothing is seen: nothing is fitted
+    dot[0, 5, 6] = 1
+    with pytest.raises(ValueError, match=r"2 components, more than .*\(1\)"):
+        Blend((one,), many.sources[:2])._check_work(given.frame)
     two = Extended(position_px=(3, 3), n_components=2)
     wide = SimpleNamespace(weights=np.ones((1, 60, 60)), data=np.zeros((1, 60, 60)))
     with pytest.raises(ValueError, match=r"1001 sources with 2002 components .* takes 2000 comp"):

@@ -27,11 +27,11 @@ def answers(widths=(1.0, 2.5)):
 class Made:
     """A galaxy's SourceInverse, and its curvature in full."""
 
-    def __init__(self, shape, strengths):
+    def __init__(self, shape, strengths, found=None, sigma=4.0):
         prior = self.prior = LearnedPrior()
-        self.profile = galaxy(*shape)
+        self.profile = galaxy(*shape, sigma)
         spectra = Spectra(prior)
-        found = answers()
+        found = answers() if found is None else found
         response = spectra.of_answers(*found)
         self.lags = np.tensordot(SPECTRUM**2, found[0], 1)
         evidence = SourceEvidence(spectra, prior, self.profile, response)
@@ -77,8 +77,36 @@ class Made:
         precision = np.repeat(self.strengths**-2, [a * b for a, b in self.sizes])
         return u.T @ between @ u + np.diag(precision)
 
+    def binned(self, places, step):
+        """H (m, m) of some coefficients, on pixels of step x step: U is summed over them, and T is
+        the mean between theirs."""
+        n_cells = [-(-n // step) for n in self.profile.shape]
+        u = np.zeros((*(n * step for n in n_cells), len(places)))
+        ny, nx = self.profile.shape
+        u[:ny, :nx] = self.columns()[:, places].reshape(ny, nx, -1)
+        u = u.reshape(n_cells[0], step, n_cells[1], step, -1).sum((1, 3)).reshape(-1, len(places))
+        lags, between = np.pad(self.lags, 64), 0
+        middle = np.array(lags.shape) // 2
+        y, x = np.divmod(np.arange(n_cells[0] * n_cells[1]), n_cells[1])
+        dy, dx = (step * (a[:, None] - a) for a in (y, x))
+        for i in range(1 - step, step):
+            for k in range(1 - step, step):
+                share = (step - abs(i)) * (step - abs(k)) / step**4
+                between = between + share * lags[dy + i + middle[0], dx + k + middle[1]]
+        return u.T @ between @ u + np.diag(self.precision(places))
+
+    def precision(self, places):
+        """1 / alpha^2 (m,) of some coefficients."""
+        return np.repeat(self.strengths**-2.0, [a * b for a, b in self.sizes])[places]
+
     def blocks(self):
         return self.made.blocks(self.strengths, SPECTRUM)
+
+
+def between(matrix, curvature):
+    """Least and largest of what a matrix makes of the curvature, 1 of its inverse."""
+    values = np.linalg.eigvals(matrix @ curvature).real
+    return values.min(), values.max()
 
 
 @pytest.mark.parametrize(
@@ -97,6 +125,68 @@ def test_one_block_is_the_inverse_of_its_part_of_the_curvature(strengths, error)
     assert values.min() > 1 / (1 + error) and values.max() < 1 + error
     diagonal = np.linalg.eigvals(curvature / curvature.diagonal()).real
     assert diagonal.max() / diagonal.min() > 5000
+
+
+@pytest.mark.parametrize(
+    "shape, strengths, step, most_pixels",
+    [
+        ((17, 20), (0.003, 0.3, 0.05), 2, inverse.MOST_PIXELS),
+        ((17, 20), (0.003, 0.01, 1.0), 2, 9 * 10),
+        ((17, 20), (0.003, 0.01, 1.0), 4, 9 * 10 - 1),
+        ((40, 44), (1e-5, 1e-5, 0.018), 2, inverse.MOST_PIXELS),  # fewer than the window has rows
+        ((40, 44), (0.003, 0.01, 1.0), 4, 200),
+    ],
+)
+def test_binned_pixels_hold_sums_of_structure_and_means_of_what_the_data_say(
+    shape, strengths, step, most_pixels, monkeypatch
+):
+    """The block is the inverse on such pixels, to what little light its window leaves out."""
+    assert inverse.COARSEST == 2
+    monkeypatch.setattr(inverse, "MOST_PIXELS", most_pixels)
+    monkeypatch.setattr(inverse, "WORTH", 10.0)
+    made = Made(shape, strengths)
+    ((_, places, found),) = made.blocks()
+    low, high = between(found, made.binned(places, step))
+    assert 0.99 < low and high < 1.04
+
+
+@pytest.mark.parametrize("more", [0, 1])
+def test_a_source_of_more_coefficients_than_a_block_holds_has_two(more, monkeypatch):
+    made = Made((17, 20), (1e-5, 0.3, 1e-5))
+    ((_, places, _),) = made.blocks()
+    monkeypatch.setattr(inverse, "MOST", len(places) - more)
+    made = Made((17, 20), (1e-5, 0.3, 1e-5))
+    parts = [own for level, own, _ in made.blocks() if level == 0]
+    assert len(parts) == 1 + more
+    assert sorted(np.concatenate(parts)) == sorted(places)
+
+
+def test_each_part_of_a_large_source_is_the_inverse_there(monkeypatch):
+    """Parts with the finest scale in them see each pixel; parts lie side by side, none of them
+    long and narrow, so that each has all there is within it."""
+    monkeypatch.setattr(inverse, "MOST", 150)
+    made = Made((26, 30), (0.3, 0.1, 0.05))
+    curvature, blocks = made.curvature(), made.blocks()
+    ends = np.cumsum([0, *(a * b for a, b in made.sizes)])
+    for level, places, found in blocks:
+        low, high = between(found, curvature[np.ix_(places, places)])
+        assert 0.98 < low and high < (1.2, 1.8, 1.3)[level]
+        assert (places.min() < ends[1]) == (level == 0) and places.min() >= ends[level]
+    assert {level for level, *_ in blocks} == {0, 1, 2}
+    first = [places[places < ends[1]] for level, places, _ in blocks if level == 0]
+    for own in first:
+        sides = np.ptp(np.divmod(own, made.sizes[0][1]), axis=1) + 1
+        assert sides.prod() < 1.7 * len(own) + 10 and sides.max() < 3 * sides.min()
+
+
+def test_what_the_data_say_of_neighbours_reaches_half_a_spectrum():
+    """Answers to one pixel are taken as far as 31 pixels, here to the ends of the box."""
+    along = np.exp(-np.abs(np.arange(-32, 33)) / 40)
+    found = np.array([50 * np.outer(along, along)] * 2), np.full((2, 2), 32)
+    made = Made((32, 5), (0.3, 1e-5, 1e-5), found, sigma=20.0)
+    ((_, places, matrix),) = made.blocks()
+    low, high = between(matrix, made.curvature()[np.ix_(places, places)])
+    assert len(places) > 150 and 0.99 < low and high < 1.01
 
 
 def test_coefficients_of_which_the_data_say_little_are_in_no_block():

@@ -157,6 +157,7 @@ def test_inner_products_are_those_of_each_scene(build, dtype, with_blocks):
         assert slope[i] == pytest.approx((g * s[0])[part].sum(), rel=1e-3)
         wanted = (m.host["precision"] * m.host["x_new"] ** 2)[part].sum()
         assert energy[i] == pytest.approx(wanted, rel=1e-3)
+    assert not sums[1, 2:].any()  # of slots that are not in use there is nothing
 
 
 @every_type

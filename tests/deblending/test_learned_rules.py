@@ -145,7 +145,7 @@ def test_strengths_are_learned_at_once_where_little_is_left_to_gain():
     """Where three iterations have gained less than 5; and not again before
     three more."""
     progress, due, loss = Progress(1, 0.5, [100]), [], 50.0
-    for i, drop in enumerate([0, 9, 4, 2, 1, 0.5, 0.1, 0.1, 0.1, 0.1]):
+    for i, drop in enumerate([0, 9, 3, 2, 0.5, 2.0, 0.1, 0.1, 0.1, 0.1]):
         loss -= drop
         accepted, _ = progress.judge(np.array([loss]), np.array([-1e-6]))
         if progress.due(accepted)[0]:
@@ -239,13 +239,21 @@ def test_pixels_of_a_scene_are_those_with_a_weight():
     assert _n_pixels(scene([0 * first])) == 1
 
 
-def test_curvature_is_left_out_where_nothing_is_seen():
-    power = np.array([[4.0, 1e-13], [1e-15, 0.0]])
+@pytest.mark.parametrize("unit", [1.0, 1e6, 1e-20])
+def test_curvature_is_left_out_where_nothing_is_seen(unit):
+    """Under 1e-14 of what the best seen source has in any channel, whatever the unit."""
+    power = unit * np.array([[4.0, 1e-13], [1e-15, 0.0]])
     weights = [np.full((1, 2, 2), 0.5), np.zeros((1, 3, 3))]
     for fit_sky in (True, False):
         spectra, sky = _inverse_curvature([scene(weights, power=power, fit_sky=fit_sky)])
-        np.testing.assert_allclose(spectra, [[0.25, 1e13], [0, 0]])
+        np.testing.assert_allclose(unit * spectra, [[0.25, 1e13], [0, 0]])
         np.testing.assert_allclose(sky, [[0.5 * fit_sky, 0]])
+
+
+def test_where_nothing_is_seen_of_any_source_there_is_no_curvature():
+    dark = scene([np.zeros((2, 3, 3))], power=np.zeros((3, 2)), fit_sky=True)
+    spectra, sky = _inverse_curvature([dark])
+    assert not spectra.any() and not sky.any()
 
 
 def test_memory_of_a_scenes_vectors():

@@ -45,6 +45,18 @@ def test_the_inverse_is_the_dense_one_where_it_is_asked_for(common):
         np.testing.assert_allclose(block / size, expected / size, atol=1e-7)
 
 
+def test_solutions_are_the_dense_ones():
+    matrix, rng = field(4, 4, common=2), np.random.default_rng(3)
+    dense = matrix.dense()
+    right = [rng.normal(size=n) * np.sqrt(np.diag(matrix.block(i, i)))
+             for i, n in enumerate(matrix.sizes)]  # fmt: skip
+    scale = np.sqrt(np.diag(dense))
+    scaled = dense / scale[:, None] / scale + RIDGE * np.eye(len(dense))
+    wanted = np.linalg.solve(scaled, np.concatenate(right) / scale) / scale
+    found = np.concatenate(Factor(matrix).solve(right))
+    np.testing.assert_allclose(found * scale, wanted * scale, rtol=1e-6, atol=1e-9)
+
+
 def test_what_the_data_say_is_kept_and_what_nobody_knows_has_a_number():
     """Of two unknowns of which the data know the sum alone, the sum keeps its error."""
     matrix = Blocks([1, 2])

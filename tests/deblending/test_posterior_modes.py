@@ -5,6 +5,7 @@ import pytest
 from helpers import scenes
 from scipy.signal import fftconvolve
 
+from clresample.deblending.posterior import bumps as room
 from clresample.deblending.posterior.bumps import MOST, Bumps, uncorrelated
 from clresample.deblending.posterior.moments import moments_of
 from clresample.deblending.posterior.profile_modes import profile_modes
@@ -136,3 +137,13 @@ def test_bumps_of_large_galaxies_are_wider():
     shared = np.ones(profile.shape, bool)
     bumps = Bumps((0, 0), profile, np.full(3, 0.05), LearnedPrior().kernels(), shared)
     assert MOST / 8 < len(bumps.images) <= MOST
+
+
+@pytest.mark.parametrize("more", [0, 1])
+def test_bumps_are_no_more_than_they_may_be(more, monkeypatch):
+    y, x = np.indices((40, 30))
+    profile = np.exp(-0.5 * ((y - 20) ** 2 + (x - 15) ** 2) / 6.0**2)
+    given = (0, 0), profile, np.full(3, 0.05), LearnedPrior().kernels(), np.ones((40, 30), bool)
+    n = len(Bumps(*given).images)
+    monkeypatch.setattr(room, "MOST", n - more)
+    assert (len(Bumps(*given).images) == n) == (not more)

@@ -77,8 +77,27 @@ def test_what_bumps_change_counts_in_errors_of_flux_and_size():
     images[0, 10, 10] = images[1, 10, 14] = images[2, 7, 10] = 0.01
     mean = 2 * 4.0  # of r^2 in a Gaussian of sigma 2
     wanted = 0.01 / profile.sum() * 10 * np.array([1, 1 + 16 / mean, 1 + 9 / mean])
-    np.testing.assert_allclose(one._change(0, images), wanted, rtol=1e-3)
-    np.testing.assert_allclose(one._change(0, -images), one._change(0, images))
+    np.testing.assert_allclose(one.change(0, images), wanted, rtol=1e-3)
+    np.testing.assert_allclose(one.change(0, -images), one.change(0, images))
+
+
+def test_modes_leave_the_spectrum_and_pixels_at_their_bound_alone():
+    """What lies along the profile is taken off; where a free morphology is 0 nothing changes."""
+    rng = np.random.default_rng(0)
+    one = solution([(0, 0)] * 2, [spot(), spot()], fixed=(1,))
+    for m in one.morphs:
+        m[2, 3] = m[5] = 0
+    profile = spot()
+    given = rng.normal(size=(3, 9, 9))
+    wanted = given - np.tensordot(given, profile, 2)[:, None, None] * profile / (profile**2).sum()
+    for i in range(2):
+        one.scene.profile[i] = profile
+        found = given.copy()
+        along = one.gauge(i, found)
+        np.testing.assert_allclose(along, np.tensordot(given, profile, 2) / (profile**2).sum())
+        inside = one.morphs[i] > 0
+        assert not inside.all()
+        np.testing.assert_allclose(found, wanted * (inside if i == 0 else 1), atol=1e-12)
 
 
 def test_light_of_a_neighbour_on_a_box():
@@ -101,7 +120,7 @@ def test_light_is_exchanged_where_a_neighbour_has_a_part_of_it_and_both_are_seen
     def shared(level, *more):
         spectra = [[level, 0], [level, 0]] + [[1e3, 0]] * len(more)
         boxes = [own, other, *[np.ones((1, 1))] * len(more)]
-        return solution([(3, 3), (3, 3), *more], boxes, spectra=spectra)._shared(0).tolist()[0]
+        return solution([(3, 3), (3, 3), *more], boxes, spectra=spectra).shared(0).tolist()[0]
 
     assert shared(100.0) == [False, True, True, True, True, True]
     assert shared(10.0) == [False, True, True, True, True, False]  # its own 0.2 are not seen

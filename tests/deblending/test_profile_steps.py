@@ -20,12 +20,11 @@ class Valley:
         self.scene, self.index = np.arange(n), np.zeros(n, int)
         self.n_scenes, self.n_most = n, 1
         self.spectra, self.sky = np.ones((n, 1)), np.zeros((n, 1))
-        self.n_looks = np.zeros(n, int)
+        self.n_looks, self.n_slopes = np.zeros((2, n), int)
 
     def look(self, scenes, thetas, _brightness, *, slopes):
         self.scenes, self.now = np.asarray(scenes), np.array([t[0] for t in thetas])
-        if not slopes:
-            self.n_looks[self.scenes] += 1
+        (self.n_slopes if slopes else self.n_looks)[self.scenes] += 1
 
     def solve(self, _error):
         self.spectra[self.scenes, 0] = self.now[self.scenes]
@@ -90,7 +89,17 @@ def test_a_step_that_gains_nothing_is_taken_back_and_damped(valley):
     assert damped[:5] == pytest.approx([0.01, 0.1, 1, 1 / 3, 10 / 3])
     assert gained[:5] == (False, False, True, False, True)
     assert at[:4] == pytest.approx([0, 0, 0, 0.15]) and len(gains) <= 10
+    # equations are made anew where a step has gained, and another one follows it
+    assert gained[-1] and looking.n_slopes.tolist() == [1 + sum(gained[:-1])]
     assert fit.chi2[0] == pytest.approx(100, abs=0.2)
+
+
+def test_a_scene_ends_when_a_step_gains_a_thousandth_of_chi2(valley):
+    """9 of 10,000, but not 11.5."""
+    fit, looking = valley([0.03, 0.034], rest=1e4)
+    before = looking.n_looks.copy()
+    fit.run()
+    assert (looking.n_looks - before).tolist() == [1, 2] and looking.n_slopes.tolist() == [1, 2]
 
 
 def test_a_scene_that_no_step_helps_is_left_when_damping_is_too_large(valley):

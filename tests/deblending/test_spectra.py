@@ -98,3 +98,19 @@ def test_problems_that_settle_and_that_do_not_are_solved_together():
     np.testing.assert_allclose(found[0], right / 4, rtol=1e-7)
     np.testing.assert_array_equal(found[1], non_negative(normal[None], right[None])[0])
     assert not found[2].any()
+
+
+def test_matrices_that_rounding_spoiled_harm_no_others():
+    """Each as if alone, where few and where all of them are spoiled."""
+    rng = np.random.default_rng(6)
+    images = rng.random((2, 50))[np.arange(20) % 2]
+    noise = rng.normal(0, 3e-7, (20, 20))
+    spoiled = (images @ images.T) * (1 + noise + noise.T)
+    apart = rng.normal(size=(20, 50))
+    normal = np.stack([apart @ apart.T, spoiled, 4 * spoiled])
+    assert (np.linalg.eigvalsh(scaled(normal)[0])[:, 0] < 0).tolist() == [False, True, True]
+    found = inverse(normal)
+    for one, own in zip(found, normal, strict=True):
+        np.testing.assert_allclose(one, inverse(own[None])[0], rtol=1e-6)
+    variance = np.diagonal(found, axis1=1, axis2=2) * np.diagonal(normal, axis1=1, axis2=2)
+    assert (variance > 0.99).all()

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from clresample.deblending import image_profiles, view as view_module
+from clresample.deblending.blend import Blend
 from clresample.deblending.rendered import Rendered, weighted_sum
 from clresample.deblending.view import WhitenedView, _padded, _typical_noise, without_dark
+from clresample.sky.sources import Extended, Point
 
 
 def view(shares=None, matrix=((0.5, 0.0), (0.0, 0.5))):
@@ -174,3 +176,47 @@ def test_the_sharpest_image_that_sees_a_source_shows_it(device):
     assert flat[10:71, 9:70].min() == pytest.approx(1) and flat.sum() == pytest.approx(61**2)
     alone = profile(np.zeros((1, 90, 80)))
     assert alone.sum() == alone[40, 39] == 1
+
+
+def test_extended_sources_of_one_component_get_profiles(monkeypatch):
+    """Wherever they stand in the list; those that have one, and what lies outside, stay."""
+    monkeypatch.setattr(image_profiles, "get_device", lambda device: device)
+    monkeypatch.setattr(image_profiles, "_in_frame", lambda o, *_: o.name)
+    monkeypatch.setattr(image_profiles, "_sharpness", lambda o: {"a": 2.0, "b": 1.0}[o.name])
+    found = []
+
+    def profile(shape, position, views, device):
+        found.append((position.tolist(), views))
+        return np.ones((2, 2))
+
+    monkeypatch.setattr(image_profiles, "_profile", profile)
+    given = np.full((2, 2), 0.5)
+    sources = (
+        Point(position_px=(1, 1)),
+        Extended(position_px=(2, 2), n_components=2),
+        Extended(position_px=(3, 3), profile=given),
+        Extended(position_px=(4, 4)),
+        Extended(position_px=(90, 5)),
+        Extended(position_px=(6, 6), n_components=1),
+    )
+    frame = SimpleNamespace(
+        shape=(20, 20),
+        place=lambda sources, *_: np.array([s.position_px for s in sources], float),
+        inside=lambda positions: (positions < 20).all(1),
+    )
+    blend = Blend([SimpleNamespace(name="a"), SimpleNamespace(name="b")], sources, frame)
+    made = image_profiles.with_image_profiles(blend, device="any")
+    assert found == [([4, 4], ["b", "a"]), ([6, 6], ["b", "a"])]  # the sharpest first
+    assert [getattr(s, "profile", None) is not None for s in made.sources] == [
+        False, False, True, True, False, True
+    ]  # fmt: skip
+    assert made.sources[2].profile is sources[2].profile and made.frame is frame
+
+
+def test_sources_outside_an_observation_have_its_psf_at_the_nearest_pixel():
+    """Where the observation's projection holds none of them, that at its middle."""
+    at = np.array([[3.0, 4.0], [-2.0, 50.0], [np.nan, np.nan], [10.0, 40.0]])
+    grid = SimpleNamespace(positions_in=lambda grid, y, x: at)
+    home = view_module.Home(SimpleNamespace(grid=grid), None, np.zeros((4, 2)), 0.0)
+    observation = SimpleNamespace(grid=None, data=np.zeros((2, 13, 41)))
+    assert home._on(observation).tolist() == [[3, 4], [0, 40], [6, 20], [10, 40]]

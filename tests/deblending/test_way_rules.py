@@ -1,4 +1,4 @@
-"""Rules of shifts, of rendering and of batches, each on few numbers or one small image."""
+"""Rules of shifts, of what is seen and of batches, each on few numbers or one small image."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -12,10 +12,8 @@ from clresample.deblending import iterate as iterate_module
 from clresample.deblending.profiles import Star
 from clresample.deblending.rendered import Rendered
 from clresample.deblending.shifts import SCATTER_PX, shift_steps
-from clresample.deblending.solver.boxes import Boxes
-from clresample.deblending.solver.rendering import choice
-from clresample.deblending.solver.rendering.windows import ROUND_PX, Groups
 from clresample.deblending.solver.scene import Scene, State
+from clresample.deblending.start import renderer as renderer_module
 from clresample.deblending.start.looking import looking_at
 from clresample.deblending.start.seen import WHOLE_PX, Model, see
 from clresample.deblending.start.slots import Component
@@ -125,14 +123,15 @@ def test_morphologies_in_large_frames_are_seen_where_they_are(device):
 
 
 def test_slots_are_rendered_in_groups_of_what_the_memory_takes(device, monkeypatch):
-    """One at a time or all at once: the same is seen."""
+    """One at a time or all at once: the same is seen. No more than a launch has groups for."""
     home, position = scenes.frame(), np.array([14.0, 17.0])
     star = Star(home, free=True)
     places = [position + (k - 2) for k in range(5)]
     chosen = [Component(0, k, k, star, place, home.shape) for k, place in enumerate(places)]
     found = []
-    for n_bytes in (1, 1 << 30):
+    for n_bytes, most in ((1, 65535), (1 << 30, 65535), (1 << 30, 2 * 3 * 2)):
         tune(monkeypatch, group_bytes=n_bytes)
+        monkeypatch.setattr(renderer_module, "MOST_GROUPS", most)
         views = [
             whitened_view(
                 Home(home, home, np.array(places), 0.0), o, 1, device, np.float32, private=True
@@ -142,13 +141,13 @@ def test_slots_are_rendered_in_groups_of_what_the_memory_takes(device, monkeypat
         looking = looking_at([views], chosen, PRECISION, TOLERANCE, fit_sky=False)
         looking.look([0], [np.zeros(2)] * 5, np.ones(5), slopes=True)
         found.append([device.get(sight.seen) for sight in looking.sights])
-        for sight in looking.sights:
+        for sight, n_bands in zip(looking.sights, (1, 2), strict=True):
             (windows,) = sight.aim._renderers.values()
-            assert windows.renderer._capacity == (
-                3 if n_bytes == 1 else 15
-            )  # images of a slot, or of all
-    for one, other in zip(*found, strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-6 * np.abs(one).max())
+            slots = 1 if n_bytes == 1 else min(5, most // (3 * n_bands))
+            assert windows.renderer._capacity == 3 * slots
+    for one, *others in zip(*found, strict=True):
+        for other in others:
+            np.testing.assert_allclose(one, other, atol=1e-6 * np.abs(one).max())
 
 
 def a_star(device, shape):
@@ -183,57 +182,6 @@ def test_boxes_of_a_whole_frame_are_seen_through_the_observations_own_operator(d
     for sight, view in zip(looking.sights, views, strict=True):
         (renderer,) = sight.aim._renderers.values()
         assert renderer.plans == [view.op.plans[0]]
-
-
-def boxes_at(*places, scene=None, n=8):
-    count = len(places)
-    return Boxes(
-        np.zeros(count, int) if scene is None else np.array(scene),
-        np.array(places),
-        np.full((count, 2), n),
-    )
-
-
-def test_groups_are_of_the_cells_that_hold_the_middles_of_boxes():
-    """Of those that are meant, by scene; frames of one size, multiples of 16, about all of each."""
-    boxes = boxes_at((0, 0), (5, 9), (7, 12), (40, 3), (0, 0), (3, 3), scene=[0, 0, 0, 0, 1, 1])
-    groups = Groups(boxes, np.array([0, 1, 2, 3, 4]), np.array([10, 16]))
-    assert ROUND_PX == 16 and len(groups) == 4
-    assert groups.group.tolist() == [0, 0, 1, 2, 3, 0] and groups.scene.tolist() == [0, 0, 0, 1]
-    assert groups.low.tolist() == [[0, 0], [7, 12], [40, 3], [0, 0]]
-    assert groups.shape.tolist() == [16, 32]  # 13 x 17 pixels of the first
-    exact = Groups(boxes_at((0, 0), (8, 8)), np.arange(2), np.array([50, 50]))
-    assert exact.shape.tolist() == [16, 16] and exact.low.tolist() == [[0, 0]]
-
-
-def test_operations_are_counted_from_sizes():
-    """Products of matrices, four operations a term and pair; weighed sums at points beside them."""
-    shape, (n_y, n_x, k_y, k_x) = np.array([[3, 5], [4, 2]]), (20, 30, 16, 48)
-    of_frame, of_box = np.tile([k_y, k_x], (2, 1)), np.tile([k_y, k_x], (2, 1))
-    found = choice._counts(shape, 3, n_y, n_x, of_frame, of_box)
-    rows, pixels, n_images = 7, 23, 6
-    second = n_images * k_y * n_y * k_x
-    wanted = [
-        n_images * n_y * n_x * k_x + second + choice.POINT * 1.5 * 3 * pixels,
-        choice.BOXED * pixels * k_x + second + choice.POINT * 1.5 * 3 * rows * k_x,
-        choice.BOXED * (pixels * k_x + rows * k_y * k_x) + choice.POINT * 1.5 * 3 * 2 * k_y * k_x,
-    ]
-    np.testing.assert_allclose(found, 4 * np.array(wanted))
-    # each frame, and each box in it, has waves of its own
-    of_frame, of_box = np.array([[4, 32], [6, 16]]), np.array([[6, 16], [4, 32]])
-    first, second = 3 * 20 * 30 * (32 + 16), 3 * 20 * (4 * 32 + 6 * 16)
-    to_lines, to_planes = 15 * 16 + 8 * 32, 3 * 6 * 16 + 4 * 4 * 32
-    by_pixel, by_line, by_wave = 23, 3 * 16 + 4 * 32, 6 * 16 + 4 * 32
-    wanted = [
-        first + second + choice.POINT * 4.5 * by_pixel,
-        choice.BOXED * to_lines + second + choice.POINT * 4.5 * by_line,
-        choice.BOXED * (to_lines + to_planes) + choice.POINT * 4.5 * by_wave,
-    ]
-    found = choice._counts(shape, 3, 20, 30, of_frame, of_box)
-    np.testing.assert_allclose(found, 4 * np.array(wanted))
-    plain, lines = SimpleNamespace(lines=None), SimpleNamespace(lines=1)
-    assert choice._observed(plain, 5, 7, 11, 13) == 5 * 11 * 13 + 5 * 13 * 7
-    assert choice._observed(lines, 5, 7, 11, 13) == 11 * 13 * 7 + 11 * 7 * 5
 
 
 def running(live, n_steps=5, resize=False):

@@ -201,6 +201,15 @@ def test_long_sums_keep_their_accuracy(device, monkeypatch):
     assert error() > 1e-6
 
 
+@pytest.mark.parametrize("k", [1, 4, 37, 74, 128, 129, 400, 5000, 40_000])
+def test_stretches_are_whole_turns_and_share_the_terms(k):
+    found = contract.stretch(k)
+    assert found % contract.TERMS == 0
+    assert found <= max(contract.SUM_BLOCK, np.sqrt(k) + contract.TERMS)
+    assert k <= 2 * found or found >= contract.SUM_BLOCK / 2  # no more of them than it takes
+    assert k < 8 or k > found  # one at least from each end
+
+
 def test_a_tall_product_is_cut_where_a_launch_would_have_too_many_groups(device, monkeypatch):
     monkeypatch.setattr(contract, "MOST_GROUPS", 2)
     m, n, k, batch = 11, 17, 9, 13

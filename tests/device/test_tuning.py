@@ -4,6 +4,8 @@ import warnings
 
 import numpy as np
 import pytest
+from helpers.products import TILES
+from helpers.tuning import tune
 
 from clresample import PSF, Grid, Resampler
 from clresample.cli.command import main
@@ -11,6 +13,7 @@ from clresample.cli.machine import tune as tuner
 from clresample.cli.machine.tune import CPU_TILES, GPU_TILES, supposed
 from clresample.cli.machine.workload import Iterations
 from clresample.device import measure
+from clresample.device.contraction import padded
 from clresample.device.remembered import DeviceWarning, Remembered
 from clresample.device.tuning import PART, Tuning, is_tile
 
@@ -85,6 +88,28 @@ def test_candidates_build_what_they_say():
     for wrong in ({"MR": 5}, {"VW": 3}, {"KB": 12}, {"WGX": 64, "WGY": 8}, {"NV": 0}, {"NV": True}):
         assert not is_tile(GPU_TILES[0] | wrong)
     assert not is_tile({"VW": 8})
+
+
+@pytest.mark.parametrize(
+    ("name", "n", "vectors"),
+    [
+        ("AVX2", 114, (2, 8)),  # 7 vectors of 16 and 2 columns
+        ("AVX2", 120, (2, 8)),
+        ("AVX2", 121, (1, 16)),  # more than half of the last one is full
+        ("AVX2", 112, (1, 16)),
+        ("AVX2", 130, (1, 16)),  # one of nine
+        ("wide CPU", 74, (5, 16)),  # five vectors, which two at a time leave one of
+        ("wide CPU", 90, (2, 16)),
+        ("wide CPU", 114, (2, 16)),
+        ("CPU", 114, (1, 8)),
+    ],
+)
+def test_columns_choose_the_vectors_of_a_tile(device, monkeypatch, name, n, vectors):
+    tune(monkeypatch, tile=TILES[name])
+    tile = Tuning.of(device).tile_for_columns(n, padded(n))
+    assert (tile["NV"], tile["VW"]) == vectors
+    rows = {5: 4}.get(tile["NV"], TILES[name]["MR"])
+    assert tile == TILES[name] | {"NV": vectors[0], "VW": vectors[1], "MR": rows}
 
 
 @pytest.mark.parametrize("rows", [1, 47, 48, 49, 60, 74, 118, 132, 1000])

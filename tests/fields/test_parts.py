@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.io import fits
 from astropy.table import QTable
 
 from clresample.fields.blends.plan import Patch
@@ -80,9 +81,31 @@ def test_patches_components_and_models_come_back(part, tmp_path):
     for _, i, _, model in found:
         np.testing.assert_array_equal(model, models[i])
     assert list(file.models({8})) == []
+    assert [m[1] for m in file.models(mosaic=1)] == [m[1] for m in found if m[1] == 1]
 
 
 def test_an_empty_part_is_a_file_too(tmp_path):
     file, _ = read(Part(), tmp_path)
     assert [len(one) for one in file.read("CATALOGUE", "PATCHES", "PIXELS")] == [0, 0, 0]
     assert list(file.models()) == []
+
+
+def test_files_are_fits_as_others_see_them(part, tmp_path):
+    named = "flux_it's a long name" + " of a channel" * 2
+    part.rows[0].put(named, np.array([1.0, 2.0]))
+    part.rows[0].meta["note"] = "quoted 'text', " * 8 + "and its end"
+    for n, one in enumerate([part, Part()]):
+        path = tmp_path / f"{n}.fits"
+        path.write_bytes(one.to_bytes())
+        with fits.open(path) as hdus:
+            hdus.verify("exception")
+            for hdu in hdus[1:]:
+                again = type(hdu)(hdu.data, hdu.header).header  # as astropy would write it
+                assert dict(again) == dict(hdu.header)
+    file = PartFile(tmp_path / "0.fits")
+    np.testing.assert_array_equal(file.read("CATALOGUE")[0][named], [1.0, 2.0, np.nan])
+    header = fits.getheader(file.path, "CATALOGUE")
+    assert header["NOTE"] == part.rows[0].meta["note"]
+    part.rows[0].put("reason", np.array(["\N{LATIN SMALL LETTER E WITH ACUTE}", ""]))
+    with pytest.raises(ValueError, match="ascii"):
+        part.to_bytes()

@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.checkout import ROOT
 
@@ -96,6 +97,31 @@ def test_the_system_holds_a_worker_to_its_memory():
     small, large = sorted(found, key=lambda o: o.task)
     assert small.value == 10 << 20
     assert large.reason.startswith("MemoryError") and not large.worker_died
+
+
+class Itself:
+    """A large array in an object that refers to itself, as operators do."""
+
+    def __init__(self, n_bytes):
+        self.array, self.itself = np.ones(n_bytes, np.uint8), self
+
+
+def held_before(n_bytes, task):
+    """Memory [bytes] of the worker when it begins; it leaves an Itself behind."""
+    if not isinstance(task, int):
+        raise ValueError(f"{task} leaves {Itself(n_bytes).array.size} bytes too")
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    Itself(n_bytes)
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+@pytest.mark.parametrize("n_workers", [0, 1])
+def test_what_a_task_leaves_behind_is_freed_before_the_next(n_workers):
+    large = 64 << 20
+    found = ran(held_before, [large], [0, 1, "raises", 2, 3], n_workers)
+    held = [o.value for o in found if o.reason is None]
+    assert len(held) == 4 and max(held) - held[0] < large
 
 
 def test_workers_live_on_from_one_run_to_the_next():

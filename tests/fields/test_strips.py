@@ -6,7 +6,7 @@ from astropy.io import fits
 
 from clresample.fields.box import Box
 from clresample.fields.mosaic import FilePlane, _opened
-from clresample.fields.strips import STRIP_PX, Strips, section
+from clresample.fields.strips import MOST_BYTES, STRIP_PX, Strips, section
 
 SHAPE = 3, 150, 90
 
@@ -62,6 +62,16 @@ def test_rows_are_decoded_once_and_the_oldest_go(packed, cube):
             found = few.read(Counted(), plane, Box(30, 7, 131, 44))
             np.testing.assert_array_equal(found, cube[plane, 30:131, 7:44])
             assert 0 < few.n_bytes <= few.most
+
+
+def test_strips_take_a_tenth_of_what_a_process_may_hold():
+    strips = Strips()
+    strips.hold(1 << 30)
+    assert strips.most == int(0.1 * (1 << 30)) < MOST_BYTES
+    strips.hold(64 << 30)
+    assert strips.most == MOST_BYTES
+    strips.hold(None)
+    assert strips.most == MOST_BYTES
 
 
 def test_large_boxes_are_left_to_the_file(packed):

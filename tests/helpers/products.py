@@ -13,6 +13,7 @@ every_type = pytest.mark.parametrize("dtype", TYPES, ids=lambda t: t.__name__)
 
 TILES = {
     "CPU": {"VW": 8, "NV": 1, "MR": 6, "WGX": 1, "WGY": 1},
+    "AVX2": {"VW": 16, "NV": 1, "MR": 6, "WGX": 1, "WGY": 1},
     "wide CPU": {"VW": 16, "NV": 2, "MR": 8, "WGX": 1, "WGY": 1},
     "GPU": {"VW": 4, "NV": 1, "MR": 8, "WGX": 8, "WGY": 8},
     "pairs": {"VW": 2, "NV": 3, "MR": 8, "WGX": 8, "WGY": 8},

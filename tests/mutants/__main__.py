@@ -154,7 +154,8 @@ def main():
             else:
                 what, why = trial.outcome(mutation)
             counts[what] += 1
-            shown = f"{file}:{mutation.line}: {mutation.change}: {mutation.shown}"
+            at = f"{file}:{mutation.line}: {mutation.change} (place {mutation.place})"
+            shown = f"{at}: {mutation.shown}"
             print(f"{what:10}  {shown}  [{why}]", flush=True)
         trial.server.stdin.close()
         trial.server.wait()

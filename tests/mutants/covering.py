@@ -71,10 +71,12 @@ class Covering:
         return tests
 
     def tests(self, mutation):
-        """The tests that may notice a Mutation; one variant of each test before the next ones,
-        where a build of kernels for groups of work-items counts as a test of its own.
+        """The tests that may notice a Mutation, where a build of kernels for groups of work-items
+        counts as a test of its own.
 
-        Quick ones come first, and those that run little else: they look at this alone.
+        Quick ones come first, and those that run little else: they look at this alone. The second
+        variant of a test counts as twice as slow, the third as three times: one of each test comes
+        early, and all variants of a quick one before a whole fit.
         """
         file = str(mutation.path.relative_to(ROOT))
         places = _kernel_places if file.startswith("kernels/") else _python_places
@@ -86,8 +88,8 @@ class Covering:
         for test in sorted(near, key=lambda test: (cost[test], test)):
             function = test.split("[")[0], "groups-" in test
             seen[function] = seen.get(function, -1) + 1
-            order.append((seen[function], cost[test], test))
-        return [test for _, _, test in sorted(order)]
+            order.append((cost[test] * (1 + seen[function]), test))
+        return [test for _, test in sorted(order)]
 
 
 def _python_places(mutation, file):

@@ -97,23 +97,22 @@ class Factor:
     def _ends(self, v):
         return np.cumsum([0, *self.sizes[self._later[v]]]) if self._later[v] else np.zeros(1, int)
 
-    def draw(self, normal):
-        """H^-1/2 of numbers (N,), node after node: arrays (n) that scatter as the inverse says."""
-        return self._back(np.split(np.asarray(normal, float), np.cumsum(self.sizes)[:-1]))
-
     def solve(self, right):
-        """H^-1 right, arrays (n) of the nodes in and out."""
-        parts = [np.divide(r, s) for r, s in zip(right, self.scale, strict=True)]
+        """H^-1 of arrays (n), one for each node."""
+        parts = [r / s for r, s in zip(right, self.scale, strict=True)]
         for v in self.order:
             parts[v] = solve_triangular(self._lower[v], parts[v], lower=True)
-            if self._later[v]:
-                taken = np.split(self._below[v] @ parts[v], self._ends(v)[1:-1])
-                for u, part in zip(self._later[v], taken, strict=True):
-                    parts[u] = parts[u] - part
-        return self._back(parts)
+            ends = self._ends(v)
+            for a, u in enumerate(self._later[v]):
+                parts[u] = parts[u] - self._below[v][ends[a] : ends[a + 1]] @ parts[v]
+        return self._upwards(parts)
 
-    def _back(self, parts):
-        """Scaled L^-T of arrays (n)."""
+    def draw(self, normal):
+        """H^-1/2 of numbers (N,), node after node: arrays (n) that scatter as the inverse says."""
+        return self._upwards(np.split(np.asarray(normal, float), np.cumsum(self.sizes)[:-1]))
+
+    def _upwards(self, parts):
+        """The transposed factor's inverse of scaled arrays (n), unscaled."""
         out = [np.zeros(0)] * len(parts)
         for v in reversed(self.order):
             right = parts[v]

@@ -40,6 +40,7 @@ class Bumps:
     """Bumps on the box of one component, on a grid aligned with the frame, which neighbours share.
 
     images (k, ny, nx), float32; precision (k, k): Q^-1 of their coefficients, with a diagonal of 1
+    sides: (k, ny) and (k, nx), whose products are the Gaussians y
 
     origin (2,) [px]: of the box in the frame; profile (ny, nx); strengths (J,): of the prior's
     scales; kernels: its J kernels; shared (ny, nx): where light may be exchanged
@@ -70,6 +71,7 @@ class Bumps:
         )
         self.images = along.transpose(1, 2, 0) @ across.transpose(1, 0, 2)
         self.images *= amplitude
+        self.sides = scale[:, None] * rows.values[low], columns.values[high]
 
 
 def uncorrelated(precision):

@@ -51,7 +51,7 @@ class Solution:
     shapes, thetas, positions (n): the start's Shapes, parameters, places (2,) [px]
     findings: Findings; chi2 (n,): per pixel, where each component's light is
     prior: LearnedPrior
-    pulls (n): arrays (ny, nx), see bounds.py
+    pulls (n): arrays (ny, nx), see bounds.py; None where nothing asks for `modes`
     """
 
     scene: Scene
@@ -65,7 +65,7 @@ class Solution:
     findings: object
     chi2: np.ndarray
     prior: LearnedPrior
-    pulls: list
+    pulls: list | None = None
 
     def unlikeness(self, i):
         """Strength of component i's structure over that of a galaxy that is like its smooth
@@ -106,9 +106,9 @@ class Solution:
         n_own, own = 0, None
         if not scene.fixed[i]:
             bumps = Bumps(
-                scene.origin[i], profile, self.strengths(i), self.prior.kernels(), self._shared(i)
+                scene.origin[i], profile, self.strengths(i), self.prior.kernels(), self.shared(i)
             )
-            keep = np.flatnonzero(self._change(i, bumps.images) > LEAST_CHANGE)
+            keep = np.flatnonzero(self.change(i, bumps.images) > LEAST_CHANGE)
             own = uncorrelated(bumps.precision[np.ix_(keep, keep)]) / self.peaks[i]
             n_own = len(own)
         seen = np.empty((1 + n_own + len(images), *profile.shape), np.float32)
@@ -118,10 +118,18 @@ class Solution:
             flat = flat if len(keep) == len(flat) else flat[keep]
             np.matmul(own.astype(np.float32), flat, out=out[:n_own].reshape(n_own, -1))
         out[n_own:] = without_dark(scatter[:, None, None] * images)
-        far = far.gauged(self._gauge(i, out) * self.peaks[i])
+        far = far.gauged(self.along(i, out) * self.peaks[i])
         return seen, far, self._held(i, out)
 
-    def _gauge(self, i, images):
+    def gauge(self, i, images):
+        """Take off images, in place, what lies along the profile, and all of them where the
+        morphology is at its bound; returns how much lay along it (k,)."""
+        along, inside = self.along(i, images), self.morphs[i] > 0
+        if not self.scene.fixed[i] and not inside.all():
+            images *= inside
+        return along
+
+    def along(self, i, images):
         """Take off images, in place, what lies along the profile; returns how much it was (k,)."""
         p = without_dark(self.scene.profile[i].astype(images.dtype))
         along = images.reshape(len(images), p.size) @ p.ravel() / max((p * p).sum(), 1e-30)
@@ -135,7 +143,7 @@ class Solution:
             return np.zeros(len(images))
         return (images[:, held] @ self.pulls[i][held].astype(images.dtype)).astype(np.float64)
 
-    def _change(self, i, images):
+    def change(self, i, images):
         """What images (k, ny, nx) of scatter 1 change of flux and second moment [fixed errors]."""
         m = self.morphs[i] * self.peaks[i]
         total = max(m.sum(), 1e-30)
@@ -160,7 +168,7 @@ class Solution:
         """First and one-past-last pixels (n, 2), (n, 2) of all boxes."""
         return self.scene.origin, self.scene.origin + [p.shape for p in self.scene.profile]
 
-    def _shared(self, i):
+    def shared(self, i):
         """Where (ny, nx) component i may exchange light with another."""
         own, (low, high) = self._light(i, i), self._boxes
         shared = np.zeros(own.shape, bool)

@@ -148,10 +148,13 @@ def _hills(light, inside):
     """The hills of the light (Ny, Nx) int32, numbered from 1, 0 outside, and how many there are:
     all pixels from which the steepest way up ends on the same peak."""
     n_y, n_x = light.shape
-    rank = np.empty(light.size, np.int64)  # of equal pixels the later is higher: no plateaus
-    rank[np.argsort(light, axis=None, kind="stable")] = np.arange(light.size)
-    rank = np.pad(np.where(inside, rank.reshape(light.shape), -1), 1, constant_values=-1)
-    own = np.arange(light.size).reshape(light.shape)
+    kind = np.int32 if light.size < 1 << 31 else np.int64
+    rank = np.empty(light.size, kind)  # of equal pixels the later is higher: no plateaus
+    own = np.arange(light.size, dtype=kind)
+    rank[np.argsort(light, axis=None, kind="stable")] = own
+    own, rank = own.reshape(light.shape), rank.reshape(light.shape)
+    rank[~inside] = -1
+    rank = np.pad(rank, 1, constant_values=-1)
     best, up = rank[1:-1, 1:-1].copy(), own.copy()
     for dy in (-1, 0, 1):
         for dx in (-1, 0, 1):
@@ -162,10 +165,13 @@ def _hills(light, inside):
     up = up.ravel()
     while (up[up] != up).any():  # halves the ways each time
         up = up[up]
-    tops, hill = np.unique(up[inside.ravel()], return_inverse=True)
+    up = up[inside.ravel()]
+    is_top = np.zeros(light.size, bool)
+    is_top[up] = True
+    number = np.cumsum(is_top, dtype=np.int32)
     found = np.zeros(light.shape, np.int32)
-    found[inside] = hill + 1
-    return found, len(tops)
+    found[inside] = number[up]
+    return found, int(number[-1])
 
 
 def _saddles(light, basins):

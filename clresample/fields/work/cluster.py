@@ -23,7 +23,7 @@ from ...device.discovery import DeviceError
 from ...files.whole_file import FileError
 from .pool import LOOK_S, reason_of
 from .seats import Seats
-from .share import shared_threads
+from .share import return_memory, shared_threads
 
 NO_DASK = "distributed is not installed (pip install 'clresample[dask]')"
 CONNECT_S = 30.0  # [s] within which the scheduler answers and its first worker is there
@@ -230,3 +230,5 @@ def _done(context, parcel):
         return done(context, task, given), None
     except Exception as error:
         return (None, None), reason_of(error)
+    finally:
+        return_memory()

@@ -77,9 +77,15 @@ def fit_group(job, group, given) -> tuple[dict, bytes]:
     given: Given of the group. A patch that fails is in the part with its reason. Raises
     KeyboardInterrupt after Ctrl-C, DeviceError where the device no longer answers.
     """
-    began = time.perf_counter()
-    default_cache().clear()  # of the groups before, whose places and PSFs do not come again
-    part, cuts = Part(), []
+    try:
+        return _fitted(job, group, given)
+    finally:
+        default_cache().clear()  # its places and PSFs do not come again
+
+
+def _fitted(job, group, given):
+    """As `fit_group`, whose operators stay in the cache."""
+    began, part, cuts = time.perf_counter(), Part(), []
     for number in group.patches:
         patch, start = job.plan.patches[number], time.perf_counter()
         corner, labels = given.labels[number]

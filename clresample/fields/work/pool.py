@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from multiprocessing.connection import wait
 
 from ...device.discovery import DeviceError
-from .share import end_with, hold_memory, return_memory, shared_threads
+from ..strips import STRIPS
+from .share import end_with, hold_memory, keep_for_good, return_memory, shared_threads
 
 # [s] Between two looks at whether a worker takes too long.
 LOOK_S = 1.0
@@ -166,6 +167,7 @@ def _in_this_process(function, context, task):
         raise
     except Exception as error:
         value, reason = None, reason_of(error)
+    return_memory()
     return Outcome(task, value, reason, began=began, ended=time.monotonic())
 
 
@@ -245,9 +247,10 @@ def _work(pipe, bound, parent):
     import signal
 
     hold_memory(bound)
+    STRIPS.hold(bound)
     end_with(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all; the parent ends its workers
-    function = context = None
+    function = context = kept = None
     while True:
         try:
             given, what = pipe.recv()
@@ -268,6 +271,9 @@ def _work(pipe, bound, parent):
             return
         del answer, what
         return_memory()
+        if kept is not function:  # its first task has loaded what the others need
+            keep_for_good()
+            kept = function
 
 
 def reason_of(error):

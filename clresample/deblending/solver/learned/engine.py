@@ -21,7 +21,7 @@ from .progress import Progress
 from .steps import REST, STAY, TRY, Steps
 from .strengths import Strengths
 from .structure import Structure, coarse
-from .vectors import Vectors
+from .vectors import Slopes, Vectors
 
 # Pairs of changes that a scene remembers: 20 take no fewer iterations, 5 some more.
 N_PAIRS = 10
@@ -143,6 +143,25 @@ class LearnedEngine:
         energies = self.device.get(self.structure.energies).astype(np.float64)
         spectra = self.device.get(b.spectra).astype(np.float64)
         return self.strengths.findings(which, energies, spectra)
+
+    def slopes(self, which):
+        """The Slopes of the scenes `which` (B,) where they are; None for the others."""
+        x, g = (self.vectors.split(v) for v in (self.vectors.x, self.vectors.g))
+        return [
+            Slopes(*slopes, (now[1] <= 0) & (slopes[1] > 0)) if on else None
+            for now, slopes, on in zip(x, g, which, strict=True)
+        ]
+
+    def step(self, steps):
+        """Let scenes try steps next, also those that have converged; steps {scene: changes of
+        structure, spectra and sky, see Slopes; structure None where there is none}."""
+        which = np.isin(np.arange(len(self.scenes)), list(steps))
+        self.vectors.put_directions(steps)
+        self.progress.go_on(which)
+        nothing = np.zeros((len(self.scenes), N_PAIRS + 1))
+        self.steps.follow(self.pairs, np.where(which, TRY, REST))
+        self.steps.advance(nothing, nothing, nothing[:, 0], nothing[:, 0] + 1)
+        self._rest_others(self.progress.live)
 
     def follow_shifts(self, moved):
         """Take over the shifts that the operators of the scenes `moved` (B,) have by now."""

@@ -15,13 +15,12 @@ on the host, at first and after strengths were learned.
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import lapack
 
 from .evidence import N_FREQUENCIES
+from .prior import kernel_rows
 
 # Coefficients of which the data say more than so many times what the prior does are in blocks. With
 # 3 the blocks take a tenth more of a fit's time, and it no fewer iterations; with 100, half as many
@@ -116,23 +115,13 @@ class SourceInverse:
     def _seen(self, j, places, window, step):
         """Columns of U, of scale j and places (m, 2), in a window of the box and binned."""
         p, (y, x) = self._profile, places.T
-        along_y, along_x = (_along(self._evidence.prior, j, n) for n in p.shape)
+        along_y, along_x = (kernel_rows(self._evidence.prior, j, n) for n in p.shape)
         first, of_x = np.unique(x, return_inverse=True)
         rows = self._root[window][:, None] * along_x[first][:, window[1]]
         rows = _binned(rows, 2, step)[:, of_x].swapaxes(0, 1)  # (m, ny, nx / step)
         u = _binned(along_y[y][:, window[0], None] * rows, 1, step)
         along = (along_y @ (p * self._root) @ along_x.T)[y, x] / self._power
         return u - along[:, None, None] * _binned(_binned(p[window], 0, step), 1, step)
-
-
-@functools.lru_cache(maxsize=32)
-def _along(prior, j, n):
-    """K_j of each coefficient along a side of `n` pixels (n_j, n)."""
-    step, taps = prior.steps[j], prior.kernels()[j]
-    at = np.arange(0, n + step - 1, step)
-    lag = np.arange(n) - at[:, None] + len(taps) // 2
-    inside = (lag >= 0) & (lag < len(taps))
-    return (np.sqrt(step) * np.where(inside, taps[np.where(inside, lag, 0)], 0)).astype(np.float32)
 
 
 def _split(rows, places):

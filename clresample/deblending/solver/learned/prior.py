@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,3 +66,13 @@ def gaussian(sigma, radius, *, unit_sum=False):
     """A Gaussian (2 radius + 1), sum of squares 1, or sum 1."""
     k = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
     return k / (k.sum() if unit_sum else np.linalg.norm(k))
+
+
+@functools.lru_cache(maxsize=32)
+def kernel_rows(prior, j, n):
+    """K_j of each coefficient along a side of `n` pixels (n_j, n)."""
+    step, taps = prior.steps[j], prior.kernels()[j]
+    at = np.arange(0, n + step - 1, step)
+    lag = np.arange(n) - at[:, None] + len(taps) // 2
+    inside = (lag >= 0) & (lag < len(taps))
+    return (np.sqrt(step) * np.where(inside, taps[np.where(inside, lag, 0)], 0)).astype(np.float32)

@@ -102,6 +102,14 @@ class Progress:
         self.converged &= ~which
         self.live |= which
 
+    def go_on(self, which):
+        """Let the scenes `which` (B,) try a step that was not theirs, also those that have
+        converged."""
+        self.live |= which
+        self.converged &= ~which
+        self._drops[which] = np.inf
+        self._length[which], self._trials[which] = 1.0, 0
+
     def next(self, accepted):
         """Mode (B,) and length (B,) of each scene's next step, and which drop their pairs (B,)."""
         enough = self.enough * self.chi2()

@@ -5,7 +5,23 @@ x = (z of all free sources, A (S, C), sky (B, C))
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Slopes:
+    """Slopes of one scene's loss by its variables.
+
+    structure [s][j] (ny_j, nx_j): by the coefficients of each source and scale
+    spectra (n, C), sky (C,); bound (n, C): spectra that are 0 and would fall
+    """
+
+    structure: list
+    spectra: np.ndarray
+    sky: np.ndarray
+    bound: np.ndarray
 
 
 class Vectors:
@@ -48,6 +64,40 @@ class Vectors:
         sky = self.latents.size + self.n_spectra
         ends = starts[source], self.latents.size + source * c, sky + np.arange(len(source)) * c
         return np.stack([np.stack([e[:-1], e[1:]], axis=1) for e in ends], axis=1)
+
+    def split(self, vector):
+        """A vector on the host, of each scene: its sources' coefficients [s][j] (ny_j, nx_j),
+        spectra (n, C) and sky (C,)."""
+        values = self.buffers.device.get(vector).astype(np.float64)
+        structure = self.latents.unpack(values)
+        spectra, sky = self._numbers(values)
+        source = self.buffers.device.get(self.buffers.first)
+        return [
+            (structure[a:b], spectra[a:b], sky[i])
+            for i, (a, b) in enumerate(zip(source[:-1], source[1:], strict=True))
+        ]
+
+    def put_directions(self, steps):
+        """Overwrite the directions d of some scenes: steps {scene: parts as of `split`}, structure
+        None where a source has none."""
+        values = self.buffers.device.get(self.d)
+        spectra, sky = self._numbers(values)
+        source = self.buffers.device.get(self.buffers.first)
+        for low, high in self.parts()[list(steps), 0]:
+            values[low:high] = 0
+        for i, (structure, by_spectrum, by_sky) in steps.items():
+            spectra[source[i] : source[i + 1]], sky[i] = by_spectrum, by_sky
+            for start, scales in zip(self.latents.start[source[i] :], structure):
+                if scales is not None:
+                    flat = np.concatenate([np.ravel(part) for part in scales])
+                    values[start : start + len(flat)] = flat
+        self.buffers.device.upload(values, self.d)
+
+    def _numbers(self, values):
+        """Spectra (S, C) and sky levels (B, C) in the elements of a vector, on the host."""
+        n, c = self.latents.size, self.buffers.n_channels
+        both = values[n:].reshape(-1, c)
+        return both[: self.n_spectra // c], both[self.n_spectra // c :]
 
     def _chunks(self):
         length, rows = self.buffers.tuning.vector_chunk, []

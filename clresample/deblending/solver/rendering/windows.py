@@ -77,8 +77,6 @@ class WindowOperator:
     shape_in, shape_out (3,); low (G, 2): the windows' first pixels in the observation
     """
 
-    is_identity = False
-
     def __init__(self, op, groups):
         plan, self.op, self._groups = op.plans[0], op, groups
         shape = tuple(groups.shape.tolist())

@@ -1,0 +1,154 @@
+"""Newton's step along what sources that overlap exchange: structure, spectra and sky in one.
+
+L-BFGS knows the curvature of each source by itself. Light that a source may as well give to its
+neighbours lowers the loss by little in each iteration, and moves fluxes by more than their errors
+in the end. Along the smooth changes of which errors are made (bumps.py) the curvature of all
+sources together is one normal matrix, which says where the minimum lies, and how far below.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..solver.learned.prior import kernel_rows
+from ..view import without_dark
+from .blocks import Blocks, Factor
+from .bumps import Bumps, uncorrelated
+from .exposure import Exposure
+from .modes import Solution
+from .normal import Layout, normal_matrix
+
+# Changes of structure that the prior allows to move a flux or a second moment by less than this
+# many errors at fixed morphologies are left out. With 1 fits end as near to their minimum, with
+# fewer of them; errors (modes.py) leave out those under 1 as well.
+LEAST_CHANGE = 0.3
+LEAST_POWER = 1e-30  # of a component in a channel that does not see it
+
+
+class Exchange:
+    """The unknowns of a scene that is nearly fitted, and their normal matrix.
+
+    solution: Solution with the solver's own morphologies and spectra, its peaks 1
+    exposures: an Exposure of each observation; fit_sky: whether sky levels are unknowns too
+
+    moves (n): each component's Moves, None where it shares no light with another
+    """
+
+    def __init__(self, solution, exposures, *, fit_sky=False):
+        n_channels, pairs = solution.spectra.shape[1], []
+        for i, morph in enumerate(solution.morphs):
+            pairs.append(_moves(solution, i, without_dark(morph.astype(np.float32))[None]))
+        self.moves = [moves for moves, _ in pairs]
+        counts = np.array([len(images) - 1 for _, images in pairs])
+        self._layout = Layout(counts, n_channels, n_channels if fit_sky else 0)
+        images = [images for _, images in pairs]
+        self._matrix = normal_matrix(
+            solution.scene, exposures, images, solution.spectra, self._layout
+        )
+
+    def step(self, slopes):
+        """The step to the minimum of all unknowns; slopes: Slopes of the loss.
+
+        returns changes [i][j] (ny_j, nx_j) of the structure, None of components that share none,
+        (n, C) of the spectra, (C,) of the sky, and by how much the loss is expected to fall
+        """
+        layout, right, bound = self._layout, [], slopes.bound
+        for i, moves in enumerate(self.moves):
+            own = moves.slopes(slopes.structure[i]) if moves else np.zeros(0)
+            right.append(-np.concatenate([own, np.where(bound[i], 0, slopes.spectra[i])]))
+        if layout.n_sky:
+            right.append(-slopes.sky)
+        found = Factor(_held(self._matrix, layout.counts, bound)).solve(right)
+        gain = 0.5 * sum(x @ r for x, r in zip(found, right, strict=True))
+        own = list(zip(self.moves, layout.counts, found, strict=False))
+        structure = [moves.structure(x[:k]) if moves else None for moves, k, x in own]
+        sky = found[-1] if layout.n_sky else np.zeros_like(slopes.sky)
+        return structure, np.array([x[k:] for _, k, x in own]), sky, gain
+
+
+@dataclass(frozen=True, eq=False)
+class Moves:
+    """Smooth changes of one component's structure; the prior expects their coefficients (k,) to
+    scatter by 1, each on its own.
+
+    weights (k, m): of m bumps; rows (m, ny), columns (m, nx): whose products are these
+    along (J): pairs (ny_j, ny), (nx_j, nx), see prior.kernel_rows; variance (J,): of the structure
+    """
+
+    weights: np.ndarray
+    rows: np.ndarray
+    columns: np.ndarray
+    along: list
+    variance: np.ndarray
+
+    def slopes(self, gradients):
+        """Slopes (k,) of the loss by the coefficients; gradients [j] (ny_j, nx_j): by z_j."""
+        parts = zip(self.variance, self.along, gradients, strict=True)
+        image = sum(v * (y.T @ g @ x) for v, (y, x), g in parts)
+        return self.weights @ ((self.rows @ image) * self.columns).sum(axis=1)
+
+    def structure(self, coefficients):
+        """Changes [j] (ny_j, nx_j) of z_j."""
+        image = (self.rows * (coefficients @ self.weights)[:, None]).T @ self.columns
+        return [v * (y @ image @ x.T) for v, (y, x) in zip(self.variance, self.along, strict=True)]
+
+
+def _moves(solution, i, image):
+    """Component i's Moves and images (1 + k, ny, nx), float32, of its morphology (1, ny, nx) and
+    of what they change; None and the morphology alone where it shares no light."""
+    scene, prior, shared = solution.scene, solution.prior, solution.shared(i)
+    if scene.fixed[i] or not shared.any():
+        return None, image
+    profile, strengths = scene.profile[i], solution.findings.strengths[i]
+    bumps = Bumps(scene.origin[i], profile, strengths, prior.kernels(), shared)
+    keep = np.flatnonzero(solution.change(i, bumps.images) > LEAST_CHANGE)
+    if not len(keep):
+        return None, image
+    weights = uncorrelated(bumps.precision[np.ix_(keep, keep)])
+    changes = np.tensordot(weights.astype(np.float32), bumps.images[keep], 1)
+    solution.gauge(i, changes)
+    rows, columns = bumps.sides
+    both = [tuple(kernel_rows(prior, j, n) for n in profile.shape) for j in range(len(strengths))]
+    moves = Moves(weights, rows[keep], columns[keep], both, np.square(strengths))
+    return moves, np.concatenate([image, changes])
+
+
+def _held(matrix, counts, bound):
+    """Blocks in which the spectra `bound` (n, C) have nothing to do with all else, and a diagonal
+    of 1; counts (n,): unknowns before a component's spectrum."""
+    held = {i: k + np.flatnonzero(b) for i, (k, b) in enumerate(zip(counts, bound, strict=True))}
+    out = Blocks(matrix.sizes)
+    for (i, j), block in matrix.items():
+        new = out.block(i, j)
+        new[:] = block
+        new[held.get(i, [])] = 0
+        new[:, held.get(j, [])] = 0
+        if i == j:
+            new[held.get(i, []), held.get(i, [])] = 1
+    return out
+
+
+def exchange_of(fit, scene, state, findings):
+    """The Exchange of a Fit at a State of a Scene, with the Findings there; None where no sources
+    share light, or with a normal matrix that is not positive definite."""
+    n = len(state.morph)
+    solution = Solution(
+        scene,
+        [m.astype(float) for m in state.morph],
+        np.ones(n),
+        np.asarray(state.spectra),
+        1 / np.sqrt(np.maximum(scene.power, LEAST_POWER)),
+        fit.start.shapes,
+        fit.start.thetas,
+        fit.start.positions[fit.start.source],
+        findings,
+        np.ones(n),
+        fit.settings.prior,
+    )
+    if not any(solution.shared(i).any() for i in range(n)):
+        return None
+    pairs = zip(fit.views, fit.blend.observations, strict=True)
+    exposures = [Exposure.of(view, fit.frame, o, fit.start.source) for view, o in pairs]
+    return Exchange(solution, exposures, fit_sky=fit.settings.fit_sky)

@@ -1,0 +1,295 @@
+"""What runs a batch of fits, with engines that only say what they are told: who stops, who is
+shifted, what is kept, who goes on."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from clresample.deblending import iterate as room
+from clresample.deblending.iterate import CHECK, LEAST_GAIN, MOVE, REPACK, iterate
+
+
+class Told(SimpleNamespace):
+    """A fit that notes what is done with it."""
+
+    def __init__(self, name, status="iteration limit"):
+        super().__init__(name=name, status=status, ended=None, best=None, seconds={})
+        self.shifts, self.last_steps = np.zeros((2, 2)), np.full((2, 2), 9.0)
+        self.losses = []
+
+    def shift(self, shifts):
+        self.shifts = shifts
+
+    def end(self, *given):
+        self.ended = given
+
+    settle = end
+
+    def remember(self, *given):
+        self.best = given
+
+    def interrupt(self):
+        self.status = "interrupted"
+
+    def note_seconds(self, stage, seconds):
+        self.seconds[stage] = seconds
+
+
+def learning(n_rounds, *, live=None, converged=None, failed=None, **settings):
+    """Fits a, b, c under the prior that learns."""
+    n = len(n_rounds)
+    no = np.zeros(n, bool)
+    progress = SimpleNamespace(
+        live=~no if live is None else np.array(live),
+        converged=no.copy() if converged is None else np.array(converged),
+        failed=no.copy() if failed is None else np.array(failed),
+        settled=no.copy(),
+        n_rounds=np.array(n_rounds),
+        loss=np.arange(1.0, n + 1),
+        chi2=lambda: np.array([1.0, 2.0, 4.0])[:n],
+    )
+    engine = SimpleNamespace(
+        progress=progress,
+        scenes=[f"scene {i}" for i in range(n)],
+        states=lambda: [f"state {i}" for i in range(n)],
+        findings=lambda which: [f"findings {i}" if on else None for i, on in enumerate(which)],
+        followed=[],
+    )
+    engine.follow_shifts = lambda moved: engine.followed.append(moved.tolist())
+    engine.slopes = lambda which: [f"slopes {i}" for i in range(n)]
+    settings = SimpleNamespace(**({"max_iter": 100, "fit_shifts": False, "enough": 0.5} | settings))
+    past = engine, [None] * n, np.tile([0, np.inf], (n, 1))
+    return room._Learning([Told(c) for c in "abc"[:n]], settings, None, None, past)
+
+
+@pytest.fixture(autouse=True)
+def no_exchange(monkeypatch):
+    """No sources share light."""
+    monkeypatch.setattr(room, "exchange_of", lambda *given: None)
+
+
+def test_steps_of_exchange_are_asked_for_in_time_and_again_where_the_last_one_gained(monkeypatch):
+    """Of settled fits after FIRST_EXCHANGE rounds and each EXCHANGE, of converged ones at once."""
+    made, steps = [], []
+
+    def exchange_of(fit, scene, state, findings):
+        made.append((fit.name, scene, state, findings))
+        gain = {"a": 0.2, "b": 0.6, "c": 0.9}[fit.name]
+        return SimpleNamespace(step=lambda slopes: (slopes, None, None, gain))
+
+    monkeypatch.setattr(room, "exchange_of", exchange_of)
+    one = learning([39, 39, 12], converged=[False, False, True], enough=1.0)
+    p, every = one.engine.progress, np.ones(3, bool)
+    one.engine.step = lambda given: steps.append({i: step[0] for i, step in given.items()})
+    one._exchange(every)
+    assert made == [("c", "scene 2", "state 2", "findings 2")] and not steps  # .9 of 2
+    p.n_rounds += 1
+    one._exchange(every)
+    assert len(made) == 1  # strengths have not settled
+    p.settled[:2] = True
+    one._exchange(every)
+    assert [name for name, *_ in made] == ["c", "a", "b"] and not steps
+    p.chi2 = lambda: np.array([0.5, 1.0, 1.0])
+    p.n_rounds += 20
+    one._exchange(every)
+    assert not steps  # the losses are what they were
+    p.loss = p.loss - 0.51
+    p.n_rounds -= 1
+    one._exchange(np.array([True, True, False]))
+    assert not steps  # too early
+    p.n_rounds += 1
+    one._exchange(np.array([True, True, False]))
+    assert steps == [{1: "slopes 1"}] and len(made) == 3
+    one._exchange(every)
+    assert steps[1:] == [{2: "slopes 2"}]
+    p.loss, p.converged = p.loss - 1, every
+    one.settings.max_iter = int(p.n_rounds.max()) - 1
+    one._exchange(every)
+    assert len(steps) == 2  # at the limit
+
+
+def test_fits_that_are_over_are_left_with_their_present_state():
+    """Each with its own status; one that was going on keeps what it had."""
+    one = learning([5, 9, 7], converged=[True, False, False], failed=[False, False, True])
+    assert one.n_steps == 8 and learning([0, 0]).n_steps == 0
+    one.fits[1].status = "interrupted"
+    one.settle(np.array([True, True, True]))
+    found = [f.ended for f in one.fits]
+    assert [ended[3] for ended in found] == ["converged", "interrupted", "diverged"]
+    assert found[1][:3] == ("scene 1", "state 1", "findings 1")
+    one = learning([5, 9])
+    one.settle(np.array([False, True]))
+    assert one.fits[0].ended is None and one.fits[1].ended[3] == "iteration limit"
+
+
+def test_a_round_settles_those_that_it_ends():
+    """Not those that had stopped before; at the limit all that go on."""
+    one = learning([5, 5, 5], live=[True, True, False])
+    p = one.engine.progress
+
+    def round_():
+        p.n_rounds += p.live
+        p.live[0] = False
+        return np.array([True, False, False])
+
+    one.engine.round = round_
+    np.testing.assert_array_equal(one.run(), [[1, 2, 3]])
+    assert [f.ended is not None for f in one.fits] == [True, False, False]
+    assert one.fits[0].losses == [1.0] * CHECK and p.n_rounds.tolist() == [6, 10, 5]
+    assert p.live.tolist() == [False, True, False]
+    one.settings.max_iter = one.n_steps + 2
+    one.run()
+    assert p.n_rounds.tolist() == [6, 12, 5] and not p.live.any()
+    assert one.fits[1].ended is not None and one.fits[2].ended is None
+
+
+@pytest.mark.parametrize("at_limit", [False, True])
+def test_converged_fits_are_shifted_once_more_before_they_end(at_limit, monkeypatch):
+    one = learning([2, 2, 2], live=[True, True, False], fit_shifts=True, max_iter=2 + 4 * at_limit)
+    one.settings.max_iter = 4 if at_limit else 50
+    p = one.engine.progress
+
+    def round_():
+        p.n_rounds += p.live
+        if p.n_rounds[1] == (5 if at_limit else 4):
+            p.live[0], p.converged[0], p.converged[2] = False, True, True
+        return np.zeros(3, bool)
+
+    one.engine.round, moved = round_, []
+    one._move = lambda which: moved.append(which.tolist())
+    one.run()
+    assert moved == ([] if at_limit else [[True, False, False]])
+
+
+def test_shifts_are_made_where_they_gain_part_of_what_ends_a_fit(monkeypatch):
+    """In its own measure of misfit; steps are taken ahead from the last ones."""
+    one = learning([11, 11, 11], fit_shifts=True, enough=0.2)
+    gains = {"scene 0": 1.01, "scene 1": 1.99, "scene 2": 4.01}
+    steps = np.array([[0.0, 0.0], [0.1, 0.2]])
+    part = LEAST_GAIN * 0.2
+
+    def shift_steps(scene, state):
+        assert state[-1] == scene[-1]
+        return steps, part * gains[scene]
+
+    asked = []
+    monkeypatch.setattr(room, "shift_steps", shift_steps)
+    monkeypatch.setattr(room, "ahead", lambda new, last: asked.append(last.max()) or 3 * new)
+    one.shift()
+    assert one.engine.followed == [[True, False, True]] and asked == [9, 9]
+    np.testing.assert_array_equal(one.fits[0].shifts, 3 * steps)
+    np.testing.assert_array_equal(one.fits[0].last_steps, steps)
+    assert not one.fits[1].shifts.any() and one.fits[1].last_steps.max() == 9
+    one._move(np.array([False, True, False]))
+    assert len(one.engine.followed) == 1  # nothing has moved
+    one._move(np.array([False, False, True]))
+    assert one.engine.followed[1:] == [[False, False, True]]
+    np.testing.assert_array_equal(one.fits[2].shifts, 6 * steps)
+    before = len(asked)
+    one._move(np.zeros(3, bool))
+    assert len(asked) == before
+    one.engine.progress.n_rounds[:] = MOVE + 2
+    one.shift()  # not every round
+    one.engine.progress.n_rounds[:] = MOVE + 1
+    one.settings.fit_shifts = False
+    one.shift()
+    assert len(asked) == before
+
+
+def test_fits_that_go_on_leave_a_batch_of_which_a_quarter_has_stopped():
+    assert REPACK == 0.25
+    one = learning([3] * 3, live=[True, False, True])
+    one.engine.take = lambda keep: SimpleNamespace(kept=keep.tolist())
+    rest = one.repacked()
+    assert rest is not one and rest.engine.kept == [0, 2]
+    assert [f.name for f in rest.fits] == ["a", "c"]
+
+
+class Engine:
+    """One under another prior: each iteration lowers fit i's loss by i + 1."""
+
+    def __init__(self, n, n_steps=0):
+        self.n_steps, self.scenes = n_steps, [f"scene {i}" for i in range(n)]
+        self.followed = 0
+
+    def run(self, n):
+        self.n_steps += n
+        return np.arange(n)[:, None] * -np.arange(1.0, len(self.scenes) + 1)
+
+    def states(self, kept=False):
+        return [f"{'kept' if kept else 'state'} {i}" for i in range(len(self.scenes))]
+
+    def best_losses(self):
+        return np.arange(len(self.scenes)) + 0.25
+
+    def final_losses(self):
+        return np.arange(len(self.scenes)) + 0.5
+
+    def follow_shifts(self):
+        self.followed += 1
+
+
+RUNNING = room._Running
+
+
+def running(n, *, live=None, n_steps=0, **settings):
+    one = object.__new__(RUNNING)
+    one.fits, one.engine = [Told(c) for c in "abcdefgh"[:n]], Engine(n, n_steps)
+    one.live = np.ones(n, bool) if live is None else np.array(live)
+    one.settings = SimpleNamespace(**({"max_iter": 100, "fit_shifts": False} | settings))
+    one.device = one.dtype = None
+    for f in one.fits:
+        f.stopped = lambda losses, f=f: f.losses.extend(losses) or f.name == "b"
+    return one
+
+
+def test_other_engines_run_a_few_iterations_and_settle_who_stops():
+    one = running(3, live=[True, True, False], max_iter=CHECK + 2)
+    losses = one.run()
+    assert losses.shape == (CHECK, 3) and one.live.tolist() == [True, False, False]
+    assert one.fits[0].losses == (-np.arange(CHECK)).tolist() and one.fits[2].losses == []
+    assert one.fits[1].ended == (1.5, "scene 1", "state 1")
+    assert one.fits[1].best == (1.25, "scene 1", "kept 1")
+    assert one.fits[0].ended is None and one.fits[0].best is None
+    assert one.run().shape == (2, 3)  # and then no more
+    assert not one.live.any() and one.fits[0].ended == (0.5, "scene 0", "state 0")
+    assert one.fits[2].ended is None
+
+
+@pytest.mark.parametrize("fit_shifts, n_steps", [(True, MOVE), (True, MOVE - 1), (False, MOVE)])
+def test_other_engines_shift_every_few_iterations(fit_shifts, n_steps, monkeypatch):
+    one = running(3, live=[True, False, True], fit_shifts=fit_shifts, n_steps=n_steps)
+    monkeypatch.setattr(room, "shift_steps", lambda scene, state: (np.full((2, 2), 0.5), 1.0))
+    one.fits[0].shifts = np.ones((2, 2))
+    one.shift()
+    due = fit_shifts and n_steps == MOVE
+    assert one.engine.followed == due
+    assert [f.shifts.max() for f in one.fits] == ([1.5, 0, 0.5] if due else [1, 0, 0])
+    assert (one.fits[0].best == (0.25, "scene 0", "kept 0")) == due and one.fits[1].best is None
+
+
+def test_ctrl_c_settles_those_that_go_on(monkeypatch):
+    one = running(3, live=[True, False, True])
+    one.run = lambda: (_ for _ in ()).throw(KeyboardInterrupt)
+    monkeypatch.setattr(room, "_Running", lambda *_: one)
+    clock = iter([10.0, 13.0, 13.0, 13.0])
+    monkeypatch.setattr(room, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    iterate(one.fits, SimpleNamespace(learns=False, max_iter=9), None, None)
+    assert [f.status == "interrupted" for f in one.fits] == [True, False, True]
+    assert [f.ended is not None for f in one.fits] == [True, False, True]
+    assert [f.seconds for f in one.fits] == [{"fit": 1.0}] * 3  # shared among them
+
+
+def test_a_run_ends_when_no_fit_goes_on_or_at_the_limit(monkeypatch):
+    """And tells how far it is."""
+    for max_iter, wanted in ((100, [5, 10]), (7, [5, 7]), (0, [])):
+        one, seen, calls = running(2, max_iter=max_iter), [], []
+        one.fits[0].stopped = lambda losses, one=one: one.n_steps >= 10
+        one.shift, one.repacked = lambda calls=calls: calls.append(1), lambda one=one: one
+        monkeypatch.setattr(room, "_Running", lambda *_, one=one: one)
+        settings = SimpleNamespace(learns=False, max_iter=max_iter)
+        iterate(one.fits, settings, None, None, lambda n, loss, seen=seen: seen.append((n, loss)))
+        assert [n for n, _ in seen] == wanted and len(calls) == max(len(wanted) - 1, 0)
+        if seen:
+            np.testing.assert_array_equal(seen[0][1], [-4, -8])

@@ -1,0 +1,121 @@
+"""Fitted morphologies as observations see them, beside whole frames; weights about bright stars."""
+
+import numpy as np
+import pytest
+from helpers.scenes import BRIGHT, SHAPE, frame, observe
+from helpers.start import least_squares, rendered, view, views
+
+from clresample.deblending.profiles import Star
+from clresample.deblending.start import seen as room
+from clresample.deblending.start.seen import Model, see
+from clresample.deblending.view import FAINT, allow_for_psf_error
+from clresample.resampling.cache import cached_resampler
+from clresample.sky.psf import PSF
+
+BOXES = (((4, 2), (15, 14)), ((10, 14), (14, 17)), ((3, 5), (24, 26)))
+
+
+def spot(shape):
+    """An image with maximum 1, brightest beside its middle."""
+    y, x = (np.arange(n) - 0.45 * n for n in shape)
+    return np.exp(-0.5 * (y[:, None] ** 2 / 2.5**2 + x**2 / 2.0**2))
+
+
+def whole(origin, image):
+    out = np.zeros(SHAPE)
+    out[origin[0] : origin[0] + image.shape[0], origin[1] : origin[1] + image.shape[1]] = image
+    return out
+
+
+@pytest.mark.parametrize("fit_sky", [False, True])
+@pytest.mark.parametrize("whole_px", [room.WHOLE_PX, 0])
+def test_models_are_seen_side_by_side_each_with_its_own_spectra(
+    device, fit_sky, whole_px, monkeypatch
+):
+    """Whole frames and boxes; the second observation was taken with another PSF than it is fitted
+    with."""
+    monkeypatch.setattr(room, "WHOLE_PX", whole_px)
+    sky = (0.4, -0.3, 0.2) if fit_sky else (0, 0, 0)
+    own = [views(device, observe(BRIGHT, seed=i, sky=sky)) for i in range(2)]
+    wider = PSF.gaussian(1.5, n_pixels=19, n_bands=2)
+    o = observe(BRIGHT)[1]
+    op = cached_resampler(frame(), o.grid, wider, dtype=np.float64, device=device)
+    bare = view(op, o)
+    images = [spot(shape) for _, shape in BOXES]
+    models, close = [], 1e-6 if whole_px else 2e-3
+    for of, part, other in zip(own, (BOXES[:2], BOXES[2:]), ([None, bare], [None, None])):
+        low = np.array([origin for origin, _ in part])
+        shown = images[: len(part)] if len(part) == 2 else images[2:]
+        models.append(Model(SHAPE, of, other, np.zeros(len(part), int), low, shown))
+    found = see(models, fit_sky=fit_sky)
+    for model, seen in zip(models, found, strict=True):
+        pairs = zip(model.origin, model.morphs, strict=True)
+        frames = np.array([whole(*pair) for pair in pairs])
+        units = [rendered(v, frames) for v in model.views]
+        spectra, level, covariance = least_squares(units, model.views, sky=fit_sky)
+        np.testing.assert_allclose(seen.spectra, spectra, rtol=10 * close)
+        np.testing.assert_allclose(seen.sky, level, atol=10 * close)
+        scale = np.abs(covariance).max()
+        np.testing.assert_allclose(seen.covariance, covariance, atol=10 * close * scale)
+        for v, other, shown, taken in zip(
+            model.views, model.bare, seen.observed, seen.bare, strict=True
+        ):
+            wanted = v.op.render(frames)
+            shown, taken = (np.asarray(images) * v.covered for images in (shown, taken))
+            np.testing.assert_allclose(shown, wanted, atol=close * wanted.max())
+            wanted = (other or v).op.render(frames)  # where one is asked for, all are seen
+            np.testing.assert_allclose(taken, wanted, atol=close * wanted.max())
+    for model in models:
+        model.bare[:] = [None, None]
+    assert all(seen.bare == (None, None) for seen in see(models, fit_sky=fit_sky))
+
+
+def star(flux):
+    home = frame()
+    place = np.array([14.3, 17.6])
+    return Star(home, free=True), 0, place, np.asarray(flux, float)
+
+
+def wrong_light(one, v, spectrum):
+    """L and r . grad L of a star, whitened views' units, by finite differences of its place."""
+    shape, _, place, _ = one
+    n, m = np.indices(v.mapping.shape_out)
+    away = v.mapping.at(n, m) - place
+
+    def at(offset):
+        image = shape.draw(np.zeros(2), place + offset)[:1]
+        return spectrum[:, None, None] * v.op.render(image)[0]
+
+    h = 1e-3
+    slopes = [(at(h * unit) - at(-h * unit)) / (2 * h) for unit in np.eye(2)]
+    return at(np.zeros(2)), -(away[..., 0] * slopes[0] + away[..., 1] * slopes[1])
+
+
+def test_weights_hold_the_psfs_error_in_all_stars(device):
+    """1/w = sigma^2 + psf_error^2 sum (L^2 + (r . grad L)^2), of each star its own."""
+    own = views(device, observe(BRIGHT))
+    stars = [star([3e3, 2e3, 4e3]), star([1e3, 5e3, 2e3])]
+    stars[1][2][:] = 9.2, 25.1
+    found = allow_for_psf_error(own, stars, 0.02)
+    for old, new, part in zip(own, found, (slice(0, 1), slice(1, 3)), strict=True):
+        error = 0.0
+        for one in stars:
+            light, change = wrong_light(one, old, one[3][part])
+            error = error + light**2 + change**2
+        wanted = 1 / np.sqrt(1 / np.maximum(old.root, 1e-30) ** 2 + 0.02**2 * error)
+        np.testing.assert_allclose(new.root, wanted * (old.root > 0), rtol=1e-3)
+        assert (new.root < 0.5 * old.root).any()
+        assert new.data is old.data
+
+
+@pytest.mark.parametrize("brightness, changes", [(1.3, True), (0.7, False)])
+def test_stars_count_where_their_error_shows_in_a_pixel(device, brightness, changes):
+    """Above FAINT of a pixel's noise in an observation; the others keep their weights."""
+    own = views(device, observe(BRIGHT))
+    one = star([1.0, 1e-9, 1e-9])
+    light, change = wrong_light(one, own[0], one[3][:1])
+    largest = (np.sqrt(light**2 + change**2) * own[0].root).max()
+    one[3][:] *= brightness * FAINT / (0.03 * largest)
+    found = allow_for_psf_error(own, [one], 0.03)
+    assert (found[0] is not own[0]) == changes and found[1] is own[1]
+    assert allow_for_psf_error(own, [one], 0.0) == own
