@@ -156,7 +156,9 @@ class Result(ShownResult):
         """Draw n sets of components from the posterior about the solution, as `errors` has it.
 
         rng: NumPy Generator. Morphologies and spectra below 0 become 0, so that faint sources are
-        brighter in the mean; morphologies keep their scale, their maximum is no longer 1.
+        brighter in the mean, and where a morphology is at that bound it stays there; morphologies
+        keep their scale, their maximum is no longer 1. Fluxes scatter about the components' own,
+        not about those of `fluxes` and the catalogue, from which Errors.released was taken.
         Settings.flux_floor is not in them, nor is what lies beyond the boxes, which makes fluxes of
         faint sources scatter by up to a tenth less than `errors` has it.
 
@@ -172,7 +174,9 @@ class Result(ShownResult):
         return tuple(
             replace(
                 c,
-                morphology=np.maximum(c.morphology + m, np.minimum(c.morphology, 0)),
+                morphology=np.where(
+                    c.morphology > 0, np.maximum(c.morphology + m, 0), c.morphology
+                ),
                 spectrum=np.maximum(c.spectrum + a, 0),
             )
             for c, m, a in zip(self.components, morphs, spectra, strict=True)

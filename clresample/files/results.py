@@ -31,6 +31,7 @@ KEPT = ("name", "channels", "zero_points", "n_bad", "messages")  # of an observa
 BOX = ("source", "y", "x", "n_y", "n_x")
 # HDUs of Errors
 ERRORS = {"FLUXCOV": "flux", "COLOURCOV": "colour", "MOMENTCOV": "moments", "BEYOND": "beyond"}
+ERRORS |= {"RELEASED": "released", "MOVED": "moved"}
 ARRAYS = ("sky", "covariance", "shifts", "losses")
 # every WCS card with the 17 digits that give back the same float64
 RELAX = WCSHDO_all | WCSHDO_SIP | WCSHDO_P17 | WCSHDO_EFMT
@@ -41,11 +42,11 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
 
     HDUs that `read_result` reads: ABOUT (keys and JSON: sources, names, status, messages, ...),
     COMPONENTS (boxes), SPECTRA (n, C), MORPHOLOGIES (one after the other), SKY, COVARIANCE, SHIFTS,
-    LOSSES, where the result has errors FLUXCOV, COLOURCOV, MOMENTCOV, BEYOND and MORPHOLOGYERR
-    (one after the other), MODELPSF, and per observation from 1 on: DATA, WEIGHTS, PSF, RENDERED.
-    For other programs: CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all sources in the model frame, and
-    per observation MODEL and RESIDUAL, 0 where data have no weight. All images have their WCS; a
-    flat sky is put at RA = Dec = 0. For NaN and infinity see arrays.py.
+    LOSSES, where the result has errors FLUXCOV, COLOURCOV, MOMENTCOV, BEYOND, RELEASED, MOVED and
+    MORPHOLOGYERR (one after the other), MODELPSF, and per observation from 1 on: DATA, WEIGHTS,
+    PSF, RENDERED. For other programs: CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all sources in the
+    model frame, and per observation MODEL and RESIDUAL, 0 where data have no weight. All images
+    have their WCS; a flat sky is put at RA = Dec = 0. For NaN and infinity see arrays.py.
 
     result: of `deblend`; overwrite: replace a file that exists
     device: name of the OpenCL device; inputs: {what: file}; both for the header

@@ -73,7 +73,8 @@ def catalogue(result, *, magnitudes=False) -> QTable:
         size [arcsec], e1, e2, angle [deg]: see `shapes.shape`. They are those of the model under
             the model's PSF, not deconvolved; a source's components are weighted by their flux, that
             of all channels, each in units of its error. Where the result has Errors, what the
-            smooth profile has beyond its box is counted
+            smooth profile has beyond its box is counted, and what the bound of morphologies at 0
+            adds is taken off, see `Errors.moved`
         *_centroid_err, size_err, e1_err, e2_err, angle_err: errors in the units of the values, to
             first order; ra's in degrees of ra, angle_err at most 52 deg, that of an unknown angle.
             NaN where the result has no Errors, and where the shape was not fitted, as stars'
@@ -101,7 +102,8 @@ def columns_of(result, *, magnitudes=False) -> Columns:
     table.put("name", [s.name or str(i) for i, s in enumerate(result.sources)])
     positions = result.frame.place(result.sources)
     add_positions(table, result.frame.grid, positions, "")
-    table.put("flags", _flags(result, flux, error, positions, result.footprints))
+    bounded = flux if result.errors is None else flux - result.errors.released
+    table.put("flags", _flags(result, bounded, error, positions, result.footprints))
     with np.errstate(divide="ignore", invalid="ignore"):
         snr = np.sqrt(np.nansum((flux / error) ** 2, axis=1))
     table.put("snr", np.where(fitted_sources(result), snr, np.nan))
@@ -156,6 +158,8 @@ def _add_shapes(table, result, error):
         weight = np.where(good, 1 / np.where(good, error[s], 1.0), 0.0)
         light = np.array([weight @ c.flux for c in parts])
         centroids[s], second = moments(parts, light, beyond)
+        if result.errors is not None:
+            centroids[s], second = _released(centroids[s], second, result.errors.moved[s])
         if np.isfinite(centroids[s]).all():
             axes = local_axes(result.frame.grid, centroids[s])
             sizes[s] = shape(axes @ second @ axes.T)
@@ -168,6 +172,16 @@ def _add_shapes(table, result, error):
     for i, (name, unit) in enumerate(SHAPE_UNITS.items()):
         table.put(name, sizes[:, i], unit)
         table.put(f"{name}_err", shape_errors[:, i], unit)
+
+
+def _released(centroid, second, moved):
+    """A centroid (2,) and second moments (2, 2) changed by `moved` (5,), see Errors; as they were
+    where that would leave no moments of an image, as it may those of noise."""
+    yy, yx, xx = moved[2:]
+    changed = second + [[yy, yx], [yx, xx]]
+    if not (np.linalg.det(changed) > 0 and np.trace(changed) > 0):
+        return centroid, second
+    return centroid + moved[:2], changed
 
 
 def _scatter(slopes, covariance):
@@ -220,7 +234,7 @@ def _add_colours(table, result, flux):
 
 
 def _flags(result, flux, error, positions, footprints):
-    """Bit masks (S,) of `Flag`."""
+    """Bit masks (S,) of `Flag`; flux (S, C): of the components, at their bound or above."""
     fitted = fitted_sources(result)
     flags = np.zeros(len(fitted), dtype=np.int32)
     if result.status != "converged":

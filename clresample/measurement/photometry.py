@@ -19,7 +19,9 @@ def fluxes(result):
 
     over the components i of s and j of t: with morphologies fixed. Where the result has Errors, the
     covariances are theirs, marginal over morphologies, and |S| has what the smooth profile holds
-    beyond its box, where it is under the noise: a percent of the flux at signal to noise 10.
+    beyond its box, where it is under the noise: a percent of the flux at signal to noise 10. And
+    F is without what the bound of morphologies at 0 adds to it, 0.1 to 1 % of bright galaxies,
+    see `Errors.released`; it may be below 0 by chance.
 
     result: a fitted blend
     returns flux (S, C) [counts]: NaN for a source without components; covariance (C, S, S)
@@ -32,6 +34,8 @@ def fluxes(result):
         if result.errors is not None:
             sums[component.source, i] += result.errors.beyond[i, 0]
     flux = sums @ spectra_of(result)
+    if result.errors is not None:
+        flux = flux + result.errors.released
     flux[~fitted_sources(result)] = np.nan
     known = np.isfinite(np.diagonal(result.covariance, axis1=1, axis2=2))  # (C, n)
     both = known[:, :, None] & known[:, None, :]

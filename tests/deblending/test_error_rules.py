@@ -117,6 +117,7 @@ def test_errors_at_fixed_morphologies_are_those_of_the_normal_matrix(monkeypatch
     made = []
     monkeypatch.setattr(posterior_module, "Posterior", lambda s, *_a, **_k: made.append(s))
     monkeypatch.setattr(posterior_module, "_local_chi2", lambda *_: np.ones(2))
+    monkeypatch.setattr(posterior_module, "pulls", lambda *_: [])
     covariance = np.array([[[1e-8, 5.0], [5.0, 4.0]], [[0.0, 0], [0, -1e-20]]])
     spectra = np.array([[3.0, 3.0], [1e6, 0.0]])
     start = SimpleNamespace(source=np.array([0, 1]), shapes=0, thetas=0, positions=np.eye(2))
@@ -150,6 +151,7 @@ def made_up(rng, *, fixed=(), n_common=2):
     for i in range(len(nodes)):
         for j in range(i, len(nodes)):
             made.covariance.block(i, j)[:] = dense[ends[i] : ends[i + 1], ends[j] : ends[j + 1]]
+    made.released = [1e-4 * rng.normal(size=k) for k in nodes]
     made.solution = SimpleNamespace(
         spectra=rng.uniform(5, 9, (3, n_channels)),
         morphs=[rng.uniform(1, 2, size) for size in sizes],
@@ -204,15 +206,18 @@ def slopes(function, n, step=1e-5):
 
 def test_errors_follow_from_the_covariance_of_all_unknowns():
     """Fluxes, colours, shapes and maps, by finite differences; in counts; with the floor, which
-    grows with the square of a component's structure."""
+    grows with the cube of a component's structure."""
     made, covariance = made_up(np.random.default_rng(0))
     n, unit, floor = len(covariance), np.array([10.0, 3.0]), 0.02
     errors = made.errors(OWNER, 2, unit, floor)
     by = slopes(lambda v: fluxes(made, v).ravel(), n)  # (S C, n)
     full = (by @ covariance @ by.T).reshape(2, 2, 2, 2)
+    released = np.concatenate(made.released[:3])
+    wanted = (by @ released).reshape(2, 2) * unit
+    np.testing.assert_allclose(errors.released, wanted, rtol=1e-6)
     own = np.zeros((2, 2))
     for i, (morph, far, spectrum) in enumerate(shifted(made, np.zeros(n))):
-        own[OWNER[i]] += floor * (1.0 + i) ** 2 * spectrum * (morph.sum() + far[0])
+        own[OWNER[i]] += floor * (1.0 + i) ** 3 * spectrum * (morph.sum() + far[0])
     for c in range(2):
         wanted = full[:, c, :, c] + np.diag(own[:, c] ** 2)
         np.testing.assert_allclose(errors.flux[c], wanted * unit[c] ** 2, rtol=1e-5)
@@ -223,7 +228,8 @@ def test_errors_follow_from_the_covariance_of_all_unknowns():
         by = slopes(lambda v, s=s, w=weight: shapes(made, v, s, w), n)
         if s == 1:  # the other has no mode: nothing is known of its shape's error
             np.testing.assert_allclose(errors.moments[s], by @ covariance @ by.T, rtol=1e-4)
-    assert np.isnan(errors.moments[0]).all()
+            np.testing.assert_allclose(errors.moved[s], by @ released, rtol=1e-4)
+    assert np.isnan(errors.moments[0]).all() and not errors.moved[0].any()
     ends = np.cumsum([0, *made.layout.sizes])
     for i, modes in enumerate(made.modes):
         block = covariance[ends[i] : ends[i] + len(modes), ends[i] : ends[i] + len(modes)]

@@ -79,6 +79,22 @@ def test_draws_scatter_as_the_inverse_says():
     np.testing.assert_allclose(found * scale[:, None] / scale, np.eye(n), atol=1e-6)
 
 
+@pytest.mark.parametrize("common", [0, 3])
+def test_equations_are_solved_for_all_nodes(common):
+    """Also for those that are no neighbours, which `inverse` leaves out."""
+    matrix = field(3, 4, common=common)
+    right = [np.random.default_rng(i).normal(size=n) for i, n in enumerate(matrix.sizes)]
+    given = np.concatenate(right)
+    dense = matrix.dense()
+    scale = np.sqrt(np.diag(dense))
+    scaled = dense / scale[:, None] / scale + RIDGE * np.eye(len(dense))
+    wanted = np.linalg.solve(scaled, given / scale) / scale
+    found = Factor(matrix).solve(right)
+    assert [len(part) for part in found] == list(matrix.sizes)
+    np.testing.assert_allclose(np.concatenate(found) * scale, wanted * scale, rtol=1e-6, atol=1e-9)
+    np.testing.assert_array_equal(np.concatenate(right), given)  # left as they are
+
+
 def test_a_matrix_that_is_not_positive_definite_is_refused():
     matrix = field(3, 3)
     matrix.block(4, 4)[:] -= 10 * np.trace(matrix.block(4, 4)) * np.eye(matrix.sizes[4])

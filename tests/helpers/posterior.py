@@ -116,7 +116,7 @@ def _dense_modes(posterior, i):
         covariance += a**2 * np.kron(rows, columns)
     root = np.linalg.cholesky(covariance).T.reshape(n, *profile.shape)
     images = np.sqrt(np.maximum(profile, 0)) * root
-    along = s.gauge(i, images)
+    along = s.along(i, images)
     far = posterior.beyond[i]
     beyond = np.concatenate([-far.sums[0] * along, far.slopes[0, -n_slopes:]])
     return np.concatenate([images / s.peaks[i], posterior.modes[i][-n_slopes:]]), beyond

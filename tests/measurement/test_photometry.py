@@ -126,7 +126,8 @@ def test_colours_are_better_known_than_fluxes_that_err_together():
     covariance = np.array([[[25.0, 45.0], [45.0, 100.0]]])
     flux = np.array([[[25.0]], [[100.0]]])
     maps, beyond = (component.morphology,), np.zeros((1, 6))
-    known = Errors(flux, covariance, np.full((1, 5, 5), np.nan), maps, beyond)
+    unbound = np.zeros((1, 2)), np.zeros((1, 5))
+    known = Errors(flux, covariance, np.full((1, 5, 5), np.nan), maps, beyond, *unbound)
     observations = [observe(grid, ("g", "r"), **zero_points)]
     total = component.flux
     for errors, both in ((known, covariance[0]), (None, np.diag([25.0, 100.0]))):
@@ -141,13 +142,17 @@ def test_colours_are_better_known_than_fluxes_that_err_together():
 
 
 def test_fluxes_hold_what_lies_beyond_the_boxes():
-    """Of each component its own light there, the first of its sums."""
+    """Of each component its own light there, the first of its sums; and what the bound adds is
+    taken off."""
     parts = [round_component(0, (30, 28), (2.0, 1.0)), round_component(1, (30, 44), (1.0, 4.0))]
     beyond = np.arange(12.0).reshape(2, 6) + 3
     maps = tuple(c.morphology for c in parts)
     variance = np.tile(np.diag([4.0, 9.0]), (2, 1, 1))
-    errors = Errors(variance, np.ones((2, 2, 2)), np.full((2, 5, 5), np.nan), maps, beyond)
+    released = np.array([[0.5, -9.0], [0.0, 1.0]])
+    moments = np.full((2, 5, 5), np.nan), maps, beyond, released, np.zeros((2, 5))
+    errors = Errors(variance, np.ones((2, 2, 2)), *moments)
     flux, found = fluxes(blend(parts, errors=errors))
+    flux = flux - released
     a, b = (c.morphology.sum() for c in parts)
     np.testing.assert_allclose(flux, [[2 * (a + 3), a + 3], [b + 9, 4 * (b + 9)]], rtol=1e-13)
     np.testing.assert_array_equal(found, variance)

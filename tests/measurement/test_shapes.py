@@ -90,7 +90,8 @@ def test_errors_of_positions_on_the_sky(cards):
     covariance[0, :2, :2], covariance[0, 2:, 2:] = pixel, 0.01 * np.eye(3)
     flux = np.ones((2, 1, 1))
     maps = (component.morphology,)
-    errors = Errors(flux, np.ones((1, 2, 2)), covariance, maps, np.zeros((1, 6)))
+    unbound = np.zeros((1, 2)), np.zeros((1, 5))
+    errors = Errors(flux, np.ones((1, 2, 2)), covariance, maps, np.zeros((1, 6)), *unbound)
     row = catalogue(blend([component], grid=grid, errors=errors))[0]
     assert row["y_centroid_err"].value == pytest.approx(0.2)
     assert row["x_centroid_err"].value == pytest.approx(0.3)
@@ -102,6 +103,23 @@ def test_errors_of_positions_on_the_sky(cards):
     assert row["dec_centroid_err"].to_value("deg") == pytest.approx(np.std(lat), rel=0.03)
     assert row["flux_err_g"].value == 1
     assert row["angle_err"].value == pytest.approx(180 / np.sqrt(12))  # a round source's
+
+
+def test_shapes_are_without_what_the_bound_adds():
+    """Unless nothing would be left."""
+    component = round_component(0, (30, 34), [1.0, 2.0])
+    given = np.zeros((1, 5, 5)), (component.morphology,), np.zeros((1, 6)), np.zeros((1, 2))
+    moved = np.array([[0.1, -0.2, -0.5, 0.25, -0.125]])
+    rows = []
+    for by in (0, 1, 100):
+        errors = Errors(np.ones((2, 1, 1)), np.ones((1, 2, 2)), *given, by * moved)
+        rows.append(catalogue(blend([component], errors=errors))[0])
+    plain, changed, kept = rows
+    for axis, by in (("y", 0.1), ("x", -0.2)):
+        name = f"{axis}_centroid"
+        assert (changed[name] - plain[name]).value == pytest.approx(by)
+    assert changed["size"] < plain["size"] and changed["e2"] != plain["e2"]
+    assert kept["size"] == plain["size"] and kept["y_centroid"] == plain["y_centroid"]
 
 
 def test_a_single_pixel_has_size_0_and_no_ellipticity():

@@ -28,6 +28,9 @@ class Errors:
     beyond (n, 6) [1, px, px^2]: no error, but what belongs to the fluxes and moments: the sums of
         each component's smooth profile beyond its box, times 1, y, x, y y, y x, x x of the frame,
         where the morphology has its maximum 1
+    released (S, C) [counts], moved (S, 5) [px, px^2]: likewise no errors: what fluxes, and
+        centroids and second moments, change by when the bound of morphologies at 0 is released,
+        see bounds.py
     """
 
     flux: np.ndarray
@@ -35,6 +38,8 @@ class Errors:
     moments: np.ndarray
     morphology: tuple[np.ndarray, ...]
     beyond: np.ndarray
+    released: np.ndarray
+    moved: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,9 +27,18 @@ RATIO, FAINT = 0.05, 0.3
 STRUCTURE_PX, WEIGHT, STRENGTH = 2.0, 10.0, 0.05
 # Powers of that strength, over STRENGTH, with which the other scales, the core and the halo of a
 # profile, and Settings.flux_floor go: what is unlike a smooth profile at one scale is so at all.
-# Parametric galaxies have 1 and hardly notice; real ones of COSMOS, which have 2 (a quarter of
-# them 3), gain 0.03 in the coverage of fluxes by the first, and 0.05 by the second.
-OTHERS, FLOOR = 1.5, 2.0
+# Parametric galaxies have 0.7 to 1.1 and hardly notice; real ones of COSMOS have 2, a quarter of
+# them 3. With 1.5 and 2 the coverage of their sizes is 0.04 lower, and that of fluxes from signal
+# to noise 10 to 100 as well.
+OTHERS, FLOOR = 2.5, 3.0
+# Unlikeness that counts for these at most: a merger of real galaxies reaches 10, of which the
+# powers would be a floor of half its flux.
+MOST_UNLIKE = 3.0
+
+
+def power_of(unlikeness, exponent):
+    """Unlikeness to the power of OTHERS or FLOOR, see MOST_UNLIKE."""
+    return min(unlikeness, MOST_UNLIKE) ** exponent
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +51,7 @@ class Solution:
     shapes, thetas, positions (n): the start's Shapes, parameters, places (2,) [px]
     findings: Findings; chi2 (n,): per pixel, where each component's light is
     prior: LearnedPrior
+    pulls (n): arrays (ny, nx), see bounds.py; None where nothing asks for `modes`
     """
 
     scene: Scene
@@ -55,6 +65,7 @@ class Solution:
     findings: object
     chi2: np.ndarray
     prior: LearnedPrior
+    pulls: list | None = None
 
     def unlikeness(self, i):
         """Strength of component i's structure over that of a galaxy that is like its smooth
@@ -73,13 +84,14 @@ class Solution:
     def strengths(self, i):
         """Strengths (J,) of component i's structure; see STRUCTURE_PX."""
         unlike = self.unlikeness(i)
-        out = self.findings.strengths[i] * unlike**OTHERS
+        out = self.findings.strengths[i] * power_of(unlike, OTHERS)
         out[self._scale] = unlike * STRENGTH
         return out
 
     def modes(self, i):
         """Images (1 + k, ny, nx), float32, of component i's morphology and of its modes, whose
-        coefficients the prior expects to scatter by 1, each on its own; and its Beyond."""
+        coefficients the prior expects to scatter by 1, each on its own; its Beyond; and what the
+        data pull of each mode (k,) where the bound at 0 holds the morphology."""
         profile, scene = self.scene.profile[i], self.scene
         images, scatter, far = profile_modes(
             self.shapes[i],
@@ -87,7 +99,7 @@ class Solution:
             self.positions[i],
             profile,
             scene.origin[i],
-            radial=self.unlikeness(i) ** OTHERS,
+            radial=power_of(self.unlikeness(i), OTHERS),
         )
         scatter = scatter / self.peaks[i]
         far = far.scaled(np.append(1 / self.peaks[i], scatter))
@@ -106,19 +118,30 @@ class Solution:
             flat = flat if len(keep) == len(flat) else flat[keep]
             np.matmul(own.astype(np.float32), flat, out=out[:n_own].reshape(n_own, -1))
         out[n_own:] = without_dark(scatter[:, None, None] * images)
-        far = far.gauged(self.gauge(i, out) * self.peaks[i])
-        return seen, far
+        far = far.gauged(self.along(i, out) * self.peaks[i])
+        return seen, far, self._held(i, out)
 
     def gauge(self, i, images):
         """Take off images, in place, what lies along the profile, and all of them where the
         morphology is at its bound; returns how much lay along it (k,)."""
+        along, inside = self.along(i, images), self.morphs[i] > 0
+        if not self.scene.fixed[i] and not inside.all():
+            images *= inside
+        return along
+
+    def along(self, i, images):
+        """Take off images, in place, what lies along the profile; returns how much it was (k,)."""
         p = without_dark(self.scene.profile[i].astype(images.dtype))
         along = images.reshape(len(images), p.size) @ p.ravel() / max((p * p).sum(), 1e-30)
         images -= along[:, None, None] * p
-        inside = self.morphs[i] > 0
-        if not self.scene.fixed[i] and not inside.all():
-            images *= inside
         return along.astype(np.float64)
+
+    def _held(self, i, images):
+        """What the data pull of images (k, ny, nx) where the bound holds the morphology (k,)."""
+        held = self.morphs[i] <= 0
+        if self.scene.fixed[i] or not held.any():
+            return np.zeros(len(images))
+        return (images[:, held] @ self.pulls[i][held].astype(images.dtype)).astype(np.float64)
 
     def change(self, i, images):
         """What images (k, ny, nx) of scatter 1 change of flux and second moment [fixed errors]."""

@@ -1,0 +1,31 @@
+"""What the bound of morphologies at 0 holds back, and so adds to fluxes and sizes.
+
+In a galaxy's wings structure follows the noise up, but not down: S >= 0 holds it. So the light of
+bright galaxies comes out 0.1 to 1 % too high, about half an error. Where a pixel is held the loss
+still has a slope; released along the modes it leads to the minimum without the bound, whose fluxes
+and moments are not biased so.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...sky.extent import box_slices
+
+
+def pulls(scene, views, source, seen):
+    """Minus the slopes of half chi2 by all pixels (ny, nx) of n morphologies with max = 1.
+
+    scene: Scene; views: WhitenedViews; source (n,): of each component, by which views know its PSF
+    seen: Seen, of the morphologies
+    """
+    out = [np.zeros(p.shape) for p in scene.profile]
+    for view, rendered, part in zip(views, seen.observed, scene.channels(), strict=True):
+        spectra = seen.spectra[:, part]
+        left = view.data - rendered.total(spectra) - seen.sky[part, None, None]
+        frames = view.op.adjoint((view.root**2 * left).astype(view.op.dtype))
+        if view.shares is not None:
+            spectra = (spectra[:, :, None] * view.shares[source]).reshape(len(spectra), -1)
+        for image, origin, a in zip(out, scene.origin, spectra, strict=True):
+            image += np.tensordot(a, frames[:, *box_slices(origin, image.shape)], 1)
+    return out
