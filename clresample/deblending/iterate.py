@@ -28,6 +28,9 @@ LEAST_GAIN = 0.5
 FIRST_EXCHANGE, EXCHANGE = 40, 20
 # It takes the step if its loss is expected to fall by more than this part of what ends it.
 LEAST_EXCHANGE = 0.5
+# An Exchange is given up if until the next one the loss has fallen by less than this part of what
+# it promised: bounds hold the scene elsewhere, and trials along its steps would be refused.
+LEAST_KEPT = 0.2
 # [iterations] between two adjustments of the boxes to the light they hold; each makes a new batch.
 RESIZE = 40
 
@@ -143,14 +146,14 @@ class _Learning:
 
     Boxes stay as they are: structure fades at their edges, as the profile does that they follow.
 
-    exchanges (B): each fit's Exchange, or None; asked (B, 2): a fit's rounds and loss when that was
-        last looked at, 0 and infinite before
+    exchanges (B): each fit's Exchange, or None; asked (B, 3): a fit's rounds and loss when that was
+        last looked at, 0 and infinite before, and the gain that it promised then
     """
 
     def __init__(self, fits, settings, device, dtype, past=None):
         self.fits, self.settings, self.device, self.dtype = list(fits), settings, device, dtype
         if past is None:
-            self.exchanges, self.asked = [None] * len(fits), np.tile([0, np.inf], (len(fits), 1))
+            self.exchanges, self.asked = [None] * len(fits), np.tile([0, np.inf, 0], (len(fits), 1))
             scenes, states = [f.scene for f in fits], [f.state for f in fits]
             self.engine = LearnedEngine(
                 scenes, states, device, dtype, settings.prior, settings.enough
@@ -215,13 +218,13 @@ class _Learning:
         enough; those that have converged then go on."""
         engine, p = self.engine, self.engine.progress
         enough = LEAST_EXCHANGE * self.settings.enough * p.chi2()
-        rounds, loss = self.asked.T
+        rounds, loss, promised = self.asked.T
         due = p.n_rounds >= np.maximum(rounds + EXCHANGE, FIRST_EXCHANGE)
         which = which & (p.converged | (p.live & p.settled & due)) & (p.loss < loss - enough)
         if not which.any() or self.n_steps >= self.settings.max_iter:
             return
-        new = which & (rounds == 0)
-        self.asked[which] = np.stack([p.n_rounds, p.loss], axis=1)[which]
+        new, kept = which & (rounds == 0), loss - p.loss >= LEAST_KEPT * promised
+        self.asked[which] = np.stack([p.n_rounds, p.loss, 0 * loss], axis=1)[which]
         if new.any():
             states, findings = engine.states(), engine.findings(new)
             for i in np.flatnonzero(new):
@@ -229,10 +232,12 @@ class _Learning:
                 self.exchanges[i] = exchange_of(self.fits[i], *given)
         slopes, steps = engine.slopes(which), {}
         for i in np.flatnonzero(which):
+            if not kept[i]:
+                self.exchanges[i] = None
             if self.exchanges[i] is not None:
                 *step, gain = self.exchanges[i].step(slopes[i])
                 if gain > enough[i]:
-                    steps[i] = step
+                    steps[i], self.asked[i, 2] = step, gain
         if steps:
             engine.step(steps)
 

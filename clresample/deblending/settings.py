@@ -24,8 +24,9 @@ class Settings:
         morphologies themselves, by the constraints alone; both by the adaptive proximal gradients
         of Melchior et al. (2019)
     enough: with a LearnedPrior a fit has converged when its loss, half of chi2, fell by less than
-        this, times chi2 per pixel where that is above 1, over 6 iterations. Half as much
-        takes a tenth more iterations; `bench.settings --continued` measures what is left to gain
+        this, times chi2 per pixel where that is above 1, over 6 iterations, and a step along what
+        its sources exchange would gain less than half of this. With 0.3 it takes a sixth more
+        iterations; `bench.settings --continued` measures what is left to gain
     tol: with others it has when its best loss fell by less than this part of itself over 15
     constraints: with others, Chain of proximal operators on the morphologies; None: non-negative,
         and monotone by the sweep. With a LearnedPrior they are non-negative and nothing else: on
@@ -57,7 +58,7 @@ class Settings:
 
     max_iter: int = 500
     prior: LearnedPrior | Prior | None = LearnedPrior()
-    enough: float = 0.2
+    enough: float = 0.5
     tol: float = 1e-5
     constraints: Chain | None = None
     step_sizes: StepSizes = StepSizes()

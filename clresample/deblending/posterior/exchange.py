@@ -47,6 +47,7 @@ class Exchange:
         self._matrix = normal_matrix(
             solution.scene, exposures, images, solution.spectra, self._layout
         )
+        self._held = None
 
     def step(self, slopes):
         """The step to the minimum of all unknowns; slopes: Slopes of the loss.
@@ -60,12 +61,18 @@ class Exchange:
             right.append(-np.concatenate([own, np.where(bound[i], 0, slopes.spectra[i])]))
         if layout.n_sky:
             right.append(-slopes.sky)
-        found = Factor(_held(self._matrix, layout.counts, bound)).solve(right)
+        found = self._factor(bound).solve(right)
         gain = 0.5 * sum(x @ r for x, r in zip(found, right, strict=True))
         own = list(zip(self.moves, layout.counts, found, strict=False))
         structure = [moves.structure(x[:k]) if moves else None for moves, k, x in own]
         sky = found[-1] if layout.n_sky else np.zeros_like(slopes.sky)
         return structure, np.array([x[k:] for _, k, x in own]), sky, gain
+
+    def _factor(self, bound):
+        """The Factor with the spectra `bound` (n, C) held; the last one stays."""
+        if self._held is None or (self._held[0] != bound).any():
+            self._held = bound.copy(), Factor(_held(self._matrix, self._layout.counts, bound))
+        return self._held[1]
 
 
 @dataclass(frozen=True, eq=False)
