@@ -224,7 +224,7 @@ class _Learning:
         if not which.any() or self.n_steps >= self.settings.max_iter:
             return
         new, kept = which & (rounds == 0), loss - p.loss >= LEAST_KEPT * promised
-        self.asked[which] = np.stack([p.n_rounds, p.loss, 0 * loss], axis=1)[which]
+        self.asked[which] = np.stack([p.n_rounds, p.loss, 0 * p.loss], axis=1)[which]
         if new.any():
             states, findings = engine.states(), engine.findings(new)
             for i in np.flatnonzero(new):

@@ -103,10 +103,15 @@ def test_steps_of_exchange_are_asked_for_in_time_and_again_where_the_last_one_ga
     assert steps == [{1: "slopes 1"}] and len(made) == 3
     one._exchange(every)
     assert steps[1:] == [{2: "slopes 2"}]
+    p.n_rounds += 20
+    p.loss, p.chi2 = p.loss - np.array([0, 0.6, 0.1]), lambda: np.full(3, 0.1)
+    one._exchange(every)
+    assert steps[2:] == [{1: "slopes 1"}]
+    assert one.exchanges[2] is None  # it fell by .1 of .9 that was promised
     p.loss, p.converged = p.loss - 1, every
     one.settings.max_iter = int(p.n_rounds.max()) - 1
     one._exchange(every)
-    assert len(steps) == 2  # at the limit
+    assert len(steps) == 3  # at the limit
 
 
 def test_fits_that_are_over_are_left_with_their_present_state():
