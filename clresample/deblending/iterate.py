@@ -231,13 +231,12 @@ class _Learning:
                 given = engine.scenes[i], states[i], findings[i]
                 self.exchanges[i] = exchange_of(self.fits[i], *given)
         slopes, steps = engine.slopes(which), {}
-        for i in np.flatnonzero(which):
-            if not kept[i]:
+        for i in np.flatnonzero(which & np.array([e is not None for e in self.exchanges])):
+            step, gain = _promise(self.exchanges[i], slopes[i]) if kept[i] else (None, 0.0)
+            if step is None:
                 self.exchanges[i] = None
-            if self.exchanges[i] is not None:
-                *step, gain = self.exchanges[i].step(slopes[i])
-                if gain > enough[i]:
-                    steps[i], self.asked[i, 2] = step, gain
+            elif gain > enough[i]:
+                steps[i], self.asked[i, 2] = step, gain
         if steps:
             engine.step(steps)
 
@@ -258,3 +257,12 @@ class _Learning:
         fits, exchanges = ([some[i] for i in keep] for some in (self.fits, self.exchanges))
         past = self.engine.take(keep), exchanges, self.asked[keep]
         return _Learning(fits, self.settings, self.device, self.dtype, past)
+
+
+def _promise(exchange, slopes):
+    """An Exchange's step, None where its matrix is not positive definite, and what that gains."""
+    try:
+        *step, gain = exchange.step(slopes)
+    except np.linalg.LinAlgError:
+        return None, 0.0
+    return step, gain

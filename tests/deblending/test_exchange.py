@@ -7,7 +7,7 @@ from helpers.scenes import GALAXIES, blend
 
 from clresample.deblending import iterate as loop
 from clresample.deblending.fit import Fit, begin
-from clresample.deblending.posterior.exchange import exchange_of
+from clresample.deblending.posterior.exchange import Exchange, exchange_of
 from clresample.deblending.settings import Settings
 
 # Two galaxies of alike colours, each in the other's light, that L-BFGS tells apart slowly.
@@ -121,6 +121,15 @@ def test_fits_end_nearer_to_their_minimum(device, monkeypatch):
     without = ended(started(device, CLOSE, enough=0.2)).fits[0].losses[-1]
     assert with_steps - end < 0.1
     assert without - end > with_steps - end
+
+
+def test_fits_go_on_without_a_matrix_that_is_not_positive_definite(device, monkeypatch):
+    def broken(self, slopes):
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr(Exchange, "step", broken)
+    running = ended(started(device, CLOSE))
+    assert running.fits[0].status == "converged" and running.exchanges == [None]
 
 
 def test_galaxies_apart_exchange_nothing(device):
