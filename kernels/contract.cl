@@ -18,7 +18,8 @@
  *                                   n <= n_pad
  *
  * The tile is kept in registers: B is read as aligned vectors, A as scalars that broadcast.  No
- * local memory, no barrier, no builtin.  A work-item takes RT such tiles, one below the other.
+ * local memory, no barrier, no builtin but READ_AHEAD's.  A work-item takes RT such tiles, one
+ * below the other.
  *
  * Layout: n_pad = n rounded up to a multiple of 16, so to whole vectors; where a tile reaches
  *   beyond n_pad, its vectors there do the first one's work again.  B always has ld n_pad with

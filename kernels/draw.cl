@@ -45,7 +45,7 @@ static float ln(const float x)
  * left out. */
 static float power_of_e(const float x)
 {
-    const float y = x > -60 ? x : -60;
+    const float y = x < -60 ? -60 : x;
     const int n = (int)(y * 1.44269504f - 0.5f);
     const float r = (y - n * 0.693359375f) + n * 2.12194440e-4f;   /* the first has 10 bits */
     float sum = 1 + r * (1 / 7.0f);

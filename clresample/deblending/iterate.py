@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 
 import numpy as np
@@ -11,6 +12,7 @@ from .resize import resized
 from .shifts import ahead, shift_steps
 from .solver.engine import Engine
 from .solver.learned.engine import LearnedEngine
+from .solver.learned.progress import PATIENCE
 
 # [iterations] between two looks at the losses: each waits for the device, but fits stop only there.
 CHECK = 5
@@ -221,15 +223,16 @@ class _Learning:
         rounds, loss, promised = self.asked.T
         due = p.n_rounds >= np.maximum(rounds + EXCHANGE, FIRST_EXCHANGE)
         which = which & (p.converged | (p.live & p.settled & due)) & (p.loss < loss - enough)
-        if not which.any() or self.n_steps >= self.settings.max_iter:
-            return
+        if not which.any() or self.n_steps + PATIENCE >= self.settings.max_iter:
+            return  # a fit takes that long to converge again
         new, kept = which & (rounds == 0), loss - p.loss >= LEAST_KEPT * promised
         self.asked[which] = np.stack([p.n_rounds, p.loss, 0 * p.loss], axis=1)[which]
         if new.any():
             states, findings = engine.states(), engine.findings(new)
             for i in np.flatnonzero(new):
                 given = engine.scenes[i], states[i], findings[i]
-                self.exchanges[i] = exchange_of(self.fits[i], *given)
+                with contextlib.suppress(np.linalg.LinAlgError):
+                    self.exchanges[i] = exchange_of(self.fits[i], *given)
         slopes, steps = engine.slopes(which), {}
         for i in np.flatnonzero(which & np.array([e is not None for e in self.exchanges])):
             step, gain = _promise(self.exchanges[i], slopes[i]) if kept[i] else (None, 0.0)

@@ -107,7 +107,7 @@ def test_operations_in_windows_are_those_of_smaller_frames(axes, lines, monkeypa
         observed = k_y * n_columns * (k_x + (along_y if lines else along_x))
     waves = np.tile([k_y, k_x], (3, 1))
     counts = choice._counts(np.full((3, 2), 8), 3, n_y, n_x, waves[:2], waves)
-    found = choice._window_flops(boxes, op, groups)
+    found = choice._window_flops(boxes, op, groups, np.diag([2.0, 3.0]))
     assert found == pytest.approx(min(counts) + 4 * 2 * 3 * observed)
 
 

@@ -1,24 +1,29 @@
 """Newton's step along what overlapping sources exchange: transposes, the fall of the loss, ends."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.learned import Source
 from helpers.scenes import GALAXIES, blend
 
 from clresample.deblending import iterate as loop
+from clresample.deblending.blend import Blend
 from clresample.deblending.fit import Fit, begin
 from clresample.deblending.posterior.exchange import Exchange, exchange_of
 from clresample.deblending.settings import Settings
+from clresample.sky.observation import Observation
 
 # Two galaxies of alike colours, each in the other's light, that L-BFGS tells apart slowly.
 CLOSE = (((14.0, 14.5), (60, 50, 80), 2.4), ((16.0, 19.0), (50, 42, 70), 2.0))
 
 
 def started(device, *objects, **given):
-    """Fits of a blend for each of `objects`, float64 where the device has it."""
+    """Fits of a blend for each of `objects`, or of Blends, float64 where the device has it."""
     dtype = np.float64 if device.has_fp64 else np.float32
     settings = Settings(**given)
-    fits = [Fit(blend(some), settings, device, np.dtype(dtype), pad=1) for some in objects]
+    blends = [some if isinstance(some, Blend) else blend(some) for some in objects]
+    fits = [Fit(b, settings, device, np.dtype(dtype), pad=1) for b in blends]
     begin(fits)
     return loop._Learning(fits, settings, device, dtype)
 
@@ -112,6 +117,20 @@ def test_spectra_at_their_bound_stay(near):
     assert spectra[1, 2] == 0 and np.abs(spectra).max() > 0
     slopes.bound[1, 2] = False
     assert found.step(slopes)[-1] >= gain
+
+
+def test_what_the_data_do_not_see_stays(device):
+    """The second observation has no weight in its first channel."""
+    sharp, o = blend(CLOSE).observations
+    weights = np.broadcast_to(o.weights, o.data.shape) * np.array([0, 1])[:, None, None]
+    o = Observation(o.data, o.psf, o.grid, weights=weights, channels=o.channels, name=o.name)
+    running = started(device, replace(blend(CLOSE), observations=(sharp, o)), enough=2.0)
+    for _ in range(30):
+        running.engine.round()
+    (slopes,) = running.engine.slopes(np.ones(1, bool))
+    slopes.spectra[:, 1] = 1e-3  # what rounding may leave
+    _, spectra, _, gain = exchange(running).step(slopes)
+    assert not spectra[:, 1].any() and gain < 10
 
 
 def test_fits_end_nearer_to_their_minimum(device, monkeypatch):

@@ -123,7 +123,9 @@ def test_the_models_error_is_added_to_the_noise_of_residuals(monkeypatch):
     result = blend([component], observations=(seen,), grid=GRID, sky=np.array([5.0, 3.0]))
     detect_more(result, threshold=4.0)
     ((left,), frame, threshold, known), more = given[0]
-    assert (frame, threshold, more) == (result.frame, 4.0, {"beside": False})
+    assert (frame, threshold, more["beside"]) == (result.frame, 4.0, False)
+    (places,) = more["places"]
+    np.testing.assert_allclose(places, np.moveaxis(np.indices((60, 60)), 0, 2), atol=1e-9)
     np.testing.assert_array_equal(known, [[30, 30]])
     light = result.model(0) - result.sky[:, None, None]
     assert MODEL_ERROR == 0.15

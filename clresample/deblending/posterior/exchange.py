@@ -25,6 +25,9 @@ from .normal import Layout, normal_matrix
 # scenes end 0.5 higher in the mean.
 LEAST_CHANGE = 0.3
 LEAST_POWER = 1e-30  # of a component in a channel that does not see it
+# Spectra and levels of which the data say less than this part of what they say of the best one
+# stay: what is left of wings in their channel would move them by thousands.
+UNSEEN = 1e-9
 
 
 class Exchange:
@@ -47,6 +50,10 @@ class Exchange:
         self._matrix = normal_matrix(
             solution.scene, exposures, images, solution.spectra, self._layout
         )
+        diagonal = [np.diag(self._matrix.block(i, i)) for i in range(len(self._layout.sizes))]
+        power = np.array([d[k:] for k, d in zip(counts, diagonal, strict=False)])
+        self._unseen = power <= UNSEEN * power.max()
+        self._level = diagonal[-1] > UNSEEN * diagonal[-1].max() if fit_sky else None
         self._held = None
 
     def step(self, slopes):
@@ -57,12 +64,12 @@ class Exchange:
 
         Raises LinAlgError where the matrix is not positive definite.
         """
-        layout, right, bound = self._layout, [], slopes.bound
+        layout, right, bound = self._layout, [], slopes.bound | self._unseen
         for i, moves in enumerate(self.moves):
             own = moves.slopes(slopes.structure[i]) if moves else np.zeros(0)
             right.append(-np.concatenate([own, np.where(bound[i], 0, slopes.spectra[i])]))
         if layout.n_sky:
-            right.append(-slopes.sky)
+            right.append(-np.where(self._level, slopes.sky, 0))
         found = self._factor(bound).solve(right)
         gain = 0.5 * sum(x @ r for x, r in zip(found, right, strict=True))
         own = list(zip(self.moves, layout.counts, found, strict=False))

@@ -76,13 +76,15 @@ def _header(cards):
 
 def _card(key, value):
     """One card, or several of a long text."""
+    key = key.upper()
     if isinstance(value, bool):
         return f"{key:<8}= {'T' if value else 'F':>20}{'':50}"
     if isinstance(value, int):
         return f"{key:<8}= {value:>20}{'':50}"
-    if isinstance(value, str) and len(value) <= LONGEST and value.isascii() and "'" not in value:
+    plain = isinstance(value, str) and value.isascii() and value.isprintable()
+    if plain and len(value) <= LONGEST and "'" not in value:
         quoted = f"'{value:<8}'"
-        return f"{key.upper():<8}= {quoted:<70}"
+        return f"{key:<8}= {quoted:<70}"
     return fits.Card(key, value).image
 
 

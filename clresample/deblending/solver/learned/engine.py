@@ -180,8 +180,8 @@ def _n_pixels(scene):
 
 def vector_bytes(scene, prior) -> int:
     """Device memory [bytes] of the scene's vectors in a batch, roughly, of float64: both rings,
-    eleven others and the light; and its blocks, half of
-    a matrix each, on the host too, of a quarter of each source's coefficients."""
+    eleven others and the light; and its blocks, of a quarter of each source's coefficients: half a
+    matrix each, with room for half as many more, and half a one on the host."""
     n = [sum(coarse(p.shape, step).prod() for step in prior.steps) for p in scene.profile]
     blocks = 1.25 * sum(k / 4 * min(k / 4, 2 * MOST) for k in n)
     return int(8 * ((2 * (N_PAIRS + 1) + 12) * (sum(n) + scene.power.size) + blocks))

@@ -12,14 +12,14 @@ ROOM, LEAST_USED = 1.5, 0.25
 
 
 class Shelf:
-    """Where the roots of Blocks are in one device array of a Buffers' floating type.
+    """Where the roots of Blocks are in one array on a device, of a floating type.
 
     values: the array; those of a block begin at `first(block)`
     """
 
-    def __init__(self, buffers):
-        self._buffers = buffers
-        self.values = buffers.device.zeros(ALIGN, buffers.dtype)
+    def __init__(self, device, dtype):
+        self._device, self._dtype = device, dtype
+        self.values = device.zeros(ALIGN, dtype)
         self._first, self._end = {}, 0
 
     def first(self, block):
@@ -28,15 +28,15 @@ class Shelf:
 
     def hold(self, blocks):
         """Hold the roots of these Blocks, and of no others any longer."""
-        b = self._buffers
         need = sum(_room(block) for block in blocks)
         new = [block for block in blocks if block not in self._first]
         full = self._end + sum(_room(block) for block in new) > self.values.size
         if full or need < LEAST_USED * self.values.size:
             new, self._end = list(blocks), 0
-            self.values = b.device.zeros(max(int(ROOM * need), ALIGN), b.dtype)
+            self.values = None  # before the next one is made
+            self.values = self._device.zeros(max(int(ROOM * need), ALIGN), self._dtype)
             self._first = {}
-        flat = np.zeros(sum(_room(block) for block in new), b.dtype)
+        flat = np.zeros(sum(_room(block) for block in new), self._dtype)
         self._first = {block: self._first[block] for block in blocks if block in self._first}
         start = self._end
         for block in new:
@@ -45,7 +45,7 @@ class Shelf:
             self._first[block] = self._end
             self._end += _room(block)
         if new:
-            b.device.upload(flat, self.values[start : self._end])
+            self._device.upload(flat, self.values[start : self._end])
 
 
 def _room(block):

@@ -29,7 +29,7 @@ class Steps:
         self._plan = b.device.put(np.zeros((n, 3)), np.int32)
         self._coefficients = b.put(np.zeros((n, 2 * n_slots + 2)))
         self._sums = b.put(np.zeros((self._n_chunks, 4 * n_slots + 2)))
-        self._levels, self.shelf = [], shelf or Shelf(b)
+        self._levels, self.shelf = [], shelf or Shelf(b.device, b.dtype)
         y, projected, hg_new = (b.device.zeros(v.size, b.dtype) for _ in range(3))
         shared = {"plan": self._plan, "size": v.size, "ring_s": v.s, "ring_hy": v.hy}
         shared |= {"chunks": v.chunk_table, "x_new": v.x_new}
