@@ -121,11 +121,12 @@ def test_errors_at_fixed_morphologies_are_those_of_the_normal_matrix(monkeypatch
     covariance = np.array([[[1e-8, 5.0], [5.0, 4.0]], [[0.0, 0], [0, -1e-20]]])
     spectra = np.array([[3.0, 3.0], [1e6, 0.0]])
     start = SimpleNamespace(source=np.array([0, 1]), shapes=0, thetas=0, positions=np.eye(2))
+    scene = SimpleNamespace(channels=lambda: [])
     fit = SimpleNamespace(
-        settings=Settings(), scene=None, findings=1, views=[], start=start, frame=None
+        settings=Settings(), scene=scene, findings=1, views=[], start=start, frame=None
     )
     fit.blend = SimpleNamespace(observations=[])
-    seen = SimpleNamespace(spectra=spectra, covariance=covariance)
+    seen = SimpleNamespace(spectra=spectra, covariance=covariance, residuals=lambda *_: [])
     _, messages = posterior_module.posterior_of(fit, [], np.ones(2), seen)
     assert messages == []
     wanted = [[1e-4, 3e-9], [2.0, 1e-150]]

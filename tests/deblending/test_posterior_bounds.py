@@ -1,4 +1,4 @@
-"""What the bound of morphologies at 0 holds back, against finite differences and many noises."""
+"""What the bound at 0 holds back and chi2 where light is: finite differences, many noises."""
 
 from types import SimpleNamespace
 
@@ -10,6 +10,9 @@ from helpers.scenes import MODEL_PSF
 from clresample.deblending.batch import deblend_many
 from clresample.deblending.blend import Blend
 from clresample.deblending.posterior.bounds import pulls
+from clresample.deblending.posterior.posterior import _local_chi2
+from clresample.deblending.rendered import Rendered
+from clresample.deblending.start.seen import Seen
 from clresample.measurement.photometry import fluxes
 from clresample.sky.frame import Frame
 from clresample.sky.sources import Extended
@@ -62,9 +65,7 @@ def test_pulls_are_slopes_of_chi2(n_terms):
     view = SimpleNamespace(op=op, root=root, data=data, shares=shares)
     scene = SimpleNamespace(origin=origin, profile=morphs, channels=lambda: [slice(0, 2)])
     model = sum(image(i, m) for i, m in enumerate(morphs))
-    observed = [SimpleNamespace(total=lambda _: model)]
-    seen = SimpleNamespace(spectra=spectra, sky=sky, observed=observed)
-    found = pulls(scene, [view], source, seen)
+    found = pulls(scene, [view], source, spectra, [data - model - sky[:, None, None]])
     for i, morph in enumerate(morphs):
         for at in np.ndindex(morph.shape):
             step = [m.copy() for m in morphs]
@@ -88,3 +89,30 @@ def test_fluxes_of_bright_galaxies_are_not_biased_by_noise(device):
     assert (released < 0).mean() > 0.9
     bias, before = (((f.mean(0) - FLUX) / error).mean() for f in (found, found - released))
     assert before > 0.2 and abs(bias) < 0.5 * before, (bias, before)
+
+
+def test_chi2_is_that_where_a_components_light_is():
+    """By A^2 times its image; both of two observations count, sky included."""
+    seen, views, residuals, wanted = [], [], [], np.zeros((2, 2))
+    rng = np.random.default_rng(3)
+    spectra, sky = rng.random((2, 3)) + 0.5, rng.random(3)
+    for part in (slice(0, 1), slice(1, 3)):
+        n = part.stop - part.start
+        low = np.array([[1, 0], [4, 3]])
+        images = [rng.random((n, 3, 4)), rng.random((n, 4, 3))]
+        rendered = Rendered((2, n, 8, 7), low, images)
+        root, data = rng.random((n, 8, 7)), rng.normal(size=(n, 8, 7))
+        views.append(SimpleNamespace(root=root, data=data))
+        seen.append(rendered)
+        whole = np.asarray(rendered)
+        model = np.einsum("ic,icyx->cyx", spectra[:, part], whole) + sky[part, None, None]
+        residuals.append(data - model)
+        chi2 = root**2 * residuals[-1] ** 2
+        light = spectra[:, part, None, None] ** 2 * whole * root**2
+        wanted += [(light * chi2).sum((1, 2, 3)), light.sum((1, 2, 3))]
+    scene = SimpleNamespace(channels=lambda: [slice(0, 1), slice(1, 3)])
+    seen = Seen(spectra, sky, None, tuple(seen), ())
+    found = _local_chi2(scene, views, seen, seen.residuals(scene.channels(), views))
+    for a, b in zip(residuals, seen.residuals(scene.channels(), views), strict=True):
+        np.testing.assert_allclose(a, b)
+    np.testing.assert_allclose(found, wanted[0] / wanted[1])

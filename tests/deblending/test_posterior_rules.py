@@ -11,10 +11,8 @@ from clresample.deblending.posterior.bumps import _gaussians
 from clresample.deblending.posterior.errors import Draws
 from clresample.deblending.posterior.modes import STRENGTH, Solution, power_of
 from clresample.deblending.posterior.normal import Layout, _by_channel
-from clresample.deblending.posterior.posterior import _local_chi2
 from clresample.deblending.posterior.profile_modes import Beyond, profile_modes
 from clresample.deblending.profiles import Galaxy, Given, Star
-from clresample.deblending.rendered import Rendered
 from clresample.deblending.solver.learned.prior import LearnedPrior
 
 PRIOR = LearnedPrior(scales_px=(0.8, 2.2, 5.0), strengths=(0.005, 0.1, 0.02))
@@ -273,25 +271,3 @@ def test_draws_are_numbers_times_modes_and_spectra_in_counts():
     np.testing.assert_allclose(morphs[0], modes[0][0] + 2 * modes[0][1])
     assert morphs[1].shape == (2, 2) and not morphs[1].any()
     np.testing.assert_allclose(spectra, [[30, 400], [50, 600]])
-
-
-def test_chi2_is_that_where_a_components_light_is():
-    """By A^2 times its image; both of two observations count, sky included."""
-    seen, views, wanted = [], [], np.zeros((2, 2))
-    rng = np.random.default_rng(3)
-    spectra, sky = rng.random((2, 3)) + 0.5, rng.random(3)
-    for part in (slice(0, 1), slice(1, 3)):
-        n = part.stop - part.start
-        low = np.array([[1, 0], [4, 3]])
-        images = [rng.random((n, 3, 4)), rng.random((n, 4, 3))]
-        rendered = Rendered((2, n, 8, 7), low, images)
-        root, data = rng.random((n, 8, 7)), rng.normal(size=(n, 8, 7))
-        views.append(SimpleNamespace(root=root, data=data))
-        seen.append(rendered)
-        whole = np.asarray(rendered)
-        model = np.einsum("ic,icyx->cyx", spectra[:, part], whole) + sky[part, None, None]
-        chi2 = root**2 * (data - model) ** 2
-        light = spectra[:, part, None, None] ** 2 * whole * root**2
-        wanted += [(light * chi2).sum((1, 2, 3)), light.sum((1, 2, 3))]
-    found = _local_chi2(SimpleNamespace(spectra=spectra, sky=sky, observed=seen), views)
-    np.testing.assert_allclose(found, wanted[0] / wanted[1])

@@ -91,11 +91,9 @@ def _misfits(fits):
     found = []
     images = see([model_of(fit) for fit in fits], fit_sky=fits[0].settings.fit_sky)
     for fit, seen in zip(fits, images, strict=True):
-        chi2 = 0.0
-        for view, image, part in zip(fit.views, seen.observed, fit.scene.channels(), strict=True):
-            model = image.total(seen.spectra[:, part]) + seen.sky[part, None, None]
-            chi2 += ((view.root * (view.data - model)) ** 2).sum()
-        found.append(chi2)
+        residuals = seen.residuals(fit.scene.channels(), fit.views)
+        pairs = zip(fit.views, residuals, strict=True)
+        found.append(sum(((view.root * left) ** 2).sum() for view, left in pairs))
     return found
 
 

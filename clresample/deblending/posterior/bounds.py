@@ -13,19 +13,18 @@ import numpy as np
 from ...sky.extent import box_slices
 
 
-def pulls(scene, views, source, seen):
+def pulls(scene, views, source, spectra, residuals):
     """Minus the slopes of half chi2 by all pixels (ny, nx) of n morphologies with max = 1.
 
     scene: Scene; views: WhitenedViews; source (n,): of each component, by which views know its PSF
-    seen: Seen, of the morphologies
+    spectra (n, C): theirs; residuals: data minus model (Co, My, Mx) of each view
     """
     out = [np.zeros(p.shape) for p in scene.profile]
-    for view, rendered, part in zip(views, seen.observed, scene.channels(), strict=True):
-        spectra = seen.spectra[:, part]
-        left = view.data - rendered.total(spectra) - seen.sky[part, None, None]
+    for view, left, part in zip(views, residuals, scene.channels(), strict=True):
         frames = view.op.adjoint((view.root**2 * left).astype(view.op.dtype))
+        own = spectra[:, part]
         if view.shares is not None:
-            spectra = (spectra[:, :, None] * view.shares[source]).reshape(len(spectra), -1)
-        for image, origin, a in zip(out, scene.origin, spectra, strict=True):
+            own = (own[:, :, None] * view.shares[source]).reshape(len(own), -1)
+        for image, origin, a in zip(out, scene.origin, own, strict=True):
             image += np.tensordot(a, frames[:, *box_slices(origin, image.shape)], 1)
     return out

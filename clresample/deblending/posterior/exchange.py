@@ -16,7 +16,7 @@ from ..solver.learned.prior import kernel_rows
 from ..view import without_dark
 from .blocks import Blocks, Factor
 from .bumps import Bumps, uncorrelated
-from .exposure import Exposure
+from .exposure import exposures_of
 from .modes import Solution
 from .normal import Layout, normal_matrix
 
@@ -34,15 +34,17 @@ class Exchange:
     """The unknowns of a scene that is nearly fitted, and their normal matrix.
 
     solution: Solution with the solver's own morphologies and spectra, its peaks 1
+    shared (n): where (ny, nx) each component may exchange light, see Solution.shared
     exposures: an Exposure of each observation; fit_sky: whether sky levels are unknowns too
 
     moves (n): each component's Moves, None where it shares no light with another
     """
 
-    def __init__(self, solution, exposures, *, fit_sky=False):
+    def __init__(self, solution, shared, exposures, *, fit_sky=False):
         n_channels, pairs = solution.spectra.shape[1], []
-        for i, morph in enumerate(solution.morphs):
-            pairs.append(_moves(solution, i, without_dark(morph.astype(np.float32))[None]))
+        for i, (morph, where) in enumerate(zip(solution.morphs, shared, strict=True)):
+            image = without_dark(morph.astype(np.float32))[None]
+            pairs.append(_moves(solution, i, where, image))
         self.moves = [moves for moves, _ in pairs]
         counts = np.array([len(images) - 1 for _, images in pairs])
         self._layout = Layout(counts, n_channels, n_channels if fit_sky else 0)
@@ -111,10 +113,10 @@ class Moves:
         return [v * (y @ image @ x.T) for v, (y, x) in zip(self.variance, self.along, strict=True)]
 
 
-def _moves(solution, i, image):
+def _moves(solution, i, shared, image):
     """Component i's Moves and images (1 + k, ny, nx), float32, of its morphology (1, ny, nx) and
     of what they change; None and the morphology alone where it shares no light."""
-    scene, prior, shared = solution.scene, solution.prior, solution.shared(i)
+    scene, prior = solution.scene, solution.prior
     if scene.fixed[i] or not shared.any():
         return None, image
     profile, strengths = scene.profile[i], solution.findings.strengths[i]
@@ -134,6 +136,8 @@ def _moves(solution, i, image):
 def _held(matrix, counts, bound):
     """Blocks in which the spectra `bound` (n, C) have nothing to do with all else, and a diagonal
     of 1; counts (n,): unknowns before a component's spectrum."""
+    if not bound.any():
+        return matrix
     held = {i: k + np.flatnonzero(b) for i, (k, b) in enumerate(zip(counts, bound, strict=True))}
     out = Blocks(matrix.sizes)
     for (i, j), block in matrix.items():
@@ -163,8 +167,7 @@ def exchange_of(fit, scene, state, findings):
         np.ones(n),
         fit.settings.prior,
     )
-    if not any(solution.shared(i).any() for i in range(n)):
+    shared = [solution.shared(i) for i in range(n)]
+    if not any(where.any() for where in shared):
         return None
-    pairs = zip(fit.views, fit.blend.observations, strict=True)
-    exposures = [Exposure.of(view, fit.frame, o, fit.start.source) for view, o in pairs]
-    return Exchange(solution, exposures, fit_sky=fit.settings.fit_sky)
+    return Exchange(solution, shared, exposures_of(fit), fit_sky=fit.settings.fit_sky)

@@ -107,6 +107,12 @@ class Exposure:
         return seen * self.root[:, low[0] : high[0], low[1] : high[1]]
 
 
+def exposures_of(fit):
+    """An Exposure of each observation of a Fit."""
+    pairs = zip(fit.views, fit.blend.observations, strict=True)
+    return [Exposure.of(view, fit.frame, o, fit.start.source) for view, o in pairs]
+
+
 class _Content:
     """A PSF that is equal to others of the same samples."""
 

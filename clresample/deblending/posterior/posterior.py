@@ -10,7 +10,7 @@ from scipy.linalg.blas import strmm
 from .blocks import RIDGE, Factor
 from .bounds import pulls
 from .errors import Draws, Errors
-from .exposure import Exposure
+from .exposure import exposures_of
 from .modes import FLOOR, Solution, power_of
 from .moments import moments_of
 from .normal import Layout, normal_matrix
@@ -195,6 +195,7 @@ def posterior_of(fit, morphs, peaks, seen):
         return None, []
     spectra, covariance = seen.spectra, seen.covariance
     variance = np.diagonal(covariance, axis1=1, axis2=2).T
+    residuals = seen.residuals(scene.channels(), fit.views)
     solution = Solution(
         scene,
         morphs,
@@ -205,29 +206,25 @@ def posterior_of(fit, morphs, peaks, seen):
         fit.start.thetas,
         fit.start.positions[fit.start.source],
         fit.findings,
-        _local_chi2(seen, fit.views),
+        _local_chi2(scene, fit.views, seen, residuals),
         settings.prior,
-        pulls(scene, fit.views, fit.start.source, seen),
+        pulls(scene, fit.views, fit.start.source, seen.spectra, residuals),
     )
-    pairs = zip(fit.views, fit.blend.observations, strict=True)
-    exposures = [Exposure.of(view, fit.frame, o, fit.start.source) for view, o in pairs]
     try:
         sky, shifts = settings.fit_sky, settings.fit_shifts
-        return Posterior(solution, exposures, fit_sky=sky, fit_shifts=shifts), []
+        return Posterior(solution, exposures_of(fit), fit_sky=sky, fit_shifts=shifts), []
     except np.linalg.LinAlgError:
         why = "their normal matrix is not positive definite"
     return None, [f"errors are those of fixed morphologies: {why}"]
 
 
-def _local_chi2(seen, views):
+def _local_chi2(scene, views, seen, residuals):
     """chi2 per pixel (n,) where each component's light is, by A^2 times its image."""
     found, light = np.zeros((2, len(seen.spectra)))
-    ends = np.cumsum([0, *(len(view.data) for view in views)])
-    for rendered, view, first in zip(seen.observed, views, ends[:-1], strict=True):
-        channels = slice(first, first + len(view.data))
-        model = rendered.total(seen.spectra[:, channels]) + seen.sky[channels, None, None]
-        weight, power = view.root**2, seen.spectra[:, channels] ** 2
-        chi2 = weight * (view.data - model) ** 2
+    observed = zip(views, seen.observed, residuals, scene.channels(), strict=True)
+    for view, rendered, left, part in observed:
+        weight, power = view.root**2, seen.spectra[:, part] ** 2
+        chi2 = weight * left**2
         for i, image in enumerate(rendered.images):
             image = image * weight[:, *rendered.window(i)]
             light[i] += power[i] @ image.sum((1, 2))

@@ -54,6 +54,15 @@ class Seen:
     observed: tuple[Rendered, ...]
     bare: tuple
 
+    def residuals(self, channels, views):
+        """Data minus model (Co, My, Mx) of each of the Model's WhitenedViews, in their units;
+        channels: the slices of all channels that these have."""
+        out = []
+        for part, view, rendered in zip(channels, views, self.observed, strict=True):
+            model = rendered.total(self.spectra[:, part]) + self.sky[part, None, None]
+            out.append(view.data - model)
+        return out
+
 
 class _Cutout(Shape):
     """An image (ny, nx) in a box of the frame from `origin` on; no parameters.

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from astropy import units as u
+from astropy.io import fits
 
 from ...files.fits import open_fits
 from ...measurement.columns import Columns
 from ..box import Box
-from .hdus import image, primary, table
 
 PATCH_COLUMNS: dict[str, type | str] = {
     "patch": np.int64,
@@ -24,6 +25,7 @@ PATCH_COLUMNS: dict[str, type | str] = {
     "seconds": float,
 }
 META = "FRAME", "EXTNAME"  # cards of a table's header that its Columns know too
+FITS_FORMATS = {"int16": "I", "int32": "J", "int64": "K", "float32": "E", "float64": "D"}
 COMPONENT_COLUMNS = ("id", "parent_id", "patch", "y0", "x0", "n_y", "n_x", "offset")
 MODEL_COLUMNS = ("patch", "mosaic", "y0", "x0", "y1", "x1", "offset")
 
@@ -69,21 +71,43 @@ class Part:
             for (name, kind), values in zip(PATCH_COLUMNS.items(), columns, strict=True)
         }
         hdus = [
-            primary(),
-            table(Columns.joined([rows for rows in self.rows if len(rows)]), "CATALOGUE"),
-            table(Columns(patches), "PATCHES"),
-            table(_whole(self.components, COMPONENT_COLUMNS), "COMPONENTS"),
-            image(self.spectra, "SPECTRA"),
-            image(self.flat and np.concatenate(self.flat), "MORPHOLOGIES"),
-            table(_whole(self.models, MODEL_COLUMNS), "MODELS"),
-            image(self.pixels and np.concatenate(self.pixels), "PIXELS"),
+            fits.PrimaryHDU(),
+            _table(Columns.joined([rows for rows in self.rows if len(rows)]), "CATALOGUE"),
+            _table(Columns(patches), "PATCHES"),
+            _table(_whole(self.components, COMPONENT_COLUMNS), "COMPONENTS"),
+            _floats(self.spectra, "SPECTRA"),
+            _floats(self.flat and np.concatenate(self.flat), "MORPHOLOGIES"),
+            _table(_whole(self.models, MODEL_COLUMNS), "MODELS"),
+            _floats(self.pixels and np.concatenate(self.pixels), "PIXELS"),
         ]
-        return b"".join(hdus)
+        file = BytesIO()
+        fits.HDUList(hdus).writeto(file)
+        return file.getvalue()
 
 
 def _whole(rows, names):
     values = np.array(rows, np.int64).reshape(-1, len(names))
     return Columns(dict(zip(names, values.T, strict=True)))
+
+
+def _table(columns, name):
+    """The HDU of Columns; their meta are cards of its header."""
+    found = []
+    for key, values in columns.values.items():
+        form, unit = FITS_FORMATS.get(values.dtype.name), columns.units.get(key)
+        if form is None:  # text
+            values = np.char.encode(values, "ascii")
+            form = f"{max(1, values.dtype.itemsize)}A"
+        unit = None if unit is None else unit.to_string("fits")
+        found.append(fits.Column(key, form, unit, array=values))
+    hdu = fits.BinTableHDU.from_columns(found, name=name) if found else fits.BinTableHDU(name=name)
+    hdu.header.update(columns.meta)
+    return hdu
+
+
+def _floats(array, name):
+    array = np.asarray(array)
+    return fits.ImageHDU(array if array.size else None, name=name)
 
 
 @dataclass(frozen=True)

@@ -158,18 +158,19 @@ class LearnedEngine:
         which = np.isin(np.arange(len(self.scenes)), list(steps))
         self.vectors.put_directions(steps)
         self.progress.go_on(which)
-        nothing = np.zeros((len(self.scenes), N_PAIRS + 1))
-        self.steps.follow(self.pairs, np.where(which, TRY, REST))
-        self.steps.advance(nothing, nothing, nothing[:, 0], nothing[:, 0] + 1)
-        self._rest_others(self.progress.live)
+        self._queue(np.where(which, TRY, REST), 1.0)
 
     def follow_shifts(self, moved):
         """Take over the shifts that the operators of the scenes `moved` (B,) have by now."""
         self._gradient.follow_shifts()
         self.progress.look_again(moved)
+        self._queue(np.where(moved, STAY, REST), 0.0)
+
+    def _queue(self, mode, length):
+        """Queue trials of one length in the directions that are there already; mode (B,)."""
         nothing = np.zeros((len(self.scenes), N_PAIRS + 1))
-        self.steps.follow(self.pairs, np.where(moved, STAY, REST))
-        self.steps.advance(nothing, nothing, nothing[:, 0], nothing[:, 0])
+        self.steps.follow(self.pairs, mode)
+        self.steps.advance(nothing, nothing, nothing[:, 0], nothing[:, 0] + length)
         self._rest_others(self.progress.live)
 
 

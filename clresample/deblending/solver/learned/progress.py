@@ -98,17 +98,19 @@ class Progress:
         are."""
         self._fresh |= which
         self._bare &= ~which
-        self._drops[which] = np.inf
-        self.converged &= ~which
-        self.live |= which
+        self._call_back(which)
 
     def go_on(self, which):
         """Let the scenes `which` (B,) try a step that was not theirs, also those that have
         converged."""
-        self.live |= which
-        self.converged &= ~which
-        self._drops[which] = np.inf
+        self._call_back(which)
         self._length[which], self._trials[which] = 1.0, 0
+
+    def _call_back(self, which):
+        """The scenes `which` (B,) go on, whatever they had gained."""
+        self._drops[which] = np.inf
+        self.converged &= ~which
+        self.live |= which
 
     def next(self, accepted):
         """Mode (B,) and length (B,) of each scene's next step, and which drop their pairs (B,)."""
