@@ -59,7 +59,7 @@ def learning(n_rounds, *, live=None, converged=None, failed=None, **settings):
     engine.follow_shifts = lambda moved: engine.followed.append(moved.tolist())
     engine.slopes = lambda which: [f"slopes {i}" for i in range(n)]
     settings = SimpleNamespace(**({"max_iter": 100, "fit_shifts": False, "enough": 0.5} | settings))
-    past = engine, [None] * n, np.tile([0, np.inf, 0], (n, 1))
+    past = engine, [None] * n, np.tile([0, np.inf, 0, 1], (n, 1))
     return room._Learning([Told(c) for c in "abc"[:n]], settings, None, None, past)
 
 
@@ -71,15 +71,14 @@ def no_exchange(monkeypatch):
 
 def test_steps_of_exchange_are_asked_for_in_time_and_again_where_the_last_one_gained(monkeypatch):
     """Of settled fits after FIRST_EXCHANGE rounds and each EXCHANGE, of converged ones at once."""
-    made, steps = [], []
+    made, steps, gains = [], [], {"a": 0.2, "b": 0.6, "c": 0.9}
 
     def exchange_of(fit, scene, state, findings):
         made.append((fit.name, scene, state, findings))
-        gain = {"a": 0.2, "b": 0.6, "c": 0.9}[fit.name]
-        return SimpleNamespace(step=lambda slopes: (slopes, None, None, gain))
+        return SimpleNamespace(step=lambda x: (x, 0, 0, gains[fit.name]))
 
     monkeypatch.setattr(room, "exchange_of", exchange_of)
-    one = learning([39, 39, 12], converged=[False, False, True], enough=1.0)
+    one = learning([39, 39, 12], converged=[False, False, True], enough=2.5, max_iter=200)
     p, every = one.engine.progress, np.ones(3, bool)
     one.engine.step = lambda given: steps.append({i: step[0] for i, step in given.items()})
     one._exchange(every)
@@ -90,8 +89,7 @@ def test_steps_of_exchange_are_asked_for_in_time_and_again_where_the_last_one_ga
     p.settled[:2] = True
     one._exchange(every)
     assert [name for name, *_ in made] == ["c", "a", "b"] and not steps
-    p.chi2 = lambda: np.array([0.5, 1.0, 1.0])
-    p.n_rounds += 20
+    p.chi2, p.n_rounds = (lambda: np.array([0.5, 1.0, 1.0])), p.n_rounds + 20
     one._exchange(every)
     assert not steps  # the losses are what they were
     p.loss = p.loss - 0.51
@@ -100,18 +98,20 @@ def test_steps_of_exchange_are_asked_for_in_time_and_again_where_the_last_one_ga
     assert not steps  # too early
     p.n_rounds += 1
     one._exchange(np.array([True, True, False]))
-    assert steps == [{1: "slopes 1"}] and len(made) == 3
     one._exchange(every)
-    assert steps[1:] == [{2: "slopes 2"}]
+    assert steps == [{1: "slopes 1"}, {2: "slopes 2"}] and len(made) == 3
     p.n_rounds += 20
     p.loss, p.chi2 = p.loss - np.array([0, 0.6, 0.1]), lambda: np.full(3, 0.1)
     one._exchange(every)
-    assert steps[2:] == [{1: "slopes 1"}]
-    assert one.exchanges[2] is None  # it fell by .1 of .9 that was promised
+    assert steps[2:] == [{1: "slopes 1", 2: "slopes 2"}]
+    assert made[3:][0][0] == "c"  # it fell by .1 of .9 that was promised
+    p.n_rounds, p.loss = p.n_rounds + 20, p.loss - np.array([0, 0.6, 0.1])
+    one._exchange(every)  # and again, with a new matrix
+    assert steps[3:] == [{1: "slopes 1"}] and one.exchanges[2] is None and len(made) == 4
     p.loss, p.converged = p.loss - 1, every
     one.settings.max_iter = int(p.n_rounds.max()) - 1
     one._exchange(every)
-    assert len(steps) == 3  # at the limit
+    assert len(steps) == 4  # at the limit
 
 
 def test_fits_that_are_over_are_left_with_their_present_state():
