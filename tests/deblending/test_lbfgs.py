@@ -225,7 +225,10 @@ def test_only_new_roots_are_uploaded(build, monkeypatch):
     blocks = [made(k + 30) for k in range(8)]
     shelf.hold(blocks)
     assert shelf.values is not before and held() == list(range(30, 38))
-    before, blocks = shelf.values, blocks[2:4]
+    before, blocks = shelf.values, blocks[1:4]  # a quarter of the room, which is enough
+    shelf.hold(blocks)
+    assert shelf.values is before and held() == [31, 32, 33]
+    blocks = blocks[1:]
     shelf.hold(blocks)
     assert shelf.values.size < before.size and held() == [32, 33]
 
