@@ -66,11 +66,13 @@ class Sums:
         return np.stack([s.sum(2)[scenes] for s in sums], axis=-1)
 
     def gram(self, table, n_images):
+        assert n_images <= self.slots.n_images.max()  # no work on what no slot has
         own = self.images[self.at][:, :n_images]
         weight = self.weight[[PARTS[self.at[a]][0] for a in table[:, 0]]]
         return np.einsum("xkcp,xcp,xlcp->xckl", own[table[:, 0]], weight, own[table[:, 1]])
 
     def pull(self, n_images):
+        assert n_images <= self.slots.n_images.max()
         scene = [PARTS[i][0] for i in self.at]
         both = np.stack([self.residual[scene], self.root[scene]])
         own = self.images[self.at][:, :n_images]
@@ -130,6 +132,7 @@ def test_spectra_are_each_scenes_least_squares(posed, fit_sky, error):
     before = one.spectra.copy(), one.sky.copy()
     chi2, wanted_chi2 = one.compare(error), np.zeros(2)
     one.solve(error)
+    assert one.normal.shape == (2, 3, 4, 4)
     for row, b in enumerate(SEEN):
         for channel in range(3):
             own, images, root, data = columns(one, b, channel)
@@ -168,7 +171,7 @@ def test_parameters_have_the_normal_equations_of_gauss_and_newton(posed, fit_sky
     """What a step of the parameters changes once lit spectra and sky levels have followed it;
     slopes that a component does not have say nothing."""
     one, rng, error = posed(fit_sky), np.random.default_rng(6), 0.1
-    one.spectra[:], one.sky[:] = rng.uniform(1, 4, (6, 3)), rng.normal(size=(3, 3)) * fit_sky
+    one.spectra[:], one.sky[:] = rng.uniform(0.1, 4, (6, 3)), rng.normal(size=(3, 3)) * fit_sky
     one.spectra[1, 2] = 0  # at its bound
     one.compare(error)
     normal, right = equations(one)
@@ -201,6 +204,8 @@ def test_light_as_each_profile_sees_it(posed):
     """<u, d - sky> / |u|, 0 where a profile is not seen or its scene is not looked at."""
     one, sky = posed(True, slopes=False), np.random.default_rng(7).normal(size=(3, 3))
     one.spectra[:] = 3.0
+    for sight in one.sights:
+        sight.images *= 1e-2
     found, wanted = one.signal_to_noise(sky), np.zeros((6, 3))
     for b in SEEN:
         for channel in range(3):
@@ -221,3 +226,20 @@ def test_each_component_is_drawn_as_far_as_its_own_brightness_reaches(posed):
     one = posed(False, scenes=[1, 0])
     np.testing.assert_allclose(one.slots.boxes, [2e-3, 1e-3, 1e-4, 1e-5])
     assert one.rows.tolist() == [[1, 0][one.scene[i]] for i in one.at]
+
+
+@pytest.mark.parametrize("counts", [(2,), (2, 1, 3)])
+def test_channels_of_observations_follow_each_other(monkeypatch, counts):
+    """Each observation of all scenes in one Sight; of as many channels as their data have."""
+    made = []
+    monkeypatch.setattr(room, "Sight", lambda *given: made.append(given) or SimpleNamespace())
+    monkeypatch.setattr(room, "Looking", lambda *given, fit_sky: given)
+    monkeypatch.setattr(room.Tuning, "of", lambda *given: given)
+    op = SimpleNamespace(device="here", dtype="float32")
+    views = [[SimpleNamespace(op=op, data=np.zeros((n, 4, 5))) for n in counts] for _ in range(2)]
+    room.looking_at(views, [], "precision", 0.1, fit_sky=True)
+    ends = np.cumsum([0, *counts]).tolist()
+    for k, (own, channels, *rest) in enumerate(made):
+        assert own == [scene[k] for scene in views] and channels == slice(ends[k], ends[k + 1])
+        assert rest == ["here", "float32", ("here", "float32"), "precision", 0.1]
+    assert len(made) == len(counts)
