@@ -52,11 +52,12 @@ def posed(bright=10.0):
     return replace(one, fixed_error=np.full((len(BOXES), 3), 0.5))
 
 
-def exposures(scale=(1.0, 1.0, 1.0)):
-    """Weights' roots of a sharp noise, each channel's times a scale."""
+def exchange_at(one, scale=(1.0, 1.0, 1.0), *, fit_sky=True):
+    """The Exchange of a Solution under weights of a sharp noise, each channel's times scale^2."""
     rng = np.random.default_rng(1)
     root = 30 * rng.uniform(0.5, 2, (3, *SHAPE)) * np.array(scale)[:, None, None]
-    return [Shown(root[part]) for part in CHANNELS]
+    shared = [one.shared(i) for i in range(len(BOXES))]
+    return Exchange(one, shared, [Shown(root[part]) for part in CHANNELS], fit_sky=fit_sky)
 
 
 def slopes_of(one, seed=2, bound=()):
@@ -101,7 +102,7 @@ def test_a_step_leads_to_the_minimum_of_all_that_is_free(fit_sky, monkeypatch):
     factored, factor = [], exchange.Factor
     monkeypatch.setattr(exchange, "Factor", lambda m: factored.append(m) or factor(m))
     one = posed()
-    found = Exchange(one, exposures(), fit_sky=fit_sky)
+    found = exchange_at(one, fit_sky=fit_sky)
     assert [moves is None for moves in found.moves] == [True, True, False, False]
     for n, bound in ((1, [(0, 1), (2, 0)]), (1, [(0, 1), (2, 0)]), (2, [(1, 2)]), (3, [])):
         slopes = slopes_of(one, seed=len(bound), bound=bound)
@@ -122,7 +123,7 @@ def test_a_channel_that_hardly_weighs_stays(part, stays):
     """Spectra and level of one with less than 1e-9 of the best one's information. The level follows
     by no more than the light that is moved."""
     one = posed()
-    found = Exchange(one, exposures((1.0, part, 1.0)), fit_sky=True)
+    found = exchange_at(one, (1.0, part, 1.0))
     _, spectra, sky, _ = found.step(slopes_of(one))
     assert (spectra[:, 1] == 0).all() == stays
     assert (abs(sky[1]) < 1e-4) == (stays or part == 1)
@@ -131,7 +132,7 @@ def test_a_channel_that_hardly_weighs_stays(part, stays):
 
 def test_where_nothing_weighs_nothing_moves():
     one = posed()
-    _, spectra, sky, _ = Exchange(one, exposures((0, 0, 0)), fit_sky=True).step(slopes_of(one))
+    _, spectra, sky, _ = exchange_at(one, (0, 0, 0)).step(slopes_of(one))
     assert not spectra.any() and not sky.any()
 
 
@@ -139,7 +140,7 @@ def test_where_nothing_weighs_nothing_moves():
 def test_changes_of_more_than_a_third_of_an_error_are_unknowns(bright):
     """0.3 errors of flux and second moment at fixed morphologies, of all channels together."""
     one = posed(bright)
-    found, n_small = Exchange(one, exposures()), 0
+    found, n_small = exchange_at(one), 0
     for i in (2, 3):
         moves = found.moves[i]
         profile = one.scene.profile[i]
@@ -160,7 +161,7 @@ def test_changes_of_more_than_a_third_of_an_error_are_unknowns(bright):
 def test_errors_at_fixed_morphologies_are_those_of_the_power(monkeypatch):
     """1 / sqrt(sum w (R S)^2); where nothing is seen a number that makes all changes negligible."""
     monkeypatch.setattr(exchange, "Exchange", lambda solution, *given, fit_sky: solution)
-    monkeypatch.setattr(exchange.Exposure, "of", lambda *given: None)
+    monkeypatch.setattr(exchange, "exposures_of", lambda fit: None)
     one = posed()
     one.scene.power = np.full((len(BOXES), 3), 4.0)
     one.scene.power[1] = 0, 0.25, 1e-20
@@ -168,10 +169,7 @@ def test_errors_at_fixed_morphologies_are_those_of_the_power(monkeypatch):
         shapes=[None] * 4, thetas=[None] * 4, positions=np.arange(10).reshape(5, 2),
         source=np.array([2, 0, 3, 1]),
     )  # fmt: skip
-    fit = SimpleNamespace(
-        start=start, views=[None], blend=SimpleNamespace(observations=[None]), frame=None,
-        settings=SimpleNamespace(prior=one.prior, fit_sky=False),
-    )  # fmt: skip
+    fit = SimpleNamespace(start=start, settings=SimpleNamespace(prior=one.prior, fit_sky=False))
     state = SimpleNamespace(morph=one.morphs, spectra=one.spectra)
     found = exchange_of(fit, one.scene, state, one.findings)
     np.testing.assert_allclose(found.fixed_error[0], 0.5)
