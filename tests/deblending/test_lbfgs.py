@@ -127,7 +127,7 @@ def random_blocks(made, seed=5):
         for level, places in enumerate((range(0, n, 2), range(1, n, 2), range(0, n, 3))):
             if not n or (level == 2 and any(blocks)):
                 continue
-            places = rng.permutation(np.array(places))[:40]
+            places = rng.permutation(np.array(places))[:37]
             root = np.tril(rng.normal(size=(len(places), len(places)))).astype(np.float32)
             block = Block(int(level == 2), places, _panels(root))
             found.append((block, root.T.astype(float) @ root))
@@ -190,6 +190,21 @@ def test_a_step_does_what_its_scene_asks_for(build, dtype, mode):
     x_new = np.where(m.bounded, np.maximum(x_new, 0), x_new)
     for name, wanted in (("x", x), ("g", g), ("hg", hg), ("d", d), ("x_new", x_new)):
         close(m.get(name), np.where(m.scene < 2, wanted, m.host[name]), dtype)
+
+
+@every_type
+def test_a_scene_that_is_no_number_harms_no_other(build, dtype):
+    """Nor through its blocks, which follow those of the scene before: rows that fill no panel."""
+    found = []
+    for bad in (1.0, np.nan):
+        m = Made(build, dtype)
+        m.steps.take_blocks([[block for block, _ in some] for some in random_blocks(m)])
+        build.upload(np.where(m.scene == 1, bad, m.host["g_new"]).astype(dtype), m.v.g_new)
+        m.steps.change()
+        m.follow([NEXT, NEXT, REST])
+        m.steps.advance(*np.zeros((2, 3, 5)), *np.zeros((2, 3)))
+        found.append(np.vstack([m.get("hy"), m.get("hg")])[:, m.scene == 0])
+    np.testing.assert_array_equal(*found)
 
 
 def test_only_new_roots_are_uploaded(build, monkeypatch):
