@@ -83,6 +83,7 @@ def test_boxes_grow_and_shrink_by_their_edges():
     wide[3, 10] = wide[26, 10] = 0.009
     wide[4, 10], wide[25, 10] = 0.011, 0.011
     assert box(wide) == [14, 24, 36, 36]
+    assert box(0 * wide) == [20, 25, 31, 36]  # one without any light
     full = np.full((50, 60), 1.0)
     assert box(full, origin=(0, 0)) == [0, 0, 50, 60]
     assert box(np.full((49, 58), 1.0), origin=(1, 1)) == [0, 0, 50, 60]

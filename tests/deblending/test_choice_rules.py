@@ -7,7 +7,7 @@ import pytest
 
 from clresample.deblending.solver.boxes import Boxes
 from clresample.deblending.solver.rendering import choice
-from clresample.deblending.solver.rendering.windows import ROUND_PX, Groups
+from clresample.deblending.solver.rendering.windows import ROUND_PX, Groups, WindowOperator
 from clresample.device.contraction import COLUMN_PAD
 
 
@@ -30,6 +30,70 @@ def test_groups_are_of_the_cells_that_hold_the_middles_of_boxes():
     assert groups.shape.tolist() == [16, 32]  # 13 x 17 pixels of the first
     exact = Groups(boxes_at((0, 0), (8, 8)), np.arange(2), np.array([50, 50]))
     assert exact.shape.tolist() == [16, 16] and exact.low.tolist() == [[0, 0]]
+
+
+class Host:
+    """A device whose arrays are NumPy's."""
+
+    def put(self, values, dtype=None):
+        return np.array(values, dtype)
+
+
+def test_groups_take_the_place_of_scenes():
+    """Each source lies in its group's frame as in its scene's; kernels find those of a group in a
+    list, in which sources that are not meant are left out."""
+    boxes = boxes_at((41, 5), (3, 30), (7, 12), (40, 3), (2, 1), (30, 3), scene=[0, 0, 0, 0, 1, 1])
+    boxes = Boxes(boxes.scene, boxes.origin, boxes.shape, np.tile([2, 5], (6, 1)))
+    groups = Groups(boxes, np.array([0, 2, 3, 4, 5]), np.array([25, 100]))
+    batch = SimpleNamespace(host_boxes=boxes, scenes=["a", "b"], device=Host(), spectra="kept")
+    found = groups.buffers(batch)
+    assert found.scenes == ["a", "a", "b", "b"] and found.spectra == "kept"
+    assert batch.scenes == ["a", "b"] and batch.host_boxes is boxes  # that one stays as it is
+    assert found.everyone.tolist() == [0, 2, 3, 4, 5]
+    assert found.first.tolist() == [0, 1, 3, 4, 5] and found.order.tolist() == [2, 0, 3, 4, 5]
+    assert {a.dtype for a in (found.everyone, found.first, found.order)} == {np.dtype(np.int32)}
+    own = found.host_boxes
+    assert own.scene[[0, 2, 3, 4, 5]].tolist() == [1, 0, 1, 2, 3]
+    origin = [[1, 2], [0, 0], [0, 0], [0, 0], [0, 0]]
+    assert own.origin[[0, 2, 3, 4, 5]].tolist() == origin
+    assert own.center.tolist() == boxes.center.tolist()
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.4, -2.3)])
+def test_windows_lie_where_the_observation_sees_their_frames(shift):
+    """To a pixel; what is left of a pixel and of the shift moves the transfer function."""
+    c, s = 1.7 * np.cos(0.5), 0.8 * np.sin(0.5)
+    turned = np.array([[c, -s], [s, c]])
+    at = SimpleNamespace(matrix=turned, offset=np.array([-3.2, 5.9]))
+    small = SimpleNamespace(matrix=turned, offset=np.array([-11.3, -8.4]))
+    one, moves = object.__new__(WindowOperator), []
+    one.op = SimpleNamespace(plans=[SimpleNamespace(mapping=at)], shift=np.array(shift))
+    one.plan = SimpleNamespace(mapping=small, shifted=lambda move: move)
+    one._groups = SimpleNamespace(low=np.array([[0, 0], [40, 3], [17, 60]]))
+    one._executor = SimpleNamespace(set_transfer=moves.extend)
+    one.place()
+    for low, move, group in zip(one.low, moves, one._groups.low, strict=True):
+        pixel = np.array([4, 9])  # of the observation: where it lies on the model, by either way
+        wanted = turned @ pixel + at.offset + shift
+        found = turned @ (pixel - low) + small.offset + move + group
+        np.testing.assert_allclose(found, wanted)
+        assert np.abs(np.linalg.solve(turned, move)).max() <= 0.5
+
+
+def test_the_cheapest_of_all_sizes_of_cells_is_taken(monkeypatch):
+    matrix = np.array([[2.0, -1.0], [0.5, 4.0]])
+    op = SimpleNamespace(
+        shape_in=(3, 120, 240), plans=[SimpleNamespace(mapping=SimpleNamespace(matrix=matrix))]
+    )
+
+    def cost(boxes, op, cell, inverse):
+        np.testing.assert_allclose(inverse, np.abs(np.linalg.inv(matrix)))
+        return abs(cell[0] - 15) + abs(cell[1] - 30) + 7
+
+    monkeypatch.setattr(choice, "Groups", lambda boxes, which, cell: cell)
+    monkeypatch.setattr(choice, "_window_flops", cost)
+    count, cell = choice._best_groups(SimpleNamespace(host_boxes=None), op, np.arange(3))
+    assert count == 7 and cell.tolist() == [15, 30]
 
 
 def test_operations_are_counted_from_sizes():

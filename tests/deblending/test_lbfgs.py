@@ -127,7 +127,7 @@ def random_blocks(made, seed=5):
         for level, places in enumerate((range(0, n, 2), range(1, n, 2), range(0, n, 3))):
             if not n or (level == 2 and any(blocks)):
                 continue
-            places = rng.permutation(np.array(places))[:40]
+            places = rng.permutation(np.array(places))[:37]
             root = np.tril(rng.normal(size=(len(places), len(places)))).astype(np.float32)
             block = Block(int(level == 2), places, _panels(root))
             found.append((block, root.T.astype(float) @ root))
@@ -192,6 +192,21 @@ def test_a_step_does_what_its_scene_asks_for(build, dtype, mode):
         close(m.get(name), np.where(m.scene < 2, wanted, m.host[name]), dtype)
 
 
+@every_type
+def test_a_scene_that_is_no_number_harms_no_other(build, dtype):
+    """Nor through its blocks, which follow those of the scene before: rows that fill no panel."""
+    found = []
+    for bad in (1.0, np.nan):
+        m = Made(build, dtype)
+        m.steps.take_blocks([[block for block, _ in some] for some in random_blocks(m)])
+        build.upload(np.where(m.scene == 1, bad, m.host["g_new"]).astype(dtype), m.v.g_new)
+        m.steps.change()
+        m.follow([NEXT, NEXT, REST])
+        m.steps.advance(*np.zeros((2, 3, 5)), *np.zeros((2, 3)))
+        found.append(np.vstack([m.get("hy"), m.get("hg")])[:, m.scene == 0])
+    np.testing.assert_array_equal(*found)
+
+
 def test_only_new_roots_are_uploaded(build, monkeypatch):
     """Blocks that stay keep their place; where room runs out, or is hardly used, all move."""
     m = Made(build, np.float32)
@@ -225,7 +240,10 @@ def test_only_new_roots_are_uploaded(build, monkeypatch):
     blocks = [made(k + 30) for k in range(8)]
     shelf.hold(blocks)
     assert shelf.values is not before and held() == list(range(30, 38))
-    before, blocks = shelf.values, blocks[2:4]
+    before, blocks = shelf.values, blocks[1:4]  # a quarter of the room, which is enough
+    shelf.hold(blocks)
+    assert shelf.values is before and held() == [31, 32, 33]
+    blocks = blocks[1:]
     shelf.hold(blocks)
     assert shelf.values.size < before.size and held() == [32, 33]
 

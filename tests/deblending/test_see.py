@@ -1,5 +1,7 @@
 """Fitted morphologies as observations see them, beside whole frames; weights about bright stars."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from helpers.scenes import BRIGHT, SHAPE, frame, observe
@@ -119,3 +121,35 @@ def test_stars_count_where_their_error_shows_in_a_pixel(device, brightness, chan
     found = allow_for_psf_error(own, [one], 0.03)
     assert (found[0] is not own[0]) == changes and found[1] is own[1]
     assert allow_for_psf_error(own, [one], 0.0) == own
+
+
+def test_what_is_seen_is_listed_by_scene_and_component():
+    """Slots come in another order; of each the part of its window that is lit, where that lies on
+    the observation."""
+    rng, n_bands, shape = np.random.default_rng(0), 2, (9, 11)
+    at, scene = np.array([3, 0, 2, 1]), np.array([1, 0, 1, 0])
+    windows = np.array([(2, 3, 5, 4), (-2, 6, 6, 7), (0, 0, 3, 3), (6, -1, 4, 5)])
+    lit = np.array([(3, 3, 2, 4), (-1, 6, 4, 6), (0, 0, 3, 3), (7, 1, 3, 2)])
+    sizes = n_bands * windows[:, 2:].prod(axis=1)
+    begin = np.cumsum(sizes) - sizes + 5
+    flat = rng.random(sizes.sum() + 9).astype(np.float32)
+    wanted = np.zeros((4, n_bands, *shape))
+    for row, (y, x, wy, wx) in enumerate(windows):
+        whole = np.zeros((n_bands, 40, 40))
+        part = flat[begin[row] : begin[row] + sizes[row]].reshape(n_bands, wy, wx)
+        whole[:, y + 10 : y + 10 + wy, x + 10 : x + 10 + wx] = part
+        low, high = lit[row, :2] + 10, lit[row, :2] + lit[row, 2:] + 10
+        inside = np.zeros((40, 40), bool)
+        inside[low[0] : high[0], low[1] : high[1]] = True
+        wanted[at[row]] = (whole * inside)[:, 10:19, 10:21]
+    place = np.column_stack([scene, windows, np.ones(4, int), begin])
+    sight = SimpleNamespace(seen=flat, n_bands=n_bands, my=9, mx=11, place=place, lit=lit)
+    device = SimpleNamespace(get=lambda array: array)
+    slots = SimpleNamespace(scene=scene)
+    looking = SimpleNamespace(n_scenes=3, sights=[sight, sight], device=device, at=at, slots=slots)
+    found = room._taken(looking)
+    for b, own in enumerate(([0, 1], [2, 3], [])):
+        for shown in found[b]:
+            assert shown.shape == (len(own), n_bands, *shape)
+            np.testing.assert_array_equal(np.asarray(shown), wanted[own])
+        assert len(found[b]) == 2

@@ -148,6 +148,8 @@ def test_a_profile_read_off_images_is_symmetric_and_above_the_noise():
     images[0, 1, 1], images[1, 1, 1], images[1, 0, 0] = 3.0, 4.0, 10.0
     found = image_profiles._combine(images, (1, 1))
     assert found[1, 1] == pytest.approx(5) and found[0, 0] == pytest.approx(8)
+    images[1, 1, 1] = -1  # a channel that does not see the centre takes no part
+    np.testing.assert_allclose(image_profiles._combine(images, (1, 1)), images[0])
     images[:, 1, 1] = -1
     assert image_profiles._combine(images, (1, 1))[0, 0] == pytest.approx(10 / np.sqrt(2))
 

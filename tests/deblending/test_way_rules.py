@@ -8,12 +8,13 @@ import pytest
 from helpers import scenes
 from helpers.tuning import tune
 
-from clresample.deblending import iterate as iterate_module
+from clresample.deblending import batch, iterate as iterate_module
 from clresample.deblending.profiles import Star
 from clresample.deblending.rendered import Rendered
 from clresample.deblending.shifts import SCATTER_PX, shift_steps
 from clresample.deblending.solver.scene import Scene, State
 from clresample.deblending.start import renderer as renderer_module
+from clresample.deblending.start.aim import _Windows
 from clresample.deblending.start.looking import looking_at
 from clresample.deblending.start.seen import WHOLE_PX, Model, see
 from clresample.deblending.start.slots import Component
@@ -235,3 +236,40 @@ def test_learning_runs_five_rounds_at_a_time_and_no_more_than_it_may():
             assert len(rounds) == k
         assert len(one.fits[0].losses) == sum(wanted) and one.fits[1].losses == []
         assert settled == ([] if max_iter == 100 else [[True, False]])
+
+
+def test_light_lies_in_the_middle_of_its_window():
+    """Where that is larger than one scene's light needs; mappings begin where the light does."""
+    rng = np.random.default_rng(0)
+    maps = [
+        SimpleNamespace(offset=rng.normal(size=2), matrix=rng.normal(size=(2, 2))) for _ in "ab"
+    ]
+    renderer = SimpleNamespace(size=(24, 31), plans=[SimpleNamespace(mapping=m) for m in maps])
+    found = _Windows(np.arange(2), renderer, np.array([(20, 20), (24, 30)]))
+    assert found.before.tolist() == [[2, 5], [0, 0]]
+    for m, before, offset in zip(maps, found.before, found.offset, strict=True):
+        np.testing.assert_allclose(offset, m.matrix @ before + m.offset)
+
+
+@pytest.mark.parametrize("group", ["b", "ab", "ba", "abc", "bb", "ac"])
+def test_a_fit_that_cannot_start_leaves_the_others(monkeypatch, group):
+    """b fails, whoever starts beside it; a group that starts is started once."""
+    begun = []
+
+    def begin(fits):
+        begun.append(len(fits))
+        if any(fit.blend == "b" for fit in fits):
+            raise ValueError("no")
+
+    monkeypatch.setattr(batch, "begin", begin)
+    many = object.__new__(batch._ManyFits)
+    many.done, many.dark = {}, {}
+    fits = [(10 + i, SimpleNamespace(blend=name, dark=[7])) for i, name in enumerate(group)]
+    good = [one for one in fits if one[1].blend != "b"]
+    assert many._begin(fits) == good
+    assert {i: done.status for i, done in many.done.items()} == {
+        i: "failed: no" for i, fit in fits if fit.blend == "b"
+    }
+    assert many.dark == {i: [7] for i, _ in good}
+    alone = [1] * len(group) if "b" in group and len(group) > 1 else []
+    assert begun == [len(group), *alone]
