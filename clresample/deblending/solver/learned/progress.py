@@ -20,8 +20,9 @@ NEAR, CALM = 5.0, 3
 FIRST, EVERY, SETTLED = 16, 8, 0.1
 # Whether the finest structure of sources is clear (evidence.py) is asked once strengths have
 # settled, where a scene's loss fell by less than this, times chi2 per pixel likewise, over the last
-# CALM iterations. Earlier, structure still holds what spectra and neighbours will take from it: with
-# 5, simulated galaxies exceed what is clear; later ones find the same and take more iterations.
+# CALM iterations. Earlier, structure still holds what spectra and neighbours will take from it:
+# with 5, more simulated galaxies exceed what is clear. With 1 the same ones do, up to 30
+# iterations later.
 LOOK = 2.5
 # A fit has converged when its strengths have settled and its loss fell by less than `enough` over
 # so many iterations; by that times chi2 per pixel where that is above 1, since a model that misfits
