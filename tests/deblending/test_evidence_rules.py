@@ -7,7 +7,6 @@ import pytest
 
 from clresample.deblending.solver.learned.evidence import (
     CLEAR,
-    CLEAR_WEIGHT,
     LEAST_SEEN,
     SourceEvidence,
     Spectra,
@@ -70,7 +69,7 @@ def test_clear_structure_follows_the_data():
     """At the finest scale, with a tenth of the weight and whatever the misfit; not at others."""
     prior = LearnedPrior(scales_px=(1.0, 3.0), strengths=(0.02, 0.1), weight=10.0)
     one, spectrum, old = evidence(prior, level=1e4), np.array([2.0]), np.array([0.05, 0.1])
-    m = np.array([10 * CLEAR_WEIGHT, 10]) / one.seen(spectrum) ** 2
+    m = np.array([1, 10]) / one.seen(spectrum) ** 2
     energies, misfit = np.array([0.3, 0.5]), np.array([1.0, 3.0])
     wanted = energies / misfit + m * np.square(prior.strengths)
     wanted = np.sqrt(wanted / (one.determined(old, spectrum) + m))

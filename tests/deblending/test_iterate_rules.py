@@ -85,12 +85,10 @@ def test_steps_of_exchange_are_asked_for_in_time_and_again_where_the_last_one_ga
     one._exchange(every)
     assert made == [("c", "scene 2", "state 2", "findings 2")] and not steps  # .9 of 2
     p.n_rounds += 1
-    one._exchange(every)
-    assert len(made) == 1  # strengths have not settled
-    p.settled[:2] = True
-    one._exchange(every)
-    assert len(made) == 1  # which structure is clear is not known
-    p.looked[:2] = True
+    for known in (p.settled, p.looked):
+        one._exchange(every)
+        assert len(made) == 1  # strengths have not settled, or what is clear is not known
+        known[:2] = True
     one._exchange(every)
     assert [name for name, *_ in made] == ["c", "a", "b"] and not steps
     p.chi2, p.n_rounds = (lambda: np.array([0.5, 1.0, 1.0])), p.n_rounds + 20
