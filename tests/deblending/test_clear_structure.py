@@ -42,9 +42,9 @@ def test_a_scene_with_clear_structure_learns_again(clear):
     one.round()
     assert asked == [([True, False], ("energies", "spectra"))]
     assert learned == ([[True, False]] if clear else [])
-    assert one.progress.looked.tolist() == [True, False]
+    assert one.progress.looked.tolist() == [not clear, False]
     assert one.progress.settled.tolist() == [not clear, True]
-    assert not one.progress.asks(np.ones(2, bool))[0]  # it has looked
+    assert not one.progress.asks(np.ones(2, bool))[0]  # it has looked, or learns
 
 
 def test_scenes_look_when_they_are_calm_and_settled():

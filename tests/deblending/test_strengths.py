@@ -159,6 +159,8 @@ def test_clear_structure_is_looked_for_in_scenes_that_ask_and_learned_from_then_
     found = m.strengths.find_clear(np.array([True, True, False]), energies, m.spectra)
     assert found.tolist() == [True, False, False]
     assert np.flatnonzero(m.strengths.clear).tolist() == [one]
+    assert not m.strengths.find_clear(np.array([True, True, False]), energies, m.spectra).any()
+    assert m.strengths.clear[one]  # it stays so, and is nothing new
     old = m.strengths.values.copy()
     m.strengths.learn(np.ones(3, bool), energies, m.spectra)
     chi2 = np.concatenate([misfit(*pair) for pair in zip(m.scenes, m.states, strict=True)])

@@ -99,8 +99,8 @@ class Progress:
 
     def answered(self, which, clear):
         """Take down that the scenes `which` (B,) have looked, and where `clear` (B,) is true found
-        some: their strengths are learned again, from now on."""
-        self.looked |= which
+        more: they learn strengths again from now on, and look again after that."""
+        self.looked |= which & ~clear
         self.settled &= ~clear
         return clear
 

@@ -89,9 +89,10 @@ class Strengths:
         return np.stack([precision, self._curvature, precision * 0 + change], axis=2)
 
     def find_clear(self, due, energies, spectra):
-        """Find which sources of the scenes `due` (B,) are clear; which scenes (B,) hold some."""
+        """Find which sources of the scenes `due` (B,) are clear; which scenes (B,) hold some that
+        were not."""
         found = np.zeros(len(due), bool)
-        for s in self._free[due[self._scene[self._free]]]:
+        for s in self._free[due[self._scene[self._free]] & ~self.clear[self._free]]:
             given = self.values[s], energies[s], spectra[s]
             self.clear[s] = self._evidence[s].is_clear(*given)
             found[self._scene[s]] |= self.clear[s]
