@@ -232,7 +232,8 @@ class _Learning:
         fallen = loss - p.loss
         failed = there & (fallen < LEAST_KEPT * promised)
         old = failed & (fresh == 0)
-        which = which & (p.converged | (p.live & p.settled & due)) & ((fallen > enough) | old)
+        ready = p.converged | (p.live & p.settled & p.looked & due)
+        which = which & ready & ((fallen > enough) | old)
         if not which.any() or self.n_steps + PATIENCE >= self.settings.max_iter:
             return  # a fit takes that long to converge again
         new = which & ((rounds == 0) | old)

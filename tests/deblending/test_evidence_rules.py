@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from clresample.deblending.solver.learned.evidence import (
+    CLEAR,
     LEAST_SEEN,
     SourceEvidence,
     Spectra,
@@ -51,6 +52,30 @@ def test_new_strengths_are_the_fixed_point_of_the_evidence():
     tiny = LearnedPrior(scales_px=(1.0, 3.0), strengths=(1e-6, 1e-6), weight=10.0)
     found = evidence(tiny, level=1e4).learned(np.full(2, 2e-3), np.zeros(2), spectrum, 1.0)
     np.testing.assert_allclose(found, 1e-3)
+
+
+def test_structure_is_clear_where_the_finest_scale_holds_more_than_the_data_determine():
+    prior = LearnedPrior(scales_px=(1.0, 3.0), strengths=(0.02, 0.1), weight=10.0)
+    one, spectrum, old = evidence(prior, level=1e4), np.array([2.0]), np.array([0.05, 0.1])
+    gamma = one.determined(old, spectrum)[0]
+    assert gamma > 0.2 * CLEAR  # else the test could not tell one from the other
+    for energy, clear in ((gamma + CLEAR + 0.01, True), (gamma + CLEAR - 0.01, False)):
+        energies = np.array([energy * old[0] ** 2, 0.0])
+        assert one.is_clear(old, energies, spectrum) == clear
+    assert not one.is_clear(old, np.array([0.0, 1e9]), spectrum)  # at the finest scale alone
+
+
+def test_clear_structure_follows_the_data():
+    """At the finest scale, with a tenth of the weight and whatever the misfit; not at others."""
+    prior = LearnedPrior(scales_px=(1.0, 3.0), strengths=(0.02, 0.1), weight=10.0)
+    one, spectrum, old = evidence(prior, level=1e4), np.array([2.0]), np.array([0.05, 0.1])
+    m = np.array([1, 10]) / one.seen(spectrum) ** 2
+    energies, misfit = np.array([0.3, 0.5]), np.array([1.0, 3.0])
+    wanted = energies / misfit + m * np.square(prior.strengths)
+    wanted = np.sqrt(wanted / (one.determined(old, spectrum) + m))
+    found = one.learned(old, energies, spectrum, 3.0, clear=True)
+    np.testing.assert_allclose(found, wanted)
+    assert found[0] > 1.2 * one.learned(old, energies, spectrum, 3.0)[0]
 
 
 def test_what_is_not_seen_stays_as_it_was_expected():

@@ -44,7 +44,7 @@ def learning(n_rounds, *, live=None, converged=None, failed=None, **settings):
         live=~no if live is None else np.array(live),
         converged=no.copy() if converged is None else np.array(converged),
         failed=no.copy() if failed is None else np.array(failed),
-        settled=no.copy(),
+        **{name: no.copy() for name in ("settled", "looked")},
         n_rounds=np.array(n_rounds),
         loss=np.arange(1.0, n + 1),
         chi2=lambda: np.array([1.0, 2.0, 4.0])[:n],
@@ -84,10 +84,10 @@ def test_steps_of_exchange_are_asked_for_in_time_and_again_where_the_last_one_ga
     one._exchange(every)
     assert made == [("c", "scene 2", "state 2", "findings 2")] and not steps  # .9 of 2
     p.n_rounds += 1
-    one._exchange(every)
-    assert len(made) == 1  # strengths have not settled
-    p.settled[:2] = True
-    one._exchange(every)
+    for known in (p.settled, p.looked):  # strengths, and what is clear
+        assert len(made) == 1
+        known[:2] = True
+        one._exchange(every)
     assert [name for name, *_ in made] == ["c", "a", "b"] and not steps
     p.chi2, p.n_rounds = (lambda: np.array([0.5, 1.0, 1.0])), p.n_rounds + 20
     one._exchange(every)

@@ -161,6 +161,7 @@ def test_a_scene_learns_when_it_is_due_though_others_are_not(due):
     one.progress = SimpleNamespace(
         judge=lambda *_: (np.ones(2, bool), np.zeros(2, bool)),
         due=lambda _: np.array(due),
+        asks=lambda _: np.zeros(2, bool),
         next=lambda _: (None, None, None),
     )
     one.pairs = SimpleNamespace(

@@ -16,6 +16,8 @@ pytest.importorskip("matplotlib")
 SHIFT_PX, HEADERS_PX = (-1.54, -1.54), (-0.592, -0.748)
 # chi2 per pixel of an earlier deblender on these data, noise estimated alike
 CHI2 = {"HST": 1.12, "HSC": 0.92}
+# what our own best settings, chosen by hand, reach for HST: the merger's core holds most of it
+HST_CHI2 = 0.905
 
 
 @pytest.fixture(scope="module")
@@ -36,6 +38,11 @@ def test_chi2_is_no_worse_than_others_reach(fitted):
     result, _, _ = fitted
     for i, o in enumerate(result.observations):
         assert np.nanmean(result.residual(i) ** 2 * o.weights) <= CHI2[o.name]
+
+
+def test_the_core_of_the_merger_is_followed(fitted):
+    result, _, _ = fitted
+    assert np.nanmean(result.residual(0) ** 2 * result.observations[0].weights) <= HST_CHI2
 
 
 def test_residuals_hold_no_galaxy(fitted):

@@ -148,6 +148,28 @@ def test_scenes_that_are_due_learn_from_their_own_energies_and_misfit(build):
     np.testing.assert_allclose(change, [loss[m.scene == b].sum() for b in range(3)], rtol=1e-5)
 
 
+def test_clear_structure_is_looked_for_in_scenes_that_ask_and_learned_from_then_on(build):
+    m = Learning(build)
+    m.strengths.weights(m.spectra)
+    m.gradient.queue()
+    free = np.flatnonzero(~m.fixed)
+    one, other = free[m.scene[free] == 0][0], free[m.scene[free] == 2][0]
+    energies = np.zeros((9, 3))
+    energies[[one, other], 0] = 1e4 * m.strengths.values[0, 0] ** 2
+    found = m.strengths.find_clear(np.array([True, True, False]), energies, m.spectra)
+    assert found.tolist() == [True, False, False]
+    assert np.flatnonzero(m.strengths.clear).tolist() == [one]
+    assert not m.strengths.find_clear(np.array([True, True, False]), energies, m.spectra).any()
+    assert m.strengths.clear[one]  # it stays so, and is nothing new
+    old = m.strengths.values.copy()
+    m.strengths.learn(np.ones(3, bool), energies, m.spectra)
+    chi2 = np.concatenate([misfit(*pair) for pair in zip(m.scenes, m.states, strict=True)])
+    for i in (one, other):
+        given = old[i], energies[i], m.spectra[i], chi2[i]
+        wanted = m.evidence[i].learned(*given, clear=bool(i == one))
+        np.testing.assert_allclose(m.strengths.values[i], wanted, rtol=1e-6)
+
+
 def test_findings_are_those_of_scenes_that_were_asked_for(build):
     m = Learning(build)
     energies = np.random.default_rng(1).uniform(0, 3, (9, 3))
@@ -165,12 +187,14 @@ def test_scenes_that_go_on_alone_keep_their_strengths(build):
     m, keep = Learning(build), np.array([2, 0])
     m.strengths.weights(m.spectra)
     m.strengths.values *= np.arange(1, 10)[:, None]
+    m.strengths.clear[:] = np.arange(9) % 2
     scenes, states = [m.scenes[i] for i in keep], [m.states[i] for i in keep]
     b = Buffers(scenes, states, build, np.float64, m.prior)
     gradient = Gradient(b, with_prior=False)
     part = Strengths(b, gradient, latents(b, m.prior), m.prior, past=(m.strengths, keep))
     kept = np.concatenate([np.flatnonzero(m.scene == i) for i in keep])
     np.testing.assert_array_equal(part.values, m.strengths.values[kept])
+    np.testing.assert_array_equal(part.clear, m.strengths.clear[kept])
     np.testing.assert_allclose(build.get(part.precision), part.values**-2)
     assert [id(own) for own in part.blocks] == [id(m.strengths.blocks[i]) for i in kept]
     nobody = np.zeros(2, bool)

@@ -90,7 +90,7 @@ class LearnedEngine:
         accepted, stepped = p.judge(loss, slope)
         new = np.flatnonzero(stepped)
         self.pairs.take(new, sums[new, :, 2], sums[new, :, 3])
-        due = p.due(accepted)
+        due = p.due(accepted) | self._clear(p.asks(accepted))
         if due.any():
             sums = self._learn(due)
         mode, length, bare = p.next(accepted)
@@ -112,11 +112,22 @@ class LearnedEngine:
         rows = self.device.get(gradient.rows_loss).sum(1, dtype=np.float64)
         return sums, slope, rows + 0.5 * energy
 
+    def _clear(self, asking):
+        """Which scenes (B,) hold structure that is clear, of those `asking` (B,)."""
+        if not asking.any():
+            return asking
+        clear = self.strengths.find_clear(asking, *self._energies(self.vectors.x_new))
+        return self.progress.answered(asking, clear)
+
+    def _energies(self, vector):
+        """|z|^2 (S, J) of a vector, and the spectra (S, C) last taken."""
+        self.structure.energy(vector)
+        energies, spectra = self.structure.energies, self.buffers.spectra
+        return tuple(self.device.get(a).astype(np.float64) for a in (energies, spectra))
+
     def _learn(self, due):
         """New strengths of the scenes `due` (B,), and all that follows; other inner products."""
-        self.structure.energy(self.vectors.x_new)
-        energies = self.device.get(self.structure.energies).astype(np.float64)
-        spectra = self.device.get(self.buffers.spectra).astype(np.float64)
+        energies, spectra = self._energies(self.vectors.x_new)
         moved, weights, change = self.strengths.learn(due, energies, spectra)
         self._rest_others(self.progress.live)
         self.steps.reweigh(self.strengths.light, weights, self.strengths.blocks)
@@ -137,12 +148,8 @@ class LearnedEngine:
 
     def findings(self, which):
         """Findings of the scenes `which` (B,) at their present states; None for the others."""
-        b = self.buffers
-        self.structure.energy(self.vectors.x)
         self.vectors.take(self.vectors.x)
-        energies = self.device.get(self.structure.energies).astype(np.float64)
-        spectra = self.device.get(b.spectra).astype(np.float64)
-        return self.strengths.findings(which, energies, spectra)
+        return self.strengths.findings(which, *self._energies(self.vectors.x))
 
     def slopes(self, which):
         """The Slopes of the scenes `which` (B,) where they are; None for the others."""

@@ -13,6 +13,14 @@ determined parameters, and MacKay's (1992) fixed point under a hyperprior about 
 chi2_s is chi2 per pixel where the source's light is: misfit that no structure can take up is not
 taken for structure. seen_j is the share of scale j's power that the data show at the profile's
 peak: what they barely resolve is not extrapolated to. All of it in float64 on the host.
+
+Where a fit has come so far that its structure hardly changes, a source's structure is *clear* if
+
+    |z_0|^2 / alpha_0^2 - gamma_0 > CLEAR
+
+at the finest scale 0, whose lack no other one makes up for: the slope of the log of the evidence
+with ln alpha_0. From then on alpha_0 follows the data, without chi2_s and with CLEAR_WEIGHT of m:
+alpha0 is that of ordinary galaxies, and mergers and bright cores are none.
 """
 
 from __future__ import annotations
@@ -34,6 +42,12 @@ LEAST_SEEN = 1e-3  # so that m stays a number where the data show nothing
 STEP = 4.0
 # Where strengths end: structure of 0.1 % is none, and of 100 % the profile means nothing.
 STRENGTHS = 1e-3, 1.0
+# From where on the finest structure is clear [1]. Of 259 simulated galaxies, which have none, one
+# exceeds it, the next ones have 12 and less; bright real ones of HST and HSC have 24 to 490.
+CLEAR = 20.0
+# Part of `weight` that strengths which are clear keep: 10 numbers, of which bright cores determine
+# hundreds. With all of it the core of a merger that HST sees is left with residuals of 19 sigma.
+CLEAR_WEIGHT = 0.1
 # The preconditioner's light is the profile blurred by so many sigma of each scale, its curvature
 # the mean of t with weights P^POWER, P being k_j broadened by the source's extent: between the true
 # diagonal (1), and the curvature of the smoothest structure (2). Other values take up to 4 times
@@ -125,10 +139,19 @@ class SourceEvidence:
         k, x = self.spectra.k, SEEN_STRENGTH**2 * self.sharpness(spectrum) * self.spectra.k
         return np.maximum((k * x / (1 + x)) @ self.spectra.weight, LEAST_SEEN)
 
-    def learned(self, strengths, energies, spectrum, chi2):
+    def is_clear(self, strengths, energies, spectrum):
+        """Whether the finest structure is clear; energies (J,): |z_j|^2."""
+        ratio = energies[0] / strengths[0] ** 2
+        return ratio > CLEAR and ratio - self.determined(strengths, spectrum)[0] > CLEAR
+
+    def learned(self, strengths, energies, spectrum, chi2, *, clear=False):
         """New strengths (J,) from the present ones and |z_j|^2 (J,); see the module's text."""
         m = self.prior.weight / self.seen(spectrum) ** 2
-        wanted = energies / max(chi2, 1.0) + m * np.square(self.prior.strengths)
+        misfit = np.full(len(m), max(chi2, 1.0))
+        if clear:
+            m[0] *= CLEAR_WEIGHT
+            misfit[0] = 1.0
+        wanted = energies / misfit + m * np.square(self.prior.strengths)
         new = np.sqrt(wanted / (self.determined(strengths, spectrum) + m))
         return np.clip(np.clip(new, strengths / STEP, strengths * STEP), *STRENGTHS)
 

@@ -25,7 +25,8 @@ class LearnedPrior:
         at each scale; medians of fits to simulated galaxies
     weight [px]: determined pixels whose evidence counts as much as `strengths`: larger ones learn
         less from a source's own data. A faint galaxy determines 10 to 60 numbers, a bright blend
-        of HSC thousands
+        of HSC thousands. A tenth counts at the finest scale where data clearly ask for more of it,
+        as cores of bright galaxies do
     """
 
     scales_px: tuple[float, ...] = (0.8, 2.0, 5.0)

@@ -18,6 +18,12 @@ TRIALS = 8
 # its logarithm.
 NEAR, CALM = 5.0, 3
 FIRST, EVERY, SETTLED = 16, 8, 0.1
+# Whether the finest structure of sources is clear (evidence.py) is asked once strengths have
+# settled, where a scene's loss fell by less than this, times chi2 per pixel likewise, over the last
+# CALM iterations. Earlier, structure still holds what spectra and neighbours will take from it:
+# with 5, more simulated galaxies exceed what is clear. With 1 the same ones do, up to 30
+# iterations later.
+LOOK = 2.5
 # A fit has converged when its strengths have settled and its loss fell by less than `enough` over
 # so many iterations; by that times chi2 per pixel where that is above 1, since a model that misfits
 # so knows its fluxes less well by its root.
@@ -33,6 +39,7 @@ class Progress:
         because the loss of their start is no number
     loss: of the last accepted trial; n_iterations: accepted trials, the start not counted
     n_rounds: of each scene, trials so far
+    settled: scenes whose strengths are; looked: those that know which structure is clear
     """
 
     def __init__(self, n_scenes, enough, n_pixels):
@@ -44,7 +51,7 @@ class Progress:
         )
         self.loss = np.full(n, np.inf)
         self.n_iterations, self.n_rounds = np.zeros(n, int), np.zeros(n, int)
-        self.settled = np.zeros(n, bool)  # strengths
+        self.settled, self.looked = np.zeros(n, bool), np.zeros(n, bool)
         self._due = np.full(n, FIRST)
         self._fresh = np.ones(n, bool)  # the trial is where the scene is, with another loss
         self._bare = np.zeros(n, bool)  # without pairs since a direction that led nowhere
@@ -84,6 +91,18 @@ class Progress:
         """Which scenes (B,) learn their strengths now."""
         calm = self._drops[:, :CALM].sum(1) < NEAR * self.chi2()
         return accepted & ~self.settled & (calm | (self.n_rounds >= self._due))
+
+    def asks(self, accepted):
+        """Which scenes (B,) look now for structure that is clear."""
+        calm = self._drops[:, :CALM].sum(1) < LOOK * self.chi2()
+        return accepted & self.settled & ~self.looked & calm
+
+    def answered(self, which, clear):
+        """Take down that the scenes `which` (B,) have looked, and where `clear` (B,) is true found
+        more: they learn strengths again from now on, and look again after that."""
+        self.looked |= which & ~clear
+        self.settled &= ~clear
+        return clear
 
     def learned(self, due, moved, change):
         """Take down what the scenes `due` have learned: moved (B,), largest change of a logarithm

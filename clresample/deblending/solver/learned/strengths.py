@@ -29,6 +29,7 @@ class Strengths:
     past: other Strengths and the scenes (n,) of theirs that go on here, which are all
 
     values (S, J): alpha, at the prior's start; of fixed sources without meaning
+    clear (S,): sources whose finest structure is, see evidence.py
     precision (S, J): alpha^-2 on the device; light: a vector on the device, see lbfgs.cl
     blocks (S): of each source, see `SourceInverse.blocks`; none of fixed ones
     """
@@ -41,12 +42,14 @@ class Strengths:
         if past is None:
             self.values = np.tile(np.array(prior.strengths, float), (b.n_sources, 1))
             self._curvature = np.zeros_like(self.values)
+            self.clear = np.zeros(len(self.values), bool)
             self._evidence, self._inverses, self._light = self._prepare(prior)
             self.blocks = [[] for _ in self.values]
         else:
             other, keep = past
             kept = np.concatenate([np.flatnonzero(other._scene == i) for i in keep])
             self.values, self._curvature = other.values[kept], other._curvature[kept]
+            self.clear = other.clear[kept]
             self._evidence = [other._evidence[i] for i in kept]
             self._inverses = [other._inverses[i] for i in kept]
             self._light = [other._light[i] for i in kept]
@@ -85,6 +88,16 @@ class Strengths:
         precision = self.values**-2
         return np.stack([precision, self._curvature, precision * 0 + change], axis=2)
 
+    def find_clear(self, due, energies, spectra):
+        """Find which sources of the scenes `due` (B,) are clear; which scenes (B,) hold some that
+        were not."""
+        found = np.zeros(len(due), bool)
+        for s in self._free[due[self._scene[self._free]] & ~self.clear[self._free]]:
+            given = self.values[s], energies[s], spectra[s]
+            self.clear[s] = self._evidence[s].is_clear(*given)
+            found[self._scene[s]] |= self.clear[s]
+        return found
+
     def learn(self, due, energies, spectra):
         """New strengths of the scenes `due` (B,), from the residuals in the image buffers.
 
@@ -93,7 +106,8 @@ class Strengths:
         """
         chi2, old = self._response.misfit(spectra), self.values.copy()
         for s in self._free[due[self._scene[self._free]]]:
-            self.values[s] = self._evidence[s].learned(old[s], energies[s], spectra[s], chi2[s])
+            given = old[s], energies[s], spectra[s], chi2[s]
+            self.values[s] = self._evidence[s].learned(*given, clear=self.clear[s])
         change = self.values**-2 - old**-2
         self.buffers.device.upload(
             np.ascontiguousarray(self.values**-2, self.buffers.dtype), self.precision

@@ -1,0 +1,59 @@
+"""When a scene looks for clear structure, what follows for it, and for scenes beside it."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from clresample.deblending.solver.learned.engine import LearnedEngine
+from clresample.deblending.solver.learned.progress import Progress
+
+N_PIXELS = 1000  # so many that chi2 per pixel is below 1
+
+
+def begun(*losses):
+    """Scenes that have taken their first trial."""
+    progress = Progress(len(losses), 0.5, [N_PIXELS] * len(losses))
+    progress.judge(np.array(losses, float), np.zeros(len(losses)))
+    return progress
+
+
+@pytest.mark.parametrize("clear", [True, False])
+def test_a_scene_with_clear_structure_learns_again(clear):
+    """The first scene is calm, the second one's loss still falls."""
+    one, learned, asked = object.__new__(LearnedEngine), [], []
+    sums, nothing = np.zeros((2, 3, 4)), lambda *_: None
+    one.progress = begun(100, 100)
+    one.progress.settled[:] = True
+    one.progress._drops[0] = 0.1
+    one._energies = lambda _: ("energies", "spectra")
+    one.vectors = SimpleNamespace(x_new=None)
+    one._evaluate = lambda: (sums, np.array([-0.1, -1.0]), np.array([99.9, 90.0]))
+    one.strengths = SimpleNamespace(
+        find_clear=lambda which, *given: (
+            asked.append((which.tolist(), given)) or np.array([clear, False])
+        )
+    )
+    one.pairs = SimpleNamespace(
+        take=nothing, forget=nothing, coefficients=lambda *_: (None, None, None)
+    )
+    one.steps = SimpleNamespace(follow=nothing, advance=nothing)
+    one._learn = lambda which: learned.append(which.tolist()) or sums
+    one.round()
+    assert asked == [([True, False], ("energies", "spectra"))]
+    assert learned == ([[True, False]] if clear else [])
+    assert one.progress.looked.tolist() == [not clear, False]
+    assert one.progress.settled.tolist() == [not clear, True]
+    assert not one.progress.asks(np.ones(2, bool))[0]  # it has looked, or learns
+
+
+def test_scenes_look_when_they_are_calm_and_settled():
+    progress = begun(100, 100, 100, 100, 3 * N_PIXELS)
+    progress.settled[[0, 1, 2, 4]] = True
+    progress.looked[1] = True
+    progress._drops[:] = 0.8  # 2.4 over three iterations
+    accepted = np.ones(5, bool)
+    assert progress.asks(accepted).tolist() == [True, False, True, False, True]
+    assert not progress.asks(~accepted).any()
+    progress._drops[[0, 4]] = 0.9  # much, but for a scene of chi2 6
+    assert progress.asks(accepted).tolist() == [False, False, True, False, True]
