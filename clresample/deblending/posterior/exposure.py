@@ -34,6 +34,9 @@ BAND = 1e-2
 # the width of its own: half as many pixels and less, for which 99 % of the errors of fluxes and
 # moments of simulated scenes change by less than 0.2 %.
 WIDER = 1.2
+# Frequencies, of all channels and as many images as are observed at a time: their 8 bytes each, and
+# what is made of them, stay in a core's second cache. All at once take a quarter more time.
+CACHED = 1 << 15
 # [px] Periods are multiples of it, and one: boxes of about one size share their transfer function.
 PERIOD_PX = 8
 # [px] Period at which the band is looked for.
@@ -92,19 +95,23 @@ class Exposure:
         if self.shares is not None:
             parts = self.shares[i]
             d = np.einsum("yctx,ct->ycx", d.reshape(len(nu_y), *parts.shape, -1), parts)
-        columns = images.transpose(1, 0, 2).reshape(n_y, -1)  # (ny, k nx)
-        wave_y = _waves(nu_y, -np.arange(n_y))  # (Hy, ny)
-        parts = np.concatenate([wave_y.real, wave_y.imag]) @ columns
-        rows = (parts[: len(nu_y)] + 1j * parts[len(nu_y) :]).reshape(-1, n_x)
-        z = (rows @ _waves(-np.arange(n_x), nu_x)).reshape(len(nu_y), k, 1, -1) * d[:, None]
-        z = z.reshape(-1, len(nu_x)) @ _waves(nu_x, self.x[low[1] : high[1]] - origin[1])
-        z = z.reshape(len(nu_y), -1)
-        wave_y = _waves(self.y[low[0] : high[0]] - origin[0], nu_y)
-        seen = np.concatenate([wave_y.real, -wave_y.imag], axis=1) @ np.concatenate(
-            [z.real, z.imag]
-        )
-        seen = seen.reshape(len(wave_y), k, len(self.root), -1).transpose(1, 2, 0, 3)
-        return seen * self.root[:, low[0] : high[0], low[1] : high[1]]
+        to_y, to_x = _waves(nu_y, -np.arange(n_y)), _waves(-np.arange(n_x), nu_x)
+        from_y = _waves(self.y[low[0] : high[0]] - origin[0], nu_y)
+        from_x = _waves(nu_x, self.x[low[1] : high[1]] - origin[1])
+        to_y = np.concatenate([to_y.real, to_y.imag])
+        from_y = np.concatenate([from_y.real, -from_y.imag], axis=1)
+        root = self.root[:, low[0] : high[0], low[1] : high[1]]
+        out, n = np.empty((k, *root.shape), np.float32), max(CACHED // d.size, 1)
+        for first in range(0, k, n):
+            some = images[first : first + n]
+            z = to_y @ some.transpose(1, 0, 2).reshape(n_y, -1)  # (2 Hy, k nx)
+            z = (z[: len(nu_y)] + 1j * z[len(nu_y) :]).reshape(-1, n_x) @ to_x
+            z = z.reshape(len(nu_y), len(some), 1, -1) * d[:, None]
+            z = (z.reshape(-1, len(nu_x)) @ from_x).reshape(len(nu_y), -1)
+            seen = from_y @ np.concatenate([z.real, z.imag])
+            seen = seen.reshape(len(from_y), len(some), len(root), -1).transpose(1, 2, 0, 3)
+            np.multiply(seen, root, out=out[first : first + n])
+        return out
 
 
 def exposures_of(fit):
