@@ -30,6 +30,56 @@ def test_a_window_holds_the_pixels_within_reach():
     assert low[0] == high[0] == 20  # none
 
 
+def test_few_modes_at_a_time_are_seen_as_all_at_once(monkeypatch):
+    """Also where the last ones are fewer, and each with its channel's root weights."""
+    psf, rng = PSF.gaussian(1.2, n_pixels=25), np.random.default_rng(3)
+    root, images = rng.uniform(1, 2, (1, 9, 11)), rng.standard_normal((5, 7, 8))
+    place = np.arange(9) * 2.0, np.arange(11) * 2.0
+    one = Exposure(*place, root.astype("f4"), 4.0, Transfer(2.0 * np.eye(2), psf, psf), None)
+    found = []
+    for size in (1, 2 * one.transfer.at((7, 8), 4.0)[2].size, 1 << 30):
+        monkeypatch.setattr(module, "CACHED", size)
+        found.append(one.observe(images.astype("f4"), 0, np.array([3, 4]), (1, 2), (9, 10)))
+    assert found[0].shape == (5, 1, 8, 8) and np.abs(found[0]).max() > 0.1
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], atol=1e-5)
+
+
+def test_exposures_are_kept_until_a_view_is_another_or_has_moved(monkeypatch):
+    """Sources may be others at any time: their shares are taken anew."""
+
+    def view_of(shares):
+        return SimpleNamespace(op=SimpleNamespace(shift=np.zeros(2)), shares=shares)
+
+    made = []
+
+    def of(view, frame, observation, source):
+        made.append(view)
+        return Exposure(np.zeros(1), np.zeros(1), np.zeros(1), 1.0, None, None)
+
+    monkeypatch.setattr(module.Exposure, "of", of)
+    views = [Kept(**vars(view_of(shares))) for shares in (None, np.arange(6.0).reshape(3, 1, 2))]
+    blend, start = SimpleNamespace(observations=(1, 2)), SimpleNamespace(source=np.array([0, 2]))
+    fit = SimpleNamespace(views=views, blend=blend, start=start, frame=None)
+    first = module.exposures_of(fit)
+    again = module.exposures_of(fit)
+    assert made == views and again[0] is first[0]
+    assert again[1].shares.ravel().tolist() == [0, 1, 4, 5]
+    start.source = np.array([1])
+    assert module.exposures_of(fit)[1].shares.ravel().tolist() == [2, 3] and len(made) == 2
+    views[0].op.shift[1] = 0.25  # in place
+    assert module.exposures_of(fit)[0] is not first[0] and made == [*views, views[0]]
+    fit.views = [Kept(**vars(views[0])), views[1]]
+    module.exposures_of(fit)
+    assert len(made) == 4
+
+
+class Kept(SimpleNamespace):
+    """One that is itself alone, as views are."""
+
+    __hash__, __eq__ = object.__hash__, object.__eq__
+
+
 def seen_as(monkeypatch, view, pixel):
     """Rows, columns, root weights of a view's Exposure, whose band asks for pixels of `pixel`."""
     psf = PSF.gaussian(1.0, n_pixels=15)
