@@ -289,10 +289,12 @@ def test_errors_follow_from_the_covariance_of_all_unknowns():
     np.testing.assert_array_equal(errors.beyond, [far.sums for far in made.beyond])
 
 
-def test_second_moments_of_stars_have_no_error():
-    """Their places have; a source with one free component has both."""
+def test_second_moments_of_stars_have_no_error_and_are_not_released():
+    """Their places have, and are; a source with one free component has both."""
     for fixed, known in (((0, 2), False), ((0,), True)):
         made, _ = made_up(np.random.default_rng(1), fixed=fixed, n_common=0)
-        found = made.errors(OWNER, 2, np.ones(2), 0.0).moments[1]
+        errors = made.errors(OWNER, 2, np.ones(2), 0.0)
+        found, moved = errors.moments[1], errors.moved[1]
         assert np.isfinite(found[:2, :2]).all() and np.isfinite(found[2:, 2:]).all() == known
         assert np.isnan(found[:2, 2:]).all() != known
+        assert (moved[:2] != 0).all() and ((moved[2:] != 0) == known).all()

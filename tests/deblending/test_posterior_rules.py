@@ -60,7 +60,7 @@ def test_unlikeness_is_what_the_scale_next_to_two_pixels_shows(chi2):
     assert one.unlikeness(0) == pytest.approx(wanted) and one.unlikeness(1) == 1
     assert STRENGTH == 0.05
     np.testing.assert_allclose(
-        one.strengths(0), [0.01 * wanted**2.5, 0.05 * wanted, 0.03 * wanted**2.5]
+        one.strengths(0), [0.01 * wanted**3.5, 0.05 * wanted, 0.03 * wanted**3.5]
     )
     np.testing.assert_array_equal(one.findings.strengths[0], [0.01, 0.05, 0.03])  # left as it is
     assert [power_of(unlike, 2.0) for unlike in (0.5, 3.0, 7.0)] == [0.25, 9.0, 9.0]
@@ -192,7 +192,7 @@ def test_how_far_profiles_and_places_may_be_off():
     for shape, theta, wanted in kinds:
         for radial in (1.0, 0.5):
             _, scatter, _ = profile_modes(shape, theta, position, box, [6, 7], radial=radial)
-            np.testing.assert_allclose(scatter, [*wanted, 0.1 * radial, 0.02 * radial])
+            np.testing.assert_allclose(scatter, [*wanted, 0.1 * radial, 0.01 * radial])
     assert profile_modes(star, np.zeros(2), position, box, [6, 7])[1] is star.scatter
 
 

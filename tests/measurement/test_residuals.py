@@ -8,8 +8,9 @@ import pytest
 from clresample import PSF, Extended, Frame, Grid, Observation, Resampler, Settings, deblend
 from clresample.measurement import residuals
 from clresample.measurement.catalogue import Flag, catalogue
+from clresample.measurement.photometry import channel_covariances
 from clresample.measurement.quality import summary
-from clresample.measurement.residuals import channel_residuals, misfits, worst_residuals
+from clresample.measurement.residuals import channel_residuals, misfits, widening, worst_residuals
 
 POSITIONS = [(16.0, 14.0), (28.0, 31.0)]
 GRID, FRAME_PSF, SEEN = Grid.flat((46, 44), 0.1), PSF.gaussian(0.8), PSF.gaussian([1.3, 1.5])
@@ -55,6 +56,30 @@ def test_it_is_flagged_and_the_fit_is_not_called_good(result):
     ended = summary(replace(found, status="converged"))
     assert ended["misfits"] == [1] and not ended["good"]
     assert summary(replace(left_over(result, bump=0), status="converged"))["good"]
+
+
+def test_errors_of_a_misfitted_source_grow_with_its_residual(result):
+    """In proportion, from 5 sigma on; those of the other source, and all values, stay."""
+    base = left_over(result, bump=0)
+    plain = catalogue(base)
+    for bump, factor in ((4.5, 1), (-20, 4), (40, 8)):
+        one = left_over(result, bump=bump)
+        found = catalogue(one)
+        errors = [name for name in found.colnames if "_err" in name and name != "angle_err"]
+        assert len(errors) == 9  # places on the sky and in pixels, size, e1, e2, two fluxes
+        for name in errors:
+            ratio = np.asarray(found[name], float) / np.asarray(plain[name], float)
+            assert ratio[0] == 1 and ratio[1] == pytest.approx(factor, rel=0.03), name
+        for name in ("flux_g", "y_centroid", "size", "e1"):
+            np.testing.assert_array_equal(found[name], plain[name])
+        ratio = channel_covariances(one) / channel_covariances(base)
+        np.testing.assert_array_equal(ratio[0], 1)
+        np.testing.assert_allclose(ratio[1], factor**2, rtol=0.06)
+
+
+def test_errors_grow_with_the_largest_residual_of_all_channels():
+    seen = np.array([[1.0, 4.9], [np.nan, 15.0], [np.nan, np.nan], [10.0, 2.0]])
+    np.testing.assert_allclose(widening(seen), [1, 3, 1, 2])
 
 
 def test_noise_alone_is_not_flagged(result):

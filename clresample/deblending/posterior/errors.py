@@ -30,7 +30,7 @@ class Errors:
         where the morphology has its maximum 1
     released (S, C) [counts], moved (S, 5) [px, px^2]: likewise no errors: what fluxes, and
         centroids and second moments, change by when the bound of morphologies at 0 is released,
-        see bounds.py
+        see bounds.py; second moments of stars stay
     """
 
     flux: np.ndarray

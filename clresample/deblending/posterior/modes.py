@@ -28,9 +28,10 @@ STRUCTURE_PX, WEIGHT, STRENGTH = 2.0, 10.0, 0.05
 # Powers of that strength, over STRENGTH, with which the other scales, the core and the halo of a
 # profile, and Settings.flux_floor go: what is unlike a smooth profile at one scale is so at all.
 # Parametric galaxies have 0.7 to 1.1 and hardly notice; real ones of COSMOS have 2, a quarter of
-# them 3. With 1.5 and 2 the coverage of their sizes is 0.04 lower, and that of fluxes from signal
-# to noise 10 to 100 as well.
-OTHERS, FLOOR = 2.5, 3.0
+# them 3. With OTHERS = 3.5 and HALO = 0.01 their errors are those of 2.5 and 0.02; with 1.5 and
+# 0.02 the coverage of their sizes is 0.04 lower, and that of fluxes from signal to noise 10 to 100
+# as well.
+OTHERS, FLOOR = 3.5, 3.0
 # Unlikeness that counts for these at most: a merger of real galaxies reaches 10, of which the
 # powers would be a floor of half its flux.
 MOST_UNLIKE = 3.0

@@ -145,10 +145,11 @@ class Posterior:
                 for b, j in enumerate(own):
                     block = self.covariance.block(min(i, j), max(i, j))
                     covariance += rows[a] @ (block if i <= j else block.T) @ rows[b].T
-            if s.scene.fixed[own].all():
-                covariance[2:] = covariance[:, 2:] = np.nan
-            out[source] = covariance
             moved[source] = sum(row @ self.released[i] for i, row in zip(own, rows, strict=True))
+            if s.scene.fixed[own].all():  # a star's place was fitted, but no shape
+                covariance[2:] = covariance[:, 2:] = np.nan
+                moved[source, 2:] = 0
+            out[source] = covariance
         return out, moved
 
     def _map(self, i):

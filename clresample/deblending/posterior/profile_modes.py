@@ -14,9 +14,9 @@ from ..profiles import Galaxy, Star
 POSITION_PX = 0.1
 # [peak] Scatter of what is added in proportion to p^2, a core, and to sqrt(p), a halo: how galaxies
 # differ from the family of profiles. Without them the sizes of simulated bright galaxies lie within
-# their errors in 59 % of cases. HALO = 0.05 adds 0.03 to the coverage of sizes, and 0.04 to that of
-# fluxes from signal to noise 100 to 300; twice the CORE adds nothing.
-CORE, HALO = 0.1, 0.02
+# their errors in 59 % of cases. HALO = 0.02 adds 0.02 to the coverage of sizes and 0.025 to that of
+# fluxes above signal to noise 300, which is too much then; twice or half the CORE adds nothing.
+CORE, HALO = 0.1, 0.01
 
 
 # A box ends where its profile is under the noise of a pixel. What lies beyond is followed for half
