@@ -9,6 +9,7 @@ from clresample.deblending.blend import INTERRUPTED
 from clresample.deblending.components import gradients, second
 from clresample.deblending.components.gradients import Asked, gain
 from clresample.deblending.rendered import Rendered
+from clresample.deblending.start.seen import Seen
 from clresample.deblending.start.start import StartingPoint
 from clresample.deblending.view import WhitenedView
 from clresample.sky.sources import Extended, Point
@@ -264,7 +265,7 @@ def test_misfits_are_chi2_of_all_observations(monkeypatch):
         scene=SimpleNamespace(channels=lambda: parts),
         settings=SimpleNamespace(fit_sky=True),
     )
-    seen = SimpleNamespace(observed=observed, spectra=spectra, sky=sky)
+    seen = Seen(spectra, sky, None, tuple(observed), ())
     monkeypatch.setattr(second, "model_of", lambda one: one)
     monkeypatch.setattr(second, "see", lambda models, fit_sky: [seen] * len(models))
     assert second._misfits([fit, fit]) == pytest.approx([wanted, wanted])
