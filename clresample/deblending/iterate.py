@@ -33,9 +33,9 @@ FIRST_EXCHANGE, EXCHANGE = 40, 20
 # fits go on, with 0.2 one in 40, with 0.1 no fewer.
 LEAST_EXCHANGE = 0.2
 # If until the next one the loss has fallen by less than this part of what an Exchange promised, it
-# is made anew, of the scene as it is now; one that was new is given up: bounds hold the scene
+# is made anew, of the scene as it is now. The second one is given up: bounds hold the scene
 # elsewhere, and trials along its steps would be refused.
-LEAST_KEPT = 0.2
+LEAST_KEPT, MOST_MADE = 0.2, 2
 # [iterations] between two adjustments of the boxes to the light they hold; each makes a new batch.
 RESIZE = 40
 
@@ -152,7 +152,7 @@ class _Learning:
     Boxes stay as they are: structure fades at their edges, as the profile does that they follow.
 
     exchanges (B): each fit's Exchange, or None; asked (B, 4): when that was last looked at a fit's
-        rounds and loss, 0 and infinite before, the gain that it promised, and whether it was new
+        rounds and loss, 0 and infinite before, the gain that it promised, and how many were made
     """
 
     def __init__(self, fits, settings, device, dtype, past=None):
@@ -160,7 +160,7 @@ class _Learning:
         if past is None:
             self.exchanges, self.asked = (
                 [None] * len(fits),
-                np.tile([0, np.inf, 0, 1], (len(fits), 1)),
+                np.tile([0, np.inf, 0, 0], (len(fits), 1)),
             )
             scenes, states = [f.scene for f in fits], [f.state for f in fits]
             self.engine = LearnedEngine(
@@ -226,18 +226,18 @@ class _Learning:
         enough; those that have converged then go on."""
         engine, p = self.engine, self.engine.progress
         enough = LEAST_EXCHANGE * self.settings.enough * p.chi2()
-        rounds, loss, promised, fresh = self.asked.T
+        rounds, loss, promised, made = self.asked.T
         there = np.array([e is not None for e in self.exchanges])
         due = p.n_rounds >= np.maximum(rounds + EXCHANGE, FIRST_EXCHANGE)
         fallen = loss - p.loss
         failed = there & (fallen < LEAST_KEPT * promised)
-        old = failed & (fresh == 0)
+        old = failed & (made < MOST_MADE)
         ready = p.converged | (p.live & p.settled & p.looked & due)
         which = which & ready & ((fallen > enough) | old)
         if not which.any() or self.n_steps + PATIENCE >= self.settings.max_iter:
             return  # a fit takes that long to converge again
         new = which & ((rounds == 0) | old)
-        self.asked[which] = np.stack([p.n_rounds, p.loss, 0 * p.loss, new], axis=1)[which]
+        self.asked[which] = np.stack([p.n_rounds, p.loss, 0 * p.loss, made + new], 1)[which]
         for i in np.flatnonzero(which & failed):
             self.exchanges[i] = None
         if new.any():

@@ -59,7 +59,7 @@ def learning(n_rounds, *, live=None, converged=None, failed=None, **settings):
     engine.follow_shifts = lambda moved: engine.followed.append(moved.tolist())
     engine.slopes = lambda which: [f"slopes {i}" for i in range(n)]
     settings = SimpleNamespace(**({"max_iter": 100, "fit_shifts": False, "enough": 0.5} | settings))
-    past = engine, [None] * n, np.tile([0, np.inf, 0, 1], (n, 1))
+    past = engine, [None] * n, np.tile([0, np.inf, 0, 0], (n, 1))
     return room._Learning([Told(c) for c in "abc"[:n]], settings, None, None, past)
 
 
