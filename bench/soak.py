@@ -53,7 +53,8 @@ def disturbed(sky, out, expected, took_s, what, rng):
     status = process.wait()
     while status != 0:
         if status != -signal.SIGKILL:
-            raise RuntimeError(f"exit status {status} after {kills} kills of a {what}")
+            said = process.stderr.read().strip()
+            raise RuntimeError(f"exit status {status} after {kills} kills of a {what}: {said}")
         process = start(sky, out)
         if rng.random() < 0.5:
             kills += kill_at(process, rng.random() * took_s, "run", rng)
