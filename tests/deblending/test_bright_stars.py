@@ -76,7 +76,7 @@ def test_a_right_psf_costs_no_accuracy_and_errors_hold(device):
     away, stated = (np.array(one) for one in zip(*found[0.03], strict=True))
     assert np.median(np.abs(away / stated)) < 1.1  # 0.67 is due
     # beside the star less is known; but the errors follow the structure that each fit finds
-    assert np.median(stated / np.array([error for _, error in found[0]])) > 0.9
+    assert np.median(stated / np.array([error for _, error in found[0]])) > 0.8
 
 
 def test_one_scene_and_many_are_alike(device):

@@ -47,7 +47,7 @@ def test_a_star_in_each_corner_has_its_own_psf(device):
     assert chi2(same) > 1.3
     found, wrong = (_pulls(result) for result in (own, same))
     assert np.abs(found).max() < 4
-    assert np.abs(wrong).max() > 20
+    assert np.abs(wrong).max() > 10  # of errors that have grown with what is left of the stars
 
 
 @pytest.mark.parametrize(
