@@ -135,7 +135,7 @@ def test_a_source_far_from_any_light_is_warned_about(device):
     b = wide_blend(Extended(position_px=(90, 95)), Point(position_px=(100, 20)))
     with pytest.warns(SourceWarning, match="2 sources lie far from any light: see") as caught:
         result = fit(b, device, settings=SHORT)
-    assert len(caught) == 1
+    assert [w.category for w in caught].count(SourceWarning) == 1  # compilers may say more
     assert [m.split(" lies")[0] for m in result.messages] == [
         "source 2 at (y, x) = (90.0, 95.0) [px] in the model frame",
         "source 3 at (y, x) = (100.0, 20.0) [px] in the model frame",
