@@ -158,10 +158,8 @@ class _Learning:
     def __init__(self, fits, settings, device, dtype, past=None):
         self.fits, self.settings, self.device, self.dtype = list(fits), settings, device, dtype
         if past is None:
-            self.exchanges, self.asked = (
-                [None] * len(fits),
-                np.tile([0, np.inf, 0, 0], (len(fits), 1)),
-            )
+            self.exchanges = [None] * len(fits)
+            self.asked = np.tile([0, np.inf, 0, 0], (len(fits), 1))
             scenes, states = [f.scene for f in fits], [f.state for f in fits]
             self.engine = LearnedEngine(
                 scenes, states, device, dtype, settings.prior, settings.enough
@@ -236,7 +234,7 @@ class _Learning:
         which = which & ready & ((fallen > enough) | old)
         if not which.any() or self.n_steps + PATIENCE >= self.settings.max_iter:
             return  # a fit takes that long to converge again
-        new = which & ((rounds == 0) | old)
+        new = which & ((made == 0) | old)
         self.asked[which] = np.stack([p.n_rounds, p.loss, 0 * p.loss, made + new], 1)[which]
         for i in np.flatnonzero(which & failed):
             self.exchanges[i] = None
@@ -247,7 +245,9 @@ class _Learning:
                 with contextlib.suppress(np.linalg.LinAlgError):
                     self.exchanges[i] = exchange_of(self.fits[i], *given)
         slopes, steps = engine.slopes(which), {}
-        for i in np.flatnonzero(which & np.array([e is not None for e in self.exchanges])):
+        for i in np.flatnonzero(which):
+            if self.exchanges[i] is None:
+                continue
             step, gain = _promise(self.exchanges[i], slopes[i])
             if step is None:
                 self.exchanges[i] = None
