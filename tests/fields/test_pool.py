@@ -1,5 +1,6 @@
 """Worker processes: tasks that fail, hang or are killed cost themselves at most."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -68,6 +69,31 @@ def test_again_replaces_a_failed_task(tmp_path):
     assert set(found) == {"die once", "a", "b", "die"}
     assert found["die once"].value == "DIE ONCE"
     assert found["die"].value is None
+
+
+def whose(folder, task):
+    """Which process has it."""
+    return os.getpid()
+
+
+def test_all_workers_begin_before_they_are_asked(tmp_path):
+    with Pool(2) as pool:
+        pool.begin(whose)
+        begun = {child.pid for child in multiprocessing.active_children()}
+        found = [o.value for o in pool.run(whose, [str(tmp_path)], ["a"])]
+        assert len(begun) == 2 and found[0] in begun
+        pool.begin(whose)  # those that are there stay
+        assert begun == {child.pid for child in multiprocessing.active_children()}
+
+
+def test_a_worker_that_dies_before_it_is_asked_is_replaced(tmp_path):
+    with Pool(1) as pool:
+        pool.begin(whose)
+        (first,) = multiprocessing.active_children()
+        first.kill()
+        first.join()
+        (outcome,) = pool.run(whose, [str(tmp_path)], ["a"])
+        assert outcome.reason is None and outcome.value != first.pid
 
 
 def on_device(device, task):

@@ -88,6 +88,9 @@ class Cluster:
         """Leave the cluster as it is."""
         self.client.close()
 
+    def begin(self, work):
+        """The workers run already."""
+
     def run(self, work, context, tasks, again=None, stage=""):
         """Yield the Outcome of every task, as `Pool.run` does.
 

@@ -59,6 +59,10 @@ class Processes:
         n = -(-max(self.n_workers, 1) // len(self.devices))
         return [(device, n) for device in self.devices]
 
+    def begin(self, work):
+        """Begin the processes now, and have them load what the work needs."""
+        self.pool.begin(work)
+
     def run(self, work, context, tasks, again=None, stage=""):
         """Yield the Outcome of every task, as `Pool.run` does."""
         contexts = [replace(context, device=device) for device in self.devices]

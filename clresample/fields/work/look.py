@@ -51,6 +51,7 @@ def take_look(mosaics, reference, work, engine):
         tried.append(outcome)
         return [outcome.task] if outcome.worker_died and len(tried) < 2 else None
 
+    engine.begin(LOOK)  # one worker looks, the others load meanwhile what their tiles need
     field = _Field(mosaics, reference, work)
     for outcome in engine.run(LOOK, field, [engine.sharing], again=again, stage="search"):
         if outcome.reason is not None:

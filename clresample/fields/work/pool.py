@@ -79,6 +79,14 @@ class Pool:
         while self._workers:
             _end(self._workers.pop())
 
+    def begin(self, function):
+        """Begin every worker now, and have it load what the function needs, before it is asked."""
+        for seat in sorted(self._faults.keys() - {w.seat for w in self._workers}):
+            worker = self._start(seat)
+            self._workers.append(worker)
+            with contextlib.suppress(OSError):  # it has died: its successor loads what it is given
+                worker.pipe.send((function, None))
+
     def run(self, function, contexts, tasks, again=None):
         """Yield the Outcome of every task, as they end.
 
