@@ -17,7 +17,7 @@ from clresample.fields.mosaic import FilePlane
 from clresample.fields.options import Progress
 from clresample.fields.run import run_field
 from clresample.fields.work import fitting, look
-from clresample.files.whole_file import FileError
+from clresample.files.whole_file import HOST, FileError
 
 
 def table(folder, name="catalogue"):
@@ -133,7 +133,12 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(done, sky, tmp_path):
     other = FieldOptions(threshold=6.0)
     with pytest.raises(FileError, match=r"another threshold, 5.0 and not 6.0"):
         run_field(mosaics, tmp_path, options=other, resume=True)
+    n_most = 1 << 22  # numbers of processes lie below
+    left = tmp_path / "work" / f".part-{HOST}-{n_most}-0a" / "fit-x.fits"  # killed as it wrote
+    left.parent.mkdir()
+    left.write_bytes(parts[0].read_bytes()[:100])
     run_field(mosaics, tmp_path, resume=True)
+    assert not left.parent.exists()
     assert parts[0].stat().st_mtime_ns == before  # what was done is not done again
     for name in ("catalogue.fits", "catalogue.ecsv", "models.fits", "residual_Euclid.fits"):
         assert (tmp_path / name).read_bytes() == (folder / name).read_bytes(), name

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...files.whole_file import FileError, whole_file
+from ...files.whole_file import FileError, sweep, whole_file
 
 WORK = "work"  # folder of the parts inside the output folder
 
@@ -37,8 +37,7 @@ def open_folder(folder, mosaics, reference, options, resume, overwrite, progress
                 f"{mine[other[0]]!r}: --overwrite forgets it"
             )
         progress.say(f"going on with the run in {folder}")
-        for left in work.glob(".part-*"):
-            left.unlink()
+        sweep(work)  # files in the midst of which it was killed
         return work, replace(options, memory=before["memory"])
     try:
         work.mkdir(parents=True, exist_ok=True)
