@@ -8,6 +8,8 @@ tile       one tile of Euclid's compressed image is damaged; the run is killed o
            every source on it must have a reason, or its tile of the search be reported
 memory     the device has a tenth of this machine's memory, and a worker process a gigabyte at most.
            Fits share other batches then: the same sources, their fluxes within NEAR of its errors
+write      the run is killed whenever one more of its files is being written, until WRITES of them
+           were left unfinished. The catalogue must be the same
 hang       a worker is stopped (SIGSTOP) and never goes on. The catalogue must be the same
 """
 
@@ -36,6 +38,8 @@ from .harness.options import ROOT
 LOOK_S = 0.02
 NEAR = 0.1  # [errors] of a flux: what batches of other sizes change is under a hundredth
 FIRST_ROOM = 128 << 10  # [bytes] of the file system that fills up
+WRITES = 5  # unfinished files, each of which the next run must clear away
+SOON_S = 1e-3  # [s] between two looks for a file that is being written, which takes some ms
 HANGS_S = 30.0  # [s] after which a worker is taken to hang
 SMALL = {"POCL_MEMORY_LIMIT": str(max(1, os.sysconf("SC_PHYS_PAGES") * 4096 // 10 >> 30))}
 # [px] A field of six compressed tiles of Euclid's image, of which the last is damaged. The search's
@@ -209,6 +213,36 @@ def small_device(sky, out, whole, took_s):
     return row_of(good, same_bytes(out, whole), about)
 
 
+def unfinished(out):
+    """Whether a run writes a file, or has left one as it was killed."""
+    return any((out / "work").glob(".part-*"))
+
+
+def finished(out):
+    """Files of a run that are whole."""
+    return sum(path.is_file() for path in (out / "work").glob("*"))
+
+
+def killed_writing(sky, out, whole, took_s):
+    """A run that is killed while it writes, again and again."""
+    process, kills, left, parts, whole_files = start(sky, out), 0, 0, 0, 0
+    while process.poll() is None:
+        if left < WRITES and unfinished(out) and finished(out) > whole_files:
+            process.kill()
+            process.wait()
+            kills, left = kills + 1, left + unfinished(out)
+            parts, whole_files = parts_in(out), finished(out)
+            process = start(sky, out)
+        time.sleep(SOON_S)
+    if process.returncode != 0:
+        said = process.stderr.read().strip()
+        return row_of(False, False, f"exit status {process.returncode}: {said[-80:]}", kills)
+    same = same_bytes(out, whole)
+    about = f"{left} files were left unfinished"
+    good = same and left > 0 and not unfinished(out)
+    return row_of(good, same, about, kills, parts)
+
+
 def hanging(sky, out, whole, took_s):
     """A run one of whose workers stops and never goes on."""
     process = start(sky, out, "--limit", max(HANGS_S, 2 * took_s))
@@ -220,4 +254,10 @@ def hanging(sky, out, whole, took_s):
     return row_of(same, same, about, int(stopped), parts, 0.5)
 
 
-FAULTS = {"disk": full_disk, "tile": damaged_tile, "memory": small_device, "hang": hanging}
+FAULTS = {
+    "disk": full_disk,
+    "tile": damaged_tile,
+    "memory": small_device,
+    "write": killed_writing,
+    "hang": hanging,
+}

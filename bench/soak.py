@@ -4,10 +4,11 @@
 
 A small simulated field is run once undisturbed. Then, each time in a new folder, the command or one
 of its workers is killed (SIGKILL) at a random moment; a run that was killed is resumed, and killed
-again with one chance in two. Four more runs follow, see bench/faults.py. At the end the catalogue
+again with one chance in two. Five more runs follow, see bench/faults.py. At the end the catalogue
 must be the undisturbed one, byte for byte, or what `good` says of a run that must differ.
 
-what       "run" or "worker": what was killed; "disk", "tile", "memory", "hang": see bench/faults.py
+what       "run" or "worker": what was killed; "disk", "tile", "memory", "write", "hang": see
+           bench/faults.py
 at         when, as part of the undisturbed run's time
 kills      how often it was killed, or was ended by what it met
 parts      groups of fits that were on disk when that came

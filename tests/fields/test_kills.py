@@ -14,7 +14,7 @@ def test_disturbed_runs_end_with_the_same_catalogue():
     pytest.importorskip("sep")
     from bench.soak import soak
 
-    rows = list(soak(2, 3, ("disk", "tile")))
-    assert [row["what"] for row in rows] == ["run", "worker", "disk", "tile"]
+    rows = list(soak(2, 3, ("disk", "tile", "write")))
+    assert [row["what"] for row in rows] == ["run", "worker", "disk", "tile", "write"]
     assert sum(row["kills"] for row in rows[:2]) >= 1  # a moment may come after the end
     assert all(row["good"] for row in rows), rows
