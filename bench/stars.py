@@ -26,7 +26,18 @@ import warnings
 import numpy as np
 from tqdm import tqdm
 
-from clresample import PSF, Extended, Frame, Grid, Observation, Point, Resampler, Settings, fluxes
+from clresample import (
+    PSF,
+    Extended,
+    Frame,
+    Grid,
+    Observation,
+    Point,
+    Resampler,
+    Settings,
+    fluxes,
+    get_device,
+)
 from clresample.deblending.blend import Blend
 from clresample.deblending.profiles import moment, point, profile
 from clresample.simulation.sdr import sdr
@@ -110,7 +121,8 @@ def make_scene(seed, psf, snr):
     for i, instrument in enumerate(INSTRUMENTS):
         grid, channels, model = instrument[0], instrument[-1], INSTRUMENTS[0][0]
         true = psf_of(instrument, *PSFS[psf])
-        units = Resampler(model, MODEL_PSF, grid, true, dtype=np.float64).render(np.array(images))
+        dtype = np.float64 if get_device().has_fp64 else np.float32
+        units = Resampler(model, MODEL_PSF, grid, true, dtype=dtype).render(np.array(images))
         flux = snrs[:, None] / np.sqrt((units**2).sum(axis=(2, 3)))
         flux *= rng.uniform(0.6, 1.4, flux.shape)
         data = np.einsum("sc,scyx->cyx", flux, units) + rng.normal(size=units.shape[1:])
