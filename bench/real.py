@@ -39,8 +39,8 @@ from scipy.ndimage import gaussian_filter
 
 from clresample import PSF, Extended, Flag, Grid, Observation, catalogue, deblend, summary
 from clresample.cli.command import main as clresample
+from clresample.deblending.posterior.residuals import worst_residuals
 from clresample.files.results import read_result
-from clresample.measurement.residuals import worst_residuals
 from clresample.simulation.galaxies import import_galsim, open_catalogue
 
 from .harness import records

@@ -10,7 +10,7 @@ import numpy as np
 from ..resampling.transfer import noise_warnings
 from ..sky.frame import Frame
 from .blend import INTERRUPTED
-from .posterior.posterior import errors_of
+from .posterior.posterior import with_errors
 from .rendered import Rendered
 from .result import Component, Result
 from .solver.learned.engine import vector_bytes
@@ -168,8 +168,7 @@ class Fit:
         ]
         rendered = _rendered(self, seen)
         self.seconds["result"] += time.perf_counter() - began
-        errors, draws = errors_of(self, components, peaks, seen)
-        return Result(
+        result = Result(
             observations=self.blend.observations,
             frame=self.frame,
             sources=self.sources,
@@ -177,14 +176,13 @@ class Fit:
             rendered=rendered,
             sky=seen.sky * self.unit,
             covariance=seen.covariance * self.unit[:, None, None] ** 2,
-            errors=errors,
-            draws=draws,
             shifts=self.shifts,
             losses=np.array(self.losses),
             status=self.status,
             messages=tuple(self.messages),
             seconds=self.seconds,
         )
+        return with_errors(self, result, peaks, seen)
 
 
 def begin(fits):

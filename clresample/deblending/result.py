@@ -157,10 +157,12 @@ class Result(ShownResult):
 
         rng: NumPy Generator. Morphologies and spectra below 0 become 0, so that faint sources are
         brighter in the mean, and where a morphology is at that bound it stays there; morphologies
-        keep their scale, their maximum is no longer 1. Fluxes scatter about the components' own,
-        not about those of `fluxes` and the catalogue, from which Errors.released was taken.
-        Settings.flux_floor is not in them, nor is what lies beyond the boxes, which makes fluxes of
-        faint sources scatter by up to a tenth less than `errors` has it.
+        keep their scale, their maximum is no longer 1. Misfitted sources scatter more, as Errors
+        has it. Fluxes scatter about the components' own, not about those of `fluxes` and the
+        catalogue, from which Errors.released was taken. Settings.flux_floor is not in them, nor is
+        what lies beyond the boxes, which makes fluxes of faint sources scatter by up to a tenth
+        less than `errors` has it. The bound at 0 takes more of it from misfitted sources that stand
+        where light was missed, up to 0.4: their changes are as large as their morphologies.
 
         Raises ValueError for results without draws: of other priors, without errors, or read from
         a file.

@@ -25,13 +25,13 @@ from .fits import add_provenance, celestial_header, open_fits, write_hdus
 from .names import check_channels, to_ascii
 from .whole_file import FileError, check_output, whole_file
 
-FORMAT = 1  # of the files; raised when an older reader would misread them
+FORMAT = 2  # of the files; raised when an older reader would misread them
 KINDS = {kind.__name__: kind for kind in (Source, Point, Extended)}
 KEPT = ("name", "channels", "zero_points", "n_bad", "messages")  # of an observation, as JSON
 BOX = ("source", "y", "x", "n_y", "n_x")
 # HDUs of Errors
 ERRORS = {"FLUXCOV": "flux", "COLOURCOV": "colour", "MOMENTCOV": "moments", "BEYOND": "beyond"}
-ERRORS |= {"RELEASED": "released", "MOVED": "moved"}
+ERRORS |= {"RELEASED": "released", "MOVED": "moved", "RESIDUALMAX": "residuals"}
 ARRAYS = ("sky", "covariance", "shifts", "losses")
 # every WCS card with the 17 digits that give back the same float64
 RELAX = WCSHDO_all | WCSHDO_SIP | WCSHDO_P17 | WCSHDO_EFMT
@@ -42,11 +42,12 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
 
     HDUs that `read_result` reads: ABOUT (keys and JSON: sources, names, status, messages, ...),
     COMPONENTS (boxes), SPECTRA (n, C), MORPHOLOGIES (one after the other), SKY, COVARIANCE, SHIFTS,
-    LOSSES, where the result has errors FLUXCOV, COLOURCOV, MOMENTCOV, BEYOND, RELEASED, MOVED and
-    MORPHOLOGYERR (one after the other), MODELPSF, and per observation from 1 on: DATA, WEIGHTS,
-    PSF, RENDERED. For other programs: CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all sources in the
-    model frame, and per observation MODEL and RESIDUAL, 0 where data have no weight. All images
-    have their WCS; a flat sky is put at RA = Dec = 0. For NaN and infinity see arrays.py.
+    LOSSES, where the result has errors FLUXCOV, COLOURCOV, MOMENTCOV, BEYOND, RELEASED, MOVED,
+    RESIDUALMAX and MORPHOLOGYERR (one after the other), MODELPSF, and per observation from 1 on:
+    DATA, WEIGHTS, PSF, RENDERED. For other programs: CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all
+    sources in the model frame, and per observation MODEL and RESIDUAL, 0 where data have no weight.
+    All images have their WCS; a flat sky is put at RA = Dec = 0. For NaN and infinity see
+    arrays.py.
 
     result: of `deblend`; overwrite: replace a file that exists
     device: name of the OpenCL device; inputs: {what: file}; both for the header
@@ -124,7 +125,9 @@ def read_result(path) -> Result:
     for PSFs that vary (Observation.psf_field), which files do not hold: psf is that in the middle,
     `rendered` what each source's own made of it.
 
-    Raises FileError for a file that does not exist, is not FITS, is damaged, or holds no blend.
+    Raises FileError for a file that does not exist, is not FITS, is damaged, or holds no blend, and
+    for errors of format 1: they were not widened for misfitted sources, and may lack what the bound
+    of morphologies adds to fluxes, without which the catalogue would be another one.
     """
     with open_fits(path) as hdus:
         if "ABOUT" not in hdus or "COMPONENTS" not in hdus:
@@ -148,7 +151,7 @@ def read_result(path) -> Result:
             status=about["status"],
             messages=tuple(about["messages"]),
             seconds=about["seconds"],
-            errors=_errors(hdus),
+            errors=_errors(path, hdus, about["format"]),
             **{key: array_of(hdus[key.upper()]) for key in ARRAYS},
         )
 
@@ -270,9 +273,11 @@ def _source(path, *, kind, **given):
     return KINDS[kind](**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})
 
 
-def _errors(hdus):
+def _errors(path, hdus, written):
     if "MORPHOLOGYERR" not in hdus:
         return None
+    if written < FORMAT:
+        raise FileError(f"{path}: has errors of format {written}, not {FORMAT}; fit it again")
     flat, maps = array_of(hdus["MORPHOLOGYERR"]), []
     for row in hdus["COMPONENTS"].data:
         shape = int(row["n_y"]), int(row["n_x"])

@@ -9,13 +9,13 @@ import numpy as np
 from astropy import units as u
 from astropy.table import QTable
 
+from ..deblending.posterior.residuals import channel_residuals, misfits
 from ..sky.footprint import open_edge
 from ..sky.observation import ZERO_POINT_UJY
 from ..sky.wcs import frame_of, local_axes, names_of
 from .columns import Columns
 from .photometry import channel_covariances, flux_scale, fluxes
 from .quality import box_chi2, fitted_sources, labels, masked_cores
-from .residuals import channel_residuals, misfits, widening
 from .shapes import moments, shape, shape_slopes
 
 # of a morphology's peak: light at the edge of what was seen is flagged when it is brighter. Fainter
@@ -78,7 +78,7 @@ def catalogue(result, *, magnitudes=False) -> QTable:
         *_centroid_err, size_err, e1_err, e2_err, angle_err: errors in the units of the values, to
             first order; ra's in degrees of ra, angle_err at most 52 deg, that of an unknown angle.
             NaN where the result has no Errors, and where the shape was not fitted, as stars'. They,
-            and those of fluxes, are larger for misfitted sources, see `residuals.widening`
+            and those of fluxes, are larger for misfitted sources, see `Errors`
         flux_*, flux_err_* per channel [uJy where observations have zero points, else counts]: see
             `fluxes`
         mag_*, mag_err_* per channel [mag, AB]: where the flux is positive
@@ -98,7 +98,7 @@ def catalogue(result, *, magnitudes=False) -> QTable:
 def columns_of(result, *, magnitudes=False) -> Columns:
     """The same as `catalogue`, before it is a table."""
     worst = channel_residuals(result)
-    flux, covariance = fluxes(result, worst)
+    flux, covariance = fluxes(result)
     error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).T)  # (S, C)
     table = Columns()
     table.put("name", [s.name or str(i) for i, s in enumerate(result.sources)])
@@ -110,7 +110,7 @@ def columns_of(result, *, magnitudes=False) -> Columns:
         snr = np.sqrt(np.nansum((flux / error) ** 2, axis=1))
     table.put("snr", np.where(fitted_sources(result), snr, np.nan))
     table.put("n_components", _counts(result))
-    _add_shapes(table, result, error, widening(worst))
+    _add_shapes(table, result, error)
     scale, unit = flux_scale(result)
     for i, channel in enumerate(result.channels):
         table.put(f"flux_{channel}", flux[:, i] * scale[i], unit[i])
@@ -118,7 +118,7 @@ def columns_of(result, *, magnitudes=False) -> Columns:
         if magnitudes and unit[i] == u.uJy:
             _add_magnitudes(table, channel, flux[:, i] * scale[i], error[:, i] * scale[i])
     if magnitudes:
-        _add_colours(table, result, flux, worst)
+        _add_colours(table, result, flux)
     for i, label in enumerate(labels(result)):
         table.put(f"chi2_{label}", box_chi2(result, i, result.footprints[i]))
     for channel, values in zip(result.channels, worst.T, strict=True):
@@ -146,9 +146,8 @@ def add_positions(table, grid, positions, suffix):
         table.put(name + suffix, values, u.pix)
 
 
-def _add_shapes(table, result, error, wide):
-    """Columns of centroids and second moments, (S, C) errors weighting a source's channels; wide
-    (S,): factors of errors."""
+def _add_shapes(table, result, error):
+    """Columns of centroids and second moments, (S, C) errors weighting a source's channels."""
     n_sources = len(result.sources)
     centroids, sizes = np.full((n_sources, 2), np.nan), np.full((n_sources, 4), np.nan)
     shape_errors = sizes.copy()
@@ -167,9 +166,9 @@ def _add_shapes(table, result, error, wide):
             sizes[s] = shape(axes @ second @ axes.T)
             if result.errors is not None:
                 moved = shape_slopes(second, axes)
-                shape_errors[s] = wide[s] * _scatter(moved, result.errors.moments[s, 2:, 2:])
+                shape_errors[s] = _scatter(moved, result.errors.moments[s, 2:, 2:])
     add_positions(table, result.frame.grid, centroids, "_centroid")
-    _add_position_errors(table, result, centroids, wide)
+    _add_position_errors(table, result, centroids)
     shape_errors[:, 3] = np.minimum(shape_errors[:, 3], UNKNOWN_ANGLE_DEG)
     for i, (name, unit) in enumerate(SHAPE_UNITS.items()):
         table.put(name, sizes[:, i], unit)
@@ -191,14 +190,13 @@ def _scatter(slopes, covariance):
     return np.sqrt(np.einsum("nk,kl,nl->n", slopes, covariance, slopes))
 
 
-def _add_position_errors(table, result, centroids, wide):
-    """Columns of the errors of the fitted light's centroids (S, 2) [model px]; wide (S,): factors
-    of errors."""
+def _add_position_errors(table, result, centroids):
+    """Columns of the errors of the fitted light's centroids (S, 2) [model px]."""
     grid = result.frame.grid
     names = ("y_sky", "x_sky") if grid.is_flat else list(table.values)[1:3]
     on_sky, errors = np.full((2, *centroids.shape), np.nan)
     for s in np.flatnonzero(np.isfinite(centroids).all(1) & (result.errors is not None)):
-        covariance = wide[s] ** 2 * result.errors.moments[s, :2, :2]
+        covariance = result.errors.moments[s, :2, :2]
         n, m = centroids[s, :, None] + [[0.5, -0.5, 0, 0], [0, 0, 0.5, -0.5]]
         sky = np.array(grid.sky(n, m))
         steps = np.stack([sky[:, 0] - sky[:, 1], sky[:, 2] - sky[:, 3]], axis=1)
@@ -219,9 +217,9 @@ def _add_magnitudes(table, channel, flux_ujy, error_ujy):
     table.put(f"mag_err_{channel}", 2.5 / np.log(10) * error_ujy / flux_ujy, u.mag)
 
 
-def _add_colours(table, result, flux, residuals):
-    """Columns of colours of neighbouring channels that have magnitudes; flux, residuals (S, C)."""
-    covariance, names = channel_covariances(result, residuals), result.channels
+def _add_colours(table, result, flux):
+    """Columns of colours of neighbouring channels that have magnitudes; flux (S, C)."""
+    covariance, names = channel_covariances(result), result.channels
     for i, (a, b) in enumerate(pairwise(names)):
         if f"mag_{a}" not in table or f"mag_{b}" not in table:
             continue

@@ -6,14 +6,13 @@ import numpy as np
 from astropy import units as u
 
 from .quality import fitted_sources
-from .residuals import channel_residuals, widening
 
 # of a channel's brightest model pixel: where all models are fainter, a pixel is shared by none.
 # There the rounding of float32 renderings (1e-6), not light, would decide whose it is
 TRACE = 1e-5
 
 
-def fluxes(result, residuals=None):
+def fluxes(result):
     """Fluxes of all sources and their covariances, from the full normal matrix.
 
         F_s = sum_i A_i |S_i|,  cov(F_s, F_t) = sum_ij |S_i| cov(A_i, A_j) |S_j|,  |S| = sum of S
@@ -22,11 +21,9 @@ def fluxes(result, residuals=None):
     covariances are theirs, marginal over morphologies, and |S| has what the smooth profile holds
     beyond its box, where it is under the noise: a percent of the flux at signal to noise 10. And
     F is without what the bound of morphologies at 0 adds to it, 0.1 to 1 % of bright galaxies,
-    see `Errors.released`; it may be below 0 by chance. Errors of misfitted sources are larger, see
-    `residuals.widening`.
+    see `Errors.released`; it may be below 0 by chance.
 
     result: a fitted blend
-    residuals (S, C): its `channel_residuals`; None: they are worked out where they are needed
     returns flux (S, C) [counts]: NaN for a source without components; covariance (C, S, S)
         [counts^2]: the variance is infinite where a channel does not determine a flux, and for
         sources without components
@@ -45,8 +42,7 @@ def fluxes(result, residuals=None):
     if result.errors is None:
         summed = sums @ np.where(both, result.covariance, 0.0) @ sums.T
     else:
-        wide = widening(channel_residuals(result) if residuals is None else residuals)
-        summed = result.errors.flux * wide[:, None] * wide
+        summed = result.errors.flux.copy()
     # a component that is zero everywhere adds no flux, and no variance even where it is unknown
     lost = (~known) @ (sums != 0).T | ~fitted_sources(result)
     i_channel, i_source = np.nonzero(lost)
@@ -55,24 +51,18 @@ def fluxes(result, residuals=None):
     return flux, summed
 
 
-def channel_covariances(result, residuals=None):
+def channel_covariances(result):
     """Covariances (S, C, C) [counts^2] of each source's fluxes between channels.
 
     Morphologies that are not known move the fluxes of all channels together, so that colours are
     known better than fluxes. Without Errors channels are independent. Settings.flux_floor is in it
-    as common to all channels. The variance is infinite as in `fluxes`, and larger for misfitted
-    sources.
-
-    residuals: as in `fluxes`
+    as common to all channels. The variance is infinite as in `fluxes`.
     """
-    if residuals is None and result.errors is not None:
-        residuals = channel_residuals(result)
-    variance = np.diagonal(fluxes(result, residuals)[1], axis1=1, axis2=2).T  # (S, C)
+    variance = np.diagonal(fluxes(result)[1], axis1=1, axis2=2).T  # (S, C)
     found = np.zeros((*variance.shape, variance.shape[1]))
     if result.errors is not None:
         both = np.isfinite(variance)[:, :, None] & np.isfinite(variance)[:, None, :]
-        wide = widening(residuals)[:, None, None]
-        found = np.where(both, result.errors.colour, 0.0) * wide**2
+        found = np.where(both, result.errors.colour, 0.0)
     i = np.arange(variance.shape[1])
     found[:, i, i] = variance
     return found

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..deblending.posterior.residuals import channel_residuals, misfits, pixels_in_boxes
 from ..sky.sources import Point
-from .residuals import channel_residuals, misfits, pixels_in_boxes
 
 # [px] from a pixel's centre to its corners
 PIXEL_RADIUS = 0.5**0.5

@@ -20,6 +20,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from ..deblending.posterior.residuals import TOGETHER_PX
 from ..sky.noise import sigma_below_zero
 
 # [arcsec] Standard deviations of G: of points, of galaxies of the usual size in deep images (half
@@ -34,9 +35,6 @@ NO_WEIGHT = 1e-5
 SAME_PX = 1e-3  # by which pixels of the model may lie beside observed ones and count as the same
 # [sigma^2] Sum of squares up to which its significance is tabulated; above, both grow alike
 TABLE_END, TABLE_STEP = 400.0, 0.25
-# [px] Images of several channels that are transformed at once: those of blends, for which each call
-# costs as much as its arithmetic. More would only take memory: a tile's channels go one by one.
-TOGETHER_PX = 1 << 17
 
 
 @dataclass(frozen=True, eq=False)

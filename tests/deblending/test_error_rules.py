@@ -257,35 +257,35 @@ def slopes(function, n, step=1e-5):
 
 def test_errors_follow_from_the_covariance_of_all_unknowns():
     """Fluxes, colours, shapes and maps, by finite differences; in counts; with the floor, which
-    grows with the cube of a component's structure."""
+    grows with the cube of a component's structure; three times as large at 15 sigma."""
     made, covariance = made_up(np.random.default_rng(0))
-    n, unit, floor = len(covariance), np.array([10.0, 3.0]), 0.02
-    errors = made.errors(OWNER, 2, unit, floor)
+    n, unit, wide, floor = len(covariance), np.array([10.0, 3.0]), np.array([1, 3]), 0.02
+    errors = made.errors(OWNER, np.array([[1.0, np.nan], [15.0, 3.0]]), unit, floor)
     by = slopes(lambda v: fluxes(made, v).ravel(), n)  # (S C, n)
     full = (by @ covariance @ by.T).reshape(2, 2, 2, 2)
     released = np.concatenate(made.released[:3])
-    wanted = (by @ released).reshape(2, 2) * unit
-    np.testing.assert_allclose(errors.released, wanted, rtol=1e-6)
+    np.testing.assert_allclose(errors.released, (by @ released).reshape(2, 2) * unit, rtol=1e-6)
     own = np.zeros((2, 2))
     for i, (morph, far, spectrum) in enumerate(shifted(made, np.zeros(n))):
         own[OWNER[i]] += floor * (1.0 + i) ** 3 * spectrum * (morph.sum() + far[0])
     for c in range(2):
-        wanted = full[:, c, :, c] + np.diag(own[:, c] ** 2)
+        wanted = (full[:, c, :, c] + np.diag(own[:, c] ** 2)) * np.outer(wide, wide)
         np.testing.assert_allclose(errors.flux[c], wanted * unit[c] ** 2, rtol=1e-5)
     for s in range(2):
         wanted = full[s, :, s] + np.outer(own[s], own[s])
-        np.testing.assert_allclose(errors.colour[s], wanted * np.outer(unit, unit), rtol=1e-5)
+        scale = np.outer(unit, unit) * wide[s] ** 2
+        np.testing.assert_allclose(errors.colour[s], wanted * scale, rtol=1e-5)
         weight = 1 / np.sqrt(np.diag(wanted))
         by = slopes(lambda v, s=s, w=weight: shapes(made, v, s, w), n)
         if s == 1:  # the other has no mode: nothing is known of its shape's error
-            np.testing.assert_allclose(errors.moments[s], by @ covariance @ by.T, rtol=1e-4)
+            np.testing.assert_allclose(errors.moments[s], 9 * by @ covariance @ by.T, rtol=1e-4)
             np.testing.assert_allclose(errors.moved[s], by @ released, rtol=1e-4)
     assert np.isnan(errors.moments[0]).all() and not errors.moved[0].any()
     ends = np.cumsum([0, *made.layout.sizes])
     for i, modes in enumerate(made.modes):
         block = covariance[ends[i] : ends[i] + len(modes), ends[i] : ends[i] + len(modes)]
         wanted = np.sqrt(np.einsum("kyx,kl,lyx->yx", modes, block, modes))
-        np.testing.assert_allclose(errors.morphology[i], wanted, rtol=1e-5)
+        np.testing.assert_allclose(errors.morphology[i], wide[OWNER[i]] * wanted, rtol=1e-5)
     np.testing.assert_array_equal(errors.beyond, [far.sums for far in made.beyond])
 
 
@@ -293,7 +293,7 @@ def test_second_moments_of_stars_have_no_error_and_are_not_released():
     """Their places have, and are; a source with one free component has both."""
     for fixed, known in (((0, 2), False), ((0,), True)):
         made, _ = made_up(np.random.default_rng(1), fixed=fixed, n_common=0)
-        errors = made.errors(OWNER, 2, np.ones(2), 0.0)
+        errors = made.errors(OWNER, np.zeros((2, 2)), np.ones(2), 0.0)
         found, moved = errors.moments[1], errors.moved[1]
         assert np.isfinite(found[:2, :2]).all() and np.isfinite(found[2:, 2:]).all() == known
         assert np.isnan(found[:2, 2:]).all() != known

@@ -13,10 +13,13 @@ from clresample.deblending.posterior import exposure
 from clresample.deblending.posterior.moments import moments_of
 from clresample.deblending.settings import Settings
 from clresample.deblending.solver.prior import Prior
+from clresample.files import results as store
 from clresample.files.results import read_result, write_result
-from clresample.measurement.catalogue import catalogue
+from clresample.files.whole_file import FileError
+from clresample.measurement.catalogue import Flag, catalogue
 from clresample.measurement.photometry import fluxes
 from clresample.measurement.shapes import moments
+from clresample.sky.observation import Observation
 from clresample.sky.sources import Extended, Point
 
 ALONE = (((14.3, 17.6), (60, 40, 80), 2.0),)
@@ -110,6 +113,28 @@ def test_draws_scatter_as_the_errors_say(fitted):
     assert len(fitted.sample(0, rng)) == 0
 
 
+def test_draws_of_misfitted_sources_scatter_as_the_catalogue_says(fitted, device):
+    """Two pixels that no model follows, as those that a cosmic ray hits, one on each galaxy."""
+    b = blend(BRIGHT)
+    sharp, other = b.observations
+    data = sharp.data.copy()
+    data[0, 15, 14] -= 1.25
+    data[0, 19, 24] += 2.0
+    hit = Observation(data, sharp.psf, sharp.grid, weights=sharp.weights, channels=("v",))
+    result = deblend([hit, other], b.sources, frame=b.frame, device=device, settings=BARE)
+    found = {}
+    for name, one in (("well fitted", fitted), ("misfitted", result)):
+        table = catalogue(one)
+        error = np.stack([np.asarray(table[f"flux_err_{c}"]) for c in "vgr"], axis=1)
+        drawn = one.sample(500, np.random.default_rng(0))
+        found[name] = np.std([[c.flux for c in parts] for parts in drawn], axis=0) / error
+        flagged = table["flags"] & Flag.MISFIT != 0
+        assert flagged.all() if name == "misfitted" else not flagged.any()
+        assert (table["residual_v"] > 9).all() == (name == "misfitted")
+    np.testing.assert_allclose(found["misfitted"], found["well fitted"], rtol=0.2)
+    assert (found["misfitted"] > 0.7).all() and (found["misfitted"] < 1.1).all()
+
+
 def test_errors_hold_the_truth(device):
     """68 % of what is measured on 30 scenes of other noise: a smoke test, of 180 fluxes.
 
@@ -196,7 +221,7 @@ def test_a_channel_that_sees_nothing(device):
 def test_stored_and_read_back(fitted, tmp_path):
     write_result(tmp_path / "blend.fits", fitted)
     found = read_result(tmp_path / "blend.fits")
-    for name in ("flux", "colour", "moments"):
+    for name in ("flux", "colour", "moments", "beyond", "released", "moved", "residuals"):
         np.testing.assert_array_equal(getattr(found.errors, name), getattr(fitted.errors, name))
     for one, other in zip(found.errors.morphology, fitted.errors.morphology, strict=True):
         np.testing.assert_array_equal(one, other)
@@ -204,3 +229,14 @@ def test_stored_and_read_back(fitted, tmp_path):
     one, other = catalogue(found), catalogue(fitted)
     for name in other.colnames:
         np.testing.assert_array_equal(one[name], other[name])
+
+
+def test_errors_of_an_older_format_are_refused(fitted, tmp_path, monkeypatch):
+    """They were not widened; a file of that format without errors is as good as ever."""
+    monkeypatch.setattr(store, "FORMAT", 1)
+    write_result(tmp_path / "blend.fits", fitted)
+    write_result(tmp_path / "bare.fits", replace(fitted, errors=None))
+    monkeypatch.undo()
+    with pytest.raises(FileError, match=r"blend.fits: has errors of format 1, not 2; fit it again"):
+        read_result(tmp_path / "blend.fits")
+    assert read_result(tmp_path / "bare.fits").errors is None

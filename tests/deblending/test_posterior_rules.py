@@ -266,8 +266,8 @@ def test_draws_are_numbers_times_modes_and_spectra_in_counts():
     values = [np.array([1.0, 2.0, 3.0, 4.0]), np.array([5.0, 6.0])]
     asked = []
     factor = SimpleNamespace(sizes=np.array([4, 2, 1]), draw=lambda x: asked.append(x) or values)
-    morphs, spectra = Draws(modes, factor, np.array([10.0, 100.0])).draw(rng)
+    morphs, spectra = Draws(modes, factor, np.array([10.0, 100.0]), np.array([3, 1])).draw(rng)
     assert asked[0].shape == (7,)
-    np.testing.assert_allclose(morphs[0], modes[0][0] + 2 * modes[0][1])
+    np.testing.assert_allclose(morphs[0], 3 * (modes[0][0] + 2 * modes[0][1]))
     assert morphs[1].shape == (2, 2) and not morphs[1].any()
-    np.testing.assert_allclose(spectra, [[30, 400], [50, 600]])
+    np.testing.assert_allclose(spectra, [[90, 1200], [50, 600]])

@@ -21,7 +21,7 @@ from clresample import (
     deblend_many,
 )
 from clresample.deblending.fit import Fit, begin
-from clresample.measurement import residuals
+from clresample.deblending.posterior import residuals
 from clresample.resampling.resampler import Resampler
 from clresample.sky.frame import Frame
 from clresample.sky.psf import PSF
@@ -48,7 +48,7 @@ def test_a_star_in_each_corner_has_its_own_psf(device):
     assert chi2(same) > 1.3
     found, wrong = (_pulls(result) for result in (own, same))
     assert np.abs(found).max() < 4
-    grown = residuals.widening(residuals.channel_residuals(same))[:, None]  # with what is left
+    grown = residuals.widening(same.errors.residuals)[:, None]  # with what is left
     assert np.abs(wrong * grown).max() > 20
 
 

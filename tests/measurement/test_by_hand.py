@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from helpers.blends import MIDDLE, SCALE, blend, gaussian, observe, round_component, two_sources
 
+from clresample.deblending.posterior.residuals import _window, worst_residuals
 from clresample.deblending.rendered import Rendered
 from clresample.deblending.result import Component
 from clresample.measurement.catalogue import Flag, catalogue
 from clresample.measurement.quality import box_chi2
-from clresample.measurement.residuals import _window, worst_residuals
 from clresample.measurement.shapes import moments
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation

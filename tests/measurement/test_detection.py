@@ -7,10 +7,10 @@ import pytest
 from helpers.blends import gaussian
 
 from clresample.deblending.batch import deblend
+from clresample.deblending.posterior.residuals import convolved
 from clresample.deblending.profiles import point
 from clresample.deblending.settings import Settings
 from clresample.measurement.detection import detect, detect_more
-from clresample.measurement.residuals import convolved
 from clresample.resampling.cache import cached_resampler
 from clresample.sky.frame import model_frame
 from clresample.sky.grid import Grid

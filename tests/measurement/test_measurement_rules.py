@@ -5,10 +5,10 @@ import pytest
 from helpers.blends import blend, observe, round_component
 from scipy.signal import fftconvolve
 
+from clresample.deblending.posterior.residuals import _filtered, _kernels, convolved, misfits
 from clresample.deblending.spectra import MODEL_ERROR
 from clresample.measurement import detection
 from clresample.measurement.detection import detect, detect_more
-from clresample.measurement.residuals import _filtered, _kernels, convolved, misfits
 from clresample.sky.frame import model_frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation

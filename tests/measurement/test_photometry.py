@@ -126,7 +126,7 @@ def test_colours_are_better_known_than_fluxes_that_err_together():
     covariance = np.array([[[25.0, 45.0], [45.0, 100.0]]])
     flux = np.array([[[25.0]], [[100.0]]])
     maps, beyond = (component.morphology,), np.zeros((1, 6))
-    unbound = np.zeros((1, 2)), np.zeros((1, 5))
+    unbound = np.zeros((1, 2)), np.zeros((1, 5)), np.zeros((1, 2))
     known = Errors(flux, covariance, np.full((1, 5, 5), np.nan), maps, beyond, *unbound)
     # as in `blend`, the data do not hold the model
     observations = [observe(grid, ("g", "r"), weights=1e-12, **zero_points)]
@@ -150,7 +150,7 @@ def test_fluxes_hold_what_lies_beyond_the_boxes():
     maps = tuple(c.morphology for c in parts)
     variance = np.tile(np.diag([4.0, 9.0]), (2, 1, 1))
     released = np.array([[0.5, -9.0], [0.0, 1.0]])
-    moments = np.full((2, 5, 5), np.nan), maps, beyond, released, np.zeros((2, 5))
+    moments = np.full((2, 5, 5), np.nan), maps, beyond, released, np.zeros((2, 5)), np.zeros((2, 2))
     errors = Errors(variance, np.ones((2, 2, 2)), *moments)
     flux, found = fluxes(blend(parts, errors=errors))
     flux = flux - released

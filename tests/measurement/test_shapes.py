@@ -90,7 +90,7 @@ def test_errors_of_positions_on_the_sky(cards):
     covariance[0, :2, :2], covariance[0, 2:, 2:] = pixel, 0.01 * np.eye(3)
     flux = np.ones((2, 1, 1))
     maps = (component.morphology,)
-    unbound = np.zeros((1, 2)), np.zeros((1, 5))
+    unbound = np.zeros((1, 2)), np.zeros((1, 5)), np.zeros((1, 2))
     errors = Errors(flux, np.ones((1, 2, 2)), covariance, maps, np.zeros((1, 6)), *unbound)
     row = catalogue(blend([component], grid=grid, errors=errors))[0]
     assert row["y_centroid_err"].value == pytest.approx(0.2)
@@ -112,7 +112,8 @@ def test_shapes_are_without_what_the_bound_adds():
     moved = np.array([[0.1, -0.2, -0.5, 0.25, -0.125]])
     rows = []
     for by in (0, 1, 100):
-        errors = Errors(np.ones((2, 1, 1)), np.ones((1, 2, 2)), *given, by * moved)
+        last = by * moved, np.zeros((1, 2))
+        errors = Errors(np.ones((2, 1, 1)), np.ones((1, 2, 2)), *given, *last)
         rows.append(catalogue(blend([component], errors=errors))[0])
     plain, changed, kept = rows
     for axis, by in (("y", 0.1), ("x", -0.2)):

@@ -13,7 +13,8 @@ from .blocks import Factor
 class Errors:
     """Errors of one blend's sources, marginal over morphologies, neighbours, fitted sky and shifts.
 
-    S sources, C channels of all observations, n components.
+    S sources, C channels of all observations, n components. A misfitted source's are all larger by
+    one factor, see `residuals.widening`; its covariances with others by both factors.
 
     flux (C, S, S) [counts^2]: covariance of the fluxes of one channel, Settings.flux_floor
         included; 0 between sources that share no light, what a common sky or shift does to them
@@ -31,6 +32,7 @@ class Errors:
     released (S, C) [counts], moved (S, 5) [px, px^2]: likewise no errors: what fluxes, and
         centroids and second moments, change by when the bound of morphologies at 0 is released,
         see bounds.py; second moments of stars stay
+    residuals (S, C) [sigma]: the largest on each source, see `channel_residuals`
     """
 
     flux: np.ndarray
@@ -40,6 +42,7 @@ class Errors:
     beyond: np.ndarray
     released: np.ndarray
     moved: np.ndarray
+    residuals: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,17 +52,20 @@ class Draws:
     modes (n): (k_i, ny, nx), images of each component's modes
     factor: of the normal matrix, whose node i is component i, its modes and then its spectrum (C,)
     unit (C,) [counts]: in which spectra count there
+    wide (n,): by what draws of misfitted sources' components scatter more, as their Errors do
     """
 
     modes: list[np.ndarray]
     factor: Factor
     unit: np.ndarray
+    wide: np.ndarray
 
     def draw(self, rng):
         """Changes of the morphologies (n arrays) and of the spectra (n, C) [counts]."""
         found = self.factor.draw(rng.standard_normal(sum(self.factor.sizes)))
         morphs, spectra = [], []
-        for values, images in zip(found, self.modes, strict=False):
+        for values, images, wide in zip(found, self.modes, self.wide, strict=False):
+            values = wide * values
             morphs.append(np.tensordot(values[: len(images)], images, 1))
             spectra.append(values[len(images) :] * self.unit)
         return morphs, np.array(spectra)

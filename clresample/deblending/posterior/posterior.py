@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 from scipy.linalg.blas import strmm
@@ -14,6 +15,7 @@ from .exposure import exposures_of
 from .modes import FLOOR, Solution, power_of
 from .moments import moments_of
 from .normal import Layout, normal_matrix
+from .residuals import channel_residuals, widening
 
 # Least error of a spectrum at fixed morphology, relative to it: smaller ones are rounding.
 LEAST_ERROR = 1e-9
@@ -64,11 +66,13 @@ class Posterior:
             right[i][:k] = pull * min(1, MOST_RELEASED / max(steps, 1e-30))
         return self.factor.solve(right)
 
-    def errors(self, owner, n_sources, unit, flux_floor) -> Errors:
+    def errors(self, owner, residuals, unit, flux_floor) -> Errors:
         """The Errors of sources, component i belonging to source owner[i] (n,).
 
-        unit (C,) [counts]: of the spectra; flux_floor: see Settings
+        residuals (S, C) [sigma]: that widen them; unit (C,) [counts]: of the spectra; flux_floor:
+            see Settings
         """
+        n_sources, wide = len(residuals), widening(residuals)
         flux, slopes = self._fluxes(owner, n_sources)
         n_channels = len(unit)
         between = np.zeros((n_channels, n_sources, n_sources))
@@ -94,19 +98,21 @@ class Posterior:
         for s, slope, change in zip(owner, slopes, self.released, strict=False):
             released[s] += slope @ change
         moments, moved = self._moments(owner, n_sources, error)
+        scale = wide[:, None] * unit
         return Errors(
-            between * unit[:, None, None] ** 2,
-            colour * unit[:, None] * unit,
-            moments,
-            tuple(self._map(i) for i in range(len(self.modes))),
+            between * scale.T[:, :, None] * scale.T[:, None],
+            colour * scale[:, :, None] * scale[:, None],
+            moments * wide[:, None, None] ** 2,
+            tuple(w * self._map(i) for i, w in enumerate(wide[owner])),
             np.array([far.sums for far in self.beyond]),
             released * unit,
             moved,
+            residuals,
         )
 
-    def draws(self, unit) -> Draws:
-        """What `Result.sample` draws from."""
-        return Draws(self.modes, self.factor, unit)
+    def draws(self, owner, residuals, unit) -> Draws:
+        """What `Result.sample` draws from; for what it takes see `errors`."""
+        return Draws(self.modes, self.factor, unit, widening(residuals)[owner])
 
     def _fluxes(self, owner, n_sources):
         """Fluxes (S, C), and each component's slopes (C, k + C) of its own by its unknowns."""
@@ -166,23 +172,23 @@ class Posterior:
         return np.sqrt(np.square(turned, out=turned).sum(1)).astype(float).reshape(images.shape[1:])
 
 
-def errors_of(fit, components, peaks, seen):
-    """The Errors and Draws of a Fit that has ended with these Components, or None and None.
+def with_errors(fit, result, peaks, seen):
+    """The Result of a Fit that has ended with its Errors and Draws, or with why there are none.
 
     peaks, seen: see `posterior_of`
 
-    Messages and seconds of it are taken down in the fit.
+    Its seconds are taken down in the fit.
     """
     began = time.perf_counter()
-    morphs = [c.morphology for c in components]
+    morphs = [c.morphology for c in result.components]
     posterior, messages = posterior_of(fit, morphs, peaks, seen)
-    fit.messages += messages
     if posterior is None:
-        return None, None
-    owner, floor = fit.fitted[fit.start.source], fit.settings.flux_floor
-    errors = posterior.errors(owner, len(fit.sources), fit.unit, floor)
+        return replace(result, messages=(*result.messages, *messages))
+    owner, residuals = fit.fitted[fit.start.source], channel_residuals(result)
+    errors = posterior.errors(owner, residuals, fit.unit, fit.settings.flux_floor)
+    draws = posterior.draws(owner, residuals, fit.unit)
     fit.note_seconds("errors", time.perf_counter() - began)
-    return errors, posterior.draws(fit.unit)
+    return replace(result, errors=errors, draws=draws)
 
 
 def posterior_of(fit, morphs, peaks, seen):

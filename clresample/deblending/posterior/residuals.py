@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..deblending.rendered import Rendered
-from ..sky.noise import HALF_WIDTH
-from .signal import TOGETHER_PX
+from ...sky.noise import HALF_WIDTH
+from ..rendered import Rendered
 
 # [sigma] of a filtered residual from which on a source is flagged as misfitted: among the 1e5
 # pixels of a large blend in all its channels, noise alone reaches it once in 20 blends.
@@ -15,6 +14,9 @@ MISFIT_SIGMAS = 5.0
 MIN_PIXELS = 400
 # Of a channel's largest filtered weight: pixels seen with less are not judged.
 LEAST_WEIGHT = 1e-6
+# [px] Images of several channels that are transformed at once: those of blends, for which each call
+# costs as much as its arithmetic. More would only take memory: a tile's channels go one by one.
+TOGETHER_PX = 1 << 17
 
 
 def worst_residuals(result, i_observation):
@@ -49,7 +51,12 @@ def worst_residuals(result, i_observation):
 
 
 def channel_residuals(result):
-    """`worst_residuals` in all channels of all observations: (S, C) [sigma]."""
+    """`worst_residuals` in all channels of all observations: (S, C) [sigma].
+
+    Of a result with Errors those that these were widened by.
+    """
+    if result.errors is not None:
+        return result.errors.residuals
     found = [worst_residuals(result, i) for i in range(len(result.observations))]
     return np.concatenate(found, axis=1)
 
