@@ -113,7 +113,10 @@ def run(arguments):
     from .fields.progress import Live
 
     started = time.perf_counter()
-    field = read_field(arguments.field)
+    try:
+        field = read_field(arguments.field)
+    except ImportError as error:
+        raise ValueError(f"{arguments.field}: {error}") from error
     if not arguments.quiet:
         for text in field.notes:
             note(arguments, text)

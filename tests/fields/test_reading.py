@@ -1,5 +1,8 @@
 """FIELD.toml and headers: what is read, and one line for each mistake."""
 
+import re
+import sys
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -39,6 +42,8 @@ def files(tmp_path):
     mask = fits.PrimaryHDU(flags)
     mask.header["MP_SAT"], mask.header["MP_CR"] = 3, 5
     mask.writeto(tmp_path / "mask.fits")
+    large = np.ones((SHAPE[0] + 1, SHAPE[1]), np.int32)
+    fits.PrimaryHDU(large).writeto(tmp_path / "large.fits")
     fits.PrimaryHDU(PSF.gaussian(1.5).images).writeto(tmp_path / "psf.fits")
     return tmp_path
 
@@ -102,12 +107,24 @@ def test_options_of_the_file(files):
         ('weight = 1.0\npsf_format = "cells"', "psf_cell_px is missing"),
         ("weight = 1.0\nzero_point = [1.0, 2.0]", "zero_point has 2 numbers for 1 channels"),
         ('weight = "a.fits"', "weight is in the image's own file"),
+        ('variance = "large.fits"', "variance has (301, 260) pixels"),
+        ('weight = 1.0\nmask = "large.fits"', "mask has (301, 260) pixels"),
+        ('weight = 1.0\nmask = "mask.fits"\nmask_bits = [63]', "mask_bits has 63, bit 63, must be"),
     ],
 )
 def test_mistakes_are_one_line_that_names_the_key(files, more, message):
-    with pytest.raises(SceneError, match=message.replace("(", r"\(")) as caught:
+    with pytest.raises(SceneError, match=re.escape(message)) as caught:
         field_of(files, more)
     assert "\n" not in str(caught.value)
+    assert "damaged" not in str(caught.value)  # a mistake in field.toml is none of a file's
+
+
+def test_a_package_that_is_not_there_is_one_line(files, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "piff", None)
+    (files / "field.toml").write_text(TOML.format(more='weight = 1.0\npsf_format = "piff"'))
+    assert main(["field", str(files / "field.toml"), "-o", str(files / "out")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "field.toml: Piff files need piff" in line and "pip install" in line
 
 
 @pytest.mark.parametrize(

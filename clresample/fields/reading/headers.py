@@ -9,6 +9,7 @@ JANSKY = 8.90  # [mag] AB of one: -2.5 log10(3631)
 # cards that hold an AB zero point: Euclid's MER, DES, SWarp's users, HSC
 ZERO_POINTS = "MAGZERO", "MAGZPT", "MAGZP", "PHOTZP", "ZEROPNT", "MAG_ZERO"
 BIT_PREFIX = "MP_"  # of Rubin's and HSC's masks: MP_SAT = 1 says that bit 1 is SAT
+LAST_BIT = 62  # of masks, which are read as integers of 64 bits with a sign
 STERADIAN_ARCSEC2 = (180 / math.pi * 3600) ** 2
 
 
@@ -64,7 +65,7 @@ def mask_value(header, bits, known=None) -> int:
     """The sum of 2^n over the bits to ignore, given by number or by name.
 
     known {name: bit}: of the format, None = those of the header
-    Raises ValueError for a name that neither has.
+    Raises ValueError for a name that neither has, and for a bit that no integer of 64 bits has.
     """
     names = bit_names(header) if known is None else known
     value = 0
@@ -72,7 +73,10 @@ def mask_value(header, bits, known=None) -> int:
         if isinstance(bit, str) and bit not in names:
             there = ", ".join(names) or f"none, as it has no cards {BIT_PREFIX}* or MSKN*"
             raise ValueError(f"mask_bits has {bit!r}, the mask's header names {there}")
-        value |= 1 << (names[bit] if isinstance(bit, str) else bit)
+        number = names[bit] if isinstance(bit, str) else bit
+        if number > LAST_BIT:
+            raise ValueError(f"mask_bits has {bit!r}, bit {number}, must be at most {LAST_BIT}")
+        value |= 1 << number
     return value
 
 

@@ -36,8 +36,8 @@ def read_mosaic(folder, table, inputs, notes) -> Mosaic:
     if len(names) != len(planes):
         raise ValueError(f"channels has {len(names)} names, the images {len(planes)} planes")
     points = _zero_points(table, headers, grid, notes)
-    weights, kind = _weights(folder, table, planes, inputs)
-    masks, bits = _masks(folder, table, planes, inputs)
+    weights, kind = _weights(folder, table, planes, grid.shape, inputs)
+    masks, bits = _masks(folder, table, planes, grid.shape, inputs)
     channels = [
         Channel(names[i], plane, weights[i], kind, masks[i], bits[i], points[i])
         for i, plane in enumerate(planes)
@@ -121,8 +121,8 @@ def _zero_points(table, headers, grid, notes):
     return found
 
 
-def _file_planes(folder, table, key, planes, inputs):
-    """Planes of the files or numbers of a key, one for each channel."""
+def _file_planes(folder, table, key, planes, size, inputs):
+    """Planes of the files or numbers of a key, one for each channel, of the images' (Ny, Nx)."""
     given, hdu = _listed(table[key]), table.get(f"{key}_hdu")
     found = []
     for one in given:
@@ -138,6 +138,8 @@ def _file_planes(folder, table, key, planes, inputs):
         with open_fits(path) as hdus:
             chosen = choose_hdu(path, hdus, hdu)
             number, shape = hdus.index(chosen), chosen.shape
+        if shape[-2:] != size:
+            raise ValueError(f"{key} has {shape[-2:]} pixels ({path}), the images {size}")
         indices = [None] if len(shape) == 2 else range(shape[0])
         found += [FilePlane(path, number, i) for i in indices]
     if len(found) == 1:
@@ -147,25 +149,26 @@ def _file_planes(folder, table, key, planes, inputs):
     return found
 
 
-def _weights(folder, table, planes, inputs):
+def _weights(folder, table, planes, size, inputs):
     """Planes of weights, variances or RMS, and which of them; None where there are none."""
     for kind in WEIGHTS:
         if kind in table:
-            return _file_planes(folder, table, kind, planes, inputs), kind
+            return _file_planes(folder, table, kind, planes, size, inputs), kind
     return [None] * len(planes), "weight"
 
 
-def _masks(folder, table, planes, inputs):
+def _masks(folder, table, planes, size, inputs):
     """Planes of masks, and the bits of each that mean: ignore."""
     if "mask" not in table:
         return [None] * len(planes), [None] * len(planes)
-    masks = _file_planes(folder, table, "mask", planes, inputs)
+    masks = _file_planes(folder, table, "mask", planes, size, inputs)
     if "mask_bits" not in table:
         return masks, [None] * len(planes)
     values = []
     for mask in masks:
         with open_fits(mask.path) as hdus:
-            values.append(mask_value(hdus[mask.hdu].header, table["mask_bits"]))
+            header = hdus[mask.hdu].header.copy()
+        values.append(mask_value(header, table["mask_bits"]))
     return masks, values
 
 
