@@ -107,7 +107,7 @@ def run(arguments):
     import os
 
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # as in `clresample deblend`
-    from ..fields.options import LEAST_MEMORY, MEMORY, group_memory
+    from ..fields.options import LEAST_BOUND, LEAST_MEMORY, MEMORY, group_memory
     from ..fields.reading.field_file import read_field
     from ..fields.run import free_memory, run_field
     from .fields.progress import Live
@@ -120,6 +120,10 @@ def run(arguments):
     if not arguments.quiet:
         for text in field.notes:
             note(arguments, text)
+    if arguments.memory is not None and arguments.memory < LEAST_BOUND:
+        raise ValueError(
+            f"--memory is {arguments.memory >> 20}M, must be {LEAST_BOUND >> 30}G or more"
+        )
     devices = arguments.device.split(",") if arguments.device else []
     workers = max(arguments.workers, len(devices)) if len(devices) > 1 else arguments.workers
     memory = min(MEMORY, free_memory() // (MEMORY_PART * max(workers, 1)))

@@ -164,6 +164,12 @@ def test_commands_from_simulation_to_catalogue_in_worker_processes(tmp_path, cap
     assert "converged" in printed and str(out / "catalogue.fits") in printed
     before = (out / "catalogue.fits").read_bytes()
     assert main(command) == 2  # holds a run
+    capsys.readouterr()
+    assert main([*command[:3], str(tmp_path / "other"), "--memory", "100M"]) == 2
+    assert "--memory is 100M, must be 1G or more" in capsys.readouterr().err
+    mistaken = ["field", str(sky / "field.toml"), "-o", str(tmp_path / "other"), "--quiet"]
+    assert main([*mistaken, "--device", "no such device"]) == 2
+    assert main([*mistaken, "--workers", "0"]) == 0  # of the mistake nothing is left in the way
     assert main([*command, "--resume", "--workers", "0"]) == 0
     assert (out / "catalogue.fits").read_bytes() == before
     assert main([*command, "--overwrite", "--workers", "0"]) == 0

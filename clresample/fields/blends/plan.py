@@ -148,8 +148,8 @@ def make_plan(
 ) -> Plan:
     """Blends from sources and the labels of their light; giants cut; groups by predicted cost.
 
-    positions (S, 2) [px], peaks (S,) [sigma]; footprints: Footprints of `region`, whose labels are
-    renumbered here: label n + 1 is patch n's
+    positions (S, 2) [px], peaks (S,) [sigma]: in whose order blends are numbered
+    footprints: Footprints of `region`, whose labels are renumbered here: label n + 1 is patch n's
     memory [bytes]: that the fits of one group may take; None = no limit; n_channels: of all mosaics
     most: blends in a group, as many as a CPU fits side by side. More share a round's launches,
         which take longer than the arithmetic of small blends, but are lost together with their
@@ -164,7 +164,7 @@ def make_plan(
     for s, label in enumerate(labels[at[:, 0], at[:, 1]].tolist()):
         of_label.setdefault(label, []).append(s)
     made: list[dict] = []
-    order = sorted((label for label in of_label if label), key=int)
+    order = sorted((label for label in of_label if label), key=lambda label: of_label[label][0])
     pending = []
     for label in order:
         sources, box = of_label[label], footprints.boxes[label - 1]

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...files.whole_file import FileError, sweep, whole_file
+from .look import FILE as LOOK_FILE
 
 WORK = "work"  # folder of the parts inside the output folder
 
@@ -26,7 +27,7 @@ def open_folder(folder, mosaics, reference, options, resume, overwrite, progress
     if overwrite and work.exists():
         shutil.rmtree(work)
     there = work / "run.json"
-    if there.exists():
+    if there.exists() and (work / LOOK_FILE).exists():  # before that look nothing is done
         if not resume:
             raise FileError(f"{folder}: holds a run already: --resume goes on, --overwrite forgets")
         before = json.loads(there.read_text())
