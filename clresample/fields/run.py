@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..files.names import check_columns, to_ascii
 from ..sky.grid import Grid
 from .blends.tiles import part_of
 from .box import Box
@@ -104,8 +105,8 @@ def run_field(
 def reference_of(mosaics) -> Grid:
     """The grid of the mosaic with the smallest pixels, of equal ones the first.
 
-    Raises ValueError for no mosaic, names or channels that are not unique, zero points that only
-    some have, and grids of which some are flat.
+    Raises ValueError for no mosaic, names or channels that are not unique or that tables cannot
+    hold, zero points that only some have, and grids of which some are flat.
     """
     if not mosaics:
         raise ValueError("mosaics is empty, at least one is needed")
@@ -115,6 +116,14 @@ def reference_of(mosaics) -> Grid:
     ):
         if len(set(names)) < len(names):
             raise ValueError(f"{what}s of mosaics must be unique, not {', '.join(names)}")
+        for name in names:
+            if to_ascii(name) != name or name != name.rstrip():
+                raise ValueError(
+                    f"{what} {name!r} must be printable ASCII without a space at its end, for "
+                    "columns of FITS tables: give another one"
+                )
+    check_columns(f"chi2_{m.name}" for m in mosaics)
+    check_columns(f"flux_err_{c.name}" for m in mosaics for c in m.channels)
     for what, have in (
         ("zero points", [m.channels[0].zero_point is not None for m in mosaics]),
         ("a WCS", [not m.grid.is_flat for m in mosaics]),

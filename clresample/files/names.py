@@ -2,13 +2,38 @@
 
 from __future__ import annotations
 
-# A FITS card holds a column's name of 68 characters; the longest prefix is "flux_err_".
-MOST_CHARACTERS = 68 - len("flux_err_")
+from itertools import pairwise
+
+# Characters of a column's name that a FITS card holds; an apostrophe is written as two.
+COLUMN = 68
+MOST_CHARACTERS = COLUMN - len("flux_err_")  # of channels, whose longest column that is
 
 
 def to_ascii(text):
     """Text as FITS cards can hold it: "?" for other characters than printable ASCII."""
     return "".join(c if " " <= c <= "~" else "?" for c in str(text))
+
+
+def check_columns(names):
+    """Raise ValueError where a catalogue's columns have names that FITS cards cannot hold."""
+    for name in names:
+        n = len(name) + name.count("'")
+        if n > COLUMN:
+            raise ValueError(
+                f"column {name[:20]!r}... of the catalogue has {n} characters, FITS takes "
+                f"{COLUMN}: give observations and channels shorter names"
+            )
+
+
+def check_observations(observations, *, magnitudes=False):
+    """Raise ValueError where observations, their names and channels' being those of a catalogue's
+    columns, give such that FITS cannot hold; magnitudes: see `catalogue`."""
+    channels = [channel for o in observations for channel in o.channels]
+    check_channels(channels)
+    check_columns(f"flux_err_{channel}" for channel in channels)
+    check_columns(f"chi2_{o.name}" for o in observations)
+    if magnitudes:
+        check_columns(f"colour_err_{a}_{b}" for a, b in pairwise(channels))
 
 
 def check_channels(channels):

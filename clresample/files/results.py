@@ -22,7 +22,7 @@ from ..sky.psf import PSF
 from ..sky.sources import Extended, Point, Source
 from .arrays import array_of, image_hdu
 from .fits import add_provenance, celestial_header, open_fits, write_hdus
-from .names import check_channels, to_ascii
+from .names import check_channels, check_columns, to_ascii
 from .whole_file import FileError, check_output, whole_file
 
 FORMAT = 2  # of the files; raised when an older reader would misread them
@@ -161,7 +161,8 @@ def write_catalogue(path, table, *, overwrite=False):
 
     path: ends in .ecsv, .fits or .fits.gz; table: of `catalogue`
 
-    Raises FileError when the file exists or cannot be written, ValueError for other endings.
+    Raises FileError when the file exists or cannot be written, ValueError for other endings and,
+    as FITS, for names of columns that are too long.
     """
     path = Path(path)
     if not path.name.endswith((".ecsv", ".fits", ".fits.gz")):
@@ -215,6 +216,7 @@ def _flag_table():
 
 def _table(table, name):
     """A table as an HDU; other characters than ASCII, which FITS does not have, become "?"."""
+    check_columns(table.colnames)
     table = QTable(table, names=[to_ascii(column) for column in table.colnames])
     table["name"] = [to_ascii(value) for value in table["name"]]
     hdu = fits.table_to_hdu(table)

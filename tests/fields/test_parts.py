@@ -1,13 +1,17 @@
 """Parts on disk: what went in comes out, of sources that failed too."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable
+from helpers.fields import mosaics_of
 
 from clresample.fields.blends.plan import Patch
 from clresample.fields.box import Box
+from clresample.fields.run import reference_of
 from clresample.fields.work.part import COMPONENT_COLUMNS, PATCH_COLUMNS, Part, PartFile
 from clresample.measurement.columns import Columns
 
@@ -109,3 +113,20 @@ def test_files_are_fits_as_others_see_them(part, tmp_path):
     part.rows[0].put("reason", np.array(["\N{LATIN SMALL LETTER E WITH ACUTE}", ""]))
     with pytest.raises(ValueError, match="ascii"):
         part.to_bytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("caf\u00e9", "'caf\u00e9' must be printable ASCII"),
+        ("g ", "'g ' must be printable ASCII without a space at its end"),
+        ("g" * 64, "FITS takes 68: give observations and channels shorter names"),
+        ("g'" * 30, "has [0-9]+ characters, FITS takes 68"),
+    ],
+)
+def test_names_that_no_part_can_hold_are_refused_before_the_fits(sky, name, message):
+    euclid, _ = mosaics_of(sky)
+    renamed = replace(euclid, channels=(replace(euclid.channels[0], name=name),))
+    for mosaic in (replace(euclid, name=name), renamed):
+        with pytest.raises(ValueError, match=message):
+            reference_of([mosaic])
