@@ -6,7 +6,9 @@ import signal
 import subprocess
 import sys
 import time
+import weakref
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -130,6 +132,34 @@ class Itself:
 
     def __init__(self, n_bytes):
         self.array, self.itself = np.ones(n_bytes, np.uint8), self
+
+
+class Shared(Itself):
+    """What the tasks of a stage share; a process knows those that are there."""
+
+    there: ClassVar = weakref.WeakSet()
+
+    def __init__(self):
+        super().__init__(1)
+
+    def __setstate__(self, state):
+        vars(self).update(state)
+        self.there.add(self)
+
+
+def shared_there(shared, task):
+    """How many contexts of this and earlier stages the worker holds."""
+    return len(Shared.there)
+
+
+def test_a_stage_leaves_nothing_of_the_one_before():
+    with Pool(1) as pool:
+        for _ in range(2):  # the second one's first task still meets the first one's context
+            found = [o.value for o in pool.run(shared_there, [Shared()], range(3))]
+            assert found[1:] == [1, 1]
+        (outcome,) = pool.run(whose, ["."], [0])
+        found = [o.value for o in pool.run(shared_there, ["."], range(2))]
+        assert outcome.reason is None and found == [0, 0]
 
 
 def held_before(n_bytes, task):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import multiprocessing
 import os
 import time
@@ -13,7 +14,7 @@ from multiprocessing.connection import wait
 
 from ...device.discovery import DeviceError
 from ..strips import STRIPS
-from .share import end_with, hold_memory, keep_for_good, return_memory, shared_threads
+from .share import end_with, hold_memory, keep, return_memory, shared_threads
 
 # [s] Between two looks at whether a worker takes too long.
 LOOK_S = 1.0
@@ -258,14 +259,16 @@ def _work(pipe, bound, parent):
     STRIPS.hold(bound)
     end_with(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all; the parent ends its workers
-    function = context = kept = None
+    function = context = None
+    kept = False
     while True:
         try:
             given, what = pipe.recv()
         except (EOFError, OSError):
             return
         if given is not None:
-            function, context = given, what
+            function, context, kept = given, what, False
+            gc.unfreeze()  # the last stage's context is no longer kept
             continue
         try:
             answer = function(context, what), None
@@ -279,9 +282,9 @@ def _work(pipe, bound, parent):
             return
         del answer, what
         return_memory()
-        if kept is not function:  # its first task has loaded what the others need
-            keep_for_good()
-            kept = function
+        if not kept:  # its first task has loaded what the others need
+            keep()
+            kept = True
 
 
 def reason_of(error):
