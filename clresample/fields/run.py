@@ -17,6 +17,7 @@ from .box import Box
 from .hats import check_hats
 from .options import LEAST_MEMORY, FieldOptions, Progress
 from .outputs import Outputs, write_outputs
+from .strips import STRIPS
 from .work.engine import engine_of
 from .work.fitting import Job
 from .work.folder import open_folder
@@ -94,9 +95,11 @@ def run_field(
         parts, unsettled = fitted(job, engine, progress)
     finally:
         engine.close()
+        STRIPS.clear()  # which residuals fill again
     clock.stop("fit")
     progress.stage("write", 1)
     outputs = write_outputs(folder, job, parts, unsettled, about or {}, seconds, options.hats)
+    STRIPS.clear()
     clock.stop("write")
     failed = outputs.status.get("failed", 0)
     return FieldRun(outputs, seconds, failed, plan.lost, tuple(engine.turns))

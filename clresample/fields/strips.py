@@ -39,6 +39,12 @@ class Strips:
         """Keep within a part of the memory [bytes] that this process may take; None = any."""
         self.most = MOST_BYTES if bound is None else min(MOST_BYTES, int(PART * bound))
 
+    def clear(self):
+        """Keep none of those that are there."""
+        with self._lock:
+            self._kept.clear()
+            self.n_bytes = 0
+
     def read(self, hdu, plane, box) -> np.ndarray | None:
         """The pixels of a Box of an HDU's plane (its number, None where there is one); None where
         strips would not help."""

@@ -12,6 +12,7 @@ from helpers.fields import mosaics_of
 from clresample import FieldOptions
 from clresample.fields.options import Progress
 from clresample.fields.run import run_field
+from clresample.fields.strips import MOST_BYTES, STRIPS
 from clresample.fields.work.cluster import Cluster
 from clresample.fields.work.engine import Work
 
@@ -22,7 +23,7 @@ distributed = pytest.importorskip("distributed")
 def scheduler():
     """Two worker processes with a nanny each."""
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
+        n_workers=2, threads_per_worker=1, dashboard_address=":0", memory_limit="3GiB"
     ) as cluster:
         yield cluster.scheduler_address
 
@@ -85,6 +86,20 @@ def test_workers_that_die_or_hang_cost_their_own_tasks_alone(scheduler, tmp_path
     assert found["die"].worker_died and found["hang"].worker_died
     assert "over 20 s" in found["hang"].reason
     assert found["raise"].reason.startswith("ValueError: a bad blend")
+
+
+def rows_kept(context, task, given):
+    """Memory [bytes] that decoded rows may take on a worker."""
+    return STRIPS.most, b""
+
+
+def test_decoded_rows_are_held_to_a_part_of_a_workers_memory(scheduler, tmp_path):
+    cluster = Cluster(scheduler, (), 60.0, Progress())
+    try:
+        (found,) = cluster.run(Work(nothing, rows_kept, path_of), Context(str(tmp_path)), ["a"])
+    finally:
+        cluster.close()
+    assert found.value == int(0.1 * 3 * (1 << 30)) < MOST_BYTES
 
 
 def test_what_does_not_answer_is_named():

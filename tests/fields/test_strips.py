@@ -74,6 +74,15 @@ def test_strips_take_a_tenth_of_what_a_process_may_hold():
     assert strips.most == MOST_BYTES
 
 
+def test_strips_that_are_cleared_are_decoded_again(packed, cube):
+    strips, box = Strips(), Box(0, 0, 10, 10)
+    for _ in range(2):
+        np.testing.assert_array_equal(strips.read(packed, 1, box), cube[1][box.slices])
+        assert strips.n_bytes > 0
+        strips.clear()
+        assert strips.n_bytes == 0 and not strips._kept
+
+
 def test_large_boxes_are_left_to_the_file(packed):
     assert Strips(most=100_000).read(packed, 0, Box(0, 0, 150, 90)) is None
 

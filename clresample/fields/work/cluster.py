@@ -21,6 +21,7 @@ from ... import __version__
 from ...device.device import get_device
 from ...device.discovery import DeviceError
 from ...files.whole_file import FileError
+from ..strips import STRIPS
 from .pool import LOOK_S, reason_of
 from .seats import Seats
 from .share import return_memory, shared_threads
@@ -219,8 +220,11 @@ def _version():
 
 def _opened(blob, n_beside):
     """The context on a worker, which shares its host's processor with so many."""
+    from distributed import get_worker
+
     for name, value in shared_threads(n_beside).items():
         os.environ.setdefault(name, value)
+    STRIPS.hold(get_worker().memory_manager.memory_limit or None)  # 0 and None: any
     context = pickle.loads(blob)
     get_device(context.device)
     return context
