@@ -2,15 +2,20 @@
 
 import hashlib
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from astropy.table import QTable
 from helpers.fields import mosaics_of
 
 import clresample
 from clresample import FieldOptions
+from clresample.fields.box import Box
+from clresample.fields.mosaic import FilePlane
 from clresample.fields.run import run_field
+from clresample.fields.strips import STRIPS
 
 
 def test_every_column_has_its_unit_and_a_description(done):
@@ -28,6 +33,22 @@ def test_every_column_has_its_unit_and_a_description(done):
     blends = QTable.read(folder / "blends.ecsv")
     assert all(blends[name].info.description for name in blends.colnames)
     assert blends["seconds"].unit == "s"
+
+
+def test_a_run_leaves_no_decoded_rows(sky, tmp_path):
+    """They may be hundreds of megabytes, which a notebook would hold to its end."""
+    (euclid,) = mosaics_of(sky)[:1]
+    (channel,) = euclid.channels
+    pixels = channel.data.read(Box.of(euclid.grid.shape))
+    lossless = {"compression_type": "GZIP_2", "quantize_level": 0}
+    fits.CompImageHDU(pixels, **lossless).writeto(tmp_path / "packed.fits")
+    packed = replace(channel, data=FilePlane(tmp_path / "packed.fits", 1))
+    options = FieldOptions(passes=1, threshold=7.0)
+    run_field([replace(euclid, channels=(packed,))], tmp_path / "out", options=options)
+    assert STRIPS.n_bytes == 0
+    packed.data.read(Box(0, 0, 9, 9))
+    assert STRIPS.n_bytes > 0  # they would have been kept
+    STRIPS.clear()
 
 
 def test_the_provenance_says_what_was_read_and_with_what(sky, tmp_path):

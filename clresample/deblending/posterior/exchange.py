@@ -25,8 +25,9 @@ from .normal import Layout, normal_matrix
 # scenes end 0.5 higher in the mean.
 LEAST_CHANGE = 0.3
 LEAST_POWER = 1e-30  # of a component in a channel that does not see it
-# Spectra and levels of which the data say less than this part of what they say of the best one
-# stay: what is left of wings in their channel would move them by thousands.
+# Spectra of which the data say less than this part of what they say of the best one stay: what is
+# left of wings in their channel would move them by thousands. Of such levels the slopes count as 0;
+# their rows stay, so that they still follow what structure does in their channel.
 UNSEEN = 1e-9
 
 
