@@ -15,6 +15,7 @@ from ..sky.grid import Grid
 from .blends.tiles import part_of
 from .box import Box
 from .hats import check_hats
+from .images import file_name
 from .options import LEAST_MEMORY, FieldOptions, Progress
 from .outputs import Outputs, write_outputs
 from .strips import STRIPS
@@ -115,6 +116,7 @@ def reference_of(mosaics) -> Grid:
         raise ValueError("mosaics is empty, at least one is needed")
     for what, names in (
         ("name", [m.name for m in mosaics]),
+        ("file name", [file_name(m.name) for m in mosaics]),
         ("channel", [c.name for m in mosaics for c in m.channels]),
     ):
         if len(set(names)) < len(names):

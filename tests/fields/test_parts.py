@@ -130,3 +130,9 @@ def test_names_that_no_part_can_hold_are_refused_before_the_fits(sky, name, mess
     for mosaic in (replace(euclid, name=name), renamed):
         with pytest.raises(ValueError, match=message):
             reference_of([mosaic])
+
+
+def test_mosaics_whose_files_would_be_one_are_refused(sky):
+    euclid, rubin = mosaics_of(sky)
+    with pytest.raises(ValueError, match="file names of mosaics must be unique, not u_g, u_g"):
+        reference_of([replace(euclid, name="u g"), replace(rubin, name="u_g")])
