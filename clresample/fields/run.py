@@ -96,7 +96,6 @@ def run_field(
         parts, unsettled = fitted(job, engine, progress)
     finally:
         engine.close()
-        STRIPS.clear()  # which residuals fill again
     clock.stop("fit")
     progress.stage("write", 1)
     outputs = write_outputs(folder, job, parts, unsettled, about or {}, seconds, options.hats)
@@ -121,14 +120,7 @@ def reference_of(mosaics) -> Grid:
     ):
         if len(set(names)) < len(names):
             raise ValueError(f"{what}s of mosaics must be unique, not {', '.join(names)}")
-        for name in names:
-            if to_ascii(name) != name or name != name.rstrip():
-                raise ValueError(
-                    f"{what} {name!r} must be printable ASCII without a space at its end, for "
-                    "columns of FITS tables: give another one"
-                )
-    check_columns(f"chi2_{m.name}" for m in mosaics)
-    check_columns(f"flux_err_{c.name}" for m in mosaics for c in m.channels)
+    _check_names(mosaics)
     for what, have in (
         ("zero points", [m.channels[0].zero_point is not None for m in mosaics]),
         ("a WCS", [not m.grid.is_flat for m in mosaics]),
@@ -138,6 +130,21 @@ def reference_of(mosaics) -> Grid:
             raise ValueError(f"mosaic {has!r} has {what}, {none!r} has none: give all or none")
     scales = [m.grid.pixel_scale_arcsec for m in mosaics]
     return mosaics[int(np.argmin(scales))].grid
+
+
+def _check_names(mosaics):
+    """Raise ValueError for names of mosaics or channels that tables cannot hold."""
+    for what, name in [
+        *(("name", m.name) for m in mosaics),
+        *(("channel", c.name) for m in mosaics for c in m.channels),
+    ]:
+        if to_ascii(name) != name or name != name.rstrip():
+            raise ValueError(
+                f"{what} {name!r} must be printable ASCII without a space at its end, for "
+                "columns of FITS tables: give another one"
+            )
+    check_columns(f"chi2_{m.name}" for m in mosaics)
+    check_columns(f"flux_err_{c.name}" for m in mosaics for c in m.channels)
 
 
 def _as_sent(mosaics):

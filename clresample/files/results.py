@@ -160,9 +160,8 @@ def write_catalogue(path, table, *, overwrite=False):
     """Write a catalogue, whole or not at all: as ECSV or, by the file's name, as FITS.
 
     path: ends in .ecsv, .fits or .fits.gz; table: of `catalogue`
-
-    Raises FileError when the file exists or cannot be written, ValueError for other endings and,
-    as FITS, for names of columns that are too long.
+    Raises FileError when the file exists or cannot be written, ValueError for other endings
+    and columns' names too long for FITS.
     """
     path = Path(path)
     if not path.name.endswith((".ecsv", ".fits", ".fits.gz")):

@@ -12,7 +12,6 @@ from helpers.headers import OBSERVED, grid_of, header, observed_headers, with_ta
 
 from clresample.files import results as store
 from clresample.files.fits import FileError, read_image
-from clresample.files.names import check_observations
 from clresample.files.results import read_result, write_catalogue, write_result
 from clresample.measurement.catalogue import Flag, catalogue
 from clresample.sky.frame import Frame
@@ -240,25 +239,6 @@ def test_channels_that_differ_in_case_only_keep_their_columns(tmp_path):
     write_catalogue(tmp_path / "cat.fits", catalogue(result))
     found = Table.read(tmp_path / "cat.fits", hdu="CATALOGUE")
     assert found["flux_R"][0] == 2 * found["flux_r"][0]
-
-
-def test_columns_too_long_for_fits_are_refused_by_name(tmp_path):
-    """As colours of two channels, each of which by itself would do, and chi2 of observations."""
-    grid, names = Grid.flat((60, 70), SCALE), ("g" * 30, "r" * 30)
-    one = observe(grid, names, zero_points=(25.0, 25.0))
-    result = blend([round_component(0, (30, 35), (1, 2))], observations=(one,))
-    check_observations([one])
-    with pytest.raises(ValueError, match="'colour_err_ggggggggg'... of the catalogue has 72 char"):
-        check_observations([one], magnitudes=True)
-    with pytest.raises(ValueError, match="of the catalogue has 69 characters, FITS takes 68"):
-        check_observations([observe(grid, ("i",), name="o" * 64)])
-    with pytest.raises(ValueError, match="of the catalogue has 69 characters, FITS takes 68"):
-        check_observations([observe(grid, ("i" * 50 + "'" * 5,))])
-    table = catalogue(result, magnitudes=True)
-    with pytest.raises(ValueError, match="give observations and channels shorter names"):
-        write_catalogue(tmp_path / "cat.fits", table)
-    assert not list(tmp_path.iterdir())
-    write_catalogue(tmp_path / "cat.ecsv", table)
 
 
 # what is wrong is reported in one line, and nothing is half-written
