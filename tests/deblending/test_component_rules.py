@@ -8,9 +8,13 @@ import pytest
 from clresample.deblending.blend import INTERRUPTED
 from clresample.deblending.components import gradients, second
 from clresample.deblending.components.gradients import Asked, gain
+from clresample.deblending.profiles import Galaxy, Given, Star
 from clresample.deblending.rendered import Rendered
+from clresample.deblending.solver.learned.prior import LearnedPrior
+from clresample.deblending.solver.learned.structure import coarse
+from clresample.deblending.solver.scene import Learned, State
 from clresample.deblending.start.seen import Seen
-from clresample.deblending.start.start import StartingPoint
+from clresample.deblending.start.start import Patch, StartingPoint
 from clresample.deblending.view import WhitenedView
 from clresample.sky.sources import Extended, Point
 
@@ -249,6 +253,38 @@ def test_morphologies_are_followed_by_the_cores_that_are_asked_about():
     assert len(gradients.model_of(fit).morphs) == 3
 
 
+def test_a_second_fit_goes_on_where_the_first_has_ended():
+    """Two components in place of one begin on their profiles, with its strengths; all else where it
+    was left."""
+    rng, prior = np.random.default_rng(8), LearnedPrior(scales_px=(1.0, 2.0), strengths=(0.1, 0.2))
+
+    def coefficients(shape):
+        return [rng.normal(size=[coarse(n, step) for n in shape]) for step in prior.steps]
+
+    def state(shapes, learned=None):
+        n = len(shapes)
+        morph = [rng.random(shape) for shape in shapes]
+        return State([0] * n, morph, rng.random((n, 2)), rng.random(2), learned=learned)
+
+    shapes = (4, 5), (6, 7), (3, 3)
+    known = Learned([coefficients(s) for s in shapes], rng.random((3, 2)), np.arange(3) == 1)
+    end, begin = state(shapes, known), state(((4, 5), (8, 9), (7, 5), (3, 3)))
+    first = SimpleNamespace(state=end, settings=SimpleNamespace(prior=prior))
+    found = second._going_on(begin, first, np.array([1]))
+    for k, i in ((0, 0), (3, 2)):
+        np.testing.assert_array_equal(found.morph[k], end.morph[i])
+        np.testing.assert_array_equal(found.spectra[k], end.spectra[i])
+        assert found.learned.structure[k] is known.structure[i]
+    for k in (1, 2):
+        assert found.morph[k] is begin.morph[k]
+        np.testing.assert_array_equal(found.spectra[k], begin.spectra[k])
+        assert not any(part.any() for part in found.learned.structure[k])
+    assert [part.shape for part in found.learned.structure[1]] == [(8, 9), (5, 5)]
+    np.testing.assert_array_equal(found.learned.strengths, known.strengths[[0, 1, 1, 2]])
+    assert found.learned.clear.tolist() == [False, True, True, False]
+    np.testing.assert_array_equal(found.sky, end.sky)
+
+
 def test_misfits_are_chi2_of_all_observations(monkeypatch):
     rng, views, observed = np.random.default_rng(5), [], []
     spectra, sky, wanted = rng.random((2, 3)), rng.random(3), 0.0
@@ -272,28 +308,76 @@ def test_misfits_are_chi2_of_all_observations(monkeypatch):
 
 
 def test_of_two_starts_the_one_that_fits_better_is_taken(monkeypatch):
-    """Of scenes with clear gradients alone."""
+    """Of scenes with clear gradients alone; only one of them goes on from the first fit."""
 
     def clear(*which):
         return SimpleNamespace(clear=np.array(which, int))
 
     asked = [None, clear(1), clear(), clear(0, 2)]
-    fits = [
-        SimpleNamespace(
-            name=i,
-            patch=f"patch {i}",
-            start=SimpleNamespace(source=np.array([4, 5, 6])),
-            settings=SimpleNamespace(fit_sky=True),
-        )
-        for i in range(4)
-    ]
+    settings = SimpleNamespace(fit_sky=True)
+    fits = [SimpleNamespace(name=i, start=f"start {i}", settings=settings) for i in range(4)]
     monkeypatch.setattr(second, "ask", lambda fits: asked)
     monkeypatch.setattr(second, "_alone", lambda fit, one: f"alone {fit.name}")
-    monkeypatch.setattr(second, "_together", lambda patch, double: f"{patch} {double.tolist()}")
+    monkeypatch.setattr(second, "_together", lambda fit, which: f"all {fit.name} {which.tolist()}")
     monkeypatch.setattr(second, "start", lambda patches, fit_sky=False: patches)
-    monkeypatch.setattr(second, "_joined", lambda begin, own, which: f"joined {own}")
-    monkeypatch.setattr(second, "_again", lambda fit, point: (fit.name, point))
+    monkeypatch.setattr(second, "_joined", lambda begin, own, which: f"{own} in {begin}")
+    monkeypatch.setattr(second, "_as_before", lambda whole, begin, which: f"{whole} as {begin}")
+    monkeypatch.setattr(
+        second, "_again", lambda fit, point: SimpleNamespace(point=point, state="new")
+    )
+    monkeypatch.setattr(
+        second, "_going_on", lambda state, first, which: f"{state} from {first.name} {which}"
+    )
     monkeypatch.setattr(second, "_misfits", lambda fits: [3.0, 2.0, 1.0, 4.0][: len(fits)])
-    assert second._begun(fits) == {1: (1, "patch 1 [5]"), 3: (3, "joined alone 3")}
+    again = second._begun(fits)
+    assert {i: (one.point, one.state) for i, one in again.items()} == {
+        1: ("all 1 [1] as start 1", "new"),
+        3: ("alone 3 in start 3", "new from 3 [0 2]"),
+    }
     asked[1] = asked[3] = None
     assert second._begun(fits) == {}
+
+
+def test_the_other_start_takes_galaxies_over():
+    """Given profiles, stars and galaxies of two components are fitted as ever."""
+    frame = SimpleNamespace(shape=(6, 7))
+    one, two = object.__new__(Galaxy), object.__new__(Galaxy)
+    shapes = [one, Star.__new__(Star), two, two, Given(np.ones((6, 7))), one]
+    source = np.array([0, 1, 2, 2, 3, 4])
+    drawn = np.random.default_rng(9).random((6, 7))
+    begin = SimpleNamespace(source=source, shapes=shapes, drawn=lambda i, low, size: drawn + i)
+    place = {"position_px": (1.0, 2.0)}
+    sources = [
+        Extended(**place),
+        Point(**place),
+        Extended(**place, n_components=2),
+        Extended(**place, profile=np.ones((6, 7))),
+        Extended(**place),
+    ]
+    patch = Patch(frame, sources, np.ones((5, 2)), ["view"])
+    found = second._together(SimpleNamespace(start=begin, patch=patch, frame=frame), np.array([5]))
+    assert found.sources[1:4] == sources[1:4] and found.views == ["view"]
+    assert found.sources[4].n_components == 2 and found.sources[4].profile is None
+    np.testing.assert_array_equal(found.sources[0].profile, drawn)
+    assert patch.sources[0].profile is None
+
+
+def test_what_was_taken_over_has_its_first_shape_again():
+    one, star, own = object.__new__(Galaxy), Star.__new__(Star), Given(np.ones((3, 3)))
+    held, new = Given(np.ones((3, 3))), object.__new__(Galaxy)
+
+    def point(shapes, first):
+        n = len(shapes)
+        numbers = {name: np.arange(n) + first for name in ("places", "peaks", "spectra", "power")}
+        rest = {"source": np.arange(n), "positions": 0, "dark": 0, "sky": 0}
+        thetas = [first + i for i in range(n)]
+        return StartingPoint(shapes=shapes, thetas=thetas, **numbers, **rest)
+
+    begin = point([one, star, one, own], 0)
+    whole = point([held, star, new, new, own], 10)
+    found = second._as_before(whole, begin, np.array([2]))
+    assert found.shapes == [one, star, new, new, own]
+    assert found.thetas == [0, 11, 12, 13, 3]
+    assert found.places.tolist() == found.peaks.tolist() == [0, 11, 12, 13, 3]
+    assert found.spectra.tolist() == found.power.tolist() == [10, 11, 12, 13, 14]
+    assert whole.shapes[0] is held and whole.peaks[0] == 10

@@ -10,11 +10,13 @@ to 0.05, a twentieth of what ends a fit.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..buffers import Buffers
 from ..gradient import Gradient
-from ..scene import State
+from ..scene import Learned, State
 from .inverse import MOST
 from .pairs import Pairs
 from .progress import Progress
@@ -32,7 +34,8 @@ UNSEEN = 1e-14
 class LearnedEngine:
     """A batch of scenes of one signature on the device, under a LearnedPrior.
 
-    scenes, states: of the scenes at their start: structure begins at 0, on the profiles
+    scenes, states: of the scenes at their start: structure begins where the states' Learned says,
+        else at 0, on the profiles
     enough: a scene has converged when its loss fell by less than this over some
         iterations, see progress.py
     past: another engine and the indices (n,) of its scenes that go on here, which are `scenes`
@@ -52,9 +55,10 @@ class LearnedEngine:
         if past is None:
             self.progress = Progress(len(scenes), enough, [_n_pixels(s) for s in scenes])
             self.pairs = Pairs(len(scenes), N_PAIRS)
-            self.strengths = Strengths(b, self._gradient, latents, prior)
+            learned = [s.learned for s in states]
+            self.strengths = Strengths(b, self._gradient, latents, prior, learned)
             spectra, sky = np.concatenate([s.spectra for s in states]), [s.sky for s in states]
-            v.start(spectra, sky, _inverse_curvature(scenes))
+            v.start(self._first(learned), spectra, sky, _inverse_curvature(scenes))
             self._rest_others(self.progress.live)
             weights = self.strengths.weights(spectra)
             self.steps.reweigh(self.strengths.light, weights, self.strengths.blocks)
@@ -67,6 +71,13 @@ class LearnedEngine:
             v.copy_from(engine.vectors, keep)
             self._rest_others(self.progress.live)
             self.steps.take_blocks(self.strengths.blocks)
+
+    def _first(self, learned):
+        """The coefficients that the scenes begin with, as one vector; learned: Learned or None."""
+        arrays = []
+        for scene, own in zip(self.scenes, learned, strict=True):
+            arrays += [None] * len(scene.profile) if own is None else own.structure
+        return self.structure.latents.pack(arrays)
 
     def take(self, keep):
         """An engine of the scenes `keep` (n,) alone, which go on as if nothing had happened."""
@@ -144,7 +155,12 @@ class LearnedEngine:
         b, v = self.buffers, self.vectors
         self.structure.form(v.x)
         v.take(v.x)
-        return b.states(b.iterated, [None] * len(self.scenes), int(self.progress.n_rounds.max()))
+        n_steps, known = int(self.progress.n_rounds.max()), self.strengths.by_scene()
+        found = b.states(b.iterated, [None] * len(self.scenes), n_steps)
+        return [
+            replace(state, learned=Learned(structure, *own))
+            for state, (structure, *_), own in zip(found, v.split(v.x), known, strict=True)
+        ]
 
     def findings(self, which):
         """Findings of the scenes `which` (B,) at their present states; None for the others."""
