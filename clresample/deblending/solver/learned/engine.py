@@ -55,10 +55,9 @@ class LearnedEngine:
         if past is None:
             self.progress = Progress(len(scenes), enough, [_n_pixels(s) for s in scenes])
             self.pairs = Pairs(len(scenes), N_PAIRS)
-            learned = [s.learned for s in states]
-            self.strengths = Strengths(b, self._gradient, latents, prior, learned)
+            self.strengths = Strengths(b, self._gradient, latents, prior, states)
             spectra, sky = np.concatenate([s.spectra for s in states]), [s.sky for s in states]
-            v.start(self._first(learned), spectra, sky, _inverse_curvature(scenes))
+            v.start(_structure(latents, states), spectra, sky, _inverse_curvature(scenes))
             self._rest_others(self.progress.live)
             weights = self.strengths.weights(spectra)
             self.steps.reweigh(self.strengths.light, weights, self.strengths.blocks)
@@ -71,13 +70,6 @@ class LearnedEngine:
             v.copy_from(engine.vectors, keep)
             self._rest_others(self.progress.live)
             self.steps.take_blocks(self.strengths.blocks)
-
-    def _first(self, learned):
-        """The coefficients that the scenes begin with, as one vector; learned: Learned or None."""
-        arrays = []
-        for scene, own in zip(self.scenes, learned, strict=True):
-            arrays += [None] * len(scene.profile) if own is None else own.structure
-        return self.structure.latents.pack(arrays)
 
     def take(self, keep):
         """An engine of the scenes `keep` (n,) alone, which go on as if nothing had happened."""
@@ -155,12 +147,9 @@ class LearnedEngine:
         b, v = self.buffers, self.vectors
         self.structure.form(v.x)
         v.take(v.x)
-        n_steps, known = int(self.progress.n_rounds.max()), self.strengths.by_scene()
-        found = b.states(b.iterated, [None] * len(self.scenes), n_steps)
-        return [
-            replace(state, learned=Learned(structure, *own))
-            for state, (structure, *_), own in zip(found, v.split(v.x), known, strict=True)
-        ]
+        n_steps = int(self.progress.n_rounds.max())
+        states = b.states(b.iterated, [None] * len(self.scenes), n_steps)
+        return _that_learned(states, v.split(v.x), self.strengths.by_scene())
 
     def findings(self, which):
         """Findings of the scenes `which` (B,) at their present states; None for the others."""
@@ -195,6 +184,22 @@ class LearnedEngine:
         self.steps.follow(self.pairs, mode)
         self.steps.advance(nothing, nothing, nothing[:, 0], nothing[:, 0] + length)
         self._rest_others(self.progress.live)
+
+
+def _structure(latents, states):
+    """The coefficients that scenes begin with, as one vector."""
+    arrays = []
+    for state in states:
+        arrays += state.learned.structure if state.learned else [None] * len(state.morph)
+    return latents.pack(arrays)
+
+
+def _that_learned(states, parts, known):
+    """States with what was learned; parts: see `Vectors.split`; known: `Strengths.by_scene`."""
+    return [
+        replace(state, learned=Learned(structure, *own))
+        for state, (structure, *_), own in zip(states, parts, known, strict=True)
+    ]
 
 
 def _n_pixels(scene):

@@ -26,8 +26,8 @@ class Findings:
 class Strengths:
     """Present strengths of a batch's sources, learned from their evidence.
 
-    learned (B): the scenes' Learned at their start, None for those that begin with the prior's
-        strengths
+    states (B): the scenes' States at their start; their Learned, if any, says which strengths they
+        begin with
     past: other Strengths and the scenes (n,) of theirs that go on here, which are all
 
     values (S, J): alpha; of fixed sources without meaning
@@ -36,7 +36,7 @@ class Strengths:
     blocks (S): of each source, see `SourceInverse.blocks`; none of fixed ones
     """
 
-    def __init__(self, buffers, gradient, latents, prior, learned=(), *, past=None):
+    def __init__(self, buffers, gradient, latents, prior, states=(), *, past=None):
         b = self.buffers = buffers
         self._scene = b.host_boxes.scene
         self._free = b.device.get(b.free)[: b.n_free]
@@ -45,10 +45,10 @@ class Strengths:
             self.values = np.tile(np.array(prior.strengths, float), (b.n_sources, 1))
             self._curvature = np.zeros_like(self.values)
             self.clear = np.zeros(len(self.values), bool)
-            for i, own in enumerate(learned):
-                if own is not None:
+            for i, state in enumerate(states):
+                if state.learned is not None:
                     at = self._scene == i
-                    self.values[at], self.clear[at] = own.strengths, own.clear
+                    self.values[at], self.clear[at] = state.learned.strengths, state.learned.clear
             self._evidence, self._inverses, self._light = self._prepare(prior)
             self.blocks = [[] for _ in self.values]
         else:
