@@ -34,8 +34,7 @@ UNSEEN = 1e-14
 class LearnedEngine:
     """A batch of scenes of one signature on the device, under a LearnedPrior.
 
-    scenes, states: of the scenes at their start: structure begins where the states' Learned says,
-        else at 0, on the profiles
+    scenes, states: of the scenes at their start: on the profiles, but where states have a Learned
     enough: a scene has converged when its loss fell by less than this over some
         iterations, see progress.py
     past: another engine and the indices (n,) of its scenes that go on here, which are `scenes`
@@ -56,10 +55,9 @@ class LearnedEngine:
             self.progress = Progress(len(scenes), enough, [_n_pixels(s) for s in scenes])
             self.pairs = Pairs(len(scenes), N_PAIRS)
             self.strengths = Strengths(b, self._gradient, latents, prior, states)
-            spectra, sky = np.concatenate([s.spectra for s in states]), [s.sky for s in states]
-            v.start(_structure(latents, states), spectra, sky, _inverse_curvature(scenes))
+            v.start(*_begins(latents, states), _inverse_curvature(scenes))
             self._rest_others(self.progress.live)
-            weights = self.strengths.weights(spectra)
+            weights = self.strengths.weights(np.concatenate([s.spectra for s in states]))
             self.steps.reweigh(self.strengths.light, weights, self.strengths.blocks)
         else:
             engine, keep = past
@@ -147,9 +145,8 @@ class LearnedEngine:
         b, v = self.buffers, self.vectors
         self.structure.form(v.x)
         v.take(v.x)
-        n_steps = int(self.progress.n_rounds.max())
-        states = b.states(b.iterated, [None] * len(self.scenes), n_steps)
-        return _that_learned(states, v.split(v.x), self.strengths.by_scene())
+        found = b.states(b.iterated, [None] * len(self.scenes), int(self.progress.n_rounds.max()))
+        return _that_learned(found, v.split(v.x), self.strengths.by_scene())
 
     def findings(self, which):
         """Findings of the scenes `which` (B,) at their present states; None for the others."""
@@ -186,12 +183,13 @@ class LearnedEngine:
         self._rest_others(self.progress.live)
 
 
-def _structure(latents, states):
-    """The coefficients that scenes begin with, as one vector."""
+def _begins(latents, states):
+    """What scenes begin with: coefficients as one vector, spectra (S, C), sky levels (B, C)."""
     arrays = []
     for state in states:
         arrays += state.learned.structure if state.learned else [None] * len(state.morph)
-    return latents.pack(arrays)
+    spectra, sky = np.concatenate([s.spectra for s in states]), [s.sky for s in states]
+    return latents.pack(arrays), spectra, sky
 
 
 def _that_learned(states, parts, known):
