@@ -9,9 +9,6 @@ from clresample.deblending.blend import INTERRUPTED
 from clresample.deblending.components import gradients, second
 from clresample.deblending.components.gradients import Asked, gain
 from clresample.deblending.rendered import Rendered
-from clresample.deblending.start.seen import Seen
-from clresample.deblending.start.start import StartingPoint
-from clresample.deblending.view import WhitenedView
 from clresample.sky.sources import Extended, Point
 
 
@@ -122,37 +119,6 @@ def test_what_neighbours_leave_nothing_of_is_not_seen():
     np.testing.assert_allclose([values[0], precision[0]], [[0, 0.25], [0, 4]])
 
 
-def test_the_second_start_is_from_what_the_others_leave():
-    """Their light and the sky are taken off the data, in every channel of each observation."""
-    rng, shape = np.random.default_rng(6), (5, 4)
-    spectra, sky = rng.uniform(1, 2, (3, 3)), np.array([0.5, -0.25, 0.125])
-    parts, views, observed = [slice(0, 1), slice(1, 3)], [], []
-    begin = SimpleNamespace(source=np.array([0, 2, 1]), positions=rng.uniform(0, 4, (3, 2)))
-    for part in parts:
-        images = rng.random((3, part.stop - part.start, *shape))
-        observed.append(Rendered(images.shape, np.zeros((3, 2), int), list(images)))
-        data, root = rng.normal(size=images.shape[1:]), np.ones(images.shape[1:])
-        shares = rng.random((3, part.stop - part.start, 2))
-        views.append(WhitenedView(None, None, None, None, root, data, shares))
-    fit = SimpleNamespace(
-        state=SimpleNamespace(spectra=spectra, sky=sky),
-        scene=SimpleNamespace(channels=lambda: parts),
-        start=begin,
-        views=views,
-        frame="home",
-    )
-    patch = second._alone(fit, Asked(np.array([1]), np.array([9.0]), observed))
-    for view, own, images, part in zip(views, patch.views, observed, parts, strict=True):
-        others = np.einsum("ic,icyx->cyx", spectra[[0, 2], part], np.asarray(images)[[0, 2]])
-        np.testing.assert_allclose(own.data, view.data - others - sky[part, None, None])
-        np.testing.assert_array_equal(own.shares, view.shares[[2]])
-    (source,) = patch.sources
-    assert source.n_components == 2 and patch.frame == "home"
-    np.testing.assert_array_equal(patch.positions, begin.positions[[2]])
-    np.testing.assert_array_equal(source.position_px, begin.positions[2])
-    assert fit.state.spectra.all()  # the first fit's own stay
-
-
 def ended(n, losses, *, energies=0.0, findings=True, fixed=()):
     """A finished fit of n components in three channels."""
     found = SimpleNamespace(energies=np.full((n, 2), energies), strengths=np.full((n, 2), 0.5))
@@ -179,23 +145,6 @@ def test_more_components_must_lower_the_loss_by_what_their_numbers_cost():
     assert not second._is_better(ended(3, [150, 81.0]), stiff)
     assert second._is_better(ended(3, [150, 80.0]), stiff)
     assert second._half_chi2(ended(2, [1, 100.0], energies=2.5, fixed=(0,))) == pytest.approx(90)
-
-
-def test_the_second_fit_takes_the_place_of_the_chosen_components():
-    """Two each, in the order of the sources."""
-
-    def point(n, first):
-        fields = {name: np.arange(n) + first for name in ("peaks", "spectra", "power", "places")}
-        return fields | {"shapes": list("abcdef"[:n]), "thetas": [first] * n}
-
-    others = {"positions": np.zeros((3, 2)), "dark": np.zeros(3, bool), "sky": np.zeros(1)}
-    begin = StartingPoint(source=np.array([0, 2, 1]), **others, **point(3, 0))
-    found = StartingPoint(source=np.array([0, 0, 1, 1]), **others, **point(4, 10))
-    joined = second._joined(begin, found, np.array([2, 0]))
-    assert joined.source.tolist() == [0, 0, 2, 1, 1]
-    for name in ("peaks", "spectra", "power", "places"):
-        assert getattr(joined, name).tolist() == [12, 13, 1, 10, 11]
-    assert joined.shapes == list("cdbab") and joined.thetas == [10, 10, 0, 10, 10]
 
 
 def test_each_scene_keeps_its_second_fit_where_that_is_better(monkeypatch):
@@ -247,53 +196,3 @@ def test_morphologies_are_followed_by_the_cores_that_are_asked_about():
     np.testing.assert_array_equal(model.morphs[3], morphs[2] * profile[2])
     np.testing.assert_array_equal(model.morphs[4], morphs[0] * profile[0])
     assert len(gradients.model_of(fit).morphs) == 3
-
-
-def test_misfits_are_chi2_of_all_observations(monkeypatch):
-    rng, views, observed = np.random.default_rng(5), [], []
-    spectra, sky, wanted = rng.random((2, 3)), rng.random(3), 0.0
-    parts = slice(0, 1), slice(1, 3)
-    for part in parts:
-        images = rng.random((2, part.stop - part.start, 4, 5))
-        observed.append(Rendered(images.shape, np.zeros((2, 2), int), images))
-        root, data = rng.random((2, *images.shape[1:]))
-        views.append(SimpleNamespace(root=root, data=data))
-        model = np.einsum("ic,icyx->cyx", spectra[:, part], images) + sky[part, None, None]
-        wanted += (root**2 * (data - model) ** 2).sum()
-    fit = SimpleNamespace(
-        views=views,
-        scene=SimpleNamespace(channels=lambda: parts),
-        settings=SimpleNamespace(fit_sky=True),
-    )
-    seen = Seen(spectra, sky, None, tuple(observed), ())
-    monkeypatch.setattr(second, "model_of", lambda one: one)
-    monkeypatch.setattr(second, "see", lambda models, fit_sky: [seen] * len(models))
-    assert second._misfits([fit, fit]) == pytest.approx([wanted, wanted])
-
-
-def test_of_two_starts_the_one_that_fits_better_is_taken(monkeypatch):
-    """Of scenes with clear gradients alone."""
-
-    def clear(*which):
-        return SimpleNamespace(clear=np.array(which, int))
-
-    asked = [None, clear(1), clear(), clear(0, 2)]
-    fits = [
-        SimpleNamespace(
-            name=i,
-            patch=f"patch {i}",
-            start=SimpleNamespace(source=np.array([4, 5, 6])),
-            settings=SimpleNamespace(fit_sky=True),
-        )
-        for i in range(4)
-    ]
-    monkeypatch.setattr(second, "ask", lambda fits: asked)
-    monkeypatch.setattr(second, "_alone", lambda fit, one: f"alone {fit.name}")
-    monkeypatch.setattr(second, "_together", lambda patch, double: f"{patch} {double.tolist()}")
-    monkeypatch.setattr(second, "start", lambda patches, fit_sky=False: patches)
-    monkeypatch.setattr(second, "_joined", lambda begin, own, which: f"joined {own}")
-    monkeypatch.setattr(second, "_again", lambda fit, point: (fit.name, point))
-    monkeypatch.setattr(second, "_misfits", lambda fits: [3.0, 2.0, 1.0, 4.0][: len(fits)])
-    assert second._begun(fits) == {1: (1, "patch 1 [5]"), 3: (3, "joined alone 3")}
-    asked[1] = asked[3] = None
-    assert second._begun(fits) == {}

@@ -11,6 +11,9 @@ import numpy as np
 from ...sky.sources import Extended
 from ..blend import INTERRUPTED
 from ..iterate import iterate
+from ..profiles import Galaxy, Given
+from ..solver.learned.structure import coarse
+from ..solver.scene import Learned
 from ..start.first_scene import first_scene
 from ..start.seen import see
 from ..start.start import Patch, start
@@ -65,25 +68,26 @@ def _note(fits, error):
 def _begun(fits):
     """{index: a Fit at its start} of the scenes with sources that clearly need two components.
 
-    Of two starts the one that fits the data better. A start of those sources alone, all others'
-    light taken off as the first fit left it, knows the others' structure, but their light may hold
-    what one component could not take. In a start of the whole scene profiles alone share the light.
+    Of two starts the one that fits the data better where it begins. One has all else as the first
+    fit has left it, structure and strengths too, and smooth profiles of the two components alone,
+    fitted to what that leaves of the data: real neighbours are known from then on, but their
+    structure may hold what one component could not take. In the other one smooth profiles alone
+    share the light, those of all else being the first start's.
     """
     asked = {i: one for i, one in enumerate(ask(fits)) if one is not None and len(one.clear)}
     if not asked:
         return {}
     alone = start([_alone(fits[i], one) for i, one in asked.items()])
-    together = start(
-        [_together(fits[i].patch, fits[i].start.source[one.clear]) for i, one in asked.items()],
-        fit_sky=fits[0].settings.fit_sky,
-    )
-    begun = [
-        [_again(fits[i], point) for point in (_joined(fits[i].start, own, one.clear), whole)]
-        for (i, one), own, whole in zip(asked.items(), alone, together, strict=True)
-    ]
-    misfits = np.reshape(_misfits([fit for pair in begun for fit in pair]), (-1, 2))
-    best = misfits.argmin(axis=1)
-    return {i: pair[k] for i, pair, k in zip(asked, begun, best, strict=True)}
+    patches = [_together(fits[i], one.clear) for i, one in asked.items()]
+    together = start(patches, fit_sky=fits[0].settings.fit_sky)
+    begun = []
+    for (i, one), own, whole in zip(asked.items(), alone, together, strict=True):
+        first = fits[i]
+        known = _again(first, _joined(first.start, own, one.clear))
+        known.state = _going_on(known.state, first, one.clear)
+        begun += [known, _again(first, _as_before(whole, first.start, one.clear))]
+    best = np.reshape(_misfits(begun), (-1, 2)).argmin(axis=1)
+    return {i: begun[2 * n + k] for n, (i, k) in enumerate(zip(asked, best, strict=True))}
 
 
 def _misfits(fits):
@@ -108,13 +112,32 @@ def _again(fit, point):
     return new
 
 
-def _together(patch, double):
-    """A Patch whose sources of the numbers `double` have two components each."""
-    sources = [
-        replace(source, n_components=2) if i in double else source
-        for i, source in enumerate(patch.sources)
-    ]
-    return replace(patch, sources=sources)
+def _together(fit, chosen):
+    """The Patch of a fit whose sources of the components `chosen` (k,) have two each, and other
+    galaxies of one component the profiles of its start."""
+    begin, sources = fit.start, list(fit.patch.sources)
+    for i, source in enumerate(sources):
+        own = np.flatnonzero(begin.source == i)
+        if own[0] in chosen:
+            sources[i] = replace(source, n_components=2)
+        elif len(own) == 1 and isinstance(begin.shapes[own[0]], Galaxy):
+            profile = begin.drawn(own[0], (0, 0), fit.frame.shape)
+            sources[i] = replace(source, profile=profile, n_components=None)
+    return replace(fit.patch, sources=sources)
+
+
+def _as_before(point, begin, chosen):
+    """The StartingPoint of `_together`, with the Shapes of the first one for what it was given."""
+    before, new = _places(len(begin), chosen)
+    drawn = [isinstance(shape, Given) for shape in point.shapes]
+    held = np.flatnonzero(~new & drawn)
+    shapes, thetas = list(point.shapes), list(point.thetas)
+    places, peaks = point.places.copy(), point.peaks.copy()
+    for k in held:
+        i = before[k]
+        shapes[k], thetas[k] = begin.shapes[i], begin.thetas[i]
+        places[k], peaks[k] = begin.places[i], begin.peaks[i]
+    return replace(point, shapes=shapes, thetas=thetas, places=places, peaks=peaks)
 
 
 def _alone(fit, asked):
@@ -145,6 +168,34 @@ def _joined(begin, point, chosen):
     }
     arrays = {name: np.array(parts[name]) for name in ("places", "peaks", "spectra", "power")}
     return replace(begin, source=np.array(source), **(parts | arrays))
+
+
+def _places(n, chosen):
+    """Which of the n components of a first fit each one of the second is, or one of two in place
+    of, (n + k,); and whether it is one of two (n + k,); chosen (k,): the components in question."""
+    two = np.isin(np.arange(n), chosen)
+    return np.repeat(np.arange(n), 1 + two), np.repeat(two, 1 + two)
+
+
+def _going_on(state, first, chosen):
+    """The State of `_joined` components that are not new where the first fit has left it.
+
+    state: at the start of all; first: a finished Fit; chosen (k,): its components that are now two
+    """
+    end, steps = first.state, first.settings.prior.steps
+    known, (before, new) = end.learned, _places(len(end.morph), chosen)
+    structure, morph = [], []
+    for i, is_new, begin in zip(before, new, state.morph, strict=True):
+        nothing = [np.zeros(coarse(begin.shape, step)) for step in steps]
+        structure.append(nothing if is_new else known.structure[i])
+        morph.append(begin if is_new else end.morph[i])
+    return replace(
+        state,
+        morph=morph,
+        spectra=np.where(new[:, None], state.spectra, end.spectra[before]),
+        sky=end.sky,
+        learned=Learned(structure, known.strengths[before], known.clear[before]),
+    )
 
 
 def _following(second, first):

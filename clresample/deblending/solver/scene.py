@@ -90,12 +90,27 @@ class Memory:
 
 
 @dataclass(frozen=True, eq=False)
+class Learned:
+    """What a fit under a LearnedPrior knows of the structure of one scene's n components.
+
+    structure [s][j] (ny_j, nx_j): coefficients z of each scale, on the grids of `Latents`
+    strengths (n, J): their scatter; clear (n,): bool, see evidence.py. Of fixed ones
+        without meaning
+    """
+
+    structure: list[list[np.ndarray]]
+    strengths: np.ndarray
+    clear: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class State:
     """What the iterations change of one scene.
 
     latent, morph (S): arrays (ny, nx): z (see Prior; of no use without one) and S
     spectra (S, C): A, and sky (C,), in the unit of the data
     memory: of the update, None before its first step; n_steps: iterations done so far
+    learned: Learned under a LearnedPrior; None: no structure, strengths that are the prior's
     """
 
     latent: list[np.ndarray]
@@ -104,6 +119,7 @@ class State:
     sky: np.ndarray
     memory: Memory | None = None
     n_steps: int = 0
+    learned: Learned | None = None
 
 
 def signature_of(shape, fit_sky, ops):

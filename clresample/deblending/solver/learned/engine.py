@@ -10,11 +10,13 @@ to 0.05, a twentieth of what ends a fit.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..buffers import Buffers
 from ..gradient import Gradient
-from ..scene import State
+from ..scene import Learned, State
 from .inverse import MOST
 from .pairs import Pairs
 from .progress import Progress
@@ -32,7 +34,7 @@ UNSEEN = 1e-14
 class LearnedEngine:
     """A batch of scenes of one signature on the device, under a LearnedPrior.
 
-    scenes, states: of the scenes at their start: structure begins at 0, on the profiles
+    scenes, states: of the scenes at their start: on the profiles, but where states have a Learned
     enough: a scene has converged when its loss fell by less than this over some
         iterations, see progress.py
     past: another engine and the indices (n,) of its scenes that go on here, which are `scenes`
@@ -52,11 +54,10 @@ class LearnedEngine:
         if past is None:
             self.progress = Progress(len(scenes), enough, [_n_pixels(s) for s in scenes])
             self.pairs = Pairs(len(scenes), N_PAIRS)
-            self.strengths = Strengths(b, self._gradient, latents, prior)
-            spectra, sky = np.concatenate([s.spectra for s in states]), [s.sky for s in states]
-            v.start(spectra, sky, _inverse_curvature(scenes))
+            self.strengths = Strengths(b, self._gradient, latents, prior, states)
+            v.start(*_begins(latents, states), _inverse_curvature(scenes))
             self._rest_others(self.progress.live)
-            weights = self.strengths.weights(spectra)
+            weights = self.strengths.weights(np.concatenate([s.spectra for s in states]))
             self.steps.reweigh(self.strengths.light, weights, self.strengths.blocks)
         else:
             engine, keep = past
@@ -144,7 +145,8 @@ class LearnedEngine:
         b, v = self.buffers, self.vectors
         self.structure.form(v.x)
         v.take(v.x)
-        return b.states(b.iterated, [None] * len(self.scenes), int(self.progress.n_rounds.max()))
+        found = b.states(b.iterated, [None] * len(self.scenes), int(self.progress.n_rounds.max()))
+        return _that_learned(found, v.split(v.x), self.strengths.by_scene())
 
     def findings(self, which):
         """Findings of the scenes `which` (B,) at their present states; None for the others."""
@@ -179,6 +181,23 @@ class LearnedEngine:
         self.steps.follow(self.pairs, mode)
         self.steps.advance(nothing, nothing, nothing[:, 0], nothing[:, 0] + length)
         self._rest_others(self.progress.live)
+
+
+def _begins(latents, states):
+    """What scenes begin with: coefficients as one vector, spectra (S, C), sky levels (B, C)."""
+    arrays = []
+    for state in states:
+        arrays += state.learned.structure if state.learned else [None] * len(state.morph)
+    spectra, sky = np.concatenate([s.spectra for s in states]), [s.sky for s in states]
+    return latents.pack(arrays), spectra, sky
+
+
+def _that_learned(states, parts, known):
+    """States with what was learned; parts: see `Vectors.split`; known: `Strengths.by_scene`."""
+    return [
+        replace(state, learned=Learned(structure, *own))
+        for state, (structure, *_), own in zip(states, parts, known, strict=True)
+    ]
 
 
 def _n_pixels(scene):

@@ -26,15 +26,17 @@ class Findings:
 class Strengths:
     """Present strengths of a batch's sources, learned from their evidence.
 
+    states (B): the scenes' States at their start; their Learned, if any, says which strengths they
+        begin with
     past: other Strengths and the scenes (n,) of theirs that go on here, which are all
 
-    values (S, J): alpha, at the prior's start; of fixed sources without meaning
+    values (S, J): alpha; of fixed sources without meaning
     clear (S,): sources whose finest structure is, see evidence.py
     precision (S, J): alpha^-2 on the device; light: a vector on the device, see lbfgs.cl
     blocks (S): of each source, see `SourceInverse.blocks`; none of fixed ones
     """
 
-    def __init__(self, buffers, gradient, latents, prior, *, past=None):
+    def __init__(self, buffers, gradient, latents, prior, states=(), *, past=None):
         b = self.buffers = buffers
         self._scene = b.host_boxes.scene
         self._free = b.device.get(b.free)[: b.n_free]
@@ -43,6 +45,10 @@ class Strengths:
             self.values = np.tile(np.array(prior.strengths, float), (b.n_sources, 1))
             self._curvature = np.zeros_like(self.values)
             self.clear = np.zeros(len(self.values), bool)
+            for i, state in enumerate(states):
+                if state.learned is not None:
+                    at = self._scene == i
+                    self.values[at], self.clear[at] = state.learned.strengths, state.learned.clear
             self._evidence, self._inverses, self._light = self._prepare(prior)
             self.blocks = [[] for _ in self.values]
         else:
@@ -127,6 +133,11 @@ class Strengths:
             None if own is None else Findings(self.values[own], energies[own], determined[own])
             for own in parts
         ]
+
+    def by_scene(self):
+        """Strengths (n, J) and which are clear (n,) of each scene's n components, pairs."""
+        at = [self._scene == i for i in range(len(self.buffers.scenes))]
+        return [(self.values[own], self.clear[own]) for own in at]
 
     def _by_scene(self, values):
         """Sums (B,) over the scenes' sources."""

@@ -42,10 +42,11 @@ class Latents:
         return np.stack([first, length], axis=2)
 
     def pack(self, arrays):
-        """One vector (size,) from arrays[s][j] of the shapes `shape`; of free sources alone."""
+        """One vector (size,) from arrays[s][j] of the shapes `shape`; of free sources alone, 0 of
+        those whose arrays[s] is None."""
         out = np.zeros(self.size)
         for s, scales in enumerate(arrays):
-            if self.shape[s].any():
+            if scales is not None and self.shape[s].any():
                 flat = np.concatenate([np.ravel(a) for a in scales])
                 out[self.start[s] : self.start[s] + len(flat)] = flat
         return out

@@ -107,12 +107,13 @@ class Vectors:
                 rows += [(i, at, min(length, high - at), k == 1) for at in starts]
         return np.array(rows)
 
-    def start(self, spectra, sky, inverse_curvature):
-        """Put x and the first trial there: z = 0, spectra (S, C), sky (B, C); and h of both."""
+    def start(self, structure, spectra, sky, inverse_curvature):
+        """Put x and the first trial there: z (latents.size,), spectra (S, C), sky (B, C); and h of
+        the latter two."""
         upload, nothing = self.buffers.device.upload, np.zeros(self.latents.size)
         there, h = (
-            np.concatenate([nothing, *map(np.ravel, parts)]).astype(self.buffers.dtype)
-            for parts in ((spectra, sky), inverse_curvature)
+            np.concatenate([first, *map(np.ravel, parts)]).astype(self.buffers.dtype)
+            for first, parts in ((structure, (spectra, sky)), (nothing, inverse_curvature))
         )
         upload(there, self.x)
         upload(there, self.x_new)
