@@ -227,7 +227,8 @@ class _Learning:
         rounds, loss, promised, made = self.asked.T
         there = np.array([e is not None for e in self.exchanges])
         due = p.n_rounds >= np.maximum(rounds + EXCHANGE, FIRST_EXCHANGE)
-        fallen = loss - p.loss
+        with np.errstate(invalid="ignore"):  # of a fit whose loss was never a number
+            fallen = loss - p.loss
         failed = there & (fallen < LEAST_KEPT * promised)
         old = failed & (made < MOST_MADE)
         ready = p.converged | (p.live & p.settled & p.looked & due)
@@ -244,10 +245,9 @@ class _Learning:
                 given = engine.scenes[i], states[i], findings[i]
                 with contextlib.suppress(np.linalg.LinAlgError):
                     self.exchanges[i] = exchange_of(self.fits[i], *given)
-        slopes, steps = engine.slopes(which), {}
+        which &= np.array([e is not None for e in self.exchanges])
+        slopes, steps = engine.slopes(which) if which.any() else (), {}
         for i in np.flatnonzero(which):
-            if self.exchanges[i] is None:
-                continue
             step, gain = _promise(self.exchanges[i], slopes[i])
             if step is None:
                 self.exchanges[i] = None
