@@ -6,6 +6,16 @@ inside the functions that run it. The demonstration and the example are themselv
 they run, and have their imports at the top.
 """
 
-from .command import main
+import sys
 
 __all__ = ["main"]
+
+
+def main(argv=None):
+    """Run `clresample` with these arguments (None: sys.argv's); returns the exit status."""
+    try:
+        from .command import main as run
+    except KeyboardInterrupt:  # Ctrl-C ends the imports too in one line
+        print("clresample: interrupted", file=sys.stderr)
+        return 130
+    return run(argv)

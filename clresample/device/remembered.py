@@ -25,13 +25,16 @@ class DeviceWarning(UserWarning):
 def cache_folder():
     """Where clresample keeps what can be made again: CLRESAMPLE_CACHE, or the system's place."""
     given = os.environ.get("CLRESAMPLE_CACHE")
-    if given:
-        return Path(given)
+    return Path(given) if given else system_caches() / "clresample"
+
+
+def system_caches():
+    """The folder in which this system's programs have the user's cache folders."""
     if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "clresample"
+        return Path.home() / "Library" / "Caches"
     if os.name == "nt":
-        return Path(os.environ.get("LOCALAPPDATA") or Path.home()) / "clresample"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "clresample"
+        return Path(os.environ.get("LOCALAPPDATA") or Path.home())
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 
 
 class Remembered:

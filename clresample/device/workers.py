@@ -19,6 +19,7 @@ from multiprocessing import connection
 
 from .device import Device, get_device
 from .discovery import DeviceError, choose, find_devices
+from .profile import report
 from .remembered import DeviceWarning
 
 # Items of a device's first portion, before its speed is known.
@@ -221,4 +222,5 @@ def _work(function, index, pipe):
                 what = traceback.format_exception_only(error)[-1].strip()
                 answer = None, what
             pipe.send(answer)
+    report()
     os._exit(0)  # leaves out the exit handlers of drivers, some of which wait for ever

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
-from helpers.checkout import ROOT
+from helpers.checkout import ROOT, run_python
 from helpers.resample_files import resample
 from helpers.tiny_scene import change, deblend, gaussian, write_scene
 
@@ -243,3 +243,18 @@ def test_ctrl_c_before_a_command_is_known(monkeypatch, capsys):
     assert main(["devices"]) == 130
     assert refused(capsys) == "clresample: interrupted\n"
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+def test_ctrl_c_while_the_command_is_imported():
+    interrupted = """
+import sys
+class Interrupted:
+    def find_spec(name, *_):
+        if name == "clresample.cli.deblend":
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Interrupted)
+from clresample.cli import main
+sys.exit(main(["--help"]))
+"""
+    answer = run_python("-c", interrupted)
+    assert (answer.returncode, answer.stderr) == (130, "clresample: interrupted\n")

@@ -75,3 +75,15 @@ def test_a_cache_that_cannot_be_written_is_said(tmp_path, monkeypatch, variables
     )
     assert said.replace("{file}", str(file)) in answer.stdout
     assert "pip install" not in answer.stdout
+
+
+def test_a_home_that_cannot_be_written_hides_no_device(tmp_path):
+    """PoCL's cache is elsewhere, as its message says; pyopencl and clresample keep nothing."""
+    nowhere = dict.fromkeys(("HOME", "XDG_CACHE_HOME", "CLRESAMPLE_CACHE"), "/proc/nobody")
+    answer = run_python(
+        "-c",
+        SET_UP + "print(make()(np.ones((20, 20))).shape)",
+        POCL_CACHE_DIR=str(tmp_path),
+        **nowhere,
+    )
+    assert (answer.stdout, answer.stderr) == ("(9, 9)\n", "")

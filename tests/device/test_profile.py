@@ -96,3 +96,14 @@ def test_a_command_prints_it_when_asked(tmp_path, monkeypatch):
     answer = run_python("-m", "clresample.cli", "resample", *map(str, words[1:]), "--profile")
     assert answer.returncode == 0, answer.stderr
     assert re.search(rf"^kernels on .*({TABLE}|{CALLS})", answer.stderr)
+
+
+def test_processes_of_several_devices_print_their_own():
+    fit = (
+        "from clresample import *; from clresample.cli.machine.workload import blends\n"
+        "one, settings = blends(1, get_device()), Settings(max_iter=1)\n"
+        "print(deblend_many(one, settings=settings, device=[get_device()])[0].status)"
+    )
+    answer = run_python("-c", fit, CLRESAMPLE_PROFILE="1")
+    assert answer.stdout == "iteration limit\n", answer.stderr
+    assert "\ntrial " in answer.stderr or ", trial " in answer.stderr, answer.stderr
