@@ -19,6 +19,9 @@ from .interface.interface import Interface
 
 # [px] the iterated inverse of SIP and look-up tables stops here, well under NOISE_PX
 INVERSE_PX = 1e-8
+# [px] by which a pixel may come back from the sky at another place: sixteen digits of an angle let
+# pixels of 0.1 milliarcseconds do so
+BACK_PX = 1e-4
 ARCSEC = math.radians(1 / 3600)  # [rad]
 
 
@@ -38,7 +41,7 @@ def usable_wcs(wcs, shape):
         if isinstance(wcs, WCS):
             wcs = wcs.celestial if wcs.naxis > 2 else wcs.deepcopy()
         frame_of(wcs)
-        problem = pixel_problem(wcs, shape)
+        problem = pixel_problem(wcs, shape) or _lost_digits(wcs, shape)
     except Exception as error:  # wcslib raises a dozen kinds, RuntimeError among them
         raise ValueError(f"wcs cannot be used: {' '.join(str(error).split())}") from error
     if problem:
@@ -74,6 +77,20 @@ def pixel_problem(wcs, shape):
     long, wide = np.linalg.svd(np.stack([y, x]), compute_uv=False)
     if not long <= MOST_ELONGATED * wide:
         return f"is {long / max(wide, np.finfo(float).tiny):.3g} times as long as wide"
+    return None
+
+
+def _lost_digits(wcs, shape):
+    """What is wrong where the pixel in the middle of an image (Ny, Nx) does not come back from the
+    sky; None where nothing is, or nothing comes back. Of other packages' WCS nothing is asked."""
+    if isinstance(wcs, Interface):
+        return None
+    middle = (np.array(shape) - 1) / 2
+    with np.errstate(all="ignore"):
+        back = pixels_at(wcs, *world_at(wcs, *middle[:, None]))
+    off = np.abs(back - middle).max()
+    if off > BACK_PX:
+        return f"comes back from the sky {off:.3g} px off: an angle of the header is far too large"
     return None
 
 

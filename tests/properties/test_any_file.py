@@ -141,6 +141,7 @@ CARD_VALUE = st.one_of(
 
 
 @given(st.dictionaries(CARDS, CARD_VALUE, max_size=4))
+@example({"LONPOLE": 1.17e16})
 def test_headers_with_any_cards(tmp_path_factory, cards):
     path = tmp_path_factory.mktemp("any") / "image.fits"
     with warnings.catch_warnings():
