@@ -28,14 +28,14 @@ def folder_outputs(arguments, names):
 
 def check_scene(arguments, scene, paths):
     """Raise ValueError, before the fit, where an output is an input or could not hold its names."""
-    from ..files.names import check_observations
+    from ..files.names import check_catalogue_names
     from ..files.whole_file import check_output
 
     for path in paths if paths[0].parent.is_dir() else ():
         check_output(path, overwrite=arguments.overwrite, inputs=scene.inputs.values())
     try:
         magnitudes = scene.observations[0].zero_points is not None
-        check_observations(scene.observations, magnitudes=magnitudes)
+        check_catalogue_names(scene.observations, magnitudes=magnitudes)
     except ValueError as error:
         raise ValueError(f"{arguments.scene}: {error}") from error
 

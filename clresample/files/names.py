@@ -25,7 +25,7 @@ def check_columns(names):
             )
 
 
-def check_observations(observations, *, magnitudes=False):
+def check_catalogue_names(observations, *, magnitudes=False):
     """Raise ValueError where observations, their names and channels' being those of a catalogue's
     columns, give such that FITS cannot hold; magnitudes: see `catalogue`."""
     channels = [channel for o in observations for channel in o.channels]

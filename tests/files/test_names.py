@@ -3,7 +3,7 @@
 import pytest
 from helpers.blends import SCALE, blend, observe, round_component
 
-from clresample.files.names import check_observations
+from clresample.files.names import check_catalogue_names
 from clresample.files.results import write_catalogue
 from clresample.measurement.catalogue import catalogue
 from clresample.sky.grid import Grid
@@ -14,13 +14,13 @@ def test_columns_too_long_for_fits_are_refused_by_name(tmp_path):
     grid, names = Grid.flat((60, 70), SCALE), ("g" * 30, "r" * 30)
     one = observe(grid, names, zero_points=(25.0, 25.0))
     result = blend([round_component(0, (30, 35), (1, 2))], observations=(one,))
-    check_observations([one])
+    check_catalogue_names([one])
     with pytest.raises(ValueError, match="'colour_err_ggggggggg'... of the catalogue has 72 char"):
-        check_observations([one], magnitudes=True)
+        check_catalogue_names([one], magnitudes=True)
     with pytest.raises(ValueError, match="of the catalogue has 69 characters, FITS takes 68"):
-        check_observations([observe(grid, ("i",), name="o" * 64)])
+        check_catalogue_names([observe(grid, ("i",), name="o" * 64)])
     with pytest.raises(ValueError, match="of the catalogue has 69 characters, FITS takes 68"):
-        check_observations([observe(grid, ("i" * 50 + "'" * 5,))])
+        check_catalogue_names([observe(grid, ("i" * 50 + "'" * 5,))])
     table = catalogue(result, magnitudes=True)
     with pytest.raises(ValueError, match="give observations and channels shorter names"):
         write_catalogue(tmp_path / "cat.fits", table)

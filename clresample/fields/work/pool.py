@@ -82,9 +82,7 @@ class Pool:
 
     def begin(self, function):
         """Begin every worker now, and have it load what the function needs, before it is asked."""
-        for seat in sorted(self._faults.keys() - {w.seat for w in self._workers}):
-            worker = self._start(seat)
-            self._workers.append(worker)
+        for worker in self._added(self.n_workers):
             with contextlib.suppress(OSError):  # it has died: its successor loads what it is given
                 worker.pipe.send((function, None))
 
@@ -124,10 +122,8 @@ class Pool:
         for worker in [w for w in self._workers if w.task is None and not w.process.is_alive()]:
             self._workers.remove(worker)  # killed while it had nothing to do
             _end(worker)
-        free = sorted(self._faults.keys() - {w.seat for w in self._workers})
         busy = sum(worker.task is not None for worker in self._workers)
-        for seat in free[: max(0, len(waiting) + busy - len(self._workers))]:
-            self._workers.append(self._start(seat))
+        self._added(max(0, len(waiting) + busy - len(self._workers)))
         for worker in self._workers:
             if worker.task is None and waiting:
                 _give(worker, run, waiting.popleft())
@@ -145,6 +141,14 @@ class Pool:
             else:
                 found.append(outcome)
         return found
+
+    def _added(self, most):
+        """New workers on empty seats, so many at most."""
+        free = sorted(self._faults.keys() - {w.seat for w in self._workers})
+        n_before = len(self._workers)
+        for seat in free[:most]:
+            self._workers.append(self._start(seat))
+        return self._workers[n_before:]
 
     def _count(self, seat, outcome):
         """Count a device's error; the seat goes when there were too many, DeviceError with the
