@@ -13,7 +13,7 @@ import numpy as np
 from .scenes import MODES
 
 # Of all sources in all channels of a scene, each alone and with its shape known. Errors of a fit
-# are larger: by a tenth of faint sources, three times of bright ones.
+# are larger: by up to a half for faint sources, twice to five times for bright ones.
 MEDIAN_SNR = 3.0, 10000.0
 BRIGHTEST_MAG = 18.0  # [mag] about where such exposures saturate
 
