@@ -5,6 +5,8 @@ PYTHON ?= $(shell python3.11 -c '' 2>/dev/null && echo python3.11 || echo python
 VENV ?= .venv
 STAMP = $(VENV)/made
 RUN = $(VENV)/bin/python -m
+# Test files side by side, on up to four cores: most of a test's time is Python's.
+PYTEST = $(RUN) pytest -n auto --maxprocesses 4 --dist loadfile
 
 .PHONY: demo test test-on test-kernels-on grind lint mutants fuzz clean paper paper-full dist \
     test-as-gpu test-install test-oldest test-adapters threads docs soak
@@ -22,14 +24,14 @@ demo: $(STAMP)
 	$(RUN) clresample.cli.demo $(ARGS)
 
 test: $(STAMP)
-	$(RUN) pytest $(ARGS)
+	$(PYTEST) $(ARGS)
 
 # make test-on RUNTIME=pocl|pocl-debian|intel|rusticl [TESTS=...]: on that OpenCL runtime alone.
 # What it needs is fetched into .runtimes/; where that fails, it is skipped, and said so.
 RUNTIME ?= pocl
 TESTS ?= tests
 test-on: $(STAMP)
-	@PYTHON=$(PYTHON) tools/on_runtime.sh $(RUNTIME) $(RUN) pytest $(TESTS) $(ARGS) || \
+	@PYTHON=$(PYTHON) tools/on_runtime.sh $(RUNTIME) $(PYTEST) $(TESTS) $(ARGS) || \
 	    { status=$$?; [ $$status = 77 ] || exit $$status; }
 
 # Kernels' tests on one other runtime.
@@ -38,7 +40,7 @@ test-kernels-on: test-on
 
 # Kernels' tests as kernels are built for GPUs, in buffers that show bad reads and writes.
 test-as-gpu: $(STAMP)
-	$(RUN) pytest $(KERNEL_TESTS) --as-gpu --nan-buffers --guard-buffers $(ARGS)
+	$(PYTEST) $(KERNEL_TESTS) --as-gpu --nan-buffers --guard-buffers $(ARGS)
 
 # Renders and fits in several threads against the same alone, on that runtime.
 threads: $(STAMP)
