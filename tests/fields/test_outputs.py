@@ -16,6 +16,7 @@ from clresample.fields.box import Box
 from clresample.fields.mosaic import FilePlane
 from clresample.fields.run import run_field
 from clresample.fields.strips import STRIPS
+from clresample.files.whole_file import FileError
 
 
 def test_every_column_has_its_unit_and_a_description(done):
@@ -62,3 +63,23 @@ def test_the_provenance_says_what_was_read_and_with_what(sky, tmp_path):
     assert found["packages"]["numpy"] == np.__version__ and found["device"] and found["system"]
     assert found["run"]["threshold"] == 7.0 and "max_iter=" in found["run"]["settings"]
     assert {"search", "link", "fit"} <= set(found["seconds"])
+
+
+def test_all_outputs_appear_together(sky, tmp_path, monkeypatch):
+    """One that cannot be written leaves those of the run before; the next run replaces all."""
+    options, folder = FieldOptions(passes=1, threshold=7.0), tmp_path / "out"
+    folder.mkdir()
+    (folder / "catalogue.fits").write_text("old")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("clresample.fields.outputs._write_provenance", full)
+        with pytest.raises(FileError, match="cannot be written .No space left"):
+            run_field(mosaics_of(sky)[:1], folder, options=options)
+    assert {p.name for p in folder.iterdir()} == {"catalogue.fits", "work"}
+    assert (folder / "catalogue.fits").read_text() == "old"
+    run_field(mosaics_of(sky)[:1], folder, options=options, resume=True)
+    assert len(QTable.read(folder / "catalogue.fits"))
+    assert (folder / "provenance.json").exists()
