@@ -7,7 +7,7 @@ STAMP = $(VENV)/made
 RUN = $(VENV)/bin/python -m
 
 .PHONY: demo test test-on test-kernels-on grind lint mutants fuzz clean paper paper-full dist \
-    test-as-gpu test-install test-oldest test-adapters threads docs soak
+    test-as-gpu test-install test-oldest test-adapters threads docs soak kills
 
 # What runs on one OpenCL device whatever the others are: operators, and the solver's kernels.
 KERNEL_TESTS = tests/device/test_contraction.py tests/device/test_launcher.py \
@@ -65,6 +65,10 @@ fuzz: $(STAMP)
 # Whole fields killed thirty times at random moments, starved and damaged, half an hour.
 soak: $(STAMP)
 	$(RUN) bench.soak $(ARGS)
+
+# Every command killed in the midst of its writing, 56 times, a quarter of an hour.
+kills: $(STAMP)
+	$(RUN) bench.kills $(ARGS)
 
 # The paper's evidence, in bench/report/report.md; an interrupted run continues, a larger one adds.
 paper: GALAXIES = 600
