@@ -12,6 +12,7 @@ from collections import deque
 from dataclasses import dataclass
 from multiprocessing.connection import wait
 
+from ...device import profile
 from ...device.discovery import DeviceError
 from ..strips import STRIPS
 from .share import end_with, hold_memory, keep, return_memory, shared_threads
@@ -216,8 +217,9 @@ def _ended(workers, limit_s):
     for worker in busy:
         if worker.pipe in ready:
             try:
-                value, reason = worker.pipe.recv()
+                value, reason, kernels = worker.pipe.recv()
                 died = False
+                profile.add(kernels)
             except (EOFError, OSError):
                 value, reason, died = None, _dead(worker), True
         elif worker.process.sentinel in ready:
@@ -281,7 +283,7 @@ def _work(pipe, bound, parent):
         except Exception as error:
             answer = None, reason_of(error)
         try:
-            pipe.send(answer)
+            pipe.send((*answer, profile.taken()))
         except OSError:
             return
         del answer, what
