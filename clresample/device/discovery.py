@@ -13,7 +13,7 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
-from .drivers import cure, fault_of, named_library, show_named_library, unseen
+from .drivers import cure, fault_of, named_library, show_named_library, unseen, warn_of
 from .remembered import system_caches
 
 # Order of preference when nothing is chosen; a kind that is not listed comes last.
@@ -162,10 +162,8 @@ def hints():
         found = find_devices()
     except DeviceError:
         found = []
-    library = named_library()
-    if library:
-        fault = fault_of(library)
-        return [f"CLRESAMPLE_ICD={library} cannot be loaded: {fault}"] if fault else []
+    if named_library():
+        return []
     return [
         f"{vendor}'s OpenCL driver is at {path}, where the OpenCL loader does not look: "
         f"{cure(path)}"
@@ -180,7 +178,10 @@ def _served(found):
 
 
 def find_devices():
-    """Every device of every platform, in the drivers' order; DeviceError where there is none."""
+    """Every device of every platform, in the drivers' order; DeviceError where there is none.
+
+    A DeviceWarning says so where the library of CLRESAMPLE_ICD brings no device.
+    """
     cl = load_pyopencl()
     try:
         platforms = cl.get_platforms()
@@ -192,7 +193,10 @@ def find_devices():
             found += platform.get_devices()
         except cl.Error:  # a driver without a device, such as a GPU's on a machine without one
             continue
+    library = named_library()
     if found:
+        if library:
+            warn_of(library, frozenset(d.platform.int_ptr for d in found))
         return found
     if any("Portable Computing" in p.name for p in platforms) and (cause := unusable_cache()):
         raise DeviceError(cause)
@@ -206,6 +210,8 @@ def find_devices():
         way = "install your GPU's OpenCL driver, or the CPU runtime: pip install 'clresample[pocl]'"
         if vendors:
             way += f"; OCL_ICD_VENDORS={vendors} limits the search to that place"
+        if library:
+            way += f"; CLRESAMPLE_ICD={library} {fault_of(library, set())}"
         for vendor, path in unseen([]):
             way += f"; or, for {vendor}'s driver at {path}: {cure(path)}"
     raise DeviceError(f"no {what} found: {way}")
