@@ -7,7 +7,8 @@ STAMP = $(VENV)/made
 RUN = $(VENV)/bin/python -m
 
 .PHONY: demo test test-on test-kernels-on grind lint mutants fuzz clean paper paper-full dist \
-    test-as-gpu test-install test-oldest test-adapters threads docs soak kills
+    test-as-gpu test-install test-oldest test-adapters threads docs soak kills \
+    kernel-tests
 
 # What runs on one OpenCL device whatever the others are: operators, and the solver's kernels.
 KERNEL_TESTS = tests/device/test_contraction.py tests/device/test_launcher.py \
@@ -35,6 +36,10 @@ test-on: $(STAMP)
 # Kernels' tests on one other runtime.
 test-kernels-on: TESTS = $(KERNEL_TESTS)
 test-kernels-on: test-on
+
+# Their names, for bench/gpu_check.sh.
+kernel-tests:
+	@echo $(KERNEL_TESTS)
 
 # Kernels' tests as kernels are built for GPUs, in buffers that show bad reads and writes.
 test-as-gpu: $(STAMP)

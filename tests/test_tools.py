@@ -1,5 +1,6 @@
 """The scripts beside the package: runtimes to test on, and the run of every kernel."""
 
+import os
 import re
 import subprocess
 import sys
@@ -55,3 +56,19 @@ def test_planted_faults_build(device, fault):
     import pyopencl as cl
 
     cl.Kernel(cl.Program(device.context, grind.FAULTS[fault]).build(), fault)
+
+
+def test_a_machine_without_a_device_gets_its_report(tmp_path):
+    """Of bench/gpu_check.sh, which is tried in full on machines with a GPU."""
+    report = tmp_path / "report.md"
+    answer = subprocess.run(
+        [ROOT / "bench" / "gpu_check.sh", report],
+        env={**os.environ, "PYTHON": sys.executable, "CLRESAMPLE_ICD": "/nowhere/lib.so"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert answer.returncode == 1
+    assert "No device could be opened" in report.read_text()
+    assert "a driver library that is not there: /nowhere/lib.so" in report.read_text()
+    assert f"gpu_check: {report}" in answer.stderr
