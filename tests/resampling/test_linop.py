@@ -194,7 +194,7 @@ def test_numbers_that_the_type_cannot_hold_are_refused(device, geometry):
     before = op(x)
     x[1, 0, 3, 4] = 1e39
     for call, name, values in ((op, "x", x), (op.adjoint, "y", 1e39 * np.ones(op.shape_out))):
-        with pytest.raises(ValueError, match=rf"^{name} holds numbers of up to 1e\+39, float32 .*3"):
+        with pytest.raises(ValueError, match=rf"^{name} holds numbers of up to 1e\+39, float32 "):
             call(values)
     assert np.array_equal(op(np.ones((2, *op.shape_in))), before)
     x[1, 0, 3, 4] = np.inf  # what says itself what it is goes through
