@@ -64,13 +64,13 @@ print(f"a small render in float32 against NumPy in float64: {error:.1e}, {ALLOWE
 raise SystemExit(not error <= ALLOWED)'
 # The suite: the tests of all kernels, as `make test-kernels-on` has them.
 read -r -a tests <<<"$(make -s kernel-tests)"
-step "Kernel tests" 240 "$python" -m pytest -q -p no:cacheprovider "${tests[@]}"
-step "Tuning" 60 "$python" -m clresample.cli tune
-step "Devices, tuned" 20 "$python" -m clresample.cli devices --bench
+step "Kernel tests" 220 "$python" -m pytest -q -p no:cacheprovider "${tests[@]}"
+step "Tuning" 90 "$python" -m clresample.cli tune
+step "Devices, tuned" 30 "$python" -m clresample.cli devices --bench
 step "Renders" 50 "$python" -m bench.render --quick
 step "Matrix products" 30 "$python" -m bench.contract
 step "Fits" 70 "$python" -m bench.throughput --quick
-step "Kernels of a fit" 30 env CLRESAMPLE_PROFILE=1 "$python" -c '
+step "Kernels of a fit" 25 env CLRESAMPLE_PROFILE=1 "$python" -c '
 from clresample import get_device
 from clresample.cli.machine.workload import blends, fit
 device = get_device()

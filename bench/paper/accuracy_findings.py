@@ -184,8 +184,7 @@ def _against_sinc(name, off, diagonal):
     return Finding(
         SINC,
         f"within {apart:.2f} dB",
-        f"Off the diagonal the means differ by {apart:.2f} dB at most in float64"
-        f"{on_it}.",
+        f"Off the diagonal the means differ by {apart:.2f} dB at most in float64{on_it}.",
         apart < SIMILAR and all(margin > apart for margin in identity),
         better=min(margins) > -SIMILAR and all(margin > 0 for margin in identity),
         figure=f"{name}-SDR_sinc.png",
