@@ -8,12 +8,21 @@ from __future__ import annotations
 import functools
 import os
 import sys
-import tempfile
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
-from .drivers import cure, fault_of, named_library, show_named_library, unseen, warn_of
+from .drivers import (
+    cure,
+    fault_of,
+    named_library,
+    show_named_library,
+    too_little_space,
+    unseen,
+    unusable_cache,
+    unwritable,
+    warn_of,
+)
 from .remembered import system_caches
 
 # Order of preference when nothing is chosen; a kind that is not listed comes last.
@@ -217,44 +226,15 @@ def find_devices():
     raise DeviceError(f"no {what} found: {way}")
 
 
-def unusable_cache():
-    """What hides PoCL's device although its driver is there; None where nothing is known to.
-
-    PoCL offers no device where it cannot write to its cache of built kernels.
-    """
-    if os.environ.get("POCL_DEVICES"):
-        return (
-            f"PoCL shows no device for POCL_DEVICES={os.environ['POCL_DEVICES']}: unset it, or set "
-            "it to cpu"
-        )
-    home = Path(os.environ.get("HOME") or "/tmp")
-    shared = Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache") / "pocl"
-    folder = Path(os.environ.get("POCL_CACHE_DIR") or shared)
-    if cause := _unwritable(folder):
-        return (
-            f"PoCL cannot write to its cache of built kernels, {folder} ({cause}): "
-            "set POCL_CACHE_DIR to a folder that can be written"
-        )
-    return None
-
-
-def _unwritable(folder):
-    """Why files cannot be made in a folder, in the system's words; None where they can."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        return error.strerror
-    return None
-
-
 def load_pyopencl():
+    if cause := too_little_space():
+        raise DeviceError(cause)
     if os.environ.get("POCL_CACHE_DIR") == "":
         del os.environ["POCL_CACHE_DIR"]  # an empty one ends the process in PoCL 3.1
     if "pyopencl" not in sys.modules and "PYOPENCL_NO_CACHE" not in os.environ:
         # pyopencl keeps some milliseconds' work there, and ends where it cannot
         kept = Path(os.environ.get("XDG_CACHE_HOME") or system_caches()) / "pytools"
-        if _unwritable(kept):
+        if unwritable(kept):
             os.environ["PYOPENCL_NO_CACHE"] = "1"
     try:
         import pyopencl

@@ -40,6 +40,7 @@ FOLDERS = (
     "/opt/rocm*/lib",
     "/opt/amdgpu*/lib/*-linux-gnu",
 )
+LEAST_SPACE = 800 << 20  # [bytes] of addresses, under which builds of small kernels failed
 VENDORS = "/etc/OpenCL/vendors"
 
 
@@ -195,3 +196,52 @@ def _in_full(icd):
     library = icd.read_text().strip()
     beside = icd.parent / library
     return str(beside) if beside.is_file() else library
+
+
+def unusable_cache():
+    """What hides PoCL's device although its driver is there; None where nothing is known to.
+
+    PoCL offers no device where it cannot write to its cache of built kernels.
+    """
+    if os.environ.get("POCL_DEVICES"):
+        return (
+            f"PoCL shows no device for POCL_DEVICES={os.environ['POCL_DEVICES']}: unset it, or set "
+            "it to cpu"
+        )
+    home = Path(os.environ.get("HOME") or "/tmp")
+    shared = Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache") / "pocl"
+    folder = Path(os.environ.get("POCL_CACHE_DIR") or shared)
+    if cause := unwritable(folder):
+        return (
+            f"PoCL cannot write to its cache of built kernels, {folder} ({cause}): "
+            "set POCL_CACHE_DIR to a folder that can be written"
+        )
+    return None
+
+
+def unwritable(folder):
+    """Why files cannot be made in a folder, in the system's words; None where they can."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        return error.strerror
+    return None
+
+
+def too_little_space():
+    """What is to be said where this process may not have the addresses that drivers need; or None.
+
+    Under less, PoCL's compiler ends the process or waits for ever, or no driver is found.
+    """
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    given, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if given == resource.RLIM_INFINITY or given >= LEAST_SPACE:
+        return None
+    return (
+        f"this process may have {given >> 20} MiB of address space, OpenCL's compiler needs "
+        f"{LEAST_SPACE >> 20} MiB: raise the limit (ulimit -v unlimited)"
+    )
