@@ -94,12 +94,13 @@ def run_field(
             field_number=options.field_number,
         )
         parts, unsettled = fitted(job, engine, progress)
+        engine.close()  # its memory is for what follows
+        clock.stop("fit")
+        progress.stage("write", 1)
+        outputs = write_outputs(folder, job, parts, unsettled, about or {}, seconds, options.hats)
     finally:
         engine.close()
-    clock.stop("fit")
-    progress.stage("write", 1)
-    outputs = write_outputs(folder, job, parts, unsettled, about or {}, seconds, options.hats)
-    STRIPS.clear()
+        STRIPS.clear()
     clock.stop("write")
     failed = outputs.status.get("failed", 0)
     return FieldRun(outputs, seconds, failed, plan.lost, tuple(engine.turns))

@@ -65,6 +65,17 @@ def test_the_provenance_says_what_was_read_and_with_what(sky, tmp_path):
     assert {"search", "link", "fit"} <= set(found["seconds"])
 
 
+def test_a_run_that_fails_leaves_no_decoded_rows(sky, tmp_path, monkeypatch):
+    def broken(*_):
+        STRIPS.n_bytes = 1
+        raise MemoryError
+
+    monkeypatch.setattr("clresample.fields.run.take_look", broken)
+    with pytest.raises(MemoryError):
+        run_field(mosaics_of(sky)[:1], tmp_path / "out", options=FieldOptions())
+    assert STRIPS.n_bytes == 0
+
+
 def test_all_outputs_appear_together(sky, tmp_path, monkeypatch):
     """One that cannot be written leaves those of the run before; the next run replaces all."""
     options, folder = FieldOptions(passes=1, threshold=7.0), tmp_path / "out"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import gc
 import multiprocessing
 import os
 import time
@@ -15,7 +14,7 @@ from multiprocessing.connection import wait
 from ...device import profile
 from ...device.discovery import DeviceError
 from ..strips import STRIPS
-from .share import end_with, hold_memory, keep, return_memory, shared_threads
+from .share import end_with, hold_memory, keep, keep_no_more, return_memory, shared_threads
 
 # [s] Between two looks at whether a worker takes too long.
 LOOK_S = 1.0
@@ -274,7 +273,7 @@ def _work(pipe, bound, parent):
             return
         if given is not None:
             function, context, kept = given, what, False
-            gc.unfreeze()  # the last stage's context is no longer kept
+            keep_no_more()  # the last stage's context is no longer kept
             continue
         try:
             answer = function(context, what), None
