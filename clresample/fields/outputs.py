@@ -15,15 +15,19 @@ from pathlib import Path
 from astropy.io import fits
 
 from .. import __version__
-from ..files.whole_file import whole_tree
+from ..files.whole_file import check_output, whole_tree
 from .columns import finished
 from .hats import write_hats
-from .images import write_mosaics
+from .images import file_name, write_mosaics
 from .models import write_models
 from .parquet import write_parquet
 from .work.look import looked
 
 NO_PARQUET = "no catalogue.parquet: pyarrow is not installed (pip install 'clresample[field]')"
+FILES = (
+    *("catalogue.parquet", "catalogue.fits", "catalogue.ecsv", "blends.ecsv", "models.fits"),
+    "provenance.json",
+)
 PACKAGES = (  # those whose numbers enter a catalogue, or whose formats are read and written
     *("numpy", "scipy", "astropy", "pyopencl", "pocl-binary-distribution", "sep"),
     *("pyarrow", "astropy-healpix", "galsim", "gwcs"),
@@ -42,6 +46,15 @@ class Outputs:
     n_blends: int
     status: dict = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+
+
+def check_outputs(folder, mosaics):
+    """Raise FileError where something is in the way that is kept: folders, links, devices."""
+    names = list(FILES)
+    for mosaic in mosaics:
+        names += [f"{what}_{file_name(mosaic.name)}.fits" for what in ("model", "residual")]
+    for name in names if folder.is_dir() else ():
+        check_output(folder / name, overwrite=True)
 
 
 def write_outputs(folder, job, parts, unsettled, about, seconds, hats=False) -> Outputs:

@@ -17,7 +17,7 @@ from .box import Box
 from .hats import check_hats
 from .images import file_name
 from .options import LEAST_MEMORY, FieldOptions, Progress
-from .outputs import Outputs, write_outputs
+from .outputs import Outputs, check_outputs, write_outputs
 from .strips import STRIPS
 from .work.engine import engine_of
 from .work.fitting import Job
@@ -67,6 +67,7 @@ def run_field(
     reference = reference_of(mosaics)
     if options.hats:
         check_hats(reference)
+    check_outputs(folder, mosaics)
     inputs = tuple((about or {}).get("inputs", {}).values())
     work, options = open_folder(
         folder, mosaics, reference, options, resume, overwrite, progress, inputs

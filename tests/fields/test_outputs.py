@@ -76,6 +76,16 @@ def test_a_run_that_fails_leaves_no_decoded_rows(sky, tmp_path, monkeypatch):
     assert STRIPS.n_bytes == 0
 
 
+def test_what_is_in_the_way_is_told_at_once(sky, tmp_path):
+    (euclid,) = mosaics_of(sky)[:1]
+    for name in ("catalogue.ecsv", f"residual_{euclid.name}.fits"):
+        (tmp_path / name).symlink_to("nowhere")
+        with pytest.raises(FileError, match=f"{name}: is a symbolic link, and is kept"):
+            run_field([euclid], tmp_path, options=FieldOptions())
+        assert [p.name for p in tmp_path.iterdir()] == [name]
+        (tmp_path / name).unlink()
+
+
 def test_all_outputs_appear_together(sky, tmp_path, monkeypatch):
     """One that cannot be written leaves those of the run before; the next run replaces all."""
     options, folder = FieldOptions(passes=1, threshold=7.0), tmp_path / "out"
