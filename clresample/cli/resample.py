@@ -241,7 +241,8 @@ def _resampled(arguments, op, pixels):
         with np.errstate(over="ignore"):  # NumPy's warning, of which more is said here
             result = op(pixels)
     except ValueError as error:  # of pixels that the type cannot hold
-        raise ValueError(f"{arguments.image}: {error}".replace("dtype=", "--dtype ")) from error
+        reason = str(error).replace("dtype=", "--dtype ")
+        raise ValueError(f"{arguments.image}: {reason}") from error
     n_bad = int(np.count_nonzero(~np.isfinite(result)))
     if n_bad:
         raise ValueError(
