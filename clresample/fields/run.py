@@ -65,9 +65,7 @@ def run_field(
     mosaics, folder = _as_sent(mosaics), Path(folder)
     seconds: dict[str, float] = {}
     reference = reference_of(mosaics)
-    if options.hats:
-        check_hats(reference)
-    check_outputs(folder, mosaics)
+    _check_outputs(folder, mosaics, reference, options)
     inputs = tuple((about or {}).get("inputs", {}).values())
     work, options = open_folder(
         folder, mosaics, reference, options, resume, overwrite, progress, inputs
@@ -78,8 +76,8 @@ def run_field(
     engine = engine_of(options, progress)
     try:
         take_look(mosaics, reference, work, engine)
-        least = min(options.memory, looked(work).memory)
-        options = replace(options, memory=max(LEAST_MEMORY, least))
+        memory = max(LEAST_MEMORY, min(options.memory, looked(work).memory))
+        options = replace(options, memory=memory)
         plan = planned(mosaics, reference, region, core, work, options, engine, progress, clock)
         job = Job(
             mosaics=mosaics,
@@ -105,6 +103,13 @@ def run_field(
     clock.stop("write")
     failed = outputs.status.get("failed", 0)
     return FieldRun(outputs, seconds, failed, plan.lost, tuple(engine.turns))
+
+
+def _check_outputs(folder, mosaics, reference, options):
+    """Raise ValueError, FileError or ImportError, now, for what cannot be written at the end."""
+    if options.hats:
+        check_hats(reference)
+    check_outputs(folder, mosaics)
 
 
 def reference_of(mosaics) -> Grid:

@@ -42,9 +42,8 @@ class LinOp:
     def forward(self, x, out=None):
         """A x.  x (B,) + shape_in -> (B,) + shape_out, into `out` (of x's kind) if given.
 
-        Raises ValueError for shapes that do not fit, complex x, numbers too large for `dtype`,
-        device arrays of another dtype, layout or context, and an `out` that is on the host where x
-        is on the device or the reverse.
+        Raises ValueError for shapes that do not fit, complex or too large numbers, device arrays of
+        another dtype, layout or context, an `out` that is on the host where x is not or the reverse.
         """
         return self._apply(self._forward, "x", x, out, self.shape_in, self.shape_out)
 
