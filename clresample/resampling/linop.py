@@ -43,7 +43,7 @@ class LinOp:
         """A x.  x (B,) + shape_in -> (B,) + shape_out, into `out` (of x's kind) if given.
 
         Raises ValueError for shapes that do not fit, complex or too large numbers, device arrays of
-        another dtype, layout or context, an `out` that is on the host where x is not or the reverse.
+        another dtype, layout or context, an `out` on the host where x is not or the reverse.
         """
         return self._apply(self._forward, "x", x, out, self.shape_in, self.shape_out)
 
