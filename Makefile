@@ -9,7 +9,8 @@ RUN = $(VENV)/bin/python -m
 PYTEST = $(RUN) pytest -n auto --maxprocesses 4 --dist loadfile
 
 .PHONY: demo test test-on test-kernels-on grind lint mutants fuzz clean paper paper-full dist \
-    test-as-gpu test-install test-oldest test-adapters threads docs soak
+    test-as-gpu test-install test-oldest test-adapters threads docs soak kills \
+    kernel-tests
 
 # What runs on one OpenCL device whatever the others are: operators, and the solver's kernels.
 KERNEL_TESTS = tests/device/test_contraction.py tests/device/test_launcher.py \
@@ -37,6 +38,10 @@ test-on: $(STAMP)
 # Kernels' tests on one other runtime.
 test-kernels-on: TESTS = $(KERNEL_TESTS)
 test-kernels-on: test-on
+
+# Their names, for bench/gpu_check.sh.
+kernel-tests:
+	@echo $(KERNEL_TESTS)
 
 # Kernels' tests as kernels are built for GPUs, in buffers that show bad reads and writes.
 test-as-gpu: $(STAMP)
@@ -67,6 +72,10 @@ fuzz: $(STAMP)
 # Whole fields killed thirty times at random moments, starved and damaged, half an hour.
 soak: $(STAMP)
 	$(RUN) bench.soak $(ARGS)
+
+# Every command killed in the midst of its writing, 56 times, a quarter of an hour.
+kills: $(STAMP)
+	$(RUN) bench.kills $(ARGS)
 
 # The paper's evidence, in bench/report/report.md; an interrupted run continues, a larger one adds.
 paper: GALAXIES = 600
