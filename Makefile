@@ -5,9 +5,12 @@ PYTHON ?= $(shell python3.11 -c '' 2>/dev/null && echo python3.11 || echo python
 VENV ?= .venv
 STAMP = $(VENV)/made
 RUN = $(VENV)/bin/python -m
+# Test files side by side, on up to four cores: most of a test's time is Python's.
+PYTEST = $(RUN) pytest -n auto --maxprocesses 4 --dist loadfile
 
 .PHONY: demo test test-on test-kernels-on grind lint mutants fuzz clean paper paper-full dist \
-    test-as-gpu test-install test-oldest test-adapters threads docs soak
+    test-as-gpu test-install test-oldest test-adapters threads docs soak kills \
+    kernel-tests
 
 # What runs on one OpenCL device whatever the others are: operators, and the solver's kernels.
 KERNEL_TESTS = tests/device/test_contraction.py tests/device/test_launcher.py \
@@ -22,23 +25,27 @@ demo: $(STAMP)
 	$(RUN) clresample.cli.demo $(ARGS)
 
 test: $(STAMP)
-	$(RUN) pytest $(ARGS)
+	$(PYTEST) $(ARGS)
 
 # make test-on RUNTIME=pocl|pocl-debian|intel|rusticl [TESTS=...]: on that OpenCL runtime alone.
 # What it needs is fetched into .runtimes/; where that fails, it is skipped, and said so.
 RUNTIME ?= pocl
 TESTS ?= tests
 test-on: $(STAMP)
-	@PYTHON=$(PYTHON) tools/on_runtime.sh $(RUNTIME) $(RUN) pytest $(TESTS) $(ARGS) || \
+	@PYTHON=$(PYTHON) tools/on_runtime.sh $(RUNTIME) $(PYTEST) $(TESTS) $(ARGS) || \
 	    { status=$$?; [ $$status = 77 ] || exit $$status; }
 
 # Kernels' tests on one other runtime.
 test-kernels-on: TESTS = $(KERNEL_TESTS)
 test-kernels-on: test-on
 
+# Their names, for bench/gpu_check.sh.
+kernel-tests:
+	@echo $(KERNEL_TESTS)
+
 # Kernels' tests as kernels are built for GPUs, in buffers that show bad reads and writes.
 test-as-gpu: $(STAMP)
-	$(RUN) pytest $(KERNEL_TESTS) --as-gpu --nan-buffers --guard-buffers $(ARGS)
+	$(PYTEST) $(KERNEL_TESTS) --as-gpu --nan-buffers --guard-buffers $(ARGS)
 
 # Renders and fits in several threads against the same alone, on that runtime.
 threads: $(STAMP)
@@ -65,6 +72,10 @@ fuzz: $(STAMP)
 # Whole fields killed thirty times at random moments, starved and damaged, half an hour.
 soak: $(STAMP)
 	$(RUN) bench.soak $(ARGS)
+
+# Every command killed in the midst of its writing, 56 times, a quarter of an hour.
+kills: $(STAMP)
+	$(RUN) bench.kills $(ARGS)
 
 # The paper's evidence, in bench/report/report.md; an interrupted run continues, a larger one adds.
 paper: GALAXIES = 600

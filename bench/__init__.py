@@ -8,6 +8,7 @@ settings   `python -m bench.settings`: accuracy with the default settings beside
 coverage   `python -m bench.coverage`: how often the errors of simulated galaxies hold the truth
 field      `python -m bench.field`: whole simulated mosaics to a catalogue, beside the truth
 soak       `python -m bench.soak`: fields killed, starved and damaged, to the same catalogue
+kills      `python -m bench.kills`: every command killed while it writes, and run again
 scaling    `python -m bench.scaling`: a field by numbers of workers, and one blend of many sources
 on_paper   `python -m bench.on_paper`: what surveys take, by arithmetic from what was measured
 throughput `python -m bench.throughput`: core-seconds of a source, and blends of many sources

@@ -23,6 +23,7 @@ import resource
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 
 import numpy as np
@@ -50,20 +51,31 @@ TILES = "\n[field]\ntile_px = 64\noverlap_px = 16\n"
 
 
 def start(sky, out, *options, environment=None, before=None):
-    """The command, begun; it goes on where a run in this folder has begun."""
+    """The command, begun; it goes on where a run in this folder has begun. For its errors see
+    `told`: a file holds them, since a pipe that nobody reads would stop it when full."""
     if (out / "work" / "run.json").exists():
         options = *options, "--resume"
     words = [sys.executable, "-m", "clresample.cli", "field", sky / "field.toml", "-o", out]
     words += ["--workers", 2, "--quiet", *options]
-    return subprocess.Popen(
+    errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - read when the process has ended
+    process = subprocess.Popen(
         [str(word) for word in words],
         cwd=ROOT,
         stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
+        stderr=errors,
         env={**os.environ, **(environment or {})},
         preexec_fn=before,
-        text=True,
     )
+    process.errors = errors
+    return process
+
+
+def told(process):
+    """What a process of `start` says on standard error, once it has ended."""
+    process.wait()
+    with process.errors as file:
+        file.seek(0)
+        return file.read().strip()
 
 
 def parts_in(out):
@@ -107,7 +119,7 @@ def full_disk(sky, out, whole, took_s):
         while True:
             before = None if mounted else functools.partial(_limit_files, room)
             process = start(sky, out, before=before)
-            _, said = process.communicate()
+            said = told(process)
             if process.returncode == 0:
                 break
             if "cannot be written" not in said or process.returncode < 0:
@@ -148,14 +160,14 @@ def damaged_tile(sky, out, whole, took_s):
         with open(folder / "field.toml", "a") as file:
             file.write(TILES)
     first, _ = damage(bad / "euclid.fits")
-    start(good, out.with_name("clean")).communicate()
+    start(good, out.with_name("clean")).wait()
     process = start(bad, out)
     kills = kill_at(process, took_s * 0.6, "run", random.Random(0))
-    process.communicate()
+    process.wait()
     parts = parts_in(out)
     if kills:
         process = start(bad, out)
-        process.communicate()
+        process.wait()
     rows, clean = (QTable.read(f / "catalogue.fits") for f in (out, out.with_name("clean")))
     lost = json.loads((out / "provenance.json").read_text())["lost_tiles"]
     failed = np.array([str(s) == "failed" for s in rows["status"]], bool)
@@ -203,7 +215,7 @@ def compared(rows, clean):
 def small_device(sky, out, whole, took_s):
     """A run on a device with a tenth of the memory, its processes held to a gigabyte."""
     process = start(sky, out, "--memory", "1G", environment=SMALL)
-    _, said = process.communicate()
+    said = told(process)
     if process.returncode != 0:
         return row_of(False, False, f"exit status {process.returncode}: {said.strip()[-80:]}")
     rows, clean = (QTable.read(f / "catalogue.fits") for f in (out, whole))
@@ -235,7 +247,7 @@ def killed_writing(sky, out, whole, took_s):
             process = start(sky, out)
         time.sleep(SOON_S)
     if process.returncode != 0:
-        said = process.stderr.read().strip()
+        said = told(process)
         return row_of(False, False, f"exit status {process.returncode}: {said[-80:]}", kills)
     same = same_bytes(out, whole)
     about = f"{left} files were left unfinished"
@@ -248,7 +260,7 @@ def hanging(sky, out, whole, took_s):
     process = start(sky, out, "--limit", max(HANGS_S, 2 * took_s))
     stopped = kill_at(process, 0.5 * took_s, "worker", random.Random(0), signal.SIGSTOP)
     parts = parts_in(out)
-    process.communicate()
+    process.wait()
     same = process.returncode == 0 and same_bytes(out, whole)
     about = "one worker stopped" if stopped else "the run had ended before a worker was stopped"
     return row_of(same, same, about, int(stopped), parts, 0.5)

@@ -31,12 +31,26 @@ step() {
     [ "$status" = 0 ] || failed=1
 }
 
-name=$("$python" -c 'from clresample import get_device; print(get_device())') || exit 1
+name=$("$python" -c '
+from clresample import DeviceError, get_device
+try:
+    print(get_device())
+except DeviceError as error:
+    raise SystemExit(str(error))' 2>"$part") || name=
 {
-    printf '# %s\n\n' "$name"
+    printf '# %s\n\n' "${name:-No device}"
     printf '%s, %s, commit %s.\n' "$(date -u +%Y-%m-%dT%H:%MZ)" "$(uname -sm)" \
         "$(git rev-parse --short HEAD 2>/dev/null || echo unknown)"
-} >"$report"
+    if [ -z "$name" ]; then
+        printf '\n**No device could be opened, nothing was measured.**\n\n'
+        sed 's/^/    /' "$part"
+    fi
+} >"$report" || exit 1
+if [ -z "$name" ]; then
+    cat "$part" >&2
+    echo "gpu_check: $report" >&2
+    exit 1
+fi
 
 export PYTHONUNBUFFERED=1 OMP_NUM_THREADS=1
 step "Devices" 40 "$python" -m clresample.cli devices --bench
@@ -48,15 +62,15 @@ found, truth = render(get_device()), reference()
 error = np.linalg.norm(found - truth) / np.linalg.norm(truth)
 print(f"a small render in float32 against NumPy in float64: {error:.1e}, {ALLOWED:g} allowed")
 raise SystemExit(not error <= ALLOWED)'
-step "Kernel tests" 150 "$python" -m pytest -q -p no:cacheprovider tests/device/test_contraction.py \
-    tests/device/test_selftest.py tests/resampling/test_resampler.py \
-    tests/deblending/test_constraints.py tests/deblending/test_gradient.py
-step "Tuning" 100 "$python" -m clresample.cli tune
+# The suite: the tests of all kernels, as `make test-kernels-on` has them.
+read -r -a tests <<<"$(make -s kernel-tests)"
+step "Kernel tests" 220 "$python" -m pytest -q -p no:cacheprovider "${tests[@]}"
+step "Tuning" 90 "$python" -m clresample.cli tune
 step "Devices, tuned" 30 "$python" -m clresample.cli devices --bench
-step "Renders" 60 "$python" -m bench.render --quick
-step "Matrix products" 40 "$python" -m bench.contract
-step "Fits" 80 "$python" -m bench.throughput --quick
-step "Kernels of a fit" 30 env CLRESAMPLE_PROFILE=1 "$python" -c '
+step "Renders" 50 "$python" -m bench.render --quick
+step "Matrix products" 30 "$python" -m bench.contract
+step "Fits" 70 "$python" -m bench.throughput --quick
+step "Kernels of a fit" 25 env CLRESAMPLE_PROFILE=1 "$python" -c '
 from clresample import get_device
 from clresample.cli.machine.workload import blends, fit
 device = get_device()

@@ -27,7 +27,7 @@ from pathlib import Path
 from clresample import simulate_field
 from clresample.cli.simulate import write_field
 
-from .faults import FAULTS, kill_at, parts_in, start
+from .faults import FAULTS, kill_at, parts_in, start, told
 from .harness import records
 from .harness.clock import on_all_cores
 from .harness.options import Parser, run, seed
@@ -54,7 +54,7 @@ def disturbed(sky, out, expected, took_s, what, rng):
     status = process.wait()
     while status != 0:
         if status != -signal.SIGKILL:
-            said = process.stderr.read().strip()
+            said = told(process)
             raise RuntimeError(f"exit status {status} after {kills} kills of a {what}: {said}")
         process = start(sky, out)
         if rng.random() < 0.5:

@@ -8,14 +8,15 @@ fills each new buffer of a device with NaN, so that a kernel that reads what nob
 import os
 import shutil
 import signal
-import tempfile
 from pathlib import Path
 
 # Before NumPy is loaded: on small matrices BLAS threads only wait for each other, and for PoCL's.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 # What the user's own devices were tuned to is no matter of the tests. Processes that tests start
-# have the same folder; it is removed at the end.
-os.environ["CLRESAMPLE_CACHE"] = tempfile.mkdtemp(prefix="clresample-cache-")
+# have the same folder; it is removed at the end, or by the next run where this one is killed.
+from clresample.device.drivers import temporary_folder
+
+os.environ["CLRESAMPLE_CACHE"] = str(temporary_folder("cache"))
 
 import numpy as np
 import pytest

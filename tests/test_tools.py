@@ -1,5 +1,6 @@
 """The scripts beside the package: runtimes to test on, and the run of every kernel."""
 
+import os
 import re
 import subprocess
 import sys
@@ -55,3 +56,55 @@ def test_planted_faults_build(device, fault):
     import pyopencl as cl
 
     cl.Kernel(cl.Program(device.context, grind.FAULTS[fault]).build(), fault)
+
+
+def test_a_machine_without_a_device_gets_its_report(tmp_path):
+    """Of bench/gpu_check.sh, which is tried in full on machines with a GPU."""
+    report = tmp_path / "report.md"
+    answer = subprocess.run(
+        [ROOT / "bench" / "gpu_check.sh", report],
+        env={**os.environ, "PYTHON": sys.executable, "CLRESAMPLE_ICD": "/nowhere/lib.so"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert answer.returncode == 1
+    assert "No device could be opened" in report.read_text()
+    assert "a driver library that is not there: /nowhere/lib.so" in report.read_text()
+    assert f"gpu_check: {report}" in answer.stderr
+
+
+MAKE = """#!/bin/sh
+case "$* " in
+"test VENV"*) echo "=== 7 passed in 1.0s ===" ;;
+*RUNTIME=intel*) echo "1 test"; {intel} ;;
+*RUNTIME=rusticl*) echo "skipped: no runtime rusticl here: no network" ;;
+*) echo "5 passed in 1.0s" ;;
+esac
+"""
+
+
+@pytest.mark.parametrize(
+    "intel, status, said",
+    [
+        ("exit 0", 0, "=== 7 passed in 1.0s ===; rusticl NOT RUN"),
+        ("sleep 9", 0, "; intel NOT RUN TO THE END, no answer in time; rusticl NOT RUN"),
+        ("echo ..F.; sleep 9", 1, "; intel NOT RUN TO THE END, no answer in time"),
+        ("exit 2", 2, "=== 7 passed in 1.0s ==="),
+    ],
+)
+def test_runtimes_that_were_not_tested_stand_in_the_last_line(tmp_path, intel, status, said):
+    script = ROOT / ".ci" / "run"
+    if not script.exists():
+        pytest.skip("this checkout has no .ci")
+    (tmp_path / "make").write_text(MAKE.format(intel=intel))
+    (tmp_path / "make").chmod(0o755)
+    answer = subprocess.run(
+        ["bash", script],
+        env={**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "PATIENCE_S": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert answer.returncode == status, answer.stderr
+    assert answer.stdout.splitlines()[-1].endswith(said)

@@ -6,7 +6,7 @@ import argparse
 import time
 from dataclasses import replace
 
-from .options import add_device_option, note, positive, size, whole
+from .options import add_device_option, add_profile_option, note, positive, size, whole
 
 DESCRIPTION = """\
 Find, fit and measure every source of a field: mosaics of any size, of several
@@ -90,6 +90,7 @@ def add_field(commands):
         help="write the catalogue as HATS too, which LSDB opens (extra hats)",
     )
     add_device_option(parser, several=True)
+    add_profile_option(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress, no notes")
     parser.set_defaults(run=run)
 

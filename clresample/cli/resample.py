@@ -237,8 +237,12 @@ def _resampled(arguments, op, pixels):
     """The result. Raises ValueError where it has overflowed."""
     import numpy as np
 
-    with np.errstate(over="ignore"):  # NumPy's warning, of which more is said here
-        result = op(pixels)
+    try:
+        with np.errstate(over="ignore"):  # NumPy's warning, of which more is said here
+            result = op(pixels)
+    except ValueError as error:  # of pixels that the type cannot hold
+        reason = str(error).replace("dtype=", "--dtype ")
+        raise ValueError(f"{arguments.image}: {reason}") from error
     n_bad = int(np.count_nonzero(~np.isfinite(result)))
     if n_bad:
         raise ValueError(

@@ -84,10 +84,11 @@ def _part(text):
 
 def run(arguments):
     """Simulate and write. Raises ValueError and FileError, one line, for what cannot be done."""
-    from ..files.whole_file import check_output
+    from ..files.whole_file import check_folder, check_output
     from ..simulation.field import simulate_field
 
     folder = Path(arguments.output)
+    check_folder(folder)
     for name in FILES if folder.exists() else ():
         check_output(folder / name, overwrite=arguments.overwrite)
     try:
@@ -105,25 +106,47 @@ def run(arguments):
     except ImportError as error:
         raise ValueError(f"simulate: {error}") from error
     write = write_field if arguments.format == "plain" else write_surveys
-    for path in write(folder, field):
+    for path in write(folder, field, overwrite=arguments.overwrite):
         print(path)
     note(arguments, f"next: clresample field {folder / FILES[0]} -o {folder / 'out'}")
 
 
-def write_field(folder, field) -> list[Path]:
+def write_field(folder, field, *, overwrite=True) -> list[Path]:
     """Write a SimulatedField: an image and a PSF cube of each mosaic, field.toml, truth.ecsv.
 
     An image file has the HDUs SCI (cube of bands, tile-compressed without loss), RMS and MASK,
-    whose bit BAD (1) marks dead columns. Returns the paths, field.toml first.
+    whose bit BAD (1) marks dead columns. All files appear together. overwrite: whether they may
+    replace others. Returns the paths, field.toml first.
     """
+    return _written(_write_plain, folder, field, overwrite)
+
+
+def write_surveys(folder, field, *, overwrite=True) -> list[Path]:
+    """Write a SimulatedField as its surveys hand out their data, field.toml, truth.ecsv.
+
+    As `write_field`. euclid/ holds a tile of MER, rubin/ a cell coadd for each band. Dead columns
+    have the flag 1 there and NO_DATA here.
+    """
+    return _written(_write_surveys, folder, field, overwrite)
+
+
+def _written(write, folder, field, overwrite):
+    """The paths of what write(part, field) has put into a folder `part`, moved to `folder`."""
+    from ..files.whole_file import whole_tree
+
+    with whole_tree(folder, overwrite=overwrite) as part:
+        paths = write(part, field)
+    return [Path(folder) / path.relative_to(part) for path in paths]
+
+
+def _write_plain(folder, field):
+    """The files of `write_field`."""
     import numpy as np
     from astropy.io import fits
     from astropy.table import Table
 
     from ..files.fits import write_hdus
 
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     paths, tables = [], []
     lossless = {"compression_type": "GZIP_2", "quantize_level": 0}
     for mosaic in field.mosaics:
@@ -158,30 +181,21 @@ def _with_truth(folder, tables, paths, field):
     """Write field.toml and truth.ecsv; all paths, field.toml first."""
     from astropy.table import Table
 
-    from ..files.whole_file import whole_file
-
-    with whole_file(folder / FILES[0]) as part:
-        part.write_text("\n".join(tables))
-    truth = Table(field.truth)
-    with whole_file(folder / FILES[1]) as part:
-        truth.write(part, format="ascii.ecsv", overwrite=True)
+    (folder / FILES[0]).write_text("\n".join(tables))
+    Table(field.truth).write(folder / FILES[1], format="ascii.ecsv", overwrite=True)
     return [folder / FILES[0], *paths, folder / FILES[1]]
 
 
-def write_surveys(folder, field) -> list[Path]:
-    """Write a SimulatedField as its surveys hand out their data, field.toml, truth.ecsv.
-
-    euclid/ holds a tile of MER, rubin/ a cell coadd for each band. Dead columns have the flag 1
-    there and NO_DATA here. Returns the paths, field.toml first.
-    """
+def _write_surveys(folder, field):
+    """The files of `write_surveys`."""
     import numpy as np
 
     from ..fields.psfs.sampled import PSFCube
     from ..fields.readers.writers import write_cell_coadd, write_mer_tile
 
-    folder, (euclid, rubin) = Path(folder), field.mosaics
+    euclid, rubin = field.mosaics
     for name in ("euclid", "rubin"):
-        (folder / name).mkdir(parents=True, exist_ok=True)
+        (folder / name).mkdir()
     paths = []
     for i, (band, point) in enumerate(_bands(euclid)):
         paths += write_mer_tile(

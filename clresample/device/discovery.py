@@ -8,12 +8,21 @@ from __future__ import annotations
 import functools
 import os
 import sys
-import tempfile
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
-from .drivers import cure, fault_of, named_library, show_named_library, unseen
+from .drivers import (
+    cure,
+    fault_of,
+    named_library,
+    show_named_library,
+    too_little_space,
+    unseen,
+    unusable_cache,
+    unwritable,
+    warn_of,
+)
 from .remembered import system_caches
 
 # Order of preference when nothing is chosen; a kind that is not listed comes last.
@@ -162,10 +171,8 @@ def hints():
         found = find_devices()
     except DeviceError:
         found = []
-    library = named_library()
-    if library:
-        fault = fault_of(library)
-        return [f"CLRESAMPLE_ICD={library} cannot be loaded: {fault}"] if fault else []
+    if named_library():
+        return []
     return [
         f"{vendor}'s OpenCL driver is at {path}, where the OpenCL loader does not look: "
         f"{cure(path)}"
@@ -180,7 +187,10 @@ def _served(found):
 
 
 def find_devices():
-    """Every device of every platform, in the drivers' order; DeviceError where there is none."""
+    """Every device of every platform, in the drivers' order; DeviceError where there is none.
+
+    A DeviceWarning says so where the library of CLRESAMPLE_ICD brings no device.
+    """
     cl = load_pyopencl()
     try:
         platforms = cl.get_platforms()
@@ -192,7 +202,10 @@ def find_devices():
             found += platform.get_devices()
         except cl.Error:  # a driver without a device, such as a GPU's on a machine without one
             continue
+    library = named_library()
     if found:
+        if library:
+            warn_of(library, frozenset(d.platform.int_ptr for d in found))
         return found
     if any("Portable Computing" in p.name for p in platforms) and (cause := unusable_cache()):
         raise DeviceError(cause)
@@ -206,49 +219,22 @@ def find_devices():
         way = "install your GPU's OpenCL driver, or the CPU runtime: pip install 'clresample[pocl]'"
         if vendors:
             way += f"; OCL_ICD_VENDORS={vendors} limits the search to that place"
+        if library:
+            way += f"; CLRESAMPLE_ICD={library} {fault_of(library, set())}"
         for vendor, path in unseen([]):
             way += f"; or, for {vendor}'s driver at {path}: {cure(path)}"
     raise DeviceError(f"no {what} found: {way}")
 
 
-def unusable_cache():
-    """What hides PoCL's device although its driver is there; None where nothing is known to.
-
-    PoCL offers no device where it cannot write to its cache of built kernels.
-    """
-    if os.environ.get("POCL_DEVICES"):
-        return (
-            f"PoCL shows no device for POCL_DEVICES={os.environ['POCL_DEVICES']}: unset it, or set "
-            "it to cpu"
-        )
-    home = Path(os.environ.get("HOME") or "/tmp")
-    shared = Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache") / "pocl"
-    folder = Path(os.environ.get("POCL_CACHE_DIR") or shared)
-    if cause := _unwritable(folder):
-        return (
-            f"PoCL cannot write to its cache of built kernels, {folder} ({cause}): "
-            "set POCL_CACHE_DIR to a folder that can be written"
-        )
-    return None
-
-
-def _unwritable(folder):
-    """Why files cannot be made in a folder, in the system's words; None where they can."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        return error.strerror
-    return None
-
-
 def load_pyopencl():
+    if cause := too_little_space():
+        raise DeviceError(cause)
     if os.environ.get("POCL_CACHE_DIR") == "":
         del os.environ["POCL_CACHE_DIR"]  # an empty one ends the process in PoCL 3.1
     if "pyopencl" not in sys.modules and "PYOPENCL_NO_CACHE" not in os.environ:
         # pyopencl keeps some milliseconds' work there, and ends where it cannot
         kept = Path(os.environ.get("XDG_CACHE_HOME") or system_caches()) / "pytools"
-        if _unwritable(kept):
+        if unwritable(kept):
             os.environ["PYOPENCL_NO_CACHE"] = "1"
     try:
         import pyopencl

@@ -7,14 +7,19 @@ often have a GPU's library without its .icd file.
 from __future__ import annotations
 
 import ctypes
+import functools
 import os
+import platform
 import re
 import shutil
 import subprocess
 import tempfile
+import warnings
 import weakref
 from contextlib import suppress
 from pathlib import Path
+
+from .remembered import DeviceWarning
 
 # OpenCL drivers of GPUs, by their library.
 LIBRARIES = {
@@ -35,6 +40,7 @@ FOLDERS = (
     "/opt/rocm*/lib",
     "/opt/amdgpu*/lib/*-linux-gnu",
 )
+LEAST_SPACE = 800 << 20  # [bytes] of addresses, under which builds of small kernels failed
 VENDORS = "/etc/OpenCL/vendors"
 
 
@@ -54,7 +60,7 @@ def show_named_library():
         return
     if "/" in library and not Path(library).exists():
         raise FileNotFoundError(library)
-    folder = Path(tempfile.mkdtemp(prefix="clresample-icd-"))
+    folder = temporary_folder("icd")
     weakref.finalize(_Vendors, shutil.rmtree, folder, ignore_errors=True)
     for name, known in (_known() | {"clresample.icd": library}).items():
         (folder / name).write_text(known)
@@ -82,13 +88,71 @@ def unseen(served):
     return list(paths.items())
 
 
-def fault_of(library):
-    """Why a driver library cannot be loaded, in the system's words; None where it can."""
+def fault_of(library, served):
+    """What is wrong with a driver library that brings no device, in words; None where it does.
+
+    served: addresses of the platforms that have a device
+    """
     try:
-        ctypes.CDLL(library)
+        loaded = ctypes.CDLL(library)
     except OSError as error:
-        return str(error)
-    return None
+        return f"cannot be loaded: {error}"
+    platforms = _platforms_of(loaded)
+    if platforms is None:
+        return "is no OpenCL driver"
+    return None if platforms & served else "is an OpenCL driver that finds no device here"
+
+
+@functools.cache  # once
+def warn_of(library, served):
+    """Warn of the library of CLRESAMPLE_ICD where it brings no device."""
+    if fault := fault_of(library, served):
+        warnings.warn(f"CLRESAMPLE_ICD={library} {fault}", DeviceWarning, stacklevel=3)
+
+
+def _platforms_of(library):
+    """Addresses of a driver library's platforms, None of what is no driver: as the loader asks."""
+    find = getattr(library, "clGetExtensionFunctionAddress", None)
+    if find is None:
+        return None
+    find.restype, find.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
+    address = find(b"clIcdGetPlatformIDsKHR")
+    if not address:
+        return None
+    number = ctypes.c_uint(0)
+    whole = ctypes.POINTER(ctypes.c_uint)
+    get = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_uint, ctypes.POINTER(ctypes.c_void_p), whole)(
+        address
+    )
+    if get(0, None, ctypes.byref(number)) != 0:
+        return set()
+    found = (ctypes.c_void_p * number.value)()
+    get(number, found, None)
+    return set(found)
+
+
+def temporary_folder(kind):
+    """A folder of this process among the temporary files, after those of this user's processes on
+    this machine that are gone, killed perhaps, are removed."""
+    host = re.sub(r"[\W_]", "", platform.node())[:32] or "host"  # containers may share the place
+    mine = re.compile(rf"clresample-{kind}-{host}-(\d+)-\w+")
+    for entry in list(os.scandir(tempfile.gettempdir())) if os.name == "posix" else ():
+        found = mine.fullmatch(entry.name)
+        with suppress(OSError):
+            if found and entry.stat(follow_symlinks=False).st_uid == os.getuid():
+                _remove_of_gone(entry, int(found[1]))
+    return Path(tempfile.mkdtemp(prefix=f"clresample-{kind}-{host}-{os.getpid()}-"))
+
+
+def _remove_of_gone(entry, pid):
+    """Remove a folder unless a process has this number, or may have it."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        if entry.is_dir(follow_symlinks=False):
+            shutil.rmtree(entry.path)
+    except OverflowError:
+        return
 
 
 def cure(path):
@@ -132,3 +196,52 @@ def _in_full(icd):
     library = icd.read_text().strip()
     beside = icd.parent / library
     return str(beside) if beside.is_file() else library
+
+
+def unusable_cache():
+    """What hides PoCL's device although its driver is there; None where nothing is known to.
+
+    PoCL offers no device where it cannot write to its cache of built kernels.
+    """
+    if os.environ.get("POCL_DEVICES"):
+        return (
+            f"PoCL shows no device for POCL_DEVICES={os.environ['POCL_DEVICES']}: unset it, or set "
+            "it to cpu"
+        )
+    home = Path(os.environ.get("HOME") or "/tmp")
+    shared = Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache") / "pocl"
+    folder = Path(os.environ.get("POCL_CACHE_DIR") or shared)
+    if cause := unwritable(folder):
+        return (
+            f"PoCL cannot write to its cache of built kernels, {folder} ({cause}): "
+            "set POCL_CACHE_DIR to a folder that can be written"
+        )
+    return None
+
+
+def unwritable(folder):
+    """Why files cannot be made in a folder, in the system's words; None where they can."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        return error.strerror
+    return None
+
+
+def too_little_space():
+    """What is to be said where this process may not have the addresses that drivers need; or None.
+
+    Under less, PoCL's compiler ends the process or waits for ever, or no driver is found.
+    """
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    given, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if given == resource.RLIM_INFINITY or given >= LEAST_SPACE:
+        return None
+    return (
+        f"this process may have {given >> 20} MiB of address space, OpenCL's compiler needs "
+        f"{LEAST_SPACE >> 20} MiB: raise the limit (ulimit -v unlimited)"
+    )

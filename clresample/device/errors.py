@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from .discovery import DeviceError, format_size, load_pyopencl, unusable_cache
+from .discovery import DeviceError, format_size, load_pyopencl
+from .drivers import unusable_cache
 
 # Status codes after which the device or its queue no longer answers.
 # -9999 is NVIDIA's own code for an illegal access, after which its context is dead.

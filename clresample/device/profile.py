@@ -2,7 +2,7 @@
 
 A device that is opened while CLRESAMPLE_PROFILE is set times every launch. The table is printed on
 standard error when the process ends, or by the command at its end. Timing takes some microseconds
-a launch.
+a launch. Of a field's worker processes it holds the sums.
 """
 
 from __future__ import annotations
@@ -80,6 +80,19 @@ class Profile:
         ]
         return "\n".join([f"kernels on {self.name}:", *lines])
 
+    def add(self, rows):
+        """Add what another process has measured, {kernel: Row}."""
+        for kernel, row in rows.items():
+            mine = self._rows[kernel]
+            mine.n_calls += row.n_calls
+            mine.seconds += row.seconds
+            mine.flops += row.flops
+            mine.n_bytes += row.n_bytes
+
+    def clear(self):
+        """Begin anew."""
+        self._rows.clear()
+
     def _read(self):
         events, self._events = self._events, []
         for event, kernel, (n_flops, n_bytes) in events:
@@ -106,10 +119,30 @@ def started(name):
     """A Profile for a device that is opened now; None where CLRESAMPLE_PROFILE does not ask."""
     if os.environ.get("CLRESAMPLE_PROFILE", "0") in ("", "0"):
         return None
+    return _begun(name)
+
+
+def _begun(name):
     if not _PROFILES:
         atexit.register(report)
     _PROFILES.append(Profile(name))
     return _PROFILES[-1]
+
+
+def taken():
+    """[(device's name, {kernel: Row}), ...] of what this process has launched since it was last
+    asked: for the process that it works for."""
+    found = [(profile.name, profile.rows()) for profile in _PROFILES]
+    for profile in _PROFILES:
+        profile.clear()
+    return [(name, rows) for name, rows in found if rows]
+
+
+def add(found):
+    """Add what another process has `taken` to this one's tables, one for each device's name."""
+    for name, rows in found:
+        same = [profile for profile in _PROFILES if profile.name == name]
+        (same[0] if same else _begun(name)).add(rows)
 
 
 def report():
@@ -118,4 +151,4 @@ def report():
         table = profile.table()
         if table:
             print(table, file=sys.stderr, flush=True)
-        profile._rows.clear()
+        profile.clear()

@@ -27,7 +27,7 @@ def write_mosaics(folder, job, parts, last):
         if not here.area:
             continue
         shape = len(mosaic.channels), *here.shape
-        scratch = job.folder / f"model-{i_mosaic}.npy"
+        scratch = folder / f".model-{i_mosaic}.npy"
         model = mapped_array(scratch, np.float32, shape)
         for i, part in enumerate(parts):
             chosen = {patch for patch, k in last.items() if k == i}

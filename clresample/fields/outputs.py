@@ -15,15 +15,19 @@ from pathlib import Path
 from astropy.io import fits
 
 from .. import __version__
-from ..files.whole_file import whole_file
+from ..files.whole_file import check_output, whole_tree
 from .columns import finished
 from .hats import write_hats
-from .images import write_mosaics
+from .images import file_name, write_mosaics
 from .models import write_models
 from .parquet import write_parquet
 from .work.look import looked
 
 NO_PARQUET = "no catalogue.parquet: pyarrow is not installed (pip install 'clresample[field]')"
+FILES = (
+    *("catalogue.parquet", "catalogue.fits", "catalogue.ecsv", "blends.ecsv", "models.fits"),
+    "provenance.json",
+)
 PACKAGES = (  # those whose numbers enter a catalogue, or whose formats are read and written
     *("numpy", "scipy", "astropy", "pyopencl", "pocl-binary-distribution", "sep"),
     *("pyarrow", "astropy-healpix", "galsim", "gwcs"),
@@ -44,8 +48,17 @@ class Outputs:
     notes: tuple[str, ...] = ()
 
 
+def check_outputs(folder, mosaics):
+    """Raise FileError where something is in the way that is kept: folders, links, devices."""
+    names = list(FILES)
+    for mosaic in mosaics:
+        names += [f"{what}_{file_name(mosaic.name)}.fits" for what in ("model", "residual")]
+    for name in names if folder.is_dir() else ():
+        check_output(folder / name, overwrite=True)
+
+
 def write_outputs(folder, job, parts, unsettled, about, seconds, hats=False) -> Outputs:
-    """Write all outputs of a field, each file whole or not at all.
+    """Write all outputs of a field, all files together or none; the folder of HATS before them.
 
     folder: to write into; job: Job; parts: PartFiles, those of later rounds last
     unsettled: parents of cut blends whose pieces did not settle
@@ -57,15 +70,16 @@ def write_outputs(folder, job, parts, unsettled, about, seconds, hats=False) -> 
     """
     last = _last_rounds(parts)
     table, blends = finished(job, parts, last, unsettled)
-    paths = list(_write_catalogues(folder, table))
-    notes = () if find_spec("pyarrow") else (NO_PARQUET,)
-    if hats and len(table):
-        paths.append(write_hats(folder / "hats", table))
-    paths.append(_write_ecsv(folder / "blends.ecsv", blends))
-    paths.append(write_models(folder / "models.fits", job, parts, last, set(table["id"].tolist())))
-    paths += write_mosaics(folder, job, parts, last)
     status = Counter(str(s).split(":")[0] for s in blends["status"])
-    paths.append(_write_provenance(folder / "provenance.json", job, about, seconds, status))
+    notes = () if find_spec("pyarrow") else (NO_PARQUET,)
+    paths = [write_hats(folder / "hats", table)] if hats and len(table) else []
+    with whole_tree(folder) as part:
+        made = list(_write_catalogues(part, table))
+        made.append(_write_ecsv(part / "blends.ecsv", blends))
+        made.append(write_models(part / "models.fits", job, parts, last, set(table["id"].tolist())))
+        made += write_mosaics(part, job, parts, last)
+        made.append(_write_provenance(part / "provenance.json", job, about, seconds, status))
+    paths += [folder / path.name for path in made]
     return Outputs(tuple(paths), len(table), len(blends), dict(status), notes)
 
 
@@ -83,24 +97,21 @@ def _last_rounds(parts):
 def _write_catalogues(folder, table):
     """The catalogue in all forms: Parquet where pyarrow is there, FITS, ECSV."""
     if find_spec("pyarrow"):
-        with whole_file(folder / "catalogue.parquet") as part:
-            write_parquet(part, table)
+        write_parquet(folder / "catalogue.parquet", table)
         yield folder / "catalogue.parquet"
-    with whole_file(folder / "catalogue.fits") as part:
-        hdu = fits.table_to_hdu(table)
-        hdu.name = "CATALOGUE"
-        for i, name in enumerate(table.colnames, start=1):
-            text = table[name].info.description
-            if text:  # as the Virtual Observatory's tools read it
-                hdu.header[f"TCOMM{i}"] = text[:68]
-        fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(part, overwrite=True)
+    hdu = fits.table_to_hdu(table)
+    hdu.name = "CATALOGUE"
+    for i, name in enumerate(table.colnames, start=1):
+        text = table[name].info.description
+        if text:  # as the Virtual Observatory's tools read it
+            hdu.header[f"TCOMM{i}"] = text[:68]
+    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(folder / "catalogue.fits")
     yield folder / "catalogue.fits"
     yield _write_ecsv(folder / "catalogue.ecsv", table)
 
 
 def _write_ecsv(path, table):
-    with whole_file(path) as part:
-        table.write(part, format="ascii.ecsv", overwrite=True)
+    table.write(path, format="ascii.ecsv")
     return path
 
 
@@ -126,8 +137,7 @@ def _write_provenance(path, job, about, seconds, status):
         "seconds": seconds,
         "inputs": {what: {"file": str(f), "sha256": _checksum(f)} for what, f in files.items()},
     }
-    with whole_file(path) as part:
-        part.write_text(json.dumps(found, indent=1))
+    path.write_text(json.dumps(found, indent=1))
     return path
 
 

@@ -17,7 +17,7 @@ from .box import Box
 from .hats import check_hats
 from .images import file_name
 from .options import LEAST_MEMORY, FieldOptions, Progress
-from .outputs import Outputs, write_outputs
+from .outputs import Outputs, check_outputs, write_outputs
 from .strips import STRIPS
 from .work.engine import engine_of
 from .work.fitting import Job
@@ -65,8 +65,7 @@ def run_field(
     mosaics, folder = _as_sent(mosaics), Path(folder)
     seconds: dict[str, float] = {}
     reference = reference_of(mosaics)
-    if options.hats:
-        check_hats(reference)
+    _check_outputs(folder, mosaics, reference, options)
     inputs = tuple((about or {}).get("inputs", {}).values())
     work, options = open_folder(
         folder, mosaics, reference, options, resume, overwrite, progress, inputs
@@ -77,8 +76,8 @@ def run_field(
     engine = engine_of(options, progress)
     try:
         take_look(mosaics, reference, work, engine)
-        least = min(options.memory, looked(work).memory)
-        options = replace(options, memory=max(LEAST_MEMORY, least))
+        memory = max(LEAST_MEMORY, min(options.memory, looked(work).memory))
+        options = replace(options, memory=memory)
         plan = planned(mosaics, reference, region, core, work, options, engine, progress, clock)
         job = Job(
             mosaics=mosaics,
@@ -94,15 +93,23 @@ def run_field(
             field_number=options.field_number,
         )
         parts, unsettled = fitted(job, engine, progress)
+        engine.close()  # its memory is for what follows
+        clock.stop("fit")
+        progress.stage("write", 1)
+        outputs = write_outputs(folder, job, parts, unsettled, about or {}, seconds, options.hats)
     finally:
         engine.close()
-    clock.stop("fit")
-    progress.stage("write", 1)
-    outputs = write_outputs(folder, job, parts, unsettled, about or {}, seconds, options.hats)
-    STRIPS.clear()
+        STRIPS.clear()
     clock.stop("write")
     failed = outputs.status.get("failed", 0)
     return FieldRun(outputs, seconds, failed, plan.lost, tuple(engine.turns))
+
+
+def _check_outputs(folder, mosaics, reference, options):
+    """Raise ValueError, FileError or ImportError, now, for what cannot be written at the end."""
+    if options.hats:
+        check_hats(reference)
+    check_outputs(folder, mosaics)
 
 
 def reference_of(mosaics) -> Grid:

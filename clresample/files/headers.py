@@ -2,7 +2,8 @@
 
 astropy (to 8.0 at least) believes some numbers in a header and counts up to them: with NAXIS =
 99999999999 or SIP polynomials of order 30000 it does not end, TFIELDS = 2000000000 takes all
-memory, and after data of a negative size it reads the same header again without end.
+memory. After data of a negative size it reads the same header again without end, and so it does in
+compressed files that begin without SIMPLE, or that say with it that they are not FITS.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ NUMBER = re.compile(
     rf"\s*(?:HIERARCH\s+)?({'|'.join(LIMITS)})\s*=\s*([^/]*)".encode(), re.IGNORECASE
 )
 FLAG = re.compile(rb"(GROUPS|ZIMAGE)\s*=\s*T")
+SIZED = re.compile(rb"(BITPIX|NAXIS)\s*=")
+OTHER = re.compile(rb"SIMPLE\s*=\s*F")
 END = re.compile(rb"END([^A-Z0-9_-]|$)")
 
 
@@ -45,8 +48,11 @@ def check_headers(path):
     """
     try:
         with _opened(path) as file:
-            if file.read(6) == b"SIMPLE":
+            begins = file.read(6)
+            if begins == b"SIMPLE":
                 _check(path, file)
+            elif _is_header(begins + file.read(MOST_CARDS * CARD)):
+                raise FileError(f"{path}: damaged, begins with a header without SIMPLE")
     except FileError:
         raise
     except Exception:  # of the libraries that decompress, on what is cut or nothing of theirs
@@ -62,6 +68,8 @@ def _check(path, file):
         cards = _cards(what, file)
         if cards is None:
             return
+        if OTHER.match(cards[0]):
+            raise FileError(f"{what} says that it is not FITS, SIMPLE = F")
         place += -(-len(cards) * CARD // BLOCK) * BLOCK
         place += -(-_n_bytes(what, *_values(what, cards)) // BLOCK) * BLOCK
 
@@ -91,6 +99,12 @@ def _cards(what, file):
         if len(block) < BLOCK:
             return None
     raise FileError(f"{what} has a header of more than {MOST_CARDS} cards")
+
+
+def _is_header(text):
+    """Whether a text is a FITS header, of whatever kind."""
+    cards = [text[i : i + CARD] for i in range(0, len(text), CARD)]
+    return any(map(SIZED.match, cards)) and any(map(END.match, cards))
 
 
 def _values(what, cards):

@@ -92,37 +92,63 @@ def whole_file(path):
 def whole_files(paths):
     """Paths to write several files under; all of them appear together, or none does.
 
-    As `whole_file`. A folder that does not exist yet is made, and appears with all its files in it.
-    Where one exists already, files are moved in the order of `paths`; a run killed in the midst of
-    that is completed by the next `check_folder` or `whole_files` there.
+    As `whole_file`. A folder that does not exist yet appears with all its files in it. Where one
+    exists, files are moved in the order of `paths`; a run killed in the midst of that is completed
+    by the next `check_folder` or `whole_files` there.
     """
     paths = [Path(path) for path in paths]
-    outputs = _Outputs(dict.fromkeys(path.absolute().parent for path in paths))
-    try:
-        outputs.open()
-        yield [outputs.stages[path.absolute().parent] / path.name for path in paths]
-        outputs.commit([path.absolute() for path in paths])
-    except OSError as error:
-        reason = error.strerror or error
-        raise FileError(f"{', '.join(map(str, paths))}: cannot be written ({reason})") from error
-    except FileError as error:  # of a writer, which knows the file under its other path
-        message = str(error)
-        for path in paths:
-            stage = outputs.stages.get(path.absolute().parent)
-            message = message.replace(f"{stage}{os.sep}{path.name}", str(path))
-        raise FileError(message) from error
-    finally:
-        outputs.close()
+    files = [(path.absolute().parent, path.name) for path in paths]
+    outputs = _Outputs(dict.fromkeys(folder for folder, _ in files))
+    with outputs.named(dict(zip(files, paths, strict=True))):
+        yield [outputs.stages[folder] / name for folder, name in files]
+        outputs.commit(files)
+
+
+@contextmanager
+def whole_tree(folder, *, overwrite=True):
+    """A folder to write into; all that it then holds appears together in `folder`, or nothing does.
+
+    As `whole_files`, for files whose names nobody knows before, in folders of that folder too.
+    What lies in `folder` under other names stays. overwrite: whether files may be replaced
+    """
+    home = Path(folder).absolute()
+    outputs = _Outputs([home])
+    with outputs.named({(home, ""): Path(folder)}):
+        stage = outputs.stages[home]
+        yield stage
+        files = [p.relative_to(stage) for p in sorted(stage.rglob("*")) if not p.is_dir()]
+        for name in files if home.is_dir() else ():
+            if (home / name).parent.is_dir():
+                check_output(Path(folder) / name, overwrite=overwrite)
+        outputs.commit([(home, name) for name in files])
 
 
 class _Outputs:
     """The folders in which outputs are written, each beside or in the folder it is meant for.
 
     stages {folder: where its files are written}; made: folders that were made on the way
+    Files are pairs of the folder and of their place inside it.
     """
 
     def __init__(self, folders):
         self.folders, self.stages, self.made, self.old = list(folders), {}, [], {}
+
+    @contextmanager
+    def named(self, names):
+        """Open them, and close them after the block; messages have files by names {file: name}."""
+        try:
+            self.open()
+            yield
+        except OSError as error:
+            given = ", ".join(map(str, names.values()))
+            raise FileError(f"{given}: cannot be written ({error.strerror or error})") from error
+        except FileError as error:  # of a writer, which knows the file under its other path
+            message = str(error)
+            for (folder, name), given in names.items():
+                message = message.replace(str(self.stages.get(folder, folder) / name), str(given))
+            raise FileError(message) from error
+        finally:
+            self.close()
 
     def open(self):
         """Make them, after what killed runs left is cleared away."""
@@ -136,55 +162,55 @@ class _Outputs:
             sweep(home)
             self.stages[folder] = _new_folder(home)
 
-    def commit(self, paths):
+    def commit(self, files):
         """Bring all files to the disk, then move them; those moved go back where one cannot be."""
         for stage in self.stages.values():
-            for file in stage.iterdir():
-                _to_disk(file)
-            _to_disk(stage)
+            for one in (*stage.rglob("*"), stage):
+                _to_disk(one)
         with _unbroken():
             moved = []
             try:
                 for folder in self.folders:
-                    self._keep_old(folder, paths)
-                for path in paths:
-                    self._move(path, moved)
+                    self._keep_old(folder, [name for home, name in files if home == folder])
+                for file in files:
+                    self._move(*file)
+                    moved.append(file)
             except BaseException:
-                for path in reversed(moved):
-                    self._move_back(path)
+                for file in reversed(moved):
+                    self._move_back(*file)
                 raise
             self.made = []
         for folder in self.folders:
             _to_disk(folder)
 
-    def _keep_old(self, folder, paths):
+    def _keep_old(self, folder, names):
         """Second names of the files that will be replaced, and the mark that all is complete."""
         if not folder.is_dir():
             return
-        there = [p for p in paths if p.parent == folder and p.exists()]
+        there = [name for name in names if (folder / name).exists()]
         if there:
             self.old[folder] = _new_folder(folder)
-            for path in there:
+            for name in there:
+                kept = self.old[folder] / name
+                kept.parent.mkdir(parents=True, exist_ok=True)
                 with suppress(OSError):  # a file system without hard links
-                    os.link(path, self.old[folder] / path.name)
+                    os.link(folder / name, kept)
         stage = self.stages[folder]
         self.stages[folder] = stage.with_name(stage.name.replace(".part-", ".done-", 1))
         os.rename(stage, self.stages[folder])
 
-    def _move(self, path, moved):
-        folder = path.parent
+    def _move(self, folder, name):
         if not folder.is_dir():  # with all that lies in it
             os.rename(self.stages[folder], folder)
-        elif (self.stages[folder] / path.name).exists():
-            os.replace(self.stages[folder] / path.name, path)
-        moved.append(path)
+        elif (self.stages[folder] / name).exists():
+            _put(self.stages[folder] / name, folder / name)
 
-    def _move_back(self, path):
-        old = self.old.get(path.parent, path.parent) / path.name
-        if path.parent in self.old and old.exists():
-            os.rename(old, path)
+    def _move_back(self, folder, name):
+        old = self.old.get(folder, folder) / name
+        if folder in self.old and old.exists():
+            os.rename(old, folder / name)
         else:
-            path.unlink(missing_ok=True)
+            (folder / name).unlink(missing_ok=True)
 
     def close(self):
         """Remove what is left of them."""
@@ -207,9 +233,22 @@ def sweep(folder):
             continue
         with suppress(OSError):
             if found[1] == "done":
-                for file in list(os.scandir(entry.path)):
-                    os.replace(file.path, Path(folder) / file.name)
+                for file in [p for p in Path(entry.path).rglob("*") if not p.is_dir()]:
+                    _put(file, Path(folder) / file.relative_to(entry.path))
             shutil.rmtree(entry.path)
+
+
+def forget(folder):
+    """Remove a folder with all in it, all at once; what a kill leaves of it, `sweep` removes."""
+    aside = _new_folder(folder.absolute().parent)
+    os.rename(folder, aside)
+    shutil.rmtree(aside)
+
+
+def _put(file, path):
+    """Move a file to its place, into a folder that is made where there is none."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    os.replace(file, path)
 
 
 def _alive(pid):

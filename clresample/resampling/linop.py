@@ -42,8 +42,8 @@ class LinOp:
     def forward(self, x, out=None):
         """A x.  x (B,) + shape_in -> (B,) + shape_out, into `out` (of x's kind) if given.
 
-        Raises ValueError for shapes that do not fit, complex x, device arrays of another dtype,
-        layout or context, and an `out` that is on the host where x is on the device or the reverse.
+        Raises ValueError for shapes that do not fit, complex or too large numbers, device arrays of
+        another dtype, layout or context, an `out` on the host where x is not or the reverse.
         """
         return self._apply(self._forward, "x", x, out, self.shape_in, self.shape_out)
 
@@ -122,7 +122,7 @@ class LinOp:
 
     def _through_host(self, run, name, x, out, batched_x, batched_out, shape_result):
         """`run` on a caller's NumPy arrays, through device arrays that are kept for the next."""
-        x = np.ascontiguousarray(x, dtype=self.dtype)
+        x = _cast(name, x, self.dtype)
         direct = out is None or (out.dtype == self.dtype and out.flags.c_contiguous)
         result = np.empty(shape_result, self.dtype) if out is None or not direct else out
         with self._lock:
@@ -174,7 +174,7 @@ class HostOp(LinOp):
 
     def _through_host(self, run, name, x, out, batched_x, batched_out, shape_result):
         """`run` on a caller's NumPy arrays, copied only where dtype or layout ask for it."""
-        x = np.ascontiguousarray(x, dtype=self.dtype).reshape(batched_x)
+        x = _cast(name, x, self.dtype).reshape(batched_x)
         direct = out is not None and out.dtype == self.dtype and out.flags.c_contiguous
         direct = direct and not np.may_share_memory(x, out)
         result = out if direct else np.empty(shape_result, self.dtype)
@@ -238,6 +238,20 @@ def _check_out(name, x, out, on_device, shape):
     ):
         kind = "read-only" if not out.flags.writeable else f"of type {out.dtype}"
         raise ValueError(f"out is a {_kind(out)}, {kind}: it must be a plain array of floats")
+
+
+def _cast(name, x, dtype):
+    """A caller's NumPy array in the operator's type and in C order; ValueError where the type
+    cannot hold its numbers."""
+    try:
+        with np.errstate(over="raise"):
+            return np.ascontiguousarray(x, dtype=dtype)
+    except FloatingPointError:
+        largest = np.abs(x[np.isfinite(x)]).max()
+        raise ValueError(
+            f"{name} holds numbers of up to {largest:.3g}, {dtype} holds {np.finfo(dtype).max:.3g} "
+            "at most: scale it, or use dtype=float64"
+        ) from None
 
 
 def _kind(array):

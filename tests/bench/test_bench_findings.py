@@ -52,6 +52,17 @@ def test_verdicts_follow_the_numbers(change, failing):
     assert all(isinstance(f.holds, bool) for f in found)
 
 
+@pytest.mark.parametrize("which", [0, 1], ids=["of two surveys", "of one survey"])
+def test_pairs_of_one_kind_are_enough(which):
+    """As `--pairs` chooses them."""
+    from bench.paper.accuracy_findings import findings
+
+    numbers = accuracy_numbers()
+    numbers["pairs"] = numbers["pairs"][which : which + 1]
+    found = findings("accuracy", numbers)
+    assert found and all("nan" not in f.number + f.found for f in found)
+
+
 def test_lines_and_slopes_are_found():
     from bench.paper.timing_findings import line_fit, slope
 

@@ -1,11 +1,15 @@
 """What `clresample field` shows while it runs: on a terminal, in a log, and nothing if quiet."""
 
 import io
+import re
 from types import SimpleNamespace
 
 import pytest
+from helpers.checkout import run_python
 
+from clresample import simulate_field
 from clresample.cli.fields.progress import LINE_S, Live, duration
+from clresample.cli.simulate import write_field
 
 
 class Clock:
@@ -83,3 +87,17 @@ def test_quiet_runs_show_nothing(live):
 )
 def test_times_are_told_in_words(seconds, words):
     assert duration(seconds) == words
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_field_prints_what_its_kernels_took(tmp_path, workers):
+    """Of all worker processes together, once."""
+    pytest.importorskip("galsim")
+    pytest.importorskip("sep")
+    sky = simulate_field(3, n_pixels=96, density=90, rubin_bands=("i",))
+    toml, *_ = write_field(tmp_path / "sky", sky)
+    words = [toml, "-o", tmp_path / "out", "--quiet", "--workers", workers, "--profile"]
+    answer = run_python("-m", "clresample.cli", "field", *map(str, words))
+    assert answer.returncode == 0, answer.stderr
+    assert answer.stderr.count("kernels on ") == 1
+    assert re.search(r"\btrial +\d", answer.stderr), answer.stderr

@@ -57,3 +57,15 @@ def test_scenes_look_when_they_are_calm_and_settled():
     assert not progress.asks(~accepted).any()
     progress._drops[[0, 4]] = 0.9  # much, but for a scene of chi2 6
     assert progress.asks(accepted).tolist() == [False, False, True, False, True]
+
+
+def test_no_fit_converges_before_it_has_looked():
+    """Of a larger `enough` than what looking needs."""
+    progress = begun(100, 100)
+    progress.enough = 6.0
+    progress.settled[:] = True
+    progress._drops[:] = [[0.9] * 6, [1.1] * 6]
+    accepted = np.ones(2, bool)
+    assert progress.asks(accepted).tolist() == [True, True]
+    progress.next(accepted)
+    assert progress.converged.tolist() == [True, False]

@@ -1,7 +1,5 @@
 """A real blend, HST F814W with HSC grizy, from detection to residuals: what it must reach."""
 
-import time
-
 import numpy as np
 import pytest
 from helpers.checkout import ROOT
@@ -24,34 +22,31 @@ HST_CHI2 = 0.905
 
 @pytest.fixture(scope="module")
 def fitted(data, tmp_path_factory):
-    """The fit of docs/hst_hsc.toml, its time [s] from files to files, and its folder."""
+    """The fit of docs/hst_hsc.toml, and its folder; bench.real says what it takes."""
     if any(word in get_device().name.lower() for word in SIMULATED):
         pytest.skip(f"{get_device().name} takes half an hour")
     folder = tmp_path_factory.mktemp("real")
     text = (ROOT / "docs" / "hst_hsc.toml").read_text()
     scene = folder / "hst_hsc.toml"
     scene.write_text(text.replace("../../shared/data", str(data.resolve())))
-    started = time.perf_counter(), time.process_time()
     assert main(["deblend", str(scene), "-o", str(folder / "out")]) == 0
-    wall, processor = time.perf_counter() - started[0], time.process_time() - started[1]
-    took = min(wall, processor / 2)  # of two cores: the clock also counts what others do on them
-    return read_result(folder / "out" / "result.fits"), took, folder / "out"
+    return read_result(folder / "out" / "result.fits"), folder / "out"
 
 
 def test_chi2_is_no_worse_than_others_reach(fitted):
-    result, _, _ = fitted
+    result, _ = fitted
     for i, o in enumerate(result.observations):
         assert np.nanmean(result.residual(i) ** 2 * o.weights) <= CHI2[o.name]
 
 
 def test_the_core_of_the_merger_is_followed(fitted):
-    result, _, _ = fitted
+    result, _ = fitted
     assert np.nanmean(result.residual(0) ** 2 * result.observations[0].weights) <= HST_CHI2
 
 
 def test_residuals_hold_no_galaxy(fitted):
     """Within 5 deviations of the noise and 5 % of the model, in windows of a PSF's width."""
-    result, _, _ = fitted
+    result, _ = fitted
     for i, o in enumerate(result.observations):
         width = {"HST": 5, "HSC": 4}[o.name]
         for residual, model, weights in zip(result.residual(i), result.model(i), o.weights):
@@ -66,7 +61,7 @@ def test_residuals_hold_no_galaxy(fitted):
 
 
 def test_all_that_is_seen_is_found(fitted):
-    result, _, _ = fitted
+    result, _ = fitted
     found = result.frame.place(result.sources)
     seen = (
         (130, 178),
@@ -85,13 +80,12 @@ def test_all_that_is_seen_is_found(fitted):
 
 
 def test_shift_is_what_images_show(fitted):
-    result, _, _ = fitted
+    result, _ = fitted
     assert not result.shifts[0].any()
     # 0.5 px = 0.015": the merger's clumps differ in colour, so bands disagree by that much
     assert np.all(np.abs(result.shifts[1] + HEADERS_PX - SHIFT_PX) < 0.5)
 
 
-def test_it_takes_seconds_and_writes_the_figure(fitted):
-    _, took, folder = fitted
-    assert took < 30
+def test_it_writes_the_figure(fitted):
+    _, folder = fitted
     assert (folder / "deblended.png").stat().st_size < 400_000

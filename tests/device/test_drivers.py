@@ -1,5 +1,6 @@
 """Driver libraries that the loader does not see, and the one that CLRESAMPLE_ICD names."""
 
+import ctypes.util
 import os
 import shlex
 from pathlib import Path
@@ -100,6 +101,7 @@ def test_a_named_driver_is_seen_beside_the_others(tmp_path):
     after = run_python("-c", PLATFORMS, CLRESAMPLE_ICD=str(pocl[0]))
     assert after.returncode == 0, after.stderr
     assert len(after.stdout.split("Portable")) == len(before) + 1
+    assert "CLRESAMPLE_ICD" not in after.stderr
 
 
 def test_what_the_loader_reads_anyway_is_kept(tmp_path, monkeypatch):
@@ -120,3 +122,42 @@ def test_the_cure_is_one_line_for_a_shell():
 
 def _after(folder):
     return f"{os.environ.get('LD_LIBRARY_PATH', '')}:{folder}"
+
+
+def test_a_library_that_brings_no_device_is_said():
+    library = ctypes.util.find_library("m")
+    if not library:
+        pytest.skip("no C library is known by name")
+    code = "from clresample import get_device; get_device(); get_device(); print('fine')"
+    answer = run_python("-c", code, CLRESAMPLE_ICD=library)
+    assert answer.stdout == "fine\n"
+    assert answer.stderr.count(f"CLRESAMPLE_ICD={library} is no OpenCL driver") == 1
+    answer = run_python("-m", "clresample.cli", "devices", CLRESAMPLE_ICD=library)
+    assert f"note: CLRESAMPLE_ICD={library} is no OpenCL driver\n" in answer.stderr
+
+
+def test_a_driver_without_a_device_is_said(monkeypatch):
+    monkeypatch.setattr(drivers.ctypes, "CDLL", lambda _: None)
+    monkeypatch.setattr(drivers, "_platforms_of", lambda _: {12, 34})
+    assert drivers.fault_of("libx.so", {34}) is None
+    assert drivers.fault_of("libx.so", {56}) == "is an OpenCL driver that finds no device here"
+
+
+def test_temporary_folders_of_killed_processes_are_removed(tmp_path, monkeypatch):
+    monkeypatch.setattr(drivers.tempfile, "tempdir", str(tmp_path))
+    code = (
+        "import os, sys, tempfile; from clresample.device import drivers\n"
+        "tempfile.tempdir = sys.argv[1]\n"
+        "print(drivers.temporary_folder('icd')); drivers.temporary_folder('cache')\n"
+        "sys.stdout.flush(); os.kill(os.getpid(), 9)"
+    )
+    left = Path(run_python("-c", code, str(tmp_path)).stdout.strip())
+    assert left.is_dir()
+    (left / "x.icd").write_text("")
+    other = tmp_path / left.name.replace("clresample-icd-", "clresample-icd-elsewhere")
+    other.mkdir()
+    (tmp_path / left.name.replace("-icd-", "-icd-x-")).mkdir()
+    first, second = drivers.temporary_folder("icd"), drivers.temporary_folder("icd")
+    assert first.is_dir() and second.is_dir() and first != second  # this process is alive
+    assert not left.exists() and other.exists()
+    assert len(list(tmp_path.glob("clresample-cache-*"))) == 1  # another kind

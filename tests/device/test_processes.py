@@ -1,6 +1,7 @@
 """A device in forked processes, and PoCL without a cache that it can write: said, not hung."""
 
 import os
+import sys
 
 import pytest
 from helpers.checkout import run_python
@@ -87,3 +88,24 @@ def test_a_home_that_cannot_be_written_hides_no_device(tmp_path):
         **nowhere,
     )
     assert (answer.stdout, answer.stderr) == ("(9, 9)\n", "")
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux holds it")
+@pytest.mark.parametrize("space", [450, 600, 750])
+def test_too_little_address_space_is_said(space):
+    """In one line; drivers abort, hang or are not found."""
+    held = (
+        "import resource, sys; from clresample.cli import main\n"
+        f"resource.setrlimit(resource.RLIMIT_AS, ({space} << 20,) * 2)\n"
+        "sys.exit(main(['devices']))"
+    )
+    answer = run_python("-c", held)
+    assert answer.returncode == 2
+    assert answer.stderr.startswith(f"clresample devices: this process may have {space} MiB of add")
+    assert answer.stderr.count("\n") == 1
+
+
+def test_enough_address_space_is_taken():
+    held = "import resource; resource.setrlimit(resource.RLIMIT_AS, (3 << 30,) * 2)\n"
+    answer = run_python("-c", held + SET_UP + "print(make()(np.ones((20, 20))).shape)")
+    assert answer.stdout == "(9, 9)\n", answer.stderr

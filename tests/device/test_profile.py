@@ -1,5 +1,6 @@
 """The table of kernels' times, from the library and from the commands."""
 
+import pickle
 import re
 
 import numpy as np
@@ -107,3 +108,23 @@ def test_processes_of_several_devices_print_their_own():
     answer = run_python("-c", fit, CLRESAMPLE_PROFILE="1")
     assert answer.stdout == "iteration limit\n", answer.stderr
     assert "\ntrial " in answer.stderr or ", trial " in answer.stderr, answer.stderr
+
+
+def test_tables_of_other_processes_are_added(profiled, monkeypatch):
+    op = Resampler(
+        Grid.flat((40, 42), 0.1), PSF.gaussian(0.8), Grid.flat((20, 22), 0.2),
+        PSF.gaussian(1.5), device=profiled,
+    )  # fmt: skip
+    op(np.ones((40, 42)))
+    ((name, rows),) = found = profiles.taken()
+    assert name == profiled.name and rows and profiles.taken() == []
+    profiles.add(pickle.loads(pickle.dumps(found)))
+    profiles.add(pickle.loads(pickle.dumps(found)))
+    profiles.add([("another", rows)])
+    here, other = profiles._PROFILES
+    assert here.rows().keys() == rows.keys() and other.name == "another"
+    for kernel, row in rows.items():
+        assert here.rows()[kernel].n_calls == 2 * row.n_calls == 2 * other.rows()[kernel].n_calls
+        assert here.rows()[kernel].seconds == 2 * row.seconds
+        assert here.rows()[kernel].flops == 2 * row.flops
+        assert here.rows()[kernel].n_bytes == 2 * row.n_bytes

@@ -16,6 +16,7 @@ from clresample.fields.box import Box
 from clresample.fields.mosaic import FilePlane
 from clresample.fields.run import run_field
 from clresample.fields.strips import STRIPS
+from clresample.files.whole_file import FileError
 
 
 def test_every_column_has_its_unit_and_a_description(done):
@@ -62,3 +63,44 @@ def test_the_provenance_says_what_was_read_and_with_what(sky, tmp_path):
     assert found["packages"]["numpy"] == np.__version__ and found["device"] and found["system"]
     assert found["run"]["threshold"] == 7.0 and "max_iter=" in found["run"]["settings"]
     assert {"search", "link", "fit"} <= set(found["seconds"])
+
+
+def test_a_run_that_fails_leaves_no_decoded_rows(sky, tmp_path, monkeypatch):
+    def broken(*_):
+        STRIPS.n_bytes = 1
+        raise MemoryError
+
+    monkeypatch.setattr("clresample.fields.run.take_look", broken)
+    with pytest.raises(MemoryError):
+        run_field(mosaics_of(sky)[:1], tmp_path / "out", options=FieldOptions())
+    assert STRIPS.n_bytes == 0
+
+
+def test_what_is_in_the_way_is_told_at_once(sky, tmp_path):
+    (euclid,) = mosaics_of(sky)[:1]
+    for name in ("catalogue.ecsv", f"residual_{euclid.name}.fits"):
+        (tmp_path / name).symlink_to("nowhere")
+        with pytest.raises(FileError, match=f"{name}: is a symbolic link, and is kept"):
+            run_field([euclid], tmp_path, options=FieldOptions())
+        assert [p.name for p in tmp_path.iterdir()] == [name]
+        (tmp_path / name).unlink()
+
+
+def test_all_outputs_appear_together(sky, tmp_path, monkeypatch):
+    """One that cannot be written leaves those of the run before; the next run replaces all."""
+    options, folder = FieldOptions(passes=1, threshold=7.0), tmp_path / "out"
+    folder.mkdir()
+    (folder / "catalogue.fits").write_text("old")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("clresample.fields.outputs._write_provenance", full)
+        with pytest.raises(FileError, match="cannot be written .No space left"):
+            run_field(mosaics_of(sky)[:1], folder, options=options)
+    assert {p.name for p in folder.iterdir()} == {"catalogue.fits", "work"}
+    assert (folder / "catalogue.fits").read_text() == "old"
+    run_field(mosaics_of(sky)[:1], folder, options=options, resume=True)
+    assert len(QTable.read(folder / "catalogue.fits"))
+    assert (folder / "provenance.json").exists()

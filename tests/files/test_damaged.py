@@ -13,7 +13,7 @@ from astropy.table import Table
 from helpers.headers import header
 
 from clresample.files.fits import open_fits, read_image, read_pixels, read_psf
-from clresample.files.headers import MOST_CARDS
+from clresample.files.headers import MOST_CARDS, check_headers
 from clresample.files.source_table import read_sources
 from clresample.files.whole_file import FileError
 
@@ -183,3 +183,32 @@ def test_random_groups_are_passed_over(tmp_path):
     path.write_bytes(raw)
     with pytest.raises(FileError, match="HDU 1 has NAXIS = 99999999999"):
         read_psf(path)
+
+
+@pytest.mark.parametrize("pack", [bytes, gzip.compress], ids=["plain", "gzip"])
+@pytest.mark.parametrize(
+    "hdu, card, said",
+    [
+        (0, "TDIM1   =                    1", "begins with a header without SIMPLE"),
+        (0, "SIMPLE  =                    F", "damaged, HDU 0 says that it is not FITS"),
+        (1, "SIMPLE  =                    F", "damaged, HDU 1 says that it is not FITS"),
+    ],
+)
+def test_headers_of_no_known_kind_are_refused(tmp_path, pack, hdu, card, said):
+    """astropy reads those of compressed files again and again, without end."""
+    path = tmp_path / "t.fits"
+    table = fits.BinTableHDU(Table({"y": [4.0], "x": [4.0]}))
+    fits.HDUList([fits.PrimaryHDU(np.ones((3, 3))), table]).writeto(path)
+    with fits.open(path) as hdus:
+        at = hdus[hdu].fileinfo()["hdrLoc"]
+    raw = path.read_bytes()
+    path.write_bytes(pack(raw[:at] + card.ljust(80).encode() + raw[at + 80 :]))
+    for read in (read_image, read_psf, read_sources):
+        with pytest.raises(FileError, match=rf"t\.fits: .*{said}"):
+            read(path)
+
+
+def test_a_compressed_text_is_no_header(tmp_path):
+    path = tmp_path / "t.csv.gz"
+    path.write_bytes(gzip.compress(b"y,x\n4.0,5.0\n"))
+    check_headers(path)

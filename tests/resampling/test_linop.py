@@ -187,6 +187,20 @@ def test_wrong_arrays_are_refused(device):
         op.adjoint(x)
 
 
+@pytest.mark.parametrize("geometry", ["aligned", "60 degrees"])
+def test_numbers_that_the_type_cannot_hold_are_refused(device, geometry):
+    op = build(device, geometry)
+    x = np.ones((2, *op.shape_in))
+    before = op(x)
+    x[1, 0, 3, 4] = 1e39
+    for call, name, values in ((op, "x", x), (op.adjoint, "y", 1e39 * np.ones(op.shape_out))):
+        with pytest.raises(ValueError, match=rf"^{name} holds numbers of up to 1e\+39, float32 "):
+            call(values)
+    assert np.array_equal(op(np.ones((2, *op.shape_in))), before)
+    x[1, 0, 3, 4] = np.inf  # what says itself what it is goes through
+    assert not np.isfinite(op(x)[1]).all() and np.array_equal(op(x)[0], before[0])
+
+
 def test_images_of_one_band_need_no_band_axis(device):
     op = operator(device, GEOMETRIES["mirrored"](), PSF.gaussian(0.8), PSF.gaussian(1.5))
     x = noise(op.shape_in)

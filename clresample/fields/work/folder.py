@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from dataclasses import replace
 
 import numpy as np
 
-from ...files.whole_file import FileError, sweep, whole_file
+from ...files.whole_file import FileError, check_folder, forget, sweep, whole_file
 from .look import FILE as LOOK_FILE
 
 WORK = "work"  # folder of the parts inside the output folder
@@ -24,8 +23,9 @@ def open_folder(folder, mosaics, reference, options, resume, overwrite, progress
     Raises FileError for the folder of another run.
     """
     work, mine = folder / WORK, _fingerprint(mosaics, reference, options, inputs)
+    check_folder(folder)
     if overwrite and work.exists():
-        shutil.rmtree(work)
+        forget(work)
     there = work / "run.json"
     if there.exists() and (work / LOOK_FILE).exists():  # before that look nothing is done
         if not resume:

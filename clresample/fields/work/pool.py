@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import gc
 import multiprocessing
 import os
 import time
@@ -12,9 +11,10 @@ from collections import deque
 from dataclasses import dataclass
 from multiprocessing.connection import wait
 
+from ...device import profile
 from ...device.discovery import DeviceError
 from ..strips import STRIPS
-from .share import end_with, hold_memory, keep, return_memory, shared_threads
+from .share import end_with, hold_memory, keep, keep_no_more, return_memory, shared_threads
 
 # [s] Between two looks at whether a worker takes too long.
 LOOK_S = 1.0
@@ -216,8 +216,9 @@ def _ended(workers, limit_s):
     for worker in busy:
         if worker.pipe in ready:
             try:
-                value, reason = worker.pipe.recv()
+                value, reason, kernels = worker.pipe.recv()
                 died = False
+                profile.add(kernels)
             except (EOFError, OSError):
                 value, reason, died = None, _dead(worker), True
         elif worker.process.sentinel in ready:
@@ -272,7 +273,7 @@ def _work(pipe, bound, parent):
             return
         if given is not None:
             function, context, kept = given, what, False
-            gc.unfreeze()  # the last stage's context is no longer kept
+            keep_no_more()  # the last stage's context is no longer kept
             continue
         try:
             answer = function(context, what), None
@@ -281,7 +282,7 @@ def _work(pipe, bound, parent):
         except Exception as error:
             answer = None, reason_of(error)
         try:
-            pipe.send(answer)
+            pipe.send((*answer, profile.taken()))
         except OSError:
             return
         del answer, what

@@ -19,10 +19,10 @@ TRIALS = 8
 NEAR, CALM = 5.0, 3
 FIRST, EVERY, SETTLED = 16, 8, 0.1
 # Whether the finest structure of sources is clear (evidence.py) is asked once strengths have
-# settled, where a scene's loss fell by less than this, times chi2 per pixel likewise, over the last
-# CALM iterations. Earlier, structure still holds what spectra and neighbours will take from it:
-# with 5, more simulated galaxies exceed what is clear. With 1 the same ones do, up to 30
-# iterations later.
+# settled, where a scene's loss fell by less than this (or `enough`, where that is more: none has
+# converged before it is asked), times chi2 per pixel likewise, over the last CALM iterations.
+# Earlier, structure still holds what spectra and neighbours will take from it: with 5, more
+# simulated galaxies exceed what is clear. With 1 the same ones do, up to 30 iterations later.
 LOOK = 2.5
 # A fit has converged when its strengths have settled and its loss fell by less than `enough` over
 # so many iterations; by that times chi2 per pixel where that is above 1, since a model that misfits
@@ -94,7 +94,7 @@ class Progress:
 
     def asks(self, accepted):
         """Which scenes (B,) look now for structure that is clear."""
-        calm = self._drops[:, :CALM].sum(1) < LOOK * self.chi2()
+        calm = self._drops[:, :CALM].sum(1) < max(LOOK, self.enough) * self.chi2()
         return accepted & self.settled & ~self.looked & calm
 
     def answered(self, which, clear):
