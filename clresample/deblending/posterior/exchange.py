@@ -164,6 +164,7 @@ def exchange_of(fit, scene, state, findings):
         fit.start.shapes,
         fit.start.thetas,
         fit.start.positions[fit.start.source],
+        fit.start.source,
         findings,
         np.ones(n),
         fit.settings.prior,

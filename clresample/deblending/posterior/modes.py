@@ -37,6 +37,11 @@ STRUCTURE_PX, WEIGHT, STRENGTH = 2.0, 10.0, 0.05
 # 0.02 the coverage of their sizes is 0.04 lower, and that of fluxes from signal to noise 10 to 100
 # as well.
 OTHERS, FLOOR = 3.5, 3.0
+# Strengths are learned from light whose owner is uncertain where sources overlap: what is unlike a
+# source's profile is fitted by its neighbour, and they come out too small. For errors they are
+# multiplied by OVERLAPPED where MOST_OVERLAPPED of the light, or more, is of other sources, by less
+# in proportion where less is. With 2 positions are over-covered, 0.75, with 1 fluxes are under-.
+OVERLAPPED, MOST_OVERLAPPED = 1.5, 0.2
 # Unlikeness that counts for these at most: a merger of real galaxies reaches 10, of which the
 # powers would be a floor of half its flux.
 MOST_UNLIKE = 3.0
@@ -47,6 +52,14 @@ def power_of(unlikeness, exponent):
     return min(unlikeness, MOST_UNLIKE) ** exponent
 
 
+def enlarged(own, others):
+    """What strengths are multiplied by where the light of other sources lies on the own, both
+    (ny, nx) as expected; see OVERLAPPED."""
+    own, others = np.maximum(own, 0), np.maximum(others, 0)
+    shared = (own * others / np.maximum(own + others, 1e-30)).sum() / max(own.sum(), 1e-30)
+    return 1 + (OVERLAPPED - 1) * min(1, shared / MOST_OVERLAPPED)
+
+
 @dataclass(frozen=True, eq=False)
 class Solution:
     """A fitted scene, n components, C channels, in units of the views' noise.
@@ -55,6 +68,7 @@ class Solution:
         morphologies, by which those were divided
     spectra (n, C); fixed_error (n, C): of these at fixed morphologies
     shapes, thetas, positions (n): the start's Shapes, parameters, places (2,) [px]
+    source (n,): to which each component belongs
     findings: Findings; chi2 (n,): per pixel, where each component's light is
     prior: LearnedPrior
     pulls (n): arrays (ny, nx), see bounds.py; None where nothing asks for `modes`
@@ -68,6 +82,7 @@ class Solution:
     shapes: list
     thetas: list
     positions: np.ndarray
+    source: np.ndarray
     findings: object
     chi2: np.ndarray
     prior: LearnedPrior
@@ -88,11 +103,12 @@ class Solution:
         return np.argmin(np.abs(np.log(np.array(self.prior.scales_px) / STRUCTURE_PX)))
 
     def strengths(self, i):
-        """Strengths (J,) of component i's structure; see STRUCTURE_PX."""
+        """Strengths (J,) of component i's structure; see STRUCTURE_PX and OVERLAPPED."""
         unlike = self.unlikeness(i)
         out = self.findings.strengths[i] * power_of(unlike, OTHERS)
         out[self._scale] = unlike * STRENGTH
-        return out
+        others = [self._light(j, i) for j in self._beside(i) if self.source[j] != self.source[i]]
+        return out * enlarged(self._light(i, i), sum(others))
 
     def modes(self, i):
         """Images (1 + k, ny, nx), float32, of component i's morphology and of its modes, whose
@@ -180,10 +196,15 @@ class Solution:
 
     def shared(self, i):
         """Where (ny, nx) component i may exchange light with another."""
-        own, (low, high) = self._light(i, i), self._boxes
+        own = self._light(i, i)
         shared = np.zeros(own.shape, bool)
-        for j in np.flatnonzero(((low < high[i]) & (high > low[i])).all(1)):
-            if j != i:
-                other = self._light(j, i)
-                shared |= (other > RATIO * own) & (other > FAINT) & (own > FAINT)
+        for j in self._beside(i):
+            other = self._light(j, i)
+            shared |= (other > RATIO * own) & (other > FAINT) & (own > FAINT)
         return shared
+
+    def _beside(self, i):
+        """Other components whose boxes meet component i's."""
+        low, high = self._boxes
+        meet = ((low < high[i]) & (high > low[i])).all(1)
+        return [j for j in np.flatnonzero(meet) if j != i]
