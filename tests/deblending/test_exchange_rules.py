@@ -136,7 +136,7 @@ def test_where_nothing_weighs_nothing_moves():
     assert not spectra.any() and not sky.any()
 
 
-@pytest.mark.parametrize("bright", [0.5, 0.7, 1.0, 2.0])
+@pytest.mark.parametrize("bright", [0.5, 0.6, 0.8, 1.0])
 def test_changes_of_more_than_a_third_of_an_error_are_unknowns(bright):
     """0.3 errors of flux and second moment at fixed morphologies, of all channels together."""
     one = posed(bright)
@@ -145,7 +145,7 @@ def test_changes_of_more_than_a_third_of_an_error_are_unknowns(bright):
         moves = found.moves[i]
         profile = one.scene.profile[i]
         given = one.scene.origin[i], profile, one.findings.strengths[i], one.prior.kernels()
-        images = Bumps(*given, one.shared(i)).images.astype(float)
+        images = Bumps(*given, one.shared(i), all_over=False).images.astype(float)
         y, x = np.indices(profile.shape)
         middle = [(v * profile).sum() / profile.sum() for v in (y, x)]
         r2 = (y - middle[0]) ** 2 + (x - middle[1]) ** 2

@@ -116,12 +116,16 @@ class Moves:
 
 def _moves(solution, i, shared, image):
     """Component i's Moves and images (1 + k, ny, nx), float32, of its morphology (1, ny, nx) and
-    of what they change; None and the morphology alone where it shares no light."""
+    of what they change; None and the morphology alone where it shares no light.
+
+    What a source may be where it shares none L-BFGS finds by itself: of changes all over a large
+    galaxy most would be there.
+    """
     scene, prior = solution.scene, solution.prior
     if scene.fixed[i] or not shared.any():
         return None, image
     profile, strengths = scene.profile[i], solution.findings.strengths[i]
-    bumps = Bumps(scene.origin[i], profile, strengths, prior.kernels(), shared)
+    bumps = Bumps(scene.origin[i], profile, strengths, prior.kernels(), shared, all_over=False)
     keep = np.flatnonzero(solution.change(i, bumps.images) > LEAST_CHANGE)
     if not len(keep):
         return None, image
