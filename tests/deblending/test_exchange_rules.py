@@ -158,6 +158,14 @@ def test_changes_of_more_than_a_third_of_an_error_are_unknowns(bright):
     assert n_small
 
 
+def test_changes_of_large_shared_parts_are_further_apart(monkeypatch):
+    one = posed()
+    counts = [len(moves.weights) for moves in exchange_at(one).moves[2:]]
+    monkeypatch.setattr(exchange, "MOST_CHANGES", 4)
+    fewer = [len(moves.weights) for moves in exchange_at(one).moves[2:]]
+    assert min(counts) > 4 and 0 < min(fewer) and max(fewer) <= 4
+
+
 def test_errors_at_fixed_morphologies_are_those_of_the_power(monkeypatch):
     """1 / sqrt(sum w (R S)^2); where nothing is seen a number that makes all changes negligible."""
     monkeypatch.setattr(exchange, "Exchange", lambda solution, *given, fit_sky: solution)

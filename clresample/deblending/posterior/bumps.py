@@ -44,12 +44,12 @@ class Bumps:
 
     origin (2,) [px]: of the box in the frame; profile (ny, nx); strengths (J,): of the prior's
     scales; kernels: its J kernels; shared (ny, nx): where light may be exchanged; all_over: else
-        there are none but where that is
+        there are none but where that is; most: how many at most, MOST by default
     """
 
-    def __init__(self, origin, profile, strengths, kernels, shared, *, all_over=True):
+    def __init__(self, origin, profile, strengths, kernels, shared, *, all_over=True, most=None):
         spacings, low = (COARSE, FINE), None
-        while low is None or len(low) > MOST:
+        while low is None or len(low) > (most or MOST):
             taps, period = tuple(k.tobytes() for k in kernels), max(spacings)
             axes = [
                 _axis(int(o) % period, n, taps, spacings)
