@@ -89,7 +89,8 @@ def _parts(buffers, op, count):
     e = op.executor()
     observed = _observed(plan, e.n_rows, e.n_columns, e.k_y, e.k_x)
     least, found = GAIN * (count + 4 * n_images * observed), None
-    for limit in (np.inf, *(LARGE * np.median(sides))):
+    limits = LARGE * np.median(sides)
+    for limit in (np.inf, *limits[limits < sides.max()]):
         split = [np.flatnonzero(part) for part in (sides <= limit, sides > limit)]
         best = [_best_groups(buffers, op, which) for which in split if len(which)]
         total = sum(one for one, _ in best)
