@@ -129,7 +129,8 @@ class Solution:
         if not scene.fixed[i]:
             strengths, kernels = self.strengths(i), self.prior.kernels()
             least = min(LEAST_LIGHT, FAINTEST / max(self._peak(i), 1e-30))
-            bumps = Bumps(scene.origin[i], profile, strengths, kernels, self.shared(i), least)
+            given = scene.origin[i], profile, strengths, kernels, self.shared(i)
+            bumps = Bumps(*given, least_light=least)
             keep = np.flatnonzero(self.change(i, bumps.images) > LEAST_CHANGE)
             own = uncorrelated(bumps.precision[np.ix_(keep, keep)]) / self.peaks[i]
             n_own = len(own)
