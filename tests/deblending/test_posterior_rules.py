@@ -68,14 +68,14 @@ def test_unlikeness_is_what_the_scale_next_to_two_pixels_shows(chi2):
 
 @pytest.mark.parametrize("level, share", [(0.0, 0.0), (0.1, 1 / 22), (9.0, 0.45)])
 def test_structure_is_stronger_where_light_may_be_a_neighbours(level, share):
-    """By half where a fifth of a source's light is others', in proportion below. A neighbour of
+    """By a quarter where a fifth of its light is others', in proportion below. A neighbour of
     0.1 over half of a source has 1 / 11 of the light there; one beside it has none, nor has the
     source's second component."""
     own, half = np.ones((4, 6)), np.ones((4, 3))
     boxes, spectra = [(5, 5), (5, 8), (5, 11), (5, 5)], np.outer([1, level, 20, 5], [3.0, 4.0])
     one = solution(boxes, [own, half, half, own], spectra=spectra)
     one.source[3] = 0
-    wanted = (1 + 0.5 * min(1, share / 0.2)) * solution(boxes[:1], [own]).strengths(0)
+    wanted = (1 + 0.25 * min(1, share / 0.2)) * solution(boxes[:1], [own]).strengths(0)
     np.testing.assert_allclose(one.strengths(0), wanted)
     np.testing.assert_array_equal(one.findings.strengths[0], [0.01, 0.05, 0.03])  # as the fit's
 

@@ -37,11 +37,11 @@ STRUCTURE_PX, WEIGHT, STRENGTH = 2.0, 10.0, 0.05
 # 0.02 the coverage of their sizes is 0.04 lower, and that of fluxes from signal to noise 10 to 100
 # as well.
 OTHERS, FLOOR = 3.5, 3.0
-# Strengths are learned from light whose owner is uncertain where sources overlap: what is unlike a
-# source's profile is fitted by its neighbour, and they come out too small. For errors they are
-# multiplied by OVERLAPPED where MOST_OVERLAPPED of the light, or more, is of other sources, by less
-# in proportion where less is. With 2 positions are over-covered, 0.75, with 1 fluxes are under-.
-OVERLAPPED, MOST_OVERLAPPED = 1.5, 0.2
+# Where sources overlap strengths are learned from light whose owner is uncertain, and come out too
+# small. For errors they are multiplied by OVERLAPPED where MOST_OVERLAPPED of the light, or more,
+# is that of other sources, by less in proportion where less is. With 1.5 joint fits have 76 % of
+# positions in 68 % intervals (seeds 20400 to 20459; without, 73 %).
+OVERLAPPED, MOST_OVERLAPPED = 1.25, 0.2
 # Unlikeness that counts for these at most: a merger of real galaxies reaches 10, of which the
 # powers would be a floor of half its flux.
 MOST_UNLIKE = 3.0
