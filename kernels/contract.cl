@@ -5,7 +5,7 @@
  *                                   NV VW
  *                              +----+----+-------+
  *                              |    |    |       |
- *                            k |    | B  |       |     ld n_pad
+ *                            k |    | B  |       |     row stride n_pad
  *                              |    |    |       |
  *               k              +----+----+-------+
  *          +---------+         +----+----+-------+
@@ -13,28 +13,30 @@
  *       MR +---------+      MR +----#====#       |     one work-item owns this tile of C:
  *          |    A    |         |    #    #       |     MR rows, NV vectors of VW columns
  *          +---------+         +----#====#       |
- *        m |         |       m |                 |     ld n_pad, or any if RAGGED
+ *        m |         |       m |                 |     n_pad, or any if RAGGED
  *          +---------+         +-----------------+
- *                                   n <= n_pad
+ *                                n in whole vectors
  *
  * The tile is kept in registers: B is read as aligned vectors, A as scalars that broadcast.  No
  * local memory, no barrier, no builtin but READ_AHEAD's.  A work-item takes RT such tiles, one
  * below the other.
  *
- * Layout: n_pad = n rounded up to a multiple of 16, so to whole vectors; where a tile reaches
- *   beyond n_pad, its vectors there do the first one's work again.  B always has ld n_pad with
- *   zeros in the padding; so has C, unless RAGGED, when C is a caller's array: element (i, j) at i
- *   * ld_c + j * step_c, any alignment.  A is any array: element (i, l) at i * ld_a + l, or at i *
- *   ld_a + l * step_a if STRIDED, so that it may be read transposed.
+ * Layout: `width` = n rounded up to a multiple of 16, so to whole vectors; where a tile reaches
+ *   beyond, its vectors there do the first one's work again.  Rows of B lie n_pad >= width apart,
+ *   with zeros from n to width; so do those of C, unless RAGGED, when C is a caller's array:
+ *   element (i, j) at i * ld_c + j * step_c, any alignment.  Beyond width nothing is read or
+ *   written.  A is any array: element (i, l) at i * ld_a + l, or at i * ld_a + l * step_a if
+ *   STRIDED, so that it may be read transposed.
  * Batch: item b uses A + (b / div_a) * stride_a and likewise for B, so a table that all bands of a
  *   scene share has div = n_bands, one that every scene shares has stride 0.
  * Terms are summed in stretches of `block` and the stretches' sums in a second set of registers:
  *   rounding then grows with the root of block + k / block, not of k.  Their order: `inward`, see
  *   contract.h.
- * READ_AHEAD: while a tile is multiplied, the columns of B that the next work-item reads are
- *   fetched into the core's second cache, a row of each KU for each tile.  They lie a row of B
- *   apart, which is slow to come from memory.  After the last columns of B come the first of the
- *   next item's.
+ * READ_AHEAD: what is slow to come from memory is fetched while something else is multiplied.
+ *   Of B the columns that the next work-item reads, into the core's second cache, a row of each KU
+ *   for each tile: they lie a row of B apart.  After the last columns come the first of the next
+ *   item's.  Of A, by the work-item of the first columns, the rows of the tile below, a stretch at
+ *   a time.  Of C and E what the tile itself will write and read.
  * Rows beyond m read row m - 1 again and are not stored.
  *
  * Epilogue, at most one of (rows 2i, 2i+1 hold the cos and sin parts of row frequency i):
@@ -49,15 +51,22 @@
  *   are m, n and k, none larger than the arguments, which set the layout. What of C lies beyond is
  *   not written. A factor with div 0, and E, are those of t.
  *
- * Launch: global = (ceil(n_pad / (NV VW)), ceil(m / (MR RT)), batch), each rounded up to its
+ * Launch: global = (ceil(width / (NV VW)), ceil(m / (MR RT)), batch), each rounded up to its
  *   local size.
  */
-#ifndef READ_AHEAD  /* 1: fetch the next columns of B meanwhile, by a builtin of clang and GCC */
+#ifndef READ_AHEAD  /* 1: fetch what is soon needed, by a builtin of clang and GCC */
 #define READ_AHEAD 0
 #endif
 #if READ_AHEAD
-#define AHEAD(from, step) \
-    __builtin_prefetch((const void *)(size_t)((from) + next + (step) * skipped), 0, 2);
+#define PREFETCH(from, writes, cache) \
+    __builtin_prefetch((const void *)(size_t)(from), writes, cache);
+#define LINE (64 / (int)sizeof(REAL))       /* elements that come at once */
+#define AHEAD(from, step) PREFETCH((from) + next + (step) * skipped, 0, 2)
+#if !STRIDED        /* rows that follow each other closely, as they do nearly everywhere */
+#define AHEAD_LEFT(row, l, step, n) \
+    if (j0 == 0) _Pragma("nounroll") for (int q = 0; q < (n) * MR; q += LINE) \
+        PREFETCH(row[0] + (long)MR * ld_a + (l) * MR + (step) * q, 0, 3)
+#endif
 #endif
 #include "contract.h"
 
@@ -65,11 +74,16 @@
 #define RT 1
 #endif
 #define OWNED(i, v) (i0 + (i) < m && j0 + (v) * VW < width)
-/* By the vector's address: on CPUs the vector leaves its register in one store. */
+/* By the vector's address: on CPUs the vector leaves its register in one store. Of adjacent columns
+ * that is one store to C too; asked of each lane, it would take a third of the product's time. */
 #define STORE_LANES(sums, c, n_left) \
     const REAL *lane = (const REAL *)&sums; \
-    for (int j = 0; j < VW; ++j) \
-        if (j < n_left) c[(size_t)j * step_c] = lane[j];
+    if (step_c == 1 && n_left >= VW) { \
+        UNROLL(j, VW) c[j] = lane[j]; \
+    } else { \
+        for (int j = 0; j < VW; ++j) \
+            if (j < n_left) c[(size_t)j * step_c] = lane[j]; \
+    }
 
 __kernel __attribute__((reqd_work_group_size(WGX, WGY, 1)))
 void contract(int m, int n, const int n_pad, int k, const int block,
@@ -87,6 +101,7 @@ void contract(int m, int n, const int n_pad, int k, const int block,
     const int top = (int)get_global_id(1) * MR * RT;
     const int b = (int)get_global_id(2);
     TAKE_OWN
+    const int width = (n + 15) / 16 * 16;
     if (j0 >= width || top >= m) return;
     A += offset_a + TABLE(div_a) * stride_a;
     B += TABLE(div_b) * stride_b;
@@ -104,6 +119,13 @@ void contract(int m, int n, const int n_pad, int k, const int block,
         WIDE acc[MR][NV];
 #if READ_AHEAD
         const long skipped = (i0 - top) / MR % KU * (long)n_pad;
+        if (!RAGGED || step_c == 1)
+            UNROLL(i, MR) for (int j = j0; j < j0 + NV * VW; j += LINE)
+                PREFETCH(C + (size_t)(i0 + i) * ld_c + j, 1, 3)
+#if MIX || TWIST
+        UNROLL(h, MR / 2) UNROLL(q, PLANES) for (int j = j0; j < j0 + NV * VW; j += LINE)
+            PREFETCH(PLANE(h, q, j), 0, 3)
+#endif
 #endif
         UNROLL(i, MR) row[i] = A + (size_t)(i0 + i < m ? i0 + i : m - 1) * ld_a;
         SUM_INSIDE(n - j0, m - i0, acc, row, B, n_pad, column, terms, block, inward)

@@ -45,24 +45,38 @@
 #ifndef AHEAD       /* what a kernel reads ahead of a turn's terms, which begin at `from` in B */
 #define AHEAD(from, step)
 #endif
+#ifndef AHEAD_LEFT  /* likewise of the n terms of a stretch from l on, in the rows of A */
+#define AHEAD_LEFT(row, l, step, n)
+#endif
 
 #ifndef OWN         /* 1: items have sizes and tables of their own, see contract.cl */
 #define OWN 0
 #endif
 
-/* Of an item b: the table that a factor reads, and `width`, its columns in whole vectors. */
+/* Of an item b: its sizes, and the table that a factor reads. */
 #if OWN
 #define TAKE_OWN \
     const int table = which[b / n_bands]; \
     m = own[3 * table]; \
     n = own[3 * table + 1]; \
-    k = own[3 * table + 2]; \
-    const int width = (n + 15) / 16 * 16;
+    k = own[3 * table + 2];
 #define TABLE(div) (size_t)((div) ? b / (div) : table)
 #else
-#define TAKE_OWN const int width = n_pad, table = b / n_bands;
+#define TAKE_OWN const int table = b / n_bands;
 #define TABLE(div) (size_t)(b / (div))
 #endif
+
+/* Where plane q of the epilogue's tables is for an item's row pair h and column j. */
+#if MIX
+#define PLANES 4
+#define BAND_E (size_t)(b % n_bands) * band_e
+#elif TWIST
+#define PLANES 2
+#define BAND_E 0
+#endif
+#define PLANE(h, q, j) \
+    (E + (size_t)table * stride_e + BAND_E + (size_t)(i0 / 2 + (h)) * 2 * n_pad \
+     + (q) * (2 * n_pad / PLANES) + (j) * 2 / PLANES)
 
 #define WIDE VEC(VW)
 #if VW == 16
@@ -104,6 +118,7 @@
         WIDE part[mr][nv], right[nv]; \
         UNROLL(i, mr) UNROLL(v, nv) part[i][v] = (WIDE)(0); \
         remain -= n_terms; \
+        AHEAD_LEFT(row, l, step, n_terms) \
         for (; n_terms >= KU; n_terms -= KU) { \
             AHEAD(from, step) \
             UNROLL(u, KU) { \

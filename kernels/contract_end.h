@@ -5,15 +5,14 @@
  * of a vector from c on, step_c apart, n_left of them at most.
  */
 #if MIX
-    __global const REAL *tables =
-        E + (size_t)table * stride_e + (size_t)(b % n_bands) * band_e;
     UNROLL(h, MR / 2) UNROLL(v, NV) {
         const int i = 2 * h;
         if (!OWNED(i, v)) continue;
         const WIDE c = acc[i][v], s = acc[i + 1][v];
-        __global const REAL *d = tables + (size_t)(i0 / 2 + h) * 2 * n_pad + column[v] / 2;
-        const HALF pr = AT(const HALF, d), pi = SIGN * AT(const HALF, d + n_pad / 2);
-        const HALF mr = AT(const HALF, d + n_pad), mi = SIGN * AT(const HALF, d + n_pad / 2 * 3);
+        const HALF pr = AT(const HALF, PLANE(h, 0, column[v]));
+        const HALF pi = SIGN * AT(const HALF, PLANE(h, 1, column[v]));
+        const HALF mr = AT(const HALF, PLANE(h, 2, column[v]));
+        const HALF mi = SIGN * AT(const HALF, PLANE(h, 3, column[v]));
         const HALF fpr = EVEN(c) - ODD(s), fpi = -(ODD(c) + EVEN(s));   /* F(+nu_y, +nu_x) */
         const HALF fmr = EVEN(c) + ODD(s), fmi = ODD(c) - EVEN(s);      /* F(+nu_y, -nu_x) */
         const HALF gpr = pr * fpr - pi * fpi, gpi = pr * fpi + pi * fpr;
@@ -24,13 +23,12 @@
         ODD(acc[i + 1][v]) = gmr - gpr;
     }
 #elif TWIST
-    __global const REAL *tables = E + (size_t)table * stride_e;
     UNROLL(h, MR / 2) UNROLL(v, NV) {
         const int i = 2 * h;
         if (!OWNED(i, v)) continue;
         const WIDE c = acc[i][v], s = acc[i + 1][v];
-        __global const REAL *t = tables + (size_t)(i0 / 2 + h) * 2 * n_pad + column[v];
-        const WIDE cos_t = AT(const WIDE, t), sin_t = SIGN * AT(const WIDE, t + n_pad);
+        const WIDE cos_t = AT(const WIDE, PLANE(h, 0, column[v]));
+        const WIDE sin_t = SIGN * AT(const WIDE, PLANE(h, 1, column[v]));
         acc[i][v] = c * cos_t + s * sin_t;
         acc[i + 1][v] = s * cos_t - c * sin_t;
     }

@@ -22,7 +22,7 @@
  *   stretches of `block` terms, rounded up to whole slabs, are summed first. What lies beyond k or
  *   m counts as zero.
  *
- * Launch: global = (ceil(n_pad / TN) WGX, ceil(m / TM) WGY, batch), groups of (WGX, WGY, 1).
+ * Launch: global = (ceil(width / TN) WGX, ceil(m / TM) WGY, batch), groups of (WGX, WGY, 1).
  */
 #include "contract.h"
 
@@ -104,6 +104,7 @@ void contract_group(int m, int n, const int n_pad, int k,
     const int top = (int)get_group_id(1) * TM, first = (int)get_group_id(0) * VECTORS * VW;
     const int i0 = top + ly * MR, b = (int)get_global_id(2);
     TAKE_OWN
+    const int width = (n + 15) / 16 * 16;
     if (top >= m || first >= width) return;   /* all of a group */
     A += offset_a + TABLE(div_a) * stride_a;
     B += TABLE(div_b) * stride_b;

@@ -12,11 +12,12 @@
  *            work-item takes a line of all bands of a scene, whose taps it reads once for all of
  *            them, (1, n_lines, batch / n_bands).
  *
- * rowdot   y[b, p] = sum_x T[b, p, x] * E[p, x]          launch: (n_positions rounded up, batch)
+ * rowdot   y[b, p] = sum_x<n T[b, p, x] * E[p, x]        launch: (n_positions rounded up, batch)
  * rowscale T[b, p, x] = y[b, p] * E[p, x]                launch: (n_positions * n_pad, batch)
  *          The two ends of the executor for any positions: each observed pixel p has a table row
  *          E[p] of its own.
- *   E (n_tables, n_positions, n_pad), T (batch, n_positions, n_pad): zero in the padding
+ *   E (n_tables, n_positions, n_pad), T (batch, n_positions, n_pad): zero from n on, of which
+ *   rowdot reads whole eights
  *
  * Item b uses table b / n_bands, or table 0 where there is only one; in gather which[b / n_bands].
  */
@@ -96,8 +97,8 @@ __kernel void gather(const int n_out, const int n_lines, const int n_bands, cons
 #endif
 }
 
-__kernel void rowdot(const int n_positions, const int n_pad, const int n_bands, const int n_tables,
-                     __global REAL *restrict y, const ulong y_offset,
+__kernel void rowdot(const int n_positions, const int n_pad, const int n, const int n_bands,
+                     const int n_tables, __global REAL *restrict y, const ulong y_offset,
                      __global const REAL *restrict T, __global const REAL *restrict E)
 {
     const int p = (int)get_global_id(0), b = (int)get_global_id(1);
@@ -106,7 +107,7 @@ __kernel void rowdot(const int n_positions, const int n_pad, const int n_bands, 
     T += ((size_t)b * n_positions + p) * n_pad;
     E += (i_table * n_positions + p) * n_pad;
     REAL part[8] = {0, 0, 0, 0, 0, 0, 0, 0};       /* independent sums, so that they vectorise */
-    for (int x = n_pad - 8; x >= 0; x -= 8)        /* low frequencies, the largest terms, last */
+    for (int x = (n - 1) / 8 * 8; x >= 0; x -= 8)  /* low frequencies, the largest terms, last */
         for (int i = 0; i < 8; ++i) part[i] += T[x + i] * E[x + i];
     y[y_offset + (size_t)b * n_positions + p] = SUM8(part);
 }

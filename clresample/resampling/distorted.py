@@ -27,7 +27,7 @@ class DistortedExecutor(Executor):
         self.to_rows = self.plain.bind(
             self.n_rows, self.k_x, self.k_y, self.out_y, z, half, inward=False
         )
-        self.rowdot = self._rows("rowdot", (self.tuning.line_group, 1), half)
+        self.rowdot = self._rows("rowdot", (self.tuning.line_group, 1), half).bind(n=self.k_x)
 
     def bind_back(self):
         super().bind_back()

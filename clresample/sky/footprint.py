@@ -64,8 +64,9 @@ class Footprint:
         """Whether points lie on the image (...), and its nearest pixels (2, ...) to them."""
         pixels = np.floor(np.nan_to_num(self.locate(points), nan=-1.0) + 0.5)
         top = np.array(self.mapping.shape_out) - 1
-        held = ((pixels >= 0) & (pixels <= top)).all(axis=-1)
-        return held, np.moveaxis(np.clip(pixels, 0, top).astype(int), -1, 0)
+        (y, x), (last_y, last_x) = np.moveaxis(pixels, -1, 0), top
+        held = (y >= 0) & (y <= last_y) & (x >= 0) & (x <= last_x)
+        return held, np.stack([np.clip(y, 0, last_y), np.clip(x, 0, last_x)]).astype(int)
 
 
 def open_edge(footprints, shape) -> np.ndarray:

@@ -235,6 +235,21 @@ def test_large_sources_have_parts_and_wide_waves_across_them(monkeypatch):
     assert worst[-1] < 0.1 * worst[0]
 
 
+@pytest.mark.parametrize("step", [1, 2, 4])
+@pytest.mark.parametrize("shape", [(12, 15), (40, 3)])
+def test_transforms_do_what_the_matrix_between_pixels_does(step, shape, monkeypatch):
+    """Also where answers are strong as far as they are taken, and pixels are further apart."""
+    rng = np.random.default_rng(0)
+    sharpness, images = rng.random(64 * 33), rng.normal(size=(40, *shape)).astype(np.float32)
+    wanted = inverse._through(sharpness, images, step)
+    np.testing.assert_array_equal(
+        wanted, images.reshape(40, -1) @ inverse._between(sharpness, shape, step)
+    )
+    monkeypatch.setattr(inverse, "MANY_PIXELS", 0)
+    found = inverse._through(sharpness, images, step)
+    np.testing.assert_allclose(found, wanted, atol=1e-6 * np.abs(wanted).max())
+
+
 def test_wide_waves_are_seen_on_coarser_pixels(monkeypatch):
     """So that T between the pixels stays small, and the inverse right to a factor of a few."""
     made, sizes = Made((40, 44), (0.003, 0.01, 1.0)), []

@@ -131,6 +131,21 @@ def test_what_lies_beyond_a_box():
     assert far.sums[0] > 0.01 * box.sum()
 
 
+def test_bumps_may_be_only_where_light_is_shared():
+    y, x = np.indices((40, 30))
+    profile = np.exp(-0.5 * ((y - 20) ** 2 + (x - 15) ** 2) / 6.0**2)
+    given, (row, column) = ((0, 0), profile, np.full(3, 0.05), LearnedPrior().kernels()), (24, 16)
+    shared = (np.abs(y - row) < 5) & (np.abs(x - column) < 3)
+    bumps = Bumps(*given, shared, all_over=False)
+    rows, columns = bumps.sides
+    at = np.column_stack([side.argmax(1) for side in (rows, columns)]) - (row, column)
+    wide = (columns / columns.max(1, keepdims=True) > 0.1).sum(1) > 11
+    assert 0 < wide.sum() < len(at) < len(Bumps(*given, shared).images) / 2
+    assert (np.abs(at) < (5 + 2, 3 + 2)).all()
+    between = (y == 18) & (x == 14)
+    assert not len(Bumps(*given, between, all_over=False).images)
+
+
 def test_bumps_of_large_galaxies_are_wider():
     y, x = np.indices((400, 300))
     profile = np.exp(-0.5 * ((y - 200) ** 2 + (x - 150) ** 2) / 60.0**2)

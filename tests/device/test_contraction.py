@@ -32,6 +32,37 @@ def test_product(device, tile, shape, dtype):
 
 
 @every_type
+@pytest.mark.parametrize("n", [120, 128, 256])
+def test_rows_do_not_crowd_the_cache(device, n, dtype):
+    """Rows a vector further apart than their columns, which stay alone beyond them."""
+    need(device, dtype)
+    m, k, n_pad = 8, 9, padded(n)
+    assert n_pad == contract.whole(n) + contract.COLUMN_PAD
+    a, b = random(m, k), random(k, n)
+    host = np.full((k, n_pad), np.nan)
+    host[:, :n], host[:, n : contract.whole(n)] = b, 0
+    right = device.put(host, dtype)
+    result = device.put(np.full((m, n_pad), 7.0), dtype)
+    Contraction(device, dtype).bind(
+        m, n, k, Matrix(device.put(a, dtype).base_data, k), Matrix(right.base_data, n_pad),
+        Matrix(result.base_data, n_pad),
+    )(1)  # fmt: skip
+    found = device.get(result)
+    check(found[:, :n], a @ b, dtype)
+    assert not found[:, n : contract.whole(n)].any()
+    assert (found[:, contract.whole(n) :] == 7).all()
+
+
+@pytest.mark.parametrize("n", [1, 16, 112, 113, 128, 129, 200, 384])
+def test_no_row_is_as_long_as_what_crowds_a_cache(n):
+    assert contract.whole(n) in range(n, n + contract.COLUMN_PAD)
+    assert padded(n) % contract.COLUMN_PAD == 0
+    assert padded(n) % contract.CROWDED
+    assert padded(n) - contract.whole(n) in (0, contract.COLUMN_PAD)
+    np.testing.assert_array_equal(padded(np.array([n, 7])), [padded(n), 16])
+
+
+@every_type
 def test_one_right_factor_for_all_and_tables_shared_by_bands(device, dtype):
     need(device, dtype)
     m, n, k, n_bands = 5, 19, 11, 3

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.products import check, every_type, need, put_right, random, tile
 
-from clresample.device.contraction import Contraction, Matrix, Own, padded
+from clresample.device.contraction import Contraction, Matrix, Own, whole
 
 __all__ = ["tile"]  # a fixture
 
@@ -29,6 +29,6 @@ def test_items_with_tables_and_sizes_of_their_own(device, tile, dtype):
     found = device.get(result)
     for item, right, t in zip(found, b, np.repeat(which, n_bands), strict=True):
         check(item[: m[t], : n[t]], tables[t, : m[t], : k[t]] @ right[: k[t], : n[t]], dtype)
-        assert (item[m[t] :] == 7).all() and (item[:, padded(n[t]) :] == 7).all()
+        assert (item[m[t] :] == 7).all() and (item[:, whole(n[t]) :] == 7).all()
     with pytest.raises(ValueError, match=r"own sizes .*40.*30.*\(13, 40, 30\)"):
         bind(*arguments, own=Own(on_device, m=np.array([5, 14, 1])))

@@ -13,7 +13,7 @@ from clresample.cli.machine import tune as tuner
 from clresample.cli.machine.tune import CPU_TILES, GPU_TILES, supposed
 from clresample.cli.machine.workload import Iterations
 from clresample.device import measure
-from clresample.device.contraction import padded
+from clresample.device.contraction import whole
 from clresample.device.remembered import DeviceWarning, Remembered
 from clresample.device.tuning import PART, Tuning, is_tile
 
@@ -106,7 +106,7 @@ def test_candidates_build_what_they_say():
 )
 def test_columns_choose_the_vectors_of_a_tile(device, monkeypatch, name, n, vectors):
     tune(monkeypatch, tile=TILES[name])
-    tile = Tuning.of(device).tile_for_columns(n, padded(n))
+    tile = Tuning.of(device).tile_for_columns(n, whole(n))
     assert (tile["NV"], tile["VW"]) == vectors
     rows = {5: 4}.get(tile["NV"], TILES[name]["MR"])
     assert tile == TILES[name] | {"NV": vectors[0], "VW": vectors[1], "MR": rows}

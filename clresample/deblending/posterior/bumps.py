@@ -43,18 +43,19 @@ class Bumps:
     sides: (k, ny) and (k, nx), whose products are the Gaussians y
 
     origin (2,) [px]: of the box in the frame; profile (ny, nx); strengths (J,): of the prior's
-    scales; kernels: its J kernels; shared (ny, nx): where light may be exchanged
+    scales; kernels: its J kernels; shared (ny, nx): where light may be exchanged; all_over: else
+        there are none but where that is; most: how many at most, MOST by default
     """
 
-    def __init__(self, origin, profile, strengths, kernels, shared):
+    def __init__(self, origin, profile, strengths, kernels, shared, *, all_over=True, most=None):
         spacings, low = (COARSE, FINE), None
-        while low is None or len(low) > MOST:
+        while low is None or len(low) > (most or MOST):
             taps, period = tuple(k.tobytes() for k in kernels), max(spacings)
             axes = [
                 _axis(int(o) % period, n, taps, spacings)
                 for o, n in zip(origin, profile.shape, strict=True)
             ]
-            pairs = zip(*_chosen(axes, profile, shared), strict=True)
+            pairs = zip(*_chosen(axes, profile, shared, all_over), strict=True)
             low, high = (np.concatenate(part) for part in pairs)
             spacings = tuple(2 * h for h in spacings)
         rows, columns = axes
@@ -125,10 +126,11 @@ def _blur(values, taps):
     return values @ np.where(inside, taps[np.clip(lag, 0, len(taps) - 1)], 0)
 
 
-def _chosen(axes, profile, shared):
-    """Pairs of indices (k,), (k,) of rows and columns: coarse bumps, and fine ones where shared."""
+def _chosen(axes, profile, shared, all_over):
+    """Pairs of indices (k,), (k,) of rows and columns: coarse bumps, all over the profile or where
+    shared, and fine ones where shared."""
     rows, columns = axes
-    for which, where in (("coarse", None), ("fine", shared)):
+    for which, where in (("coarse", None if all_over else shared), ("fine", shared)):
         if where is not None and not where.any():
             continue
         a, b = (getattr(axis, which) for axis in axes)

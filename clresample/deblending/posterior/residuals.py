@@ -142,9 +142,9 @@ def pixels_in_boxes(result, i_observation, positions):
     for s in np.unique(owners):
         parts = np.flatnonzero(owners == s)
         window = _window(result.rendered[i_observation], parts, positions.shape)
-        places, inside = positions[window], None
-        for low, size in (boxes[i] for i in parts):
-            one = ((places >= low) & (places < low + size)).all(axis=-1)
+        (y, x), inside = np.moveaxis(positions[window], -1, 0), None
+        for (y0, x0), (n_y, n_x) in (boxes[i] for i in parts):
+            one = (y >= y0) & (y < y0 + n_y) & (x >= x0) & (x < x0 + n_x)
             inside = one if inside is None else inside | one
         yield s, window, inside
 

@@ -11,7 +11,7 @@ from the cache.
 
 from __future__ import annotations
 
-from ...device.contraction import Contraction, ImageBatch, Matrix, padded
+from ...device.contraction import Contraction, ImageBatch, Matrix, padded, whole
 from ...device.tuning import Tuning
 from .launches import Pixels, Shifts, SlabLaunches
 from .slabs import SHIFT_COST, cut
@@ -43,7 +43,7 @@ class Factors:
         self.h_y, self.h_x = (self.k_y + 1) // 2, (self.k_x + 1) // 2
         self.n_units, self.unit_rows, self.z_rows = self.units()
         self.n_terms = self.n_units * self.unit_rows
-        self.cost = self.n_terms * padded(self.n_i) * (self.n_l + SHIFT_COST)
+        self.cost = self.n_terms * whole(self.n_i) * (self.n_l + SHIFT_COST)
 
     def prepare(self):
         """Kernels and the model's transform on the device, and the slabs of the inner index."""

@@ -60,7 +60,7 @@ def interpolate_psf(device, matrix, psf: PSF, n_fft, fine=1):
         device.zeros(shape, dtype)
         for shape in ((n_block, n_y), (n_block, n_pad), (n_block, n_pad), (n_block,))
     )
-    along_x.bind(n_pad=n_pad, n_bands=1, n_tables=1, y=values, y_offset=0, T=sums, E=columns)
+    along_x.bind(n_pad=n_pad, n=n_x, n_bands=1, n_tables=1, y=values, y_offset=0, T=sums, E=columns)
     for band, image in enumerate(psf.images):
         samples = device.put(np.pad(image, ((0, 0), (0, n_pad - n_x))), dtype)
         samples = Matrix(samples.base_data, n_pad)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ....device.contraction import padded, stretch
+from ....device.contraction import stretch, whole
 
 # The columns of the kernel's table, each int64.
 COLUMNS = ["m", "n", "k", "begin_a", "ld_a", "next_a", "begin_b", "ld_b", "skip"]
@@ -28,7 +28,7 @@ class BoxedProduct:
         items = [np.broadcast_to(sizes[name], b.n_sources) for name in COLUMNS]
         tile, m, width = _tile(b.tuning), max(items[0]), max(items[1] + items[8])
         group = tile["WGX"], tile["WGY"]
-        along = math.ceil(padded(int(width)) / (tile["VW"] * tile["NV"]))
+        along = math.ceil(whole(int(width)) / (tile["VW"] * tile["NV"]))
         tiles = b.along_row(along), int(m) / tile["MR"]
         self._size = tuple(math.ceil(n / g) * g for n, g in zip(map(math.ceil, tiles), group))
         self._launch = b.device.launcher(

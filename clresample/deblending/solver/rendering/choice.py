@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ....device.contraction import padded
+from ....device.contraction import whole
 from .stages import Frames, Transformed
 from .windows import Groups, Windows, reach_of
 
@@ -31,7 +31,7 @@ def flops(buffers, op, executor) -> list[float]:
     What all of them do, from frequencies to the observation and back, is left out.
     """
     e, shape = executor, buffers.host_boxes.shape[:, list(executor.axes)]
-    waves = np.stack([e.k_ys, padded(e.k_xs)], axis=1)
+    waves = np.stack([e.k_ys, whole(e.k_xs)], axis=1)
     of_plan = np.arange(len(buffers.scenes)) % len(waves)  # one serves all scenes, or each has one
     of_frame, of_box = waves[of_plan], waves[of_plan[buffers.host_boxes.scene]]
     return _counts(shape, op.shape_in[0], e.n_y, e.n_x, of_frame, of_box)
@@ -89,7 +89,8 @@ def _parts(buffers, op, count):
     e = op.executor()
     observed = _observed(plan, e.n_rows, e.n_columns, e.k_y, e.k_x)
     least, found = GAIN * (count + 4 * n_images * observed), None
-    for limit in (np.inf, *(LARGE * np.median(sides))):
+    limits = LARGE * np.median(sides)
+    for limit in (np.inf, *limits[limits < sides.max()]):
         split = [np.flatnonzero(part) for part in (sides <= limit, sides > limit)]
         best = [_best_groups(buffers, op, which) for which in split if len(which)]
         total = sum(one for one, _ in best)

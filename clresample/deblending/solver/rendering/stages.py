@@ -22,7 +22,7 @@ import functools
 
 import numpy as np
 
-from ....device.contraction import COLUMN_PAD, ImageBatch, padded
+from ....device.contraction import COLUMN_PAD, ImageBatch, padded, whole
 from ..boxes import Boxes
 from .boxed import BoxedProduct
 from .composition import Composition
@@ -138,7 +138,7 @@ class _Boxes:
         self._buffers, self._executor = b, e
         # frequencies of the sources' own scenes: elements of a row, and those that are not padding
         self._k_y, self._k_x = (k[own.scene % len(k)] for k in (e.k_ys, e.k_xs))
-        self._wide = padded(self._k_x)
+        self._wide = whole(self._k_x)
         zero = np.zeros(n, np.int32)
         self.lines = Boxes(
             own.scene,
