@@ -11,6 +11,10 @@ mode        joint, euclid or rubin; joint-lanczos and joint-drizzle: parametric 
             of pixels of 0.7, whose noise is correlated, which the fit is told; and the same with
             "-as-white": it is not told
 galaxies    parametric: bulge, disk and knots; cosmos: real ones whose light is not clearly negative
+light       drawn: magnitudes uniform in 20 - 29, those of all COSMOS galaxies; even: all light of a
+            scene times one factor, so that its sources' median signal to noise, of shapes that are
+            known, is log-uniform in 3 - 10000 and no source brighter than magnitude 18. Bins are
+            then filled about alike, where magnitudes as drawn leave few fluxes above 300
 quantity    flux, colour (of neighbouring bands), position, size, ellipticity
 n           values; of a flux one for each galaxy and band
 coverage    share of |estimate - truth| < error: 0.683 where errors are right and normal
@@ -33,29 +37,30 @@ from clresample.simulation.coadds import mosaic_scene
 from clresample.simulation.scenes import simulate_scene
 
 from .harness import records, scenes, truth
+from .harness.brightness import evened
 from .harness.clock import in_processes, on_one_thread
 from .harness.options import BadOption, Parser, positive, run
 
 GALAXIES = ("parametric", "cosmos")
 EDGES = (3.0, 10.0, 30.0, 100.0, 300.0, np.inf)  # signal to noise
 # Scenes of each kind and mode. Of parametric galaxies so many that the standard error of a flux
-# bin's coverage is under 0.015: of 1000 fluxes above signal to noise 300, of which a scene has 2.5
-# together, 0.4 in Euclid, 2 in Rubin. All take half an hour on two cores.
+# bin's coverage is under 0.015, by what 100 joint and Rubin scenes and 200 of Euclid's had. All
+# take an hour or two on two cores.
 N_SCENES = {
     "parametric": {
-        "joint": 700,
-        "euclid": 2500,
-        "rubin": 950,
-        "joint-lanczos": 450,
-        "joint-drizzle": 450,
+        "joint": 550,
+        "euclid": 1500,
+        "rubin": 650,
+        "joint-lanczos": 550,
+        "joint-drizzle": 550,
         "joint-lanczos-as-white": 60,
         "joint-drizzle-as-white": 60,
     },
     "cosmos": {"joint": 120, "euclid": 300, "rubin": 120},
 }
-N_QUICK, N_QUICK_MOSAICS = 10, 3
+N_QUICK, N_QUICK_MOSAICS = 5, 2
 # Constants were chosen on scenes of seeds before these.
-FIRST_SEED = 1000
+FIRST_SEED = 20000
 MODES = tuple(N_SCENES["parametric"])
 # How the images of scenes become mosaics, see `mosaic_scene`; in other modes they stay as taken.
 MOSAICS = {
@@ -73,6 +78,7 @@ NEGATIVE = 0.005
 COLUMNS = (
     ("mode", 22, ""),
     ("galaxies", 10, ""),
+    ("light", 5, ""),
     ("quantity", 11, ""),
     ("snr_low", 7, "g"),
     ("snr_high", 8, "g"),
@@ -84,22 +90,34 @@ COLUMNS = (
 )
 
 
-def make_scene(galaxies, mode, folder, seed):
-    """A `SimulatedScene` of one of GALAXIES; folder: of the COSMOS galaxies."""
+def light_of(galaxies, as_drawn):
+    """What rows say of the scenes' light."""
+    return "drawn" if as_drawn or galaxies == "cosmos" else "even"
+
+
+def make_scene(galaxies, mode, folder, seed, as_drawn):
+    """A `SimulatedScene` of one of GALAXIES; folder: of COSMOS'; as_drawn: see `light_of`."""
     scene = simulate_scene(seed) if galaxies == "parametric" else scenes.opened(folder).take(seed)
+    if light_of(galaxies, as_drawn) == "even":
+        scene = evened(scene, instruments(mode))
     if mode not in MOSAICS:
         return scene
     return mosaic_scene(scene, np.random.default_rng(seed), **MOSAICS[mode])
 
 
-def measure(galaxies, mode, folder, seeds, negative=NEGATIVE):
+def instruments(mode):
+    """Which of `scenes.MODES` one of MODES is."""
+    return mode.partition("-")[0]
+
+
+def measure(galaxies, mode, folder, seeds, negative=NEGATIVE, as_drawn=False):
     """What `truth.compare` finds in scenes of these seeds, and how their fits ended.
 
     returns [{quantity: (4, n)}, ...], one for each scene that could be fitted; [status, ...]
     """
     parametric = galaxies == "parametric"
-    found = [make_scene(galaxies, mode, folder, seed) for seed in seeds]
-    mode = mode.partition("-")[0]
+    found = [make_scene(galaxies, mode, folder, seed, as_drawn) for seed in seeds]
+    mode = instruments(mode)
     results = scenes.fit([scenes.blend(scene, mode) for scene in found])
     values = []
     for scene, result in zip(found, results, strict=True):
@@ -109,8 +127,8 @@ def measure(galaxies, mode, folder, seeds, negative=NEGATIVE):
     return values, [result.status for result in results]
 
 
-def rows_of(mode, galaxies, values):
-    """Rows of one mode and kind of galaxies; values: of `measure`, all chunks in one list."""
+def rows_of(mode, galaxies, light, values):
+    """Rows of one mode, kind of galaxies and of light; values: of `measure`, chunks in one list."""
     for quantity in truth.QUANTITIES:
         found = [one[quantity] for one in values if quantity in one]
         if not found:
@@ -122,7 +140,7 @@ def rows_of(mode, galaxies, values):
             here = (snr >= low) & (snr < high)
             pull = (estimate - true)[here] / error[here]
             relative = (estimate - true)[here] / true[here]
-            row = {"mode": mode, "galaxies": galaxies, "quantity": quantity}
+            row = {"mode": mode, "galaxies": galaxies, "light": light, "quantity": quantity}
             row |= {"snr_low": low, "snr_high": high, "n": int(here.sum())}
             bias = relative if quantity in truth.RELATIVE else pull
             yield row | _statistics(pull, bias, i_scene[here])
@@ -148,8 +166,9 @@ def fitted(wanted, n_scenes, options):
     yields, once all scenes of a pair are done: galaxies, mode, the values of its scenes in the
         order of their seeds, and how many fits ended in which way
     """
+    how = options.negative, options.as_drawn
     tasks = [
-        (galaxies, mode, options.catalogue, range(start, min(start + CHUNK, end)), options.negative)
+        (galaxies, mode, options.catalogue, range(start, min(start + CHUNK, end)), *how)
         for galaxies, mode in wanted
         for end in [options.seed + n_scenes[galaxies][mode]]
         for start in range(options.seed, end, CHUNK)
@@ -195,7 +214,7 @@ def main(options):
     rows, summary = [], {"how fits ended": {}}
     records.print_head(COLUMNS)
     for kind, mode, values, ends in fitted(wanted, n_scenes, options):
-        for row in rows_of(mode, kind, values):
+        for row in rows_of(mode, kind, light_of(kind, options.as_drawn), values):
             rows.append(row)
             records.print_row(COLUMNS, row)
         summary["how fits ended"][f"{kind}, {mode}"] = dict(ends)
@@ -220,6 +239,11 @@ def parser():
     )
     parser.add_first_seed(FIRST_SEED)
     parser.add_argument("--modes", nargs="+", choices=MODES, default=MODES)
+    parser.add_argument(
+        "--as-drawn",
+        action="store_true",
+        help="leave the light of parametric galaxies as drawn",
+    )
     parser.add_argument(
         "--galaxies",
         nargs="+",

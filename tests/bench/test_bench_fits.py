@@ -11,8 +11,8 @@ pytest.importorskip("galsim")
 
 RECORD = {"date", "device", "platform", "machine", "python", "threads", "clresample", "numpy"}
 COVERAGE = {
-    "mode", "galaxies", "quantity", "snr_low", "snr_high", "n", "coverage", "error", "width",
-    "bias",
+    "mode", "galaxies", "light", "quantity", "snr_low", "snr_high", "n", "coverage", "error",
+    "width", "bias",
 }  # fmt: skip
 THROUGHPUT = {
     "what", "n_scenes", "n_sources", "n_model", "core_s_per_source", "wall_s", "galsim_ms",
@@ -51,6 +51,7 @@ def test_coverage(tmp_path):
         "--galaxies", "parametric", "--processes", 1,
     )  # fmt: skip
     assert all(row.keys() == COVERAGE for row in rows)
+    assert {row["light"] for row in rows} == {"even"}
     fluxes = [row for row in rows if row["quantity"] == "flux"]
     assert [(r["mode"], r["snr_low"]) for r in fluxes] == [
         (mode, low) for mode in ("euclid", "rubin") for low in (3, 10, 30, 100, 300, 3)
@@ -70,7 +71,8 @@ def test_coverage_of_right_errors_is_that_of_a_normal_distribution():
     error = true / snr
     estimate = 1.01 * true + error * rng.standard_normal(snr.shape)
     values = [{"flux": np.stack(one)} for one in zip(snr, estimate, true, error, strict=True)]
-    rows = {(r["snr_low"], r["snr_high"]): r for r in rows_of("joint", "parametric", values)}
+    found = rows_of("joint", "parametric", "even", values)
+    rows = {(r["snr_low"], r["snr_high"]): r for r in found}
     whole = rows[3, np.inf]
     assert whole["n"] == 8000
     assert whole["coverage"] == pytest.approx(0.68, abs=0.02)
@@ -80,8 +82,30 @@ def test_coverage_of_right_errors_is_that_of_a_normal_distribution():
     assert rows[100, 300]["n"] == 0
     # galaxies of a scene that all err alike say as little as one of them
     alike = [{"flux": np.repeat(v["flux"][:, :1], 20, axis=1)} for v in values]
-    *_, found = rows_of("joint", "parametric", alike)
+    *_, found = rows_of("joint", "parametric", "even", alike)
     assert found["error"] == pytest.approx(np.sqrt(0.68 * 0.32 / 400), rel=0.2)
+
+
+def test_scenes_are_made_brighter_with_their_truth_and_the_same_noise():
+    from bench.harness.brightness import BRIGHTEST_MAG, evened, signal_to_noise
+    from clresample.simulation.scenes import simulate_scene
+
+    scene = simulate_scene(0, n_sources=3, n_pixels=30)
+    for mode, images in (("euclid", ["euclid"]), ("joint", ["euclid", "rubin"])):
+        found = evened(scene, mode)
+        snr = np.median(signal_to_noise(found, mode))
+        factor = snr / np.median(signal_to_noise(scene, mode))
+        brightest = min(getattr(found, name).magnitudes.min() for name in images)
+        assert brightest == pytest.approx(BRIGHTEST_MAG) or (brightest > 18 and 3 < snr < 10000)
+        for name in ("euclid", "rubin"):
+            old, new = getattr(scene, name), getattr(found, name)
+            noise = [image.data - image.contributions.sum(axis=0) for image in (old, new)]
+            np.testing.assert_allclose(*noise, atol=1e-6 * new.survey.noise_sigma.min())
+            np.testing.assert_allclose(new.counts, factor * old.counts)
+            np.testing.assert_allclose(new.survey.counts(new.magnitudes), new.counts)
+            np.testing.assert_allclose(new.contributions, factor * old.contributions)
+            assert new.truth is old.truth
+        assert evened(scene, mode).euclid.counts[0] == found.euclid.counts[0]  # by the seed
 
 
 def test_values_with_errors_are_found_by_their_columns(monkeypatch):

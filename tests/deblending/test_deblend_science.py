@@ -115,6 +115,24 @@ def test_the_angle_and_the_parity_of_pixels_do_not_matter(fitted, view):
     )
 
 
+def test_sizes_of_very_bright_galaxies_are_free_of_what_the_bound_adds_to_their_wings():
+    """At signal to noise 5000 if shapes were known; were wings left as they are, by an error."""
+    pytest.importorskip("galsim")
+    from bench.harness import scenes, truth
+    from bench.harness.brightness import brightened, signal_to_noise
+    from clresample.simulation.scenes import simulate_scene
+
+    bright = []
+    for seed in range(100, 108):
+        scene = simulate_scene(seed, n_sources=1, n_pixels=40)
+        bright.append(brightened(scene, 5000 / signal_to_noise(scene, "euclid").item()))
+    results = deblend_many([scenes.blend(scene, "euclid") for scene in bright])
+    sizes = [truth.compare(r, s, "euclid")["size"] for r, s in zip(results, bright, strict=True)]
+    _, estimate, true, error = np.concatenate(sizes, axis=1)
+    assert estimate.shape == (8,)
+    assert np.median((estimate - true) / error) < 0.75
+
+
 def test_a_source_that_only_rubin_sees_starts_right():
     """Low-resolution data count when a fit starts, beside a source that both see."""
     pytest.importorskip("galsim")

@@ -26,15 +26,16 @@ def gaussians(origin, shape, h):
     return np.exp(-0.5 * np.array(away))
 
 
-def test_bumps_are_convolutions_by_definition():
+@pytest.mark.parametrize("least_light", [1e-4, 1e-6])
+def test_bumps_are_convolutions_by_definition(least_light):
     prior, shape, origin = LearnedPrior(), (23, 27), (13, 22)
     y, x = np.indices(shape)
     profile = np.exp(-0.5 * ((y - 10) ** 2 + (x - 14) ** 2) / 3.0**2)
     shared = (np.abs(y - 11) < 4) & (x > 9) & (x < 18)
     strengths = np.array([0.02, 0.06, 0.03])
-    bumps = Bumps(origin, profile, strengths, prior.kernels(), shared)
+    bumps = Bumps(origin, profile, strengths, prior.kernels(), shared, least_light=least_light)
     coarse, fine = (gaussians(origin, shape, h) for h in (8, 4))
-    light = [(bump * profile).max((1, 2)) > 1e-4 for bump in (coarse, fine)]
+    light = [(bump * profile).max((1, 2)) > least_light for bump in (coarse, fine)]
     wanted = np.concatenate(
         [coarse[light[0]], fine[light[1] & ((fine * shared).max((1, 2)) > 0.8)]]
     )

@@ -37,6 +37,7 @@ def solution(
         [None] * n,
         [None] * n,
         np.zeros((n, 2)),
+        np.arange(n),
         SimpleNamespace(**(given | findings)),
         np.full(n, chi2),
         PRIOR,
@@ -53,9 +54,8 @@ def spot(n=9, sigma=2.0):
 def test_unlikeness_is_what_the_scale_next_to_two_pixels_shows(chi2):
     """Under ten pixels' worth of 5 %; misfit makes it less, and 1 of stars."""
     energies, determined = np.array([[9, 0.8, 9]] * 2), np.array([[1, 30, 1]] * 2)
-    one = solution(
-        [(0, 0)] * 2, [spot()] * 2, energies=energies, determined=determined, chi2=chi2, fixed=(1,)
-    )
+    given = {"energies": energies, "determined": determined, "chi2": chi2}
+    one = solution([(0, 0), (9, 0)], [spot()] * 2, fixed=(1,), **given)
     wanted = np.sqrt((0.8 / max(chi2, 1) + 10 * 0.05**2) / 40) / 0.05
     assert one.unlikeness(0) == pytest.approx(wanted) and one.unlikeness(1) == 1
     assert STRENGTH == 0.05
@@ -64,6 +64,20 @@ def test_unlikeness_is_what_the_scale_next_to_two_pixels_shows(chi2):
     )
     np.testing.assert_array_equal(one.findings.strengths[0], [0.01, 0.05, 0.03])  # left as it is
     assert [power_of(unlike, 2.0) for unlike in (0.5, 3.0, 7.0)] == [0.25, 9.0, 9.0]
+
+
+@pytest.mark.parametrize("level, share", [(0.0, 0.0), (0.1, 1 / 22), (9.0, 0.45)])
+def test_structure_is_stronger_where_light_may_be_a_neighbours(level, share):
+    """By a quarter where a fifth of its light is others', in proportion below. A neighbour of
+    0.1 over half of a source has 1 / 11 of the light there; one beside it has none, nor has the
+    source's second component."""
+    own, half = np.ones((4, 6)), np.ones((4, 3))
+    boxes, spectra = [(5, 5), (5, 8), (5, 11), (5, 5)], np.outer([1, level, 20, 5], [3.0, 4.0])
+    one = solution(boxes, [own, half, half, own], spectra=spectra)
+    one.source[3] = 0
+    wanted = (1 + 0.25 * min(1, share / 0.2)) * solution(boxes[:1], [own]).strengths(0)
+    np.testing.assert_allclose(one.strengths(0), wanted)
+    np.testing.assert_array_equal(one.findings.strengths[0], [0.01, 0.05, 0.03])  # as the fit's
 
 
 def test_what_bumps_change_counts_in_errors_of_flux_and_size():

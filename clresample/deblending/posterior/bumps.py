@@ -22,7 +22,8 @@ COARSE, FINE = 8, 4
 # Their cost grows with the square. 400 are those of a box of 160 pixels a side; a galaxy that is
 # wider has its light, and what may be unknown of it, in more than that.
 MOST = 400
-# Bumps that hold no more than this of the profile's peak anywhere are left out: they add no light.
+# Bumps that hold no more than this of the profile's peak anywhere are left out: they add no light
+# that overlapping sources could exchange. Errors go further, see modes.py.
 LEAST_LIGHT = 1e-4
 # Sides of boxes whose tables are kept, 50 kB each at 30 pixels.
 MOST_AXES = 256
@@ -43,11 +44,23 @@ class Bumps:
     sides: (k, ny) and (k, nx), whose products are the Gaussians y
 
     origin (2,) [px]: of the box in the frame; profile (ny, nx); strengths (J,): of the prior's
-    scales; kernels: its J kernels; shared (ny, nx): where light may be exchanged; all_over: else
-        there are none but where that is; most: how many at most, MOST by default
+        scales; kernels: its J kernels; shared (ny, nx): where light may be exchanged; all_over:
+        else there are none but where that is; most: how many at most, MOST by default;
+        least_light: see LEAST_LIGHT
     """
 
-    def __init__(self, origin, profile, strengths, kernels, shared, *, all_over=True, most=None):
+    def __init__(
+        self,
+        origin,
+        profile,
+        strengths,
+        kernels,
+        shared,
+        *,
+        all_over=True,
+        most=None,
+        least_light=LEAST_LIGHT,
+    ):
         spacings, low = (COARSE, FINE), None
         while low is None or len(low) > (most or MOST):
             taps, period = tuple(k.tobytes() for k in kernels), max(spacings)
@@ -55,7 +68,7 @@ class Bumps:
                 _axis(int(o) % period, n, taps, spacings)
                 for o, n in zip(origin, profile.shape, strict=True)
             ]
-            pairs = zip(*_chosen(axes, profile, shared, all_over), strict=True)
+            pairs = zip(*_chosen(axes, profile, shared, all_over, least_light), strict=True)
             low, high = (np.concatenate(part) for part in pairs)
             spacings = tuple(2 * h for h in spacings)
         rows, columns = axes
@@ -126,15 +139,15 @@ def _blur(values, taps):
     return values @ np.where(inside, taps[np.clip(lag, 0, len(taps) - 1)], 0)
 
 
-def _chosen(axes, profile, shared, all_over):
+def _chosen(axes, profile, shared, all_over, least_light):
     """Pairs of indices (k,), (k,) of rows and columns: coarse bumps, all over the profile or where
-    shared, and fine ones where shared."""
+    shared, and fine ones where shared; none with less light anywhere than least_light."""
     rows, columns = axes
     for which, where in (("coarse", None if all_over else shared), ("fine", shared)):
         if where is not None and not where.any():
             continue
         a, b = (getattr(axis, which) for axis in axes)
-        keep = _most(rows.values[a], columns.values[b], profile) > LEAST_LIGHT
+        keep = _most(rows.values[a], columns.values[b], profile) > least_light
         if where is not None:
             keep &= _most(rows.values[a], columns.values[b], where) > REACHED
         low, high = np.nonzero(keep)

@@ -172,6 +172,7 @@ def exchange_of(fit, scene, state, findings):
         fit.start.shapes,
         fit.start.thetas,
         fit.start.positions[fit.start.source],
+        fit.start.source,
         findings,
         np.ones(n),
         fit.settings.prior,

@@ -11,12 +11,17 @@ from ...sky.extent import shared_part
 from ..solver.learned.prior import LearnedPrior
 from ..solver.scene import Scene
 from ..view import without_dark
-from .bumps import Bumps, uncorrelated
+from .bumps import LEAST_LIGHT, Bumps, uncorrelated
 from .profile_modes import profile_modes
 
 # Bumps that the prior allows to change a flux or a second moment by less than this many errors at
 # fixed morphologies are left out.
 LEAST_CHANGE = 1.0
+# [noise] So are bumps whose light is nowhere more than this or, where that is more of a source's
+# peak, than bumps.LEAST_LIGHT of it. By LEAST_LIGHT alone the wings of galaxies above signal to
+# noise 1000 have none, and what the bound of morphologies at 0 adds there stays in their sizes, an
+# error or 0.2 %, and in their fluxes, half an error.
+FAINTEST = 1e-3
 # Light is exchanged where a neighbour has more than this part of the source's own, and both more
 # than FAINT of a pixel's noise.
 RATIO, FAINT = 0.05, 0.3
@@ -32,6 +37,11 @@ STRUCTURE_PX, WEIGHT, STRENGTH = 2.0, 10.0, 0.05
 # 0.02 the coverage of their sizes is 0.04 lower, and that of fluxes from signal to noise 10 to 100
 # as well.
 OTHERS, FLOOR = 3.5, 3.0
+# Where sources overlap strengths are learned from light whose owner is uncertain, and come out too
+# small. For errors they are multiplied by OVERLAPPED where MOST_OVERLAPPED of the light, or more,
+# is that of other sources, by less in proportion where less is. With 1.5 joint fits have 76 % of
+# positions in 68 % intervals (seeds 20400 to 20459; without, 73 %).
+OVERLAPPED, MOST_OVERLAPPED = 1.25, 0.2
 # Unlikeness that counts for these at most: a merger of real galaxies reaches 10, of which the
 # powers would be a floor of half its flux.
 MOST_UNLIKE = 3.0
@@ -42,6 +52,14 @@ def power_of(unlikeness, exponent):
     return min(unlikeness, MOST_UNLIKE) ** exponent
 
 
+def enlarged(own, others):
+    """What strengths are multiplied by where the light of other sources lies on the own, both
+    (ny, nx) as expected; see OVERLAPPED."""
+    own, others = np.maximum(own, 0), np.maximum(others, 0)
+    shared = (own * others / np.maximum(own + others, 1e-30)).sum() / max(own.sum(), 1e-30)
+    return 1 + (OVERLAPPED - 1) * min(1, shared / MOST_OVERLAPPED)
+
+
 @dataclass(frozen=True, eq=False)
 class Solution:
     """A fitted scene, n components, C channels, in units of the views' noise.
@@ -50,6 +68,7 @@ class Solution:
         morphologies, by which those were divided
     spectra (n, C); fixed_error (n, C): of these at fixed morphologies
     shapes, thetas, positions (n): the start's Shapes, parameters, places (2,) [px]
+    source (n,): to which each component belongs
     findings: Findings; chi2 (n,): per pixel, where each component's light is
     prior: LearnedPrior
     pulls (n): arrays (ny, nx), see bounds.py; None where nothing asks for `modes`
@@ -63,6 +82,7 @@ class Solution:
     shapes: list
     thetas: list
     positions: np.ndarray
+    source: np.ndarray
     findings: object
     chi2: np.ndarray
     prior: LearnedPrior
@@ -83,11 +103,12 @@ class Solution:
         return np.argmin(np.abs(np.log(np.array(self.prior.scales_px) / STRUCTURE_PX)))
 
     def strengths(self, i):
-        """Strengths (J,) of component i's structure; see STRUCTURE_PX."""
+        """Strengths (J,) of component i's structure; see STRUCTURE_PX and OVERLAPPED."""
         unlike = self.unlikeness(i)
         out = self.findings.strengths[i] * power_of(unlike, OTHERS)
         out[self._scale] = unlike * STRENGTH
-        return out
+        others = [self._light(j, i) for j in self._beside(i) if self.source[j] != self.source[i]]
+        return out * enlarged(self._light(i, i), sum(others))
 
     def modes(self, i):
         """Images (1 + k, ny, nx), float32, of component i's morphology and of its modes, whose
@@ -106,9 +127,10 @@ class Solution:
         far = far.scaled(np.append(1 / self.peaks[i], scatter))
         n_own, own = 0, None
         if not scene.fixed[i]:
-            bumps = Bumps(
-                scene.origin[i], profile, self.strengths(i), self.prior.kernels(), self.shared(i)
-            )
+            strengths, kernels = self.strengths(i), self.prior.kernels()
+            least = min(LEAST_LIGHT, FAINTEST / max(self._peak(i), 1e-30))
+            given = scene.origin[i], profile, strengths, kernels, self.shared(i)
+            bumps = Bumps(*given, least_light=least)
             keep = np.flatnonzero(self.change(i, bumps.images) > LEAST_CHANGE)
             own = uncorrelated(bumps.precision[np.ix_(keep, keep)]) / self.peaks[i]
             n_own = len(own)
@@ -161,8 +183,12 @@ class Solution:
         here, there = shared_part(
             self.scene.origin[i], out.shape, self.scene.origin[j], profile.shape
         )
-        out[here] = np.linalg.norm(self.spectra[j]) / self.peaks[j] * profile[there]
+        out[here] = self._peak(j) * profile[there]
         return out
+
+    def _peak(self, i):
+        """Expected light of component i where its profile is 1, channels in quadrature [noise]."""
+        return np.linalg.norm(self.spectra[i]) / self.peaks[i]
 
     @cached_property
     def _boxes(self):
@@ -171,10 +197,15 @@ class Solution:
 
     def shared(self, i):
         """Where (ny, nx) component i may exchange light with another."""
-        own, (low, high) = self._light(i, i), self._boxes
+        own = self._light(i, i)
         shared = np.zeros(own.shape, bool)
-        for j in np.flatnonzero(((low < high[i]) & (high > low[i])).all(1)):
-            if j != i:
-                other = self._light(j, i)
-                shared |= (other > RATIO * own) & (other > FAINT) & (own > FAINT)
+        for j in self._beside(i):
+            other = self._light(j, i)
+            shared |= (other > RATIO * own) & (other > FAINT) & (own > FAINT)
         return shared
+
+    def _beside(self, i):
+        """Other components whose boxes meet component i's."""
+        low, high = self._boxes
+        meet = ((low < high[i]) & (high > low[i])).all(1)
+        return [j for j in np.flatnonzero(meet) if j != i]

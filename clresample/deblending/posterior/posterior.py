@@ -212,6 +212,7 @@ def posterior_of(fit, morphs, peaks, seen):
         fit.start.shapes,
         fit.start.thetas,
         fit.start.positions[fit.start.source],
+        fit.start.source,
         fit.findings,
         _local_chi2(scene, fit.views, seen, residuals),
         settings.prior,
