@@ -64,7 +64,7 @@ print(f"a small render in float32 against NumPy in float64: {error:.1e}, {ALLOWE
 raise SystemExit(not error <= ALLOWED)'
 # The suite: the tests of all kernels, as `make test-kernels-on` has them.
 read -r -a tests <<<"$(make -s kernel-tests)"
-step "Kernel tests" 220 "$python" -m pytest -q -p no:cacheprovider "${tests[@]}"
+step "Kernel tests" 220 "$python" -m pytest -q -n auto --maxprocesses 4 --dist loadfile -p no:cacheprovider "${tests[@]}"
 step "Tuning" 90 "$python" -m clresample.cli tune
 step "Devices, tuned" 30 "$python" -m clresample.cli devices --bench
 step "Renders" 50 "$python" -m bench.render --quick
