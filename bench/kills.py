@@ -262,17 +262,8 @@ def kills(each, names, seed_of_kills):
 
 def main(options):
     record = records.record(on_all_cores()) | {"kills": f"seed {options.seed}"}
-    records.print_record(record)
-    records.print_head(COLUMNS)
-    rows = []
-    for row in kills(options.each, options.commands, options.seed):
-        rows.append(row)
-        records.print_row(COLUMNS, row)
-        if not row["good"]:
-            print(f"  {row['about']}", flush=True)
-    if options.json is not None:
-        records.write_json(options.json, {"record": record, "rows": rows})
-    bad = sum(not row["good"] for row in rows)
+    found = kills(options.each, options.commands, options.seed)
+    rows, bad = records.judged(COLUMNS, found, record, options.json)
     print(f"{len(rows)} kills inside writes, {bad} not as they must be")
     if bad:
         sys.exit(1)

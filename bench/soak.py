@@ -86,15 +86,8 @@ def soak(times, seed_of_kills, faults=tuple(FAULTS)):
 def main(options):
     threads = on_all_cores()
     record = records.record(threads) | {"kills": f"seed {options.seed}, {options.times} runs"}
-    records.print_record(record)
-    records.print_head(COLUMNS)
-    rows = []
-    for row in soak(options.times, options.seed):
-        rows.append(row)
-        records.print_row(COLUMNS, row)
-    if options.json is not None:
-        records.write_json(options.json, {"record": record, "rows": rows})
-    bad = sum(not row["good"] for row in rows)
+    found = soak(options.times, options.seed)
+    rows, bad = records.judged(COLUMNS, found, record, options.json)
     print(f"{len(rows)} runs, {sum(row['kills'] for row in rows)} kills, {bad} not as they must be")
     if bad:
         sys.exit(1)

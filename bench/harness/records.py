@@ -45,6 +45,25 @@ def print_row(columns, row):
     print("  ".join(cells), flush=True)
 
 
+def judged(columns, found, record, path):
+    """Rows, each with whether it is `good`, printed as they are found and written to a JSON file.
+
+    What is said `about` one that is not has a line of its own, unless it is a column. path: the
+    file, or None. Returns the rows and how many of them are not good.
+    """
+    print_record(record)
+    print_head(columns)
+    rows, in_line = [], "about" in [name for name, *_ in columns]
+    for row in found:
+        rows.append(row)
+        print_row(columns, row)
+        if not row["good"] and not in_line:
+            print(f"  {row['about']}", flush=True)
+    if path is not None:
+        write_json(path, {"record": record, "rows": rows})
+    return rows, sum(not row["good"] for row in rows)
+
+
 def print_stages(row):
     """Print the seconds of a row's stages in one line below it."""
     print("  " + ", ".join(f"{name} {s:.2f} s" for name, s in row["stage"].items()), flush=True)
