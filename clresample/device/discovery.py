@@ -23,6 +23,7 @@ from .drivers import (
     unwritable,
     warn_of,
 )
+from .processor import name_processor
 from .remembered import system_caches
 
 # Order of preference when nothing is chosen; a kind that is not listed comes last.
@@ -204,6 +205,8 @@ def find_devices():
             continue
     library = named_library()
     if found:
+        for device in found:
+            name_processor(device)
         if library:
             warn_of(library, frozenset(d.platform.int_ptr for d in found))
         return found
