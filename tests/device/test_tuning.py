@@ -9,10 +9,9 @@ from helpers.tuning import tune
 
 from clresample import PSF, Grid, Resampler
 from clresample.cli.command import main
-from clresample.cli.machine import tune as tuner
+from clresample.cli.machine import measure, tune as tuner
 from clresample.cli.machine.tune import CPU_TILES, GPU_TILES, supposed
 from clresample.cli.machine.workload import Iterations
-from clresample.device import measure
 from clresample.device.contraction import whole
 from clresample.device.remembered import DeviceWarning, Remembered
 from clresample.device.tuning import PART, Tuning, is_tile

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from ...device import measure
+from . import measure
 from .workload import N_SOURCES, Renders, blends, fit, iterate_once
 
 N_BLENDS = 3  # at most

@@ -90,7 +90,7 @@ def _steps(device, quick):
     """What is measured in turn: (dtype, size, [values], function that makes the work)."""
     import numpy as np
 
-    from ...device.measure import Products
+    from .measure import Products
     from .workload import Iterations, Renders
 
     path = "GPU" if not device_is_cpu(device) else "CPU"
@@ -169,7 +169,7 @@ def row_choices(tile):
 
 
 def _timed(work):
-    from ...device.measure import best_seconds
+    from .measure import best_seconds
 
     return best_seconds(work, SECONDS, least=1)
 

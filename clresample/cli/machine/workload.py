@@ -16,13 +16,13 @@ from ...deblending.fit import Fit, begin
 from ...deblending.iterate import iterate
 from ...deblending.settings import Settings
 from ...device.discovery import DeviceError
-from ...device.measure import best_seconds
 from ...device.tuning import Tuning
 from ...resampling.resampler import Resampler
 from ...sky.grid import Grid
 from ...sky.observation import Observation
 from ...sky.psf import PSF
 from ...sky.sources import Extended, SourceWarning
+from .measure import best_seconds
 
 EUCLID_ARCSEC, RUBIN_ARCSEC = 0.1, 0.2
 STAMP_PX, BATCH = 100, 64

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from .contraction import Contraction, Matrix, padded
+from ...device.contraction import Contraction, Matrix, padded
 
 # (m, k, n), batch: products of a joint Euclid and Rubin fit of 118 x 118 model pixels.
 SHAPES = (((118, 118, 132), 24), ((132, 118, 132), 24), ((60, 74, 80), 48), ((74, 60, 80), 48))
