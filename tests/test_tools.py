@@ -101,7 +101,7 @@ def test_runtimes_that_were_not_tested_stand_in_the_last_line(tmp_path, intel, s
     (tmp_path / "make").chmod(0o755)
     answer = subprocess.run(
         ["bash", script],
-        env={**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "PATIENCE_S": "1"},
+        env={**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "BUDGET_S": "3"},
         capture_output=True,
         text=True,
         check=False,
