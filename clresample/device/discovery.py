@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from .drivers import (
-    cure,
     fault_of,
     named_library,
+    remedy,
     show_named_library,
     too_little_space,
     unseen,
@@ -174,17 +174,18 @@ def hints():
         found = []
     if named_library():
         return []
-    return [
-        f"{vendor}'s OpenCL driver is at {path}, where the OpenCL loader does not look: "
-        f"{cure(path)}"
-        for vendor, path in unseen(_served(found))
-    ]
+    return [remedy(vendor, path, _addresses(found)) for vendor, path in unseen(_served(found))]
 
 
 def _served(found):
     """Names of the platforms and devices that are real GPUs."""
     real = [d for d in found if kind_of(d) == "GPU" and not is_simulated(d)]
     return [f"{d.platform.name} {d.platform.vendor} {d.name}" for d in real]
+
+
+def _addresses(found):
+    """Of the platforms of devices, as `fault_of` takes them."""
+    return frozenset(device.platform.int_ptr for device in found)
 
 
 def find_devices():
@@ -208,7 +209,7 @@ def find_devices():
         for device in found:
             name_processor(device)
         if library:
-            warn_of(library, frozenset(d.platform.int_ptr for d in found))
+            warn_of(library, _addresses(found))
         return found
     if any("Portable Computing" in p.name for p in platforms) and (cause := unusable_cache()):
         raise DeviceError(cause)
@@ -225,7 +226,7 @@ def find_devices():
         if library:
             way += f"; CLRESAMPLE_ICD={library} {fault_of(library, set())}"
         for vendor, path in unseen([]):
-            way += f"; or, for {vendor}'s driver at {path}: {cure(path)}"
+            way += f"; {remedy(vendor, path, set())}"
     raise DeviceError(f"no {what} found: {way}")
 
 

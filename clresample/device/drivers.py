@@ -155,6 +155,18 @@ def _remove_of_gone(entry, pid):
         return
 
 
+def remedy(vendor, path, served):
+    """What is to be done about a GPU's driver library that brings no device, in words.
+
+    served: see `fault_of`
+    """
+    driver = f"{vendor}'s OpenCL driver"
+    if path.name in {Path(library).name for library in _known().values()}:
+        fault = fault_of(str(path), served) or "brings no GPU"
+        return f"{driver}, {path}, {fault}: is the GPU given to this machine or container?"
+    return f"{driver} is at {path}, where the OpenCL loader does not look: {cure(path)}"
+
+
 def cure(path):
     """The line to type, without root, that lets clresample see the driver library at `path`."""
     return f"export CLRESAMPLE_ICD={path}"

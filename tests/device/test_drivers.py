@@ -34,7 +34,8 @@ class Gpu:
     name = "H100"
 
     def __init__(self, vendor):
-        self.platform = type("Platform", (), {"name": f"{vendor} CUDA", "vendor": f"{vendor} Corp"})
+        names = {"name": f"{vendor} CUDA", "vendor": f"{vendor} Corp", "int_ptr": 0}
+        self.platform = type("Platform", (), names)
 
 
 @pytest.mark.parametrize("library", drivers.LIBRARIES)
@@ -54,6 +55,15 @@ def test_nothing_is_said_of_a_driver_that_brings_its_gpu(machine, monkeypatch):
     assert len(hints()) == 1
 
 
+def test_a_driver_that_the_loader_reads_is_not_said_to_be_hidden(machine, monkeypatch):
+    (machine / NVIDIA).write_text("no library")
+    (machine / "nvidia.icd").write_text(f"{NVIDIA}\n")
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(machine))
+    (hint,) = hints()
+    assert hint.startswith(f"NVIDIA's OpenCL driver, {machine / NVIDIA}, cannot be loaded: ")
+    assert "export" not in hint
+
+
 def test_drivers_that_the_system_lists_are_found(machine, monkeypatch):
     (machine / NVIDIA).write_text("")
     monkeypatch.delenv("LD_LIBRARY_PATH")
@@ -67,7 +77,7 @@ def test_where_there_is_no_device_the_error_names_the_driver(machine, monkeypatc
     (machine / NVIDIA).write_text("")
     monkeypatch.delenv("OCL_ICD_VENDORS", raising=False)
     monkeypatch.setattr(cl, "get_platforms", lambda: [])
-    with pytest.raises(DeviceError, match=rf"for NVIDIA's driver at .*: export .*{NVIDIA}"):
+    with pytest.raises(DeviceError, match=rf"; NVIDIA's OpenCL driver is at .*: export .*{NVIDIA}"):
         discovery.find_devices()
 
 
