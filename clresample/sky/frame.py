@@ -65,7 +65,8 @@ def model_frame(observations, *, grid=None, psf_sigma_px=0.8, shared=False) -> F
     observations: what will be fitted; see `check_observations`
     grid: Grid to take as it is; None = the pixels and orientation of the observation with the
         smallest pixel (of equal ones the first), as many as needed
-    psf_sigma_px [model px]: standard deviation of the PSF before its convolution with the pixel
+    psf_sigma_px [model px]: standard deviation of the PSF before its convolution with the pixel;
+        no more than the frame has pixels along a side
     shared: cover only what all observations see (the intersection of their footprints), instead of
         what any of them sees (the union)
 
@@ -99,6 +100,10 @@ def model_frame(observations, *, grid=None, psf_sigma_px=0.8, shared=False) -> F
                 f"none of its {observation.grid.shape} pixels lies on the frame's "
                 f"{grid.shape}"
             )
+    if psf_sigma_px > max(grid.shape):
+        raise ValueError(
+            f"psf_sigma_px is {psf_sigma_px:g}: no more than the model frame's {grid.shape} pixels"
+        )
     return Frame(grid, _model_psf(float(psf_sigma_px)))
 
 

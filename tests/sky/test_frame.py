@@ -131,6 +131,9 @@ def test_what_is_no_frame():
     for sigma in (0, -1, math.nan, math.inf):
         with pytest.raises(ValueError, match=f"psf_sigma_px .*not {sigma}"):
             model_frame([observe(flat)], psf_sigma_px=sigma)
+    for sigma in (200.0, 1e300):
+        with pytest.raises(ValueError, match=r"psf_sigma_px is .*: no more than .* pixels"):
+            model_frame([observe(flat)], psf_sigma_px=sigma)
     with pytest.raises(ValueError, match="at least one"):
         model_frame([])
 
