@@ -13,7 +13,7 @@ class AffineExecutor(Executor):
 
     Observed rows, or columns, are L lines through the model; J equidistant columns cross them.
     Sx (kx, J), Sy (L, ky): waves at the columns, and where the lines cut the model's middle column
-    twist: multiplies column frequencies by exp(-i angle), angle (Hy, J), which shears the lines
+    twist: multiplies column frequencies by the conjugate of waves (Hy, J), which shears the lines
     gather: from the J columns of a line to its observed pixels; see LineTaps
     """
 
@@ -26,7 +26,7 @@ class AffineExecutor(Executor):
         self.n_pad = padded(self.n_columns)
         super().__init__(device, dtype, plans)
         self.out_x = self._table([p.out_x for p in plans], self.k_x, self.n_pad)
-        turns = [np.stack([np.cos(p.twist), np.sin(p.twist)], axis=1) for p in plans]
+        turns = [np.stack([p.twist.real, p.twist.imag], axis=1) for p in plans]
         self.turn = self._table(turns, self.h_y, 2, self.n_pad)
         self.twist = Contraction(device, dtype, epilogue="TWIST")
         self.twist_adjoint = Contraction(device, dtype, epilogue="TWIST", adjoint=True)

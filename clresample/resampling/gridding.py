@@ -36,7 +36,7 @@ class KaiserBessel:
     def __call__(self, u):
         """phi(u) (...) at distances u (...) [columns]."""
         inside = np.clip(1 - (2 * u / self.n_taps) ** 2, 0, None)
-        return np.i0(self.beta * np.sqrt(inside)) / np.i0(self.beta) * (inside > 0)
+        return np.i0(self.beta * np.sqrt(inside)) / self._peak * (inside > 0)
 
     def taps(self, fraction):
         """phi(fraction + W/2 - 1 - t), t = 0 .. W - 1: (..., W), for fraction (...) in [0, 1).
@@ -45,6 +45,11 @@ class KaiserBessel:
         times as fast as the Bessel function does.
         """
         return np.polynomial.chebyshev.chebvander(2 * fraction - 1, SERIES_TERMS - 1) @ self._series
+
+    @functools.cached_property
+    def _peak(self):
+        """I0(beta)."""
+        return float(np.i0(self.beta))
 
     @functools.cached_property
     def _series(self):
@@ -59,7 +64,7 @@ class KaiserBessel:
     def transform(self, f):
         """phi^(f) (...) at frequencies f (...) [cycles/column]."""
         b = np.sqrt((self.beta**2 - (np.pi * self.n_taps * f) ** 2).clip(1e-300))
-        return self.n_taps * np.sinh(b) / (b * np.i0(self.beta))
+        return self.n_taps * np.sinh(b) / (b * self._peak)
 
 
 @dataclass(frozen=True, eq=False)

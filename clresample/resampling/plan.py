@@ -12,6 +12,7 @@ exponential is a (cos, sin) pair of real table rows: a plan is a list of real ma
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,7 +21,7 @@ from ..sky.extent import lit_part
 from ..sky.mapping import Around, Mapping
 from ..sky.psf import PSF
 from .gridding import KaiserBessel, LineTaps
-from .tables import aligned_tables, distorted_tables, line_tables, waves
+from .tables import aligned_tables, distorted_tables, line_tables, waves_along
 from .transfer import Certificate, transfer_function, wrap_radius
 
 # [bytes] of the tables of one operator. Frames of 7000 pixels a side need so much, and take minutes
@@ -44,8 +45,9 @@ class Precision:
     window: KaiserBessel
 
     @classmethod
+    @functools.cache
     def of(cls, dtype) -> Precision:
-        """For float32 or float64."""
+        """For float32 or float64; one of each, so that its window is worked out once."""
         if np.dtype(dtype) == np.float32:
             return cls(3e-8, KaiserBessel(10, 1.5))  # window error 5e-7
         return cls(1e-16, KaiserBessel(16, 2.0))  # window error 3e-14
@@ -66,7 +68,7 @@ class Plan:
     in_y (2Hy, Ny), in_x (2Hx, Nx): transforms of the model
     out_y, out_x: aligned (My, 2Hy), (2Hx, Mx); affine (L, 2Hy), (2Hx, J); distorted (P, 2Hy),
         (P, 2Hx)
-    twist (Hy, J) [rad], lines: affine only
+    twist (Hy, J) complex, lines: affine only
     windows: plans that `window` has made, by what they were made for
     """
 
@@ -176,7 +178,7 @@ def make_plan(
             d_plus, d_minus = d_plus.swapaxes(1, 2), d_minus.swapaxes(1, 2).conj()
         tables = aligned_tables(mapping, nu, axes, center)
     in_y, in_x = (
-        waves(nu[i], np.arange(mapping.shape_in[axes[i]]) - center[axes[i]]).T for i in (0, 1)
+        waves_along(nu[i], -center[axes[i]], 1.0, mapping.shape_in[axes[i]]).T for i in (0, 1)
     )
     return Plan(
         mapping=mapping,

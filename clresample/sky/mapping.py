@@ -55,7 +55,11 @@ class Mapping:
 
         Centres on the very edge count, whatever the last digits of two WCS make of them.
         """
-        low, high = -0.5 - NOISE_PX, np.array(self.shape_in) - 0.5 + NOISE_PX
+        return self._within(NOISE_PX)
+
+    def _within(self, reach_px):
+        """(My, Mx) bool: observed pixels whose centre lies on the model or as near to its edge."""
+        low, high = -0.5 - reach_px, np.array(self.shape_in) - 0.5 + reach_px
         if self.geometry == "distorted":
             return ((self.positions >= low) & (self.positions <= high)).all(axis=-1)
         n, m = (np.arange(n, dtype=np.float64) for n in self.shape_out)
@@ -161,9 +165,7 @@ class Around(Mapping):
     @functools.cached_property
     def covered(self):
         """(My, Mx) bool: observed pixels whose centre lies within reach of the model."""
-        at = self.at(*np.indices(self.shape_out))
-        low, high = -0.5 - self.reach_px, np.array(self.shape_in) - 0.5 + self.reach_px
-        inside = ((at >= low) & (at <= high)).all(axis=-1)
+        inside = self._within(self.reach_px)
         if self.part is not None:
             y0, x0, y1, x1 = self.part
             inside[:y0] = inside[y1:] = inside[:, :x0] = inside[:, x1:] = False

@@ -12,7 +12,7 @@ from ..drawing.shown import ShownPSF
 from .given.checks import ReadOnly, number, numbers
 from .psf_checks import PSFWarning, core_of, edge_light, fwhm, psf_warnings
 from .transforms.nufft import transform_at
-from .waves import phases
+from .waves import even_waves
 
 # relative slack on the band's edge, above the rounding of A^T nu in float64
 BAND_SLACK = 1e-12
@@ -213,32 +213,38 @@ def _pixel_gaussian(n, spacing, sigma):
     return np.array([math.erfc((u - 0.5) / width) - math.erfc((u + 0.5) / width) for u in offsets])
 
 
-def _waves(frequencies, positions):
-    """exp(-2 pi i f u) as (F, U)."""
-    return np.exp(-1j * phases(frequencies, positions))
+def _waves(frequencies, first, step, n):
+    """exp(-2 pi i f u) as (F, n), at u = first + step k."""
+    return np.conj(even_waves(frequencies, first, step, n).T, order="C")
 
 
 def _transform(psf, bands, center, nu_y, nu_x, matrix):
     """`otf` of some bands, all centred at `center`, without the band's edge: (bands, Ky, Kx)."""
     images = psf.images[bands]
     n_y, n_x = images.shape[1:]
-    u = (np.arange(n_y) - center[0]) * psf.spacing
-    v = (np.arange(n_x) - center[1]) * psf.spacing
-    (a, b), (c, d) = matrix
-    # f.(u, v) = nu_y (a u + b v) + nu_x (c u + d v)
+    (a, b), (c, d) = matrix * psf.spacing
+    (y0, x0) = center
+
+    # f.(u, v) = nu_y (a u + b v) + nu_x (c u + d v), u and v in samples from the centre
+    def along_y(nu, rate):
+        return _waves(nu, -rate * y0, rate, n_y)
+
+    def along_x(nu, rate):
+        return _waves(nu, -rate * x0, rate, n_x)
+
     if b == c == 0:
-        return _waves(nu_y, a * u) @ images @ _waves(nu_x, d * v).T
+        return along_y(nu_y, a) @ images @ along_x(nu_x, d).T
     if a == d == 0:
-        return _waves(nu_y, b * v) @ images.transpose(0, 2, 1) @ _waves(nu_x, c * u).T
+        return along_x(nu_y, b) @ images.transpose(0, 2, 1) @ along_y(nu_x, c).T
     if images[0].size > LARGE:
-        f_y, f_x = (psf.spacing * (p * nu_y[:, None] + q * nu_x) for p, q in ((a, c), (b, d)))
-        turns = f_y * center[0] + f_x * center[1]
+        f_y, f_x = (p * nu_y[:, None] + q * nu_x for p, q in ((a, c), (b, d)))
+        turns = f_y * y0 + f_x * x0
         return transform_at(images, f_y, f_x) * np.exp(2j * np.pi * (turns - np.rint(turns)))
     # the images are real: where nu_x has both signs, one of them follows from sums of the other
     n_half = nu_x.size // 2 if nu_x.size % 2 and np.array_equal(nu_x, -nu_x[::-1]) else 0
     nu_half = nu_x[n_half:]
-    waves_yu, waves_yv = _waves(nu_y, a * u), _waves(nu_y, b * v)
-    waves_xu, waves_xv = _waves(nu_half, c * u), _waves(nu_half, d * v)
+    waves_yu, waves_yv = along_y(nu_y, a), along_x(nu_y, b)
+    waves_xu, waves_xv = along_y(nu_half, c), along_x(nu_half, d)
     sums = np.zeros((len(bands), 2, nu_y.size, 2, nu_half.size))  # of cos and sin by cos and sin
     n_rows = max(1, BLOCK // (n_x * (nu_y.size + nu_x.size)))
     for i in range(0, n_y, n_rows):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 
@@ -14,6 +16,19 @@ def phases(frequencies, positions):
     cycles = np.multiply.outer(frequencies, positions)
     cycles -= np.rint(cycles)
     return 2 * np.pi * cycles
+
+
+def even_waves(frequencies, first, step, n):
+    """exp(2 pi i f u) (n, F) at equal distances, u = first + step k [px], f (F,) [cycles/px].
+
+    Products of the waves at every b-th position with those of the b positions from 0 on: 2 sqrt(n)
+    cosines and sines of each frequency instead of n, rounded once more.
+    """
+    block = math.isqrt(max(n - 1, 0)) + 1
+    fine, coarse = np.arange(block), block * np.arange(-(-n // block))
+    positions = np.concatenate([step * fine, first + step * coarse])
+    few = np.exp(1j * phases(positions, frequencies))
+    return (few[block:, None] * few[:block]).reshape(-1, len(frequencies))[:n]
 
 
 def cos_sin_columns(angle):

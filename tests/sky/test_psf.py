@@ -8,7 +8,7 @@ import pytest
 
 from clresample.sky.psf import PSF
 from clresample.sky.psf_checks import PSFWarning
-from clresample.sky.waves import cos_sin_columns, phases
+from clresample.sky.waves import cos_sin_columns, even_waves, phases
 
 NU_Y, NU_X = np.arange(-16, 17) / 33, np.arange(0, 20) / 39
 
@@ -175,6 +175,16 @@ def test_whole_cycles_are_taken_off_before_they_are_rounded():
     assert columns.shape == (2, 4)
     np.testing.assert_array_equal(columns[:, ::2], np.cos(angle))
     np.testing.assert_array_equal(columns[:, 1::2], np.sin(angle))
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 10, 117, 1000])
+def test_waves_at_equal_distances_are_the_waves(n):
+    """To the rounding of their phases, of up to 340 cycles here."""
+    nu, first, step = np.array([0.0, 1e-3, 0.37, -0.5]), -58.25, 0.73
+    waves = even_waves(nu, first, step, n)
+    truth = np.exp(1j * phases(first + step * np.arange(n), nu))
+    assert waves.shape == truth.shape and waves.flags.c_contiguous
+    np.testing.assert_allclose(waves, truth, atol=1e-12, rtol=0)
 
 
 def test_integer_and_foreign_endian_images():
