@@ -7,7 +7,7 @@ import pytest
 from helpers.products import TILES
 from helpers.tuning import tune
 
-from clresample import PSF, Grid, Resampler
+from clresample import PSF, DeviceError, Grid, Resampler
 from clresample.cli.command import main
 from clresample.cli.machine import measure, tune as tuner
 from clresample.cli.machine.tune import CPU_TILES, GPU_TILES, supposed
@@ -146,6 +146,29 @@ def test_one_that_is_not_quicker_is_not_kept(device, kept, monkeypatch):
     found = tuner.tuned_sizes(device, quick=True, note=lines.append)
     assert not any(found.values())
     assert lines and all(line.endswith(": as before") for line in lines)
+
+
+@pytest.mark.parametrize("runs", ["candidates", "none"])
+def test_sizes_that_do_not_run_are_no_choice(device, kept, monkeypatch, runs):
+    """The size until now is replaced where it does not run; where none runs, that is the error."""
+
+    class Work:
+        def __init__(self, device, dtype):
+            if runs == "none" or Tuning.of(device, dtype).tile["MR"] != 4:
+                raise DeviceError("too many registers")
+
+    monkeypatch.setattr(measure, "Products", Work)
+    monkeypatch.setattr(tuner, "_timed", lambda work: 1.0)
+    for tiles in ("CPU_TILES", "GPU_TILES"):
+        monkeypatch.setattr(tuner, tiles, [TILE | {"MR": 2}, TILE])
+    lines = []
+    if runs == "none":
+        with pytest.raises(DeviceError, match="tile, float32: no size runs: too many registers"):
+            tuner.tuned_sizes(device, quick=True, note=lines.append)
+        return
+    found = tuner.tuned_sizes(device, quick=True, note=lines.append)
+    assert found["float32"]["tile"] == TILE
+    assert lines[0].endswith("}, the size until now does not run")
 
 
 def test_iterations_start_anew_each_time(device, kept):
