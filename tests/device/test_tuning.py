@@ -10,6 +10,7 @@ from helpers.tuning import tune
 from clresample import PSF, DeviceError, Grid, Resampler
 from clresample.cli.command import main
 from clresample.cli.machine import measure, tune as tuner
+from clresample.cli.machine.bench import most_at_once
 from clresample.cli.machine.tune import CPU_TILES, GPU_TILES, supposed
 from clresample.cli.machine.workload import Iterations
 from clresample.device.contraction import whole
@@ -184,6 +185,34 @@ def test_rates_are_those_of_the_device(device, kept):
     assert 1e5 < products.rate(0.01) < 1e15
     assert 1e-8 < measure.launch_seconds(device, 0.01) < 0.1
     assert measure.peak_flops(device) is None or device.kind == "GPU"
+
+
+@pytest.mark.parametrize(
+    "first, fixed, each, n_most, tried",
+    [
+        (0.0, 0.0, 0.7, 32, [1, 3]),  # two cores
+        (0.0, 0.0, 0.1, 32, [1, 3, 24]),
+        (0.0, 0.5, 1e-4, 1024, [1, 3, 23, 184, 1024]),  # a GPU, which waits for launches
+        (0.0, 0.0, 1e-4, 2, [1, 2]),
+        (0.0, 0.0, 1e-4, 1, [1]),
+        (3.0, 0.0, 0.1, 32, [1]),  # kernels were built
+        (2.0, 0.0, 0.5, 32, [1]),
+        (0.0, 0.0, 9.0, 32, [1]),
+    ],
+)
+def test_as_many_are_fitted_as_the_time_allows(first, fixed, each, n_most, tried):
+    now, seen = 0.0, []
+
+    def seconds_of(n):
+        nonlocal now
+        took = fixed + each * n + first * (not seen)
+        now += took
+        seen.append(n)
+        return took
+
+    assert most_at_once(seconds_of, n_most, 5.0, lambda: now)[0] == tried[-1]
+    assert seen == tried
+    assert now < 5.0 or tried == [1]
 
 
 class Gpu:
