@@ -25,7 +25,7 @@ COLUMNS = ("kernel", "calls", "seconds", "share", "GFLOP/s", "GB/s")
 class Row:
     """What the launches of one kernel took together.
 
-    flops: of the kernels whose arithmetic is known, 0 for others
+    flops: of the kernels whose arithmetic is counted, 0 for others
     n_bytes: the kernel's buffers, each counted once a launch: what it reads and writes at least,
         where it runs through all of them
     """
@@ -105,11 +105,28 @@ class Profile:
 
 
 def flops(kernel, arguments, global_size):
-    """Floating-point operations of a launch; 0 where they are not known. Items with sizes of their
-    own count as the largest, so that their rates are upper bounds."""
+    """Floating-point operations of a launch's matrix products; 0 of kernels without, and of others
+    that are not counted. Items with sizes of their own count as the largest, so that their rates
+    are upper bounds."""
     if kernel.startswith("contract"):
         return 2.0 * math.prod(int(arguments[name]) for name in "mnk") * global_size[2]
+    if kernel == "folded":
+        return _folded_flops(arguments)
     return 0.0
+
+
+def _folded_flops(arguments):
+    """Products of folded.cl, without the columns that pad its vectors: of each source and of each
+    image of the target, even and odd waves along x and along y."""
+
+    def products(n_y, n_x):
+        half_y, half_x = (n_y + 1) // 2, (n_x + 1) // 2
+        along_x = 2 * (2 * half_y * half_x * h_x)
+        return along_x + 2 * (h_y * half_y * 2 * h_x)
+
+    names = "h_y", "h_x", "n_y", "n_x", "to_n_y", "to_n_x", "n_sources", "n_seen"
+    h_y, h_x, n_y, n_x, to_n_y, to_n_x, n, n_seen = (int(arguments[name]) for name in names)
+    return 2.0 * n * (products(n_y, n_x) + n_seen * products(to_n_y, to_n_x))
 
 
 _PROFILES: list[Profile] = []

@@ -10,6 +10,7 @@ from helpers.resample_files import ARGUMENTS, write_files
 
 from clresample import PSF, Device, Grid, Resampler
 from clresample.device import profile as profiles
+from clresample.device.tuning import Tuning
 
 # What a profile shows of the first kernel; and on llvmpipe, which says 1 ns of every kernel.
 TABLE = r":\nkernel [^\n]* GFLOP/s [^\n]*\n(contract|folded)"
@@ -56,6 +57,27 @@ def test_every_launch_is_counted(profiled, monkeypatch):
     row.seconds = 12e-9
     table = profiled.profile.table()
     assert re.fullmatch(f"kernels on .*{CALLS}", table)
+
+
+@pytest.mark.parametrize("spread", [False, True])
+def test_products_of_folded_images_are_counted(profiled, spread):
+    if not (profiled.has_fp64 and Tuning.of(profiled).folds):
+        pytest.skip(f"{profiled.name} does not go through float64")
+    op = Resampler(
+        Grid.flat((40, 43), 0.1), PSF.gaussian(0.8), Grid.flat((20, 23), 0.2),
+        PSF.gaussian([1.5, 1.6, 1.7]), device=profiled,
+    )  # fmt: skip
+    n = 4  # images, or models of which each is seen in three bands
+    op.render(np.ones((n, 40, 43))) if spread else op(np.ones((n, 3, 40, 43)))
+    (row,) = profiled.profile.rows().values()
+    plan = op.plans[0]
+    h_y, h_x = map(len, plan.nu)
+    # of 2 H waves along an axis each meets half of the pixels, even or odd about the middle
+    source = (2 * h_x) * 40 * 44 / 2 + (2 * h_y) * 40 * (2 * h_x) / 2
+    target = (2 * h_y) * 20 * (2 * h_x) / 2 + (2 * h_x) * 20 * 24 / 2
+    assert row.flops == 2 * n * (source + 3 * target if spread else 3 * (source + target))
+    table = profiled.profile.table()
+    assert re.search(r"\nfolded +\d+ +[\d.]+ +100.0 % +\d", table) or "llvmpipe" in profiled.name
 
 
 def test_seconds_are_those_of_the_device(profiled):

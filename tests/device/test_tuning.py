@@ -7,9 +7,10 @@ import pytest
 from helpers.products import TILES
 from helpers.tuning import tune
 
-from clresample import PSF, Grid, Resampler
+from clresample import PSF, DeviceError, Grid, Resampler
 from clresample.cli.command import main
 from clresample.cli.machine import measure, tune as tuner
+from clresample.cli.machine.bench import most_at_once
 from clresample.cli.machine.tune import CPU_TILES, GPU_TILES, supposed
 from clresample.cli.machine.workload import Iterations
 from clresample.device.contraction import whole
@@ -148,6 +149,29 @@ def test_one_that_is_not_quicker_is_not_kept(device, kept, monkeypatch):
     assert lines and all(line.endswith(": as before") for line in lines)
 
 
+@pytest.mark.parametrize("runs", ["candidates", "none"])
+def test_sizes_that_do_not_run_are_no_choice(device, kept, monkeypatch, runs):
+    """The size until now is replaced where it does not run; where none runs, that is the error."""
+
+    class Work:
+        def __init__(self, device, dtype):
+            if runs == "none" or Tuning.of(device, dtype).tile["MR"] != 4:
+                raise DeviceError("too many registers")
+
+    monkeypatch.setattr(measure, "Products", Work)
+    monkeypatch.setattr(tuner, "_timed", lambda work: 1.0)
+    for tiles in ("CPU_TILES", "GPU_TILES"):
+        monkeypatch.setattr(tuner, tiles, [TILE | {"MR": 2}, TILE])
+    lines = []
+    if runs == "none":
+        with pytest.raises(DeviceError, match="tile, float32: no size runs: too many registers"):
+            tuner.tuned_sizes(device, quick=True, note=lines.append)
+        return
+    found = tuner.tuned_sizes(device, quick=True, note=lines.append)
+    assert found["float32"]["tile"] == TILE
+    assert lines[0].endswith("}, the size until now does not run")
+
+
 def test_iterations_start_anew_each_time(device, kept):
     work = Iterations(device, 3)
     work()
@@ -161,6 +185,34 @@ def test_rates_are_those_of_the_device(device, kept):
     assert 1e5 < products.rate(0.01) < 1e15
     assert 1e-8 < measure.launch_seconds(device, 0.01) < 0.1
     assert measure.peak_flops(device) is None or device.kind == "GPU"
+
+
+@pytest.mark.parametrize(
+    "first, fixed, each, n_most, tried",
+    [
+        (0.0, 0.0, 0.7, 32, [1, 3]),  # two cores
+        (0.0, 0.0, 0.1, 32, [1, 3, 24]),
+        (0.0, 0.5, 1e-4, 1024, [1, 3, 23, 184, 1024]),  # a GPU, which waits for launches
+        (0.0, 0.0, 1e-4, 2, [1, 2]),
+        (0.0, 0.0, 1e-4, 1, [1]),
+        (3.0, 0.0, 0.1, 32, [1]),  # kernels were built
+        (2.0, 0.0, 0.5, 32, [1]),
+        (0.0, 0.0, 9.0, 32, [1]),
+    ],
+)
+def test_as_many_are_fitted_as_the_time_allows(first, fixed, each, n_most, tried):
+    now, seen = 0.0, []
+
+    def seconds_of(n):
+        nonlocal now
+        took = fixed + each * n + first * (not seen)
+        now += took
+        seen.append(n)
+        return took
+
+    assert most_at_once(seconds_of, n_most, 5.0, lambda: now)[0] == tried[-1]
+    assert seen == tried
+    assert now < 5.0 or tried == [1]
 
 
 class Gpu:

@@ -6,10 +6,13 @@ import time
 
 import numpy as np
 
+from ...device.tuning import Tuning
 from . import measure
 from .workload import N_SOURCES, Renders, blends, fit, iterate_once
 
-N_BLENDS = 3  # at most
+N_FEW = 3  # blends, fitted after a first one
+GROWTH = 8  # times as many blends at most as were fitted before
+N_DIFFERENT = 32  # blends, which are fitted several times where more are wanted
 # [s] Of one measurement.
 SECONDS = 0.2
 # [s] Of all measurements: one blend is fitted, and more while that much time is left.
@@ -20,7 +23,8 @@ def bench_lines(device):
     """Measure one thing after the other; yields a line of text for each.
 
     Kernels are built before anything is timed; the first run on a machine takes longer for that.
-    On a device that fits slowly fewer blends are fitted, down to one.
+    As many blends are fitted side by side as the device takes at once and the time allows: one at
+    least.
     """
     end = time.perf_counter() + ALL_SECONDS
     yield f"copy         {measure.copy_rate(device, SECONDS) / 1e9:.1f} GB/s read and written"
@@ -32,20 +36,43 @@ def bench_lines(device):
             yield f"contraction  {rate / 1e9:.0f} GFLOP/s {dtype.__name__}{share}"
     rate = Renders(device).rate(SECONDS)
     yield f"renders      {rate:.0f} a second, 100 x 100 Euclid pixels to Rubin's, float32"
-    made = blends(N_BLENDS, device)
+    made = blends(N_DIFFERENT, device)
     iterate_once(made[0], device)
-    seconds, n = _fit_seconds(made[:1], device), 1
-    more = min(N_BLENDS, int((end - time.perf_counter()) / seconds))
-    if more > 1:
-        seconds, n = _fit_seconds(made[:more], device), more
+
+    def fit_seconds(n):
+        began = time.perf_counter()
+        fit([made[i % len(made)] for i in range(n)], device)
+        return time.perf_counter() - began
+
+    n, seconds = most_at_once(fit_seconds, Tuning.of(device).n_scenes, end)
     rate = n * N_SOURCES / seconds
-    yield f"fits         {rate:.1f} sources a second, {n} joint blends of three in four bands"
+    yield f"fits         {rate:.1f} sources a second, {n} of three at once, in four bands each"
 
 
-def _fit_seconds(given, device):
-    began = time.perf_counter()
-    fit(given, device)
-    return time.perf_counter() - began
+def most_at_once(seconds_of, n_most, end, clock=time.perf_counter):
+    """(n, seconds) of the most blends, up to `n_most`, that are fitted before `end` of `clock` [s].
+
+    seconds_of: a function that fits n blends and returns the time it took
+
+    One, a few, then again more while twice as many or more are thought to be done in time. The
+    first fit is often slower than others, so that it says how many follow it at most, and nothing
+    of what each one more costs: that say the last two numbers, and before these are known, and
+    where noise has more of them take less time, each costs as much as the last did on average.
+    """
+    n, seconds, measured = 1, seconds_of(1), []
+    more = min(N_FEW, n_most, int((end - clock()) / seconds))
+    while more > n and (more >= 2 * n or more == n_most):
+        n, seconds = more, seconds_of(more)
+        measured.append((n, seconds))
+        each = seconds / n
+        if len(measured) > 1:
+            (n_before, before), _ = measured[-2:]
+            gained = (seconds - before) / (n - n_before)
+            # one step may not be wrong by more than the growth allows
+            each = max(gained, each / GROWTH) if gained > 0 else each
+        left = end - clock()
+        more = min(n_most, GROWTH * n, n + int((left - seconds) / each))
+    return n, seconds
 
 
 def _share(device, dtype, rate):

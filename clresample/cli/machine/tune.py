@@ -82,7 +82,10 @@ def tuned_sizes(device, *, quick, note):
                 note(f"{name}, {dtype}: as before")
                 continue
             known |= best
-            note(f"{name}, {dtype}: {best[name]}, {100 * gain:.0f} % quicker")
+            gained = (
+                "the size until now does not run" if gain is None else f"{100 * gain:.0f} % quicker"
+            )
+            note(f"{name}, {dtype}: {best[name]}, {gained}")
     return found
 
 
@@ -113,7 +116,8 @@ def _steps(device, quick):
 def _best(device, dtype, known, name, candidates, make, bar):
     """The candidate that is quickest, as {name: value}, and the part of the time that it saves.
 
-    (None, 0) where none is enough quicker than what Tuning has without it.
+    (None, 0) where none is enough quicker than what Tuning has without it; the part is None where
+    that does not run on the device. DeviceError where none does.
     """
     from ...device.discovery import DeviceError
     from ...device.tuning import Tuning
@@ -132,16 +136,19 @@ def _best(device, dtype, known, name, candidates, make, bar):
             try:
                 runs[i] = sizes, make()
                 _timed(runs[i][1])
-            except DeviceError:  # too many registers or too much local memory for this device
+            except DeviceError as error:  # too many registers or too much local memory
                 runs.pop(i, None)
+                failure = error
         bar.update(value is not None)
+    if not runs:
+        raise DeviceError(f"{device.name}: {name}, {dtype}: no size runs: {failure}") from failure
     for _ in range(ROUNDS):
         for i, (sizes, work) in runs.items():
             with supposed(device, dtype, sizes):
                 seconds[i] = min(_timed(work), seconds.get(i, float("inf")))
     i = min(seconds, key=seconds.get)
-    gain = _duel(device, dtype, runs[0], runs[i]) if i else 0.0
-    if i == 0 or gain < LEAST_GAIN:
+    gain = 0.0 if i == 0 else _duel(device, dtype, runs[0], runs[i]) if 0 in runs else None
+    if gain is not None and gain < LEAST_GAIN:
         return None, 0.0
     names = {name, "row_choices"} if name == "tile" else {name}
     return {n: runs[i][0][n] for n in names}, gain

@@ -49,7 +49,7 @@ def equations(looking):
             cross[*at, n, own[:, None]] = slope[..., 1]
             rest[:, channels, n], inner[:, channels, n, n] = np.moveaxis(sums[..., 1:], -1, 0)
     lit = looking.solution() > 0
-    lit[..., n] = looking.fit_sky
+    lit[..., n] = inner[..., n, n] > 0  # none in a channel without weights, nor if it is not fitted
     return _eliminated(normal, right, inner, cross, rest, lit)
 
 
