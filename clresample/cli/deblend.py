@@ -253,7 +253,7 @@ def _report(arguments, result, found, device, took):
             f"{those}{more}"
         )
     for label, o in zip(found["shifts"], result.observations, strict=True):
-        values = "  ".join(f"{c} {found['chi2'][c]:.3f}" for c in o.channels)
+        values = "  ".join(f"{c} {_chi2(found['chi2'][c])}" for c in o.channels)
         shift = ""
         if any(found["shifts"][label]):
             y, x = found["shifts"][label]
@@ -276,3 +276,8 @@ def _run_example(arguments):
     for path in paths:
         print(printable(path))
     print(f"next: clresample deblend {paths[0]} -o {Path(arguments.example) / 'out'}")
+
+
+def _chi2(value):
+    """A channel's chi2 per pixel in words; NaN where no pixel has weight."""
+    return "without weight" if value != value else f"{value:.3f}"

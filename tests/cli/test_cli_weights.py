@@ -80,10 +80,11 @@ FAULTS = masked_channel, masked_observation, masked_half, weights_of_zero, no_we
 @pytest.mark.parametrize("also", ["", "shifts and sky"])
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
 @pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_pixels_without_weight_and_equal_sources(scene, fault, also):
+def test_pixels_without_weight_and_equal_sources(scene, capsys, fault, also):
     """COVARIANCE, RESIDUAL and LOSSES have held NaN, and matrices been singular."""
     fault(scene)
     if also:
         change(scene, "max_iter = 2", "max_iter = 2\nfit_shifts = true\nfit_sky = true")
     assert deblend(scene) == 0
     finite(scene / "out")
+    assert "nan" not in capsys.readouterr().out
