@@ -123,6 +123,7 @@ def test_priors_have_unit_variance():
     assert len(taps) == 13 and (taps**2).sum() == pytest.approx(1)
     assert taps[8] / taps[6] == pytest.approx(np.exp(-0.5))
     assert len(Prior(correlation_px=1.5).taps) == 11  # cut behind 3 sigma, not before
+    assert np.array_equal(Prior(correlation_px=1e-300).taps, [0, 1, 0])  # nor a warning
     noise = np.random.default_rng(0).normal(size=(200, 200))
     assert ref.blur(noise, taps)[10:-10, 10:-10].std() == pytest.approx(1, abs=0.05)
     assert PRIOR.amplitude(np.array([-1.0, 4.0])).tolist() == [0, 0.2]

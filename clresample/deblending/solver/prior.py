@@ -31,5 +31,6 @@ class Prior:
     def taps(self) -> np.ndarray:
         """K along one axis (2 radius + 1), cut at 3 sigma, so that K z has unit variance."""
         radius = int(np.ceil(3 * self.correlation_px))
-        k = np.exp(-0.5 * (np.arange(-radius, radius + 1) / self.correlation_px) ** 2)
+        sigma_px = max(self.correlation_px, 1e-3)  # narrower ones reach no neighbour either
+        k = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma_px) ** 2)
         return k / np.linalg.norm(k)
