@@ -22,9 +22,10 @@ grind() {
     return "$status"
 }
 
+declare -A reports=([race]='data race at global memory' [overrun]='^Invalid write of size')
 for fault in race overrun; do
     grind --plant "$fault" || true
-    if [ ! -s "$log" ]; then
+    if ! grep -q "${reports[$fault]}" "$log"; then
         echo "grind: a planted $fault was not reported" >&2
         exit 1
     fi

@@ -5,6 +5,7 @@
 #   pocl         PoCL, as pip install 'clresample[pocl]' brings it
 #   pocl-debian  Debian's PoCL
 #   intel        Intel's runtime for CPUs, from pip
+#   pair         Intel's beside PoCL's wheel: two unlike devices in one process
 #   rusticl      Mesa's OpenCL on llvmpipe: a CPU that behaves as a GPU without double precision
 #   oclgrind     a simulator that reports races and accesses out of bounds on standard error
 #
@@ -67,7 +68,8 @@ rusticl)
     export UNPACKED=$root LD_PRELOAD=$home/unpacked.so RUSTICL_ENABLE=llvmpipe
     export OCL_ICD_VENDORS=$root/usr/lib/$arch/libRusticlOpenCL.so.1
     ;;
-intel)
+intel | pair)
+    home=${home%/*}/intel
     python=$(command -v "${PYTHON:-python3}")
     if [ ! -e "$home/made" ]; then
         mkdir -p "$home"
@@ -78,6 +80,12 @@ intel)
         touch "$home/made"
     fi
     export OCL_ICD_VENDORS=$home/venv/lib/libintelocl.so
+    if [ "$runtime" = pair ]; then # of a folder the loader reads the wheel's driver too
+        [ -e "$OCL_ICD_VENDORS" ] || skip "$OCL_ICD_VENDORS is missing"
+        mkdir -p "$home/vendors"
+        echo "$OCL_ICD_VENDORS" >"$home/vendors/intel.icd"
+        OCL_ICD_VENDORS=$home/vendors
+    fi
     ;;
 oclgrind)
     unpack oclgrind
@@ -86,7 +94,7 @@ oclgrind)
     export OCLGRIND_DATA_RACES=1
     ;;
 *)
-    echo "RUNTIME is $runtime; there are pocl, pocl-debian, intel, rusticl and oclgrind" >&2
+    echo "RUNTIME is $runtime; there are pocl, pocl-debian, intel, pair, rusticl and oclgrind" >&2
     exit 2
     ;;
 esac
