@@ -87,7 +87,8 @@ def test_a_home_that_cannot_be_written_hides_no_device(tmp_path):
         POCL_CACHE_DIR=str(tmp_path),
         **nowhere,
     )
-    assert (answer.stdout, answer.stderr) == ("(9, 9)\n", "")
+    said = [line for line in answer.stderr.splitlines() if "shader cache" not in line]  # Mesa's
+    assert (answer.stdout, said) == ("(9, 9)\n", [])
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux holds it")
