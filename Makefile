@@ -27,7 +27,7 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(PYTEST) $(ARGS)
 
-# make test-on RUNTIME=pocl|pocl-debian|intel|pair|rusticl [TESTS=...]: on that OpenCL runtime alone.
+# make test-on RUNTIME=pocl|pocl-debian|intel|pair|rusticl [TESTS=...]: there alone.
 # What it needs is fetched into .runtimes/; where that fails, it is skipped, and said so.
 RUNTIME ?= pocl
 TESTS ?= tests

@@ -264,6 +264,11 @@ def _report(arguments, result, found, device, took):
             note(arguments, message)
 
 
+def _chi2(value):
+    """A channel's chi2 per pixel in words; NaN where no pixel has weight."""
+    return "without weight" if value != value else f"{value:.3f}"
+
+
 def _run_example(arguments):
     if arguments.scene is not None or arguments.output is not None:
         raise ValueError("--example DIR takes neither SCENE.toml nor -o")
@@ -276,8 +281,3 @@ def _run_example(arguments):
     for path in paths:
         print(printable(path))
     print(f"next: clresample deblend {paths[0]} -o {Path(arguments.example) / 'out'}")
-
-
-def _chi2(value):
-    """A channel's chi2 per pixel in words; NaN where no pixel has weight."""
-    return "without weight" if value != value else f"{value:.3f}"

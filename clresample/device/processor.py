@@ -40,7 +40,7 @@ def name_processor(device):
     """
     if not (device.version.endswith(VERSION) and device.driver_version.startswith(RELEASE)):
         return None
-    place, name = _place(device.int_ptr), known_name(_flags())
+    place, name = _place(device.int_ptr), _known_name(_flags())
     if place is None or name is None:
         return None
     libc = ctypes.CDLL(None)
@@ -49,7 +49,7 @@ def name_processor(device):
     return name
 
 
-def known_name(flags):
+def _known_name(flags):
     """The first of NAMES whose instructions are all among flags, or None."""
     return next((n for n, needed in NAMES.items() if flags >= set(needed.split())), None)
 

@@ -2,6 +2,7 @@
 
 import pytest
 from helpers.resample_files import write_files
+from helpers.tiny_scene import write_scene
 
 from clresample import get_device
 
@@ -11,6 +12,13 @@ def files(tmp_path, monkeypatch):
     """A folder, the current one, of an image, a reference, and their PSFs."""
     monkeypatch.chdir(tmp_path)
     write_files()
+    return tmp_path
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """A folder with a scene file that can be fitted."""
+    write_scene(tmp_path)
     return tmp_path
 
 

@@ -12,16 +12,9 @@ from astropy.io import fits
 from astropy.table import Table
 from helpers.checkout import ROOT, run_python
 from helpers.resample_files import resample
-from helpers.tiny_scene import change, deblend, gaussian, write_scene
+from helpers.tiny_scene import OF_FIT, change, deblend, gaussian
 
 from clresample.cli import deblend as command
-
-
-@pytest.fixture
-def scene(tmp_path):
-    """A folder with a scene file that can be fitted."""
-    write_scene(tmp_path)
-    return tmp_path
 
 
 def refused(capsys):
@@ -34,9 +27,6 @@ def refused(capsys):
 
 def kept(folder):
     return {p.name for p in folder.iterdir()}
-
-
-OF_FIT = {"catalogue.fits", "catalogue.ecsv", "result.fits"}
 
 
 @pytest.mark.parametrize(

@@ -4,19 +4,12 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
-from helpers.tiny_scene import change, deblend, write_scene
-
-
-@pytest.fixture
-def scene(tmp_path):
-    """A folder with a scene file that can be fitted."""
-    write_scene(tmp_path)
-    return tmp_path
+from helpers.tiny_scene import OF_FIT, change, deblend
 
 
 def finite(folder):
     """Assert that the outputs are all there and hold finite numbers in every image."""
-    assert {p.name for p in folder.iterdir()} == {"catalogue.fits", "catalogue.ecsv", "result.fits"}
+    assert {p.name for p in folder.iterdir()} == OF_FIT
     with fits.open(folder / "result.fits") as hdus:
         for hdu in hdus:
             assert not hdu.is_image or hdu.data is None or np.isfinite(hdu.data).all(), hdu.name

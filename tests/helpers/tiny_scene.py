@@ -10,6 +10,7 @@ from clresample.cli.command import main
 
 N = 20  # pixels along a side of the larger image
 RA, DEC = 150.0, 2.0  # [deg]
+OF_FIT = {"catalogue.fits", "catalogue.ecsv", "result.fits"}  # what the command writes of it
 SCENE = """
 [[observation]]
 name = "A"

@@ -59,19 +59,17 @@ def most_at_once(seconds_of, n_most, end, clock=time.perf_counter):
     of what each one more costs: that say the last two numbers, and before these are known, and
     where noise has more of them take less time, each costs as much as the last did on average.
     """
-    n, seconds, measured = 1, seconds_of(1), []
+    fitted = [(1, seconds_of(1))]
+    n, seconds = fitted[0]
     more = min(N_FEW, n_most, int((end - clock()) / seconds))
     while more > n and (more >= 2 * n or more == n_most):
-        n, seconds = more, seconds_of(more)
-        measured.append((n, seconds))
+        fitted.append((more, seconds_of(more)))
+        (n_before, before), (n, seconds) = fitted[-2:]
         each = seconds / n
-        if len(measured) > 1:
-            (n_before, before), _ = measured[-2:]
-            gained = (seconds - before) / (n - n_before)
+        if len(fitted) > 2 and seconds > before:
             # one step may not be wrong by more than the growth allows
-            each = max(gained, each / GROWTH) if gained > 0 else each
-        left = end - clock()
-        more = min(n_most, GROWTH * n, n + int((left - seconds) / each))
+            each = max((seconds - before) / (n - n_before), each / GROWTH)
+        more = min(n_most, GROWTH * n, n + int((end - clock() - seconds) / each))
     return n, seconds
 
 

@@ -147,9 +147,11 @@ def _best(device, dtype, known, name, candidates, make, bar):
             with supposed(device, dtype, sizes):
                 seconds[i] = min(_timed(work), seconds.get(i, float("inf")))
     i = min(seconds, key=seconds.get)
-    gain = 0.0 if i == 0 else _duel(device, dtype, runs[0], runs[i]) if 0 in runs else None
-    if gain is not None and gain < LEAST_GAIN:
-        return None, 0.0
+    gain = None
+    if 0 in runs:
+        gain = _duel(device, dtype, runs[0], runs[i]) if i else 0.0
+        if gain < LEAST_GAIN:
+            return None, 0.0
     names = {name, "row_choices"} if name == "tile" else {name}
     return {n: runs[i][0][n] for n in names}, gain
 
