@@ -157,8 +157,8 @@ def run(arguments):
     pixels = _finite(arguments, image)
     reference = read_image(arguments.like, hdu=arguments.like_hdu, bands=arguments.like_band)
     psfs = [_psf(arguments, which, len(pixels)) for which in ("psf", "psf_like")]
-    unit = image.header.get("BUNIT")
-    if unit and ("sr" in unit.lower() or "arcsec" in unit.lower()):
+    unit = str(image.header.get("BUNIT") or "")
+    if "sr" in unit.lower() or "arcsec" in unit.lower():
         note(
             arguments, f"{arguments.image}: BUNIT is {unit}, but pixels are taken as flux per pixel"
         )

@@ -19,7 +19,7 @@ from ..sky.grid import Grid
 from ..sky.psf import PSF
 from .compressed import check_tiles
 from .headers import check_headers
-from .names import to_ascii
+from .names import text_card
 from .whole_file import FileError, check_output, whole_file
 
 # header cards that describe a third axis
@@ -130,9 +130,9 @@ def write_fits(
     hdus = [fits.PrimaryHDU(data, placed[0].header)]
     cards = hdus[0].header
     if unit:
-        cards["BUNIT"] = (to_ascii(unit), "flux per pixel")
+        cards["BUNIT"] = text_card(unit, "flux per pixel")
     for i, name in enumerate(bands or ()):
-        cards[f"BAND{i + 1}"] = (to_ascii(name), f"plane {i + 1}")
+        cards[f"BAND{i + 1}"] = text_card(name, f"plane {i + 1}")
     add_provenance(cards, data.dtype, device, inputs or {}, shift_px)
     if coverage is not None:
         coverage = np.asarray(coverage)
@@ -278,9 +278,9 @@ def add_provenance(header, dtype, device, inputs, shift_px):
     header["DATE"] = (datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "written, UTC")
     header["CLDTYPE"] = (str(dtype), "arithmetic of the operator")
     if device is not None:
-        header["CLDEVICE"] = (to_ascii(device), "OpenCL device")
+        header["CLDEVICE"] = text_card(device, "OpenCL device")
     if shift_px is not None:
         header["CLSHIFTY"] = (float(shift_px[0]), "[pixel] shift applied, input rows")
         header["CLSHIFTX"] = (float(shift_px[1]), "[pixel] shift applied, input columns")
     for i, (what, file) in enumerate(inputs.items()):
-        header[f"CLFILE{i + 1}"] = (to_ascii(Path(file).name), to_ascii(what))
+        header[f"CLFILE{i + 1}"] = text_card(Path(file).name, what)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-# Characters of a column's name that a FITS card holds; an apostrophe is written as two.
+# Characters of a column's name, or of a text on one card, that FITS takes; an apostrophe is written
+# as two.
 COLUMN = 68
 MOST_CHARACTERS = COLUMN - len("flux_err_")  # of channels, whose longest column that is
 
@@ -12,6 +13,17 @@ MOST_CHARACTERS = COLUMN - len("flux_err_")  # of channels, whose longest column
 def to_ascii(text):
     """Text as FITS cards can hold it: "?" for other characters than printable ASCII."""
     return "".join(c if " " <= c <= "~" else "?" for c in str(text))
+
+
+def text_card(text, comment):
+    """(value, comment) of a FITS card: the text in ASCII, the comment if there is room for it.
+
+    What is longer than a card goes on in others, which have room.
+    """
+    value, comment = to_ascii(text), to_ascii(comment)
+    length = max(len(value) + value.count("'"), 8)  # shorter ones are padded
+    fits = length > COLUMN or length + len(" / ") + len(comment) <= COLUMN
+    return value, comment if fits else ""
 
 
 def check_columns(names):

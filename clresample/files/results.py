@@ -22,7 +22,7 @@ from ..sky.psf import PSF
 from ..sky.sources import Extended, Point, Source
 from .arrays import array_of, image_hdu
 from .fits import add_provenance, celestial_header, open_fits, write_hdus
-from .names import check_channels, check_columns, to_ascii
+from .names import check_channels, check_columns, text_card, to_ascii
 from .whole_file import FileError, check_output, whole_file
 
 FORMAT = 2  # of the files; raised when an older reader would misread them
@@ -58,7 +58,7 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
     check_channels(result.channels)
     check_output(path, overwrite=overwrite)
     primary = fits.PrimaryHDU()
-    primary.header["CLSTATUS"] = (to_ascii(" ".join(result.status.split())), "how the fit ended")
+    primary.header["CLSTATUS"] = text_card(" ".join(result.status.split()), "how the fit ended")
     add_provenance(primary.header, result.rendered[0].dtype, device, inputs or {}, None)
     hdus = [primary, _table(catalogue(result), "CATALOGUE"), _flag_table(), *_fit_hdus(result)]
     for i in range(len(result.observations)):
@@ -103,7 +103,7 @@ def _observation_hdus(result, i):
     o = result.observations[i]
     cards, tables = _placed(o.grid, i + 1)
     for k, channel in enumerate(o.channels):
-        cards[f"BAND{k + 1}"] = (to_ascii(channel), f"plane {k + 1}")
+        cards[f"BAND{k + 1}"] = text_card(channel, f"plane {k + 1}")
     images = {"DATA": o.data, "WEIGHTS": o.weights}
     more = {"MODEL": result.model(i), "RESIDUAL": _residual(result, i)} if result.components else {}
     return [

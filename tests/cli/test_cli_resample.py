@@ -111,6 +111,15 @@ def test_notes_are_one_line_each(files, capsys):
     assert "BUNIT is MJy/sr" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("unit", [True, 5, "x" * 60])
+def test_units_that_are_no_words_or_leave_no_room_are_kept(files, unit):
+    with fits.open("in.fits") as hdus:
+        hdus[0].header["BUNIT"] = unit
+        hdus.writeto("odd.fits")
+    assert resample(image="odd.fits") == 0
+    assert fits.getheader("out.fits")["BUNIT"] == str(unit)
+
+
 def test_small_memory_gives_the_same(files, capsys):
     assert resample() == 0
     whole = fits.getdata("out.fits")

@@ -1,9 +1,12 @@
 """Names of observations and channels that are to be parts of FITS columns' names."""
 
+import warnings
+
 import pytest
+from astropy.io import fits
 from helpers.blends import SCALE, blend, observe, round_component
 
-from clresample.files.names import check_catalogue_names
+from clresample.files.names import check_catalogue_names, text_card
 from clresample.files.results import write_catalogue
 from clresample.measurement.catalogue import catalogue
 from clresample.sky.grid import Grid
@@ -26,3 +29,16 @@ def test_columns_too_long_for_fits_are_refused_by_name(tmp_path):
         write_catalogue(tmp_path / "cat.fits", table)
     assert not list(tmp_path.iterdir())
     write_catalogue(tmp_path / "cat.ecsv", table)
+
+
+@pytest.mark.parametrize("text", ["x" * n for n in range(46, 75)] + ["'" * 27, "'" * 30, "'" * 40])
+def test_comments_are_left_out_where_a_card_has_no_room(text):
+    """Cut by astropy, they would be a warning to the user."""
+    header = fits.Header()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        header["BUNIT"] = text_card(text, "flux per pixel")
+        found = fits.Header.fromstring(header.tostring())
+    length = len(text) + text.count("'")
+    room = length <= 68 - len(" / flux per pixel") or length > 68
+    assert (found["BUNIT"], found.comments["BUNIT"]) == (text, "flux per pixel" if room else "")
