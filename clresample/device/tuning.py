@@ -10,12 +10,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .processor import name_processor
+
 # Groups of a launch along its second and third axis, which GPUs limit to so many: NVIDIA's compute
 # capabilities list it, Mesa's drivers have the same.
 MOST_GROUPS = 65535
 # Mesa's driver for CPUs, llvmpipe, counts the iterations of all loops of a work-item in a launch;
 # after 65,535 of them it ends every loop at once, and reports no error.
 LLVMPIPE_LOOPS = 65535
+# Processors, as PoCL's compiler names them and its device's version ends, for which it makes code
+# of 16 registers, whatever width of vectors PoCL reports.
+NARROW = ("haswell", "znver1", "znver2", "znver3")
 
 
 @dataclass(frozen=True)
@@ -173,8 +178,9 @@ class Tuning:
 
 def _cpu_tile(device, dtype) -> dict[str, int]:
     """Eight rows of two vectors use the 32 registers of AVX-512 and load little for each product;
-    elsewhere, and in PoCL's code for AMD hosts of any kind, 16 registers hold six rows of one."""
-    wide = device.cl.native_vector_width_float >= 16 and "AMD" not in device.name
+    elsewhere 16 registers hold six rows of one."""
+    built_for = name_processor(device.cl) or device.cl.version
+    wide = device.cl.native_vector_width_float >= 16 and not built_for.endswith(NARROW)
     rows = {"NV": 2, "MR": 8} if wide else {"NV": 1, "MR": 6}
     return {"VW": 16 if dtype == np.float32 else 8, **rows, "WGX": 1, "WGY": 1}
 

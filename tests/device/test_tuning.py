@@ -1,6 +1,7 @@
 """Sizes that were measured and kept: read, checked, and without influence but on the time."""
 
 import warnings
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from clresample.cli.machine.tune import CPU_TILES, GPU_TILES, supposed
 from clresample.cli.machine.workload import Iterations
 from clresample.device.contraction import whole
 from clresample.device.remembered import DeviceWarning, Remembered
-from clresample.device.tuning import PART, Tuning, is_tile
+from clresample.device.tuning import PART, Tuning, _cpu_tile, is_tile
 
 TILE = {"VW": 8, "NV": 1, "MR": 4, "WGX": 1, "WGY": 1}
 BOTH = ("CPU", "GPU")
@@ -110,6 +111,24 @@ def test_columns_choose_the_vectors_of_a_tile(device, monkeypatch, name, n, vect
     assert (tile["NV"], tile["VW"]) == vectors
     rows = {5: 4}.get(tile["NV"], TILES[name]["MR"])
     assert tile == TILES[name] | {"NV": vectors[0], "VW": vectors[1], "MR": rows}
+
+
+@pytest.mark.parametrize(
+    ("width", "version", "rows", "vectors"),
+    [
+        (16, "OpenCL 3.0 PoCL HSTR: pthread-x86_64-pc-linux-gnu-skylake-avx512", 8, 2),
+        (16, "OpenCL 3.0 PoCL HSTR: cpu-x86_64-pc-linux-gnu-znver5", 8, 2),
+        (16, "OpenCL 3.0 PoCL HSTR: pthread-x86_64-pc-linux-gnu-znver3", 6, 1),
+        (8, "OpenCL 3.0 PoCL HSTR: pthread-x86_64-pc-linux-gnu-skylake", 6, 1),
+        (16, "OpenCL 3.1 (Build 0)", 8, 2),  # Intel's runtime
+    ],
+)
+def test_cpus_with_registers_of_avx512_use_them(width, version, rows, vectors):
+    """PoCL reports vectors of 16 on AMD's processors, whatever its compiler makes for them."""
+    cl = Mock(native_vector_width_float=width, version=version)
+    device = Mock(cl=cl)
+    tile = _cpu_tile(device, np.dtype(np.float32))
+    assert (tile["MR"], tile["NV"]) == (rows, vectors)
 
 
 @pytest.mark.parametrize("rows", [1, 47, 48, 49, 60, 74, 118, 132, 1000])
