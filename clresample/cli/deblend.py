@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import threading
 import time
 import warnings
@@ -96,9 +95,6 @@ def run(arguments):
     started = time.perf_counter()
     paths = folder_outputs(arguments, OUTPUTS[: 3 if arguments.no_figure else 4])
     _progress(arguments, f"reading {arguments.scene}")
-    # Read by NumPy's linear algebra when NumPy is imported. Its matrices are small here: threads
-    # wait for each other and for the OpenCL device's own, up to 0.1 s a product on a busy CPU.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     from ..device.contraction import operator_programs
     from ..device.device import get_device
 

@@ -12,7 +12,7 @@ import numpy as np
 from ..device.device import get_device
 from ..device.discovery import DeviceError
 from ..device.tuning import Tuning
-from ..device.workers import ahead, deal
+from ..device.workers import ahead, deal, one_blas_thread
 from ..drawing.bar import Bar
 from ..sky.given.checks import float_type, instance
 from ..sky.sources import SourceWarning
@@ -41,6 +41,7 @@ ERRORS = (ValueError, DeviceError, np.linalg.LinAlgError)
 START_SOURCES = 500
 
 
+@one_blas_thread()
 def deblend(
     observations,
     sources,
@@ -119,6 +120,7 @@ def deblend_many(
     return [result for result, _ in pairs]
 
 
+@one_blas_thread()
 def _fit_all(blends, *, device, progress=lambda n_done: None, **given):
     """(Result or Failure, sources far from any light or None) for each blend."""
     many = _ManyFits(blends, device, **given)

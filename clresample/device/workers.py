@@ -1,4 +1,5 @@
-"""Work dealt to several devices, a process each: OpenCL drivers share badly within one process.
+"""The host's threads beside a device, and work dealt to several devices, a process each: OpenCL
+drivers share badly within one process.
 
 Each process is started anew (spawn), so a script that calls this must keep what it does itself
 under `if __name__ == "__main__":`, as Python's multiprocessing asks.
@@ -14,8 +15,10 @@ import threading
 import time
 import traceback
 import warnings
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from multiprocessing import connection
+
+from threadpoolctl import threadpool_limits
 
 from .device import Device, get_device
 from .discovery import DeviceError, choose, find_devices
@@ -29,6 +32,35 @@ FIRST = 4
 SHARE = 0.5
 # [s] An interrupted process has so long to hand in what it has.
 PATIENCE_S = 60.0
+
+
+class _Alone:
+    """How many callers want linear algebra on one thread, and what restores its threads."""
+
+    lock = threading.Lock()
+    n_callers = 0
+    limits: threadpool_limits | None = None
+
+
+@contextmanager
+def one_blas_thread():
+    """NumPy's and SciPy's linear algebra on one thread of this process meanwhile.
+
+    Its threads wait for each other and for a CPU device's by counting, not asleep. On matrices as
+    small as a fit's that takes 2.7 times the processor time on two cores, and 1.8 times as long.
+    Callers in several threads share it: the last one to leave restores what the first one found.
+    """
+    with _Alone.lock:
+        if not _Alone.n_callers:
+            _Alone.limits = threadpool_limits(1, user_api="blas")
+        _Alone.n_callers += 1
+    try:
+        yield
+    finally:
+        with _Alone.lock:
+            _Alone.n_callers -= 1
+            if not _Alone.n_callers:
+                _Alone.limits.restore_original_limits()
 
 
 def ahead(items):

@@ -5,10 +5,43 @@ import threading
 
 import pytest
 from helpers.portions import fails_on_seven, first_dies, slow, squares
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from clresample import DeviceError
+from clresample import DeviceError, deblend, deblend_many
+from clresample.deblending import batch
 from clresample.device.remembered import DeviceWarning
-from clresample.device.workers import _Table, ahead, deal
+from clresample.device.workers import _Table, ahead, deal, one_blas_thread
+
+
+def blas_threads():
+    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+
+def test_linear_algebra_has_one_thread_until_the_last_caller_leaves():
+    """Also where the first to come is the first to go, as in two threads; and after an error."""
+    with threadpool_limits(2, user_api="blas"):
+        first, last = one_blas_thread(), one_blas_thread()
+        first.__enter__()
+        last.__enter__()
+        first.__exit__(None, None, None)
+        assert blas_threads() == {1}
+        last.__exit__(None, None, None)
+        assert blas_threads() == {2}
+        with pytest.raises(ArithmeticError), one_blas_thread():
+            raise ArithmeticError
+        assert blas_threads() == {2}
+
+
+def test_fits_have_linear_algebra_on_one_thread(monkeypatch):
+    """Of 32 scenes on two cores, two threads take 2.7 times the processor time."""
+    seen = []
+    monkeypatch.setattr(batch, "Fit", lambda *_, **__: seen.append(blas_threads()))
+    with threadpool_limits(2, user_api="blas"):
+        (failure,) = deblend_many([None])
+        with pytest.raises(AttributeError):
+            deblend([None], [None])
+    assert seen == [{1}]
+    assert failure.status
 
 
 def dealt(function, items, devices, most=1000):
