@@ -7,6 +7,8 @@
  * VEC(n) is the vector type of n REALs: VEC(4) is float4 or double4.
  * AT(type, p) is the value of that type at address p: AT(const VEC(4), p) reads p[0] .. p[3].
  * SUM8(p) adds p[0] .. p[7] in pairs: eight running sums vectorise, and round less than one.
+ * UNROLL(i, n) is a loop over i < n, a constant, that is written out: left rolled, what it keeps in
+ * an array goes through memory.
  */
 #ifndef REAL         /* float or double */
 #define REAL float
@@ -20,4 +22,5 @@
 #define AT(type, p) (*(__global type *)(p))
 #define SUM8(p) \
     ((((p)[0] + (p)[1]) + ((p)[2] + (p)[3])) + (((p)[4] + (p)[5]) + ((p)[6] + (p)[7])))
+#define UNROLL(i, n) _Pragma("unroll") for (int i = 0; i < (n); ++i)
 #define SQRT_HALF ((REAL)0.70710678118654752440)

@@ -103,8 +103,6 @@
 #define STEP_A 1
 #endif
 
-#define UNROLL(i, n) _Pragma("unroll") for (int i = 0; i < (n); ++i)
-
 /* part[mr][nv] += row[i][l STEP_A] times the vectors at from + column[v], nv of them. */
 #define ADD_TERM(mr, nv, l, row, from, column) \
     UNROLL(v, nv) right[v] = AT(const WIDE, (from) + column[v]); \

@@ -69,9 +69,9 @@ static REAL symmetry(ARGUMENTS)
     __global REAL *last = x + (size_t)(cy + ry) * nx + cx + rx;
     for (int i = lid; i < n_pairs; i += WG) {
         const int k = (i / width) * nx + i % width;
-        const REAL d = h * (first[k] - last[-k]);
-        first[k] -= d;
-        last[-k] += d;
+        const REAL a = first[k], b = last[-k], d = h * (a - b);
+        first[k] = a - d;
+        last[-k] = b + d;
     }
     return 1;
 }

@@ -57,10 +57,11 @@ __kernel void gather(const int n_out, const int n_lines, const int n_bands, cons
         /* four pixels at a time, their taps side by side, where these are neighbours */
         for (; source_step == 1 && p + 4 <= n_out; p += 4) {
             FOUR sum[4];
-            for (int i = 0; i < 4; ++i) {
+            UNROLL(i, 4) {
                 __global const REAL *in = source + start[p + i], *w = weight + (p + i) * N_TAPS;
                 sum[i] = FOUR_AT(w) * FOUR_AT(in);
-                for (int t = 4; t < N_TAPS; t += 4) sum[i] += FOUR_AT(w + t) * FOUR_AT(in + t);
+                UNROLL(t, N_TAPS / 4 - 1)
+                    sum[i] += FOUR_AT(w + 4 * t + 4) * FOUR_AT(in + 4 * t + 4);
             }
             const FOUR even = {sum[0].x, sum[1].x, sum[2].x, sum[3].x};
             const FOUR odd = {sum[0].y, sum[1].y, sum[2].y, sum[3].y};
