@@ -14,11 +14,10 @@
  * condense   g = K_j^T q + precision[s, j] z for every scale;  launch: (X, COARSE rows, n_free)
  * energy     out[s, j] = sum z_sj^2 of the sources listed;      launch: (WG, n_scales, n_free)
  *
- * taps       N_SCALES rows of TAPS: K_j along one axis, zeros after 2 RADII[j] + 1 of them, up to a
- *            multiple of 8 at least
+ * taps       N_SCALES rows of TAPS: K_j along one axis, at least one zero after 2 RADII[j] + 1
  * line       zeros; scratch of a source from LINES on, LINE(nx) for each row of either
  *            kernel: a row of one pass, with MARGIN zeros before it, and as many and 16 more behind
- * MARGIN     a multiple of ALIGN, the largest of RADII at least
+ * MARGIN     a multiple of ALIGN, the largest of RADII and of STEPS together at least
  * start      (S, 2) int: of LATENTS and LINES, in units of ALIGN elements
  * table, flat buffers: see boxes.h.  X is 1 where a work-item walks a whole row (ROWS), else the
  * widest row: there each pixel is one sum over two axes, and `line` is not used.
@@ -39,7 +38,7 @@
 #define TAPS 32
 #endif
 #ifndef MARGIN      /* zeros before a row of line; ALIGN more behind, so that whole vectors fit */
-#define MARGIN 16
+#define MARGIN 32
 #endif
 #define LINE(nx) (((nx) + ALIGN - 1) / ALIGN * ALIGN + 2 * MARGIN + ALIGN)
 #define COARSE(n, step) (((n) + (step) - 2) / (step) + 1)
@@ -55,24 +54,50 @@ __constant int steps[N_SCALES] = STEPS;
 #define LINES(s) ((size_t)start[2 * (s) + 1] * ALIGN)
 
 #if ROWS
-/* out[x] += sum_c taps[x - step c + radius] line[c]; line: zero for `MARGIN` before and behind. */
-static void upsample(__global const REAL *line, __global const REAL *taps,
-                     const int nx, const int step, const int radius, __global REAL *out)
+/* A function compiled by itself has its vectors cut in two: PoCL allows the widest to kernels. */
+#define INLINE static inline __attribute__((always_inline))
+/* Neighbouring elements, which begin anywhere. */
+typedef REAL EIGHT __attribute__((ext_vector_type(8), aligned(sizeof(REAL))));
+typedef REAL SIXTEEN __attribute__((ext_vector_type(16), aligned(sizeof(REAL))));
+
+/* to[step i] = sum_r<n_rows k[r k_step] rows[r ld + i], i from `i` on, as many as VECTOR has. */
+#define SUM_ROWS(VECTOR, N) { \
+    VECTOR sum = (VECTOR)(0); \
+    for (int r = 0; r < n_rows; ++r) sum += k[r * k_step] * AT(const VECTOR, rows + r * ld + i); \
+    if (step == 1) AT(VECTOR, to + i) = sum; \
+    else UNROLL(l, N) to[step * (i + l)] = sum[l]; \
+}
+
+/* The same for all i < n. */
+INLINE void sum_rows(__global const REAL *rows, const int n_rows, const int ld,
+                     __global const REAL *k, const int k_step, const int n,
+                     __global REAL *to, const int step)
 {
-    for (int phase = 0; phase < step; ++phase) {
-        const int low = -((radius - phase) / step), high = (radius + phase) / step;
-        for (int i0 = 0; step * i0 + phase < nx; i0 += 8) {
-            REAL sum[8] = {0, 0, 0, 0, 0, 0, 0, 0};
-            for (int o = low; o <= high; ++o) {
-                const REAL k = taps[phase - step * o + radius];
-                for (int l = 0; l < 8; ++l) sum[l] += k * line[i0 + o + l];
-            }
-            for (int l = 0; l < 8; ++l) {
-                const int x = step * (i0 + l) + phase;
-                if (x < nx) out[x] += sum[l];
-            }
-        }
+    int i = 0;
+    for (; i + 16 <= n; i += 16) SUM_ROWS(SIXTEEN, 16)
+    for (; i + 8 <= n; i += 8) SUM_ROWS(EIGHT, 8)
+    if (i < n && n >= 8) {      /* the last eight, some of them once more */
+        i = n - 8;
+        SUM_ROWS(EIGHT, 8)
+        return;
     }
+    for (; i < n; ++i) {
+        REAL sum = 0;
+        for (int r = 0; r < n_rows; ++r) sum += k[r * k_step] * rows[r * ld + i];
+        to[step * i] = sum;
+    }
+}
+
+/* sum_t<=2 radius k[t] line[x - radius + t] at sixteen x from line[0] on; k[2 radius + 1] is 0. */
+INLINE SIXTEEN smoothed(__global const REAL *line, __global const REAL *k, const int radius)
+{
+    SIXTEEN even = (SIXTEEN)(0), odd = (SIXTEEN)(0);
+    line -= radius;
+    for (int t = 0; t <= 2 * radius; t += 2) {
+        even += k[t] * AT(const SIXTEEN, line + t);
+        odd += k[t + 1] * AT(const SIXTEEN, line + t + 1);
+    }
+    return even + odd;
 }
 #endif
 
@@ -88,27 +113,26 @@ __kernel void spread(__global const int *restrict active, __global const int *re
     __global REAL *out = u + box + (size_t)y * nx;
 #if ROWS
     __global REAL *row = line + LINES(s) + (size_t)y * LINE(nx) + MARGIN;
-    for (int x = 0; x < nx; ++x) out[x] = 0;
     for (int j = 0; j < N_SCALES; ++j) {
         const int step = steps[j], radius = radii[j];
         const int cy = COARSE(ny, step), cx = COARSE(nx, step);
         const int low = y - radius > 0 ? (y - radius + step - 1) / step : 0;
         const int top = (y + radius) / step, high = top < cy - 1 ? top : cy - 1;
-        __global const REAL *k = taps + (size_t)j * TAPS + y + radius;
-        int c = 0;
-        for (; c + 8 <= cx; c += 8) {
-            REAL sum[8] = {0, 0, 0, 0, 0, 0, 0, 0};
-            for (int r = low; r <= high; ++r)
-                for (int l = 0; l < 8; ++l) sum[l] += k[-step * r] * plane[(size_t)r * cx + c + l];
-            for (int l = 0; l < 8; ++l) row[c + l] = sum[l];
+        __global const REAL *k = taps + (size_t)j * TAPS;
+        /* coefficients on the pixels that they belong to, zeros between them */
+        for (int m = 0; m < LINE(nx) - MARGIN; ++m) row[m] = 0;
+        sum_rows(plane + (size_t)low * cx, high - low + 1, cx, k + y + radius - step * low, -step,
+                 cx, row, step);
+        int x = 0;
+        for (; x + 16 <= nx; x += 16) {
+            SIXTEEN sum = smoothed(row + x, k, radius);
+            if (j) sum += AT(const SIXTEEN, out + x);
+            AT(SIXTEEN, out + x) = sum;
         }
-        for (; c < cx; ++c) {
-            REAL sum = 0;
-            for (int r = low; r <= high; ++r) sum += k[-step * r] * plane[(size_t)r * cx + c];
-            row[c] = sum;
+        if (x < nx) {
+            const SIXTEEN sum = smoothed(row + x, k, radius);
+            for (int l = 0; x + l < nx; ++l) out[x + l] = (j ? out[x + l] : (REAL)0) + sum[l];
         }
-        for (int m = cx; m < cx + MARGIN; ++m) row[m] = 0;
-        upsample(row, taps + (size_t)j * TAPS, nx, step, radius, out);
         plane += (size_t)cy * cx;
     }
     for (int x = 0; x < nx; ++x) out[x] *= amp[box + (size_t)y * nx + x];
@@ -183,17 +207,6 @@ void unform(__global const int *restrict active, __global const int *restrict ta
     for (int i = lid; i < n; i += WG) d[i] = a[i] * ((m[i] > 0 ? d[i] : (REAL)0) - b[i] * less);
 }
 
-/* Eight coefficients of a row at a time, of a step that is known when this is compiled. */
-#define ALONG_ROW(STEP) \
-    for (; c + 8 <= cx; c += 8) { \
-        REAL sum[8] = {0, 0, 0, 0, 0, 0, 0, 0}; \
-        __global const REAL *from = row + STEP * c - radius; \
-        for (int t = 0; t <= 2 * radius; ++t) \
-            for (int l = 0; l < 8; ++l) sum[l] += k[t] * from[STEP * l + t]; \
-        for (int l = 0; l < 8; ++l) \
-            gradient[at + c + l] = sum[l] + weight * z[at + c + l]; \
-    }
-
 __kernel void condense(__global const int *restrict active, __global const int *restrict table,
                        __global const int *restrict start, __global const REAL *restrict taps,
                        __global const REAL *restrict q, __global const REAL *restrict precision,
@@ -223,29 +236,19 @@ __kernel void condense(__global const int *restrict active, __global const int *
 #if ROWS
     __global REAL *row =
         line + LINES(s) + (size_t)get_global_id(1) * LINE(nx) + MARGIN;
-    int x = 0;
-    for (; x + 8 <= nx; x += 8) {
-        REAL sum[8] = {0, 0, 0, 0, 0, 0, 0, 0};
-        for (int y = low; y <= high; ++y) {
-            const REAL ky = k[y - middle + radius];
-            for (int l = 0; l < 8; ++l) sum[l] += ky * in[(size_t)y * nx + x + l];
-        }
-        for (int l = 0; l < 8; ++l) row[x + l] = sum[l];
-    }
-    for (; x < nx; ++x) {
-        REAL sum = 0;
-        for (int y = low; y <= high; ++y) sum += k[y - middle + radius] * in[(size_t)y * nx + x];
-        row[x] = sum;
-    }
+    sum_rows(in + (size_t)low * nx, high - low + 1, nx, k + low - middle + radius, 1, nx, row, 1);
     for (int m = nx; m < LINE(nx) - MARGIN; ++m) row[m] = 0;
-    int c = 0;
-    if (step == 1) ALONG_ROW(1)
-    if (step == 2) ALONG_ROW(2)
-    for (; c < cx; ++c) {
-        REAL sum[8] = {0, 0, 0, 0, 0, 0, 0, 0};
-        for (int t = 0; t <= 2 * radius; t += 8)
-            for (int l = 0; l < 8; ++l) sum[l] += k[t + l] * row[step * c - radius + t + l];
-        gradient[at + c] = SUM8(sum) + weight * z[at + c];
+    /* at all pixels, of which a coefficient belongs to every `step`-th */
+    for (int x = 0; x <= step * (cx - 1); x += step > 16 ? step : 16) {
+        const SIXTEEN sum = smoothed(row + x, k, radius);
+        if (step == 1 && x + 16 <= cx) {
+            const SIXTEEN own = AT(const SIXTEEN, z + at + x);
+            AT(SIXTEEN, gradient + at + x) = sum + weight * own;
+        } else
+            for (int l = 0; l < 16 && x + l <= step * (cx - 1); l += step) {
+                const size_t c = at + (x + l) / step;
+                gradient[c] = sum[l] + weight * z[c];
+            }
     }
 #else
     const int c = (int)get_global_id(0);

@@ -11,7 +11,11 @@ from clresample.deblending.solver.buffers import Buffers
 from clresample.deblending.solver.learned.prior import LearnedPrior
 from clresample.deblending.solver.learned.structure import Latents, Structure, coarse
 
-PRIORS = LearnedPrior(), LearnedPrior(scales_px=(1.0, 6.5), strengths=(0.1, 0.1))
+PRIORS = {
+    "three": LearnedPrior(),
+    "two": LearnedPrior(scales_px=(1.0, 6.5), strengths=(0.1, 0.1)),
+    "wide": LearnedPrior(scales_px=(2.0, 40.0), strengths=(0.1, 0.1)),  # steps over a vector
+}
 
 
 def made(build, dtype, prior, seed=0):
@@ -29,7 +33,7 @@ def made(build, dtype, prior, seed=0):
 
 
 @every_type
-@pytest.mark.parametrize("prior", PRIORS, ids=["three", "two"])
+@pytest.mark.parametrize("prior", PRIORS.values(), ids=PRIORS)
 def test_kernels_are_their_references(build, dtype, prior):
     b, structure, z, profiles, free = made(build, dtype, prior)
     rng = np.random.default_rng(1)
@@ -61,7 +65,7 @@ def test_kernels_are_their_references(build, dtype, prior):
 def test_nothing_is_written_beyond_the_buffers(build, monkeypatch):
     """Lines keep their margins of zeros: a second time the answers are the same."""
     guards, rng = Guards(monkeypatch), np.random.default_rng(4)
-    for prior in PRIORS:
+    for prior in PRIORS.values():
         b, structure, z, profiles, _ = made(build, np.float32, prior)
         vector, precision = b.put(structure.latents.pack(z)), b.put(np.ones((len(profiles), 3)))
         d_morph = [rng.normal(size=p.shape) for p in profiles]
@@ -80,7 +84,7 @@ def test_nothing_is_written_beyond_the_buffers(build, monkeypatch):
 
 def test_memory_is_that_of_a_line_for_each_row(build):
     """Besides one array of all boxes: rows of coefficients, padded to vectors and by the kernels'
-    radii. Also where a kernel is a pixel longer than vectors."""
+    radii and steps. Also where a kernel is a pixel longer than vectors."""
     scenes, states = map(list, zip(*ragged(build, np.float32), strict=True))
     kept = []  # what is freed meanwhile would be counted as less
     for prior in (LearnedPrior(), LearnedPrior(scales_px=(1.3,), strengths=(0.1,))):
@@ -90,8 +94,8 @@ def test_memory_is_that_of_a_line_for_each_row(build):
         kept.append((b, structure))
         used = (build.in_use - before) / 4
         rows = structure.latents.shape[:, :, 0].sum(1)
-        radius = -(-max(prior.radii) // ALIGN) * ALIGN
-        line = b.host_boxes.shape[:, 1] + 2 * radius + 2 * ALIGN
+        margin = -(-(max(prior.radii) + max(prior.steps)) // ALIGN) * ALIGN
+        line = b.host_boxes.shape[:, 1] + 2 * margin + 2 * ALIGN
         assert 0 < used < b.host_boxes.size + (rows * line).sum() + 8 * len(rows) + 500
     assert len(prior.kernels()[0]) == 9
 

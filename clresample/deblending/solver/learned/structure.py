@@ -72,8 +72,8 @@ class Structure:
         free = b.device.get(b.free)[: b.n_free]
         self.latents = Latents(b.host_boxes, free, prior.steps)
         self.n_scales = len(prior.steps)
-        margin = -(-max(prior.radii) // ALIGN) * ALIGN
-        n_taps = -(-(2 * max(prior.radii) + 1) // 8) * 8
+        margin = -(-(max(prior.radii) + max(prior.steps)) // ALIGN) * ALIGN
+        n_taps = 2 * max(prior.radii) + 2
         taps = np.zeros((self.n_scales, n_taps))
         for row, kernel, step in zip(taps, prior.kernels(), prior.steps, strict=True):
             row[: len(kernel)] = kernel * np.sqrt(step)
@@ -85,8 +85,9 @@ class Structure:
             "MARGIN": margin,
         }
         rows = self.latents.shape[:, :, 0].sum(1)
+        lines = np.maximum(rows, b.host_boxes.shape[:, 0])  # of condense, and of spread
         width = -(-b.host_boxes.shape[:, 1] // ALIGN) * ALIGN + 2 * margin + ALIGN
-        scratch = np.concatenate([[0], np.cumsum(rows * width)])  # spread has fewer rows
+        scratch = np.concatenate([[0], np.cumsum(lines * width)])
         line = b.device.zeros(max(int(scratch[-1]), 1) if b.tuning.row_loops else 1, b.dtype)
         start = np.stack([self.latents.start, scratch[:-1]], axis=1) // ALIGN
         power = np.array([(p * p).sum() for s in b.scenes for p in s.profile])
