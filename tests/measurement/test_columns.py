@@ -19,13 +19,15 @@ def columns(n, first, names, meta):
 def test_rows_follow_each_other_and_what_is_missing_is_nan():
     one, other = columns(2, 1, ("a",), {"frame": "icrs"}), columns(3, 4, ("a", "b"), {"k": 1})
     other.put("n", np.arange(3, dtype=np.int16))
+    other.put("bits", np.full(3, 6, dtype=np.uint8))
     other.put("note", np.full(3, "why"))
     both = Columns.joined([one, other])
-    assert len(both) == 5 and list(both.values) == ["id", "a", "status", "b", "n", "note"]
+    assert len(both) == 5 and list(both.values) == ["id", "a", "status", "b", "n", "bits", "note"]
     assert both.units == {"a": u.uJy, "b": u.uJy} and both.meta == {"frame": "icrs", "k": 1}
     assert both["id"].tolist() == [1, 2, 4, 5, 6] and both["id"].dtype == np.int32
     np.testing.assert_array_equal(both["b"], [np.nan, np.nan, 4.0, 4.5, 5.0])
     assert both["n"].tolist() == [0, 0, 0, 1, 2] and both["n"].dtype == np.int16
+    assert both["bits"].tolist() == [0, 0, 6, 6, 6] and both["bits"].dtype == np.uint8
     assert both["status"].tolist() == ["x", "x", "xxxx", "xxxx", "xxxx"]
     assert both["note"].tolist() == ["", "", "why", "why", "why"]
     assert len(one) == 2 and "b" not in one and "a" in one  # as they were

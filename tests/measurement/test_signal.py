@@ -70,6 +70,8 @@ def test_significance_goes_on_beyond_its_table():
     assert (np.diff(sigmas) > 0).all()
     assert sigmas[1] - sigmas[0] == pytest.approx(np.sqrt(401) - np.sqrt(399), rel=0.3)
     assert sigmas[2] == pytest.approx(100, rel=0.05)
+    below, above = significance(module.TABLE_END + np.array([-1e-3, 0]), np.array([7, 7]))
+    assert above == pytest.approx(below, abs=1e-4)  # one step of the table is 6e-3
     assert significance(np.array([50.0]), np.array([0]))[0] == 0
     mixed = significance(np.array([50.0, 50.0, 50.0]), np.array([0, 1, 7]))
     assert mixed[0] == 0 and mixed[1] > mixed[2] > 5

@@ -1,5 +1,7 @@
 """Signal to noise at its limits: units, edges, channels that see nothing."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -62,7 +64,9 @@ def test_where_nothing_was_seen_there_is_no_signal():
     assert signal.flat()[30, 30] == pytest.approx(both / np.sqrt(2))
     weights[0] = 0  # a channel without any
     dark = Observation(o.data, o.psf, GRID, weights=weights, channels=o.channels)
-    alone = signal_of(dark, model_frame([o]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        alone = signal_of(dark, model_frame([o]))
     assert alone.n_seen.max() == 1 and np.isfinite(alone.sums).all()
     assert alone.sums[0, 30, 30] == pytest.approx(one, rel=1e-4)
 

@@ -6,6 +6,7 @@ import warnings
 import numpy as np
 import pytest
 
+from clresample.resampling.paper.sincs import sinc_transfer
 from clresample.resampling.transfer import (
     DIVISION_FLOOR,
     FLOORED_POWER,
@@ -78,3 +79,12 @@ def test_wrap_radius_of_turned_pixels_that_are_not_square():
     for matrix in ([[2.0, 1.0], [0.0, 0.5]], [[0.3, 1.9], [-0.6, 0.2]]):
         y, x = wrap_radius(psf, np.array(matrix))
         assert y / x == pytest.approx(np.hypot(*matrix[0]) / np.hypot(*matrix[1]))
+
+
+def test_the_papers_psf_of_finer_pixels_does_not_fold_back(device):
+    """It fills their band, which is wider than the model's; the sincs' cut leaves under 1 %."""
+    n_fft, psf_in, psf_out = (65, 67), PSF.gaussian(0.8), PSF.gaussian(0.7)
+    found, *_ = sinc_transfer(device, 0.5 * np.eye(2), psf_in, psf_out, n_fft)
+    nu = [np.fft.fftfreq(n) for n in n_fft]
+    wanted = 0.25 * psf_out.otf(*(0.5 * n for n in nu)) / psf_in.otf(*nu)
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-2 * np.abs(wanted).max())
