@@ -13,22 +13,26 @@ SETTINGS = Settings(max_iter=6)
 
 
 def test_results_are_those_of_one_device(device):
+    """To the rounding of the solver's blocks, which are float32 in every fit and not the same in
+    batches of other sizes; six iterations make 1e-6 of it, and 2e-5 where all is float32."""
+    dtype, rtol = (np.float64, 1e-5) if device.has_fp64 else (np.float32, 1e-4)
     given = blends(5, device)
     outside = (Extended(position_px=(1e4, 1e4)),)
     given[2] = replace(given[2], sources=outside)  # harms no other
     done = []
-    together = deblend_many(given, settings=SETTINGS, device=[device, device], progress=done.append)
-    alone = deblend_many(given, settings=SETTINGS, device=device)
+    fit = {"settings": SETTINGS, "dtype": dtype}
+    together = deblend_many(given, device=[device, device], progress=done.append, **fit)
+    alone = deblend_many(given, device=device, **fit)
     assert done[-1] == 5
     assert [type(r) for r in together] == [type(r) for r in alone]
     assert isinstance(together[2], Failure) and together[2].status == alone[2].status
     for one, other in zip(together, alone):
         if not isinstance(one, Failure):
             assert one.status == other.status
-            np.testing.assert_allclose(one.losses, other.losses, rtol=1e-5)
+            np.testing.assert_allclose(one.losses, other.losses, rtol=rtol)
             for a, b in zip(one.components, other.components):
-                np.testing.assert_allclose(a.morphology, b.morphology, atol=1e-6)
-                np.testing.assert_allclose(a.spectrum, b.spectrum, rtol=1e-5)
+                np.testing.assert_allclose(a.morphology, b.morphology, rtol=0, atol=rtol)
+                np.testing.assert_allclose(a.spectrum, b.spectrum, rtol=rtol)
 
 
 @pytest.fixture
