@@ -19,6 +19,8 @@ BAND_SLACK = 1e-12
 # [px] largest distance of two samples, and the inverse of the smallest: beyond lie mistakes of unit
 COARSEST = 1e3
 SPACINGS = f"a positive number of pixels, from {1 / COARSEST:g} to {COARSEST:g}"
+# [samples] from the middle of the array to a centre, at most: who is off by more has mistaken units
+FAR = 1e3
 # [complex numbers] one block of the general transform's tables: 16 MiB, near the cache's size;
 # larger ones are read back from memory, smaller ones make many small products
 BLOCK = 1 << 20
@@ -37,8 +39,8 @@ class PSF(ReadOnly, ShownPSF):
     center (C, 2) [samples]: (y, x) array coordinates of each band's centre. Given as None: the
         geometric centre (n-1)/2; as "core": the centroid of each band's core; else (2,) or (C, 2)
 
-    Raises ValueError for wrong shapes, NaN or infinite samples, and sums that are not positive.
-    Warns (PSFWarning) of what `warnings` lists.
+    Raises ValueError for wrong shapes, NaN or infinite samples, sums that are not positive, and
+    centres over FAR away. Warns (PSFWarning) of what `warnings` lists.
     """
 
     images: np.ndarray
@@ -193,6 +195,8 @@ def _center(images, center):
     center = numbers("center", center)
     if center.shape not in ((2,), (n_bands, 2)) or not np.isfinite(center).all():
         raise ValueError(f"center must be (2,) or ({n_bands}, 2) finite numbers, not {center}")
+    if (np.abs(center - [n_y / 2, n_x / 2]) > FAR).any():
+        raise ValueError(f"center is {center.tolist()}, over {FAR:g} samples from their middle")
     return np.broadcast_to(center, (n_bands, 2)).copy()
 
 

@@ -275,3 +275,10 @@ def test_what_is_no_gaussian():
         PSF.gaussian([1.0, 2.0], n_bands=3)
     with pytest.raises(ValueError, match="matrix"):
         PSF.gaussian(1.0).otf(NU_Y, NU_X, np.eye(3))
+
+
+@pytest.mark.parametrize("center", [(1e300, 1e300), (2.0, -1e4), [(2, 2), (1e4, 2)]])
+def test_centres_far_from_the_samples_are_refused(center):
+    quiet(np.ones((2, 5, 5)), center=(900.0, -900.0))
+    with pytest.raises(ValueError, match=r"center is .*, over 1000 samples from their middle"):
+        PSF(np.ones((2, 5, 5)), center=center)
