@@ -9,6 +9,8 @@
  * SUM8(p) adds p[0] .. p[7] in pairs: eight running sums vectorise, and round less than one.
  * UNROLL(i, n) is a loop over i < n, a constant, that is written out: left rolled, what it keeps in
  * an array goes through memory.
+ * INLINE begins a function of vectors, which, compiled by itself, would have them cut in two: PoCL
+ * allows the widest to kernels.
  */
 #ifndef REAL         /* float or double */
 #define REAL float
@@ -23,4 +25,5 @@
 #define SUM8(p) \
     ((((p)[0] + (p)[1]) + ((p)[2] + (p)[3])) + (((p)[4] + (p)[5]) + ((p)[6] + (p)[7])))
 #define UNROLL(i, n) _Pragma("unroll") for (int i = 0; i < (n); ++i)
+#define INLINE static inline __attribute__((always_inline))
 #define SQRT_HALF ((REAL)0.70710678118654752440)

@@ -31,9 +31,6 @@
 #define KU 1        /* its sums are short: what four leave over would cost as much as they gain */
 #include "contract.h"
 
-/* A function compiled by itself has its vectors cut in two: PoCL allows the widest to kernels. */
-#define INLINE static inline __attribute__((always_inline))
-
 #ifndef SPACED      /* 1: an image's columns lie `step` apart; 0: they are adjacent */
 #define SPACED 0
 #endif

@@ -54,8 +54,6 @@ __constant int steps[N_SCALES] = STEPS;
 #define LINES(s) ((size_t)start[2 * (s) + 1] * ALIGN)
 
 #if ROWS
-/* A function compiled by itself has its vectors cut in two: PoCL allows the widest to kernels. */
-#define INLINE static inline __attribute__((always_inline))
 /* Neighbouring elements, which begin anywhere. */
 typedef REAL EIGHT __attribute__((ext_vector_type(8), aligned(sizeof(REAL))));
 typedef REAL SIXTEEN __attribute__((ext_vector_type(16), aligned(sizeof(REAL))));
