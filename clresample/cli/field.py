@@ -107,7 +107,8 @@ def run(arguments):
     """Read the field file, run the field, report. Returns the exit status."""
     import os
 
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # as in `clresample deblend`
+    # what runs beside the fits has small matrices too: see one_blas_thread
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     from ..fields.options import LEAST_BOUND, LEAST_MEMORY, MEMORY, group_memory
     from ..fields.reading.field_file import read_field
     from ..fields.run import free_memory, run_field

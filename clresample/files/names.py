@@ -22,8 +22,8 @@ def text_card(text, comment):
     """
     value, comment = to_ascii(text), to_ascii(comment)
     length = max(len(value) + value.count("'"), 8)  # shorter ones are padded
-    fits = length > COLUMN or length + len(" / ") + len(comment) <= COLUMN
-    return value, comment if fits else ""
+    has_room = length > COLUMN or length + len(" / ") + len(comment) <= COLUMN
+    return value, comment if has_room else ""
 
 
 def check_columns(names):

@@ -7,7 +7,7 @@ import pytest
 from helpers.portions import fails_on_seven, first_dies, slow, squares
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from clresample import DeviceError, deblend, deblend_many
+from clresample import Blend, DeviceError, deblend, deblend_many
 from clresample.deblending import batch
 from clresample.device.remembered import DeviceWarning
 from clresample.device.workers import _Table, ahead, deal, one_blas_thread
@@ -35,13 +35,18 @@ def test_linear_algebra_has_one_thread_until_the_last_caller_leaves():
 def test_fits_have_linear_algebra_on_one_thread(monkeypatch):
     """Of 32 scenes on two cores, two threads take 2.7 times the processor time."""
     seen = []
-    monkeypatch.setattr(batch, "Fit", lambda *_, **__: seen.append(blas_threads()))
+
+    def noted(*_, **__):
+        seen.append(blas_threads())
+        raise ValueError("no fit")
+
+    monkeypatch.setattr(batch, "Fit", noted)
     with threadpool_limits(2, user_api="blas"):
-        (failure,) = deblend_many([None])
-        with pytest.raises(AttributeError):
+        (failure,) = deblend_many([Blend([None], [None])])
+        with pytest.raises(ValueError, match="no fit"):
             deblend([None], [None])
-    assert seen == [{1}]
-    assert failure.status
+    assert seen == [{1}, {1}]
+    assert "no fit" in failure.status
 
 
 def dealt(function, items, devices, most=1000):
