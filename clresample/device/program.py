@@ -88,12 +88,12 @@ class Programs:
         DeviceError: the file does not build here (with the compiler's log), or no float64
         ValueError: dtype is another, or the file has no such kernel
         """
-        dtype, cl = np.dtype(dtype), load_pyopencl()
+        dtype = np.dtype(dtype)
         if dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
             raise ValueError(f"dtype is {dtype}; kernels are built for float32 or float64")
         build = _request(file, dtype, defines)
         if (build, name) not in self._kernels:
-            arguments = signature(file, name)
+            arguments, cl = signature(file, name), load_pyopencl()
             program = self._program(file, dtype, defines)
             kernel, types = cl.Kernel(program, name), SCALARS | {"REAL": dtype.type}
             kernel.set_scalar_arg_dtypes([types.get(type_) for _, type_ in arguments])
