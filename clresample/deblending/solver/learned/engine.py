@@ -132,7 +132,6 @@ class LearnedEngine:
         moved, weights, change = self.strengths.learn(due, energies, spectra)
         self._rest_others(self.progress.live)
         self.steps.reweigh(self.strengths.light, weights, self.strengths.blocks)
-        self.pairs.forget(due)
         self.progress.learned(due, moved, change)
         return self.steps.change()[0]  # its s and y go into spare slots
 
