@@ -90,12 +90,18 @@ class Solution:
 
     def unlikeness(self, i):
         """Strength of component i's structure over that of a galaxy that is like its smooth
-        profile, see STRENGTH; 1 of fixed ones."""
+        profile, see STRENGTH; 1 of fixed ones. Misfit is not taken for structure, but makes no
+        galaxy more alike than that."""
         if self.scene.fixed[i]:
             return 1.0
         found, j = self.findings, self._scale
-        wanted = found.energies[i, j] / max(self.chi2[i], 1) + WEIGHT * STRENGTH**2
-        return np.sqrt(wanted / (found.determined[i, j] + WEIGHT)) / STRENGTH
+
+        def unlike(energy):
+            wanted = energy + WEIGHT * STRENGTH**2
+            return np.sqrt(wanted / (found.determined[i, j] + WEIGHT)) / STRENGTH
+
+        energy = found.energies[i, j]
+        return max(unlike(energy / max(self.chi2[i], 1)), min(unlike(energy), 1.0))
 
     @cached_property
     def _scale(self):
