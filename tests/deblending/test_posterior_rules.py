@@ -66,6 +66,15 @@ def test_unlikeness_is_what_the_scale_next_to_two_pixels_shows(chi2):
     assert [power_of(unlike, 2.0) for unlike in (0.5, 3.0, 7.0)] == [0.25, 9.0, 9.0]
 
 
+@pytest.mark.parametrize("alone, wanted", [(0.8, 0.8), (1.35, 1.0), (6.0, 1.3)])
+def test_misfit_makes_no_galaxy_more_like_its_profile(alone, wanted):
+    """Of unlikeness `alone` without it: no less than that, or than 1."""
+    energy = 40 * (0.05 * alone) ** 2 - 10 * 0.05**2
+    given = {"energies": np.full((1, 3), energy), "determined": np.full((1, 3), 30.0)}
+    one = solution([(0, 0)], [spot()], chi2=25.0, **given)
+    assert one.unlikeness(0) == pytest.approx(wanted, rel=0.02)
+
+
 @pytest.mark.parametrize("level, share", [(0.0, 0.0), (0.1, 1 / 22), (9.0, 0.45)])
 def test_structure_is_stronger_where_light_may_be_a_neighbours(level, share):
     """By a quarter where a fifth of its light is others', in proportion below. A neighbour of
