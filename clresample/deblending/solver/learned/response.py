@@ -48,11 +48,10 @@ class Response:
                 [_middle(_unpadded(*pair)) for pair in zip(b.scenes, covered, strict=True)]
             )
             impulse = np.zeros(covered.shape, b.dtype)
-            for scene, (y, x) in zip(impulse, at, strict=True):
-                scene[::n_terms, y, x] = 1
+            for image, scene, (y, x) in zip(impulse, b.scenes, at, strict=True):
+                image[::n_terms, y, x] = [_median(w) for w in scene.weights[i]]
             answer = b.device.get(o.op.adjoint(o.op.forward(b.put(impulse))))[:, ::n_terms]
-            level = [[_median(w) for w in s.weights[i]] for s in b.scenes]
-            answers.append(answer * np.array(level)[:, :, None, None])
+            answers.append(answer)
             pixels.append(np.repeat(at[:, None], answer.shape[1], axis=1))
         answers = np.concatenate(answers, axis=1)
         pairs = zip(b.scenes, answers, strict=True)
