@@ -120,15 +120,19 @@ class Gather:
         n_lines = executor.n_rows
         n_taps = kept_taps(max(w.shape[1] for w in weights), n_in, tuning)
         start = np.zeros((len(starts), n_lines, n_out), np.int32)
-        weight = np.zeros((len(starts), n_lines, n_taps, n_out), executor.dtype)
+        shape = (n_out, n_taps) if by_pixel else (n_taps, n_out)
+        weight = np.zeros((len(starts), n_lines, *shape), executor.dtype)
+        by_tap = weight.swapaxes(2, 3) if by_pixel else weight
         for i, (s, w) in enumerate(zip(starts, weights, strict=True)):
+            taps = np.arange(w.shape[1])
+            by_tap[i, :, : len(taps), : w.shape[2]] = w
             # with more taps than its own, a plan's last ones would read beyond the line
             back = np.maximum(s - (n_in - n_taps), 0)
-            taps = back[:, None] + np.arange(w.shape[1])[:, None]
             start[i, :, : s.shape[1]] = s - back
-            np.put_along_axis(weight[i, :, :, : w.shape[2]], taps, w, axis=1)
-        if by_pixel:
-            weight = np.ascontiguousarray(weight.swapaxes(2, 3))
+            line, at = np.nonzero(back)
+            by_tap[i, line, :, at] = 0
+            later = back[line, at, None] + taps
+            by_tap[i, line[:, None], later, at[:, None]] = w[line, :, at]
         self.launch = device.launcher(
             "warp.cl",
             "gather",
