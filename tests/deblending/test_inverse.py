@@ -271,13 +271,13 @@ def test_wide_waves_are_seen_on_coarser_pixels(monkeypatch):
 def test_blocks_stand_until_something_has_changed():
     made = Made((17, 20), (0.1, 0.1, 0.1))
     first = made.blocks()
-    made.strengths = made.strengths * 1.3
+    made.strengths = made.strengths * 2.6  # under e
     assert made.blocks() is first
-    made.strengths = made.strengths * [1.4, 1, 1]
+    made.strengths = made.strengths * [1.1, 1, 1]
     second = made.blocks()
     assert second is not first
-    assert made.made.blocks(made.strengths, SPECTRUM * [1.2, 1.5]) is second
-    assert made.made.blocks(made.strengths, SPECTRUM * [1.4, 1]) is not second
+    assert made.made.blocks(made.strengths, SPECTRUM * [1.9, 1.5]) is second
+    assert made.made.blocks(made.strengths, SPECTRUM * [2.1, 1]) is not second
 
 
 def test_a_curvature_that_is_no_sum_of_squares_leaves_its_diagonal():

@@ -41,9 +41,10 @@ COARSEST, MOST_PIXELS = 2, 3000
 # it takes as a matrix, which is quicker below. So many images are transformed at a time.
 MANY_PIXELS, TOGETHER = 1200, 32
 # A block is made of the pixels where one of its coefficients has more than this part of its largest
-# value. Blocks stand until a strength or the spectrum has changed by CHANGE of itself: with 0.1 a
-# fit takes a twentieth more time, and no fewer iterations; with 0.6, some more.
-LEAST, CHANGE = 0.1, 0.35
+# value. Blocks stand until the logarithm of a strength, or the spectrum as a part of its largest
+# value, has changed by more than CHANGE: with 0.35 fits of simulated scenes take a tenth more time,
+# and as many rounds; with 2, some more rounds.
+LEAST, CHANGE = 0.1, 1.0
 # Rows of a root that are stored with one length, as many numbers as a CPU takes at a time.
 PANEL = 8
 
