@@ -157,5 +157,9 @@ def _chosen(axes, profile, shared, all_over, least_light):
 def _most(rows, columns, image):
     """Largest pixel (k, l) of each product of a row (k, ny) and a column (l, nx), none of them
     negative, with an image (ny, nx)."""
-    by_row = (rows[:, :, None] * image).max(1)
+    by_row = np.empty((len(rows), image.shape[1]))
+    for row, most in zip(rows, by_row, strict=True):
+        low, high = np.flatnonzero(row > TINY)[[0, -1]]
+        near = slice(low, high + 1)
+        (row[near, None] * image[near]).max(0, out=most)
     return (by_row[:, None] * columns).max(2)
