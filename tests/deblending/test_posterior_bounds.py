@@ -88,7 +88,8 @@ def test_fluxes_of_bright_galaxies_are_not_biased_by_noise(device):
     released = np.array([r.errors.released[0] for r in results])
     assert (released < 0).mean() > 0.9
     bias, before = (((f.mean(0) - FLUX) / error).mean() for f in (found, found - released))
-    assert before > 0.2 and abs(bias) < 0.5 * before, (bias, before)
+    # each is known to 1 / sqrt(32 noises of 3 bands) = 0.1, their difference better
+    assert before > 0.2 and abs(bias) < 0.6 * before, (bias, before)
 
 
 def test_chi2_is_that_where_a_components_light_is():

@@ -52,6 +52,11 @@ def power_of(unlikeness, exponent):
     return min(unlikeness, MOST_UNLIKE) ** exponent
 
 
+def _unlike(energy, determined):
+    """Unlikeness by |z|^2 of the structure and how many numbers of it the data determine."""
+    return np.sqrt((energy + WEIGHT * STRENGTH**2) / (determined + WEIGHT)) / STRENGTH
+
+
 def enlarged(own, others):
     """What strengths are multiplied by where the light of other sources lies on the own, both
     (ny, nx) as expected; see OVERLAPPED."""
@@ -94,14 +99,10 @@ class Solution:
         galaxy more alike than that."""
         if self.scene.fixed[i]:
             return 1.0
-        found, j = self.findings, self._scale
-
-        def unlike(energy):
-            wanted = energy + WEIGHT * STRENGTH**2
-            return np.sqrt(wanted / (found.determined[i, j] + WEIGHT)) / STRENGTH
-
-        energy = found.energies[i, j]
-        return max(unlike(energy / max(self.chi2[i], 1)), min(unlike(energy), 1.0))
+        energy, known = (
+            a[i, self._scale] for a in (self.findings.energies, self.findings.determined)
+        )
+        return max(_unlike(energy / max(self.chi2[i], 1), known), min(_unlike(energy, known), 1.0))
 
     @cached_property
     def _scale(self):
