@@ -159,7 +159,6 @@ def _most(rows, columns, image):
     negative, with an image (ny, nx)."""
     by_row = np.empty((len(rows), image.shape[1]))
     for row, most in zip(rows, by_row, strict=True):
-        low, high = np.flatnonzero(row > TINY)[[0, -1]]
-        near = slice(low, high + 1)
+        near = row > TINY
         (row[near, None] * image[near]).max(0, out=most)
     return (by_row[:, None] * columns).max(2)

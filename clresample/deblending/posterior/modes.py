@@ -95,8 +95,8 @@ class Solution:
 
     def unlikeness(self, i):
         """Strength of component i's structure over that of a galaxy that is like its smooth
-        profile, see STRENGTH; 1 of fixed ones. Misfit is not taken for structure, but makes no
-        galaxy more alike than that."""
+        profile, see STRENGTH; 1 of fixed ones. Misfit is not taken for structure, but takes none
+        below 1."""
         if self.scene.fixed[i]:
             return 1.0
         energy, known = (
