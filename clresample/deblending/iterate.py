@@ -29,8 +29,8 @@ LEAST_GAIN = 0.5
 # between two; also where it has converged. Every 40 of them, bright scenes take a third longer.
 FIRST_EXCHANGE, EXCHANGE = 40, 20
 # It takes the step if its loss is expected to fall by more than this part of what ends it. With
-# 0.5, one in 20 fluxes of simulated scenes of Rubin's alone still moves by over 0.2 errors where
-# fits go on, with 0.2 one in 40, with 0.1 no fewer.
+# 0.4, two in 100 fluxes of simulated scenes of Rubin's or Euclid's alone move by over 0.2 errors
+# where fits go on, with 0.2 one in 200.
 LEAST_EXCHANGE = 0.2
 # If until the next one the loss has fallen by less than this part of what an Exchange promised, it
 # is made anew, of the scene as it is now. The second one is given up: bounds hold the scene

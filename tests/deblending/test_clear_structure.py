@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clresample.deblending.solver.learned.engine import LearnedEngine
-from clresample.deblending.solver.learned.progress import Progress
+from clresample.deblending.solver.learned.progress import PATIENCE, Progress
 
 N_PIXELS = 1000  # so many that chi2 per pixel is below 1
 
@@ -62,9 +62,9 @@ def test_scenes_look_when_they_are_calm_and_settled():
 def test_no_fit_converges_before_it_has_looked():
     """Of a larger `enough` than what looking needs."""
     progress = begun(100, 100)
-    progress.enough = 6.0
+    progress.enough = float(PATIENCE)
     progress.settled[:] = True
-    progress._drops[:] = [[0.9] * 6, [1.1] * 6]
+    progress._drops[:] = [[0.9] * PATIENCE, [1.1] * PATIENCE]
     accepted = np.ones(2, bool)
     assert progress.asks(accepted).tolist() == [True, True]
     progress.next(accepted)

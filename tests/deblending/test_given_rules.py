@@ -28,7 +28,7 @@ from clresample.sky.grid import Grid
 def test_defaults_are_those_of_the_docstring():
     """Steps, errors and tolerances as they are documented, and measured."""
     s = Settings()
-    assert (s.max_iter, s.enough, s.tol, s.flux_floor) == (500, 0.5, 1e-5, 0.0005)
+    assert (s.max_iter, s.enough, s.tol, s.flux_floor) == (500, 0.25, 1e-5, 0.0005)
     assert (s.psf_error, s.psf_tolerance, s.fit_shifts, s.fit_sky) == (0.03, 1e-3, False, False)
     assert s.learns and s.constraints is None and s.prior == LearnedPrior()
     steps = s.step_sizes

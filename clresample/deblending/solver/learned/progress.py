@@ -27,7 +27,7 @@ LOOK = 2.5
 # A fit has converged when its strengths have settled and its loss fell by less than `enough` over
 # so many iterations; by that times chi2 per pixel where that is above 1, since a model that misfits
 # so knows its fluxes less well by its root.
-PATIENCE = 6
+PATIENCE = 5
 
 
 class Progress:
