@@ -92,11 +92,15 @@ def with_noise(scene, rng):
 
 
 def scores(result, scene):
-    """SDR [dB] of each source's morphology, against its truth on Euclid's pixels, both of sum 1."""
+    """SDR [dB] of each source's morphology, against its truth on Euclid's pixels, both of sum 1.
+
+    Of several components each counts by its counts in all channels; the truth has one colour.
+    """
     models = np.zeros_like(scene.euclid.truth)
     for component in result.components:
         (y, x), (n_y, n_x) = component.origin, component.morphology.shape
-        models[component.source, y : y + n_y, x : x + n_x] += component.morphology
+        counts = max(component.spectrum.sum(), 1e-30)  # one without light keeps its morphology
+        models[component.source, y : y + n_y, x : x + n_x] += counts * component.morphology
     return sdr(scene.euclid.truth, models, unit_sum=True).tolist()
 
 

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -106,6 +107,21 @@ def test_scenes_are_made_brighter_with_their_truth_and_the_same_noise():
             np.testing.assert_allclose(new.contributions, factor * old.contributions)
             assert new.truth is old.truth
         assert evened(scene, mode).euclid.counts[0] == found.euclid.counts[0]  # by the seed
+
+
+def test_components_are_scored_by_their_counts():
+    """Of one source, with a right one of all light and a wrong one of a hundredth of it."""
+    from bench.harness.scenes import scores
+
+    truth, wrong = np.zeros((2, 1, 8, 8))
+    truth[0, 2, 3], wrong[0, 6, 5] = 1, 1
+    parts = [
+        SimpleNamespace(source=0, origin=(0, 0), morphology=image[0], spectrum=np.array(spectrum))
+        for image, spectrum in ((truth, [60.0, 40.0]), (wrong, [0.0, 1.0]))
+    ]
+    scene = SimpleNamespace(euclid=SimpleNamespace(truth=truth))
+    (found,) = scores(SimpleNamespace(components=parts), scene)
+    assert found == pytest.approx(10 * np.log10(101 / np.sqrt(2)))
 
 
 def test_values_with_errors_are_found_by_their_columns(monkeypatch):
