@@ -44,8 +44,8 @@ from .harness.options import BadOption, Parser, positive, run
 GALAXIES = ("parametric", "cosmos")
 EDGES = (3.0, 10.0, 30.0, 100.0, 300.0, np.inf)  # signal to noise
 # Scenes of each kind and mode. Of parametric galaxies so many that the standard error of a flux
-# bin's coverage is under 0.015: with 1500 of Euclid's, 650 of Rubin's and 550 of the others it was
-# 0.011 to 0.016. All take one to two hours on two cores.
+# bin's coverage is under 0.015: it is 0.010 to 0.014. All take 40 minutes to two hours on two
+# cores.
 N_SCENES = {
     "parametric": {
         "joint": 550,
