@@ -20,6 +20,9 @@ from .exposure import exposures_of
 from .modes import Solution
 from .normal import Layout, normal_matrix
 
+# Light is exchanged where a neighbour has more than RATIO of the source's own, and both more than
+# FAINT of a pixel's noise: less of it moves a fit by too little to be worth its unknowns.
+RATIO, FAINT = 0.05, 0.3
 # Changes of structure that the prior allows to move a flux or a second moment by less than this
 # many errors at fixed morphologies are left out. With 1, as for errors, the losses of simulated
 # scenes end 0.5 higher in the mean.
@@ -177,7 +180,7 @@ def exchange_of(fit, scene, state, findings):
         np.ones(n),
         fit.settings.prior,
     )
-    shared = [solution.shared(i) for i in range(n)]
+    shared = [solution.shared(i, faint=FAINT, ratio=RATIO) for i in range(n)]
     if not any(where.any() for where in shared):
         return None
     return Exchange(solution, shared, exposures_of(fit), fit_sky=fit.settings.fit_sky)
