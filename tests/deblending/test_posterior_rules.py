@@ -133,7 +133,7 @@ def test_light_of_a_neighbour_on_a_box():
 
 
 def test_light_is_exchanged_where_a_neighbour_has_a_part_of_it_and_both_are_seen():
-    """More than `ratio` of the source's own; both above `faint` of the noise; boxes that meet alone."""
+    """More than `ratio` of the source's own; both above `faint` [noise]; boxes that meet alone."""
     own = np.ones((1, 6))
     own[0, 5] = 0.02
     other = np.array([[0.04, 0.06, 0.5, 0.5, 0.5, 0.5]])

@@ -22,10 +22,10 @@ LEAST_CHANGE = 1.0
 # noise 1000 have none, and what the bound of morphologies at 0 adds there stays in their sizes, an
 # error or 0.2 %, and in their fluxes, half an error.
 FAINTEST = 1e-3
-# [noise] For errors light may be exchanged where two sources have more than this in a pixel, however
-# unlike: a faint galaxy's flux is as uncertain as the fine structure of the bright one that it lies
-# on. Where fits exchange light alone, see exchange.py, the coverage of fluxes of Euclid alone is
-# 0.02 lower below signal to noise 10 and above 300 (400 scenes, seeds from 60000 and 61000).
+# [noise] For errors light may be exchanged where two sources have more than this in a pixel: a
+# faint galaxy's flux is as uncertain as the fine structure of the bright one that it lies on. Only
+# where fits exchange light, see exchange.py, the coverage of fluxes of Euclid alone is 0.02 lower
+# below signal to noise 10 and above 300 (400 scenes, seeds from 60000 and 61000).
 FAINT = 0.05
 # The prior's scale next to STRUCTURE_PX is given the strength that the source's own data show,
 # under a weak hyperprior of WEIGHT pixels about STRENGTH, that of simulated parametric galaxies.
@@ -205,7 +205,7 @@ class Solution:
         return self.scene.origin, self.scene.origin + [p.shape for p in self.scene.profile]
 
     def shared(self, i, *, faint=FAINT, ratio=0.0):
-        """Where (ny, nx) i shares light: over faint [noise] both, over this ratio of i's the other."""
+        """Where (ny, nx) i shares light: both have over faint [noise], one over ratio of i's."""
         own = self._light(i, i)
         shared = np.zeros(own.shape, bool)
         for j in self._beside(i):
