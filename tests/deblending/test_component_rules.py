@@ -13,7 +13,7 @@ from clresample.sky.sources import Extended, Point
 
 
 def test_clear_gradients_have_odds_of_150_to_1():
-    asked = Asked(np.array([2, 5, 7]), np.array([4.99, 5.01, -np.inf]), [])
+    asked = Asked(np.array([2, 5, 7]), np.array([4.99, 5.01, -np.inf]), np.ones((3, 2)), [])
     assert asked.clear.tolist() == [5]
 
 
@@ -102,6 +102,7 @@ def test_evidence_is_asked_of_whitened_residuals(noise):
     flux = np.maximum(spectra[1], 1 / np.sqrt(power[1]))
     assert asked.evidence == pytest.approx(gain(core, precision, flux), rel=1e-10)
     assert asked.which.tolist() == [1] and (chi2 / light > 1) == (noise > 1)
+    np.testing.assert_allclose(asked.power, power[[2]])
     for rendered, bare in zip(observed, asked.observed, strict=True):
         np.testing.assert_array_equal(np.asarray(bare), np.asarray(rendered)[:2])
 
@@ -161,7 +162,7 @@ def test_each_scene_keeps_its_second_fit_where_that_is_better(monkeypatch):
     firsts = [fit(k, shifts=float(k)) for k in range(5)]
     again = {k: fit(10 + k, shifts=9.0) for k in (0, 1, 3, 4)}
     again[4].status = INTERRUPTED
-    monkeypatch.setattr(second, "_begun", lambda fits: again)
+    monkeypatch.setattr(second, "begun", lambda fits: again)
     monkeypatch.setattr(second, "iterate", lambda *given: None)
     monkeypatch.setattr(second, "_is_better", lambda new, old: new.name != 11)
     kept = second.with_second(firsts, None, None, None)

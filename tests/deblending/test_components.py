@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 
 from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.blend import INTERRUPTED, Blend
-from clresample.deblending.components import gradients, second
+from clresample.deblending.components import gradients, second, second_start
 from clresample.deblending.components.gradients import GRADIENT, _eliminated, gain
 from clresample.deblending.profiles import moment, profile
 from clresample.deblending.settings import Settings
@@ -116,29 +116,35 @@ def test_two_found_are_as_two_asked_for(two, device):
     assert result.losses[-1] == pytest.approx(told.losses[-1], abs=1)
 
 
-def test_a_second_fit_begins_with_what_the_first_one_leaves_of_the_others(two, device, monkeypatch):
-    """Structure that two components do not change is there from the first trial on."""
+@pytest.mark.parametrize(("which", "kept"), [(0, {2: 1}), (2, {0: 0, 2: 1})])
+def test_a_second_fit_begins_with_what_the_first_leaves(two, device, monkeypatch, which, kept):
+    """Structure that two components do not change is there from the first trial on; where a core
+    begins beside the first one, that one's too."""
     _, b, _ = two
-    pairs, again = [], second._again
+    pairs = []
 
-    def noted(fit, point):
-        pairs.append((fit, again(fit, point)))
-        return pairs[-1][1]
+    def asked(fits):
+        pairs.append(list(fits))
+        return gradients.ask(fits)
 
-    monkeypatch.setattr(second, "_again", noted)
+    def chosen(starts, fit_sky):
+        pairs.append(starts)
+        return starts[which]
+
+    monkeypatch.setattr(second_start, "ask", asked)
+    monkeypatch.setattr(second_start, "_best", chosen)
+    monkeypatch.setattr(second, "iterate", lambda *given: None)
     deblend(b.observations, b.sources, frame=b.frame, device=device)
-    (first, new), _ = pairs
-    begun = second._going_on(again(first, new.start).state, first, np.array([0]))
-    engine = LearnedEngine([new.scene], [begun], device, np.float32, LearnedPrior(), 1.0)
-    found = engine.states()[0]
-    np.testing.assert_allclose(found.morph[2], first.state.morph[1], atol=1e-5)
-    for morph, smooth in zip(found.morph[:2], new.scene.profile[:2], strict=True):
-        np.testing.assert_allclose(morph, smooth, atol=1e-5)
-    known = first.state.learned
-    for part, wanted in zip(found.learned.structure[2], known.structure[1], strict=True):
-        np.testing.assert_allclose(part, wanted, rtol=1e-5, atol=1e-6)
+    (first,), new = pairs[0], pairs[1][which]
+    engine = LearnedEngine([new.scene], [new.state], device, np.float32, LearnedPrior(), 1.0)
+    found, known = engine.states()[0], first.state.learned
+    for k, morph in enumerate(found.morph):
+        wanted = first.state.morph[kept[k]] if k in kept else new.scene.profile[k]
+        np.testing.assert_allclose(morph, wanted, atol=1e-5)
+    for k, i in kept.items():
+        for part, wanted in zip(found.learned.structure[k], known.structure[i], strict=True):
+            np.testing.assert_allclose(part, wanted, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(found.learned.strengths, known.strengths[[0, 0, 1]])
-    np.testing.assert_allclose(found.spectra[2], first.state.spectra[1], rtol=1e-5)
 
 
 def test_what_gains_nothing_is_not_kept(device, monkeypatch):
@@ -177,7 +183,7 @@ def test_a_second_fit_that_fails_leaves_the_first(device, monkeypatch):
     def fails(*args, **given):
         raise MemoryError("too large")
 
-    monkeypatch.setattr(second, "start", fails)
+    monkeypatch.setattr(second_start, "start", fails)
     result = deblend(b.observations, b.sources, frame=b.frame, device=device)
     assert result.converged and counts(result) == [1, 1]
     assert any("too large" in line for line in result.messages)

@@ -1,13 +1,16 @@
-"""A real blend, HST F814W with HSC grizy, from detection to residuals: what it must reach."""
+"""Real blends, HST F814W with HSC grizy from detection to residuals, and one of HSC's from its
+catalogue: what they must reach."""
 
 import numpy as np
 import pytest
 from helpers.checkout import ROOT
 
-from clresample import get_device
+from bench.real import hsc_blend
+from clresample import deblend, get_device, summary
 from clresample.cli.command import main
 from clresample.device.discovery import SIMULATED
 from clresample.files.results import read_result
+from clresample.sky.sources import Extended
 
 pytest.importorskip("sep")
 pytest.importorskip("matplotlib")
@@ -18,6 +21,9 @@ SHIFT_PX, HEADERS_PX = (-1.54, -1.54), (-0.592, -0.748)
 CHI2 = {"HST": 1.12, "HSC": 0.92}
 # what our own best settings, chosen by hand, reach for HST: the merger's core holds most of it
 HST_CHI2 = 0.905
+# [HSC px] scatter of given places, and chi2 in grizy of the HSC blend, where scarlet reaches 1.39
+# 1.47 1.16 1.19 1.13
+PLACE_PX, BLEND_CHI2 = 0.3, (1.25, 1.35, 1.12, 1.12, 1.12)
 
 
 @pytest.fixture(scope="module")
@@ -89,3 +95,17 @@ def test_shift_is_what_images_show(fitted):
 def test_it_writes_the_figure(fitted):
     _, folder = fitted
     assert (folder / "deblended.png").stat().st_size < 400_000
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_bright_blend_is_fitted_wherever_its_galaxies_are_said_to_be(data, seed):
+    """The brightest ones are spirals that need two components. Where smooth profiles of these are
+    all that the second fit begins with, it ends at 1.33 and 1.31 in g, and creeps."""
+    if any(word in get_device().name.lower() for word in SIMULATED):
+        pytest.skip(f"{get_device().name} takes minutes")
+    observation, sources = hsc_blend(data)
+    rng = np.random.default_rng(seed)
+    places = [np.array(s.position_px) + rng.normal(0, PLACE_PX, 2) for s in sources]
+    result = deblend([observation], [Extended(position_px=tuple(p)) for p in places])
+    assert result.status == "converged"
+    assert (np.array(list(summary(result)["chi2"].values())) <= BLEND_CHI2).all()

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clresample.deblending.components import second
+from clresample.deblending.components import second_start as second
 from clresample.deblending.components.gradients import Asked
 from clresample.deblending.profiles import Galaxy, Given, Star
 from clresample.deblending.rendered import Rendered
@@ -15,6 +15,9 @@ from clresample.deblending.solver.scene import Learned, State
 from clresample.deblending.start.seen import Seen
 from clresample.deblending.start.start import Patch, StartingPoint
 from clresample.deblending.view import WhitenedView
+from clresample.sky.frame import Frame
+from clresample.sky.grid import Grid
+from clresample.sky.psf import PSF
 from clresample.sky.sources import Extended, Point
 
 
@@ -37,7 +40,7 @@ def test_the_second_start_is_from_what_the_others_leave():
         views=views,
         frame="home",
     )
-    patch = second._alone(fit, Asked(np.array([1]), np.array([9.0]), observed))
+    patch = second._alone(fit, Asked(np.array([1]), np.array([9.0]), np.ones((1, 3)), observed))
     for view, own, images, part in zip(views, patch.views, observed, parts, strict=True):
         others = np.einsum("ic,icyx->cyx", spectra[[0, 2], part], np.asarray(images)[[0, 2]])
         np.testing.assert_allclose(own.data, view.data - others - sky[part, None, None])
@@ -68,7 +71,7 @@ def test_the_second_fit_takes_the_place_of_the_chosen_components():
 
 def test_a_second_fit_goes_on_where_the_first_has_ended():
     """Two components in place of one begin on their profiles, with its strengths; all else where it
-    was left."""
+    was left, also what has a core beside it."""
     rng, prior = np.random.default_rng(8), LearnedPrior(scales_px=(1.0, 2.0), strengths=(0.1, 0.2))
 
     def coefficients(shape):
@@ -81,74 +84,135 @@ def test_a_second_fit_goes_on_where_the_first_has_ended():
 
     shapes = (4, 5), (6, 7), (3, 3)
     known = Learned([coefficients(s) for s in shapes], rng.random((3, 2)), np.arange(3) == 1)
-    end, begin = state(shapes, known), state(((4, 5), (8, 9), (7, 5), (3, 3)))
+    end, chosen = state(shapes, known), np.array([1])
     first = SimpleNamespace(state=end, settings=SimpleNamespace(prior=prior))
-    found = second._going_on(begin, first, np.array([1]))
-    for k, i in ((0, 0), (3, 2)):
-        np.testing.assert_array_equal(found.morph[k], end.morph[i])
-        np.testing.assert_array_equal(found.spectra[k], end.spectra[i])
-        assert found.learned.structure[k] is known.structure[i]
-    for k in (1, 2):
-        assert found.morph[k] is begin.morph[k]
-        np.testing.assert_array_equal(found.spectra[k], begin.spectra[k])
-        assert not any(part.any() for part in found.learned.structure[k])
-    assert [part.shape for part in found.learned.structure[1]] == [(8, 9), (5, 5)]
-    np.testing.assert_array_equal(found.learned.strengths, known.strengths[[0, 1, 1, 2]])
-    assert found.learned.clear.tolist() == [False, True, True, False]
-    np.testing.assert_array_equal(found.sky, end.sky)
+    cases = (
+        (second._places, ((4, 5), (8, 9), (7, 5), (3, 3)), {0: 0, 3: 2}),
+        (second._cores, ((4, 5), (6, 7), (7, 5), (3, 3)), {0: 0, 1: 1, 3: 2}),
+    )
+    for places, boxes, kept in cases:
+        begin = state(boxes)
+        found = second._going_on(begin, first, *places(3, chosen))
+        for k, box in enumerate(boxes):
+            own = found.learned.structure[k]
+            if k in kept:
+                np.testing.assert_array_equal(found.morph[k], end.morph[kept[k]])
+                assert own is known.structure[kept[k]]
+                continue
+            assert found.morph[k] is begin.morph[k]
+            assert not any(part.any() for part in own)
+            for part, step in zip(own, prior.steps, strict=True):
+                assert part.shape == tuple(coarse(n, step) for n in box)
+        np.testing.assert_array_equal(found.learned.strengths, known.strengths[[0, 1, 1, 2]])
+        assert found.learned.clear.tolist() == [False, True, True, False]
 
 
-def test_misfits_are_chi2_of_all_observations(monkeypatch):
+def test_a_core_begins_beside_each_component_in_question():
+    """With half its area, its axes and its wings: nearly its square; all else stays."""
+    home = Frame(Grid.flat((40, 44), 0.1), PSF.gaussian(0.3, n_pixels=11))
+    shape, theta = Galaxy(home), np.array([1.2, 0.2, -0.1, 3.0])
+    position = np.array([[20.3, 21.6], [9.0, 9.0]])
+    drawn = shape.draw(theta, position[0])[0]
+    begin = StartingPoint(
+        source=np.array([1, 0]),
+        positions=position,
+        dark=np.zeros(2, bool),
+        shapes=["other", shape],
+        thetas=["its", theta],
+        places=position[::-1],
+        peaks=np.array([0.5, drawn.max()]),
+        spectra=np.array([[1.0, 2.0], [4.0, 5.0]]),
+        sky=np.zeros(2),
+        power=np.array([[1.0, 1.0], [2.0, 2.0]]),
+    )
+    asked = Asked(np.array([0, 1]), np.array([0.0, 9.0]), np.array([[7.0] * 2, [8.0] * 2]), [])
+    found = second._with_cores(SimpleNamespace(start=begin, frame=home), asked)
+    assert found.source.tolist() == [1, 0, 0] and found.shapes == ["other", shape, shape]
+    assert found.thetas[0] == "its" and found.thetas[1] is theta and theta[0] == 1.2
+    np.testing.assert_allclose(found.thetas[2], [1.2 - np.log(2) / 2, 0.2, -0.1, 3.0])
+    np.testing.assert_array_equal(found.places, position[[1, 0, 0]])
+    np.testing.assert_array_equal(found.spectra, begin.spectra[[0, 1, 1]])
+    assert found.power.tolist() == [[1] * 2, [2] * 2, [8] * 2] and begin.power.shape == (2, 2)
+    core = found.drawn(2, (0, 0), home.shape)
+    assert core.max() == pytest.approx(1)
+    assert abs(core - (drawn / drawn.max()) ** 2).max() < 0.06
+
+
+def test_of_three_starts_the_one_that_fits_best_is_taken(monkeypatch):
+    """chi2 of all observations, with the best spectra and sky, which it then begins with."""
     rng, views, observed = np.random.default_rng(5), [], []
-    spectra, sky, wanted = rng.random((2, 3)), rng.random(3), 0.0
+    spectra, sky = rng.random((2, 3)), rng.random(3)
     parts = slice(0, 1), slice(1, 3)
     for part in parts:
         images = rng.random((2, part.stop - part.start, 4, 5))
         observed.append(Rendered(images.shape, np.zeros((2, 2), int), images))
-        root, data = rng.random((2, *images.shape[1:]))
-        views.append(SimpleNamespace(root=root, data=data))
+        root, noise = rng.uniform(1, 2, (2, *images.shape[1:]))
         model = np.einsum("ic,icyx->cyx", spectra[:, part], images) + sky[part, None, None]
-        wanted += (root**2 * (data - model) ** 2).sum()
-    fit = SimpleNamespace(
-        views=views,
-        scene=SimpleNamespace(channels=lambda: parts),
-        settings=SimpleNamespace(fit_sky=True),
-    )
-    seen = Seen(spectra, sky, None, tuple(observed), ())
-    monkeypatch.setattr(second, "model_of", lambda one: one)
-    monkeypatch.setattr(second, "see", lambda models, fit_sky: [seen] * len(models))
-    assert second._misfits([fit, fit]) == pytest.approx([wanted, wanted])
+        views.append(SimpleNamespace(root=root, data=model + noise))
+
+    def fit(name):
+        channels = SimpleNamespace(channels=lambda: parts)
+        state = State([], [], np.zeros((2, 3)), np.zeros(3))
+        return SimpleNamespace(name=name, views=views, scene=channels, state=state)
+
+    def of(change):  # what is seen, with the sky off by so much
+        return Seen(spectra, sky + change, None, tuple(observed), ())
+
+    starts, skies = [fit(k) for k in range(3)], [0.5, 1.4, -1.0]
+    chi2 = [0.0] * 3
+    for k, change in enumerate(skies):
+        for view, part, rendered in zip(views, parts, observed, strict=True):
+            model = np.einsum("ic,icyx->cyx", spectra[:, part], np.asarray(rendered))
+            left = view.data - model - (sky + change)[part, None, None]
+            chi2[k] += (view.root**2 * left**2).sum()
+    monkeypatch.setattr(second, "model_of", lambda one: one.name)
+    monkeypatch.setattr(second, "see", lambda names, fit_sky: [of(skies[k]) for k in names])
+    best = second._best(starts, True)
+    assert best is starts[int(np.argmin(chi2))] and best.name == 1
+    np.testing.assert_array_equal(best.state.spectra, spectra)
+    np.testing.assert_array_equal(best.state.sky, sky + skies[1])
 
 
-def test_of_two_starts_the_one_that_fits_better_is_taken(monkeypatch):
-    """Of scenes with clear gradients alone; only one of them goes on from the first fit."""
+def test_scenes_with_clear_gradients_begin_anew(monkeypatch):
+    """They alone; each of its three starts from what it should be made of."""
 
     def clear(*which):
         return SimpleNamespace(clear=np.array(which, int))
 
     asked = [None, clear(1), clear(), clear(0, 2)]
     settings = SimpleNamespace(fit_sky=True)
-    fits = [SimpleNamespace(name=i, start=f"start {i}", settings=settings) for i in range(4)]
+    fits = [SimpleNamespace(name=i, start=[i] * 3, settings=settings) for i in range(4)]
     monkeypatch.setattr(second, "ask", lambda fits: asked)
     monkeypatch.setattr(second, "_alone", lambda fit, one: f"alone {fit.name}")
     monkeypatch.setattr(second, "_together", lambda fit, which: f"all {fit.name} {which.tolist()}")
     monkeypatch.setattr(second, "start", lambda patches, fit_sky=False: patches)
-    monkeypatch.setattr(second, "_joined", lambda begin, own, which: f"{own} in {begin}")
-    monkeypatch.setattr(second, "_as_before", lambda whole, begin, which: f"{whole} as {begin}")
+    monkeypatch.setattr(second, "_joined", lambda begin, own, which: f"{own} in {begin[0]}")
+    monkeypatch.setattr(second, "_as_before", lambda whole, begin, _: f"{whole} as {begin[0]}")
+    monkeypatch.setattr(second, "_with_cores", lambda fit, one: f"cores {one.clear.tolist()}")
     monkeypatch.setattr(
         second, "_again", lambda fit, point: SimpleNamespace(point=point, state="new")
     )
     monkeypatch.setattr(
-        second, "_going_on", lambda state, first, which: f"{state} from {first.name} {which}"
+        second,
+        "_going_on",
+        lambda state, first, before, new: (first.name, before.tolist(), new.tolist()),
     )
-    monkeypatch.setattr(second, "_misfits", lambda fits: [3.0, 2.0, 1.0, 4.0][: len(fits)])
-    again = second._begun(fits)
-    assert {i: (one.point, one.state) for i, one in again.items()} == {
-        1: ("all 1 [1] as start 1", "new"),
-        3: ("alone 3 in start 3", "new from 3 [0 2]"),
+    monkeypatch.setattr(second, "_best", lambda starts, fit_sky: starts)
+    begun = second.begun(fits)
+    assert {i: [(one.point, one.state) for one in three] for i, three in begun.items()} == {
+        1: [
+            ("alone 1 in 1", (1, [0, 1, 1, 2], [False, True, True, False])),
+            ("all 1 [1] as 1", "new"),
+            ("cores [1]", (1, [0, 1, 1, 2], [False, False, True, False])),
+        ],
+        3: [
+            ("alone 3 in 3", (3, [0, 0, 1, 2, 2], [True, True, False, True, True])),
+            ("all 3 [0, 2] as 3", "new"),
+            ("cores [0, 2]", (3, [0, 0, 1, 2, 2], [False, True, False, False, True])),
+        ],
     }
     asked[1] = asked[3] = None
-    assert second._begun(fits) == {}
+    assert second.begun(fits) == {}
 
 
 def test_the_other_start_takes_galaxies_over():

@@ -32,7 +32,7 @@ from clresample.deblending.start.slots import (
     peaks_of,
     thresholds,
 )
-from clresample.deblending.start.start import LIGHT_SIGMAS, _is_dark, _peak
+from clresample.deblending.start.start import LIGHT_SIGMAS, _is_dark, peak_of
 from clresample.sky.sources import Extended, Point
 
 BIG = (1000, 900)
@@ -225,9 +225,10 @@ def test_darkness_is_under_three_sigma_in_any_channel_and_in_all_together():
 def test_the_peak_of_a_profile_is_its_largest_pixel_on_the_frame(centre):
     home = frame()
     for shape, theta in ((Star(home, free=True), np.zeros(2)), (Galaxy(home), Galaxy(home).mean)):
-        one = Component(0, 0, 0, shape, np.array(centre), home.shape)
-        wanted = shape.draw(theta, np.array(centre))[0].max()
-        assert _peak(one, theta, np.array(centre)) == pytest.approx(wanted, rel=1e-4)
+        place = np.array(centre)
+        wanted = shape.draw(theta, place)[0].max()
+        found = peak_of(shape, theta, place, place, home.shape)
+        assert found == pytest.approx(wanted, rel=1e-4)
 
 
 def test_parameters_without_the_spectra_are_a_schur_complement():

@@ -18,7 +18,7 @@ from clresample.deblending.start.aim import _Windows
 from clresample.deblending.start.looking import looking_at
 from clresample.deblending.start.seen import WHOLE_PX, Model, see
 from clresample.deblending.start.slots import Component
-from clresample.deblending.start.start import PRECISION, TOLERANCE, _peak
+from clresample.deblending.start.start import PRECISION, TOLERANCE, peak_of
 from clresample.deblending.view import Home, whitened_view
 from clresample.sky.frame import Frame
 from clresample.sky.grid import Grid
@@ -86,7 +86,7 @@ def test_a_sharp_stars_peak_is_of_its_profile_and_not_of_its_slopes():
     star, place = Star(home, free=True), np.array([10.4, 11.4])
     drawn = star.draw(np.zeros(2), place)
     assert drawn[1:].max() > drawn[0].max()
-    found = _peak(Component(0, 0, 0, star, place, home.shape), np.zeros(2), place)
+    found = peak_of(star, np.zeros(2), place, place, home.shape)
     assert found == pytest.approx(drawn[0].max(), rel=0.01)
 
 

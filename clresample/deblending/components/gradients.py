@@ -41,11 +41,13 @@ class Asked:
     """What a finished Fit says of some of its components.
 
     which (k,): the components; evidence (k,): ln of the ratio of evidences for a gradient
+    power (k, C): sum u^2 of their cores' whitened images u
     observed: per view, Rendered (n, Co, My, Mx) of all n components' morphologies
     """
 
     which: np.ndarray
     evidence: np.ndarray
+    power: np.ndarray
     observed: list[Rendered]
 
     @property
@@ -115,7 +117,7 @@ def _asked(fit, which, seen):
     precision /= np.maximum(chi2 / np.maximum(light, 1e-30), 1)[:, None]
     error = 1 / np.sqrt(np.maximum(power[which], 1e-30))
     rows = zip(core, precision, np.maximum(spectra[which], error), strict=True)
-    return Asked(which, np.array([gain(*row) for row in rows]), bare)
+    return Asked(which, np.array([gain(*row) for row in rows]), power[n:], bare)
 
 
 def _eliminated(covariance, slope, power, k):

@@ -147,7 +147,8 @@ def _point(patch, looking, thetas, sources, b, dark):
     for k, (i, c) in enumerate(zip(at, chosen, strict=True)):
         own.append(thetas[i])
         positions[sources[i]] = c.shape.place(thetas[i], c.position)
-        peaks[k] = _peak(c, thetas[i], positions[sources[i]])
+        center = positions[sources[i]]
+        peaks[k] = peak_of(c.shape, thetas[i], c.position, center, c.frame)
     power = np.diagonal(looking.normal[b], axis1=1, axis2=2)[:, : len(at)].T
     return StartingPoint(
         source=sources[at],
@@ -163,14 +164,16 @@ def _point(patch, looking, thetas, sources, b, dark):
     )
 
 
-def _peak(component, theta, center):
-    """The largest pixel of a component's profile in its frame, which lies near its centre."""
-    if isinstance(component.shape, Given):
-        return component.shape.peak
-    middle, top = np.floor(center + 0.5).astype(int), np.array(component.frame)
+def peak_of(shape, theta, place, center, frame):
+    """The largest pixel of a Shape's profile of unit integral in its frame.
+
+    place, center (2,) [px]: where it is drawn, and near which that pixel lies; frame (2,) [px]
+    """
+    if isinstance(shape, Given):
+        return shape.peak
+    middle, top = np.floor(center + 0.5).astype(int), np.array(frame)
     low, high = np.maximum(middle - 2, 0), np.minimum(middle + 3, top)
-    cut = component.shape.cut(theta, component.position, low, high - low, slopes=False)
-    return float(cut.max())
+    return float(shape.cut(theta, place, low, high - low, slopes=False).max())
 
 
 def _components(patches):
