@@ -133,11 +133,11 @@ def test_a_given_profile_reaches_to_its_faintest_pixel_above_the_threshold():
 
 
 def test_what_is_expected_of_galaxies():
-    """0.25" on pixels of 0.1", components of a source a factor e apart, round, with wings of 5."""
+    """0.25" on pixels of 0.1", components of a source a factor e apart, round, wings of 6.5."""
     one = Galaxy(frame())
-    np.testing.assert_allclose(one.mean, [np.log(2.5), 0, 0, np.log(5)])
-    assert ELLIPTICITY_SCATTER == 0.26 and COMPONENT_SPREAD == 1
-    np.testing.assert_allclose(one.scatter, [0.4, 0.26, 0.26, 0.7])
+    np.testing.assert_allclose(one.mean, [np.log(2.5), 0, 0, np.log(6.5)])
+    assert ELLIPTICITY_SCATTER == 0.17 and COMPONENT_SPREAD == 1
+    np.testing.assert_allclose(one.scatter, [0.4, 0.17, 0.17, 0.7])
     free = Star(frame(), free=True)  # half a pixel about its place
     assert free.mean.tolist() == [0, 0] and free.scatter.tolist() == [0.5, 0.5]
     wide = Galaxy(frame(), 1, 2, widened=6.0)
