@@ -128,8 +128,8 @@ def test_a_second_fit_begins_with_what_the_first_leaves(two, device, monkeypatch
         return gradients.ask(fits)
 
     def chosen(starts, fit_sky):
-        pairs.append(starts)
-        return starts[which]
+        pairs.append(starts[0])
+        return [starts[0][which]]
 
     monkeypatch.setattr(second_start, "ask", asked)
     monkeypatch.setattr(second_start, "_best", chosen)

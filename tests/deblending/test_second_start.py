@@ -139,7 +139,7 @@ def test_a_core_begins_beside_each_component_in_question():
 
 
 def test_of_three_starts_the_one_that_fits_best_is_taken(monkeypatch):
-    """chi2 of all observations, with the best spectra and sky, which it then begins with."""
+    """Of each scene; chi2 of all observations, with the best spectra and sky, kept from then on."""
     rng, views, observed = np.random.default_rng(5), [], []
     spectra, sky = rng.random((2, 3)), rng.random(3)
     parts = slice(0, 1), slice(1, 3)
@@ -167,8 +167,9 @@ def test_of_three_starts_the_one_that_fits_best_is_taken(monkeypatch):
             chi2[k] += (view.root**2 * left**2).sum()
     monkeypatch.setattr(second, "model_of", lambda one: one.name)
     monkeypatch.setattr(second, "see", lambda names, fit_sky: [of(skies[k]) for k in names])
-    best = second._best(starts, True)
-    assert best is starts[int(np.argmin(chi2))] and best.name == 1
+    others = [fit(k) for k in (2, 0, 1)]  # another scene's
+    best, other = second._best([starts, others], True)
+    assert best is starts[int(np.argmin(chi2))] and best.name == 1 and other is others[2]
     np.testing.assert_array_equal(best.state.spectra, spectra)
     np.testing.assert_array_equal(best.state.sky, sky + skies[1])
 

@@ -44,29 +44,29 @@ def begun(fits):
     patches = [_together(fits[i], one.clear) for i, one in asked.items()]
     together = start(patches, fit_sky=fit_sky)
     starts = []
-    for (i, one), own, whole in zip(asked.items(), alone, together, strict=True):
+    for (i, one), own, all_smooth in zip(asked.items(), alone, together, strict=True):
         first = fits[i]
         known = _again(first, _joined(first.start, own, one.clear))
         known.state = _going_on(known.state, first, *_places(len(first.start), one.clear))
+        whole = _again(first, _as_before(all_smooth, first.start, one.clear))
         beside = _again(first, _with_cores(first, one))
         beside.state = _going_on(beside.state, first, *_cores(len(first.start), one.clear))
-        whole = _again(first, _as_before(whole, first.start, one.clear))
         starts.append((known, whole, beside))
-    return {i: _best(three, fit_sky) for i, three in zip(asked, starts, strict=True)}
+    return dict(zip(asked, _best(starts, fit_sky), strict=True))
 
 
 def _best(starts, fit_sky):
-    """The one of a scene's Fits at their starts that has the least chi2, with spectra and sky that
-    are the best there."""
-    chi2, images = [], see([model_of(fit) for fit in starts], fit_sky=fit_sky)
-    for fit, seen in zip(starts, images, strict=True):
+    """Of each scene's Fits at their starts, as many for all, the one that has the least chi2, with
+    spectra and sky that are the best there."""
+    fits = [fit for of_scene in starts for fit in of_scene]
+    images, chi2 = see([model_of(fit) for fit in fits], fit_sky=fit_sky), []
+    for fit, seen in zip(fits, images, strict=True):
         residuals = seen.residuals(fit.scene.channels(), fit.views)
         pairs = zip(fit.views, residuals, strict=True)
         chi2.append(sum(((view.root * left) ** 2).sum() for view, left in pairs))
-    best = int(np.argmin(chi2))
-    fit, seen = starts[best], images[best]
-    fit.state = replace(fit.state, spectra=seen.spectra, sky=seen.sky)
-    return fit
+        fit.state = replace(fit.state, spectra=seen.spectra, sky=seen.sky)
+    best = np.reshape(chi2, (len(starts), -1)).argmin(axis=1)
+    return [of_scene[k] for of_scene, k in zip(starts, best, strict=True)]
 
 
 def _again(fit, point):

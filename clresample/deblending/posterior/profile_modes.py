@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...sky.extent import box_slices
-from ..profiles import Galaxy, Star
+from ..profiles import SIZE_SCATTER, Galaxy, Star
 
 # How galaxies scatter in ln sigma, g1, g2 (Leauthaud et al. 2007) and ln beta, in errors. Fits
 # expect less, which makes better models of faint ones; by what they expect 0.015 fewer of Euclid's
 # fluxes of signal to noise 10 to 30 would be within their errors, and 0.02 fewer of its sizes.
-SCATTER = np.array([0.4, 0.26, 0.26, 0.9])
+SCATTER = np.array([SIZE_SCATTER, 0.26, 0.26, 0.9])
 # [px] scatter of a catalogue's position. 0.5 makes the errors of faint sources' positions half as
 # large again as their scatter.
 POSITION_PX = 0.1
