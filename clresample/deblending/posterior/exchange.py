@@ -4,6 +4,12 @@ L-BFGS knows the curvature of each source by itself. Light that a source may as 
 neighbours lowers the loss by little in each iteration, and moves fluxes by more than their errors
 in the end. Along the smooth changes of which errors are made (bumps.py) the curvature of all
 sources together is one normal matrix, which says where the minimum lies, and how far below.
+
+The matrix does not know that morphologies are held at 0: many pixels of wings lie right at that
+bound, and a step that lifts them raises the loss along a kink. So three in four of the full steps
+are refused on simulated scenes (133 of 180 in 120 scenes), nearly all in a bright blend of HSC, and
+a shortened one gains: without any, a fit of HST and HSC to a merger was 50 higher in its loss after
+500 iterations than with them after 250.
 """
 
 from __future__ import annotations
