@@ -161,6 +161,8 @@ class Galaxy(Shape):
 
     frame: the model's Frame; i_component of n_components: of its source, from compact to wide
     widened: how much larger than usual it is expected to be
+
+    whole: whether it is all of its source
     """
 
     def __init__(self, frame, i_component=0, n_components=1, *, widened=1.0):
@@ -168,6 +170,7 @@ class Galaxy(Shape):
         spread = COMPONENT_SPREAD * (i_component - (n_components - 1) / 2)
         size = np.log(SIZE_ARCSEC / scale_arcsec) + spread + np.log(widened)
         self.shape, self.psf_moment = frame.shape, moment(frame.psf)
+        self.whole = n_components == 1
         self.mean = np.array([size, 0, 0, np.log(WINGS)])
         self.scatter = np.array([SIZE_SCATTER, *[ELLIPTICITY_SCATTER] * 2, WINGS_SCATTER])
 

@@ -49,7 +49,7 @@ def test_slopes_of_chi2(device, monkeypatch):
     fit.begin()
     used = np.arange(4) < fit.counts[:, None]
     scatter = 0.1 * np.random.default_rng(0).normal(size=fit.theta.shape) * used
-    fit.theta = fit.mean + scatter
+    fit.theta = fit.population.mean + scatter
     every = np.arange(1)
 
     def chi2(theta):

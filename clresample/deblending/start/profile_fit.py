@@ -7,6 +7,7 @@ import numpy as np
 from ..spectra import MODEL_ERROR
 from .equations import N_PARAMETERS, equations
 from .looking import Looking
+from .population import Population
 from .slots import peaks_of
 
 # Longest step of a parameter: far from the minimum the quadratic model of chi2 promises too much.
@@ -26,6 +27,7 @@ class ProfileFit:
 
     looking: Looking; noise (B, C): of a model pixel
 
+    population: what is expected of the parameters
     theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs
     brightness (N,): of the components, see `thresholds`
     """
@@ -36,10 +38,8 @@ class ProfileFit:
         self.counts = np.array([len(shape.mean) for shape in shapes])
         self.at = looking.scene, looking.index
         size = looking.n_scenes, looking.n_most, N_PARAMETERS
-        self.mean, self.scatter = np.zeros(size), np.ones(size)
-        for b, i, shape, n in zip(*self.at, shapes, self.counts, strict=True):
-            self.mean[b, i, :n], self.scatter[b, i, :n] = shape.mean, shape.scatter
-        self.theta, self.chi2 = self.mean.copy(), np.full(len(self.mean), np.inf)
+        self.population = Population(shapes, *self.at, *size)
+        self.theta, self.chi2 = self.population.mean.copy(), np.full(size[0], np.inf)
         self.brightness = np.zeros(len(shapes))
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = np.zeros((*self.right.shape, self.right.shape[1]))
@@ -76,6 +76,7 @@ class ProfileFit:
             enough = gained & (gain < ENOUGH * self.chi2[scenes])
             live[scenes] = ~enough & (damping[scenes] <= MOST_DAMPING)
             self.theta[scenes[gained]] = trial[scenes[gained]]
+            self._learn(scenes[gained])
             self._measure_brightness(self.theta)
             further = scenes[gained & live[scenes]]
             if len(further) and i_step < N_STEPS - 1:
@@ -107,17 +108,22 @@ class ProfileFit:
         self.looking.look(scenes, self.thetas(theta), self.brightness, slopes=slopes)
 
     def _chi2(self, scenes, theta):
-        """With the prior (k,)."""
-        pull = ((theta - self.mean) / self.scatter)[scenes]
-        return self.looking.compare(MODEL_ERROR) + (pull**2).sum(axis=(1, 2))
+        """With what is expected (k,)."""
+        return self.looking.compare(MODEL_ERROR) + self.population.pull(scenes, theta)
+
+    def _learn(self, scenes):
+        """Learn what to expect of some scenes from the present parameters."""
+        before = self.population.pull(scenes, self.theta)
+        self.population.learn(scenes, self.theta, self.normal)
+        self.chi2[scenes] += self.population.pull(scenes, self.theta) - before
 
     def _take_equations(self, scenes):
-        """Note the normal equations of some scenes, the prior among them."""
+        """Note the normal equations of some scenes, what is expected among them."""
         normal, right = equations(self.looking)
-        scatter, size = self.scatter[scenes].reshape(len(scenes), -1), right.shape[1]
-        pull = (self.mean - self.theta)[scenes].reshape(len(scenes), -1) / scatter
-        self.normal[scenes] = normal + (scatter**-2.0)[..., None] * np.eye(size)
-        self.right[scenes] = right + pull / scatter
+        mean, scatter = self.population.mean[scenes], self.population.scatter[scenes]
+        weight = scatter.reshape(len(scenes), -1) ** -2.0
+        self.normal[scenes] = normal + weight[..., None] * np.eye(right.shape[1])
+        self.right[scenes] = right + weight * (mean - self.theta[scenes]).reshape(weight.shape)
 
     def _measure_brightness(self, theta):
         """Note the components' peaks over the noise of a model pixel, where they are best seen."""
