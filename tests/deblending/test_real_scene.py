@@ -97,10 +97,10 @@ def test_it_writes_the_figure(fitted):
     assert (folder / "deblended.png").stat().st_size < 400_000
 
 
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_bright_blend_is_fitted_wherever_its_galaxies_are_said_to_be(data, seed):
     """The brightest ones are spirals that need two components. Where smooth profiles of these are
-    all that the second fit begins with, it ends at 1.33 and 1.31 in g, and creeps."""
+    all that the second fit begins with, it ends at 1.29 in g, and creeps."""
     if any(word in get_device().name.lower() for word in SIMULATED):
         pytest.skip(f"{get_device().name} takes minutes")
     observation, sources = hsc_blend(data)
