@@ -22,12 +22,13 @@ from ..sky.sources import Extended, Point
 
 # OTFs of model PSFs that are kept: the stars of one frame share one, of 1 MB at 256 pixels.
 N_OTFS = 8
-# What is expected of a galaxy before its images are looked at: Gaussian sigma 0.25" (half-light
-# radius 0.3") with a scatter of 0.4 in its logarithm, as in deep fields; round, with a scatter of
-# 0.17 per component; wings between exponential and Gaussian, nearer to this. Galaxies are less
-# round, 0.26 (Leauthaud et al. 2007), but under their own scatter and wings of 5 models of faint
-# ones follow the noise: median SDRs of simulated COSMOS galaxies, 0.22" wide or more, are 0.1 to
-# 0.3 dB lower in Euclid's or Rubin's images alone, and as high without that smoothing.
+# What is expected of a galaxy before its images are looked at (start/population.py learns more of
+# it from a scene's other galaxies): Gaussian sigma 0.25" (half-light radius 0.3") with a scatter of
+# 0.4 in its logarithm, as in deep fields; round, with a scatter of 0.17 per component; wings
+# between exponential and Gaussian, nearer to this. Galaxies are less round, 0.26 (Leauthaud et al.
+# 2007), but under their own scatter and wings of 5 models of faint ones follow the noise: median
+# SDRs of simulated COSMOS galaxies, 0.22" wide or more, are 0.1 to 0.3 dB lower in Euclid's or
+# Rubin's images alone, and as high without that smoothing.
 SIZE_ARCSEC, SIZE_SCATTER = 0.25, 0.4
 ELLIPTICITY_SCATTER = 0.17
 WINGS, WINGS_SCATTER = 6.5, 0.7
