@@ -26,7 +26,7 @@ def test_scenes_learn_what_their_galaxies_have_in_common():
     data = theta + noise * rng.normal(size=theta.shape)
     common, own = np.zeros_like(true), np.tile(OWN, (n_scenes, 1))
     scatter = np.broadcast_to(np.hypot(COMMON, OWN), theta.shape)
-    known = np.ones((n_scenes, n, 1), bool)
+    known = np.ones((n_scenes, n), bool)
     for _ in range(15):
         common, own, scatter = learned(
             *shrunk(data, noise, common[:, None], scatter), known, common, own
@@ -46,7 +46,7 @@ def test_scenes_learn_what_their_galaxies_have_in_common():
 
 def test_a_galaxy_unlike_the_others_counts_for_little():
     """Three times as large as five others, it moves what is expected of these by 3 % of that."""
-    off, known = np.zeros((1, 7, 2)), np.ones((1, 7, 1), bool)
+    off, known = np.zeros((1, 7, 2)), np.ones((1, 7), bool)
     off[0, 0], off[0, 6], known[0, 6] = np.log(3), 5.0, False  # the last one is no galaxy
     common, own = np.zeros((1, 2)), OWN[None].copy()
     for _ in range(10):

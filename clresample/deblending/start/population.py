@@ -65,15 +65,16 @@ class Population:
         """
         scenes = scenes[self._several[scenes]]
         n, p = theta.shape[1:]
-        own = normal[scenes].reshape(-1, n, p, n, p)[:, np.arange(n), :, np.arange(n)]
-        variance = np.diagonal(np.linalg.inv(own), axis1=2, axis2=3).swapaxes(0, 1)
+        each = normal[scenes].reshape(-1, n, p, n, p)[:, np.arange(n), :, np.arange(n)]
+        variance = np.diagonal(np.linalg.inv(each), axis1=2, axis2=3).swapaxes(0, 1)
         off, known = theta[scenes][..., LEARNED] - self._before[scenes], self._known[scenes]
-        given = known[..., None], self._common[scenes], self._own[scenes]
-        common, own, scatter = learned(off, variance[..., LEARNED], *given)
-        self._common[scenes], self._own[scenes] = common, own
+        self._common[scenes], self._own[scenes], scatter = learned(
+            off, variance[..., LEARNED], known, self._common[scenes], self._own[scenes]
+        )
         k, i = np.nonzero(known)
-        at = scenes[k, None], i[:, None], LEARNED
-        self.mean[at] = self._before[scenes[k], i] + common[k]
+        b = scenes[k]
+        at = b[:, None], i[:, None], LEARNED
+        self.mean[at] = self._before[b, i] + self._common[b]
         self.scatter[at] = scatter[k, i]
 
 
@@ -82,9 +83,9 @@ def learned(off, variance, known, common, own):
 
     off, variance (k, n, 2): theta - mean, and how well each galaxy's is known, what was expected of
         it included, neighbours as they are
-    known (k, n, 1): which of them are galaxies; common, own (k, 2): the present c and s
+    known (k, n): which of them are galaxies; common, own (k, 2): the present c and s
     """
-    away = (off - common[:, None]) ** 2 + variance
+    known, away = known[..., None], (off - common[:, None]) ** 2 + variance
     weight = (FREEDOM + 1) / (FREEDOM + away / own[:, None] ** 2)
     counted = weight * known
     common = (counted * off).sum(1) / (counted.sum(1) + (own / COMMON) ** 2)

@@ -76,10 +76,10 @@ class ProfileFit:
             enough = gained & (gain < ENOUGH * self.chi2[scenes])
             live[scenes] = ~enough & (damping[scenes] <= MOST_DAMPING)
             self.theta[scenes[gained]] = trial[scenes[gained]]
-            self._learn(scenes[gained])
             self._measure_brightness(self.theta)
             further = scenes[gained & live[scenes]]
             if len(further) and i_step < N_STEPS - 1:
+                self._learn(further)
                 self._look(further, self.theta, slopes=True)
                 self.looking.compare(MODEL_ERROR)
                 self._take_equations(further)
