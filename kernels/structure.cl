@@ -159,11 +159,12 @@ __kernel void spread(__global const int *restrict active, __global const int *re
 /* sum_i VALUE over i < n by all work-items of a group, each of which gets it. */
 #define SUM_OVER(total, n, VALUE) \
     REAL part[8] = {0, 0, 0, 0, 0, 0, 0, 0}; \
-    for (int i0 = 8 * lid; i0 < (n); i0 += 8 * WG) \
+    for (int i0 = 8 * lid; i0 + 8 <= (n); i0 += 8 * WG) \
         for (int l = 0; l < 8; ++l) { \
             const int i = i0 + l; \
-            if (i < (n)) part[l] += VALUE; \
+            part[l] += VALUE; \
         } \
+    for (int i = (n) / 8 * 8 + lid; i < (n); i += WG) part[0] += VALUE; \
     const REAL total = group_sum(SUM8(part), lid, share);
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
