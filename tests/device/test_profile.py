@@ -81,22 +81,30 @@ def test_products_of_folded_images_are_counted(profiled, spread):
 
 
 def test_seconds_are_those_of_the_device(profiled):
-    """Ten times the work takes longer, and all of it no longer than the clock on the wall."""
+    """Ten times the work takes longer, and all of it no longer than the clock on the wall. Of each
+    the quickest of several runs counts: other processes may hold the cores in any of them."""
     from time import perf_counter
 
     if "llvmpipe" in profiled.name:
         pytest.skip("llvmpipe says 1 ns of every kernel")
-    began = perf_counter()
-    seconds = []
+    began, least = perf_counter(), []
+
+    def total():
+        profiled.finish()
+        return sum(row.seconds for row in profiled.profile.rows().values())
+
     for n in (60, 600):
         op = Resampler(
             Grid.flat((n, n), 0.1), PSF.gaussian(0.8), Grid.flat((n // 2, n // 2), 0.2),
             PSF.gaussian(1.5), device=profiled,
         )  # fmt: skip
-        op(np.ones((n, n)))
-        profiled.finish()
-        seconds.append(sum(r.seconds for r in profiled.profile.rows().values()))
-    assert 2 * seconds[0] < seconds[1] < perf_counter() - began
+        seconds = []
+        for _ in range(7):
+            before = total()
+            op(np.ones((n, n)))
+            seconds.append(total() - before)
+        least.append(min(seconds))
+    assert 2 * least[0] < least[1] and 0 < total() < perf_counter() - began
 
 
 def test_without_being_asked_nothing_is_timed(device, monkeypatch):
