@@ -15,6 +15,7 @@ import threading
 import time
 import traceback
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from multiprocessing import connection
 
@@ -32,6 +33,10 @@ FIRST = 4
 SHARE = 0.5
 # [s] An interrupted process has so long to hand in what it has.
 PATIENCE_S = 60.0
+
+
+# Threads of the host at most: what they share, memory and Python itself, feeds no more.
+MOST_THREADS = 8
 
 
 class _Alone:
@@ -61,6 +66,25 @@ def one_blas_thread():
             _Alone.n_callers -= 1
             if not _Alone.n_callers:
                 _Alone.limits.restore_original_limits()
+
+
+def host_threads(device):
+    """Threads that the host may use beside a device: on a CPU as many as that has compute units, so
+    that a process that was given some of the cores stays on them; else one a core."""
+    if device.kind == "CPU":
+        return min(device.compute_units, MOST_THREADS)
+    cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else [0]
+    return min(len(cores), MOST_THREADS)
+
+
+def in_threads(n_threads, function, items):
+    """[function(item), ...] of items, in their order, so many at a time. For calls that spend their
+    time in large products of NumPy's, for which other threads need not wait."""
+    items = list(items)
+    if min(n_threads, len(items)) < 2:
+        return [function(item) for item in items]
+    with ThreadPoolExecutor(min(n_threads, len(items))) as pool:
+        return list(pool.map(function, items))
 
 
 def ahead(items):

@@ -45,13 +45,19 @@ def test_few_modes_at_a_time_are_seen_as_all_at_once(monkeypatch):
         np.testing.assert_allclose(other, found[0], atol=1e-5)
 
 
-def test_exposures_are_those_of_views_as_they_are(monkeypatch):
-    """Of each observation with its own view; sources and shifts may be others at any time."""
+@pytest.mark.parametrize(("n_pixels", "n_threads"), [(25_000, 1), (25_001, 7)])
+def test_exposures_are_those_of_views_as_they_are(n_pixels, n_threads, monkeypatch):
+    """Of each observation with its own view; sources and shifts may be others at any time. Large
+    scenes take the threads that go with their device."""
+    monkeypatch.setattr(module, "host_threads", {"device": 7}.get)
     monkeypatch.setattr(module.Exposure, "of", lambda *given: given)
     blend, start = SimpleNamespace(observations=(1, 2)), SimpleNamespace(source=np.array([0, 2]))
-    fit = SimpleNamespace(views=("a", "b"), blend=blend, start=start, frame="frame")
+    views = [SimpleNamespace(op=SimpleNamespace(device="device")) for _ in "ab"]
+    scene = SimpleNamespace(profile=[np.ones((2, n_pixels // 2)), np.ones(n_pixels)])
+    fit = SimpleNamespace(views=views, blend=blend, start=start, frame="frame", scene=scene)
     found = module.exposures_of(fit)
-    assert found == [("a", "frame", 1, start.source), ("b", "frame", 2, start.source)]
+    given = start.source, n_threads
+    assert found == [(views[0], "frame", 1, *given), (views[1], "frame", 2, *given)]
 
 
 def seen_as(monkeypatch, view, pixel):
@@ -145,7 +151,7 @@ def test_errors_at_fixed_morphologies_are_those_of_the_normal_matrix(monkeypatch
     covariance = np.array([[[1e-8, 5.0], [5.0, 4.0]], [[0.0, 0], [0, -1e-20]]])
     spectra = np.array([[3.0, 3.0], [1e6, 0.0]])
     start = SimpleNamespace(source=np.array([0, 1]), shapes=0, thetas=0, positions=np.eye(2))
-    scene = SimpleNamespace(channels=lambda: [])
+    scene = SimpleNamespace(channels=lambda: [], profile=[])
     fit = SimpleNamespace(
         settings=Settings(), scene=scene, findings=1, views=[], start=start, frame=None
     )

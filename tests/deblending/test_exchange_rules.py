@@ -21,6 +21,8 @@ STAR = 1
 class Shown:
     """An exposure that shows the frame itself, under weights root^2."""
 
+    n_threads = 1
+
     def __init__(self, root):
         self.root = root
 

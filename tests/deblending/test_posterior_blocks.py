@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from clresample.deblending.posterior import normal
 from clresample.deblending.posterior.blocks import RIDGE, Blocks, Factor
 from clresample.deblending.posterior.normal import _Sum
 
@@ -113,7 +114,7 @@ def test_memory_follows_the_number_of_sources():
     assert held[1] < 0.15 * whole
 
 
-def test_neighbours_are_those_whose_rows_meet():
+def test_neighbours_are_those_whose_rows_meet(monkeypatch):
     """Low in x and high in y as well; and those that see nothing are none."""
     windows = [((30, 2), (50, 20)), ((40, 4), (60, 22)), ((60, 0), (70, 9)), ((45, 3), (45, 9))]
     pairs = []
@@ -122,10 +123,11 @@ def test_neighbours_are_those_whose_rows_meet():
         def _seen(self, i, images, spectrum, origin, low, high):
             return SimpleNamespace(i=i, low=low, high=high)
 
-        def _add(self, one, other):
+        def _add(self, one, other, *_):
             pairs.append((one.i, other.i))
 
-    exposure = SimpleNamespace(window=lambda at, _: np.array(windows[at]))
+    monkeypatch.setattr(normal, "_products", lambda one, other: ())
+    exposure = SimpleNamespace(window=lambda at, _: np.array(windows[at]), n_threads=1)
     layout = SimpleNamespace(shift=lambda _: None, n_sky=0)
     images, spectra = [np.zeros((1, 2, 2))] * 4, np.ones((4, 1))
     Watched(None, layout, exposure, 0, slice(0, 1)).run(range(4), images, spectra)

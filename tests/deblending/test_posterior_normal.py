@@ -19,7 +19,8 @@ class Plain:
     """An exposure that shows the frame itself, in channels of other weights; of components from
     `dark` on no pixel."""
 
-    def __init__(self, n_channels, seed, dark=3):
+    def __init__(self, n_channels, seed, dark=3, n_threads=1):
+        self.n_threads = n_threads
         self.root = np.random.default_rng(seed).uniform(0.5, 2, (n_channels, *SHAPE))
         self.dark = dark
 
@@ -79,7 +80,8 @@ def dense(scene, exposures, images, spectra, layout):
 @pytest.mark.parametrize("n_shifts", [0, 2])
 @pytest.mark.parametrize("bright", [1.0, 3e3])
 def test_the_normal_matrix_is_that_of_whole_frames(n_sky, n_shifts, bright):
-    """Of modes, spectra, sky levels and a shift; sums of bright sources are float64's."""
+    """Of modes, spectra, sky levels and a shift; sums of bright sources are float64's. With several
+    threads it is the same bit by bit."""
     rng = np.random.default_rng(1)
     counts = np.array([3, 1, 0, 2, 2])
     images = [
@@ -93,6 +95,10 @@ def test_the_normal_matrix_is_that_of_whole_frames(n_sky, n_shifts, bright):
     spectra = bright * rng.uniform(1, 2, (5, 3))
     layout = Layout(counts, 3, n_sky=n_sky, n_shifts=n_shifts)
     found = normal_matrix(scene, exposures, images, spectra, layout).dense()
+    threaded = [Plain(2, 2, n_threads=3), Plain(1, 3, n_threads=3)]
+    np.testing.assert_array_equal(
+        normal_matrix(scene, threaded, images, spectra, layout).dense(), found
+    )
     wanted = dense(scene, exposures, images, spectra, layout)
     size = np.sqrt(np.diag(wanted) + 1e-9)
     np.testing.assert_allclose(

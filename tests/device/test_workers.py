@@ -2,6 +2,7 @@
 
 import os
 import threading
+from types import SimpleNamespace
 
 import pytest
 from helpers.portions import fails_on_seven, first_dies, slow, squares
@@ -9,8 +10,9 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from clresample import Blend, DeviceError, deblend, deblend_many
 from clresample.deblending import batch
+from clresample.device import workers
 from clresample.device.remembered import DeviceWarning
-from clresample.device.workers import _Table, ahead, deal, one_blas_thread
+from clresample.device.workers import _Table, ahead, deal, in_threads, one_blas_thread
 
 
 def blas_threads():
@@ -148,6 +150,35 @@ def test_ahead_raises_what_was_raised_in_its_turn():
     assert next(given) == 1
     with pytest.raises(ValueError, match="two is missing"):
         next(given)
+
+
+@pytest.mark.parametrize("n_threads", [1, 3])
+def test_threads_give_what_each_item_gives_in_order(n_threads):
+    """As many at a time as there may be; what one raises is raised."""
+    going, most, all_in = [], [], threading.Barrier(n_threads, timeout=10)
+
+    def square(i):
+        going.append(i)
+        most.append(len(going))
+        all_in.wait()
+        going.remove(i)
+        return i * i
+
+    found = in_threads(n_threads, square, range(2 * n_threads))
+    assert found == [i * i for i in range(2 * n_threads)]
+    assert max(most) == n_threads and in_threads(n_threads, square, []) == []
+    with pytest.raises(ZeroDivisionError):
+        in_threads(n_threads, lambda i: 1 / i, [1, 0, 2])
+
+
+def test_the_host_has_as_many_threads_as_its_processor_may_use(monkeypatch):
+    """Those of a CPU that is the device; beside another one all cores that the process may use."""
+    cpu = SimpleNamespace(kind="CPU", compute_units=3)
+    gpu = SimpleNamespace(kind="GPU", compute_units=100)
+    monkeypatch.setattr(workers.os, "sched_getaffinity", lambda _: set(range(5)), raising=False)
+    assert workers.host_threads(cpu) == 3 and workers.host_threads(gpu) == 5
+    cpu.compute_units = 64
+    assert workers.host_threads(cpu) == workers.MOST_THREADS
 
 
 def test_ahead_ends_its_thread_when_it_is_closed():

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ...device.workers import host_threads, in_threads
 from ...resampling.plan import FAINT
 from ...resampling.transfer import transfer_function
 from ...sky.extent import lit_part
@@ -42,6 +43,9 @@ PERIOD_PX = 8
 BAND_PERIOD_PX = 65
 # Transfers that are kept, of 0.3 to 1 MB: those of all observations of a field's tile and more.
 MOST_TRANSFERS = 32
+# [px] Of all boxes together, from which on a scene's errors take several threads of the host: of
+# smaller ones each product takes less time than handing it over.
+LARGE_PX = 50_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +56,7 @@ class Exposure:
     root (C, My, Mx): square root of the weights
     reach_px [model px]: see REACH_FWHM; transfer: its Transfer
     shares (n, C, T): of its terms in the PSF of each component, None where it has one
+    n_threads: of the host, for what is observed of it and its products
     """
 
     y: np.ndarray
@@ -60,9 +65,10 @@ class Exposure:
     reach_px: float
     transfer: Transfer
     shares: np.ndarray | None
+    n_threads: int = 1
 
     @classmethod
-    def of(cls, view: WhitenedView, frame, observation, source):
+    def of(cls, view: WhitenedView, frame, observation, source, n_threads=1):
         """That of an Observation and its view on a Frame; source (n,): of each component."""
         scale = np.sqrt(abs(np.linalg.det(view.mapping.matrix)))
         reach = REACH_FWHM * float(observation.psf.fwhm_px.max()) * scale
@@ -74,7 +80,7 @@ class Exposure:
         make = _parallel if view.mapping.geometry == "aligned" else _spread
         y, x, root = make(view, pixel)
         shares = None if view.shares is None else view.shares[source].astype(np.float32)
-        return cls(y, x, root, reach, transfer, shares)
+        return cls(y, x, root, reach, transfer, shares, n_threads)
 
     def window(self, origin, shape):
         """First and one-past-last row and column (2, 2) within reach of a box of the frame."""
@@ -102,7 +108,8 @@ class Exposure:
         from_y = np.concatenate([from_y.real, -from_y.imag], axis=1)
         root = self.root[:, low[0] : high[0], low[1] : high[1]]
         out, n = np.empty((k, *root.shape), np.float32), max(CACHED // d.size, 1)
-        for first in range(0, k, n):
+
+        def observe_from(first):
             some = images[first : first + n]
             z = to_y @ some.transpose(1, 0, 2).reshape(n_y, -1)  # (2 Hy, k nx)
             z = (z[: len(nu_y)] + 1j * z[len(nu_y) :]).reshape(-1, n_x) @ to_x
@@ -111,13 +118,18 @@ class Exposure:
             seen = from_y @ np.concatenate([z.real, z.imag])
             seen = seen.reshape(len(from_y), len(some), len(root), -1).transpose(1, 2, 0, 3)
             np.multiply(seen, root, out=out[first : first + n])
+
+        in_threads(self.n_threads, observe_from, range(0, k, n))
         return out
 
 
 def exposures_of(fit):
     """An Exposure of each observation of a Fit: 1 ms each, 15 ms of 500 x 500 pixels."""
     pairs = zip(fit.views, fit.blend.observations, strict=True)
-    return [Exposure.of(view, fit.frame, one, fit.start.source) for view, one in pairs]
+    large = sum(profile.size for profile in fit.scene.profile) > LARGE_PX
+    n_threads = host_threads(fit.views[0].op.device) if large else 1
+    given = fit.start.source, n_threads
+    return [Exposure.of(view, fit.frame, one, *given) for view, one in pairs]
 
 
 class _Content:

@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ...device.workers import in_threads
 from ...sky.extent import box_slices
 from ..shifts import SCATTER_PX
 from .blocks import Blocks
@@ -121,8 +122,11 @@ class _Sum:
             spectrum = spectra[i, self.channels].astype(np.float32)
             one = self._seen(i, images[i], spectrum, origin[i], low, high)
             near.append(one)
-            for other in near:
-                self._add(*((other, one) if other.i <= i else (one, other)))
+            pairs = [(other, one) if other.i <= i else (one, other) for other in near]
+            products = in_threads(self.exposure.n_threads, lambda pair: _products(*pair), pairs)
+            for pair, found in zip(pairs, products, strict=True):
+                if found is not None:
+                    self._add(*pair, *found)
             if self.layout.n_sky:
                 self._add_level(one)
         if self.layout.n_sky:
@@ -140,19 +144,9 @@ class _Sum:
         light *= spectrum[:, None, None]
         return _Seen(i, k, low, high, light, unit)
 
-    def _add(self, a, b):
-        """The products of two components, a.i <= b.i, where their windows meet."""
-        low, high = np.maximum(a.low, b.low), np.minimum(a.high, b.high)
-        if not (high > low).all():
-            return
-        dtype = np.float64 if a.size * b.size > LARGE else np.float32
-        light_a, unit_a = a.within(low, high, dtype)
-        same = a is b  # NumPy takes half the products where both factors are one array
-        light_b, unit_b = (light_a, unit_a) if same else b.within(low, high, dtype)
-        n_channels, modes = len(unit_a), light_a @ light_b.T
-        by_b = _by_channel(light_a, unit_b)  # (k, Co)
-        by_a = by_b if same else _by_channel(light_b, unit_a)
-        units = np.einsum("cp,cp->c", unit_a, unit_b, dtype=np.float64)
+    def _add(self, a, b, modes, by_a, by_b, units):
+        """Add what `_products` has found of two components, a.i <= b.i."""
+        same, n_channels = a is b, len(units)
         block = self.matrix.block(a.i, b.i)
         block[: a.k, : b.k] += modes[: a.k, : b.k]
         of_a, of_b = (s.k + np.arange(n_channels) + self.channels.start for s in (a, b))
@@ -187,6 +181,22 @@ class _Sum:
             both, found = self.matrix.block(*[self.layout.common] * 2), products[one.k :]
             both[np.ix_(self.shift, at)] += found
             both[np.ix_(at, self.shift)] += found.T
+
+
+def _products(a, b):
+    """The products of two _Seen where their windows meet, None where they do not: of the light of
+    both (ka, kb), of b's light with a's unit and of a's with b's (k, C), of the units (C,)."""
+    low, high = np.maximum(a.low, b.low), np.minimum(a.high, b.high)
+    if not (high > low).all():
+        return None
+    dtype = np.float64 if a.size * b.size > LARGE else np.float32
+    light_a, unit_a = a.within(low, high, dtype)
+    same = a is b  # NumPy takes half the products where both factors are one array
+    light_b, unit_b = (light_a, unit_a) if same else b.within(low, high, dtype)
+    by_b = _by_channel(light_a, unit_b)
+    by_a = by_b if same else _by_channel(light_b, unit_a)
+    units = np.einsum("cp,cp->c", unit_a, unit_b, dtype=np.float64)
+    return light_a @ light_b.T, by_a, by_b, units
 
 
 def _by_channel(light, unit):
