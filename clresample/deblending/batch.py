@@ -17,7 +17,7 @@ from ..drawing.bar import Bar
 from ..sky.given.checks import float_type, instance
 from ..sky.sources import SourceWarning
 from .blend import INTERRUPTED, Blend, Failure
-from .components.second import with_second
+from .components.second import asks_for_more, with_second
 from .fit import Fit, begin, data_bytes, finish, scene_bytes
 from .iterate import iterate
 from .result import Result
@@ -71,7 +71,7 @@ def deblend(
     begin([fit])
     if len(fit.dark):
         _warn_dark([fit.dark], "")
-    iterate([fit], settings, device, dtype, progress)
+    iterate([fit], settings, device, dtype, progress, takes_over=asks_for_more)
     if fit.status != INTERRUPTED:
         (fit,) = with_second([fit], settings, device, dtype, progress)
     return fit.result(*finish([fit]))
@@ -221,7 +221,7 @@ class _ManyFits:
         """Yield (index, Result or Failure) of a group; one by one where all at once fails."""
         fits, run = [fit for _, fit in group], (self.settings, self.device, self.dtype)
         try:
-            iterate(fits, *run)
+            iterate(fits, *run, takes_over=asks_for_more)
             if not any(fit.status == INTERRUPTED for fit in fits):
                 fits = with_second(fits, *run)
             seen = finish(fits)

@@ -13,6 +13,8 @@ from ..sky.sources import Source
 
 # Status of a fit that Ctrl-C ended.
 INTERRUPTED = "interrupted"
+# That of a fit whose scene another one takes over; no result has it.
+HANDED_OVER = "handed over"
 # What one fit takes at most. Its spectra are solved together, n^3 for n components: 2000 take
 # minutes. Arrays of components times pixels are held several at a time. A blend of 4096 pixels a
 # side has no neighbours that would need to be fitted at once.

@@ -7,7 +7,8 @@ import time
 
 import numpy as np
 
-from .posterior.exchange import exchange_of
+from .blend import HANDED_OVER
+from .posterior.exchange import exchange_of, step_of
 from .resize import resized
 from .shifts import ahead, shift_steps
 from .solver.engine import Engine
@@ -40,11 +41,16 @@ LEAST_KEPT, MOST_MADE = 0.2, 2
 RESIZE = 40
 
 
-def iterate(fits, settings, device, dtype, progress=None):
-    """Run the fits of one signature until each has stopped; they keep their final states."""
+def iterate(fits, settings, device, dtype, progress=None, *, takes_over=None):
+    """Run the fits of one signature until each has stopped; they keep their final states.
+
+    takes_over: called with a fit that has just found clear structure under a LearnedPrior, and
+        knows how much; where it returns True the fit ends there, HANDED_OVER
+    """
     began, running = time.perf_counter(), None
     try:
-        running = (_Learning if settings.learns else _Running)(fits, settings, device, dtype)
+        given = fits, settings, device, dtype
+        running = _Learning(*given, takes_over=takes_over) if settings.learns else _Running(*given)
         while running.n_steps < settings.max_iter:
             losses = running.run()
             if progress is not None:
@@ -54,7 +60,8 @@ def iterate(fits, settings, device, dtype, progress=None):
             running.shift()
             running = running.repacked()
     except KeyboardInterrupt:
-        for f in running.going() if running else fits:
+        handed_over = [f for f in fits if f.status == HANDED_OVER]
+        for f in handed_over + (running.going() if running else fits):
             f.interrupt()
         if running:
             running.settle(running.live)
@@ -153,10 +160,12 @@ class _Learning:
 
     exchanges (B): each fit's Exchange, or None; asked (B, 4): when that was last looked at a fit's
         rounds and loss, 0 and infinite before, the gain that it promised, and how many were made
+    takes_over: see `iterate`
     """
 
-    def __init__(self, fits, settings, device, dtype, past=None):
+    def __init__(self, fits, settings, device, dtype, past=None, *, takes_over=None):
         self.fits, self.settings, self.device, self.dtype = list(fits), settings, device, dtype
+        self.takes_over = takes_over
         if past is None:
             self.exchanges = [None] * len(fits)
             self.asked = np.tile([0, np.inf, 0, 0], (len(fits), 1))
@@ -186,8 +195,10 @@ class _Learning:
         engine, live = self.engine, self.live.copy()
         n_steps = min(self.n_steps + CHECK, self.settings.max_iter)
         while self.n_steps < n_steps and self.live.any():
+            looked = engine.progress.looked.copy()
             for i in np.flatnonzero(engine.round()):
                 self.fits[i].losses.append(float(engine.progress.loss[i]))
+            live &= ~self._handed_over(live & engine.progress.looked & ~looked)
             self._exchange(live)
         if self.settings.fit_shifts and self.n_steps < self.settings.max_iter:
             self._move(live & engine.progress.converged)
@@ -219,6 +230,19 @@ class _Learning:
         if moved.any():
             self.engine.follow_shifts(moved)
 
+    def _handed_over(self, which):
+        """Those of the fits (B,) that end here, since another one takes their scene over."""
+        if not which.any() or self.takes_over is None:
+            return np.zeros_like(which)
+        which = which & self.engine.strengths.clear_scenes()
+        self.settle(which)
+        for i in np.flatnonzero(which):
+            which[i] = self.takes_over(self.fits[i])
+            if which[i]:
+                self.fits[i].status = HANDED_OVER
+        self.engine.progress.live &= ~which
+        return which
+
     def _exchange(self, which):
         """Let those of the fits (B,) whose time has come take a step of their Exchange, if it gains
         enough; those that have converged then go on."""
@@ -248,7 +272,7 @@ class _Learning:
         which &= np.array([e is not None for e in self.exchanges])
         slopes, steps = engine.slopes(which) if which.any() else (), {}
         for i in np.flatnonzero(which):
-            step, gain = _promise(self.exchanges[i], slopes[i])
+            step, gain = step_of(self.exchanges[i], slopes[i])
             if step is None:
                 self.exchanges[i] = None
             elif gain > enough[i]:
@@ -272,13 +296,5 @@ class _Learning:
         keep = np.flatnonzero(self.live)
         fits, exchanges = ([some[i] for i in keep] for some in (self.fits, self.exchanges))
         past = self.engine.take(keep), exchanges, self.asked[keep]
-        return _Learning(fits, self.settings, self.device, self.dtype, past)
-
-
-def _promise(exchange, slopes):
-    """An Exchange's step, None where its matrix is not positive definite, and what that gains."""
-    try:
-        *step, gain = exchange.step(slopes)
-    except np.linalg.LinAlgError:
-        return None, 0.0
-    return step, gain
+        given = fits, self.settings, self.device, self.dtype, past
+        return _Learning(*given, takes_over=self.takes_over)

@@ -4,11 +4,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.told import named
 
 from clresample.deblending.blend import INTERRUPTED
 from clresample.deblending.components import gradients, second
 from clresample.deblending.components.gradients import Asked, gain
 from clresample.deblending.rendered import Rendered
+from clresample.deblending.settings import Settings
 from clresample.sky.sources import Extended, Point
 
 
@@ -150,24 +152,15 @@ def test_more_components_must_lower_the_loss_by_what_their_numbers_cost():
 
 def test_each_scene_keeps_its_second_fit_where_that_is_better(monkeypatch):
     """Whatever the others do; what is not kept gives the shifts of the first fit back."""
-
-    def fit(name, status="converged", shifts=0.0):
-        one = SimpleNamespace(name=name, status=status, shifts=shifts, messages=[], seconds={})
-        one.note_seconds = one.seconds.__setitem__
-        one.shift = lambda shifts: setattr(one, "shifts", shifts)
-        one.interrupt = lambda: setattr(one, "status", INTERRUPTED)
-        one.losses = [1.0]
-        return one
-
-    firsts = [fit(k, shifts=float(k)) for k in range(5)]
-    again = {k: fit(10 + k, shifts=9.0) for k in (0, 1, 3, 4)}
+    firsts = [named(k, shifts=float(k)) for k in range(5)]
+    again = {k: named(10 + k, shifts=9.0, of=firsts[k]) for k in (0, 1, 3, 4)}
     again[4].status = INTERRUPTED
     monkeypatch.setattr(second, "begun", lambda fits: again)
     monkeypatch.setattr(second, "iterate", lambda *given: None)
-    monkeypatch.setattr(second, "_is_better", lambda new, old: new.name != 11)
-    kept = second.with_second(firsts, None, None, None)
+    monkeypatch.setattr(second, "_is_better", lambda new, old, more=0: new.name != 11)
+    kept = second.with_second(firsts, Settings(), None, None)
     assert [one.name for one in kept] == [10, 1, 2, 13, 4]
-    assert [again[k].shifts for k in (0, 1, 3, 4)] == [9, 1, 9, 4]
+    assert [one.at["shifts"] for one in firsts] == [9, 1, 2, 9, 4]
     assert [one.status == INTERRUPTED for one in kept] == [False] * 4 + [True]
 
 

@@ -31,7 +31,7 @@ def many_of(names, monkeypatch, *, memory=100, **sizes):
         for i, name in enumerate(names)
     ]
 
-    def stop(fits, *_):
+    def stop(fits, *_, takes_over=None):
         if any(fit.name == "bad" for fit in fits):
             raise ValueError("bad data")
         if any(fit.name == "stop" for fit in fits):

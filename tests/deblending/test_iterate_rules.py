@@ -5,62 +5,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.told import Told, learning
 
 from clresample.deblending import iterate as room
 from clresample.deblending.iterate import CHECK, LEAST_GAIN, MOVE, REPACK, iterate
-
-
-class Told(SimpleNamespace):
-    """A fit that notes what is done with it."""
-
-    def __init__(self, name, status="iteration limit"):
-        super().__init__(name=name, status=status, ended=None, best=None, seconds={})
-        self.shifts, self.last_steps = np.zeros((2, 2)), np.full((2, 2), 9.0)
-        self.losses = []
-
-    def shift(self, shifts):
-        self.shifts = shifts
-
-    def end(self, *given):
-        self.ended = given
-
-    settle = end
-
-    def remember(self, *given):
-        self.best = given
-
-    def interrupt(self):
-        self.status = "interrupted"
-
-    def note_seconds(self, stage, seconds):
-        self.seconds[stage] = seconds
-
-
-def learning(n_rounds, *, live=None, converged=None, failed=None, **settings):
-    """Fits a, b, c under the prior that learns."""
-    n = len(n_rounds)
-    no = np.zeros(n, bool)
-    progress = SimpleNamespace(
-        live=~no if live is None else np.array(live),
-        converged=no.copy() if converged is None else np.array(converged),
-        failed=no.copy() if failed is None else np.array(failed),
-        **{name: no.copy() for name in ("settled", "looked")},
-        n_rounds=np.array(n_rounds),
-        loss=np.arange(1.0, n + 1),
-        chi2=lambda: np.array([1.0, 2.0, 4.0])[:n],
-    )
-    engine = SimpleNamespace(
-        progress=progress,
-        scenes=[f"scene {i}" for i in range(n)],
-        states=lambda: [f"state {i}" for i in range(n)],
-        findings=lambda which: [f"findings {i}" if on else None for i, on in enumerate(which)],
-        followed=[],
-    )
-    engine.follow_shifts = lambda moved: engine.followed.append(moved.tolist())
-    engine.slopes = lambda which: [f"slopes {i}" for i in range(n)]
-    settings = SimpleNamespace(**({"max_iter": 100, "fit_shifts": False, "enough": 0.5} | settings))
-    past = engine, [None] * n, np.tile([0, np.inf, 0, 0], (n, 1))
-    return room._Learning([Told(c) for c in "abc"[:n]], settings, None, None, past)
 
 
 @pytest.fixture(autouse=True)

@@ -215,6 +215,7 @@ def test_learning_runs_five_rounds_at_a_time_and_no_more_than_it_may():
         progress = SimpleNamespace(
             live=np.array([True, False]),
             converged=np.zeros(2, bool),
+            looked=np.zeros(2, bool),
             n_rounds=n,
             loss=np.array([3.0, 4.0]),
         )

@@ -3,55 +3,88 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
-from ..blend import INTERRUPTED
+from ..blend import HANDED_OVER, INTERRUPTED
 from ..iterate import iterate
+from .gradients import ask
 from .second_start import begun
 
 # What a second component must lower the loss by, for each number that it adds: a spectrum and a
 # profile's four. Half a unit each is what noise alone gives.
 LEAST_GAIN = 1.0
 N_PROFILE = 4
+# [loss] Twice what fits of HST and HSC and of a bright blend of HSC gained at most where they were
+# taken over, and yet went on to their end. Where the second one is better by less, they do.
+SURE = 200.0
+
+
+def asks_for_more(fit):
+    """Whether a Fit in its present state clearly needs second components."""
+    (asked,) = ask([fit])
+    return asked is not None and len(asked.clear) > 0
 
 
 def with_second(fits, settings, device, dtype, progress=None):
-    """What to keep of finished Fits: each itself, or a second one with more components.
+    """What to keep of Fits that have ended: each itself, or a second one with more components.
 
-    fits: of one signature; settings, device, dtype: theirs; progress: see `deblend`
+    fits: of one signature; those HANDED_OVER go on to their end, unless a second one is better than
+        they can become; settings, device, dtype: theirs; progress: see `deblend`
     returns Fits, in the order of `fits`
     """
-    kept, began = list(fits), time.perf_counter()
-    try:
-        again = begun(fits)
-    except Exception as error:
-        _note(fits, error)
-        return kept
-    for fit in fits:
-        fit.note_seconds("components", (time.perf_counter() - began) / len(fits))
-    if not again:
-        return kept
-    shifts = {i: fits[i].shifts for i in again}
-    try:
-        iterate(list(again.values()), settings, device, dtype, _after(fits, progress))
-    except Exception as error:
-        _note([fits[i] for i in again], error)
-        for i, second in again.items():
-            second.shift(shifts[i])
-        return kept
+    run, before = (settings, device, dtype, progress), [fit.shifts for fit in fits]
+    again = _second_fits(fits, *run)
+    after = {i: second.shifts for i, second in again.items()}
+    for i in again:
+        fits[i].shift(before[i])
+    if not any(second.status == INTERRUPTED for second in again.values()):
+        sure = [i for i, second in again.items() if _is_better(second, fits[i], SURE)]
+        going = [fit for i, fit in enumerate(fits) if i not in sure and fit.status == HANDED_OVER]
+        _go_on(going, *run)
+    kept = list(fits)
     for i, second in again.items():
-        if second.status != INTERRUPTED and _is_better(second, kept[i]):
-            kept[i] = _following(second, kept[i])
-            continue
-        second.shift(shifts[i])
-        if second.status == INTERRUPTED:
+        if second.status != INTERRUPTED and _is_better(second, fits[i]):
+            second.shift(after[i])
+            kept[i] = _following(second, fits[i])
+        elif INTERRUPTED in (second.status, fits[i].status):
             kept[i].interrupt()
+    for fit in kept:
+        if fit.status == HANDED_OVER:
+            fit.interrupt()
     return kept
 
 
-def _note(fits, error):
-    """Say in the messages of fits what kept them from second components."""
-    for fit in fits:
-        fit.messages.append(f"second components could not be fitted: {error}")
+def _second_fits(fits, settings, device, dtype, progress):
+    """{index: a Fit that has ended} with more components of those that need them; none where that
+    fails, which their messages say."""
+    began, shifts = time.perf_counter(), [fit.shifts for fit in fits]
+    asked = fits
+    try:
+        again = begun(fits)
+        for fit in fits:
+            fit.note_seconds("components", (time.perf_counter() - began) / len(fits))
+        asked = [fits[i] for i in again]
+        if again:  # both fits of a scene may take twice `max_iter` together
+            n_left = 2 * settings.max_iter - max(len(fit.losses) for fit in asked)
+            longer = replace(settings, max_iter=n_left)
+            iterate(list(again.values()), longer, device, dtype, _after(fits, progress))
+    except Exception as error:
+        for fit, shift in zip(fits, shifts, strict=True):
+            fit.shift(shift)
+        for fit in asked:
+            fit.messages.append(f"second components could not be fitted: {error}")
+        return {}
+    return again
+
+
+def _go_on(fits, settings, device, dtype, progress):
+    """Run fits that were HANDED_OVER to their end."""
+    if not fits:
+        return
+    before = [fit.seconds["fit"] for fit in fits]
+    iterate(fits, settings, device, dtype, _after(fits, progress))
+    for fit, seconds in zip(fits, before, strict=True):
+        fit.note_seconds("fit", seconds + fit.seconds["fit"])
 
 
 def _following(second, first):
@@ -61,14 +94,14 @@ def _following(second, first):
     return second
 
 
-def _is_better(second, first):
-    """Whether more components lower the loss by more than their numbers cost, and fit the data
-    better: one component with stronger structure may do that, at a higher loss."""
+def _is_better(second, first, more=0.0):
+    """Whether more components lower the loss by more than their numbers cost, and `more` than that,
+    and fit the data better: one component with stronger structure may do that, at a higher loss."""
     if second.findings is None or _half_chi2(second) > _half_chi2(first):
         return False
     n_more = len(second.state.morph) - len(first.state.morph)
     n_numbers = n_more * (N_PROFILE + first.state.spectra.shape[1])
-    return second.losses[-1] < first.losses[-1] - LEAST_GAIN * n_numbers
+    return second.losses[-1] < first.losses[-1] - LEAST_GAIN * n_numbers - more
 
 
 def _half_chi2(fit):

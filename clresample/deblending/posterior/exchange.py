@@ -190,3 +190,12 @@ def exchange_of(fit, scene, state, findings):
     if not any(where.any() for where in shared):
         return None
     return Exchange(solution, shared, exposures_of(fit), fit_sky=fit.settings.fit_sky)
+
+
+def step_of(exchange, slopes):
+    """An Exchange's step, None where its matrix is not positive definite, and what that gains."""
+    try:
+        *step, gain = exchange.step(slopes)
+    except np.linalg.LinAlgError:
+        return None, 0.0
+    return step, gain

@@ -139,6 +139,10 @@ class Strengths:
         at = [self._scene == i for i in range(len(self.buffers.scenes))]
         return [(self.values[own], self.clear[own]) for own in at]
 
+    def clear_scenes(self):
+        """Which scenes (B,) hold sources whose finest structure is clear."""
+        return self._by_scene(self.clear) > 0
+
     def _by_scene(self, values):
         """Sums (B,) over the scenes' sources."""
         return np.bincount(self._scene, values, len(self.buffers.scenes))
