@@ -1,5 +1,6 @@
 """What errors are made of: pixels along the model's axes, and sums over modes and spectra."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -31,7 +32,8 @@ def test_a_window_holds_the_pixels_within_reach():
 
 
 def test_few_modes_at_a_time_are_seen_as_all_at_once(monkeypatch):
-    """Also where the last ones are fewer, and each with its channel's root weights."""
+    """Also where the last ones are fewer, and each with its channel's root weights; and by several
+    threads."""
     psf, rng = PSF.gaussian(1.2, n_pixels=25), np.random.default_rng(3)
     root, images = rng.uniform(1, 2, (1, 9, 11)), rng.standard_normal((5, 7, 8))
     place = np.arange(9) * 2.0, np.arange(11) * 2.0
@@ -43,32 +45,34 @@ def test_few_modes_at_a_time_are_seen_as_all_at_once(monkeypatch):
     assert found[0].shape == (5, 1, 8, 8) and np.abs(found[0]).max() > 0.1
     for other in found[1:]:
         np.testing.assert_allclose(other, found[0], atol=1e-5)
+    monkeypatch.setattr(module, "CACHED", 1)
+    monkeypatch.setattr(module, "MANY", 1)
+    shared = replace(one, n_threads=3)
+    again = shared.observe(images.astype("f4"), 0, np.array([3, 4]), (1, 2), (9, 10))
+    np.testing.assert_array_equal(again, found[0])
 
 
-@pytest.mark.parametrize(("n_pixels", "n_threads"), [(25_000, 1), (25_001, 7)])
-def test_exposures_are_those_of_views_as_they_are(n_pixels, n_threads, monkeypatch):
-    """Of each observation with its own view; sources and shifts may be others at any time. Large
-    scenes take the threads that go with their device."""
-    monkeypatch.setattr(module, "host_threads", {"device": 7}.get)
+def test_exposures_are_those_of_views_as_they_are(monkeypatch):
+    """Of each observation with its own view; sources and shifts may be others at any time."""
     monkeypatch.setattr(module.Exposure, "of", lambda *given: given)
     blend, start = SimpleNamespace(observations=(1, 2)), SimpleNamespace(source=np.array([0, 2]))
-    views = [SimpleNamespace(op=SimpleNamespace(device="device")) for _ in "ab"]
-    scene = SimpleNamespace(profile=[np.ones((2, n_pixels // 2)), np.ones(n_pixels)])
-    fit = SimpleNamespace(views=views, blend=blend, start=start, frame="frame", scene=scene)
+    fit = SimpleNamespace(views=("a", "b"), blend=blend, start=start, frame="frame")
     found = module.exposures_of(fit)
-    given = start.source, n_threads
-    assert found == [(views[0], "frame", 1, *given), (views[1], "frame", 2, *given)]
+    assert found == [("a", "frame", 1, start.source), ("b", "frame", 2, start.source)]
 
 
 def seen_as(monkeypatch, view, pixel):
     """Rows, columns, root weights of a view's Exposure, whose band asks for pixels of `pixel`."""
     psf = PSF.gaussian(1.0, n_pixels=15)
     view.shares, view.op.plans = None, [SimpleNamespace(psfs=(psf, psf))]
+    view.op.device = SimpleNamespace(kind="CPU", compute_units=5)
     monkeypatch.setattr(module, "_transfer", lambda *_: SimpleNamespace(nyquist_px=pixel))
     observation = SimpleNamespace(psf=psf)
     made = Exposure.of(view, SimpleNamespace(psf=psf), observation, np.zeros(1, int))
     scale = np.sqrt(abs(np.linalg.det(view.mapping.matrix)))
     assert made.reach_px == pytest.approx(1.5 * psf.fwhm_px.max() * scale)
+    few, many = (np.empty((n, 1 << 10)) for n in (1 << 10, (1 << 10) + 1))
+    assert (made.threads_for(few), made.threads_for(many)) == (1, 5)
     return made.y, made.x, made.root
 
 
@@ -151,7 +155,7 @@ def test_errors_at_fixed_morphologies_are_those_of_the_normal_matrix(monkeypatch
     covariance = np.array([[[1e-8, 5.0], [5.0, 4.0]], [[0.0, 0], [0, -1e-20]]])
     spectra = np.array([[3.0, 3.0], [1e6, 0.0]])
     start = SimpleNamespace(source=np.array([0, 1]), shapes=0, thetas=0, positions=np.eye(2))
-    scene = SimpleNamespace(channels=lambda: [], profile=[])
+    scene = SimpleNamespace(channels=lambda: [])
     fit = SimpleNamespace(
         settings=Settings(), scene=scene, findings=1, views=[], start=start, frame=None
     )

@@ -121,13 +121,15 @@ def test_neighbours_are_those_whose_rows_meet(monkeypatch):
 
     class Watched(_Sum):
         def _seen(self, i, images, spectrum, origin, low, high):
-            return SimpleNamespace(i=i, low=low, high=high)
+            return SimpleNamespace(i=i, low=low, high=high, light=0)
 
         def _add(self, one, other, *_):
             pairs.append((one.i, other.i))
 
     monkeypatch.setattr(normal, "_products", lambda one, other: ())
-    exposure = SimpleNamespace(window=lambda at, _: np.array(windows[at]), n_threads=1)
+    exposure = SimpleNamespace(
+        window=lambda at, _: np.array(windows[at]), threads_for=lambda light: 1
+    )
     layout = SimpleNamespace(shift=lambda _: None, n_sky=0)
     images, spectra = [np.zeros((1, 2, 2))] * 4, np.ones((4, 1))
     Watched(None, layout, exposure, 0, slice(0, 1)).run(range(4), images, spectra)

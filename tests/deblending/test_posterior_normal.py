@@ -20,7 +20,7 @@ class Plain:
     `dark` on no pixel."""
 
     def __init__(self, n_channels, seed, dark=3, n_threads=1):
-        self.n_threads = n_threads
+        self.threads_for = lambda light: n_threads
         self.root = np.random.default_rng(seed).uniform(0.5, 2, (n_channels, *SHAPE))
         self.dark = dark
 

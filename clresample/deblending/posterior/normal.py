@@ -123,7 +123,8 @@ class _Sum:
             one = self._seen(i, images[i], spectrum, origin[i], low, high)
             near.append(one)
             pairs = [(other, one) if other.i <= i else (one, other) for other in near]
-            products = in_threads(self.exposure.n_threads, lambda pair: _products(*pair), pairs)
+            n_threads = self.exposure.threads_for(one.light)
+            products = in_threads(n_threads, lambda pair: _products(*pair), pairs)
             for pair, found in zip(pairs, products, strict=True):
                 if found is not None:
                     self._add(*pair, *found)
