@@ -17,7 +17,7 @@ from .solver.prior import Prior
 class Settings:
     """How a fit goes.
 
-    max_iter: most iterations
+    max_iter: most iterations; of a second fit, with more components, half as many more
     prior: what is expected of extended sources' morphologies about their smooth profiles, which
         also chooses the solver. LearnedPrior: structure at several scales, as strong as each
         source's data say, by L-BFGS. Prior: structure of one scale and strength; None: the

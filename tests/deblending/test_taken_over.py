@@ -54,11 +54,10 @@ def test_ctrl_c_interrupts_fits_that_wait_to_be_taken_over(monkeypatch):
 
 
 def test_a_fit_that_is_taken_over_goes_on_unless_the_second_one_is_surely_better(monkeypatch):
-    """Then with the shifts that it had, and no less time; the better one is kept in the end. Both
-    together may take twice the iterations of one."""
+    """Then with the shifts that it had, and no less time; the better one is kept in the end. Second
+    ones may take half as many iterations more."""
     firsts = [named(k, HANDED_OVER, shifts=float(k)) for k in range(4)]
     again = {k: named(10 + k, shifts=9.0, of=firsts[k]) for k in (0, 1, 2)}
-    firsts[0].losses = [1.0] * 30
     monkeypatch.setattr(second, "begun", lambda fits: again)
     runs = []
 
@@ -71,7 +70,7 @@ def test_a_fit_that_is_taken_over_goes_on_unless_the_second_one_is_surely_better
     monkeypatch.setattr(second, "iterate", iterate)
     monkeypatch.setattr(second, "_is_better", lambda new, old, more=0: gains[new.name] > more)
     kept = second.with_second(firsts, Settings(max_iter=50), None, None)
-    assert runs[0][:2] == (list(again.values()), 70)
+    assert runs[0][:2] == (list(again.values()), 75)
     assert runs[1:] == [(firsts[1:], 50, [1, 2, 3])]
     assert [one.name for one in kept] == [10, 11, 2, 3]
     assert [one.at["shifts"] for one in firsts] == [9, 9, 2, 3]
@@ -123,3 +122,11 @@ def test_a_scene_is_taken_over_where_a_gradient_is_clear(evidence, monkeypatch):
     asked = evidence and Asked(np.arange(len(evidence)), np.array(evidence), np.ones((3, 2)), [])
     monkeypatch.setattr(second, "ask", lambda fits: [asked])
     assert second.asks_for_more("fit") == (evidence == [4.9, 5.1])
+
+
+def test_a_fit_goes_on_where_nobody_can_tell_what_it_needs(monkeypatch):
+    def ask(fits):
+        raise MemoryError
+
+    monkeypatch.setattr(second, "ask", ask)
+    assert not second.asks_for_more("fit")

@@ -17,11 +17,18 @@ N_PROFILE = 4
 # [loss] Twice what fits of HST and HSC and of a bright blend of HSC gained at most where they were
 # taken over, and yet went on to their end. Where the second one is better by less, they do.
 SURE = 200.0
+# A second fit may take so many times `max_iter`: the first one, if it was taken over, has left as
+# many, and some fits of bright blends need them.
+LONGER = 1.5
 
 
 def asks_for_more(fit):
-    """Whether a Fit in its present state clearly needs second components."""
-    (asked,) = ask([fit])
+    """Whether a Fit in its present state clearly needs second components. Where that cannot be told
+    it goes on: `with_second` asks again, and says in its messages what is wrong."""
+    try:
+        (asked,) = ask([fit])
+    except Exception:
+        return False
     return asked is not None and len(asked.clear) > 0
 
 
@@ -64,9 +71,8 @@ def _second_fits(fits, settings, device, dtype, progress):
         for fit in fits:
             fit.note_seconds("components", (time.perf_counter() - began) / len(fits))
         asked = [fits[i] for i in again]
-        if again:  # both fits of a scene may take twice `max_iter` together
-            n_left = 2 * settings.max_iter - max(len(fit.losses) for fit in asked)
-            longer = replace(settings, max_iter=n_left)
+        if again:
+            longer = replace(settings, max_iter=int(LONGER * settings.max_iter))
             iterate(list(again.values()), longer, device, dtype, _after(fits, progress))
     except Exception as error:
         for fit, shift in zip(fits, shifts, strict=True):
