@@ -156,7 +156,8 @@ __kernel void spread(__global const int *restrict active, __global const int *re
 #endif
 }
 
-/* sum_i VALUE over i < n by all work-items of a group, each of which gets it. */
+/* sum_i VALUE over i < n by all work-items of a group, each of which gets it. Whole eights come
+ * first: with a test of each i among them compilers do not vectorise. */
 #define SUM_OVER(total, n, VALUE) \
     REAL part[8] = {0, 0, 0, 0, 0, 0, 0, 0}; \
     for (int i0 = 8 * lid; i0 + 8 <= (n); i0 += 8 * WG) \

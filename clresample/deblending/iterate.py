@@ -44,8 +44,7 @@ RESIZE = 40
 def iterate(fits, settings, device, dtype, progress=None, *, takes_over=None):
     """Run the fits of one signature until each has stopped; they keep their final states.
 
-    takes_over: called with a fit that has just found clear structure under a LearnedPrior, and
-        knows how much; where it returns True the fit ends there, HANDED_OVER
+    takes_over: of a fit that has learned clear structure; where True the fit ends, HANDED_OVER
     """
     began, running = time.perf_counter(), None
     try:
@@ -235,7 +234,8 @@ class _Learning:
         if not which.any() or self.takes_over is None:
             return np.zeros_like(which)
         which = which & self.engine.strengths.clear_scenes()
-        self.settle(which)
+        if which.any():
+            self.settle(which)
         for i in np.flatnonzero(which):
             which[i] = self.takes_over(self.fits[i])
             if which[i]:

@@ -33,10 +33,8 @@ FIRST = 4
 SHARE = 0.5
 # [s] An interrupted process has so long to hand in what it has.
 PATIENCE_S = 60.0
-
-
-# Threads of the host at most: what they share, memory and Python itself, feeds no more.
-MOST_THREADS = 8
+# Threads of the host at most, each with intermediate arrays of its own. More were not tried.
+MOST_THREADS = 4
 
 
 class _Alone:
@@ -69,12 +67,12 @@ def one_blas_thread():
 
 
 def host_threads(device):
-    """Threads that the host may use beside a device: on a CPU as many as that has compute units, so
-    that a process that was given some of the cores stays on them; else one a core."""
-    if device.kind == "CPU":
-        return min(device.compute_units, MOST_THREADS)
-    cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else [0]
-    return min(len(cores), MOST_THREADS)
+    """Threads that the host may use beside a device: one for each core of this process, but no more
+    than a CPU device has compute units: it has few where processes share the cores."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    n_cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+    n_units = device.compute_units if device.kind == "CPU" else n_cores
+    return min(n_cores, n_units, MOST_THREADS)
 
 
 def in_threads(n_threads, function, items):

@@ -65,7 +65,8 @@ def seen_as(monkeypatch, view, pixel):
     """Rows, columns, root weights of a view's Exposure, whose band asks for pixels of `pixel`."""
     psf = PSF.gaussian(1.0, n_pixels=15)
     view.shares, view.op.plans = None, [SimpleNamespace(psfs=(psf, psf))]
-    view.op.device = SimpleNamespace(kind="CPU", compute_units=5)
+    view.op.device = "device"
+    monkeypatch.setattr(module, "host_threads", {"device": 5}.get)
     monkeypatch.setattr(module, "_transfer", lambda *_: SimpleNamespace(nyquist_px=pixel))
     observation = SimpleNamespace(psf=psf)
     made = Exposure.of(view, SimpleNamespace(psf=psf), observation, np.zeros(1, int))

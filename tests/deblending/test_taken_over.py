@@ -61,21 +61,28 @@ def test_a_fit_that_is_taken_over_goes_on_unless_the_second_one_is_surely_better
     monkeypatch.setattr(second, "begun", lambda fits: again)
     runs = []
 
-    def iterate(fits, settings, *given):
+    def iterate(fits, settings, device, dtype, progress):
         runs.append((fits, settings.max_iter, [fit.at["shifts"] for fit in fits]))
+        progress(3, 0.5)
         for fit in fits:
-            fit.status, fit.seconds["fit"] = "converged", 2.0
+            fit.seconds["fit"] = 2.0
+            fit.losses.append(0.5)
 
     gains = {10: second.SURE + 1, 11: second.SURE - 1, 12: -1}
     monkeypatch.setattr(second, "iterate", iterate)
     monkeypatch.setattr(second, "_is_better", lambda new, old, more=0: gains[new.name] > more)
-    kept = second.with_second(firsts, Settings(max_iter=50), None, None)
+    told = []
+    kept = second.with_second(firsts, Settings(max_iter=50), None, None, lambda *n: told.append(n))
     assert runs[0][:2] == (list(again.values()), 75)
     assert runs[1:] == [(firsts[1:], 50, [1, 2, 3])]
+    assert told == [(4, 0.5), (6, 0.5)]  # after one iteration of the first, and two of the second
     assert [one.name for one in kept] == [10, 11, 2, 3]
     assert [one.at["shifts"] for one in firsts] == [9, 9, 2, 3]
     assert [one.seconds["fit"] for one in kept] == [3, 5, 3, 3]
-    assert HANDED_OVER not in [one.status for one in kept]
+    # at its limit one that goes on is neither that nor interrupted
+    assert [one.status for one in firsts] == [HANDED_OVER] + ["iteration limit"] * 3
+    # the loss of the state in which it goes on is there once
+    assert [one.losses for one in firsts] == [[1.0]] + [[0.5]] * 3
 
 
 @pytest.mark.parametrize("begins", [True, False])

@@ -175,10 +175,14 @@ def test_the_host_has_as_many_threads_as_its_processor_may_use(monkeypatch):
     """Those of a CPU that is the device; beside another one all cores that the process may use."""
     cpu = SimpleNamespace(kind="CPU", compute_units=3)
     gpu = SimpleNamespace(kind="GPU", compute_units=100)
+    monkeypatch.setattr(workers, "MOST_THREADS", 6)
     monkeypatch.setattr(workers.os, "sched_getaffinity", lambda _: set(range(5)), raising=False)
     assert workers.host_threads(cpu) == 3 and workers.host_threads(gpu) == 5
     cpu.compute_units = 64
-    assert workers.host_threads(cpu) == workers.MOST_THREADS
+    assert workers.host_threads(cpu) == 5
+    monkeypatch.delattr(workers.os, "sched_getaffinity")
+    monkeypatch.setattr(workers.os, "cpu_count", lambda: 9)
+    assert workers.host_threads(cpu) == workers.host_threads(gpu) == 6
 
 
 def test_ahead_ends_its_thread_when_it_is_closed():

@@ -14,8 +14,9 @@ from .second_start import begun
 # profile's four. Half a unit each is what noise alone gives.
 LEAST_GAIN = 1.0
 N_PROFILE = 4
-# [loss] Twice what fits of HST and HSC and of a bright blend of HSC gained at most where they were
-# taken over, and yet went on to their end. Where the second one is better by less, they do.
+# [loss] By so much more than LEAST_GAIN a second fit must be better than a first one that was taken
+# over; else the first one goes on to its end before they are compared. Twice what fits of HST and
+# HSC, and of a bright blend of HSC, still gained at most where they went on.
 SURE = 200.0
 # A second fit may take so many times `max_iter`: the first one, if it was taken over, has left as
 # many, and some fits of bright blends need them.
@@ -47,7 +48,7 @@ def with_second(fits, settings, device, dtype, progress=None):
     if not any(second.status == INTERRUPTED for second in again.values()):
         sure = [i for i, second in again.items() if _is_better(second, fits[i], SURE)]
         going = [fit for i, fit in enumerate(fits) if i not in sure and fit.status == HANDED_OVER]
-        _go_on(going, *run)
+        _go_on(going, settings, device, dtype, _after(list(again.values()), _after(fits, progress)))
     kept = list(fits)
     for i, second in again.items():
         if second.status != INTERRUPTED and _is_better(second, fits[i]):
@@ -84,11 +85,14 @@ def _second_fits(fits, settings, device, dtype, progress):
 
 
 def _go_on(fits, settings, device, dtype, progress):
-    """Run fits that were HANDED_OVER to their end."""
+    """Run fits that were HANDED_OVER to their end, from where they are; nobody asks them again."""
     if not fits:
         return
     before = [fit.seconds["fit"] for fit in fits]
-    iterate(fits, settings, device, dtype, _after(fits, progress))
+    for fit in fits:
+        fit.status = "iteration limit"
+        del fit.losses[-1]  # that of the present state, which comes first again
+    iterate(fits, settings, device, dtype, progress)
     for fit, seconds in zip(fits, before, strict=True):
         fit.note_seconds("fit", seconds + fit.seconds["fit"])
 
@@ -120,5 +124,5 @@ def _after(fits, progress):
     """`progress`, with the iterations of the first fits counted."""
     if progress is None:
         return None
-    n_first = max(len(fit.losses) for fit in fits)
+    n_first = max((len(fit.losses) for fit in fits), default=0)
     return lambda n_steps, loss: progress(n_first + n_steps, loss)

@@ -122,10 +122,10 @@ class _Sum:
             spectrum = spectra[i, self.channels].astype(np.float32)
             one = self._seen(i, images[i], spectrum, origin[i], low, high)
             near.append(one)
-            pairs = [(other, one) if other.i <= i else (one, other) for other in near]
+            both = [(other, one) if other.i <= i else (one, other) for other in near]
             n_threads = self.exposure.threads_for(one.light)
-            products = in_threads(n_threads, lambda pair: _products(*pair), pairs)
-            for pair, found in zip(pairs, products, strict=True):
+            products = in_threads(n_threads, lambda pair: _products(*pair), both)
+            for pair, found in zip(both, products, strict=True):
                 if found is not None:
                     self._add(*pair, *found)
             if self.layout.n_sky:
