@@ -7,6 +7,7 @@ import pytest
 from helpers.scenes import MODEL_PSF, SHAPE, frame, grids, sources
 from scipy.stats import multivariate_normal
 
+from clresample.deblending import batch
 from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.blend import INTERRUPTED, Blend
 from clresample.deblending.components import gradients, second, second_start
@@ -147,9 +148,12 @@ def test_a_second_fit_begins_with_what_the_first_leaves(two, device, monkeypatch
     np.testing.assert_allclose(found.learned.strengths, known.strengths[[0, 0, 1]])
 
 
-def test_what_gains_nothing_is_not_kept(device, monkeypatch):
-    """The first fit comes back, as it was."""
+@pytest.mark.parametrize("taken_over", [False, True])
+def test_what_gains_nothing_is_not_kept(device, monkeypatch, taken_over):
+    """The first fit comes back, as it was; one that was taken over before its end goes on to it."""
     b, _ = blend()
+    if not taken_over:
+        monkeypatch.setattr(batch, "asks_for_more", lambda fit: False)
     given = {"frame": b.frame, "device": device}
     monkeypatch.setattr(gradients, "CLEAR", np.inf)
     plain = deblend(b.observations, b.sources, **given)
@@ -157,11 +161,13 @@ def test_what_gains_nothing_is_not_kept(device, monkeypatch):
     monkeypatch.setattr(second, "LEAST_GAIN", np.inf)
     tried = deblend(b.observations, b.sources, **given)
     assert tried.seconds["components"] > plain.seconds["components"]
-    # it was taken over before its end, and went on
+    assert counts(tried) == [1, 1] and tried.status == plain.status
+    if not taken_over:
+        np.testing.assert_array_equal(tried.losses, plain.losses)
+        return
     n_same = min(map(len, (plain.losses, tried.losses))) // 2
     np.testing.assert_array_equal(tried.losses[:n_same], plain.losses[:n_same])
     assert tried.losses[-1] == pytest.approx(plain.losses[-1], abs=1)
-    assert counts(tried) == [1, 1]
 
 
 def test_ctrl_c_in_the_second_fit_leaves_the_first(device, monkeypatch):

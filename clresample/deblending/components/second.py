@@ -40,8 +40,8 @@ def with_second(fits, settings, device, dtype, progress=None):
         they can become; settings, device, dtype: theirs; progress: see `deblend`
     returns Fits, in the order of `fits`
     """
-    run, before = (settings, device, dtype, progress), [fit.shifts for fit in fits]
-    again = _second_fits(fits, *run)
+    before = [fit.shifts for fit in fits]
+    again = _second_fits(fits, settings, device, dtype, progress)
     after = {i: second.shifts for i, second in again.items()}
     for i in again:
         fits[i].shift(before[i])
@@ -54,7 +54,7 @@ def with_second(fits, settings, device, dtype, progress=None):
         if second.status != INTERRUPTED and _is_better(second, fits[i]):
             second.shift(after[i])
             kept[i] = _following(second, fits[i])
-        elif INTERRUPTED in (second.status, fits[i].status):
+        elif second.status == INTERRUPTED:
             kept[i].interrupt()
     for fit in kept:
         if fit.status == HANDED_OVER:
