@@ -4,8 +4,9 @@
 
 A row is one observation of a batch of joint scenes, one thread: its part of an iteration, model to
 gradients, with spectra applied to frames (depth 0), between the operator's two transforms of the
-model (1) and after both (2); see clresample/deblending/solver/rendering/stages.py. Scenes have
-sources in random boxes; those of one size share their operators.
+model (1) and after both (2); see clresample/deblending/solver/rendering/stages.py; and of large
+scenes in windows (3), where these are chosen. Scenes have sources in random boxes; those of one
+size share their operators.
 
 mf       10^6 weighed operations of a scene at each depth, what all of them do left out
 ms       processor time of a scene at each depth, calls by turns
@@ -48,7 +49,7 @@ COLUMNS = (
     ("n_model", 7, "d"),
     ("n_scenes", 8, "d"),
     ("mf", 22, ""),
-    ("ms", 26, ""),
+    ("ms", 32, ""),
     ("chosen", 6, "d"),
     ("gain", 5, ".2f"),
 )
@@ -106,7 +107,11 @@ def rows_of(case, rng, seconds):
     ways = {depth: Gradient(buffers, False, depth).observations for depth in (0, 1, 2)}
     chosen = Gradient(buffers, False).observations
     for i, survey in enumerate((EUCLID_VIS, RUBIN_UGRIZY)):
-        calls = {depth: functools.partial(iteration, device, ways[depth][i]) for depth in ways}
+        observed = {depth: observations[i] for depth, observations in ways.items()}
+        observed.setdefault(chosen[i].rendering.depth, chosen[i])
+        calls = {
+            depth: functools.partial(iteration, device, one) for depth, one in observed.items()
+        }
         ms = interleaved_ms(calls, seconds=seconds, timer=time.process_time)
         counts = flops(buffers, chosen[i].op, chosen[i].op.executor())
         depth = chosen[i].rendering.depth

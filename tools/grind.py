@@ -239,7 +239,7 @@ def main():
         print(f"grind: {work.__name__} after {time.perf_counter() - began:.0f} s", flush=True)
     others = {  # kernels of the other kind of device
         "cpu": {"contract_group.cl contract_group"},
-        "gpu": {"contract.cl contract", "folded.cl folded"},
+        "gpu": {f"{name}.cl {name}" for name in ("contract", "folded", "waves", "waves_back")},
     }
     missing = all_kernels() - launched - others[arguments.kind]
     took = f"{time.perf_counter() - began:.0f} s on {device.name}"

@@ -145,8 +145,8 @@ def run(arguments):
         "PSF of these": arguments.psf_like,
     }
     paths = file_outputs(arguments, inputs.values())
-    from ..device.contraction import operator_programs
     from ..device.device import get_device
+    from ..resampling.parts.waves import operator_programs
 
     device = get_device(arguments.device)
     device.build_ahead(operator_programs(device, arguments.dtype))

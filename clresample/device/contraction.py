@@ -11,7 +11,6 @@ from .tuning import MOST_GROUPS, Tuning
 
 # The kernel of a tile in registers, for CPUs, and that of a group with local memory, for GPUs.
 FILE, GROUP_FILE = "contract.cl", "contract_group.cl"
-EPILOGUES = ("MIX", "TWIST")
 # Columns of device matrices are padded with zeros to a multiple of this, the widest OpenCL vector.
 COLUMN_PAD = 16
 # Rows as long as a multiple of this many elements would begin in few sets of a core's first cache,
@@ -179,8 +178,7 @@ class Contraction:
             n=n,
             n_pad=padded(n),
             k=k,
-            block=stretch(k),
-            inward=inward,
+            **self._order(k, inward),
             A=a.buffer,
             offset_a=a.offset,
             ld_a=a.ld,
@@ -203,20 +201,15 @@ class Contraction:
             own=sizes,
         )
         starts = (a.offset, a.stride, c.offset, c.stride)
-        return Product(launch, tile, m, whole(n), starts if tall else None)
+        return Product(launch, tile, m, self._extent(tile, n), starts if tall else None)
 
+    def _extent(self, tile, n):
+        """Rows and columns of C that a work-item takes, and columns that all take."""
+        return tile["MR"] * tile.get("RT", 1), tile["NV"] * tile["VW"], whole(n)
 
-def operator_programs(device, dtype):
-    """The contractions of an operator between images turned against each other.
-
-    returns [(file, dtype, macros)], as `Device.build_ahead` takes them
-    """
-    variants = [{}, {"ragged": True}]
-    variants += [
-        {"epilogue": name, "adjoint": adjoint} for name in EPILOGUES for adjoint in (False, True)
-    ]
-    builds = [Contraction(device, dtype, **variant).build() for variant in variants]
-    return [(file, dtype, macros | {"OWN": False}) for file, macros in builds]
+    def _order(self, k, inward):
+        """The order in which the kernel sums k terms, as its arguments."""
+        return {"block": stretch(k), "inward": inward}
 
 
 class Product:
@@ -226,10 +219,10 @@ class Product:
         C [elements]; else None
     """
 
-    def __init__(self, launch, tile, m, width, tall):
+    def __init__(self, launch, tile, m, extent, tall):
         self.launch, self.m, self.tall = launch, m, tall
-        self.rows, self.group_rows = tile["MR"] * tile.get("RT", 1), tile["WGY"]
-        self.n_x = _groups(-(-width // (tile["NV"] * tile["VW"])), tile["WGX"])
+        (self.rows, columns, width), self.group_rows = extent, tile["WGY"]
+        self.n_x = _groups(-(-width // columns), tile["WGX"])
 
     def __call__(self, batch, *, a=None, c=None):
         """Queue `batch` products.

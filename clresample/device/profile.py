@@ -110,6 +110,8 @@ def flops(kernel, arguments, global_size):
     are upper bounds."""
     if kernel.startswith("contract"):
         return 2.0 * math.prod(int(arguments[name]) for name in "mnk") * global_size[2]
+    if kernel.startswith("waves"):
+        return math.prod(int(arguments[name]) for name in "mnk") * float(global_size[2])
     if kernel == "folded":
         return _folded_flops(arguments)
     return 0.0

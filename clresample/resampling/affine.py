@@ -29,7 +29,9 @@ class AffineExecutor(Executor):
         turns = [np.stack([p.twist.real, p.twist.imag], axis=1) for p in plans]
         self.turn = self._table(turns, self.h_y, 2, self.n_pad)
         self.twist = Contraction(device, dtype, epilogue="TWIST")
-        self.twist_adjoint = Contraction(device, dtype, epilogue="TWIST", adjoint=True)
+        self.lines_out = self.waves("out_y", "left", back=True)
+        self.lines_taken = self.waves("out_y", "left", epilogue="TWIST", adjoint=True)
+        self.columns_taken = Contraction(device, dtype, **self.mixed_back())
         lines = [p.lines for p in plans]
         self.to_pixels = Gather(
             self, [p.start for p in lines], [p.weight for p in lines], self.n_columns, self.n_steps
@@ -53,7 +55,7 @@ class AffineExecutor(Executor):
             inward=False,
             own=self.own(m=k_y, n=j, k=k_x),
         )
-        self.to_lines = self.plain.bind(
+        self.to_lines = self.lines_out.bind(
             *(n_y, n_x, self.k_y),
             *(self.out_y, turned, lines),
             n_bands=n,
@@ -69,13 +71,13 @@ class AffineExecutor(Executor):
         out_y_t = self.made("out_y_t", lambda: self._transposed("out_y", self.k_y, n_y))
         out_x_t = self.made("out_x_t", lambda: self._transposed("out_x", n_x, self.k_pad))
         self.from_pixels = self.made("from_pixels", self._gather_back)
-        self.from_lines = self.twist_adjoint.bind(
+        self.from_lines = self.lines_taken.bind(
             *(self.k_y, n_x, n_y),
             *(out_y_t, lines, turned, turn),
             n,
             own=self.own(m=k_y, n=j),
         )
-        self.from_columns = self.to_frequencies(self.mix_adjoint, n_x, turned, out_x_t, j)
+        self.from_columns = self.to_frequencies(self.columns_taken, n_x, turned, out_x_t, j)
 
     def _gather_back(self):
         lines = [p.lines for p in self.plans]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from ..device.contraction import COLUMN_PAD, ImageBatch
+from ..device.contraction import COLUMN_PAD, Contraction, ImageBatch
 from .executor import Executor
 
 
@@ -20,11 +20,13 @@ class DistortedExecutor(Executor):
         self.n_rows = math.prod(plans[0].mapping.shape_out)
         super().__init__(device, dtype, plans)
         self.out_x = self._table([p.out_x for p in plans], self.n_rows, self.k_pad)
+        self.rows_out = Contraction(device, dtype)
+        self.rows_taken = Contraction(device, dtype, **self.mixed_back())
 
     def bind(self):
         super().bind()
         half, z = self.matrix("half", self.n_rows), self.matrix("frequencies")
-        self.to_rows = self.plain.bind(
+        self.to_rows = self.rows_out.bind(
             self.n_rows, self.k_x, self.k_y, self.out_y, z, half, inward=False
         )
         self.rowdot = self._rows("rowdot", (self.tuning.line_group, 1), half).bind(n=self.k_x)
@@ -33,7 +35,7 @@ class DistortedExecutor(Executor):
         super().bind_back()
         half = self.matrix("half", self.n_rows)
         out_y_t = self.made("out_y_t", lambda: self._transposed("out_y", self.k_y, self.n_rows))
-        self.from_rows = self.to_frequencies(self.mix_adjoint, self.n_rows, out_y_t, half)
+        self.from_rows = self.to_frequencies(self.rows_taken, self.n_rows, out_y_t, half)
         self.rowscale = self._rows("rowscale", (COLUMN_PAD, 1), half)
 
     def _rows(self, name, local_size, half):

@@ -24,6 +24,7 @@ from typing import Self
 from ..device.contraction import Contraction, ImageBatch, Matrix
 from .parts.tables import Tables
 from .parts.terms import Terms
+from .parts.waves import waves
 
 
 class Executor(Tables):
@@ -36,11 +37,16 @@ class Executor(Tables):
     def __init__(self, device, dtype, plans):
         super().__init__(device, dtype, plans)
         self.terms = Terms(self) if self.n_terms > 1 else None
-        self.plain = Contraction(device, dtype)
-        self.strided = Contraction(device, dtype, strided=self.axes != (0, 1))
-        self.ragged = Contraction(device, dtype, ragged=True)
-        self.mix = Contraction(device, dtype, epilogue="MIX")
-        self.mix_adjoint = Contraction(device, dtype, epilogue="MIX", adjoint=True)
+        strided = self.axes != (0, 1)
+        self.columns_in = self.waves("in_x", "right", strided=strided)
+        self.rows_in = self.waves("in_y", "left")
+        self.rows_mixed_in = self.waves("in_y", "left", epilogue="MIX")
+        self.rows_back = self.waves("in_y", "left", back=True)
+        self.columns_back = self.waves("in_x", "right", back=True, ragged=True)
+
+    def waves(self, name, side, **options) -> Contraction:
+        """The products with a table of waves, or its transpose, on that side."""
+        return waves(self.device, self.dtype, side, mirrored=self.mirrored(name), **options)
 
     def apart(self) -> Self:
         other = super().apart()
@@ -66,7 +72,7 @@ class Executor(Tables):
         once, shared = self.in_x_t._replace(div=1), half._replace(div=n)
         k_y, k_x = self.k_ys, self.k_xs
         self.in_columns, self.in_columns_once = (
-            self.strided.bind(
+            self.columns_in.bind(
                 *(self.n_y, self.k_x, self.n_x),
                 *(model, in_x_t, half),
                 n_bands=in_x_t.div,
@@ -76,7 +82,7 @@ class Executor(Tables):
         )
         d, in_y, own = self.tables(self.transfer), self.in_y._replace(div=n), self.own(m=k_y, n=k_x)
         self.in_rows, self.in_rows_shared = (
-            self.mix.bind(self.k_y, self.k_x, self.n_y, in_y, right, z, d, n, own=own)
+            self.rows_mixed_in.bind(self.k_y, self.k_x, self.n_y, in_y, right, z, d, n, own=own)
             for right in (half, shared)
         )
         if self.terms:
@@ -89,14 +95,14 @@ class Executor(Tables):
         model = ImageBatch.shaped(*self.plans[0].mapping.shape_in).matrix(self.axes)
         k_y, k_x = self.k_ys, self.k_xs
         in_y_t, in_x = self.in_y_t._replace(div=n), self.in_x._replace(div=n)
-        self.back_rows = self.plain.bind(
+        self.back_rows = self.rows_back.bind(
             *(self.n_y, self.k_x, self.k_y),
             *(in_y_t, z, half),
             n_bands=n,
             inward=False,
             own=self.own(n=k_x, k=k_y),
         )
-        self.back_columns = self.ragged.bind(
+        self.back_columns = self.columns_back.bind(
             *(self.n_y, self.n_x, self.k_x),
             *(half, in_x, model),
             n_bands=n,
@@ -136,14 +142,18 @@ class Executor(Tables):
         its own: y (n, My, Mx) into the same scratch."""
         raise NotImplementedError
 
-    def to_frequencies(self, mix: Contraction, k, left: Matrix, right: Matrix, own_k=None):
-        """The product Z = D o (left right), left (ky, k), right (k, kx); `mix` may conjugate D.
-        Where there are terms, it is that without D. own_k (plans,): k of each plan, if not all's"""
-        z, d, n = self.matrix("frequencies"), self.tables(self.transfer), self.n_bands
+    def mixed_back(self) -> dict:
+        """Options of the products to frequencies of the adjoint: with conj(D) o behind them, where
+        that is not left to the terms."""
+        return {} if self.terms else {"epilogue": "MIX", "adjoint": True}
+
+    def to_frequencies(self, product: Contraction, k, left: Matrix, right: Matrix, own_k=None):
+        """The product Z = conj(D) o (left right), left (ky, k), right (k, kx), without D where
+        there are terms; `product` has those options. own_k (plans,): k of each, if not all's"""
+        z, n = self.matrix("frequencies"), self.n_bands
+        d = None if self.terms else self.tables(self.transfer)
         own = self.own(m=self.k_ys, n=self.k_xs, k=own_k)
-        if self.terms:
-            d, mix = None, self.plain
-        return mix.bind(self.k_y, self.k_x, k, left, right, z, d, n, own=own)
+        return product.bind(self.k_y, self.k_x, k, left, right, z, d, n, own=own)
 
     def analyse(self, x: ImageBatch, n, spread=False):
         """Z = D o (Ty I1 Tx) for `n` images, into `model_frequencies`.

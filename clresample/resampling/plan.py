@@ -20,6 +20,7 @@ import numpy as np
 from ..sky.extent import lit_part
 from ..sky.mapping import Around, Mapping
 from ..sky.psf import PSF
+from ..sky.waves import is_mirrored
 from .gridding import KaiserBessel, LineTaps
 from .tables import aligned_tables, distorted_tables, line_tables, waves_along
 from .transfer import Certificate, transfer_function, wrap_radius
@@ -64,7 +65,9 @@ class Plan:
     psfs: of the model and of the observation
     n_bands, n_terms: C bands of the observation, each of which adds up T images of the model, one
         through each PSF of a PSFBasis; 1 where its PSF is the same everywhere
-    d_plus, d_minus (C * T, Hy, Hx) complex: D(+,+), D(+,-) times K^-2 and the half-plane weights
+    d_plus, d_minus (C * T, Hy, Hx) complex: D(+,+), D(+,-) times K^-2 and the half-plane weights,
+        and the phases that take the observed rows and columns, if aligned, or lines, if affine, to
+        their places: their own tables begin and end at equal distances from 0
     in_y (2Hy, Ny), in_x (2Hx, Nx): transforms of the model
     out_y, out_x: aligned (My, 2Hy), (2Hx, Mx); affine (L, 2Hy), (2Hx, J); distorted (P, 2Hy),
         (P, 2Hx)
@@ -130,9 +133,15 @@ class Plan:
 
     def shifted(self, shift) -> tuple[np.ndarray, np.ndarray]:
         """D(+,+), D(+,-) with every observed pixel moved by `shift` (2,) [model px]."""
-        phase_y, phase_x = (np.exp(2j * np.pi * self.nu[i] * shift[self.axes[i]]) for i in (0, 1))
-        phase_y = phase_y[:, None]
-        return self.d_plus * (phase_y * phase_x), self.d_minus * (phase_y * phase_x.conj())
+        return _moved(self.d_plus, self.d_minus, self.nu, [shift[axis] for axis in self.axes])
+
+    @functools.cached_property
+    def mirrored(self) -> dict[str, bool]:
+        """Whether halves of tables mirror each other; of pixels beyond the model they do not."""
+        tables = {"in_y": self.in_y, "in_x": self.in_x}
+        if self.geometry != "distorted":
+            tables |= {"out_y": self.out_y.T, "out_x": self.out_x}
+        return {name: is_mirrored(table) for name, table in tables.items()}
 
 
 def make_plan(
@@ -162,7 +171,6 @@ def make_plan(
     nu, d, max_gain, floored_power = _band(mapping.matrix, psf_in, psf_out, n_fft, precision)
     d = np.broadcast_to(d, (n_bands,) + d.shape[1:])
     n_frequencies = h_y, h_x = len(nu[0]), len(nu[1])
-
     center, axes = (np.array(mapping.shape_in) - 1) / 2, (0, 1)
     if mapping.geometry == "affine":
         tables, d = line_tables(mapping, nu, d, center, precision.window)
@@ -176,7 +184,8 @@ def make_plan(
         if mapping.matrix[0, 0] == 0:
             axes, nu = (1, 0), nu[::-1]
             d_plus, d_minus = d_plus.swapaxes(1, 2), d_minus.swapaxes(1, 2).conj()
-        tables = aligned_tables(mapping, nu, axes, center)
+        tables, middle = aligned_tables(mapping, nu, axes, center)
+        d_plus, d_minus = _moved(d_plus, d_minus, nu, middle)
     in_y, in_x = (
         waves_along(nu[i], -center[axes[i]], 1.0, mapping.shape_in[axes[i]]).T for i in (0, 1)
     )
@@ -195,6 +204,13 @@ def make_plan(
         n_terms=n_terms,
         **tables,
     )
+
+
+def _moved(d_plus, d_minus, nu, way):
+    """D(+,+), D(+,-) with every observed pixel moved by `way` (2,) [model px] along table axes."""
+    phase_y, phase_x = (np.exp(2j * np.pi * nu[i] * way[i]) for i in (0, 1))
+    phase_y = phase_y[:, None]
+    return d_plus * (phase_y * phase_x), d_minus * (phase_y * phase_x.conj())
 
 
 def _check_size(mapping, psf_out, n_fft, n_bands):

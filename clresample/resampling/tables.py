@@ -20,14 +20,17 @@ def waves_along(nu, first, step, n) -> np.ndarray:
 
 
 def aligned_tables(mapping: Mapping, nu, axes, center):
-    """Waves at the observed rows and columns, zero where the model does not cover them."""
-    tables = []
+    """Waves at the observed rows and columns about their middle, zero where the model does not
+    cover them; and how far off the model's middle that is (2,) [model px]."""
+    tables, middle = [], []
     for i in (0, 1):
-        axis = axes[i]
-        first, step = mapping.offset[axis] - center[axis], mapping.matrix[axis, i]
-        table = waves_along(nu[i], first, step, mapping.shape_out[i])
+        axis, n = axes[i], mapping.shape_out[i]
+        step = mapping.matrix[axis, i]
+        reach = step * (n - 1) / 2
+        table = waves_along(nu[i], -reach, step, n)
         tables.append(table * mapping.covered.any(axis=1 - i)[:, None])
-    return {"out_y": tables[0], "out_x": tables[1].T}
+        middle.append(mapping.offset[axis] + reach - center[axis])
+    return {"out_y": tables[0], "out_x": tables[1].T}, middle
 
 
 def distorted_tables(mapping: Mapping, nu, center):
@@ -45,7 +48,7 @@ def line_tables(mapping: Mapping, nu, d, center, window: KaiserBessel):
 
     Along a line a plane wave has the single frequency nu_x + r nu_y; columns finer than its Nyquist
     spacing by window.oversampling carry it, divided by the window's transform.  Returns
-    (tables, d).
+    (tables, d): the lines' waves are about the middle line, d takes them to its place.
     """
     slope = np.abs(mapping.matrix[1]) / np.linalg.norm(mapping.matrix, axis=0)
     by_row = slope[1] >= slope[0]
@@ -60,7 +63,9 @@ def line_tables(mapping: Mapping, nu, d, center, window: KaiserBessel):
     along = nu_x_both + r * nu[0][:, None]
     nu_max = max(np.abs(along[(d != 0).any(axis=0)]).max(), np.finfo(float).tiny ** 0.5)
     spacing = min(1 / (2 * nu_max * window.oversampling), float(max(mapping.shape_in)))
-    d = d / window.transform(along * spacing)
+    reach = (a - r * c) * (n_lines - 1) / 2
+    middle = np.exp(2j * np.pi * nu[0] * (t_y - r * t_x + reach))
+    d = d / window.transform(along * spacing) * middle[:, None]
 
     x = c * np.arange(n_lines)[:, None] + e * np.arange(n_steps) + t_x
     x_first, x_last = x[covered].min(), x[covered].max()
@@ -72,7 +77,7 @@ def line_tables(mapping: Mapping, nu, d, center, window: KaiserBessel):
     start = np.where(covered, below.astype(int) + 1, 0)
     weight = window.taps(u - window.n_taps / 2 - below) * covered[:, :, None]
     return {
-        "out_y": waves_along(nu[0], t_y - r * t_x, a - r * c, n_lines),
+        "out_y": waves_along(nu[0], -reach, a - r * c, n_lines),
         "out_x": waves_along(nu[1], column0, spacing, n_columns).T,
         "twist": even_waves(nu[0], r * column0, r * spacing, n_columns).T,
         "lines": LineTaps(bool(by_row), start, weight.swapaxes(1, 2), covered, n_columns),

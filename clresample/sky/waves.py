@@ -6,6 +6,9 @@ import math
 
 import numpy as np
 
+# Largest error of a wave, of amplitude 1, that is made in float64.
+ROUNDING = 1e-12
+
 
 def phases(frequencies, positions):
     """2 pi f u (F, U) [rad] for f (F,) [cycles/px], u (U,) [px], whole cycles taken off.
@@ -29,6 +32,14 @@ def even_waves(frequencies, first, step, n):
     positions = np.concatenate([step * fine, first + step * coarse])
     few = np.exp(1j * phases(positions, frequencies))
     return (few[block:, None] * few[:block]).reshape(-1, len(frequencies))[:n]
+
+
+def is_mirrored(table) -> bool:
+    """Whether cosines, the rows 2i of a table of waves (2 H, n), are even about the middle of its n
+    positions, and sines, the rows 2i + 1, odd; up to rounding in float64."""
+    sign = np.where(np.arange(len(table)) % 2, -1.0, 1.0)
+    mirrored = sign[:, None] * table[:, ::-1]
+    return bool(np.abs(table - mirrored).max(initial=0) <= ROUNDING)
 
 
 def cos_sin_columns(angle):

@@ -58,13 +58,7 @@ class FoldedExecutor:
 
     def set_transfer(self, transfer):
         """Take the transfer functions, one pair D(+,+), D(+,-) (C, Hy, Hx), in a list."""
-        mapping, nu, axes = self.plan.mapping, self.plan.nu, self.plan.axes
-        ends = ((np.array(shape) - 1) / 2 for shape in (mapping.shape_in, mapping.shape_out))
-        middle_in, middle_out = ends
-        way = mapping.matrix @ middle_out + mapping.offset - middle_in
-        y, x = (np.exp(2j * np.pi * nu[i] * way[axes[i]]) for i in (0, 1))
         ((d_plus, d_minus),) = transfer
-        d_plus, d_minus = d_plus * (y[:, None] * x), d_minus * (y[:, None] * x.conj())
         for i, plane in enumerate((d_plus.real, d_plus.imag, d_minus.real, d_minus.imag)):
             self._transfer[:, :, i, : plane.shape[2]] = plane
         if self.scratch:

@@ -14,7 +14,6 @@ import functools
 
 import numpy as np
 
-from ....device.contraction import ImageBatch
 from ....resampling.plan import Precision
 from ....resampling.resampler import EXECUTORS
 from ..boxes import Boxes
@@ -76,6 +75,8 @@ class WindowOperator:
     shape_in, shape_out (3,); low (G, 2): the windows' first pixels in the observation
     """
 
+    is_identity = False
+
     def __init__(self, op, groups):
         plan, self.op, self._groups = op.plans[0], op, groups
         shape = tuple(groups.shape.tolist())
@@ -96,19 +97,6 @@ class WindowOperator:
     def executor(self):
         """What computes it, with intermediates of its own."""
         return self._executor.apart()
-
-    def forward_into(self, frames, windows):
-        """Queue windows = R frames, of all groups."""
-        self._run(self._executor.forward, frames, windows)
-
-    def adjoint_into(self, windows, frames):
-        """Queue frames = R^T windows, of all groups."""
-        self._run(self._executor.adjoint, windows, frames)
-
-    def _run(self, chain, source, target):
-        n = len(self._groups) * self.shape_in[0]
-        self._executor.reserve(n)
-        chain(ImageBatch.of(source), ImageBatch.of(target), n)
 
 
 class _Part:

@@ -1,0 +1,194 @@
+"""Products with tables of waves in half the operations, against NumPy; where they are used."""
+
+import numpy as np
+import pytest
+from helpers.products import TILES, check, need, put_right, random
+from helpers.tuning import tune
+
+from clresample import PSF, Grid, Resampler
+from clresample.device.contraction import Contraction, Matrix, Own, padded
+from clresample.resampling.parts.waves import Waves, waves
+from clresample.sky.waves import is_mirrored
+
+# Tiles of CPUs, the only devices with this kernel, each in one type.
+CASES = [("device's", np.float32), ("device's", np.float64)]
+CASES += [("CPU", np.float64), ("wide CPU", np.float32), ("pairs", np.float32)]
+# Pixels and frequencies: few, odd, more than a stretch of pairs of either, and more than a tile.
+SIZES = [(1, 1), (2, 1), (7, 5), (40, 33), (135, 70)]
+N_BATCH, N_OTHER = 3, 21
+every_size = pytest.mark.parametrize(("n", "h"), SIZES, ids=lambda size: str(size))
+
+
+@pytest.fixture(params=CASES, ids=lambda case: f"{case[0]}-{case[1].__name__}")
+def dtype(request, device, monkeypatch):
+    """A floating type, with a tile for it."""
+    name, dtype = request.param
+    need(device, dtype)
+    if name != "device's":
+        tune(monkeypatch, tile=TILES[name], row_choices=())
+    elif "KB" in Contraction(device, dtype).tuning.tile:
+        pytest.skip("for CPUs")
+    return dtype
+
+
+def table(n, h):
+    """Waves (2 h, n) at n pixels about their middle."""
+    angle = 2 * np.pi * np.outer(np.arange(h) / (1.3 * n + 7), np.arange(n) - (n - 1) / 2)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1).reshape(2 * h, n)
+
+
+def left(device, a, dtype):
+    """A left factor (m, k), or one for each item (B, m, k)."""
+    return Matrix(device.put(a, dtype).base_data, a.shape[-1], a[0].size if a.ndim > 2 else 0)
+
+
+def right(device, b, dtype):
+    wide = put_right(device, b, dtype)
+    return Matrix(wide.base_data, wide.shape[-1], wide[0].size if b.ndim > 2 else 0)
+
+
+def result(device, m, n, dtype):
+    return device.put(np.full((N_BATCH, m + 2, padded(n)), 7.0), dtype)
+
+
+def check_padded(device, found, truth, dtype):
+    """The product, zeros beyond its columns, and nothing beyond its rows."""
+    found, (m, n) = device.get(found), truth.shape[-2:]
+    check(found[:, :m, :n], truth, dtype)
+    assert not found[:, :m, n : (n + 15) // 16 * 16].any()
+    assert (found[:, m:] == 7).all()
+
+
+@every_size
+def test_to_waves_from_the_left(device, dtype, n, h):
+    w, x = table(n, h), random(N_BATCH, n, N_OTHER)
+    c = result(device, 2 * h, N_OTHER, dtype)
+    into = Matrix(c.base_data, c.shape[-1], c[0].size)
+    factors = left(device, w, dtype), right(device, x, dtype), into
+    Waves(device, dtype, "left").bind(2 * h, N_OTHER, n, *factors)(N_BATCH)
+    check_padded(device, c, w @ x, dtype)
+
+
+@every_size
+def test_to_waves_from_the_right(device, dtype, n, h):
+    w, x = table(n, h), random(N_BATCH, N_OTHER, n)
+    c = result(device, N_OTHER, 2 * h, dtype)
+    into = Matrix(c.base_data, c.shape[-1], c[0].size)
+    Waves(device, dtype, "right").bind(
+        N_OTHER, 2 * h, n, left(device, x, dtype), right(device, w.T, dtype), into
+    )(N_BATCH)
+    check_padded(device, c, x @ w.T, dtype)
+
+
+@every_size
+def test_back_from_the_left(device, dtype, n, h):
+    w, z = table(n, h), random(N_BATCH, 2 * h, N_OTHER)
+    c = result(device, n, N_OTHER, dtype)
+    into = Matrix(c.base_data, c.shape[-1], c[0].size)
+    Waves(device, dtype, "left", back=True).bind(
+        n, N_OTHER, 2 * h, left(device, w.T.copy(), dtype), right(device, z, dtype), into
+    )(N_BATCH)
+    check_padded(device, c, w.T @ z, dtype)
+
+
+@every_size
+@pytest.mark.parametrize("transposed", [False, True])
+def test_back_from_the_right_into_a_callers_images(device, dtype, n, h, transposed):
+    w, z = table(n, h), random(N_BATCH, N_OTHER, 2 * h)
+    images = np.full((N_BATCH + 1, n, N_OTHER) if transposed else (N_BATCH + 1, N_OTHER, n), 7.0)
+    c = device.put(images, dtype)
+    ld, step = (1, N_OTHER) if transposed else (n, 1)
+    # from the second image on
+    into = Matrix(c.base_data, ld, N_OTHER * n, step=step, offset=N_OTHER * n)
+    Waves(device, dtype, "right", back=True, ragged=True).bind(
+        N_OTHER, n, 2 * h, left(device, z, dtype), right(device, w, dtype), into
+    )(N_BATCH)
+    found, truth = device.get(c), z @ w
+    check(found[1:], truth.swapaxes(1, 2) if transposed else truth, dtype)
+    assert (found[0] == 7).all()
+
+
+def test_of_a_callers_images_transposed(device, dtype):
+    w, x = table(30, 9), random(N_BATCH, 30, N_OTHER)
+    c = result(device, N_OTHER, 18, dtype)
+    given = Matrix(device.put(x, dtype).base_data, 1, 30 * N_OTHER, step=N_OTHER)
+    Waves(device, dtype, "right", strided=True).bind(
+        *(N_OTHER, 18, 30),
+        *(given, right(device, w.T, dtype), Matrix(c.base_data, c.shape[-1], c[0].size)),
+    )(N_BATCH)
+    check_padded(device, c, x.swapaxes(1, 2) @ w.T, dtype)
+
+
+@pytest.mark.parametrize("epilogue", ["MIX", "TWIST"])
+@pytest.mark.parametrize("adjoint", [False, True])
+def test_epilogues_are_those_of_the_contraction(device, dtype, epilogue, adjoint):
+    n, h, n_other = 31, 13, 30
+    w, x = table(n, h), random(N_BATCH, n, n_other)
+    planes = 4 if epilogue == "MIX" else 2
+    e = device.put(random(h, planes, padded(n_other) * 2 // planes), dtype)
+    found = []
+    for make in (Contraction, lambda *a, **o: Waves(*a, "left", **o)):
+        c = result(device, 2 * h, n_other, dtype)
+        make(device, dtype, epilogue=epilogue, adjoint=adjoint).bind(
+            *(2 * h, n_other, n, left(device, w, dtype), right(device, x, dtype)),
+            Matrix(c.base_data, c.shape[-1], c[0].size),
+            (e.base_data, 0, 0),
+        )(N_BATCH)
+        found.append(device.get(c)[:, : 2 * h, :n_other])
+    check(found[1], found[0], dtype)
+
+
+def test_items_have_waves_of_their_own(device, dtype):
+    """As frequencies of scenes with other PSFs: fewer than the layout has room for."""
+    n, h = 24, [5, 9, 7]
+    w = np.zeros((3, 18, n))
+    for item, n_own in zip(w, h, strict=True):
+        item[: 2 * n_own] = table(n, n_own)
+    which = device.put(np.array([2, 0, 1]), np.int32)
+    own, order = 2 * np.array(h), [2, 0, 1]
+    x, z = random(N_BATCH, n, N_OTHER), random(N_BATCH, 18, N_OTHER)
+    c, back = result(device, 18, N_OTHER, dtype), result(device, n, N_OTHER, dtype)
+    tables = left(device, w, dtype)._replace(own=True)
+    transposed = left(device, w.swapaxes(1, 2).copy(), dtype)._replace(own=True)
+    into, out = (Matrix(a.base_data, a.shape[-1], a[0].size) for a in (c, back))
+    Waves(device, dtype, "left").bind(
+        18, N_OTHER, n, tables, right(device, x, dtype), into, own=Own(which, m=own)
+    )(N_BATCH)
+    Waves(device, dtype, "left", back=True).bind(
+        n, N_OTHER, 18, transposed, right(device, z, dtype), out, own=Own(which, k=own)
+    )(N_BATCH)
+    found, found_back = device.get(c), device.get(back)
+    for b, t in enumerate(order):
+        k = own[t]
+        check(found[b, :k, :N_OTHER], w[t, :k] @ x[b], dtype)
+        assert (found[b, k:] == 7).all()
+        check(found_back[b, :n, :N_OTHER], w[t, :k].T @ z[b, :k], dtype)
+
+
+def test_tables_that_are_not_mirrored_take_the_whole_product(device):
+    w = table(20, 6)
+    assert is_mirrored(w)
+    off = w.copy()
+    off[:, -1] = 0  # a pixel that the model does not cover
+    assert not is_mirrored(off)
+    assert not is_mirrored(w[1:])  # sines first
+    assert type(waves(device, np.float32, "left", mirrored=False)) is Contraction
+
+
+@pytest.mark.parametrize(
+    ("given", "observed"),
+    [
+        ({}, True),
+        ({"angle_deg": 20}, True),
+        ({"angle_deg": 90, "flip": True}, True),
+        ({"center_arcsec": (2.5, 0)}, False),  # partly beyond the model, on one side
+    ],
+)
+def test_which_operators_multiply_by_halves(given, observed):
+    model, wide = Grid.flat((64, 66), 0.1), Grid.flat((20, 22), 0.2, **given)
+    (plan,) = Resampler(model, PSF.gaussian(0.8), wide, PSF.gaussian(1.5)).plans
+    assert plan.mirrored["in_y"]
+    assert plan.mirrored["in_x"]
+    # lines have no halves along them: their columns go as far as taps reach
+    ends = ("out_y",) if plan.lines else ("out_y", "out_x")
+    assert all(plan.mirrored[name] for name in ends) == observed
