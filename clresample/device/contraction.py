@@ -133,11 +133,22 @@ class Contraction:
     adjoint: conjugate the epilogue
     ragged: C is a caller's array, of any strides; otherwise its rows are padded with zeros
     strided: A's columns may be any distance apart; otherwise they are adjacent
+    tuning: that of device and dtype, where it is at hand: to work it out takes 60 us
     """
 
-    def __init__(self, device, dtype, *, epilogue=None, adjoint=False, ragged=False, strided=False):
+    def __init__(
+        self,
+        device,
+        dtype,
+        *,
+        epilogue=None,
+        adjoint=False,
+        ragged=False,
+        strided=False,
+        tuning=None,
+    ):
         self.device, self.dtype = device, dtype
-        self.tuning = Tuning.of(device, dtype)
+        self.tuning = tuning or Tuning.of(device, dtype)
         self.options = {"SIGN": -1 if adjoint else 1, "RAGGED": ragged, "STRIDED": strided}
         self.options |= {epilogue: True} if epilogue else {}
 

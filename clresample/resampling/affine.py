@@ -28,10 +28,10 @@ class AffineExecutor(Executor):
         self.out_x = self._table([p.out_x for p in plans], self.k_x, self.n_pad)
         turns = [np.stack([p.twist.real, p.twist.imag], axis=1) for p in plans]
         self.turn = self._table(turns, self.h_y, 2, self.n_pad)
-        self.twist = Contraction(device, dtype, epilogue="TWIST")
+        self.twist = Contraction(device, dtype, epilogue="TWIST", tuning=self.tuning)
         self.lines_out = self.waves("out_y", "left", back=True)
         self.lines_taken = self.waves("out_y", "left", epilogue="TWIST", adjoint=True)
-        self.columns_taken = Contraction(device, dtype, **self.mixed_back())
+        self.columns_taken = Contraction(device, dtype, tuning=self.tuning, **self.mixed_back())
         lines = [p.lines for p in plans]
         self.to_pixels = Gather(
             self, [p.start for p in lines], [p.weight for p in lines], self.n_columns, self.n_steps

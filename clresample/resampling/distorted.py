@@ -20,8 +20,8 @@ class DistortedExecutor(Executor):
         self.n_rows = math.prod(plans[0].mapping.shape_out)
         super().__init__(device, dtype, plans)
         self.out_x = self._table([p.out_x for p in plans], self.n_rows, self.k_pad)
-        self.rows_out = Contraction(device, dtype)
-        self.rows_taken = Contraction(device, dtype, **self.mixed_back())
+        self.rows_out = Contraction(device, dtype, tuning=self.tuning)
+        self.rows_taken = Contraction(device, dtype, tuning=self.tuning, **self.mixed_back())
 
     def bind(self):
         super().bind()

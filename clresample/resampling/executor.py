@@ -46,7 +46,8 @@ class Executor(Tables):
 
     def waves(self, name, side, **options) -> Contraction:
         """The products with a table of waves, or its transpose, on that side."""
-        return waves(self.device, self.dtype, side, mirrored=self.mirrored(name), **options)
+        options |= {"mirrored": self.mirrored(name), "tuning": self.tuning}
+        return waves(self.device, self.dtype, side, **options)
 
     def apart(self) -> Self:
         other = super().apart()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ...device.contraction import ROW_TILES, Contraction, whole
+from ...device.tuning import Tuning
 
 FILE, BACK_FILE = "waves.cl", "waves_back.cl"
 # Tiles that a work-item takes one below the other where sums and differences are made for it: of
@@ -11,7 +12,7 @@ FILE, BACK_FILE = "waves.cl", "waves_back.cl"
 OF_ROWS, OF_COLUMNS = 4, 16
 
 
-def waves(device, dtype, side, *, back=False, mirrored=True, **options) -> Contraction:
+def waves(device, dtype, side, *, back=False, mirrored=True, tuning=None, **options) -> Contraction:
     """The Contraction that is the quickest for one factor that is a table of waves (2 h, n), rows
     2i, 2i + 1 the cosines and sines of frequency i, or its transpose.
 
@@ -19,11 +20,11 @@ def waves(device, dtype, side, *, back=False, mirrored=True, **options) -> Contr
     back: from waves to pixels, a product with W on the right or W^T on the left; else W^T on the
         right or W on the left
     mirrored: whether all tables are, see `sky.waves.is_mirrored`
-    options: Contraction's
+    tuning, options: Contraction's
     """
-    plain = Contraction(device, dtype, **options)
-    if not mirrored or "KB" in plain.tuning.tile:
-        return plain
+    options["tuning"] = tuning or Tuning.of(device, dtype)
+    if not mirrored or "KB" in options["tuning"].tile:
+        return Contraction(device, dtype, **options)
     return Waves(device, dtype, side, back=back, **options)
 
 
