@@ -1,4 +1,5 @@
-/* The end of both contraction kernels, pasted into their bodies: the epilogue, then the stores.
+/* The end of the contraction kernels and of waves.cl, pasted into their bodies: the epilogue, then
+ * the stores.
  *
  * acc[MR][NV]: the sums of rows i0 + i and of the VW columns from column[v] on. A kernel defines
  * OWNED(i, v), whether they lie inside C, and STORE_LANES(sums, c, n_left), which stores the lanes

@@ -59,9 +59,12 @@ void waves(int m, int n, const int n_pad, int k,
     const int top = (int)get_global_id(1) * MR * RT;
     const int b = (int)get_global_id(2);
     TAKE_OWN
-    const int n_pairs = k / 2, width = (n + 15) / 16 * 16;
+    const int n_pairs = k / 2, n_sums = n, width = (n + 15) / 16 * 16;
     const int bottom = m - top < MR * RT ? m : top + MR * RT;
     if (j0 >= width || top >= m) return;
+#if SIDE == 1
+    if (j0 > 0) return;                     /* one takes all columns */
+#endif
     A += offset_a + TABLE(div_a) * stride_a;
     B += TABLE(div_b) * stride_b;
     C += offset_c + (size_t)b * stride_c;
@@ -88,6 +91,7 @@ void waves(int m, int n, const int n_pad, int k,
         /* two tiles at a time: the rows of both that are cosines, then those that are sines */
         for (int i_two = top; i_two < bottom; i_two += 2 * MR) {
             WIDE sums[2][MR][NV];
+            if (NV > 1) UNROLL(odd, 2) CLEAR(sums[odd], MR, NV)     /* a vector may be left out */
             UNROLL(i, 2 * MR) TO_WRITE(C + (size_t)(i_two + i) * ld_c + j0)
             UNROLL(odd, 2) {
                 __global const REAL *row[MR];

@@ -16,11 +16,12 @@
  *
  * Tiles, layout, batches, epilogues, OWN and arguments are those of contract.cl, but for this:
  *   Terms are summed in stretches of FOLDED pairs, the smallest first: from both ends of an image
- *   towards its middle, and from the highest frequency down.
- *   W X has epilogues, Z W is RAGGED, X W^T may be STRIDED; the others are none of these.
+ *   towards its middle, and from the highest frequency down. There is no `block` or `inward`.
+ *   Only W X has epilogues; Z W alone is RAGGED, and always; X W^T alone may be STRIDED.
  *
- * Launch: as there, for the half of C's rows or columns that are summed on the way back. A
- * work-item takes RT tiles of MR rows, of MR / 2 back; NV VW columns, or all of X W^T.
+ * Launch: (columns, rows, batch) as there, of W^T Z for the first half of its rows, of Z W for the
+ * first half of its columns, of X W^T with one work-item for all columns. A work-item takes RT
+ * tiles of MR rows, of MR / 2 on the way back.
  */
 #include "contract.h"
 
@@ -33,7 +34,7 @@
 #ifndef READ_AHEAD  /* 1: fetch what is soon needed, as contract.cl */
 #define READ_AHEAD 0
 #endif
-#ifndef FOLDED      /* pairs of a stretch: with 128, sums are rounded twice as much */
+#ifndef FOLDED      /* pairs of a stretch: with 128, sums of 400 pixels are rounded more */
 #define FOLDED 64
 #endif
 
@@ -46,7 +47,7 @@
 #define TAKE_NEXT const long next = j0 + NV * VW < width ? j0 + NV * VW : stride_b;
 #else
 #define NEXT_COLUMNS(from)
-#define TO_WRITE(c)
+#define TO_WRITE(c) {}
 #define TAKE_NEXT
 #endif
 
@@ -54,7 +55,7 @@
 #define TAKE_COLUMNS UNROLL(v, NV) column[v] = j0 + v * VW < width ? j0 + v * VW : j0;
 /* add(rows, vectors) of a tile, or of what it has inside: one vector, or half of its rows. */
 #define INSIDE(n_rows, add) { \
-        if (NV > 1 && width - j0 <= VW) add(MR, 1) \
+        if (NV > 1 && n_sums - j0 <= VW) add(MR, 1) \
         else if (MR > 2 && (n_rows) <= MR / 2) add(MR / 2, NV) \
         else add(MR, NV) \
     }

@@ -57,7 +57,7 @@ from clresample.deblending.solver.constraints import (  # noqa: E402
 from clresample.deblending.solver.gradient import Gradient  # noqa: E402
 from clresample.deblending.solver.learned.engine import LearnedEngine  # noqa: E402
 from clresample.device import tuning  # noqa: E402
-from clresample.device.launcher import Launcher  # noqa: E402
+from clresample.device.program import Launcher  # noqa: E402
 
 FAULTS = {
     "race": "__kernel void race(__global float *x) { x[0] += get_global_id(0); }",

@@ -28,7 +28,7 @@ from clresample import (
     get_device,
 )
 from clresample.cli.machine.measure import best_seconds
-from clresample.device.launcher import Launcher
+from clresample.device.program import Launcher
 
 N_RENDERS, RENDER_THREADS, N_FITS, FIT_THREADS = 800, 4, 24, 3
 SHAPE, N_DIFFERENT = (100, 90), 8  # [model px] of an image; images or blends that differ

@@ -96,7 +96,7 @@ def run(arguments):
     paths = folder_outputs(arguments, OUTPUTS[: 3 if arguments.no_figure else 4])
     _progress(arguments, f"reading {arguments.scene}")
     from ..device.device import get_device
-    from ..resampling.parts.waves import operator_programs
+    from ..device.waves import operator_programs
 
     device = get_device(arguments.device)
     device.build_ahead(operator_programs(device, arguments.dtype))

@@ -146,7 +146,7 @@ def run(arguments):
     }
     paths = file_outputs(arguments, inputs.values())
     from ..device.device import get_device
-    from ..resampling.parts.waves import operator_programs
+    from ..device.waves import operator_programs
 
     device = get_device(arguments.device)
     device.build_ahead(operator_programs(device, arguments.dtype))

@@ -33,9 +33,8 @@ from .discovery import (
     ranked,
 )
 from .errors import FULL, explained, forked, status_of, too_large
-from .launcher import Launcher
 from .profile import started
-from .program import Programs
+from .program import Launcher, Programs
 from .remembered import DeviceWarning, Remembered
 
 __all__ = ["Device", "get_device"]

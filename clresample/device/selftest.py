@@ -1,6 +1,6 @@
 """A small render on a device against NumPy: a driver that computes wrongly is found at once.
 
-    Y = Re[ Sy (D o (Ty X Tx)) Sx ]     as in kernels/contract.cl, by three of its builds
+    Y = Re[ Sy (D o (Ty X Tx)) Sx ]     by the kernels that aligned operators take there
 
 A render of random numbers passes every step of an aligned operator: products of cos and sin
 waves, the transfer function, and rows that are stored one element at a time.
@@ -13,8 +13,9 @@ from contextlib import suppress
 
 import numpy as np
 
-from .contraction import FILE, GROUP_FILE, Contraction, Matrix, padded
+from .contraction import FILE, GROUP_FILE, Matrix, padded
 from .program import read_kernel
+from .waves import BACK_FILE, FILE as WAVES_FILE, waves
 
 # [1] Largest relative error, L2. float32 on a sound device leaves 1e-7; a wrong driver, one that
 # computes in half precision, or one that loses a row, leaves 1e-3 and more.
@@ -30,8 +31,8 @@ def fault(device, remembered):
 
     remembered: the Remembered of the device
     """
-    sources = read_kernel(FILE) + read_kernel(GROUP_FILE)
-    kernels = hashlib.sha256(sources.encode()).hexdigest()
+    files = FILE, GROUP_FILE, WAVES_FILE, BACK_FILE
+    kernels = hashlib.sha256("".join(map(read_kernel, files)).encode()).hexdigest()
     if remembered.read(PART) == kernels:
         return None
     found, truth = render(device), reference()
@@ -86,19 +87,18 @@ def render(device):
     out_y, out_x, transfer = device.put(sy.T, dtype), put(sx), device.put(planes, dtype)
     half, z, lines = (device.empty((n, padded(k_x)), dtype) for n in (N_Y, 2 * H_Y, M_Y))
     image = device.empty((M_Y, M_X), dtype)
-    plain = Contraction(device, dtype)
-    mix, ragged = (
-        Contraction(device, dtype, epilogue="MIX"),
-        Contraction(device, dtype, ragged=True),
-    )
 
     def matrix(array):
         return Matrix(array.base_data, array.shape[1])
 
-    plain.bind(N_Y, k_x, N_X, matrix(model), matrix(right), matrix(half))(1)
-    mix.bind(2 * H_Y, k_x, N_Y, matrix(left), matrix(half), matrix(z), (transfer.base_data, 0, 0))(
-        1
-    )
-    plain.bind(M_Y, k_x, 2 * H_Y, matrix(out_y), matrix(z), matrix(lines))(1)
-    ragged.bind(M_Y, M_X, k_x, matrix(lines), matrix(out_x), matrix(image))(1)
+    def product(side, **options):
+        return waves(device, dtype, side, **options).bind
+
+    d = transfer.base_data, 0, 0
+    product("right")(N_Y, k_x, N_X, matrix(model), matrix(right), matrix(half))(1)
+    to_frequencies = product("left", epilogue="MIX")
+    to_frequencies(2 * H_Y, k_x, N_Y, matrix(left), matrix(half), matrix(z), d)(1)
+    product("left", back=True)(M_Y, k_x, 2 * H_Y, matrix(out_y), matrix(z), matrix(lines))(1)
+    to_pixels = product("right", back=True, ragged=True)
+    to_pixels(M_Y, M_X, k_x, matrix(lines), matrix(out_x), matrix(image))(1)
     return device.get(image)

@@ -12,7 +12,8 @@ class AffineExecutor(Executor):
     """Any affine mapping in two passes: columns of the model to lines, then along each line.
 
     Observed rows, or columns, are L lines through the model; J equidistant columns cross them.
-    Sx (kx, J), Sy (L, ky): waves at the columns, and where the lines cut the model's middle column
+    Sx (kx, J), Sy (L, ky): waves at the columns, and where the lines cut the model's middle column,
+        about the middle line
     twist: multiplies column frequencies by the conjugate of waves (Hy, J), which shears the lines
     gather: from the J columns of a line to its observed pixels; see LineTaps
     """

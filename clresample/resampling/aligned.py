@@ -9,7 +9,7 @@ from .executor import Executor
 class AlignedExecutor(Executor):
     """Grids whose axes are parallel, crossed or mirrored: four thin products each way.
 
-    Sy (My, ky), Sx (kx, Mx): waves at the observed rows and columns
+    Sy (My, ky), Sx (kx, Mx): waves at the observed rows and columns, about their middle
     """
 
     def __init__(self, device, dtype, plans):

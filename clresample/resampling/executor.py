@@ -22,9 +22,9 @@ from __future__ import annotations
 from typing import Self
 
 from ..device.contraction import Contraction, ImageBatch, Matrix
+from ..device.waves import serves, waves
 from .parts.tables import Tables
 from .parts.terms import Terms
-from .parts.waves import waves
 
 
 class Executor(Tables):
@@ -46,8 +46,9 @@ class Executor(Tables):
 
     def waves(self, name, side, **options) -> Contraction:
         """The products with a table of waves, or its transpose, on that side."""
-        options |= {"mirrored": self.mirrored(name), "tuning": self.tuning}
-        return waves(self.device, self.dtype, side, **options)
+        mirrored = serves(self.tuning) and self.mirrored(name)
+        given = {"mirrored": mirrored, "tuning": self.tuning}
+        return waves(self.device, self.dtype, side, **given, **options)
 
     def apart(self) -> Self:
         other = super().apart()
@@ -144,13 +145,13 @@ class Executor(Tables):
         raise NotImplementedError
 
     def mixed_back(self) -> dict:
-        """Options of the products to frequencies of the adjoint: with conj(D) o behind them, where
-        that is not left to the terms."""
+        """Options of the product `to_frequencies`: it multiplies its result by conj(D), unless
+        that is left to the terms."""
         return {} if self.terms else {"epilogue": "MIX", "adjoint": True}
 
     def to_frequencies(self, product: Contraction, k, left: Matrix, right: Matrix, own_k=None):
         """The product Z = conj(D) o (left right), left (ky, k), right (k, kx), without D where
-        there are terms; `product` has those options. own_k (plans,): k of each, if not all's"""
+        there are terms. product: made with `mixed_back`; own_k (plans,): k of each, if not all's"""
         z, n = self.matrix("frequencies"), self.n_bands
         d = None if self.terms else self.tables(self.transfer)
         own = self.own(m=self.k_ys, n=self.k_xs, k=own_k)

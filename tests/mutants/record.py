@@ -40,7 +40,7 @@ class Recorder:
     def pytest_collection_finish(self, session):
         """Lines run when modules are imported belong to no test: the tracing begins after it."""
         from clresample import Device
-        from clresample.device.launcher import Launcher
+        from clresample.device.program import Launcher
 
         launcher, call, add = Device.launcher, Launcher.__call__, self._ran.add
 

@@ -1,4 +1,4 @@
-"""What executors are made of: their memory on the device, and sums over an operator's terms.
+"""What executors are made of: their memory on the device, tables, and sums over terms.
 
 Imports device alone.
 """

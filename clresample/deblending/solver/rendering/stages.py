@@ -38,7 +38,6 @@ class Frames:
 
     def __init__(self, buffers, i_observation, op):
         self.buffers, self._op, n = buffers, op, len(buffers.scenes)
-        self._n_images = n * op.shape_out[0]
         self._model = buffers.device.empty((n, *op.shape_in), buffers.dtype)
         self._composition = Composition(buffers, i_observation, buffers.host_boxes, op.shape_in[1:])
 
@@ -49,25 +48,11 @@ class Frames:
     def render(self, spectra, image):
         """Queue the image (B, Co, My, Mx) of the morphologies with spectra (S, C)."""
         self._composition.compose(self._morph, spectra, self._model)
-        if self._op.is_identity:
-            self._op.forward_into(self._model, image)
-        else:
-            self._executor.forward(*map(ImageBatch.of, (self._model, image)), self._n_images)
+        self._op.queue_plain("forward", self._model, image)
 
     def collect(self, image):
         """Queue the way back of an image (B, Co, My, Mx), whose gradients are asked for next."""
-        if self._op.is_identity:
-            self._op.adjoint_into(image, self._model)
-        else:
-            self._executor.adjoint(*map(ImageBatch.of, (image, self._model)), self._n_images)
-
-    @functools.cached_property
-    def _executor(self):
-        """In float32 also where the operator itself would go through float64, which takes longer:
-        the other stages round as much."""
-        executor = self._op.executor()
-        executor.reserve(self._n_images)
-        return executor
+        self._op.queue_plain("adjoint", image, self._model)
 
     def gather_spectra(self, d_spectra):
         """Queue dA of this observation's channels into d_spectra (S, C)."""

@@ -14,6 +14,7 @@ import functools
 
 import numpy as np
 
+from ....device.contraction import ImageBatch
 from ....resampling.plan import Precision
 from ....resampling.resampler import EXECUTORS
 from ..boxes import Boxes
@@ -75,8 +76,6 @@ class WindowOperator:
     shape_in, shape_out (3,); low (G, 2): the windows' first pixels in the observation
     """
 
-    is_identity = False
-
     def __init__(self, op, groups):
         plan, self.op, self._groups = op.plans[0], op, groups
         shape = tuple(groups.shape.tolist())
@@ -97,6 +96,12 @@ class WindowOperator:
     def executor(self):
         """What computes it, with intermediates of its own."""
         return self._executor.apart()
+
+    def queue_plain(self, way, source, target):
+        """Queue "forward", windows = R frames of all groups, or "adjoint", frames = R^T windows."""
+        n = len(self._groups) * self.shape_in[0]
+        self._executor.reserve(n)
+        getattr(self._executor, way)(ImageBatch.of(source), ImageBatch.of(target), n)
 
 
 class _Part:

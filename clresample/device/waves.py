@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from ...device.contraction import ROW_TILES, Contraction, whole
-from ...device.tuning import Tuning
+from .contraction import ROW_TILES, Contraction, whole
+from .tuning import Tuning
 
 FILE, BACK_FILE = "waves.cl", "waves_back.cl"
-# Tiles that a work-item takes one below the other where sums and differences are made for it: of
-# its rows, which it multiplies by the whole table, as many as stay in its core's first cache; of
-# its columns, which all its rows share. With half as many, products take up to 10 % longer.
-OF_ROWS, OF_COLUMNS = 4, 16
+# Tiles that a work-item of X W^T takes one below the other: the sums and differences of their rows
+# stay in its core's first cache. With 2 products take a quarter longer; more would leave fewer
+# work-items of a single image for many cores.
+OF_ROWS = 4
+# Likewise of W X, where all of them share the sums and differences of its columns. With 8 products
+# take up to 10 % longer.
+OF_COLUMNS = 16
 
 
 def waves(device, dtype, side, *, back=False, mirrored=True, tuning=None, **options) -> Contraction:
@@ -17,19 +20,25 @@ def waves(device, dtype, side, *, back=False, mirrored=True, tuning=None, **opti
     2i, 2i + 1 the cosines and sines of frequency i, or its transpose.
 
     side: "left" or "right", the factor that is the table
-    back: from waves to pixels, a product with W on the right or W^T on the left; else W^T on the
-        right or W on the left
+    back: from waves to pixels, Z W or W^T Z; else to waves, X W^T or W X
     mirrored: whether all tables are, see `sky.waves.is_mirrored`
     tuning, options: Contraction's
     """
     options["tuning"] = tuning or Tuning.of(device, dtype)
-    if not mirrored or "KB" in options["tuning"].tile:
+    if not mirrored or not serves(options["tuning"]):
         return Contraction(device, dtype, **options)
     return Waves(device, dtype, side, back=back, **options)
 
 
+def serves(tuning) -> bool:
+    """Whether a device takes them: kernels are for CPUs, whose work-items are alone in a group."""
+    return tuning.row_loops and "KB" not in tuning.tile
+
+
 class Waves(Contraction):
     """A Contraction with a table of waves as one of its factors; see kernels/waves.h, for CPUs.
+
+    Its sums have an order of their own, whatever `bind` is asked for with `inward`.
 
     side, back: see `waves`
     """
@@ -64,13 +73,15 @@ class Waves(Contraction):
 
 
 def operator_programs(device, dtype):
-    """The contractions of an operator between images turned against each other.
+    """The contractions of operators between images aligned with or turned against each other, which
+    lie within the model.
 
     returns [(file, dtype, macros)], as `Device.build_ahead` takes them
     """
     taken = {"epilogue": "MIX", "adjoint": True}
     turned = {"epilogue": "TWIST", "adjoint": True}
     products = [
+        waves(device, dtype, "left", **taken),
         *(waves(device, dtype, "right"), waves(device, dtype, "left", epilogue="MIX")),
         *(Contraction(device, dtype, epilogue="TWIST"), waves(device, dtype, "left", back=True)),
         *(waves(device, dtype, "left", **turned), Contraction(device, dtype, **taken)),
