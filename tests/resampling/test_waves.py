@@ -140,31 +140,65 @@ def test_epilogues_are_those_of_the_contraction(device, dtype, epilogue, adjoint
     check(found[1], found[0], dtype)  # zeros beyond the columns, and nothing beyond the rows
 
 
-def test_items_have_waves_of_their_own(device, dtype):
-    """As frequencies of scenes with other PSFs: fewer than the layout has room for."""
-    n, h = 24, [5, 9, 7]
-    w = np.zeros((3, 18, n))
+def own_tables(n, h):
+    """Waves (3, 2 max h, n) of so many frequencies each, zeros beyond."""
+    w = np.zeros((3, 2 * max(h), n))
     for item, n_own in zip(w, h, strict=True):
         item[: 2 * n_own] = table(n, n_own)
-    which = device.put(np.array([2, 0, 1]), np.int32)
-    own, order = 2 * np.array(h), [2, 0, 1]
-    x, z = random(N_BATCH, n, N_OTHER), random(N_BATCH, 18, N_OTHER)
-    c, back = result(device, 18, N_OTHER, dtype), result(device, n, N_OTHER, dtype)
+    return w
+
+
+ORDER = [2, 0, 1]  # the table of each item
+
+
+@pytest.mark.parametrize("h", [(5, 9, 7), (70, 33, 81)])
+def test_items_have_waves_of_their_own_on_the_left(device, dtype, h):
+    """As frequencies of scenes with other PSFs: fewer than the layout has room for."""
+    n, k = 24, 2 * max(h)
+    w, own = own_tables(n, h), 2 * np.array(h)
+    which = device.put(np.array(ORDER), np.int32)
+    x, z = random(N_BATCH, n, N_OTHER), random(N_BATCH, k, N_OTHER)
+    c, back = result(device, k, N_OTHER, dtype), result(device, n, N_OTHER, dtype)
     tables = left(device, w, dtype)._replace(own=True)
     transposed = left(device, w.swapaxes(1, 2).copy(), dtype)._replace(own=True)
     into, out = (Matrix(a.base_data, a.shape[-1], a[0].size) for a in (c, back))
     Waves(device, dtype, "left").bind(
-        18, N_OTHER, n, tables, right(device, x, dtype), into, own=Own(which, m=own)
+        k, N_OTHER, n, tables, right(device, x, dtype), into, own=Own(which, m=own)
     )(N_BATCH)
     Waves(device, dtype, "left", back=True).bind(
-        n, N_OTHER, 18, transposed, right(device, z, dtype), out, own=Own(which, k=own)
+        n, N_OTHER, k, transposed, right(device, z, dtype), out, own=Own(which, k=own)
     )(N_BATCH)
     found, found_back = device.get(c), device.get(back)
-    for b, t in enumerate(order):
+    for b, t in enumerate(ORDER):
         k = own[t]
         check(found[b, :k, :N_OTHER], w[t, :k] @ x[b], dtype)
         assert (found[b, k:] == 7).all()
         check(found_back[b, :n, :N_OTHER], w[t, :k].T @ z[b, :k], dtype)
+
+
+@pytest.mark.parametrize("h", [(5, 9, 7), (70, 33, 81)])
+def test_items_have_waves_of_their_own_on_the_right(device, dtype, h):
+    n, k = 25, 2 * max(h)
+    w, own = own_tables(n, h), 2 * np.array(h)
+    which = device.put(np.array(ORDER), np.int32)
+    x, z = random(N_BATCH, N_OTHER, n), random(N_BATCH, N_OTHER, k)
+    c, back = result(device, N_OTHER, k, dtype), device.zeros((N_BATCH, N_OTHER, n), dtype)
+    transposed = right(device, w.swapaxes(1, 2), dtype)._replace(own=True)
+    tables = right(device, w, dtype)._replace(own=True)
+    into = Matrix(c.base_data, c.shape[-1], c[0].size)
+    out = Matrix(back.base_data, n, N_OTHER * n, step=1)
+    Waves(device, dtype, "right").bind(
+        N_OTHER, k, n, left(device, x, dtype), transposed, into, own=Own(which, n=own)
+    )(N_BATCH)
+    Waves(device, dtype, "right", back=True, ragged=True).bind(
+        N_OTHER, n, k, left(device, z, dtype), tables, out, own=Own(which, k=own)
+    )(N_BATCH)
+    found, found_back = device.get(c), device.get(back)
+    for b, t in enumerate(ORDER):
+        k = own[t]
+        check(found[b, :N_OTHER, :k], x[b] @ w[t, :k].T, dtype)
+        assert (found[b, :, (k + 15) // 16 * 16 :] == 7).all()
+        check(found_back[b], z[b, :, :k] @ w[t, :k], dtype)
 
 
 def test_tables_that_are_not_mirrored_take_the_whole_product(device):
