@@ -11,8 +11,8 @@ from ..sky.given.checks import instance, numbers
 from ..sky.observation import Observation, check_observations
 from ..sky.sources import Source
 
-# Status of a fit that Ctrl-C ended.
-INTERRUPTED = "interrupted"
+# Status of a fit until something else ends it than `max_iter`, and of one that Ctrl-C ended.
+UNFINISHED, INTERRUPTED = "iteration limit", "interrupted"
 # That of a fit whose scene another one takes over; no result has it.
 HANDED_OVER = "handed over"
 # What one fit takes at most. Its spectra are solved together, n^3 for n components: 2000 take

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..resampling.transfer import noise_warnings
 from ..sky.frame import Frame
-from .blend import INTERRUPTED
+from .blend import INTERRUPTED, UNFINISHED
 from .posterior.posterior import with_errors
 from .rendered import Rendered
 from .result import Component, Result
@@ -78,7 +78,7 @@ class Fit:
         self.unit = np.concatenate([view.unit for view in self.views])
         self.noise = np.concatenate([view.pixel_noise for view in self.views])
         self.padded, self._positions, self.start = padded, positions, None
-        self.losses, self.status, self.findings = [], "iteration limit", None
+        self.losses, self.status, self.findings = [], UNFINISHED, None
         self._best = _Best(np.inf, None, None, self.shifts)
         self.last_steps = np.zeros_like(self.shifts)
         self.seconds = {"setup": time.perf_counter() - began}

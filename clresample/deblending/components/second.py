@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 
-from ..blend import HANDED_OVER, INTERRUPTED
+from ..blend import HANDED_OVER, INTERRUPTED, UNFINISHED
 from ..iterate import iterate
 from .gradients import ask
 from .second_start import begun
@@ -90,7 +90,7 @@ def _go_on(fits, settings, device, dtype, progress):
         return
     before = [fit.seconds["fit"] for fit in fits]
     for fit in fits:
-        fit.status = "iteration limit"
+        fit.status = UNFINISHED
         del fit.losses[-1]  # that of the present state, which comes first again
     iterate(fits, settings, device, dtype, progress)
     for fit, seconds in zip(fits, before, strict=True):

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...sky.sources import Extended
+from ..blend import UNFINISHED
 from ..profiles import Galaxy, Given
 from ..solver.learned.structure import coarse
 from ..solver.scene import Learned
@@ -74,7 +75,7 @@ def _again(fit, point):
     new = copy(fit)
     new.start = point
     new.scene, new.state = first_scene(new)
-    new.losses, new.status, new.findings = [], "iteration limit", None
+    new.losses, new.status, new.findings = [], UNFINISHED, None
     new.messages, new.seconds = list(fit.messages), {}
     new.last_steps = np.zeros_like(fit.last_steps)
     return new
