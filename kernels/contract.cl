@@ -54,13 +54,8 @@
  * Launch: global = (ceil(width / (NV VW)), ceil(m / (MR RT)), batch), each rounded up to its
  *   local size.
  */
-#ifndef READ_AHEAD  /* 1: fetch what is soon needed, by a builtin of clang and GCC */
-#define READ_AHEAD 0
-#endif
+#include "ahead.h"
 #if READ_AHEAD
-#define PREFETCH(from, writes, cache) \
-    __builtin_prefetch((const void *)(size_t)(from), writes, cache);
-#define LINE (64 / (int)sizeof(REAL))       /* elements that come at once */
 #define AHEAD(from, step) PREFETCH((from) + next + (step) * skipped, 0, 2)
 #if !STRIDED        /* rows that follow each other closely, as they do nearly everywhere */
 #define AHEAD_LEFT(row, l, step, n) \

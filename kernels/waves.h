@@ -23,6 +23,7 @@
  * first half of its columns, of X W^T with one work-item for all columns. A work-item takes RT
  * tiles of MR rows, of MR / 2 on the way back.
  */
+#include "ahead.h"
 #include "contract.h"
 
 #ifndef SIDE        /* factor that is the table: 0 left, 1 right */
@@ -31,17 +32,11 @@
 #ifndef RT          /* tiles that a work-item owns, one below the other; even for W X */
 #define RT 2
 #endif
-#ifndef READ_AHEAD  /* 1: fetch what is soon needed, as contract.cl */
-#define READ_AHEAD 0
-#endif
 #ifndef FOLDED      /* pairs of a stretch: with 128, sums of 400 pixels are rounded more */
 #define FOLDED 64
 #endif
 
 #if READ_AHEAD
-#define PREFETCH(from, writes, cache) \
-    __builtin_prefetch((const void *)(size_t)(from), writes, cache);
-#define LINE (64 / (int)sizeof(REAL))       /* elements that come at once */
 #define NEXT_COLUMNS(from) PREFETCH((from) + next, 0, 2)
 #define TO_WRITE(c) for (int j = 0; j < NV * VW; j += LINE) PREFETCH((c) + j, 1, 3)
 #define TAKE_NEXT const long next = j0 + NV * VW < width ? j0 + NV * VW : stride_b;

@@ -81,11 +81,14 @@ def operator_programs(device, dtype):
     taken = {"epilogue": "MIX", "adjoint": True}
     turned = {"epilogue": "TWIST", "adjoint": True}
     products = [
-        waves(device, dtype, "left", **taken),
-        *(waves(device, dtype, "right"), waves(device, dtype, "left", epilogue="MIX")),
-        *(Contraction(device, dtype, epilogue="TWIST"), waves(device, dtype, "left", back=True)),
-        *(waves(device, dtype, "left", **turned), Contraction(device, dtype, **taken)),
+        waves(device, dtype, "right"),
+        waves(device, dtype, "left", epilogue="MIX"),
+        waves(device, dtype, "left", back=True),
         waves(device, dtype, "right", back=True, ragged=True),
+        waves(device, dtype, "left", **taken),
+        waves(device, dtype, "left", **turned),
+        Contraction(device, dtype, epilogue="TWIST"),
+        Contraction(device, dtype, **taken),
     ]
     builds = [product.build() for product in products]
     return [(file, dtype, macros | {"OWN": False}) for file, macros in builds]

@@ -29,10 +29,6 @@ class AffineExecutor(Executor):
         self.out_x = self._table([p.out_x for p in plans], self.k_x, self.n_pad)
         turns = [np.stack([p.twist.real, p.twist.imag], axis=1) for p in plans]
         self.turn = self._table(turns, self.h_y, 2, self.n_pad)
-        self.twist = Contraction(device, dtype, epilogue="TWIST", tuning=self.tuning)
-        self.lines_out = self.waves("out_y", "left", back=True)
-        self.lines_taken = self.waves("out_y", "left", epilogue="TWIST", adjoint=True)
-        self.columns_taken = Contraction(device, dtype, tuning=self.tuning, **self.mixed_back())
         lines = [p.lines for p in plans]
         self.to_pixels = Gather(
             self, [p.start for p in lines], [p.weight for p in lines], self.n_columns, self.n_steps
@@ -49,14 +45,15 @@ class AffineExecutor(Executor):
         n_y, n_x, turn = self.n_rows, self.n_columns, (self.turn.buffer, self.turn.stride, 0)
         z, turned, lines = (self.matrix(name) for name in ("frequencies", "turned", "lines"))
         k_y, k_x, j, n = self.k_ys, self.k_xs, self._columns, self.n_bands
-        self.to_columns = self.twist.bind(
+        twist = Contraction(self.device, self.dtype, epilogue="TWIST", tuning=self.tuning)
+        self.to_columns = twist.bind(
             *(self.k_y, n_x, self.k_x),
             *(z, self.out_x, turned, turn),
             n,
             inward=False,
             own=self.own(m=k_y, n=j, k=k_x),
         )
-        self.to_lines = self.lines_out.bind(
+        self.to_lines = self.waves("out_y", "left", back=True).bind(
             *(n_y, n_x, self.k_y),
             *(self.out_y, turned, lines),
             n_bands=n,
@@ -72,13 +69,15 @@ class AffineExecutor(Executor):
         out_y_t = self.made("out_y_t", lambda: self._transposed("out_y", self.k_y, n_y))
         out_x_t = self.made("out_x_t", lambda: self._transposed("out_x", n_x, self.k_pad))
         self.from_pixels = self.made("from_pixels", self._gather_back)
-        self.from_lines = self.lines_taken.bind(
+        twist = self.waves("out_y", "left", epilogue="TWIST", adjoint=True)
+        self.from_lines = twist.bind(
             *(self.k_y, n_x, n_y),
             *(out_y_t, lines, turned, turn),
             n,
             own=self.own(m=k_y, n=j),
         )
-        self.from_columns = self.to_frequencies(self.columns_taken, n_x, turned, out_x_t, j)
+        product = Contraction(self.device, self.dtype, tuning=self.tuning, **self.mixed_back())
+        self.from_columns = self.to_frequencies(product, n_x, turned, out_x_t, j)
 
     def _gather_back(self):
         lines = [p.lines for p in self.plans]

@@ -16,10 +16,6 @@ class AlignedExecutor(Executor):
         self.n_rows, self.n_columns = plans[0].mapping.shape_out
         super().__init__(device, dtype, plans)
         self.out_x = self._table([p.out_x for p in plans], self.k_x, padded(self.n_columns))
-        self.rows_out = self.waves("out_y", "left", back=True)
-        self.columns_out = self.waves("out_x", "right", back=True, ragged=True)
-        self.columns_taken = self.waves("out_x", "right")
-        self.rows_taken = self.waves("out_y", "left", **self.mixed_back())
 
     def bind(self):
         super().bind()
@@ -27,14 +23,14 @@ class AlignedExecutor(Executor):
         half, z = self.matrix("half", n_y), self.matrix("frequencies")
         observed = ImageBatch.shaped(n_y, n_x).matrix()
         k_y, k_x, n = self.k_ys, self.k_xs, self.n_bands
-        self.to_rows = self.rows_out.bind(
+        self.to_rows = self.waves("out_y", "left", back=True).bind(
             *(n_y, self.k_x, self.k_y),
             *(self.out_y, z, half),
             n_bands=n,
             inward=False,
             own=self.own(n=k_x, k=k_y),
         )
-        self.to_pixels = self.columns_out.bind(
+        self.to_pixels = self.waves("out_x", "right", back=True, ragged=True).bind(
             *(n_y, n_x, self.k_x),
             *(half, self.out_x, observed),
             n_bands=n,
@@ -48,10 +44,11 @@ class AlignedExecutor(Executor):
         half, observed = self.matrix("half", n_y), ImageBatch.shaped(n_y, n_x).matrix()
         out_y_t = self.made("out_y_t", lambda: self._transposed("out_y", self.k_y, n_y))
         out_x_t = self.made("out_x_t", lambda: self._transposed("out_x", n_x, self.k_pad))
-        self.from_pixels = self.columns_taken.bind(
+        self.from_pixels = self.waves("out_x", "right").bind(
             n_y, self.k_x, n_x, observed, out_x_t, half, n_bands=n, own=self.own(n=self.k_xs)
         )
-        self.from_rows = self.to_frequencies(self.rows_taken, n_y, out_y_t, half)
+        product = self.waves("out_y", "left", **self.mixed_back())
+        self.from_rows = self.to_frequencies(product, n_y, out_y_t, half)
 
     def observe(self, y: ImageBatch, n):
         """I2 = Sy Z Sx;  y (n, My, Mx): the observation I2 of each band, overwritten"""

@@ -20,13 +20,12 @@ class DistortedExecutor(Executor):
         self.n_rows = math.prod(plans[0].mapping.shape_out)
         super().__init__(device, dtype, plans)
         self.out_x = self._table([p.out_x for p in plans], self.n_rows, self.k_pad)
-        self.rows_out = Contraction(device, dtype, tuning=self.tuning)
-        self.rows_taken = Contraction(device, dtype, tuning=self.tuning, **self.mixed_back())
 
     def bind(self):
         super().bind()
         half, z = self.matrix("half", self.n_rows), self.matrix("frequencies")
-        self.to_rows = self.rows_out.bind(
+        plain = Contraction(self.device, self.dtype, tuning=self.tuning)
+        self.to_rows = plain.bind(
             self.n_rows, self.k_x, self.k_y, self.out_y, z, half, inward=False
         )
         self.rowdot = self._rows("rowdot", (self.tuning.line_group, 1), half).bind(n=self.k_x)
@@ -35,7 +34,8 @@ class DistortedExecutor(Executor):
         super().bind_back()
         half = self.matrix("half", self.n_rows)
         out_y_t = self.made("out_y_t", lambda: self._transposed("out_y", self.k_y, self.n_rows))
-        self.from_rows = self.to_frequencies(self.rows_taken, self.n_rows, out_y_t, half)
+        product = Contraction(self.device, self.dtype, tuning=self.tuning, **self.mixed_back())
+        self.from_rows = self.to_frequencies(product, self.n_rows, out_y_t, half)
         self.rowscale = self._rows("rowscale", (COLUMN_PAD, 1), half)
 
     def _rows(self, name, local_size, half):

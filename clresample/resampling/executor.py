@@ -37,12 +37,6 @@ class Executor(Tables):
     def __init__(self, device, dtype, plans):
         super().__init__(device, dtype, plans)
         self.terms = Terms(self) if self.n_terms > 1 else None
-        strided = self.axes != (0, 1)
-        self.columns_in = self.waves("in_x", "right", strided=strided)
-        self.rows_in = self.waves("in_y", "left")
-        self.rows_mixed_in = self.waves("in_y", "left", epilogue="MIX")
-        self.rows_back = self.waves("in_y", "left", back=True)
-        self.columns_back = self.waves("in_x", "right", back=True, ragged=True)
 
     def waves(self, name, side, **options) -> Contraction:
         """The products with a table of waves, or its transpose, on that side."""
@@ -73,8 +67,9 @@ class Executor(Tables):
         # `spread`: an image is transformed once for all bands
         once, shared = self.in_x_t._replace(div=1), half._replace(div=n)
         k_y, k_x = self.k_ys, self.k_xs
+        to_columns = self.waves("in_x", "right", strided=self.axes != (0, 1))
         self.in_columns, self.in_columns_once = (
-            self.columns_in.bind(
+            to_columns.bind(
                 *(self.n_y, self.k_x, self.n_x),
                 *(model, in_x_t, half),
                 n_bands=in_x_t.div,
@@ -83,8 +78,9 @@ class Executor(Tables):
             for in_x_t in (self.in_x_t._replace(div=n), once)
         )
         d, in_y, own = self.tables(self.transfer), self.in_y._replace(div=n), self.own(m=k_y, n=k_x)
+        to_rows = self.waves("in_y", "left", epilogue="MIX")
         self.in_rows, self.in_rows_shared = (
-            self.rows_mixed_in.bind(self.k_y, self.k_x, self.n_y, in_y, right, z, d, n, own=own)
+            to_rows.bind(self.k_y, self.k_x, self.n_y, in_y, right, z, d, n, own=own)
             for right in (half, shared)
         )
         if self.terms:
@@ -97,14 +93,14 @@ class Executor(Tables):
         model = ImageBatch.shaped(*self.plans[0].mapping.shape_in).matrix(self.axes)
         k_y, k_x = self.k_ys, self.k_xs
         in_y_t, in_x = self.in_y_t._replace(div=n), self.in_x._replace(div=n)
-        self.back_rows = self.rows_back.bind(
+        self.back_rows = self.waves("in_y", "left", back=True).bind(
             *(self.n_y, self.k_x, self.k_y),
             *(in_y_t, z, half),
             n_bands=n,
             inward=False,
             own=self.own(n=k_x, k=k_y),
         )
-        self.back_columns = self.columns_back.bind(
+        self.back_columns = self.waves("in_x", "right", back=True, ragged=True).bind(
             *(self.n_y, self.n_x, self.k_x),
             *(half, in_x, model),
             n_bands=n,

@@ -171,9 +171,9 @@ def make_plan(
     nu, d, max_gain, floored_power = _band(mapping.matrix, psf_in, psf_out, n_fft, precision)
     d = np.broadcast_to(d, (n_bands,) + d.shape[1:])
     n_frequencies = h_y, h_x = len(nu[0]), len(nu[1])
-    center, axes = (np.array(mapping.shape_in) - 1) / 2, (0, 1)
+    center, axes, middle = (np.array(mapping.shape_in) - 1) / 2, (0, 1), (0.0, 0.0)
     if mapping.geometry == "affine":
-        tables, d = line_tables(mapping, nu, d, center, precision.window)
+        tables, d, middle = line_tables(mapping, nu, d, center, precision.window)
     elif mapping.geometry == "distorted":
         tables = distorted_tables(mapping, nu, center)
     d = d * (2 / (n_fft[0] * n_fft[1]))
@@ -185,7 +185,7 @@ def make_plan(
             axes, nu = (1, 0), nu[::-1]
             d_plus, d_minus = d_plus.swapaxes(1, 2), d_minus.swapaxes(1, 2).conj()
         tables, middle = aligned_tables(mapping, nu, axes, center)
-        d_plus, d_minus = _moved(d_plus, d_minus, nu, middle)
+    d_plus, d_minus = _moved(d_plus, d_minus, nu, middle)
     in_y, in_x = (
         waves_along(nu[i], -center[axes[i]], 1.0, mapping.shape_in[axes[i]]).T for i in (0, 1)
     )

@@ -138,28 +138,27 @@ class Resampler(GridOperator):
 
     def _render(self, x, out):
         """`render` on device arrays (B, Ny, Nx) and (B, C, My, Mx)."""
-        self._run("forward", x, out, (1, *x.shape[1:]), self.shape_out, spread=True)
+        self._run("forward", x, out, spread=True)
 
     def _forward(self, x, out):
         """I2 of device arrays: x (B, C, Ny, Nx), out (B, C, My, Mx)."""
-        self._run("forward", x, out, self.shape_in, self.shape_out)
+        self._run("forward", x, out)
 
     def _adjoint(self, y, out):
         """R^T y of device arrays: y (B, C, My, Mx), out (B, C, Ny, Nx)."""
-        self._run("adjoint", y, out, self.shape_out, self.shape_in)
+        self._run("adjoint", y, out)
 
     def queue_plain(self, way, source, target):
         """Queue "forward" or "adjoint" as `forward_into` does, in the operator's own type all the
         way: float32 images that go through float64 there take two thirds of the time here."""
-        shapes = (self.shape_in, self.shape_out)[:: 1 if way == "forward" else -1]
         with self._lock:
-            self._run(way, source, target, *shapes, whole=self._executor)
+            self._run(way, source, target, whole=self._executor)
 
-    def _run(self, way, source, target, shape_source, shape_target, *, whole=None, **options):
+    def _run(self, way, source, target, *, whole=None, **options):
         """Queue "forward" or "adjoint" on as many items at a time as the cache holds.
 
-        source, target: device arrays (B,) + shape; shape_*: of an item; whole: the executor, None
-        for that of callers; options: of `way`
+        source, target: device arrays (B,) + shape of an item; whole: the executor, None for that of
+        callers; options: of `way`
         """
         batch, whole = source.shape[0], whole or self._whole
         if len(self.plans) not in (1, batch):
@@ -167,21 +166,19 @@ class Resampler(GridOperator):
         if self._identity and not options:
             self.device.copy(source, target)
             return
+        n_bands = self.plans[0].n_bands
         # per-item tables are counted from a launch's first item, so they go in one group; so do
         # images of a folded executor, which has intermediates for cores
         grouped = len(self.plans) == 1 and whole is self._executor
-        steps = [math.prod(shape[:-2]) for shape in (shape_source, shape_target)]
-        sizes = self.plans[0].n_bands, batch, min(self._group, batch) if grouped else batch
-        _queue(whole, way, (source, target), steps, *sizes, **options)
-
-
-def _queue(executor, way, arrays, steps, n_bands, batch, group, **options):
-    """Queue `batch` items of two arrays (source, target), `group` at a time; steps (2,): images of
-    an item in each."""
-    executor.reserve(group * n_bands)
-    for start in range(0, batch, group):
-        images = (ImageBatch.of(a, start * step) for a, step in zip(arrays, steps, strict=True))
-        getattr(executor, way)(*images, min(group, batch - start) * n_bands, **options)
+        group = min(self._group, batch) if grouped else batch
+        whole.reserve(group * n_bands)
+        for start in range(0, batch, group):
+            n = min(group, batch - start) * n_bands
+            getattr(whole, way)(
+                *(ImageBatch.of(a, start * math.prod(a.shape[1:-2])) for a in (source, target)),
+                n,
+                **options,
+            )
 
 
 def _images_at_once(executor: Executor) -> int:

@@ -48,7 +48,8 @@ def line_tables(mapping: Mapping, nu, d, center, window: KaiserBessel):
 
     Along a line a plane wave has the single frequency nu_x + r nu_y; columns finer than its Nyquist
     spacing by window.oversampling carry it, divided by the window's transform.  Returns
-    (tables, d): the lines' waves are about the middle line, d takes them to its place.
+    (tables, d, middle): the lines' waves are about the middle line, which is `middle` (2,)
+    [model px, along the table axes] off the model's middle.
     """
     slope = np.abs(mapping.matrix[1]) / np.linalg.norm(mapping.matrix, axis=0)
     by_row = slope[1] >= slope[0]
@@ -64,8 +65,7 @@ def line_tables(mapping: Mapping, nu, d, center, window: KaiserBessel):
     nu_max = max(np.abs(along[(d != 0).any(axis=0)]).max(), np.finfo(float).tiny ** 0.5)
     spacing = min(1 / (2 * nu_max * window.oversampling), float(max(mapping.shape_in)))
     reach = (a - r * c) * (n_lines - 1) / 2
-    middle = np.exp(2j * np.pi * nu[0] * (t_y - r * t_x + reach))
-    d = d / window.transform(along * spacing) * middle[:, None]
+    d = d / window.transform(along * spacing)
 
     x = c * np.arange(n_lines)[:, None] + e * np.arange(n_steps) + t_x
     x_first, x_last = x[covered].min(), x[covered].max()
@@ -76,9 +76,13 @@ def line_tables(mapping: Mapping, nu, d, center, window: KaiserBessel):
     below = np.floor(u - window.n_taps / 2)
     start = np.where(covered, below.astype(int) + 1, 0)
     weight = window.taps(u - window.n_taps / 2 - below) * covered[:, :, None]
-    return {
-        "out_y": waves_along(nu[0], -reach, a - r * c, n_lines),
-        "out_x": waves_along(nu[1], column0, spacing, n_columns).T,
-        "twist": even_waves(nu[0], r * column0, r * spacing, n_columns).T,
-        "lines": LineTaps(bool(by_row), start, weight.swapaxes(1, 2), covered, n_columns),
-    }, d
+    return (
+        {
+            "out_y": waves_along(nu[0], -reach, a - r * c, n_lines),
+            "out_x": waves_along(nu[1], column0, spacing, n_columns).T,
+            "twist": even_waves(nu[0], r * column0, r * spacing, n_columns).T,
+            "lines": LineTaps(bool(by_row), start, weight.swapaxes(1, 2), covered, n_columns),
+        },
+        d,
+        (t_y - r * t_x + reach, 0.0),
+    )

@@ -91,7 +91,7 @@ class Renderer:
         z0 = Matrix(plain.base_data, e.k_pad, e.k_y * e.k_pad)
         half, own = e.matrix("half", e.n_y), e.own(m=e.k_ys, n=e.k_xs)
         in_y = e.in_y._replace(div=1)
-        self._rows = e.rows_in.bind(e.k_y, e.k_x, e.n_y, in_y, half, z0, own=own)
+        self._rows = e.waves("in_y", "left").bind(e.k_y, e.k_x, e.n_y, in_y, half, z0, own=own)
         self._turn.bind(z0=z0.buffer, z=e.matrix("frequencies").buffer, which=e.which)
 
     def _phases(self, which, moves):

@@ -40,7 +40,7 @@ class Tables(OnDevice):
 
     def mirrored(self, name) -> bool:
         """Whether the halves of a table, of rows or columns, mirror each other in all plans."""
-        return all(p.mirrored.get(name, False) for p in self.plans)
+        return all(p.mirrored[name] for p in self.plans)
 
     @property
     def in_y_t(self) -> Matrix:

@@ -37,7 +37,8 @@ class Frames:
     depth = 0
 
     def __init__(self, buffers, i_observation, op):
-        self.buffers, self._op, n = buffers, op, len(buffers.scenes)
+        self.buffers, self._op = buffers, op
+        n = len(buffers.scenes)
         self._model = buffers.device.empty((n, *op.shape_in), buffers.dtype)
         self._composition = Composition(buffers, i_observation, buffers.host_boxes, op.shape_in[1:])
 
