@@ -166,19 +166,20 @@ class Resampler(GridOperator):
         if self._identity and not options:
             self.device.copy(source, target)
             return
-        n_bands = self.plans[0].n_bands
         # per-item tables are counted from a launch's first item, so they go in one group; so do
         # images of a folded executor, which has intermediates for cores
         grouped = len(self.plans) == 1 and whole is self._executor
         group = min(self._group, batch) if grouped else batch
-        whole.reserve(group * n_bands)
-        for start in range(0, batch, group):
-            n = min(group, batch - start) * n_bands
-            getattr(whole, way)(
-                *(ImageBatch.of(a, start * math.prod(a.shape[1:-2])) for a in (source, target)),
-                n,
-                **options,
-            )
+        _queue(whole, way, source, target, group, self.plans[0].n_bands, **options)
+
+
+def _queue(executor, way, source, target, group, n_bands, **options):
+    """Queue the items of device arrays, `group` at a time; see `Resampler._run`."""
+    executor.reserve(group * n_bands)
+    for start in range(0, len(source), group):
+        n = min(group, len(source) - start) * n_bands
+        images = (ImageBatch.of(a, start * math.prod(a.shape[1:-2])) for a in (source, target))
+        getattr(executor, way)(*images, n, **options)
 
 
 def _images_at_once(executor: Executor) -> int:
