@@ -5,6 +5,7 @@ fills each new buffer of a device with NaN, so that a kernel that reads what nob
 --guard-buffers fails tests whose kernels write beyond the end of a buffer.
 """
 
+import functools
 import os
 import shutil
 import signal
@@ -38,13 +39,18 @@ def pytest_addoption(parser):
 
 
 def pytest_generate_tests(metafunc):
-    if "device" not in metafunc.fixturenames:
-        return
+    if "device" in metafunc.fixturenames:
+        found = _devices()
+        metafunc.parametrize("device", found.values(), ids=found, indirect=True, scope="session")
+
+
+@functools.cache
+def _devices():
+    """{name of a test's parameter: index} of every device; asking builds a kernel for each."""
     try:
-        found = {f"{info.index}-{info.name.split()[0]}": info.index for info in list_devices()}
+        return {f"{info.index}-{info.name.split()[0]}": info.index for info in list_devices()}
     except DeviceError:
-        found = {"none": None}  # then the fixture fails and says why, instead of skipping
-    metafunc.parametrize("device", found.values(), ids=found, indirect=True, scope="session")
+        return {"none": None}  # then the fixture fails and says why, instead of skipping
 
 
 @pytest.hookimpl(wrapper=True)

@@ -102,6 +102,7 @@ def test_decoded_rows_are_held_to_a_part_of_a_workers_memory(scheduler, tmp_path
     assert found.value == int(0.1 * 3 * (1 << 30)) < MOST_BYTES
 
 
-def test_what_does_not_answer_is_named():
+def test_what_does_not_answer_is_named(monkeypatch):
+    monkeypatch.setattr("clresample.fields.work.cluster.CONNECT_S", 2.0)  # [s]
     with pytest.raises(ValueError, match="scheduler 'tcp://127.0.0.1:1' does not answer"):
         Cluster("tcp://127.0.0.1:1", (), None, Progress())
