@@ -2,19 +2,29 @@
 
 import numpy as np
 import pytest
-from helpers.products import TILES, check, every_type, need, put_right, random, tile
+from helpers.products import (
+    BY_TURNS,
+    EACH,
+    TILES,
+    check,
+    dtype,
+    every_type,
+    need,
+    put_right,
+    random,
+    tiled,
+)
 from helpers.tuning import tune
 
 from clresample.device import contraction as contract
 from clresample.device.contraction import Contraction, ImageBatch, Matrix, padded
 
-__all__ = ["tile"]  # a fixture
+__all__ = ["dtype"]  # a fixture
 
 
-@every_type
+@tiled(EACH)
 @pytest.mark.parametrize("shape", [(1, 1, 1), (7, 16, 5), (8, 17, 1), (23, 40, 130)], ids=str)
-def test_product(device, tile, shape, dtype):
-    need(device, dtype)
+def test_product(device, shape, dtype):
     m, n, k = shape
     a, b = random(3, m, k), random(3, k, n)
     right = put_right(device, b, dtype)
@@ -82,9 +92,8 @@ def test_one_right_factor_for_all_and_tables_shared_by_bands(device, dtype):
     check(device.get(result)[..., :n], np.repeat(a[:2] @ b, n_bands, axis=0), dtype)
 
 
-@every_type
-def test_a_callers_arrays_read_and_written_transposed(device, tile, dtype):
-    need(device, dtype)
+@tiled(BY_TURNS)
+def test_a_callers_arrays_read_and_written_transposed(device, dtype):
     m, n, k = 13, 21, 10
     images, b = random(4, k, m), random(1, k, n)
     source, right = device.put(images, dtype), put_right(device, b, dtype)
@@ -161,11 +170,10 @@ def mixed(quads, d_plus, d_minus):
     return result
 
 
-@every_type
+@tiled(BY_TURNS)
 @pytest.mark.parametrize("adjoint", [False, True])
 @pytest.mark.parametrize("n_tables", [1, 2])
-def test_mix_multiplies_by_the_spectra(device, tile, n_tables, adjoint, dtype):
-    need(device, dtype)
+def test_mix_multiplies_by_the_spectra(device, n_tables, adjoint, dtype):
     h_y, h_x, k, n_bands, batch = 5, 11, 7, 3, 6
     a, b = random(1, 2 * h_y, k), random(batch, k, 2 * h_x)
     d = random(2, n_tables, n_bands, h_y, h_x) + 1j * random(2, n_tables, n_bands, h_y, h_x, seed=1)

@@ -2,16 +2,15 @@
 
 import numpy as np
 import pytest
-from helpers.products import check, every_type, need, put_right, random, tile
+from helpers.products import BY_TURNS, check, dtype, put_right, random, tiled
 
 from clresample.device.contraction import Contraction, Matrix, Own, whole
 
-__all__ = ["tile"]  # a fixture
+__all__ = ["dtype"]  # a fixture
 
 
-@every_type
-def test_items_with_tables_and_sizes_of_their_own(device, tile, dtype):
-    need(device, dtype)
+@tiled(BY_TURNS)
+def test_items_with_tables_and_sizes_of_their_own(device, dtype):
     n_bands, which, m, n, k = 2, [2, 0, 1, 2], [5, 13, 1], [40, 7, 16], [9, 30, 21]
     tables, b = random(3, 13, 30), random(8, 30, 40)
     for table, rows, terms in zip(tables, m, k, strict=True):

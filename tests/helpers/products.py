@@ -1,5 +1,7 @@
 """Random matrices, tiles and the check of products, for tests of the contraction kernels."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -22,11 +24,32 @@ TILES = {
 }
 
 
-@pytest.fixture(params=["device's", *TILES])
-def tile(request, monkeypatch):
-    """Register tiles of other devices than the one at hand; any device must run them all."""
-    if request.param != "device's":
-        tune(monkeypatch, tile=TILES[request.param], row_choices=())
+# Tiles of other devices than the one at hand, which must run them all: each in both types, or by
+# turns in one where tests need several kernels of each, which take seconds to build.
+OWN = [("device's", dtype) for dtype in TYPES]
+EACH = OWN + [(name, dtype) for name in TILES for dtype in TYPES]
+BY_TURNS = OWN + list(zip(TILES, itertools.cycle(TYPES)))
+
+
+def tiled(cases):
+    """Parametrise a test with the fixture `dtype` by cases of a tile and a type."""
+    ids = [f"{name}-{dtype.__name__}" for name, dtype in cases]
+    return pytest.mark.parametrize("dtype", cases, ids=ids, indirect=True)
+
+
+@pytest.fixture
+def dtype(request, device, monkeypatch):
+    """The type of a case, with its tile in use; see `tiled`."""
+    return type_of(request.param, device, monkeypatch)
+
+
+def type_of(case, device, monkeypatch):
+    """The type of a case, whose tile is in use from now on."""
+    name, dtype = case
+    need(device, dtype)
+    if name != "device's":
+        tune(monkeypatch, tile=TILES[name], row_choices=())
+    return dtype
 
 
 def random(*shape, seed=0):

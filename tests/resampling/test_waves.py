@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.products import TILES, check, need, put_right, random
-from helpers.tuning import tune
+from helpers.products import OWN, check, put_right, random, type_of
 
 from clresample import PSF, Grid, Resampler
 from clresample.device.contraction import Contraction, Matrix, Own, padded
@@ -12,8 +11,7 @@ from clresample.device.waves import Waves, serves, waves
 from clresample.sky.waves import is_mirrored
 
 # Tiles of CPUs, the only devices with this kernel, each in one type.
-CASES = [("device's", np.float32), ("device's", np.float64)]
-CASES += [("CPU", np.float64), ("wide CPU", np.float32), ("pairs", np.float32)]
+CASES = [*OWN, ("CPU", np.float64), ("wide CPU", np.float32), ("pairs", np.float32)]
 # Pixels and frequencies: few, odd, more than a stretch of pairs of either, and more than a tile.
 SIZES = [(1, 1), (2, 1), (7, 5), (40, 33), (135, 70)]
 N_BATCH, N_OTHER = 3, 53
@@ -23,11 +21,8 @@ every_size = pytest.mark.parametrize(("n", "h"), SIZES, ids=lambda size: str(siz
 @pytest.fixture(params=CASES, ids=lambda case: f"{case[0]}-{case[1].__name__}")
 def dtype(request, device, monkeypatch):
     """A floating type, with a tile for it."""
-    name, dtype = request.param
-    need(device, dtype)
-    if name != "device's":
-        tune(monkeypatch, tile=TILES[name], row_choices=())
-    elif not serves(Tuning.of(device, dtype)):
+    dtype = type_of(request.param, device, monkeypatch)
+    if request.param in OWN and not serves(Tuning.of(device, dtype)):
         pytest.skip("for CPUs")
     return dtype
 
