@@ -86,8 +86,10 @@ INLINE void sum_rows(__global const REAL *rows, const int n_rows, const int ld,
     }
 }
 
-/* sum_t<=2 radius k[t] line[x - radius + t] at sixteen x from line[0] on; k[2 radius + 1] is 0. */
-INLINE SIXTEEN smoothed(__global const REAL *line, __global const REAL *k, const int radius)
+/* *sum = sum_t<=2 radius k[t] line[x - radius + t] at sixteen x from line[0] on; k[2 radius + 1] is
+ * 0. By a pointer: Clang warns of wide vectors that are returned on CPUs without them. */
+INLINE void smoothed(__global const REAL *line, __global const REAL *k, const int radius,
+                     SIXTEEN *sum)
 {
     SIXTEEN even = (SIXTEEN)(0), odd = (SIXTEEN)(0);
     line -= radius;
@@ -95,7 +97,7 @@ INLINE SIXTEEN smoothed(__global const REAL *line, __global const REAL *k, const
         even += k[t] * AT(const SIXTEEN, line + t);
         odd += k[t + 1] * AT(const SIXTEEN, line + t + 1);
     }
-    return even + odd;
+    *sum = even + odd;
 }
 #endif
 
@@ -123,12 +125,14 @@ __kernel void spread(__global const int *restrict active, __global const int *re
                  cx, row, step);
         int x = 0;
         for (; x + 16 <= nx; x += 16) {
-            SIXTEEN sum = smoothed(row + x, k, radius);
+            SIXTEEN sum;
+            smoothed(row + x, k, radius, &sum);
             if (j) sum += AT(const SIXTEEN, out + x);
             AT(SIXTEEN, out + x) = sum;
         }
         if (x < nx) {
-            const SIXTEEN sum = smoothed(row + x, k, radius);
+            SIXTEEN sum;
+            smoothed(row + x, k, radius, &sum);
             for (int l = 0; x + l < nx; ++l) out[x + l] = (j ? out[x + l] : (REAL)0) + sum[l];
         }
         plane += (size_t)cy * cx;
@@ -240,7 +244,8 @@ __kernel void condense(__global const int *restrict active, __global const int *
     for (int m = nx; m < LINE(nx) - MARGIN; ++m) row[m] = 0;
     /* at all pixels, of which a coefficient belongs to every `step`-th */
     for (int x = 0; x <= step * (cx - 1); x += step > 16 ? step : 16) {
-        const SIXTEEN sum = smoothed(row + x, k, radius);
+        SIXTEEN sum;
+        smoothed(row + x, k, radius, &sum);
         if (step == 1 && x + 16 <= cx) {
             const SIXTEEN own = AT(const SIXTEEN, z + at + x);
             AT(SIXTEEN, gradient + at + x) = sum + weight * own;

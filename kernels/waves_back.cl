@@ -1,7 +1,7 @@
 /* From waves to pixels, C = W^T Z or Z W: see waves.h. */
 #include "waves.h"
 
-#define ROWS (MR / 2)                       /* of a tile: E and O of each are summed */
+#define PAIRS (MR / 2)                      /* rows of a tile: E and O of each are summed */
 #if VW == 16
 #define REVERSED(x) (x).sfedcba9876543210
 #elif VW == 8
@@ -54,7 +54,7 @@ void waves_back(int m, int n, const int n_pad, int k,
                 __global const int *restrict which, __global const int *restrict own)
 {
     const int j0 = (int)get_global_id(0) * NV * VW;
-    const int top = (int)get_global_id(1) * ROWS * RT;
+    const int top = (int)get_global_id(1) * PAIRS * RT;
     const int b = (int)get_global_id(2);
     int column[NV];
     TAKE_OWN
@@ -62,7 +62,7 @@ void waves_back(int m, int n, const int n_pad, int k,
     const int m_sums = SIDE == 0 ? (m + 1) / 2 : m;      /* rows and columns that are summed */
     const int n_sums = SIDE == 0 ? n : (n + 1) / 2;
     const int width = (n_sums + 15) / 16 * 16;
-    const int bottom = m_sums - top < ROWS * RT ? m_sums : top + ROWS * RT;
+    const int bottom = m_sums - top < PAIRS * RT ? m_sums : top + PAIRS * RT;
     if (j0 >= width || top >= m_sums) return;
     A += offset_a + TABLE(div_a) * stride_a;
     B += TABLE(div_b) * stride_b;
@@ -70,29 +70,29 @@ void waves_back(int m, int n, const int n_pad, int k,
     TAKE_NEXT
     TAKE_COLUMNS
 
-    for (int i0 = top; i0 < bottom; i0 += ROWS) {
-        __global const REAL *row[ROWS];
+    for (int i0 = top; i0 < bottom; i0 += PAIRS) {
+        __global const REAL *row[PAIRS];
         WIDE acc[MR][NV];                   /* E and O of each row */
-        UNROLL(i, ROWS) row[i] = A + (size_t)(i0 + i < m_sums ? i0 + i : m_sums - 1) * ld_a;
+        UNROLL(i, PAIRS) row[i] = A + (size_t)(i0 + i < m_sums ? i0 + i : m_sums - 1) * ld_a;
         CLEAR(acc, MR, NV)
 #if READ_AHEAD && SIDE == 0
-        const long skipped = (i0 - top) / ROWS % KU * 2 * (long)n_pad;
-        UNROLL(i, ROWS) TO_WRITE(C + (size_t)(i0 + i) * ld_c + j0)
-        UNROLL(i, ROWS) TO_WRITE(C + (size_t)(m - 1 - i0 - i) * ld_c + j0)
+        const long skipped = (i0 - top) / PAIRS % KU * 2 * (long)n_pad;
+        UNROLL(i, PAIRS) TO_WRITE(C + (size_t)(i0 + i) * ld_c + j0)
+        UNROLL(i, PAIRS) TO_WRITE(C + (size_t)(m - 1 - i0 - i) * ld_c + j0)
 #elif READ_AHEAD
         if (step_c == 1) {
-            UNROLL(i, ROWS) TO_WRITE(C + (size_t)(i0 + i) * ld_c + j0)
-            UNROLL(i, ROWS) TO_WRITE(C + (size_t)(i0 + i) * ld_c + n - j0 - NV * VW)
+            UNROLL(i, PAIRS) TO_WRITE(C + (size_t)(i0 + i) * ld_c + j0)
+            UNROLL(i, PAIRS) TO_WRITE(C + (size_t)(i0 + i) * ld_c + n - j0 - NV * VW)
         }
         if (j0 == 0)
-            for (int q = 0; q < ROWS * ld_a; q += LINE)
-                PREFETCH(row[0] + ROWS * (long)ld_a + q, 0, 3)
+            for (int q = 0; q < PAIRS * ld_a; q += LINE)
+                PREFETCH(row[0] + PAIRS * (long)ld_a + q, 0, 3)
 #endif
         for (int last = n_pairs - 1; last >= 0; last -= FOLDED) {
             const int first = last < FOLDED ? 0 : last + 1 - FOLDED;
             INSIDE(2 * (m_sums - i0), ADD_PAIRS)
         }
-        UNROLL(i, ROWS) UNROLL(v, NV) {
+        UNROLL(i, PAIRS) UNROLL(v, NV) {
             if (i0 + i >= m_sums || j0 + v * VW >= width) continue;
             const WIDE here = acc[2 * i][v] + acc[2 * i + 1][v];
             const WIDE there = acc[2 * i][v] - acc[2 * i + 1][v];

@@ -3,18 +3,16 @@
 import numpy as np
 import pytest
 from helpers.products import (
-    BY_TURNS,
-    EACH,
-    TILES,
+    by_turns,
     check,
     dtype,
+    every_tile,
     every_type,
     need,
     put_right,
     random,
-    tiled,
+    type_of,
 )
-from helpers.tuning import tune
 
 from clresample.device import contraction as contract
 from clresample.device.contraction import Contraction, ImageBatch, Matrix, padded
@@ -22,7 +20,7 @@ from clresample.device.contraction import Contraction, ImageBatch, Matrix, padde
 __all__ = ["dtype"]  # a fixture
 
 
-@tiled(EACH)
+@every_tile
 @pytest.mark.parametrize("shape", [(1, 1, 1), (7, 16, 5), (8, 17, 1), (23, 40, 130)], ids=str)
 def test_product(device, shape, dtype):
     m, n, k = shape
@@ -92,7 +90,7 @@ def test_one_right_factor_for_all_and_tables_shared_by_bands(device, dtype):
     check(device.get(result)[..., :n], np.repeat(a[:2] @ b, n_bands, axis=0), dtype)
 
 
-@tiled(BY_TURNS)
+@by_turns
 def test_a_callers_arrays_read_and_written_transposed(device, dtype):
     m, n, k = 13, 21, 10
     images, b = random(4, k, m), random(1, k, n)
@@ -170,7 +168,7 @@ def mixed(quads, d_plus, d_minus):
     return result
 
 
-@tiled(BY_TURNS)
+@by_turns
 @pytest.mark.parametrize("adjoint", [False, True])
 @pytest.mark.parametrize("n_tables", [1, 2])
 def test_mix_multiplies_by_the_spectra(device, n_tables, adjoint, dtype):
@@ -272,7 +270,7 @@ def test_a_tall_product_is_cut_where_a_launch_would_have_too_many_groups(device,
 @pytest.mark.parametrize("name", ["CPU", "groups"])
 def test_the_largest_terms_are_summed_last(device, monkeypatch, name):
     # light about the middle of a row of pixels, and amplitudes that fall off with frequency
-    tune(monkeypatch, tile=TILES[name], row_choices=())
+    type_of((name, np.float32), device, monkeypatch)
     m, n, k = 64, 64, 96
     waves = np.abs(random(k, n)).astype(np.float32)
     right = device.put(waves)

@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 import pytest
-from helpers.checkout import ROOT
+from helpers.checkout import ROOT, run_python
 
 from clresample import DeviceError
 from clresample.device.device import Device
@@ -143,6 +143,26 @@ def test_every_kernel_can_be_launched_by_name(device, file, name):
     names = [argument for argument, _ in signature(file, name)]
     assert launch.kernel.num_args == len(names) == len(set(names))
     assert all(argument.isidentifier() and not keyword.iskeyword(argument) for argument in names)
+
+
+BUILT = """
+import sys
+from clresample import get_device
+from clresample.device.program import read_kernel
+device = get_device("portable")
+for pair in sys.argv[1:]:
+    file, name = pair.split(":")
+    device.launcher(file, name, **{"ROWS": True} if "ifndef ROWS" in read_kernel(file) else {})
+"""
+
+
+def test_compilers_have_nothing_to_say(device, tmp_path):
+    """PoCL's writes warnings into the terminal of whoever builds a kernel first."""
+    if "Portable" not in device.platform:
+        pytest.skip("for PoCL")
+    of_each_file = [f"{file}:{name}" for file, name in dict(ALL).items()]
+    answer = run_python("-c", BUILT, *of_each_file, POCL_CACHE_DIR=str(tmp_path))
+    assert (answer.returncode, answer.stderr) == (0, "")
 
 
 def test_the_names_are_those_of_the_source():

@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
-from helpers.products import BY_TURNS, check, dtype, put_right, random, tiled
+from helpers.products import by_turns, check, dtype, put_right, random
 
 from clresample.device.contraction import Contraction, Matrix, Own, whole
 
 __all__ = ["dtype"]  # a fixture
 
 
-@tiled(BY_TURNS)
+@by_turns
 def test_items_with_tables_and_sizes_of_their_own(device, dtype):
     n_bands, which, m, n, k = 2, [2, 0, 1, 2], [5, 13, 1], [40, 7, 16], [9, 30, 21]
     tables, b = random(3, 13, 30), random(8, 30, 40)

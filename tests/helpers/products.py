@@ -24,22 +24,24 @@ TILES = {
 }
 
 
-# Tiles of other devices than the one at hand, which must run them all: each in both types, or by
-# turns in one where tests need several kernels of each, which take seconds to build.
 OWN = [("device's", dtype) for dtype in TYPES]
-EACH = OWN + [(name, dtype) for name in TILES for dtype in TYPES]
-BY_TURNS = OWN + list(zip(TILES, itertools.cycle(TYPES)))
 
 
-def tiled(cases):
-    """Parametrise a test with the fixture `dtype` by cases of a tile and a type."""
+def _tiled(cases):
+    """Parametrises a test with the fixture `dtype` by cases of a tile and a type."""
     ids = [f"{name}-{dtype.__name__}" for name, dtype in cases]
     return pytest.mark.parametrize("dtype", cases, ids=ids, indirect=True)
 
 
+# The device's own tile in both types, and those of other devices, which any must run: in both, or
+# by turns in one where a test needs several kernels of each, which take seconds to build.
+every_tile = _tiled(OWN + [(name, dtype) for name in TILES for dtype in TYPES])
+by_turns = _tiled(OWN + list(zip(TILES, itertools.cycle(TYPES))))
+
+
 @pytest.fixture
 def dtype(request, device, monkeypatch):
-    """The type of a case, with its tile in use; see `tiled`."""
+    """The type of a case, with its tile in use; see `every_tile`."""
     return type_of(request.param, device, monkeypatch)
 
 
