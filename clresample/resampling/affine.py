@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..device.contraction import Contraction, ImageBatch, Matrix, padded
+from ..device.contraction import ImageBatch, Matrix, padded
 from .executor import Executor
 
 
@@ -45,8 +45,7 @@ class AffineExecutor(Executor):
         n_y, n_x, turn = self.n_rows, self.n_columns, (self.turn.buffer, self.turn.stride, 0)
         z, turned, lines = (self.matrix(name) for name in ("frequencies", "turned", "lines"))
         k_y, k_x, j, n = self.k_ys, self.k_xs, self._columns, self.n_bands
-        twist = Contraction(self.device, self.dtype, epilogue="TWIST", tuning=self.tuning)
-        self.to_columns = twist.bind(
+        self.to_columns = self.product(epilogue="TWIST").bind(
             *(self.k_y, n_x, self.k_x),
             *(z, self.out_x, turned, turn),
             n,
@@ -76,7 +75,7 @@ class AffineExecutor(Executor):
             n,
             own=self.own(m=k_y, n=j),
         )
-        product = Contraction(self.device, self.dtype, tuning=self.tuning, **self.mixed_back())
+        product = self.product(**self.mixed_back())
         self.from_columns = self.to_frequencies(product, n_x, turned, out_x_t, j)
 
     def _gather_back(self):

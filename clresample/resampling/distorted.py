@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from ..device.contraction import COLUMN_PAD, Contraction, ImageBatch
+from ..device.contraction import COLUMN_PAD, ImageBatch
 from .executor import Executor
 
 
@@ -24,8 +24,7 @@ class DistortedExecutor(Executor):
     def bind(self):
         super().bind()
         half, z = self.matrix("half", self.n_rows), self.matrix("frequencies")
-        plain = Contraction(self.device, self.dtype, tuning=self.tuning)
-        self.to_rows = plain.bind(
+        self.to_rows = self.product().bind(
             self.n_rows, self.k_x, self.k_y, self.out_y, z, half, inward=False
         )
         self.rowdot = self._rows("rowdot", (self.tuning.line_group, 1), half).bind(n=self.k_x)
@@ -34,7 +33,7 @@ class DistortedExecutor(Executor):
         super().bind_back()
         half = self.matrix("half", self.n_rows)
         out_y_t = self.made("out_y_t", lambda: self._transposed("out_y", self.k_y, self.n_rows))
-        product = Contraction(self.device, self.dtype, tuning=self.tuning, **self.mixed_back())
+        product = self.product(**self.mixed_back())
         self.from_rows = self.to_frequencies(product, self.n_rows, out_y_t, half)
         self.rowscale = self._rows("rowscale", (COLUMN_PAD, 1), half)
 

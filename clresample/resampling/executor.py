@@ -38,6 +38,10 @@ class Executor(Tables):
         super().__init__(device, dtype, plans)
         self.terms = Terms(self) if self.n_terms > 1 else None
 
+    def product(self, **options) -> Contraction:
+        """A Contraction of the executor's type and tuning."""
+        return Contraction(self.device, self.dtype, tuning=self.tuning, **options)
+
     def waves(self, name, side, **options) -> Contraction:
         """The products with a table of waves, or its transpose, on that side."""
         mirrored = serves(self.tuning) and self.mirrored(name)

@@ -135,12 +135,13 @@ def test_epilogues_are_those_of_the_contraction(device, dtype, epilogue, adjoint
     check(found[1], found[0], dtype)  # zeros beyond the columns, and nothing beyond the rows
 
 
-def own_tables(n, h):
-    """Waves (3, 2 max h, n) of so many frequencies each, zeros beyond."""
+def own_tables(device, n, h):
+    """Waves (3, 2 max h, n) of so many frequencies each, zeros beyond; their numbers of rows (3,);
+    and on the device which of them each item has, ORDER."""
     w = np.zeros((3, 2 * max(h), n))
     for item, n_own in zip(w, h, strict=True):
         item[: 2 * n_own] = table(n, n_own)
-    return w
+    return w, 2 * np.array(h), device.put(np.array(ORDER), np.int32)
 
 
 ORDER = [2, 0, 1]  # the table of each item
@@ -150,8 +151,7 @@ ORDER = [2, 0, 1]  # the table of each item
 def test_items_have_waves_of_their_own_on_the_left(device, dtype, h):
     """As frequencies of scenes with other PSFs: fewer than the layout has room for."""
     n, k = 24, 2 * max(h)
-    w, own = own_tables(n, h), 2 * np.array(h)
-    which = device.put(np.array(ORDER), np.int32)
+    w, own, which = own_tables(device, n, h)
     x, z = random(N_BATCH, n, N_OTHER), random(N_BATCH, k, N_OTHER)
     c, back = result(device, k, N_OTHER, dtype), result(device, n, N_OTHER, dtype)
     tables = left(device, w, dtype)._replace(own=True)
@@ -174,8 +174,7 @@ def test_items_have_waves_of_their_own_on_the_left(device, dtype, h):
 @pytest.mark.parametrize("h", [(5, 9, 7), (70, 33, 81)])
 def test_items_have_waves_of_their_own_on_the_right(device, dtype, h):
     n, k = 25, 2 * max(h)
-    w, own = own_tables(n, h), 2 * np.array(h)
-    which = device.put(np.array(ORDER), np.int32)
+    w, own, which = own_tables(device, n, h)
     x, z = random(N_BATCH, N_OTHER, n), random(N_BATCH, N_OTHER, k)
     c, back = result(device, N_OTHER, k, dtype), device.zeros((N_BATCH, N_OTHER, n), dtype)
     transposed = right(device, w.swapaxes(1, 2), dtype)._replace(own=True)
