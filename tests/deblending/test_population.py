@@ -2,12 +2,22 @@
 
 import numpy as np
 import pytest
-from helpers.scenes import blend, frame
+from helpers.scenes import blend, frame, observe, sources
 
 from clresample import Settings
+from clresample.deblending.blend import Blend
 from clresample.deblending.fit import Fit, begin
 from clresample.deblending.profiles import Galaxy, Given, Star
-from clresample.deblending.start.population import COMMON, LEARNED, OWN, Population, learned
+from clresample.deblending.start import population
+from clresample.deblending.start.population import (
+    COMMON,
+    LEARNED,
+    OWN,
+    WRONG,
+    Population,
+    doubts,
+    learned,
+)
 
 
 def shrunk(data, noise, mean, scatter):
@@ -96,3 +106,91 @@ def test_a_faint_galaxy_is_taken_for_what_its_neighbours_are(device):
     np.testing.assert_allclose(large[1:], np.log(4.5), atol=0.05)
     np.testing.assert_allclose(small[1:], np.log(1.5), atol=0.05)
     assert large[0] - small[0] > 0.15
+
+
+def test_shapes_are_doubted_for_the_light_of_other_sources():
+    """By what a neighbour's light counts in units of the noise, seen as the galaxy sees its own."""
+    rng = np.random.default_rng(2)
+    images, light = rng.uniform(0, 1, (2, 3, 40)), rng.uniform(1, 9, (2, 3))  # channels, components
+    images[:, 2, :20] = 0
+    images[:, 0, 20:] = 0  # the first one and the third one have no pixel in common
+    source = np.array([[0, 1, 2]])
+    seen = light[..., None] * images
+    normal = np.einsum("cip,cjp->cij", images, images)[None]
+    expected = []
+    for i in range(3):
+        others = seen.sum(1) - seen[:, i]
+        expected.append((others * seen[:, i]).sum() ** 2 / (seen[:, i] ** 2).sum())
+    found = doubts(normal, light[None], source)[0]
+    np.testing.assert_allclose(found, 1 + WRONG**2 * np.array(expected))
+    # components of one source do not doubt each other, and one without light is not doubted
+    np.testing.assert_allclose(doubts(normal, light[None], 0 * source), 1)
+    dark = doubts(normal, light[None] * [0, 1, 1], source)[0]
+    assert dark[0] == 1 and dark[1] < found[1]
+
+
+def test_doubt_holds_a_galaxy_as_if_its_data_said_less():
+    """Ten times as doubtful as another one, it is held ten times as strongly; what is learned of
+    both is what data of a tenth of the weight would have taught."""
+    home, scenes = frame(), np.arange(2)
+    shapes, at = [Galaxy(home) for _ in range(4)], (np.repeat(scenes, 2), np.tile([0, 1], 2))
+    one = Population(shapes, *at, 2, 2, 4)
+    theta, data = one.mean + 0.3, 50.0
+    plain = one.pull(scenes, theta)
+    one.doubt_shapes(np.array([0]), np.full((1, 2), 10.0))
+    np.testing.assert_allclose(one.pull(scenes, theta), plain * [10, 1])
+    # the second scene's data say a tenth as much
+    weight = np.array([data, data / 10])[:, None, None] + one.precision(scenes)
+    normal = weight.reshape(2, -1)[..., None] * np.eye(8)
+    one.learn(scenes, theta, normal)
+    np.testing.assert_allclose(one.mean[0], one.mean[1])
+    np.testing.assert_allclose(one.scatter[0], one.scatter[1])
+
+
+def test_places_of_stars_are_not_doubted():
+    home = frame()
+    one = Population([Galaxy(home, 0, 2), Star(home, free=True)], [0, 0], [0, 1], 1, 2, 4)
+    one.doubt_shapes(np.array([0]), np.array([[7.0, 9.0]]))
+    assert one.doubt.tolist() == [[7, 1]]
+
+
+def test_shapes_are_doubted_in_a_group_as_alone(device):
+    """Of scenes that end after different numbers of steps, in none of which rows are mixed up."""
+    rng, blends = np.random.default_rng(6), []
+    for n in (2, 5, 1, 4, 5):
+        objects = [
+            (
+                tuple(rng.uniform(12, 48, 2)),
+                tuple(10 ** rng.uniform(2, 4.5) * rng.uniform(0.5, 1, 3)),
+                rng.uniform(0.8, 4),
+            )
+            for _ in range(n)
+        ]
+        blends.append(blend(objects, shape=(60, 60), seed=n))
+    together, alone = (
+        [Fit(b, Settings(), device, np.float32, pad=1) for b in blends] for _ in range(2)
+    )
+    begin(together)
+    for one, other in zip(alone, together, strict=True):
+        begin([one])
+        for a, b in zip(one.start.thetas, other.start.thetas, strict=True):
+            np.testing.assert_allclose(b, a, atol=1e-4)
+
+
+def test_a_faint_galaxy_takes_less_of_what_is_wrong_with_a_bright_one(device, monkeypatch):
+    """A bright galaxy with an arm of 1 % of its light is no smooth profile; the faint one beside it
+    is round, and drawn out along the arm half as far where its shape is doubted."""
+    bright, faint = ((30, 24), (6e4, 5e4, 7e4), 3.0), ((30, 34), (300, 240, 270), 2.0)
+    arm = [((30 - 2 * k, 31 + k), (150, 135, 165), 1.5) for k in range(5)]
+    seen = observe((bright, faint, *arm), shape=(60, 60), seed=5)
+    shapes = []
+    for wrong in (0.0, WRONG):
+        monkeypatch.setattr(population, "WRONG", wrong)
+        given = Blend(seen, sources((bright, faint)), frame((60, 60)))
+        one = Fit(given, Settings(), device, np.float32, pad=1)
+        begin([one])
+        shapes.append(one.start.thetas)
+    before, after = (np.hypot(*thetas[1][1:3]) for thetas in shapes)
+    assert before > 1.2 and after < 0.5 * before
+    # that of the bright one hardly changes
+    np.testing.assert_allclose(shapes[1][0], shapes[0][0], atol=0.1)

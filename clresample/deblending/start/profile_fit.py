@@ -7,7 +7,7 @@ import numpy as np
 from ..spectra import MODEL_ERROR
 from .equations import N_PARAMETERS, equations
 from .looking import Looking
-from .population import Population
+from .population import Population, doubts
 from .slots import peaks_of
 
 # Longest step of a parameter: far from the minimum the quadratic model of chi2 promises too much.
@@ -39,6 +39,8 @@ class ProfileFit:
         self.at = looking.scene, looking.index
         size = looking.n_scenes, looking.n_most, N_PARAMETERS
         self.population = Population(shapes, *self.at, *size)
+        self.source = np.full(size[:2], -1)
+        self.source[self.at] = [c.source for c in looking.components]
         self.theta, self.chi2 = self.population.mean.copy(), np.full(size[0], np.inf)
         self.brightness = np.zeros(len(shapes))
         self.right = np.zeros((size[0], size[1] * size[2]))
@@ -58,6 +60,7 @@ class ProfileFit:
         self._look(scenes, self.theta, slopes=True)
         for _ in range(FIRST_ROUNDS):
             looking.solve(MODEL_ERROR)
+        self._doubt(scenes)
         self.chi2 = self._chi2(scenes, self.theta)
         self._take_equations(scenes)
 
@@ -115,15 +118,23 @@ class ProfileFit:
         """Learn what to expect of some scenes from the present parameters."""
         before = self.population.pull(scenes, self.theta)
         self.population.learn(scenes, self.theta, self.normal)
+        self._doubt(scenes)
         self.chi2[scenes] += self.population.pull(scenes, self.theta) - before
+
+    def _doubt(self, scenes):
+        """Note how far the shapes of some scenes, of those last solved, are to be doubted."""
+        looking = self.looking
+        at = np.searchsorted(looking.scenes, scenes)
+        normal, spectra = looking.normal[at][..., :-1, :-1], looking.solution()[at][..., :-1]
+        self.population.doubt_shapes(scenes, doubts(normal, spectra, self.source[scenes]))
 
     def _take_equations(self, scenes):
         """Note the normal equations of some scenes, what is expected among them."""
         normal, right = equations(self.looking)
-        mean, scatter = self.population.mean[scenes], self.population.scatter[scenes]
-        weight = scatter.reshape(len(scenes), -1) ** -2.0
+        weight = self.population.precision(scenes).reshape(right.shape)
+        away = self.population.mean[scenes] - self.theta[scenes]
         self.normal[scenes] = normal + weight[..., None] * np.eye(right.shape[1])
-        self.right[scenes] = right + weight * (mean - self.theta[scenes]).reshape(weight.shape)
+        self.right[scenes] = right + weight * away.reshape(right.shape)
 
     def _measure_brightness(self, theta):
         """Note the components' peaks over the noise of a model pixel, where they are best seen."""

@@ -3,8 +3,9 @@
 Gauss-Newton on the shapes with the spectra eliminated (variable projection), over every channel of
 every instrument, so that a source that only one of them sees still starts right:
 
-    min  sum_pixels w (d - sum_s A_s R S_s)^2 + sum ((theta - mean) / scatter)^2,     A >= 0
+    min  sum_pixels w (d - sum_s A_s R S_s)^2 + sum doubt ((theta - mean) / scatter)^2,     A >= 0
 
+What is expected of theta, and how far shapes are doubted beside other sources: population.py.
 Smooth profiles leave a tenth of a bright galaxy's light unexplained. The weights allow for it,
 1/w = sigma^2 + (MODEL_ERROR * model)^2: without, spiral arms would be taken for faint neighbours.
 """
