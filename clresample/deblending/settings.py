@@ -17,7 +17,7 @@ from .solver.prior import Prior
 class Settings:
     """How a fit goes.
 
-    max_iter: most iterations; a second fit, with more components, may take half as many more, and a
+    max_iter: most iterations; a second fit, with more components, may take twice as many, and a
         first one that goes on after it as many again
     prior: what is expected of extended sources' morphologies about their smooth profiles, which
         also chooses the solver. LearnedPrior: structure at several scales, as strong as each

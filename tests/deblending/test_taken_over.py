@@ -55,7 +55,7 @@ def test_ctrl_c_interrupts_fits_that_wait_to_be_taken_over(monkeypatch):
 
 def test_a_fit_that_is_taken_over_goes_on_unless_the_second_one_is_surely_better(monkeypatch):
     """Then with the shifts that it had, and no less time; the better one is kept in the end. Second
-    ones may take half as many iterations more."""
+    ones may take twice as many iterations."""
     firsts = [named(k, HANDED_OVER, shifts=float(k)) for k in range(4)]
     again = {k: named(10 + k, shifts=9.0, of=firsts[k]) for k in (0, 1, 2)}
     monkeypatch.setattr(second, "begun", lambda fits: again)
@@ -73,7 +73,7 @@ def test_a_fit_that_is_taken_over_goes_on_unless_the_second_one_is_surely_better
     monkeypatch.setattr(second, "_is_better", lambda new, old, more=0: gains[new.name] > more)
     told = []
     kept = second.with_second(firsts, Settings(max_iter=50), None, None, lambda *n: told.append(n))
-    assert runs[0][:2] == (list(again.values()), 75)
+    assert runs[0][:2] == (list(again.values()), 100)
     assert runs[1:] == [(firsts[1:], 50, [1, 2, 3])]
     assert told == [(4, 0.5), (6, 0.5)]  # after one iteration of the first, and two of the second
     assert [one.name for one in kept] == [10, 11, 2, 3]
