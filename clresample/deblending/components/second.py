@@ -18,8 +18,8 @@ N_PROFILE = 4
 # over; else the first one goes on to its end before they are compared. Twice what fits of HST and
 # HSC, and of a bright blend of HSC, still gained at most where they went on.
 SURE = 200.0
-# A second fit may take so many times `max_iter`: the first one, if it was taken over, has left some,
-# and one in 40 fits of a bright blend of HSC needs more than 1.5.
+# A second fit may take so many times `max_iter`: the first one, if it was taken over, has left some
+# of its own, and one in 40 fits of a bright blend of HSC needs more than 1.5.
 LONGER = 2.0
 
 
