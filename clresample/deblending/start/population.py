@@ -77,7 +77,7 @@ class Population:
         self._several = self._known.sum(1) >= FEWEST
 
     def doubt_shapes(self, scenes, found):
-        """Take down how far those of some scenes are to be doubted, see `doubts` (k, n)."""
+        """Take down how far shapes of some scenes are to be doubted, (k, n) of `doubts`."""
         self.doubt[scenes] = np.where(self._galaxies[scenes], found, 1)
 
     def precision(self, scenes):

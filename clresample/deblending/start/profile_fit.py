@@ -28,6 +28,7 @@ class ProfileFit:
     looking: Looking; noise (B, C): of a model pixel
 
     population: what is expected of the parameters
+    source (B, n): to which each component belongs, -1 where there is none
     theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs
     brightness (N,): of the components, see `thresholds`
     """
