@@ -81,7 +81,11 @@ class Looking:
     @property
     def rows(self):
         """The row (slots,) among the scenes looked at of each slot's scene."""
-        return self._row[self.scene[self.at]]
+        return self.rows_of(self.scene[self.at])
+
+    def rows_of(self, scenes):
+        """The rows of scenes among those looked at; -1 of others."""
+        return self._row[scenes]
 
     def compare(self, error) -> np.ndarray:
         """Compare the present solution with the data; chi2 (k,) of the scenes looked at."""

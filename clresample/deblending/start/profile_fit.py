@@ -125,8 +125,8 @@ class ProfileFit:
     def _doubt(self, scenes):
         """Note how far the shapes of some scenes, of those last solved, are to be doubted."""
         looking = self.looking
-        at = np.searchsorted(looking.scenes, scenes)
-        normal, spectra = looking.normal[at][..., :-1, :-1], looking.solution()[at][..., :-1]
+        rows = looking.rows_of(scenes)
+        normal, spectra = looking.normal[rows][..., :-1, :-1], looking.solution()[rows][..., :-1]
         self.population.doubt_shapes(scenes, doubts(normal, spectra, self.source[scenes]))
 
     def _take_equations(self, scenes):
