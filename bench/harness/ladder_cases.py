@@ -20,7 +20,9 @@ from .options import data_folder
 SERSIC_N = (1.0, 2.5, 4.0)
 RE_PX, SNR, AXIS_RATIO = (2.0, 64.0), (10.0, 3e4), (0.2, 1.0)
 BLEND_RE_PX, BLEND_SNR = (4.0, 32.0), (100.0, 1e4)
-CUT_RE = 8.0  # half-light radii, where the wings of profiles, which never end, are cut
+# [px] Wings are drawn to r_e times the first and the second number: beyond the frame's corners and
+# the PSF of each case. Their flux beyond counts in the total.
+WINGS_RE, WINGS_PX = 6.0, 64.0
 NEIGHBOUR_SNR, NEIGHBOUR_RE_PX = 20.0, 2.0
 NEIGHBOUR_AWAY_RE, GAP_PX = (1.0, 2.5, 4.0), 4.0  # distance: a multiple of r_e and this gap
 PAIR_AWAY_RE = (0.5, 3.0)
@@ -34,21 +36,21 @@ WRONG_KIND_RE_PX = (2.0, 8.0)
 
 
 class Limits:
-    """Values that the caller fixes: n, re_px, snr, each a sequence or None; --quick's largest r_e."""
+    """Values of n, re_px, snr that the caller fixes (None: drawn), and the largest r_e drawn."""
 
     def __init__(self, n=None, re_px=None, snr=None, largest_re_px=np.inf):
         self.n, self.re_px, self.snr, self.largest_re_px = n, re_px, snr, largest_re_px
 
     def size(self, rng, low, high):
-        if self.re_px:
-            return float(rng.choice(self.re_px))
+        if self.re_px is not None:
+            return self.re_px
         return log_uniform(rng, low, max(low, min(high, self.largest_re_px)))
 
     def brightness(self, rng, low, high):
-        return float(rng.choice(self.snr)) if self.snr else log_uniform(rng, low, high)
+        return log_uniform(rng, low, high) if self.snr is None else self.snr
 
     def steepness(self, rng):
-        return float(rng.choice(self.n or SERSIC_N))
+        return float(rng.choice(SERSIC_N)) if self.n is None else self.n
 
 
 def log_uniform(rng, low, high):
@@ -56,17 +58,20 @@ def log_uniform(rng, low, high):
 
 
 def sersic(n, re_px, q, angle_deg, scale_arcsec):
-    """A GalSim profile of unit flux, cut at CUT_RE."""
+    """A GalSim profile whose flux, wings to infinity included, is 1."""
     galsim, size = import_galsim(), re_px * scale_arcsec
-    if n == 1:  # no wings to be cut: at 8 half-light radii 2e-5 of the light is left
+    if n == 1:  # no wings that make drawing costly
         profile = galsim.Exponential(half_light_radius=size)
     else:
-        profile = galsim.Sersic(n, half_light_radius=size, trunc=CUT_RE * size)
+        reach_px = (WINGS_RE * re_px + WINGS_PX) / np.sqrt(q)  # on the profile before the shear
+        profile = galsim.Sersic(
+            n, half_light_radius=size, trunc=reach_px * scale_arcsec, flux_untruncated=True
+        )
     return profile.shear(q=q, beta=angle_deg * galsim.degrees)
 
 
 def colour(rng):
-    """Index of a galaxy's spectrum, as that of simulated scenes."""
+    """Index of a galaxy's power-law spectrum, scattered as in simulated scenes."""
     return rng.normal(*POWER_LAW_INDEX)
 
 

@@ -1,7 +1,7 @@
-"""Scenes of bench.ladder: galaxies of all sizes and brightnesses, alone and blended, with their truth.
+"""Scenes of bench.ladder as images: sources under PSF and pixel, noise of the sky, and the truth.
 
-Two kinds of images (MODES): one survey of three bands under a Moffat PSF, or Euclid and Rubin on the
-same sky. GalSim draws every source under the PSF and the pixel; the noise is that of the sky alone.
+Two kinds of images (MODES): one survey of three bands under a Moffat PSF, or Euclid and Rubin on
+the same sky. GalSim draws every source alone.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from clresample.simulation.surveys import EUCLID_VIS, RUBIN_UGRIZY
 MODES = ("one", "joint")
 SIDE_RE, MIN_SIDE_PX = 8.0, 65  # frame's side in half-light radii and in pixels, at least
 MARGIN_PX = 16.0  # [px] from the outermost source's centre to the frame's edge, at least
-# One survey: 0.2 arcsec pixels, Moffat PSF 4.2 pixels wide, of whose light 5e-5 lies beyond its image
+# One survey: 0.2 arcsec pixels, a Moffat PSF 4.2 pixels wide, 5e-5 of it beyond its image
 SCALE_ARCSEC, FWHM_PX, BETA, PSF_PX = 0.2, 4.2, 3.5, 65
 BANDS = ("g", "r", "i")
 WAVELENGTHS_NM = {"VIS": 720.0, **dict(zip("ugrizy", RUBIN_WAVELENGTHS_NM, strict=True))}
@@ -66,7 +66,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Item:
-    """A source of a scene. n, re_px, q: of its profile, NaN where it has none; snr: of all bands."""
+    """A source of a scene; n, re_px, q are those of its profile, NaN where it has none."""
 
     parts: tuple
     snr: float
@@ -101,9 +101,7 @@ def instruments(mode):
         image = draw(moffat, Grid.flat((PSF_PX, PSF_PX), SCALE_ARCSEC))
         psfs, images = (moffat,) * len(BANDS), PSF(np.array([image] * len(BANDS)))
         n = len(BANDS)
-        return (
-            Instrument("one", SCALE_ARCSEC, BANDS, psfs, images, np.ones(n), np.full(n, 27.0)),
-        )
+        return (Instrument("one", SCALE_ARCSEC, BANDS, psfs, images, np.ones(n), np.full(n, 27.0)),)
     return tuple(
         Instrument(
             survey.name,
@@ -161,7 +159,9 @@ def _draw(item, views, place):
     """Images of a source, one (C, Ny, Nx) for each view, and all its counts (all channels)."""
     images = [
         sum(
-            part.share * one.counts(part.index)[:, None, None] * one.light(part.profile, grid, place)
+            part.share
+            * one.counts(part.index)[:, None, None]
+            * one.light(part.profile, grid, place)
             for part in item.parts
         )
         for one, grid in views
