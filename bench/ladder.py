@@ -199,7 +199,8 @@ def tasks_of(options):
         cells = itertools.product(*(x or [None] for x in (options.n, options.re, options.snr)))
         limits = [Limits(*cell, largest) for cell in cells]
         n = options.scenes or (1 if len(limits) > 1 else counts[case])
-        for mode, some, i in itertools.product(options.modes, limits, range(n)):
+        scenes_of_case = [some for some in limits for _ in range(n)]
+        for mode, (i, some) in itertools.product(options.modes, enumerate(scenes_of_case)):
             yield case, mode, options.seed, i, some
 
 
