@@ -9,6 +9,8 @@ hst_hsc       docs/hst_hsc.toml: HST and HSC, sources detected, shifts and sky f
 hst, hsc      the images of either alone, likewise
 cosmos-*      HST images of single COSMOS galaxies, those of the highest signal to noise, each from
               its brightest point
+decam_*       DECam's single exposures, sources detected; decam_galaxy also with its sources listed
+              in several orders, and without each neighbour, which must change no flux
 further ones  files for `clresample deblend`, named by --scene, as they are
 
 A row is one band of one scene:
@@ -21,12 +23,14 @@ residual      [sigma] the largest of any source, filtered with the PSF (`measure
 source        that source's number
 flagged       whether the catalogue flags it as a misfit; null where the library has no such flag
 n_unflagged   sources with a residual over 5 sigma in this band that are not flagged
+
+The JSON has the sources' fluxes, errors and flags too. The summary compares decam_galaxy's flux with
+the light in an aperture, and decam_pair's fluxes with the Tractor's.
 """
 
 from __future__ import annotations
 
 import io
-import json
 import tempfile
 import time
 import tomllib
@@ -43,9 +47,10 @@ from clresample.deblending.posterior.residuals import worst_residuals
 from clresample.files.results import read_result
 from clresample.simulation.galaxies import import_galsim, open_catalogue
 
-from .harness import records
+from .harness import decam, records
 from .harness.clock import on_all_cores
 from .harness.options import ROOT, BadOption, Parser, data_folder, positive, run
+from .harness.toml import lines_of
 
 STRUCTURED = 5.0  # [sigma] A residual above this is no noise.
 N_COSMOS = 12
@@ -56,7 +61,7 @@ HSC_SCALE_ARCSEC = 0.168
 HST_ZERO_POINT = 25.94  # [mag] AB magnitude of 1 count/s in COSMOS' F814W images
 PEAK_SIGMA_PX = 2.0  # Smoothing of a COSMOS image before its brightest point is looked for.
 COLUMNS = (
-    ("scene", 14, ""),
+    ("scene", 21, ""),
     ("band", 5, ""),
     ("chi2", 6, ".2f"),
     ("status", 15, ""),
@@ -125,18 +130,13 @@ def scene_files(data, folder):
         fit = {key: tables["fit"][key] for key in ABOUT_THE_DATA if key in tables["fit"]}
         if len(some) == 1:
             fit.pop("fit_shifts", None)
-        lines = [line for o in some for line in ("[[observation]]", *_keys(o))]
+        lines = [line for o in some for line in ("[[observation]]", *lines_of(o))]
         for title in ("detection", "sources"):
             if title in tables:
-                lines += [f"[{title}]", *_keys(tables[title])]
+                lines += [f"[{title}]", *lines_of(tables[title])]
         paths[name] = folder / f"{name}.toml"
-        paths[name].write_text("\n".join([*lines, "[fit]", *_keys(fit), ""]), encoding="utf-8")
+        paths[name].write_text("\n".join([*lines, "[fit]", *lines_of(fit), ""]), encoding="utf-8")
     return paths
-
-
-def _keys(table):
-    """Lines of TOML; JSON's texts, numbers, lists and switches are TOML's too."""
-    return [f"{key} = {json.dumps(value)}" for key, value in table.items()]
 
 
 def fit_file(path, folder):
@@ -184,6 +184,7 @@ def rows_of(name, fit):
                 "flagged": None if misfit is None else bool(flagged[source]),
                 "n_unflagged": int(((worst > STRUCTURED) & ~flagged).sum()),
                 "stages": found["seconds"],
+                "sources": decam.measured(table, band),
             }
 
 
@@ -193,6 +194,7 @@ def plan(data, more, n_galaxies, folder):
         observation, sources = hsc_blend(data)
         yield "hsc_blend", lambda: fit_arrays(observation, sources)
     files = scene_files(data, folder) if (data / "hst_hsc").is_dir() else {}
+    files |= decam.scene_files(data, folder)
     for name, path in (files | {path.stem: path for path in more}).items():
         yield name, lambda path=path: fit_file(path, folder)
     if n_galaxies and (data / "cosmos").is_dir():
@@ -202,7 +204,7 @@ def plan(data, more, n_galaxies, folder):
 
 
 def summarise(rows):
-    """Figures of all scenes together: how fits ended, and how many misfits have no flag."""
+    """Figures of all scenes together: how fits ended, how many misfits have no flag, DECam's."""
     scenes = {row["scene"]: row for row in rows}
     return {
         "all scenes": {
@@ -213,7 +215,7 @@ def summarise(rows):
             "sources and bands over 5 sigma, not flagged": sum(r["n_unflagged"] for r in rows),
             "seconds": sum(row["seconds"] for row in scenes.values()),
         }
-    }
+    } | decam.compared(rows, data_folder())
 
 
 def main(options):
