@@ -24,8 +24,8 @@ source        that source's number
 flagged       whether the catalogue flags it as a misfit; null where the library has no such flag
 n_unflagged   sources with a residual over 5 sigma in this band that are not flagged
 
-The JSON has the sources' fluxes, errors and flags too. The summary compares decam_galaxy's flux with
-the light in an aperture, and decam_pair's fluxes with the Tractor's.
+The JSON has the sources' fluxes, errors and flags too. The summary compares decam_galaxy's flux
+with the light in an aperture, and decam_pair's fluxes with the Tractor's.
 """
 
 from __future__ import annotations
