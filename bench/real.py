@@ -24,8 +24,9 @@ source        that source's number
 flagged       whether the catalogue flags it as a misfit; null where the library has no such flag
 n_unflagged   sources with a residual over 5 sigma in this band that are not flagged
 
-The JSON has the sources' fluxes, errors and flags too. The summary compares decam_galaxy's flux
-with the light in an aperture, and decam_pair's fluxes with the Tractor's.
+The JSON has the sources' fluxes, errors and flags too, and what was said of the scene, which the
+summary counts. It compares decam_galaxy's flux with the light in an aperture, and decam_pair's
+fluxes with the Tractor's.
 """
 
 from __future__ import annotations
@@ -185,6 +186,7 @@ def rows_of(name, fit):
                 "n_unflagged": int(((worst > STRUCTURED) & ~flagged).sum()),
                 "stages": found["seconds"],
                 "sources": decam.measured(table, band),
+                "messages": [*observation.messages, *result.messages],
             }
 
 
@@ -214,6 +216,7 @@ def summarise(rows):
             "bands with a residual over 5 sigma": sum(r["residual"] > STRUCTURED for r in rows),
             "sources and bands over 5 sigma, not flagged": sum(r["n_unflagged"] for r in rows),
             "seconds": sum(row["seconds"] for row in scenes.values()),
+            "scenes with messages": "; ".join(n for n, r in scenes.items() if r["messages"]),
         }
     } | decam.compared(rows, data_folder())
 
@@ -235,6 +238,8 @@ def main(options):
             for row in rows_of(name, fit):
                 rows.append(row)
                 records.print_row(COLUMNS, row)
+            for message in row["messages"]:
+                print(f"    {message}", flush=True)
     if not rows:
         raise BadOption(f"no scene in {data}, or none that --only names")
     summary_of_all = summarise(rows)

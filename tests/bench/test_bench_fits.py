@@ -21,7 +21,7 @@ THROUGHPUT = {
 }  # fmt: skip
 REAL = {
     "scene", "band", "chi2", "status", "seconds", "core_s", "iterations", "n_sources", "residual",
-    "source", "flagged", "n_unflagged", "stages", "sources",
+    "source", "flagged", "n_unflagged", "stages", "sources", "messages",
 }  # fmt: skip
 NOISE = {
     "recipe", "bands", "n", "median", "mean", "against", "coverage", "error", "width", "scatter",

@@ -59,6 +59,8 @@ def test_fluxes_between_the_bounds_are_right():
     # negative light beyond the frame: the whole has less than the frame
     ratio, pull = compare(np.array([0.9]), np.array([0.1]), np.array([1.0]), np.array([0.95]))
     np.testing.assert_allclose([*ratio, *pull], [0.9 / 0.95, -0.5])
+    ratio, pull = compare(np.array([0.97]), np.array([0.1]), np.array([1.0]), np.array([0.95]))
+    np.testing.assert_allclose([*ratio, *pull], [1, 0])
 
 
 @pytest.mark.parametrize(
