@@ -132,9 +132,27 @@ def measure(case, mode, seed, i, limits):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         began = time.process_time()
-        result = deblend(scene.observations, scene.sources)
-        seconds = time.process_time() - began
-    return list(rows_of(case, mode, i, scene, result, seconds))
+        try:
+            result = deblend(scene.observations, scene.sources)
+            rows = list(rows_of(case, mode, i, scene, result, time.process_time() - began))
+        except (ValueError, ArithmeticError, RuntimeError) as error:
+            rows = failed(case, mode, i, scene, error, time.process_time() - began)
+    return rows
+
+
+def failed(case, mode, i, scene, error, seconds):
+    """Rows of a scene that could not be fitted: nothing is within any limit, nothing is silent."""
+    nothing = np.full(scene.total.shape[1], np.nan).tolist()
+    lists = dict.fromkeys(("ratios", "pulls", "total_pulls", "snrs"), nothing)
+    numbers = dict.fromkeys(("ratio", "pull", "chi2"), np.nan)
+    return [
+        {"case": case, "mode": mode, "scene": i, "source": s, "role": item.role, "n": item.n}
+        | {"re_px": item.re_px, "q": item.q, "snr": item.snr, "flags": "", "silent": False}
+        | {"status": f"failed: {error}", "seconds": seconds, "position_px": list(item.away_px)}
+        | lists
+        | numbers
+        for s, item in enumerate(scene.items)
+    ]
 
 
 def summarise(rows):

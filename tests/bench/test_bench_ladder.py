@@ -87,6 +87,22 @@ def test_silently_wrong_is_over_five_percent_and_sigma_and_no_flag(
     assert row["ratio"] == pytest.approx(1.2)
 
 
+def test_a_scene_that_cannot_be_fitted_is_rows_and_never_right(monkeypatch):
+    from bench import ladder
+    from bench.harness.ladder_cases import Limits
+
+    def fails(*_):
+        raise ValueError("singular")
+
+    monkeypatch.setattr(ladder, "deblend", fails)
+    rows = ladder.measure("pair", "one", 0, 0, Limits(1.0, 4.0, 100.0))
+    assert [row["status"] for row in rows] == ["failed: singular"] * 2
+    assert all(row.keys() == LADDER for row in rows)
+    figures = ladder.summarise(rows)["pair, one"]
+    assert figures["fluxes within 3 % or 3 sigma"] == 0
+    assert figures["chi2 <= 1.1"] == 0
+
+
 def test_a_neighbour_lost_is_counted_unless_a_flag_names_it():
     from bench.ladder import is_lost
 
