@@ -59,6 +59,7 @@ class Channel:
     zero_point [mag]: AB magnitude of one count; None = unknown
     background: Background that is subtracted, or None
     saturation [counts]: of the plane's pixels, before the background is subtracted; None = unknown
+    band: of which this is an exposure, see Observation; None = its own, `name`
     """
 
     name: str
@@ -70,6 +71,7 @@ class Channel:
     zero_point: float | None = None
     background: Background | None = None
     saturation: float | None = None
+    band: str | None = None
 
     def read(self, box) -> np.ndarray:
         """Pixels (Ny, Nx) [counts] of a Box, float64, the background subtracted if there is one."""
@@ -257,6 +259,7 @@ class Mosaic:
                 grid or self.grid.cutout(box.y0, box.x0, box.shape),
                 weights=weights,
                 channels=tuple(c.name for c in self.channels),
+                bands=tuple(c.band or c.name for c in self.channels),
                 zero_points=None if zero_points[0] is None else zero_points,
                 noise=self.noise,
                 name=self.name,

@@ -28,7 +28,7 @@ from .whole_file import FileError, check_output, whole_file
 FORMAT = 2  # of the files; raised when an older reader would misread them
 KINDS = {kind.__name__: kind for kind in (Source, Point, Extended)}
 # of an observation, as JSON
-KEPT = ("name", "channels", "zero_points", "saturation", "n_bad", "messages")
+KEPT = ("name", "channels", "bands", "zero_points", "saturation", "n_bad", "messages")
 BOX = ("source", "y", "x", "n_y", "n_x")
 # HDUs of Errors
 ERRORS = {"FLUXCOV": "flux", "COLOURCOV": "colour", "MOMENTCOV": "moments", "BEYOND": "beyond"}

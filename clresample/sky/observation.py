@@ -10,7 +10,7 @@ from ..drawing.shown import ShownObservation
 from .correlation import NoiseCorrelation, noise_of_channels
 from .given.checks import ReadOnly, instance
 from .given.derived import ZERO_POINT_UJY as ZERO_POINT_UJY, DerivedQuantities
-from .given.observed import channels_of, images_of, per_channel, psfs_of, saturation_of
+from .given.observed import bands_of, channels_of, images_of, per_channel, psfs_of, saturation_of
 from .grid import Grid
 from .noise import weights_from
 from .psf import PSF
@@ -34,6 +34,9 @@ class Observation(ReadOnly, ShownObservation, DerivedQuantities):
     mask (C, Ny, Nx) or (Ny, Nx): True = ignore this pixel; may come with either of the two or
         alone. Masks of masked arrays among data, weights and variance mean the same
     channels (C,): names, unique over all instruments; None numbers them after `name`
+    bands (C,): names of the channels' bands; channels of one band, here or in other observations
+        of a fit, are exposures of it and have one spectrum, by the ratio of their zero points.
+        None = each channel's own name
     zero_points (C,) or one number [mag]: AB magnitude of one count
     noise: correlation of the noise of neighbouring pixels, in drizzled, resampled and stacked
         images: a NoiseCorrelation, or its autocorrelation (2L + 1, 2L + 1), for all channels, or C
@@ -60,6 +63,7 @@ class Observation(ReadOnly, ShownObservation, DerivedQuantities):
     grid: Grid
     weights: np.ndarray
     channels: tuple[str, ...]
+    bands: tuple[str, ...]
     zero_points: np.ndarray | None
     noise: tuple[NoiseCorrelation, ...] | None
     name: str | None
@@ -77,6 +81,7 @@ class Observation(ReadOnly, ShownObservation, DerivedQuantities):
         variance=None,
         mask=None,
         channels=None,
+        bands=None,
         zero_points=None,
         noise=None,
         name=None,
@@ -97,6 +102,7 @@ class Observation(ReadOnly, ShownObservation, DerivedQuantities):
             grid=grid,
             weights=weights,
             channels=channels,
+            bands=bands_of(bands, channels),
             zero_points=zero_points,
             noise=noise,
             name=name,

@@ -1,14 +1,18 @@
 """Keys of an image that scenes and fields share: PSFEx, a cutout's place, SATURATE."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy.io import fits
-from astropy.table import Table
+from astropy.table import QTable, Table
 
 from clresample import PSF, Grid
+from clresample.fields.mosaic import Mosaic
 from clresample.fields.psfs.psfex import PSFExPSF
 from clresample.fields.reading.field_file import read_field
 from clresample.fields.reading.scene_file import read_scene
+from clresample.fields.run import run_field
 from clresample.files.scene_keys import SceneError
 from clresample.files.whole_file import FileError
 
@@ -204,3 +208,54 @@ def test_every_psfex_file_of_decam_is_read_and_its_image_lies_among_its_stars(da
         assert o.psf_field.psf_at(50, 50).images.shape == (1, 63, 63)
         assert 3 < o.psf.fwhm_px[0] < 7 and 2e4 < o.saturation[0] < 5e4
         assert not any("outside the stars" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("table", ["observation", "mosaic"])
+def test_the_band_of_an_exposure_is_read(folder, table):
+    more = 'psf_format = "psfex"\nchannels = "g1"\nband = "g"'
+    _, o, _ = opened(folder, more, table)
+    assert (o.channels, o.bands) == (("g1",), ("g",))
+    assert opened(folder, 'psf_format = "psfex"', table)[1].bands == ("cam",)
+    with pytest.raises(SceneError, match="band has 2 names, it takes one"):
+        opened(folder, 'psf_format = "psfex"\nband = ["g", "r"]', table)
+
+
+def test_exposures_of_a_field_give_one_flux_a_band(tmp_path):
+    """Two exposures of one band, of which one shows half of the field, and another band."""
+    pytest.importorskip("sep")
+    rng, (y, x) = np.random.default_rng(2), np.indices((96, 96))
+    flat = Grid.flat((96, 96), 0.2)
+    grid = Grid.from_wcs(flat.to_wcs(ra_deg=10, dec_deg=-30), flat.shape)
+    sources = [(30.0, 25.0, 3000.0), (60.0, 70.0, 4000.0)]
+    light = sum(f * np.exp(-((y - a) ** 2 + (x - b) ** 2) / 8) / (8 * np.pi) for a, b, f in sources)
+    psf = PSF.gaussian(1.6)
+
+    def mosaic(name, band, factor, point, columns=96):
+        weights = np.where(x < columns, 1.0, 0.0)
+        made = Mosaic.of_arrays(
+            name,
+            factor * light + rng.normal(size=light.shape),
+            grid,
+            psf,
+            weights=weights,
+            channels=[name],
+            zero_points=[point],
+        )
+        return replace(made, channels=(replace(made.channels[0], band=band),))
+
+    mosaics = [
+        mosaic("g1", "g", 1.0, 25.0),
+        mosaic("g2", "g", 2.0, 25.0 + 2.5 * np.log10(2), columns=50),
+        mosaic("r", None, 1.0, 25.0),
+    ]
+    run_field(mosaics, tmp_path / "out")
+    table = QTable.read(tmp_path / "out" / "catalogue.ecsv")
+    assert {"flux_g", "flux_r", "chi2_g1", "chi2_g2", "residual_g2"} <= {*table.colnames}
+    assert not {"flux_g1", "flux_g2"} & {*table.colnames}
+    assert len(table) == 2
+    ratio = (table["flux_g"] / table["flux_err_g"]).value
+    assert (ratio > 20).all()
+    for row in table:
+        f = min(sources, key=lambda s: np.hypot(s[0] - row["y"].value, s[1] - row["x"].value))[2]
+        wanted = f * 10 ** (-0.4 * (25 - 23.9))
+        assert abs(row["flux_g"].value - wanted) < 4 * row["flux_err_g"].value + 0.02 * wanted

@@ -29,6 +29,7 @@ class Given:
 
     name: of the mosaic, unique in a field; bands: those to take, as the format calls them
     channels (C,): what they are to be called, unique in a field
+    band (C,): of which they are exposures, where several mosaics have some; see Observation
     mask_bits: bits that mean: ignore this pixel, by number or name
     zero_point [mag]: AB of one count, one number or C of them
     psf: PSF or PSFField for all bands, a list with one for each, or a function that makes one of
@@ -42,6 +43,7 @@ class Given:
     name: str | None = None
     bands: object = None
     channels: object = None
+    band: object = None
     mask_bits: object = None
     zero_point: object = None
     psf: object = None
@@ -149,10 +151,12 @@ def assembled(survey, found, given, *, noise="white") -> Mosaic:
     names = _one_for_each("channels", given.channels, found) or [one.band for one in found]
     points = _zero_points(found, given)
     psf, levels = _psf(found, given, grid), _saturations(found, given)
+    exposed = _one_for_each("band", given.band, found) or [None] * len(found)
     channels = tuple(
         Channel(
             *(names[i], f.data, f.weight, f.kind, f.mask, f.mask_value, points[i]),
             saturation=levels[i],
+            band=exposed[i],
         )
         for i, f in enumerate(found)
     )

@@ -49,6 +49,7 @@ IMAGE = {
     "hdu": HDU,
     "bands": BANDS,
     "channels": NAMES,
+    "band": NAMES,
     "psf": FILES,
     "psf_format": Rule(" or ".join(f'"{form}"' for form in FORMATS), lambda v: v in FORMATS),
     "psf_hdu": HDU,
@@ -88,7 +89,7 @@ IMAGE = {
         '"estimate", "white", or the name of a file with the autocorrelation of the noise', is_text
     ),
 }
-SHARED = ("name", "channels", "mask_bits", "zero_point", "background", "saturation")
+SHARED = ("name", "channels", "band", "mask_bits", "zero_point", "background", "saturation")
 SURVEY = {  # the same of a survey's files
     "format": Rule(" or ".join(f'"{form}"' for form in READERS), lambda v: v in READERS),
     "path": Rule("the name of a folder or a file, or a list of files", one_or_many(is_text)),

@@ -48,9 +48,13 @@ def open_mosaic(folder, table, inputs, notes, *, in_memory=False) -> Mosaic:
     points = _zero_points(table, headers, images.grid, notes)
     weights, kind = source.weights(bands)
     masks, bits = source.masks(bands)
-    levels = _saturations(table, headers)
+    levels, exposed = _saturations(table, headers), _bands(table, len(planes))
     channels = [
-        Channel(names[i], plane, weights[i], kind, masks[i], bits[i], points[i], None, levels[i])
+        Channel(
+            *(names[i], plane, weights[i], kind, masks[i], bits[i], points[i]),
+            saturation=levels[i],
+            band=exposed[i],
+        )
         for i, plane in enumerate(planes)
     ]
     psf = read_psf_keys(folder, table, images.grid, headers[0], bands, inputs, notes)
@@ -86,6 +90,16 @@ def _channels(table, bands):
     if len(set(bands)) == n and not any(band.isdigit() for band in bands):
         return bands
     return [name] if n == 1 else [f"{name}{i}" for i in range(n)]
+
+
+def _bands(table, n):
+    """Bands (n,) of the channels, None where each has its own."""
+    if "band" not in table:
+        return [None] * n
+    names = as_list(table["band"])
+    if len(names) not in (1, n):
+        raise ValueError(f"band has {len(names)} names, it takes one, or one for each of {n}")
+    return names * (n if len(names) == 1 else 1)
 
 
 def _zero_points(table, headers, grid, notes):

@@ -132,6 +132,7 @@ def _observation(mosaic, table, calibrated):
             mosaic.psf if mosaic.psf.varies else mosaic.psf.psf_at(0, 0),
             mosaic.grid,
             channels=[c.name for c in channels],
+            bands=[c.band or c.name for c in channels],
             saturation=saturations(channels, box),
             name=mosaic.name,
             **given,

@@ -41,7 +41,7 @@ class DerivedQuantities:
         weights = np.stack(
             [n.reached(w) * w * s**2 for n, w, s in zip(self.noise, self.weights, sums)]
         )
-        names = {key: getattr(self, key) for key in ("channels", "zero_points", "name")}
+        names = {key: getattr(self, key) for key in ("channels", "bands", "zero_points", "name")}
         return type(self)(data, psf, self.grid, weights=weights, **names)
 
     def as_white(self, images) -> np.ndarray:

@@ -57,6 +57,16 @@ def channels_of(channels, name, n_channels):
     return channels
 
 
+def bands_of(bands, channels):
+    """Names (C,) of the bands of channels; the channels' own names for None."""
+    if bands is None:
+        return channels
+    bands = (bands,) if isinstance(bands, str) else tuple(bands)
+    if len(bands) != len(channels) or not all(isinstance(b, str) and b for b in bands):
+        raise ValueError(f"bands is {bands}, must be {len(channels)} names, one for each channel")
+    return bands
+
+
 def saturation_of(values, n_channels):
     """Saturation levels (C,) [counts] above 0, infinite ones where unknown; None for None."""
     if values is None:
