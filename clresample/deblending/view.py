@@ -12,7 +12,7 @@ from ..sky.frame import Frame
 from ..sky.mapping import Mapping
 from ..sky.varying.basis import PSFBasis
 from .profiles import point
-from .solver.ties import Ties
+from .solver.rendering.ties import Ties
 
 # [sigma] Stars whose PSF's error is nowhere more than this leave the weights as they are.
 FAINT = 0.05

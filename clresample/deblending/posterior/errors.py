@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..solver.ties import Ties
+from ..solver.rendering.ties import Ties
 from .blocks import Factor
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from ...device.workers import in_threads
 from ...sky.extent import box_slices
 from ..shifts import SCATTER_PX
-from ..solver.ties import Ties
+from ..solver.rendering.ties import Ties
 from .blocks import Blocks
 
 # [1] Products of this size and more are summed in float64: in float32 they round to what the prior,
@@ -39,6 +39,13 @@ class Layout:
     n_sky: int = 0
     n_shifts: int = 0
     ties: Ties | None = None
+
+    def band_weights(self, weights):
+        """Weights (C,) with which each band counts once: 0 in channels but its first; and (B,)."""
+        if self.ties is None:
+            return weights, weights
+        first = self.ties.first
+        return np.where(np.isin(np.arange(len(weights)), first), weights, 0), weights[first]
 
     @property
     def n_spectra(self):

@@ -133,14 +133,11 @@ class Posterior:
         """Covariances (S, 5, 5) of centroids and second moments, and what they change by (S, 5)
         without the bound; error (S, C): of the fluxes."""
         s, out, moved = self.solution, np.full((n_sources, 5, 5), np.nan), np.zeros((n_sources, 5))
-        ties = self.layout.ties
         for source in np.unique(owner):
             own = np.flatnonzero(owner == source)
             weight = np.where(error[source] > 0, 1 / np.maximum(error[source], 1e-30), 0)
-            if ties is not None:  # each band counts once
-                weight = np.where(ties.first[ties.band] == np.arange(len(weight)), weight, 0)
+            weight, by_band = self.layout.band_weights(weight)
             light = s.spectra[own] @ weight
-            by_band = weight if ties is None else weight[ties.first]
             n_modes = sum(len(self.modes[i]) for i in own)
             if not n_modes or not light.any():
                 continue

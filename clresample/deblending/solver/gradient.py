@@ -4,7 +4,7 @@
     G_o = R_o^T w_o (R_o M + sky - d_o)
     dS_s = sum_c A[s, c] G_c on the box,   dA[s, c] = <S_s, G_c>,   dsky_c = sum of w_o (...)
 
-dA of tied channels is the mean over their band, see ties.py.
+dA of tied channels is the mean over their band, see rendering/ties.py.
 
 |z|^2 is the prior's, and its gradient is added where z is stepped (amsgrad.py). rendering/ has how
 R_o M and the gradients are computed; kernels in scene.cl, boxed.cl and losses.cl.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...device.tuning import Tuning
-from ..solver.ties import band_equations
+from ..solver.rendering.ties import band_equations
 from ..spectra import inverse, non_negative
 from .sight import Sight
 from .slots import Slots, boxes_of, thresholds
@@ -159,23 +159,12 @@ class Looking:
     def _non_negative(self):
         """The least squares (k, C, n) or, with the sky, (k, C, n + 1)."""
         if self.ties is not None:
-            return self._by_band()
+            return _by_band(self)
         size = self.n_most + self.fit_sky
         free = np.arange(size) >= self.n_most
         normal = self.normal[..., :size, :size].reshape(-1, size, size)
         found = non_negative(normal, self.right[..., :size].reshape(-1, size), free)
         return found.reshape(len(self.scenes), self.n_channels, size)
-
-    def _by_band(self):
-        """As `_non_negative`, of tied channels."""
-        ties, n = self.ties, self.n_most
-        normal, right, own, value = band_equations(ties, self.normal, self.right, self.fit_sky)
-        found = non_negative(normal.reshape(-1, n, n), right.reshape(-1, n))
-        spectra = ties.spread(found.reshape(right.shape), axis=1)
-        if not self.fit_sky:
-            return spectra
-        sky = value - (own * spectra).sum(axis=-1)
-        return np.concatenate([spectra, sky[..., None]], axis=-1)
 
     def covariance(self, row):
         """Of one scene's spectra (C, n, n), the sky levels unknown too if they are fitted."""
@@ -185,3 +174,15 @@ class Looking:
             return self.ties.spread(inverse(band_equations(*given)[0][:, :n, :n]), axis=0)
         own = np.r_[0:n, self.n_most : self.n_most + self.fit_sky]
         return inverse(self.normal[row][:, own[:, None], own])[:, :n, :n]
+
+
+def _by_band(looking):
+    """The least squares (k, C, n) of tied channels or, with the sky, (k, C, n + 1)."""
+    ties, n = looking.ties, looking.n_most
+    normal, right, own, value = band_equations(ties, looking.normal, looking.right, looking.fit_sky)
+    found = non_negative(normal.reshape(-1, n, n), right.reshape(-1, n))
+    spectra = ties.spread(found.reshape(right.shape), axis=1)
+    if not looking.fit_sky:
+        return spectra
+    sky = value - (own * spectra).sum(axis=-1)
+    return np.concatenate([spectra, sky[..., None]], axis=-1)
