@@ -16,7 +16,7 @@
  *
  * whiten   seen <- seen root;  launch: (X, tallest window, slots)
  * compare  model m = sky root + sum_slots A seen, residual r = data - m, weight w = 1 / (1 + (error
- *          m)^2) where root is not 0; sums (B, n_bands, my, 3): of w r^2, w r root, w root^2;
+ *          m)^2) where root is not 0, error (B, n_bands); sums (B, n_bands, my, 3): of w r^2, w r root, w root^2;
  *          launch: (WG my, n_bands, scenes), a group a row.  `listed`: the slots scene by scene,
  *          those of scenes[k] from first[k] to first[k + 1]
  * gram     out (pairs, n_bands, K, K) = sum over the pixels where both windows lie of w a_i b_j;
@@ -72,7 +72,8 @@ __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
 void compare(__global const int *restrict scenes, __global const int *restrict first,
              __global const int *restrict listed, __global const int *restrict place,
              const int n_bands, const int my, const int mx, const int channel,
-             const int n_channels, const REAL error, __global const REAL *restrict spectra,
+             const int n_channels, __global const REAL *restrict error,
+             __global const REAL *restrict spectra,
              __global const REAL *restrict sky, __global const REAL *restrict root,
              __global const REAL *restrict data, __global const REAL *restrict seen,
              __global REAL *restrict residual, __global REAL *restrict weight,
@@ -85,6 +86,7 @@ void compare(__global const int *restrict scenes, __global const int *restrict f
     __global REAL *m = residual + line * mx, *w = weight + line * mx;
     __global const REAL *r = root + line * mx, *d = data + line * mx;
     const REAL level = sky[(size_t)b * n_channels + channel + c];
+    const REAL part_of_model = error[b * n_bands + c];
 #if ROWS
     for (int x = 0; x < mx; ++x) m[x] = level * r[x];
     for (int l = first[k]; l < first[k + 1]; ++l) {
@@ -108,7 +110,8 @@ void compare(__global const int *restrict scenes, __global const int *restrict f
         for (int i = 0; i < 8; ++i) {
             const int x = ROWS ? at + i : at + i * WG;
             if (x < mx) {
-                const REAL part = error * m[x], rest = d[x] - m[x], weigh = 1 / (1 + part * part);
+                const REAL part = part_of_model * m[x], rest = d[x] - m[x];
+                const REAL weigh = 1 / (1 + part * part);
                 m[x] = rest;
                 w[x] = weigh;
                 chi2[i] += weigh * rest * rest;

@@ -100,7 +100,7 @@ def run(arguments):
 
     device = get_device(arguments.device)
     device.build_ahead(operator_programs(device, arguments.dtype))
-    from ..files.scene import read_scene  # half a second of astropy and scipy
+    from ..fields.reading.scene_file import read_scene  # half a second of astropy and scipy
     from ..measurement.quality import summary
 
     scene = read_scene(arguments.scene)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from .solver.scene import Scene, State, signature_of
 from .start.first_scene import first_scene
 from .start.seen import Model, Seen, see
 from .start.start import LIGHT_SIGMAS, Patch, StartingPoint, start, weighed
-from .view import Home, view_as_taken, whitened_view
+from .view import Home, pixel_noise, tied_views, view_as_taken, whitened_view
 
 # The stopping rule compares the best loss with the best one this many iterations ago: losses of
 # single iterations scatter, and a smaller number would take a pause for the end.
@@ -45,6 +46,7 @@ class Fit:
     fitted (n,): indices of those inside the frame; dark (n_dark,): of those far from any light
     views: the observations as WhitenedViews, whose operators hold the observations' shifts
     noise (C,): of one model pixel, in the views' units; unit (C,) [counts]: of these
+    ties: Ties of the channels, or None
     padded: the frame with its sides grown to those that a batch shares; home: Home
     last_steps (n_observations, 2) [model px]: what shifts were last asked for, before `ahead`
     start: the StartingPoint that `begin` was given; from then on
@@ -65,10 +67,10 @@ class Fit:
         places, tolerance = positions[self.fitted], settings.psf_tolerance
         padded, private = _padded_frame(self.frame, pad), settings.fit_shifts or shifts.any()
         self.home = Home(self.frame, padded, places, tolerance)
-        self.views = [
-            whitened_view(self.home, o, pad, device, dtype, private=private)
-            for o in blend.observations
-        ]
+        view = partial(whitened_view, pad=pad, device=device, dtype=dtype, private=private)
+        views = [view(self.home, o) for o in blend.observations]
+        self.views = tied_views(views, blend.observations)
+        self.ties = self.views[0].ties
         if private:
             self.shift(shifts)
         for o, view in zip(blend.observations, self.views, strict=True):
@@ -76,7 +78,7 @@ class Fit:
         if not any(view.root.any() for view in self.views):
             raise ValueError("no observed pixel on the model frame has a weight")
         self.unit = np.concatenate([view.unit for view in self.views])
-        self.noise = np.concatenate([view.pixel_noise for view in self.views])
+        self.noise = pixel_noise(self.views)
         self.padded, self._positions, self.start = padded, positions, None
         self.losses, self.status, self.findings = [], UNFINISHED, None
         self._best = _Best(np.inf, None, None, self.shifts)
@@ -92,9 +94,8 @@ class Fit:
     @property
     def signature(self):
         """Fits of equal signature start and iterate side by side; see Scene.signature."""
-        return signature_of(
-            self.padded.shape, self.settings.fit_sky, [view.op for view in self.views]
-        )
+        ops = [view.op for view in self.views]
+        return signature_of(self.padded.shape, self.settings.fit_sky, ops, self.ties)
 
     def begin(self, point: StartingPoint, seconds):
         """Make the scene and its state from where it starts; seconds: that this took."""

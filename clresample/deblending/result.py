@@ -93,6 +93,12 @@ class Result(ShownResult):
         """Names (C,) of all channels, in the order of the spectra."""
         return tuple(name for o in self.observations for name in o.channels)
 
+    @property
+    def bands(self) -> dict[str, int]:
+        """The bands of all channels by name, each with the number of its first channel."""
+        names = [band for o in self.observations for band in o.bands]
+        return {name: names.index(name) for name in dict.fromkeys(names)}
+
     @cached_property
     def footprints(self) -> tuple[Footprint, ...]:
         """Where each observation's pixels lie in the frame, at its fitted shift."""

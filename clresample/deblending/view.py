@@ -12,6 +12,7 @@ from ..sky.frame import Frame
 from ..sky.mapping import Mapping
 from ..sky.varying.basis import PSFBasis
 from .profiles import point
+from .solver.rendering.ties import Ties
 
 # [sigma] Stars whose PSF's error is nowhere more than this leave the weights as they are.
 FAINT = 0.05
@@ -33,6 +34,9 @@ class WhitenedView:
     data (Co, My, Mx) [unit]: the observation's data, 0 where root is
     shares (S, Co, T): of the op's terms in the PSF of each of the scene's sources; None where its
         PSF is the same for all
+    noise (Co,) [unit]: of a typical pixel, where `unit` is another one; None = 1
+    ties: Ties of the channels of all views of the scene; None where each has a band of its own
+    exposures (Co,): with ties, how many exposures like this one the band has the weight of
     """
 
     op: Resampler
@@ -42,6 +46,9 @@ class WhitenedView:
     root: np.ndarray
     data: np.ndarray
     shares: np.ndarray | None = None
+    noise: np.ndarray | None = None
+    ties: Ties | None = None
+    exposures: np.ndarray | None = None
 
     @classmethod
     def of(cls, op, frame, data, weights, shares=None):
@@ -77,11 +84,52 @@ class WhitenedView:
         """The same view of a scene that has the sources `chosen` (k,) of this one alone."""
         return self if self.shares is None else replace(self, shares=self.shares[chosen])
 
+    def in_units(self, unit, ties) -> WhitenedView:
+        """The same view with data and model in other units (Co,) [counts], and with Ties."""
+        ratio = self.unit / unit
+        data = self.data * ratio[:, None, None]
+        root = self.root / ratio[:, None, None]
+        return replace(self, unit=unit, root=root, data=data, noise=ratio, ties=ties)
+
     @property
     def pixel_noise(self) -> np.ndarray:
         """Noise (Co,) [unit] of one model pixel, if it were observed with the same exposure."""
         area = abs(np.linalg.det(self.mapping.matrix))
-        return np.full(len(self.data), 1 / np.sqrt(area))
+        return np.full(len(self.data), 1 if self.noise is None else self.noise) / np.sqrt(area)
+
+
+def pixel_noise(views) -> np.ndarray:
+    """Noise (C,) [unit] of one model pixel in each channel of a scene's views; of tied channels
+    that of all exposures of their band together."""
+    noise, ties = np.concatenate([view.pixel_noise for view in views]), views[0].ties
+    if ties is None:
+        return noise
+    seen = np.concatenate([(view.root > 0).any((1, 2)) for view in views])
+    together = ties.spread(ties.total(np.where(seen, 1 / noise**2, 0)))
+    return np.where(together > 0, 1 / np.sqrt(np.where(together > 0, together, 1)), noise)
+
+
+def tied_views(views, observations):
+    """Views of Observations; where channels share a band, in units that are one flux density for
+    all channels of it: the noise of their typical pixels, as if all had the mean weight."""
+    names = [band for o in observations for band in o.bands]
+    ties = Ties.of(names)
+    if ties is None:
+        return views
+    unit = np.concatenate([view.unit for view in views])
+    scales = [o.flux_scale for o in observations]
+    scale = np.ones(len(unit)) if scales[0] is None else np.concatenate(scales)
+    seen = np.concatenate([(view.root > 0).any((1, 2)) for view in views])
+    weight = ties.total(np.where(seen, (unit * scale) ** -2.0, 0))
+    n = np.maximum(ties.total(seen), 1)
+    common = np.where(weight > 0, np.sqrt(n / np.where(weight > 0, weight, 1)), scale[ties.first])
+    unit = ties.spread(common) / scale
+    ends = np.cumsum([len(view.data) for view in views])[:-1]
+    views = [v.in_units(u, ties) for v, u in zip(views, np.split(unit, ends), strict=True)]
+    noise = np.concatenate([view.pixel_noise for view in views])
+    exposures = np.where(seen, (noise / pixel_noise(views)) ** 2, 1)
+    parts = np.split(exposures, ends)
+    return [replace(v, exposures=part) for v, part in zip(views, parts, strict=True)]
 
 
 def without_dark(images):

@@ -93,7 +93,7 @@ def finished(job, parts, last, unsettled=()):
 def _order(job, names):
     """Names of columns: who and where, how it went, positions and shapes, then all channels."""
     channels, labels = job.channels, [m.name for m in job.mosaics]
-    fluxes = [f"{key}_{c}" for c in channels for key in ("flux", "flux_err")]
+    fluxes = [f"{key}_{b}" for b in job.bands for key in ("flux", "flux_err")]
     quality = [f"chi2_{name}" for name in labels] + [f"residual_{c}" for c in channels]
     fixed = [*FIRST, *THEN]
     middle = [n for n in names if n not in {*fixed, *fluxes, *quality}]

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from astropy.io import fits
 
-from ..files.whole_file import FileError
 from ..sky.grid import Grid
 from ..sky.observation import Observation
 from ..sky.psf_checks import PSFWarning
@@ -19,7 +15,7 @@ from ..sky.varying.field import PSFField
 from .background import Background
 from .box import Box, outline
 from .psfs.psf_field import ConstantPSF
-from .strips import STRIPS, section
+from .strips import FilePlane as FilePlane  # beside the other kinds of Plane
 
 
 class Plane(Protocol):
@@ -27,35 +23,6 @@ class Plane(Protocol):
 
     def read(self, box) -> np.ndarray:
         """The pixels of a Box that lies on the image."""
-
-
-@dataclass(frozen=True)
-class FilePlane:
-    """One plane (Ny, Nx) of an image HDU, plain or tile-compressed, read piece by piece.
-
-    path, hdu: file and number of the HDU; plane: index on the axis that is not on the sky, None
-        where the image has two axes
-    """
-
-    path: Path
-    hdu: int
-    plane: int | None = None
-
-    def read(self, box) -> np.ndarray:
-        """The pixels of a Box that lies on the image, native. Raises FileError."""
-        try:
-            hdu = _opened(str(self.path))[self.hdu]
-            data = STRIPS.read(hdu, self.plane, box)
-            if data is None:
-                data = section(hdu, self.plane, box)
-        except Exception as error:  # a damaged file may provoke any exception in astropy
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise FileError(f"{self.path}: HDU {self.hdu} cannot be read ({reason})") from error
-        if data.shape != box.shape:
-            raise FileError(
-                f"{self.path}: HDU {self.hdu} is truncated, {data.shape} pixels of {box.shape}"
-            )
-        return data.astype(data.dtype.newbyteorder("="), copy=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,15 +47,6 @@ class NumberPlane:
         return np.full(box.shape, self.value)
 
 
-@lru_cache(maxsize=64)
-def _opened(path):
-    """The HDUs of a file, which stay open: each process maps a file into its memory once.
-
-    Asked for by memmap=True, astropy would refuse integers without a sign, as masks have them.
-    """
-    return fits.open(path, lazy_load_hdus=True)
-
-
 @dataclass(frozen=True, eq=False)
 class Channel:
     """One band of a mosaic.
@@ -100,6 +58,8 @@ class Channel:
     mask: plane or None; mask_value: the bits that mean: ignore this pixel; None = any that is not 0
     zero_point [mag]: AB magnitude of one count; None = unknown
     background: Background that is subtracted, or None
+    saturation [counts]: of the plane's pixels, before the background is subtracted; None = unknown
+    band: of which this is an exposure, see Observation; None = its own, `name`
     """
 
     name: str
@@ -110,6 +70,8 @@ class Channel:
     mask_value: int | None = None
     zero_point: float | None = None
     background: Background | None = None
+    saturation: float | None = None
+    band: str | None = None
 
     def read(self, box) -> np.ndarray:
         """Pixels (Ny, Nx) [counts] of a Box, float64, the background subtracted if there is one."""
@@ -138,6 +100,18 @@ class Channel:
             bad = bad | (self.masked(box) if masked is None else masked)
         return np.where(bad, 0.0, values)
 
+    def saturation_of(self, box) -> float:
+        """Saturation level [counts] of what `read` returns of a Box; infinite where unknown.
+
+        Of a background that is subtracted its mean over the Box counts.
+        """
+        if self.saturation is None:
+            return np.inf
+        if self.background is None:
+            return self.saturation
+        left = self.saturation - float(self.background.read(box).mean())
+        return left if left > 0 else np.inf
+
     @property
     def mask_key(self):
         """Equal for channels that ignore the same pixels."""
@@ -147,7 +121,7 @@ class Channel:
         """Which pixels (Ny, Nx) of a Box the mask excludes; a channel without one excludes none."""
         if self.mask is None:
             return np.zeros(box.shape, bool)
-        flags = self.mask.read(box)
+        flags = np.nan_to_num(self.mask.read(box))
         return flags != 0 if self.mask_value is None else _set(flags, self.mask_value)
 
 
@@ -198,11 +172,13 @@ class Mosaic:
         zero_points=None,
         mask=None,
         noise=None,
+        saturation=None,
     ) -> Mosaic:
         """A mosaic of arrays in memory, as `Observation` takes them.
 
         data, weights (C, Ny, Nx); mask (Ny, Nx) or (C, Ny, Nx): True = ignore this pixel
         channels (C,): names; zero_points (C,) [mag]; psf: PSF or PSFField
+        saturation (C,) or one number [counts]
         Raises ValueError for shapes that disagree.
         """
         data = np.asarray(data)
@@ -218,6 +194,9 @@ class Mosaic:
                 f"channels has {len(names)} names and zero_points {len(given)} numbers, data have "
                 f"{len(data)} channels"
             )
+        levels = (
+            [None] * len(data) if saturation is None else np.broadcast_to(saturation, len(data))
+        )
         made = tuple(
             Channel(
                 names[i],
@@ -225,6 +204,7 @@ class Mosaic:
                 ArrayPlane(weights[i]),
                 mask=None if masks is None else ArrayPlane(masks[i]),
                 zero_point=given[i],
+                saturation=levels[i],
             )
             for i in range(len(data))
         )
@@ -279,9 +259,11 @@ class Mosaic:
                 grid or self.grid.cutout(box.y0, box.x0, box.shape),
                 weights=weights,
                 channels=tuple(c.name for c in self.channels),
+                bands=tuple(c.band or c.name for c in self.channels),
                 zero_points=None if zero_points[0] is None else zero_points,
                 noise=self.noise,
                 name=self.name,
+                saturation=saturations(self.channels, box),
             )
 
     def _weights(self, box):
@@ -292,6 +274,13 @@ class Mosaic:
     def _middle(self, box):
         """The PSF in the middle of a Box."""
         return self.psf.psf_at(*((np.array(box[:2]) + np.array(box[2:]) - 1) / 2))
+
+
+def saturations(channels, box) -> np.ndarray | None:
+    """Saturation levels (C,) [counts] of channels on a Box; None where none of them has one."""
+    if all(c.saturation is None for c in channels):
+        return None
+    return np.array([c.saturation_of(box) for c in channels])
 
 
 def _set(flags, bits):

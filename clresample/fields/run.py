@@ -144,6 +144,7 @@ def _check_names(mosaics):
     for what, name in [
         *(("name", m.name) for m in mosaics),
         *(("channel", c.name) for m in mosaics for c in m.channels),
+        *(("band", c.band) for m in mosaics for c in m.channels if c.band),
     ]:
         if to_ascii(name) != name or name != name.rstrip():
             raise ValueError(
@@ -151,7 +152,7 @@ def _check_names(mosaics):
                 "columns of FITS tables: give another one"
             )
     check_columns(f"chi2_{m.name}" for m in mosaics)
-    check_columns(f"flux_err_{c.name}" for m in mosaics for c in m.channels)
+    check_columns(f"flux_err_{c.band or c.name}" for m in mosaics for c in m.channels)
 
 
 def _as_sent(mosaics):

@@ -1,12 +1,17 @@
-"""Parts of images in files; rows of compressed ones are kept decoded for neighbouring cutouts."""
+"""Planes of images in files, read piece by piece; decoded rows are kept for other cutouts."""
 
 from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
+
+from ..files.whole_file import FileError
 
 # [px] Rows that are kept together, in whole tiles: about the side of a small blend's cutout. Fewer
 # are more entries, more are decoded for a cutout that is the only one there.
@@ -104,3 +109,41 @@ def section(hdu, plane, box):
     index = (rows, slice(None) if whole else columns)
     data = np.asarray(hdu.section[index if plane is None else (plane, *index)])
     return data[:, columns] if whole else data
+
+
+@dataclass(frozen=True)
+class FilePlane:
+    """One plane (Ny, Nx) of an image HDU, plain or tile-compressed, read piece by piece.
+
+    path, hdu: file and number of the HDU; plane: index on the axis that is not on the sky, None
+        where the image has two axes
+    """
+
+    path: Path
+    hdu: int
+    plane: int | None = None
+
+    def read(self, box) -> np.ndarray:
+        """The pixels of a Box that lies on the image, native. Raises FileError."""
+        try:
+            hdu = _opened(str(self.path))[self.hdu]
+            data = STRIPS.read(hdu, self.plane, box)
+            if data is None:
+                data = section(hdu, self.plane, box)
+        except Exception as error:  # a damaged file may provoke any exception in astropy
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise FileError(f"{self.path}: HDU {self.hdu} cannot be read ({reason})") from error
+        if data.shape != box.shape:
+            raise FileError(
+                f"{self.path}: HDU {self.hdu} is truncated, {data.shape} pixels of {box.shape}"
+            )
+        return data.astype(data.dtype.newbyteorder("="), copy=False)
+
+
+@lru_cache(maxsize=64)
+def _opened(path):
+    """The HDUs of a file, which stay open: each process maps a file into its memory once.
+
+    Asked for by memmap=True, astropy would refuse integers without a sign, as masks have them.
+    """
+    return fits.open(path, lazy_load_hdus=True)

@@ -70,7 +70,7 @@ def read_image(path, *, hdu=None, bands=None):
             grid = Grid.from_wcs(wcs, data.shape)
         except ValueError as error:
             raise FileError(f"{path}: {error}") from error
-    names = _band_names(header, len(data))
+    names = band_names(header, len(data))
     chosen = choose_bands(path, names, bands)
     return Image(to_native(data[chosen]), grid, header, tuple(names[i] for i in chosen))
 
@@ -86,7 +86,7 @@ def read_psf(path, *, hdu=None, bands=None, spacing=1.0, center=None):
         chosen = choose_hdu(path, hdus, hdu)
         data, header = read_pixels(path, chosen), chosen.header
         data = data[None] if data.ndim == 2 else data
-        chosen = choose_bands(path, _band_names(header, len(data)), bands)
+        chosen = choose_bands(path, band_names(header, len(data)), bands)
     try:
         return PSF(to_native(data[chosen]), spacing=spacing, center=center)
     except ValueError as error:
@@ -245,7 +245,8 @@ def to_native(data):
     return np.ascontiguousarray(data, dtype=dtype)
 
 
-def _band_names(header, n_bands):
+def band_names(header, n_bands):
+    """Names of an image's bands by its header, their numbers where it has none."""
     keys = [f"BAND{i + 1}" for i in range(n_bands)]
     if n_bands == 1:
         keys = [next((key for key in ("BAND1", "BAND", "FILTER") if key in header), "BAND1")]

@@ -40,11 +40,12 @@ def check_columns(names):
 def check_catalogue_names(observations, *, magnitudes=False):
     """Raise ValueError where observations, their names and channels' being those of a catalogue's
     columns, give such that FITS cannot hold; magnitudes: see `catalogue`."""
-    channels = [channel for o in observations for channel in o.channels]
-    check_channels(channels)
+    bands = list(dict.fromkeys(band for o in observations for band in o.bands))
+    check_channels([channel for o in observations for channel in o.channels])
+    check_channels(bands)
     check_columns(f"chi2_{o.name}" for o in observations)
     if magnitudes:
-        check_columns(f"colour_err_{a}_{b}" for a, b in pairwise(channels))
+        check_columns(f"colour_err_{a}_{b}" for a, b in pairwise(bands))
 
 
 def check_channels(channels):

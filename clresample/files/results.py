@@ -27,7 +27,8 @@ from .whole_file import FileError, check_output, whole_file
 
 FORMAT = 2  # of the files; raised when an older reader would misread them
 KINDS = {kind.__name__: kind for kind in (Source, Point, Extended)}
-KEPT = ("name", "channels", "zero_points", "n_bad", "messages")  # of an observation, as JSON
+# of an observation, as JSON
+KEPT = ("name", "channels", "bands", "zero_points", "saturation", "n_bad", "messages")
 BOX = ("source", "y", "x", "n_y", "n_x")
 # HDUs of Errors
 ERRORS = {"FLUXCOV": "flux", "COLOURCOV": "colour", "MOMENTCOV": "moments", "BEYOND": "beyond"}
@@ -105,7 +106,10 @@ def _observation_hdus(result, i):
     for k, channel in enumerate(o.channels):
         cards[f"BAND{k + 1}"] = text_card(channel, f"plane {k + 1}")
     images = {"DATA": o.data, "WEIGHTS": o.weights}
-    more = {"MODEL": result.model(i), "RESIDUAL": _residual(result, i)} if result.components else {}
+    more = {}
+    if result.components:
+        residual = np.where(o.weights > 0, result.residual(i), 0.0)  # 0 where data have no weight
+        more = {"MODEL": result.model(i), "RESIDUAL": residual}
     return [
         *(image_hdu(name, image, cards, i) for name, image in images.items()),
         *tables,
@@ -113,11 +117,6 @@ def _observation_hdus(result, i):
         image_hdu("RENDERED", np.asarray(result.rendered[i]), None, i),
         image_hdu("PSF", o.psf.images, None, i),
     ]
-
-
-def _residual(result, i):
-    """The residual of observation i; 0 where the data have no weight."""
-    return np.where(result.observations[i].weights > 0, result.residual(i), 0.0)
 
 
 def read_result(path) -> Result:
@@ -264,7 +263,7 @@ def _observation(path, hdus, i, about):
         _grid(path, data, about, hdus),
         weights=array_of(hdus["WEIGHTS", i + 1]),
         noise=about.get("noise"),
-        **{key: about[key] for key in KEPT},
+        **{key: about[key] for key in KEPT if key in about},
     )
 
 

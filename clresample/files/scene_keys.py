@@ -1,4 +1,4 @@
-"""The keys of a scene file, what each takes, and the error for each mistake in one."""
+"""Rules for the keys of TOML files, and the error for each mistake in one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LARGEST = sys.float_info.max
 
 
 class SceneError(ValueError):
-    """A scene file that cannot be used: one line with the file, the table and the key."""
+    """A scene or field file that cannot be used: one line with the file, the table and the key."""
 
 
 @dataclass(frozen=True)
@@ -64,46 +64,12 @@ FRACTION = Rule("a number from 0 to 1", lambda value: is_number(value) and 0 <= 
 COUNT = Rule("a whole number, 0 or more", is_whole)
 FILE = Rule("the name of a file", is_text)
 HDU = Rule('a number from 0, "NAME" or "NAME,VERSION"', either(is_whole, is_text))
-BANDS = Rule(
-    "numbers from 0 or names of the file's bands, one or a list",
-    one_or_many(is_whole, is_text),
-)
 NUMBERS = Rule("a number, or a list with one for each channel", one_or_many(is_number))
-PLANES = Rule(
-    "the name of a file, a number, or a list with one for each channel",
-    either(is_text, _above, many(_above)),
-)
 SWITCH = Rule("true or false", lambda value: isinstance(value, bool))
 POSITIVE = Rule("a number above 0", _above)
 
+# Tables that scene files and field files share; that of an image: fields/reading/keys.py.
 TABLES = {
-    "observation": {
-        "name": TEXT,
-        "image": FILE,
-        "hdu": HDU,
-        "bands": BANDS,
-        "channels": Rule("a list of names", many(is_text)),
-        "psf": FILE,
-        "psf_hdu": HDU,
-        "psf_bands": BANDS,
-        "psf_center": Rule(
-            '"middle", "core" or [y, x]',
-            lambda value: (
-                value in ("middle", "core") or (many(is_number)(value) and len(value) == 2)
-            ),
-        ),
-        "psf_spacing": POSITIVE,
-        "weight": PLANES,
-        "weight_hdu": HDU,
-        "variance": PLANES,
-        "variance_hdu": HDU,
-        "mask": FILE,
-        "mask_hdu": HDU,
-        "zero_point": NUMBERS,
-        "noise": Rule(
-            '"estimate", or the name of a file with the autocorrelation of the noise', is_text
-        ),
-    },
     "sources": {
         "catalogue": FILE,
         "format": TEXT,
@@ -132,34 +98,6 @@ TABLES = {
         "psf_error": FRACTION,
     },
 }
-NEEDED = {"observation": ("name", "image", "psf"), "sources": ("catalogue",)}
-
-
-def parse(path):
-    """The tables of a scene file, each key checked; [frame] and [fit] are always among them.
-
-    returns {table: {key: value}}, and for "observation" a list of such dicts
-    Raises SceneError.
-    """
-    tables = read_tables(path, "scene file")
-    check_names(path, tables, TABLES, "table")
-    observations = tables.get("observation")
-    if not many(lambda value: isinstance(value, dict))(observations):
-        raise SceneError(f"{path}: observation is missing: one [[observation]] per instrument")
-    for i, table in enumerate(observations):
-        check_table(f"{path}: observation {i + 1}", "observation", table, TABLES, NEEDED)
-    for name, table in tables.items():
-        if name != "observation":
-            check_table(f"{path}: {name}", name, table, TABLES, NEEDED)
-    with_zero_point = ["zero_point" in table for table in observations]
-    if len(set(with_zero_point)) > 1:
-        one, other = (observations[with_zero_point.index(has)]["name"] for has in (True, False))
-        raise SceneError(
-            f"{path}: observation {one!r} has zero_point, {other!r} has none: give all or none"
-        )
-    if "sources" in tables and "detection" in tables:
-        raise SceneError(f"{path}: sources and detection are both given: a scene takes one")
-    return {"frame": {}, "fit": {}} | tables
 
 
 def read_tables(path, what) -> dict:

@@ -65,8 +65,8 @@ def catalogue(result, *, magnitudes=False) -> QTable:
         ra, dec [deg], or what the frame's WCS calls them; y_sky, x_sky [arcsec] on a flat sky; and
             y, x [model px]: position as given
         flags: sum of `Flag`
-        snr: signal to noise of all C channels together, sqrt(sum_c flux_c^2 / variance_c), which
-            is about sqrt(C) where there is no source
+        snr: signal to noise of all B bands together, sqrt(sum_b flux_b^2 / variance_b), which
+            is about sqrt(B) where there is no source
         n_components: of morphology and spectrum, of which the source is the sum; two where the data
             show that its core has another colour, see `Extended`
         *_centroid: the same positions, of the fitted light
@@ -79,10 +79,12 @@ def catalogue(result, *, magnitudes=False) -> QTable:
             first order; ra's in degrees of ra, angle_err at most 52 deg, that of an unknown angle.
             NaN where the result has no Errors, and where the shape was not fitted, as stars'. They,
             and those of fluxes, are larger for misfitted sources, see `Errors`
-        flux_*, flux_err_* per channel [uJy where observations have zero points, else counts]: see
+        flux_*, flux_err_* per band, which is a channel's own name where the observation has no
+            `bands`; of several exposures the one flux that all of them give [uJy where
+            observations have zero points, else counts]: see
             `fluxes`
-        mag_*, mag_err_* per channel [mag, AB]: where the flux is positive
-        colour_A_B, colour_err_A_B [mag]: mag_A - mag_B of channels A, B next to each other; the
+        mag_*, mag_err_* per band [mag, AB]: where the flux is positive
+        colour_A_B, colour_err_A_B [mag]: mag_A - mag_B of bands A, B next to each other; the
             error from the covariance of the two fluxes, see `channel_covariances`, to first order:
             of use where both are detected
         chi2_* per observation: mean chi2 of the pixels with weight in the source's box, of all
@@ -100,6 +102,7 @@ def columns_of(result, *, magnitudes=False) -> Columns:
     worst = channel_residuals(result)
     flux, covariance = fluxes(result)
     error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).T)  # (S, C)
+    of_bands = list(result.bands.values())
     table = Columns()
     table.put("name", [s.name or str(i) for i, s in enumerate(result.sources)])
     positions = result.frame.place(result.sources)
@@ -107,16 +110,17 @@ def columns_of(result, *, magnitudes=False) -> Columns:
     bounded = flux if result.errors is None else flux - result.errors.released
     table.put("flags", _flags(result, bounded, error, positions, result.footprints))
     with np.errstate(divide="ignore", invalid="ignore"):
-        snr = np.sqrt(np.nansum((flux / error) ** 2, axis=1))
+        snr = np.sqrt(np.nansum((flux / error)[:, of_bands] ** 2, axis=1))
     table.put("snr", np.where(fitted_sources(result), snr, np.nan))
     table.put("n_components", _counts(result))
-    _add_shapes(table, result, error)
+    once = np.isin(np.arange(len(result.channels)), of_bands)  # exposures of a band count once
+    _add_shapes(table, result, np.where(once, error, np.inf))
     scale, unit = flux_scale(result)
-    for i, channel in enumerate(result.channels):
-        table.put(f"flux_{channel}", flux[:, i] * scale[i], unit[i])
-        table.put(f"flux_err_{channel}", error[:, i] * scale[i], unit[i])
+    for band, i in result.bands.items():
+        table.put(f"flux_{band}", flux[:, i] * scale[i], unit[i])
+        table.put(f"flux_err_{band}", error[:, i] * scale[i], unit[i])
         if magnitudes and unit[i] == u.uJy:
-            _add_magnitudes(table, channel, flux[:, i] * scale[i], error[:, i] * scale[i])
+            _add_magnitudes(table, band, flux[:, i] * scale[i], error[:, i] * scale[i])
     if magnitudes:
         _add_colours(table, result, flux)
     for i, label in enumerate(labels(result)):
@@ -218,14 +222,14 @@ def _add_magnitudes(table, channel, flux_ujy, error_ujy):
 
 
 def _add_colours(table, result, flux):
-    """Columns of colours of neighbouring channels that have magnitudes; flux (S, C)."""
-    covariance, names = channel_covariances(result), result.channels
-    for i, (a, b) in enumerate(pairwise(names)):
+    """Columns of colours of neighbouring bands that have magnitudes; flux (S, C)."""
+    covariance = channel_covariances(result)
+    for (a, i), (b, j) in pairwise(result.bands.items()):
         if f"mag_{a}" not in table or f"mag_{b}" not in table:
             continue
-        one, other = (np.where(flux[:, k] > 0, flux[:, k], np.nan) for k in (i, i + 1))
+        one, other = (np.where(flux[:, k] > 0, flux[:, k], np.nan) for k in (i, j))
         slopes = np.stack([1 / one, -1 / other], axis=1)  # of ln(flux ratio)
-        both = covariance[:, i : i + 2, i : i + 2]
+        both = covariance[:, [[i], [j]], [i, j]]
         with np.errstate(invalid="ignore"):  # infinite variances
             error = np.sqrt(np.einsum("sa,sab,sb->s", slopes, both, slopes))
         known = np.isfinite(both).all((1, 2))

@@ -164,7 +164,7 @@ def test_real(data, tmp_path):
 def test_real_scene_files_hold_nothing_but_defaults(data, tmp_path):
     from bench.real import scene_files
     from clresample import Settings
-    from clresample.files.scene import read_scene
+    from clresample.fields.reading.scene_file import read_scene
 
     paths = scene_files(data, tmp_path)
     assert paths.keys() == {"hst_hsc", "hst", "hsc"}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from clresample.cli import example
-from clresample.files.scene_keys import TABLES, parse
+from clresample.fields.reading.keys import SCENE_TABLES as TABLES, parse_scene as parse
 from clresample.files.whole_file import FileError
 from clresample.simulation.surveys import EUCLID_VIS, RUBIN_UGRIZY
 
@@ -32,15 +32,16 @@ def test_every_key_is_shown():
 
 @pytest.mark.parametrize("left_out", ["[sources]", "[detection]"])
 def test_its_optional_keys_are_correct_too(tmp_path, left_out):
-    """All keys are taken as given, but for the one of two tables, and weights beside variances."""
+    """All keys are taken as given, but for the one of two tables, weights and RMS beside variances,
+    and one of the two for a cutout's place."""
     taken, table = [], ""
     for line in lines():
         table = line.split()[0] if line.startswith("[") else table
-        if table != left_out and not line.startswith("weight"):
+        if table != left_out and not line.startswith(("weight", "rms")):
             taken.append(line)
     (tmp_path / "scene.toml").write_text("\n".join(taken))
     found = parse(tmp_path / "scene.toml")
-    assert len(found["observation"][0]) == len(TABLES["observation"]) - 2
+    assert len(found["observation"][0]) == len(TABLES["observation"]) - 4
     assert len(found["fit"]) == len(TABLES["fit"])
 
 

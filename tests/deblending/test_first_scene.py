@@ -37,6 +37,7 @@ def posed(monkeypatch, *, learns=True, shares=False):
     fit = SimpleNamespace(
         start=start,
         noise=np.array([2.0, 1.0, 0.1]),
+        ties=None,
         frame=SimpleNamespace(shape=(20, 21)),
         padded=SimpleNamespace(shape=(24, 32)),
         views=views,

@@ -61,7 +61,7 @@ def test_zero_point_band_variance_and_named_bits_are_found(files):
     assert (channel.name, channel.zero_point) == ("r", 25.5)
     weights = channel.weights(Box(0, 0, 10, 10))
     assert (weights[5] == 0).all() and np.allclose(weights[[4, 6]], 0.25)
-    assert set(field.inputs) >= {"field", "image of A", "mask 1 of A"}
+    assert set(field.inputs) >= {"field", "image of A", "mask of A"}
 
 
 def test_noise_and_sky_are_estimated_where_they_are_asked_for(files):
@@ -89,23 +89,25 @@ def test_a_bright_galaxy_is_not_taken_for_sky():
 def test_options_of_the_file(files):
     rest = "[field]\nnumber = 7\ntile_px = 500\nmax_sources = 12\n[detection]\nthreshold = 4.5\n"
     options = field_of(
-        files, 'variance = "var.fits"', rest + "[fit]\nmax_iter = 9\npsf_tolerance = 0.01\n"
+        files,
+        'variance = "var.fits"',
+        rest + "[fit]\nmax_iter = 9\npsf_tolerance = 0.01\nfit_shifts = true\n",
     ).options
     assert (options.field_number, options.tile_px, options.threshold) == (7, 500, 4.5)
     assert options.limits.sources == 12 and options.settings.max_iter == 9
-    assert options.settings.psf_tolerance == 0.01
+    assert options.settings.psf_tolerance == 0.01 and options.settings.fit_shifts
 
 
 @pytest.mark.parametrize(
     ("more", "message"),
     [
         ("varianze = 1.0", "mosaic 1: key varianze is unknown"),
-        ("weight = 1.0\nrms = 2.0", "mosaic 1: weight and rms are given, a mosaic takes one"),
+        ("weight = 1.0\nrms = 2.0", "mosaic 1: weight and rms are both given: an image takes one"),
         ("weight = -1.0", "mosaic 1: weight is -1.0, it takes"),
         ('variance = "none.fits"', "none.fits: no such file"),
         ('weight = 1.0\nmask = "mask.fits"\nmask_bits = ["BAD"]', "names SAT, CR"),
         ('weight = 1.0\npsf_format = "cells"', "psf_cell_px is missing"),
-        ("weight = 1.0\nzero_point = [1.0, 2.0]", "zero_point has 2 numbers for 1 channels"),
+        ("weight = 1.0\nzero_point = [1.0, 2.0]", "zero_point has 2 numbers, it takes one for all"),
         ('weight = "a.fits"', "weight is in the image's own file"),
         ('variance = "large.fits"', "variance has (301, 260) pixels"),
         ('weight = 1.0\nmask = "large.fits"', "mask has (301, 260) pixels"),

@@ -5,8 +5,7 @@ import pytest
 from astropy.io import fits
 
 from clresample.fields.box import Box
-from clresample.fields.mosaic import FilePlane, _opened
-from clresample.fields.strips import MOST_BYTES, STRIP_PX, Strips, section
+from clresample.fields.strips import MOST_BYTES, STRIP_PX, FilePlane, Strips, _opened, section
 
 SHAPE = 3, 150, 90
 

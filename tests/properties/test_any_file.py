@@ -14,10 +14,11 @@ from hypothesis import example, given, strategies as st
 from hypothesis.extra import numpy as hnp
 
 from clresample.cli.options import printable
+from clresample.fields.reading.keys import SCENE_TABLES as TABLES, parse_scene as parse
 from clresample.files.arrays import array_of, image_hdu
 from clresample.files.fits import read_image, read_psf
 from clresample.files.names import check_channels, to_ascii
-from clresample.files.scene_keys import TABLES, SceneError, parse
+from clresample.files.scene_keys import SceneError
 from clresample.files.source_table import read_sources
 from clresample.files.whole_file import FileError
 

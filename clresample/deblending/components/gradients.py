@@ -76,7 +76,8 @@ def _candidates(fit):
     source = fit.fitted[fit.start.source]
     free = [_is_free(fit.blend.sources[i]) for i in source]
     snr = np.sqrt((fit.state.spectra**2 * fit.scene.power).sum(1))
-    seen_in = ((fit.state.spectra > 0) & (fit.scene.power > 0)).sum(1)
+    seen = (fit.state.spectra > 0) & (fit.scene.power > 0)
+    seen_in = (seen if fit.ties is None else fit.ties.total(seen) > 0).sum(1)
     return np.flatnonzero(np.array(free, bool) & (snr > LEAST_SNR) & (seen_in > 1))
 
 
@@ -113,11 +114,15 @@ def _asked(fit, which, seen):
             weight = spectra[i, part, None, None] ** 2 * rendered.images[i] * view.root[window] ** 2
             chi2[k] += (weight * residual[window] ** 2).sum()
             light[k] += weight.sum()
-    core, precision = _eliminated(seen.covariance, slope, power, len(which))
+    covariance, cores = seen.covariance, power[n:]
+    if fit.ties is not None:
+        slope, power = fit.ties.total(slope), fit.ties.total(power)
+        covariance, spectra = covariance[fit.ties.first], spectra[:, fit.ties.first]
+    core, precision = _eliminated(covariance, slope, power, len(which))
     precision /= np.maximum(chi2 / np.maximum(light, 1e-30), 1)[:, None]
     error = 1 / np.sqrt(np.maximum(power[which], 1e-30))
     rows = zip(core, precision, np.maximum(spectra[which], error), strict=True)
-    return Asked(which, np.array([gain(*row) for row in rows]), power[n:], bare)
+    return Asked(which, np.array([gain(*row) for row in rows]), cores, bare)
 
 
 def _eliminated(covariance, slope, power, k):

@@ -110,7 +110,8 @@ def _is_better(second, first, more=0.0):
     if second.findings is None or _half_chi2(second) > _half_chi2(first):
         return False
     n_more = len(second.state.morph) - len(first.state.morph)
-    n_numbers = n_more * (N_PROFILE + first.state.spectra.shape[1])
+    n_spectra = first.state.spectra.shape[1] if first.ties is None else first.ties.n_bands
+    n_numbers = n_more * (N_PROFILE + n_spectra)
     return second.losses[-1] < first.losses[-1] - LEAST_GAIN * n_numbers - more
 
 

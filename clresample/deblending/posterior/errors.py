@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..solver.rendering.ties import Ties
 from .blocks import Factor
 
 
@@ -50,15 +51,17 @@ class Draws:
     """What draws from the posterior are made of.
 
     modes (n): (k_i, ny, nx), images of each component's modes
-    factor: of the normal matrix, whose node i is component i, its modes and then its spectrum (C,)
+    factor: of the normal matrix, whose node i is component i, its modes and then its spectrum (B,)
     unit (C,) [counts]: in which spectra count there
     wide (n,): by what draws of misfitted sources' components scatter more, as their Errors do
+    ties: Ties of the channels, of B bands; None: B = C
     """
 
     modes: list[np.ndarray]
     factor: Factor
     unit: np.ndarray
     wide: np.ndarray
+    ties: Ties | None = None
 
     def draw(self, rng):
         """Changes of the morphologies (n arrays) and of the spectra (n, C) [counts]."""
@@ -67,5 +70,8 @@ class Draws:
         for values, images, wide in zip(found, self.modes, self.wide, strict=False):
             values = wide * values
             morphs.append(np.tensordot(values[: len(images)], images, 1))
-            spectra.append(values[len(images) :] * self.unit)
+            spectrum = values[len(images) :]
+            spectra.append(
+                (spectrum if self.ties is None else self.ties.spread(spectrum)) * self.unit
+            )
         return morphs, np.array(spectra)

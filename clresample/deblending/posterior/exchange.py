@@ -60,7 +60,8 @@ class Exchange:
             pairs.append(_moves(solution, i, where, image))
         self.moves = [moves for moves, _ in pairs]
         counts = np.array([len(images) - 1 for _, images in pairs])
-        self._layout = Layout(counts, n_channels, n_channels if fit_sky else 0)
+        ties = solution.scene.ties
+        self._layout = Layout(counts, n_channels, n_channels if fit_sky else 0, ties=ties)
         images = [images for _, images in pairs]
         self._matrix = normal_matrix(
             solution.scene, exposures, images, solution.spectra, self._layout
@@ -79,10 +80,14 @@ class Exchange:
 
         Raises LinAlgError where the matrix is not positive definite.
         """
-        layout, right, bound = self._layout, [], slopes.bound | self._unseen
+        layout, right = self._layout, []
+        bound, by_spectra, ties = slopes.bound, slopes.spectra, layout.ties
+        if ties is not None:
+            bound, by_spectra = bound[:, ties.first], ties.total(by_spectra)
+        bound = bound | self._unseen
         for i, moves in enumerate(self.moves):
             own = moves.slopes(slopes.structure[i]) if moves else np.zeros(0)
-            right.append(-np.concatenate([own, np.where(bound[i], 0, slopes.spectra[i])]))
+            right.append(-np.concatenate([own, np.where(bound[i], 0, by_spectra[i])]))
         if layout.n_sky:
             right.append(-np.where(self._level, slopes.sky, 0))
         found = self._factor(bound).solve(right)
@@ -90,10 +95,11 @@ class Exchange:
         own = list(zip(self.moves, layout.counts, found, strict=False))
         structure = [moves.structure(x[:k]) if moves else None for moves, k, x in own]
         sky = found[-1] if layout.n_sky else np.zeros_like(slopes.sky)
-        return structure, np.array([x[k:] for _, k, x in own]), sky, gain
+        spectra = np.array([x[k:] for _, k, x in own])
+        return structure, spectra if ties is None else ties.spread(spectra), sky, gain
 
     def _factor(self, bound):
-        """The Factor with the spectra `bound` (n, C) held; the last one stays."""
+        """The Factor with the spectra `bound` (n, B) held; the last one stays."""
         if self._held is None or (self._held[0] != bound).any():
             self._held = bound.copy(), Factor(_held(self._matrix, self._layout.counts, bound))
         return self._held[1]
@@ -152,7 +158,7 @@ def _moves(solution, i, shared, image):
 
 
 def _held(matrix, counts, bound):
-    """Blocks in which the spectra `bound` (n, C) have nothing to do with all else, and a diagonal
+    """Blocks in which the spectra `bound` (n, B) have nothing to do with all else, and a diagonal
     of 1; counts (n,): unknowns before a component's spectrum."""
     if not bound.any():
         return matrix

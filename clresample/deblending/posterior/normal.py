@@ -16,6 +16,7 @@ import numpy as np
 from ...device.workers import in_threads
 from ...sky.extent import box_slices
 from ..shifts import SCATTER_PX
+from ..solver.rendering.ties import Ties
 from .blocks import Blocks
 
 # [1] Products of this size and more are summed in float64: in float32 they round to what the prior,
@@ -26,22 +27,40 @@ LARGE = 3e5
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where unknowns are: a node for each of n components, its modes and then its spectrum (C,);
+    """Where unknowns are: a node for each of n components, its modes and then its spectrum (B,);
     and one of all, of sky levels (C or 0) and shifts (n_observations - 1, 2) or none, if any.
 
     counts (n,): of the components' modes; n_channels, n_sky, n_shifts
+    ties: Ties of the channels, by which B is the number of bands; None: B = C
     """
 
     counts: np.ndarray
     n_channels: int
     n_sky: int = 0
     n_shifts: int = 0
+    ties: Ties | None = None
+
+    def band_weights(self, weights):
+        """Weights (C,) with which each band counts once: 0 in channels but its first; and (B,)."""
+        if self.ties is None:
+            return weights, weights
+        first = self.ties.first
+        return np.where(np.isin(np.arange(len(weights)), first), weights, 0), weights[first]
+
+    @property
+    def n_spectra(self):
+        """B."""
+        return self.n_channels if self.ties is None else self.ties.n_bands
+
+    def spectra_at(self, channels):
+        """Unknowns (Co,) in a spectrum of the channels (Co,) of an observation."""
+        return channels if self.ties is None else self.ties.band[channels]
 
     @property
     def sizes(self):
         """Of the nodes (n or n + 1,)."""
         common = self.n_sky + self.n_shifts
-        return np.append(self.counts + self.n_channels, [common] if common else []).astype(int)
+        return np.append(self.counts + self.n_spectra, [common] if common else []).astype(int)
 
     @property
     def common(self):
@@ -108,6 +127,12 @@ class _Sum:
     def __init__(self, matrix, layout, exposure, o, channels):
         self.matrix, self.layout, self.exposure = matrix, layout, exposure
         self.channels, self.shift = channels, layout.shift(o)
+        at = layout.spectra_at(np.arange(channels.start, channels.stop))
+        self.at = np.unique(at)
+        # sums over channels of one band, where the observation has several
+        self.sum = None if len(self.at) == len(at) else (at[:, None] == self.at).astype(float)
+        if self.sum is None:
+            self.at = at
 
     def run(self, origin, images, spectra):
         """Add it."""
@@ -147,10 +172,12 @@ class _Sum:
 
     def _add(self, a, b, modes, by_a, by_b, units):
         """Add what `_products` has found of two components, a.i <= b.i."""
-        same, n_channels = a is b, len(units)
+        same = a is b
+        if self.sum is not None:
+            by_a, by_b, units = by_a @ self.sum, by_b @ self.sum, units @ self.sum
         block = self.matrix.block(a.i, b.i)
         block[: a.k, : b.k] += modes[: a.k, : b.k]
-        of_a, of_b = (s.k + np.arange(n_channels) + self.channels.start for s in (a, b))
+        of_a, of_b = (s.k + self.at for s in (a, b))
         block[: a.k, of_b] += by_b[: a.k]
         block[of_a, : b.k] += by_a[: b.k].T
         block[of_a, of_b] += units
@@ -177,7 +204,9 @@ class _Sum:
         at = np.arange(self.channels.start, self.channels.stop)
         side = self.matrix.block(one.i, self.layout.common)
         side[: one.k, at] += products[: one.k]
-        side[one.k + at, at] += np.einsum("cp,cp->c", unit, level, dtype=np.float64)
+        side[one.k + self.layout.spectra_at(at), at] += np.einsum(
+            "cp,cp->c", unit, level, dtype=np.float64
+        )
         if self.shift is not None:
             both, found = self.matrix.block(*[self.layout.common] * 2), products[one.k :]
             both[np.ix_(self.shift, at)] += found

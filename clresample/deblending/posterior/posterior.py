@@ -49,6 +49,7 @@ class Posterior:
             n_channels,
             n_channels if fit_sky else 0,
             2 * (len(exposures) - 1) if fit_shifts else 0,
+            solution.scene.ties,
         )
         self.matrix = normal_matrix(
             solution.scene, exposures, images, solution.spectra, self.layout
@@ -88,7 +89,7 @@ class Posterior:
                 colour[s] += found if i == j else found + found.T
         floor = np.zeros(flux.shape)
         for i, slope in enumerate(slopes):
-            own = self.solution.spectra[i] * slope[0, -n_channels]  # its flux
+            own = self.solution.spectra[i] * slope[0, -self.layout.n_spectra]  # its flux
             unlike = power_of(self.solution.unlikeness(i), FLOOR)
             floor[owner[i]] += flux_floor * unlike * own
         between[:, np.arange(n_sources), np.arange(n_sources)] += floor.T**2
@@ -112,18 +113,20 @@ class Posterior:
 
     def draws(self, owner, residuals, unit) -> Draws:
         """What `Result.sample` draws from; for what it takes see `errors`."""
-        return Draws(self.modes, self.factor, unit, widening(residuals)[owner])
+        wide = widening(residuals)[owner]
+        return Draws(self.modes, self.factor, unit, wide, self.layout.ties)
 
     def _fluxes(self, owner, n_sources):
-        """Fluxes (S, C), and each component's slopes (C, k + C) of its own by its unknowns."""
-        s, slopes = self.solution, []
+        """Fluxes (S, C), and each component's slopes (C, k + B) of its own by its unknowns."""
+        s, slopes, ties = self.solution, [], self.layout.ties
+        of_channels = np.eye(self.layout.n_channels) if ties is None else ties.matrix
         flux = np.zeros((n_sources, self.layout.n_channels))
         for i, (modes, morph) in enumerate(zip(self.modes, s.morphs, strict=True)):
             far = self.beyond[i]
             total = morph.sum() + far.sums[0]
             flux[owner[i]] += s.spectra[i] * total
             by_mode = np.outer(s.spectra[i], modes.sum((1, 2)) + far.slopes[0])
-            slopes.append(np.concatenate([by_mode, total * np.eye(len(by_mode))], axis=1))
+            slopes.append(np.concatenate([by_mode, total * of_channels], axis=1))
         return flux, slopes
 
     def _moments(self, owner, n_sources, error):
@@ -133,6 +136,7 @@ class Posterior:
         for source in np.unique(owner):
             own = np.flatnonzero(owner == source)
             weight = np.where(error[source] > 0, 1 / np.maximum(error[source], 1e-30), 0)
+            weight, by_band = self.layout.band_weights(weight)
             light = s.spectra[own] @ weight
             n_modes = sum(len(self.modes[i]) for i in own)
             if not n_modes or not light.any():
@@ -145,7 +149,7 @@ class Posterior:
                 by_mode = flat.astype(np.float32) @ images.reshape(len(images), flat.shape[1]).T
                 by_mode = part * (by_mode + by_far @ self.beyond[i].slopes)
                 by_light = flat @ s.morphs[i].ravel() + by_far @ self.beyond[i].sums
-                rows.append(np.concatenate([by_mode, by_light[:, None] * weight], axis=1))
+                rows.append(np.concatenate([by_mode, by_light[:, None] * by_band], axis=1))
             covariance = np.zeros((5, 5))
             for a, i in enumerate(own):
                 for b, j in enumerate(own):
@@ -202,6 +206,8 @@ def posterior_of(fit, morphs, peaks, seen):
         return None, []
     spectra, covariance = seen.spectra, seen.covariance
     variance = np.diagonal(covariance, axis1=1, axis2=2).T
+    if scene.ties is not None:  # of one exposure, as each of a band counts
+        variance = variance * scene.ties.count
     residuals = seen.residuals(scene.channels(), fit.views)
     solution = Solution(
         scene,

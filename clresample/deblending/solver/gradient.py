@@ -4,6 +4,8 @@
     G_o = R_o^T w_o (R_o M + sky - d_o)
     dS_s = sum_c A[s, c] G_c on the box,   dA[s, c] = <S_s, G_c>,   dsky_c = sum of w_o (...)
 
+dA of tied channels is the mean over their band, see rendering/ties.py.
+
 |z|^2 is the prior's, and its gradient is added where z is stepped (amsgrad.py). rendering/ has how
 R_o M and the gradients are computed; kernels in scene.cl, boxed.cl and losses.cl.
 """
@@ -41,7 +43,19 @@ class Gradient:
         )
         self.best = buffers.put(np.full(len(scenes), np.inf))
         self.observations = [_ObservedBatch(self, i, depth) for i in range(len(scenes[0].ops))]
-        self._with_prior = with_prior
+        self._with_prior, self._tie = with_prior, None
+        ties = scenes[0].ties
+        if ties is not None:
+            first, count = (
+                buffers.device.put(a, np.int32) for a in (ties.first[ties.band], ties.count)
+            )
+            self._tie = buffers.launcher("ties.cl", "tie", 1).bind(
+                n_sources=buffers.n_sources,
+                n_channels=buffers.n_channels,
+                first=first,
+                count=count,
+                d_spectra=buffers.d_spectra,
+            )
 
     def __call__(self, losses, i_loss):
         """Queue it all; losses[i_loss] of losses (n, B), on the device, are the scenes' losses."""
@@ -66,6 +80,8 @@ class Gradient:
         """Queue everything but the losses' sums: gradients, rows_loss and rows_pull."""
         for observed in self.observations:
             observed.queue()
+        if self._tie is not None:
+            self._tie(self.buffers.items(self.buffers.n_sources))
 
     def follow_shifts(self):
         """Take over the shifts that the scenes' own operators have by now."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...resampling.resampler import Resampler
+from .rendering.ties import Ties
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +33,7 @@ class Scene:
     damping (S,): gradients under which steps are shorter than the step sizes; see
         `curvature.damping`
     fit_sky: whether the sky level of each channel is free
+    ties: Ties of the channels; None where each has a band of its own
     """
 
     shape: tuple[int, int]
@@ -48,6 +50,7 @@ class Scene:
     power: np.ndarray | None = None
     damping: np.ndarray | None = None
     fit_sky: bool = False
+    ties: Ties | None = None
 
     def channels(self) -> list[slice]:
         """For each observation, its part of the channels."""
@@ -75,7 +78,7 @@ class Scene:
     @property
     def signature(self):
         """Scenes of equal signature can share a batch: frames, observed shapes, kernels to run."""
-        return signature_of(self.shape, self.fit_sky, self.ops)
+        return signature_of(self.shape, self.fit_sky, self.ops, self.ties)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +125,6 @@ class State:
     learned: Learned | None = None
 
 
-def signature_of(shape, fit_sky, ops):
+def signature_of(shape, fit_sky, ops, ties=None):
     """`Scene.signature` of scenes with these."""
-    return shape, fit_sky, tuple(op.layout for op in ops)
+    return shape, fit_sky, tuple(op.layout for op in ops), ties

@@ -50,7 +50,28 @@ def equations(looking):
             rest[:, channels, n], inner[:, channels, n, n] = np.moveaxis(sums[..., 1:], -1, 0)
     lit = looking.solution() > 0
     lit[..., n] = inner[..., n, n] > 0  # none in a channel without weights, nor if it is not fitted
+    if looking.ties is not None:
+        normal, right, *rows = _of_bands(looking.ties, normal, right, inner, cross, rest, lit)
+        return _eliminated(normal, right, *rows)
     return _eliminated(normal, right, inner, cross, rest, lit)
+
+
+def _of_bands(ties, normal, right, inner, cross, rest, lit):
+    """What `_eliminated` takes, with the sky levels eliminated and tied channels summed.
+
+    `inner`, `cross`, `rest` and `lit` then have B bands in place of C channels, and n spectra.
+    """
+    n = rest.shape[-1] - 1
+    level = np.divide(1, inner[..., n, n], where=lit[..., n], out=np.zeros(lit.shape[:-1]))
+    side, by_level = inner[..., :n, n] * level[..., None], cross[..., n, :, :]
+    normal = normal - np.einsum("kcip,kcjq,kc->kipjq", by_level, by_level, level)
+    right = right - np.einsum("kcip,kc->kip", by_level, level * rest[..., n])
+    gram = inner[..., :n, :n] - side[..., None] * inner[..., n, None, :n]
+    cross = cross[..., :n, :, :] - side[..., None, None] * by_level[..., None, :, :]
+    rest = rest[..., :n] - side * rest[..., n, None]
+    of_bands = (ties.total(a, axis=1) for a in (gram, cross, rest, lit[..., :n]))
+    gram, cross, rest, lit = of_bands
+    return normal, right, gram, cross, rest, lit > 0
 
 
 def _eliminated(normal, right, inner, cross, rest, lit):

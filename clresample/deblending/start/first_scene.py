@@ -29,7 +29,8 @@ def first_scene(fit) -> tuple[Scene, State]:
     ]
     morphs = [image for *_, image in boxes]
     spectra, power = begin.spectra, begin.power
-    error = 1 / np.sqrt(np.maximum(power, LEAST_POWER))
+    together = power if fit.ties is None else fit.ties.spread(fit.ties.total(power))
+    error = 1 / np.sqrt(np.maximum(together, LEAST_POWER))
     scene = Scene(
         shape=fit.padded.shape,
         extent=fit.frame.shape,
@@ -44,6 +45,7 @@ def first_scene(fit) -> tuple[Scene, State]:
         shares=[None if v.shares is None else v.shares[begin.source] for v in fit.views],
         power=power,
         fit_sky=fit.settings.fit_sky,
+        ties=fit.ties,
     )
     latent = [np.zeros_like(m) for m in morphs]
     state = State(latent, [m.copy() for m in morphs], spectra, begin.sky)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...device.tuning import Tuning
+from ..solver.rendering.ties import band_equations
 from ..spectra import inverse, non_negative
 from .sight import Sight
 from .slots import Slots, boxes_of, thresholds
@@ -48,7 +49,7 @@ class Looking:
         self.scene = np.array([c.scene for c in components])
         self.index = np.array([c.index for c in components])
         self.n_most = int(self.index.max()) + 1
-        self.n_channels = sights[-1].channels.stop
+        self.n_channels, self.ties = sights[-1].channels.stop, sights[0].views[0].ties
         self.spectra = np.zeros((len(components), self.n_channels))
         self.sky = np.zeros((n_scenes, self.n_channels))
         self._kept: dict = {}
@@ -135,15 +136,17 @@ class Looking:
         """Of all light but the sky's as each component's profile sees it: <u, d> / |u| (N, C), 0
         where it sees nothing; sky (B, C)."""
         spectra = np.zeros((len(self.slots), self.n_channels))
+        pull, power = np.zeros((2, len(self.slots), self.n_channels))
         out = np.zeros((len(self.components), self.n_channels))
         for sight, (table, pairs) in zip(self.sights, self.pairs, strict=True):
             sight.compare(self.scenes, self.slots, spectra, sky, 0.0)
             alone = table[:, 0] == table[:, 1]
-            size = np.zeros((len(self.slots), sight.n_bands))
-            size[table[alone, 0]] = np.sqrt(sight.gram(pairs, 1)[alone][..., 0, 0])
-            light = sight.pull(1)[:, :, 0, 0]
-            found = np.divide(light, size, out=np.zeros_like(light), where=size > 0)
-            out[self.at, sight.channels] = found
+            power[table[alone, 0], sight.channels] = sight.gram(pairs, 1)[alone][..., 0, 0]
+            pull[:, sight.channels] = sight.pull(1)[:, :, 0, 0]
+        if self.ties is not None:
+            pull, power = (self.ties.spread(self.ties.total(a)) for a in (pull, power))
+        size = np.sqrt(power)
+        out[self.at] = np.divide(pull, size, out=np.zeros_like(pull), where=size > 0)
         return out
 
     def solution(self):
@@ -155,6 +158,8 @@ class Looking:
 
     def _non_negative(self):
         """The least squares (k, C, n) or, with the sky, (k, C, n + 1)."""
+        if self.ties is not None:
+            return _by_band(self)
         size = self.n_most + self.fit_sky
         free = np.arange(size) >= self.n_most
         normal = self.normal[..., :size, :size].reshape(-1, size, size)
@@ -164,5 +169,20 @@ class Looking:
     def covariance(self, row):
         """Of one scene's spectra (C, n, n), the sky levels unknown too if they are fitted."""
         n = int((self.scene == self.scenes[row]).sum())
+        if self.ties is not None:
+            given = self.ties, self.normal[row], self.right[row], self.fit_sky
+            return self.ties.spread(inverse(band_equations(*given)[0][:, :n, :n]), axis=0)
         own = np.r_[0:n, self.n_most : self.n_most + self.fit_sky]
         return inverse(self.normal[row][:, own[:, None], own])[:, :n, :n]
+
+
+def _by_band(looking):
+    """The least squares (k, C, n) of tied channels or, with the sky, (k, C, n + 1)."""
+    ties, n = looking.ties, looking.n_most
+    normal, right, own, value = band_equations(ties, looking.normal, looking.right, looking.fit_sky)
+    found = non_negative(normal.reshape(-1, n, n), right.reshape(-1, n))
+    spectra = ties.spread(found.reshape(right.shape), axis=1)
+    if not looking.fit_sky:
+        return spectra
+    sky = value - (own * spectra).sum(axis=-1)
+    return np.concatenate([spectra, sky[..., None]], axis=-1)

@@ -31,6 +31,9 @@ class Sight:
         self.data = device.put(np.array([v.data * v.root for v in views]), dtype)
         self.residual, self.weight = (device.empty(shape, dtype) for _ in range(2))
         self.sums = device.empty((*shape[:3], 3), dtype)
+        # (B, Co): the model's error is one for all exposures of a band
+        alike = np.ones(self.n_bands)
+        self.exposures = np.array([alike if v.ties is None else v.exposures for v in views])
         self.aim = Aim(views, device, dtype, precision, tolerance)
         self.n_elements = self.n_pixels = 0
         self._listed = None  # of the scenes last compared, on the device
@@ -102,7 +105,7 @@ class Sight:
             place=self.place_on_device,
             channel=self.channels.start,
             n_channels=spectra.shape[1],
-            error=error,
+            error=put(error * np.sqrt(self.exposures), self.dtype),
             spectra=put(spectra, self.dtype),
             sky=put(sky, self.dtype),
             root=self.root,

@@ -20,7 +20,7 @@ from ...resampling.gridding import KaiserBessel
 from ...resampling.plan import Precision
 from ...sky.frame import Frame
 from ..profiles import Galaxy, Given, Star, components_of
-from ..view import WhitenedView, allow_for_psf_error
+from ..view import WhitenedView, allow_for_psf_error, pixel_noise
 from .looking import looking_at
 from .profile_fit import ProfileFit
 from .slots import Component
@@ -103,7 +103,7 @@ def start(patches: list[Patch], *, fit_sky=False) -> list[StartingPoint]:
     sources, components = _components(patches)
     views = [p.views for p in patches]
     looking = looking_at(views, components, PRECISION, TOLERANCE, fit_sky=fit_sky)
-    noise = np.array([np.concatenate([v.pixel_noise for v in p.views]) for p in patches])
+    noise = np.array([pixel_noise(p.views) for p in patches])
     fit = ProfileFit(looking, noise)
     fit.begin()
     dark = _dark(patches, sources, looking)
@@ -127,7 +127,7 @@ def _solved_again(patch, point, fit_sky):
     rows = enumerate(zip(point.source, point.shapes, point.places, strict=True))
     components = [Component(0, i, *row, patch.frame.shape) for i, row in rows]
     looking = looking_at([patch.views], components, PRECISION, TOLERANCE, fit_sky=fit_sky)
-    noise = np.concatenate([v.pixel_noise for v in patch.views])
+    noise = pixel_noise(patch.views)
     brightness = (point.spectra / noise).max(axis=1)
     looking.look(np.arange(1), point.thetas, brightness, slopes=False)
     looking.solve(0.0)

@@ -22,6 +22,7 @@ def read_psf_field(
     grid,
     *,
     hdu=None,
+    bands=None,
     spacing=1.0,
     center=None,
     stamp_px=STAMP_PX,
@@ -36,14 +37,14 @@ def read_psf_field(
             x and y [px of the mosaic, from 0], or ra and dec [deg]
         "cells": a FITS image (cells_y, cells_x, ny, nx) or (cells_y, cells_x, C, ny, nx), with
             cell_px and origin_px, see PSFCells
-        "psfex": a PSFEx file
+        "psfex": a PSFEx file, or a table with a row for each detector, see PSFExPSF
         "piff": a Piff file
         "gridded": a file that photutils' GriddedPSFModel reads, see `read_gridded`
         "euclid-mer": a CATALOG-PSF of Euclid's MER, see `read_mer_sheet`
-    grid: of the mosaic; hdu: of the image, None = the first
+    grid: of the mosaic; hdu: of the image, None = the first; bands: of "image", by number or name
     spacing [px], center: of the samples, see PSF; those of PSFEx, Piff and gridded files are their
         own; stamp_px [px]: side of Piff's stamps
-    detector: its number, of Piff and STDPSF files that hold several
+    detector: its number, of Piff and STDPSF files that hold several; of PSFEx, also its name
 
     Raises FileError, one line that names the file, and ValueError for another form.
     """
@@ -51,9 +52,11 @@ def read_psf_field(
         raise ValueError(f"psf_format is {form!r}, it takes {', '.join(FORMATS)}")
     samples = {"spacing": spacing, "center": center}
     if form == "image":
-        return ConstantPSF(read_psf(path, hdu=hdu, **samples))
+        return ConstantPSF(read_psf(path, hdu=hdu, bands=bands, **samples))
     if form == "psfex":
-        return PSFExPSF(path)
+        return PSFExPSF(path, detector)
+    if isinstance(detector, str):
+        raise ValueError(f"psf_detector is {detector!r}, must be a whole number for {form} files")
     if form == "piff":
         return PiffPSF(path, chip=detector, stamp_px=stamp_px)
     if form == "gridded":

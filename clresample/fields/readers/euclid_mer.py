@@ -23,7 +23,7 @@ import re
 from ...files.whole_file import FileError
 from ..mosaic import Mosaic
 from ..psfs.read import read_psf_field
-from ..reading.headers import mask_value, zero_point
+from ..reading.headers import mask_value, saturation, zero_point
 from .found import Found, Given, assembled, files_at, image_plane, paths_of, placed, plane_on
 
 NAME = re.compile(
@@ -107,5 +107,6 @@ def _band(band, files, given):
         zero_point(header, grid.pixel_scale_arcsec),
         psf,
         missing_psf=f"there is no EUC_MER_CATALOG-PSF-{band} beside it",
+        saturation=saturation(header),
         files=files,
     )

@@ -29,23 +29,27 @@ class Given:
 
     name: of the mosaic, unique in a field; bands: those to take, as the format calls them
     channels (C,): what they are to be called, unique in a field
+    band (C,): of which they are exposures, where several mosaics have some; see Observation
     mask_bits: bits that mean: ignore this pixel, by number or name
     zero_point [mag]: AB of one count, one number or C of them
     psf: PSF or PSFField for all bands, a list with one for each, or a function that makes one of
         the mosaic's Grid
     background: "subtract", or "none" where it is subtracted already
     noise: "estimate" its correlation, or "white"
+    saturation [counts]: one number or C of them
     inputs {what: file}, notes: filled with the files, and with what the user should know
     """
 
     name: str | None = None
     bands: object = None
     channels: object = None
+    band: object = None
     mask_bits: object = None
     zero_point: object = None
     psf: object = None
     background: str = "none"
     noise: str | None = None
+    saturation: object = None
     inputs: dict = field(default_factory=dict)
     notes: list = field(default_factory=list)
 
@@ -56,7 +60,8 @@ class Found:
 
     band: the format's name of it; grid, data, weight, kind, mask, mask_value, zero_point: as in
     Channel, None where the file does not say; psf: PSFField, or None
-    noise: NoiseCorrelation, or None; missing_zero_point, missing_psf: why there is none
+    noise: NoiseCorrelation, or None; saturation [counts]: of the image's pixels, or None
+    missing_zero_point, missing_psf: why there is none
     files {what: file}
     """
 
@@ -70,6 +75,7 @@ class Found:
     zero_point: float | None = None
     psf: PSFField | None = None
     noise: object = None
+    saturation: float | None = None
     missing_zero_point: str = "its header does not say"
     missing_psf: str = "the format holds none"
     files: dict = field(default_factory=dict)
@@ -144,9 +150,14 @@ def assembled(survey, found, given, *, noise="white") -> Mosaic:
             )
     names = _one_for_each("channels", given.channels, found) or [one.band for one in found]
     points = _zero_points(found, given)
-    psf = _psf(found, given, grid)
+    psf, levels = _psf(found, given, grid), _saturations(found, given)
+    exposed = _one_for_each("band", given.band, found) or [None] * len(found)
     channels = tuple(
-        Channel(names[i], f.data, f.weight, f.kind, f.mask, f.mask_value, points[i])
+        Channel(
+            *(names[i], f.data, f.weight, f.kind, f.mask, f.mask_value, points[i]),
+            saturation=levels[i],
+            band=exposed[i],
+        )
         for i, f in enumerate(found)
     )
     for one in found:
@@ -204,11 +215,21 @@ def _one_for_each(what, value, found):
     return values
 
 
+def _saturations(found, given):
+    if given.saturation is None:
+        return [one.saturation for one in found]
+    return _numbers("saturation", given.saturation, found)
+
+
+def _numbers(what, value, found):
+    """The number given for each band, or the one for all of them."""
+    values = [value] * len(found) if np.ndim(value) == 0 else list(value)
+    return [float(v) for v in _one_for_each(what, values, found)]
+
+
 def _zero_points(found, given):
     if given.zero_point is not None:
-        one = np.ndim(given.zero_point) == 0
-        points = [given.zero_point] * len(found) if one else given.zero_point
-        return [float(p) for p in _one_for_each("zero_point", list(points), found)]
+        return _numbers("zero_point", given.zero_point, found)
     for one in found:
         if one.zero_point is None:
             raise ValueError(

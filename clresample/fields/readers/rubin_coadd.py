@@ -31,7 +31,7 @@ from ...sky.correlation import NoiseCorrelation
 from ..mosaic import Channel, FilePlane, Mosaic
 from ..psfs.sampled import PSFCells
 from ..reading.estimates import sample_box
-from ..reading.headers import zero_point
+from ..reading.headers import saturation, zero_point
 from .found import Found, Given, assembled, image_plane, paths_of, placed, plane_on
 from .rubin_mask import rubin_mask
 
@@ -81,6 +81,7 @@ def _band(path, given):
         PSFCells(images, cell_px=cell, origin_px=origin),
         noise=_noise(path, noises, grid, data, variance, mask, given),
         missing_zero_point=f"BUNIT is {header.get('BUNIT')!r}",
+        saturation=saturation(header),
         files={"image": path},
     )
 

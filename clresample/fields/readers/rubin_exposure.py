@@ -26,7 +26,7 @@ import numpy as np
 from ...files.fits import open_fits
 from ...files.whole_file import FileError
 from ..mosaic import Mosaic
-from ..reading.headers import NANOJANSKY, zero_point
+from ..reading.headers import NANOJANSKY, saturation, zero_point
 from .found import Found, Given, assembled, image_plane, paths_of, placed, plane_on
 from .rubin_mask import rubin_mask
 
@@ -79,6 +79,7 @@ def _band(path, given):
         point,
         missing_zero_point="there is neither BUNIT of nJy nor PhotoCalib nor FLUXMAG0",
         missing_psf="it can be read by the LSST pipelines only",
+        saturation=saturation(header),
         files={"image": path},
     )
 

@@ -1,4 +1,4 @@
-"""FIELD.toml and what it names: keys, headers, mosaics opened, sky and noise estimated.
+"""FIELD.toml, scene files and what they name: keys, headers, mosaics opened, sky and noise.
 
 Imports `files`, `measurement`, `deblending` and `sky`.
 """

@@ -61,7 +61,7 @@ def with_weights(mosaic, notes):
 
 def with_noise(mosaic, table, notes):
     """The mosaic with the correlation of its noise, estimated once from its middle."""
-    if table.get("noise", "white") == "white":
+    if table.get("noise", "white") != "estimate":
         return mosaic
     box, found = sample_box(mosaic.grid), []
     for c in mosaic.channels:

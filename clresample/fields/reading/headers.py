@@ -1,4 +1,4 @@
-"""What headers say of an image: its zero point, and the names of its mask's bits."""
+"""Properties of an image by its header: zero point, saturation level, names of mask bits."""
 
 from __future__ import annotations
 
@@ -46,6 +46,11 @@ def zero_point(header, pixel_scale_arcsec) -> float | None:
     return None
 
 
+def saturation(header) -> float | None:
+    """Level [the image's unit] from which on pixels are saturated, by SATURATE; None without."""
+    return float(header["SATURATE"]) if _positive(header, "SATURATE") else None
+
+
 def bit_names(header) -> dict[str, int]:
     """The bits of a mask by name, as its header has them.
 
@@ -82,4 +87,4 @@ def mask_value(header, bits, known=None) -> int:
 
 def _positive(header, card):
     value = header.get(card)
-    return isinstance(value, int | float) and value > 0
+    return isinstance(value, int | float) and 0 < value < math.inf

@@ -1,4 +1,4 @@
-"""The keys of FIELD.toml, what each takes, and the error for each mistake in one."""
+"""The keys of scene and field files: one set for an image in both, and the tables of each."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from ...files.scene_keys import (
     SceneError,
     check_names,
     check_table,
+    either,
     is_number,
     is_text,
     is_whole,
@@ -25,20 +26,45 @@ from ..psfs.read import FORMATS
 from ..readers.formats import READERS
 
 FILES = Rule("the name of a file, or a list with one for each channel", one_or_many(is_text))
+NAMES = Rule("a name, or a list of names", one_or_many(is_text))
+BANDS = Rule(
+    "numbers from 0 or names of the file's bands, one or a list", one_or_many(is_whole, is_text)
+)
 PLANES = Rule(
     "the name of a file, a number above 0, or a list with one for each channel",
     one_or_many(is_text, POSITIVE.fits),
 )
-PAIR = Rule(
-    "a number, or two: [y, x]",
-    lambda value: is_number(value) or (many(is_number)(value) and len(value) == 2),
-)
 
-MOSAIC = {
+
+def _is_pair(value):
+    return many(is_number)(value) and len(value) == 2
+
+
+PAIR = Rule("a number, or two: [y, x]", either(is_number, _is_pair))
+
+# An [[observation]] of a scene and a [[mosaic]] of a field.
+IMAGE = {
     "name": TEXT,
     "image": FILES,
     "hdu": HDU,
-    "channels": Rule("a list of names", one_or_many(is_text)),
+    "bands": BANDS,
+    "channels": NAMES,
+    "band": NAMES,
+    "psf": FILES,
+    "psf_format": Rule(" or ".join(f'"{form}"' for form in FORMATS), lambda v: v in FORMATS),
+    "psf_hdu": HDU,
+    "psf_bands": BANDS,
+    "psf_center": Rule(
+        '"middle", "core" or [y, x]',
+        lambda value: value in ("middle", "core") or _is_pair(value),
+    ),
+    "psf_spacing": POSITIVE,
+    "psf_stamp_px": COUNT,
+    "psf_detector": Rule("a whole number, 0 or more, or a name", either(is_whole, is_text)),
+    "psf_cell_px": PAIR,
+    "psf_origin_px": PAIR,
+    "psf_cutout_px": Rule("two numbers: [y, x]", _is_pair),
+    "psf_crpix": Rule("two numbers: [CRPIX1, CRPIX2]", _is_pair),
     "weight": PLANES,
     "weight_hdu": HDU,
     "variance": PLANES,
@@ -51,30 +77,29 @@ MOSAIC = {
         "a list of bits to ignore, by number from 0 or by the name in the mask's header",
         one_or_many(is_whole, is_text),
     ),
+    "saturation": Rule(
+        "a number above 0, or a list with one for each channel", one_or_many(POSITIVE.fits)
+    ),
     "zero_point": NUMBERS,
     "background": Rule(
         '"subtract", or "none" where it is subtracted already',
         lambda value: value in ("subtract", "none"),
     ),
-    "noise": Rule('"estimate", or "white"', lambda value: value in ("estimate", "white")),
-    "psf": FILES,
-    "psf_format": Rule(" or ".join(f'"{form}"' for form in FORMATS), lambda v: v in FORMATS),
-    "psf_hdu": HDU,
-    "psf_spacing": POSITIVE,
-    "psf_stamp_px": COUNT,
-    "psf_detector": COUNT,
-    "psf_cell_px": PAIR,
-    "psf_origin_px": PAIR,
+    "noise": Rule(
+        '"estimate", "white", or the name of a file with the autocorrelation of the noise', is_text
+    ),
 }
-SHARED = ("name", "channels", "mask_bits", "zero_point", "background", "noise")
-SURVEY = {  # a [[mosaic]] of a survey's files
+SHARED = ("name", "channels", "band", "mask_bits", "zero_point", "background", "saturation")
+SURVEY = {  # the same of a survey's files
     "format": Rule(" or ".join(f'"{form}"' for form in READERS), lambda v: v in READERS),
     "path": Rule("the name of a folder or a file, or a list of files", one_or_many(is_text)),
     "bands": Rule("a list of the format's bands", one_or_many(is_text)),
-    **{key: MOSAIC[key] for key in (*SHARED, *(key for key in MOSAIC if key.startswith("psf")))},
+    **{key: IMAGE[key] for key in (*SHARED, *(key for key in IMAGE if key.startswith("psf")))},
+    "noise": Rule('"estimate", or "white"', lambda value: value in ("estimate", "white")),
 }
+SCENE_TABLES = {"observation": IMAGE} | TABLES
 FIELD_TABLES = {
-    "mosaic": MOSAIC,
+    "mosaic": IMAGE,
     "field": {
         "number": COUNT,
         "tile_px": COUNT,
@@ -85,11 +110,40 @@ FIELD_TABLES = {
     },
     "sources": {key: TABLES["sources"][key] for key in ("catalogue", "format", "ra", "dec")},
     "detection": TABLES["detection"],
-    "fit": {key: TABLES["fit"][key] for key in ("max_iter", "enough", "fit_sky", "flux_floor")}
+    "fit": {
+        key: TABLES["fit"][key]
+        for key in ("max_iter", "enough", "fit_shifts", "fit_sky", "flux_floor")
+    }
     | {"psf_tolerance": FRACTION},
 }
-NEEDED = {"mosaic": ("name", "image", "psf"), "sources": ("catalogue",)}
+IMAGE_NEEDS = "name", "image", "psf"
+NEEDED: dict[str, tuple[str, ...]] = {"observation": IMAGE_NEEDS, "mosaic": IMAGE_NEEDS}
+NEEDED |= {"sources": ("catalogue",)}
 WEIGHTS = "weight", "variance", "rms"
+
+
+def parse_scene(path) -> dict:
+    """The tables of a scene file, each key checked; [frame] and [fit] are always among them.
+
+    returns {table: {key: value}}, and for "observation" a list of such dicts
+    Raises SceneError, one line with the file, the table and the key.
+    """
+    tables = read_tables(path, "scene file")
+    check_names(path, tables, SCENE_TABLES, "table")
+    observations = _images(path, tables, "observation", SCENE_TABLES)
+    for name, table in tables.items():
+        if name != "observation":
+            check_table(f"{path}: {name}", name, table, SCENE_TABLES, NEEDED)
+    plain = [table for table in observations if "format" not in table]
+    with_zero_point = ["zero_point" in table for table in plain]
+    if len(set(with_zero_point)) > 1:
+        one, other = (plain[with_zero_point.index(has)]["name"] for has in (True, False))
+        raise SceneError(
+            f"{path}: observation {one!r} has zero_point, {other!r} has none: give all or none"
+        )
+    if "sources" in tables and "detection" in tables:
+        raise SceneError(f"{path}: sources and detection are both given: a scene takes one")
+    return {"frame": {}, "fit": {}} | tables
 
 
 def parse_field(path) -> dict:
@@ -99,19 +153,25 @@ def parse_field(path) -> dict:
     """
     tables = read_tables(path, "field file")
     check_names(path, tables, FIELD_TABLES, "table")
-    mosaics = tables.get("mosaic")
-    if not isinstance(mosaics, list) or not mosaics:
-        raise SceneError(f"{path}: mosaic is missing: one [[mosaic]] for each instrument")
-    for i, table in enumerate(mosaics):
-        where = f"{path}: mosaic {i + 1}"
-        if isinstance(table, dict) and "format" in table:
-            check_table(where, "mosaic", table, {"mosaic": SURVEY}, {"mosaic": ("path",)})
-        else:
-            check_table(where, "mosaic", table, FIELD_TABLES, NEEDED)
-        given = [key for key in WEIGHTS if key in table]
-        if len(given) > 1:
-            raise SceneError(f"{where}: {' and '.join(given)} are given, a mosaic takes one")
+    mosaics = _images(path, tables, "mosaic", FIELD_TABLES)
     for name in FIELD_TABLES:
         if name != "mosaic" and name in tables:
             check_table(f"{path}: {name}", name, tables[name], FIELD_TABLES, NEEDED)
     return {name: tables.get(name, {}) for name in FIELD_TABLES} | {"mosaic": mosaics}
+
+
+def _images(path, tables, name, known):
+    """The tables of a file's images, checked; name: "observation" or "mosaic"."""
+    given = tables.get(name)
+    if not isinstance(given, list) or not given:
+        raise SceneError(f"{path}: {name} is missing: one [[{name}]] for each instrument")
+    for i, table in enumerate(given):
+        where = f"{path}: {name} {i + 1}"
+        if isinstance(table, dict) and "format" in table:
+            check_table(where, name, table, {name: SURVEY}, {name: ("path",)})
+        else:
+            check_table(where, name, table, known, NEEDED)
+        kinds = [key for key in WEIGHTS if key in table]
+        if len(kinds) > 1:
+            raise SceneError(f"{where}: {' and '.join(kinds)} are both given: an image takes one")
+    return given

@@ -60,6 +60,12 @@ class Job:
         """Names (C,) of all channels of all mosaics."""
         return tuple(c.name for mosaic in self.mosaics for c in mosaic.channels)
 
+    @property
+    def bands(self) -> tuple[str, ...]:
+        """Names (B,) of the bands of all channels."""
+        names = [c.band or c.name for mosaic in self.mosaics for c in mosaic.channels]
+        return tuple(dict.fromkeys(names))
+
 
 @dataclass(frozen=True, eq=False)
 class _Cut:

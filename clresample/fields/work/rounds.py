@@ -157,8 +157,8 @@ def _owners(part):
 
 
 def _columns(rows, kind, job):
-    """Columns of all channels that the rows have: (S, C)."""
-    names = [f"{kind}_{c}" for c in job.channels if f"{kind}_{c}" in rows]
+    """Columns of all bands that the rows have: (S, B)."""
+    names = [f"{kind}_{b}" for b in job.bands if f"{kind}_{b}" in rows]
     return np.array([rows[name] for name in names], float).reshape(len(names), len(rows)).T
 
 

@@ -216,7 +216,8 @@ def vector_bytes(scene, prior) -> int:
 def _inverse_curvature(scenes):
     """1 / (sum w (R S)^2) of every spectrum (S, C) and 1 / sum w of every sky level (B, C); 0 where
     nothing is seen, and of sky levels that are not fitted."""
-    power = np.concatenate([s.power for s in scenes])
+    power, ties = np.concatenate([s.power for s in scenes]), scenes[0].ties
+    power = power if ties is None else ties.mean(power)
     seen = power > UNSEEN * power.max(initial=0)
     total = np.array([np.concatenate([w.sum((1, 2)) for w in s.weights]) for s in scenes])
     free = (total > 0) & np.array([s.fit_sky for s in scenes])[:, None]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
+from clresample.fields.reading.scene_file import read_scene
 from clresample.files.fits import write_fits
-from clresample.files.scene import read_scene
 from clresample.files.scene_keys import SceneError
 from clresample.sky.grid import Grid
 from clresample.sky.psf import PSF

@@ -7,8 +7,8 @@ from astropy.io import fits
 from astropy.table import QTable, Table
 
 from clresample.deblending.solver.constraints import Chain, Positivity
+from clresample.fields.reading.scene_file import read_scene
 from clresample.files.fits import write_fits
-from clresample.files.scene import read_scene
 from clresample.files.scene_keys import SceneError
 from clresample.files.source_table import read_sources
 from clresample.sky.grid import Grid
@@ -185,7 +185,7 @@ def test_bands_of_the_image_choose_those_of_the_psf(folder):
         (ONE + 'hdu = "SCI"', "no HDU SCI (HDUs: 0 PRIMARY)"),
         (ONE + "bands = 4", "no band 4 (bands: 0)"),
         (ONE + 'bands = ["z"]', "no band z"),
-        (ONE + 'channels = "V"', "channels is 'V', it takes a list of names"),
+        (ONE + "channels = 3", "channels is 3, it takes a name, or a list of names"),
         (ONE + 'channels = ["V", "I"]', "channels has 2 names, data have 1 channels"),
         (
             ONE + 'psf_center = "left"',
@@ -198,12 +198,12 @@ def test_bands_of_the_image_choose_those_of_the_psf(folder):
             "zero_point has 2 numbers, it takes one for",
         ),
         (ONE + "variance = -1", "variance is -1, it takes the name of a file, a number"),
-        (ONE + "variance = [1, 2]", "variance has the shape (2,)"),
+        (ONE + "variance = [1, 2]", "variance has 2 planes, the images 1"),
         (ONE + "variance = 1\nweight = 1", "weight and variance are both given"),
         (ONE + 'weight_hdu = "WHT"', "weight_hdu is given, but weight names no file"),
         (ONE + 'weight = "none.fits"', "none.fits: no such file"),
         (ONE + 'weight = "image.fits"', "weight_hdu must say which HDU"),
-        (ONE + 'weight = "psf.fits"', "weight has the shape (21, 21), data (1, 30, 34)"),
+        (ONE + 'weight = "psf.fits"', "weight has (21, 21) pixels"),
         (CUBE.replace("psf3", "psf2"), "psf has 2 bands, the image 3"),
         (ONE.replace("image.fits", "none.fits"), "none.fits: no such file"),
         (ONE.replace("image.fits", "psf.fits"), "has no celestial WCS"),
