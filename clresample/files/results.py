@@ -32,6 +32,7 @@ BOX = ("source", "y", "x", "n_y", "n_x")
 # HDUs of Errors
 ERRORS = {"FLUXCOV": "flux", "COLOURCOV": "colour", "MOMENTCOV": "moments", "BEYOND": "beyond"}
 ERRORS |= {"RELEASED": "released", "MOVED": "moved", "RESIDUALMAX": "residuals"}
+ERRORS["OUTSIDE"] = "outside"  # which errors may lack
 ARRAYS = ("sky", "covariance", "shifts", "losses")
 # every WCS card with the 17 digits that give back the same float64
 RELAX = WCSHDO_all | WCSHDO_SIP | WCSHDO_P17 | WCSHDO_EFMT
@@ -43,7 +44,7 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
     HDUs that `read_result` reads: ABOUT (keys and JSON: sources, names, status, messages, ...),
     COMPONENTS (boxes), SPECTRA (n, C), MORPHOLOGIES (one after the other), SKY, COVARIANCE, SHIFTS,
     LOSSES, where the result has errors FLUXCOV, COLOURCOV, MOMENTCOV, BEYOND, RELEASED, MOVED,
-    RESIDUALMAX and MORPHOLOGYERR (one after the other), MODELPSF, and per observation from 1 on:
+    RESIDUALMAX, OUTSIDE and MORPHOLOGYERR (one after the other), MODELPSF, and per observation from 1 on:
     DATA, WEIGHTS, PSF, RENDERED. For other programs: CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all
     sources in the model frame, and per observation MODEL and RESIDUAL, 0 where data have no weight.
     All images have their WCS; a flat sky is put at RA = Dec = 0. For NaN and infinity see
@@ -92,8 +93,9 @@ def _error_hdus(errors):
     if errors is None:
         return []
     flat = [np.ravel(m) for m in errors.morphology]
+    given = {name: getattr(errors, key) for name, key in ERRORS.items()}
     return [
-        *(image_hdu(name, getattr(errors, key)) for name, key in ERRORS.items()),
+        *(image_hdu(name, a) for name, a in given.items() if a is not None),
         image_hdu("MORPHOLOGYERR", np.concatenate(flat) if flat else np.zeros(0)),
     ]
 
@@ -285,7 +287,8 @@ def _errors(path, hdus, written):
         end = shape[0] * shape[1]
         maps.append(flat[:end].reshape(shape).copy())
         flat = flat[end:]
-    arrays = {key: array_of(hdus[name]) for name, key in ERRORS.items()}
+    kept = {name: key for name, key in ERRORS.items() if name != "OUTSIDE" or name in hdus}
+    arrays = {key: array_of(hdus[name]) for name, key in kept.items()}
     return Errors(**arrays, morphology=tuple(maps))
 
 

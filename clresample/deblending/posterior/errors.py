@@ -33,6 +33,8 @@ class Errors:
         centroids and second moments, change by when the bound of morphologies at 0 is released,
         see bounds.py; second moments of stars stay
     residuals (S, C) [sigma]: the largest on each source, see `channel_residuals`
+    outside (S, C) [counts]: flux that the smooth profiles have outside of what was observed, see
+        `light_outside`; its square is in `flux` and `colour`. None of errors without it
     """
 
     flux: np.ndarray
@@ -43,6 +45,7 @@ class Errors:
     released: np.ndarray
     moved: np.ndarray
     residuals: np.ndarray
+    outside: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 
 import numpy as np
 from scipy.linalg.blas import strmm
 
+from ..assessment.edge import light_outside, widened
 from .blocks import RIDGE, Factor
 from .bounds import pulls
 from .errors import Draws, Errors
@@ -183,12 +183,16 @@ def with_errors(fit, result, peaks, seen):
     morphs = [c.morphology for c in result.components]
     posterior, messages = posterior_of(fit, morphs, peaks, seen)
     if posterior is None:
-        return replace(result, messages=(*result.messages, *messages))
+        return result.noted(messages=(*result.messages, *messages))
     owner, residuals = fit.fitted[fit.start.source], channel_residuals(result)
     errors = posterior.errors(owner, residuals, fit.unit, fit.settings.flux_floor)
     draws = posterior.draws(owner, residuals, fit.unit)
+    start = fit.start
+    outside = light_outside(
+        result, start.shapes, start.thetas, start.positions[start.source], peaks
+    )
     fit.note_seconds("errors", time.perf_counter() - began)
-    return replace(result, errors=errors, draws=draws)
+    return result.noted(errors=widened(errors, outside), draws=draws)
 
 
 def posterior_of(fit, morphs, peaks, seen):
