@@ -11,7 +11,7 @@ from ..sky.given.checks import instance, numbers
 from ..sky.observation import Observation, check_observations
 from ..sky.sources import Source
 
-# Status of a fit whose loss falls no further, and of a result of it that does not describe the data.
+# Status of a fit whose loss falls no further, and of its result if that does not describe the data.
 CONVERGED, MISFIT = "converged", "misfit"
 # Status of a fit until something else ends it than `max_iter`, and of one that Ctrl-C ended.
 UNFINISHED, INTERRUPTED = "iteration limit", "interrupted"

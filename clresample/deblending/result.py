@@ -18,6 +18,8 @@ from .posterior.errors import Draws, Errors
 from .rendered import Rendered, weighted_sum
 from .solver.scene_model import compose
 
+DERIVED = "footprints", "misfit"  # what a Result works out of its model once it is wanted
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Component:
@@ -88,8 +90,7 @@ class Result(ShownResult):
 
     @property
     def converged(self) -> bool:
-        """Whether the fit ended because its loss did not fall any further, at a model that describes
-        the data."""
+        """Whether the fit's loss did not fall any further, at a model that describes the data."""
         return self.status == CONVERGED
 
     @property
@@ -109,16 +110,6 @@ class Result(ShownResult):
     def misfit(self) -> Misfit:
         """What the model leaves in the data, source by source and channel by channel."""
         return misfit_of(self)
-
-    def noted(self, **fields) -> Result:
-        """A copy with another status, other messages, errors or draws of the same model: what was
-        derived from the model stays."""
-        copy = replace(self, **fields)
-        derived = {
-            name: vars(self)[name] for name in ("footprints", "misfit") if name in vars(self)
-        }
-        vars(copy).update(derived)
-        return copy
 
     def channel_slices(self) -> list[slice]:
         """For each observation, its part of a spectrum."""
@@ -202,3 +193,15 @@ class Result(ShownResult):
             )
             for c, m, a in zip(self.components, morphs, spectra, strict=True)
         )
+
+
+def noted(result, **given) -> Result:
+    """A copy with another status, other messages, errors or draws of the same model.
+
+    What was derived from the model stays: footprints, misfit.
+    """
+    copy, derived = replace(result, **given), vars(result)
+    for key in DERIVED:
+        if key in derived:
+            vars(copy)[key] = derived[key]
+    return copy

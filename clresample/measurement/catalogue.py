@@ -22,8 +22,7 @@ from .quality import box_chi2, fitted_sources, labels, masked_cores
 from .shapes import moments, shape, shape_slopes
 
 # of a morphology's peak: light at the edge of what was seen is flagged when it is brighter. Fainter
-# light makes no flux wrong by more than a few percent; lower, noise in the wings is flagged too.
-# Likewise of a flux, what its profile has outside
+# light makes no flux wrong by more than a few percent; lower, noise in the wings is flagged too
 EDGE_LIGHT = 0.01
 
 # [deg] scatter of an angle that may have any value: no error is larger
@@ -50,8 +49,8 @@ class Flag(IntFlag):
 
 
 MEANINGS = {
-    Flag.EDGE: "light at the frame's edge, or beside unobserved sky: over 1 % of a morphology's peak, "
-    "or a profile with over 1 % of the flux, and over its error, outside",
+    Flag.EDGE: "at the frame's edge or beside unobserved sky over 1 % of a morphology's peak, or "
+    "over 3 % of the flux outside, as the model goes on there",
     Flag.NOT_CONVERGED: "the blend's fit ended for another reason than convergence",
     Flag.ZERO_FLUX: "the flux in a channel that determines it is at its limit, zero",
     Flag.NO_COVERAGE: "a channel's image does not hold the centre, or determines no flux",
@@ -59,7 +58,7 @@ MEANINGS = {
     Flag.MASKED: "the centre is on a pixel without weight in a channel whose image holds it",
     Flag.SATURATED: "a point source with masked pixels in its core: its flux is that of its wings",
     Flag.MISFIT: "the model leaves over 5 sigma and over 3 % of the flux in a channel",
-    Flag.AMBIGUOUS: "the data do not tell how much of its light is that of the source ambiguous_with",
+    Flag.AMBIGUOUS: "the data do not tell its light from that of the source in ambiguous_with",
 }
 
 
@@ -275,8 +274,7 @@ def _flags(result, flux, error, positions, footprints):
         flags[fitted & ~held] |= Flag.NO_COVERAGE
         flags[fitted & held & ~footprint.weighted(positions).all(axis=0)] |= Flag.MASKED
     flags[masked_cores(result, positions)] |= Flag.SATURATED
-    if result.errors is not None:
-        flags[reaches_outside(result.errors, flux, EDGE_LIGHT)] |= Flag.EDGE
+    flags[reaches_outside(result, flux)] |= Flag.EDGE
     edge = open_edge(footprints, result.frame.shape)
     for c in result.components:
         (y, x), (n_y, n_x) = c.origin, c.morphology.shape

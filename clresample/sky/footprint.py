@@ -80,7 +80,7 @@ def open_edge(footprints, shape) -> np.ndarray:
 
 
 def unobserved(footprints, shape) -> np.ndarray:
-    """Pixels of the frame outside of what was observed, with a border of one: (Ny + 2, Nx + 2) bool.
+    """Pixels of the frame outside of what was observed, and a border: (Ny + 2, Nx + 2) bool.
 
     The border, and those without a weight in any channel that are connected to it through others
     without one. Masked pixels within an image, single or in patches, are not outside.

@@ -29,7 +29,9 @@ def is_ambiguous(flux, covariance) -> np.ndarray:
     found = np.zeros(2, bool)
     for one in (0, 1):
         own, shared = covariance[:, one, one], covariance[:, 0, 1]
-        usable = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(flux).all(axis=1) & (own > 0)
+        usable = (
+            np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(flux).all(axis=1) & (own > 0)
+        )
         if not usable.any():
             continue
         snr = np.where(usable, flux[:, one] / np.sqrt(np.where(usable, own, 1.0)), -np.inf)

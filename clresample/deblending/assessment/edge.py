@@ -1,4 +1,4 @@
-"""Light of galaxies beyond what was observed: how much their smooth profiles have there."""
+"""Light of galaxies outside of what was observed: how much their models would have there."""
 
 from __future__ import annotations
 
@@ -9,12 +9,26 @@ import numpy as np
 from ...sky.footprint import unobserved
 from ..profiles import Galaxy
 
+# Part of a flux that is outside where light is said to reach the edge: three errors of a bright
+# galaxy's flux are as much.
+OUTSIDE = 0.03
+# Share of a ring's area that must have been observed for its mean brightness to stand for all of
+# it: less is a corner of the frame.
+LEAST_COVERED = 0.2
+# Rings at the end of a profile, as a part of all, whose mean slope it goes on with.
+OUTER = 0.25
+# [radius] Largest scale length with which it does: a galaxy that falls less steeply where its image
+# ends is noise, or a sky that is wrong.
+MOST_SCALE = 0.5
+
 
 def light_outside(result, shapes, thetas, positions, peaks) -> np.ndarray:
-    """Flux outside of what was observed that each source's smooth profile has: (S, C) [counts].
+    """Flux that each source's model would have outside of what was observed: (S, C) [counts].
 
-    At most the flux inside. 0 of sources whose boxes end before the border, and of all but
-    galaxies: the wings of stars are those of the PSF.
+    The smaller one of two estimates: what the smooth profile has there, which may have wings that
+    its morphology lacks, and the morphology continued, which in its wings may have noise. 0 of
+    sources whose boxes end before the border, and of all but galaxies: the wings of stars are those
+    of the PSF.
 
     shapes, thetas, positions (n): of the components' profiles; peaks (n,): of the morphologies
         before they were scaled to a maximum of 1, where those of the profiles are 1
@@ -30,8 +44,61 @@ def light_outside(result, shapes, thetas, positions, peaks) -> np.ndarray:
         (image,) = shapes[i].cut(thetas[i], positions[i], (0, 0), observed.shape, slopes=False)
         scale = max(image.max() * peaks[i], 1e-300)
         beyond = max(1 - image[observed].sum(), 0.0) / scale  # its integral is 1
-        found[c.source] += c.spectrum * min(beyond, c.morphology.sum())
+        found[c.source] += c.spectrum * min(beyond, continued(c.origin, c.morphology, observed))
     return found
+
+
+def continued(origin, morphology, observed) -> float:
+    """Sum of a morphology (ny, nx) where its frame, observed (Ny, Nx) bool, was not.
+
+    Its elliptical rings have their mean brightness outside too; from where less than a fifth of a
+    ring was observed it goes on as an exponential, with the slope of the last quarter of the rings.
+    """
+    rings = _rings(origin, morphology, observed.shape)
+    if rings is None:
+        return 0.0
+    n = np.bincount(rings[observed])
+    (y, x), (n_y, n_x) = origin, morphology.shape
+    box = np.s_[y : y + n_y, x : x + n_x]
+    own = observed[box]
+    light = np.bincount(rings[box][own], morphology[own], len(n))
+    area = np.pi * (2 * np.arange(len(n)) + 1)
+    bare = n <= LEAST_COVERED * area
+    end = int(np.argmax(bare)) if bare.any() else len(n)
+    if end < 2:
+        return 0.0
+    brightness = light[:end] / n[:end]
+    between = np.maximum(area[:end] - n[:end], 0.0) @ brightness
+    return float(between + _tail(brightness))
+
+
+def _rings(origin, morphology, shape):
+    """Number (Ny, Nx) of the ring of a frame's pixels about a morphology's centroid, similar to the
+    ellipse of its second moments and one pixel wide in the mean; None without such an ellipse."""
+    total, at = morphology.sum(), np.indices(morphology.shape)
+    if not total > 0:
+        return None
+    centre = (at * morphology).sum(axis=(1, 2)) / total
+    away = at - centre[:, None, None]
+    second = np.einsum("yx,iyx,jyx->ij", morphology / total, away, away)
+    determinant = np.linalg.det(second)
+    if not determinant > 0:
+        return None
+    metric = np.linalg.inv(second) * np.sqrt(determinant)
+    away = np.indices(shape) - (centre + origin)[:, None, None]
+    return np.sqrt(np.einsum("iyx,ij,jyx->yx", away, metric, away)).astype(int)
+
+
+def _tail(brightness):
+    """Sum beyond rings of one pixel, brightness (n,), that go on as an exponential."""
+    end, n = float(len(brightness)), max(1, int(OUTER * len(brightness) / 2))
+    inner, outer = brightness[-2 * n : -n].mean(), brightness[-n:].mean()
+    if not outer > 0:
+        return 0.0
+    fall = np.log(inner / outer) / n if inner > outer else 0.0
+    scale = min(1 / max(fall, 1e-30), MOST_SCALE * end)
+    at_end = outer * np.exp(-n / 2 / scale)
+    return 2 * np.pi * at_end * scale * (end + scale)
 
 
 def widened(errors, outside):
@@ -45,11 +112,16 @@ def widened(errors, outside):
     return replace(errors, flux=flux, colour=colour, outside=outside)
 
 
-def reaches_outside(errors, flux, part):
-    """Which sources (S,) have more light outside than their flux (S, C) is uncertain without it, and
-    more than a part of it, in some channel."""
-    if errors.outside is None:
+def reaches_outside(result, flux) -> np.ndarray:
+    """Which sources (S,) have more than OUTSIDE of their flux (S, C) outside of what was observed.
+
+    In a channel where that is more than the noise of the flux at fixed morphology.
+    """
+    if result.errors is None:
         return np.zeros(len(flux), bool)
-    variance = np.diagonal(errors.flux, axis1=1, axis2=2).T  # that of the light outside is in it
-    more = errors.outside**2 > variance / 2
-    return (more & (errors.outside > part * flux)).any(axis=1)
+    noise = np.zeros(flux.shape)
+    for i, c in enumerate(result.components):
+        variance = np.maximum(result.covariance[:, i, i], 0)
+        noise[c.source] += np.sqrt(variance) * c.morphology.sum()
+    outside = result.errors.outside
+    return ((outside > OUTSIDE * flux) & (outside > noise)).any(axis=1)

@@ -65,8 +65,10 @@ class Misfit:
         return part.max(axis=1, initial=0.0)
 
     def sources(self) -> np.ndarray:
-        """Which sources (S,) are misfitted: over 5 sigma and over MISFIT_FRACTION of the flux; all of
-        a model that does not describe the data where none is."""
+        """Which sources (S,) are misfitted: over 5 sigma and over MISFIT_FRACTION of the flux.
+
+        All of a model that does not describe the data though none of them is.
+        """
         found = self.fraction() > MISFIT_FRACTION
         return found | (self.is_wrong and not found.any())
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..blend import CONVERGED, MISFIT
+from ..result import noted
 
 # Sources and channels that a message names.
 MOST_NAMED = 5
@@ -15,7 +16,7 @@ def judged(result):
     not describe the data, see `Misfit.is_wrong`."""
     if result.status != CONVERGED or not result.misfit.is_wrong:
         return result
-    return result.noted(status=MISFIT, messages=(*result.messages, _message(result)))
+    return noted(result, status=MISFIT, messages=(*result.messages, _message(result)))
 
 
 def _message(result):

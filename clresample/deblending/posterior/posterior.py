@@ -8,6 +8,7 @@ import numpy as np
 from scipy.linalg.blas import strmm
 
 from ..assessment.edge import light_outside, widened
+from ..result import noted
 from .blocks import RIDGE, Factor
 from .bounds import pulls
 from .errors import Draws, Errors
@@ -183,7 +184,7 @@ def with_errors(fit, result, peaks, seen):
     morphs = [c.morphology for c in result.components]
     posterior, messages = posterior_of(fit, morphs, peaks, seen)
     if posterior is None:
-        return result.noted(messages=(*result.messages, *messages))
+        return noted(result, messages=(*result.messages, *messages))
     owner, residuals = fit.fitted[fit.start.source], channel_residuals(result)
     errors = posterior.errors(owner, residuals, fit.unit, fit.settings.flux_floor)
     draws = posterior.draws(owner, residuals, fit.unit)
@@ -192,7 +193,7 @@ def with_errors(fit, result, peaks, seen):
         result, start.shapes, start.thetas, start.positions[start.source], peaks
     )
     fit.note_seconds("errors", time.perf_counter() - began)
-    return result.noted(errors=widened(errors, outside), draws=draws)
+    return noted(result, errors=widened(errors, outside), draws=draws)
 
 
 def posterior_of(fit, morphs, peaks, seen):
