@@ -11,6 +11,7 @@ from astropy.table import QTable
 
 from ..deblending.assessment.ambiguity import partners
 from ..deblending.assessment.edge import reaches_outside
+from ..deblending.assessment.status import misfitted
 from ..deblending.blend import CONVERGED, MISFIT
 from ..deblending.posterior.residuals import channel_residuals
 from ..sky.footprint import open_edge
@@ -138,7 +139,7 @@ def columns_of(result, *, magnitudes=False) -> Columns:
         table.put(f"residual_{channel}", values)
     table.put("misfit_sigma", np.where(fitted, misfit.sigma().max(axis=1, initial=0), np.nan))
     table.put("misfit_fraction", np.where(fitted, misfit.fraction(), np.nan))
-    table["flags"][misfit.sources() & fitted] |= Flag.MISFIT
+    table["flags"][misfitted(result)] |= Flag.MISFIT
     _add_partners(table, result, flux, covariance)
     return table
 

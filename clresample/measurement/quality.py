@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..deblending.assessment.status import misfitted
 from ..deblending.posterior.residuals import pixels_in_boxes
 from ..sky.sources import Point
 
@@ -19,15 +20,15 @@ def summary(result) -> dict:
         frame), n_components, n_iterations, losses; chi2 {channel: per pixel with a weight on the
         frame, NaN without any}, n_pixels {channel: number of these pixels}, sky {channel} [counts],
         shifts {observation: (y, x)} [model px]; misfits, the numbers of the sources that
-        are flagged MISFIT (`Misfit.sources`); good, whether the fit converged at a model that
+        are flagged MISFIT (`misfitted`); good, whether the fit converged at a model that
         describes the data and there is none
     """
     chi2, n_pixels = channel_chi2(result)
-    misfitted = np.flatnonzero(result.misfit.sources() & fitted_sources(result)).tolist()
+    misfits = np.flatnonzero(misfitted(result)).tolist()
     return {
         "status": result.status,
-        "good": result.converged and not misfitted,
-        "misfits": misfitted,
+        "good": result.converged and not misfits,
+        "misfits": misfits,
         "messages": list(result.messages),
         "n_sources": len(result.sources),
         "n_fitted": int(fitted_sources(result).sum()),

@@ -25,10 +25,10 @@ MOST_SCALE = 0.5
 def light_outside(result, shapes, thetas, positions, peaks) -> np.ndarray:
     """Flux that each source's model would have outside of what was observed: (S, C) [counts].
 
-    The smaller one of two estimates: what the smooth profile has there, which may have wings that
-    its morphology lacks, and the morphology continued, which in its wings may have noise. 0 of
-    sources whose boxes end before the border, and of all but galaxies: the wings of stars are those
-    of the PSF.
+    At most what it has inside, and the smaller one of two estimates: what the smooth profile has
+    there, which may have wings that its morphology lacks, and the morphology continued, which in
+    its wings may have noise. 0 of sources whose boxes end before the border, and of all but
+    galaxies: the wings of stars are those of the PSF.
 
     shapes, thetas, positions (n): of the components' profiles; peaks (n,): of the morphologies
         before they were scaled to a maximum of 1, where those of the profiles are 1
@@ -44,53 +44,60 @@ def light_outside(result, shapes, thetas, positions, peaks) -> np.ndarray:
         (image,) = shapes[i].cut(thetas[i], positions[i], (0, 0), observed.shape, slopes=False)
         scale = max(image.max() * peaks[i], 1e-300)
         beyond = max(1 - image[observed].sum(), 0.0) / scale  # its integral is 1
-        found[c.source] += c.spectrum * min(beyond, continued(c.origin, c.morphology, observed))
+        longer = continued(c.origin, c.morphology, positions[i], outside)
+        found[c.source] += c.spectrum * min(beyond, longer)
     return found
 
 
-def continued(origin, morphology, observed) -> float:
-    """Sum of a morphology (ny, nx) where its frame, observed (Ny, Nx) bool, was not.
+def continued(origin, morphology, centre, outside) -> float:
+    """Sum of a morphology (ny, nx) where its frame was not observed; outside: see `unobserved`.
 
-    Its elliptical rings have their mean brightness outside too; from where less than a fifth of a
-    ring was observed it goes on as an exponential, with the slope of the last quarter of the rings.
+    Its elliptical rings about the centre (2,) [frame px] have their mean brightness outside too;
+    from where less than a fifth of a ring was observed it goes on as an exponential, with the slope
+    of the last quarter of the rings. No more than the sum that was observed.
     """
-    rings = _rings(origin, morphology, observed.shape)
+    rings = _rings(origin, morphology, centre, outside.shape)
     if rings is None:
         return 0.0
-    n = np.bincount(rings[observed])
+    n = np.bincount(rings[~outside], minlength=rings.max() + 1)
     (y, x), (n_y, n_x) = origin, morphology.shape
-    box = np.s_[y : y + n_y, x : x + n_x]
-    own = observed[box]
+    box = np.s_[y + 1 : y + 1 + n_y, x + 1 : x + 1 + n_x]
+    own = ~outside[box]
     light = np.bincount(rings[box][own], morphology[own], len(n))
-    area = np.pi * (2 * np.arange(len(n)) + 1)
+    ring = np.arange(len(n))
+    area = np.pi * (2 * ring + 1)
     bare = n <= LEAST_COVERED * area
+    first = rings[outside].min()
+    bare &= ring >= first  # rings within have all their pixels
     end = int(np.argmax(bare)) if bare.any() else len(n)
-    if end < 2:
-        return 0.0
-    brightness = light[:end] / n[:end]
-    between = np.maximum(area[:end] - n[:end], 0.0) @ brightness
-    return float(between + _tail(brightness))
+    brightness = light[:end] / np.maximum(n[:end], 1)
+    missing = np.where(ring >= first, np.maximum(area - n, 0.0), 0.0)[:end]
+    return float(min(missing @ brightness + _tail(brightness), morphology.sum()))
 
 
-def _rings(origin, morphology, shape):
-    """Number (Ny, Nx) of the ring of a frame's pixels about a morphology's centroid, similar to the
-    ellipse of its second moments and one pixel wide in the mean; None without such an ellipse."""
-    total, at = morphology.sum(), np.indices(morphology.shape)
+def _rings(origin, morphology, centre, shape):
+    """Number (Ny + 2, Nx + 2) of the ring of a frame's pixels and its border about a centre.
+
+    Rings are similar to the ellipse of the morphology's second moments, and one pixel wide in the
+    mean. None without such an ellipse.
+    """
+    total = morphology.sum()
     if not total > 0:
         return None
-    centre = (at * morphology).sum(axis=(1, 2)) / total
-    away = at - centre[:, None, None]
+    away = np.indices(morphology.shape) - (np.asarray(centre) - origin)[:, None, None]
     second = np.einsum("yx,iyx,jyx->ij", morphology / total, away, away)
     determinant = np.linalg.det(second)
     if not determinant > 0:
         return None
     metric = np.linalg.inv(second) * np.sqrt(determinant)
-    away = np.indices(shape) - (centre + origin)[:, None, None]
+    away = np.indices(shape) - (np.asarray(centre) + 1)[:, None, None]
     return np.sqrt(np.einsum("iyx,ij,jyx->yx", away, metric, away)).astype(int)
 
 
 def _tail(brightness):
     """Sum beyond rings of one pixel, brightness (n,), that go on as an exponential."""
+    if len(brightness) < 2:
+        return 0.0
     end, n = float(len(brightness)), max(1, int(OUTER * len(brightness) / 2))
     inner, outer = brightness[-2 * n : -n].mean(), brightness[-n:].mean()
     if not outer > 0:

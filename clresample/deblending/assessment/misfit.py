@@ -13,7 +13,8 @@ from ..posterior.residuals import MIN_PIXELS, MISFIT_SIGMAS, remainder
 # bright galaxies are about 1 % (Settings.flux_floor, structure, their growth with the residual), so
 # that three of them cover less; simulated galaxies that are fitted well have fluxes within 3 %.
 MISFIT_FRACTION = 0.03
-# Likewise from which on the model of the whole blend does not describe the data.
+# Part of the flux of all sources of a blend that is left where its model does not describe the
+# data. What a single one leaves is said by its flag.
 WRONG_FRACTION = 0.1
 # chi2 per pixel, over that of the noise, from which on it is not of noise: weights whose sigma is
 # wrong by 15 % somewhere in an image have as much.
@@ -42,7 +43,8 @@ class Misfit:
     light (S, C) [counts]: sum of the absolute residual there, smoothed with the PSF, without what
         noise adds; where a residual is over 5 sigma, at least the flux of that point source
     flux (S, C) [counts]: of the model, and at least its error at fixed morphology
-    whole_excess, whole_chi2, whole_light (C,): of all pixels of the channel on the frame
+    whole_excess, whole_chi2, whole_light (2, C): the same of the pixels of all sources together,
+        and of all pixels of the channel on the frame
     """
 
     residuals: np.ndarray
@@ -65,22 +67,32 @@ class Misfit:
         return part.max(axis=1, initial=0.0)
 
     def sources(self) -> np.ndarray:
-        """Which sources (S,) are misfitted: over 5 sigma and over MISFIT_FRACTION of the flux.
-
-        All of a model that does not describe the data though none of them is.
-        """
-        found = self.fraction() > MISFIT_FRACTION
-        return found | (self.is_wrong and not found.any())
+        """Which sources (S,) are misfitted: over 5 sigma and over MISFIT_FRACTION of the flux."""
+        return self.fraction() > MISFIT_FRACTION
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the model does not describe the data: chi2 of some channel or some source is not
-        of noise, and more than a part of the light is left."""
-        sources = (self.excess > MISFIT_SIGMAS) & (self.chi2 > WRONG_CHI2)
-        sources &= self.light > WRONG_FRACTION * self.flux
-        much = self.whole_light > MISFIT_FRACTION * self.flux.sum(axis=0)
-        whole = (self.whole_chi2 > WRONG_CHI2) & much | (self.whole_chi2 > WRONG_ANYWAY)
-        return bool(sources.any() or (whole & (self.whole_excess > MISFIT_SIGMAS)).any())
+        """Whether the model as a whole does not describe the data.
+
+        chi2 of a channel is not of noise, where the sources are or on the frame, and much of the
+        light is left, or that of the frame is large.
+        """
+        beyond = self.whole_chi2[1] > WRONG_ANYWAY
+        return bool((self._wrong | [np.zeros_like(beyond), beyond & self._significant[1]]).any())
+
+    @property
+    def is_wrong_on_sources(self) -> bool:
+        """The same of the pixels of the sources alone, whatever there is beside them."""
+        return bool(self._wrong[0].any())
+
+    @property
+    def _significant(self):
+        return self.whole_excess > MISFIT_SIGMAS
+
+    @property
+    def _wrong(self):
+        much = self.whole_light > WRONG_FRACTION * self.flux.sum(axis=0)
+        return (self.whole_chi2 > WRONG_CHI2) & much & self._significant
 
 
 def misfit_of(result) -> Misfit:
@@ -90,19 +102,20 @@ def misfit_of(result) -> Misfit:
         left = remainder(result, i)
         worst.append(left.worst(n_sources))
         rest += [_of_channel(left, c, n_sources) for c in range(len(left.filtered))]
-    own = [np.stack(rows, axis=-1) for rows in zip(*rest, strict=True)]  # (S + 1, C)
-    given = np.concatenate(worst, axis=1), *(rows[:-1] for rows in own), _model_flux(result)
-    return Misfit(*given, *(rows[-1] for rows in own))
+    own = [np.stack(rows, axis=-1) for rows in zip(*rest, strict=True)]  # (S + 2, C)
+    given = np.concatenate(worst, axis=1), *(rows[:-2] for rows in own), _model_flux(result)
+    return Misfit(*given, *(rows[-2:] for rows in own))
 
 
 def _of_channel(rest, c, n_sources):
-    """excess, chi2, light (S + 1,) of a channel of a Remainder; the last ones of all pixels."""
+    """excess, chi2, light (S + 2,) of a channel of a Remainder, the last ones of the whole."""
     used, owner = rest.used[c], rest.owner[c]
     shared = correlation_sum(rest.residual[c], rest.sky[c])
 
     def sums(where, values):
         own = where & (owner >= 0)
-        return np.append(np.bincount(owner[own], values[own], n_sources), values[where].sum())
+        found = np.bincount(owner[own], values[own], n_sources)
+        return np.concatenate([found, [found.sum(), values[where].sum()]])
 
     count = sums(used, np.ones(used.shape))
     with np.errstate(invalid="ignore"):
@@ -112,7 +125,7 @@ def _of_channel(rest, c, n_sources):
     seen = used & np.isfinite(rest.filtered[c])
     light = sums(seen, rest.power[c] * np.nan_to_num(rest.point[c]) * left)
     points = np.where(size > MISFIT_SIGMAS, size * np.nan_to_num(rest.point[c]), 0.0)
-    np.maximum.at(light, np.where(owner < 0, n_sources, owner)[seen], points[seen])
+    np.maximum.at(light, np.where(owner < 0, n_sources + 1, owner)[seen], points[seen])
     return chi2_excess(chi2, count / shared), chi2, np.maximum(light, 0.0)
 
 
@@ -123,7 +136,7 @@ def chi2_excess(chi2, n):
     Hilferty 1931, PNAS 17, 684): noise is over 5 sigma once in 3e6, from 10 pixels on.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
-        variance = 2 / (9 * n)
+        variance = 2 / (9 * np.asarray(n, float))
         return (np.cbrt(chi2 / TRUSTED_CHI2) - 1 + variance) / np.sqrt(variance)
 
 
