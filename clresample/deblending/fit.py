@@ -9,7 +9,6 @@ import numpy as np
 
 from ..resampling.transfer import noise_warnings
 from ..sky.frame import Frame
-from .assessment.status import judged
 from .blend import INTERRUPTED, UNFINISHED
 from .posterior.posterior import with_errors
 from .rendered import Rendered
@@ -183,7 +182,7 @@ class Fit:
             messages=tuple(self.messages),
             seconds=self.seconds,
         )
-        return with_errors(self, judged(result), peaks, seen)
+        return with_errors(self, result, peaks, seen)
 
 
 def begin(fits):

@@ -18,8 +18,6 @@ from .posterior.errors import Draws, Errors
 from .rendered import Rendered, weighted_sum
 from .solver.scene_model import compose
 
-DERIVED = "footprints", "misfit"  # what a Result works out of its model once it is wanted
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Component:
@@ -196,12 +194,8 @@ class Result(ShownResult):
 
 
 def noted(result, **given) -> Result:
-    """A copy with another status, other messages, errors or draws of the same model.
-
-    What was derived from the model stays: footprints, misfit.
-    """
-    copy, derived = replace(result, **given), vars(result)
-    for key in DERIVED:
-        if key in derived:
-            vars(copy)[key] = derived[key]
+    """A copy with another status, other messages, errors or draws, and the same misfit."""
+    copy = replace(result, **given)
+    if "misfit" in vars(result):
+        vars(copy)["misfit"] = result.misfit
     return copy

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.linalg.blas import strmm
 
 from ..assessment.edge import light_outside, widened
+from ..assessment.status import judged
 from ..result import noted
 from .blocks import RIDGE, Factor
 from .bounds import pulls
@@ -174,13 +175,13 @@ class Posterior:
 
 
 def with_errors(fit, result, peaks, seen):
-    """The Result of a Fit that has ended with its Errors and Draws, or with why there are none.
+    """The Result of a Fit that has ended, judged, with its Errors and Draws or why there are none.
 
     peaks, seen: see `posterior_of`
 
     Its seconds are taken down in the fit.
     """
-    began = time.perf_counter()
+    began, result = time.perf_counter(), judged(result)
     morphs = [c.morphology for c in result.components]
     posterior, messages = posterior_of(fit, morphs, peaks, seen)
     if posterior is None:

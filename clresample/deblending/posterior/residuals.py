@@ -128,11 +128,6 @@ def channel_residuals(result):
     return result.misfit.residuals
 
 
-def misfits(residuals):
-    """Sources (S,) bool with one of these `channel_residuals` (S, C) over 5 sigma."""
-    return (np.nan_to_num(residuals) > MISFIT_SIGMAS).any(axis=1)
-
-
 def widening(residuals):
     """Factors (S,), 1 or more, of the errors of sources with these `channel_residuals` (S, C).
 
