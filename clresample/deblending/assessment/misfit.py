@@ -110,7 +110,6 @@ def misfit_of(result) -> Misfit:
 def _of_channel(rest, c, n_sources):
     """excess, chi2, light (S + 2,) of a channel of a Remainder, the last ones of the whole."""
     used, owner = rest.used[c], rest.owner[c]
-    shared = correlation_sum(rest.residual[c], rest.sky[c])
 
     def sums(where, values):
         own = where & (owner >= 0)
@@ -126,7 +125,10 @@ def _of_channel(rest, c, n_sources):
     light = sums(seen, rest.power[c] * np.nan_to_num(rest.point[c]) * left)
     points = np.where(size > MISFIT_SIGMAS, size * np.nan_to_num(rest.point[c]), 0.0)
     np.maximum.at(light, np.where(owner < 0, n_sources + 1, owner)[seen], points[seen])
-    return chi2_excess(chi2, count / shared), chi2, np.maximum(light, 0.0)
+    excess = chi2_excess(chi2, count)
+    if (excess > MISFIT_SIGMAS).any():  # else it is no misfit, however few pixels are independent
+        excess = chi2_excess(chi2, count / correlation_sum(rest.residual[c], rest.sky[c]))
+    return excess, chi2, np.maximum(light, 0.0)
 
 
 def chi2_excess(chi2, n):

@@ -36,7 +36,7 @@ class Remainder:
     power (Co,) [1]: sum of the squared PSF: power t point is the residual smoothed with the PSF
     residual [sigma]: of single pixels, 0 without weight
     used, sky (bool): pixels with a weight; those of them with less than one sigma of model
-    noise (Co,) [1]: variance of the noise over the weights' own, 1 or more, see `noise_scale`
+    noise (Co,) [1]: variance of the noise over the weights' own, 1 or more
     owner: the source whose model is the brightest in a pixel, or -1
     """
 
@@ -73,9 +73,11 @@ def remainder(result, i_observation) -> Remainder:
     for c, image in enumerate(filtered):
         if sky[c].sum() < MIN_PIXELS:
             continue
-        fine = fine_scatter(scaled[c], weights[c] > 0)
-        noise[c] = noise_scale(scaled[c][sky[c]], WRONG_WEIGHTS * fine) ** 2
-        scale = noise_scale(image[sky[c]], CORRELATED * fine)
+        plain, scale = _scatter(scaled[c][sky[c]]), _scatter(image[sky[c]])
+        if plain > WRONG_WEIGHTS or scale > CORRELATED:
+            fine = fine_scatter(scaled[c], weights[c] > 0)
+            plain, scale = min(plain, WRONG_WEIGHTS * fine), min(scale, CORRELATED * fine)
+        noise[c] = plain**2
         image /= scale
         point[c] *= scale
     owner = _owners(result, i_observation, footprint.positions)
@@ -100,9 +102,9 @@ def worst_residuals(result, i_observation):
     return remainder(result, i_observation).worst(len(result.sources))
 
 
-def noise_scale(values, most):
-    """Robust scatter of values (n,) of the sky, from 1 to `most`."""
-    return min(max(1.0, np.median(np.abs(values)) / HALF_WIDTH), most)
+def _scatter(values):
+    """Robust scatter, 1 or more, of values (n,) of the sky."""
+    return max(1.0, np.median(np.abs(values)) / HALF_WIDTH)
 
 
 def fine_scatter(image, used):
