@@ -245,7 +245,7 @@ def _report(arguments, result, found, device, took):
         n, those = len(found["misfits"]), ", ".join(map(str, found["misfits"][:FEW]))
         more = f" and {n - FEW} more" if n > FEW else ""
         print(
-            f"{n} of {found['n_fitted']} sources leave residuals over 5 sigma (flag MISFIT): "
+            f"{n} of {found['n_fitted']} sources leave over 5 sigma and 3 % of a flux (MISFIT): "
             f"{those}{more}"
         )
     for label, o in zip(found["shifts"], result.observations, strict=True):

@@ -11,6 +11,8 @@ from ..sky.given.checks import instance, numbers
 from ..sky.observation import Observation, check_observations
 from ..sky.sources import Source
 
+# Status of a fit whose loss falls no further, and of its result if that does not describe the data.
+CONVERGED, MISFIT = "converged", "misfit"
 # Status of a fit until something else ends it than `max_iter`, and of one that Ctrl-C ended.
 UNFINISHED, INTERRUPTED = "iteration limit", "interrupted"
 # That of a fit whose scene another one takes over; no result has it.

@@ -12,6 +12,8 @@ from ..sky.footprint import Footprint
 from ..sky.frame import Frame
 from ..sky.observation import Observation
 from ..sky.sources import Source
+from .assessment.misfit import Misfit, misfit_of
+from .blend import CONVERGED
 from .posterior.errors import Draws, Errors
 from .rendered import Rendered, weighted_sum
 from .solver.scene_model import compose
@@ -64,7 +66,8 @@ class Result(ShownResult):
     draws: what `sample` draws from; not stored in files
     shifts (n_observations, 2) [model px]: fitted offsets of the observations' pixels
     losses (n_iterations + 1,): half chi2 (plus priors) before each iteration and at the end
-    status: "converged", "iteration limit", "diverged", "interrupted" or "failed: ..."
+    status: "converged", "misfit" (its steps ended, but the model does not describe the data, see
+        `Misfit.is_wrong`), "iteration limit", "diverged", "interrupted" or "failed: ..."
     messages: what the user should know, a line each; seconds: wall time by stage
     """
 
@@ -85,8 +88,8 @@ class Result(ShownResult):
 
     @property
     def converged(self) -> bool:
-        """Whether the fit ended because its loss did not fall any further."""
-        return self.status == "converged"
+        """Whether the fit's loss did not fall any further, at a model that describes the data."""
+        return self.status == CONVERGED
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -106,6 +109,11 @@ class Result(ShownResult):
             Footprint(o, o.grid.map_to(self.frame.grid), np.asarray(shift, np.float64))
             for o, shift in zip(self.observations, self.shifts, strict=True)
         )
+
+    @cached_property
+    def misfit(self) -> Misfit:
+        """What the model leaves in the data, source by source and channel by channel."""
+        return misfit_of(self)
 
     def channel_slices(self) -> list[slice]:
         """For each observation, its part of a spectrum."""
@@ -189,3 +197,11 @@ class Result(ShownResult):
             )
             for c, m, a in zip(self.components, morphs, spectra, strict=True)
         )
+
+
+def noted(result, **given) -> Result:
+    """A copy with another status, other messages, errors or draws, and the same misfit."""
+    copy = replace(result, **given)
+    if "misfit" in vars(result):
+        vars(copy)["misfit"] = result.misfit
+    return copy

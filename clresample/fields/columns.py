@@ -13,7 +13,7 @@ DESCRIPTIONS = {
     "id": "of the source: field, row and column of the model's pixel that holds it",
     "parent_id": "id of the brightest source that was detected in the same blend",
     "flags": "sum of what limits the measurement: 1 EDGE, 2 NOT_CONVERGED, 4 ZERO_FLUX, "
-    "8 NO_COVERAGE, 16 OUTSIDE, 32 MASKED, 64 MISFIT",
+    "8 NO_COVERAGE, 16 OUTSIDE, 32 MASKED, 64 MISFIT, 128 SATURATED, 256 AMBIGUOUS",
     "status": "how the fit ended",
     "reason": "why it failed, or was cut",
     "n_blend": "sources that were detected in the blend",
@@ -31,6 +31,9 @@ DESCRIPTIONS = {
     "e1": "ellipticity of the fitted light: above 0 where it is stretched north - south",
     "e2": "ellipticity of the fitted light: above 0 where it is stretched north-east - south-west",
     "angle": "of the fitted light's long axis, east of north",
+    "misfit_sigma": "largest residual, or excess of chi2, of the source in any channel, in sigma",
+    "misfit_fraction": "light that the model leaves over the flux, 0 where it is under 5 sigma",
+    "ambiguous_with": "id of the source whose light this one's may be, -1 without any",
 }
 BLENDS = {  # of blends.ecsv
     "patch": "number of the fit",
@@ -95,6 +98,7 @@ def _order(job, names):
     channels, labels = job.channels, [m.name for m in job.mosaics]
     fluxes = [f"{key}_{b}" for b in job.bands for key in ("flux", "flux_err")]
     quality = [f"chi2_{name}" for name in labels] + [f"residual_{c}" for c in channels]
+    quality += ["misfit_sigma", "misfit_fraction", "ambiguous_with"]
     fixed = [*FIRST, *THEN]
     middle = [n for n in names if n not in {*fixed, *fluxes, *quality}]
     return [n for n in [*fixed, *middle, *fluxes, *quality] if n in names]

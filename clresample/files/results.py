@@ -32,7 +32,7 @@ KEPT = ("name", "channels", "bands", "zero_points", "saturation", "n_bad", "mess
 BOX = ("source", "y", "x", "n_y", "n_x")
 # HDUs of Errors
 ERRORS = {"FLUXCOV": "flux", "COLOURCOV": "colour", "MOMENTCOV": "moments", "BEYOND": "beyond"}
-ERRORS |= {"RELEASED": "released", "MOVED": "moved", "RESIDUALMAX": "residuals"}
+ERRORS |= {"RELEASED": "released", "MOVED": "moved", "RESIDUALMAX": "residuals", "OUTER": "outside"}
 ARRAYS = ("sky", "covariance", "shifts", "losses")
 # every WCS card with the 17 digits that give back the same float64
 RELAX = WCSHDO_all | WCSHDO_SIP | WCSHDO_P17 | WCSHDO_EFMT
@@ -44,8 +44,8 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
     HDUs that `read_result` reads: ABOUT (keys and JSON: sources, names, status, messages, ...),
     COMPONENTS (boxes), SPECTRA (n, C), MORPHOLOGIES (one after the other), SKY, COVARIANCE, SHIFTS,
     LOSSES, where the result has errors FLUXCOV, COLOURCOV, MOMENTCOV, BEYOND, RELEASED, MOVED,
-    RESIDUALMAX and MORPHOLOGYERR (one after the other), MODELPSF, and per observation from 1 on:
-    DATA, WEIGHTS, PSF, RENDERED. For other programs: CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all
+    RESIDUALMAX, OUTER, MORPHOLOGYERR (one after the other), MODELPSF, and per observation from 1
+    on: DATA, WEIGHTS, PSF, RENDERED. For other programs: CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all
     sources in the model frame, and per observation MODEL and RESIDUAL, 0 where data have no weight.
     All images have their WCS; a flat sky is put at RA = Dec = 0. For NaN and infinity see
     arrays.py.
@@ -284,7 +284,8 @@ def _errors(path, hdus, written):
         end = shape[0] * shape[1]
         maps.append(flat[:end].reshape(shape).copy())
         flat = flat[end:]
-    arrays = {key: array_of(hdus[name]) for name, key in ERRORS.items()}
+    kept = ERRORS if "OUTER" in hdus else {n: ERRORS[n] for n in ERRORS if n != "OUTER"}
+    arrays = {key: array_of(hdus[name]) for name, key in kept.items()}
     return Errors(**arrays, morphology=tuple(maps))
 
 

@@ -9,7 +9,11 @@ import numpy as np
 from astropy import units as u
 from astropy.table import QTable
 
-from ..deblending.posterior.residuals import channel_residuals, misfits
+from ..deblending.assessment.ambiguity import partners
+from ..deblending.assessment.edge import reaches_outside
+from ..deblending.assessment.status import misfitted
+from ..deblending.blend import CONVERGED, MISFIT
+from ..deblending.posterior.residuals import channel_residuals
 from ..sky.footprint import open_edge
 from ..sky.observation import ZERO_POINT_UJY
 from ..sky.wcs import frame_of, local_axes, names_of
@@ -38,6 +42,7 @@ class Flag(IntFlag):
     MASKED = 32
     MISFIT = 64
     SATURATED = 128
+    AMBIGUOUS = 256
 
     @classmethod
     def _missing_(cls, value):
@@ -45,14 +50,16 @@ class Flag(IntFlag):
 
 
 MEANINGS = {
-    Flag.EDGE: "over 1 % of a morphology's peak at the frame's edge, or beside unobserved sky",
+    Flag.EDGE: "at the frame's edge or beside unobserved sky over 1 % of a morphology's peak, or "
+    "over 3 % of the flux outside, as the model goes on there",
     Flag.NOT_CONVERGED: "the blend's fit ended for another reason than convergence",
     Flag.ZERO_FLUX: "the flux in a channel that determines it is at its limit, zero",
     Flag.NO_COVERAGE: "a channel's image does not hold the centre, or determines no flux",
     Flag.OUTSIDE: "outside the frame, thus not fitted: nothing is measured",
     Flag.MASKED: "the centre is on a pixel without weight in a channel whose image holds it",
     Flag.SATURATED: "a point source with masked pixels in its core: its flux is that of its wings",
-    Flag.MISFIT: "the model leaves a residual of over 5 sigma somewhere on the source in a channel",
+    Flag.MISFIT: "the model leaves over 5 sigma and over 3 % of the flux in a channel",
+    Flag.AMBIGUOUS: "the data do not tell its light from that of the source in ambiguous_with",
 }
 
 
@@ -90,7 +97,13 @@ def catalogue(result, *, magnitudes=False) -> QTable:
         chi2_* per observation: mean chi2 of the pixels with weight in the source's box, of all
             channels and with all sources' models
         residual_* per channel [sigma]: the largest residual on the source once filtered with the
-            PSF, see `residuals.worst_residuals`; over 5 the source is flagged MISFIT
+            PSF, see `residuals.worst_residuals`
+        misfit_sigma [sigma]: the largest of these, or of the excess of chi2 of the source's pixels
+            in a channel, if larger; misfit_fraction: the light that is left there over the flux, in
+            the channel where it is the largest of those over 5 sigma, 0 without any. Over 5 sigma
+            and over 0.03 the source is flagged MISFIT, see `Misfit`
+        ambiguous_with: row of the source with which light may be exchanged, see `is_ambiguous`; -1
+            without any
     """
     table = columns_of(result, magnitudes=magnitudes).table()
     table["flags"].info.description = ", ".join(f"{flag.value} {flag.name}" for flag in Flag)
@@ -99,7 +112,7 @@ def catalogue(result, *, magnitudes=False) -> QTable:
 
 def columns_of(result, *, magnitudes=False) -> Columns:
     """The same as `catalogue`, before it is a table."""
-    worst = channel_residuals(result)
+    worst, misfit = channel_residuals(result), result.misfit
     flux, covariance = fluxes(result)
     error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).T)  # (S, C)
     of_bands = list(result.bands.values())
@@ -109,9 +122,10 @@ def columns_of(result, *, magnitudes=False) -> Columns:
     add_positions(table, result.frame.grid, positions, "")
     bounded = flux if result.errors is None else flux - result.errors.released
     table.put("flags", _flags(result, bounded, error, positions, result.footprints))
+    fitted = fitted_sources(result)
     with np.errstate(divide="ignore", invalid="ignore"):
         snr = np.sqrt(np.nansum((flux / error)[:, of_bands] ** 2, axis=1))
-    table.put("snr", np.where(fitted_sources(result), snr, np.nan))
+    table.put("snr", np.where(fitted, snr, np.nan))
     table.put("n_components", _counts(result))
     once = np.isin(np.arange(len(result.channels)), of_bands)  # exposures of a band count once
     _add_shapes(table, result, np.where(once, error, np.inf))
@@ -127,8 +141,21 @@ def columns_of(result, *, magnitudes=False) -> Columns:
         table.put(f"chi2_{label}", box_chi2(result, i, result.footprints[i]))
     for channel, values in zip(result.channels, worst.T, strict=True):
         table.put(f"residual_{channel}", values)
-    table["flags"][misfits(worst)] |= Flag.MISFIT
+    table.put("misfit_sigma", np.where(fitted, misfit.sigma().max(axis=1, initial=0), np.nan))
+    table.put("misfit_fraction", np.where(fitted, misfit.fraction(), np.nan))
+    table["flags"][misfitted(result)] |= Flag.MISFIT
+    _add_partners(table, result, flux, covariance)
     return table
+
+
+def _add_partners(table, result, flux, covariance):
+    """The column of ambiguous sources' partners and their flag; of results with Errors, since at
+    fixed morphologies light is not exchanged."""
+    found = np.full(len(flux), -1)
+    if result.errors is not None:
+        found = partners(flux, covariance)
+    table.put("ambiguous_with", found)
+    table["flags"][found >= 0] |= Flag.AMBIGUOUS
 
 
 def _counts(result):
@@ -242,7 +269,7 @@ def _flags(result, flux, error, positions, footprints):
     """Bit masks (S,) of `Flag`; flux (S, C): of the components, at their bound or above."""
     fitted = fitted_sources(result)
     flags = np.zeros(len(fitted), dtype=np.int32)
-    if result.status != "converged":
+    if result.status not in (CONVERGED, MISFIT):
         flags |= Flag.NOT_CONVERGED
     flags[~fitted] |= Flag.OUTSIDE
     flags[((flux <= 0) & np.isfinite(error)).any(axis=1)] |= Flag.ZERO_FLUX
@@ -252,6 +279,7 @@ def _flags(result, flux, error, positions, footprints):
         flags[fitted & ~held] |= Flag.NO_COVERAGE
         flags[fitted & held & ~footprint.weighted(positions).all(axis=0)] |= Flag.MASKED
     flags[masked_cores(result, positions)] |= Flag.SATURATED
+    flags[reaches_outside(result, flux)] |= Flag.EDGE
     edge = open_edge(footprints, result.frame.shape)
     for c in result.components:
         (y, x), (n_y, n_x) = c.origin, c.morphology.shape

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..deblending.posterior.residuals import channel_residuals, misfits, pixels_in_boxes
+from ..deblending.assessment.status import misfitted
+from ..deblending.posterior.residuals import pixels_in_boxes
 from ..sky.sources import Point
 
 # [px] from a pixel's centre to its corners
@@ -18,15 +19,16 @@ def summary(result) -> dict:
     returns a dict: status, messages, seconds as in `Result`; n_sources, n_fitted (inside the
         frame), n_components, n_iterations, losses; chi2 {channel: per pixel with a weight on the
         frame, NaN without any}, n_pixels {channel: number of these pixels}, sky {channel} [counts],
-        shifts {observation: (y, x)} [model px]; misfits, the numbers of the sources with a residual
-        over 5 sigma (`residuals.misfits`); good, whether the fit converged and there is none
+        shifts {observation: (y, x)} [model px]; misfits, the numbers of the sources that
+        are flagged MISFIT (`misfitted`); good, whether the fit converged at a model that
+        describes the data and there is none
     """
     chi2, n_pixels = channel_chi2(result)
-    misfitted = np.flatnonzero(misfits(channel_residuals(result))).tolist()
+    misfits = np.flatnonzero(misfitted(result)).tolist()
     return {
         "status": result.status,
-        "good": result.converged and not misfitted,
-        "misfits": misfitted,
+        "good": result.converged and not misfits,
+        "misfits": misfits,
         "messages": list(result.messages),
         "n_sources": len(result.sources),
         "n_fitted": int(fitted_sources(result).sum()),

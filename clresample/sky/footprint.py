@@ -15,6 +15,8 @@ from .observation import Observation
 # distortion's relative change over it, 1e-2 at most in real instruments. Three leave 1e-6 of it;
 # more would only cost time
 INVERSE_ROUNDS = 3
+# of a pixel: those that share a side or a corner with it
+NEIGHBOURS = np.ones((3, 3), dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +74,16 @@ class Footprint:
 def open_edge(footprints, shape) -> np.ndarray:
     """Pixels of the frame from which light may leave what was observed: (Ny, Nx) bool.
 
-    Those on the frame's edge, those without a weight in any channel that are connected to the edge
-    through others without one, and the neighbours of these. Masked pixels within an image, single
-    or in patches, are no edge.
+    Those on the frame's edge, those of `unobserved`, and the neighbours of these.
+    """
+    return ndimage.binary_dilation(unobserved(footprints, shape), NEIGHBOURS)[1:-1, 1:-1]
+
+
+def unobserved(footprints, shape) -> np.ndarray:
+    """Pixels of the frame outside of what was observed, and a border: (Ny + 2, Nx + 2) bool.
+
+    The border, and those without a weight in any channel that are connected to it through others
+    without one. Masked pixels within an image, single or in patches, are not outside.
     """
     points = np.stack([*np.indices(shape)], axis=-1)
     seen = np.zeros(shape, dtype=bool)
@@ -82,6 +91,4 @@ def open_edge(footprints, shape) -> np.ndarray:
         seen |= footprint.weighted(points).any(axis=0)
     blind = np.pad(~seen, 1, constant_values=True)
     ring = np.pad(np.zeros(shape, dtype=bool), 1, constant_values=True)
-    neighbours = np.ones((3, 3), dtype=bool)
-    beyond = ndimage.binary_propagation(ring, neighbours, mask=blind)
-    return ndimage.binary_dilation(beyond, neighbours)[1:-1, 1:-1]
+    return ndimage.binary_propagation(ring, NEIGHBOURS, mask=blind)

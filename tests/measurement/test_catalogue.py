@@ -135,7 +135,9 @@ def test_a_source_outside_the_frame_is_listed_and_not_measured():
     assert table["name"][1] == "far"
     assert table["x"][1] == 90 * u.pix
     for name in table.colnames:
-        if name not in ("name", "flags", "n_components", "y", "x", "y_sky", "x_sky"):
+        if name == "ambiguous_with":
+            assert table[name][1] == -1
+        elif name not in ("name", "flags", "n_components", "y", "x", "y_sky", "x_sky"):
             value = u.Quantity(table[name]).value[1]
             unknown = np.isinf if name.startswith("flux_err") else np.isnan
             assert unknown(value), name
@@ -194,6 +196,7 @@ def test_columns_have_units():
     assert units.pop("angle") == units.pop("angle_err") == u.deg
     plain = {"snr", "n_components", "chi2_raw", "chi2_cam", "e1", "e2", "e1_err", "e2_err"}
     plain |= {f"residual_{name}" for name in "abgri"}
+    plain |= {"misfit_sigma", "misfit_fraction", "ambiguous_with"}
     assert set(units) == plain
     assert all(units[name] in (None, u.dimensionless_unscaled) for name in plain)
     magnitudes = 25 - 2.5 * np.log10(table["flux_g"].value / 10 ** ((23.9 - 25) / 2.5))

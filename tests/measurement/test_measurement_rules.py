@@ -5,7 +5,8 @@ import pytest
 from helpers.blends import blend, observe, round_component
 from scipy.signal import fftconvolve
 
-from clresample.deblending.posterior.residuals import _filtered, _kernels, convolved, misfits
+from clresample.deblending.assessment.misfit import Misfit
+from clresample.deblending.posterior.residuals import _filtered, _kernels, convolved
 from clresample.deblending.spectra import MODEL_ERROR
 from clresample.measurement import detection
 from clresample.measurement.detection import detect, detect_more
@@ -17,9 +18,16 @@ from clresample.sky.psf import PSF
 GRID = Grid.flat((60, 60), 0.1)
 
 
-def test_five_sigma_in_any_channel_is_a_misfit():
-    residuals = np.array([[4.99, np.nan], [5.01, 0.0], [1.0, 5.01], [np.nan, np.nan]])
-    assert misfits(residuals).tolist() == [False, True, True, False]
+def test_five_sigma_and_three_percent_in_any_channel_are_a_misfit():
+    residuals = np.array([[4.99, np.nan], [5.01, 0], [1, 5.01], [np.nan, np.nan], [9, 1], [9, 9]])
+    light = np.array([[9, 9], [3.01, 0], [9, 3.01], [9, 9], [2.99, 9], [2.99, 3.01]])
+    whole = np.zeros((2, 2))
+    none = np.full(residuals.shape, np.nan)
+    found = Misfit(residuals, none, none, light, np.full(light.shape, 100.0), whole, whole, whole)
+    assert found.sources().tolist() == [False, True, True, False, False, True]
+    excess = np.where(residuals > 5, residuals, np.nan)  # as well
+    found = Misfit(none, excess, none, light, np.full(light.shape, 100.0), whole, whole, whole)
+    assert found.sources().tolist() == [False, True, True, False, False, True]
 
 
 @pytest.mark.parametrize(
@@ -48,7 +56,7 @@ def test_residuals_are_known_where_pixels_have_a_weight():
     weights[0, 5, 20] = 1e-7
     seen = weights > 0.1
     for unit in (1.0, 1e-9, 1e9):
-        found = _filtered(np.full(weights.shape, unit**-0.5), unit * weights, kernel[None])
+        found, _ = _filtered(np.full(weights.shape, unit**-0.5), unit * weights, kernel[None])
         np.testing.assert_array_equal(np.isfinite(found), seen)
         assert found[0, 4, 4] == pytest.approx(1 / np.sqrt((kernel**2).sum()))
 

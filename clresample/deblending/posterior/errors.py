@@ -34,6 +34,8 @@ class Errors:
         centroids and second moments, change by when the bound of morphologies at 0 is released,
         see bounds.py; second moments of stars stay
     residuals (S, C) [sigma]: the largest on each source, see `channel_residuals`
+    outside (S, C) [counts]: flux that models would have outside of what was observed, see
+        `light_outside`; its square is in `flux` and `colour`. 0 where it is not given
     """
 
     flux: np.ndarray
@@ -44,6 +46,11 @@ class Errors:
     released: np.ndarray
     moved: np.ndarray
     residuals: np.ndarray
+    outside: np.ndarray | None = None
+
+    def __post_init__(self):
+        if self.outside is None:
+            object.__setattr__(self, "outside", np.zeros(np.shape(self.released)))
 
 
 @dataclass(frozen=True, eq=False)

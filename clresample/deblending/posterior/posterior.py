@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 
 import numpy as np
 from scipy.linalg.blas import strmm
 
+from ..assessment.edge import light_outside, widened
+from ..assessment.status import judged
+from ..result import noted
 from .blocks import RIDGE, Factor
 from .bounds import pulls
 from .errors import Draws, Errors
@@ -177,22 +179,26 @@ class Posterior:
 
 
 def with_errors(fit, result, peaks, seen):
-    """The Result of a Fit that has ended with its Errors and Draws, or with why there are none.
+    """The Result of a Fit that has ended, judged, with its Errors and Draws or why there are none.
 
     peaks, seen: see `posterior_of`
 
     Its seconds are taken down in the fit.
     """
-    began = time.perf_counter()
+    began, result = time.perf_counter(), judged(result)
     morphs = [c.morphology for c in result.components]
     posterior, messages = posterior_of(fit, morphs, peaks, seen)
     if posterior is None:
-        return replace(result, messages=(*result.messages, *messages))
+        return noted(result, messages=(*result.messages, *messages))
     owner, residuals = fit.fitted[fit.start.source], channel_residuals(result)
     errors = posterior.errors(owner, residuals, fit.unit, fit.settings.flux_floor)
     draws = posterior.draws(owner, residuals, fit.unit)
+    start = fit.start
+    outside = light_outside(
+        result, start.shapes, start.thetas, start.positions[start.source], peaks
+    )
     fit.note_seconds("errors", time.perf_counter() - began)
-    return replace(result, errors=errors, draws=draws)
+    return noted(result, errors=widened(errors, outside), draws=draws)
 
 
 def posterior_of(fit, morphs, peaks, seen):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ...sky.noise import HALF_WIDTH
@@ -12,11 +14,75 @@ from ..rendered import Rendered
 MISFIT_SIGMAS = 5.0
 # Least number of sky pixels that say how much correlated noise adds up under the filter.
 MIN_PIXELS = 400
+# Most by which the scatter of single pixels of the sky is taken for noise over that about their
+# neighbours: the noise of published weight maps is wrong by 10 to 30 %.
+WRONG_WEIGHTS = 1.3
+# Likewise of filtered pixels: noise that resampling has correlated over two pixels adds up under
+# the filter to two or three times what it is in single ones.
+CORRELATED = 3.0
 # Of a channel's largest filtered weight: pixels seen with less are not judged.
 LEAST_WEIGHT = 1e-6
 # [px] Images of several channels that are transformed at once: those of blends, for which each call
 # costs as much as its arithmetic. More would only take memory: a tile's channels go one by one.
 TOGETHER_PX = 1 << 17
+
+
+@dataclass(frozen=True, eq=False)
+class Remainder:
+    """One observation's residual, whitened and filtered with its PSF (Co, My, Mx).
+
+    filtered [sigma]: t of `worst_residuals`, NaN unseen
+    point [counts]: error of the flux of a point source there, which t times it is
+    power (Co,) [1]: sum of the squared PSF: power t point is the residual smoothed with the PSF
+    residual [sigma]: of single pixels, 0 without weight
+    used, sky (bool): pixels with a weight; those of them with less than one sigma of model
+    noise (Co,) [1]: variance of the noise over the weights' own, 1 or more
+    owner: the source whose model is the brightest in a pixel, or -1
+    """
+
+    filtered: np.ndarray
+    point: np.ndarray
+    power: np.ndarray
+    residual: np.ndarray
+    used: np.ndarray
+    sky: np.ndarray
+    noise: np.ndarray
+    owner: np.ndarray
+
+    def worst(self, n_sources):
+        """The largest |t| of each source in each channel (S, Co) [sigma], NaN unseen."""
+        found = np.full((n_sources, len(self.filtered)), np.nan)
+        for c, image in enumerate(self.filtered):
+            own = (self.owner[c] >= 0) & np.isfinite(image)
+            np.fmax.at(found[:, c], self.owner[c][own], np.abs(image[own]))
+        return found
+
+
+def remainder(result, i_observation) -> Remainder:
+    """The Remainder of an observation of a fitted blend."""
+    footprint = result.footprints[i_observation]
+    observation = result.observations[i_observation].white
+    weights = np.where(footprint.used, observation.weights, 0.0)
+    model = result.observations[i_observation].as_white(result.model(i_observation))
+    residual = np.where(weights > 0, observation.data - model, 0.0)
+    kernels = _kernels(observation.psf)
+    filtered, point = _filtered(residual, weights, kernels)
+    scaled, sky = residual * np.sqrt(weights), weights > 0
+    sky &= (model * np.sqrt(weights) < 1) & np.isfinite(filtered)
+    noise = np.ones(len(weights))
+    for c, image in enumerate(filtered):
+        if sky[c].sum() < MIN_PIXELS:
+            continue
+        plain, scale = _scatter(scaled[c][sky[c]]), _scatter(image[sky[c]])
+        if plain > WRONG_WEIGHTS or scale > CORRELATED:
+            fine = fine_scatter(scaled[c], weights[c] > 0)
+            plain, scale = min(plain, WRONG_WEIGHTS * fine), min(scale, CORRELATED * fine)
+        noise[c] = plain**2
+        image /= scale
+        point[c] *= scale
+    owner = _owners(result, i_observation, footprint.positions)
+    power = (kernels**2).sum((1, 2))
+    return Remainder(filtered, point, power, scaled, weights > 0, sky, noise, owner)
 
 
 def worst_residuals(result, i_observation):
@@ -28,26 +94,30 @@ def worst_residuals(result, i_observation):
     would be in what is left. Noise alone gives t unit scatter. A pixel belongs to the brightest
     model among the sources whose boxes hold it. Where a channel has 400 pixels of sky, those with
     less than one sigma of model, t is divided by its robust scatter there, if over 1: then the
-    noise is larger than the weights say, or correlated.
+    noise is larger than the weights say, or correlated. By no more than CORRELATED times the
+    scatter of single pixels about their neighbours: more is light that the model lacks.
 
     result: a fitted blend; i_observation: of which the channels are
     """
-    footprint = result.footprints[i_observation]
-    observation = result.observations[i_observation].white
-    weights = np.where(footprint.used, observation.weights, 0.0)
-    model = result.observations[i_observation].as_white(result.model(i_observation))
-    residual = np.where(weights > 0, observation.data - model, 0.0)
-    filtered = _filtered(residual, weights, _kernels(observation.psf))
-    for image, light, weight in zip(filtered, model, weights, strict=True):
-        sky = (light * np.sqrt(weight) < 1) & (weight > 0) & np.isfinite(image)
-        if sky.sum() >= MIN_PIXELS:
-            image /= max(1.0, np.median(np.abs(image[sky])) / HALF_WIDTH)
-    found = np.full((len(result.sources), len(weights)), np.nan)
-    owner = _owners(result, i_observation, footprint.positions)
-    for c, image in enumerate(filtered):
-        own = (owner[c] >= 0) & np.isfinite(image)
-        np.fmax.at(found[:, c], owner[c][own], np.abs(image[own]))
-    return found
+    return remainder(result, i_observation).worst(len(result.sources))
+
+
+def _scatter(values):
+    """Robust scatter, 1 or more, of values (n,) of the sky."""
+    return max(1.0, np.median(np.abs(values)) / HALF_WIDTH)
+
+
+def fine_scatter(image, used):
+    """Robust scatter, 1 or more, of pixels (Ny, Nx) [sigma] about their neighbours, by second
+    differences along both axes (Immerkaer 1996, CVIU 64, 300): smooth light, which a model may
+    lack, has none."""
+    along = image[:-2] - 2 * image[1:-1] + image[2:]
+    both = along[:, :-2] - 2 * along[:, 1:-1] + along[:, 2:]
+    whole = used[:-2] & used[1:-1] & used[2:]
+    whole = whole[:, :-2] & whole[:, 1:-1] & whole[:, 2:]
+    if whole.sum() < MIN_PIXELS // 2:
+        return 1.0
+    return max(1.0, np.median(np.abs(both[whole])) / (6 * HALF_WIDTH))
 
 
 def channel_residuals(result):
@@ -57,13 +127,7 @@ def channel_residuals(result):
     """
     if result.errors is not None:
         return result.errors.residuals
-    found = [worst_residuals(result, i) for i in range(len(result.observations))]
-    return np.concatenate(found, axis=1)
-
-
-def misfits(residuals):
-    """Sources (S,) bool with one of these `channel_residuals` (S, C) over 5 sigma."""
-    return (np.nan_to_num(residuals) > MISFIT_SIGMAS).any(axis=1)
+    return result.misfit.residuals
 
 
 def widening(residuals):
@@ -96,8 +160,8 @@ def convolved(image, psf):
 
 
 def _filtered(residual, weights, kernels):
-    """t (Co, My, Mx); NaN where nothing was seen."""
-    found = np.full(residual.shape, np.nan)
+    """t (Co, My, Mx), NaN where nothing was seen, and the `point` of Remainder."""
+    found, point = np.full((2, *residual.shape), np.nan)
     step = max(1, TOGETHER_PX // residual[0].size)
     for first in range(0, len(residual), step):
         c = slice(first, first + step)
@@ -105,8 +169,10 @@ def _filtered(residual, weights, kernels):
         variance = convolved(w, kernel**2)
         most = variance.max(axis=(1, 2), keepdims=True, initial=0)
         seen = (variance > LEAST_WEIGHT * most) & (w > 0)
-        found[c][seen] = convolved(w * residual[c], kernel)[seen] / np.sqrt(variance[seen])
-    return found
+        root = np.sqrt(variance[seen])
+        found[c][seen] = convolved(w * residual[c], kernel)[seen] / root
+        point[c][seen] = 1 / root
+    return found, point
 
 
 def _kernels(psf):

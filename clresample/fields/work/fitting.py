@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...deblending.assessment.status import judged_on_sources
 from ...deblending.batch import deblend_many
 from ...deblending.blend import INTERRUPTED, Blend, Failure
 from ...deblending.settings import Settings
@@ -206,10 +207,13 @@ def _on_patch(given, patch, source):
 def _take(part, job, cut, result, n_round):
     """Add a fitted patch to the part."""
     patch, origin = cut.patch, np.array(cut.patch.box[:2])
+    result = judged_on_sources(result)  # of its neighbours there is light in wide pixels
     rows = columns_of(result)
     ids = np.array([int(name) for name in rows.values.pop("name")], np.int64)
     for name in POSITIONS:
         rows.put(name, rows[name] + origin[0 if name[0] == "y" else 1])
+    partner = rows["ambiguous_with"]
+    rows.put("ambiguous_with", np.where(partner < 0, -1, ids[partner]))
     _add_columns(rows, ids, job, patch, result.status)
     models = [
         (job.mosaics.index(mosaic), box, result.model(i) - _sky(result, i))
@@ -259,6 +263,7 @@ def _set_aside(part, job, patch, n_round, status):
     positions, ids = job.plan.positions[sources], job.plan.ids[sources]
     add_positions(rows, job.reference, positions, "")
     rows.put("flags", np.full(len(sources), int(Flag.NOT_CONVERGED), np.int32))
+    rows.put("ambiguous_with", np.full(len(sources), -1))
     _add_columns(rows, ids, job, patch, status)
     part.rows.append(rows)
     part.patches.append(

@@ -1,0 +1,134 @@
+"""Light of galaxies outside of what was observed: how much their models would have there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ...sky.footprint import unobserved
+from ..profiles import Galaxy
+
+# Part of a flux that is outside where light is said to reach the edge: three errors of a bright
+# galaxy's flux are as much.
+OUTSIDE = 0.03
+# Share of a ring's area that must have been observed for its mean brightness to stand for all of
+# it: less is a corner of the frame.
+LEAST_COVERED = 0.2
+# Rings at the end of a profile, as a part of all, whose mean slope it goes on with.
+OUTER = 0.25
+# [radius] Largest scale length with which it does: a galaxy that falls less steeply where its image
+# ends is noise, or a sky that is wrong.
+MOST_SCALE = 0.5
+
+
+def light_outside(result, shapes, thetas, positions, peaks) -> np.ndarray:
+    """Flux that each source's model would have outside of what was observed: (S, C) [counts].
+
+    At most what it has inside, and the smaller one of two estimates: what the smooth profile has
+    there, which may have wings that its morphology lacks, and the morphology continued, which in
+    its wings may have noise. 0 of sources whose boxes end before the border, and of all but
+    galaxies: the wings of stars are those of the PSF.
+
+    shapes, thetas, positions (n): of the components' profiles; peaks (n,): of the morphologies
+        before they were scaled to a maximum of 1, where those of the profiles are 1
+    """
+    found = np.zeros((len(result.sources), len(result.channels)))
+    outside = unobserved(result.footprints, result.frame.shape)
+    observed = ~outside[1:-1, 1:-1]
+    for i, c in enumerate(result.components):
+        (y, x), (n_y, n_x) = c.origin, c.morphology.shape
+        beside = outside[y : y + n_y + 2, x : x + n_x + 2]  # with a pixel about the box
+        if not isinstance(shapes[i], Galaxy) or not beside.any():
+            continue
+        (image,) = shapes[i].cut(thetas[i], positions[i], (0, 0), observed.shape, slopes=False)
+        scale = max(image.max() * peaks[i], 1e-300)
+        beyond = max(1 - image[observed].sum(), 0.0) / scale  # its integral is 1
+        longer = continued(c.origin, c.morphology, positions[i], outside)
+        found[c.source] += c.spectrum * min(beyond, longer)
+    return found
+
+
+def continued(origin, morphology, centre, outside) -> float:
+    """Sum of a morphology (ny, nx) where its frame was not observed; outside: see `unobserved`.
+
+    Its elliptical rings about the centre (2,) [frame px] have their mean brightness outside too;
+    from where less than a fifth of a ring was observed it goes on as an exponential, with the slope
+    of the last quarter of the rings. No more than the sum that was observed.
+    """
+    rings = _rings(origin, morphology, centre, outside.shape)
+    if rings is None:
+        return 0.0
+    n = np.bincount(rings[~outside], minlength=rings.max() + 1)
+    (y, x), (n_y, n_x) = origin, morphology.shape
+    box = np.s_[y + 1 : y + 1 + n_y, x + 1 : x + 1 + n_x]
+    own = ~outside[box]
+    light = np.bincount(rings[box][own], morphology[own], len(n))
+    ring = np.arange(len(n))
+    area = np.pi * (2 * ring + 1)
+    bare = n <= LEAST_COVERED * area
+    first = rings[outside].min()
+    bare &= ring >= first  # rings within have all their pixels
+    end = int(np.argmax(bare)) if bare.any() else len(n)
+    brightness = light[:end] / np.maximum(n[:end], 1)
+    missing = np.where(ring >= first, np.maximum(area - n, 0.0), 0.0)[:end]
+    return float(min(missing @ brightness + _tail(brightness), morphology.sum()))
+
+
+def _rings(origin, morphology, centre, shape):
+    """Number (Ny + 2, Nx + 2) of the ring of a frame's pixels and its border about a centre.
+
+    Rings are similar to the ellipse of the morphology's second moments, and one pixel wide in the
+    mean. None without such an ellipse.
+    """
+    total = morphology.sum()
+    if not total > 0:
+        return None
+    away = np.indices(morphology.shape) - (np.asarray(centre) - origin)[:, None, None]
+    second = np.einsum("yx,iyx,jyx->ij", morphology / total, away, away)
+    determinant = np.linalg.det(second)
+    if not determinant > 0:
+        return None
+    metric = np.linalg.inv(second) * np.sqrt(determinant)
+    away = np.indices(shape) - (np.asarray(centre) + 1)[:, None, None]
+    return np.sqrt(np.einsum("iyx,ij,jyx->yx", away, metric, away)).astype(int)
+
+
+def _tail(brightness):
+    """Sum beyond rings of one pixel, brightness (n,), that go on as an exponential."""
+    if len(brightness) < 2:
+        return 0.0
+    end, n = float(len(brightness)), max(1, int(OUTER * len(brightness) / 2))
+    inner, outer = brightness[-2 * n : -n].mean(), brightness[-n:].mean()
+    if not outer > 0:
+        return 0.0
+    fall = np.log(inner / outer) / n if inner > outer else 0.0
+    scale = min(1 / max(fall, 1e-30), MOST_SCALE * end)
+    at_end = outer * np.exp(-n / 2 / scale)
+    return 2 * np.pi * at_end * scale * (end + scale)
+
+
+def widened(errors, outside):
+    """Errors with the light outside of what was observed (S, C) [counts] in those of fluxes.
+
+    It is as uncertain as it is large, and common to all channels of a source.
+    """
+    flux, s = errors.flux.copy(), np.arange(len(outside))
+    flux[:, s, s] += outside.T**2
+    colour = errors.colour + outside[:, :, None] * outside[:, None, :]
+    return replace(errors, flux=flux, colour=colour, outside=outside)
+
+
+def reaches_outside(result, flux) -> np.ndarray:
+    """Which sources (S,) have more than OUTSIDE of their flux (S, C) outside of what was observed.
+
+    In a channel where that is more than the noise of the flux at fixed morphology.
+    """
+    if result.errors is None:
+        return np.zeros(len(flux), bool)
+    noise = np.zeros(flux.shape)
+    for i, c in enumerate(result.components):
+        variance = np.maximum(result.covariance[:, i, i], 0)
+        noise[c.source] += np.sqrt(variance) * c.morphology.sum()
+    outside = result.errors.outside
+    return ((outside > OUTSIDE * flux) & (outside > noise)).any(axis=1)

@@ -1,0 +1,136 @@
+"""Fits that are broken on purpose: how badly is told in sigma and in part of the flux."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.blends import blend, gaussian, observe, round_component
+
+from clresample import Flag, Grid, catalogue, summary
+from clresample.deblending.assessment.misfit import chi2_excess, correlation_sum
+from clresample.deblending.assessment.status import judged
+from clresample.deblending.posterior.residuals import fine_scatter
+
+GRID = Grid.flat((80, 84), 0.1)
+PLACES = (30, 28), (48, 55)
+
+
+def broken(*, times=(1.0, 1.0), bright=300.0, noise=1.0, smooth=False, seed=0, extra=0.0):
+    """Two galaxies of a peak of `bright` counts, whose models have `times` their flux.
+
+    noise [counts]: of which the weights state 1; smooth: it is correlated; extra [counts]: light
+    that no source has, far from both
+    """
+    rng, spectrum = np.random.default_rng(seed), (bright, bright)
+    parts = [round_component(i, at, spectrum, n=25, sigma=2.5) for i, at in enumerate(PLACES)]
+    grain = rng.normal(0, noise, (2, *GRID.shape))
+    if smooth:  # correlated: the mean of a pixel and two neighbours, with the scatter kept
+        grain = sum(np.roll(grain, k, axis=2) for k in range(3)) / np.sqrt(3)
+    far = extra * gaussian(GRID.shape, (65, 20), 9 * np.eye(2))
+    truth = blend(parts, grid=GRID, observations=(observe(GRID, ("g", "r")),))
+    seen = observe(GRID, ("g", "r"), data=truth.model(0) + grain + far, weights=1.0)
+    parts = [replace(c, spectrum=t * c.spectrum) for c, t in zip(parts, times, strict=True)]
+    covariance = np.tile(np.eye(2) * 1e-4, (2, 1, 1))
+    return blend(parts, grid=GRID, observations=(seen,), covariance=covariance)
+
+
+def flagged(result):
+    return (catalogue(result)["flags"] & Flag.MISFIT != 0).tolist()
+
+
+def test_models_that_describe_the_data_are_neither_flagged_nor_renamed():
+    for seed in range(20):
+        found = judged(broken(seed=seed))
+        assert found.status == "converged" and summary(found)["good"] and not found.messages
+        assert not any(flagged(found))
+
+
+@pytest.mark.parametrize("bright", [20.0, 300.0, 30000.0])
+def test_half_a_flux_is_wrong_however_bright(bright):
+    found = judged(broken(times=(0.5, 1), bright=bright))
+    assert found.status == "misfit" and not found.converged
+    assert flagged(found) == [True, False]
+    ended, table = summary(found), catalogue(found)
+    assert ended["misfits"] == [0] and not ended["good"] and ended["status"] == "misfit"
+    assert table["misfit_fraction"][0] == pytest.approx(1, rel=0.3)  # as much is left as there is
+    assert table["misfit_fraction"][1] < 0.01 and table["misfit_sigma"][0] > 5
+    assert "chi2 per pixel" in found.messages[0] and "source 0 leaves" in found.messages[0]
+    assert not any(catalogue(found)["flags"] & Flag.NOT_CONVERGED)
+
+
+def test_a_faint_source_whose_chi2_is_all_but_of_noise_is_flagged():
+    """Ten sigma are missing in 600 pixels."""
+    found = judged(broken(times=(0.5, 1), bright=5.0))
+    assert flagged(found) == [True, False] and not summary(found)["good"]
+
+
+def test_a_bright_galaxy_that_is_half_a_percent_off_is_not_wrong():
+    found = judged(broken(times=(1.005, 1), bright=3000.0))
+    table = catalogue(found)
+    assert table["misfit_sigma"][0] > 20
+    assert table["misfit_fraction"][0] == pytest.approx(0.005, rel=0.3)
+    assert not any(flagged(found)) and found.status == "converged" and summary(found)["good"]
+
+
+def test_a_misfit_of_a_tenth_of_the_flux_is_flagged_where_it_is_no_noise():
+    assert flagged(broken(times=(0.9, 1), bright=300.0)) == [True, False]
+    assert flagged(broken(times=(0.9, 1), bright=3.0)) == [False, False]
+
+
+@pytest.mark.parametrize(
+    "given", [{"noise": 3.0}, {"noise": 1.3, "smooth": True}, {"smooth": True}]
+)
+def test_noise_that_weights_do_not_state_is_no_misfit(given):
+    for seed in range(5):
+        found = judged(broken(seed=seed, **given))
+        assert found.status == "converged" and not any(flagged(found))
+        assert flagged(broken(times=(0.5, 1), seed=seed, **given)) == [True, False]
+
+
+def test_light_without_a_source_is_not_taken_for_noise():
+    """It fills a good part of the sky; no source is to blame, so that all are flagged."""
+    found = judged(broken(extra=300.0))
+    assert found.status == "misfit" and flagged(found) == [True, True]
+    assert judged(broken(extra=1.0)).status == "converged"
+
+
+def test_other_ends_keep_their_status():
+    result = replace(broken(times=(0.5, 1)), status="iteration limit")
+    assert judged(result) is result
+    assert catalogue(result)["flags"][0] == Flag.NOT_CONVERGED | Flag.MISFIT
+
+
+def test_what_is_known_of_a_model_is_not_kept_when_the_model_changes():
+    result = broken()
+    assert not result.misfit.sources().any()
+    parts = tuple(replace(c, spectrum=c.spectrum / 2) for c in result.components)
+    assert replace(result, components=parts).misfit.sources().all()
+
+
+def test_excess_of_chi2_is_as_rare_as_its_sigma_says():
+    rng = np.random.default_rng(1)
+    for n in (10, 100, 3000):
+        chi2 = 1.1 * rng.chisquare(n, 20000) / n
+        found = chi2_excess(chi2, n)
+        assert np.mean(found > 2) == pytest.approx(0.0228, abs=0.004)
+        np.testing.assert_allclose([found.mean(), found.std()], [0, 1], atol=0.03)
+    assert np.isnan(chi2_excess(np.nan, 0))
+
+
+def test_correlated_noise_counts_for_fewer_pixels():
+    rng, sky = np.random.default_rng(2), np.ones((200, 200), bool)
+    white = rng.normal(size=(200, 202))
+    pairs = (white[:, :-2] + white[:, 1:-1]) / np.sqrt(2)  # correlated by 1/2 along x
+    assert correlation_sum(white[:, :200], sky) == pytest.approx(1, abs=0.01)
+    assert correlation_sum(pairs, sky) == pytest.approx(1.5, abs=0.05)
+    assert correlation_sum(pairs.T, sky) == pytest.approx(1.5, abs=0.05)
+    assert correlation_sum(pairs, sky & (np.arange(200) < 1)) == 1  # too few to say
+
+
+def test_scatter_about_neighbours_is_that_of_white_noise_and_not_of_light():
+    used = np.ones((60, 60), bool)
+    light = 1000 * gaussian((60, 60), (30, 30), 100 * np.eye(2))
+    noise = np.random.default_rng(3).normal(0, 2.5, (60, 60))
+    assert fine_scatter(noise, used) == pytest.approx(2.5, rel=0.06)
+    assert fine_scatter(noise + light, used) == pytest.approx(2.5, rel=0.06)
+    assert fine_scatter(noise, used & (np.arange(60) < 5)) == 1
