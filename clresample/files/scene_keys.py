@@ -74,6 +74,7 @@ PLANES = Rule(
     either(is_text, _above, many(_above)),
 )
 SWITCH = Rule("true or false", lambda value: isinstance(value, bool))
+SHIFTS = Rule('true, false or "auto"', lambda value: isinstance(value, bool) or value == "auto")
 POSITIVE = Rule("a number above 0", _above)
 
 TABLES = {
@@ -126,7 +127,7 @@ TABLES = {
         "enough": POSITIVE,
         "monotone": SWITCH,
         "structure_px": POSITIVE,
-        "fit_shifts": SWITCH,
+        "fit_shifts": SHIFTS,
         "fit_sky": SWITCH,
         "flux_floor": FRACTION,
         "psf_error": FRACTION,

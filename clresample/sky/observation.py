@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -143,6 +144,13 @@ class Observation(ReadOnly, ShownObservation):
         )
         names = {key: getattr(self, key) for key in ("channels", "zero_points", "name")}
         return Observation(data, psf, self.grid, weights=weights, **names)
+
+    def without(self, pixels) -> Observation:
+        """The same observation, the pixels (C, Ny, Nx) bool masked: their weight is 0."""
+        masked = copy.copy(self)
+        masked.__dict__.pop("white", None)
+        masked._set(weights=np.where(pixels, 0.0, self.weights))
+        return masked
 
     def as_white(self, images) -> np.ndarray:
         """Images (C, Ny, Nx) of this observation as they are in `white`."""
