@@ -68,6 +68,15 @@ def centroids(image: Image) -> Centroids:
     return Centroids(chosen, offsets.swapaxes(0, 1), error.T)
 
 
+def over_channels(found) -> tuple[np.ndarray, np.ndarray]:
+    """Offsets (n, 2) and errors (n,) of Centroids from all channels together."""
+    weight = found.errors**-2.0
+    total = weight.sum(axis=1)
+    safe = np.where(total > 0, total, 1.0)
+    offsets = np.einsum("nc,ncd->nd", weight, found.offsets) / safe[:, None]
+    return offsets, np.where(total > 0, safe**-0.5, np.inf)
+
+
 def common(offsets, errors) -> tuple[np.ndarray, np.ndarray]:
     """Weighted mean (2,) of offsets (n, 2) with errors (n,), and its error (2,), which is that of
     their scatter where this is larger; infinite of none."""

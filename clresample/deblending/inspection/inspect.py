@@ -10,13 +10,17 @@ from ...sky.psf_checks import LIMIT_TOLERANCE
 from ..blend import Blend
 from ..settings import AUTO, Settings
 from . import listing, shifted, spoilt
+from .centroids import centroids
 from .image import Image
 from .levels import SkyLevel, sky_level
 from .stars import misfitting_widths
 
 # A level counts as left in or over-subtracted above this many of its errors, and above this part
 # of a pixel's noise: over 100 pixels of a source that moves a flux by its own error.
-LEVEL_SIGMAS, LEVEL_PART = 5.0, 0.1
+LEVEL_SIGMAS, LEVEL_PART = 4.0, 0.1
+# The same of the light at the rim, which may be that of wings: 4 errors of the flux in 100 pixels,
+# by two errors of its own at least.
+RIM_PART, RIM_SIGMAS = 0.4, 2.0
 # [FWHM], [px] Pixels nearer to a listed source are not masked as cosmic rays: its core may be one
 # of a PSF narrower than the one given.
 CORE_FWHM, CORE_PX = 0.5, 1.5
@@ -51,7 +55,7 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
     """
     near = np.flatnonzero(frame.inside(positions))
     sources = [blend.sources[i] for i in near]
-    messages, levels, images = _doubles(blend.sources, positions), [], []
+    messages, levels, images, found = _doubles(blend.sources, positions), [], [], []
     for observation, shift in zip(blend.observations, shifts, strict=True):
         image = Image.of(observation, frame, positions[near], shift)
         levels.append(sky_level(image))
@@ -61,10 +65,11 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         if bad.any():
             image = image.without(bad)
         lines += more + _coarse(observation.psf, observation.channels)
-        lines += _missing(image) + _widths(image, sources, near)
+        found.append(centroids(image))
+        lines += _missing(image) + _offset(found[-1]) + _widths(image, sources, near)
         messages += [f"{observation.label}: {line}" for line in lines]
         images.append(image)
-    moved, lines = shifted.disagreements(images, settings.fit_shifts)
+    moved, lines = shifted.disagreements(images, found, settings.fit_shifts)
     move = moved is not None if settings.fit_shifts == AUTO else settings.fit_shifts
     observations = tuple(image.observation for image in images)
     if any(a is not b for a, b in zip(observations, blend.observations, strict=True)):
@@ -86,26 +91,47 @@ def _doubles(sources, positions):
     ]
 
 
-def _level_lines(image, level):
-    """What is said of a level that is not zero."""
-    part = level.level / image.sigma
-    wrong = (np.abs(level.level) > LEVEL_SIGMAS * level.error) & (np.abs(part) > LEVEL_PART)
+def _level_lines(image, sky):
+    """What is said of a SkyLevel that is not zero, and of a rim that is not dark."""
+    part, error = sky.level / image.sigma, sky.error / image.sigma
+    known = np.isfinite(error)
+    wrong = known & (np.abs(part) > np.maximum(LEVEL_SIGMAS * error, LEVEL_PART))
+    if known.any():  # all channels together: what wings leave unsure is common to them
+        mean, shared = part[known].mean(), (sky.wings / image.sigma)[known].mean()
+        own = np.maximum(error[known] ** 2 - (sky.wings / image.sigma)[known] ** 2, 0).sum()
+        total = np.hypot(shared, np.sqrt(own) / known.sum())
+        wrong |= known & (abs(mean) > max(LEVEL_SIGMAS * total, LEVEL_PART)) & (part * mean > 0)
     lines = []
     for chosen, what, cure in (
         (wrong & (part > 0), "sky is left in", "subtract it"),
         (wrong & (part < 0), "too much sky was subtracted", "add it back"),
     ):
         if chosen.any():
-            some = ", ".join(
-                f"{name} {part[c]:+.2g} sigma ({level.level[c]:+.4g} counts) a pixel"
-                for c, name in enumerate(image.observation.channels)
-                if chosen[c]
-            )
             lines.append(
-                f"{what}: pixels without a source have the level {some}, and every flux holds its "
-                f"share of it; {cure}, or give fit_sky=True"
+                f"{what}: pixels without a source have the level {_parts(image, sky.level, chosen)}"
+                f" a pixel, and every flux holds its share of it; {cure}, or give fit_sky=True"
             )
+    if lines or not np.isfinite(sky.rim_error).all():
+        return lines
+    rim = sky.rim / image.sigma
+    rim_error = np.sqrt((sky.rim_error / image.sigma) ** 2).mean() / np.sqrt(len(rim))
+    if rim.mean() > RIM_PART + RIM_SIGMAS * rim_error:
+        lines.append(
+            "the pixels furthest from the sources are not dark, "
+            f"{_parts(image, sky.rim, rim > 0)} a pixel: sky is left in, or wings of the sources "
+            "end beyond the image, and fluxes hold a part of it; give fit_sky=True or a larger "
+            "image"
+        )
     return lines
+
+
+def _parts(image, level, chosen):
+    """Levels (C,) [counts] of the channels chosen, in words."""
+    return ", ".join(
+        f"{name} {level[c] / image.sigma[c]:+.3g} sigma ({level[c]:+.4g} counts)"
+        for c, name in enumerate(image.observation.channels)
+        if chosen[c]
+    )
 
 
 def _spoilt(image):
@@ -176,6 +202,18 @@ def _missing(image):
     return [
         f"light that no source is listed for, brightest at (y, x) = {some}: it goes to the "
         "neighbours; list it, or run detection"
+    ]
+
+
+def _offset(found):
+    offset = listing.common_offset(found)
+    if offset is None:
+        return []
+    (y, x), error = offset
+    return [
+        f"the sources' light lies at ({y:+.2f}, {x:+.2f}) +- {error.max():.1g} pixels (y, x) from "
+        "their positions: these are wrong by as much (the centre of the first pixel is (0, 0), "
+        "FITS counts from 1), or the WCS is"
     ]
 
 

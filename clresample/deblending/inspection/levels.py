@@ -19,71 +19,90 @@ CLIP = 3.0
 N_ROUNDS = 4
 # Median |x| of a unit Gaussian, inverted.
 SIGMAS_A_MAD = 1.4826
-# Quarter of the blocks below which the level is looked for at first: sources fill most of a blend.
-LOW = 0.25
+# Parts of the blocks without a source, those furthest from the light: the level is fitted in the
+# first, where wings are faint; the second is the rim, where they should have ended.
+DARK, RIM = 0.5, 0.25
+# Powers of the distance by which wings fall: exponential disks end faster, the outskirts of
+# ellipticals (n = 4) fall by r^-2.5 to r^-3.5 from 3 to 12 effective radii, other powers bound it.
+POWERS = 2.0, 3.0, 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class SkyLevel:
     """Level of the sky in each channel of an observation.
 
-    level (C,) [counts]: of source-free pixels, half of the wings' light in them taken off
-    error (C,) [counts]: from the scatter of blocks of pixels, correlated noise included, and half
-        of the wings' light; infinite where too few pixels are free of sources
-    n_pixels (C,): in these blocks
+    level (C,) [counts]: of source-free pixels, the sources' wings in them taken off
+    error (C,) [counts]: of it, all causes; infinite where too few pixels are free of sources
+    wings (C,) [counts]: part of the error from wings that may fall slower or faster, which is of
+        one sign in all channels
+    rim (C,) [counts]: level of the pixels furthest from the sources, with all that is in them
+    rim_error (C,) [counts]: of it; infinite where it is not known
     """
 
     level: np.ndarray
     error: np.ndarray
-    n_pixels: np.ndarray
+    wings: np.ndarray
+    rim: np.ndarray
+    rim_error: np.ndarray
 
 
 def sky_level(image) -> SkyLevel:
     """The SkyLevel of an Image.
 
-        mean of block b = level + wing T_b,    T_b = sum_s f_s / (r_sb^2 + r_0^2),    wing >= 0
+        mean of block b = level + wing T_b,    T_b = sum_s f_s (r_sb^2 + r_0^2)^(-p/2),    wing >= 0
 
-    fitted to the means of blocks of pixels, those off by over 3 sigma left out. f_s is the light at
-    source s, r its distance, r_0 the PSF's FWHM. Profiles of galaxies fall by r^-2 or faster where
-    their wings meet the noise, so that the level lies between that fit and the blocks' mean: it is
-    half way, and half of their difference is part of its error.
+    fitted with p = 3 to the means of blocks of pixels in the darker half of the image, those off by
+    over 3 sigma left out. f_s is the light at source s, r its distance, r_0 the PSF's FWHM. Half of
+    what the level moves by from p = 2 to 4 is part of its error; the rest of the error follows from
+    the scatter of the blocks, correlated noise included.
     """
     means, counts, centers, side = _blocks(image)
-    n_channels, n_blocks = means.shape
+    n_channels = len(means)
     white = image.sigma[:, None] / np.sqrt(np.maximum(counts, 1))
-    known = 2 * counts > side**2
-    free = _free(image, centers)
-    if free.sum() >= max(MIN_BLOCKS, n_blocks // 4):
-        known &= free
-    enough = known.sum(axis=1) >= MIN_BLOCKS
-    if not enough.any():
-        return _unknown(n_channels)
     wings = _wings(image, means, centers)
-    masked = np.where(known, means, np.inf)
-    order = np.sort(masked, axis=1)
-    low = np.take_along_axis(order, (LOW * known.sum(axis=1)).astype(int)[:, None], 1)
-    low = np.where(enough[:, None], low, 0.0)
-    kept = known & (means < low + (CLIP + 1) * white)
+    darker = _darker(image, centers, wings[0])
+    known = 2 * counts > side**2
+    dark = known & (darker < DARK)
+    if not (dark.sum(axis=1) >= MIN_BLOCKS).any():
+        return SkyLevel(np.zeros(n_channels), *_unknown(n_channels))
+    kept, none = dark, np.zeros(n_channels)
     for _ in range(N_ROUNDS):
-        level, wing, variance = _fitted(means, wings, white, kept)
-        rest = (means - level[:, None] - wing[:, None] * wings) / white
-        spread = _spread(rest, kept)
-        kept = known & (np.abs(rest) < CLIP * spread[:, None])
-    enough &= kept.sum(axis=1) >= MIN_BLOCKS
-    number = np.maximum(kept.sum(axis=1), 1)
-    half = wing * (wings * kept).sum(axis=1) / number / 2
-    error = np.sqrt(variance * spread**2 + half**2)
+        level, wing, variance = _fitted(means, wings[1], white, kept)
+        model = level[:, None] + wing[:, None] * wings[1]
+        spread = _spread(means - model, white, none, kept)
+        kept = dark & (np.abs(means - model) < CLIP * spread)
+    scale = (spread / white).max(axis=1)
+    ends = [_fitted(means, wings[k], white, kept)[0] for k in (0, 2)]
+    unsure = np.abs(ends[1] - ends[0]) / 2
+    enough = kept.sum(axis=1) >= MIN_BLOCKS
+    rim, rim_error = _rim(means, white, known & (darker < RIM))
     return SkyLevel(
-        np.where(enough, level + half, 0.0),
-        np.where(enough, error, np.inf),
-        (counts * kept).sum(axis=1) * enough,
+        np.where(enough, level, 0.0),
+        np.where(enough, np.sqrt(variance * scale**2 + unsure**2), np.inf),
+        np.where(enough, unsure, 0.0),
+        rim,
+        rim_error,
     )
 
 
 def _unknown(n_channels):
-    """The SkyLevel of channels without blank pixels."""
+    """Error, wings, rim and its error of channels without blank pixels."""
     zeros = np.zeros(n_channels)
-    return SkyLevel(zeros, zeros + np.inf, zeros.astype(int))
+    return zeros + np.inf, zeros, zeros, zeros + np.inf
+
+
+def _rim(means, white, kept):
+    """Mean (C,) of the kept blocks and its error, outliers left out."""
+    for _ in range(N_ROUNDS):
+        middle = _middle(means, kept)
+        spread = _spread(means, white, middle, kept)
+        near = kept & (np.abs(means - middle[:, None]) < CLIP * spread)
+        kept = np.where(near.sum(axis=1, keepdims=True) >= MIN_BLOCKS // 2, near, kept)
+    number = kept.sum(axis=1)
+    known = number >= MIN_BLOCKS // 2
+    number = np.maximum(number, 1)
+    error = np.sqrt((spread**2 * kept).sum(axis=1)) / number
+    return (means * kept).sum(axis=1) / number, np.where(known, error, np.inf)
 
 
 def _blocks(image):
@@ -108,26 +127,34 @@ def _blocks(image):
     return total / np.maximum(counts, 1), counts, centers.reshape(-1, 2), side
 
 
-def _free(image, centers):
-    """Which blocks (B,) lie further from all sources than the PSF is wide."""
+def _darker(image, centers, wings):
+    """Rank (B,) of the blocks by the light of wings (C, B) in them, from 0, the darkest, to 1;
+    infinite of those in a source, where this leaves enough others."""
+    light = (wings / image.sigma[:, None]).sum(axis=0) if len(wings) else np.zeros(len(centers))
+    free = np.ones(len(centers), bool)
     places = image.places[np.isfinite(image.places).all(axis=1)]
-    if not len(places):
-        return np.ones(len(centers), bool)
-    squares = ((centers[:, None] - places) ** 2).sum(axis=-1)
-    return squares.min(axis=1) > (NEAR_SOURCE * image.width_px) ** 2
+    if len(places):
+        squares = ((centers[:, None] - places) ** 2).sum(axis=-1)
+        free = squares.min(axis=1) > (NEAR_SOURCE * image.width_px) ** 2
+    if free.sum() < 2 * MIN_BLOCKS:
+        free[:] = True
+    rank = np.full(len(centers), np.inf)
+    order = np.argsort(light[free], kind="stable")
+    rank[np.flatnonzero(free)[order]] = np.arange(len(order)) / max(len(order), 1)
+    return rank
 
 
 def _wings(image, means, centers):
-    """Light of wings (C, B) falling as r^-2 about the sources, as bright as the blocks there; its
-    largest value is 1, or it is 0 without sources."""
+    """Light of wings (3, C, B) [counts] about the sources that fall by each of POWERS, those of
+    the first power as bright at the sources as the blocks there; 0 without sources."""
     places = image.places[image.inside]
-    if not len(places):
-        return np.zeros_like(means)
+    if not len(places) or not len(centers):
+        return np.zeros((len(POWERS), *means.shape))
     squares = ((centers[:, None] - places) ** 2).sum(axis=-1)  # (B, S)
     light = means[:, squares.argmin(axis=0)] - np.median(means, axis=1, keepdims=True)
-    light = np.maximum(light, image.sigma[:, None] * 1e-3)  # a source nobody can see has no wings
-    wings = light @ (1 / (squares + image.width_px**2)).T
-    return wings / wings.max(axis=1, keepdims=True)
+    light = np.maximum(light, image.sigma[:, None] * 1e-3)  # wings of undetected sources are none
+    core = max(image.width_px, 1.0) ** 2
+    return np.stack([light @ (1 + squares / core).T ** (-p / 2) for p in POWERS])
 
 
 def _fitted(means, wings, white, kept):
@@ -146,8 +173,15 @@ def _fitted(means, wings, white, kept):
     return (d - wing * b) / a, wing, variance
 
 
-def _spread(rest, kept):
-    """Scatter (C,) of the kept blocks, in units of white noise, at least 1."""
-    order = np.sort(np.where(kept, np.abs(rest), np.inf), axis=1)
+def _middle(values, kept):
+    """Median (C,) of the kept values (C, B); 0 of none."""
+    order = np.sort(np.where(kept, values, np.inf), axis=1)
     middle = np.take_along_axis(order, kept.sum(axis=1)[:, None] // 2, 1)[:, 0]
-    return np.maximum(1.0, SIGMAS_A_MAD * np.where(np.isfinite(middle), middle, 1.0))
+    return np.where(np.isfinite(middle), middle, 0.0)
+
+
+def _spread(values, white, middle, kept):
+    """Scatter (C, B) of blocks about the middle (C,): their white noise, times how much wider the
+    kept ones scatter, at least 1."""
+    wide = SIGMAS_A_MAD * _middle(np.abs(values - middle[:, None]) / white, kept)
+    return np.maximum(1.0, wide)[:, None] * white

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .centroids import centroids, common
+from .centroids import common, over_channels
 from .disagreement import Plane, shifts_at
 
 # [model px] Shifts from here on count: world coordinates of good surveys agree to about this, and
@@ -23,16 +23,15 @@ MAX_CHANNELS = 2
 MAX_ERROR_PX = 0.5
 
 
-def disagreements(images, fit_shifts):
+def disagreements(images, found, fit_shifts):
     """Shifts (n_observations, 2) [model px] that bring observations together which disagree, the
     first at rest; None where none do. And a sentence on each, also on channels that disagree.
 
-    images: Image of each observation; fit_shifts: see Settings; nothing is measured where it is
+    images, found: Image and Centroids of each observation; fit_shifts: see Settings; nothing is measured where it is
         True
     """
     if fit_shifts is True:
         return None, []
-    found = [centroids(image) for image in images]
     lines, moved = [], np.zeros((len(images), 2))
     sharpest = min(range(len(images)), key=lambda i: _width(images[i]))
     for i, image in enumerate(images):
@@ -68,7 +67,7 @@ def _between(one, its, other, theirs):
     _, at, there = np.intersect1d(its.sources, theirs.sources, return_indices=True)
     ends = []
     for image, found, chosen in ((one, its, at), (other, theirs, there)):
-        offsets, errors = _over_channels(found, chosen)
+        offsets, errors = (values[chosen] for values in over_channels(found))
         inverse = np.linalg.inv(image.matrix)
         ends.append((offsets @ inverse.T, errors * np.sqrt(abs(np.linalg.det(inverse)))))
     (first, first_error), (second, second_error) = ends
@@ -76,15 +75,6 @@ def _between(one, its, other, theirs):
     if not np.isfinite(error).all() or np.hypot(*shift) < CLOSER * LEAST_SHIFT_PX:
         return shift, np.full(2, np.inf)
     return _closer(one, other)
-
-
-def _over_channels(found, chosen):
-    """Offsets (n, 2) and errors (n,) of some of the Centroids' sources, from all channels."""
-    weight = found.errors[chosen] ** -2.0
-    total = weight.sum(axis=1)
-    safe = np.where(total > 0, total, 1.0)
-    offsets = np.einsum("nc,ncd->nd", weight, found.offsets[chosen]) / safe[:, None]
-    return offsets, np.where(total > 0, safe**-0.5, np.inf)
 
 
 def _closer(one, other):
