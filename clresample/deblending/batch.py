@@ -19,7 +19,7 @@ from ..sky.sources import SourceWarning
 from .blend import INTERRUPTED, Blend, Failure
 from .components.second import asks_for_more, with_second
 from .fit import Fit, begin, data_bytes, finish, scene_bytes
-from .inspection.inspect import InputWarning
+from .inspection.inspect import InputWarning, warn_of_many
 from .iterate import iterate
 from .result import Result
 from .settings import Settings
@@ -128,7 +128,7 @@ def deblend_many(
         _warn_dark(dark, " of blends that were fitted together")
     problems = [lines for _, (_, lines) in pairs if lines]
     if problems:
-        _warn_input(problems)
+        warn_of_many(problems)
     return [result for result, _ in pairs]
 
 
@@ -291,16 +291,5 @@ def _warn_dark(dark, where):
         f"{n} source{'s lie' if n > 1 else ' lies'} far from any light{where}: see the messages of "
         "the result",
         SourceWarning,
-        stacklevel=3,
-    )
-
-
-def _warn_input(problems):
-    """Warn the caller of `deblend_many` of the problems of blends; a list of sentences of each."""
-    n = len(problems)
-    warnings.warn(
-        f"{n} blend{'s have' if n > 1 else ' has'} problems with observations or sources, such as: "
-        f"{problems[0][0]}; see the messages of the results",
-        InputWarning,
         stacklevel=3,
     )

@@ -41,8 +41,8 @@ class _Best:
 class Fit:
     """One blend on its way from data to result.
 
-    blend, settings, frame: what is fitted, how, and on which Frame; spoilt pixels are masked and
-        fit_shifts is decided, see `inspect`; problems (n,): sentences on what it has found
+    blend, settings, frame: what is fitted, how, and on which Frame; as `inspect` returns them
+    problems (n,): sentences on what that has found
     sources: the blend's, with positions in the frame's pixels where an observation's were given
     fitted (n,): indices of those inside the frame; dark (n_dark,): of those far from any light
     views: the observations as WhitenedViews, whose operators hold the observations' shifts
@@ -59,15 +59,14 @@ class Fit:
         self.frame = blend.made_frame()
         shifts = blend.known_shifts()
         positions = self.frame.place(blend.sources, blend.observations, shifts)
-        inside, self.messages = _inside(self.frame, positions)
+        inside, outside = _inside(self.frame, positions)
         found = inspect(blend, self.frame, positions, shifts, settings)
         blend, settings, shifts = found.blend, found.settings, found.shifts
         positions = self.frame.place(blend.sources, blend.observations, shifts)
         pairs = zip(blend.sources, positions, strict=True)
         self.sources = tuple(source.on_frame(position) for source, position in pairs)
         self.blend, self.settings, self.problems = blend, settings, found.messages
-        self.messages += self.problems
-        self.fitted = np.flatnonzero(inside)
+        self.messages, self.fitted = outside + self.problems, np.flatnonzero(inside)
         places, tolerance = positions[self.fitted], settings.psf_tolerance
         padded, private = _padded_frame(self.frame, pad), settings.fit_shifts or shifts.any()
         self.home = Home(self.frame, padded, places, tolerance)
@@ -98,10 +97,9 @@ class Fit:
     @property
     def signature(self):
         """Fits of equal signature start and iterate side by side; see Scene.signature."""
-        known = signature_of(
-            self.padded.shape, self.settings.fit_sky, [view.op for view in self.views]
-        )
-        return known, bool(self.settings.fit_shifts)
+        ops = [view.op for view in self.views]
+        known = signature_of(self.padded.shape, self.settings.fit_sky, ops)
+        return known, self.settings.fit_shifts
 
     def begin(self, point: StartingPoint, seconds):
         """Make the scene and its state from where it starts; seconds: that this took."""

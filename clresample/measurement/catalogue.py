@@ -51,7 +51,7 @@ MEANINGS = {
     Flag.NO_COVERAGE: "a channel's image does not hold the centre, or determines no flux",
     Flag.OUTSIDE: "outside the frame, thus not fitted: nothing is measured",
     Flag.MASKED: "the centre is on a pixel without weight in a channel whose image holds it",
-    Flag.SATURATED: "a star with masked pixels in its core, or a bright source with half of it masked",
+    Flag.SATURATED: "a star with masked pixels in its core, a bright source with half of it masked",
     Flag.MISFIT: "the model leaves a residual of over 5 sigma somewhere on the source in a channel",
 }
 

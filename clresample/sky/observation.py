@@ -145,13 +145,6 @@ class Observation(ReadOnly, ShownObservation):
         names = {key: getattr(self, key) for key in ("channels", "zero_points", "name")}
         return Observation(data, psf, self.grid, weights=weights, **names)
 
-    def without(self, pixels) -> Observation:
-        """The same observation, the pixels (C, Ny, Nx) bool masked: their weight is 0."""
-        masked = copy.copy(self)
-        masked.__dict__.pop("white", None)
-        masked._set(weights=np.where(pixels, 0.0, self.weights))
-        return masked
-
     def as_white(self, images) -> np.ndarray:
         """Images (C, Ny, Nx) of this observation as they are in `white`."""
         if self.noise is None:
@@ -179,6 +172,14 @@ class Observation(ReadOnly, ShownObservation):
         if self.zero_points is None:
             return None
         return 10 ** (-0.4 * (self.zero_points - ZERO_POINT_UJY))
+
+
+def masked(observation, pixels) -> Observation:
+    """The same observation with the pixels (C, Ny, Nx) bool masked: their weight is 0."""
+    made = copy.copy(observation)
+    made.__dict__.pop("white", None)  # that of the observation before
+    made._set(weights=np.where(pixels, 0.0, observation.weights))
+    return made
 
 
 def check_observations(observations):

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..drawing.shown import ShownPSF
 from .given.checks import ReadOnly, number, numbers
-from .psf_checks import PSFWarning, core_of, edge_light, fwhm, limit_power, psf_warnings
+from .psf_checks import PSFWarning, core_of, edge_light, fwhm, psf_warnings
 from .transforms.nufft import transform_at
 from .waves import even_waves
 
@@ -177,10 +177,6 @@ class PSF(ReadOnly, ShownPSF):
     def edge_light(self) -> np.ndarray:
         """Light beyond the edge (C,), as a fraction of the light inside; see `psf_checks`."""
         return edge_light(self.images)
-
-    def limit_power(self) -> np.ndarray:
-        """Part (C,) of the transform left at the samples' frequency limit; see `psf_checks`."""
-        return limit_power(self.images)
 
     def warnings(self, core='center="core"') -> list[str]:
         """What a user should know of this PSF, a sentence each; see `psf_checks.psf_warnings`."""

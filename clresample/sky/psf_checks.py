@@ -103,7 +103,7 @@ def psf_warnings(images, center, core='center="core"') -> list[str]:
     """What a user should know of PSF images: a sentence each, with figures.
 
     A core more than 0.25 samples off the centre along an axis, and more than 5 % of the light
-    (either sign) beyond the edge, by `edge_light`; samples too coarse for the PSF, by `limit_power`.
+    (either sign) beyond the edge, by `edge_light`; samples too coarse, by `limit_power`.
 
     images (C, ny, nx): of unit sum; center (C, 2) [samples]: (y, x), where they are said to be
     core: how the reader of the message makes the core the centre
@@ -135,8 +135,8 @@ def psf_warnings(images, center, core='center="core"') -> list[str]:
     if coarse.any():
         i = int(limit.argmax())
         messages.append(
-            f"PSF sampled too coarsely, {_bands(coarse)}: in band {i} {100 * limit[i]:.0f} % of its "
-            "transform is left at the frequency limit of the samples, and models are wrong by "
+            f"PSF sampled too coarsely, {_bands(coarse)}: in band {i} {100 * limit[i]:.0f} % of "
+            "its transform is left at the frequency limit of the samples, and models are wrong by "
             "about that part of their light; give an oversampled image with its `spacing`, such "
             "as 0.25 (native pixels of HST, Roman, and Euclid VIS and NISP are too coarse)"
         )

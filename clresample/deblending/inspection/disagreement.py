@@ -16,6 +16,8 @@ import numpy as np
 from scipy import fft
 from scipy.ndimage import map_coordinates
 
+from ...sky.psf import PSF
+
 # [FWHM of the wider PSF] Radius of the pixels about a source that are compared.
 RADIUS_FWHM = 1.2
 # Relative weight of "nothing" beside sources that the images hardly tell apart: rounding's.
@@ -46,7 +48,7 @@ class Plane:
     data: np.ndarray
     usable: np.ndarray
     sigma: float
-    psf: object
+    psf: PSF
     matrix: np.ndarray
     offset: np.ndarray
 
@@ -69,7 +71,7 @@ def shifts_at(one: Plane, other: Plane, places) -> tuple[np.ndarray, np.ndarray]
     matrix = one.matrix @ np.linalg.inv(other.matrix)
     offset = one.offset - matrix @ other.offset
     area = abs(np.linalg.det(matrix))
-    shape = np.array(other.data.shape)
+    shape = other.data.shape
     at = (np.stack([*np.indices(shape)], axis=-1) @ matrix.T + offset).transpose(2, 0, 1)
     smear, there = Blur(one, other.psf, matrix), Blur(other, one.psf, np.linalg.inv(matrix))
     near = places @ other.matrix.T + other.offset
@@ -119,14 +121,15 @@ def _nearest(shape, places):
 
 
 def _solved(images, there, good, noise):
-    """Shifts (n, 2), their errors (n,), and brightness (n,) of the images (n) of the sources in what is `there`, from the
-    good pixels; noise: of a pixel of either."""
+    """Shifts (n, 2), their errors (n,) and the brightness (n,) of sources' images (n) in the image
+    `there`, from the good pixels; noise: of a pixel of either."""
     n = len(images)
     light = np.stack([image[good] for image in images])
     slopes = np.stack([[s[good] for s in np.gradient(image)] for image in images])  # (n, 2, P)
     value = there[good]
     a = _brightness(light, value, noise[0])
-    design = np.vstack([np.ones_like(value), light, -(a[:, None, None] * slopes).reshape(2 * n, -1)])
+    moving = -(a[:, None, None] * slopes).reshape(2 * n, -1)
+    design = np.vstack([np.ones_like(value), light, moving])
     scale = np.maximum(np.sqrt((design**2).sum(axis=1)), 1e-300)
     design /= scale[:, None]
     normal = design @ design.T

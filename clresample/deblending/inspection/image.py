@@ -1,4 +1,4 @@
-"""One observation as the inspection uses it: significance of its pixels, positions of the sources."""
+"""One observation as it is inspected: significance of its pixels, places of the sources."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ...sky.observation import Observation
+from ...sky.observation import Observation, masked
 
 # [pixels] Noise of a channel: the median of this many weights, evenly spread over the image. Their
 # median is known to a few percent of the spread of weights, which is all that thresholds need.
@@ -45,7 +45,7 @@ class Image:
     def of(cls, observation, frame, positions, shift) -> Image:
         """The Image of an observation whose pixels are moved by `shift` (2,) [model px], with
         sources at `positions` (S, 2) [model px] of a Frame."""
-        corner = np.array(frame.shape) - 1.0
+        corner = np.maximum(np.array(frame.shape) - 1.0, 1.0)
         points = np.concatenate([LATTICE * corner, positions - shift])
         found = frame.grid.positions_in(observation.grid, *points.T)
         lattice, places = np.split(found, [len(LATTICE)])
@@ -54,7 +54,7 @@ class Image:
         solution = np.linalg.lstsq(design[good], lattice[good], rcond=None)[0]
         shape = np.array(observation.data.shape[1:])
         with np.errstate(invalid="ignore"):
-            inside = ((places >= -0.5) & (places < shape - 0.5)).all(axis=1)
+            inside = np.all((places >= -0.5) & (places < shape - 0.5), axis=1)
         usable = observation.weights > 0
         sigma = np.array([_typical_sigma(w) for w in observation.weights])
         matrix = solution[:2].T
@@ -69,7 +69,7 @@ class Image:
 
     def without(self, pixels) -> Image:
         """The same Image of the observation with the pixels (C, My, Mx) masked."""
-        observation, usable = self.observation.without(pixels), self.usable & ~pixels
+        observation, usable = masked(self.observation, pixels), self.usable & ~pixels
         return replace(self, observation=observation, usable=usable)
 
     @cached_property

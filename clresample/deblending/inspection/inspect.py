@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...sky.psf_checks import LIMIT_TOLERANCE
+from ...sky.psf_checks import LIMIT_TOLERANCE, limit_power
 from ..blend import Blend
 from ..settings import AUTO, Settings
 from . import listing, shifted, spoilt
@@ -28,6 +29,17 @@ CORE_FWHM, CORE_PX = 0.5, 1.5
 
 class InputWarning(UserWarning):
     """Observations or sources that were fitted, with something in them that spoils fluxes."""
+
+
+def warn_of_many(problems):
+    """Warn once of the problems of blends, a list of messages of each."""
+    n = len(problems)
+    warnings.warn(
+        f"{n} blend{'s have' if n > 1 else ' has'} problems with observations or sources, such as: "
+        f"{problems[0][0]}; see the messages of the results",
+        InputWarning,
+        stacklevel=4,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +78,12 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
             image = image.without(bad)
         lines += more + _coarse(observation.psf, observation.channels)
         found.append(centroids(image))
-        lines += _missing(image) + _offset(found[-1]) + _widths(image, sources, near)
+        lines += _missing(image) + _widths(image, sources, near)
         messages += [f"{observation.label}: {line}" for line in lines]
         images.append(image)
+    messages += _offset(images, found)
     moved, lines = shifted.disagreements(images, found, settings.fit_shifts)
-    move = moved is not None if settings.fit_shifts == AUTO else settings.fit_shifts
+    move = moved is not None if settings.fit_shifts == AUTO else bool(settings.fit_shifts)
     observations = tuple(image.observation for image in images)
     if any(a is not b for a, b in zip(observations, blend.observations, strict=True)):
         blend = replace(blend, observations=observations)
@@ -183,7 +196,7 @@ def _cores(image):
 
 def _coarse(psf, channels):
     """What is said of a PSF whose samples are too coarse."""
-    limit = psf.limit_power()
+    limit = limit_power(psf.images)
     names = [name for name, part in zip(channels, limit, strict=True) if part > LIMIT_TOLERANCE]
     if not names:
         return []
@@ -205,13 +218,15 @@ def _missing(image):
     ]
 
 
-def _offset(found):
-    offset = listing.common_offset(found)
+def _offset(images, found):
+    """What is said of positions that are off in the sharpest Image, of the Centroids in each."""
+    i = shifted.sharpest(images)
+    offset = listing.common_offset(found[i])
     if offset is None:
         return []
     (y, x), error = offset
     return [
-        f"the sources' light lies at ({y:+.2f}, {x:+.2f}) +- {error.max():.1g} pixels (y, x) from "
+        f"{images[i].observation.label}: the sources' light lies at ({y:+.2f}, {x:+.2f}) +- {error.max():.1g} pixels (y, x) from "
         "their positions: these are wrong by as much (the centre of the first pixel is (0, 0), "
         "FITS counts from 1), or the WCS is"
     ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..settings import AUTO
 from .centroids import common, over_channels
 from .disagreement import Plane, shifts_at
 
@@ -27,22 +28,22 @@ def disagreements(images, found, fit_shifts):
     """Shifts (n_observations, 2) [model px] that bring observations together which disagree, the
     first at rest; None where none do. And a sentence on each, also on channels that disagree.
 
-    images, found: Image and Centroids of each observation; fit_shifts: see Settings; nothing is measured where it is
-        True
+    images, found: Image and Centroids of each observation; fit_shifts: see Settings, with True
+        nothing is measured
     """
-    if fit_shifts is True:
+    if fit_shifts != AUTO and fit_shifts:
         return None, []
     lines, moved = [], np.zeros((len(images), 2))
-    sharpest = min(range(len(images)), key=lambda i: _width(images[i]))
+    first = sharpest(images)
     for i, image in enumerate(images):
         lines += _channel_lines(image, found[i])
-        if i == sharpest:
+        if i == first:
             continue
-        shift, error = _between(images[sharpest], found[sharpest], image, found[i])
+        shift, error = _between(images[first], found[first], image, found[i])
         if not significant(shift, error):
             continue
         moved[i] = -shift
-        names = [images[k].observation.label for k in (sharpest, i)]
+        names = [images[k].observation.label for k in (first, i)]
         cure = "the fit moves them" if fit_shifts else "give fit_shifts=True"
         lines.append(
             f"light in {names[1]} lies at ({shift[0]:+.2f}, {shift[1]:+.2f}) +- {error.max():.1g} "
@@ -56,9 +57,11 @@ def significant(shift, error, least=LEAST_SHIFT_PX, sigmas=SHIFT_SIGMAS):
     return np.hypot(*shift) > least and np.hypot(*(shift / error)) > sigmas
 
 
-def _width(image):
-    """FWHM of an Image's PSF [model px]."""
-    return image.width_px / np.sqrt(max(abs(np.linalg.det(image.matrix)), 1e-30))
+def sharpest(images) -> int:
+    """Which of the Images has the narrowest PSF on the sky."""
+    areas = [max(abs(np.linalg.det(image.matrix)), 1e-30) for image in images]  # [px / model px]
+    widths = [image.width_px / area**0.5 for image, area in zip(images, areas, strict=True)]
+    return int(np.argmin(widths))
 
 
 def _between(one, its, other, theirs):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import binary_dilation, label
 
-from ...sky.psf_checks import LIMIT_TOLERANCE
+from ...sky.psf_checks import LIMIT_TOLERANCE, limit_power
 from .psf_samples import pair_ratios
 
 # [sigma] Pixels of a plateau are brighter: noise alone gives images of integers small ones.
@@ -17,7 +17,7 @@ FLAT_PIXELS, FLAT_INTEGERS = 3, 5
 GROW_PX = 2
 # [sigma] Of 1e6 pixels of noise none is so far off.
 SHARP_SIGMAS = 6.0
-# Of the brightest pixel beside one, what is uncertain in it: PSFs' cores are known to a few percent.
+# Part of the brightest pixel near one that is uncertain in it: PSFs are known to a few percent.
 NEIGHBOUR_PART = 0.05
 # PSF images with more of their transform left at their limit (psf_checks.LIMIT_TOLERANCE) are
 # interpolated with errors of that order: their contrast is taken to be this part.
@@ -47,7 +47,7 @@ def saturated(image) -> np.ndarray:
 
 
 def grown(pixels) -> np.ndarray:
-    """Pixels (C, My, Mx) bool and their eight neighbours: charge of a cosmic ray spreads to them."""
+    """Pixels (C, My, Mx) bool and their eight neighbours, to which charge spreads."""
     return binary_dilation(pixels, np.ones((1, 3, 3), bool))
 
 
@@ -88,7 +88,9 @@ def sharper_than_psf(image) -> np.ndarray:
     """
     z, psf = image.significance, image.observation.psf
     ratios = pair_ratios(psf)
-    ratios = np.where(psf.limit_power()[:, None] > LIMIT_TOLERANCE, COARSE_PART * ratios, ratios)
+    ratios = np.where(
+        limit_power(psf.images)[:, None] > LIMIT_TOLERANCE, COARSE_PART * ratios, ratios
+    )
     found = np.zeros(z.shape, bool)
     inner = z[:, 1:-1, 1:-1]
     pairs = (z[:, :-2, 1:-1] + z[:, 2:, 1:-1], z[:, 1:-1, :-2] + z[:, 1:-1, 2:])
