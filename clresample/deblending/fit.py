@@ -42,7 +42,7 @@ class Fit:
     """One blend on its way from data to result.
 
     blend, settings, frame: what is fitted, how, and on which Frame; as `inspect` returns them
-    problems (n,): sentences on what that has found
+    problems (n,): sentences on what that has found; sky_levels: SkyLevel of each observation
     sources: the blend's, with positions in the frame's pixels where an observation's were given
     fitted (n,): indices of those inside the frame; dark (n_dark,): of those far from any light
     views: the observations as WhitenedViews, whose operators hold the observations' shifts
@@ -59,17 +59,17 @@ class Fit:
         self.frame = blend.made_frame()
         shifts = blend.known_shifts()
         positions = self.frame.place(blend.sources, blend.observations, shifts)
-        inside, outside = _inside(self.frame, positions)
         found = inspect(blend, self.frame, positions, shifts, settings)
         blend, settings, shifts = found.blend, found.settings, found.shifts
         positions = self.frame.place(blend.sources, blend.observations, shifts)
+        inside, outside = _inside(self.frame, positions)
         pairs = zip(blend.sources, positions, strict=True)
         self.sources = tuple(source.on_frame(position) for source, position in pairs)
-        self.blend, self.settings, self.problems = blend, settings, found.messages
+        self.blend, self.settings = blend, settings
+        self.problems, self.sky_levels = found.messages, found.levels
         self.messages, self.fitted = outside + self.problems, np.flatnonzero(inside)
-        places, tolerance = positions[self.fitted], settings.psf_tolerance
         padded, private = _padded_frame(self.frame, pad), settings.fit_shifts or shifts.any()
-        self.home = Home(self.frame, padded, places, tolerance)
+        self.home = Home(self.frame, padded, positions[self.fitted], settings.psf_tolerance)
         self.views = [
             whitened_view(self.home, o, pad, device, dtype, private=private)
             for o in blend.observations

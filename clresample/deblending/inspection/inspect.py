@@ -226,9 +226,9 @@ def _offset(images, found):
         return []
     (y, x), error = offset
     return [
-        f"{images[i].observation.label}: the sources' light lies at ({y:+.2f}, {x:+.2f}) +- {error.max():.1g} pixels (y, x) from "
-        "their positions: these are wrong by as much (the centre of the first pixel is (0, 0), "
-        "FITS counts from 1), or the WCS is"
+        f"{images[i].observation.label}: the sources' light lies at ({y:+.2f}, {x:+.2f}) +- "
+        f"{error.max():.1g} pixels (y, x) from their positions: these are wrong by as much (the "
+        "centre of the first pixel is (0, 0), FITS counts from 1), or the WCS is"
     ]
 
 
