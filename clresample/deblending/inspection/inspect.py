@@ -114,6 +114,9 @@ def _level_lines(image, sky):
         own = np.maximum(error[known] ** 2 - (sky.wings / image.sigma)[known] ** 2, 0).sum()
         total = np.hypot(shared, np.sqrt(own) / known.sum())
         wrong |= known & (abs(mean) > max(LEVEL_SIGMAS * total, LEVEL_PART)) & (part * mean > 0)
+    # light is positive: where the rim is not below zero, the sky need not be
+    rim, rim_error = sky.rim / image.sigma, sky.rim_error / image.sigma
+    wrong &= (part > 0) | (rim < -np.maximum(LEVEL_SIGMAS * rim_error, LEVEL_PART))
     lines = []
     for chosen, what, cure in (
         (wrong & (part > 0), "sky is left in", "subtract it"),
@@ -124,11 +127,9 @@ def _level_lines(image, sky):
                 f"{what}: pixels without a source have the level {_parts(image, sky.level, chosen)}"
                 f" a pixel, and every flux holds its share of it; {cure}, or give fit_sky=True"
             )
-    if lines or not np.isfinite(sky.rim_error).all():
+    if lines or not np.isfinite(rim_error).all():
         return lines
-    rim = sky.rim / image.sigma
-    rim_error = np.sqrt((sky.rim_error / image.sigma) ** 2).mean() / np.sqrt(len(rim))
-    if rim.mean() > RIM_PART + RIM_SIGMAS * rim_error:
+    if rim.mean() > RIM_PART + RIM_SIGMAS * rim_error.mean() / np.sqrt(len(rim)):
         lines.append(
             "the pixels furthest from the sources are not dark, "
             f"{_parts(image, sky.rim, rim > 0)} a pixel: sky is left in, or wings of the sources "

@@ -21,7 +21,7 @@ OWN_FWHM, OWN_PX = 1.5, 3.0
 SADDLE_PART = 0.5
 N_NEAREST = 6  # sources that light may be a part of, the nearest ones
 # [px], [sigma] Offset that all positions share, from which on it is named, and its significance.
-OFFSET_PX, OFFSET_SIGMAS = 0.4, 4.0
+OFFSET_PX, OFFSET_SIGMAS = 0.6, 4.0
 # Sources from whose scatter the error of an offset is known.
 MIN_SOURCES = 3
 # [px] By which a galaxy's light within the PSF's width lies off its catalogued centre, as a rule.

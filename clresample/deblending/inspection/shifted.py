@@ -53,8 +53,10 @@ def disagreements(images, found, fit_shifts):
 
 
 def significant(shift, error, least=LEAST_SHIFT_PX, sigmas=SHIFT_SIGMAS):
-    """Whether a shift (2,) with errors (2,) is longer than `least`, and than `sigmas` of these."""
-    return np.hypot(*shift) > least and np.hypot(*(shift / error)) > sigmas
+    """Whether a shift (2,) with errors (2,) is longer than `least`, and than `sigmas` of these,
+    which are no larger than `least`: what is known no better comes from one doubtful source."""
+    known = error.max() < least
+    return known and np.hypot(*shift) > least and np.hypot(*(shift / error)) > sigmas
 
 
 def sharpest(images) -> int:
