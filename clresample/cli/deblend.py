@@ -135,7 +135,7 @@ def _fit(arguments, scene, device):
         sources = _detect(arguments, scene)
     seen = ", ".join(f"{o.name} ({' '.join(o.channels)})" for o in scene.observations)
     _progress(arguments, f"fitting {len(sources)} sources to {seen} on {device.name}")
-    if settings.max_iter and (settings.fit_shifts or (looking and scene.passes > 1)):
+    if settings.max_iter and (settings.fit_shifts is True or (looking and scene.passes > 1)):
         first = replace(settings, max_iter=min(FIRST_LOOK, settings.max_iter))
         if looking and scene.passes > 1 and settings.learns:
             from ..deblending.solver.constraints import Chain, Positivity
@@ -185,6 +185,7 @@ def _deblend(arguments, what, observations, sources, settings, given):
     from tqdm import tqdm
 
     from ..deblending.batch import deblend
+    from ..deblending.inspection.inspect import InputWarning
     from ..sky.sources import SourceWarning
 
     # disable=None: no bar where standard error is no terminal
@@ -198,7 +199,8 @@ def _deblend(arguments, what, observations, sources, settings, given):
             disable=True if arguments.quiet else None,
         ) as bar,
     ):
-        warnings.simplefilter("ignore", SourceWarning)  # the result's messages are printed
+        for kind in (SourceWarning, InputWarning):  # the result's messages are printed
+            warnings.simplefilter("ignore", kind)
 
         def progress(n_steps, losses):
             bar.update(n_steps - bar.n)

@@ -19,6 +19,7 @@ from ..sky.sources import SourceWarning
 from .blend import INTERRUPTED, Blend, Failure
 from .components.second import asks_for_more, with_second
 from .fit import Fit, begin, data_bytes, finish, scene_bytes
+from .inspection.inspect import InputWarning, warn_of_many
 from .iterate import iterate
 from .result import Result
 from .settings import Settings
@@ -39,6 +40,9 @@ ERRORS = (ValueError, DeviceError, np.linalg.LinAlgError)
 # Sources that are started together at most: each takes up to 1 MB, profile and slopes as all
 # observations see them. A few dozen hide what a launch costs.
 START_SOURCES = 500
+
+# What a blend has that nothing is warned about: sources far from any light, and problems.
+NOTHING: tuple = ((), ())
 
 
 @one_blas_thread()
@@ -61,16 +65,20 @@ def deblend(
     progress: called every few iterations with their number so far and the loss (1,)
     raises ValueError for what `check_observations`, `model_frame` and `Source` refuse, and when no
     source lies inside the frame. Warns (SourceWarning) of sources far from any light. Ctrl-C ends
-    the fit with the best state so far.
+    the fit with the best state so far. Warns (InputWarning) of what is wrong with the observations
+    and the list of sources, as far as their light tells (inspection/): messages of the result.
     """
     given = (_listed("observations", observations), _listed("sources", sources))
     blend = Blend(*given, frame, shifts)
     settings, dtype = _checked(settings, dtype)
     device = get_device(device)
     fit = Fit(blend, settings, device, dtype, pad=1)
+    settings = fit.settings
     begin([fit])
     if len(fit.dark):
         _warn_dark([fit.dark], "")
+    for problem in fit.problems:
+        warnings.warn(problem, InputWarning, stacklevel=3)
     iterate([fit], settings, device, dtype, progress, takes_over=asks_for_more)
     if fit.status != INTERRUPTED:
         (fit,) = with_second([fit], settings, device, dtype, progress)
@@ -93,7 +101,8 @@ def deblend_many(
     returns a Result for each blend, in their order, or a Failure: it does not harm the others.
         Ctrl-C ends the fits of the group that runs with the best state so far; what was done before
         comes back, and Failures with the status "interrupted" for the rest
-    Warns once (SourceWarning) of all sources far from any light; results' messages name them.
+    Warns once (SourceWarning) of all sources far from any light, and once (InputWarning) of all
+    problems with observations and lists of sources; results' messages name them.
     """
     blends = list(blends)
     if progress is True:
@@ -111,24 +120,27 @@ def deblend_many(
     else:
         pairs = _fit_all(blends, device=get_device(device), progress=progress, **given)
     pairs = [
-        pair or (Failure(blend, INTERRUPTED), None)
+        pair or (Failure(blend, INTERRUPTED), NOTHING)
         for blend, pair in zip(blends, pairs, strict=True)
     ]
-    dark = [sources for _, sources in pairs if sources is not None]
+    dark = [sources for _, (sources, _) in pairs if len(sources)]
     if dark:
         _warn_dark(dark, " of blends that were fitted together")
+    problems = [lines for _, (_, lines) in pairs if lines]
+    if problems:
+        warn_of_many(problems)
     return [result for result, _ in pairs]
 
 
 @one_blas_thread()
 def _fit_all(blends, *, device, progress=lambda n_done: None, **given):
-    """(Result or Failure, sources far from any light or None) for each blend."""
+    """(Result or Failure, what is warned about: sources far from any light, problems)."""
     many = _ManyFits(blends, device, **given)
     # the results of what was not done say so
     with contextlib.suppress(KeyboardInterrupt):
         many.run(progress)
     return [
-        (Failure(blend, INTERRUPTED) if done is None else done, many.dark.get(i))
+        (Failure(blend, INTERRUPTED) if done is None else done, many.warned.get(i, NOTHING))
         for i, (blend, done) in enumerate(zip(blends, many.done, strict=True))
     ]
 
@@ -137,14 +149,14 @@ class _ManyFits:
     """Blends on their way through groups of fits that share a batch.
 
     done: for each blend its Result or Failure, None before that
-    dark {blend: array}: indices of its sources far from any light, where it has some
+    warned {blend: (array, list)}: indices of its sources far from any light, and its problems
     """
 
     def __init__(self, blends, device, *, settings, dtype, memory, pad):
         self.blends, self.settings, self.device, self.dtype = blends, settings, device, dtype
         self.pad, self.memory, self.tuning = pad, memory, Tuning.of(device, dtype)
         self.done: list[Result | Failure | None] = [None] * len(blends)
-        self.dark = {}
+        self.warned = {}
 
     def run(self, progress):
         """Fit them all; raises KeyboardInterrupt when the group that runs was interrupted."""
@@ -193,7 +205,7 @@ class _ManyFits:
             (i, fit), *_ = group
             self.done[i] = _failure(fit.blend, error)
             return []
-        self.dark |= {i: fit.dark for i, fit in group if len(fit.dark)}
+        self.warned |= {i: (fit.dark, fit.problems) for i, fit in group}
         return group
 
     def _fit(self, group):
@@ -219,7 +231,8 @@ class _ManyFits:
 
     def _try(self, group):
         """Yield (index, Result or Failure) of a group; one by one where all at once fails."""
-        fits, run = [fit for _, fit in group], (self.settings, self.device, self.dtype)
+        fits = [fit for _, fit in group]
+        run = fits[0].settings, self.device, self.dtype
         try:
             iterate(fits, *run, takes_over=asks_for_more)
             if not any(fit.status == INTERRUPTED for fit in fits):

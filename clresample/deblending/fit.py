@@ -11,6 +11,7 @@ import numpy as np
 from ..resampling.transfer import noise_warnings
 from ..sky.frame import Frame
 from .blend import INTERRUPTED, UNFINISHED
+from .inspection.inspect import inspect
 from .posterior.posterior import with_errors
 from .rendered import Rendered
 from .result import Component, Result
@@ -41,7 +42,8 @@ class _Best:
 class Fit:
     """One blend on its way from data to result.
 
-    blend, settings, frame: what is fitted, how, and on which Frame
+    blend, settings, frame: what is fitted, how, and on which Frame; as `inspect` returns them
+    problems (n,): sentences on what that has found; sky_levels: SkyLevel of each observation
     sources: the blend's, with positions in the frame's pixels where an observation's were given
     fitted (n,): indices of those inside the frame; dark (n_dark,): of those far from any light
     views: the observations as WhitenedViews, whose operators hold the observations' shifts
@@ -56,21 +58,32 @@ class Fit:
 
     def __init__(self, blend, settings, device, dtype, *, pad):
         began = time.perf_counter()
-        self.blend, self.settings = blend, settings
         self.frame = blend.made_frame()
         shifts = blend.known_shifts()
         positions = self.frame.place(blend.sources, blend.observations, shifts)
+        found = inspect(blend, self.frame, positions, shifts, settings)
+        blend, settings, shifts = found.blend, found.settings, found.shifts
+        positions = self.frame.place(blend.sources, blend.observations, shifts)
+        inside, outside = _inside(self.frame, positions)
         pairs = zip(blend.sources, positions, strict=True)
         self.sources = tuple(source.on_frame(position) for source, position in pairs)
-        inside, self.messages = _inside(self.frame, positions)
-        self.fitted = np.flatnonzero(inside)
-        places, tolerance = positions[self.fitted], settings.psf_tolerance
+        self.blend, self.settings = blend, settings
+        self.problems, self.sky_levels = found.messages, found.levels
+        self.messages, self.fitted = outside + self.problems, np.flatnonzero(inside)
         padded, private = _padded_frame(self.frame, pad), settings.fit_shifts or shifts.any()
+<<<<<<< HEAD
         self.home = Home(self.frame, padded, places, tolerance)
         view = partial(whitened_view, pad=pad, device=device, dtype=dtype, private=private)
         views = [view(self.home, o) for o in blend.observations]
         self.views = tied_views(views, blend.observations)
         self.ties = self.views[0].ties
+=======
+        self.home = Home(self.frame, padded, positions[self.fitted], settings.psf_tolerance)
+        self.views = [
+            whitened_view(self.home, o, pad, device, dtype, private=private)
+            for o in blend.observations
+        ]
+>>>>>>> h-c
         if private:
             self.shift(shifts)
         for o, view in zip(blend.observations, self.views, strict=True):
@@ -95,7 +108,12 @@ class Fit:
     def signature(self):
         """Fits of equal signature start and iterate side by side; see Scene.signature."""
         ops = [view.op for view in self.views]
+<<<<<<< HEAD
         return signature_of(self.padded.shape, self.settings.fit_sky, ops, self.ties)
+=======
+        known = signature_of(self.padded.shape, self.settings.fit_sky, ops)
+        return known, self.settings.fit_shifts
+>>>>>>> h-c
 
     def begin(self, point: StartingPoint, seconds):
         """Make the scene and its state from where it starts; seconds: that this took."""

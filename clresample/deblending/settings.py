@@ -12,6 +12,8 @@ from .solver.constraints import Chain, MaxNorm, Monotone, Positivity, SumNorm
 from .solver.learned.prior import LearnedPrior
 from .solver.prior import Prior
 
+AUTO = "auto"  # fit_shifts: by measurement
+
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
@@ -34,7 +36,9 @@ class Settings:
         and monotone by the sweep. With a LearnedPrior they are non-negative and nothing else: on
         simulated galaxies a monotone morphology gains nothing, and real ones are none
     step_sizes: with others, their StepSizes
-    fit_shifts: let each observation but the first move by a constant shift
+    fit_shifts: let each observation but the first move by a constant shift. "auto": where light of
+        isolated sources lies over 0.25 model pixels and 3 sigma apart in two observations
+        (inspection/shifted.py), from the shift measured there; else the fit is that of False
     fit_sky: fit a constant per channel
     flux_floor: with a LearnedPrior, part of each flux added to its error in quadrature, the same
         for all channels of a source: what no likelihood knows, the error of the model of bright
@@ -64,7 +68,7 @@ class Settings:
     tol: float = 1e-5
     constraints: Chain | None = None
     step_sizes: StepSizes = StepSizes()
-    fit_shifts: bool = False
+    fit_shifts: bool | str = "auto"
     fit_sky: bool = False
     flux_floor: float = 0.0005
     psf_error: float = 0.03
@@ -75,8 +79,9 @@ class Settings:
         number("enough", self.enough, "0 or more", lambda x: x >= 0)
         for name in ("tol", "flux_floor", "psf_error", "psf_tolerance"):
             number(name, getattr(self, name), "at least 0 and under 1", lambda x: 0 <= x < 1)
-        for name in ("fit_shifts", "fit_sky"):
-            instance(name, getattr(self, name), (bool, np.bool_))
+        instance("fit_sky", self.fit_sky, (bool, np.bool_))
+        if not isinstance(self.fit_shifts, (bool, np.bool_)) and self.fit_shifts != AUTO:
+            raise ValueError(f'fit_shifts is {self.fit_shifts!r}, must be True, False or "{AUTO}"')
         for name, kind in (("prior", (LearnedPrior, Prior)), ("constraints", Chain)):
             if getattr(self, name) is not None:
                 instance(name, getattr(self, name), kind)

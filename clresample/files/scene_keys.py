@@ -66,6 +66,7 @@ FILE = Rule("the name of a file", is_text)
 HDU = Rule('a number from 0, "NAME" or "NAME,VERSION"', either(is_whole, is_text))
 NUMBERS = Rule("a number, or a list with one for each channel", one_or_many(is_number))
 SWITCH = Rule("true or false", lambda value: isinstance(value, bool))
+SHIFTS = Rule('true, false or "auto"', lambda value: isinstance(value, bool) or value == "auto")
 POSITIVE = Rule("a number above 0", _above)
 
 # Tables that scene files and field files share; that of an image: fields/reading/keys.py.
@@ -92,7 +93,7 @@ TABLES = {
         "enough": POSITIVE,
         "monotone": SWITCH,
         "structure_px": POSITIVE,
-        "fit_shifts": SWITCH,
+        "fit_shifts": SHIFTS,
         "fit_sky": SWITCH,
         "flux_floor": FRACTION,
         "psf_error": FRACTION,

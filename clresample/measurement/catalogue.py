@@ -57,7 +57,7 @@ MEANINGS = {
     Flag.NO_COVERAGE: "a channel's image does not hold the centre, or determines no flux",
     Flag.OUTSIDE: "outside the frame, thus not fitted: nothing is measured",
     Flag.MASKED: "the centre is on a pixel without weight in a channel whose image holds it",
-    Flag.SATURATED: "a point source with masked pixels in its core: its flux is that of its wings",
+    Flag.SATURATED: "a star with masked pixels in its core, a bright source with half of it masked",
     Flag.MISFIT: "the model leaves over 5 sigma and over 3 % of the flux in a channel",
     Flag.AMBIGUOUS: "the data do not tell its light from that of the source in ambiguous_with",
 }

@@ -10,6 +10,10 @@ from ..sky.sources import Point
 
 # [px] from a pixel's centre to its corners
 PIXEL_RADIUS = 0.5**0.5
+# [radii of the core] Light beside a masked core, which is wider than the core where it saturates.
+BESIDE = 4.0
+# [sigma] Light of a pixel beside a saturated core is brighter: detectors saturate at 1e3 sigma.
+SATURATED_SIGMAS = 20.0
 
 
 def summary(result) -> dict:
@@ -78,22 +82,33 @@ def fitted_sources(result):
 
 
 def masked_cores(result, positions):
-    """Point sources (S,) bool with a pixel without weight in their core in some channel.
+    """Sources (S,) bool whose core is masked in some channel, as it is where it is saturated.
 
     The core is what lies within half of the PSF's FWHM of the position (S, 2) [model px], and the
-    pixel that holds it.
+    pixel that holds it. Of a point source, one pixel without weight is enough; of others half of
+    the core, beside light of over 20 sigma in a pixel: faint ones are not saturated.
     """
     found = np.zeros(len(result.sources), dtype=bool)
-    points = [i for i, source in enumerate(result.sources) if isinstance(source, Point)]
-    for footprint in result.footprints if points else ():
+    for footprint in result.footprints:
         observation = footprint.observation
+        masked = observation.weights == 0
+        if not masked.any():
+            continue
         scale = np.sqrt(abs(np.linalg.det(footprint.mapping.matrix)))  # [model px / px]
         radius = scale * np.maximum(observation.psf.fwhm_px / 2, PIXEL_RADIUS)
-        masked = observation.weights == 0
-        for i in points:
+        for i in np.flatnonzero(fitted_sources(result) & ~found):
             distance = np.linalg.norm(footprint.positions - positions[i], axis=-1)
-            found[i] |= (masked & (distance <= radius[:, None, None])).any()
-    return found & fitted_sources(result)
+            core = distance <= radius[:, None, None]
+            if not (masked & core).any():
+                continue
+            if isinstance(result.sources[i], Point):
+                found[i] = True
+                continue
+            half = 2 * (masked & core).sum(axis=(1, 2)) >= core.sum(axis=(1, 2))
+            beside = ~masked & (distance <= BESIDE * radius[:, None, None])
+            light = np.where(beside, observation.data * np.sqrt(observation.weights), 0)
+            found[i] = (half & (light.max(axis=(1, 2)) > SATURATED_SIGMAS)).any()
+    return found
 
 
 def chi2_terms(result, i_observation, used):

@@ -20,6 +20,11 @@ LARGEST = 1e100
 # [sigma] Largest signal to noise of a pixel: in float32, whose rounding is 1e5 sigma there, chi2
 # comes to its end soon after. Real images reach 1e4.
 MOST_SIGMAS = 1e12
+# Pixels of each value from which on, on average, an image is taken to be one in steps: noise of
+# sigma in 1000 pixels of integers has some 7 sigma values, float images as many as pixels.
+EQUAL = 4
+# Pixels from which is told at first whether an image has steps at all: most are of floats.
+SOME = 2000
 # median |x| of a unit Gaussian, whole and cut at CLIP
 HALF_WIDTH = NormalDist().inv_cdf(0.75)
 HALF_WIDTH_CUT = NormalDist().inv_cdf(0.5 + math.erf(CLIP / math.sqrt(2)) / 4)
@@ -36,8 +41,11 @@ def background(image, mask=None) -> tuple[float, float]:
     scatter of single pixels; 0 where more than half of the pixels have one value.
 
     image (Ny, Nx); mask (Ny, Nx): True = ignore; NaN and infinite pixels are ignored too
+
+    Of an image in steps, such as one of integers, whose MAD would move in steps too, equal values
+    are spread evenly over their step first.
     """
-    values = _usable(image, mask)
+    values, step = _spread_steps(_usable(image, mask))
     level = np.median(values)
     sigma = np.median(np.abs(values - level)) / HALF_WIDTH
     for _ in range(MAX_ROUNDS):
@@ -48,7 +56,23 @@ def background(image, mask=None) -> tuple[float, float]:
         if kept.all():
             break
         values = values[kept]
+    if step and sigma:
+        sigma = math.sqrt(max(sigma**2 - step**2 / 12, 0))  # what spreading has added
     return float(level), float(sigma)
+
+
+def _spread_steps(values):
+    """Values (n,) with equal ones spread evenly over the step between neighbouring ones, and the
+    step; as they are, and 0, where few are equal, or more than half."""
+    some = values[:: max(1, values.size // SOME)]
+    if 2 * np.unique(some).size > some.size:
+        return values, 0.0
+    steps, counts = np.unique(values, return_counts=True)
+    if EQUAL * steps.size > values.size or 2 * counts.max() > values.size:
+        return values, 0.0
+    step = float(np.median(np.diff(steps)))
+    rank = np.arange(values.size) - np.repeat(np.cumsum(counts) - counts, counts)
+    return np.repeat(steps, counts) + step * ((rank + 0.5) / np.repeat(counts, counts) - 0.5), step
 
 
 def noise_sigma(image, mask=None) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -135,6 +136,14 @@ class Observation(ReadOnly, ShownObservation, DerivedQuantities):
     def label(self) -> str:
         """What messages call this observation: its name, or else its channels."""
         return self.name or f"with channels {', '.join(self.channels)}"
+
+
+def masked(observation, pixels) -> Observation:
+    """The same observation with the pixels (C, Ny, Nx) bool masked: their weight is 0."""
+    made = copy.copy(observation)
+    made.__dict__.pop("white", None)  # that of the observation before
+    made._set(weights=np.where(pixels, 0.0, observation.weights))
+    return made
 
 
 def check_observations(observations):

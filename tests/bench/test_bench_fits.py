@@ -170,10 +170,10 @@ def test_real_scene_files_hold_nothing_but_defaults(data, tmp_path):
     assert paths.keys() == {"hst_hsc", "hst", "hsc"}
     joint = read_scene(paths["hst_hsc"])
     assert [o.name for o in joint.observations] == ["HST", "HSC"]
-    assert joint.settings.fit_shifts
-    assert str(replace(joint.settings, fit_shifts=False, fit_sky=False)) == str(Settings())
+    assert joint.settings.fit_shifts is True
+    assert str(replace(joint.settings, fit_shifts="auto", fit_sky=False)) == str(Settings())
     assert joint.sources is None
-    assert not read_scene(paths["hst"]).settings.fit_shifts
+    assert read_scene(paths["hst"]).settings.fit_shifts == "auto"
 
 
 def test_throughput(tmp_path):

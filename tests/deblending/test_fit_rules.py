@@ -172,7 +172,7 @@ def test_blends_of_one_size_keep_it_and_others_share_one(monkeypatch):
 
     def fitted(blends, *, pad, **_):
         pads.append(pad)
-        return [(Failure(b, "not asked"), None) for b in blends]
+        return [(Failure(b, "not asked"), ((), ())) for b in blends]
 
     monkeypatch.setattr(batch, "_fit_all", fitted)
     monkeypatch.setattr(batch, "get_device", lambda device: device)

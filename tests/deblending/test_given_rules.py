@@ -29,7 +29,7 @@ def test_defaults_are_those_of_the_docstring():
     """Steps, errors and tolerances as they are documented, and measured."""
     s = Settings()
     assert (s.max_iter, s.enough, s.tol, s.flux_floor) == (500, 0.25, 1e-5, 0.0005)
-    assert (s.psf_error, s.psf_tolerance, s.fit_shifts, s.fit_sky) == (0.03, 1e-3, False, False)
+    assert (s.psf_error, s.psf_tolerance, s.fit_shifts, s.fit_sky) == (0.03, 1e-3, "auto", False)
     assert s.learns and s.constraints is None and s.prior == LearnedPrior()
     steps = s.step_sizes
     assert (steps.latent, steps.morphology, steps.spectrum) == (0.1, 0.01, 0.1)
@@ -47,7 +47,7 @@ def test_defaults_are_those_of_the_docstring():
         ("flux_floor", [-1e-9, 1.0, np.inf], [0, 0.99]),
         ("psf_error", [-1e-9, 1.0], [0, 0.99]),
         ("psf_tolerance", [-1e-9, 1.0], [0, 0.99]),
-        ("fit_shifts", [1, "no", None], [True, np.False_]),
+        ("fit_shifts", [1, "no", None], [True, np.False_, "auto"]),
         ("fit_sky", [1, "no", None], [True, np.False_]),
         ("prior", [3, "none"], [None, Prior(), LearnedPrior()]),
         ("constraints", [Positivity(), [Positivity()]], [None, Chain(Positivity())]),

@@ -10,6 +10,7 @@ from helpers.scenes import GALAXIES, SHAPE, blend, fit, frame, same
 
 from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.image_profiles import with_image_profiles
+from clresample.deblending.inspection.inspect import InputWarning
 from clresample.deblending.settings import Settings
 from clresample.sky.frame import model_frame
 from clresample.sky.observation import Observation
@@ -175,7 +176,9 @@ def test_what_one_instrument_sees_alone_is_light(device):
 def test_a_background_that_is_fitted_is_no_light(device):
     b = blend(shape=(120, 120), sky=(0.5, 0.5, 0.5))
     b = replace(b, sources=(*b.sources, Extended(position_px=(90, 95))))
-    assert fit(b, device, settings=SHORT).messages == ()
+    with pytest.warns(InputWarning, match="sky is left in"):
+        found = fit(b, device, settings=SHORT).messages
+    assert not any("far from any light" in m for m in found)
     with pytest.warns(SourceWarning):
         result = fit(b, device, settings=replace(SHORT, fit_sky=True))
     assert len(result.messages) == 1
@@ -190,4 +193,4 @@ def test_where_nothing_was_seen_there_is_no_light(device):
     seen = Extended(position_px=GALAXIES[0][0], observation="e")
     with pytest.warns(SourceWarning, match="1 source lies"):
         result = deblend(b.observations, [seen, corner], device=device, settings=SHORT)
-    assert result.messages[0].startswith("source 1 at")
+    assert any(m.startswith("source 1 at") for m in result.messages)

@@ -5,6 +5,7 @@ import pytest
 
 from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.blend import Blend
+from clresample.deblending.inspection.inspect import InputWarning
 from clresample.deblending.settings import Settings
 from clresample.deblending.shifts import ahead, shift_steps
 from clresample.deblending.solver.scene import Scene, State
@@ -75,12 +76,34 @@ def test_shifts_that_cannot_be_are_refused(shifts):
         deblend(b.observations, b.sources, frame=b.frame, shifts=shifts)
 
 
-def test_without_being_asked_nothing_moves(device):
+@pytest.mark.parametrize("choice", ["auto", False])
+def test_a_shift_is_measured_and_fitted_unless_refused(device, choice):
     b = blend((1.2, -0.8))
-    result = deblend(
-        b.observations, b.sources, frame=b.frame, device=device, settings=Settings(max_iter=30)
+    settings = Settings(fit_shifts=choice, max_iter=40)
+    with pytest.warns(InputWarning, match=r"light in gr lies at .* their WCS disagree"):
+        result = deblend(b.observations, b.sources, frame=b.frame, device=device, settings=settings)
+    if choice:
+        np.testing.assert_allclose(result.shifts[1], (1.2, -0.8), atol=0.1)
+    else:
+        assert not result.shifts.any()
+
+
+def test_what_agrees_is_fitted_as_without_shifts(device):
+    """To the last bit, one by one and in a batch with one that is moved."""
+    b, moved = blend((0, 0)), blend((1.2, -0.8))
+    given = {"frame": b.frame, "device": device}
+    auto, fixed = (
+        deblend(
+            b.observations, b.sources, settings=Settings(fit_shifts=choice, max_iter=20), **given
+        )
+        for choice in ("auto", False)
     )
-    assert not result.shifts.any()
+    np.testing.assert_array_equal(auto.losses, fixed.losses)
+    np.testing.assert_array_equal(auto.components[0].flux, fixed.components[0].flux)
+    with pytest.warns(InputWarning, match="1 blend has problems"):
+        many = deblend_many([b, moved], settings=Settings(max_iter=20), device=device)
+    assert not many[0].shifts.any() and many[1].shifts.any()
+    np.testing.assert_array_equal(many[0].losses, fixed.losses)
 
 
 def test_batches_find_the_shifts_of_single_fits(device):

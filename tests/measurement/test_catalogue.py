@@ -1,6 +1,7 @@
 """A catalogue's names, flags, and sources that were not fitted."""
 
 import numpy as np
+import pytest
 from astropy import units as u
 from helpers.blends import (
     MIDDLE,
@@ -17,6 +18,7 @@ from clresample.measurement.catalogue import MEANINGS, Flag, catalogue
 from clresample.measurement.photometry import redistribute
 from clresample.measurement.quality import summary
 from clresample.sky.grid import Grid
+from clresample.sky.observation import Observation
 from clresample.sky.sources import Extended, Point
 
 
@@ -95,6 +97,20 @@ def test_saturated_is_a_star_with_masked_pixels_in_its_core():
             "sources": (source(position_px=(30.0, 36.0)),),
         }
         assert flags(one_source(**given)) == [expected]
+
+
+@pytest.mark.parametrize("reach, light, expected", [(1, 50, True), (0, 50, False), (1, 5, False)])
+def test_saturated_is_a_bright_galaxy_with_half_of_its_core_masked(reach, light, expected):
+    grid = Grid.flat((60, 70), SCALE)
+    weights = np.ones((2, 60, 70))
+    weights[1, 30 - reach : 31 + reach, 36 - reach : 37 + reach] = 0
+    data = np.zeros((2, 60, 70))
+    data[1, 30, 38] = light
+    o = observe(grid, ("g", "r"), weights=weights)
+    o = Observation(data, o.psf, grid, weights=weights, channels=o.channels, name=o.name)
+    source = (Extended(position_px=(30.0, 36.0)),)
+    (found,) = flags(one_source(observations=[o], sources=source))
+    assert bool(found & Flag.SATURATED) == expected
 
 
 def test_a_core_is_as_large_as_the_psf_of_larger_pixels():

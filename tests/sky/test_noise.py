@@ -75,3 +75,22 @@ def test_the_scatter_below_zero_knows_nothing_of_sources():
         assert sigma_below_zero(np.abs(image)) is None
         assert sigma_below_zero(-np.abs(image[:1, :31])) is None
     assert sigma_below_zero(-np.abs(image[:1, :32])) > 0
+
+
+@pytest.mark.parametrize("step", [1.0, 0.37])
+@pytest.mark.parametrize("sigma", [0.8, 1.3, 2.0, 3.4, 7.7])
+def test_noise_of_images_in_steps(sigma, step):
+    """Of whole numbers the MAD is one too: 2 or 3 where sigma is 3.4, which is 2.97 or 4.46."""
+    whole = np.rint(np.random.default_rng(4).normal(50.3, sigma, (100, 100)))
+    level, found = background(step * whole - 7)
+    assert found == pytest.approx(step * np.hypot(sigma, 12**-0.5), rel=0.03)
+    assert level == pytest.approx(step * 50.3 - 7, abs=0.06 * step * sigma)
+
+
+def test_values_that_are_few_are_no_steps():
+    assert background(np.zeros((20, 20))) == (0.0, 0.0)
+    rng = np.random.default_rng(1)
+    filled = rng.normal(0, 1, 400)
+    filled[:90] = 0.0  # among floats
+    apart = filled + 1e-9 * rng.normal(0, 1, 400)
+    assert background(filled)[1] == pytest.approx(background(apart)[1], rel=1e-6)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from clresample.sky.psf import PSF
-from clresample.sky.psf_checks import PSFWarning
+from clresample.sky.psf_checks import PSFWarning, limit_power
 from clresample.sky.waves import cos_sin_columns, even_waves, phases
 
 NU_Y, NU_X = np.arange(-16, 17) / 33, np.arange(0, 20) / 39
@@ -215,6 +215,17 @@ def test_a_core_off_the_centre_is_warned_of_once_with_figures():
         assert figure in str(warned[0].message)
     assert PSF(image, center=(10, 10)).warnings() == []
     assert PSF(image, center="core").warnings() == []
+
+
+def test_samples_that_are_too_coarse_are_warned_of():
+    for sigma in (0.4, 0.3):
+        with pytest.warns(PSFWarning, match="sampled too coarsely, band 0: .*`spacing`"):
+            PSF.gaussian(sigma)
+    assert PSF.gaussian(0.4, spacing=0.25, n_pixels=81).warnings() == []
+    assert PSF.gaussian(0.8).warnings() == []
+    images = PSF.gaussian(0.8).images
+    nyquist = np.exp(-2 * (np.pi * 0.8 / 2) ** 2) * np.sinc(0.5)
+    np.testing.assert_allclose(limit_power(images), nyquist, rtol=1e-3)
 
 
 def test_light_cut_at_the_edge_is_warned_of():

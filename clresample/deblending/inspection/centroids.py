@@ -1,0 +1,90 @@
+"""Distances of the light's centroids from the places of the sources, in every channel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .image import SIGMAS_A_FWHM, Image
+
+# [sigma] Sources this bright in a channel have a centroid to a tenth of the PSF's width.
+BRIGHT_SIGMAS = 20.0
+# [standard deviations of the weight] Half-width of the pixels about a source.
+REACH = 2.5
+# Part of its shift by which a weighted centroid moves: half for light as wide as the weight, less
+# for wider light, of which it says little from a tenth on.
+LEAST_RESPONSE = 0.1
+# [px] Centroids are trusted to no better than this: neighbours, structure, errors of the PSF.
+FLOOR_PX = 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class Centroids:
+    """Offsets of light from the places of an Image's bright sources.
+
+    sources (n,): numbers of the sources
+    offsets (n, C, 2) [px]: of the light within about the PSF's width, (y, x)
+    errors (n, C) [px]: infinite where a channel is too faint
+    """
+
+    sources: np.ndarray
+    offsets: np.ndarray
+    errors: np.ndarray
+
+
+def centroids(image: Image) -> Centroids:
+    """The Centroids of the brightest sources of an Image.
+
+        m1 = sum w z r / sum w z,    m2 = sum w z r^2 / (2 sum w z),    offset = m1 / (1 - m2 / s^2)
+
+    z: significance; r: from the place; w: Gaussian of standard deviation s, that of the PSF. The
+    offset is exact for Gaussian light of any width.
+    """
+    chosen = image.brightest
+    width = np.maximum(image.observation.psf.fwhm_px / SIGMAS_A_FWHM, 0.7)  # a pixel's at least
+    reach = int(np.ceil(REACH * width.max()))
+    y, x, on = image.patches(chosen, reach)
+    usable = image.usable[:, y, x] & on
+    light = np.where(usable, image.significance[:, y, x], 0)  # (C, n, h, h)
+    dy = y - image.places[chosen, 0, None, None]
+    dx = x - image.places[chosen, 1, None, None]
+    square = dy**2 + dx**2
+    weight = np.exp(-0.5 * square / (width**2)[:, None, None, None])
+    whole = (usable | (square > (width.max() * 1.5) ** 2)).all(axis=(2, 3))  # (C, n)
+    weighted = weight * light
+    total = weighted.sum(axis=(2, 3))
+    noise = np.sqrt((weight**2).sum(axis=(2, 3)))
+    good = whole & (total > BRIGHT_SIGMAS * noise)
+    total = np.where(good, total, 1.0)
+    first = np.stack([(weighted * d).sum(axis=(2, 3)) for d in (dy, dx)], axis=-1)
+    second = (weighted * square).sum(axis=(2, 3)) / (2 * total)
+    response = 1 - second / (width**2)[:, None]
+    good &= response > LEAST_RESPONSE
+    response = np.where(good, response, 1.0)
+    error = np.sqrt((weight**2 * square).sum(axis=(2, 3)) / 2) / total / response
+    error = np.where(good, np.hypot(error, FLOOR_PX), np.inf)
+    offsets = first / (total * response)[..., None]
+    return Centroids(chosen, offsets.swapaxes(0, 1), error.T)
+
+
+def over_channels(found) -> tuple[np.ndarray, np.ndarray]:
+    """Offsets (n, 2) and errors (n,) of Centroids from all channels together."""
+    weight = found.errors**-2.0
+    total = weight.sum(axis=1)
+    safe = np.where(total > 0, total, 1.0)
+    offsets = np.einsum("nc,ncd->nd", weight, found.offsets) / safe[:, None]
+    return offsets, np.where(total > 0, safe**-0.5, np.inf)
+
+
+def common(offsets, errors) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted mean (2,) of offsets (n, 2) with errors (n,), and its error (2,), which is that of
+    their scatter where this is larger; infinite of none."""
+    weight = errors**-2.0
+    total = weight.sum()
+    if not total > 0:
+        return np.zeros(2), np.full(2, np.inf)
+    mean = weight @ offsets / total
+    n = np.count_nonzero(weight)
+    rest = (weight[:, None] * (offsets - mean) ** 2).sum(axis=0)
+    return mean, np.sqrt(np.maximum(1.0, rest / max(n - 1, 1)) / total)

@@ -1,0 +1,183 @@
+"""Shift between two images of one patch of sky, measured without a model of it.
+
+Either image convolved with the other's PSF has one PSF, the convolution of both. The light of the
+sharper one, A, is parted among the sources by nearness, so that each may have any colour, and
+
+    V = b + sum_s [ a_s U_s - a_s t_s . grad U_s ],    V = P_A * d_B,    U_s = P_B * d_A of source s
+
+is fitted to V at the pixels of B, to first order in the shifts t_s.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft
+from scipy.ndimage import map_coordinates
+
+from ...sky.psf import PSF
+
+# [FWHM of the wider PSF] Radius of the pixels about a source that are compared.
+RADIUS_FWHM = 1.2
+# Relative weight of "nothing" beside sources that the images hardly tell apart: rounding's.
+RIDGE = 1e-10
+# Pixels that a fit takes at least, beside three for each source.
+MIN_PIXELS = 12
+# [px of the coarser image] A source's shift is trusted to no better than this: neighbours of other
+# colours, structure, and errors of the PSFs.
+FLOOR_PX = 0.02
+# Part of a neighbour's light that is taken to lie elsewhere than the sharper image has it, as
+# colours differ inside galaxies and light is parted by nearness alone.
+COLOUR = 0.2
+# [FWHM] Half-width of the image of a PSF that is convolved with: of light further out, which is
+# spread evenly about a source, no shift follows.
+KERNEL_FWHM = 3.0
+# Part of a pixel's light that comes from unusable pixels, above which it is left out.
+HIDDEN = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """One channel of an Image.
+
+    data (My, Mx) [counts]: above the sky, 0 where not usable; usable (My, Mx): bool
+    sigma [counts]; psf: PSF of one band; matrix, offset: as those of Image
+    """
+
+    data: np.ndarray
+    usable: np.ndarray
+    sigma: float
+    psf: PSF
+    matrix: np.ndarray
+    offset: np.ndarray
+
+    @classmethod
+    def of(cls, image, c) -> Plane:
+        """Channel c of an Image."""
+        usable = image.usable[c]
+        data = np.where(usable, image.observation.data[c] - image.level[c], 0)
+        psf = image.observation.psf[c]
+        return cls(data, usable, image.sigma[c], psf, image.matrix, image.offset)
+
+
+def shifts_at(one: Plane, other: Plane, places) -> tuple[np.ndarray, np.ndarray]:
+    """Shifts of sources' light in the Plane `other` against the sharper one, `one`.
+
+    places (n, 2) [model px]: of the sources
+    returns shifts (n, 2) [px of other] and their errors (n,), infinite where they are not measured
+    """
+    # a position p in `other` lies at matrix p + offset in `one`
+    matrix = one.matrix @ np.linalg.inv(other.matrix)
+    offset = one.offset - matrix @ other.offset
+    area = abs(np.linalg.det(matrix))
+    shape = other.data.shape
+    at = (np.stack([*np.indices(shape)], axis=-1) @ matrix.T + offset).transpose(2, 0, 1)
+    smear, there = Blur(one, other.psf, matrix), Blur(other, one.psf, np.linalg.inv(matrix))
+    near = places @ other.matrix.T + other.offset
+    radius = RADIUS_FWHM * max(other.psf.fwhm_px[0], one.psf.fwhm_px[0] / np.sqrt(area))
+    top = np.array(one.data.shape)[:, None, None] - 1
+    good = other.usable & ((at >= 0) & (at <= top)).all(axis=0) & ~there.hidden
+    if smear.hidden.any():
+        good &= map_coordinates(smear.hidden.astype(np.float32), at, order=1, mode="nearest") < 0.5
+    good &= _within(shape, near, radius)
+    if good.sum() < MIN_PIXELS + 3 * len(places):
+        return np.zeros((len(places), 2)), np.full(len(places), np.inf)
+    owner = _nearest(one.data.shape, places @ one.matrix.T + one.offset)
+    images = [
+        area * map_coordinates(smear.of(one.data * (owner == s)), at, order=3, mode="constant")
+        for s in range(len(places))
+    ]
+    noise = other.sigma, one.sigma * np.sqrt(area)
+    shifts, errors, brightness = _solved(images, there.of(other.data), good, noise)
+    parts = np.array([_foreign(images, brightness, s, near[s], radius) for s in range(len(near))])
+    return shifts, np.hypot(errors, COLOUR * parts * radius)
+
+
+def _foreign(images, brightness, s, place, radius):
+    """Light of other sources near source s that has another colour than this one's, as part of its
+    own light; infinite without any of its own."""
+    y, x = (np.arange(n) - p for n, p in zip(images[s].shape, place, strict=True))
+    near = y[:, None] ** 2 + x**2 <= radius**2
+    light = np.array([np.abs(image[near]).sum() for image in images])
+    if not (brightness[s] > 0 and light[s] > 0):
+        return np.inf
+    return (np.abs(brightness / brightness[s] - 1) @ light) / light[s]
+
+
+def _within(shape, places, radius):
+    """Pixels of an image of this shape within a radius [px] of one of the places (n, 2)."""
+    y, x = np.arange(shape[0])[:, None], np.arange(shape[1])
+    near = np.zeros(shape, bool)
+    for a, b in places:
+        near |= (y - a) ** 2 + (x - b) ** 2 <= radius**2
+    return near
+
+
+def _nearest(shape, places):
+    """Which of the places (n, 2) [px] is the nearest to each pixel: (Ny, Nx)."""
+    y, x = np.arange(shape[0])[:, None], np.arange(shape[1])
+    return np.stack([(y - a) ** 2 + (x - b) ** 2 for a, b in places]).argmin(axis=0)
+
+
+def _solved(images, there, good, noise):
+    """Shifts (n, 2), their errors (n,) and the brightness (n,) of sources' images (n) in the image
+    `there`, from the good pixels; noise: of a pixel of either."""
+    n = len(images)
+    light = np.stack([image[good] for image in images])
+    slopes = np.stack([[s[good] for s in np.gradient(image)] for image in images])  # (n, 2, P)
+    value = there[good]
+    a = _brightness(light, value, noise[0])
+    moving = -(a[:, None, None] * slopes).reshape(2 * n, -1)
+    design = np.vstack([np.ones_like(value), light, moving])
+    scale = np.maximum(np.sqrt((design**2).sum(axis=1)), 1e-300)
+    design /= scale[:, None]
+    normal = design @ design.T
+    inverse = np.linalg.inv(normal + RIDGE * np.eye(len(normal)))
+    solution = inverse @ (design @ value)
+    rest = value - solution @ design
+    variance = noise[0] ** 2 + (np.abs(a).max() * noise[1]) ** 2
+    variance = max(variance, (rest @ rest) / max(value.size - len(solution), 1))
+    shifts = (solution / scale)[1 + n :].reshape(n, 2)
+    errors = np.sqrt(variance * np.diag(inverse)) / scale
+    errors = np.hypot(*errors[1 + n :].reshape(n, 2).T) / np.sqrt(2)
+    errors = np.where(a > 0, np.hypot(errors, FLOOR_PX), np.inf)
+    return shifts, errors, a
+
+
+def _brightness(light, value, sigma):
+    """Brightness (n,) of the light (n, P) of the sources in pixels of `value` (P,), with noise
+    sigma: that of all together, where it cannot be told apart."""
+    total = np.stack([np.ones_like(value), light.sum(axis=0)])
+    background, mean = np.linalg.lstsq(total.T, value, rcond=None)[0]
+    rest = value - background - mean * total[1]
+    normal = light @ light.T + (sigma / max(abs(mean), 1e-300)) ** 2 * np.eye(len(light))
+    return mean + np.linalg.solve(normal, light @ rest)
+
+
+class Blur:
+    """Convolution of images on a Plane's pixels with another PSF.
+
+    hidden (My, Mx): pixels that thereby hold light of unusable ones
+    """
+
+    def __init__(self, plane, psf, matrix):
+        """matrix (2, 2): from the PSF's pixels to the Plane's."""
+        width = psf.fwhm_px[0] * np.sqrt(abs(np.linalg.det(matrix)))
+        reach = int(np.ceil(KERNEL_FWHM * width)) + 1
+        side = 2 * reach
+        nu = np.fft.fftfreq(side), np.fft.rfftfreq(side)
+        kernel = fft.irfft2(psf.otf(*nu, matrix)[0], (side, side))
+        size = [fft.next_fast_len(max(n + reach, side), real=True) for n in plane.data.shape]
+        padded = np.zeros(size)
+        padded[:side, :side] = fft.fftshift(kernel)
+        self._transfer = fft.rfft2(np.roll(padded, (-reach, -reach), (0, 1)))
+        self._size, self._inside = size, tuple(slice(n) for n in plane.data.shape)
+        self.hidden = np.zeros(plane.data.shape, bool)
+        if not plane.usable.all():
+            self.hidden = self.of(~plane.usable) > HIDDEN
+
+    def of(self, image):
+        """An image (My, Mx) convolved, without light from beyond its edges."""
+        transform = fft.rfft2(np.asarray(image, float), self._size) * self._transfer
+        return fft.irfft2(transform, self._size)[self._inside]

@@ -1,0 +1,140 @@
+"""One observation as it is inspected: significance of its pixels, places of the sources."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ...sky.observation import Observation, masked
+
+# [pixels] Noise of a channel: the median of this many weights, evenly spread over the image. Their
+# median is known to a few percent of the spread of weights, which is all that thresholds need.
+N_WEIGHTS = 1000
+# [model px] Lattice of points from which positions in the observation are taken to be affine.
+LATTICE = np.array([(y, x) for y in (0.0, 0.5, 1.0) for x in (0.0, 0.5, 1.0)])
+# Sources that are measured in an image at most, the brightest: more would only cost time.
+MAX_SOURCES = 12
+SIGMAS_A_FWHM = 2.3548  # of a Gaussian
+# Relative size under which an element of a matrix fitted to the lattice is rounding.
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """One Observation with the positions of a blend's sources in its pixels.
+
+    observation: Observation; usable (C, My, Mx): bool, pixels with a weight
+    sigma (C,) [counts]: noise of a typical pixel, 1 of channels without a weight
+    level (C,) [counts]: of the sky, as far as known: 0 before `levels.sky_levels`
+    places (S, 2) [px]: of the sources; inside (S,): bool, those on a pixel of the image
+    matrix (2, 2), offset (2,): p = matrix X + offset, from model pixels to observed ones
+    """
+
+    observation: Observation
+    usable: np.ndarray
+    sigma: np.ndarray
+    level: np.ndarray
+    places: np.ndarray
+    inside: np.ndarray
+    matrix: np.ndarray
+    offset: np.ndarray
+
+    @classmethod
+    def of(cls, observation, frame, positions, shift) -> Image:
+        """The Image of an observation whose pixels are moved by `shift` (2,) [model px], with
+        sources at `positions` (S, 2) [model px] of a Frame."""
+        corner = np.maximum(np.array(frame.shape) - 1.0, 1.0)
+        points = np.concatenate([LATTICE * corner, positions - shift])
+        found = frame.grid.positions_in(observation.grid, *points.T)
+        lattice, places = np.split(found, [len(LATTICE)])
+        design = np.column_stack([LATTICE * corner, np.ones(len(LATTICE))])
+        good = np.isfinite(lattice).all(axis=1)
+        solution = np.linalg.lstsq(design[good], lattice[good], rcond=None)[0]
+        shape = np.array(observation.data.shape[1:])
+        with np.errstate(invalid="ignore"):
+            inside = np.all((places >= -0.5) & (places < shape - 0.5), axis=1)
+        usable = observation.weights > 0
+        sigma = np.array([_typical_sigma(w) for w in observation.weights])
+        matrix = solution[:2].T
+        matrix[np.abs(matrix) < ROUNDING * np.abs(matrix).max()] = 0  # upright grids stay upright
+        offset = solution[2] - matrix @ shift
+        level = np.zeros(len(sigma))
+        return cls(observation, usable, sigma, level, places, inside, matrix, offset)
+
+    def over(self, level) -> Image:
+        """The same Image with the level (C,) [counts] of its sky known."""
+        return replace(self, level=level)
+
+    def without(self, pixels) -> Image:
+        """The same Image of the observation with the pixels (C, My, Mx) masked."""
+        observation, usable = masked(self.observation, pixels), self.usable & ~pixels
+        return replace(self, observation=observation, usable=usable)
+
+    @cached_property
+    def significance(self) -> np.ndarray:
+        """Data above the level (C, My, Mx) [sigma of each pixel], 0 where not usable; float32."""
+        data = self.observation.data - self.level[:, None, None]
+        return np.where(self.usable, data * np.sqrt(self.observation.weights), 0).astype(np.float32)
+
+    @cached_property
+    def smooth(self) -> np.ndarray:
+        """Signal to noise (My, Mx) of points, all channels together with equal weight [1].
+
+        Smoothed with a Gaussian as wide as the PSF: near a matched filter, whatever the PSF.
+        """
+        from scipy.ndimage import gaussian_filter
+
+        width = max(self.width_px / SIGMAS_A_FWHM, 0.5)  # narrower ones are a single pixel
+        total = self.significance.sum(axis=0) / np.sqrt(len(self.significance))
+        smooth = gaussian_filter(total, width, mode="constant", truncate=3.0)
+        return smooth * (2 * np.sqrt(np.pi) * width)
+
+    @cached_property
+    def light(self) -> np.ndarray:
+        """Signal to noise (S,) of the pixel of `smooth` at each source; 0 outside the image."""
+        y, x = self._nearest()
+        return np.where(self.inside, self.smooth[y, x], 0)
+
+    @cached_property
+    def brightest(self) -> np.ndarray:
+        """Numbers (n,) of the brightest sources on the image, at most MAX_SOURCES."""
+        order = np.argsort(-self.light, kind="stable")
+        return order[self.inside[order]][:MAX_SOURCES]
+
+    def _nearest(self):
+        """Nearest pixels (2, S) of the image to the sources."""
+        top = np.array(self.usable.shape[1:]) - 1
+        return np.clip(np.rint(np.nan_to_num(self.places)).astype(int), 0, top).T
+
+    @cached_property
+    def width_px(self) -> float:
+        """FWHM [px] of the PSF, the median of the channels'."""
+        return float(np.median(self.observation.psf.fwhm_px))
+
+    def model_places(self, chosen) -> np.ndarray:
+        """Places (n, 2) [model px] of sources `chosen` (n,)."""
+        return (self.places[chosen] - self.offset) @ np.linalg.inv(self.matrix).T
+
+    def patches(self, chosen, reach):
+        """Pixel numbers (n, h, h) [px] in y and in x about the places of sources `chosen` (n,),
+        reach pixels to each side, and which of them lie on the image (n, h, h)."""
+        middle = np.rint(self.places[chosen]).astype(int)
+        span = np.arange(-reach, reach + 1)
+        y = middle[:, :1, None] + span[:, None]
+        x = middle[:, 1:, None] + span
+        y, x = np.broadcast_arrays(y, x)
+        n_y, n_x = self.usable.shape[1:]
+        on = (y >= 0) & (y < n_y) & (x >= 0) & (x < n_x)
+        return np.clip(y, 0, n_y - 1), np.clip(x, 0, n_x - 1), on
+
+
+def _typical_sigma(weights):
+    """1 / sqrt of the median weight [counts] among pixels (My, Mx) that have one; 1 without."""
+    flat = weights.ravel()
+    some = flat[:: max(1, flat.size // N_WEIGHTS)]
+    some = some[some > 0]
+    if not some.size:
+        some = flat[flat > 0]
+    return 1 / np.sqrt(np.median(some)) if some.size else 1.0

@@ -1,0 +1,246 @@
+"""All checks of a blend's observations before its fit, with what is said and what is cured."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...sky.psf_checks import LIMIT_TOLERANCE, limit_power
+from ..blend import Blend
+from ..settings import AUTO, Settings
+from . import listing, shifted, spoilt
+from .centroids import centroids
+from .image import Image
+from .levels import SkyLevel, sky_level
+from .stars import misfitting_widths
+
+# A level counts as left in or over-subtracted above this many of its errors, and above this part
+# of a pixel's noise: over 100 pixels of a source that moves a flux by its own error.
+LEVEL_SIGMAS, LEVEL_PART = 4.0, 0.1
+# The same of the light at the rim, which may be that of wings: 4 errors of the flux in 100 pixels,
+# by two errors of its own at least.
+RIM_PART, RIM_SIGMAS = 0.4, 2.0
+# [FWHM], [px] Pixels nearer to a listed source are not masked as cosmic rays: its core may be one
+# of a PSF narrower than the one given.
+CORE_FWHM, CORE_PX = 0.5, 1.5
+
+
+class InputWarning(UserWarning):
+    """Observations or sources that were fitted, with something in them that spoils fluxes."""
+
+
+def warn_of_many(problems):
+    """Warn once of the problems of blends, a list of messages of each."""
+    n = len(problems)
+    warnings.warn(
+        f"{n} blend{'s have' if n > 1 else ' has'} problems with observations or sources, such as: "
+        f"{problems[0][0]}; see the messages of the results",
+        InputWarning,
+        stacklevel=4,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """Results of the inspection of a blend.
+
+    blend: the Blend to be fitted, spoilt pixels masked; the one inspected where there are none
+    settings: Settings with fit_shifts decided
+    shifts (n_observations, 2) [model px]: of the observations, from which a fit of them starts
+    messages: a sentence for each problem
+    levels: SkyLevel of each observation
+    """
+
+    blend: Blend
+    settings: Settings
+    shifts: np.ndarray
+    messages: list[str]
+    levels: list[SkyLevel]
+
+
+def inspect(blend, frame, positions, shifts, settings) -> Inspection:
+    """The Inspection of a Blend with sources at positions (S, 2) [model px] of its Frame.
+
+    shifts (n_observations, 2) [model px]: of the observations, as known; settings: Settings
+    """
+    near = np.flatnonzero(frame.inside(positions))
+    sources = [blend.sources[i] for i in near]
+    messages, levels, images, found = _doubles(blend.sources, positions), [], [], []
+    for observation, shift in zip(blend.observations, shifts, strict=True):
+        image = Image.of(observation, frame, positions[near], shift)
+        levels.append(sky_level(image))
+        image = image.over(levels[-1].level)
+        lines = [] if settings.fit_sky else _level_lines(image, levels[-1])
+        bad, more = _spoilt(image)
+        if bad.any():
+            image = image.without(bad)
+        lines += more + _coarse(observation.psf, observation.channels)
+        found.append(centroids(image))
+        lines += _missing(image) + _widths(image, sources, near)
+        messages += [f"{observation.label}: {line}" for line in lines]
+        images.append(image)
+    messages += _offset(images, found)
+    moved, lines = shifted.disagreements(images, found, settings.fit_shifts)
+    move = moved is not None if settings.fit_shifts == AUTO else bool(settings.fit_shifts)
+    observations = tuple(image.observation for image in images)
+    if any(a is not b for a, b in zip(observations, blend.observations, strict=True)):
+        blend = replace(blend, observations=observations)
+    if moved is not None:
+        shifts = shifts + moved
+    settings = replace(settings, fit_shifts=move)
+    return Inspection(blend, settings, shifts, messages + lines, levels)
+
+
+def _doubles(sources, positions):
+    pairs = listing.doubles(sources, positions)
+    if not pairs:
+        return []
+    some = ", ".join(f"{i} and {j}" for i, j in pairs[:5])
+    return [
+        f"sources {some} lie within {listing.SAME_PLACE_PX:g} model pixel of each other: no image "
+        "tells their fluxes apart; if they are one source listed twice, leave one out"
+    ]
+
+
+def _level_lines(image, sky):
+    """What is said of a SkyLevel that is not zero, and of a rim that is not dark."""
+    part, error = sky.level / image.sigma, sky.error / image.sigma
+    known = np.isfinite(error)
+    wrong = known & (np.abs(part) > np.maximum(LEVEL_SIGMAS * error, LEVEL_PART))
+    if known.any():  # all channels together: what wings leave unsure is common to them
+        mean, shared = part[known].mean(), (sky.wings / image.sigma)[known].mean()
+        own = np.maximum(error[known] ** 2 - (sky.wings / image.sigma)[known] ** 2, 0).sum()
+        total = np.hypot(shared, np.sqrt(own) / known.sum())
+        wrong |= known & (abs(mean) > max(LEVEL_SIGMAS * total, LEVEL_PART)) & (part * mean > 0)
+    # light is positive: where the rim is not below zero, the sky need not be
+    rim, rim_error = sky.rim / image.sigma, sky.rim_error / image.sigma
+    wrong &= (part > 0) | (rim < -np.maximum(LEVEL_SIGMAS * rim_error, LEVEL_PART))
+    lines = []
+    for chosen, what, cure in (
+        (wrong & (part > 0), "sky is left in", "subtract it"),
+        (wrong & (part < 0), "too much sky was subtracted", "add it back"),
+    ):
+        if chosen.any():
+            lines.append(
+                f"{what}: pixels without a source have the level {_parts(image, sky.level, chosen)}"
+                f" a pixel, and every flux holds its share of it; {cure}, or give fit_sky=True"
+            )
+    if lines or not np.isfinite(rim_error).all():
+        return lines
+    if rim.mean() > RIM_PART + RIM_SIGMAS * rim_error.mean() / np.sqrt(len(rim)):
+        lines.append(
+            "the pixels furthest from the sources are not dark, "
+            f"{_parts(image, sky.rim, rim > 0)} a pixel: sky is left in, or wings of the sources "
+            "end beyond the image, and fluxes hold a part of it; give fit_sky=True or a larger "
+            "image"
+        )
+    return lines
+
+
+def _parts(image, level, chosen):
+    """Levels (C,) [counts] of the channels chosen, in words."""
+    return ", ".join(
+        f"{name} {level[c] / image.sigma[c]:+.3g} sigma ({level[c]:+.4g} counts)"
+        for c, name in enumerate(image.observation.channels)
+        if chosen[c]
+    )
+
+
+def _spoilt(image):
+    """Pixels (C, My, Mx) to mask, and what is said of them."""
+    names, lines = image.observation.channels, []
+    full = spoilt.saturated(image)
+    for c in np.flatnonzero(full.any(axis=(1, 2))):
+        y, x = np.argwhere(full[c])[0]
+        lines.append(
+            f"channel {names[c]} is saturated: {full[c].sum()} pixels from (y, x) = ({y}, {x}) on, "
+            "flat tops or above `saturation` and what touches them, are masked"
+        )
+    if full.any():
+        image = image.without(full)
+    sharp = spoilt.sharper_than_psf(image)
+    if not sharp.any():
+        return full, lines
+    on_source = sharp & _cores(image)
+    repeated = sharp & (sharp.sum(axis=0) > 1)
+    kept = on_source | repeated
+    for c in np.flatnonzero(kept.any(axis=(1, 2))):
+        y, x = np.argwhere(kept[c])[0]
+        lines.append(
+            f"channel {names[c]} has light sharper than its PSF at (y, x) = ({y}, {x}), "
+            f"{'on a source' if on_source[c].any() else 'in other channels too'}: the PSF is too "
+            "wide, or a cosmic ray lies there; it is fitted as it is: mask it if it is none of the "
+            "sky's"
+        )
+    rays = spoilt.grown(sharp & ~kept) & image.usable & ~kept
+    for c in np.flatnonzero(rays.any(axis=(1, 2))):
+        y, x = np.argwhere((sharp & ~kept)[c])[0]
+        lines.append(
+            f"channel {names[c]} has {(sharp & ~kept)[c].sum()} pixels sharper than its PSF, "
+            f"cosmic rays or hot pixels, the first at (y, x) = ({y}, {x}): they and those beside "
+            "them are masked"
+        )
+    return full | rays, lines
+
+
+def _cores(image):
+    """Pixels (My, Mx) in the core of a listed source."""
+    n_y, n_x = image.usable.shape[1:]
+    reach = max(CORE_FWHM * image.width_px, CORE_PX)
+    core = np.zeros((n_y, n_x), bool)
+    for y, x in image.places[image.inside]:
+        core |= np.hypot(np.arange(n_y)[:, None] - y, np.arange(n_x) - x) <= reach
+    return core
+
+
+def _coarse(psf, channels):
+    """What is said of a PSF whose samples are too coarse."""
+    limit = limit_power(psf.images)
+    names = [name for name, part in zip(channels, limit, strict=True) if part > LIMIT_TOLERANCE]
+    if not names:
+        return []
+    return [
+        f"the PSF of {', '.join(names)} is sampled too coarsely: {100 * limit.max():.0f} % of its "
+        "transform is left at the samples' limit, and models are wrong by about as much; give an "
+        "oversampled image with its `spacing`"
+    ]
+
+
+def _missing(image):
+    peaks = listing.unlisted(image)
+    if not peaks:
+        return []
+    some = ", ".join(f"({y}, {x}) at {value:.0f} sigma" for value, y, x in peaks[:3])
+    return [
+        f"light that no source is listed for, brightest at (y, x) = {some}: it goes to the "
+        "neighbours; list it, or run detection"
+    ]
+
+
+def _offset(images, found):
+    """What is said of positions that are off in the sharpest Image, of the Centroids in each."""
+    i = shifted.sharpest(images)
+    offset = listing.common_offset(found[i])
+    if offset is None:
+        return []
+    (y, x), error = offset
+    return [
+        f"{images[i].observation.label}: the sources' light lies at ({y:+.2f}, {x:+.2f}) +- "
+        f"{error.max():.1g} pixels (y, x) from their positions: these are wrong by as much (the "
+        "centre of the first pixel is (0, 0), FITS counts from 1), or the WCS is"
+    ]
+
+
+def _widths(image, sources, numbers):
+    """What is said of a PSF that the sources disagree with."""
+    lines = []
+    for i, c, part, error in misfitting_widths(image, sources):
+        how = "narrower" if part < 0 else "wider"
+        which = "too wide" if part < 0 else "too narrow, or the source is no star"
+        lines.append(
+            f"source {numbers[i]} is {how} than the PSF of {image.observation.channels[c]} by "
+            f"{100 * abs(part):.0f} +- {100 * error:.1g} %: the PSF is {which}"
+        )
+    return lines

@@ -1,0 +1,96 @@
+"""Sources as listed against the light in an observation: doubles, missing ones, wrong positions."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+
+from .centroids import common, over_channels
+
+# [model px] Two sources nearer than this share every pixel: no image tells their fluxes apart.
+SAME_PLACE_PX = 1.0
+# [sigma] Light that nobody listed counts from here on, in all channels together.
+UNLISTED_SIGMAS = 10.0
+# Unlisted light is named when it is brighter than this part of the typical listed source: fainter
+# light is given to its neighbours in part, and moves them by less.
+UNLISTED_PART = 0.25
+# [FWHM of the PSF] Light nearer to a listed source belongs to it; at least in pixels.
+OWN_FWHM, OWN_PX = 1.5, 3.0
+# Of a peak: light that stays above this part all the way to a listed source is a part of it.
+SADDLE_PART = 0.5
+N_NEAREST = 6  # sources that light may be a part of, the nearest ones
+# [px], [sigma] Offset that all positions share, from which on it is named, and its significance.
+OFFSET_PX, OFFSET_SIGMAS = 0.6, 4.0
+# Sources from whose scatter the error of an offset is known.
+MIN_SOURCES = 3
+# [px] By which a galaxy's light within the PSF's width lies off its catalogued centre, as a rule.
+OFFSET_FLOOR_PX = 0.2
+
+
+def doubles(sources, positions):
+    """Pairs (i, j) of sources of one kind within a pixel of each other; positions (S, 2)
+    [model px]."""
+    return [
+        (i, j)
+        for i, j in combinations(range(len(sources)), 2)
+        if type(sources[i]) is type(sources[j])
+        and np.hypot(*(positions[i] - positions[j])) < SAME_PLACE_PX
+    ]
+
+
+def common_offset(found):
+    """Offset (2,) [px] and its error (2,) of the light from all sources, of their Centroids; None
+    where there is none that is significant."""
+    offsets, errors = over_channels(found)
+    errors = np.hypot(errors, OFFSET_FLOOR_PX)
+    if np.isfinite(errors).sum() < MIN_SOURCES:
+        return None
+    offset, error = common(offsets, errors)
+    far = np.hypot(*offset) > OFFSET_PX and np.hypot(*(offset / error)) > OFFSET_SIGMAS
+    return (offset, error) if far else None
+
+
+def unlisted(image):
+    """Peaks [(significance [sigma], y, x [px])] of an Image's light that no source lies at, the
+    brightest first."""
+    peaks = _peaks(image.smooth)
+    if not len(peaks):
+        return []
+    places = image.places[np.isfinite(image.places).all(axis=1)]
+    if not image.inside.any():
+        return []  # sources all lie outside, which is reported by itself
+    # what is masked may be as bright as anything
+    smooth = np.where(image.usable.all(axis=0), image.smooth, np.inf)
+    own = max(OWN_FWHM * image.width_px, OWN_PX)
+    least = UNLISTED_PART * np.median(np.maximum(image.light[image.inside], 0))
+    found = []
+    for y, x in peaks:
+        value = image.smooth[y, x]
+        away = np.hypot(*(places - (y, x)).T)
+        if value < least or away.min() < own:
+            continue
+        nearest = places[away.argsort()[:N_NEAREST]]
+        if not any(_joined(smooth, (y, x), value, place) for place in nearest):
+            found.append((float(value), int(y), int(x)))
+    return sorted(found, reverse=True)
+
+
+def _peaks(smooth):
+    """Local maxima (n, 2) above UNLISTED_SIGMAS, those on the outermost pixels left out."""
+    inner = smooth[1:-1, 1:-1]
+    top = inner > UNLISTED_SIGMAS
+    if not top.any():
+        return np.zeros((0, 2), int)
+    for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)):
+        n_y, n_x = smooth.shape
+        top &= inner >= smooth[1 + dy : n_y - 1 + dy, 1 + dx : n_x - 1 + dx]
+    return np.argwhere(top) + 1
+
+
+def _joined(smooth, peak, value, place):
+    """Whether the light stays high on the straight line from a peak of this value to a source."""
+    n = int(np.ceil(np.hypot(*(np.asarray(place) - peak)))) + 1
+    line = np.linspace(peak, place, n)
+    y, x = np.clip(np.rint(line).astype(int), 0, np.array(smooth.shape) - 1).T
+    return smooth[y, x].min() > SADDLE_PART * value

@@ -1,0 +1,135 @@
+"""Observations, and channels of one, whose light lies at different places of the sky."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..settings import AUTO
+from .centroids import common, over_channels
+from .disagreement import Plane, shifts_at
+
+# [model px] Shifts from here on count: world coordinates of good surveys agree to about this, and
+# smaller ones move fluxes by less than the PSF's errors do.
+LEAST_SHIFT_PX = 0.25
+# [px] The same between channels of one observation.
+LEAST_CHANNEL_PX = 0.15
+# [sigma] significance of a shift; between channels, of which there are many more, colours that
+# differ inside a galaxy count as one too.
+SHIFT_SIGMAS, CHANNEL_SIGMAS = 3.0, 5.0
+# Part of LEAST_SHIFT_PX from which on centroids call for a closer look, as neighbours move them.
+CLOSER = 0.5
+# Channels of each observation that are compared, those of most light.
+MAX_CHANNELS = 2
+# [px of the coarser image] Shifts of single sources known no better tell nothing.
+MAX_ERROR_PX = 0.5
+
+
+def disagreements(images, found, fit_shifts):
+    """Shifts (n_observations, 2) [model px] that bring observations together which disagree, the
+    first at rest; None where none do. And a sentence on each, also on channels that disagree.
+
+    images, found: Image and Centroids of each observation; fit_shifts: see Settings, with True
+        nothing is measured
+    """
+    if fit_shifts != AUTO and fit_shifts:
+        return None, []
+    lines, moved = [], np.zeros((len(images), 2))
+    first = sharpest(images)
+    for i, image in enumerate(images):
+        lines += _channel_lines(image, found[i])
+        if i == first:
+            continue
+        shift, error = _between(images[first], found[first], image, found[i])
+        if not significant(shift, error):
+            continue
+        moved[i] = -shift
+        names = [images[k].observation.label for k in (first, i)]
+        cure = "the fit moves them" if fit_shifts else "give fit_shifts=True"
+        lines.append(
+            f"light in {names[1]} lies at ({shift[0]:+.2f}, {shift[1]:+.2f}) +- {error.max():.1g} "
+            f"model pixels (y, x) from that in {names[0]}: their WCS disagree; {cure}"
+        )
+    return (moved - moved[0] if fit_shifts and moved.any() else None), lines
+
+
+def significant(shift, error, least=LEAST_SHIFT_PX, sigmas=SHIFT_SIGMAS):
+    """Whether a shift (2,) with errors (2,) is longer than `least`, and than `sigmas` of these,
+    which are no larger than `least`: what is known no better comes from one doubtful source."""
+    known = error.max() < least
+    return known and np.hypot(*shift) > least and np.hypot(*(shift / error)) > sigmas
+
+
+def sharpest(images) -> int:
+    """Which of the Images has the narrowest PSF on the sky."""
+    areas = [max(abs(np.linalg.det(image.matrix)), 1e-30) for image in images]  # [px / model px]
+    widths = [image.width_px / area**0.5 for image, area in zip(images, areas, strict=True)]
+    return int(np.argmin(widths))
+
+
+def _between(one, its, other, theirs):
+    """Shift (2,) [model px] of the light in Image `other` against `one`, and its error (2,); from
+    their Centroids, and where these differ from the images themselves."""
+    _, at, there = np.intersect1d(its.sources, theirs.sources, return_indices=True)
+    ends = []
+    for image, found, chosen in ((one, its, at), (other, theirs, there)):
+        offsets, errors = (values[chosen] for values in over_channels(found))
+        inverse = np.linalg.inv(image.matrix)
+        ends.append((offsets @ inverse.T, errors * np.sqrt(abs(np.linalg.det(inverse)))))
+    (first, first_error), (second, second_error) = ends
+    shift, error = common(second - first, np.hypot(first_error, second_error))
+    if not np.isfinite(error).all() or np.hypot(*shift) < CLOSER * LEAST_SHIFT_PX:
+        return shift, np.full(2, np.inf)
+    return _closer(one, other)
+
+
+def _closer(one, other):
+    """The shift and its error by `shifts_at`, between the channels of most light."""
+    chosen = other.brightest
+    chosen = chosen[one.inside[chosen]]
+    inverse = np.linalg.inv(other.matrix)
+    scale = np.sqrt(abs(np.linalg.det(inverse)))
+    plane = Plane.of(one, _channels_of_light(one)[0])
+    pairs = [
+        _trusted(*shifts_at(plane, Plane.of(other, c), other.model_places(chosen)))
+        for c in _channels_of_light(other)[:MAX_CHANNELS]
+    ]
+    shifts, errors = (np.concatenate(some) for some in zip(*pairs, strict=True))
+    shift, error = common(shifts @ inverse.T, errors * scale)
+    return shift, error * np.sqrt(len(pairs))  # channels share what is wrong with a source
+
+
+def _trusted(shifts, errors):
+    """Shifts and errors, infinite where a shift is hardly known."""
+    return shifts, np.where(errors < MAX_ERROR_PX, errors, np.inf)
+
+
+def _channels_of_light(image):
+    """Channels (C,) of an Image, those in which its sources are brightest first."""
+    light = np.maximum(image.significance, 0) ** 2
+    return np.argsort(-light.sum(axis=(1, 2)), kind="stable")
+
+
+def _channel_lines(image, found):
+    """What is said of channels whose light lies elsewhere than that of the brightest one."""
+    n_channels = found.offsets.shape[1]
+    if n_channels == 1 or not len(found.sources):
+        return []
+    first = _channels_of_light(image)[0]
+    lines = []
+    for c in range(n_channels):
+        if c == first:
+            continue
+        apart = found.offsets[:, c] - found.offsets[:, first]
+        shift, error = common(apart, np.hypot(found.errors[:, c], found.errors[:, first]))
+        if not np.isfinite(error).all() or np.hypot(*shift) < CLOSER * LEAST_CHANNEL_PX:
+            continue
+        planes = Plane.of(image, first), Plane.of(image, c)
+        shift, error = common(*_trusted(*shifts_at(*planes, image.model_places(image.brightest))))
+        if significant(shift, error, LEAST_CHANNEL_PX, CHANNEL_SIGMAS):
+            names = image.observation.channels
+            lines.append(
+                f"{image.observation.label}: light in channel {names[c]} lies at ({shift[0]:+.2f}, "
+                f"{shift[1]:+.2f}) +- {error.max():.1g} pixels (y, x) from that in {names[first]}: "
+                "give the channels as observations of their own, which fit_shifts moves"
+            )
+    return lines

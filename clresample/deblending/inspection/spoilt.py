@@ -1,0 +1,119 @@
+"""Pixels that hold no light of the sky as it is: saturated ones, cosmic rays, hot pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import binary_dilation, label
+
+from ...sky.psf_checks import LIMIT_TOLERANCE, limit_power
+from .psf_samples import pair_ratios
+
+# [sigma] Pixels of a plateau are brighter: noise alone gives images of integers small ones.
+FLAT_SIGMAS = 20.0
+# Connected pixels of one value that make a plateau, and of images of integers, where two bright
+# pixels are equal by chance once in a few sigma [counts].
+FLAT_PIXELS, FLAT_INTEGERS = 3, 5
+# [px] Pixels beside saturated ones have taken some of their charge.
+GROW_PX = 2
+# [sigma] Of 1e6 pixels of noise none is so far off.
+SHARP_SIGMAS = 6.0
+# Part of the brightest pixel near one that is uncertain in it: PSFs are known to a few percent.
+NEIGHBOUR_PART = 0.05
+# PSF images with more of their transform left at their limit (psf_checks.LIMIT_TOLERANCE) are
+# interpolated with errors of that order: their contrast is taken to be this part.
+COARSE_PART = 0.5
+
+
+def saturated(image) -> np.ndarray:
+    """Saturated pixels (C, My, Mx) bool of an Image, and those within 2 px of them.
+
+    Those at or above the observation's saturation, where it has one, and flat tops: connected
+    bright pixels of exactly one value, brighter than all that touch them.
+    """
+    observation = image.observation
+    found = np.zeros(image.usable.shape, bool)
+    limit = getattr(observation, "saturation", None)
+    if limit is not None:
+        limits = np.broadcast_to(np.asarray(limit, float), len(found))
+        with np.errstate(invalid="ignore"):  # NaN: a channel without a limit
+            found |= image.usable & (observation.data >= limits[:, None, None])
+    bright = image.significance > FLAT_SIGMAS
+    for c in np.flatnonzero(bright.any(axis=(1, 2))):
+        found[c] |= _flat_tops(observation.data[c], bright[c])
+    if not found.any():
+        return found
+    ring = np.ones((1, 3, 3), bool)
+    return binary_dilation(found, ring, iterations=GROW_PX)
+
+
+def grown(pixels) -> np.ndarray:
+    """Pixels (C, My, Mx) bool and their eight neighbours, to which charge spreads."""
+    return binary_dilation(pixels, np.ones((1, 3, 3), bool))
+
+
+def _flat_tops(data, bright):
+    """Plateaus (My, Mx) bool of an image among its bright pixels."""
+    found = np.zeros(data.shape, bool)
+    equal = np.zeros(data.shape, bool)
+    down = bright[1:] & (data[1:] == data[:-1])
+    right = bright[:, 1:] & (data[:, 1:] == data[:, :-1])
+    if down.sum() + right.sum() < FLAT_PIXELS - 1:
+        return found
+    equal[1:] |= down
+    equal[:-1] |= down
+    equal[:, 1:] |= right
+    equal[:, :-1] |= right
+    values = data[bright]
+    whole = bool((values == np.rint(values)).all())
+    least = FLAT_INTEGERS if whole else FLAT_PIXELS
+    for value in np.unique(data[equal]):
+        groups, n = label(equal & (data == value))
+        for k in range(1, n + 1):
+            group = groups == k
+            if group.sum() < least:
+                continue
+            around = binary_dilation(group, np.ones((3, 3), bool)) & ~group
+            if not (data[around] > value).any():
+                found |= group
+    return found
+
+
+def sharper_than_psf(image) -> np.ndarray:
+    """Pixels (C, My, Mx) bool of an Image that are sharper than any light behind its PSF.
+
+        kappa v > v_up + v_down + 6 sigma + uncertainty of the PSF, or the same along x
+
+    kappa: `psf_samples.pair_ratios`. None where pixels as negative are as many: the noise is larger
+    than its weights, then. Pixels beside unusable ones and on the edge are left alone.
+    """
+    z, psf = image.significance, image.observation.psf
+    ratios = pair_ratios(psf)
+    ratios = np.where(
+        limit_power(psf.images)[:, None] > LIMIT_TOLERANCE, COARSE_PART * ratios, ratios
+    )
+    found = np.zeros(z.shape, bool)
+    inner = z[:, 1:-1, 1:-1]
+    pairs = (z[:, :-2, 1:-1] + z[:, 2:, 1:-1], z[:, 1:-1, :-2] + z[:, 1:-1, 2:])
+    for axis, pair in enumerate(pairs):
+        kappa = ratios[:, axis].astype(np.float32)[:, None, None]
+        noise = SHARP_SIGMAS * np.sqrt(kappa**2 + 2)
+        found[:, 1:-1, 1:-1] |= kappa * inner > np.maximum(pair, 0) + noise
+    found &= image.usable
+    if not found.any() or (z < -SHARP_SIGMAS).sum() > found.sum() / 4:
+        return np.zeros_like(found)
+    return _confirmed(image, found, ratios)
+
+
+def _confirmed(image, found, ratios):
+    """Those of the pixels found (C, My, Mx) that lie between usable ones, and stay sharper with
+    the uncertainty of the PSF in the light beside them."""
+    z, sure = image.significance, np.zeros_like(found)
+    for c, y, x in np.argwhere(found):
+        near = z[c, max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3]
+        doubt = NEIGHBOUR_PART * near.max()
+        for kappa, (dy, dx) in zip(ratios[c], ((1, 0), (0, 1)), strict=True):
+            both = [(c, y - dy, x - dx), (c, y + dy, x + dx)]
+            if all(image.usable[at] for at in both):
+                least = max(z[both[0]] + z[both[1]], 0) + SHARP_SIGMAS * np.sqrt(kappa**2 + 2)
+                sure[c, y, x] |= kappa * z[c, y, x] > least + doubt
+    return sure

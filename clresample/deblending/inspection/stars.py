@@ -1,0 +1,88 @@
+"""Width of the sources in an observation against its PSF."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...sky.sources import Point
+from .psf_samples import psf_at
+
+# [sigma] Light of a source, in one channel, whose width is then known to a few percent.
+STAR_SIGMAS = 50.0
+# Part by which a PSF is reported to be too wide or too narrow: 5 % moves fluxes by 2.5 sigma beside
+# sources of signal to noise 100 (fluxes of real HSC images), and is what PSFs are known to.
+WIDTH_PART = 0.05
+# [sigma] significance of that
+WIDTH_SIGMAS = 5.0
+# [FWHM] Half-width of the pixels compared; nearer neighbours widen a star.
+REACH_FWHM, NEIGHBOUR_FWHM = 1.5, 4.0
+# Stars measured in an image at most.
+MAX_STARS = 3
+# [1], [px] Steps of the slopes by width and by position: small against the PSF's core.
+WIDTH_STEP, SHIFT_STEP = 0.05, 0.1
+
+
+def misfitting_widths(image, sources):
+    """Sources whose width disagrees with an Image's PSF: [(source, channel, part, error)].
+
+    part: by which the light is wider than the PSF, negative where it is narrower. Of Points, alone
+    within 4 FWHM, both are reported; of other sources only narrower light, which no source behind
+    this PSF has.
+    """
+    found = []
+    for i in image.brightest[:MAX_STARS]:
+        if image.light[i] < STAR_SIGMAS:
+            break
+        star = isinstance(sources[i], Point)
+        if star and not _alone(image, i):
+            continue
+        c, part, error = _width(image, i)
+        if abs(part) < max(WIDTH_PART, WIDTH_SIGMAS * error) or (part > 0 and not star):
+            continue
+        found.append((int(i), c, part, error))
+    return found
+
+
+def _alone(image, i):
+    """Whether no other source lies near to source i."""
+    others = np.delete(image.places, i, axis=0)
+    others = others[np.isfinite(others).all(axis=1)]
+    away = np.hypot(*(others - image.places[i]).T)
+    return not (away < NEIGHBOUR_FWHM * image.width_px).any()
+
+
+def _width(image, i):
+    """Channel of most light of source i, its width against the PSF's (1 + part), and the error.
+
+        d = b + a P(x - p) - a t . grad P + a part dP/dpart,   P wider by part: P(x / (1 + part))
+
+    by least squares; 0 and infinity where it cannot be measured.
+    """
+    reach = int(np.ceil(REACH_FWHM * image.width_px)) + 1
+    y, x, on = image.patches(np.array([i]), reach)
+    y, x, on = y[0], x[0], on[0]
+    light = image.significance[:, y, x]
+    c = int(light.sum(axis=(1, 2)).argmax())
+    good = on & image.usable[c, y, x]
+    if not good.all():
+        return c, 0.0, np.inf
+    dy, dx = y[:, 0] - image.places[i, 0], x[0] - image.places[i, 1]
+    e, s, n = WIDTH_STEP, SHIFT_STEP, len(dy)
+    steps_y = [dy, dy + s, dy - s, dy, dy, dy / (1 + e), dy / (1 - e)]
+    steps_x = [dx, dx, dx, dx + s, dx - s, dx / (1 + e), dx / (1 - e)]
+    psf = image.observation.psf
+    values = psf_at(psf, c, np.concatenate(steps_y), np.concatenate(steps_x)).reshape(7, n, 7, n)
+    here, up, down, right, left, wide, narrow = (values[k, :, k] for k in range(7))
+    slope = (wide / (1 + e) ** 2 - narrow / (1 - e) ** 2) / (2 * e)
+    columns = (np.ones_like(here), here, (up - down) / (2 * s), (right - left) / (2 * s), slope)
+    design = np.stack([column.ravel() for column in columns])
+    design[1:] /= here.max()
+    z = light[c].ravel().astype(float)
+    inverse = np.linalg.pinv(design @ design.T)
+    found = inverse @ (design @ z)
+    if not found[1] * np.sqrt((design[1] ** 2).sum()) > STAR_SIGMAS:
+        return c, 0.0, np.inf
+    rest = z - found @ design
+    spread = max(1.0, float(rest @ rest) / (rest.size - len(found)))
+    part = found[4] / found[1]
+    return c, float(part), float(np.sqrt(inverse[4, 4] * spread) / found[1])

@@ -1,0 +1,226 @@
+"""What is wrong with observations is said before a fit, and cured where that is safe."""
+
+import numpy as np
+import pytest
+
+from clresample.deblending.blend import Blend
+from clresample.deblending.inspection import levels, listing, spoilt
+from clresample.deblending.inspection.image import Image
+from clresample.deblending.inspection.inspect import inspect
+from clresample.deblending.inspection.psf_samples import pair_ratios, psf_at
+from clresample.deblending.settings import Settings
+from clresample.sky.frame import model_frame
+from clresample.sky.grid import Grid
+from clresample.sky.observation import Observation
+from clresample.sky.psf import PSF
+from clresample.sky.sources import Extended, Point
+
+SHAPE, NOISE, FWHM_SIGMA = (64, 60), 2.0, 1.5
+# (y, x) [px], flux [counts] in two channels, sigma [px] of the galaxy before the PSF; 0: a star
+DRAWN = (((20.2, 18.7), (3000, 5000), 1.5), ((24.0, 41.3), (2500, 1500), 2.0))
+DRAWN += (((47.6, 30.1), (2000, 3000), 0.0),)
+
+
+def image_of(drawn=DRAWN, *, seed=0, sky=0.0, sigma=FWHM_SIGMA, shape=SHAPE, noise=NOISE):
+    """Data (2, Ny, Nx) of Gaussian galaxies behind a Gaussian PSF of `sigma` [px]."""
+    y, x = np.indices(shape)
+    data = np.random.default_rng(seed).normal(sky, noise, (2, *shape))
+    for (a, b), fluxes, size in drawn:
+        s2 = size**2 + sigma**2 + 1 / 12
+        light = np.exp(-((y - a) ** 2 + (x - b) ** 2) / (2 * s2)) / (2 * np.pi * s2)
+        data += np.array(fluxes)[:, None, None] * light
+    return data
+
+
+def observed(data, *, sigma=FWHM_SIGMA, name="cam", channels=("g", "r"), **given):
+    grid = Grid.flat(data.shape[-2:], 0.2)
+    given = {"weights": NOISE**-2} | given
+    return Observation(data, PSF.gaussian(sigma), grid, name=name, channels=channels, **given)
+
+
+def sources_of(drawn=DRAWN, kind=Extended):
+    return tuple(kind(position_px=place) for place, _, _ in drawn)
+
+
+def inspected(observations, sources=None, **settings):
+    blend = Blend(tuple(observations), sources or sources_of())
+    frame = model_frame(blend.observations)
+    shifts = np.zeros((len(blend.observations), 2))
+    positions = frame.place(blend.sources, blend.observations)
+    return inspect(blend, frame, positions, shifts, Settings(**settings))
+
+
+def looked_at(observation, sources=None):
+    frame = model_frame([observation])
+    return Image.of(observation, frame, frame.place(sources or sources_of()), np.zeros(2))
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("kind", [Extended, Point])
+def test_of_a_clean_image_nothing_is_said(seed, kind):
+    drawn = DRAWN if kind is Extended else tuple((p, f, 0.0) for p, f, _ in DRAWN)
+    found = inspected([observed(image_of(drawn, seed=seed))], sources_of(drawn, kind))
+    assert found.messages == [] and found.settings.fit_shifts is False
+    assert not found.shifts.any()
+
+
+@pytest.mark.parametrize(
+    "sky, words", [(0.3, "sky is left in"), (-0.3, "too much sky"), (1e4, "in")]
+)
+def test_sky_is_named_with_its_level(sky, words):
+    o = observed(image_of(sky=sky * NOISE))
+    (message,) = inspected([o]).messages
+    assert words in message and "g " in message and "fit_sky=True" in message
+    level = levels.sky_level(looked_at(o))
+    assert np.abs(level.level - sky * NOISE).max() < 4 * level.error.max() < 0.4 * NOISE
+    assert inspected([o], fit_sky=True).messages == []
+
+
+def test_wings_are_no_sky():
+    """A galaxy whose light falls by r^-2.5 to the image's edge."""
+    y, x = np.indices((80, 80)) - 39.5
+    wings = 12000 * (4 + y**2 + x**2) ** -1.25
+    o = observed(image_of((), shape=(80, 80)) + wings)
+    source = (Extended(position_px=(39.5, 39.5)),)
+    level = levels.sky_level(looked_at(o, source))
+    assert (np.abs(level.level) < 3 * level.error).all() and (level.rim > 0.4 * NOISE).all()
+    (message,) = inspected([o], source).messages
+    assert "the pixels furthest from the sources are not dark" in message
+
+
+def test_levels_allow_for_correlated_noise():
+    from scipy.ndimage import gaussian_filter
+
+    white = np.random.default_rng(3).normal(0, 1, (2, 96, 96))
+    data = gaussian_filter(white, (0, 2, 2))
+    data *= NOISE / data.std()
+    level = levels.sky_level(looked_at(observed(data)))
+    alone = levels.sky_level(looked_at(observed(NOISE * white)))
+    assert (level.error > 3 * alone.error).all()
+
+
+@pytest.mark.parametrize("at", [(8, 50), (33, 8)])
+def test_cosmic_rays_are_masked(at):
+    data = image_of()
+    for k in range(6):  # a slanted track
+        data[1, at[0] + k // 2, at[1] + k] += 60 * NOISE
+    o = observed(data)
+    found = inspected([o])
+    (message,) = found.messages
+    assert "channel r has 6 pixels sharper than its PSF" in message and str(at) in message
+    weights = found.blend.observations[0].weights
+    assert (weights[1, at[0] : at[0] + 2, at[1] : at[1] + 3] == 0).all()
+    assert (weights == 0).sum() < 40 and (weights[0] > 0).all()
+    assert (o.weights > 0).all()  # the user's own stays
+
+
+@pytest.mark.parametrize("given_sigma", [FWHM_SIGMA, 1.3 * FWHM_SIGMA])
+def test_stars_are_never_masked(given_sigma):
+    """Nor where the PSF is too wide, nor where nobody listed them."""
+    stars = tuple((p, (1e5, 1e5), 0.0) for p, _, _ in DRAWN)
+    found = inspected([observed(image_of(stars), sigma=given_sigma)], sources_of(stars[:1], Point))
+    assert all((o.weights > 0).all() for o in found.blend.observations)
+
+
+@pytest.mark.parametrize("sigma", [0.3, 0.5, 0.8, 1.5])
+def test_no_point_behind_a_psf_has_less_contrast(sigma):
+    psf = PSF.gaussian(sigma)
+    kappa = pair_ratios(psf)[0]
+    rng = np.random.default_rng(0)
+    for y, x in rng.uniform(-0.5, 0.5, (20, 2)):
+        p = psf_at(psf, 0, np.arange(-1.0, 2) - y, np.arange(-1.0, 2) - x)
+        assert p[0, 1] + p[2, 1] >= kappa[0] * p[1, 1] and p[1, 0] + p[1, 2] >= kappa[1] * p[1, 1]
+
+
+def test_hot_pixels_on_a_source_are_said_and_stay():
+    data = image_of()
+    data[0, 20, 19] += 300 * NOISE
+    found = inspected([observed(data)])
+    assert any(
+        "light sharper than its PSF at (y, x) = (20, 19), on a source" in m for m in found.messages
+    )
+    assert (found.blend.observations[0].weights > 0).all()
+
+
+def test_flat_tops_are_masked_as_saturated():
+    data = image_of(((DRAWN[0][0], (9e4, 9e4), 0.0), *DRAWN[1:]))
+    data[1] = np.minimum(data[1], 0.6 * data[1].max())
+    found = inspected([observed(data)])
+    assert [m for m in found.messages if "channel r is saturated" in m]
+    weights = found.blend.observations[0].weights
+    assert (weights[1, 19:22, 17:21] == 0).all() and (weights[0] > 0).all()
+
+
+def test_whole_numbers_are_not_flat_by_chance():
+    assert not spoilt.saturated(looked_at(observed(np.rint(image_of())))).any()
+
+
+def test_values_at_the_saturation_are_masked():
+    o = observed(image_of())
+    object.__setattr__(o, "saturation", np.array([np.nan, 100.0]))
+    full = spoilt.saturated(looked_at(o))
+    assert not full[0].any() and full[1][o.data[1] >= 100].all()
+
+
+def test_light_without_a_source_is_named():
+    o = observed(image_of())
+    (message,) = inspected([o], sources_of(DRAWN[1:])).messages
+    assert "no source is listed for" in message and "(20, 19)" in message
+    assert listing.unlisted(looked_at(o)) == []
+
+
+def test_doubles_are_named_unless_of_two_kinds():
+    o, near = observed(image_of()), DRAWN[0][0][0] + 0.6
+    twin = Extended(position_px=(near, DRAWN[0][0][1]))
+    (message,) = inspected([o], (*sources_of(), twin)).messages
+    assert message.startswith("sources 0 and 3 lie within 1 model pixel")
+    core = Point(position_px=DRAWN[0][0])
+    assert inspected([o], (*sources_of(), core)).messages == []
+
+
+def test_positions_that_are_all_off_are_named():
+    moved = tuple(Extended(position_px=(y + 1, x + 1)) for (y, x), _, _ in DRAWN)
+    messages = inspected([observed(image_of())], moved).messages
+    assert any("light lies at (-1." in m and "FITS counts from 1" in m for m in messages)
+
+
+@pytest.mark.parametrize("factor, word", [(1.25, "too wide"), (0.8, "too narrow")])
+def test_stars_of_another_width_than_the_psf_are_named(factor, word):
+    star = ((DRAWN[0][0], (2e4, 2e4), 0.0),)
+    o = observed(image_of(star), sigma=factor * FWHM_SIGMA)
+    assert any(word in m for m in inspected([o], sources_of(star, Point)).messages)
+
+
+def test_channels_that_lie_apart_are_named():
+    data = image_of()
+    data[1] = image_of(tuple(((y + 0.4, x), f, s) for (y, x), f, s in DRAWN))[1]
+    messages = inspected([observed(data)]).messages
+    assert any("light in channel" in m and "fit_shifts" in m for m in messages)
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.5, -0.4)])
+def test_observations_that_disagree_are_moved(shift):
+    there = tuple(((y + shift[0], x + shift[1]), f, s) for (y, x), f, s in DRAWN)
+    both = [
+        observed(image_of()),
+        observed(image_of(there, seed=1, sigma=2), sigma=2, name="b", channels=("i", "z")),
+    ]
+    found = inspected(both)
+    assert found.settings.fit_shifts == any(shift)
+    assert not found.shifts[0].any()
+    np.testing.assert_allclose(found.shifts[1], -np.array(shift), atol=0.1)
+    said = inspected(both, fit_shifts=False)
+    assert said.settings.fit_shifts is False and not said.shifts.any()
+    assert len(said.messages) == any(shift)
+
+
+def test_coarse_psfs_are_named():
+    o = observed(image_of())
+    with pytest.warns(match="sampled too coarsely"):
+        psf = PSF.gaussian(0.4)
+    (message,) = inspected([replace_psf(o, psf)]).messages
+    assert "is sampled too coarsely" in message and "spacing" in message
+
+
+def replace_psf(o, psf):
+    return Observation(o.data, psf, o.grid, weights=o.weights, channels=o.channels, name=o.name)
