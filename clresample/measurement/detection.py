@@ -33,23 +33,15 @@ from .companions import (
     noise_of,
     top_near,
 )
+from .peaks import import_sep, new_peaks
+from .searched import SAME_SOURCE, Search
 from .signal import SMALL_GALAXY, combined, signal_of
 
 # [sigma] of the combined image: white noise reaches it once in two million independent pixels
 THRESHOLD = 5.0
-# [FWHM^2] least area of connected pixels above the threshold: smaller ones are not as wide as the
-# PSF, but noise on top of light just below the threshold
-MIN_AREA = 0.25
-# [FWHM^2] the same of what is left beside brighter sources: its area above the threshold is what a
-# noise that grows towards them leaves
+# [FWHM^2] least area of what is left beside brighter sources: its area above the threshold is what
+# a noise that grows towards them leaves
 MIN_AREA_BESIDE = 0.125
-# sep's deblending: levels between a threshold and a peak, of equal ratio, and the part of an
-# object's light that a branch must hold to be an object of its own. SExtractor's 32 levels and
-# 0.005 lose the neighbours of bright galaxies, whose branch rises over few of the levels; a part
-# under 0.001 takes clumps of large galaxies for objects.
-N_LEVELS, MIN_CONTRAST = 256, 0.001
-# of the wider PSF's FWHM: nearer to a source that is found, a peak counts as that source
-SAME_SOURCE = 0.7
 ALL = "all"  # the name of the combined image
 
 
@@ -61,6 +53,8 @@ class Detection:
     frame: Frame that their positions, pixels (y, x), belong to
     peaks (S,) [sigma]: signal to noise of each in the image that found it
     found_in (S,): name of that image: an observation's, or "all"
+    groups (S,): number of the source in whose light each lies and whose clump it may be, see
+        clumps.py; its own number where there is none
     image (Ny, Nx) [sigma]: signal to noise of all observations together, 0 where nothing was seen
     """
 
@@ -69,6 +63,7 @@ class Detection:
     peaks: np.ndarray
     found_in: tuple[str, ...]
     image: np.ndarray
+    groups: np.ndarray
 
 
 def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> Detection:
@@ -148,7 +143,7 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
     """
     if not 0 < threshold < math.inf:
         raise ValueError(f"threshold must be a positive number of sigmas, not {threshold}")
-    sep = _import_sep()
+    sep = import_sep()
     at = places or [None] * len(observations)
     signals = [signal_of(o, frame, one) for o, one in zip(observations, at, strict=True)]
     if scatters is None:
@@ -157,31 +152,28 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
     widths = np.array([_fwhm_px(o, frame) for o in observations])
     order = np.argsort(widths, kind="stable")
     everything, best = combined(signals)
-    found = []  # position, peak, label
-
-    def add(image, label, narrow, wide):
-        before = known + [position for position, _, _ in found]
-        new = _new_peaks(sep, image, threshold, MIN_AREA * narrow**2, before, SAME_SOURCE * wide)
-        found.extend((position, peak, label) for position, peak in new)
-
-    for i in order:
-        add(signals[i].flat(), observations[i].label, widths[i], widths[i])
-    add(best, ALL, widths.min(), widths.max())
-    if beside and found:
-        sharp = order[0]
-        places = np.array([position for position, _, _ in found])
+    sharp = order[0]
+    found = Search(sep, threshold, known)
+    found.add(signals[sharp].flat(), observations[sharp].label, widths[sharp], widths[sharp])
+    if beside:
+        found.sort_out(signals[sharp].flat(), widths[sharp])
+    for i in order[1:]:
+        found.add(signals[i].flat(), observations[i].label, widths[i], widths[i])
+    found.add(best, ALL, widths.min(), widths.max())
+    if beside and found.positions:
         scale = frame.grid.pixel_scale_arcsec
-        for position, peak in _companions(
-            sep, signals, sharp, everything, places, threshold, widths[sharp], scale
-        ):
-            found.append((position, peak, observations[sharp].label))
-    found.sort(key=lambda one: -one[1])
+        places = np.array(found.positions)
+        new = _companions(sep, signals, sharp, everything, places, threshold, widths[sharp], scale)
+        found.add_companions(new, signals[sharp].flat(), observations[sharp].label)
+    order, groups = found.in_order()
+    positions = [found.positions[i] for i in order]
     return Detection(
-        sources=tuple(Extended(position_px=tuple(map(float, p))) for p, _, _ in found),
+        sources=tuple(Extended(position_px=(float(y), float(x))) for y, x in positions),
         frame=frame,
-        peaks=np.array([peak for _, peak, _ in found]),
-        found_in=tuple(label for _, _, label in found),
+        peaks=np.array([found.peaks[i] for i in order]),
+        found_in=tuple(found.labels[i] for i in order),
         image=everything,
+        groups=groups,
     )
 
 
@@ -197,7 +189,7 @@ def _companions(sep, signals, sharp, everything, places, threshold, fwhm, scale)
     )
     rest, model = left_over(image, seen, centres)
     wide, _ = left_over(signals[sharp].flat(SMALL_GALAXY), seen, centres)
-    new = _new_peaks(
+    new = new_peaks(
         sep,
         rest / noise_of(model),
         max(threshold, LEAST),
@@ -220,55 +212,7 @@ def _companions(sep, signals, sharp, everything, places, threshold, fwhm, scale)
     return found
 
 
-def _import_sep():
-    try:
-        import sep
-    except ImportError as error:
-        raise ImportError(
-            "detection needs sep, which is not installed: pip install 'clresample[detect]'"
-        ) from error
-    return sep
-
-
 def _fwhm_px(observation, frame):
     """Width [model px] of an observation's sharpest PSF."""
     scale = observation.grid.pixel_scale_arcsec / frame.grid.pixel_scale_arcsec
     return observation.psf.fwhm_px.min() * scale
-
-
-def _new_peaks(sep, image, threshold, area, known, apart, own=True):
-    """Positions (y, x) and heights of the objects in a signal-to-noise image, brightest first.
-
-    area [px]: least of an object; known: positions (2,) of sources; objects whose peak is within
-    `apart` [px] of one are left out, and (own) those that hold one: under a wide filter a pair of
-    them is one object whose peak lies between
-    """
-    objects, segments = _objects(sep, image, threshold, area)
-    places = np.array(known).reshape(-1, 2)
-    at = np.clip(np.rint(places).astype(int), 0, np.array(image.shape) - 1)
-    taken = set(segments[at[:, 0], at[:, 1]].tolist()) if own else set()
-    found = []
-    for i, (position, peak) in enumerate(objects, start=1):
-        near = len(places) and np.hypot(*(places - position).T).min() <= apart
-        if i not in taken and not near:
-            found.append((position, peak))
-    return sorted(found, key=lambda one: -one[1])
-
-
-def _objects(sep, image, threshold, area):
-    """sep's objects: (position (y, x), height) of each, and the number from 1 of that which holds a
-    pixel (Ny, Nx), 0 = none."""
-    if not image.max(initial=0) > threshold:  # as most residuals: sep takes 1 ms to say so
-        return [], np.zeros(image.shape, np.int32)
-    objects, segments = sep.extract(
-        np.ascontiguousarray(image),
-        threshold,
-        minarea=max(1, int(area)),
-        filter_kernel=None,
-        deblend_nthresh=N_LEVELS,
-        deblend_cont=MIN_CONTRAST,
-        segmentation_map=True,
-    )
-    return [
-        (np.array([o["ypeak"], o["xpeak"]], float), float(o["peak"])) for o in objects
-    ], segments

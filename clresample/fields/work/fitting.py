@@ -200,7 +200,9 @@ def _on_patch(given, patch, source):
 def _take(part, job, cut, result, n_round):
     """Add a fitted patch to the part."""
     patch, origin = cut.patch, np.array(cut.patch.box[:2])
-    rows = columns_of(result)
+    names = [int(source.name) for source in result.sources]
+    hosts = np.array([job.plan.host_of.get(name, name) for name in names], np.int64)
+    rows = columns_of(result, groups=hosts)
     ids = np.array([int(name) for name in rows.values.pop("name")], np.int64)
     for name in POSITIONS:
         rows.put(name, rows[name] + origin[0 if name[0] == "y" else 1])
@@ -253,6 +255,8 @@ def _set_aside(part, job, patch, n_round, status):
     positions, ids = job.plan.positions[sources], job.plan.ids[sources]
     add_positions(rows, job.reference, positions, "")
     rows.put("flags", np.full(len(sources), int(Flag.NOT_CONVERGED), np.int32))
+    rows.put("group_id", np.array([job.plan.host_of[i] for i in ids.tolist()], np.int64))
+    rows.put("n_group", np.zeros(len(sources), np.int32))
     _add_columns(rows, ids, job, patch, status)
     part.rows.append(rows)
     part.patches.append(

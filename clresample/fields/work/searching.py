@@ -62,13 +62,15 @@ def planned(mosaics, reference, region, core, work, options, engine, progress, c
     everything = [found(tile.number) for tile in tiles]
     positions = np.concatenate([f.positions for f in everything])
     peaks = np.concatenate([f.peaks for f in everything])
+    hosts = np.concatenate([f.positions if f.hosts is None else f.hosts for f in everything])
     del everything
     # What a field's division into tiles would change: the last digits, and who comes first. Both
     # decide how fits round, which moves fluxes of some blends by two tenths of their errors.
     if options.positions is None:
         positions = np.floor(positions * STEPS) / STEPS  # not up: over the edge of the core
+        hosts = np.floor(hosts * STEPS) / STEPS
     order = np.lexsort(positions.T[::-1])
-    positions, peaks = positions[order], peaks[order]
+    positions, peaks, hosts = positions[order], peaks[order], hosts[order]
     footprints = link(tiles, found, region, work)
     plan = make_plan(
         positions,
@@ -79,6 +81,7 @@ def planned(mosaics, reference, region, core, work, options, engine, progress, c
         field_number=options.field_number,
         memory=options.memory,
         n_channels=n_channels,
+        hosts=hosts,
     )
     plan = replace(plan.only(core), lost=lost)
     if hasattr(footprints.labels, "flush"):
@@ -141,6 +144,7 @@ def _search_tile(shared, tile, given):
         positions=found.positions,
         peaks=found.peaks,
         light=found.light,
+        hosts=found.positions if found.hosts is None else found.hosts,
         lit=np.packbits(found.lit),
     )
     return len(found.positions), file.getvalue()
@@ -157,4 +161,4 @@ def _read_found(work, number):
     with np.load(_found_path(work, number)) as file:
         light = file["light"]
         lit = np.unpackbits(file["lit"], count=light.size).reshape(light.shape).astype(bool)
-        return Found(file["positions"], file["peaks"], light, lit)
+        return Found(file["positions"], file["peaks"], light, lit, file["hosts"])
