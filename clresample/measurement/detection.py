@@ -24,6 +24,7 @@ from ..deblending.spectra import MODEL_ERROR
 from ..sky.frame import Frame, model_frame
 from ..sky.observation import Observation
 from ..sky.sources import Extended
+from .clumps import bodies_of
 from .companions import (
     LEAST,
     LEAST_WIDE,
@@ -119,21 +120,56 @@ def detect_more(result, *, threshold=THRESHOLD) -> Detection:
     for i, o in enumerate(result.observations):
         sky = result.sky[result.channel_slices()[i], None, None]
         error = MODEL_ERROR * (result.model(i) - sky)
-        left.append(
-            Observation(
-                np.nan_to_num(result.residual(i)),
-                o.psf,
-                o.grid,
-                weights=o.weights / (1 + o.weights * error**2),
-                channels=o.channels,
-                zero_points=o.zero_points,
-                name=o.name,
-            )
-        )
+        left.append(_with_data(o, result.residual(i), o.weights / (1 + o.weights * error**2)))
     known = result.frame.place(result.sources)
     pixels = np.stack([*np.indices(result.frame.shape)], axis=-1)
     places = [footprint.locate(pixels) for footprint in result.footprints]
-    return _search(left, result.frame, threshold, list(known), beside=False, places=places)
+    found = _search(left, result.frame, threshold, list(known), beside=False, places=places)
+    return _without_structure(result, found, known, places, threshold) if found.sources else found
+
+
+def _with_data(observation, data, weights):
+    """An Observation of other data (C, Ny, Nx), 0 where they are NaN, with white noise."""
+    return Observation(
+        np.nan_to_num(data),
+        observation.psf,
+        observation.grid,
+        weights=weights,
+        channels=observation.channels,
+        zero_points=observation.zero_points,
+        name=observation.name,
+    )
+
+
+def _without_structure(result, found, known, places, threshold):
+    """The Detection without peaks that are structure of a large galaxy of the model, see clumps.py.
+
+    known (S, 2) [px]: of the fit's sources; places: of the frame's pixels on each observation
+    """
+    frame = result.frame
+    sharp = int(np.argmin([_fwhm_px(o, frame) for o in result.observations]))
+    o = result.observations[sharp]
+    sky = result.sky[result.channel_slices()[sharp], None, None]
+    light, rest = (
+        signal_of(_with_data(o, image, o.weights), frame, places[sharp]).flat()
+        for image in (result.model(sharp) - sky, result.residual(sharp))
+    )
+    inside = known[frame.inside(known)]
+    bodies = bodies_of(light, inside, _fwhm_px(o, frame), threshold)
+    kept = []
+    for i, source in enumerate(found.sources):
+        body = bodies.body_at(np.array(source.position_px))
+        y, x = np.rint(source.position_px).astype(int)
+        if body < 0 or not bodies.bodies[body].takes(rest[y, x], light[y, x])[0]:
+            kept.append(i)
+    return Detection(
+        sources=tuple(found.sources[i] for i in kept),
+        frame=frame,
+        peaks=found.peaks[kept],
+        found_in=tuple(found.found_in[i] for i in kept),
+        image=found.image,
+        groups=np.arange(len(kept)),
+    )
 
 
 def _search(observations, frame, threshold, known, scatters=None, beside=True, places=None):

@@ -1,5 +1,7 @@
 """Rules of detection and residuals at their limits, each alone: what is just inside counts."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from helpers.blends import blend, observe, round_component
@@ -117,7 +119,12 @@ def test_the_width_of_an_observation_is_that_of_its_sharpest_channel():
 def test_the_models_error_is_added_to_the_noise_of_residuals(monkeypatch):
     """1 / w + (0.15 model)^2, the sky left out; no known source is searched beside."""
     given = []
-    monkeypatch.setattr(detection, "_search", lambda *a, **more: given.append((a, more)))
+
+    def searched(*arguments, **more):
+        given.append((arguments, more))
+        return SimpleNamespace(sources=())
+
+    monkeypatch.setattr(detection, "_search", searched)
     component = round_component(0, (30, 30), (40.0, 20.0))
     seen = observe(GRID, ("g", "r"), data=7.0, weights=0.25, zero_points=25.0, name="cam")
     result = blend([component], observations=(seen,), grid=GRID, sky=np.array([5.0, 3.0]))

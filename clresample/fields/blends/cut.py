@@ -10,6 +10,10 @@ from scipy import ndimage
 from ...measurement.hills import root, saddles, watershed
 from ..box import Box
 
+# [sigma] of the combined signal to noise at a saddle: what lies beyond is worth a joint fit only
+# where that takes little time. A piece's neighbours are subtracted to 15 % (MODEL_ERROR): what is
+# left of their light at the border is under a sigma of a point source's flux there.
+WEAK = 6.0
 # A fit's memory over that of its images: four pieces of 512 x 320 pixels, 12 sources and seven
 # channels each, took 2.8 GB for 1.03 GB of images.
 OVERHEAD = 2.7
@@ -22,17 +26,20 @@ class Limits:
     sources: how many; pixels: of the model, in the box about the blend. Larger ones are fitted more
     exactly, as one scene, but take longer than in proportion: the errors' normal matrix grows with
     the square of the number of sources, its inverse with the cube
+    work [px]: model pixels times sources that blends may have before they are cut where the light
+        between their parts is weak (WEAK); others only over the limits above
     memory [bytes]: that it may take by prediction, see `fit_bytes`; None = any; n_channels: of all
     mosaics, for that
     """
 
     sources: int = 40
     pixels: int = 400 * 400
+    work: int = 1_000_000
     memory: float | None = None
     n_channels: int = 1
 
     def __post_init__(self):
-        for name in ("sources", "pixels"):
+        for name in ("sources", "pixels", "work"):
             if not getattr(self, name) >= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, must be 1 or more")
 
@@ -48,6 +55,10 @@ class Limits:
         n_bytes = fit_bytes(n_sources, n_pixels, self.n_channels)
         few = n_sources <= self.sources and n_pixels <= self.pixels
         return few and (self.memory is None or n_bytes <= self.memory)
+
+    def quick(self, n_sources, n_pixels) -> bool:
+        """Whether a fit of so many sources in a box of so many pixels is within `work` too."""
+        return self.hold(n_sources, n_pixels) and n_sources * n_pixels <= self.work
 
 
 def fit_bytes(n_sources, n_pixels, n_channels) -> float:
@@ -66,7 +77,8 @@ def pieces_of(light, inside, positions, limits, margin, groups=None):
 
     Each source gets the pixels from which the light rises to it (watershed); sources are then put
     together in the order of the light at the saddle between them, brightest first, as long as the
-    pieces stay within the limits. So the pieces part where the light is weakest.
+    pieces stay within the limits, and below WEAK as long as they are quick. So they part where the
+    light is weakest.
 
     light (Ny, Nx) [sigma]; inside (Ny, Nx) bool: the blend's pixels; positions (S, 2) [px] in these
     groups (S,): sources of one number are put together first; None = each has its own
@@ -85,12 +97,16 @@ def pieces_of(light, inside, positions, limits, margin, groups=None):
     )
     counts = np.bincount(owner, minlength=n)
     piece = np.arange(n)
-    for a, b in _within(owner, groups) + saddles(light, basins):
+    pairs, heights = saddles(light, basins, heights=True)
+    within = _within(owner, groups)
+    heights = [np.inf] * len(within) + heights
+    for (a, b), height in zip(within + pairs, heights, strict=True):
         a, b = root(piece, a), root(piece, b)
         if a == b:
             continue
         both = boxes[a].join(boxes[b])
-        if not limits.hold(counts[a] + counts[b], both.grown(margin).area):
+        fits = limits.hold if height > WEAK else limits.quick
+        if not fits(counts[a] + counts[b], both.grown(margin).area):
             continue
         piece[b], boxes[a] = a, both
         counts[a] += counts[b]

@@ -182,7 +182,7 @@ def make_plan(
         own = {"parent": int(ids[brightest]), "n_blend": len(sources)}
         inner = box.within(region)
         inside = labels[inner.slices] == label
-        if limits.hold(len(sources), box.grown(MARGIN_PX).area) or len(sources) == 1:
+        if limits.quick(len(sources), box.grown(MARGIN_PX).area) or len(sources) == 1:
             pending.append((inner, inside, len(made)))
             made.append(own | {"box": box, "sources": tuple(sources)})
             continue

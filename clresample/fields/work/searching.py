@@ -12,7 +12,7 @@ from ...files.whole_file import whole_file
 from ...sky.grid import Grid
 from ..blends.link import link
 from ..blends.plan import Plan, make_plan
-from ..blends.search import Found, place, search
+from ..blends.search import Found, grown_footprints, place, search
 from ..blends.tiles import tiles_of
 from .engine import Work
 from .look import looked
@@ -21,6 +21,7 @@ from .look import looked
 # of channels in the model's own pixels 132, 268 and 536 bytes a pixel were held for 1, 4 and 8
 SEARCH_BYTES = 60
 STEPS = 1024  # of the positions that are found, in a pixel: a hundredth of a bright source's error
+LOST_RADIUS_PX = 8  # of a given source's footprint on a tile whose light could not be looked at
 LEAST_TILE_PX = 64  # however little memory there is: smaller tiles are mostly overlap
 
 
@@ -55,8 +56,7 @@ def planned(mosaics, reference, region, core, work, options, engine, progress, c
 
     def found(number):
         if str(number) in lost:
-            shape = tiles[number].core.shape
-            return Found(np.zeros((0, 2)), np.zeros(0), np.zeros(shape), np.zeros(shape, bool))
+            return _lost(tiles[number], _given_px(options.positions, reference))
         return _read_found(work, number)
 
     everything = [found(tile.number) for tile in tiles]
@@ -94,9 +94,7 @@ def planned(mosaics, reference, region, core, work, options, engine, progress, c
 
 def _searched(mosaics, reference, tiles, work, options, engine, progress):
     """Search the tiles that are not yet; {number: reason} of those that could not be."""
-    positions = options.positions
-    if positions is not None:
-        positions = reference.pixel(*np.asarray(positions, float).reshape(-1, 2).T)
+    positions = _given_px(options.positions, reference)
     todo = [tile for tile in tiles if not _found_path(work, tile.number).exists()]
     progress.stage("search", len(tiles))
     progress.step(len(tiles) - len(todo))
@@ -121,6 +119,23 @@ def _searched(mosaics, reference, tiles, work, options, engine, progress):
             progress.say(f"tile {outcome.task.number} is lost: {outcome.reason}")
         progress.step(1, outcome.value or 0)
     return lost
+
+
+def _given_px(positions, reference):
+    """Positions (S, 2) [px] in the reference's pixels of a catalogue's (S, 2) [deg], or None."""
+    if positions is None:
+        return None
+    return reference.pixel(*np.asarray(positions, float).reshape(-1, 2).T)
+
+
+def _lost(tile, positions):
+    """The Found of a tile that could not be searched: the sources that a catalogue gives, which are
+    fitted on discs, and of detection none."""
+    light, lit = np.zeros(tile.core.shape), np.zeros(tile.core.shape, bool)
+    if positions is None or not (own := tile.core.holds(positions)).any():
+        return Found(np.zeros((0, 2)), np.zeros(0), light, lit)
+    lit = grown_footprints(lit, positions[own] - np.array(tile.core[:2]), LOST_RADIUS_PX)
+    return Found(positions[own], np.zeros(own.sum()), light, lit)
 
 
 def _found_path(work, number):
