@@ -7,7 +7,7 @@ from astropy import units as u
 from astropy.table import QTable
 
 from ..measurement.columns import Columns
-from ..measurement.groups import whole_groups
+from ..measurement.photometry import whole_groups
 from .work.part import PATCH_COLUMNS
 
 DESCRIPTIONS = {

@@ -14,8 +14,7 @@ from ..sky.footprint import open_edge
 from ..sky.observation import ZERO_POINT_UJY
 from ..sky.wcs import frame_of, local_axes, names_of
 from .columns import Columns
-from .groups import add_groups
-from .photometry import channel_covariances, flux_scale, fluxes
+from .photometry import add_groups, channel_covariances, flux_scale, fluxes
 from .quality import box_chi2, fitted_sources, labels, masked_cores
 from .shapes import moments, shape, shape_slopes
 

@@ -8,12 +8,13 @@ stands on a body at the level B of its isophote, L, or of the saddle to it, if t
     contrast = I / B - 1,    part = (I - B) a / sum of the body's light,
 
 a being the area of a point source's image. Every disk has peaks at high resolution. By chance as
-many sources lie before or behind a galaxy as on an equal area of sky: a tenth of one on ten
-square arcseconds. So a peak of low contrast and part is structure and no source: the galaxy's
-morphology has its light. Up to `MEMBER_PART` it is a source in the galaxy's group, clump or
-neighbour. Above, it is a source to which the galaxy is a background. The galaxy's own position is
-the peak next to the middle of its body, where the light, clipped at L / 2, is highest under a
-filter as wide as the body: there clumps weigh no more than the disk they lie in.
+many sources lie before or behind a galaxy as on an equal area of sky: n = `CHANCE` times its area.
+So a peak of low part and of a contrast under `CLUMP` is structure and no source, the galaxy's
+morphology has its light; on galaxies so large that n is over 1, under `CLUMP` / n. Up to
+`MEMBER_PART` it is a source in the galaxy's group, clump or neighbour. Above, it is a source to
+which the galaxy is a background. The galaxy's own position is the peak next to the middle of its
+body, where the light, clipped at L / 2, is highest under a filter as wide as the body: there clumps
+weigh no more than the disk they lie in.
 """
 
 from __future__ import annotations
@@ -27,10 +28,15 @@ from .hills import root, saddles, watershed
 
 # [FWHM^2] area of a body's highest isophote, FWHM of the PSF: a star reaches it at 1e-3 of its peak
 BODY_AREA = 100.0
+# [thresholds] level of a body from which its peaks can be structure: of fainter ones little is
+# above the noise, and every peak stays a source
+BRIGHT = 8.0
 # [1] light under a body's level, of all that is above OUTLINE of it
 WIDE = 0.3
 # [1] contrast and part up to which a peak is structure, and part up to which it is in the group
 CLUMP, CLUMP_PART, MEMBER_PART = 2.0, 0.03, 0.2
+# [arcsec^-2] sources by chance: 90 on a square arcminute, to i = 26 (simulation/counts.py)
+CHANCE = 0.025
 # [1] of a body's level: saddles to it below that are its outskirts, peaks behind them not its own
 FRINGE = 0.03
 # [1] two bodies are one where the fainter one's level exceeds that of the saddle between them by
@@ -52,18 +58,20 @@ class Body:
 
     center (2,) [px]: (y, x); level [sigma]: of its highest isophote of BODY_AREA
     light [sigma]: all of its light as the peak of a point source; outline: (slices, mask) of it
+    clump [1]: contrast up to which peaks are its structure, 0 of a faint one
     """
 
     center: np.ndarray
     level: float
     light: float
     outline: tuple
+    clump: float
 
     def takes(self, above, base):
         """Whether peaks of heights above [sigma] on a base [sigma] of it are its structure, and
         whether they are in its group."""
         part = above / self.light
-        return (above < CLUMP * base) & (part < CLUMP_PART), part < MEMBER_PART
+        return (above < self.clump * base) & (part < CLUMP_PART), part < MEMBER_PART
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,22 +86,23 @@ class Bodies:
     structure: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
 
     def body_at(self, position) -> int:
-        """Number of the body whose outline holds a position (2,) [px], -1 for none."""
+        """Number of the bright body whose outline holds a position (2,) [px], -1 for none."""
         y, x = np.rint(position).astype(int)
         for i, body in enumerate(self.bodies):
             (rows, columns), mask = body.outline
             y_in, x_in = y - rows.start, x - columns.start
-            held = 0 <= y_in < mask.shape[0] and 0 <= x_in < mask.shape[1]
+            held = body.clump > 0 and 0 <= y_in < mask.shape[0] and 0 <= x_in < mask.shape[1]
             if held and mask[y_in, x_in]:
                 return i
         return -1
 
 
-def bodies_of(image, places, fwhm_px, threshold) -> Bodies:
+def bodies_of(image, places, fwhm_px, threshold, scale) -> Bodies:
     """The Bodies of a signal-to-noise image.
 
     image (Ny, Nx) [sigma]: filtered with the PSF; places (S, 2) [px]: its peaks
     fwhm_px [px]: of the PSF; threshold [sigma]: least level of a body
+    scale [arcsec]: side of a pixel
     """
     at = np.rint(np.asarray(places).reshape(-1, 2)).astype(int)
     n, area = len(at), int(BODY_AREA * fwhm_px**2)
@@ -120,10 +129,13 @@ def bodies_of(image, places, fwhm_px, threshold) -> Bodies:
         if np.minimum(light, level).sum() < WIDE * light.sum():
             continue
         body = Body(
-            _center(image, outline, level, at[members], area),
+            _center(image, outline, level, at[members], area, level >= BRIGHT * threshold),
             level,
             float(light.sum()) / (POINT_AREA * fwhm_px**2),
             outline,
+            0.0
+            if level < BRIGHT * threshold
+            else CLUMP / max(1.0, CHANCE * outline[1].sum() * scale**2),
         )
         above = image[at[members, 0], at[members, 1]] - base[members]
         is_clump, is_member = body.takes(above, base[members])
@@ -214,8 +226,9 @@ def _outline(image, basins, numbers, level):
     return where, inside[where]
 
 
-def _center(image, outline, level, at, area):
-    """The peak of those at (k, 2) [px] in the middle of an outline, or the middle itself (2,)."""
+def _center(image, outline, level, at, area, bright):
+    """The peak of those at (k, 2) [px] in the middle of an outline, or the middle itself (2,); of a
+    faint body its brightest peak."""
     where, mask = outline
     radius = np.sqrt(area / np.pi)
     light = np.where(mask, np.minimum(image[where], CENTER_LIGHT * level), 0.0)
@@ -223,6 +236,8 @@ def _center(image, outline, level, at, area):
     middle = np.unravel_index(light.argmax(), light.shape)
     middle = np.array(middle) + [where[0].start, where[1].start]
     away = np.hypot(*(at - middle).T) / radius
+    if not bright:
+        return at[int(image[at[:, 0], at[:, 1]].argmax())].astype(float)
     if (away < 1).any():  # the brightest for its distance: light of a galaxy falls outwards
         heights = np.log(np.maximum(image[at[:, 0], at[:, 1]], 1e-3))
         return at[int(np.where(away < 1, heights - away, -np.inf).argmax())].astype(float)

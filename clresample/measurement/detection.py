@@ -34,6 +34,7 @@ from .companions import (
     noise_of,
     top_near,
 )
+from .levels import level_of
 from .peaks import import_sep, new_peaks
 from .searched import SAME_SOURCE, Search
 from .signal import SMALL_GALAXY, combined, signal_of
@@ -155,7 +156,7 @@ def _without_structure(result, found, known, places, threshold):
         for image in (result.model(sharp) - sky, result.residual(sharp))
     )
     inside = known[frame.inside(known)]
-    bodies = bodies_of(light, inside, _fwhm_px(o, frame), threshold)
+    bodies = bodies_of(light, inside, _fwhm_px(o, frame), threshold, frame.grid.pixel_scale_arcsec)
     kept = []
     for i, source in enumerate(found.sources):
         body = bodies.body_at(np.array(source.position_px))
@@ -187,19 +188,25 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
     signals = [one.over(scatter) for one, scatter in zip(signals, scatters, strict=True)]
     widths = np.array([_fwhm_px(o, frame) for o in observations])
     order = np.argsort(widths, kind="stable")
-    everything, best = combined(signals)
+    everything, _ = combined(signals)
+    if beside:
+        everything = everything - level_of(everything, everything != 0)[1]
+    levelled, skies = signals, np.zeros((len(signals), 1))
+    if beside:
+        levelled, skies = zip(*(signal.levelled() for signal in signals), strict=True)
+    _, best = combined(levelled)
     sharp = order[0]
     found = Search(sep, threshold, known)
-    found.add(signals[sharp].flat(), observations[sharp].label, widths[sharp], widths[sharp])
+    found.add(levelled[sharp].flat(), observations[sharp].label, widths[sharp], widths[sharp])
+    scale = frame.grid.pixel_scale_arcsec
     if beside:
-        found.sort_out(signals[sharp].flat(), widths[sharp])
+        found.sort_out(signals[sharp].flat() - skies[sharp][0], widths[sharp], scale)
     for i in order[1:]:
-        found.add(signals[i].flat(), observations[i].label, widths[i], widths[i])
+        found.add(levelled[i].flat(), observations[i].label, widths[i], widths[i])
     found.add(best, ALL, widths.min(), widths.max())
     if beside and found.positions:
-        scale = frame.grid.pixel_scale_arcsec
         places = np.array(found.positions)
-        new = _companions(sep, signals, sharp, everything, places, threshold, widths[sharp], scale)
+        new = _companions(sep, levelled, sharp, everything, places, threshold, widths[sharp], scale)
         found.add_companions(new, signals[sharp].flat(), observations[sharp].label)
     order, groups = found.in_order()
     positions = [found.positions[i] for i in order]

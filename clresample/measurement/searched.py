@@ -43,9 +43,9 @@ class Search:
             if self.bodies.body_at(position) < 0:
                 self._put(position, peak, label)
 
-    def sort_out(self, image, fwhm):
+    def sort_out(self, image, fwhm, scale):
         """Find the bodies of the searched image, and leave out peaks that are their structure."""
-        self.bodies = bodies_of(image, np.array(self.positions), fwhm, self.threshold)
+        self.bodies = bodies_of(image, np.array(self.positions), fwhm, self.threshold, scale)
         if not self.bodies.bodies:
             return
         places, peaks, labels = self.positions, self.peaks, self.labels

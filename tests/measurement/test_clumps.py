@@ -6,8 +6,8 @@ from scipy import ndimage
 
 from clresample.measurement.clumps import bodies_of
 from clresample.measurement.columns import Columns
-from clresample.measurement.groups import group_fluxes, whole_groups
 from clresample.measurement.hills import saddles
+from clresample.measurement.photometry import group_fluxes, whole_groups
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
@@ -22,25 +22,39 @@ def point(at, height, width=FWHM * 2**0.5 / 2.355):
     return height * np.exp(-((y - at[0]) ** 2 + (x - at[1]) ** 2) / (2 * width**2))
 
 
-def disk(size, height=200.0):
+def disk(size, height=400.0):
     """An exponential disk of a half-light radius [px], flat in its core."""
     y, x = np.indices((SIZE, SIZE)) - MIDDLE[0]
     return height * np.exp(-1.678 * np.maximum(np.hypot(y, x) - 2, 0) / size)
 
 
-def judged(image, places):
-    return bodies_of(image, np.array(places), FWHM, 5.0)
+def judged(image, places, scale=0.1):
+    return bodies_of(image, np.array(places), FWHM, 5.0, scale)
 
 
 def test_a_weak_peak_in_a_disk_is_structure_and_a_strong_one_a_member():
     weak, strong = (60, 80), (42, 60)
-    image = disk(20) + point(weak, 40) + point(strong, 900)
+    image = disk(20) + point(weak, 60) + point(strong, 1800)
     found = judged(image, [MIDDLE, weak, strong])
     assert len(found.bodies) == 1
     assert found.bodies[0].center.tolist() == MIDDLE.tolist()
     assert found.structure.tolist()[1:] == [True, False]
     assert found.owners[2] == 0
     assert found.body_at(np.array(weak)) == 0 and found.body_at(np.array([3.0, 3.0])) == -1
+
+
+def test_a_weak_peak_on_so_large_a_galaxy_that_there_are_others_by_chance_is_a_source():
+    weak = (60, 80)
+    image = disk(20) + point(weak, 160)
+    assert judged(image, [MIDDLE, weak], scale=0.1).structure[1]
+    assert not judged(image, [MIDDLE, weak], scale=0.4).structure[1]
+
+
+def test_a_faint_galaxys_peaks_stay_sources_of_its_group():
+    weak = (60, 80)
+    found = judged(disk(20, 40.0) + point(weak, 12), [MIDDLE, weak])
+    assert not found.structure.any() and found.owners.tolist() == [0, 0]
+    assert found.body_at(MIDDLE) == -1
 
 
 def test_what_holds_much_of_the_light_is_a_source_of_its_own():
@@ -66,14 +80,14 @@ def test_a_source_in_the_outskirts_is_no_member():
 
 def test_a_knot_brighter_than_the_middle_does_not_become_the_galaxy():
     knots = [(60, 74), (50, 50), (72, 58)]
-    image = disk(20) + sum(point(k, 600) for k in knots)
+    image = disk(20) + sum(point(k, 1200) for k in knots)
     found = judged(image, knots)
     assert np.hypot(*(found.bodies[0].center - MIDDLE)) < 8
 
 
 def test_two_disks_apart_are_two_bodies():
     y, x = np.indices((SIZE, SIZE))
-    image = sum(200 * np.exp(-1.678 * np.hypot(y - 60, x - at) / 10) for at in (30.0, 90.0))
+    image = sum(400 * np.exp(-1.678 * np.hypot(y - 60, x - at) / 10) for at in (30.0, 90.0))
     image = ndimage.gaussian_filter(image, 1.0)
     found = judged(image, [(60, 30), (60, 90)])
     assert sorted(body.center[1] for body in found.bodies) == [30, 90]
