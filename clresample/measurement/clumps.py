@@ -11,10 +11,10 @@ a being the area of a point source's image. Every disk has peaks at high resolut
 many sources lie before or behind a galaxy as on an equal area of sky: n = `CHANCE` times its area.
 So a peak of low part and of a contrast under `CLUMP` is structure and no source, the galaxy's
 morphology has its light; on galaxies so large that n is over 1, under `CLUMP` / n. Up to
-`MEMBER_PART` it is a source in the galaxy's group, clump or neighbour. Above, it is a source to
-which the galaxy is a background. The galaxy's own position is the peak next to the middle of its
-body, where the light, clipped at L / 2, is highest under a filter as wide as the body: there clumps
-weigh no more than the disk they lie in.
+`MEMBER_PART` it is a source in the galaxy's group, clump or neighbour; not so if its part is over
+`CLUMP_PART` and its contrast over `STAR`. To all others the galaxy is a background. The galaxy's
+own position is the peak next to the middle of its body, where the light, clipped at L / 2, is
+highest under a filter as wide as the body: there clumps weigh no more than the disk they lie in.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ BRIGHT = 8.0
 WIDE = 0.3
 # [1] contrast and part up to which a peak is structure, and part up to which it is in the group
 CLUMP, CLUMP_PART, MEMBER_PART = 2.0, 0.03, 0.2
+# [1] contrast of stars before a galaxy: the brightest knots of simulated disks have 15
+STAR = 30.0
 # [arcsec^-2] sources by chance: 90 on a square arcminute, to i = 26 (simulation/counts.py)
 CHANCE = 0.025
 # [1] of a body's level: saddles to it below that are its outskirts, peaks behind them not its own
@@ -71,7 +73,9 @@ class Body:
         """Whether peaks of heights above [sigma] on a base [sigma] of it are its structure, and
         whether they are in its group."""
         part = above / self.light
-        return (above < self.clump * base) & (part < CLUMP_PART), part < MEMBER_PART
+        faint = part < CLUMP_PART
+        is_member = (part < MEMBER_PART) & (faint | (above < STAR * base))
+        return (above < self.clump * base) & faint, is_member
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,8 @@ SATURATION_MAG = {"Euclid": 17.8, "Rubin": 16.5}
 # [noise of a pixel] surface brightness down to which a source is drawn, in every channel
 FAINTEST_LIGHT = 0.1
 RADII_ARCSEC = np.geomspace(0.5, 120, 100)  # [arcsec] where it is looked for
-PSF_PX = 65  # [samples a side] of handed-out PSF images
+# [samples a side] of handed-out PSF images: an Airy pattern has a hundredth of its light beyond
+PSF_PX = {"Euclid": 129, "Rubin": 65}
 # Samples of handed-out PSFs in pixels: an Airy pattern's highest frequency, D / wavelength = 8.1
 # per arcsec, is above what pixels of 0.1 arcsec hold
 PSF_SPACING = {"Euclid": 0.5, "Rubin": 1.0}
@@ -71,15 +72,16 @@ class Instrument:
         nodes = PSF_NODES if self.variation else 1
         ends = [np.linspace(0, n - 1, nodes) if nodes > 1 else [(n - 1) / 2] for n in grid.shape]
         places = np.array([(y, x) for y in ends[0] for x in ends[1]])
+        n_px = PSF_PX[survey.name]
         scale, images = survey.pixel_scale_arcsec, []
         for place in places:
             for band in range(survey.n_bands):
                 stretch = self.stretch(place, grid.shape) * (1 + self.width[band])
                 whole = galsim.Convolve(self.psf(band, stretch), galsim.Pixel(scale))
                 step = scale * PSF_SPACING[survey.name]
-                image = whole.drawImage(nx=PSF_PX, ny=PSF_PX, scale=step, method="no_pixel")
+                image = whole.drawImage(nx=n_px, ny=n_px, scale=step, method="no_pixel")
                 images.append(image.array)
-        shape = len(places), survey.n_bands, PSF_PX, PSF_PX
+        shape = len(places), survey.n_bands, n_px, n_px
         return places, np.array(images, np.float32).reshape(shape)
 
 

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from helpers.blends import blend
 from scipy import ndimage
 
+from clresample.deblending.result import Component
 from clresample.measurement.clumps import bodies_of
 from clresample.measurement.columns import Columns
 from clresample.measurement.hills import saddles
@@ -157,3 +159,23 @@ def test_a_large_knotty_galaxy_is_one_group_and_a_field_of_light_is_no_limit():
     groups = set(found.groups.tolist())
     assert (found.image > 5).sum() > 300_000
     assert len(groups) < 6 and len(found.sources) < 25
+
+
+def test_what_a_fit_leaves_of_a_large_galaxys_structure_is_no_source():
+    """A residual of half of the galaxy's light there; one of ten times as much is a source."""
+    pytest.importorskip("sep")
+    from clresample.measurement.detection import detect_more
+
+    grid = Grid.flat((SIZE, SIZE), 0.1)
+    light = disk(20, 400.0)
+    weak, strong = (60, 84), (84, 60)
+    found = []
+    for part in (0.9, 12.0):
+        data = light.copy()
+        for at in (weak, strong) if part > 1 else (weak,):
+            data += point(at, part * light[at], 1.0)
+        o = Observation(data, PSF.gaussian(1.0, n_pixels=15), grid, weights=0.05)
+        component = Component(0, (0, 0), light / light.max(), np.array([light.max()]))
+        result = blend([component], observations=(o,), grid=grid)
+        found.append(len(detect_more(result).sources))
+    assert found[0] == 0 and found[1] >= 1

@@ -110,7 +110,7 @@ def _fitted(job, group, given):
         cuts.append(_Cut(patch, blend, boxes, time.perf_counter() - start))
     results = _fits(job, [cut.blend for cut in cuts])
     if job.passes > 1:
-        results = _second_look(job, given, cuts, results)
+        results = _second_look(job, given, cuts, results, group.round)
     for cut, result in zip(cuts, results, strict=True):
         if isinstance(result, Failure):
             if result.status == INTERRUPTED:
@@ -162,16 +162,17 @@ def _fits(job, blends):
     return results
 
 
-def _second_look(job, given, cuts, results):
+def _second_look(job, given, cuts, results, n_round):
     """Fit those blends again in whose residuals there are more sources, with these.
 
     The residuals are those of the whole fit. A first look of 30 iterations without structure, as
     `clresample deblend` takes, leaves bright galaxies' own structure in them: in simulated fields
-    15 % of all rows were clumps of it then, and no more true sources were found.
+    15 % of all rows were clumps of it then, and no more true sources were found. Pieces of a cut
+    blend are looked at from round 1 on, when their neighbours' light is subtracted.
     """
     again = {}
     for i, (cut, result) in enumerate(zip(cuts, results, strict=True)):
-        if isinstance(result, Failure):
+        if isinstance(result, Failure) or (n_round == 0 and cut.patch.siblings):
             continue
         try:
             found = detect_more(result, threshold=job.threshold).sources

@@ -15,6 +15,9 @@ from .part import PartFile
 # Most rounds in which a cut blend's pieces are fitted again, their neighbours' light subtracted.
 # The first takes the neighbours out; crowded pieces settle by the third or fourth.
 ROUNDS = 4
+# [px] The same of pieces of more model pixels times sources, which take tens of seconds each: the
+# first round subtracts their neighbours' light, the second what these have gained by that
+LARGE, LARGE_ROUNDS = 500_000, 2
 # [errors] A blend's pieces have settled when no flux changes by more than this from one round to
 # the next. Fits end within 0.2 of their limit (Settings.enough), two of them within 0.3 of each
 # other: a smaller number would not be reached.
@@ -49,7 +52,8 @@ def fitted(job, engine, progress):
     pending = {n for n in pieces if job.plan.patches[n].siblings}
     moved: set[int] = set()
     for n_round in range(1, ROUNDS + 1):
-        groups = [few for g in job.plan.giants if (few := tuple(n for n in g if n in pending))]
+        again = {n for n in pending if n_round <= LARGE_ROUNDS or not _is_large(job, n)}
+        groups = [few for g in job.plan.giants if (few := tuple(n for n in g if n in again))]
         if not groups:
             break
         progress.stage(f"pieces, round {n_round}", len(pending))
@@ -71,6 +75,12 @@ def fitted(job, engine, progress):
     # by round and group, in whichever order they ended: sums of models are the same to the last bit
     unsettled = {job.plan.patches[n].parent for n in (moved if pending else ())}
     return [_file(job, name) for name in sorted(parts)], unsettled
+
+
+def _is_large(job, number):
+    """Whether a patch has over LARGE pixels times sources."""
+    patch = job.plan.patches[number]
+    return patch.box.area * len(patch.sources) > LARGE
 
 
 def _name(n_round, i):
