@@ -52,6 +52,7 @@ SIZES, QUICK_SIZES = (1024, 2048), (384,)
 BANDS, QUICK_BANDS = "ugrizy", "ri"
 MOST_PAIRS, BLENDED_PX = 60, 16.0
 N_SCALE, SCALE_SNR = 20, 50.0  # sources alone, of each field, that say what part apertures see
+PUBLISHED = "36 (plain) or as published (real)"
 LEAST_FLUX = 5.0  # [sigma] of a point source's flux: fainter ones say how deep a band is
 COLUMNS = (
     ("n_model", 7, "d"),
@@ -141,6 +142,7 @@ def beside_others(fields, channels, most_px):
 def simulated(size, number, options):
     return simulate_field(
         options.seed + number,
+        sky=options.sky,
         n_pixels=size,
         density=options.density,
         faintest=options.faintest,
@@ -203,8 +205,9 @@ def main(options):
     threads = on_all_cores()
     sizes = options.sizes or (QUICK_SIZES if options.quick else SIZES)
     record = records.record(threads) | {
-        "fields": f"{options.fields} from seed {options.seed}, {options.density:g} sources per "
-        f"square arcminute to i = {options.faintest:g}, Euclid VIS and Rubin "
+        "fields": f"{options.fields} from seed {options.seed}, {options.sky} sky, "
+        f"{options.density or PUBLISHED} sources per square arcminute to i = "
+        f"{options.faintest:g}, Euclid VIS and Rubin "
         f"{QUICK_BANDS if options.quick else BANDS} at 12 degrees",
         "workers": f"{options.workers}, {' '.join(ONE_THREAD)} = 1 each",
     }
@@ -225,7 +228,8 @@ def parser():
         "--quick", action="store_true", help="one field of 384 pixels, two bands of Rubin"
     )
     parser.add_sizes(SIZES)
-    parser.add_density()
+    parser.add_density(None, "36; of a real sky as published")
+    parser.add_sky()
     parser.add_argument(
         "--faintest",
         type=positive(float),

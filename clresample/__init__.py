@@ -71,6 +71,7 @@ _ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
     "simulation": {
         "scenes": ("simulate_scene",),
         "field": ("simulate_field",),
+        "spoilers": ("Spoilers",),
     },
     # OpenCL devices
     "device": {
@@ -122,6 +123,7 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from .resampling.tiled.resampler import TiledResampler as TiledResampler
     from .simulation.field import simulate_field as simulate_field
     from .simulation.scenes import simulate_scene as simulate_scene
+    from .simulation.spoilers import Spoilers as Spoilers
     from .sky.correlation import NoiseCorrelation as NoiseCorrelation
     from .sky.frame import Frame as Frame, model_frame as model_frame
     from .sky.grid import Grid as Grid

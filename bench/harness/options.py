@@ -99,13 +99,21 @@ class Parser(argparse.ArgumentParser):
             help="seed of the first scene (%(default)s)",
         )
 
-    def add_density(self):
+    def add_density(self, default=36.0, said="36"):
         self.add_argument(
             "--density",
             type=positive(float),
-            default=36.0,
+            default=default,
             metavar="N",
-            help="sources per square arcminute (%(default)s)",
+            help=f"sources per square arcminute ({said})",
+        )
+
+    def add_sky(self):
+        self.add_argument(
+            "--sky",
+            choices=("plain", "real", "bright"),
+            default="plain",
+            help="of simulated fields, see simulate_field (%(default)s)",
         )
 
     def add_processes(self):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from dataclasses import replace
 
@@ -166,7 +167,7 @@ def _report(arguments, done, took):
     print(f"{out.n_sources} sources in {out.n_blends} fits ({ended or 'none'})")
     print(f"{took:.1f} s: {stages}")
     for number, reason in done.lost.items():
-        print(f"tile {number} is lost: {reason}")
+        print(f"error: tile {number} is lost, with all of its sources: {reason}", file=sys.stderr)
     if not arguments.quiet:
         for text in out.notes:
             note(arguments, text)

@@ -5,15 +5,18 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .options import names, note, positive, whole
+from .fields.sky_options import add_images, add_sky
+from .options import note
 
 FILES = "field.toml", "truth.ecsv"
+CLUMPS = "clumps.ecsv"  # written where a field's galaxies have clumps
 TILE = 1  # number of the tile of Euclid's MER that a simulated field becomes
 CELL_PX = 150  # side of a cell of Rubin's coadds
 DESCRIPTION = """\
 Write a simulated field of galaxies and stars as Euclid (VIS) and Rubin see it:
 mosaics with RMS, masks and PSFs that vary, field.toml for `clresample field`, and
-truth.ecsv. One seed gives one field."""
+truth.ecsv. One seed gives one field. --sky real draws large and bright galaxies,
+stars that saturate, and images with faults; clumps.ecsv lists clumps by galaxy."""
 
 
 def add_simulate(commands):
@@ -27,73 +30,29 @@ def add_simulate(commands):
     parser.add_argument("what", choices=["field"], help="field: mosaics of two surveys")
     parser.add_argument("-o", "--output", metavar="DIR", required=True, help="to write into")
     parser.add_argument("--overwrite", action="store_true", help="replace files that exist")
-    sky = parser.add_argument_group("sky")
-    sky.add_argument("--seed", type=whole, default=0, help="(default %(default)s)")
-    sky.add_argument(
-        "--size", type=whole, default=512, metavar="PX", help="Euclid pixels a side (%(default)s)"
-    )
-    sky.add_argument(
-        "--density",
-        type=positive,
-        default=36.0,
-        metavar="N",
-        help="sources per square arcminute to i = 26 (%(default)s)",
-    )
-    for name, default, what in (
-        ("clustering", 0.2, "part of the sources beside another one"),
-        ("stars", 0.05, "part of the sources that are stars"),
-        ("psf-variation", 0.1, "by which part PSFs widen across the field"),
-    ):
-        sky.add_argument(
-            f"--{name}", type=_part, default=default, metavar="F", help=f"{what} (%(default)s)"
-        )
-    images = parser.add_argument_group("images")
-    images.add_argument(
-        "--bands",
-        type=names,
-        default=list("ugrizy"),
-        metavar="B,...",
-        help="of Rubin (default u,g,r,i,z,y)",
-    )
-    images.add_argument(
-        "--angle", type=float, default=12.0, metavar="DEG", help="of Rubin's pixels (%(default)s)"
-    )
-    images.add_argument(
-        "--bad-columns", type=whole, default=2, metavar="N", help="of each mosaic (%(default)s)"
-    )
-    images.add_argument(
-        "--format",
-        choices=["plain", "survey"],
-        default="plain",
-        help="plain: FITS cubes with RMS, MASK and PSFs; survey: Euclid as a tile of MER, Rubin as "
-        "cell coadds, whose PSF is constant in a cell (%(default)s)",
-    )
+    add_sky(parser.add_argument_group("sky"))
+    add_images(parser.add_argument_group("images"))
     parser.set_defaults(run=run)
-
-
-def _part(text):
-    """A number from 0 to 1."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = -1.0
-    if not 0 <= number <= 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number from 0 to 1")
-    return number
 
 
 def run(arguments):
     """Simulate and write. Raises ValueError and FileError, one line, for what cannot be done."""
     from ..files.whole_file import check_folder, check_output
     from ..simulation.field import simulate_field
+    from ..simulation.spoilers import Spoilers
 
     folder = Path(arguments.output)
     check_folder(folder)
     for name in FILES if folder.exists() else ():
         check_output(folder / name, overwrite=arguments.overwrite)
+    size = arguments.spoilers
+    spoilers = None if size is None else Spoilers().scaled(size)
     try:
         field = simulate_field(
             arguments.seed,
+            sky=arguments.sky,
+            spoilers=spoilers,
+            n_large=arguments.large,
             n_pixels=arguments.size,
             density=arguments.density,
             rubin_bands=tuple(arguments.bands),
@@ -182,8 +141,12 @@ def _with_truth(folder, tables, paths, field):
     from astropy.table import Table
 
     (folder / FILES[0]).write_text("\n".join(tables))
+    written = [FILES[1]]
     Table(field.truth).write(folder / FILES[1], format="ascii.ecsv", overwrite=True)
-    return [folder / FILES[0], *paths, folder / FILES[1]]
+    if field.clumps:
+        Table(field.clumps).write(folder / CLUMPS, format="ascii.ecsv", overwrite=True)
+        written.append(CLUMPS)
+    return [folder / FILES[0], *paths, *(folder / name for name in written)]
 
 
 def _write_surveys(folder, field):
@@ -254,4 +217,5 @@ mask_bits = ["BAD"]
 zero_point = [{points}]
 psf = "{name}_psf.fits"
 psf_format = "cube"
+psf_spacing = {mosaic.psf_spacing}
 """

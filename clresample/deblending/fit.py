@@ -71,19 +71,11 @@ class Fit:
         self.problems, self.sky_levels = found.messages, found.levels
         self.messages, self.fitted = outside + self.problems, np.flatnonzero(inside)
         padded, private = _padded_frame(self.frame, pad), settings.fit_shifts or shifts.any()
-<<<<<<< HEAD
-        self.home = Home(self.frame, padded, places, tolerance)
+        self.home = Home(self.frame, padded, positions[self.fitted], settings.psf_tolerance)
         view = partial(whitened_view, pad=pad, device=device, dtype=dtype, private=private)
         views = [view(self.home, o) for o in blend.observations]
         self.views = tied_views(views, blend.observations)
         self.ties = self.views[0].ties
-=======
-        self.home = Home(self.frame, padded, positions[self.fitted], settings.psf_tolerance)
-        self.views = [
-            whitened_view(self.home, o, pad, device, dtype, private=private)
-            for o in blend.observations
-        ]
->>>>>>> h-c
         if private:
             self.shift(shifts)
         for o, view in zip(blend.observations, self.views, strict=True):
@@ -108,12 +100,8 @@ class Fit:
     def signature(self):
         """Fits of equal signature start and iterate side by side; see Scene.signature."""
         ops = [view.op for view in self.views]
-<<<<<<< HEAD
-        return signature_of(self.padded.shape, self.settings.fit_sky, ops, self.ties)
-=======
-        known = signature_of(self.padded.shape, self.settings.fit_sky, ops)
+        known = signature_of(self.padded.shape, self.settings.fit_sky, ops, self.ties)
         return known, self.settings.fit_shifts
->>>>>>> h-c
 
     def begin(self, point: StartingPoint, seconds):
         """Make the scene and its state from where it starts; seconds: that this took."""

@@ -7,11 +7,14 @@ from astropy import units as u
 from astropy.table import QTable
 
 from ..measurement.columns import Columns
+from ..measurement.photometry import whole_groups
 from .work.part import PATCH_COLUMNS
 
 DESCRIPTIONS = {
     "id": "of the source: field, row and column of the model's pixel that holds it",
     "parent_id": "id of the brightest source that was detected in the same blend",
+    "group_id": "id of the galaxy whose clump the source may be, or its own",
+    "n_group": "sources of the group",
     "flags": "sum of what limits the measurement: 1 EDGE, 2 NOT_CONVERGED, 4 ZERO_FLUX, "
     "8 NO_COVERAGE, 16 OUTSIDE, 32 MASKED, 64 MISFIT, 128 SATURATED, 256 AMBIGUOUS",
     "status": "how the fit ended",
@@ -45,18 +48,32 @@ BLENDS = {  # of blends.ecsv
     "iterations": "of the fit",
     "seconds": "of the fit, its share of a group's",
 }
-FIRST = ("id", "parent_id", "ra", "dec", "y_sky", "x_sky", "y", "x", "flags", "status", "reason")
+FIRST = (
+    "id",
+    "parent_id",
+    "group_id",
+    "ra",
+    "dec",
+    "y_sky",
+    "x_sky",
+    "y",
+    "x",
+    "flags",
+    "status",
+    "reason",
+)
 # of a field without a source
 EMPTY = {
     "id": np.zeros(0, np.int64),
     "parent_id": np.zeros(0, np.int64),
+    "group_id": np.zeros(0, np.int64),
     "y": np.zeros(0) * u.pix,
     "x": np.zeros(0) * u.pix,
     "flags": np.zeros(0, np.int32),
     "status": np.zeros(0, "U1"),
     "reason": np.zeros(0, "U1"),
 }
-THEN = ("n_blend", "pass", "peak", "snr")
+THEN = ("n_blend", "n_group", "pass", "peak", "snr")
 
 
 def finished(job, parts, last, unsettled=()):
@@ -76,6 +93,7 @@ def finished(job, parts, last, unsettled=()):
     if tables:
         tables.sort(key=lambda rows: -len(rows.values))  # so that the first one has their order
         rows = Columns.joined(tables)
+        whole_groups(rows, job.bands)
         table = rows.chosen(np.argsort(rows["id"], kind="stable")).table()
         at = np.stack([table["y"].value, table["x"].value], axis=1)
         table = table[job.core.holds(at)]
@@ -96,7 +114,8 @@ def finished(job, parts, last, unsettled=()):
 def _order(job, names):
     """Names of columns: who and where, how it went, positions and shapes, then all channels."""
     channels, labels = job.channels, [m.name for m in job.mosaics]
-    fluxes = [f"{key}_{b}" for b in job.bands for key in ("flux", "flux_err")]
+    kinds = "flux", "flux_err", "group_flux", "group_flux_err"
+    fluxes = [f"{key}_{b}" for b in job.bands for key in kinds]
     quality = [f"chi2_{name}" for name in labels] + [f"residual_{c}" for c in channels]
     quality += ["misfit_sigma", "misfit_fraction", "ambiguous_with"]
     fixed = [*FIRST, *THEN]
@@ -114,6 +133,8 @@ def _described(table):
 def _description(name):
     """What a column is whose name holds a channel or an instrument, or an error's."""
     for prefix, text in (
+        ("group_flux_err_", "error of the flux of all of the group in {}"),
+        ("group_flux_", "flux of all of the group in {}"),
         ("flux_err_", "error of the flux in {}"),
         ("flux_", "total flux in {}"),
         ("chi2_", "mean chi2 of the source's pixels in {}"),

@@ -18,7 +18,7 @@ from ..sky.footprint import open_edge
 from ..sky.observation import ZERO_POINT_UJY
 from ..sky.wcs import frame_of, local_axes, names_of
 from .columns import Columns
-from .photometry import channel_covariances, flux_scale, fluxes
+from .photometry import add_groups, channel_covariances, flux_scale, fluxes
 from .quality import box_chi2, fitted_sources, labels, masked_cores
 from .shapes import moments, shape, shape_slopes
 
@@ -63,10 +63,11 @@ MEANINGS = {
 }
 
 
-def catalogue(result, *, magnitudes=False) -> QTable:
+def catalogue(result, *, magnitudes=False, groups=None) -> QTable:
     """The catalogue of a fitted blend: one row per source, columns with units.
 
     result: a fitted blend; magnitudes: add the columns of magnitudes and colours
+    groups (S,): a number for each group of sources, as `Detection.groups`: adds their columns
     returns QTable (S rows, in the order of `result.sources`); what was not measured is NaN:
         name: the source's own, or its number
         ra, dec [deg], or what the frame's WCS calls them; y_sky, x_sky [arcsec] on a flat sky; and
@@ -94,6 +95,8 @@ def catalogue(result, *, magnitudes=False) -> QTable:
         colour_A_B, colour_err_A_B [mag]: mag_A - mag_B of bands A, B next to each other; the
             error from the covariance of the two fluxes, see `channel_covariances`, to first order:
             of use where both are detected
+        group_id, n_group: number of the group, and its sources; group_flux_*, group_flux_err_* per
+            channel: of all of them together, the error with the covariances of their fluxes
         chi2_* per observation: mean chi2 of the pixels with weight in the source's box, of all
             channels and with all sources' models
         residual_* per channel [sigma]: the largest residual on the source once filtered with the
@@ -105,12 +108,12 @@ def catalogue(result, *, magnitudes=False) -> QTable:
         ambiguous_with: row of the source with which light may be exchanged, see `is_ambiguous`; -1
             without any
     """
-    table = columns_of(result, magnitudes=magnitudes).table()
+    table = columns_of(result, magnitudes=magnitudes, groups=groups).table()
     table["flags"].info.description = ", ".join(f"{flag.value} {flag.name}" for flag in Flag)
     return table
 
 
-def columns_of(result, *, magnitudes=False) -> Columns:
+def columns_of(result, *, magnitudes=False, groups=None) -> Columns:
     """The same as `catalogue`, before it is a table."""
     worst, misfit = channel_residuals(result), result.misfit
     flux, covariance = fluxes(result)
@@ -137,6 +140,9 @@ def columns_of(result, *, magnitudes=False) -> Columns:
             _add_magnitudes(table, band, flux[:, i] * scale[i], error[:, i] * scale[i])
     if magnitudes:
         _add_colours(table, result, flux)
+    if groups is not None:
+        table.put("group_id", np.asarray(groups))
+        add_groups(table, result, flux, covariance, groups)
     for i, label in enumerate(labels(result)):
         table.put(f"chi2_{label}", box_chi2(result, i, result.footprints[i]))
     for channel, values in zip(result.channels, worst.T, strict=True):

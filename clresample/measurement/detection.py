@@ -24,6 +24,7 @@ from ..deblending.spectra import MODEL_ERROR
 from ..sky.frame import Frame, model_frame
 from ..sky.observation import Observation
 from ..sky.sources import Extended
+from .clumps import bodies_of
 from .companions import (
     LEAST,
     LEAST_WIDE,
@@ -33,23 +34,16 @@ from .companions import (
     noise_of,
     top_near,
 )
+from .levels import level_of
+from .peaks import import_sep, new_peaks
+from .searched import SAME_SOURCE, Search
 from .signal import SMALL_GALAXY, combined, signal_of
 
 # [sigma] of the combined image: white noise reaches it once in two million independent pixels
 THRESHOLD = 5.0
-# [FWHM^2] least area of connected pixels above the threshold: smaller ones are not as wide as the
-# PSF, but noise on top of light just below the threshold
-MIN_AREA = 0.25
-# [FWHM^2] the same of what is left beside brighter sources: its area above the threshold is what a
-# noise that grows towards them leaves
+# [FWHM^2] least area of what is left beside brighter sources: its area above the threshold is what
+# a noise that grows towards them leaves
 MIN_AREA_BESIDE = 0.125
-# sep's deblending: levels between a threshold and a peak, of equal ratio, and the part of an
-# object's light that a branch must hold to be an object of its own. SExtractor's 32 levels and
-# 0.005 lose the neighbours of bright galaxies, whose branch rises over few of the levels; a part
-# under 0.001 takes clumps of large galaxies for objects.
-N_LEVELS, MIN_CONTRAST = 256, 0.001
-# of the wider PSF's FWHM: nearer to a source that is found, a peak counts as that source
-SAME_SOURCE = 0.7
 ALL = "all"  # the name of the combined image
 
 
@@ -61,6 +55,8 @@ class Detection:
     frame: Frame that their positions, pixels (y, x), belong to
     peaks (S,) [sigma]: signal to noise of each in the image that found it
     found_in (S,): name of that image: an observation's, or "all"
+    groups (S,): number of the source in whose light each lies and whose clump it may be, see
+        clumps.py; its own number where there is none
     image (Ny, Nx) [sigma]: signal to noise of all observations together, 0 where nothing was seen
     """
 
@@ -69,6 +65,7 @@ class Detection:
     peaks: np.ndarray
     found_in: tuple[str, ...]
     image: np.ndarray
+    groups: np.ndarray
 
 
 def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> Detection:
@@ -124,21 +121,56 @@ def detect_more(result, *, threshold=THRESHOLD) -> Detection:
     for i, o in enumerate(result.observations):
         sky = result.sky[result.channel_slices()[i], None, None]
         error = MODEL_ERROR * (result.model(i) - sky)
-        left.append(
-            Observation(
-                np.nan_to_num(result.residual(i)),
-                o.psf,
-                o.grid,
-                weights=o.weights / (1 + o.weights * error**2),
-                channels=o.channels,
-                zero_points=o.zero_points,
-                name=o.name,
-            )
-        )
+        left.append(_with_data(o, result.residual(i), o.weights / (1 + o.weights * error**2)))
     known = result.frame.place(result.sources)
     pixels = np.stack([*np.indices(result.frame.shape)], axis=-1)
     places = [footprint.locate(pixels) for footprint in result.footprints]
-    return _search(left, result.frame, threshold, list(known), beside=False, places=places)
+    found = _search(left, result.frame, threshold, list(known), beside=False, places=places)
+    return _without_structure(result, found, known, places, threshold) if found.sources else found
+
+
+def _with_data(observation, data, weights):
+    """An Observation of other data (C, Ny, Nx), 0 where they are NaN, with white noise."""
+    return Observation(
+        np.nan_to_num(data),
+        observation.psf,
+        observation.grid,
+        weights=weights,
+        channels=observation.channels,
+        zero_points=observation.zero_points,
+        name=observation.name,
+    )
+
+
+def _without_structure(result, found, known, places, threshold):
+    """The Detection without peaks that are structure of a large galaxy of the model, see clumps.py.
+
+    known (S, 2) [px]: of the fit's sources; places: of the frame's pixels on each observation
+    """
+    frame = result.frame
+    sharp = int(np.argmin([_fwhm_px(o, frame) for o in result.observations]))
+    o = result.observations[sharp]
+    sky = result.sky[result.channel_slices()[sharp], None, None]
+    light, rest = (
+        signal_of(_with_data(o, image, o.weights), frame, places[sharp]).flat()
+        for image in (result.model(sharp) - sky, result.residual(sharp))
+    )
+    inside = known[frame.inside(known)]
+    bodies = bodies_of(light, inside, _fwhm_px(o, frame), threshold, frame.grid.pixel_scale_arcsec)
+    kept = []
+    for i, source in enumerate(found.sources):
+        body = bodies.body_at(np.array(source.position_px))
+        y, x = np.rint(source.position_px).astype(int)
+        if body < 0 or not bodies.bodies[body].takes(rest[y, x], light[y, x])[0]:
+            kept.append(i)
+    return Detection(
+        sources=tuple(found.sources[i] for i in kept),
+        frame=frame,
+        peaks=found.peaks[kept],
+        found_in=tuple(found.found_in[i] for i in kept),
+        image=found.image,
+        groups=np.arange(len(kept)),
+    )
 
 
 def _search(observations, frame, threshold, known, scatters=None, beside=True, places=None):
@@ -148,7 +180,7 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
     """
     if not 0 < threshold < math.inf:
         raise ValueError(f"threshold must be a positive number of sigmas, not {threshold}")
-    sep = _import_sep()
+    sep = import_sep()
     at = places or [None] * len(observations)
     signals = [signal_of(o, frame, one) for o, one in zip(observations, at, strict=True)]
     if scatters is None:
@@ -156,32 +188,35 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
     signals = [one.over(scatter) for one, scatter in zip(signals, scatters, strict=True)]
     widths = np.array([_fwhm_px(o, frame) for o in observations])
     order = np.argsort(widths, kind="stable")
-    everything, best = combined(signals)
-    found = []  # position, peak, label
-
-    def add(image, label, narrow, wide):
-        before = known + [position for position, _, _ in found]
-        new = _new_peaks(sep, image, threshold, MIN_AREA * narrow**2, before, SAME_SOURCE * wide)
-        found.extend((position, peak, label) for position, peak in new)
-
-    for i in order:
-        add(signals[i].flat(), observations[i].label, widths[i], widths[i])
-    add(best, ALL, widths.min(), widths.max())
-    if beside and found:
-        sharp = order[0]
-        places = np.array([position for position, _, _ in found])
-        scale = frame.grid.pixel_scale_arcsec
-        for position, peak in _companions(
-            sep, signals, sharp, everything, places, threshold, widths[sharp], scale
-        ):
-            found.append((position, peak, observations[sharp].label))
-    found.sort(key=lambda one: -one[1])
+    everything, _ = combined(signals)
+    if beside:
+        everything = everything - level_of(everything, everything != 0)[1]
+    levelled, skies = signals, np.zeros((len(signals), 1))
+    if beside:
+        levelled, skies = zip(*(signal.levelled() for signal in signals), strict=True)
+    _, best = combined(levelled)
+    sharp = order[0]
+    found = Search(sep, threshold, known)
+    found.add(levelled[sharp].flat(), observations[sharp].label, widths[sharp], widths[sharp])
+    scale = frame.grid.pixel_scale_arcsec
+    if beside:
+        found.sort_out(signals[sharp].flat() - skies[sharp][0], widths[sharp], scale)
+    for i in order[1:]:
+        found.add(levelled[i].flat(), observations[i].label, widths[i], widths[i])
+    found.add(best, ALL, widths.min(), widths.max())
+    if beside and found.positions:
+        places = np.array(found.positions)
+        new = _companions(sep, levelled, sharp, everything, places, threshold, widths[sharp], scale)
+        found.add_companions(new, signals[sharp].flat(), observations[sharp].label)
+    order, groups = found.in_order()
+    positions = [found.positions[i] for i in order]
     return Detection(
-        sources=tuple(Extended(position_px=tuple(map(float, p))) for p, _, _ in found),
+        sources=tuple(Extended(position_px=(float(y), float(x))) for y, x in positions),
         frame=frame,
-        peaks=np.array([peak for _, peak, _ in found]),
-        found_in=tuple(label for _, _, label in found),
+        peaks=np.array([found.peaks[i] for i in order]),
+        found_in=tuple(found.labels[i] for i in order),
         image=everything,
+        groups=groups,
     )
 
 
@@ -197,7 +232,7 @@ def _companions(sep, signals, sharp, everything, places, threshold, fwhm, scale)
     )
     rest, model = left_over(image, seen, centres)
     wide, _ = left_over(signals[sharp].flat(SMALL_GALAXY), seen, centres)
-    new = _new_peaks(
+    new = new_peaks(
         sep,
         rest / noise_of(model),
         max(threshold, LEAST),
@@ -220,55 +255,7 @@ def _companions(sep, signals, sharp, everything, places, threshold, fwhm, scale)
     return found
 
 
-def _import_sep():
-    try:
-        import sep
-    except ImportError as error:
-        raise ImportError(
-            "detection needs sep, which is not installed: pip install 'clresample[detect]'"
-        ) from error
-    return sep
-
-
 def _fwhm_px(observation, frame):
     """Width [model px] of an observation's sharpest PSF."""
     scale = observation.grid.pixel_scale_arcsec / frame.grid.pixel_scale_arcsec
     return observation.psf.fwhm_px.min() * scale
-
-
-def _new_peaks(sep, image, threshold, area, known, apart, own=True):
-    """Positions (y, x) and heights of the objects in a signal-to-noise image, brightest first.
-
-    area [px]: least of an object; known: positions (2,) of sources; objects whose peak is within
-    `apart` [px] of one are left out, and (own) those that hold one: under a wide filter a pair of
-    them is one object whose peak lies between
-    """
-    objects, segments = _objects(sep, image, threshold, area)
-    places = np.array(known).reshape(-1, 2)
-    at = np.clip(np.rint(places).astype(int), 0, np.array(image.shape) - 1)
-    taken = set(segments[at[:, 0], at[:, 1]].tolist()) if own else set()
-    found = []
-    for i, (position, peak) in enumerate(objects, start=1):
-        near = len(places) and np.hypot(*(places - position).T).min() <= apart
-        if i not in taken and not near:
-            found.append((position, peak))
-    return sorted(found, key=lambda one: -one[1])
-
-
-def _objects(sep, image, threshold, area):
-    """sep's objects: (position (y, x), height) of each, and the number from 1 of that which holds a
-    pixel (Ny, Nx), 0 = none."""
-    if not image.max(initial=0) > threshold:  # as most residuals: sep takes 1 ms to say so
-        return [], np.zeros(image.shape, np.int32)
-    objects, segments = sep.extract(
-        np.ascontiguousarray(image),
-        threshold,
-        minarea=max(1, int(area)),
-        filter_kernel=None,
-        deblend_nthresh=N_LEVELS,
-        deblend_cont=MIN_CONTRAST,
-        segmentation_map=True,
-    )
-    return [
-        (np.array([o["ypeak"], o["xpeak"]], float), float(o["peak"])) for o in objects
-    ], segments

@@ -22,6 +22,7 @@ import numpy as np
 
 from ..deblending.posterior.residuals import TOGETHER_PX
 from ..sky.noise import sigma_below_zero
+from .levels import level_of
 
 # [arcsec] Standard deviations of G: of points, of galaxies of the usual size in deep images (half
 # of their light within 0.25 arcsec) and of large faint ones. A galaxy between two of them loses
@@ -70,6 +71,21 @@ class Signal:
         return Signal(
             self.sums / by, self.squares / by**2, self.n_seen, self.channels / by[0], self.places
         )
+
+    def levelled(self):
+        """The same without smooth levels, see levels.py, and those of its sky alone (W,) [sigma].
+
+        Sums of squares are left out where there is a level: they hold it in every channel.
+        """
+        sums, squares, skies = self.sums.copy(), self.squares.copy(), []
+        root = np.sqrt(np.maximum(self.n_seen, 1))
+        for w in range(len(sums)):
+            level, sky = level_of(self.flat(w), self.n_seen > 0)
+            sums[w] -= np.where(self.n_seen > 0, level * root, 0)
+            squares[w][level != 0] = 0
+            skies.append(sky)
+        levelled = Signal(sums, squares, self.n_seen, self.channels, self.places)
+        return levelled, np.array(skies)
 
     def spectra(self, at):
         """Signal to noise (n, C) [sigma] of the channels at pixels (n, 2) of the model, those

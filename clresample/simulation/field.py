@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..sky.grid import Grid
 from ..sky.psf import PSF
 from .galaxies import draw, import_galsim, parametric_galaxy
-from .scenes import POWER_LAW_INDEX, RUBIN_WAVELENGTHS_NM
-from .surveys import EUCLID_VIS, PSF_PIXELS, RUBIN_UGRIZY, Survey
+from .mosaicked import WAVELENGTH_NM, SimulatedField, SimulatedMosaic, with_bands
+from .real_sky import painted_field, sky_sources, spoilers_of
+from .scenes import POWER_LAW_INDEX
+from .surveys import EUCLID_VIS, PSF_PIXELS, RUBIN_UGRIZY
 
-WAVELENGTH_NM = dict(zip(RUBIN_UGRIZY.bands, RUBIN_WAVELENGTHS_NM, strict=True)) | {"VIS": 715.0}
+SKIES = "plain", "real", "bright"
 # [mag] brightest i magnitude, and dex per magnitude of the number counts, as of galaxies of i 20-26
 BRIGHTEST, COUNTS_SLOPE = 18.0, 0.32
 # [arcsec] half side of the stamp that a source is drawn on, down to each i magnitude: beyond it the
@@ -22,50 +24,19 @@ CLUSTER_ARCSEC = 1.5  # scatter of a companion's position about its host, in y a
 PSF_NODES = 5  # places along each axis at which the PSF cube of a mosaic is given
 
 
-@dataclass(frozen=True, eq=False)
-class SimulatedMosaic:
-    """One instrument's mosaic.
-
-    survey: the instrument; grid: Grid with a WCS
-    data (C, Ny, Nx) [counts]: float32; noise_sigma (C,) [counts]: of every pixel
-    bad (Ny, Nx) bool: columns whose pixels are worthless
-    psf_positions (K, 2) [px], psf_images (K, C, ny, nx): the PSF where it is given
-    """
-
-    survey: Survey
-    grid: Grid
-    data: np.ndarray
-    noise_sigma: np.ndarray
-    bad: np.ndarray
-    psf_positions: np.ndarray
-    psf_images: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class SimulatedField:
-    """A field with its truth.
-
-    mosaics: of Euclid and Rubin
-    truth: {column: array (S,)}: ra, dec [deg]; y, x [px of the first mosaic]; snr, the signal to
-        noise of the best possible filter over all mosaics and channels; kind "galaxy" or
-        "star"; host, the number of the source that it was put beside, -1 for none; mag_* and flux_*
-        [mag, uJy] of each channel
-    """
-
-    mosaics: tuple[SimulatedMosaic, ...]
-    truth: dict
-
-
 def simulate_field(
     seed,
     *,
+    sky="plain",
+    spoilers=None,
+    n_large=0,
     n_pixels=512,
-    density=36.0,
+    density=None,
     faintest=26.0,
     rubin_bands=RUBIN_UGRIZY.bands,
     angle_deg=12.0,
     clustering=0.2,
-    stars=0.05,
+    stars=None,
     psf_variation=0.0,
     bad_columns=0,
     center_deg=(150.0, 2.0),
@@ -73,29 +44,67 @@ def simulate_field(
     """A field as Euclid VIS and Rubin see it; one seed gives one field.
 
     seed: whole number; n_pixels: of Euclid a side; Rubin's mosaic holds the same sky
-    density [arcmin^-2]: of sources with i < `faintest` [mag]
+    sky: "plain", small parametric galaxies (`parametric_galaxy`) under Gaussian PSFs; "real",
+        numbers and sizes as published (counts.py), galaxies to 20 arcsec with bars, arms and
+        clumps, ellipticals to n = 6, stars that saturate, under an Airy PSF (Euclid) and Moffat
+        profiles (Rubin); "bright", six galaxies of half-light radii of 8 to 30 Euclid pixels among
+        160 small ones and five stars, one of them saturated, in 1024 x 1024 pixels
+    spoilers: Spoilers of the images of another sky than "plain"; None = all of them for "real",
+        masked saturation alone for "bright"
+    n_large: galaxies of 2 to 20 arcsec that are added to a "real" sky, where they are rare
+    density [arcmin^-2]: of sources with i < `faintest` [mag]; None = 36, for "real" as published
     rubin_bands: some of u g r i z y
     angle_deg [deg]: by which Rubin's pixels are turned
     clustering: part of the sources that lie beside another one, 1.5 arcsec away or so
-    stars: part of the sources that are stars
+    stars: part of the sources that are stars; None = 0.05, for "real" as published
     psf_variation: by which part the PSF's width grows from the left edge to the right one; Rubin's
         from the lower to the upper
     bad_columns: of each mosaic that hold nothing
     center_deg (2,) [deg]: right ascension and declination of the field's centre
 
-    Galaxies are parametric ones (`parametric_galaxy`) with power-law spectra. Needs GalSim.
+    Spectra are power laws. "bright" takes no density, faintest, clustering and stars. Needs GalSim.
 
     Raises ValueError for numbers out of range; ImportError, with what to install, without GalSim.
     """
+    density, stars = _defaults(sky, spoilers, n_large, density, stars)
     _check(n_pixels, density, faintest, clustering, stars, psf_variation, bad_columns, rubin_bands)
     source_rng, *rngs = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3))
-    surveys = EUCLID_VIS, _with_bands(RUBIN_UGRIZY, rubin_bands)
+    surveys = EUCLID_VIS, with_bands(RUBIN_UGRIZY, rubin_bands)
     side = n_pixels * EUCLID_VIS.pixel_scale_arcsec
-    sources = _sources(source_rng, side, density, faintest, clustering, stars)
+    grids = _grids(surveys, n_pixels, angle_deg)
+    if sky == "plain":
+        sources = _sources(source_rng, side, density, faintest, clustering, stars)
+        return _plain(surveys, grids, sources, rngs, psf_variation, bad_columns, center_deg)
+    counts = {"density": density, "faintest": faintest, "clustering": clustering, "stars": stars}
+    sources = sky_sources(sky, source_rng, side, n_large=n_large, **counts)
+    images = {"psf_variation": psf_variation, "bad_columns": bad_columns, "center_deg": center_deg}
+    return painted_field(sources, grids, surveys, rngs, spoilers_of(sky, spoilers), **images)
+
+
+def _defaults(sky, spoilers, n_large, density, stars):
+    """Density and stars with the values of a plain sky; raise ValueError for another sky's."""
+    if sky not in SKIES:
+        raise ValueError(f"sky is {sky!r}, must be one of {', '.join(SKIES)}")
+    if n_large < 0 or (n_large and sky != "real"):
+        raise ValueError(f'n_large is {n_large}, must be 0 or more: pass it with sky="real"')
+    if sky != "plain":
+        return density, stars
+    if spoilers is not None:
+        raise ValueError('spoilers change nothing of a plain sky: pass sky="real" or "bright"')
+    return 36.0 if density is None else density, 0.05 if stars is None else stars
+
+
+def _grids(surveys, n_pixels, angle_deg):
+    """Flat grids of both surveys; the second holds the sky of the first."""
+    euclid, rubin = surveys
     turns = np.radians(angle_deg)
     reach = abs(np.cos(turns)) + abs(np.sin(turns))
-    n_rubin = int(np.ceil(side * reach / RUBIN_UGRIZY.pixel_scale_arcsec))
-    grids = EUCLID_VIS.grid(n_pixels), surveys[1].grid(n_rubin, angle_deg=angle_deg)
+    n_rubin = int(np.ceil(n_pixels * euclid.pixel_scale_arcsec * reach / rubin.pixel_scale_arcsec))
+    return euclid.grid(n_pixels), rubin.grid(n_rubin, angle_deg=angle_deg)
+
+
+def _plain(surveys, grids, sources, rngs, psf_variation, bad_columns, center_deg):
+    """The SimulatedField of parametric galaxies."""
     mosaics, powers = zip(
         *(
             _mosaic(survey, grid, sources, rng, psf_variation, axis, bad_columns, center_deg)
@@ -111,10 +120,10 @@ def _check(n_pixels, density, faintest, clustering, stars, psf_variation, bad_co
     """Raise ValueError for what `simulate_field` does not take."""
     for name, value, good in (
         ("n_pixels", n_pixels, n_pixels >= 32),
-        ("density", density, density > 0),
+        ("density", density, density is None or density > 0),
         ("faintest", faintest, faintest > BRIGHTEST),
         ("clustering", clustering, 0 <= clustering <= 1),
-        ("stars", stars, 0 <= stars <= 1),
+        ("stars", stars, stars is None or 0 <= stars <= 1),
         ("psf_variation", psf_variation, 0 <= psf_variation < 1),
         ("bad_columns", bad_columns, bad_columns >= 0),
     ):
@@ -123,12 +132,6 @@ def _check(n_pixels, density, faintest, clustering, stars, psf_variation, bad_co
     unknown = [band for band in rubin_bands if band not in RUBIN_UGRIZY.bands]
     if unknown or not rubin_bands:
         raise ValueError(f"rubin_bands is {rubin_bands}, some of {RUBIN_UGRIZY.bands} are taken")
-
-
-def _with_bands(survey, bands):
-    chosen = [survey.bands.index(band) for band in bands]
-    columns = ("bands", "psf_sigma_arcsec", "exposure_s", "zero_point", "sky_mag")
-    return replace(survey, **{c: tuple(getattr(survey, c)[i] for i in chosen) for c in columns})
 
 
 @dataclass(frozen=True, eq=False)

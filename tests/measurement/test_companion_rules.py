@@ -233,7 +233,7 @@ def test_what_no_channel_has_seen_is_told_by_the_other_side(monkeypatch):
         return np.zeros(image.shape), np.zeros(image.shape)
 
     monkeypatch.setattr(detection, "left_over", left)
-    monkeypatch.setattr(detection, "_new_peaks", lambda *_, **__: [])
+    monkeypatch.setattr(detection, "new_peaks", lambda *_, **__: [])
     n_seen = np.array([[0, 1, 2]] * 3)
     image = np.zeros((3, 3), np.float32)
     both = np.stack([image, image])  # under both filters that are asked
@@ -249,7 +249,7 @@ def test_companions_have_five_sigma_however_low_the_threshold(monkeypatch):
         given.append((threshold, area, len(known), apart, own))
         return []
 
-    monkeypatch.setattr(detection, "_new_peaks", searched)
+    monkeypatch.setattr(detection, "new_peaks", searched)
     image = np.zeros((20, 20), np.float32)
     places = np.moveaxis(np.indices(image.shape), 0, -1).astype(float)
     both = np.stack([image, image])  # under both filters that are asked

@@ -115,7 +115,7 @@ def beside(narrow, wide, monkeypatch):
     places = np.moveaxis(np.indices(SHAPE), 0, -1).astype(float)
     signals = [Signal(sums, sums**2, SEEN.astype(int), narrow[None], places)]
     peaks = [(np.array([60.0, x]), 9.0) for x in (71, 73)]
-    monkeypatch.setattr(detection, "_new_peaks", lambda *args, **more: peaks)
+    monkeypatch.setattr(detection, "new_peaks", lambda *args, **more: peaks)
     at = np.array([[60.0, 60.0]])
     found = detection._companions(None, signals, 0, narrow, at, 5.0, FWHM, SCALE)
     return [place for place, _ in found]

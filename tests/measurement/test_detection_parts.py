@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.blends import blend, in_frame, observe, round_component
 
-from clresample.measurement import detection as module
+from clresample.measurement import detection as module, peaks
 from clresample.measurement.detection import ALL, detect, detect_more
 from clresample.measurement.signal import signal_of
 from clresample.sky.frame import model_frame
@@ -72,8 +72,8 @@ def two_widths():
 def test_a_peak_of_all_images_within_the_wider_psf_is_the_same_source(monkeypatch, away, n):
     """FWHM 3.5 and 8 px: 4 px away counts as the source of the sharp image, 9 px do not."""
     found = [(np.array([30.0, 30.0]), 20.0)], [], [(np.array([30.0, 30.0 + away]), 9.0)], []
-    peaks = iter(found)
-    monkeypatch.setattr(module, "_objects", lambda *_: (next(peaks), np.zeros(GRID.shape, int)))
+    each = iter(found)
+    monkeypatch.setattr(peaks, "_objects", lambda *_: (next(each), np.zeros(GRID.shape, int)))
     found = detect(two_widths(), model_frame(two_widths(), grid=GRID))
     assert len(found.sources) == n
     assert found.found_in == ("sharp", ALL)[:n]
@@ -126,7 +126,7 @@ def test_an_object_has_as_many_pixels_as_it_has_to(area, n):
 
     image = np.zeros((20, 20), np.float32)
     image[10, 12] = 9
-    found = module._new_peaks(sep, image, 5.0, area, [], 1.0)
+    found = peaks.new_peaks(sep, image, 5.0, area, [], 1.0)
     assert [(tuple(place), peak) for place, peak in found] == [((10, 12), 9)][:n]
 
 
@@ -136,7 +136,7 @@ def test_the_brightest_peak_comes_first():
     image = np.zeros((30, 30), np.float32)
     for place, peak in (((5, 5), 9), ((20, 8), 30), ((12, 24), 15)):
         image[place] = peak
-    assert [peak for _, peak in module._new_peaks(sep, image, 5.0, 1, [], 1.0)] == [30, 15, 9]
+    assert [peak for _, peak in peaks.new_peaks(sep, image, 5.0, 1, [], 1.0)] == [30, 15, 9]
 
 
 def test_an_image_below_the_threshold_is_not_searched(monkeypatch):
@@ -148,8 +148,8 @@ def test_an_image_below_the_threshold_is_not_searched(monkeypatch):
 
     image = np.zeros((9, 12), np.float32)
     image[4, 5:8] = 5.0
-    objects, segments = module._objects(NotAsked(), image, 5.0, 1)
+    objects, segments = peaks._objects(NotAsked(), image, 5.0, 1)
     assert objects == [] and segments.shape == image.shape and not segments.any()
     image[4, 6] = np.float32(5.0001)
-    (found,), segments = module._objects(sep, image, 5.0, 1)
+    (found,), segments = peaks._objects(sep, image, 5.0, 1)
     assert found[0].tolist() == [4, 6] and segments.sum() == 1

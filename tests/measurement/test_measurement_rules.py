@@ -1,5 +1,7 @@
 """Rules of detection and residuals at their limits, each alone: what is just inside counts."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from helpers.blends import blend, observe, round_component
@@ -8,7 +10,7 @@ from scipy.signal import fftconvolve
 from clresample.deblending.assessment.misfit import Misfit
 from clresample.deblending.posterior.residuals import _filtered, _kernels, convolved
 from clresample.deblending.spectra import MODEL_ERROR
-from clresample.measurement import detection
+from clresample.measurement import detection, peaks, searched as searched_module
 from clresample.measurement.detection import detect, detect_more
 from clresample.sky.frame import model_frame
 from clresample.sky.grid import Grid
@@ -100,7 +102,7 @@ def test_objects_have_a_quarter_of_the_square_of_their_images_fwhm(monkeypatch):
         given.append((threshold, area, apart))
         return []
 
-    monkeypatch.setattr(detection, "_new_peaks", searched)
+    monkeypatch.setattr(searched_module, "new_peaks", searched)
     seen = two_widths()
     frame = model_frame(seen, grid=GRID)
     assert not detect(seen, frame).sources
@@ -125,7 +127,12 @@ def test_the_width_of_an_observation_is_that_of_its_sharpest_channel():
 def test_the_models_error_is_added_to_the_noise_of_residuals(monkeypatch):
     """1 / w + (0.15 model)^2, the sky left out; no known source is searched beside."""
     given = []
-    monkeypatch.setattr(detection, "_search", lambda *a, **more: given.append((a, more)))
+
+    def searched(*arguments, **more):
+        given.append((arguments, more))
+        return SimpleNamespace(sources=())
+
+    monkeypatch.setattr(detection, "_search", searched)
     component = round_component(0, (30, 30), (40.0, 20.0))
     seen = observe(GRID, ("g", "r"), data=7.0, weights=0.25, zero_points=25.0, name="cam")
     result = blend([component], observations=(seen,), grid=GRID, sky=np.array([5.0, 3.0]))
@@ -150,7 +157,7 @@ def test_what_an_object_is_and_what_a_known_source_hides():
         image[place] = peak
 
     def found(known, apart=0.0, own=True, area=1):
-        new = detection._new_peaks(sep, image, 5.0, area, known, apart, own)
+        new = peaks.new_peaks(sep, image, 5.0, area, known, apart, own)
         return [tuple(map(int, place)) for place, _ in new]
 
     assert found([]) == [(5, 30), (5, 5), (20, 10)]
@@ -177,6 +184,6 @@ def test_a_faint_neighbour_of_a_bright_object_is_an_object_of_its_own():
     bright = spot((30, 20), 3000, 5)
     for height, n in ((100.0, 2), (9.0, 1)):
         image = (bright + spot((30, 41), height, 1.8)).astype(np.float32)
-        objects, segments = detection._objects(sep, image, 5.0, 3)
+        objects, segments = peaks._objects(sep, image, 5.0, 3)
         assert len(objects) == n == segments.max()
         assert tuple(objects[0][0]) == (30, 20) or tuple(objects[-1][0]) == (30, 20)

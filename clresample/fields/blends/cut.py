@@ -7,8 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from ...measurement.hills import root, saddles, watershed
 from ..box import Box
 
+# [sigma] of the combined signal to noise at a saddle: what lies beyond is worth a joint fit only
+# where that takes little time. A piece's neighbours are subtracted to 15 % (MODEL_ERROR): what is
+# left of their light at the border is under a sigma of a point source's flux there.
+WEAK = 6.0
 # A fit's memory over that of its images: four pieces of 512 x 320 pixels, 12 sources and seven
 # channels each, took 2.8 GB for 1.03 GB of images.
 OVERHEAD = 2.7
@@ -21,17 +26,20 @@ class Limits:
     sources: how many; pixels: of the model, in the box about the blend. Larger ones are fitted more
     exactly, as one scene, but take longer than in proportion: the errors' normal matrix grows with
     the square of the number of sources, its inverse with the cube
+    work [px]: model pixels times sources that blends may have before they are cut where the light
+        between their parts is weak (WEAK); others only over the limits above
     memory [bytes]: that it may take by prediction, see `fit_bytes`; None = any; n_channels: of all
     mosaics, for that
     """
 
     sources: int = 40
     pixels: int = 400 * 400
+    work: int = 1_000_000
     memory: float | None = None
     n_channels: int = 1
 
     def __post_init__(self):
-        for name in ("sources", "pixels"):
+        for name in ("sources", "pixels", "work"):
             if not getattr(self, name) >= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, must be 1 or more")
 
@@ -48,6 +56,10 @@ class Limits:
         few = n_sources <= self.sources and n_pixels <= self.pixels
         return few and (self.memory is None or n_bytes <= self.memory)
 
+    def quick(self, n_sources, n_pixels) -> bool:
+        """Whether a fit of so many sources in a box of so many pixels is within `work` too."""
+        return self.hold(n_sources, n_pixels) and n_sources * n_pixels <= self.work
+
 
 def fit_bytes(n_sources, n_pixels, n_channels) -> float:
     """Memory [bytes] that a fit takes on device and host together, roughly.
@@ -60,14 +72,16 @@ def fit_bytes(n_sources, n_pixels, n_channels) -> float:
     return OVERHEAD * 4.0 * images * n_pixels
 
 
-def pieces_of(light, inside, positions, limits, margin):
+def pieces_of(light, inside, positions, limits, margin, groups=None):
     """Cut a blend into pieces within the limits: territories (Ny, Nx) and a piece (S,) per source.
 
     Each source gets the pixels from which the light rises to it (watershed); sources are then put
     together in the order of the light at the saddle between them, brightest first, as long as the
-    pieces stay within the limits. So the pieces part where the light is weakest.
+    pieces stay within the limits, and below WEAK as long as they are quick. So they part where the
+    light is weakest.
 
     light (Ny, Nx) [sigma]; inside (Ny, Nx) bool: the blend's pixels; positions (S, 2) [px] in these
+    groups (S,): sources of one number are put together first; None = each has its own
     margin [px]: by which the box of a piece's fit is larger on each side
     A single source whose own pixels are over the limits keeps those near it: the others are
     nobody's, and sky in the pieces that hold them.
@@ -75,7 +89,7 @@ def pieces_of(light, inside, positions, limits, margin):
     """
     at = np.clip(np.rint(positions).astype(int), 0, np.array(light.shape) - 1)
     light = np.asarray(light, np.float32)
-    basins = _watershed(light, inside | _at(inside.shape, at), at)
+    basins = watershed(light, inside | _at(inside.shape, at), at)
     owner = basins[at[:, 0], at[:, 1]] - 1  # two sources on one pixel share a basin
     n = int(basins.max())
     boxes = _boxes_within(
@@ -83,16 +97,20 @@ def pieces_of(light, inside, positions, limits, margin):
     )
     counts = np.bincount(owner, minlength=n)
     piece = np.arange(n)
-    for a, b in _saddles(light, basins):
-        a, b = _root(piece, a), _root(piece, b)
+    pairs, heights = saddles(light, basins, heights=True)
+    within = _within(owner, groups)
+    heights = [np.inf] * len(within) + heights
+    for (a, b), height in zip(within + pairs, heights, strict=True):
+        a, b = root(piece, a), root(piece, b)
         if a == b:
             continue
         both = boxes[a].join(boxes[b])
-        if not limits.hold(counts[a] + counts[b], both.grown(margin).area):
+        fits = limits.hold if height > WEAK else limits.quick
+        if not fits(counts[a] + counts[b], both.grown(margin).area):
             continue
         piece[b], boxes[a] = a, both
         counts[a] += counts[b]
-    roots = np.array([_root(piece, i) for i in range(n)])
+    roots = np.array([root(piece, i) for i in range(n)])
     _, number = np.unique(roots, return_inverse=True)
     territory = np.concatenate([[0], number + 1])[basins].astype(np.int32)
     return territory, number[owner]
@@ -125,77 +143,10 @@ def _at(shape, pixels):
     return found
 
 
-def _watershed(light, inside, at):
-    """Basins (Ny, Nx) int32 of the sources at pixels (S, 2), numbered from 1 without gaps, 0
-    outside: each pixel belongs to the source from which the light falls to it."""
-    peaks, n_peaks = _hills(light, inside)
-    hills = peaks[at[:, 0], at[:, 1]] - 1
-    taken = np.zeros(n_peaks, bool)
-    taken[hills] = True
-    parent = np.arange(n_peaks)
-    for a, b in _saddles(light, peaks):
-        a, b = _root(parent, a), _root(parent, b)
-        if a != b and not (taken[a] and taken[b]):
-            parent[b], taken[a] = a, taken[a] or taken[b]
-    roots = np.array([_root(parent, i) for i in range(n_peaks)])
-    own = np.unique(roots[hills])
-    number = np.zeros(n_peaks, np.int32)
-    number[np.isin(roots, own)] = 1 + np.searchsorted(own, roots[np.isin(roots, own)])
-    return np.concatenate([[0], number]).astype(np.int32)[peaks]
-
-
-def _hills(light, inside):
-    """The hills of the light (Ny, Nx) int32, numbered from 1, 0 outside, and how many there are:
-    all pixels from which the steepest way up ends on the same peak."""
-    n_y, n_x = light.shape
-    kind = np.int32 if light.size < 1 << 31 else np.int64
-    rank = np.empty(light.size, kind)  # of equal pixels the later is higher: no plateaus
-    own = np.arange(light.size, dtype=kind)
-    rank[np.argsort(light, axis=None, kind="stable")] = own
-    own, rank = own.reshape(light.shape), rank.reshape(light.shape)
-    rank[~inside] = -1
-    rank = np.pad(rank, 1, constant_values=-1)
-    best, up = rank[1:-1, 1:-1].copy(), own.copy()
-    for dy in (-1, 0, 1):
-        for dx in (-1, 0, 1):
-            there = rank[1 + dy : 1 + dy + n_y, 1 + dx : 1 + dx + n_x]
-            higher = inside & (there > best)
-            up[higher] = own[higher] + dy * n_x + dx
-            best[higher] = there[higher]
-    up = up.ravel()
-    while (up[up] != up).any():  # halves the ways each time
-        up = up[up]
-    up = up[inside.ravel()]
-    is_top = np.zeros(light.size, bool)
-    is_top[up] = True
-    number = np.cumsum(is_top, dtype=np.int32)
-    found = np.zeros(light.shape, np.int32)
-    found[inside] = number[up]
-    return found, int(number[-1])
-
-
-def _saddles(light, basins):
-    """Pairs of basins (from 0) that touch, by the brightest light on their border, falling."""
-    pairs, heights = [], []
-    for first, second in (
-        (np.s_[:-1, :], np.s_[1:, :]),
-        (np.s_[:, :-1], np.s_[:, 1:]),
-        (np.s_[:-1, :-1], np.s_[1:, 1:]),
-        (np.s_[:-1, 1:], np.s_[1:, :-1]),
-    ):
-        a, b = basins[first], basins[second]
-        touch = (a != b) & (a > 0) & (b > 0)
-        heights.append(np.minimum(light[first], light[second])[touch])
-        pairs.append(np.sort(np.stack([a[touch], b[touch]], axis=1) - 1, axis=1))
-    both, height = np.concatenate(pairs), np.concatenate(heights)
-    order = np.lexsort((both[:, 1], both[:, 0], -height))
-    _, first = np.unique(both[order], axis=0, return_index=True)
-    return both[order][np.sort(first)].tolist()
-
-
-def _root(parents, i):
-    """The root of i in a forest, whose ways are made shorter."""
-    while parents[i] != i:
-        parents[i] = parents[parents[i]]
-        i = parents[i]
-    return i
+def _within(owner, groups):
+    """Pairs of the basins (from 0) of sources of one group."""
+    if groups is None:
+        return []
+    first: dict[int, int] = {}
+    of_group = zip(groups.tolist(), owner.tolist(), strict=True)
+    return [(a, o) for g, o in of_group if (a := first.setdefault(g, o)) != o]

@@ -52,6 +52,8 @@ class Plan:
     groups: of patch numbers, those predicted to take longest first
     giants: groups of pieces only, which are fitted again with their neighbours' light subtracted
     lost: {tile's number: why it could not be searched}
+    hosts (S,): int64, id of the source whose clump each may be, its own where there is none; None =
+        their own
     """
 
     positions: np.ndarray
@@ -61,11 +63,18 @@ class Plan:
     groups: tuple[tuple[int, ...], ...]
     giants: tuple[tuple[int, ...], ...] = ()
     lost: dict = field(default_factory=dict)
+    hosts: np.ndarray | None = None
 
     @cached_property
     def peak_of(self) -> dict[int, float]:
         """{id: peak} [sigma] of all sources."""
         return dict(zip(self.ids.tolist(), self.peaks.tolist(), strict=True))
+
+    @cached_property
+    def host_of(self) -> dict[int, int]:
+        """{id: id of its host} of all sources."""
+        hosts = self.ids if self.hosts is None else self.hosts
+        return dict(zip(self.ids.tolist(), hosts.tolist(), strict=True))
 
     def to_json(self) -> str:
         """All of it, as `from_json` takes it; floats with the digits that give them back."""
@@ -78,6 +87,7 @@ class Plan:
                 "groups": self.groups,
                 "giants": self.giants,
                 "lost": self.lost,
+                "hosts": None if self.hosts is None else self.hosts.tolist(),
             }
         )
 
@@ -110,6 +120,7 @@ class Plan:
             tuple(map(tuple, about["groups"])),
             tuple(map(tuple, about["giants"])),
             about["lost"],
+            about["hosts"] and np.array(about["hosts"], np.int64),
         )
 
 
@@ -145,6 +156,7 @@ def make_plan(
     memory=None,
     n_channels=1,
     most=32,
+    hosts=None,
 ) -> Plan:
     """Blends from sources and the labels of their light; giants cut; groups by predicted cost.
 
@@ -154,15 +166,13 @@ def make_plan(
     most: blends in a group, as many as a CPU fits side by side. More share a round's launches,
         which take longer than the arithmetic of small blends, but are lost together with their
         worker
+    hosts (S, 2) [px]: see Found; in cut blends they stay with their clumps if the limits allow it
     """
     limits = replace(limits or Limits(), memory=memory, n_channels=n_channels)
     ids = source_ids(positions, field_number)
+    hosts = ids if hosts is None else host_ids(positions, peaks, ids, hosts)
     labels, corner = footprints.labels, np.array(region[:2])
-    at = nearest(positions) - corner
-    at = np.clip(at, 0, np.array(labels.shape) - 1)
-    of_label: dict[int, list[int]] = {}
-    for s, label in enumerate(labels[at[:, 0], at[:, 1]].tolist()):
-        of_label.setdefault(label, []).append(s)
+    of_label = _by_label(labels, nearest(positions) - corner)
     made: list[dict] = []
     order = sorted((label for label in of_label if label), key=lambda label: of_label[label][0])
     pending = []
@@ -172,13 +182,13 @@ def make_plan(
         own = {"parent": int(ids[brightest]), "n_blend": len(sources)}
         inner = box.within(region)
         inside = labels[inner.slices] == label
-        if limits.hold(len(sources), box.grown(MARGIN_PX).area) or len(sources) == 1:
+        if limits.quick(len(sources), box.grown(MARGIN_PX).area) or len(sources) == 1:
             pending.append((inner, inside, len(made)))
             made.append(own | {"box": box, "sources": tuple(sources)})
             continue
         light = footprints.light[inner.slices]
         local = positions[sources] - box[:2]
-        territory, number = pieces_of(light, inside, local, limits, MARGIN_PX)
+        territory, number = pieces_of(light, inside, local, limits, MARGIN_PX, hosts[sources])
         n_pieces = int(number.max()) + 1
         for i, where in enumerate(ndimage.find_objects(territory)):
             part = territory[where] == i + 1
@@ -187,13 +197,42 @@ def make_plan(
             pending.append((there.within(region), part, len(made)))
             few = tuple(s for s, piece in zip(sources, number, strict=True) if piece == i)
             made.append(own | {"box": there, "sources": few, "pieces": n_pieces})
-    labels[:] = 0
-    for inner, inside, i in pending:
-        labels[inner.slices][inside] = i + 1
+    _number(labels, pending)
     patches = _patches(made)
     groups = _groups(patches, memory, n_channels, most)
     giants = _groups([p for p in patches if p.pieces > 1], memory, n_channels, most)
-    return Plan(positions, ids, np.asarray(peaks), patches, groups, giants)
+    return Plan(positions, ids, np.asarray(peaks), patches, groups, giants, hosts=hosts)
+
+
+def host_ids(positions, peaks, ids, hosts) -> np.ndarray:
+    """Ids (S,) int64 of sources' hosts, whose positions (S, 2) [px] are `hosts`.
+
+    Where none of the sources is at a host's position, the brightest of those with it is.
+    """
+    at = {tuple(p): i for i, p in enumerate(np.asarray(positions).tolist())}
+    of_host: dict[tuple, list[int]] = {}
+    for i, host in enumerate(np.asarray(hosts).tolist()):
+        of_host.setdefault(tuple(host), []).append(i)
+    found = np.array(ids)
+    for host, members in of_host.items():
+        found[members] = ids[at.get(host, max(members, key=lambda i: peaks[i]))]
+    return found
+
+
+def _by_label(labels, at):
+    """{label: numbers of the sources} at pixels (S, 2) of labels (Ny, Nx), taken to the edge."""
+    at = np.clip(at, 0, np.array(labels.shape) - 1)
+    found: dict[int, list[int]] = {}
+    for s, label in enumerate(labels[at[:, 0], at[:, 1]].tolist()):
+        found.setdefault(label, []).append(s)
+    return found
+
+
+def _number(labels, pending):
+    """Write the numbers of patches, from 1, into labels (Ny, Nx); pending: (Box, mask, number)."""
+    labels[:] = 0
+    for inner, inside, i in pending:
+        labels[inner.slices][inside] = i + 1
 
 
 def _patches(made):

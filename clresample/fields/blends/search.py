@@ -31,12 +31,15 @@ class Found:
         [sigma]
     light (Ny, Nx) [sigma]: float16, signal to noise of all instruments together, of the core
     lit (Ny, Nx) bool: the core's pixels of footprints, grown by the PSF
+    hosts (S, 2) [px]: position of the source whose clump each may be, its own where there is none;
+        None = their own
     """
 
     positions: np.ndarray
     peaks: np.ndarray
     light: np.ndarray
     lit: np.ndarray
+    hosts: np.ndarray | None = None
 
 
 def search(mosaics, reference, tile, *, threshold, scatters=None) -> Found:
@@ -60,10 +63,11 @@ def search(mosaics, reference, tile, *, threshold, scatters=None) -> Found:
     radius = footprint_radius(observations, frame)
     lit = grown_footprints(found.image > LIGHT, positions, radius)
     positions = positions + tile.outer[:2]
+    hosts = positions[found.groups]
     own = tile.core.holds(positions)
     inner = tile.core.within(tile.outer).slices
     light = np.clip(found.image[inner], -100, 6e4).astype(np.float16)
-    return Found(positions[own], found.peaks[own], light, lit[inner])
+    return Found(positions[own], found.peaks[own], light, lit[inner], hosts[own])
 
 
 def place(mosaics, reference, tile, positions, *, scatters=None) -> Found:

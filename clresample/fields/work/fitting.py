@@ -117,7 +117,7 @@ def _fitted(job, group, given):
         cuts.append(_Cut(patch, blend, boxes, time.perf_counter() - start))
     results = _fits(job, [cut.blend for cut in cuts])
     if job.passes > 1:
-        results = _second_look(job, given, cuts, results)
+        results = _second_look(job, given, cuts, results, group.round)
     for cut, result in zip(cuts, results, strict=True):
         if isinstance(result, Failure):
             if result.status == INTERRUPTED:
@@ -169,16 +169,17 @@ def _fits(job, blends):
     return results
 
 
-def _second_look(job, given, cuts, results):
+def _second_look(job, given, cuts, results, n_round):
     """Fit those blends again in whose residuals there are more sources, with these.
 
     The residuals are those of the whole fit. A first look of 30 iterations without structure, as
     `clresample deblend` takes, leaves bright galaxies' own structure in them: in simulated fields
-    15 % of all rows were clumps of it then, and no more true sources were found.
+    15 % of all rows were clumps of it then, and no more true sources were found. Pieces of a cut
+    blend are looked at from round 1 on, when their neighbours' light is subtracted.
     """
     again = {}
     for i, (cut, result) in enumerate(zip(cuts, results, strict=True)):
-        if isinstance(result, Failure):
+        if isinstance(result, Failure) or (n_round == 0 and cut.patch.siblings):
             continue
         try:
             found = detect_more(result, threshold=job.threshold).sources
@@ -208,7 +209,9 @@ def _take(part, job, cut, result, n_round):
     """Add a fitted patch to the part."""
     patch, origin = cut.patch, np.array(cut.patch.box[:2])
     result = judged_on_sources(result)  # of its neighbours there is light in wide pixels
-    rows = columns_of(result)
+    names = [int(source.name) for source in result.sources]
+    hosts = np.array([job.plan.host_of.get(name, name) for name in names], np.int64)
+    rows = columns_of(result, groups=hosts)
     ids = np.array([int(name) for name in rows.values.pop("name")], np.int64)
     for name in POSITIONS:
         rows.put(name, rows[name] + origin[0 if name[0] == "y" else 1])
@@ -264,6 +267,8 @@ def _set_aside(part, job, patch, n_round, status):
     add_positions(rows, job.reference, positions, "")
     rows.put("flags", np.full(len(sources), int(Flag.NOT_CONVERGED), np.int32))
     rows.put("ambiguous_with", np.full(len(sources), -1))
+    rows.put("group_id", np.array([job.plan.host_of[i] for i in ids.tolist()], np.int64))
+    rows.put("n_group", np.zeros(len(sources), np.int32))
     _add_columns(rows, ids, job, patch, status)
     part.rows.append(rows)
     part.patches.append(

@@ -12,7 +12,7 @@ from ...files.whole_file import whole_file
 from ...sky.grid import Grid
 from ..blends.link import link
 from ..blends.plan import Plan, make_plan
-from ..blends.search import Found, place, search
+from ..blends.search import Found, grown_footprints, place, search
 from ..blends.tiles import tiles_of
 from .engine import Work
 from .look import looked
@@ -21,6 +21,7 @@ from .look import looked
 # of channels in the model's own pixels 132, 268 and 536 bytes a pixel were held for 1, 4 and 8
 SEARCH_BYTES = 60
 STEPS = 1024  # of the positions that are found, in a pixel: a hundredth of a bright source's error
+LOST_RADIUS_PX = 8  # of a given source's footprint on a tile whose light could not be looked at
 LEAST_TILE_PX = 64  # however little memory there is: smaller tiles are mostly overlap
 
 
@@ -55,20 +56,21 @@ def planned(mosaics, reference, region, core, work, options, engine, progress, c
 
     def found(number):
         if str(number) in lost:
-            shape = tiles[number].core.shape
-            return Found(np.zeros((0, 2)), np.zeros(0), np.zeros(shape), np.zeros(shape, bool))
+            return _lost(tiles[number], _given_px(options.positions, reference))
         return _read_found(work, number)
 
     everything = [found(tile.number) for tile in tiles]
     positions = np.concatenate([f.positions for f in everything])
     peaks = np.concatenate([f.peaks for f in everything])
+    hosts = np.concatenate([f.positions if f.hosts is None else f.hosts for f in everything])
     del everything
     # What a field's division into tiles would change: the last digits, and who comes first. Both
     # decide how fits round, which moves fluxes of some blends by two tenths of their errors.
     if options.positions is None:
         positions = np.floor(positions * STEPS) / STEPS  # not up: over the edge of the core
+        hosts = np.floor(hosts * STEPS) / STEPS
     order = np.lexsort(positions.T[::-1])
-    positions, peaks = positions[order], peaks[order]
+    positions, peaks, hosts = positions[order], peaks[order], hosts[order]
     footprints = link(tiles, found, region, work)
     plan = make_plan(
         positions,
@@ -79,6 +81,7 @@ def planned(mosaics, reference, region, core, work, options, engine, progress, c
         field_number=options.field_number,
         memory=options.memory,
         n_channels=n_channels,
+        hosts=hosts,
     )
     plan = replace(plan.only(core), lost=lost)
     if hasattr(footprints.labels, "flush"):
@@ -91,9 +94,7 @@ def planned(mosaics, reference, region, core, work, options, engine, progress, c
 
 def _searched(mosaics, reference, tiles, work, options, engine, progress):
     """Search the tiles that are not yet; {number: reason} of those that could not be."""
-    positions = options.positions
-    if positions is not None:
-        positions = reference.pixel(*np.asarray(positions, float).reshape(-1, 2).T)
+    positions = _given_px(options.positions, reference)
     todo = [tile for tile in tiles if not _found_path(work, tile.number).exists()]
     progress.stage("search", len(tiles))
     progress.step(len(tiles) - len(todo))
@@ -120,6 +121,23 @@ def _searched(mosaics, reference, tiles, work, options, engine, progress):
     return lost
 
 
+def _given_px(positions, reference):
+    """Positions (S, 2) [px] in the reference's pixels of a catalogue's (S, 2) [deg], or None."""
+    if positions is None:
+        return None
+    return reference.pixel(*np.asarray(positions, float).reshape(-1, 2).T)
+
+
+def _lost(tile, positions):
+    """The Found of a tile that could not be searched: the sources that a catalogue gives, which are
+    fitted on discs, and of detection none."""
+    light, lit = np.zeros(tile.core.shape), np.zeros(tile.core.shape, bool)
+    if positions is None or not (own := tile.core.holds(positions)).any():
+        return Found(np.zeros((0, 2)), np.zeros(0), light, lit)
+    lit = grown_footprints(lit, positions[own] - np.array(tile.core[:2]), LOST_RADIUS_PX)
+    return Found(positions[own], np.zeros(own.sum()), light, lit)
+
+
 def _found_path(work, number):
     return work / f"tile-{number:05d}.npz"
 
@@ -141,6 +159,7 @@ def _search_tile(shared, tile, given):
         positions=found.positions,
         peaks=found.peaks,
         light=found.light,
+        hosts=found.positions if found.hosts is None else found.hosts,
         lit=np.packbits(found.lit),
     )
     return len(found.positions), file.getvalue()
@@ -157,4 +176,4 @@ def _read_found(work, number):
     with np.load(_found_path(work, number)) as file:
         light = file["light"]
         lit = np.unpackbits(file["lit"], count=light.size).reshape(light.shape).astype(bool)
-        return Found(file["positions"], file["peaks"], light, lit)
+        return Found(file["positions"], file["peaks"], light, lit, file["hosts"])

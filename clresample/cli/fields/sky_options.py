@@ -1,0 +1,93 @@
+"""Options of `clresample simulate`: the sky that is drawn and its images."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from ..options import names, positive, whole
+
+
+def _up_to(largest, said):
+    """An option's type: a number from 0 to `largest`, which a message names by `said`."""
+
+    def convert(text):
+        try:
+            number = float(text)
+        except ValueError:
+            number = -1.0
+        if not 0 <= number <= largest:
+            raise argparse.ArgumentTypeError(f"{text!r} is no number {said}")
+        return number
+
+    return convert
+
+
+_part, _size = _up_to(1, "from 0 to 1"), _up_to(sys.float_info.max, "of 0 or more")
+
+
+def add_sky(sky):
+    """Add the options of the group `sky`."""
+    sky.add_argument("--seed", type=whole, default=0, help="(default %(default)s)")
+    sky.add_argument(
+        "--size", type=whole, default=512, metavar="PX", help="Euclid pixels a side (%(default)s)"
+    )
+    sky.add_argument(
+        "--sky",
+        choices=["plain", "real", "bright"],
+        default="plain",
+        help="plain: small galaxies; real: counts and sizes as published, to 20 arcsec; bright: "
+        "six bright galaxies of 8 to 30 px, 160 small ones, five stars (%(default)s)",
+    )
+    sky.add_argument(
+        "--large",
+        type=whole,
+        default=0,
+        metavar="N",
+        help="galaxies of 2 to 20 arcsec added to a real sky (%(default)s)",
+    )
+    sky.add_argument(
+        "--density",
+        type=positive,
+        metavar="N",
+        help="sources per square arcminute to i = 26 (36; real: as published)",
+    )
+    for name, default, said, what in (
+        ("clustering", 0.2, "0.2", "part of the sources beside another one"),
+        ("stars", None, "0.05; real: as published", "part of the sources that are stars"),
+        ("psf-variation", 0.1, "0.1", "by which part PSFs widen across the field"),
+    ):
+        sky.add_argument(
+            f"--{name}", type=_part, default=default, metavar="F", help=f"{what} ({said})"
+        )
+
+
+def add_images(images):
+    """Add the options of the group `images`."""
+    images.add_argument(
+        "--bands",
+        type=names,
+        default=list("ugrizy"),
+        metavar="B,...",
+        help="of Rubin (default u,g,r,i,z,y)",
+    )
+    images.add_argument(
+        "--angle", type=float, default=12.0, metavar="DEG", help="of Rubin's pixels (%(default)s)"
+    )
+    images.add_argument(
+        "--bad-columns", type=whole, default=2, metavar="N", help="of each mosaic (%(default)s)"
+    )
+    images.add_argument(
+        "--format",
+        choices=["plain", "survey"],
+        default="plain",
+        help="plain: FITS cubes with RMS, MASK and PSFs; survey: Euclid as a tile of MER, Rubin as "
+        "cell coadds, whose PSF is constant in a cell (%(default)s)",
+    )
+    images.add_argument(
+        "--spoilers",
+        type=_size,
+        metavar="F",
+        help="sizes of the images' faults in units of the usual ones: offsets of WCS, wrong PSFs, "
+        "sky left in, cosmic rays, chip gaps; 0 = none (real: 1, bright: saturation alone)",
+    )

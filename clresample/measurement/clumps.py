@@ -1,0 +1,248 @@
+"""Peaks inside the light of large galaxies: structure of one object, or sources of their own.
+
+A body is the light of a galaxy that is much wider than the PSF: the connected pixels above a level
+L cover `BODY_AREA` widths of the PSF squared, and at least `WIDE` of the light is left when all
+that exceeds L is cut off. Of a star or a small galaxy that is a hundredth. A peak of height I
+stands on a body at the level B of its isophote, L, or of the saddle to it, if that is lower:
+
+    contrast = I / B - 1,    part = (I - B) a / sum of the body's light,
+
+a being the area of a point source's image. Every disk has peaks at high resolution. By chance as
+many sources lie before or behind a galaxy as on an equal area of sky: n = `CHANCE` times its area.
+So a peak of low part and of a contrast under `CLUMP` is structure and no source, the galaxy's
+morphology has its light; on galaxies so large that n is over 1, under `CLUMP` / n. Up to
+`MEMBER_PART` it is a source in the galaxy's group, clump or neighbour; not so if its part is over
+`CLUMP_PART` and its contrast over `STAR`. To all others the galaxy is a background. The galaxy's
+own position is the peak next to the middle of its body, where the light, clipped at L / 2, is
+highest under a filter as wide as the body: there clumps weigh no more than the disk they lie in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import ndimage
+
+from .hills import root, saddles, watershed
+
+# [FWHM^2] area of a body's highest isophote, FWHM of the PSF: a star reaches it at 1e-3 of its peak
+BODY_AREA = 100.0
+# [thresholds] level of a body from which its peaks can be structure: of fainter ones little is
+# above the noise, and every peak stays a source
+BRIGHT = 8.0
+# [1] light under a body's level, of all that is above OUTLINE of it
+WIDE = 0.3
+# [1] contrast and part up to which a peak is structure, and part up to which it is in the group
+CLUMP, CLUMP_PART, MEMBER_PART = 2.0, 0.03, 0.2
+# [1] contrast of stars before a galaxy: the brightest knots of simulated disks have 15
+STAR = 30.0
+# [arcsec^-2] sources by chance: 90 on a square arcminute, to i = 26 (simulation/counts.py)
+CHANCE = 0.025
+# [1] of a body's level: saddles to it below that are its outskirts, peaks behind them not its own
+FRINGE = 0.03
+# [1] two bodies are one where the fainter one's level exceeds that of the saddle between them by
+# less, and where the saddle has at least that part of the brighter one's level
+SAME_BODY, SAME_LIGHT = 0.4, 0.2
+# [1] of a body's level: its outline, down to which its light is added up
+OUTLINE = 0.1
+# [1] of a body's level, at which light is clipped to find its centre
+CENTER_LIGHT = 0.5
+# [1] width of the Gaussian under which the centre is sought, in radii of the highest isophote
+CENTER_WIDTH = 0.7
+# [FWHM^2] sum of a point source's image filtered with its PSF, over its peak: 4 pi sigma^2
+POINT_AREA = 2.27
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A large galaxy's light.
+
+    center (2,) [px]: (y, x); level [sigma]: of its highest isophote of BODY_AREA
+    light [sigma]: all of its light as the peak of a point source; outline: (slices, mask) of it
+    clump [1]: contrast up to which peaks are its structure, 0 of a faint one
+    """
+
+    center: np.ndarray
+    level: float
+    light: float
+    outline: tuple
+    clump: float
+
+    def takes(self, above, base):
+        """Whether peaks of heights above [sigma] on a base [sigma] of it are its structure, and
+        whether they are in its group."""
+        part = above / self.light
+        faint = part < CLUMP_PART
+        is_member = (part < MEMBER_PART) & (faint | (above < STAR * base))
+        return (above < self.clump * base) & faint, is_member
+
+
+@dataclass(frozen=True, eq=False)
+class Bodies:
+    """The bodies of an image and what its peaks are to them.
+
+    owners (S,): number of a peak's body, -1 for none; structure (S,) bool: peaks that are no source
+    """
+
+    bodies: tuple[Body, ...] = ()
+    owners: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    structure: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+
+    def body_at(self, position) -> int:
+        """Number of the bright body whose outline holds a position (2,) [px], -1 for none."""
+        y, x = np.rint(position).astype(int)
+        for i, body in enumerate(self.bodies):
+            (rows, columns), mask = body.outline
+            y_in, x_in = y - rows.start, x - columns.start
+            held = body.clump > 0 and 0 <= y_in < mask.shape[0] and 0 <= x_in < mask.shape[1]
+            if held and mask[y_in, x_in]:
+                return i
+        return -1
+
+
+def bodies_of(image, places, fwhm_px, threshold, scale) -> Bodies:
+    """The Bodies of a signal-to-noise image.
+
+    image (Ny, Nx) [sigma]: filtered with the PSF; places (S, 2) [px]: its peaks
+    fwhm_px [px]: of the PSF; threshold [sigma]: least level of a body
+    scale [arcsec]: side of a pixel
+    """
+    at = np.rint(np.asarray(places).reshape(-1, 2)).astype(int)
+    n, area = len(at), int(BODY_AREA * fwhm_px**2)
+    if not n or np.count_nonzero(image > threshold) < area:
+        return Bodies((), np.full(n, -1), np.zeros(n, bool))
+    inside = image > threshold
+    inside[at[:, 0], at[:, 1]] = True
+    basins = watershed(image, inside, at)
+    basin = basins[at[:, 0], at[:, 1]] - 1
+    tree = _Tree(image, basins, area)
+    for (a, b), height in zip(*saddles(image, basins, heights=True), strict=True):
+        tree.join(a, b, height)
+    tree.end(threshold)
+    number, base = np.array([tree.last(b) for b in tree.body[basin]], int), tree.level[basin]
+    found: list[Body] = []
+    owners, structure = np.full(n, -1), np.zeros(n, bool)
+    for one in np.unique(number[number >= 0]):
+        level = tree.levels[one]
+        members = np.flatnonzero((number == one) & (base > FRINGE * level))
+        if not len(members):
+            continue
+        outline = _outline(image, basins, np.unique(basin[members]) + 1, level)
+        light = image[outline[0]][outline[1]]
+        if np.minimum(light, level).sum() < WIDE * light.sum():
+            continue
+        body = Body(
+            _center(image, outline, level, at[members], area, level >= BRIGHT * threshold),
+            level,
+            float(light.sum()) / (POINT_AREA * fwhm_px**2),
+            outline,
+            0.0
+            if level < BRIGHT * threshold
+            else CLUMP / max(1.0, CHANCE * outline[1].sum() * scale**2),
+        )
+        above = image[at[members, 0], at[members, 1]] - base[members]
+        is_clump, is_member = body.takes(above, base[members])
+        structure[members] = is_clump
+        owners[members[is_member]] = len(found)
+        found.append(body)
+    return Bodies(tuple(found), owners, structure)
+
+
+class _Tree:
+    """Basins joined at falling levels; bodies are those that have become wide enough.
+
+    body (n,), level (n,): of each basin the number of its body, -1 for none, and the level at which
+    it is part of it; levels: of each body, the highest of those that were joined
+    """
+
+    def __init__(self, image, basins, area):
+        order = np.argsort(basins, axis=None, kind="stable")
+        labels, values = basins.ravel()[order], image.ravel()[order]
+        n = int(basins.max())
+        ends = np.searchsorted(labels, np.arange(1, n + 2))
+        self.area = area
+        self.parts = [[np.sort(values[ends[i] : ends[i + 1]])] for i in range(n)]
+        self.basins = [[i] for i in range(n)]
+        self.parent = np.arange(n)
+        self.of_root = [-1] * n
+        self.body, self.level = np.full(n, -1), np.zeros(n)
+        self.levels: list[float] = []
+        self.joined: list[int] = []
+
+    def last(self, number):
+        """The number of the body that a body has become part of."""
+        while number >= 0 and self.joined[number] != number:
+            number = self.joined[number]
+        return number
+
+    def join(self, a, b, height):
+        """Join two basins at the height of their saddle."""
+        a, b = root(self.parent, a), root(self.parent, b)
+        if a == b:
+            return
+        for one in (a, b):
+            self._widen(one, height)
+        first, second = self.of_root[a], self.of_root[b]
+        if first >= 0 and second >= 0:
+            lower = min(self.levels[first], self.levels[second])
+            higher = max(self.levels[first], self.levels[second])
+            if lower < (1 + SAME_BODY) * height and height > SAME_LIGHT * higher:
+                self.joined[second] = first
+                self.levels[first] = higher
+        elif first >= 0 or second >= 0:
+            number = max(first, second)
+            for i in self.basins[b if first >= 0 else a]:
+                self.body[i], self.level[i] = number, height
+            self.of_root[a] = number
+        self.parent[b] = a
+        self.parts[a] += self.parts[b]
+        self.basins[a] += self.basins[b]
+
+    def end(self, threshold):
+        """Make bodies of what is wide enough at the threshold."""
+        for i in range(len(self.parent)):
+            if self.parent[i] == i:
+                self._widen(i, threshold)
+
+    def _widen(self, one, height):
+        """Make a body of a root's basins if they are wide enough above a height."""
+        if self.of_root[one] >= 0:
+            return
+        n = sum(len(p) - np.searchsorted(p, height) for p in self.parts[one])
+        if n < self.area:
+            return
+        values = np.concatenate(self.parts[one])
+        level = float(np.partition(values, len(values) - self.area)[len(values) - self.area])
+        number = len(self.levels)
+        self.levels.append(level)
+        self.joined.append(number)
+        self.of_root[one] = number
+        for i in self.basins[one]:
+            self.body[i], self.level[i] = number, level
+
+
+def _outline(image, basins, numbers, level):
+    """(slices, mask) of the pixels of some basins above OUTLINE of a level."""
+    inside = np.isin(basins, numbers) & (image > OUTLINE * level)
+    rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
+    where = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    return where, inside[where]
+
+
+def _center(image, outline, level, at, area, bright):
+    """The peak of those at (k, 2) [px] in the middle of an outline, or the middle itself (2,); of a
+    faint body its brightest peak."""
+    where, mask = outline
+    radius = np.sqrt(area / np.pi)
+    light = np.where(mask, np.minimum(image[where], CENTER_LIGHT * level), 0.0)
+    light = ndimage.gaussian_filter(light, CENTER_WIDTH * radius, mode="constant")
+    middle = np.unravel_index(light.argmax(), light.shape)
+    middle = np.array(middle) + [where[0].start, where[1].start]
+    away = np.hypot(*(at - middle).T) / radius
+    if not bright:
+        return at[int(image[at[:, 0], at[:, 1]].argmax())].astype(float)
+    if (away < 1).any():  # the brightest for its distance: light of a galaxy falls outwards
+        heights = np.log(np.maximum(image[at[:, 0], at[:, 1]], 1e-3))
+        return at[int(np.where(away < 1, heights - away, -np.inf).argmax())].astype(float)
+    return middle.astype(float)

@@ -1,0 +1,53 @@
+"""Smooth levels of signal-to-noise images: sky left in, and the far wings of bright sources.
+
+A level that is wider than any source that is searched for makes peaks of noise exceed a threshold,
+and joins all light of an image. It is the median in cells of `CELL_PX`, over 3 x 3 cells, between
+which it is interpolated. Up to `DEAD_SIGMA` it counts as the light of faint sources, and stays.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+CELL_PX = 64  # [px] of the model: several times the size of the galaxies in deep images
+MIN_CELLS = 8  # along each axis: in fewer, a bright galaxy with its neighbours may fill most
+# [sigma] of a level that is left: blank cells of simulated deep fields have up to 0.6
+DEAD_SIGMA = 1.0
+# [1] of the cells: a field's darkest ones have its sky alone
+DARKEST = 0.1
+
+
+def level_of(image, seen):
+    """Level (Ny, Nx) [sigma] of an image and that of its sky [sigma], 0 within DEAD_SIGMA.
+
+    image (Ny, Nx) [sigma]; seen (Ny, Nx) bool: its pixels with data. Cells with few of them have
+    the level of all cells together; images of fewer than MIN_CELLS along an axis have none
+    """
+    if min(image.shape) < MIN_CELLS * CELL_PX:
+        return np.zeros(image.shape, np.float32), 0.0
+    n_y, n_x = (round(n / CELL_PX) for n in image.shape)
+    rows, columns = (np.linspace(0, n, k + 1).astype(int) for n, k in zip(image.shape, (n_y, n_x)))
+    cells = np.full((n_y, n_x), np.nan)
+    for i in range(n_y):
+        for j in range(n_x):
+            where = np.s_[rows[i] : rows[i + 1], columns[j] : columns[j + 1]]
+            values = image[where][seen[where]]
+            if values.size > seen[where].size / 4:
+                cells[i, j] = np.median(values)
+    if not np.isfinite(cells).any():
+        return np.zeros(image.shape, np.float32), 0.0
+    cells = np.where(np.isfinite(cells), cells, np.nanmedian(cells))
+    sky = float(_clear(np.quantile(cells, DARKEST)))
+    cells = _clear(ndimage.median_filter(cells, 3, mode="nearest"))
+    if not cells.any():
+        return np.zeros(image.shape, np.float32), sky
+    at = [(np.arange(n) + 0.5) * k / n - 0.5 for n, k in zip(image.shape, cells.shape, strict=True)]
+    places = np.meshgrid(*at, indexing="ij")
+    level = ndimage.map_coordinates(cells, places, order=1, mode="nearest")
+    return level.astype(np.float32), sky
+
+
+def _clear(level):
+    """Levels, 0 where they are within DEAD_SIGMA."""
+    return np.where(np.abs(level) > DEAD_SIGMA, level, 0.0)

@@ -1,0 +1,87 @@
+"""Sources of successive searches: what is known already, and the bodies of large galaxies."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .clumps import Bodies, bodies_of
+from .peaks import new_peaks
+
+# [FWHM^2] least area of connected pixels above the threshold: smaller ones are not as wide as the
+# PSF, but noise on top of light just below the threshold
+MIN_AREA = 0.25
+# of the wider PSF's FWHM: nearer to a source that is found, a peak counts as that source
+SAME_SOURCE = 0.7
+
+
+class Search:
+    """Sources of the searches so far, and what large galaxies' bodies make of them.
+
+    positions (S), peaks (S) [sigma], labels (S), owners (S): number of a source's body, -1 = none
+    """
+
+    def __init__(self, sep, threshold, known):
+        self.sep, self.threshold, self.known = sep, threshold, known
+        self.positions: list[np.ndarray] = []
+        self.peaks: list[float] = []
+        self.labels: list[str] = []
+        self.owners: list[int] = []
+        self.clumps: list[np.ndarray] = []
+        self.bodies = Bodies()
+
+    def _put(self, position, peak, label, owner=-1):
+        self.positions.append(position)
+        self.peaks.append(peak)
+        self.labels.append(label)
+        self.owners.append(owner)
+
+    def add(self, image, label, narrow, wide):
+        """Add the peaks of an image that are not yet known; of bodies seen before none."""
+        before = self.known + self.positions + self.clumps
+        area, apart = MIN_AREA * narrow**2, SAME_SOURCE * wide
+        for position, peak in new_peaks(self.sep, image, self.threshold, area, before, apart):
+            if self.bodies.body_at(position) < 0:
+                self._put(position, peak, label)
+
+    def sort_out(self, image, fwhm, scale):
+        """Find the bodies of the searched image, and leave out peaks that are their structure."""
+        self.bodies = bodies_of(image, np.array(self.positions), fwhm, self.threshold, scale)
+        if not self.bodies.bodies:
+            return
+        places, peaks, labels = self.positions, self.peaks, self.labels
+        centers = [tuple(body.center) for body in self.bodies.bodies]
+        self.positions, self.peaks, self.labels, self.owners = [], [], [], []
+        for i, (place, peak, label) in enumerate(zip(places, peaks, labels, strict=True)):
+            if tuple(place) in centers:
+                continue
+            if self.bodies.structure[i]:
+                self.clumps.append(place)
+            else:
+                self._put(place, peak, label, int(self.bodies.owners[i]))
+        for i, body in enumerate(self.bodies.bodies):
+            y, x = body.center.astype(int)
+            self._put(body.center, float(image[y, x]), labels[0], i)
+
+    def add_companions(self, new, image, label):
+        """Add peaks beside others: positions and heights of what is left of an image there."""
+        for position, height in new:
+            owner = self.bodies.body_at(position)
+            if owner >= 0:
+                y, x = np.rint(position).astype(int)
+                is_clump, is_member = self.bodies.bodies[owner].takes(height, image[y, x] - height)
+                if is_clump:
+                    continue
+                owner = owner if is_member else -1
+            self._put(position, height, label, owner)
+
+    def in_order(self):
+        """Indices of the sources, brightest peak first, and the group of each, see Detection."""
+        order = sorted(range(len(self.peaks)), key=lambda i: -self.peaks[i])
+        centers = {tuple(b.center): i for i, b in enumerate(self.bodies.bodies)}
+        center_of = {}
+        for k, i in enumerate(order):
+            body = centers.get(tuple(self.positions[i]))
+            if body is not None:
+                center_of[body] = k
+        groups = [center_of.get(self.owners[i], k) for k, i in enumerate(order)]
+        return order, np.array(groups, int)
