@@ -92,6 +92,12 @@ class WhitenedView:
         return replace(self, unit=unit, root=root, data=data, noise=ratio, ties=ties)
 
     @property
+    def error_scale(self) -> np.ndarray:
+        """Factor (Co,) of a model's own error beside the noise: the error is common to all
+        exposures of a band, whose noise together is smaller by it."""
+        return np.ones(len(self.data)) if self.exposures is None else np.sqrt(self.exposures)
+
+    @property
     def pixel_noise(self) -> np.ndarray:
         """Noise (Co,) [unit] of one model pixel, if it were observed with the same exposure."""
         area = abs(np.linalg.det(self.mapping.matrix))

@@ -31,6 +31,7 @@ def fitted(spectra, sources=None, power=1.0, **given):
             "fitted": np.arange(n),
             "start": SimpleNamespace(source=np.arange(n)),
             "blend": SimpleNamespace(sources=sources),
+            "ties": None,
             "state": SimpleNamespace(spectra=np.array(spectra, float)),
             "scene": SimpleNamespace(power=np.full((n, 2), power)),
         }
@@ -96,6 +97,7 @@ def test_evidence_is_asked_of_whitened_residuals(noise):
         state=SimpleNamespace(spectra=spectra, sky=sky, morph=[0, 0]),
         views=views,
         scene=SimpleNamespace(channels=lambda: parts),
+        ties=None,
     )
     seen = SimpleNamespace(observed=observed, covariance=covariance)
     asked = gradients._asked(fit, np.array([1]), seen)
@@ -129,6 +131,7 @@ def ended(n, losses, *, energies=0.0, findings=True, fixed=()):
         findings=found if findings else None,
         state=SimpleNamespace(morph=[0] * n, spectra=np.zeros((n, 3))),
         scene=SimpleNamespace(fixed=np.isin(np.arange(n), fixed)),
+        ties=None,
         losses=losses,
         status="converged",
     )

@@ -24,6 +24,8 @@ SEEN = [2, 0]  # the scenes that are looked at
 class Sums:
     """A Sight whose pixels are one row, in NumPy: of random images, roots and data."""
 
+    ties = None
+
     def __init__(self, channels, seed):
         rng = np.random.default_rng(seed)
         self.channels, self.n_bands = channels, channels.stop - channels.start

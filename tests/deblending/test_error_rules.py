@@ -156,7 +156,7 @@ def test_errors_at_fixed_morphologies_are_those_of_the_normal_matrix(monkeypatch
     covariance = np.array([[[1e-8, 5.0], [5.0, 4.0]], [[0.0, 0], [0, -1e-20]]])
     spectra = np.array([[3.0, 3.0], [1e6, 0.0]])
     start = SimpleNamespace(source=np.array([0, 1]), shapes=0, thetas=0, positions=np.eye(2))
-    scene = SimpleNamespace(channels=lambda: [])
+    scene = SimpleNamespace(channels=lambda: [], ties=None)
     fit = SimpleNamespace(
         settings=Settings(), scene=scene, findings=1, views=[], start=start, frame=None
     )

@@ -1,5 +1,7 @@
 """Several exposures of a band: one spectrum value for all of them, by the ratio of zero points."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -15,8 +17,11 @@ from clresample import (
     deblend,
     deblend_many,
 )
+from clresample.deblending.components.gradients import ask
 from clresample.deblending.fit import Fit, begin, finish
-from clresample.deblending.posterior.posterior import posterior_of
+from clresample.deblending.iterate import iterate
+from clresample.deblending.posterior.exposure import exposures_of
+from clresample.deblending.posterior.posterior import Posterior, posterior_of
 from clresample.device.device import get_device
 from clresample.files.results import read_result, write_result
 from clresample.measurement.photometry import fluxes
@@ -25,7 +30,9 @@ from clresample.measurement.quality import channel_chi2
 SHAPE, N, SIGMA, POINT = (48, 52), 4, 2.0, 25.0
 PLACES = (22.0, 24.0), (29.0, 31.0), (12.0, 40.0)
 GRID, NARROW = Grid.flat(SHAPE, 0.2), PSF.gaussian(1.5)
-SOURCES = [Extended(position_px=p) for p in PLACES]
+SOURCES = [Extended(position_px=PLACES[0], n_components=2)]
+SOURCES += [Extended(position_px=p) for p in PLACES[1:]]
+DEPTHS = (0.4, 1.6, 1.2, 0.8)  # weights over their mean
 
 
 @pytest.fixture(scope="module")
@@ -46,21 +53,21 @@ def red(images):
     return Observation(images[1], NARROW, GRID, weights=1.0, channels=["r"], zero_points=POINT)
 
 
-def exposures(data, scales=(1.0,) * N, **given):
+def exposures(data, scales=(1.0,) * N, depths=(1.0,) * N, **given):
     """Observations of one exposure each, in counts that are `scales` times as many."""
     return [
         Observation(
             image * scale,
             NARROW,
             GRID,
-            weights=(SIGMA * scale) ** -2,
+            weights=depth * (SIGMA * scale) ** -2,
             channels=[f"g{i}"],
             bands=["g"],
             name=f"G{i}",
             zero_points=POINT + 2.5 * np.log10(scale),
             **given,
         )
-        for i, (image, scale) in enumerate(zip(data, scales, strict=True))
+        for i, (image, scale, depth) in enumerate(zip(data, scales, depths, strict=True))
     ]
 
 
@@ -90,7 +97,7 @@ def stack(images):
 
 def test_n_exposures_give_what_one_image_of_n_times_the_weight_does(images, stack):
     """Of the same pixels, to the last digits: flux, errors, shapes, the iterations too."""
-    copies = exposures([np.mean(images[0], axis=0)] * N)
+    copies = exposures([np.mean(images[0], axis=0)] * N, depths=DEPTHS)
     settings = Settings(enough=1e-4)
     tied = deblend([*copies, red(images)], SOURCES, settings=settings, dtype=np.float64)
     (flux, error), (found, own) = measured(stack), measured(tied)
@@ -101,10 +108,29 @@ def test_n_exposures_give_what_one_image_of_n_times_the_weight_does(images, stac
         np.testing.assert_allclose(one.morphology, other.morphology, atol=1e-5)
     np.testing.assert_allclose(tied.errors.moments, stack.errors.moments, rtol=1e-4)
     np.testing.assert_allclose(tied.covariance[0], stack.covariance[0], rtol=1e-5)
-    rng = (np.random.default_rng(1) for _ in range(2))
-    one, other = (result.sample(2, next(rng))[1] for result in (tied, stack))
-    spectra = [c.spectrum for c in one]
-    assert np.ptp([s[:N] for s in spectra], axis=1).max() < 1e-9 * np.max(spectra)
+    assert [len(m) for m in tied.draws.modes] == [len(m) for m in stack.draws.modes]
+    one, other = catalogue(tied, magnitudes=True), catalogue(stack, magnitudes=True)
+    assert {"colour_g_r", "snr", "size_err", "flux_err_g"} <= {*one.colnames} & {*other.colnames}
+    for name in {*one.colnames} & {*other.colnames} - {"name"}:
+        values = (np.asarray(getattr(t[name], "value", t[name]), float) for t in (one, other))
+        np.testing.assert_allclose(*values, rtol=1e-3, atol=1e-6, err_msg=name)
+    spectra = np.array([c.spectrum[:N] for c in tied.sample(1, np.random.default_rng(1))[0]])
+    np.testing.assert_allclose(spectra, spectra[:, :1] * np.ones(N), rtol=1e-9)
+
+
+def test_evidence_for_a_gradient_is_that_of_the_stack(images):
+    device, settings = get_device(None), Settings(enough=1e-4)
+    sources = tuple(Extended(position_px=p) for p in PLACES)
+    copies = exposures([np.mean(images[0], axis=0)] * N, depths=DEPTHS)
+    found = []
+    for observations in ([*copies, red(images)], [stacked(images[0]), red(images)]):
+        fit = Fit(Blend(tuple(observations), sources), settings, device, np.float64, pad=1)
+        begin([fit])
+        iterate([fit], settings, device, np.float64)
+        found.append(ask([fit])[0])
+    assert len(found[0].which)
+    np.testing.assert_array_equal(found[0].which, found[1].which)
+    np.testing.assert_allclose(found[0].evidence, found[1].evidence, rtol=1e-3)
 
 
 def test_exposures_with_noise_of_their_own_agree_with_their_stack(images, stack):
@@ -188,12 +214,6 @@ def test_errors_are_those_of_the_dense_matrix_summed_over_channels(images):
 
 def _posteriors(observations, settings):
     """A Result, its Posterior, and that of the same scene with no ties."""
-    from dataclasses import replace
-
-    from clresample.deblending.iterate import iterate
-    from clresample.deblending.posterior.exposure import exposures_of
-    from clresample.deblending.posterior.posterior import Posterior
-
     device = get_device(None)
     fit = Fit(Blend(tuple(observations), tuple(SOURCES)), settings, device, np.float32, pad=1)
     begin([fit])

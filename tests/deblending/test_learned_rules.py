@@ -229,7 +229,7 @@ def test_a_prior_that_makes_no_sense_is_refused(given, words):
 
 
 def scene(weights, **given):
-    return SimpleNamespace(weights=weights, **given)
+    return SimpleNamespace(weights=weights, ties=None, **given)
 
 
 def test_pixels_of_a_scene_are_those_with_a_weight():

@@ -23,9 +23,8 @@ def solution(
 ):
     """Components in boxes, of which all else is as the profiles say."""
     n = len(profiles)
-    scene = SimpleNamespace(
-        origin=np.array(origin), profile=profiles, fixed=np.isin(np.arange(n), fixed)
-    )
+    fixed = np.isin(np.arange(n), fixed)
+    scene = SimpleNamespace(origin=np.array(origin), profile=profiles, fixed=fixed, ties=None)
     given = {"energies": np.ones((n, 3)), "determined": np.ones((n, 3))}
     given |= {"strengths": np.tile([0.01, 0.05, 0.03], (n, 1))}
     return Solution(
@@ -251,7 +250,7 @@ def test_unknowns_are_modes_spectra_sky_levels_and_shifts_of_all_but_the_first(m
     images = [np.arange(k).reshape(k, 1, 1) for k in (1, 3)]
     one = SimpleNamespace(
         spectra=np.ones((2, 5)),
-        scene=None,
+        scene=SimpleNamespace(ties=None),
         modes=lambda i: (images[i], Beyond.none(len(images)), np.arange(1.0, 2 * i + 1)),
     )
     for sky, shifts in ((False, False), (True, False), (False, True), (True, True)):

@@ -202,7 +202,7 @@ def test_pixels_that_cannot_be_read_cost_their_blends_alone_with_a_reason(sky, t
         run_field(mosaics, tmp_path / "out", progress=_Stop(1))
     n = sky.mosaics[0].data.shape[1]
     path.write_bytes(path.read_bytes()[: 2880 + 4 * n * (n // 2)])
-    from clresample.fields.mosaic import _opened
+    from clresample.fields.strips import _opened
 
     _opened.cache_clear()
     run = run_field(mosaics, tmp_path / "out", resume=True)

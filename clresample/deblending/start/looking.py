@@ -49,7 +49,7 @@ class Looking:
         self.scene = np.array([c.scene for c in components])
         self.index = np.array([c.index for c in components])
         self.n_most = int(self.index.max()) + 1
-        self.n_channels, self.ties = sights[-1].channels.stop, sights[0].views[0].ties
+        self.n_channels, self.ties = sights[-1].channels.stop, sights[0].ties
         self.spectra = np.zeros((len(components), self.n_channels))
         self.sky = np.zeros((n_scenes, self.n_channels))
         self._kept: dict = {}

@@ -19,6 +19,7 @@ class Sight:
 
     lit (slots, 4): first pixels and sizes of what the slots seen last light up
     n_elements: that were last seen; n_pixels: of all products so far
+    ties: Ties of all channels, or None; scale (B, Co): WhitenedView.error_scale
     root (B, Co, My, Mx): on the device, as are data (times root), residual and weight
     """
 
@@ -31,9 +32,7 @@ class Sight:
         self.data = device.put(np.array([v.data * v.root for v in views]), dtype)
         self.residual, self.weight = (device.empty(shape, dtype) for _ in range(2))
         self.sums = device.empty((*shape[:3], 3), dtype)
-        # (B, Co): the model's error is one for all exposures of a band
-        alike = np.ones(self.n_bands)
-        self.exposures = np.array([alike if v.ties is None else v.exposures for v in views])
+        self.ties, self.scale = views[0].ties, np.array([v.error_scale for v in views])
         self.aim = Aim(views, device, dtype, precision, tolerance)
         self.n_elements = self.n_pixels = 0
         self._listed = None  # of the scenes last compared, on the device
@@ -105,7 +104,7 @@ class Sight:
             place=self.place_on_device,
             channel=self.channels.start,
             n_channels=spectra.shape[1],
-            error=put(error * np.sqrt(self.exposures), self.dtype),
+            error=put(error * self.scale, self.dtype),
             spectra=put(spectra, self.dtype),
             sky=put(sky, self.dtype),
             root=self.root,
