@@ -16,7 +16,7 @@ MIN_BLOCKS = 8
 NEAR_SOURCE = 1.5
 # [sigma] Blocks further from the level and the wings hold sources that nobody listed, or defects.
 CLIP = 3.0
-N_ROUNDS = 4
+N_ROUNDS = 3
 # Median |x| of a unit Gaussian, inverted.
 SIGMAS_A_MAD = 1.4826
 # Parts of the blocks without a source, those furthest from the light: the level is fitted in the

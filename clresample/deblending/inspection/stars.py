@@ -30,10 +30,11 @@ def misfitting_widths(image, sources):
     this PSF has.
     """
     found = []
-    for i in image.brightest[:MAX_STARS]:
-        if image.light[i] < STAR_SIGMAS:
-            break
-        star = isinstance(sources[i], Point)
+    stars = np.array([isinstance(source, Point) for source in sources], bool)
+    bright = image.brightest[image.light[image.brightest] > STAR_SIGMAS]
+    # of others the brightest tells as much as all
+    for i in [*bright[stars[bright]][:MAX_STARS], *bright[~stars[bright]][:1]]:
+        star = stars[i]
         if star and not _alone(image, i):
             continue
         c, part, error = _width(image, i)
