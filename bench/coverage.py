@@ -10,7 +10,8 @@ snr_high = null in the JSON:
 mode        joint, euclid or rubin; joint-lanczos and joint-drizzle: parametric galaxies on mosaics
             of pixels of 0.7, whose noise is correlated, which the fit is told; and the same with
             "-as-white": it is not told
-galaxies    parametric: bulge, disk and knots; cosmos: real ones whose light is not clearly negative
+galaxies    parametric: bulge, disk and knots; cosmos: real ones whose light is not clearly
+            negative; real: sizes, arms, clumps and ellipticals of a real sky, where asked for
 light       drawn: magnitudes uniform in 20 - 29, those of all COSMOS galaxies; even: all light of a
             scene times one factor, so that its sources' median signal to noise, of shapes that are
             known, is log-uniform in 3 - 10000 and no source brighter than magnitude 18. Bins are
@@ -41,7 +42,7 @@ from .harness.brightness import evened
 from .harness.clock import in_processes, on_one_thread
 from .harness.options import BadOption, Parser, positive, run
 
-GALAXIES = ("parametric", "cosmos")
+GALAXIES, REAL = ("parametric", "cosmos"), "real"
 EDGES = (3.0, 10.0, 30.0, 100.0, 300.0, np.inf)  # signal to noise
 # Scenes of each kind and mode. Of parametric galaxies so many that the standard error of a flux
 # bin's coverage is under 0.015: it is 0.010 to 0.014. All take 40 minutes to two hours on two
@@ -57,6 +58,7 @@ N_SCENES = {
         "joint-drizzle-as-white": 60,
     },
     "cosmos": {"joint": 120, "euclid": 300, "rubin": 120},
+    "real": {"joint": 550, "euclid": 1800, "rubin": 700},
 }
 N_QUICK, N_QUICK_MOSAICS = 5, 2
 # Constants were chosen on scenes of seeds before these.
@@ -97,7 +99,10 @@ def light_of(galaxies, as_drawn):
 
 def make_scene(galaxies, mode, folder, seed, as_drawn):
     """A `SimulatedScene` of one of GALAXIES; folder: of COSMOS'; as_drawn: see `light_of`."""
-    scene = simulate_scene(seed) if galaxies == "parametric" else scenes.opened(folder).take(seed)
+    if galaxies == "cosmos":
+        scene = scenes.opened(folder).take(seed)
+    else:
+        scene = simulate_scene(seed, sky="real" if galaxies == REAL else "plain")
     if light_of(galaxies, as_drawn) == "even":
         scene = evened(scene, instruments(mode))
     if mode not in MOSAICS:
@@ -115,7 +120,7 @@ def measure(galaxies, mode, folder, seeds, negative=NEGATIVE, as_drawn=False):
 
     returns [{quantity: (4, n)}, ...], one for each scene that could be fitted; [status, ...]
     """
-    parametric = galaxies == "parametric"
+    parametric = galaxies != "cosmos"
     found = [make_scene(galaxies, mode, folder, seed, as_drawn) for seed in seeds]
     mode = instruments(mode)
     results = scenes.fit([scenes.blend(scene, mode) for scene in found])
@@ -189,7 +194,7 @@ def fitted(wanted, n_scenes, options):
 
 
 def main(options):
-    galaxies = [name for name in GALAXIES if name in options.galaxies]
+    galaxies = [name for name in (*GALAXIES, REAL) if name in options.galaxies]
     if "cosmos" in galaxies and scenes.Galaxies(options.catalogue).catalogue is None:
         galaxies.remove("cosmos")
     if not galaxies:
@@ -247,7 +252,7 @@ def parser():
     parser.add_argument(
         "--galaxies",
         nargs="+",
-        choices=GALAXIES,
+        choices=(*GALAXIES, REAL),
         default=GALAXIES,
         help="which; without a catalogue of COSMOS galaxies only parametric ones (both)",
     )

@@ -134,7 +134,7 @@ def blend_row(options):
     limit = int(options.memory * 1e9)
     resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
     scenes.fit([crowded_blend(WARM_SEED, *WARM_BLEND)])
-    blend = crowded_blend(options.seed, n_sources, BLENDS[n_sources])
+    blend = crowded_blend(options.seed, n_sources, BLENDS[n_sources], options.sky)
     return timed("blend", [blend], scenes.GalSimClock(timer=time.process_time))
 
 
@@ -147,6 +147,7 @@ def blend_apart(n_sources, options, limit_s):
         file = Path(folder) / "row.json"
         command = [sys.executable, "-m", "bench.throughput", "--blend", n_sources, "--json", file]
         command += ["--seed", options.seed, "--memory", options.memory]
+        command += ["--sky", options.sky]
         try:
             done = subprocess.run(
                 [str(word) for word in command],
@@ -232,6 +233,12 @@ def parser():
         default=MEMORY_GB,
         metavar="GB",
         help="that the process of a blend may have (%(default)s)",
+    )
+    parser.add_argument(
+        "--sky",
+        choices=("plain", "real"),
+        default="plain",
+        help="galaxies of the single large blends (%(default)s)",
     )
     parser.add_first_seed(0)
     parser.add_catalogue()

@@ -12,6 +12,7 @@ from clresample.simulation.scenes import (
     RUBIN_WAVELENGTHS_NM,
     SMOOTHING_ARCSEC,
 )
+from clresample.simulation.structure import real_galaxy
 from clresample.simulation.surveys import EUCLID_VIS, RUBIN_UGRIZY
 
 ANGLE_DEG = 12.0  # Of Rubin's pixels to Euclid's: no survey's pixels are aligned with another's.
@@ -21,11 +22,12 @@ FILLED = 0.9  # Part of the field's side in which the galaxies' centres lie.
 REACH_ARCSEC = 6.0
 
 
-def crowded_blend(seed, n_sources, n_model):
+def crowded_blend(seed, n_sources, n_model, sky="plain"):
     """Parametric galaxies at random places of a field, with their true positions.
 
     Magnitudes and colours are drawn as those of `simulate_scene`.
 
+    sky: "real" for galaxies as of simulate_field's, to REACH_ARCSEC / 3
     n_model [px]: Euclid's pixels a side, on which the model lives
     returns Blend
     """
@@ -34,6 +36,8 @@ def crowded_blend(seed, n_sources, n_model):
     positions_arcsec = rng.uniform(-half_arcsec, half_arcsec, (n_sources, 2))
     galaxies = [random_galaxy(rng, smoothing_arcsec=SMOOTHING_ARCSEC) for _ in range(n_sources)]
     vis = rng.uniform(*MAGNITUDE_RANGE, (n_sources, 1))
+    if sky == "real":
+        galaxies = [real_galaxy(rng, float(mag[0]), REACH_ARCSEC / 3) for mag in vis]
     index = rng.normal(*POWER_LAW_INDEX, (n_sources, 1))
     colours = -2.5 * index * np.log10(RUBIN_WAVELENGTHS_NM)
     brightest = rng.uniform(*MAGNITUDE_RANGE, (n_sources, 1))

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from .counts import (
-    galaxy_magnitudes,
-    half_light_arcsec,
-    is_elliptical,
-    sersic_index,
-    star_magnitudes,
-)
+from .counts import galaxy_magnitudes, half_light_arcsec, star_magnitudes
 from .galaxies import HALF_LIGHT_ARCSEC, KNOT_FRACTION, parametric_galaxy
 from .mosaicked import SimulatedField
 from .painting import band_fluxes, painted
 from .spoilers import Spoilers
-from .structure import SkySource, disk_parts, elliptical_parts, smooth_part, star_parts
+from .structure import (
+    SkySource,
+    disk_parts,
+    elliptical_parts,
+    galaxy_parts,
+    smooth_part,
+    star_parts,
+)
 from .surveys import EUCLID_VIS
 
 # Spectral index of f_nu ~ wavelength^index: mean, standard deviation
@@ -75,11 +76,7 @@ def _place(rng, side, found, clustering):
 def _galaxy(rng, mag, size, at, host):
     """A galaxy of a magnitude and half-light radius [arcsec]."""
     mag = float(mag)
-    if is_elliptical(rng, mag):
-        n = sersic_index(rng, mag)
-        parts = elliptical_parts(rng, size, n, rng.normal(*RED_SPECTRUM))
-    else:
-        n, parts = 1.0, disk_parts(rng, size, rng.normal(*DISK_SPECTRUM))
+    parts, n = galaxy_parts(rng, mag, size, DISK_SPECTRUM, RED_SPECTRUM)
     return SkySource(parts, at, mag, "galaxy", host, size, n)
 
 

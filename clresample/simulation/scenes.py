@@ -14,12 +14,14 @@ import numpy as np
 from ..sky.grid import Grid
 from ..sky.observation import Observation
 from ..sky.psf import PSF
-from .galaxies import draw, open_catalogue, random_galaxy
+from .galaxies import draw, import_galsim, open_catalogue, random_galaxy
+from .structure import real_galaxy
 from .surveys import EUCLID_VIS, RUBIN_UGRIZY, Survey
 
 MODEL_PSF_SIGMA_PX = 0.8  # the paper's minimal PSF, in pixels of the frame that a model lives in
 MAGNITUDE_RANGE = (20.0, 29.0)  # [mag] the paper's uniform range
 CENTRAL_FRACTION = 2 / 3  # of a stamp's side: where galaxies are put
+MAX_REAL_ARCSEC = 2.0  # [arcsec] half-light radius of a stamp's largest galaxy of a real sky
 MAX_SOURCES = 10  # the paper's scenes hold 1 to 10 galaxies
 # Gaussians of sigma 2 and then 1 Euclid pixels, in one: no light is left above Nyquist's limit
 SMOOTHING_ARCSEC = np.hypot(2, 1) * EUCLID_VIS.pixel_scale_arcsec
@@ -175,6 +177,7 @@ def simulate_scene(
     flip=False,
     n_pixels=60,
     center_deg=None,
+    sky="plain",
 ):
     """A blend of galaxies as Euclid (VIS) and Rubin (ugrizy) see it; one seed gives one scene.
 
@@ -186,37 +189,36 @@ def simulate_scene(
     seed: a whole number
     n_sources: how many galaxies; None draws 1 to 10
     catalogue: folder or open catalogue of COSMOS galaxies; None for bulge + disk + knots
-    colours: table, or path of one, with columns u_ab ... y_ab [mag]; None for power-law spectra
+    colours: table, or its path, with columns u_ab ... y_ab [mag]; None for power-law spectra
     angle_deg [deg], flip: turn Rubin's grid, mirror it; Euclid's stays
     n_pixels: Rubin pixels a side; Euclid has as many as the same sky holds
     center_deg (2,) [deg]: right ascension and declination of the centre; grids then have a WCS
+    sky: "plain", or "real" for galaxies to 2 arcsec as of `simulate_field`, without a catalogue
     returns SimulatedScene: images with noise [counts], and the truth behind them
 
-    Raises ValueError for fewer than one source, a folder without a catalogue, or a table without
-    the columns or without a finite row; ImportError, with what to install, without GalSim.
+    Raises ValueError for bad numbers, sky or table; ImportError without GalSim.
     Source: section `Sect:real_images`, Table `tab:sim_param`.
     """
     streams = np.random.SeedSequence(seed).spawn(4)
     n_rng, rubin_rng, euclid_rng = (np.random.default_rng(s) for s in streams[:3])
     if n_sources is None:
         n_sources = int(n_rng.integers(1, MAX_SOURCES, endpoint=True))
-    if n_sources < 1:
-        raise ValueError(f"n_sources is {n_sources}, must be 1 or more")
+    _check(n_sources, sky, catalogue)
     if catalogue is not None:
         catalogue = open_catalogue(catalogue)
     rows = None if colours is None else _colour_rows(colours, RUBIN_UGRIZY.bands)
     n_euclid = EUCLID_VIS.n_same_sky(n_pixels, RUBIN_UGRIZY)
     half_arcsec = CENTRAL_FRACTION * n_euclid * EUCLID_VIS.pixel_scale_arcsec / 2
-    drawn = [
-        _random_source(np.random.default_rng(stream), half_arcsec, catalogue, rows)
-        for stream in streams[3].spawn(n_sources)
-    ]
-    profiles, galaxies, positions, vis, ugrizy = zip(*drawn, strict=True)
-    sky = {"center_deg": center_deg}
-    euclid_grid = EUCLID_VIS.grid(n_euclid)
-    rubin_grid = RUBIN_UGRIZY.grid(n_pixels, angle_deg=angle_deg, flip=flip)
-    euclid = observe(EUCLID_VIS, euclid_grid, profiles, positions, vis, euclid_rng, **sky)
-    rubin = observe(RUBIN_UGRIZY, rubin_grid, profiles, positions, ugrizy, rubin_rng, **sky)
+    drawn = _random_sources(streams[3].spawn(n_sources), half_arcsec, catalogue, rows, sky)
+    profiles, galaxies, positions, vis, ugrizy = drawn
+    turned = RUBIN_UGRIZY.grid(n_pixels, angle_deg=angle_deg, flip=flip)
+    euclid, rubin = (
+        observe(survey, grid, profiles, positions, mags, rng, center_deg=center_deg)
+        for survey, grid, mags, rng in (
+            (EUCLID_VIS, EUCLID_VIS.grid(n_euclid), vis, euclid_rng),
+            (RUBIN_UGRIZY, turned, ugrizy, rubin_rng),
+        )
+    )
     return SimulatedScene(
         seed=seed,
         euclid=euclid,
@@ -227,7 +229,21 @@ def simulate_scene(
     )
 
 
-def _random_source(rng, half_arcsec, catalogue, rows):
+def _check(n_sources, sky, catalogue):
+    """Raise ValueError for what `simulate_scene` does not take."""
+    if n_sources < 1:
+        raise ValueError(f"n_sources is {n_sources}, must be 1 or more")
+    if sky not in ("plain", "real") or (sky == "real" and catalogue is not None):
+        raise ValueError(f'sky is {sky!r}, must be "plain", or "real" without a catalogue')
+
+
+def _random_sources(streams, *how):
+    """What `_random_source` draws from each of these seeds, as five tuples (S)."""
+    drawn = [_random_source(np.random.default_rng(stream), *how) for stream in streams]
+    return zip(*drawn, strict=True)
+
+
+def _random_source(rng, half_arcsec, catalogue, rows, sky="plain"):
     """One galaxy: its profile, row of the catalogue, position [arcsec], magnitudes of both surveys.
 
     half_arcsec [arcsec]: positions lie within as much of the centre, in y and in x
@@ -238,6 +254,10 @@ def _random_source(rng, half_arcsec, catalogue, rows):
     row = _power_law_colours(rng) if rows is None else rows[rng.integers(len(rows))]
     ugrizy = row - row.min() + rng.uniform(*MAGNITUDE_RANGE)
     i_galaxy = None if catalogue is None else int(rng.integers(catalogue.nobjects))
+    if sky == "real":
+        light = real_galaxy(rng, float(vis[0]), MAX_REAL_ARCSEC)
+        light = import_galsim().Convolve(light, import_galsim().Gaussian(sigma=SMOOTHING_ARCSEC))
+        return light, None, position, vis, ugrizy
     profile = random_galaxy(
         rng, catalogue=catalogue, i_galaxy=i_galaxy, smoothing_arcsec=SMOOTHING_ARCSEC
     )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .counts import half_light_arcsec, is_elliptical, sersic_index
 from .galaxies import BULGE_CUT, import_galsim
 
 # Spectral indices of f_nu ~ wavelength^index about that of the galaxy: bulges and bars are old and
@@ -105,6 +106,27 @@ def disk_parts(
     parts.append(_clumps(rng, turned, n_knots, fraction, index + CLUMP_INDEX, arms))
     profile = disk.shear(q=ratio, beta=angle)
     return (smooth_part(profile, left - fraction, index), *parts)
+
+
+def galaxy_parts(rng, magnitude, size, disk_index, red_index):
+    """The parts and Sersic index of a galaxy of an i magnitude and half-light radius [arcsec].
+
+    disk_index, red_index: mean and standard deviation of spectral indices of disks and ellipticals
+    """
+    if is_elliptical(rng, magnitude):
+        n = sersic_index(rng, magnitude)
+        return elliptical_parts(rng, size, n, rng.normal(*red_index)), n
+    return disk_parts(rng, size, rng.normal(*disk_index)), 1.0
+
+
+def real_galaxy(rng, magnitude, max_size_arcsec):
+    """A galaxy of a real sky as a GalSim object of unit flux, of one spectrum, for an i magnitude.
+
+    max_size_arcsec [arcsec]: largest half-light radius
+    """
+    size = min(half_light_arcsec(rng, magnitude), max_size_arcsec)
+    parts, _ = galaxy_parts(rng, magnitude, size, (0, 0), (0, 0))
+    return import_galsim().Add([part.fraction * part.profile for part in parts])
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clresample import Spoilers, simulate_field
+from clresample import Spoilers, simulate_field, simulate_scene
 from clresample.simulation.counts import (
     GALAXIES_TO_BREAK,
     GALAXY_BREAK,
@@ -130,3 +130,12 @@ def test_clumps_name_their_galaxy_and_hold_part_of_its_flux():
 def test_bad_input_is_named(options, message):
     with pytest.raises(ValueError, match=message):
         field(**options)
+
+
+def test_scenes_take_galaxies_of_a_real_sky():
+    plain, real = (simulate_scene(4, n_sources=2, sky=sky) for sky in ("plain", "real"))
+    np.testing.assert_array_equal(plain.positions_arcsec, real.positions_arcsec)
+    np.testing.assert_array_equal(plain.euclid.counts, real.euclid.counts)
+    assert not np.allclose(plain.euclid.truth, real.euclid.truth, atol=1e-3)
+    with pytest.raises(ValueError, match='sky is \'dark\', must be "plain", or "real"'):
+        simulate_scene(4, sky="dark")
