@@ -12,11 +12,13 @@
  *
  *   place    (slots, N_PLACE) int: scene, y0, x0, wy, wx, n, and the element of `seen` where the
  *            slot's images begin: (n, n_bands, wy, wx), row by row
- *   root, data, residual, weight   (B, n_bands, my, mx): root of the weights, data times root
+ *   root, data, light, residual, weight   (B, n_bands, my, mx): root of the weights, data times
+ *            root, smoothed data times root
  *
  * whiten   seen <- seen root;  launch: (X, tallest window, slots)
  * compare  model m = sky root + sum_slots A seen, residual r = data - m, weight w = 1 / (1 + (error
- *          m)^2) where root is not 0, error (B, n_bands); sums (B, n_bands, my, 3): of w r^2, w r root, w root^2;
+ *          (light - sky root))^2) where root is not 0, error (B, n_bands); sums (B, n_bands, my, 3):
+ *          of w r^2, w r root, w root^2;
  *          launch: (WG my, n_bands, scenes), a group a row.  `listed`: the slots scene by scene,
  *          those of scenes[k] from first[k] to first[k + 1]
  * gram     out (pairs, n_bands, K, K) = sum over the pixels where both windows lie of w a_i b_j;
@@ -75,8 +77,9 @@ void compare(__global const int *restrict scenes, __global const int *restrict f
              const int n_channels, __global const REAL *restrict error,
              __global const REAL *restrict spectra,
              __global const REAL *restrict sky, __global const REAL *restrict root,
-             __global const REAL *restrict data, __global const REAL *restrict seen,
-             __global REAL *restrict residual, __global REAL *restrict weight,
+             __global const REAL *restrict data, __global const REAL *restrict light,
+             __global const REAL *restrict seen, __global REAL *restrict residual,
+             __global REAL *restrict weight,
              __global REAL *restrict sums)
 {
     __local REAL share[WG];
@@ -85,8 +88,9 @@ void compare(__global const int *restrict scenes, __global const int *restrict f
     const size_t line = ((size_t)b * n_bands + c) * my + y;
     __global REAL *m = residual + line * mx, *w = weight + line * mx;
     __global const REAL *r = root + line * mx, *d = data + line * mx;
+    __global const REAL *bright = light + line * mx;
+    const REAL part_of_light = error[(size_t)b * n_bands + c];
     const REAL level = sky[(size_t)b * n_channels + channel + c];
-    const REAL part_of_model = error[b * n_bands + c];
 #if ROWS
     for (int x = 0; x < mx; ++x) m[x] = level * r[x];
     for (int l = first[k]; l < first[k + 1]; ++l) {
@@ -110,8 +114,8 @@ void compare(__global const int *restrict scenes, __global const int *restrict f
         for (int i = 0; i < 8; ++i) {
             const int x = ROWS ? at + i : at + i * WG;
             if (x < mx) {
-                const REAL part = part_of_model * m[x], rest = d[x] - m[x];
-                const REAL weigh = 1 / (1 + part * part);
+                const REAL part = part_of_light * (bright[x] - level * r[x]);
+                const REAL rest = d[x] - m[x], weigh = 1 / (1 + part * part);
                 m[x] = rest;
                 w[x] = weigh;
                 chi2[i] += weigh * rest * rest;

@@ -63,9 +63,11 @@ def sersic(n, re_px, q, angle_deg, scale_arcsec):
     if n == 1:  # no wings that make drawing costly
         profile = galsim.Exponential(half_light_radius=size)
     else:
-        reach_px = (WINGS_RE * re_px + WINGS_PX) / np.sqrt(q)  # on the profile before the shear
+        reach_re = (WINGS_RE + WINGS_PX / re_px) / np.sqrt(q)  # on the profile before the shear
+        # of few values: GalSim tabulates each one, and does not succeed with all of them
+        reach_re = 2.0 ** np.ceil(np.log2(reach_re))
         profile = galsim.Sersic(
-            n, half_light_radius=size, trunc=reach_px * scale_arcsec, flux_untruncated=True
+            n, half_light_radius=size, trunc=reach_re * size, flux_untruncated=True
         )
     return profile.shear(q=q, beta=angle_deg * galsim.degrees)
 

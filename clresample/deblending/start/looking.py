@@ -132,14 +132,14 @@ class Looking:
         device = self.device, self.dtype, self.tuning
         return Looking(components, self.sights, self.n_scenes, *device, fit_sky=self.fit_sky)
 
-    def signal_to_noise(self, sky):
+    def signal_to_noise(self, sky, error=0.0):
         """Of all light but the sky's as each component's profile sees it: <u, d> / |u| (N, C), 0
-        where it sees nothing; sky (B, C)."""
+        where it sees nothing; sky (B, C); error: part of the light that adds to the noise."""
         spectra = np.zeros((len(self.slots), self.n_channels))
         pull, power = np.zeros((2, len(self.slots), self.n_channels))
         out = np.zeros((len(self.components), self.n_channels))
         for sight, (table, pairs) in zip(self.sights, self.pairs, strict=True):
-            sight.compare(self.scenes, self.slots, spectra, sky, 0.0)
+            sight.compare(self.scenes, self.slots, spectra, sky, error)
             alone = table[:, 0] == table[:, 1]
             power[table[alone, 0], sight.channels] = sight.gram(pairs, 1)[alone][..., 0, 0]
             pull[:, sight.channels] = sight.pull(1)[:, :, 0, 0]

@@ -6,20 +6,18 @@ import numpy as np
 
 from ..spectra import MODEL_ERROR
 from .equations import N_PARAMETERS, equations
+from .first_sizes import first_sizes
 from .looking import Looking
 from .population import Population, doubts
 from .slots import peaks_of
 
 # Longest step of a parameter: far from the minimum the quadratic model of chi2 promises too much.
 LONGEST_STEP = 0.7
-# Most steps, and the part of chi2 that ends them when one of them gains no more than it.
-N_STEPS, ENOUGH = 10, 1e-3
+# Most steps, and the chi2 that ends them when one of them gains no more than it.
+N_STEPS, ENOUGH = 40, 1.0
 # Levenberg-Marquardt: damping of the first step as a part of the normal matrix's diagonal, what it
 # is divided by after a step that gains, multiplied by after one that does not, and where it ends.
 FIRST_DAMPING, LESS, MORE, MOST_DAMPING = 1e-2, 3, 10, 1e3
-# Solutions of the spectra at each step, the weights following the model: the first ones of all,
-# and those that begin with the spectra of the step before.
-FIRST_ROUNDS, ROUNDS = 2, 2
 
 
 class ProfileFit:
@@ -53,14 +51,16 @@ class ProfileFit:
         return [t[:n] for t, n in zip(theta[self.at], self.counts, strict=True)]
 
     def begin(self):
-        """Solve at the mean."""
+        """Solve at the mean, and where galaxies are larger at sizes that are near theirs."""
         looking, scenes = self.looking, np.arange(len(self.theta))
         self._look(scenes, self.theta, slopes=False)
-        looking.solve(0.0)
+        looking.solve(MODEL_ERROR)
+        sized = first_sizes(looking, self.thetas(), MODEL_ERROR)
+        for b, i, theta in zip(*self.at, sized, strict=True):
+            self.theta[b, i, : len(theta)] = theta
         self._measure_brightness(self.theta)
         self._look(scenes, self.theta, slopes=True)
-        for _ in range(FIRST_ROUNDS):
-            looking.solve(MODEL_ERROR)
+        looking.solve(MODEL_ERROR)
         self._doubt(scenes)
         self.chi2 = self._chi2(scenes, self.theta)
         self._take_equations(scenes)
@@ -77,7 +77,7 @@ class ProfileFit:
             gain, trial = self._try(scenes, damping[scenes])
             gained = gain > 0
             damping[scenes] = np.where(gained, damping[scenes] / LESS, damping[scenes] * MORE)
-            enough = gained & (gain < ENOUGH * self.chi2[scenes])
+            enough = gained & (gain < ENOUGH)
             live[scenes] = ~enough & (damping[scenes] <= MOST_DAMPING)
             self.theta[scenes[gained]] = trial[scenes[gained]]
             self._measure_brightness(self.theta)
@@ -98,8 +98,7 @@ class ProfileFit:
         trial, before = self.theta.copy(), (looking.spectra.copy(), looking.sky.copy())
         trial[scenes] += np.clip(step, -LONGEST_STEP, LONGEST_STEP).reshape(trial[scenes].shape)
         self._look(scenes, trial, slopes=False)
-        for _ in range(ROUNDS):
-            looking.solve(MODEL_ERROR)
+        looking.solve(MODEL_ERROR)
         new = self._chi2(scenes, trial)
         gain = self.chi2[scenes] - new
         worse = scenes[~(gain > 0)]
@@ -132,7 +131,7 @@ class ProfileFit:
     def _take_equations(self, scenes):
         """Note the normal equations of some scenes, what is expected among them."""
         normal, right = equations(self.looking)
-        weight = self.population.precision(scenes).reshape(right.shape)
+        weight = self.population.precision(scenes, self.theta).reshape(right.shape)
         away = self.population.mean[scenes] - self.theta[scenes]
         self.normal[scenes] = normal + weight[..., None] * np.eye(right.shape[1])
         self.right[scenes] = right + weight * away.reshape(right.shape)

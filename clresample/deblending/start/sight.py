@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from ...resampling.plan import Precision
 from .aim import Aim
 from .slots import Slots, ends_of
 
 FILE = "start.cl"
+# [px] Sigma by which data are smoothed before a model's error is taken as a part of them. Noise
+# is then 10 times smaller. SDRs of simulated COSMOS galaxies are the same with 2 to 4, and 0.1 dB
+# lower with 1.
+LIGHT_PX = 3.0
 
 
 class Sight:
@@ -30,6 +35,7 @@ class Sight:
         shape = len(views), *shape
         self.root = device.put(np.array([v.root for v in views]), dtype)
         self.data = device.put(np.array([v.data * v.root for v in views]), dtype)
+        self.light = device.put(np.array([smoothed_light(v) for v in views]), dtype)
         self.residual, self.weight = (device.empty(shape, dtype) for _ in range(2))
         self.sums = device.empty((*shape[:3], 3), dtype)
         self.ties, self.scale = views[0].ties, np.array([v.error_scale for v in views])
@@ -86,8 +92,8 @@ class Sight:
         """Residuals and weights of the scenes (k,) of the slots seen last, and sums (k, Co, 3) over
         the pixels.
 
-        spectra (slots, C), sky (B, C): of the model; error: part of the model that adds to the
-        noise
+        spectra (slots, C), sky (B, C): of the model; error: part of the light that adds to
+        the noise
         """
         put = self.device.put
         if self._listed is None:
@@ -109,6 +115,7 @@ class Sight:
             sky=put(sky, self.dtype),
             root=self.root,
             data=self.data,
+            light=self.light,
             seen=self.seen,
             residual=self.residual,
             weight=self.weight,
@@ -160,6 +167,16 @@ class Sight:
             out=out,
         )
         return self.device.get(out).astype(np.float64)
+
+
+def smoothed_light(view):
+    """Light of a WhitenedView's pixels over their noise (Co, My, Mx), smoothed over neighbours.
+
+    Pixels without a weight take no part, and have none.
+    """
+    seen = gaussian_filter(view.root**2, (0, LIGHT_PX, LIGHT_PX), mode="constant")
+    light = gaussian_filter(view.root**2 * view.data, (0, LIGHT_PX, LIGHT_PX), mode="constant")
+    return view.root * np.divide(light, seen, out=np.zeros_like(light), where=view.root > 0)
 
 
 def _listed(slots, scenes):

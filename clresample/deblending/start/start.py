@@ -7,7 +7,9 @@ every instrument, so that a source that only one of them sees still starts right
 
 What is expected of theta, and how far shapes are doubted beside other sources: population.py.
 Smooth profiles leave a tenth of a bright galaxy's light unexplained. The weights allow for it,
-1/w = sigma^2 + (MODEL_ERROR * model)^2: without, spiral arms would be taken for faint neighbours.
+1/w = sigma^2 + (MODEL_ERROR * light)^2: without, spiral arms would be taken for faint neighbours.
+The light is that of the data, smoothed, so that weights stay as they are while profiles change:
+weights that followed the model would make chi2 smaller the more light a model claims.
 """
 
 from __future__ import annotations
