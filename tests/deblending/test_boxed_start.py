@@ -15,6 +15,7 @@ from clresample.deblending.start import profile_fit, start as start_module
 from clresample.deblending.start.equations import equations
 from clresample.deblending.start.looking import looking_at
 from clresample.deblending.start.profile_fit import ProfileFit
+from clresample.deblending.start.sight import smoothed_light
 from clresample.deblending.start.slots import Component, Slots, boxes_of
 from clresample.deblending.start.start import Patch
 from clresample.deblending.view import WhitenedView
@@ -124,7 +125,8 @@ def reference(whole, v, looking, fit_sky):
         for c in range(seen.shape[1]):
             a, root = looking.spectra[:, channel], w.root[c].ravel()
             model = a @ seen[heads, c] + looking.sky[0, channel] * root
-            weight = 1 / (1 + (profile_fit.MODEL_ERROR * model) ** 2)
+            light = smoothed_light(w)[c].ravel() - looking.sky[0, channel] * root
+            weight = 1 / (1 + (profile_fit.MODEL_ERROR * light) ** 2)
             rest = w.data[c].ravel() * root - model
             columns = a[owner, None] * seen[slopes, c]
             lit = np.concatenate([seen[heads, c][a > 0], root[None][: int(fit_sky)]])

@@ -59,10 +59,9 @@ def _grid(looking, thetas, error):
     All light there, whosever it is, is clearly more significant as such a profile weighs it than as
     the one before does.
     """
-    before = _significance(looking, looking.sky, error)
     going = [i for i, c in enumerate(looking.components) if isinstance(c.shape, Galaxy)]
     going = [i for i in going if looking.components[i].shape.whole]
-    grid = {}
+    before, grid = _significance(looking, looking.sky, error) if going else [], {}
     while going:
         sizes = {i: grid.get(i, [thetas[i][0]])[-1] + np.log(GROWTH) for i in going}
         sizes = {i: s for i, s in sizes.items() if 2 * np.exp(s) < max(looking.components[i].frame)}
