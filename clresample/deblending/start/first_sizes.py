@@ -48,7 +48,7 @@ def first_sizes(looking, thetas, error) -> list:
         chosen = _choose(looking, thetas, grid)
         for i, size in chosen.items():
             thetas[i][0] = size
-        scenes = np.unique(looking.scene[list(chosen)]) if chosen else []
+        scenes = looking.scene[np.array(list(chosen), int)]
         grid = {i: sizes for i, sizes in grid.items() if looking.scene[i] in scenes}
     return thetas
 
@@ -61,7 +61,9 @@ def _grid(looking, thetas, error):
     """
     going = [i for i, c in enumerate(looking.components) if isinstance(c.shape, Galaxy)]
     going = [i for i in going if looking.components[i].shape.whole]
-    before, grid = _significance(looking, looking.sky, error) if going else [], {}
+    if not going:
+        return {}
+    before, grid = dict(enumerate(_significance(looking, looking.sky, error))), {}
     while going:
         sizes = {i: grid.get(i, [thetas[i][0]])[-1] + np.log(GROWTH) for i in going}
         sizes = {i: s for i, s in sizes.items() if 2 * np.exp(s) < max(looking.components[i].frame)}
