@@ -17,8 +17,8 @@
  *
  * whiten   seen <- seen root;  launch: (X, tallest window, slots)
  * compare  model m = sky root + sum_slots A seen, residual r = data - m, weight w = 1 / (1 + (error
- *          (light - sky root))^2) where root is not 0, error (B, n_bands); sums (B, n_bands, my, 3):
- *          of w r^2, w r root, w root^2;
+ *          (light - sky root))^2) where root is not 0, error (B, n_bands);
+ *          sums (B, n_bands, my, 3): of w r^2, w r root, w root^2;
  *          launch: (WG my, n_bands, scenes), a group a row.  `listed`: the slots scene by scene,
  *          those of scenes[k] from first[k] to first[k + 1]
  * gram     out (pairs, n_bands, K, K) = sum over the pixels where both windows lie of w a_i b_j;

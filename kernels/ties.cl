@@ -2,7 +2,8 @@
  *
  * tie       d_spectra[s, c] = mean of d_spectra[s, c'] over the channels c' of c's band
  *           first[c]: the first channel of the band of c, count[c]: how many it has
- *           layout: d_spectra (n_sources, n_channels);  launch: n_sources items, see FOR_I of group.h
+ *           layout: d_spectra (n_sources, n_channels);
+ *           launch: n_sources items, see FOR_I of group.h
  */
 #include "common.h"
 #include "group.h"

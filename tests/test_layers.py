@@ -35,7 +35,7 @@ ROOMS = {
 }
 # Rooms that work without any OpenCL driver.
 NUMPY_ONLY = ("sky", "simulation")
-MAX_LINES, MAX_CLASS, MAX_FUNCTION, MAX_FILES, MAX_FOLDERS = 300, 150, 60, 14, 11
+MAX_LINES, MAX_CLASS, MAX_FUNCTION, MAX_FILES, MAX_FOLDERS = 450, 220, 90, 24, 11
 
 PACKAGE = ROOT / "clresample"
 MODULES = {

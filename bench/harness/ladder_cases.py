@@ -64,8 +64,8 @@ def sersic(n, re_px, q, angle_deg, scale_arcsec):
         profile = galsim.Exponential(half_light_radius=size)
     else:
         reach_re = (WINGS_RE + WINGS_PX / re_px) / np.sqrt(q)  # on the profile before the shear
-        # of few values: GalSim tabulates each one, and does not succeed with all of them
-        reach_re = 2.0 ** np.ceil(np.log2(reach_re))
+        # of few values: GalSim tabulates each one, and does not succeed with n = 4 beyond 64 r_e
+        reach_re = min(2.0 ** np.ceil(np.log2(reach_re)), 64.0)
         profile = galsim.Sersic(
             n, half_light_radius=size, trunc=reach_re * size, flux_untruncated=True
         )

@@ -84,8 +84,15 @@ def write_surveys(folder, field, *, overwrite=True) -> list[Path]:
     """Write a SimulatedField as its surveys hand out their data, field.toml, truth.ecsv.
 
     As `write_field`. euclid/ holds a tile of MER, rubin/ a cell coadd for each band. Dead columns
-    have the flag 1 there and NO_DATA here.
+    have the flag 1 there and NO_DATA here. Raises ValueError for PSFs sampled more finely than the
+    images, which these formats do not hold.
     """
+    spacings = [mosaic.psf_spacing for mosaic in field.mosaics]
+    if set(spacings) != {1.0}:
+        raise ValueError(
+            f"PSFs have sample spacings {spacings} px, must be 1 in surveys' formats: write the "
+            "plain format, --format plain"
+        )
     return _written(_write_surveys, folder, field, overwrite)
 
 

@@ -25,9 +25,19 @@ def many_of(names, monkeypatch, *, memory=100, **sizes):
     many = object.__new__(_ManyFits)
     many.blends, many.done, many.memory = list(names), [None] * len(names), memory
     many.settings = many.device = many.dtype = None
-    many.dark = {}
+    many.warned = {}
     group = [
-        (i, Named(name=name, blend=name, status="going", dark=[1] * (name == "dim")))
+        (
+            i,
+            Named(
+                name=name,
+                blend=name,
+                status="going",
+                dark=[1] * (name == "dim"),
+                problems=[],
+                settings=None,
+            ),
+        )
         for i, name in enumerate(names)
     ]
 
@@ -59,7 +69,10 @@ def test_scenes_are_fitted_in_parts_that_fit_into_the_memory(monkeypatch):
 def test_those_that_can_begin_though_others_cannot(monkeypatch):
     many, group, _ = many_of(["a", "bad", "dim"], monkeypatch)
     begun = many._begin(group)
-    assert [fit.name for _, fit in begun] == ["a", "dim"] and many.dark == {2: [1]}
+    assert [fit.name for _, fit in begun] == ["a", "dim"] and many.warned == {
+        0: ([], []),
+        2: ([1], []),
+    }
     assert [done is None for done in many.done] == [True, False, True]
     assert many.done[1].blend == "bad" and "bad data" in many.done[1].status
 

@@ -111,7 +111,8 @@ def test_n_exposures_give_what_one_image_of_n_times_the_weight_does(images, stac
     assert [len(m) for m in tied.draws.modes] == [len(m) for m in stack.draws.modes]
     one, other = catalogue(tied, magnitudes=True), catalogue(stack, magnitudes=True)
     assert {"colour_g_r", "snr", "size_err", "flux_err_g"} <= {*one.colnames} & {*other.colnames}
-    for name in {*one.colnames} & {*other.colnames} - {"name"}:
+    of_each = {"name", "misfit_sigma", "misfit_fraction"}  # residuals are those of an exposure
+    for name in {*one.colnames} & {*other.colnames} - of_each:
         values = (np.asarray(getattr(t[name], "value", t[name]), float) for t in (one, other))
         np.testing.assert_allclose(*values, rtol=1e-3, atol=1e-6, err_msg=name)
     spectra = np.array([c.spectrum[:N] for c in tied.sample(1, np.random.default_rng(1))[0]])
@@ -130,7 +131,8 @@ def test_evidence_for_a_gradient_is_that_of_the_stack(images):
         found.append(ask([fit])[0])
     assert len(found[0].which)
     np.testing.assert_array_equal(found[0].which, found[1].which)
-    np.testing.assert_allclose(found[0].evidence, found[1].evidence, rtol=1e-3)
+    # [1], a logarithm: one of 20 counts as clear
+    np.testing.assert_allclose(found[0].evidence, found[1].evidence, atol=0.1)
 
 
 def test_exposures_with_noise_of_their_own_agree_with_their_stack(images, stack):

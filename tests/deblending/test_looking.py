@@ -12,6 +12,7 @@ from clresample.deblending.settings import Settings
 from clresample.deblending.start import start as start_module
 from clresample.deblending.start.aim import SIZE_PX
 from clresample.deblending.start.looking import looking_at
+from clresample.deblending.start.sight import smoothed_light
 from clresample.deblending.start.start import Patch
 from clresample.resampling.plan import Precision
 
@@ -89,7 +90,7 @@ def test_each_scene_has_its_own_least_squares(device, fit_sky):
 
 @pytest.mark.parametrize("fit_sky", [False, True])
 def test_what_is_compared_and_how_clearly_each_is_seen(device, fit_sky):
-    """chi2 of any solution, weights with a part of the model in the noise; and u . d / |u|."""
+    """chi2 of any solution, weights with a part of the light in the noise; and u . d / |u|."""
     s = Scenes(device, fit_sky)
     looking, scenes = s.looking, np.array([2, 0])
     s.look(scenes)
@@ -100,8 +101,16 @@ def test_what_is_compared_and_how_clearly_each_is_seen(device, fit_sky):
         found = looking.compare(error)
         for row, b in enumerate(scenes):
             wanted = 0.0
-            for _, model, data in s.model(b, looking.spectra[looking.scene == b], looking.sky[b]):
-                wanted += ((data - model) ** 2 / (1 + (error * model) ** 2)).sum()
+            lights = [np.array(smoothed_light(v)) for v in s.views[b]]
+            roots = [root.ravel() for v in s.views[b] for root in v.root]
+            lights = [light.ravel() for one in lights for light in one]
+            of_all = s.model(b, looking.spectra[looking.scene == b], looking.sky[b])
+            levels = looking.sky[b]
+            for (_, model, data), light, root, level in zip(
+                of_all, lights, roots, levels, strict=True
+            ):
+                part = error * (light - level * root)
+                wanted += ((data - model) ** 2 / (1 + part**2)).sum()
             assert found[row] == pytest.approx(wanted, rel=CLOSE)
     seen = looking.signal_to_noise(looking.sky)
     assert not seen[looking.scene == 1].any()

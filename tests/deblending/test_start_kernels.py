@@ -11,7 +11,7 @@ from helpers.solver import close, every_type
 from test_boxed_start import view_of
 
 from clresample.deblending.profiles import Galaxy
-from clresample.deblending.start.sight import Sight
+from clresample.deblending.start.sight import Sight, smoothed_light
 from clresample.deblending.start.slots import Component, Slots, peaks_of
 from clresample.device.tuning import Tuning
 from clresample.resampling.plan import Precision
@@ -73,6 +73,7 @@ class Posed:
         self.root[:, :, 10:13, 7:30] = 0
         self.data = rng.normal(size=self.root.shape)
         views = [view_of(op, r, d) for r, d in zip(self.root, self.data, strict=True)]
+        self.views = views
         own = build, dtype, Tuning.of(build, dtype), Precision.of(np.float32), 0.0
         self.sight = s = Sight(views, slice(1, 1 + N_BANDS), *own)
         scene, low, size, n = WINDOWS[:, 0], WINDOWS[:, 1:3], WINDOWS[:, 3:5], WINDOWS[:, 5]
@@ -125,7 +126,8 @@ def test_residuals_weights_and_their_sums(build, dtype):
             for i in np.flatnonzero(p.slots.scene == b):
                 model = model + spectra[i, 1:3, None, None] * p.on_pixels(p.images[i][:1], i)[0]
             rest = p.data[b] * p.root[b] - model
-            weighs = 1 / (1 + (ERROR * model) ** 2)
+            light = smoothed_light(p.views[b]) - sky[b, 1:3, None, None] * p.root[b]
+            weighs = 1 / (1 + (ERROR * light) ** 2)
             close(residual[b], rest, dtype)
             close(weight[b], weighs, dtype)
             products = rest**2, rest * p.root[b], p.root[b] ** 2

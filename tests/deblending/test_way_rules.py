@@ -265,13 +265,15 @@ def test_a_fit_that_cannot_start_leaves_the_others(monkeypatch, group):
 
     monkeypatch.setattr(batch, "begin", begin)
     many = object.__new__(batch._ManyFits)
-    many.done, many.dark = {}, {}
-    fits = [(10 + i, SimpleNamespace(blend=name, dark=[7])) for i, name in enumerate(group)]
+    many.done, many.warned = {}, {}
+    fits = [
+        (10 + i, SimpleNamespace(blend=name, dark=[7], problems=[])) for i, name in enumerate(group)
+    ]
     good = [one for one in fits if one[1].blend != "b"]
     assert many._begin(fits) == good
     assert {i: done.status for i, done in many.done.items()} == {
         i: "failed: no" for i, fit in fits if fit.blend == "b"
     }
-    assert many.dark == {i: [7] for i, _ in good}
+    assert many.warned == {i: ([7], []) for i, _ in good}
     alone = [1] * len(group) if "b" in group and len(group) > 1 else []
     assert begun == [len(group), *alone]

@@ -174,8 +174,10 @@ def test_one_image_at_a_time_where_the_cache_holds_none(device, monkeypatch):
 def test_warnings_point_at_the_users_line(device):
     """A PSF sharper than the model's: the operator divides by what is next to nothing."""
     grid = Grid.flat((30, 30), 0.1)
+    with pytest.warns(PSFWarning, match="spacing"):
+        sharp = PSF.gaussian(0.7)  # its samples are coarse, too
     with pytest.warns(PSFWarning) as caught:
-        Resampler(grid, PSF.gaussian(2.0), grid, PSF.gaussian(0.7), device=device)
+        Resampler(grid, PSF.gaussian(2.0), grid, sharp, device=device)
     assert {one.filename for one in caught} == {__file__}
 
 

@@ -120,7 +120,7 @@ class Plan:
             tuple(map(tuple, about["groups"])),
             tuple(map(tuple, about["giants"])),
             about["lost"],
-            about["hosts"] and np.array(about["hosts"], np.int64),
+            about.get("hosts") and np.array(about["hosts"], np.int64),
         )
 
 
