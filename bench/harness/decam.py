@@ -56,23 +56,6 @@ def above_sky(image, weight):
     return image - np.median(image[rim & (weight > 0)])
 
 
-def rows_psf(path, y, x):
-    """PSF image at a pixel (y, x) of a PSFEx file that is kept as a row of a table.
-
-    The bench reads these files itself; the library's PSFExPSF reads PSFEx's own form alone.
-    """
-    row = {name.lower(): value for name, value in zip(*_first_row(path), strict=True)}
-    u, v = ((place + 1 - row[f"polzero{i}"]) / row[f"polscal{i}"] for i, place in ((1, x), (2, y)))
-    degree = int(row["poldeg1"])
-    terms = [u**i * v**j for j in range(degree + 1) for i in range(degree + 1 - j)]
-    return np.tensordot(terms, np.asarray(row["psf_mask"], float), axes=1)
-
-
-def _first_row(path):
-    table = fits.getdata(path, 1)
-    return table.columns.names, table[0]
-
-
 def exposures(folder):
     """Exposures of decam_galaxy or decam_star; the PSFEx tables count their cutouts' pixels."""
     table = Table(fits.getdata(next(folder.glob("survey-ccds.fits*")), 1))
@@ -91,7 +74,7 @@ def exposures(folder):
                 f"{band}{n_before or ''}",
                 above_sky(image, weight),
                 weight,
-                rows_psf(psf, *middle),
+                PSFExPSF(psf).psf_at(*middle).images[0],
                 header,
                 float(row["ccdzpt"] + 2.5 * np.log10(row["exptime"])),
             )

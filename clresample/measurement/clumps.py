@@ -35,7 +35,7 @@ BRIGHT = 8.0
 WIDE = 0.3
 # [1] contrast and part up to which a peak is structure, and part up to which it is in the group
 CLUMP, CLUMP_PART, MEMBER_PART = 2.0, 0.03, 0.2
-# [1] contrast of stars before a galaxy: the brightest knots of simulated disks have 15
+# [1] contrast of stars before a galaxy; most knots of simulated disks have less, some up to 86
 STAR = 30.0
 # [arcsec^-2] sources by chance: 90 on a square arcminute, to i = 26 (simulation/counts.py)
 CHANCE = 0.025

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 CELL_PX = 64  # [px] of the model: several times the size of the galaxies in deep images
 MIN_CELLS = 8  # along each axis: in fewer, a bright galaxy with its neighbours may fill most
-# [sigma] of a level that is left: blank cells of simulated deep fields have up to 0.6
+# [sigma] of a level that is left: faint sources raise the median of blank cells
 DEAD_SIGMA = 1.0
 # [1] of the cells: a field's darkest ones have its sky alone
 DARKEST = 0.1

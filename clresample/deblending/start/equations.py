@@ -51,8 +51,7 @@ def equations(looking):
     lit = looking.solution() > 0
     lit[..., n] = inner[..., n, n] > 0  # none in a channel without weights, nor if it is not fitted
     if looking.ties is not None:
-        normal, right, *rows = _of_bands(looking.ties, normal, right, inner, cross, rest, lit)
-        return _eliminated(normal, right, *rows)
+        return _eliminated(*_of_bands(looking.ties, normal, right, inner, cross, rest, lit))
     return _eliminated(normal, right, inner, cross, rest, lit)
 
 

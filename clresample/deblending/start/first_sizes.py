@@ -25,8 +25,8 @@ GROWTH = 3.0
 # Chi2 by which another size must be better. Noise gains under 10 for the few numbers of a profile;
 # smaller differences are left to the least squares, which take account of what is expected.
 NEED = 25.0
-# Most rounds, in each of which sources that are apart from each other take other sizes. Eight
-# satellites in the light of a giant take 2 to 4.
+# Most rounds, in each of which sources that are apart from each other take other sizes; what is
+# left then is for the least squares.
 N_ROUNDS = 12
 
 
