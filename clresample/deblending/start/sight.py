@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
@@ -35,13 +37,17 @@ class Sight:
         shape = len(views), *shape
         self.root = device.put(np.array([v.root for v in views]), dtype)
         self.data = device.put(np.array([v.data * v.root for v in views]), dtype)
-        self.light = device.put(np.array([smoothed_light(v) for v in views]), dtype)
         self.residual, self.weight = (device.empty(shape, dtype) for _ in range(2))
         self.sums = device.empty((*shape[:3], 3), dtype)
         self.ties, self.scale = views[0].ties, np.array([v.error_scale for v in views])
         self.aim = Aim(views, device, dtype, precision, tolerance)
         self.n_elements = self.n_pixels = 0
         self._listed = None  # of the scenes last compared, on the device
+
+    @cached_property
+    def _light(self):
+        """`smoothed_light` of all views, on the device."""
+        return self.device.put(np.array([smoothed_light(v) for v in self.views]), self.dtype)
 
     def _launch(self, name, size, *, local_size=None, **arguments):
         """Queue a kernel of start.cl; K of them: images of a slot that are summed."""
@@ -115,7 +121,7 @@ class Sight:
             sky=put(sky, self.dtype),
             root=self.root,
             data=self.data,
-            light=self.light,
+            light=self._light if error else self.data,  # times 0 without an error
             seen=self.seen,
             residual=self.residual,
             weight=self.weight,
