@@ -132,22 +132,28 @@ class Looking:
         device = self.device, self.dtype, self.tuning
         return Looking(components, self.sights, self.n_scenes, *device, fit_sky=self.fit_sky)
 
-    def signal_to_noise(self, sky, error=0.0):
-        """Of all light but the sky's as each component's profile sees it: <u, d> / |u| (N, C), 0
-        where it sees nothing; sky (B, C); error: part of the light that adds to the noise."""
+    def light_products(self, sky, error=0.0):
+        """Products (N, C) of each component's whitened image with all light but the sky's, and with
+        itself; 0 where it has no pixels.
+
+        sky (B, C); error: part of the light that adds to the noise
+        """
         spectra = np.zeros((len(self.slots), self.n_channels))
-        pull, power = np.zeros((2, len(self.slots), self.n_channels))
-        out = np.zeros((len(self.components), self.n_channels))
+        right, power = np.zeros((2, len(self.components), self.n_channels))
         for sight, (table, pairs) in zip(self.sights, self.pairs, strict=True):
             sight.compare(self.scenes, self.slots, spectra, sky, error)
             alone = table[:, 0] == table[:, 1]
-            power[table[alone, 0], sight.channels] = sight.gram(pairs, 1)[alone][..., 0, 0]
-            pull[:, sight.channels] = sight.pull(1)[:, :, 0, 0]
+            square = sight.gram(pairs, 1)[alone][..., 0, 0]
+            power[self.at[table[alone, 0]], sight.channels] = square
+            right[self.at, sight.channels] = sight.pull(1)[:, :, 0, 0]
         if self.ties is not None:
-            pull, power = (self.ties.spread(self.ties.total(a)) for a in (pull, power))
-        size = np.sqrt(power)
-        out[self.at] = np.divide(pull, size, out=np.zeros_like(pull), where=size > 0)
-        return out
+            right, power = (self.ties.spread(self.ties.total(a)) for a in (right, power))
+        return right, power
+
+    def signal_to_noise(self, sky, error=0.0):
+        """<u, d> / |u| (N, C) of `light_products`, 0 without pixels."""
+        right, power = self.light_products(sky, error)
+        return np.divide(right, np.sqrt(power), out=np.zeros_like(right), where=power > 0)
 
     def solution(self):
         """The present spectra and sky levels (k, C, n + 1)."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..spectra import MODEL_ERROR
 from .equations import N_PARAMETERS, equations
-from .first_sizes import first_sizes
+from .first_profiles import first_profiles
 from .looking import Looking
 from .population import Population, doubts
 from .slots import peaks_of
@@ -15,6 +17,8 @@ from .slots import peaks_of
 LONGEST_STEP = 0.7
 # Most steps, and the chi2 that ends them when one of them gains no more than it.
 N_STEPS, ENOUGH = 40, 1.0
+# Most steps of large galaxies' profiles after each that is found, before all are fitted together.
+N_FIRST_STEPS = 5
 # Levenberg-Marquardt: damping of the first step as a part of the normal matrix's diagonal, what it
 # is divided by after a step that gains, multiplied by after one that does not, and where it ends.
 FIRST_DAMPING, LESS, MORE, MOST_DAMPING = 1e-2, 3, 10, 1e3
@@ -51,30 +55,58 @@ class ProfileFit:
         return [t[:n] for t, n in zip(theta[self.at], self.counts, strict=True)]
 
     def begin(self):
-        """Solve at the mean, and where galaxies are larger at sizes that are near theirs."""
+        """Solve at the mean, and fit the profiles of galaxies that are larger, one after another."""
         looking, scenes = self.looking, np.arange(len(self.theta))
         self._look(scenes, self.theta, slopes=False)
         looking.solve(MODEL_ERROR)
-        sized = first_sizes(looking, self.thetas(), MODEL_ERROR)
-        for b, i, theta in zip(*self.at, sized, strict=True):
-            self.theta[b, i, : len(theta)] = theta
-        self._measure_brightness(self.theta)
-        self._look(scenes, self.theta, slopes=True)
-        looking.solve(MODEL_ERROR)
-        self._doubt(scenes)
-        self.chi2 = self._chi2(scenes, self.theta)
-        self._take_equations(scenes)
+        first_profiles(self, MODEL_ERROR)
+        self._take(np.arange(len(self.theta)))
 
     def run(self):
         """Step until all scenes have ended."""
-        live = np.array([(self.counts[self.looking.scene == b] > 0).any()
-                         for b in range(len(self.theta))])  # fmt: skip
+        some = [(self.counts[self.looking.scene == b] > 0).any() for b in range(len(self.theta))]
+        self._step(np.flatnonzero(some), np.ones(self.source.shape, bool), N_STEPS, learn=True)
+
+    def fit_part(self, thetas, free, scenes):
+        """Fit profiles of some components without the others; their parameters, as `thetas`.
+
+        thetas: {component: parameters (n,)}; free: set of those that move; scenes (k,): that are
+            fitted, others stay as they are
+        """
+        count = np.zeros(len(self.theta), int)
+        part, here = [], [i for i in thetas if self.looking.scene[i] in scenes]
+        for i in here:
+            c = self.looking.components[i]
+            part.append(replace(c, index=int(count[c.scene])))
+            count[c.scene] += 1
+        fit = ProfileFit(self.looking.instead(part), self.noise)
+        moves = np.zeros(fit.source.shape, bool)
+        for c, i in zip(part, here, strict=True):
+            fit.theta[c.scene, c.index, : len(thetas[i])] = thetas[i]
+            moves[c.scene, c.index] = i in free
+        fit._take(scenes)
+        fit._step(scenes, moves, N_FIRST_STEPS)
+        return thetas | dict(zip(here, fit.thetas(), strict=True))
+
+    def _take(self, scenes):
+        """Solve some scenes at their present parameters, and note all that a step needs."""
+        if len(scenes):
+            self._measure_brightness(self.theta)
+            self._look(scenes, self.theta, slopes=True)
+            self.looking.solve(MODEL_ERROR)
+            self._doubt(scenes)
+            self.chi2[scenes] = self._chi2(scenes, self.theta)
+            self._take_equations(scenes)
+
+    def _step(self, scenes, free, n_steps, *, learn=False):
+        """Step until some scenes have ended; free (B, n): the components that move."""
+        live = np.isin(np.arange(len(self.theta)), scenes)
         damping = np.full(len(live), FIRST_DAMPING)
-        for i_step in range(N_STEPS):
+        for i_step in range(n_steps):
             scenes = np.flatnonzero(live)
             if not len(scenes):
                 return
-            gain, trial = self._try(scenes, damping[scenes])
+            gain, trial = self._try(scenes, damping[scenes], free[scenes])
             gained = gain > 0
             damping[scenes] = np.where(gained, damping[scenes] / LESS, damping[scenes] * MORE)
             enough = gained & (gain < ENOUGH)
@@ -82,19 +114,22 @@ class ProfileFit:
             self.theta[scenes[gained]] = trial[scenes[gained]]
             self._measure_brightness(self.theta)
             further = scenes[gained & live[scenes]]
-            if len(further) and i_step < N_STEPS - 1:
-                self._learn(further)
+            if len(further) and i_step < n_steps - 1:
+                if learn:
+                    self._learn(further)
                 self._look(further, self.theta, slopes=True)
                 self.looking.compare(MODEL_ERROR)
                 self._take_equations(further)
 
-    def _try(self, scenes, damping):
+    def _try(self, scenes, damping, free):
         """Try a step of each of the scenes; what it gains (k,), spectra those of the better one,
         and theta (B, n, 4) after it."""
-        looking, normal = self.looking, self.normal[scenes]
-        diagonal = np.diagonal(normal, axis1=1, axis2=2) * damping[:, None]
-        matrix = normal + diagonal[..., None] * np.eye(normal.shape[-1])
-        step = np.linalg.solve(matrix, self.right[scenes][..., None])
+        looking, own = self.looking, np.eye(self.right.shape[1])
+        moves = np.repeat(free, N_PARAMETERS, axis=1)
+        normal = self.normal[scenes] * (moves[:, None] & moves[..., None])
+        diagonal = np.diagonal(normal, axis1=1, axis2=2) * damping[:, None] + ~moves
+        matrix = normal + diagonal[..., None] * own
+        step = np.linalg.solve(matrix, (self.right[scenes] * moves)[..., None])
         trial, before = self.theta.copy(), (looking.spectra.copy(), looking.sky.copy())
         trial[scenes] += np.clip(step, -LONGEST_STEP, LONGEST_STEP).reshape(trial[scenes].shape)
         self._look(scenes, trial, slopes=False)

@@ -1,0 +1,157 @@
+"""Profiles of large galaxies, from a coarse grid, before the least squares of all shapes begin.
+
+Those step from what is expected, galaxies of a few pixels. Where one galaxy of a scene is far
+larger, small profiles of all sources share its light at first, and each grows into it. So sizes
+GROWTH times apart, with the expected wings and with WIDE_WINGS, are compared here,
+
+    gain_k = sum_c max(0, <u_k, r>)^2 / (|u_k|^2 + (WRONG <u_k, M>)^2),
+
+u_k being a source's whitened image with profile k, r what is left of the data by the models of the
+sources before it, and M these models: they are wrong by WRONG of their light, see population.py,
+which a small neighbour must not take for its own. The source that gains the most comes first, with
+its best profile, whose shape is then fitted; then the one that gains the most of what is left, and
+so on: in whatever order they are listed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..profiles import Galaxy
+from .population import WRONG
+
+# Sizes follow each other by this factor: the least squares find their way from half of it.
+GROWTH = 3.0
+# Beta of large galaxies with wings: fits of Sersic profiles of n = 1 to 4 have 1.5 to 0.1.
+WIDE_WINGS = 0.7
+# Most rounds, in each of which sources that are apart from each other take their profiles; what is
+# left then is for the least squares.
+N_ROUNDS = 12
+# Chi2 by which another profile must be better. Noise gains under 10 for the few numbers of a
+# profile; smaller differences are left to the least squares, which take account of what is
+# expected.
+NEED = 25.0
+
+
+def profile_grid(looking, thetas, error) -> dict:
+    """Parameters of galaxies that may be larger than expected: {component: [theta, ...]}.
+
+    All light there, whosever it is, is clearly more significant as such a profile weighs it than as
+    the one before does.
+
+    looking: Looking that has its solution at `thetas` (N), those that are expected
+    error: part of the light that adds to the noise
+    """
+    going = [i for i, c in enumerate(looking.components) if isinstance(c.shape, Galaxy)]
+    going = [i for i in going if looking.components[i].shape.whole]
+    if not going:
+        return {}
+    before = dict(enumerate(_significance(looking, looking.sky, error)))
+    grid: dict[int, list] = {}
+    while going:
+        sizes = {i: grid.get(i, [thetas[i]])[-1][0] + np.log(GROWTH) for i in going}
+        sizes = {i: s for i, s in sizes.items() if 2 * np.exp(s) < max(looking.components[i].frame)}
+        if not sizes:
+            break
+        larger = {i: np.array([size, *thetas[i][1:]]) for i, size in sizes.items()}
+        now = _significance(_instead(looking, list(larger.items())), looking.sky, error)
+        going = [i for i, new in zip(larger, now, strict=True) if new > before[i] + NEED]
+        before = dict(zip(larger, now, strict=True))
+        for i in going:
+            grid.setdefault(i, [thetas[i]]).append(larger[i])
+    for own in grid.values():
+        own += [np.array([*theta[:3], np.log(WIDE_WINGS)]) for theta in own]
+    return grid
+
+
+def first_profiles(fit, error):
+    """Set the parameters of large galaxies of a ProfileFit, which are at their means.
+
+    error: part of the light that adds to the noise
+    """
+    looking, thetas = fit.looking, fit.thetas()
+    grid = profile_grid(looking, thetas, error)
+    scenes = np.unique(looking.scene[list(grid)])
+    # those without larger light about them are there from the first
+    models = {i: thetas[i] for i in np.flatnonzero(np.isin(looking.scene, scenes)) if i not in grid}
+    large: set[int] = set()
+    for _ in range(N_ROUNDS):
+        rest = {i: own for i, own in grid.items() if i not in models}
+        rest = {i: own for i, own in rest.items() if looking.scene[i] in scenes}
+        if not rest:
+            break
+        chosen = _next(looking, models, rest, error)
+        scenes = np.unique(looking.scene[list(chosen)]) if chosen else scenes[:0]
+        models |= chosen
+        new = {i for i, theta in chosen.items() if theta is not grid[i][0]}
+        large |= new
+        if new:
+            models = fit.fit_part(models, large, np.unique(looking.scene[list(new)]))
+    for i in large:
+        fit.theta[looking.scene[i], looking.index[i], : len(models[i])] = models[i]
+
+
+def _next(looking, models, rest, error):
+    """The components of `rest` that gain the most of all near them, with their best profiles, in
+    scenes where a larger one gains: {component: theta}.
+
+    models: those before it, {component: theta}; rest: {component: [theta expected, ...]}
+    """
+    listed = [(i, theta) for i, own in rest.items() for theta in own]
+    component = np.array([i for i, _ in listed])
+    if models:
+        before = _instead(looking, list(models.items()))
+        before.solve(error)
+        before.compare(error)
+    around = _instead(looking, listed)
+    right = np.zeros((len(listed), looking.n_channels))
+    for sight in around.sights:
+        right[around.at, sight.channels] = sight.pull(1)[:, :, 0, 0] if models else 0
+    if looking.ties is not None:
+        right = looking.ties.spread(looking.ties.total(right))
+    sky = before.sky if models else looking.sky
+    light, alone = around.light_products(sky, error)
+    right = right if models else light
+    noise = alone + (WRONG * (light - right)) ** 2
+    square = np.maximum(right, 0) ** 2
+    gain = np.divide(square, noise, out=np.zeros_like(noise), where=alone > 0).sum(axis=1)
+    # of each component the best profile
+    first = np.flatnonzero(np.diff(component, prepend=-1))
+    best = np.array([a + np.argmax(gain[a:b]) for a, b in zip(first, [*first[1:], len(gain)])])
+    going = np.unique(around.scene[best][gain[best] > gain[first] + NEED])
+    at = best[np.isin(around.scene[best], going)]
+    return dict(_apart(around, listed, gain, at))
+
+
+def _apart(around, listed, gain, at):
+    """Of those `listed` (n) that are `at` some places the ones of the largest gain (n,), in boxes
+    apart."""
+    low, high = np.zeros((2, len(listed), 2))
+    low[around.at], high[around.at] = around.slots.origin, around.slots.origin + around.slots.size
+    taken: list[int] = []
+    for k in at[np.argsort(-gain[at], kind="stable")]:
+        same = [j for j in taken if around.scene[j] == around.scene[k]]
+        if not ((low[same] < high[k]) & (low[k] < high[same])).all(axis=1).any():
+            taken.append(int(k))
+    return [listed[k] for k in taken]
+
+
+def _instead(looking, listed):
+    """A Looking that has looked at components [(i, theta)] as they would be."""
+    components, parameters, count = [], [], {}
+    for i, theta in listed:
+        c = looking.components[i]
+        count[c.scene] = index = count.get(c.scene, -1) + 1
+        components.append(replace(c, index=index))
+        parameters.append(theta)
+    around = looking.instead(components)
+    scenes = np.unique(around.scene)
+    around.look(scenes, parameters, np.zeros(len(components)), slopes=False)
+    return around
+
+
+def _significance(looking, sky, error):
+    """Chi2 (N,) that each of the components looked at explains of all light but the sky's."""
+    return (np.maximum(looking.signal_to_noise(sky, error), 0) ** 2).sum(axis=1)
