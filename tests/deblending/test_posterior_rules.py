@@ -11,7 +11,7 @@ from clresample.deblending.posterior.bumps import _gaussians
 from clresample.deblending.posterior.errors import Draws
 from clresample.deblending.posterior.modes import STRENGTH, Solution, power_of
 from clresample.deblending.posterior.normal import Layout, _by_channel
-from clresample.deblending.posterior.profile_modes import Beyond, profile_modes
+from clresample.deblending.posterior.profile_modes import FAR_LIGHT, Beyond, profile_modes
 from clresample.deblending.profiles import Galaxy, Given, Star
 from clresample.deblending.solver.learned.prior import LearnedPrior
 
@@ -158,10 +158,10 @@ def test_light_is_exchanged_where_a_neighbour_has_a_part_of_it_and_both_are_seen
 def test_sums_of_what_lies_beyond_a_box():
     """Of a profile and its modes, in pixels of the frame; as scaled, and as gauged."""
     rng = np.random.default_rng(2)
-    images, low, margin = rng.random((3, 8, 10)), np.array([5, -3]), (2, 3)
-    beyond = Beyond.of(images, low, margin)
+    images, low, box = rng.random((3, 8, 10)), np.array([5, -3]), np.s_[1:6, 3:7]
+    beyond = Beyond.of(images, low, box)
     outside = images.copy()
-    outside[:, 2:6, 3:7] = 0
+    outside[:, *box] = 0
     y, x = np.indices((8, 10)) + low[:, None, None]
     wanted = np.array([(outside * v).sum((1, 2)) for v in (1, y, x, y * y, y * x, x * x)])
     np.testing.assert_allclose(beyond.sums, wanted[:, 0])
@@ -180,7 +180,7 @@ def test_sums_of_what_lies_beyond_a_box():
 @pytest.mark.parametrize("side, margin", [(20, 10), (21, 10), (49, 24), (80, 24)])
 def test_light_beyond_a_box_is_followed_for_half_its_side(side, margin):
     """24 px at most; there halos are 0.2 times as large."""
-    shape, theta = Galaxy(scenes.frame()), np.array([2.5, 0.1, 0.2, 0.5])
+    shape, theta = Galaxy(scenes.frame()), np.array([1.0, 0.1, 0.2, 3.0])
     position, low = np.array([60.3, 59.8]), np.array([60, 60]) - side // 2
     size = side + 2 * margin
     whole = shape.draw(theta, position - low + margin, (size, size))[0]
@@ -191,6 +191,22 @@ def test_light_beyond_a_box_is_followed_for_half_its_side(side, margin):
     halo = np.sqrt(whole / whole.max())
     rest = halo.sum() - halo[margin:-margin, margin:-margin].sum()
     assert far.slopes[0, -1] == pytest.approx(0.2 * rest, rel=1e-9)
+
+
+@pytest.mark.parametrize("log_beta", [-3.0, 1.0])
+def test_wings_are_followed_to_the_edge_of_the_frame(log_beta):
+    """Of a profile that has ended before, less than FAR_LIGHT is left."""
+    frame = scenes.frame((96, 120))
+    position, low = np.array([46.2, 60.3]), np.array([41, 54])
+    shape, theta = Galaxy(frame), np.array([1.2, 0.3, 0.1, log_beta])
+    whole = shape.draw(theta, position)[0]
+    box = shape.cut(theta, position, low, (12, 12), slopes=False)[0]
+    _, _, far = profile_modes(shape, theta, position, box / whole.max(), low)
+    found = box.sum() + far.sums[0] * whole.max()
+    if log_beta > 0:
+        assert 1 - FAR_LIGHT < found < whole.sum() * (1 + 1e-9)
+    else:
+        assert found == pytest.approx(whole.sum(), rel=1e-9)
 
 
 def test_light_beyond_a_box_is_that_of_a_morphology_of_maximum_1():

@@ -1,0 +1,61 @@
+"""Profiles of large galaxies before the least squares of all shapes: from a grid, one by one."""
+
+import numpy as np
+import pytest
+from helpers.scenes import blend
+
+from clresample import Settings
+from clresample.deblending.fit import Fit, begin
+from clresample.deblending.start import profile_fit
+from clresample.deblending.start.first_profiles import GROWTH, first_profiles
+
+GIANT = ((48.2, 47.6), (3e5, 2e5, 2.5e5), 14.0)
+SMALL = [
+    ((48 + 22 * np.sin(a), 48 + 22 * np.cos(a)), (200, 260, 150), 1.5)
+    for a in (0.3, 1.6, 2.8, 4.1, 5.4)
+]
+
+
+@pytest.fixture
+def sized(device, monkeypatch):
+    """Sizes [ln px] that are expected of objects, those of the grid, and those of the start."""
+    kept = []
+
+    def noted(fit, error):
+        kept.append([theta[0] for theta in fit.thetas()])
+        first_profiles(fit, error)
+        kept.append([theta[0] for theta in fit.thetas()])
+
+    monkeypatch.setattr(profile_fit, "first_profiles", noted)
+
+    def sizes_of(objects):
+        one = Fit(blend(objects, shape=(96, 96), seed=5), Settings(), device, np.float32, pad=1)
+        begin([one])
+        return *map(np.array, kept), np.array([theta[0] for theta in one.start.thetas])
+
+    return sizes_of
+
+
+@pytest.mark.parametrize("at", [0, 3, 5])
+def test_a_giant_among_satellites_is_the_one_that_is_large(sized, at):
+    """In whatever place it is listed; its satellites are left to the least squares."""
+    before, first, found = sized([*SMALL[:at], GIANT, *SMALL[at:]])
+    assert first[at] == pytest.approx(np.log(GIANT[2]), abs=0.1)
+    assert found[at] == pytest.approx(np.log(GIANT[2]), abs=0.05)
+    np.testing.assert_array_equal(np.delete(first, at), np.delete(before, at))
+    assert (np.delete(found, at) < np.log(1.5 * GROWTH)).all()
+
+
+def test_of_two_giants_each_has_its_size(sized):
+    """The second is found in what the first one's model leaves."""
+    other = ((24.0, 70.0), (4e4, 3e4, 3e4), 9.0)
+    _, first, found = sized([GIANT, SMALL[0], other])
+    sizes = np.log([GIANT[2], other[2]])
+    assert abs(first[0] - sizes[0]) < 0.3
+    np.testing.assert_allclose(found[[0, 2]], sizes, atol=0.1)
+
+
+def test_sizes_of_small_galaxies_are_left_alone(sized):
+    """Noise and neighbours are no reason for another size."""
+    before, first, _ = sized(SMALL)
+    np.testing.assert_array_equal(before, first)
