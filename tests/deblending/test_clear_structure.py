@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.progress import falls
 
 from clresample.deblending.solver.learned.engine import LearnedEngine
 from clresample.deblending.solver.learned.progress import PATIENCE, Progress
@@ -25,7 +26,7 @@ def test_a_scene_with_clear_structure_learns_again(clear):
     sums, nothing = np.zeros((2, 3, 4)), lambda *_: None
     one.progress = begun(100, 100)
     one.progress.settled[:] = True
-    one.progress._drops[0] = 0.1
+    falls(one.progress, 0.1, 1e9)
     one._energies = lambda _: ("energies", "spectra")
     one.vectors = SimpleNamespace(x_new=None)
     one._evaluate = lambda: (sums, np.array([-0.1, -1.0]), np.array([99.9, 90.0]))
@@ -51,11 +52,11 @@ def test_scenes_look_when_they_are_calm_and_settled():
     progress = begun(100, 100, 100, 100, 3 * N_PIXELS)
     progress.settled[[0, 1, 2, 4]] = True
     progress.looked[1] = True
-    progress._drops[:] = 0.8  # 2.4 over three iterations
+    falls(progress, *[0.8] * 5)  # 2.4 over three iterations
     accepted = np.ones(5, bool)
     assert progress.asks(accepted).tolist() == [True, False, True, False, True]
     assert not progress.asks(~accepted).any()
-    progress._drops[[0, 4]] = 0.9  # much, but for a scene of chi2 6
+    falls(progress, 0.9, 0.8, 0.8, 0.8, 0.9)  # much, but for a scene of chi2 6
     assert progress.asks(accepted).tolist() == [False, False, True, False, True]
 
 
@@ -64,7 +65,7 @@ def test_no_fit_converges_before_it_has_looked():
     progress = begun(100, 100)
     progress.enough = float(PATIENCE)
     progress.settled[:] = True
-    progress._drops[:] = [[0.9] * PATIENCE, [1.1] * PATIENCE]
+    falls(progress, 0.9, 1.1)
     accepted = np.ones(2, bool)
     assert progress.asks(accepted).tolist() == [True, True]
     progress.next(accepted)

@@ -10,7 +10,7 @@ from clresample.deblending.posterior import exposure as module, posterior as pos
 from clresample.deblending.posterior.blocks import Blocks
 from clresample.deblending.posterior.exposure import Exposure, Transfer
 from clresample.deblending.posterior.normal import Layout
-from clresample.deblending.posterior.posterior import Posterior
+from clresample.deblending.posterior.posterior import FAR_ERROR, Posterior
 from clresample.deblending.posterior.profile_modes import Beyond
 from clresample.deblending.result import Component
 from clresample.deblending.settings import Settings
@@ -242,7 +242,8 @@ def slopes(function, n, step=1e-5):
 
 def test_errors_follow_from_the_covariance_of_all_unknowns():
     """Fluxes, colours, shapes and maps, by finite differences; in counts; with the floor, which
-    grows with the cube of a component's structure; three times as large at 15 sigma."""
+    grows with the cube of a component's structure, and a part of the light beyond boxes; three times
+    as large at 15 sigma."""
     made, covariance = made_up(np.random.default_rng(0))
     n, unit, wide, floor = len(covariance), np.array([10.0, 3.0]), np.array([1, 3]), 0.02
     errors = made.errors(OWNER, np.array([[1.0, np.nan], [15.0, 3.0]]), unit, floor)
@@ -250,14 +251,17 @@ def test_errors_follow_from_the_covariance_of_all_unknowns():
     full = (by @ covariance @ by.T).reshape(2, 2, 2, 2)
     released = np.concatenate(made.released[:3])
     np.testing.assert_allclose(errors.released, (by @ released).reshape(2, 2) * unit, rtol=1e-6)
-    own = np.zeros((2, 2))
+    own, beyond = np.zeros((2, 2, 2))
     for i, (morph, far, spectrum) in enumerate(shifted(made, np.zeros(n))):
         own[OWNER[i]] += floor * (1.0 + i) ** 3 * spectrum * (morph.sum() + far[0])
+        beyond[OWNER[i]] += FAR_ERROR * spectrum * far[0]
     for c in range(2):
-        wanted = (full[:, c, :, c] + np.diag(own[:, c] ** 2)) * np.outer(wide, wide)
+        wanted = (full[:, c, :, c] + np.diag(own[:, c] ** 2 + beyond[:, c] ** 2)) * np.outer(
+            wide, wide
+        )
         np.testing.assert_allclose(errors.flux[c], wanted * unit[c] ** 2, rtol=1e-5)
     for s in range(2):
-        wanted = full[s, :, s] + np.outer(own[s], own[s])
+        wanted = full[s, :, s] + np.outer(own[s], own[s]) + np.outer(beyond[s], beyond[s])
         scale = np.outer(unit, unit) * wide[s] ** 2
         np.testing.assert_allclose(errors.colour[s], wanted * scale, rtol=1e-5)
         weight = 1 / np.sqrt(np.diag(wanted))

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.progress import falls
 
 from clresample.deblending.solver.learned import progress as progress_module
 from clresample.deblending.solver.learned.engine import (
@@ -13,7 +14,15 @@ from clresample.deblending.solver.learned.engine import (
     vector_bytes,
 )
 from clresample.deblending.solver.learned.prior import LearnedPrior, gaussian
-from clresample.deblending.solver.learned.progress import EVERY, FIRST, PATIENCE, TRIALS, Progress
+from clresample.deblending.solver.learned.progress import (
+    EVERY,
+    FIRST,
+    LONGEST,
+    PATIENCE,
+    TRIALS,
+    TWELFTH,
+    Progress,
+)
 from clresample.deblending.solver.learned.steps import AGAIN, NEXT, REST, STAY, TRY
 
 
@@ -136,7 +145,7 @@ def test_strengths_are_learned_after_sixteen_rounds_and_then_every_eighth():
             moved = 0.11 if i < 30 else 0.09
             progress.learned(np.array([True]), np.array([moved]), np.array([0.25]))
             assert progress.settled[0] == (moved < 0.1)
-            assert np.isinf(progress._drops[0]).all()
+            assert np.isinf(progress._losses[0, 1:]).all()
         progress.next(accepted)
     assert due == [16, 24, 32]
 
@@ -178,15 +187,26 @@ def test_another_loss_is_looked_at_where_the_scene_is():
     """Of scenes that have moved; converged ones go on."""
     progress = begun(10, 10, 10)
     progress.settled[:] = True
-    progress._drops[:] = 0
+    falls(progress, 0, 0, 0)
     progress.next(np.array([True, True, False]))
     assert progress.converged.tolist() == [True, True, False]
     progress.look_again(np.array([True, False, True]))
     assert progress.live.tolist() == [True, False, True]
     assert progress.converged.tolist() == [False, True, False]
-    assert np.isinf(progress._drops[[0, 2]]).all() and not progress._drops[1].any()
+    assert np.isinf(progress._losses[[0, 2], 1:]).all() and (progress._losses[1] == 10).all()
     accepted, stepped = progress.judge(np.array([20.0, 20.0, 20.0]), np.zeros(3))
     assert accepted.tolist() == [True, False, True] and not stepped.any()
+
+
+@pytest.mark.parametrize("n_iterations, ends", [(60, True), (119, True), (132, False)])
+def test_a_long_fit_ends_when_a_twelfth_of_its_iterations_gained_little(n_iterations, ends):
+    """0.05 in each of them: 0.25 in five, 0.55 in eleven, and 0.5 are enough."""
+    progress = begun(10)
+    progress.settled[:], progress.n_iterations[:] = True, n_iterations
+    falls(progress, 0.05)
+    progress.next(np.array([True]))
+    assert progress.converged.tolist() == [ends]
+    assert n_iterations // TWELFTH <= LONGEST
 
 
 def test_some_scenes_go_on_alone():
@@ -194,7 +214,7 @@ def test_some_scenes_go_on_alone():
     progress.n_rounds[:] = [1, 2, 3]
     part = progress.take(np.array([2, 0]))
     assert part.loss.tolist() == [30, 10] and part.n_rounds.tolist() == [3, 1]
-    assert part._drops.shape == (2, PATIENCE) and part.enough == 0.5
+    assert part._losses.shape == (2, LONGEST + 1) and part.enough == 0.5
     part.loss[:] = 0
     assert progress.loss.tolist() == [10, 20, 30]
 

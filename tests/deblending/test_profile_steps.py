@@ -84,8 +84,8 @@ def test_a_step_that_gains_nothing_is_taken_back_and_damped(valley):
     fit, looking = valley([0.1], promise=3.0)
     gains, real = [], fit._try
 
-    def tried(scenes, damping):
-        gain, trial = real(scenes, damping)
+    def tried(scenes, damping, free):
+        gain, trial = real(scenes, damping, free)
         gains.append((float(damping[0]), bool(gain[0] > 0), float(fit.theta[0, 0, 0])))
         assert looking.spectra[0, 0] == (trial[0, 0, 0] if gain[0] > 0 else fit.theta[0, 0, 0])
         return gain, trial

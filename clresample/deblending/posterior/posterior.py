@@ -101,7 +101,9 @@ class Posterior:
         between[:, np.arange(n_sources), np.arange(n_sources)] += floor.T**2
         colour += floor[:, :, None] * floor[:, None, :]
         far = np.zeros(flux.shape)
-        for i, (spectrum, beyond) in enumerate(zip(self.solution.spectra, self.beyond, strict=True)):
+        for i, (spectrum, beyond) in enumerate(
+            zip(self.solution.spectra, self.beyond, strict=True)
+        ):
             far[owner[i]] += FAR_ERROR * spectrum * beyond.sums[0]
         between[:, np.arange(n_sources), np.arange(n_sources)] += far.T**2
         colour += far[:, :, None] * far[:, None, :]
