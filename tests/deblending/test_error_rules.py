@@ -242,8 +242,8 @@ def slopes(function, n, step=1e-5):
 
 def test_errors_follow_from_the_covariance_of_all_unknowns():
     """Fluxes, colours, shapes and maps, by finite differences; in counts; with the floor, which
-    grows with the cube of a component's structure, and a part of the light beyond boxes; three times
-    as large at 15 sigma."""
+    grows with the cube of a component's structure, and a part of the light beyond boxes; three
+    times as large at 15 sigma."""
     made, covariance = made_up(np.random.default_rng(0))
     n, unit, wide, floor = len(covariance), np.array([10.0, 3.0]), np.array([1, 3]), 0.02
     errors = made.errors(OWNER, np.array([[1.0, np.nan], [15.0, 3.0]]), unit, floor)

@@ -21,9 +21,9 @@ from .residuals import channel_residuals, widening
 
 # Least error of a spectrum at fixed morphology, relative to it: smaller ones are rounding.
 LEAST_ERROR = 1e-9
-# Relative error of the light that a profile has beyond its box, where it is under the noise. Fluxes
-# of galaxies of r_e over 30 px and signal to noise 30 to 60 are 15 % too faint: two of these errors,
-# three without this part (bench.ladder).
+# Relative error of the light that a profile has beyond its box, where it is under the noise.
+# Fluxes of galaxies of r_e over 30 px and signal to noise 30 to 60 are 15 % too faint: two of these
+# errors, three without this part (bench.ladder).
 FAR_ERROR = 0.3
 # [sigma] How far one component is released from the bound at 0 at most. Noise holds 98 in 100
 # simulated galaxies back by less; galaxies with negative light, of which images of COSMOS have

@@ -55,7 +55,7 @@ class ProfileFit:
         return [t[:n] for t, n in zip(theta[self.at], self.counts, strict=True)]
 
     def begin(self):
-        """Solve at the mean, and fit the profiles of galaxies that are larger, one after another."""
+        """Solve at the mean, and fit the profiles of larger galaxies, one after another."""
         looking, scenes = self.looking, np.arange(len(self.theta))
         self._look(scenes, self.theta, slopes=False)
         looking.solve(MODEL_ERROR)

@@ -25,8 +25,8 @@ FIRST, EVERY, SETTLED = 16, 8, 0.1
 # simulated galaxies exceed what is clear. With 1 the same ones do, up to 30 iterations later.
 LOOK = 2.5
 # A fit has converged when its strengths have settled and its loss fell by less than `enough` over
-# PATIENCE iterations and over the last twelfth of all, at most LONGEST; by that times chi2 per pixel
-# where that is above 1, since a model that misfits so knows its fluxes less well by its root. Light
+# PATIENCE iterations and over the last twelfth of all, at most LONGEST; by that times chi2 per
+# pixel where that is above 1: a model that misfits so knows its fluxes less well by its root. Light
 # of a small galaxy inside a giant comes back from the giant's structure over hundreds of iterations
 # that gain 0.03 each: without the twelfth such fits ended 8 above the lowest loss, and fluxes 6
 # errors from the truth (bench.ladder, giant). Fits of up to 60 iterations end as without it.
