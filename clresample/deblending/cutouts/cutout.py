@@ -8,7 +8,14 @@ from astropy import units as u
 from ...adapters.astropy import ccddata_of
 from .choice import chosen_observation, chosen_sources
 from .deviations import deviations
-from .separation import Separation, check_kind, faintest_light, models_on
+from .separation import (
+    Separation,
+    check_kind,
+    faintest_light,
+    models_on,
+    separation_of,
+    source_image,
+)
 from .window import sized_window, window_of
 
 
@@ -33,7 +40,8 @@ def separate(result, chosen, i_observation, *, size=None) -> tuple[Separation, t
     position = _position(result, chosen, i_observation)
     whole = tuple(slice(0, n) for n in o.shape[1:])
     if size is None:
-        own = models_on(result, chosen, i_observation, whole)["own"]
+        images = [source_image(result, s, i_observation, whole) for s in chosen]
+        own = sum((image for image in images if image is not None), np.zeros(o.shape))
         corners = window_of(own, o.weights, position, float(o.psf.fwhm_px.max()))
     else:
         if not np.isfinite(position).all():
@@ -48,14 +56,13 @@ def separate(result, chosen, i_observation, *, size=None) -> tuple[Separation, t
         )
     channels = result.channel_slices()[i_observation]
     sky = np.asarray(result.sky)[channels, None, None]
-    own, others = deviations(result, chosen, i_observation, window)
-    found = Separation(
-        data=o.data[:, *window] - sky,
-        weights=o.weights[:, *window],
-        **models_on(result, chosen, i_observation, window),
-        own_deviations=own,
-        others_deviations=others,
-        faintest=faintest_light(result.model(i_observation) - sky),
+    found = separation_of(
+        o.data[:, *window] - sky,
+        o.weights[:, *window],
+        models_on(result, i_observation, window),
+        chosen,
+        deviations(result, chosen, i_observation, window),
+        faintest_light(result.model(i_observation) - sky),
     )
     return found.padded((low[0] - y0, low[1] - x0), (y1 - y0, x1 - x0)), (y0, x0)
 
@@ -67,11 +74,14 @@ def _position(result, chosen, i_observation):
     return (at.min(axis=0) + at.max(axis=0)) / 2
 
 
-def as_ccddata(found, observation, origin, what, *, channel=None, unit=None, name=""):
+def as_ccddata(
+    found, observation, origin, what, *, channel=None, unit=None, name="", first=(0, 0)
+):
     """A Separation as CCDData; one channel of it where a number is given.
 
     observation: of its grid, names, zero points and PSF; origin (2,) [px]: (y, x) of the first
-    pixel; unit: None for counts, or one of flux density; name: of the source
+    pixel in it; unit: None for counts, or one of flux density; name: of the source; first (2,)
+    [px]: (y, x) of the observation's first pixel in the instrument's image
     Raises ValueError for a unit of another kind, and for any without zero points.
     """
     o, (y0, x0) = observation, origin
@@ -88,8 +98,8 @@ def as_ccddata(found, observation, origin, what, *, channel=None, unit=None, nam
         ("OBJECT", name[:60], "source"),
         ("CUTKIND", what, "what the image is"),
         ("INSTRUME", o.label[:60], "observation"),
-        ("LTV1", -float(x0), "[px] x here minus x in the observation"),
-        ("LTV2", -float(y0), "[px] y here minus y in the observation"),
+        ("LTV1", -float(first[1] + x0), "[px] x here minus x in the image"),
+        ("LTV2", -float(first[0] + y0), "[px] y here minus y in the image"),
     ]
     cards += [(f"BAND{k + 1}", o.channels[c], f"plane {k + 1}") for k, c in enumerate(some)]
     if o.zero_points is not None and unit == u.ct:

@@ -16,6 +16,7 @@ import warnings
 
 import numpy as np
 
+from ...device.workers import one_blas_thread
 from ...resampling.resampler import Resampler
 from ...sky.extent import shared_part
 from ...sky.psf_checks import PSFWarning
@@ -26,6 +27,7 @@ from .separation import component_image, source_image
 REACH_FWHM = 3.0
 
 
+@one_blas_thread()
 def deviations(result, chosen, i_observation, window):
     """Deviations (K, C, ny, nx) [counts] of the chosen sources' model and of all others'.
 

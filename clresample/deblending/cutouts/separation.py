@@ -17,10 +17,11 @@ belong to either, cov(t, u) is negative and the error grows. It is never stated 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
+OUTSIDE = {"weights": 0.0}  # of an image: all else is NaN there
 KINDS = "data", "model", "residual", "neighbours", "redistributed"
 # of a channel's brightest model pixel: where all models are fainter, a pixel is shared by none.
 # There the rounding of float32 renderings (1e-6), not light, would decide whose it is
@@ -34,21 +35,21 @@ class Separation:
     data (C, Ny, Nx) [counts]: without the fitted sky; NaN where there are no data
     weights (C, Ny, Nx) [counts^-2]: inverse variances, 0 = ignore this pixel
     own, others (C, Ny, Nx) [counts]: models of the chosen sources and of all others
-    shared (C, Ny, Nx) [counts]: sum of max(model, 0) over all sources; own_shared: over the chosen
-    own_deviations, others_deviations (K, C, Ny, Nx) [counts]: changes of `own` and `others` whose
-        sums of squares and products over K are the posterior's variances and covariances
-    faintest (C,) [counts]: models below this share no pixel, see TRACE
+    fraction (C, Ny, Nx) [1]: part of each pixel's light that the models give to the chosen sources
+    own_variance, others_variance (C, Ny, Nx) [counts^2]: of `own` and `others`
+    added_variance (C, Ny, Nx) [counts^2]: what the models' errors add to the noise of `data`
+    fraction_variance (C, Ny, Nx) [1]: of `fraction`
     """
 
     data: np.ndarray
     weights: np.ndarray
     own: np.ndarray
     others: np.ndarray
-    own_shared: np.ndarray
-    shared: np.ndarray
-    own_deviations: np.ndarray
-    others_deviations: np.ndarray
-    faintest: np.ndarray
+    fraction: np.ndarray
+    own_variance: np.ndarray
+    others_variance: np.ndarray
+    added_variance: np.ndarray
+    fraction_variance: np.ndarray
 
     def image(self, what) -> np.ndarray:
         """One of KINDS (C, Ny, Nx) [counts]; NaN where it needs data that have no weight.
@@ -67,31 +68,20 @@ class Separation:
             return data - self.own - self.others
         return data * self.fraction
 
-    @property
-    def fraction(self) -> np.ndarray:
-        """Part (C, Ny, Nx) of each pixel's light that the models give to the chosen sources."""
-        return fraction_of(self.own_shared, self.shared, self.faintest)
-
     def variance(self, what) -> np.ndarray:
         """Variance (C, Ny, Nx) [counts^2] of `image`; NaN where that is, infinite nowhere."""
         check_kind(what)
-        own, others = self.own_deviations, self.others_deviations
         if what == "model":
-            return (own**2).sum(axis=0)
+            return self.own_variance.copy()
         if what == "neighbours":
-            return (others**2).sum(axis=0)
+            return self.others_variance.copy()
         good = self.weights > 0
         noise = np.divide(1.0, self.weights, out=np.full(good.shape, np.nan), where=good)
         if what == "residual":
             return noise
         if what == "data":
-            extra = -(others**2).sum(axis=0) - 2 * (own * others).sum(axis=0)
-            return noise + np.maximum(extra, 0)
-        # of t / (t + u): d(t / (t + u)) = (u dt - t du) / (t + u)^2
-        lit = self.shared > self.faintest[:, None, None]
-        part = np.divide(1.0, self.shared, out=np.zeros(lit.shape), where=lit)
-        turned = (1 - self.fraction) * own - self.fraction * others
-        return self.fraction**2 * noise + ((turned * part) ** 2).sum(axis=0) * self.data**2
+            return noise + self.added_variance
+        return self.fraction**2 * noise + self.fraction_variance * self.data**2
 
     @property
     def mask(self) -> np.ndarray:
@@ -106,13 +96,58 @@ class Separation:
                  zip(origin, shape, (n_y, n_x), strict=True)]  # fmt: skip
         if not any(map(any, sides)):
             return self
-        images = {}
-        for name, value in vars(self).items():
-            if name != "faintest":
-                fill = 0.0 if name == "weights" else np.nan
-                widths = [(0, 0)] * (value.ndim - 2) + sides
-                images[name] = np.pad(value, widths, constant_values=fill)
-        return replace(self, **images)
+        return Separation(
+            **{
+                name: np.pad(image, [(0, 0), *sides], constant_values=OUTSIDE.get(name, np.nan))
+                for name, image in vars(self).items()
+            }
+        )
+
+    def part(self, window) -> Separation:
+        """The same on a part of it: slices (y, x)."""
+        return Separation(**{name: image[:, *window] for name, image in vars(self).items()})
+
+
+def separation_of(data, weights, images, chosen, deviations, faintest=None, *, joint=True):
+    """The Separation of a window from its sources' models.
+
+    data, weights: see Separation; images {source: (C, Ny, Nx) [counts]}: models of all sources
+        that have light there; chosen: the sources that are wanted, a set or sequence
+    deviations: own and others (K, C, Ny, Nx) [counts], changes of the two models whose sums of
+        squares over K are their variances; joint: sums of products are their covariances; else
+        those are unknown, and var(u) is added to the noise as if light went from u to t
+    faintest (C,) [counts]: models below this share no pixel; None = TRACE of the window's brightest
+    """
+    own, others, own_shared, shared = np.zeros((4, *data.shape))
+    for source, image in images.items():
+        light = np.maximum(image, 0)
+        shared += light
+        if source in chosen:
+            own += image
+            own_shared += light
+        else:
+            others += image
+    faintest = faintest_light(shared) if faintest is None else faintest
+    fraction = fraction_of(own_shared, shared, faintest)
+    own_change, others_change = deviations
+    others_variance = (others_change**2).sum(axis=0)
+    added = others_variance
+    if joint:
+        added = np.maximum(-others_variance - 2 * (own_change * others_change).sum(axis=0), 0)
+    # of t / (t + u): d(t / (t + u)) = (u dt - t du) / (t + u)^2
+    over = fraction_of(np.ones(shared.shape), shared, faintest)
+    change = ((1 - fraction) * own_change - fraction * others_change) * over
+    return Separation(
+        data=data,
+        weights=weights,
+        own=own,
+        others=others,
+        fraction=fraction,
+        own_variance=(own_change**2).sum(axis=0),
+        others_variance=others_variance,
+        added_variance=added,
+        fraction_variance=(change**2).sum(axis=0),
+    )
 
 
 def check_kind(what):
@@ -141,25 +176,13 @@ def source_image(result, source, i_observation, window) -> np.ndarray | None:
     return total
 
 
-def models_on(result, chosen, i_observation, window):
-    """Fields `own`, `others`, `own_shared`, `shared` of a Separation, as a dict.
-
-    chosen: numbers of sources; window: slices (y, x) of the observation
-    """
-    n_channels = result.observations[i_observation].shape[0]
-    shape = (n_channels, *(part.stop - part.start for part in window))
-    own, others, own_shared, shared = np.zeros((4, *shape))
-    for source in range(len(result.sources)):
-        image = source_image(result, source, i_observation, window)
-        if image is None:
-            continue
-        if source in chosen:
-            own += image
-            own_shared += np.maximum(image, 0)
-        else:
-            others += image
-        shared += np.maximum(image, 0)
-    return {"own": own, "others": others, "own_shared": own_shared, "shared": shared}
+def models_on(result, i_observation, window) -> dict[int, np.ndarray]:
+    """{source: model (C, ny, nx) [counts]} of all with light on a window of an observation."""
+    images = {
+        source: source_image(result, source, i_observation, window)
+        for source in range(len(result.sources))
+    }
+    return {source: image for source, image in images.items() if image is not None}
 
 
 def component_image(rendered, i, window):
