@@ -35,7 +35,13 @@ def observation_of(image, psf, *, channels=None, zero_points=None, **given) -> O
         given.setdefault("mask", np.asarray(image.mask))
     given.update(_variance(image, given))
     unit = getattr(image, "unit", None)
-    if zero_points is None and unit not in (None, u.dimensionless_unscaled, u.adu, u.electron, u.ct):
+    if zero_points is None and unit not in (
+        None,
+        u.dimensionless_unscaled,
+        u.adu,
+        u.electron,
+        u.ct,
+    ):
         zero_points = _zero_point(u.Unit(unit))
     return Observation(
         data,

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..deblending.cutouts.choice import chosen_observation
+from ..deblending.cutouts.choice import MissingSource, chosen_observation
 from ..deblending.cutouts.cutout import as_ccddata
 from ..deblending.cutouts.separation import Separation, check_kind, separation_of
 from ..deblending.cutouts.window import sized_window, window_of
@@ -103,7 +103,9 @@ class FieldCutouts:
         known = (about.get("run") or {}).get("inputs") or {}
         for path in map(str, inputs.values()):
             state = os.stat(path) if os.path.exists(path) else None
-            if path in known and (state is None or known[path] != [state.st_size, state.st_mtime_ns]):
+            if path in known and (
+                state is None or known[path] != [state.st_size, state.st_mtime_ns]
+            ):
                 self.notes.append(f"{path} has changed since the run: models may not belong to it")
 
     def cutout(self, source, observation, what="data", *, size=None, unit=None, group=False):
@@ -157,7 +159,7 @@ class FieldCutouts:
         rows = [self._row[one] for one in ids]
         if not len(own):
             status = self._columns["status"][rows[0]]
-            raise ValueError(f"source {ids[0]} has no model: its fit ended as {str(status)!r}")
+            raise MissingSource(f"source {ids[0]} has no model: its fit ended as {str(status)!r}")
         position = self._position(mosaic, rows)
         psf = mosaic.psf.psf_at(*position)
         n_channels = len(mosaic.channels)
@@ -171,7 +173,7 @@ class FieldCutouts:
         window = wide.meet(whole)
         o = mosaic.observation(window) if window.area else None
         if o is None:
-            raise ValueError(f"source {ids[0]} has no pixel with a weight in {mosaic.name!r}")
+            raise MissingSource(f"source {ids[0]} has no pixel with a weight in {mosaic.name!r}")
         images = self._images(i_mosaic, window, own, psf, o.grid)
         sky = models.sky(own[0])[self._channels(i_mosaic), None, None]
         given = o.data - sky, o.weights, images, set(ids)
@@ -185,7 +187,7 @@ class FieldCutouts:
         local = position - np.array(window[:2])
         inner = Box(*window_of(found.own, o.weights, local, fwhm))
         if not inner.area:
-            raise ValueError(f"source {ids[0]} lies outside of {mosaic.name!r}")
+            raise MissingSource(f"source {ids[0]} lies outside of {mosaic.name!r}")
         first = window.y0 + inner.y0, window.x0 + inner.x0
         grid = mosaic.grid.cutout(*first, inner.shape)
         return found.part(inner.slices), _Seen(o, grid, mosaic, psf), first
@@ -201,7 +203,7 @@ class FieldCutouts:
         at = self._reference.positions_in(mosaic.grid, y, x)
         middle = (at.min(axis=0) + at.max(axis=0)) / 2
         if not np.isfinite(middle).all():
-            raise ValueError(f"source {self.ids[rows[0]]} has no place in {mosaic.name!r}")
+            raise MissingSource(f"source {self.ids[rows[0]]} has no place in {mosaic.name!r}")
         return middle
 
     def _window_about(self, mosaic, components, reach):
@@ -305,7 +307,9 @@ class _Seen:
 
 def _corners(low, high):
     """Rows and columns (4,) of the corners of a box (2,), (2,)."""
-    return np.array([low[0], low[0], high[0], high[0]]), np.array([low[1], high[1], low[1], high[1]])
+    return np.array([low[0], low[0], high[0], high[0]]), np.array(
+        [low[1], high[1], low[1], high[1]]
+    )
 
 
 def is_field_run(folder) -> bool:

@@ -7,6 +7,10 @@ import numbers
 import numpy as np
 
 
+class MissingSource(ValueError):
+    """A source without a model, or without data in an observation."""
+
+
 def chosen_sources(result, source) -> tuple[int, ...]:
     """Numbers of the sources meant by a number, a name, or a sequence of these.
 

@@ -6,7 +6,7 @@ import numpy as np
 from astropy import units as u
 
 from ...adapters.astropy import ccddata_of
-from .choice import chosen_observation, chosen_sources
+from .choice import MissingSource, chosen_observation, chosen_sources
 from .deviations import deviations
 from .separation import (
     Separation,
@@ -45,13 +45,13 @@ def separate(result, chosen, i_observation, *, size=None) -> tuple[Separation, t
         corners = window_of(own, o.weights, position, float(o.psf.fwhm_px.max()))
     else:
         if not np.isfinite(position).all():
-            raise ValueError(f"source {chosen[0]} has no place in observation {o.label!r}")
+            raise MissingSource(f"source {chosen[0]} has no place in observation {o.label!r}")
         corners = sized_window(size, position, o.grid.pixel_scale_arcsec)
     y0, x0, y1, x1 = corners
     low = max(y0, 0), max(x0, 0)
     window = slice(low[0], min(y1, o.shape[1])), slice(low[1], min(x1, o.shape[2]))
     if any(part.stop <= part.start for part in window):
-        raise ValueError(
+        raise MissingSource(
             f"source {', '.join(map(str, chosen))} lies outside of observation {o.label!r}"
         )
     channels = result.channel_slices()[i_observation]
@@ -74,9 +74,7 @@ def _position(result, chosen, i_observation):
     return (at.min(axis=0) + at.max(axis=0)) / 2
 
 
-def as_ccddata(
-    found, observation, origin, what, *, channel=None, unit=None, name="", first=(0, 0)
-):
+def as_ccddata(found, observation, origin, what, *, channel=None, unit=None, name="", first=(0, 0)):
     """A Separation as CCDData; one channel of it where a number is given.
 
     observation: of its grid, names, zero points and PSF; origin (2,) [px]: (y, x) of the first

@@ -190,9 +190,7 @@ def component_image(rendered, i, window):
     if not hasattr(rendered, "window"):
         return np.asarray(rendered[i])[:, *window]
     here, there = rendered.window(i), window
-    both = [
-        (max(a.start, b.start), min(a.stop, b.stop)) for a, b in zip(here, there, strict=True)
-    ]
+    both = [(max(a.start, b.start), min(a.stop, b.stop)) for a, b in zip(here, there, strict=True)]
     if any(low >= high for low, high in both):
         return None
     image = rendered.images[i]
