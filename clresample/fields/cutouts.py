@@ -27,8 +27,7 @@ from ..sky.psf_checks import PSFWarning
 from .box import Box
 from .models import ModelFile
 from .reading.field_file import read_field
-from .run import reference_of
-from .work.folder import WORK
+from .reference import reference_of
 
 # [FWHM of the PSF] How far beyond a model's box its light is rendered, and looked for.
 REACH_FWHM = 3.0
@@ -310,9 +309,3 @@ def _corners(low, high):
     return np.array([low[0], low[0], high[0], high[0]]), np.array(
         [low[1], high[1], low[1], high[1]]
     )
-
-
-def is_field_run(folder) -> bool:
-    """Whether a folder holds a run over a field, finished or not."""
-    folder = Path(folder)
-    return (folder / WORK).is_dir() or (folder / "models.fits").is_file()
