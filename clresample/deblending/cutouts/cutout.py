@@ -121,17 +121,17 @@ def _scale(observation, unit):
     if unit is None:
         return u.ct, np.ones(n_channels)
     try:
-        unit = u.Unit(unit)
-        micro = (1 * u.uJy).to_value(unit)
-    except (ValueError, TypeError, u.UnitConversionError):
-        if unit == u.ct:
+        wanted = u.Unit(unit)
+        if wanted == u.ct:
             return u.ct, np.ones(n_channels)
+        micro = (1 * u.uJy).to_value(wanted)
+    except (ValueError, TypeError, u.UnitConversionError):
         raise ValueError(
-            f"unit is {unit!r}, must be None or ct for counts, or a flux density such as 'uJy'"
+            f"unit is {str(unit)!r}, must be None or ct for counts, or a flux density such as 'uJy'"
         ) from None
     if observation.flux_scale is None:
         raise ValueError(
             f"unit is {unit}, but observation {observation.label!r} has no zero_points: leave the "
             "unit out for counts"
         )
-    return unit, micro * observation.flux_scale
+    return wanted, micro * observation.flux_scale

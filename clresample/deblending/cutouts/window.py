@@ -52,9 +52,9 @@ def sized_window(size, position, pixel_scale_arcsec):
 def size_px(size, pixel_scale_arcsec) -> tuple[int, int]:
     """(ny, nx) [px] of a size: numbers of pixels, or Quantities of angle."""
     try:
-        given = size if isinstance(size, u.Quantity) else np.asarray(size)
-        if isinstance(size, (tuple, list)) and any(isinstance(s, u.Quantity) for s in size):
-            given = u.Quantity(size)
+        several = isinstance(size, (tuple, list))
+        with_unit = any(isinstance(one, u.Quantity) for one in (size if several else [size]))
+        given = u.Quantity(size) if with_unit else np.asarray(size)
         if isinstance(given, u.Quantity):
             in_px = given.unit.is_equivalent(u.pix)
             given = given.to_value(u.pix) if in_px else given.to_value(u.arcsec)
