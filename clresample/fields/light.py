@@ -39,11 +39,14 @@ class ModelLight:
         return slice(start, start + len(self.mosaics[i_mosaic].channels))
 
     def window_about(self, i_mosaic, components, reach):
-        """The pixels of a mosaic about the boxes of some components: a Box."""
+        """The pixels of a mosaic about the boxes of some components: a Box; of area 0 where its
+        projection does not hold them."""
         models, mosaic = self.models, self.mosaics[i_mosaic]
         low, high = models.low[components].min(axis=0), models.high[components].max(axis=0)
         corners = _corners(low - 0.5, high - 0.5)
         at = self.reference.positions_in(mosaic.grid, *corners)
+        if not np.isfinite(at).all():
+            return Box(0, 0, 0, 0)
         return Box.around(at).grown(int(np.ceil(reach)) + 1)
 
     def images(self, i_mosaic, window, own, psf, grid):
