@@ -118,6 +118,20 @@ def test_shifts_and_skies_of_the_fits_are_kept_and_followed(moved, sky):
     np.testing.assert_allclose(cut[0].data + cut[1].data, expected, atol=0.003 * expected.max())
 
 
+def test_a_fitted_shift_moves_what_is_rebuilt(done, sky):
+    """By two pixels, for a mosaic whose pixels are the models'."""
+    field = FieldCutouts(done[0], mosaics_of(sky))
+    one = int(field.ids[np.argmax(field._models.spectra[:, 0] > 0)])
+    still = field.cutout(one, "Euclid", "model", size=25).data
+    row = np.array([0.0, 2.0, 0.0, 0.0, 0.0, 0.0])
+    field._models._offsets.update(dict.fromkeys(field._models.table["patch"].tolist(), row))
+    moved = field.cutout(one, "Euclid", "model", size=25).data
+    a, b = moved[:, 3:-5], still[:, 5:-3]
+    known = np.isfinite(a) & np.isfinite(b)
+    assert known.sum() > 200
+    np.testing.assert_allclose(a[known], b[known], atol=2e-3 * np.nanmax(still))
+
+
 def test_offsets_are_read_back_and_parts_without_them_have_none(tmp_path):
     part, patch = Part(), SimpleNamespace(number=3)
     part.add_offsets(patch, [[0, 0], [0.25, -0.5]], [0.0, 1.5])
