@@ -220,7 +220,7 @@ class _Label:
 
 
 class _Seen:
-    """What `as_ccddata` asks of an observation, on the grid of a cutout, with the source's PSF."""
+    """Properties of an observation for `as_ccddata`: the grid of a cutout, the source's PSF."""
 
     psf_field = None
 

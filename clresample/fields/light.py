@@ -22,7 +22,7 @@ BATCH_BYTES = 64 << 20
 
 @dataclass(frozen=True, eq=False)
 class ModelLight:
-    """What renders the models of a field.
+    """Renders the models of a field on windows of its mosaics.
 
     models: ModelFile; mosaics: of the field; reference: Grid of the models' pixels; device: as
     `get_device` takes it

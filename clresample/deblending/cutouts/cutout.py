@@ -1,4 +1,4 @@
-"""What `Result.cutout` returns: a source without its neighbours, as an astropy CCDData."""
+"""Cutouts of fitted sources without their neighbours, as astropy CCDData."""
 
 from __future__ import annotations
 

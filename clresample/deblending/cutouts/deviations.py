@@ -1,4 +1,4 @@
-"""What the posterior lets the models of a window change by: images whose products are covariances.
+"""Changes of models that the posterior allows: images whose products are covariances.
 
 From draws (A_k, S_k) of the posterior, where a result has some, none of them below 0:
 

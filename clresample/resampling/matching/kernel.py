@@ -1,4 +1,4 @@
-"""What an operator does to noise: the variance of its pixels, and their correlation.
+"""The noise of an operator's output: the variance of its pixels, and their correlation.
 
 With the kernel h of an operator, I2(X) = sum_x h(X - x) I1(x), and white noise of variance
 sigma^2(x) in the input,
