@@ -68,7 +68,7 @@ def separate(result, chosen, i_observation, *, size=None) -> tuple[Separation, t
 
 
 def _position(result, chosen, i_observation):
-    """Where (2,) [px] sources lie on an observation: the middle of their positions."""
+    """Position (2,) [px] of sources on an observation: the middle of their positions."""
     positions = result.frame.place([result.sources[s] for s in chosen])
     at = result.footprints[i_observation].locate(positions)
     return (at.min(axis=0) + at.max(axis=0)) / 2
