@@ -30,6 +30,7 @@ _ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
         "resampler": ("Resampler",),
         "tiled.resampler": ("TiledResampler",),
         "paper.resampler": ("PaperResampler",),
+        "matching.match": ("match",),
     },
     # fits of scenes to observations
     "deblending": {
@@ -51,10 +52,12 @@ _ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
     },
     # results and catalogues on disk
     "files": {
+        "cutouts": ("read_cutouts", "write_cutouts"),
         "results": ("read_result", "write_catalogue", "write_result"),
     },
     # whole fields, from mosaics to one catalogue
     "fields": {
+        "cutouts": ("FieldCutouts",),
         "mosaic": ("Mosaic",),
         "psfs.sampled": ("PSFCube",),
         "options": ("FieldOptions",),
@@ -98,6 +101,7 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from .deblending.solver.prior import Prior as Prior
     from .device.device import Device as Device, get_device as get_device
     from .device.discovery import DeviceError as DeviceError, list_devices as list_devices
+    from .fields.cutouts import FieldCutouts as FieldCutouts
     from .fields.mosaic import Mosaic as Mosaic
     from .fields.options import FieldOptions as FieldOptions
     from .fields.psfs.sampled import PSFCube as PSFCube
@@ -109,6 +113,7 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from .fields.readers.rubin_exposure import read_rubin_exposure as read_rubin_exposure
     from .fields.report.write import write_report as write_report
     from .fields.run import run_field as run_field
+    from .files.cutouts import read_cutouts as read_cutouts, write_cutouts as write_cutouts
     from .files.results import (
         read_result as read_result,
         write_catalogue as write_catalogue,
@@ -118,6 +123,7 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from .measurement.detection import detect as detect, detect_more as detect_more
     from .measurement.photometry import fluxes as fluxes, redistribute as redistribute
     from .measurement.quality import summary as summary
+    from .resampling.matching.match import match as match
     from .resampling.paper.resampler import PaperResampler as PaperResampler
     from .resampling.resampler import Resampler as Resampler
     from .resampling.tiled.resampler import TiledResampler as TiledResampler

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from astropy import units as u
 from astropy.coordinates import SkyCoord
-from astropy.nddata import InverseVariance, StdDevUncertainty, VarianceUncertainty
+from astropy.io import fits
+from astropy.nddata import CCDData, InverseVariance, StdDevUncertainty, VarianceUncertainty
 
 from ..sky.grid import Grid
 from ..sky.observation import ZERO_POINT_UJY, Observation
@@ -34,7 +35,13 @@ def observation_of(image, psf, *, channels=None, zero_points=None, **given) -> O
         given.setdefault("mask", np.asarray(image.mask))
     given.update(_variance(image, given))
     unit = getattr(image, "unit", None)
-    if zero_points is None and unit not in (None, u.dimensionless_unscaled, u.adu, u.electron):
+    if zero_points is None and unit not in (
+        None,
+        u.dimensionless_unscaled,
+        u.adu,
+        u.electron,
+        u.ct,
+    ):
         zero_points = _zero_point(u.Unit(unit))
     return Observation(
         data,
@@ -43,6 +50,37 @@ def observation_of(image, psf, *, channels=None, zero_points=None, **given) -> O
         channels=channels,
         zero_points=zero_points,
         **given,
+    )
+
+
+def ccddata_of(data, grid, *, variance=None, mask=None, psf=None, unit=u.ct, cards=()) -> CCDData:
+    """An image with its place on the sky as an astropy CCDData.
+
+    data (C, Ny, Nx) or (Ny, Nx): one channel is returned as (Ny, Nx), several as a cube, whose WCS
+        is that of its rows and columns
+    grid: Grid of (Ny, Nx); a flat one is put at RA = Dec = 0
+    variance, mask: of the shape of data, or None; psf: PSF of 1 or C bands, or None
+    unit: of data; cards: (keyword, value, comment) of the FITS header that is `meta`
+
+    `psf` is the array of the PSF's samples, as many as there are images, divided by their sums.
+    PSFSPACE of `meta` is their distance in pixels.
+    """
+    data = np.asarray(data)
+    one = data.ndim == 3 and len(data) == 1
+    header = fits.Header([fits.Card(*card) for card in cards])
+    images = None
+    if psf is not None:
+        header["PSFSPACE"] = (psf.spacing, "[px] distance of the PSF's samples")
+        images = psf.images[0] if len(psf.images) == 1 else psf.images
+    variance, mask = (None if a is None else a[0] if one else a for a in (variance, mask))
+    return CCDData(
+        data[0] if one else data,
+        unit=unit,
+        wcs=grid.to_wcs(),
+        uncertainty=None if variance is None else StdDevUncertainty(np.sqrt(variance)),
+        mask=mask,
+        psf=images,
+        meta=header,
     )
 
 

@@ -20,6 +20,7 @@ from .. import __version__
 from ..device.discovery import DeviceError
 from ..device.profile import report
 from ..device.remembered import DeviceWarning
+from .cutout import add_cutout
 from .deblend import add_deblend
 from .devices import add_devices
 from .field import add_field
@@ -116,6 +117,7 @@ COMMANDS = (
     add_deblend,
     add_field,
     add_report,
+    add_cutout,
     add_simulate,
     add_devices,
     add_tune,

@@ -166,6 +166,31 @@ class Result(ShownResult):
         o = self.observations[i_observation]
         return np.where(o.weights > 0, o.data - self.model(i_observation), np.nan)
 
+    def cutout(self, source, observation, what="data", *, size=None, unit=None):
+        """One source, or several as one, without its neighbours, in an observation's own pixels.
+
+        source: a number, a name, or a sequence of these: a group that is cut out as one
+        observation: a number, an observation's name, or a channel's name for that channel alone
+        what: "data", minus the sky and the models of all other sources; "model", of the source;
+            "residual", data minus all models; "neighbours", the model of all others; or
+            "redistributed", the source's share of the data in proportion to the models, see
+            `redistribute`. "data" is "model" plus "residual"
+        size: (ny, nx) or one number of pixels, or angles as Quantities, about the source; None =
+            what holds its model down to a tenth of the noise, as far as the image goes
+        unit: None = counts, or one of flux density, such as "uJy", where there are zero points
+
+        returns astropy.nddata.CCDData (Ny, Nx), or (C, Ny, Nx) of several channels: with the WCS,
+            the standard deviation (of "data": noise and what the posterior leaves open of the
+            neighbours, see docs/howto/alone.md), mask (True = ignore: no data, or outside), and the
+            PSF at the middle. Images of data are NaN where they are masked
+
+        Raises ValueError for names and sizes that are none, for a source outside of the
+        observation, and for units without zero points.
+        """
+        from .cutouts.cutout import cutout  # 0.1 s of astropy, which fits need not wait for
+
+        return cutout(self, source, observation, what, size=size, unit=unit)
+
     def sample(self, n, rng) -> list[tuple[Component, ...]]:
         """Draw n sets of components from the posterior about the solution, as `errors` has it.
 

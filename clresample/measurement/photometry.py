@@ -5,11 +5,8 @@ from __future__ import annotations
 import numpy as np
 from astropy import units as u
 
+from ..deblending.cutouts.separation import faintest_light, fraction_of, source_image
 from .quality import fitted_sources
-
-# of a channel's brightest model pixel: where all models are fainter, a pixel is shared by none.
-# There the rounding of float32 renderings (1e-6), not light, would decide whose it is
-TRACE = 1e-5
 
 
 def fluxes(result):
@@ -83,17 +80,15 @@ def redistribute(result, i_observation) -> np.ndarray:
     """
     observation = result.observations[i_observation]
     channels = result.channel_slices()[i_observation]
-    shares = np.zeros((len(result.sources), *observation.data.shape))
-    spectra = spectra_of(result)[:, channels]
-    for i, component in enumerate(result.components):
-        shares[component.source] += spectra[i, :, None, None] * result.rendered[i_observation][i]
-    np.maximum(shares, 0.0, out=shares)
-    total = shares.sum(axis=0)
-    lit = total > TRACE * total.max(axis=(1, 2), keepdims=True)
-    ratio = np.zeros_like(total)
-    data = observation.data - np.asarray(result.sky)[channels, None, None]
-    np.divide(data, total, out=ratio, where=lit)
-    shares *= ratio
+    whole = tuple(slice(0, n) for n in observation.shape[1:])
+    lights = np.zeros((len(result.sources), *observation.shape))
+    for source, light in enumerate(lights):
+        image = source_image(result, source, i_observation, whole)
+        if image is not None:
+            np.maximum(image, 0.0, out=light)
+    total = lights.sum(axis=0)
+    shares = fraction_of(lights, total, faintest_light(total))
+    shares *= observation.data - np.asarray(result.sky)[channels, None, None]
     shares[:, observation.weights <= 0] = np.nan
     return shares
 

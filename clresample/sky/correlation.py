@@ -137,6 +137,14 @@ class NoiseCorrelation(ReadOnly):
         taps = self.filter.reshape((1,) * (images.ndim - 2) + self.filter.shape)
         return convolve(images, taps, mode="constant")
 
+    def colouring_filter(self) -> np.ndarray:
+        """Filter (n, n), n odd, that makes this noise out of white noise of unit variance.
+
+        Symmetric, with the transform P^(1/2).
+        """
+        root = np.fft.fftshift(np.fft.ifft2(np.sqrt(_power(self.autocorrelation))).real)
+        return root[1:, 1:]  # of an even number of taps the middle one is n // 2
+
     def reached(self, weights):
         """Pixels (..., Ny, Nx) that w mixes with none that has no weight, nor with the outside."""
         good = np.asarray(weights) > 0

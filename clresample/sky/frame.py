@@ -104,11 +104,11 @@ def model_frame(observations, *, grid=None, psf_sigma_px=0.8, shared=False) -> F
         raise ValueError(
             f"psf_sigma_px is {psf_sigma_px:g}: no more than the model frame's {grid.shape} pixels"
         )
-    return Frame(grid, _model_psf(float(psf_sigma_px)))
+    return Frame(grid, model_psf(float(psf_sigma_px)))
 
 
 @lru_cache(maxsize=4)
-def _model_psf(sigma_px):
+def model_psf(sigma_px=0.8):
     """The Gaussian of this standard deviation [model px] in model pixels."""
     # the pixel adds its own variance, 1/12, to the Gaussian's
     radius = math.ceil(REACH * math.sqrt(sigma_px**2 + 1 / 12))

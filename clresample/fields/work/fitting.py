@@ -228,6 +228,10 @@ def _take(part, job, cut, result, n_round):
         part.add_component(ids[c.source], patch, origin + c.origin, c.morphology, spectrum)
     for model in models:
         part.add_model(patch, *model)
+    shifts = np.zeros((len(job.mosaics), 2))
+    shifts[[i_mosaic for i_mosaic, *_ in models]] = result.shifts
+    sky = _all_channels(job, result.channels, result.sky)
+    part.add_offsets(patch, shifts, np.nan_to_num(sky))
     seconds = cut.seconds + sum(result.seconds.values())
     n_iterations = max(len(result.losses) - 1, 0)
     part.patches.append(

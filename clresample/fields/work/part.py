@@ -37,6 +37,8 @@ class Part:
     rows: Columns of sources, one for each patch; patches: rows of PATCH_COLUMNS
     components: rows of COMPONENT_COLUMNS, offsets counted in `flat`; spectra: (C,) of each
     flat: morphologies, flattened; models: rows of MODEL_COLUMNS, pixels: of these, flattened
+    offsets: (1 + 2 M + C,) of each patch with fitted shifts or sky levels other than 0: its number,
+        shifts (M, 2) [model px] of all mosaics, sky levels (C,) [counts] of all channels
     """
 
     rows: list = field(default_factory=list)
@@ -46,6 +48,7 @@ class Part:
     flat: list = field(default_factory=list)
     models: list = field(default_factory=list)
     pixels: list = field(default_factory=list)
+    offsets: list = field(default_factory=list)
     n_flat: int = 0
     n_pixels: int = 0
 
@@ -63,6 +66,11 @@ class Part:
         self.pixels.append(np.ravel(model).astype(np.float32))
         self.n_pixels += model.size
 
+    def add_offsets(self, patch, shifts, sky):
+        """A patch's shifts (M, 2) [model px] and sky levels (C,) [counts], if any is not 0."""
+        if np.any(shifts) or np.any(sky):
+            self.offsets.append(np.concatenate([[patch.number], np.ravel(shifts), sky]))
+
     def to_bytes(self) -> bytes:
         """The file that PartFile reads."""
         columns = zip(*self.patches, strict=True) if self.patches else [()] * len(PATCH_COLUMNS)
@@ -79,6 +87,7 @@ class Part:
             _floats(self.flat and np.concatenate(self.flat), "MORPHOLOGIES"),
             _table(_whole(self.models, MODEL_COLUMNS), "MODELS"),
             _floats(self.pixels and np.concatenate(self.pixels), "PIXELS"),
+            _floats(self.offsets, "OFFSETS"),
         ]
         file = BytesIO()
         fits.HDUList(hdus).writeto(file)
@@ -122,6 +131,12 @@ class PartFile:
         with open_fits(self.path) as hdus:
             chosen = [hdus[name] for name in names]
             return [_array(hdu) if hdu.is_image else _columns(hdu) for hdu in chosen]
+
+    def offsets(self) -> np.ndarray:
+        """The rows of `Part.offsets`; none of a part that an older version wrote."""
+        with open_fits(self.path) as hdus:
+            rows = _array(hdus["OFFSETS"]) if "OFFSETS" in hdus else np.zeros(0)
+        return np.zeros((0, 1)) if not rows.size else rows.astype(np.float64)
 
     def models(self, chosen=None, mosaic=None):
         """(patch, mosaic, Box, model (C, Ny, Nx)) of its patches, or of those whose number is in

@@ -1,0 +1,210 @@
+"""Data of a window divided between chosen sources and all others, with the noise of the result.
+
+With the data d (its sky subtracted), the model t of the chosen sources and u of all others:
+
+    data           d - u                 model        t
+    residual       d - t - u             neighbours   u
+    redistributed  d max(t, 0) / sum of max(model, 0) over all sources
+
+so that data = model + residual. The error of `data` against the light of the chosen sources is
+
+    <(d - u - t_true)^2> = 1 / w - var(u) - 2 cov(t, u),
+
+by the posterior covariance of t and u: what the fit does not know of the neighbours is in var(u);
+as much of the noise as their model has followed is not in d - u any more; and where light could
+belong to either, cov(t, u) is negative and the error grows. It is never stated below the noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+OUTSIDE = {"weights": 0.0}  # of an image: all else is NaN there
+KINDS = "data", "model", "residual", "neighbours", "redistributed"
+# of a channel's brightest model pixel: where all models are fainter, a pixel is shared by none.
+# There the rounding of float32 renderings (1e-6), not light, would decide whose it is
+TRACE = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class Separation:
+    """Chosen sources and their neighbours on a window of one observation.
+
+    data (C, Ny, Nx) [counts]: without the fitted sky; NaN where there are no data
+    weights (C, Ny, Nx) [counts^-2]: inverse variances, 0 = ignore this pixel
+    own, others (C, Ny, Nx) [counts]: models of the chosen sources and of all others
+    fraction (C, Ny, Nx) [1]: part of each pixel's light that the models give to the chosen sources
+    own_variance, others_variance (C, Ny, Nx) [counts^2]: of `own` and `others`
+    added_variance (C, Ny, Nx) [counts^2]: what the models' errors add to the noise of `data`
+    fraction_variance (C, Ny, Nx) [1]: of `fraction`
+    """
+
+    data: np.ndarray
+    weights: np.ndarray
+    own: np.ndarray
+    others: np.ndarray
+    fraction: np.ndarray
+    own_variance: np.ndarray
+    others_variance: np.ndarray
+    added_variance: np.ndarray
+    fraction_variance: np.ndarray
+
+    def image(self, what) -> np.ndarray:
+        """One of KINDS (C, Ny, Nx) [counts]; NaN where it needs data that have no weight.
+
+        Raises ValueError for another kind.
+        """
+        check_kind(what)
+        data = np.where(self.weights > 0, self.data, np.nan)
+        if what == "data":
+            return data - self.others
+        if what == "model":
+            return self.own.copy()
+        if what == "neighbours":
+            return self.others.copy()
+        if what == "residual":
+            return data - self.own - self.others
+        return data * self.fraction
+
+    def variance(self, what) -> np.ndarray:
+        """Variance (C, Ny, Nx) [counts^2] of `image`; NaN where that is, infinite nowhere."""
+        check_kind(what)
+        if what == "model":
+            return self.own_variance.copy()
+        if what == "neighbours":
+            return self.others_variance.copy()
+        good = self.weights > 0
+        noise = np.divide(1.0, self.weights, out=np.full(good.shape, np.nan), where=good)
+        if what == "residual":
+            return noise
+        if what == "data":
+            return noise + self.added_variance
+        return self.fraction**2 * noise + self.fraction_variance * self.data**2
+
+    @property
+    def mask(self) -> np.ndarray:
+        """Pixels (C, Ny, Nx) bool without weight: True = ignore."""
+        return ~(self.weights > 0)
+
+    def padded(self, origin, shape) -> Separation:
+        """The same on a window of `shape` (2,) [px] that begins `origin` (2,) [px] before this one,
+        both at least as large; there are no data and no models in what is added."""
+        n_y, n_x = self.data.shape[1:]
+        sides = [(before, size - before - n) for before, size, n in
+                 zip(origin, shape, (n_y, n_x), strict=True)]  # fmt: skip
+        if not any(map(any, sides)):
+            return self
+        return Separation(
+            **{
+                name: np.pad(image, [(0, 0), *sides], constant_values=OUTSIDE.get(name, np.nan))
+                for name, image in vars(self).items()
+            }
+        )
+
+    def part(self, window) -> Separation:
+        """The same on a part of it: slices (y, x)."""
+        return Separation(**{name: image[:, *window] for name, image in vars(self).items()})
+
+
+def separation_of(data, weights, images, chosen, deviations, faintest=None, *, joint=True):
+    """The Separation of a window from its sources' models.
+
+    data, weights: see Separation; images {source: (C, Ny, Nx) [counts]}: models of all sources
+        that have light there; chosen: the sources that are wanted, a set or sequence
+    deviations: own and others (K, C, Ny, Nx) [counts], changes of the two models whose sums of
+        squares over K are their variances; joint: sums of products are their covariances; else
+        those are unknown, and var(u) is added to the noise as if light went from u to t
+    faintest (C,) [counts]: models below this share no pixel; None = TRACE of the window's brightest
+    """
+    own, others, own_shared, shared = np.zeros((4, *data.shape))
+    for source, image in images.items():
+        light = np.maximum(image, 0)
+        shared += light
+        if source in chosen:
+            own += image
+            own_shared += light
+        else:
+            others += image
+    faintest = faintest_light(shared) if faintest is None else faintest
+    fraction = fraction_of(own_shared, shared, faintest)
+    own_change, others_change = deviations
+    others_variance = (others_change**2).sum(axis=0)
+    added = others_variance
+    if joint:
+        added = np.maximum(-others_variance - 2 * (own_change * others_change).sum(axis=0), 0)
+    # of t / (t + u): d(t / (t + u)) = (u dt - t du) / (t + u)^2
+    over = fraction_of(np.ones(shared.shape), shared, faintest)
+    change = ((1 - fraction) * own_change - fraction * others_change) * over
+    return Separation(
+        data=data,
+        weights=weights,
+        own=own,
+        others=others,
+        fraction=fraction,
+        own_variance=(own_change**2).sum(axis=0),
+        others_variance=others_variance,
+        added_variance=added,
+        fraction_variance=(change**2).sum(axis=0),
+    )
+
+
+def check_kind(what):
+    """Raise ValueError for what is not one of KINDS."""
+    if what not in KINDS:
+        raise ValueError(f"what is {what!r}, must be one of {', '.join(map(repr, KINDS))}")
+
+
+def fraction_of(part, total, faintest):
+    """part / total (..., C, Ny, Nx) where total (C, Ny, Nx) is over `faintest` (C,), else 0."""
+    lit = np.broadcast_to(total > faintest[:, None, None], part.shape)
+    return np.divide(part, total, out=np.zeros(part.shape), where=lit)
+
+
+def source_image(result, source, i_observation, window) -> np.ndarray | None:
+    """Model (C, ny, nx) [counts] of one source on a window (slices y, x) of an observation; None
+    where it has no light there."""
+    channels = result.channel_slices()[i_observation]
+    total = None
+    for i, component in enumerate(result.components):
+        if component.source == source:
+            image = component_image(result.rendered[i_observation], i, window)
+            if image is not None:
+                image = component.spectrum[channels, None, None] * image
+                total = image if total is None else total + image
+    return total
+
+
+def models_on(result, i_observation, window) -> dict[int, np.ndarray]:
+    """{source: model (C, ny, nx) [counts]} of all with light on a window of an observation."""
+    images = {
+        source: source_image(result, source, i_observation, window)
+        for source in range(len(result.sources))
+    }
+    return {source: image for source, image in images.items() if image is not None}
+
+
+def component_image(rendered, i, window):
+    """Component i (C, ny, nx) [1] on a window (slices y, x); None where it has no light there."""
+    if not hasattr(rendered, "window"):
+        return np.asarray(rendered[i])[:, *window]
+    here, there = rendered.window(i), window
+    both = [(max(a.start, b.start), min(a.stop, b.stop)) for a, b in zip(here, there, strict=True)]
+    if any(low >= high for low, high in both):
+        return None
+    image = rendered.images[i]
+    out = np.zeros((image.shape[0], *(part.stop - part.start for part in window)), image.dtype)
+    to, of = (
+        tuple(slice(low - part.start, high - part.start) for (low, high), part in
+              zip(both, parts, strict=True))
+        for parts in (there, here)
+    )  # fmt: skip
+    out[:, *to] = image[:, *of]
+    return out
+
+
+def faintest_light(total) -> np.ndarray:
+    """Light (C,) [counts] below which a pixel is shared by none; total (C, My, Mx): of all models
+    on the whole image."""
+    return TRACE * total.max(axis=(1, 2), initial=0)

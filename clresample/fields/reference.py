@@ -1,0 +1,52 @@
+"""The model's pixels of a field, and whether its mosaics go together."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..files.names import check_columns, to_ascii
+from ..sky.grid import Grid
+from .images import file_name
+
+
+def reference_of(mosaics) -> Grid:
+    """The grid of the mosaic with the smallest pixels, of equal ones the first.
+
+    Raises ValueError for no mosaic, names or channels that are not unique or that tables cannot
+    hold, zero points that only some have, and grids of which some are flat.
+    """
+    if not mosaics:
+        raise ValueError("mosaics is empty, at least one is needed")
+    for what, names in (
+        ("name", [m.name for m in mosaics]),
+        ("file name", [file_name(m.name) for m in mosaics]),
+        ("channel", [c.name for m in mosaics for c in m.channels]),
+    ):
+        if len(set(names)) < len(names):
+            raise ValueError(f"{what}s of mosaics must be unique, not {', '.join(names)}")
+    _check_names(mosaics)
+    for what, have in (
+        ("zero points", [m.channels[0].zero_point is not None for m in mosaics]),
+        ("a WCS", [not m.grid.is_flat for m in mosaics]),
+    ):
+        if len(set(have)) > 1:
+            has, none = (mosaics[have.index(there)].name for there in (True, False))
+            raise ValueError(f"mosaic {has!r} has {what}, {none!r} has none: give all or none")
+    scales = [m.grid.pixel_scale_arcsec for m in mosaics]
+    return mosaics[int(np.argmin(scales))].grid
+
+
+def _check_names(mosaics):
+    """Raise ValueError for names of mosaics or channels that tables cannot hold."""
+    for what, name in [
+        *(("name", m.name) for m in mosaics),
+        *(("channel", c.name) for m in mosaics for c in m.channels),
+        *(("band", c.band) for m in mosaics for c in m.channels if c.band),
+    ]:
+        if to_ascii(name) != name or name != name.rstrip():
+            raise ValueError(
+                f"{what} {name!r} must be printable ASCII without a space at its end, for "
+                "columns of FITS tables: give another one"
+            )
+    check_columns(f"chi2_{m.name}" for m in mosaics)
+    check_columns(f"flux_err_{c.band or c.name}" for m in mosaics for c in m.channels)
