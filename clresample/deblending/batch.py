@@ -14,7 +14,8 @@ from ..device.discovery import DeviceError
 from ..device.tuning import Tuning
 from ..device.workers import ahead, deal, one_blas_thread
 from ..drawing.bar import Bar
-from ..sky.given.checks import float_type, instance
+from ..sky.given.checks import described, float_type, instance
+from ..sky.observation import as_observations
 from ..sky.sources import SourceWarning
 from .blend import INTERRUPTED, Blend, Failure
 from .components.second import asks_for_more, with_second
@@ -61,15 +62,15 @@ def deblend(
 
         min 1/2 sum_o |sqrt(w_o) (R_o sum_s A_s S_s - d_o)|^2 + 1/2 |z|^2,  A >= 0, S constrained
 
-    observations, sources, frame, shifts: see Blend; settings: see Settings
+    observations, sources, frame, shifts: see Blend; among observations may be astropy's NDData and
+        CCDData that have a PSF; settings: see Settings
     progress: called every few iterations with their number so far and the loss (1,)
     raises ValueError for what `check_observations`, `model_frame` and `Source` refuse, and when no
     source lies inside the frame. Warns (SourceWarning) of sources far from any light. Ctrl-C ends
     the fit with the best state so far. Warns (InputWarning) of what is wrong with the observations
     and the list of sources, as far as their light tells (inspection/): messages of the result.
     """
-    given = (_listed("observations", observations), _listed("sources", sources))
-    blend = Blend(*given, frame, shifts)
+    blend = Blend(as_observations(observations), _listed("sources", sources), frame, shifts)
     settings, dtype = _checked(settings, dtype)
     device = get_device(device)
     fit = Fit(blend, settings, device, dtype, pad=1)
@@ -266,7 +267,7 @@ def _listed(name, values):
     try:
         return tuple(values)
     except TypeError:
-        raise ValueError(f"{name} is {values!r:.80}, must be a sequence") from None
+        raise ValueError(f"{name} is {described(values)}, must be a sequence") from None
 
 
 def _failure(blend, error):

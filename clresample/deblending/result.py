@@ -10,7 +10,7 @@ import numpy as np
 from ..drawing.shown import ShownResult
 from ..sky.footprint import Footprint
 from ..sky.frame import Frame
-from ..sky.observation import Observation
+from ..sky.observation import Observation, observation_index
 from ..sky.sources import Source
 from .assessment.misfit import Misfit, misfit_of
 from .blend import CONVERGED
@@ -115,6 +115,10 @@ class Result(ShownResult):
         """What the model leaves in the data, source by source and channel by channel."""
         return misfit_of(self)
 
+    def index_of(self, observation) -> int:
+        """The number of an observation, given by its number or name; ValueError for others."""
+        return observation_index(self.observations, observation)
+
     def channel_slices(self) -> list[slice]:
         """For each observation, its part of a spectrum."""
         ends = np.cumsum([len(o.channels) for o in self.observations])
@@ -124,12 +128,16 @@ class Result(ShownResult):
         ]
 
     def source_model(self, i_source, i_observation=None) -> np.ndarray:
-        """One source (C, Ny, Nx) in the model frame, or (Co, My, Mx) as an observation sees it."""
+        """One source (C, Ny, Nx) in the model frame, or (Co, My, Mx) as an observation sees it.
+
+        i_observation: number or name of the observation; None = the model frame
+        """
         parts = [(i, c) for i, c in enumerate(self.components) if c.source == i_source]
         if i_observation is None:
             spectra = np.array([c.spectrum for _, c in parts]).reshape(-1, len(self.channels))
             origin, morphs = [c.origin for _, c in parts], [c.morphology for _, c in parts]
             return compose(self.frame.shape, origin, morphs, spectra)
+        i_observation = self.index_of(i_observation)
         channels = self.channel_slices()[i_observation]
         unit = self.rendered[i_observation]
         zero = np.zeros(self.observations[i_observation].data.shape)
@@ -154,7 +162,11 @@ class Result(ShownResult):
         return profile_of(self.source_model(i_source)[channel], self.frame.grid, position)
 
     def model(self, i_observation) -> np.ndarray:
-        """All sources and the sky (Co, My, Mx) [counts] as an observation sees them."""
+        """All sources and the sky (Co, My, Mx) [counts] as an observation sees them.
+
+        i_observation: its number or name
+        """
+        i_observation = self.index_of(i_observation)
         channels = self.channel_slices()[i_observation]
         n_channels = channels.stop - channels.start
         spectra = np.array([c.spectrum[channels] for c in self.components]).reshape(-1, n_channels)
@@ -163,7 +175,7 @@ class Result(ShownResult):
 
     def residual(self, i_observation) -> np.ndarray:
         """Data minus model (Co, My, Mx) [counts]; NaN where the data have no weight."""
-        o = self.observations[i_observation]
+        o = self.observations[self.index_of(i_observation)]
         return np.where(o.weights > 0, o.data - self.model(i_observation), np.nan)
 
     def sample(self, n, rng) -> list[tuple[Component, ...]]:

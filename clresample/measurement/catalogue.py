@@ -88,9 +88,9 @@ def catalogue(result, *, magnitudes=False, groups=None) -> QTable:
             NaN where the result has no Errors, and where the shape was not fitted, as stars'. They,
             and those of fluxes, are larger for misfitted sources, see `Errors`
         flux_*, flux_err_* per band, which is a channel's own name where the observation has no
-            `bands`; of several exposures the one flux that all of them give [uJy where
-            observations have zero points, else counts]: see
-            `fluxes`
+            `bands`; of several exposures the one flux that all of them give [the unit of the data
+            where all observations have the same, else uJy where they have zero points, else
+            counts]: see `fluxes`. NaN where no pixel of the band determines it
         mag_*, mag_err_* per band [mag, AB]: where the flux is positive
         colour_A_B, colour_err_A_B [mag]: mag_A - mag_B of bands A, B next to each other; the
             error from the covariance of the two fluxes, see `channel_covariances`, to first order:
@@ -136,8 +136,9 @@ def columns_of(result, *, magnitudes=False, groups=None) -> Columns:
     for band, i in result.bands.items():
         table.put(f"flux_{band}", flux[:, i] * scale[i], unit[i])
         table.put(f"flux_err_{band}", error[:, i] * scale[i], unit[i])
-        if magnitudes and unit[i] == u.uJy:
-            _add_magnitudes(table, band, flux[:, i] * scale[i], error[:, i] * scale[i])
+        if magnitudes and unit[i] != u.ct:
+            to_ujy = scale[i] * unit[i].to(u.uJy)
+            _add_magnitudes(table, band, flux[:, i] * to_ujy, error[:, i] * to_ujy)
     if magnitudes:
         _add_colours(table, result, flux)
     if groups is not None:

@@ -11,9 +11,10 @@ from tqdm import tqdm
 from ...device.tuning import Tuning
 from ...sky.extent import box_slices, shared_part
 from ...sky.given.checks import float_type
-from ...sky.grid import Grid
+from ...sky.given.observed import as_psf
+from ...sky.grid import Grid, as_grid
 from ...sky.psf import PSF
-from ..grid_operator import GridOperator, check_parts
+from ..grid_operator import GridOperator
 from ..linop import HostOp, LinOp
 from ..plan import Precision, is_identity, make_plan
 from ..resampler import Resampler
@@ -59,7 +60,8 @@ class TiledResampler(HostOp, GridOperator):
         memory=None,
         progress=True,
     ):
-        check_parts((psf_in, psf_out), (grid_in, grid_out))
+        grid_in, grid_out = as_grid("grid_in", grid_in), as_grid("grid_out", grid_out)
+        psf_in, psf_out = as_psf("psf_in", psf_in), as_psf("psf_out", psf_out)
         dtype = float_type(dtype)
         n_bands = max(psf_in.n_bands, psf_out.n_bands)
         shapes = (n_bands, *grid_in.shape), (n_bands, *grid_out.shape)
