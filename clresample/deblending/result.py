@@ -15,6 +15,7 @@ from ..sky.sources import Source
 from .assessment.misfit import Misfit, misfit_of
 from .blend import CONVERGED
 from .posterior.errors import Draws, Errors
+from .posterior.sampling import drawn_components, drawn_fluxes
 from .rendered import Rendered, weighted_sum
 from .solver.scene_model import compose
 
@@ -63,7 +64,7 @@ class Result(ShownResult):
     errors: of fits with a LearnedPrior, the Errors of fluxes, shapes and morphologies, marginal
         over the morphologies, which `fluxes` and `catalogue` report. None where there are none: of
         other priors, and where `messages` says so; then these report the covariance above
-    draws: what `sample` draws from; not stored in files
+    draws: what `sample` and `sample_fluxes` draw from
     shifts (n_observations, 2) [model px]: fitted offsets of the observations' pixels
     losses (n_iterations + 1,): half chi2 (plus priors) before each iteration and at the end
     status: "converged", "misfit" (its steps ended, but the model does not describe the data, see
@@ -178,10 +179,11 @@ class Result(ShownResult):
         o = self.observations[self.index_of(i_observation)]
         return np.where(o.weights > 0, o.data - self.model(i_observation), np.nan)
 
-    def sample(self, n, rng) -> list[tuple[Component, ...]]:
+    def sample(self, n, rng=None) -> list[tuple[Component, ...]]:
         """Draw n sets of components from the posterior about the solution, as `errors` has it.
 
-        rng: NumPy Generator. Morphologies and spectra below 0 become 0, so that faint sources are
+        rng: NumPy Generator, or a seed: equal seeds give equal draws, also of a result read from a
+        file. Morphologies and spectra below 0 become 0, so that faint sources are
         brighter in the mean, and where a morphology is at that bound it stays there; morphologies
         keep their scale, their maximum is no longer 1. Misfitted sources scatter more, as Errors
         has it. Fluxes scatter about the components' own, not about those of `fluxes` and the
@@ -190,25 +192,22 @@ class Result(ShownResult):
         less than `errors` has it. The bound at 0 takes more of it from misfitted sources that stand
         where light was missed, up to 0.4: their changes are as large as their morphologies.
 
-        Raises ValueError for results without draws: of other priors, without errors, or read from
-        a file.
+        Raises ValueError for results without draws: of other priors, or without errors.
         """
-        if self.draws is None:
-            raise ValueError("this result has no posterior to draw from, see Result.draws")
-        return [self._drawn(rng) for _ in range(n)]
+        rng = np.random.default_rng(rng)
+        return [drawn_components(self, rng) for _ in range(n)]
 
-    def _drawn(self, rng):
-        morphs, spectra = self.draws.draw(rng)
-        return tuple(
-            replace(
-                c,
-                morphology=np.where(
-                    c.morphology > 0, np.maximum(c.morphology + m, 0), c.morphology
-                ),
-                spectrum=np.maximum(c.spectrum + a, 0),
-            )
-            for c, m, a in zip(self.components, morphs, spectra, strict=True)
-        )
+    def sample_fluxes(self, n, rng=None) -> np.ndarray:
+        """Draw the sources' fluxes (n, S, C) [counts] from the posterior, n times.
+
+        Those of `sample`, with what `fluxes` adds for light beyond the boxes and takes off for the
+        bound at 0, so that they scatter about the catalogue's; NaN where nothing was measured.
+
+        rng: NumPy Generator, or a seed
+
+        Raises ValueError as `sample` does.
+        """
+        return drawn_fluxes(self, n, np.random.default_rng(rng))
 
 
 def noted(result, **given) -> Result:

@@ -21,14 +21,16 @@ from ..sky.observation import Observation
 from ..sky.psf import PSF
 from ..sky.sources import Extended, Point, Source
 from .arrays import array_of, image_hdu
+from .draws import draw_hdus, read_draws
 from .fits import add_provenance, celestial_header, open_fits, write_hdus
 from .names import check_channels, check_columns, text_card, to_ascii
 from .whole_file import FileError, check_output, whole_file
 
-FORMAT = 2  # of the files; raised when an older reader would misread them
+FORMAT = 3  # of the files; raised when an older reader would misread them
+WIDENED = 2  # the first format whose errors are widened for misfitted sources
 KINDS = {kind.__name__: kind for kind in (Source, Point, Extended)}
 # of an observation, as JSON
-KEPT = ("name", "channels", "bands", "zero_points", "saturation", "n_bad", "messages")
+KEPT = ("name", "channels", "bands", "zero_points", "saturation", "unit", "n_bad", "messages")
 BOX = ("source", "y", "x", "n_y", "n_x")
 # HDUs of Errors
 ERRORS = {"FLUXCOV": "flux", "COLOURCOV": "colour", "MOMENTCOV": "moments", "BEYOND": "beyond"}
@@ -44,8 +46,9 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
     HDUs that `read_result` reads: ABOUT (keys and JSON: sources, names, status, messages, ...),
     COMPONENTS (boxes), SPECTRA (n, C), MORPHOLOGIES (one after the other), SKY, COVARIANCE, SHIFTS,
     LOSSES, where the result has errors FLUXCOV, COLOURCOV, MOMENTCOV, BEYOND, RELEASED, MOVED,
-    RESIDUALMAX, OUTER, MORPHOLOGYERR (one after the other), MODELPSF, and per observation from 1
-    on: DATA, WEIGHTS, PSF, RENDERED. For other programs: CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all
+    RESIDUALMAX, OUTER, MORPHOLOGYERR (one after the other), those of the draws (see draws.py),
+    MODELPSF, and per observation from 1 on: DATA, WEIGHTS, PSF, RENDERED. For other programs:
+    CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all
     sources in the model frame, and per observation MODEL and RESIDUAL, 0 where data have no weight.
     All images have their WCS; a flat sky is put at RA = Dec = 0. For NaN and infinity see
     arrays.py.
@@ -82,6 +85,7 @@ def _fit_hdus(result):
         image_hdu("MORPHOLOGIES", np.concatenate(flat) if flat else np.zeros(0)),
         *(image_hdu(name.upper(), getattr(result, name)) for name in ARRAYS),
         *_error_hdus(result.errors),
+        *draw_hdus(result.draws),
         image_hdu("MODELPSF", result.frame.psf.images),
         image_hdu("SCENE", scene, cards),
         *tables,
@@ -120,9 +124,9 @@ def _observation_hdus(result, i):
 
 
 def read_result(path) -> Result:
-    """The blend that `write_result` wrote to a file, equal to the last bit but for Result.draws and
-    for PSFs that vary (Observation.psf_field), which files do not hold: psf is that in the middle,
-    `rendered` what each source's own made of it.
+    """The blend that `write_result` wrote to a file, equal to the last bit, draws with a seed among
+    it, but for PSFs that vary (Observation.psf_field), which files do not hold: psf is that in the
+    middle, `rendered` what each source's own made of it.
 
     Raises FileError for a file that does not exist, is not FITS, is damaged, or holds no blend, and
     for errors of format 1: they were not widened for misfitted sources, and may lack what the bound
@@ -151,6 +155,7 @@ def read_result(path) -> Result:
             messages=tuple(about["messages"]),
             seconds=about["seconds"],
             errors=_errors(path, hdus, about["format"]),
+            draws=read_draws(hdus, [(row["n_y"], row["n_x"]) for row in hdus["COMPONENTS"].data]),
             **{key: array_of(hdus[key.upper()]) for key in ARRAYS},
         )
 
@@ -188,6 +193,7 @@ def _about(result):
         "frame": _placing(result.frame.grid, result.frame.psf),
         "observations": [
             {key: getattr(o, key) for key in KEPT}
+            | {"unit": o.unit and o.unit.to_string()}
             | {"noise": o.noise and [n.autocorrelation.tolist() for n in o.noise]}
             | _placing(o.grid, o.psf)
             for o in result.observations
@@ -276,8 +282,10 @@ def _source(path, *, kind, **given):
 def _errors(path, hdus, written):
     if "MORPHOLOGYERR" not in hdus:
         return None
-    if written < FORMAT:
-        raise FileError(f"{path}: has errors of format {written}, not {FORMAT}; fit it again")
+    if written < WIDENED:
+        raise FileError(
+            f"{path}: has errors of format {written}, {WIDENED} is the oldest read: fit it again"
+        )
     flat, maps = array_of(hdus["MORPHOLOGYERR"]), []
     for row in hdus["COMPONENTS"].data:
         shape = int(row["n_y"]), int(row["n_x"])

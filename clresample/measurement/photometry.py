@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from astropy import units as u
 
-from .quality import fitted_sources
+from ..deblending.posterior.sampling import undetermined
 
 # of a channel's brightest model pixel: where all models are fainter, a pixel is shared by none.
 # There the rounding of float32 renderings (1e-6), not light, would decide whose it is
@@ -36,16 +36,13 @@ def fluxes(result):
     flux = sums @ spectra_of(result)
     if result.errors is not None:
         flux = flux + result.errors.released
-    flux[~fitted_sources(result)] = np.nan
     known = np.isfinite(np.diagonal(result.covariance, axis1=1, axis2=2))  # (C, n)
     both = known[:, :, None] & known[:, None, :]
     if result.errors is None:
         summed = sums @ np.where(both, result.covariance, 0.0) @ sums.T
     else:
         summed = result.errors.flux.copy()
-    # a component that is zero everywhere adds no flux, and no variance even where it is unknown
-    lost = (~known) @ (sums != 0).T | ~fitted_sources(result)
-    i_channel, i_source = np.nonzero(lost)
+    i_source, i_channel = np.nonzero(undetermined(result))
     summed[i_channel, i_source] = summed[i_channel, :, i_source] = 0.0
     summed[i_channel, i_source, i_source] = np.nan
     flux[i_source, i_channel] = np.nan

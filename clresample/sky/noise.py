@@ -10,6 +10,7 @@ import numpy as np
 
 from .given.checks import mask_of, numbers, split_mask, without_unit
 
+
 class NoiseWarning(UserWarning):
     """An image without weights, whose noise was estimated from its background."""
 

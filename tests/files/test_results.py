@@ -291,8 +291,8 @@ def test_damaged_and_newer_files_are_refused(tmp_path, monkeypatch):
         with pytest.raises(FileError) as error:
             read_result(path)
         assert "\n" not in str(error.value) and str(path) in str(error.value)
-    monkeypatch.setattr(store, "FORMAT", 3)
+    monkeypatch.setattr(store, "FORMAT", 4)
     write_result(path, result, overwrite=True)
     monkeypatch.undo()
-    with pytest.raises(FileError, match="format 3, this version reads 2"):
+    with pytest.raises(FileError, match="format 4, this version reads 3"):
         read_result(path)
