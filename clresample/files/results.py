@@ -48,10 +48,9 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
     LOSSES, where the result has errors FLUXCOV, COLOURCOV, MOMENTCOV, BEYOND, RELEASED, MOVED,
     RESIDUALMAX, OUTER, MORPHOLOGYERR (one after the other), those of the draws (see draws.py),
     MODELPSF, and per observation from 1 on: DATA, WEIGHTS, PSF, RENDERED. For other programs:
-    CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all
-    sources in the model frame, and per observation MODEL and RESIDUAL, 0 where data have no weight.
-    All images have their WCS; a flat sky is put at RA = Dec = 0. For NaN and infinity see
-    arrays.py.
+    CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all sources in the model frame, and per observation MODEL
+    and RESIDUAL, 0 where data have no weight. All images have their WCS; a flat sky is put at
+    RA = Dec = 0. For NaN and infinity see arrays.py.
 
     result: of `deblend`; overwrite: replace a file that exists
     device: name of the OpenCL device; inputs: {what: file}; both for the header
@@ -284,7 +283,7 @@ def _errors(path, hdus, written):
         return None
     if written < WIDENED:
         raise FileError(
-            f"{path}: has errors of format {written}, {WIDENED} is the oldest read: fit it again"
+            f"{path}: has errors of format {written}, must be {WIDENED} or more: fit it again"
         )
     flat, maps = array_of(hdus["MORPHOLOGYERR"]), []
     for row in hdus["COMPONENTS"].data:

@@ -24,8 +24,8 @@ def fluxes(result):
     see `Errors.released`; it may be below 0 by chance.
 
     result: a fitted blend
-    returns flux (S, C) [counts] and covariance (C, S, S) [counts^2]: flux and variance are NaN where
-        a channel does not determine a flux, as one without weights, and for sources without
+    returns flux (S, C) [counts] and covariance (C, S, S) [counts^2]: flux and variance are NaN
+        where a channel does not determine a flux, as one without weights, and for sources without
         components; their covariances with others are 0
     """
     sums = np.zeros((len(result.sources), len(result.components)))

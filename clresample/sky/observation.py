@@ -104,13 +104,13 @@ class Observation(ReadOnly, ShownObservation, DerivedQuantities):
                 f"data is of type {type(data).__name__}: give Observation.from_nddata(image, psf)"
             )
         data, unit = take_unit(data, unit)
+        flux = flux_unit(unit)
         data, mask, grid = images_of(data, grid, mask)
         psfs = psfs_of(psf, data.shape)
         bad = ~np.isfinite(data)
         channels = channels_of(channels, name, len(data))
         given = weights, variance
         weights, n_bad, messages = weights_from(data, bad, given, mask, channels, unit)
-        flux = flux_unit(unit)
         zero_points = per_channel("zero_points", zero_points, len(data))
         data = np.where(bad, 0.0, data)
         noise, found = noise_of_channels(noise, data, weights, channels)

@@ -19,9 +19,9 @@ class SourceWarning(UserWarning):
 class Source:
     """A source at one position, given on the sky, in an observation's or in the model's pixels.
 
-    sky_deg (2,) [deg]: right ascension and declination (for a flat sky: y, x [arcsec]), or longitude
-        and latitude in the WCS's own frame. Or a SkyCoord of one place, in any frame: it is kept in
-        degrees, with `sky_frame`
+    sky_deg (2,) [deg]: right ascension and declination (for a flat sky: y, x [arcsec]), or
+        longitude and latitude in the WCS's own frame. Or a SkyCoord of one place, in any frame: it
+        is kept in degrees, with `sky_frame`
     position_px (2,) [px]: (y, x), the centre of the first pixel at (0, 0); exactly one of the two
         is given
     observation: the name of the Observation whose pixels position_px counts (its label, where it
@@ -73,10 +73,11 @@ class Source:
         shifts (n_observations, 2) [model px]: of their pixels, None = none
         ValueError: `observation` names none of them, or more than one
         """
-        if self.sky_frame is not None:
-            return grid.pixel(SkyCoord(*self.sky_deg, unit="deg", frame=self.sky_frame))
         if self.sky_deg is not None:
-            return grid.pixel(*self.sky_deg)
+            a, b = self.sky_deg
+            if self.sky_frame is None:
+                return grid.pixel(a, b)
+            return grid.pixel(SkyCoord(a, b, unit="deg", frame=self.sky_frame))
         if self.observation is None:
             return np.asarray(self.position_px, dtype=np.float64)
         i = observation_index(observations, self.observation)

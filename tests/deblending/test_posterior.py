@@ -266,8 +266,6 @@ def test_errors_of_an_older_format_are_refused(fitted, tmp_path, monkeypatch):
     write_result(tmp_path / "blend.fits", fitted)
     write_result(tmp_path / "bare.fits", replace(fitted, errors=None))
     monkeypatch.undo()
-    with pytest.raises(
-        FileError, match=r"blend.fits: has errors of format 1, 2 is the oldest read: fit it again"
-    ):
+    with pytest.raises(FileError, match="errors of format 1, must be 2 or more: fit it"):
         read_result(tmp_path / "blend.fits")
     assert read_result(tmp_path / "bare.fits").errors is None
