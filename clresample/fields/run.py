@@ -6,6 +6,7 @@ import os
 import pickle
 import time
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -152,7 +153,9 @@ def _check_names(mosaics):
                 "columns of FITS tables: give another one"
             )
     check_columns(f"chi2_{m.name}" for m in mosaics)
-    check_columns(f"flux_err_{c.band or c.name}" for m in mosaics for c in m.channels)
+    bands = list(dict.fromkeys(c.band or c.name for m in mosaics for c in m.channels))
+    check_columns(f"group_flux_err_{band}" for band in bands)
+    check_columns(f"colour_err_{a}_{b}" for a, b in pairwise(bands))
 
 
 def _as_sent(mosaics):

@@ -113,8 +113,11 @@ def catalogue(result, *, magnitudes=False, groups=None) -> QTable:
     return table
 
 
-def columns_of(result, *, magnitudes=False, groups=None) -> Columns:
-    """The same as `catalogue`, before it is a table."""
+def columns_of(result, *, magnitudes=False, groups=None, bands=None) -> Columns:
+    """The same as `catalogue`, before it is a table.
+
+    bands: names in the order whose neighbours make colours; None = as in the result
+    """
     worst, misfit = channel_residuals(result), result.misfit
     flux, covariance = fluxes(result)
     error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).T)  # (S, C)
@@ -140,7 +143,7 @@ def columns_of(result, *, magnitudes=False, groups=None) -> Columns:
             to_ujy = scale[i] * unit[i].to(u.uJy)
             _add_magnitudes(table, band, flux[:, i] * to_ujy, error[:, i] * to_ujy)
     if magnitudes:
-        _add_colours(table, result, flux)
+        _add_colours(table, result, flux, bands or list(result.bands))
     if groups is not None:
         table.put("group_id", np.asarray(groups))
         add_groups(table, result, flux, covariance, groups)
@@ -255,20 +258,18 @@ def _add_magnitudes(table, channel, flux_ujy, error_ujy):
     table.put(f"mag_err_{channel}", 2.5 / np.log(10) * error_ujy / flux_ujy, u.mag)
 
 
-def _add_colours(table, result, flux):
+def _add_colours(table, result, flux, bands):
     """Columns of colours of neighbouring bands that have magnitudes; flux (S, C)."""
     covariance = channel_covariances(result)
-    for (a, i), (b, j) in pairwise(result.bands.items()):
+    for a, b in pairwise(bands):
         if f"mag_{a}" not in table or f"mag_{b}" not in table:
             continue
-        one, other = (np.where(flux[:, k] > 0, flux[:, k], np.nan) for k in (i, j))
+        pair = [result.bands[a], result.bands[b]]
+        one, other = (np.where(flux[:, k] > 0, flux[:, k], np.nan) for k in pair)
         slopes = np.stack([1 / one, -1 / other], axis=1)  # of ln(flux ratio)
-        both = covariance[:, [[i], [j]], [i, j]]
-        with np.errstate(invalid="ignore"):  # infinite variances
-            error = np.sqrt(np.einsum("sa,sab,sb->s", slopes, both, slopes))
-        known = np.isfinite(both).all((1, 2))
+        both = covariance[:, pair][:, :, pair]
+        error = np.sqrt(np.einsum("sa,sab,sb->s", slopes, both, slopes))
         table.put(f"colour_{a}_{b}", table[f"mag_{a}"] - table[f"mag_{b}"], u.mag)
-        error = np.where(known, error, np.where(np.isfinite(slopes).all(1), np.inf, np.nan))
         table.put(f"colour_err_{a}_{b}", 2.5 / np.log(10) * error, u.mag)
 
 
