@@ -45,7 +45,7 @@ def test_every_page_is_in_the_contents():
 def test_every_public_name_is_in_the_reference():
     reference = (DOCS / "reference.md").read_text()
     found = set(
-        re.findall(r"^\.\. auto(?:class|function):: ([A-Za-z_]+)$", reference, re.MULTILINE)
+        re.findall(r"^\.\. auto(?:class|data|function):: ([A-Za-z_]+)$", reference, re.MULTILINE)
     )
     assert found == set(clresample.__all__)
 

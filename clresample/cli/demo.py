@@ -19,7 +19,8 @@ from ..deblending.settings import Settings
 from ..device.device import get_device
 from ..device.discovery import DeviceError
 from ..files.plot_deblended import plot_deblended
-from ..files.results import write_catalogue, write_result
+from ..files.results import write_result
+from ..files.tables import write_catalogue
 from ..measurement.catalogue import catalogue
 from ..simulation.scenes import simulate_scene
 from ..simulation.sdr import sdr

@@ -1,4 +1,4 @@
-"""Fitted blends to FITS files and back, bit by bit; catalogues to ECSV."""
+"""Fitted blends to FITS files and back, bit by bit."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
-from astropy.table import QTable, Table
+from astropy.table import Table
 from astropy.wcs import WCSHDO_EFMT, WCSHDO_P17, WCSHDO_all
 from astropy.wcs.wcs import WCSHDO_SIP
 
 from ..deblending.posterior.errors import Errors
 from ..deblending.result import Component, Result
-from ..measurement.catalogue import MEANINGS, catalogue
+from ..measurement.catalogue import catalogue
 from ..sky.frame import Frame
 from ..sky.grid import Grid
 from ..sky.observation import Observation
@@ -23,8 +23,9 @@ from ..sky.sources import Extended, Point, Source
 from .arrays import array_of, image_hdu
 from .draws import draw_hdus, read_draws
 from .fits import add_provenance, celestial_header, open_fits, write_hdus
-from .names import check_channels, check_columns, text_card, to_ascii
-from .whole_file import FileError, check_output, whole_file
+from .names import check_channels, text_card
+from .tables import flag_table_hdu, table_hdu
+from .whole_file import FileError, check_output
 
 FORMAT = 3  # of the files; raised when an older reader would misread them
 WIDENED = 2  # the first format whose errors are widened for misfitted sources
@@ -63,7 +64,8 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
     primary = fits.PrimaryHDU()
     primary.header["CLSTATUS"] = text_card(" ".join(result.status.split()), "how the fit ended")
     add_provenance(primary.header, result.rendered[0].dtype, device, inputs or {}, None)
-    hdus = [primary, _table(catalogue(result), "CATALOGUE"), _flag_table(), *_fit_hdus(result)]
+    hdus = [primary, table_hdu(catalogue(result), "CATALOGUE"), flag_table_hdu()]
+    hdus += _fit_hdus(result)
     for i in range(len(result.observations)):
         hdus += _observation_hdus(result, i)
     write_hdus(path, hdus)
@@ -159,24 +161,6 @@ def read_result(path) -> Result:
         )
 
 
-def write_catalogue(path, table, *, overwrite=False):
-    """Write a catalogue, whole or not at all: as ECSV or, by the file's name, as FITS.
-
-    path: ends in .ecsv, .fits or .fits.gz; table: of `catalogue`
-    Raises FileError when the file exists or cannot be written, ValueError for other endings
-    and columns' names too long for FITS.
-    """
-    path = Path(path)
-    if not path.name.endswith((".ecsv", ".fits", ".fits.gz")):
-        raise ValueError(f"path is {path.name}, a catalogue ends in .ecsv, .fits or .fits.gz")
-    check_output(path, overwrite=overwrite)
-    if not path.name.endswith(".ecsv"):
-        hdus = [fits.PrimaryHDU(), _table(table, "CATALOGUE"), _flag_table()]
-        return write_hdus(path, hdus)
-    with whole_file(path) as part:
-        table.write(part, format="ascii.ecsv", overwrite=True)
-
-
 def _about(result):
     return {
         "format": FORMAT,
@@ -210,21 +194,6 @@ def _about_table(about):
     # JSON writes float64 with the digits that give it back, and anything else than ASCII escaped
     values = [json.dumps(value, default=lambda array: array.tolist()) for value in about.values()]
     return fits.BinTableHDU(Table([list(about), values], names=("key", "value")), name="ABOUT")
-
-
-def _flag_table():
-    rows = [(flag.name, flag.value, meaning) for flag, meaning in MEANINGS.items()]
-    return fits.BinTableHDU(Table(rows=rows, names=("flag", "value", "meaning")), name="FLAGS")
-
-
-def _table(table, name):
-    """A table as an HDU; other characters than ASCII, which FITS does not have, become "?"."""
-    check_columns(table.colnames)
-    table = QTable(table, names=[to_ascii(column) for column in table.colnames])
-    table["name"] = [to_ascii(value) for value in table["name"]]
-    hdu = fits.table_to_hdu(table)
-    hdu.name = name
-    return hdu
 
 
 def _placed(grid, number):

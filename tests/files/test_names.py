@@ -7,7 +7,7 @@ from astropy.io import fits
 from helpers.blends import SCALE, blend, observe, round_component
 
 from clresample.files.names import check_catalogue_names, text_card
-from clresample.files.results import write_catalogue
+from clresample.files.tables import write_catalogue
 from clresample.measurement.catalogue import catalogue
 from clresample.sky.grid import Grid
 
