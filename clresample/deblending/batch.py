@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import logging
 import warnings
 from collections import defaultdict
 
@@ -25,6 +26,7 @@ from .iterate import iterate
 from .result import Result
 from .settings import Settings
 
+LOG = logging.getLogger("clresample")
 # [px] Blends of several sizes have their frames and observations padded to multiples of this, so
 # that they share batches: smaller ones make more batches, larger ones more padding to compute.
 PAD_PX = 16
@@ -83,7 +85,9 @@ def deblend(
     iterate([fit], settings, device, dtype, progress, takes_over=asks_for_more)
     if fit.status != INTERRUPTED:
         (fit,) = with_second([fit], settings, device, dtype, progress)
-    return fit.result(*finish([fit]))
+    result = fit.result(*finish([fit]))
+    LOG.info("%r in %.2f s", result, sum(result.seconds.values()))
+    return result
 
 
 def deblend_many(

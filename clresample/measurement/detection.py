@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..deblending.spectra import MODEL_ERROR
+from ..drawing.shown import ShownDetection
 from ..sky.frame import Frame, model_frame
 from ..sky.observation import Observation, as_observations
 from ..sky.sources import Extended
@@ -47,8 +48,8 @@ MIN_AREA_BESIDE = 0.125
 ALL = "all"  # the name of the combined image
 
 
-@dataclass(frozen=True, eq=False)
-class Detection:
+@dataclass(frozen=True, eq=False, repr=False)
+class Detection(ShownDetection):
     """Sources that `detect` or `detect_more` found, S of them, brightest peak first.
 
     sources (S,): Extended, at the pixel of their peak

@@ -79,6 +79,9 @@ class GridOperator(LinOp):
         op.shift = shift
         return op
 
+    def _about(self):
+        return (self.geometry,) + (("shifted",) if self._shift.any() else ())
+
     def _prepare(self, mapping, psf_in, psf_out, dtype, device):
         """Everything but the shift, from a mapping; calls `_begin` first."""
         raise NotImplementedError

@@ -82,6 +82,9 @@ class TiledResampler(HostOp, GridOperator):
         self._operators = TileOperators(psf_in, psf_out, self.dtype, self.device)
         self.shift, self.progress = shift, progress
 
+    def _about(self):
+        return (*super()._about(), f"{self.n_tiles} tiles")
+
     def _use_shift(self):
         """Nothing to do: each tile's operator is shifted when its turn comes."""
 
