@@ -102,7 +102,7 @@ def test_messages_name_the_way_and_dump_no_array():
     for given, said in (
         ((NOISE, ROUND, np.eye(3)), r"grid is of type ndarray and shape .3, 3., must be Grid: give "
          r"Grid.from_wcs\(wcs, shape\)"),
-        ((NOISE, "psf.fits", GRID), r"psf is 'psf.fits' \(str\), must be PSF or PSFField: give PSF"),
+        ((NOISE, "psf.fits", GRID), r"psf is 'psf.fits' \(str\), must be PSF or PSFField: give"),
         ((NDData(NOISE), ROUND, GRID), r"data is of type NDData: give Observation.from_nddata\("),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=said) as error:
