@@ -28,7 +28,7 @@ class FieldOptions:
     threshold [sigma]: least signal to noise of a source; passes: 1, or 2 to search each blend's
         residuals too
     positions (S, 2) [deg]: right ascension and declination (y, x [arcsec] on a flat sky) of sources
-        that are known; None = search for them
+        that are known, or a SkyCoord of S places; None = search for them
     part (i, n): run the i-th of n parts of the field (from 1) alone, for job arrays: its catalogue
         has the sources whose centres lie in it; None = the whole
     border_px [model px]: around the part, which is searched and fitted too. Blends that reach from

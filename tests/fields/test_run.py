@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import QTable
 from helpers.fields import mosaics_of
@@ -228,8 +229,7 @@ def test_pixels_that_cannot_be_read_cost_their_blends_alone_with_a_reason(sky, t
 def test_known_sources_are_taken_where_they_are(done, sky, tmp_path):
     folder, _ = done
     rows = table(folder)
-    places = np.stack([rows["ra"].value, rows["dec"].value], axis=1)
-    options = FieldOptions(positions=places, passes=1)
+    options = FieldOptions(positions=SkyCoord(rows["ra"], rows["dec"]), passes=1)
     run_field(mosaics_of(sky), tmp_path, options=options)
     known = table(tmp_path)
     np.testing.assert_array_equal(known["id"], rows["id"])
