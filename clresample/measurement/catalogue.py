@@ -49,7 +49,7 @@ class Flag(IntFlag):
         return super()._missing_(int(value))  # tables hold NumPy's integers, enum takes Python's
 
 
-#: Meaning of each `Flag` in words.
+# Meaning of each Flag in words.
 MEANINGS = {
     Flag.EDGE: "at the frame's edge or beside unobserved sky over 1 % of a morphology's peak, or "
     "over 3 % of the flux outside, as the model goes on there",

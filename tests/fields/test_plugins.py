@@ -1,12 +1,15 @@
 """Readers and PSF formats that other packages add by entry points."""
 
+import re
 import sys
 
 import numpy as np
 import pytest
 from astropy.io import fits
+from helpers.checkout import ROOT
 
-from clresample import read_field, read_scene
+from clresample import PSF, read_field, read_scene
+from clresample.fields.box import Box
 from clresample.fields.psfs.read import FORMATS, read_psf_field
 from clresample.fields.readers.formats import READERS, read_survey
 from clresample.files.scene_keys import SceneError
@@ -106,6 +109,26 @@ def test_faults_of_others_are_told_in_one_line(package, tmp_path):
     (other / "entry_points.txt").write_text("[clresample.readers]\ndots = json:loads\n")
     with pytest.raises(ValueError, match="added by fake-survey 1.2 and other 1: uninstall one"):
         read_survey("dots", "x")
+
+
+def test_the_reader_of_the_documentation_reads(tmp_path):
+    text = (ROOT / "docs" / "howto" / "formats.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    exec(code, names := {})
+    wcs = Grid.flat((9, 8), 0.2).to_wcs(ra_deg=10, dec_deg=2).to_header()
+    planes = [
+        fits.ImageHDU(np.full((9, 8), v, "f4"), wcs, name=n) for v, n in ((2, "SCI"), (5, "WHT"))
+    ]
+    planes[0].header["FILTER"], planes[0].header["ZP"] = "g", 27.5
+    fits.HDUList([fits.PrimaryHDU(), *planes]).writeto(tmp_path / "one.fits")
+    inputs, psf = {}, PSF.gaussian(1.2, n_pixels=11)
+    mosaic = names["read_my_survey"](
+        [tmp_path / "one.fits"], inputs=inputs, notes=[], psf=lambda grid: psf
+    )
+    (channel,) = mosaic.channels
+    box = Box(1, 1, 4, 5)
+    assert (channel.read(box) == 2).all() and (channel.weights(box) == 5).all()
+    assert (channel.name, channel.zero_point) == ("g", 27.5) and len(inputs) == 1
 
 
 def test_without_such_packages_our_own_remain():
