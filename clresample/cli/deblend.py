@@ -224,7 +224,7 @@ def _write(arguments, result, inputs, device, paths):
     from ..files.whole_file import whole_files
     from ..measurement.catalogue import catalogue
 
-    table = catalogue(result, magnitudes=result.observations[0].zero_points is not None)
+    table = catalogue(result)
     with whole_files(paths) as parts:
         for part in parts[:2]:
             write_catalogue(part, table)

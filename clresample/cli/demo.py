@@ -68,7 +68,7 @@ def run(folder="demo", *, device=None):
     result = fitted["joint"][0]
     names = "deblended.png", "catalogue.fits", "catalogue.ecsv", "result.fits"
     files = [folder / name for name in names]
-    table = catalogue(result, magnitudes=True)
+    table = catalogue(result)
     plot_deblended(files[0], result, title="Six galaxies, two telescopes, one model")
     for path in files[1:3]:
         write_catalogue(path, table, overwrite=True)

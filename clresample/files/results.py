@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import fields
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from ..sky.sources import Extended, Point, Source
 from .arrays import array_of, image_hdu
 from .draws import draw_hdus, read_draws
 from .fits import add_provenance, celestial_header, open_fits, write_hdus
-from .names import check_channels, text_card
+from .names import check_channels, check_columns, text_card
 from .tables import flag_table_hdu, table_hdu
 from .whole_file import FileError, check_output
 
@@ -64,11 +65,20 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
     primary = fits.PrimaryHDU()
     primary.header["CLSTATUS"] = text_card(" ".join(result.status.split()), "how the fit ended")
     add_provenance(primary.header, result.rendered[0].dtype, device, inputs or {}, None)
-    hdus = [primary, table_hdu(catalogue(result), "CATALOGUE"), flag_table_hdu()]
+    hdus = [primary, table_hdu(_catalogue(result), "CATALOGUE"), flag_table_hdu()]
     hdus += _fit_hdus(result)
     for i in range(len(result.observations)):
         hdus += _observation_hdus(result, i)
     write_hdus(path, hdus)
+
+
+def _catalogue(result):
+    """The catalogue, without magnitudes where bands have names too long for those of colours."""
+    try:
+        check_columns(f"colour_err_{a}_{b}" for a, b in pairwise(result.bands))
+    except ValueError:
+        return catalogue(result, magnitudes=False)
+    return catalogue(result)
 
 
 def _fit_hdus(result):

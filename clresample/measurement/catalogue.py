@@ -64,10 +64,11 @@ MEANINGS = {
 }
 
 
-def catalogue(result, *, magnitudes=False, groups=None) -> QTable:
+def catalogue(result, *, magnitudes=True, groups=None) -> QTable:
     """The catalogue of a fitted blend: one row per source, columns with units.
 
-    result: a fitted blend; magnitudes: add the columns of magnitudes and colours
+    result: a fitted blend; magnitudes: add the columns of magnitudes and colours of bands that have
+        zero points
     groups (S,): a number for each group of sources, as `Detection.groups`: adds their columns
     returns QTable (S rows, in the order of `result.sources`); what was not measured is NaN:
         name: the source's own, or its number
@@ -114,7 +115,7 @@ def catalogue(result, *, magnitudes=False, groups=None) -> QTable:
     return table
 
 
-def columns_of(result, *, magnitudes=False, groups=None, bands=None) -> Columns:
+def columns_of(result, *, magnitudes=True, groups=None, bands=None) -> Columns:
     """The same as `catalogue`, before it is a table.
 
     bands: names in the order whose neighbours make colours; None = as in the result
