@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ..sky.given.checks import float_type, instance, numbers
-from ..sky.given.observed import as_psf
-from ..sky.grid import Grid, as_grid
+from ..sky.given.observed import PSFLike, as_psf
+from ..sky.grid import GridLike, as_grid
 from ..sky.mapping import Mapping
-from ..sky.psf import PSF
 from .linop import LinOp
 from .transfer import Certificate
 
@@ -43,10 +42,10 @@ class GridOperator(LinOp):
 
     def __init__(
         self,
-        grid_in: Grid,
-        psf_in: PSF,
-        grid_out: Grid,
-        psf_out: PSF,
+        grid_in: GridLike,
+        psf_in: PSFLike,
+        grid_out: GridLike,
+        psf_out: PSFLike,
         *,
         dtype=np.float32,
         device=None,
@@ -64,8 +63,8 @@ class GridOperator(LinOp):
     def from_mapping(
         cls,
         mapping: Mapping,
-        psf_in: PSF,
-        psf_out: PSF,
+        psf_in: PSFLike,
+        psf_out: PSFLike,
         *,
         dtype=np.float32,
         device=None,

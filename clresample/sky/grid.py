@@ -301,6 +301,10 @@ class WcsGrid(Grid):
         return mapping
 
 
+# A Grid, or a WCS of astropy or of another package.
+GridLike = Grid | BaseLowLevelWCS | BaseHighLevelWCS
+
+
 def as_grid(name, grid, shape=None) -> Grid:
     """The Grid, made of a WCS where one is given: astropy's, gwcs, or any other of APE 14.
 

@@ -11,8 +11,8 @@ from tqdm import tqdm
 from ...device.tuning import Tuning
 from ...sky.extent import box_slices, shared_part
 from ...sky.given.checks import float_type
-from ...sky.given.observed import as_psf
-from ...sky.grid import Grid, as_grid
+from ...sky.given.observed import PSFLike, as_psf
+from ...sky.grid import GridLike, as_grid
 from ...sky.psf import PSF
 from ..grid_operator import GridOperator
 from ..linop import HostOp, LinOp
@@ -48,10 +48,10 @@ class TiledResampler(HostOp, GridOperator):
 
     def __init__(
         self,
-        grid_in: Grid,
-        psf_in: PSF,
-        grid_out: Grid,
-        psf_out: PSF,
+        grid_in: GridLike,
+        psf_in: PSFLike,
+        grid_out: GridLike,
+        psf_out: PSFLike,
         *,
         dtype=np.float32,
         device=None,
@@ -61,9 +61,9 @@ class TiledResampler(HostOp, GridOperator):
         progress=True,
     ):
         grid_in, grid_out = as_grid("grid_in", grid_in), as_grid("grid_out", grid_out)
-        psf_in, psf_out = as_psf("psf_in", psf_in), as_psf("psf_out", psf_out)
+        model_psf, seen_psf = as_psf("psf_in", psf_in), as_psf("psf_out", psf_out)
         dtype = float_type(dtype)
-        n_bands = max(psf_in.n_bands, psf_out.n_bands)
+        n_bands = max(model_psf.n_bands, seen_psf.n_bands)
         shapes = (n_bands, *grid_in.shape), (n_bands, *grid_out.shape)
         LinOp.__init__(self, device, dtype, *shapes)
         tuning = Tuning.of(self.device, dtype)
@@ -71,15 +71,15 @@ class TiledResampler(HostOp, GridOperator):
         self.grid_in, self.grid_out, self.tolerance_px = grid_in, grid_out, tolerance_px
         self.groups = make_groups(
             grid_in,
-            psf_in,
+            model_psf,
             grid_out,
-            psf_out,
+            seen_psf,
             precision=Precision.of(dtype),
             tolerance_px=tolerance_px,
             tuning=tuning,
             memory=self.memory,
         )
-        self._operators = TileOperators(psf_in, psf_out, self.dtype, self.device)
+        self._operators = TileOperators(model_psf, seen_psf, self.dtype, self.device)
         self.shift, self.progress = shift, progress
 
     def _about(self):

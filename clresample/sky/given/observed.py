@@ -70,6 +70,10 @@ def bands_of(bands, channels):
     return bands
 
 
+# A PSF, or its images.
+PSFLike = PSF | np.ndarray
+
+
 def as_psf(name, psf, kinds=PSF):
     """The PSF, made of its images where an array is given. Raises ValueError for anything else."""
     if isinstance(psf, np.ndarray) or (isinstance(psf, list | tuple) and len(psf)):
