@@ -37,7 +37,7 @@ def observation_sheet(observation, title=""):
         shown = np.where(seen, image, np.nan)
         white = float(np.nanquantile(shown, BRIGHT_QUANTILE)) if seen.any() else 1.0
         axes.imshow(stretch(shown, limits_of(level, sigma, white)), cmap=COLOURS, origin="lower")
-        _label(axes, o.channels[k], f"noise {sigma:.3g} counts")
+        _label(axes, o.channels[k], f"noise {sigma:.3g} {o.unit or 'counts'}")
         if k == 0:
             scale_bar(axes, o.grid)
     return figure

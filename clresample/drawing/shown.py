@@ -70,6 +70,7 @@ class ShownObservation:
         properties = {
             "channels": " ".join(self.channels),
             "pixels": _pixels(self.grid),
+            "unit": self.unit or "counts",
             "without weight": f"{np.mean(self.weights == 0):.2%}",
             "PSF, FWHM [px]": few(self.psf.fwhm_px),
             "zero points [mag]": "none" if zero_points is None else few(zero_points, ".5g"),

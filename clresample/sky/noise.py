@@ -186,7 +186,7 @@ def _weights_of(data, bad, given, mask, channels, unit, estimates):
     elif variance is not None:
         weights, no_weight = _inverse(variance, data.shape)
     else:
-        weights, messages = _estimated(data, bad | masked, channels)
+        weights, messages = _estimated(data, bad | masked, channels, unit or "counts")
         estimates += messages
         no_weight = np.zeros_like(bad)
     n_bad = int(np.count_nonzero(~masked & (no_weight | (bad & (weights > 0)))))
@@ -272,8 +272,9 @@ def _inverse(variance, shape):
     return np.divide(1.0, variance, out=np.zeros(shape), where=good), ~good
 
 
-def _estimated(data, ignored, channels):
-    """Weights (C, Ny, Nx) from each channel's own background, and messages on the estimate."""
+def _estimated(data, ignored, channels, unit):
+    """Weights (C, Ny, Nx) from each channel's own background, and messages on the estimate, which
+    name the unit."""
     weights, messages = np.ones(data.shape), []
     for i, channel in enumerate(channels):
         if ignored[i].all():
@@ -284,6 +285,6 @@ def _estimated(data, ignored, channels):
             raise ValueError(f"channel {channel}: {error}; give weights or variance") from None
         weights[i] = sigma**-2
         messages.append(
-            f"noise of channel {channel} estimated from the background: sigma = {sigma:.4g} counts"
+            f"noise of channel {channel} estimated from the background: sigma = {sigma:.4g} {unit}"
         )
     return weights, messages

@@ -158,6 +158,8 @@ def test_units_that_do_not_fit_are_refused(given, said):
 
 
 def test_a_list_of_weights_may_have_gaps():
+    with pytest.warns(NoiseWarning, match="noise of channel r estimated .*: sigma = 1.0.* nJy$"):
+        Observation(NOISE * u.nJy, ROUND, GRID, channels=["r"])
     three = np.stack([NOISE, 3 * NOISE[::-1], NOISE])
     with pytest.warns(NoiseWarning, match="noise of channel channel1 estimated .* sigma = [23]"):
         found = Observation(three, ROUND, GRID, weights=[4.0, None, np.full(SHAPE, 2.0)])
