@@ -28,7 +28,8 @@ class Component:
     origin (2,) [px]: (y, x) of the box's first pixel in the model frame; the box lies inside it
     morphology (ny, nx) [1]: max = 1, under the model's PSF
     spectrum (C,) [counts]: flux per model pixel where the morphology is 1, over all channels of all
-        observations in their order, each in its own observation's counts
+        observations in their order, each in its own observation's counts; 0 in a channel without
+        any data, whose fluxes are NaN, see `fluxes`
 
     The covariance of all spectra is Result.covariance.
     """

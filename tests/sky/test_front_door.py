@@ -189,6 +189,8 @@ def test_astropys_images_are_observations_with_their_units(device):
     np.testing.assert_allclose(
         table["mag_image00"].value, table["flux_image00"].to_value(u.ABmag), atol=1e-6
     )
+    found = [result.index_of(key) for key in (0, 1, -1, "image0", "image1")]
+    assert found == [0, 1, 1, 0, 1]
     for i, name in enumerate(("image0", "image1")):
         np.testing.assert_array_equal(result.model(name), result.model(i))
         np.testing.assert_array_equal(result.residual(name), result.residual(i))
