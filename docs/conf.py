@@ -6,6 +6,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+from elsewhere import write_inventories
+
 import clresample
 
 project = "clresample"
@@ -13,7 +15,11 @@ author = "The clresample developers"
 version = release = clresample.__version__
 copyright = author
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx-mathjax-offline", "docstrings"]
+extensions = [
+    *("myst_nb", "sphinx.ext.autodoc", "sphinx.ext.intersphinx", "sphinx-mathjax-offline"),
+    "docstrings",
+]
+intersphinx_mapping = write_inventories(Path(__file__).parent / "_build" / "inventories")
 exclude_patterns = ["_build"]
 myst_enable_extensions = ["dollarmath", "deflist", "colon_fence"]
 myst_heading_anchors = 3

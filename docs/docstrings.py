@@ -9,6 +9,10 @@ What our docstrings do that reStructuredText would run together:
 
 import re
 
+from elsewhere import SHORT
+
+# A short name of another package's class, on its own: not a part of code or of a longer name.
+ELSEWHERE = re.compile(rf"(?<![\w.`])({'|'.join(SHORT)})(?![\w`]|\.\w)")
 PARAMETER = re.compile(
     r"^(?P<names>[\w*]+(?:, [\w*]+)*)"
     r"(?P<kind>(?: \([^:]*\))?(?: \[[^\]:]*\])?)"
@@ -58,6 +62,21 @@ def entries(block):
     return [*out, ""]
 
 
+def _role(match):
+    return f":py:class:`~{SHORT[match[1]]}`"
+
+
+def _role(match):
+    return f":py:class:`~{SHORT[match[1]]}`"
+
+
+def linked(line):
+    """A line with the classes of other packages as links, those between backticks apart."""
+    parts = line.split("`")
+    parts[::2] = [ELSEWHERE.sub(_role, part) for part in parts[::2]]
+    return "`".join(parts)
+
+
 def restructured(lines):
     """The lines of one docstring as reStructuredText."""
     out = []
@@ -71,6 +90,7 @@ def restructured(lines):
             ]
             continue
         block = [line.replace("|", "\\|") for line in block]  # no substitution: an absolute value
+        block = [linked(line) for line in block]
         out += entries(block) or [*(line.strip() for line in block), ""]
     return out
 

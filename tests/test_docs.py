@@ -4,7 +4,10 @@
 without Sphinx, in a second.
 """
 
+import importlib
 import re
+import zlib
+from pathlib import Path
 
 import pytest
 from helpers.checkout import ROOT
@@ -44,10 +47,36 @@ def test_every_page_is_in_the_contents():
 
 def test_every_public_name_is_in_the_reference():
     reference = (DOCS / "reference.md").read_text()
-    found = set(
-        re.findall(r"^\.\. auto(?:class|function):: ([A-Za-z_]+)$", reference, re.MULTILINE)
-    )
+    kinds = r"auto(?:class|function)|py:data"
+    found = set(re.findall(rf"^\.\. (?:{kinds}):: ([A-Za-z_]+)$", reference, re.MULTILINE))
     assert found == set(clresample.__all__)
+
+
+def test_links_to_other_packages_lead_to_what_there_is(monkeypatch, tmp_path):
+    """In files that need no network; as intersphinx reads them."""
+    monkeypatch.syspath_prepend(str(DOCS))
+    elsewhere = importlib.import_module("elsewhere")
+    mapping = elsewhere.write_inventories(tmp_path / "inventories")
+    assert set(mapping) == set(elsewhere.PROJECTS)
+    for address, path in mapping.values():
+        *head, rest = Path(path).read_bytes().split(b"\n", 4)
+        assert head[0] == b"# Sphinx inventory version 2" and address.endswith("/")
+        for line in zlib.decompress(rest).decode().splitlines():
+            name, kind, priority, page, shown = line.split()
+            module, _, last = name.rpartition(".")
+            if module.startswith("matplotlib"):
+                pytest.importorskip("matplotlib")
+            found = getattr(importlib.import_module(module), last)
+            assert isinstance(found, type) == (kind == "py:class")
+            assert priority == "1" and shown == "-" and page.endswith(f".html#{name}")
+
+
+def test_docstrings_link_classes_of_others_and_leave_code_alone(monkeypatch):
+    monkeypatch.syspath_prepend(str(DOCS))
+    docstrings = importlib.import_module("docstrings")
+    link = ":py:class:`~astropy.table.QTable`"
+    assert docstrings.linked("a QTable, `QTable` of QTables") == f"a {link}, `QTable` of QTables"
+    assert docstrings.linked("QTable.read") == "QTable.read"
 
 
 def test_a_broken_link_is_seen():

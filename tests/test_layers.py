@@ -17,7 +17,7 @@ ROOMS = {
     "resampling": ("device", "drawing", "sky"),
     "adapters": ("sky", "resampling"),
     "deblending": ("device", "drawing", "sky", "resampling", "adapters"),
-    "measurement": ("sky", "resampling", "deblending"),
+    "measurement": ("drawing", "sky", "resampling", "deblending"),
     "files": ("drawing", "sky", "deblending", "measurement"),
     "simulation": ("sky",),
     "fields": ("device", "sky", "resampling", "deblending", "measurement", "files"),

@@ -35,6 +35,8 @@ assert_type(psf, PSF)
 operator = Resampler(grid, psf, Grid.flat((30, 30), 0.2), psf, dtype=np.float64)
 assert_type(operator, Resampler)
 
+assert_type(Resampler(grid.to_wcs(), psf.images, grid, psf), Resampler)
+
 observation = Observation(np.zeros((60, 60)), psf, grid, weights=1.0, channels=["VIS"])
 frame = model_frame([observation])
 assert_type(frame, Frame)

@@ -6,51 +6,20 @@ import numpy as np
 from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
-from astropy.nddata import CCDData, InverseVariance, StdDevUncertainty, VarianceUncertainty
+from astropy.nddata import CCDData, StdDevUncertainty
 
-from ..sky.grid import Grid
-from ..sky.observation import ZERO_POINT_UJY, Observation
+from ..sky.observation import Observation
 from .needed import needed
 
 
-def observation_of(image, psf, *, channels=None, zero_points=None, **given) -> Observation:
-    """An Observation of an astropy NDData, CCDData or Cutout2D.
+def observation_of(image, psf=None, **given) -> Observation:
+    """The Observation of an astropy NDData, CCDData or Cutout2D.
 
-    image: its data (Ny, Nx) or (C, Ny, Nx), wcs, mask (True = ignore) and uncertainty (standard
-        deviation, variance or inverse variance) are taken; a Cutout2D has data and wcs only
-    psf: PSF of one band or of C
-    channels: names, as of Observation; zero_points [mag]: AB magnitude of one count; where the
-        image has a unit of flux density (Jy, nJy, ...; per pixel) they follow from it
-    given: more arguments of Observation (weights, variance, mask, noise, name), instead of the
-        image's own
+    image, psf, given: see `Observation.from_nddata`, which this is
 
-    Raises ValueError for an image without a WCS, with an uncertainty of another kind, in a unit
-    that is neither flux density nor counts, and as Observation does.
+    Raises ValueError as that does.
     """
-    wcs = getattr(image, "wcs", None)
-    if wcs is None:
-        raise ValueError(f"image, a {type(image).__name__}, has no wcs")
-    data = np.asarray(image.data)
-    if getattr(image, "mask", None) is not None:
-        given.setdefault("mask", np.asarray(image.mask))
-    given.update(_variance(image, given))
-    unit = getattr(image, "unit", None)
-    if zero_points is None and unit not in (
-        None,
-        u.dimensionless_unscaled,
-        u.adu,
-        u.electron,
-        u.ct,
-    ):
-        zero_points = _zero_point(u.Unit(unit))
-    return Observation(
-        data,
-        psf,
-        Grid.from_wcs(wcs, data.shape),
-        channels=channels,
-        zero_points=zero_points,
-        **given,
-    )
+    return Observation.from_nddata(image, psf, **given)
 
 
 def ccddata_of(data, grid, *, variance=None, mask=None, psf=None, unit=u.ct, cards=()) -> CCDData:
@@ -81,36 +50,6 @@ def ccddata_of(data, grid, *, variance=None, mask=None, psf=None, unit=u.ct, car
         mask=mask,
         psf=images,
         meta=header,
-    )
-
-
-def _variance(image, given):
-    """What Observation needs of the image's uncertainty; nothing where the caller gave it."""
-    uncertainty = getattr(image, "uncertainty", None)
-    if uncertainty is None or {"weights", "variance"} & set(given):
-        return {}
-    values = np.asarray(uncertainty.array, np.float64)
-    if isinstance(uncertainty, StdDevUncertainty):
-        return {"variance": values**2}
-    if isinstance(uncertainty, VarianceUncertainty):
-        return {"variance": values}
-    if isinstance(uncertainty, InverseVariance):
-        return {"weights": values}
-    raise ValueError(
-        f"image.uncertainty is {type(uncertainty).__name__}: it must be a standard deviation, a "
-        "variance or an inverse variance, or give `variance`"
-    )
-
-
-def _zero_point(unit):
-    """AB magnitude of one count, for a unit of flux density per pixel."""
-    for per_pixel in (u.dimensionless_unscaled, u.pix):
-        try:
-            return ZERO_POINT_UJY - 2.5 * np.log10((unit * per_pixel).to(u.uJy))
-        except u.UnitConversionError:
-            continue
-    raise ValueError(
-        f"image.unit is {unit}, neither a flux density nor counts: convert it, or give zero_points"
     )
 
 

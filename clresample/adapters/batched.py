@@ -5,6 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 
+def with_bands(op, x):
+    """An image (Ny, Nx) of an operator of one band as (1, Ny, Nx), others as they are, and whether
+    it was one. Raises ValueError for shapes that the operator does not take."""
+    shape, expected = tuple(x.shape), op.shape_in
+    if len(expected) == 3 and expected[0] == 1 == op.shape_out[0] and shape == expected[1:]:
+        return x[None], True
+    if len(shape) < len(expected) or shape[len(shape) - len(expected) :] != expected:
+        raise ValueError(f"x has shape {shape}, expected (...,) + {expected}")
+    return x, False
+
+
 def shapes(x, op, transposed):
     """Of one item of x, and of the result with all of x's leading axes."""
     shape_x, shape_result = op.shape_in, op.shape_out

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 
-from .batched import applied, shapes
+from .batched import applied, shapes, with_bands
 from .needed import needed
 
 
@@ -17,7 +17,8 @@ def as_jax(op):
     derivatives are exact. `jax.vmap` makes one launch of a batch, not many.
 
     op: any LinOp (Resampler, TiledResampler, ...) of item shapes shape_in and shape_out
-    returns f(x): x (...,) + shape_in -> (...,) + shape_out, arrays of the operator's dtype
+    returns f(x): x (...,) + shape_in -> (...,) + shape_out, arrays of the operator's dtype; of one
+        band also (Ny, Nx) -> (My, Mx)
 
     Raises ImportError without JAX; ValueError for a float64 operator where JAX holds float32 only
     (`jax.config.update("jax_enable_x64", True)` first), and, when called, for other shapes.
@@ -32,9 +33,9 @@ def as_jax(op):
 
     def apply(x):
         x = jax.numpy.asarray(x, op.dtype)
-        if x.ndim < len(op.shape_in) or x.shape[x.ndim - len(op.shape_in) :] != op.shape_in:
-            raise ValueError(f"x has shape {x.shape}, expected (...,) + {op.shape_in}")
-        return primitive.bind(x, op=op, transposed=False)
+        x, is_flat = with_bands(op, x)
+        result = primitive.bind(x, op=op, transposed=False)
+        return result[0] if is_flat else result
 
     return apply
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .batched import applied
+from .batched import applied, with_bands
 from .needed import needed
 
 
@@ -14,7 +14,8 @@ def as_torch(op):
     exact: the backward pass is the adjoint, and its own backward pass the operator.
 
     op: any LinOp (Resampler, TiledResampler, ...) of item shapes shape_in and shape_out
-    returns f(x): x (...,) + shape_in -> (...,) + shape_out, tensors of x's dtype and device
+    returns f(x): x (...,) + shape_in -> (...,) + shape_out, tensors of x's dtype and device; of one
+        band also (Ny, Nx) -> (My, Mx)
 
     Raises ImportError without torch; ValueError, when called, for other shapes and dtypes.
     """
@@ -35,10 +36,10 @@ def as_torch(op):
             return Applied.apply(y, not ctx.transposed), None
 
     def apply(x):
-        if tuple(x.shape[x.ndim - len(op.shape_in) :]) != op.shape_in or x.ndim < len(op.shape_in):
-            raise ValueError(f"x has shape {tuple(x.shape)}, expected (...,) + {op.shape_in}")
+        x, is_flat = with_bands(op, x)
         if x.dtype != dtype:
             raise ValueError(f"x is {x.dtype}, the operator computes in {dtype}: convert one")
-        return Applied.apply(x, False)
+        result = Applied.apply(x, False)
+        return result[0] if is_flat else result
 
     return apply

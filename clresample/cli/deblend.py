@@ -219,11 +219,12 @@ def _import_drawing():
 
 def _write(arguments, result, inputs, device, paths):
     """Write the catalogue twice, the result and, where `paths` has a fourth, the figure."""
-    from ..files.results import write_catalogue, write_result
+    from ..files.results import write_result
+    from ..files.tables import write_catalogue
     from ..files.whole_file import whole_files
     from ..measurement.catalogue import catalogue
 
-    table = catalogue(result, magnitudes=result.observations[0].zero_points is not None)
+    table = catalogue(result)
     with whole_files(paths) as parts:
         for part in parts[:2]:
             write_catalogue(part, table)

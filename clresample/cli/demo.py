@@ -19,7 +19,8 @@ from ..deblending.settings import Settings
 from ..device.device import get_device
 from ..device.discovery import DeviceError
 from ..files.plot_deblended import plot_deblended
-from ..files.results import write_catalogue, write_result
+from ..files.results import write_result
+from ..files.tables import write_catalogue
 from ..measurement.catalogue import catalogue
 from ..simulation.scenes import simulate_scene
 from ..simulation.sdr import sdr
@@ -67,7 +68,7 @@ def run(folder="demo", *, device=None):
     result = fitted["joint"][0]
     names = "deblended.png", "catalogue.fits", "catalogue.ecsv", "result.fits"
     files = [folder / name for name in names]
-    table = catalogue(result, magnitudes=True)
+    table = catalogue(result)
     plot_deblended(files[0], result, title="Six galaxies, two telescopes, one model")
     for path in files[1:3]:
         write_catalogue(path, table, overwrite=True)

@@ -14,7 +14,7 @@ from astropy.io import fits
 from astropy.table import QTable
 
 from ..files.fits import write_fits, write_hdus
-from ..files.results import write_catalogue
+from ..files.tables import write_catalogue
 from ..files.whole_file import check_folder, check_output, whole_files
 from ..simulation.scenes import simulate_scene
 from .pointing import ANGLE_DEG, CENTER_DEG

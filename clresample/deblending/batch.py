@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import logging
 import warnings
 from collections import defaultdict
 
@@ -14,7 +15,8 @@ from ..device.discovery import DeviceError
 from ..device.tuning import Tuning
 from ..device.workers import ahead, deal, one_blas_thread
 from ..drawing.bar import Bar
-from ..sky.given.checks import float_type, instance
+from ..sky.given.checks import described, float_type, instance
+from ..sky.observation import as_observations
 from ..sky.sources import SourceWarning
 from .blend import INTERRUPTED, Blend, Failure
 from .components.second import asks_for_more, with_second
@@ -24,6 +26,7 @@ from .iterate import iterate
 from .result import Result
 from .settings import Settings
 
+LOG = logging.getLogger("clresample")
 # [px] Blends of several sizes have their frames and observations padded to multiples of this, so
 # that they share batches: smaller ones make more batches, larger ones more padding to compute.
 PAD_PX = 16
@@ -61,15 +64,15 @@ def deblend(
 
         min 1/2 sum_o |sqrt(w_o) (R_o sum_s A_s S_s - d_o)|^2 + 1/2 |z|^2,  A >= 0, S constrained
 
-    observations, sources, frame, shifts: see Blend; settings: see Settings
+    observations, sources, frame, shifts: see Blend; among observations may be astropy's NDData and
+        CCDData that have a PSF; settings: see Settings
     progress: called every few iterations with their number so far and the loss (1,)
     raises ValueError for what `check_observations`, `model_frame` and `Source` refuse, and when no
     source lies inside the frame. Warns (SourceWarning) of sources far from any light. Ctrl-C ends
     the fit with the best state so far. Warns (InputWarning) of what is wrong with the observations
     and the list of sources, as far as their light tells (inspection/): messages of the result.
     """
-    given = (_listed("observations", observations), _listed("sources", sources))
-    blend = Blend(*given, frame, shifts)
+    blend = Blend(as_observations(observations), _listed("sources", sources), frame, shifts)
     settings, dtype = _checked(settings, dtype)
     device = get_device(device)
     fit = Fit(blend, settings, device, dtype, pad=1)
@@ -82,7 +85,9 @@ def deblend(
     iterate([fit], settings, device, dtype, progress, takes_over=asks_for_more)
     if fit.status != INTERRUPTED:
         (fit,) = with_second([fit], settings, device, dtype, progress)
-    return fit.result(*finish([fit]))
+    result = fit.result(*finish([fit]))
+    LOG.info("%r in %.2f s", result, sum(result.seconds.values()))
+    return result
 
 
 def deblend_many(
@@ -266,7 +271,7 @@ def _listed(name, values):
     try:
         return tuple(values)
     except TypeError:
-        raise ValueError(f"{name} is {values!r:.80}, must be a sequence") from None
+        raise ValueError(f"{name} is {described(values)}, must be a sequence") from None
 
 
 def _failure(blend, error):

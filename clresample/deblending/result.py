@@ -10,11 +10,12 @@ import numpy as np
 from ..drawing.shown import ShownResult
 from ..sky.footprint import Footprint
 from ..sky.frame import Frame
-from ..sky.observation import Observation
+from ..sky.observation import Observation, observation_index
 from ..sky.sources import Source
 from .assessment.misfit import Misfit, misfit_of
 from .blend import CONVERGED
 from .posterior.errors import Draws, Errors
+from .posterior.sampling import drawn_components, drawn_fluxes
 from .rendered import Rendered, weighted_sum
 from .solver.scene_model import compose
 
@@ -27,7 +28,8 @@ class Component:
     origin (2,) [px]: (y, x) of the box's first pixel in the model frame; the box lies inside it
     morphology (ny, nx) [1]: max = 1, under the model's PSF
     spectrum (C,) [counts]: flux per model pixel where the morphology is 1, over all channels of all
-        observations in their order, each in its own observation's counts
+        observations in their order, each in its own observation's counts; 0 in a channel without
+        any data, whose fluxes are NaN, see `fluxes`
 
     The covariance of all spectra is Result.covariance.
     """
@@ -63,7 +65,7 @@ class Result(ShownResult):
     errors: of fits with a LearnedPrior, the Errors of fluxes, shapes and morphologies, marginal
         over the morphologies, which `fluxes` and `catalogue` report. None where there are none: of
         other priors, and where `messages` says so; then these report the covariance above
-    draws: what `sample` draws from; not stored in files
+    draws: what `sample` and `sample_fluxes` draw from
     shifts (n_observations, 2) [model px]: fitted offsets of the observations' pixels
     losses (n_iterations + 1,): half chi2 (plus priors) before each iteration and at the end
     status: "converged", "misfit" (its steps ended, but the model does not describe the data, see
@@ -115,6 +117,10 @@ class Result(ShownResult):
         """What the model leaves in the data, source by source and channel by channel."""
         return misfit_of(self)
 
+    def index_of(self, observation) -> int:
+        """The number of an observation, given by its number or name; ValueError for others."""
+        return observation_index(self.observations, observation)
+
     def channel_slices(self) -> list[slice]:
         """For each observation, its part of a spectrum."""
         ends = np.cumsum([len(o.channels) for o in self.observations])
@@ -124,12 +130,16 @@ class Result(ShownResult):
         ]
 
     def source_model(self, i_source, i_observation=None) -> np.ndarray:
-        """One source (C, Ny, Nx) in the model frame, or (Co, My, Mx) as an observation sees it."""
+        """One source (C, Ny, Nx) in the model frame, or (Co, My, Mx) as an observation sees it.
+
+        i_observation: number or name of the observation; None = the model frame
+        """
         parts = [(i, c) for i, c in enumerate(self.components) if c.source == i_source]
         if i_observation is None:
             spectra = np.array([c.spectrum for _, c in parts]).reshape(-1, len(self.channels))
             origin, morphs = [c.origin for _, c in parts], [c.morphology for _, c in parts]
             return compose(self.frame.shape, origin, morphs, spectra)
+        i_observation = self.index_of(i_observation)
         channels = self.channel_slices()[i_observation]
         unit = self.rendered[i_observation]
         zero = np.zeros(self.observations[i_observation].data.shape)
@@ -154,7 +164,11 @@ class Result(ShownResult):
         return profile_of(self.source_model(i_source)[channel], self.frame.grid, position)
 
     def model(self, i_observation) -> np.ndarray:
-        """All sources and the sky (Co, My, Mx) [counts] as an observation sees them."""
+        """All sources and the sky (Co, My, Mx) [counts] as an observation sees them.
+
+        i_observation: its number or name
+        """
+        i_observation = self.index_of(i_observation)
         channels = self.channel_slices()[i_observation]
         n_channels = channels.stop - channels.start
         spectra = np.array([c.spectrum[channels] for c in self.components]).reshape(-1, n_channels)
@@ -163,7 +177,7 @@ class Result(ShownResult):
 
     def residual(self, i_observation) -> np.ndarray:
         """Data minus model (Co, My, Mx) [counts]; NaN where the data have no weight."""
-        o = self.observations[i_observation]
+        o = self.observations[self.index_of(i_observation)]
         return np.where(o.weights > 0, o.data - self.model(i_observation), np.nan)
 
     def cutout(self, source, observation, what="data", *, size=None, unit=None):
@@ -191,10 +205,11 @@ class Result(ShownResult):
 
         return cutout(self, source, observation, what, size=size, unit=unit)
 
-    def sample(self, n, rng) -> list[tuple[Component, ...]]:
+    def sample(self, n, rng=None) -> list[tuple[Component, ...]]:
         """Draw n sets of components from the posterior about the solution, as `errors` has it.
 
-        rng: NumPy Generator. Morphologies and spectra below 0 become 0, so that faint sources are
+        rng: NumPy Generator, or a seed: equal seeds give equal draws, also of a result read from a
+        file. Morphologies and spectra below 0 become 0, so that faint sources are
         brighter in the mean, and where a morphology is at that bound it stays there; morphologies
         keep their scale, their maximum is no longer 1. Misfitted sources scatter more, as Errors
         has it. Fluxes scatter about the components' own, not about those of `fluxes` and the
@@ -203,25 +218,22 @@ class Result(ShownResult):
         less than `errors` has it. The bound at 0 takes more of it from misfitted sources that stand
         where light was missed, up to 0.4: their changes are as large as their morphologies.
 
-        Raises ValueError for results without draws: of other priors, without errors, or read from
-        a file.
+        Raises ValueError for results without draws: of other priors, or without errors.
         """
-        if self.draws is None:
-            raise ValueError("this result has no posterior to draw from, see Result.draws")
-        return [self._drawn(rng) for _ in range(n)]
+        rng = np.random.default_rng(rng)
+        return [drawn_components(self, rng) for _ in range(n)]
 
-    def _drawn(self, rng):
-        morphs, spectra = self.draws.draw(rng)
-        return tuple(
-            replace(
-                c,
-                morphology=np.where(
-                    c.morphology > 0, np.maximum(c.morphology + m, 0), c.morphology
-                ),
-                spectrum=np.maximum(c.spectrum + a, 0),
-            )
-            for c, m, a in zip(self.components, morphs, spectra, strict=True)
-        )
+    def sample_fluxes(self, n, rng=None) -> np.ndarray:
+        """Draw the sources' fluxes (n, S, C) [counts] from the posterior, n times.
+
+        Those of `sample`, with what `fluxes` adds for light beyond the boxes and takes off for the
+        bound at 0, so that they scatter about the catalogue's; NaN where nothing was measured.
+
+        rng: NumPy Generator, or a seed
+
+        Raises ValueError as `sample` does.
+        """
+        return drawn_fluxes(self, n, np.random.default_rng(rng))
 
 
 def noted(result, **given) -> Result:

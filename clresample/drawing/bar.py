@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 import time
 import warnings
 
+LOG = logging.getLogger("clresample")
 # [s] Between two lines of a log.
 LINE_S = 30.0
 
@@ -36,7 +38,7 @@ class Bar:
         if now - self._said >= LINE_S or n_done == self.total:
             took = now - self._began
             line = f"{n_done} of {self.total} {self.unit} after {took:.0f} s"
-            print(line, file=sys.stderr, flush=True)
+            tell(line)
             self._said = now
 
     def _drawn(self):
@@ -46,6 +48,14 @@ class Bar:
             from tqdm.auto import tqdm
 
             return tqdm(total=self.total, unit=f" {self.unit}")
+
+
+def tell(line):
+    """A line of progress that was asked for: to the logger, and to standard error unless Python's
+    `logging` is set up to show such lines or to hide them."""
+    LOG.info(line)
+    if not LOG.isEnabledFor(logging.INFO) and LOG.level == logging.NOTSET:
+        print(line, file=sys.stderr, flush=True)
 
 
 def _is_watched():

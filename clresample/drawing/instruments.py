@@ -1,4 +1,4 @@
-"""Figures of PSFs and observations: one panel a band."""
+"""Figures of PSFs and observations, one panel a band, and of detections."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import numpy as np
 from .sheet import GAP, INK, add_panel, dark_sheet, limits_of, scale_bar, stretch
 
 PANEL_INCHES, MOST_IN_A_ROW = 2.2, 6
+DETECTION_INCHES = 5.0
+MARK = "#7fe3ff"
 ABOVE, BELOW = 0.56, 0.32  # [inch] for a row's titles and notes
 PSF_DECADES = 4  # of brightness below a PSF's peak that are shown
 BRIGHT_QUANTILE = 0.999  # of an image's pixels: shown as white
@@ -19,7 +21,7 @@ def psf_sheet(psf, title=""):
     for k, (axes, image) in enumerate(zip(panels, psf.images, strict=True)):
         floor = image.max() * 10.0**-PSF_DECADES
         axes.imshow(np.log10(np.maximum(image, floor)), cmap=COLOURS, origin="lower")
-        axes.plot(*psf.center[k][::-1], "+", color="#7fe3ff", ms=9, mew=0.8)
+        axes.plot(*psf.center[k][::-1], "+", color=MARK, ms=9, mew=0.8)
         _label(axes, f"band {k}", f"FWHM {psf.fwhm_px[k]:.2f} px")
     return figure
 
@@ -35,9 +37,26 @@ def observation_sheet(observation, title=""):
         shown = np.where(seen, image, np.nan)
         white = float(np.nanquantile(shown, BRIGHT_QUANTILE)) if seen.any() else 1.0
         axes.imshow(stretch(shown, limits_of(level, sigma, white)), cmap=COLOURS, origin="lower")
-        _label(axes, o.channels[k], f"noise {sigma:.3g} counts")
+        _label(axes, o.channels[k], f"noise {sigma:.3g} {o.unit or 'counts'}")
         if k == 0:
             scale_bar(axes, o.grid)
+    return figure
+
+
+def detection_sheet(detection, title=""):
+    """Signal to noise of a Detection, linear up to some sigma, with a cross at each source."""
+    image = detection.image
+    n_y, n_x = image.shape
+    height = DETECTION_INCHES * n_y / n_x
+    figure = dark_sheet(DETECTION_INCHES + 2 * GAP, ABOVE / 2 + height + GAP, title)
+    axes = add_panel(figure, GAP, ABOVE / 2, DETECTION_INCHES, height)
+    seen = image != 0
+    white = float(np.quantile(image[seen], BRIGHT_QUANTILE)) if seen.any() else 1.0
+    shown = np.where(seen, image, np.nan)
+    axes.imshow(stretch(shown, limits_of(0.0, 1.0, white)), cmap=COLOURS, origin="lower")
+    for y, x in detection.frame.place(detection.sources):
+        axes.plot(x, y, "+", color=MARK, ms=5, mew=0.7)
+    axes.set(xlim=(-0.5, n_x - 0.5), ylim=(-0.5, n_y - 0.5), xticks=[], yticks=[])
     return figure
 
 

@@ -5,11 +5,13 @@ Base classes without any state, one for each class that users meet.
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 
 from .card import card, few
 from .deblended import deblended_sheet
-from .instruments import observation_sheet, psf_sheet
+from .instruments import detection_sheet, observation_sheet, psf_sheet
 
 
 class ShownGrid:
@@ -68,6 +70,7 @@ class ShownObservation:
         properties = {
             "channels": " ".join(self.channels),
             "pixels": _pixels(self.grid),
+            "unit": self.unit or "counts",
             "without weight": f"{np.mean(self.weights == 0):.2%}",
             "PSF, FWHM [px]": few(self.psf.fwhm_px),
             "zero points [mag]": "none" if zero_points is None else few(zero_points, ".5g"),
@@ -85,7 +88,10 @@ class ShownObservation:
 
 
 class ShownResult:
-    """A Result's line, card and figure."""
+    """A Result's length, that of its sources, line, card and figure."""
+
+    def __len__(self):
+        return len(self.sources)
 
     def __repr__(self):
         sources = f"{len(self.sources)} sources, {len(self.components)} components"
@@ -108,6 +114,33 @@ class ShownResult:
         returns matplotlib Figure. Raises ImportError, with what to install, without matplotlib.
         """
         return deblended_sheet(self, title=title)
+
+
+class ShownDetection:
+    """A Detection's length, line, card and figure."""
+
+    def __len__(self):
+        return len(self.sources)
+
+    def __repr__(self):
+        counts = ", ".join(f"{n} in {name}" for name, n in Counter(self.found_in).items())
+        return f"Detection({len(self)} sources{f': {counts}' * bool(counts)}; {_heights(self)})"
+
+    def _repr_html_(self):
+        properties = {
+            "sources": len(self),
+            "peaks": _heights(self),
+            **{f"found in {name}": n for name, n in Counter(self.found_in).items()},
+            "frame": _pixels(self.frame.grid),
+        }
+        return card("Detection", properties, self.plot)
+
+    def plot(self, *, title=""):
+        """Signal to noise of all observations together, with the sources marked.
+
+        returns matplotlib Figure. Raises ImportError, with what to install, without matplotlib.
+        """
+        return detection_sheet(self, title)
 
 
 class ShownCertificate:
@@ -136,6 +169,12 @@ def _middle(grid):
 
 def _ending(result):
     return f"{result.status} after {max(len(result.losses) - 1, 0)} iterations"
+
+
+def _heights(detection):
+    if not len(detection):
+        return "no peaks"
+    return f"peaks of {detection.peaks.min():.3g} to {detection.peaks.max():.3g} sigma"
 
 
 def _notes(messages):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from astropy import units as u
 from astropy.table import QTable
@@ -114,8 +116,10 @@ def finished(job, parts, last, unsettled=()):
 def _order(job, names):
     """Names of columns: who and where, how it went, positions and shapes, then all channels."""
     channels, labels = job.channels, [m.name for m in job.mosaics]
-    kinds = "flux", "flux_err", "group_flux", "group_flux_err"
+    kinds = "flux", "flux_err", "mag", "mag_err", "group_flux", "group_flux_err"
     fluxes = [f"{key}_{b}" for b in job.bands for key in kinds]
+    pairs = list(pairwise(job.bands))
+    fluxes += [f"{key}_{a}_{b}" for a, b in pairs for key in ("colour", "colour_err")]
     quality = [f"chi2_{name}" for name in labels] + [f"residual_{c}" for c in channels]
     quality += ["misfit_sigma", "misfit_fraction", "ambiguous_with"]
     fixed = [*FIRST, *THEN]
@@ -137,6 +141,10 @@ def _description(name):
         ("group_flux_", "flux of all of the group in {}"),
         ("flux_err_", "error of the flux in {}"),
         ("flux_", "total flux in {}"),
+        ("mag_err_", "error of the magnitude in {}"),
+        ("mag_", "AB magnitude of the total flux in {}"),
+        ("colour_err_", "error of the colour of {}"),
+        ("colour_", "AB magnitude in the first band minus that in the second, of {}"),
         ("chi2_", "mean chi2 of the source's pixels in {}"),
         ("residual_", "largest residual on the source in {}, in sigma"),
     ):

@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 
 from .. import __version__
+from ..files.parquet import arrow_table
 from ..files.whole_file import FileError
 from ..sky.wcs import names_of
-from .parquet import arrow_table
 
 FINEST = 29  # order of the index: pixels of 0.4 milliarcseconds, the finest that int64 numbers
 INDEX = f"_healpix_{FINEST}"

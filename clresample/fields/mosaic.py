@@ -8,7 +8,8 @@ from typing import Protocol
 
 import numpy as np
 
-from ..sky.grid import Grid
+from ..sky.given.observed import as_psf
+from ..sky.grid import Grid, as_grid
 from ..sky.observation import Observation
 from ..sky.psf_checks import PSFWarning
 from ..sky.varying.field import PSFField
@@ -129,9 +130,9 @@ class Channel:
 class Mosaic:
     """One instrument's mosaic of a field.
 
-    name: of the instrument; grid: Grid of (Ny, Nx) of all channels
+    name: of the instrument; grid: Grid of (Ny, Nx) of all channels, or a WCS that knows its shape
     channels: of Channel, at least one
-    psf: PSFField, or PSF, of one band or of one for each channel
+    psf: PSFField, PSF or its images, of one band or of one for each channel
     noise: correlation of neighbouring pixels' noise, as in Observation, or None. An estimate is
         made once, for the whole mosaic, by whoever makes the mosaic
     """
@@ -143,8 +144,9 @@ class Mosaic:
     noise: object = None
 
     def __post_init__(self):
+        object.__setattr__(self, "grid", as_grid("grid", self.grid))
         if not isinstance(self.psf, PSFField):
-            object.__setattr__(self, "psf", ConstantPSF(self.psf))
+            object.__setattr__(self, "psf", ConstantPSF(as_psf("psf", self.psf)))
         if not self.channels:
             raise ValueError(f"channels of mosaic {self.name!r} is empty, at least one is needed")
         if self.psf.n_bands not in (1, len(self.channels)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from ..measurement.detection import THRESHOLD
 from .blends.cut import Limits
 from .blends.plan import LARGEST_FIELD
 
+LOG = logging.getLogger("clresample")
 # [bytes] of one group of fits: more lets more blends share a batch
 MEMORY = 1 << 30
 # [bytes] of a worker process: libraries, compiler and one small group take some 600 MiB
@@ -26,7 +28,7 @@ class FieldOptions:
     threshold [sigma]: least signal to noise of a source; passes: 1, or 2 to search each blend's
         residuals too
     positions (S, 2) [deg]: right ascension and declination (y, x [arcsec] on a flat sky) of sources
-        that are known; None = search for them
+        that are known, or a SkyCoord of S places; None = search for them
     part (i, n): run the i-th of n parts of the field (from 1) alone, for job arrays: its catalogue
         has the sources whose centres lie in it; None = the whole
     border_px [model px]: around the part, which is searched and fitted too. Blends that reach from
@@ -96,7 +98,7 @@ def group_memory(bound) -> int:
 
 @dataclass(eq=False)
 class Progress:
-    """What a run tells while it goes: override what is wanted.
+    """What a run tells while it goes, to the logger "clresample": override what is wanted.
 
     stage(name, total): a stage begins, of so many tiles or blends; step(n, sources): n of them are
     done; say(text): what the user should know; dashboard(address): where workers can be watched
@@ -104,12 +106,14 @@ class Progress:
 
     def stage(self, name, total):
         """A stage begins."""
+        LOG.info("%s: %d to do", name, total)
 
     def step(self, n, sources=0):
         """Some of it is done."""
 
     def say(self, text):
         """What the user should know, a line."""
+        LOG.info(text)
 
     def dashboard(self, address):
         """The address of a page that shows what the workers do, where there is one: a line."""

@@ -15,12 +15,12 @@ from pathlib import Path
 from astropy.io import fits
 
 from .. import __version__
+from ..files.parquet import write_parquet
 from ..files.whole_file import check_output, whole_tree
 from .columns import finished
 from .hats import write_hats
 from .images import file_name, write_mosaics
 from .models import write_models
-from .parquet import write_parquet
 from .work.look import looked
 
 NO_PARQUET = "no catalogue.parquet: pyarrow is not installed (pip install 'clresample[field]')"

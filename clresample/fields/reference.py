@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from ..files.names import check_columns, to_ascii
@@ -49,4 +51,6 @@ def _check_names(mosaics):
                 "columns of FITS tables: give another one"
             )
     check_columns(f"chi2_{m.name}" for m in mosaics)
-    check_columns(f"flux_err_{c.band or c.name}" for m in mosaics for c in m.channels)
+    bands = list(dict.fromkeys(c.band or c.name for m in mosaics for c in m.channels))
+    check_columns(f"group_flux_err_{band}" for band in bands)
+    check_columns(f"colour_err_{a}_{b}" for a, b in pairwise(bands))

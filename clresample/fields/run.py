@@ -8,6 +8,10 @@ import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+from astropy.coordinates import SkyCoord
+
+from ..sky.wcs import frame_of
 from .blends.tiles import part_of
 from .box import Box
 from .hats import check_hats
@@ -61,6 +65,7 @@ def run_field(
     mosaics, folder = _as_sent(mosaics), Path(folder)
     seconds: dict[str, float] = {}
     reference = reference_of(mosaics)
+    options = replace(options, positions=_degrees(options.positions, reference))
     _check_outputs(folder, mosaics, reference, options)
     inputs = tuple((about or {}).get("inputs", {}).values())
     work, options = open_folder(
@@ -99,6 +104,20 @@ def run_field(
     clock.stop("write")
     failed = outputs.status.get("failed", 0)
     return FieldRun(outputs, seconds, failed, plan.lost, tuple(engine.turns))
+
+
+def _degrees(positions, reference):
+    """Positions (S, 2) [deg] in the frame of the reference's WCS where a SkyCoord is given, else as
+    they are. Raises ValueError for a SkyCoord on a flat sky."""
+    if not isinstance(positions, SkyCoord):
+        return positions
+    if reference.is_flat:
+        raise ValueError(
+            "positions is a SkyCoord, but the mosaics are flat: give (y, x) [arcsec], or the "
+            "mosaics a WCS"
+        )
+    sky = positions.ravel().transform_to(frame_of(reference.wcs)).spherical
+    return np.stack([sky.lon.deg, sky.lat.deg], axis=1)
 
 
 def _check_outputs(folder, mosaics, reference, options):

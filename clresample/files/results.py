@@ -1,34 +1,38 @@
-"""Fitted blends to FITS files and back, bit by bit; catalogues to ECSV."""
+"""Fitted blends to FITS files and back, bit by bit."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import fields
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
-from astropy.table import QTable, Table
+from astropy.table import Table
 from astropy.wcs import WCSHDO_EFMT, WCSHDO_P17, WCSHDO_all
 from astropy.wcs.wcs import WCSHDO_SIP
 
 from ..deblending.posterior.errors import Errors
 from ..deblending.result import Component, Result
-from ..measurement.catalogue import MEANINGS, catalogue
+from ..measurement.catalogue import catalogue
 from ..sky.frame import Frame
 from ..sky.grid import Grid
 from ..sky.observation import Observation
 from ..sky.psf import PSF
 from ..sky.sources import Extended, Point, Source
 from .arrays import array_of, image_hdu
+from .draws import draw_hdus, read_draws
 from .fits import add_provenance, celestial_header, open_fits, write_hdus
-from .names import check_channels, check_columns, text_card, to_ascii
-from .whole_file import FileError, check_output, whole_file
+from .names import check_channels, check_columns, text_card
+from .tables import flag_table_hdu, table_hdu
+from .whole_file import FileError, check_output
 
-FORMAT = 2  # of the files; raised when an older reader would misread them
+FORMAT = 3  # of the files; raised when an older reader would misread them
+WIDENED = 2  # the first format whose errors are widened for misfitted sources
 KINDS = {kind.__name__: kind for kind in (Source, Point, Extended)}
 # of an observation, as JSON
-KEPT = ("name", "channels", "bands", "zero_points", "saturation", "n_bad", "messages")
+KEPT = ("name", "channels", "bands", "zero_points", "saturation", "unit", "n_bad", "messages")
 BOX = ("source", "y", "x", "n_y", "n_x")
 # HDUs of Errors
 ERRORS = {"FLUXCOV": "flux", "COLOURCOV": "colour", "MOMENTCOV": "moments", "BEYOND": "beyond"}
@@ -44,11 +48,11 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
     HDUs that `read_result` reads: ABOUT (keys and JSON: sources, names, status, messages, ...),
     COMPONENTS (boxes), SPECTRA (n, C), MORPHOLOGIES (one after the other), SKY, COVARIANCE, SHIFTS,
     LOSSES, where the result has errors FLUXCOV, COLOURCOV, MOMENTCOV, BEYOND, RELEASED, MOVED,
-    RESIDUALMAX, OUTER, MORPHOLOGYERR (one after the other), MODELPSF, and per observation from 1
-    on: DATA, WEIGHTS, PSF, RENDERED. For other programs: CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all
-    sources in the model frame, and per observation MODEL and RESIDUAL, 0 where data have no weight.
-    All images have their WCS; a flat sky is put at RA = Dec = 0. For NaN and infinity see
-    arrays.py.
+    RESIDUALMAX, OUTER, MORPHOLOGYERR (one after the other), those of the draws (see draws.py),
+    MODELPSF, and per observation from 1 on: DATA, WEIGHTS, PSF, RENDERED. For other programs:
+    CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all sources in the model frame, and per observation MODEL
+    and RESIDUAL, 0 where data have no weight. All images have their WCS; a flat sky is put at
+    RA = Dec = 0. For NaN and infinity see arrays.py.
 
     result: of `deblend`; overwrite: replace a file that exists
     device: name of the OpenCL device; inputs: {what: file}; both for the header
@@ -61,10 +65,20 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
     primary = fits.PrimaryHDU()
     primary.header["CLSTATUS"] = text_card(" ".join(result.status.split()), "how the fit ended")
     add_provenance(primary.header, result.rendered[0].dtype, device, inputs or {}, None)
-    hdus = [primary, _table(catalogue(result), "CATALOGUE"), _flag_table(), *_fit_hdus(result)]
+    hdus = [primary, table_hdu(_catalogue(result), "CATALOGUE"), flag_table_hdu()]
+    hdus += _fit_hdus(result)
     for i in range(len(result.observations)):
         hdus += _observation_hdus(result, i)
     write_hdus(path, hdus)
+
+
+def _catalogue(result):
+    """The catalogue, without magnitudes where bands have names too long for those of colours."""
+    try:
+        check_columns(f"colour_err_{a}_{b}" for a, b in pairwise(result.bands))
+    except ValueError:
+        return catalogue(result, magnitudes=False)
+    return catalogue(result)
 
 
 def _fit_hdus(result):
@@ -82,6 +96,7 @@ def _fit_hdus(result):
         image_hdu("MORPHOLOGIES", np.concatenate(flat) if flat else np.zeros(0)),
         *(image_hdu(name.upper(), getattr(result, name)) for name in ARRAYS),
         *_error_hdus(result.errors),
+        *draw_hdus(result.draws),
         image_hdu("MODELPSF", result.frame.psf.images),
         image_hdu("SCENE", scene, cards),
         *tables,
@@ -120,9 +135,9 @@ def _observation_hdus(result, i):
 
 
 def read_result(path) -> Result:
-    """The blend that `write_result` wrote to a file, equal to the last bit but for Result.draws and
-    for PSFs that vary (Observation.psf_field), which files do not hold: psf is that in the middle,
-    `rendered` what each source's own made of it.
+    """The blend that `write_result` wrote to a file, equal to the last bit, draws with a seed among
+    it, but for PSFs that vary (Observation.psf_field), which files do not hold: psf is that in the
+    middle, `rendered` what each source's own made of it.
 
     Raises FileError for a file that does not exist, is not FITS, is damaged, or holds no blend, and
     for errors of format 1: they were not widened for misfitted sources, and may lack what the bound
@@ -151,26 +166,9 @@ def read_result(path) -> Result:
             messages=tuple(about["messages"]),
             seconds=about["seconds"],
             errors=_errors(path, hdus, about["format"]),
+            draws=read_draws(hdus, [(row["n_y"], row["n_x"]) for row in hdus["COMPONENTS"].data]),
             **{key: array_of(hdus[key.upper()]) for key in ARRAYS},
         )
-
-
-def write_catalogue(path, table, *, overwrite=False):
-    """Write a catalogue, whole or not at all: as ECSV or, by the file's name, as FITS.
-
-    path: ends in .ecsv, .fits or .fits.gz; table: of `catalogue`
-    Raises FileError when the file exists or cannot be written, ValueError for other endings
-    and columns' names too long for FITS.
-    """
-    path = Path(path)
-    if not path.name.endswith((".ecsv", ".fits", ".fits.gz")):
-        raise ValueError(f"path is {path.name}, a catalogue ends in .ecsv, .fits or .fits.gz")
-    check_output(path, overwrite=overwrite)
-    if not path.name.endswith(".ecsv"):
-        hdus = [fits.PrimaryHDU(), _table(table, "CATALOGUE"), _flag_table()]
-        return write_hdus(path, hdus)
-    with whole_file(path) as part:
-        table.write(part, format="ascii.ecsv", overwrite=True)
 
 
 def _about(result):
@@ -188,6 +186,7 @@ def _about(result):
         "frame": _placing(result.frame.grid, result.frame.psf),
         "observations": [
             {key: getattr(o, key) for key in KEPT}
+            | {"unit": o.unit and o.unit.to_string()}
             | {"noise": o.noise and [n.autocorrelation.tolist() for n in o.noise]}
             | _placing(o.grid, o.psf)
             for o in result.observations
@@ -205,21 +204,6 @@ def _about_table(about):
     # JSON writes float64 with the digits that give it back, and anything else than ASCII escaped
     values = [json.dumps(value, default=lambda array: array.tolist()) for value in about.values()]
     return fits.BinTableHDU(Table([list(about), values], names=("key", "value")), name="ABOUT")
-
-
-def _flag_table():
-    rows = [(flag.name, flag.value, meaning) for flag, meaning in MEANINGS.items()]
-    return fits.BinTableHDU(Table(rows=rows, names=("flag", "value", "meaning")), name="FLAGS")
-
-
-def _table(table, name):
-    """A table as an HDU; other characters than ASCII, which FITS does not have, become "?"."""
-    check_columns(table.colnames)
-    table = QTable(table, names=[to_ascii(column) for column in table.colnames])
-    table["name"] = [to_ascii(value) for value in table["name"]]
-    hdu = fits.table_to_hdu(table)
-    hdu.name = name
-    return hdu
 
 
 def _placed(grid, number):
@@ -276,8 +260,10 @@ def _source(path, *, kind, **given):
 def _errors(path, hdus, written):
     if "MORPHOLOGYERR" not in hdus:
         return None
-    if written < FORMAT:
-        raise FileError(f"{path}: has errors of format {written}, not {FORMAT}; fit it again")
+    if written < WIDENED:
+        raise FileError(
+            f"{path}: has errors of format {written}, must be {WIDENED} or more: fit it again"
+        )
     flat, maps = array_of(hdus["MORPHOLOGYERR"]), []
     for row in hdus["COMPONENTS"].data:
         shape = int(row["n_y"]), int(row["n_x"])

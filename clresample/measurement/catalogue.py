@@ -49,6 +49,7 @@ class Flag(IntFlag):
         return super()._missing_(int(value))  # tables hold NumPy's integers, enum takes Python's
 
 
+# Meaning of each Flag in words.
 MEANINGS = {
     Flag.EDGE: "at the frame's edge or beside unobserved sky over 1 % of a morphology's peak, or "
     "over 3 % of the flux outside, as the model goes on there",
@@ -63,10 +64,11 @@ MEANINGS = {
 }
 
 
-def catalogue(result, *, magnitudes=False, groups=None) -> QTable:
+def catalogue(result, *, magnitudes=True, groups=None) -> QTable:
     """The catalogue of a fitted blend: one row per source, columns with units.
 
-    result: a fitted blend; magnitudes: add the columns of magnitudes and colours
+    result: a fitted blend; magnitudes: add the columns of magnitudes and colours of bands that have
+        zero points
     groups (S,): a number for each group of sources, as `Detection.groups`: adds their columns
     returns QTable (S rows, in the order of `result.sources`); what was not measured is NaN:
         name: the source's own, or its number
@@ -88,9 +90,9 @@ def catalogue(result, *, magnitudes=False, groups=None) -> QTable:
             NaN where the result has no Errors, and where the shape was not fitted, as stars'. They,
             and those of fluxes, are larger for misfitted sources, see `Errors`
         flux_*, flux_err_* per band, which is a channel's own name where the observation has no
-            `bands`; of several exposures the one flux that all of them give [uJy where
-            observations have zero points, else counts]: see
-            `fluxes`
+            `bands`; of several exposures the one flux that all of them give [the unit of the data
+            where all observations have the same, else uJy where they have zero points, else
+            counts]: see `fluxes`. NaN where no pixel of the band determines it
         mag_*, mag_err_* per band [mag, AB]: where the flux is positive
         colour_A_B, colour_err_A_B [mag]: mag_A - mag_B of bands A, B next to each other; the
             error from the covariance of the two fluxes, see `channel_covariances`, to first order:
@@ -113,8 +115,11 @@ def catalogue(result, *, magnitudes=False, groups=None) -> QTable:
     return table
 
 
-def columns_of(result, *, magnitudes=False, groups=None) -> Columns:
-    """The same as `catalogue`, before it is a table."""
+def columns_of(result, *, magnitudes=True, groups=None, bands=None) -> Columns:
+    """The same as `catalogue`, before it is a table.
+
+    bands: names in the order whose neighbours make colours; None = as in the result
+    """
     worst, misfit = channel_residuals(result), result.misfit
     flux, covariance = fluxes(result)
     error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).T)  # (S, C)
@@ -136,10 +141,11 @@ def columns_of(result, *, magnitudes=False, groups=None) -> Columns:
     for band, i in result.bands.items():
         table.put(f"flux_{band}", flux[:, i] * scale[i], unit[i])
         table.put(f"flux_err_{band}", error[:, i] * scale[i], unit[i])
-        if magnitudes and unit[i] == u.uJy:
-            _add_magnitudes(table, band, flux[:, i] * scale[i], error[:, i] * scale[i])
+        if magnitudes and unit[i] != u.ct:
+            to_ujy = scale[i] * unit[i].to(u.uJy)
+            _add_magnitudes(table, band, flux[:, i] * to_ujy, error[:, i] * to_ujy)
     if magnitudes:
-        _add_colours(table, result, flux)
+        _add_colours(table, result, flux, bands or list(result.bands))
     if groups is not None:
         table.put("group_id", np.asarray(groups))
         add_groups(table, result, flux, covariance, groups)
@@ -254,20 +260,18 @@ def _add_magnitudes(table, channel, flux_ujy, error_ujy):
     table.put(f"mag_err_{channel}", 2.5 / np.log(10) * error_ujy / flux_ujy, u.mag)
 
 
-def _add_colours(table, result, flux):
+def _add_colours(table, result, flux, bands):
     """Columns of colours of neighbouring bands that have magnitudes; flux (S, C)."""
     covariance = channel_covariances(result)
-    for (a, i), (b, j) in pairwise(result.bands.items()):
+    for a, b in pairwise(bands):
         if f"mag_{a}" not in table or f"mag_{b}" not in table:
             continue
-        one, other = (np.where(flux[:, k] > 0, flux[:, k], np.nan) for k in (i, j))
+        pair = [result.bands[a], result.bands[b]]
+        one, other = (np.where(flux[:, k] > 0, flux[:, k], np.nan) for k in pair)
         slopes = np.stack([1 / one, -1 / other], axis=1)  # of ln(flux ratio)
-        both = covariance[:, [[i], [j]], [i, j]]
-        with np.errstate(invalid="ignore"):  # infinite variances
-            error = np.sqrt(np.einsum("sa,sab,sb->s", slopes, both, slopes))
-        known = np.isfinite(both).all((1, 2))
+        both = covariance[:, pair][:, :, pair]
+        error = np.sqrt(np.einsum("sa,sab,sb->s", slopes, both, slopes))
         table.put(f"colour_{a}_{b}", table[f"mag_{a}"] - table[f"mag_{b}"], u.mag)
-        error = np.where(known, error, np.where(np.isfinite(slopes).all(1), np.inf, np.nan))
         table.put(f"colour_err_{a}_{b}", 2.5 / np.log(10) * error, u.mag)
 
 

@@ -21,8 +21,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..deblending.spectra import MODEL_ERROR
+from ..drawing.shown import ShownDetection
 from ..sky.frame import Frame, model_frame
-from ..sky.observation import Observation
+from ..sky.observation import Observation, as_observations
 from ..sky.sources import Extended
 from .clumps import bodies_of
 from .companions import (
@@ -47,8 +48,8 @@ MIN_AREA_BESIDE = 0.125
 ALL = "all"  # the name of the combined image
 
 
-@dataclass(frozen=True, eq=False)
-class Detection:
+@dataclass(frozen=True, eq=False, repr=False)
+class Detection(ShownDetection):
     """Sources that `detect` or `detect_more` found, S of them, brightest peak first.
 
     sources (S,): Extended, at the pixel of their peak
@@ -77,7 +78,8 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> D
     that source again, the FWHM being that of the image's PSF. At last the sharpest image is
     searched without the symmetric light of what was found. Needs `sep` (the extra `detect`).
 
-    observations: sequence of Observation, as `check_observations` takes them
+    observations: sequence of Observation, as `check_observations` takes them, or of astropy's
+        NDData and CCDData that have a PSF
     frame: Frame to search and to place the sources in; None = `model_frame(observations)`
     threshold [sigma]: least signal to noise of a peak. 5 is reached by white noise once in two
         million independent pixels of one image; lower thresholds find more noise
@@ -90,7 +92,8 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> D
     not fit together; ImportError, with what to install, without `sep`.
     Source: see the head of this module.
     """
-    frame = frame or model_frame(observations)
+    observations = as_observations(observations)
+    frame = model_frame(observations) if frame is None else frame
     return _search(observations, frame, threshold, [], scatters)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from astropy import units as u
 
 from ..deblending.cutouts.separation import faintest_light, fraction_of, source_image
-from .quality import fitted_sources
+from ..deblending.posterior.sampling import undetermined
 
 
 def fluxes(result):
@@ -21,9 +21,9 @@ def fluxes(result):
     see `Errors.released`; it may be below 0 by chance.
 
     result: a fitted blend
-    returns flux (S, C) [counts]: NaN for a source without components; covariance (C, S, S)
-        [counts^2]: the variance is infinite where a channel does not determine a flux, and for
-        sources without components
+    returns flux (S, C) [counts] and covariance (C, S, S) [counts^2]: flux and variance are NaN
+        where a channel does not determine a flux, as one without weights, and for sources without
+        components; their covariances with others are 0
     """
     sums = np.zeros((len(result.sources), len(result.components)))
     for i, component in enumerate(result.components):
@@ -33,18 +33,16 @@ def fluxes(result):
     flux = sums @ spectra_of(result)
     if result.errors is not None:
         flux = flux + result.errors.released
-    flux[~fitted_sources(result)] = np.nan
     known = np.isfinite(np.diagonal(result.covariance, axis1=1, axis2=2))  # (C, n)
     both = known[:, :, None] & known[:, None, :]
     if result.errors is None:
         summed = sums @ np.where(both, result.covariance, 0.0) @ sums.T
     else:
         summed = result.errors.flux.copy()
-    # a component that is zero everywhere adds no flux, and no variance even where it is unknown
-    lost = (~known) @ (sums != 0).T | ~fitted_sources(result)
-    i_channel, i_source = np.nonzero(lost)
+    i_source, i_channel = np.nonzero(undetermined(result))
     summed[i_channel, i_source] = summed[i_channel, :, i_source] = 0.0
-    summed[i_channel, i_source, i_source] = np.inf
+    summed[i_channel, i_source, i_source] = np.nan
+    flux[i_source, i_channel] = np.nan
     return flux, summed
 
 
@@ -53,7 +51,7 @@ def channel_covariances(result):
 
     Morphologies that are not known move the fluxes of all channels together, so that colours are
     known better than fluxes. Without Errors channels are independent. Settings.flux_floor is in it
-    as common to all channels. The variance is infinite as in `fluxes`.
+    as common to all channels. The variance is NaN as in `fluxes`.
     """
     variance = np.diagonal(fluxes(result)[1], axis1=1, axis2=2).T  # (S, C)
     found = np.zeros((*variance.shape, variance.shape[1]))
@@ -74,10 +72,11 @@ def redistribute(result, i_observation) -> np.ndarray:
     without the sky, unless all models are fainter there than 1e-5 of the channel's brightest model
     pixel: there all shares are 0.
 
-    result: a fitted blend; i_observation: number of the observation
+    result: a fitted blend; i_observation: number or name of the observation
     returns (S, Co, My, Mx) [counts]: NaN where the data have no weight
     Source: the deblender of SDSS (R. Lupton), with fitted models as its templates.
     """
+    i_observation = result.index_of(i_observation)
     observation = result.observations[i_observation]
     channels = result.channel_slices()[i_observation]
     whole = tuple(slice(0, n) for n in observation.shape[1:])
@@ -100,12 +99,19 @@ def spectra_of(result):
 
 
 def flux_scale(result):
-    """Per channel, what turns counts into the catalogue's unit, and that unit."""
+    """Per channel, what turns counts into the catalogue's unit, and that unit.
+
+    The unit of the data where all observations have the same one; else uJy, or counts without zero
+    points.
+    """
+    units = {o.unit for o in result.observations}
+    shared = units.pop() if len(units) == 1 else None
     scale, unit = [], []
     for o in result.observations:
-        given = o.flux_scale is not None
-        scale += list(o.flux_scale) if given else [1.0] * len(o.channels)
-        unit += [u.uJy if given else u.ct] * len(o.channels)
+        one = shared or (u.ct if o.flux_scale is None else u.uJy)
+        counts = shared is not None or o.flux_scale is None
+        scale += [1.0] * len(o.channels) if counts else list(o.flux_scale)
+        unit += [one] * len(o.channels)
     return scale, unit
 
 
@@ -115,18 +121,19 @@ def group_fluxes(flux, covariance, groups):
         F_g = sum_s F_s,   var F_g = sum_st cov(F_s, F_t)   over s, t in g
 
     flux (S, C), covariance (C, S, S): as `fluxes` returns them; groups (S,): a value for
-    each group. Of members without a flux, whose variance is infinite, none is added: the error is
-    infinite too
+    each group. Both are NaN where a member has no flux
     """
     _, number = np.unique(np.asarray(groups), return_inverse=True)
     member = np.zeros((number.max(initial=-1) + 1, len(number)))
     member[number, np.arange(len(number))] = 1.0
-    total = member @ np.where(np.isfinite(flux), flux, 0.0)
+    known = np.isfinite(flux)
+    total = member @ np.where(known, flux, 0.0)
+    total[member @ ~known > 0] = np.nan
     variances = np.diagonal(covariance, axis1=1, axis2=2)
     known = np.isfinite(variances)
     summed = np.where(known[:, :, None] & known[:, None, :], covariance, 0.0)
     variance = np.einsum("gs,cst,gt->gc", member, summed, member)
-    variance[member @ ~known.T > 0] = np.inf
+    variance[member @ ~known.T > 0] = np.nan
     return total[number], np.sqrt(np.maximum(variance, 0.0))[number]
 
 
@@ -154,7 +161,7 @@ def whole_groups(rows, bands):
     for band in bands:
         if f"flux_{band}" not in rows:
             continue
-        total = np.bincount(number, np.nan_to_num(rows[f"flux_{band}"]))
+        total = np.bincount(number, np.asarray(rows[f"flux_{band}"], float))
         variance = np.bincount(number, np.asarray(rows[f"flux_err_{band}"], float) ** 2)
         rows[f"group_flux_{band}"][apart] = total[number][apart]
         rows[f"group_flux_err_{band}"][apart] = np.sqrt(variance)[number][apart]

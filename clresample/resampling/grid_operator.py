@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ..sky.given.checks import float_type, instance, numbers
-from ..sky.grid import Grid
+from ..sky.given.observed import PSFLike, as_psf
+from ..sky.grid import GridLike, as_grid
 from ..sky.mapping import Mapping
-from ..sky.psf import PSF
 from .linop import LinOp
 from .transfer import Certificate
 
@@ -15,8 +15,10 @@ from .transfer import Certificate
 class GridOperator(LinOp):
     """A linear operator from images on one pixel grid to images on another.
 
-    grid_in, grid_out (Grid): pixels of the model and of the observation
-    psf_in (1 or C bands), psf_out (1 or C bands): their PSFs, each in its own grid's pixels
+    grid_in, grid_out (Grid): pixels of the model and of the observation, or WCS that know their
+        shapes
+    psf_in (1 or C bands), psf_out (1 or C bands): their PSFs, each in its own grid's pixels, or
+        images that `PSF` takes
     dtype: float32, or float64 where the device has it
     device: as `get_device` takes it; None = the default one
     shift (2,) [model px]: moves every observed pixel; may be set again at any time
@@ -40,17 +42,18 @@ class GridOperator(LinOp):
 
     def __init__(
         self,
-        grid_in: Grid,
-        psf_in: PSF,
-        grid_out: Grid,
-        psf_out: PSF,
+        grid_in: GridLike,
+        psf_in: PSFLike,
+        grid_out: GridLike,
+        psf_out: PSFLike,
         *,
         dtype=np.float32,
         device=None,
         shift=(0.0, 0.0),
         tolerance_px=1e-4,
     ):
-        check_parts((psf_in, psf_out), (grid_in, grid_out))
+        grid_in, grid_out = as_grid("grid_in", grid_in), as_grid("grid_out", grid_out)
+        psf_in, psf_out = as_psf("psf_in", psf_in), as_psf("psf_out", psf_out)
         dtype = float_type(dtype)
         mapping = grid_out.map_to(grid_in, tolerance_px=tolerance_px)
         self._prepare(mapping, psf_in, psf_out, dtype, device)
@@ -60,8 +63,8 @@ class GridOperator(LinOp):
     def from_mapping(
         cls,
         mapping: Mapping,
-        psf_in: PSF,
-        psf_out: PSF,
+        psf_in: PSFLike,
+        psf_out: PSFLike,
         *,
         dtype=np.float32,
         device=None,
@@ -69,11 +72,14 @@ class GridOperator(LinOp):
     ):
         """The operator of a mapping, observed pixels -> model pixels, instead of two grids."""
         instance("mapping", mapping, Mapping)
-        check_parts((psf_in, psf_out))
+        psf_in, psf_out = as_psf("psf_in", psf_in), as_psf("psf_out", psf_out)
         op, dtype = cls.__new__(cls), float_type(dtype)
         op._prepare(mapping, psf_in, psf_out, dtype, device)
         op.shift = shift
         return op
+
+    def _about(self):
+        return (self.geometry,) + (("shifted",) if self._shift.any() else ())
 
     def _prepare(self, mapping, psf_in, psf_out, dtype, device):
         """Everything but the shift, from a mapping; calls `_begin` first."""
@@ -137,13 +143,6 @@ class GridOperator(LinOp):
         with self._lock:
             self._shift = shift
             self._use_shift()
-
-
-def check_parts(psfs, grids=()):
-    """Raise ValueError where PSFs or grids of an operator, (in, out), are something else."""
-    for what, parts, kind in (("grid", grids, Grid), ("psf", psfs, PSF)):
-        for side, part in zip(("in", "out"), parts):
-            instance(f"{what}_{side}", part, kind)
 
 
 def _one_or_all(values):

@@ -16,10 +16,10 @@ class LinOp:
     shape_in, shape_out: shapes of one item, for images (C, Ny, Nx)
     dtype: float32 or float64, of both sides
 
-    NumPy arrays in give NumPy arrays out; pyopencl arrays in give pyopencl arrays out and never
-    touch the host.  Where both sides have one band, (Ny, Nx) images may be given without the band
-    axis.  Subclasses implement `_forward` and `_adjoint` on device arrays (B,) + shape; both
-    overwrite `out` and leave their input alone.
+    NumPy arrays in give NumPy arrays out, a Quantity one in its unit; pyopencl arrays in give
+    pyopencl arrays out and never touch the host.  Where both sides have one band, (Ny, Nx) images
+    may be given without the band axis.  Subclasses implement `_forward` and `_adjoint` on device
+    arrays (B,) + shape; both overwrite `out` and leave their input alone.
 
     Safe to use from several threads: intermediates and staging arrays are one set an operator, so
     each call has the operator for itself between upload and download. Casting NumPy arrays to
@@ -31,6 +31,14 @@ class LinOp:
         self.dtype = float_type(dtype)
         self.shape_in, self.shape_out = tuple(shape_in), tuple(shape_out)
         self._staged, self._lock = {}, threading.RLock()
+
+    def __repr__(self):
+        parts = [_pixels(self.shape_in) + " -> " + _pixels(self.shape_out), *self._about()]
+        return f"{type(self).__name__}({', '.join(parts)}, {self.dtype} on {self.device.name})"
+
+    def _about(self):
+        """Words of `repr` between shapes and type."""
+        return ()
 
     def __getstate__(self):
         """Without what belongs to one process: lock and staging arrays, which copies make anew."""
@@ -96,6 +104,9 @@ class LinOp:
     def _apply(self, run, name, x, out, shape_x, shape_out):
         """`run`, one of the two above, on an array `x` of a caller, who calls it `name`."""
         on_device = hasattr(x, "base_data")
+        unit = None if on_device or out is not None else getattr(x, "unit", None)
+        if unit is not None and hasattr(x, "to_value"):
+            return self._apply(run, name, x.to_value(unit), None, shape_x, shape_out) * unit
         if not on_device:
             x = real(name, x)
         batch, shape_result = _match_shape(name, tuple(x.shape), shape_x, shape_out)
@@ -204,6 +215,12 @@ class Adjoint(LinOp):
     def _adjoint(self, y, out):
         """The operator itself."""
         self.op._forward(y, out)
+
+
+def _pixels(shape):
+    """An item's shape in words: bands, if more than one, and pixels."""
+    *bands, n_y, n_x = (1, *shape) if len(shape) == 1 else shape
+    return "".join(f"{n} bands of " for n in bands if n > 1) + f"{n_y} x {n_x} px"
 
 
 def _match_shape(name, shape, shape_x, shape_out):

@@ -35,7 +35,7 @@ def _to_pixels(grid, positions_arcsec):
     return np.linalg.solve(grid.jacobian, (positions_arcsec - grid.origin).T).T
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SimulatedImage:
     """What one instrument sees of a scene of S sources, and the truth behind it.
 
@@ -58,6 +58,10 @@ class SimulatedImage:
     magnitudes: np.ndarray
     counts: np.ndarray
     positions_px: np.ndarray
+
+    def __repr__(self):
+        n_y, n_x = self.grid.shape
+        return f"SimulatedImage({self.survey.name} {' '.join(self.survey.bands)}, {n_y} x {n_x} px)"
 
     @property
     def weights(self):
@@ -84,7 +88,7 @@ class SimulatedImage:
         return replace(self, data=self.contributions.sum(axis=0) + noise)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SimulatedScene:
     """A blend of S galaxies seen by Euclid and Rubin.
 
@@ -101,6 +105,14 @@ class SimulatedScene:
     profiles: tuple
     galaxies: tuple | None
     positions_arcsec: np.ndarray
+
+    def __repr__(self):
+        return (
+            f"SimulatedScene(seed {self.seed}: {len(self)} galaxies; {self.euclid}, {self.rubin})"
+        )
+
+    def __len__(self):
+        return len(self.positions_arcsec)
 
     @property
     def images(self):

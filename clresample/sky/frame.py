@@ -9,8 +9,9 @@ from functools import lru_cache
 import numpy as np
 
 from .extent import boxes_meet, intersection, overlap, union
-from .grid import Grid
-from .observation import check_observations
+from .given.observed import as_psf
+from .grid import Grid, as_grid
+from .observation import as_observations, check_observations
 from .psf import PSF
 
 # [sigma] half-width of the model PSF's image: less than 1e-16 of the light lies beyond, float64's
@@ -24,12 +25,18 @@ SAME_SCALE = 1e-6
 class Frame:
     """Pixels and PSF of the model.
 
-    grid: Grid of the model's pixels (Ny, Nx)
+    grid: Grid of the model's pixels (Ny, Nx), or a WCS that knows its shape
     psf: PSF of one band in these pixels, pixel response included; see `model_frame`
+
+    Raises ValueError for anything else.
     """
 
     grid: Grid
     psf: PSF
+
+    def __post_init__(self):
+        object.__setattr__(self, "grid", as_grid("grid", self.grid))
+        object.__setattr__(self, "psf", as_psf("psf", self.psf))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -79,6 +86,7 @@ def model_frame(observations, *, grid=None, psf_sigma_px=0.8, shared=False) -> F
     an observation overlaps none of the others, or not the frame, and for what `check_observations`
     finds.
     """
+    observations = as_observations(observations)
     check_observations(observations)
     if not 0 < psf_sigma_px < math.inf:
         raise ValueError(f"psf_sigma_px must be a positive number of pixels, not {psf_sigma_px}")
@@ -88,6 +96,7 @@ def model_frame(observations, *, grid=None, psf_sigma_px=0.8, shared=False) -> F
         _check_connected(observations, like)
         extent = intersection if shared else union
         grid = extent([o.grid for o in observations], like=like)
+    grid = as_grid("grid", grid)
     for observation in observations:
         if observation.grid.is_flat != grid.is_flat:
             raise ValueError(

@@ -9,13 +9,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from astropy.wcs import WCS
+from astropy.wcs.wcsapi import BaseHighLevelWCS, BaseLowLevelWCS
 
 from ..drawing.shown import ShownGrid
-from .given.checks import arcseconds, image_shape, instance, number, numbers
+from .given.checks import arcseconds, described, image_shape, instance, number, numbers
 from .interface.interface import Interface
 from .mapping import Mapping, map_affine, map_positions
 from .wcs import (
     convert,
+    frame_of,
     pixel_scale,
     pixels_at,
     shifted_wcs,
@@ -105,12 +107,15 @@ class Grid(ShownGrid, ABC):
         """
 
     @abstractmethod
-    def pixel(self, a, b) -> np.ndarray:
+    def pixel(self, a, b=None) -> np.ndarray:
         """Pixel positions at points of the sky, the inverse of `sky`.
 
         a, b: y and x [arcsec] if flat, else longitude and latitude [deg] in the WCS's own frame
-            (right ascension and declination if that is equatorial); any shapes that broadcast
+            (right ascension and declination if that is equatorial); any shapes that broadcast. Or,
+            unless flat, a SkyCoord alone, of any frame
         returns (..., 2) [px]: (y, x); NaN where the projection holds no such point
+
+        Raises ValueError for a SkyCoord on a flat grid.
         """
 
     @abstractmethod
@@ -151,7 +156,8 @@ class Grid(ShownGrid, ABC):
         Raises ValueError when one grid is flat and the other not, when no pixel has a place in
         `grid_in`'s projection, and for a singular Jacobian.
         """
-        self.check_like(instance("grid_in", grid_in, Grid), "grid_in")
+        grid_in = as_grid("grid_in", grid_in)
+        self.check_like(grid_in, "grid_in")
         tolerance = number("tolerance_px", tolerance_px, "0 or more", lambda x: 0 <= x < math.inf)
         return self._map_to(grid_in, tolerance)
 
@@ -189,8 +195,13 @@ class FlatGrid(Grid):
         origin = self.origin.reshape((2,) + (1,) * n.ndim)
         return np.tensordot(self.jacobian, np.stack([n, m]), 1) + origin
 
-    def pixel(self, a, b):
+    def pixel(self, a, b=None):
         """Pixels (..., 2) at (y, x) = (a, b) [arcsec]: J^-1 ((a, b) - origin)."""
+        if b is None:
+            raise ValueError(
+                f"position is {described(a)}, but this grid is flat: give (y, x) [arcsec], or the "
+                "grid a WCS (Grid.to_wcs)"
+            )
         inverse = np.linalg.inv(self.jacobian)
         return (np.stack(_float_arrays(a, b), axis=-1) - self.origin) @ inverse.T
 
@@ -242,8 +253,11 @@ class WcsGrid(Grid):
         """Longitude and latitude (2, ...) [deg] at pixels (n, m)."""
         return world_at(self.wcs, *_float_arrays(n, m))
 
-    def pixel(self, a, b):
-        """Pixels (..., 2) at longitudes a and latitudes b [deg]."""
+    def pixel(self, a, b=None):
+        """Pixels (..., 2) at longitudes a and latitudes b [deg], or at a SkyCoord a."""
+        if b is None:
+            sky = a.transform_to(frame_of(self.wcs)).spherical
+            a, b = sky.lon.deg, sky.lat.deg
         a, b = _float_arrays(a, b)
         return pixels_at(self.wcs, a.ravel(), b.ravel()).reshape(a.shape + (2,))
 
@@ -285,6 +299,27 @@ class WcsGrid(Grid):
         if mapping.positions is None:
             LAST[self] = weakref.ref(grid_in), tolerance_px, mapping
         return mapping
+
+
+# A Grid, or a WCS of astropy or of another package.
+GridLike = Grid | BaseLowLevelWCS | BaseHighLevelWCS
+
+
+def as_grid(name, grid, shape=None) -> Grid:
+    """The Grid, made of a WCS where one is given: astropy's, gwcs, or any other of APE 14.
+
+    shape (..., Ny, Nx) [px]: of the image; None = as the WCS knows it (array_shape)
+
+    Raises ValueError for anything else, and for a WCS without a shape.
+    """
+    if not isinstance(grid, BaseLowLevelWCS | BaseHighLevelWCS):
+        return instance(name, grid, Grid)
+    if shape is None:
+        low = grid.low_level_wcs if isinstance(grid, BaseHighLevelWCS) else grid
+        shape = low.array_shape
+    if shape is None or len(shape) < 2:
+        raise ValueError(f"{name} is a WCS without a shape: give Grid.from_wcs(wcs, shape)")
+    return Grid.from_wcs(grid, shape)
 
 
 def _cos_sin(angle_deg):

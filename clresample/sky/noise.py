@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import math
+import warnings
 from statistics import NormalDist
 
 import numpy as np
 
-from .given.checks import mask_of, numbers, split_mask
+from .given.checks import mask_of, numbers, split_mask, without_unit
+
+
+class NoiseWarning(UserWarning):
+    """An image without weights, whose noise was estimated from its background."""
+
 
 # [sigma] pixels further from the median are sources: one in 370 of pure noise is lost
 CLIP = 3.0
@@ -118,18 +124,58 @@ def _usable(image, mask):
     return image[good]
 
 
-def weights_from(data, bad, weights, variance, mask, channels):
+def weights_from(data, bad, given, mask, channels, unit=None):
     """Weights (C, Ny, Nx), `n_bad` and messages of an Observation, from what its user gave.
 
     data (C, Ny, Nx) float64; bad (C, Ny, Nx) bool: pixels where they are NaN or infinite
-    weights, variance, mask: as in Observation, None where they are not given
-    channels (C,): names
+    given: weights and variance, and mask: as in Observation, None where they are not given
+    channels (C,): names; unit: of the data, None where they have none
 
-    Raises ValueError where Observation does, for these.
+    Warns (NoiseWarning) of noise that is estimated. Raises ValueError where Observation does, for
+    these.
     """
+    weights, variance = given
     if weights is not None and variance is not None:
         raise ValueError("weights and variance are both given: an observation takes one")
-    masked, messages = mask_from(mask, data.shape), []
+    mask, estimates = mask_from(mask, data.shape), []
+    if not (_has_gaps("weights", weights, data) or _has_gaps("variance", variance, data)):
+        found = _weights_of(data, bad, given, mask, channels, unit, estimates)
+    else:
+        parts = [
+            _weights_of(
+                data[c : c + 1],
+                bad[c : c + 1],
+                (weights and weights[c], variance and variance[c]),
+                mask[c : c + 1],
+                channels[c : c + 1],
+                unit,
+                estimates,
+            )
+            for c in range(len(data))
+        ]
+        images, counts, messages = zip(*parts, strict=True)
+        found = np.concatenate(images), sum(counts), [line for one in messages for line in one]
+    if estimates:
+        warnings.warn("; ".join(estimates), NoiseWarning, stacklevel=3)
+    return found
+
+
+def _has_gaps(name, values, data):
+    """Whether values are a list with one for each channel and None among them."""
+    if not isinstance(values, list | tuple) or not any(one is None for one in values):
+        return False
+    if len(values) != len(data):
+        raise ValueError(f"{name} has {len(values)} values, data have {len(data)} channels")
+    return True
+
+
+def _weights_of(data, bad, given, mask, channels, unit, estimates):
+    """As `weights_from`, of values without gaps; what is estimated is added to `estimates`."""
+    weights, variance = given
+    masked, messages = mask, []
+    if unit is not None:
+        weights = without_unit("weights", weights, unit**-2)
+        variance = without_unit("variance", variance, unit**2)
     weights, hidden = split_mask("weights", weights)
     variance, unknown = split_mask("variance", variance)
     for name, more in (("weights", hidden), ("variance", unknown)):
@@ -140,11 +186,13 @@ def weights_from(data, bad, weights, variance, mask, channels):
     elif variance is not None:
         weights, no_weight = _inverse(variance, data.shape)
     else:
-        weights, messages = _estimated(data, bad | masked, channels)
+        weights, messages = _estimated(data, bad | masked, channels, unit or "counts")
+        estimates += messages
         no_weight = np.zeros_like(bad)
     n_bad = int(np.count_nonzero(~masked & (no_weight | (bad & (weights > 0)))))
     weights = np.where(bad | masked, 0.0, weights)
     _check_range(data, weights)
+    messages = list(messages)
     if n_bad:
         messages.append(
             f"{n_bad} of {data.size} pixels have weight 0: no usable data, weight or variance"
@@ -224,8 +272,9 @@ def _inverse(variance, shape):
     return np.divide(1.0, variance, out=np.zeros(shape), where=good), ~good
 
 
-def _estimated(data, ignored, channels):
-    """Weights (C, Ny, Nx) from each channel's own background, and messages on the estimate."""
+def _estimated(data, ignored, channels, unit):
+    """Weights (C, Ny, Nx) from each channel's own background, and messages on the estimate, which
+    name the unit."""
     weights, messages = np.ones(data.shape), []
     for i, channel in enumerate(channels):
         if ignored[i].all():
@@ -236,6 +285,6 @@ def _estimated(data, ignored, channels):
             raise ValueError(f"channel {channel}: {error}; give weights or variance") from None
         weights[i] = sigma**-2
         messages.append(
-            f"noise of channel {channel} estimated from the background: sigma = {sigma:.4g} counts"
+            f"noise of channel {channel} estimated from the background: sigma = {sigma:.4g} {unit}"
         )
     return weights, messages

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import copy
+import operator
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..drawing.shown import ShownObservation
 from .correlation import NoiseCorrelation, noise_of_channels
-from .given.checks import ReadOnly, instance
+from .given.checks import ReadOnly, described
+from .given.containers import arguments_of, is_container
 from .given.derived import ZERO_POINT_UJY as ZERO_POINT_UJY, DerivedQuantities
 from .given.observed import bands_of, channels_of, images_of, per_channel, psfs_of, saturation_of
+from .given.units import flux_unit, take_unit, zero_points_of
 from .grid import Grid
 from .noise import weights_from
 from .psf import PSF
@@ -25,13 +28,15 @@ class Observation(ReadOnly, ShownObservation, DerivedQuantities):
         chi2 = sum weights (model - data)^2
 
     data (C, Ny, Nx) [counts per pixel]: background-subtracted images; (Ny, Nx) is one channel. Read
-        back, they are float64 and hold 0 where they were NaN or infinite
-    psf: PSF of C bands, pixel response included; one band serves all channels. Or a PSFField: fits
-        render each source with the PSF at its position
-    grid: Grid of (Ny, Nx)
+        back, they are float64 and hold 0 where they were NaN or infinite. A Quantity of counts or
+        of flux density per pixel (data * u.nJy) keeps its unit: see `unit`
+    psf: PSF of C bands, pixel response included; one band serves all channels. Or its images, an
+        array that `PSF` takes. Or a PSFField: fits render each source with the PSF at its position
+    grid: Grid of (Ny, Nx), or the WCS of these pixels, of astropy or gwcs
     weights [counts^-2]: inverse variance, 0 = ignore this pixel; or, instead of it,
     variance [counts^2]: NaN, infinite, zero and negative ones mean: ignore this pixel. Weights and
-        variances are (C, Ny, Nx), or (Ny, Nx) for all channels, (C,) or one number for all pixels
+        variances are (C, Ny, Nx), or (Ny, Nx) for all channels, (C,) or one number for all pixels,
+        or a list of C of these, None where a channel's noise is to be estimated
     mask (C, Ny, Nx) or (Ny, Nx): True = ignore this pixel; may come with either of the two or
         alone. Masks of masked arrays among data, weights and variance mean the same
     channels (C,): names, unique over all instruments; None numbers them after `name`
@@ -45,17 +50,21 @@ class Observation(ReadOnly, ShownObservation, DerivedQuantities):
     name: of the instrument, for messages
     saturation (C,) or one number [counts]: values of data from which on pixels are saturated,
         infinite where unknown; None = unknown in all channels
+    unit: of data without one of their own, an astropy unit or its name. A flux density sets
+        zero_points, and is the unit of the catalogue's fluxes where all observations have it
 
     With neither weights nor variance the noise is estimated, channel by channel, from the scatter
-    of the background (`noise_sigma`), and reported: one number, without sources' photon noise.
+    of the background (`noise_sigma`): one number, without sources' photon noise. Warns
+    (NoiseWarning) of it.
 
     Read back: data and weights (C, Ny, Nx) float64, psf of C bands, that in the middle, psf_field
     of C bands where it varies, else None, zero_points and noise (C,) or None, n_bad = number of
     unmasked pixels whose weight became 0 because data, weight or variance is none, messages;
-    saturation (C,) or None
+    saturation (C,) or None, unit of flux density or None, of counts
 
     Raises ValueError for shapes that disagree, negative or infinite weights, masks not of 0 and 1,
-    names not unique, weights beside variance, noise not to be found, and what is no real number.
+    names not unique, weights beside variance, noise not to be found, units that do not fit, and
+    what is no real number.
     """
 
     data: np.ndarray
@@ -69,6 +78,7 @@ class Observation(ReadOnly, ShownObservation, DerivedQuantities):
     noise: tuple[NoiseCorrelation, ...] | None
     name: str | None
     saturation: np.ndarray | None
+    unit: object
     n_bad: int
     messages: tuple[str, ...]
 
@@ -87,13 +97,21 @@ class Observation(ReadOnly, ShownObservation, DerivedQuantities):
         noise=None,
         name=None,
         saturation=None,
+        unit=None,
     ):
-        data, mask = images_of(data, instance("grid", grid, Grid), mask)
+        if is_container(data):
+            raise ValueError(
+                f"data is of type {type(data).__name__}: give Observation.from_nddata(image, psf)"
+            )
+        data, unit = take_unit(data, unit)
+        flux = flux_unit(unit)
+        data, mask, grid = images_of(data, grid, mask)
         psfs = psfs_of(psf, data.shape)
         bad = ~np.isfinite(data)
         channels = channels_of(channels, name, len(data))
+        given = weights, variance
+        weights, n_bad, messages = weights_from(data, bad, given, mask, channels, unit)
         zero_points = per_channel("zero_points", zero_points, len(data))
-        weights, n_bad, messages = weights_from(data, bad, weights, variance, mask, channels)
         data = np.where(bad, 0.0, data)
         noise, found = noise_of_channels(noise, data, weights, channels)
         messages += found
@@ -104,10 +122,11 @@ class Observation(ReadOnly, ShownObservation, DerivedQuantities):
             weights=weights,
             channels=channels,
             bands=bands_of(bands, channels),
-            zero_points=zero_points,
+            zero_points=zero_points_of(flux, zero_points, len(data)),
             noise=noise,
             name=name,
-            saturation=saturation_of(saturation, len(data)),
+            saturation=saturation_of(saturation, len(data), unit),
+            unit=flux,
             n_bad=n_bad,
             messages=tuple(messages),
         )
@@ -118,6 +137,20 @@ class Observation(ReadOnly, ShownObservation, DerivedQuantities):
             if key in ("data", "weights"):
                 value.flags.writeable = False
             object.__setattr__(self, key, value)
+
+    @classmethod
+    def from_nddata(cls, image, psf=None, **given) -> Observation:
+        """An Observation of an astropy NDData, CCDData or Cutout2D.
+
+        image: its data (Ny, Nx) or (C, Ny, Nx), unit, wcs, mask (True = ignore) and uncertainty
+            (standard deviation, variance or inverse variance); a Cutout2D has data and wcs only
+        psf: as for Observation; None = that of the image, which a CCDData may have
+        given: more arguments of Observation (weights, variance, mask, ...), instead of the image's
+
+        Raises ValueError for an image without a WCS or a PSF, with an uncertainty of another kind,
+        and as Observation does.
+        """
+        return cls(**arguments_of(image, psf, given))
 
     @classmethod
     def restore(cls, data, psf, grid, *, weights, n_bad, messages, **given) -> Observation:
@@ -144,6 +177,45 @@ def masked(observation, pixels) -> Observation:
     made.__dict__.pop("white", None)  # that of the observation before
     made._set(weights=np.where(pixels, 0.0, observation.weights))
     return made
+
+
+def as_observations(observations) -> tuple[Observation, ...]:
+    """Observations from a list that may hold astropy's images, NDData or CCDData with a PSF.
+
+    Images are named by their place in the list, image0 and so on. Anything else is left as it is.
+    Raises ValueError for one observation instead of a list, and for images without a WCS or a PSF.
+    """
+    if isinstance(observations, Observation) or is_container(observations):
+        raise ValueError("observations is a single one, must be a sequence: give [observation]")
+    try:
+        observations = tuple(observations)
+    except TypeError:
+        raise ValueError(
+            f"observations is {described(observations)}, must be a sequence of Observation"
+        ) from None
+    return tuple(
+        Observation.from_nddata(o, name=f"image{i}") if is_container(o) else o
+        for i, o in enumerate(observations)
+    )
+
+
+def observation_index(observations, key) -> int:
+    """The number of an observation, from its number or name (label where it has no name).
+
+    Raises ValueError for a name that none of them or several have, and for another number.
+    """
+    n = len(observations)
+    if not isinstance(key, str):
+        i = operator.index(key)
+        if not -n <= i < n:
+            raise ValueError(f"observation is {i}, must be a number below {n} or a name")
+        return i % n
+    found = [i for i, o in enumerate(observations) if key in (o.name, o.label)]
+    if len(found) == 1:
+        return found[0]
+    labels = ", ".join(repr(o.label) for o in observations) or "none"
+    how_many = "no observation has" if not found else f"{len(found)} observations have"
+    raise ValueError(f"observation is {key!r}, but {how_many} this name: given are {labels}")
 
 
 def check_observations(observations):

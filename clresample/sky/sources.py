@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from astropy.coordinates import ICRS, BaseCoordinateFrame, SkyCoord
 
 from .given.checks import numbers, whole
+from .observation import observation_index
 
 
 class SourceWarning(UserWarning):
@@ -17,7 +19,9 @@ class SourceWarning(UserWarning):
 class Source:
     """A source at one position, given on the sky, in an observation's or in the model's pixels.
 
-    sky_deg (2,) [deg]: right ascension and declination (for a flat sky: y, x [arcsec])
+    sky_deg (2,) [deg]: right ascension and declination (for a flat sky: y, x [arcsec]), or
+        longitude and latitude in the WCS's own frame. Or a SkyCoord of one place, in any frame: it
+        is kept in degrees, with `sky_frame`
     position_px (2,) [px]: (y, x), the centre of the first pixel at (0, 0); exactly one of the two
         is given
     observation: the name of the Observation whose pixels position_px counts (its label, where it
@@ -25,6 +29,7 @@ class Source:
         footprints (see `model_frame`), of which few users know the first pixel: give the frame
         too, or the observation's name
     name: how the catalogue calls it; None numbers it
+    sky_frame: "icrs" where sky_deg was a SkyCoord; None = numbers in the frame of the grid's WCS
 
     Raises ValueError where not exactly one finite position is given, and for an observation beside
     sky_deg.
@@ -34,6 +39,7 @@ class Source:
     position_px: tuple[float, float] | None = None
     observation: str | None = None
     name: str | None = None
+    sky_frame: str | None = None
 
     def __post_init__(self):
         if (self.sky_deg is None) == (self.position_px is None):
@@ -42,9 +48,15 @@ class Source:
                 f"not sky_deg={self.sky_deg} with position_px={self.position_px}"
             )
         name = "sky_deg" if self.position_px is None else "position_px"
+        if name == "sky_deg" and isinstance(self.sky_deg, BaseCoordinateFrame | SkyCoord):
+            object.__setattr__(self, "sky_deg", _icrs(self.sky_deg))
+            object.__setattr__(self, "sky_frame", ICRS.name)
+        if self.sky_frame not in (None, ICRS.name):
+            raise ValueError(f"sky_frame is {self.sky_frame!r:.80}, must be {ICRS.name!r} or None")
         given = getattr(self, name)
-        position = numbers(name, given, "deg" if name == "sky_deg" else None)
-        if hasattr(given, "unit") and position.shape == (2,):
+        position = numbers(name, given, "deg" if name == "sky_deg" else "pix")
+        plain = isinstance(given, list | tuple) and not any(hasattr(v, "unit") for v in given)
+        if not plain and position.shape == (2,):
             object.__setattr__(self, name, tuple(map(float, position)))
         if position.shape != (2,) or not np.isfinite(position).all():
             raise ValueError(f"{name} is {getattr(self, name)}, it takes two finite numbers")
@@ -62,10 +74,13 @@ class Source:
         ValueError: `observation` names none of them, or more than one
         """
         if self.sky_deg is not None:
-            return grid.pixel(*self.sky_deg)
+            a, b = self.sky_deg
+            if self.sky_frame is None:
+                return grid.pixel(a, b)
+            return grid.pixel(SkyCoord(a, b, unit="deg", frame=self.sky_frame))
         if self.observation is None:
             return np.asarray(self.position_px, dtype=np.float64)
-        i = self._named(observations)
+        i = observation_index(observations, self.observation)
         observations[i].grid.check_like(grid, "frame")
         y, x = np.asarray(self.position_px, dtype=np.float64)
         position = observations[i].grid.positions_in(grid, y, x)
@@ -86,17 +101,19 @@ class Source:
         y, x = map(float, position)
         return replace(self, position_px=(y, x), observation=None)
 
-    def _named(self, observations):
-        """Index of the one observation of this name or label."""
-        found = [i for i, o in enumerate(observations) if self.observation in (o.name, o.label)]
-        if len(found) == 1:
-            return found[0]
-        labels = ", ".join(repr(o.label) for o in observations) or "none"
-        how_many = "no observation has" if not found else f"{len(found)} observations have"
+
+def _icrs(coordinate):
+    """Right ascension and declination [deg] of a SkyCoord of one place.
+
+    Raises ValueError for several places.
+    """
+    if coordinate.shape != ():
         raise ValueError(
-            f"a source's observation is {self.observation!r}, but {how_many} this name: "
-            f"given are {labels}"
+            f"sky_deg is a SkyCoord of shape {coordinate.shape}, must be of one place: give each "
+            "source its own, [Extended(sky_deg=c) for c in coordinates]"
         )
+    sky = SkyCoord(coordinate).icrs
+    return float(sky.ra.deg), float(sky.dec.deg)
 
 
 @dataclass(frozen=True, kw_only=True)

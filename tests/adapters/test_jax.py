@@ -71,3 +71,12 @@ def test_refuses_what_it_cannot_hold(op):
         x = np.random.default_rng(1).standard_normal(double.shape_in)
         gradient = jax.grad(lambda x: 0.5 * (as_jax(double)(x) ** 2).sum())(x)
         np.testing.assert_allclose(gradient, double.adjoint(double(x)), 0, 1e-14)
+
+
+def test_an_image_of_one_band_needs_no_band_axis():
+    one = Resampler(EUCLID, PSF.gaussian(1.6), RUBIN, PSF.gaussian(1.5))
+    f, x = as_jax(one), draw(one.shape_in[1:])
+    np.testing.assert_array_equal(f(x), one(x))
+    gradient = jax.grad(lambda x: 0.5 * (f(x) ** 2).sum())(x)
+    np.testing.assert_allclose(gradient, one.adjoint(one(x)), atol=1e-6)
+    assert jax.vmap(f)(np.stack([x, x])).shape == (2, *RUBIN.shape)

@@ -47,3 +47,10 @@ def test_refuses_other_shapes_and_dtypes(op):
         as_torch(op)(torch.zeros(3, 4))
     with pytest.raises(ValueError, match="float32"):
         as_torch(op)(torch.zeros(op.shape_in, dtype=torch.float32))
+
+
+def test_an_image_of_one_band_needs_no_band_axis():
+    grids = Grid.flat((7, 8), 0.1), Grid.flat((3, 4), 0.2, angle_deg=20)
+    one = Resampler(grids[0], PSF.gaussian(1.6), grids[1], PSF.gaussian(1.5), dtype=np.float64)
+    x = torch.randn((7, 8), dtype=torch.float64)
+    np.testing.assert_array_equal(as_torch(one)(x).numpy(), one(x.numpy()))

@@ -121,8 +121,9 @@ def test_draws_below_zero_become_zero(monkeypatch):
         return [change], np.array([[-3.0, 1.0]])
 
     result = replace(blend([component]), draws=SimpleNamespace(draw=draw))
-    first, second = result.sample(2, "numbers")
-    assert asked == ["numbers"] * 2 and len(first) == len(second) == 1
+    numbers = np.random.default_rng(1)
+    first, second = result.sample(2, numbers)
+    assert asked == [numbers] * 2 and len(first) == len(second) == 1
     np.testing.assert_allclose(first[0].morphology, [[1.5, 0], [-0.1, 0]])
     assert first[0].spectrum.tolist() == [0, 4]
     with pytest.raises(ValueError, match="no posterior to draw from"):

@@ -9,6 +9,7 @@ from helpers.posterior import capture, dense_error, full_matrix
 from helpers.scenes import BRIGHT, blend
 
 from clresample.deblending.batch import deblend, deblend_many
+from clresample.deblending.inspection.inspect import InputWarning
 from clresample.deblending.posterior import exposure
 from clresample.deblending.posterior.moments import moments_of
 from clresample.deblending.settings import Settings
@@ -208,15 +209,37 @@ def test_other_priors_keep_errors_of_fixed_morphologies(device, prior):
 
 
 def test_a_channel_that_sees_nothing(device):
-    """Its fluxes have no error; the others' are finite."""
+    """Its fluxes are unknown, which is warned about; the others' are known."""
     b = blend(BRIGHT)
     dark = b.observations[1].weights.copy()
     dark[1] = 0
     o = b.observations[1]
     changed = type(o)(o.data, o.psf, o.grid, weights=dark, channels=o.channels, name=o.name)
-    result = deblend((b.observations[0], changed), b.sources, frame=b.frame, device=device)
-    assert np.isinf(errors(result)[:, 2]).all() and np.isfinite(errors(result)[:, :2]).all()
+    with pytest.warns(InputWarning, match="r: no pixel of r has a weight: fluxes there are NaN"):
+        result = deblend((b.observations[0], changed), b.sources, frame=b.frame, device=device)
+    assert any("no pixel of r has a weight" in line for line in result.messages)
+    table = catalogue(result, magnitudes=True, groups=[0] * len(b.sources))
+    drawn = result.sample_fluxes(3, 0)
+    for values in (
+        *(fluxes(result)[0], errors(result), *drawn),
+        *(np.stack([table[f"{k}_{c}"].value for c in "vgr"], 1) for k in ("flux", "group_flux")),
+    ):
+        assert np.isnan(values[:, 2]).all() and np.isfinite(values[:, :2]).all()
+    for name in ("flux_err_r", "group_flux_err_r"):
+        assert np.isnan(table[name]).all()
     assert np.isfinite(result.errors.moments).all()
+
+
+def test_drawn_fluxes_scatter_about_the_catalogues(fitted):
+    flux, error = fluxes(fitted)[0], errors(fitted)
+    drawn = fitted.sample_fluxes(400, 1)
+    assert drawn.shape == (400, *flux.shape)
+    np.testing.assert_allclose(drawn.mean(0), flux, atol=0.25 * error.max())
+    np.testing.assert_allclose(drawn.std(0), error, rtol=0.15)
+    by_hand = np.zeros(flux.shape)
+    for i, c in enumerate(fitted.sample(1, 1)[0]):
+        by_hand[c.source] += c.spectrum * (c.morphology.sum() + fitted.errors.beyond[i, 0])
+    np.testing.assert_allclose(drawn[0], by_hand + fitted.errors.released)
 
 
 def test_stored_and_read_back(fitted, tmp_path):
@@ -226,7 +249,12 @@ def test_stored_and_read_back(fitted, tmp_path):
         np.testing.assert_array_equal(getattr(found.errors, name), getattr(fitted.errors, name))
     for one, other in zip(found.errors.morphology, fitted.errors.morphology, strict=True):
         np.testing.assert_array_equal(one, other)
-    assert found.draws is None
+    for one, other in zip(found.sample(2, 5), fitted.sample(2, 5), strict=True):
+        for a, b in zip(one, other, strict=True):
+            np.testing.assert_array_equal(a.morphology, b.morphology)
+            np.testing.assert_array_equal(a.spectrum, b.spectrum)
+    np.testing.assert_array_equal(found.sample_fluxes(2, 5), fitted.sample_fluxes(2, 5))
+    assert (found.sample_fluxes(2, 6) != fitted.sample_fluxes(2, 5)).any()
     one, other = catalogue(found), catalogue(fitted)
     for name in other.colnames:
         np.testing.assert_array_equal(one[name], other[name])
@@ -238,6 +266,6 @@ def test_errors_of_an_older_format_are_refused(fitted, tmp_path, monkeypatch):
     write_result(tmp_path / "blend.fits", fitted)
     write_result(tmp_path / "bare.fits", replace(fitted, errors=None))
     monkeypatch.undo()
-    with pytest.raises(FileError, match=r"blend.fits: has errors of format 1, not 2; fit it again"):
+    with pytest.raises(FileError, match="errors of format 1, must be 2 or more: fit it"):
         read_result(tmp_path / "blend.fits")
     assert read_result(tmp_path / "bare.fits").errors is None

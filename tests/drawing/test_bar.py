@@ -1,6 +1,9 @@
 """Progress for people and for logs."""
 
+import logging
 import sys
+
+import pytest
 
 from clresample.drawing import bar as bar_module
 from clresample.drawing.bar import Bar
@@ -15,6 +18,14 @@ def test_a_log_gets_a_line_now_and_then_and_one_at_the_end(capsys, monkeypatch):
             bar(n)
     lines = capsys.readouterr().err.splitlines()
     assert lines == ["2 of 4 blends after 11 s", "4 of 4 blends after 13 s"]
+
+
+@pytest.mark.parametrize("level, shown", [(logging.INFO, True), (logging.WARNING, False)])
+def test_lines_go_through_logging_where_it_is_set_up(capsys, caplog, level, shown):
+    with caplog.at_level(level, logger="clresample"), Bar(4, "blends") as bar:
+        bar(4)
+    assert bool(caplog.records) == shown and not capsys.readouterr().err
+    assert not shown or caplog.messages[0].startswith("4 of 4 blends after")
 
 
 def test_a_terminal_gets_a_bar(capsys, monkeypatch):

@@ -1,12 +1,23 @@
 """What notebooks show: one line, a card, a figure; none of them holds a dump of arrays."""
 
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 
-from clresample import PSF, Extended, Grid, Observation, Resampler, deblend
+from clresample import (
+    PSF,
+    Detection,
+    Extended,
+    Frame,
+    Grid,
+    Observation,
+    Resampler,
+    TiledResampler,
+    deblend,
+)
 
 FLAT = Grid.flat((24, 30), 0.2)
 GRI = PSF.gaussian([1.5, 1.6, 1.7], n_pixels=15)
@@ -27,11 +38,18 @@ def result():
 def objects(result):
     grid = Grid.from_wcs(FLAT.to_wcs(ra_deg=10, dec_deg=5), FLAT.shape)
     operator = Resampler(FLAT, GRI, Grid.flat((10, 10), 0.4), GRI)
-    return {"FLAT": FLAT, "Grid": grid, "PSF": GRI, "Observation": result.observations[0],
-            "Result": result, "Certificate": operator.certificate}  # fmt: skip
+    image = np.where(np.indices(FLAT.shape)[0] > 3, 9.0, 0)
+    found = Detection(
+        (Extended(position_px=(12, 14)), Extended(position_px=(3, 4))),
+        Frame(FLAT, GRI.select([0])), np.array([20.5, 5.1]), ("<Rubin>", "all"), image,
+        np.arange(2),
+    )  # fmt: skip
+    return {"FLAT": FLAT, "Grid": grid, "Detection": found, "PSF": GRI,
+            "Observation": result.observations[0], "Result": result,
+            "Certificate": operator.certificate}  # fmt: skip
 
 
-NAMES = "FLAT", "Grid", "PSF", "Observation", "Result", "Certificate"
+NAMES = "FLAT", "Grid", "PSF", "Observation", "Detection", "Result", "Certificate"
 
 
 class Tags(HTMLParser):
@@ -65,7 +83,30 @@ def test_the_card_is_whole_html(objects, name):
     assert "<Rubin>" not in text  # names are escaped
 
 
-@pytest.mark.parametrize("name", ["PSF", "Observation", "Result"])
+def test_results_and_detections_count_their_sources(objects):
+    assert len(objects["Result"]) == 1 and len(objects["Detection"]) == 2
+    text = "Detection(2 sources: 1 in <Rubin>, 1 in all; peaks of 5.1 to 20.5 sigma)"
+    assert repr(objects["Detection"]) == text
+    none = replace(objects["Detection"], sources=(), peaks=np.zeros(0), found_in=())
+    assert repr(none) == "Detection(0 sources; no peaks)" and len(none) == 0
+    assert "no peaks" in none._repr_html_()
+
+
+def test_operators_name_their_sides_and_their_device():
+    one = Resampler(FLAT, GRI, Grid.flat((10, 11), 0.4, angle_deg=3), GRI, shift=(0, 0.5))
+    name = one.device.name
+    about = f"3 bands of 24 x 30 px -> 3 bands of 10 x 11 px, affine, shifted, float32 on {name}"
+    assert repr(one) == f"Resampler({about})"
+    assert repr(one.T).startswith("Adjoint(3 bands of 10 x 11 px -> 3 bands of 24 x 30 px, float32")
+    psf = GRI.select([0])
+    tiled = TiledResampler(FLAT, psf, FLAT, psf, progress=False)
+    assert (
+        repr(tiled)
+        == f"TiledResampler(24 x 30 px -> 24 x 30 px, aligned, 1 tiles, float32 on {name})"
+    )
+
+
+@pytest.mark.parametrize("name", ["PSF", "Observation", "Detection", "Result"])
 def test_figures_show_by_themselves(objects, name):
     pytest.importorskip("matplotlib")
     figure = objects[name].plot(title="a title")

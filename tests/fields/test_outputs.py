@@ -16,6 +16,7 @@ from clresample.fields.box import Box
 from clresample.fields.mosaic import FilePlane
 from clresample.fields.run import run_field
 from clresample.fields.strips import STRIPS
+from clresample.files.tables import read_catalogue
 from clresample.files.whole_file import FileError
 
 
@@ -31,6 +32,9 @@ def test_every_column_has_its_unit_and_a_description(done):
         about = schema.field(name).metadata
         assert about[b"description"].decode() == rows[name].info.description
         assert about.get(b"unit", b"").decode() == str(getattr(rows[name], "unit", None) or "")
+    one, other = read_catalogue(folder / "catalogue.parquet"), rows
+    assert [one[n].unit for n in one.colnames] == [other[n].unit for n in one.colnames]
+    np.testing.assert_array_equal(one["colour_err_VIS_i"].value, other["colour_err_VIS_i"].value)
     blends = QTable.read(folder / "blends.ecsv")
     assert all(blends[name].info.description for name in blends.colnames)
     assert blends["seconds"].unit == "s"

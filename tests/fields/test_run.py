@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import QTable
 from helpers.fields import mosaics_of
@@ -66,6 +67,18 @@ def test_the_three_catalogues_are_one_with_units_and_descriptions(done):
     assert binary["flux_i"].unit == text["flux_i"].unit == "uJy"
     assert "total flux in i" in text["flux_i"].info.description
     np.testing.assert_array_equal(text["flux_i"], binary["flux_i"])
+    flux, error = (text[f"{key}_i"].value for key in ("flux", "flux_err"))
+    good = flux > 0
+    assert good.any()
+    np.testing.assert_allclose(text["mag_i"].value[good], 23.9 - 2.5 * np.log10(flux[good]))
+    of_mag = np.where(good, 2.5 / np.log(10) * error / flux, np.nan)
+    np.testing.assert_allclose(text["mag_err_i"].value, of_mag)
+    colour = (text["mag_VIS"] - text["mag_i"]).value
+    np.testing.assert_allclose(text["colour_VIS_i"].value, colour, atol=1e-12)
+    known = np.isfinite(colour)
+    most = np.hypot(text["mag_err_VIS"].value, text["mag_err_i"].value)
+    assert (text["colour_err_VIS_i"].value[known] < most[known]).all()
+    assert "magnitude" in text["mag_i"].info.description
     pq = pytest.importorskip("pyarrow.parquet")
     columns = pq.read_table(folder / "catalogue.parquet")
     assert columns.column_names == text.colnames
@@ -216,8 +229,7 @@ def test_pixels_that_cannot_be_read_cost_their_blends_alone_with_a_reason(sky, t
 def test_known_sources_are_taken_where_they_are(done, sky, tmp_path):
     folder, _ = done
     rows = table(folder)
-    places = np.stack([rows["ra"].value, rows["dec"].value], axis=1)
-    options = FieldOptions(positions=places, passes=1)
+    options = FieldOptions(positions=SkyCoord(rows["ra"], rows["dec"]), passes=1)
     run_field(mosaics_of(sky), tmp_path, options=options)
     known = table(tmp_path)
     np.testing.assert_array_equal(known["id"], rows["id"])

@@ -7,7 +7,8 @@ from astropy.io import fits
 from helpers.blends import SCALE, blend, observe, round_component
 
 from clresample.files.names import check_catalogue_names, text_card
-from clresample.files.results import write_catalogue
+from clresample.files.results import write_result
+from clresample.files.tables import read_catalogue, write_catalogue
 from clresample.measurement.catalogue import catalogue
 from clresample.sky.grid import Grid
 
@@ -29,6 +30,9 @@ def test_columns_too_long_for_fits_are_refused_by_name(tmp_path):
         write_catalogue(tmp_path / "cat.fits", table)
     assert not list(tmp_path.iterdir())
     write_catalogue(tmp_path / "cat.ecsv", table)
+    write_result(tmp_path / "blend.fits", result)  # whose catalogue is without colours then
+    assert read_catalogue(tmp_path / "blend.fits").colnames[-1] == "ambiguous_with"
+    assert "mag_" not in " ".join(read_catalogue(tmp_path / "blend.fits").colnames)
 
 
 @pytest.mark.parametrize("text", ["x" * n for n in range(46, 75)] + ["'" * 27, "'" * 30, "'" * 40])

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.wcs import WCS
 from helpers.geometries import GEOMETRIES, distance, operator, psfs
 
 from clresample.device.device import Device
@@ -170,7 +171,11 @@ def test_a_turned_grid_of_the_papers_scheme_says_what_it_costs(device):
         ({"grid_in": None}, r"grid_in is None \(NoneType\), must be Grid"),
         ({"psf_in": None}, "psf_in is None"),
         ({"grid_out": (3, 3)}, "grid_out is"),
-        ({"psf_out": np.eye(3)}, "psf_out is"),
+        ({"psf_out": "psf.fits"}, r"psf_out is 'psf.fits' .str., must be PSF: give PSF\(array\)"),
+        (
+            {"grid_in": WCS(naxis=2)},
+            r"grid_in is a WCS without a shape: give Grid.from_wcs",
+        ),
         ({"tolerance_px": np.nan}, "tolerance_px is nan"),
         ({"tolerance_px": -1}, "tolerance_px is -1"),
         ({"dtype": None}, "dtype is None, allowed are float32 and float64"),
@@ -192,6 +197,20 @@ def test_parts_of_other_types_are_refused_by_name(device, kind, given, said):
 
 
 @every_operator
+def test_wcs_that_know_their_shape_are_grids_and_arrays_are_psfs(device, kind):
+    grids = Grid.flat((12, 13), 0.1), Grid.flat((6, 7), 0.2, angle_deg=8)
+    wcs = [grid.to_wcs(ra_deg=10, dec_deg=3) for grid in grids]
+    for one, grid in zip(wcs, grids, strict=True):
+        one.array_shape = grid.shape
+    psf = PSF.gaussian(1.0, n_pixels=11)
+    op = kind(wcs[0], psf.images[0], wcs[1], psf.images[0], device=device)
+    pair = (Grid.from_wcs(one, grid.shape) for one, grid in zip(wcs, grids, strict=True))
+    model, seen = pair
+    x = np.random.default_rng(1).random((12, 13))
+    np.testing.assert_array_equal(op(x), kind(model, psf, seen, psf, device=device)(x))
+
+
+@every_operator
 def test_arrays_that_are_no_real_numbers_are_refused_by_name(device, kind):
     op = make(kind, device)
     x = np.ones(op.shape_in)
@@ -200,13 +219,16 @@ def test_arrays_that_are_no_real_numbers_are_refused_by_name(device, kind):
     masked[..., 0, 0] = np.ma.masked
     for image, said in (
         (masked, "x is masked at"),
-        (x * u.Jy, "x has the unit Jy"),
         (x.astype("M8[s]"), "not of type datetime64"),
         (x.astype(str), "not of type <U"),
     ):
         with pytest.raises(ValueError, match=said):
             op(image)
     y = op(x)
+    with_unit = op(x * u.nJy)
+    assert with_unit.unit == u.nJy
+    np.testing.assert_array_equal(with_unit.value, y)
+    np.testing.assert_array_equal(op.T(y * u.nJy).value, op.adjoint(y))
     fixed = y.copy()
     fixed.flags.writeable = False
     for out in (y.astype(int), y.astype(complex), fixed, np.ma.MaskedArray(y, False), y * u.Jy):

@@ -29,7 +29,7 @@ ODD = {
     "bytes": (np.full(SHAPE, b"1.5"), "|S3"),
     "texts as objects": (np.full(SHAPE, "1.5", object), "it holds '1.5'"),
     "complex objects": (np.full(SHAPE, 1j, object), "it holds 1j"),
-    "a unit": (IMAGE * u.adu, "has the unit adu"),
+    "a unit": (IMAGE * u.m, "has the unit m"),
     "records": (np.zeros(SHAPE, [("a", float)]), "must be an array of real numbers"),
 }
 

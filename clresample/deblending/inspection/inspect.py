@@ -72,7 +72,8 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         image = Image.of(observation, frame, positions[near], shift)
         levels.append(sky_level(image))
         image = image.over(levels[-1].level)
-        lines = [] if settings.fit_sky else _level_lines(image, levels[-1])
+        lines = _unmeasured(image)
+        lines += [] if settings.fit_sky else _level_lines(image, levels[-1])
         bad, more = _spoilt(image)
         if bad.any():
             image = image.without(bad)
@@ -101,6 +102,19 @@ def _doubles(sources, positions):
     return [
         f"sources {some} lie within {listing.SAME_PLACE_PX:g} model pixel of each other: no image "
         "tells their fluxes apart; if they are one source listed twice, leave one out"
+    ]
+
+
+def _unmeasured(image):
+    """A line on channels without any pixel to fit."""
+    seen = image.usable.any(axis=(1, 2))
+    pairs = zip(image.observation.channels, seen, strict=True)
+    names = [name for name, one in pairs if not one]
+    if not names:
+        return []
+    return [
+        f"no pixel of {', '.join(names)} has a weight: fluxes there are NaN; check weights or "
+        "variance for NaN, or leave the channel out"
     ]
 
 

@@ -75,6 +75,27 @@ class Factor:
         for v in self.order:
             self._eliminate(v, rest)
 
+    @classmethod
+    def restore(cls, sizes, scale, order, later, lower, below) -> Factor:
+        """The Factor whose attributes and `blocks` these are: sizes (n,), scale (n): arrays, order
+        (n,), later (n): lists of nodes, lower and below {node: block}."""
+        factor = object.__new__(cls)
+        factor.sizes, factor.scale, factor.order, factor._later = sizes, scale, order, later
+        factor._lower, factor._below = lower, below
+        return factor
+
+    @property
+    def later(self) -> list[list[int]]:
+        """For each node (n), its neighbours that are eliminated later."""
+        return self._later
+
+    def blocks(self):
+        """Each node's own block of the factor and, if any, the one below, in the order."""
+        for v in self.order:
+            yield self._lower[v]
+            if self._later[v]:
+                yield self._below[v]
+
     def _eliminate(self, v, rest):
         """Factor node v's columns, and take their products off what is left."""
         later = self._later[v]

@@ -6,14 +6,17 @@ import numpy as np
 
 from ...files.fits import choose_hdu, open_fits, read_pixels, read_psf
 from ...files.whole_file import FileError
+from ...sky.given.checks import instance
+from ...sky.psf import PSF
 from ...sky.varying.field import PSFField
+from ..plugins import Formats
 from .gridded import read_gridded
 from .piff import STAMP_PX, PiffPSF
 from .psf_field import ConstantPSF
 from .psfex import PSFExPSF
 from .sampled import PSFCells, PSFCube
 
-FORMATS = ("image", "cube", "cells", "psfex", "piff", "gridded", "euclid-mer")
+OWN = ("image", "cube", "cells", "psfex", "piff", "gridded", "euclid-mer")
 
 
 def read_psf_field(
@@ -41,6 +44,7 @@ def read_psf_field(
         "piff": a Piff file
         "gridded": a file that photutils' GriddedPSFModel reads, see `read_gridded`
         "euclid-mer": a CATALOG-PSF of Euclid's MER, see `read_mer_sheet`
+        or a name that another package adds, see FORMATS
     grid: of the mosaic; hdu: of the image, None = the first; bands: of "image", by number or name
     spacing [px], center: of the samples, see PSF; those of PSFEx, Piff and gridded files are their
         own; stamp_px [px]: side of Piff's stamps
@@ -51,6 +55,10 @@ def read_psf_field(
     if form not in FORMATS:
         raise ValueError(f"psf_format is {form!r}, it takes {', '.join(FORMATS)}")
     samples = {"spacing": spacing, "center": center}
+    if form not in OWN:
+        given = {"hdu": hdu, "bands": bands, "stamp_px": stamp_px, "detector": detector} | samples
+        found = instance(f"the result of {form!r}", FORMATS[form](path, grid, **given), PSF_KINDS)
+        return ConstantPSF(found) if isinstance(found, PSF) else found
     if form == "image":
         return ConstantPSF(read_psf(path, hdu=hdu, bands=bands, **samples))
     if form == "psfex":
@@ -73,6 +81,12 @@ def read_psf_field(
             raise
         except ValueError as error:
             raise FileError(f"{path}: {error}") from error
+
+
+# Those of other packages are called as reader(path, grid, **given), with hdu, bands, spacing,
+# center, stamp_px and detector as `read_psf_field` has them; they return a PSFField or a PSF.
+FORMATS = Formats("clresample.psf_formats", dict.fromkeys(OWN, read_psf_field))
+PSF_KINDS = PSFField, PSF
 
 
 def read_mer_sheet(path, hdus, grid, **samples) -> PSFCube:

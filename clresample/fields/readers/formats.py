@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from ...sky.given.checks import instance
 from ..mosaic import Mosaic
+from ..plugins import Formats
 from .euclid_mer import read_euclid_mer
 from .hst import read_hst
 from .jwst import read_jwst
@@ -10,7 +12,7 @@ from .legacy import read_legacy_survey
 from .rubin_coadd import read_rubin_coadd
 from .rubin_exposure import read_rubin_exposure
 
-READERS = {
+OWN = {
     "euclid-mer": read_euclid_mer,
     "rubin-coadd": read_rubin_coadd,
     "rubin-exposure": read_rubin_exposure,
@@ -18,6 +20,8 @@ READERS = {
     "jwst": read_jwst,
     "legacy": read_legacy_survey,
 }
+# Called as reader(path, **given), with what the user gives of `Given`; they return a Mosaic.
+READERS = Formats("clresample.readers", OWN)
 
 
 def read_survey(form, path, **given) -> Mosaic:
@@ -25,8 +29,9 @@ def read_survey(form, path, **given) -> Mosaic:
 
     form: of READERS; path: a file, a list of files or a folder, see its module; given: see `Given`
 
-    Raises ValueError for another format, and what is missing; FileError for what cannot be read.
+    Raises ValueError for another format, what is missing, and a reader of another package that
+    cannot be imported or returns something else; FileError for what cannot be read.
     """
     if form not in READERS:
         raise ValueError(f"format is {form!r}, it takes {', '.join(READERS)}")
-    return READERS[form](path, **given)
+    return instance(f"the result of the reader {form!r}", READERS[form](path, **given), Mosaic)

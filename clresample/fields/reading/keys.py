@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from ...files.scene_keys import (
     COUNT,
     FRACTION,
@@ -22,6 +24,7 @@ from ...files.scene_keys import (
     one_or_many,
     read_tables,
 )
+from ..plugins import Formats
 from ..psfs.read import FORMATS
 from ..readers.formats import READERS
 
@@ -40,10 +43,26 @@ def _is_pair(value):
     return many(is_number)(value) and len(value) == 2
 
 
+@dataclass(frozen=True)
+class OneOf:
+    """A Rule for one of the names of Formats, which other packages may add to."""
+
+    formats: Formats
+
+    @property
+    def text(self):
+        """What messages say of it."""
+        return " or ".join(f'"{form}"' for form in self.formats)
+
+    def fits(self, value):
+        """Whether a value is one of the names."""
+        return isinstance(value, str) and value in self.formats
+
+
 PAIR = Rule("a number, or two: [y, x]", either(is_number, _is_pair))
 
 # An [[observation]] of a scene and a [[mosaic]] of a field.
-IMAGE = {
+IMAGE: dict[str, Rule | OneOf] = {
     "name": TEXT,
     "image": FILES,
     "hdu": HDU,
@@ -51,7 +70,7 @@ IMAGE = {
     "channels": NAMES,
     "band": NAMES,
     "psf": FILES,
-    "psf_format": Rule(" or ".join(f'"{form}"' for form in FORMATS), lambda v: v in FORMATS),
+    "psf_format": OneOf(FORMATS),
     "psf_hdu": HDU,
     "psf_bands": BANDS,
     "psf_center": Rule(
@@ -90,8 +109,8 @@ IMAGE = {
     ),
 }
 SHARED = ("name", "channels", "band", "mask_bits", "zero_point", "background", "saturation")
-SURVEY = {  # the same of a survey's files
-    "format": Rule(" or ".join(f'"{form}"' for form in READERS), lambda v: v in READERS),
+SURVEY: dict[str, Rule | OneOf] = {  # the same of a survey's files
+    "format": OneOf(READERS),
     "path": Rule("the name of a folder or a file, or a list of files", one_or_many(is_text)),
     "bands": Rule("a list of the format's bands", one_or_many(is_text)),
     **{key: IMAGE[key] for key in (*SHARED, *(key for key in IMAGE if key.startswith("psf")))},

@@ -24,6 +24,7 @@ from ...files.source_table import read_sources
 from ...measurement.detection import THRESHOLD
 from ...sky.extent import intersection, union
 from ...sky.frame import Frame, model_frame
+from ...sky.noise import NoiseWarning
 from ...sky.observation import Observation, check_observations
 from ...sky.psf_checks import PSFWarning
 from ...sky.sources import Source
@@ -126,7 +127,8 @@ def _observation(mosaic, table, calibrated):
     if calibrated:
         given["zero_points"] = [c.zero_point for c in channels]
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PSFWarning)  # in the notes already
+        for kind in (NoiseWarning, PSFWarning):  # in the notes already
+            warnings.simplefilter("ignore", kind)
         return Observation(
             np.stack([c.read(box) for c in channels]),
             mosaic.psf if mosaic.psf.varies else mosaic.psf.psf_at(0, 0),

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from astropy.table import QTable, vstack
-from astropy.utils.exceptions import AstropyWarning
 
+from ...files.tables import read_catalogue
 from ...files.whole_file import FileError
 from ..images import file_name
 from ..work.folder import WORK
@@ -110,45 +109,15 @@ def _first(folder, names):
 def _finished(folder, notes):
     """The catalogue and the fits of a run that has ended."""
     path = _first(folder, ("catalogue.fits", "catalogue.ecsv"))
-    sources = read_table(path)
+    sources = read_catalogue(path)
     if len(sources.colnames) and not {"id", "y", "x"} <= set(sources.colnames):
         raise FileError(f"{path}: has no columns id, y and x: not the catalogue of a field")
     fits = QTable()
     if (folder / "blends.ecsv").is_file():
-        fits = read_table(folder / "blends.ecsv")
+        fits = read_catalogue(folder / "blends.ecsv")
     else:
         notes.append("blends.ecsv is not there: nothing is told of single fits")
     return sources, fits
-
-
-def read_table(path) -> QTable:
-    """A table of a FITS, ECSV or Parquet file, texts as str. Raises FileError."""
-    if not Path(path).is_file():
-        raise FileError(f"{path}: no such file")
-    form = {"format": "ascii.ecsv"} if str(path).endswith(".ecsv") else {}
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", AstropyWarning)  # of units and headers that it repairs
-            table = QTable.read(path, **form)
-    except Exception as error:  # a damaged file may provoke any exception in astropy
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise FileError(f"{path}: cannot be read as a table ({reason})") from error
-    return _with_text(table)
-
-
-def _with_text(table):
-    """The table with texts in place of bytes, and no masked values."""
-    for name in table.colnames:
-        column = table[name]
-        kind = getattr(getattr(column, "dtype", None), "kind", "")
-        if kind in "SUO":
-            plain = np.ma.filled(np.ma.asarray(column), b"" if kind == "S" else "")
-            table[name] = [
-                v.decode("utf-8", "replace") if isinstance(v, bytes) else str(v) for v in plain
-            ]
-        elif hasattr(column, "filled"):
-            table[name] = column.filled(np.nan if kind == "f" else 0)
-    return table
 
 
 def _json(path, notes):

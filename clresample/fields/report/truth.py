@@ -9,8 +9,8 @@ import numpy as np
 from astropy.table import QTable
 from scipy.spatial import cKDTree
 
+from ...files.tables import read_catalogue
 from ...files.whole_file import FileError
-from .folder import read_table
 from .stamps import plain
 
 # [px] A row is a true source's own when it lies as near; further off it is another one in most
@@ -76,7 +76,7 @@ def _places(run):
 
 
 def _read(run, path):
-    table = read_table(path)
+    table = read_catalogue(path)
     names = set(table.colnames)
     if not {"y", "x"} <= names or not any(name.startswith("flux_") for name in names):
         raise FileError(f"{path}: is no truth of a field: it needs y, x [px] and flux_CHANNEL")

@@ -211,7 +211,7 @@ def _take(part, job, cut, result, n_round):
     result = judged_on_sources(result)  # of its neighbours there is light in wide pixels
     names = [int(source.name) for source in result.sources]
     hosts = np.array([job.plan.host_of.get(name, name) for name in names], np.int64)
-    rows = columns_of(result, groups=hosts)
+    rows = columns_of(result, groups=hosts, bands=job.bands)
     ids = np.array([int(name) for name in rows.values.pop("name")], np.int64)
     for name in POSITIONS:
         rows.put(name, rows[name] + origin[0 if name[0] == "y" else 1])

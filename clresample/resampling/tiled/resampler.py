@@ -11,9 +11,10 @@ from tqdm import tqdm
 from ...device.tuning import Tuning
 from ...sky.extent import box_slices, shared_part
 from ...sky.given.checks import float_type
-from ...sky.grid import Grid
+from ...sky.given.observed import PSFLike, as_psf
+from ...sky.grid import GridLike, as_grid
 from ...sky.psf import PSF
-from ..grid_operator import GridOperator, check_parts
+from ..grid_operator import GridOperator
 from ..linop import HostOp, LinOp
 from ..plan import Precision, is_identity, make_plan
 from ..resampler import Resampler
@@ -47,10 +48,10 @@ class TiledResampler(HostOp, GridOperator):
 
     def __init__(
         self,
-        grid_in: Grid,
-        psf_in: PSF,
-        grid_out: Grid,
-        psf_out: PSF,
+        grid_in: GridLike,
+        psf_in: PSFLike,
+        grid_out: GridLike,
+        psf_out: PSFLike,
         *,
         dtype=np.float32,
         device=None,
@@ -59,9 +60,10 @@ class TiledResampler(HostOp, GridOperator):
         memory=None,
         progress=True,
     ):
-        check_parts((psf_in, psf_out), (grid_in, grid_out))
+        grid_in, grid_out = as_grid("grid_in", grid_in), as_grid("grid_out", grid_out)
+        model_psf, seen_psf = as_psf("psf_in", psf_in), as_psf("psf_out", psf_out)
         dtype = float_type(dtype)
-        n_bands = max(psf_in.n_bands, psf_out.n_bands)
+        n_bands = max(model_psf.n_bands, seen_psf.n_bands)
         shapes = (n_bands, *grid_in.shape), (n_bands, *grid_out.shape)
         LinOp.__init__(self, device, dtype, *shapes)
         tuning = Tuning.of(self.device, dtype)
@@ -69,16 +71,19 @@ class TiledResampler(HostOp, GridOperator):
         self.grid_in, self.grid_out, self.tolerance_px = grid_in, grid_out, tolerance_px
         self.groups = make_groups(
             grid_in,
-            psf_in,
+            model_psf,
             grid_out,
-            psf_out,
+            seen_psf,
             precision=Precision.of(dtype),
             tolerance_px=tolerance_px,
             tuning=tuning,
             memory=self.memory,
         )
-        self._operators = TileOperators(psf_in, psf_out, self.dtype, self.device)
+        self._operators = TileOperators(model_psf, seen_psf, self.dtype, self.device)
         self.shift, self.progress = shift, progress
+
+    def _about(self):
+        return (*super()._about(), f"{self.n_tiles} tiles")
 
     def _use_shift(self):
         """Nothing to do: each tile's operator is shifted when its turn comes."""

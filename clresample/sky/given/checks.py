@@ -14,6 +14,12 @@ import numpy as np
 
 # kinds of NumPy types that are real numbers: bool, integers, floats
 REAL = "biuf"
+# How a user makes what an argument must be, for messages.
+WAYS = {
+    "Grid": "Grid.from_wcs(wcs, shape) or Grid.flat(shape, scale_arcsec)",
+    "PSF": "PSF(array)",
+    "Observation": "Observation(data, psf, grid) or Observation.from_nddata(image, psf)",
+}
 
 
 def numbers(name, values, unit=None) -> np.ndarray:
@@ -63,6 +69,8 @@ def check_real(name, array):
 
 def without_unit(name, values, unit=None):
     """The values, in `unit` if they have one. Raises ValueError for a unit that does not fit."""
+    if isinstance(values, list | tuple) and any(hasattr(value, "unit") for value in values):
+        return [without_unit(name, value, unit) for value in values]
     given = getattr(values, "unit", None)
     if given is None or str(given) == "":
         return values
@@ -129,10 +137,25 @@ def instance(name, value, kind):
     if isinstance(value, kind):
         return value
     wanted = kind if isinstance(kind, tuple) else (kind,)
+    names = [k.__name__ for k in wanted]
+    ways = [WAYS[one] for one in names if one in WAYS]
     raise ValueError(
-        f"{name} is {value!r:.80} ({type(value).__name__}), must be "
-        f"{' or '.join(k.__name__ for k in wanted)}"
+        f"{name} is {described(value)}, must be {' or '.join(names)}"
+        + (f": give {' or '.join(ways)}" if ways else "")
     )
+
+
+def described(value) -> str:
+    """A value in a few words for messages; of arrays and images the type and shape alone."""
+    kind, shape = type(value).__name__, getattr(value, "shape", None)
+    if shape is not None and np.ndim(shape) == 1 and len(shape):
+        return f"of type {kind} and shape {tuple(shape)}"
+    text = repr(value)
+    if isinstance(value, str | int | float | bool | None):
+        return f"{text:.80} ({kind})"
+    if "\n" in text or len(text) > 80:
+        return f"of type {kind}"
+    return f"{text} ({kind})"
 
 
 def image_shape(shape):

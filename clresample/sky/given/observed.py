@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..grid import as_grid
 from ..noise import mask_from
 from ..psf import PSF
 from ..varying.field import PSFField
@@ -12,23 +13,25 @@ from .checks import instance, numbers, split_mask
 
 
 def images_of(data, grid, mask):
-    """Data (C, Ny, Nx) float64 of as many pixels as the grid has, and the mask with data's own."""
+    """Data (C, Ny, Nx) float64 of as many pixels as the grid has, the mask with data's own, and the
+    grid, made of a WCS where one is given."""
     data, hidden = split_mask("data", data)
     data = numbers("data", data)
     if data.ndim == 2:
         data = data[None]
     if data.ndim != 3 or 0 in data.shape:
         raise ValueError(f"data must be (C, Ny, Nx) or (Ny, Nx), not {data.shape}")
+    grid = as_grid("grid", grid, data.shape)
     if data.shape[1:] != tuple(grid.shape):
         raise ValueError(f"data has images of {data.shape[1:]} pixels, grid has {grid.shape}")
-    return data, mask if hidden is None else mask_from(mask, data.shape) | hidden
+    return data, mask if hidden is None else mask_from(mask, data.shape) | hidden, grid
 
 
 def psfs_of(psf, shape):
     """psf and psf_field of images (C, Ny, Nx), each of one band for each channel, a single one
     serving all."""
     n_channels = shape[0]
-    instance("psf", psf, (PSF, PSFField))
+    psf = as_psf("psf", psf, (PSF, PSFField))
     if psf.n_bands not in (1, n_channels):
         raise ValueError(
             f"psf has {psf.n_bands} bands, data have {n_channels} channels: "
@@ -67,11 +70,25 @@ def bands_of(bands, channels):
     return bands
 
 
-def saturation_of(values, n_channels):
-    """Saturation levels (C,) [counts] above 0, infinite ones where unknown; None for None."""
+# A PSF, or its images.
+PSFLike = PSF | np.ndarray
+
+
+def as_psf(name, psf, kinds=PSF):
+    """The PSF, made of its images where an array is given. Raises ValueError for anything else."""
+    if isinstance(psf, np.ndarray) or (isinstance(psf, list | tuple) and len(psf)):
+        return PSF(psf)
+    return instance(name, psf, kinds)
+
+
+def saturation_of(values, n_channels, unit=None):
+    """Saturation levels (C,) [counts] above 0, infinite ones where unknown; None for None.
+
+    unit: of the data, to which levels with a unit are converted
+    """
     if values is None:
         return None
-    values = numbers("saturation", values)
+    values = numbers("saturation", values, unit)
     if values.shape not in ((), (n_channels,)) or not (values > 0).all():
         raise ValueError(
             f"saturation is {values}, must be above 0, one number or {n_channels}: give infinity "

@@ -1,0 +1,87 @@
+"""The posterior of a fit in HDUs and back: modes of the morphologies and the matrix's factor."""
+
+from __future__ import annotations
+
+import numpy as np
+from astropy.io import fits
+from astropy.table import Table
+
+from ..deblending.posterior.blocks import Factor
+from ..deblending.posterior.errors import Draws
+from ..deblending.solver.rendering.ties import Ties
+from .arrays import array_of, image_hdu
+
+NODES = ("n_modes", "size", "order", "n_later")
+
+
+def draw_hdus(draws):
+    """HDUs of Draws, none for None.
+
+    DRAWNODES: a row a node of the matrix, its modes, unknowns, place in the elimination, and number
+    of neighbours that are eliminated later; DRAWLATER: these. DRAWMODES, DRAWSCALE, DRAWFACTOR: all
+    arrays one after the other, of the factor each node's own block and the block below, in the
+    order of elimination. DRAWUNIT, DRAWWIDE, DRAWBANDS: as in Draws.
+    """
+    if draws is None:
+        return []
+    factor = draws.factor
+    n_nodes = len(factor.sizes)
+    counts = [len(images) for images in draws.modes] + [0] * (n_nodes - len(draws.modes))
+    rows = np.stack([counts, factor.sizes, factor.order, [len(x) for x in factor.later]], axis=1)
+    later = [node for nodes in factor.later for node in nodes]
+    bands = () if draws.ties is None else draws.ties.bands
+    return [
+        fits.BinTableHDU(Table(rows.astype(np.int64), names=NODES), name="DRAWNODES"),
+        image_hdu("DRAWLATER", np.array(later, np.int64)),
+        image_hdu("DRAWMODES", _flat(draws.modes, np.float32)),
+        image_hdu("DRAWSCALE", _flat(factor.scale, np.float64)),
+        image_hdu("DRAWFACTOR", _flat(factor.blocks(), np.float64)),
+        image_hdu("DRAWUNIT", draws.unit),
+        image_hdu("DRAWWIDE", draws.wide),
+        image_hdu("DRAWBANDS", np.array(bands, np.int64)),
+    ]
+
+
+def read_draws(hdus, shapes):
+    """The Draws of `draw_hdus`, bit by bit; None where there are none.
+
+    shapes (n): (ny, nx) [px] of each component's box
+    """
+    if "DRAWNODES" not in hdus:
+        return None
+    table = hdus["DRAWNODES"].data
+    counts, sizes, order, n_later = (table[name].astype(np.int64) for name in NODES)
+    ends = np.cumsum(n_later)[:-1]
+    later = [part.tolist() for part in np.split(array_of(hdus["DRAWLATER"]), ends)]
+    modes = _Flat(array_of(hdus["DRAWMODES"]))
+    scale, factor = (_Flat(array_of(hdus[name])) for name in ("DRAWSCALE", "DRAWFACTOR"))
+    lower, below = {}, {}
+    for v in order.tolist():
+        lower[v] = factor.take(sizes[v], sizes[v])
+        if later[v]:
+            below[v] = factor.take(sum(sizes[u] for u in later[v]), sizes[v])
+    bands = array_of(hdus["DRAWBANDS"])
+    return Draws(
+        [modes.take(n, *shape) for n, shape in zip(counts, shapes, strict=False)],
+        Factor.restore(sizes, [scale.take(n) for n in sizes], order.tolist(), later, lower, below),
+        array_of(hdus["DRAWUNIT"]),
+        array_of(hdus["DRAWWIDE"]),
+        Ties(tuple(bands.tolist())) if len(bands) else None,
+    )
+
+
+def _flat(arrays, dtype):
+    """All values of arrays, one after the other."""
+    return np.concatenate([np.zeros(0, dtype), *(np.ravel(array) for array in arrays)])
+
+
+class _Flat:
+    """Values (N,) that arrays are taken from, one after the other."""
+
+    def __init__(self, values):
+        self.values, self.start = values, 0
+
+    def take(self, *shape):
+        """The next array of this shape."""
+        begin, self.start = self.start, self.start + int(np.prod(shape))
+        return self.values[begin : self.start].reshape(shape).copy()

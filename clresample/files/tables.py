@@ -1,0 +1,98 @@
+"""Catalogues on disk: read from FITS, ECSV and Parquet, and written."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+from astropy.table import QTable, Table
+from astropy.utils.exceptions import AstropyWarning
+
+from ..measurement.catalogue import MEANINGS
+from .fits import write_hdus
+from .names import check_columns, to_ascii
+from .parquet import read_parquet, write_parquet
+from .whole_file import FileError, check_output, whole_file
+
+ENDINGS = ".ecsv", ".parquet", ".fits", ".fits.gz"
+
+
+def read_catalogue(path) -> QTable:
+    """A catalogue of a FITS, ECSV or Parquet file, columns with units and descriptions.
+
+    Parquet takes pyarrow (the extra `field`), not pandas. Texts are str, nothing is masked.
+
+    path: a file that `write_catalogue` or `run_field` left, or any table of these kinds
+
+    Raises FileError for a file that does not exist or is no table; ImportError without pyarrow.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileError(f"{path}: no such file")
+    form = {"format": "ascii.ecsv"} if path.suffix == ".ecsv" else {}
+    try:
+        if path.suffix == ".parquet":
+            return read_parquet(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", AstropyWarning)  # of units and headers that it repairs
+            table = QTable.read(path, **form)
+    except ImportError:
+        raise
+    except Exception as error:  # a damaged file may provoke any exception in astropy
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise FileError(f"{path}: cannot be read as a table ({reason})") from error
+    return _with_text(table)
+
+
+def write_catalogue(path, table, *, overwrite=False):
+    """Write a catalogue, whole or not at all: as ECSV or, by the file's name, as FITS or Parquet.
+
+    path: ends in .ecsv, .parquet, .fits or .fits.gz; table: of `catalogue`
+    Raises FileError when the file exists or cannot be written, ValueError for other endings
+    and columns' names too long for FITS; ImportError without pyarrow for Parquet.
+    """
+    path = Path(path)
+    if not path.name.endswith(ENDINGS):
+        raise ValueError(f"path is {path.name}, a catalogue ends in {', '.join(ENDINGS)}")
+    check_output(path, overwrite=overwrite)
+    if ".fits" in path.suffixes:
+        return write_hdus(
+            path, [fits.PrimaryHDU(), table_hdu(table, "CATALOGUE"), flag_table_hdu()]
+        )
+    with whole_file(path) as part:
+        if path.suffix == ".parquet":
+            return write_parquet(part, table)
+        table.write(part, format="ascii.ecsv", overwrite=True)
+
+
+def table_hdu(table, name):
+    """A table as an HDU; other characters than ASCII, which FITS does not have, become "?"."""
+    check_columns(table.colnames)
+    table = QTable(table, names=[to_ascii(column) for column in table.colnames])
+    table["name"] = [to_ascii(value) for value in table["name"]]
+    hdu = fits.table_to_hdu(table)
+    hdu.name = name
+    return hdu
+
+
+def flag_table_hdu():
+    """The meanings of `flags` as an HDU."""
+    rows = [(flag.name, flag.value, meaning) for flag, meaning in MEANINGS.items()]
+    return fits.BinTableHDU(Table(rows=rows, names=("flag", "value", "meaning")), name="FLAGS")
+
+
+def _with_text(table):
+    """The table with texts in place of bytes, and no masked values."""
+    for name in table.colnames:
+        column = table[name]
+        kind = getattr(getattr(column, "dtype", None), "kind", "")
+        if kind in "SUO":
+            plain = np.ma.filled(np.ma.asarray(column), b"" if kind == "S" else "")
+            table[name] = [
+                v.decode("utf-8", "replace") if isinstance(v, bytes) else str(v) for v in plain
+            ]
+        elif hasattr(column, "filled"):
+            table[name] = column.filled(np.nan if kind == "f" else 0)
+    return table
