@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from .codes import as_text
 from .png import png
-from .pyramid import as_text
 from .shades import EMPTY
 from .stamps import plain
 from .svg import SQUARE, Chart, Scale

@@ -1,0 +1,59 @@
+"""Models of single sources on the instruments' pixels, for pictures without their neighbours."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from ...device.errors import DeviceError
+from ...files.whole_file import FileError
+from ..box import Box
+from ..cutouts import FieldCutouts, MissingSource
+
+MAX_SECONDS = 60.0  # for all sources of a page: some 20 ms each
+
+
+class OwnModels:
+    """Renders single sources of a finished run, for MAX_SECONDS in all.
+
+    Needs the inputs of the run, models.fits and an OpenCL device; without them a note says so, and
+    `on` gives None.
+    """
+
+    def __init__(self, run, notes):
+        self._cutouts, self._notes = None, notes
+        self._end = time.monotonic() + MAX_SECONDS
+        if not run.finished or run.settings.get("part") or not (run.folder / "models.fits").exists():
+            return
+        try:
+            self._cutouts = FieldCutouts(run.folder)
+        except (FileError, DeviceError, ImportError, ValueError) as error:
+            self._give_up(error)
+
+    def _give_up(self, reason):
+        self._cutouts = None
+        self._notes.append(f"no pictures of sources without their neighbours: {reason}")
+
+    def on(self, source, instrument, box):
+        """Model (C, ny, nx) [counts] of a source on a Box of an instrument's pixels; None where it
+        has none, or cannot be had."""
+        if self._cutouts is None:
+            return None
+        if time.monotonic() > self._end:
+            self._give_up(f"those after the first {MAX_SECONDS:g} s")
+            return None
+        names = [mosaic.name for mosaic in self._cutouts.mosaics]
+        try:
+            found, _, first = self._cutouts.separate([source], names.index(instrument.name))
+        except MissingSource:
+            return None
+        except (FileError, DeviceError, ValueError) as error:
+            self._give_up(error)
+            return None
+        own = Box(*first, *(np.add(first, found.own.shape[1:]).tolist()))
+        image = np.zeros((len(instrument.channels), *box.shape))
+        both = own.meet(box)
+        if both.area:
+            image[:, *both.within(box).slices] = found.own[:, *both.within(own).slices]
+        return image
