@@ -84,7 +84,7 @@ function drawTitle(c, pane) {
   c.lineWidth = 3;
   c.strokeStyle = "#000c";
   c.fillStyle = "#f2f4f8";
-  const words = `${DATA.instruments[pane.instrument]?.name ?? ""} ${layer}`, [x, y] = [10, pane.height - 44];
+  const words = `${DATA.instruments[pane.instrument]?.name ?? ""} ${layer}`, [x, y] = [10, pane.height - 58];
   c.strokeText(words, x, y);
   c.fillText(words, x, y);
   c.strokeStyle = "#f2f4f866";
