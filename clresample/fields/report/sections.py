@@ -95,17 +95,23 @@ def source_table(run) -> str:
     return section("sources", "Sources", FILTERS, table(told, heads, body, link=0))
 
 
+def colours(run) -> str:
+    """The colour-magnitude diagram, which a script draws; nothing without two magnitudes."""
+    if sum(one.kind == "magnitude" for one in columns_of(run)) < 2:
+        return ""
+    return (PAGE / "colours.html").read_text()
+
+
 def photometry(run, truth, area_arcmin2) -> str:
     """Number counts, and flux against signal to noise."""
     counts, ratio = number_counts(run, truth, area_arcmin2), signal_to_noise(run)
     if not counts and not ratio:
         return ""
-    colours = (PAGE / "colours.html").read_text() if len(run.channels) > 1 else ""
     key = '<p class="legend"><span><span class="key bars"></span>catalogue</span>'
     if truth is not None:
         key += '<span><span class="key outline"></span>truth</span>'
     told = "The dotted line is a flux of five times its error."
-    return colours + section(
+    return section(
         "counts", "Number counts", charts([(*one, "") for one in counts]), f"{key}</p>"
     ) + section(
         "noise", "Flux against signal to noise", text(told), charts([(*o, "") for o in ratio])

@@ -136,13 +136,14 @@ def _body(run, truth, pyramids, notes):
     parts = {
         "Field": _field(run, pyramids),
         "Sources": sections.source_table(run),
+        "Colours": sections.colours(run),
         "Counts": sections.photometry(run, truth, area),
         "χ²": sections.chi2(run, pyramids),
         "Truth": sections.truth_section(run, truth),
         "Fits": sections.fits(run),
         "Origin": sections.origin(run),
     }
-    anchors = "field", "sources", "counts", "chi2", "truth", "fits", "origin"
+    anchors = "field", "sources", "colours", "counts", "chi2", "truth", "fits", "origin"
     links = "".join(
         f'<a href="#{anchor}">{title}</a>'
         for (title, text), anchor in zip(parts.items(), anchors, strict=True)
