@@ -245,8 +245,8 @@ def test_the_table_made_by_the_script_reads_as_the_page_without_it(browser, page
 
 
 def test_limits_follow_the_pixels_in_view(browser, page):
-    folder = page[0].parent
-    data = fits.getdata(folder / "model_Euclid.fits") + fits.getdata(folder / "residual_Euclid.fits")
+    paths = [page[0].parent / f"{kind}_Euclid.fits" for kind in ("model", "residual")]
+    data = sum(map(fits.getdata, paths))
     choose(browser, "limits", "minmax")
     browser.value("new Promise((done) => setTimeout(done, 200))")
     low, high = (float(browser.value(f"byId('{k}').value")) for k in ("low", "high"))

@@ -24,7 +24,8 @@ class OwnModels:
     def __init__(self, run, notes):
         self._cutouts, self._notes = None, notes
         self._end = time.monotonic() + MAX_SECONDS
-        if not run.finished or run.settings.get("part") or not (run.folder / "models.fits").exists():
+        whole = run.finished and not run.settings.get("part")
+        if not whole or not (run.folder / "models.fits").is_file():
             return
         try:
             self._cutouts = FieldCutouts(run.folder)

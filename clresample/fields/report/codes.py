@@ -14,9 +14,9 @@ import zlib
 import numpy as np
 
 KNEE = 5.0  # [unit] where steps begin to grow
-# [1] Steps are KNEE step = 0.25 units wide near 0 and 5 % of bright residuals, as fine as noise needs
-# (finer steps store the noise's own digits); of models 0.1 units and 2 %.
-NOISY_STEP, SMOOTH_STEP = 0.05, 0.02
+# [1] Steps are KNEE step = 0.25 units wide near 0 and 5 % of bright residuals: finer ones store the
+# noise's own digits. Those of models are 0.025 units and 0.5 %.
+NOISY_STEP, SMOOTH_STEP = 0.05, 0.005
 MAX_STEPS = 32766  # of either sign: beyond it codes have more than 16 bits
 # Of zlib: noise does not get smaller with more, and 9 takes four times as long.
 EFFORT = 6

@@ -26,8 +26,9 @@ MOST_CHI2 = 36.0
 class Pyramid:
     """Tiles of one instrument.
 
-    instrument; stretch: how its light is shown at first; finest: level of the finest tiles, 0 = the mosaic's pixels,
-        each level above has pixels twice as large
+    instrument; stretch: how its light is shown at first
+    finest: level of the finest tiles, 0 = the mosaic's pixels, each level above has pixels twice as
+        large
     levels: dicts as the page reads them, the finest first
     n_bytes: of all tiles
     chi2 (My, Mx): mean of (residual / sigma)^2 in cells, NaN where there is no sky; cell_px

@@ -48,10 +48,11 @@ def write_report(
 ) -> Report:
     """Write the report of a run of `run_field`, finished or not: one HTML page.
 
-    The page holds the field's data, models and residuals as tiles to zoom into, every source of it,
-    pictures of up to 2000 sources in every channel, with the source alone where the run's inputs and
-    an OpenCL device are there, colours, number counts, signal to noise, a map of chi2, pulls where the truth is known, the slowest and the failed fits, and what made it. It loads
-    nothing and needs no network.
+    The page holds the pixel values of the field's data, models and residuals as tiles to zoom into,
+    every source of it, pictures of up to 2000 sources in every channel, the source alone where the
+    run's inputs and an OpenCL device are there, colours and magnitudes, number counts, signal to
+    noise, a map of chi2, pulls where the truth is known, the slowest and the failed fits, and the
+    versions and settings of the run. It loads nothing and needs no network.
 
     folder: of the run, or of one part of a field
     path: of the page; None = report.html in the folder, which is replaced
