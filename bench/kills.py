@@ -59,6 +59,7 @@ def commands(base):
     resample = [euclid, "--psf", base / "scene" / "euclid_psf.fits", "--like", rubin]
     resample += ["--psf-like", base / "scene" / "rubin_psf.fits", "--psf-like-band", "i"]
     simulate = ["simulate", "field", "-o", "OUT", "--size", 96, "--bands", "i"]
+    run = base / "run"
     return {
         "example": ["deblend", "--example", "OUT"],
         "deblend": ["deblend", scene, "-o", "OUT", "--max-iter", 2, "--quiet"],
@@ -66,13 +67,15 @@ def commands(base):
         "plain": simulate,
         "survey": [*simulate, "--format", "survey"],
         "field": ["field", sky, "-o", "OUT", "--workers", 0, "--quiet"],
-        "report": ["report", base / "run", "-o", "OUT/report.html"],
+        "report": ["report", run, "-o", "OUT/report.html"],
+        "cutout": ["cutout", run, "--ids-from", run / "catalogue.fits", "-o", "OUT/cut.fits"],
     }
 
 
 def prepare(base, names):
     """The inputs of these commands."""
-    needs = {"scene": {"deblend", "resample"}, "sky": {"field", "report"}, "run": {"report"}}
+    after = {"report", "cutout"}
+    needs = {"scene": {"deblend", "resample"}, "sky": {"field", *after}, "run": after}
     made = {
         "scene": ["deblend", "--example", base / "scene"],
         "sky": ["simulate", "field", "-o", base / "sky", *["--size", "96", "--bands", "i"]],
@@ -184,7 +187,7 @@ class Way:
     def fresh(self):
         """The folder as it is before the command."""
         shutil.rmtree(self.out, ignore_errors=True)
-        if self.name in ("resample", "report") or self.over:
+        if self.name in ("resample", "report", "cutout") or self.over:
             self.out.mkdir(parents=True)
         for name in self.names:
             (self.out / name).parent.mkdir(parents=True, exist_ok=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -21,18 +20,11 @@ from ..deblending.cutouts.window import sized_window, window_of
 from ..device.workers import one_blas_thread
 from ..files.fits import open_fits
 from ..files.whole_file import FileError
-from ..resampling.resampler import Resampler
-from ..sky.frame import model_psf
-from ..sky.psf_checks import PSFWarning
 from .box import Box
+from .light import REACH_FWHM, ModelLight
 from .models import ModelFile
 from .reading.field_file import read_field
 from .reference import reference_of
-
-# [FWHM of the PSF] How far beyond a model's box its light is rendered, and looked for.
-REACH_FWHM = 3.0
-# [bytes] Images that are rendered in one call: more would not be faster.
-BATCH_BYTES = 64 << 20
 
 
 class FieldCutouts:
@@ -51,7 +43,7 @@ class FieldCutouts:
     """
 
     def __init__(self, folder, mosaics=None, *, device=None):
-        self.folder, self.device, self.notes = Path(folder), device, []
+        self.folder, self.notes = Path(folder), []
         if not self.folder.is_dir():
             raise FileError(f"{folder}: no such folder")
         catalogue = self.folder / "catalogue.fits"
@@ -76,6 +68,7 @@ class FieldCutouts:
                 f", the mosaics have {', '.join(names)}: give those that it was run with"
             )
         self._reference = reference_of(self.mosaics)
+        self._light = ModelLight(self._models, self.mosaics, self._reference, device)
 
     def _read_mosaics(self):
         """The mosaics of the field file that the run was made with."""
@@ -166,17 +159,17 @@ class FieldCutouts:
         fwhm = float(psf.fwhm_px.max())
         whole = Box.of(mosaic.grid.shape)
         if size is None:
-            wide = self._window_about(mosaic, own, REACH_FWHM * fwhm).meet(whole)
+            wide = self._light.window_about(i_mosaic, own, REACH_FWHM * fwhm).meet(whole)
         else:
             wide = Box(*sized_window(size, position, mosaic.grid.pixel_scale_arcsec))
         window = wide.meet(whole)
         o = mosaic.observation(window) if window.area else None
         if o is None:
             raise MissingSource(f"source {ids[0]} has no pixel with a weight in {mosaic.name!r}")
-        images = self._images(i_mosaic, window, own, psf, o.grid)
-        sky = models.sky(own[0])[self._channels(i_mosaic), None, None]
+        images = self._light.images(i_mosaic, window, own, psf, o.grid)
+        sky = models.sky(own[0])[self._light.channels(i_mosaic), None, None]
         given = o.data - sky, o.weights, images, set(ids)
-        errors = self._errors(images, set(ids), o, mosaic)
+        errors = self._errors(images, set(ids), o, i_mosaic)
         found = separation_of(*given, errors, joint=False)
         if size is not None:
             before = window.y0 - wide.y0, window.x0 - wide.x0
@@ -191,11 +184,6 @@ class FieldCutouts:
         grid = mosaic.grid.cutout(*first, inner.shape)
         return found.part(inner.slices), _Seen(o, grid, mosaic, psf), first
 
-    def _channels(self, i_mosaic):
-        """The part of all channels that a mosaic has."""
-        start = sum(len(m.channels) for m in self.mosaics[:i_mosaic])
-        return slice(start, start + len(self.mosaics[i_mosaic].channels))
-
     def _position(self, mosaic, rows):
         """(y, x) [px] of the middle of some sources in a mosaic."""
         y, x = (self._columns[name][rows] for name in ("y", "x"))
@@ -205,84 +193,23 @@ class FieldCutouts:
             raise MissingSource(f"source {self.ids[rows[0]]} has no place in {mosaic.name!r}")
         return middle
 
-    def _window_about(self, mosaic, components, reach):
-        """The pixels of a mosaic about the boxes of some components: a Box."""
-        models = self._models
-        low, high = models.low[components].min(axis=0), models.high[components].max(axis=0)
-        corners = _corners(low - 0.5, high - 0.5)
-        at = self._reference.positions_in(mosaic.grid, *corners)
-        return Box.around(at).grown(int(np.ceil(reach)) + 1)
-
-    def _images(self, i_mosaic, window, own, psf, grid):
-        """{id: model (C, ny, nx) [counts]} of all sources with light on a window of a mosaic."""
-        models, mosaic = self._models, self.mosaics[i_mosaic]
-        low, high = np.array(window[:2]) - 0.5, np.array(window[2:]) - 0.5
-        seen = Box.around(mosaic.grid.positions_in(self._reference, *_corners(low, high)))
-        scale = mosaic.grid.pixel_scale_arcsec / self._reference.pixel_scale_arcsec
-        reach = int(np.ceil(REACH_FWHM * float(psf.fwhm_px.max()) * scale)) + 1
-        near = seen.grown(reach)
-        meet = (models.low < near[2:]).all(axis=1) & (models.high > near[:2]).all(axis=1)
-        meet[own] = True
-        chosen = np.flatnonzero(meet)
-        box = seen.grown(1)
-        for i in chosen:
-            box = box.join(Box(*models.low[i].tolist(), *models.high[i].tolist()))
-        found: dict[int, np.ndarray] = {}
-        by_shift: dict[tuple, list] = {}
-        for i in chosen.tolist():
-            by_shift.setdefault(models.shift(i, i_mosaic), []).append(i)
-        frame = self._reference.cutout(box.y0, box.x0, box.shape)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", PSFWarning)  # said when the field was run
-            op = Resampler(frame, model_psf(), grid, psf, device=self.device)
-        n_at_once = max(1, BATCH_BYTES // (4 * psf.n_bands * box.area))
-        for shift, components in by_shift.items():
-            op.shift = shift
-            sources = list(dict.fromkeys(models.table["id"][components].tolist()))
-            for start in range(0, len(sources), n_at_once):
-                some = sources[start : start + n_at_once]
-                light = self._light(some, components, box, i_mosaic)
-                found |= zip(some, op(light).astype(np.float64), strict=True)
-        return found
-
-    def _light(self, sources, components, box, i_mosaic):
-        """Models (n, C, Ny, Nx) [counts] of sources on a Box of the field's model pixels."""
-        models, channels = self._models, self._channels(i_mosaic)
-        light = np.zeros((len(sources), channels.stop - channels.start, *box.shape), np.float32)
-        for i in components:
-            one = int(models.table["id"][i])
-            if one in sources:
-                (y0, x0), (y1, x1) = models.low[i] - box[:2], models.high[i] - box[:2]
-                spectrum = np.nan_to_num(models.spectra[i, channels])
-                image = spectrum[:, None, None] * models.morphology(i)
-                light[sources.index(one), :, y0:y1, x0:x1] += image.astype(np.float32)
-        return light
-
-    def _errors(self, images, ids, observation, mosaic):
+    def _errors(self, images, ids, observation, i_mosaic):
         """Deviations (K, C, ny, nx) of own and others, one for each source: its flux error."""
         shape = (len(images), *observation.shape)
         own, others = np.zeros((2, *shape))
+        bands = [c.band or c.name for c in self.mosaics[i_mosaic].channels]
         scale = observation.flux_scale
         scale = np.ones(shape[1]) if scale is None else scale
         for k, (one, image) in enumerate(images.items()):
             row = self._row.get(one)
             if row is None:
                 continue
-            bands = [c.band or c.name for c in mosaic.channels]
             error = np.array([float(self._columns[f"flux_err_{b}"][row]) for b in bands]) / scale
-            flux = self._flux(one, mosaic)
+            flux = self._light.flux(one, i_mosaic)
             good = np.isfinite(error) & (flux > 0)
             part = np.where(good, error / np.where(good, flux, 1), 0)
             (own if one in ids else others)[k] = np.where(good, part, 0)[:, None, None] * image
         return own, others
-
-    def _flux(self, one, mosaic):
-        """Fluxes (C,) [counts] of a source's model."""
-        models, channels = self._models, self._channels(self.mosaics.index(mosaic))
-        total = np.zeros(channels.stop - channels.start)
-        for i in np.flatnonzero(models.table["id"] == one):
-            total += np.nan_to_num(models.spectra[i, channels]) * models.morphology(i).sum()
-        return total
 
 
 class _Label:
@@ -302,10 +229,3 @@ class _Seen:
         self.channels, self.zero_points = observation.channels, observation.zero_points
         self.flux_scale = observation.flux_scale
         self.psf, self.shape = psf, (len(self.channels), *grid.shape)
-
-
-def _corners(low, high):
-    """Rows and columns (4,) of the corners of a box (2,), (2,)."""
-    return np.array([low[0], low[0], high[0], high[0]]), np.array(
-        [low[1], high[1], low[1], high[1]]
-    )

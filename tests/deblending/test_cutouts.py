@@ -6,12 +6,16 @@ from astropy import units as u
 from helpers import scenes
 from helpers.blends import SCALE, blend, observe, round_component, two_sources
 
+from clresample.deblending.cutouts.choice import MissingSource
 from clresample.deblending.cutouts.cutout import separate
 from clresample.deblending.cutouts.separation import KINDS
 from clresample.files.results import read_result, write_result
 from clresample.measurement.photometry import redistribute
 from clresample.resampling.resampler import Resampler
 from clresample.sky.grid import Grid
+from clresample.sky.observation import Observation
+from clresample.sky.psf import PSF
+from clresample.sky.varying.field import FunctionPSF
 
 GRID = Grid.flat((60, 70), SCALE)
 
@@ -121,6 +125,27 @@ def test_what_lies_beyond_the_image_is_masked():
     assert cut.shape == (41, 41) and place(cut)[0].start == -10
     assert np.isnan(cut.data[:10]).all() and cut.mask[:10].all() and not cut.mask[10:, 8:].any()
     np.testing.assert_allclose(cut.data[10:, 8:], result.source_model(0, 0)[0, :31, :33])
+
+
+def test_a_source_outside_of_an_observation_is_refused():
+    away = Grid.flat((20, 20), SCALE, center_arcsec=(30, 30))
+    both = [observe(GRID, ("g",), weights=1.0), observe(away, ("r",), weights=1.0, name="far")]
+    result = blend([round_component(0, (30, 30), (1.0, 1.0))], observations=both)
+    for size in (None, 5):
+        with pytest.raises(MissingSource, match="source 0 lies outside of observation 'far'"):
+            result.cutout(0, "far", size=size)
+    assert result.cutout(0, "g", size=5).shape == (5, 5)
+
+
+def test_a_psf_that_varies_is_that_of_the_cutouts_middle():
+    def psf(y, x):
+        return PSF.gaussian(1 + 0.01 * x, n_pixels=21)
+
+    data = np.zeros((60, 70))
+    o = Observation(data, FunctionPSF(psf), GRID, weights=1.0, channels=["g"])
+    result = blend([round_component(0, (30, 50), (1.0,))], observations=[o])
+    cut = result.cutout(0, "g", size=11)
+    np.testing.assert_allclose(cut.psf, psf(30, 50).images[0])
 
 
 @pytest.mark.parametrize(

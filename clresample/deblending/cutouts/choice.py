@@ -44,7 +44,7 @@ def chosen_observation(observations, observation) -> tuple[int, int | None]:
     Raises ValueError for what names none, or several.
     """
     if isinstance(observation, numbers.Integral) and not isinstance(observation, bool):
-        if 0 <= observation < len(observations):
+        if 0 <= int(observation) < len(observations):
             return int(observation), None
     elif isinstance(observation, str):
         named = [i for i, o in enumerate(observations) if observation == o.name]

@@ -38,14 +38,14 @@ def separate(result, chosen, i_observation, *, size=None) -> tuple[Separation, t
     """
     o = result.observations[i_observation]
     position = _position(result, chosen, i_observation)
+    if not np.isfinite(position).all():
+        raise MissingSource(f"source {chosen[0]} has no place in observation {o.label!r}")
     whole = tuple(slice(0, n) for n in o.shape[1:])
     if size is None:
         images = [source_image(result, s, i_observation, whole) for s in chosen]
         own = sum((image for image in images if image is not None), np.zeros(o.shape))
         corners = window_of(own, o.weights, position, float(o.psf.fwhm_px.max()))
     else:
-        if not np.isfinite(position).all():
-            raise MissingSource(f"source {chosen[0]} has no place in observation {o.label!r}")
         corners = sized_window(size, position, o.grid.pixel_scale_arcsec)
     y0, x0, y1, x1 = corners
     low = max(y0, 0), max(x0, 0)

@@ -50,12 +50,12 @@ def psf_on(psf: PSF, grid_from: Grid, grid_to: Grid) -> PSF:
     half = int(math.ceil(reach / spacing))
     offsets = np.arange(-half, half + 1) * spacing
     u = np.stack(np.meshgrid(offsets, offsets, indexing="ij"), axis=-1) @ matrix.T / psf.spacing
-    images = []
+    found = []
     for image, center in zip(psf.images, psf.center, strict=True):
         at = u + center
         along_y = np.sinc(at[..., 0, None] - np.arange(n_y))
         along_x = np.sinc(at[..., 1, None] - np.arange(n_x))
-        images.append(((along_y @ image) * along_x).sum(axis=-1))
-    images = np.array(images)
+        found.append(((along_y @ image) * along_x).sum(axis=-1))
+    images = np.array(found)
     images /= images.sum(axis=(1, 2), keepdims=True)
     return PSF.restore(images, spacing=spacing, center=np.full((len(images), 2), float(half)))
