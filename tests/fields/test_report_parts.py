@@ -113,9 +113,14 @@ def test_own_models_are_put_where_they_are(monkeypatch, tmp_path):
     expected[:, 2:, :2] = 1
     np.testing.assert_array_equal(image, expected)
     assert own.on(7, one, Box(0, 0, 9, 9)) is None and notes == []
-    monkeypatch.setattr(alone, "MAX_SECONDS", -1.0)
-    late = alone.OwnModels(run, notes)
-    assert late.on(3, one, Box(0, 0, 9, 9)) is None and "first -1 s" in notes[0]
+    monkeypatch.setattr(alone, "MAX_SOURCES", 2)
+    assert own.on(4, one, Box(0, 0, 9, 9)) is None and own.on(3, one, Box(0, 0, 9, 9)) is not None
+    (tmp_path / "models.fits").unlink()
+    assert alone.OwnModels(run, notes).on(3, one, Box(0, 0, 9, 9)) is None and notes == []
+    (tmp_path / "models.fits").touch()
+    monkeypatch.undo()
+    assert alone.OwnModels(run, notes).on(3, one, Box(0, 0, 9, 9)) is None
+    assert "no pictures of sources without their neighbours: " in notes[0]
 
 
 def test_means_of_blocks_leave_out_what_is_not_there():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 
 from ...device.errors import DeviceError
@@ -11,11 +9,11 @@ from ...files.whole_file import FileError
 from ..box import Box
 from ..cutouts import FieldCutouts, MissingSource
 
-MAX_SECONDS = 60.0  # for all sources of a page: some 20 ms each
+MAX_SOURCES = 1000  # of a page: each takes some 20 core-milliseconds an instrument
 
 
 class OwnModels:
-    """Renders single sources of a finished run, for MAX_SECONDS in all.
+    """Renders single sources of a finished run, MAX_SOURCES at most.
 
     Needs the inputs of the run, models.fits and an OpenCL device; without them a note says so, and
     `on` gives None.
@@ -23,7 +21,7 @@ class OwnModels:
 
     def __init__(self, run, notes):
         self._cutouts, self._notes = None, notes
-        self._end = time.monotonic() + MAX_SECONDS
+        self._rendered: set[int] = set()
         whole = run.finished and not run.settings.get("part")
         if not whole or not (run.folder / "models.fits").is_file():
             return
@@ -41,9 +39,9 @@ class OwnModels:
         has none, or cannot be had."""
         if self._cutouts is None:
             return None
-        if time.monotonic() > self._end:
-            self._give_up(f"those after the first {MAX_SECONDS:g} s")
+        if source not in self._rendered and len(self._rendered) == MAX_SOURCES:
             return None
+        self._rendered.add(source)
         names = [mosaic.name for mosaic in self._cutouts.mosaics]
         try:
             found, _, first = self._cutouts.separate([source], names.index(instrument.name))

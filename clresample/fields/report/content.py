@@ -15,10 +15,10 @@ from .table import columns_of
 
 OK, FLAGGED, FAILED = 0, 1, 2  # states of a source, as the script counts them
 # [bytes] of a source on the field, of one of its numbers there, of its measurements
-SOURCE_BYTES, NUMBER_BYTES, DETAIL_BYTES = 76, 9, 1000
+SOURCE_BYTES, NUMBER_BYTES, DETAIL_BYTES = 76, 6, 1000
 SHAPE = "size", "e1", "e2"
 # of the page: places of sources, their measurements, their pictures
-SOURCES_PART, DETAILS_PART, STAMPS_PART = 0.2, 0.1, 0.25
+SOURCES_PART, DETAILS_PART, STAMPS_PART = 0.25, 0.1, 0.25
 
 
 def order_of(run) -> np.ndarray:
@@ -88,7 +88,7 @@ def data_of(run, most_bytes, notes) -> dict:
             "flags": _whole(run, "flags", order),
             "status": _places(run, "status", order),
             **{name: _numbers(run, name, order) for name in SHAPE},
-            "columns": [[_digits(v) for v in one.values[order]] for one in columns],
+            "columns": [[_shown(v, one.form) for v in one.values[order]] for one in columns],
         },
         "statuses": _different(run, "status"),
         "flags": [[str(flag.name), int(flag)] for flag in MEANINGS],
@@ -141,8 +141,13 @@ def _numbers(run, name, order):
 
 
 def _digits(value):
-    """A number to nine digits, which hold a position to a milliarcsecond; None for NaN."""
-    return float(f"{value:.9g}") if np.isfinite(value) else None
+    """A number to seven digits, those of float32; None for NaN."""
+    return float(f"{value:.7g}") if np.isfinite(value) else None
+
+
+def _shown(value, form):
+    """A number to the digits that a table shows; None for NaN."""
+    return float(format(value, form)) if np.isfinite(value) else None
 
 
 def _short(value, digits):

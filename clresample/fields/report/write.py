@@ -59,8 +59,8 @@ def write_report(
     truth: table of the true sources (y, x [px of the model], flux_CHANNEL [uJy], and snr); None =
         truth.ecsv in the folder, beside it or beside the run's inputs, if there is one
     most_bytes: of the page. What does not fit is left out: the finest tiles; pictures of sources
-        after those that failed, misfit, or have the highest signal to noise; of more than 200,000
-        sources (by default) the faintest
+        after those that failed, misfit, or have the highest signal to noise; of more than some
+        90,000 sources (of four channels, by default) the faintest
     overwrite: replace the file at `path`
 
     Raises FileError for a folder without a run, a catalogue or `truth` that cannot be read, and

@@ -106,7 +106,7 @@ async function saveField(view) {
     ...wcsCards([a, b, c, d, x + a * du + c * dv, y + b * du + d * dv]), card("BUNIT", "ct", level.scale > 1 ? `mean of ${level.scale} x ${level.scale} pixels` : ""),
     card("LAYER", layer), card("INSTRUME", one.name), ...one.channels.map((name, i) => card(`BAND${i + 1}`, name)),
     card("X0", box[0], "first column, of pixels of this size"), card("Y0", box[1], "first row"),
-    card("STEPMODL", DATA.codes.smooth / 2, "largest relative rounding, models"), card("STEPRES", DATA.codes.noisy / 2, "of residuals; 2.5 sigma-steps near 0"),
+    card("ROUNDMOD", DATA.codes.smooth / 2, "relative rounding of models"), card("ROUNDRES", DATA.codes.noisy / 2, "relative rounding of residuals"),
   ];
   offer(`${safe(one.name)}-${layer}.fits`, hdu(planes, nx, ny, cards, true), "application/fits");
 }
@@ -190,6 +190,7 @@ function coordinatesOf(x, y) {
 
 async function copyText(text) {
   root.dataset.copied = text;
+  byId("answer").textContent = `Copied: ${text}`;
   try {
     await navigator.clipboard.writeText(text);
   } catch {
@@ -200,5 +201,4 @@ async function copyText(text) {
     document.execCommand("copy");
     area.remove();
   }
-  byId("answer").textContent = `Copied: ${text}`;
 }
