@@ -169,7 +169,7 @@ function readOut(view, pane, u, v) {
 function valuesText(one, { level, k, column, row }, then) {
   const i = row * level.places[k][0] + column, [x0, y0] = level.origins[k];
   const size = level.scale > 1 ? `, means of ${level.scale} x ${level.scale} pixels` : "";
-  const lines = [`${one.name} pixel (${x0 + column}, ${y0 + row})${size} [${one.unit}]`];
+  const lines = [`${one.name} pixel (${x0 + column}, ${y0 + row})${size} [${one.unit}]; ± is the rounding of this page, not the noise`];
   one.channels.forEach((name, channel) => {
     const picture = tilePicture(one, level, k, channel);
     const texts = LAYERS.map((layer) => {
