@@ -70,7 +70,7 @@ def test_the_page_holds_every_source_and_loads_nothing(done, tmp_path):
     assert all(str(i) in text for i in rows["id"])
     order = np.argsort(-rows["snr"])
     np.testing.assert_allclose(data["sources"]["x"], rows["x"].value[order], atol=0.006)
-    assert [len(i["levels"][0]["data"]) for i in data["instruments"]] == [1, 1]
+    assert [len(i["levels"][0]["model"]) for i in data["instruments"]] == [1, 1]
     assert {r["name"] for r in data["details"]["0"]["stamps"]["rows"]} == {"VIS", "i"}
     for _, attributes in elements.all:
         for key in ("src", "href", "action", "data"):

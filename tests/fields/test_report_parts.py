@@ -1,5 +1,6 @@
 """What the report is made of: PNG, tiles, places of tiles, maps of chi2, matches, axes."""
 
+import base64
 import io
 import struct
 import zlib
@@ -13,7 +14,8 @@ from astropy.table import QTable
 from helpers.field_folder import SIGMA, write_folder
 
 from clresample import Grid
-from clresample.fields.report import pyramid, shades
+from clresample.fields.box import Box
+from clresample.fields.report import alone, codes, pyramid, shades
 from clresample.fields.report.charts import chi2_numbers, chi2_palette, magnitudes
 from clresample.fields.report.content import flag_names
 from clresample.fields.report.folder import Run, read_run
@@ -54,27 +56,71 @@ def test_a_png_gives_its_pixels_back(shape, smooth):
     np.testing.assert_array_equal(np.asarray(other), image)
 
 
-def test_a_palette_gives_colours():
-    image = pytest.importorskip("PIL.Image")
-    numbers = shades.residual_numbers(np.array([[-9.0, 0.0, 9.0, np.nan]]))
-    shown = image.open(io.BytesIO(png(numbers, shades.residual_palette()))).convert("RGB")
-    expected = shades.NEGATIVE, shades.MIDDLE, shades.POSITIVE, shades.EMPTY
-    np.testing.assert_array_equal(np.asarray(shown)[0], expected)
+def values_of(text, shape, step, smooth):
+    """Values [unit] of a text of `codes.encode`, by its definition."""
+    data = np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8).astype(int)
+    code = data[: data.size // 2] + 256 * data[data.size // 2 :]
+    code = code.reshape(shape)
+    if smooth:
+        code = np.cumsum(code, axis=0) % 65536
+    steps = np.where(code % 2, (code - 1) // 2, -(code // 2))
+    return np.where(code == 0, np.nan, codes.KNEE * np.sinh(step * steps))
 
 
-def test_colours_survive_the_stretch_and_noise_is_dark():
-    sigma, rng = np.array([1.0, 2.0, 4.0]), np.random.default_rng(1)
-    model = np.zeros((3, 40, 40))
-    model[:, 10:14, 10:14] = np.array([50.0, 100.0, 400.0])[:, None, None]
-    model[:, 30:34, 30:34] = np.array([400.0, 100.0, 50.0])[:, None, None]
-    stretch = shades.stretch_of(model.reshape(3, -1), sigma)
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_text_gives_values_back_to_half_a_step(smooth):
+    step = codes.SMOOTH_STEP if smooth else codes.NOISY_STEP
+    rng = np.random.default_rng(0)
+    image = 3.0 * np.concatenate([rng.normal(0, 2, (9, 7)), rng.normal(0, 1, (4, 7)) * 1e6])
+    image[2, 3] = np.nan
+    got = 3.0 * values_of(codes.encode(image, 3.0, smooth=smooth), image.shape, step, smooth)
+    np.testing.assert_array_equal(np.isnan(got), np.isnan(image))
+    most = 1.001 * step / 2 * np.hypot(3.0 * codes.KNEE, image)
+    good = np.isfinite(image)
+    assert (np.abs(got - image)[good] <= most[good] * (1 + step)).all()
+
+
+def test_the_first_stretch_shows_the_three_channels_of_the_most_signal():
+    sigma = np.array([1.0, 2.0, 4.0, 4.0])
+    light = np.zeros((4, 400))
+    light[:, :40] = np.array([50.0, 100.0, 400.0, 1.0])[:, None]
+    stretch = shades.stretch_of(light, sigma)
     assert stretch.chosen == (0, 1, 2)
-    image = stretch.shown(model + sigma[:, None, None] * rng.standard_normal(model.shape))
-    red, blue = (image[y : y + 4, y : y + 4].mean(axis=(0, 1)) for y in (10, 30))
-    assert red[0] > red[1] > red[2] and blue[2] > blue[1] > blue[0]
-    assert np.median(image) < 70
-    model[0, 0, 0] = np.nan
-    np.testing.assert_array_equal(stretch.shown(model)[0, 0], shades.EMPTY)
+    np.testing.assert_allclose(stretch.balance * light[:3].sum(axis=1), light[:3].sum() / 3)
+    np.testing.assert_allclose(stretch.whites, [50, 100, 400, 8 * 2.5 * 4])
+
+
+class OneModel:
+    """Cutouts of a run whose sources are all a square of ones at (y, x) = (10, 20)."""
+
+    def __init__(self, folder):
+        self.mosaics = (SimpleNamespace(name="E"),)
+
+    def separate(self, ids, i_mosaic):
+        if ids == [7]:
+            raise alone.MissingSource("none")
+        return SimpleNamespace(own=np.ones((2, 4, 4))), None, (10, 20)
+
+
+def test_own_models_are_put_where_they_are(monkeypatch, tmp_path):
+    (tmp_path / "models.fits").touch()
+    monkeypatch.setattr(alone, "FieldCutouts", OneModel)
+    notes, run = [], SimpleNamespace(finished=True, settings={}, folder=tmp_path)
+    own = alone.OwnModels(run, notes)
+    one = SimpleNamespace(name="E", channels=("a", "b"))
+    image = own.on(3, one, Box(8, 22, 13, 30))
+    expected = np.zeros((2, 5, 8))
+    expected[:, 2:, :2] = 1
+    np.testing.assert_array_equal(image, expected)
+    assert own.on(7, one, Box(0, 0, 9, 9)) is None and notes == []
+    monkeypatch.setattr(alone, "MAX_SOURCES", 2)
+    assert own.on(4, one, Box(0, 0, 9, 9)) is None and own.on(3, one, Box(0, 0, 9, 9)) is not None
+    (tmp_path / "models.fits").unlink()
+    assert alone.OwnModels(run, notes).on(3, one, Box(0, 0, 9, 9)) is None and notes == []
+    (tmp_path / "models.fits").touch()
+    monkeypatch.undo()
+    assert alone.OwnModels(run, notes).on(3, one, Box(0, 0, 9, 9)) is None
+    assert "no pictures of sources without their neighbours: " in notes[0]
 
 
 def test_means_of_blocks_leave_out_what_is_not_there():
@@ -113,7 +159,7 @@ def test_a_pyramid_is_of_the_mosaic_and_its_chi2_of_the_noise(tmp_path):
     assert [level["scale"] for level in made.levels] == [1, 2]
     assert [len(level["model"]) for level in made.levels] == [4, 1]
     assert made.n_bytes == sum(len(t) for level in made.levels for n in pyramid.LAYERS
-                               for t in level[n])  # fmt: skip
+                               for tile in level[n] for t in tile)  # fmt: skip
     assert made.chi2.shape == (38, 38)
     assert abs(np.nanmean(made.chi2) - 1) < 0.03
     assert np.nanmax(np.abs(made.chi2 - 1)) < 0.6
@@ -132,7 +178,7 @@ def test_dead_columns_are_no_light(tmp_path):
     (euclid, _) = read_run(tmp_path).instruments
     made = pyramid.pyramid_of(euclid, euclid.grid, 10**8)
     assert np.nanmax(made.chi2) < 2.5
-    planes, _, _ = pyramid._read(euclid, made.stretch, 0)
+    planes, _, _ = pyramid._read(euclid, 0)
     for plane in planes:
         assert np.isnan(plane[0, :, 40]).all() and np.isfinite(plane[0, :, 41]).all()
 

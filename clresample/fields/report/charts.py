@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from .codes import as_text
 from .png import png
-from .pyramid import as_text
 from .shades import EMPTY
 from .stamps import plain
 from .svg import SQUARE, Chart, Scale
@@ -41,7 +41,7 @@ def fluxes(run):
 
 def number_counts(run, truth, area_arcmin2):
     """[(title, svg)] of sources in magnitude, one for each channel, beside the true ones."""
-    found, per = [], "per arcmin² and" if area_arcmin2 else "per"
+    found, per = [], "/ arcmin² /" if area_arcmin2 else "per"
     area = area_arcmin2 or 1.0
     for channel, flux, _, unit in fluxes(run):
         mags = [magnitudes(flux, unit)]

@@ -7,14 +7,18 @@ import numpy as np
 from ...measurement.catalogue import MEANINGS, Flag
 from ...sky.wcs import local_axes
 from .charts import fluxes, magnitudes
+from .codes import KNEE, NOISY_STEP, SMOOTH_STEP
 from .html import EMPTY, number
-from .pyramid import LAYERS
+from .shades import EMPTY as NO_DATA
 from .stamps import plain, positions, stamps_of
+from .table import columns_of
 
 OK, FLAGGED, FAILED = 0, 1, 2  # states of a source, as the script counts them
-SOURCE_BYTES, DETAIL_BYTES = 64, 1000  # [bytes] of a source on the field, of its measurements
+# [bytes] of a source on the field, of one of its numbers there, of its measurements
+SOURCE_BYTES, NUMBER_BYTES, DETAIL_BYTES = 76, 6, 1000
+SHAPE = "size", "e1", "e2"
 # of the page: places of sources, their measurements, their pictures
-SOURCES_PART, DETAILS_PART, STAMPS_PART = 0.2, 0.1, 0.25
+SOURCES_PART, DETAILS_PART, STAMPS_PART = 0.25, 0.1, 0.25
 
 
 def order_of(run) -> np.ndarray:
@@ -51,7 +55,9 @@ def data_of(run, most_bytes, notes) -> dict:
     """
     frame = run.instruments[0].grid if run.instruments else None
     order = order_of(run)
-    most = int(SOURCES_PART * most_bytes / SOURCE_BYTES)
+    columns = columns_of(run)
+    each = SOURCE_BYTES + NUMBER_BYTES * (len(columns) + len(SHAPE))
+    most = int(SOURCES_PART * most_bytes / each)
     if len(order) > most:
         notes.append(
             f"the field shows {most} sources of {len(order)}, those of the highest signal to noise"
@@ -79,7 +85,16 @@ def data_of(run, most_bytes, notes) -> dict:
             "y": [_short(v, 2) for v in at[:, 0]],
             "state": state.tolist(),
             "snr": [_short(v, 1) for v in snr],
+            "flags": _whole(run, "flags", order),
+            "status": _places(run, "status", order),
+            **{name: _numbers(run, name, order) for name in SHAPE},
+            "columns": [[_shown(v, one.form) for v in one.values[order]] for one in columns],
         },
+        "statuses": _different(run, "status"),
+        "flags": [[str(flag.name), int(flag)] for flag in MEANINGS],
+        "columns": [one.as_json() for one in columns],
+        "codes": {"knee": KNEE, "noisy": NOISY_STEP, "smooth": SMOOTH_STEP},
+        "empty": NO_DATA,
         "flux_columns": _flux_columns(run),
         "details": _details(run, order, detailed, stamps),
     }
@@ -101,6 +116,40 @@ def _texts(run, name, order):
     return [str(int(v)) for v in np.asarray(run.sources[name])[order]]
 
 
+def _whole(run, name, order):
+    """A column of small whole numbers, 0 where there is none."""
+    if name not in run.sources.colnames:
+        return [0] * len(order)
+    return np.nan_to_num(plain(run.sources[name]))[order].astype(int).tolist()
+
+
+def _different(run, name):
+    """The different texts of a column."""
+    return sorted({str(v) for v in run.sources[name]}) if name in run.sources.colnames else []
+
+
+def _places(run, name, order):
+    """For each source the place of its text in `_different`."""
+    places = {text: k for k, text in enumerate(_different(run, name))}
+    return [places[str(run.sources[name][row])] for row in order] if places else []
+
+
+def _numbers(run, name, order):
+    if name not in run.sources.colnames:
+        return []
+    return [_short(v, 3) for v in plain(run.sources[name])[order]]
+
+
+def _digits(value):
+    """A number to seven digits, those of float32; None for NaN."""
+    return float(f"{value:.7g}") if np.isfinite(value) else None
+
+
+def _shown(value, form):
+    """A number to the digits that a table shows; None for NaN."""
+    return float(format(value, form)) if np.isfinite(value) else None
+
+
 def _short(value, digits):
     return round(float(value), digits) if np.isfinite(value) else None
 
@@ -111,7 +160,8 @@ def _frame(run, frame, at):
     if frame is None:
         good = at[np.isfinite(at).all(axis=1)]
         shape = np.ceil(good.max(axis=0)) + 20 if len(good) else [100, 100]
-        return {"shape": [int(n) for n in shape], "scale": None, "offset": offset, "sky": None}
+        pixels = [int(n) for n in shape]
+        return {"shape": pixels, "scale": None, "offset": offset, "sky": None, "axes": None}
     middle = (np.array(frame.shape) - 1) / 2
     flat = "y_sky" in run.sources.colnames
     ra, dec = frame.sky(*middle)
@@ -121,7 +171,6 @@ def _frame(run, frame, at):
         "y": middle[0],
         "ra": float(ra),
         "dec": float(dec),
-        "m": local_axes(frame, middle).tolist(),
         "names": names,
     }
     return {
@@ -129,19 +178,28 @@ def _frame(run, frame, at):
         "scale": float(frame.pixel_scale_arcsec),
         "offset": offset,
         "sky": None if flat else sky,
+        "axes": local_axes(frame, middle).tolist(),
     }
 
 
 def instrument_data(pyramid) -> dict:
     """What the script reads of an instrument."""
-    names = [pyramid.instrument.channels[c] for c in pyramid.stretch.chosen]
-    how = f"{', '.join(names)} as blue, green, red" if len(names) == 3 else names[0]
+    one, stretch = pyramid.instrument, pyramid.stretch
+    names = [one.channels[c] for c in stretch.chosen]
     return {
-        "name": pyramid.instrument.name,
-        "channels": pyramid.instrument.channels,
-        "colours": f"{how}, logarithmic above the noise",
+        "name": one.name,
+        "channels": one.channels,
+        "sigma": [_digits(v) for v in one.sigma],
+        "whites": [_digits(v) for v in stretch.whites],
+        "colour": {
+            "title": f"{', '.join(names)} as blue, green, red",
+            "channels": stretch.chosen,
+            "balance": [_digits(v) for v in stretch.balance],
+            "knee": _digits(stretch.knee),
+            "white": _digits(stretch.white),
+        },
+        "unit": "counts",
         "levels": pyramid.levels,
-        "layers": LAYERS,
     }
 
 

@@ -10,7 +10,11 @@ from html import escape
 from pathlib import Path
 
 PAGE = Path(__file__).parent / "page"
-SCRIPTS = "view.js", "source.js", "page.js"  # in this order, as one script
+# in this order, as one script
+SCRIPTS = (
+    *("pixels.js", "shades.js", "view.js", "overlays.js", "source.js", "table.js", "chart.js"),
+    *("save.js", "page.js"),
+)
 EMPTY = "–"
 
 

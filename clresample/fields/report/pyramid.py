@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import base64
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..box import Box
+from .codes import encode
 from .instrument import Instrument
-from .png import png
-from .shades import Stretch, residual_numbers, residual_palette, stretch_of
+from .shades import Stretch, stretch_of
 
 TILE_PX = 256  # side of a tile: smaller ones are more to list, larger ones more to decode at once
-LAYERS = "data", "model", "residual"
-# [bytes] that a pixel of the three layers takes together, as base64: of noisy images of one channel
-# and of three. Where a finest level starts from; what it really takes decides.
-PIXEL_BYTES = {1: 1.4, 3: 2.4}
+LAYERS = "model", "residual"  # the data are their sum
+# [bytes] that a pixel of both layers takes in one channel, as base64. Where a finest level starts
+# from; what it really takes decides.
+PIXEL_BYTES = 1.0
 CELLS = 96  # of the map of chi2 along the longer side, at most
 LEAST_CELL_PX = 8  # smaller cells scatter by over 20 % in one channel from the noise alone
 # [sigma^2] A pixel counts no more: one cosmic ray or star's core does not hide what a cell says.
@@ -27,8 +26,9 @@ MOST_CHI2 = 36.0
 class Pyramid:
     """Tiles of one instrument.
 
-    instrument; stretch: of its light; finest: level of the finest tiles, 0 = the mosaic's pixels,
-        each level above has pixels twice as large
+    instrument; stretch: how its light is shown at first
+    finest: level of the finest tiles, 0 = the mosaic's pixels, each level above has pixels twice as
+        large
     levels: dicts as the page reads them, the finest first
     n_bytes: of all tiles
     chi2 (My, Mx): mean of (residual / sigma)^2 in cells, NaN where there is no sky; cell_px
@@ -55,12 +55,12 @@ def pyramid_of(instrument, frame, budget) -> Pyramid:
     # what is predicted may be a half too much: a level is not left out for that
     more = max(full_bytes(instrument) / (1.5 * max(budget, 1)), 1)
     finest = int(np.clip(np.ceil(np.log2(more) / 2), 0, coarsest))
-    planes, chi2, cell = _read(instrument, stretch, finest)
+    planes, chi2, cell = _read(instrument, finest)
     levels = []
     for level in range(finest, coarsest + 1):
         if level > finest:
             planes = [_halved(plane) for plane in planes]
-        levels.append(_tiles(planes, level, stretch, instrument.grid, frame))
+        levels.append(_tiles(planes, level, instrument, frame))
     sizes = [_size(level) for level in levels]
     while len(levels) > 1 and sum(sizes) > budget:
         levels, sizes, finest = levels[1:], sizes[1:], finest + 1
@@ -70,14 +70,16 @@ def pyramid_of(instrument, frame, budget) -> Pyramid:
 def full_bytes(instrument) -> float:
     """[bytes] that an instrument's tiles take if none is left out, about."""
     n_y, n_x = instrument.grid.shape
-    return 4 / 3 * n_y * n_x * PIXEL_BYTES[3 if len(instrument.channels) >= 3 else 1]
+    return 4 / 3 * n_y * n_x * PIXEL_BYTES * len(instrument.channels)
 
 
-def _read(instrument, stretch, level):
-    """[data (K, ny, nx), model (K, ny, nx), residual (1, ny, nx)] of a level, map of chi2, its
-    cells' side. The residual is the mean of all channels' in units of sigma, times their root."""
+def _read(instrument, level):
+    """[model (C, ny, nx), residual (C, ny, nx)] [counts] of a level, map of chi2, its cells' side.
+
+    Both are NaN where there are no data.
+    """
     n_y, n_x = instrument.grid.shape
-    step, chosen = 2**level, list(stretch.chosen)
+    step = 2**level
     cell = LEAST_CELL_PX
     while max(n_y, n_x) > CELLS * cell:
         cell *= 2
@@ -88,11 +90,9 @@ def _read(instrument, stretch, level):
         for y0 in range(0, n_y, rows):
             model, left = read(Box(y0, 0, min(y0 + rows, n_y), n_x))
             left = np.where(instrument.dead(left), np.nan, left)
-            sigmas = left / sigma
-            part = [(model + left)[chosen], np.where(np.isfinite(left), model, np.nan)[chosen]]
-            part.append(sigmas.mean(axis=0, keepdims=True) * len(sigmas) ** 0.5)
-            strips.append([_averaged(plane, step) for plane in part])
-            squares = np.minimum(sigmas**2, MOST_CHI2).mean(axis=0, keepdims=True)
+            model = np.where(np.isfinite(left), model, np.nan)
+            strips.append([_averaged(plane, step) for plane in (model, left)])
+            squares = np.minimum((left / sigma) ** 2, MOST_CHI2).mean(axis=0, keepdims=True)
             cells.append(_averaged(squares, cell)[0])
     planes = [np.concatenate(few, axis=1) for few in zip(*strips, strict=True)]
     return planes, np.concatenate(cells), cell
@@ -115,29 +115,31 @@ def _halved(planes):
     return _averaged(planes, 2)
 
 
-def _tiles(planes, level, stretch, grid, frame):
-    """A level as the page reads it: {"scale", "places", and of each layer its tiles}.
+def _tiles(planes, level, instrument, frame):
+    """A level as the page reads it: {"scale", "places", "origins", and of each layer its tiles}.
 
-    Tiles are base64 of PNG; places are six numbers each that take a tile's pixels (column, row),
-    counted from its first corner, to (x, y) of the frame.
+    A tile is a list of a text of `codes.encode` for each channel, in units of the noise of a mean
+    of 4^level pixels; places are the columns and rows of a tile and six numbers that take its
+    pixels (column, row), counted from its first corner, to (x, y) of the frame; origins are its
+    first (x, y) in the level.
     """
-    found = {"scale": 2**level, "places": []} | {layer: [] for layer in LAYERS}
+    found = {"scale": 2**level, "places": [], "origins": []} | {layer: [] for layer in LAYERS}
     n_y, n_x = planes[0].shape[1:]
+    units = instrument.sigma / 2.0**level
     for y0 in range(0, n_y, TILE_PX):
         for x0 in range(0, n_x, TILE_PX):
-            data, model, residual = (
-                plane[:, y0 : y0 + TILE_PX, x0 : x0 + TILE_PX] for plane in planes
-            )
-            sides = data.shape[1:]
-            place = placed(grid, frame, (y0, x0), sides, 2**level)
+            cut = [plane[:, y0 : y0 + TILE_PX, x0 : x0 + TILE_PX] for plane in planes]
+            sides = cut[0].shape[1:]
+            place = placed(instrument.grid, frame, (y0, x0), sides, 2**level)
             if place is None:
                 continue
             found["places"].append([sides[1], sides[0], *place])
-            # of a mean of 4^level pixels the noise is smaller
-            left = png(residual_numbers(residual[0] * 2.0**level), residual_palette())
-            found["data"].append(as_text(png(stretch.shown(data))))
-            found["model"].append(as_text(png(stretch.shown(model, noisy=False), smooth=True)))
-            found["residual"].append(as_text(left))
+            found["origins"].append([x0, y0])
+            for layer, images in zip(LAYERS, cut, strict=True):
+                smooth = layer == "model"
+                found[layer].append(
+                    [encode(i, u, smooth=smooth) for i, u in zip(images, units, strict=True)]
+                )
     return found
 
 
@@ -159,10 +161,5 @@ def placed(grid, frame, corner, shape, scale):
     return [float(f"{value:.7g}") for value in (ax, ay, bx, by, cx, cy)]
 
 
-def as_text(data) -> str:
-    """Bytes as base64."""
-    return base64.b64encode(data).decode("ascii")
-
-
 def _size(level):
-    return sum(len(tile) for layer in LAYERS for tile in level[layer])
+    return sum(len(text) for layer in LAYERS for tile in level[layer] for text in tile)

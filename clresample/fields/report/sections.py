@@ -14,19 +14,18 @@ from .charts import (
     chi2_palette,
     completeness,
     fit_times,
-    fluxes,
     number_counts,
     pull_charts,
     signal_to_noise,
 )
 from .content import FAILED, FLAGGED, flag_names, order_of, states
-from .html import charts, facts, number, section, table, text
-from .shades import residual_palette
+from .html import PAGE, charts, facts, number, section, table, text
 from .stamps import plain
+from .table import columns_of
 from .truth import EDGE_PX, FOUND_PX
 
 MOST_ROWS = 500  # of the table of sources: the page stays quick, and the catalogue has them all
-MOST_CHANNELS = 8  # with a column in that table
+FILTERS = (PAGE / "filters.html").read_text()
 SLOWEST, MOST_FAILED = 15, 200
 
 
@@ -79,34 +78,28 @@ def source_table(run) -> str:
     rows = run.sources
     if not len(rows):
         return section("sources", "Sources", text("No source was found or fitted."))
-    sky = [n for n in ("ra", "dec", "y_sky", "x_sky", "l", "b") if n in rows.colnames][:2]
-    numbers = [
-        *((n, str(rows[n].unit or ""), ".6f", n) for n in sky),
-        ("S/N", "all channels", ".4g", "snr"),
-        *(
-            (c, unit.replace("uJy", "µJy"), ".4g", f"flux_{c}")
-            for c, _, _, unit in list(fluxes(run))[:MOST_CHANNELS]
-        ),
-        ("size", "arcsec", ".3f", "size"),
-        *((f"χ² {n[5:]}", "", ".2f", n) for n in rows.colnames if n.startswith("chi2_")),
-    ]
-    numbers = [one for one in numbers if one[3] in rows.colnames]
-    values = [plain(rows[name]) for *_, name in numbers]
-    forms = [form for _, _, form, _ in numbers]
+    columns = columns_of(run)
     order = order_of(run)[:MOST_ROWS].tolist()
     body = [
         [
             str(int(rows["id"][k])),
-            *(number(column[k], form) for column, form in zip(values, forms, strict=True)),
+            *(number(one.values[k], one.form) for one in columns),
             flag_names(np.nan_to_num(rows["flags"][k])) if "flags" in rows.colnames else "",
             str(rows["status"][k]) if "status" in rows.colnames else "",
         ]
         for k in order
     ]
-    heads = [("id", "", "n"), *((title, unit, "n") for title, unit, *_ in numbers)]
+    heads = [("id", "", "n"), *((one.title, one.unit, "n") for one in columns)]
     heads += [("flags", "", ""), ("fit", "", "")]
     told = f"{len(body)} of {len(rows)} sources, the highest signal to noise first"
-    return section("sources", "Sources", table(told, heads, body, sort=True, link=0))
+    return section("sources", "Sources", FILTERS, table(told, heads, body, link=0))
+
+
+def colours(run) -> str:
+    """The colour-magnitude diagram, which a script draws; nothing without two magnitudes."""
+    if sum(one.kind == "magnitude" for one in columns_of(run)) < 2:
+        return ""
+    return (PAGE / "colours.html").read_text()
 
 
 def photometry(run, truth, area_arcmin2) -> str:
@@ -141,11 +134,6 @@ def chi2(run, pyramids) -> str:
         f"{_ramp(chi2_palette())}</svg>{CHI2_ENDS[1]:g}, logarithmic, 1 in the middle</span></p>"
     )
     return section("chi2", "χ² over the field", text(told), charts(figures), ramp, _misfits(run))
-
-
-def ramp_of_residuals():
-    """The residuals' colours, one unit each."""
-    return _ramp(residual_palette())
 
 
 def _ramp(palette):

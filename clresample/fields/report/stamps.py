@@ -1,4 +1,4 @@
-"""Pictures of single sources: data, model and residual in every channel."""
+"""Pictures of single sources: data, model, residual and the source alone in every channel."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ import numpy as np
 
 from ...files.whole_file import FileError
 from ..box import Box
-from .png import png
-from .pyramid import as_text, placed
-from .shades import EMPTY, KNEE_SIGMAS, NOISY_SHADES, residual_numbers, residual_palette
+from .alone import OwnModels
+from .codes import encode
+from .pyramid import placed
 
 # [frame px] Half the side of a source's pictures: some sky is seen around the faintest, and the
 # largest still fit a page.
 LEAST_HALF, MOST_HALF = 18, 64
 SIZES = 4.0  # half sides in units of a source's size
+LAYERS = "model", "residual", "own"
 MOST_STAMPS = 2000  # sources with pictures, at most: reading them takes some 10 ms each
 
 
@@ -26,12 +27,13 @@ def stamps_of(run, frame, order, budget, notes):
     run: Run; frame: Grid of the page's pixels; order: rows of the catalogue, the first ones first
 
     Of each: "box" [x0, y0, side] of the frame's pixels shown, and "rows", a dict for each channel:
-    "name", "sky" and "left" (base64 of PNG: data beside model, and the residual), "size" [columns,
-    rows] of one of them, "place" as `pyramid.placed` gives it.
+    "name", "instrument" and "channel" (numbers), "model" and "residual" (texts of `codes.encode` in
+    units of the channel's noise), "own" (the source's own model, where it can be had), "size"
+    [columns, rows], "origin" (x, y) of the first pixel, "place" as `pyramid.placed` gives it.
     """
     at = positions(run)
     sizes = _sizes(run, frame)
-    found, used = {}, 0
+    found, used, own = {}, 0, OwnModels(run, notes)
     with ExitStack() as files:
         opened = [(one, files.enter_context(one.opened())) for one in run.instruments]
         for row in list(order)[:MOST_STAMPS]:
@@ -41,11 +43,14 @@ def stamps_of(run, frame, order, budget, notes):
             y, x = np.rint(at[row]).astype(int).tolist()
             wanted = Box(y - half, x - half, y + half + 1, x + half + 1)
             try:
-                rows = [r for one, read in opened for r in _rows(one, read, frame, wanted)]
+                source = int(run.sources["id"][row])
+                rows = []
+                for k, (one, read) in enumerate(opened):
+                    rows += _rows(k, one, read, frame, wanted, own, source)
             except FileError as error:
                 notes.append(f"no pictures of some sources: {error}")
                 break
-            used += sum(len(r["sky"]) + len(r["left"]) for r in rows)
+            used += sum(len(r[name]) for r in rows for name in LAYERS if name in r)
             if used > budget:
                 break
             found[int(row)] = {"box": [wanted.x0, wanted.y0, 2 * half + 1], "rows": rows}
@@ -71,7 +76,7 @@ def _sizes(run, frame):
     return np.nan_to_num(plain(run.sources["size"])) / frame.pixel_scale_arcsec
 
 
-def _rows(instrument, read, frame, wanted):
+def _rows(number, instrument, read, frame, wanted, own, source):
     """The pictures of one instrument's channels; none where it does not hold the place."""
     y0, x0, y1, x1 = np.array(wanted) - 0.5
     corners = frame.positions_in(instrument.grid, [y0, y0, y1, y1], [x0, x1, x0, x1])
@@ -82,26 +87,23 @@ def _rows(instrument, read, frame, wanted):
         return
     models, left = read(box)
     left = np.where(instrument.dead(left), np.nan, left)
+    models = np.where(np.isfinite(left), models, np.nan)
     place = placed(instrument.grid, frame, box[:2], box.shape, 1)
     if place is None:
         return
+    light = own.on(source, instrument, box)
     for c, name in enumerate(instrument.channels):
         sigma = float(instrument.sigma[c])
-        white = max(float(np.nan_to_num(models[c]).max(initial=0)), 8 * KNEE_SIGMAS * sigma)
-        pair = [_grey(image, sigma, white) for image in (models[c] + left[c], models[c])]
-        yield {
+        found = {
             "name": name,
-            "sky": as_text(png(np.hstack(pair))),
-            "left": as_text(png(residual_numbers(left[c] / sigma), residual_palette())),
+            "instrument": number,
+            "channel": c,
+            "model": encode(models[c], sigma, smooth=True),
+            "residual": encode(left[c], sigma),
             "size": [box.shape[1], box.shape[0]],
+            "origin": [box.x0, box.y0],
             "place": place,
         }
-
-
-def _grey(image, sigma, white):
-    """Shades (Ny, Nx) uint8 of an image [counts], those of EMPTY for no data."""
-    knee = KNEE_SIGMAS * sigma
-    level = np.arcsinh((np.nan_to_num(image) + knee) / knee) / np.arcsinh((white + knee) / knee)
-    steps = np.rint((NOISY_SHADES - 1) * np.clip(level, 0, 1))
-    shades = np.rint(steps * (255 / (NOISY_SHADES - 1))).astype(np.uint8)
-    return np.where(np.isfinite(image), shades, np.uint8(EMPTY[1]))
+        if light is not None:
+            found["own"] = encode(light[c], sigma, smooth=True)
+        yield found

@@ -14,7 +14,7 @@ from ..box import Box
 from . import sections
 from .content import data_of, instrument_data
 from .folder import read_run
-from .html import data_block, page
+from .html import PAGE, data_block, page
 from .pyramid import full_bytes, pyramid_of
 from .truth import truth_of
 
@@ -25,31 +25,7 @@ MOST_BYTES = 64 << 20
 TEXT_BYTES = 700_000  # [bytes] that tables and figures take at most, whatever the field
 LEAST_BYTES = 2_000_000
 
-FIELD = """<section id="field"><h2>The field</h2>
-<noscript><p class="about">Images need a script, which this browser does not run. All tables and
-figures below are there without it.</p></noscript>
-<div class="live"><div class="tools">
-<fieldset class="choice"{hidden}><legend>Layer</legend>{layers}</fieldset>
-<fieldset class="choice"{hidden}><legend>Instrument</legend>{instruments}</fieldset>
-<label class="check"><input type="checkbox" id="marks" checked> Mark sources</label></div>
-<div class="viewer"><div><div class="stage">
-<canvas id="sky" tabindex="0" role="application" aria-label="The field. Arrow keys move, plus and
-minus zoom, 0 shows all, 1 2 3 choose data, model, residual, Enter opens the source nearest to the
-middle."></canvas><div class="over readout" id="readout"></div>{compass}
-<div class="over scale"><span id="scale-text"></span><i id="scale-bar"></i></div>
-<div class="zoom"><button type="button" id="zoom-out" aria-label="Zoom out">−</button>
-<button type="button" id="zoom-in" aria-label="Zoom in">+</button>
-<button type="button" id="zoom-fit">All</button></div></div>
-<p class="legend"><span><svg viewBox="0 0 16 16"><circle cx="8" cy="8" r="6"/></svg>source</span>
-<span><svg viewBox="0 0 16 16"><path d="M2 2h12v12h-12z"/></svg>flagged</span>
-<span><svg viewBox="0 0 16 16"><path d="M2 2l12 12M14 2l-12 12"/></svg>fit failed</span>
-<span id="shown"></span><span id="ramp-residual" hidden>−6 σ<svg class="ramp" viewBox="0 0 41 1"
-preserveAspectRatio="none" role="img" aria-label="colours of residuals">{ramp}</svg>+6 σ</span></p>
-<p class="legend">Drag to move; click into the field, then turn the wheel to zoom; click on a source
-to see it. {reduced}</p></div>
-<div class="panel" id="source" aria-live="polite"><h3>No source chosen</h3><p class="about">Click on
-a source, or on its id in a table: data, model and residual in every channel appear here.</p></div>
-</div></div></section>"""
+FIELD = (PAGE / "field.html").read_text()
 
 
 @dataclass(frozen=True)
@@ -72,18 +48,19 @@ def write_report(
 ) -> Report:
     """Write the report of a run of `run_field`, finished or not: one HTML page.
 
-    The page holds the field's data, models and residuals as tiles to zoom into, every source of it,
-    pictures of up to 2000 sources in every channel, number counts, signal to noise, a map of chi2,
-    pulls where the truth is known, the slowest and the failed fits, and what made it. It loads
-    nothing and needs no network.
+    The page holds the pixel values of the field's data, models and residuals as tiles to zoom into,
+    every source of it, pictures of up to 2000 sources in every channel, the source alone where the
+    run's inputs and an OpenCL device are there, colours and magnitudes, number counts, signal to
+    noise, a map of chi2, pulls where the truth is known, the slowest and the failed fits, and the
+    versions and settings of the run. It loads nothing and needs no network.
 
     folder: of the run, or of one part of a field
     path: of the page; None = report.html in the folder, which is replaced
     truth: table of the true sources (y, x [px of the model], flux_CHANNEL [uJy], and snr); None =
         truth.ecsv in the folder, beside it or beside the run's inputs, if there is one
     most_bytes: of the page. What does not fit is left out: the finest tiles; pictures of sources
-        after those that failed, misfit, or have the highest signal to noise; of more than 200,000
-        sources (by default) the faintest
+        after those that failed, misfit, or have the highest signal to noise; of more than some
+        90,000 sources (of four channels, by default) the faintest
     overwrite: replace the file at `path`
 
     Raises FileError for a folder without a run, a catalogue or `truth` that cannot be read, and
@@ -160,13 +137,14 @@ def _body(run, truth, pyramids, notes):
     parts = {
         "Field": _field(run, pyramids),
         "Sources": sections.source_table(run),
+        "Colours": sections.colours(run),
         "Counts": sections.photometry(run, truth, area),
         "χ²": sections.chi2(run, pyramids),
         "Truth": sections.truth_section(run, truth),
         "Fits": sections.fits(run),
         "Origin": sections.origin(run),
     }
-    anchors = "field", "sources", "counts", "chi2", "truth", "fits", "origin"
+    anchors = "field", "sources", "colours", "counts", "chi2", "truth", "fits", "origin"
     links = "".join(
         f'<a href="#{anchor}">{title}</a>'
         for (title, text), anchor in zip(parts.items(), anchors, strict=True)
@@ -183,11 +161,6 @@ def _body(run, truth, pyramids, notes):
 
 def _field(run, pyramids):
     """The viewer, which a script fills."""
-    layers = "".join(
-        f'<label><input type="radio" name="layer" value="{layer}"{" checked" if not k else ""}>'
-        f"<span>{layer.capitalize()}</span></label>"
-        for k, layer in enumerate(("data", "model", "residual"))
-    )
     instruments = "".join(
         f'<label><input type="radio" name="instrument" value="{k}"{" checked" if not k else ""}>'
         f"<span>{escape(pyramid.instrument.name)}</span></label>"
@@ -199,11 +172,9 @@ def _field(run, pyramids):
         if p.finest
     ]
     return FIELD.format(
-        layers=layers,
         instruments=instruments,
         hidden="" if pyramids else " hidden",
         compass=_compass(run),
-        ramp=sections.ramp_of_residuals(),
         reduced=escape("; ".join(coarse) + ("." if coarse else "")),
     )
 
