@@ -60,6 +60,7 @@ def posed(
         scale=rng.uniform(0.1, 0.3, (n, 3)),
         damping=rng.uniform(0, 20, n),
         fit_sky=True,
+        sky_precision=np.array([500.0, 0.0, 90.0]),
     )
     state = State(
         latent=latent,
@@ -132,7 +133,9 @@ class Reference:
             g.append(op.adjoint(wr.astype(op.dtype)))
             self.loss += loss
             pull.append(total)
-        self.pull, self.g = np.concatenate(pull), np.concatenate(g).astype(float)
+        of_sky, slopes = ref.expected_sky(self.sky, s.known_sky)
+        self.loss += of_sky
+        self.pull, self.g = np.concatenate(pull) + slopes, np.concatenate(g).astype(float)
         self.d_morph = gather_morph(self.g, s.origin, self.morph, self.spectra)
         self.d_spectra = gather_spectra(self.g, s.origin, self.morph)
         if self.prior:
@@ -146,7 +149,7 @@ class Reference:
             s.scale * self.d_spectra, self.moments_spectra, self.i_step
         )
         self.spectra = np.maximum(self.spectra - STEPS.spectrum * s.scale * direction, 0)
-        total = np.concatenate([w.sum(axis=(1, 2)) for w in s.weights])
+        total = np.concatenate([w.sum(axis=(1, 2)) for w in s.weights]) + s.known_sky
         self.sky = self.sky - 0.5 * self.pull / total
         for i in np.flatnonzero(~s.fixed):
             self._move(i)
