@@ -73,8 +73,8 @@ def test_the_sky_of_a_channel_without_weight_stays(device):
 
 @pytest.mark.parametrize("unit", [1.0, 1e-6])
 def test_a_sky_step_is_half_of_newtons(device, unit):
-    """Alone with the data and what is expected it leaves half of the mean of both, however faint the
-    weights."""
+    """Alone with the data and what is expected it leaves half of the mean of both, however faint
+    the weights."""
     known = unit * np.array([0.0, 700.0, 1e5])
     scene, state = posed(
         device, spectra=np.zeros((3, 3)), scale=np.zeros((3, 3)), sky_precision=known

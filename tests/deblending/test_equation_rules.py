@@ -119,8 +119,8 @@ def posed(monkeypatch):
 
 
 def columns(one, b, channel):
-    """Numbers of scene b's components, and of a channel their images (n, 5, P), root, data (P,), and
-    the root of what the sky's precision is."""
+    """Numbers of scene b's components, and of a channel their images (n, 5, P), root, data (P,),
+    and the square root of the sky's precision."""
     own = [k for k, part in enumerate(PARTS) if part[0] == b]
     sight = one.sights[int(channel >= 2)]
     c = channel - sight.channels.start
@@ -136,8 +136,8 @@ def with_pixel(values, of_level):
 @pytest.mark.parametrize("fit_sky", [False, True])
 @pytest.mark.parametrize("error", [0.0, 0.1])
 def test_spectra_are_each_scenes_least_squares(posed, fit_sky, error):
-    """Not negative, but for the sky, which is expected to be 0 with its precision; under weights that
-    follow the solution before."""
+    """Not negative, but for the sky, which is expected to be 0 with its precision; under weights
+    that follow the solution before."""
     one, rng = posed(fit_sky, slopes=False), np.random.default_rng(5)
     one.spectra[:], one.sky[:] = rng.uniform(0, 4, (6, 3)), rng.normal(size=(3, 3)) * fit_sky
     before = one.spectra.copy(), one.sky.copy()

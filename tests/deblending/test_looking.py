@@ -32,13 +32,10 @@ class Scenes:
             for i, (some, angle) in enumerate(zip(objects, (25, 25, 10), strict=True))
         ]
         if fit_sky:
-            self.views[0] = [
-                v.expecting_sky(np.full(len(v.data), 0.2), 0.03) for v in self.views[0]
-            ]
-            self.views[1:] = [
-                [v.expecting_sky(np.zeros(len(v.data)), np.inf) for v in some]
-                for some in self.views[1:]
-            ]
+            for i, error in enumerate((0.03, np.inf, np.inf)):
+                self.views[i] = [
+                    v.expecting_sky(np.full(len(v.data), 0.2), error) for v in self.views[i]
+                ]
         self.fit_sky, found = fit_sky, []
         for some, own in zip(objects, self.views, strict=True):
             catalogue = sources(some)

@@ -72,7 +72,8 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         image = Image.of(observation, frame, positions[near], shift)
         levels.append(sky_level(image))
         image = image.over(levels[-1].level)
-        lines = [] if settings.fit_sky else _level_lines(image, levels[-1])
+        about = _unsure_lines if settings.fit_sky else _level_lines
+        lines = about(image, levels[-1])
         bad, more = _spoilt(image)
         if bad.any():
             image = image.without(bad)
@@ -114,17 +115,18 @@ def _level_lines(image, sky):
         own = np.maximum(error[known] ** 2 - (sky.wings / image.sigma)[known] ** 2, 0).sum()
         total = np.hypot(shared, np.sqrt(own) / known.sum())
         wrong |= known & (abs(mean) > max(LEVEL_SIGMAS * total, LEVEL_PART)) & (part * mean > 0)
-    # light is positive: where the rim is not below zero, the sky need not be
+    # light is positive: a rim below zero is sky, and where it is not, the sky need not be
     rim, rim_error = sky.rim / image.sigma, sky.rim_error / image.sigma
-    wrong &= (part > 0) | (rim < -np.maximum(LEVEL_SIGMAS * rim_error, LEVEL_PART))
+    below = rim < -np.maximum(LEVEL_SIGMAS * rim_error, LEVEL_PART)
+    level = np.where(below & ~wrong, sky.rim, sky.level)
     lines = []
     for chosen, what, cure in (
         (wrong & (part > 0), "sky is left in", "subtract it"),
-        (wrong & (part < 0), "too much sky was subtracted", "add it back"),
+        (below, "too much sky was subtracted", "add it back"),
     ):
         if chosen.any():
             lines.append(
-                f"{what}: pixels without a source have the level {_parts(image, sky.level, chosen)}"
+                f"{what}: pixels without a source have the level {_parts(image, level, chosen)}"
                 f" a pixel, and every flux holds its share of it; {cure}, or give fit_sky=True"
             )
     if lines or not np.isfinite(rim_error).all():
@@ -137,6 +139,25 @@ def _level_lines(image, sky):
             "image"
         )
     return lines
+
+
+def _unsure_lines(image, sky):
+    """Message about a sky that is fitted and whose SkyLevel is known to little better than a pixel's
+    noise."""
+    seen = image.usable.any(axis=(1, 2))
+    part, names = sky.error / image.sigma, image.observation.channels
+    unsure = seen & (part > LEVEL_PART)
+    if not unsure.any():
+        return []
+    some = ", ".join(
+        f"{names[c]} +- {part[c]:.2g} sigma" if np.isfinite(part[c]) else f"{names[c]} not at all"
+        for c in np.flatnonzero(unsure)
+    )
+    return [
+        f"the sky is fitted, and pixels without a source hardly tell its level ({some} a pixel): "
+        "fluxes of faint or wide sources and their errors depend on it; give a larger image, or "
+        "subtract the sky that is known from one"
+    ]
 
 
 def _parts(image, level, chosen):

@@ -103,8 +103,7 @@ class Looking:
         return sum(sums[:, :, 0].sum(axis=1) for sums in self.sums) + of_sky
 
     def of_level(self):
-        """Right sides and curvatures (k, C) of the sky levels about the solution last compared, with
-        what is expected of them."""
+        """Right sides and curvatures (k, C) of the sky levels about the solution last compared."""
         sums = np.concatenate([s[..., 1:] for s in self.sums], axis=1)
         right, curvature = np.moveaxis(sums, -1, 0)
         known = self.sky_precision[self.scenes]
