@@ -142,8 +142,7 @@ def _level_lines(image, sky):
 
 
 def _unsure_lines(image, sky):
-    """Message about a sky that is fitted and whose SkyLevel is known to little better than a pixel's
-    noise."""
+    """Message about a fitted sky of which the SkyLevel says little; none where it says enough."""
     seen = image.usable.any(axis=(1, 2))
     part, names = sky.error / image.sigma, image.observation.channels
     unsure = seen & (part > LEVEL_PART)
