@@ -76,6 +76,20 @@ def test_sky_is_named_with_its_level(sky, words):
     assert inspected([o], fit_sky=True).messages == []
 
 
+def test_a_rim_below_zero_is_no_light():
+    """A galaxy whose wings hide the sky's level everywhere but at the rim."""
+    y, x = np.indices((48, 48)) - 23.5
+    wings = 4000 * (4 + y**2 + x**2) ** -1.0
+    o = observed(image_of((), shape=(48, 48)) + wings - wings[0, 24] - 0.6 * NOISE)
+    source = (Extended(position_px=(23.5, 23.5)),)
+    level = levels.sky_level(looked_at(o, source))
+    assert (level.rim < -0.3 * NOISE).all() and (np.abs(level.level) < 4 * level.error).all()
+    (message,) = inspected([o], source).messages
+    assert "too much sky was subtracted" in message and f"{level.rim[0]:+.4g} counts" in message
+    (message,) = inspected([o], source, fit_sky=True).messages
+    assert "hardly tell its level" in message and "g +- " in message
+
+
 def test_wings_are_no_sky():
     """A galaxy whose light falls by r^-2.5 to the image's edge."""
     y, x = np.indices((80, 80)) - 39.5
