@@ -6,7 +6,7 @@ import pytest
 from clresample.deblending.blend import Blend
 from clresample.deblending.inspection import levels, listing, spoilt
 from clresample.deblending.inspection.image import Image
-from clresample.deblending.inspection.inspect import inspect
+from clresample.deblending.inspection.inspect import _level_lines, inspect
 from clresample.deblending.inspection.psf_samples import pair_ratios, psf_at
 from clresample.deblending.settings import Settings
 from clresample.sky.frame import model_frame
@@ -88,6 +88,18 @@ def test_a_rim_below_zero_is_no_light():
     assert "too much sky was subtracted" in message and f"{level.rim[0]:+.4g} counts" in message
     (message,) = inspected([o], source, fit_sky=True).messages
     assert "hardly tell its level" in message and "g +- " in message
+
+
+def test_a_level_under_wings_may_be_wrong():
+    """As far below zero as its error, and no rim that shows it."""
+    o, found = observed(image_of()), []
+    for part in (-0.6, -0.35, -0.2):
+        level, error = np.full(2, part * NOISE), np.full(2, 0.3 * NOISE)
+        sky = levels.SkyLevel(level, error, error, 0 * level, 0.1 * error)
+        found.append(_level_lines(looked_at(o), sky))
+    ((line,), *others) = found
+    assert "level is unsure" in line and "g -0.6 sigma" in line and "+- 0.3 sigma" in line
+    assert others == [[], []]
 
 
 def test_wings_are_no_sky():
