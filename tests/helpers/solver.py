@@ -22,6 +22,7 @@ STEPS = StepSizes(latent=0.05, morphology=0.01, spectrum=0.1)
 # [relative to an array's largest value] a few hundred roundings: sums over pixels and frequencies
 CLOSE = {np.float32: 1e-4, np.float64: 1e-12}
 PSFS = PSF.gaussian(1.2, n_pixels=19), PSF.gaussian(0.9, n_pixels=15, n_bands=2)
+KNOWN_SKY = 500.0, 0.0, 90.0  # precisions with which levels are expected to be 0
 BOXES = ((2, 3, 11, 14), (0, 0, 9, 8), (19, 27, 11, 9), (29, 35, 1, 1), (4, 0, 7, 36))
 
 every_type = pytest.mark.parametrize("dtype", [np.float32, np.float64], ids=lambda t: t.__name__)
@@ -60,7 +61,7 @@ def posed(
         scale=rng.uniform(0.1, 0.3, (n, 3)),
         damping=rng.uniform(0, 20, n),
         fit_sky=True,
-        sky_precision=np.array([500.0, 0.0, 90.0]),
+        sky_precision=np.resize(KNOWN_SKY, np.shape(given.get("sky", KNOWN_SKY))),
     )
     state = State(
         latent=latent,
