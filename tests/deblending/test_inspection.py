@@ -91,11 +91,11 @@ def test_a_rim_below_zero_is_no_light():
 
 
 def test_a_level_under_wings_may_be_wrong():
-    """As far below zero as its error, and no rim that shows it."""
+    """Two errors below zero, where the rim is not above it; a rim that is dark shows no sky."""
     o, found = observed(image_of()), []
-    for part in (-0.6, -0.35, -0.2):
+    for part, rim in ((-0.6, -0.1), (-0.35, -0.1), (-0.6, 0.0)):
         level, error = np.full(2, part * NOISE), np.full(2, 0.3 * NOISE)
-        sky = levels.SkyLevel(level, error, error, 0 * level, 0.1 * error)
+        sky = levels.SkyLevel(level, error, error, np.full(2, rim * NOISE), 0.1 * error)
         found.append(_level_lines(looked_at(o), sky))
     ((line,), *others) = found
     assert "level is unsure" in line and "g -0.6 sigma" in line and "+- 0.3 sigma" in line

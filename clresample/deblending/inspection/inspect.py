@@ -115,6 +115,8 @@ def _level_lines(image, sky):
     """What is said of a SkyLevel that is not zero, and of a rim that is not dark."""
     part, error = sky.level / image.sigma, sky.error / image.sigma
     known, doubt = np.isfinite(error), False
+    rim, rim_error = sky.rim / image.sigma, sky.rim_error / image.sigma
+    unsure = RIM_SIGMAS * rim_error.mean() / np.sqrt(len(rim))
     wrong = known & (np.abs(part) > np.maximum(LEVEL_SIGMAS * error, LEVEL_PART))
     if known.any():  # all channels together: what wings leave unsure is common to them
         mean, shared = part[known].mean(), (sky.wings / image.sigma)[known].mean()
@@ -122,13 +124,13 @@ def _level_lines(image, sky):
         total = np.hypot(shared, np.sqrt(own) / known.sum())
         wrong |= known & (abs(mean) > max(LEVEL_SIGMAS * total, LEVEL_PART)) & (part * mean > 0)
         doubt = abs(mean) > max(DOUBT_SIGMAS * total, DOUBT_PART)
+        doubt &= mean > 0 or rim.mean() < -unsure
     # light is positive: a rim below zero is sky, and where it is not, the sky need not be
-    rim, rim_error = sky.rim / image.sigma, sky.rim_error / image.sigma
     below = rim < -np.maximum(LEVEL_SIGMAS * rim_error, LEVEL_PART)
-    level = np.where(below & ~wrong, sky.rim, sky.level)
+    level = np.where(below & ~(wrong & (part < 0)), sky.rim, sky.level)
     lines = []
     for chosen, what, cure in (
-        (wrong & (part > 0), "sky is left in", "subtract it"),
+        (wrong & (part > 0) & ~below, "sky is left in", "subtract it"),
         (below, "too much sky was subtracted", "add it back"),
     ):
         if chosen.any():
@@ -138,7 +140,7 @@ def _level_lines(image, sky):
             )
     if lines or not np.isfinite(rim_error).all():
         return lines
-    if rim.mean() > RIM_PART + RIM_SIGMAS * rim_error.mean() / np.sqrt(len(rim)):
+    if rim.mean() > RIM_PART + unsure:
         lines.append(
             "the pixels furthest from the sources are not dark, "
             f"{_parts(image, sky.rim, rim > 0)} a pixel: sky is left in, or wings of the sources "
