@@ -4,6 +4,8 @@
  *             best[b] = the lowest of those with i_loss = 0; launch: (WG, B), groups of (WG, 1)
  * keep        kept_* <- latent, morph, spectra, sky of the scenes whose loss[b] is best[b], and so
  *             never of one whose loss is NaN; launch: (X, tallest box, S)
+ * expect_sky  first row r of each channel c: rows[b, r] += 1/2 precision[b, c] sky[b, c]^2 and
+ *             pull[b, r] += precision[b, c] sky[b, c], for n = B C levels; launch: see FOR_I
  *
  * rows (B, n_rows): losses of the observed rows; spectra (S, C), sky (B, C)
  * first, table, X, flat buffers: as in scene.cl
@@ -66,5 +68,18 @@ __kernel void keep(__global const int *restrict active, __global const int *rest
         const size_t i = (size_t)s * n_channels + c, j = (size_t)b * n_channels + c;
         kept_spectra[i] = spectra[i];
         if (s == first[b]) kept_sky[j] = sky[j];
+    }
+}
+
+__kernel void expect_sky(const int n, const int n_channels, const int n_rows,
+                         __global const int *restrict row0, __global const REAL *restrict precision,
+                         __global const REAL *restrict sky, __global REAL *restrict rows,
+                         __global REAL *restrict pull)
+{
+    FOR_I(i, n) {
+        const size_t r = (size_t)(i / n_channels) * n_rows + row0[i % n_channels];
+        const REAL slope = precision[i] * sky[i];
+        rows[r] += (REAL)0.5 * slope * sky[i];
+        pull[r] += slope;
     }
 }

@@ -75,6 +75,9 @@ class Fit:
         view = partial(whitened_view, pad=pad, device=device, dtype=dtype, private=private)
         views = [view(self.home, o) for o in blend.observations]
         self.views = tied_views(views, blend.observations)
+        if settings.fit_sky:
+            pairs = zip(self.views, self.sky_levels, strict=True)
+            self.views = [view.expecting_sky(sky.level, sky.error) for view, sky in pairs]
         self.ties = self.views[0].ties
         if private:
             self.shift(shifts)
@@ -111,6 +114,16 @@ class Fit:
         self.messages += [_dark_message(i, self._positions[i]) for i in self.dark]
         self.scene, self.state = first_scene(self)
         self.seconds["setup"] += seconds + time.perf_counter() - began
+
+    @property
+    def sky_level(self) -> np.ndarray:
+        """Level (C,) of the sky that is taken off the views' data, in their units."""
+        return _joined([view.sky_level for view in self.views], len(self.unit))
+
+    @property
+    def sky_precision(self) -> np.ndarray:
+        """Inverse variance (C,) of that level, in their units; 0 where nothing is expected."""
+        return _joined([view.sky_precision for view in self.views], len(self.unit))
 
     @property
     def shifts(self) -> np.ndarray:
@@ -181,7 +194,7 @@ class Fit:
             sources=self.sources,
             components=tuple(components),
             rendered=rendered,
-            sky=seen.sky * self.unit,
+            sky=(seen.sky + self.sky_level) * self.unit,
             covariance=seen.covariance * self.unit[:, None, None] ** 2,
             shifts=self.shifts,
             losses=np.array(self.losses),
@@ -208,6 +221,11 @@ def finish(fits) -> list[Seen]:
     for fit in fits:
         fit.note_seconds("result", (time.perf_counter() - began) / len(fits))
     return found
+
+
+def _joined(parts, n_channels):
+    """Arrays (Co,) of all observations as one (C,); 0 where there are none, but None."""
+    return np.zeros(n_channels) if parts[0] is None else np.concatenate(parts)
 
 
 def _model(fit) -> Model:

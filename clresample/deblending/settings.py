@@ -39,7 +39,9 @@ class Settings:
     fit_shifts: let each observation but the first move by a constant shift. "auto": where light of
         isolated sources lies over 0.25 model pixels and 3 sigma apart in two observations
         (inspection/shifted.py), from the shift measured there; else the fit is that of False
-    fit_sky: fit a constant per channel
+    fit_sky: fit a constant per channel. Its prior is Gaussian, with the level of the pixels that
+        hold no source and its error (inspection/levels.py), so that it takes no light of wide
+        sources; where no pixel is free of sources the constant is unconstrained
     flux_floor: with a LearnedPrior, part of each flux added to its error in quadrature, the same
         for all channels of a source: what no likelihood knows, the error of the model of bright
         galaxies, their photons' own noise where the weights leave it out, and PSFs. It is that of

@@ -37,6 +37,9 @@ class WhitenedView:
     noise (Co,) [unit]: of a typical pixel, where `unit` is another one; None = 1
     ties: Ties of the channels of all views of the scene; None where each has a band of its own
     exposures (Co,): with ties, how many exposures like this one the band has the weight of
+    sky_level (Co,) [unit]: expected level of the sky, which is taken off the data; 0 where unknown
+    sky_precision (Co,) [1 / unit^2]: inverse variance of that expectation; 0 where unknown
+        Both are None unless the sky is fitted.
     """
 
     op: Resampler
@@ -49,6 +52,8 @@ class WhitenedView:
     noise: np.ndarray | None = None
     ties: Ties | None = None
     exposures: np.ndarray | None = None
+    sky_level: np.ndarray | None = None
+    sky_precision: np.ndarray | None = None
 
     @classmethod
     def of(cls, op, frame, data, weights, shares=None):
@@ -90,6 +95,17 @@ class WhitenedView:
         data = self.data * ratio[:, None, None]
         root = self.root / ratio[:, None, None]
         return replace(self, unit=unit, root=root, data=data, noise=ratio, ties=ties)
+
+    def expecting_sky(self, level, error) -> WhitenedView:
+        """The same view with the sky at this level, with this Gaussian error, (Co,) [counts].
+
+        The data are above the level, so that a fitted sky deviates from it. An infinite error is
+        one of which nothing is known.
+        """
+        level = level / self.unit
+        data = np.where(self.root > 0, self.data - level[:, None, None], 0.0)
+        precision = (self.unit / error) ** 2
+        return replace(self, data=data, sky_level=level, sky_precision=precision)
 
     @property
     def error_scale(self) -> np.ndarray:

@@ -131,7 +131,8 @@ def reference(whole, v, looking, fit_sky):
             columns = a[owner, None] * seen[slopes, c]
             lit = np.concatenate([seen[heads, c][a > 0], root[None][: int(fit_sky)]])
             inner = (lit * weight) @ lit.T
-            inner += 1e-8 * np.trace(inner) * np.eye(len(inner))
+            spectra = np.arange(len(lit)) < len(lit) - fit_sky
+            inner += 1e-8 * np.trace(inner[np.ix_(spectra, spectra)]) * np.diag(spectra)
             cross = (lit * weight) @ columns.T
             solved = np.linalg.solve(inner, cross)
             matrix = matrix + (columns * weight) @ columns.T - cross.T @ solved

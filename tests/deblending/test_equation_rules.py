@@ -31,6 +31,7 @@ class Sums:
         self.channels, self.n_bands = channels, channels.stop - channels.start
         self.root = rng.uniform(0.5, 1.5, (N_SCENES, self.n_bands, N_PIXELS))
         self.data = rng.normal(5, 3, self.root.shape)  # times the root
+        self.sky_precision = rng.uniform(10, 40, self.root.shape[:2])
         self.images = rng.uniform(-0.2, 1, (len(PARTS), 5, self.n_bands, N_PIXELS))
         for image, (_, _, n, first, last) in zip(self.images, PARTS, strict=True):
             image[..., :first] = image[..., last:] = 0
@@ -118,17 +119,25 @@ def posed(monkeypatch):
 
 
 def columns(one, b, channel):
-    """Numbers of scene b's components, and of a channel their images (n, 5, P), root, data (P,)."""
+    """Numbers of scene b's components, and of a channel their images (n, 5, P), root, data (P,),
+    and the square root of the sky's precision."""
     own = [k for k, part in enumerate(PARTS) if part[0] == b]
     sight = one.sights[int(channel >= 2)]
     c = channel - sight.channels.start
-    return own, sight.images[own][:, :, c], sight.root[b, c], sight.data[b, c]
+    known = np.sqrt(sight.sky_precision[b, c])
+    return own, sight.images[own][:, :, c], sight.root[b, c], sight.data[b, c], known
+
+
+def with_pixel(values, of_level):
+    """Images (..., P) with a pixel more, in which only a level of 1 is, by this value."""
+    return np.concatenate([values, np.broadcast_to(of_level, (*values.shape[:-1], 1))], axis=-1)
 
 
 @pytest.mark.parametrize("fit_sky", [False, True])
 @pytest.mark.parametrize("error", [0.0, 0.1])
 def test_spectra_are_each_scenes_least_squares(posed, fit_sky, error):
-    """Not negative, but for the sky; under weights that follow the solution before."""
+    """Not negative, but for the sky, which is expected to be 0 with its precision; under weights
+    that follow the solution before."""
     one, rng = posed(fit_sky, slopes=False), np.random.default_rng(5)
     one.spectra[:], one.sky[:] = rng.uniform(0, 4, (6, 3)), rng.normal(size=(3, 3)) * fit_sky
     before = one.spectra.copy(), one.sky.copy()
@@ -137,9 +146,13 @@ def test_spectra_are_each_scenes_least_squares(posed, fit_sky, error):
     assert one.normal.shape == (2, 3, 4, 4)
     for row, b in enumerate(SEEN):
         for channel in range(3):
-            own, images, root, data = columns(one, b, channel)
+            own, images, root, data, known = columns(one, b, channel)
             model = before[0][own, channel] @ images[:, 0] + before[1][b, channel] * root
-            weight = 1 / (1 + (error * model) ** 2)
+            weight = with_pixel(1 / (1 + (error * model) ** 2), 1)
+            images, root, data = (
+                with_pixel(images, 0), with_pixel(root, known * fit_sky), with_pixel(data, 0)
+            )  # fmt: skip
+            model = with_pixel(model, before[1][b, channel] * known * fit_sky)
             wanted_chi2[row] += (weight * (data - model) ** 2).sum()
             a = np.concatenate([images[:, 0], root[None][: int(fit_sky)]]) * np.sqrt(weight)
             low = np.where(np.arange(len(a)) < len(own), 0, -np.inf)
@@ -168,12 +181,17 @@ def test_spectra_are_each_scenes_least_squares(posed, fit_sky, error):
     np.testing.assert_array_equal(one.sky[1], before[1][1])
 
 
+@pytest.mark.parametrize("size", [1.0, 1e-3])
 @pytest.mark.parametrize("fit_sky", [False, True])
-def test_parameters_have_the_normal_equations_of_gauss_and_newton(posed, fit_sky):
+def test_parameters_have_the_normal_equations_of_gauss_and_newton(posed, fit_sky, size):
     """What a step of the parameters changes once lit spectra and sky levels have followed it;
-    slopes that a component does not have say nothing."""
+    slopes that a component does not have say nothing. Images of unit integral are far smaller than
+    a level of 1, whose curvature is no measure of theirs."""
     one, rng, error = posed(fit_sky), np.random.default_rng(6), 0.1
-    one.spectra[:], one.sky[:] = rng.uniform(0.1, 4, (6, 3)), rng.normal(size=(3, 3)) * fit_sky
+    for sight in one.sights:
+        sight.images *= size
+    one.spectra[:] = rng.uniform(0.1, 4, (6, 3)) / size
+    one.sky[:] = rng.normal(size=(3, 3)) * fit_sky
     one.spectra[1, 2] = 0  # at its bound
     one.compare(error)
     normal, right = equations(one)
@@ -181,21 +199,24 @@ def test_parameters_have_the_normal_equations_of_gauss_and_newton(posed, fit_sky
         n_own = sum(part[0] == b for part in PARTS)
         matrix, side = np.zeros((4 * n_own,) * 2), np.zeros(4 * n_own)
         for channel in range(3):
-            own, images, root, data = columns(one, b, channel)
+            own, images, root, data, known = columns(one, b, channel)
             a = one.spectra[own, channel]
             model = a @ images[:, 0] + one.sky[b, channel] * root
-            weight = 1 / (1 + (error * model) ** 2)
-            known = np.arange(4) < np.array([PARTS[i][2] for i in own])[:, None]
-            slopes = (a[:, None, None] * images[:, 1:] * known[..., None]).reshape(4 * n_own, -1)
+            weight = with_pixel(1 / (1 + (error * model) ** 2), 1)
+            images, root, data = with_pixel(images, 0), with_pixel(root, known), with_pixel(data, 0)
+            model = with_pixel(model, one.sky[b, channel] * known)
+            used = np.arange(4) < np.array([PARTS[i][2] for i in own])[:, None]
+            slopes = (a[:, None, None] * images[:, 1:] * used[..., None]).reshape(4 * n_own, -1)
             lit = np.concatenate([images[a > 0, 0], root[None][: int(fit_sky)]])
             inner = (lit * weight) @ lit.T
-            inner += RIDGE * np.trace(inner) * np.eye(len(inner))
+            spectra = np.arange(len(lit)) < len(lit) - fit_sky
+            inner += RIDGE * np.trace(inner[np.ix_(spectra, spectra)]) * np.diag(spectra)
             solved = np.linalg.solve(inner, (lit * weight) @ slopes.T)
             matrix += (slopes * weight) @ slopes.T - ((lit * weight) @ slopes.T).T @ solved
             rest = weight * (data - model)
             side += slopes @ rest - solved.T @ (lit @ rest)
-        k, size = 4 * n_own, np.abs(matrix).max()
-        np.testing.assert_allclose(normal[row, :k, :k], matrix, atol=1e-8 * size)
+        k, most = 4 * n_own, np.abs(matrix).max()
+        np.testing.assert_allclose(normal[row, :k, :k], matrix, atol=1e-8 * most)
         np.testing.assert_allclose(right[row, :k], side, atol=1e-8 * np.abs(side).max())
         assert (
             not normal[row, k:].any() and not normal[row, :, k:].any() and not right[row, k:].any()
@@ -211,7 +232,7 @@ def test_light_as_each_profile_sees_it(posed):
     found, wanted = one.signal_to_noise(sky), np.zeros((6, 3))
     for b in SEEN:
         for channel in range(3):
-            own, images, root, data = columns(one, b, channel)
+            own, images, root, data, _ = columns(one, b, channel)
             for k, u in zip(own, images[:, 0], strict=True):
                 if u.any():
                     rest = data - sky[b, channel] * root

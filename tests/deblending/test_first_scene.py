@@ -38,6 +38,7 @@ def posed(monkeypatch, *, learns=True, shares=False):
         start=start,
         noise=np.array([2.0, 1.0, 0.1]),
         ties=None,
+        sky_precision=np.array([4.0, 0.0, 9.0]),
         frame=SimpleNamespace(shape=(20, 21)),
         padded=SimpleNamespace(shape=(24, 32)),
         views=views,
@@ -75,6 +76,7 @@ def test_a_first_scene_holds_what_the_start_has_found(monkeypatch, shares):
         assert state.morph[i] is not scene.profile[i]  # it changes
         assert state.latent[i].shape == (3 + i, 4) and not state.latent[i].any()
     assert state.spectra is fit.start.spectra and state.sky is fit.start.sky
+    assert scene.known_sky is fit.sky_precision
     assert scene.power is fit.start.power and scene.damping is None
 
 

@@ -29,6 +29,7 @@ def ended(noise=(None, "correlated")):
     fit = SimpleNamespace(
         blend=SimpleNamespace(observations=tuple(observations)),
         frame="frame", home="home", sources=("a", "b"), views=views, unit=UNIT,
+        sky_level=np.array([0.5, -0.25, 2.0]),
         padded=SimpleNamespace(shape=(24, 32)),
         fitted=np.array([3, 5]),
         start=SimpleNamespace(source=np.array([1, 1, 0])),
@@ -79,7 +80,7 @@ def test_results_are_in_counts_and_have_maxima_of_1(monkeypatch, bare):
     ((of, bare_result, given, same),) = asked
     assert of is fit and bare_result.components == found.components and same is seen
     np.testing.assert_array_equal(given, peaks)
-    np.testing.assert_array_equal(found.sky, seen.sky * UNIT)
+    np.testing.assert_array_equal(found.sky, (seen.sky + [0.5, -0.25, 2.0]) * UNIT)
     for c in range(3):
         np.testing.assert_array_equal(found.covariance[c], seen.covariance[c] * UNIT[c] ** 2)
     for view, shown, here, other in zip(

@@ -6,7 +6,7 @@ import pytest
 from clresample.deblending.blend import Blend
 from clresample.deblending.inspection import levels, listing, spoilt
 from clresample.deblending.inspection.image import Image
-from clresample.deblending.inspection.inspect import inspect
+from clresample.deblending.inspection.inspect import _level_lines, inspect
 from clresample.deblending.inspection.psf_samples import pair_ratios, psf_at
 from clresample.deblending.settings import Settings
 from clresample.sky.frame import model_frame
@@ -74,6 +74,32 @@ def test_sky_is_named_with_its_level(sky, words):
     level = levels.sky_level(looked_at(o))
     assert np.abs(level.level - sky * NOISE).max() < 4 * level.error.max() < 0.4 * NOISE
     assert inspected([o], fit_sky=True).messages == []
+
+
+def test_a_rim_below_zero_is_no_light():
+    """A galaxy whose wings hide the sky's level everywhere but at the rim."""
+    y, x = np.indices((48, 48)) - 23.5
+    wings = 4000 * (4 + y**2 + x**2) ** -1.0
+    o = observed(image_of((), shape=(48, 48)) + wings - wings[0, 24] - 0.6 * NOISE)
+    source = (Extended(position_px=(23.5, 23.5)),)
+    level = levels.sky_level(looked_at(o, source))
+    assert (level.rim < -0.3 * NOISE).all() and (np.abs(level.level) < 4 * level.error).all()
+    (message,) = inspected([o], source).messages
+    assert "too much sky was subtracted" in message and f"{level.rim[0]:+.4g} counts" in message
+    (message,) = inspected([o], source, fit_sky=True).messages
+    assert "hardly tell its level" in message and "g +- " in message
+
+
+def test_a_level_under_wings_may_be_wrong():
+    """Two errors below zero, where the rim is not above it; a rim that is dark shows no sky."""
+    o, found = observed(image_of()), []
+    for part, rim in ((-0.6, -0.1), (-0.35, -0.1), (-0.6, 0.0)):
+        level, error = np.full(2, part * NOISE), np.full(2, 0.3 * NOISE)
+        sky = levels.SkyLevel(level, error, error, np.full(2, rim * NOISE), 0.1 * error)
+        found.append(_level_lines(looked_at(o), sky))
+    ((line,), *others) = found
+    assert "level is unsure" in line and "g -0.6 sigma" in line and "+- 0.3 sigma" in line
+    assert others == [[], []]
 
 
 def test_wings_are_no_sky():

@@ -249,7 +249,8 @@ def test_a_prior_that_makes_no_sense_is_refused(given, words):
 
 
 def scene(weights, **given):
-    return SimpleNamespace(weights=weights, ties=None, **given)
+    known = np.zeros(sum(map(len, weights)))
+    return SimpleNamespace(**{"weights": weights, "ties": None, "known_sky": known} | given)
 
 
 def test_pixels_of_a_scene_are_those_with_a_weight():
@@ -269,6 +270,8 @@ def test_curvature_is_left_out_where_nothing_is_seen(unit):
         spectra, sky = _inverse_curvature([scene(weights, power=power, fit_sky=fit_sky)])
         np.testing.assert_allclose(unit * spectra, [[0.25, 1e13], [0, 0]])
         np.testing.assert_allclose(sky, [[0.5 * fit_sky, 0]])
+    known = scene(weights, power=power, fit_sky=True, known_sky=np.array([6.0, 0.5]))
+    np.testing.assert_allclose(_inverse_curvature([known])[1], [[1 / 8, 2]])
 
 
 def test_where_nothing_is_seen_of_any_source_there_is_no_curvature():

@@ -31,6 +31,11 @@ class Scenes:
             views(device, observe(some, seed=i, angle=angle, sky=SKY if fit_sky else (0, 0, 0)))
             for i, (some, angle) in enumerate(zip(objects, (25, 25, 10), strict=True))
         ]
+        if fit_sky:
+            for i, error in enumerate((0.03, np.inf, np.inf)):
+                self.views[i] = [
+                    v.expecting_sky(np.full(len(v.data), 0.2), error) for v in self.views[i]
+                ]
         self.fit_sky, found = fit_sky, []
         for some, own in zip(objects, self.views, strict=True):
             catalogue = sources(some)
@@ -111,6 +116,8 @@ def test_what_is_compared_and_how_clearly_each_is_seen(device, fit_sky):
             ):
                 part = error * (light - level * root)
                 wanted += ((data - model) ** 2 / (1 + part**2)).sum()
+            if fit_sky and not b:
+                wanted += (levels**2 / 0.03**2).sum()
             assert found[row] == pytest.approx(wanted, rel=CLOSE)
     seen = looking.signal_to_noise(looking.sky)
     assert not seen[looking.scene == 1].any()

@@ -54,6 +54,8 @@ def dense(scene, exposures, images, spectra, layout):
     for m in range(layout.n_shifts):
         at = starts[n] + layout.n_sky + m
         matrix[at, at] += SCATTER_PX**-2
+    for c, known in enumerate(scene.known_sky[: layout.n_sky]):
+        matrix[starts[n] + c, starts[n] + c] += known
     for o, (exposure, part) in enumerate(zip(exposures, scene.channels(), strict=True)):
         for c, root in zip(range(part.start, part.stop), exposure.root, strict=True):
             j = np.zeros((total, *SHAPE))
@@ -89,7 +91,10 @@ def test_the_normal_matrix_is_that_of_whole_frames(n_sky, n_shifts, bright):
         for k, box in zip(counts, BOXES, strict=True)
     ]
     scene = SimpleNamespace(
-        origin=np.array(BOXES)[:, :2], profile=images, channels=lambda: CHANNELS
+        origin=np.array(BOXES)[:, :2],
+        profile=images,
+        channels=lambda: CHANNELS,
+        known_sky=np.array([0.0, 700.0, 1e5]),
     )
     exposures = [Plain(2, 2), Plain(1, 3)]
     spectra = bright * rng.uniform(1, 2, (5, 3))

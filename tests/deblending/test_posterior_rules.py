@@ -24,7 +24,8 @@ def solution(
     """Components in boxes, of which all else is as the profiles say."""
     n = len(profiles)
     fixed = np.isin(np.arange(n), fixed)
-    scene = SimpleNamespace(origin=np.array(origin), profile=profiles, fixed=fixed, ties=None)
+    rows = {"origin": np.array(origin), "profile": profiles, "fixed": fixed}
+    scene = SimpleNamespace(**rows, ties=None, known_sky=np.zeros(3))
     given = {"energies": np.ones((n, 3)), "determined": np.ones((n, 3))}
     given |= {"strengths": np.tile([0.01, 0.05, 0.03], (n, 1))}
     return Solution(

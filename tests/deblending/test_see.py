@@ -39,6 +39,12 @@ def test_models_are_seen_side_by_side_each_with_its_own_spectra(
     monkeypatch.setattr(room, "WHOLE_PX", whole_px)
     sky = (0.4, -0.3, 0.2) if fit_sky else (0, 0, 0)
     own = [views(device, observe(BRIGHT, seed=i, sky=sky)) for i in range(2)]
+    if fit_sky:
+        level = np.full(2, 0.1)
+        own = [
+            [v.expecting_sky(level[: len(v.data)], 0.03 + i) for v in some]
+            for i, some in enumerate(own)
+        ]
     wider = PSF.gaussian(1.5, n_pixels=19, n_bands=2)
     o = observe(BRIGHT)[1]
     op = cached_resampler(frame(), o.grid, wider, dtype=np.float64, device=device)

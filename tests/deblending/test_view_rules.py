@@ -56,6 +56,17 @@ def test_data_count_in_the_noise_of_a_typical_pixel():
     np.testing.assert_allclose(turned.pixel_noise, [1, 1])
 
 
+def test_data_are_above_the_sky_that_is_expected():
+    """In the view's units; a level of which nothing is known has no precision."""
+    one, data = view()
+    found = one.expecting_sky(np.array([1.5, -2.0]), np.array([0.25, np.inf]))
+    np.testing.assert_allclose(found.sky_level, [3, -10])
+    np.testing.assert_allclose(found.sky_precision, [4, 0])
+    wanted = np.where(one.root > 0, data - np.array([1.5, -2.0])[:, None, None], 0)
+    np.testing.assert_allclose(found.data, wanted / np.array([0.5, 0.2])[:, None, None])
+    assert found.root is one.root and one.sky_level is None and one.sky_precision is None
+
+
 def test_an_error_of_the_model_is_added_to_the_noise():
     one, _ = view()
     error = np.full((2, 3, 4), 3.0)

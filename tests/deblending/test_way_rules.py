@@ -109,7 +109,7 @@ def test_morphologies_in_large_frames_are_seen_where_they_are(device):
         image[a : a + 15, b : b + 13] = morph
     shown = view.op.render(whole)
     light = 3 * shown[0] + 5 * shown[1] + 0.5
-    names = "op", "root", "shares", "ties", "error_scale"
+    names = "op", "root", "shares", "ties", "error_scale", "sky_precision"
     filled = SimpleNamespace(**{name: getattr(view, name) for name in names})
     filled.mapping, filled.data, filled.covered = view.mapping, 2 * light, view.covered
     for fit_sky in (True, False):

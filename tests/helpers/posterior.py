@@ -80,6 +80,8 @@ def full_matrix(kept, modes=None):
             channel += 1
     for at, m in zip(starts, modes, strict=False):
         matrix[at : at + len(m), at : at + len(m)] += np.eye(len(m))
+    for c, known in enumerate(scene.known_sky[: layout.n_sky]):
+        matrix[starts[len(modes)] + c, starts[len(modes)] + c] += known
     if layout.n_shifts:
         matrix[-layout.n_shifts :, -layout.n_shifts :] += np.eye(layout.n_shifts) / SCATTER_PX**2
     return matrix

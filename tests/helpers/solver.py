@@ -22,6 +22,7 @@ STEPS = StepSizes(latent=0.05, morphology=0.01, spectrum=0.1)
 # [relative to an array's largest value] a few hundred roundings: sums over pixels and frequencies
 CLOSE = {np.float32: 1e-4, np.float64: 1e-12}
 PSFS = PSF.gaussian(1.2, n_pixels=19), PSF.gaussian(0.9, n_pixels=15, n_bands=2)
+KNOWN_SKY = 500.0, 0.0, 90.0  # precisions with which levels are expected to be 0
 BOXES = ((2, 3, 11, 14), (0, 0, 9, 8), (19, 27, 11, 9), (29, 35, 1, 1), (4, 0, 7, 36))
 
 every_type = pytest.mark.parametrize("dtype", [np.float32, np.float64], ids=lambda t: t.__name__)
@@ -60,6 +61,7 @@ def posed(
         scale=rng.uniform(0.1, 0.3, (n, 3)),
         damping=rng.uniform(0, 20, n),
         fit_sky=True,
+        sky_precision=np.resize(KNOWN_SKY, np.shape(given.get("sky", KNOWN_SKY))),
     )
     state = State(
         latent=latent,
@@ -132,7 +134,9 @@ class Reference:
             g.append(op.adjoint(wr.astype(op.dtype)))
             self.loss += loss
             pull.append(total)
-        self.pull, self.g = np.concatenate(pull), np.concatenate(g).astype(float)
+        of_sky, slopes = ref.expected_sky(self.sky, s.known_sky)
+        self.loss += of_sky
+        self.pull, self.g = np.concatenate(pull) + slopes, np.concatenate(g).astype(float)
         self.d_morph = gather_morph(self.g, s.origin, self.morph, self.spectra)
         self.d_spectra = gather_spectra(self.g, s.origin, self.morph)
         if self.prior:
@@ -146,7 +150,7 @@ class Reference:
             s.scale * self.d_spectra, self.moments_spectra, self.i_step
         )
         self.spectra = np.maximum(self.spectra - STEPS.spectrum * s.scale * direction, 0)
-        total = np.concatenate([w.sum(axis=(1, 2)) for w in s.weights])
+        total = np.concatenate([w.sum(axis=(1, 2)) for w in s.weights]) + s.known_sky
         self.sky = self.sky - 0.5 * self.pull / total
         for i in np.flatnonzero(~s.fixed):
             self._move(i)

@@ -29,6 +29,10 @@ def least_squares(units, views, sky=False):
             rows, target = unit[:, c], (view.data[c] * view.root[c]).ravel()
             if sky:  # a free coefficient is the difference of two non-negative ones
                 level = view.root[c].ravel()[None]
+                if view.sky_precision is not None:  # as a pixel more, of the level alone
+                    known = np.sqrt(view.sky_precision[c])
+                    level = np.append(level, known)[None]
+                    rows, target = np.pad(rows, ((0, 0), (0, 1))), np.append(target, 0)
                 rows = np.concatenate([rows, level, -level])
             size = np.maximum(np.linalg.norm(rows, axis=1), 1e-30)
             a = nnls((rows / size[:, None]).T, target)[0] / size

@@ -22,6 +22,12 @@ LEVEL_SIGMAS, LEVEL_PART = 4.0, 0.1
 # The same of the light at the rim, which may be that of wings: 4 errors of the flux in 100 pixels,
 # by two errors of its own at least.
 RIM_PART, RIM_SIGMAS = 0.4, 2.0
+# A level that wings leave unsure is reported as one that may be wrong above this many of its errors
+# and this part of a pixel's noise: none of 400 clean simulated images has two thirds of it.
+DOUBT_SIGMAS, DOUBT_PART = 1.5, 0.3
+# Part of a pixel's noise above which the error of a level is reported where the sky is fitted: it
+# moves a flux by its own error over 50 pixels.
+UNSURE_PART = 0.15
 # [FWHM], [px] Pixels nearer to a listed source are not masked as cosmic rays: its core may be one
 # of a PSF narrower than the one given.
 CORE_FWHM, CORE_PX = 0.5, 1.5
@@ -72,8 +78,8 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         image = Image.of(observation, frame, positions[near], shift)
         levels.append(sky_level(image))
         image = image.over(levels[-1].level)
-        lines = _unmeasured(image)
-        lines += [] if settings.fit_sky else _level_lines(image, levels[-1])
+        about = _unsure_lines if settings.fit_sky else _level_lines
+        lines = _unmeasured(image) + about(image, levels[-1])
         bad, more = _spoilt(image)
         if bad.any():
             image = image.without(bad)
@@ -121,36 +127,64 @@ def _unmeasured(image):
 def _level_lines(image, sky):
     """What is said of a SkyLevel that is not zero, and of a rim that is not dark."""
     part, error = sky.level / image.sigma, sky.error / image.sigma
-    known = np.isfinite(error)
+    known, doubt = np.isfinite(error), False
+    rim, rim_error = sky.rim / image.sigma, sky.rim_error / image.sigma
+    unsure = RIM_SIGMAS * rim_error.mean() / np.sqrt(len(rim))
     wrong = known & (np.abs(part) > np.maximum(LEVEL_SIGMAS * error, LEVEL_PART))
     if known.any():  # all channels together: what wings leave unsure is common to them
         mean, shared = part[known].mean(), (sky.wings / image.sigma)[known].mean()
         own = np.maximum(error[known] ** 2 - (sky.wings / image.sigma)[known] ** 2, 0).sum()
         total = np.hypot(shared, np.sqrt(own) / known.sum())
         wrong |= known & (abs(mean) > max(LEVEL_SIGMAS * total, LEVEL_PART)) & (part * mean > 0)
-    # light is positive: where the rim is not below zero, the sky need not be
-    rim, rim_error = sky.rim / image.sigma, sky.rim_error / image.sigma
-    wrong &= (part > 0) | (rim < -np.maximum(LEVEL_SIGMAS * rim_error, LEVEL_PART))
+        doubt = abs(mean) > max(DOUBT_SIGMAS * total, DOUBT_PART)
+        doubt &= mean > 0 or rim.mean() < -unsure
+    # light is positive: a rim below zero is sky, and where it is not, the sky need not be
+    below = rim < -np.maximum(LEVEL_SIGMAS * rim_error, LEVEL_PART)
+    level = np.where(below & ~(wrong & (part < 0)), sky.rim, sky.level)
     lines = []
     for chosen, what, cure in (
-        (wrong & (part > 0), "sky is left in", "subtract it"),
-        (wrong & (part < 0), "too much sky was subtracted", "add it back"),
+        (wrong & (part > 0) & ~below, "sky is left in", "subtract it"),
+        (below, "too much sky was subtracted", "add it back"),
     ):
         if chosen.any():
             lines.append(
-                f"{what}: pixels without a source have the level {_parts(image, sky.level, chosen)}"
+                f"{what}: pixels without a source have the level {_parts(image, level, chosen)}"
                 f" a pixel, and every flux holds its share of it; {cure}, or give fit_sky=True"
             )
     if lines or not np.isfinite(rim_error).all():
         return lines
-    if rim.mean() > RIM_PART + RIM_SIGMAS * rim_error.mean() / np.sqrt(len(rim)):
+    if rim.mean() > RIM_PART + unsure:
         lines.append(
             "the pixels furthest from the sources are not dark, "
             f"{_parts(image, sky.rim, rim > 0)} a pixel: sky is left in, or wings of the sources "
             "end beyond the image, and fluxes hold a part of it; give fit_sky=True or a larger "
             "image"
         )
+    elif doubt:
+        lines.append(
+            "the sky's level is unsure, as the sources' wings reach all over the image: "
+            f"{_parts(image, sky.level, known)} a pixel, +- {error[known].mean():.2g} sigma, and "
+            "every flux holds its share of it; give fit_sky=True or a larger image"
+        )
     return lines
+
+
+def _unsure_lines(image, sky):
+    """Message about a fitted sky of which the SkyLevel says little; none where it says enough."""
+    seen = image.usable.any(axis=(1, 2))
+    part, names = sky.error / image.sigma, image.observation.channels
+    unsure = seen & (part > UNSURE_PART)
+    if not unsure.any():
+        return []
+    some = ", ".join(
+        f"{names[c]} +- {part[c]:.2g} sigma" if np.isfinite(part[c]) else f"{names[c]} not at all"
+        for c in np.flatnonzero(unsure)
+    )
+    return [
+        f"the sky is fitted, and pixels without a source hardly tell its level ({some} a pixel): "
+        "fluxes of faint or wide sources and their errors depend on it; give a larger image, or "
+        "subtract the sky that is known from one"
+    ]
 
 
 def _parts(image, level, chosen):

@@ -75,7 +75,7 @@ class Layout:
 
 
 def normal_matrix(scene, exposures, images, spectra, layout) -> Blocks:
-    """J^T J + prior^-1.
+    """J^T J + prior^-1, where sky levels have the precision of Scene.known_sky.
 
     scene: Scene; exposures: an Exposure of each observation
     images (n): arrays (1 + k, ny, nx), float32, of morphologies and their modes
@@ -84,6 +84,9 @@ def normal_matrix(scene, exposures, images, spectra, layout) -> Blocks:
     matrix = Blocks(layout.sizes)
     for i, k in enumerate(layout.counts):
         matrix.block(i, i)[:k, :k] += np.eye(k)
+    if layout.n_sky:
+        at = np.arange(layout.n_sky)
+        matrix.block(layout.common, layout.common)[at, at] += scene.known_sky
     if layout.n_shifts:
         at = layout.n_sky + np.arange(layout.n_shifts)
         matrix.block(layout.common, layout.common)[at, at] += SCATTER_PX**-2

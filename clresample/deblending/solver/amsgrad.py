@@ -177,7 +177,7 @@ def _launcher(buffers, prior, name, n_axes):
 def _sky_step(buffers, gradient, prior):
     """The kernel that moves sky levels by a part of a Newton step; launch: (B * C)."""
     totals = [w.sum(axis=(1, 2)) for s in buffers.scenes for w in s.weights]
-    total = np.concatenate(totals)
+    total = np.concatenate(totals) + np.concatenate([s.known_sky for s in buffers.scenes])
     inverse = np.divide(1, total, where=total > 0, out=np.zeros_like(total))
     return _launcher(buffers, prior, "step_sky", 1).bind(
         n_channels=buffers.n_channels,

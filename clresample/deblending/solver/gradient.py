@@ -1,8 +1,9 @@
 """The loss of a batch of scenes and its gradients, on the device.
 
-    L = 1/2 sum_o |sqrt(w_o) (R_o M + sky - d_o)|^2 + 1/2 |z|^2,      M_c = sum_s A[s, c] S_s
-    G_o = R_o^T w_o (R_o M + sky - d_o)
-    dS_s = sum_c A[s, c] G_c on the box,   dA[s, c] = <S_s, G_c>,   dsky_c = sum of w_o (...)
+    L = 1/2 sum_o |sqrt(w_o) (R_o M + sky - d_o)|^2 + 1/2 sum_c p_c sky_c^2 + 1/2 |z|^2
+    M_c = sum_s A[s, c] S_s,   p = Scene.known_sky,   G_o = R_o^T w_o (R_o M + sky - d_o)
+    dS_s = sum_c A[s, c] G_c on the box,   dA[s, c] = <S_s, G_c>
+    dsky_c = sum of w_o (...) + p_c sky_c
 
 dA of tied channels is the mean over their band, see rendering/ties.py.
 
@@ -28,8 +29,8 @@ class Gradient:
     depth: at which stage of rendering spectra are applied, see rendering/stages.py; None leaves it
         to each observation's count
     rows (C + 1,): observed rows of all channels up to each, the columns of:
-    rows_loss, rows_pull (B, n_rows): 1/2 sum w r^2 and sum w r of each observed row, whose sums
-        over a channel's rows are its loss and dL/dsky
+    rows_loss, rows_pull (B, n_rows): 1/2 sum w r^2 and sum w r of each observed row, in a channel's
+        first one with what is expected of its sky; sums over its rows are its loss and dL/dsky
     best (B,): lowest loss of each scene among those computed with i_loss = 0, infinite before
     """
 
@@ -43,7 +44,19 @@ class Gradient:
         )
         self.best = buffers.put(np.full(len(scenes), np.inf))
         self.observations = [_ObservedBatch(self, i, depth) for i in range(len(scenes[0].ops))]
-        self._with_prior, self._tie = with_prior, None
+        self._with_prior, self._tie, self._expect_sky = with_prior, None, None
+        known = np.array([scene.known_sky for scene in scenes])
+        if known.any():
+            self._expect_sky = buffers.launcher("losses.cl", "expect_sky", 1).bind(
+                n=known.size,
+                n_channels=buffers.n_channels,
+                n_rows=self.rows[-1],
+                row0=buffers.device.put(self.rows, np.int32),
+                precision=buffers.put(known),
+                sky=buffers.sky,
+                rows=self.rows_loss,
+                pull=self.rows_pull,
+            )
         ties = scenes[0].ties
         if ties is not None:
             first, count = (
@@ -80,6 +93,8 @@ class Gradient:
         """Queue everything but the losses' sums: gradients, rows_loss and rows_pull."""
         for observed in self.observations:
             observed.queue()
+        if self._expect_sky is not None:
+            self._expect_sky(self.buffers.items(self.buffers.sky.size))
         if self._tie is not None:
             self._tie(self.buffers.items(self.buffers.n_sources))
 

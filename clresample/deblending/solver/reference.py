@@ -26,6 +26,11 @@ def residual(image, data, weights, sky):
     return weights * r, 0.5 * (weights * r**2).sum(), (weights * r).sum(axis=(1, 2))
 
 
+def expected_sky(sky, precision):
+    """Loss 1/2 sum p sky^2 of levels (C,) that are expected to be 0, and its slopes p sky (C,)."""
+    return 0.5 * (precision * sky**2).sum(), precision * sky
+
+
 def blur(image, taps):
     """K image: `taps` along both axes, zero beyond the image's edges."""
     for axis in (0, 1):

@@ -33,6 +33,8 @@ class Scene:
     damping (S,): gradients under which steps are shorter than the step sizes; see
         `curvature.damping`
     fit_sky: whether the sky level of each channel is free
+    sky_precision (C,): of a fitted level inverse variance with which it is expected to be 0, as the
+        data are above what is expected of the sky; 0 where nothing is, None = 0 in all channels
     ties: Ties of the channels; None where each has a band of its own
     """
 
@@ -50,6 +52,7 @@ class Scene:
     power: np.ndarray | None = None
     damping: np.ndarray | None = None
     fit_sky: bool = False
+    sky_precision: np.ndarray | None = None
     ties: Ties | None = None
 
     def channels(self) -> list[slice]:
@@ -60,6 +63,13 @@ class Scene:
     def shares_of(self, i):
         """Observation i's shares (S, Co, T) or None."""
         return self.shares[i] if self.shares else None
+
+    @property
+    def known_sky(self) -> np.ndarray:
+        """`sky_precision` (C,), 0 without one or where the sky is not fitted."""
+        if self.sky_precision is None or not self.fit_sky:
+            return np.zeros(sum(op.shape_out[0] for op in self.ops))
+        return self.sky_precision
 
     def parts(self, i, spectra):
         """Spectra (S, Co) of observation i as its operator takes them, (S, Co T)."""

@@ -20,9 +20,9 @@ def equations(looking):
     cross = np.zeros((k, looking.n_channels, n + 1, n, p))
     rest = np.zeros((k, looking.n_channels, n + 1))
     known = np.arange(p) < (looking.slots.n_images - 1)[:, None]  # (slots, p)
-    for sight, (table, on_device), sums in zip(
-        looking.sights, looking.pairs, looking.sums, strict=True
-    ):
+    if looking.fit_sky:
+        rest[..., n], inner[..., n, n] = looking.of_level()
+    for sight, (table, on_device) in zip(looking.sights, looking.pairs, strict=True):
         c, channels = np.arange(looking.n_channels)[sight.channels][None], sight.channels
         gram, pull = sight.gram(on_device, 1 + p), sight.pull(1 + p)
         pairs = table[:, :2]
@@ -47,18 +47,20 @@ def equations(looking):
         if looking.fit_sky:
             inner[*at, own[:, None], n] = inner[*at, n, own[:, None]] = pull[:, :, 0, 1]
             cross[*at, n, own[:, None]] = slope[..., 1]
-            rest[:, channels, n], inner[:, channels, n, n] = np.moveaxis(sums[..., 1:], -1, 0)
     lit = looking.solution() > 0
     lit[..., n] = inner[..., n, n] > 0  # none in a channel without weights, nor if it is not fitted
-    if looking.ties is not None:
-        return _eliminated(*_of_bands(looking.ties, normal, right, inner, cross, rest, lit))
-    return _eliminated(normal, right, inner, cross, rest, lit)
+    parts = normal, right, inner, cross, rest, lit
+    if looking.fit_sky or looking.ties is not None:
+        parts = _of_bands(looking.ties, *parts)
+    return _eliminated(*parts)
 
 
 def _of_bands(ties, normal, right, inner, cross, rest, lit):
     """What `_eliminated` takes, with the sky levels eliminated and tied channels summed.
 
-    `inner`, `cross`, `rest` and `lit` then have B bands in place of C channels, and n spectra.
+    `inner`, `cross`, `rest` and `lit` then have n spectra and, with Ties, B bands in place of C
+    channels. A level has thousands of times the curvature of a spectrum: a ridge relative to that
+    would hold the spectra.
     """
     n = rest.shape[-1] - 1
     level = np.divide(1, inner[..., n, n], where=lit[..., n], out=np.zeros(lit.shape[:-1]))
@@ -68,6 +70,8 @@ def _of_bands(ties, normal, right, inner, cross, rest, lit):
     gram = inner[..., :n, :n] - side[..., None] * inner[..., n, None, :n]
     cross = cross[..., :n, :, :] - side[..., None, None] * by_level[..., None, :, :]
     rest = rest[..., :n] - side * rest[..., n, None]
+    if ties is None:
+        return normal, right, gram, cross, rest, lit[..., :n]
     of_bands = (ties.total(a, axis=1) for a in (gram, cross, rest, lit[..., :n]))
     gram, cross, rest, lit = of_bands
     return normal, right, gram, cross, rest, lit > 0

@@ -45,6 +45,7 @@ def first_scene(fit) -> tuple[Scene, State]:
         shares=[None if v.shares is None else v.shares[begin.source] for v in fit.views],
         power=power,
         fit_sky=fit.settings.fit_sky,
+        sky_precision=fit.sky_precision,
         ties=fit.ties,
     )
     latent = [np.zeros_like(m) for m in morphs]

@@ -41,6 +41,7 @@ class Looking:
 
     spectra (N, C), sky (B, C): of the last solution, in the views' units, for profiles of unit
         integral
+    sky_precision (B, C): with which each level is expected to be 0; 0 where it is not fitted
     """
 
     def __init__(self, components, sights, n_scenes, device, dtype, tuning, *, fit_sky):
@@ -52,6 +53,8 @@ class Looking:
         self.n_channels, self.ties = sights[-1].channels.stop, sights[0].ties
         self.spectra = np.zeros((len(components), self.n_channels))
         self.sky = np.zeros((n_scenes, self.n_channels))
+        known = np.concatenate([sight.sky_precision for sight in sights], axis=1)
+        self.sky_precision = known * bool(fit_sky)
         self._kept: dict = {}
 
     def look(self, scenes, thetas, brightness, *, slopes, whiten=True):
@@ -89,13 +92,22 @@ class Looking:
         return self._row[scenes]
 
     def compare(self, error) -> np.ndarray:
-        """Compare the present solution with the data; chi2 (k,) of the scenes looked at."""
+        """Compare the present solution with the data; chi2 (k,) of the scenes looked at, with what
+        is expected of the sky."""
         spectra = self.spectra[self.at]
         self.sums = [
             sight.compare(self.scenes, self.slots, spectra, self.sky, error)
             for sight in self.sights
         ]
-        return sum(sums[:, :, 0].sum(axis=1) for sums in self.sums)
+        of_sky = (self.sky_precision * self.sky**2)[self.scenes].sum(axis=1)
+        return sum(sums[:, :, 0].sum(axis=1) for sums in self.sums) + of_sky
+
+    def of_level(self):
+        """Right sides and curvatures (k, C) of the sky levels about the solution last compared."""
+        sums = np.concatenate([s[..., 1:] for s in self.sums], axis=1)
+        right, curvature = np.moveaxis(sums, -1, 0)
+        known = self.sky_precision[self.scenes]
+        return right - known * self.sky[self.scenes], curvature + known
 
     def solve(self, error):
         """Spectra and sky levels of the least squares, weights from the present solution.
@@ -109,7 +121,8 @@ class Looking:
         normal = np.zeros((len(self.scenes), self.n_channels, n + 1, n + 1))
         right = np.zeros(normal.shape[:3])
         own = self.index[self.at]
-        for sight, (table, pairs), sums in zip(self.sights, self.pairs, self.sums, strict=True):
+        right[..., n], normal[..., n, n] = self.of_level()
+        for sight, (table, pairs) in zip(self.sights, self.pairs, strict=True):
             channels = np.arange(self.n_channels)[sight.channels]
             gram, pull = sight.gram(pairs, 1)[..., 0, 0], sight.pull(1)[:, :, 0]
             (i, j), c = own[table[:, :2]].T[:, :, None], channels[None]
@@ -118,7 +131,6 @@ class Looking:
             right[rows[:, None], c, own[:, None]] = pull[..., 0]
             normal[rows[:, None], c, own[:, None], n] = pull[..., 1]
             normal[rows[:, None], c, n, own[:, None]] = pull[..., 1]
-            right[:, channels, n], normal[:, channels, n, n] = np.moveaxis(sums[..., 1:], -1, 0)
         solution = self.solution()
         right += np.einsum("kcij,kcj->kci", normal, solution)
         self.normal, self.right = normal, right

@@ -27,6 +27,7 @@ class Sight:
     lit (slots, 4): first pixels and sizes of what the slots seen last light up
     n_elements: that were last seen; n_pixels: of all products so far
     ties: Ties of all channels, or None; scale (B, Co): WhitenedView.error_scale
+    sky_precision (B, Co): the views', 0 where they have none
     root (B, Co, My, Mx): on the device, as are data (times root), residual and weight
     """
 
@@ -40,6 +41,8 @@ class Sight:
         self.residual, self.weight = (device.empty(shape, dtype) for _ in range(2))
         self.sums = device.empty((*shape[:3], 3), dtype)
         self.ties, self.scale = views[0].ties, np.array([v.error_scale for v in views])
+        known = [v.sky_precision for v in views]
+        self.sky_precision = np.zeros(shape[:2]) if known[0] is None else np.array(known)
         self.aim = Aim(views, device, dtype, precision, tolerance)
         self.n_elements = self.n_pixels = 0
         self._listed = None  # of the scenes last compared, on the device

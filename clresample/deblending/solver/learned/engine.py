@@ -1,6 +1,7 @@
 """Runs a batch of scenes under the prior that learns: rounds of trials, strengths, stops.
 
-    L = 1/2 sum_o |sqrt(w_o) (R_o M + sky - d_o)|^2 + 1/2 sum_sj |z_sj|^2 / alpha_sj^2
+    L = 1/2 sum_o |sqrt(w_o) (R_o M + sky - d_o)|^2 + 1/2 sum_c p_c sky_c^2
+        + 1/2 sum_sj |z_sj|^2 / alpha_sj^2,      p: Scene.known_sky
 
 A round costs one pair of operators for the whole batch. Each scene then does what its own loss
 asks for: it accepts its trial and takes a new direction, or goes back and takes a shorter step. The
@@ -214,12 +215,13 @@ def vector_bytes(scene, prior) -> int:
 
 
 def _inverse_curvature(scenes):
-    """1 / (sum w (R S)^2) of every spectrum (S, C) and 1 / sum w of every sky level (B, C); 0 where
-    nothing is seen, and of sky levels that are not fitted."""
+    """1 / (sum w (R S)^2) of every spectrum (S, C) and 1 / (sum w + p) of every sky level (B, C), p
+    its precision as it is expected; 0 where nothing is seen, and of levels that are not fitted."""
     power, ties = np.concatenate([s.power for s in scenes]), scenes[0].ties
     power = power if ties is None else ties.mean(power)
     seen = power > UNSEEN * power.max(initial=0)
     total = np.array([np.concatenate([w.sum((1, 2)) for w in s.weights]) for s in scenes])
+    total = total + np.array([s.known_sky for s in scenes])
     free = (total > 0) & np.array([s.fit_sky for s in scenes])[:, None]
     return _inverse(power, seen), _inverse(total, free)
 
