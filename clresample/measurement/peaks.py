@@ -22,7 +22,7 @@ def import_sep():
         import sep
     except ImportError as error:
         raise ImportError(
-            "detection needs sep, which is not installed: pip install 'clresample[detect]'"
+            "detection needs sep, which is not installed: pip install sep"
         ) from error
     return sep
 

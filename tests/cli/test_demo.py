@@ -45,4 +45,4 @@ def test_demo_writes_what_it_names(tmp_path, capsys):
 def test_demo_names_what_is_missing(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "galsim", None)
     assert demo.main([str(tmp_path)]) == 2
-    assert "pip install 'clresample[sim]'" in capsys.readouterr().err
+    assert "pip install galsim" in capsys.readouterr().err

@@ -103,7 +103,7 @@ def read_gridded(path, *, detector=None) -> GriddedPSF:
     except ImportError as error:
         raise ImportError(
             "files of gridded PSFs need photutils, which is not installed: "
-            "pip install 'clresample[photutils]'"
+            "pip install photutils"
         ) from error
     given = {} if detector is None else {"detector_id": detector}
     try:
