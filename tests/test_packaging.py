@@ -137,7 +137,8 @@ def test_conda_installs_what_pip_does():
 
 
 def test_all_is_every_extra_but_the_large_ones_and_the_developers():
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
     (whole,) = extras.pop("all")
     left_out = {"jax", "torch", "scarlet2", "docs", "dev"}
     named = set(re.search(r"\[(.+)\]", whole)[1].split(","))

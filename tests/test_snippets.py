@@ -1,4 +1,4 @@
-"""README's and the start page's examples run as they stand, one after the other, in an empty folder."""
+"""README's and the start page's examples run as they stand, in turn, in an empty folder."""
 
 import numpy as np
 import pytest
@@ -61,8 +61,9 @@ def test_readme_is_short():
 
 
 def test_code_is_found_in_its_order():
-    text = "    clresample devices  # all\n```python\na\n```\nx\n```{code-cell}\n:tags: [b]\nc\n```\n"
-    text += "```toml\nd = 1\n    clresample no\n```\n    pip install x\n    clresample tune -o 'a b'\n"
+    text = "    clresample devices  # all\n```python\na\n```\nx\n"
+    text += "```{code-cell}\n:tags: [b]\nc\n```\n```toml\nd = 1\n    clresample no\n```\n"
+    text += "    pip install x\n    clresample tune -o 'a b'\n"
     assert snippets(text) == [
         ("command", ["devices"]),
         ("python", "a"),

@@ -11,8 +11,8 @@ FENCED = re.compile(r"^```(\{?[\w-]*\}?)[^\n]*\n(.*?)^```$", flags=re.DOTALL | r
 def snippets(text):
     """All that a page has to run: [("python", code) or ("command", words)].
 
-    Python stands in fences, ```python or myst-nb's ```{code-cell}; a command is a line of an indented
-    block that begins with `clresample`. Its words are without the program's name and comments.
+    Python stands in fences, ```python or myst-nb's ```{code-cell}; a command is a line of an
+    indented block that begins with `clresample`, its words those after the name, without comments.
     """
     found, end = [], 0
     for block in FENCED.finditer(text):
