@@ -128,7 +128,7 @@ docs: .venv-docs/made
 .venv-docs/made: pyproject.toml
 	$(PYTHON) -m venv --without-pip .venv-docs
 	$(PYTHON) -m pip --python .venv-docs/bin/python install --quiet \
-	    --editable '.[pocl,sim,plot,detect,docs]'
+	    --editable '.[pocl,sim,plot,field,jax,docs]'
 	touch $@
 
 clean:

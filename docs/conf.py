@@ -33,7 +33,7 @@ toc_object_entries = False
 # Examples run when the pages are built; an error in one is an error of the build.
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
-nb_execution_timeout = 120  # [s] for one page; the slowest takes 20 s
+nb_execution_timeout = 300  # [s] for one cell; the slowest compiles kernels
 nb_execution_in_temp = True  # examples write files
 nb_execution_show_tb = True
 nb_merge_streams = True

@@ -108,22 +108,22 @@
     UNROLL(v, nv) right[v] = AT(const WIDE, (from) + column[v]); \
     UNROLL(i, mr) UNROLL(v, nv) part[i][v] += row[i][(l) * STEP_A] * right[v];
 
-/* sums[mr][nv] += the next stretch of `block` terms, or of those that remain: from l on, whose row
- * of B is at `from`, upwards or downwards as `step` is 1 or -1. Both go on with the next stretch of
- * that direction: found anew for each of them, they would take 6 % of the time. */
-#define ADD_STRETCH(mr, nv, sums, row, l, step, from, ld_b, column, block) { \
+/* sums[mr][nv] += the next stretch of `block` terms, ku a turn, or of those that remain: from l on,
+ * whose row of B is at `from`, upwards or downwards as `step` is 1 or -1. Both go on with the next
+ * stretch of that direction: found anew for each of them, they would take 6 % of the time. */
+#define ADD_STRETCH(mr, nv, ku, sums, row, l, step, from, ld_b, column, block) { \
         int n_terms = remain < (block) ? remain : (block); \
         WIDE part[mr][nv], right[nv]; \
         UNROLL(i, mr) UNROLL(v, nv) part[i][v] = (WIDE)(0); \
         remain -= n_terms; \
         AHEAD_LEFT(row, l, step, n_terms) \
-        for (; n_terms >= KU; n_terms -= KU) { \
+        if (ku > 1) for (; n_terms >= ku; n_terms -= ku) { \
             AHEAD(from, step) \
-            UNROLL(u, KU) { \
+            UNROLL(u, ku) { \
                 ADD_TERM(mr, nv, l + (step) * u, row, from + (step) * u * (long)(ld_b), column) \
             } \
-            l += (step) * KU; \
-            from += (step) * KU * (long)(ld_b); \
+            l += (step) * ku; \
+            from += (step) * ku * (long)(ld_b); \
         } \
         for (; n_terms > 0; --n_terms) { \
             ADD_TERM(mr, nv, l, row, from, column) \
@@ -135,28 +135,29 @@
 
 /* sums[mr][nv] = the terms l < k, in stretches of `block` and in the order above. A loop for each
  * direction: one with a step that is a variable takes 4 % longer. */
-#define SUM_TERMS(mr, nv, sums, row, B, ld_b, column, k, block, inward) { \
+#define SUM_TERMS(mr, nv, ku, sums, row, B, ld_b, column, k, block, inward) { \
         int remain = (k); \
         long up = 0, down = (k) - 1; \
         __global const REAL *from_up = (B), *from_down = (B) + down * (ld_b); \
         UNROLL(i, mr) UNROLL(v, nv) sums[i][v] = (WIDE)(0); \
         while (remain > 0) { \
             if (inward) \
-                ADD_STRETCH(mr, nv, sums, row, up, 1, from_up, ld_b, column, block) \
-            ADD_STRETCH(mr, nv, sums, row, down, -1, from_down, ld_b, column, block) \
+                ADD_STRETCH(mr, nv, ku, sums, row, up, 1, from_up, ld_b, column, block) \
+            ADD_STRETCH(mr, nv, ku, sums, row, down, -1, from_down, ld_b, column, block) \
         } \
     }
 
 /* The same of a tile of MR rows and NV vectors of which the columns from `inside` on and the rows
  * from `below` on count for nothing: of the last tile of a row, one vector alone is summed where it
  * is the only one inside, and the others are zero; of the last of a column, two rows alone, and
- * the others are left as they were. */
+ * the others are left as they were. Those two take two terms a turn: with KU, they took half of the
+ * time of compilers. */
 #define SUM_INSIDE(inside, below, sums, row, B, ld_b, column, k, block, inward) \
     if (NV > 1 && (inside) <= VW) { \
         UNROLL(i, MR) UNROLL(v, NV) sums[i][v] = (WIDE)(0); \
-        SUM_TERMS(MR, 1, sums, row, B, ld_b, column, k, block, inward) \
+        SUM_TERMS(MR, 1, 2, sums, row, B, ld_b, column, k, block, inward) \
     } else if (MR > 2 && (below) <= 2) { \
-        SUM_TERMS(2, NV, sums, row, B, ld_b, column, k, block, inward) \
+        SUM_TERMS(2, NV, 2, sums, row, B, ld_b, column, k, block, inward) \
     } else { \
-        SUM_TERMS(MR, NV, sums, row, B, ld_b, column, k, block, inward) \
+        SUM_TERMS(MR, NV, KU, sums, row, B, ld_b, column, k, block, inward) \
     }

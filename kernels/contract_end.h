@@ -6,7 +6,7 @@
  * of a vector from c on, step_c apart, n_left of them at most.
  */
 #if MIX
-    UNROLL(h, MR / 2) UNROLL(v, NV) {
+    if (E) UNROLL(h, MR / 2) UNROLL(v, NV) {
         const int i = 2 * h;
         if (!OWNED(i, v)) continue;
         const WIDE c = acc[i][v], s = acc[i + 1][v];

@@ -12,21 +12,21 @@
 #else
 #define IN_TURN(x) (x)
 #endif
-/* add(l) for l < n, KU of them a turn. */
-#define TURNS(n, add) { \
+/* add(l) for l < n, ku of them a turn. */
+#define TURNS(n, ku, add) { \
         int l = 0; \
-        for (; l + KU <= (n); l += KU) UNROLL(u, KU) { add(l + u) } \
+        if (ku > 1) for (; l + ku <= (n); l += ku) UNROLL(u, ku) { add(l + u) } \
         for (; l < (n); ++l) { add(l) } \
     }
 
 /* A stretch of pairs of rows or of columns, whose sums and differences are in `folded`. */
 #if SIDE == 0
 #define ADD_PAIR(l) UNROLL(i, rows) UNROLL(v, vectors) part[i][v] += row[i][l] * folded[odd][l][v];
-#define ADD_PAIRS(mr, nv) { \
+#define ADD_PAIRS(mr, nv, ku) { \
     enum { rows = mr, vectors = nv }; \
     WIDE part[mr][nv]; \
     CLEAR(part, mr, nv) \
-    TURNS(n_here, ADD_PAIR) \
+    TURNS(n_here, ku, ADD_PAIR) \
     UNROLL(i, mr) UNROLL(v, nv) sums[odd][i][v] = part[i][v]; \
 }
 #else
@@ -37,10 +37,10 @@
         const WIDE both = IN_TURN(folded[i0 - top + i][l]); \
         UNROLL(v, vectors) acc[i][v] += both * right[v]; \
     }
-#define ADD_PAIRS(mr, nv) { \
+#define ADD_PAIRS(mr, nv, ku) { \
         enum { rows = mr, vectors = nv }; \
         WIDE right[nv]; \
-        TURNS(n_here, ADD_PAIR) \
+        TURNS(n_here, ku, ADD_PAIR) \
     }
 #endif
 

@@ -48,9 +48,10 @@
 
 #define CLEAR(sums, mr, nv) UNROLL(i, mr) UNROLL(v, nv) sums[i][v] = (WIDE)(0);
 #define TAKE_COLUMNS UNROLL(v, NV) column[v] = j0 + v * VW < width ? j0 + v * VW : j0;
-/* add(rows, vectors) of a tile, or of what it has inside: one vector, or half of its rows. */
+/* add(rows, vectors, terms a turn) of a tile, or of what it has inside: one vector, or half of its
+ * rows, two terms a turn, as in contract.h. */
 #define INSIDE(n_rows, add) { \
-        if (NV > 1 && n_sums - j0 <= VW) add(MR, 1) \
-        else if (MR > 2 && (n_rows) <= MR / 2) add(MR / 2, NV) \
-        else add(MR, NV) \
+        if (NV > 1 && n_sums - j0 <= VW) add(MR, 1, 2) \
+        else if (MR > 2 && (n_rows) <= MR / 2) add(MR / 2, NV, 2) \
+        else add(MR, NV, KU) \
     }

@@ -25,15 +25,15 @@
     UNROLL(i, (mr) / 2) UNROLL(v, nv) \
         part[2 * i + 1][v] += row[i][2 * (l) + 1] * right[v];
 /* `from` and l go down together: found anew for each pair, they take as long as the sums. */
-#define ADD_PAIRS(mr, nv) { \
+#define ADD_PAIRS(mr, nv, ku) { \
         WIDE part[mr][nv], right[nv]; \
         __global const REAL *from = B + 2 * last * (long)n_pad; \
         int l = last; \
         CLEAR(part, mr, nv) \
-        for (; l - KU >= first - 1; l -= KU) { \
+        if (ku > 1) for (; l - ku >= first - 1; l -= ku) { \
             FETCH_AHEAD \
-            UNROLL(u, KU) { ADD_PAIR(mr, nv, l - u, from - 2 * u * (long)n_pad) } \
-            from -= 2 * KU * (long)n_pad; \
+            UNROLL(u, ku) { ADD_PAIR(mr, nv, l - u, from - 2 * u * (long)n_pad) } \
+            from -= 2 * ku * (long)n_pad; \
         } \
         for (; l >= first; --l) { \
             ADD_PAIR(mr, nv, l, from) \

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import tarfile
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -106,3 +107,41 @@ def test_every_public_name_is_there():
     assert set(clresample.__all__) | {"__version__"} == set(dir(clresample))
     with pytest.raises(AttributeError, match="no attribute 'missing'"):
         clresample.missing  # noqa: B018
+
+
+CONDA_NAMES = {"astropy": "astropy-base", "matplotlib": "matplotlib-base"}
+
+
+def listed(requirements):
+    """{conda's name: lower bound} of requirements as pip or conda write them."""
+    parts = [re.fullmatch(r"([\w-]+)(?:\[\w+\])? ?(?:>=(.+))?", text) for text in requirements]
+    return {CONDA_NAMES.get(part[1], part[1]): part[2] for part in parts}
+
+
+def test_conda_installs_what_pip_does():
+    """The recipe's and the environment's packages and bounds are those of pyproject.toml."""
+    yaml = pytest.importorskip("yaml")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    needed = listed(project["dependencies"])
+    recipe = yaml.safe_load((ROOT / "tools/conda/meta.yaml").read_text())
+    assert recipe["package"]["version"] == clresample.__version__
+    run_packages = listed(recipe["requirements"]["run"])
+    assert needed.items() <= run_packages.items()
+    assert {"pocl", "ocl-icd-system"} <= set(run_packages)
+    made = yaml.safe_load((ROOT / "environment.yml").read_text())["dependencies"]
+    extras = project["optional-dependencies"]
+    needed |= listed([*extras["sim"], *extras["plot"], *extras["field"]])
+    assert needed.items() <= listed([entry for entry in made if isinstance(entry, str)]).items()
+    (script,) = recipe["build"]["entry_points"]
+    assert script == " = ".join(*project["scripts"].items())
+
+
+def test_all_is_every_extra_but_the_large_ones_and_the_developers():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    (whole,) = extras.pop("all")
+    left_out = {"jax", "torch", "scarlet2", "docs", "dev"}
+    named = set(re.search(r"\[(.+)\]", whole)[1].split(","))
+    packages = {package for name in named for package in extras[name]}
+    assert packages >= {p for name in set(extras) - left_out for p in extras[name]}
+    assert not named & left_out

@@ -2,7 +2,7 @@
 # Runs a command on one OpenCL runtime:  tools/on_runtime.sh RUNTIME COMMAND ...
 #
 # RUNTIME is one of
-#   pocl         PoCL, as pip install 'clresample[pocl]' brings it
+#   pocl         PoCL, as pip install 'pyopencl[pocl]' brings it
 #   pocl-debian  Debian's PoCL
 #   intel        Intel's runtime for CPUs, from pip
 #   pair         Intel's beside PoCL's wheel: two unlike devices in one process

@@ -16,5 +16,5 @@ def needed(module, extra):
         package = module.partition(".")[0]
         raise ImportError(
             f"clresample.adapters.{extra} needs {package}, which cannot be imported ({error}): "
-            f"pip install 'clresample[{extra}]'"
+            f"pip install {package}"
         ) from error

@@ -51,15 +51,24 @@ def main(argv=None):
             return 130
 
 
-def _run(argv):
-    parser = Parser(
+def parser():
+    """The parser of the command with all of its subcommands."""
+    whole = Parser(
         prog="clresample", description="Images between telescopes, on any OpenCL device."
     )
-    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    whole.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    commands = whole.add_subparsers(dest="command", metavar="COMMAND")
     for add_command in COMMANDS:
         add_command(commands)
-    arguments = parser.parse_args(argv)
+    return whole
+
+
+def _run(argv):
+    parsed = parser()
+    arguments = parsed.parse_args(argv)
+    if arguments.command is None:
+        parsed.print_help()
+        return 0
     try:
         with warnings.catch_warnings():
             _show_in_one_line(arguments)

@@ -29,7 +29,7 @@ from ..sky.sources import Extended
 from . import demo_resample
 from .pointing import ANGLE_DEG, CENTER_DEG
 
-SEED, N_SOURCES = 2, 6
+SEED, N_SOURCES = 10, 6
 MODES = {"Rubin": ("Rubin",), "Euclid": ("Euclid",), "joint": ("Euclid", "Rubin")}
 
 
@@ -62,7 +62,8 @@ def fit_all(scene, *, device=None):
 def run(folder="demo", *, device=None):
     """Make the demonstration's files in `folder`; returns what `fit_all` does and the files."""
     folder, device = Path(folder), get_device(device)
-    scene = simulate_scene(SEED, n_sources=N_SOURCES, angle_deg=ANGLE_DEG, center_deg=CENTER_DEG)
+    sky = {"angle_deg": ANGLE_DEG, "center_deg": CENTER_DEG, "spectra": "smooth"}
+    scene = simulate_scene(SEED, n_sources=N_SOURCES, **sky)
     folder.mkdir(parents=True, exist_ok=True)
     fitted = fit_all(scene, device=device)
     result = fitted["joint"][0]

@@ -41,7 +41,8 @@ def write_example(folder, *, overwrite=False) -> list[Path]:
     check_folder(folder)
     for path in paths.values() if folder.exists() else ():
         check_output(path, overwrite=overwrite)
-    scene = simulate_scene(SEED, n_sources=N_SOURCES, angle_deg=ANGLE_DEG, center_deg=CENTER_DEG)
+    sky = {"angle_deg": ANGLE_DEG, "center_deg": CENTER_DEG, "spectra": "smooth"}
+    scene = simulate_scene(SEED, n_sources=N_SOURCES, **sky)
     with whole_files(paths.values()) as parts:
         _write(dict(zip(paths, parts, strict=True)), scene)
     return list(paths.values())

@@ -63,7 +63,7 @@ def run(arguments):
             bad_columns=arguments.bad_columns,
         )
     except ImportError as error:
-        raise ValueError(f"simulate: {error}") from error
+        raise ValueError(error) from error
     write = write_field if arguments.format == "plain" else write_surveys
     for path in write(folder, field, overwrite=arguments.overwrite):
         print(path)

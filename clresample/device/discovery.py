@@ -220,7 +220,7 @@ def find_devices():
             f"OCL_ICD_VENDORS names a missing folder, {vendors}, which hides every driver: unset it"
         )
     else:
-        way = "install your GPU's OpenCL driver, or the CPU runtime: pip install 'clresample[pocl]'"
+        way = "install your GPU's OpenCL driver, or the CPU runtime: pip install 'pyopencl[pocl]'"
         if vendors:
             way += f"; OCL_ICD_VENDORS={vendors} limits the search to that place"
         if library:
@@ -244,7 +244,7 @@ def load_pyopencl():
         import pyopencl
     except ImportError as error:
         raise DeviceError(
-            f"pyopencl cannot be imported ({error}): pip install 'clresample[pocl]'"
+            f"pyopencl cannot be imported ({error}): pip install 'pyopencl[pocl]'"
         ) from error
     _ignore_remarks(pyopencl)
     try:

@@ -13,6 +13,7 @@ import platform
 import re
 import shutil
 import subprocess
+import sys
 import tempfile
 import warnings
 import weakref
@@ -42,6 +43,19 @@ FOLDERS = (
 )
 LEAST_SPACE = 800 << 20  # [bytes] of addresses, under which builds of small kernels failed
 VENDORS = "/etc/OpenCL/vendors"
+# Lets the loader of a conda environment read the drivers of VENDORS too.
+CONDA_CURE = "conda install -c conda-forge ocl-icd-system"
+
+
+def conda_prefix():
+    """The folder of the conda environment that this pyopencl comes from; None of other pyopencls.
+
+    Its OpenCL loader reads the environment's etc/OpenCL/vendors instead of the system's.
+    """
+    prefix = os.environ.get("CONDA_PREFIX")
+    if not prefix or Path(prefix).resolve() != Path(sys.prefix).resolve():
+        return None
+    return Path(prefix) if any(Path(prefix, "conda-meta").glob("pyopencl-*.json")) else None
 
 
 def named_library():
@@ -164,6 +178,9 @@ def remedy(vendor, path, served):
     if path.name in {Path(library).name for library in _known().values()}:
         fault = fault_of(str(path), served) or "brings no GPU"
         return f"{driver}, {path}, {fault}: is the GPU given to this machine or container?"
+    conda = conda_prefix()
+    if conda and path.name in {Path(library).name for library in _read(VENDORS).values()}:
+        return f"{driver} is at {path}, which the loader of {conda} does not read: {CONDA_CURE}"
     return f"{driver} is at {path}, where the OpenCL loader does not look: {cure(path)}"
 
 
@@ -191,16 +208,18 @@ def _libraries():
 
 def _known():
     """What the loader reads beside the drivers that come with pyopencl: {name: library}."""
-    given, files = os.environ.get("OCL_ICD_VENDORS"), []
-    place = Path(given or VENDORS)
-    if place.is_dir():
-        files = sorted(place.glob("*.icd"))
-    elif place.suffix == ".icd":
-        files = [place]
-    known = {file.name: _in_full(file) for file in files}
-    if given and not files and not place.is_dir():  # a library, by its path or name
-        known["given.icd"] = given
-    return known
+    if given := os.environ.get("OCL_ICD_VENDORS"):
+        is_library = not Path(given).is_dir() and Path(given).suffix != ".icd"
+        return {"given.icd": given} if is_library else _read(given)
+    conda = conda_prefix()
+    return _read(conda / "etc/OpenCL/vendors" if conda else VENDORS)
+
+
+def _read(place):
+    """What a folder of .icd files, or one of them, names: {name: library}."""
+    path = Path(place)
+    files = [path] if path.suffix == ".icd" else sorted(path.glob("*.icd"))
+    return {file.name: _in_full(file) for file in files}
 
 
 def _in_full(icd):

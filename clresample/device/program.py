@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .compiling import CompilationNotice
 from .discovery import DeviceError, load_pyopencl
 from .errors import no_double, not_built
 
@@ -84,6 +85,7 @@ class Programs:
     def __init__(self, device):
         self.device = device
         self._programs, self._kernels = {}, {}
+        self._notice = CompilationNotice(device.name)
 
     def kernel(self, file, name, dtype, defines):
         """A pyopencl.Kernel that knows its scalars' types, and {argument: whether it is a buffer}.
@@ -138,7 +140,7 @@ class Programs:
             raise no_double(device)
         program = cl.Program(device.context, source_of(file, dtype, defines))
         try:
-            return program.build(options=["-cl-std=CL1.2"])
+            return self._notice.build(lambda: program.build(options=["-cl-std=CL1.2"]))
         except cl.Error as error:
             raise not_built(device, file, defines, build_log(error)) from error
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import sys
 import tempfile
 import warnings
 from contextlib import suppress
@@ -30,11 +29,9 @@ def cache_folder():
 
 def system_caches():
     """The folder in which this system's programs have the user's cache folders."""
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches"
-    if os.name == "nt":
-        return Path(os.environ.get("LOCALAPPDATA") or Path.home())
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    import platformdirs  # for commands that need no device
+
+    return platformdirs.user_cache_path()
 
 
 class Remembered:

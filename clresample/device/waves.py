@@ -47,6 +47,8 @@ class Waves(Contraction):
         super().__init__(device, dtype, **options)
         self.right, self.back = side == "right", back
         self.options |= {"SIDE": int(self.right)}
+        if not self.right and not back and "TWIST" not in self.options:
+            self.options["MIX"] = True  # one build with and without its tables
 
     def build(self, n_rows=None, n_terms=0, n=0):
         """See `Contraction.build`; n_rows does not matter."""

@@ -11,7 +11,7 @@ INK, PAPER, EDGE = "#e8eaf0", "#10131a", "#3a4152"  # text, background, a panel'
 SKY_COLOURS, RESIDUAL_COLOURS = "inferno", "RdBu_r"
 GAP = 0.06  # [inch] between panels
 BAR_FRACTION = 0.3  # of a panel's width: the scale bar is shorter
-NO_MATPLOTLIB = "pictures need matplotlib, which is not installed: pip install 'clresample[plot]'"
+NO_MATPLOTLIB = "pictures need matplotlib, which is not installed: pip install matplotlib"
 
 
 def limits_of(level, sigma, white):

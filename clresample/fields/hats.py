@@ -43,7 +43,7 @@ def check_hats(grid):
     if grid.is_flat or names_of(grid.wcs) != ("ra", "dec"):
         raise ValueError(f"HATS needs right ascension and declination, the field is {grid.placing}")
     if not find_spec("pyarrow"):
-        raise ImportError("HATS needs pyarrow: pip install 'clresample[hats]'")
+        raise ImportError("HATS needs pyarrow, which is not installed: pip install pyarrow")
     healpix_index([0.0], [0.0])
 
 
@@ -56,7 +56,7 @@ def healpix_index(ra, dec) -> np.ndarray:
         from astropy_healpix.core import lonlat_to_healpix
     except ImportError as error:
         raise ImportError(
-            "HATS needs astropy-healpix, which is not installed: pip install 'clresample[hats]'"
+            "HATS needs astropy-healpix, which is not installed: pip install astropy-healpix"
         ) from error
     from astropy import units as u
 

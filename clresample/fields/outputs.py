@@ -23,7 +23,7 @@ from .images import file_name, write_mosaics
 from .models import write_models
 from .work.look import looked
 
-NO_PARQUET = "no catalogue.parquet: pyarrow is not installed (pip install 'clresample[field]')"
+NO_PARQUET = "no catalogue.parquet: pyarrow is not installed (pip install pyarrow)"
 FILES = (
     *("catalogue.parquet", "catalogue.fits", "catalogue.ecsv", "blends.ecsv", "models.fits"),
     "provenance.json",

@@ -21,9 +21,7 @@ def import_sep():
     try:
         import sep
     except ImportError as error:
-        raise ImportError(
-            "detection needs sep, which is not installed: pip install 'clresample[detect]'"
-        ) from error
+        raise ImportError("detection needs sep, which is not installed: pip install sep") from error
     return sep
 
 

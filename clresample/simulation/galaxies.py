@@ -28,7 +28,7 @@ def import_galsim():
         import galsim
     except ImportError as error:
         raise ImportError(
-            "simulations need GalSim, which is not installed: pip install 'clresample[sim]'"
+            "simulations need GalSim, which is not installed: pip install galsim"
         ) from error
     return galsim
 

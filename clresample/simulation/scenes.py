@@ -20,6 +20,7 @@ from .surveys import EUCLID_VIS, RUBIN_UGRIZY, Survey
 
 MODEL_PSF_SIGMA_PX = 0.8  # the paper's minimal PSF, in pixels of the frame that a model lives in
 MAGNITUDE_RANGE = (20.0, 29.0)  # [mag] the paper's uniform range
+SMOOTH_MAGNITUDE_RANGE = (20.0, 25.5)  # [mag] of VIS with smooth spectra: what both telescopes see
 CENTRAL_FRACTION = 2 / 3  # of a stamp's side: where galaxies are put
 MAX_REAL_ARCSEC = 2.0  # [arcsec] half-light radius of a stamp's largest galaxy of a real sky
 MAX_SOURCES = 10  # the paper's scenes hold 1 to 10 galaxies
@@ -28,6 +29,8 @@ SMOOTHING_ARCSEC = np.hypot(2, 1) * EUCLID_VIS.pixel_scale_arcsec
 # Colours where no table is given: mean and spread of the power law's index, fitted to CatSim's rows
 POWER_LAW_INDEX = (1.3, 1.2)
 RUBIN_WAVELENGTHS_NM = (367.0, 482.0, 622.0, 754.0, 869.0, 971.0)  # [nm] effective, u to y
+# [nm] where Rubin's r, i and z divide VIS's 550 - 900 nm between them
+VIS_EDGES_NM = (550.0, 691.0, 818.0, 900.0)
 
 
 def _to_pixels(grid, positions_arcsec):
@@ -190,6 +193,7 @@ def simulate_scene(
     n_pixels=60,
     center_deg=None,
     sky="plain",
+    spectra="independent",
 ):
     """A blend of galaxies as Euclid (VIS) and Rubin (ugrizy) see it; one seed gives one scene.
 
@@ -206,22 +210,25 @@ def simulate_scene(
     n_pixels: Rubin pixels a side; Euclid has as many as the same sky holds
     center_deg (2,) [deg]: right ascension and declination of the centre; grids then have a WCS
     sky: "plain", or "real" for galaxies to 2 arcsec as of `simulate_field`, without a catalogue
+    spectra: "independent", VIS magnitudes and Rubin's drawn apart, as in the paper's tests;
+        "smooth", one spectrum a galaxy: VIS is what r, i and z make of it, uniform in 20 - 25.5
     returns SimulatedScene: images with noise [counts], and the truth behind them
 
-    Raises ValueError for bad numbers, sky or table; ImportError without GalSim.
+    Raises ValueError for bad numbers, sky, spectra or table; ImportError without GalSim.
     Source: section `Sect:real_images`, Table `tab:sim_param`.
     """
     streams = np.random.SeedSequence(seed).spawn(4)
     n_rng, rubin_rng, euclid_rng = (np.random.default_rng(s) for s in streams[:3])
     if n_sources is None:
         n_sources = int(n_rng.integers(1, MAX_SOURCES, endpoint=True))
-    _check(n_sources, sky, catalogue)
+    _check(n_sources, sky, catalogue, spectra)
     if catalogue is not None:
         catalogue = open_catalogue(catalogue)
     rows = None if colours is None else _colour_rows(colours, RUBIN_UGRIZY.bands)
     n_euclid = EUCLID_VIS.n_same_sky(n_pixels, RUBIN_UGRIZY)
     half_arcsec = CENTRAL_FRACTION * n_euclid * EUCLID_VIS.pixel_scale_arcsec / 2
-    drawn = _random_sources(streams[3].spawn(n_sources), half_arcsec, catalogue, rows, sky)
+    how = half_arcsec, catalogue, rows, sky, spectra
+    drawn = _random_sources(streams[3].spawn(n_sources), *how)
     profiles, galaxies, positions, vis, ugrizy = drawn
     turned = RUBIN_UGRIZY.grid(n_pixels, angle_deg=angle_deg, flip=flip)
     euclid, rubin = (
@@ -241,12 +248,14 @@ def simulate_scene(
     )
 
 
-def _check(n_sources, sky, catalogue):
+def _check(n_sources, sky, catalogue, spectra):
     """Raise ValueError for what `simulate_scene` does not take."""
     if n_sources < 1:
         raise ValueError(f"n_sources is {n_sources}, must be 1 or more")
     if sky not in ("plain", "real") or (sky == "real" and catalogue is not None):
         raise ValueError(f'sky is {sky!r}, must be "plain", or "real" without a catalogue')
+    if spectra not in ("independent", "smooth"):
+        raise ValueError(f'spectra is {spectra!r}, must be "independent" or "smooth"')
 
 
 def _random_sources(streams, *how):
@@ -255,16 +264,19 @@ def _random_sources(streams, *how):
     return zip(*drawn, strict=True)
 
 
-def _random_source(rng, half_arcsec, catalogue, rows, sky="plain"):
+def _random_source(rng, half_arcsec, catalogue, rows, sky, spectra):
     """One galaxy: its profile, row of the catalogue, position [arcsec], magnitudes of both surveys.
 
     half_arcsec [arcsec]: positions lie within as much of the centre, in y and in x
     catalogue: open, or None; rows (n, 6) [mag]: colours to choose from, or None
     """
     position = rng.uniform(-half_arcsec, half_arcsec, 2)
-    vis = rng.uniform(*MAGNITUDE_RANGE, 1)
+    is_smooth = spectra == "smooth"
+    vis = rng.uniform(*(SMOOTH_MAGNITUDE_RANGE if is_smooth else MAGNITUDE_RANGE), 1)
     row = _power_law_colours(rng) if rows is None else rows[rng.integers(len(rows))]
     ugrizy = row - row.min() + rng.uniform(*MAGNITUDE_RANGE)
+    if is_smooth:
+        ugrizy = row - vis_magnitude(row) + vis
     i_galaxy = None if catalogue is None else int(rng.integers(catalogue.nobjects))
     if sky == "real":
         light = real_galaxy(rng, float(vis[0]), MAX_REAL_ARCSEC)
@@ -274,6 +286,19 @@ def _random_source(rng, half_arcsec, catalogue, rows, sky="plain"):
         rng, catalogue=catalogue, i_galaxy=i_galaxy, smoothing_arcsec=SMOOTHING_ARCSEC
     )
     return profile, i_galaxy, position, vis, ugrizy
+
+
+def vis_magnitude(ugrizy):
+    """Euclid's VIS magnitude of sources of given Rubin magnitudes.
+
+    The flux density of VIS is the mean of r, i and z, weighted by ln(wavelength) of the part of VIS
+    that each covers: by the photons that a flat f_nu sends there.
+
+    ugrizy (..., 6) [mag]; returns (...) [mag]
+    """
+    widths = np.diff(np.log(VIS_EDGES_NM))
+    fluxes = 10 ** (-0.4 * np.asarray(ugrizy, float)[..., 2:5])
+    return -2.5 * np.log10(fluxes @ (widths / widths.sum()))
 
 
 def _colour_rows(colours, bands):

@@ -6,7 +6,7 @@ import pytest
 from clresample import PSF, Extended, Grid, Observation, Resampler, deblend
 from clresample.adapters.galsim import as_galsim, grid_of, image_of, profile_of, psf_of
 
-galsim = pytest.importorskip("galsim", reason="GalSim is missing: pip install 'clresample[sim]'")
+galsim = pytest.importorskip("galsim", reason="GalSim is missing: pip install galsim")
 
 FLAT = Grid.flat((41, 37), 0.2, angle_deg=25, flip=True, center_arcsec=(0.3, -0.4))
 SKY = Grid.from_wcs(FLAT.to_wcs(ra_deg=359.9999, dec_deg=-41), FLAT.shape)

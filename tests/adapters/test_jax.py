@@ -6,7 +6,7 @@ import pytest
 from clresample import PSF, Grid, Resampler
 from clresample.adapters.jax import as_jax
 
-jax = pytest.importorskip("jax", reason="JAX is not installed: pip install 'clresample[jax]'")
+jax = pytest.importorskip("jax", reason="JAX is not installed: pip install jax")
 
 EUCLID, RUBIN = Grid.flat((20, 24), 0.1), Grid.flat((9, 11), 0.2, angle_deg=20)
 

@@ -6,7 +6,7 @@ import pytest
 from clresample import PSF, Grid, Resampler
 from clresample.adapters.torch import as_torch
 
-torch = pytest.importorskip("torch", reason="torch is missing: pip install 'clresample[torch]'")
+torch = pytest.importorskip("torch", reason="torch is missing: pip install torch")
 
 
 @pytest.fixture(scope="module")

@@ -114,7 +114,7 @@ def test_without_a_device_the_package_to_install_is_named(monkeypatch, platforms
     monkeypatch.delenv("OCL_ICD_VENDORS", raising=False)
     monkeypatch.setattr(cl, "get_platforms", lambda: platforms)
     for ask in (get_device, list_devices):
-        with pytest.raises(DeviceError, match=r"no .* found: .*pip install 'clresample\[pocl\]'"):
+        with pytest.raises(DeviceError, match=r"no .* found: .*pip install 'pyopencl\[pocl\]'"):
             ask()
 
 

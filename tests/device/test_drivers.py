@@ -126,6 +126,30 @@ def test_what_the_loader_reads_anyway_is_kept(tmp_path, monkeypatch):
         assert drivers._known() == expected
 
 
+@pytest.mark.parametrize("is_listed", [False, True])
+def test_conda_s_loader_is_told_of_the_systems_drivers(machine, monkeypatch, is_listed):
+    """Conda's loader reads its own folder of drivers, and the system's by a package more."""
+    (machine / NVIDIA).write_text("")
+    conda, system = machine / "conda", machine / "vendors"
+    for folder in (conda / "conda-meta", conda / "etc/OpenCL/vendors", system):
+        folder.mkdir(parents=True)
+    (conda / "etc/OpenCL/vendors/pocl.icd").write_text("libpocl.so")
+    if is_listed:
+        (system / "nvidia.icd").write_text(NVIDIA)
+    monkeypatch.setattr(drivers, "VENDORS", str(system))
+    monkeypatch.setattr(drivers.sys, "prefix", str(conda))
+    monkeypatch.setenv("CONDA_PREFIX", str(conda))
+    monkeypatch.delenv("OCL_ICD_VENDORS", raising=False)
+    assert drivers.conda_prefix() is None  # the environment's pyopencl is pip's
+    (conda / "conda-meta/pyopencl-2025.1-0.json").write_text("{}")
+    assert drivers._known() == {"pocl.icd": "libpocl.so"}
+    (hint,) = hints()
+    cure = drivers.CONDA_CURE if is_listed else f"export CLRESAMPLE_ICD={machine / NVIDIA}"
+    assert hint.endswith(f": {cure}")
+    monkeypatch.setattr(drivers.sys, "prefix", "/usr")  # another Python than the environment's
+    assert drivers.conda_prefix() is None
+
+
 def test_the_cure_is_one_line_for_a_shell():
     assert shlex.split(drivers.cure(Path("/a/b.so"))) == ["export", "CLRESAMPLE_ICD=/a/b.so"]
 

@@ -10,7 +10,12 @@ from astropy.coordinates import SkyCoord
 from astropy.table import Table
 
 from clresample.simulation.galaxies import draw, import_galsim, open_catalogue, random_galaxy
-from clresample.simulation.scenes import SMOOTHING_ARCSEC, observe, simulate_scene
+from clresample.simulation.scenes import (
+    SMOOTHING_ARCSEC,
+    observe,
+    simulate_scene,
+    vis_magnitude,
+)
 from clresample.simulation.sdr import sdr
 from clresample.simulation.surveys import (
     EUCLID_VIS,
@@ -181,7 +186,7 @@ def test_galaxy_mistakes_are_refused(galsim, tmp_path):
 
 def test_missing_galsim_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "galsim", None)
-    with pytest.raises(ImportError, match=r"clresample\[sim\]"):
+    with pytest.raises(ImportError, match="pip install galsim"):
         import_galsim()
 
 
@@ -202,6 +207,21 @@ def test_sources_do_not_depend_on_geometry_or_number(galsim, scene):
     np.testing.assert_array_equal(straight.rubin.magnitudes, scene.rubin.magnitudes[:2])
     np.testing.assert_array_equal(straight.euclid.truth, scene.euclid.truth[:2])
     assert straight.positions_deg is None and straight.euclid.grid.is_flat
+
+
+def test_vis_follows_from_r_i_z_where_spectra_are_smooth(galsim, scene):
+    """A flat spectrum has one magnitude; light in z alone gives VIS's part ln(900/818)."""
+    smooth = simulate_scene(7, n_sources=3, spectra="smooth")
+    ugrizy, vis = smooth.rubin.magnitudes, smooth.euclid.magnitudes[:, 0]
+    r_i_z = ugrizy[:, 2:5]
+    assert ((r_i_z.min(axis=1) < vis) & (vis < r_i_z.max(axis=1))).all()
+    np.testing.assert_allclose(vis_magnitude(ugrizy), vis, atol=1e-9)
+    assert vis_magnitude(np.full(6, 22.5)) == pytest.approx(22.5)
+    part = np.log(900 / 818) / np.log(900 / 550)
+    in_z = vis_magnitude([99, 99, 99, 99, 20, 99])
+    assert in_z == pytest.approx(20 - 2.5 * np.log10(part), abs=1e-4)
+    np.testing.assert_array_equal(smooth.positions_arcsec, scene.positions_arcsec)
+    np.testing.assert_array_equal(smooth.euclid.truth, scene.euclid.truth)
 
 
 def test_shapes_and_flux_budget(scene):
@@ -283,6 +303,8 @@ def test_colours_from_a_table(galsim, data):
 def test_scene_mistakes_are_refused(galsim):
     with pytest.raises(ValueError, match="n_sources is 0"):
         simulate_scene(1, n_sources=0)
+    with pytest.raises(ValueError, match="spectra is 'blue', must be .independent. or"):
+        simulate_scene(1, n_sources=1, spectra="blue")
     with pytest.raises(ValueError, match="colours has no column u_ab; it has a"):
         simulate_scene(1, n_sources=1, colours=Table({"a": [1]}))
     point, rng = galsim.Gaussian(sigma=0.1), np.random.default_rng(0)

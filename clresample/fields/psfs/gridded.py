@@ -102,8 +102,7 @@ def read_gridded(path, *, detector=None) -> GriddedPSF:
         from photutils.psf import GriddedPSFModel
     except ImportError as error:
         raise ImportError(
-            "files of gridded PSFs need photutils, which is not installed: "
-            "pip install 'clresample[photutils]'"
+            "files of gridded PSFs need photutils, which is not installed: pip install photutils"
         ) from error
     given = {} if detector is None else {"detector_id": detector}
     try:

@@ -64,7 +64,7 @@ def _opened(path, chip):
         import piff
     except ImportError as error:
         raise ImportError(
-            "Piff files need piff, which is not installed: pip install 'clresample[piff]'"
+            "Piff files need piff, which is not installed: pip install piff"
         ) from error
     if not path.is_file():
         raise FileError(f"{path}: no such file")

@@ -87,7 +87,7 @@ def _gwcs(hdus):
         import asdf
         import gwcs  # noqa: F401  whose objects the tree holds
     except ImportError:
-        return None, "gwcs is not installed (pip install 'clresample[jwst]')"
+        return None, "gwcs is not installed (pip install gwcs)"
     try:
         # arrays of other HDUs stay unread: only the WCS is asked for, which holds its own numbers
         return asdf.open(io.BytesIO(hdus["ASDF"].data.tobytes())).tree["meta"]["wcs"], None

@@ -26,7 +26,7 @@ from .pool import LOOK_S, reason_of
 from .seats import Seats
 from .share import return_memory, shared_threads
 
-NO_DASK = "distributed is not installed (pip install 'clresample[dask]')"
+NO_DASK = "distributed is not installed (pip install distributed)"
 CONNECT_S = 30.0  # [s] within which the scheduler answers and its first worker is there
 FETCH_S = 60.0  # [s] within which a finished task's file must have come from its worker
 
