@@ -27,6 +27,11 @@ from .part import Part
 
 # What can go wrong with one patch and is no reason to give up the others.
 ERRORS = (ValueError, ArithmeticError, MemoryError, OSError, np.linalg.LinAlgError)
+# Iterations of the first fits of a cut blend's pieces, which the next round replaces: all that this
+# one takes of them is their light, which it subtracts as if it were wrong by 15 % (MODEL_ERROR).
+ROUGH_ITERATIONS = 60
+# The round in which pieces' residuals are searched; the next one fits what is found there.
+SEARCHED = 1
 NO_ANSWER = "no longer answers"  # in the message of a device that is gone with all its memory
 POSITIONS = ("y", "x", "y_centroid", "x_centroid")  # columns in pixels of a fit's frame
 
@@ -97,6 +102,7 @@ def _fitted(job, group, given):
         patch, start = job.plan.patches[number], time.perf_counter()
         corner, labels = given.labels[number]
         around = None if given.light is None else given.light[number]
+        more = [row[1:] for row in group.found if row[0] == number]
         try:
             blend, boxes = blend_of(
                 patch,
@@ -114,10 +120,12 @@ def _fitted(job, group, given):
         if not blend.observations:
             _set_aside(part, job, patch, group.round, "failed: no pixel here has a weight")
             continue
+        blend = replace(blend, sources=blend.sources + tuple(_source(patch, *row) for row in more))
         cuts.append(_Cut(patch, blend, boxes, time.perf_counter() - start))
-    results = _fits(job, [cut.blend for cut in cuts])
+    rough = [group.round == 0 and bool(cut.patch.siblings) for cut in cuts]
+    results = _fits(job, [cut.blend for cut in cuts], rough)
     if job.passes > 1:
-        results = _second_look(job, given, cuts, results, group.round)
+        results = _second_look(job, given, cuts, results, part, group.round)
     for cut, result in zip(cuts, results, strict=True):
         if isinstance(result, Failure):
             if result.status == INTERRUPTED:
@@ -148,18 +156,27 @@ def _summary(part, seconds):
     }
 
 
-def _fits(job, blends):
-    """Results and Failures of blends; one that was interrupted ends all."""
+def _source(patch, number, y, x):
+    """The source of an id at (y, x) [px] of the field's model pixels, in a patch's fit."""
+    return Extended(position_px=(y - patch.box.y0, x - patch.box.x0), name=str(number))
+
+
+def _fits(job, blends, rough=None):
+    """Results and Failures of blends; one that was interrupted ends all.
+
+    rough (n): those of few iterations, see ROUGH_ITERATIONS; None = none
+    """
     if not blends:
         return []
     device, sizes = get_device(job.device), {}
     for i, blend in enumerate(blends):
-        frame = blend.frame and blend.frame.shape
-        sizes.setdefault((frame, *(o.shape for o in blend.observations)), []).append(i)
+        frame, few = blend.frame and blend.frame.shape, bool(rough and rough[i])
+        sizes.setdefault((few, frame, *(o.shape for o in blend.observations)), []).append(i)
     results: list = [None] * len(blends)
-    for alike in sizes.values():  # all at once, those of one size would be padded too
-        few = [blends[i] for i in alike]
-        found = deblend_many(few, settings=job.settings, device=device, memory=job.memory)
+    for (is_rough, *_), alike in sizes.items():  # all at once, those of one size would be padded
+        settings = _rough(job.settings) if is_rough else job.settings
+        some = [blends[i] for i in alike]
+        found = deblend_many(some, settings=settings, device=device, memory=job.memory)
         if any(r.status == INTERRUPTED for r in found):
             raise KeyboardInterrupt
         if lost := next((r.status for r in found if NO_ANSWER in r.status), None):
@@ -169,17 +186,26 @@ def _fits(job, blends):
     return results
 
 
-def _second_look(job, given, cuts, results, n_round):
+def _rough(settings):
+    """Settings of fits of few iterations; other priors than the one that learns need all."""
+    if not settings.learns:
+        return settings
+    return replace(settings, max_iter=min(settings.max_iter, ROUGH_ITERATIONS))
+
+
+def _second_look(job, given, cuts, results, part, n_round):
     """Fit those blends again in whose residuals there are more sources, with these.
 
     The residuals are those of the whole fit. A first look of 30 iterations without structure, as
     `clresample deblend` takes, leaves bright galaxies' own structure in them: in simulated fields
     15 % of all rows were clumps of it then, and no more true sources were found. Pieces of a cut
-    blend are looked at from round 1 on, when their neighbours' light is subtracted.
+    blend are looked at in the round SEARCHED, when their neighbours' light is subtracted; their
+    new sources are left in the part, for the next round.
     """
     again = {}
     for i, (cut, result) in enumerate(zip(cuts, results, strict=True)):
-        if isinstance(result, Failure) or (n_round == 0 and cut.patch.siblings):
+        is_piece = bool(cut.patch.siblings)
+        if isinstance(result, Failure) or n_round != (SEARCHED if is_piece else 0):
             continue
         try:
             found = detect_more(result, threshold=job.threshold).sources
@@ -188,8 +214,12 @@ def _second_look(job, given, cuts, results, n_round):
         new = [source for source in found if _on_patch(given, cut.patch, source)]
         if new:
             places = np.array([s.position_px for s in new]) + cut.patch.box[:2]
-            ids = source_ids(places, job.field_number)
-            named = tuple(replace(s, name=str(n)) for s, n in zip(new, ids, strict=True))
+            ids = source_ids(places, job.field_number).tolist()
+            rows = [(n, *place) for n, place in zip(ids, places.tolist(), strict=True)]
+            if is_piece:
+                part.found += [(cut.patch.number, *row) for row in rows]
+                continue
+            named = tuple(_source(cut.patch, *row) for row in rows)
             again[i] = replace(cut.blend, sources=cut.blend.sources + named)
     for i, result in zip(again, _fits(job, list(again.values())), strict=True):
         if not isinstance(result, Failure):  # else what was fitted before stands

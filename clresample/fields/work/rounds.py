@@ -10,7 +10,7 @@ from ...files.whole_file import FileError
 from .engine import Work
 from .fitting import fit_group, set_aside
 from .given import Group, given
-from .part import PartFile
+from .part import FOUND_COLUMNS, PartFile
 
 # Most rounds in which a cut blend's pieces are fitted again, their neighbours' light subtracted.
 # The first takes the neighbours out; crowded pieces settle by the third or fourth.
@@ -39,7 +39,8 @@ FIT = Work(given, fit_group, part_path)
 def fitted(job, engine, progress):
     """Fit all groups that are not yet, round by round.
 
-    A cut blend's pieces are fitted again as long as a neighbour of theirs moves.
+    A cut blend's pieces are fitted again as long as a neighbour of theirs moves, and where their
+    residuals held more sources.
     returns the PartFiles, the last round's of each patch counting, and the parents of those cut
     blends whose pieces had not settled when the rounds ended
     """
@@ -64,6 +65,7 @@ def fitted(job, engine, progress):
                 n_round,
                 history.light_about(patches),
                 history.components_of(patches),
+                history.found_in(patches),
             )
             for i, patches in enumerate(groups)
         ]
@@ -71,6 +73,7 @@ def fitted(job, engine, progress):
         history.add(names)
         moved = history.moved({n for patches in names.values() for n in patches})
         pending = {n for n in pieces if moved.intersection(job.plan.patches[n].siblings)}
+        pending |= history.new
         parts += names
     # by round and group, in whichever order they ended: sums of models are the same to the last bit
     unsettled = {job.plan.patches[n].parent for n in (moved if pending else ())}
@@ -92,14 +95,22 @@ def _file(job, name):
 
 
 class _Parts:
-    """In which parts a cut blend's pieces are, round by round."""
+    """In which parts a cut blend's pieces are, round by round.
+
+    new: pieces in whose residuals the last round has found sources
+    """
 
     def __init__(self, job):
-        self.job, self.names = job, {}
+        self.job, self.names, self.found, self.new = job, {}, {}, set()
 
     def add(self, names):
         """Add a round: {name: patches} of its parts."""
+        self.new = set()
         for name in sorted(names):
+            (table,) = _file(self.job, name).read("FOUND")
+            for row in zip(*(table[column].tolist() for column in FOUND_COLUMNS), strict=True):
+                self.found.setdefault(row[0], []).append(row)
+                self.new.add(row[0])
             for patch in names[name]:
                 if self.job.plan.patches[patch].pieces > 1:
                     self.names.setdefault(patch, []).append(name)
@@ -120,6 +131,10 @@ class _Parts:
             if mean:
                 found.append((patch, older[-1], 0.5))
         return tuple(found)
+
+    def found_in(self, patches):
+        """`Group.found` of some pieces: all that was found in their residuals so far."""
+        return tuple(row for patch in patches for row in self.found.get(patch, ()))
 
     def components_of(self, patches):
         """`Group.components` of some pieces, by their last fits.
