@@ -9,7 +9,8 @@ from clresample.fields.blends.cut import Limits, pieces_of
 from clresample.fields.blends.plan import host_ids, source_ids
 from clresample.fields.blends.tiles import Tile
 from clresample.fields.box import Box
-from clresample.fields.work.rounds import LARGE, _is_large, _Parts
+from clresample.fields.work.fitting import LARGE, is_large
+from clresample.fields.work.rounds import _Parts
 from clresample.fields.work.searching import _lost
 
 
@@ -77,9 +78,8 @@ def test_a_piece_moves_by_errors_and_by_part_of_its_flux(monkeypatch, flux, erro
 
 
 def test_a_large_piece_has_many_pixels_times_sources():
-    def job(n, side):
-        patch = SimpleNamespace(box=Box(0, 0, side, side), sources=tuple(range(n)))
-        return SimpleNamespace(plan=SimpleNamespace(patches=[patch]))
+    def patch(n, side):
+        return SimpleNamespace(box=Box(0, 0, side, side), sources=tuple(range(n)))
 
-    assert _is_large(job(20, 200), 0) and not _is_large(job(2, 200), 0)
+    assert is_large(patch(20, 200)) and not is_large(patch(2, 200))
     assert LARGE == 500_000

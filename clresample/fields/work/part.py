@@ -26,7 +26,13 @@ PATCH_COLUMNS: dict[str, type | str] = {
 }
 META = "FRAME", "EXTNAME"  # cards of a table's header that its Columns know too
 FITS_FORMATS = {"int16": "I", "int32": "J", "int64": "K", "float32": "E", "float64": "D"}
-FOUND_COLUMNS: dict[str, type] = {"patch": np.int64, "id": np.int64, "y": float, "x": float}
+FOUND_COLUMNS: dict[str, type] = {
+    "patch": np.int64,
+    "id": np.int64,
+    "y": float,
+    "x": float,
+    "host": np.int64,
+}
 COMPONENT_COLUMNS = ("id", "parent_id", "patch", "y0", "x0", "n_y", "n_x", "offset")
 MODEL_COLUMNS = ("patch", "mosaic", "y0", "x0", "y1", "x1", "offset")
 

@@ -8,16 +8,17 @@ import numpy as np
 
 from ...files.whole_file import FileError
 from .engine import Work
-from .fitting import fit_group, set_aside
+from .fitting import fit_group, is_large, set_aside
 from .given import Group, given
 from .part import FOUND_COLUMNS, PartFile
 
 # Most rounds in which a cut blend's pieces are fitted again, their neighbours' light subtracted.
 # The first takes the neighbours out; crowded pieces settle by the third or fourth.
 ROUNDS = 4
-# [px] The same of pieces of more model pixels times sources, which take tens of seconds each: the
-# first round subtracts their neighbours' light, the second what these have gained by that
-LARGE, LARGE_ROUNDS = 500_000, 2
+# The same of large pieces, which take tens of seconds each (fitting.LARGE), but where their
+# residuals held more sources: the first round subtracts their neighbours' light, and what these
+# gain by that is a part of what it is taken to be wrong by
+LARGE_ROUNDS = 1
 # [errors] A blend's pieces have settled when no flux changes by more than this from one round to
 # the next. Fits end within 0.2 of their limit (Settings.enough), two of them within 0.3 of each
 # other: a smaller number would not be reached.
@@ -52,12 +53,14 @@ def fitted(job, engine, progress):
     pieces = {n for group in job.plan.giants for n in group}
     pending = {n for n in pieces if job.plan.patches[n].siblings}
     moved: set[int] = set()
+    n_last = 0
     for n_round in range(1, ROUNDS + 1):
-        again = {n for n in pending if n_round <= LARGE_ROUNDS or not _is_large(job, n)}
+        again = {n for n in pending if n_round <= LARGE_ROUNDS or not is_large(job.plan.patches[n])}
+        again |= history.new
         groups = [few for g in job.plan.giants if (few := tuple(n for n in g if n in again))]
         if not groups:
             break
-        progress.stage(f"pieces, round {n_round}", len(pending))
+        progress.stage(f"pieces, round {n_round}", sum(map(len, groups)))
         tasks = [
             Group(
                 _name(n_round, i),
@@ -73,17 +76,13 @@ def fitted(job, engine, progress):
         history.add(names)
         moved = history.moved({n for patches in names.values() for n in patches})
         pending = {n for n in pieces if moved.intersection(job.plan.patches[n].siblings)}
-        pending |= history.new
         parts += names
+        n_last = n_round
     # by round and group, in whichever order they ended: sums of models are the same to the last bit
-    unsettled = {job.plan.patches[n].parent for n in (moved if pending else ())}
+    # the first round's fits come after rough ones, by which nobody can tell
+    judged = moved if pending and n_last > 1 else ()
+    unsettled = {job.plan.patches[n].parent for n in judged}
     return [_file(job, name) for name in sorted(parts)], unsettled
-
-
-def _is_large(job, number):
-    """Whether a patch has over LARGE pixels times sources."""
-    patch = job.plan.patches[number]
-    return patch.box.area * len(patch.sources) > LARGE
 
 
 def _name(n_round, i):
