@@ -138,8 +138,7 @@ def _fitted(job, group, given):
         cut = _Cut(patch, blend, boxes, time.perf_counter() - start)
         cuts.append(cut.joined(more))
     rough = [group.round == 0 and bool(cut.patch.siblings) for cut in cuts]
-    large = [is_large(cut.patch) for cut in cuts]
-    results = _fits(job, [cut.blend for cut in cuts], rough, large)
+    results = _fits(job, [cut.blend for cut in cuts], rough)
     if job.passes > 1:
         cuts, results = _second_look(job, given, cuts, results, part, group.round)
     for cut, result in zip(cuts, results, strict=True):
@@ -177,25 +176,26 @@ def _source(patch, number, y, x, host):
     return Extended(position_px=(y - patch.box.y0, x - patch.box.x0), name=str(number))
 
 
-def is_large(patch):
-    """Whether a patch has over LARGE pixels times sources."""
-    return patch.box.area * len(patch.sources) > LARGE
+def is_large(n_sources, shape):
+    """Whether a fit of so many sources has over LARGE model pixels times them; shape (2,) [px]."""
+    return n_sources * shape[0] * shape[1] > LARGE
 
 
-def _fits(job, blends, rough, large):
+def _fits(job, blends, rough=None):
     """Results and Failures of blends; one that was interrupted ends all.
 
-    rough, large (n): bool, those of few iterations; see ROUGH_ITERATIONS, LARGE_ITERATIONS
+    rough (n): bool, those of few iterations, see ROUGH_ITERATIONS; None = none
     """
     if not blends:
         return []
     device, sizes = get_device(job.device), {}
-    for i, (blend, *limits) in enumerate(zip(blends, rough, large, strict=True)):
-        frame = blend.frame and blend.frame.shape
-        sizes.setdefault((*limits, frame, *(o.shape for o in blend.observations)), []).append(i)
+    for i, blend in enumerate(blends):
+        frame = blend.frame.shape
+        limits = bool(rough and rough[i]), is_large(len(blend.sources), frame)
+        sizes.setdefault((limits, frame, *(o.shape for o in blend.observations)), []).append(i)
     results: list = [None] * len(blends)
-    for limits, alike in sizes.items():  # all at once, those of one size would be padded too
-        settings, few = _settings(job, *limits[:2]), [blends[i] for i in alike]
+    for (limits, *_), alike in sizes.items():  # all at once, those of one size would be padded too
+        settings, few = _settings(job, *limits), [blends[i] for i in alike]
         found = deblend_many(few, settings=settings, device=device, memory=job.memory)
         if any(r.status == INTERRUPTED for r in found):
             raise KeyboardInterrupt
@@ -238,9 +238,7 @@ def _second_look(job, given, cuts, results, part, n_round):
             part.found += [(cut.patch.number, *row) for row in rows]
         elif rows:
             again.append((i, cut.joined(rows)))
-    new = [cut for _, cut in again]
-    large = [is_large(cut.patch) for cut in new]
-    fits = _fits(job, [cut.blend for cut in new], [False] * len(new), large)
+    fits = _fits(job, [cut.blend for _, cut in again])
     for (i, cut), result in zip(again, fits, strict=True):
         if not isinstance(result, Failure):  # else what was fitted before stands
             cuts[i], results[i] = cut, result

@@ -55,7 +55,7 @@ def fitted(job, engine, progress):
     moved: set[int] = set()
     n_last = 0
     for n_round in range(1, ROUNDS + 1):
-        again = {n for n in pending if n_round <= LARGE_ROUNDS or not is_large(job.plan.patches[n])}
+        again = {n for n in pending if n_round <= LARGE_ROUNDS or not _is_large(job, n)}
         again |= history.new
         groups = [few for g in job.plan.giants if (few := tuple(n for n in g if n in again))]
         if not groups:
@@ -83,6 +83,12 @@ def fitted(job, engine, progress):
     judged = moved if pending and n_last > 1 else ()
     unsettled = {job.plan.patches[n].parent for n in judged}
     return [_file(job, name) for name in sorted(parts)], unsettled
+
+
+def _is_large(job, number):
+    """Whether a patch is large, see fitting.LARGE."""
+    patch = job.plan.patches[number]
+    return is_large(len(patch.sources), patch.box.shape)
 
 
 def _name(n_round, i):
