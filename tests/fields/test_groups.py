@@ -110,12 +110,15 @@ def test_what_is_found_beside_pieces_is_left_for_the_next_round(
     patch = SimpleNamespace(number=3, siblings=siblings, box=Box(10, 20, 40, 50), sources=(0,))
     cut = fitting._Cut(patch, fitting.Blend((), (), None), {}, 0.0)
     row, blends = (77, 15.0, 27.0, 5), []
+    seen = SimpleNamespace(weights=np.ones((1, 10, 10)))
+    good, bad = (SimpleNamespace(observations=[seen], losses=[2, x]) for x in (4900.0, 5100.0))
     monkeypatch.setattr(fitting, "_found", lambda *given: [row])
     monkeypatch.setattr(fitting, "_fits", lambda job, some, *limits: blends.extend(some) or some)
     n_round = 1 if siblings else 0
     for i in (n_round, 2):
         part = Part()
-        cuts, _ = fitting._second_look(None, None, [cut], ["fit"], part, i)
+        cuts, _ = fitting._second_look(None, None, [cut], [good], part, i)
+        assert fitting._second_look(None, None, [cut], [bad], part, i)[0] == [cut]
         if i == 2:
             assert not part.found and cuts == [cut]
         else:

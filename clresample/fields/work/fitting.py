@@ -35,6 +35,10 @@ ROUGH_ITERATIONS = 60
 # clumps go on for a thousand, in which clumps exchange light with what they lie on: of one with 24
 # sources no flux moved by over 2 errors after twice as many, and that of all by 0.3 %.
 LARGE, LARGE_ITERATIONS = 500_000, 150
+# [per pixel] Chi2 of a fit over which its residuals are not searched: they are the model's own
+# errors, as about a star that is far from its PSF, with dozens of peaks. Large galaxies with clumps
+# have up to 10 in a first fit.
+MOST_CHI2 = 100.0
 # The round in which pieces' residuals are searched; the next one fits what is found there.
 SEARCHED = 1
 NO_ANSWER = "no longer answers"  # in the message of a device that is gone with all its memory
@@ -228,7 +232,9 @@ def _second_look(job, given, cuts, results, part, n_round):
     cuts, results, again = list(cuts), list(results), []
     for i, (cut, result) in enumerate(zip(cuts, results, strict=True)):
         is_piece = bool(cut.patch.siblings)
-        if isinstance(result, Failure) or n_round != (SEARCHED if is_piece else 0):
+        if isinstance(result, Failure) or _chi2(result) > MOST_CHI2:
+            continue
+        if n_round != (SEARCHED if is_piece else 0):
             continue
         try:
             rows = _found(job, given, cut, result)
@@ -243,6 +249,12 @@ def _second_look(job, given, cuts, results, part, n_round):
         if not isinstance(result, Failure):  # else what was fitted before stands
             cuts[i], results[i] = cut, result
     return cuts, results
+
+
+def _chi2(result):
+    """Chi2 per pixel of a fit, prior included; 0 of one that has no loss."""
+    n = sum(np.count_nonzero(o.weights) for o in result.observations)
+    return 2 * float(result.losses[-1]) / max(n, 1) if len(result.losses) else 0.0
 
 
 def _found(job, given, cut, result):
