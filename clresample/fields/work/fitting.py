@@ -32,9 +32,9 @@ ERRORS = (ValueError, ArithmeticError, MemoryError, OSError, np.linalg.LinAlgErr
 # one takes of them is their light, which it subtracts as if it were wrong by 15 % (MODEL_ERROR).
 ROUGH_ITERATIONS = 60
 # [px] Blends of more model pixels times sources, and most iterations of theirs. Large galaxies with
-# clumps go on for a thousand, in which clumps exchange light with what they lie on: of one with 24
-# sources no flux moved by over 2 errors after twice as many, and that of all by 0.3 %.
-LARGE, LARGE_ITERATIONS = 500_000, 150
+# clumps go on for a thousand, in which clumps and neighbours exchange light with what they lie on.
+# With 150 a disk of signal to noise 8600 has 0.95 of its light, with 500 it has 0.975.
+LARGE, LARGE_ITERATIONS = 500_000, 250
 # [per pixel] Chi2 of a fit over which its residuals are not searched: they are the model's own
 # errors, as about a star that is far from its PSF, with dozens of peaks. Large galaxies with clumps
 # have up to 10 in a first fit.

