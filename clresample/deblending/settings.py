@@ -49,6 +49,9 @@ class Settings:
         the data show, to 0.4 % for a typical bright galaxy of COSMOS and 1.4 % at most. Larger
         ones are not needed by simulated parametric galaxies, smaller ones cover COSMOS' less.
         PSFs that are wrong by a percent need 0.01
+    errors: with a LearnedPrior, whether errors are worked out that know of morphologies and
+        neighbours. False takes two thirds of the time; fluxes have those of fixed morphologies,
+        and sizes none
     psf_error: part by which PSFs may be too narrow or too wide. That part of a bright point
         source's light, more in its wings, adds to the noise of its pixels, so that what the PSF
         does not explain of a star is not given to its neighbours. Weights follow the stars' light
@@ -73,6 +76,7 @@ class Settings:
     fit_shifts: bool | str = "auto"
     fit_sky: bool = False
     flux_floor: float = 0.0005
+    errors: bool = True
     psf_error: float = 0.03
     psf_tolerance: float = 1e-3
 
@@ -81,7 +85,8 @@ class Settings:
         number("enough", self.enough, "0 or more", lambda x: x >= 0)
         for name in ("tol", "flux_floor", "psf_error", "psf_tolerance"):
             number(name, getattr(self, name), "at least 0 and under 1", lambda x: 0 <= x < 1)
-        instance("fit_sky", self.fit_sky, (bool, np.bool_))
+        for name in ("fit_sky", "errors"):
+            instance(name, getattr(self, name), (bool, np.bool_))
         if not isinstance(self.fit_shifts, (bool, np.bool_)) and self.fit_shifts != AUTO:
             raise ValueError(f'fit_shifts is {self.fit_shifts!r}, must be True, False or "{AUTO}"')
         for name, kind in (("prior", (LearnedPrior, Prior)), ("constraints", Chain)):

@@ -16,7 +16,7 @@ those of signal.py and companions.py.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -59,6 +59,8 @@ class Detection(ShownDetection):
     groups (S,): number of the source in whose light each lies and whose clump it may be, see
         clumps.py; its own number where there is none
     image (Ny, Nx) [sigma]: signal to noise of all observations together, 0 where nothing was seen
+    hosts (S,): by `detect_more`, number of the fit's source, the large galaxy in whose light each
+        lies and whose clump it may be; -1 where there is none. None by `detect`
     """
 
     sources: tuple[Extended, ...]
@@ -67,6 +69,7 @@ class Detection(ShownDetection):
     found_in: tuple[str, ...]
     image: np.ndarray
     groups: np.ndarray
+    hosts: np.ndarray | None = None
 
 
 def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> Detection:
@@ -129,7 +132,9 @@ def detect_more(result, *, threshold=THRESHOLD) -> Detection:
     pixels = np.stack([*np.indices(result.frame.shape)], axis=-1)
     places = [footprint.locate(pixels) for footprint in result.footprints]
     found = _search(left, result.frame, threshold, list(known), beside=False, places=places)
-    return _without_structure(result, found, known, places, threshold) if found.sources else found
+    if not found.sources:
+        return replace(found, hosts=np.zeros(0, int))
+    return _without_structure(result, found, known, places, threshold)
 
 
 def _with_data(observation, data, weights):
@@ -160,12 +165,18 @@ def _without_structure(result, found, known, places, threshold):
     )
     inside = known[frame.inside(known)]
     bodies = bodies_of(light, inside, _fwhm_px(o, frame), threshold, frame.grid.pixel_scale_arcsec)
-    kept = []
+    kept, hosts = [], []
     for i, source in enumerate(found.sources):
-        body = bodies.body_at(np.array(source.position_px))
+        number = bodies.body_at(np.array(source.position_px))
         y, x = np.rint(source.position_px).astype(int)
-        if body < 0 or not bodies.bodies[body].takes(rest[y, x], light[y, x])[0]:
+        is_structure = is_member = False
+        if number >= 0:
+            body = bodies.bodies[number]
+            is_structure, is_member = body.takes(rest[y, x], light[y, x])
+        if not is_structure:
             kept.append(i)
+            host = np.hypot(*(known - body.center).T).argmin() if is_member else -1
+            hosts.append(int(host))
     return Detection(
         sources=tuple(found.sources[i] for i in kept),
         frame=frame,
@@ -173,6 +184,7 @@ def _without_structure(result, found, known, places, threshold):
         found_in=tuple(found.found_in[i] for i in kept),
         image=found.image,
         groups=np.arange(len(kept)),
+        hosts=np.array(hosts, int),
     )
 
 

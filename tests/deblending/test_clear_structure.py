@@ -60,6 +60,14 @@ def test_scenes_look_when_they_are_calm_and_settled():
     assert progress.asks(accepted).tolist() == [False, False, True, False, True]
 
 
+def test_scenes_that_still_fall_far_look_after_eighty_rounds():
+    progress = begun(100, 100, 100, 100)
+    progress.settled[:] = True
+    falls(progress, 20, 20, 10, np.inf)
+    progress.n_rounds[:] = [79, 80, 80, 80]
+    assert progress.asks(np.ones(4, bool)).tolist() == [False, True, False, False]
+
+
 def test_no_fit_converges_before_it_has_looked():
     """Of a larger `enough` than what looking needs."""
     progress = begun(100, 100)

@@ -30,7 +30,7 @@ def test_defaults_are_those_of_the_docstring():
     s = Settings()
     assert (s.max_iter, s.enough, s.tol, s.flux_floor) == (500, 0.25, 1e-5, 0.0005)
     assert (s.psf_error, s.psf_tolerance, s.fit_shifts, s.fit_sky) == (0.03, 1e-3, "auto", False)
-    assert s.learns and s.constraints is None and s.prior == LearnedPrior()
+    assert s.errors and s.learns and s.constraints is None and s.prior == LearnedPrior()
     steps = s.step_sizes
     assert (steps.latent, steps.morphology, steps.spectrum) == (0.1, 0.01, 0.1)
     assert (s.prior.scales_px, s.prior.weight) == ((0.8, 2.0, 5.0), 100)
@@ -49,6 +49,7 @@ def test_defaults_are_those_of_the_docstring():
         ("psf_tolerance", [-1e-9, 1.0], [0, 0.99]),
         ("fit_shifts", [1, "no", None], [True, np.False_, "auto"]),
         ("fit_sky", [1, "no", None], [True, np.False_]),
+        ("errors", [1, "no", None], [True, np.False_]),
         ("prior", [3, "none"], [None, Prior(), LearnedPrior()]),
         ("constraints", [Positivity(), [Positivity()]], [None, Chain(Positivity())]),
         ("step_sizes", [None, 0.1], []),

@@ -196,9 +196,9 @@ def test_the_floor_is_added_in_quadrature_and_leaves_colours(device, fitted, mon
         Settings(flux_floor=-0.1)
 
 
-@pytest.mark.parametrize("prior", [Prior(), None], ids=["one scale", "none"])
-def test_other_priors_keep_errors_of_fixed_morphologies(device, prior):
-    result = scenes.fit(blend(BRIGHT), device, settings=Settings(prior=prior, max_iter=20))
+@pytest.mark.parametrize("given", [{"prior": Prior()}, {"prior": None}, {"errors": False}], ids=str)
+def test_others_keep_errors_of_fixed_morphologies(device, given):
+    result = scenes.fit(blend(BRIGHT), device, settings=Settings(max_iter=20, **given))
     assert result.errors is None and result.draws is None
     sums = np.array([c.morphology.sum() for c in result.components])
     wanted = np.sqrt(np.einsum("css->sc", result.covariance)) * sums[:, None]

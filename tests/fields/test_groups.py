@@ -5,11 +5,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from clresample.deblending.settings import Settings
 from clresample.fields.blends.cut import Limits, pieces_of
 from clresample.fields.blends.plan import host_ids, source_ids
 from clresample.fields.blends.tiles import Tile
 from clresample.fields.box import Box
-from clresample.fields.work.rounds import LARGE, _is_large, _Parts
+from clresample.fields.work import fitting
+from clresample.fields.work.fitting import LARGE, _settings, is_large
+from clresample.fields.work.part import Part, PartFile
+from clresample.fields.work.rounds import _Parts
 from clresample.fields.work.searching import _lost
 
 
@@ -77,9 +81,62 @@ def test_a_piece_moves_by_errors_and_by_part_of_its_flux(monkeypatch, flux, erro
 
 
 def test_a_large_piece_has_many_pixels_times_sources():
-    def job(n, side):
-        patch = SimpleNamespace(box=Box(0, 0, side, side), sources=tuple(range(n)))
-        return SimpleNamespace(plan=SimpleNamespace(patches=[patch]))
-
-    assert _is_large(job(20, 200), 0) and not _is_large(job(2, 200), 0)
+    assert is_large(20, (250, 160)) and not is_large(2, (250, 160))
     assert LARGE == 500_000
+
+
+@pytest.mark.parametrize(
+    "rough, large, given, most, errors",
+    [
+        (True, False, {}, 60, False),
+        (True, True, {}, 60, False),
+        (False, True, {}, 250, True),
+        (False, False, {}, 500, True),
+        (True, False, {"max_iter": 10}, 10, False),
+        (True, True, {"prior": None}, 500, True),
+    ],
+)
+def test_rough_and_large_fits_have_few_iterations(rough, large, given, most, errors):
+    settings = _settings(SimpleNamespace(settings=Settings(**given)), rough, large)
+    assert (settings.max_iter, settings.errors) == (most, errors)
+
+
+@pytest.mark.parametrize("siblings, fitted, left", [((), 1, 0), ((1,), 0, 1)])
+def test_what_is_found_beside_pieces_is_left_for_the_next_round(
+    monkeypatch, siblings, fitted, left
+):
+    """A blend that is whole is fitted again at once; only the first round after the rough one, or
+    the only one, searches."""
+    patch = SimpleNamespace(number=3, siblings=siblings, box=Box(10, 20, 40, 50), sources=(0,))
+    cut = fitting._Cut(patch, fitting.Blend((), (), None), {}, 0.0)
+    row, blends = (77, 15.0, 27.0, 5), []
+    seen = SimpleNamespace(weights=np.ones((1, 10, 10)))
+    good, bad = (SimpleNamespace(observations=[seen], losses=[2, x]) for x in (4900.0, 5100.0))
+    monkeypatch.setattr(fitting, "_found", lambda *given: [row])
+    monkeypatch.setattr(fitting, "_fits", lambda job, some, *limits: blends.extend(some) or some)
+    n_round = 1 if siblings else 0
+    for i in (n_round, 2):
+        part = Part()
+        cuts, _ = fitting._second_look(None, None, [cut], [good], part, i)
+        assert fitting._second_look(None, None, [cut], [bad], part, i)[0] == [cut]
+        if i == 2:
+            assert not part.found and cuts == [cut]
+        else:
+            assert part.found == [(3, *row)] * left and cuts[0].more == (row,) * fitted
+    assert [b.sources[0].position_px for b in blends] == [(5.0, 7.0)] * fitted
+    assert [b.sources[0].name for b in blends] == ["77"] * fitted
+
+
+def test_what_was_found_is_carried_from_round_to_round(tmp_path):
+    parts = _Parts(SimpleNamespace(folder=tmp_path, plan=SimpleNamespace(patches=[])))
+    rows = [(3, 77, 15.0, 27.0, 5), (4, 78, 16.5, 2.25, 78)]
+    patches = {3: SimpleNamespace(pieces=2), 4: SimpleNamespace(pieces=2)}
+    parts.job.plan.patches = patches
+    for name, found in (("fit-1-000000", rows), ("fit-2-000000", [])):
+        part = Part(found=found)
+        (tmp_path / f"{name}.fits").write_bytes(part.to_bytes())
+        parts.add({name: (3, 4)})
+        assert parts.new == {row[0] for row in found}
+    assert parts.found_in((4,)) == (rows[1],) and parts.found_in((3, 4)) == tuple(rows)
+    (table,) = PartFile(tmp_path / "fit-1-000000.fits").read("FOUND")
+    assert table["host"].tolist() == [5, 78]

@@ -219,7 +219,7 @@ def posterior_of(fit, morphs, peaks, seen):
     seen: Seen, of these
     """
     settings, scene = fit.settings, fit.scene
-    if not settings.learns or fit.findings is None:
+    if not settings.learns or not settings.errors or fit.findings is None:
         return None, []
     spectra, covariance = seen.spectra, seen.covariance
     variance = np.diagonal(covariance, axis1=1, axis2=2).T

@@ -18,6 +18,8 @@ class Group:
     light: (patch, name of a part, share) for each model of a neighbour that is subtracted; the
         shares of a patch add up to 1
     components: (id, how many) of those sources whose number of components an earlier round found
+    found: (patch, id, y, x, id of the host) of sources that an earlier round found in a patch's
+        residuals, at (y, x) [px] of the field's model pixels
     """
 
     name: str
@@ -25,6 +27,7 @@ class Group:
     round: int = 0
     light: tuple[tuple[int, str, float], ...] = ()
     components: tuple[tuple[int, int], ...] = ()
+    found: tuple[tuple[int, int, float, float, int], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,6 +26,13 @@ PATCH_COLUMNS: dict[str, type | str] = {
 }
 META = "FRAME", "EXTNAME"  # cards of a table's header that its Columns know too
 FITS_FORMATS = {"int16": "I", "int32": "J", "int64": "K", "float32": "E", "float64": "D"}
+FOUND_COLUMNS: dict[str, type] = {
+    "patch": np.int64,
+    "id": np.int64,
+    "y": float,
+    "x": float,
+    "host": np.int64,
+}
 COMPONENT_COLUMNS = ("id", "parent_id", "patch", "y0", "x0", "n_y", "n_x", "offset")
 MODEL_COLUMNS = ("patch", "mosaic", "y0", "x0", "y1", "x1", "offset")
 
@@ -35,6 +42,7 @@ class Part:
     """The results of a group of patches.
 
     rows: Columns of sources, one for each patch; patches: rows of PATCH_COLUMNS
+    found: rows of FOUND_COLUMNS, sources in residuals that the next round is to fit
     components: rows of COMPONENT_COLUMNS, offsets counted in `flat`; spectra: (C,) of each
     flat: morphologies, flattened; models: rows of MODEL_COLUMNS, pixels: of these, flattened
     offsets: (1 + 2 M + C,) of each patch with fitted shifts or sky levels other than 0: its number,
@@ -43,6 +51,7 @@ class Part:
 
     rows: list = field(default_factory=list)
     patches: list = field(default_factory=list)
+    found: list = field(default_factory=list)
     components: list = field(default_factory=list)
     spectra: list = field(default_factory=list)
     flat: list = field(default_factory=list)
@@ -73,15 +82,11 @@ class Part:
 
     def to_bytes(self) -> bytes:
         """The file that PartFile reads."""
-        columns = zip(*self.patches, strict=True) if self.patches else [()] * len(PATCH_COLUMNS)
-        patches = {
-            name: np.array(values, kind)
-            for (name, kind), values in zip(PATCH_COLUMNS.items(), columns, strict=True)
-        }
         hdus = [
             fits.PrimaryHDU(),
             _table(Columns.joined([rows for rows in self.rows if len(rows)]), "CATALOGUE"),
-            _table(Columns(patches), "PATCHES"),
+            _table(_typed(self.patches, PATCH_COLUMNS), "PATCHES"),
+            _table(_typed(self.found, FOUND_COLUMNS), "FOUND"),
             _table(_whole(self.components, COMPONENT_COLUMNS), "COMPONENTS"),
             _floats(self.spectra, "SPECTRA"),
             _floats(self.flat and np.concatenate(self.flat), "MORPHOLOGIES"),
@@ -92,6 +97,13 @@ class Part:
         file = BytesIO()
         fits.HDUList(hdus).writeto(file)
         return file.getvalue()
+
+
+def _typed(rows, kinds):
+    """The Columns of rows; kinds: {name: type}."""
+    columns = zip(*rows, strict=True) if rows else [()] * len(kinds)
+    pairs = zip(kinds.items(), columns, strict=True)
+    return Columns({name: np.array(values, kind) for (name, kind), values in pairs})
 
 
 def _whole(rows, names):

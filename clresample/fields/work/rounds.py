@@ -8,16 +8,17 @@ import numpy as np
 
 from ...files.whole_file import FileError
 from .engine import Work
-from .fitting import fit_group, set_aside
+from .fitting import fit_group, is_large, set_aside
 from .given import Group, given
-from .part import PartFile
+from .part import FOUND_COLUMNS, PartFile
 
 # Most rounds in which a cut blend's pieces are fitted again, their neighbours' light subtracted.
 # The first takes the neighbours out; crowded pieces settle by the third or fourth.
 ROUNDS = 4
-# [px] The same of pieces of more model pixels times sources, which take tens of seconds each: the
-# first round subtracts their neighbours' light, the second what these have gained by that
-LARGE, LARGE_ROUNDS = 500_000, 2
+# The same of large pieces, which take tens of seconds each (fitting.LARGE), but where their
+# residuals held more sources: the first round subtracts their neighbours' light, and what these
+# gain by that is a part of what it is taken to be wrong by
+LARGE_ROUNDS = 1
 # [errors] A blend's pieces have settled when no flux changes by more than this from one round to
 # the next. Fits end within 0.2 of their limit (Settings.enough), two of them within 0.3 of each
 # other: a smaller number would not be reached.
@@ -39,7 +40,8 @@ FIT = Work(given, fit_group, part_path)
 def fitted(job, engine, progress):
     """Fit all groups that are not yet, round by round.
 
-    A cut blend's pieces are fitted again as long as a neighbour of theirs moves.
+    A cut blend's pieces are fitted again as long as a neighbour of theirs moves, and where their
+    residuals held more sources.
     returns the PartFiles, the last round's of each patch counting, and the parents of those cut
     blends whose pieces had not settled when the rounds ended
     """
@@ -51,12 +53,14 @@ def fitted(job, engine, progress):
     pieces = {n for group in job.plan.giants for n in group}
     pending = {n for n in pieces if job.plan.patches[n].siblings}
     moved: set[int] = set()
+    n_last = 0
     for n_round in range(1, ROUNDS + 1):
         again = {n for n in pending if n_round <= LARGE_ROUNDS or not _is_large(job, n)}
+        again |= history.new
         groups = [few for g in job.plan.giants if (few := tuple(n for n in g if n in again))]
         if not groups:
             break
-        progress.stage(f"pieces, round {n_round}", len(pending))
+        progress.stage(f"pieces, round {n_round}", sum(map(len, groups)))
         tasks = [
             Group(
                 _name(n_round, i),
@@ -64,6 +68,7 @@ def fitted(job, engine, progress):
                 n_round,
                 history.light_about(patches),
                 history.components_of(patches),
+                history.found_in(patches),
             )
             for i, patches in enumerate(groups)
         ]
@@ -72,15 +77,18 @@ def fitted(job, engine, progress):
         moved = history.moved({n for patches in names.values() for n in patches})
         pending = {n for n in pieces if moved.intersection(job.plan.patches[n].siblings)}
         parts += names
+        n_last = n_round
     # by round and group, in whichever order they ended: sums of models are the same to the last bit
-    unsettled = {job.plan.patches[n].parent for n in (moved if pending else ())}
+    # the first round's fits come after rough ones, by which nobody can tell
+    judged = moved if pending and n_last > 1 else ()
+    unsettled = {job.plan.patches[n].parent for n in judged}
     return [_file(job, name) for name in sorted(parts)], unsettled
 
 
 def _is_large(job, number):
-    """Whether a patch has over LARGE pixels times sources."""
+    """Whether a patch is large, see fitting.LARGE."""
     patch = job.plan.patches[number]
-    return patch.box.area * len(patch.sources) > LARGE
+    return is_large(len(patch.sources), patch.box.shape)
 
 
 def _name(n_round, i):
@@ -92,14 +100,22 @@ def _file(job, name):
 
 
 class _Parts:
-    """In which parts a cut blend's pieces are, round by round."""
+    """In which parts a cut blend's pieces are, round by round.
+
+    new: pieces in whose residuals the last round has found sources
+    """
 
     def __init__(self, job):
-        self.job, self.names = job, {}
+        self.job, self.names, self.found, self.new = job, {}, {}, set()
 
     def add(self, names):
         """Add a round: {name: patches} of its parts."""
+        self.new = set()
         for name in sorted(names):
+            (table,) = _file(self.job, name).read("FOUND")
+            for row in zip(*(table[column].tolist() for column in FOUND_COLUMNS), strict=True):
+                self.found.setdefault(row[0], []).append(row)
+                self.new.add(row[0])
             for patch in names[name]:
                 if self.job.plan.patches[patch].pieces > 1:
                     self.names.setdefault(patch, []).append(name)
@@ -120,6 +136,10 @@ class _Parts:
             if mean:
                 found.append((patch, older[-1], 0.5))
         return tuple(found)
+
+    def found_in(self, patches):
+        """`Group.found` of some pieces: all that was found in their residuals so far."""
+        return tuple(row for patch in patches for row in self.found.get(patch, ()))
 
     def components_of(self, patches):
         """`Group.components` of some pieces, by their last fits.
