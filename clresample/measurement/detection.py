@@ -23,7 +23,7 @@ import numpy as np
 from ..deblending.spectra import MODEL_ERROR
 from ..sky.frame import Frame, model_frame
 from ..sky.observation import Observation
-from ..sky.sources import Extended
+from ..sky.sources import Extended, Point
 from .clumps import bodies_of
 from .companions import (
     LEAST,
@@ -38,6 +38,7 @@ from .levels import level_of
 from .peaks import import_sep, new_peaks
 from .searched import SAME_SOURCE, Search
 from .signal import SMALL_GALAXY, combined, signal_of
+from .star_light import height_beside, saturated_stars, starless
 
 # [sigma] of the combined image: white noise reaches it once in two million independent pixels
 THRESHOLD = 5.0
@@ -183,12 +184,16 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
     sep = import_sep()
     at = places or [None] * len(observations)
     signals = [signal_of(o, frame, one) for o, one in zip(observations, at, strict=True)]
-    if scatters is None:
-        scatters = [signal.scatters() for signal in signals]
-    signals = [one.over(scatter) for one, scatter in zip(signals, scatters, strict=True)]
     widths = np.array([_fwhm_px(o, frame) for o in observations])
     order = np.argsort(widths, kind="stable")
-    everything, _ = combined(signals)
+    scale = frame.grid.pixel_scale_arcsec
+    stars = saturated_stars(observations, frame) if beside else []
+    full = signals
+    signals = [starless(s, stars, w, scale) for s, w in zip(signals, widths, strict=True)]
+    if scatters is None:
+        scatters = [signal.scatters() for signal in signals]
+    full, signals = ([one.over(s) for one, s in zip(many, scatters, strict=True)] for many in (full, signals))
+    everything, _ = combined(full)
     if beside:
         everything = everything - level_of(everything, everything != 0)[1]
     levelled, skies = signals, np.zeros((len(signals), 1))
@@ -196,9 +201,8 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
         levelled, skies = zip(*(signal.levelled() for signal in signals), strict=True)
     _, best = combined(levelled)
     sharp = order[0]
-    found = Search(sep, threshold, known)
+    found = Search(sep, threshold, known + [star.place for star in stars])
     found.add(levelled[sharp].flat(), observations[sharp].label, widths[sharp], widths[sharp])
-    scale = frame.grid.pixel_scale_arcsec
     if beside:
         found.sort_out(signals[sharp].flat() - skies[sharp][0], widths[sharp], scale)
     for i in order[1:]:
@@ -209,14 +213,16 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
         new = _companions(sep, levelled, sharp, everything, places, threshold, widths[sharp], scale)
         found.add_companions(new, signals[sharp].flat(), observations[sharp].label)
     order, groups = found.in_order()
-    positions = [found.positions[i] for i in order]
+    positions = [tuple(map(float, found.positions[i])) for i in order]
+    points = [Point(position_px=tuple(map(float, star.place)), free=True) for star in stars]
+    heights = [height_beside(everything, star) for star in stars]
     return Detection(
-        sources=tuple(Extended(position_px=(float(y), float(x))) for y, x in positions),
+        sources=(*points, *(Extended(position_px=position) for position in positions)),
         frame=frame,
-        peaks=np.array([found.peaks[i] for i in order]),
-        found_in=tuple(found.labels[i] for i in order),
+        peaks=np.array([*heights, *(found.peaks[i] for i in order)]),
+        found_in=(*(ALL for _ in stars), *(found.labels[i] for i in order)),
         image=everything,
-        groups=groups,
+        groups=np.concatenate([np.arange(len(stars)), groups + len(stars)]),
     )
 
 
