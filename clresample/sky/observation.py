@@ -146,6 +146,14 @@ def masked(observation, pixels) -> Observation:
     return made
 
 
+def with_psf_field(observation, psf_field) -> Observation:
+    """The same observation with the PSFs of a PSFField; its PSF in the middle stays."""
+    made = copy.copy(observation)
+    made.__dict__.pop("white", None)
+    made._set(psf_field=psf_field)
+    return made
+
+
 def check_observations(observations):
     """Raise ValueError unless these observations can be fitted together.
 

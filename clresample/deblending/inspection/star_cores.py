@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt, find_objects, label
@@ -32,12 +32,13 @@ class StarCore:
     """A star with a masked core in one channel of an image.
 
     place (2,) [px]: (y, x) of the star; radius [px]: from which on its light is unmasked in most
-        directions; light [sigma]: of a pixel there
+        directions; light [sigma]: of a pixel there; masked (My, Mx): bool, the core with its bleeds
     """
 
     place: np.ndarray
     radius: float
     light: float
+    masked: np.ndarray
 
 
 def star_cores(significance, usable, psf, band) -> list[StarCore]:
@@ -61,7 +62,8 @@ def star_cores(significance, usable, psf, band) -> list[StarCore]:
         core = _core(significance[window], usable[window], groups[window] == k, psf, band, fwhm)
         if core is not None:
             y0, x0 = (s.start for s in window)
-            found.append(StarCore(core.place + (y0, x0), core.radius, core.light))
+            place = core.place + (y0, x0)
+            found.append(replace(core, place=place, masked=groups == k))
     return sorted(found, key=lambda core: -core.light)
 
 
@@ -85,7 +87,7 @@ def _core(light, usable, masked, psf, band, fwhm):
         guess, scatter = _centred(light, ring, guess, fwhm)
     if scatter > MAX_SCATTER or not _falls_like(light, ring, guess, psf, band, fwhm):
         return None
-    return StarCore(guess, inner, float(np.median(light[ring])))
+    return StarCore(guess, inner, float(np.median(light[ring])), masked)
 
 
 def _ring(usable, masked, place, fwhm):
