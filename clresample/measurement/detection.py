@@ -189,10 +189,13 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
     scale = frame.grid.pixel_scale_arcsec
     stars = saturated_stars(observations, frame) if beside else []
     full = signals
-    signals = [starless(s, stars, w, scale) for s, w in zip(signals, widths, strict=True)]
+    parted = [starless(s, stars, w, scale) for s, w in zip(signals, widths, strict=True)]
+    signals, held = zip(*parted, strict=True)
     if scatters is None:
         scatters = [signal.scatters() for signal in signals]
-    full, signals = ([one.over(s) for one, s in zip(many, scatters, strict=True)] for many in (full, signals))
+    full, signals = (
+        [one.over(s) for one, s in zip(many, scatters, strict=True)] for many in (full, signals)
+    )
     everything, _ = combined(full)
     if beside:
         everything = everything - level_of(everything, everything != 0)[1]
@@ -211,6 +214,8 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
     if beside and found.positions:
         places = np.array(found.positions)
         new = _companions(sep, levelled, sharp, everything, places, threshold, widths[sharp], scale)
+        # what is left of a star's light is not symmetric about a source on it
+        new = [one for one in new if not held[sharp][tuple(np.rint(one[0]).astype(int))]]
         found.add_companions(new, signals[sharp].flat(), observations[sharp].label)
     order, groups = found.in_order()
     positions = [tuple(map(float, found.positions[i])) for i in order]

@@ -29,7 +29,7 @@ END_SIGMAS, LEAST_COVERED = 0.5, 0.25
 SPIKES = 1.5  # [radii of that ring] how far spikes reach, which hold a small part of a ring
 ALL_SEEN = 0.99  # [1] of the weights of interpolation between pixels
 FWHM_A_SIGMA = 2.3548  # of a Gaussian
-# [FWHM of a filtered point] Pixels nearer to the core's edge hold no peak that could be told from it.
+# [FWHM of a filtered point] Pixels nearer to the core's edge hold no peak of their own.
 CORE_FWHM = 1.0
 # [FWHM of a filtered point] Pixels nearer to masked ones hold none either, beside a star.
 BESIDE_FWHM = 1.0
@@ -91,23 +91,27 @@ def height_beside(image, star) -> float:
     return float(image[away < 2 * star.radius + 1].max(initial=0.0))
 
 
-def starless(signal, stars, fwhm_px, pixel_arcsec) -> Signal:
-    """The Signal without the light of StarPlaces, in units of its scatter there.
+def starless(signal, stars, fwhm_px, pixel_arcsec) -> tuple[Signal, np.ndarray]:
+    """The Signal without the light of StarPlaces, in units of its scatter there, and the pixels
+    (Ny, Nx) bool that held it.
 
     Sums of squares are left out where there is such light: they hold it in every channel.
     fwhm_px [px]: of the PSF; pixel_arcsec [arcsec]: side of a pixel
     """
+    all_held = np.zeros(signal.n_seen.shape, bool)
     if not stars:
-        return signal
+        return signal, all_held
     sums, squares, seen = signal.sums.copy(), signal.squares.copy(), signal.n_seen > 0
     root = np.sqrt(np.maximum(signal.n_seen, 1))
     for w, sigma in enumerate(WIDTHS_ARCSEC):
         # of the PSF filtered with itself and twice with the Gaussian
         wide = FWHM_A_SIGMA * sigma / pixel_arcsec
-        rest, held = _without_stars(signal.flat(w), seen, stars, np.sqrt(2) * np.hypot(fwhm_px, wide))
+        point_px = np.sqrt(2) * np.hypot(fwhm_px, wide)
+        rest, held = _without_stars(signal.flat(w), seen, stars, point_px)
         sums[w] = np.where(held, rest * root, sums[w])
         squares[w][held] = 0
-    return Signal(sums, squares, signal.n_seen, signal.channels, signal.places)
+        all_held |= held
+    return Signal(sums, squares, signal.n_seen, signal.channels, signal.places), all_held
 
 
 def _without_stars(image, seen, stars, fwhm):

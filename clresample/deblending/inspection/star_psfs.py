@@ -76,8 +76,10 @@ class StarPSFs(PSFField):
 
 
 def with_star_psfs(image, sources, places, sky):
-    """The Image with an observation that has own PSFs of its stars with masked cores; the same
-    where there are none. And how many channels each source (S,) has such a core in.
+    """The Image with PSFs of their own for stars with masked cores, and in how many channels each
+    source (S,) has one.
+
+    The masked pixels of these cores grow by `spoilt.GROW_PX`. Without such a star it is the same.
 
     sources: those of which `image.places` are; places (S, 2) [px]: of them, without any shift
     sky: whether a level of the sky is fitted
@@ -91,7 +93,9 @@ def with_star_psfs(image, sources, places, sky):
         for core in star_cores(image.significance[c], image.usable[c], image.observation.psf, c):
             away = np.hypot(*(image.places[stars] - core.place).T)
             if away.min() < max(core.radius, 1.0):
-                wide[c] |= image.usable[c] & binary_dilation(core.masked, np.ones((3, 3), bool), GROW_PX)
+                wide[c] |= image.usable[c] & binary_dilation(
+                    core.masked, np.ones((3, 3), bool), GROW_PX
+                )
                 found.setdefault(stars[int(away.argmin())], {})[c] = core
     image = image.without(wide) if wide.any() else image
     found = {
@@ -151,7 +155,10 @@ def _own(image, c, place, core, sky):
     # samples at the PSF's spacing about the star, over all of the image
     step, low = psf.spacing, -core.place
     high = np.array([n_y - 1, n_x - 1]) - core.place
-    y, x = (np.arange(np.floor(a / step), np.ceil(b / step) + 1) * step for a, b in zip(low, high, strict=True))
+    y, x = (
+        np.arange(np.floor(a / step), np.ceil(b / step) + 1) * step
+        for a, b in zip(low, high, strict=True)
+    )
     away, turn = np.hypot(y[:, None], x), np.arctan2(y[:, None], x) / (2 * np.pi)
     n_angles = lasting.shape[1] - 1
     more = map_coordinates(lasting, [away, turn % 1 * n_angles], order=1, mode="nearest")
@@ -200,11 +207,16 @@ def _scale(psf, band, radial, first):
 
 
 def _lasting(rest, known, light, first, fwhm):
-    """What lasts of rays (radii, angles) of what is left of the mean light (radii,) [sigma]: (radii,
-    angles + 1), the first angle's again at the end; it falls to 0 within the core."""
+    """Light above the mean that lasts along rays: (radii, angles + 1), the first angle twice.
+
+    rest, known (radii, angles): light above the mean, and where it is known; light (radii,)
+    [sigma]: the mean; first: number of the core's last ring, within which it falls to 0
+    """
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     rest = rest[tuple(nearest)]
-    long, short = (median_filter(rest, (_odd(n * fwhm), 1), mode="nearest") for n in (LONG_FWHM, SHORT_FWHM))
+    long, short = (
+        median_filter(rest, (_odd(n * fwhm), 1), mode="nearest") for n in (LONG_FWHM, SHORT_FWHM)
+    )
     lasting = np.where(light[:, None] > BRIGHT_SIGMAS, short, long)[tuple(nearest)]
     lasting[:first] = np.arange(first)[:, None] / max(first, 1) * lasting[first]
     return np.concatenate([lasting, lasting[:, :1]], axis=1)
