@@ -26,7 +26,8 @@ SOURCE_FWHM = 3.0
 # [sigma] Median light of a ring over the least of any, where that of the star has ended; rings
 # count of which this part was seen.
 END_SIGMAS, LEAST_COVERED = 0.5, 0.25
-SPIKES = 1.5  # [radii of that ring] how far spikes reach, which hold a small part of a ring
+SPIKES = 2.0  # [radii of that ring] how far spikes reach, which hold a small part of a ring
+UNEVEN = 0.02  # [1] of what lasts: spikes are not even along a ray
 ALL_SEEN = 0.99  # [1] of the weights of interpolation between pixels
 FWHM_A_SIGMA = 2.3548  # of a Gaussian
 # [FWHM of a filtered point] Pixels nearer to the core's edge hold no peak of their own.
@@ -148,7 +149,8 @@ def _without(image, seen, star, fwhm):
     model = map_coordinates(lasting, [np.minimum(away, end), turn], order=1)
     left = np.where(own, image - model, 0.0)
     middle, spread = _statistics(left[own], rings[own], end)
-    left = (left - middle[np.minimum(rings, end)]) / spread[np.minimum(rings, end)]
+    noise = np.hypot(spread[np.minimum(rings, end)], UNEVEN * model)
+    left = (left - middle[np.minimum(rings, end)]) / noise
     # light beside pixels without weight is that of one side
     left[(away < star.radius + CORE_FWHM * fwhm) | _beside(~seen, BESIDE_FWHM * fwhm)] = 0
     return np.where(own, left, image).astype(image.dtype), own

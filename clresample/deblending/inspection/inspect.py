@@ -14,7 +14,7 @@ from . import listing, shifted, spoilt
 from .centroids import centroids
 from .image import Image
 from .levels import SkyLevel, sky_level
-from .star_psfs import with_star_psfs
+from .star_psfs import as_stars, with_star_psfs
 from .stars import misfitting_widths
 
 # A level counts as left in or over-subtracted above this many of its errors, and above this part
@@ -74,13 +74,14 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         image = Image.of(observation, frame, positions[near], shift)
         levels.append(sky_level(image))
         image = image.over(levels[-1].level)
-        lines = [] if settings.fit_sky else _level_lines(image, levels[-1])
         bad, more = _spoilt(image)
         if bad.any():
             image = image.without(bad)
         there = frame.grid.positions_in(observation.grid, *positions[near].T)
         image, own = with_star_psfs(image, sources, there, settings.fit_sky)
         n_own += own, image.inside * len(image.usable)
+        # beside a star whose wings fill an image its sky is not known
+        lines = [] if settings.fit_sky or own.any() else _level_lines(image, levels[-1])
         lines += more + _coarse(observation.psf, observation.channels)
         found.append(centroids(image))
         lines += _missing(image) + _widths(image, sources, near)
@@ -92,18 +93,13 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
     observations = tuple(image.observation for image in images)
     if any(a is not b for a, b in zip(observations, blend.observations, strict=True)):
         blend = replace(blend, observations=observations)
-    still = near[(n_own[0] > 0) & (n_own[0] == n_own[1])]
-    if len(still):
-        blend = replace(blend, sources=_still(blend.sources, still))
+    stars, still = near[n_own[0] > 0], near[(n_own[0] > 0) & (n_own[0] == n_own[1])]
+    if len(stars):
+        blend = replace(blend, sources=as_stars(blend.sources, stars, still))
     if moved is not None:
         shifts = shifts + moved
     settings = replace(settings, fit_shifts=move)
     return Inspection(blend, settings, shifts, messages + lines, levels)
-
-
-def _still(sources, numbers):
-    """Sources with those numbered at rest: their PSFs were measured about their positions."""
-    return tuple(replace(s, free=False) if i in numbers else s for i, s in enumerate(sources))
 
 
 def _doubles(sources, positions):

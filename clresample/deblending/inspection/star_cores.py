@@ -21,7 +21,7 @@ RING_FWHM = 1.5
 MIN_RING_PIXELS, MIN_QUARTERS = 12, 3
 # Light of the outer half of the ring over that of the inner one may be larger than the PSF has it
 # by this factor: PSFs are uncertain in their wings. A galaxy's is larger by more.
-MAX_FLATTER = 3.0
+MAX_FLATTER = 2.0
 # [e-foldings] Mean deviation of the ring's light from its value at each radius: of a star it is
 # that of spikes and of the PSF's ellipticity.
 MAX_SCATTER = 0.5

@@ -4,7 +4,7 @@ A saturated star shows its PSF out to where no PSF image reaches: far wings, spi
 light is the star's, not its neighbours'. About each star whose core is masked the part of it that
 lasts along rays is the star's own PSF, beside that given, which holds the core:
 
-    P_s(r, t) ~ B(r) + G(r, t),    B = median of d over angles,    G = median of d - B along rays
+    P_s(r, t) ~ B(r) + G(r, t),    B: median of d over angles,    G: median of d - B along rays
 
 beyond the core, and a P in it, the mean of a P being B at its rim.
 """
@@ -22,10 +22,11 @@ from scipy.ndimage import (
     map_coordinates,
     median_filter,
 )
+from scipy.interpolate import PchipInterpolator
 
 from ...sky.observation import with_psf_field
 from ...sky.psf import PSF
-from ...sky.sources import Point
+from ...sky.sources import Extended, Point
 from ...sky.varying.field import PSFField
 from .image import SIGMAS_A_FWHM
 from .psf_samples import psf_at
@@ -34,18 +35,18 @@ from .star_cores import star_cores
 
 # [FWHM of the PSF] Length of the medians along rays, where sources are narrower than half of it,
 # and where the star's light is over BRIGHT_SIGMAS: there no source is as bright.
-LONG_FWHM, SHORT_FWHM, BRIGHT_SIGMAS = 4.0, 1.0, 30.0
+LONG_FWHM, SHORT_FWHM, BRIGHT_SIGMAS = 8.0, 1.0, 100.0
 # Times that what is left is smoothed and added: once more than a convolution, gradients stay.
 N_ROUNDS = 5
+# [FWHM of the PSF] Radius of a core from which on a source is taken for a star if it was listed as
+# a galaxy: no galaxy's light falls like that of a PSF so far out.
+SURE_FWHM = 1.0
 # [px] By which a place may differ from the star's, as positions are rounded.
 SAME_PLACE_PX = 0.5
-# Light of the core, which nobody sees, is left out above so many times that of its rim: of the sum
-# of a star's PSF, 1 with it, only what is seen is rendered, with errors of rounding that are parts
-# of the brightest sample.
-CAP = 3.0
-# Power of the distance by which light falls between the end of a PSF image and the rim of a core
-# that is larger: that of seeing's wings.
-POWER = 3.0
+# [sigma] Rings of less light are left to medians along rays; pixels of a ring, at least; rings over
+# which the slope at either end is taken.
+RING_SIGMAS, MIN_RING, END_RINGS = 3.0, 6, 3
+LOG_STEP = 0.1  # of a radius, over which the slope at the rim is taken
 N_ANGLES = 16  # of the rings over which a PSF image is averaged
 ALL_USABLE = 0.99  # [1] of the weights of interpolation between pixels
 
@@ -84,7 +85,7 @@ def with_star_psfs(image, sources, places, sky):
     sources: those of which `image.places` are; places (S, 2) [px]: of them, without any shift
     sky: whether a level of the sky is fitted
     """
-    stars = [i for i, s in enumerate(sources) if isinstance(s, Point) and image.inside[i]]
+    stars = [i for i, source in enumerate(sources) if _may_be(source) and image.inside[i]]
     found, n_own = {}, np.zeros(len(sources), int)
     if not stars or image.usable.all():
         return image, n_own
@@ -92,11 +93,13 @@ def with_star_psfs(image, sources, places, sky):
     for c in range(len(wide)):
         for core in star_cores(image.significance[c], image.usable[c], image.observation.psf, c):
             away = np.hypot(*(image.places[stars] - core.place).T)
-            if away.min() < max(core.radius, 1.0):
+            i = stars[int(away.argmin())]
+            is_wide = core.radius > SURE_FWHM * image.observation.psf.fwhm_px[c]
+            if away.min() < max(core.radius, 1.0) and (is_wide or isinstance(sources[i], Point)):
                 wide[c] |= image.usable[c] & binary_dilation(
                     core.masked, np.ones((3, 3), bool), GROW_PX
                 )
-                found.setdefault(stars[int(away.argmin())], {})[c] = core
+                found.setdefault(i, {})[c] = core
     image = image.without(wide) if wide.any() else image
     found = {
         i: {c: _own(image, c, image.places[i], core, sky) for c, core in cores.items()}
@@ -112,6 +115,25 @@ def with_star_psfs(image, sources, places, sky):
     psfs = tuple(_joined(_given(o, places[i]), found[i]) for i in numbers)
     field = StarPSFs(o.psf, o.psf_field, places[numbers], psfs)
     return dataclasses.replace(image, observation=with_psf_field(o, field)), n_own
+
+
+def as_stars(sources, numbers, still):
+    """Sources with those of `numbers` as Points, at rest if they are among `still`: their PSFs
+    were measured about their positions."""
+    found = list(sources)
+    for i in numbers:
+        keys = ("sky_deg", "position_px", "observation", "name")
+        given = {key: getattr(sources[i], key) for key in keys}
+        free = i not in still and getattr(sources[i], "free", True)
+        found[i] = Point(**given, free=free)
+    return tuple(found)
+
+
+def _may_be(source):
+    """Whether a source is a star, or one of which nothing is said but its position."""
+    if isinstance(source, Point):
+        return True
+    return isinstance(source, Extended) and source.n_components is None and source.profile is None
 
 
 def _given(observation, place):
@@ -143,15 +165,14 @@ def _own(image, c, place, core, sky):
     # what is fitted is the light above no level, or above one that is fitted
     data = np.where(image.usable[c], o.data[c] - sky * image.level[c], 0.0)
     radius = core.radius + GROW_PX
-    rays, known = _rays(data, image.usable[c], core.place, radius)
-    radial, first = _radial(rays, known), int(np.ceil(radius))
-    scale = _scale(psf, c, radial, first)
-    if scale is None:
+    away = np.hypot(np.arange(n_y)[:, None] - core.place[0], np.arange(n_x) - core.place[1])
+    fall = _Fall.of(data, image.usable[c] & (away >= radius), away, image.sigma[c])
+    scale = fall and _scale(psf, c, fall, radius)
+    if not scale:
         return None
-    near = radial[first : first + _odd(fwhm)]
-    fall = np.log(max(near[0] / near[-1], 1.0)) / np.log((first + len(near)) / first)
-    radial[:first] = radial[first] * (first / np.maximum(np.arange(first), 1)) ** fall
-    lasting = _lasting(rays - radial[:, None], known, radial / image.sigma[c], first, fwhm)
+    rays, known = _rays(data - fall.at(away), image.usable[c], core.place, radius)
+    light = fall.at(np.arange(len(rays))) / image.sigma[c]
+    lasting = _lasting(rays, known, light, int(np.ceil(radius)), fwhm)
     # samples at the PSF's spacing about the star, over all of the image
     step, low = psf.spacing, -core.place
     high = np.array([n_y - 1, n_x - 1]) - core.place
@@ -162,10 +183,10 @@ def _own(image, c, place, core, sky):
     away, turn = np.hypot(y[:, None], x), np.arctan2(y[:, None], x) / (2 * np.pi)
     n_angles = lasting.shape[1] - 1
     more = map_coordinates(lasting, [away, turn % 1 * n_angles], order=1, mode="nearest")
-    taken = np.clip((first - away) / fwhm, 0, 1)  # of the PSF given, none beside the core
-    mean = np.interp(away, np.arange(len(radial)), radial)
+    taken = np.clip((radius - away) / fwhm, 0, 1)  # of the PSF given, none beside the core
+    mean, more = fall.at(away), _smooth(more, fwhm / SIGMAS_A_FWHM / step)
     total = (taken * scale * _within_image(psf, c, y, x) + (1 - taken) * mean + more).sum()
-    own = _smooth(np.minimum(mean, CAP * radial[first]) + more, fwhm / SIGMAS_A_FWHM / step)
+    own = fall.outside(away, radius) + more
     if not total > 0:
         return None
     # the model's star lies at `place`, its light about the core's
@@ -185,25 +206,67 @@ def _rays(data, usable, place, radius):
     return rays, (seen > ALL_USABLE) & (radii >= radius)
 
 
-def _radial(rays, known):
-    """Median (radii,) of what is known of each ring; that of the one before where nothing is."""
-    found, last = np.zeros(len(rays)), 0.0
-    for r, (ring, sure) in enumerate(zip(rays, known, strict=True)):
-        last = found[r] = np.median(ring[sure]) if sure.any() else last
-    return found
+@dataclass(frozen=True, eq=False)
+class _Fall:
+    """Light of a star by distance, all directions together.
+
+    log_radius, log_light (n,): of its rings, n > 2, between which it is interpolated; it goes on as
+    a power of the distance beyond both ends
+    """
+
+    log_radius: np.ndarray
+    log_light: np.ndarray
+
+    @classmethod
+    def of(cls, data, usable, away, sigma):
+        """Of pixels (My, Mx) at distances `away` [px]: rings of one pixel's width, as far out as
+        their light falls and is over RING_SIGMAS; None where these are fewer than three."""
+        rings, found = np.rint(away[usable]).astype(int), []
+        value, radius = data[usable], away[usable]
+        for r in range(rings.min(initial=0), rings.max(initial=-1) + 1):
+            own = rings == r
+            if own.sum() < MIN_RING:
+                continue
+            light = np.median(value[own])
+            if light < RING_SIGMAS * sigma or (found and light > found[-1][1]):
+                break
+            found.append((np.median(radius[own]), light))
+        return cls(*np.log(found).T) if len(found) > 2 else None
+
+    def at(self, radius):
+        """The light at distances [px], any shape; those under a pixel count as one."""
+        x = np.log(np.maximum(radius, 1.0))
+        u, v = self.log_radius, self.log_light
+        found = PchipInterpolator(u, v)(np.clip(x, u[0], u[-1]))
+        k = min(END_RINGS, len(u) - 1)
+        for end, far, outside in ((0, k, x < u[0]), (-1, -1 - k, x > u[-1])):
+            slope = (v[end] - v[far]) / (u[end] - u[far])
+            found = found + np.where(outside, slope * (x - u[end]), 0.0)
+        return np.exp(found)
+
+    def outside(self, radius, core):
+        """The same with the Gaussian in a core [px] that has its light and slope at the rim.
+
+        What nobody sees of a star is rendered with errors of rounding that are parts of the
+        brightest sample: a Gaussian is fainter, and as smooth as can be.
+        """
+        rim, step = self.at(core), np.exp(LOG_STEP)
+        slope = np.log(rim / self.at(core * step)) / LOG_STEP
+        inside = rim * np.exp(0.5 * slope * (1 - (radius / core) ** 2))
+        return np.where(radius < core, inside, self.at(radius))
 
 
-def _scale(psf, band, radial, first):
-    """Factor by which the PSF given has the light of the ring number `first`; None where there is
-    no such light, in the image or in the PSF."""
+def _scale(psf, band, fall, radius):
+    """Factor by which the PSF given has the light of a _Fall at a radius [px]; None where it has
+    none there."""
     (n_y, n_x), (y0, x0) = psf.images.shape[1:], psf.center[band]
-    end = min(first, int(psf.spacing * min(y0, x0, n_y - 1 - y0, n_x - 1 - x0)) - 1)
-    if end < 1 or first + 1 >= len(radial) or not radial[first] > radial[first + 1] > 0:
+    end = min(radius, psf.spacing * min(y0, x0, n_y - 1 - y0, n_x - 1 - x0) - 1)
+    if end < 1:
         return None
     angles = np.arange(N_ANGLES) * 2 * np.pi / N_ANGLES
     places = [([end * np.sin(t)], [end * np.cos(t)]) for t in angles]
     ring = np.mean([psf_at(psf, band, y, x)[0, 0] for y, x in places])
-    return radial[first] * (first / end) ** POWER / ring if ring > 0 else None
+    return float(fall.at(end)) / ring if ring > 0 else None
 
 
 def _lasting(rest, known, light, first, fwhm):
