@@ -50,9 +50,10 @@ ALL = "all"  # the name of the combined image
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """Sources that `detect` or `detect_more` found, S of them, brightest peak first.
+    """Sources that `detect` or `detect_more` found, S of them, stars first, brightest peak first.
 
-    sources (S,): Extended, at the pixel of their peak
+    sources (S,): first a free Point for each star with a saturated or masked core, see
+        star_light.py, then Extended, at the pixel of their peak
     frame: Frame that their positions, pixels (y, x), belong to
     peaks (S,) [sigma]: signal to noise of each in the image that found it
     found_in (S,): name of that image: an observation's, or "all"

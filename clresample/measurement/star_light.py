@@ -2,11 +2,12 @@
 
 Such a star's light is not that of the PSF that is known: wings beyond its image, diffraction
 spikes, ghosts. But it comes from one place, and changes slowly outwards. Along every ray from the
-star the part of the light that stays for longer than a source is wide, its morphological opening,
+star the part of the light, above the median of each ring, that stays for longer than a source is
+wide, its morphological opening,
 
     m(r) = max over windows of length L that hold r of the least light in them,
 
-is the star's. What is left of the image above it, in units of its scatter on the same ring, is
+is the star's, too. What is left of the image above it, in units of its scatter on the same ring, is
 searched.
 """
 
@@ -19,6 +20,7 @@ from scipy.ndimage import distance_transform_edt, grey_dilation, grey_erosion, m
 
 from ..deblending.inspection.spoilt import saturated_pixels
 from ..deblending.inspection.star_cores import star_cores
+from ..deblending.inspection.star_fall import Fall
 from .signal import WIDTHS_ARCSEC, Signal
 
 # [FWHM of the filtered image] Length L: a source is narrower along every ray.
@@ -27,7 +29,7 @@ SOURCE_FWHM = 3.0
 # count of which this part was seen.
 END_SIGMAS, LEAST_COVERED = 0.5, 0.25
 SPIKES = 2.0  # [radii of that ring] how far spikes reach, which hold a small part of a ring
-UNEVEN = 0.02  # [1] of what lasts: spikes are not even along a ray
+UNEVEN = 0.1  # [1] of what lasts: spikes are not even along a ray
 ALL_SEEN = 0.99  # [1] of the weights of interpolation between pixels
 FWHM_A_SIGMA = 2.3548  # of a Gaussian
 # [FWHM of a filtered point] Pixels nearer to the core's edge hold no peak of their own.
@@ -141,15 +143,17 @@ def _without(image, seen, star, fwhm):
     angles = np.arange(n_angles) * 2 * np.pi / n_angles
     radii = np.arange(end + 1.0)[:, None]
     at = [star.place[0] + radii * np.sin(angles), star.place[1] + radii * np.cos(angles)]
-    rays = map_coordinates(np.where(seen, image, 0), at, order=1, mode="nearest")
+    fall = Fall.of(image, own & (away >= star.radius), away, 1.0)
+    mean = fall.at(away) if fall else np.zeros(image.shape)
+    rays = map_coordinates(np.where(seen, image - mean, 0), at, order=1, mode="nearest")
     rays[map_coordinates(seen.astype(np.float32), at, order=1, mode="nearest") < ALL_SEEN] = np.inf
     lasting = _opened(rays, int(np.ceil(SOURCE_FWHM * fwhm)))
     turn = np.arctan2(dy, dx) / (2 * np.pi) * n_angles % n_angles
     lasting = np.concatenate([lasting, lasting[:, :1]], axis=1)
     model = map_coordinates(lasting, [np.minimum(away, end), turn], order=1)
-    left = np.where(own, image - model, 0.0)
+    left = np.where(own, image - mean - model, 0.0)
     middle, spread = _statistics(left[own], rings[own], end)
-    noise = np.hypot(spread[np.minimum(rings, end)], UNEVEN * model)
+    noise = np.hypot(spread[np.minimum(rings, end)], UNEVEN * (mean + model))
     left = (left - middle[np.minimum(rings, end)]) / noise
     # light beside pixels without weight is that of one side
     left[(away < star.radius + CORE_FWHM * fwhm) | _beside(~seen, BESIDE_FWHM * fwhm)] = 0

@@ -22,7 +22,6 @@ from scipy.ndimage import (
     map_coordinates,
     median_filter,
 )
-from scipy.interpolate import PchipInterpolator
 
 from ...sky.observation import with_psf_field
 from ...sky.psf import PSF
@@ -32,6 +31,7 @@ from .image import SIGMAS_A_FWHM
 from .psf_samples import psf_at
 from .spoilt import GROW_PX
 from .star_cores import star_cores
+from .star_fall import Fall
 
 # [FWHM of the PSF] Length of the medians along rays, where sources are narrower than half of it,
 # and where the star's light is over BRIGHT_SIGMAS: there no source is as bright.
@@ -43,10 +43,6 @@ N_ROUNDS = 5
 SURE_FWHM = 1.0
 # [px] By which a place may differ from the star's, as positions are rounded.
 SAME_PLACE_PX = 0.5
-# [sigma] Rings of less light are left to medians along rays; pixels of a ring, at least; rings over
-# which the slope at either end is taken.
-RING_SIGMAS, MIN_RING, END_RINGS = 3.0, 6, 3
-LOG_STEP = 0.1  # of a radius, over which the slope at the rim is taken
 N_ANGLES = 16  # of the rings over which a PSF image is averaged
 ALL_USABLE = 0.99  # [1] of the weights of interpolation between pixels
 
@@ -166,7 +162,7 @@ def _own(image, c, place, core, sky):
     data = np.where(image.usable[c], o.data[c] - sky * image.level[c], 0.0)
     radius = core.radius + GROW_PX
     away = np.hypot(np.arange(n_y)[:, None] - core.place[0], np.arange(n_x) - core.place[1])
-    fall = _Fall.of(data, image.usable[c] & (away >= radius), away, image.sigma[c])
+    fall = Fall.of(data, image.usable[c] & (away >= radius), away, image.sigma[c])
     scale = fall and _scale(psf, c, fall, radius)
     if not scale:
         return None
@@ -206,58 +202,8 @@ def _rays(data, usable, place, radius):
     return rays, (seen > ALL_USABLE) & (radii >= radius)
 
 
-@dataclass(frozen=True, eq=False)
-class _Fall:
-    """Light of a star by distance, all directions together.
-
-    log_radius, log_light (n,): of its rings, n > 2, between which it is interpolated; it goes on as
-    a power of the distance beyond both ends
-    """
-
-    log_radius: np.ndarray
-    log_light: np.ndarray
-
-    @classmethod
-    def of(cls, data, usable, away, sigma):
-        """Of pixels (My, Mx) at distances `away` [px]: rings of one pixel's width, as far out as
-        their light falls and is over RING_SIGMAS; None where these are fewer than three."""
-        rings, found = np.rint(away[usable]).astype(int), []
-        value, radius = data[usable], away[usable]
-        for r in range(rings.min(initial=0), rings.max(initial=-1) + 1):
-            own = rings == r
-            if own.sum() < MIN_RING:
-                continue
-            light = np.median(value[own])
-            if light < RING_SIGMAS * sigma or (found and light > found[-1][1]):
-                break
-            found.append((np.median(radius[own]), light))
-        return cls(*np.log(found).T) if len(found) > 2 else None
-
-    def at(self, radius):
-        """The light at distances [px], any shape; those under a pixel count as one."""
-        x = np.log(np.maximum(radius, 1.0))
-        u, v = self.log_radius, self.log_light
-        found = PchipInterpolator(u, v)(np.clip(x, u[0], u[-1]))
-        k = min(END_RINGS, len(u) - 1)
-        for end, far, outside in ((0, k, x < u[0]), (-1, -1 - k, x > u[-1])):
-            slope = (v[end] - v[far]) / (u[end] - u[far])
-            found = found + np.where(outside, slope * (x - u[end]), 0.0)
-        return np.exp(found)
-
-    def outside(self, radius, core):
-        """The same with the Gaussian in a core [px] that has its light and slope at the rim.
-
-        What nobody sees of a star is rendered with errors of rounding that are parts of the
-        brightest sample: a Gaussian is fainter, and as smooth as can be.
-        """
-        rim, step = self.at(core), np.exp(LOG_STEP)
-        slope = np.log(rim / self.at(core * step)) / LOG_STEP
-        inside = rim * np.exp(0.5 * slope * (1 - (radius / core) ** 2))
-        return np.where(radius < core, inside, self.at(radius))
-
-
 def _scale(psf, band, fall, radius):
-    """Factor by which the PSF given has the light of a _Fall at a radius [px]; None where it has
+    """Factor by which the PSF given has the light of a Fall at a radius [px]; None where it has
     none there."""
     (n_y, n_x), (y0, x0) = psf.images.shape[1:], psf.center[band]
     end = min(radius, psf.spacing * min(y0, x0, n_y - 1 - y0, n_x - 1 - x0) - 1)
