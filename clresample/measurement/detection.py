@@ -23,7 +23,7 @@ import numpy as np
 from ..deblending.spectra import MODEL_ERROR
 from ..sky.frame import Frame, model_frame
 from ..sky.observation import Observation
-from ..sky.sources import Extended, Point
+from ..sky.sources import Extended, Point, Source
 from .clumps import bodies_of
 from .companions import (
     LEAST,
@@ -62,7 +62,7 @@ class Detection:
     image (Ny, Nx) [sigma]: signal to noise of all observations together, 0 where nothing was seen
     """
 
-    sources: tuple[Extended, ...]
+    sources: tuple[Source, ...]
     frame: Frame
     peaks: np.ndarray
     found_in: tuple[str, ...]
@@ -77,7 +77,8 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> D
     the images are searched one after the other, the sharpest first and then all together under
     filters of several widths; a peak within 0.7 FWHM of a source that an earlier image found is
     that source again, the FWHM being that of the image's PSF. At last the sharpest image is
-    searched without the symmetric light of what was found. Needs `sep` (the extra `detect`).
+    searched without the symmetric light of what was found. The light of stars with a saturated core
+    is left out before. Needs `sep` (the extra `detect`).
 
     observations: sequence of Observation, as `check_observations` takes them
     frame: Frame to search and to place the sources in; None = `model_frame(observations)`

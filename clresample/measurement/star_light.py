@@ -30,6 +30,7 @@ SOURCE_FWHM = 3.0
 END_SIGMAS, LEAST_COVERED = 0.5, 0.25
 SPIKES = 2.0  # [radii of that ring] how far spikes reach, which hold a small part of a ring
 UNEVEN = 0.1  # [1] of what lasts: spikes are not even along a ray
+MAX_REACH_PX = 300  # [model px] of a star's light that is searched apart; further out it is faint
 ALL_SEEN = 0.99  # [1] of the weights of interpolation between pixels
 FWHM_A_SIGMA = 2.3548  # of a Gaussian
 # [FWHM of a filtered point] Pixels nearer to the core's edge hold no peak of their own.
@@ -131,6 +132,17 @@ def _without_stars(image, seen, stars, fwhm):
 
 
 def _without(image, seen, star, fwhm):
+    """`_without_stars` of one star, in the window about it that its light may reach."""
+    at, shape = np.rint(star.place).astype(int), np.array(image.shape)
+    low, high = np.clip(at - MAX_REACH_PX, 0, shape), np.clip(at + MAX_REACH_PX + 1, 0, shape)
+    window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    moved = StarPlace(star.place - low, star.radius)
+    rest, held = image.copy(), np.zeros(image.shape, bool)
+    rest[window], held[window] = _in_window(image[window], seen[window], moved, fwhm)
+    return rest, held
+
+
+def _in_window(image, seen, star, fwhm):
     n_y, n_x = image.shape
     dy, dx = np.arange(n_y)[:, None] - star.place[0], np.arange(n_x) - star.place[1]
     away = np.hypot(dy, dx)

@@ -127,4 +127,6 @@ def test_its_wings_and_spikes_are_its_own(fits, which):
     flux, error = (float(getattr(v, "value", v)) for v in table["flux_r", "flux_err_r"][1])
     assert abs(flux - GALAXY_FLUX) < max(4 * error, 0.05 * GALAXY_FLUX)
     flux = float(getattr(table["flux_r"][0], "value", table["flux_r"][0]))
-    assert flux == pytest.approx(FLUX, rel=0.15)
+    error = float(getattr(table["flux_err_r"][0], "value", table["flux_err_r"][0]))
+    assert abs(flux - FLUX) < 2 * error  # of the PSF's width, by which the core follows from wings
+    assert error < 0.2 * FLUX

@@ -51,13 +51,16 @@ class Fall:
             found = found + np.where(outside, slope * (x - u[end]), 0.0)
         return np.exp(found)
 
+    def power(self, radius) -> float:
+        """Power of the distance by which the light falls at a radius [px]."""
+        ends = self.at(np.array([1.0, np.exp(LOG_STEP)]) * radius)
+        return float(np.log(ends[0] / ends[1]) / LOG_STEP)
+
     def outside(self, radius, core):
         """The same with the Gaussian in a core [px] that has its light and slope at the rim.
 
         What nobody sees of a star is rendered with errors of rounding that are parts of the
         brightest sample: a Gaussian is fainter, and as smooth as can be.
         """
-        rim, step = self.at(core), np.exp(LOG_STEP)
-        slope = np.log(rim / self.at(core * step)) / LOG_STEP
-        inside = rim * np.exp(0.5 * slope * (1 - (radius / core) ** 2))
+        inside = self.at(core) * np.exp(0.5 * self.power(core) * (1 - (radius / core) ** 2))
         return np.where(radius < core, inside, self.at(radius))

@@ -52,23 +52,29 @@ class StarPSFs(PSFField):
     """The PSFs of an observation with those of single stars in their places.
 
     psf: PSF of all other places, or field: PSFField of them, not None; places (K, 2) [px] of the
-    stars; own (K): their PSFs
+    stars; own (K): their PSFs; doubt (K, C) [1]: by how much more than the PSF's width their fluxes
+    change, as a part
     """
 
     psf: PSF
     field: PSFField | None
     places: np.ndarray
     own: tuple[PSF, ...]
+    doubt: np.ndarray
 
     @property
     def n_bands(self):
         return self.psf.n_bands
 
-    def psf_at(self, y, x):
+    def number_at(self, y, x):
+        """Number of the star at (y, x) [px], None where there is none."""
         away = np.hypot(*(self.places - (y, x)).T)
-        nearest = int(away.argmin())
-        if away[nearest] < SAME_PLACE_PX:
-            return self.own[nearest]
+        return int(away.argmin()) if away.min() < SAME_PLACE_PX else None
+
+    def psf_at(self, y, x):
+        star = self.number_at(y, x)
+        if star is not None:
+            return self.own[star]
         return self.psf if self.field is None else self.field.psf_at(y, x)
 
 
@@ -109,7 +115,11 @@ def with_star_psfs(image, sources, places, sky):
         n_own[i] = len(own)
     o, numbers = image.observation, sorted(found)
     psfs = tuple(_joined(_given(o, places[i]), found[i]) for i in numbers)
-    field = StarPSFs(o.psf, o.psf_field, places[numbers], psfs)
+    doubt = np.zeros((len(numbers), len(wide)))
+    for k, i in enumerate(numbers):
+        for c, (_, _, part) in found[i].items():
+            doubt[k, c] = part
+    field = StarPSFs(o.psf, o.psf_field, places[numbers], psfs, doubt)
     return dataclasses.replace(image, observation=with_psf_field(o, field)), n_own
 
 
@@ -140,20 +150,21 @@ def _given(observation, place):
 
 
 def _joined(given, own):
-    """The PSF given with the samples {band: (image, centre)} in place of some bands' own."""
-    shape = np.max([given.images.shape[1:], *(image.shape for image, _ in own.values())], axis=0)
+    """The PSF given with the samples {band: (image, centre, doubt)} in place of some bands'."""
+    shape = np.max([given.images.shape[1:], *(image.shape for image, *_ in own.values())], axis=0)
     images, centers = np.zeros((given.n_bands, *shape)), given.center.copy()
     for c, image in enumerate(given.images):
         if c in own:
-            image, centers[c] = own[c]
+            image, centers[c], _ = own[c]
         images[c, : image.shape[0], : image.shape[1]] = image
     return PSF.restore(images, spacing=given.spacing, center=centers)
 
 
 def _own(image, c, place, core, sky):
-    """Samples of a star's own PSF in channel c, and their centre (2,) [samples]; None where its
-    light does not fall from the core on. Their sum is 1 less the light left out of the core.
+    """Samples of a star's own PSF in channel c, their centre (2,) [samples], and the doubt of its
+    flux, see StarPSFs; None where its light does not fall from the core on.
 
+    The samples' sum is 1 less the light left out of the core.
     place (2,) [px]: of the model's star; core: StarCore; sky: see `with_star_psfs`
     """
     o, fwhm = image.observation, float(image.observation.psf.fwhm_px[c])
@@ -186,7 +197,8 @@ def _own(image, c, place, core, sky):
     if not total > 0:
         return None
     # the model's star lies at `place`, its light about the core's
-    return own / total, np.array([-y[0], -x[0]]) / step + (place - core.place) / step
+    centre = np.array([-y[0], -x[0]]) / step + (place - core.place) / step
+    return own / total, centre, abs(fall.power(radius) - 2)
 
 
 def _rays(data, usable, place, radius):
