@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..deblending.inspection.star_psfs import StarPSFs
 from ..deblending.spectra import MODEL_ERROR
 from ..sky.frame import Frame, model_frame
 from ..sky.observation import Observation
@@ -38,7 +39,7 @@ from .levels import level_of
 from .peaks import import_sep, new_peaks
 from .searched import SAME_SOURCE, Search
 from .signal import SMALL_GALAXY, combined, signal_of
-from .star_light import height_beside, saturated_stars, starless
+from .star_light import UNEVEN, height_beside, saturated_stars, starless
 
 # [sigma] of the combined image: white noise reaches it once in two million independent pixels
 THRESHOLD = 5.0
@@ -129,6 +130,7 @@ def detect_more(result, *, threshold=THRESHOLD) -> Detection:
     pixels = np.stack([*np.indices(result.frame.shape)], axis=-1)
     places = [footprint.locate(pixels) for footprint in result.footprints]
     found = _search(left, result.frame, threshold, list(known), beside=False, places=places)
+    found = _without_ghosts(result, found, places, threshold)
     return _without_structure(result, found, known, places, threshold) if found.sources else found
 
 
@@ -166,9 +168,27 @@ def _without_structure(result, found, known, places, threshold):
         y, x = np.rint(source.position_px).astype(int)
         if body < 0 or not bodies.bodies[body].takes(rest[y, x], light[y, x])[0]:
             kept.append(i)
+    return _chosen(found, kept)
+
+
+def _without_ghosts(result, found, places, threshold):
+    """The Detection without peaks that are the unevenness of a saturated star's light."""
+    light = np.zeros(result.frame.shape)
+    for i, o in enumerate(result.observations):
+        if found.sources and isinstance(o.psf_field, StarPSFs):
+            sky = result.sky[result.channel_slices()[i], None, None]
+            model = _with_data(o, result.model(i) - sky, o.weights)
+            light = np.maximum(light, signal_of(model, result.frame, places[i]).flat())
+    noise = np.hypot(1, UNEVEN * light)
+    at = [tuple(np.rint(source.position_px).astype(int)) for source in found.sources]
+    return _chosen(found, [i for i, p in enumerate(at) if found.peaks[i] > threshold * noise[p]])
+
+
+def _chosen(found, kept):
+    """The Detection of some of its sources, each in a group of its own."""
     return Detection(
         sources=tuple(found.sources[i] for i in kept),
-        frame=frame,
+        frame=found.frame,
         peaks=found.peaks[kept],
         found_in=tuple(found.found_in[i] for i in kept),
         image=found.image,
