@@ -20,11 +20,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..deblending.inspection.star_psfs import StarPSFs
 from ..deblending.spectra import MODEL_ERROR
 from ..drawing.shown import ShownDetection
 from ..sky.frame import Frame, model_frame
 from ..sky.observation import Observation, as_observations
-from ..sky.sources import Extended
+from ..sky.sources import Extended, Point, Source
 from .clumps import bodies_of
 from .companions import (
     LEAST,
@@ -39,6 +40,7 @@ from .levels import level_of
 from .peaks import import_sep, new_peaks
 from .searched import SAME_SOURCE, Search
 from .signal import SMALL_GALAXY, combined, signal_of
+from .star_light import UNEVEN, height_beside, saturated_stars, starless
 
 # [sigma] of the combined image: white noise reaches it once in two million independent pixels
 THRESHOLD = 5.0
@@ -50,9 +52,10 @@ ALL = "all"  # the name of the combined image
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Detection(ShownDetection):
-    """Sources that `detect` or `detect_more` found, S of them, brightest peak first.
+    """Sources that `detect` or `detect_more` found, S of them, stars first, brightest peak first.
 
-    sources (S,): Extended, at the pixel of their peak
+    sources (S,): first a free Point for each star with a saturated or masked core, see
+        star_light.py, then Extended, at the pixel of their peak
     frame: Frame that their positions, pixels (y, x), belong to
     peaks (S,) [sigma]: signal to noise of each in the image that found it
     found_in (S,): name of that image: an observation's, or "all"
@@ -63,7 +66,7 @@ class Detection(ShownDetection):
         lies and whose clump it may be; -1 where there is none. None by `detect`
     """
 
-    sources: tuple[Extended, ...]
+    sources: tuple[Source, ...]
     frame: Frame
     peaks: np.ndarray
     found_in: tuple[str, ...]
@@ -79,7 +82,8 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> D
     the images are searched one after the other, the sharpest first and then all together under
     filters of several widths; a peak within 0.7 FWHM of a source that an earlier image found is
     that source again, the FWHM being that of the image's PSF. At last the sharpest image is
-    searched without the symmetric light of what was found. Needs `sep` (the extra `detect`).
+    searched without the symmetric light of what was found. The light of stars with a saturated core
+    is left out before. Needs `sep` (the extra `detect`).
 
     observations: sequence of Observation, as `check_observations` takes them, or of astropy's
         NDData and CCDData that have a PSF
@@ -132,6 +136,7 @@ def detect_more(result, *, threshold=THRESHOLD) -> Detection:
     pixels = np.stack([*np.indices(result.frame.shape)], axis=-1)
     places = [footprint.locate(pixels) for footprint in result.footprints]
     found = _search(left, result.frame, threshold, list(known), beside=False, places=places)
+    found = _without_ghosts(result, found, places, threshold)
     if not found.sources:
         return replace(found, hosts=np.zeros(0, int))
     return _without_structure(result, found, known, places, threshold)
@@ -177,14 +182,31 @@ def _without_structure(result, found, known, places, threshold):
             kept.append(i)
             host = np.hypot(*(known - body.center).T).argmin() if is_member else -1
             hosts.append(int(host))
+    return replace(_chosen(found, kept), hosts=np.array(hosts, int))
+
+
+def _without_ghosts(result, found, places, threshold):
+    """The Detection without peaks that are the unevenness of a saturated star's light."""
+    light = np.zeros(result.frame.shape)
+    for i, o in enumerate(result.observations):
+        if found.sources and isinstance(o.psf_field, StarPSFs):
+            sky = result.sky[result.channel_slices()[i], None, None]
+            model = _with_data(o, result.model(i) - sky, o.weights)
+            light = np.maximum(light, signal_of(model, result.frame, places[i]).flat())
+    noise = np.hypot(1, UNEVEN * light)
+    at = [tuple(np.rint(source.position_px).astype(int)) for source in found.sources]
+    return _chosen(found, [i for i, p in enumerate(at) if found.peaks[i] > threshold * noise[p]])
+
+
+def _chosen(found, kept):
+    """The Detection of some of its sources, each in a group of its own."""
     return Detection(
         sources=tuple(found.sources[i] for i in kept),
-        frame=frame,
+        frame=found.frame,
         peaks=found.peaks[kept],
         found_in=tuple(found.found_in[i] for i in kept),
         image=found.image,
         groups=np.arange(len(kept)),
-        hosts=np.array(hosts, int),
     )
 
 
@@ -198,12 +220,19 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
     sep = import_sep()
     at = places or [None] * len(observations)
     signals = [signal_of(o, frame, one) for o, one in zip(observations, at, strict=True)]
-    if scatters is None:
-        scatters = [signal.scatters() for signal in signals]
-    signals = [one.over(scatter) for one, scatter in zip(signals, scatters, strict=True)]
     widths = np.array([_fwhm_px(o, frame) for o in observations])
     order = np.argsort(widths, kind="stable")
-    everything, _ = combined(signals)
+    scale = frame.grid.pixel_scale_arcsec
+    stars = saturated_stars(observations, frame) if beside else []
+    full = signals
+    parted = [starless(s, stars, w, scale) for s, w in zip(signals, widths, strict=True)]
+    signals, held = zip(*parted, strict=True)
+    if scatters is None:
+        scatters = [signal.scatters() for signal in signals]
+    full, signals = (
+        [one.over(s) for one, s in zip(many, scatters, strict=True)] for many in (full, signals)
+    )
+    everything, _ = combined(full)
     if beside:
         everything = everything - level_of(everything, everything != 0)[1]
     levelled, skies = signals, np.zeros((len(signals), 1))
@@ -211,9 +240,8 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
         levelled, skies = zip(*(signal.levelled() for signal in signals), strict=True)
     _, best = combined(levelled)
     sharp = order[0]
-    found = Search(sep, threshold, known)
+    found = Search(sep, threshold, known + [star.place for star in stars])
     found.add(levelled[sharp].flat(), observations[sharp].label, widths[sharp], widths[sharp])
-    scale = frame.grid.pixel_scale_arcsec
     if beside:
         found.sort_out(signals[sharp].flat() - skies[sharp][0], widths[sharp], scale)
     for i in order[1:]:
@@ -222,16 +250,20 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
     if beside and found.positions:
         places = np.array(found.positions)
         new = _companions(sep, levelled, sharp, everything, places, threshold, widths[sharp], scale)
+        # what is left of a star's light is not symmetric about a source on it
+        new = [one for one in new if not held[sharp][tuple(np.rint(one[0]).astype(int))]]
         found.add_companions(new, signals[sharp].flat(), observations[sharp].label)
     order, groups = found.in_order()
-    positions = [found.positions[i] for i in order]
+    positions = [tuple(map(float, found.positions[i])) for i in order]
+    points = [Point(position_px=tuple(map(float, star.place)), free=True) for star in stars]
+    heights = [height_beside(everything, star) for star in stars]
     return Detection(
-        sources=tuple(Extended(position_px=(float(y), float(x))) for y, x in positions),
+        sources=(*points, *(Extended(position_px=position) for position in positions)),
         frame=frame,
-        peaks=np.array([found.peaks[i] for i in order]),
-        found_in=tuple(found.labels[i] for i in order),
+        peaks=np.array([*heights, *(found.peaks[i] for i in order)]),
+        found_in=(*(ALL for _ in stars), *(found.labels[i] for i in order)),
         image=everything,
-        groups=groups,
+        groups=np.concatenate([np.arange(len(stars)), groups + len(stars)]),
     )
 
 

@@ -179,6 +179,14 @@ def masked(observation, pixels) -> Observation:
     return made
 
 
+def with_psf_field(observation, psf_field) -> Observation:
+    """The same observation with the PSFs of a PSFField; its PSF in the middle stays."""
+    made = copy.copy(observation)
+    made.__dict__.pop("white", None)
+    made._set(psf_field=psf_field)
+    return made
+
+
 def as_observations(observations) -> tuple[Observation, ...]:
     """Observations from a list that may hold astropy's images, NDData or CCDData with a PSF.
 

@@ -14,6 +14,7 @@ from . import listing, shifted, spoilt
 from .centroids import centroids
 from .image import Image
 from .levels import SkyLevel, sky_level
+from .star_psfs import as_stars, with_star_psfs
 from .stars import misfitting_widths
 
 # A level counts as left in or over-subtracted above this many of its errors, and above this part
@@ -74,15 +75,22 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
     near = np.flatnonzero(frame.inside(positions))
     sources = [blend.sources[i] for i in near]
     messages, levels, images, found = _doubles(blend.sources, positions), [], [], []
+    n_own = np.zeros((2, len(near)), int)
     for observation, shift in zip(blend.observations, shifts, strict=True):
         image = Image.of(observation, frame, positions[near], shift)
         levels.append(sky_level(image))
         image = image.over(levels[-1].level)
-        about = _unsure_lines if settings.fit_sky else _level_lines
-        lines = _unmeasured(image) + about(image, levels[-1])
         bad, more = _spoilt(image)
         if bad.any():
             image = image.without(bad)
+        there = frame.grid.positions_in(observation.grid, *positions[near].T)
+        image, own = with_star_psfs(image, sources, there, settings.fit_sky)
+        n_own += own, image.inside * len(image.usable)
+        # beside a star whose wings fill an image its sky is not known
+        if own.any():
+            levels[-1] = replace(levels[-1], error=np.full_like(levels[-1].error, np.inf))
+        about = _unsure_lines if settings.fit_sky else _level_lines
+        lines = _unmeasured(image) + ([] if own.any() else about(image, levels[-1]))
         lines += more + _coarse(observation.psf, observation.channels)
         found.append(centroids(image))
         lines += _missing(image) + _widths(image, sources, near)
@@ -94,6 +102,9 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
     observations = tuple(image.observation for image in images)
     if any(a is not b for a, b in zip(observations, blend.observations, strict=True)):
         blend = replace(blend, observations=observations)
+    stars, still = near[n_own[0] > 0], near[(n_own[0] > 0) & (n_own[0] == n_own[1])]
+    if len(stars):
+        blend = replace(blend, sources=as_stars(blend.sources, stars, still))
     if moved is not None:
         shifts = shifts + moved
     settings = replace(settings, fit_shifts=move)

@@ -30,14 +30,19 @@ def saturated(image) -> np.ndarray:
     Those at or above the observation's saturation, where it has one, and flat tops: connected
     bright pixels of exactly one value, brighter than all that touch them.
     """
-    observation = image.observation
-    found = np.zeros(image.usable.shape, bool)
+    return saturated_pixels(image.observation, image.significance, image.usable)
+
+
+def saturated_pixels(observation, significance, usable) -> np.ndarray:
+    """The same of an observation, of its data in units of the noise (C, My, Mx) [sigma] and its
+    pixels (C, My, Mx) bool with a weight."""
+    found = np.zeros(usable.shape, bool)
     limit = getattr(observation, "saturation", None)
     if limit is not None:
         limits = np.broadcast_to(np.asarray(limit, float), len(found))
         with np.errstate(invalid="ignore"):  # NaN: a channel without a limit
-            found |= image.usable & (observation.data >= limits[:, None, None])
-    bright = image.significance > FLAT_SIGMAS
+            found |= usable & (observation.data >= limits[:, None, None])
+    bright = significance > FLAT_SIGMAS
     for c in np.flatnonzero(bright.any(axis=(1, 2))):
         found[c] |= _flat_tops(observation.data[c], bright[c])
     if not found.any():

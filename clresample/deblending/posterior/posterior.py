@@ -7,6 +7,7 @@ import time
 import numpy as np
 from scipy.linalg.blas import strmm
 
+from ..assessment.cores import core_errors, with_core_errors
 from ..assessment.edge import light_outside, widened
 from ..assessment.status import judged
 from ..result import noted
@@ -209,7 +210,9 @@ def with_errors(fit, result, peaks, seen):
         result, start.shapes, start.thetas, start.positions[start.source], peaks
     )
     fit.note_seconds("errors", time.perf_counter() - began)
-    return noted(result, errors=widened(errors, outside), draws=draws)
+    cores = core_errors(result, fit.settings.psf_error)
+    errors = with_core_errors(widened(errors, outside), cores)
+    return noted(result, errors=errors, draws=draws)
 
 
 def posterior_of(fit, morphs, peaks, seen):

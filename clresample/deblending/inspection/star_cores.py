@@ -1,0 +1,150 @@
+"""Stars whose core is saturated or masked, found by the light around it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import binary_dilation, distance_transform_edt, find_objects, label
+from scipy.optimize import minimize
+
+from .psf_samples import psf_at
+
+# [FWHM of the PSF] Least radius of the disc that fits into the masked pixels of a core: narrower
+# ones are bad columns and cosmic rays.
+MIN_RADIUS_FWHM = 0.35
+# [sigma] Light of a pixel beside a core: detectors saturate at 1e3 sigma, a pixel or two inwards.
+MIN_EDGE_SIGMAS = 20.0
+# [FWHM] Width of the ring beside a core in which the star's light is compared with the PSF.
+RING_FWHM = 1.5
+# Pixels of that ring with a weight, at least, and how many of its four quarters they lie in.
+MIN_RING_PIXELS, MIN_QUARTERS = 12, 3
+# Light of the outer half of the ring over that of the inner one may be larger than the PSF has it
+# by this factor: PSFs are uncertain in their wings. A galaxy's is larger by more.
+MAX_FLATTER = 2.0
+# [e-foldings] Mean deviation of the ring's light from its value at each radius: of a star it is
+# that of spikes and of the PSF's ellipticity.
+MAX_SCATTER = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class StarCore:
+    """A star with a masked core in one channel of an image.
+
+    place (2,) [px]: (y, x) of the star; radius [px]: from which on its light is unmasked in most
+        directions; light [sigma]: of a pixel there; masked (My, Mx): bool, the core with its bleeds
+    """
+
+    place: np.ndarray
+    radius: float
+    light: float
+    masked: np.ndarray
+
+
+def star_cores(significance, usable, psf, band) -> list[StarCore]:
+    """Stars with a masked core in a channel, the brightest first.
+
+    significance (My, Mx) [sigma]: data over the noise, 0 where not usable; usable (My, Mx): bool,
+    pixels with a weight that are not saturated; psf: PSF; band: of it
+    """
+    fwhm = float(psf.fwhm_px[band])
+    depth = distance_transform_edt(np.pad(~usable, 1, mode="edge"))[1:-1, 1:-1]
+    deep = depth > max(MIN_RADIUS_FWHM * fwhm, 1.0)
+    if not deep.any():
+        return []
+    groups, _ = label(~usable, np.ones((3, 3), bool))
+    found = []
+    reach = int(np.ceil(RING_FWHM * fwhm)) + 2
+    for k, window in enumerate(find_objects(groups), start=1):
+        if not (deep[window] & (groups[window] == k)).any():
+            continue
+        window = tuple(slice(max(s.start - reach, 0), s.stop + reach) for s in window)
+        core = _core(significance[window], usable[window], groups[window] == k, psf, band, fwhm)
+        if core is not None:
+            y0, x0 = (s.start for s in window)
+            place = core.place + (y0, x0)
+            found.append(replace(core, place=place, masked=groups == k))
+    return sorted(found, key=lambda core: -core.light)
+
+
+def _core(light, usable, masked, psf, band, fwhm):
+    """The StarCore of one group of masked pixels (My, Mx), None where the light beside it is not
+    that of a star."""
+    edge = usable & binary_dilation(masked, np.ones((3, 3), bool))
+    if not edge.any() or light[edge].max() < MIN_EDGE_SIGMAS:
+        return None
+    y, x = np.nonzero(edge)
+    weight = np.maximum(light[edge], 0) ** 2
+    guess = np.array([weight @ y, weight @ x]) / weight.sum()
+    top = np.array(light.shape) - 1
+    for _ in range(2):  # the ring is chosen about the place, which is found from the ring
+        at = tuple(np.clip(np.rint(guess).astype(int), 0, top))
+        if not masked[at] and not binary_dilation(masked, np.ones((3, 3), bool))[at]:
+            return None
+        ring, inner = _ring(usable, masked, guess, fwhm)
+        if ring is None:
+            return None
+        guess, scatter = _centred(light, ring, guess, fwhm)
+    if scatter > MAX_SCATTER or not _falls_like(light, ring, guess, psf, band, fwhm):
+        return None
+    return StarCore(guess, inner, float(np.median(light[ring])), masked)
+
+
+def _ring(usable, masked, place, fwhm):
+    """Pixels (My, Mx) bool of the ring beside a core, and its inner radius [px]; None, 0 where
+    they are too few."""
+    n_y, n_x = usable.shape
+    away = np.hypot(np.arange(n_y)[:, None] - place[0], np.arange(n_x) - place[1])
+    own = usable & (away < 1 + _reach_of(masked, away) + RING_FWHM * fwhm)
+    if own.sum() < MIN_RING_PIXELS:
+        return None, 0.0
+    inner = float(np.quantile(away[own], 0.02))
+    ring = own & (away < inner + RING_FWHM * fwhm)
+    y, x = np.nonzero(ring)
+    quarters = np.unique(2 * (y > place[0]) + (x > place[1]))
+    if ring.sum() < MIN_RING_PIXELS or len(quarters) < MIN_QUARTERS:
+        return None, 0.0
+    return ring, inner
+
+
+def _reach_of(masked, away):
+    """Radius [px] of the largest disc about a place that is masked."""
+    return float(away[~masked].min(initial=away.max()))
+
+
+def _centred(light, ring, guess, fwhm):
+    """Place (2,) [px] about which the light of a ring depends on the radius alone, and the mean
+    deviation of its logarithm there."""
+    y, x = np.nonzero(ring)
+    value = np.log(np.maximum(light[ring], 1.0))
+
+    def scatter(place):
+        away = np.hypot(y - place[0], x - place[1])
+        order = np.polynomial.polynomial.Polynomial.fit(away, value, 2)
+        return np.abs(value - order(away)).mean()
+
+    found = minimize(
+        scatter, guess, method="Nelder-Mead", options={"xatol": 0.05, "fatol": 1e-4, "maxiter": 80}
+    )
+    if np.hypot(*(found.x - guess)) > 2 * fwhm:
+        return guess, scatter(guess)
+    return found.x, float(found.fun)
+
+
+def _falls_like(light, ring, place, psf, band, fwhm):
+    """Whether the light of a ring falls outwards nearly as steeply as a PSF's."""
+    y, x = np.nonzero(ring)
+    away = np.hypot(y - place[0], x - place[1])
+    outer = away > np.median(away)
+    radii = np.median(away[~outer]), np.median(away[outer])
+    bright = np.array([np.median(light[ring][part]) for part in (~outer, outer)])
+    if not bright[0] > bright[1] > 0:
+        return False
+    angles = np.arange(16) * np.pi / 8
+    own = [
+        np.mean([psf_at(psf, band, [r * np.sin(t)], [r * np.cos(t)])[0, 0] for t in angles])
+        for r in radii
+    ]
+    if not own[0] > own[1] > 0:  # beyond the PSF's image
+        return bright[1] < bright[0]
+    return bright[1] / bright[0] < MAX_FLATTER * own[1] / own[0]

@@ -1,0 +1,217 @@
+"""Light of stars with a saturated core in signal-to-noise images, so that peaks on it can be told.
+
+Such a star's light is not that of the PSF that is known: wings beyond its image, diffraction
+spikes, ghosts. But it comes from one place, and changes slowly outwards. Along every ray from the
+star the part of the light, above the median of each ring, that stays for longer than a source is
+wide, its morphological opening,
+
+    m(r) = max over windows of length L that hold r of the least light in them,
+
+is the star's, too. What is left of the image above it, in units of its scatter on the same ring, is
+searched.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, grey_dilation, grey_erosion, map_coordinates
+
+from ..deblending.inspection.spoilt import saturated_pixels
+from ..deblending.inspection.star_cores import star_cores
+from ..deblending.inspection.star_fall import Fall
+from .signal import WIDTHS_ARCSEC, Signal
+
+# [FWHM of the filtered image] Length L: a source is narrower along every ray.
+SOURCE_FWHM = 3.0
+# [sigma] Median light of a ring over the least of any, where that of the star has ended; rings
+# count of which this part was seen.
+END_SIGMAS, LEAST_COVERED = 0.5, 0.25
+SPIKES = 2.0  # [radii of that ring] how far spikes reach, which hold a small part of a ring
+UNEVEN = 0.1  # [1] of what lasts: spikes are not even along a ray
+MAX_REACH_PX = 300  # [model px] of a star's light that is searched apart; further out it is faint
+ALL_SEEN = 0.99  # [1] of the weights of interpolation between pixels
+FWHM_A_SIGMA = 2.3548  # of a Gaussian
+# [FWHM of a filtered point] Pixels nearer to the core's edge hold no peak of their own.
+CORE_FWHM = 1.0
+# [FWHM of a filtered point] Pixels nearer to masked ones hold none either, beside a star.
+BESIDE_FWHM = 1.0
+# [FWHM of the PSF] Cores of several images nearer than this, and than their radius, are one star's.
+SAME_STAR_FWHM = 1.0
+# Median |x| of a unit Gaussian, inverted.
+SIGMAS_A_MAD = 1.4826
+
+
+@dataclass(frozen=True, eq=False)
+class StarPlace:
+    """A star with a saturated core: its place (2,) [model px] and the core's radius [model px]."""
+
+    place: np.ndarray
+    radius: float
+
+
+def saturated_stars(observations, frame) -> list[StarPlace]:
+    """Stars with a saturated or masked core in any channel, the brightest first.
+
+    observations: of any kind; frame: Frame in whose pixels their places are
+    """
+    found = []
+    for o in observations:
+        usable = o.weights > 0
+        light = np.where(usable, o.data * np.sqrt(o.weights), 0).astype(np.float32)
+        usable = usable & ~saturated_pixels(o, light, usable)
+        light[~usable] = 0
+        scale = o.grid.pixel_scale_arcsec / frame.grid.pixel_scale_arcsec
+        for c, fwhm in enumerate(o.psf.fwhm_px):
+            for core in star_cores(light[c], usable[c], o.psf, c):
+                place = o.grid.positions_in(frame.grid, *core.place)
+                found.append((core.light, fwhm * scale, StarPlace(place, core.radius * scale)))
+    return _merged(found)
+
+
+def _merged(found):
+    """StarPlaces of cores (light, FWHM, StarPlace), one of each star: at their median place."""
+    stars: list[list] = []
+    for _, fwhm, star in sorted(found, key=lambda one: -one[0]):
+        for group in stars:
+            first = group[0]
+            near = max(SAME_STAR_FWHM * fwhm, first.radius, star.radius)
+            if np.hypot(*(first.place - star.place)) < near:
+                group.append(star)
+                break
+        else:
+            stars.append([star])
+    return [
+        StarPlace(np.median([s.place for s in group], axis=0), max(s.radius for s in group))
+        for group in stars
+    ]
+
+
+def height_beside(image, star) -> float:
+    """The brightest pixel of an image (Ny, Nx) within two radii of a star's core."""
+    n_y, n_x = image.shape
+    away = np.hypot(np.arange(n_y)[:, None] - star.place[0], np.arange(n_x) - star.place[1])
+    return float(image[away < 2 * star.radius + 1].max(initial=0.0))
+
+
+def starless(signal, stars, fwhm_px, pixel_arcsec) -> tuple[Signal, np.ndarray]:
+    """The Signal without the light of StarPlaces, in units of its scatter there, and the pixels
+    (Ny, Nx) bool that held it.
+
+    Sums of squares are left out where there is such light: they hold it in every channel.
+    fwhm_px [px]: of the PSF; pixel_arcsec [arcsec]: side of a pixel
+    """
+    all_held = np.zeros(signal.n_seen.shape, bool)
+    if not stars:
+        return signal, all_held
+    sums, squares, seen = signal.sums.copy(), signal.squares.copy(), signal.n_seen > 0
+    root = np.sqrt(np.maximum(signal.n_seen, 1))
+    for w, sigma in enumerate(WIDTHS_ARCSEC):
+        # of the PSF filtered with itself and twice with the Gaussian
+        wide = FWHM_A_SIGMA * sigma / pixel_arcsec
+        point_px = np.sqrt(2) * np.hypot(fwhm_px, wide)
+        rest, held = _without_stars(signal.flat(w), seen, stars, point_px)
+        sums[w] = np.where(held, rest * root, sums[w])
+        squares[w][held] = 0
+        all_held |= held
+    return Signal(sums, squares, signal.n_seen, signal.channels, signal.places), all_held
+
+
+def _without_stars(image, seen, stars, fwhm):
+    """An image (Ny, Nx) [sigma] without the light of StarPlaces, and the pixels (Ny, Nx) bool that
+    held it.
+
+    seen (Ny, Nx): bool; fwhm [px]: of a point source in the image
+    """
+    rest, held = image, np.zeros(image.shape, bool)
+    for star in stars:
+        rest, own = _without(rest, seen, star, fwhm)
+        held |= own
+    return rest, held
+
+
+def _without(image, seen, star, fwhm):
+    """`_without_stars` of one star, in the window about it that its light may reach."""
+    at, shape = np.rint(star.place).astype(int), np.array(image.shape)
+    low, high = np.clip(at - MAX_REACH_PX, 0, shape), np.clip(at + MAX_REACH_PX + 1, 0, shape)
+    window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    moved = StarPlace(star.place - low, star.radius)
+    rest, held = image.copy(), np.zeros(image.shape, bool)
+    rest[window], held[window] = _in_window(image[window], seen[window], moved, fwhm)
+    return rest, held
+
+
+def _in_window(image, seen, star, fwhm):
+    n_y, n_x = image.shape
+    dy, dx = np.arange(n_y)[:, None] - star.place[0], np.arange(n_x) - star.place[1]
+    away = np.hypot(dy, dx)
+    rings = np.rint(away).astype(int)
+    end = _end(image, seen, rings, int(star.radius))
+    own = (away < end) & seen
+    if not own.any():
+        return image, own
+    n_angles = int(np.ceil(2 * np.pi * end))
+    angles = np.arange(n_angles) * 2 * np.pi / n_angles
+    radii = np.arange(end + 1.0)[:, None]
+    at = [star.place[0] + radii * np.sin(angles), star.place[1] + radii * np.cos(angles)]
+    fall = Fall.of(image, own & (away >= star.radius), away, 1.0)
+    mean = fall.at(away) if fall else np.zeros(image.shape)
+    rays = map_coordinates(np.where(seen, image - mean, 0), at, order=1, mode="nearest")
+    rays[map_coordinates(seen.astype(np.float32), at, order=1, mode="nearest") < ALL_SEEN] = np.inf
+    lasting = _opened(rays, int(np.ceil(SOURCE_FWHM * fwhm)))
+    turn = np.arctan2(dy, dx) / (2 * np.pi) * n_angles % n_angles
+    lasting = np.concatenate([lasting, lasting[:, :1]], axis=1)
+    model = map_coordinates(lasting, [np.minimum(away, end), turn], order=1)
+    left = np.where(own, image - mean - model, 0.0)
+    middle, spread = _statistics(left[own], rings[own], end)
+    noise = np.hypot(spread[np.minimum(rings, end)], UNEVEN * (mean + model))
+    left = (left - middle[np.minimum(rings, end)]) / noise
+    # light beside pixels without weight is that of one side
+    left[(away < star.radius + CORE_FWHM * fwhm) | _beside(~seen, BESIDE_FWHM * fwhm)] = 0
+    return np.where(own, left, image).astype(image.dtype), own
+
+
+def _beside(pixels, radius):
+    """Pixels (Ny, Nx) bool within a radius [px] of some, these too."""
+    return distance_transform_edt(~pixels) < radius if pixels.any() else pixels
+
+
+def _opened(rays, length):
+    """The opening of rays (radii, angles) over a length [px], their unseen pixels left out."""
+    size = (length, 1)
+    least = grey_erosion(rays, size=size, mode="nearest")
+    least = np.where(np.isfinite(least), least, -np.inf)
+    found = grey_dilation(least, size=size, mode="nearest")
+    return np.where(np.isfinite(found), found, 0.0)
+
+
+def _end(image, seen, rings, first):
+    """Radius [px] from which on the median light of rings (Ny, Nx) of pixels falls no more."""
+    order = np.argsort(rings[seen], kind="stable")
+    number, values = rings[seen][order], image[seen][order]
+    starts = np.searchsorted(number, np.arange(number[-1] + 2 if len(number) else 1))
+    light = np.full(len(starts) - 1, np.inf)
+    for r in range(first, len(light)):
+        part = values[starts[r] : starts[r + 1]]
+        if len(part) > LEAST_COVERED * 2 * np.pi * r:
+            light[r] = np.median(part)
+    if not np.isfinite(light).any():
+        return len(light)
+    end = int(np.argmax(light < light.min() + END_SIGMAS))
+    return int(SPIKES * end)
+
+
+def _statistics(values, rings, end):
+    """Median and scatter, at least 1, (end + 1,) of values on rings."""
+    middle, spread = np.zeros(end + 1), np.ones(end + 1)
+    order = np.argsort(rings, kind="stable")
+    number, values = rings[order], values[order]
+    starts = np.searchsorted(number, np.arange(end + 2))
+    for r in range(end + 1):
+        # three rings, so that the innermost hold enough pixels
+        part = values[starts[max(r - 1, 0)] : starts[min(r + 2, end + 1)]]
+        if len(part):
+            middle[r] = np.median(part)
+            spread[r] = max(1.0, SIGMAS_A_MAD * np.median(np.abs(part - middle[r])))
+    return middle, spread

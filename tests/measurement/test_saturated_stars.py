@@ -1,0 +1,132 @@
+"""Stars that saturate: one point in detection, with wings and spikes of its own in the fit."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_dilation
+
+from clresample.deblending.batch import deblend
+from clresample.deblending.inspection.star_cores import star_cores
+from clresample.measurement.catalogue import Flag, catalogue
+from clresample.measurement.detection import detect
+from clresample.measurement.quality import summary
+from clresample.measurement.star_light import saturated_stars
+from clresample.simulation.spoilers import saturate
+from clresample.sky.frame import model_frame
+from clresample.sky.grid import Grid
+from clresample.sky.observation import Observation
+from clresample.sky.psf import PSF
+from clresample.sky.sources import Extended, Point
+
+SHAPE, NOISE, FWHM, BETA, LEVEL = (90, 96), 5.0, 4.0, 2.5, 3e4
+STAR, FLUX = (44.3, 47.6), 4e6
+GALAXY, GALAXY_FLUX, GALAXY_SIGMA = (23.0, 52.0), 8000.0, 2.0
+
+
+def moffat(y, x):
+    radius = FWHM / 2 / np.sqrt(2 ** (1 / BETA) - 1)
+    value = (1 + (y**2 + x**2) / radius**2) ** -BETA
+    return value * (BETA - 1) / (np.pi * radius**2)
+
+
+def starry(*, spikes=True, galaxy=True, seed=1):
+    """An Observation of a saturated star with bleeds, masked, whose PSF image is a small one."""
+    y, x = np.indices(SHAPE)
+    dy, dx = y - STAR[0], x - STAR[1]
+    data = FLUX * moffat(dy, dx)
+    if spikes:
+        along, across = (dy + dx) / np.sqrt(2), (dy - dx) / np.sqrt(2)
+        for a, b in ((along, across), (across, along)):
+            data += 150 * np.exp(-np.abs(a) / 20 - 0.5 * (b / 1.7) ** 2)
+    if galaxy:
+        s2 = GALAXY_SIGMA**2 + (FWHM / 2.3548) ** 2
+        away = (y - GALAXY[0]) ** 2 + (x - GALAXY[1]) ** 2
+        data += GALAXY_FLUX * np.exp(-away / (2 * s2)) / (2 * np.pi * s2)
+    full = saturate(data, LEVEL)
+    data += np.random.default_rng(seed).normal(0, NOISE, SHAPE)
+    n = np.arange(25) - 12.0
+    psf = PSF(moffat(n[:, None], n))
+    return Observation(
+        data,
+        psf,
+        Grid.flat(SHAPE, 0.26),
+        weights=np.where(binary_dilation(full, np.ones((3, 3))), 0, NOISE**-2),
+        channels=("r",),
+        name="cam",
+    )
+
+
+def cores_of(observation):
+    usable = observation.weights[0] > 0
+    light = np.where(usable, observation.data[0] / NOISE, 0)
+    return star_cores(light, usable, observation.psf, 0)
+
+
+@pytest.fixture(scope="module")
+def fits():
+    observation = starry()
+    found = detect([observation])
+    listed = Extended(position_px=STAR), Extended(position_px=GALAXY)
+    results = [deblend([observation], sources) for sources in (found.sources, listed)]
+    return SimpleNamespace(found=found, results=results)
+
+
+def test_a_masked_core_is_found_by_the_light_around_it():
+    (core,) = cores_of(starry())
+    assert np.hypot(*(core.place - STAR)) < 0.5
+    assert 2 < core.radius < 8
+    assert core.masked[44, 47] and core.masked[:, 47].sum() > 20  # with its bleeds
+
+
+def test_bad_columns_and_masked_galaxies_are_no_stars():
+    y, x = np.indices(SHAPE)
+    clean = starry(galaxy=False)
+    masked = np.zeros(SHAPE, bool)
+    masked[:, 25:27] = True  # through the star's wings
+    galaxy = 3e4 * np.exp(-np.hypot(y - 60, x - 20) / 6)
+    masked |= np.hypot(y - 60, x - 20) < 5
+    weights = np.where(masked, 0, clean.weights[0])
+    data = clean.data[0] + galaxy
+    cores = star_cores(np.where(weights > 0, data / NOISE, 0), weights > 0, clean.psf, 0)
+    assert [np.hypot(*(core.place - STAR)) < 1 for core in cores] == [True]
+
+
+def test_flat_tops_that_nobody_masked_are_cores_too():
+    observation = starry()
+    unmasked = Observation(
+        np.minimum(observation.data, LEVEL),
+        observation.psf,
+        observation.grid,
+        weights=NOISE**-2,
+        channels=("r",),
+    )
+    (star,) = saturated_stars([unmasked], model_frame([unmasked]))
+    frame = model_frame([unmasked])
+    place = unmasked.grid.positions_in(frame.grid, *STAR)
+    assert np.hypot(*(star.place - place)) < 0.7
+
+
+def test_detection_finds_a_point_and_the_galaxy_and_no_spikes(fits):
+    kinds = [type(source) for source in fits.found.sources]
+    assert kinds == [Point, Extended]
+    grid = starry().grid
+    at = [fits.found.frame.grid.positions_in(grid, *s.position_px) for s in fits.found.sources]
+    assert np.hypot(*(at[0] - STAR)) < 0.7
+    assert np.hypot(*(at[1] - GALAXY)) < 2.5
+
+
+@pytest.mark.parametrize("which", [0, 1], ids=["detected", "listed as a galaxy"])
+def test_its_wings_and_spikes_are_its_own(fits, which):
+    result = fits.results[which]
+    assert isinstance(result.sources[0], Point)
+    assert result.status == "converged"
+    assert summary(result)["chi2"]["r"] < 1.5
+    table = catalogue(result)
+    assert table["flags"][0] & Flag.SATURATED
+    flux, error = (float(getattr(v, "value", v)) for v in table["flux_r", "flux_err_r"][1])
+    assert abs(flux - GALAXY_FLUX) < max(4 * error, 0.05 * GALAXY_FLUX)
+    flux = float(getattr(table["flux_r"][0], "value", table["flux_r"][0]))
+    error = float(getattr(table["flux_err_r"][0], "value", table["flux_err_r"][0]))
+    assert abs(flux - FLUX) < 2 * error  # of the PSF's width, by which the core follows from wings
+    assert error < 0.2 * FLUX
