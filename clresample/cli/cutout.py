@@ -148,9 +148,9 @@ def _listed(arguments):
     """The column id of --ids-from, as texts."""
     if arguments.ids_from is None:
         return []
-    from ..fields.report.folder import read_table
+    from ..files.tables import read_catalogue
 
-    table = read_table(arguments.ids_from)
+    table = read_catalogue(arguments.ids_from)
     if "id" not in table.colnames:
         raise ValueError(f"{arguments.ids_from}: has no column id")
     return [str(one) for one in table["id"].tolist()]

@@ -189,7 +189,7 @@ def _without_ghosts(result, found, places, threshold):
     """The Detection without peaks that are the unevenness of a saturated star's light."""
     light = np.zeros(result.frame.shape)
     for i, o in enumerate(result.observations):
-        if found.sources and isinstance(o.psf_field, StarPSFs):
+        if isinstance(o.psf_field, StarPSFs):
             sky = result.sky[result.channel_slices()[i], None, None]
             model = _with_data(o, result.model(i) - sky, o.weights)
             light = np.maximum(light, signal_of(model, result.frame, places[i]).flat())

@@ -150,7 +150,7 @@ def test_what_a_failure_says():
     assert batch._failure("b", ValueError("no")) == Failure("b", "failed: no")
     assert batch._failure("b", KeyError("no")).status == "failed: KeyError: 'no'"
     assert not Failure("b", "failed").converged
-    with pytest.raises(ValueError, match="blends is 3, must be a sequence"):
+    with pytest.raises(ValueError, match="blends is 3 .int., must be a sequence"):
         batch._listed("blends", 3)
     for n, words in ((1, "1 source lies far"), (2, "2 sources lie far")):
         with pytest.warns(SourceWarning, match=f"{words} from any light here: see the messages"):

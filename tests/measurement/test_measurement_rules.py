@@ -1,7 +1,5 @@
 """Rules of detection and residuals at their limits, each alone: what is just inside counts."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from helpers.blends import blend, observe, round_component
@@ -130,7 +128,8 @@ def test_the_models_error_is_added_to_the_noise_of_residuals(monkeypatch):
 
     def searched(*arguments, **more):
         given.append((arguments, more))
-        return SimpleNamespace(sources=())
+        nothing = np.zeros(0)
+        return detection.Detection((), arguments[1], nothing, (), np.zeros((60, 60)), nothing)
 
     monkeypatch.setattr(detection, "_search", searched)
     component = round_component(0, (30, 30), (40.0, 20.0))
