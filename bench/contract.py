@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from clresample import get_device
-from clresample.device.contraction import Contraction, Matrix, padded
+from clresample.device.contraction import Contraction, MatrixBatch, row_stride
 from clresample.simulation.surveys import NOTEBOOK_SURVEYS
 
 from .harness import records
@@ -45,12 +45,12 @@ def measure(shape, batch, dtype, seconds):
     m, k, n = shape
     device, rng = get_device(), np.random.default_rng(0)
     a = rng.standard_normal((batch, m, k)).astype(dtype)
-    b = np.zeros((batch, k, padded(n)), dtype)
+    b = np.zeros((batch, k, row_stride(n)), dtype)
     b[:, :, :n] = rng.standard_normal((batch, k, n))
     a_device, b_device = device.put(a), device.put(b)
-    c_device = device.empty((batch, m, padded(n)), dtype)
+    c_device = device.empty((batch, m, row_stride(n)), dtype)
     left, right, result = (
-        Matrix(array.base_data, array.shape[2], array.shape[1] * array.shape[2])
+        MatrixBatch(array.base_data, array.shape[2], array.shape[1] * array.shape[2])
         for array in (a_device, b_device, c_device)
     )
     b, c = np.ascontiguousarray(b[:, :, :n]), np.empty((batch, m, n), dtype)

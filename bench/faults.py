@@ -169,7 +169,7 @@ def damaged_tile(sky, out, whole, took_s):
         process = start(bad, out)
         process.wait()
     rows, clean = (QTable.read(f / "catalogue.fits") for f in (out, out.with_name("clean")))
-    lost = json.loads((out / "provenance.json").read_text())["lost_tiles"]
+    lost = json.loads((out / "provenance.json").read_text())["failed_tiles"]
     failed = np.array([str(s) == "failed" for s in rows["status"]], bool)
     named = all("euclid.fits" in str(r) for r in [*rows["reason"][failed], *lost.values()])
     away = clean["y"].value < first - AWAY_PX
@@ -214,7 +214,7 @@ def compared(rows, clean):
 
 def small_device(sky, out, whole, took_s):
     """A run on a device with a tenth of the memory, its processes held to a gigabyte."""
-    process = start(sky, out, "--memory", "1G", environment=SMALL)
+    process = start(sky, out, "--worker-memory", "1G", environment=SMALL)
     said = told(process)
     if process.returncode != 0:
         return row_of(False, False, f"exit status {process.returncode}: {said.strip()[-80:]}")
@@ -257,7 +257,7 @@ def killed_writing(sky, out, whole, took_s):
 
 def hanging(sky, out, whole, took_s):
     """A run one of whose workers stops and never goes on."""
-    process = start(sky, out, "--limit", max(HANGS_S, 2 * took_s))
+    process = start(sky, out, "--timeout", max(HANGS_S, 2 * took_s))
     stopped = kill_at(process, 0.5 * took_s, "worker", random.Random(0), signal.SIGSTOP)
     parts = parts_in(out)
     process.wait()

@@ -50,10 +50,10 @@ from .harness.runs import fitted, found_in
 
 SIZES, QUICK_SIZES = (1024, 2048), (384,)
 BANDS, QUICK_BANDS = "ugrizy", "ri"
-MOST_PAIRS, BLENDED_PX = 60, 16.0
+MAX_PAIRS, BLENDED_PX = 60, 16.0
 N_SCALE, SCALE_SNR = 20, 50.0  # sources alone, of each field, that say what part apertures see
 PUBLISHED = "36 (plain) or as published (real)"
-LEAST_FLUX = 5.0  # [sigma] of a point source's flux: fainter ones say how deep a band is
+MIN_FLUX = 5.0  # [sigma] of a point source's flux: fainter ones say how deep a band is
 COLUMNS = (
     ("n_model", 7, "d"),
     ("n_truth", 7, "d"),
@@ -114,7 +114,7 @@ def beside_others(fields, channels, most_px):
 
     fields: of (table, SimulatedField, n_model)
     """
-    ours, theirs, alone, n_left = [], [], [], MOST_PAIRS
+    ours, theirs, alone, n_left = [], [], [], MAX_PAIRS
     for table, field, n_model in fields:
         one = Judged(np.stack([table["y"].value, table["x"].value], axis=1), field.truth, n_model)
         blended = np.flatnonzero(one.pairs(most_px=most_px))[:n_left]
@@ -122,7 +122,7 @@ def beside_others(fields, channels, most_px):
         lone = np.flatnonzero(one.pairs(BLENDED_PX, np.inf) & (one.snr > SCALE_SNR))[:N_SCALE]
         for chosen, found in ((blended, theirs), (lone, alone)):
             flux, _, true = fluxes(table, field.truth, chosen, one.own, channels)
-            deep = true > LEAST_FLUX * photometry.point_errors(field.mosaics)
+            deep = true > MIN_FLUX * photometry.point_errors(field.mosaics)
             measured = photometry.compared(field.mosaics, one.at, one.own[chosen], true)
             found.append({name: np.where(deep, m, np.nan) for name, m in measured.items()})
             if found is theirs:

@@ -72,7 +72,7 @@ step "Matrix products" 30 "$python" -m bench.contract
 step "Fits" 70 "$python" -m bench.throughput --quick
 step "Kernels of a fit" 25 env CLRESAMPLE_PROFILE=1 "$python" -c '
 from clresample import get_device
-from clresample.cli.machine.workload import blends, fit
+from clresample.cli.device_tools.workload import blends, fit
 device = get_device()
 fit(blends(8, device), device)'
 echo "gpu_check: $report" >&2

@@ -31,14 +31,14 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import Table
 
-from clresample.files.whole_file import check_folder
+from clresample.files.atomic import check_folder
 
 from .harness import records
 from .harness.clock import on_all_cores
 from .harness.options import ROOT, Parser, run, seed
 
 EACH = 4
-MOST_BYTES = 600  # of a file that is cut short: less than any output has
+MAX_BYTES = 600  # of a file that is cut short: less than any output has
 COLUMNS = (
     ("command", 8, ""),
     ("over", 5, ""),
@@ -112,7 +112,7 @@ def content(path):
                     return [_hdu(hdu) for hdu in hdus]
         if path.suffix == ".json":
             return {k: v for k, v in json.loads(path.read_text()).items() if k not in TIMES}
-        if path.name == "blends.ecsv":
+        if path.name == "fit_table.ecsv":
             table = Table.read(path)
             return repr(list(table[[c for c in table.colnames if c not in TIMES]]))
         if path.suffix == ".html":
@@ -241,7 +241,7 @@ def moments_of(way, n, rng):
     for i in range(n):
         if i % 2 and opens:
             found.append((opens[int((i + rng.random()) / n * len(opens)) % len(opens)],
-                          rng.randint(1, MOST_BYTES)))  # fmt: skip
+                          rng.randint(1, MAX_BYTES)))  # fmt: skip
         else:
             found.append((1 + int((i + rng.random()) / n * total), 0))
     return found

@@ -20,7 +20,7 @@ ratio, pull flux over truth, (flux - truth) / error; of the band where the pull 
 chi2        per pixel with weight, all images together
 flags       of the source, in the catalogue
 silent      over 5 % and 5 sigma off in a band, and the source has none of the flags MISFIT,
-            NOT_CONVERGED, SATURATED, AMBIGUOUS, NO_COVERAGE, OUTSIDE. EDGE is no excuse: the
+            NOT_CONVERGED, SATURATED, AMBIGUOUS, NO_COVERAGE, OUTSIDE_FRAME. EDGE is no excuse: the
             truth's range allows for light beyond the image
 seconds     processor time of the fit, on one thread
 
@@ -58,7 +58,7 @@ RIGHT, RIGHT_SIGMA = 0.03, 3.0
 WRONG, WRONG_SIGMA = 0.05, 5.0
 LOST, LOST_SIGMA = 2.0, 4.0  # factor and sigma by which a source is taken by another
 CHI2 = 1.1
-SAYS_SO = {"MISFIT", "NOT_CONVERGED", "SATURATED", "AMBIGUOUS", "NO_COVERAGE", "OUTSIDE"}
+SAYS_SO = {"MISFIT", "NOT_CONVERGED", "SATURATED", "AMBIGUOUS", "NO_COVERAGE", "OUTSIDE_FRAME"}
 COVERAGE_RE_PX = (4.0, 32.0)
 COVERAGE_SNR = (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0, np.inf)  # of a band's flux
 COLUMNS = (

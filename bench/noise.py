@@ -42,7 +42,7 @@ N_SCENES, N_QUICK = 120, 4
 FIRST_SEED = 2000
 CHUNK = 4  # scenes fitted side by side: some seconds
 ANGLE_DEG = 20.0
-LEAST_SNR, BIAS_SNR = 3.0, 10.0
+MIN_SNR, BIAS_SNR = 3.0, 10.0
 COLUMNS = (
     ("recipe", 10, ""),
     ("bands", 6, ""),
@@ -125,7 +125,7 @@ def _fluxes(one, native, part):
     )
     i_scene = np.repeat(np.arange(len(one)), [s["flux"][:, part].size for s in one])
     snr = truth / unit
-    good = np.isfinite(away) & np.isfinite(error) & (snr > LEAST_SNR)
+    good = np.isfinite(away) & np.isfinite(error) & (snr > MIN_SNR)
     held = np.abs(away[good]) < error[good]
     excess = np.bincount(i_scene[good], held - held.mean())
     return {

@@ -42,9 +42,9 @@ import numpy as np
 from astropy.table import QTable
 from scipy.ndimage import gaussian_filter
 
-from clresample import PSF, Extended, Flag, Grid, Observation, catalogue, deblend, summary
+from clresample import PSF, ExtendedSource, Flag, Grid, Observation, catalogue, deblend, summary
 from clresample.cli.command import main as clresample
-from clresample.deblending.posterior.residuals import worst_residuals
+from clresample.deblending.posterior.residuals import max_filtered_residuals
 from clresample.files.results import read_result
 from clresample.simulation.galaxies import import_galsim, open_catalogue
 
@@ -90,7 +90,7 @@ def hsc_blend(folder):
             name="HSC",
         )
         places = file["catalog"]
-    return observation, [Extended(position_px=(float(y), float(x))) for x, y in places]
+    return observation, [ExtendedSource(position_px=(float(y), float(x))) for x, y in places]
 
 
 def cosmos_galaxies(folder, n_galaxies):
@@ -113,7 +113,7 @@ def cosmos_galaxies(folder, n_galaxies):
         yield (
             f"cosmos-{galaxies.ident[i]}",
             observation,
-            Extended(position_px=tuple(map(float, peak))),
+            ExtendedSource(position_px=tuple(map(float, peak))),
         )
 
 
@@ -169,7 +169,9 @@ def rows_of(name, fit):
         np.zeros(len(table), bool) if misfit is None else np.array(table["flags"]) & misfit != 0
     )
     for i, observation in enumerate(result.observations):
-        for band, worst in zip(observation.channels, worst_residuals(result, i).T, strict=True):
+        for band, worst in zip(
+            observation.channels, max_filtered_residuals(result, i).T, strict=True
+        ):
             source = int(np.nanargmax(worst)) if np.isfinite(worst).any() else -1
             yield {
                 "scene": name,

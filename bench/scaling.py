@@ -36,8 +36,8 @@ from astropy.table import QTable
 
 from clresample import FieldOptions, Settings, simulate_field
 from clresample.cli.simulate import write_field
-from clresample.fields.options import Progress
-from clresample.fields.reading.field_file import read_field
+from clresample.fields.field_toml.field_file import read_field
+from clresample.fields.options import RunProgress
 from clresample.fields.run import run_field
 
 from .harness import records
@@ -48,7 +48,7 @@ from .harness.options import Parser, positive, run, seed
 SIZES, QUICK_SIZES, GIANT_SIZES = (2048,), (256,), (3000,)
 REPEATS = 3  # of a field; a giant, and with --quick, once
 BANDS, QUICK_BANDS = "ugrizy", "ri"
-LEAST_SNR = 5.0  # of sources whose places are given
+MIN_SNR = 5.0  # of sources whose places are given
 # Euclid's signal to noise of the halo's light in one pixel, in the corners: 28.7 mag per square
 # arcsecond, 26.8 in the middle, as light between galaxies has it. In the search's filtered sum of
 # all instruments that is over the limit everywhere. Its core is a rich cluster's at redshift 0.3:
@@ -76,7 +76,7 @@ COLUMNS = (
 )
 
 
-class Stages(Progress):
+class Stages(RunProgress):
     """Processor time [s] of this process when each stage began, without that of the TreeMemory."""
 
     def __init__(self, memory):
@@ -117,7 +117,7 @@ def written(folder, size, options, bands):
     for mosaic in field.mosaics:
         mosaic.data[:] += halo_of(mosaic, size, field.mosaics[0].survey)
     brightest = np.argsort(-field.truth["snr"])[: options.giant]
-    chosen = brightest[field.truth["snr"][brightest] > LEAST_SNR]
+    chosen = brightest[field.truth["snr"][brightest] > MIN_SNR]
     places = np.stack([field.truth["ra"], field.truth["dec"]], axis=1)[chosen]
     own = {"positions": places, "passes": 1, "settings": Settings(fit_sky=True)}
     return write_field(folder, field)[0], own
@@ -139,10 +139,10 @@ def row_of(toml, out, size, workers, own):
     own_s -= memory.spent_s
     theirs_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     dealing_s = stages.began["write"] - stages.began["fit"]
-    table, blends = QTable.read(out / "catalogue.fits"), QTable.read(out / "blends.ecsv")
+    table, blends = QTable.read(out / "catalogue.fits"), QTable.read(out / "fit_table.ecsv")
     fluxes = [np.asarray(table[c]) for c in table.colnames if c.startswith("flux_")]
     fluxes = [f for f in fluxes if f.dtype.kind == "f"]
-    fit_s, turns = done.seconds["fit"], [o for stage, o in done.turns if stage == "fit"]
+    fit_s, turns = done.seconds["fit"], [o for stage, o in done.task_times if stage == "fit"]
     return {
         "n_model": size,
         "workers": workers,
@@ -155,7 +155,7 @@ def row_of(toml, out, size, workers, own):
         "core_s": own_s + theirs_s,
         "core_s_per_source": (own_s + theirs_s) / max(len(table), 1),
         "own_cost": dealing_s / (dealing_s + theirs_s),
-        "busy": sum(o.ended - o.began for o in turns) / (workers * fit_s),
+        "busy": sum(o.end_s - o.start_s for o in turns) / (workers * fit_s),
         "tail_s": tail_of(turns, workers),
         "peak_gb": memory.peak / 1e9,
         "largest_gb": memory.largest / 1e9,
@@ -169,7 +169,7 @@ def tail_of(turns, workers):
     rounds: dict[int, dict] = {}
     for outcome in turns:
         ends = rounds.setdefault(outcome.task.round, {})
-        ends[outcome.seat] = max(ends.get(outcome.seat, 0.0), outcome.ended)
+        ends[outcome.worker] = max(ends.get(outcome.worker, 0.0), outcome.end_s)
     return sum(
         max(ends.values()) - min(ends.values()) for ends in rounds.values() if len(ends) == workers
     )

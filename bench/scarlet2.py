@@ -40,7 +40,7 @@ from clresample import (
     model_frame,
     simulate_scene,
 )
-from clresample.adapters.needed import needed
+from clresample.adapters.optional import require
 from clresample.adapters.scarlet2 import renderer_of
 
 from .harness import records
@@ -118,7 +118,7 @@ def tutorial(folder):
         noise = rng.standard_normal(o.shape) / np.sqrt(o.weights)
         same = {"weights": o.weights, "channels": o.channels, "name": o.name}
         anew.append(Observation(seen + noise, o.psf, o.grid, **same))
-    return Truth(anew, result.frame, result.frame.place(result.sources), models)
+    return Truth(anew, result.frame, result.frame.positions_of(result.sources), models)
 
 
 def exact(frame, observation):
@@ -131,8 +131,8 @@ class Scarlet2:
     """The truth's observations, start and fit in scarlet2's own terms."""
 
     def __init__(self, truth):
-        self.package = needed("scarlet2", "scarlet2")
-        needed("scarlet2.validation_utils", "scarlet2").set_validation(False)  # it prints
+        self.package = require("scarlet2", "scarlet2")
+        require("scarlet2.validation_utils", "scarlet2").set_validation(False)  # it prints
         self.truth = truth
         channels = [name for o in truth.observations for name in o.channels]
         shape = (len(channels), *truth.frame.shape)

@@ -27,7 +27,7 @@ from dataclasses import replace
 import numpy as np
 from tqdm import tqdm
 
-from clresample import Prior, Settings
+from clresample import Settings, SingleScalePrior
 from clresample.measurement.photometry import fluxes
 
 from .harness import records, scenes
@@ -36,7 +36,7 @@ from .harness.options import Parser, positive, run
 
 SETTINGS = {
     "default": Settings(),
-    "prior": Settings(prior=Prior()),
+    "prior": Settings(prior=SingleScalePrior()),
     "paper": Settings(prior=None),
 }
 N_SCENES, N_QUICK = 120, 8
@@ -92,7 +92,7 @@ def measure(names, folder, seeds, continued):
 def _changes(scene, blend, result, settings):
     """Changes of fluxes [their errors] and SDRs [dB] where a fit goes on."""
     n = LONGER * max(scenes.iterations(result), 1)
-    (later,) = scenes.fit([blend], settings=replace(settings, enough=0, tol=0, max_iter=n))
+    (later,) = scenes.fit([blend], settings=replace(settings, loss_tol=0, rel_tol=0, max_iter=n))
     (flux, covariance), (flux_later, _) = fluxes(result), fluxes(later)
     error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).T)
     known = np.isfinite(error) & (error > 0)

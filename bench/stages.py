@@ -21,10 +21,10 @@ import time
 import numpy as np
 
 from clresample import get_device
-from clresample.deblending.solver.buffers import Buffers
-from clresample.deblending.solver.gradient import Gradient
-from clresample.deblending.solver.prior import Prior
-from clresample.deblending.solver.rendering.choice import flops
+from clresample.deblending.solver.buffers import SceneBuffers
+from clresample.deblending.solver.gradient import LossGradient
+from clresample.deblending.solver.prior import SingleScalePrior
+from clresample.deblending.solver.rendering.stage_selection import stage_flops
 from clresample.deblending.solver.scene import Scene, State
 from clresample.resampling.resampler import Resampler
 from clresample.simulation.surveys import EUCLID_VIS, RUBIN_UGRIZY
@@ -77,7 +77,7 @@ def scene(rng, ops, n_sources):
     n_channels = sum(op.shape_out[0] for op in ops)
     found = Scene(
         shape=shape,
-        extent=shape,
+        unpadded_shape=shape,
         ops=ops,
         data=[rng.normal(size=op.shape_out) for op in ops],
         weights=[np.ones(op.shape_out) for op in ops],
@@ -85,7 +85,7 @@ def scene(rng, ops, n_sources):
         center=sizes // 2,
         profile=profiles,
         fixed=np.zeros(n_sources, bool),
-        scale=np.ones((n_sources, n_channels)),
+        step_scale=np.ones((n_sources, n_channels)),
     )
     spectra = rng.uniform(5, 50, (n_sources, n_channels))
     nothing = [np.zeros_like(p) for p in profiles]
@@ -103,9 +103,9 @@ def rows_of(case, rng, seconds):
     n_sources, n_model, n_scenes, angle_deg = case
     ops, device = operators(n_model, angle_deg), get_device()
     scenes, states = zip(*(scene(rng, ops, n_sources) for _ in range(n_scenes)), strict=True)
-    buffers = Buffers(scenes, states, device, np.float32, Prior())
-    ways = {depth: Gradient(buffers, False, depth).observations for depth in (0, 1, 2)}
-    chosen = Gradient(buffers, False).observations
+    buffers = SceneBuffers(scenes, states, device, np.float32, SingleScalePrior())
+    ways = {depth: LossGradient(buffers, False, depth).observations for depth in (0, 1, 2)}
+    chosen = LossGradient(buffers, False).observations
     for i, survey in enumerate((EUCLID_VIS, RUBIN_UGRIZY)):
         observed = {depth: observations[i] for depth, observations in ways.items()}
         observed.setdefault(chosen[i].rendering.depth, chosen[i])
@@ -113,7 +113,7 @@ def rows_of(case, rng, seconds):
             depth: functools.partial(iteration, device, one) for depth, one in observed.items()
         }
         ms = interleaved_ms(calls, seconds=seconds, timer=time.process_time)
-        counts = flops(buffers, chosen[i].op, chosen[i].op.executor())
+        counts = stage_flops(buffers, chosen[i].op, chosen[i].op.executor())
         depth = chosen[i].rendering.depth
         yield {
             "survey": survey.name,

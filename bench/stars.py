@@ -28,18 +28,18 @@ from tqdm import tqdm
 
 from clresample import (
     PSF,
-    Extended,
+    ExtendedSource,
     Frame,
     Grid,
     Observation,
-    Point,
+    PointSource,
     Resampler,
     Settings,
     fluxes,
     get_device,
 )
 from clresample.deblending.blend import Blend
-from clresample.deblending.profiles import moment, point, profile
+from clresample.deblending.profiles import draw_psf, profile, psf_second_moment
 from clresample.simulation.sdr import sdr
 
 from .harness import records, scenes
@@ -110,12 +110,14 @@ def make_scene(seed, psf, snr):
     """A Blend, the true fluxes (S, 3), the star's first, and true images (S, Ny, Nx)."""
     rng = np.random.default_rng(seed)
     star = (N_MODEL - 1) / 2 + rng.uniform(-0.5, 0.5, 2)
-    positions, images = [star], [point(MODEL_PSF, star, (N_MODEL,) * 2, slopes=False)[0]]
+    positions, images = [star], [draw_psf(MODEL_PSF, star, (N_MODEL,) * 2, slopes=False)[0]]
     for _ in range(N_GALAXIES):
         distance, angle = rng.uniform(*AWAY_PX), rng.uniform(0, 2 * np.pi)
         positions.append(star + distance * np.array([np.sin(angle), np.cos(angle)]))
         theta = rng.normal(*LOG_SIZE), *rng.normal(0, ELLIPTICITY, 2), np.log(5.0)
-        images.append(profile(np.array(theta), positions[-1], (N_MODEL,) * 2, moment(MODEL_PSF))[0])
+        images.append(
+            profile(np.array(theta), positions[-1], (N_MODEL,) * 2, psf_second_moment(MODEL_PSF))[0]
+        )
     snrs = np.array([snr, *np.exp(rng.uniform(*np.log(SNR_RANGE), N_GALAXIES))])
     observations, fluxes_of = [], []
     for i, instrument in enumerate(INSTRUMENTS):
@@ -131,8 +133,8 @@ def make_scene(seed, psf, snr):
         )
         fluxes_of.append(flux)
     given = tuple(star + rng.normal(0, GIVEN_PX, 2))
-    galaxies = (Extended(position_px=tuple(p)) for p in positions[1:])
-    sources = Point(position_px=given, free=True), *galaxies
+    galaxies = (ExtendedSource(position_px=tuple(p)) for p in positions[1:])
+    sources = PointSource(position_px=given, free_position=True), *galaxies
     frame = Frame(INSTRUMENTS[0][0], MODEL_PSF)
     return Blend(tuple(observations), sources, frame), np.concatenate(fluxes_of, 1), images
 

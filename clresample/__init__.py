@@ -14,18 +14,18 @@ __version__ = "0.1.0"
 
 # Each room's public names and the module that defines them; imported when first used, so that the
 # command line answers at once and no OpenCL driver is touched before it is needed.
-_ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
+_PUBLIC_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
     # the sky: pixels, PSFs, images, sources
     "sky": {
         "grid": ("Grid",),
         "psf": ("PSF",),
         "correlation": ("NoiseCorrelation",),
         "observation": ("Observation",),
-        "sources": ("Extended", "Point", "SourceWarning"),
+        "sources": ("ExtendedSource", "PointSource", "SourceWarning"),
         "noise": ("NoiseWarning",),
         "psf_checks": ("PSFWarning",),
         "frame": ("Frame", "model_frame"),
-        "varying.field": ("FunctionPSF", "PSFField"),
+        "varying_psf.field": ("FunctionPSF", "PSFField"),
     },
     # the operator and its variants
     "resampling": {
@@ -39,8 +39,8 @@ _ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
         "batch": ("deblend", "deblend_many"),
         "blend": ("Blend", "Failure"),
         "settings": ("Settings",),
-        "solver.prior": ("Prior",),
-        "solver.learned.prior": ("LearnedPrior",),
+        "solver.prior": ("SingleScalePrior",),
+        "solver.multiscale.prior": ("MultiscalePrior",),
         "solver.amsgrad": ("StepSizes",),
         "image_profiles": ("with_image_profiles",),
         "inspection.inspect": ("InputWarning",),
@@ -50,7 +50,7 @@ _ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
     "measurement": {
         "detection": ("Detection", "detect", "detect_more"),
         "photometry": ("fluxes", "redistribute"),
-        "catalogue": ("MEANINGS", "Flag", "catalogue"),
+        "catalogue": ("FLAG_MEANINGS", "Flag", "catalogue"),
         "quality": ("summary",),
     },
     # results and catalogues on disk
@@ -59,17 +59,17 @@ _ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
         "fits": ("read_image", "read_psf"),
         "results": ("read_result", "write_result"),
         "tables": ("read_catalogue", "write_catalogue"),
-        "whole_file": ("FileError",),
+        "atomic": ("FileError",),
     },
     # whole fields, from mosaics to one catalogue
     "fields": {
         "cutouts": ("FieldCutouts",),
         "mosaic": ("Mosaic",),
-        "psfs.sampled": ("PSFCube",),
+        "psfs.sampled": ("ScatteredPSF",),
         "models": ("read_models",),
-        "options": ("FieldOptions", "Progress"),
-        "reading.field_file": ("read_field",),
-        "reading.scene_file": ("read_scene",),
+        "options": ("FieldOptions", "RunProgress"),
+        "field_toml.field_file": ("read_field",),
+        "field_toml.scene_file": ("read_scene",),
         "run": ("run_field",),
         "readers.euclid_mer": ("read_euclid_mer",),
         "readers.hst": ("read_hst",),
@@ -89,16 +89,16 @@ _ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
     "device": {
         "device": ("Device", "get_device"),
         "discovery": ("DeviceError", "list_devices"),
-        "remembered": ("DeviceWarning",),
+        "device_cache": ("DeviceWarning",),
     },
 }
-_HOMES = {
+_MODULE_OF = {
     name: f"clresample.{room}.{module}"
-    for room, modules in _ROOMS.items()
+    for room, modules in _PUBLIC_NAMES.items()
     for module, names in modules.items()
     for name in names
 }
-__all__ = sorted(_HOMES)
+__all__ = sorted(_MODULE_OF)
 
 if TYPE_CHECKING:  # the same names for type checkers and editors
     from .deblending.batch import deblend as deblend, deblend_many as deblend_many
@@ -108,32 +108,36 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from .deblending.result import Component as Component, Result as Result
     from .deblending.settings import Settings as Settings
     from .deblending.solver.amsgrad import StepSizes as StepSizes
-    from .deblending.solver.learned.prior import LearnedPrior as LearnedPrior
-    from .deblending.solver.prior import Prior as Prior
+    from .deblending.solver.multiscale.prior import MultiscalePrior as MultiscalePrior
+    from .deblending.solver.prior import SingleScalePrior as SingleScalePrior
     from .device.device import Device as Device, get_device as get_device
+    from .device.device_cache import DeviceWarning as DeviceWarning
     from .device.discovery import DeviceError as DeviceError, list_devices as list_devices
-    from .device.remembered import DeviceWarning as DeviceWarning
     from .fields.cutouts import FieldCutouts as FieldCutouts
+    from .fields.field_toml.field_file import read_field as read_field
+    from .fields.field_toml.scene_file import read_scene as read_scene
     from .fields.models import read_models as read_models
     from .fields.mosaic import Mosaic as Mosaic
-    from .fields.options import FieldOptions as FieldOptions, Progress as Progress
-    from .fields.psfs.sampled import PSFCube as PSFCube
+    from .fields.options import FieldOptions as FieldOptions, RunProgress as RunProgress
+    from .fields.psfs.sampled import ScatteredPSF as ScatteredPSF
     from .fields.readers.euclid_mer import read_euclid_mer as read_euclid_mer
     from .fields.readers.hst import read_hst as read_hst
     from .fields.readers.jwst import read_jwst as read_jwst
     from .fields.readers.legacy import read_legacy_survey as read_legacy_survey
     from .fields.readers.rubin_coadd import read_rubin_coadd as read_rubin_coadd
     from .fields.readers.rubin_exposure import read_rubin_exposure as read_rubin_exposure
-    from .fields.reading.field_file import read_field as read_field
-    from .fields.reading.scene_file import read_scene as read_scene
     from .fields.report.write import write_report as write_report
     from .fields.run import run_field as run_field
+    from .files.atomic import FileError as FileError
     from .files.cutouts import read_cutouts as read_cutouts, write_cutouts as write_cutouts
     from .files.fits import read_image as read_image, read_psf as read_psf
     from .files.results import read_result as read_result, write_result as write_result
     from .files.tables import read_catalogue as read_catalogue, write_catalogue as write_catalogue
-    from .files.whole_file import FileError as FileError
-    from .measurement.catalogue import MEANINGS as MEANINGS, Flag as Flag, catalogue as catalogue
+    from .measurement.catalogue import (
+        FLAG_MEANINGS as FLAG_MEANINGS,
+        Flag as Flag,
+        catalogue as catalogue,
+    )
     from .measurement.detection import (
         Detection as Detection,
         detect as detect,
@@ -155,14 +159,18 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from .sky.observation import Observation as Observation
     from .sky.psf import PSF as PSF
     from .sky.psf_checks import PSFWarning as PSFWarning
-    from .sky.sources import Extended as Extended, Point as Point, SourceWarning as SourceWarning
-    from .sky.varying.field import FunctionPSF as FunctionPSF, PSFField as PSFField
+    from .sky.sources import (
+        ExtendedSource as ExtendedSource,
+        PointSource as PointSource,
+        SourceWarning as SourceWarning,
+    )
+    from .sky.varying_psf.field import FunctionPSF as FunctionPSF, PSFField as PSFField
 
 
 def __getattr__(name):
-    if name not in _HOMES:
+    if name not in _MODULE_OF:
         raise AttributeError(f"module 'clresample' has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
+    return getattr(import_module(_MODULE_OF[name]), name)
 
 
 def __dir__():

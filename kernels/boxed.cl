@@ -24,7 +24,7 @@
 enum { M, N, K, BEGIN_A, LD_A, NEXT_A, BEGIN_B, LD_B, SKIP, BEGIN_C, LD_C, NEXT_C, N_COLUMNS };
 
 __kernel __attribute__((reqd_work_group_size(WGX, WGY, 1)))
-void boxed(__global const int *restrict active, __global const long *restrict items,
+void multiply_boxes(__global const int *restrict active, __global const long *restrict items,
            const int block, const int inward, __global const REAL *restrict A,
            __global const REAL *restrict B, __global REAL *restrict C, const int add)
 {

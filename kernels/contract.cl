@@ -54,9 +54,9 @@
  * Launch: global = (ceil(width / (NV VW)), ceil(m / (MR RT)), batch), each rounded up to its
  *   local size.
  */
-#include "ahead.h"
+#include "prefetch.h"
 #if READ_AHEAD
-#define AHEAD(from, step) PREFETCH((from) + next + (step) * skipped, 0, 2)
+#define PREFETCH_B(from, step) PREFETCH((from) + next + (step) * skipped, 0, 2)
 #if !STRIDED        /* rows that follow each other closely, as they do nearly everywhere */
 #define AHEAD_LEFT(row, l, step, n) \
     if (j0 == 0) _Pragma("nounroll") for (int q = 0; q < (n) * MR; q += LINE) \
@@ -125,6 +125,6 @@ void contract(int m, int n, const int n_pad, int k, const int block,
         UNROLL(i, MR) row[i] = A + (size_t)(i0 + i < m ? i0 + i : m - 1) * ld_a;
         SUM_INSIDE(n - j0, m - i0, acc, row, B, n_pad, column, terms, block, inward)
 
-#include "contract_end.h"
+#include "contract_epilogue.h"
     }
 }

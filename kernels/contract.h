@@ -1,4 +1,4 @@
-/* What the kernels of contract.cl, boxed.cl, contract_group.cl and waves.h share: their sizes,
+/* What the kernels of contract.cl, boxed.cl, contract_group.cl and mirror.h share: their sizes,
  * vectors of VW, and the sums of a tile in registers.
  *
  * Order of the terms: the smallest first, so that roundings are those of small sums.
@@ -42,8 +42,8 @@
 #ifndef KU          /* terms that a turn of the loop adds: with 1, counting takes 6 % of the time */
 #define KU 4
 #endif
-#ifndef AHEAD       /* what a kernel reads ahead of a turn's terms, which begin at `from` in B */
-#define AHEAD(from, step)
+#ifndef PREFETCH_B  /* what a kernel reads ahead of a turn's terms, which begin at `from` in B */
+#define PREFETCH_B(from, step)
 #endif
 #ifndef AHEAD_LEFT  /* likewise of the n terms of a stretch from l on, in the rows of A */
 #define AHEAD_LEFT(row, l, step, n)
@@ -118,7 +118,7 @@
         remain -= n_terms; \
         AHEAD_LEFT(row, l, step, n_terms) \
         if (ku > 1) for (; n_terms >= ku; n_terms -= ku) { \
-            AHEAD(from, step) \
+            PREFETCH_B(from, step) \
             UNROLL(u, ku) { \
                 ADD_TERM(mr, nv, l + (step) * u, row, from + (step) * u * (long)(ld_b), column) \
             } \

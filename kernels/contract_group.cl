@@ -168,5 +168,5 @@ void contract_group(int m, int n, const int n_pad, int k,
 #endif
     }
 
-#include "contract_end.h"
+#include "contract_epilogue.h"
 }

@@ -1,13 +1,14 @@
 /* Smooth profiles, and their slopes by their parameters, drawn in boxes.
  *
- * draw     (slots, N_DRAW) int: ny, nx, n, first element of its images (n, ny, nx); n = 0: not
- *          drawn here, at most K.  shape (slots, N_SHAPE), see the enum: profile and its slopes by
- *          (ln sigma, g1, g2, ln beta), see profiles.py;  launch: (X, tallest box, slots)
+ * draw_profiles  (slots, N_DRAW) int: ny, nx, n, first element of its images (n, ny, nx); n = 0:
+ *          not drawn here, at most K.  shape (slots, N_SHAPE), see the enum: profile and its slopes
+ *          by (ln sigma, g1, g2, ln beta), see profiles.py;  launch: (X, tallest box, slots)
  *
- * X is 1 where a work-item walks a whole row (ROWS of group.h), else the width of the widest row.
+ * X is 1 where a work-item walks a whole row (ROWS of work_group.h), else the width of the widest
+ *     row.
  */
 #include "common.h"
-#include "group.h"
+#include "work_group.h"
 #ifndef K           /* images of a slot: 1, or 5 with slopes */
 #define K 1
 #endif
@@ -64,7 +65,7 @@ static float power_of_e(const float x)
 #define EXP exp
 #endif
 
-__kernel void draw(__global const int *restrict table, __global const REAL *restrict shape,
+__kernel void draw_profiles(__global const int *restrict table, __global const REAL *restrict shape,
                    __global REAL *restrict images)
 {
     const int s = (int)get_global_id(2), y = (int)get_global_id(1);

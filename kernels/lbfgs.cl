@@ -9,25 +9,25 @@
  * x, g: where a scene is, and the gradient there; x_new, g_new: those of its trial; d: direction
  * h: the inverse of the curvature's diagonal.  A variable is held where it must not fall: bounded,
  * x <= 0 and g > 0.  P g is g where variables are free and 0 where they are held.
- * H: h, but for the variables of blocks, see invert.cl
+ * H: h, but for the variables of blocks, see block_inverse.cl
  *
- * trial     s = x_new - x and h y into the spare slots, y = g_new - g, P g_new and h P g_new;
+ * form_pairs     s = x_new - x and h y into the spare slots, y = g_new - g, P g_new and h P g_new;
  *           scenes at rest stay as they are, here and below
- * change    for each chunk the sums s_k . P g_new, H y_k . P g_new, s_k . y, H y_k . y of each slot
- *           k, g . s and x_new . precision x_new;  out (n, 4 SLOTS + 2)
- * advance   NEXT: x, g, hg <- x_new, g_new, H P g_new, and
+ * inner_products  for each chunk the sums s_k . P g_new, H y_k . P g_new, s_k . y, H y_k . y of
+ *           each slot k, g . s and x_new . precision x_new;  out (n, 4 SLOTS + 2)
+ * take_step   NEXT: x, g, hg <- x_new, g_new, H P g_new, and
  *           d = P (scale (sum_k a_k H y_k - hg) - sum_k c_k s_k)
  *           AGAIN: the same d from the x, g, hg that are there; TRY: d as it is
  *           then x_new = x + length d, at least 0 where bounded;  STAY: x_new = x
  *           coefficients (B, 2 SLOTS + 2): a, c, scale, length
- * reweigh   after new strengths of the prior: precision, h = 1 / (precision + curvature light),
- *           g_new += change x_new; launch: (WG, n_scales, n_free)
+ * update_preconditioner  after new strengths of the prior: precision, h = 1 / (precision +
+ *           curvature light), g_new += change x_new; launch: (WG, n_scales, n_free)
  *           weights (S, n_scales, 3): precision, curvature, change
  * launch of trial, change, advance: (WG, n chunks), groups of (WG, 1)
  */
 #include "common.h"
 #include "boxes.h"
-#include "group.h"
+#include "work_group.h"
 #ifndef SLOTS       /* of the ring: pairs that are remembered, and the spare one */
 #define SLOTS 11
 #endif
@@ -52,11 +52,11 @@ enum { MODE, USED, SPARE };
     const int bounded = chunks[4 * chunk + 3]; \
     const size_t first = (size_t)chunks[4 * chunk + 1];
 
-/* LANES running sums, and PUT: their total over a group into the table of sums. */
+/* LANES running sums, and STORE_SUM: their total over a group into the table of sums. */
 #define SUMS(name) \
     REAL name[LANES]; \
     for (int l = 0; l < LANES; ++l) name[l] = 0;
-#define PUT(name, to) \
+#define STORE_SUM(name, to) \
     { \
         REAL mine = 0; \
         for (int l = 0; l < LANES; ++l) mine += name[l]; \
@@ -76,7 +76,7 @@ enum { MODE, USED, SPARE };
     }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
-void trial(__global const int *restrict chunks, __global const int *restrict plan,
+void form_pairs(__global const int *restrict chunks, __global const int *restrict plan,
            const ulong size, __global const REAL *restrict x, __global const REAL *restrict x_new,
            __global const REAL *restrict g, __global const REAL *restrict g_new,
            __global const REAL *restrict h, __global REAL *restrict ring_s,
@@ -98,7 +98,7 @@ void trial(__global const int *restrict chunks, __global const int *restrict pla
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
-void change(__global const int *restrict chunks, __global const int *restrict plan,
+void inner_products(__global const int *restrict chunks, __global const int *restrict plan,
             const ulong size, __global const REAL *restrict precision,
             __global const REAL *restrict x_new, __global const REAL *restrict g,
             __global const REAL *restrict y, __global const REAL *restrict projected,
@@ -125,10 +125,10 @@ void change(__global const int *restrict chunks, __global const int *restrict pl
             s_y[l] += si * dg[i];
             y_y[l] += hyi * dg[i];
         })
-        PUT(s_g, to[4 * k])
-        PUT(y_g, to[4 * k + 1])
-        PUT(s_y, to[4 * k + 2])
-        PUT(y_y, to[4 * k + 3])
+        STORE_SUM(s_g, to[4 * k])
+        STORE_SUM(y_g, to[4 * k + 1])
+        STORE_SUM(s_y, to[4 * k + 2])
+        STORE_SUM(y_y, to[4 * k + 3])
     }
     __global const REAL *weight = precision + first, *there = x_new + first;
     __global const REAL *s = ring_s + PLAN(b, SPARE) * (size_t)size + first;
@@ -138,12 +138,12 @@ void change(__global const int *restrict chunks, __global const int *restrict pl
         slope[l] += before[i] * s[i];
         energy[l] += weight[i] * there[i] * there[i];
     })
-    PUT(slope, to[4 * SLOTS])
-    PUT(energy, to[4 * SLOTS + 1])
+    STORE_SUM(slope, to[4 * SLOTS])
+    STORE_SUM(energy, to[4 * SLOTS + 1])
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
-void advance(__global const int *restrict chunks, __global const int *restrict plan,
+void take_step(__global const int *restrict chunks, __global const int *restrict plan,
           __global const REAL *restrict coefficients, const ulong size,
           __global const REAL *restrict ring_s, __global const REAL *restrict ring_hy,
           __global const REAL *restrict g_new, __global const REAL *restrict hg_new,
@@ -189,7 +189,7 @@ void advance(__global const int *restrict chunks, __global const int *restrict p
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
-void reweigh(__global const int *restrict active,
+void update_preconditioner(__global const int *restrict active,
              __global const int *restrict planes, __global const REAL *restrict weights,
              __global const REAL *restrict light, __global const REAL *restrict x_new,
              __global REAL *restrict g_new, __global REAL *restrict precision,

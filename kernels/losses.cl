@@ -2,7 +2,7 @@
  *
  * losses      out[i_loss, b] = sum of loss rows + 1/2 sum_s |z_s|^2, z the flat `latent`
  *             best[b] = the lowest of those with i_loss = 0; launch: (WG, B), groups of (WG, 1)
- * keep        kept_* <- latent, morph, spectra, sky of the scenes whose loss[b] is best[b], and so
+ * keep_best  kept_* <- latent, morph, spectra, sky of the scenes whose loss[b] is best[b], and so
  *             never of one whose loss is NaN; launch: (X, tallest box, S)
  * expect_sky  first row r of each channel c: rows[b, r] += 1/2 precision[b, c] sky[b, c]^2 and
  *             pull[b, r] += precision[b, c] sky[b, c], for n = B C levels; launch: see FOR_I
@@ -12,7 +12,7 @@
  */
 #include "common.h"
 #include "boxes.h"
-#include "group.h"
+#include "work_group.h"
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
 void losses(__global const int *restrict first, __global const int *restrict table,
@@ -46,7 +46,7 @@ void losses(__global const int *restrict first, __global const int *restrict tab
     if (i_loss == 0 && total < best[b]) best[b] = total;
 }
 
-__kernel void keep(__global const int *restrict active, __global const int *restrict table,
+__kernel void keep_best(__global const int *restrict active, __global const int *restrict table,
                    __global const int *restrict first, const int n_channels,
                    __global const REAL *restrict loss, __global const REAL *restrict best,
                    __global const REAL *restrict latent, __global const REAL *restrict morph,

@@ -34,7 +34,7 @@
  */
 #include "common.h"
 #include "boxes.h"
-#include "group.h"
+#include "work_group.h"
 
 #ifndef CHECK_EVERY /* iterations between looks at the sums, which cost about half an iteration */
 #define CHECK_EVERY 4

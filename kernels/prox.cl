@@ -20,7 +20,7 @@
  */
 #include "common.h"
 #include "boxes.h"
-#include "group.h"
+#include "work_group.h"
 
 #ifndef OCTANTS     /* octants of a pixel for one work-item, which share the weights: 1, 2, 4, 8 */
 #define OCTANTS (WG > 1 ? 1 : 8)

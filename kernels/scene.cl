@@ -27,17 +27,17 @@
  * gather_spectra  dA[s, channel + c] = sum_yx boxed_s[y, x] frame[b, c, y0 + y, x0 + x]
  *             for the sources listed in `active`
  *             launch: (WG, n_bands, len(active)), groups of (WG, 1, 1)
- * share       parts[s, c, t] = spectra[s, channel + c] shares[s, c, t], both (S, n_bands,
+ * split_spectra       parts[s, c, t] = spectra[s, channel + c] shares[s, c, t], both (S, n_bands,
  *             n_terms): a source's spectrum in each term of its PSF;  launch: (X, S, 1), rows
  *             of n_bands
- * unshare     spectra[s, channel + c] = sum_t shares[s, c, t] parts[s, c, t];  launch: the same
+ * merge_spectra  spectra[s, channel + c] = sum_t shares[s, c, t] parts[s, c, t];  launch: the same
  *
- * X is 1 where a work-item walks a whole row (ROWS of group.h), else at least the width of the
+ * X is 1 where a work-item walks a whole row (ROWS of work_group.h), else at least the width of the
  * widest row; of the second axis, which counts rows, any part or more than all may be launched.
  */
 #include "contract.h"
 #include "boxes.h"
-#include "group.h"
+#include "work_group.h"
 #define LANES 16    /* sums that run side by side where a work-item has a whole row */
 
 #define HEAD(s) \
@@ -253,7 +253,7 @@ void gather_spectra(__global const int *restrict active, __global const int *res
     if (lid == 0) d_spectra[(size_t)s * n_channels + channel + c] = total;
 }
 
-__kernel void share(const int n_sources, const int n_bands, const int n_terms,
+__kernel void split_spectra(const int n_sources, const int n_bands, const int n_terms,
                     const int n_channels, const int channel, __global const REAL *restrict shares,
                     __global const REAL *restrict spectra, __global REAL *restrict parts)
 {
@@ -264,7 +264,7 @@ __kernel void share(const int n_sources, const int n_bands, const int n_terms,
     }
 }
 
-__kernel void unshare(const int n_sources, const int n_bands, const int n_terms,
+__kernel void merge_spectra(const int n_sources, const int n_bands, const int n_terms,
                       const int n_channels, const int channel,
                       __global const REAL *restrict shares, __global const REAL *restrict parts,
                       __global REAL *restrict spectra)

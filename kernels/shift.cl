@@ -141,7 +141,7 @@ __kernel void unshift_plane(const int h_x, const int n_units, const int first,
     Z[ld_z + 1] = c - a;
 }
 
-__kernel void collect(const int n_chunks, const int n_i, const int n_cols, const int ld,
+__kernel void sum_chunks(const int n_chunks, const int n_i, const int n_cols, const int ld,
                       __global const REAL *restrict part, __global const uchar *restrict covered,
                       __global REAL *restrict pixels, const ulong offset, const int stride,
                       const int step_l, const int step_i)
@@ -156,7 +156,7 @@ __kernel void collect(const int n_chunks, const int n_i, const int n_cols, const
     pixels[offset + (size_t)b * stride + p] = covered[p] ? sum : (REAL)0;
 }
 
-__kernel void spread(const int n_items, const int n_i, const int n_cols, const int ld,
+__kernel void scatter_pixels(const int n_items, const int n_i, const int n_cols, const int ld,
                      __global REAL *restrict part, __global const uchar *restrict covered,
                      __global const REAL *restrict pixels, const ulong offset, const int stride,
                      const int step_l, const int step_i)

@@ -10,14 +10,14 @@
  *         |   +-----+       |     --->     |  +----------+    |   may lie in part beyond the pixels
  *         +-----------------+              +------------------+
  *
- *   place    (slots, N_PLACE) int: scene, y0, x0, wy, wx, n, and the element of `seen` where the
+ *   place    (slots, N_PLACE) int: scene, y0, x0, wy, wx, n, and the element of `images` where the
  *            slot's images begin: (n, n_bands, wy, wx), row by row
  *   root, data, light, residual, weight   (B, n_bands, my, mx): root of the weights, data times
  *            root, smoothed data times root
  *
- * whiten   seen <- seen root;  launch: (X, tallest window, slots)
- * compare  model m = sky root + sum_slots A seen, residual r = data - m, weight w = 1 / (1 + (error
- *          (light - sky root))^2) where root is not 0, error (B, n_bands);
+ * whiten   images <- images root;  launch: (X, tallest window, slots)
+ * compute_residuals  model m = sky root + sum_slots A images, residual r = data - m, weight w = 1 /
+ *          (1 + (error (light - sky root))^2) where root is not 0, error (B, n_bands);
  *          sums (B, n_bands, my, 3): of w r^2, w r root, w root^2;
  *          launch: (WG my, n_bands, scenes), a group a row.  `listed`: the slots scene by scene,
  *          those of scenes[k] from first[k] to first[k + 1]
@@ -25,26 +25,28 @@
  *          pairs (., 6) int: slots a, b, and the pixels: y, x, height, width; images beyond a
  *          slot's n are its last again;  launch: (WG pairs, n_bands), groups of (WG, 1): of pairs
  *          there may be more than a GPU's groups along other axes
- * pull     out (slots, n_bands, K, 2) = sums of w a_i r and w a_i root;
+ * residual_products     out (slots, n_bands, K, 2) = sums of w a_i r and w a_i root;
  *          launch: (WG slots, n_bands)
  *
- * X is 1 where a work-item walks a whole row (ROWS of group.h), else the width of the widest row.
+ * X is 1 where a work-item walks a whole row (ROWS of work_group.h), else the width of the widest
+ *     row.
  */
 #include "common.h"
-#include "group.h"
+#include "work_group.h"
 #ifndef K           /* images of a slot: 1, or 5 with slopes */
 #define K 1
 #endif
 
 enum { SCENE, Y0, X0, WY, WX, N_IMAGES, BEGIN, N_PLACE };
 __kernel void whiten(__global const int *restrict place, const int n_bands, const int my,
-                     const int mx, __global const REAL *restrict root, __global REAL *restrict seen)
+                     const int mx, __global const REAL *restrict root,
+        __global REAL *restrict images)
 {
     const int s = (int)get_global_id(2), y = (int)get_global_id(1);
     __global const int *p = place + N_PLACE * (size_t)s;
     const int wy = p[WY], wx = p[WX], y0 = p[Y0], x0 = p[X0], n = p[N_IMAGES];
     if (y >= wy) return;
-    __global REAL *image = seen + p[BEGIN] + (size_t)y * wx;
+    __global REAL *image = images + p[BEGIN] + (size_t)y * wx;
     const int inside = y0 + y >= 0 && y0 + y < my;
     const int low = x0 < 0 ? -x0 : 0, high = x0 + wx < mx ? wx : mx - x0;
     for (int k = 0; k < n; ++k)
@@ -68,17 +70,17 @@ __kernel void whiten(__global const int *restrict place, const int n_bands, cons
     if (row < 0 || row >= wy) continue; \
     const REAL a = spectra[(size_t)(s) * n_channels + channel + c]; \
     if (a == 0) continue; \
-    __global const REAL *u = seen + p[BEGIN] + ((size_t)c * wy + row) * wx;
+    __global const REAL *u = images + p[BEGIN] + ((size_t)c * wy + row) * wx;
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
-void compare(__global const int *restrict scenes, __global const int *restrict first,
+void compute_residuals(__global const int *restrict scenes, __global const int *restrict first,
              __global const int *restrict listed, __global const int *restrict place,
              const int n_bands, const int my, const int mx, const int channel,
              const int n_channels, __global const REAL *restrict error,
              __global const REAL *restrict spectra,
              __global const REAL *restrict sky, __global const REAL *restrict root,
              __global const REAL *restrict data, __global const REAL *restrict light,
-             __global const REAL *restrict seen, __global REAL *restrict residual,
+             __global const REAL *restrict images, __global REAL *restrict residual,
              __global REAL *restrict weight,
              __global REAL *restrict sums)
 {
@@ -134,7 +136,7 @@ void compare(__global const int *restrict scenes, __global const int *restrict f
 
 /* Image i of a slot in channel c, at a pixel of the observation; the last one beyond n. */
 #define ROW_OF(p, i) \
-    (seen + (p)[BEGIN] + \
+    (images + (p)[BEGIN] + \
      (((size_t)((i) < (p)[N_IMAGES] ? (i) : (p)[N_IMAGES] - 1) * n_bands + c) * (p)[WY] \
       + y0 + y - (p)[Y0]) * (p)[WX] + x0 - (p)[X0])
 
@@ -153,7 +155,7 @@ void compare(__global const int *restrict scenes, __global const int *restrict f
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
 void gram(__global const int *restrict pairs, __global const int *restrict place,
-          const int n_bands, const int my, const int mx, __global const REAL *restrict seen,
+          const int n_bands, const int my, const int mx, __global const REAL *restrict images,
           __global const REAL *restrict weight, __global REAL *restrict out)
 {
     __local REAL share[WG];
@@ -191,8 +193,9 @@ void gram(__global const int *restrict pairs, __global const int *restrict place
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
-void pull(__global const int *restrict place, const int n_bands, const int my, const int mx,
-          __global const REAL *restrict seen, __global const REAL *restrict weight,
+void residual_products(__global const int *restrict place, const int n_bands, const int my,
+        const int mx,
+          __global const REAL *restrict images, __global const REAL *restrict weight,
           __global const REAL *restrict residual, __global const REAL *restrict root,
           __global REAL *restrict out)
 {

@@ -8,11 +8,14 @@
  * after scale from LATENTS on in the solver's vectors.  A step of sigma or less loses nothing: the
  * kernel holds no frequency that the coarse grid lacks (0.7 % of its amplitude at most).
  *
- * spread     u = amp o sum_j K_j z;  launch: (X, tallest box, n_free)
- * form       S from u, the gauge with it;  launch: (WG, n_free), groups (WG, 1)
- * unform     q = amp o (v - b <b, v> / <b, b>), v = dS where S > 0, over dS;  launch: as form
- * condense   g = K_j^T q + precision[s, j] z for every scale;  launch: (X, COARSE rows, n_free)
- * energy     out[s, j] = sum z_sj^2 of the sources listed;      launch: (WG, n_scales, n_free)
+ * coefficients_to_image     u = amp o sum_j K_j z;  launch: (X, tallest box, n_free)
+ * form_morphology       S from u, the gauge with it;  launch: (WG, n_free), groups (WG, 1)
+ * morphology_adjoint  q = amp o (v - b <b, v> / <b, b>), v = dS where S > 0, over dS;  launch: as
+ *     form
+ * image_to_coefficients  g = K_j^T q + precision[s, j] z for every scale;  launch: (X, COARSE rows,
+ *     n_free)
+ * coefficient_norms  out[s, j] = sum z_sj^2 of the sources listed;      launch: (WG, n_scales,
+ *     n_free)
  *
  * taps       N_SCALES rows of TAPS: K_j along one axis, at least one zero after 2 RADII[j] + 1
  * line       zeros; scratch of a source from LINES on, LINE(nx) for each row of either
@@ -24,7 +27,7 @@
  */
 #include "common.h"
 #include "boxes.h"
-#include "group.h"
+#include "work_group.h"
 #ifndef N_SCALES    /* J, of which RADII, STEPS and rows of taps are given */
 #define N_SCALES 3
 #endif
@@ -101,7 +104,8 @@ INLINE void smoothed(__global const REAL *line, __global const REAL *k, const in
 }
 #endif
 
-__kernel void spread(__global const int *restrict active, __global const int *restrict table,
+__kernel void coefficients_to_image(__global const int *restrict active,
+        __global const int *restrict table,
                      __global const int *restrict start, __global const REAL *restrict taps,
                      __global const REAL *restrict z, __global const REAL *restrict amp,
                      __global REAL *restrict line, __global REAL *restrict u)
@@ -173,7 +177,7 @@ __kernel void spread(__global const int *restrict active, __global const int *re
     const REAL total = group_sum(SUM8(part), lid, share);
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
-void form(__global const int *restrict active, __global const int *restrict table,
+void form_morphology(__global const int *restrict active, __global const int *restrict table,
           __global const REAL *restrict inverse, __global const REAL *restrict profile,
           __global const REAL *restrict u, __global REAL *restrict morph)
 {
@@ -193,7 +197,7 @@ void form(__global const int *restrict active, __global const int *restrict tabl
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
-void unform(__global const int *restrict active, __global const int *restrict table,
+void morphology_adjoint(__global const int *restrict active, __global const int *restrict table,
             __global const REAL *restrict inverse, __global const REAL *restrict profile,
             __global const REAL *restrict amp, __global const REAL *restrict morph,
             __global REAL *restrict d_morph)
@@ -211,7 +215,8 @@ void unform(__global const int *restrict active, __global const int *restrict ta
     for (int i = lid; i < n; i += WG) d[i] = a[i] * ((m[i] > 0 ? d[i] : (REAL)0) - b[i] * less);
 }
 
-__kernel void condense(__global const int *restrict active, __global const int *restrict table,
+__kernel void image_to_coefficients(__global const int *restrict active,
+        __global const int *restrict table,
                        __global const int *restrict start, __global const REAL *restrict taps,
                        __global const REAL *restrict q, __global const REAL *restrict precision,
                        __global const REAL *restrict z, __global REAL *restrict line,
@@ -272,7 +277,7 @@ __kernel void condense(__global const int *restrict active, __global const int *
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
-void energy(__global const int *restrict active, __global const int *restrict table,
+void coefficient_norms(__global const int *restrict active, __global const int *restrict table,
             __global const int *restrict start, __global const REAL *restrict z,
             __global REAL *restrict out)
 {

@@ -4,26 +4,27 @@
  *   z (n, 2 h_y, n_pad): of each of n images of the observation, n_bands of them for each plan
  *   terms (n, T, 2 h_y, n_pad): its parts.  Both hold quads as contract.cl has them
  *
- * add      z = sum_t terms[t]
- * spread   terms[t] = conj(D_t) o z;  D (plans, n_bands, T, h_y, 4, n_pad / 2) as MIX has it,
+ * sum_terms      z = sum_t terms[t]
+ * split_terms   terms[t] = conj(D_t) o z;  D (plans, n_bands, T, h_y, 4, n_pad / 2) as MIX has it,
  *          stride_d: elements from a plan's to the next
  *
- * turn     z = D o phase o z0: n_bands spectra from one, each moved by its slot's own offset:
- *          z0 (items, 2 h_y, n_pad), z (items * n_bands, 2 h_y, n_pad); D of its plan, TERMS of
- *          each band, added up with the slot's shares (slots, n_bands, TERMS), which are not read
- *          where there is one; phase (slots, h_y + n_pad / 2, 2) cos and sin by row and by column;
- *          item i belongs to slot first + i / n, and where there are more plans than one its D is
- *          that of which[i];  launch: (X, h_y, items * n_bands)
+ * apply_transfer  z = D o phase o z0: n_bands spectra from one, each moved by its slot's own
+ *          offset: z0 (items, 2 h_y, n_pad), z (items * n_bands, 2 h_y, n_pad); D of its plan,
+ *          TERMS of each band, added up with the slot's shares (slots, n_bands, TERMS), which are
+ *          not read where there is one; phase (slots, h_y + n_pad / 2, 2) cos and sin by row and by
+ *          column; item i belongs to slot first + i / n, and where there are more plans than one
+ *          its D is that of which[i];  launch: (X, h_y, items * n_bands)
  *
- * Launch: (X, h_y, n); X is 1 where a work-item walks a whole row (ROWS of group.h), else n_pad / 2
+ * Launch: (X, h_y, n); X is 1 where a work-item walks a whole row (ROWS of work_group.h), else
+ *     n_pad / 2
  */
 #include "common.h"
-#include "group.h"
+#include "work_group.h"
 #ifndef TERMS       /* of each band's transfer function, in turn */
 #define TERMS 1
 #endif
 
-__kernel void add(const int n_terms, const int h_y, const int n_pad,
+__kernel void sum_terms(const int n_terms, const int h_y, const int n_pad,
                   __global const REAL *restrict terms, __global REAL *restrict z)
 {
     const size_t image = get_global_id(2), plane = (size_t)2 * h_y * n_pad;
@@ -40,7 +41,7 @@ __kernel void add(const int n_terms, const int h_y, const int n_pad,
     }
 }
 
-__kernel void spread(const int n_terms, const int h_y, const int n_pad, const int n_bands,
+__kernel void split_terms(const int n_terms, const int h_y, const int n_pad, const int n_bands,
                      __global const REAL *restrict D, const int stride_d,
                      __global const REAL *restrict z, __global REAL *restrict terms)
 {
@@ -69,7 +70,8 @@ __kernel void spread(const int n_terms, const int h_y, const int n_pad, const in
     }
 }
 
-__kernel void turn(const int h_y, const int n_pad, const int n_bands, const int n, const int first,
+__kernel void apply_transfer(const int h_y, const int n_pad, const int n_bands, const int n,
+        const int first,
                    __global const REAL *restrict z0, __global const REAL *restrict phase,
                    const int n_plans, __global const int *restrict which,
                    __global const REAL *restrict D, __global const REAL *restrict shares,

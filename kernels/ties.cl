@@ -3,10 +3,10 @@
  * tie       d_spectra[s, c] = mean of d_spectra[s, c'] over the channels c' of c's band
  *           first[c]: the first channel of the band of c, count[c]: how many it has
  *           layout: d_spectra (n_sources, n_channels);
- *           launch: n_sources items, see FOR_I of group.h
+ *           launch: n_sources items, see FOR_I of work_group.h
  */
 #include "common.h"
-#include "group.h"
+#include "work_group.h"
 
 __kernel void tie(const int n_sources, const int n_channels, __global const int *restrict first,
                   __global const int *restrict count, __global REAL *restrict d_spectra)

@@ -8,17 +8,17 @@
  * unit-normal `latent` image.  The variable is z, its gradient K (W o dS) + z; constraints act on
  * S.  Without a prior the variable is S itself.
  *
- * blur         scratch = K_x v,  v = W o dS where S > 0 (weigh: the gradient), or z
+ * blur_latent         scratch = K_x v,  v = W o dS where S > 0 (weigh: the gradient), or z
  * step_latent  z <- AMSGrad with g = K_y scratch + z
- * form         S = P + W o K_y scratch
+ * form_latent_morphology         S = P + W o K_y scratch
  * step_morph   S <- AMSGrad with g = dS
  *              launch of these: (X, tallest box, len(active)); for the sources listed in `active`
  * step_spectra A <- max(0, AMSGrad in units of `scale` with g = scale o dA); for n = S C of them
  * step_sky     sky <- sky - SKY_RATE sum(w r) / sum(w); for n = B C levels
  *              pull (B, n_rows): sum of w r of each observed row; channel c has rows
  *              row0[c] .. row0[c + 1] - 1;  inverse (B, C): 1 / sum(w)
- * rescale      A[s, c] *= factor[s]: what a normalisation took out of a morphology; for n = S C
- *              launch of these three: any (see FOR_I of group.h)
+ * rescale_spectra  A[s, c] *= factor[s]: what a normalisation took out of a morphology; for n = S C
+ *              launch of these three: any (see FOR_I of work_group.h)
  *
  * e = EPSILON + rate damping[s] for morphologies: no step is longer than gradient / damping, where
  * damping is a bound on the curvature; EPSILON for spectra, whose units are those of their errors.
@@ -27,7 +27,7 @@
  */
 #include "common.h"
 #include "boxes.h"
-#include "group.h"
+#include "work_group.h"
 
 #ifndef B1           /* part of the first moment that an iteration keeps */
 #define B1 0.9
@@ -81,7 +81,7 @@ static REAL amsgrad(const REAL g, __global REAL *m, __global REAL *v, __global R
     return mi * t1 / (root(hi * t2) + e);
 }
 
-__kernel void blur(__global const int *restrict active, __global const int *restrict table,
+__kernel void blur_latent(__global const int *restrict active, __global const int *restrict table,
                    __global const REAL *restrict taps, const int weigh,
                    __global const REAL *restrict v, __global const REAL *restrict amplitude,
                    __global const REAL *restrict morph, __global REAL *restrict weighed,
@@ -159,7 +159,8 @@ __kernel void step_latent(__global const int *restrict active, __global const in
     }
 }
 
-__kernel void form(__global const int *restrict active, __global const int *restrict table,
+__kernel void form_latent_morphology(__global const int *restrict active,
+        __global const int *restrict table,
                    __global const REAL *restrict taps, __global const REAL *restrict scratch,
                    __global const REAL *restrict profile, __global const REAL *restrict amplitude,
                    __global REAL *restrict morph)
@@ -209,7 +210,7 @@ __kernel void step_sky(const int n_channels, const int n_rows, __global const in
     }
 }
 
-__kernel void rescale(__global const REAL *restrict factor, const int n_channels,
+__kernel void rescale_spectra(__global const REAL *restrict factor, const int n_channels,
                       __global REAL *restrict spectra, const int n)
 {
     FOR_I(i, n) spectra[i] *= factor[i / n_channels];

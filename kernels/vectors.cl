@@ -1,15 +1,16 @@
 /* Into and out of vectors of the variables of all scenes of a batch, as lbfgs.cl has them.
  *
- * take      spectra and sky levels out of x, n of them in all;  launch: any, see FOR_I of group.h
- * give      their gradients into g_new: pull[b, row] summed over rows row0[c] .. row0[c + 1] - 1
- *           launch: as take
- * move      values[row, first + i] = values_from[row, source + i] of each chunk, the source of each
- *           given; launch: (WG, n chunks, rows)
+ * unpack_spectra  spectra and sky levels out of x, n of them in all;  launch: any, see FOR_I of
+ *     work_group.h
+ * pack_gradients  their gradients into g_new: pull[b, row] summed over rows row0[c] .. row0[c + 1]
+ *           - 1 launch: as take
+ * copy_chunks  values[row, first + i] = values_from[row, source + i] of each chunk, the source of
+ *           each given; launch: (WG, n chunks, rows)
  */
 #include "common.h"
-#include "group.h"
+#include "work_group.h"
 
-__kernel void take(const int n_latents, const int n_spectra, const int n,
+__kernel void unpack_spectra(const int n_latents, const int n_spectra, const int n,
                    __global const REAL *restrict x, __global REAL *restrict spectra,
                    __global REAL *restrict sky)
 {
@@ -20,7 +21,8 @@ __kernel void take(const int n_latents, const int n_spectra, const int n,
     }
 }
 
-__kernel void give(const int n_latents, const int n_spectra, const int n, const int n_channels,
+__kernel void pack_gradients(const int n_latents, const int n_spectra, const int n,
+        const int n_channels,
                    const int n_rows, __global const int *restrict row0,
                    __global const REAL *restrict pull, __global const REAL *restrict d_spectra,
                    __global REAL *restrict g_new)
@@ -38,7 +40,7 @@ __kernel void give(const int n_latents, const int n_spectra, const int n, const 
 }
 
 __kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
-void move(__global const int *restrict chunks, __global const int *restrict source,
+void copy_chunks(__global const int *restrict chunks, __global const int *restrict source,
           const ulong size, const ulong size_from, __global const REAL *restrict values_from,
           __global REAL *restrict values)
 {

@@ -4,17 +4,17 @@
  *             pixels from low[g] (y, x) on, in part or all of them outside of the image
  *   Groups are sorted by scene; those of scene b are first[b] .. first[b + 1] - 1.
  *
- * assemble  image[b, c, y, x] (+)= sum_g windows[g, c, y - low_y, x - low_x]
+ * add_windows  image[b, c, y, x] (+)= sum_g windows[g, c, y - low_y, x - low_x]
  *           launch: (X, my, B * n_bands)
- * cut       windows[g, c, y, x] = image[scene[g], c, y + low_y, x + low_x], 0 outside of it
+ * cut_windows       windows[g, c, y, x] = image[scene[g], c, y + low_y, x + low_x], 0 outside of it
  *           launch: (X, wy, G * n_bands)
  *
- * X is 1 where a work-item walks a whole row (ROWS of group.h), else at least a row's pixels.
+ * X is 1 where a work-item walks a whole row (ROWS of work_group.h), else at least a row's pixels.
  */
 #include "common.h"
-#include "group.h"
+#include "work_group.h"
 
-__kernel void assemble(__global const int *restrict first, __global const int *restrict low,
+__kernel void add_windows(__global const int *restrict first, __global const int *restrict low,
                        const int n_bands, const int my, const int mx, const int wy, const int wx,
                        const int add, __global const REAL *restrict windows,
                        __global REAL *restrict image)
@@ -46,7 +46,7 @@ __kernel void assemble(__global const int *restrict first, __global const int *r
     }
 }
 
-__kernel void cut(__global const int *restrict scene, __global const int *restrict low,
+__kernel void cut_windows(__global const int *restrict scene, __global const int *restrict low,
                   const int n_bands, const int my, const int mx, const int wy, const int wx,
                   __global const REAL *restrict image, __global REAL *restrict windows)
 {

@@ -1,6 +1,7 @@
-"""The house: who may import whom, no circles, and nothing too long to read.
+"""The layers: who may import whom, no circles, and nothing too long to read.
 
-Rooms are the folders of clresample/; a room may import the rooms named beside it here, and itself.
+Packages are the folders of clresample/; a package may import the packages named beside it here, and
+itself.
 """
 
 import ast
@@ -10,7 +11,7 @@ import sys
 import pytest
 from helpers.checkout import ROOT
 
-ROOMS = {
+ALLOWED_IMPORTS = {
     "device": (),
     "drawing": (),
     "sky": ("drawing",),
@@ -33,7 +34,7 @@ ROOMS = {
         "fields",
     ),
 }
-# Rooms that work without any OpenCL driver.
+# Packages that work without any OpenCL driver.
 NUMPY_ONLY = ("sky", "simulation")
 MAX_LINES, MAX_CLASS, MAX_FUNCTION, MAX_FILES, MAX_FOLDERS = 450, 220, 90, 24, 11
 
@@ -64,24 +65,26 @@ def imported(name, source, is_package=False):
             yield from inside or [base]
 
 
-def room_of(name):
-    """The room of a module of clresample's; "" for those beside the rooms."""
+def package_of(name):
+    """The package of a module of clresample's; "" for those beside the packages."""
     parts = name.split(".")
-    return parts[1] if len(parts) > 1 and parts[1] in ROOMS else ""
+    return parts[1] if len(parts) > 1 and parts[1] in ALLOWED_IMPORTS else ""
 
 
 def violations(name, source, is_package=False):
-    """The imports in `source`, the text of module `name`, that its room does not allow."""
-    room = room_of(name)
+    """The imports in `source`, the text of module `name`, that its package does not allow."""
+    package = package_of(name)
     for target in imported(name, source, is_package):
-        if target.split(".")[0] == "pyopencl" and room in NUMPY_ONLY:
+        if target.split(".")[0] == "pyopencl" and package in NUMPY_ONLY:
             yield target
         if target.split(".")[0] != "clresample" or target == "clresample":
             continue
-        if room_of(target) != room and room_of(target) not in ROOMS.get(room, ()):
+        if package_of(target) != package and package_of(target) not in ALLOWED_IMPORTS.get(
+            package, ()
+        ):
             yield target
         inside = "clresample.deblending.solver."
-        leaves = room_of(target) == "deblending" and not target.startswith(inside)
+        leaves = package_of(target) == "deblending" and not target.startswith(inside)
         if name.startswith(inside) and leaves:  # the solver knows nothing of the fits around it
             yield target
 
@@ -144,16 +147,16 @@ def test_nothing_is_too_long(path):
 
 
 def test_the_house_has_few_rooms_with_few_files():
-    rooms = [path for path in PACKAGE.iterdir() if path.is_dir() and path.name != "__pycache__"]
-    assert {path.name for path in rooms} - {"kernels"} == set(ROOMS)
-    assert len(rooms) <= MAX_FOLDERS
+    packages = [path for path in PACKAGE.iterdir() if path.is_dir() and path.name != "__pycache__"]
+    assert {path.name for path in packages} - {"kernels"} == set(ALLOWED_IMPORTS)
+    assert len(packages) <= MAX_FOLDERS
     for folder in {path.parent for path in MODULES.values()} - {PACKAGE}:
         assert len(list(folder.glob("*.py"))) <= MAX_FILES, folder
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_each_room_says_what_it_holds(room):
-    text = ast.get_docstring(ast.parse((PACKAGE / room / "__init__.py").read_text()))
+@pytest.mark.parametrize("package", ALLOWED_IMPORTS)
+def test_each_room_says_what_it_holds(package):
+    text = ast.get_docstring(ast.parse((PACKAGE / package / "__init__.py").read_text()))
     assert text
     assert "import" in text.lower()
 

@@ -13,7 +13,7 @@ from clresample import (
     Blend,
     Device,
     DeviceError,
-    Extended,
+    ExtendedSource,
     Failure,
     Frame,
     Grid,
@@ -41,9 +41,9 @@ observation = Observation(np.zeros((60, 60)), psf, grid, weights=1.0, channels=[
 frame = model_frame([observation])
 assert_type(frame, Frame)
 
-result = deblend([observation], [Extended(position_px=(30.0, 30.0))], settings=Settings())
+result = deblend([observation], [ExtendedSource(position_px=(30.0, 30.0))], settings=Settings())
 assert_type(result, Result)
-blends = [Blend((observation,), (Extended(position_px=(30.0, 30.0)),))]
+blends = [Blend((observation,), (ExtendedSource(position_px=(30.0, 30.0)),))]
 assert_type(deblend_many(blends), list[Result | Failure])
 
 try:

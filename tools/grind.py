@@ -26,36 +26,36 @@ from clresample import (  # noqa: E402
     PSF,
     Blend,
     Device,
-    Extended,
+    ExtendedSource,
     FunctionPSF,
     Grid,
-    LearnedPrior,
+    MultiscalePrior,
     Observation,
     PaperResampler,
-    Point,
-    Prior,
+    PointSource,
     Resampler,
     Settings,
+    SingleScalePrior,
     deblend_many,
     get_device,
     model_frame,
 )
-from clresample.deblending.fit import Fit, begin  # noqa: E402
+from clresample.deblending.fit import Fit, start_fits  # noqa: E402
 from clresample.deblending.solver.boxes import Boxes  # noqa: E402
-from clresample.deblending.solver.buffers import Buffers  # noqa: E402
+from clresample.deblending.solver.buffers import SceneBuffers  # noqa: E402
 from clresample.deblending.solver.constraints import (  # noqa: E402
     L0,
     L1,
-    Chain,
     MaxNorm,
     Monotone,
     MonotoneProjection,
     Positivity,
+    ProxChain,
     SumNorm,
     Symmetry,
 )
-from clresample.deblending.solver.gradient import Gradient  # noqa: E402
-from clresample.deblending.solver.learned.engine import LearnedEngine  # noqa: E402
+from clresample.deblending.solver.gradient import LossGradient  # noqa: E402
+from clresample.deblending.solver.multiscale.engine import MultiscaleEngine  # noqa: E402
 from clresample.device import tuning  # noqa: E402
 from clresample.device.program import Launcher  # noqa: E402
 
@@ -93,7 +93,7 @@ def watch(device, kind):
     Device.launcher, Launcher.__call__ = of_file, noted
     of = tuning.Tuning.of
     # Oclgrind knows no instruction that reads ahead, which changes no result.
-    sizes = {"chunk_terms": CHUNK_TERMS, "loops": LOOPS, "reads_ahead": False}
+    sizes = {"chunk_terms": CHUNK_TERMS, "max_loop_iterations": LOOPS, "prefetch_columns": False}
     tuning.Tuning.of = lambda *a: replace(of(*a), **sizes)
     return launched
 
@@ -135,8 +135,8 @@ def blends(n, profile=None, *, varying=False):
             seen = FunctionPSF(_widening, 1) if varying and not i else psf
             observations.append(Observation(light, seen, grid, weights=weights, channels=names))
         places = (4.5, 4.5), (3.0, 6.5)
-        galaxies = [Extended(position_px=place, profile=profile) for place in places]
-        sources = (*galaxies, Point(position_px=(6.5, 3.0)))
+        galaxies = [ExtendedSource(position_px=place, profile=profile) for place in places]
+        sources = (*galaxies, PointSource(position_px=(6.5, 3.0)))
         frame = model_frame(observations, grid=grids[0])
         made.append(Blend(tuple(observations), sources, frame))
     return made
@@ -152,19 +152,19 @@ def render(device):
 
     scene, state = posed(device, np.float32, fixed=(1,))
     for depth in (0, 1, 2, 3):
-        buffers = Buffers([scene, scene], [state, state], device, np.float32, PRIOR)
-        Gradient(buffers, with_prior=False, depth=depth).queue()
+        buffers = SceneBuffers([scene, scene], [state, state], device, np.float32, PRIOR)
+        LossGradient(buffers, with_prior=False, depth=depth).queue()
     device.finish()
 
 
-CHAIN = Chain(Positivity(), L1(1e-3), L0(1e-3), Symmetry(0.5), Monotone(), MaxNorm())
+CHAIN = ProxChain(Positivity(), L1(1e-3), L0(1e-3), Symmetry(0.5), Monotone(), MaxNorm())
 # All kinds of fits, some iterations each.
 FITS = (
-    Settings(prior=LearnedPrior(), max_iter=2),
-    Settings(prior=LearnedPrior(), max_iter=25, enough=20.0, fit_sky=True),
-    Settings(prior=Prior(), max_iter=2, fit_sky=True),
+    Settings(prior=MultiscalePrior(), max_iter=2),
+    Settings(prior=MultiscalePrior(), max_iter=25, loss_tol=20.0, fit_sky=True),
+    Settings(prior=SingleScalePrior(), max_iter=2, fit_sky=True),
     Settings(prior=None, max_iter=2, constraints=CHAIN),
-    Settings(prior=None, max_iter=2, constraints=Chain(MonotoneProjection(), SumNorm())),
+    Settings(prior=None, max_iter=2, constraints=ProxChain(MonotoneProjection(), SumNorm())),
 )
 
 
@@ -175,18 +175,18 @@ def _disc():
 
 def leave(device):
     """One of two scenes goes on alone."""
-    settings = Settings(prior=LearnedPrior())
+    settings = Settings(prior=MultiscalePrior())
     fits = [Fit(b, settings, device, np.float32, pad=1) for b in blends(2, _disc())]
-    begin(fits)
+    start_fits(fits)
     scenes, states = [f.scene for f in fits], [f.state for f in fits]
-    engine = LearnedEngine(scenes, states, device, np.float32, settings.prior, 1.0)
+    engine = MultiscaleEngine(scenes, states, device, np.float32, settings.prior, 1.0)
     engine.round()
     engine.take([1]).round()
 
 
 def vary(device):
     """A fit with a PSF that varies over the blend."""
-    settings = Settings(prior=Prior(), max_iter=1)
+    settings = Settings(prior=SingleScalePrior(), max_iter=1)
     (result,) = deblend_many(blends(1, _disc(), varying=True), settings=settings, device=device)
     if result.status.startswith("failed"):
         raise SystemExit(f"grind: a fit {result.status}")
@@ -239,7 +239,10 @@ def main():
         print(f"grind: {work.__name__} after {time.perf_counter() - began:.0f} s", flush=True)
     others = {  # kernels of the other kind of device
         "cpu": {"contract_group.cl contract_group"},
-        "gpu": {f"{name}.cl {name}" for name in ("contract", "folded", "waves", "waves_back")},
+        "gpu": {
+            f"{name}.cl {name}"
+            for name in ("contract", "folded", "mirror_to_waves", "mirror_to_pixels")
+        },
     }
     missing = all_kernels() - launched - others[arguments.kind]
     took = f"{time.perf_counter() - began:.0f} s on {device.name}"

@@ -19,7 +19,7 @@ import numpy as np
 
 from clresample import (
     PSF,
-    Extended,
+    ExtendedSource,
     Grid,
     Observation,
     Resampler,
@@ -27,7 +27,7 @@ from clresample import (
     deblend,
     get_device,
 )
-from clresample.cli.machine.measure import best_seconds
+from clresample.cli.device_tools.measure import best_seconds
 from clresample.device.program import Launcher
 
 N_RENDERS, RENDER_THREADS, N_FITS, FIT_THREADS = 800, 4, 24, 3
@@ -96,7 +96,7 @@ def blend(seed, device):
         op = Resampler(model, PSF.gaussian(0.8), grid, psf, device=device)
         data = op(10 * light.astype(np.float32)) + 0.1 * rng.standard_normal(op.shape_out)
         observations.append(Observation(data, psf, grid, weights=100.0, channels=[band]))
-    return observations, [Extended(position_px=p) for p in places]
+    return observations, [ExtendedSource(position_px=p) for p in places]
 
 
 def in_threads(work, n_threads):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clresample import Blend, Extended, Observation, model_frame
+from clresample import Blend, ExtendedSource, Observation, model_frame
 from clresample.simulation.galaxies import draw, random_galaxy
 from clresample.simulation.scenes import (
     MAGNITUDE_RANGE,
@@ -52,7 +52,7 @@ def crowded_blend(seed, n_sources, n_model, sky="plain"):
         )
     )
     places = euclid.pixel(*positions_arcsec.T)
-    sources = tuple(Extended(position_px=tuple(map(float, place))) for place in places)
+    sources = tuple(ExtendedSource(position_px=tuple(map(float, place))) for place in places)
     return Blend(observations, sources, model_frame(observations, grid=euclid))
 
 

@@ -10,7 +10,7 @@ from functools import cache
 
 import numpy as np
 
-from clresample import Extended, Point
+from clresample import ExtendedSource, PointSource
 from clresample.simulation.galaxies import import_galsim, open_catalogue
 from clresample.simulation.scenes import POWER_LAW_INDEX
 
@@ -160,12 +160,12 @@ def cosmos(rng, scale, limits):
 def star_as_galaxy(rng, scale, limits):
     star = import_galsim().DeltaFunction()
     snr = limits.brightness(rng, *SNR)
-    return [Item((Part(star, colour(rng)),), snr, role="star", fitted_as=Extended)]
+    return [Item((Part(star, colour(rng)),), snr, role="star", fitted_as=ExtendedSource)]
 
 
 def galaxy_as_point(rng, scale, limits):
     re_px, snr = limits.size(rng, *WRONG_KIND_RE_PX), limits.brightness(rng, *SNR)
-    return [galaxy(rng, scale, limits.steepness(rng), re_px, snr, fitted_as=Point)]
+    return [galaxy(rng, scale, limits.steepness(rng), re_px, snr, fitted_as=PointSource)]
 
 
 CASES = {

@@ -11,7 +11,7 @@ from functools import cache
 
 import numpy as np
 
-from clresample import PSF, Extended, Grid, Observation
+from clresample import PSF, ExtendedSource, Grid, Observation
 from clresample.simulation.galaxies import draw, import_galsim
 from clresample.simulation.scenes import RUBIN_WAVELENGTHS_NM
 from clresample.simulation.surveys import EUCLID_VIS, RUBIN_UGRIZY
@@ -75,7 +75,7 @@ class Item:
     q: float = np.nan
     away_px: tuple = (0.0, 0.0)
     role: str = "galaxy"
-    fitted_as: type = Extended
+    fitted_as: type = ExtendedSource
 
 
 @dataclass(frozen=True, eq=False)

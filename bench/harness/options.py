@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 
 from clresample import DeviceError
-from clresample.files.whole_file import FileError
+from clresample.files.atomic import FileError
 from clresample.simulation.surveys import NOTEBOOK_SURVEYS, PAPER_SURVEYS
 
 ROOT = Path(__file__).resolve().parents[2]

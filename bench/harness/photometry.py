@@ -16,12 +16,12 @@ import warnings
 import numpy as np
 
 from clresample import PSF, Resampler
-from clresample.fields.psfs.sampled import PSFCube
+from clresample.fields.psfs.sampled import ScatteredPSF
 
 RADII_ARCSEC = (0.3, 0.4, 0.6, 0.8, 1.0, 1.5)
 HALF_PX = 48  # [px of the sharpest mosaic] half side of the cutout about a source
 PROFILE_PX = 24  # reach of a source's profile
-LEAST_WIDTH_PX = 0.3  # half-light radius below which a source is a point
+MIN_WIDTH_PX = 0.3  # half-light radius below which a source is a point
 
 
 class Cutout:
@@ -46,8 +46,8 @@ class Cutout:
                 a = np.maximum(np.floor(there.min(axis=0)).astype(int) - 2, 0)
                 b = np.minimum(np.ceil(there.max(axis=0)).astype(int) + 3, mosaic.grid.shape)
             box = (slice(a[0], b[0]), slice(a[1], b[1]))
-            good = ~mosaic.bad[box]
-            cube = PSFCube(mosaic.psf_images, mosaic.psf_positions)
+            good = ~mosaic.bad_pixels[box]
+            cube = ScatteredPSF(mosaic.psf_images, mosaic.psf_positions)
             self.grids.append(mosaic.grid.cutout(*a, tuple(b - a)))
             self.psfs.append(cube.psf_at(*((a + b - 1) / 2)))
             self.data.append(np.where(good, mosaic.data[(slice(None), *box)], 0.0))
@@ -128,7 +128,7 @@ def _exponential(shape, centre, moments, psf):
     fine = (np.arange(over) - (over - 1) / 2) / over
     values, vectors = np.linalg.eigh(moments)
     # <x^2> of an exponential of scale h is 3 h^2 along each axis
-    scale = np.sqrt(np.maximum(values, LEAST_WIDTH_PX**2) / 3)
+    scale = np.sqrt(np.maximum(values, MIN_WIDTH_PX**2) / 3)
     total = np.zeros(shape)
     for a in fine:
         for b in fine:

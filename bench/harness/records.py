@@ -10,7 +10,7 @@ import platform
 from importlib.metadata import version
 
 from clresample import __version__, get_device
-from clresample.files.whole_file import whole_file
+from clresample.files.atomic import atomic_file
 
 from .options import BadOption
 
@@ -95,7 +95,7 @@ def read_json(path):
 
 def write_text(path, text):
     """Write a file whole or not at all. Raises FileError where it cannot be written."""
-    with whole_file(path) as part:
+    with atomic_file(path) as part:
         part.write_text(text, encoding="utf-8")
 
 

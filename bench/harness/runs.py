@@ -14,12 +14,12 @@ import numpy as np
 from astropy.table import QTable
 
 from clresample.cli.simulate import write_field
-from clresample.fields.blends.search import scatters_of, search
+from clresample.fields.blends.search import search_tile, snr_scatter
 from clresample.fields.blends.tiles import tiles_of
 from clresample.fields.box import Box
+from clresample.fields.field_toml.field_file import read_field
 from clresample.fields.options import FieldOptions
-from clresample.fields.reading.field_file import read_field
-from clresample.fields.run import reference_of
+from clresample.fields.run import reference_grid
 
 from .memory import TreeMemory
 from .options import ROOT
@@ -30,11 +30,13 @@ def found_in(field, folder):
     and wall time [s]."""
     mosaics = read_field(write_field(folder, field)[0]).mosaics
     core, wall = time.process_time(), time.perf_counter()
-    reference, options = reference_of(mosaics), FieldOptions()
+    reference, options = reference_grid(mosaics), FieldOptions()
     tiles = tiles_of(Box.of(reference.shape), options.tile_px, options.overlap_px)
-    scatters = scatters_of(mosaics, reference)
+    scatters = snr_scatter(mosaics, reference)
     found = [
-        search(mosaics, reference, tile, threshold=options.threshold, scatters=scatters).positions
+        search_tile(
+            mosaics, reference, tile, threshold=options.threshold, scatters=scatters
+        ).positions
         for tile in tiles
     ]
     return np.concatenate(found), time.process_time() - core, time.perf_counter() - wall

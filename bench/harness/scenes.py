@@ -17,7 +17,7 @@ from clresample.simulation.scenes import simulate_scene
 from clresample.simulation.sdr import sdr
 from clresample.simulation.surveys import NOTEBOOK_SURVEYS
 from clresample.sky.frame import model_frame
-from clresample.sky.sources import Extended, SourceWarning
+from clresample.sky.sources import ExtendedSource, SourceWarning
 
 from .cases import Case, Galaxies
 from .options import data_folder
@@ -63,7 +63,7 @@ def blend(scene, mode, *, profiles=None):
     if profiles is None:
         profiles = [None] * len(scene.profiles)
     sources = tuple(
-        Extended(position_px=tuple(position), profile=profile)
+        ExtendedSource(position_px=tuple(position), profile=profile)
         for position, profile in zip(scene.euclid.positions_px, profiles, strict=True)
     )
     return Blend(observations, sources, model_frame(observations, grid=scene.euclid.grid))

@@ -8,7 +8,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.wcs import WCS
 
-from clresample import PSF, Extended, Grid, Observation, Settings, detect
+from clresample import PSF, ExtendedSource, Grid, Observation, Settings, detect
 from clresample.simulation.galaxies import import_galsim
 from clresample.simulation.scenes import simulate_scene
 from clresample.sky.noise import background
@@ -32,7 +32,7 @@ class Scene:
     settings: Settings
 
     def sources(self):
-        return [Extended(sky_deg=tuple(map(float, place))) for place in self.places]
+        return [ExtendedSource(sky_deg=tuple(map(float, place))) for place in self.places]
 
 
 def scene_of(observations, places):

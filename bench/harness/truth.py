@@ -80,7 +80,7 @@ def _truths(scene, mode, columns):
         centroid, second = moments([SimpleNamespace(origin=(0, 0), morphology=image)], np.ones(1))
         with np.errstate(invalid="ignore"):  # negative light can make a second moment negative
             found.append((*centroid, *shape(axes @ second @ axes.T)[:3]))
-    names = "y_centroid", "x_centroid", "size", "e1", "e2"
+    names = "y_centroid", "x_centroid", "rms_size", "e1", "e2"
     truths |= dict(zip(names, np.array(found).T, strict=True))
     return {name: truth for name, truth in truths.items() if name in columns}
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clresample.drawing.sheet import RESIDUAL_COLOURS, SKY_COLOURS, import_figure, stretch
+from clresample.drawing.figure import RESIDUAL_COLOURS, SKY_COLOURS, import_figure, stretch
+from clresample.files.atomic import atomic_file
 from clresample.files.panels import stretch_limits
-from clresample.files.whole_file import whole_file
 
 DPI = 110  # dots per inch: a page's width in about 100 kB
 INK, FAINT, BLANK = "#20242c", "#c9ced8", "#f1f3f6"
@@ -253,5 +253,5 @@ def save(path, figure):
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png", facecolor="white")
     few = Image.open(drawn).convert("RGB").quantize(256, dither=Image.Dither.NONE)
-    with whole_file(path) as part:
+    with atomic_file(path) as part:
         few.save(part, format="png", optimize=True)

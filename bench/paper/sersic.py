@@ -20,7 +20,7 @@ START_SIGMA_PX, START_INDEX = 3.5, 0.7
 INDICES = (0.3, 6.0)
 SIGMAS_PX = (0.8, 20.0)
 # Bound of each shear component; with both there, 1 - g1^2 - g2^2 is negative and replaced
-MAX_SHEAR, LEAST_DETERMINANT = 0.9, 1e-3
+MAX_SHEAR, MIN_DETERMINANT = 0.9, 1e-3
 # [px] how far the profile's centre may lie from the given one
 SHIFT_PX = 5.0
 
@@ -54,7 +54,7 @@ def _profile(parameters, position, shape):
     dy, dx = np.arange(shape[0]) - position[0] - y, np.arange(shape[1]) - position[1] - x
     # the square root of C^-1 is symmetric, of determinant 1 / sigma^2
     root = np.array([[1 + g1, g2], [g2, 1 - g1]]) / np.exp(log_sigma)
-    root /= np.sqrt(max(1 - g1**2 - g2**2, LEAST_DETERMINANT))
+    root /= np.sqrt(max(1 - g1**2 - g2**2, MIN_DETERMINANT))
     u = root[0, 0] * dy[:, None] + root[0, 1] * dx
     v = root[1, 0] * dy[:, None] + root[1, 1] * dx
     return np.exp(-0.5 * (u**2 + v**2) ** (0.5 * np.exp(-log_index)))

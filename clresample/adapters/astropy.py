@@ -9,7 +9,7 @@ from astropy.io import fits
 from astropy.nddata import CCDData, StdDevUncertainty
 
 from ..sky.observation import Observation
-from .needed import needed
+from .optional import require
 
 
 def observation_of(image, psf=None, **given) -> Observation:
@@ -63,19 +63,19 @@ def regions_of(table, *, radius_arcsec=1.0):
 
     Raises ImportError without regions; ValueError for a table of a flat sky.
     """
-    regions = needed("regions", "regions")
+    regions = require("regions", "regions")
     if "ra" not in table.colnames or "dec" not in table.colnames:
         raise ValueError(f"table has no ra and dec, but {', '.join(table.colnames[:4])}, ...")
     frame = table.meta.get("frame", "icrs")
     centres = SkyCoord(table["ra"], table["dec"], frame=frame)
     found = []
     for row, centre in zip(table, centres):
-        size, e = row["size"], np.hypot(row["e1"], row["e2"])
+        size, e = row["rms_size"], np.hypot(row["e1"], row["e2"])
         meta = regions.RegionMeta({"text": str(row["name"])})
         if np.isfinite(size.value) and size.value > 0 and np.isfinite(e):
             axes = 4 * size * np.sqrt([1 + e, 1 - e])
             # ours is counted from north to east, that of regions from west to north
-            angle = row["angle"] + 90 * u.deg
+            angle = row["position_angle"] + 90 * u.deg
             found.append(regions.EllipseSkyRegion(centre, *axes, angle=angle, meta=meta))
         else:
             found.append(regions.CircleSkyRegion(centre, radius_arcsec * u.arcsec, meta=meta))

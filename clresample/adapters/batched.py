@@ -16,7 +16,7 @@ def with_bands(op, x):
     return x, False
 
 
-def shapes(x, op, transposed):
+def batched_shapes(x, op, transposed):
     """Of one item of x, and of the result with all of x's leading axes."""
     shape_x, shape_result = op.shape_in, op.shape_out
     if transposed:
@@ -24,10 +24,10 @@ def shapes(x, op, transposed):
     return shape_x, (*x.shape[: x.ndim - len(shape_x)], *shape_result)
 
 
-def applied(op, transposed, x):
+def apply_batched(op, transposed, x):
     """A x, or A^T x where `transposed`, all leading axes of the array x as one batch."""
     x = np.ascontiguousarray(x)
-    shape_x, shape_result = shapes(x, op, transposed)
+    shape_x, shape_result = batched_shapes(x, op, transposed)
     if 0 in x.shape:
         return np.zeros(shape_result, op.dtype)
     run = op.adjoint if transposed else op.forward

@@ -12,7 +12,7 @@ from astropy.wcs import WCS
 from ..sky.grid import Grid
 from ..sky.psf import PSF
 from ..sky.wcs import local_axes
-from .needed import needed
+from .optional import require
 
 
 def grid_of(image) -> Grid:
@@ -22,7 +22,7 @@ def grid_of(image) -> Grid:
 
     Raises ValueError for a WCS that is neither celestial nor the same all over the image.
     """
-    galsim = needed("galsim", "galsim")
+    galsim = require("galsim", "galsim")
     wcs = image.wcs or galsim.PixelScale(1.0)
     shape = image.array.shape
     if wcs.isCelestial():
@@ -49,7 +49,7 @@ def psf_of(profile, grid, *, n_pixels=41, oversampling=1, position_px=None) -> P
 
     Raises ValueError for even numbers.
     """
-    galsim = needed("galsim", "galsim")
+    galsim = require("galsim", "galsim")
     for name, value in (("n_pixels", n_pixels), ("oversampling", oversampling)):
         if value != int(value) or value < 1 or value % 2 == 0:
             raise ValueError(f"{name} is {value}, must be an odd whole number")
@@ -68,7 +68,7 @@ def psf_of(profile, grid, *, n_pixels=41, oversampling=1, position_px=None) -> P
 
 def image_of(array, grid):
     """A GalSim image of an array (Ny, Nx), placed on the sky by its grid."""
-    galsim = needed("galsim", "galsim")
+    galsim = require("galsim", "galsim")
     array = np.asarray(array)
     if array.shape != tuple(grid.shape):
         raise ValueError(f"array has shape {array.shape}, its grid {tuple(grid.shape)}")
@@ -96,7 +96,7 @@ def profile_of(image, grid, position_px, *, interpolant="lanczos15"):
         lanczos15 is within 1e-3 of the peak for images sampled as finely as models are
     returns galsim.InterpolatedImage, in arcsec on the tangent plane at that place
     """
-    galsim = needed("galsim", "galsim")
+    galsim = require("galsim", "galsim")
     image, position = np.asarray(image, np.float64), np.asarray(position_px, np.float64)
     if image.shape != tuple(grid.shape):
         raise ValueError(f"image has shape {image.shape}, its grid {tuple(grid.shape)}")

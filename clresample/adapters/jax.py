@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import functools
 
-from .batched import applied, shapes, with_bands
-from .needed import needed
+from .batched import apply_batched, batched_shapes, with_bands
+from .optional import require
 
 
 def as_jax(op):
@@ -23,7 +23,7 @@ def as_jax(op):
     Raises ImportError without JAX; ValueError for a float64 operator where JAX holds float32 only
     (`jax.config.update("jax_enable_x64", True)` first), and, when called, for other shapes.
     """
-    jax = needed("jax", "jax")
+    jax = require("jax", "jax")
     if jax.dtypes.canonicalize_dtype(op.dtype) != op.dtype:
         raise ValueError(
             f"op computes in {op.dtype}, JAX holds {jax.dtypes.canonicalize_dtype(op.dtype)}: "
@@ -43,15 +43,15 @@ def as_jax(op):
 @functools.cache
 def _primitive():
     """The JAX primitive: x -> A x, or A^T x where `transposed`, of an operator `op`."""
-    jax = needed("jax", "jax")
+    jax = require("jax", "jax")
     ad, batching, mlir = (
-        needed(f"jax.interpreters.{name}", "jax") for name in ("ad", "batching", "mlir")
+        require(f"jax.interpreters.{name}", "jax") for name in ("ad", "batching", "mlir")
     )
-    p = needed("jax.extend.core", "jax").Primitive("clresample")
+    p = require("jax.extend.core", "jax").Primitive("clresample")
 
     def called_back(x, *, op, transposed):
-        result = jax.ShapeDtypeStruct(shapes(x, op, transposed)[1], op.dtype)
-        return jax.pure_callback(functools.partial(applied, op, transposed), result, x)
+        result = jax.ShapeDtypeStruct(batched_shapes(x, op, transposed)[1], op.dtype)
+        return jax.pure_callback(functools.partial(apply_batched, op, transposed), result, x)
 
     def transpose(y, _, *, op, transposed):
         return [p.bind(y, op=op, transposed=not transposed)]
@@ -61,7 +61,9 @@ def _primitive():
 
     p.def_impl(jax.jit(called_back, static_argnames=("op", "transposed")))
     p.def_abstract_eval(
-        lambda x, *, op, transposed: jax.core.ShapedArray(shapes(x, op, transposed)[1], op.dtype)
+        lambda x, *, op, transposed: jax.core.ShapedArray(
+            batched_shapes(x, op, transposed)[1], op.dtype
+        )
     )
     ad.deflinear2(p, transpose)
     batching.primitive_batchers[p] = batch

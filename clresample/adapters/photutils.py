@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..sky.psf import PSF
-from .needed import needed
+from .optional import require
 
 
 def psf_of(model, *, position_px=(0.0, 0.0), n_pixels=41, oversampling=None) -> PSF:
@@ -21,7 +21,7 @@ def psf_of(model, *, position_px=(0.0, 0.0), n_pixels=41, oversampling=None) -> 
 
     Raises ImportError without photutils; ValueError for a model that is not of that kind.
     """
-    needed("photutils", "photutils")
+    require("photutils", "photutils")
     models = model if isinstance(model, (list, tuple)) else [model]
     if oversampling is None:
         own = {int(n) for m in models for n in np.ravel(getattr(m, "oversampling", 1))}

@@ -10,7 +10,7 @@ from ..resampling.resampler import Resampler
 from ..sky.grid import Grid
 from ..sky.psf import PSF
 from .jax import as_jax
-from .needed import needed
+from .optional import require
 
 
 def renderer_of(model_frame, obs_frame, *, device=None, dtype=np.float32):
@@ -51,8 +51,8 @@ def renderer_of(model_frame, obs_frame, *, device=None, dtype=np.float32):
 @functools.cache
 def _renderer_class():
     """A scarlet2 Renderer of a function, made once scarlet2 is there."""
-    equinox = needed("equinox", "scarlet2")
-    renderer = needed("scarlet2.renderer", "scarlet2")
+    equinox = require("equinox", "scarlet2")
+    renderer = require("scarlet2.renderer", "scarlet2")
 
     class OperatorRenderer(renderer.Renderer):
         """The model's channels of an observation through a Resampler."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from .batched import applied, with_bands
-from .needed import needed
+from .batched import apply_batched, with_bands
+from .optional import require
 
 
 def as_torch(op):
@@ -19,7 +19,7 @@ def as_torch(op):
 
     Raises ImportError without torch; ValueError, when called, for other shapes and dtypes.
     """
-    torch = needed("torch", "torch")
+    torch = require("torch", "torch")
     dtype = getattr(torch, op.dtype.name)
 
     class Applied(torch.autograd.Function):
@@ -28,7 +28,7 @@ def as_torch(op):
         @staticmethod
         def forward(ctx, x, transposed):
             ctx.transposed = transposed
-            result = applied(op, transposed, x.detach().cpu().numpy())
+            result = apply_batched(op, transposed, x.detach().cpu().numpy())
             return torch.from_numpy(result).to(x.device)
 
         @staticmethod

@@ -1,4 +1,4 @@
-"""`python -m clresample.cli`: the same as the command `clresample`, where that is not installed."""
+"""Runs `python -m clresample.cli` like the command `clresample`, where that is not installed."""
 
 import sys
 

@@ -17,28 +17,28 @@ import warnings
 from contextlib import contextmanager
 
 from .. import __version__
+from ..device.device_cache import DeviceWarning
 from ..device.discovery import DeviceError
-from ..device.profile import report
-from ..device.remembered import DeviceWarning
+from ..device.kernel_profiler import report
 from .cutout import add_cutout
 from .deblend import add_deblend
+from .device_tools.tune import add_tune
 from .devices import add_devices
 from .field import add_field
 from .fields.report import add_report
-from .machine.tune import add_tune
-from .options import note, printable
+from .options import print_note, printable
 from .resample import add_resample
 from .simulate import add_simulate
 
 # Of an error's line: some errors quote a whole file.
-MOST_CHARACTERS = 900
+MAX_CHARACTERS = 900
 
 
 class Parser(argparse.ArgumentParser):
     """Complains in one line, without the usage that `--help` gives."""
 
     def error(self, message):
-        self.exit(2, f"{self.prog}: {printable(message, MOST_CHARACTERS)}\n")
+        self.exit(2, f"{self.prog}: {printable(message, MAX_CHARACTERS)}\n")
 
 
 def main(argv=None):
@@ -79,7 +79,7 @@ def _run(argv):
     except DeviceError as error:  # may hold a compiler's log: its lines are kept
         return _fail(arguments, str(error))
     except (ValueError, OSError) as error:
-        return _fail(arguments, printable(" ".join(str(error).split()), MOST_CHARACTERS))
+        return _fail(arguments, printable(" ".join(str(error).split()), MAX_CHARACTERS))
     except KeyboardInterrupt:
         _fail(arguments, "interrupted")
         return 130  # what a shell reports after Ctrl-C
@@ -92,7 +92,7 @@ def _show_in_one_line(arguments):
 
     def show(message, category, *rest, **more):
         if issubclass(category, DeviceWarning):
-            note(arguments, str(message))
+            print_note(arguments, str(message))
         else:
             shown(message, category, *rest, **more)
 

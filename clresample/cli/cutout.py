@@ -6,7 +6,7 @@ import argparse
 from contextlib import nullcontext
 from pathlib import Path
 
-from .options import add_device_option, names, note
+from .options import add_device_option, name_list, print_note
 
 KINDS = "data", "model", "residual", "neighbours", "redistributed"
 
@@ -50,7 +50,7 @@ def add_cutout(commands):
     which.add_argument(
         "--id",
         metavar="N,...",
-        type=names,
+        type=name_list,
         action="extend",
         dest="ids",
         help="a source, or several by commas; may be given again",
@@ -68,7 +68,7 @@ def add_cutout(commands):
     image.add_argument(
         "--observation",
         metavar="NAME,...",
-        type=names,
+        type=name_list,
         help="instruments or channels, by name; all instruments by default",
     )
     image.add_argument(
@@ -104,7 +104,7 @@ def extent(text):
 
 def run(arguments):
     """Cut out, write. Raises ValueError and FileError, one line, for what cannot be done."""
-    from ..files.whole_file import check_folder, check_output
+    from ..files.atomic import check_folder, check_output
 
     if not arguments.ids and not arguments.ids_from:
         raise ValueError("--id is missing: give sources by --id N,... or --ids-from FILE")
@@ -112,7 +112,7 @@ def run(arguments):
     check_output(path, overwrite=arguments.overwrite)
     check_folder(path.absolute().parent)
     from ..deblending.cutouts.choice import MissingSource
-    from ..device.workers import one_blas_thread
+    from ..device.multi_device import one_blas_thread
     from ..files.cutouts import write_cutouts
 
     wanted = [*(arguments.ids or ()), *_listed(arguments)]
@@ -131,7 +131,7 @@ def run(arguments):
     if not found:
         raise ValueError(f"nothing to write: {missing[0]}")
     for text in missing if not arguments.quiet else ():
-        note(arguments, text)
+        print_note(arguments, text)
     write_cutouts(path, found, overwrite=arguments.overwrite, inputs=inputs)
     print(f"{len(found)} cutouts of {len(dict.fromkeys(ids))} sources: {path}")
 
@@ -186,7 +186,7 @@ def _field(arguments, folder, wanted):
             raise ValueError(f"--id is {', '.join(wanted)}: ids of a field are numbers") from None
         raise
     for text in field.notes if not arguments.quiet else ():
-        note(arguments, text)
+        print_note(arguments, text)
 
     def cutout(one, observation, **given):
         return field.cutout(one, observation, group=arguments.group, **given)

@@ -15,10 +15,10 @@ from .options import (
     add_dtype_option,
     add_profile_option,
     fraction,
-    note,
+    non_negative_integer,
+    print_note,
+    print_progress,
     printable,
-    say,
-    whole,
 )
 from .outputs import check_scene, folder_outputs
 
@@ -71,9 +71,11 @@ def add_deblend(commands):
         help="let every observation but the first move by a constant shift",
     )
     fit.add_argument("--fit-sky", action="store_true", help="fit a constant in each channel")
-    fit.add_argument("--max-iter", metavar="N", type=whole, help="largest number of iterations")
     fit.add_argument(
-        "--tol",
+        "--max-iter", metavar="N", type=non_negative_integer, help="largest number of iterations"
+    )
+    fit.add_argument(
+        "--rel-tol",
         metavar="T",
         type=fraction,
         help="stop when the loss falls by less than this part of itself",
@@ -96,18 +98,18 @@ def run(arguments):
     paths = folder_outputs(arguments, OUTPUTS[: 3 if arguments.no_figure else 4])
     _progress(arguments, f"reading {arguments.scene}")
     from ..device.device import get_device
-    from ..device.waves import operator_programs
+    from ..device.mirror_contraction import operator_programs
 
     device = get_device(arguments.device)
     device.build_ahead(operator_programs(device, arguments.dtype))
-    from ..fields.reading.scene_file import read_scene  # half a second of astropy and scipy
+    from ..fields.field_toml.scene_file import read_scene  # half a second of astropy and scipy
     from ..measurement.quality import summary
 
     scene = read_scene(arguments.scene)
     check_scene(arguments, scene, paths)
     if not arguments.quiet:
         for message in scene.notes:
-            note(arguments, message)
+            print_note(arguments, message)
     if not arguments.no_figure:
         threading.Thread(target=_import_drawing).start()
     result = _fit(arguments, scene, device)
@@ -121,7 +123,7 @@ def run(arguments):
 
 def _progress(arguments, message):
     if not arguments.quiet:
-        say(arguments, message)
+        print_progress(arguments, message)
 
 
 def _fit(arguments, scene, device):
@@ -137,13 +139,13 @@ def _fit(arguments, scene, device):
     _progress(arguments, f"fitting {len(sources)} sources to {seen} on {device.name}")
     if settings.max_iter and (settings.fit_shifts is True or (looking and scene.passes > 1)):
         first = replace(settings, max_iter=min(FIRST_LOOK, settings.max_iter))
-        if looking and scene.passes > 1 and settings.learns:
-            from ..deblending.solver.constraints import Chain, Positivity
-            from ..deblending.solver.prior import Prior
+        if looking and scene.passes > 1 and settings.has_multiscale_prior:
+            from ..deblending.solver.constraints import Positivity, ProxChain
+            from ..deblending.solver.prior import SingleScalePrior
 
             # structure of a pixel alone leaves unknown neighbours' light in the residuals
-            small = Prior(correlation_px=1.0)
-            first = replace(first, prior=small, constraints=Chain(Positivity()))
+            small = SingleScalePrior(correlation_px=1.0)
+            first = replace(first, prior=small, constraints=ProxChain(Positivity()))
         result = _deblend(arguments, "first look", scene.observations, sources, first, given)
         if result.status == "interrupted":
             return result
@@ -160,7 +162,9 @@ def _fit(arguments, scene, device):
 def _settings(arguments, settings):
     """The scene file's settings with those of the command line in their place."""
     given = {
-        key: value for key in ("max_iter", "tol") if (value := getattr(arguments, key)) is not None
+        key: value
+        for key in ("max_iter", "rel_tol")
+        if (value := getattr(arguments, key)) is not None
     }
     given |= {key: True for key in ("fit_shifts", "fit_sky") if getattr(arguments, key)}
     return replace(settings, **given)
@@ -219,13 +223,13 @@ def _import_drawing():
 
 def _write(arguments, result, inputs, device, paths):
     """Write the catalogue twice, the result and, where `paths` has a fourth, the figure."""
+    from ..files.atomic import atomic_files
     from ..files.results import write_result
     from ..files.tables import write_catalogue
-    from ..files.whole_file import whole_files
     from ..measurement.catalogue import catalogue
 
     table = catalogue(result)
-    with whole_files(paths) as parts:
+    with atomic_files(paths) as parts:
         for part in parts[:2]:
             write_catalogue(part, table)
         write_result(parts[2], result, device=device.name, inputs=inputs)
@@ -260,7 +264,7 @@ def _report(arguments, result, found, device, took):
         print(f"chi2 per pixel, {label}: {values}{shift}")
     if not arguments.quiet:
         for message in found["messages"]:
-            note(arguments, message)
+            print_note(arguments, message)
 
 
 def _chi2(value):

@@ -25,9 +25,9 @@ from ..measurement.catalogue import catalogue
 from ..simulation.scenes import simulate_scene
 from ..simulation.sdr import sdr
 from ..sky.frame import model_frame
-from ..sky.sources import Extended
+from ..sky.sources import ExtendedSource
 from . import demo_resample
-from .pointing import ANGLE_DEG, CENTER_DEG
+from .demo_sky import ANGLE_DEG, CENTER_DEG
 
 SEED, N_SOURCES = 10, 6
 MODES = {"Rubin": ("Rubin",), "Euclid": ("Euclid",), "joint": ("Euclid", "Rubin")}
@@ -41,7 +41,7 @@ def fit_all(scene, *, device=None):
     """
     seen = {image.survey.name: image.observation() for image in scene.images}
     sources = [
-        Extended(sky_deg=tuple(map(float, place)), name=f"{i + 1}")
+        ExtendedSource(sky_deg=tuple(map(float, place)), name=f"{i + 1}")
         for i, place in enumerate(scene.positions_deg)
     ]
     fitted = {}

@@ -18,7 +18,7 @@ from ..simulation.galaxies import draw, random_galaxy
 from ..simulation.sdr import sdr
 from ..simulation.surveys import EUCLID_VIS, RUBIN_UGRIZY
 from ..sky.grid import Grid
-from .pointing import ANGLE_DEG, CENTER_DEG
+from .demo_sky import ANGLE_DEG, CENTER_DEG
 
 SEED = 20
 N_GALAXIES, BRIGHTEST, FAINTEST = 40, 19.5, 24.5  # magnitudes, more faint ones than bright
@@ -26,7 +26,7 @@ N_PIXELS = 110  # of Rubin, a side
 BAND = RUBIN_UGRIZY.bands.index("i")
 
 
-class Sky(NamedTuple):
+class SimulatedSky(NamedTuple):
     """The same galaxies twice, without noise, in Euclid's counts.
 
     euclid (Ny, Nx), rubin (My, Mx): drawn by GalSim under each telescope's PSF and pixels
@@ -59,7 +59,7 @@ def simulate(seed=SEED):
         ):
             image += draw(galaxy, grid, psf_sigma_arcsec=sigma, position_arcsec=position)
     grids = (Grid.from_wcs(_wcs(grid), grid.shape) for grid in (euclid_grid, rubin_grid))
-    return Sky(*grids, euclid, rubin)
+    return SimulatedSky(*grids, euclid, rubin)
 
 
 def _wcs(grid):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from ..device.discovery import format_size, hints, list_devices
-from .options import add_device_option, note
+from ..device.discovery import driver_hints, format_size, list_devices
+from .options import add_device_option, print_note
 
 COLUMNS = ("platform", "device", "kind", "OpenCL", "units", "memory", "largest buffer", "fp64")
 
@@ -28,11 +28,11 @@ def run(arguments):
     from ..device.device import get_device
 
     print(format_table(list_devices(arguments.device)))
-    for hint in hints():
-        note(arguments, hint)
+    for hint in driver_hints():
+        print_note(arguments, hint)
     device = get_device(arguments.device)
     if arguments.bench:
-        from .machine.bench import bench_lines
+        from .device_tools.bench import bench_lines
 
         print(f"\n{device.name}:")
         for line in bench_lines(device):

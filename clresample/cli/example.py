@@ -13,11 +13,11 @@ from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable
 
+from ..files.atomic import atomic_files, check_folder, check_output
 from ..files.fits import write_fits, write_hdus
 from ..files.tables import write_catalogue
-from ..files.whole_file import check_folder, check_output, whole_files
 from ..simulation.scenes import simulate_scene
-from .pointing import ANGLE_DEG, CENTER_DEG
+from .demo_sky import ANGLE_DEG, CENTER_DEG
 
 SEED, N_SOURCES = 11, 6
 FILES = (
@@ -43,7 +43,7 @@ def write_example(folder, *, overwrite=False) -> list[Path]:
         check_output(path, overwrite=overwrite)
     sky = {"angle_deg": ANGLE_DEG, "center_deg": CENTER_DEG, "spectra": "smooth"}
     scene = simulate_scene(SEED, n_sources=N_SOURCES, **sky)
-    with whole_files(paths.values()) as parts:
+    with atomic_files(paths.values()) as parts:
         _write(dict(zip(paths, parts, strict=True)), scene)
     return list(paths.values())
 

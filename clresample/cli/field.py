@@ -7,7 +7,14 @@ import sys
 import time
 from dataclasses import replace
 
-from .options import add_device_option, add_profile_option, note, positive, size, whole
+from .options import (
+    add_device_option,
+    add_profile_option,
+    byte_size,
+    non_negative_integer,
+    positive_number,
+    print_note,
+)
 
 DESCRIPTION = """\
 Find, fit and measure every source of a field: mosaics of any size, of several
@@ -19,7 +26,7 @@ and ends with the same catalogue."""
 EPILOG = """\
 in DIR   catalogue.parquet, .fits, .ecsv   fluxes with errors, positions, shapes, flags
          hats/                             the catalogue for LSDB, with --hats
-         blends.ecsv                       fits: how they ended, sizes, seconds
+         fit_table.ecsv                       fits: how they ended, sizes, seconds
          models.fits                       every source's model, by blend
          model_*.fits, residual_*.fits     mosaics
          provenance.json                   versions, device, settings, input checksums
@@ -53,14 +60,14 @@ def add_field(commands):
     parser.add_argument(
         "--workers",
         metavar="N",
-        type=whole,
+        type=non_negative_integer,
         default=1,
         help="processes that search and fit; 0 = this one (default %(default)s)",
     )
     parser.add_argument(
-        "--memory",
+        "--worker-memory",
         metavar="SIZE",
-        type=size,
+        type=byte_size,
         help="private memory that a worker process may take, at least 1G, held by the system on "
         "Linux; groups of fits are sized for it. Without it they take 1G by prediction, or an "
         "eighth of the free memory where that is less, and a worker what it needs",
@@ -72,9 +79,9 @@ def add_field(commands):
         "they need this package and the mosaics' files",
     )
     parser.add_argument(
-        "--limit",
+        "--timeout",
         metavar="S",
-        type=positive,
+        type=positive_number,
         default=3600.0,
         help="seconds after which a worker is taken to hang (default %(default)g)",
     )
@@ -110,10 +117,10 @@ def run(arguments):
 
     # what runs beside the fits has small matrices too: see one_blas_thread
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    from ..fields.options import LEAST_BOUND, LEAST_MEMORY, MEMORY, group_memory
-    from ..fields.reading.field_file import read_field
+    from ..fields.field_toml.field_file import read_field
+    from ..fields.options import MEMORY, MIN_BOUND, MIN_MEMORY, default_group_memory
     from ..fields.run import free_memory, run_field
-    from .fields.progress import Live
+    from .fields.progress import ProgressDisplay
 
     started = time.perf_counter()
     try:
@@ -122,10 +129,11 @@ def run(arguments):
         raise ValueError(f"{arguments.field}: {error}") from error
     if not arguments.quiet:
         for text in field.notes:
-            note(arguments, text)
-    if arguments.memory is not None and arguments.memory < LEAST_BOUND:
+            print_note(arguments, text)
+    if arguments.worker_memory is not None and arguments.worker_memory < MIN_BOUND:
         raise ValueError(
-            f"--memory is {arguments.memory >> 20}M, must be {LEAST_BOUND >> 30}G or more"
+            f"--worker-memory is {arguments.worker_memory >> 20}M, must be {MIN_BOUND >> 30}G or "
+            f"more"
         )
     devices = arguments.device.split(",") if arguments.device else []
     workers = max(arguments.workers, len(devices)) if len(devices) > 1 else arguments.workers
@@ -135,13 +143,15 @@ def run(arguments):
         workers=workers,
         device=devices or None,
         scheduler=arguments.scheduler,
-        limit_s=arguments.limit,
+        task_timeout_s=arguments.timeout,
         part=arguments.part,
         hats=arguments.hats,
-        bound=arguments.memory,
-        memory=group_memory(arguments.memory) if arguments.memory else max(memory, LEAST_MEMORY),
+        worker_memory=arguments.worker_memory,
+        group_memory=default_group_memory(arguments.worker_memory)
+        if arguments.worker_memory
+        else max(memory, MIN_MEMORY),
     )
-    progress = Live(arguments)
+    progress = ProgressDisplay(arguments)
     try:
         done = run_field(
             field.mosaics,
@@ -166,11 +176,11 @@ def _report(arguments, done, took):
     stages = ", ".join(f"{name} {s:.1f} s" for name, s in done.seconds.items())
     print(f"{out.n_sources} sources in {out.n_blends} fits ({ended or 'none'})")
     print(f"{took:.1f} s: {stages}")
-    for number, reason in done.lost.items():
+    for number, reason in done.failed_tiles.items():
         print(f"error: tile {number} is lost, with all of its sources: {reason}", file=sys.stderr)
     if not arguments.quiet:
         for text in out.notes:
-            note(arguments, text)
+            print_note(arguments, text)
     for path in out.paths:
         print(path)
-    return 1 if done.lost or done.failed else 0
+    return 1 if done.failed_tiles or done.failed else 0

@@ -40,12 +40,12 @@ def add_dtype_option(parser, what):
     )
 
 
-def note(arguments, message):
+def print_note(arguments, message):
     """Print what the user should know on standard error."""
-    say(arguments, f"note: {message}")
+    print_progress(arguments, f"note: {message}")
 
 
-def say(arguments, message):
+def print_progress(arguments, message):
     """Print a line of progress on standard error."""
     print(f"clresample {arguments.command}: {printable(message)}", file=sys.stderr, flush=True)
 
@@ -64,12 +64,12 @@ def printable(text, most=None):
 def check_matplotlib(option, way_out=""):
     """Raise ValueError where `option` needs matplotlib and it is not there; it is not imported."""
     if find_spec("matplotlib") is None:
-        from ..drawing.sheet import NO_MATPLOTLIB
+        from ..drawing.figure import NO_MATPLOTLIB
 
         raise ValueError(f"{option}: {NO_MATPLOTLIB}{way_out}")
 
 
-def size(text):
+def byte_size(text):
     """Bytes: a number, or one with K, M or G (also KiB, MB, ...), in powers of 1024."""
     number = text.upper().removesuffix("B").removesuffix("I")
     unit = number[-1:] if number[-1:] in SIZES else ""
@@ -82,7 +82,7 @@ def size(text):
     return int(n_bytes)
 
 
-def names(text):
+def name_list(text):
     """Comma-separated names or numbers."""
     found = [part.strip() for part in text.split(",")]
     if not all(found):
@@ -91,7 +91,7 @@ def names(text):
 
 
 def center(text):
-    """Where a PSF's centre lies: "core", "middle", or Y,X."""
+    """Centre of a PSF: "core", "middle", or Y,X."""
     if text in ("core", "middle"):
         return None if text == "middle" else text
     try:
@@ -101,7 +101,7 @@ def center(text):
     return y, x
 
 
-def positive(text):
+def positive_number(text):
     """A number above zero."""
     number = _number(text)
     if not 0 < number < float("inf"):
@@ -117,7 +117,7 @@ def fraction(text):
     return number
 
 
-def whole(text):
+def non_negative_integer(text):
     """A whole number from 0."""
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"{text!r} is no whole number from 0")

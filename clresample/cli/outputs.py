@@ -1,4 +1,4 @@
-"""What a command is about to write, checked before it computes anything."""
+"""Checks the outputs of a command before it computes anything."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def folder_outputs(arguments, names):
 
     Raises ValueError where one of them could not be written.
     """
-    from ..files.whole_file import check_folder, check_output
+    from ..files.atomic import check_folder, check_output
 
     if not arguments.output:
         raise ValueError("-o is empty: give a folder to write into, . for this one")
@@ -28,8 +28,8 @@ def folder_outputs(arguments, names):
 
 def check_scene(arguments, scene, paths):
     """Raise ValueError, before the fit, where an output is an input or could not hold its names."""
-    from ..files.names import check_catalogue_names
-    from ..files.whole_file import check_output
+    from ..files.atomic import check_output
+    from ..files.fits_names import check_catalogue_names
 
     for path in paths if paths[0].parent.is_dir() else ():
         check_output(path, overwrite=arguments.overwrite, inputs=scene.inputs.values())
@@ -45,7 +45,7 @@ def file_outputs(arguments, inputs):
 
     Raises ValueError where one of them could not be written, or is a file that is read.
     """
-    from ..files.whole_file import check_folder, check_output
+    from ..files.atomic import check_folder, check_output
 
     if not arguments.output:
         raise ValueError("-o is empty: give a file to write")

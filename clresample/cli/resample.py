@@ -11,12 +11,12 @@ from .options import (
     add_device_option,
     add_dtype_option,
     add_profile_option,
+    byte_size,
     center,
-    names,
-    note,
-    positive,
+    name_list,
+    positive_number,
+    print_note,
     printable,
-    size,
 )
 from .outputs import file_outputs
 
@@ -83,7 +83,7 @@ def _add_parts(group):
         group.add_argument(
             f"--{prefix}band",
             metavar="BANDS",
-            type=names,
+            type=name_list,
             help=f"bands of {name}{drawn}; all by default",
         )
 
@@ -93,7 +93,7 @@ def _add_psfs(group):
         group.add_argument(
             f"--{prefix}spacing",
             metavar="PX",
-            type=positive,
+            type=positive_number,
             default=1.0,
             help=f"distance of {name}'s samples in pixels: 0.5 if oversampled twice (default 1)",
         )
@@ -106,7 +106,7 @@ def _add_psfs(group):
     group.add_argument(
         "--max-gain",
         metavar="G",
-        type=positive,
+        type=positive_number,
         default=GAIN_REFUSED,
         help="refuse PSFs that need sharpening by more than this (default %(default)g)",
     )
@@ -122,7 +122,10 @@ def _add_ways(group):
         help="move every output pixel by so many pixels of IN, where the two WCS disagree",
     )
     group.add_argument(
-        "--nan", type=float, metavar="VALUE", help="put VALUE for NaN and infinite pixels of IN"
+        "--fill-nan",
+        type=float,
+        metavar="VALUE",
+        help="put VALUE for NaN and infinite pixels of IN",
     )
     add_dtype_option(group, "arithmetic and output")
     add_device_option(group)
@@ -130,7 +133,7 @@ def _add_ways(group):
     group.add_argument(
         "--memory",
         metavar="SIZE",
-        type=size,
+        type=byte_size,
         help="device memory to stay within, as 512M or 2G; larger frames go through in tiles "
         "(default: 1G, or a quarter of the device's)",
     )
@@ -146,12 +149,12 @@ def run(arguments):
     }
     paths = file_outputs(arguments, inputs.values())
     from ..device.device import get_device
-    from ..device.waves import operator_programs
+    from ..device.mirror_contraction import operator_programs
 
     device = get_device(arguments.device)
     device.build_ahead(operator_programs(device, arguments.dtype))
+    from ..files.atomic import atomic_files
     from ..files.fits import read_image, write_fits  # a quarter of a second of astropy
-    from ..files.whole_file import whole_files
 
     image = read_image(arguments.image, hdu=arguments.hdu, bands=arguments.band)
     pixels = _finite(arguments, image)
@@ -159,7 +162,7 @@ def run(arguments):
     psfs = [_psf(arguments, which, len(pixels)) for which in ("psf", "psf_like")]
     unit = str(image.header.get("BUNIT") or "")
     if "sr" in unit.lower() or "arcsec" in unit.lower():
-        note(
+        print_note(
             arguments, f"{arguments.image}: BUNIT is {unit}, but pixels are taken as flux per pixel"
         )
 
@@ -168,7 +171,7 @@ def run(arguments):
     result = _resampled(arguments, op, pixels)
     took = time.perf_counter() - started
     written = result if len(result) > 1 else result[0]
-    with whole_files(paths) as parts:
+    with atomic_files(paths) as parts:
         write_fits(
             parts[0],
             written,
@@ -223,10 +226,10 @@ def _operator(arguments, device, grid_in, grid_out, psfs):
     if gain > arguments.max_gain:
         raise ValueError(f"{message}, more than --max-gain {arguments.max_gain:g}")
     if gain > GAIN_WARNED:
-        note(arguments, message)
+        print_note(arguments, message)
     floored = float(op.certificate.floored_power.max())
     if floored > FLOORED_POWER:
-        note(
+        print_note(
             arguments,
             f"{floored:.2%} of {arguments.psf_like}'s power lies beyond {arguments.psf}: floored",
         )
@@ -254,16 +257,19 @@ def _resampled(arguments, op, pixels):
 
 
 def _finite(arguments, image):
-    """The image's pixels; NaN and infinite ones have the value of --nan, or are refused."""
+    """The image's pixels; NaN and infinite ones have the value of --fill-nan, or are refused."""
     import numpy as np
 
-    if image.n_bad and arguments.nan is None:
+    if image.n_invalid and arguments.fill_nan is None:
         raise ValueError(
-            f"{arguments.image}: {image.n_bad} of {image.data.size} pixels are NaN or infinite, "
-            "and would spread; --nan 0 puts 0 there"
+            f"{arguments.image}: {image.n_invalid} of {image.data.size} pixels are NaN or "
+            f"infinite, "
+            "and would spread; --fill-nan 0 puts 0 there"
         )
-    if image.n_bad:
-        return np.where(np.isfinite(image.data), image.data, image.data.dtype.type(arguments.nan))
+    if image.n_invalid:
+        return np.where(
+            np.isfinite(image.data), image.data, image.data.dtype.type(arguments.fill_nan)
+        )
     return image.data
 
 
@@ -284,7 +290,7 @@ def _psf(arguments, which, n_bands):
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     for message in psf.warnings(core=f"{option}-center core"):
-        note(arguments, f"{path}: {message}")
+        print_note(arguments, f"{path}: {message}")
     if psf.n_bands not in (1, n_bands):
         raise ValueError(
             f"{path}: has {psf.n_bands} bands, {arguments.image} {n_bands}: choose with --band and "

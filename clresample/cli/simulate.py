@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from .fields.sky_options import add_images, add_sky
-from .options import note
+from .options import print_note
 
 FILES = "field.toml", "truth.ecsv"
 CLUMPS = "clumps.ecsv"  # written where a field's galaxies have clumps
@@ -37,7 +37,7 @@ def add_simulate(commands):
 
 def run(arguments):
     """Simulate and write. Raises ValueError and FileError, one line, for what cannot be done."""
-    from ..files.whole_file import check_folder, check_output
+    from ..files.atomic import check_folder, check_output
     from ..simulation.field import simulate_field
     from ..simulation.spoilers import Spoilers
 
@@ -67,7 +67,7 @@ def run(arguments):
     write = write_field if arguments.format == "plain" else write_surveys
     for path in write(folder, field, overwrite=arguments.overwrite):
         print(path)
-    note(arguments, f"next: clresample field {folder / FILES[0]} -o {folder / 'out'}")
+    print_note(arguments, f"next: clresample field {folder / FILES[0]} -o {folder / 'out'}")
 
 
 def write_field(folder, field, *, overwrite=True) -> list[Path]:
@@ -98,9 +98,9 @@ def write_surveys(folder, field, *, overwrite=True) -> list[Path]:
 
 def _written(write, folder, field, overwrite):
     """The paths of what write(part, field) has put into a folder `part`, moved to `folder`."""
-    from ..files.whole_file import whole_tree
+    from ..files.atomic import atomic_tree
 
-    with whole_tree(folder, overwrite=overwrite) as part:
+    with atomic_tree(folder, overwrite=overwrite) as part:
         paths = write(part, field)
     return [Path(folder) / path.relative_to(part) for path in paths]
 
@@ -124,7 +124,7 @@ def _write_plain(folder, field):
             mosaic.noise_sigma[:, None, None].astype(np.float32), mosaic.data.shape
         )
         tile = {"tile_shape": (1, 64, mosaic.data.shape[2])}
-        mask = fits.ImageHDU(2 * mosaic.bad.astype(np.uint8), name="MASK")
+        mask = fits.ImageHDU(2 * mosaic.bad_pixels.astype(np.uint8), name="MASK")
         mask.header["MP_BAD"] = (1, "bit of dead columns")
         hdus = [
             fits.PrimaryHDU(),
@@ -160,7 +160,7 @@ def _write_surveys(folder, field):
     """The files of `write_surveys`."""
     import numpy as np
 
-    from ..fields.psfs.sampled import PSFCube
+    from ..fields.psfs.sampled import ScatteredPSF
     from ..fields.readers.writers import write_cell_coadd, write_mer_tile
 
     euclid, rubin = field.mosaics
@@ -175,20 +175,20 @@ def _write_surveys(folder, field):
             euclid.data[i],
             euclid.grid,
             rms=np.full(euclid.grid.shape, euclid.noise_sigma[i], np.float32),
-            flags=euclid.bad.astype(np.uint8),
+            flags=euclid.bad_pixels.astype(np.uint8),
             zero_point=point,
             psfs=euclid.psf_images[:, i],
             places=euclid.psf_positions,
         )
     for i, (band, point) in enumerate(_bands(rubin)):
-        psf = PSFCube(rubin.psf_images[:, i], rubin.psf_positions)
+        psf = ScatteredPSF(rubin.psf_images[:, i], rubin.psf_positions)
         path = write_cell_coadd(
             folder / "rubin" / f"coadd_{band}.fits",
             band,
             rubin.data[i],
             rubin.grid,
             variance=np.full(rubin.grid.shape, rubin.noise_sigma[i] ** 2),
-            mask={"NO_DATA": rubin.bad},
+            mask={"NO_DATA": rubin.bad_pixels},
             zero_point=point,
             psf_at=lambda y, x, psf=psf: psf.psf_at(y, x).images[0],
             cell_px=CELL_PX,

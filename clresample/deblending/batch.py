@@ -12,17 +12,17 @@ import numpy as np
 
 from ..device.device import get_device
 from ..device.discovery import DeviceError
+from ..device.multi_device import distribute, one_blas_thread, prefetch
 from ..device.tuning import Tuning
-from ..device.workers import ahead, deal, one_blas_thread
-from ..drawing.bar import Bar
-from ..sky.given.checks import described, float_type, instance
+from ..drawing.bar import ProgressBar
 from ..sky.observation import as_observations
 from ..sky.sources import SourceWarning
+from ..sky.validation.checks import check_dtype, check_instance, described
 from .blend import INTERRUPTED, Blend, Failure
-from .components.second import asks_for_more, with_second
-from .fit import Fit, begin, data_bytes, finish, scene_bytes
+from .fit import Fit, data_bytes, render_fits, scene_bytes, start_fits
 from .inspection.inspect import InputWarning, warn_of_many
 from .iterate import iterate
+from .refit.two_component_fit import needs_second_component, refit_two_components
 from .result import Result
 from .settings import Settings
 
@@ -34,7 +34,7 @@ PAD_PX = 16
 MEMORY = 1 << 30
 # Components of the scenes of one batch: each is a group of work-items along the third axis of a
 # launch, of which GPUs take no more.
-MOST_SOURCES = 65_535
+MAX_SOURCES = 65_535
 # Blends that one of several devices is given at a time, at most: what a full batch of a GPU holds.
 SCENES_A_PORTION = 1024
 # What says by itself what went wrong with one blend; other errors are named by their kind as well.
@@ -77,15 +77,15 @@ def deblend(
     device = get_device(device)
     fit = Fit(blend, settings, device, dtype, pad=1)
     settings = fit.settings
-    begin([fit])
-    if len(fit.dark):
-        _warn_dark([fit.dark], "")
+    start_fits([fit])
+    if len(fit.undetected):
+        _warn_dark([fit.undetected], "")
     for problem in fit.problems:
         warnings.warn(problem, InputWarning, stacklevel=3)
-    iterate([fit], settings, device, dtype, progress, takes_over=asks_for_more)
+    iterate([fit], settings, device, dtype, progress, takes_over=needs_second_component)
     if fit.status != INTERRUPTED:
-        (fit,) = with_second([fit], settings, device, dtype, progress)
-    result = fit.result(*finish([fit]))
+        (fit,) = refit_two_components([fit], settings, device, dtype, progress)
+    result = fit.result(*render_fits([fit]))
     LOG.info("%r in %.2f s", result, sum(result.seconds.values()))
     return result
 
@@ -100,6 +100,7 @@ def deblend_many(
         `if __name__ == "__main__":`. Results are those of one device. One that fails is named by a
         DeviceWarning, and the others do its part
     blends: Blend, with sizes, sources, PSFs, WCS and instruments of their own
+    settings: see Settings; dtype: float32 or float64, of the fits
     memory [bytes]: of the device for one group of scenes; GPUs hold the next group's data beside it
     progress: called with the number of blends done, after each group and each failure; True draws
         a bar in terminals and notebooks, and prints a line now and then where nobody looks
@@ -112,7 +113,7 @@ def deblend_many(
     blends = list(blends)
     if progress is True:
         given = {"settings": settings, "device": device, "dtype": dtype, "memory": memory}
-        with Bar(len(blends), "blends") as bar:
+        with ProgressBar(len(blends), "blends") as bar:
             return deblend_many(blends, progress=bar, **given)
     settings, dtype = _checked(settings, dtype)
     progress = progress or (lambda n_done: None)
@@ -121,7 +122,7 @@ def deblend_many(
     given["pad"] = PAD_PX if len({_sizes(b) for b in blends} - {None}) > 1 else 1
     if isinstance(device, (list, tuple)):
         fit_some = functools.partial(_fit_all, **given)
-        pairs = deal(fit_some, blends, device, done=progress, most=SCENES_A_PORTION)
+        pairs = distribute(fit_some, blends, device, done=progress, most=SCENES_A_PORTION)
     else:
         pairs = _fit_all(blends, device=get_device(device), progress=progress, **given)
     pairs = [
@@ -140,7 +141,7 @@ def deblend_many(
 @one_blas_thread()
 def _fit_all(blends, *, device, progress=lambda n_done: None, **given):
     """(Result or Failure, what is warned about: sources far from any light, problems)."""
-    many = _ManyFits(blends, device, **given)
+    many = _BatchRunner(blends, device, **given)
     # the results of what was not done say so
     with contextlib.suppress(KeyboardInterrupt):
         many.run(progress)
@@ -150,7 +151,7 @@ def _fit_all(blends, *, device, progress=lambda n_done: None, **given):
     ]
 
 
-class _ManyFits:
+class _BatchRunner:
     """Blends on their way through groups of fits that share a batch.
 
     done: for each blend its Result or Failure, None before that
@@ -166,7 +167,9 @@ class _ManyFits:
     def run(self, progress):
         """Fit them all; raises KeyboardInterrupt when the group that runs was interrupted."""
         n_done, groups = 0, self._groups()
-        with contextlib.closing(ahead(groups) if self.tuning.ahead else groups) as begun:
+        with contextlib.closing(
+            prefetch(groups) if self.tuning.prefetch_groups else groups
+        ) as begun:
             for n, group in begun:
                 interrupted = self._fit(group)
                 del group  # before the next one is made
@@ -176,12 +179,15 @@ class _ManyFits:
                     raise KeyboardInterrupt
 
     def _groups(self):
-        """Groups of (index, Fit) that have begun, as they fill up, each with the number of blends
-        that are done with it; empty where a blend has failed."""
+        """Groups of (index, Fit) that have begun, as they fill up.
+
+        Each comes with the number of blends that are done with it; a group is empty where a blend
+        has failed.
+        """
         waiting = defaultdict(list)
         for i, blend in enumerate(self.blends):
             try:
-                instance("blend", blend, Blend)
+                check_instance("blend", blend, Blend)
                 fit = Fit(blend, self.settings, self.device, self.dtype, pad=self.pad)
             except Exception as error:
                 self.done[i] = _failure(blend, error)
@@ -191,7 +197,7 @@ class _ManyFits:
             group.append((i, fit))
             n_sources = [len(f.fitted) for _, f in group]
             full = sum(data_bytes(f) for _, f in group) + data_bytes(fit) > self.memory
-            full |= sum(n_sources) >= START_SOURCES or sum(n_sources) + n_sources[-1] > MOST_SOURCES
+            full |= sum(n_sources) >= START_SOURCES or sum(n_sources) + n_sources[-1] > MAX_SOURCES
             if full or len(group) >= self.tuning.n_scenes:
                 yield self._begun(waiting.pop(fit.signature))
         while waiting:
@@ -203,14 +209,14 @@ class _ManyFits:
     def _begin(self, group):
         """Start a group of (index, Fit); those that could, one by one where all at once fails."""
         try:
-            begin([fit for _, fit in group])
+            start_fits([fit for _, fit in group])
         except Exception as error:
             if len(group) > 1:
                 return [item for one in group for item in self._begin([one])]
             (i, fit), *_ = group
             self.done[i] = _failure(fit.blend, error)
             return []
-        self.warned |= {i: (fit.dark, fit.problems) for i, fit in group}
+        self.warned |= {i: (fit.undetected, fit.problems) for i, fit in group}
         return group
 
     def _fit(self, group):
@@ -239,10 +245,10 @@ class _ManyFits:
         fits = [fit for _, fit in group]
         run = fits[0].settings, self.device, self.dtype
         try:
-            iterate(fits, *run, takes_over=asks_for_more)
+            iterate(fits, *run, takes_over=needs_second_component)
             if not any(fit.status == INTERRUPTED for fit in fits):
-                fits = with_second(fits, *run)
-            seen = finish(fits)
+                fits = refit_two_components(fits, *run)
+            seen = render_fits(fits)
         except Exception as error:
             if len(group) == 1:
                 yield group[0][0], _failure(group[0][1].blend, error)
@@ -261,9 +267,9 @@ class _ManyFits:
 
 def _checked(settings, dtype):
     """Settings, the default ones for None, and the NumPy type. ValueError for anything else."""
-    return instance("settings", Settings() if settings is None else settings, Settings), float_type(
-        dtype
-    )
+    return check_instance(
+        "settings", Settings() if settings is None else settings, Settings
+    ), check_dtype(dtype)
 
 
 def _listed(name, values):

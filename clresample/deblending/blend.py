@@ -7,20 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..sky.frame import Frame, model_frame
-from ..sky.given.checks import instance, numbers
 from ..sky.observation import Observation, check_observations
 from ..sky.sources import Source
+from ..sky.validation.checks import as_float_array, check_instance
 
 # Status of a fit whose loss falls no further, and of its result if that does not describe the data.
 CONVERGED, MISFIT = "converged", "misfit"
 # Status of a fit until something else ends it than `max_iter`, and of one that Ctrl-C ended.
-UNFINISHED, INTERRUPTED = "iteration limit", "interrupted"
+ITERATION_LIMIT, INTERRUPTED = "iteration limit", "interrupted"
 # That of a fit whose scene another one takes over; no result has it.
-HANDED_OVER = "handed over"
+STOPPED_FOR_REFIT = "stopped for refit"
 # What one fit takes at most. Its spectra are solved together, n^3 for n components: 2000 take
 # minutes. Arrays of components times pixels are held several at a time. A blend of 4096 pixels a
 # side has no neighbours that would need to be fitted at once.
-MOST_COMPONENTS, MOST_BYTES, MOST_PIXELS = 2000, 8 << 30, 1 << 24
+MAX_COMPONENTS, MAX_BYTES, MAX_PIXELS = 2000, 8 << 30, 1 << 24
 # [bytes] What a fit holds for each pixel of a component's box, here one of bright galaxies, and for
 # each pixel of the frame and the data: 60 sources at 512 px take 0.4 GB, 300 at 1024 px 1 GB.
 BYTES_A_BOX, BOX_PIXELS, BYTES_A_PIXEL = 40, 256 * 256, 100
@@ -45,19 +45,19 @@ class Blend:
     def check(self):
         """Raise ValueError where an observation, a source or the frame is something else."""
         for i, observation in enumerate(self.observations):
-            instance(f"observations[{i}]", observation, Observation)
+            check_instance(f"observations[{i}]", observation, Observation)
         for i, source in enumerate(self.sources):
-            instance(f"sources[{i}]", source, Source)
+            check_instance(f"sources[{i}]", source, Source)
         if self.frame is not None:
-            instance("frame", self.frame, Frame)
+            check_instance("frame", self.frame, Frame)
 
     def _check_work(self, frame):
         """Raise ValueError where a fit would take more than could be meant, before it begins."""
         n_pixels = int(np.prod(frame.shape, dtype=float))
-        if n_pixels > MOST_PIXELS:
+        if n_pixels > MAX_PIXELS:
             raise ValueError(
                 f"the model frame has {frame.shape[0]} x {frame.shape[1]} pixels, more than the "
-                f"{MOST_PIXELS} of one fit: are the WCS right? If so, cut the field into blends"
+                f"{MAX_PIXELS} of one fit: are the WCS right? If so, cut the field into blends"
             )
         n = sum(getattr(source, "n_components", 1) or 1 for source in self.sources)
         n_seen = max(int(np.count_nonzero(o.weights, axis=(1, 2)).max()) for o in self.observations)
@@ -68,25 +68,27 @@ class Blend:
             )
         n_bytes = BYTES_A_BOX * n * min(n_pixels, BOX_PIXELS)
         n_bytes += BYTES_A_PIXEL * (n_pixels + sum(o.data.size for o in self.observations))
-        if n > MOST_COMPONENTS or n_bytes > MOST_BYTES:
+        if n > MAX_COMPONENTS or n_bytes > MAX_BYTES:
             raise ValueError(
                 f"{len(self.sources)} sources with {n} components on {n_pixels} model pixels need "
-                f"{n_bytes / 2**30:.3g} GiB in one fit; it takes {MOST_COMPONENTS} components and "
-                f"{MOST_BYTES >> 30} GiB at most: cut the field into blends for deblend_many"
+                f"{n_bytes / 2**30:.3g} GiB in one fit; it takes {MAX_COMPONENTS} components and "
+                f"{MAX_BYTES >> 30} GiB at most: cut the field into blends for deblend_many"
             )
 
-    def known_shifts(self) -> np.ndarray:
+    def initial_shifts(self) -> np.ndarray:
         """Shifts (n_observations, 2) [model px], 0 where none are given.
 
         ValueError: they are not as many, or not finite.
         """
         expected = len(self.observations), 2
-        shifts = np.zeros(expected) if self.shifts is None else numbers("shifts", self.shifts)
+        shifts = (
+            np.zeros(expected) if self.shifts is None else as_float_array("shifts", self.shifts)
+        )
         if shifts.shape != expected or not np.isfinite(shifts).all():
             raise ValueError(f"shifts is {shifts.tolist()}, must be {expected} finite numbers")
         return shifts
 
-    def made_frame(self) -> Frame:
+    def resolve_frame(self) -> Frame:
         """The frame, or one made for the observations, which are checked on the way.
 
         ValueError: observations that do not go together, a profile of another shape than the frame.

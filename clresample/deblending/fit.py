@@ -10,17 +10,23 @@ import numpy as np
 
 from ..resampling.transfer import noise_warnings
 from ..sky.frame import Frame
-from .blend import INTERRUPTED, UNFINISHED
+from .blend import INTERRUPTED, ITERATION_LIMIT
+from .component_images import ComponentImages
 from .inspection.inspect import inspect
 from .posterior.posterior import with_errors
-from .rendered import Rendered
 from .result import Component, Result
-from .solver.learned.engine import vector_bytes
+from .solver.multiscale.engine import vector_bytes
 from .solver.scene import Scene, State, signature_of
+from .start.final_render import MorphologyModel, RenderedModel, render_models
 from .start.first_scene import first_scene
-from .start.seen import Model, Seen, see
-from .start.start import LIGHT_SIGMAS, Patch, StartingPoint, start, weighed
-from .view import Home, pixel_noise, tied_views, view_as_taken, whitened_view
+from .start.profile_start import (
+    LIGHT_SIGMAS,
+    StartingPoint,
+    StartInput,
+    fit_start_profiles,
+    with_psf_error_weights,
+)
+from .view import SceneGeometry, pixel_noise, tied_views, unfiltered_view, whitened_view
 
 # The stopping rule compares the best loss with the best one this many iterations ago: losses of
 # single iterations scatter, and a smaller number would take a pause for the end.
@@ -30,7 +36,7 @@ DIVERGED = 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class _Best:
+class _BestState:
     """The lowest loss so far, and what it belongs to."""
 
     loss: float
@@ -45,25 +51,27 @@ class Fit:
     blend, settings, frame: what is fitted, how, and on which Frame; as `inspect` returns them
     problems (n,): sentences on what that has found; sky_levels: SkyLevel of each observation
     sources: the blend's, with positions in the frame's pixels where an observation's were given
-    fitted (n,): indices of those inside the frame; dark (n_dark,): of those far from any light
+    fitted (n,): indices of those inside the frame; undetected (n_dark,): of those far from any
+        light
     views: the observations as WhitenedViews, whose operators hold the observations' shifts
     noise (C,): of one model pixel, in the views' units; unit (C,) [counts]: of these
     ties: Ties of the channels, or None
-    padded: the frame with its sides grown to those that a batch shares; home: Home
+    padded: the frame with its sides grown to those that a batch shares; geometry: SceneGeometry
     last_steps (n_observations, 2) [model px]: what shifts were last asked for, before `ahead`
     start: the StartingPoint that `begin` was given; from then on
-    scene, state: Scene and State, as of the start or of where `settle` left them; findings: what a
-        LearnedPrior has learned by then, or None; losses, status, messages, seconds: see Result
+    scene, state: Scene and State, as of the start or of where `store_final` left them;
+        strength_estimates: what a MultiscalePrior has learned by then, or None; losses, status,
+            messages, seconds: see Result
     """
 
     def __init__(self, blend, settings, device, dtype, *, pad):
         began = time.perf_counter()
-        self.frame = blend.made_frame()
-        shifts = blend.known_shifts()
-        positions = self.frame.place(blend.sources, blend.observations, shifts)
+        self.frame = blend.resolve_frame()
+        shifts = blend.initial_shifts()
+        positions = self.frame.positions_of(blend.sources, blend.observations, shifts)
         found = inspect(blend, self.frame, positions, shifts, settings)
         blend, settings, shifts = found.blend, found.settings, found.shifts
-        positions = self.frame.place(blend.sources, blend.observations, shifts)
+        positions = self.frame.positions_of(blend.sources, blend.observations, shifts)
         inside, outside = _inside(self.frame, positions)
         pairs = zip(blend.sources, positions, strict=True)
         self.sources = tuple(source.on_frame(position) for source, position in pairs)
@@ -71,9 +79,11 @@ class Fit:
         self.problems, self.sky_levels = found.messages, found.levels
         self.messages, self.fitted = outside + self.problems, np.flatnonzero(inside)
         padded, private = _padded_frame(self.frame, pad), settings.fit_shifts or shifts.any()
-        self.home = Home(self.frame, padded, positions[self.fitted], settings.psf_tolerance)
+        self.geometry = SceneGeometry(
+            self.frame, padded, positions[self.fitted], settings.psf_tolerance
+        )
         view = partial(whitened_view, pad=pad, device=device, dtype=dtype, private=private)
-        views = [view(self.home, o) for o in blend.observations]
+        views = [view(self.geometry, o) for o in blend.observations]
         self.views = tied_views(views, blend.observations)
         if settings.fit_sky:
             pairs = zip(self.views, self.sky_levels, strict=True)
@@ -83,21 +93,21 @@ class Fit:
             self.shift(shifts)
         for o, view in zip(blend.observations, self.views, strict=True):
             self.messages += [f"{o.label}: {line}" for line in noise_warnings(view.op.certificate)]
-        if not any(view.root.any() for view in self.views):
+        if not any(view.sqrt_weights.any() for view in self.views):
             raise ValueError("no observed pixel on the model frame has a weight")
-        self.unit = np.concatenate([view.unit for view in self.views])
+        self.unit = np.concatenate([view.noise_unit for view in self.views])
         self.noise = pixel_noise(self.views)
         self.padded, self._positions, self.start = padded, positions, None
-        self.losses, self.status, self.findings = [], UNFINISHED, None
-        self._best = _Best(np.inf, None, None, self.shifts)
+        self.losses, self.status, self.strength_estimates = [], ITERATION_LIMIT, None
+        self._best = _BestState(np.inf, None, None, self.shifts)
         self.last_steps = np.zeros_like(self.shifts)
         self.seconds = {"setup": time.perf_counter() - began}
 
     @property
-    def patch(self) -> Patch:
-        """What its start is made from."""
+    def patch(self) -> StartInput:
+        """Inputs of the start of this fit."""
         i = self.fitted
-        return Patch(self.frame, [self.sources[k] for k in i], self._positions[i], self.views)
+        return StartInput(self.frame, [self.sources[k] for k in i], self._positions[i], self.views)
 
     @property
     def signature(self):
@@ -109,9 +119,9 @@ class Fit:
     def begin(self, point: StartingPoint, seconds):
         """Make the scene and its state from where it starts; seconds: that this took."""
         began = time.perf_counter()
-        self.views, self.start = weighed(self.patch, point, self.settings)
-        self.dark = self.fitted[point.dark]
-        self.messages += [_dark_message(i, self._positions[i]) for i in self.dark]
+        self.views, self.start = with_psf_error_weights(self.patch, point, self.settings)
+        self.undetected = self.fitted[point.undetected]
+        self.messages += [_dark_message(i, self._positions[i]) for i in self.undetected]
         self.scene, self.state = first_scene(self)
         self.seconds["setup"] += seconds + time.perf_counter() - began
 
@@ -138,13 +148,18 @@ class Fit:
     def stopped(self, losses) -> bool:
         """Take the losses (n,) of the last iterations; whether the fit ends here, and why."""
         self.losses.extend(losses.tolist())
-        reason = stop_reason(self.losses, len(losses), self.settings.tol)
+        reason = stop_reason(self.losses, len(losses), self.settings.rel_tol)
         self.status = reason or self.status
         return reason is not None
 
     def end(self, scene, state, findings, status):
         """End here, with this state."""
-        self.scene, self.state, self.findings, self.status = scene, state, findings, status
+        self.scene, self.state, self.strength_estimates, self.status = (
+            scene,
+            state,
+            findings,
+            status,
+        )
 
     def interrupt(self):
         """Note that the fit ends because the user wants it to."""
@@ -154,14 +169,16 @@ class Fit:
         """Take down how long a stage has taken."""
         self.seconds[stage] = seconds
 
-    def remember(self, loss, scene, state):
+    def keep_best(self, loss, scene, state):
         """Keep a state, at the present shifts, if its loss is the lowest so far."""
         if loss < self._best.loss:
-            self._best = _Best(float(loss), scene, state, self.shifts)
+            self._best = _BestState(float(loss), scene, state, self.shifts)
 
-    def settle(self, loss, scene, state):
-        """End here, with the present state, or with the best one where that is better; the present
-        one, if it was interrupted, may be half-way through an iteration."""
+    def store_final(self, loss, scene, state):
+        """End here, with the present state, or with the best one where that is better.
+
+        The present one, if it was interrupted, may be half-way through an iteration.
+        """
         best = self._best
         if self.status != INTERRUPTED and loss <= best.loss:
             self.scene, self.state = scene, state
@@ -173,8 +190,8 @@ class Fit:
             return
         self.losses.append(float(loss))
 
-    def result(self, seen: Seen) -> Result:
-        """Everything back in the data's own units; seen: by `finish`."""
+    def result(self, seen: RenderedModel) -> Result:
+        """Everything back in the data's own units; seen: by `render_fits`."""
         began, scene, peaks = time.perf_counter(), self.scene, _peaks(self.state)
         morphs = _scaled(self.state)
         components = [
@@ -205,19 +222,19 @@ class Fit:
         return with_errors(self, result, peaks, seen)
 
 
-def begin(fits):
+def start_fits(fits):
     """Start fits of one signature side by side."""
     began = time.perf_counter()
-    points = start([fit.patch for fit in fits], fit_sky=fits[0].settings.fit_sky)
+    points = fit_start_profiles([fit.patch for fit in fits], fit_sky=fits[0].settings.fit_sky)
     seconds = (time.perf_counter() - began) / len(fits)
     for fit, point in zip(fits, points, strict=True):
         fit.begin(point, seconds)
 
 
-def finish(fits) -> list[Seen]:
-    """What `Fit.result` takes of fits that have ended, of one signature, side by side."""
+def render_fits(fits) -> list[RenderedModel]:
+    """Renders ended fits of one batch key side by side, as `Fit.result` needs them."""
     began = time.perf_counter()
-    found = see([_model(fit) for fit in fits], fit_sky=fits[0].settings.fit_sky)
+    found = render_models([_model(fit) for fit in fits], fit_sky=fits[0].settings.fit_sky)
     for fit in fits:
         fit.note_seconds("result", (time.perf_counter() - began) / len(fits))
     return found
@@ -228,13 +245,13 @@ def _joined(parts, n_channels):
     return np.zeros(n_channels) if parts[0] is None else np.concatenate(parts)
 
 
-def _model(fit) -> Model:
+def _model(fit) -> MorphologyModel:
     """A fit's morphologies as they are by now, max = 1, and what sees them."""
     pairs = zip(fit.views, fit.blend.observations, strict=True)
-    return Model(
+    return MorphologyModel(
         fit.padded.shape,
         fit.views,
-        [view_as_taken(fit.home, o, v) if o.noise is not None else None for v, o in pairs],
+        [unfiltered_view(fit.geometry, o, v) if o.noise is not None else None for v, o in pairs],
         fit.start.source,
         fit.scene.origin,
         _scaled(fit.state),
@@ -259,13 +276,13 @@ def data_bytes(fit) -> int:
 
 def scene_bytes(fit) -> int:
     """Device memory [bytes] that a fit takes in a batch, roughly, once it has begun."""
-    learns, prior = fit.settings.learns, fit.settings.prior
+    learns, prior = fit.settings.has_multiscale_prior, fit.settings.prior
     return fit.scene.n_bytes + (vector_bytes(fit.scene, prior) if learns else 0)
 
 
 def _inside(frame, positions):
-    """Which positions (n,) lie inside the frame, and messages of the others; ValueError if none."""
-    inside, n = frame.inside(positions), len(positions)
+    """Positions (n,) inside the frame, and messages about the others; ValueError if none is."""
+    inside, n = frame.contains(positions), len(positions)
     if not inside.any():
         raise ValueError(f"none of the {n} sources lies inside the model frame {frame.shape}")
     return inside, [
@@ -279,12 +296,12 @@ def _rendered(fit, seen):
     """See Result.rendered: of an observation as it was taken, 0 where the frame does not cover."""
     rendered = []
     for view, o, here, bare in zip(
-        fit.views, fit.blend.observations, seen.observed, seen.bare, strict=True
+        fit.views, fit.blend.observations, seen.observed, seen.unfiltered_views, strict=True
     ):
         found = here if bare is None else bare
         shape = len(found), *o.data.shape
         images = [image * view.covered[found.window(i)] for i, image in enumerate(found.images)]
-        rendered.append(Rendered.cropped(shape, found.low, images))
+        rendered.append(ComponentImages.cropped(shape, found.low, images))
     return tuple(rendered)
 
 
@@ -295,7 +312,7 @@ def _padded_frame(frame, pad):
 
 
 def _dark_message(i_source, position):
-    """What to say of a source far from any light."""
+    """Message about a source far from any light."""
     y, x = position
     return (
         f"source {i_source} at (y, x) = ({y:.1f}, {x:.1f}) [px] in the model frame lies far from "

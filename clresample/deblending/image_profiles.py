@@ -15,10 +15,10 @@ import numpy as np
 from ..device.device import get_device
 from ..resampling.resampler import Resampler
 from ..sky.frame import model_frame
-from ..sky.sources import Extended
+from ..sky.sources import ExtendedSource
 from .blend import Blend
 from .solver.boxes import Boxes
-from .solver.constraints import Chain, MaxNorm, Monotone, Positivity
+from .solver.constraints import MaxNorm, Monotone, Positivity, ProxChain
 
 # [sigma] What an instrument shows at a source's centre from which on its image is taken: below, the
 # noise would shape the morphology. And what a pixel needs to count as light.
@@ -31,18 +31,20 @@ RADIUS_PX = 30
 def with_image_profiles(blend: Blend, *, device=None) -> Blend:
     """The blend with a `profile` for each extended source of one component that has none.
 
+    device: see get_device
+
     Raises ValueError where `model_frame` does.
     """
     device = get_device(device)
     frame = blend.frame or model_frame(blend.observations)
-    positions = frame.place(blend.sources, blend.observations, blend.known_shifts())
-    inside = frame.inside(positions)
+    positions = frame.positions_of(blend.sources, blend.observations, blend.initial_shifts())
+    inside = frame.contains(positions)
     views = [_in_frame(o, frame, device) for o in blend.observations]
     order = np.argsort([_sharpness(o) for o in blend.observations], kind="stable")
     sources = list(blend.sources)
     for i in np.flatnonzero(inside):
         source = sources[i]
-        if not isinstance(source, Extended) or source.n_components not in (None, 1):
+        if not isinstance(source, ExtendedSource) or source.n_components not in (None, 1):
             continue
         if source.profile is None:
             profile = _profile(frame.shape, positions[i], [views[k] for k in order], device)
@@ -77,7 +79,7 @@ def _profile(shape, position, views, device):
 
     boxes = Boxes(np.zeros(1, int), low[None], np.array([image.shape]), (center - low)[None])
     morph = device.put(boxes.pack([image]))
-    Chain(Positivity(), Monotone(), MaxNorm()).prox(morph, boxes.put(device))
+    ProxChain(Positivity(), Monotone(), MaxNorm()).prox(morph, boxes.put(device))
     out = np.zeros(shape)
     out[part] = boxes.unpack(device.get(morph))[0]
     return out

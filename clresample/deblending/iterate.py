@@ -7,49 +7,54 @@ import time
 
 import numpy as np
 
-from .blend import HANDED_OVER
-from .posterior.exchange import exchange_of, step_of
-from .resize import resized
-from .shifts import ahead, shift_steps
+from .blend import STOPPED_FOR_REFIT
+from .posterior.joint_step import make_joint_step, solve_joint_step
+from .resize import resize_boxes
+from .shifts import extrapolate, shift_steps
 from .solver.engine import Engine
-from .solver.learned.engine import LearnedEngine
-from .solver.learned.progress import PATIENCE
+from .solver.multiscale.engine import MultiscaleEngine
+from .solver.multiscale.lbfgs_control import CONVERGENCE_WINDOW
 
 # [iterations] between two looks at the losses: each waits for the device, but fits stop only there.
-CHECK = 5
+CHECK_ITERATIONS = 5
 # [iterations] between two shifts of the observations: by then the model has followed most of the
 # last one. Fewer would measure a shift on a model that lags behind, more would take longer.
-MOVE = 10
+SHIFT_ITERATIONS = 10
 # Part of a batch's fits that have stopped by when the others go on in a smaller batch: making that
 # costs some iterations, and until then the stopped ones are still computed.
-REPACK = 0.25
-# A fit under a LearnedPrior stays where it is if the next shift would lower its loss by less than
-# this part of what ends it.
-LEAST_GAIN = 0.5
+REPACK_FRACTION = 0.25
+# A fit under a MultiscalePrior stays where it is if the next shift would lower its loss by less
+# than this part of what ends it.
+MIN_GAIN = 0.5
 # [iterations] When a fit whose strengths have settled takes a step of its Exchange: at first, and
 # between two; also where it has converged. Every 40 of them, bright scenes take a third longer.
-FIRST_EXCHANGE, EXCHANGE = 40, 20
+FIRST_JOINT_STEP, JOINT_STEP_ITERATIONS = 40, 20
 # It takes the step if its loss is expected to fall by more than this part of what ends it. With
 # 0.4, two in 100 fluxes of simulated scenes of Rubin's or Euclid's alone move by over 0.2 errors
 # where fits go on, with 0.2 one in 200.
-LEAST_EXCHANGE = 0.2
+MIN_JOINT_GAIN = 0.2
 # If until the next one the loss has fallen by less than this part of what an Exchange promised, it
 # is made anew, of the scene as it is now. The second one is given up: bounds hold the scene
 # elsewhere, and trials along its steps would be refused.
-LEAST_KEPT, MOST_MADE = 0.2, 2
+MIN_JOINT_PROGRESS, MAX_JOINT_MATRICES = 0.2, 2
 # [iterations] between two adjustments of the boxes to the light they hold; each makes a new batch.
-RESIZE = 40
+RESIZE_ITERATIONS = 40
 
 
 def iterate(fits, settings, device, dtype, progress=None, *, takes_over=None):
     """Run the fits of one signature until each has stopped; they keep their final states.
 
-    takes_over: of a fit that has learned clear structure; where True the fit ends, HANDED_OVER
+    takes_over: of a fit that has learned clear structure; where True the fit ends,
+        STOPPED_FOR_REFIT
     """
     began, running = time.perf_counter(), None
     try:
         given = fits, settings, device, dtype
-        running = _Learning(*given, takes_over=takes_over) if settings.learns else _Running(*given)
+        running = (
+            _LbfgsRun(*given, takes_over=takes_over)
+            if settings.has_multiscale_prior
+            else _AmsgradRun(*given)
+        )
         while running.n_steps < settings.max_iter:
             losses = running.run()
             if progress is not None:
@@ -59,7 +64,7 @@ def iterate(fits, settings, device, dtype, progress=None, *, takes_over=None):
             running.shift()
             running = running.repacked()
     except KeyboardInterrupt:
-        handed_over = [f for f in fits if f.status == HANDED_OVER]
+        handed_over = [f for f in fits if f.status == STOPPED_FOR_REFIT]
         for f in handed_over + (running.going() if running else fits):
             f.interrupt()
         if running:
@@ -68,7 +73,7 @@ def iterate(fits, settings, device, dtype, progress=None, *, takes_over=None):
         f.note_seconds("fit", (time.perf_counter() - began) / len(fits))
 
 
-class _Running:
+class _AmsgradRun:
     """The fits of one engine, on their way.
 
     fits (B): in the engine's order; live (B,): those that have not stopped
@@ -82,7 +87,7 @@ class _Running:
             states or [f.state for f in self.fits],
             device,
             dtype,
-            chain=settings.chain,
+            chain=settings.constraint_chain,
             prior=settings.prior,
             step_sizes=settings.step_sizes,
         )
@@ -99,7 +104,7 @@ class _Running:
     def run(self):
         """Some iterations, after which fits may have stopped; their losses (n, B)."""
         engine, max_iter = self.engine, self.settings.max_iter
-        losses = engine.run(min(CHECK, max_iter - engine.n_steps))
+        losses = engine.run(min(CHECK_ITERATIONS, max_iter - engine.n_steps))
         stop = np.zeros(len(self.fits), bool)
         for i in np.flatnonzero(self.live):
             stop[i] = self.fits[i].stopped(losses[:, i])
@@ -114,63 +119,63 @@ class _Running:
         """Bring the states kept on the device to those of the fits (B,) that had none better."""
         losses, kept = self.engine.best_losses(), self.engine.states(kept=True)
         for i in np.flatnonzero(which):
-            self.fits[i].remember(losses[i], self.engine.scenes[i], kept[i])
+            self.fits[i].keep_best(losses[i], self.engine.scenes[i], kept[i])
 
     def settle(self, stop):
         """Leave the fits (B,) that stop here with their final state and its loss."""
         self.remember(stop)
         states, losses = self.engine.states(), self.engine.final_losses()
         for i in np.flatnonzero(stop):
-            self.fits[i].settle(losses[i], self.engine.scenes[i], states[i])
+            self.fits[i].store_final(losses[i], self.engine.scenes[i], states[i])
 
     def shift(self):
         """Shift the observations, where that is asked for and due."""
-        if not self.settings.fit_shifts or self.engine.n_steps % MOVE:
+        if not self.settings.fit_shifts or self.engine.n_steps % SHIFT_ITERATIONS:
             return
         self.remember(self.live)
         states = self.engine.states()
         for i in np.flatnonzero(self.live):
             f = self.fits[i]
             f.shift(f.shifts + shift_steps(self.engine.scenes[i], states[i])[0])
-        self.engine.follow_shifts()
+        self.engine.update_shifts()
 
-    def repacked(self) -> _Running:
-        """What goes on: itself, or a new batch where boxes change or enough fits have stopped."""
-        engine, resize = self.engine, self.engine.n_steps % RESIZE == 0
-        if not resize and (~self.live).mean() < REPACK:
+    def repacked(self) -> _AmsgradRun:
+        """Returns itself, or a new batch where boxes change or enough fits have stopped."""
+        engine, resize = self.engine, self.engine.n_steps % RESIZE_ITERATIONS == 0
+        if not resize and (~self.live).mean() < REPACK_FRACTION:
             return self
         states, going = engine.states(), np.flatnonzero(self.live)
         pairs = [(engine.scenes[i], states[i]) for i in going]
         if resize:
             fits = [self.fits[i] for i in going]
-            pairs = [resized(*pair, f.start, f.noise) for f, pair in zip(fits, pairs)]
+            pairs = [resize_boxes(*pair, f.start, f.noise) for f, pair in zip(fits, pairs)]
         same = [scene is engine.scenes[i] for i, (scene, _) in zip(going, pairs)]
         if all(same) and len(going) == len(self.fits):
             return self
         self.remember(self.live)
         scenes, states = map(list, zip(*pairs, strict=True))
-        return _Running(self.going(), self.settings, self.device, self.dtype, scenes, states)
+        return _AmsgradRun(self.going(), self.settings, self.device, self.dtype, scenes, states)
 
 
-class _Learning:
-    """The fits of one engine under a LearnedPrior, on their way; else as _Running.
+class _LbfgsRun:
+    """The fits of one engine under a MultiscalePrior, on their way; else as _AmsgradRun.
 
     Boxes stay as they are: structure fades at their edges, as the profile does that they follow.
 
     exchanges (B): each fit's Exchange, or None; asked (B, 4): when that was last looked at a fit's
         rounds and loss, 0 and infinite before, the gain that it promised, and how many were made
-    takes_over: see `iterate`
+    stop_for_refit: see `iterate`
     """
 
     def __init__(self, fits, settings, device, dtype, past=None, *, takes_over=None):
         self.fits, self.settings, self.device, self.dtype = list(fits), settings, device, dtype
-        self.takes_over = takes_over
+        self.stop_for_refit = takes_over
         if past is None:
             self.exchanges = [None] * len(fits)
             self.asked = np.tile([0, np.inf, 0, 0], (len(fits), 1))
             scenes, states = [f.scene for f in fits], [f.state for f in fits]
-            self.engine = LearnedEngine(
-                scenes, states, device, dtype, settings.prior, settings.enough
+            self.engine = MultiscaleEngine(
+                scenes, states, device, dtype, settings.prior, settings.loss_tol
             )
         else:
             self.engine, self.exchanges, self.asked = past
@@ -192,12 +197,12 @@ class _Learning:
     def run(self):
         """Some iterations, after which fits may have stopped; their losses (1, B)."""
         engine, live = self.engine, self.live.copy()
-        n_steps = min(self.n_steps + CHECK, self.settings.max_iter)
+        n_steps = min(self.n_steps + CHECK_ITERATIONS, self.settings.max_iter)
         while self.n_steps < n_steps and self.live.any():
-            looked = engine.progress.looked.copy()
+            looked = engine.progress.tested.copy()
             for i in np.flatnonzero(engine.round()):
                 self.fits[i].losses.append(float(engine.progress.loss[i]))
-            live &= ~self._handed_over(live & engine.progress.looked & ~looked)
+            live &= ~self._handed_over(live & engine.progress.tested & ~looked)
             self._exchange(live)
         if self.settings.fit_shifts and self.n_steps < self.settings.max_iter:
             self._move(live & engine.progress.converged)
@@ -210,7 +215,7 @@ class _Learning:
 
     def shift(self):
         """Shift the observations, where that is asked for and due."""
-        if self.settings.fit_shifts and self.n_steps % MOVE == 0:
+        if self.settings.fit_shifts and self.n_steps % SHIFT_ITERATIONS == 0:
             self._move(self.live)
 
     def _move(self, which):
@@ -218,46 +223,48 @@ class _Learning:
         if not which.any():
             return
         states, moved = self.engine.states(), np.zeros(len(self.fits), bool)
-        enough = self.settings.enough * self.engine.progress.chi2()
+        enough = self.settings.loss_tol * self.engine.progress.chi2()
         for i in np.flatnonzero(which):
             steps, gain = shift_steps(self.engine.scenes[i], states[i])
-            moved[i] = gain > LEAST_GAIN * enough[i]
+            moved[i] = gain > MIN_GAIN * enough[i]
             if moved[i]:
                 f = self.fits[i]
-                f.shift(f.shifts + ahead(steps, f.last_steps))
+                f.shift(f.shifts + extrapolate(steps, f.last_steps))
                 f.last_steps = steps
         if moved.any():
-            self.engine.follow_shifts(moved)
+            self.engine.update_shifts(moved)
 
     def _handed_over(self, which):
         """Those of the fits (B,) that end here, since another one takes their scene over."""
-        if not which.any() or self.takes_over is None:
+        if not which.any() or self.stop_for_refit is None:
             return np.zeros_like(which)
-        which = which & self.engine.strengths.clear_scenes()
+        which = which & self.engine.strengths.significant_scenes()
         if which.any():
             self.settle(which)
         for i in np.flatnonzero(which):
-            which[i] = self.takes_over(self.fits[i])
+            which[i] = self.stop_for_refit(self.fits[i])
             if which[i]:
-                self.fits[i].status = HANDED_OVER
+                self.fits[i].status = STOPPED_FOR_REFIT
         self.engine.progress.live &= ~which
         return which
 
     def _exchange(self, which):
-        """Let those of the fits (B,) whose time has come take a step of their Exchange, if it gains
-        enough; those that have converged then go on."""
+        """Takes the joint step of those fits (B,) whose time has come, if it gains enough.
+
+        Those that have converged then go on.
+        """
         engine, p = self.engine, self.engine.progress
-        enough = LEAST_EXCHANGE * self.settings.enough * p.chi2()
+        enough = MIN_JOINT_GAIN * self.settings.loss_tol * p.chi2()
         rounds, loss, promised, made = self.asked.T
         there = np.array([e is not None for e in self.exchanges])
-        due = p.n_rounds >= np.maximum(rounds + EXCHANGE, FIRST_EXCHANGE)
+        due = p.n_rounds >= np.maximum(rounds + JOINT_STEP_ITERATIONS, FIRST_JOINT_STEP)
         with np.errstate(invalid="ignore"):  # of a fit whose loss was never a number
             fallen = loss - p.loss
-        failed = there & (fallen < LEAST_KEPT * promised)
-        old = failed & (made < MOST_MADE)
-        ready = p.converged | (p.live & p.settled & p.looked & due)
+        failed = there & (fallen < MIN_JOINT_PROGRESS * promised)
+        old = failed & (made < MAX_JOINT_MATRICES)
+        ready = p.converged | (p.live & p.settled & p.tested & due)
         which = which & ready & ((fallen > enough) | old)
-        if not which.any() or self.n_steps + PATIENCE >= self.settings.max_iter:
+        if not which.any() or self.n_steps + CONVERGENCE_WINDOW >= self.settings.max_iter:
             return  # a fit takes that long to converge again
         new = which & ((made == 0) | old)
         self.asked[which] = np.stack([p.n_rounds, p.loss, 0 * p.loss, made + new], 1)[which]
@@ -268,11 +275,11 @@ class _Learning:
             for i in np.flatnonzero(new):
                 given = engine.scenes[i], states[i], findings[i]
                 with contextlib.suppress(np.linalg.LinAlgError):
-                    self.exchanges[i] = exchange_of(self.fits[i], *given)
+                    self.exchanges[i] = make_joint_step(self.fits[i], *given)
         which &= np.array([e is not None for e in self.exchanges])
         slopes, steps = engine.slopes(which) if which.any() else (), {}
         for i in np.flatnonzero(which):
-            step, gain = step_of(self.exchanges[i], slopes[i])
+            step, gain = solve_joint_step(self.exchanges[i], slopes[i])
             if step is None:
                 self.exchanges[i] = None
             elif gain > enough[i]:
@@ -289,12 +296,12 @@ class _Learning:
             status = ended if p.failed[i] or p.converged[i] else f.status
             f.end(self.engine.scenes[i], states[i], findings[i], status)
 
-    def repacked(self) -> _Learning:
-        """What goes on: itself, or a smaller batch where enough fits have stopped."""
-        if (~self.live).mean() < REPACK:
+    def repacked(self) -> _LbfgsRun:
+        """Returns itself, or a new batch where boxes change or enough fits have stopped."""
+        if (~self.live).mean() < REPACK_FRACTION:
             return self
         keep = np.flatnonzero(self.live)
         fits, exchanges = ([some[i] for i in keep] for some in (self.fits, self.exchanges))
-        past = self.engine.take(keep), exchanges, self.asked[keep]
+        past = self.engine.subset(keep), exchanges, self.asked[keep]
         given = fits, self.settings, self.device, self.dtype, past
-        return _Learning(*given, takes_over=self.takes_over)
+        return _LbfgsRun(*given, takes_over=self.stop_for_refit)

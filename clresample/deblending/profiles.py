@@ -1,7 +1,8 @@
 """Smooth profiles on model pixels: what a source looks like before its own structure is fitted.
 
-A source has one Shape for each of its components: a Galaxy, a Given profile or a Star. A shape is
-drawn from a few parameters theta (n,), which `start` fits to the data.
+A source has one ComponentProfile for each of its components: a GalaxyProfile, a FixedProfile
+profile or a StarProfile. A shape is drawn from a few parameters theta (n,), which `start` fits to
+the data.
 
     S(x) = (1 + q / (2 beta))^(-beta - 1),   q = (x - c)^T C^-1 (x - c)
     C = sigma^2 [[1 + e1, e2], [e2, 1 - e1]] + C_psf      rows and columns (y, x)
@@ -18,7 +19,7 @@ import numpy as np
 
 from ..sky.extent import box_slices
 from ..sky.psf import PSF
-from ..sky.sources import Extended, Point
+from ..sky.sources import ExtendedSource, PointSource
 
 # OTFs of model PSFs that are kept: the stars of one frame share one, of 1 MB at 256 pixels.
 N_OTFS = 8
@@ -60,7 +61,7 @@ def covariance(parameters, psf_moment):
 
 
 def galaxy_reach(parameters, psf_moment, threshold):
-    """How far (n, 2) [px] along y and x profiles of `covariance` are above a part of their peaks.
+    """Distance (n, 2) [px] along y and x within which profiles exceed a fraction of their peaks.
 
     parameters (n, 4); psf_moment (n, 2, 2); threshold (n,)
     """
@@ -71,8 +72,10 @@ def galaxy_reach(parameters, psf_moment, threshold):
 
 
 def profile(parameters, position, shape, psf_moment, *, slopes=True):
-    """Profile of unit integral and its derivatives by (ln sigma, g1, g2, ln beta), (5, ny, nx); the
-    profile alone (1, ny, nx) without `slopes`."""
+    """Profile of unit integral and its derivatives by (ln sigma, g1, g2, ln beta), (5, ny, nx).
+
+    The profile alone (1, ny, nx) without `slopes`.
+    """
     c, by_parameter = covariance(parameters, psf_moment)
     inverse, beta = np.linalg.inv(c), np.exp(parameters[3])
     dy, dx = (np.arange(n) - p for n, p in zip(shape, position, strict=True))
@@ -92,7 +95,7 @@ def profile(parameters, position, shape, psf_moment, *, slopes=True):
 
 
 @functools.lru_cache(maxsize=N_OTFS)
-def moment(psf: PSF) -> np.ndarray:
+def psf_second_moment(psf: PSF) -> np.ndarray:
     """Second moment (2, 2) [px^2] of the first band's image about its centre, rows (y, x)."""
     image = psf.images[0]
     y, x = (
@@ -102,7 +105,7 @@ def moment(psf: PSF) -> np.ndarray:
     return np.array([[yy, yx], [yx, xx]])
 
 
-def point(psf: PSF, position, shape, *, slopes=True):
+def draw_psf(psf: PSF, position, shape, *, slopes=True):
     """The PSF at a sub-pixel position and its derivatives by (y, x) (3, ny, nx), unit integral.
 
         S(x) = K^-2 sum_nu P^(nu) exp(2 pi i nu.(x - c))      K > n + the PSF's own extent
@@ -129,8 +132,8 @@ def _otf(psf, n_fft):
     return psf.otf(nu, nu)[0]
 
 
-class Shape:
-    """What a component looks like.
+class ComponentProfile:
+    """The smooth profile of a component.
 
     mean, scatter (n,): what is expected of theta
     draw(theta, position, shape): (1 + n, Ny, Nx), the profile of unit integral for a source at a
@@ -143,21 +146,21 @@ class Shape:
         """The profile and its slopes."""
         raise NotImplementedError
 
-    def cut(self, theta, position, origin, size, *, slopes=True):
+    def draw_box(self, theta, position, origin, size, *, slopes=True):
         """The same in a box of the frame, (1 + n, ny, nx); (1, ny, nx) without `slopes`."""
         drawn = self.draw(theta, np.subtract(position, origin), tuple(size))
         return drawn if slopes else drawn[:1]
 
-    def reach(self, theta, position, threshold):
+    def bounding_box(self, theta, position, threshold):
         """Middle (2,) and half size (2,) [px] of what is above a part of the peak."""
         raise NotImplementedError
 
-    def place(self, theta, position):
-        """Where the component is (2,) [px]: where its source was given to be."""
+    def center(self, theta, position):
+        """Position of the component (2,) [px]."""
         return position
 
 
-class Galaxy(Shape):
+class GalaxyProfile(ComponentProfile):
     """A smooth elliptical profile; theta = (ln sigma [px], g1, g2, ln beta), see profiles.py.
 
     frame: the model's Frame; i_component of n_components: of its source, from compact to wide
@@ -170,7 +173,7 @@ class Galaxy(Shape):
         scale_arcsec = float(np.mean(frame.grid.pixel_scale_arcsec))
         spread = COMPONENT_SPREAD * (i_component - (n_components - 1) / 2)
         size = np.log(SIZE_ARCSEC / scale_arcsec) + spread + np.log(widened)
-        self.shape, self.psf_moment = frame.shape, moment(frame.psf)
+        self.shape, self.psf_moment = frame.shape, psf_second_moment(frame.psf)
         self.whole = n_components == 1
         self.mean = np.array([size, 0, 0, np.log(WINGS)])
         self.scatter = np.array([SIZE_SCATTER, *[ELLIPTICITY_SCATTER] * 2, WINGS_SCATTER])
@@ -179,17 +182,17 @@ class Galaxy(Shape):
         """The profile and its four slopes, (5, Ny, Nx)."""
         return profile(theta, position, shape or self.shape, self.psf_moment)
 
-    def cut(self, theta, position, origin, size, *, slopes=True):
+    def draw_box(self, theta, position, origin, size, *, slopes=True):
         """The same in a box of the frame."""
         place = np.subtract(position, origin)
         return profile(theta, place, tuple(size), self.psf_moment, slopes=slopes)
 
-    def reach(self, theta, position, threshold):
+    def bounding_box(self, theta, position, threshold):
         """Its ellipse where the profile falls to the threshold."""
         half = galaxy_reach(np.array([theta]), self.psf_moment[None], np.array([threshold]))
         return position, half[0]
 
-    def place_slopes(self, theta, position, image):
+    def position_derivatives(self, theta, position, image):
         """Slopes (2, ny, nx) by the position (y, x) [px] of `image`, what is drawn there."""
         inverse, beta = np.linalg.inv(covariance(theta, self.psf_moment)[0]), np.exp(theta[3])
         dy, dx = (np.arange(n) - p for n, p in zip(image.shape, position, strict=True))
@@ -198,7 +201,7 @@ class Galaxy(Shape):
         return 2 * image * (beta + 1) / (2 * beta + q) * along
 
 
-class Given(Shape):
+class FixedProfile(ComponentProfile):
     """A profile (Ny, Nx) that comes with the source; no parameters."""
 
     def __init__(self, image):
@@ -208,7 +211,7 @@ class Given(Shape):
         """The profile (1, Ny, Nx), over the frame."""
         return self.image[None]
 
-    def cut(self, theta, position, origin, size, *, slopes=True):
+    def draw_box(self, theta, position, origin, size, *, slopes=True):
         """A part of it."""
         return self.image[None, *box_slices(origin, size)]
 
@@ -217,7 +220,7 @@ class Given(Shape):
         """Its largest value."""
         return float(self.image.max())
 
-    def reach(self, theta, position, threshold):
+    def bounding_box(self, theta, position, threshold):
         """The box of all pixels above the threshold."""
         lit, ends = np.abs(self.image) > threshold * np.abs(self.image).max(), []
         for axis in (0, 1):
@@ -227,7 +230,7 @@ class Given(Shape):
         return (low + high) / 2, (high - low) / 2 + 1
 
 
-class Star(Shape):
+class StarProfile(ComponentProfile):
     """The model's PSF; theta (2,) [px] = how far off the given position it is, if free."""
 
     def __init__(self, frame, *, free):
@@ -238,29 +241,29 @@ class Star(Shape):
     def draw(self, theta, position, shape=None):
         """The PSF and, if free, its two slopes, (3, Ny, Nx); else (1, Ny, Nx)."""
         shape = shape or self.shape
-        return point(self.psf, self.place(theta, position), shape, slopes=self.free)
+        return draw_psf(self.psf, self.center(theta, position), shape, slopes=self.free)
 
     @property
     def peak(self) -> float:
         """The PSF's largest value."""
         return float(self.psf.images[0].max())
 
-    def reach(self, theta, position, threshold):
+    def bounding_box(self, theta, position, threshold):
         """Its image, and the rings of an image cut at Nyquist's frequency: RING / x of the peak."""
         half = max(self.psf.images.shape[1:]) * self.psf.spacing / 2
         half = max(half, RING_PX / threshold)
-        return self.place(theta, position), np.full(2, half + 1)
+        return self.center(theta, position), np.full(2, half + 1)
 
-    def place(self, theta, position):
-        """Where the star is (2,) [px]: off its source's position by theta, if free."""
+    def center(self, theta, position):
+        """Position of the component (2,) [px]."""
         return position + theta if self.free else position
 
 
 def components_of(source, frame):
     """The components of a Source, at least one."""
-    if isinstance(source, Point):
-        return [Star(frame, free=source.free)]
-    if isinstance(source, Extended) and source.profile is not None:
-        return [Given(source.profile)]
-    n = (source.n_components if isinstance(source, Extended) else None) or 1
-    return [Galaxy(frame, i, n) for i in range(n)]
+    if isinstance(source, PointSource):
+        return [StarProfile(frame, free=source.free_position)]
+    if isinstance(source, ExtendedSource) and source.profile is not None:
+        return [FixedProfile(source.profile)]
+    n = (source.n_components if isinstance(source, ExtendedSource) else None) or 1
+    return [GalaxyProfile(frame, i, n) for i in range(n)]

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..sky.extent import box_slices, shared_part
+from ..sky.extent import box_slices, intersect_boxes
 from .solver.scene import Scene, State
 
 # A box holds the pixels where the source is brighter than this part of the noise of a model pixel;
@@ -54,7 +54,7 @@ def box_around(profile, position, brightness):
     return low, high - low + 1, pixel - low
 
 
-def box_of(start, i, frame, brightness):
+def component_box(start, i, frame, brightness):
     """`box_around` of a component that a start has found, and its profile there (ny, nx), max = 1.
 
     start: StartingPoint; i: which component; frame (2,) [px]: the frame's shape
@@ -70,7 +70,7 @@ def box_of(start, i, frame, brightness):
     return low + inside, size, center, image[box_slices(inside, size)]
 
 
-def resized(scene: Scene, state: State, start, noise) -> tuple[Scene, State]:
+def resize_boxes(scene: Scene, state: State, start, noise) -> tuple[Scene, State]:
     """Scene and state in boxes that fit the present morphologies; themselves where all of them do.
 
     start: StartingPoint, whose profiles are expected; noise (C,): of a model pixel. What the state
@@ -116,7 +116,7 @@ def _box(scene, state, i, start, noise):
     if scene.fixed[i]:
         return low, high
     brightness = (state.spectra[i] * morph.max() / noise).max()
-    wanted, size, *_ = box_of(start, i, scene.extent, brightness)
+    wanted, size, *_ = component_box(start, i, scene.unpadded_shape, brightness)
     light = BOX_NOISE / max(brightness, 1e-30) * morph.max()
     new_low, new_high = low.copy(), high.copy()
     for axis in (0, 1):
@@ -129,14 +129,14 @@ def _box(scene, state, i, start, noise):
         elif first - low[axis] >= TRIM_PX:
             new_low[axis] = first
         if along[-1] > GROW_AT * light:
-            new_high[axis] = min(high[axis] + GROW_PX, scene.extent[axis])
+            new_high[axis] = min(high[axis] + GROW_PX, scene.unpadded_shape[axis])
         elif high[axis] - last >= TRIM_PX:
             new_high[axis] = last
     return new_low, new_high
 
 
 def _same(scene, i, box):
-    """Whether source i has this box already."""
+    """Returns True if source i has this box already."""
     low, high = box
     shape = scene.profile[i].shape
     return np.array_equal(low, scene.origin[i]) and np.array_equal(high - low, shape)
@@ -145,6 +145,6 @@ def _same(scene, i, box):
 def _moved(array, origin, low, high, fill):
     """The array of a box at `origin`, in the box from `low` to `high`; new pixels from `fill`."""
     out = np.zeros(high - low, array.dtype) if fill is None else fill.astype(array.dtype)
-    here, there = shared_part(low, high - low, origin, array.shape)
+    here, there = intersect_boxes(low, high - low, origin, array.shape)
     out[here] = array[there]
     return out

@@ -1,4 +1,4 @@
-"""What a fit leaves behind for one blend: plain arrays, from which everything else is measured."""
+"""The fitted model of one blend, as plain arrays."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from functools import cached_property
 
 import numpy as np
 
-from ..drawing.shown import ShownResult
+from ..drawing.display import ResultDisplay
 from ..sky.footprint import Footprint
 from ..sky.frame import Frame
 from ..sky.observation import Observation, observation_index
 from ..sky.sources import Source
 from .assessment.misfit import Misfit, misfit_of
 from .blend import CONVERGED
-from .posterior.errors import Draws, Errors
+from .component_images import ComponentImages, weighted_sum
+from .posterior.errors import Errors, PosteriorSampler
 from .posterior.sampling import drawn_components, drawn_fluxes
-from .rendered import Rendered, weighted_sum
 from .solver.scene_model import compose
 
 
@@ -50,19 +50,20 @@ class Component:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Result(ShownResult):
+class Result(ResultDisplay):
     """The fitted model of one blend.
 
     observations, frame, sources: what was fitted; sources that were given in an observation's
         pixels have their position in the frame's now; components (n): in the order of the sources
     rendered: per observation (n, Co, My, Mx) [1], each component's morphology on its pixels under
-        its PSF: spectrum times this is the model of the data. An array, or a Rendered, which holds
+        its PSF: spectrum times this is the model of the data. An array, or a ComponentImages, which
+            holds
         each component only where its light reaches
     sky (C,) [counts]: constant background per channel, 0 where it was not fitted
     covariance (C, n, n) [counts^2]: of the spectra of one channel over all components, inverse of
         the normal matrix with morphologies fixed (and sky free where it was); infinite variance for
         components without coverage
-    errors: of fits with a LearnedPrior, the Errors of fluxes, shapes and morphologies, marginal
+    errors: of fits with a MultiscalePrior, the Errors of fluxes, shapes and morphologies, marginal
         over the morphologies, which `fluxes` and `catalogue` report. None where there are none: of
         other priors, and where `messages` says so; then these report the covariance above
     draws: what `sample` and `sample_fluxes` draw from
@@ -77,20 +78,20 @@ class Result(ShownResult):
     frame: Frame
     sources: tuple[Source, ...]
     components: tuple[Component, ...]
-    rendered: tuple[np.ndarray | Rendered, ...]
+    rendered: tuple[np.ndarray | ComponentImages, ...]
     sky: np.ndarray
     covariance: np.ndarray
     shifts: np.ndarray
     losses: np.ndarray
     status: str
     errors: Errors | None = None
-    draws: Draws | None = None
+    draws: PosteriorSampler | None = None
     messages: tuple[str, ...] = ()
     seconds: dict = field(default_factory=dict)
 
     @property
     def converged(self) -> bool:
-        """Whether the fit's loss did not fall any further, at a model that describes the data."""
+        """True if the fit's loss did not fall any further, at a model that describes the data."""
         return self.status == CONVERGED
 
     @property
@@ -106,7 +107,7 @@ class Result(ShownResult):
 
     @cached_property
     def footprints(self) -> tuple[Footprint, ...]:
-        """Where each observation's pixels lie in the frame, at its fitted shift."""
+        """Footprints of the observations in the frame, at their fitted shifts."""
         return tuple(
             Footprint(o, o.grid.map_to(self.frame.grid), np.asarray(shift, np.float64))
             for o, shift in zip(self.observations, self.shifts, strict=True)
@@ -114,7 +115,7 @@ class Result(ShownResult):
 
     @cached_property
     def misfit(self) -> Misfit:
-        """What the model leaves in the data, source by source and channel by channel."""
+        """Residual light of the model, source by source and channel by channel."""
         return misfit_of(self)
 
     def index_of(self, observation) -> int:
@@ -160,7 +161,7 @@ class Result(ShownResult):
             if channel not in self.channels:
                 raise ValueError(f"channel is {channel!r}, must be one of {self.channels}")
             channel = self.channels.index(channel)
-        position = self.frame.place(self.sources)[i_source]
+        position = self.frame.positions_of(self.sources)[i_source]
         return profile_of(self.source_model(i_source)[channel], self.frame.grid, position)
 
     def model(self, i_observation) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""How a fit goes: prior, constraints, steps, limits."""
+"""Settings of a fit: prior, constraints, steps, limits."""
 
 from __future__ import annotations
 
@@ -6,35 +6,36 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..sky.given.checks import instance, number, whole
+from ..sky.validation.checks import check_instance, check_integer, check_number
 from .solver.amsgrad import StepSizes
-from .solver.constraints import Chain, MaxNorm, Monotone, Positivity, SumNorm
-from .solver.learned.prior import LearnedPrior
-from .solver.prior import Prior
+from .solver.constraints import MaxNorm, Monotone, Positivity, ProxChain, SumNorm
+from .solver.multiscale.prior import MultiscalePrior
+from .solver.prior import SingleScalePrior
 
 AUTO = "auto"  # fit_shifts: by measurement
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How a fit goes.
+    """Settings of a fit.
 
     max_iter: most iterations; a second fit, with more components, may take twice as many, and a
         first one that goes on after it as many again
     prior: what is expected of extended sources' morphologies about their smooth profiles, which
-        also chooses the solver. LearnedPrior: structure at several scales, as strong as each
+        also chooses the solver. MultiscalePrior: structure at several scales, as strong as each
         source's data say, by L-BFGS. Prior: structure of one scale and strength; None: the
         morphologies themselves, by the constraints alone; both by the adaptive proximal gradients
         of Melchior et al. (2019)
-    enough: with a LearnedPrior a fit has converged when its loss, half of chi2, fell by less than
-        this, times chi2 per pixel where that is above 1, over 5 iterations, and a step along what
-        its sources exchange would gain less than a fifth of this. With 0.5 it takes a tenth fewer
-        iterations, and where fits of Euclid's or Rubin's images alone go on, over 1 in 100 fluxes
-        move by more than 0.2 errors; with 0.25 about 1 in 200 (`bench.settings --continued`)
-    tol: with others it has when its best loss fell by less than this part of itself over 15
-    constraints: with others, Chain of proximal operators on the morphologies; None: non-negative,
-        and monotone by the sweep. With a LearnedPrior they are non-negative and nothing else: on
-        simulated galaxies a monotone morphology gains nothing, and real ones are none
+    loss_tol: with a MultiscalePrior a fit has converged when its loss, half of chi2, fell by less
+        than this, times chi2 per pixel where that is above 1, over 5 iterations, and a step along
+        what its sources exchange would gain less than a fifth of this. With 0.5 it takes a tenth
+        fewer iterations, and where fits of Euclid's or Rubin's images alone go on, over 1 in 100
+        fluxes move by more than 0.2 errors; with 0.25 about 1 in 200 (`bench.settings --continued`)
+    rel_tol: with others it has when its best loss fell by less than this part of itself over 15
+    constraints: with others, ProxChain of proximal operators on the morphologies; None:
+        non-negative, and monotone by the sweep. With a MultiscalePrior they are non-negative and
+        nothing else: on simulated galaxies a monotone morphology gains nothing, and real ones are
+            none
     step_sizes: with others, their StepSizes
     fit_shifts: let each observation but the first move by a constant shift. "auto": where light of
         isolated sources lies over 0.25 model pixels and 3 sigma apart in two observations
@@ -42,14 +43,15 @@ class Settings:
     fit_sky: fit a constant per channel. Its prior is Gaussian, with the level of the pixels that
         hold no source and its error (inspection/levels.py), so that it takes no light of wide
         sources; where no pixel is free of sources the constant is unconstrained
-    flux_floor: with a LearnedPrior, part of each flux added to its error in quadrature, the same
-        for all channels of a source: what no likelihood knows, the error of the model of bright
+    flux_error_floor: with a MultiscalePrior, part of each flux added to its error in quadrature,
+        the same for all channels of a source: what no likelihood knows, the error of the model of
+            bright
         galaxies, their photons' own noise where the weights leave it out, and PSFs. It is that of
         a galaxy that is like its smooth profile, and grows with the cube of the structure that
         the data show, to 0.4 % for a typical bright galaxy of COSMOS and 1.4 % at most. Larger
         ones are not needed by simulated parametric galaxies, smaller ones cover COSMOS' less.
         PSFs that are wrong by a percent need 0.01
-    errors: with a LearnedPrior, whether errors are worked out that know of morphologies and
+    errors: with a MultiscalePrior, whether errors are worked out that know of morphologies and
         neighbours. False takes two thirds of the time; fluxes have those of fixed morphologies,
         and sizes none
     psf_error: part by which PSFs may be too narrow or too wide. That part of a bright point
@@ -68,32 +70,35 @@ class Settings:
     """
 
     max_iter: int = 500
-    prior: LearnedPrior | Prior | None = LearnedPrior()
-    enough: float = 0.25
-    tol: float = 1e-5
-    constraints: Chain | None = None
+    prior: MultiscalePrior | SingleScalePrior | None = MultiscalePrior()
+    loss_tol: float = 0.25
+    rel_tol: float = 1e-5
+    constraints: ProxChain | None = None
     step_sizes: StepSizes = StepSizes()
     fit_shifts: bool | str = "auto"
     fit_sky: bool = False
-    flux_floor: float = 0.0005
+    flux_error_floor: float = 0.0005
     errors: bool = True
     psf_error: float = 0.03
     psf_tolerance: float = 1e-3
 
     def __post_init__(self):
-        whole("max_iter", self.max_iter)
-        number("enough", self.enough, "0 or more", lambda x: x >= 0)
-        for name in ("tol", "flux_floor", "psf_error", "psf_tolerance"):
-            number(name, getattr(self, name), "at least 0 and under 1", lambda x: 0 <= x < 1)
+        check_integer("max_iter", self.max_iter)
+        check_number("loss_tol", self.loss_tol, "0 or more", lambda x: x >= 0)
+        for name in ("rel_tol", "flux_error_floor", "psf_error", "psf_tolerance"):
+            check_number(name, getattr(self, name), "at least 0 and under 1", lambda x: 0 <= x < 1)
         for name in ("fit_sky", "errors"):
-            instance(name, getattr(self, name), (bool, np.bool_))
+            check_instance(name, getattr(self, name), (bool, np.bool_))
         if not isinstance(self.fit_shifts, (bool, np.bool_)) and self.fit_shifts != AUTO:
             raise ValueError(f'fit_shifts is {self.fit_shifts!r}, must be True, False or "{AUTO}"')
-        for name, kind in (("prior", (LearnedPrior, Prior)), ("constraints", Chain)):
+        for name, kind in (
+            ("prior", (MultiscalePrior, SingleScalePrior)),
+            ("constraints", ProxChain),
+        ):
             if getattr(self, name) is not None:
-                instance(name, getattr(self, name), kind)
-        instance("step_sizes", self.step_sizes, StepSizes)
-        steps = self.chain.steps()
+                check_instance(name, getattr(self, name), kind)
+        check_instance("step_sizes", self.step_sizes, StepSizes)
+        steps = self.constraint_chain.steps()
         scaling = [p for p in steps if isinstance(p, MaxNorm | SumNorm)]
         if self.prior is not None and scaling:
             raise ValueError(
@@ -101,20 +106,24 @@ class Settings:
                 "scale of the morphologies: leave it out, or give prior=None"
             )
         others = [p for p in steps if not isinstance(p, Positivity)]
-        if self.learns and others:
+        if self.has_multiscale_prior and others:
             raise ValueError(
-                f"constraints hold {others[0]!r}, but with a LearnedPrior morphologies are "
-                "non-negative and nothing else: leave it out, or give prior=Prior()"
+                f"constraints hold {others[0]!r}, but with a MultiscalePrior morphologies are "
+                "non-negative and nothing else: leave it out, or give prior=SingleScalePrior()"
             )
 
     @property
-    def learns(self) -> bool:
-        """Whether the prior is a LearnedPrior."""
-        return isinstance(self.prior, LearnedPrior)
+    def has_multiscale_prior(self) -> bool:
+        """True if the prior is a MultiscalePrior."""
+        return isinstance(self.prior, MultiscalePrior)
 
     @property
-    def chain(self) -> Chain:
+    def constraint_chain(self) -> ProxChain:
         """The constraints, or those that go with the prior where none are given."""
         if self.constraints is not None:
             return self.constraints
-        return Chain(Positivity()) if self.learns else Chain(Positivity(), Monotone())
+        return (
+            ProxChain(Positivity())
+            if self.has_multiscale_prior
+            else ProxChain(Positivity(), Monotone())
+        )

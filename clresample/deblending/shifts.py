@@ -14,19 +14,20 @@ import numpy as np
 from .solver.scene_model import compose
 
 # Steps that fall off by a larger factor than this are taken to fall off by it.
-MOST_FACTOR = 0.8
+MAX_DECAY_FACTOR = 0.8
 # [model px] scatter that is expected of a shift. Where the data leave a larger scatter than this,
 # the step falls to 0; a larger value lets noise move observations that hold hardly any light.
 SCATTER_PX = 2.0
 
 
 def shift_steps(scene, state) -> tuple[np.ndarray, float]:
-    """By how much to move the observations (n_observations, 2) [model px], the first not at all,
-    and by how much that lowers half of chi2, to second order, where the model fits the first.
+    """Steps of the observations (n_observations, 2) [model px], the first at rest, and their gain.
+
+    The gain is of half of chi2, to second order, where the model fits the first.
 
     scene: a Scene, its operators at their present shifts; state: its present State
     """
-    n_y, n_x = scene.extent
+    n_y, n_x = scene.unpadded_shape
     found = []
     parts = zip(scene.channels(), scene.ops, scene.data, scene.weights, strict=True)
     for i, (part, op, data, weights) in enumerate(parts):
@@ -44,8 +45,11 @@ def shift_steps(scene, state) -> tuple[np.ndarray, float]:
     return steps, float(gain)
 
 
-def ahead(steps, last):
-    """Where steps (n, 2) lead after the `last` ones: as the model follows each shift by a part of
-    it, they fall off by a factor each, and sum up to the first one over 1 minus that factor."""
+def extrapolate(steps, last):
+    """Limits (n, 2) of steps that fall off by a factor each, from the `last` ones.
+
+    As the model follows each shift by a part of it, steps sum up to the first one over 1 minus that
+    factor.
+    """
     factor = (steps * last).sum() / max((last * last).sum(), 1e-30)
-    return steps / (1 - np.clip(factor, 0, MOST_FACTOR))
+    return steps / (1 - np.clip(factor, 0, MAX_DECAY_FACTOR))

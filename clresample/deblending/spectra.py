@@ -15,12 +15,14 @@ MODEL_ERROR = 0.15
 RIDGE = 1e-8
 # Rounds of exchanges of whole sets: problems of sources that the data can tell apart take 2 to 5.
 # Those that still change are solved one by one, some ms for each of 200 unknowns.
-ROUNDS = 10
+SPECTRUM_ITERATIONS = 10
 
 
-def scaled(normal):
-    """Normal matrices (..., n, n) with a unit diagonal and RIDGE, their scales (..., n), and what
-    is seen (..., n): bool, not 0 beside the others."""
+def unit_diagonal(normal):
+    """Scales normal matrices (..., n, n) to a unit diagonal and adds RIDGE.
+
+    Returns them, their scales (..., n), and a mask (..., n): bool, not 0 beside the others.
+    """
     size = np.sqrt(np.maximum(np.diagonal(normal, axis1=-2, axis2=-1), 0))
     seen = size > 1e-12 * size.max(axis=-1, keepdims=True, initial=0)
     scale = np.where(seen, size, 1)
@@ -30,7 +32,7 @@ def scaled(normal):
     return out, scale, seen
 
 
-def non_negative(normal, right, free=None):
+def nnls_batch(normal, right, free=None):
     """x (M, n) >= 0 of the least 1/2 x N x - x r; 0 where N is.
 
     normal N (M, n, n), right r (M, n); free (n,): bool, those that may be negative
@@ -39,14 +41,14 @@ def non_negative(normal, right, free=None):
     until both have the right signs; all problems side by side. Where many sources lie in one place
     this may go round in circles, all the more as rounding leaves N eigenvalues below zero.
     """
-    matrix, scale, seen = scaled(normal)
+    matrix, scale, seen = unit_diagonal(normal)
     right = np.where(seen, right / scale, 0)
     n_problems, n = right.shape
     free = np.zeros(n, bool) if free is None else free
     off, x = np.ones((n_problems, n), bool), np.zeros((n_problems, n))
     rounding = 1e-10 * np.abs(right).max(axis=1, initial=0)[:, None]
     going = np.arange(n_problems)
-    for _ in range(ROUNDS):
+    for _ in range(SPECTRUM_ITERATIONS):
         on = off[going]
         found = np.linalg.solve(_masked(matrix[going], on), (right[going] * on)[..., None])[..., 0]
         slope = np.einsum("mij,mj->mi", matrix[going], found) - right[going]
@@ -65,7 +67,7 @@ def non_negative(normal, right, free=None):
 def _by_active_sets(matrix, right, free):
     """x (n,) of one problem with a unit diagonal, by Lawson and Hanson's method, which ends.
 
-    Eigenvalues are at least RIDGE, as in `inverse`.
+    Eigenvalues are at least RIDGE, as in `spectrum_covariance`.
     """
     from scipy.optimize import nnls
 
@@ -80,14 +82,14 @@ def _by_active_sets(matrix, right, free):
     return x
 
 
-def inverse(normal):
+def spectrum_covariance(normal):
     """Covariances (M, n, n): infinite variance of what is not seen, and none with others.
 
     Where many sources lie in one place, rounding of `normal` can leave it with eigenvalues below
     zero, and its inverse with variances that are too small, or negative: no variance is less than
     with all other unknowns known. There eigenvalues are at least RIDGE.
     """
-    matrix, scale, seen = scaled(normal)
+    matrix, scale, seen = unit_diagonal(normal)
     out = np.linalg.inv(matrix)
     variance = np.diagonal(out, axis1=-2, axis2=-1)
     wrong = ~(variance > 0.99).all(axis=-1)  # they are at least 1 / (1 + RIDGE)

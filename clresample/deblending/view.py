@@ -10,15 +10,15 @@ from ..resampling.cache import cached_resampler
 from ..resampling.resampler import Resampler
 from ..sky.frame import Frame
 from ..sky.mapping import Mapping
-from ..sky.varying.basis import PSFBasis
-from .profiles import point
+from ..sky.varying_psf.basis import PSFBasis
+from .profiles import draw_psf
 from .solver.rendering.ties import Ties
 
 # [sigma] Stars whose PSF's error is nowhere more than this leave the weights as they are.
-FAINT = 0.05
+MIN_PSF_ERROR_SIGMA = 0.05
 # Pixels of a model under this part of its brightest one count as 0 when it is rendered: of the
 # model's light they hold nothing, but float32 keeps them as denormals, 20 times slower.
-DARK = 1e-20
+DENORMAL_FRACTION = 1e-20
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,12 +29,14 @@ class WhitenedView:
         Plan, where the PSF varies over the scene's sources
     mapping: the op's, with the frame itself, without its padding, as the model
     covered (My, Mx): bool, whose centre lies on the frame itself
-    unit (Co,) [counts]: noise of a typical pixel of each channel, in which data and model count
-    root (Co, My, Mx) [1 / unit]: square root of the weights, 0 where the frame does not cover
+    noise_unit (Co,) [counts]: noise of a typical pixel of each channel, in which data and model
+        count
+    sqrt_weights (Co, My, Mx) [1 / unit]: square root of the weights, 0 where the frame does not
+        cover
     data (Co, My, Mx) [unit]: the observation's data, 0 where root is
-    shares (S, Co, T): of the op's terms in the PSF of each of the scene's sources; None where its
-        PSF is the same for all
-    noise (Co,) [unit]: of a typical pixel, where `unit` is another one; None = 1
+    coefficients (S, Co, T): of the op's terms in the PSF of each of the scene's sources; None where
+        its PSF is the same for all
+    noise (Co,) [unit]: of a typical pixel, where `noise_unit` is another one; None = 1
     ties: Ties of the channels of all views of the scene; None where each has a band of its own
     exposures (Co,): with ties, how many exposures like this one the band has the weight of
     sky_level (Co,) [unit]: expected level of the sky, which is taken off the data; 0 where unknown
@@ -45,10 +47,10 @@ class WhitenedView:
     op: Resampler
     mapping: Mapping
     covered: np.ndarray
-    unit: np.ndarray
-    root: np.ndarray
+    noise_unit: np.ndarray
+    sqrt_weights: np.ndarray
     data: np.ndarray
-    shares: np.ndarray | None = None
+    coefficients: np.ndarray | None = None
     noise: np.ndarray | None = None
     ties: Ties | None = None
     exposures: np.ndarray | None = None
@@ -69,32 +71,40 @@ class WhitenedView:
         data = np.where(root > 0, data, 0.0) / unit[:, None, None]
         return cls(op, mapping, covered, unit, root, data, shares)
 
-    def allowing(self, error) -> WhitenedView:
+    def with_model_error(self, error) -> WhitenedView:
         """The same view with a model whose own error (Co, My, Mx) [unit] adds to the noise.
 
         1/w = sigma^2 + error^2,  of pixels that have a weight
         """
-        return replace(self, root=self.root / np.sqrt(1 + (self.root * error) ** 2))
+        return replace(
+            self, sqrt_weights=self.sqrt_weights / np.sqrt(1 + (self.sqrt_weights * error) ** 2)
+        )
 
-    def see(self, images, source) -> np.ndarray:
-        """Images (n, Ny, Nx) of the frame, padding left out or not, as all channels see them where
-        they are of a source, by its number: (n, Co, My, Mx) in the op's type."""
+    def render(self, images, source) -> np.ndarray:
+        """Renders images (n, Ny, Nx) of the frame, padded or not, in all channels: (n, Co, My, Mx).
+
+        Each as the image of a source, by its number; in the op's type.
+        """
         images = _padded(images, self.op.shape_in).astype(self.op.dtype)
-        if self.shares is None:
+        if self.coefficients is None:
             return self.op.render(images)
-        parts = self.shares[source].reshape(1, -1, 1, 1).astype(self.op.dtype)
+        parts = self.coefficients[source].reshape(1, -1, 1, 1).astype(self.op.dtype)
         return self.op.forward(images[:, None] * parts)
 
-    def of_sources(self, chosen) -> WhitenedView:
+    def for_sources(self, chosen) -> WhitenedView:
         """The same view of a scene that has the sources `chosen` (k,) of this one alone."""
-        return self if self.shares is None else replace(self, shares=self.shares[chosen])
+        return (
+            self
+            if self.coefficients is None
+            else replace(self, coefficients=self.coefficients[chosen])
+        )
 
     def in_units(self, unit, ties) -> WhitenedView:
         """The same view with data and model in other units (Co,) [counts], and with Ties."""
-        ratio = self.unit / unit
+        ratio = self.noise_unit / unit
         data = self.data * ratio[:, None, None]
-        root = self.root / ratio[:, None, None]
-        return replace(self, unit=unit, root=root, data=data, noise=ratio, ties=ties)
+        root = self.sqrt_weights / ratio[:, None, None]
+        return replace(self, noise_unit=unit, sqrt_weights=root, data=data, noise=ratio, ties=ties)
 
     def expecting_sky(self, level, error) -> WhitenedView:
         """The same view with the sky at this level, with this Gaussian error, (Co,) [counts].
@@ -102,15 +112,17 @@ class WhitenedView:
         The data are above the level, so that a fitted sky deviates from it. An infinite error is
         one of which nothing is known.
         """
-        level = level / self.unit
-        data = np.where(self.root > 0, self.data - level[:, None, None], 0.0)
-        precision = (self.unit / error) ** 2
+        level = level / self.noise_unit
+        data = np.where(self.sqrt_weights > 0, self.data - level[:, None, None], 0.0)
+        precision = (self.noise_unit / error) ** 2
         return replace(self, data=data, sky_level=level, sky_precision=precision)
 
     @property
     def error_scale(self) -> np.ndarray:
-        """Factor (Co,) of a model's own error beside the noise: the error is common to all
-        exposures of a band, whose noise together is smaller by it."""
+        """Factor (Co,) of a model's own error beside the noise.
+
+        The error is common to all exposures of a band, whose noise together is smaller by it.
+        """
         return np.ones(len(self.data)) if self.exposures is None else np.sqrt(self.exposures)
 
     @property
@@ -121,27 +133,32 @@ class WhitenedView:
 
 
 def pixel_noise(views) -> np.ndarray:
-    """Noise (C,) [unit] of one model pixel in each channel of a scene's views; of tied channels
-    that of all exposures of their band together."""
+    """Noise (C,) [unit] of one model pixel in each channel of a scene's views.
+
+    Of tied channels that of all exposures of their band together.
+    """
     noise, ties = np.concatenate([view.pixel_noise for view in views]), views[0].ties
     if ties is None:
         return noise
-    seen = np.concatenate([(view.root > 0).any((1, 2)) for view in views])
+    seen = np.concatenate([(view.sqrt_weights > 0).any((1, 2)) for view in views])
     together = ties.spread(ties.total(np.where(seen, 1 / noise**2, 0)))
     return np.where(together > 0, 1 / np.sqrt(np.where(together > 0, together, 1)), noise)
 
 
 def tied_views(views, observations):
-    """Views of Observations; where channels share a band, in units that are one flux density for
-    all channels of it: the noise of their typical pixels, as if all had the mean weight."""
+    """Views of Observations.
+
+    Where channels share a band, in units that are one flux density for all channels of it: the
+    noise of their typical pixels, as if all had the mean weight.
+    """
     names = [band for o in observations for band in o.bands]
     ties = Ties.of(names)
     if ties is None:
         return views
-    unit = np.concatenate([view.unit for view in views])
+    unit = np.concatenate([view.noise_unit for view in views])
     scales = [o.flux_scale for o in observations]
     scale = np.ones(len(unit)) if scales[0] is None else np.concatenate(scales)
-    seen = np.concatenate([(view.root > 0).any((1, 2)) for view in views])
+    seen = np.concatenate([(view.sqrt_weights > 0).any((1, 2)) for view in views])
     weight = ties.total(np.where(seen, (unit * scale) ** -2.0, 0))
     n = np.maximum(ties.total(seen), 1)
     common = np.where(weight > 0, np.sqrt(n / np.where(weight > 0, weight, 1)), scale[ties.first])
@@ -154,35 +171,38 @@ def tied_views(views, observations):
     return [replace(v, exposures=part) for v, part in zip(views, parts, strict=True)]
 
 
-def without_dark(images):
-    """The images, in place, with DARK pixels set to 0."""
-    images[np.abs(images) < DARK * np.abs(images).max(initial=0)] = 0
+def flush_faint(images):
+    """The images, in place, with DENORMAL_FRACTION pixels set to 0."""
+    images[np.abs(images) < DENORMAL_FRACTION * np.abs(images).max(initial=0)] = 0
     return images
 
 
 @dataclass(frozen=True, eq=False)
-class Home:
-    """Where a scene's model lies.
+class SceneGeometry:
+    """Model frame of a scene, padded frame, source positions, PSF tolerance; builds operators.
 
-    frame: Frame; padded: the same with its sides grown to those that a batch shares
-    places (S, 2) [px]: of the scene's sources in it; psf_tolerance: see Settings
+    frame: Frame; padded_frame: the same with its sides grown to those that a batch shares
+    source_positions (S, 2) [px]: of the scene's sources in it; psf_tolerance: see Settings
     """
 
     frame: Frame
-    padded: Frame
-    places: np.ndarray
+    padded_frame: Frame
+    source_positions: np.ndarray
     psf_tolerance: float
 
     def operator(self, observation, grid, device, dtype, *, private):
-        """The operator to a grid with an Observation's PSF at the places, and the shares of its
-        terms (S, C, T) or None, see WhitenedView; private: see `whitened_view`."""
+        """Operator to a grid with an Observation's PSF at the places, and its coefficients.
+
+        Coefficients (S, C, T) are None with one term, see WhitenedView; private: see
+        `whitened_view`.
+        """
         psf, n_terms, shares = observation.psf, 1, None
         if observation.psf_field is not None:
             basis = PSFBasis.of(observation.psf_field, self._on(observation), self.psf_tolerance)
             psf, n_terms = basis.psf, basis.n_terms
-            shares = basis.shares if n_terms > 1 else None
+            shares = basis.coefficients if n_terms > 1 else None
         return cached_resampler(
-            self.padded,
+            self.padded_frame,
             grid,
             psf,
             dtype=dtype,
@@ -193,22 +213,24 @@ class Home:
         ), shares
 
     def _on(self, observation):
-        """The places (S, 2) in an Observation's pixels; of those outside, the nearest on its image,
-        so that its PSF there takes no term of its own."""
-        at = self.frame.grid.positions_in(observation.grid, *self.places.T)
+        """The places (S, 2) in an Observation's pixels.
+
+        Of those outside, the nearest on its image, so that its PSF there takes no term of its own.
+        """
+        at = self.frame.grid.positions_in(observation.grid, *self.source_positions.T)
         top = np.array(observation.data.shape[1:]) - 1
         return np.clip(np.where(np.isfinite(at), at, top / 2), 0, top)
 
 
 def whitened_view(home, observation, pad, device, dtype, *, private) -> WhitenedView:
-    """The view of an Observation on the frame of a Home, padded to multiples of `pad`.
+    """The view of an Observation on the frame of a SceneGeometry, padded to multiples of `pad`.
 
     Correlated noise is made white first (Observation.white).
 
     private: with an operator of its own, which may be shifted; else one that equal observations
         share
     """
-    observation = observation.white
+    observation = observation.whitened
     shape = tuple(-(-n // pad) * pad for n in observation.data.shape[1:])
     grid = observation.grid
     if shape != observation.data.shape[1:]:
@@ -235,31 +257,36 @@ def allow_for_psf_error(views, stars, psf_error) -> list[WhitenedView]:
         parts = [spectrum[a:b, None, None] for a, b in zip(ends, ends[1:], strict=False)]
         pairs = list(zip(views, parts, strict=True))
         # no pixel holds more than all of its light
-        if all(psf_error * np.abs(a * view.root).max() < FAINT for view, a in pairs):
+        if all(
+            psf_error * np.abs(a * view.sqrt_weights).max() < MIN_PSF_ERROR_SIGMA
+            for view, a in pairs
+        ):
             continue
-        images = point(star.psf, place, star.shape)
+        images = draw_psf(star.psf, place, star.shape)
         for i, (view, a) in enumerate(pairs):
-            seen = view.see(images, source)
+            seen = view.render(images, source)
             light, *slopes = seen.astype(np.float64)  # slopes by the place: minus the gradient
             n, m = np.indices(view.mapping.shape_out)
             away = np.moveaxis(view.mapping.at(n, m) + view.op.shift - place, -1, 0)
             change = sum(r * slope for r, slope in zip(away, slopes, strict=True))
             found = (a * light) ** 2 + (a * change) ** 2
-            if psf_error * (np.sqrt(found) * view.root).max() > FAINT:
+            if psf_error * (np.sqrt(found) * view.sqrt_weights).max() > MIN_PSF_ERROR_SIGMA:
                 squares[i] = squares[i] + found
     return [
-        view if np.isscalar(square) else view.allowing(psf_error * np.sqrt(square))
+        view if np.isscalar(square) else view.with_model_error(psf_error * np.sqrt(square))
         for view, square in zip(views, squares, strict=True)
     ]
 
 
-def view_as_taken(home, observation, view) -> WhitenedView:
-    """The view of an Observation on the frame of a Home, with the observation's own PSF; where
-    noise is correlated, the view has that of the white observation instead."""
+def unfiltered_view(home, observation, view) -> WhitenedView:
+    """The view of an Observation on the frame of a SceneGeometry, with the observation's own PSF.
+
+    Where noise is correlated, the view has that of the white observation instead.
+    """
     device, dtype = view.op.device, view.op.dtype
     op, shares = home.operator(observation, observation.grid, device, dtype, private=True)
     op.shift = view.op.shift
-    return replace(view, op=op, shares=shares)
+    return replace(view, op=op, coefficients=shares)
 
 
 def _typical_noise(weights):

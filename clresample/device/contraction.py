@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .tuning import MOST_GROUPS, Tuning
+from .tuning import MAX_GROUPS, Tuning
 
 # The kernel of a tile in registers, for CPUs, and that of a group with local memory, for GPUs.
 FILE, GROUP_FILE = "contract.cl", "contract_group.cl"
@@ -30,21 +30,22 @@ TERMS = 4
 ONE_SUM = 256
 
 
-def whole(n):
+def round_up_columns(n):
     """`n` columns rounded up to whole vectors; of an array each."""
     return -(-n // COLUMN_PAD) * COLUMN_PAD
 
 
-def padded(n):
+def row_stride(n):
     """Elements from row to row of matrices with `n` columns on the device; of an array each.
 
-    Products make the columns up to `whole(n)`, zeros beyond n. What lies beyond is not touched.
+    Products make the columns up to `round_up_columns(n)`, zeros beyond n. What lies beyond is not
+    touched.
     """
-    n = whole(n)
+    n = round_up_columns(n)
     return n + COLUMN_PAD * (n % CROWDED == 0)
 
 
-def stretch(k: int) -> int:
+def terms_per_block(k: int) -> int:
     """Terms of k that are summed at a stretch: a half of them, or as many for each end.
 
     sqrt(k) if that is more than SUM_BLOCK, so that stretches and their sum round alike. A multiple
@@ -54,32 +55,32 @@ def stretch(k: int) -> int:
     return -(-max(math.isqrt(k), -(-k // n_stretches)) // TERMS) * TERMS
 
 
-class Matrix(NamedTuple):
+class MatrixBatch(NamedTuple):
     """A batch of matrices in device memory; item b starts at offset + (b // div) * stride.
 
-    buffer: OpenCL buffer, or None where each call of a Product gives one
+    buffer: OpenCL buffer, or None where each call of a BoundContraction gives one
     offset, ld, stride [elements]: start, distance of rows, of items
     step [elements]: distance of columns (only of a strided left factor, and of a ragged result)
-    own: item b starts at `which` of Own instead, where a product has that
+    own: item b starts at `table_index` of ItemSizes instead, where a product has that
     """
 
     buffer: object
     ld: int
     stride: int = 0
-    div: int = 1
+    items_per_matrix: int = 1
     step: int = 1
     offset: int = 0
     own: bool = False
 
 
-class Own(NamedTuple):
+class ItemSizes(NamedTuple):
     """Sizes and tables that the items of a batch have of their own.
 
-    which (batch / n_bands,): int32, on the device: the table of each n_bands items in turn
+    table_index (batch / n_bands,): int32, on the device: the table of each n_bands items in turn
     m, n, k (tables,): rows, columns and terms of each; None where all have those of the product
     """
 
-    which: object
+    table_index: object
     m: np.ndarray | None = None
     n: np.ndarray | None = None
     k: np.ndarray | None = None
@@ -118,10 +119,10 @@ class ImageBatch(NamedTuple):
         """Every `every`-th of many images (n_y, n_x), of an array that is not there yet."""
         return cls(None, 0, every * n_y * n_x, n_x)
 
-    def matrix(self, axes=(0, 1)) -> Matrix:
+    def matrix(self, axes=(0, 1)) -> MatrixBatch:
         """The images as matrices, transposed where `axes` is (1, 0)."""
         ld, step = (self.ld, 1) if axes == (0, 1) else (1, self.ld)
-        return Matrix(self.buffer, ld, self.stride, step=step, offset=self.offset)
+        return MatrixBatch(self.buffer, ld, self.stride, step=step, offset=self.offset)
 
 
 class Contraction:
@@ -156,27 +157,38 @@ class Contraction:
         """(file, macros) for matrices of so many rows, terms and columns; of most, if not given."""
         tile = self.tuning.tile_for(n_rows) if n_rows else self.tuning.tile
         if "KB" not in tile:
-            own = {"RT": ROW_TILES, "READ_AHEAD": self.tuning.reads_ahead}
-            return FILE, self.options | own | self.tuning.tile_for_columns(n, whole(n))
+            own = {"RT": ROW_TILES, "READ_AHEAD": self.tuning.prefetch_columns}
+            return FILE, self.options | own | self.tuning.tile_for_columns(n, round_up_columns(n))
         return GROUP_FILE, self.options | tile | {"TWO_SUMS": n_terms > ONE_SUM}
 
     def bind(
-        self, m, n, k, a: Matrix, b: Matrix, c: Matrix, e=None, n_bands=1, *, inward=True, own=None
-    ) -> Product:
+        self,
+        m,
+        n,
+        k,
+        a: MatrixBatch,
+        b: MatrixBatch,
+        c: MatrixBatch,
+        e=None,
+        n_bands=1,
+        *,
+        inward=True,
+        own=None,
+    ) -> BoundContraction:
         """The products of (m, k) matrices A with (k, n) matrices B into C.
 
         inward: the largest terms lie about the middle, as those of pixels do; otherwise they come
             first, as those of low frequencies. Small terms are summed first, to round less
         e (buffer, stride, band stride): tables of the epilogue, shared by `n_bands` items
-        own: Own, of whose sizes m, n and k are the largest; C is not written beyond an item's
+        own: ItemSizes, of whose sizes m, n and k are the largest; C is not written beyond an item's
         """
         buffer_e, stride_e, band_e = e or (None, 0, 0)
         # one right factor for all: the rows of all items are those of one tall matrix
-        whole_a = a.step == 1 and a.stride == m * a.ld and a.div == 1
+        whole_a = a.step == 1 and a.stride == m * a.ld and a.items_per_matrix == 1
         tall = e is None and b.stride == 0 and whole_a and c.step == 1 and c.stride == m * c.ld
         file, tile = self.build(None if tall else m, k, n)
         tile = tile | {"OWN": own is not None}
-        which = own and own.which
+        which = own and own.table_index
         sizes = own and self.device.put(own.sizes(m, n, k), np.int32)
         launch = self.device.launcher(
             file,
@@ -187,7 +199,7 @@ class Contraction:
         ).bind(
             m=m,
             n=n,
-            n_pad=padded(n),
+            n_pad=row_stride(n),
             k=k,
             **self._order(k, inward),
             A=a.buffer,
@@ -195,10 +207,10 @@ class Contraction:
             ld_a=a.ld,
             step_a=a.step,
             stride_a=a.stride,
-            div_a=0 if own and a.own else a.div,
+            div_a=0 if own and a.own else a.items_per_matrix,
             B=b.buffer,
             stride_b=b.stride,
-            div_b=0 if own and b.own else b.div,
+            div_b=0 if own and b.own else b.items_per_matrix,
             C=c.buffer,
             offset_c=c.offset,
             ld_c=c.ld,
@@ -212,18 +224,18 @@ class Contraction:
             own=sizes,
         )
         starts = (a.offset, a.stride, c.offset, c.stride)
-        return Product(launch, tile, m, self._extent(tile, n), starts if tall else None)
+        return BoundContraction(launch, tile, m, self._extent(tile, n), starts if tall else None)
 
     def _extent(self, tile, n):
         """Rows and columns of C that a work-item takes, and columns that all take."""
-        return tile["MR"] * tile.get("RT", 1), tile["NV"] * tile["VW"], whole(n)
+        return tile["MR"] * tile.get("RT", 1), tile["NV"] * tile["VW"], round_up_columns(n)
 
     def _order(self, k, inward):
         """The order in which the kernel sums k terms, as its arguments."""
-        return {"block": stretch(k), "inward": inward}
+        return {"block": terms_per_block(k), "inward": inward}
 
 
-class Product:
+class BoundContraction:
     """A contraction with all its matrices bound; `Contraction.bind` makes it.
 
     tall: where items are stacked into one matrix of m rows each: the offsets and strides of A and
@@ -250,7 +262,7 @@ class Product:
             return
         a0, stride_a, c0, stride_c = self.tall
         a0, c0 = given.get("offset_a", a0), given.get("offset_c", c0)
-        most = max(1, MOST_GROUPS * self.group_rows * self.rows // m)  # items, one launch each
+        most = max(1, MAX_GROUPS * self.group_rows * self.rows // m)  # items, one launch each
         for first in range(0, batch, most):
             m_tall = m * min(most, batch - first)
             if first:

@@ -21,21 +21,21 @@ import weakref
 import numpy as np
 
 from . import selftest
+from .device_cache import DeviceCache, DeviceWarning
 from .discovery import (
     DeviceError,
     builds_fp64,
+    by_preference,
     choose,
     find_devices,
-    is_free,
+    is_default_choice,
     is_simulated,
     kind_of,
     load_pyopencl,
-    ranked,
 )
-from .errors import FULL, explained, forked, status_of, too_large
-from .profile import started
+from .errors import OUT_OF_MEMORY_STATUS, allocation_error, fork_error, status_of, to_device_error
+from .kernel_profiler import start_profiling
 from .program import Launcher, Programs
-from .remembered import DeviceWarning, Remembered
 
 __all__ = ["Device", "get_device"]
 
@@ -63,12 +63,12 @@ class Device:
         self.compute_units = cl_device.max_compute_units
         self.memory = cl_device.global_mem_size
         self.max_alloc = cl_device.max_mem_alloc_size
-        self.in_use, self.remembered = 0, Remembered(cl_device)
+        self.in_use, self.remembered = 0, DeviceCache(cl_device)
         _opened[self] = os.getpid()
         self._enqueue, self._error = cl.enqueue_nd_range_kernel, cl.Error
         self._programs, self._lock = Programs(self), threading.Lock()
         self.context = self._call(cl.Context, [cl_device])
-        self.profile = started(self.name)
+        self.profile = start_profiling(self.name)
         timed = cl.command_queue_properties.PROFILING_ENABLE if self.profile else 0
         self.queue = self._call(cl.CommandQueue, self.context, cl_device, properties=timed)
 
@@ -93,7 +93,7 @@ class Device:
         shape = (int(shape),) if np.ndim(shape) == 0 else tuple(map(int, shape))
         n_bytes = math.prod(shape, start=dtype.itemsize)
         if n_bytes > self.memory:
-            raise too_large(self, n_bytes)
+            raise allocation_error(self, n_bytes)
         return self._call(pyopencl.array.Array, self.queue, shape, dtype, allocator=self._allocate)
 
     def zeros(self, shape, dtype):
@@ -162,11 +162,11 @@ class Device:
         self._call(self._call(cl.enqueue_marker, queue or self.queue).wait)
 
     def _call(self, function, *arguments, **options):
-        """What a function of pyopencl returns; an error that a user can meet made readable."""
+        """Calls a function of pyopencl; an error that a user can meet becomes a DeviceError."""
         try:
             return function(*arguments, **options)
         except self._error as error:
-            meant = explained(self, error)
+            meant = to_device_error(self, error)
             if meant is None:
                 raise
             raise meant from error
@@ -179,12 +179,12 @@ class Device:
         if self.in_use + n_bytes > self.memory:
             gc.collect()  # arrays in reference cycles are still counted
         if n_bytes > min(self.max_alloc, self.memory - self.in_use):
-            raise too_large(self, n_bytes)
+            raise allocation_error(self, n_bytes)
         try:
             buffer = _buffer_type()(self.context, cl.mem_flags.READ_WRITE, n_bytes)
         except self._error as error:
-            if status_of(error) in FULL:
-                raise too_large(self, n_bytes) from error
+            if status_of(error) in OUT_OF_MEMORY_STATUS:
+                raise allocation_error(self, n_bytes) from error
             raise
         self.in_use += n_bytes
         weakref.finalize(buffer, self._freed, n_bytes).atexit = False
@@ -224,7 +224,7 @@ def get_device(choice=None) -> Device:
     """
     if isinstance(choice, Device):
         return _of_this_process(choice)
-    candidates = ranked(find_devices()) if is_free(choice) else [choose(choice)]
+    candidates = by_preference(find_devices()) if is_default_choice(choice) else [choose(choice)]
     faults: list[str] = []
     for candidate in candidates:
         fault = _fault(candidate)
@@ -246,7 +246,7 @@ _opened: weakref.WeakKeyDictionary[Device, int] = weakref.WeakKeyDictionary()
 def _of_this_process(device):
     """The device; DeviceError in a process that was forked after it was opened."""
     if os.getpid() != _opened[device]:
-        raise forked(device)
+        raise fork_error(device)
     return device
 
 
@@ -257,7 +257,7 @@ def _refuse_in_child():
     """
 
     def refuse(device):
-        raise forked(device)
+        raise fork_error(device)
 
     for device in _opened:
         device._call = lambda *_, device=device, **__: refuse(device)
@@ -277,6 +277,6 @@ def _fault(cl_device):
     """Why a pyopencl device is not to be used, or None."""
     try:
         device = _open(cl_device)
-        return selftest.fault(device, device.remembered)
+        return selftest.self_test_fault(device, device.remembered)
     except (DeviceError, load_pyopencl().Error) as error:
         return f"{cl_device.name.strip()} fails its self-test: {error}"

@@ -1,4 +1,4 @@
-"""Which OpenCL devices there are, and which one is meant by a user's choice such as "GPU" or "0:1".
+"""Lists OpenCL devices and selects one by a user's choice such as "GPU" or "0:1".
 
 pyopencl is imported when devices are first looked for, never before.
 """
@@ -12,22 +12,22 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
+from .device_cache import system_caches
 from .drivers import (
-    fault_of,
+    address_space_warning,
+    driver_advice,
+    driver_fault,
     named_library,
-    remedy,
-    show_named_library,
-    too_little_space,
-    unseen,
-    unusable_cache,
-    unwritable,
-    warn_of,
+    pocl_cache_fault,
+    register_named_library,
+    undetected_drivers,
+    warn_named_library,
+    write_fault,
 )
-from .processor import name_processor
-from .remembered import system_caches
+from .pocl_cpu_name import set_pocl_cpu_name
 
 # Order of preference when nothing is chosen; a kind that is not listed comes last.
-KINDS = ("GPU", "CPU", "ACCELERATOR")
+DEVICE_KINDS = ("GPU", "CPU", "ACCELERATOR")
 # Parts of the names of devices that stand in for others: simulators, and drivers that draw on the
 # CPU. They come last in the choice, whatever kind they say they are.
 SIMULATED = ("oclgrind", "simulator", "emulat", "llvmpipe", "softpipe", "swiftshader")
@@ -100,10 +100,10 @@ def choose(choice):
         return _match(os.environ["CLRESAMPLE_DEVICE"], found, "CLRESAMPLE_DEVICE")
     if os.environ.get("PYOPENCL_CTX"):
         return _match_pyopencl(os.environ["PYOPENCL_CTX"], found)
-    return ranked(found)[0]
+    return by_preference(found)[0]
 
 
-def is_free(choice):
+def is_default_choice(choice):
     """True where neither the caller's choice nor the environment names a device."""
     return choice is None and not any(map(os.environ.get, ("CLRESAMPLE_DEVICE", "PYOPENCL_CTX")))
 
@@ -120,7 +120,7 @@ def _match(choice, found, source):
         fits = fits or [d for d in found if text and text in d.platform.name.lower()]
     if not fits:
         raise _no_fit(source, choice, found)
-    return ranked(fits)[0]
+    return by_preference(fits)[0]
 
 
 def _match_pair(platform, device, found):
@@ -149,14 +149,14 @@ def _no_fit(source, choice, found):
     return DeviceError(f"{source} is {choice!r}, which fits no device; there are: {names}")
 
 
-def ranked(found):
+def by_preference(found):
     """Devices in the order in which they are taken when nothing is chosen."""
     return sorted(found, key=_preference)
 
 
 def _preference(device):
     kind = kind_of(device)
-    place = KINDS.index(kind) if kind in KINDS else len(KINDS)
+    place = DEVICE_KINDS.index(kind) if kind in DEVICE_KINDS else len(DEVICE_KINDS)
     return not device.available, is_simulated(device), place
 
 
@@ -166,7 +166,7 @@ def is_simulated(device):
     return any(name in names for name in SIMULATED)
 
 
-def hints():
+def driver_hints():
     """Lines on GPU drivers of this machine that bring no device, each with its cure."""
     try:
         found = find_devices()
@@ -174,7 +174,10 @@ def hints():
         found = []
     if named_library():
         return []
-    return [remedy(vendor, path, _addresses(found)) for vendor, path in unseen(_served(found))]
+    return [
+        driver_advice(vendor, path, _addresses(found))
+        for vendor, path in undetected_drivers(_served(found))
+    ]
 
 
 def _served(found):
@@ -184,7 +187,7 @@ def _served(found):
 
 
 def _addresses(found):
-    """Of the platforms of devices, as `fault_of` takes them."""
+    """Of the platforms of devices, as `driver_fault` takes them."""
     return frozenset(device.platform.int_ptr for device in found)
 
 
@@ -207,11 +210,11 @@ def find_devices():
     library = named_library()
     if found:
         for device in found:
-            name_processor(device)
+            set_pocl_cpu_name(device)
         if library:
-            warn_of(library, _addresses(found))
+            warn_named_library(library, _addresses(found))
         return found
-    if any("Portable Computing" in p.name for p in platforms) and (cause := unusable_cache()):
+    if any("Portable Computing" in p.name for p in platforms) and (cause := pocl_cache_fault()):
         raise DeviceError(cause)
     what = "OpenCL platform" if not platforms else f"device on {platforms[0].name}"
     vendors = os.environ.get("OCL_ICD_VENDORS")
@@ -224,21 +227,21 @@ def find_devices():
         if vendors:
             way += f"; OCL_ICD_VENDORS={vendors} limits the search to that place"
         if library:
-            way += f"; CLRESAMPLE_ICD={library} {fault_of(library, set())}"
-        for vendor, path in unseen([]):
-            way += f"; {remedy(vendor, path, set())}"
+            way += f"; CLRESAMPLE_ICD={library} {driver_fault(library, set())}"
+        for vendor, path in undetected_drivers([]):
+            way += f"; {driver_advice(vendor, path, set())}"
     raise DeviceError(f"no {what} found: {way}")
 
 
 def load_pyopencl():
-    if cause := too_little_space():
+    if cause := address_space_warning():
         raise DeviceError(cause)
     if os.environ.get("POCL_CACHE_DIR") == "":
         del os.environ["POCL_CACHE_DIR"]  # an empty one ends the process in PoCL 3.1
     if "pyopencl" not in sys.modules and "PYOPENCL_NO_CACHE" not in os.environ:
         # pyopencl keeps some milliseconds' work there, and ends where it cannot
         kept = Path(os.environ.get("XDG_CACHE_HOME") or system_caches()) / "pytools"
-        if unwritable(kept):
+        if write_fault(kept):
             os.environ["PYOPENCL_NO_CACHE"] = "1"
     try:
         import pyopencl
@@ -248,7 +251,7 @@ def load_pyopencl():
         ) from error
     _ignore_remarks(pyopencl)
     try:
-        show_named_library()
+        register_named_library()
     except OSError as error:
         raise DeviceError(
             f"CLRESAMPLE_ICD names a driver library that is not there: {named_library()}"
@@ -264,7 +267,7 @@ def _ignore_remarks(cl):
 
 def kind_of(device):
     types = load_pyopencl().device_type
-    return next((kind for kind in KINDS if device.type & getattr(types, kind)), "OTHER")
+    return next((kind for kind in DEVICE_KINDS if device.type & getattr(types, kind)), "OTHER")
 
 
 def _try_fp64(device):

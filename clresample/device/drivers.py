@@ -1,4 +1,4 @@
-"""Driver libraries: one that CLRESAMPLE_ICD names, and GPUs' that the OpenCL loader does not see.
+"""Finds driver libraries: that of CLRESAMPLE_ICD, and GPUs' that the OpenCL loader misses.
 
 The loader (libOpenCL) learns of drivers from .icd files, each of which names a library. Containers
 often have a GPU's library without its .icd file.
@@ -20,7 +20,7 @@ import weakref
 from contextlib import suppress
 from pathlib import Path
 
-from .remembered import DeviceWarning
+from .device_cache import DeviceWarning
 
 # OpenCL drivers of GPUs, by their library.
 LIBRARIES = {
@@ -41,7 +41,7 @@ FOLDERS = (
     "/opt/rocm*/lib",
     "/opt/amdgpu*/lib/*-linux-gnu",
 )
-LEAST_SPACE = 800 << 20  # [bytes] of addresses, under which builds of small kernels failed
+MIN_SPACE = 800 << 20  # [bytes] of addresses, under which builds of small kernels failed
 VENDORS = "/etc/OpenCL/vendors"
 # Lets the loader of a conda environment read the drivers of VENDORS too.
 CONDA_CURE = "conda install -c conda-forge ocl-icd-system"
@@ -59,11 +59,11 @@ def conda_prefix():
 
 
 def named_library():
-    """What CLRESAMPLE_ICD names, or None: a library's path, or a name the system finds it by."""
+    """Value of CLRESAMPLE_ICD or None: a library's path, or a name the system finds it by."""
     return os.environ.get("CLRESAMPLE_ICD") or None
 
 
-def show_named_library():
+def register_named_library():
     """Have the loader read the library of CLRESAMPLE_ICD beside the drivers that it reads anyway.
 
     It must be called before the process asks pyopencl for platforms: the loader reads once.
@@ -88,7 +88,7 @@ class _Vendors:
     made: Path | None = None
 
 
-def unseen(served):
+def undetected_drivers(served):
     """GPU drivers on this machine that brought no device: [(vendor, path)].
 
     served: names of platforms that have a GPU; their vendors' drivers are not looked for
@@ -102,8 +102,8 @@ def unseen(served):
     return list(paths.items())
 
 
-def fault_of(library, served):
-    """What is wrong with a driver library that brings no device, in words; None where it does.
+def driver_fault(library, served):
+    """Fault of a driver library that brings no device, in words; None where it has none.
 
     served: addresses of the platforms that have a device
     """
@@ -118,9 +118,9 @@ def fault_of(library, served):
 
 
 @functools.cache  # once
-def warn_of(library, served):
+def warn_named_library(library, served):
     """Warn of the library of CLRESAMPLE_ICD where it brings no device."""
-    if fault := fault_of(library, served):
+    if fault := driver_fault(library, served):
         warnings.warn(f"CLRESAMPLE_ICD={library} {fault}", DeviceWarning, stacklevel=3)
 
 
@@ -146,8 +146,10 @@ def _platforms_of(library):
 
 
 def temporary_folder(kind):
-    """A folder of this process among the temporary files, after those of this user's processes on
-    this machine that are gone, killed perhaps, are removed."""
+    """A folder of this process among the temporary files.
+
+    Those of this user's processes on this machine that are gone, killed perhaps, are removed first.
+    """
     host = re.sub(r"[\W_]", "", platform.node())[:32] or "host"  # containers may share the place
     mine = re.compile(rf"clresample-{kind}-{host}-(\d+)-\w+")
     for entry in list(os.scandir(tempfile.gettempdir())) if os.name == "posix" else ():
@@ -169,22 +171,22 @@ def _remove_of_gone(entry, pid):
         return
 
 
-def remedy(vendor, path, served):
-    """What is to be done about a GPU's driver library that brings no device, in words.
+def driver_advice(vendor, path, served):
+    """Remedy for a GPU's driver library that brings no device, in words.
 
-    served: see `fault_of`
+    served: see `driver_fault`
     """
     driver = f"{vendor}'s OpenCL driver"
     if path.name in {Path(library).name for library in _known().values()}:
-        fault = fault_of(str(path), served) or "brings no GPU"
+        fault = driver_fault(str(path), served) or "brings no GPU"
         return f"{driver}, {path}, {fault}: is the GPU given to this machine or container?"
     conda = conda_prefix()
     if conda and path.name in {Path(library).name for library in _read(VENDORS).values()}:
         return f"{driver} is at {path}, which the loader of {conda} does not read: {CONDA_CURE}"
-    return f"{driver} is at {path}, where the OpenCL loader does not look: {cure(path)}"
+    return f"{driver} is at {path}, where the OpenCL loader does not look: {icd_export_line(path)}"
 
 
-def cure(path):
+def icd_export_line(path):
     """The line to type, without root, that lets clresample see the driver library at `path`."""
     return f"export CLRESAMPLE_ICD={path}"
 
@@ -207,7 +209,7 @@ def _libraries():
 
 
 def _known():
-    """What the loader reads beside the drivers that come with pyopencl: {name: library}."""
+    """Drivers that the loader reads beside those that come with pyopencl: {name: library}."""
     if given := os.environ.get("OCL_ICD_VENDORS"):
         is_library = not Path(given).is_dir() and Path(given).suffix != ".icd"
         return {"given.icd": given} if is_library else _read(given)
@@ -223,14 +225,14 @@ def _read(place):
 
 
 def _in_full(icd):
-    """What an .icd file names; a library beside it with its folder."""
+    """Library of an .icd file; one beside the file with its folder."""
     library = icd.read_text().strip()
     beside = icd.parent / library
     return str(beside) if beside.is_file() else library
 
 
-def unusable_cache():
-    """What hides PoCL's device although its driver is there; None where nothing is known to.
+def pocl_cache_fault():
+    """Reason why PoCL's device is hidden although its driver is there; None if none is known.
 
     PoCL offers no device where it cannot write to its cache of built kernels.
     """
@@ -242,7 +244,7 @@ def unusable_cache():
     home = Path(os.environ.get("HOME") or "/tmp")
     shared = Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache") / "pocl"
     folder = Path(os.environ.get("POCL_CACHE_DIR") or shared)
-    if cause := unwritable(folder):
+    if cause := write_fault(folder):
         return (
             f"PoCL cannot write to its cache of built kernels, {folder} ({cause}): "
             "set POCL_CACHE_DIR to a folder that can be written"
@@ -250,7 +252,7 @@ def unusable_cache():
     return None
 
 
-def unwritable(folder):
+def write_fault(folder):
     """Why files cannot be made in a folder, in the system's words; None where they can."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -260,8 +262,8 @@ def unwritable(folder):
     return None
 
 
-def too_little_space():
-    """What is to be said where this process may not have the addresses that drivers need; or None.
+def address_space_warning():
+    """Warning where this process may not have the addresses that drivers need; or None.
 
     Under less, PoCL's compiler ends the process or waits for ever, or no driver is found.
     """
@@ -270,9 +272,9 @@ def too_little_space():
     except ImportError:  # Windows
         return None
     given, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if given == resource.RLIM_INFINITY or given >= LEAST_SPACE:
+    if given == resource.RLIM_INFINITY or given >= MIN_SPACE:
         return None
     return (
         f"this process may have {given >> 20} MiB of address space, OpenCL's compiler needs "
-        f"{LEAST_SPACE >> 20} MiB: raise the limit (ulimit -v unlimited)"
+        f"{MIN_SPACE >> 20} MiB: raise the limit (ulimit -v unlimited)"
     )

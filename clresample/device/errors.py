@@ -1,13 +1,13 @@
-"""What a user reads when a device cannot go on: which device, what happened, what to do."""
+"""Errors of devices in readable words: the device, the fault, the remedy."""
 
 from __future__ import annotations
 
 from .discovery import DeviceError, format_size, load_pyopencl
-from .drivers import unusable_cache
+from .drivers import pocl_cache_fault
 
 # Status codes after which the device or its queue no longer answers.
 # -9999 is NVIDIA's own code for an illegal access, after which its context is dead.
-LOST = {
+LOST_STATUS = {
     "DEVICE_NOT_AVAILABLE",
     "OUT_OF_RESOURCES",
     "INVALID_COMMAND_QUEUE",
@@ -17,7 +17,11 @@ LOST = {
     "-9999",
 }
 # Status codes of a device without memory for a buffer.
-FULL = {"MEM_OBJECT_ALLOCATION_FAILURE", "INVALID_BUFFER_SIZE", "OUT_OF_HOST_MEMORY"}
+OUT_OF_MEMORY_STATUS = {
+    "MEM_OBJECT_ALLOCATION_FAILURE",
+    "INVALID_BUFFER_SIZE",
+    "OUT_OF_HOST_MEMORY",
+}
 
 
 def status_of(error):
@@ -27,15 +31,15 @@ def status_of(error):
     return next((n for n, c in names.items() if n.isupper() and c == code), str(code))
 
 
-def explained(device, error):
+def to_device_error(device, error):
     """A DeviceError for a pyopencl error that a user can meet; None for a mistake of our own."""
     status = status_of(error)
-    if status in FULL:
+    if status in OUT_OF_MEMORY_STATUS:
         return DeviceError(
             f"{device.name} is out of memory ({status}; it has {format_size(device.memory)}): use "
             "smaller batches or tiles, or free other arrays"
         )
-    if status in LOST:
+    if status in LOST_STATUS:
         return DeviceError(
             f"{device.name} ({device.platform}) no longer answers ({status}): start again, look "
             "at the driver's log for a reset or a time limit on kernels, use smaller "
@@ -44,7 +48,7 @@ def explained(device, error):
     return None
 
 
-def too_large(device, n_bytes):
+def allocation_error(device, n_bytes):
     """A DeviceError for an array of `n_bytes` that does not fit."""
     return DeviceError(
         f"an array needs {format_size(n_bytes)}; {device.name} has {format_size(device.memory)}, "
@@ -53,7 +57,7 @@ def too_large(device, n_bytes):
     )
 
 
-def forked(device):
+def fork_error(device):
     """A DeviceError for a device that was opened before this process was forked."""
     return DeviceError(
         f"{device.name} was opened before this process was forked, and cannot answer here: start "
@@ -61,7 +65,7 @@ def forked(device):
     )
 
 
-def no_double(device):
+def float64_error(device):
     """A DeviceError for float64 on a device without it."""
     return DeviceError(
         f"{device.name} has no double precision: use float32, or another device "
@@ -69,9 +73,9 @@ def no_double(device):
     )
 
 
-def not_built(device, file, defines, log):
+def build_error(device, file, defines, log):
     """A DeviceError for a kernel file that does not compile; log: the compiler's own words."""
-    if "Portable Computing" in device.platform and (cause := unusable_cache()):
+    if "Portable Computing" in device.platform and (cause := pocl_cache_fault()):
         return DeviceError(f"{file} does not build: {cause}")
     return DeviceError(
         f"{file} does not build on {device.name} ({device.platform}) with "

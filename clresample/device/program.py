@@ -1,5 +1,4 @@
-"""Kernel sources: where they lie, what they declare, what is built of them for a device, and how it
-is launched."""
+"""Kernel sources, their arguments, their builds for a device, and their launches."""
 
 from __future__ import annotations
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from .compiling import CompilationNotice
 from .discovery import DeviceError, load_pyopencl
-from .errors import no_double, not_built
+from .errors import build_error, float64_error
 
 # Types of scalar arguments; REAL is the floating type of a build. Whatever else is a buffer.
 SCALARS = {"int": np.int32, "uint": np.uint32, "long": np.int64, "ulong": np.uint64}
@@ -44,7 +43,7 @@ def read_kernel(file):
 
 
 def source_of(file, dtype, defines):
-    """What is compiled for kernels/`file`: its macros, a line each, and its text.
+    """Source of kernels/`file` as compiled: its macros, a line each, and its text.
 
     dtype: float32 or float64, which REAL stands for
     defines: macros; True defines the bare name, False and None leave it out
@@ -80,7 +79,7 @@ def signature(file, name):
 
 
 class Programs:
-    """What was built for one device so far: equal requests share one program and one kernel."""
+    """Programs built for one device so far: equal requests share one program and one kernel."""
 
     def __init__(self, device):
         self.device = device
@@ -137,16 +136,16 @@ class Programs:
     def _built(self, file, dtype, defines):
         device, cl = self.device, load_pyopencl()
         if dtype == np.float64 and not device.has_fp64:
-            raise no_double(device)
+            raise float64_error(device)
         program = cl.Program(device.context, source_of(file, dtype, defines))
         try:
             return self._notice.build(lambda: program.build(options=["-cl-std=CL1.2"]))
         except cl.Error as error:
-            raise not_built(device, file, defines, build_log(error)) from error
+            raise build_error(device, file, defines, build_log(error)) from error
 
 
 def _request(file, dtype, defines):
-    """What tells one program from another."""
+    """Key by which programs are told apart."""
     return file, np.dtype(dtype), tuple(sorted(defines.items()))
 
 
@@ -159,7 +158,7 @@ def build_log(error):
 class Launcher:
     """One kernel, some of its arguments bound; `Device.launcher` makes it.
 
-        blur = device.launcher("update.cl", "blur", dtype=dtype).bind(table=table, taps=taps)
+        blur = device.launcher("update.cl", "blur_latent", dtype=dtype).bind(table=table, taps=taps)
         blur((nx, ny, n_sources), v=latent)
 
     `bind` gives arguments that stay, a call those of one launch. A buffer is a pyopencl array that
@@ -210,7 +209,7 @@ class Launcher:
         profile = self.device.profile
         if profile is not None:
             given = dict(zip(self._bound, values, strict=True))
-            profile.note(event, self.kernel.function_name, given, global_size)
+            profile.record(event, self.kernel.function_name, given, global_size)
 
     def _merged(self, arguments):
         for name, value in arguments.items():

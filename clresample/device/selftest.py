@@ -13,9 +13,9 @@ from contextlib import suppress
 
 import numpy as np
 
-from .contraction import FILE, GROUP_FILE, Matrix, padded
+from .contraction import FILE, GROUP_FILE, MatrixBatch, row_stride
+from .mirror_contraction import BACK_FILE, FILE as WAVES_FILE, fourier_contraction
 from .program import read_kernel
-from .waves import BACK_FILE, FILE as WAVES_FILE, waves
 
 # [1] Largest relative error, L2. float32 on a sound device leaves 1e-7; a wrong driver, one that
 # computes in half precision, or one that loses a row, leaves 1e-3 and more.
@@ -26,7 +26,7 @@ PART = "self_test"
 N_Y, N_X, M_Y, M_X, H_Y, H_X = 19, 21, 11, 13, 9, 10
 
 
-def fault(device, remembered):
+def self_test_fault(device, remembered):
     """Why `device` is not to be used, or None. What has passed once is remembered, not tried again.
 
     remembered: the Remembered of the device
@@ -77,22 +77,22 @@ def render(device):
     dtype, k_x = np.float32, 2 * H_X
 
     def put(values):
-        wide = np.zeros((len(values), padded(values.shape[1])))
+        wide = np.zeros((len(values), row_stride(values.shape[1])))
         wide[:, : values.shape[1]] = values
         return device.put(wide, dtype)
 
-    planes = np.zeros((H_Y, 4, padded(k_x) // 2))
+    planes = np.zeros((H_Y, 4, row_stride(k_x) // 2))
     planes[:, :, :H_X] = np.stack([d[0].real, d[0].imag, d[1].real, d[1].imag], axis=1)
     model, left, right = device.put(x, dtype), device.put(ty, dtype), put(tx.T)
     out_y, out_x, transfer = device.put(sy.T, dtype), put(sx), device.put(planes, dtype)
-    half, z, lines = (device.empty((n, padded(k_x)), dtype) for n in (N_Y, 2 * H_Y, M_Y))
+    half, z, lines = (device.empty((n, row_stride(k_x)), dtype) for n in (N_Y, 2 * H_Y, M_Y))
     image = device.empty((M_Y, M_X), dtype)
 
     def matrix(array):
-        return Matrix(array.base_data, array.shape[1])
+        return MatrixBatch(array.base_data, array.shape[1])
 
     def product(side, **options):
-        return waves(device, dtype, side, **options).bind
+        return fourier_contraction(device, dtype, side, **options).bind
 
     d = transfer.base_data, 0, 0
     product("right")(N_Y, k_x, N_X, matrix(model), matrix(right), matrix(half))(1)

@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .processor import name_processor
+from .pocl_cpu_name import set_pocl_cpu_name
 
 # Groups of a launch along its second and third axis, which GPUs limit to so many: NVIDIA's compute
 # capabilities list it, Mesa's drivers have the same.
-MOST_GROUPS = 65535
+MAX_GROUPS = 65535
 # Mesa's driver for CPUs, llvmpipe, counts the iterations of all loops of a work-item in a launch;
 # after 65,535 of them it ends every loop at once, and reports no error.
 LLVMPIPE_LOOPS = 65535
@@ -34,7 +34,7 @@ class Tuning:
         are computed and not stored
     row_loops: one work-item takes a whole row of pixels, as a CPU's vector unit wants it; else one
         takes a pixel
-    reads_ahead: the contraction fetches the right factor's next columns while it multiplies.
+    prefetch_columns: the contraction fetches the right factor's next columns while it multiplies.
         Without it, a CPU takes 15 to 20 % longer for a batch that is not in its cache
     sum_group: work-items that share one sum over a box or one sweep: 1 needs no barrier
     line_group: work-items of a group along an image row where a kernel has no loop of its own.
@@ -52,13 +52,14 @@ class Tuning:
         and back. Larger values make larger tiles
     vector_chunk: elements of a vector that one sum of lbfgs.cl runs over; on CPUs what stays in the
         first cache with all that it is multiplied by
-    folds: small float32 images go through float64 in parts even and odd about their middles, where
-        the device has it: as fast as float32 on CPUs, which do half as many a second, not on GPUs
+    use_folded: small float32 images go through float64 in parts even and odd about their middles,
+        where the device has it: as fast as float32 on CPUs, which do half as many a second, not on
+            GPUs
     n_scenes: scenes fitted side by side; more hide the launches better, and need more memory
-    ahead: a group of fits is prepared and uploaded by a second thread while another iterates; where
-        the device is the CPU itself, both would share its cores
-    loops: iterations of all its loops that a work-item may make in one launch; None where a device
-        has no such limit
+    prefetch_groups: a group of fits is prepared and uploaded by a second thread while another
+        iterates; where the device is the CPU itself, both would share its cores
+    max_loop_iterations: iterations of all its loops that a work-item may make in one launch; None
+        where a device has no such limit
     memory [bytes]: of the device for one frame in tiles, unless a caller says otherwise. With less,
         tiles are smaller and overlap more; most instruments' quickest tiles take less than 1 GiB
     """
@@ -66,7 +67,7 @@ class Tuning:
     tile: dict[str, int]
     row_choices: tuple[int, ...]
     row_loops: bool
-    reads_ahead: bool
+    prefetch_columns: bool
     sum_group: int
     line_group: int
     tile_group: tuple[int, int, int]
@@ -78,19 +79,19 @@ class Tuning:
     tile_flops: float
     pixel_flops: float
     vector_chunk: int
-    folds: bool
+    use_folded: bool
     n_scenes: int
-    ahead: bool
-    loops: int | None
+    prefetch_groups: bool
+    max_loop_iterations: int | None
     memory: int
 
     @classmethod
     def of(cls, device, dtype=np.float32) -> Tuning:
         """The sizes for a Device and float32 or float64: those `clresample tune` kept, if any."""
-        return replace(cls.before(device, dtype), **tuned(device, dtype))
+        return replace(cls.untuned(device, dtype), **tuned(device, dtype))
 
     @classmethod
-    def before(cls, device, dtype=np.float32) -> Tuning:
+    def untuned(cls, device, dtype=np.float32) -> Tuning:
         """The sizes for a device of which nothing was measured."""
         shared = {
             "line_group": 32,  # one warp of a GPU
@@ -98,7 +99,7 @@ class Tuning:
             "chunk_terms": 1024,
             "tile_flops": 4e7,  # 1 ms, where PoCL does 40 Gflop/s
             "pixel_flops": 80.0,  # 2 ns
-            "loops": LLVMPIPE_LOOPS if "llvmpipe" in device.name else None,
+            "max_loop_iterations": LLVMPIPE_LOOPS if "llvmpipe" in device.name else None,
             "memory": min(1 << 30, device.memory // 4),
         }
         # Drivers that draw on the CPU compile as for a GPU, with many work-items at a time; and a
@@ -108,16 +109,16 @@ class Tuning:
                 tile=_cpu_tile(device, np.dtype(dtype)),
                 row_choices=(),
                 row_loops=True,
-                reads_ahead=True,
+                prefetch_columns=True,
                 tile_group=(8, 1, 1),  # fewer cost more in starting them, more are cut off
                 item_group=(1, 1),
                 sum_group=1,
                 group_bytes=4 << 20,  # in the cache, where they are read back at speed
                 slab_bytes=2 << 20,  # what one core has in its cache
                 vector_chunk=512,
-                folds=True,
+                use_folded=True,
                 n_scenes=32,  # more leave the cache, fewer do not hide the launches
-                ahead=False,
+                prefetch_groups=False,
                 **shared,
             )
         return cls(
@@ -127,16 +128,16 @@ class Tuning:
             | {"WGX": 8, "WGY": 8, "KB": 16},
             row_choices=(6, 8, 10),  # 48, 64 or 80 rows a group; more spill
             row_loops=False,
-            reads_ahead=False,
+            prefetch_columns=False,
             tile_group=(8, 8, 1),
             item_group=(32, 1),
             sum_group=64,  # what every GPU allows
             group_bytes=1 << 30,  # the whole batch in flight
             slab_bytes=256 << 20,
             vector_chunk=4096,  # some for each work-item of a group
-            folds=False,
+            use_folded=False,
             n_scenes=1024,
-            ahead=not device.simulated,
+            prefetch_groups=not device.simulated,
             **shared,
         )
 
@@ -177,9 +178,11 @@ class Tuning:
 
 
 def _cpu_tile(device, dtype) -> dict[str, int]:
-    """Eight rows of two vectors use the 32 registers of AVX-512 and load little for each product;
-    elsewhere 16 registers hold six rows of one."""
-    built_for = name_processor(device.cl) or device.cl.version
+    """Eight rows of two vectors use the 32 registers of AVX-512 and load little for each product.
+
+    Elsewhere 16 registers hold six rows of one.
+    """
+    built_for = set_pocl_cpu_name(device.cl) or device.cl.version
     wide = device.cl.native_vector_width_float >= 16 and not built_for.endswith(NARROW)
     rows = {"NV": 2, "MR": 8} if wide else {"NV": 1, "MR": 6}
     return {"VW": 16 if dtype == np.float32 else 8, **rows, "WGX": 1, "WGY": 1}
@@ -217,5 +220,5 @@ def tuned(device, dtype):
             return {n: tuple(s) if n == "row_choices" else s for n, s in sizes.items()}
     except (TypeError, ValueError, AttributeError, KeyError):
         pass
-    device.remembered.forget(PART, "its sizes are none that `clresample tune` keeps")
+    device.remembered.invalidate(PART, "its sizes are none that `clresample tune` keeps")
     return {}

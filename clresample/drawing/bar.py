@@ -1,4 +1,4 @@
-"""How far work has come: a bar in terminals and notebooks, a line now and then in logs."""
+"""Progress bars in terminals and notebooks; a line now and then in logs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LOG = logging.getLogger("clresample")
 LINE_S = 30.0
 
 
-class Bar:
+class ProgressBar:
     """Called with the number of items that are done; a context manager that ends its line.
 
     total: number of all items; unit: what they are, in the plural
@@ -59,5 +59,5 @@ def tell(line):
 
 
 def _is_watched():
-    """Whether someone looks: a terminal, or a notebook's kernel."""
+    """Returns True if someone looks: a terminal, or a notebook's kernel."""
     return sys.stderr.isatty() or "ipykernel" in sys.modules

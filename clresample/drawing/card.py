@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import html
 
-from .sheet import png_of
+from .figure import png_of
 
 TABLE = "border-collapse:collapse;margin:0.3em 0;font-size:90%"
 CELL = "text-align:left;padding:0.15em 1em 0.15em 0;vertical-align:top"
@@ -38,7 +38,7 @@ def _picture(draw):
     return f'<img alt="" style="max-width:100%" src="data:image/png;base64,{data}">'
 
 
-def few(values, form=".3g"):
+def format_values(values, form=".3g"):
     """A few values as text, the first six where there are more; numbers in the given format."""
     values = list(values)
     more = " ..." if len(values) > 6 else ""

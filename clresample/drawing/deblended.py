@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .sheet import GAP, INK, PAPER, add_panel, dark_sheet, show_image
+from .figure import GAP, INK, PAPER, add_panel, dark_figure, show_image
 
 PANEL_INCHES = 3.2
 ABOVE, BELOW = 0.62, 0.28  # [inch] for the titles, and for the line below each row
@@ -16,7 +16,7 @@ MARK = "#7fe3ff"
 COLUMNS = "observed", "model", "residual"
 
 
-def deblended_sheet(result, *, title=""):
+def deblended_figure(result, *, title=""):
     """Observed, model and residual of every observation, with the sources marked, as a figure.
 
     Observations of three or more channels are shown in colour: the three neighbouring channels of
@@ -30,7 +30,7 @@ def deblended_sheet(result, *, title=""):
     n_y, n_x = result.frame.shape
     width, height = PANEL_INCHES, PANEL_INCHES * n_y / n_x
     n_rows = len(result.observations)
-    figure = dark_sheet(3 * (width + GAP) + GAP, ABOVE + n_rows * (height + BELOW), title)
+    figure = dark_figure(3 * (width + GAP) + GAP, ABOVE + n_rows * (height + BELOW), title)
     for i, o in enumerate(result.observations):
         mapping = result.footprints[i].mapping
         chosen = _shown(result, i)
@@ -104,8 +104,8 @@ def _mark(axes, result, *, numbers):
     """Crosses at the sources; as many as can be read are named."""
     from matplotlib.patheffects import withStroke
 
-    positions = result.frame.place(result.sources)
-    inside = result.frame.inside(positions)
+    positions = result.frame.positions_of(result.sources)
+    inside = result.frame.contains(positions)
     few = inside.sum() <= FEW
     for i in np.flatnonzero(inside):
         y, x = positions[i]

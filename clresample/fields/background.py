@@ -17,8 +17,9 @@ CELL_PX = 128
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """A surface through levels at the middles of cells: linear between them, and on beyond
-    the outer ones as between the last two.
+    """A surface through levels at the middles of cells, linear between them.
+
+    Beyond the outer ones it goes on as between the last two.
 
     levels (n_y, n_x) [counts]; cell (2,) [px]: their distance (y, x)
     """

@@ -41,23 +41,23 @@ class Box(NamedTuple):
         """With n more pixels on each side."""
         return Box(self.y0 - n, self.x0 - n, self.y1 + n, self.x1 + n)
 
-    def meet(self, other) -> Box:
-        """What both hold; of area 0 where they do not meet."""
+    def intersection(self, other) -> Box:
+        """Common part of two boxes; of area 0 where they do not overlap."""
         y0, x0 = max(self.y0, other.y0), max(self.x0, other.x0)
         return Box(y0, x0, max(min(self.y1, other.y1), y0), max(min(self.x1, other.x1), x0))
 
-    def join(self, other) -> Box:
+    def union(self, other) -> Box:
         """The smallest box with both."""
         low = min(self.y0, other.y0), min(self.x0, other.x0)
         return Box(*low, max(self.y1, other.y1), max(self.x1, other.x1))
 
-    def within(self, other) -> Box:
+    def relative_to(self, other) -> Box:
         """The same pixels counted from the first pixel of `other`."""
         y, x = other.y0, other.x0
         return Box(self.y0 - y, self.x0 - x, self.y1 - y, self.x1 - x)
 
-    def holds(self, positions) -> np.ndarray:
-        """Which positions (..., 2) [px], (y, x), lie on its pixels; an edge belongs to one side."""
+    def contains(self, positions) -> np.ndarray:
+        """Selects positions (..., 2) [px], (y, x), on its pixels; an edge belongs to one side."""
         positions = np.asarray(positions)
         low, high = np.array(self[:2]) - 0.5, np.array(self[2:]) - 0.5
         return ((positions >= low) & (positions < high)).all(axis=-1)
@@ -108,7 +108,7 @@ def box_within(points, margin, step, whole) -> Box:
     return Box(y0, x0, y1, x1)
 
 
-def sized_up(box, step) -> Box:
+def round_up_size(box, step) -> Box:
     """The box, larger about its middle, with sides that are multiples of `step` [px]."""
     sides = [step * math.ceil(n / step) for n in box.shape]
     y0, x0 = (a - (side - n) // 2 for a, n, side in zip(box[:2], box.shape, sides, strict=True))

@@ -17,14 +17,14 @@ from ..deblending.cutouts.choice import MissingSource, chosen_observation
 from ..deblending.cutouts.cutout import as_ccddata
 from ..deblending.cutouts.separation import Separation, check_kind, separation_of
 from ..deblending.cutouts.window import sized_window, window_of
-from ..device.workers import one_blas_thread
+from ..device.multi_device import one_blas_thread
+from ..files.atomic import FileError
 from ..files.fits import open_fits
-from ..files.whole_file import FileError
 from .box import Box
+from .field_toml.field_file import read_field
 from .light import REACH_FWHM, ModelLight
 from .models import ModelFile
-from .reading.field_file import read_field
-from .reference import reference_of
+from .reference import reference_grid
 
 
 class FieldCutouts:
@@ -67,7 +67,7 @@ class FieldCutouts:
                 f"{folder}: is a run over the channels {', '.join(map(str, self._models.channels))}"
                 f", the mosaics have {', '.join(names)}: give those that it was run with"
             )
-        self._reference = reference_of(self.mosaics)
+        self._reference = reference_grid(self.mosaics)
         self._light = ModelLight(self._models, self.mosaics, self._reference, device)
 
     def _read_mosaics(self):
@@ -159,10 +159,10 @@ class FieldCutouts:
         fwhm = float(psf.fwhm_px.max())
         whole = Box.of(mosaic.grid.shape)
         if size is None:
-            wide = self._light.window_about(i_mosaic, own, REACH_FWHM * fwhm).meet(whole)
+            wide = self._light.window_about(i_mosaic, own, REACH_FWHM * fwhm).intersection(whole)
         else:
             wide = Box(*sized_window(size, position, mosaic.grid.pixel_scale_arcsec))
-        window = wide.meet(whole)
+        window = wide.intersection(whole)
         o = mosaic.observation(window) if window.area else None
         if o is None:
             raise MissingSource(f"source {ids[0]} has no pixel with a weight in {mosaic.name!r}")

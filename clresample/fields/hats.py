@@ -1,4 +1,4 @@
-"""A catalogue in the HATS layout, in which LSDB opens, matches and joins catalogues of any size.
+"""Writes a catalogue in the HATS layout, for LSDB to open, match and join at any size.
 
     hats/hats.properties            names of columns, number of rows
     hats/partition_info.csv         pixels of the partitions
@@ -22,26 +22,30 @@ from pathlib import Path
 import numpy as np
 
 from .. import __version__
+from ..files.atomic import FileError
 from ..files.parquet import arrow_table
-from ..files.whole_file import FileError
-from ..sky.wcs import names_of
+from ..sky.wcs import axis_names
 
 FINEST = 29  # order of the index: pixels of 0.4 milliarcseconds, the finest that int64 numbers
 INDEX = f"_healpix_{FINEST}"
 # rows of a partition: one of ours takes 1 kB, and LSDB's workers hold a few partitions each; with
 # more they need gigabytes, with fewer there are thousands of files for a sky survey
-MOST_ROWS = 300_000
+MAX_ROWS = 300_000
 LARGEST_ORDER = 10  # pixels of 3.4 arcminutes, smaller than a tile: no partition is divided further
 
 
 def check_hats(grid):
-    """Raise, before a run begins, ValueError for a field whose catalogue will have no ra and dec,
-    and ImportError without pyarrow or astropy-healpix.
+    """Raises, before a run begins, the errors of a HATS catalogue that cannot be written.
+
+    ValueError for a field whose catalogue will have no ra and dec, and ImportError without pyarrow
+    or astropy-healpix.
 
     grid: of the model's pixels
     """
-    if grid.is_flat or names_of(grid.wcs) != ("ra", "dec"):
-        raise ValueError(f"HATS needs right ascension and declination, the field is {grid.placing}")
+    if grid.is_flat or axis_names(grid.wcs) != ("ra", "dec"):
+        raise ValueError(
+            f"HATS needs right ascension and declination, the field is {grid.sky_description}"
+        )
     if not find_spec("pyarrow"):
         raise ImportError("HATS needs pyarrow, which is not installed: pip install pyarrow")
     healpix_index([0.0], [0.0])
@@ -68,7 +72,7 @@ def healpix_index(ra, dec) -> np.ndarray:
     return np.asarray(found, np.int64)
 
 
-def partitions(index, most=MOST_ROWS) -> list[tuple[int, int]]:
+def partitions(index, most=MAX_ROWS) -> list[tuple[int, int]]:
     """The (order, pixel) of each partition of rows with these pixels of order 29, in their order.
 
     Of the lowest order at which a pixel has at most `most` rows, up to LARGEST_ORDER.
@@ -88,7 +92,7 @@ def partitions(index, most=MOST_ROWS) -> list[tuple[int, int]]:
     return found
 
 
-def write_hats(folder, table, *, name="clresample", most_rows=MOST_ROWS) -> Path:
+def write_hats(folder, table, *, name="clresample", most_rows=MAX_ROWS) -> Path:
     """Write a catalogue of a field, or of several, in the HATS layout.
 
     folder: to make; one of this name that holds HATS is replaced

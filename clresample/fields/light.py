@@ -39,8 +39,10 @@ class ModelLight:
         return slice(start, start + len(self.mosaics[i_mosaic].channels))
 
     def window_about(self, i_mosaic, components, reach):
-        """The pixels of a mosaic about the boxes of some components: a Box; of area 0 where its
-        projection does not hold them."""
+        """The pixels of a mosaic about the boxes of some components: a Box.
+
+        Of area 0 where its projection does not hold them.
+        """
         models, mosaic = self.models, self.mosaics[i_mosaic]
         low, high = models.low[components].min(axis=0), models.high[components].max(axis=0)
         corners = _corners(low - 0.5, high - 0.5)

@@ -9,15 +9,15 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import Table
 
+from ..files.atomic import FileError, atomic_file
 from ..files.fits import open_fits
-from ..files.whole_file import FileError, whole_file
-from .work.part import COMPONENT_COLUMNS
+from .execution.group_results import COMPONENT_COLUMNS
 
 FORMAT = 1  # of the file; raised when an older reader would misread it
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class ComponentModel:
     """One component of a source's model.
 
     id, parent_id: as in the catalogue; origin (2,) [px]: (y, x) of its first pixel in the field's
@@ -71,7 +71,7 @@ def write_models(path, job, parts, last, ids):
     offsets = [row for row in offsets if int(row[0]) in known]
     moved = fits.ImageHDU(np.array(sorted(offsets, key=lambda row: row[0])) if offsets else None)
     moved.name = "OFFSETS"
-    with whole_file(path) as part:
+    with atomic_file(path) as part:
         fits.HDUList([primary, hdu, image, moved]).writeto(part, overwrite=True)
     return path
 
@@ -133,10 +133,10 @@ class ModelFile:
         n_channels, row = len(self.channels), self._offsets.get(int(self.table["patch"][i]))
         return np.zeros(n_channels) if row is None else row[-n_channels:]
 
-    def model(self, i) -> Model:
+    def model(self, i) -> ComponentModel:
         """Component i."""
         table = self.table
-        return Model(
+        return ComponentModel(
             int(table["id"][i]),
             int(table["parent_id"][i]),
             (int(table["y0"][i]), int(table["x0"][i])),
@@ -145,7 +145,7 @@ class ModelFile:
         )
 
 
-def read_models(path, parent_id=None) -> list[Model]:
+def read_models(path, parent_id=None) -> list[ComponentModel]:
     """The models of one blend, or of all; of the pixels, only theirs are read.
 
     Raises FileError for a file without models, or without this blend.

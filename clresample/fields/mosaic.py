@@ -8,14 +8,14 @@ from typing import Protocol
 
 import numpy as np
 
-from ..sky.given.observed import as_psf
 from ..sky.grid import Grid, as_grid
 from ..sky.observation import Observation
 from ..sky.psf_checks import PSFWarning
-from ..sky.varying.field import PSFField
+from ..sky.validation.observed import as_psf
+from ..sky.varying_psf.field import PSFField
 from .background import Background
 from .box import Box, outline
-from .psfs.psf_field import ConstantPSF
+from .psfs.combined import ConstantPSF
 from .strips import FilePlane as FilePlane  # beside the other kinds of Plane
 
 
@@ -38,7 +38,7 @@ class ArrayPlane:
 
 
 @dataclass(frozen=True)
-class NumberPlane:
+class ConstantPlane:
     """The same number in every pixel."""
 
     value: float
@@ -54,8 +54,8 @@ class Channel:
 
     name: of the channel, unique over all mosaics
     data [counts]: plane of the image
-    weight: plane, or None; kind: what it holds, "weight" [counts^-2], "variance" [counts^2] or
-        "rms" [counts], the standard deviation; 0, NaN and infinite ones mean: ignore this pixel
+    weight: plane, or None; weight_kind: what it holds, "weight" [counts^-2], "variance" [counts^2]
+        or "rms" [counts], the standard deviation; 0, NaN and infinite ones mean: ignore this pixel
     mask: plane or None; mask_value: the bits that mean: ignore this pixel; None = any that is not 0
     zero_point [mag]: AB magnitude of one count; None = unknown
     background: Background that is subtracted, or None
@@ -66,7 +66,7 @@ class Channel:
     name: str
     data: Plane
     weight: Plane | None = None
-    kind: str = "weight"
+    weight_kind: str = "weight"
     mask: Plane | None = None
     mask_value: int | None = None
     zero_point: float | None = None
@@ -88,10 +88,10 @@ class Channel:
         if self.weight is None:
             raise ValueError(f"weight of channel {self.name!r} is None, it takes a plane")
         values = np.asarray(self.weight.read(box), dtype=np.float64)
-        if self.kind == "weight":
+        if self.weight_kind == "weight":
             bad = ~np.isfinite(values) | (values < 0)
         else:
-            variance = values**2 if self.kind == "rms" else values
+            variance = values**2 if self.weight_kind == "rms" else values
             good = (variance >= np.finfo(np.float64).tiny) & (variance < np.inf)  # no NaN is
             values = np.divide(1.0, variance, out=np.zeros(variance.shape), where=good)
             if self.mask is None:
@@ -119,7 +119,7 @@ class Channel:
         return self.mask, self.mask_value
 
     def masked(self, box) -> np.ndarray:
-        """Which pixels (Ny, Nx) of a Box the mask excludes; a channel without one excludes none."""
+        """Pixels (Ny, Nx) of a Box that the mask excludes; a channel without one excludes none."""
         if self.mask is None:
             return np.zeros(box.shape, bool)
         flags = np.nan_to_num(self.mask.read(box))
@@ -220,7 +220,7 @@ class Mosaic:
         there = self.edge_of(grid)
         if not len(there):
             return Box(0, 0, 0, 0)
-        return Box.around(there).grown(1).meet(Box.of(self.grid.shape))
+        return Box.around(there).grown(1).intersection(Box.of(self.grid.shape))
 
     def edge_of(self, grid) -> np.ndarray:
         """Points (n, 2) [px] along the outer edge of a grid, those that this mosaic has."""
@@ -286,5 +286,5 @@ def saturations(channels, box) -> np.ndarray | None:
 
 
 def _set(flags, bits):
-    """Where any of the bits is set; flags of any integer type."""
+    """Pixels with any of the bits; flags of any integer type."""
     return (np.asarray(flags).astype(np.int64) & bits) != 0

@@ -1,4 +1,4 @@
-"""How a field is run, and what it tells meanwhile."""
+"""Options of a field run and its progress callbacks."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import numpy as np
 
 from ..deblending.settings import Settings
 from ..measurement.detection import THRESHOLD
-from .blends.cut import Limits
+from .blends.cut import FitLimits
 from .blends.plan import LARGEST_FIELD
 
 LOG = logging.getLogger("clresample")
 # [bytes] of one group of fits: more lets more blends share a batch
 MEMORY = 1 << 30
 # [bytes] of a worker process: libraries, compiler and one small group take some 600 MiB
-LEAST_BOUND = 1 << 30
-LEAST_MEMORY = 1 << 26  # [bytes] what a single blend of some ten sources takes
+MIN_BOUND = 1 << 30
+MIN_MEMORY = 1 << 26  # [bytes] what a single blend of some ten sources takes
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FieldOptions:
-    """How a field is run.
+    """Options of a field run.
 
     settings: of the fits
     threshold [sigma]: least signal to noise of a source; passes: 1, or 2 to search each blend's
@@ -31,15 +31,16 @@ class FieldOptions:
         that are known, or a SkyCoord of S places; None = search for them
     part (i, n): run the i-th of n parts of the field (from 1) alone, for job arrays: its catalogue
         has the sources whose centres lie in it; None = the whole
-    border_px [model px]: around the part, which is searched and fitted too. Blends that reach from
+    margin_px [model px]: around the part, which is searched and fitted too. Blends that reach from
         the part to beyond the border are fitted without what lies there
     tile_px [model px]: largest side of a tile of the search; overlap_px: by which tiles overlap
     limits: of one fit; larger blends are cut
-    memory [bytes]: that a group of fits, and the search of a tile, may take in a worker; a run that
-        goes on keeps what it began with
-    bound [bytes]: private memory that the system lets a worker process take in all (Linux); None =
-        what it has. What is refused costs a group its batch: it is fitted in halves, then alone
-    workers: processes; 0 = this one. limit_s [s]: longest time of a group, None = no limit
+    group_memory [bytes]: that a group of fits, and the search of a tile, may take in a worker; a
+        run that goes on keeps what it began with
+    worker_memory [bytes]: private memory that the system lets a worker process take in all (Linux);
+        None = what it has. What is refused costs a group its batch: it is fitted in halves, then
+        alone
+    workers: processes; 0 = this one. task_timeout_s [s]: longest time of a group, None = no limit
     hats: write the catalogue in the HATS layout too, into DIR/hats
     device: as `get_device` takes it, or a list: one worker process a device at least
     scheduler: address of a `dask.distributed` scheduler, whose workers do the work instead; None =
@@ -52,14 +53,14 @@ class FieldOptions:
     passes: int = 2
     positions: np.ndarray | None = None
     part: tuple[int, int] | None = None
-    border_px: int = 256
+    margin_px: int = 256
     tile_px: int = 1024
     overlap_px: int = 96
-    limits: Limits = Limits()
-    memory: int = MEMORY
-    bound: int | None = None
+    limits: FitLimits = FitLimits()
+    group_memory: int = MEMORY
+    worker_memory: int | None = None
     workers: int = 0
-    limit_s: float | None = None
+    task_timeout_s: float | None = None
     hats: bool = False
     device: object = None
     scheduler: str | None = None
@@ -72,10 +73,10 @@ class FieldOptions:
             raise ValueError(f"field_number is {self.field_number}, must be 0 to {LARGEST_FIELD}")
         if self.workers < 0:
             raise ValueError(f"workers is {self.workers}, must be 0 or more")
-        if not self.memory >= LEAST_MEMORY:
-            raise ValueError(f"memory is {self.memory} bytes, must be 64 MiB or more")
-        if self.bound is not None and not self.bound >= LEAST_BOUND:
-            raise ValueError(f"bound is {self.bound} bytes, must be 1 GiB or more")
+        if not self.group_memory >= MIN_MEMORY:
+            raise ValueError(f"group_memory is {self.group_memory} bytes, must be 64 MiB or more")
+        if self.worker_memory is not None and not self.worker_memory >= MIN_BOUND:
+            raise ValueError(f"worker_memory is {self.worker_memory} bytes, must be 1 GiB or more")
         if isinstance(self.device, (list, tuple)) and not self.device:
             raise ValueError("device is an empty list, must name at least one")
 
@@ -87,18 +88,18 @@ class FieldOptions:
         return () if self.device is None else (self.device,)
 
 
-def group_memory(bound) -> int:
+def default_group_memory(bound) -> int:
     """Memory [bytes] of a group of fits by prediction, in a process that may take `bound` in all.
 
     Half of what its libraries leave: predictions are rough, and a group's results are held beside
     the device's memory.
     """
-    return max(LEAST_MEMORY, min(MEMORY, (bound - LEAST_BOUND // 2) // 2))
+    return max(MIN_MEMORY, min(MEMORY, (bound - MIN_BOUND // 2) // 2))
 
 
 @dataclass(eq=False)
-class Progress:
-    """What a run tells while it goes, to the logger "clresample": override what is wanted.
+class RunProgress:
+    """Progress callbacks of a field run; override those you need.
 
     stage(name, total): a stage begins, of so many tiles or blends; step(n, sources): n of them are
     done; say(text): what the user should know; dashboard(address): where workers can be watched
@@ -111,10 +112,10 @@ class Progress:
     def step(self, n, sources=0):
         """Some of it is done."""
 
-    def say(self, text):
-        """What the user should know, a line."""
+    def message(self, text):
+        """Receives a message for the user, one line."""
         LOG.info(text)
 
     def dashboard(self, address):
         """The address of a page that shows what the workers do, where there is one: a line."""
-        self.say(f"dashboard: {address}")
+        self.message(f"dashboard: {address}")

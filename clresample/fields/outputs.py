@@ -1,4 +1,4 @@
-"""What a field leaves: catalogues, blends, models by source, model and residual mosaics."""
+"""Outputs of a field: catalogues, table of fits, models by source, model and residual mosaics."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from pathlib import Path
 from astropy.io import fits
 
 from .. import __version__
+from ..files.atomic import atomic_tree, check_output
 from ..files.parquet import write_parquet
-from ..files.whole_file import check_output, whole_tree
-from .columns import finished
+from .columns import finalise_catalogue
+from .execution.search_setup import read_search_setup
 from .hats import write_hats
-from .images import file_name, write_mosaics
+from .model_mosaics import file_name, write_mosaics
 from .models import write_models
-from .work.look import looked
 
 NO_PARQUET = "no catalogue.parquet: pyarrow is not installed (pip install pyarrow)"
 FILES = (
-    *("catalogue.parquet", "catalogue.fits", "catalogue.ecsv", "blends.ecsv", "models.fits"),
+    *("catalogue.parquet", "catalogue.fits", "catalogue.ecsv", "fit_table.ecsv", "models.fits"),
     "provenance.json",
 )
 PACKAGES = (  # those whose numbers enter a catalogue, or whose formats are read and written
@@ -35,8 +35,8 @@ PACKAGES = (  # those whose numbers enter a catalogue, or whose formats are read
 
 
 @dataclass(frozen=True, eq=False)
-class Outputs:
-    """What was written.
+class FieldOutputs:
+    """Files that were written.
 
     paths: of the files; n_sources, n_blends; status: how many fits ended how; notes: a line each
     """
@@ -57,7 +57,7 @@ def check_outputs(folder, mosaics):
         check_output(folder / name, overwrite=True)
 
 
-def write_outputs(folder, job, parts, unsettled, about, seconds, hats=False) -> Outputs:
+def write_outputs(folder, job, parts, unsettled, about, seconds, hats=False) -> FieldOutputs:
     """Write all outputs of a field, all files together or none; the folder of HATS before them.
 
     folder: to write into; job: Job; parts: PartFiles, those of later rounds last
@@ -66,21 +66,21 @@ def write_outputs(folder, job, parts, unsettled, about, seconds, hats=False) -> 
     hats: write the catalogue in the HATS layout too, if it has rows
 
     catalogue.{parquet,fits,ecsv} hold nothing that another run of the same field would change:
-    times are in blends.ecsv and provenance.json. Raises FileError.
+    times are in fit_table.ecsv and provenance.json. Raises FileError.
     """
     last = _last_rounds(parts)
-    table, blends = finished(job, parts, last, unsettled)
+    table, blends = finalise_catalogue(job, parts, last, unsettled)
     status = Counter(str(s).split(":")[0] for s in blends["status"])
     notes = () if find_spec("pyarrow") else (NO_PARQUET,)
     paths = [write_hats(folder / "hats", table)] if hats and len(table) else []
-    with whole_tree(folder) as part:
+    with atomic_tree(folder) as part:
         made = list(_write_catalogues(part, table))
-        made.append(_write_ecsv(part / "blends.ecsv", blends))
+        made.append(_write_ecsv(part / "fit_table.ecsv", blends))
         made.append(write_models(part / "models.fits", job, parts, last, set(table["id"].tolist())))
         made += write_mosaics(part, job, parts, last)
         made.append(_write_provenance(part / "provenance.json", job, about, seconds, status))
     paths += [folder / path.name for path in made]
-    return Outputs(tuple(paths), len(table), len(blends), dict(status), notes)
+    return FieldOutputs(tuple(paths), len(table), len(blends), dict(status), notes)
 
 
 def _last_rounds(parts):
@@ -88,7 +88,7 @@ def _last_rounds(parts):
     last, n_round = {}, {}
     for i, part in enumerate(parts):
         (rows,) = part.read("PATCHES")
-        for patch, one in zip(rows["patch"].tolist(), rows["round"].tolist(), strict=True):
+        for patch, one in zip(rows["fit_id"].tolist(), rows["n_refits"].tolist(), strict=True):
             if one >= n_round.get(patch, -1):
                 last[patch], n_round[patch] = i, one
     return last
@@ -116,7 +116,7 @@ def _write_ecsv(path, table):
 
 
 def _write_provenance(path, job, about, seconds, status):
-    """What made these files: versions, device, settings, inputs with their checksums, times."""
+    """Writes the provenance: versions, device, settings, inputs with checksums, times."""
     packages = {}
     for name in PACKAGES:
         try:
@@ -129,10 +129,10 @@ def _write_provenance(path, job, about, seconds, status):
         "python": platform.python_version(),
         "system": platform.platform(),
         "packages": packages,
-        "device": ", ".join(looked(job.folder).devices),
+        "device": ", ".join(read_search_setup(job.folder).devices),
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
         "run": json.loads((job.folder / "run.json").read_text()),
-        "lost_tiles": job.plan.lost,
+        "failed_tiles": job.plan.failed_tiles,
         "fits": dict(status),
         "seconds": seconds,
         "inputs": {what: {"file": str(f), "sha256": _checksum(f)} for what, f in files.items()},

@@ -34,8 +34,11 @@ class Formats(Mapping):
         return name in self.own or (isinstance(name, str) and bool(self._points(name)))
 
     def __getitem__(self, name) -> Callable:
-        """The reader of a name. Raises KeyError for an unknown one, ValueError for one that cannot
-        be imported or that several packages add."""
+        """The reader of a name.
+
+        Raises KeyError for an unknown one, ValueError for one that cannot be imported or that
+        several packages add.
+        """
         if name in self.own:
             return self.own[name]
         points = self._points(name)

@@ -6,12 +6,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..files.names import check_columns, to_ascii
+from ..files.fits_names import check_columns, to_ascii
 from ..sky.grid import Grid
-from .images import file_name
+from .model_mosaics import file_name
 
 
-def reference_of(mosaics) -> Grid:
+def reference_grid(mosaics) -> Grid:
     """The grid of the mosaic with the smallest pixels, of equal ones the first.
 
     Raises ValueError for no mosaic, names or channels that are not unique or that tables cannot

@@ -11,36 +11,36 @@ from pathlib import Path
 import numpy as np
 from astropy.coordinates import SkyCoord
 
-from ..sky.wcs import frame_of
-from .blends.tiles import part_of
+from ..sky.wcs import celestial_frame
+from .blends.tiles import field_part
 from .box import Box
+from .execution.backend import make_backend
+from .execution.fitting import FieldJob
+from .execution.folder import open_folder
+from .execution.rounds import fit_all_groups
+from .execution.search_setup import prepare_search, read_search_setup
+from .execution.searching import load_or_make_plan
 from .hats import check_hats
-from .options import LEAST_MEMORY, FieldOptions, Progress
-from .outputs import Outputs, check_outputs, write_outputs
-from .reference import reference_of as reference_of
+from .options import MIN_MEMORY, FieldOptions, RunProgress
+from .outputs import FieldOutputs, check_outputs, write_outputs
+from .reference import reference_grid as reference_grid
 from .strips import STRIPS
-from .work.engine import engine_of
-from .work.fitting import Job
-from .work.folder import open_folder
-from .work.look import looked, take_look
-from .work.rounds import fitted
-from .work.searching import planned
 
 
 @dataclass(frozen=True, eq=False)
 class FieldRun:
-    """What a run has left in its folder.
+    """Results of a run in its folder.
 
     outputs: paths and numbers, see Outputs; seconds: wall time by stage
-    failed: fits that were set aside; lost: {tile: why it could not be searched}
-    turns: (stage, Outcome) of every task that the workers have done: who had it, and when
+    failed: fits that were set aside; failed_tiles: {tile: why it could not be searched}
+    task_times: (stage, Outcome) of every task that the workers have done: who had it, and when
     """
 
-    outputs: Outputs
+    outputs: FieldOutputs
     seconds: dict = field(default_factory=dict)
     failed: int = 0
-    lost: dict = field(default_factory=dict)
-    turns: tuple = ()
+    failed_tiles: dict = field(default_factory=dict)
+    task_times: tuple = ()
 
 
 def run_field(
@@ -49,8 +49,8 @@ def run_field(
     """Find, fit and measure every source of a field of mosaics.
 
     mosaics: sequence of Mosaic; the model's pixels are those of the one with the smallest
-    folder: for catalogue.{parquet,fits,ecsv}, blends.ecsv, models.fits, model and residual mosaics,
-        provenance.json; and for work/, what is done so far
+    folder: for catalogue.{parquet,fits,ecsv}, fit_table.ecsv, models.fits, model and residual
+        mosaics, provenance.json; and for work/, what is done so far
     options: FieldOptions
     resume: go on where a run with the same options stopped; overwrite: forget such a run
     progress: Progress; about: dict of plain values for the provenance, such as input files
@@ -61,10 +61,10 @@ def run_field(
     Raises ValueError for mosaics that do not go together, FileError for a folder with another run,
     and where nothing can be written; ImportError without sep, and without what HATS needs.
     """
-    options, progress = options or FieldOptions(), progress or Progress()
+    options, progress = options or FieldOptions(), progress or RunProgress()
     mosaics, folder = _as_sent(mosaics), Path(folder)
     seconds: dict[str, float] = {}
-    reference = reference_of(mosaics)
+    reference = reference_grid(mosaics)
     options = replace(options, positions=_degrees(options.positions, reference))
     _check_outputs(folder, mosaics, reference, options)
     inputs = tuple((about or {}).get("inputs", {}).values())
@@ -72,28 +72,30 @@ def run_field(
         folder, mosaics, reference, options, resume, overwrite, progress, inputs
     )
     whole, clock = Box.of(reference.shape), _Clock(seconds)
-    core = whole if options.part is None else part_of(whole, *options.part)
-    region = core if options.part is None else core.grown(options.border_px).meet(whole)
-    engine = engine_of(options, progress)
+    core = whole if options.part is None else field_part(whole, *options.part)
+    region = core if options.part is None else core.grown(options.margin_px).intersection(whole)
+    engine = make_backend(options, progress)
     try:
-        take_look(mosaics, reference, work, engine)
-        memory = max(LEAST_MEMORY, min(options.memory, looked(work).memory))
-        options = replace(options, memory=memory)
-        plan = planned(mosaics, reference, region, core, work, options, engine, progress, clock)
-        job = Job(
+        prepare_search(mosaics, reference, work, engine)
+        memory = max(MIN_MEMORY, min(options.group_memory, read_search_setup(work).memory))
+        options = replace(options, group_memory=memory)
+        plan = load_or_make_plan(
+            mosaics, reference, region, core, work, options, engine, progress, clock
+        )
+        job = FieldJob(
             mosaics=mosaics,
             reference=reference,
             folder=work,
             plan=plan,
-            corner=(region.y0, region.x0),
+            origin_px=(region.y0, region.x0),
             core=core,
             settings=options.settings,
             threshold=options.threshold,
             passes=options.passes,
-            memory=options.memory,
+            memory=options.group_memory,
             field_number=options.field_number,
         )
-        parts, unsettled = fitted(job, engine, progress)
+        parts, unsettled = fit_all_groups(job, engine, progress)
         engine.close()  # its memory is for what follows
         clock.stop("fit")
         progress.stage("write", 1)
@@ -103,7 +105,7 @@ def run_field(
         STRIPS.clear()
     clock.stop("write")
     failed = outputs.status.get("failed", 0)
-    return FieldRun(outputs, seconds, failed, plan.lost, tuple(engine.turns))
+    return FieldRun(outputs, seconds, failed, plan.failed_tiles, tuple(engine.turns))
 
 
 def _degrees(positions, reference):
@@ -116,7 +118,7 @@ def _degrees(positions, reference):
             "positions is a SkyCoord, but the mosaics are flat: give (y, x) [arcsec], or the "
             "mosaics a WCS"
         )
-    sky = positions.ravel().transform_to(frame_of(reference.wcs)).spherical
+    sky = positions.ravel().transform_to(celestial_frame(reference.wcs)).spherical
     return np.stack([sky.lon.deg, sky.lat.deg], axis=1)
 
 

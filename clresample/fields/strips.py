@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 
-from ..files.whole_file import FileError
+from ..files.atomic import FileError
 
 # [px] Rows that are kept together, in whole tiles: about the side of a small blend's cutout. Fewer
 # are more entries, more are decoded for a cutout that is the only one there.
@@ -19,7 +19,7 @@ STRIP_PX = 64
 # [bytes] of all strips: a field of 4096 pixels a side, with six bands in pixels twice as large and
 # the errors of all, has 350 MB of them. The blends of a group lie all over a field. With 64 MB each
 # decoded its rows again: 7.6 GB of that field in all, at 160 MB a second a fifth of a run's time.
-MOST_BYTES = 384 << 20
+MAX_BYTES = 384 << 20
 # Part of the memory that a process is bound to which they may take.
 PART = 0.1
 # Part of them that the rows of one box may take; larger ones would drive out all others.
@@ -29,20 +29,20 @@ PLAIN = fits.ImageHDU, fits.PrimaryHDU
 SCALES = {"BSCALE", "BZERO", "BLANK"}  # cards of images whose pixels are computed as they are read
 
 
-class Strips:
+class StripCache:
     """Strips of planes, those read longest ago dropped beyond `most` bytes. Safe between threads.
 
     Only of images whose tiles are as wide as they are, of which any cutout decodes whole rows.
     """
 
-    def __init__(self, most=MOST_BYTES):
+    def __init__(self, most=MAX_BYTES):
         self.most, self.n_bytes = most, 0
         self._kept: OrderedDict[tuple, np.ndarray] = OrderedDict()
         self._lock = threading.Lock()
 
-    def hold(self, bound):
+    def set_limit(self, bound):
         """Keep within a part of the memory [bytes] that this process may take; None = any."""
-        self.most = MOST_BYTES if bound is None else min(MOST_BYTES, int(PART * bound))
+        self.most = MAX_BYTES if bound is None else min(MAX_BYTES, int(PART * bound))
 
     def clear(self):
         """Keep none of those that are there."""
@@ -51,8 +51,10 @@ class Strips:
             self.n_bytes = 0
 
     def read(self, hdu, plane, box) -> np.ndarray | None:
-        """The pixels of a Box of an HDU's plane (its number, None where there is one); None where
-        strips would not help."""
+        """The pixels of a Box of an HDU's plane (its number, None where there is one).
+
+        None where strips would not help.
+        """
         n_rows = _rows_of(hdu)
         if not n_rows or not box.area:
             return None
@@ -94,10 +96,10 @@ def _rows_of(hdu):
     return int(tile[-2]) * max(1, STRIP_PX // int(tile[-2]))
 
 
-STRIPS = Strips()
+STRIPS = StripCache()
 
 
-def section(hdu, plane, box):
+def read_section(hdu, plane, box):
     """The pixels of a Box of an HDU's plane, None where it has one.
 
     Of a plain image, whole rows are taken and cut: astropy reads them at once, as a view of the
@@ -129,7 +131,7 @@ class FilePlane:
             hdu = _opened(str(self.path))[self.hdu]
             data = STRIPS.read(hdu, self.plane, box)
             if data is None:
-                data = section(hdu, self.plane, box)
+                data = read_section(hdu, self.plane, box)
         except Exception as error:  # a damaged file may provoke any exception in astropy
             reason = " ".join(str(error).split()) or type(error).__name__
             raise FileError(f"{self.path}: HDU {self.hdu} cannot be read ({reason})") from error

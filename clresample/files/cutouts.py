@@ -9,10 +9,10 @@ from astropy.io import fits
 from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.table import Table
 
-from .arrays import array_of
+from .array_hdus import array_of
+from .atomic import FileError, check_output
 from .fits import add_provenance, celestial_header, open_fits, write_hdus
-from .names import to_ascii
-from .whole_file import FileError, check_output
+from .fits_names import to_ascii
 
 NAMES = {"hdu_mask": "MASK", "hdu_uncertainty": "UNCERT", "hdu_psf": "PSFIMAGE"}
 COLUMNS = ("source", "observation", "what", "ny", "nx")

@@ -6,10 +6,10 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import Table
 
-from ..deblending.posterior.blocks import Factor
-from ..deblending.posterior.errors import Draws
+from ..deblending.posterior.block_matrix import BlockCholesky
+from ..deblending.posterior.errors import PosteriorSampler
 from ..deblending.solver.rendering.ties import Ties
-from .arrays import array_of, image_hdu
+from .array_hdus import array_of, image_hdu
 
 NODES = ("n_modes", "size", "order", "n_later")
 
@@ -37,7 +37,7 @@ def draw_hdus(draws):
         image_hdu("DRAWSCALE", _flat(factor.scale, np.float64)),
         image_hdu("DRAWFACTOR", _flat(factor.blocks(), np.float64)),
         image_hdu("DRAWUNIT", draws.unit),
-        image_hdu("DRAWWIDE", draws.wide),
+        image_hdu("DRAWWIDE", draws.misfit_scale),
         image_hdu("DRAWBANDS", np.array(bands, np.int64)),
     ]
 
@@ -61,9 +61,11 @@ def read_draws(hdus, shapes):
         if later[v]:
             below[v] = factor.take(sum(sizes[u] for u in later[v]), sizes[v])
     bands = array_of(hdus["DRAWBANDS"])
-    return Draws(
+    return PosteriorSampler(
         [modes.take(n, *shape) for n, shape in zip(counts, shapes, strict=False)],
-        Factor.restore(sizes, [scale.take(n) for n in sizes], order.tolist(), later, lower, below),
+        BlockCholesky.restore(
+            sizes, [scale.take(n) for n in sizes], order.tolist(), later, lower, below
+        ),
         array_of(hdus["DRAWUNIT"]),
         array_of(hdus["DRAWWIDE"]),
         Ties(tuple(bands.tolist())) if len(bands) else None,

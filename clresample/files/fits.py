@@ -17,17 +17,17 @@ from astropy.wcs import WCS
 from .. import __version__
 from ..sky.grid import Grid
 from ..sky.psf import PSF
-from .compressed import check_tiles
+from .atomic import FileError, atomic_file, check_output
+from .fits_names import text_card
 from .headers import check_headers
-from .names import text_card
-from .whole_file import FileError, check_output, whole_file
+from .tile_sizes import check_tiles
 
 # header cards that describe a third axis
 THIRD_AXIS = re.compile(r"(NAXIS|CTYPE|CUNIT|CRPIX|CRVAL|CDELT|CROTA)3|(PC|CD)(3_\d|\d_3)")
 
 
-class Image(NamedTuple):
-    """What `read_image` returns.
+class FitsImage(NamedTuple):
+    """Return value of `read_image`.
 
     data (C, Ny, Nx) [the file's unit]: native float32 or float64; grid: Grid of (Ny, Nx)
     header: the image's FITS header; bands: names of the C bands, their numbers where the header
@@ -40,13 +40,13 @@ class Image(NamedTuple):
     bands: tuple
 
     @property
-    def n_bad(self):
+    def n_invalid(self):
         """Number of NaN and infinite pixels."""
         return int(np.count_nonzero(~np.isfinite(self.data)))
 
 
 def read_image(path, *, hdu=None, bands=None):
-    """Image or cube of a FITS file with its celestial grid: Image(data, grid, header, bands).
+    """Image or cube of a FITS file with its celestial grid: FitsImage(data, grid, header, bands).
 
     hdu: number (from 0), "NAME" or "NAME,VERSION"; None = the first that holds an image
     bands: numbers (from 0) or names, one or several; None = all. Names are those of the cards
@@ -72,7 +72,7 @@ def read_image(path, *, hdu=None, bands=None):
             raise FileError(f"{path}: {error}") from error
     names = band_names(header, len(data))
     chosen = choose_bands(path, names, bands)
-    return Image(to_native(data[chosen]), grid, header, tuple(names[i] for i in chosen))
+    return FitsImage(to_native(data[chosen]), grid, header, tuple(names[i] for i in chosen))
 
 
 def read_psf(path, *, hdu=None, bands=None, spacing=1.0, center=None):
@@ -146,7 +146,7 @@ def write_fits(
 
 def write_hdus(path, hdus):
     """Write HDUs with their checksums, whole or not at all. Raises FileError."""
-    with whole_file(path) as part:
+    with atomic_file(path) as part:
         fits.HDUList(hdus).writeto(part, checksum=True, overwrite=True)
 
 

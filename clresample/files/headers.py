@@ -16,18 +16,18 @@ from contextlib import contextmanager
 
 from astropy.utils.data import get_readable_fileobj
 
-from .whole_file import FileError
+from .atomic import FileError
 
 BLOCK, CARD = 2880, 80  # bytes
 # A header has at most so many cards, 8 MB: an end of it is not looked for in all of a large file.
-MOST_CARDS = 100_000
+MAX_CARDS = 100_000
 # Least and most of what each card may hold. 999 axes and columns are the FITS standard's limits, 9
 # that of the names of SIP's coefficients; sizes and places in files are 64-bit integers.
-MOST_BYTES = 2**63 - 1
+MAX_BYTES = 2**63 - 1
 LIMITS = {
     r"Z?NAXIS|TFIELDS": (0, 999),
     r"BITPIX": (-64, 64),
-    r"Z?NAXIS\d+|ZTILE\d+|[PG]COUNT": (0, MOST_BYTES),
+    r"Z?NAXIS\d+|ZTILE\d+|[PG]COUNT": (0, MAX_BYTES),
     r"WCSAXES[A-Z]?": (-math.inf, 999),
     r"[AB]P?_ORDER": (-math.inf, 9),
 }
@@ -51,7 +51,7 @@ def check_headers(path):
             begins = file.read(6)
             if begins == b"SIMPLE":
                 _check(path, file)
-            elif _is_header(begins + file.read(MOST_CARDS * CARD)):
+            elif _is_header(begins + file.read(MAX_CARDS * CARD)):
                 raise FileError(f"{path}: damaged, begins with a header without SIMPLE")
     except FileError:
         raise
@@ -90,7 +90,7 @@ def _opened(path):
 def _cards(what, file):
     """The cards of the header that begins here, or None where the file ends before it does."""
     cards = []
-    while len(cards) < MOST_CARDS:
+    while len(cards) < MAX_CARDS:
         block = file.read(BLOCK)
         for i in range(0, len(block), CARD):
             cards.append(block[i : i + CARD])
@@ -98,11 +98,11 @@ def _cards(what, file):
                 return cards
         if len(block) < BLOCK:
             return None
-    raise FileError(f"{what} has a header of more than {MOST_CARDS} cards")
+    raise FileError(f"{what} has a header of more than {MAX_CARDS} cards")
 
 
 def _is_header(text):
-    """Whether a text is a FITS header, of whatever kind."""
+    """Returns True if a text is a FITS header, of whatever kind."""
     cards = [text[i : i + CARD] for i in range(0, len(text), CARD)]
     return any(map(SIZED.match, cards)) and any(map(END.match, cards))
 
@@ -133,7 +133,7 @@ def _values(what, cards):
 
 
 def _n_bytes(what, values, flags):
-    """Size of an HDU's data, less than MOST_BYTES. Raises FileError."""
+    """Size of an HDU's data, less than MAX_BYTES. Raises FileError."""
     shape = _axes(what, values, "NAXIS")
     if "ZIMAGE" in flags:
         _check_tiles(what, values)
@@ -143,7 +143,7 @@ def _n_bytes(what, values, flags):
         shape = shape[1:]
     n_pixels = values.get("GCOUNT", 1) * (values.get("PCOUNT", 0) + math.prod(shape))
     n_bytes = abs(values.get("BITPIX", 8)) * n_pixels // 8
-    if n_bytes > MOST_BYTES:
+    if n_bytes > MAX_BYTES:
         raise FileError(f"{what} has {n_bytes:.1e} bytes of data by its header")
     return n_bytes
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..drawing.sheet import (
+from ..drawing.figure import (
     GAP,
     INK,
     add_panel,
-    dark_sheet,
+    dark_figure,
     limits_of,
     scale_bar,
     show_image,
@@ -18,7 +18,7 @@ from ..drawing.sheet import (
 )
 from ..sky.grid import Grid
 from ..sky.noise import background
-from .whole_file import whole_file
+from .atomic import atomic_file
 
 PANEL_INCHES = 2.75  # a row of four panels fills a page's width
 # of the pixels: shown as white, so that one hot pixel does not darken the others
@@ -66,7 +66,7 @@ def save_panels(path, panels, *, like: Grid, title=""):
     n_y, n_x = like.shape
     width, height = PANEL_INCHES, PANEL_INCHES * n_y / n_x
     above, below = (0.64 if title else 0.36), 0.36  # inches for the text
-    figure = dark_sheet(len(panels) * (width + GAP) + GAP, height + above + below, title)
+    figure = dark_figure(len(panels) * (width + GAP) + GAP, height + above + below, title)
     for i, panel in enumerate(panels):
         axes = add_panel(figure, GAP + i * (width + GAP), above, width, height)
         if panel.residual is None:
@@ -95,5 +95,5 @@ def write_png(path, figure):
         N_COLOURS, Image.Quantize.MAXCOVERAGE, kmeans=KMEANS_ROUNDS, dither=Image.Dither.NONE
     )
     few = Image.fromarray(pixels).quantize(palette=palette, dither=Image.Dither.NONE)
-    with whole_file(path) as part:
+    with atomic_file(path) as part:
         few.save(part, format="png")

@@ -12,7 +12,7 @@ from .panels import RESIDUAL_SIGMAS, Panel, save_panels, stretch_limits
 
 
 class Comparison(NamedTuple):
-    """How a rendered image agrees with an observed one: observed = scale * rendered + level.
+    """Fit of a rendered image to an observed one: observed = scale * rendered + level.
 
     correlation: Pearson's, over `mask` (My, Mx): pixels one PSF width inside the coverage
     residual (My, Mx): observed - scale * rendered - level, NaN outside the coverage
@@ -20,7 +20,7 @@ class Comparison(NamedTuple):
 
     correlation: float
     scale: float
-    level: float
+    sky_level: float
     residual: np.ndarray
     mask: np.ndarray
 
@@ -70,7 +70,7 @@ def plot_resampled(path, image, reference, result, covered, psf_out, *, names, t
     if comparison:
         limits = stretch_limits(reference.data[0][box])
         same = tuple(
-            np.subtract(limits, (comparison.level, 0, comparison.level)) / comparison.scale
+            np.subtract(limits, (comparison.sky_level, 0, comparison.sky_level)) / comparison.scale
         )
         panels[1] = Panel(rendered[box], grid, seen, panels[1].note, limits=same)
         sigma = background(comparison.residual[comparison.mask])[1]

@@ -20,23 +20,32 @@ from ..sky.frame import Frame
 from ..sky.grid import Grid
 from ..sky.observation import Observation
 from ..sky.psf import PSF
-from ..sky.sources import Extended, Point, Source
-from .arrays import array_of, image_hdu
+from ..sky.sources import ExtendedSource, PointSource, Source
+from .array_hdus import array_of, image_hdu
+from .atomic import FileError, check_output
 from .draws import draw_hdus, read_draws
 from .fits import add_provenance, celestial_header, open_fits, write_hdus
-from .names import check_channels, check_columns, text_card
+from .fits_names import check_channels, check_columns, text_card
 from .tables import flag_table_hdu, table_hdu
-from .whole_file import FileError, check_output
 
-FORMAT = 3  # of the files; raised when an older reader would misread them
-WIDENED = 2  # the first format whose errors are widened for misfitted sources
-KINDS = {kind.__name__: kind for kind in (Source, Point, Extended)}
+FORMAT = 4  # of the files; raised when an older reader would misread them
+KINDS = {kind.__name__: kind for kind in (Source, PointSource, ExtendedSource)}
 # of an observation, as JSON
-KEPT = ("name", "channels", "bands", "zero_points", "saturation", "unit", "n_bad", "messages")
+KEPT = ("name", "channels", "bands", "zero_points", "saturation", "unit", "n_invalid", "messages")
 BOX = ("source", "y", "x", "n_y", "n_x")
 # HDUs of Errors
-ERRORS = {"FLUXCOV": "flux", "COLOURCOV": "colour", "MOMENTCOV": "moments", "BEYOND": "beyond"}
-ERRORS |= {"RELEASED": "released", "MOVED": "moved", "RESIDUALMAX": "residuals", "OUTER": "outside"}
+ERRORS = {
+    "FLUXCOV": "flux",
+    "COLOURCOV": "colour",
+    "MOMENTCOV": "moments",
+    "OUTSIDEBOX": "outside_box_moments",
+}
+ERRORS |= {
+    "FLUXBIAS": "flux_bound_bias",
+    "MOMENTBIAS": "moment_bound_bias",
+    "RESIDUALMAX": "residuals",
+    "OUTER": "outside",
+}
 ARRAYS = ("sky", "covariance", "shifts", "losses")
 # every WCS card with the 17 digits that give back the same float64
 RELAX = WCSHDO_all | WCSHDO_SIP | WCSHDO_P17 | WCSHDO_EFMT
@@ -47,14 +56,15 @@ def write_result(path, result, *, overwrite=False, device=None, inputs=None):
 
     HDUs that `read_result` reads: ABOUT (keys and JSON: sources, names, status, messages, ...),
     COMPONENTS (boxes), SPECTRA (n, C), MORPHOLOGIES (one after the other), SKY, COVARIANCE, SHIFTS,
-    LOSSES, where the result has errors FLUXCOV, COLOURCOV, MOMENTCOV, BEYOND, RELEASED, MOVED,
-    RESIDUALMAX, OUTER, MORPHOLOGYERR (one after the other), those of the draws (see draws.py),
+    LOSSES, where the result has errors FLUXCOV, COLOURCOV, MOMENTCOV, OUTSIDEBOX, FLUXBIAS,
+    MOMENTBIAS, RESIDUALMAX, OUTER, MORPHOLOGYERR (one after the other), those of the draws (see
+    draws.py),
     MODELPSF, and per observation from 1 on: DATA, WEIGHTS, PSF, RENDERED. For other programs:
     CATALOGUE, FLAGS, SCENE (C, Ny, Nx) = all sources in the model frame, and per observation MODEL
     and RESIDUAL, 0 where data have no weight. All images have their WCS; a flat sky is put at
-    RA = Dec = 0. For NaN and infinity see arrays.py.
+    RA = Dec = 0. For NaN and infinity see array_hdus.py.
 
-    result: of `deblend`; overwrite: replace a file that exists
+    path: of the file; result: of `deblend`; overwrite: replace a file that exists
     device: name of the OpenCL device; inputs: {what: file}; both for the header
 
     Raises FileError when the file exists or cannot be written.
@@ -135,20 +145,24 @@ def _observation_hdus(result, i):
 
 
 def read_result(path) -> Result:
-    """The blend that `write_result` wrote to a file, equal to the last bit, draws with a seed among
-    it, but for PSFs that vary (Observation.psf_field), which files do not hold: psf is that in the
-    middle, `rendered` what each source's own made of it.
+    """Reads the blend that `write_result` wrote to a file, equal to the last bit.
 
-    Raises FileError for a file that does not exist, is not FITS, is damaged, or holds no blend, and
-    for errors of format 1: they were not widened for misfitted sources, and may lack what the bound
-    of morphologies adds to fluxes, without which the catalogue would be another one.
+    Except for Result.draws and for PSFs that vary (Observation.psf_field), which files do not hold:
+    psf is that in the middle, `rendered` what each source's own made of it.
+
+    path: of the file
+
+    Raises FileError for a file that does not exist, is not FITS, is damaged, holds no blend, or was
+    written in another format.
     """
     with open_fits(path) as hdus:
         if "ABOUT" not in hdus or "COMPONENTS" not in hdus:
             raise FileError(f"{path}: holds no fitted blend (no HDU ABOUT with COMPONENTS)")
         about = {row["key"]: json.loads(row["value"]) for row in hdus["ABOUT"].data}
-        if about["format"] > FORMAT:
-            raise FileError(f"{path}: has format {about['format']}, this version reads {FORMAT}")
+        if about["format"] != FORMAT:
+            raise FileError(
+                f"{path}: has format {about['format']}, this version reads {FORMAT}: fit it again"
+            )
         numbers = range(len(about["observations"]))
         frame = Frame(
             _grid(path, hdus["SCENE"], about["frame"], hdus),
@@ -165,7 +179,7 @@ def read_result(path) -> Result:
             status=about["status"],
             messages=tuple(about["messages"]),
             seconds=about["seconds"],
-            errors=_errors(path, hdus, about["format"]),
+            errors=_errors(hdus),
             draws=read_draws(hdus, [(row["n_y"], row["n_x"]) for row in hdus["COMPONENTS"].data]),
             **{key: array_of(hdus[key.upper()]) for key in ARRAYS},
         )
@@ -178,7 +192,7 @@ def _about(result):
         "messages": result.messages,
         "seconds": result.seconds,
         "sources": [
-            # without what fits start from (Extended.profile): the morphologies came of it
+            # without what fits start from (ExtendedSource.profile): the morphologies came of it
             {"kind": type(s).__name__}
             | {f.name: getattr(s, f.name) for f in fields(s) if f.compare}
             for s in result.sources
@@ -195,7 +209,7 @@ def _about(result):
 
 
 def _placing(grid, psf):
-    """What images and WCS do not say of a grid and a PSF."""
+    """Properties of a grid and a PSF that images and WCS do not hold."""
     flat = {"jacobian": grid.jacobian, "origin": grid.origin} if grid.is_flat else None
     return {"flat": flat, "spacing": psf.spacing, "center": psf.center}
 
@@ -257,13 +271,9 @@ def _source(path, *, kind, **given):
     return KINDS[kind](**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})
 
 
-def _errors(path, hdus, written):
+def _errors(hdus):
     if "MORPHOLOGYERR" not in hdus:
         return None
-    if written < WIDENED:
-        raise FileError(
-            f"{path}: has errors of format {written}, must be {WIDENED} or more: fit it again"
-        )
     flat, maps = array_of(hdus["MORPHOLOGYERR"]), []
     for row in hdus["COMPONENTS"].data:
         shape = int(row["n_y"]), int(row["n_x"])

@@ -16,60 +16,60 @@ class SceneError(ValueError):
 
 
 @dataclass(frozen=True)
-class Rule:
-    """What a key takes: `text` describes it to the user, `fits(value)` says whether it is one."""
+class KeyRule:
+    """Rule of a key: `text` describes valid values to the user, `fits(value)` tests one."""
 
     text: str
     fits: object
 
 
 def is_number(value):
-    """Whether a value is a finite number, and a float can hold it."""
+    """Returns True if a value is a finite number, and a float can hold it."""
     if not isinstance(value, int | float) or isinstance(value, bool):
         return False
     return abs(value) <= LARGEST  # of integers, which may be too large for a float, and not NaN
 
 
-def many(fits):
-    """Whether a value is a list of at least one, each of which fits."""
+def is_list_of(fits):
+    """Returns True if a value is a list of at least one, each of which fits."""
     return lambda value: isinstance(value, list) and len(value) > 0 and all(map(fits, value))
 
 
 def is_text(value):
-    """Whether a value is a text with more than blanks in it."""
+    """Returns True if a value is a text with more than blanks in it."""
     return isinstance(value, str) and bool(value.strip())
 
 
 def is_whole(value):
-    """Whether a value is a whole number, 0 or more."""
+    """Returns True if a value is a whole number, 0 or more."""
     return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 
-def either(*kinds):
-    """Whether a value fits one of several."""
+def is_any_of(*kinds):
+    """Returns True if a value fits one of several."""
     return lambda value: any(fits(value) for fits in kinds)
 
 
 def one_or_many(*kinds):
-    """Whether a value, or each of a list, fits one of several."""
-    return either(*kinds, many(either(*kinds)))
+    """Returns True if a value, or each of a list, fits one of several."""
+    return is_any_of(*kinds, is_list_of(is_any_of(*kinds)))
 
 
 def _above(value):
     return is_number(value) and value > 0
 
 
-TEXT = Rule("a text", is_text)
-FRACTION = Rule("a number from 0 to 1", lambda value: is_number(value) and 0 <= value < 1)
-COUNT = Rule("a whole number, 0 or more", is_whole)
-FILE = Rule("the name of a file", is_text)
-HDU = Rule('a number from 0, "NAME" or "NAME,VERSION"', either(is_whole, is_text))
-NUMBERS = Rule("a number, or a list with one for each channel", one_or_many(is_number))
-SWITCH = Rule("true or false", lambda value: isinstance(value, bool))
-SHIFTS = Rule('true, false or "auto"', lambda value: isinstance(value, bool) or value == "auto")
-POSITIVE = Rule("a number above 0", _above)
+TEXT = KeyRule("a text", is_text)
+FRACTION = KeyRule("a number from 0 to 1", lambda value: is_number(value) and 0 <= value < 1)
+COUNT = KeyRule("a whole number, 0 or more", is_whole)
+FILE = KeyRule("the name of a file", is_text)
+HDU = KeyRule('a number from 0, "NAME" or "NAME,VERSION"', is_any_of(is_whole, is_text))
+NUMBERS = KeyRule("a number, or a list with one for each channel", one_or_many(is_number))
+SWITCH = KeyRule("true or false", lambda value: isinstance(value, bool))
+SHIFTS = KeyRule('true, false or "auto"', lambda value: isinstance(value, bool) or value == "auto")
+POSITIVE = KeyRule("a number above 0", _above)
 
-# Tables that scene files and field files share; that of an image: fields/reading/keys.py.
+# Tables that scene files and field files share; that of an image: fields/field_toml/keys.py.
 TABLES = {
     "sources": {
         "catalogue": FILE,
@@ -78,24 +78,24 @@ TABLES = {
     },
     "detection": {
         "threshold": POSITIVE,
-        "passes": Rule("1, or 2 to look at the residuals too", lambda value: value in (1, 2)),
+        "passes": KeyRule("1, or 2 to look at the residuals too", lambda value: value in (1, 2)),
     },
     "frame": {
-        "like": TEXT,
-        "footprint": Rule(
+        "reference": TEXT,
+        "footprint": KeyRule(
             '"union" or "intersection"', lambda value: value in ("union", "intersection")
         ),
         "psf_sigma_px": POSITIVE,
     },
     "fit": {
         "max_iter": COUNT,
-        "tol": FRACTION,
-        "enough": POSITIVE,
+        "rel_tol": FRACTION,
+        "loss_tol": POSITIVE,
         "monotone": SWITCH,
-        "structure_px": POSITIVE,
+        "correlation_px": POSITIVE,
         "fit_shifts": SHIFTS,
         "fit_sky": SWITCH,
-        "flux_floor": FRACTION,
+        "flux_error_floor": FRACTION,
         "psf_error": FRACTION,
     },
 }
@@ -119,7 +119,7 @@ def read_tables(path, what) -> dict:
 def check_table(where, name, table, tables, needed):
     """Raise SceneError unless a table holds what the rules of its name say.
 
-    where: file and table, for messages; tables {name: {key: Rule}}; needed {name: keys}
+    where: file and table, for messages; tables {name: {key: KeyRule}}; needed {name: keys}
     """
     rules = tables[name]
     if not isinstance(table, dict):

@@ -10,10 +10,10 @@ import numpy as np
 from astropy.table import Table
 from astropy.utils.exceptions import AstropyWarning
 
-from ..sky.sources import Extended, Point
+from ..sky.sources import ExtendedSource, PointSource
 from .headers import check_headers
 
-KINDS = {"point": Point, "extended": Extended}
+KINDS = {"point": PointSource, "extended": ExtendedSource}
 # what columns may hold; each is looked for under this name unless the scene file gives another
 COLUMNS = ("ra", "dec", "y", "x", "name", "type", "components", "observation")
 
@@ -27,7 +27,7 @@ def read_sources(path, columns=None) -> tuple:
         type ("point" or "extended"), components (how many spectra an extended source has; masked
             = as many as the data show); and
         format: astropy's name of it. What is left out is looked for under its own name
-    returns a tuple of Point and Extended; sources without a type are extended
+    returns a tuple of PointSource and ExtendedSource; sources without a type are extended
 
     Raises ValueError, one line that names file, column and row.
     """

@@ -10,11 +10,11 @@ from astropy.io import fits
 from astropy.table import QTable, Table
 from astropy.utils.exceptions import AstropyWarning
 
-from ..measurement.catalogue import MEANINGS
+from ..measurement.catalogue import FLAG_MEANINGS
+from .atomic import FileError, atomic_file, check_output
 from .fits import write_hdus
-from .names import check_columns, to_ascii
+from .fits_names import check_columns, to_ascii
 from .parquet import read_parquet, write_parquet
-from .whole_file import FileError, check_output, whole_file
 
 ENDINGS = ".ecsv", ".parquet", ".fits", ".fits.gz"
 
@@ -61,7 +61,7 @@ def write_catalogue(path, table, *, overwrite=False):
         return write_hdus(
             path, [fits.PrimaryHDU(), table_hdu(table, "CATALOGUE"), flag_table_hdu()]
         )
-    with whole_file(path) as part:
+    with atomic_file(path) as part:
         if path.suffix == ".parquet":
             return write_parquet(part, table)
         table.write(part, format="ascii.ecsv", overwrite=True)
@@ -79,7 +79,7 @@ def table_hdu(table, name):
 
 def flag_table_hdu():
     """The meanings of `flags` as an HDU."""
-    rows = [(flag.name, flag.value, meaning) for flag, meaning in MEANINGS.items()]
+    rows = [(flag.name, flag.value, meaning) for flag, meaning in FLAG_MEANINGS.items()]
     return fits.BinTableHDU(Table(rows=rows, names=("flag", "value", "meaning")), name="FLAGS")
 
 

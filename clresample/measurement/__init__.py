@@ -1,4 +1,4 @@
-"""What is measured: detections before a fit; fluxes, shapes, chi2 and the catalogue after it.
+"""Detections before a fit; fluxes, shapes, chi2 and the catalogue after it.
 
 Imports `deblending`, `resampling` and `sky`.
 """

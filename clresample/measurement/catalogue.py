@@ -1,4 +1,4 @@
-"""A fitted model turned into a catalogue: fluxes with errors, positions, shapes, chi2 and flags."""
+"""Converts a fitted model to a catalogue: fluxes, errors, positions, shapes, chi2 and flags."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from astropy.table import QTable
 
 from ..deblending.assessment.ambiguity import partners
 from ..deblending.assessment.edge import reaches_outside
-from ..deblending.assessment.status import misfitted
+from ..deblending.assessment.status import misfitted_sources
 from ..deblending.blend import CONVERGED, MISFIT
 from ..deblending.posterior.residuals import channel_residuals
-from ..sky.footprint import open_edge
+from ..sky.footprint import coverage_border
 from ..sky.observation import ZERO_POINT_UJY
-from ..sky.wcs import frame_of, local_axes, names_of
+from ..sky.wcs import axis_names, celestial_frame, local_axes
 from .columns import Columns
 from .photometry import add_groups, channel_covariances, flux_scale, fluxes
-from .quality import box_chi2, fitted_sources, labels, masked_cores
+from .quality import box_chi2, fitted_sources, masked_cores, observation_labels
 from .shapes import moments, shape, shape_slopes
 
 # of a morphology's peak: light at the edge of what was seen is flagged when it is brighter. Fainter
@@ -28,18 +28,21 @@ EDGE_LIGHT = 0.01
 
 # [deg] scatter of an angle that may have any value: no error is larger
 UNKNOWN_ANGLE_DEG = 180 / np.sqrt(12)
-SHAPE_UNITS = {"size": u.arcsec, "e1": None, "e2": None, "angle": u.deg}
+SHAPE_UNITS = {"rms_size": u.arcsec, "e1": None, "e2": None, "position_angle": u.deg}
 
 
 class Flag(IntFlag):
-    """What limits a source's measurement: `flags` of a catalogue are sums of these (MEANINGS)."""
+    """Limits of a source's measurement.
+
+    `flags` of a catalogue are sums of these (FLAG_MEANINGS).
+    """
 
     EDGE = 1
     NOT_CONVERGED = 2
     ZERO_FLUX = 4
     NO_COVERAGE = 8
-    OUTSIDE = 16
-    MASKED = 32
+    OUTSIDE_FRAME = 16
+    CENTER_MASKED = 32
     MISFIT = 64
     SATURATED = 128
     AMBIGUOUS = 256
@@ -50,14 +53,14 @@ class Flag(IntFlag):
 
 
 # Meaning of each Flag in words.
-MEANINGS = {
+FLAG_MEANINGS = {
     Flag.EDGE: "at the frame's edge or beside unobserved sky over 1 % of a morphology's peak, or "
     "over 3 % of the flux outside, as the model goes on there",
     Flag.NOT_CONVERGED: "the blend's fit ended for another reason than convergence",
     Flag.ZERO_FLUX: "the flux in a channel that determines it is at its limit, zero",
     Flag.NO_COVERAGE: "a channel's image does not hold the centre, or determines no flux",
-    Flag.OUTSIDE: "outside the frame, thus not fitted: nothing is measured",
-    Flag.MASKED: "the centre is on a pixel without weight in a channel whose image holds it",
+    Flag.OUTSIDE_FRAME: "outside the frame, thus not fitted: nothing is measured",
+    Flag.CENTER_MASKED: "the centre is on a pixel without weight in a channel whose image holds it",
     Flag.SATURATED: "a star with masked pixels in its core, a bright source with half of it masked",
     Flag.MISFIT: "the model leaves over 5 sigma and over 3 % of the flux in a channel",
     Flag.AMBIGUOUS: "the data do not tell its light from that of the source in ambiguous_with",
@@ -78,13 +81,13 @@ def catalogue(result, *, magnitudes=True, groups=None) -> QTable:
         snr: signal to noise of all B bands together, sqrt(sum_b flux_b^2 / variance_b), which
             is about sqrt(B) where there is no source
         n_components: of morphology and spectrum, of which the source is the sum; two where the data
-            show that its core has another colour, see `Extended`
+            show that its core has another colour, see `ExtendedSource`
         *_centroid: the same positions, of the fitted light
         size [arcsec], e1, e2, angle [deg]: see `shapes.shape`. They are those of the model under
             the model's PSF, not deconvolved; a source's components are weighted by their flux, that
             of all channels, each in units of its error. Where the result has Errors, what the
             smooth profile has beyond its box is counted, and what the bound of morphologies at 0
-            adds is taken off, see `Errors.moved`
+            adds is taken off, see `Errors.moment_bound_bias`
         *_centroid_err, size_err, e1_err, e2_err, angle_err: errors in the units of the values, to
             first order; ra's in degrees of ra, angle_err at most 52 deg, that of an unknown angle.
             NaN where the result has no Errors, and where the shape was not fitted, as stars'. They,
@@ -101,8 +104,8 @@ def catalogue(result, *, magnitudes=True, groups=None) -> QTable:
             channel: of all of them together, the error with the covariances of their fluxes
         chi2_* per observation: mean chi2 of the pixels with weight in the source's box, of all
             channels and with all sources' models
-        residual_* per channel [sigma]: the largest residual on the source once filtered with the
-            PSF, see `residuals.worst_residuals`
+        max_residual_* per channel [sigma]: the largest residual on the source once filtered with
+            the PSF, see `residuals.max_filtered_residuals`
         misfit_sigma [sigma]: the largest of these, or of the excess of chi2 of the source's pixels
             in a channel, if larger; misfit_fraction: the light that is left there over the flux, in
             the channel where it is the largest of those over 5 sigma, 0 without any. Over 5 sigma
@@ -110,12 +113,12 @@ def catalogue(result, *, magnitudes=True, groups=None) -> QTable:
         ambiguous_with: row of the source with which light may be exchanged, see `is_ambiguous`; -1
             without any
     """
-    table = columns_of(result, magnitudes=magnitudes, groups=groups).table()
+    table = catalogue_columns(result, magnitudes=magnitudes, groups=groups).table()
     table["flags"].info.description = ", ".join(f"{flag.value} {flag.name}" for flag in Flag)
     return table
 
 
-def columns_of(result, *, magnitudes=True, groups=None, bands=None) -> Columns:
+def catalogue_columns(result, *, magnitudes=True, groups=None, bands=None) -> Columns:
     """The same as `catalogue`, before it is a table.
 
     bands: names in the order whose neighbours make colours; None = as in the result
@@ -126,9 +129,9 @@ def columns_of(result, *, magnitudes=True, groups=None, bands=None) -> Columns:
     of_bands = list(result.bands.values())
     table = Columns()
     table.put("name", [s.name or str(i) for i, s in enumerate(result.sources)])
-    positions = result.frame.place(result.sources)
+    positions = result.frame.positions_of(result.sources)
     add_positions(table, result.frame.grid, positions, "")
-    bounded = flux if result.errors is None else flux - result.errors.released
+    bounded = flux if result.errors is None else flux - result.errors.flux_bound_bias
     table.put("flags", _flags(result, bounded, error, positions, result.footprints))
     fitted = fitted_sources(result)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -149,20 +152,22 @@ def columns_of(result, *, magnitudes=True, groups=None, bands=None) -> Columns:
     if groups is not None:
         table.put("group_id", np.asarray(groups))
         add_groups(table, result, flux, covariance, groups)
-    for i, label in enumerate(labels(result)):
+    for i, label in enumerate(observation_labels(result)):
         table.put(f"chi2_{label}", box_chi2(result, i, result.footprints[i]))
     for channel, values in zip(result.channels, worst.T, strict=True):
-        table.put(f"residual_{channel}", values)
+        table.put(f"max_residual_{channel}", values)
     table.put("misfit_sigma", np.where(fitted, misfit.sigma().max(axis=1, initial=0), np.nan))
     table.put("misfit_fraction", np.where(fitted, misfit.fraction(), np.nan))
-    table["flags"][misfitted(result)] |= Flag.MISFIT
+    table["flags"][misfitted_sources(result)] |= Flag.MISFIT
     _add_partners(table, result, flux, covariance)
     return table
 
 
 def _add_partners(table, result, flux, covariance):
-    """The column of ambiguous sources' partners and their flag; of results with Errors, since at
-    fixed morphologies light is not exchanged."""
+    """The column of ambiguous sources' partners and their flag.
+
+    Of results with Errors, since at fixed morphologies light is not exchanged.
+    """
     found = np.full(len(flux), -1)
     if result.errors is not None:
         found = partners(flux, covariance)
@@ -181,8 +186,8 @@ def add_positions(table, grid, positions, suffix):
     sky = grid.sky(*positions.T)
     names, unit = ("y_sky", "x_sky"), u.arcsec
     if not grid.is_flat:
-        names, unit = names_of(grid.wcs), u.deg
-        table.meta["frame"] = frame_of(grid.wcs).name
+        names, unit = axis_names(grid.wcs), u.deg
+        table.meta["frame"] = celestial_frame(grid.wcs).name
     for name, values in zip(names, sky, strict=True):
         table.put(name + suffix, values, unit)
     for name, values in zip("yx", positions.T, strict=True):
@@ -197,13 +202,15 @@ def _add_shapes(table, result, error):
     for s in np.flatnonzero(fitted_sources(result)):
         own = [i for i, c in enumerate(result.components) if c.source == s]
         parts = [result.components[i] for i in own]
-        beyond = None if result.errors is None else result.errors.beyond[own]
+        beyond = None if result.errors is None else result.errors.outside_box_moments[own]
         good = np.isfinite(error[s]) & (error[s] > 0)
         weight = np.where(good, 1 / np.where(good, error[s], 1.0), 0.0)
         light = np.array([weight @ c.flux for c in parts])
         centroids[s], second = moments(parts, light, beyond)
         if result.errors is not None:
-            centroids[s], second = _released(centroids[s], second, result.errors.moved[s])
+            centroids[s], second = _released(
+                centroids[s], second, result.errors.moment_bound_bias[s]
+            )
         if np.isfinite(centroids[s]).all():
             axes = local_axes(result.frame.grid, centroids[s])
             sizes[s] = shape(axes @ second @ axes.T)
@@ -219,8 +226,10 @@ def _add_shapes(table, result, error):
 
 
 def _released(centroid, second, moved):
-    """A centroid (2,) and second moments (2, 2) changed by `moved` (5,), see Errors; as they were
-    where that would leave no moments of an image, as it may those of noise."""
+    """A centroid (2,) and second moments (2, 2) changed by `moved` (5,), see Errors.
+
+    As they were where that would leave no moments of an image, as it may those of noise.
+    """
     yy, yx, xx = moved[2:]
     changed = second + [[yy, yx], [yx, xx]]
     if not (np.linalg.det(changed) > 0 and np.trace(changed) > 0):
@@ -281,16 +290,16 @@ def _flags(result, flux, error, positions, footprints):
     flags = np.zeros(len(fitted), dtype=np.int32)
     if result.status not in (CONVERGED, MISFIT):
         flags |= Flag.NOT_CONVERGED
-    flags[~fitted] |= Flag.OUTSIDE
+    flags[~fitted] |= Flag.OUTSIDE_FRAME
     flags[((flux <= 0) & np.isfinite(error)).any(axis=1)] |= Flag.ZERO_FLUX
     flags[fitted & ~np.isfinite(error).all(axis=1)] |= Flag.NO_COVERAGE
     for footprint in footprints:
-        held = footprint.holds(positions)
+        held = footprint.contains(positions)
         flags[fitted & ~held] |= Flag.NO_COVERAGE
-        flags[fitted & held & ~footprint.weighted(positions).all(axis=0)] |= Flag.MASKED
+        flags[fitted & held & ~footprint.weighted(positions).all(axis=0)] |= Flag.CENTER_MASKED
     flags[masked_cores(result, positions)] |= Flag.SATURATED
     flags[reaches_outside(result, flux)] |= Flag.EDGE
-    edge = open_edge(footprints, result.frame.shape)
+    edge = coverage_border(footprints, result.frame.shape)
     for c in result.components:
         (y, x), (n_y, n_x) = c.origin, c.morphology.shape
         bright = c.morphology > EDGE_LIGHT * c.morphology.max(initial=0.0)

@@ -70,8 +70,10 @@ class Body:
     clump: float
 
     def takes(self, above, base):
-        """Whether peaks of heights above [sigma] on a base [sigma] of it are its structure, and
-        whether they are in its group."""
+        """Selects peaks of heights above [sigma] on a base [sigma] that are its structure.
+
+        And whether they are in its group.
+        """
         part = above / self.light
         faint = part < CLUMP_PART
         is_member = (part < MEMBER_PART) & (faint | (above < STAR * base))
@@ -231,8 +233,10 @@ def _outline(image, basins, numbers, level):
 
 
 def _center(image, outline, level, at, area, bright):
-    """The peak of those at (k, 2) [px] in the middle of an outline, or the middle itself (2,); of a
-    faint body its brightest peak."""
+    """The peak of those at (k, 2) [px] in the middle of an outline, or the middle itself (2,).
+
+    Of a faint body its brightest peak.
+    """
     where, mask = outline
     radius = np.sqrt(area / np.pi)
     light = np.where(mask, np.minimum(image[where], CENTER_LIGHT * level), 0.0)

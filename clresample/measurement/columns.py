@@ -35,13 +35,13 @@ class Columns:
         if unit is not None:
             self.units[name] = unit
 
-    def chosen(self, which) -> Columns:
+    def select_rows(self, which) -> Columns:
         """The rows of an index: a slice, numbers or bool."""
         rows = {name: values[which] for name, values in self.values.items()}
         return Columns(rows, dict(self.units), dict(self.meta))
 
     @classmethod
-    def joined(cls, several) -> Columns:
+    def concatenate(cls, several) -> Columns:
         """Rows of several one after the other; names in the order in which they first come.
 
         Where one has no such column its rows hold NaN, 0 of whole numbers, "" of texts.

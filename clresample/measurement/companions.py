@@ -12,7 +12,7 @@ have its colours. A peak h is a source of its own where
     h >= c(r) sqrt(H (m + 1)),   or   h >= COLOURED sqrt(H (m + 1)) and its spectrum is another
 
 H being the galaxy's peak and m its light there, all in sigma, r the distance from its centre and
-c(r) = CLUMP r / CLUMP_ARCSEC within LEAST_CLUMP and MOST_CLUMP. Clumps that hold some part of all
+c(r) = CLUMP r / CLUMP_ARCSEC within MIN_CLUMP and MAX_CLUMP. Clumps that hold some part of all
 the galaxy's light would ask for H, those that hold some part of the light about them for m; the
 mean of the two, sqrt(H m), tells neighbours from clumps better than either. Near the centre the
 symmetric light holds part of the neighbour's too, so that less of it is left than it has; far out a
@@ -29,7 +29,7 @@ import numpy as np
 
 # Chosen on forty simulated fields of 1024 pixels (4000 sources) and reported on others, see
 # docs/fields.md. Larger ones lose neighbours, smaller ones take clumps for sources.
-CLUMP, LEAST_CLUMP, MOST_CLUMP, COLOURED = 0.45, 0.15, 0.75, 0.15
+CLUMP, MIN_CLUMP, MAX_CLUMP, COLOURED = 0.45, 0.15, 0.75, 0.15
 # [arcsec] from its centre where a galaxy's clumps reach CLUMP: three half-light radii of the usual
 # galaxy in deep images. A larger one finds more neighbours and takes more clumps for sources
 CLUMP_ARCSEC = 0.8
@@ -40,14 +40,14 @@ OTHER_COLOUR, MODEL_PART = 8.0, 0.1
 ASYMMETRY = 0.05
 # [sigma] a peak's height, and its height under the filter of small galaxies: two noisy sides are
 # compared, and many places tried
-LEAST, LEAST_WIDE = 5.0, 6.0
+MIN_PEAK_SIGMA, MIN_WIDE = 5.0, 6.0
 REACH_PX, N_ANGLES = 60, 32  # of a source's light, and directions in which it is followed
-LEAST_LIGHT = 0.5  # [sigma] where a source's own light ends
+MIN_LIGHT = 0.5  # [sigma] where a source's own light ends
 UNSEEN = 1e30  # [sigma] a side that was not seen: the other one tells
 
 
-def left_over(image, seen, positions):
-    """What symmetric models of sources leave of an image, and these models added up: (Ny, Nx).
+def symmetric_residual(image, seen, positions):
+    """Residual of an image after symmetric models of sources, and the sum of these: (Ny, Nx).
 
     image (Ny, Nx) [sigma]; seen (Ny, Nx) bool; positions (S, 2) [px]: centres, to part of a pixel
     """
@@ -65,7 +65,7 @@ def left_over(image, seen, positions):
         rings = np.clip(np.minimum.accumulate(rings, axis=0), 0, UNSEEN / 2)
         if rings[0].max() == UNSEEN / 2:  # nothing is known of its centre
             continue
-        bright = np.flatnonzero((rings > LEAST_LIGHT).any(axis=1))
+        bright = np.flatnonzero((rings > MIN_LIGHT).any(axis=1))
         if not len(bright):
             continue
         reach = min(bright[-1] + 1, REACH_PX)
@@ -80,12 +80,12 @@ def left_over(image, seen, positions):
     return np.where(seen, image - total, 0.0), total
 
 
-def noise_of(model):
-    """Scatter (Ny, Nx) [sigma] of what `left_over` leaves: the noise of both sides, asymmetry."""
+def residual_scatter(model):
+    """Scatter (Ny, Nx) [sigma] of `symmetric_residual`: the noise of both sides, asymmetry."""
     return np.sqrt(1.0 + (model > 1) + (ASYMMETRY * model) ** 2)
 
 
-def centred(image, position):
+def parabolic_peak(image, position):
     """The top of the parabolas through a peak and its neighbours, within half a pixel: (2,)."""
     y, x = (int(p) for p in position)
     if not (0 < y < image.shape[0] - 1 and 0 < x < image.shape[1] - 1):
@@ -103,22 +103,23 @@ def _top(before, at, after):
     return 0.0 if curved >= 0 else float(np.clip(0.5 * (before - after) / curved, -0.5, 0.5))
 
 
-def top_near(rest, place, radius):
+def brightest_peak_near(rest, place, radius):
     """Position (2,) and height of the brightest that is left within `radius` [px] of a peak.
 
-    Peaks are searched in units of `noise_of`, which is larger towards the brighter source: they lie
-    outwards of the light's own top, by a pixel or so.
+    Peaks are searched in units of `residual_scatter`, which is larger towards the brighter source:
+    they lie outwards of the light's own top, by a pixel or so.
     """
     low = np.maximum(np.asarray(place) - radius, 0)
     window = rest[low[0] : place[0] + radius + 1, low[1] : place[1] + radius + 1]
     top = low + np.unravel_index(window.argmax(), window.shape)
-    return centred(rest, top), float(rest[tuple(top)])
+    return parabolic_peak(rest, top), float(rest[tuple(top)])
 
 
 def is_a_source(place, height, model, image, signals, centres, fwhm, scale):
-    """Whether a peak of what was left is a source of its own, as the head of this module says.
+    """Returns True if a residual peak is a source of its own, as the head of this module says.
 
-    place (2,) ints: (y, x) of the peak; height [sigma]: of what is left there, as `top_near` says
+    place (2,) ints: (y, x) of the peak; height [sigma]: of what is left there, as
+    `brightest_peak_near` says
     model, image (Ny, Nx) [sigma]: models, what was searched
     signals: Signal of each observation; centres (S, 2) [px]: of the sources
     fwhm [px]: of the searched image's PSF; scale [arcsec]: of a pixel
@@ -130,7 +131,7 @@ def is_a_source(place, height, model, image, signals, centres, fwhm, scale):
     host = np.argmax(np.log(heights) - away / fwhm)  # brightest there, if light falls by e a FWHM
     clump = np.sqrt(max(heights[host], 1.0) * (model[at] + 1))
     part = CLUMP * away[host] * scale / CLUMP_ARCSEC
-    if height >= np.clip(part, LEAST_CLUMP, MOST_CLUMP) * clump:
+    if height >= np.clip(part, MIN_CLUMP, MAX_CLUMP) * clump:
         return True
     if height < COLOURED * clump:
         return False
@@ -143,8 +144,10 @@ def is_a_source(place, height, model, image, signals, centres, fwhm, scale):
 
 
 def _other_colour(at, spectra, centres, host):
-    """chi2, beyond its mean, by which the spectrum of what is left at a pixel differs from that of
-    the source it lies on, in one observation: `spectra` of its Signal."""
+    """chi2, beyond its mean, of a colour at a residual pixel unlike that of its source.
+
+    In one observation: `spectra` of its SignalToNoise.
+    """
     light = sum(_light_at(at, spectra, centre) for centre in centres)
     noise = np.sqrt(2 + (MODEL_PART * light) ** 2)
     here, there = spectra(np.array([at, host]))

@@ -1,16 +1,16 @@
-"""Where the sources are: detection with `sep` on signal-to-noise images in the model frame.
+"""Detects sources with `sep` on signal-to-noise images in the model frame.
 
 Three searches, each adding what those before have not found:
 
-1. every observation alone, the sharpest first, its channels added up (`signal.py`): there
+1. every observation alone, the sharpest first, its channels added up (`signal_to_noise.py`): there
    neighbours are best told apart
 2. all observations together, under filters of several widths: there faint sources, large ones and
-   those seen in few bands are reached (`signal.combined`)
+   those seen in few bands are reached (`signal.combine_bands`)
 3. what is left of the sharpest observation without the symmetric light of those found: neighbours
    on the flanks of brighter ones (`companions.py`)
 
 Sources: sep, Barbary 2016 (JOSS 1, 58), after SExtractor, Bertin & Arnouts 1996 (A&AS 117, 393);
-those of signal.py and companions.py.
+those of signal_to_noise.py and companions.py.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ import numpy as np
 
 from ..deblending.inspection.star_psfs import StarPSFs
 from ..deblending.spectra import MODEL_ERROR
-from ..drawing.shown import ShownDetection
+from ..drawing.display import ShownDetection
 from ..sky.frame import Frame, model_frame
 from ..sky.observation import Observation, as_observations
-from ..sky.sources import Extended, Point, Source
+from ..sky.sources import ExtendedSource, PointSource, Source
 from .clumps import bodies_of
 from .companions import (
-    LEAST,
-    LEAST_WIDE,
-    centred,
+    MIN_PEAK_SIGMA,
+    MIN_WIDE,
+    brightest_peak_near,
     is_a_source,
-    left_over,
-    noise_of,
-    top_near,
+    parabolic_peak,
+    residual_scatter,
+    symmetric_residual,
 )
 from .levels import level_of
 from .peaks import import_sep, new_peaks
 from .searched import SAME_SOURCE, Search
-from .signal import SMALL_GALAXY, combined, signal_of
+from .signal_to_noise import SMALL_GALAXY, combine_bands, signal_of
 from .star_light import UNEVEN, height_beside, saturated_stars, starless
 
 # [sigma] of the combined image: white noise reaches it once in two million independent pixels
@@ -54,8 +54,8 @@ ALL = "all"  # the name of the combined image
 class Detection(ShownDetection):
     """Sources that `detect` or `detect_more` found, S of them, stars first, brightest peak first.
 
-    sources (S,): first a free Point for each star with a saturated or masked core, see
-        star_light.py, then Extended, at the pixel of their peak
+    sources (S,): first a free PointSource for each star with a saturated or masked core, see
+        star_light.py, then ExtendedSource, at the pixel of their peak
     frame: Frame that their positions, pixels (y, x), belong to
     peaks (S,) [sigma]: signal to noise of each in the image that found it
     found_in (S,): name of that image: an observation's, or "all"
@@ -132,7 +132,7 @@ def detect_more(result, *, threshold=THRESHOLD) -> Detection:
         sky = result.sky[result.channel_slices()[i], None, None]
         error = MODEL_ERROR * (result.model(i) - sky)
         left.append(_with_data(o, result.residual(i), o.weights / (1 + o.weights * error**2)))
-    known = result.frame.place(result.sources)
+    known = result.frame.positions_of(result.sources)
     pixels = np.stack([*np.indices(result.frame.shape)], axis=-1)
     places = [footprint.locate(pixels) for footprint in result.footprints]
     found = _search(left, result.frame, threshold, list(known), beside=False, places=places)
@@ -168,7 +168,7 @@ def _without_structure(result, found, known, places, threshold):
         signal_of(_with_data(o, image, o.weights), frame, places[sharp]).flat()
         for image in (result.model(sharp) - sky, result.residual(sharp))
     )
-    inside = known[frame.inside(known)]
+    inside = known[frame.contains(known)]
     bodies = bodies_of(light, inside, _fwhm_px(o, frame), threshold, frame.grid.pixel_scale_arcsec)
     kept, hosts = [], []
     for i, source in enumerate(found.sources):
@@ -230,15 +230,16 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
     if scatters is None:
         scatters = [signal.scatters() for signal in signals]
     full, signals = (
-        [one.over(s) for one, s in zip(many, scatters, strict=True)] for many in (full, signals)
+        [one.divided_by(s) for one, s in zip(many, scatters, strict=True)]
+        for many in (full, signals)
     )
-    everything, _ = combined(full)
+    everything, _ = combine_bands(full)
     if beside:
         everything = everything - level_of(everything, everything != 0)[1]
     levelled, skies = signals, np.zeros((len(signals), 1))
     if beside:
         levelled, skies = zip(*(signal.levelled() for signal in signals), strict=True)
-    _, best = combined(levelled)
+    _, best = combine_bands(levelled)
     sharp = order[0]
     found = Search(sep, threshold, known + [star.place for star in stars])
     found.add(levelled[sharp].flat(), observations[sharp].label, widths[sharp], widths[sharp])
@@ -255,10 +256,12 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
         found.add_companions(new, signals[sharp].flat(), observations[sharp].label)
     order, groups = found.in_order()
     positions = [tuple(map(float, found.positions[i])) for i in order]
-    points = [Point(position_px=tuple(map(float, star.place)), free=True) for star in stars]
+    points = [
+        PointSource(position_px=tuple(map(float, star.place)), free_position=True) for star in stars
+    ]
     heights = [height_beside(everything, star) for star in stars]
     return Detection(
-        sources=(*points, *(Extended(position_px=position) for position in positions)),
+        sources=(*points, *(ExtendedSource(position_px=position) for position in positions)),
         frame=frame,
         peaks=np.array([*heights, *(found.peaks[i] for i in order)]),
         found_in=(*(ALL for _ in stars), *(found.labels[i] for i in order)),
@@ -268,21 +271,23 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
 
 
 def _companions(sep, signals, sharp, everything, places, threshold, fwhm, scale):
-    """Positions and heights of sources on the flanks of those at `places` (S, 2), in the sharpest
-    observation, whose PSF has the width fwhm [px]; scale [arcsec]: of a pixel."""
+    """Positions and heights of sources on the flanks of those at `places` (S, 2).
+
+    In the sharpest observation, whose PSF has the width fwhm [px]; scale [arcsec]: of a pixel.
+    """
     image, seen = signals[sharp].flat(), signals[sharp].n_seen > 0
     centres = np.array(
         [
-            centred(image if image[tuple(p.astype(int))] > threshold else everything, p)
+            parabolic_peak(image if image[tuple(p.astype(int))] > threshold else everything, p)
             for p in places
         ]
     )
-    rest, model = left_over(image, seen, centres)
-    wide, _ = left_over(signals[sharp].flat(SMALL_GALAXY), seen, centres)
+    rest, model = symmetric_residual(image, seen, centres)
+    wide, _ = symmetric_residual(signals[sharp].flat(SMALL_GALAXY), seen, centres)
     new = new_peaks(
         sep,
-        rest / noise_of(model),
-        max(threshold, LEAST),
+        rest / residual_scatter(model),
+        max(threshold, MIN_PEAK_SIGMA),
         MIN_AREA_BESIDE * fwhm**2,
         list(places),
         SAME_SOURCE * fwhm,
@@ -291,11 +296,11 @@ def _companions(sep, signals, sharp, everything, places, threshold, fwhm, scale)
     found: list = []
     for place, _ in new:
         at = place.astype(int)
-        top, height = top_near(rest, at, round(fwhm / 2))
+        top, height = brightest_peak_near(rest, at, round(fwhm / 2))
         # two peaks, one on either side of a top, are that one source
         if any(np.hypot(*(top - p)) <= SAME_SOURCE * fwhm for p, _ in found):
             continue
-        if top_near(wide, at, round(fwhm))[1] < LEAST_WIDE:
+        if brightest_peak_near(wide, at, round(fwhm))[1] < MIN_WIDE:
             continue
         if is_a_source(at, height, model, image, signals, centres, fwhm, scale):
             found.append((top, height))

@@ -6,8 +6,10 @@ import numpy as np
 
 
 def watershed(light, inside, at):
-    """Basins (Ny, Nx) int32 of the sources at pixels (S, 2), numbered from 1 without gaps, 0
-    outside: each pixel belongs to the source from which the light falls to it."""
+    """Basins (Ny, Nx) int32 of the sources at pixels (S, 2), numbered from 1, 0 outside.
+
+    Without gaps: each pixel belongs to the source from which the light falls to it.
+    """
     peaks, n_peaks = _hills(light, inside)
     hills = peaks[at[:, 0], at[:, 1]] - 1
     taken = np.zeros(n_peaks, bool)
@@ -25,8 +27,10 @@ def watershed(light, inside, at):
 
 
 def _hills(light, inside):
-    """The hills of the light (Ny, Nx) int32, numbered from 1, 0 outside, and how many there are:
-    all pixels from which the steepest way up ends on the same peak."""
+    """The hills of the light (Ny, Nx) int32, numbered from 1, 0 outside, and their number.
+
+    A hill: all pixels from which the steepest way up ends on the same peak.
+    """
     n_y, n_x = light.shape
     kind = np.int32 if light.size < 1 << 31 else np.int64
     rank = np.empty(light.size, kind)  # of equal pixels the later is higher: no plateaus

@@ -1,4 +1,4 @@
-"""Peaks of signal-to-noise images by `sep`: objects above a threshold, those on others told apart.
+"""Finds peaks of signal-to-noise images by `sep`: objects above a threshold, deblended.
 
 Source: sep, Barbary 2016 (JOSS 1, 58), after SExtractor, Bertin & Arnouts 1996 (A&AS 117, 393).
 """
@@ -45,8 +45,10 @@ def new_peaks(sep, image, threshold, area, known, apart, own=True):
 
 
 def _objects(sep, image, threshold, area):
-    """sep's objects: (position (y, x), height) of each, and the number from 1 of that which holds a
-    pixel (Ny, Nx), 0 = none."""
+    """sep's objects: (position (y, x), height) of each, and their numbers in pixels (Ny, Nx).
+
+    From 1, 0 = none.
+    """
     if not image.max(initial=0) > threshold:  # as most residuals: sep takes 1 ms to say so
         return [], np.zeros(image.shape, np.int32)
     objects, segments = _with_room(
@@ -68,7 +70,7 @@ def _objects(sep, image, threshold, area):
 
 
 def _with_room(sep, n_pixels, extract):
-    """What extract() returns once sep's limits hold the objects of an image of n_pixels.
+    """Runs extract() with sep's limits raised for the objects of an image of n_pixels.
 
     A bright star's wings may fill an image, as one object of many branches. The limits are
     those of the process, and are only raised.

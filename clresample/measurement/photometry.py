@@ -18,7 +18,7 @@ def fluxes(result):
     covariances are theirs, marginal over morphologies, and |S| has what the smooth profile holds
     beyond its box, where it is under the noise: a percent of the flux at signal to noise 10. And
     F is without what the bound of morphologies at 0 adds to it, 0.1 to 1 % of bright galaxies,
-    see `Errors.released`; it may be below 0 by chance.
+    see `Errors.flux_bound_bias`; it may be below 0 by chance.
 
     result: a fitted blend
     returns flux (S, C) [counts] and covariance (C, S, S) [counts^2]: flux and variance are NaN
@@ -29,10 +29,10 @@ def fluxes(result):
     for i, component in enumerate(result.components):
         sums[component.source, i] = component.morphology.sum(dtype=np.float64)
         if result.errors is not None:
-            sums[component.source, i] += result.errors.beyond[i, 0]
+            sums[component.source, i] += result.errors.outside_box_moments[i, 0]
     flux = sums @ spectra_of(result)
     if result.errors is not None:
-        flux = flux + result.errors.released
+        flux = flux + result.errors.flux_bound_bias
     known = np.isfinite(np.diagonal(result.covariance, axis1=1, axis2=2))  # (C, n)
     both = known[:, :, None] & known[:, None, :]
     if result.errors is None:

@@ -1,12 +1,12 @@
-"""How well a result fits its data: chi2 of channels and sources, and their labels."""
+"""Quality of a result's fit: chi2 of channels and sources, and their labels."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from ..deblending.assessment.status import misfitted
+from ..deblending.assessment.status import misfitted_sources
 from ..deblending.posterior.residuals import pixels_in_boxes
-from ..sky.sources import Point
+from ..sky.sources import PointSource
 
 # [px] from a pixel's centre to its corners
 PIXEL_RADIUS = 0.5**0.5
@@ -17,18 +17,18 @@ SATURATED_SIGMAS = 20.0
 
 
 def summary(result) -> dict:
-    """How the fit of a whole blend ended, in plain values that JSON can hold.
+    """Summary of the fit of a whole blend, in plain values that JSON can hold.
 
     result: a fitted blend
     returns a dict: status, messages, seconds as in `Result`; n_sources, n_fitted (inside the
         frame), n_components, n_iterations, losses; chi2 {channel: per pixel with a weight on the
         frame, NaN without any}, n_pixels {channel: number of these pixels}, sky {channel} [counts],
         shifts {observation: (y, x)} [model px]; misfits, the numbers of the sources that
-        are flagged MISFIT (`misfitted`); good, whether the fit converged at a model that
+        are flagged MISFIT (`misfitted_sources`); good, whether the fit converged at a model that
         describes the data and there is none
     """
     chi2, n_pixels = channel_chi2(result)
-    misfits = np.flatnonzero(misfitted(result)).tolist()
+    misfits = np.flatnonzero(misfitted_sources(result)).tolist()
     return {
         "status": result.status,
         "good": result.converged and not misfits,
@@ -44,15 +44,17 @@ def summary(result) -> dict:
         "sky": dict(zip(result.channels, map(float, result.sky), strict=True)),
         "shifts": {
             label: [float(s) for s in shift]
-            for label, shift in zip(labels(result), result.shifts, strict=True)
+            for label, shift in zip(observation_labels(result), result.shifts, strict=True)
         },
         "seconds": {stage: float(t) for stage, t in result.seconds.items()},
     }
 
 
 def channel_chi2(result) -> tuple[dict, dict]:
-    """Chi2 per pixel with a weight on the frame, NaN without any, and the number of these pixels,
-    both by channel."""
+    """Chi2 per pixel with a weight on the frame, and the number of these pixels, by channel.
+
+    NaN without any.
+    """
     chi2, n_pixels = {}, {}
     for i, (observation, footprint) in enumerate(
         zip(result.observations, result.footprints, strict=True)
@@ -65,7 +67,7 @@ def channel_chi2(result) -> tuple[dict, dict]:
     return chi2, n_pixels
 
 
-def labels(result) -> list[str]:
+def observation_labels(result) -> list[str]:
     """A name for each observation, unique: its own, numbered where it has none or shares it."""
     names = [o.name or "observation" for o in result.observations]
     return [
@@ -75,7 +77,7 @@ def labels(result) -> list[str]:
 
 
 def fitted_sources(result):
-    """Which sources (S,) have a component."""
+    """Selects sources (S,) with a component."""
     fitted = np.zeros(len(result.sources), dtype=bool)
     fitted[[c.source for c in result.components]] = True
     return fitted
@@ -101,7 +103,7 @@ def masked_cores(result, positions):
             core = distance <= radius[:, None, None]
             if not (masked & core).any():
                 continue
-            if isinstance(result.sources[i], Point):
+            if isinstance(result.sources[i], PointSource):
                 found[i] = True
                 continue
             half = 2 * (masked & core).sum(axis=(1, 2)) >= core.sum(axis=(1, 2))

@@ -74,7 +74,7 @@ def shape(second):
 
 
 def shape_slopes(second, axes):
-    """How `shape` of axes Q axes^T changes with Q: (4, 3), by (Q_yy, Q_yx, Q_xx).
+    """Derivatives of `shape` of axes Q axes^T with respect to Q: (4, 3), by (Q_yy, Q_yx, Q_xx).
 
     second (2, 2) [px^2]: Q; axes (2, 2) [arcsec/px]: see `local_axes`; NaN where the size is 0, and
     in the angle's row where there is no ellipticity

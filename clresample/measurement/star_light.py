@@ -21,13 +21,13 @@ from scipy.ndimage import distance_transform_edt, grey_dilation, grey_erosion, m
 from ..deblending.inspection.spoilt import saturated_pixels
 from ..deblending.inspection.star_cores import star_cores
 from ..deblending.inspection.star_fall import Fall
-from .signal import WIDTHS_ARCSEC, Signal
+from .signal_to_noise import WIDTHS_ARCSEC, SignalToNoise
 
 # [FWHM of the filtered image] Length L: a source is narrower along every ray.
 SOURCE_FWHM = 3.0
 # [sigma] Median light of a ring over the least of any, where that of the star has ended; rings
 # count of which this part was seen.
-END_SIGMAS, LEAST_COVERED = 0.5, 0.25
+END_SIGMAS, MIN_COVERED = 0.5, 0.25
 SPIKES = 2.0  # [radii of that ring] how far spikes reach, which hold a small part of a ring
 UNEVEN = 0.1  # [1] of what lasts: spikes are not even along a ray
 MAX_REACH_PX = 300  # [model px] of a star's light that is searched apart; further out it is faint
@@ -95,7 +95,7 @@ def height_beside(image, star) -> float:
     return float(image[away < 2 * star.radius + 1].max(initial=0.0))
 
 
-def starless(signal, stars, fwhm_px, pixel_arcsec) -> tuple[Signal, np.ndarray]:
+def starless(signal, stars, fwhm_px, pixel_arcsec) -> tuple[SignalToNoise, np.ndarray]:
     """The Signal without the light of StarPlaces, in units of its scatter there, and the pixels
     (Ny, Nx) bool that held it.
 
@@ -115,7 +115,7 @@ def starless(signal, stars, fwhm_px, pixel_arcsec) -> tuple[Signal, np.ndarray]:
         sums[w] = np.where(held, rest * root, sums[w])
         squares[w][held] = 0
         all_held |= held
-    return Signal(sums, squares, signal.n_seen, signal.channels, signal.places), all_held
+    return SignalToNoise(sums, squares, signal.n_seen, signal.channels, signal.places), all_held
 
 
 def _without_stars(image, seen, stars, fwhm):
@@ -194,7 +194,7 @@ def _end(image, seen, rings, first):
     light = np.full(len(starts) - 1, np.inf)
     for r in range(first, len(light)):
         part = values[starts[r] : starts[r + 1]]
-        if len(part) > LEAST_COVERED * 2 * np.pi * r:
+        if len(part) > MIN_COVERED * 2 * np.pi * r:
             light[r] = np.median(part)
     if not np.isfinite(light).any():
         return len(light)

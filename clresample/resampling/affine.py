@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..device.contraction import ImageBatch, Matrix, padded
+from ..device.contraction import ImageBatch, MatrixBatch, row_stride
 from .executor import Executor
 
 
@@ -24,13 +24,13 @@ class AffineExecutor(Executor):
         self.n_rows, self.n_steps = (n_rows, n_steps) if self.by_row else (n_steps, n_rows)
         self._columns = np.array([p.out_x.shape[1] for p in plans])
         self.n_columns = int(self._columns.max())
-        self.n_pad = padded(self.n_columns)
+        self.n_pad = row_stride(self.n_columns)
         super().__init__(device, dtype, plans)
         self.out_x = self._table([p.out_x for p in plans], self.k_x, self.n_pad)
         turns = [np.stack([p.twist.real, p.twist.imag], axis=1) for p in plans]
         self.turn = self._table(turns, self.h_y, 2, self.n_pad)
         lines = [p.lines for p in plans]
-        self.to_pixels = Gather(
+        self.to_pixels = LineInterpolation(
             self, [p.start for p in lines], [p.weight for p in lines], self.n_columns, self.n_steps
         )
 
@@ -50,40 +50,40 @@ class AffineExecutor(Executor):
             *(z, self.out_x, turned, turn),
             n,
             inward=False,
-            own=self.own(m=k_y, n=j, k=k_x),
+            own=self.item_sizes(m=k_y, n=j, k=k_x),
         )
         self.to_lines = self.waves("out_y", "left", back=True).bind(
             *(n_y, n_x, self.k_y),
             *(self.out_y, turned, lines),
             n_bands=n,
             inward=False,
-            own=self.own(n=j, k=k_y),
+            own=self.item_sizes(n=j, k=k_y),
         )
 
-    def bind_back(self):
-        super().bind_back()
+    def bind_adjoint(self):
+        super().bind_adjoint()
         n_y, n_x, turn = self.n_rows, self.n_columns, (self.turn.buffer, self.turn.stride, 0)
         turned, lines = self.matrix("turned"), self.matrix("lines")
         k_y, j, n = self.k_ys, self._columns, self.n_bands
-        out_y_t = self.made("out_y_t", lambda: self._transposed("out_y", self.k_y, n_y))
-        out_x_t = self.made("out_x_t", lambda: self._transposed("out_x", n_x, self.k_pad))
-        self.from_pixels = self.made("from_pixels", self._gather_back)
+        out_y_t = self.cached("out_y_t", lambda: self._transposed("out_y", self.k_y, n_y))
+        out_x_t = self.cached("out_x_t", lambda: self._transposed("out_x", n_x, self.k_pad))
+        self.from_pixels = self.cached("from_pixels", self._gather_back)
         twist = self.waves("out_y", "left", epilogue="TWIST", adjoint=True)
         self.from_lines = twist.bind(
             *(self.k_y, n_x, n_y),
             *(out_y_t, lines, turned, turn),
             n,
-            own=self.own(m=k_y, n=j),
+            own=self.item_sizes(m=k_y, n=j),
         )
-        product = self.product(**self.mixed_back())
+        product = self.product(**self.adjoint_options())
         self.from_columns = self.to_frequencies(product, n_x, turned, out_x_t, j)
 
     def _gather_back(self):
         lines = [p.lines for p in self.plans]
         tables = [p.start_t for p in lines], [p.weight_t for p in lines]
-        return Gather(self, *tables, self.n_steps, self.n_pad)
+        return LineInterpolation(self, *tables, self.n_steps, self.n_pad)
 
-    def observe(self, y: ImageBatch, n):
+    def frequencies_to_pixels(self, y: ImageBatch, n):
         """I2 = gather(G),  G = Sy twist(Z Sx).
 
         G (n, L, J): the lines at equidistant columns
@@ -93,23 +93,25 @@ class AffineExecutor(Executor):
         self.to_lines(n)
         self.to_pixels(self.matrix("lines"), self._lines_of(y), n, self.which)
 
-    def collect(self, y: ImageBatch, n):
+    def pixels_to_frequencies(self, y: ImageBatch, n):
         """Z = conj(D) o (twist^T(Sy^T G) Sx^T),  G = gather^T(I2);  y (n, My, Mx): I2"""
         self.from_pixels(self._lines_of(y), self.matrix("lines"), n, self.which)
         self.from_lines(n)
         self.from_columns(n)
 
-    def _lines_of(self, y: ImageBatch) -> Matrix:
+    def _lines_of(self, y: ImageBatch) -> MatrixBatch:
         return y.matrix((0, 1) if self.by_row else (1, 0))
 
 
 def kept_taps(n_taps, n_in, tuning):
-    """Taps that are kept of each sum of n_taps along a line of n_in elements: where a work-item
-    walks a line, whole fours if the line has so many."""
+    """Number of taps kept of each sum of n_taps along a line of n_in elements.
+
+    Where a work-item walks a line, whole fours if the line has so many.
+    """
     return min(-(-n_taps // 4) * 4, n_in) if tuning.row_loops else n_taps
 
 
-class Gather:
+class LineInterpolation:
     """Sparse sums along lines, out[l, p] = sum_t weight[l, t, p] in[l, start[l, p] + t].
 
     starts, weights: one (L, P), (L, taps, P) for each plan; n_in, n_out: elements of a line on
@@ -153,7 +155,7 @@ class Gather:
         self.bands_each = executor.n_bands if tuning.row_loops else 1
         self.size = 1 if tuning.row_loops else executor.whole_groups(n_out), n_lines
 
-    def __call__(self, source: Matrix, target: Matrix, n, which):
+    def __call__(self, source: MatrixBatch, target: MatrixBatch, n, which):
         """Queue the sums of `n` images, all bands of some scenes: rows of source to target.
 
         which: the executor's

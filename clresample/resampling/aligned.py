@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..device.contraction import ImageBatch, padded
+from ..device.contraction import ImageBatch, row_stride
 from .executor import Executor
 
 
@@ -15,7 +15,7 @@ class AlignedExecutor(Executor):
     def __init__(self, device, dtype, plans):
         self.n_rows, self.n_columns = plans[0].mapping.shape_out
         super().__init__(device, dtype, plans)
-        self.out_x = self._table([p.out_x for p in plans], self.k_x, padded(self.n_columns))
+        self.out_x = self._table([p.out_x for p in plans], self.k_x, row_stride(self.n_columns))
 
     def bind(self):
         super().bind()
@@ -28,34 +28,34 @@ class AlignedExecutor(Executor):
             *(self.out_y, z, half),
             n_bands=n,
             inward=False,
-            own=self.own(n=k_x, k=k_y),
+            own=self.item_sizes(n=k_x, k=k_y),
         )
         self.to_pixels = self.waves("out_x", "right", back=True, ragged=True).bind(
             *(n_y, n_x, self.k_x),
             *(half, self.out_x, observed),
             n_bands=n,
             inward=False,
-            own=self.own(k=k_x),
+            own=self.item_sizes(k=k_x),
         )
 
-    def bind_back(self):
-        super().bind_back()
+    def bind_adjoint(self):
+        super().bind_adjoint()
         n_y, n_x, n = self.n_rows, self.n_columns, self.n_bands
         half, observed = self.matrix("half", n_y), ImageBatch.shaped(n_y, n_x).matrix()
-        out_y_t = self.made("out_y_t", lambda: self._transposed("out_y", self.k_y, n_y))
-        out_x_t = self.made("out_x_t", lambda: self._transposed("out_x", n_x, self.k_pad))
+        out_y_t = self.cached("out_y_t", lambda: self._transposed("out_y", self.k_y, n_y))
+        out_x_t = self.cached("out_x_t", lambda: self._transposed("out_x", n_x, self.k_pad))
         self.from_pixels = self.waves("out_x", "right").bind(
-            n_y, self.k_x, n_x, observed, out_x_t, half, n_bands=n, own=self.own(n=self.k_xs)
+            n_y, self.k_x, n_x, observed, out_x_t, half, n_bands=n, own=self.item_sizes(n=self.k_xs)
         )
-        product = self.waves("out_y", "left", **self.mixed_back())
+        product = self.waves("out_y", "left", **self.adjoint_options())
         self.from_rows = self.to_frequencies(product, n_y, out_y_t, half)
 
-    def observe(self, y: ImageBatch, n):
+    def frequencies_to_pixels(self, y: ImageBatch, n):
         """I2 = Sy Z Sx;  y (n, My, Mx): the observation I2 of each band, overwritten"""
         self.to_rows(n)
         self.to_pixels(n, c=y)
 
-    def collect(self, y: ImageBatch, n):
+    def pixels_to_frequencies(self, y: ImageBatch, n):
         """Z = conj(D) o (Sy^T I2 Sx^T);  y (n, My, Mx): I2"""
         self.from_pixels(n, a=y)
         self.from_rows(n)

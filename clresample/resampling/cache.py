@@ -13,7 +13,7 @@ from ..device.device import get_device
 from ..sky.frame import Frame
 from ..sky.grid import Grid
 from ..sky.psf import PSF
-from .plan import Precision, make_plan
+from .plan import Precision, make_resampling_plan
 from .resampler import Resampler
 
 # [bytes] For blends of 50 to 200 pixels plans take 0.1 to 4 MB each and operators twice that, so
@@ -25,7 +25,7 @@ PLAN_BYTES, DEVICE_BYTES = 512 << 20, 256 << 20
 GROWTH = 0.1
 
 
-class _Store:
+class _LRUStore:
     """Entries by their keys, those asked for longest ago dropped beyond `most` bytes.
 
     Entries grow while they are used, and to ask each of hundreds for its size at every new one
@@ -78,7 +78,7 @@ class OperatorCache:
 
     def __init__(self, *, plan_bytes=PLAN_BYTES, device_bytes=DEVICE_BYTES):
         self.plan_bytes, self.device_bytes = plan_bytes, device_bytes
-        self._plans, self._operators = _Store(plan_bytes), _Store(device_bytes)
+        self._plans, self._operators = _LRUStore(plan_bytes), _LRUStore(device_bytes)
         self._lock = threading.RLock()
 
     def resampler(
@@ -107,7 +107,7 @@ class OperatorCache:
 
         def plan():
             precision = Precision.of(dtype)
-            return make_plan(
+            return make_resampling_plan(
                 mapping, frame.psf, psf, precision=precision, extent=extent, n_terms=n_terms
             )
 
@@ -122,12 +122,12 @@ class OperatorCache:
 
     @property
     def n_plans(self) -> int:
-        """How many plans are held."""
+        """Number of plans held."""
         return len(self._plans)
 
     @property
     def n_operators(self) -> int:
-        """How many operators are held."""
+        """Number of operators held."""
         return len(self._operators)
 
     def clear(self):
@@ -170,7 +170,7 @@ def cached_resampler(
 
 
 def _key(mapping, psf_in, psf_out, dtype, extent):
-    """What a plan is made of: equal for equal bytes."""
+    """Key of a plan: equal for equal bytes."""
     digest = hashlib.sha256()
     parts = [mapping.matrix, mapping.offset, mapping.positions, mapping.area]
     for psf in (psf_in, psf_out):

@@ -29,11 +29,11 @@ class DistortedExecutor(Executor):
         )
         self.rowdot = self._rows("rowdot", (self.tuning.line_group, 1), half).bind(n=self.k_x)
 
-    def bind_back(self):
-        super().bind_back()
+    def bind_adjoint(self):
+        super().bind_adjoint()
         half = self.matrix("half", self.n_rows)
-        out_y_t = self.made("out_y_t", lambda: self._transposed("out_y", self.k_y, self.n_rows))
-        product = self.product(**self.mixed_back())
+        out_y_t = self.cached("out_y_t", lambda: self._transposed("out_y", self.k_y, self.n_rows))
+        product = self.product(**self.adjoint_options())
         self.from_rows = self.to_frequencies(product, self.n_rows, out_y_t, half)
         self.rowscale = self._rows("rowscale", (COLUMN_PAD, 1), half)
 
@@ -48,12 +48,12 @@ class DistortedExecutor(Executor):
             E=self.out_x.buffer,
         )
 
-    def observe(self, y: ImageBatch, n):
+    def frequencies_to_pixels(self, y: ImageBatch, n):
         """I2[p] = sum_x (Sy Z)[p, x] Sx[p, x];  y (n, P): the observation I2 of each band"""
         self.to_rows(n)
         self.rowdot((self.whole_groups(self.n_rows), n), y=y.buffer, y_offset=y.offset)
 
-    def collect(self, y: ImageBatch, n):
+    def pixels_to_frequencies(self, y: ImageBatch, n):
         """Z = conj(D) o (Sy^T T),  T[p, x] = I2[p] Sx[p, x];  y (n, P): I2"""
         self.rowscale((self.k_pad * self.n_rows, n), y=y.buffer, y_offset=y.offset)
         self.from_rows(n)

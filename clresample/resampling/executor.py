@@ -1,4 +1,4 @@
-"""What the executors of all geometries share: from a model to its frequencies and back.
+"""Base of the executors of all geometries: from a model to its frequencies and back.
 
     forward   Z = D o (Ty I1 Tx)           both axes to frequencies, then the transfer function
               aligned    I2 = Sy Z Sx
@@ -21,14 +21,14 @@ from __future__ import annotations
 
 from typing import Self
 
-from ..device.contraction import Contraction, ImageBatch, Matrix
-from ..device.waves import serves, waves
-from .parts.tables import Tables
-from .parts.terms import Terms
+from ..device.contraction import Contraction, ImageBatch, MatrixBatch
+from ..device.mirror_contraction import fourier_contraction, is_supported
+from .executor_base.tables import ExecutorTables
+from .executor_base.terms import PSFTerms
 
 
-class Executor(Tables):
-    """What the three executors share: from a model to its frequencies, and back.
+class Executor(ExecutorTables):
+    """Base of the three executors: from a model to its frequencies, and back.
 
     plans, axes, n_rows: see Tables
     Subclasses add to scratch_shapes, bind and bind_back, and implement observe and collect
@@ -36,7 +36,7 @@ class Executor(Tables):
 
     def __init__(self, device, dtype, plans):
         super().__init__(device, dtype, plans)
-        self.terms = Terms(self) if self.n_terms > 1 else None
+        self.terms = PSFTerms(self) if self.n_terms > 1 else None
 
     def product(self, **options) -> Contraction:
         """A Contraction of the executor's type and tuning."""
@@ -44,13 +44,13 @@ class Executor(Tables):
 
     def waves(self, name, side, **options) -> Contraction:
         """The products with a table of waves, or its transpose, on that side."""
-        mirrored = serves(self.tuning) and self.mirrored(name)
+        mirrored = is_supported(self.tuning) and self.mirrored(name)
         given = {"mirrored": mirrored, "tuning": self.tuning}
-        return waves(self.device, self.dtype, side, **given, **options)
+        return fourier_contraction(self.device, self.dtype, side, **given, **options)
 
-    def apart(self) -> Self:
-        other = super().apart()
-        other.terms = Terms(other) if self.terms else None
+    def clone(self) -> Self:
+        other = super().clone()
+        other.terms = PSFTerms(other) if self.terms else None
         return other
 
     def scratch_shapes(self):
@@ -69,19 +69,23 @@ class Executor(Tables):
         z = self.matrix("terms" if self.terms else "frequencies", self.k_y)
         model = ImageBatch.shaped(*self.plans[0].mapping.shape_in).matrix(self.axes)
         # `spread`: an image is transformed once for all bands
-        once, shared = self.in_x_t._replace(div=1), half._replace(div=n)
+        once, shared = self.in_x_t._replace(items_per_matrix=1), half._replace(items_per_matrix=n)
         k_y, k_x = self.k_ys, self.k_xs
         to_columns = self.waves("in_x", "right", strided=self.axes != (0, 1))
         self.in_columns, self.in_columns_once = (
             to_columns.bind(
                 *(self.n_y, self.k_x, self.n_x),
                 *(model, in_x_t, half),
-                n_bands=in_x_t.div,
-                own=self.own(n=k_x),
+                n_bands=in_x_t.items_per_matrix,
+                own=self.item_sizes(n=k_x),
             )
-            for in_x_t in (self.in_x_t._replace(div=n), once)
+            for in_x_t in (self.in_x_t._replace(items_per_matrix=n), once)
         )
-        d, in_y, own = self.tables(self.transfer), self.in_y._replace(div=n), self.own(m=k_y, n=k_x)
+        d, in_y, own = (
+            self.tables(self.transfer),
+            self.in_y._replace(items_per_matrix=n),
+            self.item_sizes(m=k_y, n=k_x),
+        )
         to_rows = self.waves("in_y", "left", epilogue="MIX")
         self.in_rows, self.in_rows_shared = (
             to_rows.bind(self.k_y, self.k_x, self.n_y, in_y, right, z, d, n, own=own)
@@ -90,74 +94,89 @@ class Executor(Tables):
         if self.terms:
             self.terms.bind(self.scratch)
 
-    def bind_back(self):
+    def bind_adjoint(self):
         """Bind those of the adjoint."""
         half, n = self.matrix("half", self.n_y), self.n_bands * self.n_terms
         z = self.matrix("terms" if self.terms else "frequencies", self.k_y)
         model = ImageBatch.shaped(*self.plans[0].mapping.shape_in).matrix(self.axes)
         k_y, k_x = self.k_ys, self.k_xs
-        in_y_t, in_x = self.in_y_t._replace(div=n), self.in_x._replace(div=n)
+        in_y_t, in_x = (
+            self.in_y_t._replace(items_per_matrix=n),
+            self.in_x._replace(items_per_matrix=n),
+        )
         self.back_rows = self.waves("in_y", "left", back=True).bind(
             *(self.n_y, self.k_x, self.k_y),
             *(in_y_t, z, half),
             n_bands=n,
             inward=False,
-            own=self.own(n=k_x, k=k_y),
+            own=self.item_sizes(n=k_x, k=k_y),
         )
         self.back_columns = self.waves("in_x", "right", back=True, ragged=True).bind(
             *(self.n_y, self.n_x, self.k_x),
             *(half, in_x, model),
             n_bands=n,
             inward=False,
-            own=self.own(k=k_x),
+            own=self.item_sizes(k=k_x),
         )
 
     def forward(self, x: ImageBatch, y: ImageBatch, n, spread=False):
         """I2 from I1: x (n T, Ny, Nx), or (n / n_bands, Ny, Nx) if `spread`, to y (n, My, Mx)."""
-        self.analyse(x, n, spread)
-        self.show(y, n)
+        self.model_to_frequencies(x, n, spread)
+        self.render_from_frequencies(y, n)
 
     def adjoint(self, y: ImageBatch, x: ImageBatch, n):
         """The adjoint of `forward`: y (n, My, Mx) to x (n T, Ny, Nx)."""
-        self.take(y, n)
-        self.synthesise(x, n)
+        self.adjoint_to_frequencies(y, n)
+        self.frequencies_to_model(x, n)
 
-    def show(self, y: ImageBatch, n):
+    def render_from_frequencies(self, y: ImageBatch, n):
         """I2 of `n` images, y (n, My, Mx), from `model_frequencies`."""
         if self.terms:
             self.terms.add(n)
-        self.observe(y, n)
+        self.frequencies_to_pixels(y, n)
 
-    def take(self, y: ImageBatch, n):
-        """The adjoint of `show`, and conj(D) o of that: y (n, My, Mx) to `model_frequencies`."""
-        self.way_back()
-        self.collect(y, n)
+    def adjoint_to_frequencies(self, y: ImageBatch, n):
+        """Adjoint of `render_from_frequencies`, times conj(D).
+
+        y (n, My, Mx) to `model_frequencies`.
+        """
+        self.ensure_adjoint()
+        self.pixels_to_frequencies(y, n)
         if self.terms:
-            self.terms.spread(n)
+            self.terms.split(n)
 
-    def observe(self, y: ImageBatch, n):
+    def frequencies_to_pixels(self, y: ImageBatch, n):
         """I2 of `n` images, y (n, My, Mx), from Z in scratch "frequencies"."""
         raise NotImplementedError
 
-    def collect(self, y: ImageBatch, n):
-        """The adjoint of `observe`, and conj(D) o of that unless there are terms, of which each has
-        its own: y (n, My, Mx) into the same scratch."""
+    def pixels_to_frequencies(self, y: ImageBatch, n):
+        """Adjoint of `frequencies_to_pixels`, times conj(D) unless there are terms.
+
+        Each term has its own D: y (n, My, Mx) into the same scratch.
+        """
         raise NotImplementedError
 
-    def mixed_back(self) -> dict:
-        """Options of the product `to_frequencies`: it multiplies its result by conj(D), unless
-        that is left to the terms."""
+    def adjoint_options(self) -> dict:
+        """Options of the product `to_frequencies`.
+
+        It multiplies its result by conj(D), unless that is left to the terms.
+        """
         return {} if self.terms else {"epilogue": "MIX", "adjoint": True}
 
-    def to_frequencies(self, product: Contraction, k, left: Matrix, right: Matrix, own_k=None):
-        """The product Z = conj(D) o (left right), left (ky, k), right (k, kx), without D where
-        there are terms. product: made with `mixed_back`; own_k (plans,): k of each, if not all's"""
+    def to_frequencies(
+        self, product: Contraction, k, left: MatrixBatch, right: MatrixBatch, own_k=None
+    ):
+        """Queues the product Z = conj(D) o (left right), left (ky, k), right (k, kx).
+
+        Without D where there are terms. product: made with `adjoint_options`; own_k (plans,): k of
+        each, if not all's
+        """
         z, n = self.matrix("frequencies"), self.n_bands
         d = None if self.terms else self.tables(self.transfer)
-        own = self.own(m=self.k_ys, n=self.k_xs, k=own_k)
+        own = self.item_sizes(m=self.k_ys, n=self.k_xs, k=own_k)
         return product.bind(self.k_y, self.k_x, k, left, right, z, d, n, own=own)
 
-    def analyse(self, x: ImageBatch, n, spread=False):
+    def model_to_frequencies(self, x: ImageBatch, n, spread=False):
         """Z = D o (Ty I1 Tx) for `n` images, into `model_frequencies`.
 
         spread: the images are n / n_bands, each of which is seen in every band
@@ -169,7 +188,7 @@ class Executor(Tables):
             self.in_columns(n * self.n_terms, a=x)
             self.in_rows(n * self.n_terms)
 
-    def synthesise(self, x: ImageBatch, n):
+    def frequencies_to_model(self, x: ImageBatch, n):
         """I1 = Ty^T Z Tx^T of `n` images, Z in `model_frequencies`: the end of every adjoint."""
         self.back_rows(n * self.n_terms)
         self.back_columns(n * self.n_terms, c=x)

@@ -1,13 +1,13 @@
-"""What all operators from one pixel grid to another have: mapping, coverage, shift, certificate."""
+"""Base of all operators between pixel grids: mapping, coverage, shift, certificate."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from ..sky.given.checks import float_type, instance, numbers
-from ..sky.given.observed import PSFLike, as_psf
 from ..sky.grid import GridLike, as_grid
 from ..sky.mapping import Mapping
+from ..sky.validation.checks import as_float_array, check_dtype, check_instance
+from ..sky.validation.observed import PSFLike, as_psf
 from .linop import LinOp
 from .transfer import Certificate
 
@@ -54,7 +54,7 @@ class GridOperator(LinOp):
     ):
         grid_in, grid_out = as_grid("grid_in", grid_in), as_grid("grid_out", grid_out)
         psf_in, psf_out = as_psf("psf_in", psf_in), as_psf("psf_out", psf_out)
-        dtype = float_type(dtype)
+        dtype = check_dtype(dtype)
         mapping = grid_out.map_to(grid_in, tolerance_px=tolerance_px)
         self._prepare(mapping, psf_in, psf_out, dtype, device)
         self.shift = shift
@@ -71,9 +71,9 @@ class GridOperator(LinOp):
         shift=(0.0, 0.0),
     ):
         """The operator of a mapping, observed pixels -> model pixels, instead of two grids."""
-        instance("mapping", mapping, Mapping)
+        check_instance("mapping", mapping, Mapping)
         psf_in, psf_out = as_psf("psf_in", psf_in), as_psf("psf_out", psf_out)
-        op, dtype = cls.__new__(cls), float_type(dtype)
+        op, dtype = cls.__new__(cls), check_dtype(dtype)
         op._prepare(mapping, psf_in, psf_out, dtype, device)
         op.shift = shift
         return op
@@ -103,7 +103,7 @@ class GridOperator(LinOp):
 
     @property
     def mapping(self) -> Mapping:
-        """Where the observed pixels lie in the model's."""
+        """Mapping of the observed pixels into the model's."""
         return _one_or_all(self._mappings)
 
     @property
@@ -119,7 +119,7 @@ class GridOperator(LinOp):
 
     @property
     def certificate(self) -> Certificate:
-        """What the set-up found of the transfer function and its kernel."""
+        """Findings of the set-up about the transfer function and its kernel."""
         return _one_or_all(self._certificates)
 
     @property
@@ -133,7 +133,7 @@ class GridOperator(LinOp):
 
     @shift.setter
     def shift(self, shift):
-        shift, expected = numbers("shift", shift), (self._n_geometries, 2)
+        shift, expected = as_float_array("shift", shift), (self._n_geometries, 2)
         if shift.shape not in ((), (2,), expected) or not np.isfinite(shift).all():
             raise ValueError(
                 f"shift is {shift.tolist()}, must be (2,) or {expected} finite numbers"

@@ -7,7 +7,7 @@ import threading
 import numpy as np
 
 from ..device.device import get_device
-from ..sky.given.checks import float_type, mask_of, real
+from ..sky.validation.checks import as_real_array, check_dtype, mask_of
 
 
 class LinOp:
@@ -28,7 +28,7 @@ class LinOp:
 
     def __init__(self, device, dtype, shape_in, shape_out):
         self.device = get_device(device)
-        self.dtype = float_type(dtype)
+        self.dtype = check_dtype(dtype)
         self.shape_in, self.shape_out = tuple(shape_in), tuple(shape_out)
         self._staged, self._lock = {}, threading.RLock()
 
@@ -80,7 +80,7 @@ class LinOp:
     @property
     def T(self) -> LinOp:
         """The adjoint as an operator."""
-        return Adjoint(self)
+        return AdjointLinOp(self)
 
     def as_scipy(self):
         """The operator as a scipy LinearOperator on flat vectors (prod(shape_in),)."""
@@ -108,7 +108,7 @@ class LinOp:
         if unit is not None and hasattr(x, "to_value"):
             return self._apply(run, name, x.to_value(unit), None, shape_x, shape_out) * unit
         if not on_device:
-            x = real(name, x)
+            x = as_real_array(name, x)
         batch, shape_result = _match_shape(name, tuple(x.shape), shape_x, shape_out)
         if out is not None:
             _check_out(name, x, out, on_device, shape_result)
@@ -173,7 +173,7 @@ class LinOp:
         return self._staged[name][1:]
 
 
-class HostOp(LinOp):
+class HostLinOp(LinOp):
     """A linear operator whose arrays are too large for the device: they stay on the host.
 
     Subclasses implement `_forward` and `_adjoint` on NumPy arrays (B,) + shape of `dtype`.
@@ -197,7 +197,7 @@ class HostOp(LinOp):
         return out
 
 
-class Adjoint(LinOp):
+class AdjointLinOp(LinOp):
     """The transpose of an operator, as an operator."""
 
     def __init__(self, op):
@@ -258,8 +258,10 @@ def _check_out(name, x, out, on_device, shape):
 
 
 def _cast(name, x, dtype):
-    """A caller's NumPy array in the operator's type and in C order; ValueError where the type
-    cannot hold its numbers."""
+    """A caller's NumPy array in the operator's type and in C order.
+
+    ValueError where the type cannot hold its numbers.
+    """
     try:
         with np.errstate(over="raise"):
             return np.ascontiguousarray(x, dtype=dtype)

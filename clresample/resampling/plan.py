@@ -17,17 +17,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..sky.extent import lit_part
-from ..sky.mapping import Around, Mapping
+from ..sky.extent import crop_psf
+from ..sky.fourier import is_mirror_symmetric
+from ..sky.mapping import Mapping, PaddedMapping
 from ..sky.psf import PSF
-from ..sky.waves import is_mirrored
 from .gridding import KaiserBessel, LineTaps
-from .tables import aligned_tables, distorted_tables, line_tables, waves_along
 from .transfer import Certificate, transfer_function, wrap_radius
+from .wave_tables import aligned_tables, distorted_tables, line_tables, uniform_wave_table
 
 # [bytes] of the tables of one operator. Frames of 7000 pixels a side need so much, and take minutes
 # where tiles take seconds; a WCS that is wrong by orders of magnitude needs far more.
-MOST_BYTES = 8 << 30
+MAX_BYTES = 8 << 30
 
 # Part of the band's tolerance that a PSF's transform may lack of its light: that of outer samples,
 # which a sum over all samples would otherwise spend most of its time on.
@@ -36,7 +36,7 @@ FAINT = 1e-2
 
 @dataclass(frozen=True)
 class Precision:
-    """How exact a plan is made: to the rounding of the floating-point type that it serves.
+    """Precision of a plan: to the rounding of the floating-point type that it serves.
 
     band_tolerance [1]: |D| / max |D| below which a frequency is dropped
     window: by which pixels are interpolated along lines; see KaiserBessel for its error
@@ -55,7 +55,7 @@ class Precision:
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class ResamplingPlan:
     """Tables of one observation; rows 2i, 2i+1 of a table are the cos and sin parts of frequency i.
 
     mapping: observed pixels -> model pixels; its geometry decides which tables there are
@@ -106,7 +106,7 @@ class Plan:
         lines = 0 if self.lines is None else self.lines.n_bytes
         return own + lines + sum(plan.n_bytes for plan in self.windows.values())
 
-    def window(self, shape, reach_px, precision: Precision, size=None) -> Plan:
+    def window(self, shape, reach_px, precision: Precision, size=None) -> ResamplingPlan:
         """The plan of a box of the model, by what its light reaches of the observation.
 
         One for all boxes of a shape: those observed pixels lie about the box's middle, and how far
@@ -114,14 +114,14 @@ class Plan:
         which are another at each place.
 
         shape (2,) [model px]: of the box; reach_px [model px]: how far its light is followed
-        size (2,) [observed px]: of the window, at least as many; see Around.box_of
+        size (2,) [observed px]: of the window, at least as many; see PaddedMapping.box_of
         """
         key = tuple(shape), reach_px, precision, size
         if key not in self.windows:
-            mapping = Around.box_of(self.mapping, shape, reach_px, size)
+            mapping = PaddedMapping.for_box(self.mapping, shape, reach_px, size)
             moved = np.abs(self.mapping.matrix).sum(axis=1) / 2
             extent = tuple(np.array(shape) + mapping.reach_px + moved)
-            self.windows[key] = make_plan(
+            self.windows[key] = make_resampling_plan(
                 mapping,
                 *self.psfs,
                 precision=precision,
@@ -137,14 +137,14 @@ class Plan:
 
     @functools.cached_property
     def mirrored(self) -> dict[str, bool]:
-        """Whether halves of tables mirror each other; of pixels beyond the model they do not."""
+        """True if halves of tables mirror each other; of pixels beyond the model they do not."""
         tables = {"in_y": self.in_y, "in_x": self.in_x}
         if self.geometry != "distorted":
             tables |= {"out_y": self.out_y.T, "out_x": self.out_x}
-        return {name: is_mirrored(table) for name, table in tables.items()}
+        return {name: is_mirror_symmetric(table) for name, table in tables.items()}
 
 
-def make_plan(
+def make_resampling_plan(
     mapping: Mapping,
     psf_in: PSF,
     psf_out: PSF,
@@ -153,11 +153,12 @@ def make_plan(
     extent=None,
     n_terms=1,
     radius=None,
-) -> Plan:
+) -> ResamplingPlan:
     """Tables that take a model to the observed pixels and PSF of `mapping`.
 
     mapping: observed pixels -> model pixels; psf_in (1 or C bands), psf_out (C bands): the PSFs
-    n_terms: T, of which psf_out has so many in turn for each band that is observed; see Plan
+    n_terms: T, of which psf_out has so many in turn for each band that is observed; see
+        ResamplingPlan
     extent (2,) [model px]: from its first pixel on, what of the model holds light, and sets the
         frequencies; None = all of it
     radius (2,) [model px]: by which the model is padded; None = `wrap_radius`
@@ -187,9 +188,10 @@ def make_plan(
         tables, middle = aligned_tables(mapping, nu, axes, center)
     d_plus, d_minus = _moved(d_plus, d_minus, nu, middle)
     in_y, in_x = (
-        waves_along(nu[i], -center[axes[i]], 1.0, mapping.shape_in[axes[i]]).T for i in (0, 1)
+        uniform_wave_table(nu[i], -center[axes[i]], 1.0, mapping.shape_in[axes[i]]).T
+        for i in (0, 1)
     )
-    return Plan(
+    return ResamplingPlan(
         mapping=mapping,
         n_bands=n_bands // n_terms,
         identity=n_terms == 1 and is_identity(mapping, psf_in, psf_out),
@@ -214,7 +216,7 @@ def _moved(d_plus, d_minus, nu, way):
 
 
 def _check_size(mapping, psf_out, n_fft, n_bands):
-    """Raise ValueError where a plan would take more than MOST_BYTES."""
+    """Raise ValueError where a plan would take more than MAX_BYTES."""
     k = [_half_count(mapping.matrix, psf_out.spacing, i, n_fft[i]) for i in (0, 1)]
     n_bytes = 3 * 16 * n_bands * k[0] * 2 * k[1]  # D and both OTFs; then waves at the pixels
     n_bytes += 16 * sum(n * h for n, h in zip(mapping.shape_in, k, strict=True))
@@ -222,12 +224,12 @@ def _check_size(mapping, psf_out, n_fft, n_bands):
     if mapping.geometry == "distorted":
         n_out = [n_out[0] * n_out[1]] * 2
     n_bytes += 16 * sum(n * h for n, h in zip(n_out, k, strict=True))
-    if n_bytes > MOST_BYTES:
+    if n_bytes > MAX_BYTES:
         size = float(np.sqrt(abs(np.linalg.det(mapping.matrix))))
         raise ValueError(
             f"an operator from {mapping.shape_in} to {mapping.shape_out} pixels, one {size:.3g} "
             f"times the other's size, needs tables of {n_bytes / 2**30:.3g} GiB, more than "
-            f"{MOST_BYTES >> 30}: is the WCS right? If so, use smaller images, or TiledResampler"
+            f"{MAX_BYTES >> 30}: is the WCS right? If so, use smaller images, or TiledResampler"
         )
 
 
@@ -241,7 +243,7 @@ def _band(matrix, psf_in: PSF, psf_out: PSF, n_fft, precision: Precision):
         np.arange(_half_count(matrix, psf_out.spacing, i, n_fft[i])) / n_fft[i] for i in (0, 1)
     )
     both = np.concatenate([-nu_x[:0:-1], nu_x])
-    psf_in, psf_out = (lit_part(psf, FAINT * precision.band_tolerance) for psf in (psf_in, psf_out))
+    psf_in, psf_out = (crop_psf(psf, FAINT * precision.band_tolerance) for psf in (psf_in, psf_out))
     d, max_gain, floored_power = transfer_function(
         psf_in.otf(nu_y, both), psf_out.otf(nu_y, both, matrix)
     )

@@ -1,4 +1,6 @@
-"""The operator in NumPy float64, written from its definitions; the tests compare executors with it.
+"""The operator in NumPy float64, written from its definitions.
+
+The tests compare executors with it.
 
 With A the Jacobian and X the positions of the observed pixels in model pixels, nu = kappa / K:
 

@@ -8,16 +8,16 @@ import warnings
 import numpy as np
 
 from ..device.contraction import ImageBatch
-from ..device.tuning import MOST_GROUPS
-from ..sky.given.checks import float_type
+from ..device.tuning import MAX_GROUPS
 from ..sky.psf_checks import PSFWarning
+from ..sky.validation.checks import check_dtype
 from .affine import AffineExecutor
 from .aligned import AlignedExecutor
 from .distorted import DistortedExecutor
 from .executor import Executor
 from .folded.executor import FoldedExecutor
 from .grid_operator import GridOperator
-from .plan import Plan, Precision, make_plan
+from .plan import Precision, ResamplingPlan, make_resampling_plan
 from .transfer import noise_warnings
 
 EXECUTORS = {"aligned": AlignedExecutor, "affine": AffineExecutor, "distorted": DistortedExecutor}
@@ -38,7 +38,7 @@ class Resampler(GridOperator):
 
     @classmethod
     def from_plans(
-        cls, plans: list[Plan], *, dtype=np.float32, device=None, shift=(0.0, 0.0)
+        cls, plans: list[ResamplingPlan], *, dtype=np.float32, device=None, shift=(0.0, 0.0)
     ) -> Resampler:
         """An operator on batches whose item b has its own geometry and PSFs, plans[b].
 
@@ -56,15 +56,18 @@ class Resampler(GridOperator):
     @classmethod
     def _made(cls, plans, dtype, device, shift, folds):
         """An operator of plans; folds: a single one may go through float64, see FoldedExecutor."""
-        op, dtype = cls.__new__(cls), float_type(dtype)
+        op, dtype = cls.__new__(cls), check_dtype(dtype)
         op._take(plans, dtype, device, folds)
         op.shift = shift
         return op
 
     @classmethod
     def of_items(cls, ops: list[Resampler]) -> Resampler:
-        """The operator on batches whose item b is seen by ops[b]: theirs where they are one, else
-        one of all their plans, at their present shifts. ValueError where their layouts differ."""
+        """The operator of batches whose item b is rendered by ops[b].
+
+        Theirs where they are one, else one of all their plans, at their present shifts. ValueError
+        where their layouts differ.
+        """
         if all(op is ops[0] for op in ops):
             return ops[0]
         shifts = np.stack([op.shift for op in ops])
@@ -73,14 +76,14 @@ class Resampler(GridOperator):
 
     @property
     def layout(self):
-        """What operators have to have in common to serve one batch: see from_plans."""
+        """Properties that operators share to serve one batch: see from_plans."""
         plan = self.plans[0]
         by_row = None if plan.lines is None else plan.lines.by_row
         return self.geometry, plan.axes, self.shape_in, self.shape_out, by_row
 
     def _prepare(self, mapping, psf_in, psf_out, dtype, device):
         """The plan of a mapping, with its warnings, and its tables on the device."""
-        plan = make_plan(mapping, psf_in, psf_out, precision=Precision.of(dtype))
+        plan = make_resampling_plan(mapping, psf_in, psf_out, precision=Precision.of(dtype))
         for message in noise_warnings(plan.certificate):
             warnings.warn(message, PSFWarning, stacklevel=3)
         self._take([plan], dtype, device, folds=True)
@@ -91,7 +94,7 @@ class Resampler(GridOperator):
         self._begin(device, dtype, n_bands, mappings, plans[0].n_terms)
         self.plans, self._certificates = plans, [plan.certificate for plan in plans]
         self._executor = EXECUTORS[self.geometry](self.device, self.dtype, plans)
-        folds = folds and FoldedExecutor.serves(self.device, self.dtype, plans[0])
+        folds = folds and FoldedExecutor.is_preferred(self.device, self.dtype, plans[0])
         self._whole = FoldedExecutor(self.device, plans[0]) if folds else self._executor
         self._group = _images_at_once(self._executor) // n_bands or 1
 
@@ -109,12 +112,12 @@ class Resampler(GridOperator):
         return type(self)._made, (self.plans, self.dtype, self.device, self._shift, folds)
 
     def executor(self) -> Executor:
-        """What computes it, with intermediates of its own; for callers that work between stages."""
-        return self._executor.apart()
+        """Executor with intermediates of its own; for callers that work between stages."""
+        return self._executor.clone()
 
     @property
     def is_identity(self) -> bool:
-        """Whether it returns its input bit for bit: same pixels, same PSF, no shift."""
+        """True if it returns its input bit for bit: same pixels, same PSF, no shift."""
         return self._identity
 
     @property
@@ -149,8 +152,10 @@ class Resampler(GridOperator):
         self._run("adjoint", y, out)
 
     def queue_plain(self, way, source, target):
-        """Queue "forward" or "adjoint" as `forward_into` does, in the operator's own type all the
-        way: float32 images that go through float64 there take two thirds of the time here."""
+        """Queues "forward" or "adjoint" like `forward_into`, in the operator's own type throughout.
+
+        float32 images that go through float64 there take two thirds of the time here.
+        """
         with self._lock:
             self._run(way, source, target, whole=self._executor)
 
@@ -186,7 +191,7 @@ def _images_at_once(executor: Executor) -> int:
     """Images, one for each band, whose intermediates the cache holds and a launch may have."""
     per_image = sum(rows * ld for rows, ld in executor.scratch_shapes().values())
     fit = executor.tuning.group_bytes // (per_image * np.dtype(executor.dtype).itemsize)
-    return min(fit, MOST_GROUPS // executor.n_terms)
+    return min(fit, MAX_GROUPS // executor.n_terms)
 
 
 def _check_alike(plans):

@@ -1,4 +1,4 @@
-"""The transfer function D between two PSFs, how far its kernel reaches, and what it does to noise.
+"""The transfer function D between two PSFs, the reach of its kernel, its effect on noise.
 
 D(nu) = |det A| P2^(A^T nu) / P1^(nu)
 """
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..drawing.shown import ShownCertificate
+from ..drawing.display import CertificateDisplay
 from ..sky.psf import PSF
 
 # Light of the observed PSF beyond the wrap radius, as a fraction; images drawn by FFT ring at 1e-6.
@@ -27,8 +27,8 @@ NOISY_GAIN, FLOORED_POWER = 2.0, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Certificate(ShownCertificate):
-    """What the set-up of an operator found.
+class Certificate(CertificateDisplay):
+    """Findings of the set-up of an operator.
 
     wrap_radius_px (2,) [model px]: reach (y, x) of the observed PSF, by which the model is padded
     n_fft (2,): K, the padded length of each axis; frequencies are kappa / K
@@ -53,7 +53,7 @@ class Certificate(ShownCertificate):
 
 
 def noise_warnings(certificate: Certificate) -> list[str]:
-    """What a user should know of a difference kernel that does more than blur, a line each."""
+    """Warnings about a difference kernel that does more than blur, a line each."""
     gain, floored = certificate.max_gain.max(), certificate.floored_power.max()
     lines = []
     if gain > NOISY_GAIN:

@@ -1,4 +1,4 @@
-"""Mosaics of simulated scenes, as Observations: exposures drawn on grids of their own, then added.
+"""Mosaics of simulated scenes, as Observations: exposures drawn on their own grids, then added.
 
 A scene's image and its mosaic hold the same exposure time and the same sources; noise is drawn
 anew, exposure by exposure.
@@ -13,7 +13,7 @@ import numpy as np
 from ..sky.grid import Grid
 from ..sky.observation import Observation
 from .galaxies import draw
-from .mosaics import Mosaicking, drizzle, lanczos
+from .mosaics import MosaicOperator, drizzle, lanczos
 from .scenes import SimulatedImage, SimulatedScene
 
 # [deg] Pixels of exposures are turned against those of the mosaic, so that the sub-pixel phases,
@@ -114,7 +114,7 @@ def _expose(image, profiles, positions_arcsec, grids, rng):
     return exposures
 
 
-def _mosaic(image, mosaicking: Mosaicking, exposures, noise):
+def _mosaic(image, mosaicking: MosaicOperator, exposures, noise):
     """The MosaicImage of an image; noise: "correlated" or "white"."""
     if noise not in ("correlated", "white"):
         raise ValueError(f'noise is {noise!r}, it takes "correlated" or "white"')

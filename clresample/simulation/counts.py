@@ -73,7 +73,7 @@ def half_light_arcsec(rng, magnitude) -> float:
 
 
 def is_elliptical(rng, magnitude) -> bool:
-    """Whether a galaxy of an i magnitude has no disk."""
+    """Returns True if a galaxy of an i magnitude has no disk."""
     return bool(rng.uniform() < np.interp(magnitude, (18.0, 23.0), (1 / 3, 0.1)))
 
 

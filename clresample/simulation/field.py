@@ -1,4 +1,4 @@
-"""A field of galaxies and stars as Euclid and Rubin see it, with the truth: mosaics, not stamps."""
+"""Simulates a field of galaxies and stars by Euclid and Rubin, with its truth, as mosaics."""
 
 from __future__ import annotations
 

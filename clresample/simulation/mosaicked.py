@@ -28,7 +28,7 @@ class SimulatedMosaic:
     grid: Grid
     data: np.ndarray
     noise_sigma: np.ndarray
-    bad: np.ndarray
+    bad_pixels: np.ndarray
     psf_positions: np.ndarray
     psf_images: np.ndarray
     psf_spacing: float = 1.0

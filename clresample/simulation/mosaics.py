@@ -1,4 +1,4 @@
-"""Mosaics as pipelines make them: Lanczos resampling and drizzle, with the noise that they leave.
+"""Mosaics as pipelines make them: Lanczos resampling and drizzle, with correlated noise.
 
 Both are linear. With the pixels d_k of all exposures, of noise sigma, a mosaic's pixels are
 
@@ -25,12 +25,12 @@ N_MEAN = 1500
 # Lags of the correlation [input px]: Lanczos-3 sums over 6 pixels a side.
 MAX_LAG_PX = 6
 # Least share of a mosaic's pixel that drops must fill for it to have a value.
-LEAST_FILLED = 1e-3
+MIN_FILLED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Mosaicking:
-    """How a mosaic comes of exposures.
+class MosaicOperator:
+    """Operator from exposures to a mosaic.
 
     grid_in: `Grid.flat` of the exposures' pixels, all of one Jacobian; grid: of the mosaic
     matrix (P, P_in): M, over the pixels of all exposures one after the other; rows of zeros where
@@ -44,7 +44,7 @@ class Mosaicking:
     centers: np.ndarray
 
     @property
-    def seen(self):
+    def has_data(self):
         """Pixels (Ny, Nx) that have a value."""
         return (np.diff(self.matrix.indptr) > 0).reshape(self.grid.shape)
 
@@ -92,7 +92,7 @@ class Mosaicking:
 
     def _sample(self):
         """Some rows (n,) of the matrix, and for each of their entries c_i - x_k (., 2) [px]."""
-        rows = np.flatnonzero(self.seen.ravel())
+        rows = np.flatnonzero(self.has_data.ravel())
         if not len(rows):
             raise ValueError(f"the exposures reach no pixel of the mosaic's grid {self.grid.shape}")
         if len(rows) > N_MEAN:
@@ -103,7 +103,7 @@ class Mosaicking:
         return rows, own - self.centers[part.indices]
 
 
-def lanczos(grid_in, grid, order=3) -> Mosaicking:
+def lanczos(grid_in, grid, order=3) -> MosaicOperator:
     """Lanczos interpolation of one exposure, whose weights are normalised pixel by pixel.
 
         M_ik ~ L(y_i - n_k) L(x_i - m_k),   L(u) = sinc(u) sinc(u / order), |u| < order
@@ -130,10 +130,12 @@ def lanczos(grid_in, grid, order=3) -> Mosaicking:
     values *= abs(np.linalg.det(mapping.matrix))  # [input px] area of a mosaic's pixel
     size = np.prod(grid.shape), np.prod(grid_in.shape)
     entries = values.ravel(), (rows.ravel(), columns.ravel())
-    return Mosaicking(grid_in, grid, sparse.csr_matrix(entries, size), _centers([grid_in], grid))
+    return MosaicOperator(
+        grid_in, grid, sparse.csr_matrix(entries, size), _centers([grid_in], grid)
+    )
 
 
-def drizzle(grids_in, grid, pixfrac=0.8) -> Mosaicking:
+def drizzle(grids_in, grid, pixfrac=0.8) -> MosaicOperator:
     """Drizzle with square drops (Fruchter and Hook 2002), all exposures with the same weight.
 
         M_ik ~ area of pixel i that is covered by the drop of pixel k
@@ -158,20 +160,20 @@ def drizzle(grids_in, grid, pixfrac=0.8) -> Mosaicking:
     parts = []
     for step in np.ndindex(*span):
         pixel = low + step
-        area = overlap(centers[:, None] + corners - (pixel[:, None] - 0.5))
+        area = overlap_area(centers[:, None] + corners - (pixel[:, None] - 0.5))
         hit = (area > 0) & (pixel >= 0).all(axis=1) & (pixel < grid.shape).all(axis=1)
         rows = np.ravel_multi_index(tuple(pixel[hit].T), grid.shape)
         parts.append((area[hit], rows, np.flatnonzero(hit)))
     area, rows, columns = (np.concatenate(p) for p in zip(*parts, strict=True))
     matrix = sparse.csr_matrix((area, (rows, columns)), (np.prod(grid.shape), len(centers)))
     filled = np.asarray(matrix.sum(axis=1)).ravel()
-    scale = np.where(filled > LEAST_FILLED, 1 / np.maximum(filled, LEAST_FILLED), 0)
+    scale = np.where(filled > MIN_FILLED, 1 / np.maximum(filled, MIN_FILLED), 0)
     matrix = (sparse.diags(scale / abs(np.linalg.det(mapping.matrix))) @ matrix).tocsr()
     matrix.eliminate_zeros()
-    return Mosaicking(grids_in[0], grid, matrix, centers)
+    return MosaicOperator(grids_in[0], grid, matrix, centers)
 
 
-def overlap(polygons):
+def overlap_area(polygons):
     """Areas (n,) that polygons (n, k, 2), convex or not, share with the square [0, 1] x [0, 1].
 
     By Green's theorem: the sum over their sides of the integral of y, cut to [0, 1], along x.

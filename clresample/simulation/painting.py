@@ -37,7 +37,7 @@ LARGEST_FFT = 16384  # [samples a side] of a drawing
 
 
 @dataclass(frozen=True, eq=False)
-class Instrument:
+class InstrumentModel:
     """One survey's PSFs, handed out and true, and where its pixels really lie.
 
     width (C,): of the handed-out PSF over the true one; wings: see Spoilers.psf_wings
@@ -94,7 +94,7 @@ def painted(survey, grid, sources, spoilers, rng, center_deg, *, second, **optio
     width = signed(rng, spoilers.psf_width, survey.n_bands)
     offset = offset_of(rng, spoilers.wcs_offset_px) if second else np.zeros(2)
     columns = options.pop("bad_columns", 0)
-    instrument = Instrument(survey, width, spoilers.psf_wings, **options)
+    instrument = InstrumentModel(survey, width, spoilers.psf_wings, **options)
     data = np.zeros((survey.n_bands, *grid.shape))
     power = np.array([_add(data, instrument, grid, source) for source in sources])
     sigma = survey.noise_sigma

@@ -40,7 +40,7 @@ def _to_pixels(grid, positions_arcsec):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SimulatedImage:
-    """What one instrument sees of a scene of S sources, and the truth behind it.
+    """Image of a scene of S sources by one instrument, with its truth.
 
     survey: the instrument
     grid, psf: its `Grid` and `PSF`
@@ -259,7 +259,7 @@ def _check(n_sources, sky, catalogue, spectra):
 
 
 def _random_sources(streams, *how):
-    """What `_random_source` draws from each of these seeds, as five tuples (S)."""
+    """Draws of `_random_source` for each of these seeds, as five tuples (S)."""
     drawn = [_random_source(np.random.default_rng(stream), *how) for stream in streams]
     return zip(*drawn, strict=True)
 

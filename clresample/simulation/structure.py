@@ -15,7 +15,7 @@ BULGE_INDEX, ARM_INDEX, CLUMP_INDEX = 0.8, -0.5, -1.2
 ARM_STEPS = 18  # Gaussians along one arm, half of their width apart at its outer end
 ARM_TURNS = 0.75  # turns of an arm from 0.6 to 2.2 half-light radii
 # [arcsec] half-light radius from which a galaxy shows bars and arms: smaller ones are blurred
-LEAST_ARMS_ARCSEC = 0.8
+MIN_ARMS_ARCSEC = 0.8
 CLUMP_SIZE = (0.02, 0.08)  # Gaussian sigma of clumps in half-light radii of their galaxy
 
 
@@ -80,7 +80,7 @@ def disk_parts(
     galsim = import_galsim()
     ratio, angle = rng.uniform(0.3, 1.0), _angle(rng)
     turned = _Disk(size, ratio, angle)
-    grand = size > LEAST_ARMS_ARCSEC and n_knots is None
+    grand = size > MIN_ARMS_ARCSEC and n_knots is None
     disk = galsim.Sersic(n, half_light_radius=size, trunc=BULGE_CUT * size if n > 1.5 else 0)
     left, parts = 1.0, []
     bulge = rng.uniform(0.0, 0.3)

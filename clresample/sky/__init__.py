@@ -1,4 +1,4 @@
-"""What is seen: pixel grids, PSFs, images with their noise, sources. NumPy, SciPy, astropy.
+"""Pixel grids, PSFs, images with their noise, sources. NumPy, SciPy, astropy.
 
 The ground floor, beside `device`: imports nothing of clresample's, and never pyopencl.
 """

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import binary_dilation, convolve, gaussian_filter
 
-from .given.checks import ReadOnly, numbers
 from .psf import PSF
+from .validation.checks import ReadOnly, as_float_array
 
 # Lags that are estimated from an image [px]: drizzle and Lanczos kernels end within 5 pixels.
 MAX_LAG_PX = 8
@@ -58,7 +58,7 @@ class NoiseCorrelation(ReadOnly):
     variance: float
 
     def __init__(self, autocorrelation):
-        rho = numbers("autocorrelation", autocorrelation)
+        rho = as_float_array("autocorrelation", autocorrelation)
         if rho.ndim != 2 or rho.shape[0] % 2 == 0 or rho.shape[1] % 2 == 0:
             raise ValueError(
                 f"autocorrelation has the shape {rho.shape}, it takes odd numbers of lags a side, "
@@ -145,7 +145,7 @@ class NoiseCorrelation(ReadOnly):
         root = np.fft.fftshift(np.fft.ifft2(np.sqrt(_power(self.autocorrelation))).real)
         return root[1:, 1:]  # of an even number of taps the middle one is n // 2
 
-    def reached(self, weights):
+    def valid_after_filter(self, weights):
         """Pixels (..., Ny, Nx) that w mixes with none that has no weight, nor with the outside."""
         good = np.asarray(weights) > 0
         shape = (1,) * (good.ndim - 2) + self.filter.shape
@@ -272,7 +272,7 @@ def filtered_psf(psf: PSF, filters) -> tuple[PSF, np.ndarray]:
     return PSF.restore(images, spacing=psf.spacing, center=psf.center + reach), sums
 
 
-def noise_of_channels(noise, data, weights, channels):
+def channel_correlations(noise, data, weights, channels):
     """Correlations (C,) of an observation's channels, or None where all is white; and messages.
 
     noise: None, "estimate", a NoiseCorrelation or its autocorrelation for all channels, or a

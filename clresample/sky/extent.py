@@ -1,4 +1,4 @@
-"""Which part of a grid other grids touch: unions, intersections, overlaps, boxes of pixels."""
+"""Unions, intersections and overlaps of grids, and boxes of pixels."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import numpy as np
 
 from .mapping import BLOCK, NOISE_PX, lattice
 
-# Pixels per axis that `overlap` looks at first. They find what holds 1/33 of a side of the part
-# that can be reached; more of them cost time in every call, fewer a whole search more often.
+# Pixels per axis that `grids_overlap` looks at first. They find what holds 1/33 of a side of the
+# part that can be reached; more of them cost time in every call, fewer a whole search more often.
 N_PROBES = 33
 
 
-def union(grids, *, like):
+def grid_union(grids, *, like):
     """Smallest grid on `like`'s pixels that holds every pixel of `grids`, whole or in part."""
     boxes = np.array([_box(grid, like) for grid in grids])
     return _on(like, boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0))
 
 
-def intersection(grids, *, like):
+def grid_intersection(grids, *, like):
     """Grid on `like`'s pixels where the bounding boxes of all `grids` meet.
 
     Raises ValueError where they do not.
@@ -44,8 +44,8 @@ def _box(grid, like):
     return low, np.maximum(np.ceil(edges.max(axis=(0, 1)) + 0.5 - NOISE_PX) - 1, low)
 
 
-def overlap(grid_out, grid_in) -> bool:
-    """Whether the centre of any pixel of `grid_out` lies on `grid_in`, a grid of its kind.
+def grids_overlap(grid_out, grid_in) -> bool:
+    """Returns True if the centre of any pixel of `grid_out` lies on `grid_in`, a grid of its kind.
 
     Some pixels are looked at first, spread over the part of `grid_out` that `grid_in` can reach;
     all of that part only where none of these lies on it.
@@ -71,23 +71,23 @@ def overlap(grid_out, grid_in) -> bool:
 
 
 def _any_on(grid_out, grid_in, rows, columns):
-    """Whether any of these pixels of grid_out has its centre on grid_in."""
+    """Returns True if any of these pixels of grid_out has its centre on grid_in."""
     at = grid_out.positions_in(grid_in, rows[:, None], columns[None])
     top = np.array(grid_in.shape) - 0.5 + NOISE_PX
     return bool(((at >= -0.5 - NOISE_PX) & (at <= top)).all(axis=-1).any())
 
 
-def boxes_meet(one, other, like) -> bool:
-    """Whether the bounding boxes of two grids meet on `like`'s pixels."""
+def bounding_boxes_overlap(one, other, like) -> bool:
+    """Returns True if the bounding boxes of two grids meet on `like`'s pixels."""
     try:
-        intersection([one, other], like=like)
+        grid_intersection([one, other], like=like)
     except ValueError:  # they do not, or `like`'s projection does not hold them
         return False
     return True
 
 
-def shared_part(origin_a, shape_a, origin_b, shape_b):
-    """Where two boxes of pixels meet: slices of the first array and slices of the second.
+def intersect_boxes(origin_a, shape_a, origin_b, shape_b):
+    """Common part of two boxes of pixels: slices of the first array and of the second.
 
     origin_a, origin_b (2,) [px]: first pixels (y, x), on one grid; shape_a, shape_b (2,) [px]
     Slices are empty where the boxes do not meet.
@@ -102,9 +102,11 @@ def box_slices(origin, shape):
     return tuple(slice(int(start), int(start + n)) for start, n in zip(origin, shape, strict=True))
 
 
-def lit_part(psf, share):
-    """A PSF without the outer rows and columns that hold no more than this share of any band's
-    light: by so much, at most, its transform changes. Not divided by its sum again."""
+def crop_psf(psf, share):
+    """Removes a PSF's outer rows and columns with no more than this share of any band's light.
+
+    Its transform changes by so much at most. Not divided by its sum again.
+    """
     light = np.abs(psf.images)
     light = light / np.maximum(light.sum(axis=(1, 2), keepdims=True), 1e-300)
     (y0, y1), (x0, x1) = (_lit(light.sum(axis).max(axis=0), share / 4) for axis in (2, 1))

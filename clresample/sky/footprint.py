@@ -1,4 +1,4 @@
-"""Where an observation's pixels lie in the model frame, and which part of the frame was seen."""
+"""Pixels of an observation in the model frame, and the part of the frame that they cover."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Footprint:
     @cached_property
     def used(self) -> np.ndarray:
         """Pixels (C, My, Mx) that a fit looks at: on the frame, with a weight in white noise."""
-        return (self.observation.white.weights > 0) & self.mapping.covered
+        return (self.observation.whitened.weights > 0) & self.mapping.covered
 
     @cached_property
     def positions(self) -> np.ndarray:
@@ -53,8 +53,8 @@ class Footprint:
                 pixels = near + (points - self.mapping.at(near[..., 0], near[..., 1])) @ inverse.T
         return pixels
 
-    def holds(self, points) -> np.ndarray:
-        """Which points (..., 2) [model px] lie on a pixel of the image, weighted or not: (...)."""
+    def contains(self, points) -> np.ndarray:
+        """Selects points (..., 2) [model px] on an image's pixel, weighted or not: (...)."""
         return self._look(points)[0]
 
     def weighted(self, points) -> np.ndarray:
@@ -63,7 +63,7 @@ class Footprint:
         return held & (self.observation.weights > 0)[:, n, m]
 
     def _look(self, points):
-        """Whether points lie on the image (...), and its nearest pixels (2, ...) to them."""
+        """Tests if points lie on the image (...); returns their nearest pixels (2, ...) too."""
         pixels = np.floor(np.nan_to_num(self.locate(points), nan=-1.0) + 0.5)
         top = np.array(self.mapping.shape_out) - 1
         (y, x), (last_y, last_x) = np.moveaxis(pixels, -1, 0), top
@@ -71,7 +71,7 @@ class Footprint:
         return held, np.stack([np.clip(y, 0, last_y), np.clip(x, 0, last_x)]).astype(int)
 
 
-def open_edge(footprints, shape) -> np.ndarray:
+def coverage_border(footprints, shape) -> np.ndarray:
     """Pixels of the frame from which light may leave what was observed: (Ny, Nx) bool.
 
     Those on the frame's edge, those of `unobserved`, and the neighbours of these.

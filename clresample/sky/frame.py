@@ -8,11 +8,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from .extent import boxes_meet, intersection, overlap, union
-from .given.observed import as_psf
+from .extent import bounding_boxes_overlap, grid_intersection, grid_union, grids_overlap
 from .grid import Grid, as_grid
 from .observation import as_observations, check_observations
 from .psf import PSF
+from .validation.observed import as_psf
 
 # [sigma] half-width of the model PSF's image: less than 1e-16 of the light lies beyond, float64's
 # rounding; larger images only cost time
@@ -43,7 +43,7 @@ class Frame:
         """(Ny, Nx) [px]."""
         return self.grid.shape
 
-    def place(self, sources, observations=(), shifts=None) -> np.ndarray:
+    def positions_of(self, sources, observations=(), shifts=None) -> np.ndarray:
         """Positions (S, 2) [px] of the sources: (y, x); NaN where the projection has no place.
 
         observations: those in whose pixels sources may be given; shifts (n_observations, 2)
@@ -52,8 +52,8 @@ class Frame:
         found = [source.pixel(self.grid, observations, shifts) for source in sources]
         return np.array(found).reshape(-1, 2)
 
-    def inside(self, positions) -> np.ndarray:
-        """Which positions (..., 2) [px] lie on a pixel of the frame: -1/2 <= x < N - 1/2.
+    def contains(self, positions) -> np.ndarray:
+        """Selects positions (..., 2) [px] on a pixel of the frame: -1/2 <= x < N - 1/2.
 
         The edge belongs to one pixel only, floor(x + 1/2). A fit leaves out a source that is not
         inside and reports it: the frame does not hold its centre, from which morphologies fall, and
@@ -94,16 +94,16 @@ def model_frame(observations, *, grid=None, psf_sigma_px=0.8, shared=False) -> F
         scales = np.array([o.grid.pixel_scale_arcsec for o in observations])
         like = observations[int(np.argmax(scales <= (1 + SAME_SCALE) * scales.min()))].grid
         _check_connected(observations, like)
-        extent = intersection if shared else union
+        extent = grid_intersection if shared else grid_union
         grid = extent([o.grid for o in observations], like=like)
     grid = as_grid("grid", grid)
     for observation in observations:
         if observation.grid.is_flat != grid.is_flat:
             raise ValueError(
-                f"grid is {grid.placing}, observation {observation.label!r} "
-                f"{observation.grid.placing}: give both a WCS (Grid.to_wcs)"
+                f"grid is {grid.sky_description}, observation {observation.label!r} "
+                f"{observation.grid.sky_description}: give both a WCS (Grid.to_wcs)"
             )
-        if not overlap(observation.grid, grid):
+        if not grids_overlap(observation.grid, grid):
             raise ValueError(
                 f"observation {observation.label!r} does not overlap the model frame: "
                 f"none of its {observation.grid.shape} pixels lies on the frame's "
@@ -128,7 +128,7 @@ def _check_connected(observations, like):
     """Every observation overlaps another, and no group of them stands apart: one patch of sky."""
     near, far = [observations[0]], list(observations[1:])
     while far:
-        met = [o for o in far if any(boxes_meet(o.grid, n.grid, like) for n in near)]
+        met = [o for o in far if any(bounding_boxes_overlap(o.grid, n.grid, like) for n in near)]
         if not met:
             raise ValueError(
                 f"observation {far[0].label!r} does not overlap "

@@ -11,29 +11,36 @@ import numpy as np
 from astropy.wcs import WCS
 from astropy.wcs.wcsapi import BaseHighLevelWCS, BaseLowLevelWCS
 
-from ..drawing.shown import ShownGrid
-from .given.checks import arcseconds, described, image_shape, instance, number, numbers
-from .interface.interface import Interface
+from ..drawing.display import GridDisplay
 from .mapping import Mapping, map_affine, map_positions
-from .wcs import (
-    convert,
-    frame_of,
-    pixel_scale,
-    pixels_at,
-    shifted_wcs,
-    tangent_wcs,
-    usable_wcs,
-    world_at,
+from .validation.checks import (
+    as_float_array,
+    check_image_shape,
+    check_instance,
+    check_number,
+    check_pixel_scale,
+    described,
 )
+from .wcs import (
+    celestial_frame,
+    celestial_wcs,
+    convert,
+    cutout_wcs,
+    pixel_scale,
+    pixel_to_world,
+    tangent_wcs,
+    world_to_pixel,
+)
+from .wcs_interface.ape14 import Ape14Wcs
 
 
-class Grid(ShownGrid, ABC):
+class Grid(GridDisplay, ABC):
     """Pixels of one image and where they lie on the sky.
 
     shape (Ny, Nx) [px]
     is_flat: whether the sky is a plane, with positions (y, x) [arcsec]; else they are longitude and
         latitude [deg] of a celestial WCS
-    placing: the same in words, for messages
+    sky_description: the same in words, for messages
 
     Make one with `Grid.from_wcs`, `Grid.flat` or `Grid.from_jacobian`. Positions in pixels are
     (n, m) = (row, column) or (y, x), whole at the centre of a pixel.
@@ -41,7 +48,7 @@ class Grid(ShownGrid, ABC):
 
     shape: tuple[int, int]
     is_flat: bool
-    placing: str
+    sky_description: str
 
     @staticmethod
     def from_wcs(wcs, shape) -> Grid:
@@ -53,8 +60,8 @@ class Grid(ShownGrid, ABC):
 
         Raises ValueError without a celestial part, or where it cannot be evaluated.
         """
-        shape = image_shape(shape[-2:])
-        return WcsGrid(shape, usable_wcs(wcs, shape))
+        shape = check_image_shape(shape[-2:])
+        return WcsGrid(shape, celestial_wcs(wcs, shape))
 
     @staticmethod
     def flat(shape, scale_arcsec, *, angle_deg=0, flip=False, center_arcsec=(0, 0)) -> Grid:
@@ -68,13 +75,13 @@ class Grid(ShownGrid, ABC):
 
         Raises ValueError for a scale that is not positive.
         """
-        shape = image_shape(shape)
-        scale = arcseconds("scale_arcsec", scale_arcsec)
+        shape = check_image_shape(shape)
+        scale = check_pixel_scale("scale_arcsec", scale_arcsec)
         if not (np.isfinite(scale) & (scale > 0)).all():
             raise ValueError(f"scale_arcsec must be positive, not {scale_arcsec}")
-        cos, sin = _cos_sin(number("angle_deg", angle_deg))
+        cos, sin = _cos_sin(check_number("angle_deg", angle_deg))
         jacobian = np.array([[cos, sin], [-sin, cos]]) * scale * (1, -1 if flip else 1)
-        center = arcseconds("center_arcsec", center_arcsec)
+        center = check_pixel_scale("center_arcsec", center_arcsec)
         return FlatGrid(shape, jacobian, center - jacobian @ ((np.array(shape) - 1) / 2))
 
     @staticmethod
@@ -87,11 +94,11 @@ class Grid(ShownGrid, ABC):
 
         Raises ValueError for other shapes, and numbers that are not finite.
         """
-        jacobian, origin = numbers("jacobian", jacobian), numbers("origin", origin)
+        jacobian, origin = as_float_array("jacobian", jacobian), as_float_array("origin", origin)
         for name, array, expected in (("jacobian", jacobian, (2, 2)), ("origin", origin, (2,))):
             if array.shape != expected or not np.isfinite(array).all():
                 raise ValueError(f"{name} is {array.tolist()}, must be {expected} finite numbers")
-        return FlatGrid(image_shape(shape), jacobian.copy(), origin.copy())
+        return FlatGrid(check_image_shape(shape), jacobian.copy(), origin.copy())
 
     @property
     @abstractmethod
@@ -158,14 +165,16 @@ class Grid(ShownGrid, ABC):
         """
         grid_in = as_grid("grid_in", grid_in)
         self.check_like(grid_in, "grid_in")
-        tolerance = number("tolerance_px", tolerance_px, "0 or more", lambda x: 0 <= x < math.inf)
+        tolerance = check_number(
+            "tolerance_px", tolerance_px, "0 or more", lambda x: 0 <= x < math.inf
+        )
         return self._map_to(grid_in, tolerance)
 
     def check_like(self, other: Grid, name):
         """Raise ValueError, calling the other grid `name`, where one is flat and one is not."""
         if self.is_flat != other.is_flat:
             raise ValueError(
-                f"{name} is {other.placing} and this grid {self.placing}: "
+                f"{name} is {other.sky_description} and this grid {self.sky_description}: "
                 "give both a WCS (Grid.to_wcs)"
             )
 
@@ -182,7 +191,7 @@ class FlatGrid(Grid):
     shape: tuple[int, int]
     jacobian: np.ndarray
     origin: np.ndarray
-    is_flat, placing = True, "flat"
+    is_flat, sky_description = True, "flat"
 
     @property
     def pixel_scale_arcsec(self):
@@ -212,7 +221,9 @@ class FlatGrid(Grid):
 
     def cutout(self, y0, x0, shape):
         """The same Jacobian, the origin at pixel (y0, x0)."""
-        return FlatGrid(image_shape(shape), self.jacobian, self.origin + self.jacobian @ (y0, x0))
+        return FlatGrid(
+            check_image_shape(shape), self.jacobian, self.origin + self.jacobian @ (y0, x0)
+        )
 
     def to_wcs(self, *, ra_deg=0.0, dec_deg=0.0):
         """A gnomonic WCS (ICRS) that touches the flat sky at (y, x) = (0, 0)."""
@@ -237,12 +248,12 @@ class WcsGrid(Grid):
     """Pixels placed by a celestial WCS.
 
     shape (Ny, Nx) [px]
-    wcs: astropy WCS of the two celestial axes, or Interface
+    wcs: astropy WCS of the two celestial axes, or Ape14Wcs
     """
 
     shape: tuple[int, int]
-    wcs: WCS | Interface
-    is_flat, placing = False, "placed by a WCS"
+    wcs: WCS | Ape14Wcs
+    is_flat, sky_description = False, "placed by a WCS"
 
     @property
     def pixel_scale_arcsec(self):
@@ -251,33 +262,33 @@ class WcsGrid(Grid):
 
     def sky(self, n, m):
         """Longitude and latitude (2, ...) [deg] at pixels (n, m)."""
-        return world_at(self.wcs, *_float_arrays(n, m))
+        return pixel_to_world(self.wcs, *_float_arrays(n, m))
 
     def pixel(self, a, b=None):
         """Pixels (..., 2) at longitudes a and latitudes b [deg], or at a SkyCoord a."""
         if b is None:
-            sky = a.transform_to(frame_of(self.wcs)).spherical
+            sky = a.transform_to(celestial_frame(self.wcs)).spherical
             a, b = sky.lon.deg, sky.lat.deg
         a, b = _float_arrays(a, b)
-        return pixels_at(self.wcs, a.ravel(), b.ravel()).reshape(a.shape + (2,))
+        return world_to_pixel(self.wcs, a.ravel(), b.ravel()).reshape(a.shape + (2,))
 
     def positions_in(self, other, n, m):
         """Both WCS evaluated point by point (..., 2), their celestial frames converted."""
-        world = world_at(self.wcs, *np.broadcast_arrays(n, m))
+        world = pixel_to_world(self.wcs, *np.broadcast_arrays(n, m))
         good = np.isfinite(world).all(axis=0)
         result = np.full(good.shape + (2,), np.nan)
         if good.any():
             lon, lat = convert(self.wcs, other.wcs, *world[:, good])
-            result[good] = pixels_at(other.wcs, lon, lat)
+            result[good] = world_to_pixel(other.wcs, lon, lat)
         return result
 
     def cutout(self, y0, x0, shape):
         """The same WCS with its reference pixel, and those of its distortions, moved."""
-        return WcsGrid(image_shape(shape), shifted_wcs(self.wcs, y0, x0))
+        return WcsGrid(check_image_shape(shape), cutout_wcs(self.wcs, y0, x0))
 
     def to_wcs(self, *, ra_deg=0.0, dec_deg=0.0):
-        """A copy of the WCS, of an Interface its FITS approximation."""
-        if isinstance(self.wcs, Interface):
+        """A copy of the WCS, of an Ape14Wcs its FITS approximation."""
+        if isinstance(self.wcs, Ape14Wcs):
             return self.wcs.to_fits(self.shape)
         return self.wcs.deepcopy()
 
@@ -313,7 +324,7 @@ def as_grid(name, grid, shape=None) -> Grid:
     Raises ValueError for anything else, and for a WCS without a shape.
     """
     if not isinstance(grid, BaseLowLevelWCS | BaseHighLevelWCS):
-        return instance(name, grid, Grid)
+        return check_instance(name, grid, Grid)
     if shape is None:
         low = grid.low_level_wcs if isinstance(grid, BaseHighLevelWCS) else grid
         shape = low.array_shape

@@ -108,7 +108,7 @@ class Mapping:
 
 
 @dataclass(frozen=True, eq=False)
-class Around(Mapping):
+class PaddedMapping(Mapping):
     """Observed pixels within `reach_px` [model px] of a model: those beyond it are covered too.
 
     part: first row and column of the pixels that may be, and those behind the last; None: all
@@ -118,14 +118,14 @@ class Around(Mapping):
     part: tuple[int, int, int, int] | None = None
 
     @classmethod
-    def box_of(cls, mapping, shape, reach_px, size=None):
+    def for_box(cls, mapping, shape, reach_px, size=None):
         """The pixels about a box of this shape (2,) [px], its middle in theirs; not distorted.
 
         Half a pixel more of them on each side, for boxes that lie by so much off that middle.
 
         size (2,): of pixels, where there are to be more than that; the others are not covered
         """
-        own = cls.size_about(mapping, shape, reach_px)
+        own = cls.window_size(mapping, shape, reach_px)
         size = own if size is None else np.array(size)
         before = (size - own) // 2
         offset = (np.array(shape) - 1) / 2 - mapping.matrix @ (before + (own - 1) / 2)
@@ -141,8 +141,8 @@ class Around(Mapping):
         )
 
     @staticmethod
-    def size_about(mapping, shape, reach_px):
-        """How many pixels (2,) `box_of` takes."""
+    def window_size(mapping, shape, reach_px):
+        """Number of pixels (2,) that `for_box` needs."""
         inverse = np.abs(np.linalg.inv(mapping.matrix))
         return np.ceil(inverse @ (np.array(shape) + 2 * reach_px)).astype(int) + 1
 
@@ -238,7 +238,7 @@ def _met(corners, shape_out):
 
 
 def _spans(points):
-    """Whether an affine mapping can be fitted to these points (L, 2)."""
+    """Returns True if an affine mapping can be fitted to these points (L, 2)."""
     return len(points) > 2 and np.linalg.matrix_rank(points - points[0]) == 2
 
 

@@ -8,7 +8,7 @@ from statistics import NormalDist
 
 import numpy as np
 
-from .given.checks import mask_of, numbers, split_mask, without_unit
+from .validation.checks import as_float_array, mask_of, split_mask, to_unit
 
 
 class NoiseWarning(UserWarning):
@@ -25,7 +25,7 @@ MIN_PIXELS = 32
 LARGEST = 1e100
 # [sigma] Largest signal to noise of a pixel: in float32, whose rounding is 1e5 sigma there, chi2
 # comes to its end soon after. Real images reach 1e4.
-MOST_SIGMAS = 1e12
+MAX_SIGMAS = 1e12
 # Pixels of each value from which on, on average, an image is taken to be one in steps: noise of
 # sigma in 1000 pixels of integers has some 7 sigma values, float images as many as pixels.
 EQUAL = 4
@@ -68,8 +68,10 @@ def background(image, mask=None) -> tuple[float, float]:
 
 
 def _spread_steps(values):
-    """Values (n,) with equal ones spread evenly over the step between neighbouring ones, and the
-    step; as they are, and 0, where few are equal, or more than half."""
+    """Spreads equal values (n,) evenly over the step between neighbouring ones; and the step.
+
+    As they are, and 0, where few are equal, or more than half.
+    """
     some = values[:: max(1, values.size // SOME)]
     if 2 * np.unique(some).size > some.size:
         return values, 0.0
@@ -125,7 +127,7 @@ def _usable(image, mask):
 
 
 def weights_from(data, bad, given, mask, channels, unit=None):
-    """Weights (C, Ny, Nx), `n_bad` and messages of an Observation, from what its user gave.
+    """Weights (C, Ny, Nx), `n_invalid` and messages of an Observation, from what its user gave.
 
     data (C, Ny, Nx) float64; bad (C, Ny, Nx) bool: pixels where they are NaN or infinite
     given: weights and variance, and mask: as in Observation, None where they are not given
@@ -161,7 +163,7 @@ def weights_from(data, bad, given, mask, channels, unit=None):
 
 
 def _has_gaps(name, values, data):
-    """Whether values are a list with one for each channel and None among them."""
+    """Returns True if values are a list with one for each channel and None among them."""
     if not isinstance(values, list | tuple) or not any(one is None for one in values):
         return False
     if len(values) != len(data):
@@ -174,8 +176,8 @@ def _weights_of(data, bad, given, mask, channels, unit, estimates):
     weights, variance = given
     masked, messages = mask, []
     if unit is not None:
-        weights = without_unit("weights", weights, unit**-2)
-        variance = without_unit("variance", variance, unit**2)
+        weights = to_unit("weights", weights, unit**-2)
+        variance = to_unit("variance", variance, unit**2)
     weights, hidden = split_mask("weights", weights)
     variance, unknown = split_mask("variance", variance)
     for name, more in (("weights", hidden), ("variance", unknown)):
@@ -213,7 +215,7 @@ def _check_range(data, weights):
     for name, values, most in (
         ("data", light, LARGEST),
         ("weights", weights, LARGEST),
-        ("data in units of their noise", np.minimum(light, LARGEST) * root, MOST_SIGMAS),
+        ("data in units of their noise", np.minimum(light, LARGEST) * root, MAX_SIGMAS),
         ("variances", inverse, LARGEST),
     ):
         i = np.unravel_index(np.argmax(values), values.shape)
@@ -253,7 +255,7 @@ def mask_from(mask, shape):
 
 def _checked_weights(weights, shape):
     """Weights (C, Ny, Nx), and where they were NaN."""
-    weights = _spread("weights", numbers("weights", weights), shape)
+    weights = _spread("weights", as_float_array("weights", weights), shape)
     for wrong, what in ((weights < 0, "negative"), (np.isinf(weights), "infinite")):
         if wrong.any():
             raise ValueError(
@@ -267,7 +269,7 @@ def _checked_weights(weights, shape):
 
 def _inverse(variance, shape):
     """Weights (C, Ny, Nx) from variances, and where these were no variance."""
-    variance = _spread("variance", numbers("variance", variance), shape)
+    variance = _spread("variance", as_float_array("variance", variance), shape)
     good = variance >= np.finfo(np.float64).tiny  # the inverse of less may overflow
     return np.divide(1.0, variance, out=np.zeros(shape), where=good), ~good
 

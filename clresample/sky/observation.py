@@ -1,4 +1,4 @@
-"""What one instrument saw of a patch of sky: pixels, weights, PSF and where it all lies."""
+"""An instrument's image of a patch of sky: pixels, weights, PSF and grid."""
 
 from __future__ import annotations
 
@@ -8,21 +8,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..drawing.shown import ShownObservation
-from .correlation import NoiseCorrelation, noise_of_channels
-from .given.checks import ReadOnly, described
-from .given.containers import arguments_of, is_container
-from .given.derived import ZERO_POINT_UJY as ZERO_POINT_UJY, DerivedQuantities
-from .given.observed import bands_of, channels_of, images_of, per_channel, psfs_of, saturation_of
-from .given.units import flux_unit, take_unit, zero_points_of
+from ..drawing.display import ObservationDisplay
+from .correlation import NoiseCorrelation, channel_correlations
 from .grid import Grid
 from .noise import weights_from
 from .psf import PSF
-from .varying.field import PSFField
+from .validation.checks import ReadOnly, described
+from .validation.containers import arguments_of, is_container
+from .validation.derived import ZERO_POINT_UJY as ZERO_POINT_UJY, DerivedQuantities
+from .validation.observed import (
+    bands_of,
+    channels_of,
+    images_of,
+    per_channel,
+    psfs_of,
+    saturation_of,
+)
+from .validation.units import flux_unit, take_unit, zero_points_of
+from .varying_psf.field import PSFField
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
-class Observation(ReadOnly, ShownObservation, DerivedQuantities):
+class Observation(ReadOnly, ObservationDisplay, DerivedQuantities):
     """Images of one instrument, one per channel, on one pixel grid.
 
         chi2 = sum weights (model - data)^2
@@ -58,7 +65,7 @@ class Observation(ReadOnly, ShownObservation, DerivedQuantities):
     (NoiseWarning) of it.
 
     Read back: data and weights (C, Ny, Nx) float64, psf of C bands, that in the middle, psf_field
-    of C bands where it varies, else None, zero_points and noise (C,) or None, n_bad = number of
+    of C bands where it varies, else None, zero_points and noise (C,) or None, n_invalid = number of
     unmasked pixels whose weight became 0 because data, weight or variance is none, messages;
     saturation (C,) or None, unit of flux density or None, of counts
 
@@ -79,7 +86,7 @@ class Observation(ReadOnly, ShownObservation, DerivedQuantities):
     name: str | None
     saturation: np.ndarray | None
     unit: object
-    n_bad: int
+    n_invalid: int
     messages: tuple[str, ...]
 
     def __init__(
@@ -110,10 +117,10 @@ class Observation(ReadOnly, ShownObservation, DerivedQuantities):
         bad = ~np.isfinite(data)
         channels = channels_of(channels, name, len(data))
         given = weights, variance
-        weights, n_bad, messages = weights_from(data, bad, given, mask, channels, unit)
+        weights, n_invalid, messages = weights_from(data, bad, given, mask, channels, unit)
         zero_points = per_channel("zero_points", zero_points, len(data))
         data = np.where(bad, 0.0, data)
-        noise, found = noise_of_channels(noise, data, weights, channels)
+        noise, found = channel_correlations(noise, data, weights, channels)
         messages += found
         self._set(
             data=data,
@@ -127,7 +134,7 @@ class Observation(ReadOnly, ShownObservation, DerivedQuantities):
             name=name,
             saturation=saturation_of(saturation, len(data), unit),
             unit=flux,
-            n_bad=n_bad,
+            n_invalid=n_invalid,
             messages=tuple(messages),
         )
 
@@ -153,11 +160,14 @@ class Observation(ReadOnly, ShownObservation, DerivedQuantities):
         return cls(**arguments_of(image, psf, given))
 
     @classmethod
-    def restore(cls, data, psf, grid, *, weights, n_bad, messages, **given) -> Observation:
-        """An observation as it was made once, from what is read back; n_bad and messages are those
-        that were found then. Raises ValueError as the constructor does."""
+    def restore(cls, data, psf, grid, *, weights, n_invalid, messages, **given) -> Observation:
+        """An observation as it was made once, from what is read back.
+
+        n_invalid and messages are those that were found then. Raises ValueError as the constructor
+        does.
+        """
         restored = cls(data, psf, grid, weights=weights, **given)
-        restored._set(n_bad=int(n_bad), messages=tuple(messages))
+        restored._set(n_invalid=int(n_invalid), messages=tuple(messages))
         return restored
 
     @property
@@ -167,14 +177,14 @@ class Observation(ReadOnly, ShownObservation, DerivedQuantities):
 
     @property
     def label(self) -> str:
-        """What messages call this observation: its name, or else its channels."""
+        """Name of this observation in messages: its name, or else its channels."""
         return self.name or f"with channels {', '.join(self.channels)}"
 
 
 def masked(observation, pixels) -> Observation:
     """The same observation with the pixels (C, Ny, Nx) bool masked: their weight is 0."""
     made = copy.copy(observation)
-    made.__dict__.pop("white", None)  # that of the observation before
+    made.__dict__.pop("whitened", None)  # that of the observation before
     made._set(weights=np.where(pixels, 0.0, observation.weights))
     return made
 
@@ -182,7 +192,7 @@ def masked(observation, pixels) -> Observation:
 def with_psf_field(observation, psf_field) -> Observation:
     """The same observation with the PSFs of a PSFField; its PSF in the middle stays."""
     made = copy.copy(observation)
-    made.__dict__.pop("white", None)
+    made.__dict__.pop("whitened", None)
     made._set(psf_field=psf_field)
     return made
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..drawing.shown import ShownPSF
-from .given.checks import ReadOnly, number, numbers
-from .psf_checks import PSFWarning, core_of, edge_light, fwhm, psf_warnings
-from .transforms.nufft import transform_at
-from .waves import even_waves
+from ..drawing.display import PSFDisplay
+from .fourier import uniform_waves
+from .psf_checks import PSFWarning, core_centroid, fwhm, light_beyond_edge, psf_warnings
+from .transforms.nufft import nufft_type2
+from .validation.checks import ReadOnly, as_float_array, check_number
 
 # relative slack on the band's edge, above the rounding of A^T nu in float64
 BAND_SLACK = 1e-12
@@ -31,7 +31,7 @@ LARGE = 256 * 256
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
-class PSF(ReadOnly, ShownPSF):
+class PSF(ReadOnly, PSFDisplay):
     """PSF images of one instrument, each band divided by its own sum.
 
     images (C, ny, nx) [1]: samples, pixel response included; a single (ny, nx) image is one band
@@ -48,12 +48,14 @@ class PSF(ReadOnly, ShownPSF):
     center: np.ndarray
 
     def __init__(self, images, *, spacing=1.0, center=None):
-        images = np.array(numbers("images", images))
+        images = np.array(as_float_array("images", images))
         if images.ndim == 2:
             images = images[None]
         if images.ndim != 3 or 0 in images.shape:
             raise ValueError(f"images must be (C, ny, nx) or (ny, nx), not {images.shape}")
-        spacing = number("spacing", spacing, SPACINGS, lambda x: 1 / COARSEST <= x <= COARSEST)
+        spacing = check_number(
+            "spacing", spacing, SPACINGS, lambda x: 1 / COARSEST <= x <= COARSEST
+        )
         for i_band, image in enumerate(images):
             n_bad = np.count_nonzero(~np.isfinite(image))
             if n_bad:
@@ -86,7 +88,7 @@ class PSF(ReadOnly, ShownPSF):
 
         Raises ValueError for a sigma that is not positive.
         """
-        sigmas = np.atleast_1d(numbers("sigma_px", sigma_px))
+        sigmas = np.atleast_1d(as_float_array("sigma_px", sigma_px))
         if sigmas.ndim != 1 or not (np.isfinite(sigmas) & (sigmas > 0)).all():
             raise ValueError(f"sigma_px must be positive numbers, not {sigma_px}")
         if sigmas.size == 1:
@@ -172,14 +174,14 @@ class PSF(ReadOnly, ShownPSF):
 
         returns (C, 2) [samples]: (y, x) array coordinates
         """
-        return np.stack([core_of(image) for image in self.images])
+        return np.stack([core_centroid(image) for image in self.images])
 
     def edge_light(self) -> np.ndarray:
         """Light beyond the edge (C,), as a fraction of the light inside; see `psf_checks`."""
-        return edge_light(self.images)
+        return light_beyond_edge(self.images)
 
     def warnings(self, core='center="core"') -> list[str]:
-        """What a user should know of this PSF, a sentence each; see `psf_checks.psf_warnings`."""
+        """Warnings about this PSF, a sentence each; see `psf_checks.psf_warnings`."""
         return psf_warnings(self.images, self.center, core)
 
 
@@ -189,10 +191,10 @@ def _center(images, center):
     if isinstance(center, str):
         if center != "core":
             raise ValueError(f'center must be "core", (2,) or (C, 2) numbers, not "{center}"')
-        return np.stack([core_of(image) for image in images])
+        return np.stack([core_centroid(image) for image in images])
     if center is None:
         center = ((n_y - 1) / 2, (n_x - 1) / 2)
-    center = numbers("center", center)
+    center = as_float_array("center", center)
     if center.shape not in ((2,), (n_bands, 2)) or not np.isfinite(center).all():
         raise ValueError(f"center must be (2,) or ({n_bands}, 2) finite numbers, not {center}")
     if (np.abs(center - [n_y / 2, n_x / 2]) > FAR).any():
@@ -219,7 +221,7 @@ def _pixel_gaussian(n, spacing, sigma):
 
 def _waves(frequencies, first, step, n):
     """exp(-2 pi i f u) as (F, n), at u = first + step k."""
-    return np.conj(even_waves(frequencies, first, step, n).T, order="C")
+    return np.conj(uniform_waves(frequencies, first, step, n).T, order="C")
 
 
 def _transform(psf, bands, center, nu_y, nu_x, matrix):
@@ -243,7 +245,7 @@ def _transform(psf, bands, center, nu_y, nu_x, matrix):
     if images[0].size > LARGE:
         f_y, f_x = (p * nu_y[:, None] + q * nu_x for p, q in ((a, c), (b, d)))
         turns = f_y * y0 + f_x * x0
-        return transform_at(images, f_y, f_x) * np.exp(2j * np.pi * (turns - np.rint(turns)))
+        return nufft_type2(images, f_y, f_x) * np.exp(2j * np.pi * (turns - np.rint(turns)))
     # the images are real: where nu_x has both signs, one of them follows from sums of the other
     n_half = nu_x.size // 2 if nu_x.size % 2 and np.array_equal(nu_x, -nu_x[::-1]) else 0
     nu_half = nu_x[n_half:]

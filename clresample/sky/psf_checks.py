@@ -1,4 +1,4 @@
-"""What is measured of PSF images: width, core, light beyond the edge; and the warning about it."""
+"""Measures PSF images: width, core, light beyond the edge; and warns of them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 
 # [samples] half of what confusing the centre n/2 with (n-1)/2 gives, well above centroid errors
 CORE_TOLERANCE = 0.25
-# share of the light beyond the image's edge from which on a PSF is warned about; by `edge_light`,
-# good HST and HSC images have 2 to 5 %
+# share of the light beyond the image's edge from which on a PSF is warned about; by
+# `light_beyond_edge`, good HST and HSC images have 2 to 5 %
 EDGE_TOLERANCE = 0.05
 # The same share from which on the command refuses an image: an evenly bright one has 1.6.
 EDGE_REFUSED = 0.5
@@ -34,7 +34,7 @@ def fwhm(image):
     return 2 * math.sqrt(_n_above_half(image) / math.pi)
 
 
-def core_of(image):
+def core_centroid(image):
     """Centroid of the core of an image (ny, nx), Gaussian-weighted: (2,) [samples], (y, x).
 
     The fixed point c of sum_s w(s - c) P[s] (s - c) = 0, w a Gaussian as wide as the core, from the
@@ -60,7 +60,7 @@ def core_of(image):
 
 def check_edge(images):
     """Raise ValueError for images (C, ny, nx) of unit sum that are too small for their light."""
-    light = float(edge_light(images).max())
+    light = float(light_beyond_edge(images).max())
     if light > EDGE_REFUSED:
         raise ValueError(
             f"too wide for its {images.shape[1]} x {images.shape[2]} image, or no PSF: by the "
@@ -73,7 +73,7 @@ def _n_above_half(image):
     return np.count_nonzero(image > 0.5 * image.max())
 
 
-def edge_light(images):
+def light_beyond_edge(images):
     """Light beyond the edge, as a fraction of the light inside, for a wing falling as r^-3.
 
         L = 2 pi R^2 I(R),   I: mean of the outermost ring, R = (sqrt(ny nx) - 1)/2 its radius
@@ -89,8 +89,9 @@ def edge_light(images):
 
 
 def limit_power(images):
-    """What is left of the transform of PSF images (C, ny, nx) of unit sum at the limit of their
-    samples, half a cycle a sample along y or x, whichever is more: (C,) [1].
+    """Transform of PSF images (C, ny, nx) of unit sum at the limit of their samples: (C,) [1].
+
+    The limit is half a cycle a sample along y or x, whichever is more.
 
     The samples' own transform has twice as much there, from either side of the limit.
     """
@@ -100,16 +101,16 @@ def limit_power(images):
 
 
 def psf_warnings(images, center, core='center="core"') -> list[str]:
-    """What a user should know of PSF images: a sentence each, with figures.
+    """Warnings about PSF images: a sentence each, with figures.
 
     A core more than 0.25 samples off the centre along an axis, and more than 5 % of the light
-    (either sign) beyond the edge, by `edge_light`; samples too coarse, by `limit_power`.
+    (either sign) beyond the edge, by `light_beyond_edge`; samples too coarse, by `limit_power`.
 
     images (C, ny, nx): of unit sum; center (C, 2) [samples]: (y, x), where they are said to be
     core: how the reader of the message makes the core the centre
     """
     messages = []
-    cores = np.stack([core_of(image) for image in images])
+    cores = np.stack([core_centroid(image) for image in images])
     off = cores - center
     far = np.abs(off).max(axis=1)
     if far.max() > CORE_TOLERANCE:
@@ -120,7 +121,7 @@ def psf_warnings(images, center, core='center="core"') -> list[str]:
             f"{off[i, 1]:+.2f}) samples from ({center[i, 0]:g}, {center[i, 1]:g}), "
             f"and shifts the result by as much; {core} takes the core"
         )
-    light = edge_light(images)
+    light = light_beyond_edge(images)
     cut = np.abs(light) > EDGE_TOLERANCE
     if cut.any():
         i = int(np.abs(light).argmax())

@@ -1,4 +1,4 @@
-"""What a scene is made of: point sources and extended sources at given positions."""
+"""Sources of a scene: point sources and extended sources at given positions."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from astropy.coordinates import ICRS, BaseCoordinateFrame, SkyCoord
 
-from .given.checks import numbers, whole
 from .observation import observation_index
+from .validation.checks import as_float_array, check_integer
 
 
 class SourceWarning(UserWarning):
@@ -54,7 +54,7 @@ class Source:
         if self.sky_frame not in (None, ICRS.name):
             raise ValueError(f"sky_frame is {self.sky_frame!r:.80}, must be {ICRS.name!r} or None")
         given = getattr(self, name)
-        position = numbers(name, given, "deg" if name == "sky_deg" else "pix")
+        position = as_float_array(name, given, "deg" if name == "sky_deg" else "pix")
         plain = isinstance(given, list | tuple) and not any(hasattr(v, "unit") for v in given)
         if not plain and position.shape == (2,):
             object.__setattr__(self, name, tuple(map(float, position)))
@@ -117,23 +117,23 @@ def _icrs(coordinate):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Point(Source):
+class PointSource(Source):
     """A star: the model's PSF at the position, one spectrum. For the position see `Source`.
 
-    free: let the position move by a sub-pixel shift in the fit
+    free_position: let the position move by a sub-pixel shift in the fit
     """
 
-    free: bool = False
+    free_position: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
-class Extended(Source):
+class ExtendedSource(Source):
     """A galaxy: `n_components` morphologies about one centre, each with a spectrum of its own.
 
     For the position see `Source`.
 
     n_components: None = one, or two where the data show clearly that the galaxy's core has another
-        colour than the rest; this takes a fit with a LearnedPrior, others have one
+        colour than the rest; this takes a fit with a MultiscalePrior, others have one
     profile (Ny, Nx) [1]: what its one morphology is expected to look like under the model's PSF, on
         the frame's pixels, non-negative; None = a smooth profile fitted to the data
     """
@@ -144,14 +144,14 @@ class Extended(Source):
     def __post_init__(self):
         super().__post_init__()
         n_components = 1 if self.n_components is None else self.n_components
-        whole("n_components", n_components, 1)
+        check_integer("n_components", n_components, 1)
         if self.profile is None:
             return
         if n_components > 1:
             raise ValueError(
                 f"profile is given for n_components = {self.n_components}: it serves one component"
             )
-        profile = numbers("profile", self.profile)
+        profile = as_float_array("profile", self.profile)
         if profile.ndim != 2 or not (np.isfinite(profile) & (profile >= 0)).all():
             raise ValueError(
                 f"profile with shape {profile.shape} must be (Ny, Nx), finite and not negative"

@@ -1,4 +1,4 @@
-"""What grids need of a WCS, astropy's own or an Interface, beyond its own methods.
+"""Functions of a WCS, astropy's own or an Ape14Wcs, that grids need.
 
 Longitudes come before latitudes here, whatever the order of a header's axes, and the inverse gives
 NaN where astropy's raises.
@@ -14,8 +14,8 @@ from astropy.wcs import WCS, DistortionLookupTable, NoConvergence, Sip
 from astropy.wcs.utils import wcs_to_celestial_frame
 from astropy.wcs.wcsapi import BaseHighLevelWCS, BaseLowLevelWCS
 
-from .given.checks import instance
-from .interface.interface import Interface
+from .validation.checks import check_instance
+from .wcs_interface.ape14 import Ape14Wcs
 
 # [px] the iterated inverse of SIP and look-up tables stops here, well under NOISE_PX
 INVERSE_PX = 1e-8
@@ -25,22 +25,22 @@ BACK_PX = 1e-4
 ARCSEC = math.radians(1 / 3600)  # [rad]
 
 
-def usable_wcs(wcs, shape):
-    """A copy of a WCS with its celestial axes only, an Interface unless it is astropy's own.
+def celestial_wcs(wcs, shape):
+    """A copy of a WCS with its celestial axes only, an Ape14Wcs unless it is astropy's own.
 
     wcs: as `Grid.from_wcs` takes it; shape (Ny, Nx) [px]: of the image
 
     Raises ValueError without celestial axes, or where it cannot be evaluated.
     """
     if not isinstance(wcs, WCS):
-        wcs = Interface.of(instance("wcs", wcs, (WCS, BaseLowLevelWCS, BaseHighLevelWCS)))
+        wcs = Ape14Wcs.of(check_instance("wcs", wcs, (WCS, BaseLowLevelWCS, BaseHighLevelWCS)))
     elif not wcs.has_celestial:
         axes = ", ".join(axis or "?" for axis in wcs.wcs.ctype)
         raise ValueError(f"wcs has no celestial axes (CTYPE: {axes})")
     try:
         if isinstance(wcs, WCS):
             wcs = wcs.celestial if wcs.naxis > 2 else wcs.deepcopy()
-        frame_of(wcs)
+        celestial_frame(wcs)
         problem = pixel_problem(wcs, shape) or _lost_digits(wcs, shape)
     except Exception as error:  # wcslib raises a dozen kinds, RuntimeError among them
         raise ValueError(f"wcs cannot be used: {' '.join(str(error).split())}") from error
@@ -49,9 +49,9 @@ def usable_wcs(wcs, shape):
     return wcs
 
 
-def world_at(wcs, n, m):
+def pixel_to_world(wcs, n, m):
     """Longitude and latitude (2, ...) [deg] of the pixels n, m (...); NaN where there is none."""
-    if isinstance(wcs, Interface):
+    if isinstance(wcs, Ape14Wcs):
         return wcs.world_at(n, m)
     world = np.array(wcs.all_pix2world(np.ravel(m), np.ravel(n), 0))
     return world[[wcs.wcs.lng, wcs.wcs.lat]].reshape((2,) + np.shape(n))
@@ -59,7 +59,7 @@ def world_at(wcs, n, m):
 
 # Length of a pixel over its width, at most: those of slit spectrographs have 10, beyond lie
 # mistakes in headers.
-MOST_ELONGATED = 100.0
+MAX_ELONGATED = 100.0
 
 
 def pixel_scale(wcs, n, m):
@@ -69,25 +69,27 @@ def pixel_scale(wcs, n, m):
 
 
 def pixel_problem(wcs, shape):
-    """What is wrong with the pixel in the middle of an image (Ny, Nx); None where nothing is."""
+    """Fault of the pixel in the middle of an image (Ny, Nx); None where there is none."""
     y, x = _pixel_sides(wcs, *(np.array(shape) - 1) / 2)
     scale = math.sqrt(np.linalg.norm(np.cross(y, x))) / ARCSEC
     if not scale > 0:
         return f"has the size {scale} arcsec"
     long, wide = np.linalg.svd(np.stack([y, x]), compute_uv=False)
-    if not long <= MOST_ELONGATED * wide:
+    if not long <= MAX_ELONGATED * wide:
         return f"is {long / max(wide, np.finfo(float).tiny):.3g} times as long as wide"
     return None
 
 
 def _lost_digits(wcs, shape):
-    """What is wrong where the pixel in the middle of an image (Ny, Nx) does not come back from the
-    sky; None where nothing is, or nothing comes back. Of other packages' WCS nothing is asked."""
-    if isinstance(wcs, Interface):
+    """Fault where the middle pixel of an image (Ny, Nx) does not come back from the sky.
+
+    None where there is none, or nothing comes back. Other packages' WCS are not tested.
+    """
+    if isinstance(wcs, Ape14Wcs):
         return None
     middle = (np.array(shape) - 1) / 2
     with np.errstate(all="ignore"):
-        back = pixels_at(wcs, *world_at(wcs, *middle[:, None]))
+        back = world_to_pixel(wcs, *pixel_to_world(wcs, *middle[:, None]))
     off = np.abs(back - middle).max()
     if off > BACK_PX:
         return f"comes back from the sky {off:.3g} px off: an angle of the header is far too large"
@@ -98,13 +100,13 @@ def _pixel_sides(wcs, n, m):
     """Sides of a pixel as vectors (3,) on the unit sphere, along the rows' and columns' numbers."""
     half = np.array([-0.5, 0.5])
     n, m = np.concatenate([n + half, [n, n]]), np.concatenate([[m, m], m + half])
-    lon, lat = np.radians(world_at(wcs, n, m))
+    lon, lat = np.radians(pixel_to_world(wcs, n, m))
     v = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
     return v[:, 1] - v[:, 0], v[:, 3] - v[:, 2]
 
 
 def local_axes(grid, pixel):
-    """How a step of one pixel goes on the sky: (2, 2) [arcsec/px], rows (north, east).
+    """Step of one pixel on the sky: (2, 2) [arcsec/px], rows (north, east).
 
     Columns are (y, x). North is that of the WCS's own frame; on a flat sky it is +y, and east is
     -x, as in `Grid.to_wcs`.
@@ -123,14 +125,14 @@ def local_axes(grid, pixel):
     return np.array([north, east]) @ steps / ARCSEC
 
 
-def frame_of(wcs):
+def celestial_frame(wcs):
     """The celestial frame of a WCS, as astropy's coordinates have it."""
-    return wcs.frame if isinstance(wcs, Interface) else wcs_to_celestial_frame(wcs)
+    return wcs.frame if isinstance(wcs, Ape14Wcs) else wcs_to_celestial_frame(wcs)
 
 
-def names_of(wcs):
-    """What a WCS calls longitude and latitude: "ra" and "dec", "glon" and "glat", ..."""
-    if isinstance(wcs, Interface):
+def axis_names(wcs):
+    """Names of longitude and latitude in a WCS: "ra" and "dec", "glon" and "glat", ..."""
+    if isinstance(wcs, Ape14Wcs):
         return wcs.names
     return wcs.wcs.lngtyp.lower(), wcs.wcs.lattyp.lower()
 
@@ -139,7 +141,7 @@ def convert(wcs_from, wcs_to, lon, lat):
     """Points lon, lat (L,) [deg] of one WCS's celestial frame in that of another: (lon, lat)."""
     if _is_icrs(wcs_from) and _is_icrs(wcs_to):  # most are: astropy takes 0.1 ms to make a frame
         return lon, lat
-    frames = [frame_of(wcs) for wcs in (wcs_from, wcs_to)]
+    frames = [celestial_frame(wcs) for wcs in (wcs_from, wcs_to)]
     if frames[0].is_equivalent_frame(frames[1]):
         return lon, lat
     sky = SkyCoord(lon, lat, unit="deg", frame=frames[0]).transform_to(frames[1]).spherical
@@ -147,13 +149,13 @@ def convert(wcs_from, wcs_to, lon, lat):
 
 
 def _is_icrs(wcs):
-    """Whether a WCS's header says so by name."""
-    return not isinstance(wcs, Interface) and wcs.wcs.radesys == "ICRS"
+    """Returns True if a WCS's header says so by name."""
+    return not isinstance(wcs, Ape14Wcs) and wcs.wcs.radesys == "ICRS"
 
 
-def pixels_at(wcs, lon, lat):
+def world_to_pixel(wcs, lon, lat):
     """Pixels (L, 2), (y, x), at the points lon, lat (L,) [deg]; NaN where there is none."""
-    if isinstance(wcs, Interface):
+    if isinstance(wcs, Ape14Wcs):
         return wcs.pixels_at(lon, lat)
     world = np.stack([lon, lat] if wcs.wcs.lng < wcs.wcs.lat else [lat, lon], axis=-1)
     try:
@@ -186,9 +188,9 @@ def tangent_wcs(jacobian, origin, ra_deg, dec_deg):
     return wcs
 
 
-def shifted_wcs(wcs, y0, x0):
+def cutout_wcs(wcs, y0, x0):
     """The same WCS for an array that starts at (y0, x0)."""
-    if isinstance(wcs, Interface):
+    if isinstance(wcs, Ape14Wcs):
         return wcs.shifted(y0, x0)
     wcs = wcs.deepcopy()
     shift = np.array([x0, y0], dtype=np.float64)

@@ -65,8 +65,8 @@ def test_regions_hold_the_moments():
     pytest.importorskip("regions", reason="regions is not installed")
     table = QTable(
         {"name": ["a", "star"], "ra": [150, 150.0005] * u.deg, "dec": [2, 2] * u.deg,
-         "size": [1.0, np.nan] * u.arcsec, "e1": [0.3, np.nan], "e2": [0.4, np.nan],
-         "angle": [np.degrees(np.arctan2(0.4, 0.3)) / 2, np.nan] * u.deg}
+         "rms_size": [1.0, np.nan] * u.arcsec, "e1": [0.3, np.nan], "e2": [0.4, np.nan],
+         "position_angle": [np.degrees(np.arctan2(0.4, 0.3)) / 2, np.nan] * u.deg}
     )  # fmt: skip
     ellipse, circle = regions_of(table)
     assert ellipse.meta["text"] == "a"
@@ -81,4 +81,4 @@ def test_regions_hold_the_moments():
     assert (nn - ee) / (nn + ee) == pytest.approx(0.3, abs=0.01)
     assert 2 * ne / (nn + ee) == pytest.approx(0.4, abs=0.01)
     with pytest.raises(ValueError, match="no ra and dec"):
-        regions_of(table[["name", "size"]])
+        regions_of(table[["name", "rms_size"]])

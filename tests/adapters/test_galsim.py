@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clresample import PSF, Extended, Grid, Observation, Resampler, deblend
+from clresample import PSF, ExtendedSource, Grid, Observation, Resampler, deblend
 from clresample.adapters.galsim import as_galsim, grid_of, image_of, profile_of, psf_of
 
 galsim = pytest.importorskip("galsim", reason="GalSim is missing: pip install galsim")
@@ -84,7 +84,7 @@ def test_a_fitted_source_draws_as_it_was_fitted():
     data = source.drawImage(nx=32, ny=32, scale=0.2, dtype=float).array
     data += np.random.default_rng(1).normal(0, 0.05, data.shape)
     o = Observation(data, psf, grid, variance=0.05**2, channels=["r"])
-    result = deblend([o], [Extended(sky_deg=(-0.1, 0.1))])
+    result = deblend([o], [ExtendedSource(sky_deg=(-0.1, 0.1))])
     model, frame = result.source_model(0)[0], result.frame
     profile = result.as_galsim(0, "r")
     assert profile.flux == pytest.approx(model.sum(), rel=1e-3)

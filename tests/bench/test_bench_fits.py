@@ -137,7 +137,7 @@ def test_values_with_errors_are_found_by_their_columns(monkeypatch):
     table["y_centroid"] = scene.euclid.positions_px[:, 0] * u.pix
     table["y_centroid_err"] = [0.5, np.nan] * u.pix
     table["e1"], table["e1_err"] = [0.1, 0.2], [0.3, 0.3]
-    table["size"] = [1, 1] * u.arcsec  # without errors
+    table["rms_size"] = [1, 1] * u.arcsec  # without errors
     monkeypatch.setattr(truth, "catalogue", lambda _, magnitudes: table)
     found = truth.compare(None, scene, "euclid")
     assert found.keys() == {"flux", "position", "ellipticity"}
@@ -164,7 +164,7 @@ def test_real(data, tmp_path):
 def test_real_scene_files_hold_nothing_but_defaults(data, tmp_path):
     from bench.real import scene_files
     from clresample import Settings
-    from clresample.fields.reading.scene_file import read_scene
+    from clresample.fields.field_toml.scene_file import read_scene
 
     paths = scene_files(data, tmp_path)
     assert paths.keys() == {"hst_hsc", "hst", "hsc"}
@@ -206,7 +206,7 @@ def test_crowded_blend_holds_its_light():
 
     blend = crowded_blend(1, 4, 100)
     assert [o.shape for o in blend.observations] == [(1, 100, 100), (6, 50, 50)]
-    assert blend.frame.inside(blend.frame.place(blend.sources)).all()
+    assert blend.frame.contains(blend.frame.place(blend.sources)).all()
     for o in blend.observations:
         level = np.median(o.data, axis=(1, 2)) * np.sqrt(o.weights[:, 0, 0])
         assert np.abs(level).max() < 1

@@ -142,7 +142,7 @@ def test_every_case_draws_its_sources_in_the_frame():
         (image,) = scene.observations
         assert len(scene.sources) == counts.get(case, 1)
         assert {type(s).__name__ for s in scene.sources} == {
-            "Point" if case == "galaxy_as_point" else "Extended"
+            "PointSource" if case == "galaxy_as_point" else "ExtendedSource"
         }
         for source in scene.sources:
             place = source.pixel(image.grid)

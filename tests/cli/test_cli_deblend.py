@@ -85,7 +85,7 @@ def test_the_model_is_adequate(output):
 
 def test_report_names_files_chi2_and_shifts(example, tmp_path, capsys, monkeypatch):
     """However little a shift gains."""
-    monkeypatch.setattr(iterate, "LEAST_GAIN", 0.0)
+    monkeypatch.setattr(iterate, "MIN_GAIN", 0.0)
     out = tmp_path / "deep" / "out"
     scene = example / "scene.toml"
     assert deblend(scene, out, "--fit-shifts", "--fit-sky", "--max-iter", 12, "--no-figure") == 0
@@ -127,16 +127,16 @@ def test_nothing_is_replaced_unasked(example, output, capsys):
 
 
 def test_interrupted_runs_write_the_best_so_far(example, tmp_path, capsys, monkeypatch):
-    from clresample.deblending.solver.learned.engine import LearnedEngine
+    from clresample.deblending.solver.multiscale.engine import MultiscaleEngine
 
-    one_round = LearnedEngine.round
+    one_round = MultiscaleEngine.round
 
     def stop(self):
         if self.progress.n_rounds.max() > 5:
             raise KeyboardInterrupt
         return one_round(self)
 
-    monkeypatch.setattr(LearnedEngine, "round", stop)
+    monkeypatch.setattr(MultiscaleEngine, "round", stop)
     assert deblend(example / "scene.toml", tmp_path / "out", "--no-figure") == 130
     assert "interrupted" in capsys.readouterr().out
     assert read_result(tmp_path / "out" / "result.fits").status == "interrupted"
@@ -150,7 +150,7 @@ def test_interrupted_runs_write_the_best_so_far(example, tmp_path, capsys, monke
         (["none.toml", "-o", "new"], "none.toml: No such file"),
         (["scene.toml", "-o", "scene.toml"], "is a file, not a folder"),
         (["scene.toml", "-o", "new", "--max-iter", "-1"], "'-1' is no whole number"),
-        (["scene.toml", "-o", "new", "--tol", "1"], "'1' is no number from 0 to 1"),
+        (["scene.toml", "-o", "new", "--rel-tol", "1"], "'1' is no number from 0 to 1"),
         (["scene.toml", "-o", "new", "--dtype", "half"], "invalid choice: 'half'"),
         (["scene.toml", "-o", "new", "--device", "no such"], "no such"),
         (["scene.toml", "--example", "new"], "--example DIR takes neither"),

@@ -33,10 +33,10 @@ def kept(folder):
     "text, said",
     [
         ("max_iter = " + "9" * 400, "max_iter is"),
-        ("tol = " + "9" * 400, "tol is"),
-        ("structure_px = " + "9" * 400, "structure_px is"),
+        ("rel_tol = " + "9" * 400, "rel_tol is"),
+        ("correlation_px = " + "9" * 400, "correlation_px is"),
         ("max_iter = " + "9" * 5000, "not TOML"),
-        ("tol = nan", "tol is nan"),
+        ("rel_tol = nan", "rel_tol is nan"),
         ("x = " + "[" * 3000 + "]" * 3000, "nested too deeply"),
         ('x = "' + "long" * 2000 + '"', "key x is unknown"),
         ('"\\u001b[31m\\n" = 1', "\\x1b[31m"),
@@ -196,7 +196,7 @@ def test_file_names_with_control_characters(files, capsys):
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_signals_leave_all_or_nothing(scene, number):
     """At any time: outputs are a set, parts are gone, and the status is that of Ctrl-C."""
-    change(scene, "max_iter = 2", "max_iter = 100000\nenough = 1e-300")
+    change(scene, "max_iter = 2", "max_iter = 100000\nloss_tol = 1e-300")
     run = subprocess.Popen(
         [sys.executable, "-m", "clresample.cli", "deblend", str(scene / "scene.toml")]
         + ["-o", str(scene / "out"), "--no-figure"],

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from clresample.cli import example
-from clresample.fields.reading.keys import SCENE_TABLES as TABLES, parse_scene as parse
-from clresample.files.whole_file import FileError
+from clresample.fields.field_toml.keys import SCENE_TABLES as TABLES, parse_scene as parse
+from clresample.files.atomic import FileError
 from clresample.simulation.surveys import EUCLID_VIS, RUBIN_UGRIZY
 
 TEXT = resources.files("clresample.cli").joinpath("example.toml").read_text()

@@ -8,7 +8,7 @@ import pytest
 from helpers.checkout import run_python
 
 from clresample import simulate_field
-from clresample.cli.fields.progress import LINE_S, Live, duration
+from clresample.cli.fields.progress import LINE_S, ProgressDisplay, duration
 from clresample.cli.simulate import write_field
 
 
@@ -29,12 +29,12 @@ class Terminal(io.StringIO):
 
 @pytest.fixture
 def live(monkeypatch):
-    """A function that makes a Live on a stream: (live, clock, stream)."""
+    """A function that makes a ProgressDisplay on a stream: (live, clock, stream)."""
 
     def make(stream, quiet=False):
         monkeypatch.setattr("sys.stderr", stream)
         clock = Clock()
-        return Live(SimpleNamespace(command="field", quiet=quiet), clock), clock, stream
+        return ProgressDisplay(SimpleNamespace(command="field", quiet=quiet), clock), clock, stream
 
     return make
 
@@ -50,7 +50,7 @@ def test_a_terminal_shows_blends_sources_a_second_and_the_time_left(live):
     text = stream.getvalue()
     assert "16 of 40 blends" in text and "5.0 sources/s" in text
     assert "about 12 s left" in text  # 24 blends at 2 a second
-    shown.say("3 blends are set aside")
+    shown.message("3 blends are set aside")
     shown.dashboard("http://127.0.0.1:8787\x1b[2J")
     lines = stream.getvalue().replace("\r", "\n").splitlines()
     assert "clresample field: 3 blends are set aside" in lines
@@ -77,7 +77,7 @@ def test_quiet_runs_show_nothing(live):
     shown.stage("fit", 4)
     clock.now += 100
     shown.step(2, 7)
-    shown.say("a note")
+    shown.message("a note")
     shown.close()
     assert stream.getvalue() == ""
 

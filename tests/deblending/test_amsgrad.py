@@ -17,8 +17,8 @@ from helpers.solver import (
 
 from clresample.deblending.solver import reference as ref
 from clresample.deblending.solver.amsgrad import StepSizes
-from clresample.deblending.solver.constraints import Chain, MaxNorm
-from clresample.deblending.solver.prior import Prior
+from clresample.deblending.solver.constraints import MaxNorm, ProxChain
+from clresample.deblending.solver.prior import SingleScalePrior
 
 
 @every_type
@@ -77,7 +77,7 @@ def test_a_sky_step_is_half_of_newtons(device, unit):
     the weights."""
     known = unit * np.array([0.0, 700.0, 1e5])
     scene, state = posed(
-        device, spectra=np.zeros((3, 3)), scale=np.zeros((3, 3)), sky_precision=known
+        device, spectra=np.zeros((3, 3)), step_scale=np.zeros((3, 3)), sky_precision=known
     )
     scene, state = changed(scene, state, weights=[unit * w for w in scene.weights])
     e = engine([(scene, state)], device)
@@ -90,9 +90,9 @@ def test_a_sky_step_is_half_of_newtons(device, unit):
 
 def test_a_normalisation_hands_its_factor_to_the_spectra(device):
     """Without a prior, max = 1 and the model stays."""
-    pair = posed(device, scale=np.zeros((3, 3)), fit_sky=False)
+    pair = posed(device, step_scale=np.zeros((3, 3)), fit_sky=False)
     still = StepSizes(latent=STEPS.latent, morphology=0.0, spectrum=STEPS.spectrum)
-    e = engine([pair], device, prior=None, chain=Chain(MaxNorm()), steps=still)
+    e = engine([pair], device, prior=None, chain=ProxChain(MaxNorm()), steps=still)
     first, second = e.run(2)[:, 0]
     (now,) = e.states()
     assert second == pytest.approx(first, rel=1e-12)
@@ -122,11 +122,11 @@ def test_a_warm_start_goes_on_as_if_nothing_had_happened(device, prior, dtype):
 
 def test_priors_have_unit_variance():
     """sum of K's squares is 1; its taps fall as a Gaussian."""
-    taps = Prior(correlation_px=2.0).taps
+    taps = SingleScalePrior(correlation_px=2.0).taps
     assert len(taps) == 13 and (taps**2).sum() == pytest.approx(1)
     assert taps[8] / taps[6] == pytest.approx(np.exp(-0.5))
-    assert len(Prior(correlation_px=1.5).taps) == 11  # cut behind 3 sigma, not before
-    assert np.array_equal(Prior(correlation_px=1e-300).taps, [0, 1, 0])  # nor a warning
+    assert len(SingleScalePrior(correlation_px=1.5).taps) == 11  # cut behind 3 sigma, not before
+    assert np.array_equal(SingleScalePrior(correlation_px=1e-300).taps, [0, 1, 0])  # nor a warning
     noise = np.random.default_rng(0).normal(size=(200, 200))
     assert ref.blur(noise, taps)[10:-10, 10:-10].std() == pytest.approx(1, abs=0.05)
     assert PRIOR.amplitude(np.array([-1.0, 4.0])).tolist() == [0, 0.2]

@@ -11,11 +11,11 @@ from clresample.deblending.resize import (
     _moved,
     _same,
     box_around,
-    box_of,
     box_threshold,
+    component_box,
 )
 from clresample.deblending.solver.boxes import Boxes
-from clresample.deblending.spectra import inverse
+from clresample.deblending.spectra import spectrum_covariance
 
 
 def test_boxes_hold_a_tenth_of_the_noise():
@@ -44,7 +44,7 @@ def test_boxes_of_a_start_hold_five_pixels_about_small_sources():
     """Where its light ends before; as far as the frame goes."""
     for place, wanted in (((25, 30), [20, 25, 31, 36]), ((3, 57), [0, 52, 9, 60])):
         image = _spot((50, 60), place, 0.4)
-        low, size, centre, part = box_of(point_of(image[None], place), 0, (50, 60), 1.0)
+        low, size, centre, part = component_box(point_of(image[None], place), 0, (50, 60), 1.0)
         assert [*low, *(low + size)] == wanted and [*(low + centre)] == [*place]
         np.testing.assert_allclose(part, image[low[0] : wanted[2], low[1] : wanted[3]])
 
@@ -54,7 +54,7 @@ def test_boxes_grow_and_shrink_by_their_edges():
     noise, start = np.ones(1), point_of(_spot((50, 60), (25, 30), 1.0)[None], (25, 30))
 
     def box(morph, origin=(10, 20), extent=(50, 60), fixed=False):
-        one = SimpleNamespace(origin=np.array([origin]), fixed=[fixed], extent=extent)
+        one = SimpleNamespace(origin=np.array([origin]), fixed=[fixed], unpadded_shape=extent)
         state = SimpleNamespace(morph=[morph], spectra=np.array([[10.0]]))
         low, high = _box(one, state, 0, start, noise)
         return [*low, *high]
@@ -141,8 +141,8 @@ def test_variances_are_at_least_those_with_all_else_known():
     """Where rounding says otherwise; of what is not seen they are infinite."""
     near = np.array([[1.0, 1 - 1e-17, 0], [1 - 1e-17, 1.0, 0], [0, 0, 0]])
     for unit in (1.0, 1e-6, 1e6):
-        found = inverse(unit * near[None])[0]
+        found = spectrum_covariance(unit * near[None])[0]
         assert (np.diag(found)[:2] >= 0.99 / unit).all()
         assert np.isinf(found[2, 2]) and not found[2, :2].any()
     plain = np.array([[2.0, 0.5], [0.5, 1.0]])
-    np.testing.assert_allclose(inverse(plain[None])[0], np.linalg.inv(plain), rtol=1e-7)
+    np.testing.assert_allclose(spectrum_covariance(plain[None])[0], np.linalg.inv(plain), rtol=1e-7)

@@ -9,22 +9,22 @@ from helpers.scenes import GALAXIES, SHAPE, frame, observe, sources
 from helpers.start import rendered, view, views
 from scipy.optimize import lsq_linear
 
-from clresample.deblending.profiles import Galaxy, Star
-from clresample.deblending.spectra import inverse, non_negative
-from clresample.deblending.start import profile_fit, start as start_module
-from clresample.deblending.start.equations import equations
-from clresample.deblending.start.looking import looking_at
+from clresample.deblending.profiles import GalaxyProfile, StarProfile
+from clresample.deblending.spectra import nnls_batch, spectrum_covariance
+from clresample.deblending.start import profile_fit, profile_start as start_module
+from clresample.deblending.start.component_batch import ComponentBatch, StartComponent, boxes_of
+from clresample.deblending.start.equations import normal_equations
+from clresample.deblending.start.linearised_scenes import linearise
 from clresample.deblending.start.profile_fit import ProfileFit
-from clresample.deblending.start.sight import smoothed_light
-from clresample.deblending.start.slots import Component, Slots, boxes_of
-from clresample.deblending.start.start import Patch
+from clresample.deblending.start.profile_start import StartInput
+from clresample.deblending.start.slot_observation import smoothed_light
 from clresample.deblending.view import WhitenedView
 from clresample.device.tuning import Tuning
 from clresample.resampling.cache import cached_resampler
 from clresample.resampling.plan import Precision
-from clresample.sky.extent import box_slices, shared_part
+from clresample.sky.extent import box_slices, intersect_boxes
 from clresample.sky.psf import PSF
-from clresample.sky.sources import Point
+from clresample.sky.sources import PointSource
 
 FLUX = (100.0, 80.0, 90.0)
 
@@ -32,10 +32,10 @@ FLUX = (100.0, 80.0, 90.0)
 def profile_fit_of(device, catalogue, observations, *, precision=None, **given):
     positions = np.array([s.position_px for s in catalogue], float)
     v = views(device, observations)
-    patches = [Patch(frame(), list(catalogue), positions, v)]
+    patches = [StartInput(frame(), list(catalogue), positions, v)]
     _, components = start_module._components(patches)
     own = (precision, 0.0) if precision else (start_module.PRECISION, start_module.TOLERANCE)
-    looking = looking_at([v], components, *own, **given)
+    looking = linearise([v], components, *own, **given)
     noise = np.concatenate([w.pixel_noise for w in v])[None]
     return ProfileFit(looking, noise)
 
@@ -44,7 +44,7 @@ def test_slopes_of_chi2(device, monkeypatch):
     """By shapes and a star's place, the spectra and the sky following: half of chi2 falls by what
     `right` says."""
     monkeypatch.setattr(profile_fit, "MODEL_ERROR", 0.0)  # weights that stay
-    catalogue = (*sources(), Point(position_px=(8, 28), free=True))
+    catalogue = (*sources(), PointSource(position_px=(8, 28), free_position=True))
     objects = (*GALAXIES, ((8.3, 27.8), FLUX, 0))
     fit = profile_fit_of(device, catalogue, observe(objects), fit_sky=True)
     fit.begin()
@@ -61,7 +61,7 @@ def test_slopes_of_chi2(device, monkeypatch):
 
     chi2(fit.theta)
     fit._look(every, fit.theta, slopes=True)
-    fit.looking.compare(0.0)
+    fit.looking.compute_residuals(0.0)
     fit._take_equations(every)
     assert (fit.looking.spectra > 0).all()  # no spectrum is held at zero
     step = 1e-4
@@ -76,7 +76,7 @@ def test_slopes_of_chi2(device, monkeypatch):
 @pytest.mark.parametrize("fit_sky", [False, True])
 def test_normal_matrices_are_those_of_whole_frames(device, angle, fit_sky):
     """Of boxes and windows: as images over the frame give them by NumPy, in float64."""
-    catalogue = (*sources(), Point(position_px=(8.4, 27), free=True))
+    catalogue = (*sources(), PointSource(position_px=(8.4, 27), free_position=True))
     observations = observe((*GALAXIES, ((8.3, 26.8), FLUX, 0)), angle=angle)
     precision = Precision.of(np.float64)
     fit = profile_fit_of(device, catalogue, observations, precision=precision, fit_sky=fit_sky)
@@ -85,8 +85,8 @@ def test_normal_matrices_are_those_of_whole_frames(device, angle, fit_sky):
     looking, v = fit.looking, [s.views[0] for s in fit.looking.sights]
     fit._look(np.arange(1), fit.theta, slopes=True)
     assert (looking.slots.size < SHAPE).all(axis=1).any()
-    looking.compare(profile_fit.MODEL_ERROR)
-    normal, right = equations(looking)
+    looking.compute_residuals(profile_fit.MODEL_ERROR)
+    normal, right = normal_equations(looking)
     whole = [c.shape.draw(t, c.position) for c, t in zip(looking.components, fit.thetas())]
     for images, i in zip(whole, np.argsort(looking.at), strict=True):
         inside = np.zeros(SHAPE, bool)
@@ -123,7 +123,7 @@ def reference(whole, v, looking, fit_sky):
     for w in v:
         seen = rendered(w, np.concatenate(whole))
         for c in range(seen.shape[1]):
-            a, root = looking.spectra[:, channel], w.root[c].ravel()
+            a, root = looking.spectra[:, channel], w.sqrt_weights[c].ravel()
             model = a @ seen[heads, c] + looking.sky[0, channel] * root
             light = smoothed_light(w)[c].ravel() - looking.sky[0, channel] * root
             weight = 1 / (1 + (profile_fit.MODEL_ERROR * light) ** 2)
@@ -154,11 +154,12 @@ def test_windows_show_what_the_whole_operator_shows(device, name, shift):
     home = Home(mapping.shape_in, psf_in)
     places = np.array([(0.4, 0.45), (0.7, 0.3)]) * mapping.shape_in
     components = [
-        Component(0, i, i, Star(home, free=True), p, home.shape) for i, p in enumerate(places)
+        StartComponent(0, i, i, StarProfile(home, free=True), p, home.shape)
+        for i, p in enumerate(places)
     ]
-    looking = looking_at([v], components, Precision.of(dtype), 0.0, fit_sky=False)
+    looking = linearise([v], components, Precision.of(dtype), 0.0, fit_sky=False)
     thetas = [np.zeros(2)] * 2
-    looking.look([0], thetas, np.full(2, 1.0), slopes=True, whiten=False)
+    looking.render([0], thetas, np.full(2, 1.0), slopes=True, whiten=False)
     (sight,) = looking.sights
     assert (looking.slots.size < home.shape).any()
     seen = device.get(sight.seen)
@@ -169,7 +170,7 @@ def test_windows_show_what_the_whole_operator_shows(device, name, shift):
         images = np.zeros((n, *home.shape))
         images[:, *box] = components[i].shape.draw(thetas[i], places[i])[:, *box]
         wanted = op.render(images.astype(dtype))
-        inside, there = shared_part((0, 0), shape[1:], (y0, x0), (wy, wx))
+        inside, there = intersect_boxes((0, 0), shape[1:], (y0, x0), (wy, wx))
         whole = np.zeros_like(wanted)
         whole[:, :, *inside] = found[:, :, *there]
         away = np.abs(np.where(op.covered, whole - wanted, 0)).max(axis=(1, 2, 3))
@@ -182,7 +183,7 @@ def view_of(op, root, data):
 
 @dataclass(frozen=True)
 class Home:
-    """Of a Frame, what a Star takes."""
+    """Of a Frame, what a StarProfile takes."""
 
     shape: tuple
     psf: PSF
@@ -204,12 +205,12 @@ def test_work_and_memory_are_linear_in_the_sources(device, n_scenes):
             for o in seen:
                 op = cached_resampler(home, o.grid, o.psf, dtype=np.float32, device=device)
                 v.append(view(op, o))
-            patches.append(Patch(home, list(sources(objects)), np.array(places), v))
+            patches.append(StartInput(home, list(sources(objects)), np.array(places), v))
         _, components = start_module._components(patches)
         own = start_module.PRECISION, start_module.TOLERANCE
-        looking = looking_at([p.views for p in patches], components, *own, fit_sky=False)
+        looking = linearise([p.views for p in patches], components, *own, fit_sky=False)
         thetas = [c.shape.mean for c in components]
-        looking.look(np.arange(n_scenes), thetas, np.full(len(thetas), 30.0), slopes=True)
+        looking.render(np.arange(n_scenes), thetas, np.full(len(thetas), 30.0), slopes=True)
         elements = [looking.slots.n_elements] + [s.n_elements for s in looking.sights]
         products = [s.n_pixels for s in looking.sights]
         counts.append(np.array(elements + products) / len(components))
@@ -227,23 +228,23 @@ def test_many_least_squares_at_once(n_free):
     rows[5, 4] = 0
     target = rng.normal(size=(40, 12)) + 0.3 * rows.sum(axis=1)
     free = np.arange(n) >= n - n_free
-    found = non_negative(rows @ rows.swapaxes(1, 2), np.einsum("mip,mp->mi", rows, target), free)
+    found = nnls_batch(rows @ rows.swapaxes(1, 2), np.einsum("mip,mp->mi", rows, target), free)
     assert (found[:, ~free] >= 0).all()
     low = np.where(free, -np.inf, 0)
     for x, a, d in zip(found, rows, target, strict=True):
         best = lsq_linear(a.T, d, (low, np.inf), tol=1e-14).x
         rest, least = (np.sum((y @ a - d) ** 2) for y in (x, best))
         assert rest < least * (1 + 1e-6) + 1e-9
-    assert found[5, 4] == 0 and np.isinf(inverse(rows[5] @ rows[5].T)[4, 4])
+    assert found[5, 4] == 0 and np.isinf(spectrum_covariance(rows[5] @ rows[5].T)[4, 4])
     np.testing.assert_allclose(found[3, 1], found[3, 2], rtol=1e-4)
 
 
 def test_galaxies_in_boxes_of_other_sizes_are_drawn_together(device):
     home, place = frame((70, 60)), np.array([33.2, 29.6])
     thetas = [np.array([np.log(size), 0.2, -0.1, np.log(5)]) for size in (0.5, 3.0)]
-    chosen = [Component(0, k, k, Galaxy(home), place, home.shape) for k in range(2)]
+    chosen = [StartComponent(0, k, k, GalaxyProfile(home), place, home.shape) for k in range(2)]
     boxes = boxes_of(chosen, thetas, np.full(2, 0.01))
-    slots = Slots(chosen, thetas, boxes, slopes=True)
+    slots = ComponentBatch(chosen, thetas, boxes, slopes=True)
     assert slots.size[0].max() < slots.size[1].min()
     images = device.get(slots.draw(device, np.float32, Tuning.of(device, np.float32), {}))
     for k, c in enumerate(slots.components):

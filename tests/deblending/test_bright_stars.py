@@ -6,19 +6,19 @@ from helpers.scenes import BLURRED, GALAXIES, SHARP, blend, fit, frame, observe,
 
 from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.blend import Blend
-from clresample.deblending.fit import Fit, begin
+from clresample.deblending.fit import Fit, start_fits
 from clresample.deblending.settings import Settings
-from clresample.deblending.solver.prior import Prior
+from clresample.deblending.solver.prior import SingleScalePrior
 from clresample.measurement.catalogue import Flag, catalogue
 from clresample.measurement.photometry import fluxes
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
-from clresample.sky.sources import Point
+from clresample.sky.sources import PointSource
 
 STAR = (21.3, 17.2)
 FLUX = np.array([3000.0, 2500.0, 2700.0])  # signal to noise 2e4
 OBJECTS = (*GALAXIES, (STAR, FLUX, 0))
-CATALOGUE = (*sources(), Point(position_px=(21.1, 17.5), free=True))
+CATALOGUE = (*sources(), PointSource(position_px=(21.1, 17.5), free_position=True))
 TRUE = np.array([flux for _, flux, _ in GALAXIES])
 WIDER = (
     PSF.gaussian(0.9 * 1.03, n_pixels=19),
@@ -53,7 +53,7 @@ def flux_errors(result):
 
 @pytest.mark.parametrize("prior", ["learned", "one scale", None])
 def test_neighbours_of_a_star_whose_psf_is_wrong(device, prior):
-    given = {"one scale": {"prior": Prior()}, None: {"prior": None}}.get(prior, {})
+    given = {"one scale": {"prior": SingleScalePrior()}, None: {"prior": None}}.get(prior, {})
     scene = star_scene(WIDER)
     without, with_it = (
         fit(scene, device, settings=Settings(psf_error=error, **given)) for error in (0, 0.03)
@@ -102,7 +102,7 @@ def test_masked_cores(device):
 
 def views(scene, device, psf_error):
     made = Fit(scene, Settings(psf_error=psf_error), device, np.float32, pad=1)
-    begin([made])
+    start_fits([made])
     return made, made.views
 
 
@@ -118,10 +118,12 @@ def test_weights_hold_what_a_wider_psf_changes(device):
         r2 = ((view.mapping.at(n, m) - STAR) ** 2).sum(-1) / step**2
         variance = sigma**2 + 1 / 12  # and its pixel
         light = np.exp(-r2 / (2 * variance)) / (2 * np.pi * variance)
-        light = flux[:, None, None] * light / view.unit[:, None, None]
+        light = flux[:, None, None] * light / view.noise_unit[:, None, None]
         expected = 0.03 * light * np.hypot(1, r2 / variance)
-        inside = (view.root > 0) & (r2 < 9 * variance)
-        found = np.sqrt(np.maximum(other.root[inside] ** -2 - view.root[inside] ** -2, 0))
+        inside = (view.sqrt_weights > 0) & (r2 < 9 * variance)
+        found = np.sqrt(
+            np.maximum(other.sqrt_weights[inside] ** -2 - view.sqrt_weights[inside] ** -2, 0)
+        )
         assert np.abs(found - expected[inside]).max() < 0.03 * expected.max()
 
 
@@ -130,13 +132,13 @@ def test_faint_stars_change_nothing(device):
     scene = star_scene(objects=objects)
     (_, plain), (_, allowing) = (views(scene, device, error) for error in (0, 0.03))
     for one, other in zip(plain, allowing, strict=True):
-        assert np.array_equal(one.root, other.root)
+        assert np.array_equal(one.sqrt_weights, other.sqrt_weights)
 
 
 def test_galaxies_change_nothing(device):
     (_, plain), (_, allowing) = (views(blend(), device, error) for error in (0, 0.5))
     for one, other in zip(plain, allowing, strict=True):
-        assert np.array_equal(one.root, other.root)
+        assert np.array_equal(one.sqrt_weights, other.sqrt_weights)
 
 
 def test_psf_error_is_checked():

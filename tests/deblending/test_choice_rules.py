@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from clresample.deblending.solver.boxes import Boxes
-from clresample.deblending.solver.rendering import choice
-from clresample.deblending.solver.rendering.windows import ROUND_PX, Groups, WindowOperator
+from clresample.deblending.solver.rendering import stage_selection
+from clresample.deblending.solver.rendering.windows import ROUND_PX, WindowGroups, WindowOperator
 from clresample.device.contraction import COLUMN_PAD
 
 
@@ -23,12 +23,12 @@ def boxes_at(*places, scene=None, n=8):
 def test_groups_are_of_the_cells_that_hold_the_middles_of_boxes():
     """Of those that are meant, by scene; frames of one size, multiples of 16, about all of each."""
     boxes = boxes_at((0, 0), (5, 9), (7, 12), (40, 3), (0, 0), (3, 3), scene=[0, 0, 0, 0, 1, 1])
-    groups = Groups(boxes, np.array([0, 1, 2, 3, 4]), np.array([10, 16]))
+    groups = WindowGroups(boxes, np.array([0, 1, 2, 3, 4]), np.array([10, 16]))
     assert ROUND_PX == 16 and len(groups) == 4
     assert groups.group.tolist() == [0, 0, 1, 2, 3, 0] and groups.scene.tolist() == [0, 0, 0, 1]
     assert groups.low.tolist() == [[0, 0], [7, 12], [40, 3], [0, 0]]
     assert groups.shape.tolist() == [16, 32]  # 13 x 17 pixels of the first
-    exact = Groups(boxes_at((0, 0), (8, 8)), np.arange(2), np.array([50, 50]))
+    exact = WindowGroups(boxes_at((0, 0), (8, 8)), np.arange(2), np.array([50, 50]))
     assert exact.shape.tolist() == [16, 16] and exact.low.tolist() == [[0, 0]]
 
 
@@ -44,14 +44,14 @@ def test_groups_take_the_place_of_scenes():
     list, in which sources that are not meant are left out."""
     boxes = boxes_at((41, 5), (3, 30), (7, 12), (40, 3), (2, 1), (30, 3), scene=[0, 0, 0, 0, 1, 1])
     boxes = Boxes(boxes.scene, boxes.origin, boxes.shape, np.tile([2, 5], (6, 1)))
-    groups = Groups(boxes, np.array([0, 2, 3, 4, 5]), np.array([25, 100]))
+    groups = WindowGroups(boxes, np.array([0, 2, 3, 4, 5]), np.array([25, 100]))
     batch = SimpleNamespace(host_boxes=boxes, scenes=["a", "b"], device=Host(), spectra="kept")
     found = groups.buffers(batch)
     assert found.scenes == ["a", "a", "b", "b"] and found.spectra == "kept"
     assert batch.scenes == ["a", "b"] and batch.host_boxes is boxes  # that one stays as it is
-    assert found.everyone.tolist() == [0, 2, 3, 4, 5]
+    assert found.all_sources.tolist() == [0, 2, 3, 4, 5]
     assert found.first.tolist() == [0, 1, 3, 4, 5] and found.order.tolist() == [2, 0, 3, 4, 5]
-    assert {a.dtype for a in (found.everyone, found.first, found.order)} == {np.dtype(np.int32)}
+    assert {a.dtype for a in (found.all_sources, found.first, found.order)} == {np.dtype(np.int32)}
     own = found.host_boxes
     assert own.scene[[0, 2, 3, 4, 5]].tolist() == [1, 0, 1, 2, 3]
     origin = [[1, 2], [0, 0], [0, 0], [0, 0], [0, 0]]
@@ -90,9 +90,9 @@ def test_the_cheapest_of_all_sizes_of_cells_is_taken(monkeypatch):
         np.testing.assert_allclose(inverse, np.abs(np.linalg.inv(matrix)))
         return abs(cell[0] - 15) + abs(cell[1] - 30) + 7
 
-    monkeypatch.setattr(choice, "Groups", lambda boxes, which, cell: cell)
-    monkeypatch.setattr(choice, "_window_flops", cost)
-    count, cell = choice._best_groups(SimpleNamespace(host_boxes=None), op, np.arange(3))
+    monkeypatch.setattr(stage_selection, "WindowGroups", lambda boxes, which, cell: cell)
+    monkeypatch.setattr(stage_selection, "_window_flops", cost)
+    count, cell = stage_selection._best_groups(SimpleNamespace(host_boxes=None), op, np.arange(3))
     assert count == 7 and cell.tolist() == [15, 30]
 
 
@@ -100,13 +100,16 @@ def test_operations_are_counted_from_sizes():
     """Products of matrices, four operations a term and pair; weighed sums at points beside them."""
     shape, (n_y, n_x, k_y, k_x) = np.array([[3, 5], [4, 2]]), (20, 30, 16, 48)
     of_frame, of_box = np.tile([k_y, k_x], (2, 1)), np.tile([k_y, k_x], (2, 1))
-    found = choice._counts(shape, 3, n_y, n_x, of_frame, of_box)
+    found = stage_selection._counts(shape, 3, n_y, n_x, of_frame, of_box)
     rows, pixels, n_images = 7, 23, 6
     second = n_images * k_y * n_y * k_x
     wanted = [
-        n_images * n_y * n_x * k_x + second + choice.POINT * 1.5 * 3 * pixels,
-        choice.BOXED * pixels * k_x + second + choice.POINT * 1.5 * 3 * rows * k_x,
-        choice.BOXED * (pixels * k_x + rows * k_y * k_x) + choice.POINT * 1.5 * 3 * 2 * k_y * k_x,
+        n_images * n_y * n_x * k_x + second + stage_selection.SUM_COST * 1.5 * 3 * pixels,
+        stage_selection.BOX_COST * pixels * k_x
+        + second
+        + stage_selection.SUM_COST * 1.5 * 3 * rows * k_x,
+        stage_selection.BOX_COST * (pixels * k_x + rows * k_y * k_x)
+        + stage_selection.SUM_COST * 1.5 * 3 * 2 * k_y * k_x,
     ]
     np.testing.assert_allclose(found, 4 * np.array(wanted))
     # each frame, and each box in it, has waves of its own
@@ -115,21 +118,22 @@ def test_operations_are_counted_from_sizes():
     to_lines, to_planes = 15 * 16 + 8 * 32, 3 * 6 * 16 + 4 * 4 * 32
     by_pixel, by_line, by_wave = 23, 3 * 16 + 4 * 32, 6 * 16 + 4 * 32
     wanted = [
-        first + second + choice.POINT * 4.5 * by_pixel,
-        choice.BOXED * to_lines + second + choice.POINT * 4.5 * by_line,
-        choice.BOXED * (to_lines + to_planes) + choice.POINT * 4.5 * by_wave,
+        first + second + stage_selection.SUM_COST * 4.5 * by_pixel,
+        stage_selection.BOX_COST * to_lines + second + stage_selection.SUM_COST * 4.5 * by_line,
+        stage_selection.BOX_COST * (to_lines + to_planes)
+        + stage_selection.SUM_COST * 4.5 * by_wave,
     ]
-    found = choice._counts(shape, 3, 20, 30, of_frame, of_box)
+    found = stage_selection._counts(shape, 3, 20, 30, of_frame, of_box)
     np.testing.assert_allclose(found, 4 * np.array(wanted))
     plain, lines = SimpleNamespace(lines=None), SimpleNamespace(lines=1)
-    assert choice._observed(plain, 5, 7, 11, 13) == 5 * 11 * 13 + 5 * 13 * 7
-    assert choice._observed(lines, 5, 7, 11, 13) == 11 * 13 * 7 + 11 * 7 * 5
+    assert stage_selection._observed(plain, 5, 7, 11, 13) == 5 * 11 * 13 + 5 * 13 * 7
+    assert stage_selection._observed(lines, 5, 7, 11, 13) == 11 * 13 * 7 + 11 * 7 * 5
 
 
 @pytest.mark.parametrize("axes", [[0, 1], [1, 0]])
 def test_operations_are_those_of_an_executors_plans(axes, monkeypatch):
     """One for all scenes, or one each; their waves along x are padded to whole vectors."""
-    monkeypatch.setattr(choice, "_counts", lambda *given: given)
+    monkeypatch.setattr(stage_selection, "_counts", lambda *given: given)
     boxes = SimpleNamespace(shape=np.array([[3, 5], [4, 2], [6, 7]]), scene=np.array([0, 0, 1]))
     buffers = SimpleNamespace(host_boxes=boxes, scenes=[0, 1])
     op = SimpleNamespace(shape_in=(3, 40, 50))
@@ -137,7 +141,7 @@ def test_operations_are_those_of_an_executors_plans(axes, monkeypatch):
         executor = SimpleNamespace(
             axes=axes, n_y=40, n_x=50, k_ys=np.array(k_ys), k_xs=np.array(k_xs)
         )
-        shape, *sizes, of_frame, of_box = choice.flops(buffers, op, executor)
+        shape, *sizes, of_frame, of_box = stage_selection.stage_flops(buffers, op, executor)
         np.testing.assert_array_equal(shape, boxes.shape[:, axes])
         assert sizes == [3, 40, 50]
         waves = np.stack([np.array(k_ys), -(-np.array(k_xs) // COLUMN_PAD) * COLUMN_PAD], axis=1)
@@ -156,10 +160,10 @@ def test_operations_in_windows_are_those_of_smaller_frames(axes, lines, monkeypa
         mapping=SimpleNamespace(matrix=np.diag([1 / 2, 1 / 3])),
     )
     reach = 5
-    monkeypatch.setattr(choice, "reach_of", lambda _: reach)
+    monkeypatch.setattr(stage_selection, "reach_of", lambda _: reach)
     op = SimpleNamespace(executor=lambda: executor, plans=[plan], shape_out=(3, 9, 9))
     boxes = boxes_at((9, 9), (0, 0), (3, 10), (40, 3), n=8)
-    groups = Groups(boxes, np.array([1, 2, 3]), np.array([10, 20]))
+    groups = WindowGroups(boxes, np.array([1, 2, 3]), np.array([10, 20]))
     n_y, n_x = groups.shape[list(axes)]
     assert len(groups) == 2 and groups.shape.tolist() == [16, 32]
     k_y, k_x = 60 * (n_y + 2 * reach) / (100 + reach), 50 * (n_x + 2 * reach) / (80 + reach)
@@ -170,8 +174,8 @@ def test_operations_in_windows_are_those_of_smaller_frames(axes, lines, monkeypa
         n_columns = 70 * (n_x + 2 * reach) / 80
         observed = k_y * n_columns * (k_x + (along_y if lines else along_x))
     waves = np.tile([k_y, k_x], (3, 1))
-    counts = choice._counts(np.full((3, 2), 8), 3, n_y, n_x, waves[:2], waves)
-    found = choice._window_flops(boxes, op, groups, np.diag([2.0, 3.0]))
+    counts = stage_selection._counts(np.full((3, 2), 8), 3, n_y, n_x, waves[:2], waves)
+    found = stage_selection._window_flops(boxes, op, groups, np.diag([2.0, 3.0]))
     assert found == pytest.approx(min(counts) + 4 * 2 * 3 * observed)
 
 
@@ -188,20 +192,24 @@ def parts_of(monkeypatch, sides, cost, *, count=1000.0, n_plans=1, n_terms=1, ge
         executor=lambda: executor,
     )
     boxes = SimpleNamespace(shape=np.array([(n, n) for n in sides]))
-    monkeypatch.setattr(choice, "reach_of", lambda _: 30)
+    monkeypatch.setattr(stage_selection, "reach_of", lambda _: 30)
     monkeypatch.setattr(
-        choice, "_observed", lambda *given: 25.0 if given[1:] == (1, 2, 3, 4) else 0
+        stage_selection, "_observed", lambda *given: 25.0 if given[1:] == (1, 2, 3, 4) else 0
     )
     monkeypatch.setattr(
-        choice, "_best_groups", lambda b, o, which: (cost(which.tolist()), which.tolist())
+        stage_selection, "_best_groups", lambda b, o, which: (cost(which.tolist()), which.tolist())
     )
     buffers = SimpleNamespace(host_boxes=boxes, scenes=[0])
-    return choice._parts(buffers, op, count)
+    return stage_selection._parts(buffers, op, count)
 
 
 def test_windows_are_taken_where_they_save_most(monkeypatch):
     """For 0.4 of all operations at most; boxes far larger than the median's may have their own."""
-    assert choice.GAIN == 0.4 and choice.LARGE.tolist() == [1.3, 1.6, 2.0]
+    assert stage_selection.MAX_WINDOW_COST == 0.4 and stage_selection.LARGE.tolist() == [
+        1.3,
+        1.6,
+        2.0,
+    ]
     few, limit = [20] * 4, 0.4 * (1000 + 4 * 3 * 25)
     everyone = [[0, 1, 2, 3]]
     assert parts_of(monkeypatch, few, lambda _: limit - 1) == everyone

@@ -7,33 +7,33 @@ import pytest
 from helpers.told import named
 
 from clresample.deblending.blend import INTERRUPTED
-from clresample.deblending.components import gradients, second
-from clresample.deblending.components.gradients import Asked, gain
-from clresample.deblending.rendered import Rendered
+from clresample.deblending.component_images import ComponentImages
+from clresample.deblending.refit import colour_gradient, two_component_fit
+from clresample.deblending.refit.colour_gradient import GradientTest, log_evidence_ratio
 from clresample.deblending.settings import Settings
-from clresample.sky.sources import Extended, Point
+from clresample.sky.sources import ExtendedSource, PointSource
 
 
 def test_clear_gradients_have_odds_of_150_to_1():
-    asked = Asked(np.array([2, 5, 7]), np.array([4.99, 5.01, -np.inf]), np.ones((3, 2)), [])
-    assert asked.clear.tolist() == [5]
+    asked = GradientTest(np.array([2, 5, 7]), np.array([4.99, 5.01, -np.inf]), np.ones((3, 2)), [])
+    assert asked.significant.tolist() == [5]
 
 
 def fitted(spectra, sources=None, power=1.0, **given):
     """A finished fit as `_candidates` sees it."""
     n = len(spectra)
-    sources = [Extended(position_px=(1, 1))] * n if sources is None else sources
+    sources = [ExtendedSource(position_px=(1, 1))] * n if sources is None else sources
     return SimpleNamespace(
         **{
-            "settings": SimpleNamespace(learns=True),
-            "findings": 1,
+            "settings": SimpleNamespace(has_multiscale_prior=True),
+            "strength_estimates": 1,
             "losses": [3.0, 2.0],
             "fitted": np.arange(n),
             "start": SimpleNamespace(source=np.arange(n)),
             "blend": SimpleNamespace(sources=sources),
             "ties": None,
             "state": SimpleNamespace(spectra=np.array(spectra, float)),
-            "scene": SimpleNamespace(power=np.full((n, 2), power)),
+            "scene": SimpleNamespace(spectrum_curvature=np.full((n, 2), power)),
         }
         | given
     )
@@ -42,30 +42,35 @@ def fitted(spectra, sources=None, power=1.0, **given):
 def test_who_is_asked_for_a_gradient():
     """Sources above signal to noise 30 in more than one channel, whose components are open."""
     spectra = [(24, 18.1), (24, 17.9), (90, 0), (90, 1), (24, 18)]
-    assert gradients._candidates(fitted(spectra)).tolist() == [0, 3]
-    assert gradients._candidates(fitted(spectra, power=0.25)).tolist() == [3]
+    assert colour_gradient._candidates(fitted(spectra)).tolist() == [0, 3]
+    assert colour_gradient._candidates(fitted(spectra, power=0.25)).tolist() == [3]
     kinds = [
-        Point(position_px=(1, 1)),
-        Extended(position_px=(1, 1), n_components=1),
-        Extended(position_px=(1, 1), profile=np.ones((3, 3))),
-        Extended(position_px=(1, 1)),
+        PointSource(position_px=(1, 1)),
+        ExtendedSource(position_px=(1, 1), n_components=1),
+        ExtendedSource(position_px=(1, 1), profile=np.ones((3, 3))),
+        ExtendedSource(position_px=(1, 1)),
     ]
-    assert gradients._candidates(fitted([(90, 90)] * 4, kinds)).tolist() == [3]
+    assert colour_gradient._candidates(fitted([(90, 90)] * 4, kinds)).tolist() == [3]
     for given in (
-        {"settings": SimpleNamespace(learns=False)},
-        {"findings": None},
+        {"settings": SimpleNamespace(has_multiscale_prior=False)},
+        {"strength_estimates": None},
         {"losses": [2.0, np.nan]},
     ):
-        assert gradients._candidates(fitted(spectra, **given)).tolist() == []
-    assert gradients.ask([fitted(spectra, findings=None)] * 2) == [None, None]
+        assert colour_gradient._candidates(fitted(spectra, **given)).tolist() == []
+    assert colour_gradient.run_gradient_tests([fitted(spectra, strength_estimates=None)] * 2) == [
+        None,
+        None,
+    ]
 
 
 def test_a_gradient_needs_two_channels():
     values, precision, spectrum = np.array([3.0, -3.0]), np.array([4.0, 4.0]), np.array([5.0, 5.0])
-    assert np.isfinite(gain(values, precision, spectrum))
-    assert gain(values, np.array([4.0, 0.0]), spectrum) == -np.inf
+    assert np.isfinite(log_evidence_ratio(values, precision, spectrum))
+    assert log_evidence_ratio(values, np.array([4.0, 0.0]), spectrum) == -np.inf
     third = [np.append(a, v) for a, v in ((values, 9.0), (precision, 0.0), (spectrum, 1.0))]
-    assert gain(*third) == gain(values, precision, spectrum)  # one that sees nothing
+    assert log_evidence_ratio(*third) == log_evidence_ratio(
+        values, precision, spectrum
+    )  # one that sees nothing
 
 
 @pytest.mark.parametrize("noise", [0.7, 3.0])
@@ -81,12 +86,12 @@ def test_evidence_is_asked_of_whitened_residuals(noise):
         parts.append(part)
         n = part.stop - part.start
         images = [rng.random((n, *size)) for size in ((6, 7), (5, 6), (5, 6))]
-        observed.append(Rendered((3, n, *shape), low, images))
+        observed.append(ComponentImages((3, n, *shape), low, images))
         whole = np.asarray(observed[-1])
         root = rng.uniform(0.5, 1.5, (n, *shape))
         model = np.einsum("ic,icyx->cyx", spectra[:, part], whole[:2]) + sky[part, None, None]
         rest = noise * rng.normal(size=root.shape)
-        views.append(SimpleNamespace(root=root, data=model + rest / root))
+        views.append(SimpleNamespace(sqrt_weights=root, data=model + rest / root))
         whitened = whole * root
         slope[:, part] = np.einsum("icyx,cyx->ic", whitened, rest)
         power[:, part] = np.einsum("icyx,icyx->ic", whitened, whitened)
@@ -100,12 +105,12 @@ def test_evidence_is_asked_of_whitened_residuals(noise):
         ties=None,
     )
     seen = SimpleNamespace(observed=observed, covariance=covariance)
-    asked = gradients._asked(fit, np.array([1]), seen)
+    asked = colour_gradient._asked(fit, np.array([1]), seen)
     core = np.einsum("cj,jc->c", covariance[:, 2], slope)
     precision = 1 / covariance[:, 2, 2] / max(chi2 / light, 1)
     flux = np.maximum(spectra[1], 1 / np.sqrt(power[1]))
-    assert asked.evidence == pytest.approx(gain(core, precision, flux), rel=1e-10)
-    assert asked.which.tolist() == [1] and (chi2 / light > 1) == (noise > 1)
+    assert asked.evidence == pytest.approx(log_evidence_ratio(core, precision, flux), rel=1e-10)
+    assert asked.components.tolist() == [1] and (chi2 / light > 1) == (noise > 1)
     np.testing.assert_allclose(asked.power, power[[2]])
     for rendered, bare in zip(observed, asked.observed, strict=True):
         np.testing.assert_array_equal(np.asarray(bare), np.asarray(rendered)[:2])
@@ -116,11 +121,11 @@ def test_what_neighbours_leave_nothing_of_is_not_seen():
     slope, power = np.ones((2, 2)), np.full((2, 2), 4.0)
     covariance = np.zeros((2, 2, 2))
     covariance[:, 1, 1] = 1 / (1.1 * 4e-6), 1 / (0.9 * 4e-6)
-    values, precision = gradients._eliminated(covariance, slope, power, 1)
+    values, precision = colour_gradient._eliminated(covariance, slope, power, 1)
     np.testing.assert_allclose(precision, [[4.4e-6, 0]])
     np.testing.assert_allclose(values, [[1 / 4.4e-6, 0]])
     covariance[:, 1, 1] = np.inf, 0.25
-    values, precision = gradients._eliminated(covariance, slope, power, 1)
+    values, precision = colour_gradient._eliminated(covariance, slope, power, 1)
     np.testing.assert_allclose([values[0], precision[0]], [[0, 0.25], [0, 4]])
 
 
@@ -128,7 +133,7 @@ def ended(n, losses, *, energies=0.0, findings=True, fixed=()):
     """A finished fit of n components in three channels."""
     found = SimpleNamespace(energies=np.full((n, 2), energies), strengths=np.full((n, 2), 0.5))
     return SimpleNamespace(
-        findings=found if findings else None,
+        strength_estimates=found if findings else None,
         state=SimpleNamespace(morph=[0] * n, spectra=np.zeros((n, 3))),
         scene=SimpleNamespace(fixed=np.isin(np.arange(n), fixed)),
         ties=None,
@@ -140,17 +145,19 @@ def ended(n, losses, *, energies=0.0, findings=True, fixed=()):
 def test_more_components_must_lower_the_loss_by_what_their_numbers_cost():
     """A unit each for three fluxes and a profile's four numbers; and fit the data better."""
     one = ended(2, [200, 100.0])
-    assert second._is_better(ended(3, [150, 92.9]), one)
-    assert not second._is_better(ended(3, [150, 93.0]), one)
-    assert second._is_better(ended(4, [150, 85.9]), one)
-    assert not second._is_better(ended(4, [150, 86.1]), one)
-    assert not second._is_better(ended(3, [150, 50.0], findings=False), one)
+    assert two_component_fit._is_better(ended(3, [150, 92.9]), one)
+    assert not two_component_fit._is_better(ended(3, [150, 93.0]), one)
+    assert two_component_fit._is_better(ended(4, [150, 85.9]), one)
+    assert not two_component_fit._is_better(ended(4, [150, 86.1]), one)
+    assert not two_component_fit._is_better(ended(3, [150, 50.0], findings=False), one)
     # 20 of 100 are structure's: half of 0.25^-1 of two scales of two components
     stiff = ended(2, [200, 100.0], energies=2.5)
-    assert second._half_chi2(stiff) == pytest.approx(80)
-    assert not second._is_better(ended(3, [150, 81.0]), stiff)
-    assert second._is_better(ended(3, [150, 80.0]), stiff)
-    assert second._half_chi2(ended(2, [1, 100.0], energies=2.5, fixed=(0,))) == pytest.approx(90)
+    assert two_component_fit._half_chi2(stiff) == pytest.approx(80)
+    assert not two_component_fit._is_better(ended(3, [150, 81.0]), stiff)
+    assert two_component_fit._is_better(ended(3, [150, 80.0]), stiff)
+    assert two_component_fit._half_chi2(
+        ended(2, [1, 100.0], energies=2.5, fixed=(0,))
+    ) == pytest.approx(90)
 
 
 def test_each_scene_keeps_its_second_fit_where_that_is_better(monkeypatch):
@@ -158,10 +165,10 @@ def test_each_scene_keeps_its_second_fit_where_that_is_better(monkeypatch):
     firsts = [named(k, shifts=float(k)) for k in range(5)]
     again = {k: named(10 + k, shifts=9.0, of=firsts[k]) for k in (0, 1, 3, 4)}
     again[4].status = INTERRUPTED
-    monkeypatch.setattr(second, "begun", lambda fits: again)
-    monkeypatch.setattr(second, "iterate", lambda *given: None)
-    monkeypatch.setattr(second, "_is_better", lambda new, old, more=0: new.name != 11)
-    kept = second.with_second(firsts, Settings(), None, None)
+    monkeypatch.setattr(two_component_fit, "start_refits", lambda fits: again)
+    monkeypatch.setattr(two_component_fit, "iterate", lambda *given: None)
+    monkeypatch.setattr(two_component_fit, "_is_better", lambda new, old, more=0: new.name != 11)
+    kept = two_component_fit.refit_two_components(firsts, Settings(), None, None)
     assert [one.name for one in kept] == [10, 1, 2, 13, 4]
     assert [one.at["shifts"] for one in firsts] == [9, 1, 2, 9, 4]
     assert [one.status == INTERRUPTED for one in kept] == [False] * 4 + [True]
@@ -170,8 +177,8 @@ def test_each_scene_keeps_its_second_fit_where_that_is_better(monkeypatch):
 def test_progress_goes_on_from_the_first_fits():
     told = []
     fits = [SimpleNamespace(losses=[1] * n) for n in (7, 12)]
-    second._after(fits, lambda n, loss: told.append((n, loss)))(5, 0.5)
-    assert told == [(17, 0.5)] and second._after(fits, None) is None
+    two_component_fit._after(fits, lambda n, loss: told.append((n, loss)))(5, 0.5)
+    assert told == [(17, 0.5)] and two_component_fit._after(fits, None) is None
 
 
 def test_morphologies_are_followed_by_the_cores_that_are_asked_about():
@@ -185,11 +192,15 @@ def test_morphologies_are_followed_by_the_cores_that_are_asked_about():
         padded=SimpleNamespace(shape=(40, 41)),
         views=["a", "b"],
     )
-    model = gradients.model_of(fit, [2, 0])
-    assert model.frame == (40, 41) and model.views == ["a", "b"] and model.bare == [None, None]
+    model = colour_gradient.model_of(fit, [2, 0])
+    assert (
+        model.frame == (40, 41)
+        and model.views == ["a", "b"]
+        and model.unfiltered_views == [None, None]
+    )
     assert model.source.tolist() == [0, 0, 1, 1, 0]
     assert model.origin.tolist() == [[1, 2], [3, 4], [5, 6], [5, 6], [1, 2]]
     assert model.morphs[:3] == morphs and len(model.morphs) == 5
     np.testing.assert_array_equal(model.morphs[3], morphs[2] * profile[2])
     np.testing.assert_array_equal(model.morphs[4], morphs[0] * profile[0])
-    assert len(gradients.model_of(fit).morphs) == 3
+    assert len(colour_gradient.model_of(fit).morphs) == 3

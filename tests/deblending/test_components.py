@@ -10,18 +10,22 @@ from scipy.stats import multivariate_normal
 from clresample.deblending import batch
 from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.blend import INTERRUPTED, Blend
-from clresample.deblending.components import gradients, second, second_start
-from clresample.deblending.components.gradients import GRADIENT, _eliminated, gain
-from clresample.deblending.profiles import moment, profile
+from clresample.deblending.profiles import profile, psf_second_moment
+from clresample.deblending.refit import colour_gradient, two_component_fit, two_component_start
+from clresample.deblending.refit.colour_gradient import (
+    CORE_COLOUR_SCATTER,
+    _eliminated,
+    log_evidence_ratio,
+)
 from clresample.deblending.settings import Settings
-from clresample.deblending.solver.learned.engine import LearnedEngine
-from clresample.deblending.solver.learned.prior import LearnedPrior
-from clresample.deblending.solver.learned.progress import Progress
+from clresample.deblending.solver.multiscale.engine import MultiscaleEngine
+from clresample.deblending.solver.multiscale.lbfgs_control import LbfgsControl
+from clresample.deblending.solver.multiscale.prior import MultiscalePrior
 from clresample.measurement.catalogue import catalogue
 from clresample.resampling.resampler import Resampler
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
-from clresample.sky.sources import Extended
+from clresample.sky.sources import ExtendedSource
 
 PSFS = PSF.gaussian(0.9, n_pixels=19, n_bands=2), PSF.gaussian(1.1, n_pixels=15, n_bands=3)
 NOISE = 0.05
@@ -36,7 +40,11 @@ def galaxy(place, parts, flux=20.0):
     out = 0.0
     for sigma, spectrum in parts:
         shape = np.array([np.log(sigma), 0.1, -0.1, np.log(4.0)])
-        out = out + spectrum[:, None, None] * profile(shape, place, SHAPE, moment(MODEL_PSF))[0]
+        out = (
+            out
+            + spectrum[:, None, None]
+            * profile(shape, place, SHAPE, psf_second_moment(MODEL_PSF))[0]
+        )
     return flux * out
 
 
@@ -126,18 +134,18 @@ def test_a_second_fit_begins_with_what_the_first_leaves(two, device, monkeypatch
 
     def asked(fits):
         pairs.append(list(fits))
-        return gradients.ask(fits)
+        return colour_gradient.run_gradient_tests(fits)
 
     def chosen(starts, fit_sky):
         pairs.append(starts[0])
         return [starts[0][which]]
 
-    monkeypatch.setattr(second_start, "ask", asked)
-    monkeypatch.setattr(second_start, "_best", chosen)
-    monkeypatch.setattr(second, "iterate", lambda *given: None)
+    monkeypatch.setattr(two_component_start, "run_gradient_tests", asked)
+    monkeypatch.setattr(two_component_start, "_best", chosen)
+    monkeypatch.setattr(two_component_fit, "iterate", lambda *given: None)
     deblend(b.observations, b.sources, frame=b.frame, device=device)
     (first,), new = pairs[0], pairs[1][which]
-    engine = LearnedEngine([new.scene], [new.state], device, np.float32, LearnedPrior(), 1.0)
+    engine = MultiscaleEngine([new.scene], [new.state], device, np.float32, MultiscalePrior(), 1.0)
     found, known = engine.states()[0], first.state.learned
     for k, morph in enumerate(found.morph):
         wanted = first.state.morph[kept[k]] if k in kept else new.scene.profile[k]
@@ -153,12 +161,12 @@ def test_what_gains_nothing_is_not_kept(device, monkeypatch, taken_over):
     """The first fit comes back, as it was; one that was taken over before its end goes on to it."""
     b, _ = blend()
     if not taken_over:
-        monkeypatch.setattr(batch, "asks_for_more", lambda fit: False)
+        monkeypatch.setattr(batch, "needs_second_component", lambda fit: False)
     given = {"frame": b.frame, "device": device}
-    monkeypatch.setattr(gradients, "CLEAR", np.inf)
+    monkeypatch.setattr(colour_gradient, "MIN_LOG_EVIDENCE", np.inf)
     plain = deblend(b.observations, b.sources, **given)
-    monkeypatch.setattr(gradients, "CLEAR", -np.inf)
-    monkeypatch.setattr(second, "LEAST_GAIN", np.inf)
+    monkeypatch.setattr(colour_gradient, "MIN_LOG_EVIDENCE", -np.inf)
+    monkeypatch.setattr(two_component_fit, "MIN_GAIN", np.inf)
     tried = deblend(b.observations, b.sources, **given)
     assert tried.seconds["components"] > plain.seconds["components"]
     assert counts(tried) == [1, 1] and tried.status == plain.status
@@ -172,7 +180,7 @@ def test_what_gains_nothing_is_not_kept(device, monkeypatch, taken_over):
 
 def test_ctrl_c_in_the_second_fit_leaves_the_first(device, monkeypatch):
     b, _ = blend()
-    judge, n_fits = Progress.judge, []
+    judge, n_fits = LbfgsControl.accept_trials, []
 
     def interrupted(self, loss, slope):
         if not self.n_rounds.any():
@@ -181,7 +189,7 @@ def test_ctrl_c_in_the_second_fit_leaves_the_first(device, monkeypatch):
             raise KeyboardInterrupt
         return judge(self, loss, slope)
 
-    monkeypatch.setattr(Progress, "judge", interrupted)
+    monkeypatch.setattr(LbfgsControl, "accept_trials", interrupted)
     result = deblend(b.observations, b.sources, frame=b.frame, device=device)
     assert result.status == INTERRUPTED and counts(result) == [1, 1]
 
@@ -192,7 +200,7 @@ def test_a_second_fit_that_fails_leaves_the_first(device, monkeypatch):
     def fails(*args, **given):
         raise MemoryError("too large")
 
-    monkeypatch.setattr(second_start, "start", fails)
+    monkeypatch.setattr(two_component_start, "fit_start_profiles", fails)
     result = deblend(b.observations, b.sources, frame=b.frame, device=device)
     assert result.status == "misfit" and counts(result) == [1, 1]  # one component is not enough
     assert any("too large" in line for line in result.messages)
@@ -203,10 +211,15 @@ def test_evidence_is_that_of_normal_distributions():
     rng, n_channels, wide = np.random.default_rng(3), 5, 300.0
     a, precision = rng.uniform(0.5, 2, n_channels), rng.uniform(5, 50, n_channels)
     values = rng.normal(size=n_channels)
-    both = [np.diag(1 / precision + (g * a) ** 2) + wide**2 * np.outer(a, a) for g in (GRADIENT, 0)]
+    both = [
+        np.diag(1 / precision + (g * a) ** 2) + wide**2 * np.outer(a, a)
+        for g in (CORE_COLOUR_SCATTER, 0)
+    ]
     one, none = (multivariate_normal(np.zeros(n_channels), c).logpdf(values) for c in both)
-    assert gain(values, precision, a) == pytest.approx(one - none, abs=1e-3)
-    assert gain(values[:1], precision[:1], a[:1]) == -np.inf  # one channel has no colour
+    assert log_evidence_ratio(values, precision, a) == pytest.approx(one - none, abs=1e-3)
+    assert (
+        log_evidence_ratio(values[:1], precision[:1], a[:1]) == -np.inf
+    )  # one channel has no colour
 
 
 def test_what_is_eliminated_is_least_squares():
@@ -225,4 +238,4 @@ def test_what_is_eliminated_is_least_squares():
 @pytest.mark.parametrize("n", [0, -1])
 def test_numbers_that_cannot_be(n):
     with pytest.raises(ValueError, match=f"n_components is {n}"):
-        Extended(position_px=(1, 1), n_components=n)
+        ExtendedSource(position_px=(1, 1), n_components=n)

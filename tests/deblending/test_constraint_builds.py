@@ -14,11 +14,11 @@ from clresample.deblending.solver.boxes import ALIGN, Boxes
 from clresample.deblending.solver.constraints import (
     L0,
     L1,
-    Chain,
     MaxNorm,
     Monotone,
     MonotoneProjection,
     Positivity,
+    ProxChain,
     SumNorm,
     Symmetry,
 )
@@ -179,7 +179,7 @@ def test_what_norms_leave_alone(in_groups):
     four = Boxes(boxes.scene[:4], boxes.origin[:4], boxes.shape[:4], boxes.center[:4])
 
     def check(device):
-        for prox in (SumNorm(), MaxNorm(), Chain(SumNorm(), MaxNorm())):
+        for prox in (SumNorm(), MaxNorm(), ProxChain(SumNorm(), MaxNorm())):
             factor = device.put(np.full(4, 7, np.float32))
             found = apply(device, prox, four, images, factor=factor, active=[0, 1, 3])
             np.testing.assert_array_equal(found, images)

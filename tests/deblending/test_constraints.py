@@ -10,12 +10,12 @@ from clresample.deblending.solver.boxes import Boxes
 from clresample.deblending.solver.constraints import (
     L0,
     L1,
-    Chain,
     MaxNorm,
     Monotone,
     MonotoneProjection,
     MonotoneWeights,
     Positivity,
+    ProxChain,
     SumNorm,
     Symmetry,
 )
@@ -42,12 +42,12 @@ CASES = {
     "symmetry": (Symmetry(), lambda x, c: ref.symmetry(x, c)),
     "half symmetry": (Symmetry(0.5), lambda x, c: ref.symmetry(x, c, 0.5)),
     "chain": (
-        Chain(Positivity(), Symmetry(), Chain(Monotone(gradient=0.1), L1(0.2)), MaxNorm()),
+        ProxChain(Positivity(), Symmetry(), ProxChain(Monotone(gradient=0.1), L1(0.2)), MaxNorm()),
         lambda x, c: ref.max_norm(
             ref.l1(ref.monotone_sweep(ref.symmetry(ref.positivity(x), c), c, gradient=0.1), 0.06)
         )[0],
     ),
-    "nine steps": (Chain(*[L1(0.1)] * 9), lambda x, c: ref.l1(x, 9 * 0.3 * 0.1)),
+    "nine steps": (ProxChain(*[L1(0.1)] * 9), lambda x, c: ref.l1(x, 9 * 0.3 * 0.1)),
 }
 
 
@@ -142,7 +142,7 @@ def test_check_sees_expansion_alone():
 
 
 @pytest.mark.parametrize(
-    "prox", [Chain(Positivity(), Monotone()), MonotoneProjection(n_iterations=3), MaxNorm()]
+    "prox", [ProxChain(Positivity(), Monotone()), MonotoneProjection(n_iterations=3), MaxNorm()]
 )
 @pytest.mark.parametrize("active", [[1, 4], np.arange(10) % 3 == 1, []])
 def test_others_are_left_alone(device, boxes, prox, active):
@@ -159,7 +159,7 @@ def test_parameters_per_source(device, boxes):
     kinds = np.array([MonotoneWeights(i % 4) for i in range(10)])
     gradient = np.linspace(0, 0.3, 10)
     strength = np.arange(10) % 2 * 0.3
-    prox = Chain(L1(strength), Monotone(weights=kinds, gradient=gradient))
+    prox = ProxChain(L1(strength), Monotone(weights=kinds, gradient=gradient))
     found = apply(device, prox, boxes, images)
     for i, (image, center) in enumerate(zip(images, boxes.center, strict=True)):
         want = ref.l1(image, strength[i])
@@ -173,8 +173,8 @@ def test_factors_keep_the_model(device, boxes):
     images = [abs(image) + 0.1 for image in morphologies(boxes, np.float32)]
     images[3][:] = 0
     for prox in (
-        Chain(SumNorm(), MaxNorm()),
-        Chain(SumNorm(), MonotoneProjection(weights=MonotoneWeights.OFF), MaxNorm()),
+        ProxChain(SumNorm(), MaxNorm()),
+        ProxChain(SumNorm(), MonotoneProjection(weights=MonotoneWeights.OFF), MaxNorm()),
     ):
         factor = device.put(np.full(10, 7, np.float32))
         found = apply(device, prox, boxes, images, factor=factor, active=np.arange(9))

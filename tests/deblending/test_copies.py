@@ -13,14 +13,14 @@ from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.blend import Blend, Failure
 from clresample.deblending.result import Result
 from clresample.deblending.settings import Settings
-from clresample.deblending.solver.constraints import Chain, Monotone, Positivity
+from clresample.deblending.solver.constraints import Monotone, Positivity, ProxChain
 from clresample.resampling.paper.resampler import PaperResampler
 from clresample.resampling.tiled.resampler import TiledResampler
 from clresample.sky.grid import Grid
 from clresample.sky.psf import PSF
-from clresample.sky.sources import Extended
+from clresample.sky.sources import ExtendedSource
 
-SOURCES = tuple(Extended(position_px=position) for position, _, _ in GALAXIES)
+SOURCES = tuple(ExtendedSource(position_px=position) for position, _, _ in GALAXIES)
 ways = pytest.mark.parametrize(
     "way", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))], ids=["copied", "pickled"]
 )
@@ -70,7 +70,7 @@ def test_tiled_operators(device, way):
 
 @ways
 def test_settings_that_were_used_and_results(device, way):
-    chain = Chain(Positivity(), Monotone())
+    chain = ProxChain(Positivity(), Monotone())
     settings = Settings(max_iter=6, prior=None, constraints=chain)
     first = deblend(observe(), SOURCES, settings=settings, device=device)
     again = deblend(observe(), SOURCES, settings=way(settings), device=device)
@@ -118,13 +118,13 @@ def test_a_bad_blend_harms_no_other(device):
     [
         ({"max_iter": 1.5}, "max_iter is 1.5, must be a whole number"),
         ({"max_iter": True}, "max_iter is True"),
-        ({"tol": np.nan}, "tol is nan"),
-        ({"tol": "a"}, "tol must be an array of real numbers"),
-        ({"enough": np.nan}, "enough is nan"),
-        ({"flux_floor": None}, "flux_floor"),
+        ({"rel_tol": np.nan}, "rel_tol is nan"),
+        ({"rel_tol": "a"}, "rel_tol must be an array of real numbers"),
+        ({"loss_tol": np.nan}, "loss_tol is nan"),
+        ({"flux_error_floor": None}, "flux_error_floor"),
         ({"fit_sky": 1}, "fit_sky is 1"),
         ({"prior": 3}, "prior is 3"),
-        ({"constraints": Positivity()}, "constraints is .* must be Chain"),
+        ({"constraints": Positivity()}, "constraints is .* must be ProxChain"),
         ({"step_sizes": 0.1}, "step_sizes is 0.1"),
     ],
 )

@@ -4,7 +4,17 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
-from clresample import PSF, Blend, Frame, Grid, Observation, Point, Settings, deblend_many, fluxes
+from clresample import (
+    PSF,
+    Blend,
+    Frame,
+    Grid,
+    Observation,
+    PointSource,
+    Settings,
+    deblend_many,
+    fluxes,
+)
 from clresample.files.results import read_result, write_result
 from clresample.measurement.quality import summary
 from clresample.sky.correlation import NoiseCorrelation
@@ -26,7 +36,7 @@ def observation(rng, noise):
 def fitted(noise, n=80):
     rng = np.random.default_rng(7)
     frame = Frame(Grid.flat((N, N), 0.2), PSF.gaussian(0.8))
-    star = Point(position_px=(20.0, 20.0), free=False)
+    star = PointSource(position_px=(20.0, 20.0), free_position=False)
     blends = [Blend((observation(rng, noise),), (star,), frame) for _ in range(n)]
     return deblend_many(blends, settings=Settings(max_iter=5))
 

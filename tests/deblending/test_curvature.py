@@ -9,10 +9,10 @@ from clresample import get_device
 from clresample.deblending.settings import Settings
 from clresample.deblending.solver import curvature as module
 from clresample.deblending.solver.curvature import damping
-from clresample.deblending.solver.prior import Prior
+from clresample.deblending.solver.prior import SingleScalePrior
 
 
-@pytest.mark.parametrize("prior", [Prior(), None])
+@pytest.mark.parametrize("prior", [SingleScalePrior(), None])
 def test_damping_bounds_the_hessian_and_is_no_larger_than_it_must_be(prior, monkeypatch):
     monkeypatch.setattr(module, "NOISE_GRADIENT", np.inf)  # the bound alone
     scene, state = posed(get_device(), boxes=BOXES[:1])
@@ -30,9 +30,9 @@ def test_damping_bounds_the_hessian_and_is_no_larger_than_it_must_be(prior, monk
 
 def test_damping_falls_where_the_start_is_far_from_the_data():
     scene, state = posed(get_device(), boxes=BOXES[:1])
-    near = damping(scene, state, Prior())[0]
+    near = damping(scene, state, SingleScalePrior())[0]
     far = changed(scene, state, data=[d + 1e4 for d in scene.data])
-    assert damping(*far, Prior())[0] < 1e-3 * near
+    assert damping(*far, SingleScalePrior())[0] < 1e-3 * near
 
 
 @pytest.mark.parametrize("flux", [10, 100])

@@ -15,7 +15,7 @@ from clresample.resampling.resampler import Resampler
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
-from clresample.sky.varying.field import FunctionPSF
+from clresample.sky.varying_psf.field import FunctionPSF
 
 GRID = Grid.flat((60, 70), SCALE)
 

@@ -14,14 +14,14 @@ from clresample.deblending.fit import Fit
 from clresample.deblending.result import Result
 from clresample.deblending.settings import Settings
 from clresample.deblending.solver.engine import Engine
-from clresample.deblending.solver.prior import Prior
+from clresample.deblending.solver.prior import SingleScalePrior
 from clresample.device.discovery import DeviceError
 from clresample.sky.frame import Frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
-from clresample.sky.sources import Extended
+from clresample.sky.sources import ExtendedSource
 
-SETTINGS = Settings(prior=Prior(), max_iter=30, tol=0)
+SETTINGS = Settings(prior=SingleScalePrior(), max_iter=30, rel_tol=0)
 
 
 def fit(b, device, settings=SETTINGS, **given):
@@ -34,9 +34,9 @@ def failing():
     o = good.observations[0]
     nan = Observation(np.nan * o.data, o.psf, o.grid, weights=o.weights, channels=o.channels)
     far = Frame(Grid.flat((30, 36), 0.1, center_arcsec=(60, 0)), frame().psf)
-    ring = Extended(position_px=(15, 18), profile=np.ones((4, 4)))
+    ring = ExtendedSource(position_px=(15, 18), profile=np.ones((4, 4)))
     return [
-        (replace(good, sources=(Extended(position_px=(99, 3)),)), "none of the 1 sources"),
+        (replace(good, sources=(ExtendedSource(position_px=(99, 3)),)), "none of the 1 sources"),
         (replace(good, sources=()), "sources"),
         (replace(good, observations=(nan,)), "no observed pixel on the model frame has a weight"),
         (replace(good, observations=()), "observations is empty"),

@@ -13,7 +13,7 @@ from clresample.sky.frame import model_frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
-from clresample.sky.sources import Point
+from clresample.sky.sources import PointSource
 
 N_NOISE = 200  # realisations of the blend of stars
 SEEDS = range(6)
@@ -44,7 +44,7 @@ def test_flux_errors_of_blended_stars_are_honest():
         images[name] = np.array([[star(grid, s, p) for p in positions] for s in sigmas])
         channels += bands
     truth = rng.uniform(50, 150, (len(positions), len(channels)))  # [counts], noise 1
-    blends, sources = [], tuple(Point(sky_deg=p) for p in positions)
+    blends, sources = [], tuple(PointSource(sky_deg=p) for p in positions)
     for _ in range(N_NOISE):
         observations, first = [], 0
         for name, (grid, sigmas, bands) in instruments.items():

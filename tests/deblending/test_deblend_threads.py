@@ -8,7 +8,7 @@ from helpers.scenes import GALAXIES, observe
 
 from clresample.deblending.batch import deblend
 from clresample.deblending.settings import Settings
-from clresample.sky.sources import Extended
+from clresample.sky.sources import ExtendedSource
 
 N_THREADS = 3
 
@@ -19,7 +19,7 @@ def test_fits_in_threads_are_those_alone(device, prior, fit_shifts):
     given = {} if prior else {"prior": None}
     settings = Settings(max_iter=25, fit_shifts=fit_shifts, **given)
     seen = [observe(seed=i) for i in range(N_THREADS)]
-    sources = [Extended(position_px=position) for position, _, _ in GALAXIES]
+    sources = [ExtendedSource(position_px=position) for position, _, _ in GALAXIES]
 
     def fit(i):
         return deblend(seen[i], sources, settings=settings, device=device)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clresample.deblending import batch, fit as fit_module
-from clresample.deblending.batch import _ManyFits
+from clresample.deblending.batch import _BatchRunner
 from clresample.deblending.blend import Failure
 from clresample.deblending.fit import Fit
 
@@ -21,8 +21,8 @@ class Named(SimpleNamespace):
 
 
 def many_of(names, monkeypatch, *, memory=100, **sizes):
-    """_ManyFits on their way and the group (index, Fit) of these names."""
-    many = object.__new__(_ManyFits)
+    """_BatchRunner on their way and the group (index, Fit) of these names."""
+    many = object.__new__(_BatchRunner)
     many.blends, many.done, many.memory = list(names), [None] * len(names), memory
     many.settings = many.device = many.dtype = None
     many.warned = {}
@@ -33,7 +33,7 @@ def many_of(names, monkeypatch, *, memory=100, **sizes):
                 name=name,
                 blend=name,
                 status="going",
-                dark=[1] * (name == "dim"),
+                undetected=[1] * (name == "dim"),
                 problems=[],
                 settings=None,
             ),
@@ -49,10 +49,12 @@ def many_of(names, monkeypatch, *, memory=100, **sizes):
                 fit.status = "interrupted"
 
     calls = []
-    monkeypatch.setattr(batch, "begin", stop)
+    monkeypatch.setattr(batch, "start_fits", stop)
     monkeypatch.setattr(batch, "iterate", stop)
-    monkeypatch.setattr(batch, "with_second", lambda fits, *_: calls.append(len(fits)) or fits)
-    monkeypatch.setattr(batch, "finish", lambda fits: [f"seen {len(fits)}"] * len(fits))
+    monkeypatch.setattr(
+        batch, "refit_two_components", lambda fits, *_: calls.append(len(fits)) or fits
+    )
+    monkeypatch.setattr(batch, "render_fits", lambda fits: [f"seen {len(fits)}"] * len(fits))
     monkeypatch.setattr(batch, "scene_bytes", lambda fit: sizes.get(fit.name, 1))
     return many, group, calls
 
@@ -102,9 +104,9 @@ def going(status="iteration limit"):
     """A fit on its way at shift 1, whose best state so far is of loss 5 at shift 0."""
     one = object.__new__(Fit)
     one.views = [SimpleNamespace(op=SimpleNamespace(shift=np.zeros(2))) for _ in range(2)]
-    one.losses, one.status, one.settings = [9.0], status, SimpleNamespace(tol=1e-3)
-    one._best = fit_module._Best(np.inf, None, None, one.shifts)
-    one.remember(5.0, "best scene", "best state")
+    one.losses, one.status, one.settings = [9.0], status, SimpleNamespace(rel_tol=1e-3)
+    one._best = fit_module._BestState(np.inf, None, None, one.shifts)
+    one.keep_best(5.0, "best scene", "best state")
     one.shift(np.ones((2, 2)))
     return one
 
@@ -121,7 +123,7 @@ def going(status="iteration limit"):
 )
 def test_a_fit_ends_with_its_best_state_and_the_shifts_of_that(loss, status, kept):
     one = going(status)
-    one.settle(loss, "present scene", "present state")
+    one.store_final(loss, "present scene", "present state")
     assert (one.scene, one.state) == (f"{kept} scene", f"{kept} state")
     assert one.losses == [9.0, loss if kept == "present" else 5.0]
     assert one.shifts.tolist() == [[float(kept == "present")] * 2] * 2
@@ -130,17 +132,17 @@ def test_a_fit_ends_with_its_best_state_and_the_shifts_of_that(loss, status, kep
 def test_only_better_states_are_remembered():
     one = going()
     for loss in (5.0, 6.0, np.nan):
-        one.remember(loss, "other scene", "other state")
-    one.settle(7.0, "present scene", "present state")
+        one.keep_best(loss, "other scene", "other state")
+    one.store_final(7.0, "present scene", "present state")
     assert one.state == "best state"
-    one.remember(4.0, "new scene", "new state")
+    one.keep_best(4.0, "new scene", "new state")
     one.shift(np.full((2, 2), 2.0))
-    one.settle(7.0, "present scene", "present state")
+    one.store_final(7.0, "present scene", "present state")
     assert one.state == "new state" and one.shifts.tolist() == [[0.0, 0.0]] * 2
     none = going("interrupted")
-    none._best = fit_module._Best(np.inf, None, None, none.shifts)
+    none._best = fit_module._BestState(np.inf, None, None, none.shifts)
     none.scene, none.state = "first scene", "first state"
-    none.settle(1.0, "present scene", "present state")
+    none.store_final(1.0, "present scene", "present state")
     assert none.state == "first state" and none.losses == [9.0]
 
 
@@ -150,7 +152,7 @@ def test_losses_that_come_in_say_whether_a_fit_goes_on():
     assert one.losses == [9.0, 8.0, 7.0] and one.status == "iteration limit"
     assert one.stopped(np.array([6.0, np.nan])) is True and one.status == "diverged"
     one.end("scene", "state", "findings", "converged")
-    assert (one.scene, one.state, one.findings) == ("scene", "state", "findings")
+    assert (one.scene, one.state, one.strength_estimates) == ("scene", "state", "findings")
     assert one.status == "converged"
 
 

@@ -7,8 +7,8 @@ import pytest
 from helpers.buffers import Guards
 from helpers.solver import BOXES, PRIOR, PSFS, changed, engine, posed, ragged
 
-from clresample.deblending.solver.constraints import Chain, Positivity
-from clresample.deblending.solver.engine import MOST_STEPS, Engine
+from clresample.deblending.solver.constraints import Positivity, ProxChain
+from clresample.deblending.solver.engine import MAX_STEPS, Engine
 from clresample.device.device import Device
 from clresample.device.tuning import Tuning
 
@@ -83,8 +83,8 @@ def test_only_losses_come_back(device, monkeypatch):
         for i in range(3):
             e.gradient(i)
             e.step()
-    with pytest.raises(ValueError, match=f"n_steps is {MOST_STEPS + 1}"):
-        e.run(MOST_STEPS + 1)
+    with pytest.raises(ValueError, match=f"n_steps is {MAX_STEPS + 1}"):
+        e.run(MAX_STEPS + 1)
 
 
 def test_a_new_box_size_builds_no_kernel(device, monkeypatch):
@@ -125,7 +125,7 @@ def test_another_update_takes_the_place_of_amsgrad(device):
     scene, state = posed(device, np.float32, fit_sky=False)
     settings = type("Steps", (), {"spectrum": 1e-4})
     e = Engine(
-        [scene], [state], device, np.float32, chain=Chain(Positivity()), prior=None,
+        [scene], [state], device, np.float32, chain=ProxChain(Positivity()), prior=None,
         step_sizes=settings, update=Descent,
     )  # fmt: skip
     losses = e.run(8)[:, 0]
@@ -138,14 +138,14 @@ def test_another_update_takes_the_place_of_amsgrad(device):
 
 def test_signatures_tell_what_can_share_a_batch(device):
     scene, state = posed(device)
-    assert scene.signature == posed(device, boxes=BOXES, seed=9, psfs=PSFS)[0].signature
+    assert scene.batch_key == posed(device, boxes=BOXES, seed=9, psfs=PSFS)[0].batch_key
     for other in (
         {"shape": (30, 37)},
         {"fit_sky": False},
         {"ops": scene.ops[::-1]},
         {"ops": scene.ops[:1]},
     ):
-        assert changed(scene, state, **other)[0].signature != scene.signature
+        assert changed(scene, state, **other)[0].batch_key != scene.batch_key
 
 
 def test_engines_leave_nothing_on_the_device(device):

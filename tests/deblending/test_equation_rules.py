@@ -7,9 +7,9 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from clresample.deblending.spectra import RIDGE
-from clresample.deblending.start import looking as room
-from clresample.deblending.start.equations import equations
-from clresample.deblending.start.looking import Looking
+from clresample.deblending.start import linearised_scenes as room
+from clresample.deblending.start.equations import normal_equations
+from clresample.deblending.start.linearised_scenes import LinearisedScenes
 
 N_SCENES, N_PIXELS = 3, 60
 # scene, index there, parameters, first and one-past-last pixel of its light, of each component;
@@ -40,14 +40,14 @@ class Sums:
             self.images[DARK] = 0
         self.whitened = 0
 
-    def see(self, slots, _images):
+    def render(self, slots, _images):
         self.slots, self.whitened = slots, 0
         self.at = [slots.numbers[i] for i in slots.order]
 
     def whiten(self):
         self.whitened += 1
 
-    def pairs(self):
+    def overlapping_pairs(self):
         """Of slots a <= b of a scene that share a pixel, as numbers, and the same."""
         lit = [self.images[i, 0].any(0) for i in self.at]
         n = range(len(lit))
@@ -59,7 +59,7 @@ class Sums:
         ]
         return np.array(found), np.array(found)
 
-    def compare(self, scenes, _slots, spectra, sky, error):
+    def compute_residuals(self, scenes, _slots, spectra, sky, error):
         model = sky[:, self.channels, None] * self.root
         for row, i in enumerate(self.at):
             model[PARTS[i][0]] += spectra[row, self.channels, None] * self.images[i, 0]
@@ -74,7 +74,7 @@ class Sums:
         weight = self.weight[[PARTS[self.at[a]][0] for a in table[:, 0]]]
         return np.einsum("xkcp,xcp,xlcp->xckl", own[table[:, 0]], weight, own[table[:, 1]])
 
-    def pull(self, n_images):
+    def residual_products(self, n_images):
         assert n_images <= self.slots.n_images.max()
         scene = [PARTS[i][0] for i in self.at]
         both = np.stack([self.residual[scene], self.root[scene]])
@@ -91,7 +91,7 @@ class Listed(SimpleNamespace):
 
 @pytest.fixture
 def posed(monkeypatch):
-    """Makes a Looking at Sums of scenes."""
+    """Makes a LinearisedScenes at Sums of scenes."""
 
     def slots(chosen, thetas, boxes, *, slopes):
         order = np.random.default_rng(3).permutation(len(chosen))
@@ -103,15 +103,15 @@ def posed(monkeypatch):
         )
 
     def made(fit_sky, scenes=SEEN, slopes=True):
-        monkeypatch.setattr(room, "Slots", slots)
+        monkeypatch.setattr(room, "ComponentBatch", slots)
         monkeypatch.setattr(room, "boxes_of", lambda chosen, thetas, t: t)
         components = [
             SimpleNamespace(scene=b, index=i, number=k) for k, (b, i, *_) in enumerate(PARTS)
         ]
         sights = [Sums(c, k) for k, c in enumerate(CHANNELS)]
-        one = Looking(components, sights, N_SCENES, None, None, None, fit_sky=fit_sky)
+        one = LinearisedScenes(components, sights, N_SCENES, None, None, None, fit_sky=fit_sky)
         thetas = [np.zeros(n) for _, _, n, *_ in PARTS]
-        one.look(scenes, thetas, 10.0 ** np.arange(6), slopes=slopes)
+        one.render(scenes, thetas, 10.0 ** np.arange(6), slopes=slopes)
         assert [s.whitened for s in sights] == [1, 1]
         return one
 
@@ -141,7 +141,7 @@ def test_spectra_are_each_scenes_least_squares(posed, fit_sky, error):
     one, rng = posed(fit_sky, slopes=False), np.random.default_rng(5)
     one.spectra[:], one.sky[:] = rng.uniform(0, 4, (6, 3)), rng.normal(size=(3, 3)) * fit_sky
     before = one.spectra.copy(), one.sky.copy()
-    chi2, wanted_chi2 = one.compare(error), np.zeros(2)
+    chi2, wanted_chi2 = one.compute_residuals(error), np.zeros(2)
     one.solve(error)
     assert one.normal.shape == (2, 3, 4, 4)
     for row, b in enumerate(SEEN):
@@ -193,8 +193,8 @@ def test_parameters_have_the_normal_equations_of_gauss_and_newton(posed, fit_sky
     one.spectra[:] = rng.uniform(0.1, 4, (6, 3)) / size
     one.sky[:] = rng.normal(size=(3, 3)) * fit_sky
     one.spectra[1, 2] = 0  # at its bound
-    one.compare(error)
-    normal, right = equations(one)
+    one.compute_residuals(error)
+    normal, right = normal_equations(one)
     for row, b in enumerate(SEEN):
         n_own = sum(part[0] == b for part in PARTS)
         matrix, side = np.zeros((4 * n_own,) * 2), np.zeros(4 * n_own)
@@ -255,12 +255,14 @@ def test_each_component_is_drawn_as_far_as_its_own_brightness_reaches(posed):
 def test_channels_of_observations_follow_each_other(monkeypatch, counts):
     """Each observation of all scenes in one Sight; of as many channels as their data have."""
     made = []
-    monkeypatch.setattr(room, "Sight", lambda *given: made.append(given) or SimpleNamespace())
-    monkeypatch.setattr(room, "Looking", lambda *given, fit_sky: given)
+    monkeypatch.setattr(
+        room, "SlotObservation", lambda *given: made.append(given) or SimpleNamespace()
+    )
+    monkeypatch.setattr(room, "LinearisedScenes", lambda *given, fit_sky: given)
     monkeypatch.setattr(room.Tuning, "of", lambda *given: given)
     op = SimpleNamespace(device="here", dtype="float32")
     views = [[SimpleNamespace(op=op, data=np.zeros((n, 4, 5))) for n in counts] for _ in range(2)]
-    room.looking_at(views, [], "precision", 0.1, fit_sky=True)
+    room.linearise(views, [], "precision", 0.1, fit_sky=True)
     ends = np.cumsum([0, *counts]).tolist()
     for k, (own, channels, *rest) in enumerate(made):
         assert own == [scene[k] for scene in views] and channels == slice(ends[k], ends[k + 1])

@@ -6,12 +6,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clresample.deblending.posterior import exposure as module, posterior as posterior_module
-from clresample.deblending.posterior.blocks import Blocks
-from clresample.deblending.posterior.exposure import Exposure, Transfer
-from clresample.deblending.posterior.normal import Layout
+from clresample.deblending.posterior import (
+    aligned_observation as module,
+    posterior as posterior_module,
+)
+from clresample.deblending.posterior.aligned_observation import (
+    AlignedObservation,
+    BandLimitedTransfer,
+)
+from clresample.deblending.posterior.block_matrix import BlockMatrix
+from clresample.deblending.posterior.normal import UnknownLayout
 from clresample.deblending.posterior.posterior import FAR_ERROR, Posterior
-from clresample.deblending.posterior.profile_modes import Beyond
+from clresample.deblending.posterior.profile_modes import OutsideBoxMoments
 from clresample.deblending.result import Component
 from clresample.deblending.settings import Settings
 from clresample.measurement.shapes import moments
@@ -19,7 +25,7 @@ from clresample.sky.psf import PSF
 
 
 def exposure(y, x, reach):
-    return Exposure(np.array(y, float), np.array(x, float), None, reach, None, None)
+    return AlignedObservation(np.array(y, float), np.array(x, float), None, reach, None, None)
 
 
 def test_a_window_holds_the_pixels_within_reach():
@@ -37,7 +43,9 @@ def test_few_modes_at_a_time_are_seen_as_all_at_once(monkeypatch):
     psf, rng = PSF.gaussian(1.2, n_pixels=25), np.random.default_rng(3)
     root, images = rng.uniform(1, 2, (1, 9, 11)), rng.standard_normal((5, 7, 8))
     place = np.arange(9) * 2.0, np.arange(11) * 2.0
-    one = Exposure(*place, root.astype("f4"), 4.0, Transfer(2.0 * np.eye(2), psf, psf), None)
+    one = AlignedObservation(
+        *place, root.astype("f4"), 4.0, BandLimitedTransfer(2.0 * np.eye(2), psf, psf), None
+    )
     found = []
     for size in (1, 2 * one.transfer.at((7, 8), 4.0)[2].size, 1 << 30):
         monkeypatch.setattr(module, "CACHED", size)
@@ -46,7 +54,7 @@ def test_few_modes_at_a_time_are_seen_as_all_at_once(monkeypatch):
     for other in found[1:]:
         np.testing.assert_allclose(other, found[0], atol=1e-5)
     monkeypatch.setattr(module, "CACHED", 1)
-    monkeypatch.setattr(module, "MANY", 1)
+    monkeypatch.setattr(module, "MIN_THREADED_ELEMENTS", 1)
     shared = replace(one, n_threads=3)
     again = shared.observe(images.astype("f4"), 0, np.array([3, 4]), (1, 2), (9, 10))
     np.testing.assert_array_equal(again, found[0])
@@ -54,27 +62,28 @@ def test_few_modes_at_a_time_are_seen_as_all_at_once(monkeypatch):
 
 def test_exposures_are_those_of_views_as_they_are(monkeypatch):
     """Of each observation with its own view; sources and shifts may be others at any time."""
-    monkeypatch.setattr(module.Exposure, "of", lambda *given: given)
+    monkeypatch.setattr(module.AlignedObservation, "of", lambda *given: given)
     blend, start = SimpleNamespace(observations=(1, 2)), SimpleNamespace(source=np.array([0, 2]))
     fit = SimpleNamespace(views=("a", "b"), blend=blend, start=start, frame="frame")
-    found = module.exposures_of(fit)
+    found = module.align_observations(fit)
     assert found == [("a", "frame", 1, start.source), ("b", "frame", 2, start.source)]
 
 
 def seen_as(monkeypatch, view, pixel):
-    """Rows, columns, root weights of a view's Exposure, whose band asks for pixels of `pixel`."""
+    """Rows, columns, root weights of a view's AlignedObservation, whose band asks for pixels of
+    `pixel`."""
     psf = PSF.gaussian(1.0, n_pixels=15)
-    view.shares, view.op.plans = None, [SimpleNamespace(psfs=(psf, psf))]
+    view.coefficients, view.op.plans = None, [SimpleNamespace(psfs=(psf, psf))]
     view.op.device = "device"
     monkeypatch.setattr(module, "host_threads", {"device": 5}.get)
     monkeypatch.setattr(module, "_transfer", lambda *_: SimpleNamespace(nyquist_px=pixel))
     observation = SimpleNamespace(psf=psf)
-    made = Exposure.of(view, SimpleNamespace(psf=psf), observation, np.zeros(1, int))
+    made = AlignedObservation.of(view, SimpleNamespace(psf=psf), observation, np.zeros(1, int))
     scale = np.sqrt(abs(np.linalg.det(view.mapping.matrix)))
     assert made.reach_px == pytest.approx(1.5 * psf.fwhm_px.max() * scale)
     few, many = (np.empty((n, 1 << 10)) for n in (1 << 10, (1 << 10) + 1))
     assert (made.threads_for(few), made.threads_for(many)) == (1, 5)
-    return made.y, made.x, made.root
+    return made.y, made.x, made.sqrt_weights
 
 
 @pytest.mark.parametrize(
@@ -86,7 +95,7 @@ def test_parallel_pixels_keep_their_weights(monkeypatch, matrix):
     root = np.arange(24.0).reshape(2, 3, 4)
     offset, shift = np.array([20.0, 30.0]), np.array([0.25, -0.5])
     mapping = SimpleNamespace(matrix=matrix, offset=offset, geometry="aligned")
-    view = SimpleNamespace(mapping=mapping, root=root, op=SimpleNamespace(shift=shift))
+    view = SimpleNamespace(mapping=mapping, sqrt_weights=root, op=SimpleNamespace(shift=shift))
     y, x, found = seen_as(monkeypatch, view, 0.5)
     assert (np.diff(y) > 0).all() and (np.diff(x) > 0).all()
     for n in range(3):
@@ -116,7 +125,7 @@ def test_weights_spread_over_the_model_keep_their_density(monkeypatch):
     view = SimpleNamespace(
         mapping=Mapping(),
         covered=np.ones((n, n), bool),
-        root=np.full((1, n, n), 3.0),
+        sqrt_weights=np.full((1, n, n), 3.0),
         op=SimpleNamespace(shift=shift),
     )
     y, x, root = seen_as(monkeypatch, view, 0.8)
@@ -124,17 +133,17 @@ def test_weights_spread_over_the_model_keep_their_density(monkeypatch):
     np.testing.assert_allclose([y[0], x[0]], -0.8)
     assert y[-1] >= 24 and x[-1] >= 26
     np.testing.assert_allclose(root[0, 4:-4, 4:-4], 3, rtol=1e-5)  # of the frame all is seen
-    half = view.root.copy()
+    half = view.sqrt_weights.copy()
     n_y, m = np.indices((n, n))
     half[0][view.mapping.at(n_y, m)[..., 0] + shift[0] < 12] = 0
-    y, _, root = seen_as(monkeypatch, SimpleNamespace(**{**vars(view), "root": half}), 0.8)
+    y, _, root = seen_as(monkeypatch, SimpleNamespace(**{**vars(view), "sqrt_weights": half}), 0.8)
     assert root[0, y < 10.5, 5:-5].max() == 0 and root[0, (y > 13.5) & (y < 22), 5:-5].min() > 2.9
 
 
 def test_periods_hold_a_box_and_what_its_light_reaches():
     """Multiples of 8 px, and one; frequencies of half a plane, counted twice but for row 0."""
     psf = PSF.gaussian(1.2, n_pixels=25)
-    transfer = Transfer(2.0 * np.eye(2), psf, psf)
+    transfer = BandLimitedTransfer(2.0 * np.eye(2), psf, psf)
     nu_y, nu_x, d = transfer.at((11, 13), 4.0)
     assert nu_y[1] == pytest.approx(1 / 25) and nu_x[len(nu_x) // 2 + 1] == pytest.approx(1 / 25)
     assert transfer.at((17, 17), 4.0)[0][1] == pytest.approx(1 / 33)
@@ -152,13 +161,13 @@ def test_errors_at_fixed_morphologies_are_those_of_the_normal_matrix(monkeypatch
     made = []
     monkeypatch.setattr(posterior_module, "Posterior", lambda s, *_a, **_k: made.append(s))
     monkeypatch.setattr(posterior_module, "_local_chi2", lambda *_: np.ones(2))
-    monkeypatch.setattr(posterior_module, "pulls", lambda *_: [])
+    monkeypatch.setattr(posterior_module, "negative_chi2_gradient", lambda *_: [])
     covariance = np.array([[[1e-8, 5.0], [5.0, 4.0]], [[0.0, 0], [0, -1e-20]]])
     spectra = np.array([[3.0, 3.0], [1e6, 0.0]])
     start = SimpleNamespace(source=np.array([0, 1]), shapes=0, thetas=0, positions=np.eye(2))
     scene = SimpleNamespace(channels=lambda: [], ties=None)
     fit = SimpleNamespace(
-        settings=Settings(), scene=scene, findings=1, views=[], start=start, frame=None
+        settings=Settings(), scene=scene, strength_estimates=1, views=[], start=start, frame=None
     )
     fit.blend = SimpleNamespace(observations=[])
     seen = SimpleNamespace(spectra=spectra, covariance=covariance, residuals=lambda *_: [])
@@ -167,7 +176,10 @@ def test_errors_at_fixed_morphologies_are_those_of_the_normal_matrix(monkeypatch
     wanted = [[1e-4, 3e-9], [2.0, 1e-150]]
     np.testing.assert_allclose(made[0].fixed_error, wanted)
     assert posterior_module.posterior_of(
-        SimpleNamespace(settings=Settings(prior=None), scene=None, findings=1), [], 0, seen
+        SimpleNamespace(settings=Settings(prior=None), scene=None, strength_estimates=1),
+        [],
+        0,
+        seen,
     ) == (None, [])
 
 
@@ -177,13 +189,15 @@ def made_up(rng, *, fixed=(), n_common=2):
     sizes, counts, n_channels = [(3, 4), (4, 3), (5, 5)], np.array([2, 0, 3]), 2
     made = object.__new__(Posterior)
     made.modes = [rng.normal(size=(k, *size)) for k, size in zip(counts, sizes, strict=True)]
-    made.beyond = [Beyond(np.abs(rng.normal(size=6)) + 1, rng.normal(size=(6, k))) for k in counts]
-    made.layout = Layout(counts, n_channels, n_sky=n_common)
+    made.beyond = [
+        OutsideBoxMoments(np.abs(rng.normal(size=6)) + 1, rng.normal(size=(6, k))) for k in counts
+    ]
+    made.layout = UnknownLayout(counts, n_channels, n_sky=n_common)
     nodes = made.layout.sizes
     root = rng.normal(size=(nodes.sum(), 3 * nodes.sum()))
     dense = root @ root.T / 100
     ends = np.cumsum([0, *nodes])
-    made.covariance = Blocks(nodes)
+    made.covariance = BlockMatrix(nodes)
     for i in range(len(nodes)):
         for j in range(i, len(nodes)):
             made.covariance.block(i, j)[:] = dense[ends[i] : ends[i + 1], ends[j] : ends[j + 1]]
@@ -194,7 +208,7 @@ def made_up(rng, *, fixed=(), n_common=2):
         scene=SimpleNamespace(
             origin=np.array([[2, 3], [0, 1], [4, 0]]), fixed=np.isin(np.arange(3), fixed)
         ),
-        unlikeness=lambda i: 1.0 + i,
+        structure_excess=lambda i: 1.0 + i,
     )
     return made, dense[: ends[3], : ends[3]]
 
@@ -250,7 +264,9 @@ def test_errors_follow_from_the_covariance_of_all_unknowns():
     by = slopes(lambda v: fluxes(made, v).ravel(), n)  # (S C, n)
     full = (by @ covariance @ by.T).reshape(2, 2, 2, 2)
     released = np.concatenate(made.released[:3])
-    np.testing.assert_allclose(errors.released, (by @ released).reshape(2, 2) * unit, rtol=1e-6)
+    np.testing.assert_allclose(
+        errors.flux_bound_bias, (by @ released).reshape(2, 2) * unit, rtol=1e-6
+    )
     own, beyond = np.zeros((2, 2, 2))
     for i, (morph, far, spectrum) in enumerate(shifted(made, np.zeros(n))):
         own[OWNER[i]] += floor * (1.0 + i) ** 3 * spectrum * (morph.sum() + far[0])
@@ -268,14 +284,14 @@ def test_errors_follow_from_the_covariance_of_all_unknowns():
         by = slopes(lambda v, s=s, w=weight: shapes(made, v, s, w), n)
         if s == 1:  # the other has no mode: nothing is known of its shape's error
             np.testing.assert_allclose(errors.moments[s], 9 * by @ covariance @ by.T, rtol=1e-4)
-            np.testing.assert_allclose(errors.moved[s], by @ released, rtol=1e-4)
-    assert np.isnan(errors.moments[0]).all() and not errors.moved[0].any()
+            np.testing.assert_allclose(errors.moment_bound_bias[s], by @ released, rtol=1e-4)
+    assert np.isnan(errors.moments[0]).all() and not errors.moment_bound_bias[0].any()
     ends = np.cumsum([0, *made.layout.sizes])
     for i, modes in enumerate(made.modes):
         block = covariance[ends[i] : ends[i] + len(modes), ends[i] : ends[i] + len(modes)]
         wanted = np.sqrt(np.einsum("kyx,kl,lyx->yx", modes, block, modes))
         np.testing.assert_allclose(errors.morphology[i], wide[OWNER[i]] * wanted, rtol=1e-5)
-    np.testing.assert_array_equal(errors.beyond, [far.sums for far in made.beyond])
+    np.testing.assert_array_equal(errors.outside_box_moments, [far.sums for far in made.beyond])
 
 
 def test_second_moments_of_stars_have_no_error_and_are_not_released():
@@ -283,7 +299,7 @@ def test_second_moments_of_stars_have_no_error_and_are_not_released():
     for fixed, known in (((0, 2), False), ((0,), True)):
         made, _ = made_up(np.random.default_rng(1), fixed=fixed, n_common=0)
         errors = made.errors(OWNER, np.zeros((2, 2)), np.ones(2), 0.0)
-        found, moved = errors.moments[1], errors.moved[1]
+        found, moved = errors.moments[1], errors.moment_bound_bias[1]
         assert np.isfinite(found[:2, :2]).all() and np.isfinite(found[2:, 2:]).all() == known
         assert np.isnan(found[:2, 2:]).all() != known
         assert (moved[:2] != 0).all() and ((moved[2:] != 0) == known).all()

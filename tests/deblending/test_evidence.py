@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 from helpers.learned import Source
 
-from clresample.deblending.solver.learned.evidence import (
+from clresample.deblending.solver.multiscale.evidence import (
     STEP,
     WIDE,
+    LocalPowerSpectra,
     SourceEvidence,
-    Spectra,
     blurred_light,
 )
-from clresample.deblending.solver.learned.prior import LearnedPrior, gaussian
+from clresample.deblending.solver.multiscale.prior import MultiscalePrior, gaussian
 
-PRIOR = LearnedPrior()
+PRIOR = MultiscalePrior()
 SPECTRUM = np.array([30.0, 10.0])
 
 
@@ -36,8 +36,8 @@ def answers(sigmas=(1.0, 2.0), shape=(80, 90), pixel=(40, 45)):
 
 @pytest.fixture(scope="module")
 def evidence():
-    spectra = Spectra(PRIOR)
-    return SourceEvidence(spectra, PRIOR, disk(), spectra.of_answers(*answers()))
+    spectra = LocalPowerSpectra(PRIOR)
+    return SourceEvidence(spectra, PRIOR, disk(), spectra.from_impulse_responses(*answers()))
 
 
 def test_responses_are_transfer_functions(evidence):
@@ -64,8 +64,8 @@ def test_determined_parameters_are_their_definition(evidence):
 
 def test_determined_parameters_count_those_of_the_posterior():
     """trace(H (H + alpha^-2)^-1) of one scale on a flat profile, seen in every pixel."""
-    prior = LearnedPrior(scales_px=(1.0,), strengths=(0.1,))
-    spectra, profile = Spectra(prior), np.ones((24, 24))
+    prior = MultiscalePrior(scales_px=(1.0,), strengths=(0.1,))
+    spectra, profile = LocalPowerSpectra(prior), np.ones((24, 24))
     source = Source(profile, prior)
     ky, kx = source.axes[0]
     whole = np.kron(ky, kx)
@@ -74,18 +74,20 @@ def test_determined_parameters_count_those_of_the_posterior():
         wanted = np.trace(np.linalg.solve(curvature + np.eye(len(curvature)) / alpha**2, curvature))
         image = np.zeros((1, 70, 70))
         image[0, 35, 35] = 1
-        found = SourceEvidence(spectra, prior, profile, spectra.of_answers(image, [(35, 35)]))
+        found = SourceEvidence(
+            spectra, prior, profile, spectra.from_impulse_responses(image, [(35, 35)])
+        )
         assert found.determined(np.array([alpha]), [30.0])[0] == pytest.approx(wanted, rel=0.1)
 
 
 def test_strengths_are_found_from_draws():
     """Of structure that all is seen of, drawn from a strength: found from any start."""
-    prior = LearnedPrior(scales_px=(1.0,), strengths=(0.1,), weight=1e-3)
-    spectra, rng = Spectra(prior), np.random.default_rng(0)
+    prior = MultiscalePrior(scales_px=(1.0,), strengths=(0.1,), hyperprior_weight=1e-3)
+    spectra, rng = LocalPowerSpectra(prior), np.random.default_rng(0)
     image = np.zeros((1, 70, 70))
     image[0, 35, 35] = 1
     evidence = SourceEvidence(
-        spectra, prior, np.ones((40, 40)), spectra.of_answers(image, [(35, 35)])
+        spectra, prior, np.ones((40, 40)), spectra.from_impulse_responses(image, [(35, 35)])
     )
     for truth in (0.03, 0.3):
         z = truth * rng.normal(size=(40, 40))
@@ -113,7 +115,7 @@ def test_misfit_is_not_taken_for_structure(evidence):
 
 
 def test_seen_grows_with_light(evidence):
-    faint, bright = evidence.seen(SPECTRUM), evidence.seen(SPECTRUM * 100)
+    faint, bright = evidence.resolved_fraction(SPECTRUM), evidence.resolved_fraction(SPECTRUM * 100)
     assert (faint < bright).all() and (bright <= 1).all() and (faint > 0).all()
     assert (np.diff(bright) > -1e-9).all()  # coarser structure is seen better
 

@@ -5,15 +5,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clresample.deblending.solver.learned.evidence import (
-    CLEAR,
-    LEAST_SEEN,
+from clresample.deblending.solver.multiscale.evidence import (
+    MIN_SEEN,
+    MIN_SIGNIFICANCE,
+    LocalPowerSpectra,
     SourceEvidence,
-    Spectra,
     _pixels_at,
 )
-from clresample.deblending.solver.learned.prior import LearnedPrior
-from clresample.deblending.solver.learned.response import _median, _middle, _unpadded
+from clresample.deblending.solver.multiscale.prior import MultiscalePrior
+from clresample.deblending.solver.multiscale.response import _median, _middle, _unpadded
 
 
 def test_values_are_shared_between_the_levels_about_them():
@@ -27,7 +27,7 @@ def test_values_are_shared_between_the_levels_about_them():
 
 def evidence(prior, *, level):
     """Of a round profile on 15 x 17 pixels, seen alike at all frequencies."""
-    spectra = Spectra(prior)
+    spectra = LocalPowerSpectra(prior)
     y, x = np.indices((15, 17))
     profile = np.exp(-np.hypot(y - 7, x - 8) / 3)
     return SourceEvidence(spectra, prior, profile, np.full((1, len(spectra.weight)), level))
@@ -36,9 +36,9 @@ def evidence(prior, *, level):
 def test_new_strengths_are_the_fixed_point_of_the_evidence():
     """Of what is well seen, energies over determined numbers; within 4 of the old, 0.1 % to 100 %;
     misfit makes energies smaller, and never larger."""
-    prior = LearnedPrior(scales_px=(1.0, 3.0), strengths=(0.02, 0.1), weight=10.0)
+    prior = MultiscalePrior(scales_px=(1.0, 3.0), strengths=(0.02, 0.1), hyperprior_weight=10.0)
     one, spectrum, old = evidence(prior, level=1e4), np.array([2.0]), np.array([0.05, 0.1])
-    seen, gamma = one.seen(spectrum), one.determined(old, spectrum)
+    seen, gamma = one.resolved_fraction(spectrum), one.determined(old, spectrum)
     assert (seen > 0.9).all() and (gamma > 5).all()
     m, energies = 10 / seen**2, np.array([0.3, 0.5])
     for chi2 in (0.2, 1.0, 3.0):
@@ -49,17 +49,20 @@ def test_new_strengths_are_the_fixed_point_of_the_evidence():
     np.testing.assert_allclose(
         one.learned(np.array([1e-3, 0.5]), np.array([0.0, 1e9]), spectrum, 1.0)[1], 1.0
     )
-    tiny = LearnedPrior(scales_px=(1.0, 3.0), strengths=(1e-6, 1e-6), weight=10.0)
+    tiny = MultiscalePrior(scales_px=(1.0, 3.0), strengths=(1e-6, 1e-6), hyperprior_weight=10.0)
     found = evidence(tiny, level=1e4).learned(np.full(2, 2e-3), np.zeros(2), spectrum, 1.0)
     np.testing.assert_allclose(found, 1e-3)
 
 
 def test_structure_is_clear_where_the_finest_scale_holds_more_than_the_data_determine():
-    prior = LearnedPrior(scales_px=(1.0, 3.0), strengths=(0.02, 0.1), weight=10.0)
+    prior = MultiscalePrior(scales_px=(1.0, 3.0), strengths=(0.02, 0.1), hyperprior_weight=10.0)
     one, spectrum, old = evidence(prior, level=1e4), np.array([2.0]), np.array([0.05, 0.1])
     gamma = one.determined(old, spectrum)[0]
-    assert gamma > 0.2 * CLEAR  # else the test could not tell one from the other
-    for energy, clear in ((gamma + CLEAR + 0.01, True), (gamma + CLEAR - 0.01, False)):
+    assert gamma > 0.2 * MIN_SIGNIFICANCE  # else the test could not tell one from the other
+    for energy, clear in (
+        (gamma + MIN_SIGNIFICANCE + 0.01, True),
+        (gamma + MIN_SIGNIFICANCE - 0.01, False),
+    ):
         energies = np.array([energy * old[0] ** 2, 0.0])
         assert one.is_clear(old, energies, spectrum) == clear
     assert not one.is_clear(old, np.array([0.0, 1e9]), spectrum)  # at the finest scale alone
@@ -67,9 +70,9 @@ def test_structure_is_clear_where_the_finest_scale_holds_more_than_the_data_dete
 
 def test_clear_structure_follows_the_data():
     """At the finest scale, with a tenth of the weight and whatever the misfit; not at others."""
-    prior = LearnedPrior(scales_px=(1.0, 3.0), strengths=(0.02, 0.1), weight=10.0)
+    prior = MultiscalePrior(scales_px=(1.0, 3.0), strengths=(0.02, 0.1), hyperprior_weight=10.0)
     one, spectrum, old = evidence(prior, level=1e4), np.array([2.0]), np.array([0.05, 0.1])
-    m = np.array([1, 10]) / one.seen(spectrum) ** 2
+    m = np.array([1, 10]) / one.resolved_fraction(spectrum) ** 2
     energies, misfit = np.array([0.3, 0.5]), np.array([1.0, 3.0])
     wanted = energies / misfit + m * np.square(prior.strengths)
     wanted = np.sqrt(wanted / (one.determined(old, spectrum) + m))
@@ -79,9 +82,9 @@ def test_clear_structure_follows_the_data():
 
 
 def test_what_is_not_seen_stays_as_it_was_expected():
-    prior = LearnedPrior(scales_px=(1.0,), strengths=(0.02,), weight=10.0)
+    prior = MultiscalePrior(scales_px=(1.0,), strengths=(0.02,), hyperprior_weight=10.0)
     dark = evidence(prior, level=0.0)
-    assert dark.seen(np.ones(1)).tolist() == [LEAST_SEEN] and LEAST_SEEN == 1e-3
+    assert dark.resolved_fraction(np.ones(1)).tolist() == [MIN_SEEN] and MIN_SEEN == 1e-3
     assert dark.determined(np.array([0.02]), np.ones(1)).tolist() == [0]
     found = dark.learned(np.array([0.02]), np.array([0.5]), np.ones(1), 1.0)
     np.testing.assert_allclose(found, 0.02, rtol=1e-3)
@@ -90,7 +93,7 @@ def test_what_is_not_seen_stays_as_it_was_expected():
 
 def test_curvature_of_what_is_seen_alike_at_all_frequencies_is_that():
     """Weighted by P^1.5 over the mean of P^0.5: more than it where P is peaked."""
-    prior = LearnedPrior()
+    prior = MultiscalePrior()
     one = evidence(prior, level=5.0)
     p, weight = one.spectra.broadened(prior.amplitude(np.ones((3, 3)))), one.spectra.weight
     np.testing.assert_allclose(p @ weight, 1, rtol=1e-12)
@@ -103,10 +106,12 @@ def test_curvature_of_what_is_seen_alike_at_all_frequencies_is_that():
 
 def test_power_is_broadened_by_the_light_that_it_lies_in():
     """Noise of a kernel's power times an amplitude has the convolution of both powers; mean 1."""
-    prior = LearnedPrior()
+    prior = MultiscalePrior()
     amplitude = np.random.default_rng(3).uniform(0, 1, (9, 12))
     light = np.fft.fft2(np.abs(np.fft.fft2(amplitude, (64, 64))) ** 2)
-    for found, taps in zip(Spectra(prior).broadened(amplitude), prior.kernels(), strict=True):
+    for found, taps in zip(
+        LocalPowerSpectra(prior).broadened(amplitude), prior.kernels(), strict=True
+    ):
         along = np.abs(np.fft.fft(taps, 64)) ** 2
         power = np.fft.ifft2(np.fft.fft2(np.outer(along, along)) * light).real
         wanted = (power / power.mean())[:, :33].ravel()
@@ -115,17 +120,17 @@ def test_power_is_broadened_by_the_light_that_it_lies_in():
 
 def test_answers_are_taken_within_half_a_side_of_their_pixel():
     """Of 64: what lies further away is none of it, and nothing beyond the image is missed."""
-    spectra = Spectra(LearnedPrior(scales_px=(1.0,), strengths=(0.1,)))
+    spectra = LocalPowerSpectra(MultiscalePrior(scales_px=(1.0,), strengths=(0.1,)))
     image = np.zeros((2, 90, 20))
     image[:, 40, 3] = 2.0
     image[0, 40 - 33], image[0, 40 + 32] = 7.0, 7.0
-    found = spectra.of_answers(image, [(40, 3)] * 2)
+    found = spectra.from_impulse_responses(image, [(40, 3)] * 2)
     np.testing.assert_allclose(found, 2.0)
-    np.testing.assert_allclose(spectra.of_answers(image[:1, 2:60], [(38, 3)]), 2.0)
+    np.testing.assert_allclose(spectra.from_impulse_responses(image[:1, 2:60], [(38, 3)]), 2.0)
     image[1, 40 + 31, 3] = image[1, 40 - 31, 3] = 0.5
     nu = np.fft.fftfreq(64)
     wanted = np.repeat(2 + np.cos(2 * np.pi * 31 * nu), 33)
-    np.testing.assert_allclose(spectra.of_answers(image, [(40, 3)] * 2)[1], wanted)
+    np.testing.assert_allclose(spectra.from_impulse_responses(image, [(40, 3)] * 2)[1], wanted)
 
 
 def test_the_middle_of_what_was_seen():
@@ -135,5 +140,5 @@ def test_the_middle_of_what_was_seen():
     weights[0, 8, 11] = -5  # what rounding leaves below 0 does not count
     assert _middle(weights).tolist() == [5, 8] and _middle(0 * weights).tolist() == [0, 0]
     assert _median(np.array([[0.0, 1.0, 2.0, 9.0]])) == 2 and _median(np.zeros(3)) == 0
-    part = _unpadded(SimpleNamespace(extent=(5, 7)), np.zeros((3, 8, 9)))
+    part = _unpadded(SimpleNamespace(unpadded_shape=(5, 7)), np.zeros((3, 8, 9)))
     assert part.shape == (3, 5, 7)

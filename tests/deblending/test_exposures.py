@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from clresample import (
     PSF,
     Blend,
-    Extended,
+    ExtendedSource,
     Grid,
     Observation,
     Settings,
@@ -17,11 +17,11 @@ from clresample import (
     deblend,
     deblend_many,
 )
-from clresample.deblending.components.gradients import ask
-from clresample.deblending.fit import Fit, begin, finish
+from clresample.deblending.fit import Fit, render_fits, start_fits
 from clresample.deblending.iterate import iterate
-from clresample.deblending.posterior.exposure import exposures_of
+from clresample.deblending.posterior.aligned_observation import align_observations
 from clresample.deblending.posterior.posterior import Posterior, posterior_of
+from clresample.deblending.refit.colour_gradient import run_gradient_tests
 from clresample.device.device import get_device
 from clresample.files.results import read_result, write_result
 from clresample.measurement.photometry import fluxes
@@ -30,8 +30,8 @@ from clresample.measurement.quality import channel_chi2
 SHAPE, N, SIGMA, POINT = (48, 52), 4, 2.0, 25.0
 PLACES = (22.0, 24.0), (29.0, 31.0), (12.0, 40.0)
 GRID, NARROW = Grid.flat(SHAPE, 0.2), PSF.gaussian(1.5)
-SOURCES = [Extended(position_px=PLACES[0], n_components=2)]
-SOURCES += [Extended(position_px=p) for p in PLACES[1:]]
+SOURCES = [ExtendedSource(position_px=PLACES[0], n_components=2)]
+SOURCES += [ExtendedSource(position_px=p) for p in PLACES[1:]]
 DEPTHS = (0.4, 1.6, 1.2, 0.8)  # weights over their mean
 
 
@@ -91,14 +91,14 @@ def measured(result):
 
 @pytest.fixture(scope="module")
 def stack(images):
-    settings = Settings(enough=1e-4)
+    settings = Settings(loss_tol=1e-4)
     return deblend([stacked(images[0]), red(images)], SOURCES, settings=settings, dtype=np.float64)
 
 
 def test_n_exposures_give_what_one_image_of_n_times_the_weight_does(images, stack):
     """Of the same pixels, to the last digits: flux, errors, shapes, the iterations too."""
     copies = exposures([np.mean(images[0], axis=0)] * N, depths=DEPTHS)
-    settings = Settings(enough=1e-4)
+    settings = Settings(loss_tol=1e-4)
     tied = deblend([*copies, red(images)], SOURCES, settings=settings, dtype=np.float64)
     (flux, error), (found, own) = measured(stack), measured(tied)
     assert len(tied.losses) == len(stack.losses)
@@ -110,7 +110,9 @@ def test_n_exposures_give_what_one_image_of_n_times_the_weight_does(images, stac
     np.testing.assert_allclose(tied.covariance[0], stack.covariance[0], rtol=1e-5)
     assert [len(m) for m in tied.draws.modes] == [len(m) for m in stack.draws.modes]
     one, other = catalogue(tied, magnitudes=True), catalogue(stack, magnitudes=True)
-    assert {"colour_g_r", "snr", "size_err", "flux_err_g"} <= {*one.colnames} & {*other.colnames}
+    assert {"colour_g_r", "snr", "rms_size_err", "flux_err_g"} <= {*one.colnames} & {
+        *other.colnames
+    }
     of_each = {"name", "misfit_sigma", "misfit_fraction"}  # residuals are those of an exposure
     for name in {*one.colnames} & {*other.colnames} - of_each:
         values = (np.asarray(getattr(t[name], "value", t[name]), float) for t in (one, other))
@@ -120,24 +122,24 @@ def test_n_exposures_give_what_one_image_of_n_times_the_weight_does(images, stac
 
 
 def test_evidence_for_a_gradient_is_that_of_the_stack(images):
-    device, settings = get_device(None), Settings(enough=1e-4)
-    sources = tuple(Extended(position_px=p) for p in PLACES)
+    device, settings = get_device(None), Settings(loss_tol=1e-4)
+    sources = tuple(ExtendedSource(position_px=p) for p in PLACES)
     copies = exposures([np.mean(images[0], axis=0)] * N, depths=DEPTHS)
     found = []
     for observations in ([*copies, red(images)], [stacked(images[0]), red(images)]):
         fit = Fit(Blend(tuple(observations), sources), settings, device, np.float64, pad=1)
-        begin([fit])
+        start_fits([fit])
         iterate([fit], settings, device, np.float64)
-        found.append(ask([fit])[0])
-    assert len(found[0].which)
-    np.testing.assert_array_equal(found[0].which, found[1].which)
+        found.append(run_gradient_tests([fit])[0])
+    assert len(found[0].components)
+    np.testing.assert_array_equal(found[0].components, found[1].components)
     # [1], a logarithm: one of 20 counts as clear
     np.testing.assert_allclose(found[0].evidence, found[1].evidence, atol=0.1)
 
 
 def test_exposures_with_noise_of_their_own_agree_with_their_stack(images, stack):
     """Weights of the start follow the data's own misfit, which N exposures have N times."""
-    tied = deblend([*exposures(images[0]), red(images)], SOURCES, settings=Settings(enough=1e-4))
+    tied = deblend([*exposures(images[0]), red(images)], SOURCES, settings=Settings(loss_tol=1e-4))
     (flux, error), (found, own) = measured(stack), measured(tied)
     assert np.abs((found - flux) / error).max() < 0.15
     np.testing.assert_allclose(own, error, rtol=0.03)
@@ -157,7 +159,7 @@ def test_zero_points_give_the_ratio_of_counts(images, fit_sky):
     assert [n for n in table.colnames if n.startswith("flux_")] == [
         *("flux_g", "flux_err_g", "flux_r", "flux_err_r")
     ]
-    assert {f"chi2_G{i}" for i in range(N)} | {f"residual_g{i}" for i in range(N)} <= {
+    assert {f"chi2_G{i}" for i in range(N)} | {f"max_residual_g{i}" for i in range(N)} <= {
         *table.colnames
     }
     np.testing.assert_allclose(table["flux_g"].value, catalogue(one)["flux_g"].value, rtol=1e-4)
@@ -185,7 +187,7 @@ def test_errors_are_those_of_the_dense_matrix_summed_over_channels(images):
     observations = [*exposures(images[0], (1.0, 3.0, 0.2, 40.0)), red(images)]
     settings = Settings(fit_sky=True, fit_shifts=True, max_iter=60)
     result, posterior, free = _posteriors(observations, settings)
-    n, k = len(result.components), posterior.layout.counts
+    n, k = len(result.components), posterior.layout.n_modes
     ends = np.cumsum([0, *free.layout.sizes])
     columns, ties = [], posterior.layout.ties
     for i in range(n):
@@ -218,14 +220,14 @@ def _posteriors(observations, settings):
     """A Result, its Posterior, and that of the same scene with no ties."""
     device = get_device(None)
     fit = Fit(Blend(tuple(observations), tuple(SOURCES)), settings, device, np.float32, pad=1)
-    begin([fit])
+    start_fits([fit])
     iterate([fit], settings, device, np.float32)
-    (seen,) = finish([fit])
+    (seen,) = render_fits([fit])
     result = fit.result(seen)
     peaks = np.array([m.max() for m in fit.state.morph])
     tied, _ = posterior_of(fit, [c.morphology for c in result.components], peaks, seen)
     solution = replace(tied.solution, scene=replace(tied.solution.scene, ties=None))
-    free = Posterior(solution, exposures_of(fit), fit_sky=True, fit_shifts=True)
+    free = Posterior(solution, align_observations(fit), fit_sky=True, fit_shifts=True)
     return result, tied, free
 
 
@@ -252,9 +254,9 @@ def test_an_exposure_without_weight_changes_nothing(images):
 
 @pytest.mark.parametrize("prior", [None, "one scale"])
 def test_other_priors_keep_one_value_a_band(images, prior):
-    from clresample.deblending.solver.prior import Prior
+    from clresample.deblending.solver.prior import SingleScalePrior
 
-    settings = Settings(prior=None if prior is None else Prior(), max_iter=60)
+    settings = Settings(prior=None if prior is None else SingleScalePrior(), max_iter=60)
     result = deblend([*exposures(images[0]), red(images)], SOURCES, settings=settings)
     spectra = np.array([c.spectrum[:N] for c in result.components])
     np.testing.assert_allclose(spectra, spectra[:, :1] * np.ones(N), rtol=1e-5)

@@ -5,7 +5,7 @@ import pytest
 from helpers.scenes import blend
 
 from clresample import Settings
-from clresample.deblending.fit import Fit, begin
+from clresample.deblending.fit import Fit, start_fits
 from clresample.deblending.start import profile_fit
 from clresample.deblending.start.first_profiles import GROWTH, first_profiles
 
@@ -30,7 +30,7 @@ def sized(device, monkeypatch):
 
     def sizes_of(objects):
         one = Fit(blend(objects, shape=(96, 96), seed=5), Settings(), device, np.float32, pad=1)
-        begin([one])
+        start_fits([one])
         return *map(np.array, kept), np.array([theta[0] for theta in one.start.thetas])
 
     return sizes_of

@@ -7,7 +7,7 @@ import pytest
 
 from clresample.deblending.start import first_scene as room
 from clresample.deblending.start.first_scene import first_scene
-from clresample.sky.sources import Extended, Point
+from clresample.sky.sources import ExtendedSource, PointSource
 
 
 def posed(monkeypatch, *, learns=True, shares=False):
@@ -19,18 +19,21 @@ def posed(monkeypatch, *, learns=True, shares=False):
         asked.append((start, i, shape, brightness))
         return np.array([i, 2 * i]), (3 + i, 4), np.array([1, i]), np.full((3 + i, 4), 1.0 + i)
 
-    monkeypatch.setattr(room, "box_of", box_of)
+    monkeypatch.setattr(room, "component_box", box_of)
     monkeypatch.setattr(room, "damping", lambda scene, state, prior: (scene, state, prior))
     spectra = np.array([[30.0, 40.0, 1.0], [5.0, 6.0, 0.0], [7.0, 80.0, 9.0]])
     power = np.array([[4.0, 0.25, 1.0], [1e-27, 1e-29, 0.0], [100.0, 1e-10, 16.0]])
     start = SimpleNamespace(
-        source=np.array([1, 0, 0]), spectra=spectra, power=power, sky=rng.random(3)
+        source=np.array([1, 0, 0]), spectra=spectra, spectrum_curvature=power, sky=rng.random(3)
     )
     ops = [SimpleNamespace(shape_out=(n, 5, 6)) for n in (1, 2)]
     parts = [rng.random((2, n, 3)) if shares else None for n in (1, 2)]
     views = [
         SimpleNamespace(
-            op=op, data=rng.random(op.shape_out), root=rng.random(op.shape_out), shares=p
+            op=op,
+            data=rng.random(op.shape_out),
+            sqrt_weights=rng.random(op.shape_out),
+            coefficients=p,
         )
         for op, p in zip(ops, parts, strict=True)
     ]
@@ -43,12 +46,12 @@ def posed(monkeypatch, *, learns=True, shares=False):
         padded=SimpleNamespace(shape=(24, 32)),
         views=views,
         sources=[
-            Point(position_px=(1, 2)),
-            Point(position_px=(-9, 2)),
-            Extended(position_px=(3, 4)),
+            PointSource(position_px=(1, 2)),
+            PointSource(position_px=(-9, 2)),
+            ExtendedSource(position_px=(3, 4)),
         ],
         fitted=[0, 2],
-        settings=SimpleNamespace(learns=learns, fit_sky=True, prior="prior"),
+        settings=SimpleNamespace(has_multiscale_prior=learns, fit_sky=True, prior="prior"),
     )
     return fit, asked
 
@@ -58,16 +61,16 @@ def test_a_first_scene_holds_what_the_start_has_found(monkeypatch, shares):
     fit, asked = posed(monkeypatch, shares=shares)
     scene, state = first_scene(fit)
     assert asked == [(fit.start, i, (20, 21), b) for i, b in enumerate((40.0, 6.0, 90.0))]
-    assert (scene.shape, scene.extent, scene.fit_sky) == ((24, 32), (20, 21), True)
+    assert (scene.shape, scene.unpadded_shape, scene.fit_sky) == ((24, 32), (20, 21), True)
     assert scene.origin.tolist() == [[0, 0], [1, 2], [2, 4]]
     assert scene.center.tolist() == [[1, 0], [1, 1], [1, 2]]
     assert scene.fixed.tolist() == [False, True, True]  # the first is of the third source
     assert scene.channels() == [slice(0, 1), slice(1, 3)]
     for k, view in enumerate(fit.views):
         assert scene.ops[k] is view.op and scene.data[k] is view.data
-        np.testing.assert_allclose(scene.weights[k], view.root**2)
+        np.testing.assert_allclose(scene.weights[k], view.sqrt_weights**2)
         if shares:
-            np.testing.assert_array_equal(scene.shares[k], view.shares[[1, 0, 0]])
+            np.testing.assert_array_equal(scene.coefficients[k], view.coefficients[[1, 0, 0]])
         else:
             assert scene.shares_of(k) is None
     for i in range(3):
@@ -77,14 +80,14 @@ def test_a_first_scene_holds_what_the_start_has_found(monkeypatch, shares):
         assert state.latent[i].shape == (3 + i, 4) and not state.latent[i].any()
     assert state.spectra is fit.start.spectra and state.sky is fit.start.sky
     assert scene.known_sky is fit.sky_precision
-    assert scene.power is fit.start.power and scene.damping is None
+    assert scene.spectrum_curvature is fit.start.spectrum_curvature and scene.damping is None
 
 
 def test_spectra_step_by_their_error_and_a_fiftieth_of_themselves(monkeypatch):
     """Where the channel holds nothing of a component they stay."""
     scene, _ = first_scene(posed(monkeypatch)[0])
     wanted = [[1.1, 2.8, 1.02], [10**13.5 + 0.1, 0, 0], [0.24, 1e5 + 1.6, 0.43]]
-    np.testing.assert_allclose(scene.scale, wanted, rtol=1e-9)
+    np.testing.assert_allclose(scene.step_scale, wanted, rtol=1e-9)
 
 
 def test_only_a_prior_that_does_not_learn_asks_for_damping(monkeypatch):
@@ -98,7 +101,7 @@ def test_spectra_of_terms_are_each_channels_times_its_shares(monkeypatch):
     scene, state = first_scene(fit)
     for k, part in enumerate(scene.channels()):
         own = state.spectra[:, part]
-        wanted = np.einsum("sc,sct->sct", own, fit.views[k].shares[[1, 0, 0]])
+        wanted = np.einsum("sc,sct->sct", own, fit.views[k].coefficients[[1, 0, 0]])
         np.testing.assert_array_equal(scene.parts(k, own), wanted.reshape(3, -1))
     plain, state = first_scene(posed(monkeypatch)[0])
     own = state.spectra[:, 1:]

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from clresample.deblending import fit as room
+from clresample.deblending.component_images import ComponentImages
 from clresample.deblending.fit import Fit
-from clresample.deblending.rendered import Rendered
 
 UNIT = np.array([2.0, 10.0, 0.5])
 CHANNELS = slice(0, 1), slice(1, 3)
@@ -28,7 +28,7 @@ def ended(noise=(None, "correlated")):
         views.append(SimpleNamespace(covered=covered))
     fit = SimpleNamespace(
         blend=SimpleNamespace(observations=tuple(observations)),
-        frame="frame", home="home", sources=("a", "b"), views=views, unit=UNIT,
+        frame="frame", geometry="home", sources=("a", "b"), views=views, unit=UNIT,
         sky_level=np.array([0.5, -0.25, 2.0]),
         padded=SimpleNamespace(shape=(24, 32)),
         fitted=np.array([3, 5]),
@@ -50,11 +50,11 @@ def seen_of(fit, bare):
     def some(k):
         n = CHANNELS[k].stop - CHANNELS[k].start
         low = np.array([(0, 0), (2, 3), (1, 1)])
-        return Rendered((3, n, *SHAPES[k]), low, [rng.random((n, 3, 4)) for _ in range(3)])
+        return ComponentImages((3, n, *SHAPES[k]), low, [rng.random((n, 3, 4)) for _ in range(3)])
 
     return SimpleNamespace(
         spectra=rng.random((3, 3)), sky=rng.random(3), covariance=rng.random((3, 3, 3)),
-        observed=(some(0), some(1)), bare=(None, some(1) if bare else None),
+        observed=(some(0), some(1)), unfiltered_views=(None, some(1) if bare else None),
     )  # fmt: skip
 
 
@@ -84,7 +84,7 @@ def test_results_are_in_counts_and_have_maxima_of_1(monkeypatch, bare):
     for c in range(3):
         np.testing.assert_array_equal(found.covariance[c], seen.covariance[c] * UNIT[c] ** 2)
     for view, shown, here, other in zip(
-        fit.views, found.rendered, seen.observed, seen.bare, strict=True
+        fit.views, found.rendered, seen.observed, seen.unfiltered_views, strict=True
     ):
         wanted = np.asarray(here if other is None else other) * view.covered
         np.testing.assert_array_equal(np.asarray(shown), wanted)
@@ -99,11 +99,11 @@ def test_fits_of_one_signature_are_seen_together(monkeypatch):
     """By the views of each, and as taken where noise was made white; at equal parts of the time."""
     fits, asked, clock = [ended(), ended((None, None))], [], iter([10.0, 13.0, 13.0])
     monkeypatch.setattr(
-        room, "see", lambda models, **given: asked.append((models, given)) or "seen"
+        room, "render_models", lambda models, **given: asked.append((models, given)) or "seen"
     )
-    monkeypatch.setattr(room, "view_as_taken", lambda home, o, view: (home, o.noise, view))
+    monkeypatch.setattr(room, "unfiltered_view", lambda home, o, view: (home, o.noise, view))
     monkeypatch.setattr(room, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
-    assert room.finish(fits) == "seen"
+    assert room.render_fits(fits) == "seen"
     ((models, given),) = asked
     assert given == {"fit_sky": "whether"} and len(models) == 2
     for fit, model in zip(fits, models, strict=True):
@@ -111,13 +111,15 @@ def test_fits_of_one_signature_are_seen_together(monkeypatch):
         assert model.source is fit.start.source and model.origin is fit.scene.origin
         assert [m.max() for m in model.morphs] == [1, 1, 0]
         assert fit.seconds == {"result": 2.5, "fit": 2.0}
-    assert models[0].bare == [None, ("home", "correlated", fits[0].views[1])]
-    assert models[1].bare == [None, None]
+    assert models[0].unfiltered_views == [None, ("home", "correlated", fits[0].views[1])]
+    assert models[1].unfiltered_views == [None, None]
 
 
 def test_fits_start_side_by_side_each_from_its_own_point(monkeypatch):
     clock, asked = iter([10.0, 16.0]), []
-    monkeypatch.setattr(room, "start", lambda patches, fit_sky: [p + fit_sky for p in patches])
+    monkeypatch.setattr(
+        room, "fit_start_profiles", lambda patches, fit_sky: [p + fit_sky for p in patches]
+    )
     monkeypatch.setattr(room, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
     fits = [
         SimpleNamespace(
@@ -125,13 +127,13 @@ def test_fits_start_side_by_side_each_from_its_own_point(monkeypatch):
         )
         for k in range(3)
     ]
-    room.begin(fits)
+    room.start_fits(fits)
     assert asked == [(100, 2.0), (101, 2.0), (102, 2.0)]
 
 
 def test_memory_of_a_fit_holds_the_vectors_of_a_prior_that_learns(monkeypatch):
     monkeypatch.setattr(room, "vector_bytes", lambda scene, prior: 1000 * prior)
     for learns, wanted in ((True, 3007), (False, 7)):
-        settings = SimpleNamespace(learns=learns, prior=3)
+        settings = SimpleNamespace(has_multiscale_prior=learns, prior=3)
         fit = SimpleNamespace(settings=settings, scene=SimpleNamespace(n_bytes=7))
         assert room.scene_bytes(fit) == wanted

@@ -7,12 +7,12 @@ import pytest
 from helpers import scenes
 
 from clresample.deblending import batch, fit as fit_module
-from clresample.deblending.batch import _ManyFits
+from clresample.deblending.batch import _BatchRunner
 from clresample.deblending.blend import Blend, Failure
 from clresample.deblending.fit import DIVERGED, PATIENCE, Fit, data_bytes, stop_reason
 from clresample.deblending.settings import Settings
 from clresample.deblending.solver.scene import Scene
-from clresample.sky.sources import Extended, SourceWarning
+from clresample.sky.sources import ExtendedSource, SourceWarning
 
 
 def test_when_a_fit_ends():
@@ -89,8 +89,8 @@ def fits(n, monkeypatch, *, sources=1, n_bytes=10, memory=1000, signatures=None,
 
     monkeypatch.setattr(batch, "Fit", one)
     monkeypatch.setattr(batch, "data_bytes", lambda _: n_bytes)
-    monkeypatch.setattr(batch, "instance", lambda *_: None)
-    many = object.__new__(_ManyFits)
+    monkeypatch.setattr(batch, "check_instance", lambda *_: None)
+    many = object.__new__(_BatchRunner)
     many.blends, many.done, many.memory = [None] * n, [None] * n, memory
     many.settings = many.device = many.dtype = many.pad = None
     many.tuning = SimpleNamespace(n_scenes=n_scenes)
@@ -120,7 +120,7 @@ def test_groups_fill_up():
         assert batch.START_SOURCES == 500
         assert fits(5, patch, sources=250) == [[0, 1], [2, 3], [4]]
         assert fits(4, patch, sources=249) == [[0, 1, 2], [3]]
-        patch.setattr(batch, "MOST_SOURCES", 9)
+        patch.setattr(batch, "MAX_SOURCES", 9)
         assert fits(7, patch, sources=3) == [[0, 1, 2], [3, 4, 5], [6]]
         assert fits(4, patch, sources=4) == [[0, 1], [2, 3]]
         kinds = [0, 1, 0, 1, 0]
@@ -140,7 +140,7 @@ def test_groups_fill_up():
 def test_parts_fit_into_the_memory(monkeypatch, sizes, parts):
     """Exactly the memory fits; what is larger by itself is tried by itself."""
     monkeypatch.setattr(batch, "scene_bytes", lambda fit: fit)
-    many = object.__new__(_ManyFits)
+    many = object.__new__(_BatchRunner)
     many.memory = 100
     found = [[size for _, size in part] for part in many._parts(list(enumerate(sizes)))]
     assert found == parts
@@ -187,7 +187,7 @@ def test_work_is_bounded_before_it_begins():
     with pytest.raises(ValueError, match=r"4096 x 4097 pixels, more than the 16777216 of one fit"):
         given._check_work(home)
     seen = [np.count_nonzero(o.weights[0]) for o in given.observations]
-    many = Blend(given.observations, (Extended(position_px=(3, 3)),) * (max(seen) + 1))
+    many = Blend(given.observations, (ExtendedSource(position_px=(3, 3)),) * (max(seen) + 1))
     with pytest.raises(
         ValueError, match=rf"{max(seen) + 1} components, more than .*\({max(seen)}\)"
     ):
@@ -203,7 +203,7 @@ def test_work_is_bounded_before_it_begins():
     dot[0, 5, 6] = 1
     with pytest.raises(ValueError, match=r"2 components, more than .*\(1\)"):
         Blend((one,), many.sources[:2])._check_work(given.frame)
-    two = Extended(position_px=(3, 3), n_components=2)
+    two = ExtendedSource(position_px=(3, 3), n_components=2)
     wide = SimpleNamespace(weights=np.ones((1, 60, 60)), data=np.zeros((1, 60, 60)))
     with pytest.raises(ValueError, match=r"1001 sources with 2002 components .* takes 2000 comp"):
         Blend((wide,), (two,) * 1001)._check_work(given.frame)

@@ -9,7 +9,7 @@ from clresample.files.results import read_result, write_result
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
-from clresample.sky.sources import Extended
+from clresample.sky.sources import ExtendedSource
 
 SHAPE = (30, 34)
 
@@ -29,7 +29,7 @@ def ring():
 
 def test_start_is_the_given_profile(tmp_path):
     profile = ring()
-    source = Extended(position_px=(15.0, 17.0), profile=profile)
+    source = ExtendedSource(position_px=(15.0, 17.0), profile=profile)
     result = deblend([scene(profile)], [source], settings=Settings(max_iter=0))
     (y, x), (component,) = result.components[0].origin, result.components
     part = profile[y : y + component.morphology.shape[0], x : x + component.morphology.shape[1]]
@@ -44,9 +44,9 @@ def test_profiles_that_cannot_be_taken():
         (np.ones(4), "must be"), (np.full(SHAPE, -1.0), "not negative"), (np.zeros(SHAPE), "zero"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=words):
-            Extended(position_px=(1, 1), profile=wrong)
+            ExtendedSource(position_px=(1, 1), profile=wrong)
     with pytest.raises(ValueError, match="one component"):
-        Extended(position_px=(1, 1), profile=np.ones(SHAPE), n_components=2)
-    small = Extended(position_px=(15, 17), profile=np.ones((20, 20)))
+        ExtendedSource(position_px=(1, 1), profile=np.ones(SHAPE), n_components=2)
+    small = ExtendedSource(position_px=(15, 17), profile=np.ones((20, 20)))
     with pytest.raises(ValueError, match=r"source 0 has the shape \(20, 20\)"):
         deblend([scene(ring())], [small])

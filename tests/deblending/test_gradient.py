@@ -16,7 +16,7 @@ from helpers.solver import (
 
 from clresample.deblending.solver import reference as ref
 from clresample.deblending.solver.amsgrad import BETA1
-from clresample.deblending.solver.gradient import Gradient
+from clresample.deblending.solver.gradient import LossGradient
 
 
 @pytest.mark.parametrize("depth", [0, 1, 2, None])
@@ -27,7 +27,7 @@ def test_kernels_are_their_references(build, dtype, depth):
     e, found = engine(pairs, build, dtype), references(pairs, PRIOR)
     for r in found:
         r.gradient()
-    e._gradient = Gradient(e.buffers, with_prior=True, depth=depth)
+    e._gradient = LossGradient(e.buffers, with_prior=True, depth=depth)
     e.gradient(3)
     close(build.get(e.losses)[3], [r.loss for r in found], dtype)
     close(build.get(e.buffers.d_spectra), np.concatenate([r.d_spectra for r in found]), dtype)
@@ -48,7 +48,7 @@ def formed(pair, latent):
     """The scene at another z."""
     scene, _ = pair
     morph = [
-        ref.form(p, PRIOR.alpha * np.sqrt(p), z, PRIOR.taps)
+        ref.form(p, PRIOR.strength * np.sqrt(p), z, PRIOR.taps)
         for p, z in zip(scene.profile, latent, strict=True)
     ]
     return changed(*pair, latent=latent, morph=morph)
@@ -77,7 +77,7 @@ def test_gradients_are_finite_differences(device, what):
     gradient = {
         "latent": [m / (1 - BETA1) for m in memory.morph[0]],
         "morph": [m / (1 - BETA1) for m in memory.morph[0]],
-        "spectra": memory.spectra[0] / (1 - BETA1) / pair[0].scale,
+        "spectra": memory.spectra[0] / (1 - BETA1) / pair[0].step_scale,
         "sky": np.add.reduceat(pull[0], e._gradient.rows[:-1]),
     }[what]
     rng = np.random.default_rng(4)

@@ -5,7 +5,7 @@ import pytest
 
 from clresample.deblending.blend import Blend
 from clresample.deblending.inspection import levels, listing, spoilt
-from clresample.deblending.inspection.image import Image
+from clresample.deblending.inspection.image import InspectedImage
 from clresample.deblending.inspection.inspect import _level_lines, inspect
 from clresample.deblending.inspection.psf_samples import pair_ratios, psf_at
 from clresample.deblending.settings import Settings
@@ -13,7 +13,7 @@ from clresample.sky.frame import model_frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
-from clresample.sky.sources import Extended, Point
+from clresample.sky.sources import ExtendedSource, PointSource
 
 SHAPE, NOISE, FWHM_SIGMA = (64, 60), 2.0, 1.5
 # (y, x) [px], flux [counts] in two channels, sigma [px] of the galaxy before the PSF; 0: a star
@@ -38,7 +38,7 @@ def observed(data, *, sigma=FWHM_SIGMA, name="cam", channels=("g", "r"), **given
     return Observation(data, PSF.gaussian(sigma), grid, name=name, channels=channels, **given)
 
 
-def sources_of(drawn=DRAWN, kind=Extended):
+def sources_of(drawn=DRAWN, kind=ExtendedSource):
     return tuple(kind(position_px=place) for place, _, _ in drawn)
 
 
@@ -46,19 +46,21 @@ def inspected(observations, sources=None, **settings):
     blend = Blend(tuple(observations), sources or sources_of())
     frame = model_frame(blend.observations)
     shifts = np.zeros((len(blend.observations), 2))
-    positions = frame.place(blend.sources, blend.observations)
+    positions = frame.positions_of(blend.sources, blend.observations)
     return inspect(blend, frame, positions, shifts, Settings(**settings))
 
 
 def looked_at(observation, sources=None):
     frame = model_frame([observation])
-    return Image.of(observation, frame, frame.place(sources or sources_of()), np.zeros(2))
+    return InspectedImage.of(
+        observation, frame, frame.positions_of(sources or sources_of()), np.zeros(2)
+    )
 
 
 @pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize("kind", [Extended, Point])
+@pytest.mark.parametrize("kind", [ExtendedSource, PointSource])
 def test_of_a_clean_image_nothing_is_said(seed, kind):
-    drawn = DRAWN if kind is Extended else tuple((p, f, 0.0) for p, f, _ in DRAWN)
+    drawn = DRAWN if kind is ExtendedSource else tuple((p, f, 0.0) for p, f, _ in DRAWN)
     found = inspected([observed(image_of(drawn, seed=seed))], sources_of(drawn, kind))
     assert found.messages == [] and found.settings.fit_shifts is False
     assert not found.shifts.any()
@@ -81,7 +83,7 @@ def test_a_rim_below_zero_is_no_light():
     y, x = np.indices((48, 48)) - 23.5
     wings = 4000 * (4 + y**2 + x**2) ** -1.0
     o = observed(image_of((), shape=(48, 48)) + wings - wings[0, 24] - 0.6 * NOISE)
-    source = (Extended(position_px=(23.5, 23.5)),)
+    source = (ExtendedSource(position_px=(23.5, 23.5)),)
     level = levels.sky_level(looked_at(o, source))
     assert (level.rim < -0.3 * NOISE).all() and (np.abs(level.level) < 4 * level.error).all()
     (message,) = inspected([o], source).messages
@@ -107,7 +109,7 @@ def test_wings_are_no_sky():
     y, x = np.indices((80, 80)) - 39.5
     wings = 12000 * (4 + y**2 + x**2) ** -1.25
     o = observed(image_of((), shape=(80, 80)) + wings)
-    source = (Extended(position_px=(39.5, 39.5)),)
+    source = (ExtendedSource(position_px=(39.5, 39.5)),)
     level = levels.sky_level(looked_at(o, source))
     assert (np.abs(level.level) < 3 * level.error).all() and (level.rim > 0.4 * NOISE).all()
     (message,) = inspected([o], source).messages
@@ -144,7 +146,9 @@ def test_cosmic_rays_are_masked(at):
 def test_stars_are_never_masked(given_sigma):
     """Nor where the PSF is too wide, nor where nobody listed them."""
     stars = tuple((p, (1e5, 1e5), 0.0) for p, _, _ in DRAWN)
-    found = inspected([observed(image_of(stars), sigma=given_sigma)], sources_of(stars[:1], Point))
+    found = inspected(
+        [observed(image_of(stars), sigma=given_sigma)], sources_of(stars[:1], PointSource)
+    )
     assert all((o.weights > 0).all() for o in found.blend.observations)
 
 
@@ -197,15 +201,15 @@ def test_light_without_a_source_is_named():
 
 def test_doubles_are_named_unless_of_two_kinds():
     o, near = observed(image_of()), DRAWN[0][0][0] + 0.6
-    twin = Extended(position_px=(near, DRAWN[0][0][1]))
+    twin = ExtendedSource(position_px=(near, DRAWN[0][0][1]))
     (message,) = inspected([o], (*sources_of(), twin)).messages
     assert message.startswith("sources 0 and 3 lie within 1 model pixel")
-    core = Point(position_px=DRAWN[0][0])
+    core = PointSource(position_px=DRAWN[0][0])
     assert inspected([o], (*sources_of(), core)).messages == []
 
 
 def test_positions_that_are_all_off_are_named():
-    moved = tuple(Extended(position_px=(y + 1, x + 1)) for (y, x), _, _ in DRAWN)
+    moved = tuple(ExtendedSource(position_px=(y + 1, x + 1)) for (y, x), _, _ in DRAWN)
     messages = inspected([observed(image_of())], moved).messages
     assert any("light lies at (-1." in m and "FITS counts from 1" in m for m in messages)
 
@@ -214,7 +218,7 @@ def test_positions_that_are_all_off_are_named():
 def test_stars_of_another_width_than_the_psf_are_named(factor, word):
     star = ((DRAWN[0][0], (2e4, 2e4), 0.0),)
     o = observed(image_of(star), sigma=factor * FWHM_SIGMA)
-    assert any(word in m for m in inspected([o], sources_of(star, Point)).messages)
+    assert any(word in m for m in inspected([o], sources_of(star, PointSource)).messages)
 
 
 def test_channels_that_lie_apart_are_named():

@@ -3,10 +3,14 @@
 import numpy as np
 import pytest
 
-from clresample.deblending.solver.learned import inverse
-from clresample.deblending.solver.learned.evidence import SourceEvidence, Spectra, blurred_light
-from clresample.deblending.solver.learned.inverse import Block, SourceInverse
-from clresample.deblending.solver.learned.prior import LearnedPrior
+from clresample.deblending.solver.multiscale import inverse
+from clresample.deblending.solver.multiscale.evidence import (
+    LocalPowerSpectra,
+    SourceEvidence,
+    blurred_light,
+)
+from clresample.deblending.solver.multiscale.inverse import BlockPreconditioner, CurvatureBlock
+from clresample.deblending.solver.multiscale.prior import MultiscalePrior
 
 SPECTRUM = np.array([3.0, 1.0])
 
@@ -25,33 +29,33 @@ def answers(widths=(1.0, 2.5)):
 
 
 def whole(block):
-    """The inverse (m, m) that a Block stands for."""
-    m, n_rows = len(block.places), inverse.PANEL
+    """The inverse (m, m) that a CurvatureBlock stands for."""
+    m, n_rows = len(block.indices), inverse.PANEL
     root, at = np.zeros((-(-m // n_rows) * n_rows,) * 2), 0
     for i in range(0, len(root), n_rows):
         size = n_rows * (i + n_rows)
-        root[i : i + n_rows, : i + n_rows] = block.root[at : at + size].reshape(n_rows, -1)
+        root[i : i + n_rows, : i + n_rows] = block.cholesky[at : at + size].reshape(n_rows, -1)
         at += size
-    assert at == block.root.size and not np.triu(root, 1).any()
+    assert at == block.cholesky.size and not np.triu(root, 1).any()
     return root[:m, :m].T @ root[:m, :m]
 
 
 class Made:
-    """A galaxy's SourceInverse, and its curvature in full."""
+    """A galaxy's BlockPreconditioner, and its curvature in full."""
 
     def __init__(self, shape, strengths, found=None, sigma=4.0):
-        prior = self.prior = LearnedPrior()
+        prior = self.prior = MultiscalePrior()
         self.profile = galaxy(*shape, sigma)
-        spectra = Spectra(prior)
+        spectra = LocalPowerSpectra(prior)
         found = answers() if found is None else found
-        response = spectra.of_answers(*found)
+        response = spectra.from_impulse_responses(*found)
         self.lags = np.tensordot(SPECTRUM**2, found[0], 1)
         evidence = SourceEvidence(spectra, prior, self.profile, response)
         light = [
             blurred_light(self.profile, s, n)
             for s, n in zip(prior.scales_px, prior.steps, strict=True)
         ]
-        self.made = SourceInverse(evidence, self.profile, light)
+        self.made = BlockPreconditioner(evidence, self.profile, light)
         self.strengths = np.array(strengths)
         self.sizes = [a.shape for a in light]
 
@@ -130,7 +134,7 @@ def test_one_block_is_the_inverse_of_its_part_of_the_curvature(strengths, error)
     coarser scales are in it. Of a diagonal that factor is over 5000."""
     made = Made((17, 20), strengths)
     (block,) = made.blocks()
-    places, found = block.places, whole(block)
+    places, found = block.indices, whole(block)
     assert block.level == 0 and len(places) == len(set(places)) > 10
     curvature = made.curvature()[np.ix_(places, places)]
     values = np.linalg.eigvals(found @ curvature).real
@@ -142,10 +146,10 @@ def test_one_block_is_the_inverse_of_its_part_of_the_curvature(strengths, error)
 @pytest.mark.parametrize(
     "shape, strengths, step, most_pixels",
     [
-        ((17, 20), (0.003, 0.3, 0.05), 2, inverse.MOST_PIXELS),
+        ((17, 20), (0.003, 0.3, 0.05), 2, inverse.MAX_PIXELS),
         ((17, 20), (0.003, 0.01, 1.0), 2, 9 * 10),
         ((17, 20), (0.003, 0.01, 1.0), 4, 9 * 10 - 1),
-        ((40, 44), (1e-5, 1e-5, 0.018), 2, inverse.MOST_PIXELS),  # fewer than the window has rows
+        ((40, 44), (1e-5, 1e-5, 0.018), 2, inverse.MAX_PIXELS),  # fewer than the window has rows
         ((40, 44), (0.003, 0.01, 1.0), 4, 200),
     ],
 )
@@ -154,21 +158,21 @@ def test_binned_pixels_hold_sums_of_structure_and_means_of_what_the_data_say(
 ):
     """The block is the inverse on such pixels, to what little light its window leaves out."""
     assert inverse.COARSEST == 2
-    monkeypatch.setattr(inverse, "MOST_PIXELS", most_pixels)
-    monkeypatch.setattr(inverse, "WORTH", 10.0)
+    monkeypatch.setattr(inverse, "MAX_PIXELS", most_pixels)
+    monkeypatch.setattr(inverse, "MIN_DATA_TO_PRIOR", 10.0)
     made = Made(shape, strengths)
     (block,) = made.blocks()
-    low, high = between(whole(block), made.binned(block.places, step))
+    low, high = between(whole(block), made.binned(block.indices, step))
     assert 0.99 < low and high < 1.04
 
 
 @pytest.mark.parametrize("more", [0, 1])
 def test_a_source_of_more_coefficients_than_a_block_holds_has_two(more, monkeypatch):
     made = Made((17, 20), (1e-5, 0.3, 1e-5))
-    (places,) = (block.places for block in made.blocks())
-    monkeypatch.setattr(inverse, "MOST", len(places) - more)
+    (places,) = (block.indices for block in made.blocks())
+    monkeypatch.setattr(inverse, "MAX_BLOCK_SIZE", len(places) - more)
     made = Made((17, 20), (1e-5, 0.3, 1e-5))
-    parts = [block.places for block in made.blocks() if block.level == 0]
+    parts = [block.indices for block in made.blocks() if block.level == 0]
     assert len(parts) == 1 + more
     assert sorted(np.concatenate(parts)) == sorted(places)
 
@@ -176,17 +180,17 @@ def test_a_source_of_more_coefficients_than_a_block_holds_has_two(more, monkeypa
 def test_each_part_of_a_large_source_is_the_inverse_there(monkeypatch):
     """Parts with the finest scale in them see each pixel; parts lie side by side, none of them
     long and narrow, so that each has all there is within it."""
-    monkeypatch.setattr(inverse, "MOST", 150)
+    monkeypatch.setattr(inverse, "MAX_BLOCK_SIZE", 150)
     made = Made((26, 30), (0.3, 0.1, 0.05))
     curvature, blocks = made.curvature(), made.blocks()
     ends = np.cumsum([0, *(a * b for a, b in made.sizes)])
     for block in blocks:
-        level, places = block.level, block.places
+        level, places = block.level, block.indices
         low, high = between(whole(block), curvature[np.ix_(places, places)])
         assert 0.98 < low and high < (1.2, 1.8, 1.3)[level]
         assert (places.min() < ends[1]) == (level == 0) and places.min() >= ends[level]
     assert {block.level for block in blocks} == {0, 1, 2}
-    first = [b.places[b.places < ends[1]] for b in blocks if b.level == 0]
+    first = [b.indices[b.indices < ends[1]] for b in blocks if b.level == 0]
     for own in first:
         sides = np.ptp(np.divmod(own, made.sizes[0][1]), axis=1) + 1
         assert sides.prod() < 1.7 * len(own) + 10 and sides.max() < 3 * sides.min()
@@ -198,7 +202,7 @@ def test_what_the_data_say_of_neighbours_reaches_half_a_spectrum():
     found = np.array([50 * np.outer(along, along)] * 2), np.full((2, 2), 32)
     made = Made((32, 5), (0.3, 1e-5, 1e-5), found, sigma=20.0)
     (block,) = made.blocks()
-    places = block.places
+    places = block.indices
     low, high = between(whole(block), made.curvature()[np.ix_(places, places)])
     assert len(places) > 150 and 0.99 < low and high < 1.01
 
@@ -207,7 +211,7 @@ def test_coefficients_of_which_the_data_say_little_are_in_no_block():
     made = Made((17, 20), (1e-5, 1e-5, 1e-5))
     assert made.blocks() == []
     made = Made((17, 20), (1e-5, 0.3, 1e-5))
-    places = np.concatenate([block.places for block in made.blocks()])
+    places = np.concatenate([block.indices for block in made.blocks()])
     first = made.sizes[0][0] * made.sizes[0][1]
     assert places.min() >= first and places.max() < first + made.sizes[1][0] * made.sizes[1][1]
 
@@ -215,7 +219,7 @@ def test_coefficients_of_which_the_data_say_little_are_in_no_block():
 def test_large_sources_have_parts_and_wide_waves_across_them(monkeypatch):
     """Parts share no coefficient; the coarser scales in a second level make the worst direction's
     curvature right to a factor of a hundred, which is thousands without them."""
-    monkeypatch.setattr(inverse, "MOST", 150)
+    monkeypatch.setattr(inverse, "MAX_BLOCK_SIZE", 150)
     made = Made((26, 30), (0.3, 0.3, 0.3))
     blocks = made.blocks()
     curvature = made.curvature()
@@ -223,12 +227,12 @@ def test_large_sources_have_parts_and_wide_waves_across_them(monkeypatch):
     n = len(curvature)
     total, worst = np.zeros((n, n)), []
     for level in sorted({block.level for block in blocks}):
-        seen = np.concatenate([block.places for block in blocks if block.level == level])
+        seen = np.concatenate([block.indices for block in blocks if block.level == level])
         assert len(seen) == len(set(seen))
         for block in blocks:
-            assert len(block.places) <= 150
+            assert len(block.indices) <= 150
             if block.level == level:
-                total[np.ix_(block.places, block.places)] += whole(block)
+                total[np.ix_(block.indices, block.indices)] += whole(block)
         used = np.flatnonzero(total.diagonal())
         values = np.linalg.eigvals((total @ curvature)[np.ix_(used, used)]).real
         worst.append(values.max() / values.min())
@@ -260,9 +264,9 @@ def test_wide_waves_are_seen_on_coarser_pixels(monkeypatch):
         return between(sharpness, shape, step)
 
     monkeypatch.setattr(inverse, "_between", watched)
-    monkeypatch.setattr(inverse, "MOST_PIXELS", 200)
+    monkeypatch.setattr(inverse, "MAX_PIXELS", 200)
     (block,) = made.blocks()
-    places, found = block.places, whole(block)
+    places, found = block.indices, whole(block)
     values = np.linalg.eigvals(found @ made.curvature()[np.ix_(places, places)]).real
     assert sizes[0][0] <= 200 and sizes[0][1] == 4
     assert values.min() > 0.5 and values.max() < 10
@@ -282,11 +286,11 @@ def test_blocks_stand_until_something_has_changed():
 
 def test_a_curvature_that_is_no_sum_of_squares_leaves_its_diagonal():
     curvature = np.array([[1.0, 3.0], [3.0, 1.0]], np.float32)
-    block = Block(0, np.arange(2), inverse._root(curvature, np.array([0.5, 1.0])))
+    block = CurvatureBlock(0, np.arange(2), inverse._root(curvature, np.array([0.5, 1.0])))
     np.testing.assert_allclose(whole(block), np.diag([1 / 1.5, 1 / 2]), rtol=1e-6)
 
 
 def test_a_matrix_that_float32_cannot_factor_is_factored_in_float64():
     curvature = np.full((2, 2), 2.0**30, np.float32)
-    block = Block(0, np.arange(2), inverse._root(curvature, np.full(2, 0.5)))
+    block = CurvatureBlock(0, np.arange(2), inverse._root(curvature, np.full(2, 0.5)))
     np.testing.assert_allclose(whole(block), [[1, -1], [-1, 1]], rtol=1e-5)

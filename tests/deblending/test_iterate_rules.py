@@ -8,31 +8,40 @@ import pytest
 from helpers.told import Told, learning
 
 from clresample.deblending import iterate as room
-from clresample.deblending.iterate import CHECK, LEAST_GAIN, MOVE, REPACK, iterate
+from clresample.deblending.iterate import (
+    CHECK_ITERATIONS,
+    MIN_GAIN,
+    REPACK_FRACTION,
+    SHIFT_ITERATIONS,
+    iterate,
+)
 
 
 @pytest.fixture(autouse=True)
 def no_exchange(monkeypatch):
     """No sources share light."""
-    monkeypatch.setattr(room, "exchange_of", lambda *given: None)
+    monkeypatch.setattr(room, "make_joint_step", lambda *given: None)
 
 
 def test_steps_of_exchange_are_asked_for_in_time_and_again_where_the_last_one_gained(monkeypatch):
-    """Of settled fits after FIRST_EXCHANGE rounds and each EXCHANGE, of converged ones at once."""
+    """Of settled fits after FIRST_JOINT_STEP rounds and each EXCHANGE.
+
+    Of converged ones at once.
+    """
     made, steps, gains = [], [], {"a": 0.2, "b": 0.6, "c": 0.9}
 
     def exchange_of(fit, scene, state, findings):
         made.append((fit.name, scene, state, findings))
         return SimpleNamespace(step=lambda x: (x, 0, 0, gains[fit.name]))
 
-    monkeypatch.setattr(room, "exchange_of", exchange_of)
-    one = learning([39, 39, 12], converged=[False, False, True], enough=2.5, max_iter=200)
+    monkeypatch.setattr(room, "make_joint_step", exchange_of)
+    one = learning([39, 39, 12], converged=[False, False, True], loss_tol=2.5, max_iter=200)
     p, every = one.engine.progress, np.ones(3, bool)
     one.engine.step = lambda given: steps.append({i: step[0] for i, step in given.items()})
     one._exchange(every)
     assert made == [("c", "scene 2", "state 2", "findings 2")] and not steps  # .9 of 2
     p.n_rounds += 1
-    for known in (p.settled, p.looked):  # strengths, and what is clear
+    for known in (p.settled, p.tested):  # strengths, and what is clear
         assert len(made) == 1
         known[:2] = True
         one._exchange(every)
@@ -89,7 +98,7 @@ def test_a_round_settles_those_that_it_ends():
     one.engine.round = round_
     np.testing.assert_array_equal(one.run(), [[1, 2, 3]])
     assert [f.ended is not None for f in one.fits] == [True, False, False]
-    assert one.fits[0].losses == [1.0] * CHECK and p.n_rounds.tolist() == [6, 10, 5]
+    assert one.fits[0].losses == [1.0] * CHECK_ITERATIONS and p.n_rounds.tolist() == [6, 10, 5]
     assert p.live.tolist() == [False, True, False]
     one.settings.max_iter = one.n_steps + 2
     one.run()
@@ -117,10 +126,10 @@ def test_converged_fits_are_shifted_once_more_before_they_end(at_limit, monkeypa
 
 def test_shifts_are_made_where_they_gain_part_of_what_ends_a_fit(monkeypatch):
     """In its own measure of misfit; steps are taken ahead from the last ones."""
-    one = learning([11, 11, 11], fit_shifts=True, enough=0.2)
+    one = learning([11, 11, 11], fit_shifts=True, loss_tol=0.2)
     gains = {"scene 0": 1.01, "scene 1": 1.99, "scene 2": 4.01}
     steps = np.array([[0.0, 0.0], [0.1, 0.2]])
-    part = LEAST_GAIN * 0.2
+    part = MIN_GAIN * 0.2
 
     def shift_steps(scene, state):
         assert state[-1] == scene[-1]
@@ -128,7 +137,7 @@ def test_shifts_are_made_where_they_gain_part_of_what_ends_a_fit(monkeypatch):
 
     asked = []
     monkeypatch.setattr(room, "shift_steps", shift_steps)
-    monkeypatch.setattr(room, "ahead", lambda new, last: asked.append(last.max()) or 3 * new)
+    monkeypatch.setattr(room, "extrapolate", lambda new, last: asked.append(last.max()) or 3 * new)
     one.shift()
     assert one.engine.followed == [[True, False, True]] and asked == [9, 9]
     np.testing.assert_array_equal(one.fits[0].shifts, 3 * steps)
@@ -142,18 +151,18 @@ def test_shifts_are_made_where_they_gain_part_of_what_ends_a_fit(monkeypatch):
     before = len(asked)
     one._move(np.zeros(3, bool))
     assert len(asked) == before
-    one.engine.progress.n_rounds[:] = MOVE + 2
+    one.engine.progress.n_rounds[:] = SHIFT_ITERATIONS + 2
     one.shift()  # not every round
-    one.engine.progress.n_rounds[:] = MOVE + 1
+    one.engine.progress.n_rounds[:] = SHIFT_ITERATIONS + 1
     one.settings.fit_shifts = False
     one.shift()
     assert len(asked) == before
 
 
 def test_fits_that_go_on_leave_a_batch_of_which_a_quarter_has_stopped():
-    assert REPACK == 0.25
+    assert REPACK_FRACTION == 0.25
     one = learning([3] * 3, live=[True, False, True])
-    one.engine.take = lambda keep: SimpleNamespace(kept=keep.tolist())
+    one.engine.subset = lambda keep: SimpleNamespace(kept=keep.tolist())
     rest = one.repacked()
     assert rest is not one and rest.engine.kept == [0, 2]
     assert [f.name for f in rest.fits] == ["a", "c"]
@@ -179,11 +188,11 @@ class Engine:
     def final_losses(self):
         return np.arange(len(self.scenes)) + 0.5
 
-    def follow_shifts(self):
+    def update_shifts(self):
         self.followed += 1
 
 
-RUNNING = room._Running
+RUNNING = room._AmsgradRun
 
 
 def running(n, *, live=None, n_steps=0, **settings):
@@ -198,10 +207,12 @@ def running(n, *, live=None, n_steps=0, **settings):
 
 
 def test_other_engines_run_a_few_iterations_and_settle_who_stops():
-    one = running(3, live=[True, True, False], max_iter=CHECK + 2)
+    one = running(3, live=[True, True, False], max_iter=CHECK_ITERATIONS + 2)
     losses = one.run()
-    assert losses.shape == (CHECK, 3) and one.live.tolist() == [True, False, False]
-    assert one.fits[0].losses == (-np.arange(CHECK)).tolist() and one.fits[2].losses == []
+    assert losses.shape == (CHECK_ITERATIONS, 3) and one.live.tolist() == [True, False, False]
+    assert (
+        one.fits[0].losses == (-np.arange(CHECK_ITERATIONS)).tolist() and one.fits[2].losses == []
+    )
     assert one.fits[1].ended == (1.5, "scene 1", "state 1")
     assert one.fits[1].best == (1.25, "scene 1", "kept 1")
     assert one.fits[0].ended is None and one.fits[0].best is None
@@ -210,13 +221,16 @@ def test_other_engines_run_a_few_iterations_and_settle_who_stops():
     assert one.fits[2].ended is None
 
 
-@pytest.mark.parametrize("fit_shifts, n_steps", [(True, MOVE), (True, MOVE - 1), (False, MOVE)])
+@pytest.mark.parametrize(
+    "fit_shifts, n_steps",
+    [(True, SHIFT_ITERATIONS), (True, SHIFT_ITERATIONS - 1), (False, SHIFT_ITERATIONS)],
+)
 def test_other_engines_shift_every_few_iterations(fit_shifts, n_steps, monkeypatch):
     one = running(3, live=[True, False, True], fit_shifts=fit_shifts, n_steps=n_steps)
     monkeypatch.setattr(room, "shift_steps", lambda scene, state: (np.full((2, 2), 0.5), 1.0))
     one.fits[0].shifts = np.ones((2, 2))
     one.shift()
-    due = fit_shifts and n_steps == MOVE
+    due = fit_shifts and n_steps == SHIFT_ITERATIONS
     assert one.engine.followed == due
     assert [f.shifts.max() for f in one.fits] == ([1.5, 0, 0.5] if due else [1, 0, 0])
     assert (one.fits[0].best == (0.25, "scene 0", "kept 0")) == due and one.fits[1].best is None
@@ -225,10 +239,10 @@ def test_other_engines_shift_every_few_iterations(fit_shifts, n_steps, monkeypat
 def test_ctrl_c_settles_those_that_go_on(monkeypatch):
     one = running(3, live=[True, False, True])
     one.run = lambda: (_ for _ in ()).throw(KeyboardInterrupt)
-    monkeypatch.setattr(room, "_Running", lambda *_: one)
+    monkeypatch.setattr(room, "_AmsgradRun", lambda *_: one)
     clock = iter([10.0, 13.0, 13.0, 13.0])
     monkeypatch.setattr(room, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
-    iterate(one.fits, SimpleNamespace(learns=False, max_iter=9), None, None)
+    iterate(one.fits, SimpleNamespace(has_multiscale_prior=False, max_iter=9), None, None)
     assert [f.status == "interrupted" for f in one.fits] == [True, False, True]
     assert [f.ended is not None for f in one.fits] == [True, False, True]
     assert [f.seconds for f in one.fits] == [{"fit": 1.0}] * 3  # shared among them
@@ -240,8 +254,8 @@ def test_a_run_ends_when_no_fit_goes_on_or_at_the_limit(monkeypatch):
         one, seen, calls = running(2, max_iter=max_iter), [], []
         one.fits[0].stopped = lambda losses, one=one: one.n_steps >= 10
         one.shift, one.repacked = lambda calls=calls: calls.append(1), lambda one=one: one
-        monkeypatch.setattr(room, "_Running", lambda *_, one=one: one)
-        settings = SimpleNamespace(learns=False, max_iter=max_iter)
+        monkeypatch.setattr(room, "_AmsgradRun", lambda *_, one=one: one)
+        settings = SimpleNamespace(has_multiscale_prior=False, max_iter=max_iter)
         iterate(one.fits, settings, None, None, lambda n, loss, seen=seen: seen.append((n, loss)))
         assert [n for n, _ in seen] == wanted and len(calls) == max(len(wanted) - 1, 0)
         if seen:

@@ -4,13 +4,20 @@ import numpy as np
 import pytest
 from helpers.solver import close, every_type, ragged
 
-from clresample.deblending.solver.buffers import Buffers
-from clresample.deblending.solver.learned.inverse import Block, _panels
-from clresample.deblending.solver.learned.pairs import Pairs
-from clresample.deblending.solver.learned.prior import LearnedPrior
-from clresample.deblending.solver.learned.steps import AGAIN, NEXT, REST, STAY, TRY, Steps
-from clresample.deblending.solver.learned.structure import Latents
-from clresample.deblending.solver.learned.vectors import Vectors
+from clresample.deblending.solver.buffers import SceneBuffers
+from clresample.deblending.solver.multiscale.inverse import CurvatureBlock, _panels
+from clresample.deblending.solver.multiscale.lbfgs_pairs import LbfgsPairs
+from clresample.deblending.solver.multiscale.lbfgs_steps import (
+    AGAIN,
+    NEXT,
+    REST,
+    STAY,
+    TRY,
+    LbfgsSteps,
+)
+from clresample.deblending.solver.multiscale.prior import MultiscalePrior
+from clresample.deblending.solver.multiscale.structure import LatentLayout
+from clresample.deblending.solver.multiscale.vectors import SolverVectors
 
 N_PAIRS = 4
 
@@ -36,7 +43,7 @@ def test_pairs_give_the_direction_of_the_two_loops():
     rng, n, n_scenes = np.random.default_rng(0), 12, 3
     matrix = rng.normal(size=(n, n))
     matrix = matrix @ matrix.T + np.eye(n)
-    pairs, h = Pairs(n_scenes, N_PAIRS), rng.uniform(0.5, 2, n)
+    pairs, h = LbfgsPairs(n_scenes, N_PAIRS), rng.uniform(0.5, 2, n)
     kept = [[] for _ in range(n_scenes)]
     s_ring, y_ring = np.zeros((2, n_scenes, pairs.n_slots, n))
     for k in range(9):
@@ -67,13 +74,13 @@ class Made:
     def __init__(self, build, dtype):
         if dtype == np.float64 and not build.has_fp64:
             pytest.skip(f"{build.name} has no double precision")
-        prior, rng = LearnedPrior(), np.random.default_rng(0)
+        prior, rng = MultiscalePrior(), np.random.default_rng(0)
         scenes, states = map(list, zip(*ragged(build, dtype), strict=True))
-        self.b = b = Buffers(scenes, states, build, dtype, prior)
-        self.latents = Latents(b.host_boxes, build.get(b.free)[: b.n_free], prior.steps)
-        self.v = v = Vectors(b, self.latents, N_PAIRS + 1)
+        self.b = b = SceneBuffers(scenes, states, build, dtype, prior)
+        self.latents = LatentLayout(b.host_boxes, build.get(b.free)[: b.n_free], prior.steps)
+        self.v = v = SolverVectors(b, self.latents, N_PAIRS + 1)
         self.host, self.device = {}, build
-        for name in Vectors.NAMES:
+        for name in SolverVectors.NAMES:
             array = getattr(v, name)
             self.host[name] = rng.normal(size=array.shape).astype(dtype).astype(float)
             build.upload(self.host[name].astype(dtype), array)
@@ -90,10 +97,10 @@ class Made:
             seen[first : first + length] += 1
         assert (seen == 1).all()
         assert self.bounded.sum() == v.n_spectra
-        self.pairs = Pairs(3, N_PAIRS)
+        self.pairs = LbfgsPairs(3, N_PAIRS)
         self.pairs.used[:] = 5, 2, 5
         self.pairs._order[:] = np.arange(5)
-        self.steps = Steps(v)
+        self.steps = LbfgsSteps(v)
         self.follow([TRY, TRY, REST])
 
     def follow(self, mode):
@@ -111,7 +118,7 @@ class Made:
         for s, some in enumerate(blocks):
             for level in range(2):
                 for block, matrix in some:
-                    where = self.latents.start[s] + block.places
+                    where = self.latents.start[s] + block.indices
                     if block.level == level:
                         before = out[where] if level else 0
                         out[where] = before + matrix @ vector[where]
@@ -129,7 +136,7 @@ def random_blocks(made, seed=5):
                 continue
             places = rng.permutation(np.array(places))[:37]
             root = np.tril(rng.normal(size=(len(places), len(places)))).astype(np.float32)
-            block = Block(int(level == 2), places, _panels(root))
+            block = CurvatureBlock(int(level == 2), places, _panels(root))
             found.append((block, root.T.astype(float) @ root))
         blocks.append(found)
     return blocks
@@ -217,34 +224,34 @@ def test_only_new_roots_are_uploaded(build, monkeypatch):
     )
 
     def made(value, m=20):
-        return Block(0, np.arange(m), _panels(np.full((m, m), float(value))))
+        return CurvatureBlock(0, np.arange(m), _panels(np.full((m, m), float(value))))
 
     def held():
         """The value of each block on the device, if it is the same all over."""
         flat, out = m.b.device.get(shelf.values), []
         for block in blocks:
-            part = flat[shelf.first(block) :][: block.root.size]
-            np.testing.assert_array_equal(part, block.root)
+            part = flat[shelf.first(block) :][: block.cholesky.size]
+            np.testing.assert_array_equal(part, block.cholesky)
             out.append(part[0])
         return out
 
     blocks = [made(k) for k in range(1, 9)]
-    shelf.hold(blocks)
+    shelf.retain(blocks)
     before, first = shelf.values, [shelf.first(b) for b in blocks]
     blocks[3] = made(20)
     uploads.clear()
-    shelf.hold(blocks)
-    assert len(uploads) == 1 and uploads[0] < 2 * blocks[3].root.size
+    shelf.retain(blocks)
+    assert len(uploads) == 1 and uploads[0] < 2 * blocks[3].cholesky.size
     assert shelf.values is before and held() == [1, 2, 3, 20, 5, 6, 7, 8]
     assert [shelf.first(b) for b in blocks[4:]] == first[4:]
     blocks = [made(k + 30) for k in range(8)]
-    shelf.hold(blocks)
+    shelf.retain(blocks)
     assert shelf.values is not before and held() == list(range(30, 38))
     before, blocks = shelf.values, blocks[1:4]  # a quarter of the room, which is enough
-    shelf.hold(blocks)
+    shelf.retain(blocks)
     assert shelf.values is before and held() == [31, 32, 33]
     blocks = blocks[1:]
-    shelf.hold(blocks)
+    shelf.retain(blocks)
     assert shelf.values.size < before.size and held() == [32, 33]
 
 
@@ -269,7 +276,7 @@ def test_other_strengths_reach_every_vector(build, dtype):
 
 def test_spectra_and_sky_go_there_and_back(build):
     m = Made(build, np.float64)
-    m.v.take(m.v.x_new)
+    m.v.unpack_spectra(m.v.x_new)
     tail = m.host["x_new"][m.latents.size :]
     both = np.concatenate([build.get(a).ravel() for a in (m.b.spectra, m.b.sky)])
     np.testing.assert_array_equal(both, tail)
@@ -277,7 +284,7 @@ def test_spectra_and_sky_go_there_and_back(build):
     pull, d_spectra = rng.normal(size=(3, 10)), rng.normal(size=m.b.spectra.shape)
     rows = np.array([0, 4, 7, 10])
     build.upload(d_spectra, m.b.d_spectra)
-    m.v.give(m.b.put(pull), build.put(rows, np.int32))
+    m.v.pack_gradients(m.b.put(pull), build.put(rows, np.int32))
     wanted = np.concatenate([d_spectra.ravel(), np.add.reduceat(pull, rows[:-1], 1).ravel()])
     close(m.get("g_new")[m.latents.size :], wanted, np.float64)
 
@@ -287,14 +294,14 @@ def test_a_part_of_a_batch_goes_on_alone(build):
     m = Made(build, np.float32)
     keep = np.array([2, 0])
     scenes, states = map(list, zip(*ragged(build, np.float32), strict=True))
-    prior = LearnedPrior()
-    b = Buffers([scenes[i] for i in keep], [states[i] for i in keep], build, np.float32, prior)
-    latents = Latents(b.host_boxes, build.get(b.free)[: b.n_free], prior.steps)
-    other = Vectors(b, latents, N_PAIRS + 1)
+    prior = MultiscalePrior()
+    b = SceneBuffers([scenes[i] for i in keep], [states[i] for i in keep], build, np.float32, prior)
+    latents = LatentLayout(b.host_boxes, build.get(b.free)[: b.n_free], prior.steps)
+    other = SolverVectors(b, latents, N_PAIRS + 1)
     other.copy_from(m.v, keep)
-    for name in Vectors.NAMES:
+    for name in SolverVectors.NAMES:
         found, wanted = build.get(getattr(other, name)), build.get(getattr(m.v, name))
         parts = [wanted[..., a:b] for kind in range(3) for a, b in m.v.parts()[keep, kind]]
         np.testing.assert_array_equal(found, np.concatenate(parts, axis=-1))
-    pairs = m.pairs.take_scenes(keep)
+    pairs = m.pairs.subset(keep)
     assert pairs.used.tolist() == [5, 5]

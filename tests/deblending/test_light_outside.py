@@ -8,7 +8,7 @@ from helpers.blends import SCALE, blend, gaussian, observe
 
 from clresample.deblending.assessment.edge import continued, light_outside, reaches_outside, widened
 from clresample.deblending.posterior.errors import Errors
-from clresample.deblending.profiles import Galaxy
+from clresample.deblending.profiles import GalaxyProfile
 from clresample.deblending.result import Component
 from clresample.measurement.catalogue import Flag, catalogue
 from clresample.sky.frame import Frame
@@ -53,9 +53,9 @@ def test_light_that_ends_within_the_frame_has_none_outside():
 def galaxy(sigma_px, *, wings=6.0, frame=(61, 61)):
     """A result of one galaxy in the middle of its frame, whose box is all of it, and its shape."""
     grid = Grid.flat(frame, SCALE)
-    shape, at = Galaxy(Frame(grid, PSF.gaussian(0.8))), (np.array(frame) - 1) / 2
+    shape, at = GalaxyProfile(Frame(grid, PSF.gaussian(0.8))), (np.array(frame) - 1) / 2
     theta = np.array([np.log(sigma_px), 0, 0, np.log(wings)])
-    (image,) = shape.cut(theta, at, (0, 0), frame, slopes=False)
+    (image,) = shape.draw_box(theta, at, (0, 0), frame, slopes=False)
     part = Component(0, (0, 0), image / image.max(), np.array([50.0, 100.0]))
     seen = observe(grid, ("g", "r"), weights=1e-12)
     covariance = np.full((2, 1, 1), 1e-4)

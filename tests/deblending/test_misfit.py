@@ -8,7 +8,7 @@ from helpers.blends import blend, gaussian, observe, round_component
 
 from clresample import Flag, Grid, catalogue, summary
 from clresample.deblending.assessment.misfit import chi2_excess, correlation_sum
-from clresample.deblending.assessment.status import judged
+from clresample.deblending.assessment.status import with_misfit_status
 from clresample.deblending.posterior.residuals import fine_scatter
 
 GRID = Grid.flat((80, 84), 0.1)
@@ -40,14 +40,14 @@ def flagged(result):
 
 def test_models_that_describe_the_data_are_neither_flagged_nor_renamed():
     for seed in range(20):
-        found = judged(broken(seed=seed))
+        found = with_misfit_status(broken(seed=seed))
         assert found.status == "converged" and summary(found)["good"] and not found.messages
         assert not any(flagged(found))
 
 
 @pytest.mark.parametrize("bright", [20.0, 300.0, 30000.0])
 def test_half_a_flux_is_wrong_however_bright(bright):
-    found = judged(broken(times=(0.5, 1), bright=bright))
+    found = with_misfit_status(broken(times=(0.5, 1), bright=bright))
     assert found.status == "misfit" and not found.converged
     assert flagged(found) == [True, False]
     ended, table = summary(found), catalogue(found)
@@ -60,12 +60,12 @@ def test_half_a_flux_is_wrong_however_bright(bright):
 
 def test_a_faint_source_whose_chi2_is_all_but_of_noise_is_flagged():
     """Ten sigma are missing in 600 pixels."""
-    found = judged(broken(times=(0.5, 1), bright=5.0))
+    found = with_misfit_status(broken(times=(0.5, 1), bright=5.0))
     assert flagged(found) == [True, False] and not summary(found)["good"]
 
 
 def test_a_bright_galaxy_that_is_half_a_percent_off_is_not_wrong():
-    found = judged(broken(times=(1.005, 1), bright=3000.0))
+    found = with_misfit_status(broken(times=(1.005, 1), bright=3000.0))
     table = catalogue(found)
     assert table["misfit_sigma"][0] > 20
     assert table["misfit_fraction"][0] == pytest.approx(0.005, rel=0.3)
@@ -82,21 +82,21 @@ def test_a_misfit_of_a_tenth_of_the_flux_is_flagged_where_it_is_no_noise():
 )
 def test_noise_that_weights_do_not_state_is_no_misfit(given):
     for seed in range(5):
-        found = judged(broken(seed=seed, **given))
+        found = with_misfit_status(broken(seed=seed, **given))
         assert found.status == "converged" and not any(flagged(found))
         assert flagged(broken(times=(0.5, 1), seed=seed, **given)) == [True, False]
 
 
 def test_light_without_a_source_is_not_taken_for_noise():
     """It fills a good part of the sky; no source is to blame, so that all are flagged."""
-    found = judged(broken(extra=300.0))
+    found = with_misfit_status(broken(extra=300.0))
     assert found.status == "misfit" and flagged(found) == [True, True]
-    assert judged(broken(extra=1.0)).status == "converged"
+    assert with_misfit_status(broken(extra=1.0)).status == "converged"
 
 
 def test_other_ends_keep_their_status():
     result = replace(broken(times=(0.5, 1)), status="iteration limit")
-    assert judged(result) is result
+    assert with_misfit_status(result) is result
     assert catalogue(result)["flags"][0] == Flag.NOT_CONVERGED | Flag.MISFIT
 
 

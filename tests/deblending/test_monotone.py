@@ -9,11 +9,11 @@ from scipy.optimize import nnls
 from clresample.deblending.solver import reference as ref
 from clresample.deblending.solver.boxes import Boxes
 from clresample.deblending.solver.constraints import (
-    Chain,
     MaxNorm,
     Monotone,
     MonotoneProjection,
     MonotoneWeights,
+    ProxChain,
     SumNorm,
     Symmetry,
 )
@@ -62,7 +62,7 @@ def test_groups_of_a_gpu(device, boxes, monkeypatch):
     """64 work-items a source with barriers, whatever the device, answer as one work-item does."""
     images = morphologies(boxes, np.float32)
     for prox in (
-        lambda: Chain(Symmetry(), Monotone(gradient=0.1), SumNorm(), MaxNorm()),
+        lambda: ProxChain(Symmetry(), Monotone(gradient=0.1), SumNorm(), MaxNorm()),
         lambda: MonotoneProjection(weights=MonotoneWeights.FLAT),
     ):
         tune(monkeypatch, sum_group=64)

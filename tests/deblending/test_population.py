@@ -6,18 +6,18 @@ from helpers.scenes import blend, frame, observe, sources
 
 from clresample import Settings
 from clresample.deblending.blend import Blend
-from clresample.deblending.fit import Fit, begin
-from clresample.deblending.profiles import Galaxy, Given, Star
+from clresample.deblending.fit import Fit, start_fits
+from clresample.deblending.profiles import FixedProfile, GalaxyProfile, StarProfile
 from clresample.deblending.start import population
 from clresample.deblending.start.population import (
-    COMMON,
+    GALAXY_SCATTER,
     LEARNED,
-    OWN,
+    NEIGHBOUR_MODEL_ERROR,
+    SCENE_SCATTER,
     TAILS,
-    WRONG,
-    Population,
-    doubts,
-    learned,
+    PopulationPrior,
+    contamination_factors,
+    em_step,
 )
 
 
@@ -32,37 +32,39 @@ def test_scenes_learn_what_their_galaxies_have_in_common():
     galaxies are known better than by what is expected of any: as well as by the true two."""
     rng = np.random.default_rng(1)
     n_scenes, n, noise = 500, 12, 0.4
-    true = rng.normal(0, COMMON, (n_scenes, 2))
-    theta = true[:, None] + OWN * rng.standard_normal((n_scenes, n, 2))
+    true = rng.normal(0, SCENE_SCATTER, (n_scenes, 2))
+    theta = true[:, None] + GALAXY_SCATTER * rng.standard_normal((n_scenes, n, 2))
     data = theta + noise * rng.normal(size=theta.shape)
-    common, own = np.zeros_like(true), np.tile(OWN, (n_scenes, 1))
-    scatter = np.broadcast_to(np.hypot(COMMON, OWN), theta.shape)
+    common, own = np.zeros_like(true), np.tile(GALAXY_SCATTER, (n_scenes, 1))
+    scatter = np.broadcast_to(np.hypot(SCENE_SCATTER, GALAXY_SCATTER), theta.shape)
     known = np.ones((n_scenes, n), bool)
     for _ in range(15):
-        common, own, scatter = learned(
+        common, own, scatter = em_step(
             *shrunk(data, noise, common[:, None], scatter), known, common, own
         )
     found = shrunk(data, noise, common[:, None], scatter)[0]
-    alone = shrunk(data, noise, 0.0, np.hypot(COMMON, OWN))[0]
-    best = shrunk(data, noise, true[:, None], OWN)[0]
+    alone = shrunk(data, noise, 0.0, np.hypot(SCENE_SCATTER, GALAXY_SCATTER))[0]
+    best = shrunk(data, noise, true[:, None], GALAXY_SCATTER)[0]
     error, by_itself, least = (
         np.sqrt(np.square(a - theta).mean((0, 1))) for a in (found, alone, best)
     )
     assert (error < 0.95 * by_itself).all() and (error < 1.15 * least).all()
     # a mean of twelve, each with its noise and its own scatter
-    away = (common - true) / np.hypot(OWN, noise) * np.sqrt(n)
+    away = (common - true) / np.hypot(GALAXY_SCATTER, noise) * np.sqrt(n)
     assert (np.abs(away.std(0) - 1) < 0.2).all()
-    assert (np.abs(np.median(own, axis=0) / OWN - 1) < 0.25).all()
+    assert (np.abs(np.median(own, axis=0) / GALAXY_SCATTER - 1) < 0.25).all()
 
 
 def test_a_galaxy_unlike_the_others_counts_for_little():
     """Three times as large as five others, it moves what is expected of these by 3 % of that."""
     off, known = np.zeros((1, 7, 2)), np.ones((1, 7), bool)
     off[0, 0], off[0, 6], known[0, 6] = np.log(3), 5.0, False  # the last one is no galaxy
-    common, own = np.zeros((1, 2)), OWN[None].copy()
+    common, own = np.zeros((1, 2)), GALAXY_SCATTER[None].copy()
     for _ in range(10):
-        common, own, scatter = learned(off, np.full_like(off, 0.01), known, common, own)
-    assert 0 < common[0, 0] < 0.03 * np.log(3) and own[0, 0] == pytest.approx(OWN[0], rel=0.02)
+        common, own, scatter = em_step(off, np.full_like(off, 0.01), known, common, own)
+    assert 0 < common[0, 0] < 0.03 * np.log(3) and own[0, 0] == pytest.approx(
+        GALAXY_SCATTER[0], rel=0.02
+    )
     # nor is it held to be like them
     assert scatter[0, 0, 0] > 2.5 * own[0, 0] > 2.5 * scatter[0, 1, 0]
 
@@ -70,31 +72,36 @@ def test_a_galaxy_unlike_the_others_counts_for_little():
 def test_only_whole_galaxies_of_scenes_with_several_are_learned_from():
     home = frame()
     scenes = (
-        [Galaxy(home), Star(home, free=True), Galaxy(home), Given(np.ones((3, 3)))],
-        [Galaxy(home)],
-        [Galaxy(home, 0, 2), Galaxy(home, 1, 2), Galaxy(home)],
+        [
+            GalaxyProfile(home),
+            StarProfile(home, free=True),
+            GalaxyProfile(home),
+            FixedProfile(np.ones((3, 3))),
+        ],
+        [GalaxyProfile(home)],
+        [GalaxyProfile(home, 0, 2), GalaxyProfile(home, 1, 2), GalaxyProfile(home)],
     )
     shapes = [shape for scene in scenes for shape in scene]
     scene = np.repeat([0, 1, 2], [len(s) for s in scenes])
     index = np.concatenate([np.arange(len(s)) for s in scenes])
-    one = Population(shapes, scene, index, 3, 4, 4)
+    one = PopulationPrior(shapes, scene, index, 3, 4, 4)
     mean, scatter = one.mean.copy(), one.scatter.copy()
     theta = mean + 0.5
-    before = one.pull(np.array([2, 0]), theta)
+    before = one.penalty(np.array([2, 0]), theta)
     # galaxies' parameters have Student's tails, a star's place has none
     away, smooth = 0.25 / scatter**2, np.zeros(mean.shape[:2], bool)
     smooth[0, [0, 2]] = smooth[1, 0] = smooth[2, :3] = True
     tails = np.where(smooth[..., None], TAILS * np.log1p(away / TAILS), away)
     np.testing.assert_allclose(before, tails[[2, 0]].sum(axis=(1, 2)))
-    one.learn(np.arange(3), theta, np.tile(1e4 * np.eye(16), (3, 1, 1)))
+    one.update(np.arange(3), theta, np.tile(1e4 * np.eye(16), (3, 1, 1)))
     changed = np.zeros(mean.shape, bool)
     changed[0, [[0], [2]], LEARNED] = True
     assert ((one.mean != mean) == changed).all() and ((one.scatter != scatter) == changed).all()
     # two that are well known have moved half of the way and more
     assert (one.mean - mean)[changed] == pytest.approx(0.5, abs=0.25)
-    assert one.pull(np.array([0]), theta)[0] < before[1]
+    assert one.penalty(np.array([0]), theta)[0] < before[1]
     alone = one.mean.copy()
-    one.learn(np.array([1]), theta, np.tile(np.eye(16), (3, 1, 1)))
+    one.update(np.array([1]), theta, np.tile(np.eye(16), (3, 1, 1)))
     assert (one.mean == alone).all()
 
 
@@ -105,7 +112,7 @@ def test_a_faint_galaxy_is_taken_for_what_its_neighbours_are(device):
     for sigma in (1.5, 4.5):
         objects = (faint, *((p, (300, 250, 280), sigma) for p in places))
         one = Fit(blend(objects, shape=(60, 60), seed=3), Settings(), device, np.float32, pad=1)
-        begin([one])
+        start_fits([one])
         sizes.append([theta[0] for theta in one.start.thetas])
     small, large = np.array(sizes)
     np.testing.assert_allclose(large[1:], np.log(4.5), atol=0.05)
@@ -126,11 +133,11 @@ def test_shapes_are_doubted_for_the_light_of_other_sources():
     for i in range(3):
         others = seen.sum(1) - seen[:, i]
         expected.append((others * seen[:, i]).sum() ** 2 / (seen[:, i] ** 2).sum())
-    found = doubts(normal, light[None], source)[0]
-    np.testing.assert_allclose(found, 1 + WRONG**2 * np.array(expected))
+    found = contamination_factors(normal, light[None], source)[0]
+    np.testing.assert_allclose(found, 1 + NEIGHBOUR_MODEL_ERROR**2 * np.array(expected))
     # components of one source do not doubt each other, and one without light is not doubted
-    np.testing.assert_allclose(doubts(normal, light[None], 0 * source), 1)
-    dark = doubts(normal, light[None] * [0, 1, 1], source)[0]
+    np.testing.assert_allclose(contamination_factors(normal, light[None], 0 * source), 1)
+    dark = contamination_factors(normal, light[None] * [0, 1, 1], source)[0]
     assert dark[0] == 1 and dark[1] < found[1]
 
 
@@ -138,25 +145,27 @@ def test_doubt_holds_a_galaxy_as_if_its_data_said_less():
     """Ten times as doubtful as another one, it is held ten times as strongly; what is learned of
     both is what data of a tenth of the weight would have taught."""
     home, scenes = frame(), np.arange(2)
-    shapes, at = [Galaxy(home) for _ in range(4)], (np.repeat(scenes, 2), np.tile([0, 1], 2))
-    one = Population(shapes, *at, 2, 2, 4)
+    shapes, at = [GalaxyProfile(home) for _ in range(4)], (np.repeat(scenes, 2), np.tile([0, 1], 2))
+    one = PopulationPrior(shapes, *at, 2, 2, 4)
     theta, data = one.mean + 0.3, 50.0
-    plain = one.pull(scenes, theta)
-    one.doubt_shapes(np.array([0]), np.full((1, 2), 10.0))
-    np.testing.assert_allclose(one.pull(scenes, theta), plain * [10, 1])
+    plain = one.penalty(scenes, theta)
+    one.set_contamination(np.array([0]), np.full((1, 2), 10.0))
+    np.testing.assert_allclose(one.penalty(scenes, theta), plain * [10, 1])
     # the second scene's data say a tenth as much
     weight = np.array([data, data / 10])[:, None, None] + one.precision(scenes, theta)
     normal = weight.reshape(2, -1)[..., None] * np.eye(8)
-    one.learn(scenes, theta, normal)
+    one.update(scenes, theta, normal)
     np.testing.assert_allclose(one.mean[0], one.mean[1])
     np.testing.assert_allclose(one.scatter[0], one.scatter[1])
 
 
 def test_places_of_stars_are_not_doubted():
     home = frame()
-    one = Population([Galaxy(home, 0, 2), Star(home, free=True)], [0, 0], [0, 1], 1, 2, 4)
-    one.doubt_shapes(np.array([0]), np.array([[7.0, 9.0]]))
-    assert one.doubt.tolist() == [[7, 1]]
+    one = PopulationPrior(
+        [GalaxyProfile(home, 0, 2), StarProfile(home, free=True)], [0, 0], [0, 1], 1, 2, 4
+    )
+    one.set_contamination(np.array([0]), np.array([[7.0, 9.0]]))
+    assert one.contamination.tolist() == [[7, 1]]
 
 
 def test_shapes_are_doubted_in_a_group_as_alone(device):
@@ -175,9 +184,9 @@ def test_shapes_are_doubted_in_a_group_as_alone(device):
     together, alone = (
         [Fit(b, Settings(), device, np.float32, pad=1) for b in blends] for _ in range(2)
     )
-    begin(together)
+    start_fits(together)
     for one, other in zip(alone, together, strict=True):
-        begin([one])
+        start_fits([one])
         for a, b in zip(one.start.thetas, other.start.thetas, strict=True):
             np.testing.assert_allclose(b, a, atol=1e-4)
 
@@ -189,11 +198,11 @@ def test_a_faint_galaxy_takes_less_of_what_is_wrong_with_a_bright_one(device, mo
     arm = [((30 - 2 * k, 31 + k), (150, 135, 165), 1.5) for k in range(5)]
     seen = observe((bright, faint, *arm), shape=(60, 60), seed=5)
     shapes = []
-    for wrong in (0.0, WRONG):
-        monkeypatch.setattr(population, "WRONG", wrong)
+    for wrong in (0.0, NEIGHBOUR_MODEL_ERROR):
+        monkeypatch.setattr(population, "NEIGHBOUR_MODEL_ERROR", wrong)
         given = Blend(seen, sources((bright, faint)), frame((60, 60)))
         one = Fit(given, Settings(), device, np.float32, pad=1)
-        begin([one])
+        start_fits([one])
         shapes.append(one.start.thetas)
     before, after = (np.hypot(*thetas[1][1:3]) for thetas in shapes)
     assert before > 1.2 and after < 0.5 * before

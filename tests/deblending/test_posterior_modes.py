@@ -5,13 +5,13 @@ import pytest
 from helpers import scenes
 from scipy.signal import fftconvolve
 
-from clresample.deblending.posterior import bumps as room
-from clresample.deblending.posterior.bumps import MOST, Bumps, uncorrelated
-from clresample.deblending.posterior.moments import moments_of
+from clresample.deblending.posterior import smooth_modes as room
+from clresample.deblending.posterior.moments import moment_derivatives
 from clresample.deblending.posterior.profile_modes import profile_modes
-from clresample.deblending.profiles import Galaxy, Given, Star
+from clresample.deblending.posterior.smooth_modes import MAX_MODES, SmoothModes, whitening_transform
+from clresample.deblending.profiles import FixedProfile, GalaxyProfile, StarProfile
 from clresample.deblending.result import Component
-from clresample.deblending.solver.learned.prior import LearnedPrior
+from clresample.deblending.solver.multiscale.prior import MultiscalePrior
 from clresample.measurement.shapes import moments
 
 
@@ -28,12 +28,14 @@ def gaussians(origin, shape, h):
 
 @pytest.mark.parametrize("least_light", [1e-4, 1e-6])
 def test_bumps_are_convolutions_by_definition(least_light):
-    prior, shape, origin = LearnedPrior(), (23, 27), (13, 22)
+    prior, shape, origin = MultiscalePrior(), (23, 27), (13, 22)
     y, x = np.indices(shape)
     profile = np.exp(-0.5 * ((y - 10) ** 2 + (x - 14) ** 2) / 3.0**2)
     shared = (np.abs(y - 11) < 4) & (x > 9) & (x < 18)
     strengths = np.array([0.02, 0.06, 0.03])
-    bumps = Bumps(origin, profile, strengths, prior.kernels(), shared, least_light=least_light)
+    bumps = SmoothModes(
+        origin, profile, strengths, prior.kernels(), shared, least_light=least_light
+    )
     coarse, fine = (gaussians(origin, shape, h) for h in (8, 4))
     light = [(bump * profile).max((1, 2)) > least_light for bump in (coarse, fine)]
     wanted = np.concatenate(
@@ -55,7 +57,7 @@ def test_bumps_are_convolutions_by_definition(least_light):
     np.testing.assert_allclose(bumps.precision, expected, atol=1e-9)
     # one number each: the same covariance of the pixels
     images = bumps.images.reshape(len(bumps.images), -1)
-    pixels = [images, uncorrelated(bumps.precision) @ images]
+    pixels = [images, whitening_transform(bumps.precision) @ images]
     covariance = pixels[0].T @ np.linalg.pinv(bumps.precision, rcond=1e-8) @ pixels[0]
     largest = np.abs(covariance).max()
     np.testing.assert_allclose(pixels[1].T @ pixels[1], covariance, atol=1e-4 * largest)
@@ -65,11 +67,11 @@ def test_bumps_are_convolutions_by_definition(least_light):
 def test_slopes_are_finite_differences(kind):
     home, e = scenes.frame(), 1e-4
     position, box = np.array([13.3, 15.8]), (slice(3, 25), slice(4, 30))
-    shape = {"galaxy": Galaxy(home), "star": Star(home, free=True)}.get(kind)
+    shape = {"galaxy": GalaxyProfile(home), "star": StarProfile(home, free=True)}.get(kind)
     theta = np.array([0.6, 0.2, -0.1, 1.4]) if kind == "galaxy" else np.zeros(2)
     if kind == "given":
         shape, theta = (
-            Given(Galaxy(home).draw(np.array([0.6, 0.2, -0.1, 1.4]), position)[0]),
+            FixedProfile(GalaxyProfile(home).draw(np.array([0.6, 0.2, -0.1, 1.4]), position)[0]),
             np.zeros(0),
         )
     drawn = shape.draw(theta, position)[0]
@@ -109,7 +111,7 @@ def test_slopes_of_moments_are_finite_differences():
         c, q = moments(parts, inside, sums + e * more)
         return np.array([*c, q[0, 0], q[1, 0], q[1, 1]])
 
-    slopes, by_sums = moments_of(origins, morphs, light, sums)
+    slopes, by_sums = moment_derivatives(origins, morphs, light, sums)
     found = sum(a * np.tensordot(s, d, 2) for a, s, d in zip(light, slopes, change, strict=True))
     found = found + by_sums @ (light @ more)
     np.testing.assert_allclose(found, (at(1e-5) - at(-1e-5)) / 2e-5, rtol=1e-6)
@@ -118,7 +120,7 @@ def test_slopes_of_moments_are_finite_differences():
 def test_what_lies_beyond_a_box():
     """Sums are those of the whole profile, wherever the box ends."""
     home, position = scenes.frame(), np.array([13.3, 15.8])
-    shape, theta = Galaxy(home), np.array([0.9, 0.2, -0.1, 1.0])
+    shape, theta = GalaxyProfile(home), np.array([0.9, 0.2, -0.1, 1.0])
     whole = shape.draw(theta, position + 60, (150, 156))[0]
     whole /= whole.max()
     low = np.array([4, 6])
@@ -135,31 +137,34 @@ def test_what_lies_beyond_a_box():
 def test_bumps_may_be_only_where_light_is_shared():
     y, x = np.indices((40, 30))
     profile = np.exp(-0.5 * ((y - 20) ** 2 + (x - 15) ** 2) / 6.0**2)
-    given, (row, column) = ((0, 0), profile, np.full(3, 0.05), LearnedPrior().kernels()), (24, 16)
+    given, (row, column) = (
+        ((0, 0), profile, np.full(3, 0.05), MultiscalePrior().kernels()),
+        (24, 16),
+    )
     shared = (np.abs(y - row) < 5) & (np.abs(x - column) < 3)
-    bumps = Bumps(*given, shared, all_over=False)
+    bumps = SmoothModes(*given, shared, all_over=False)
     rows, columns = bumps.sides
     at = np.column_stack([side.argmax(1) for side in (rows, columns)]) - (row, column)
     wide = (columns / columns.max(1, keepdims=True) > 0.1).sum(1) > 11
-    assert 0 < wide.sum() < len(at) < len(Bumps(*given, shared).images) / 2
+    assert 0 < wide.sum() < len(at) < len(SmoothModes(*given, shared).images) / 2
     assert (np.abs(at) < (5 + 2, 3 + 2)).all()
     between = (y == 18) & (x == 14)
-    assert not len(Bumps(*given, between, all_over=False).images)
+    assert not len(SmoothModes(*given, between, all_over=False).images)
 
 
 def test_bumps_of_large_galaxies_are_wider():
     y, x = np.indices((400, 300))
     profile = np.exp(-0.5 * ((y - 200) ** 2 + (x - 150) ** 2) / 60.0**2)
     shared = np.ones(profile.shape, bool)
-    bumps = Bumps((0, 0), profile, np.full(3, 0.05), LearnedPrior().kernels(), shared)
-    assert MOST / 8 < len(bumps.images) <= MOST
+    bumps = SmoothModes((0, 0), profile, np.full(3, 0.05), MultiscalePrior().kernels(), shared)
+    assert MAX_MODES / 8 < len(bumps.images) <= MAX_MODES
 
 
 @pytest.mark.parametrize("more", [0, 1])
 def test_bumps_are_no_more_than_they_may_be(more, monkeypatch):
     y, x = np.indices((40, 30))
     profile = np.exp(-0.5 * ((y - 20) ** 2 + (x - 15) ** 2) / 6.0**2)
-    given = (0, 0), profile, np.full(3, 0.05), LearnedPrior().kernels(), np.ones((40, 30), bool)
-    n = len(Bumps(*given).images)
-    monkeypatch.setattr(room, "MOST", n - more)
-    assert (len(Bumps(*given).images) == n) == (not more)
+    given = (0, 0), profile, np.full(3, 0.05), MultiscalePrior().kernels(), np.ones((40, 30), bool)
+    n = len(SmoothModes(*given).images)
+    monkeypatch.setattr(room, "MAX_MODES", n - more)
+    assert (len(SmoothModes(*given).images) == n) == (not more)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clresample.deblending.posterior.normal import Layout, normal_matrix
+from clresample.deblending.posterior.normal import UnknownLayout, normal_matrix
 from clresample.deblending.shifts import SCATTER_PX
 
 SHAPE = 15, 17
@@ -21,7 +21,7 @@ class Plain:
 
     def __init__(self, n_channels, seed, dark=3, n_threads=1):
         self.threads_for = lambda light: n_threads
-        self.root = np.random.default_rng(seed).uniform(0.5, 2, (n_channels, *SHAPE))
+        self.sqrt_weights = np.random.default_rng(seed).uniform(0.5, 2, (n_channels, *SHAPE))
         self.dark = dark
 
     def window(self, origin, shape):
@@ -33,7 +33,7 @@ class Plain:
 
     def observe(self, images, _i, origin, low, high):
         """Images (k, ny, nx) of a box as seen (k, C, ry, rx)."""
-        seen = whole(images, origin)[:, None] * self.root
+        seen = whole(images, origin)[:, None] * self.sqrt_weights
         return seen[:, :, low[0] : high[0], low[1] : high[1]].astype(np.float32)
 
 
@@ -49,7 +49,7 @@ def dense(scene, exposures, images, spectra, layout):
     starts = np.cumsum([0, *layout.sizes])
     n, total = len(images), starts[-1]
     matrix = np.zeros((total, total))
-    for i, k in enumerate(layout.counts):
+    for i, k in enumerate(layout.n_modes):
         matrix[starts[i] : starts[i] + k, starts[i] : starts[i] + k] += np.eye(k)
     for m in range(layout.n_shifts):
         at = starts[n] + layout.n_sky + m
@@ -57,13 +57,13 @@ def dense(scene, exposures, images, spectra, layout):
     for c, known in enumerate(scene.known_sky[: layout.n_sky]):
         matrix[starts[n] + c, starts[n] + c] += known
     for o, (exposure, part) in enumerate(zip(exposures, scene.channels(), strict=True)):
-        for c, root in zip(range(part.start, part.stop), exposure.root, strict=True):
+        for c, root in zip(range(part.start, part.stop), exposure.sqrt_weights, strict=True):
             j = np.zeros((total, *SHAPE))
             for i in range(n):
                 if i == exposure.dark:
                     continue
                 seen = whole(images[i], scene.origin[i]) * root
-                at, k = starts[i], layout.counts[i]
+                at, k = starts[i], layout.n_modes[i]
                 j[at : at + k] = spectra[i, c] * seen[1:]
                 j[at + k + c] = seen[0]
                 if layout.n_shifts and o:
@@ -98,7 +98,7 @@ def test_the_normal_matrix_is_that_of_whole_frames(n_sky, n_shifts, bright):
     )
     exposures = [Plain(2, 2), Plain(1, 3)]
     spectra = bright * rng.uniform(1, 2, (5, 3))
-    layout = Layout(counts, 3, n_sky=n_sky, n_shifts=n_shifts)
+    layout = UnknownLayout(counts, 3, n_sky=n_sky, n_shifts=n_shifts)
     found = normal_matrix(scene, exposures, images, spectra, layout).dense()
     threaded = [Plain(2, 2, n_threads=3), Plain(1, 3, n_threads=3)]
     np.testing.assert_array_equal(

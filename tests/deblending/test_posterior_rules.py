@@ -7,15 +7,19 @@ import pytest
 from helpers import scenes
 
 from clresample.deblending.posterior import posterior
-from clresample.deblending.posterior.bumps import _gaussians
-from clresample.deblending.posterior.errors import Draws
-from clresample.deblending.posterior.modes import STRENGTH, Solution, power_of
-from clresample.deblending.posterior.normal import Layout, _by_channel
-from clresample.deblending.posterior.profile_modes import FAR_LIGHT, Beyond, profile_modes
-from clresample.deblending.profiles import Galaxy, Given, Star
-from clresample.deblending.solver.learned.prior import LearnedPrior
+from clresample.deblending.posterior.errors import PosteriorSampler
+from clresample.deblending.posterior.modes import STRENGTH, Solution, clipped_power
+from clresample.deblending.posterior.normal import UnknownLayout, _by_channel
+from clresample.deblending.posterior.profile_modes import (
+    FAR_LIGHT,
+    OutsideBoxMoments,
+    profile_modes,
+)
+from clresample.deblending.posterior.smooth_modes import _gaussians
+from clresample.deblending.profiles import FixedProfile, GalaxyProfile, StarProfile
+from clresample.deblending.solver.multiscale.prior import MultiscalePrior
 
-PRIOR = LearnedPrior(scales_px=(0.8, 2.2, 5.0), strengths=(0.005, 0.1, 0.02))
+PRIOR = MultiscalePrior(scales_px=(0.8, 2.2, 5.0), strengths=(0.005, 0.1, 0.02))
 
 
 def solution(
@@ -26,7 +30,7 @@ def solution(
     fixed = np.isin(np.arange(n), fixed)
     rows = {"origin": np.array(origin), "profile": profiles, "fixed": fixed}
     scene = SimpleNamespace(**rows, ties=None, known_sky=np.zeros(3))
-    given = {"energies": np.ones((n, 3)), "determined": np.ones((n, 3))}
+    given = {"energies": np.ones((n, 3)), "n_effective": np.ones((n, 3))}
     given |= {"strengths": np.tile([0.01, 0.05, 0.03], (n, 1))}
     return Solution(
         scene,
@@ -54,25 +58,25 @@ def spot(n=9, sigma=2.0):
 def test_unlikeness_is_what_the_scale_next_to_two_pixels_shows(chi2):
     """Under ten pixels' worth of 5 %; misfit makes it less, and 1 of stars."""
     energies, determined = np.array([[9, 0.8, 9]] * 2), np.array([[1, 30, 1]] * 2)
-    given = {"energies": energies, "determined": determined, "chi2": chi2}
+    given = {"energies": energies, "n_effective": determined, "chi2": chi2}
     one = solution([(0, 0), (9, 0)], [spot()] * 2, fixed=(1,), **given)
     wanted = np.sqrt((0.8 / max(chi2, 1) + 10 * 0.05**2) / 40) / 0.05
-    assert one.unlikeness(0) == pytest.approx(wanted) and one.unlikeness(1) == 1
+    assert one.structure_excess(0) == pytest.approx(wanted) and one.structure_excess(1) == 1
     assert STRENGTH == 0.05
     np.testing.assert_allclose(
         one.strengths(0), [0.01 * wanted**3.5, 0.05 * wanted, 0.03 * wanted**3.5]
     )
     np.testing.assert_array_equal(one.findings.strengths[0], [0.01, 0.05, 0.03])  # left as it is
-    assert [power_of(unlike, 2.0) for unlike in (0.5, 3.0, 7.0)] == [0.25, 9.0, 9.0]
+    assert [clipped_power(unlike, 2.0) for unlike in (0.5, 3.0, 7.0)] == [0.25, 9.0, 9.0]
 
 
 @pytest.mark.parametrize("alone, wanted", [(0.8, 0.8), (1.35, 1.0), (6.0, 1.3)])
 def test_misfit_makes_no_galaxy_more_like_its_profile(alone, wanted):
     """Of unlikeness `alone` without it: no less than that, or than 1."""
     energy = 40 * (0.05 * alone) ** 2 - 10 * 0.05**2
-    given = {"energies": np.full((1, 3), energy), "determined": np.full((1, 3), 30.0)}
+    given = {"energies": np.full((1, 3), energy), "n_effective": np.full((1, 3), 30.0)}
     one = solution([(0, 0)], [spot()], chi2=25.0, **given)
-    assert one.unlikeness(0) == pytest.approx(wanted, rel=0.02)
+    assert one.structure_excess(0) == pytest.approx(wanted, rel=0.02)
 
 
 @pytest.mark.parametrize("level, share", [(0.0, 0.0), (0.1, 1 / 22), (9.0, 0.45)])
@@ -98,8 +102,8 @@ def test_what_bumps_change_counts_in_errors_of_flux_and_size():
     images[0, 10, 10] = images[1, 10, 14] = images[2, 7, 10] = 0.01
     mean = 2 * 4.0  # of r^2 in a Gaussian of sigma 2
     wanted = 0.01 / profile.sum() * 10 * np.array([1, 1 + 16 / mean, 1 + 9 / mean])
-    np.testing.assert_allclose(one.change(0, images), wanted, rtol=1e-3)
-    np.testing.assert_allclose(one.change(0, -images), one.change(0, images))
+    np.testing.assert_allclose(one.flux_change_sigma(0, images), wanted, rtol=1e-3)
+    np.testing.assert_allclose(one.flux_change_sigma(0, -images), one.flux_change_sigma(0, images))
 
 
 def test_modes_leave_the_spectrum_and_pixels_at_their_bound_alone():
@@ -114,7 +118,7 @@ def test_modes_leave_the_spectrum_and_pixels_at_their_bound_alone():
     for i in range(2):
         one.scene.profile[i] = profile
         found = given.copy()
-        along = one.gauge(i, found)
+        along = one.remove_profile_part(i, found)
         np.testing.assert_allclose(along, np.tensordot(given, profile, 2) / (profile**2).sum())
         inside = one.morphs[i] > 0
         assert not inside.all()
@@ -143,7 +147,7 @@ def test_light_is_exchanged_where_a_neighbour_has_a_part_of_it_and_both_are_seen
         spectra = [[level, 0], [level, 0]] + [[1e3, 0]] * len(more)
         boxes = [own, other, *[np.ones((1, 1))] * len(more)]
         one = solution([(3, 3), (3, 3), *more], boxes, spectra=spectra)
-        return one.shared(0, **limits).tolist()[0]
+        return one.overlap_mask(0, **limits).tolist()[0]
 
     assert shared(100.0) == [False, True, True, True, True, True]
     assert shared(10.0) == [False, True, True, True, True, False]  # its own 0.2 are not seen
@@ -160,7 +164,7 @@ def test_sums_of_what_lies_beyond_a_box():
     """Of a profile and its modes, in pixels of the frame; as scaled, and as gauged."""
     rng = np.random.default_rng(2)
     images, low, box = rng.random((3, 8, 10)), np.array([5, -3]), np.s_[1:6, 3:7]
-    beyond = Beyond.of(images, low, box)
+    beyond = OutsideBoxMoments.of(images, low, box)
     outside = images.copy()
     outside[:, *box] = 0
     y, x = np.indices((8, 10)) + low[:, None, None]
@@ -171,17 +175,19 @@ def test_sums_of_what_lies_beyond_a_box():
     np.testing.assert_allclose(twice.sums, 2 * wanted[:, 0])
     np.testing.assert_allclose(twice.slopes, wanted[:, 1:] * [3, 4])
     along = np.array([0.1, 0.2, 0.3, 0.4])  # of two modes more, which come first
-    gauged = beyond.gauged(along)
+    gauged = beyond.with_gauge(along)
     expected = np.concatenate([np.zeros((6, 2)), wanted[:, 1:]], axis=1)
     np.testing.assert_allclose(gauged.slopes, expected - np.outer(wanted[:, 0], along))
     np.testing.assert_allclose(gauged.sums, wanted[:, 0])
-    assert Beyond.none(3).sums.shape == (6,) and Beyond.none(3).slopes.shape == (6, 3)
+    assert OutsideBoxMoments.none(3).sums.shape == (6,) and OutsideBoxMoments.none(
+        3
+    ).slopes.shape == (6, 3)
 
 
 @pytest.mark.parametrize("side, margin", [(20, 10), (21, 10), (49, 24), (80, 24)])
 def test_light_beyond_a_box_is_followed_for_half_its_side(side, margin):
     """24 px at most; there halos are 0.2 times as large."""
-    shape, theta = Galaxy(scenes.frame()), np.array([1.0, 0.1, 0.2, 3.0])
+    shape, theta = GalaxyProfile(scenes.frame()), np.array([1.0, 0.1, 0.2, 3.0])
     position, low = np.array([60.3, 59.8]), np.array([60, 60]) - side // 2
     size = side + 2 * margin
     whole = shape.draw(theta, position - low + margin, (size, size))[0]
@@ -199,9 +205,9 @@ def test_wings_are_followed_to_the_edge_of_the_frame(log_beta):
     """Of a profile that has ended before, less than FAR_LIGHT is left."""
     frame = scenes.frame((96, 120))
     position, low = np.array([46.2, 60.3]), np.array([41, 54])
-    shape, theta = Galaxy(frame), np.array([1.2, 0.3, 0.1, log_beta])
+    shape, theta = GalaxyProfile(frame), np.array([1.2, 0.3, 0.1, log_beta])
     whole = shape.draw(theta, position)[0]
-    box = shape.cut(theta, position, low, (12, 12), slopes=False)[0]
+    box = shape.draw_box(theta, position, low, (12, 12), slopes=False)[0]
     _, _, far = profile_modes(shape, theta, position, box / whole.max(), low)
     found = box.sum() + far.sums[0] * whole.max()
     if log_beta > 0:
@@ -212,7 +218,11 @@ def test_wings_are_followed_to_the_edge_of_the_frame(log_beta):
 
 def test_light_beyond_a_box_is_that_of_a_morphology_of_maximum_1():
     """Where structure has made the peak of a source twice that of its profile."""
-    shape, theta, place = Galaxy(scenes.frame()), np.array([1.5, 0, 0, 0.5]), np.array([10.3, 9.8])
+    shape, theta, place = (
+        GalaxyProfile(scenes.frame()),
+        np.array([1.5, 0, 0, 0.5]),
+        np.array([10.3, 9.8]),
+    )
     whole = shape.draw(theta, place, (21, 21))[0]
     box = whole[5:16, 5:16] / whole.max()
     beyond = []
@@ -227,10 +237,10 @@ def test_how_far_profiles_and_places_may_be_off():
     """A tenth of a pixel; of the peak 0.1 in the core and 0.01 in the halo, or a part of those; a
     galaxy's parameters as galaxies scatter, more than fits expect, a star's place as they do."""
     home, position = scenes.frame(), np.array([10.0, 11.0])
-    galaxy, star, box = Galaxy(home), Star(home, free=True), np.ones((9, 9))
+    galaxy, star, box = GalaxyProfile(home), StarProfile(home, free=True), np.ones((9, 9))
     kinds = [
         (galaxy, galaxy.mean, [0.4, 0.26, 0.26, 0.9, 0.1, 0.1]),
-        (Given(box), np.zeros(0), [0.1, 0.1]),
+        (FixedProfile(box), np.zeros(0), [0.1, 0.1]),
     ]
     for shape, theta, wanted in kinds:
         for radial in (1.0, 0.5):
@@ -249,12 +259,12 @@ def test_bumps_stand_on_every_hth_pixel_of_the_frame_to_beyond_both_ends():
 
 def test_where_unknowns_lie():
     counts = np.array([3, 0, 2])
-    plain = Layout(counts, 4)
+    plain = UnknownLayout(counts, 4)
     assert plain.sizes.tolist() == [7, 4, 6] and plain.common == 3 and plain.shift(1) is None
-    full = Layout(counts, 4, n_sky=4, n_shifts=4)
+    full = UnknownLayout(counts, 4, n_sky=4, n_shifts=4)
     assert full.sizes.tolist() == [7, 4, 6, 8] and full.shift(0) is None
     assert full.shift(1).tolist() == [4, 5] and full.shift(2).tolist() == [6, 7]
-    assert Layout(counts, 4, n_shifts=2).shift(1).tolist() == [0, 1]
+    assert UnknownLayout(counts, 4, n_shifts=2).shift(1).tolist() == [0, 1]
 
 
 def test_unknowns_are_modes_spectra_sky_levels_and_shifts_of_all_but_the_first(monkeypatch):
@@ -263,17 +273,17 @@ def test_unknowns_are_modes_spectra_sky_levels_and_shifts_of_all_but_the_first(m
     asked = []
     known = SimpleNamespace(block=lambda i, j: np.diag([4.0, 0.25, 1, 1, 1, 1, 1]) / 2)
     factor = SimpleNamespace(inverse=lambda: known, solve=asked.append)
-    monkeypatch.setattr(posterior, "Factor", lambda _: factor)
+    monkeypatch.setattr(posterior, "BlockCholesky", lambda _: factor)
     images = [np.arange(k).reshape(k, 1, 1) for k in (1, 3)]
     one = SimpleNamespace(
         spectra=np.ones((2, 5)),
         scene=SimpleNamespace(ties=None),
-        modes=lambda i: (images[i], Beyond.none(len(images)), np.arange(1.0, 2 * i + 1)),
+        modes=lambda i: (images[i], OutsideBoxMoments.none(len(images)), np.arange(1.0, 2 * i + 1)),
     )
     for sky, shifts in ((False, False), (True, False), (False, True), (True, True)):
         made = posterior.Posterior(one, [0, 0, 0], fit_sky=sky, fit_shifts=shifts)
         assert [m.ravel().tolist() for m in made.modes] == [[], [1, 2]]
-        assert made.layout.counts.tolist() == [0, 2] and made.layout.n_channels == 5
+        assert made.layout.n_modes.tolist() == [0, 2] and made.layout.n_channels == 5
         assert (made.layout.n_sky, made.layout.n_shifts) == (5 * sky, 4 * shifts)
         right = [part.tolist() for part in asked.pop()]
         n_common = [5 * sky + 4 * shifts] if sky or shifts else []
@@ -309,7 +319,9 @@ def test_draws_are_numbers_times_modes_and_spectra_in_counts():
     values = [np.array([1.0, 2.0, 3.0, 4.0]), np.array([5.0, 6.0])]
     asked = []
     factor = SimpleNamespace(sizes=np.array([4, 2, 1]), draw=lambda x: asked.append(x) or values)
-    morphs, spectra = Draws(modes, factor, np.array([10.0, 100.0]), np.array([3, 1])).draw(rng)
+    morphs, spectra = PosteriorSampler(
+        modes, factor, np.array([10.0, 100.0]), np.array([3, 1])
+    ).draw(rng)
     assert asked[0].shape == (7,)
     np.testing.assert_allclose(morphs[0], 3 * (modes[0][0] + 2 * modes[0][1]))
     assert morphs[1].shape == (2, 2) and not morphs[1].any()

@@ -10,7 +10,8 @@ from clresample.deblending.start.profile_fit import ProfileFit
 
 
 class Valley:
-    """Stands in for a Looking at one parameter a scene: chi2 = (theta - goal)^2 * steep + rest."""
+    """Stands in for LinearisedScenes with one parameter a scene: chi2 = (theta - goal)^2 * steep +
+    rest."""
 
     def __init__(self, goals, steep, rest, mean=0.0, scatter=1e6):
         self.goals, self.steep, self.rest = np.array(goals), steep, rest
@@ -23,7 +24,7 @@ class Valley:
         self.normal = np.zeros((n, 1, 2, 2))
         self.n_looks, self.n_slopes = np.zeros((2, n), int)
 
-    def look(self, scenes, thetas, _brightness, *, slopes):
+    def render(self, scenes, thetas, _brightness, *, slopes):
         self.scenes, self.now = np.asarray(scenes), np.array([t[0] for t in thetas])
         (self.n_slopes if slopes else self.n_looks)[self.scenes] += 1
 
@@ -39,7 +40,7 @@ class Valley:
     def away(self):
         return self.now[self.scenes] - self.goals[self.scenes]
 
-    def compare(self, _error):
+    def compute_residuals(self, _error):
         return self.steep * self.away() ** 2 + self.rest
 
 
@@ -57,7 +58,7 @@ def valley(monkeypatch):
             right[:, 0] = -steep * looking.away()
             return normal, right
 
-        monkeypatch.setattr(profile_fit, "equations", equations)
+        monkeypatch.setattr(profile_fit, "normal_equations", equations)
         monkeypatch.setattr(profile_fit, "peaks_of", lambda c, thetas: np.ones(len(c)))
         fit = ProfileFit(looking, np.ones((len(goals), 1)))
         fit.begin()

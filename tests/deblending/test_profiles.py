@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clresample.deblending.profiles import covariance, moment, point, profile
+from clresample.deblending.profiles import covariance, draw_psf, profile, psf_second_moment
 from clresample.sky.psf import PSF
 
 SHAPE = (41, 46)
@@ -21,7 +21,7 @@ def central(function, at, step=1e-5):
 @pytest.mark.parametrize("position", PLACES)
 @pytest.mark.parametrize("parameters", PARAMETERS)
 def test_slopes_of_a_galaxy(parameters, position):
-    at, c_psf = np.array(parameters), moment(STAR)
+    at, c_psf = np.array(parameters), psf_second_moment(STAR)
     values = profile(at, position, SHAPE, c_psf)
     slopes = central(lambda p: profile(p, position, SHAPE, c_psf)[0], at)
     np.testing.assert_allclose(values[1:], slopes, rtol=0, atol=1e-8 * values[0].max() + 1e-12)
@@ -33,22 +33,22 @@ def test_slopes_of_a_galaxy(parameters, position):
 @pytest.mark.parametrize("position", PLACES)
 @pytest.mark.parametrize("psf", [STAR, PSF.gaussian(1.3, n_pixels=30)], ids=["odd", "even"])
 def test_slopes_of_a_star(psf, position):
-    values = point(psf, position, SHAPE)
-    slopes = central(lambda p: point(psf, p, SHAPE)[0], np.array(position))
+    values = draw_psf(psf, position, SHAPE)
+    slopes = central(lambda p: draw_psf(psf, p, SHAPE)[0], np.array(position))
     np.testing.assert_allclose(values[1:], slopes, rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(point(psf, position, SHAPE, slopes=False), values[:1])
+    np.testing.assert_array_equal(draw_psf(psf, position, SHAPE, slopes=False), values[:1])
 
 
 def test_a_star_is_the_psf():
-    image = point(STAR, (20, 22), SHAPE)[0]
+    image = draw_psf(STAR, (20, 22), SHAPE)[0]
     np.testing.assert_allclose(image[11:30, 13:32], STAR.images[0], atol=1e-12)
     assert image.sum() == pytest.approx(1, rel=1e-12)
     # half a pixel further its light is too, but for the rings of a PSF that is cut at Nyquist
-    image = point(STAR, (20.5, 22.25), SHAPE)[0]
+    image = draw_psf(STAR, (20.5, 22.25), SHAPE)[0]
     y, x = np.indices(SHAPE)
     assert image.sum() == pytest.approx(1, abs=1e-3)
     assert ((y * image).sum(), (x * image).sum()) == pytest.approx((20.5, 22.25), abs=0.02)
-    corner = point(STAR, (0, 0), SHAPE)[0]
+    corner = draw_psf(STAR, (0, 0), SHAPE)[0]
     assert corner.sum() == pytest.approx(STAR.images[0][9:, 9:].sum(), rel=1e-9)
     assert np.abs(corner[20:, 20:]).max() < 1e-12
 
@@ -58,7 +58,7 @@ def test_a_long_psf_does_not_come_back_on_the_other_side(sigma):
     """Whichever of its sides is the longer one: beyond its last pixel there is nothing."""
     along = [np.exp(-0.5 * (np.arange(-3 * s, 3 * s + 1) / s) ** 2) for s in sigma]
     psf = PSF(np.outer(*along))
-    drawn = point(psf, (0.0, 0.0), (45, 45), slopes=False)[0]
+    drawn = draw_psf(psf, (0.0, 0.0), (45, 45), slopes=False)[0]
     height, width = (n // 2 + 1 for n in psf.images.shape[1:])
     assert drawn[0, 0] == drawn.max() > 0.01
     assert np.abs(drawn[height:]).max() < 1e-12 and np.abs(drawn[:, width:]).max() < 1e-12
@@ -69,23 +69,25 @@ def test_a_galaxy_is_what_its_parameters_say(position):
     """Unit integral; the second moments of a Gaussian where beta is large."""
     at = np.array([np.log(3.0), 0.4, -0.2, np.log(1e4)])
     wide = (121, 131)
-    image = profile(at, position + np.array([40, 42]), wide, moment(STAR))[0]
+    image = profile(at, position + np.array([40, 42]), wide, psf_second_moment(STAR))[0]
     assert image.sum() == pytest.approx(1, rel=1e-6)
     y, x = np.indices(wide) - (np.array(position) + [40, 42])[:, None, None]
-    c, _ = covariance(at, moment(STAR))
+    c, _ = covariance(at, psf_second_moment(STAR))
     found = [[(a * b * image).sum() for a in (y, x)] for b in (y, x)]
     np.testing.assert_allclose(found, c, rtol=1e-3)
     root = np.sqrt(1 + 0.4**2 + 0.2**2)
     own = 9 * np.array([[1 + 0.4 / root, -0.2 / root], [-0.2 / root, 1 - 0.4 / root]])
-    np.testing.assert_allclose(c - moment(STAR), own, rtol=1e-12)
+    np.testing.assert_allclose(c - psf_second_moment(STAR), own, rtol=1e-12)
 
 
 def test_moments_of_a_psf():
     """A Gaussian's own and the pixel's, 1/12, but for its aliasing; in the model's pixels."""
-    np.testing.assert_allclose(moment(STAR), (0.64 + 1 / 12) * np.eye(2), rtol=3e-5, atol=1e-12)
+    np.testing.assert_allclose(
+        psf_second_moment(STAR), (0.64 + 1 / 12) * np.eye(2), rtol=3e-5, atol=1e-12
+    )
     fine = PSF(PSF.gaussian(3.0, n_pixels=61, pixel=False).images, spacing=0.5)
-    np.testing.assert_allclose(moment(fine), 2.25 * np.eye(2), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(psf_second_moment(fine), 2.25 * np.eye(2), rtol=1e-6, atol=1e-12)
     image = np.zeros((5, 5))
     image[1, 3] = image[3, 1] = 1
     image[2, 2] = 2  # its core, or PSF warns
-    np.testing.assert_allclose(moment(PSF(image)), [[0.5, -0.5], [-0.5, 0.5]])
+    np.testing.assert_allclose(psf_second_moment(PSF(image)), [[0.5, -0.5], [-0.5, 0.5]])

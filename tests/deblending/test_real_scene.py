@@ -10,7 +10,7 @@ from clresample import deblend, get_device, summary
 from clresample.cli.command import main
 from clresample.device.discovery import SIMULATED
 from clresample.files.results import read_result
-from clresample.sky.sources import Extended
+from clresample.sky.sources import ExtendedSource
 
 pytest.importorskip("sep")
 pytest.importorskip("matplotlib")
@@ -68,7 +68,7 @@ def test_residuals_hold_no_galaxy(fitted):
 
 def test_all_that_is_seen_is_found(fitted):
     result, _ = fitted
-    found = result.frame.place(result.sources)
+    found = result.frame.positions_of(result.sources)
     seen = (
         (130, 178),
         (131, 57),
@@ -106,6 +106,6 @@ def test_a_bright_blend_is_fitted_wherever_its_galaxies_are_said_to_be(data, see
     observation, sources = hsc_blend(data)
     rng = np.random.default_rng(seed)
     places = [np.array(s.position_px) + rng.normal(0, PLACE_PX, 2) for s in sources]
-    result = deblend([observation], [Extended(position_px=tuple(p)) for p in places])
+    result = deblend([observation], [ExtendedSource(position_px=tuple(p)) for p in places])
     assert result.status == "converged"
     assert (np.array(list(summary(result)["chi2"].values())) <= BLEND_CHI2).all()

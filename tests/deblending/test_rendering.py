@@ -8,11 +8,11 @@ from helpers.scenes import blend, fit
 from helpers.solver import BOXES, CLOSE, PRIOR, changed, engine, every_type, posed
 
 from clresample.deblending.settings import Settings
-from clresample.deblending.solver.buffers import Buffers
-from clresample.deblending.solver.gradient import Gradient
+from clresample.deblending.solver.buffers import SceneBuffers
+from clresample.deblending.solver.gradient import LossGradient
 from clresample.deblending.solver.operators import MorphologyOperator, SpectraOperator
-from clresample.deblending.solver.rendering import choice
-from clresample.deblending.solver.rendering.stages import Transformed
+from clresample.deblending.solver.rendering import stage_selection
+from clresample.deblending.solver.rendering.stages import BoxTransformRendering
 from clresample.deblending.solver.scene_model import compose
 from clresample.resampling.resampler import Resampler
 from clresample.sky.psf import PSF
@@ -47,11 +47,11 @@ def pairs_of(device, mapping, dtype, *, own=False):
                 seed=i,
                 fixed=(1,) if len(boxes) > 1 else (),
                 shape=SHAPE,
-                extent=SHAPE,
+                unpadded_shape=SHAPE,
                 ops=[op],
                 data=[rng.normal(0, 3, op.shape_out)],
                 weights=[rng.uniform(0.5, 1.5, op.shape_out) * op.covered],
-                scale=rng.uniform(0.1, 0.3, (len(boxes), 2)),
+                step_scale=rng.uniform(0.1, 0.3, (len(boxes), 2)),
                 spectra=rng.uniform(0.5, 2, (len(boxes), 2)),
                 sky=rng.normal(size=2),
             )
@@ -61,7 +61,7 @@ def pairs_of(device, mapping, dtype, *, own=False):
 
 def buffers_of(pairs, device, dtype):
     scenes, states = map(list, zip(*pairs, strict=True))
-    return Buffers(scenes, states, device, dtype, PRIOR)
+    return SceneBuffers(scenes, states, device, dtype, PRIOR)
 
 
 def operator_of(scenes):
@@ -76,7 +76,7 @@ def operator_of(scenes):
 def scene_operator(kind, pairs, device, dtype, depth):
     b = buffers_of(pairs, device, dtype)
     op = operator_of(b.scenes)
-    return kind(b, op, choice.rendering(b, 0, op, depth))
+    return kind(b, op, stage_selection.select_rendering(b, 0, op, depth))
 
 
 CASES = pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def test_gradients_are_the_same_at_every_depth(build, name):
     pairs, found = pairs_of(build, GEOMETRIES[name](), np.float64, own=True), []
     for depth in (0, 1, 2):
         b = buffers_of(pairs, build, np.float64)
-        gradient = Gradient(b, with_prior=False, depth=depth)
+        gradient = LossGradient(b, with_prior=False, depth=depth)
         gradient.queue()
         gradient.queue()  # what is added to is written first
         arrays = b.d_morph, b.d_spectra, gradient.rows_loss, gradient.rows_pull
@@ -140,7 +140,7 @@ def test_fits_are_the_same_at_every_depth(device, monkeypatch, dtype):
     b, found = blend(), []
     for depth in (0, 1, 2):
         counts = [float(k != depth) for k in range(3)]
-        monkeypatch.setattr(choice, "flops", lambda *batch, counts=counts: counts)
+        monkeypatch.setattr(stage_selection, "stage_flops", lambda *batch, counts=counts: counts)
         settings = Settings(max_iter=20)
         found.append(fit(b, device, settings=settings, dtype=dtype))
     for other in found[1:]:
@@ -156,7 +156,7 @@ class Forgetful(MorphologyOperator):
 
     def _adjoint(self, y, out):
         self.device.copy(self._zeros, out)
-        self.rendering.collect(y[0])
+        self.rendering.back_project(y[0])
         self.rendering.gather_morph(self.buffers.spectra, out, self.buffers.free)
 
 
@@ -198,13 +198,13 @@ def test_the_dot_test_finds_a_broken_adjoint(device, kind, depth):
 
 def test_a_product_of_a_wrong_size_is_found(device, monkeypatch):
     """The oracle sees a box that is one column too narrow on its way to frequencies."""
-    made = Transformed.__init__
+    made = BoxTransformRendering.__init__
 
     def narrow(self, *arguments):
         made(self, *arguments)
         self._boxes._columns = self._boxes._columns - 1
 
-    monkeypatch.setattr(Transformed, "__init__", narrow)
+    monkeypatch.setattr(BoxTransformRendering, "__init__", narrow)
     pairs = pairs_of(device, GEOMETRIES["mirrored"](), np.float32)
     op = scene_operator(MorphologyOperator, pairs, device, np.float32, 2)
     scene, state = pairs[0]
@@ -218,7 +218,7 @@ def test_operators_are_matrices_of_the_scene(device):
     """Of one source of one pixel, column by column; a batch of items is refused."""
     scene, state = posed(device, np.float32, boxes=BOXES[3:4])
     b = engine([(scene, state)], device, np.float32).buffers
-    op = SpectraOperator(b, scene.ops[1], choice.rendering(b, 1, scene.ops[1]))
+    op = SpectraOperator(b, scene.ops[1], stage_selection.select_rendering(b, 1, scene.ops[1]))
     columns = dense(op).reshape(2, -1, 3)
     y, x = BOXES[3][:2]
     pixel = np.zeros((2, *scene.shape), np.float32)
@@ -241,11 +241,11 @@ def test_what_takes_least_is_chosen(device):
         np.float32,
         boxes=((0, 0, 31, 26),) * n,
         shape=SHAPE,
-        extent=SHAPE,
+        unpadded_shape=SHAPE,
         ops=scene.ops,
         data=scene.data,
         weights=scene.weights,
-        scale=np.ones((n, 2)),
+        step_scale=np.ones((n, 2)),
         spectra=np.ones((n, 2)),
         sky=state.sky,
     )
@@ -253,8 +253,8 @@ def test_what_takes_least_is_chosen(device):
     for pairs in (few, many):
         b = buffers_of(pairs, device, np.float32)
         op = operator_of(b.scenes)
-        counts = choice.flops(b, op, op.executor())
-        depths.append(choice.rendering(b, 0, op).depth)
+        counts = stage_selection.stage_flops(b, op, op.executor())
+        depths.append(stage_selection.select_rendering(b, 0, op).depth)
         assert counts[depths[-1]] == min(counts)
     assert depths[0] > 0
     assert depths[1] == 0
@@ -270,4 +270,4 @@ def test_what_takes_least_is_chosen(device):
         device=device,
     )
     assert same.is_identity and not home.is_identity
-    assert choice.rendering(b, 0, same).depth == 0
+    assert stage_selection.select_rendering(b, 0, same).depth == 0

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clresample import PSF, Extended, Frame, Grid, Observation, Resampler, Settings, deblend
+from clresample import PSF, ExtendedSource, Frame, Grid, Observation, Resampler, Settings, deblend
 from clresample.deblending.posterior import posterior, residuals
 from clresample.deblending.posterior.residuals import (
     MISFIT_SIGMAS,
     channel_residuals,
-    widening,
-    worst_residuals,
+    max_filtered_residuals,
+    misfit_error_scale,
 )
 from clresample.measurement.catalogue import Flag, catalogue
 from clresample.measurement.photometry import channel_covariances, fluxes
@@ -33,7 +33,7 @@ def fitted():
     model = sum(np.exp(-((y - a) ** 2 + (x - b) ** 2) / (2 * 2.0**2)) for a, b in POSITIONS)
     data = Resampler(GRID, FRAME_PSF, GRID, SEEN, dtype=np.float64)(np.stack([90 * model] * 2))
     seen = Observation(data, SEEN, GRID, weights=SIGMA**-2, channels=["g", "r"])
-    sources = [Extended(position_px=p) for p in POSITIONS]
+    sources = [ExtendedSource(position_px=p) for p in POSITIONS]
     return deblend([seen], sources, frame=Frame(GRID, FRAME_PSF), settings=Settings(max_iter=20))
 
 
@@ -56,7 +56,7 @@ def left_over(result, *, bump, noise=0.0, seed=0):
 
 
 def test_a_residual_is_measured_in_sigmas_and_given_to_its_source(result):
-    found = worst_residuals(left_over(result, bump=-8), 0)
+    found = max_filtered_residuals(left_over(result, bump=-8), 0)
     assert found.shape == (2, 2)
     assert found[1, 1] == pytest.approx(8, rel=0.03)
     assert found[1, 0] < 0.5 and found[0].max() < 3  # the other channel, the other source
@@ -66,7 +66,7 @@ def test_it_is_flagged_and_the_fit_is_not_called_good(result):
     found = left_over(result, bump=8)
     table = catalogue(found)
     assert (table["flags"] & Flag.MISFIT != 0).tolist() == [False, True]
-    assert table["residual_r"][1] == pytest.approx(8, rel=0.03)
+    assert table["max_residual_r"][1] == pytest.approx(8, rel=0.03)
     assert over_5_sigma(channel_residuals(found)).tolist() == [False, True]
     ended = summary(replace(found, status="converged"))
     assert ended["misfits"] == [1] and not ended["good"]
@@ -81,14 +81,14 @@ def test_errors_of_a_misfitted_source_grow_with_its_residual(result, monkeypatch
     monkeypatch.setattr(posterior, "channel_residuals", lambda result: left)
     one, factors = fitted(), np.array([1, factor])
     plain, found = catalogue(result), catalogue(one)
-    errors = [name for name in found.colnames if "_err" in name and name != "angle_err"]
+    errors = [name for name in found.colnames if "_err" in name and name != "position_angle_err"]
     assert len(errors) == 9  # places on the sky and in pixels, size, e1, e2, two fluxes
     for name in errors:
         ratio = np.asarray(found[name], float) / np.asarray(plain[name], float)
         np.testing.assert_allclose(ratio, factors, rtol=1e-12, err_msg=name)
-    for name in ("flux_g", "y_centroid", "size", "e1"):
+    for name in ("flux_g", "y_centroid", "rms_size", "e1"):
         np.testing.assert_array_equal(found[name], plain[name])
-    np.testing.assert_array_equal(found["residual_r"], left[:, 1])
+    np.testing.assert_array_equal(found["max_residual_r"], left[:, 1])
     ratio = channel_covariances(one) / channel_covariances(result)
     np.testing.assert_allclose(ratio, np.tile(factors[:, None, None] ** 2, (1, 2, 2)), rtol=1e-12)
     wanted = fluxes(result)[1] * np.outer(factors, factors)
@@ -102,7 +102,7 @@ def test_errors_of_a_misfitted_source_grow_with_its_residual(result, monkeypatch
 
 def test_errors_grow_with_the_largest_residual_of_all_channels():
     seen = np.array([[1.0, 4.9], [np.nan, 15.0], [np.nan, np.nan], [10.0, 2.0]])
-    np.testing.assert_allclose(widening(seen), [1, 3, 1, 2])
+    np.testing.assert_allclose(misfit_error_scale(seen), [1, 3, 1, 2])
 
 
 def test_noise_alone_is_not_flagged(result):
@@ -111,7 +111,9 @@ def test_noise_alone_is_not_flagged(result):
         for i in range(40)
     ]
     assert np.mean(flagged) < 0.05
-    worst = [worst_residuals(left_over(result, bump=0, noise=SIGMA, seed=i), 0) for i in range(40)]
+    worst = [
+        max_filtered_residuals(left_over(result, bump=0, noise=SIGMA, seed=i), 0) for i in range(40)
+    ]
     assert 2 < np.median(worst) < 4  # the largest of some hundred independent draws
 
 
@@ -125,6 +127,6 @@ def test_channels_are_filtered_the_same_together_and_one_by_one(result, monkeypa
     found = []
     for together in (1, 1 << 30):
         monkeypatch.setattr(residuals, "TOGETHER_PX", together)
-        found.append(worst_residuals(one, 0))
+        found.append(max_filtered_residuals(one, 0))
     np.testing.assert_array_equal(*found)
     assert np.isfinite(found[0]).all()

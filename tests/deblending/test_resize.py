@@ -6,8 +6,8 @@ from helpers.scenes import SHAPE
 from helpers.solver import changed, posed
 from helpers.start import point_of
 
-from clresample.deblending.resize import GROW_PX, resized
-from clresample.deblending.solver.scene import Memory
+from clresample.deblending.resize import GROW_PX, resize_boxes
+from clresample.deblending.solver.scene import AmsgradMoments
 
 NOISE = np.ones(3)
 WIDE = (48, 48)  # a frame with padding beyond SHAPE
@@ -26,7 +26,7 @@ def one(device, low, size, image):
         morph=[image[part].copy()],
         center=np.array([[15, 18]]) - low,
         latent=[rng.normal(size=size)],
-        memory=Memory([[rng.normal(size=size)] for _ in range(3)], np.zeros((3, 1, 3))),
+        memory=AmsgradMoments([[rng.normal(size=size)] for _ in range(3)], np.zeros((3, 1, 3))),
     )
 
 
@@ -64,11 +64,11 @@ def check_moved(old, new, profile):
 def test_a_box_grows_where_light_reaches_its_edge(device):
     profile = gauss(6.0)
     pair = one(device, (11, 14), (9, 9), profile)
-    new = resized(*pair, point_of(profile[None], (15, 18)), NOISE)
+    new = resize_boxes(*pair, point_of(profile[None], (15, 18)), NOISE)
     assert new[1].morph[0].shape == (9 + 2 * GROW_PX, 9 + 2 * GROW_PX)
     check_moved(pair, new, profile)
     for _ in range(4):  # up to the frame, not to its padding
-        new = resized(*new, point_of(profile[None], (15, 18)), NOISE)
+        new = resize_boxes(*new, point_of(profile[None], (15, 18)), NOISE)
     assert new[1].morph[0].shape == SHAPE
     check_moved(pair, new, profile)
 
@@ -76,18 +76,18 @@ def test_a_box_grows_where_light_reaches_its_edge(device):
 def test_a_box_shrinks_where_there_is_none(device):
     profile = gauss(1.0)
     pair = one(device, (0, 0), SHAPE, profile)
-    small = resized(*pair, point_of(profile[None], (15, 18)), NOISE)
+    small = resize_boxes(*pair, point_of(profile[None], (15, 18)), NOISE)
     (morph,) = small[1].morph
     assert np.prod(morph.shape) < np.prod(SHAPE) / 3
     assert morph.sum() > 0.999 * profile.sum()
     check_moved(pair, small, profile)
-    again = resized(*small, point_of(profile[None], (15, 18)), NOISE)
+    again = resize_boxes(*small, point_of(profile[None], (15, 18)), NOISE)
     assert again[0] is small[0] and again[1] is small[1]
 
 
 def test_a_first_state_has_no_memory_to_move(device):
     pair = changed(*one(device, (11, 14), (9, 9), gauss(6.0)), memory=None)
-    _, state = resized(*pair, point_of(gauss(6.0)[None], (15, 18)), NOISE)
+    _, state = resize_boxes(*pair, point_of(gauss(6.0)[None], (15, 18)), NOISE)
     assert state.memory is None and state.morph[0].shape != (9, 9)
 
 
@@ -96,4 +96,6 @@ def test_what_fits_stays(device, fixed):
     profile = gauss(6.0)
     scene, state = one(device, (11, 14), (9, 9), profile)
     scene, state = changed(scene, state, fixed=np.array([fixed]))
-    assert (resized(scene, state, point_of(profile[None], (15, 18)), NOISE)[0] is scene) == fixed
+    assert (
+        resize_boxes(scene, state, point_of(profile[None], (15, 18)), NOISE)[0] is scene
+    ) == fixed

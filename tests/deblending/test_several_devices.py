@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clresample import Extended, Settings, deblend_many, get_device, list_devices
-from clresample.cli.machine.workload import Renders, blends
+from clresample import ExtendedSource, Settings, deblend_many, get_device, list_devices
+from clresample.cli.device_tools.workload import RenderWorkload, blends
 from clresample.deblending.blend import Failure
 
 SETTINGS = Settings(max_iter=6)
@@ -18,7 +18,7 @@ def test_results_are_those_of_one_device(device):
     losses and 2e-6 of the morphologies; where all is float32, 2e-5 of the spectra."""
     dtype, rtol = (np.float64, 1e-5) if device.has_fp64 else (np.float32, 1e-4)
     given = blends(5, device)
-    outside = (Extended(position_px=(1e4, 1e4)),)
+    outside = (ExtendedSource(position_px=(1e4, 1e4)),)
     given[2] = replace(given[2], sources=outside)  # harms no other
     done = []
     fit = {"settings": SETTINGS, "dtype": dtype}
@@ -55,7 +55,7 @@ def test_unlike_devices_agree(unlike):
 
 def test_unlike_devices_work_side_by_side_in_one_process(unlike):
     """Operators whose launches alternate, each with what the other renders."""
-    ops = [Renders(device).op for device in unlike]
+    ops = [RenderWorkload(device).op for device in unlike]
     x = np.random.default_rng(0).standard_normal(ops[0].shape_in)
     truth = ops[0](x)
     for _ in range(3):

@@ -7,7 +7,7 @@ from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.blend import Blend
 from clresample.deblending.inspection.inspect import InputWarning
 from clresample.deblending.settings import Settings
-from clresample.deblending.shifts import ahead, shift_steps
+from clresample.deblending.shifts import extrapolate, shift_steps
 from clresample.deblending.solver.scene import Scene, State
 from clresample.deblending.solver.scene_model import compose
 from clresample.resampling.cache import cached_resampler
@@ -15,7 +15,7 @@ from clresample.sky.frame import model_frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
-from clresample.sky.sources import Extended
+from clresample.sky.sources import ExtendedSource
 
 SHARP, BLURRED = Grid.flat((60, 66), 0.1), Grid.flat((34, 36), 0.2, angle_deg=15)
 
@@ -48,7 +48,7 @@ def blend(shift, *, seed=0, noise=1.0):
         made.append(
             Observation(data, o.psf, o.grid, weights=o.weights, channels=o.channels, name=o.name)
         )
-    sources = Extended(position_px=(25, 25)), Extended(position_px=(40, 45))
+    sources = ExtendedSource(position_px=(25, 25)), ExtendedSource(position_px=(40, 45))
     return Blend(tuple(made), sources, frame)
 
 
@@ -140,10 +140,10 @@ def test_steps_that_fall_off_are_summed_up():
     """A geometric series' limit in one step; no further than 5 steps, and not at all where they
     point backwards."""
     step = np.array([[0.0, 0.0], [0.3, -0.1]])
-    np.testing.assert_allclose(ahead(step, 2 * step), 2 * step)
-    np.testing.assert_allclose(ahead(step, 1.01 * step), 5 * step)
+    np.testing.assert_allclose(extrapolate(step, 2 * step), 2 * step)
+    np.testing.assert_allclose(extrapolate(step, 1.01 * step), 5 * step)
     for last in (-step, 0 * step):
-        np.testing.assert_allclose(ahead(step, last), step)
+        np.testing.assert_allclose(extrapolate(step, last), step)
 
 
 def truth(b, device):
@@ -154,7 +154,7 @@ def truth(b, device):
     peaks = np.array([flux / (2 * np.pi * s**2) for _, _, flux, s in galaxies])
     scene = Scene(
         shape=SHARP.shape,
-        extent=SHARP.shape,
+        unpadded_shape=SHARP.shape,
         ops=[
             cached_resampler(b.frame, o.grid, o.psf, dtype=np.float64, device=device)
             for o in b.observations
@@ -165,7 +165,7 @@ def truth(b, device):
         center=np.array([(25, 25), (28, 31), (40, 45)]),
         profile=morphs,
         fixed=np.zeros(3, bool),
-        scale=np.ones((3, 3)),
+        step_scale=np.ones((3, 3)),
     )
     spectra = np.repeat(peaks[:, None], 3, axis=1)
     return scene, State([0 * m for m in morphs], morphs, spectra, np.zeros(3))

@@ -62,13 +62,13 @@ def test_spectra_of_terms_and_back(queue, dtype):
     for n_rows in (n, 4):
         parts = np.full(shares.shape, np.nan)
         found = queue(
-            "scene.cl", "share", (n_bands, n_rows, 1), dtype,
+            "scene.cl", "split_spectra", (n_bands, n_rows, 1), dtype,
             get="parts", defines={"VW": 4}, **given, spectra=spectra, parts=parts,
         )  # fmt: skip
         close(found, own * shares, dtype)
         parts = random(*shares.shape, seed=1)
         found = queue(
-            "scene.cl", "unshare", (n_bands, n_rows, 1), dtype,
+            "scene.cl", "merge_spectra", (n_bands, n_rows, 1), dtype,
             get="spectra", defines={"VW": 4}, **given, spectra=spectra, parts=parts,
         )  # fmt: skip
         wanted = spectra.copy()
@@ -106,7 +106,7 @@ def test_windows_are_put_together(queue, add, dtype):
     windows, image = random(len(LOW), n_bands, *size), random(3, n_bands, *shape)
     wanted = add * image + np.array([seen(windows, b, shape) for b in range(3)])
     found = queue(
-        "windows.cl", "assemble", (shape[1], shape[0], 3 * n_bands), dtype, get="image",
+        "windows.cl", "add_windows", (shape[1], shape[0], 3 * n_bands), dtype, get="image",
         first=FIRST.astype(np.int32), low=LOW.astype(np.int32), n_bands=n_bands, my=shape[0],
         mx=shape[1], wy=size[0], wx=size[1], add=add, windows=windows, image=image,
     )  # fmt: skip
@@ -123,7 +123,7 @@ def test_windows_are_cut_out(queue, dtype):
         padded = np.pad(image[scene[g]], [(0, 0), (60, 60), (60, 60)])
         wanted[g] = padded[:, 60 + y : 60 + y + size[0], 60 + x : 60 + x + size[1]]
     found = queue(
-        "windows.cl", "cut", (size[1], size[0], len(LOW) * n_bands), dtype, get="windows",
+        "windows.cl", "cut_windows", (size[1], size[0], len(LOW) * n_bands), dtype, get="windows",
         scene=scene, low=LOW.astype(np.int32), n_bands=n_bands, my=shape[0], mx=shape[1],
         wy=size[0], wx=size[1], image=image, windows=np.full(wanted.shape, np.nan),
     )  # fmt: skip
@@ -165,7 +165,7 @@ def test_spectra_are_turned_by_their_slots_offsets(queue, which, n_terms, dtype)
     shares = random(slots, n_bands, n_terms) if n_terms > 1 else np.ones((slots, n_bands, 1))
     turn = np.exp(2j * np.pi * random(slots, h_y + h_x))
     found = queue(
-        "terms.cl", "turn", (h_x, h_y + 1, items * n_bands), dtype, get="z",
+        "terms.cl", "apply_transfer", (h_x, h_y + 1, items * n_bands), dtype, get="z",
         defines={"TERMS": n_terms}, h_y=h_y, n_pad=2 * h_x, n_bands=n_bands, n=n, first=first,
         z0=z0, phase=np.stack([turn.real, turn.imag], axis=-1), D=planes(*d), shares=shares,
         n_plans=n_plans, which=which, z=np.full((items * n_bands, 2 * h_y, 2 * h_x), np.nan),
@@ -185,14 +185,14 @@ def test_terms_are_added_and_spread(queue, dtype):
     n = n_plans * n_bands
     terms, z = random(n, n_terms, 2 * h_y, 2 * h_x), random(n, 2 * h_y, 2 * h_x)
     given = {"n_terms": n_terms, "h_y": h_y, "n_pad": 2 * h_x, "terms": terms, "z": z}
-    found = queue("terms.cl", "add", (h_x, h_y + 1, n), dtype, get="z", **given)
+    found = queue("terms.cl", "sum_terms", (h_x, h_y + 1, n), dtype, get="z", **given)
     close(found, terms.sum(axis=1), dtype)
     shape = 2, n_plans, n_bands, n_terms, h_y, h_x
     d = random(*shape) + 1j * random(*shape, seed=1)
     for stride, own in ((n_bands * n_terms * 4 * h_y * h_x, d), (0, d[:, [0, 0]])):
         table = planes(*d)
         found = queue(
-            "terms.cl", "spread", (h_x, h_y + 1, n), dtype, get="terms", **given,
+            "terms.cl", "split_terms", (h_x, h_y + 1, n), dtype, get="terms", **given,
             n_bands=n_bands, D=table, stride_d=stride,
         )  # fmt: skip
         plus, minus = (f[:, None] for f in amplitudes(z))

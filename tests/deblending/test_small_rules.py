@@ -7,27 +7,30 @@ import numpy as np
 import pytest
 from helpers.scenes import blend
 
-from clresample.deblending.fit import Fit, begin, finish
-from clresample.deblending.posterior import exposure
-from clresample.deblending.posterior.exposure import Exposure, Transfer
-from clresample.deblending.settings import Settings
-from clresample.deblending.solver.learned.evidence import (
-    LEAST_SEEN,
-    SEEN_STRENGTH,
-    SourceEvidence,
-    Spectra,
+from clresample.deblending.fit import Fit, render_fits, start_fits
+from clresample.deblending.posterior import aligned_observation
+from clresample.deblending.posterior.aligned_observation import (
+    AlignedObservation,
+    BandLimitedTransfer,
 )
-from clresample.deblending.solver.learned.pairs import Pairs
-from clresample.deblending.solver.learned.prior import LearnedPrior
-from clresample.deblending.solver.learned.progress import Progress
-from clresample.deblending.spectra import RIDGE, scaled
+from clresample.deblending.settings import Settings
+from clresample.deblending.solver.multiscale.evidence import (
+    MIN_SEEN,
+    SEEN_STRENGTH,
+    LocalPowerSpectra,
+    SourceEvidence,
+)
+from clresample.deblending.solver.multiscale.lbfgs_control import LbfgsControl
+from clresample.deblending.solver.multiscale.lbfgs_pairs import LbfgsPairs
+from clresample.deblending.solver.multiscale.prior import MultiscalePrior
+from clresample.deblending.spectra import RIDGE, unit_diagonal
 from clresample.sky.psf import PSF
 
 
 def test_the_share_of_a_scale_that_is_seen_is_its_definition():
     """Of its power, what is over the noise where structure is a tenth of the peak."""
-    prior = LearnedPrior()
-    spectra = Spectra(prior)
+    prior = MultiscalePrior()
+    spectra = LocalPowerSpectra(prior)
     y, x = np.indices((21, 21)) - 10
     rng = np.random.default_rng(0)
     response = 3 * rng.random((2, len(spectra.weight)))
@@ -38,13 +41,13 @@ def test_the_share_of_a_scale_that_is_seen_is_its_definition():
     for k in spectra.k:
         signal = SEEN_STRENGTH**2 * power * k
         wanted.append((spectra.weight * k * signal / (1 + signal)).sum())
-    np.testing.assert_allclose(evidence.seen(spectrum), np.maximum(wanted, LEAST_SEEN))
-    assert LEAST_SEEN < min(wanted) < max(wanted) < 0.9
+    np.testing.assert_allclose(evidence.resolved_fraction(spectrum), np.maximum(wanted, MIN_SEEN))
+    assert MIN_SEEN < min(wanted) < max(wanted) < 0.9
 
 
 def test_pairs_lie_in_the_slots_that_kernels_look_at():
     """used: all pairs and the spare one are in slots before it; the oldest of a full ring goes."""
-    pairs, n = Pairs(2, 3), 0
+    pairs, n = LbfgsPairs(2, 3), 0
     for _ in range(6):
         which = np.array([1])
         slot = pairs.spare[1]
@@ -59,7 +62,7 @@ def test_pairs_lie_in_the_slots_that_kernels_look_at():
 @pytest.mark.parametrize("size", [1.0, 1e-9, 1e9])
 def test_pairs_that_show_curvature_are_kept_however_large_they_are(size):
     """s . y above a millionth of y . H y, and above 0."""
-    pairs, shape = Pairs(4, 3), (4, 4)
+    pairs, shape = LbfgsPairs(4, 3), (4, 4)
     sy = size * np.array([2e-6, 0.5e-6, -1.0, 1.0])[:, None]
     yy = size * np.array([1.0, 1.0, 1.0, -1e-3])[:, None]  # below 0 by rounding alone
     pairs.take(np.arange(4), np.broadcast_to(sy, shape), np.broadcast_to(yy, shape))
@@ -67,30 +70,30 @@ def test_pairs_that_show_curvature_are_kept_however_large_they_are(size):
 
 
 def test_only_scenes_that_learn_have_another_loss():
-    progress = Progress(3, 0.01, [100, 100, 100])
+    progress = LbfgsControl(3, 0.01, [100, 100, 100])
     progress.loss[:] = [50.0, 60.0, 70.0]
     progress.n_rounds[:] = 7
     due = np.array([False, True, False])
-    progress.learned(due, np.zeros(3), np.array([9.0, 4.0, np.nan]))
+    progress.record_strengths(due, np.zeros(3), np.array([9.0, 4.0, np.nan]))
     assert progress.loss.tolist() == [50, 64, 70]
     assert progress.settled.tolist() == [False, True, False]
 
 
 def test_weights_of_a_scene_are_those_that_bright_stars_have_lowered(device):
     one = Fit(blend(), Settings(), device, np.float32, pad=1)
-    one.views = [replace(view, root=0.5 * view.root) for view in one.views]
-    begin([one])
+    one.views = [replace(view, sqrt_weights=0.5 * view.sqrt_weights) for view in one.views]
+    start_fits([one])
     for weights, view in zip(one.scene.weights, one.views, strict=True):
-        np.testing.assert_allclose(weights, view.root**2)
+        np.testing.assert_allclose(weights, view.sqrt_weights**2)
         assert 0 < weights.max() < 0.3
 
 
 def test_seconds_are_those_that_passed(device):
     began = time.perf_counter()
     one = Fit(blend(), Settings(prior=None), device, np.float32, pad=1)
-    begin([one])
+    start_fits([one])
     assert 0 < sum(one.seconds.values()) <= time.perf_counter() - began
-    (seen,) = finish([one])
+    (seen,) = render_fits([one])
     shared = one.seconds["result"]
     found = one.result(seen).seconds
     assert 0 < shared < found["result"]
@@ -103,14 +106,14 @@ def test_no_frequency_of_an_exposure_is_beyond_the_models_pixels():
     for scale in (1.0, 0.6):
         matrix = scale * np.array([[cos, cos], [-cos, cos]])
         sharp = PSF.gaussian(0.3, n_pixels=15)
-        nu_y, nu_x, d = Transfer(matrix, sharp, sharp).at((11, 13), 4.0)
+        nu_y, nu_x, d = BandLimitedTransfer(matrix, sharp, sharp).at((11, 13), 4.0)
         assert 0.4 < nu_y.max() <= 0.5 and 0.4 < np.abs(nu_x).max() <= 0.5
         assert d.shape == (len(nu_y), 1, len(nu_x))
 
 
 def test_a_ridge_is_added_to_the_diagonal():
     """Of what is seen a little; of what is not, so that it can be divided by."""
-    matrix, scale, seen = scaled(np.diag([4.0, 0.0]))
+    matrix, scale, seen = unit_diagonal(np.diag([4.0, 0.0]))
     assert seen.tolist() == [True, False] and scale.tolist() == [2, 1]
     np.testing.assert_allclose(np.diag(matrix), [1 + RIDGE, 1 + RIDGE], rtol=1e-15)
     assert matrix[0, 1] == 0
@@ -119,12 +122,12 @@ def test_a_ridge_is_added_to_the_diagonal():
 @pytest.mark.parametrize("refused", [1, 3])
 def test_trials_of_a_direction_are_counted_one_by_one(refused):
     """A direction that leads nowhere is given up after the same number of trials as before."""
-    progress = Progress(1, 0.01, [100])
+    progress = LbfgsControl(1, 0.01, [100])
     progress.loss[:], progress._fresh[:] = 10.0, False
     for i in range(1, refused + 1):
-        accepted, _ = progress.judge(np.array([11.0]), np.array([-1.0]))
+        accepted, _ = progress.accept_trials(np.array([11.0]), np.array([-1.0]))
         assert not accepted[0]
-        progress.next(accepted)
+        progress.next_actions(accepted)
         assert progress._trials[0] == i
 
 
@@ -132,13 +135,13 @@ def test_an_exposure_shows_what_the_operator_renders(device):
     """On pixels parallel to the model's, to a part of 1e-3, as far as it follows the light."""
     one = Fit(blend(), Settings(), device, np.float32, pad=1)
     view, observation = one.views[0], one.blend.observations[0]
-    exposure = Exposure.of(view, one.frame, observation, np.zeros(1, int))
+    exposure = AlignedObservation.of(view, one.frame, observation, np.zeros(1, int))
     y, x = np.indices((13, 11))
     image = np.exp(-((y - 6) ** 2 + (x - 5) ** 2) / (2 * 1.7**2))
     whole = np.zeros(view.op.shape_in, np.float32)
     origin = np.array([8, 9])
     whole[:, 8:21, 9:20] = image
-    wanted = view.op(whole) * view.root
+    wanted = view.op(whole) * view.sqrt_weights
     low, high = exposure.window(origin, image.shape)
     reach = exposure.reach_px
     for at, o, n, first, end in zip((exposure.y, exposure.x), origin, image.shape, low, high):
@@ -159,8 +162,8 @@ def test_wider_pixels_hold_the_same_sums(device, monkeypatch, angle):
     image = np.exp(-((y - 6) ** 2 + (x - 5) ** 2) / (2 * 1.7**2)).astype(np.float32)
     origin, sums, widths = np.array([8, 12]), [], []
     for wider in (1e9, 0.1):
-        monkeypatch.setattr(exposure, "WIDER", wider)
-        found = Exposure.of(view, one.frame, observation, np.zeros(1, int))
+        monkeypatch.setattr(aligned_observation, "MIN_REBIN_FACTOR", wider)
+        found = AlignedObservation.of(view, one.frame, observation, np.zeros(1, int))
         low, high = found.window(origin, image.shape)
         seen = found.observe(image[None], 0, origin, low, high)[0]
         sums.append(np.square(seen).sum((1, 2)))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from clresample.deblending.spectra import RIDGE, inverse, non_negative, scaled
+from clresample.deblending.spectra import RIDGE, nnls_batch, spectrum_covariance, unit_diagonal
 
 
 def test_sources_in_one_place_have_variances_though_rounding_made_the_matrix_indefinite():
@@ -13,8 +13,8 @@ def test_sources_in_one_place_have_variances_though_rounding_made_the_matrix_ind
     images = rng.random((2, 50))[np.arange(80) % 2]
     noise = rng.normal(0, 3e-7, (80, 80))
     normal = ((images @ images.T) * (1 + noise + noise.T))[None]
-    assert np.linalg.eigvalsh(scaled(normal)[0]).min() < -RIDGE
-    found = inverse(normal)[0]
+    assert np.linalg.eigvalsh(unit_diagonal(normal)[0]).min() < -RIDGE
+    found = spectrum_covariance(normal)[0]
     alone = 1 / np.diag(normal[0])
     assert np.isfinite(found).all()
     assert (np.diag(found) > 1e5 * alone).all()  # neither is known without the others
@@ -26,7 +26,7 @@ def test_a_matrix_that_is_well_defined_is_inverted_as_it_is():
     images = rng.normal(size=(3, 5, 40)) * np.array([1, 10, 0.1, 3, 1])[:, None]
     normal = images @ images.swapaxes(1, 2)
     normal[1, 2] = normal[1, :, 2] = 0  # one that this channel does not see
-    found = inverse(normal)
+    found = spectrum_covariance(normal)
     np.testing.assert_allclose(found[0], np.linalg.inv(normal[0]), rtol=1e-5)
     assert found[1, 2, 2] == np.inf and not found[1, 2, [0, 1, 3, 4]].any()
     others = np.ix_([0, 1, 3, 4], [0, 1, 3, 4])
@@ -35,7 +35,7 @@ def test_a_matrix_that_is_well_defined_is_inverted_as_it_is():
 
 def test_no_variance_is_less_than_that_of_a_source_alone():
     """A source alone: 1 / N, to the ridge."""
-    found = inverse(np.array([[[4.0]], [[25.0]]]))
+    found = spectrum_covariance(np.array([[[4.0]], [[25.0]]]))
     np.testing.assert_allclose(found[:, 0, 0], [1 / 4, 1 / 25], rtol=2 * RIDGE)
 
 
@@ -46,7 +46,7 @@ def test_least_squares_meet_the_conditions_of_a_minimum(seed):
     images = rng.normal(size=(4, 7, 30))
     data = rng.normal(size=(4, 30))
     normal, right = images @ images.swapaxes(1, 2), np.einsum("mij,mj->mi", images, data)
-    found = non_negative(normal, right)
+    found = nnls_batch(normal, right)
     truth = [nnls(a.T, d)[0] for a, d in zip(images, data, strict=True)]
     np.testing.assert_allclose(found, truth, atol=1e-6)
     assert (found == 0).any() and (found > 0).any()
@@ -56,12 +56,12 @@ def test_free_unknowns_may_be_negative_and_what_is_not_seen_is_zero():
     normal = np.diag([2.0, 4.0, 0.0])[None]
     right = np.array([[-2.0, -4.0, 0.0]])
     free = np.array([False, True, False])
-    np.testing.assert_allclose(non_negative(normal, right, free), [[0, -1, 0]], rtol=1e-7)
-    np.testing.assert_allclose(non_negative(normal, -right), [[1, 1, 0]], rtol=1e-7)
+    np.testing.assert_allclose(nnls_batch(normal, right, free), [[0, -1, 0]], rtol=1e-7)
+    np.testing.assert_allclose(nnls_batch(normal, -right), [[1, 1, 0]], rtol=1e-7)
 
 
 def test_equal_sources_share_their_light():
-    found = non_negative(np.ones((1, 2, 2)), np.full((1, 2), 6.0))
+    found = nnls_batch(np.ones((1, 2, 2)), np.full((1, 2), 6.0))
     np.testing.assert_allclose(found, [[3, 3]], rtol=1e-6)
 
 
@@ -82,8 +82,8 @@ def test_sources_that_cannot_be_told_apart_get_a_minimum_all_the_same(n_free):
     """More of them than pixels: exchanges of whole sets go round in circles."""
     images, data, normal, right = crowded(n_free=n_free)
     free = np.arange(len(right)) >= len(right) - n_free
-    assert np.linalg.eigvalsh(scaled(normal)[0]).min() < 0
-    (found,) = non_negative(normal[None], right[None], free)
+    assert np.linalg.eigvalsh(unit_diagonal(normal)[0]).min() < 0
+    (found,) = nnls_batch(normal[None], right[None], free)
     assert (found[~free] >= 0).all() and np.isfinite(found).all()
     _, least = nnls(np.concatenate([images, -images[free]]).T, data)
     assert np.linalg.norm(data - found @ images) == pytest.approx(least, rel=0.01)
@@ -94,9 +94,9 @@ def test_sources_that_cannot_be_told_apart_get_a_minimum_all_the_same(n_free):
 def test_problems_that_settle_and_that_do_not_are_solved_together():
     _, _, normal, right = crowded(n_free=0)
     apart = np.eye(len(right)) * 4
-    found = non_negative(np.stack([apart, normal, apart]), np.stack([right, right, -right]))
+    found = nnls_batch(np.stack([apart, normal, apart]), np.stack([right, right, -right]))
     np.testing.assert_allclose(found[0], right / 4, rtol=1e-7)
-    np.testing.assert_array_equal(found[1], non_negative(normal[None], right[None])[0])
+    np.testing.assert_array_equal(found[1], nnls_batch(normal[None], right[None])[0])
     assert not found[2].any()
 
 
@@ -108,9 +108,9 @@ def test_matrices_that_rounding_spoiled_harm_no_others():
     spoiled = (images @ images.T) * (1 + noise + noise.T)
     apart = rng.normal(size=(20, 50))
     normal = np.stack([apart @ apart.T, spoiled, 4 * spoiled])
-    assert (np.linalg.eigvalsh(scaled(normal)[0])[:, 0] < 0).tolist() == [False, True, True]
-    found = inverse(normal)
+    assert (np.linalg.eigvalsh(unit_diagonal(normal)[0])[:, 0] < 0).tolist() == [False, True, True]
+    found = spectrum_covariance(normal)
     for one, own in zip(found, normal, strict=True):
-        np.testing.assert_allclose(one, inverse(own[None])[0], rtol=1e-6)
+        np.testing.assert_allclose(one, spectrum_covariance(own[None])[0], rtol=1e-6)
     variance = np.diagonal(found, axis1=1, axis2=2) * np.diagonal(normal, axis1=1, axis2=2)
     assert (variance > 0.99).all()

@@ -7,11 +7,11 @@ import pytest
 from helpers.scenes import GALAXIES, SHAPE, blend, frame, observe, sources, truth
 from helpers.start import least_squares, point_of, profiles, rendered, started, view, views
 
-from clresample.deblending.resize import SMALLEST_RADIUS_PX, box_around, box_of
-from clresample.deblending.start.seen import Model, see
+from clresample.deblending.resize import SMALLEST_RADIUS_PX, box_around, component_box
+from clresample.deblending.start.final_render import MorphologyModel, render_models
 from clresample.resampling.cache import cached_resampler
 from clresample.sky.extent import box_slices
-from clresample.sky.sources import Extended, Point
+from clresample.sky.sources import ExtendedSource, PointSource
 
 FLUX = (100.0, 80.0, 90.0)
 
@@ -50,14 +50,14 @@ def test_spectra_are_the_non_negative_least_squares(device, sky):
 def seen_by(v, images, **given):
     n = len(images)
     source = np.arange(n)
-    model = Model(SHAPE, v, [None] * len(v), source, np.zeros((n, 2), int), list(images))
-    return see([model], **given)[0]
+    model = MorphologyModel(SHAPE, v, [None] * len(v), source, np.zeros((n, 2), int), list(images))
+    return render_models([model], **given)[0]
 
 
 def test_components_that_nothing_sees(device):
     """Spectrum 0 of infinite variance in channels without weight; the others as without it."""
     (first, second) = views(device, observe())
-    blind = replace(second, root=second.root * np.array([0, 1])[:, None, None])
+    blind = replace(second, sqrt_weights=second.sqrt_weights * np.array([0, 1])[:, None, None])
     images = np.array([truth([g])[0] / g[1][0] for g in GALAXIES])
     one, other = (seen_by(v, images) for v in ([first, second], [first, blind]))
     assert not other.spectra[:, 1].any()
@@ -79,9 +79,11 @@ def test_shapes_are_found(device):
 
 def test_a_free_star_is_found(device):
     drawn = (((15.3, 18.2), FLUX, 0),)
-    held, wrong, _ = begin(device, drawn, [Point(position_px=(15, 18.5))])
+    held, wrong, _ = begin(device, drawn, [PointSource(position_px=(15, 18.5))])
     np.testing.assert_array_equal(held.positions, [(15, 18.5)])
-    found, spectra, _ = begin(device, drawn, [Point(position_px=(15, 18.5), free=True)])
+    found, spectra, _ = begin(
+        device, drawn, [PointSource(position_px=(15, 18.5), free_position=True)]
+    )
     np.testing.assert_allclose(found.positions, [(15.3, 18.2)], atol=0.01)
     np.testing.assert_allclose(spectra, [FLUX], rtol=0.02)
     assert abs(wrong[0, 0] - FLUX[0]) > 0.04 * FLUX[0]
@@ -104,21 +106,21 @@ def test_a_source_that_one_instrument_sees_starts_right(device):
     assert np.abs(profiles(found, SHAPE)[0] * found.peaks[0] - want).max() < 0.1 * want.max()
 
 
-@pytest.mark.parametrize("kind", [Point, Extended])
+@pytest.mark.parametrize("kind", [PointSource, ExtendedSource])
 def test_sources_on_top_of_each_other_share_the_light(device, kind):
-    drawn = ((15.0, 18.0), FLUX, 0 if kind is Point else 2.0)
+    drawn = ((15.0, 18.0), FLUX, 0 if kind is PointSource else 2.0)
     twins = [kind(position_px=(15, 18)), kind(position_px=(15, 18))]
     found, spectra, _ = begin(device, (drawn,), twins)
     np.testing.assert_allclose(spectra.sum(axis=0), FLUX, rtol=0.05)
     assert (spectra >= 0).all() and np.isfinite(found.peaks).all()
-    if kind is Point:  # galaxies may share it as a compact and a wide one
+    if kind is PointSource:  # galaxies may share it as a compact and a wide one
         np.testing.assert_allclose(spectra[0], spectra[1], rtol=0.05)
 
 
 def test_components_of_a_source(device):
     """Two about one centre, a compact and a wide one, each with its spectrum."""
     disk, bulge = ((15.0, 18.0), (50, 100, 20), 3.0), ((15.0, 18.0), (60, 10, 90), 1.0)
-    catalogue = [Extended(position_px=(15, 18), n_components=2)]
+    catalogue = [ExtendedSource(position_px=(15, 18), n_components=2)]
     seen = observe((disk, bulge), noise=0.01)
     found, spectra, _ = begin(device, (disk, bulge), catalogue, observations=seen)
     assert found.source.tolist() == [0, 0]
@@ -173,13 +175,13 @@ def test_boxes_of_a_start_are_those_of_its_images(device):
     images = profiles(found, SHAPE)
     for i, image in enumerate(images):
         for brightness in (1.0, 30.0, 1e4):
-            low, size, center, part = box_of(found, i, SHAPE, brightness)
+            low, size, center, part = component_box(found, i, SHAPE, brightness)
             wanted = box_around(image, found.positions[i], brightness)
             np.testing.assert_array_equal((low, size, center), wanted)
             np.testing.assert_allclose(part, image[box_slices(low, size)], rtol=1e-12)
     given = point_of(images[:1], found.positions[0])
     np.testing.assert_array_equal(
-        box_of(given, 0, SHAPE, 30.0)[1], box_around(images[0], found.positions[0], 30.0)[1]
+        component_box(given, 0, SHAPE, 30.0)[1], box_around(images[0], found.positions[0], 30.0)[1]
     )
 
 

@@ -10,9 +10,9 @@ from helpers.scenes import frame
 from helpers.solver import close, every_type
 from test_boxed_start import view_of
 
-from clresample.deblending.profiles import Galaxy
-from clresample.deblending.start.sight import Sight, smoothed_light
-from clresample.deblending.start.slots import Component, Slots, peaks_of
+from clresample.deblending.profiles import GalaxyProfile
+from clresample.deblending.start.component_batch import ComponentBatch, StartComponent, peaks_of
+from clresample.deblending.start.slot_observation import SlotObservation, smoothed_light
 from clresample.device.tuning import Tuning
 from clresample.resampling.plan import Precision
 from clresample.sky.psf import PSF
@@ -40,16 +40,16 @@ def test_galaxies_are_drawn_as_their_formula(build, slopes, dtype):
     """In boxes that cut them; of many widths and wings, one of them so faint that it ends."""
     if dtype == np.float64 and not build.has_fp64:
         pytest.skip(f"{build.name} has no double precision")
-    shape, rng = Galaxy(frame()), np.random.default_rng(0)
+    shape, rng = GalaxyProfile(frame()), np.random.default_rng(0)
     thetas = [*rng.normal(scale=(0.4, 0.6, 0.6, 1.0), size=(4, 4)), np.array([-3.0, 0.5, 0, 4])]
     boxes = [((-3, 2), (24, 20)), ((5, 9), (13, 35)), ((0, 0), (1, 1)), ((9, 4), (40, 7))]
     boxes += [((-7, -5), (40, 44))]
     places = [np.array((12.3, 13.8)) + 0.3 * i for i in range(5)]
-    components = [Component(i % 2, i, i, shape, p, (60, 60)) for i, p in enumerate(places)]
-    slots = Slots(components, thetas, boxes, slopes=slopes)
+    components = [StartComponent(i % 2, i, i, shape, p, (60, 60)) for i, p in enumerate(places)]
+    slots = ComponentBatch(components, thetas, boxes, slopes=slopes)
     images = build.get(slots.draw(build, dtype, Tuning.of(build, dtype), {}))
     for row, i in enumerate(slots.order):
-        wanted = shape.cut(thetas[i], places[i], *boxes[i], slopes=slopes)
+        wanted = shape.draw_box(thetas[i], places[i], *boxes[i], slopes=slopes)
         begin = slots.begin[row]
         found = images[begin : begin + wanted.size].reshape(wanted.shape)
         close(found, wanted, dtype)
@@ -75,7 +75,7 @@ class Posed:
         views = [view_of(op, r, d) for r, d in zip(self.root, self.data, strict=True)]
         self.views = views
         own = build, dtype, Tuning.of(build, dtype), Precision.of(np.float32), 0.0
-        self.sight = s = Sight(views, slice(1, 1 + N_BANDS), *own)
+        self.sight = s = SlotObservation(views, slice(1, 1 + N_BANDS), *own)
         scene, low, size, n = WINDOWS[:, 0], WINDOWS[:, 1:3], WINDOWS[:, 3:5], WINDOWS[:, 5]
         sizes = n * N_BANDS * size.prod(axis=1)
         begin = np.cumsum(sizes) - sizes + 3  # anywhere
@@ -119,7 +119,7 @@ def test_residuals_weights_and_their_sums(build, dtype):
     spectra[0, 1] = 0
     for scenes in (np.array([0, 1]), np.array([1])):
         p.sight._listed = None
-        sums = p.sight.compare(scenes, p.slots, spectra, sky, ERROR)
+        sums = p.sight.compute_residuals(scenes, p.slots, spectra, sky, ERROR)
         residual, weight = build.get(p.sight.residual), build.get(p.sight.weight)
         for row, b in enumerate(scenes):
             model = sky[b, 1:3, None, None] * p.root[b]
@@ -144,11 +144,11 @@ def test_products_of_windows_that_meet(build, n_images, dtype):
     weight, residual = rng.uniform(size=(2, *p.root.shape))
     build.upload(weight.astype(dtype), s.weight)
     build.upload(residual.astype(dtype), s.residual)
-    table, pairs = s.pairs()
+    table, pairs = s.overlapping_pairs()
     meeting = {tuple(pair) for pair in table[:, :2].tolist()}
     lit = [p.on_pixels(np.ones_like(images), i)[0].any() for i, images in enumerate(p.images)]
     assert [i for i, on in enumerate(lit) if not on] == [6, 7]
-    found, pull = s.gram(pairs, n_images), s.pull(n_images)
+    found, pull = s.gram(pairs, n_images), s.residual_products(n_images)
     which = np.minimum(np.arange(n_images), WINDOWS[:, 5, None] - 1)
     whole = [p.on_pixels(images, i)[which[i]] for i, images in enumerate(p.images)]
     for i, j in np.ndindex(len(whole), len(whole)):

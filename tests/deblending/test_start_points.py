@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from helpers.scenes import frame
 
-from clresample.deblending.profiles import Galaxy, Given, Star
-from clresample.deblending.start import start as room
-from clresample.deblending.start.start import Patch
-from clresample.sky.sources import Extended, Point
+from clresample.deblending.profiles import FixedProfile, GalaxyProfile, StarProfile
+from clresample.deblending.start import profile_start as room
+from clresample.deblending.start.profile_start import StartInput
+from clresample.sky.sources import ExtendedSource, PointSource
 
 PLACES = np.array([(8.2, 9.4), (20.0, 25.3), (14.6, 5.1)])
 FAR = np.array([(11.0, 30.2)])
@@ -21,13 +21,13 @@ def patches():
     home, y = frame(), np.arange(30)[:, None]
     profile = np.exp(-0.5 * ((y - 14) ** 2 + (np.arange(36) - 5) ** 2) / 4)
     some = [
-        Point(position_px=PLACES[0], free=True),
-        Extended(position_px=PLACES[1], n_components=2),
-        Extended(position_px=PLACES[2], profile=profile),
+        PointSource(position_px=PLACES[0], free_position=True),
+        ExtendedSource(position_px=PLACES[1], n_components=2),
+        ExtendedSource(position_px=PLACES[2], profile=profile),
     ]
     return [
-        Patch(home, some, PLACES, []),
-        Patch(home, [Extended(position_px=FAR[0])], FAR, []),
+        StartInput(home, some, PLACES, []),
+        StartInput(home, [ExtendedSource(position_px=FAR[0])], FAR, []),
     ]
 
 
@@ -35,7 +35,13 @@ def test_components_are_numbered_by_their_scene():
     sources, found = room._components(patches())
     assert sources.tolist() == [0, 1, 1, 2, 0] == [c.source for c in found]
     assert [(c.scene, c.index) for c in found] == [(0, 0), (0, 1), (0, 2), (0, 3), (1, 0)]
-    assert [type(c.shape) for c in found] == [Star, Galaxy, Galaxy, Given, Galaxy]
+    assert [type(c.shape) for c in found] == [
+        StarProfile,
+        GalaxyProfile,
+        GalaxyProfile,
+        FixedProfile,
+        GalaxyProfile,
+    ]
     places = [c.position.tolist() for c in found]
     assert places == [*PLACES[[0, 1, 1, 2]].tolist(), *FAR.tolist()]
     assert {c.frame for c in found} == {(30, 36)}
@@ -62,11 +68,11 @@ def test_a_starting_point_is_of_profiles_with_maximum_1():
         peaks = found.peaks
         np.testing.assert_allclose(found.spectra, looking.spectra[own] * peaks[:, None])
         power = np.array([[normal[b, c, k, k] for c in range(3)] for k in range(len(own))])
-        np.testing.assert_allclose(found.power, power / peaks[:, None] ** 2)
+        np.testing.assert_allclose(found.spectrum_curvature, power / peaks[:, None] ** 2)
         moved = places + (np.array([(0.3, -0.4), (0, 0), (0, 0)]) if b == 0 else 0)
         np.testing.assert_allclose(found.positions, moved)
-        np.testing.assert_array_equal(found.places, places[found.source])
-        assert found.source.tolist() == sources[own].tolist() and found.dark is dark
+        np.testing.assert_array_equal(found.drawn_positions, places[found.source])
+        assert found.source.tolist() == sources[own].tolist() and found.undetected is dark
         assert found.shapes == [components[i].shape for i in own] and len(found) == len(own)
         np.testing.assert_array_equal(found.sky, looking.sky[b])
         assert found.sky.base is None  # its own
@@ -80,7 +86,8 @@ def test_stars_come_with_their_spectra_for_unit_integral():
     given = patches()
     sources, components = room._components(given)
     one = room.StartingPoint(
-        source=sources[:4], positions=PLACES, dark=None, places=None, sky=None, power=None,
+        source=sources[:4], positions=PLACES, undetected=None, drawn_positions=None,
+        sky=None, spectrum_curvature=None,
         shapes=[c.shape for c in components[:4]], thetas=None,
         peaks=np.array([0.5, 1, 1, 1]), spectra=np.arange(12.0).reshape(4, 3) + 1,
     )  # fmt: skip
@@ -95,7 +102,9 @@ def test_sources_are_dark_where_no_light_lies_beside_them(beside):
     six times wider than is expected, all of them at their own places."""
     given, looked = patches(), []
     given.append(
-        Patch(frame(), [Extended(position_px=(3.0, 4.0))] * 2, np.array([(3.0, 4), (5, 6)]), [])
+        StartInput(
+            frame(), [ExtendedSource(position_px=(3.0, 4.0))] * 2, np.array([(3.0, 4), (5, 6)]), []
+        )
     )
     sources, components = room._components(given)
     scene = np.array([c.scene for c in components])
@@ -111,12 +120,12 @@ def test_sources_are_dark_where_no_light_lies_beside_them(beside):
 
         snr = np.array([[0, 0.2], [beside, 0], [0, beside], [0.3, 0.1]])
         return SimpleNamespace(
-            scene=np.array([c.scene for c in wide]), look=look,
+            scene=np.array([c.scene for c in wide]), render=look,
             signal_to_noise=lambda level: snr if level is sky else None,
         )  # fmt: skip
 
     looking = SimpleNamespace(
-        scene=scene, sky=sky, instead=instead,
+        scene=scene, sky=sky, with_components=instead,
         signal_to_noise=lambda level: seen if level is sky else None,
     )  # fmt: skip
     found = [dark.tolist() for dark in room._dark(given, sources, looking)]
@@ -132,7 +141,7 @@ def test_sources_are_dark_where_no_light_lies_beside_them(beside):
     ]
     places = [PLACES[0], PLACES[2], (3, 4), (5, 6)]
     np.testing.assert_array_equal([c.position for c in wide], places)
-    usual = Galaxy(frame()).mean
+    usual = GalaxyProfile(frame()).mean
     for c in wide:
         np.testing.assert_allclose(c.shape.mean - usual, [np.log(6), 0, 0, 0])
     looking.signal_to_noise = lambda level: np.full((7, 2), 99.0)

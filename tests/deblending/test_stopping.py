@@ -8,12 +8,12 @@ from helpers.scenes import BRIGHT, blend, chi2, fit, same
 
 from clresample.deblending.batch import deblend
 from clresample.deblending.fit import stop_reason
-from clresample.deblending.iterate import CHECK
+from clresample.deblending.iterate import CHECK_ITERATIONS
 from clresample.deblending.settings import Settings
 from clresample.deblending.solver.amsgrad import StepSizes
 from clresample.deblending.solver.engine import Engine
-from clresample.deblending.solver.prior import Prior
-from clresample.sky.sources import Extended
+from clresample.deblending.solver.prior import SingleScalePrior
+from clresample.sky.sources import ExtendedSource
 
 
 @pytest.mark.parametrize(
@@ -38,13 +38,15 @@ def test_the_stopping_rule(before, now, status):
 
 
 def starts(device, b, **given):
-    return fit(b, device, settings=Settings(**({"prior": Prior()} | given), max_iter=0))
+    return fit(b, device, settings=Settings(**({"prior": SingleScalePrior()} | given), max_iter=0))
 
 
 @pytest.mark.parametrize("prior", [True, False])
 @pytest.mark.parametrize("rate", [1e3, 1e30, 1e38])
 def test_divergence_gives_the_best_state(device, rate, prior):
-    given = {"step_sizes": StepSizes(rate, rate, rate)} | {"prior": Prior() if prior else None}
+    given = {"step_sizes": StepSizes(rate, rate, rate)} | {
+        "prior": SingleScalePrior() if prior else None
+    }
     result = fit(blend(), device, settings=Settings(**given))
     assert result.status == "diverged" and not result.converged
     same(result, starts(device, blend(), **given))
@@ -63,12 +65,19 @@ def test_a_nan_gives_the_best_state(device, monkeypatch, when):
             self.device.upload(np.full(spectra.shape, np.nan, np.float32), spectra)
 
     monkeypatch.setattr(Engine, "step", broken)
-    result = fit(blend(BRIGHT), device, settings=Settings(prior=Prior(), max_iter=50, tol=0))
+    result = fit(
+        blend(BRIGHT), device, settings=Settings(prior=SingleScalePrior(), max_iter=50, rel_tol=0)
+    )
     assert result.status == "diverged" and 0.8 < chi2(result) < 1.2
     monkeypatch.undo()
-    before = (when - 1) // CHECK * CHECK
+    before = (when - 1) // CHECK_ITERATIONS * CHECK_ITERATIONS
     same(
-        result, fit(blend(BRIGHT), device, settings=Settings(prior=Prior(), max_iter=before, tol=0))
+        result,
+        fit(
+            blend(BRIGHT),
+            device,
+            settings=Settings(prior=SingleScalePrior(), max_iter=before, rel_tol=0),
+        ),
     )
     assert np.isfinite(result.losses[-1])
 
@@ -76,10 +85,10 @@ def test_a_nan_gives_the_best_state(device, monkeypatch, when):
 def test_rising_losses_give_the_best_state(device):
     """Sources where no light is: the fit ends no worse than it ever was."""
     b = blend()
-    wrong = (Extended(position_px=(-0.5, 12.1)), Extended(position_px=(29.4, 35.4)))
-    settings = Settings(prior=Prior())
+    wrong = (ExtendedSource(position_px=(-0.5, 12.1)), ExtendedSource(position_px=(29.4, 35.4)))
+    settings = Settings(prior=SingleScalePrior())
     result = deblend(b.observations, wrong, frame=b.frame, device=device, settings=settings)
-    assert result.losses[-1] <= result.losses[:-1:CHECK].min()
+    assert result.losses[-1] <= result.losses[:-1:CHECK_ITERATIONS].min()
 
 
 def interrupt_call(monkeypatch, where, when):
@@ -101,14 +110,14 @@ def interrupt_call(monkeypatch, where, when):
 def test_ctrl_c_gives_the_best_state(device, monkeypatch, where, when, sizes):
     """However far an iteration has come, and be the state half-way through it a better one."""
     interrupt_call(monkeypatch, where, when)
-    settings = Settings(prior=Prior(), max_iter=60, tol=0, step_sizes=sizes)
+    settings = Settings(prior=SingleScalePrior(), max_iter=60, rel_tol=0, step_sizes=sizes)
     result = fit(blend(BRIGHT), device, settings=settings)
     assert result.status == "interrupted" and not result.converged
     monkeypatch.undo()
-    done = when // CHECK * CHECK
+    done = when // CHECK_ITERATIONS * CHECK_ITERATIONS
     whole = fit(blend(BRIGHT), device, settings=replace(settings, max_iter=max(done, 1)))
     if when or where == "step":
-        best = whole.losses[: done + 1 : CHECK].min()
+        best = whole.losses[: done + 1 : CHECK_ITERATIONS].min()
         assert result.losses[-1] == pytest.approx(best, rel=1e-6)
         np.testing.assert_array_equal(result.losses[:-1], whole.losses[:done])
     else:
@@ -119,13 +128,17 @@ def test_ctrl_c_gives_the_best_state(device, monkeypatch, where, when, sizes):
 def test_ctrl_c_while_an_engine_is_made(device, monkeypatch, when):
     """The first one, or one for boxes of other sizes."""
     interrupt_call(monkeypatch, "__init__", when)
-    monkeypatch.setattr("clresample.deblending.iterate.resized", lambda s, p, *_: (replace(s), p))
-    result = fit(blend(BRIGHT), device, settings=Settings(prior=Prior(), max_iter=60, tol=0))
+    monkeypatch.setattr(
+        "clresample.deblending.iterate.resize_boxes", lambda s, p, *_: (replace(s), p)
+    )
+    result = fit(
+        blend(BRIGHT), device, settings=Settings(prior=SingleScalePrior(), max_iter=60, rel_tol=0)
+    )
     assert result.status == "interrupted" and 0.85 < chi2(result) < 1.1
     if not when:
         same(result, starts(device, blend(BRIGHT)))
     else:
-        assert result.losses[-1] <= result.losses[:-1:CHECK].min()
+        assert result.losses[-1] <= result.losses[:-1:CHECK_ITERATIONS].min()
 
 
 def test_ctrl_c_elsewhere_is_not_swallowed(device, monkeypatch):
@@ -134,6 +147,6 @@ def test_ctrl_c_elsewhere_is_not_swallowed(device, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("clresample.deblending.fit.start", interrupt)
+    monkeypatch.setattr("clresample.deblending.fit.fit_start_profiles", interrupt)
     with pytest.raises(KeyboardInterrupt):
         fit(blend(), device)

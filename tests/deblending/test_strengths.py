@@ -8,13 +8,17 @@ import pytest
 from helpers.solver import ragged
 
 from clresample.deblending.solver import reference as ref
-from clresample.deblending.solver.buffers import ITEMS_EACH, Buffers
-from clresample.deblending.solver.gradient import Gradient
-from clresample.deblending.solver.learned.evidence import SourceEvidence, Spectra, blurred_light
-from clresample.deblending.solver.learned.prior import LearnedPrior
-from clresample.deblending.solver.learned.response import Response
-from clresample.deblending.solver.learned.strengths import Strengths
-from clresample.deblending.solver.learned.structure import Latents
+from clresample.deblending.solver.buffers import ITEMS_EACH, SceneBuffers
+from clresample.deblending.solver.gradient import LossGradient
+from clresample.deblending.solver.multiscale.evidence import (
+    LocalPowerSpectra,
+    SourceEvidence,
+    blurred_light,
+)
+from clresample.deblending.solver.multiscale.prior import MultiscalePrior
+from clresample.deblending.solver.multiscale.response import OperatorResponse
+from clresample.deblending.solver.multiscale.strengths import PriorStrengths
+from clresample.deblending.solver.multiscale.structure import LatentLayout
 from clresample.deblending.solver.scene_model import compose, gather_spectra
 
 
@@ -44,9 +48,9 @@ def made(build, unit=1.0):
         pytest.skip(f"{build.name} has no double precision")
     scenes, states = map(list, zip(*ragged(build, np.float64), strict=True))
     scenes = [replace(s, weights=[unit * w for w in s.weights]) for s in scenes]
-    b = Buffers(scenes, states, build, np.float64, LearnedPrior())
-    gradient = Gradient(b, with_prior=False)
-    return scenes, states, gradient, Response(b, gradient)
+    b = SceneBuffers(scenes, states, build, np.float64, MultiscalePrior())
+    gradient = LossGradient(b, with_prior=False)
+    return scenes, states, gradient, OperatorResponse(b, gradient)
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-6])
@@ -63,7 +67,7 @@ def test_misfit_is_chi2_where_a_sources_light_is(build, unit):
 def test_answers_to_a_pixel_are_those_of_the_operators(build, unit):
     """Of one near the middle of what is seen, each channel with its median weight."""
     scenes, _, _, response = made(build, unit)
-    for scene, answers, pixels in zip(scenes, *response.to_pixels(), strict=True):
+    for scene, answers, pixels in zip(scenes, *response.impulse_responses(), strict=True):
         wanted = []
         for op, weights in zip(scene.ops, scene.weights, strict=True):
             y, x = pixels[len(wanted)]
@@ -82,16 +86,19 @@ class Learning:
 
     def __init__(self, build):
         self.scenes, self.states, self.gradient, response = made(build)
-        self.b, self.prior = self.gradient.buffers, LearnedPrior()
+        self.b, self.prior = self.gradient.buffers, MultiscalePrior()
         self.latents = latents(self.b, self.prior)
-        self.strengths = Strengths(self.b, self.gradient, self.latents, self.prior)
+        self.strengths = PriorStrengths(self.b, self.gradient, self.latents, self.prior)
         self.spectra = np.concatenate([s.spectra for s in self.states])
         self.scene = np.repeat(np.arange(3), [len(s.profile) for s in self.scenes])
         self.profiles = [p for s in self.scenes for p in s.profile]
         self.fixed = np.concatenate([s.fixed for s in self.scenes])
-        spectra, pairs = Spectra(self.prior), list(zip(*response.to_pixels(), strict=True))
+        spectra, pairs = (
+            LocalPowerSpectra(self.prior),
+            list(zip(*response.impulse_responses(), strict=True)),
+        )
         self.evidence = [
-            SourceEvidence(spectra, self.prior, p, spectra.of_answers(*pairs[b]))
+            SourceEvidence(spectra, self.prior, p, spectra.from_impulse_responses(*pairs[b]))
             for b, p in zip(self.scene, self.profiles, strict=True)
         ]
 
@@ -102,7 +109,7 @@ class Learning:
 
 
 def latents(b, prior):
-    return Latents(b.host_boxes, b.device.get(b.free)[: b.n_free], prior.steps)
+    return LatentLayout(b.host_boxes, b.device.get(b.free)[: b.n_free], prior.steps)
 
 
 def test_weights_are_those_of_each_source(build):
@@ -156,11 +163,13 @@ def test_clear_structure_is_looked_for_in_scenes_that_ask_and_learned_from_then_
     one, other = free[m.scene[free] == 0][0], free[m.scene[free] == 2][0]
     energies = np.zeros((9, 3))
     energies[[one, other], 0] = 1e4 * m.strengths.values[0, 0] ** 2
-    found = m.strengths.find_clear(np.array([True, True, False]), energies, m.spectra)
+    found = m.strengths.find_significant(np.array([True, True, False]), energies, m.spectra)
     assert found.tolist() == [True, False, False]
-    assert np.flatnonzero(m.strengths.clear).tolist() == [one]
-    assert not m.strengths.find_clear(np.array([True, True, False]), energies, m.spectra).any()
-    assert m.strengths.clear[one]  # it stays so, and is nothing new
+    assert np.flatnonzero(m.strengths.significant).tolist() == [one]
+    assert not m.strengths.find_significant(
+        np.array([True, True, False]), energies, m.spectra
+    ).any()
+    assert m.strengths.significant[one]  # it stays so, and is nothing new
     old = m.strengths.values.copy()
     m.strengths.learn(np.ones(3, bool), energies, m.spectra)
     chi2 = np.concatenate([misfit(*pair) for pair in zip(m.scenes, m.states, strict=True)])
@@ -178,7 +187,7 @@ def test_findings_are_those_of_scenes_that_were_asked_for(build):
     for b, found in ((0, first), (2, third)):
         np.testing.assert_array_equal(found.energies, energies[m.scene == b])
         np.testing.assert_array_equal(found.strengths, m.strengths.values[m.scene == b])
-        for i, row in zip(np.flatnonzero(m.scene == b), found.determined, strict=True):
+        for i, row in zip(np.flatnonzero(m.scene == b), found.n_effective, strict=True):
             wanted = m.evidence[i].determined(m.strengths.values[i], m.spectra[i])
             np.testing.assert_allclose(row, 0 * wanted if m.fixed[i] else wanted, rtol=1e-6)
 
@@ -187,14 +196,14 @@ def test_scenes_that_go_on_alone_keep_their_strengths(build):
     m, keep = Learning(build), np.array([2, 0])
     m.strengths.weights(m.spectra)
     m.strengths.values *= np.arange(1, 10)[:, None]
-    m.strengths.clear[:] = np.arange(9) % 2
+    m.strengths.significant[:] = np.arange(9) % 2
     scenes, states = [m.scenes[i] for i in keep], [m.states[i] for i in keep]
-    b = Buffers(scenes, states, build, np.float64, m.prior)
-    gradient = Gradient(b, with_prior=False)
-    part = Strengths(b, gradient, latents(b, m.prior), m.prior, past=(m.strengths, keep))
+    b = SceneBuffers(scenes, states, build, np.float64, m.prior)
+    gradient = LossGradient(b, with_prior=False)
+    part = PriorStrengths(b, gradient, latents(b, m.prior), m.prior, past=(m.strengths, keep))
     kept = np.concatenate([np.flatnonzero(m.scene == i) for i in keep])
     np.testing.assert_array_equal(part.values, m.strengths.values[kept])
-    np.testing.assert_array_equal(part.clear, m.strengths.clear[kept])
+    np.testing.assert_array_equal(part.significant, m.strengths.significant[kept])
     np.testing.assert_allclose(build.get(part.precision), part.values**-2)
     assert [id(own) for own in part.blocks] == [id(m.strengths.blocks[i]) for i in kept]
     nobody = np.zeros(2, bool)

@@ -7,14 +7,18 @@ from helpers.learned import Source
 from helpers.solver import close, every_type, ragged
 
 from clresample.deblending.solver.boxes import ALIGN, Boxes
-from clresample.deblending.solver.buffers import Buffers
-from clresample.deblending.solver.learned.prior import LearnedPrior
-from clresample.deblending.solver.learned.structure import Latents, Structure, coarse
+from clresample.deblending.solver.buffers import SceneBuffers
+from clresample.deblending.solver.multiscale.prior import MultiscalePrior
+from clresample.deblending.solver.multiscale.structure import (
+    LatentLayout,
+    StructureOperator,
+    coarse_count,
+)
 
 PRIORS = {
-    "three": LearnedPrior(),
-    "two": LearnedPrior(scales_px=(1.0, 6.5), strengths=(0.1, 0.1)),
-    "wide": LearnedPrior(scales_px=(2.0, 40.0), strengths=(0.1, 0.1)),  # steps over a vector
+    "three": MultiscalePrior(),
+    "two": MultiscalePrior(scales_px=(1.0, 6.5), strengths=(0.1, 0.1)),
+    "wide": MultiscalePrior(scales_px=(2.0, 40.0), strengths=(0.1, 0.1)),  # steps over a vector
 }
 
 
@@ -24,8 +28,8 @@ def made(build, dtype, prior, seed=0):
         pytest.skip(f"{build.name} has no double precision")
     rng = np.random.default_rng(seed)
     scenes, states = map(list, zip(*ragged(build, dtype), strict=True))
-    b = Buffers(scenes, states, build, dtype, prior)
-    structure = Structure(b, prior)
+    b = SceneBuffers(scenes, states, build, dtype, prior)
+    structure = StructureOperator(b, prior)
     z = [[rng.normal(0, 0.3, shape) for shape in shapes] for shapes in structure.latents.shape]
     profiles = [p for s in scenes for p in s.profile]
     free = ~np.concatenate([s.fixed for s in scenes])
@@ -87,10 +91,10 @@ def test_memory_is_that_of_a_line_for_each_row(build):
     radii and steps. Also where a kernel is a pixel longer than vectors."""
     scenes, states = map(list, zip(*ragged(build, np.float32), strict=True))
     kept = []  # what is freed meanwhile would be counted as less
-    for prior in (LearnedPrior(), LearnedPrior(scales_px=(1.3,), strengths=(0.1,))):
-        b = Buffers(scenes, states, build, np.float32, prior)
+    for prior in (MultiscalePrior(), MultiscalePrior(scales_px=(1.3,), strengths=(0.1,))):
+        b = SceneBuffers(scenes, states, build, np.float32, prior)
         before = build.in_use
-        structure = Structure(b, prior)
+        structure = StructureOperator(b, prior)
         kept.append((b, structure))
         used = (build.in_use - before) / 4
         rows = structure.latents.shape[:, :, 0].sum(1)
@@ -102,7 +106,7 @@ def test_memory_is_that_of_a_line_for_each_row(build):
 
 def test_the_gradient_is_the_transpose(build):
     """<S', dS> = <z', dL/dz>, where S is positive, and so linear, throughout."""
-    prior = LearnedPrior()
+    prior = MultiscalePrior()
     b, structure, z, profiles, free = made(build, np.float64, prior, seed=2)
     z = [[1e-3 * zj for zj in scales] for scales in z]
     vector, rng = b.put(structure.latents.pack(z)), np.random.default_rng(3)
@@ -123,13 +127,13 @@ def test_the_gradient_is_the_transpose(build):
 def test_a_coarse_grid_reaches_past_the_last_pixel():
     for n in range(1, 40):
         for step in (1, 2, 4, 8):
-            k = coarse(n, step)
+            k = coarse_count(n, step)
             assert step * (k - 1) >= n - 1 > step * (k - 2)
 
 
 def test_coarse_grids_lose_nothing():
     """The scatter of structure is that of the kernel on every pixel, up to 3 % anywhere."""
-    prior = LearnedPrior()
+    prior = MultiscalePrior()
     axes = Source(np.ones((81, 81)), prior).axes
     for ky, _ in axes:
         assert (ky**2).sum(1)[20:-20] == pytest.approx(1, abs=0.03)
@@ -137,7 +141,7 @@ def test_coarse_grids_lose_nothing():
 
 def test_vectors_hold_free_sources_alone():
     boxes = Boxes(np.array([0, 0]), np.zeros((2, 2), int), np.array([[3, 5], [9, 9]]))
-    latents = Latents(boxes, np.array([1]), (1, 4))
+    latents = LatentLayout(boxes, np.array([1]), (1, 4))
     assert latents.start.tolist() == [0, 0]
     assert latents.size == 96  # 81 + 3 x 3, rounded up
     z = [[np.zeros((0, 0))] * 2, [np.ones((9, 9)), np.full((3, 3), 2.0)]]
@@ -152,4 +156,4 @@ def test_a_prior_of_nonsense_is_refused():
         {"weight": 0.0},
     ):
         with pytest.raises(ValueError):
-            LearnedPrior(**given)
+            MultiscalePrior(**given)

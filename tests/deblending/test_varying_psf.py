@@ -9,18 +9,18 @@ from helpers.varying import FLUXES, NOISE, SHAPE, observation, stars, widening
 
 from clresample import (
     Blend,
-    Extended,
+    ExtendedSource,
     FunctionPSF,
     Grid,
     Observation,
-    Point,
-    Prior,
+    PointSource,
     Settings,
+    SingleScalePrior,
     catalogue,
     deblend,
     deblend_many,
 )
-from clresample.deblending.fit import Fit, begin
+from clresample.deblending.fit import Fit, start_fits
 from clresample.deblending.posterior import residuals
 from clresample.measurement.photometry import fluxes
 from clresample.resampling.resampler import Resampler
@@ -37,7 +37,7 @@ def chi2(result):
 
 
 def points(places):
-    return [Point(position_px=tuple(map(float, p))) for p in places]
+    return [PointSource(position_px=tuple(map(float, p))) for p in places]
 
 
 def test_a_star_in_each_corner_has_its_own_psf(device):
@@ -49,20 +49,20 @@ def test_a_star_in_each_corner_has_its_own_psf(device):
     assert chi2(same) > 1.3
     found, wrong = (_pulls(result) for result in (own, same))
     assert np.abs(found).max() < 4
-    grown = residuals.widening(same.errors.residuals)[:, None]  # with what is left
+    grown = residuals.misfit_error_scale(same.errors.residuals)[:, None]  # with what is left
     assert np.abs(wrong * grown).max() > 20
 
 
 @pytest.mark.parametrize(
     "given",
-    [{"prior": Prior()}, {"prior": None}, {"fit_sky": True}, {"fit_shifts": True}],
+    [{"prior": SingleScalePrior()}, {"prior": None}, {"fit_sky": True}, {"fit_shifts": True}],
     ids=["prior", "free", "sky", "shifts"],
 )
 def test_every_kind_of_fit_follows_the_psf(device, given):
     rng = np.random.default_rng(1)
     again = rng.normal(0, NOISE, (2, *SHAPE)) + stars(CORNERS, noise=0)
     second = observation(again, channels=("G", "R"))
-    sources = [Extended(position_px=tuple(map(float, p))) for p in CORNERS[:2]]
+    sources = [ExtendedSource(position_px=tuple(map(float, p))) for p in CORNERS[:2]]
     sources += points(CORNERS[2:])
     settings = Settings(psf_error=0, **given)
     pair = [observation(stars(CORNERS)), second]
@@ -95,7 +95,7 @@ def test_turned_and_distorted_pixels_see_each_source_s_psf(device, given):
     settings = Settings(psf_error=0, psf_tolerance=1e-5)
     point = Fit(blend, settings, device, np.float32, pad=1)
     assert point.views[0].op.geometry == ("distorted" if "sip" in given else "affine")
-    begin([point])  # in boxes, which have plans of their own
+    start_fits([point])  # in boxes, which have plans of their own
     np.testing.assert_allclose(point.state.spectra * point.unit, fluxes * model.max(), rtol=3e-3)
     result = deblend([o], blend.sources, frame=frame, settings=settings, device=device)
     assert np.abs(result.residual(0)).max() < 1e-3 * data.max()
@@ -160,7 +160,7 @@ def varied(device):
     """Galaxies and a star fitted with a PSF that varies: the Result, and its Blend."""
     rng = np.random.default_rng(4)
     places = rng.uniform(15, 55, (5, 2)) * (1, 1.4)
-    sources = [Extended(position_px=tuple(map(float, p))) for p in places[:4]]
+    sources = [ExtendedSource(position_px=tuple(map(float, p))) for p in places[:4]]
     blend = Blend(
         (observation(stars(places, fluxes=rng.uniform(2e3, 5e3, (5, 2)))),),
         (*sources, *points(places[4:])),
@@ -171,7 +171,7 @@ def varied(device):
 def test_a_result_holds_each_component_through_the_psf_at_its_source(varied, device):
     blend, result = varied
     (o,), frame = blend.observations, result.frame
-    places = frame.place(blend.sources)
+    places = frame.positions_of(blend.sources)
     for i, c in enumerate(result.components):
         there = frame.grid.positions_in(o.grid, *places[c.source])
         op = Resampler(frame.grid, frame.psf, o.grid, widening(*there), device=device)

@@ -5,12 +5,12 @@ import pytest
 from helpers.geometries import GEOMETRIES, ONE_OF_EACH
 from helpers.solver import PRIOR, every_type, posed
 
-from clresample.deblending.solver.buffers import Buffers
+from clresample.deblending.solver.buffers import SceneBuffers
 from clresample.deblending.solver.operators import MorphologyOperator, SpectraOperator
-from clresample.deblending.solver.rendering import choice
+from clresample.deblending.solver.rendering import stage_selection
 from clresample.deblending.solver.scene_model import compose
 from clresample.resampling import reference
-from clresample.resampling.plan import Precision, make_plan
+from clresample.resampling.plan import Precision, make_resampling_plan
 from clresample.resampling.resampler import Resampler
 from clresample.sky.psf import PSF
 from clresample.testing import check_adjoint
@@ -29,7 +29,7 @@ def batch_of(device, geometry, dtype):
     """Two scenes of one observation of two bands, three terms; buffers and their operator."""
     if dtype == np.float64 and not device.has_fp64:
         pytest.skip(f"{device.name} has no double precision")
-    plan = make_plan(
+    plan = make_resampling_plan(
         GEOMETRIES[geometry](),
         MODEL_PSF,
         PSF.gaussian(WIDTHS.ravel()),
@@ -42,18 +42,18 @@ def batch_of(device, geometry, dtype):
         shares = rng.normal(size=(n, 2, 3))
         given = {
             "shape": FRAME,
-            "extent": FRAME,
+            "unpadded_shape": FRAME,
             "ops": [op],
             "data": [rng.normal(0, 3, op.shape_out)],
             "weights": [rng.uniform(0.5, 1.5, op.shape_out)],
-            "scale": np.ones((n, 2)),
+            "step_scale": np.ones((n, 2)),
             "spectra": rng.uniform(0.5, 2, (n, 2)),
             "sky": np.zeros(2),
-            "shares": [shares],
+            "coefficients": [shares],
         }
         pairs.append(posed(device, dtype, boxes=boxes, seed=i, **given))
     scenes, states = map(list, zip(*pairs, strict=True))
-    return Buffers(scenes, states, device, dtype, PRIOR), op, pairs
+    return SceneBuffers(scenes, states, device, dtype, PRIOR), op, pairs
 
 
 @every_type
@@ -61,12 +61,12 @@ def batch_of(device, geometry, dtype):
 @pytest.mark.parametrize("geometry", ONE_OF_EACH)
 def test_each_source_is_seen_through_its_own_psf(device, geometry, depth, dtype):
     b, op, pairs = batch_of(device, geometry, dtype)
-    shown = MorphologyOperator(b, op, choice.rendering(b, 0, op, depth))
+    shown = MorphologyOperator(b, op, stage_selection.select_rendering(b, 0, op, depth))
     found = shown.forward(b.device.get(b.morph))
     psf = PSF.gaussian(WIDTHS.ravel())
     for (scene, state), image in zip(pairs, found, strict=True):
         wanted = 0
-        for i, shares in enumerate(scene.shares[0]):  # source by source, in float64
+        for i, shares in enumerate(scene.coefficients[0]):  # source by source, in float64
             spectra = np.repeat(state.spectra[i], 3)[None]
             model = compose(FRAME, scene.origin[i : i + 1], state.morph[i : i + 1], spectra)
             n_fft = op.certificate.n_fft
@@ -84,7 +84,7 @@ def test_each_source_is_seen_through_its_own_psf(device, geometry, depth, dtype)
 def test_gradients_are_the_adjoint(device, kind, depth, dtype):
     b, op, _ = batch_of(device, "30 degrees", dtype)
     check_adjoint(
-        kind(b, op, choice.rendering(b, 0, op, depth)),
+        kind(b, op, stage_selection.select_rendering(b, 0, op, depth)),
         np.random.default_rng(1),
         tolerance={np.float32: 3e-6, np.float64: 1e-12}[dtype],
     )
@@ -92,7 +92,7 @@ def test_gradients_are_the_adjoint(device, kind, depth, dtype):
 
 def test_the_dot_test_fails_where_the_way_back_takes_other_shares(device):
     b, op, _ = batch_of(device, "30 degrees", np.float32)
-    shown = MorphologyOperator(b, op, choice.rendering(b, 0, op, 2))
+    shown = MorphologyOperator(b, op, stage_selection.select_rendering(b, 0, op, 2))
     parts, right = shown.rendering._composition._parts, shown._adjoint
 
     def wrong(y, out):

@@ -7,9 +7,9 @@ import pytest
 
 from clresample.deblending import image_profiles, view as view_module
 from clresample.deblending.blend import Blend
-from clresample.deblending.rendered import Rendered, weighted_sum
-from clresample.deblending.view import WhitenedView, _padded, _typical_noise, without_dark
-from clresample.sky.sources import Extended, Point
+from clresample.deblending.component_images import ComponentImages, weighted_sum
+from clresample.deblending.view import WhitenedView, _padded, _typical_noise, flush_faint
+from clresample.sky.sources import ExtendedSource, PointSource
 
 
 def view(shares=None, matrix=((0.5, 0.0), (0.0, 0.5))):
@@ -45,10 +45,10 @@ def plain_mapping(monkeypatch):
 
 def test_data_count_in_the_noise_of_a_typical_pixel():
     one, data = view()
-    np.testing.assert_allclose(one.unit, [0.5, 0.2])
+    np.testing.assert_allclose(one.noise_unit, [0.5, 0.2])
     root = np.ones((2, 3, 4))
     root[0, 0, 0], root[:, :, 3], root[1, 1, 1] = 0, 0, 2
-    np.testing.assert_allclose(one.root, root)
+    np.testing.assert_allclose(one.sqrt_weights, root)
     wanted = np.where(root > 0, data, 0) / np.array([0.5, 0.2])[:, None, None]
     np.testing.assert_allclose(one.data, wanted)
     np.testing.assert_allclose(one.pixel_noise, [2, 2])
@@ -62,25 +62,25 @@ def test_data_are_above_the_sky_that_is_expected():
     found = one.expecting_sky(np.array([1.5, -2.0]), np.array([0.25, np.inf]))
     np.testing.assert_allclose(found.sky_level, [3, -10])
     np.testing.assert_allclose(found.sky_precision, [4, 0])
-    wanted = np.where(one.root > 0, data - np.array([1.5, -2.0])[:, None, None], 0)
+    wanted = np.where(one.sqrt_weights > 0, data - np.array([1.5, -2.0])[:, None, None], 0)
     np.testing.assert_allclose(found.data, wanted / np.array([0.5, 0.2])[:, None, None])
-    assert found.root is one.root and one.sky_level is None and one.sky_precision is None
+    assert found.root is one.sqrt_weights and one.sky_level is None and one.sky_precision is None
 
 
 def test_an_error_of_the_model_is_added_to_the_noise():
     one, _ = view()
     error = np.full((2, 3, 4), 3.0)
     with np.errstate(divide="ignore"):
-        found, before = 1 / one.allowing(error).root ** 2, 1 / one.root**2
+        found, before = 1 / one.with_model_error(error).sqrt_weights ** 2, 1 / one.sqrt_weights**2
     np.testing.assert_allclose(found, before + 9)
 
 
 def test_a_view_of_some_sources_has_their_shares():
     shares = np.arange(12.0).reshape(3, 2, 2)
     one, _ = view(shares)
-    np.testing.assert_array_equal(one.of_sources([2, 0]).shares, shares[[2, 0]])
+    np.testing.assert_array_equal(one.for_sources([2, 0]).coefficients, shares[[2, 0]])
     plain, _ = view()
-    assert plain.of_sources([0]) is plain
+    assert plain.for_sources([0]) is plain
 
 
 def test_typical_noise_is_the_median_of_what_was_seen():
@@ -91,9 +91,9 @@ def test_typical_noise_is_the_median_of_what_was_seen():
 def test_dark_pixels_are_none():
     """Under 1e-20 of the brightest, of either sign; in place."""
     images = np.array([1.0, 1.1e-20, 0.9e-20, -0.9e-20, -1.1e-20, 0.0])
-    assert without_dark(images) is images
+    assert flush_faint(images) is images
     assert images.tolist() == [1, 1.1e-20, 0, 0, -1.1e-20, 0]
-    assert not without_dark(np.zeros(2)).any() and not without_dark(np.zeros(0)).size
+    assert not flush_faint(np.zeros(2)).any() and not flush_faint(np.zeros(0)).size
 
 
 def test_images_are_padded_at_their_ends():
@@ -108,7 +108,7 @@ def three(rng):
     """Windows of three components in an observation of 2 channels."""
     low = np.array([[0, 0], [3, 2], [5, 6]])
     images = [rng.random((2, *shape)) for shape in ((3, 4), (4, 4), (2, 1))]
-    return Rendered((3, 2, 8, 7), low, images)
+    return ComponentImages((3, 2, 8, 7), low, images)
 
 
 def test_what_is_stored_in_windows_is_an_array():
@@ -120,7 +120,7 @@ def test_what_is_stored_in_windows_is_an_array():
     np.testing.assert_array_equal(np.asarray(one), whole)
     assert np.asarray(one, np.float32).dtype == np.float32
     assert (len(one), one.ndim, one.dtype, one.shape) == (3, 4, np.float64, whole.shape)
-    assert Rendered((0, 2, 8, 7), np.zeros((0, 2)), []).dtype == np.float64
+    assert ComponentImages((0, 2, 8, 7), np.zeros((0, 2)), []).dtype == np.float64
     for key in (1, -1, np.int64(2), (1, 0), (2, 1, slice(5, 7)), slice(1, 3), (slice(None), 0)):
         np.testing.assert_array_equal(one[key], whole[key])
     np.testing.assert_array_equal(list(one), whole)
@@ -141,7 +141,7 @@ def test_windows_are_cut_to_the_observation(low):
     image = rng.random((1, 4, 3))
     padded = np.zeros((1, 30, 30))
     padded[:, 10 + low[0] : 14 + low[0], 10 + low[1] : 13 + low[1]] = image
-    found = Rendered.cropped((1, 1, 8, 7), np.array([low]), [image])
+    found = ComponentImages.cropped((1, 1, 8, 7), np.array([low]), [image])
     np.testing.assert_array_equal(found[0], padded[:, 10:18, 10:17])
 
 
@@ -205,17 +205,17 @@ def test_extended_sources_of_one_component_get_profiles(monkeypatch):
     monkeypatch.setattr(image_profiles, "_profile", profile)
     given = np.full((2, 2), 0.5)
     sources = (
-        Point(position_px=(1, 1)),
-        Extended(position_px=(2, 2), n_components=2),
-        Extended(position_px=(3, 3), profile=given),
-        Extended(position_px=(4, 4)),
-        Extended(position_px=(90, 5)),
-        Extended(position_px=(6, 6), n_components=1),
+        PointSource(position_px=(1, 1)),
+        ExtendedSource(position_px=(2, 2), n_components=2),
+        ExtendedSource(position_px=(3, 3), profile=given),
+        ExtendedSource(position_px=(4, 4)),
+        ExtendedSource(position_px=(90, 5)),
+        ExtendedSource(position_px=(6, 6), n_components=1),
     )
     frame = SimpleNamespace(
         shape=(20, 20),
-        place=lambda sources, *_: np.array([s.position_px for s in sources], float),
-        inside=lambda positions: (positions < 20).all(1),
+        positions_of=lambda sources, *_: np.array([s.position_px for s in sources], float),
+        contains=lambda positions: (positions < 20).all(1),
     )
     blend = Blend([SimpleNamespace(name="a"), SimpleNamespace(name="b")], sources, frame)
     made = image_profiles.with_image_profiles(blend, device="any")
@@ -230,6 +230,6 @@ def test_sources_outside_an_observation_have_its_psf_at_the_nearest_pixel():
     """Where the observation's projection holds none of them, that at its middle."""
     at = np.array([[3.0, 4.0], [-2.0, 50.0], [np.nan, np.nan], [10.0, 40.0]])
     grid = SimpleNamespace(positions_in=lambda grid, y, x: at)
-    home = view_module.Home(SimpleNamespace(grid=grid), None, np.zeros((4, 2)), 0.0)
+    home = view_module.SceneGeometry(SimpleNamespace(grid=grid), None, np.zeros((4, 2)), 0.0)
     observation = SimpleNamespace(grid=None, data=np.zeros((2, 13, 41)))
     assert home._on(observation).tolist() == [[3, 4], [0, 40], [6, 20], [10, 40]]

@@ -9,17 +9,17 @@ from helpers import scenes
 from helpers.tuning import tune
 
 from clresample.deblending import batch, iterate as iterate_module
-from clresample.deblending.profiles import Star
-from clresample.deblending.rendered import Rendered
+from clresample.deblending.component_images import ComponentImages
+from clresample.deblending.profiles import StarProfile
 from clresample.deblending.shifts import SCATTER_PX, shift_steps
 from clresample.deblending.solver.scene import Scene, State
 from clresample.deblending.start import renderer as renderer_module
-from clresample.deblending.start.aim import _Windows
-from clresample.deblending.start.looking import looking_at
-from clresample.deblending.start.seen import WHOLE_PX, Model, see
-from clresample.deblending.start.slots import Component
-from clresample.deblending.start.start import PRECISION, TOLERANCE, peak_of
-from clresample.deblending.view import Home, whitened_view
+from clresample.deblending.start.component_batch import StartComponent
+from clresample.deblending.start.final_render import WHOLE_PX, MorphologyModel, render_models
+from clresample.deblending.start.linearised_scenes import linearise
+from clresample.deblending.start.profile_start import PRECISION, TOLERANCE, profile_peak
+from clresample.deblending.start.render_planner import _WindowRenderer
+from clresample.deblending.view import SceneGeometry, whitened_view
 from clresample.sky.frame import Frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
@@ -51,7 +51,7 @@ def moved(weight, sky=0.0, mask=False):
     morph = galaxy(0, 0)
     scene = Scene(
         shape=(40, 44),
-        extent=(40, 44),
+        unpadded_shape=(40, 44),
         ops=[Still(), Still()],
         data=[morph[None], galaxy(*-SHIFT)[None] + sky],
         weights=weights,
@@ -59,7 +59,7 @@ def moved(weight, sky=0.0, mask=False):
         center=np.array([(19, 22)]),
         profile=[morph],
         fixed=np.zeros(1, bool),
-        scale=np.ones((1, 2)),
+        step_scale=np.ones((1, 2)),
     )
     return scene, State([0 * morph], [morph], np.ones((1, 2)), np.array([0.0, sky]))
 
@@ -83,10 +83,10 @@ def test_shifts_of_what_holds_little_light_are_smaller():
 
 def test_a_sharp_stars_peak_is_of_its_profile_and_not_of_its_slopes():
     home = Frame(Grid.flat((21, 23), 0.1), PSF.gaussian(0.35, n_pixels=15, pixel=False))
-    star, place = Star(home, free=True), np.array([10.4, 11.4])
+    star, place = StarProfile(home, free=True), np.array([10.4, 11.4])
     drawn = star.draw(np.zeros(2), place)
     assert drawn[1:].max() > drawn[0].max()
-    found = peak_of(star, np.zeros(2), place, place, home.shape)
+    found = profile_peak(star, np.zeros(2), place, place, home.shape)
     assert found == pytest.approx(drawn[0].max(), rel=0.01)
 
 
@@ -102,46 +102,51 @@ def test_morphologies_in_large_frames_are_seen_where_they_are(device):
     assert np.prod(shape) > WHOLE_PX
     data = np.zeros((1, *shape))
     blank = Observation(data, psf, grid, weights=4.0, channels=("g",))
-    place = Home(home, home, origin + [7, 6.0], 0.0)
+    place = SceneGeometry(home, home, origin + [7, 6.0], 0.0)
     view = whitened_view(place, blank, 1, device, np.float32, private=False)
     whole = np.zeros((2, *shape), np.float32)
     for image, (a, b) in zip(whole, origin, strict=True):
         image[a : a + 15, b : b + 13] = morph
     shown = view.op.render(whole)
     light = 3 * shown[0] + 5 * shown[1] + 0.5
-    names = "op", "root", "shares", "ties", "error_scale", "sky_precision"
+    names = "op", "sqrt_weights", "coefficients", "ties", "error_scale", "sky_precision"
     filled = SimpleNamespace(**{name: getattr(view, name) for name in names})
     filled.mapping, filled.data, filled.covered = view.mapping, 2 * light, view.covered
     for fit_sky in (True, False):
         filled.data = 2 * (light - 0.5 * (not fit_sky))
-        model = Model(shape, [filled], [None], np.zeros(2, int), origin, [morph, morph])
-        (seen,) = see([model], fit_sky=fit_sky)
+        model = MorphologyModel(shape, [filled], [None], np.zeros(2, int), origin, [morph, morph])
+        (seen,) = render_models([model], fit_sky=fit_sky)
         (rendered,) = seen.observed
-        assert isinstance(rendered, Rendered) and rendered.images[0].size < 0.2 * data.size
+        assert isinstance(rendered, ComponentImages) and rendered.images[0].size < 0.2 * data.size
         np.testing.assert_allclose(np.asarray(rendered), shown, atol=1e-4 * shown.max())
         np.testing.assert_allclose(seen.spectra[:, 0], [6, 10], rtol=1e-3)
         np.testing.assert_allclose(seen.sky, [1.0 * fit_sky], atol=1e-3)
-        assert seen.bare == (None,)
+        assert seen.unfiltered_views == (None,)
 
 
 def test_slots_are_rendered_in_groups_of_what_the_memory_takes(device, monkeypatch):
     """One at a time or all at once: the same is seen. No more than a launch has groups for."""
     home, position = scenes.frame(), np.array([14.0, 17.0])
-    star = Star(home, free=True)
+    star = StarProfile(home, free=True)
     places = [position + (k - 2) for k in range(5)]
-    chosen = [Component(0, k, k, star, place, home.shape) for k, place in enumerate(places)]
+    chosen = [StartComponent(0, k, k, star, place, home.shape) for k, place in enumerate(places)]
     found = []
     for n_bytes, most in ((1, 65535), (1 << 30, 65535), (1 << 30, 2 * 3 * 2)):
         tune(monkeypatch, group_bytes=n_bytes)
-        monkeypatch.setattr(renderer_module, "MOST_GROUPS", most)
+        monkeypatch.setattr(renderer_module, "MAX_GROUPS", most)
         views = [
             whitened_view(
-                Home(home, home, np.array(places), 0.0), o, 1, device, np.float32, private=True
+                SceneGeometry(home, home, np.array(places), 0.0),
+                o,
+                1,
+                device,
+                np.float32,
+                private=True,
             )
             for o in scenes.observe()
         ]
-        looking = looking_at([views], chosen, PRECISION, TOLERANCE, fit_sky=False)
-        looking.look([0], [np.zeros(2)] * 5, np.ones(5), slopes=True)
+        looking = linearise([views], chosen, PRECISION, TOLERANCE, fit_sky=False)
+        looking.render([0], [np.zeros(2)] * 5, np.ones(5), slopes=True)
         found.append([device.get(sight.seen) for sight in looking.sights])
         for sight, n_bands in zip(looking.sights, (1, 2), strict=True):
             (windows,) = sight.aim._renderers.values()
@@ -155,31 +160,31 @@ def test_slots_are_rendered_in_groups_of_what_the_memory_takes(device, monkeypat
 def a_star(device, shape):
     """One in the middle of a small frame, where it is, and two views of it."""
     home, place = scenes.frame(shape), np.array([9.0, 11.0])
-    at_home = Home(home, home, place[None], 0.0)
+    at_home = SceneGeometry(home, home, place[None], 0.0)
     views = [
         whitened_view(at_home, o, 1, device, np.float32, private=True)
         for o in scenes.observe(shape=shape)
     ]
-    return Component(0, 0, 0, Star(home, free=True), place, shape), place, views
+    return StartComponent(0, 0, 0, StarProfile(home, free=True), place, shape), place, views
 
 
 def test_signal_to_noise_is_zero_where_nothing_was_seen(device):
     """<u, d> / |u| of what was, both in units of the noise."""
     star, place, views = a_star(device, (20, 23))
-    views[1] = replace(views[1], root=0 * views[1].root)
-    looking = looking_at([views], [star], PRECISION, 0.0, fit_sky=False)
-    looking.look([0], [np.zeros(2)], np.ones(1), slopes=False)
+    views[1] = replace(views[1], sqrt_weights=0 * views[1].sqrt_weights)
+    looking = linearise([views], [star], PRECISION, 0.0, fit_sky=False)
+    looking.render([0], [np.zeros(2)], np.ones(1), slopes=False)
     found = looking.signal_to_noise(np.zeros((1, 3)))
-    u = views[0].root * views[0].see(star.shape.draw(np.zeros(2), place)[:1], 0)[0]
-    wanted = (u * views[0].root * views[0].data).sum() / np.linalg.norm(u)
+    u = views[0].sqrt_weights * views[0].render(star.shape.draw(np.zeros(2), place)[:1], 0)[0]
+    wanted = (u * views[0].sqrt_weights * views[0].data).sum() / np.linalg.norm(u)
     np.testing.assert_allclose(found, [[wanted, 0, 0]], rtol=1e-3)
 
 
 def test_boxes_of_a_whole_frame_are_seen_through_the_observations_own_operator(device):
     """Which is made already, whatever the frame's sides are."""
     star, _, views = a_star(device, (20, 23))
-    looking = looking_at([views], [star], PRECISION, 0.0, fit_sky=False)
-    looking.look([0], [np.zeros(2)], np.ones(1), slopes=True)
+    looking = linearise([views], [star], PRECISION, 0.0, fit_sky=False)
+    looking.render([0], [np.zeros(2)], np.ones(1), slopes=True)
     assert looking.slots.size.tolist() == [[20, 23]]
     for sight, view in zip(looking.sights, views, strict=True):
         (renderer,) = sight.aim._renderers.values()
@@ -188,35 +193,35 @@ def test_boxes_of_a_whole_frame_are_seen_through_the_observations_own_operator(d
 
 def running(live, n_steps=5, resize=False):
     """A batch of fits on their way, as `repacked` and `run` see it."""
-    one = object.__new__(iterate_module._Running)
+    one = object.__new__(iterate_module._AmsgradRun)
     one.live, one.fits = np.array(live), list("abcdefgh"[: len(live)])
     one.engine = SimpleNamespace(n_steps=n_steps)
     return one
 
 
 def test_a_batch_is_made_anew_when_a_quarter_has_stopped():
-    assert (iterate_module.REPACK, iterate_module.RESIZE) == (0.25, 40)
+    assert (iterate_module.REPACK_FRACTION, iterate_module.RESIZE_ITERATIONS) == (0.25, 40)
     going = running([True] * 7 + [False])
     assert going.repacked() is going and going.going() == list("abcdefg")
     with pytest.raises(AttributeError):  # asks its engine for states
         running([True, True, True, False]).repacked()
     with pytest.raises(AttributeError):
         running([True] * 8, n_steps=40).repacked()
-    one = object.__new__(iterate_module._Learning)
+    one = object.__new__(iterate_module._LbfgsRun)
     one.engine = SimpleNamespace(progress=SimpleNamespace(live=np.array([True] * 7 + [False])))
     assert one.repacked() is one
 
 
 def test_learning_runs_five_rounds_at_a_time_and_no_more_than_it_may():
     """The start is none of them."""
-    assert iterate_module.CHECK == 5
+    assert iterate_module.CHECK_ITERATIONS == 5
     for max_iter, wanted in ((100, [6, 5, 5]), (7, [6, 2, 0])):
-        one, rounds = object.__new__(iterate_module._Learning), []
+        one, rounds = object.__new__(iterate_module._LbfgsRun), []
         n = np.zeros(2, int)
         progress = SimpleNamespace(
             live=np.array([True, False]),
             converged=np.zeros(2, bool),
-            looked=np.zeros(2, bool),
+            tested=np.zeros(2, bool),
             n_rounds=n,
             loss=np.array([3.0, 4.0]),
         )
@@ -247,7 +252,7 @@ def test_light_lies_in_the_middle_of_its_window():
         SimpleNamespace(offset=rng.normal(size=2), matrix=rng.normal(size=(2, 2))) for _ in "ab"
     ]
     renderer = SimpleNamespace(size=(24, 31), plans=[SimpleNamespace(mapping=m) for m in maps])
-    found = _Windows(np.arange(2), renderer, np.array([(20, 20), (24, 30)]))
+    found = _WindowRenderer(np.arange(2), renderer, np.array([(20, 20), (24, 30)]))
     assert found.before.tolist() == [[2, 5], [0, 0]]
     for m, before, offset in zip(maps, found.before, found.offset, strict=True):
         np.testing.assert_allclose(offset, m.matrix @ before + m.offset)
@@ -263,11 +268,12 @@ def test_a_fit_that_cannot_start_leaves_the_others(monkeypatch, group):
         if any(fit.blend == "b" for fit in fits):
             raise ValueError("no")
 
-    monkeypatch.setattr(batch, "begin", begin)
-    many = object.__new__(batch._ManyFits)
+    monkeypatch.setattr(batch, "start_fits", begin)
+    many = object.__new__(batch._BatchRunner)
     many.done, many.warned = {}, {}
     fits = [
-        (10 + i, SimpleNamespace(blend=name, dark=[7], problems=[])) for i, name in enumerate(group)
+        (10 + i, SimpleNamespace(blend=name, undetected=[7], problems=[]))
+        for i, name in enumerate(group)
     ]
     good = [one for one in fits if one[1].blend != "b"]
     assert many._begin(fits) == good

@@ -7,10 +7,10 @@ from helpers.geometries import GEOMETRIES, affine, operator, psfs, turn
 from helpers.solver import every_type, posed
 from test_rendering import KINDS, SCENES, buffers_of, operator_of, pairs_of
 
-from clresample.deblending.solver.gradient import Gradient
+from clresample.deblending.solver.gradient import LossGradient
 from clresample.deblending.solver.operators import MorphologyOperator, SpectraOperator
-from clresample.deblending.solver.rendering import choice
-from clresample.deblending.solver.rendering.windows import Groups, Windows
+from clresample.deblending.solver.rendering import stage_selection
+from clresample.deblending.solver.rendering.windows import WindowGroups, WindowRendering
 from clresample.deblending.solver.scene_model import compose
 from clresample.sky.psf import PSF
 from clresample.testing import check_adjoint
@@ -27,9 +27,9 @@ def in_windows(kind, pairs, device, dtype, parts=None):
     b = buffers_of(pairs, device, dtype)
     op = operator_of(b.scenes)
     if parts is None:
-        return kind(b, op, choice.rendering(b, 0, op, 3))
-    groups = [Groups(b.host_boxes, np.array(which), (16, 13)) for which in parts]
-    return kind(b, op, Windows(b, 0, op, groups, choice._in_frames))
+        return kind(b, op, stage_selection.select_rendering(b, 0, op, 3))
+    groups = [WindowGroups(b.host_boxes, np.array(which), (16, 13)) for which in parts]
+    return kind(b, op, WindowRendering(b, 0, op, groups, stage_selection._in_frames))
 
 
 def away(op, pairs, device):
@@ -82,7 +82,7 @@ def test_windows_follow_shifts(device):
     for shift in ((0.4, -0.3), (5.2, 3.9)):
         pairs[0][0].ops[0].shift = shift
         assert away(op, pairs, device) > 1e-2
-        op.rendering.follow_shifts()
+        op.rendering.update_shifts()
         assert away(op, pairs, device) < CLOSE
 
 
@@ -102,7 +102,7 @@ def test_gradients_are_those_of_frames(build, name):
     pairs, found = pairs_of(build, GEOMETRIES[name](), np.float64), []
     for depth in (0, 3):
         b = buffers_of(pairs, build, np.float64)
-        gradient = Gradient(b, with_prior=False, depth=depth)
+        gradient = LossGradient(b, with_prior=False, depth=depth)
         gradient.queue()
         arrays = b.d_morph, b.d_spectra, gradient.rows_loss, gradient.rows_pull
         found.append([build.get(array) for array in arrays])
@@ -122,7 +122,7 @@ def test_large_fields_of_small_sources_are_chosen(device):
         ops = [operator(device, mapping, narrow, wide, np.float32) for _ in range(n_ops)]
         pairs = [_scene(device, op, shape, boxes) for op in ops]
         b = buffers_of(pairs, device, np.float32)
-        chosen.append(choice.rendering(b, 0, operator_of(b.scenes)).depth == 3)
+        chosen.append(stage_selection.select_rendering(b, 0, operator_of(b.scenes)).depth == 3)
     assert chosen == [True, False, False]
 
 
@@ -132,11 +132,11 @@ def _scene(device, op, shape, boxes):
         np.float32,
         boxes=boxes,
         shape=shape,
-        extent=shape,
+        unpadded_shape=shape,
         ops=[op],
         data=[np.zeros(op.shape_out)],
         weights=[np.ones(op.shape_out) * op.covered],
-        scale=np.ones((len(boxes), 2)),
+        step_scale=np.ones((len(boxes), 2)),
         spectra=np.ones((len(boxes), 2)),
         sky=np.zeros(2),
     )

@@ -15,7 +15,7 @@ from helpers.products import (
 )
 
 from clresample.device import contraction as contract
-from clresample.device.contraction import Contraction, ImageBatch, Matrix, padded
+from clresample.device.contraction import Contraction, ImageBatch, MatrixBatch, row_stride
 
 __all__ = ["dtype"]  # a fixture
 
@@ -29,9 +29,9 @@ def test_product(device, shape, dtype):
     n_pad = right.shape[-1]
     result = device.put(np.full((3, m + 2, n_pad), 7.0), dtype)
     Contraction(device, dtype).bind(
-        m, n, k, Matrix(device.put(a, dtype).base_data, k, m * k),
-        Matrix(right.base_data, n_pad, k * n_pad),
-        Matrix(result.base_data, n_pad, (m + 2) * n_pad),
+        m, n, k, MatrixBatch(device.put(a, dtype).base_data, k, m * k),
+        MatrixBatch(right.base_data, n_pad, k * n_pad),
+        MatrixBatch(result.base_data, n_pad, (m + 2) * n_pad),
     )(3)  # fmt: skip
     found = device.get(result)
     check(found[:, :m, :n], a @ b, dtype)
@@ -44,30 +44,31 @@ def test_product(device, shape, dtype):
 def test_rows_do_not_crowd_the_cache(device, n, dtype):
     """Rows a vector further apart than their columns, which stay alone beyond them."""
     need(device, dtype)
-    m, k, n_pad = 8, 9, padded(n)
-    assert n_pad == contract.whole(n) + contract.COLUMN_PAD
+    m, k, n_pad = 8, 9, row_stride(n)
+    assert n_pad == contract.round_up_columns(n) + contract.COLUMN_PAD
     a, b = random(m, k), random(k, n)
     host = np.full((k, n_pad), np.nan)
-    host[:, :n], host[:, n : contract.whole(n)] = b, 0
+    host[:, :n], host[:, n : contract.round_up_columns(n)] = b, 0
     right = device.put(host, dtype)
     result = device.put(np.full((m, n_pad), 7.0), dtype)
     Contraction(device, dtype).bind(
-        m, n, k, Matrix(device.put(a, dtype).base_data, k), Matrix(right.base_data, n_pad),
-        Matrix(result.base_data, n_pad),
+        m, n, k, MatrixBatch(device.put(a, dtype).base_data, k),
+        MatrixBatch(right.base_data, n_pad),
+        MatrixBatch(result.base_data, n_pad),
     )(1)  # fmt: skip
     found = device.get(result)
     check(found[:, :n], a @ b, dtype)
-    assert not found[:, n : contract.whole(n)].any()
-    assert (found[:, contract.whole(n) :] == 7).all()
+    assert not found[:, n : contract.round_up_columns(n)].any()
+    assert (found[:, contract.round_up_columns(n) :] == 7).all()
 
 
 @pytest.mark.parametrize("n", [1, 16, 112, 113, 128, 129, 200, 384])
 def test_no_row_is_as_long_as_what_crowds_a_cache(n):
-    assert contract.whole(n) in range(n, n + contract.COLUMN_PAD)
-    assert padded(n) % contract.COLUMN_PAD == 0
-    assert padded(n) % contract.CROWDED
-    assert padded(n) - contract.whole(n) in (0, contract.COLUMN_PAD)
-    np.testing.assert_array_equal(padded(np.array([n, 7])), [padded(n), 16])
+    assert contract.round_up_columns(n) in range(n, n + contract.COLUMN_PAD)
+    assert row_stride(n) % contract.COLUMN_PAD == 0
+    assert row_stride(n) % contract.CROWDED
+    assert row_stride(n) - contract.round_up_columns(n) in (0, contract.COLUMN_PAD)
+    np.testing.assert_array_equal(row_stride(np.array([n, 7])), [row_stride(n), 16])
 
 
 @every_type
@@ -78,15 +79,17 @@ def test_one_right_factor_for_all_and_tables_shared_by_bands(device, dtype):
     left, right = device.put(a, dtype), put_right(device, b, dtype)
     n_pad = right.shape[-1]
     result = device.empty((6, m, n_pad), dtype)
-    target = Matrix(result.base_data, n_pad, m * n_pad)
+    target = MatrixBatch(result.base_data, n_pad, m * n_pad)
     bind = Contraction(device, dtype).bind
-    bind(m, n, k, Matrix(left.base_data, k, m * k), Matrix(right.base_data, n_pad), target)(6)
+    bind(
+        m, n, k, MatrixBatch(left.base_data, k, m * k), MatrixBatch(right.base_data, n_pad), target
+    )(6)
     check(device.get(result)[..., :n], a @ b, dtype)
     # scene 0 has tables a[0], b[0] for its three bands, scene 1 has a[1], b[1]
     b = random(2, k, n)
     right = put_right(device, b, dtype)
-    bind(m, n, k, Matrix(left.base_data, k, m * k, n_bands),
-         Matrix(right.base_data, n_pad, k * n_pad, n_bands), target)(6)  # fmt: skip
+    bind(m, n, k, MatrixBatch(left.base_data, k, m * k, n_bands),
+         MatrixBatch(right.base_data, n_pad, k * n_pad, n_bands), target)(6)  # fmt: skip
     check(device.get(result)[..., :n], np.repeat(a[:2] @ b, n_bands, axis=0), dtype)
 
 
@@ -98,9 +101,9 @@ def test_a_callers_arrays_read_and_written_transposed(device, dtype):
     result = device.put(np.full((5, n, m), 7.0), dtype)
     # from the second image on, into the second place on: offsets in elements
     Contraction(device, dtype, strided=True, ragged=True).bind(
-        m, n, k, Matrix(source.base_data, 1, k * m, step=m, offset=k * m),
-        Matrix(right.base_data, right.shape[-1]),
-        Matrix(result.base_data, 1, n * m, step=m, offset=n * m),
+        m, n, k, MatrixBatch(source.base_data, 1, k * m, step=m, offset=k * m),
+        MatrixBatch(right.base_data, right.shape[-1]),
+        MatrixBatch(result.base_data, 1, n * m, step=m, offset=n * m),
     )(3)  # fmt: skip
     found = device.get(result)
     check(found[1:4], (images[1:].swapaxes(1, 2) @ b).swapaxes(1, 2), dtype)
@@ -115,9 +118,9 @@ def test_a_callers_rows_of_any_length(device, dtype):
     right = put_right(device, b, dtype)
     result = device.put(np.full((2, m, n + 3), 7.0), dtype)
     Contraction(device, dtype, ragged=True).bind(
-        m, n, k, Matrix(device.put(a, dtype).base_data, k, m * k),
-        Matrix(right.base_data, right.shape[-1]),
-        Matrix(result.base_data, n + 3, m * (n + 3), offset=1),
+        m, n, k, MatrixBatch(device.put(a, dtype).base_data, k, m * k),
+        MatrixBatch(right.base_data, right.shape[-1]),
+        MatrixBatch(result.base_data, n + 3, m * (n + 3), offset=1),
     )(2)  # fmt: skip
     found = device.get(result)
     check(found[..., 1:-2], a @ b, dtype)
@@ -133,10 +136,10 @@ def test_one_product_for_many_callers(device, axes, dtype):
     m, n = (shape[axis] for axis in axes)
     images, b, c = random(8, *shape), random(1, n, k), random(1, k, n)
     source, target = device.put(images, dtype), device.put(np.full((4, *shape), 7.0), dtype)
-    half = device.empty((8, m, padded(k)), dtype)
-    middle = Matrix(half.base_data, padded(k), m * padded(k))
+    half = device.empty((8, m, row_stride(k)), dtype)
+    middle = MatrixBatch(half.base_data, row_stride(k), m * row_stride(k))
     b_device, c_device = (
-        Matrix(put_right(device, a, dtype).base_data, padded(a.shape[2])) for a in (b, c)
+        MatrixBatch(put_right(device, a, dtype).base_data, row_stride(a.shape[2])) for a in (b, c)
     )
     observed = ImageBatch.shaped(*shape).matrix(axes)
     out_of = Contraction(device, dtype, ragged=True).bind(m, n, k, middle, c_device, observed)
@@ -183,8 +186,9 @@ def test_mix_multiplies_by_the_spectra(device, n_tables, adjoint, dtype):
     result = device.empty((batch, 2 * h_y, n_pad), dtype)
     band = h_y * 2 * n_pad
     Contraction(device, dtype, epilogue="MIX", adjoint=adjoint).bind(
-        2 * h_y, 2 * h_x, k, Matrix(device.put(a, dtype).base_data, k),
-        Matrix(right.base_data, n_pad, k * n_pad), Matrix(result.base_data, n_pad, 2 * h_y * n_pad),
+        2 * h_y, 2 * h_x, k, MatrixBatch(device.put(a, dtype).base_data, k),
+        MatrixBatch(right.base_data, n_pad, k * n_pad),
+        MatrixBatch(result.base_data, n_pad, 2 * h_y * n_pad),
         (tables.base_data, n_bands * band if n_tables > 1 else 0, band), n_bands,
     )(batch)  # fmt: skip
     d = np.broadcast_to(d, (2, 2, n_bands, h_y, h_x)).reshape(2, batch, h_y, h_x)
@@ -207,8 +211,9 @@ def test_twist_rotates_cos_and_sin_rows(device, adjoint, dtype):
     planes[..., :n] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     result = device.empty((3, 2 * h_y, n_pad), dtype)
     Contraction(device, dtype, epilogue="TWIST", adjoint=adjoint).bind(
-        2 * h_y, n, k, Matrix(device.put(a, dtype).base_data, k, 2 * h_y * k),
-        Matrix(right.base_data, n_pad, k * n_pad), Matrix(result.base_data, n_pad, 2 * h_y * n_pad),
+        2 * h_y, n, k, MatrixBatch(device.put(a, dtype).base_data, k, 2 * h_y * k),
+        MatrixBatch(right.base_data, n_pad, k * n_pad),
+        MatrixBatch(result.base_data, n_pad, 2 * h_y * n_pad),
         (device.put(planes, dtype).base_data, 0, 0), 1,
     )(3)  # fmt: skip
     rows = a @ b
@@ -226,8 +231,8 @@ def test_long_sums_keep_their_accuracy(device, monkeypatch):
 
     def error():
         Contraction(device, np.float32).bind(
-            8, 16, k, Matrix(left.base_data, k), Matrix(right.base_data, 16),
-            Matrix(result.base_data, 16),
+            8, 16, k, MatrixBatch(left.base_data, k), MatrixBatch(right.base_data, 16),
+            MatrixBatch(result.base_data, 16),
         )(1)  # fmt: skip
         truth = a.astype(float) @ b.astype(float)
         return np.linalg.norm(device.get(result) - truth) / np.linalg.norm(truth)
@@ -240,7 +245,7 @@ def test_long_sums_keep_their_accuracy(device, monkeypatch):
 
 @pytest.mark.parametrize("k", [1, 4, 37, 74, 128, 129, 400, 5000, 40_000])
 def test_stretches_are_whole_turns_and_share_the_terms(k):
-    found = contract.stretch(k)
+    found = contract.terms_per_block(k)
     assert found % contract.TERMS == 0
     assert found <= max(contract.SUM_BLOCK, np.sqrt(k) + contract.TERMS)
     assert k <= 2 * found or found >= contract.SUM_BLOCK / 2  # no more of them than it takes
@@ -248,15 +253,15 @@ def test_stretches_are_whole_turns_and_share_the_terms(k):
 
 
 def test_a_tall_product_is_cut_where_a_launch_would_have_too_many_groups(device, monkeypatch):
-    monkeypatch.setattr(contract, "MOST_GROUPS", 2)
+    monkeypatch.setattr(contract, "MAX_GROUPS", 2)
     m, n, k, batch = 11, 17, 9, 13
     a, b = random(batch + 1, m, k), random(1, k, n)
     left, right = device.put(a, np.float32), put_right(device, b, np.float32)
     n_pad = right.shape[-1]
     result = device.put(np.full((batch, m, n_pad), 7.0), np.float32)
     product = Contraction(device, np.float32).bind(
-        m, n, k, Matrix(None, k, m * k), Matrix(right.base_data, n_pad),
-        Matrix(result.base_data, n_pad, m * n_pad),
+        m, n, k, MatrixBatch(None, k, m * k), MatrixBatch(right.base_data, n_pad),
+        MatrixBatch(result.base_data, n_pad, m * n_pad),
     )  # fmt: skip
     sizes = []
     launch = product.launch
@@ -280,8 +285,8 @@ def test_the_largest_terms_are_summed_last(device, monkeypatch, name):
         a = (terms * (1 + 0.1 * random(m, k, seed=1))).astype(np.float32)
         left = device.put(a)
         Contraction(device, np.float32).bind(
-            m, n, k, Matrix(left.base_data, k), Matrix(right.base_data, n),
-            Matrix(result.base_data, n), inward=inward,
+            m, n, k, MatrixBatch(left.base_data, k), MatrixBatch(right.base_data, n),
+            MatrixBatch(result.base_data, n), inward=inward,
         )(1)  # fmt: skip
         truth = a.astype(float) @ waves.astype(float)
         return np.linalg.norm(device.get(result) - truth) / np.linalg.norm(truth)

@@ -11,7 +11,7 @@ from helpers.checkout import run_python
 
 from clresample import DeviceError
 from clresample.device import discovery, drivers
-from clresample.device.discovery import hints
+from clresample.device.discovery import driver_hints
 
 NVIDIA = "libnvidia-opencl.so.1"
 PLATFORMS = "from clresample import list_devices; print(*[d.platform for d in list_devices()])"
@@ -40,9 +40,9 @@ class Gpu:
 
 @pytest.mark.parametrize("library", drivers.LIBRARIES)
 def test_a_driver_without_its_icd_file_is_named_with_its_cure(machine, library):
-    assert hints() == []
+    assert driver_hints() == []
     (machine / library).write_text("")
-    (hint,) = hints()
+    (hint,) = driver_hints()
     assert hint.startswith(drivers.LIBRARIES[library])
     assert hint.endswith(f": export CLRESAMPLE_ICD={machine / library}")
 
@@ -50,16 +50,16 @@ def test_a_driver_without_its_icd_file_is_named_with_its_cure(machine, library):
 def test_nothing_is_said_of_a_driver_that_brings_its_gpu(machine, monkeypatch):
     (machine / NVIDIA).write_text("")
     monkeypatch.setattr(discovery, "find_devices", lambda: [Gpu("NVIDIA")])
-    assert hints() == []
+    assert driver_hints() == []
     monkeypatch.setattr(discovery, "find_devices", lambda: [Gpu("Intel")])
-    assert len(hints()) == 1
+    assert len(driver_hints()) == 1
 
 
 def test_a_driver_that_the_loader_reads_is_not_said_to_be_hidden(machine, monkeypatch):
     (machine / NVIDIA).write_text("no library")
     (machine / "nvidia.icd").write_text(f"{NVIDIA}\n")
     monkeypatch.setenv("OCL_ICD_VENDORS", str(machine))
-    (hint,) = hints()
+    (hint,) = driver_hints()
     assert hint.startswith(f"NVIDIA's OpenCL driver, {machine / NVIDIA}, cannot be loaded: ")
     assert "export" not in hint
 
@@ -70,7 +70,7 @@ def test_drivers_that_the_system_lists_are_found(machine, monkeypatch):
     listing = f"\t{NVIDIA} (libc6,x86-64) => {machine / NVIDIA}\n\tlibc.so.6 => /lib/libc.so.6\n"
     answer = type("R", (), {"stdout": listing})
     monkeypatch.setattr(drivers.subprocess, "run", lambda *_, **__: answer)
-    assert drivers.unseen([]) == [("NVIDIA", machine / NVIDIA)]
+    assert drivers.undetected_drivers([]) == [("NVIDIA", machine / NVIDIA)]
 
 
 def test_where_there_is_no_device_the_error_names_the_driver(machine, monkeypatch):
@@ -143,7 +143,7 @@ def test_conda_s_loader_is_told_of_the_systems_drivers(machine, monkeypatch, is_
     assert drivers.conda_prefix() is None  # the environment's pyopencl is pip's
     (conda / "conda-meta/pyopencl-2025.1-0.json").write_text("{}")
     assert drivers._known() == {"pocl.icd": "libpocl.so"}
-    (hint,) = hints()
+    (hint,) = driver_hints()
     cure = drivers.CONDA_CURE if is_listed else f"export CLRESAMPLE_ICD={machine / NVIDIA}"
     assert hint.endswith(f": {cure}")
     monkeypatch.setattr(drivers.sys, "prefix", "/usr")  # another Python than the environment's
@@ -151,7 +151,10 @@ def test_conda_s_loader_is_told_of_the_systems_drivers(machine, monkeypatch, is_
 
 
 def test_the_cure_is_one_line_for_a_shell():
-    assert shlex.split(drivers.cure(Path("/a/b.so"))) == ["export", "CLRESAMPLE_ICD=/a/b.so"]
+    assert shlex.split(drivers.icd_export_line(Path("/a/b.so"))) == [
+        "export",
+        "CLRESAMPLE_ICD=/a/b.so",
+    ]
 
 
 def _after(folder):
@@ -173,8 +176,8 @@ def test_a_library_that_brings_no_device_is_said():
 def test_a_driver_without_a_device_is_said(monkeypatch):
     monkeypatch.setattr(drivers.ctypes, "CDLL", lambda _: None)
     monkeypatch.setattr(drivers, "_platforms_of", lambda _: {12, 34})
-    assert drivers.fault_of("libx.so", {34}) is None
-    assert drivers.fault_of("libx.so", {56}) == "is an OpenCL driver that finds no device here"
+    assert drivers.driver_fault("libx.so", {34}) is None
+    assert drivers.driver_fault("libx.so", {56}) == "is an OpenCL driver that finds no device here"
 
 
 def test_temporary_folders_of_killed_processes_are_removed(tmp_path, monkeypatch):

@@ -8,8 +8,8 @@ import pytest
 
 from clresample.device.device import Device
 from clresample.device.discovery import DeviceError
+from clresample.device.mirror_contraction import operator_programs
 from clresample.device.program import Programs
-from clresample.device.waves import operator_programs
 from clresample.resampling.resampler import Resampler
 from clresample.sky.grid import Grid
 from clresample.sky.psf import PSF
@@ -54,7 +54,7 @@ def test_an_operator_builds_what_was_listed(fresh, built, ahead):
     aligned = Resampler(Grid.flat((24, 28), 0.1), PSF.gaussian(0.8), inside, PSF.gaussian(1.5))
     for op in (turned, Resampler.from_plans(aligned.plans, device=fresh)):
         op.adjoint(op(np.ones((24, 28))))
-    contractions = {request for request in built if request[0].startswith(("contract", "waves"))}
+    contractions = {request for request in built if request[0].startswith(("contract", "mirror"))}
     assert _of_any_tile(contractions) == _of_any_tile(listed)
     assert set(built.values()) == {1}
 

@@ -9,8 +9,8 @@ from helpers.checkout import run_python
 
 from clresample import Device, DeviceError, get_device
 from clresample.device import device as device_module, discovery, selftest
+from clresample.device.device_cache import DeviceCache, DeviceWarning
 from clresample.device.program import Programs
-from clresample.device.remembered import DeviceWarning, Remembered
 
 
 @pytest.fixture
@@ -43,17 +43,17 @@ def test_the_render_is_numpys(device):
 
 
 def test_what_has_passed_is_not_tried_again(device, empty_cache, monkeypatch):
-    assert selftest.fault(device, Remembered(device.cl)) is None
+    assert selftest.self_test_fault(device, DeviceCache(device.cl)) is None
     (path,) = empty_cache.glob("devices/*.json")
     assert json.loads(path.read_text())["device"] == device.name
     monkeypatch.setattr(selftest, "render", None)  # would fail if it were called again
-    assert selftest.fault(device, Remembered(device.cl)) is None
+    assert selftest.self_test_fault(device, DeviceCache(device.cl)) is None
 
 
 @pytest.mark.parametrize("error", [1e-4, np.nan])
 def test_a_wrong_render_is_a_fault(device, empty_cache, monkeypatch, error):
     monkeypatch.setattr(selftest, "render", lambda _: selftest.reference() * (1 + error))
-    message = selftest.fault(device, Remembered(device.cl))
+    message = selftest.self_test_fault(device, DeviceCache(device.cl))
     assert message.startswith(f"{device.name} ({device.platform}) fails its self-test")
     assert not empty_cache.exists()
 
@@ -73,7 +73,7 @@ def test_another_is_taken_where_none_was_named(device, empty_cache, monkeypatch)
 
     monkeypatch.setattr(device_module, "choose", lambda _: Bad)
     monkeypatch.setattr(device_module, "find_devices", list)
-    monkeypatch.setattr(device_module, "ranked", lambda _: [Bad, device.cl])
+    monkeypatch.setattr(device_module, "by_preference", lambda _: [Bad, device.cl])
     faults = {Bad: "Bad fails its self-test", device.cl: None}
     monkeypatch.setattr(device_module, "_fault", faults.get)
     with pytest.warns(DeviceWarning, match=f"Bad fails its self-test; .*{device.name[:4]}"):
@@ -94,18 +94,18 @@ def test_a_kernel_that_does_not_build_is_a_fault(device, empty_cache, monkeypatc
 
 @pytest.mark.parametrize("text", ["[", "7", "\x00"])
 def test_a_broken_file_is_ignored_in_one_line(device, empty_cache, text):
-    remembered = Remembered(device.cl)
+    remembered = DeviceCache(device.cl)
     remembered.write("a", 1)
     assert remembered.read("a") == 1
     remembered.path.write_text(text)
-    remembered = Remembered(device.cl)
+    remembered = DeviceCache(device.cl)
     with pytest.warns(DeviceWarning, match=r"\.json is ignored: ") as caught:
         assert remembered.read("a") is None
         assert remembered.read("a") is None
     (warning,) = caught
     assert "\n" not in str(warning.message)
     remembered.write("b", 2)
-    again = Remembered(device.cl)
+    again = DeviceCache(device.cl)
     assert (again.read("a"), again.read("b")) == (None, 2)
 
 
@@ -114,7 +114,7 @@ def test_a_folder_that_cannot_be_written_is_no_fault(device, tmp_path, monkeypat
     monkeypatch.setenv("CLRESAMPLE_CACHE", str(tmp_path / "file"))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeviceWarning)
-        assert selftest.fault(device, Remembered(device.cl)) is None
+        assert selftest.self_test_fault(device, DeviceCache(device.cl)) is None
 
 
 def test_the_command_shows_such_a_warning_in_one_line(tmp_path):

@@ -10,12 +10,12 @@ from helpers.tuning import tune
 
 from clresample import PSF, DeviceError, Grid, Resampler
 from clresample.cli.command import main
-from clresample.cli.machine import measure, tune as tuner
-from clresample.cli.machine.bench import most_at_once
-from clresample.cli.machine.tune import CPU_TILES, GPU_TILES, supposed
-from clresample.cli.machine.workload import Iterations
-from clresample.device.contraction import whole
-from clresample.device.remembered import DeviceWarning, Remembered
+from clresample.cli.device_tools import measure, tune as tuner
+from clresample.cli.device_tools.bench import largest_batch
+from clresample.cli.device_tools.tune import CPU_TILES, GPU_TILES, with_sizes
+from clresample.cli.device_tools.workload import FitWorkload
+from clresample.device.contraction import round_up_columns
+from clresample.device.device_cache import DeviceCache, DeviceWarning
 from clresample.device.tuning import PART, Tuning, _cpu_tile, is_tile
 
 TILE = {"VW": 8, "NV": 1, "MR": 4, "WGX": 1, "WGY": 1}
@@ -26,7 +26,7 @@ BOTH = ("CPU", "GPU")
 def kept(device, tmp_path, monkeypatch):
     """Nothing is kept of the device, in a folder of the test's own."""
     monkeypatch.setenv("CLRESAMPLE_CACHE", str(tmp_path))
-    monkeypatch.setattr(device, "remembered", Remembered(device.cl))
+    monkeypatch.setattr(device, "remembered", DeviceCache(device.cl))
     return device.remembered
 
 
@@ -46,17 +46,19 @@ def render(device):
 def test_what_was_kept_is_used(device, kept):
     before = Tuning.of(device)
     kept.write(PART, {device.kind: {"float32": {"tile": TILE, "n_scenes": 5}}})
-    device.remembered = Remembered(device.cl)  # as the next process has it
+    device.remembered = DeviceCache(device.cl)  # as the next process has it
     tuning = Tuning.of(device)
     assert (tuning.tile, tuning.n_scenes) == (TILE, 5)
     assert tuning.group_bytes == before.group_bytes
-    assert Tuning.of(device, np.float64).tile == Tuning.before(device, np.float64).tile
+    assert Tuning.of(device, np.float64).tile == Tuning.untuned(device, np.float64).tile
 
 
 def test_results_are_equal_to_rounding_with_all_tiles(device, kept):
     truth = render(device)
     for tile in (CPU_TILES[-1], GPU_TILES[0], GPU_TILES[-1]):
-        with supposed(device, "float32", {"tile": tile, "row_choices": [], "group_bytes": 1 << 16}):
+        with with_sizes(
+            device, "float32", {"tile": tile, "row_choices": [], "group_bytes": 1 << 16}
+        ):
             found = render(device)
         assert np.linalg.norm(found - truth) < 1e-6 * np.linalg.norm(truth)
     np.testing.assert_array_equal(render(device), truth)
@@ -76,10 +78,10 @@ def test_results_are_equal_to_rounding_with_all_tiles(device, kept):
 )
 def test_sizes_that_are_none_are_ignored_in_one_line(device, kept, content):
     kept.write(PART, content)
-    device.remembered = Remembered(device.cl)
+    device.remembered = DeviceCache(device.cl)
     with pytest.warns(DeviceWarning, match="is ignored: its sizes are none") as caught:
-        assert Tuning.of(device) == Tuning.before(device)
-        assert Tuning.of(device) == Tuning.before(device)
+        assert Tuning.of(device) == Tuning.untuned(device)
+        assert Tuning.of(device) == Tuning.untuned(device)
     assert len(caught) == 1
 
 
@@ -107,7 +109,7 @@ def test_candidates_build_what_they_say():
 )
 def test_columns_choose_the_vectors_of_a_tile(device, monkeypatch, name, n, vectors):
     tune(monkeypatch, tile=TILES[name])
-    tile = Tuning.of(device).tile_for_columns(n, whole(n))
+    tile = Tuning.of(device).tile_for_columns(n, round_up_columns(n))
     assert (tile["NV"], tile["VW"]) == vectors
     rows = {5: 4}.get(tile["NV"], TILES[name]["MR"])
     assert tile == TILES[name] | {"NV": vectors[0], "VW": vectors[1], "MR": rows}
@@ -134,7 +136,7 @@ def test_cpus_with_registers_of_avx512_use_them(width, version, rows, vectors):
 @pytest.mark.parametrize("rows", [1, 47, 48, 49, 60, 74, 118, 132, 1000])
 def test_groups_cover_matrices_with_little_waste(device, monkeypatch, rows):
     monkeypatch.setattr(device, "kind", "GPU")
-    tuning = Tuning.before(device)
+    tuning = Tuning.untuned(device)
     tile = tuning.tile_for(rows)
     group = tile["MR"] * tile["WGY"]
     covered = -(-rows // group) * group
@@ -149,7 +151,7 @@ def test_the_quickest_is_kept_and_said(device, kept, monkeypatch):
         def __init__(self, *_):
             self.rows = Tuning.of(device).tile["MR"]
 
-    monkeypatch.setattr(measure, "Products", Work)
+    monkeypatch.setattr(measure, "ProductTimer", Work)
     monkeypatch.setattr(tuner, "_timed", lambda work: 1.0 if work.rows == 4 else 2.0)
     for tiles in ("CPU_TILES", "GPU_TILES"):
         monkeypatch.setattr(tuner, tiles, [TILE | {"MR": 2}, TILE, TILE | {"MR": 6}])
@@ -160,7 +162,7 @@ def test_the_quickest_is_kept_and_said(device, kept, monkeypatch):
 
 
 def test_one_that_is_not_quicker_is_not_kept(device, kept, monkeypatch):
-    monkeypatch.setattr(measure, "Products", lambda *_: None)
+    monkeypatch.setattr(measure, "ProductTimer", lambda *_: None)
     monkeypatch.setattr(tuner, "_timed", lambda work: 1.0)
     lines = []
     found = tuner.tuned_sizes(device, quick=True, note=lines.append)
@@ -177,7 +179,7 @@ def test_sizes_that_do_not_run_are_no_choice(device, kept, monkeypatch, runs):
             if runs == "none" or Tuning.of(device, dtype).tile["MR"] != 4:
                 raise DeviceError("too many registers")
 
-    monkeypatch.setattr(measure, "Products", Work)
+    monkeypatch.setattr(measure, "ProductTimer", Work)
     monkeypatch.setattr(tuner, "_timed", lambda work: 1.0)
     for tiles in ("CPU_TILES", "GPU_TILES"):
         monkeypatch.setattr(tuner, tiles, [TILE | {"MR": 2}, TILE])
@@ -192,14 +194,14 @@ def test_sizes_that_do_not_run_are_no_choice(device, kept, monkeypatch, runs):
 
 
 def test_iterations_start_anew_each_time(device, kept):
-    work = Iterations(device, 3)
+    work = FitWorkload(device, 3)
     work()
     work()
     assert all(fit.losses == [] for fit in work.fits)
 
 
 def test_rates_are_those_of_the_device(device, kept):
-    products = measure.Products(device, shapes=(((20, 20, 20), 2),))
+    products = measure.ProductTimer(device, shapes=(((20, 20, 20), 2),))
     assert products.flops == 2 * 20**3 * 2
     assert 1e5 < products.rate(0.01) < 1e15
     assert 1e-8 < measure.launch_seconds(device, 0.01) < 0.1
@@ -229,7 +231,7 @@ def test_as_many_are_fitted_as_the_time_allows(first, fixed, each, n_most, tried
         seen.append(n)
         return took
 
-    assert most_at_once(seconds_of, n_most, 5.0, lambda: now)[0] == tried[-1]
+    assert largest_batch(seconds_of, n_most, 5.0, lambda: now)[0] == tried[-1]
     assert seen == tried
     assert now < 5.0 or tried == [1]
 
@@ -251,8 +253,8 @@ def test_the_peak_of_a_gpu_is_the_one_that_its_maker_gives():
 def test_a_folder_that_cannot_be_written_is_said(device, tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("CLRESAMPLE_CACHE", str(tmp_path / "file"))
-    monkeypatch.setattr(device, "remembered", Remembered(device.cl))
+    monkeypatch.setattr(device, "remembered", DeviceCache(device.cl))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeviceWarning)
-        assert main(["tune", "--forget", "--device", device.name]) == 2
+        assert main(["tune", "--clear", "--device", device.name]) == 2
     assert str(tmp_path / "file") in capsys.readouterr().err

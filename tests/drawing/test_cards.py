@@ -10,7 +10,7 @@ import pytest
 from clresample import (
     PSF,
     Detection,
-    Extended,
+    ExtendedSource,
     Frame,
     Grid,
     Observation,
@@ -31,7 +31,7 @@ def result():
     mask = np.zeros((24, 30), bool)
     mask[:4] = True
     o = Observation(data, GRI, FLAT, variance=1.0, mask=mask, channels=list("gri"), name="<Rubin>")
-    return deblend([o], [Extended(sky_deg=tuple(FLAT.sky(12, 14)))])
+    return deblend([o], [ExtendedSource(sky_deg=tuple(FLAT.sky(12, 14)))])
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def objects(result):
     operator = Resampler(FLAT, GRI, Grid.flat((10, 10), 0.4), GRI)
     image = np.where(np.indices(FLAT.shape)[0] > 3, 9.0, 0)
     found = Detection(
-        (Extended(position_px=(12, 14)), Extended(position_px=(3, 4))),
+        (ExtendedSource(position_px=(12, 14)), ExtendedSource(position_px=(3, 4))),
         Frame(FLAT, GRI.select([0])), np.array([20.5, 5.1]), ("<Rubin>", "all"), image,
         np.arange(2),
     )  # fmt: skip

@@ -10,11 +10,11 @@ import pytest
 from helpers.fields import mosaics_of
 
 from clresample import FieldOptions
-from clresample.fields.options import Progress
+from clresample.fields.execution.backend import TaskKind
+from clresample.fields.execution.cluster import DaskCluster
+from clresample.fields.options import RunProgress
 from clresample.fields.run import run_field
-from clresample.fields.strips import MOST_BYTES, STRIPS
-from clresample.fields.work.cluster import Cluster
-from clresample.fields.work.engine import Work
+from clresample.fields.strips import MAX_BYTES, STRIPS
 
 distributed = pytest.importorskip("distributed")
 
@@ -28,7 +28,7 @@ def scheduler():
         yield cluster.scheduler_address
 
 
-class _Said(Progress):
+class _Said(RunProgress):
     def __init__(self):
         self.lines = []
 
@@ -42,7 +42,7 @@ def test_a_cluster_ends_with_the_bytes_of_one_process(done, sky, scheduler, tmp_
     options = FieldOptions(scheduler=scheduler)
     run = run_field(mosaics_of(sky), tmp_path, options=options, progress=said)
     assert len(said.lines) == 1 and said.lines[0].startswith("http")
-    assert len({outcome.seat for stage, outcome in run.turns if stage == "fit"}) == 2
+    assert len({outcome.worker for stage, outcome in run.task_times if stage == "fit"}) == 2
     for name in ("catalogue.fits", "models.fits", "residual_Euclid.fits"):
         assert (tmp_path / name).read_bytes() == (folder / name).read_bytes(), name
 
@@ -74,10 +74,10 @@ def path_of(context, task):
 
 
 def test_workers_that_die_or_hang_cost_their_own_tasks_alone(scheduler, tmp_path):
-    cluster = Cluster(scheduler, (), 20.0, Progress())
+    cluster = DaskCluster(scheduler, (), 20.0, RunProgress())
     tasks = ["a", "die", "b", "raise", "hang", "c", "d"]
     try:
-        work, context = Work(nothing, act, path_of), Context(str(tmp_path))
+        work, context = TaskKind(nothing, act, path_of), Context(str(tmp_path))
         found = {o.task: o for o in cluster.run(work, context, tasks)}
     finally:
         cluster.close()
@@ -94,15 +94,15 @@ def rows_kept(context, task, given):
 
 
 def test_decoded_rows_are_held_to_a_part_of_a_workers_memory(scheduler, tmp_path):
-    cluster = Cluster(scheduler, (), 60.0, Progress())
+    cluster = DaskCluster(scheduler, (), 60.0, RunProgress())
     try:
-        (found,) = cluster.run(Work(nothing, rows_kept, path_of), Context(str(tmp_path)), ["a"])
+        (found,) = cluster.run(TaskKind(nothing, rows_kept, path_of), Context(str(tmp_path)), ["a"])
     finally:
         cluster.close()
-    assert found.value == int(0.1 * 3 * (1 << 30)) < MOST_BYTES
+    assert found.value == int(0.1 * 3 * (1 << 30)) < MAX_BYTES
 
 
 def test_what_does_not_answer_is_named(monkeypatch):
-    monkeypatch.setattr("clresample.fields.work.cluster.CONNECT_S", 2.0)  # [s]
+    monkeypatch.setattr("clresample.fields.execution.cluster.CONNECT_S", 2.0)  # [s]
     with pytest.raises(ValueError, match="scheduler 'tcp://127.0.0.1:1' does not answer"):
-        Cluster("tcp://127.0.0.1:1", (), None, Progress())
+        DaskCluster("tcp://127.0.0.1:1", (), None, RunProgress())

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clresample import PSF, Grid, NoiseCorrelation
-from clresample.fields.blends.patch import SIDE_PX, fit_box
+from clresample.fields.blends.cutouts import SIDE_PX, fit_box
 from clresample.fields.box import Box, box_within
 from clresample.fields.mosaic import ArrayPlane, Channel, Mosaic
 
@@ -20,7 +20,7 @@ def mosaic_of(grid, noise=None):
 def on_frame(mosaic, frame):
     """Pixels (n, 2) of a mosaic whose centres lie on a frame."""
     n, m = np.indices(mosaic.grid.shape)
-    return np.argwhere(Box.of(frame.shape).holds(mosaic.grid.positions_in(frame, n, m)))
+    return np.argwhere(Box.of(frame.shape).contains(mosaic.grid.positions_in(frame, n, m)))
 
 
 @pytest.mark.parametrize("angle", [0.0, 12.0, 45.0])
@@ -32,7 +32,7 @@ def test_boxes_hold_all_that_lies_on_the_frame_and_have_one_shape(angle, scale):
     for corner in [(100, 100), (101, 133), (57, 220), (240, 31), (163, 164)]:
         frame = REFERENCE.cutout(*corner, (64, 96))
         box, inside = fit_box(mosaic, frame), on_frame(mosaic, frame)
-        assert len(inside) and box.holds(inside).all()
+        assert len(inside) and box.contains(inside).all()
         tight = inside.max(axis=0) - inside.min(axis=0) + 1
         assert (np.array(box.shape) - tight <= SIDE_PX + 1).all()
         shapes.add(box.shape)

@@ -14,9 +14,9 @@ from clresample import FieldCutouts, FieldOptions, Settings, read_cutouts, run_f
 from clresample.cli import main
 from clresample.deblending.cutouts.separation import KINDS
 from clresample.fields import cutouts as module
+from clresample.fields.execution.group_results import GroupResults, GroupResultsFile
 from clresample.fields.models import ModelFile
-from clresample.fields.work.part import Part, PartFile
-from clresample.files.whole_file import FileError
+from clresample.files.atomic import FileError
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,7 @@ def test_a_fitted_shift_moves_what_is_rebuilt(done, sky):
     one = int(field.ids[np.argmax(field._models.spectra[:, 0] > 0)])
     still = field.cutout(one, "Euclid", "model", size=25).data
     row = np.array([0.0, 2.0, 0.0, 0.0, 0.0, 0.0])
-    field._models._offsets.update(dict.fromkeys(field._models.table["patch"].tolist(), row))
+    field._models._offsets.update(dict.fromkeys(field._models.table["fit_id"].tolist(), row))
     moved = field.cutout(one, "Euclid", "model", size=25).data
     a, b = moved[:, 3:-5], still[:, 5:-3]
     known = np.isfinite(a) & np.isfinite(b)
@@ -133,15 +133,17 @@ def test_a_fitted_shift_moves_what_is_rebuilt(done, sky):
 
 
 def test_offsets_are_read_back_and_parts_without_them_have_none(tmp_path):
-    part, patch = Part(), SimpleNamespace(number=3)
+    part, patch = GroupResults(), SimpleNamespace(number=3)
     part.add_offsets(patch, [[0, 0], [0.25, -0.5]], [0.0, 1.5])
     part.add_offsets(SimpleNamespace(number=4), np.zeros((2, 2)), np.zeros(2))
     (tmp_path / "a.fits").write_bytes(part.to_bytes())
-    assert PartFile(tmp_path / "a.fits").offsets().tolist() == [[3, 0, 0, 0.25, -0.5, 0, 1.5]]
+    assert GroupResultsFile(tmp_path / "a.fits").offsets().tolist() == [
+        [3, 0, 0, 0.25, -0.5, 0, 1.5]
+    ]
     with fits.open(tmp_path / "a.fits") as hdus:
         del hdus["OFFSETS"]
         hdus.writeto(tmp_path / "b.fits")
-    assert not len(PartFile(tmp_path / "b.fits").offsets())
+    assert not len(GroupResultsFile(tmp_path / "b.fits").offsets())
 
 
 @pytest.fixture
@@ -178,7 +180,7 @@ def test_the_command_writes_many_sources_into_one_file(copied, field, tmp_path, 
     more = ["--overwrite", "--quiet", "--group", "--what", "model", "--observation", "Euclid"]
     assert main([*arguments, *more, "--size", "2arcsec", "--unit", "uJy"]) == 0
     (one,) = read_cutouts(out)
-    assert one.meta["CUTKIND"] == "model" and str(one.unit) == "uJy" and one.shape == (20, 20)
+    assert one.meta["CUTKIND"] == "model" and str(one.noise_unit) == "uJy" and one.shape == (20, 20)
 
 
 @pytest.mark.parametrize(

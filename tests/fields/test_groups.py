@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from clresample.deblending.settings import Settings
-from clresample.fields.blends.cut import Limits, pieces_of
+from clresample.fields.blends.cut import FitLimits, cut_blend
 from clresample.fields.blends.plan import host_ids, source_ids
-from clresample.fields.blends.tiles import Tile
+from clresample.fields.blends.tiles import SearchTile
 from clresample.fields.box import Box
-from clresample.fields.work import fitting
-from clresample.fields.work.fitting import LARGE, _settings, is_large
-from clresample.fields.work.part import Part, PartFile
-from clresample.fields.work.rounds import _Parts
-from clresample.fields.work.searching import _lost
+from clresample.fields.execution import fitting
+from clresample.fields.execution.fitting import LARGE, _settings, is_large
+from clresample.fields.execution.group_results import GroupResults, GroupResultsFile
+from clresample.fields.execution.rounds import _PieceHistory
+from clresample.fields.execution.searching import _lost
 
 
 def chain(saddle, n=4):
@@ -29,9 +29,9 @@ def chain(saddle, n=4):
 def test_costly_blends_part_where_their_light_is_weak(saddle, n_pieces):
     light, places = chain(saddle)
     inside = np.ones(light.shape, bool)
-    _, number = pieces_of(light, inside, places, Limits(work=900), 0)
+    _, number = cut_blend(light, inside, places, FitLimits(work=900), 0)
     assert len(set(number.tolist())) == n_pieces
-    _, number = pieces_of(light, inside, places, Limits(work=10**6), 0)
+    _, number = cut_blend(light, inside, places, FitLimits(work=10**6), 0)
     assert set(number.tolist()) == {0}
 
 
@@ -39,9 +39,9 @@ def test_a_group_stays_in_one_piece():
     light, places = chain(4.0)
     inside = np.ones(light.shape, bool)
     groups = np.array([7, 1, 2, 7])
-    _, number = pieces_of(light, inside, places, Limits(work=900), 0, groups)
+    _, number = cut_blend(light, inside, places, FitLimits(work=900), 0, groups)
     assert number[0] == number[3] and len(set(number.tolist())) == 3
-    _, number = pieces_of(light, inside, places, Limits(sources=1), 0, groups)
+    _, number = cut_blend(light, inside, places, FitLimits(max_sources=1), 0, groups)
     assert len(set(number.tolist())) == 4
 
 
@@ -54,10 +54,14 @@ def test_hosts_are_found_by_their_position_and_else_the_brightest_stands_for_the
 
 
 def test_given_sources_of_a_lost_tile_are_kept_and_found_ones_cannot_be():
-    tile = Tile(0, Box(0, 0, 40, 50), Box(0, 0, 40, 50))
+    tile = SearchTile(0, Box(0, 0, 40, 50), Box(0, 0, 40, 50))
     found = _lost(tile, np.array([[10.0, 20.0], [70.0, 20.0]]))
-    assert found.positions.tolist() == [[10, 20]] and found.lit[10, 20] and not found.lit[10, 40]
-    assert not len(_lost(tile, None).positions) and not _lost(tile, None).lit.any()
+    assert (
+        found.positions.tolist() == [[10, 20]]
+        and found.footprint_mask[10, 20]
+        and not found.footprint_mask[10, 40]
+    )
+    assert not len(_lost(tile, None).positions) and not _lost(tile, None).footprint_mask.any()
 
 
 @pytest.mark.parametrize(
@@ -70,7 +74,7 @@ def test_given_sources_of_a_lost_tile_are_kept_and_found_ones_cannot_be():
     ],
 )
 def test_a_piece_moves_by_errors_and_by_part_of_its_flux(monkeypatch, flux, error, moves):
-    parts = _Parts(SimpleNamespace())
+    parts = _PieceHistory(SimpleNamespace())
     parts.names = {3: ["first", "second"]}
     monkeypatch.setattr(
         parts,
@@ -108,7 +112,7 @@ def test_what_is_found_beside_pieces_is_left_for_the_next_round(
     """A blend that is whole is fitted again at once; only the first round after the rough one, or
     the only one, searches."""
     patch = SimpleNamespace(number=3, siblings=siblings, box=Box(10, 20, 40, 50), sources=(0,))
-    cut = fitting._Cut(patch, fitting.Blend((), (), None), {}, 0.0)
+    cut = fitting._BlendCutout(patch, fitting.Blend((), (), None), {}, 0.0)
     row, blends = (77, 15.0, 27.0, 5), []
     seen = SimpleNamespace(weights=np.ones((1, 10, 10)))
     good, bad = (SimpleNamespace(observations=[seen], losses=[2, x]) for x in (4900.0, 5100.0))
@@ -116,7 +120,7 @@ def test_what_is_found_beside_pieces_is_left_for_the_next_round(
     monkeypatch.setattr(fitting, "_fits", lambda job, some, *limits: blends.extend(some) or some)
     n_round = 1 if siblings else 0
     for i in (n_round, 2):
-        part = Part()
+        part = GroupResults()
         cuts, _ = fitting._second_look(None, None, [cut], [good], part, i)
         assert fitting._second_look(None, None, [cut], [bad], part, i)[0] == [cut]
         if i == 2:
@@ -128,15 +132,15 @@ def test_what_is_found_beside_pieces_is_left_for_the_next_round(
 
 
 def test_what_was_found_is_carried_from_round_to_round(tmp_path):
-    parts = _Parts(SimpleNamespace(folder=tmp_path, plan=SimpleNamespace(patches=[])))
+    parts = _PieceHistory(SimpleNamespace(folder=tmp_path, plan=SimpleNamespace(patches=[])))
     rows = [(3, 77, 15.0, 27.0, 5), (4, 78, 16.5, 2.25, 78)]
     patches = {3: SimpleNamespace(pieces=2), 4: SimpleNamespace(pieces=2)}
     parts.job.plan.patches = patches
     for name, found in (("fit-1-000000", rows), ("fit-2-000000", [])):
-        part = Part(found=found)
+        part = GroupResults(found=found)
         (tmp_path / f"{name}.fits").write_bytes(part.to_bytes())
         parts.add({name: (3, 4)})
         assert parts.new == {row[0] for row in found}
     assert parts.found_in((4,)) == (rows[1],) and parts.found_in((3, 4)) == tuple(rows)
-    (table,) = PartFile(tmp_path / "fit-1-000000.fits").read("FOUND")
+    (table,) = GroupResultsFile(tmp_path / "fit-1-000000.fits").read("FOUND")
     assert table["host"].tolist() == [5, 78]

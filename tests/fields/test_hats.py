@@ -12,7 +12,7 @@ from clresample import FieldOptions, Grid
 from clresample.fields import hats
 from clresample.fields.hats import check_hats, healpix_index, partitions, write_hats
 from clresample.fields.run import run_field
-from clresample.files.whole_file import FileError
+from clresample.files.atomic import FileError
 
 pytest.importorskip("astropy_healpix")
 parquet = pytest.importorskip("pyarrow.parquet")

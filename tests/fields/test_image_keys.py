@@ -8,13 +8,13 @@ from astropy.io import fits
 from astropy.table import QTable, Table
 
 from clresample import PSF, Grid
+from clresample.fields.field_toml.field_file import read_field
+from clresample.fields.field_toml.scene_file import read_scene
 from clresample.fields.mosaic import Mosaic
 from clresample.fields.psfs.psfex import PSFExPSF
-from clresample.fields.reading.field_file import read_field
-from clresample.fields.reading.scene_file import read_scene
 from clresample.fields.run import run_field
+from clresample.files.atomic import FileError
 from clresample.files.scene_keys import SceneError
-from clresample.files.whole_file import FileError
 
 SHAPE = (40, 44)
 TOML = """

@@ -5,9 +5,9 @@ import pytest
 from astropy.io import fits
 
 from clresample import PSF, FunctionPSF, Grid
-from clresample.fields.box import Box, sized_up
-from clresample.fields.mosaic import ArrayPlane, Channel, FilePlane, Mosaic, NumberPlane
-from clresample.files.whole_file import FileError
+from clresample.fields.box import Box, round_up_size
+from clresample.fields.mosaic import ArrayPlane, Channel, ConstantPlane, FilePlane, Mosaic
+from clresample.files.atomic import FileError
 
 SHAPE = (60, 90)
 
@@ -23,7 +23,7 @@ def grid(angle_deg=0.0, scale=0.1, shape=SHAPE):
 
 
 def channel(data, **given):
-    return Channel("a", ArrayPlane(data), given.pop("weight", NumberPlane(1.0)), **given)
+    return Channel("a", ArrayPlane(data), given.pop("weight", ConstantPlane(1.0)), **given)
 
 
 def test_plain_and_compressed_files_and_planes_of_cubes_read_as_the_array(tmp_path, image):
@@ -77,7 +77,7 @@ def test_weights_come_from_weights_variances_and_rms_and_bits_of_the_mask(image)
     for kind, plane in (("weight", sigma**-2.0), ("variance", sigma**2), ("rms", sigma)):
         plane = np.where(np.isinf(plane) & (kind == "weight"), 0, plane)
         made = channel(
-            image, weight=ArrayPlane(plane), kind=kind, mask=ArrayPlane(flags), mask_value=4
+            image, weight=ArrayPlane(plane), weight_kind=kind, mask=ArrayPlane(flags), mask_value=4
         )
         mosaic = Mosaic("m", grid(), (made,), PSF.gaussian(1.5))
         weights = mosaic.observation(Box(0, 0, 10, 10)).weights[0]
@@ -105,8 +105,8 @@ def test_the_box_on_a_grid_holds_all_its_pixels_and_few_others():
     patch = grid().cutout(10, 20, (32, 48))
     box = mosaic.box_on(patch)
     everywhere = wide.positions_in(patch, *np.indices(wide.shape))
-    inside = np.argwhere(Box.of(patch.shape).holds(everywhere))
-    assert len(inside) and Box(*box).holds(inside).all()
+    inside = np.argwhere(Box.of(patch.shape).contains(everywhere))
+    assert len(inside) and Box(*box).contains(inside).all()
     assert box.area < 3.5 * len(inside)
     assert mosaic.box_on(grid().cutout(5000, 0, (32, 32))).area == 0
 
@@ -126,9 +126,14 @@ def test_what_does_not_go_together_is_refused(image, given, message):
 
 def test_boxes():
     a, b = Box(0, 0, 10, 20), Box(5, 15, 12, 30)
-    assert a.meet(b) == (5, 15, 10, 20) and a.join(b) == (0, 0, 12, 30)
-    assert a.meet(Box(20, 20, 30, 30)).area == 0
-    assert a.meet(b).within(b) == (0, 0, 5, 5)
-    assert sized_up(Box(10, 10, 41, 43), 32).shape == (32, 64)
-    assert sized_up(Box(10, 10, 41, 43), 32).meet(Box(10, 10, 41, 43)) == (10, 10, 41, 43)
-    assert a.holds([(-0.5, 0), (9.5, 0), (9.49, 19.4)]).tolist() == [True, False, True]
+    assert a.intersection(b) == (5, 15, 10, 20) and a.union(b) == (0, 0, 12, 30)
+    assert a.intersection(Box(20, 20, 30, 30)).area == 0
+    assert a.intersection(b).relative_to(b) == (0, 0, 5, 5)
+    assert round_up_size(Box(10, 10, 41, 43), 32).shape == (32, 64)
+    assert round_up_size(Box(10, 10, 41, 43), 32).intersection(Box(10, 10, 41, 43)) == (
+        10,
+        10,
+        41,
+        43,
+    )
+    assert a.contains([(-0.5, 0), (9.5, 0), (9.49, 19.4)]).tolist() == [True, False, True]

@@ -16,8 +16,8 @@ from clresample.fields.box import Box
 from clresample.fields.mosaic import FilePlane
 from clresample.fields.run import run_field
 from clresample.fields.strips import STRIPS
+from clresample.files.atomic import FileError
 from clresample.files.tables import read_catalogue
-from clresample.files.whole_file import FileError
 
 
 def test_every_column_has_its_unit_and_a_description(done):
@@ -33,9 +33,9 @@ def test_every_column_has_its_unit_and_a_description(done):
         assert about[b"description"].decode() == rows[name].info.description
         assert about.get(b"unit", b"").decode() == str(getattr(rows[name], "unit", None) or "")
     one, other = read_catalogue(folder / "catalogue.parquet"), rows
-    assert [one[n].unit for n in one.colnames] == [other[n].unit for n in one.colnames]
+    assert [one[n].noise_unit for n in one.colnames] == [other[n].unit for n in one.colnames]
     np.testing.assert_array_equal(one["colour_err_VIS_i"].value, other["colour_err_VIS_i"].value)
-    blends = QTable.read(folder / "blends.ecsv")
+    blends = QTable.read(folder / "fit_table.ecsv")
     assert all(blends[name].info.description for name in blends.colnames)
     assert blends["seconds"].unit == "s"
 
@@ -74,7 +74,7 @@ def test_a_run_that_fails_leaves_no_decoded_rows(sky, tmp_path, monkeypatch):
         STRIPS.n_bytes = 1
         raise MemoryError
 
-    monkeypatch.setattr("clresample.fields.run.take_look", broken)
+    monkeypatch.setattr("clresample.fields.run.prepare_search", broken)
     with pytest.raises(MemoryError):
         run_field(mosaics_of(sky)[:1], tmp_path / "out", options=FieldOptions())
     assert STRIPS.n_bytes == 0

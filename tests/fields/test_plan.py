@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from clresample.fields.blends.cut import Limits, pieces_of
-from clresample.fields.blends.link import link
-from clresample.fields.blends.plan import STEP_PX, Plan, make_plan, source_ids
-from clresample.fields.blends.search import Found, grown_footprints
+from clresample.fields.blends.cut import FitLimits, cut_blend
+from clresample.fields.blends.link import link_footprints
+from clresample.fields.blends.plan import STEP_PX, FitPlan, make_fit_plan, source_ids
+from clresample.fields.blends.search import TileDetections, grown_footprints
 from clresample.fields.blends.tiles import tiles_of
 from clresample.fields.box import Box
 
@@ -18,7 +18,10 @@ def test_cores_of_tiles_fill_the_region_once():
     count = np.zeros((600, 600), int)
     for tile in tiles:
         assert max(tile.core.shape) <= 128
-        assert tile.outer.meet(tile.core) == tile.core and region.meet(tile.outer) == tile.outer
+        assert (
+            tile.outer.intersection(tile.core) == tile.core
+            and region.intersection(tile.outer) == tile.outer
+        )
         count[tile.core.slices] += 1
     assert (count[region.slices] == 1).all() and count.sum() == region.area
     with pytest.raises(ValueError, match="size 0"):
@@ -33,10 +36,10 @@ def test_links_do_not_depend_on_tiles(size):
     tiles = tiles_of(region, size, 10)
 
     def found(number):
-        part = lit[tiles[number].core.within(region).slices]
-        return Found(np.zeros((0, 2)), np.zeros(0), part * 3.0, part)
+        part = lit[tiles[number].core.relative_to(region).slices]
+        return TileDetections(np.zeros((0, 2)), np.zeros(0), part * 3.0, part)
 
-    footprints = link(tiles, found, region)
+    footprints = link_footprints(tiles, found, region)
     expected, n = ndimage.label(lit, np.ones((3, 3)))
     pairs = np.unique(np.stack([footprints.labels, expected]).reshape(2, -1), axis=1)
     assert pairs.shape[1] == n + 1  # one to one
@@ -67,16 +70,18 @@ def test_a_giant_parts_where_its_light_is_weakest():
     positions = np.array([(30, 20), (30, 34), (30, 50), (30, 90), (30, 104), (30, 160)], float)
     light = blobs(positions, [50, 20, 30, 40, 25, 60]) + 2.5
     inside = np.ones(light.shape, bool)
-    territory, piece = pieces_of(light, inside, positions, Limits(sources=3), 8)
+    territory, piece = cut_blend(light, inside, positions, FitLimits(max_sources=3), 8)
     assert piece.tolist() == [0, 0, 0, 1, 1, 1]
     assert (territory > 0).all()
     for s, (y, x) in enumerate(positions.astype(int)):
         assert territory[y, x] == piece[s] + 1
     column = np.flatnonzero(np.diff(territory[30]))[0]
     assert abs(column - light[30, 50:90].argmin() - 50) <= 2
-    _, whole = pieces_of(light, inside, positions, Limits(sources=10), 8)
+    _, whole = cut_blend(light, inside, positions, FitLimits(max_sources=10), 8)
     assert set(whole) == {0}
-    _, small = pieces_of(light, inside, positions, Limits(sources=10, pixels=76 * 100), 8)
+    _, small = cut_blend(
+        light, inside, positions, FitLimits(max_sources=10, max_pixels=76 * 100), 8
+    )
     assert len(set(small)) > 1
 
 
@@ -89,13 +94,13 @@ def plan_of(n=40, **given):
     for y, x in np.floor(positions + 0.5).astype(int):
         light[y, x] = 10
     lit = ndimage.distance_transform_edt(light == 0) < 20
-    found = Found(positions, peaks, ndimage.gaussian_filter(light, 4) * 100, lit)
-    footprints = link(tiles_of(region, 500, 0), lambda number: found, region)
-    return make_plan(positions, peaks, footprints, region, **given), footprints
+    found = TileDetections(positions, peaks, ndimage.gaussian_filter(light, 4) * 100, lit)
+    footprints = link_footprints(tiles_of(region, 500, 0), lambda number: found, region)
+    return make_fit_plan(positions, peaks, footprints, region, **given), footprints
 
 
 def test_every_source_is_in_one_patch_and_one_group_and_its_pixel_is_labelled():
-    plan, footprints = plan_of(limits=Limits(sources=6), memory=1 << 24, n_channels=3)
+    plan, footprints = plan_of(limits=FitLimits(max_sources=6), memory=1 << 24, n_channels=3)
     assert sorted(s for p in plan.patches for s in p.sources) == list(range(40))
     assert sorted(n for g in plan.groups for n in g) == list(range(len(plan.patches)))
     assert any(p.pieces > 1 for p in plan.patches)
@@ -106,9 +111,9 @@ def test_every_source_is_in_one_patch_and_one_group_and_its_pixel_is_labelled():
             assert footprints.labels[y, x] == patch.number + 1
         for other in patch.siblings:
             assert plan.patches[other].parent == patch.parent
-    pieces = {n for g in plan.giants for n in g}
+    pieces = {n for g in plan.cut_groups for n in g}
     assert pieces == {p.number for p in plan.patches if p.pieces > 1}
-    assert Plan.from_json(plan.to_json()).patches == plan.patches
+    assert FitPlan.from_json(plan.to_json()).patches == plan.patches
 
 
 def test_ids_do_not_depend_on_the_run_and_say_where():
@@ -125,14 +130,14 @@ def test_a_source_in_a_halo_over_the_limits_keeps_the_pixels_near_it():
     light = blobs(positions, [50, 20, 30], (300, 300)) + 3
     light += 5 / (1 + np.hypot(*(np.indices(light.shape) - 150)) / 50)
     inside = np.ones(light.shape, bool)
-    limits = Limits(sources=2, pixels=100 * 100)
-    territory, piece = pieces_of(light, inside, positions, limits, 8)
+    limits = FitLimits(max_sources=2, max_pixels=100 * 100)
+    territory, piece = cut_blend(light, inside, positions, limits, 8)
     for number, box in enumerate(ndimage.find_objects(territory)):
         n_y, n_x = (s.stop - s.start for s in box)
-        assert (n_y + 16) * (n_x + 16) <= limits.pixels
+        assert (n_y + 16) * (n_x + 16) <= limits.max_pixels
         assert number in piece
     for s, (y, x) in enumerate(positions.astype(int)):
         assert territory[y, x] == piece[s] + 1
-    few = Limits(sources=2, memory=4 * 60 * 60 * (20 + 3 * 11), n_channels=3)
-    territory, _ = pieces_of(light, inside, positions, few, 8)
+    few = FitLimits(max_sources=2, max_bytes=4 * 60 * 60 * (20 + 3 * 11), n_channels=3)
+    territory, _ = cut_blend(light, inside, positions, few, 8)
     assert max(s.stop - s.start for box in ndimage.find_objects(territory) for s in box) <= 60 - 16

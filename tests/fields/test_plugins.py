@@ -18,12 +18,12 @@ from clresample.sky.grid import Grid
 MODULE = """
 import numpy as np
 from clresample import Grid, Mosaic, PSF
-from clresample.fields.mosaic import Channel, FilePlane, NumberPlane
+from clresample.fields.mosaic import Channel, FilePlane, ConstantPlane
 
 
 def read_dots(path, **given):
     grid = Grid.from_wcs(Grid.flat((20, 21), 0.2).to_wcs(ra_deg=10, dec_deg=2), (20, 21))
-    channel = Channel(given.get("channels", ["dots"])[0], FilePlane(path[0], 0), NumberPlane(1.0))
+    channel = Channel(given.get("channels", ["dots"])[0], FilePlane(path[0], 0), ConstantPlane(1.0))
     given["inputs"]["dots"] = path[0]
     return Mosaic(given.get("name", "Dots"), grid, (channel,), given["psf"](grid))
 

@@ -15,9 +15,9 @@ import pytest
 from helpers.checkout import ROOT
 
 from clresample import DeviceError, FieldOptions
-from clresample.fields.options import Progress
-from clresample.fields.work.engine import engine_of
-from clresample.fields.work.pool import Pool
+from clresample.fields.execution.backend import make_backend
+from clresample.fields.execution.pool import WorkerPool
+from clresample.fields.options import RunProgress
 
 
 def work(folder, task):
@@ -35,7 +35,7 @@ def work(folder, task):
 
 
 def ran(function, contexts, tasks, n_workers, again=None, **given):
-    with Pool(n_workers, **given) as pool:
+    with WorkerPool(n_workers, **given) as pool:
         return list(pool.run(function, contexts, tasks, again))
 
 
@@ -79,7 +79,7 @@ def whose(folder, task):
 
 
 def test_all_workers_begin_before_they_are_asked(tmp_path):
-    with Pool(2) as pool:
+    with WorkerPool(2) as pool:
         pool.begin(whose)
         begun = {child.pid for child in multiprocessing.active_children()}
         found = [o.value for o in pool.run(whose, [str(tmp_path)], ["a"])]
@@ -89,7 +89,7 @@ def test_all_workers_begin_before_they_are_asked(tmp_path):
 
 
 def test_a_worker_that_dies_before_it_is_asked_is_replaced(tmp_path):
-    with Pool(1) as pool:
+    with WorkerPool(1) as pool:
         pool.begin(whose)
         (first,) = multiprocessing.active_children()
         first.kill()
@@ -153,7 +153,7 @@ def shared_there(shared, task):
 
 
 def test_a_stage_leaves_nothing_of_the_one_before():
-    with Pool(1) as pool:
+    with WorkerPool(1) as pool:
         for _ in range(2):  # the second one's first task still meets the first one's context
             found = [o.value for o in pool.run(shared_there, [Shared()], range(3))]
             assert found[1:] == [1, 1]
@@ -181,7 +181,7 @@ def test_what_a_task_leaves_behind_is_freed_before_the_next(n_workers):
 
 
 def test_workers_live_on_from_one_run_to_the_next():
-    with Pool(2) as pool:
+    with WorkerPool(2) as pool:
         first = {o.value for o in pool.run(name_of_process, [None], range(8))}
         second = {o.value for o in pool.run(name_of_process, ["other"], range(8))}
     assert {pid for pid, _ in second} <= {pid for pid, _ in first}
@@ -196,9 +196,9 @@ def name_of_process(context, task):
 PARENT = """
 import os, sys
 sys.path[:0] = {paths!r}
-from test_pool import Pool, say_and_sleep
+from test_pool import WorkerPool, say_and_sleep
 if __name__ == "__main__":
-    with Pool(1) as pool:
+    with WorkerPool(1) as pool:
         list(pool.run(say_and_sleep, [{folder!r}], ["task"]))
 """
 
@@ -235,11 +235,11 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path):
 def test_a_cluster_without_dask_is_refused_with_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ImportError, match="pip install distributed"):
-        engine_of(FieldOptions(scheduler="tcp://127.0.0.1:8786"), Progress())
+        make_backend(FieldOptions(scheduler="tcp://127.0.0.1:8786"), RunProgress())
 
 
 def test_each_device_has_a_worker_at_least():
-    engine = engine_of(FieldOptions(device=["a", "b"], workers=3), Progress())
-    assert engine.n_workers == 3 and engine.sharing == [("a", 2), ("b", 2)]
-    assert engine_of(FieldOptions(device=["a", "b"]), Progress()).n_workers == 2
-    assert engine_of(FieldOptions(device="a"), Progress()).n_workers == 0
+    engine = make_backend(FieldOptions(device=["a", "b"], workers=3), RunProgress())
+    assert engine.n_workers == 3 and engine.device_shares == [("a", 2), ("b", 2)]
+    assert make_backend(FieldOptions(device=["a", "b"]), RunProgress()).n_workers == 2
+    assert make_backend(FieldOptions(device="a"), RunProgress()).n_workers == 0

@@ -9,12 +9,12 @@ from astropy.table import Table
 
 from clresample import PSF, FunctionPSF, Grid
 from clresample.adapters.photutils import psf_of
+from clresample.fields.psfs.combined import ConstantPSF, PerBandPSF
 from clresample.fields.psfs.gridded import GriddedPSF
-from clresample.fields.psfs.psf_field import BandPSFs, ConstantPSF
 from clresample.fields.psfs.psfex import PSFExPSF
 from clresample.fields.psfs.read import read_psf_field
-from clresample.fields.psfs.sampled import PSFCells, PSFCube
-from clresample.files.whole_file import FileError
+from clresample.fields.psfs.sampled import CellPSF, ScatteredPSF
+from clresample.files.atomic import FileError
 
 N = 25
 
@@ -45,7 +45,7 @@ def width(y, x):
 
 def test_a_cube_gives_its_own_images_and_in_between_their_mean_in_second_moments():
     images = np.stack([gaussian(width(*p)) for p in places()])
-    field = PSFCube(images, places())
+    field = ScatteredPSF(images, places())
     for image, (y, x) in zip(images, places(), strict=True):
         np.testing.assert_allclose(field.psf_at(y, x).images[0], image, atol=1e-15)
     ends = [second_moment(field.psf_at(0, x)) for x in (0, 299)]
@@ -58,30 +58,30 @@ def test_a_cube_gives_its_own_images_and_in_between_their_mean_in_second_moments
 
 def test_a_cube_takes_the_nearest_image_outside_and_with_too_few_places():
     images = np.stack([gaussian(width(*p)) for p in places()])
-    outside = PSFCube(images, places()).psf_at(-50, -80)
+    outside = ScatteredPSF(images, places()).psf_at(-50, -80)
     np.testing.assert_allclose(outside.images[0], images[0])
     for few in ([0, 1], [0, 0, 1]):  # two, and three on a line
-        field = PSFCube(images[few], places()[few])
+        field = ScatteredPSF(images[few], places()[few])
         np.testing.assert_allclose(field.psf_at(30, 250).images[0], images[1])
 
 
 def test_a_cube_refuses_positions_that_do_not_go_with_its_images():
     with pytest.raises(ValueError, match=r"positions has the shape \(4, 2\), must be \(3, 2\)"):
-        PSFCube(np.ones((3, 5, 5)), places())
+        ScatteredPSF(np.ones((3, 5, 5)), places())
     with pytest.raises(ValueError, match="finite"):
-        PSFCube(np.ones((4, 5, 5)), places()).psf_at(np.nan, 0)
+        ScatteredPSF(np.ones((4, 5, 5)), places()).psf_at(np.nan, 0)
 
 
 def test_cells_are_constant_inside_and_an_empty_one_takes_its_neighbours():
     images = np.stack([[gaussian(1.5 + 0.1 * (3 * j + i)) for i in range(3)] for j in range(2)])
     images[0, 1] = np.nan
-    field = PSFCells(images, (100, 100))
+    field = CellPSF(images, (100, 100))
     np.testing.assert_allclose(field.psf_at(99.4, 0).images[0], images[0, 0])
     np.testing.assert_allclose(field.psf_at(99.6, 0).images[0], images[1, 0])
     np.testing.assert_allclose(field.psf_at(80, 150).images[0], images[1, 1])
     np.testing.assert_allclose(field.psf_at(-10, 400).images[0], images[0, 2])
     with pytest.raises(ValueError, match="all 6 cells are empty"):
-        PSFCells(np.zeros((2, 3, 5, 5)), 10)
+        CellPSF(np.zeros((2, 3, 5, 5)), 10)
 
 
 def psfex_file(path):
@@ -213,13 +213,13 @@ def test_photutils_reads_files_of_gridded_psfs(tmp_path, grid):
 
 def test_bands_of_fields_with_smaller_stamps_keep_their_centres():
     small, large = ConstantPSF(PSF(gaussian(1.0, 11))), ConstantPSF(PSF(gaussian(2.0, 25)))
-    psf = BandPSFs([small, large]).psf_at(0, 0)
+    psf = PerBandPSF([small, large]).psf_at(0, 0)
     assert psf.n_bands == 2
     np.testing.assert_allclose(psf.images[0, 7:18, 7:18], gaussian(1.0, 11))
     np.testing.assert_array_equal(psf.center, [[12, 12], [12, 12]])
     other = ConstantPSF(PSF(gaussian(2.0, 25), spacing=0.5))
     with pytest.raises(ValueError, match="samples .* px apart"):
-        BandPSFs([small, other]).psf_at(0, 0)
+        PerBandPSF([small, other]).psf_at(0, 0)
 
 
 def test_a_function_is_asked_with_row_and_column():

@@ -10,12 +10,12 @@ from helpers.survey_files import SHAPE, noise_image, psf_image, sky_grid, write_
 from clresample import PSF, read_euclid_mer, read_legacy_survey
 from clresample.cli import main
 from clresample.fields.box import Box
-from clresample.fields.psfs.sampled import PSFCube
+from clresample.fields.field_toml.field_file import read_field
+from clresample.fields.psfs.sampled import ScatteredPSF
 from clresample.fields.readers.formats import read_survey
 from clresample.fields.readers.writers import write_mer_tile
-from clresample.fields.reading.field_file import read_field
+from clresample.files.atomic import FileError
 from clresample.files.scene_keys import SceneError
-from clresample.files.whole_file import FileError
 
 WHOLE = Box.of(SHAPE)
 
@@ -166,7 +166,7 @@ def test_a_map_of_no_widths_is_refused(tmp_path):
 def test_a_psf_may_be_given_in_every_form(tmp_path):
     write_brick(tmp_path, skip=("psfsize",))
     one = PSF(psf_image())
-    for psf in (one, [one, one], lambda grid: PSFCube(psf_image()[None], [(3, 4)])):
+    for psf in (one, [one, one], lambda grid: ScatteredPSF(psf_image()[None], [(3, 4)])):
         assert read_legacy_survey(tmp_path, psf=psf).psf.psf_at(1, 1).images.shape[1:] == (15, 15)
     with pytest.raises(ValueError, match="psf has 3 values for 2 bands"):
         read_legacy_survey(tmp_path, psf=[one] * 3)

@@ -11,9 +11,9 @@ from clresample import PSF, Grid
 from clresample.cli import main
 from clresample.fields.background import find_background
 from clresample.fields.box import Box
-from clresample.fields.reading.field_file import read_field
-from clresample.fields.reading.headers import mask_value, zero_point
-from clresample.fields.reading.keys import parse_field
+from clresample.fields.field_toml.field_file import read_field
+from clresample.fields.field_toml.headers import mask_value, zero_point
+from clresample.fields.field_toml.keys import parse_field
 from clresample.files.scene_keys import SceneError
 
 SHAPE = (300, 260)
@@ -87,14 +87,16 @@ def test_a_bright_galaxy_is_not_taken_for_sky():
 
 
 def test_options_of_the_file(files):
-    rest = "[field]\nnumber = 7\ntile_px = 500\nmax_sources = 12\n[detection]\nthreshold = 4.5\n"
+    rest = (
+        "[field]\nfield_number = 7\ntile_px = 500\nmax_sources = 12\n[detection]\nthreshold = 4.5\n"
+    )
     options = field_of(
         files,
         'variance = "var.fits"',
         rest + "[fit]\nmax_iter = 9\npsf_tolerance = 0.01\nfit_shifts = true\n",
     ).options
     assert (options.field_number, options.tile_px, options.threshold) == (7, 500, 4.5)
-    assert options.limits.sources == 12 and options.settings.max_iter == 9
+    assert options.limits.max_sources == 12 and options.settings.max_iter == 9
     assert options.settings.psf_tolerance == 0.01 and options.settings.fit_shifts
 
 
@@ -167,8 +169,8 @@ def test_commands_from_simulation_to_catalogue_in_worker_processes(tmp_path, cap
     before = (out / "catalogue.fits").read_bytes()
     assert main(command) == 2  # holds a run
     capsys.readouterr()
-    assert main([*command[:3], str(tmp_path / "other"), "--memory", "100M"]) == 2
-    assert "--memory is 100M, must be 1G or more" in capsys.readouterr().err
+    assert main([*command[:3], str(tmp_path / "other"), "--worker-memory", "100M"]) == 2
+    assert "--worker-memory is 100M, must be 1G or more" in capsys.readouterr().err
     mistaken = ["field", str(sky / "field.toml"), "-o", str(tmp_path / "other"), "--quiet"]
     assert main([*mistaken, "--device", "no such device"]) == 2
     assert main([*mistaken, "--workers", "0"]) == 0  # of the mistake nothing is left in the way

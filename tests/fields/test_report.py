@@ -17,9 +17,9 @@ from helpers.fields import mosaics_of
 
 from clresample import write_report
 from clresample.fields.mosaic import ArrayPlane
-from clresample.fields.report.folder import read_run
+from clresample.fields.report.run_folder import read_run
 from clresample.fields.run import run_field
-from clresample.files.whole_file import FileError
+from clresample.files.atomic import FileError
 
 
 class Elements(HTMLParser):
@@ -123,7 +123,7 @@ def test_an_unfinished_run_shows_what_is_done(done, tmp_path):
     _, data, text = page_of(tmp_path)
     assert "This run has not finished" in text and data["instruments"] == []
     assert len(data["sources"]["id"]) == rows
-    fits_done = len(QTable.read(folder / "blends.ecsv"))
+    fits_done = len(QTable.read(folder / "fit_table.ecsv"))
     assert re.search(rf"1 of 1 tiles searched, {fits_done} of \d+ blends fitted", text)
     parts[-1].unlink()
     parts[0].write_bytes(parts[0].read_bytes()[:4000])
@@ -172,7 +172,7 @@ def test_names_from_files_stay_texts(tmp_path):
     )
     plain, _, _ = page_of(tmp_path)
     told = json.loads((tmp_path / "provenance.json").read_text())
-    told |= {"lost_tiles": {"3": HOSTILE}, "device": HOSTILE, "packages": {HOSTILE: HOSTILE}}
+    told |= {"failed_tiles": {"3": HOSTILE}, "device": HOSTILE, "packages": {HOSTILE: HOSTILE}}
     told["inputs"] = {HOSTILE: {"file": HOSTILE, "sha256": HOSTILE}}
     (tmp_path / "provenance.json").write_text(json.dumps(told))
     elements, data, text = page_of(tmp_path)
@@ -211,11 +211,11 @@ def test_what_cannot_be_read_is_said(tmp_path):
     (folder / "model_Rubin.fits").unlink()
     path = folder / "residual_Euclid.fits"
     path.write_bytes(path.read_bytes()[:-60000])
-    (folder / "blends.ecsv").unlink()
+    (folder / "fit_table.ecsv").unlink()
     (folder / "provenance.json").write_text("{")
     report = write_report(folder)
     notes = " | ".join(report.notes)
-    for name in ("model_Rubin.fits", "residual_Euclid.fits", "blends.ecsv", "provenance.json"):
+    for name in ("model_Rubin.fits", "residual_Euclid.fits", "fit_table.ecsv", "provenance.json"):
         assert name in notes
     places = tmp_path / "places.ecsv"
     QTable({"y": [1.0], "x": [1.0]}).write(places, format="ascii.ecsv")

@@ -15,13 +15,13 @@ from helpers.field_folder import SIGMA, write_folder
 
 from clresample import Grid
 from clresample.fields.box import Box
-from clresample.fields.report import alone, codes, pyramid, shades
+from clresample.fields.report import alone, codes, colours, pyramid
 from clresample.fields.report.charts import chi2_numbers, chi2_palette, magnitudes
-from clresample.fields.report.content import flag_names
-from clresample.fields.report.folder import Run, read_run
-from clresample.fields.report.html import data_block, number
+from clresample.fields.report.html import data_block, format_number
+from clresample.fields.report.page_data import flag_names
 from clresample.fields.report.png import png
-from clresample.fields.report.svg import Chart, Scale
+from clresample.fields.report.run_folder import RunFolder, read_run
+from clresample.fields.report.svg import Chart, ChartAxis
 from clresample.fields.report.truth import FOUND_PX, matched
 
 
@@ -84,7 +84,7 @@ def test_the_first_stretch_shows_the_three_channels_of_the_most_signal():
     sigma = np.array([1.0, 2.0, 4.0, 4.0])
     light = np.zeros((4, 400))
     light[:, :40] = np.array([50.0, 100.0, 400.0, 1.0])[:, None]
-    stretch = shades.stretch_of(light, sigma)
+    stretch = colours.stretch_of(light, sigma)
     assert stretch.chosen == (0, 1, 2)
     np.testing.assert_allclose(stretch.balance * light[:3].sum(axis=1), light[:3].sum() / 3)
     np.testing.assert_allclose(stretch.whites, [50, 100, 400, 8 * 2.5 * 4])
@@ -142,7 +142,7 @@ def test_means_of_blocks_leave_out_what_is_not_there():
 def test_tiles_lie_where_their_pixels_are(scale):
     frame = Grid.flat((300, 280), 0.1, center_arcsec=(1.0, -2.0))
     grid = Grid.flat((160, 150), 0.2, angle_deg=25, flip=True)
-    place = pyramid.placed(grid, frame, (8, 16), (24, 20), scale)
+    place = pyramid.frame_transform(grid, frame, (8, 16), (24, 20), scale)
     u, v = 3.7, 11.2  # column and row in the tile, from its outer corner
     pixel = (8 + v) * scale - 0.5, (16 + u) * scale - 0.5
     y, x = frame.pixel(*grid.sky(*pixel))
@@ -154,7 +154,7 @@ def test_a_pyramid_is_of_the_mosaic_and_its_chi2_of_the_noise(tmp_path):
     write_folder(tmp_path, n_px=600, n_sources=20)
     euclid, rubin = read_run(tmp_path).instruments
     assert (euclid.name, rubin.name) == ("Euclid", "Rubin")
-    np.testing.assert_allclose(rubin.sigma, SIGMA, rtol=0.03)
+    np.testing.assert_allclose(rubin.noise_sigma, SIGMA, rtol=0.03)
     made = pyramid.pyramid_of(rubin, euclid.grid, 10**8)
     assert [level["scale"] for level in made.levels] == [1, 2]
     assert [len(level["model"]) for level in made.levels] == [4, 1]
@@ -197,10 +197,10 @@ def test_the_nearest_pairs_are_taken_first_each_once():
 @pytest.mark.parametrize(
     ("scale", "texts"),
     [
-        (Scale(-1.05, 1.05, ""), ["−1.0", "−0.5", "0.0", "0.5", "1.0"]),
-        (Scale(0, 2100, ""), ["0", "500", "1000", "1500", "2000"]),
-        (Scale(0.9, 1.1e6, "", True), ["1", "10", "100", "1000", "10000", "10⁵", "10⁶"]),
-        (Scale(3, 40, "", True), ["5", "10", "20"]),
+        (ChartAxis(-1.05, 1.05, ""), ["−1.0", "−0.5", "0.0", "0.5", "1.0"]),
+        (ChartAxis(0, 2100, ""), ["0", "500", "1000", "1500", "2000"]),
+        (ChartAxis(0.9, 1.1e6, "", True), ["1", "10", "100", "1000", "10000", "10⁵", "10⁶"]),
+        (ChartAxis(3, 40, "", True), ["5", "10", "20"]),
     ],
 )
 def test_axes_have_round_numbers(scale, texts):
@@ -210,7 +210,7 @@ def test_axes_have_round_numbers(scale, texts):
 @pytest.mark.parametrize("values", [[], [np.nan], [3.0], [0.0, -1.0], [1e-30, 1e30]])
 @pytest.mark.parametrize("log", [False, True])
 def test_any_values_have_an_axis(values, log):
-    scale = Scale.over(values, "x", log=log)
+    scale = ChartAxis.over(values, "x", log=log)
     assert np.isfinite([scale.low, scale.high]).all() and scale.low < scale.high
     chart = Chart(scale, scale, "a <b>")
     chart.points(values, values)
@@ -219,13 +219,15 @@ def test_any_values_have_an_axis(values, log):
 
 
 def test_many_points_become_cells():
-    chart = Chart(Scale(0, 1, "x"), Scale(0, 1, "y"), "many")
+    chart = Chart(ChartAxis(0, 1, "x"), ChartAxis(0, 1, "y"), "many")
     chart.points(*np.random.default_rng(3).uniform(0, 1, (2, 50_000)))
     assert 'class="cells s3"' in chart.svg and len(chart.svg) < 60_000
 
 
 def test_numbers_flags_and_magnitudes_are_told():
-    assert number(-1.5) == "−1.5" and number(float("nan")) == number(None) == "–"
+    assert (
+        format_number(-1.5) == "−1.5" and format_number(float("nan")) == format_number(None) == "–"
+    )
     assert flag_names(0) == "none" and flag_names(66 + 4096) == "NOT_CONVERGED, MISFIT, 4096"
     np.testing.assert_allclose(magnitudes(np.array([1.0, 100.0]), "uJy"), [23.9, 18.9])
     assert np.isnan(magnitudes(np.array([-1.0]), "uJy")).all()
@@ -241,5 +243,5 @@ def test_a_part_of_a_flat_field_knows_where_it_begins():
     one = SimpleNamespace(grid=Grid.from_wcs(placed, (280, 170)))
     settings = {"part": [2, 2, 64], "corner": whole.sky(0, 0).tolist()}
     rows = QTable({"y_sky": [0.0] * u.arcsec, "x_sky": [0.0] * u.arcsec})
-    run = Run(Path("run"), rows, QTable(), (one,), settings=settings)
+    run = RunFolder(Path("run"), rows, QTable(), (one,), settings=settings)
     np.testing.assert_array_equal(run.offset, [20, 110])

@@ -12,13 +12,13 @@ from helpers.fields import mosaics_of
 from clresample import FieldOptions, get_device
 from clresample.fields import options, run
 from clresample.fields.blends import plan
-from clresample.fields.blends.cut import Limits
+from clresample.fields.blends.cut import FitLimits
+from clresample.fields.execution import fitting, search_setup
 from clresample.fields.models import read_models
 from clresample.fields.mosaic import FilePlane
-from clresample.fields.options import Progress
+from clresample.fields.options import RunProgress
 from clresample.fields.run import run_field
-from clresample.fields.work import fitting, look
-from clresample.files.whole_file import HOST, FileError
+from clresample.files.atomic import HOST, FileError
 
 
 def table(folder, name="catalogue"):
@@ -29,7 +29,7 @@ def compared(folder, other):
     """Differences of fluxes [errors] of the sources that two runs share, and how many they do not;
     of those detected before the fit."""
     a, b = table(folder), table(other)
-    a, b = a[a["pass"] == 1], b[b["pass"] == 1]
+    a, b = a[a["detection_pass"] == 1], b[b["detection_pass"] == 1]
     shared, i, j = np.intersect1d(a["id"], b["id"], return_indices=True)
     differences = [
         ((a[f"flux_{c}"][i] - b[f"flux_{c}"][j]) / a[f"flux_err_{c}"][i]).value
@@ -40,7 +40,7 @@ def compared(folder, other):
 
 def test_every_source_has_an_id_a_parent_a_status_and_the_truth_within_its_errors(done, sky):
     folder, run = done
-    rows, blends = table(folder), table(folder, "blends")
+    rows, blends = table(folder), table(folder, "fit_table")
     assert run.outputs.n_sources == len(rows) > 5
     assert len(set(rows["id"])) == len(rows) and (np.diff(rows["id"]) > 0).all()
     assert set(rows["parent_id"]) <= set(rows["id"])
@@ -50,7 +50,7 @@ def test_every_source_has_an_id_a_parent_a_status_and_the_truth_within_its_error
     y, x = sky.truth["y"], sky.truth["x"]
     apart = np.hypot(rows["y"].value[:, None] - y, rows["x"].value[:, None] - x)
     assert np.median(apart.min(axis=1)) < 1
-    alone = (rows["n_blend"] == 1) & (apart.min(axis=1) < 1.5)
+    alone = (rows["n_blend_sources"] == 1) & (apart.min(axis=1) < 1.5)
     near = np.sort(apart, axis=1)[:, 1] > 15
     assert (alone & near).sum() >= 2
     which = apart.argmin(axis=1)
@@ -111,13 +111,13 @@ def test_one_blend_is_read_alone_and_models_add_up_to_the_mosaics(done, sky):
         # sources beyond the edge of Euclid, whose pixels are the model's, are not in the model
         n, m = np.indices(mosaic.grid.shape)
         at = mosaic.grid.positions_in(sky.mosaics[0].grid, n, m)
-        inner = ~mosaic.bad & ((at > 12) & (at < 180)).all(axis=-1)
+        inner = ~mosaic.bad_pixels & ((at > 12) & (at < 180)).all(axis=-1)
         left = residual[:, inner] / mosaic.noise_sigma[:, None]
         assert 0.97 < 1.4826 * np.median(abs(left)) < 1.05
         assert np.percentile(abs(left), 99.9) < 5
 
 
-class _Stop(Progress):
+class _Stop(RunProgress):
     """Stops a run as Ctrl-C does, after so many groups of fits."""
 
     def __init__(self, n):
@@ -173,16 +173,16 @@ def test_tiles_leave_no_seams(done, sky, tmp_path, tile_px, n_tiles):
 def test_a_blend_over_the_limits_is_cut_and_each_source_measured(done, sky, tmp_path):
     folder, _ = done
     rows = table(folder)
-    largest = int(rows["n_blend"].max())
+    largest = int(rows["n_blend_sources"].max())
     assert largest >= 3
-    options = FieldOptions(limits=Limits(sources=largest - 1))
+    options = FieldOptions(limits=FitLimits(max_sources=largest - 1))
     run_field(mosaics_of(sky), tmp_path, options=options)
     cut = table(tmp_path)
     assert set(cut["status"]) == {"converged"}
-    where = cut["n_blend"] == largest
+    where = cut["n_blend_sources"] == largest
     reasons = {str(reason) for reason in cut["reason"][where]}
     assert all("pieces" in reason for reason in reasons) and reasons
-    rounds = table(tmp_path, "blends")["round"]
+    rounds = table(tmp_path, "fit_table")["n_refits"]
     assert rounds.min() == 0 and rounds.max() >= 1
     differences, n_others = compared(folder, tmp_path)
     assert n_others == 0 and np.median(np.abs(differences)) < 0.5
@@ -191,15 +191,15 @@ def test_a_blend_over_the_limits_is_cut_and_each_source_measured(done, sky, tmp_
 def test_later_rounds_keep_the_number_of_components(done, sky, tmp_path, monkeypatch):
     """That an earlier one found; the first leaves it to the data."""
     folder, _ = done
-    limits = Limits(sources=int(table(folder)["n_blend"].max()) - 1)
-    given, blend_of = [], fitting.blend_of
+    limits = FitLimits(max_sources=int(table(folder)["n_blend_sources"].max()) - 1)
+    given, blend_of = [], fitting.make_blend
 
     def noted(patch, *others):
         blend, boxes = blend_of(patch, *others)
         given.append((others[-2] is not None, [s.n_components for s in blend.sources]))
         return blend, boxes
 
-    monkeypatch.setattr(fitting, "blend_of", noted)
+    monkeypatch.setattr(fitting, "make_blend", noted)
     run_field(mosaics_of(sky), tmp_path, options=FieldOptions(limits=limits, passes=1))
     first, later = ([n for is_later, ns in given if is_later == k for n in ns] for k in (0, 1))
     assert set(first) == {None} and later and None not in later
@@ -233,7 +233,7 @@ def test_known_sources_are_taken_where_they_are(done, sky, tmp_path):
     run_field(mosaics_of(sky), tmp_path, options=options)
     known = table(tmp_path)
     np.testing.assert_array_equal(known["id"], rows["id"])
-    assert set(known["pass"]) == {1}
+    assert set(known["detection_pass"]) == {1}
 
 
 @pytest.mark.parametrize(
@@ -241,7 +241,7 @@ def test_known_sources_are_taken_where_they_are(done, sky, tmp_path):
     [
         ({"passes": 3}, "passes is 3"),
         ({"field_number": -1}, "field_number is -1"),
-        ({"memory": 1000}, "memory is 1000 bytes"),
+        ({"group_memory": 1000}, "group_memory is 1000 bytes"),
         ({"workers": -1}, "workers is -1"),
     ],
 )
@@ -265,7 +265,7 @@ def test_parts_of_a_field_together_are_the_field(done, sky, tmp_path):
     folder, _ = done
     whole, ids = table(folder), []
     for i in (1, 2):
-        options = FieldOptions(part=(i, 2), border_px=110)
+        options = FieldOptions(part=(i, 2), margin_px=110)
         out = tmp_path / f"part{i}"
         run_field(mosaics_of(sky), out, options=options)
         rows = table(out)
@@ -288,7 +288,7 @@ def test_several_devices_have_a_process_each_and_leave_the_same_bytes(done, sky,
     folder, _ = done
     name = get_device().name  # named twice, it gets two processes
     run = run_field(mosaics_of(sky), tmp_path, options=FieldOptions(device=[name, name]))
-    assert {outcome.seat for stage, outcome in run.turns if stage == "fit"} == {0, 1}
+    assert {outcome.worker for stage, outcome in run.task_times if stage == "fit"} == {0, 1}
     assert (tmp_path / "catalogue.fits").read_bytes() == (folder / "catalogue.fits").read_bytes()
     with pytest.raises(ValueError, match="device is an empty list"):
         FieldOptions(device=[])
@@ -299,9 +299,9 @@ def test_groups_shrink_with_the_device_and_leave_the_same_sources(sky, tmp_path,
     folder, tmp_path = tmp_path / "all", tmp_path / "few"
     run_field(mosaics_of(sky), folder)
     device, small = get_device(), 8 << 20
-    monkeypatch.setattr(look, "DEVICE_PART", device.memory // small)
+    monkeypatch.setattr(search_setup, "DEVICE_PART", device.memory // small)
     for module in (run, options):
-        monkeypatch.setattr(module, "LEAST_MEMORY", 1 << 20)
+        monkeypatch.setattr(module, "MIN_MEMORY", 1 << 20)
     run_field(mosaics_of(sky), tmp_path)
     n_groups, n_small = (len(list((f / "work").glob("fit-*"))) for f in (folder, tmp_path))
     assert n_small > n_groups

@@ -6,14 +6,14 @@ from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable, Table
 
-from clresample.deblending.solver.constraints import Chain, Positivity
-from clresample.fields.reading.scene_file import read_scene
+from clresample.deblending.solver.constraints import Positivity, ProxChain
+from clresample.fields.field_toml.scene_file import read_scene
 from clresample.files.fits import write_fits
 from clresample.files.scene_keys import SceneError
 from clresample.files.source_table import read_sources
 from clresample.sky.grid import Grid
 from clresample.sky.psf import PSF
-from clresample.sky.sources import Extended, Point
+from clresample.sky.sources import ExtendedSource, PointSource
 
 GRID = Grid.flat((30, 34), 0.1).to_wcs(ra_deg=150.0, dec_deg=2.0)
 ONE = """
@@ -58,14 +58,14 @@ name = "id"
 type = "class"
 components = "n"
 [frame]
-like = "cube"
+reference = "cube"
 footprint = "intersection"
 psf_sigma_px = 0.7
 [fit]
 max_iter = 7
-tol = 0.01
+rel_tol = 0.01
 monotone = false
-structure_px = 1.5
+correlation_px = 1.5
 fit_shifts = true
 fit_sky = true
 """
@@ -141,12 +141,14 @@ def test_every_key_is_used(folder):
     assert not o.weights[:, :5].any() and not o.weights[:, 20:, 30:].any()
     assert (o.weights[:, 5:20] == 0.25).all()
     point, extended = found.sources
-    assert isinstance(point, Point) and isinstance(extended, Extended)
+    assert isinstance(point, PointSource) and isinstance(extended, ExtendedSource)
     assert (point.name, extended.n_components) == ("a", 2)
-    np.testing.assert_allclose(found.frame.place(found.sources), [(10, 12), (20, 22)], atol=1e-6)
+    np.testing.assert_allclose(
+        found.frame.positions_of(found.sources), [(10, 12), (20, 22)], atol=1e-6
+    )
     s = found.settings
-    assert (s.max_iter, s.tol, s.fit_shifts, s.fit_sky) == (7, 0.01, True, True)
-    assert s.prior.correlation_px == 1.5 and str(s.constraints) == str(Chain(Positivity()))
+    assert (s.max_iter, s.rel_tol, s.fit_shifts, s.fit_sky) == (7, 0.01, True, True)
+    assert s.prior.correlation_px == 1.5 and str(s.constraints) == str(ProxChain(Positivity()))
     assert set(found.inputs) == {
         "scene",
         "sources",
@@ -216,7 +218,10 @@ def test_bands_of_the_image_choose_those_of_the_psf(folder):
         (ONE + ONE, "given twice"),
         (ONE + 'channels = ["a"]' + ONE + 'channels = ["b"]', "names must be unique"),
         (ONE + "zero_point = 25" + CUBE, "'cam' has zero_point, 'cube' has none"),
-        (ONE + '[frame]\nlike = "HST"', "like is 'HST', it takes the name of an observation: cam"),
+        (
+            ONE + '[frame]\nreference = "HST"',
+            "reference is 'HST', it takes the name of an observation: cam",
+        ),
         (
             ONE + '[frame]\nfootprint = "all"',
             'footprint is \'all\', it takes "union" or "intersection"',
@@ -224,7 +229,7 @@ def test_bands_of_the_image_choose_those_of_the_psf(folder):
         (ONE + "[frame]\npsf_sigma_px = 0", "psf_sigma_px is 0, it takes a number above 0"),
         (ONE + "[fit]\nmax_iter = -1", "max_iter is -1, it takes a whole number"),
         (ONE + "[fit]\nmax_iter = true", "max_iter is True, it takes a whole number"),
-        (ONE + "[fit]\ntol = 1.0", "tol is 1.0, it takes a number from 0 to 1"),
+        (ONE + "[fit]\nrel_tol = 1.0", "rel_tol is 1.0, it takes a number from 0 to 1"),
         (ONE + "[fit]\nfit_shifts = 1", 'fit_shifts is 1, it takes true, false or "auto"'),
         (ONE + "[detection]\npasses = 3", "passes is 3, it takes 1, or 2"),
         (ONE + "[detection]\nthreshold = 0", "threshold is 0, it takes a number above 0"),

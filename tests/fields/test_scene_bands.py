@@ -4,7 +4,7 @@ import numpy as np
 from astropy.io import fits
 from helpers.tiny_scene import change, write_scene
 
-from clresample.fields.reading.scene_file import read_scene
+from clresample.fields.field_toml.scene_file import read_scene
 
 
 def test_weights_and_masks_are_those_of_the_chosen_bands(tmp_path):

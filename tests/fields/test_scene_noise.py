@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from clresample.fields.reading.scene_file import read_scene
+from clresample.fields.field_toml.scene_file import read_scene
 from clresample.files.fits import write_fits
 from clresample.files.scene_keys import SceneError
 from clresample.sky.grid import Grid

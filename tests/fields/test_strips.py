@@ -5,7 +5,14 @@ import pytest
 from astropy.io import fits
 
 from clresample.fields.box import Box
-from clresample.fields.strips import MOST_BYTES, STRIP_PX, FilePlane, Strips, _opened, section
+from clresample.fields.strips import (
+    MAX_BYTES,
+    STRIP_PX,
+    FilePlane,
+    StripCache,
+    _opened,
+    read_section,
+)
 
 SHAPE = 3, 150, 90
 
@@ -29,7 +36,7 @@ BOXES = [(0, 0, 10, 10), (60, 5, 70, 90), (149, 0, 150, 1), (0, 0, 150, 90), (30
 
 
 def test_strips_hold_the_pixels_of_the_file(packed, cube):
-    strips = Strips()
+    strips = StripCache()
     for plane in (2, 0):
         for corners in [*BOXES, *BOXES[::-1]]:
             box = Box(*corners)
@@ -51,11 +58,11 @@ def test_rows_are_decoded_once_and_the_oldest_go(packed, cube):
             self.n_rows += index[1].stop - index[1].start
             return packed.section[index]
 
-    hdu, strips = Counted(), Strips()
+    hdu, strips = Counted(), StripCache()
     for corners in BOXES:
         strips.read(hdu, 1, Box(*corners))
     assert hdu.n_rows <= SHAPE[1] + STRIP_PX
-    few = Strips(most=8 * cube[0].nbytes)
+    few = StripCache(most=8 * cube[0].nbytes)
     for _ in range(5):  # more than there is room for
         for plane in range(3):
             found = few.read(Counted(), plane, Box(30, 7, 131, 44))
@@ -64,17 +71,17 @@ def test_rows_are_decoded_once_and_the_oldest_go(packed, cube):
 
 
 def test_strips_take_a_tenth_of_what_a_process_may_hold():
-    strips = Strips()
-    strips.hold(1 << 30)
-    assert strips.most == int(0.1 * (1 << 30)) < MOST_BYTES
-    strips.hold(64 << 30)
-    assert strips.most == MOST_BYTES
-    strips.hold(None)
-    assert strips.most == MOST_BYTES
+    strips = StripCache()
+    strips.set_limit(1 << 30)
+    assert strips.most == int(0.1 * (1 << 30)) < MAX_BYTES
+    strips.set_limit(64 << 30)
+    assert strips.most == MAX_BYTES
+    strips.set_limit(None)
+    assert strips.most == MAX_BYTES
 
 
 def test_strips_that_are_cleared_are_decoded_again(packed, cube):
-    strips, box = Strips(), Box(0, 0, 10, 10)
+    strips, box = StripCache(), Box(0, 0, 10, 10)
     for _ in range(2):
         np.testing.assert_array_equal(strips.read(packed, 1, box), cube[1][box.slices])
         assert strips.n_bytes > 0
@@ -83,14 +90,14 @@ def test_strips_that_are_cleared_are_decoded_again(packed, cube):
 
 
 def test_large_boxes_are_left_to_the_file(packed):
-    assert Strips(most=100_000).read(packed, 0, Box(0, 0, 150, 90)) is None
+    assert StripCache(most=100_000).read(packed, 0, Box(0, 0, 150, 90)) is None
 
 
 def test_images_in_cells_are_read_as_they_were(tmp_path, cube):
     path = tmp_path / "cells.fits"
     fits.CompImageHDU(cube[0], tile_shape=(30, 30)).writeto(path)
     with fits.open(path) as hdus:
-        assert Strips().read(hdus[1], None, Box(0, 0, 9, 9)) is None
+        assert StripCache().read(hdus[1], None, Box(0, 0, 9, 9)) is None
 
 
 def test_a_file_written_again_is_read_again(tmp_path, cube):
@@ -113,7 +120,7 @@ def test_sections_of_plain_images_hold_the_pixels_of_the_file(tmp_path, card):
         for corners in BOXES:
             box = Box(*corners)
             for i, plane, image in ((0, 2, read[0].data[2]), (1, None, read[1].data)):
-                for got in (section(hdus[i], plane, box), FilePlane(path, i, plane).read(box)):
+                for got in (read_section(hdus[i], plane, box), FilePlane(path, i, plane).read(box)):
                     assert got.shape == box.shape
                     np.testing.assert_array_equal(got, image[box.slices])
 
@@ -131,5 +138,5 @@ def test_sections_of_compressed_images_take_their_own_tiles_alone(tmp_path, monk
     monkeypatch.setattr(fits.CompImageHDU, "section", property(lambda _: Watched()))
     box = Box(*BOXES[0])
     with fits.open(path) as hdus:
-        assert section(hdus[1], None, box).shape == box.shape
+        assert read_section(hdus[1], None, box).shape == box.shape
     assert taken == [box.slices]

@@ -12,10 +12,10 @@ from astropy.io import fits
 from astropy.table import Table
 from helpers.headers import header
 
+from clresample.files.atomic import FileError
 from clresample.files.fits import open_fits, read_image, read_pixels, read_psf
-from clresample.files.headers import MOST_CARDS, check_headers
+from clresample.files.headers import MAX_CARDS, check_headers
 from clresample.files.source_table import read_sources
-from clresample.files.whole_file import FileError
 
 
 def compressed(path, shape, tile, kind="HCOMPRESS_1"):
@@ -164,8 +164,8 @@ def test_a_header_without_an_end_is_not_looked_for_without_end(tmp_path):
     path = tmp_path / "p.fits"
     fits.PrimaryHDU(np.ones((11, 11))).writeto(path)
     raw = path.read_bytes()
-    path.write_bytes(raw.replace(b"END" + b" " * 77, b" " * 80)[:2880] + b" " * 80 * MOST_CARDS)
-    with pytest.raises(FileError, match=f"HDU 0 has a header of more than {MOST_CARDS} cards"):
+    path.write_bytes(raw.replace(b"END" + b" " * 77, b" " * 80)[:2880] + b" " * 80 * MAX_CARDS)
+    with pytest.raises(FileError, match=f"HDU 0 has a header of more than {MAX_CARDS} cards"):
         read_psf(path)
 
 

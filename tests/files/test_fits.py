@@ -9,8 +9,8 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from helpers.headers import OBSERVED, cd_header, header, observed_headers, with_tables
 
+from clresample.files.atomic import FileError
 from clresample.files.fits import read_image, read_psf, write_fits
-from clresample.files.whole_file import FileError
 from clresample.sky.grid import Grid
 from clresample.sky.psf_checks import PSFWarning
 
@@ -138,7 +138,7 @@ def test_a_cube_may_be_distorted(tmp_path, kind):
 def test_bad_pixels_are_counted(tmp_path):
     data = PIXELS.copy()
     data[0, 3, 4], data[2, 1, 1:3] = np.nan, np.inf
-    assert read_image(stored(tmp_path / "a.fits", data, header(OBSERVED))).n_bad == 3
+    assert read_image(stored(tmp_path / "a.fits", data, header(OBSERVED))).n_invalid == 3
 
 
 def test_files_that_are_no_images(tmp_path, cube):
@@ -289,7 +289,7 @@ def test_real_files(data):
     folder = data / "hst_hsc"
     hst, hsc = read_image(folder / "hst_f814w.fits"), read_image(folder / "hsc_grizy.fits", bands=2)
     assert (hst.data.shape, hsc.data.shape) == ((1, 250, 250), (1, 50, 50))
-    assert (hst.n_bad, hsc.n_bad) == (0, 0)
+    assert (hst.n_invalid, hsc.n_invalid) == (0, 0)
     whole = fits.getdata(folder / "hsc_grizy.fits")
     np.testing.assert_array_equal(hsc.data[0], whole[2])
     with pytest.warns(PSFWarning, match=r"\(\+1.21, \+0.79\)"):

@@ -6,7 +6,7 @@ import pytest
 from astropy.io import fits
 from helpers.blends import SCALE, blend, observe, round_component
 
-from clresample.files.names import check_catalogue_names, text_card
+from clresample.files.fits_names import check_catalogue_names, text_card
 from clresample.files.results import write_result
 from clresample.files.tables import read_catalogue, write_catalogue
 from clresample.measurement.catalogue import catalogue

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clresample.drawing.sheet import stretch
+from clresample.drawing.figure import stretch
 from clresample.files.panels import Panel, save_panels, stretch_limits
 from clresample.files.plot_resampled import compare
 from clresample.sky.grid import Grid
@@ -38,7 +38,7 @@ def test_compare_finds_scale_and_level_inside_the_coverage():
     observed[5:8], observed[:, 20] = 1e3, np.nan  # wrong near the edge, and a bad column
     found = compare(rendered, observed, covered, 4)
     assert found.correlation > 0.999999
-    np.testing.assert_allclose((found.scale, found.level), (3, 7), rtol=1e-9)
+    np.testing.assert_allclose((found.scale, found.sky_level), (3, 7), rtol=1e-9)
     assert found.mask[20, 10] and not found.mask[20, 7] and not found.mask[:, 20].any()
     np.testing.assert_allclose(found.residual[found.mask], 0, atol=1e-9)
     assert np.isnan(found.residual[~covered]).all()

@@ -19,7 +19,7 @@ from clresample.sky.frame import Frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
-from clresample.sky.sources import Extended, Point
+from clresample.sky.sources import ExtendedSource, PointSource
 
 
 def same(one, other, where="result"):
@@ -59,9 +59,9 @@ def distortions(wcs):
 def rich(rng, grid, other, **given):
     """A result whose numbers need every digit, of two instruments with all the rest."""
     sources = (
-        Extended(sky_deg=tuple(grid.sky(8.1, 9.2)), name="naïve", n_components=2),
-        Point(position_px=(10 / 3, 20.0), free=True),
-        Extended(position_px=(500.0, 1.0)),
+        ExtendedSource(sky_deg=tuple(grid.sky(8.1, 9.2)), name="naïve", n_components=2),
+        PointSource(position_px=(10 / 3, 20.0), free_position=True),
+        ExtendedSource(position_px=(500.0, 1.0)),
     )
     components = [
         replace(round_component(s, (10, x), rng.random(3), n=n), origin=origin)
@@ -113,7 +113,7 @@ def round_trip(result, tmp_path):
 def test_a_flat_blend_comes_back_bit_by_bit(tmp_path):
     grid = Grid.flat((30, 33), 1 / 3, angle_deg=17, center_arcsec=(0.1, 0.7))
     result = rich(np.random.default_rng(1), grid, Grid.flat((11, 10), 0.7, angle_deg=4, flip=True))
-    assert result.observations[0].n_bad == 1 and result.observations[0].messages
+    assert result.observations[0].n_invalid == 1 and result.observations[0].messages
     found = round_trip(result, tmp_path)
     assert found.rendered[0].flags.c_contiguous and found.rendered[0].dtype.isnative
     assert found.observations[0].messages == result.observations[0].messages
@@ -143,7 +143,7 @@ def test_every_observation_keeps_its_own_distortion(tmp_path):
     round_trip(result, tmp_path)
 
 
-@pytest.mark.parametrize("sources", [(), (Point(position_px=(-9.0, 0.0)),)])
+@pytest.mark.parametrize("sources", [(), (PointSource(position_px=(-9.0, 0.0)),)])
 def test_a_blend_without_components_comes_back(sources, tmp_path):
     result = blend([], sources=sources, losses=np.zeros(0))
     found = round_trip(result, tmp_path)
@@ -314,8 +314,8 @@ def test_damaged_and_newer_files_are_refused(tmp_path, monkeypatch):
         with pytest.raises(FileError) as error:
             read_result(path)
         assert "\n" not in str(error.value) and str(path) in str(error.value)
-    monkeypatch.setattr(store, "FORMAT", 4)
+    monkeypatch.setattr(store, "FORMAT", 5)
     write_result(path, result, overwrite=True)
     monkeypatch.undo()
-    with pytest.raises(FileError, match="format 4, this version reads 3"):
+    with pytest.raises(FileError, match="format 5, this version reads 4"):
         read_result(path)

@@ -7,7 +7,7 @@ from clresample.sky.frame import Frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
-from clresample.sky.sources import Extended
+from clresample.sky.sources import ExtendedSource
 
 SCALE = 0.1  # [arcsec/px]
 MIDDLE = (30.0, 35.0)  # [px] about the middle of the frame of `blend`
@@ -59,7 +59,9 @@ def blend(components, *, observations=None, sources=None, grid=None, **given):
             c.source: np.add(c.origin, np.unravel_index(c.morphology.argmax(), c.morphology.shape))
             for c in reversed(components)
         }
-        sources = tuple(Extended(position_px=tuple(map(float, peaks[s]))) for s in sorted(peaks))
+        sources = tuple(
+            ExtendedSource(position_px=tuple(map(float, peaks[s]))) for s in sorted(peaks)
+        )
     n, n_channels = len(components), sum(len(o.channels) for o in observations)
     images = np.array([in_frame(c, grid.shape) for c in components]).reshape(n, *grid.shape)
     fields = {

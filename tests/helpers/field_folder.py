@@ -18,7 +18,7 @@ INSTRUMENTS = {"Euclid": ("VIS",), "Rubin": ("g", "r", "i")}
 def write_folder(
     folder, *, n_sources=12, n_px=160, instruments=INSTRUMENTS, seed=3, part_from=0, status=None
 ):
-    """Write catalogue.fits, blends.ecsv, model and residual mosaics, provenance.json.
+    """Write catalogue.fits, fit_table.ecsv, model and residual mosaics, provenance.json.
 
     n_px: of the first instrument a side; later ones have pixels twice as large, turned by 12 deg
     part_from: column of the field at which its images begin, as those of a part do
@@ -40,13 +40,13 @@ def write_folder(
             grid = grid.cutout(0, part_from, (n_px, n_px - part_from))
         _write_images(folder, name, channels, grid, whole, at, flux, rng)
     _write_catalogue(folder / "catalogue.fits", table)
-    _fits_of(table, rng).write(folder / "blends.ecsv", format="ascii.ecsv", overwrite=True)
+    _fits_of(table, rng).write(folder / "fit_table.ecsv", format="ascii.ecsv", overwrite=True)
     run = {
         "mosaics": [[name, 0, 0, *channels] for name, channels in instruments.items()],
         "corner": whole.sky(0, 0).tolist(),
         "part": [2, 2, 256] if part_from else None,
     }
-    told = {"clresample": "0.1.0", "run": run, "lost_tiles": {}, "seconds": {"fit": 1.5}}
+    told = {"clresample": "0.1.0", "run": run, "failed_tiles": {}, "seconds": {"fit": 1.5}}
     (folder / "provenance.json").write_text(json.dumps(told))
     return table
 
@@ -69,14 +69,14 @@ def _table(grid, at, flux, channels):
     table["flags"] = np.zeros(n, np.int32)
     table["status"] = np.full(n, "converged", "U120")
     table["reason"] = np.full(n, "", "U120")
-    table["n_blend"] = np.ones(n, np.int64)
+    table["n_blend_sources"] = np.ones(n, np.int64)
     table["snr"] = 10 * flux
-    table["size"] = np.full(n, 0.2) * u.arcsec
+    table["rms_size"] = np.full(n, 0.2) * u.arcsec
     for channel in channels:
         table[f"flux_{channel}"] = flux * u.uJy
         table[f"flux_err_{channel}"] = flux / 10 * u.uJy
     for channel in channels:
-        table[f"residual_{channel}"] = np.full(n, 3.0)
+        table[f"max_residual_{channel}"] = np.full(n, 3.0)
     return table
 
 
@@ -89,15 +89,15 @@ def _write_catalogue(path, table):
 def _fits_of(table, rng):
     n = len(table)
     rows = QTable()
-    rows["patch"] = np.arange(n)
+    rows["fit_id"] = np.arange(n)
     rows["parent_id"] = table["id"]
-    rows["round"] = np.zeros(n, int)
+    rows["n_refits"] = np.zeros(n, int)
     rows["status"] = [
         f"{s}: {r}" if r else str(s) for s, r in zip(table["status"], table["reason"])
     ]
     rows["n_sources"] = np.ones(n, int)
     rows["n_pixels"] = np.full(n, 4096)
-    rows["iterations"] = np.full(n, 20)
+    rows["n_iterations"] = np.full(n, 20)
     rows["seconds"] = rng.uniform(0.1, 2, n) * u.s
     return rows
 

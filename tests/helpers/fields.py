@@ -3,7 +3,7 @@
 import numpy as np
 
 from clresample import Mosaic
-from clresample.fields.psfs.sampled import PSFCube
+from clresample.fields.psfs.sampled import ScatteredPSF
 
 
 def mosaics_of(field):
@@ -13,11 +13,11 @@ def mosaics_of(field):
             m.survey.name,
             m.data,
             m.grid,
-            PSFCube(m.psf_images, m.psf_positions),
+            ScatteredPSF(m.psf_images, m.psf_positions),
             weights=np.broadcast_to(m.noise_sigma[:, None, None] ** -2.0, m.data.shape),
             channels=m.survey.bands,
             zero_points=list(m.survey.zero_points_mag),
-            mask=m.bad,
+            mask=m.bad_pixels,
         )
         for m in field.mosaics
     )

@@ -7,7 +7,7 @@ import pytest
 from astropy.wcs import WCS, Sip
 
 from clresample.resampling import reference
-from clresample.resampling.plan import Precision, make_plan
+from clresample.resampling.plan import Precision, make_resampling_plan
 from clresample.resampling.resampler import Resampler
 from clresample.sky.grid import Grid
 from clresample.sky.mapping import Mapping
@@ -124,7 +124,7 @@ def operator(device, mapping, psf_in, psf_out, dtype=np.float32, **options):
     """The operator of a mapping made by hand; skips where the device has no float64."""
     if dtype == np.float64 and not device.has_fp64:
         pytest.skip(f"{device.name} has no float64")
-    plan = make_plan(mapping, psf_in, psf_out, precision=Precision.of(dtype))
+    plan = make_resampling_plan(mapping, psf_in, psf_out, precision=Precision.of(dtype))
     return Resampler.from_plans([plan], dtype=dtype, device=device, **options)
 
 

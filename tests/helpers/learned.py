@@ -18,7 +18,7 @@ def gauged(image, profile):
 
 
 class Source:
-    """One source's profile (ny, nx) with a LearnedPrior."""
+    """One source's profile (ny, nx) with a MultiscalePrior."""
 
     def __init__(self, profile, prior):
         self.profile, self.amp = profile, prior.amplitude(profile)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from clresample.deblending.posterior import posterior as room
-from clresample.deblending.posterior.blocks import RIDGE
-from clresample.deblending.posterior.normal import Layout
+from clresample.deblending.posterior.block_matrix import RIDGE
+from clresample.deblending.posterior.normal import UnknownLayout
 from clresample.deblending.shifts import SCATTER_PX
 
 from .start import rendered
@@ -52,7 +52,7 @@ def full_matrix(kept, modes=None):
     """
     p, scene = kept.posterior, kept.posterior.solution.scene
     modes = modes or p.modes
-    layout = Layout(np.array([len(m) for m in modes]), *list(vars(p.layout).values())[1:])
+    layout = UnknownLayout(np.array([len(m) for m in modes]), *list(vars(p.layout).values())[1:])
     starts = np.cumsum([0, *layout.sizes])
     n_common = layout.n_sky + layout.n_shifts
     images = []
@@ -66,7 +66,7 @@ def full_matrix(kept, modes=None):
     for o, view in enumerate(kept.views):
         seen = [rendered(view, full) for full in images]
         for c in range(len(view.data)):
-            j = np.zeros((len(matrix), view.root[c].size))
+            j = np.zeros((len(matrix), view.sqrt_weights[c].size))
             for i, at in enumerate(starts[: len(modes)]):
                 k = len(modes[i])
                 j[at : at + k] = p.solution.spectra[i, channel] * seen[i][:-3, c]
@@ -75,7 +75,7 @@ def full_matrix(kept, modes=None):
                     to = starts[len(modes)] + layout.n_sky + 2 * (o - 1)
                     j[to : to + 2] += p.solution.spectra[i, channel] * seen[i][-2:, c]
             if layout.n_sky:
-                j[starts[len(modes)] + channel] = view.root[c].ravel()
+                j[starts[len(modes)] + channel] = view.sqrt_weights[c].ravel()
             matrix += j @ j.T
             channel += 1
     for at, m in zip(starts, modes, strict=False):

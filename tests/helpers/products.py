@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from clresample.device.contraction import padded
+from clresample.device.contraction import row_stride
 
 from .tuning import tune
 
@@ -60,7 +60,7 @@ def random(*shape, seed=0):
 
 def put_right(device, b, dtype):
     """(B, k, n) matrices on the device, columns padded with zeros."""
-    host = np.zeros((*b.shape[:-1], padded(b.shape[-1])))
+    host = np.zeros((*b.shape[:-1], row_stride(b.shape[-1])))
     host[..., : b.shape[-1]] = b
     return device.put(host, dtype)
 

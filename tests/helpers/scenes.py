@@ -5,13 +5,13 @@ import numpy as np
 from clresample import get_device
 from clresample.deblending.batch import deblend
 from clresample.deblending.blend import Blend
-from clresample.deblending.profiles import moment, point, profile
+from clresample.deblending.profiles import draw_psf, profile, psf_second_moment
 from clresample.resampling.resampler import Resampler
 from clresample.sky.frame import Frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
-from clresample.sky.sources import Extended, Point
+from clresample.sky.sources import ExtendedSource, PointSource
 
 SHAPE = (30, 36)
 MODEL_PSF = PSF.gaussian(0.8, n_pixels=19)
@@ -35,9 +35,9 @@ def truth(objects, shape=SHAPE):
     for position, flux, sigma in objects:
         if sigma:
             parameters = np.array([np.log(sigma), 0.2, -0.1, np.log(5.0)])
-            image = profile(parameters, position, shape, moment(MODEL_PSF))[0]
+            image = profile(parameters, position, shape, psf_second_moment(MODEL_PSF))[0]
         else:
-            image = point(MODEL_PSF, position, shape)[0]
+            image = draw_psf(MODEL_PSF, position, shape)[0]
         model += np.array(flux)[:, None, None] * image
     return model
 
@@ -85,7 +85,8 @@ def observe(
 
 def sources(objects=GALAXIES):
     return tuple(
-        Extended(position_px=p) if sigma else Point(position_px=p) for p, _, sigma in objects
+        ExtendedSource(position_px=p) if sigma else PointSource(position_px=p)
+        for p, _, sigma in objects
     )
 
 

@@ -7,9 +7,9 @@ import pytest
 
 from clresample.deblending.solver import reference as ref
 from clresample.deblending.solver.amsgrad import DAMPING, StepSizes
-from clresample.deblending.solver.constraints import Chain, Monotone, Positivity
+from clresample.deblending.solver.constraints import Monotone, Positivity, ProxChain
 from clresample.deblending.solver.engine import Engine
-from clresample.deblending.solver.prior import Prior
+from clresample.deblending.solver.prior import SingleScalePrior
 from clresample.deblending.solver.scene import Scene, State
 from clresample.deblending.solver.scene_model import compose, gather_morph, gather_spectra
 from clresample.resampling.cache import cached_resampler
@@ -17,7 +17,7 @@ from clresample.sky.psf import PSF
 
 from .scenes import BLURRED, SHARP, frame, grids
 
-PRIOR = Prior(alpha=0.1, correlation_px=1.0)
+PRIOR = SingleScalePrior(strength=0.1, correlation_px=1.0)
 STEPS = StepSizes(latent=0.05, morphology=0.01, spectrum=0.1)
 # [relative to an array's largest value] a few hundred roundings: sums over pixels and frequencies
 CLOSE = {np.float32: 1e-4, np.float64: 1e-12}
@@ -50,7 +50,7 @@ def posed(
         w[:, 3, 2:5] = 0
     scene = Scene(
         shape=home.shape,
-        extent=home.shape,
+        unpadded_shape=home.shape,
         ops=ops,
         data=[rng.normal(0, 3, op.shape_out) for op in ops],
         weights=weights,
@@ -58,7 +58,7 @@ def posed(
         center=shapes // 2,
         profile=profile,
         fixed=np.isin(np.arange(n), fixed),
-        scale=rng.uniform(0.1, 0.3, (n, 3)),
+        step_scale=rng.uniform(0.1, 0.3, (n, 3)),
         damping=rng.uniform(0, 20, n),
         fit_sky=True,
         sky_precision=np.resize(KNOWN_SKY, np.shape(given.get("sky", KNOWN_SKY))),
@@ -101,7 +101,7 @@ def engine(pairs, device, dtype=np.float64, *, prior=PRIOR, chain=None, steps=ST
     """An Engine of (Scene, State) pairs; skips where the device lacks the type."""
     if dtype == np.float64 and not device.has_fp64:
         pytest.skip(f"{device.name} has no double precision")
-    chain = chain or Chain(Positivity(), Monotone())
+    chain = chain or ProxChain(Positivity(), Monotone())
     scenes, states = map(list, zip(*pairs, strict=True))
     return Engine(scenes, states, device, dtype, chain=chain, prior=prior, step_sizes=steps)
 
@@ -147,9 +147,9 @@ class Reference:
         s = self.scene
         self.i_step += 1
         direction, self.moments_spectra = ref.amsgrad(
-            s.scale * self.d_spectra, self.moments_spectra, self.i_step
+            s.step_scale * self.d_spectra, self.moments_spectra, self.i_step
         )
-        self.spectra = np.maximum(self.spectra - STEPS.spectrum * s.scale * direction, 0)
+        self.spectra = np.maximum(self.spectra - STEPS.spectrum * s.step_scale * direction, 0)
         total = np.concatenate([w.sum(axis=(1, 2)) for w in s.weights]) + s.known_sky
         self.sky = self.sky - 0.5 * self.pull / total
         for i in np.flatnonzero(~s.fixed):
@@ -167,7 +167,7 @@ class Reference:
             self.morph[i] = self.morph[i] - STEPS.morphology * direction
             return
         profile = self.scene.profile[i]
-        amplitude, taps = self.prior.alpha * np.sqrt(profile), self.prior.taps
+        amplitude, taps = self.prior.strength * np.sqrt(profile), self.prior.taps
         g = ref.latent_gradient(self.d_morph[i], self.morph[i], amplitude, self.latent[i], taps)
         direction, self.moments[i] = ref.amsgrad(
             g, self.moments[i], self.i_step, epsilon=self._damped(i, STEPS.latent)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from clresample.deblending.profiles import Given
-from clresample.deblending.spectra import inverse
-from clresample.deblending.start.start import Patch, StartingPoint, start
+from clresample.deblending.profiles import FixedProfile
+from clresample.deblending.spectra import spectrum_covariance
+from clresample.deblending.start.profile_start import StartingPoint, StartInput, fit_start_profiles
 from clresample.deblending.view import WhitenedView
 from clresample.resampling.cache import cached_resampler
 
@@ -17,7 +17,7 @@ def rendered(view, images):
     """Whitened unit-spectrum images (n, Co, My * Mx), float64, of model images (n, Ny, Nx)."""
     padded = np.zeros((len(images), *view.op.shape_in[1:]), view.op.dtype)
     padded[:, : images.shape[1], : images.shape[2]] = images
-    out = view.op.render(padded) * view.root
+    out = view.op.render(padded) * view.sqrt_weights
     return out.reshape(*out.shape[:2], -1).astype(np.float64)
 
 
@@ -26,9 +26,9 @@ def least_squares(units, views, sky=False):
     spectra, levels, covariances = [], [], []
     for view, unit in zip(views, units, strict=True):
         for c in range(unit.shape[1]):
-            rows, target = unit[:, c], (view.data[c] * view.root[c]).ravel()
+            rows, target = unit[:, c], (view.data[c] * view.sqrt_weights[c]).ravel()
             if sky:  # a free coefficient is the difference of two non-negative ones
-                level = view.root[c].ravel()[None]
+                level = view.sqrt_weights[c].ravel()[None]
                 if view.sky_precision is not None:  # as a pixel more, of the level alone
                     known = np.sqrt(view.sky_precision[c])
                     level = np.append(level, known)[None]
@@ -39,13 +39,17 @@ def least_squares(units, views, sky=False):
             spectra.append(a[: len(unit)])
             levels.append(a[-2] - a[-1] if sky else 0.0)
             own = rows[: len(rows) - sky]
-            covariances.append(inverse((own @ own.T)[None])[0, : len(unit), : len(unit)])
+            covariances.append(
+                spectrum_covariance((own @ own.T)[None])[0, : len(unit), : len(unit)]
+            )
     return np.array(spectra).T, np.array(levels), np.array(covariances)
 
 
 def started(frame, catalogue, positions, views, **given) -> StartingPoint:
     """The start of one scene."""
-    return start([Patch(frame, list(catalogue), np.asarray(positions, float), views)], **given)[0]
+    return fit_start_profiles(
+        [StartInput(frame, list(catalogue), np.asarray(positions, float), views)], **given
+    )[0]
 
 
 def profiles(point, shape):
@@ -56,18 +60,18 @@ def profiles(point, shape):
 def point_of(images, position):
     """A StartingPoint of given images (n, Ny, Nx), all about one position."""
     n = len(images)
-    shapes = [Given(image) for image in images]
+    shapes = [FixedProfile(image) for image in images]
     return StartingPoint(
         source=np.arange(n),
         positions=np.array([position] * n, float),
-        dark=np.zeros(n, bool),
+        undetected=np.zeros(n, bool),
         shapes=shapes,
         thetas=[np.zeros(0)] * n,
-        places=np.array([position] * n, float),
+        drawn_positions=np.array([position] * n, float),
         peaks=np.array([shape.peak for shape in shapes]),
         spectra=np.ones((n, 1)),
         sky=np.zeros(1),
-        power=np.ones((n, 1)),
+        spectrum_curvature=np.ones((n, 1)),
     )
 
 

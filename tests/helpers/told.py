@@ -22,9 +22,9 @@ class Told(SimpleNamespace):
     def end(self, *given):
         self.ended = given
 
-    settle = end
+    store_final = end
 
-    def remember(self, *given):
+    def keep_best(self, *given):
         self.best = given
 
     def interrupt(self):
@@ -42,7 +42,7 @@ def learning(n_rounds, *, live=None, converged=None, failed=None, **settings):
         live=~no if live is None else np.array(live),
         converged=no.copy() if converged is None else np.array(converged),
         failed=no.copy() if failed is None else np.array(failed),
-        **{name: no.copy() for name in ("settled", "looked")},
+        **{name: no.copy() for name in ("settled", "tested")},
         n_rounds=np.array(n_rounds),
         loss=np.arange(1.0, n + 1),
         chi2=lambda: np.array([1.0, 2.0, 4.0])[:n],
@@ -54,11 +54,13 @@ def learning(n_rounds, *, live=None, converged=None, failed=None, **settings):
         findings=lambda which: [f"findings {i}" if on else None for i, on in enumerate(which)],
         followed=[],
     )
-    engine.follow_shifts = lambda moved: engine.followed.append(moved.tolist())
+    engine.update_shifts = lambda moved: engine.followed.append(moved.tolist())
     engine.slopes = lambda which: [f"slopes {i}" for i in range(n)]
-    settings = SimpleNamespace(**({"max_iter": 100, "fit_shifts": False, "enough": 0.5} | settings))
+    settings = SimpleNamespace(
+        **({"max_iter": 100, "fit_shifts": False, "loss_tol": 0.5} | settings)
+    )
     past = engine, [None] * n, np.tile([0, np.inf, 0, 0], (n, 1))
-    return room._Learning([Told(c) for c in "abc"[:n]], settings, None, None, past)
+    return room._LbfgsRun([Told(c) for c in "abc"[:n]], settings, None, None, past)
 
 
 def named(name, status="converged", shifts=0.0, of=None):

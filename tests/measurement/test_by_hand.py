@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from helpers.blends import MIDDLE, SCALE, blend, gaussian, observe, round_component, two_sources
 
-from clresample.deblending.posterior.residuals import _window, worst_residuals
-from clresample.deblending.rendered import Rendered
+from clresample.deblending.component_images import ComponentImages
+from clresample.deblending.posterior.residuals import _window, max_filtered_residuals
 from clresample.deblending.result import Component
 from clresample.measurement.catalogue import Flag, catalogue
 from clresample.measurement.quality import box_chi2
@@ -15,7 +15,7 @@ from clresample.measurement.shapes import moments
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
-from clresample.sky.sources import Point
+from clresample.sky.sources import PointSource
 
 GRID = Grid.flat((60, 70), SCALE)
 
@@ -93,7 +93,7 @@ def test_a_core_is_no_less_than_the_pixel_that_holds_it(away, flagged):
     result = blend(
         [round_component(0, where, (1,))],
         observations=(seen,),
-        sources=(Point(position_px=where),),
+        sources=(PointSource(position_px=where),),
     )
     assert bool(catalogue(result)["flags"][0] & Flag.SATURATED) == flagged
 
@@ -114,7 +114,7 @@ def test_four_hundred_pixels_of_sky_say_how_large_the_noise_is(n_masked, scaled)
     weights = np.ones(400)
     weights[:n_masked] = 0
     noise = rng.normal(0, 5, (20, 20))
-    worst = worst_residuals(seen_alone(noise, weights.reshape(20, 20)), 0)[0, 0]
+    worst = max_filtered_residuals(seen_alone(noise, weights.reshape(20, 20)), 0)[0, 0]
     assert (worst < 6) == scaled and worst > 1
 
 
@@ -124,7 +124,7 @@ def test_sky_is_where_the_model_has_less_than_one_sigma(light, scaled):
     weights = np.full((20, 20), 0.25)  # 2 counts of noise
     result = seen_alone(noise + 2 * light, weights)
     part = replace(result.components[0], spectrum=np.array([2 * light]))
-    worst = worst_residuals(replace(result, components=(part,)), 0)[0, 0]
+    worst = max_filtered_residuals(replace(result, components=(part,)), 0)[0, 0]
     assert (worst < 5) == scaled
 
 
@@ -132,7 +132,7 @@ def test_residuals_beyond_the_frame_count_for_no_source():
     """Data of 24 x 24 pixels about a frame of 20 x 20."""
     data = np.full((24, 24), 1e6)
     data[2:-2, 2:-2] = 0
-    assert worst_residuals(seen_alone(data, np.ones((24, 24))), 0)[0, 0] < 1e-3
+    assert max_filtered_residuals(seen_alone(data, np.ones((24, 24))), 0)[0, 0] < 1e-3
 
 
 def test_a_flux_is_that_of_the_sources_own_components():
@@ -157,7 +157,7 @@ def test_residuals_are_filtered_with_the_psf_as_it_lies():
         o = Observation(data[None], psf, Grid.flat((20, 20), SCALE), weights=1.0, channels=("g",))
         part = Component(0, (0, 0), np.ones((20, 20)), np.array([1e-9]))
         result = blend([part], observations=(o,), grid=Grid.flat((20, 20), SCALE))
-        found.append(worst_residuals(result, 0)[0, 0])
+        found.append(max_filtered_residuals(result, 0)[0, 0])
     power = np.sqrt((psf.images[0] ** 2).sum())
     assert found[0] == pytest.approx(30 * power, rel=1e-6) and found[1] < 0.8 * found[0]
 
@@ -180,7 +180,7 @@ def test_moments_of_nothing_are_no_numbers():
 
 def test_a_window_holds_the_light_of_all_components():
     """Of a source whose components shine apart from each other: the window spans them both."""
-    rendered = Rendered.cropped(
+    rendered = ComponentImages.cropped(
         (2, 1, 40, 40), np.array([[3, 4], [20, 25]]), [np.ones((1, 6, 7)), np.ones((1, 8, 9))]
     )
     assert _window(rendered, [0, 1], (40, 40)) == (slice(3, 28), slice(4, 34))

@@ -14,12 +14,12 @@ from helpers.blends import (
 )
 from helpers.headers import grid_of, header
 
-from clresample.measurement.catalogue import MEANINGS, Flag, catalogue
+from clresample.measurement.catalogue import FLAG_MEANINGS, Flag, catalogue
 from clresample.measurement.photometry import redistribute
 from clresample.measurement.quality import summary
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
-from clresample.sky.sources import Extended, Point
+from clresample.sky.sources import ExtendedSource, PointSource
 
 
 def test_names_and_frame_are_those_of_the_wcs():
@@ -40,7 +40,7 @@ def test_a_good_source_has_no_flag():
 
 
 def test_every_flag_has_a_meaning_and_a_bit_of_its_own():
-    assert set(MEANINGS) == set(Flag)
+    assert set(FLAG_MEANINGS) == set(Flag)
     assert sorted(flag.value for flag in Flag) == [1 << i for i in range(len(Flag))]
     assert Flag(np.int32(3)) == Flag.EDGE | Flag.NOT_CONVERGED
 
@@ -76,19 +76,24 @@ def test_masked_is_the_centres_own_pixel():
     weights = np.ones((2, 60, 70))
     weights[1, 30, 36] = 0
     observations = [observe(grid, ("g", "r"), weights=weights)]
-    for x, expected in ((35.4, 0), (35.6, Flag.MASKED), (36.4, Flag.MASKED), (36.6, 0)):
-        sources = (Extended(position_px=(30.0, x)),)
+    for x, expected in (
+        (35.4, 0),
+        (35.6, Flag.CENTER_MASKED),
+        (36.4, Flag.CENTER_MASKED),
+        (36.6, 0),
+    ):
+        sources = (ExtendedSource(position_px=(30.0, x)),)
         assert flags(one_source(observations=observations, sources=sources)) == [Flag(expected)]
 
 
 def test_saturated_is_a_star_with_masked_pixels_in_its_core():
     grid = Grid.flat((60, 70), SCALE)
     for source, away, expected in (
-        (Point, (0, 0), Flag.SATURATED | Flag.MASKED),
-        (Point, (0, 1), Flag.SATURATED),  # the PSF's FWHM is 3 px
-        (Point, (-1, 1), Flag.SATURATED),  # 1.4 px away
-        (Point, (0, 2), Flag(0)),
-        (Extended, (0, 1), Flag(0)),
+        (PointSource, (0, 0), Flag.SATURATED | Flag.CENTER_MASKED),
+        (PointSource, (0, 1), Flag.SATURATED),  # the PSF's FWHM is 3 px
+        (PointSource, (-1, 1), Flag.SATURATED),  # 1.4 px away
+        (PointSource, (0, 2), Flag(0)),
+        (ExtendedSource, (0, 1), Flag(0)),
     ):
         weights = np.ones((2, 60, 70))
         weights[1, 30 + away[0], 36 + away[1]] = 0
@@ -108,7 +113,7 @@ def test_saturated_is_a_bright_galaxy_with_half_of_its_core_masked(reach, light,
     data[1, 30, 38] = light
     o = observe(grid, ("g", "r"), weights=weights)
     o = Observation(data, o.psf, grid, weights=weights, channels=o.channels, name=o.name)
-    source = (Extended(position_px=(30.0, 36.0)),)
+    source = (ExtendedSource(position_px=(30.0, 36.0)),)
     (found,) = flags(one_source(observations=[o], sources=source))
     assert bool(found & Flag.SATURATED) == expected
 
@@ -121,7 +126,7 @@ def test_a_core_is_as_large_as_the_psf_of_larger_pixels():
         weights[1, 15 + away[0], 17 + away[1]] = 0
         given = {
             "observations": [observe(grid, ("g", "r"), weights=weights)],
-            "sources": (Point(position_px=(30.5, 34.5)),),
+            "sources": (PointSource(position_px=(30.5, 34.5)),),
         }
         assert flags(one_source(**given)) == [expected]
 
@@ -145,9 +150,12 @@ def test_zero_flux_and_not_converged():
 
 
 def test_a_source_outside_the_frame_is_listed_and_not_measured():
-    sources = (Extended(position_px=MIDDLE), Point(position_px=(30.0, 90.0), name="far"))
+    sources = (
+        ExtendedSource(position_px=MIDDLE),
+        PointSource(position_px=(30.0, 90.0), name="far"),
+    )
     table = catalogue(one_source(sources=sources))
-    assert list(table["flags"]) == [0, Flag.OUTSIDE]
+    assert list(table["flags"]) == [0, Flag.OUTSIDE_FRAME]
     assert table["name"][1] == "far"
     assert table["x"][1] == 90 * u.pix
     for name in table.colnames:
@@ -161,9 +169,9 @@ def test_a_source_outside_the_frame_is_listed_and_not_measured():
 def test_nothing_fitted_is_still_a_catalogue():
     data = np.full((2, 60, 70), 3.0)
     observation = observe(Grid.flat((60, 70), SCALE), ("g", "r"), data=data)
-    far = (Point(position_px=(30.0, 90.0)),)
+    far = (PointSource(position_px=(30.0, 90.0)),)
     result = blend([], sources=far, observations=[observation], sky=np.array([1.0, 3.0]))
-    assert flags(result) == [Flag.OUTSIDE]
+    assert flags(result) == [Flag.OUTSIDE_FRAME]
     assert summary(result)["chi2"] == {"g": 4.0, "r": 0.0}
     assert not redistribute(result, 0).any()
     assert len(catalogue(blend([], sources=()))) == 0
@@ -172,13 +180,13 @@ def test_nothing_fitted_is_still_a_catalogue():
 def test_a_failed_fit_with_nan_is_still_a_catalogue():
     table = catalogue(blend([round_component(0, MIDDLE, (np.nan, 1))], status="failed: NaN"))
     assert table["flags"][0] & Flag.NOT_CONVERGED
-    assert np.isnan(table["flux_g"][0]) and np.isnan(table["size"][0])
+    assert np.isnan(table["flux_g"][0]) and np.isnan(table["rms_size"][0])
 
 
 def test_a_source_without_light_is_not_at_the_edge():
     dark = round_component(0, (14, 35), (0, 0), n=29)
     dark.morphology[:] = 0
-    sources = (Extended(position_px=(14.0, 35.0)),)
+    sources = (ExtendedSource(position_px=(14.0, 35.0)),)
     assert Flag.EDGE not in flags(blend([dark], sources=sources))[0]
 
 
@@ -207,10 +215,10 @@ def test_columns_have_units():
         assert {units.pop(sky), units.pop(f"{sky}_centroid")} == {u.arcsec}
         assert units.pop(f"{name}_centroid_err") == u.pix
         assert units.pop(f"{sky}_centroid_err") == u.arcsec
-    assert units.pop("size") == units.pop("size_err") == u.arcsec
-    assert units.pop("angle") == units.pop("angle_err") == u.deg
+    assert units.pop("rms_size") == units.pop("rms_size_err") == u.arcsec
+    assert units.pop("position_angle") == units.pop("position_angle_err") == u.deg
     plain = {"snr", "n_components", "chi2_raw", "chi2_cam", "e1", "e2", "e1_err", "e2_err"}
-    plain |= {f"residual_{name}" for name in "abgri"}
+    plain |= {f"max_residual_{name}" for name in "abgri"}
     plain |= {"misfit_sigma", "misfit_fraction", "ambiguous_with"}
     assert set(units) == plain
     assert all(units[name] in (None, u.dimensionless_unscaled) for name in plain)

@@ -21,7 +21,7 @@ def test_rows_follow_each_other_and_what_is_missing_is_nan():
     other.put("n", np.arange(3, dtype=np.int16))
     other.put("bits", np.full(3, 6, dtype=np.uint8))
     other.put("note", np.full(3, "why"))
-    both = Columns.joined([one, other])
+    both = Columns.concatenate([one, other])
     assert len(both) == 5 and list(both.values) == ["id", "a", "status", "b", "n", "bits", "note"]
     assert both.units == {"a": u.uJy, "b": u.uJy} and both.meta == {"frame": "icrs", "k": 1}
     assert both["id"].tolist() == [1, 2, 4, 5, 6] and both["id"].dtype == np.int32
@@ -31,12 +31,12 @@ def test_rows_follow_each_other_and_what_is_missing_is_nan():
     assert both["status"].tolist() == ["x", "x", "xxxx", "xxxx", "xxxx"]
     assert both["note"].tolist() == ["", "", "why", "why", "why"]
     assert len(one) == 2 and "b" not in one and "a" in one  # as they were
-    assert len(Columns.joined([])) == 0
+    assert len(Columns.concatenate([])) == 0
 
 
 def test_rows_are_chosen_and_become_a_table():
     whole = columns(4, 2, ("a",), {"frame": "icrs"})
-    some = whole.chosen(np.array([True, False, False, True]))
+    some = whole.select_rows(np.array([True, False, False, True]))
     assert some["id"].tolist() == [2, 5] and len(whole) == 4
     table = some.table()
     expected = QTable(

@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 
 from clresample.measurement import companions, detection
-from clresample.measurement.companions import centred, is_a_source, left_over, noise_of, top_near
-from clresample.measurement.signal import Signal
+from clresample.measurement.companions import (
+    brightest_peak_near,
+    is_a_source,
+    parabolic_peak,
+    residual_scatter,
+    symmetric_residual,
+)
+from clresample.measurement.signal_to_noise import SignalToNoise
 
 
 def cone(shape, centre, height):
@@ -18,13 +24,13 @@ def cone(shape, centre, height):
 
 def test_a_cone_is_all_of_one_source_and_its_light_ends_under_half_a_sigma():
     image = cone((41, 43), (20, 22), 9.4)
-    rest, model = left_over(image, np.ones(image.shape, bool), np.array([[20.0, 22.0]]))
+    rest, model = symmetric_residual(image, np.ones(image.shape, bool), np.array([[20.0, 22.0]]))
     np.testing.assert_allclose(model + rest, image, atol=1e-6)
     # rings at whole pixels between which cones are straight; a ring of 9 px has 0.4
     radius = np.hypot(*(np.indices(image.shape) - np.array([20, 22])[:, None, None]))
     np.testing.assert_allclose(model[radius <= 8], image[radius <= 8], atol=0.15)
     assert not model[radius > 9].any() and model[20, 22 + 9] == pytest.approx(0.4, abs=1e-5)
-    assert not left_over(0.05 * image, image > -1, np.array([[20.0, 22.0]]))[1].any()
+    assert not symmetric_residual(0.05 * image, image > -1, np.array([[20.0, 22.0]]))[1].any()
 
 
 def test_a_turned_ellipse_is_all_of_one_source():
@@ -32,7 +38,7 @@ def test_a_turned_ellipse_is_all_of_one_source():
     y, x = np.indices((91, 91)) - 45
     u, v = 0.8 * y + 0.6 * x, -0.6 * y + 0.8 * x
     image = 100 * np.exp(-0.5 * ((u / 9) ** 2 + (v / 4) ** 2))
-    rest, model = left_over(image, image > -1, np.array([[45.0, 45.0]]))
+    rest, model = symmetric_residual(image, image > -1, np.array([[45.0, 45.0]]))
     assert np.abs(rest).max() < 3 and model[53, 51] == pytest.approx(image[53, 51], rel=0.05)
     assert model[53, 39] < 0.5 * model[53, 51]
 
@@ -41,7 +47,7 @@ def test_a_turned_ellipse_is_all_of_one_source():
 def test_light_is_followed_for_sixty_pixels(centre):
     """On all sides, as far as there are pixels; what lies behind an edge is told by the other."""
     image = np.full((131, 133), 3.0)
-    _, model = left_over(image, np.ones(image.shape, bool), np.array([centre], float))
+    _, model = symmetric_residual(image, np.ones(image.shape, bool), np.array([centre], float))
     radius = np.hypot(*(np.indices(image.shape) - np.array(centre)[:, None, None]))
     np.testing.assert_allclose(model[radius < 59.9], 3, rtol=1e-6)
     assert not model[radius > 60.1].any()
@@ -53,7 +59,7 @@ def test_light_is_followed_for_sixty_pixels(centre):
 
 def test_models_of_two_sources_add_up():
     image = np.full((40, 40), 2.0)
-    rest, model = left_over(image, np.ones((40, 40), bool), np.array([[20.0, 20.0]] * 2))
+    rest, model = symmetric_residual(image, np.ones((40, 40), bool), np.array([[20.0, 20.0]] * 2))
     np.testing.assert_allclose(model, 4, rtol=1e-6)
     np.testing.assert_allclose(rest, -2, rtol=1e-6)
 
@@ -61,7 +67,7 @@ def test_models_of_two_sources_add_up():
 def test_noise_of_what_is_left():
     """The noise of two sides where there is light, and 5 % of that."""
     np.testing.assert_allclose(
-        noise_of(np.array([0.0, 1.0, 2.0, 100.0])),
+        residual_scatter(np.array([0.0, 1.0, 2.0, 100.0])),
         np.sqrt([1, 1 + 0.05**2, 2 + 0.1**2, 2 + 5**2]),
     )
 
@@ -72,13 +78,13 @@ def test_tops_of_parabolas_beside_an_edge(place):
     y, x = np.indices((7, 8))
     top = np.add(place, (0.3, -0.2))
     image = 50 - 2 * (y - top[0]) ** 2 - 3 * (x - top[1]) ** 2
-    np.testing.assert_allclose(centred(image, place), top, atol=1e-12)
+    np.testing.assert_allclose(parabolic_peak(image, place), top, atol=1e-12)
 
 
 @pytest.mark.parametrize("place", [(0, 4), (6, 4), (3, 0), (3, 7)])
 def test_a_peak_on_an_edge_stays(place):
     image = np.random.default_rng(0).random((7, 8))
-    np.testing.assert_array_equal(centred(image, place), place)
+    np.testing.assert_array_equal(parabolic_peak(image, place), place)
 
 
 def test_a_top_lies_within_half_a_pixel():
@@ -92,14 +98,17 @@ def test_the_top_is_looked_for_within_the_radius_and_no_further():
     for away in ((0, 2), (2, 0), (-2, 0), (0, -2), (2, -2)):
         image = np.zeros((15, 17))
         image[7, 8], image[7 + away[0], 8 + away[1]] = 1.0, 5.0
-        near, height = top_near(image, (7, 8), 2)
+        near, height = brightest_peak_near(image, (7, 8), 2)
         assert height == 5 and tuple(near) == (7 + away[0], 8 + away[1])
-        near, height = top_near(image, (7, 8), 1)
+        near, height = brightest_peak_near(image, (7, 8), 1)
         assert height == 1 and np.hypot(*(near - (7, 8))) <= 0.5
 
 
 def spectra_signal(spectra):
-    """A stand-in for a Signal: `spectra` {pixel: signal to noise of its channels}, else 0."""
+    """A stand-in for a SignalToNoise: `spectra` {pixel.
+
+    Signal to noise of its channels}, else 0.
+    """
     n = len(next(iter(spectra.values())))
 
     def at(places):
@@ -111,7 +120,7 @@ def spectra_signal(spectra):
 @pytest.mark.parametrize("light, clump", [(0.0, 10.0), (3.0, 20.0)])
 def test_clumps_grow_with_the_root_of_peak_and_light(light, clump):
     """Of a galaxy of 100 sigma: CLUMP and COLOURED times sqrt(100 (light + 1)), where pixels are so
-    large that the peak is 0.8 arcsec from its centre; further away more, up to MOST_CLUMP."""
+    large that the peak is 0.8 arcsec from its centre; further away more, up to MAX_CLUMP."""
     image, model = np.zeros((2, 40, 40))
     image[20, 8], model[20, 30] = 100.0, light
     centres = np.array([[20.2, 7.9]])
@@ -217,7 +226,7 @@ def test_a_neighbour_on_a_flank_is_found_in_one_channel():
     image = spot((40, 38), 300, 4) + spot((40, 48), 60, 1.7)
     places = np.moveaxis(np.indices(image.shape), 0, -1).astype(float)
     both = np.stack([image, image])  # under both filters that are asked
-    signal = Signal(both, both**2, np.ones(image.shape, int), image[None], places)
+    signal = SignalToNoise(both, both**2, np.ones(image.shape, int), image[None], places)
     given = sep, [signal], 0, image, np.array([[40.0, 38.0]])
     ((place, height),) = detection._companions(*given, 5.0, 4.0, 0.1)
     assert np.hypot(*(place - (40, 48))) < 0.7 and height == pytest.approx(60, rel=0.15)
@@ -232,12 +241,12 @@ def test_what_no_channel_has_seen_is_told_by_the_other_side(monkeypatch):
         given.append(seen)
         return np.zeros(image.shape), np.zeros(image.shape)
 
-    monkeypatch.setattr(detection, "left_over", left)
+    monkeypatch.setattr(detection, "symmetric_residual", left)
     monkeypatch.setattr(detection, "new_peaks", lambda *_, **__: [])
     n_seen = np.array([[0, 1, 2]] * 3)
     image = np.zeros((3, 3), np.float32)
     both = np.stack([image, image])  # under both filters that are asked
-    signal = Signal(both, both, n_seen, image[None], np.zeros((3, 3, 2)))
+    signal = SignalToNoise(both, both, n_seen, image[None], np.zeros((3, 3, 2)))
     detection._companions(None, [signal], 0, image, np.array([[1.0, 1.0]]), 5.0, 4.0, 0.1)
     assert given[0].tolist() == [[False, True, True]] * 3
 
@@ -253,7 +262,7 @@ def test_companions_have_five_sigma_however_low_the_threshold(monkeypatch):
     image = np.zeros((20, 20), np.float32)
     places = np.moveaxis(np.indices(image.shape), 0, -1).astype(float)
     both = np.stack([image, image])  # under both filters that are asked
-    signal = Signal(both, both, np.ones(image.shape, int), image[None], places)
+    signal = SignalToNoise(both, both, np.ones(image.shape, int), image[None], places)
     for threshold in (2.0, 8.0):
         where = np.array([[10.0, 10.0]])
         detection._companions(None, [signal], 0, image, where, threshold, 4.0, 0.1)

@@ -7,16 +7,16 @@ from clresample.measurement import detection
 from clresample.measurement.companions import (
     CLUMP,
     CLUMP_ARCSEC,
-    LEAST_CLUMP,
-    LEAST_WIDE,
-    MOST_CLUMP,
-    centred,
+    MAX_CLUMP,
+    MIN_CLUMP,
+    MIN_WIDE,
+    brightest_peak_near,
     is_a_source,
-    left_over,
-    noise_of,
-    top_near,
+    parabolic_peak,
+    residual_scatter,
+    symmetric_residual,
 )
-from clresample.measurement.signal import Signal
+from clresample.measurement.signal_to_noise import SignalToNoise
 
 SHAPE = (121, 121)
 FWHM = 5.0  # [px] of a point in these images
@@ -31,14 +31,14 @@ def spot(place, height, sigma=FWHM / 2.355, ratio=1.0):
 
 
 def rest_of(image, *places, seen=SEEN):
-    return left_over(image, seen, np.array(places, float))
+    return symmetric_residual(image, seen, np.array(places, float))
 
 
 def test_a_symmetric_source_leaves_little_and_its_model_is_its_light():
     image = spot((60.3, 58.6), 500, sigma=6, ratio=1.6)
     rest, model = rest_of(image, (60.3, 58.6))
     assert np.abs(rest).max() < 0.02 * 500
-    assert (rest / noise_of(model)).max() < 5
+    assert (rest / residual_scatter(model)).max() < 5
     np.testing.assert_allclose(model.sum(), image.sum(), rtol=0.05)
 
 
@@ -64,7 +64,9 @@ def test_a_side_that_was_not_seen_is_told_by_the_other():
 def judge(image, channels, place, centre=(60.0, 60.0), scale=SCALE):
     rest, model = rest_of(image, centre)
     places = np.moveaxis(np.indices(SHAPE), 0, -1).astype(float)
-    signals = [Signal(channels[None, 0], channels[None, 0], SEEN.astype(int), channels, places)]
+    signals = [
+        SignalToNoise(channels[None, 0], channels[None, 0], SEEN.astype(int), channels, places)
+    ]
     height = rest[tuple(place)]
     centres = np.array([centre])
     return is_a_source(np.array(place), height, model, image, signals, centres, FWHM, scale)
@@ -80,7 +82,7 @@ def test_a_clump_of_the_galaxys_colours_is_no_source_and_one_of_others_is():
 
 @pytest.mark.parametrize(
     "away_arcsec, part",
-    ((0.1, LEAST_CLUMP), (CLUMP_ARCSEC, CLUMP), (1.1 * CLUMP_ARCSEC, 1.1 * CLUMP), (3, MOST_CLUMP)),
+    ((0.1, MIN_CLUMP), (CLUMP_ARCSEC, CLUMP), (1.1 * CLUMP_ARCSEC, 1.1 * CLUMP), (3, MAX_CLUMP)),
 )
 def test_what_is_bright_beside_the_light_about_it_is_a_source_in_any_colour(away_arcsec, part):
     galaxy = spot((60, 60), 100, sigma=4)
@@ -92,28 +94,28 @@ def test_what_is_bright_beside_the_light_about_it_is_a_source_in_any_colour(away
 
 def test_centres_are_found_to_part_of_a_pixel():
     image = spot((60.3, 58.8), 100)
-    np.testing.assert_allclose(centred(image, (60, 59)), (60.3, 58.8), atol=0.05)
-    np.testing.assert_array_equal(centred(image, (0, 59)), (0, 59))
+    np.testing.assert_allclose(parabolic_peak(image, (60, 59)), (60.3, 58.8), atol=0.05)
+    np.testing.assert_array_equal(parabolic_peak(image, (0, 59)), (0, 59))
 
 
 def test_the_top_of_what_is_left_is_nearer_than_its_peak_in_units_of_the_noise():
     image = spot((60, 60), 400, sigma=4) + spot((60.4, 67.2), 90)
     rest, model = rest_of(image, (60, 60))
-    peak = np.unravel_index((rest / noise_of(model)).argmax(), SHAPE)
-    place, height = top_near(rest, peak, 2)
+    peak = np.unravel_index((rest / residual_scatter(model)).argmax(), SHAPE)
+    place, height = brightest_peak_near(rest, peak, 2)
     away, before = (np.hypot(*(np.array(p) - (60.4, 67.2))) for p in (place, peak))
     assert away <= before and away < 1.2
     assert height == rest.max() or height >= rest[peak]
     corner = np.zeros(SHAPE)
     corner[0, 1] = 3.0
-    assert top_near(corner, (1, 0), 2) == (pytest.approx((0, 1)), 3.0)
+    assert brightest_peak_near(corner, (1, 0), 2) == (pytest.approx((0, 1)), 3.0)
 
 
 def beside(narrow, wide, monkeypatch):
     """Places of neighbours of the source at (60, 60), where two peaks are seen about (60, 72)."""
     sums = np.stack([narrow, wide])
     places = np.moveaxis(np.indices(SHAPE), 0, -1).astype(float)
-    signals = [Signal(sums, sums**2, SEEN.astype(int), narrow[None], places)]
+    signals = [SignalToNoise(sums, sums**2, SEEN.astype(int), narrow[None], places)]
     peaks = [(np.array([60.0, x]), 9.0) for x in (71, 73)]
     monkeypatch.setattr(detection, "new_peaks", lambda *args, **more: peaks)
     at = np.array([[60.0, 60.0]])
@@ -129,6 +131,6 @@ def test_two_peaks_about_one_top_are_one_neighbour(monkeypatch):
 
 def test_a_neighbour_is_seen_under_the_filter_of_small_galaxies_too(monkeypatch):
     host = spot((60, 60), 300, sigma=4)
-    for height, n in ((0.9 * LEAST_WIDE, 0), (1.3 * LEAST_WIDE, 1)):
+    for height, n in ((0.9 * MIN_WIDE, 0), (1.3 * MIN_WIDE, 1)):
         wide = host + spot((60, 72), height)
         assert len(beside(host + spot((60, 72), 90), wide, monkeypatch)) == n

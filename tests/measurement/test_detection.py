@@ -8,7 +8,7 @@ from helpers.blends import gaussian
 
 from clresample.deblending.batch import deblend
 from clresample.deblending.posterior.residuals import convolved
-from clresample.deblending.profiles import point
+from clresample.deblending.profiles import draw_psf
 from clresample.deblending.settings import Settings
 from clresample.measurement.detection import detect, detect_more
 from clresample.resampling.cache import cached_resampler
@@ -16,7 +16,7 @@ from clresample.sky.frame import model_frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
-from clresample.sky.sources import Extended
+from clresample.sky.sources import ExtendedSource
 
 pytest.importorskip("sep")
 SHARP, BLURRED = Grid.flat((80, 90), 0.1), Grid.flat((44, 50), 0.2, angle_deg=20)
@@ -46,7 +46,7 @@ def instruments(sources, *, seed=3, size=1.2, sharp_noise=1.0, blurred_noise=1.0
             image = gaussian(frame.shape, (y, x), np.eye(2) * size**2)
             image /= image.sum()
         else:
-            image = point(frame.psf, (y, x), frame.shape)[0]
+            image = draw_psf(frame.psf, (y, x), frame.shape)[0]
         scenes += np.array(fluxes)[:, None, None] * image
     made = []
     for o, scene, noise in zip(blank, scenes, (sharp_noise, blurred_noise), strict=True):
@@ -121,7 +121,7 @@ def test_unseen_sky_and_bad_pixels_are_no_sources():
 def test_what_a_fit_leaves_over_is_found(device):
     sources = [(40, 40, 20000, 20000), (40, 52, 120, 120)]
     observations, frame = instruments(sources)
-    first = [Extended(position_px=(40, 40))]
+    first = [ExtendedSource(position_px=(40, 40))]
     result = deblend(
         observations, first, frame=frame, device=device, settings=Settings(max_iter=20)
     )

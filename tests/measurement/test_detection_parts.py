@@ -6,7 +6,7 @@ from helpers.blends import blend, in_frame, observe, round_component
 
 from clresample.measurement import detection as module, peaks
 from clresample.measurement.detection import ALL, detect, detect_more
-from clresample.measurement.signal import signal_of
+from clresample.measurement.signal_to_noise import signal_of
 from clresample.sky.frame import model_frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation

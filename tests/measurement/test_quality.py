@@ -13,7 +13,7 @@ from helpers.blends import (
 )
 
 from clresample.measurement.catalogue import catalogue
-from clresample.measurement.quality import labels, summary
+from clresample.measurement.quality import observation_labels, summary
 from clresample.sky.grid import Grid
 
 
@@ -60,7 +60,7 @@ def test_labels_are_unique():
         observe(grid, (c,), name=name) for c, name in zip("abcd", ("hst", None, "hst", "hsc"))
     ]
     result = blend([round_component(0, MIDDLE, np.ones(4))], observations=observations)
-    assert labels(result) == ["hst0", "observation1", "hst2", "hsc"]
+    assert observation_labels(result) == ["hst0", "observation1", "hst2", "hsc"]
 
 
 def test_summary_holds_the_blends_figures_as_json():

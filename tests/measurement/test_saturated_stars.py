@@ -17,7 +17,7 @@ from clresample.sky.frame import model_frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
-from clresample.sky.sources import Extended, Point
+from clresample.sky.sources import ExtendedSource, PointSource
 
 SHAPE, NOISE, FWHM, BETA, LEVEL = (90, 96), 5.0, 4.0, 2.5, 3e4
 STAR, FLUX = (44.3, 47.6), 4e6
@@ -67,7 +67,7 @@ def cores_of(observation):
 def fits():
     observation = starry()
     found = detect([observation])
-    listed = Extended(position_px=STAR), Extended(position_px=GALAXY)
+    listed = ExtendedSource(position_px=STAR), ExtendedSource(position_px=GALAXY)
     results = [deblend([observation], sources) for sources in (found.sources, listed)]
     return SimpleNamespace(found=found, results=results)
 
@@ -109,7 +109,7 @@ def test_flat_tops_that_nobody_masked_are_cores_too():
 
 def test_detection_finds_a_point_and_the_galaxy_and_no_spikes(fits):
     kinds = [type(source) for source in fits.found.sources]
-    assert kinds == [Point, Extended]
+    assert kinds == [PointSource, ExtendedSource]
     grid = starry().grid
     at = [fits.found.frame.grid.positions_in(grid, *s.position_px) for s in fits.found.sources]
     assert np.hypot(*(at[0] - STAR)) < 0.7
@@ -119,7 +119,7 @@ def test_detection_finds_a_point_and_the_galaxy_and_no_spikes(fits):
 @pytest.mark.parametrize("which", [0, 1], ids=["detected", "listed as a galaxy"])
 def test_its_wings_and_spikes_are_its_own(fits, which):
     result = fits.results[which]
-    assert isinstance(result.sources[0], Point)
+    assert isinstance(result.sources[0], PointSource)
     assert result.status == "converged"
     assert summary(result)["chi2"]["r"] < 1.5
     table = catalogue(result)

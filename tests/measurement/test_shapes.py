@@ -29,13 +29,15 @@ def test_moments_of_an_elliptical_gaussian(angle_deg):
     sky = SCALE * (center - [29.5, 34.5])
     found = [row["y_sky_centroid"].value, row["x_sky_centroid"].value]
     np.testing.assert_allclose(found, sky, atol=1e-7)
-    assert row["size"].unit == u.arcsec
-    np.testing.assert_allclose(row["size"].value, SCALE * np.sqrt((9 + 4) / 2), rtol=1e-6)
+    assert row["rms_size"].unit == u.arcsec
+    np.testing.assert_allclose(row["rms_size"].value, SCALE * np.sqrt((9 + 4) / 2), rtol=1e-6)
     e = (9 - 4) / (9 + 4)
     np.testing.assert_allclose(row["e1"], e * np.cos(2 * t), atol=1e-6)
     np.testing.assert_allclose(row["e2"], e * np.sin(2 * t), atol=1e-6)
-    np.testing.assert_allclose((row["angle"].value - angle_deg + 90) % 180 - 90, 0, atol=1e-4)
-    assert 0 <= row["angle"].value < 180
+    np.testing.assert_allclose(
+        (row["position_angle"].value - angle_deg + 90) % 180 - 90, 0, atol=1e-4
+    )
+    assert 0 <= row["position_angle"].value < 180
 
 
 @pytest.mark.parametrize("cards", [{}, {"CROTA2": 33.0}, {"CDELT1": 0.2 / 3600}, {"dec": 89.9}])
@@ -50,8 +52,8 @@ def test_angles_on_the_sky_are_east_of_north(cards):
     row = catalogue(result)[0]
     one, two = (SkyCoord(*grid.sky(*p), unit="deg") for p in (here, there))
     angle = one.position_angle(two).deg
-    np.testing.assert_allclose((row["angle"].value - angle + 90) % 180 - 90, 0, atol=0.01)
-    np.testing.assert_allclose(row["size"].value, 0.2 * np.sqrt(6.5), rtol=1e-5)
+    np.testing.assert_allclose((row["position_angle"].value - angle + 90) % 180 - 90, 0, atol=0.01)
+    np.testing.assert_allclose(row["rms_size"].value, 0.2 * np.sqrt(6.5), rtol=1e-5)
     for ra, dec in (("ra", "dec"), ("ra_centroid", "dec_centroid")):
         assert SkyCoord(row[ra], row[dec]).separation(one).arcsec < 1e-3
 
@@ -63,7 +65,7 @@ def test_components_weigh_in_moments_by_their_light_in_units_of_its_error():
     row = catalogue(result)[0]
     np.testing.assert_allclose(row["x_centroid"].value, (32 + 2 * 38) / 3, rtol=1e-9)
     spread = np.sqrt(1.5**2 + 0.5 * (4**2 + 2 * 2**2) / 3)
-    np.testing.assert_allclose(row["size"].value, SCALE * spread, rtol=1e-6)
+    np.testing.assert_allclose(row["rms_size"].value, SCALE * spread, rtol=1e-6)
     dark = [round_component(0, (30, x), (0, 0)) for x in (32, 38)]
     np.testing.assert_allclose(catalogue(blend(dark))["x_centroid"][0].value, 35, rtol=1e-12)
 
@@ -102,7 +104,7 @@ def test_errors_of_positions_on_the_sky(cards):
     assert row["ra_centroid_err"].to_value("deg") == pytest.approx(np.std(lon), rel=0.03)
     assert row["dec_centroid_err"].to_value("deg") == pytest.approx(np.std(lat), rel=0.03)
     assert row["flux_err_g"].value == 1
-    assert row["angle_err"].value == pytest.approx(180 / np.sqrt(12))  # a round source's
+    assert row["position_angle_err"].value == pytest.approx(180 / np.sqrt(12))  # a round source's
 
 
 def test_shapes_are_without_what_the_bound_adds():
@@ -119,8 +121,8 @@ def test_shapes_are_without_what_the_bound_adds():
     for axis, by in (("y", 0.1), ("x", -0.2)):
         name = f"{axis}_centroid"
         assert (changed[name] - plain[name]).value == pytest.approx(by)
-    assert changed["size"] < plain["size"] and changed["e2"] != plain["e2"]
-    assert kept["size"] == plain["size"] and kept["y_centroid"] == plain["y_centroid"]
+    assert changed["rms_size"] < plain["rms_size"] and changed["e2"] != plain["e2"]
+    assert kept["rms_size"] == plain["rms_size"] and kept["y_centroid"] == plain["y_centroid"]
 
 
 def test_a_single_pixel_has_size_0_and_no_ellipticity():

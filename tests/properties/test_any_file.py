@@ -14,13 +14,13 @@ from hypothesis import example, given, strategies as st
 from hypothesis.extra import numpy as hnp
 
 from clresample.cli.options import printable
-from clresample.fields.reading.keys import SCENE_TABLES as TABLES, parse_scene as parse
-from clresample.files.arrays import array_of, image_hdu
+from clresample.fields.field_toml.keys import SCENE_TABLES as TABLES, parse_scene as parse
+from clresample.files.array_hdus import array_of, image_hdu
+from clresample.files.atomic import FileError
 from clresample.files.fits import read_image, read_psf
-from clresample.files.names import check_channels, to_ascii
+from clresample.files.fits_names import check_channels, to_ascii
 from clresample.files.scene_keys import SceneError
 from clresample.files.source_table import read_sources
-from clresample.files.whole_file import FileError
 
 TEXT = st.text(max_size=20)
 NUMBER = st.one_of(

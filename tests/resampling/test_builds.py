@@ -16,7 +16,7 @@ from helpers.geometries import (
 )
 
 from clresample.resampling.paper.resampler import PaperResampler
-from clresample.resampling.plan import Precision, make_plan
+from clresample.resampling.plan import Precision, make_resampling_plan
 from clresample.resampling.resampler import Resampler
 from clresample.sky.psf import PSF
 from clresample.testing import check_adjoint
@@ -94,7 +94,7 @@ def test_items_with_tables_of_their_own(builds):
             angles = (0, 0, 0) if geometry == "aligned" else (10, 25, -20)
             build = distorted if geometry == "distorted" else affine
             plans = [
-                make_plan(build(turn(a, s)), *psfs(), precision=Precision.of(np.float32))
+                make_resampling_plan(build(turn(a, s)), *psfs(), precision=Precision.of(np.float32))
                 for a, s in zip(angles, (2.0, 0.7, 3.0), strict=True)
             ]
             op = Resampler.from_plans(plans, device=device)
@@ -115,7 +115,7 @@ def test_operators_of_terms(builds, name):
 
     def check(device):
         precision = Precision.of(np.float32)
-        plan = make_plan(GEOMETRIES[name](), *pair, precision=precision, n_terms=3)
+        plan = make_resampling_plan(GEOMETRIES[name](), *pair, precision=precision, n_terms=3)
         op, rng = Resampler.from_plans([plan], device=device), np.random.default_rng(2)
         images = rng.normal(size=(2, *op.shape_in)).astype(np.float32)
         seen = expected(op, images, *pair).reshape(2, 2, 3, *op.shape_out[1:]).sum(axis=2)
@@ -149,7 +149,7 @@ def test_a_buffer_left_unwritten_and_an_overrun_are_seen(builds, device):
 
     def overrun(device):
         array = device.empty(7, np.float32)
-        device.launcher("update.cl", "rescale", dtype=np.float32, local_size=(1,))(
+        device.launcher("update.cl", "rescale_spectra", dtype=np.float32, local_size=(1,))(
             (1,), factor=array, n_channels=1, spectra=array, n=9
         )
 

@@ -85,9 +85,9 @@ def test_padding_keeps_the_frequencies_and_so_the_answer(device):
 
 
 def test_a_second_fit_of_a_geometry_makes_no_plan(device, monkeypatch):
-    made, make_plan = [], cache_module.make_plan
+    made, make_plan = [], cache_module.make_resampling_plan
     monkeypatch.setattr(
-        cache_module, "make_plan", lambda *a, **k: made.append(a) or make_plan(*a, **k)
+        cache_module, "make_resampling_plan", lambda *a, **k: made.append(a) or make_plan(*a, **k)
     )
     given = {"settings": Settings(max_iter=2), "device": device}
     for seed in (0, 1):
@@ -138,7 +138,7 @@ def test_operators_count_what_they_hold_on_the_device(device):
 
 def test_what_entries_have_grown_by_is_found_out():
     """Not at once, but as soon as a tenth of the entries is new; each is asked a few times."""
-    asked, store = [], cache_module._Store(1000)
+    asked, store = [], cache_module._LRUStore(1000)
 
     class Entry:
         size = 10
@@ -160,7 +160,9 @@ def test_what_entries_have_grown_by_is_found_out():
 def test_caches_are_bounded(device, monkeypatch):
     """More geometries than are kept: the device's memory stops growing."""
     monkeypatch.setattr(
-        cache_module, "make_plan", lambda *a, **k: SimpleNamespace(n_bytes=100, mapping=None)
+        cache_module,
+        "make_resampling_plan",
+        lambda *a, **k: SimpleNamespace(n_bytes=100, mapping=None),
     )
     monkeypatch.setattr(
         cache_module.Resampler,

@@ -10,9 +10,9 @@ from helpers.geometries import GEOMETRIES, affine, distorted, operator, psfs, tu
 from clresample.device.tuning import Tuning
 from clresample.resampling import plan as plan_module
 from clresample.resampling.paper.resampler import PaperResampler
-from clresample.resampling.plan import Precision, make_plan
+from clresample.resampling.plan import Precision, make_resampling_plan
 from clresample.resampling.resampler import Resampler
-from clresample.resampling.tiled.layout import SIDES, Sizes, window_of
+from clresample.resampling.tiled.layout import SIDES, TileCosts, window_of
 from clresample.resampling.transfer import wrap_radius
 from clresample.sky.grid import Grid
 from clresample.sky.psf import PSF
@@ -54,13 +54,13 @@ def test_tiles_take_what_they_are_said_to(device, as_asked, geometry, n_bands):
     tables. From the sides that are expected of a tile: as much, or up to a sixth more."""
     tuning = replace(Tuning.of(device, np.float32), tile_flops=0.0, pixel_flops=0.0)
     given = PSF.gaussian(BANDS[:n_bands]), PSF.gaussian([b + 0.2 for b in BANDS[:n_bands]])
-    sizes = Sizes(tile(geometry, 32)[0], MARGIN, *given, Precision.of(np.float32), tuning)
+    sizes = TileCosts(tile(geometry, 32)[0], MARGIN, *given, Precision.of(np.float32), tuning)
     for m in (13, 60):
         window = tile(geometry, m)[1]
         op = None  # that of the other size is gone
         gc.collect()
         before = device.in_use
-        plan = make_plan(window, *given, precision=Precision.of(np.float32))
+        plan = make_resampling_plan(window, *given, precision=Precision.of(np.float32))
         op = Resampler.from_plans([plan], device=device)
         op.adjoint(op(np.ones(op.shape_in, np.float32)))
         used = device.in_use - before
@@ -81,7 +81,7 @@ def test_tiles_take_what_they_are_said_to(device, as_asked, geometry, n_bands):
         assert more == 1e9 + 1e3 * n_bands * (n * n + m * m)
         sizes.tuning = tuning
     doubled = replace(tuning, tile_flops=0.0)
-    exact = Sizes(tile(geometry, 32)[0], MARGIN, *given, Precision.of(np.float64), doubled)
+    exact = TileCosts(tile(geometry, 32)[0], MARGIN, *given, Precision.of(np.float64), doubled)
     assert exact.itemsize == 2 * sizes.itemsize
 
 
@@ -89,7 +89,7 @@ def test_the_quickest_tile_within_the_memory_is_chosen():
     """Of all sides, whatever a tile costs; the tiles of a frame are as equal as can be."""
     assert SIDES[0] == 8 and SIDES[-1] == 16384
     assert (SIDES[1:] / SIDES[:-1]).max() <= 1.25
-    sizes = Sizes.__new__(Sizes)
+    sizes = TileCosts.__new__(TileCosts)
 
     def total(tile, shape, time):
         return np.prod([-(-n // m) for n, m in zip(shape, tile, strict=True)]) * time(max(tile))
@@ -117,26 +117,26 @@ def test_the_bound_on_tables_counts_what_a_plan_holds(monkeypatch):
         mapping = GEOMETRIES[name]()
         for shape in ((31, 26), (43, 120)):
             mapping = replace(mapping, shape_in=shape)
-            plan = plan_module.make_plan(mapping, sample, sample, precision=precision)
+            plan = plan_module.make_resampling_plan(mapping, sample, sample, precision=precision)
             held = sum(t.nbytes for t in (plan.in_y, plan.in_x, plan.out_y, plan.out_x))
             held += 3 * (plan.d_plus.nbytes + plan.d_minus.nbytes)
-            monkeypatch.setattr(plan_module, "MOST_BYTES", held)
-            plan_module.make_plan(mapping, sample, sample, precision=precision)
-            monkeypatch.setattr(plan_module, "MOST_BYTES", held - 1)
+            monkeypatch.setattr(plan_module, "MAX_BYTES", held)
+            plan_module.make_resampling_plan(mapping, sample, sample, precision=precision)
+            monkeypatch.setattr(plan_module, "MAX_BYTES", held - 1)
             with pytest.raises(ValueError, match=r"needs tables of \S+ GiB"):
-                plan_module.make_plan(mapping, sample, sample, precision=precision)
+                plan_module.make_resampling_plan(mapping, sample, sample, precision=precision)
             monkeypatch.undo()
 
 
 def test_the_bound_on_tables_counts_bands_and_lines(monkeypatch):
     """And up to 2.7 times as much: the transforms of both PSFs, which are freed again."""
-    plan = plan_module.make_plan(
+    plan = plan_module.make_resampling_plan(
         GEOMETRIES["30 degrees"](), *psfs(), precision=Precision.of(np.float32)
     )
     held = sum(table.nbytes for table in (plan.d_plus, plan.d_minus, plan.in_y, plan.in_x))
-    monkeypatch.setattr(plan_module, "MOST_BYTES", 1)
+    monkeypatch.setattr(plan_module, "MAX_BYTES", 1)
     with pytest.raises(ValueError, match=r"needs tables of \S+ GiB") as error:
-        plan_module.make_plan(
+        plan_module.make_resampling_plan(
             GEOMETRIES["30 degrees"](), *psfs(), precision=Precision.of(np.float32)
         )
     said = float(str(error.value).split("tables of ")[1].split()[0]) * 2**30

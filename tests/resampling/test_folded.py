@@ -25,7 +25,7 @@ ROUNDED_TWICE = 6e-8
 
 @pytest.fixture(autouse=True)
 def where_it_serves(device):
-    if not (device.has_fp64 and Tuning.of(device).folds):
+    if not (device.has_fp64 and Tuning.of(device).use_folded):
         pytest.skip(f"{device.name} does not go through float64")
 
 

@@ -240,7 +240,7 @@ def test_no_launch_has_more_groups_than_a_gpu_takes(device, monkeypatch):
     """Batches larger than that, launched as on a GPU."""
     launches, launch = [], Device.launch
     monkeypatch.setattr(device, "kind", "GPU")
-    monkeypatch.setattr(resampler, "MOST_GROUPS", 7)
+    monkeypatch.setattr(resampler, "MAX_GROUPS", 7)
 
     def seen(self, kernel, size, local):
         launches.append([n // g for n, g in zip(size, local)])

@@ -5,7 +5,7 @@ import pytest
 from helpers.geometries import GEOMETRIES, psfs
 
 from clresample.resampling.gridding import transpose_taps
-from clresample.resampling.plan import Precision, make_plan
+from clresample.resampling.plan import Precision, make_resampling_plan
 from clresample.resampling.transfer import light_reach, wrap_radius
 from clresample.sky.psf import PSF
 
@@ -87,7 +87,7 @@ def test_columns_are_as_far_apart_as_the_band_allows():
     """Along a line the waves have frequencies nu_x + r nu_y, of which the corners hold nothing."""
     for name in ("30 degrees", "60 degrees", "shear along y"):
         mapping, precision = GEOMETRIES[name](), Precision.of(np.float32)
-        plan = make_plan(mapping, *psfs(), precision=precision)
+        plan = make_resampling_plan(mapping, *psfs(), precision=precision)
         r = np.divide(*mapping.matrix[:, 1 if plan.lines.by_row else 0])
         along = [r * plan.nu[0][:, None] + sign * plan.nu[1] for sign in (1, -1)]
         lit = [np.abs(d).any(axis=0) for d in (plan.d_plus, plan.d_minus)]

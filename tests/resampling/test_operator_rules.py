@@ -19,7 +19,13 @@ from helpers.tuning import tune
 from clresample.device.tuning import Tuning
 from clresample.resampling import resampler as resampler_module
 from clresample.resampling.cache import OperatorCache
-from clresample.resampling.plan import Precision, _half_count, _odd, is_identity, make_plan
+from clresample.resampling.plan import (
+    Precision,
+    _half_count,
+    _odd,
+    is_identity,
+    make_resampling_plan,
+)
 from clresample.resampling.reference import otf_ratio
 from clresample.resampling.resampler import Resampler
 from clresample.resampling.tiled.resampler import TiledResampler
@@ -48,9 +54,9 @@ def test_an_operator_is_the_identity_only_where_everything_is_the_same():
     ):
         assert not is_identity(mapping, psf, psf_out)
     precision = Precision.of(np.float32)
-    assert make_plan(same, psf, psf, precision=precision).identity
+    assert make_resampling_plan(same, psf, psf, precision=precision).identity
     both = PSF(np.repeat(psf.images, 2, axis=0))
-    assert not make_plan(same, psf, both, precision=precision, n_terms=2).identity
+    assert not make_resampling_plan(same, psf, both, precision=precision, n_terms=2).identity
 
 
 def test_padded_lengths_are_odd():
@@ -77,14 +83,14 @@ def test_frequencies_are_those_that_the_observed_samples_can_hold():
 def test_no_frequency_is_summed_that_holds_nothing():
     """The last row and column of D hold something, the certificate says how many there are."""
     for name in ONE_OF_EACH:
-        plan = make_plan(GEOMETRIES[name](), *psfs(), precision=Precision.of(np.float32))
+        plan = make_resampling_plan(GEOMETRIES[name](), *psfs(), precision=Precision.of(np.float32))
         d = np.abs(plan.d_plus) + np.abs(plan.d_minus)
         assert d[:, -1].any() and d[:, :, -1].any()
         n_frequencies = plan.certificate.n_frequencies
         assert d.shape[1:] == tuple(n_frequencies[axis] for axis in plan.axes)
         assert [len(nu) for nu in plan.nu] == list(d.shape[1:])
         # and what was left out is under the tolerance: float64's plan has it
-        more = make_plan(GEOMETRIES[name](), *psfs(), precision=Precision.of(np.float64))
+        more = make_resampling_plan(GEOMETRIES[name](), *psfs(), precision=Precision.of(np.float64))
         if plan.geometry == "affine":  # where D also holds the window's transform
             continue
         few, many = (np.stack([p.d_plus, p.d_minus]) for p in (plan, more))
@@ -104,7 +110,7 @@ def test_lengths_leave_room_for_all_that_the_light_reaches():
     """K is the smallest odd number over the model's extent and the wrap radius; of a window with
     what its pixels may be off, half an observed one."""
     skew = np.array([[1.7, -0.9], [0.4, 2.6]])
-    plan = make_plan(affine(skew, (60, 67)), *psfs(), precision=Precision.of(np.float32))
+    plan = make_resampling_plan(affine(skew, (60, 67)), *psfs(), precision=Precision.of(np.float32))
     for k, n, r in zip(plan.certificate.n_fft, (60, 67), wrap_radius(psfs()[1], skew), strict=True):
         assert k % 2 == 1 and 0 <= k - n - r < 2
     assert plan.certificate.wrap_radius_px == wrap_radius(psfs()[1], skew)
@@ -191,7 +197,7 @@ def test_an_operator_holds_each_table_twice(device, as_asked):
 
 @pytest.mark.parametrize("n_terms", [1, 3])
 def test_as_many_images_go_together_as_the_cache_holds(device, monkeypatch, n_terms):
-    plan = make_plan(
+    plan = make_resampling_plan(
         GEOMETRIES["30 degrees"](),
         PSF.gaussian(0.8, n_pixels=15),
         PSF.gaussian(np.linspace(1.4, 2.0, 2 * n_terms)),
@@ -206,14 +212,16 @@ def test_as_many_images_go_together_as_the_cache_holds(device, monkeypatch, n_te
             tune(monkeypatch, group_bytes=images * one - less)
             assert Resampler.from_plans([plan], device=device)._group == group
             monkeypatch.undo()
-    monkeypatch.setattr(resampler_module, "MOST_GROUPS", 4 * 2 * n_terms + 1)
+    monkeypatch.setattr(resampler_module, "MAX_GROUPS", 4 * 2 * n_terms + 1)
     assert Resampler.from_plans([plan], device=device)._group <= 4
     assert Tuning.of(device, np.float32).group_bytes > 5 * one
 
 
 def test_every_item_is_rendered_with_its_own_tables(device):
     plans = [
-        make_plan(affine(turn(angle, scale)), *psfs(), precision=Precision.of(np.float32))
+        make_resampling_plan(
+            affine(turn(angle, scale)), *psfs(), precision=Precision.of(np.float32)
+        )
         for angle, scale in ((10, 2.0), (25, 0.8), (-20, 3.0))
     ]
     op = Resampler.from_plans(plans, device=device)

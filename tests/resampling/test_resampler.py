@@ -22,7 +22,7 @@ from helpers.geometries import (
     turn,
 )
 
-from clresample.resampling.plan import Precision, make_plan
+from clresample.resampling.plan import Precision, make_resampling_plan
 from clresample.resampling.reference import dense_matrix
 from clresample.resampling.resampler import Resampler
 from clresample.resampling.transfer import DIVISION_FLOOR
@@ -143,7 +143,7 @@ def varied_plans(geometry, dtype=np.float32):
         build = distorted if geometry == "distorted" else affine
         mapping = build(turn(0 if geometry == "aligned" else angle, scale))
         psf_in, psf_out = PSF.gaussian([0.7, 0.8]), PSF.gaussian(sigma, n_pixels=int(9 * sigma))
-        plans.append(make_plan(mapping, psf_in, psf_out, precision=Precision.of(dtype)))
+        plans.append(make_resampling_plan(mapping, psf_in, psf_out, precision=Precision.of(dtype)))
     return plans
 
 
@@ -240,8 +240,14 @@ def test_errors_name_the_argument_and_give_both_values(device):
     plans = varied_plans("affine")
     for other, match in (
         (varied_plans("aligned")[0], "geometry aligned"),
-        (make_plan(affine(turn(30), (9, 9)), *psfs(), precision=Precision.of("f4")), "shape_in"),
-        (make_plan(affine(turn(80)), *psfs(), precision=Precision.of("f4")), "columns.*rows"),
+        (
+            make_resampling_plan(affine(turn(30), (9, 9)), *psfs(), precision=Precision.of("f4")),
+            "shape_in",
+        ),
+        (
+            make_resampling_plan(affine(turn(80)), *psfs(), precision=Precision.of("f4")),
+            "columns.*rows",
+        ),
     ):
         with pytest.raises(ValueError, match=rf"plans\[4\].*{match}"):
             Resampler.from_plans([*plans, other], device=device)
@@ -263,7 +269,7 @@ BROKEN = {
 def test_the_oracle_sees_a_broken_operator(device, fault, geometry):
     # off its centre and not alike in two bands: a PSF with no symmetry to hide behind
     pair = PSF.gaussian([0.8, 0.9]), gaussian_at((17.6, 8.0), (30, 21), 1.6, center=(17.0, 8.9))
-    plan = make_plan(GEOMETRIES[geometry](), *pair, precision=Precision.of(np.float32))
+    plan = make_resampling_plan(GEOMETRIES[geometry](), *pair, precision=Precision.of(np.float32))
     check_forward(Resampler.from_plans([plan], device=device), *pair)
     op = Resampler.from_plans([BROKEN[fault](plan)], device=device)
     with pytest.raises(AssertionError, match="relative error"):

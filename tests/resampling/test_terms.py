@@ -13,7 +13,7 @@ from helpers.geometries import (
     turn,
 )
 
-from clresample.resampling.plan import Precision, make_plan
+from clresample.resampling.plan import Precision, make_resampling_plan
 from clresample.resampling.resampler import Resampler
 from clresample.sky.psf import PSF
 from clresample.testing import check_adjoint
@@ -27,7 +27,7 @@ def of_terms(device, mapping, widths, dtype):
     """The operator of Gaussian PSFs (C, T) [px], skipped where the device lacks the type."""
     if dtype == np.float64 and not device.has_fp64:
         pytest.skip(f"{device.name} has no double precision")
-    plan = make_plan(
+    plan = make_resampling_plan(
         mapping,
         NARROW,
         PSF.gaussian(np.ravel(widths)),

@@ -15,10 +15,10 @@ from helpers.geometries import (
 
 from clresample.device.tuning import Tuning
 from clresample.resampling.paper.resampler import PaperResampler
-from clresample.resampling.paper.slabs import cut
-from clresample.resampling.paper.tables import trigonometric, wave
-from clresample.resampling.plan import Precision, make_plan
-from clresample.resampling.tiled.layout import Sizes, _taper, make_groups, window_of
+from clresample.resampling.paper.slabs import cut_slabs
+from clresample.resampling.paper.tables import cos_sin_table, wave_planes
+from clresample.resampling.plan import Precision, make_resampling_plan
+from clresample.resampling.tiled.layout import TileCosts, _taper, make_groups, window_of
 from clresample.resampling.transfer import wrap_radius
 from clresample.sky.grid import Grid
 from clresample.sky.psf import PSF
@@ -92,7 +92,7 @@ def check_groups(groups, grid_in, grid_out, psf_out, tolerance_px):
             given[y : y + shape[0], x : x + shape[1]] += tile.mask
             true = grid_out.cutout(y, x, shape).map_to(grid_in, 0.0)
             true = true.at(*np.indices(shape))
-            off = np.hypot(*(places + tile.place - true)[tile.mask].T)
+            off = np.hypot(*(places + tile.window_origin - true)[tile.mask].T)
             assert off.max() <= tolerance_px + 1e-9
     np.testing.assert_array_equal(given, grid_out.map_to(grid_in).covered)
 
@@ -129,10 +129,10 @@ def test_sides_are_the_longer_ones():
     for matrix in ([[0.5, 0.1], [0.3, 3.0]], [[2.4, 0.3], [0.2, 0.7]], [[1.0, 2.5], [-1.2, 0.4]]):
         for margin in ((14, 30), (30, 14)):
             trial = affine(matrix, (90, 90), (32, 32))
-            sizes = Sizes(trial, np.array(margin), *given, precision, SimpleNamespace())
+            sizes = TileCosts(trial, np.array(margin), *given, precision, SimpleNamespace())
             for m in (12, 60, 100):
                 window = window_of(affine(matrix, (90, 90), (m, m)), np.array(margin))
-                plan = make_plan(window, *given, precision=precision)
+                plan = make_resampling_plan(window, *given, precision=precision)
                 n, k, j = sizes.sides(m)
                 assert n >= max(window.shape_in)
                 assert k >= max(len(plan.in_y), len(plan.in_x))
@@ -141,7 +141,7 @@ def test_sides_are_the_longer_ones():
 
 def test_slabs_take_every_unit_once_and_are_alike():
     for n_units, unit_rows, n_slabs, chunk in ((17, 6, 4, 10), (5, 3, 9, 100), (8, 2, 1, 3)):
-        slabs = cut(n_units, unit_rows, n_slabs, chunk)
+        slabs = cut_slabs(n_units, unit_rows, n_slabs, chunk)
         assert len(slabs) == min(n_slabs, n_units)
         assert [s.first for s in slabs] == list(np.cumsum([0, *(s.n_units for s in slabs)])[:-1])
         assert sum(s.n_units for s in slabs) == n_units
@@ -154,13 +154,13 @@ def test_slabs_take_every_unit_once_and_are_alike():
 
 def test_waves_of_the_papers_scheme():
     k, x = 9, np.array([0.3, -2.7, 1000.25])
-    planes = wave(k, x, 8)
+    planes = wave_planes(k, x, 8)
     angle = 2 * np.pi * np.arange(5)[:, None] * x / k
     np.testing.assert_allclose(planes[:, 0, :3], np.cos(angle), atol=1e-12)
     np.testing.assert_allclose(planes[:, 1, :3], np.sin(angle), atol=1e-12)
     assert not planes[:, :, 3:].any()
     angle = 2 * np.pi * np.arange(6)[:, None] * np.arange(5) / k
-    table = trigonometric(6, k)
+    table = cos_sin_table(6, k)
     assert table.shape == (6, 10)
     assert distance(table[:, 0::2], np.cos(angle)) < 1e-15 * 10
     np.testing.assert_allclose(table[:, 1::2], np.sin(angle), atol=1e-14)

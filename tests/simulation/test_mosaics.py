@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from clresample.deblending.profiles import moment, point
-from clresample.simulation.mosaics import drizzle, lanczos, overlap
+from clresample.deblending.profiles import draw_psf, psf_second_moment
+from clresample.simulation.mosaics import drizzle, lanczos, overlap_area
 from clresample.sky.correlation import NoiseCorrelation
 from clresample.sky.grid import Grid
 from clresample.sky.psf import PSF
@@ -47,7 +47,7 @@ def test_overlaps_are_those_counted_point_by_point(k):
     angle = np.sort(rng.uniform(0, 2 * np.pi, (20, k)), axis=1)
     polygons = np.stack([np.sin(angle), np.cos(angle)], axis=2) * rng.uniform(0.3, 1.2, (20, 1, 1))
     polygons += rng.uniform(-0.5, 1.5, (20, 1, 2))
-    found = overlap(polygons)
+    found = overlap_area(polygons)
     fine = (np.arange(400) + 0.5) / 400
     y, x = np.meshgrid(fine, fine, indexing="ij")
     for polygon, area in zip(polygons, found, strict=True):
@@ -61,7 +61,7 @@ def test_overlaps_are_those_counted_point_by_point(k):
 def test_overlaps_of_upright_squares_are_exact():
     square = np.array([(0, 0), (0, 1), (1, 1), (1, 0)], float)
     moved = [square, square + (0.25, -0.5), square + (1, 0), 3 * square - 1, square[::-1] * 0.5]
-    assert overlap(np.array(moved)) == pytest.approx([1, 0.375, 0, 1, 0.25], abs=1e-15)
+    assert overlap_area(np.array(moved)) == pytest.approx([1, 0.375, 0, 1, 0.25], abs=1e-15)
 
 
 def test_all_of_a_drop_lands_on_the_mosaic():
@@ -89,7 +89,7 @@ def test_stars_have_the_stated_psf(name):
     grids, mosaicking = MOSAICS[name]
     grid, at = mosaicking.grid, (0.03, -0.05)
     psf = mosaicking.psf(PSF.gaussian(SIGMA_ARCSEC / 0.2))
-    expected = point(psf, grid.pixel(*at), grid.shape, slopes=False)[0]
+    expected = draw_psf(psf, grid.pixel(*at), grid.shape, slopes=False)[0]
     data = mosaicking.images([star(g, at)[None] for g in grids])[0]
     # what is left changes with the sub-pixel phase, and is no PSF
     assert (
@@ -100,7 +100,7 @@ def test_stars_have_the_stated_psf(name):
     native = (SIGMA_ARCSEC**2 + 0.2**2 / 12) / grid.pixel_scale_arcsec**2
     drop = 0.8 if len(grids) == 4 else 1.0
     squares = (drop * 0.2 / grid.pixel_scale_arcsec) ** 2 / 12 + 1 / 12  # drop, pixel
-    wider = moment(psf)[0, 0] - native
+    wider = psf_second_moment(psf)[0, 0] - native
     assert wider == pytest.approx(squares if name.startswith("drizzle") else 0, rel=0.1, abs=0.05)
 
 

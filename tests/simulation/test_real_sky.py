@@ -39,13 +39,13 @@ def changed(clean, **kept):
     other = field(spoilers=Spoilers.none(**kept))
     found = {"data": 0.0, "wcs": 0.0, "psf": 0.0, "bad": 0}
     for a, b in zip(clean.mosaics, other.mosaics, strict=True):
-        good = ~a.bad & ~b.bad
+        good = ~a.bad_pixels & ~b.bad_pixels
         change = (np.abs(a.data - b.data) / a.noise_sigma[:, None, None])[:, good]
         found["data"] = max(found["data"], float(np.median(change)))
         pixel = np.array(a.grid.pixel(*b.grid.sky(10.0, 10.0)))
         found["wcs"] = max(found["wcs"], float(np.hypot(*(pixel - 10.0))))
         found["psf"] = max(found["psf"], float(np.abs(a.psf_images - b.psf_images).max()))
-        found["bad"] += int((a.bad != b.bad).sum())
+        found["bad"] += int((a.bad_pixels != b.bad_pixels).sum())
     return found
 
 

@@ -106,7 +106,7 @@ def test_pixels_near_masks_and_edges_are_not_reached():
     r = found.radius_px
     weights = np.ones((2, 30, 31))
     weights[1, 15, 12] = 0
-    good = found.reached(weights)
+    good = found.valid_after_filter(weights)
     assert good[0].sum() == (30 - 2 * r) * (31 - 2 * r)
     assert not good[1, 15 - r : 16 + r, 12 - r : 13 + r].any()
     assert good[1].sum() == good[0].sum() - (2 * r + 1) ** 2
@@ -147,17 +147,17 @@ def test_the_white_observation_is_the_same_light_with_white_noise(spacing):
     images = noise(KERNELS["drizzle"], np.random.default_rng(5), 1)
     clean, psf, grid = seen_through(spacing, 0 * images, None)
     o = Observation(clean + images[:, :80, :80], psf, grid, weights=1.0, noise=correlated)
-    white = o.white
+    white = o.whitened
     model = Resampler(grid, PSF.gaussian(0.8), grid, white.psf, dtype=np.float64)
     point = np.zeros((1, 80, 80))
     point[0] = PSF.gaussian(0.8, n_pixels=(81, 81)).images[0][:80, :80]
     inside = white.weights > 0
-    seen = Observation(clean, psf, grid, weights=1.0, noise=correlated).white.data
+    seen = Observation(clean, psf, grid, weights=1.0, noise=correlated).whitened.data
     assert np.abs((model(500 * point) - seen)[inside]).max() < 1e-6 * seen.max()
     chi2 = o.chi2_map(o.data - clean)
     assert np.nanmean(chi2) == pytest.approx(1, abs=0.06)
     assert np.isnan(chi2[0, 0]).all()
-    assert Observation(clean, psf, grid, weights=1.0).white.noise is None
+    assert Observation(clean, psf, grid, weights=1.0).whitened.noise is None
 
 
 def test_noise_of_an_observation_is_checked():
@@ -172,7 +172,7 @@ def test_noise_of_an_observation_is_checked():
     with pytest.raises(ValueError, match="is 0.7 px"):
         odd = PSF.gaussian(1.4, spacing=0.7)
         wide = NoiseCorrelation(correlation(KERNELS["drizzle"]))
-        _ = Observation(data, odd, grid, weights=1.0, noise=wide).white
+        _ = Observation(data, odd, grid, weights=1.0, noise=wide).whitened
 
 
 def test_an_estimate_is_reported():

@@ -5,9 +5,9 @@ import pytest
 from helpers.headers import DEC, OBSERVED, RA, SCALE, SIP, grid_of, header, observed_headers
 
 from clresample.sky import grid as grid_module
-from clresample.sky.extent import box_slices, overlap, shared_part
+from clresample.sky.extent import box_slices, grids_overlap, intersect_boxes
 from clresample.sky.grid import Grid
-from clresample.sky.wcs import world_at
+from clresample.sky.wcs import pixel_to_world
 
 
 def flat_pairs():
@@ -35,11 +35,11 @@ def flat_pairs():
     ("observed", "model"), [pytest.param(*pair, id=name) for name, *pair in flat_pairs()]
 )
 def test_overlap_is_that_of_the_mapping(observed, model):
-    assert overlap(observed, model) == observed.map_to(model).covered.any()
+    assert grids_overlap(observed, model) == observed.map_to(model).covered.any()
 
 
 def test_the_cases_are_of_both_kinds():
-    answers = [overlap(observed, model) for _, observed, model in flat_pairs()]
+    answers = [grids_overlap(observed, model) for _, observed, model in flat_pairs()]
     assert sum(answers) >= 4 and len(answers) - sum(answers) >= 4
 
 
@@ -50,13 +50,13 @@ def test_overlap_on_the_sky(cards):
     observed = grid_of(cards, OBSERVED)
     lon, lat = observed.sky(3.2, 40.7)
     near = grid_of(header((3, 3), ra=lon, dec=lat, scale=SCALE / 3), (3, 3))
-    assert overlap(observed, near) == observed.map_to(near).covered.any()
+    assert grids_overlap(observed, near) == observed.map_to(near).covered.any()
     corner = grid_of(header((9, 9), ra=lon, dec=lat, scale=SCALE), (9, 9))
-    assert overlap(observed, corner) and overlap(corner, observed)
+    assert grids_overlap(observed, corner) and grids_overlap(corner, observed)
     for dec in (DEC + 0.1, DEC + 40):
-        assert not overlap(observed, grid_of(header((20, 20), dec=dec), (20, 20)))
+        assert not grids_overlap(observed, grid_of(header((20, 20), dec=dec), (20, 20)))
     other_side = grid_of(header((20, 20), ra=RA + 180, dec=-DEC), (20, 20))
-    assert not overlap(observed, other_side) and not overlap(other_side, observed)
+    assert not grids_overlap(observed, other_side) and not grids_overlap(other_side, observed)
 
 
 def test_a_distorted_image_is_not_evaluated_pixel_by_pixel(monkeypatch):
@@ -67,17 +67,17 @@ def test_a_distorted_image_is_not_evaluated_pixel_by_pixel(monkeypatch):
     evaluated = []
     monkeypatch.setattr(
         grid_module,
-        "world_at",
-        lambda wcs, n, m: evaluated.append(np.size(n)) or world_at(wcs, n, m),
+        "pixel_to_world",
+        lambda wcs, n, m: evaluated.append(np.size(n)) or pixel_to_world(wcs, n, m),
     )
-    assert overlap(observed, frame)
+    assert grids_overlap(observed, frame)
     assert sum(evaluated) < 5000  # of 5 million pixels
 
 
 def test_shared_part_of_two_boxes():
     a, b = np.arange(30).reshape(5, 6), np.arange(100, 120).reshape(4, 5)
     for origin in ((0, 0), (2, 3), (-2, -1), (-3, 4), (4, 5), (1, -4)):
-        here, there = shared_part((10, 20), a.shape, np.add((10, 20), origin), b.shape)
+        here, there = intersect_boxes((10, 20), a.shape, np.add((10, 20), origin), b.shape)
         expected = np.zeros((20, 20))
         expected[5:10, 5:11] = 1
         y, x = np.add((5, 5), origin)
@@ -87,7 +87,7 @@ def test_shared_part_of_two_boxes():
         at = [np.argwhere(m == m[part][0, 0])[0] for m, part in ((a, here), (b, there))]
         np.testing.assert_array_equal(at[0], np.add(at[1], origin))
     for origin in ((5, 0), (0, 6), (-4, 0), (0, -5), (90, -90)):
-        here, there = shared_part((0, 0), a.shape, origin, b.shape)
+        here, there = intersect_boxes((0, 0), a.shape, origin, b.shape)
         assert a[here].size == b[there].size == 0
         assert a[here].shape == b[there].shape
     assert box_slices(np.array([1, 2]), (3, 4)) == (slice(1, 4), slice(2, 6))

@@ -7,7 +7,7 @@ from helpers.blends import (
 )
 from helpers.headers import SIP, grid_of, header
 
-from clresample.sky.footprint import open_edge
+from clresample.sky.footprint import coverage_border
 
 
 def test_locate_inverts_the_mapping_of_a_distorted_image():
@@ -23,10 +23,12 @@ def test_locate_inverts_the_mapping_of_a_distorted_image():
     points = grid.pixel(*seen.sky(*truth.T)) + [0.4, -1.3]
     np.testing.assert_allclose(footprint.locate(points), truth, atol=0.01)
     assert footprint.weighted(points).shape == (2, 3)
-    np.testing.assert_array_equal(footprint.holds([[30, 35], [np.nan, 0], [500, 500]]), [1, 0, 0])
+    np.testing.assert_array_equal(
+        footprint.contains([[30, 35], [np.nan, 0], [500, 500]]), [1, 0, 0]
+    )
 
 
 def test_the_open_edge_of_a_frame_that_is_all_seen_is_its_border():
     expected = np.ones((60, 70), bool)
     expected[1:-1, 1:-1] = False
-    np.testing.assert_array_equal(open_edge(one_source().footprints, (60, 70)), expected)
+    np.testing.assert_array_equal(coverage_border(one_source().footprints, (60, 70)), expected)

@@ -11,7 +11,7 @@ from clresample.sky.frame import Frame, model_frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
-from clresample.sky.sources import Extended, Point
+from clresample.sky.sources import ExtendedSource, PointSource
 
 PSF_OUT = PSF.gaussian(1.5, n_pixels=17)
 
@@ -141,23 +141,27 @@ def test_what_is_no_frame():
 def test_sources_are_placed_by_sky_or_pixel():
     frame = model_frame([observe(grid_of(header((20, 31), CROTA2=30.0), (20, 31)))])
     sky = frame.grid.sky(3.25, 17.5)
-    sources = [Point(sky_deg=tuple(sky)), Extended(position_px=(4, 5)), Point(sky_deg=(RA, DEC))]
-    positions = frame.place(sources)
+    sources = [
+        PointSource(sky_deg=tuple(sky)),
+        ExtendedSource(position_px=(4, 5)),
+        PointSource(sky_deg=(RA, DEC)),
+    ]
+    positions = frame.positions_of(sources)
     # a rotated pixel grid is placed by two WCS evaluations: rounding only
     np.testing.assert_allclose(positions, [(3.25, 17.5), (4, 5), (9.5, 15)], atol=1e-6)
-    assert frame.place([]).shape == (0, 2)
-    behind = frame.place([Point(sky_deg=(RA - 180, -DEC))])
-    assert np.isnan(behind).all() and not frame.inside(behind)[0]
+    assert frame.positions_of([]).shape == (0, 2)
+    behind = frame.positions_of([PointSource(sky_deg=(RA - 180, -DEC))])
+    assert np.isnan(behind).all() and not frame.contains(behind)[0]
 
 
 def test_inside_names_a_pixel():
     frame = Frame(Grid.flat((4, 6), 0.1), PSF_OUT)
     edge = [(-0.5, 0), (3.49, 5.49), (3.5, 0), (0, 5.5), (-0.51, 0), (0, np.inf), (2, 3)]
-    inside = frame.inside(edge)
+    inside = frame.contains(edge)
     np.testing.assert_array_equal(inside, [True, True, False, False, False, False, True])
     pixel = np.floor(np.array(edge)[inside] + 0.5)
     assert ((pixel >= 0) & (pixel < frame.shape)).all()
-    assert frame.inside((1, 1)) and frame.inside(np.zeros((2, 3, 2))).shape == (2, 3)
+    assert frame.contains((1, 1)) and frame.contains(np.zeros((2, 3, 2))).shape == (2, 3)
 
 
 def test_hst_and_hsc(data):
@@ -177,6 +181,6 @@ def test_hst_and_hsc(data):
     assert all(280 <= n <= 284 for n in frame.shape)
     assert model_frame(observations, shared=True).shape == hst.grid.shape
     for o in observations:
-        assert o.n_bad == 0 and len(o.messages) == len(o.channels)
+        assert o.n_invalid == 0 and len(o.messages) == len(o.channels)
         background = o.data[np.abs(o.data) < 3 * o.weights**-0.5]
         assert 0.5 * o.data.size < background.size < o.data.size

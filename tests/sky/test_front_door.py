@@ -10,17 +10,17 @@ from astropy.wcs.wcsapi import HighLevelWCSWrapper, SlicedLowLevelWCS
 
 from clresample import (
     PSF,
-    Extended,
+    ExtendedSource,
     Frame,
     Grid,
     NoiseWarning,
     Observation,
-    Point,
+    PointSource,
     catalogue,
     deblend,
     model_frame,
 )
-from clresample.sky.given.checks import described
+from clresample.sky.validation.checks import described
 
 SHAPE = (24, 28)
 PLACED = Grid.flat(SHAPE, 0.2, angle_deg=10).to_wcs(ra_deg=150, dec_deg=2)
@@ -56,27 +56,29 @@ def test_a_source_is_where_its_coordinate_is_in_any_frame(frame, of_grid):
     lon, lat = grid.sky(9.5, 3.25)
     coordinate = SkyCoord(lon, lat, unit="deg", frame=of_grid).transform_to(frame)
     np.testing.assert_allclose(grid.pixel(coordinate), (9.5, 3.25), atol=1e-5)
-    for kind in (Extended, Point):
+    for kind in (ExtendedSource, PointSource):
         source = kind(sky_deg=coordinate)
         assert source.sky_frame == "icrs" and source == kind(sky_deg=coordinate.icrs)
         np.testing.assert_allclose(source.pixel(grid), (9.5, 3.25), atol=1e-5)
 
 
 def test_angles_and_pixels_with_units_are_positions():
-    plain = Extended(sky_deg=(150.0, 2.0))
-    assert Extended(sky_deg=(150 * u.deg, 120 * u.arcmin)).sky_deg == pytest.approx(plain.sky_deg)
-    assert Extended(sky_deg=[150, 2] * u.deg) == plain and plain.sky_frame is None
-    assert Point(position_px=[3, 4] * u.pix).position_px == (3, 4)
+    plain = ExtendedSource(sky_deg=(150.0, 2.0))
+    assert ExtendedSource(sky_deg=(150 * u.deg, 120 * u.arcmin)).sky_deg == pytest.approx(
+        plain.sky_deg
+    )
+    assert ExtendedSource(sky_deg=[150, 2] * u.deg) == plain and plain.sky_frame is None
+    assert PointSource(position_px=[3, 4] * u.pix).position_px == (3, 4)
 
 
 def test_coordinates_that_are_no_place_say_the_way():
     several = SkyCoord([1, 2], [3, 4], unit="deg")
     with pytest.raises(ValueError, match=r"must be of one place: .*sky_deg=c. for c in coord"):
-        Extended(sky_deg=several)
+        ExtendedSource(sky_deg=several)
     with pytest.raises(ValueError, match="this grid is flat: give .y, x. .arcsec."):
-        Extended(sky_deg=several[0]).pixel(Grid.flat(SHAPE, 0.2))
+        ExtendedSource(sky_deg=several[0]).pixel(Grid.flat(SHAPE, 0.2))
     with pytest.raises(ValueError, match="sky_frame is 'fk5', must be 'icrs' or None"):
-        Extended(sky_deg=(1, 2), sky_frame="fk5")
+        ExtendedSource(sky_deg=(1, 2), sky_frame="fk5")
 
 
 @pytest.mark.parametrize("wcs", [PLACED, HighLevelWCSWrapper(SlicedLowLevelWCS(PLACED, ...))])
@@ -111,7 +113,7 @@ def test_messages_name_the_way_and_dump_no_array():
     assert described(PLACED) == "of type WCS"
     assert described([1.0] * 50) == "of type list"
     with pytest.raises(ValueError, match="observations is a single one, must be a sequence"):
-        deblend(Observation(NOISE, ROUND, GRID, weights=1.0), [Extended(position_px=(1, 2))])
+        deblend(Observation(NOISE, ROUND, GRID, weights=1.0), [ExtendedSource(position_px=(1, 2))])
 
 
 @pytest.mark.parametrize(
@@ -180,7 +182,7 @@ def ccd(image=None, **given):
 def test_astropys_images_are_observations_with_their_units(device):
     """Fluxes come in the data's unit; sources are given by coordinates, observations by name."""
     image = ccd(psf=ROUND.images[0])
-    sources = [Extended(sky_deg=placed_at(*place)) for place in PLACES]
+    sources = [ExtendedSource(sky_deg=placed_at(*place)) for place in PLACES]
     result = deblend([image, ccd(psf=ROUND.images[0])], sources, device=device)
     assert [o.name for o in result.observations] == ["image0", "image1"]
     table = catalogue(result, magnitudes=True)
@@ -203,7 +205,7 @@ def test_astropys_images_are_observations_with_their_units(device):
 
 def test_images_of_several_units_have_one_in_the_catalogue(device):
     """uJy where they differ; counts and flux densities do not go together."""
-    sources = [Extended(sky_deg=placed_at(*place)) for place in PLACES]
+    sources = [ExtendedSource(sky_deg=placed_at(*place)) for place in PLACES]
     one = Observation.from_nddata(ccd(), ROUND, channels=["g"], name="one")
     rest = ccd(light() / 1e3, unit="uJy", uncertainty=StdDevUncertainty(np.full(SHAPE, 1e-3)))
     two = Observation.from_nddata(rest, ROUND, channels=["r"], name="two")
@@ -218,6 +220,6 @@ def test_images_of_several_units_have_one_in_the_catalogue(device):
 
 def test_images_without_a_psf_or_a_wcs_say_the_way():
     with pytest.raises(ValueError, match=r"CCDData, has no psf: give from_nddata\(image, psf\)"):
-        deblend([ccd()], [Extended(position_px=(1, 2))])
+        deblend([ccd()], [ExtendedSource(position_px=(1, 2))])
     with pytest.raises(ValueError, match=r"NDData, has no wcs: set it, or give Observation\("):
         Observation.from_nddata(NDData(NOISE), ROUND)

@@ -21,7 +21,7 @@ from helpers.headers import (
     with_tables,
 )
 
-from clresample.sky.extent import intersection, union
+from clresample.sky.extent import grid_intersection, grid_union
 from clresample.sky.grid import LAST, Grid
 
 
@@ -88,25 +88,25 @@ def test_union_and_intersection_lie_on_the_pixels_of_one():
     other = Grid.flat(
         (4, 30), 0.5, center_arcsec=(4.0, 6.0)
     )  # edges: rows 7.5 to 9.5, columns 3 to 18
-    both = union([like, other], like=like)
-    shared = intersection([like, other], like=like)
+    both = grid_union([like, other], like=like)
+    shared = grid_intersection([like, other], like=like)
     assert (both.shape, shared.shape) == ((10, 19), (2, 7))
     for grid, origin in ((both, (0, 0)), (shared, (8, 3))):
         mapping = grid.map_to(like)
         np.testing.assert_array_equal(mapping.matrix, np.eye(2))
         np.testing.assert_array_equal(mapping.offset, origin)
     with pytest.raises(ValueError, match="overlap"):
-        intersection([like, Grid.flat((4, 4), 1.0, center_arcsec=(0, 20))], like=like)
+        grid_intersection([like, Grid.flat((4, 4), 1.0, center_arcsec=(0, 20))], like=like)
 
 
 def test_union_holds_every_pixel_on_the_sky():
     like = grid_of(header(MODEL, scale=SCALE / 2.5), MODEL)
     grids = [like] + [grid_of(cards, OBSERVED) for _, cards in observed_headers()]
-    whole = union(grids, like=like)
+    whole = grid_union(grids, like=like)
     for grid in grids:
         assert grid.map_to(whole).covered.all()
     assert like.map_to(whole).geometry == "aligned"
-    shared = intersection(grids, like=like)
+    shared = grid_intersection(grids, like=like)
     assert shared.map_to(like).covered.all()
 
 
@@ -177,8 +177,8 @@ def test_pixel_of_a_flat_grid_and_of_no_place():
 def test_the_two_kinds():
     flat, placed = Grid.flat((4, 7), 0.5, angle_deg=20), grid_of(header(MODEL), MODEL)
     assert isinstance(flat, Grid) and isinstance(placed, Grid)
-    assert (flat.is_flat, flat.placing) == (True, "flat")
-    assert (placed.is_flat, placed.placing) == (False, "placed by a WCS")
+    assert (flat.is_flat, flat.sky_description) == (True, "flat")
+    assert (placed.is_flat, placed.sky_description) == (False, "placed by a WCS")
     for grid in (flat, placed):
         cutout = grid.cutout(1, 2, (2, 3))
         assert type(cutout) is type(grid) and cutout.shape == (2, 3)
@@ -189,7 +189,8 @@ def test_the_two_kinds():
     flat.check_like(flat.cutout(0, 0, (1, 1)), "other")
     for one, other in ((flat, placed), (placed, flat)):
         with pytest.raises(
-            ValueError, match=f"there is {other.placing} and this grid {one.placing}"
+            ValueError,
+            match=f"there is {other.sky_description} and this grid {one.sky_description}",
         ):
             one.check_like(other, "there")
 

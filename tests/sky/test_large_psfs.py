@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from clresample.resampling.plan import Precision, make_plan
+from clresample.resampling.plan import Precision, make_resampling_plan
 from clresample.sky import psf as module
 from clresample.sky.grid import Grid
 from clresample.sky.psf import PSF
@@ -34,9 +34,9 @@ def test_both_ways_are_one(monkeypatch, center):
 
 def test_no_sum_over_all_pixels_of_a_large_image(monkeypatch):
     """The set-up of an operator between turned grids: all transforms of large images by FFTs."""
-    sizes, real = [], module.transform_at
+    sizes, real = [], module.nufft_type2
     monkeypatch.setattr(
-        module, "transform_at", lambda *a: sizes.append((a[0].size, a[1].size)) or real(*a)
+        module, "nufft_type2", lambda *a: sizes.append((a[0].size, a[1].size)) or real(*a)
     )
 
     def direct(_):
@@ -45,7 +45,7 @@ def test_no_sum_over_all_pixels_of_a_large_image(monkeypatch):
     monkeypatch.setattr(module, "_parts", direct)
     n, turned = 1000, Grid.flat((20, 20), 0.2, angle_deg=30)
     mapping = turned.map_to(Grid.flat((40, 40), 0.1))
-    make_plan(mapping, moffat(n), moffat(n), precision=Precision.of(np.float32))
+    make_resampling_plan(mapping, moffat(n), moffat(n), precision=Precision.of(np.float32))
     assert sizes and all(samples <= n * n for samples, _ in sizes)
     assert sum(frequencies for _, frequencies in sizes) < 4e6  # some 5 us each
 

@@ -61,13 +61,13 @@ def test_what_has_no_variance_has_no_weight():
     variance[0, 0, :5] = np.nan, 0, -1, np.inf, 1e-310
     observation = observe(variance=variance)
     # an infinite variance is one: of a pixel that says nothing
-    assert observation.n_bad == 4 and observation.messages[0].startswith("4 of 1440 pixels")
+    assert observation.n_invalid == 4 and observation.messages[0].startswith("4 of 1440 pixels")
     assert (observation.weights[0, 0, :5] == 0).all()
     assert np.count_nonzero(observation.weights == 0.25) == observation.weights.size - 5
     weights = np.ones(SHAPE)
     weights[1, 2, 3] = np.nan
     observation = observe(weights=weights)
-    assert observation.n_bad == 1 and observation.weights[1, 2, 3] == 0
+    assert observation.n_invalid == 1 and observation.weights[1, 2, 3] == 0
 
 
 @pytest.mark.parametrize("given", [{}, {"weights": 1.0}, {"variance": 1.0}])
@@ -78,7 +78,7 @@ def test_bad_pixels_get_no_weight_and_are_counted(given):
     mask[5, 5] = mask[6, 6] = True
     observation = observe(data, mask=mask, **given)
     # the third lies under the mask: ignored anyway
-    assert observation.n_bad == 2 and observation.messages[-1].startswith("2 of 1440")
+    assert observation.n_invalid == 2 and observation.messages[-1].startswith("2 of 1440")
     lost = (observation.weights[0, 0, 0], observation.weights[1, 2, 3])
     assert lost == (0, 0) and (observation.data[[0, 1, 2], [0, 2, 5], [0, 3, 5]] == 0).all()
     assert (observation.weights[:, mask] == 0).all()
@@ -91,7 +91,7 @@ def test_a_channel_without_a_pixel_is_reported(given):
     data = noise()
     data[1] = np.nan
     observation = observe(data, channels=("g", "r", "i"), **given)
-    assert observation.n_bad == data[1].size
+    assert observation.n_invalid == data[1].size
     assert observation.messages[-1] == "channel r has no pixel with a weight"
     assert observation.weights[[0, 2]].all() and not observation.weights[1].any()
 
@@ -100,7 +100,7 @@ def test_weight_zero_needs_no_data():
     data, weights = noise(), np.ones(SHAPE)
     data[0, :3], weights[0, :3] = np.nan, 0
     observation = observe(data, weights=weights)
-    assert observation.n_bad == 0 and observation.messages == ()
+    assert observation.n_invalid == 0 and observation.messages == ()
     assert (observation.data[0, :3] == 0).all()
 
 
@@ -189,13 +189,13 @@ def test_an_observation_is_restored_with_what_was_found_then():
     data = noise()
     data[0, 0, 0] = np.nan
     first = observe(data, channels=("g", "r", "i"), zero_points=27, name="A")
-    assert first.n_bad == 1 and len(first.messages) == 4  # three estimates, one bad pixel
+    assert first.n_invalid == 1 and len(first.messages) == 4  # three estimates, one bad pixel
     kept = {key: getattr(first, key) for key in ("channels", "zero_points", "name")}
-    found = {"n_bad": first.n_bad, "messages": list(first.messages)}
+    found = {"n_invalid": first.n_invalid, "messages": list(first.messages)}
     again = Observation.restore(first.data, first.psf, GRID, weights=first.weights, **found, **kept)
     for name in ("data", "weights", "zero_points"):
         np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
-    assert again.psf is first.psf and again.messages == first.messages and again.n_bad == 1
+    assert again.psf is first.psf and again.messages == first.messages and again.n_invalid == 1
     assert (again.channels, again.name) == (first.channels, "A")
     with pytest.raises(ValueError, match="channels has 2 names"):
         Observation.restore(

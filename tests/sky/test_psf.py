@@ -6,9 +6,9 @@ import warnings
 import numpy as np
 import pytest
 
+from clresample.sky.fourier import cos_sin_columns, phases, uniform_waves
 from clresample.sky.psf import PSF
 from clresample.sky.psf_checks import PSFWarning, limit_power
-from clresample.sky.waves import cos_sin_columns, even_waves, phases
 
 NU_Y, NU_X = np.arange(-16, 17) / 33, np.arange(0, 20) / 39
 
@@ -181,7 +181,7 @@ def test_whole_cycles_are_taken_off_before_they_are_rounded():
 def test_waves_at_equal_distances_are_the_waves(n):
     """To the rounding of their phases, of up to 340 cycles here."""
     nu, first, step = np.array([0.0, 1e-3, 0.37, -0.5]), -58.25, 0.73
-    waves = even_waves(nu, first, step, n)
+    waves = uniform_waves(nu, first, step, n)
     truth = np.exp(1j * phases(first + step * np.arange(n), nu))
     assert waves.shape == truth.shape and waves.flags.c_contiguous
     np.testing.assert_allclose(waves, truth, atol=1e-12, rtol=0)

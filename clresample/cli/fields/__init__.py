@@ -1,1 +1,1 @@
-"""What `clresample field` tells while it runs, and `clresample report` afterwards."""
+"""Progress of `clresample field`, and `clresample report`."""

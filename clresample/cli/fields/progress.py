@@ -1,4 +1,4 @@
-"""How far a run over a field is: a bar on a terminal, a line now and then in a log."""
+"""Progress of a field run: a bar on a terminal, a line now and then in a log."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import time
 
 from tqdm import tqdm
 
-from ...fields.options import Progress
-from ..options import say
+from ...fields.options import RunProgress
+from ..options import print_progress
 
 # [s] Between two lines of a log: jobs of a day stay within a few thousand lines.
 LINE_S = 30.0
 FORMAT = "{desc} {percentage:3.0f} % |{bar:24}| {n_fmt} of {total_fmt} {unit}{postfix}"
 
 
-class Live(Progress):
+class ProgressDisplay(RunProgress):
     """Blends done, sources a second, time left: of every stage of a run.
 
     arguments: of the command; quiet ones show nothing
@@ -46,12 +46,14 @@ class Live(Progress):
 
     @property
     def unit(self):
-        """What the stage counts."""
+        """Unit in which the stage counts."""
         return {"search": "tiles", "write": "steps"}.get(self.name, "blends")
 
     def step(self, n, sources=0):
-        """Some of it is done; what was on disk already, in which no source is counted, is no speed
-        of this run."""
+        """Counts finished tasks.
+
+        Those on disk already, in which no source is counted, do not count in the speed of this run.
+        """
         self.done += n
         self.sources += sources
         self.counted += n if sources else 0
@@ -60,7 +62,7 @@ class Live(Progress):
             self.bar.update(n)
         elif not self.arguments.quiet and self.clock() - self.said >= LINE_S:
             line = f"{self.name}: {self.done} of {self.total} {self.unit}"
-            say(self.arguments, ", ".join(filter(None, [line, self.speed()])))
+            print_progress(self.arguments, ", ".join(filter(None, [line, self.speed()])))
             self.said = self.clock()
 
     def speed(self):
@@ -72,11 +74,11 @@ class Live(Progress):
         left = (self.total - self.done) * seconds / self.counted
         return f"{self.sources / seconds:.1f} sources/s, about {duration(left)} left"
 
-    def say(self, text):
+    def message(self, text):
         """A line of its own, above the bar."""
         if not self.arguments.quiet:
             with tqdm.external_write_mode(file=sys.stderr):
-                say(self.arguments, text)
+                print_progress(self.arguments, text)
 
     def close(self):
         """Take the bar away."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ..options import note, size
+from ..options import byte_size, print_note
 
 DESCRIPTION = """\
 Write one HTML page about a run of `clresample field`, finished or not: the field
@@ -42,7 +42,7 @@ def add_report(commands):
     parser.add_argument(
         "--max-size",
         metavar="SIZE",
-        type=size,
+        type=byte_size,
         help="of the page; what does not fit is left out, the finest images first (default 64M)",
     )
     parser.set_defaults(run=run)
@@ -50,15 +50,15 @@ def add_report(commands):
 
 def run(arguments):
     """Write the page. Raises ValueError and FileError, one line, for what cannot be done."""
-    from ...fields.report.write import MOST_BYTES, write_report
+    from ...fields.report.write import MAX_BYTES, write_report
 
     report = write_report(
         arguments.folder,
         arguments.output,
         truth=arguments.truth,
-        most_bytes=arguments.max_size or MOST_BYTES,
+        most_bytes=arguments.max_size or MAX_BYTES,
         overwrite=arguments.overwrite,
     )
     for text in report.notes:
-        note(arguments, text)
+        print_note(arguments, text)
     print(report.path)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from ..options import names, positive, whole
+from ..options import name_list, non_negative_integer, positive_number
 
 
 def _up_to(largest, said):
@@ -28,9 +28,13 @@ _part, _size = _up_to(1, "from 0 to 1"), _up_to(sys.float_info.max, "of 0 or mor
 
 def add_sky(sky):
     """Add the options of the group `sky`."""
-    sky.add_argument("--seed", type=whole, default=0, help="(default %(default)s)")
+    sky.add_argument("--seed", type=non_negative_integer, default=0, help="(default %(default)s)")
     sky.add_argument(
-        "--size", type=whole, default=512, metavar="PX", help="Euclid pixels a side (%(default)s)"
+        "--size",
+        type=non_negative_integer,
+        default=512,
+        metavar="PX",
+        help="Euclid pixels a side (%(default)s)",
     )
     sky.add_argument(
         "--sky",
@@ -41,14 +45,14 @@ def add_sky(sky):
     )
     sky.add_argument(
         "--large",
-        type=whole,
+        type=non_negative_integer,
         default=0,
         metavar="N",
         help="galaxies of 2 to 20 arcsec added to a real sky (%(default)s)",
     )
     sky.add_argument(
         "--density",
-        type=positive,
+        type=positive_number,
         metavar="N",
         help="sources per square arcminute to i = 26 (36; real: as published)",
     )
@@ -66,7 +70,7 @@ def add_images(images):
     """Add the options of the group `images`."""
     images.add_argument(
         "--bands",
-        type=names,
+        type=name_list,
         default=list("ugrizy"),
         metavar="B,...",
         help="of Rubin (default u,g,r,i,z,y)",
@@ -75,7 +79,11 @@ def add_images(images):
         "--angle", type=float, default=12.0, metavar="DEG", help="of Rubin's pixels (%(default)s)"
     )
     images.add_argument(
-        "--bad-columns", type=whole, default=2, metavar="N", help="of each mosaic (%(default)s)"
+        "--bad-columns",
+        type=non_negative_integer,
+        default=2,
+        metavar="N",
+        help="of each mosaic (%(default)s)",
     )
     images.add_argument(
         "--format",

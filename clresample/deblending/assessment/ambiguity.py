@@ -16,7 +16,7 @@ DETECTED = 5.0
 
 
 def is_ambiguous(flux, covariance) -> np.ndarray:
-    """Which of two sources (2,) may owe their light to the other one.
+    """Returns for two sources (2,) True if its light may be the other one's.
 
     In the channel that determines a source best its flux is uncertain by more than UNDETERMINED of
     itself, that error is one of exchange, since the other source has what this one lacks, and the

@@ -19,7 +19,7 @@ def core_errors(result, psf_error) -> np.ndarray:
     psf_error [1]: see Settings
     """
     found = np.zeros((len(result.sources), len(result.channels)))
-    positions = np.asarray(result.frame.place(result.sources))
+    positions = np.asarray(result.frame.positions_of(result.sources))
     for observation, channels in zip(result.observations, result.channel_slices(), strict=True):
         if not isinstance(observation.psf_field, StarPSFs):
             continue

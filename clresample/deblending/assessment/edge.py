@@ -7,19 +7,19 @@ from dataclasses import replace
 import numpy as np
 
 from ...sky.footprint import unobserved
-from ..profiles import Galaxy
+from ..profiles import GalaxyProfile
 
 # Part of a flux that is outside where light is said to reach the edge: three errors of a bright
 # galaxy's flux are as much.
 OUTSIDE = 0.03
 # Share of a ring's area that must have been observed for its mean brightness to stand for all of
 # it: less is a corner of the frame.
-LEAST_COVERED = 0.2
+MIN_COVERED = 0.2
 # Rings at the end of a profile, as a part of all, whose mean slope it goes on with.
 OUTER = 0.25
 # [radius] Largest scale length with which it does: a galaxy that falls less steeply where its image
 # ends is noise, or a sky that is wrong.
-MOST_SCALE = 0.5
+MAX_SCALE = 0.5
 
 
 def light_outside(result, shapes, thetas, positions, peaks) -> np.ndarray:
@@ -39,9 +39,9 @@ def light_outside(result, shapes, thetas, positions, peaks) -> np.ndarray:
     for i, c in enumerate(result.components):
         (y, x), (n_y, n_x) = c.origin, c.morphology.shape
         beside = outside[y : y + n_y + 2, x : x + n_x + 2]  # with a pixel about the box
-        if not isinstance(shapes[i], Galaxy) or not beside.any():
+        if not isinstance(shapes[i], GalaxyProfile) or not beside.any():
             continue
-        (image,) = shapes[i].cut(thetas[i], positions[i], (0, 0), observed.shape, slopes=False)
+        (image,) = shapes[i].draw_box(thetas[i], positions[i], (0, 0), observed.shape, slopes=False)
         scale = max(image.max() * peaks[i], 1e-300)
         beyond = max(1 - image[observed].sum(), 0.0) / scale  # its integral is 1
         longer = continued(c.origin, c.morphology, positions[i], outside)
@@ -66,7 +66,7 @@ def continued(origin, morphology, centre, outside) -> float:
     light = np.bincount(rings[box][own], morphology[own], len(n))
     ring = np.arange(len(n))
     area = np.pi * (2 * ring + 1)
-    bare = n <= LEAST_COVERED * area
+    bare = n <= MIN_COVERED * area
     first = rings[outside].min()
     bare &= ring >= first  # rings within have all their pixels
     end = int(np.argmax(bare)) if bare.any() else len(n)
@@ -103,7 +103,7 @@ def _tail(brightness):
     if not outer > 0:
         return 0.0
     fall = np.log(inner / outer) / n if inner > outer else 0.0
-    scale = min(1 / max(fall, 1e-30), MOST_SCALE * end)
+    scale = min(1 / max(fall, 1e-30), MAX_SCALE * end)
     at_end = outer * np.exp(-n / 2 / scale)
     return 2 * np.pi * at_end * scale * (end + scale)
 
@@ -120,7 +120,7 @@ def widened(errors, outside):
 
 
 def reaches_outside(result, flux) -> np.ndarray:
-    """Which sources (S,) have more than OUTSIDE of their flux (S, C) outside of what was observed.
+    """Selects sources (S,) with more than OUTSIDE of their flux (S, C) outside the observed area.
 
     In a channel where that is more than the noise of the flux at fixed morphology.
     """

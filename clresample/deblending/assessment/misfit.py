@@ -1,4 +1,4 @@
-"""How badly a model misses the data of each source: in sigma, and as a part of its flux."""
+"""Misfit of each source: in sigma, and as a fraction of its flux."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ CUT = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Misfit:
-    """What a model of S sources leaves in C channels, by source and channel.
+    """Residual light of a model of S sources in C channels, by source and channel.
 
-    residuals (S, C) [sigma]: see `worst_residuals`, NaN unseen
+    residuals (S, C) [sigma]: see `max_filtered_residuals`, NaN unseen
     excess (S, C) [sigma]: by how much chi2 of the source's pixels is over TRUSTED_CHI2
     chi2 (S, C) [1]: per pixel there, over that of the noise; NaN without pixels
     light (S, C) [counts]: sum of the absolute residual there, smoothed with the PSF, without what
@@ -61,18 +61,20 @@ class Misfit:
         return np.maximum(np.nan_to_num(self.residuals), np.nan_to_num(self.excess))
 
     def fraction(self) -> np.ndarray:
-        """Light that is left over flux (S,), of the channel where it is the largest; 0 where no
-        channel has over 5 sigma."""
+        """Light that is left over flux (S,), of the channel where it is the largest.
+
+        0 where no channel has over 5 sigma.
+        """
         part = np.where(self.sigma() > MISFIT_SIGMAS, self.light / self.flux, 0.0)
         return part.max(axis=1, initial=0.0)
 
     def sources(self) -> np.ndarray:
-        """Which sources (S,) are misfitted: over 5 sigma and over MISFIT_FRACTION of the flux."""
+        """Selects misfitted sources (S,): over 5 sigma and over MISFIT_FRACTION of the flux."""
         return self.fraction() > MISFIT_FRACTION
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the model as a whole does not describe the data.
+        """True if the model as a whole does not describe the data.
 
         chi2 of a channel is not of noise, where the sources are or on the frame, and much of the
         light is left, or that of the frame is large.
@@ -143,8 +145,11 @@ def chi2_excess(chi2, n):
 
 
 def correlation_sum(residual, sky):
-    """Sum of the squared correlations of the noise at all lags, 1 where it is white: by so much the
-    variance of chi2 is larger. residual (Ny, Nx); sky (Ny, Nx) bool: where it is noise alone."""
+    """Sum of the squared correlations of the noise at all lags, 1 where it is white.
+
+    The variance of chi2 is larger by this factor. residual (Ny, Nx); sky (Ny, Nx) bool: where it is
+    noise alone.
+    """
     if sky.sum() < MIN_PIXELS:
         return 1.0
     noise = np.where(sky, residual, 0.0)

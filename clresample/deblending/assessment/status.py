@@ -8,20 +8,22 @@ from ..blend import CONVERGED, MISFIT
 from ..result import noted
 
 # Sources and channels that a message names.
-MOST_NAMED = 5
+MAX_NAMED = 5
 WRONG = "the model does not describe the data"  # how the message begins
 
 
-def judged(result):
-    """The result, with the status "misfit" and a message if it has converged at a model that does
-    not describe the data, see `Misfit.is_wrong`."""
+def with_misfit_status(result):
+    """The result, with the status "misfit" and a message if it converged at a wrong model.
+
+    A wrong model does not describe the data, see `Misfit.is_wrong`.
+    """
     if result.status != CONVERGED or not result.misfit.is_wrong:
         return result
     return noted(result, status=MISFIT, messages=(*result.messages, _message(result)))
 
 
-def misfitted(result) -> np.ndarray:
-    """Which sources (S,) are flagged as misfits: those that leave light (`Misfit.sources`).
+def misfitted_sources(result) -> np.ndarray:
+    """Selects sources (S,) flagged as misfits: those that leave light (`Misfit.sources`).
 
     Of a result with the status "misfit" all that were fitted where no single one is to blame.
     """
@@ -31,7 +33,7 @@ def misfitted(result) -> np.ndarray:
     return fitted if result.status == MISFIT and not found.any() else found
 
 
-def judged_on_sources(result):
+def with_source_misfit_status(result):
     """The result of a piece of a larger image, beside which there is light of others.
 
     Its status is "converged" again unless the model does not describe its own sources.
@@ -45,10 +47,10 @@ def judged_on_sources(result):
 def _message(result):
     misfit = result.misfit
     largest = np.nan_to_num(misfit.whole_chi2).max(axis=0)
-    worst = np.argsort(-largest, kind="stable")[:MOST_NAMED]
+    worst = np.argsort(-largest, kind="stable")[:MAX_NAMED]
     chi2 = ", ".join(f"{largest[c]:.2f} in {result.channels[c]}" for c in sorted(worst))
     text = f"{WRONG}: chi2 per pixel, over that of the noise, {chi2}"
     fraction = misfit.fraction()
-    named = [s for s in np.argsort(-fraction, kind="stable")[:MOST_NAMED] if fraction[s] > 0]
+    named = [s for s in np.argsort(-fraction, kind="stable")[:MAX_NAMED] if fraction[s] > 0]
     parts = ", ".join(f"source {s} leaves {100 * fraction[s]:.1f} % of its flux" for s in named)
     return f"{text}; {parts}" if parts else text

@@ -69,7 +69,7 @@ def separate(result, chosen, i_observation, *, size=None) -> tuple[Separation, t
 
 def _position(result, chosen, i_observation):
     """Position (2,) [px] of sources on an observation: the middle of their positions."""
-    positions = result.frame.place([result.sources[s] for s in chosen])
+    positions = result.frame.positions_of([result.sources[s] for s in chosen])
     at = result.footprints[i_observation].locate(positions)
     return (at.min(axis=0) + at.max(axis=0)) / 2
 

@@ -16,9 +16,9 @@ import warnings
 
 import numpy as np
 
-from ...device.workers import one_blas_thread
+from ...device.multi_device import one_blas_thread
 from ...resampling.resampler import Resampler
-from ...sky.extent import shared_part
+from ...sky.extent import intersect_boxes
 from ...sky.psf_checks import PSFWarning
 from .separation import component_image, source_image
 
@@ -50,7 +50,9 @@ def _of_draws(result, chosen, i_observation, window):
     images = np.zeros((2, n_draws, n_channels, *shape), np.float32)
     for i, c in enumerate(result.components):
         which = 0 if c.source in chosen else 1
-        here, there = shared_part((0, 0), shape, np.subtract(c.origin, corner), c.morphology.shape)
+        here, there = intersect_boxes(
+            (0, 0), shape, np.subtract(c.origin, corner), c.morphology.shape
+        )
         seen = component_image(result.rendered[i_observation], i, window)
         inside = all(part.stop > part.start for part in here)
         if seen is None and not inside:

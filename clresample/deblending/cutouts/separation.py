@@ -163,8 +163,10 @@ def fraction_of(part, total, faintest):
 
 
 def source_image(result, source, i_observation, window) -> np.ndarray | None:
-    """Model (C, ny, nx) [counts] of one source on a window (slices y, x) of an observation; None
-    where it has no light there."""
+    """Model (C, ny, nx) [counts] of one source on a window (slices y, x) of an observation.
+
+    None where it has no light there.
+    """
     channels = result.channel_slices()[i_observation]
     total = None
     for i, component in enumerate(result.components):
@@ -205,6 +207,8 @@ def component_image(rendered, i, window):
 
 
 def faintest_light(total) -> np.ndarray:
-    """Light (C,) [counts] below which a pixel is shared by none; total (C, My, Mx): of all models
-    on the whole image."""
+    """Light (C,) [counts] below which a pixel is shared by none.
+
+    total (C, My, Mx): of all models on the whole image.
+    """
     return TRACE * total.max(axis=(1, 2), initial=0)

@@ -1,4 +1,4 @@
-"""Inspection of observations before a fit: problems found in them, warned about, cured where safe.
+"""Inspects observations before a fit: warns of problems, and cures them where that is safe.
 
 NumPy and SciPy alone, no device. Thresholds follow from the noise of the images.
 """

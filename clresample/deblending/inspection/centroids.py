@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .image import SIGMAS_A_FWHM, Image
+from .image import SIGMAS_A_FWHM, InspectedImage
 
 # [sigma] Sources this bright in a channel have a centroid to a tenth of the PSF's width.
 BRIGHT_SIGMAS = 20.0
@@ -14,14 +14,14 @@ BRIGHT_SIGMAS = 20.0
 REACH = 2.5
 # Part of its shift by which a weighted centroid moves: half for light as wide as the weight, less
 # for wider light, of which it says little from a tenth on.
-LEAST_RESPONSE = 0.1
+MIN_RESPONSE = 0.1
 # [px] Centroids are trusted to no better than this: neighbours, structure, errors of the PSF.
 FLOOR_PX = 0.03
 
 
 @dataclass(frozen=True, eq=False)
 class Centroids:
-    """Offsets of light from the places of an Image's bright sources.
+    """Offsets of light from the places of an InspectedImage's bright sources.
 
     sources (n,): numbers of the sources
     offsets (n, C, 2) [px]: of the light within about the PSF's width, (y, x)
@@ -33,8 +33,8 @@ class Centroids:
     errors: np.ndarray
 
 
-def centroids(image: Image) -> Centroids:
-    """The Centroids of the brightest sources of an Image.
+def centroids(image: InspectedImage) -> Centroids:
+    """The Centroids of the brightest sources of an InspectedImage.
 
         m1 = sum w z r / sum w z,    m2 = sum w z r^2 / (2 sum w z),    offset = m1 / (1 - m2 / s^2)
 
@@ -60,7 +60,7 @@ def centroids(image: Image) -> Centroids:
     first = np.stack([(weighted * d).sum(axis=(2, 3)) for d in (dy, dx)], axis=-1)
     second = (weighted * square).sum(axis=(2, 3)) / (2 * total)
     response = 1 - second / (width**2)[:, None]
-    good &= response > LEAST_RESPONSE
+    good &= response > MIN_RESPONSE
     response = np.where(good, response, 1.0)
     error = np.sqrt((weight**2 * square).sum(axis=(2, 3)) / 2) / total / response
     error = np.where(good, np.hypot(error, FLOOR_PX), np.inf)
@@ -78,8 +78,10 @@ def over_channels(found) -> tuple[np.ndarray, np.ndarray]:
 
 
 def common(offsets, errors) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted mean (2,) of offsets (n, 2) with errors (n,), and its error (2,), which is that of
-    their scatter where this is larger; infinite of none."""
+    """Weighted mean (2,) of offsets (n, 2) with errors (n,), and its error (2,).
+
+    The error is that of their scatter where this is larger; infinite of none.
+    """
     weight = errors**-2.0
     total = weight.sum()
     if not total > 0:

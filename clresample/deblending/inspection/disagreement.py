@@ -38,7 +38,7 @@ HIDDEN = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Plane:
+class ImagePlane:
     """One channel of an Image.
 
     data (My, Mx) [counts]: above the sky, 0 where not usable; usable (My, Mx): bool
@@ -53,7 +53,7 @@ class Plane:
     offset: np.ndarray
 
     @classmethod
-    def of(cls, image, c) -> Plane:
+    def of(cls, image, c) -> ImagePlane:
         """Channel c of an Image."""
         usable = image.usable[c]
         data = np.where(usable, image.observation.data[c] - image.level[c], 0)
@@ -61,8 +61,8 @@ class Plane:
         return cls(data, usable, image.sigma[c], psf, image.matrix, image.offset)
 
 
-def shifts_at(one: Plane, other: Plane, places) -> tuple[np.ndarray, np.ndarray]:
-    """Shifts of sources' light in the Plane `other` against the sharper one, `one`.
+def shifts_at(one: ImagePlane, other: ImagePlane, places) -> tuple[np.ndarray, np.ndarray]:
+    """Shifts of sources' light in the ImagePlane `other` against the sharper one, `one`.
 
     places (n, 2) [model px]: of the sources
     returns shifts (n, 2) [px of other] and their errors (n,), infinite where they are not measured
@@ -95,8 +95,10 @@ def shifts_at(one: Plane, other: Plane, places) -> tuple[np.ndarray, np.ndarray]
 
 
 def _foreign(images, brightness, s, place, radius):
-    """Light of other sources near source s that has another colour than this one's, as part of its
-    own light; infinite without any of its own."""
+    """Light of another colour from other sources near source s, as part of its own light.
+
+    Infinite without any of its own.
+    """
     y, x = (np.arange(n) - p for n, p in zip(images[s].shape, place, strict=True))
     near = y[:, None] ** 2 + x**2 <= radius**2
     light = np.array([np.abs(image[near]).sum() for image in images])
@@ -115,14 +117,16 @@ def _within(shape, places, radius):
 
 
 def _nearest(shape, places):
-    """Which of the places (n, 2) [px] is the nearest to each pixel: (Ny, Nx)."""
+    """Index of the place (n, 2) [px] nearest to each pixel: (Ny, Nx)."""
     y, x = np.arange(shape[0])[:, None], np.arange(shape[1])
     return np.stack([(y - a) ** 2 + (x - b) ** 2 for a, b in places]).argmin(axis=0)
 
 
 def _solved(images, there, good, noise):
-    """Shifts (n, 2), their errors (n,) and the brightness (n,) of sources' images (n) in the image
-    `there`, from the good pixels; noise: of a pixel of either."""
+    """Shifts (n, 2), their errors (n,) and the brightness (n,) of sources in the image `there`.
+
+    From the good pixels of sources' images (n); noise: of a pixel of either.
+    """
     n = len(images)
     light = np.stack([image[good] for image in images])
     slopes = np.stack([[s[good] for s in np.gradient(image)] for image in images])  # (n, 2, P)
@@ -146,8 +150,10 @@ def _solved(images, there, good, noise):
 
 
 def _brightness(light, value, sigma):
-    """Brightness (n,) of the light (n, P) of the sources in pixels of `value` (P,), with noise
-    sigma: that of all together, where it cannot be told apart."""
+    """Brightness (n,) of the light (n, P) of the sources in pixels of `value` (P,), noise sigma.
+
+    Of sources that cannot be told apart it is that of all together.
+    """
     total = np.stack([np.ones_like(value), light.sum(axis=0)])
     background, mean = np.linalg.lstsq(total.T, value, rcond=None)[0]
     rest = value - background - mean * total[1]
@@ -156,13 +162,13 @@ def _brightness(light, value, sigma):
 
 
 class Blur:
-    """Convolution of images on a Plane's pixels with another PSF.
+    """Convolution of images on a ImagePlane's pixels with another PSF.
 
     hidden (My, Mx): pixels that thereby hold light of unusable ones
     """
 
     def __init__(self, plane, psf, matrix):
-        """matrix (2, 2): from the PSF's pixels to the Plane's."""
+        """matrix (2, 2): from the PSF's pixels to the ImagePlane's."""
         width = psf.fwhm_px[0] * np.sqrt(abs(np.linalg.det(matrix)))
         reach = int(np.ceil(KERNEL_FWHM * width)) + 1
         side = 2 * reach

@@ -22,7 +22,7 @@ ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Image:
+class InspectedImage:
     """One Observation with the positions of a blend's sources in its pixels.
 
     observation: Observation; usable (C, My, Mx): bool, pixels with a weight
@@ -42,9 +42,11 @@ class Image:
     offset: np.ndarray
 
     @classmethod
-    def of(cls, observation, frame, positions, shift) -> Image:
-        """The Image of an observation whose pixels are moved by `shift` (2,) [model px], with
-        sources at `positions` (S, 2) [model px] of a Frame."""
+    def of(cls, observation, frame, positions, shift) -> InspectedImage:
+        """The image of an observation, moved by `shift` (2,) [model px].
+
+        Its sources are at `positions` (S, 2) [model px] of a Frame.
+        """
         corner = np.maximum(np.array(frame.shape) - 1.0, 1.0)
         points = np.concatenate([LATTICE * corner, positions - shift])
         found = frame.grid.positions_in(observation.grid, *points.T)
@@ -63,12 +65,12 @@ class Image:
         level = np.zeros(len(sigma))
         return cls(observation, usable, sigma, level, places, inside, matrix, offset)
 
-    def over(self, level) -> Image:
-        """The same Image with the level (C,) [counts] of its sky known."""
+    def over(self, level) -> InspectedImage:
+        """The same InspectedImage with the level (C,) [counts] of its sky known."""
         return replace(self, level=level)
 
-    def without(self, pixels) -> Image:
-        """The same Image of the observation with the pixels (C, My, Mx) masked."""
+    def without(self, pixels) -> InspectedImage:
+        """The same InspectedImage of the observation with the pixels (C, My, Mx) masked."""
         observation, usable = masked(self.observation, pixels), self.usable & ~pixels
         return replace(self, observation=observation, usable=usable)
 
@@ -118,8 +120,11 @@ class Image:
         return (self.places[chosen] - self.offset) @ np.linalg.inv(self.matrix).T
 
     def patches(self, chosen, reach):
-        """Pixel numbers (n, h, h) [px] in y and in x about the places of sources `chosen` (n,),
-        reach pixels to each side, and which of them lie on the image (n, h, h)."""
+        """Pixel numbers (n, h, h) [px] in y and in x about the places of sources `chosen` (n,).
+
+        They reach `reach` pixels to each side; the third array says which lie on the image (n, h,
+        h).
+        """
         middle = np.rint(self.places[chosen]).astype(int)
         span = np.arange(-reach, reach + 1)
         y = middle[:, :1, None] + span[:, None]

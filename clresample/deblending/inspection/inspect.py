@@ -12,7 +12,7 @@ from ..blend import Blend
 from ..settings import AUTO, Settings
 from . import listing, shifted, spoilt
 from .centroids import centroids
-from .image import Image
+from .image import InspectedImage
 from .levels import SkyLevel, sky_level
 from .star_psfs import as_stars, with_star_psfs
 from .stars import misfitting_widths
@@ -72,12 +72,12 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
 
     shifts (n_observations, 2) [model px]: of the observations, as known; settings: Settings
     """
-    near = np.flatnonzero(frame.inside(positions))
+    near = np.flatnonzero(frame.contains(positions))
     sources = [blend.sources[i] for i in near]
     messages, levels, images, found = _doubles(blend.sources, positions), [], [], []
     n_own = np.zeros((2, len(near)), int)
     for observation, shift in zip(blend.observations, shifts, strict=True):
-        image = Image.of(observation, frame, positions[near], shift)
+        image = InspectedImage.of(observation, frame, positions[near], shift)
         levels.append(sky_level(image))
         image = image.over(levels[-1].level)
         bad, more = _spoilt(image)
@@ -136,7 +136,7 @@ def _unmeasured(image):
 
 
 def _level_lines(image, sky):
-    """What is said of a SkyLevel that is not zero, and of a rim that is not dark."""
+    """Messages about a SkyLevel that is not zero, and about a rim that is not dark."""
     part, error = sky.level / image.sigma, sky.error / image.sigma
     known, doubt = np.isfinite(error), False
     rim, rim_error = sky.rim / image.sigma, sky.rim_error / image.sigma
@@ -255,7 +255,7 @@ def _cores(image):
 
 
 def _coarse(psf, channels):
-    """What is said of a PSF whose samples are too coarse."""
+    """Message about a PSF whose samples are too coarse."""
     limit = limit_power(psf.images)
     names = [name for name, part in zip(channels, limit, strict=True) if part > LIMIT_TOLERANCE]
     if not names:
@@ -279,7 +279,7 @@ def _missing(image):
 
 
 def _offset(images, found):
-    """What is said of positions that are off in the sharpest Image, of the Centroids in each."""
+    """Message about positions that are off in the sharpest image, from the Centroids in each."""
     i = shifted.sharpest(images)
     offset = listing.common_offset(found[i])
     if offset is None:
@@ -293,7 +293,7 @@ def _offset(images, found):
 
 
 def _widths(image, sources, numbers):
-    """What is said of a PSF that the sources disagree with."""
+    """Message about a PSF that the sources disagree with."""
     lines = []
     for i, c, part, error in misfitting_widths(image, sources):
         how = "narrower" if part < 0 else "wider"

@@ -106,8 +106,10 @@ def _rim(means, white, kept):
 
 
 def _blocks(image):
-    """Means (C, B) [counts] and numbers (C, B) of usable pixels in blocks, the blocks' centres
-    (B, 2) [px] and their side [px]."""
+    """Means (C, B) [counts] and numbers (C, B) of usable pixels in blocks.
+
+    And the blocks' centres (B, 2) [px] and their side [px].
+    """
     data = image.observation.data
     n_y, n_x = data.shape[1:]
     side = max(MIN_BLOCK_PX, -(-max(n_y, n_x) // N_BLOCKS))
@@ -128,8 +130,10 @@ def _blocks(image):
 
 
 def _darker(image, centers, wings):
-    """Rank (B,) of the blocks by the light of wings (C, B) in them, from 0, the darkest, to 1;
-    infinite of those in a source, where this leaves enough others."""
+    """Rank (B,) of the blocks by the light of wings (C, B) in them, from 0, the darkest, to 1.
+
+    Infinite of those in a source, where this leaves enough others.
+    """
     light = (wings / image.sigma[:, None]).sum(axis=0) if len(wings) else np.zeros(len(centers))
     free = np.ones(len(centers), bool)
     places = image.places[np.isfinite(image.places).all(axis=1)]
@@ -145,8 +149,10 @@ def _darker(image, centers, wings):
 
 
 def _wings(image, means, centers):
-    """Light of wings (3, C, B) [counts] about the sources that fall by each of POWERS, those of
-    the first power as bright at the sources as the blocks there; 0 without sources."""
+    """Light of wings (3, C, B) [counts] about the sources that fall by each of POWERS.
+
+    Those of the first power are as bright at the sources as the blocks there; 0 without sources.
+    """
     places = image.places[image.inside]
     if not len(places) or not len(centers):
         return np.zeros((len(POWERS), *means.shape))
@@ -158,8 +164,10 @@ def _wings(image, means, centers):
 
 
 def _fitted(means, wings, white, kept):
-    """Level and wing (C,) by least squares with wing >= 0, and the level's variance (C,), of
-    blocks with noise `white`."""
+    """Level and wing (C,) by least squares with wing >= 0, and the level's variance (C,).
+
+    Of blocks with noise `white`.
+    """
     weight = kept / white**2
     a, b, c = weight.sum(1), (weight * wings).sum(1), (weight * wings**2).sum(1)
     d, e = (weight * means).sum(1), (weight * wings * means).sum(1)
@@ -181,7 +189,9 @@ def _middle(values, kept):
 
 
 def _spread(values, white, middle, kept):
-    """Scatter (C, B) of blocks about the middle (C,): their white noise, times how much wider the
-    kept ones scatter, at least 1."""
+    """Scatter (C, B) of blocks about the middle (C,).
+
+    It is their white noise, times how much wider the kept ones scatter, at least 1.
+    """
     wide = SIGMAS_A_MAD * _middle(np.abs(values - middle[:, None]) / white, kept)
     return np.maximum(1.0, wide)[:, None] * white

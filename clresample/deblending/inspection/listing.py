@@ -1,4 +1,4 @@
-"""Sources as listed against the light in an observation: doubles, missing ones, wrong positions."""
+"""Compares listed sources with the light: doubles, missing ones, wrong positions."""
 
 from __future__ import annotations
 
@@ -29,8 +29,10 @@ OFFSET_FLOOR_PX = 0.2
 
 
 def doubles(sources, positions):
-    """Pairs (i, j) of sources of one kind within a pixel of each other; positions (S, 2)
-    [model px]."""
+    """Pairs (i, j) of sources of one kind within a pixel of each other.
+
+    positions (S, 2) [model px].
+    """
     return [
         (i, j)
         for i, j in combinations(range(len(sources)), 2)
@@ -40,8 +42,10 @@ def doubles(sources, positions):
 
 
 def common_offset(found):
-    """Offset (2,) [px] and its error (2,) of the light from all sources, of their Centroids; None
-    where there is none that is significant."""
+    """Offset (2,) [px] and its error (2,) of the light from all sources, of their Centroids.
+
+    None where there is none that is significant.
+    """
     offsets, errors = over_channels(found)
     errors = np.hypot(errors, OFFSET_FLOOR_PX)
     if np.isfinite(errors).sum() < MIN_SOURCES:
@@ -52,8 +56,7 @@ def common_offset(found):
 
 
 def unlisted(image):
-    """Peaks [(significance [sigma], y, x [px])] of an Image's light that no source lies at, the
-    brightest first."""
+    """Peaks [(significance [sigma], y, x [px])] without a source at them, the brightest first."""
     peaks = _peaks(image.smooth)
     if not len(peaks):
         return []
@@ -89,7 +92,7 @@ def _peaks(smooth):
 
 
 def _joined(smooth, peak, value, place):
-    """Whether the light stays high on the straight line from a peak of this value to a source."""
+    """Returns True if the light stays high on the line from a peak of this value to a source."""
     n = int(np.ceil(np.hypot(*(np.asarray(place) - peak)))) + 1
     line = np.linspace(peak, place, n)
     y, x = np.clip(np.rint(line).astype(int), 0, np.array(smooth.shape) - 1).T

@@ -6,13 +6,13 @@ import numpy as np
 
 from ..settings import AUTO
 from .centroids import common, over_channels
-from .disagreement import Plane, shifts_at
+from .disagreement import ImagePlane, shifts_at
 
 # [model px] Shifts from here on count: world coordinates of good surveys agree to about this, and
 # smaller ones move fluxes by less than the PSF's errors do.
-LEAST_SHIFT_PX = 0.25
+MIN_SHIFT_PX = 0.25
 # [px] The same between channels of one observation.
-LEAST_CHANNEL_PX = 0.15
+MIN_CHANNEL_PX = 0.15
 # [sigma] significance of a shift; between channels, of which there are many more, colours that
 # differ inside a galaxy count as one too.
 SHIFT_SIGMAS, CHANNEL_SIGMAS = 3.0, 5.0
@@ -26,8 +26,9 @@ MAX_ERROR_PX = 0.5
 
 
 def disagreements(images, found, fit_shifts):
-    """Shifts (n_observations, 2) [model px] that bring observations together which disagree, the
-    first at rest; None where none do. And a sentence on each, also on channels that disagree.
+    """Shifts (n_observations, 2) [model px] that align disagreeing observations, the first at rest.
+
+    None where none disagree. And a sentence on each, also on channels that disagree.
 
     images, found: Image and Centroids of each observation; fit_shifts: see Settings, with True
         nothing is measured
@@ -53,23 +54,27 @@ def disagreements(images, found, fit_shifts):
     return (moved - moved[0] if fit_shifts and moved.any() else None), lines
 
 
-def significant(shift, error, least=LEAST_SHIFT_PX, sigmas=SHIFT_SIGMAS):
-    """Whether a shift (2,) with errors (2,) is longer than `least`, and than `sigmas` of these,
-    which are no larger than `least`: what is known no better comes from one doubtful source."""
+def significant(shift, error, least=MIN_SHIFT_PX, sigmas=SHIFT_SIGMAS):
+    """Returns True if a shift (2,) with errors (2,) exceeds `least`, and `sigmas` of its errors.
+
+    Errors larger than `least` come from one doubtful source: such a shift is not significant.
+    """
     known = error.max() < least
     return known and np.hypot(*shift) > least and np.hypot(*(shift / error)) > sigmas
 
 
 def sharpest(images) -> int:
-    """Which of the Images has the narrowest PSF on the sky."""
+    """Selects the image with the narrowest PSF on the sky."""
     areas = [max(abs(np.linalg.det(image.matrix)), 1e-30) for image in images]  # [px / model px]
     widths = [image.width_px / area**0.5 for image, area in zip(images, areas, strict=True)]
     return int(np.argmin(widths))
 
 
 def _between(one, its, other, theirs):
-    """Shift (2,) [model px] of the light in Image `other` against `one`, and its error (2,); from
-    their Centroids, and where these differ from the images themselves."""
+    """Shift (2,) [model px] of the light in Image `other` against `one`, and its error (2,).
+
+    From their Centroids, and where these differ from the images themselves.
+    """
     _, at, there = np.intersect1d(its.sources, theirs.sources, return_indices=True)
     ends = []
     for image, found, chosen in ((one, its, at), (other, theirs, there)):
@@ -78,7 +83,7 @@ def _between(one, its, other, theirs):
         ends.append((offsets @ inverse.T, errors * np.sqrt(abs(np.linalg.det(inverse)))))
     (first, first_error), (second, second_error) = ends
     shift, error = common(second - first, np.hypot(first_error, second_error))
-    if not _suspect(shift, error, LEAST_SHIFT_PX):
+    if not _suspect(shift, error, MIN_SHIFT_PX):
         return shift, np.full(2, np.inf)
     return _closer(one, other)
 
@@ -89,9 +94,9 @@ def _closer(one, other):
     chosen = chosen[one.inside[chosen]]
     inverse = np.linalg.inv(other.matrix)
     scale = np.sqrt(abs(np.linalg.det(inverse)))
-    plane = Plane.of(one, _channels_of_light(one)[0])
+    plane = ImagePlane.of(one, _channels_of_light(one)[0])
     pairs = [
-        _trusted(*shifts_at(plane, Plane.of(other, c), other.model_places(chosen)))
+        _trusted(*shifts_at(plane, ImagePlane.of(other, c), other.model_places(chosen)))
         for c in _channels_of_light(other)[:MAX_CHANNELS]
     ]
     shifts, errors = (np.concatenate(some) for some in zip(*pairs, strict=True))
@@ -100,7 +105,7 @@ def _closer(one, other):
 
 
 def _suspect(shift, error, least):
-    """Whether centroids' shift (2,) with errors (2,) may be one of more than `least`."""
+    """Returns True if centroids' shift (2,) with errors (2,) may be one of more than `least`."""
     return np.isfinite(error).all() and np.hypot(*shift) > CLOSER * least
 
 
@@ -116,7 +121,7 @@ def _channels_of_light(image):
 
 
 def _channel_lines(image, found):
-    """What is said of channels whose light lies elsewhere than that of the brightest one."""
+    """Messages about channels whose light is displaced from that of the brightest one."""
     n_channels = found.offsets.shape[1]
     if n_channels == 1 or not len(found.sources):
         return []
@@ -128,14 +133,11 @@ def _channel_lines(image, found):
         apart = found.offsets[:, c] - found.offsets[:, first]
         shift, error = common(apart, np.hypot(found.errors[:, c], found.errors[:, first]))
         # channels of one observation have nearly one PSF, and neighbours move all centroids alike
-        if (
-            not _suspect(shift, error, LEAST_CHANNEL_PX)
-            or np.hypot(*(shift / error)) < SHIFT_SIGMAS
-        ):
+        if not _suspect(shift, error, MIN_CHANNEL_PX) or np.hypot(*(shift / error)) < SHIFT_SIGMAS:
             continue
-        planes = Plane.of(image, first), Plane.of(image, c)
+        planes = ImagePlane.of(image, first), ImagePlane.of(image, c)
         shift, error = common(*_trusted(*shifts_at(*planes, image.model_places(image.brightest))))
-        if significant(shift, error, LEAST_CHANNEL_PX, CHANNEL_SIGMAS):
+        if significant(shift, error, MIN_CHANNEL_PX, CHANNEL_SIGMAS):
             names = image.observation.channels
             lines.append(
                 f"{image.observation.label}: light in channel {names[c]} lies at ({shift[0]:+.2f}, "

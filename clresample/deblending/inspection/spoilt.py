@@ -110,8 +110,10 @@ def sharper_than_psf(image) -> np.ndarray:
 
 
 def _confirmed(image, found, ratios):
-    """Those of the pixels found (C, My, Mx) that lie between usable ones, and stay sharper with
-    the uncertainty of the PSF in the light beside them."""
+    """Selects found pixels (C, My, Mx) between usable ones that are sharper than the PSF.
+
+    They stay sharper with the uncertainty of the PSF in the light beside them.
+    """
     z, sure = image.significance, np.zeros_like(found)
     for c, y, x in np.argwhere(found):
         near = z[c, max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3]

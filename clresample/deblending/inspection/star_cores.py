@@ -91,8 +91,10 @@ def _core(light, usable, masked, psf, band, fwhm):
 
 
 def _ring(usable, masked, place, fwhm):
-    """Pixels (My, Mx) bool of the ring beside a core, and its inner radius [px]; None, 0 where
-    they are too few."""
+    """Pixels (My, Mx) bool of the ring beside a core, and its inner radius [px].
+
+    None, 0 where they are too few.
+    """
     n_y, n_x = usable.shape
     away = np.hypot(np.arange(n_y)[:, None] - place[0], np.arange(n_x) - place[1])
     own = usable & (away < 1 + _reach_of(masked, away) + RING_FWHM * fwhm)
@@ -132,7 +134,7 @@ def _centred(light, ring, guess, fwhm):
 
 
 def _falls_like(light, ring, place, psf, band, fwhm):
-    """Whether the light of a ring falls outwards nearly as steeply as a PSF's."""
+    """Returns True if the light of a ring falls outwards nearly as steeply as a PSF's."""
     y, x = np.nonzero(ring)
     away = np.hypot(y - place[0], x - place[1])
     outer = away > np.median(away)

@@ -25,8 +25,8 @@ from scipy.ndimage import (
 
 from ...sky.observation import with_psf_field
 from ...sky.psf import PSF
-from ...sky.sources import Extended, Point
-from ...sky.varying.field import PSFField
+from ...sky.sources import ExtendedSource, PointSource
+from ...sky.varying_psf.field import PSFField
 from .image import SIGMAS_A_FWHM
 from .psf_samples import psf_at
 from .spoilt import GROW_PX
@@ -97,7 +97,9 @@ def with_star_psfs(image, sources, places, sky):
             away = np.hypot(*(image.places[stars] - core.place).T)
             i = stars[int(away.argmin())]
             is_wide = core.radius > SURE_FWHM * image.observation.psf.fwhm_px[c]
-            if away.min() < max(core.radius, 1.0) and (is_wide or isinstance(sources[i], Point)):
+            if away.min() < max(core.radius, 1.0) and (
+                is_wide or isinstance(sources[i], PointSource)
+            ):
                 wide[c] |= image.usable[c] & binary_dilation(
                     core.masked, np.ones((3, 3), bool), GROW_PX
                 )
@@ -124,22 +126,26 @@ def with_star_psfs(image, sources, places, sky):
 
 
 def as_stars(sources, numbers, still):
-    """Sources with those of `numbers` as Points, at rest if they are among `still`: their PSFs
-    were measured about their positions."""
+    """Sources with those of `numbers` as PointSources, at rest if they are among `still`: their
+    PSFs were measured about their positions."""
     found = list(sources)
     for i in numbers:
         keys = ("sky_deg", "position_px", "observation", "name")
         given = {key: getattr(sources[i], key) for key in keys}
         free = i not in still and getattr(sources[i], "free", True)
-        found[i] = Point(**given, free=free)
+        found[i] = PointSource(**given, free_position=free)
     return tuple(found)
 
 
 def _may_be(source):
-    """Whether a source is a star, or one of which nothing is said but its position."""
-    if isinstance(source, Point):
+    """Returns True if a source is a star, or one of which nothing is said but its position."""
+    if isinstance(source, PointSource):
         return True
-    return isinstance(source, Extended) and source.n_components is None and source.profile is None
+    return (
+        isinstance(source, ExtendedSource)
+        and source.n_components is None
+        and source.profile is None
+    )
 
 
 def _given(observation, place):
@@ -215,8 +221,10 @@ def _rays(data, usable, place, radius):
 
 
 def _scale(psf, band, fall, radius):
-    """Factor by which the PSF given has the light of a Fall at a radius [px]; None where it has
-    none there."""
+    """Factor by which the PSF given has the light of a Fall at a radius [px].
+
+    None where it has none there.
+    """
     (n_y, n_x), (y0, x0) = psf.images.shape[1:], psf.center[band]
     end = min(radius, psf.spacing * min(y0, x0, n_y - 1 - y0, n_x - 1 - x0) - 1)
     if end < 1:

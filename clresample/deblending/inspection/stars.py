@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...sky.sources import Point
+from ...sky.sources import PointSource
 from .psf_samples import psf_at
 
 # [sigma] Light of a source, in one channel, whose width is then known to a few percent.
@@ -30,7 +30,7 @@ def misfitting_widths(image, sources):
     this PSF has.
     """
     found = []
-    stars = np.array([isinstance(source, Point) for source in sources], bool)
+    stars = np.array([isinstance(source, PointSource) for source in sources], bool)
     bright = image.brightest[image.light[image.brightest] > STAR_SIGMAS]
     # of others the brightest tells as much as all
     for i in [*bright[stars[bright]][:MAX_STARS], *bright[~stars[bright]][:1]]:
@@ -45,7 +45,7 @@ def misfitting_widths(image, sources):
 
 
 def _alone(image, i):
-    """Whether no other source lies near to source i."""
+    """Returns True if no other source lies near to source i."""
     others = np.delete(image.places, i, axis=0)
     others = others[np.isfinite(others).all(axis=1)]
     away = np.hypot(*(others - image.places[i]).T)

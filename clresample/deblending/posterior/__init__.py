@@ -6,12 +6,12 @@ About the solution everything is linear, in units of the noise and per channel c
     H = J^T J + prior^-1,                                           var(f) = grad f^T H^-1 grad f
 
 with one matrix H a scene, in blocks of sources that meet. modes.py makes the images m_ik, from
-bumps.py and profile_modes.py; exposure.py renders them from their boxes; normal.py adds up H and
-blocks.py factors and inverts it; posterior.py reads errors off it, and, by bounds.py, what S >= 0
-has added to fluxes and sizes, H^-1 times the slopes that it holds back. There, and only there,
-errors of sources that leave structure in the residuals, as residuals.py measures it, are made
-larger; errors.py is what a Result keeps, from which sampling.py draws. Imports solver and sky, the
-profiles and views of deblending, none of its fits.
+smooth_modes.py and profile_modes.py; aligned_observation.py renders them from their boxes;
+normal.py adds up H and block_matrix.py factors and inverts it; posterior.py reads errors off it,
+and, by bound_bias.py, what S >= 0 has added to fluxes and sizes, H^-1 times the slopes that it
+holds back. There, and only there, errors of sources that leave structure in the residuals, as
+residuals.py measures it, are made larger; errors.py is what a Result keeps, from which sampling.py
+draws. Imports solver and sky, the profiles and views of deblending, none of its fits.
 
 Not in these errors, since no likelihood knows it: errors of the PSFs, of the model in bright
 galaxies (Settings.flux_floor stands for both), and of the bounds of spectra at 0.

@@ -1,4 +1,4 @@
-"""What a Result keeps of its posterior: covariances, maps, and what draws are made of."""
+"""The covariances, error maps and posterior sampler that a Result stores."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from ..solver.rendering.ties import Ties
-from .blocks import Factor
+from .block_matrix import BlockCholesky
 
 # Draws that errors of cutouts are summed from, with the seed of these: standard deviations of so
 # many are known to a part 1 / sqrt(2 N) = 0.09, and more take longer in proportion.
@@ -20,7 +20,7 @@ class Errors:
     """Errors of one blend's sources, marginal over morphologies, neighbours, fitted sky and shifts.
 
     S sources, C channels of all observations, n components. A misfitted source's are all larger by
-    one factor, see `residuals.widening`; its covariances with others by both factors.
+    one factor, see `residuals.misfit_error_scale`; its covariances with others by both factors.
 
     flux (C, S, S) [counts^2]: covariance of the fluxes of one channel, Settings.flux_floor
         included; 0 between sources that share no light, what a common sky or shift does to them
@@ -32,12 +32,13 @@ class Errors:
         not fitted: all of stars at a given place, the second moments of free ones
     morphology (n): arrays (ny, nx) [1]: standard deviation of each component's morphology, at a
         fixed projection onto its smooth profile
-    beyond (n, 6) [1, px, px^2]: no error, but what belongs to the fluxes and moments: the sums of
-        each component's smooth profile beyond its box, times 1, y, x, y y, y x, x x of the frame,
-        where the morphology has its maximum 1
-    released (S, C) [counts], moved (S, 5) [px, px^2]: likewise no errors: what fluxes, and
+    outside_box_moments (n, 6) [1, px, px^2]: no error, but what belongs to the fluxes and moments:
+        the sums of each component's smooth profile beyond its box, times 1, y, x, y y, y x, x x of
+        the frame, where the morphology has its maximum 1
+    released (S, C) [counts], moment_bound_bias (S, 5) [px, px^2]: likewise no errors: what fluxes,
+    and
         centroids and second moments, change by when the bound of morphologies at 0 is released,
-        see bounds.py; second moments of stars stay
+        see bound_bias.py; second moments of stars stay
     residuals (S, C) [sigma]: the largest on each source, see `channel_residuals`
     outside (S, C) [counts]: flux that models would have outside of what was observed, see
         `light_outside`; its square is in `flux` and `colour`. 0 where it is not given
@@ -47,32 +48,33 @@ class Errors:
     colour: np.ndarray
     moments: np.ndarray
     morphology: tuple[np.ndarray, ...]
-    beyond: np.ndarray
-    released: np.ndarray
-    moved: np.ndarray
+    outside_box_moments: np.ndarray
+    flux_bound_bias: np.ndarray
+    moment_bound_bias: np.ndarray
     residuals: np.ndarray
     outside: np.ndarray | None = None
 
     def __post_init__(self):
         if self.outside is None:
-            object.__setattr__(self, "outside", np.zeros(np.shape(self.released)))
+            object.__setattr__(self, "outside", np.zeros(np.shape(self.flux_bound_bias)))
 
 
 @dataclass(frozen=True, eq=False)
-class Draws:
-    """What draws from the posterior are made of.
+class PosteriorSampler:
+    """Means and factors from which samples of the posterior are drawn.
 
     modes (n): (k_i, ny, nx), images of each component's modes
     factor: of the normal matrix, whose node i is component i, its modes and then its spectrum (B,)
     unit (C,) [counts]: in which spectra count there
-    wide (n,): by what draws of misfitted sources' components scatter more, as their Errors do
+    misfit_scale (n,): by what draws of misfitted sources' components scatter more, as their Errors
+        do
     ties: Ties of the channels, of B bands; None: B = C
     """
 
     modes: list[np.ndarray]
-    factor: Factor
+    factor: BlockCholesky
     unit: np.ndarray
-    wide: np.ndarray
+    misfit_scale: np.ndarray
     ties: Ties | None = None
 
     @cached_property
@@ -85,7 +87,7 @@ class Draws:
     def changes(self, i):
         """Component i in `samples`: changes of its morphology (N_SAMPLES, ny, nx) and of its
         spectrum (N_SAMPLES, C) [counts]."""
-        images, values = self.modes[i], self.wide[i] * self.samples[i]
+        images, values = self.modes[i], self.misfit_scale[i] * self.samples[i]
         morphs = np.tensordot(values[:, : len(images)], images, 1)
         return morphs, self._spectra(values[:, len(images) :])
 
@@ -93,7 +95,7 @@ class Draws:
         """Changes of the morphologies (n arrays) and of the spectra (n, C) [counts]."""
         found = self.factor.draw(rng.standard_normal(sum(self.factor.sizes)))
         morphs, spectra = [], []
-        for values, images, wide in zip(found, self.modes, self.wide, strict=False):
+        for values, images, wide in zip(found, self.modes, self.misfit_scale, strict=False):
             values = wide * values
             morphs.append(np.tensordot(values[: len(images)], images, 1))
             spectra.append(self._spectra(values[len(images) :]))

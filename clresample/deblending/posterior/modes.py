@@ -7,24 +7,24 @@ from functools import cached_property
 
 import numpy as np
 
-from ...sky.extent import shared_part
-from ..solver.learned.prior import LearnedPrior
+from ...sky.extent import intersect_boxes
+from ..solver.multiscale.prior import MultiscalePrior
 from ..solver.scene import Scene
-from ..view import without_dark
-from .bumps import LEAST_LIGHT, Bumps, uncorrelated
+from ..view import flush_faint
 from .profile_modes import profile_modes
+from .smooth_modes import MIN_LIGHT, SmoothModes, whitening_transform
 
-# Bumps that the prior allows to change a flux or a second moment by less than this many errors at
+# Modes that the prior allows to change a flux or a second moment by less than this many errors at
 # fixed morphologies are left out.
-LEAST_CHANGE = 1.0
+MIN_CHANGE = 1.0
 # [noise] So are bumps whose light is nowhere more than this or, where that is more of a source's
-# peak, than bumps.LEAST_LIGHT of it. By LEAST_LIGHT alone the wings of galaxies above signal to
+# peak, than bumps.MIN_LIGHT of it. By MIN_LIGHT alone the wings of galaxies above signal to
 # noise 1000 have none, and what the bound of morphologies at 0 adds there stays in their sizes, an
 # error or 0.2 %, and in their fluxes, half an error.
 FAINTEST = 1e-3
 # [noise] For errors light may be exchanged where two sources have more than this in a pixel: a
 # faint galaxy's flux is as uncertain as the fine structure of the bright one that it lies on. Only
-# where fits exchange light, see exchange.py, the coverage of fluxes of Euclid alone is 0.02 lower
+# where fits exchange light, see joint_step.py, the coverage of fluxes of Euclid alone is 0.02 lower
 # below signal to noise 10 and above 300 (400 scenes, seeds from 60000 and 61000).
 FAINT = 0.05
 # The prior's scale next to STRUCTURE_PX is given the strength that the source's own data show,
@@ -35,24 +35,24 @@ STRUCTURE_PX, WEIGHT, STRENGTH = 2.0, 10.0, 0.05
 # Powers of that strength, over STRENGTH, with which the other scales, the core and the halo of a
 # profile, and Settings.flux_floor go: what is unlike a smooth profile at one scale is so at all.
 # Parametric galaxies have 0.7 to 1.1 and hardly notice; real ones of COSMOS have 2, a quarter of
-# them 3. With OTHERS = 3.5 and HALO = 0.01 their errors are those of 2.5 and 0.02; with 1.5 and
-# 0.02 the coverage of their sizes is 0.04 lower, and that of fluxes from signal to noise 10 to 100
-# as well.
-OTHERS, FLOOR = 3.5, 3.0
+# them 3. With STRENGTH_EXPONENT = 3.5 and HALO = 0.01 their errors are those of 2.5 and 0.02; with
+# 1.5 and 0.02 the coverage of their sizes is 0.04 lower, and that of fluxes from signal to noise 10
+# to 100 as well.
+STRENGTH_EXPONENT, FLOOR_EXPONENT = 3.5, 3.0
 # Where sources overlap strengths are learned from light whose owner is uncertain, and come out too
-# small. For errors they are multiplied by OVERLAPPED where MOST_OVERLAPPED of the light, or more,
+# small. For errors they are multiplied by OVERLAPPED where MAX_OVERLAPPED of the light, or more,
 # is that of other sources, by less in proportion where less is. With 1.5 joint fits have 76 % of
 # positions in 68 % intervals (seeds 20400 to 20459; without, 73 %). 0.1 more adds 0.005 to the
 # coverage of fluxes and positions (200 scenes each, joint and of Euclid, seeds from 50000).
-OVERLAPPED, MOST_OVERLAPPED = 1.2, 0.2
+OVERLAPPED, MAX_OVERLAPPED = 1.2, 0.2
 # Unlikeness that counts for these at most: a merger of real galaxies reaches 10, of which the
 # powers would be a floor of half its flux.
-MOST_UNLIKE = 3.0
+MAX_STRUCTURE_EXCESS = 3.0
 
 
-def power_of(unlikeness, exponent):
-    """Unlikeness to the power of OTHERS or FLOOR, see MOST_UNLIKE."""
-    return min(unlikeness, MOST_UNLIKE) ** exponent
+def clipped_power(unlikeness, exponent):
+    """Unlikeness to the power of STRENGTH_EXPONENT or FLOOR_EXPONENT, see MAX_STRUCTURE_EXCESS."""
+    return min(unlikeness, MAX_STRUCTURE_EXCESS) ** exponent
 
 
 def _unlike(energy, determined):
@@ -60,12 +60,14 @@ def _unlike(energy, determined):
     return np.sqrt((energy + WEIGHT * STRENGTH**2) / (determined + WEIGHT)) / STRENGTH
 
 
-def enlarged(own, others):
-    """What strengths are multiplied by where the light of other sources lies on the own, both
-    (ny, nx) as expected; see OVERLAPPED."""
+def overlap_inflation(own, others):
+    """Factor on strengths where the light of other sources overlaps a source's own.
+
+    Both (ny, nx) as expected; see OVERLAPPED.
+    """
     own, others = np.maximum(own, 0), np.maximum(others, 0)
     shared = (own * others / np.maximum(own + others, 1e-30)).sum() / max(own.sum(), 1e-30)
-    return 1 + (OVERLAPPED - 1) * min(1, shared / MOST_OVERLAPPED)
+    return 1 + (OVERLAPPED - 1) * min(1, shared / MAX_OVERLAPPED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +80,9 @@ class Solution:
     shapes, thetas, positions (n): the start's Shapes, parameters, places (2,) [px]
     source (n,): to which each component belongs
     findings: Findings; chi2 (n,): per pixel, where each component's light is
-    prior: LearnedPrior
-    pulls (n): arrays (ny, nx), see bounds.py; None where nothing asks for `modes`
+    prior: MultiscalePrior
+    negative_chi2_gradient (n): arrays (ny, nx), see bound_bias.py; None where nothing asks for
+        `modes`
     """
 
     scene: Scene
@@ -93,37 +96,41 @@ class Solution:
     source: np.ndarray
     findings: object
     chi2: np.ndarray
-    prior: LearnedPrior
-    pulls: list | None = None
+    prior: MultiscalePrior
+    negative_chi2_gradient: list | None = None
 
-    def unlikeness(self, i):
-        """Strength of component i's structure over that of a galaxy that is like its smooth
-        profile, see STRENGTH; 1 of fixed ones. Misfit is not taken for structure, but takes none
-        below 1."""
+    def structure_excess(self, i):
+        """Strength of component i's structure over that of a galaxy like its smooth profile.
+
+        See STRENGTH; 1 of fixed ones. Misfit is not taken for structure, but takes none below 1.
+        """
         if self.scene.fixed[i]:
             return 1.0
         energy, known = (
-            a[i, self._scale] for a in (self.findings.energies, self.findings.determined)
+            a[i, self._scale] for a in (self.findings.energies, self.findings.n_effective)
         )
         return max(_unlike(energy / max(self.chi2[i], 1), known), min(_unlike(energy, known), 1.0))
 
     @cached_property
     def _scale(self):
-        """Which of the prior's scales is STRUCTURE_PX."""
+        """Index of the prior's scale STRUCTURE_PX."""
         return np.argmin(np.abs(np.log(np.array(self.prior.scales_px) / STRUCTURE_PX)))
 
     def strengths(self, i):
         """Strengths (J,) of component i's structure; see STRUCTURE_PX and OVERLAPPED."""
-        unlike = self.unlikeness(i)
-        out = self.findings.strengths[i] * power_of(unlike, OTHERS)
+        unlike = self.structure_excess(i)
+        out = self.findings.strengths[i] * clipped_power(unlike, STRENGTH_EXPONENT)
         out[self._scale] = unlike * STRENGTH
         others = [self._light(j, i) for j in self._beside(i) if self.source[j] != self.source[i]]
-        return out * enlarged(self._light(i, i), sum(others))
+        return out * overlap_inflation(self._light(i, i), sum(others))
 
     def modes(self, i):
-        """Images (1 + k, ny, nx), float32, of component i's morphology and of its modes, whose
-        coefficients the prior expects to scatter by 1, each on its own; its Beyond; and what the
-        data pull of each mode (k,) where the bound at 0 holds the morphology."""
+        """Images (1 + k, ny, nx), float32, of component i's morphology and of its modes.
+
+        The prior expects their coefficients to scatter by 1, each on its own. With its
+        OutsideBoxMoments, and the data's gradient by each mode (k,) where the bound at 0 holds the
+        morphology.
+        """
         profile, scene = self.scene.profile[i], self.scene
         images, scatter, far = profile_modes(
             self.shapes[i],
@@ -131,32 +138,34 @@ class Solution:
             self.positions[i],
             profile,
             scene.origin[i],
-            radial=power_of(self.unlikeness(i), OTHERS),
+            radial=clipped_power(self.structure_excess(i), STRENGTH_EXPONENT),
         )
         scatter = scatter / self.peaks[i]
         far = far.scaled(np.append(1 / self.peaks[i], scatter))
         n_own, own = 0, None
         if not scene.fixed[i]:
             strengths, kernels = self.strengths(i), self.prior.kernels()
-            least = min(LEAST_LIGHT, FAINTEST / max(self._peak(i), 1e-30))
-            given = scene.origin[i], profile, strengths, kernels, self.shared(i)
-            bumps = Bumps(*given, least_light=least)
-            keep = np.flatnonzero(self.change(i, bumps.images) > LEAST_CHANGE)
-            own = uncorrelated(bumps.precision[np.ix_(keep, keep)]) / self.peaks[i]
+            least = min(MIN_LIGHT, FAINTEST / max(self._peak(i), 1e-30))
+            given = scene.origin[i], profile, strengths, kernels, self.overlap_mask(i)
+            bumps = SmoothModes(*given, least_light=least)
+            keep = np.flatnonzero(self.flux_change_sigma(i, bumps.images) > MIN_CHANGE)
+            own = whitening_transform(bumps.precision[np.ix_(keep, keep)]) / self.peaks[i]
             n_own = len(own)
         seen = np.empty((1 + n_own + len(images), *profile.shape), np.float32)
-        seen[0], out = without_dark(self.morphs[i].copy()), seen[1:]
+        seen[0], out = flush_faint(self.morphs[i].copy()), seen[1:]
         if n_own:
             flat = bumps.images.reshape(len(bumps.images), profile.size)
             flat = flat if len(keep) == len(flat) else flat[keep]
             np.matmul(own.astype(np.float32), flat, out=out[:n_own].reshape(n_own, -1))
-        out[n_own:] = without_dark(scatter[:, None, None] * images)
-        far = far.gauged(self.along(i, out) * self.peaks[i])
+        out[n_own:] = flush_faint(scatter[:, None, None] * images)
+        far = far.with_gauge(self.along(i, out) * self.peaks[i])
         return seen, far, self._held(i, out)
 
-    def gauge(self, i, images):
-        """Take off images, in place, what lies along the profile, and all of them where the
-        morphology is at its bound; returns how much lay along it (k,)."""
+    def remove_profile_part(self, i, images):
+        """Subtracts the profile's part from images, in place; returns the parts (k,).
+
+        Images are 0 where the morphology is at its bound.
+        """
         along, inside = self.along(i, images), self.morphs[i] > 0
         if not self.scene.fixed[i] and not inside.all():
             images *= inside
@@ -164,20 +173,22 @@ class Solution:
 
     def along(self, i, images):
         """Take off images, in place, what lies along the profile; returns how much it was (k,)."""
-        p = without_dark(self.scene.profile[i].astype(images.dtype))
+        p = flush_faint(self.scene.profile[i].astype(images.dtype))
         along = images.reshape(len(images), p.size) @ p.ravel() / max((p * p).sum(), 1e-30)
         images -= along[:, None, None] * p
         return along.astype(np.float64)
 
     def _held(self, i, images):
-        """What the data pull of images (k, ny, nx) where the bound holds the morphology (k,)."""
+        """Data gradient by images (k, ny, nx) where the bound holds the morphology: (k,)."""
         held = self.morphs[i] <= 0
         if self.scene.fixed[i] or not held.any():
             return np.zeros(len(images))
-        return (images[:, held] @ self.pulls[i][held].astype(images.dtype)).astype(np.float64)
+        return (images[:, held] @ self.negative_chi2_gradient[i][held].astype(images.dtype)).astype(
+            np.float64
+        )
 
-    def change(self, i, images):
-        """What images (k, ny, nx) of scatter 1 change of flux and second moment [fixed errors]."""
+    def flux_change_sigma(self, i, images):
+        """Change of flux and second moment [fixed errors] by images (k, ny, nx) of scatter 1."""
         m = self.morphs[i] * self.peaks[i]
         total = max(m.sum(), 1e-30)
         y, x = np.indices(m.shape)
@@ -190,7 +201,7 @@ class Solution:
     def _light(self, j, i):
         """Expected light of component j on i's box, all channels in quadrature [noise]."""
         profile, out = self.scene.profile[j], np.zeros(self.scene.profile[i].shape)
-        here, there = shared_part(
+        here, there = intersect_boxes(
             self.scene.origin[i], out.shape, self.scene.origin[j], profile.shape
         )
         out[here] = self._peak(j) * profile[there]
@@ -205,8 +216,11 @@ class Solution:
         """First and one-past-last pixels (n, 2), (n, 2) of all boxes."""
         return self.scene.origin, self.scene.origin + [p.shape for p in self.scene.profile]
 
-    def shared(self, i, *, faint=FAINT, ratio=0.0):
-        """Where (ny, nx) i and another one have over faint [noise], that one over ratio of i's."""
+    def overlap_mask(self, i, *, faint=FAINT, ratio=0.0):
+        """Pixels (ny, nx) with i and another source over faint [noise].
+
+        That one over ratio of i's.
+        """
         own = self._light(i, i)
         shared = np.zeros(own.shape, bool)
         for j in self._beside(i):

@@ -1,11 +1,11 @@
-"""How centroids and second moments change with the pixels of morphologies."""
+"""Derivatives of centroids and second moments with respect to morphology pixels."""
 
 from __future__ import annotations
 
 import numpy as np
 
 
-def moments_of(origins, morphs, light, beyond=None):
+def moment_derivatives(origins, morphs, light, beyond=None):
     """Slopes of (y, x, yy, yx, xx) of I = sum_i light_i S_i by the pixels of each S_i / light_i.
 
     origins (k, 2) [px], morphs (k): arrays (ny, nx); light (k,), any unit

@@ -13,11 +13,11 @@ from functools import cached_property
 
 import numpy as np
 
-from ...device.workers import in_threads
+from ...device.multi_device import map_threads
 from ...sky.extent import box_slices
 from ..shifts import SCATTER_PX
 from ..solver.rendering.ties import Ties
-from .blocks import Blocks
+from .block_matrix import BlockMatrix
 
 # [1] Products of this size and more are summed in float64: in float32 they round to what the prior,
 # which is 1, says of a mode. A source of signal to noise 300 has products of 1e5. With 1e6 moments'
@@ -26,15 +26,17 @@ LARGE = 3e5
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
-    """Where unknowns are: a node for each of n components, its modes and then its spectrum (B,);
-    and one of all, of sky levels (C or 0) and shifts (n_observations - 1, 2) or none, if any.
+class UnknownLayout:
+    """Layout of the unknowns: a node for each of n components, and one common to all.
 
-    counts (n,): of the components' modes; n_channels, n_sky, n_shifts
+    A component's node holds its modes and then its spectrum (B,); the common one sky levels (C or
+    0) and shifts (n_observations - 1, 2) or none, if any.
+
+    n_modes (n,): of the components' modes; n_channels, n_sky, n_shifts
     ties: Ties of the channels, by which B is the number of bands; None: B = C
     """
 
-    counts: np.ndarray
+    n_modes: np.ndarray
     n_channels: int
     n_sky: int = 0
     n_shifts: int = 0
@@ -60,12 +62,12 @@ class Layout:
     def sizes(self):
         """Of the nodes (n or n + 1,)."""
         common = self.n_sky + self.n_shifts
-        return np.append(self.counts + self.n_spectra, [common] if common else []).astype(int)
+        return np.append(self.n_modes + self.n_spectra, [common] if common else []).astype(int)
 
     @property
     def common(self):
         """The number of the node of all."""
-        return len(self.counts)
+        return len(self.n_modes)
 
     def shift(self, o):
         """Unknowns (2,) of observation o's shift in the node of all; None where it has none."""
@@ -74,15 +76,15 @@ class Layout:
         return self.n_sky + 2 * (o - 1) + np.arange(2)
 
 
-def normal_matrix(scene, exposures, images, spectra, layout) -> Blocks:
+def normal_matrix(scene, exposures, images, spectra, layout) -> BlockMatrix:
     """J^T J + prior^-1, where sky levels have the precision of Scene.known_sky.
 
     scene: Scene; exposures: an Exposure of each observation
     images (n): arrays (1 + k, ny, nx), float32, of morphologies and their modes
     spectra (n, C), in the views' units
     """
-    matrix = Blocks(layout.sizes)
-    for i, k in enumerate(layout.counts):
+    matrix = BlockMatrix(layout.sizes)
+    for i, k in enumerate(layout.n_modes):
         matrix.block(i, i)[:k, :k] += np.eye(k)
     if layout.n_sky:
         at = np.arange(layout.n_sky)
@@ -91,13 +93,13 @@ def normal_matrix(scene, exposures, images, spectra, layout) -> Blocks:
         at = layout.n_sky + np.arange(layout.n_shifts)
         matrix.block(layout.common, layout.common)[at, at] += SCATTER_PX**-2
     for o, (exposure, part) in enumerate(zip(exposures, scene.channels(), strict=True)):
-        _Sum(matrix, layout, exposure, o, part).run(scene.origin, images, spectra)
+        _NormalAccumulator(matrix, layout, exposure, o, part).run(scene.origin, images, spectra)
     return matrix
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """What an observation sees of one component.
+class _ComponentView:
+    """Images of one component in an observation.
 
     i: which; k: its modes; low, high (2,): its window
     light (k or k + 2, C, ry, rx): of its modes, then of its slopes along y and x where a shift is
@@ -124,7 +126,7 @@ class _Seen:
         return light.reshape(len(light), unit.size), unit.reshape(len(unit), -1)
 
 
-class _Sum:
+class _NormalAccumulator:
     """One observation's part of the matrix; channels: slice of all, observation `o`."""
 
     def __init__(self, matrix, layout, exposure, o, channels):
@@ -141,7 +143,7 @@ class _Sum:
         """Add it."""
         pairs = zip(origin, images, strict=True)
         windows = [self.exposure.window(at, m.shape[1:]) for at, m in pairs]
-        near: list[_Seen] = []
+        near: list[_ComponentView] = []
         for i in sorted(range(len(images)), key=lambda i: windows[i][0, 0]):
             low, high = windows[i]
             near = [one for one in near if one.high[0] > low[0]]
@@ -152,7 +154,7 @@ class _Sum:
             near.append(one)
             both = [(other, one) if other.i <= i else (one, other) for other in near]
             n_threads = self.exposure.threads_for(one.light)
-            products = in_threads(n_threads, lambda pair: _products(*pair), both)
+            products = map_threads(n_threads, lambda pair: _products(*pair), both)
             for pair, found in zip(both, products, strict=True):
                 if found is not None:
                     self._add(*pair, *found)
@@ -161,7 +163,7 @@ class _Sum:
         if self.layout.n_sky:
             at = np.arange(self.channels.start, self.channels.stop)
             common = self.matrix.block(self.layout.common, self.layout.common)
-            common[at, at] += np.square(self.exposure.root, dtype=np.float64).sum((1, 2))
+            common[at, at] += np.square(self.exposure.sqrt_weights, dtype=np.float64).sum((1, 2))
 
     def _seen(self, i, images, spectrum, origin, low, high):
         k = len(images) - 1
@@ -171,7 +173,7 @@ class _Sum:
         seen = self.exposure.observe(images, i, origin, low, high)
         unit, light = seen[0].copy(), seen[1:]
         light *= spectrum[:, None, None]
-        return _Seen(i, k, low, high, light, unit)
+        return _ComponentView(i, k, low, high, light, unit)
 
     def _add(self, a, b, modes, by_a, by_b, units):
         """Add what `_products` has found of two components, a.i <= b.i."""
@@ -200,7 +202,7 @@ class _Sum:
 
     def _add_level(self, one):
         """The products of a component with a level of 1 in each channel."""
-        level = self.exposure.root[:, *box_slices(one.low, one.high - one.low)]
+        level = self.exposure.sqrt_weights[:, *box_slices(one.low, one.high - one.low)]
         level = level.reshape(len(level), -1)
         light, unit = one.within(one.low, one.high)
         products = _by_channel(light, level)
@@ -217,8 +219,11 @@ class _Sum:
 
 
 def _products(a, b):
-    """The products of two _Seen where their windows meet, None where they do not: of the light of
-    both (ka, kb), of b's light with a's unit and of a's with b's (k, C), of the units (C,)."""
+    """Products of two _ComponentView where their windows overlap, None where they do not.
+
+    Of the light of both (ka, kb), of b's light with a's unit and of a's with b's (k, C), of the
+    units (C,).
+    """
     low, high = np.maximum(a.low, b.low), np.minimum(a.high, b.high)
     if not (high > low).all():
         return None

@@ -9,19 +9,19 @@ from scipy.linalg.blas import strmm
 
 from ..assessment.cores import core_errors, with_core_errors
 from ..assessment.edge import light_outside, widened
-from ..assessment.status import judged
+from ..assessment.status import with_misfit_status
 from ..result import noted
-from .blocks import RIDGE, Factor
-from .bounds import pulls
-from .errors import Draws, Errors
-from .exposure import exposures_of
-from .modes import FLOOR, Solution, power_of
-from .moments import moments_of
-from .normal import Layout, normal_matrix
-from .residuals import channel_residuals, widening
+from .aligned_observation import align_observations
+from .block_matrix import RIDGE, BlockCholesky
+from .bound_bias import negative_chi2_gradient
+from .errors import Errors, PosteriorSampler
+from .modes import FLOOR_EXPONENT, Solution, clipped_power
+from .moments import moment_derivatives
+from .normal import UnknownLayout, normal_matrix
+from .residuals import channel_residuals, misfit_error_scale
 
 # Least error of a spectrum at fixed morphology, relative to it: smaller ones are rounding.
-LEAST_ERROR = 1e-9
+MIN_ERROR = 1e-9
 # Relative error of the light that a profile has beyond its box, where it is under the noise.
 # Fluxes of galaxies of r_e over 30 px and signal to noise 30 to 60 are 15 % too faint: two of these
 # errors, three without this part (bench.ladder).
@@ -29,7 +29,7 @@ FAR_ERROR = 0.3
 # [sigma] How far one component is released from the bound at 0 at most. Noise holds 98 in 100
 # simulated galaxies back by less; galaxies with negative light, of which images of COSMOS have
 # much, by up to 600, and no morphology should take that to its neighbours.
-MOST_RELEASED = 3.0
+MAX_BOUND_RELEASE_SIGMA = 3.0
 
 
 class Posterior:
@@ -39,9 +39,9 @@ class Posterior:
     fit_sky, fit_shifts: whether sky levels, and shifts of all observations but the first, are
         unknowns too
 
-    modes (n): arrays (k, ny, nx), beyond (n): see Solution.modes; layout: Layout; matrix: Blocks;
-        factor: its Factor; covariance: Blocks of the inverse, for the same nodes
-    released: arrays, for each node what its unknowns change by without the bound of bounds.py
+    modes (n): arrays (k, ny, nx), beyond (n): see Solution.modes; layout: UnknownLayout; matrix:
+        Blocks; factor: its BlockCholesky; covariance: Blocks of the inverse, for the same nodes
+    released: arrays, for each node what its unknowns change by without the bound of bound_bias.py
 
     Raises LinAlgError where the matrix is not positive definite.
     """
@@ -51,7 +51,7 @@ class Posterior:
         self.solution = solution
         images, self.beyond, held = zip(*(solution.modes(i) for i in range(n)), strict=True)
         self.modes = [m[1:] for m in images]
-        self.layout = Layout(
+        self.layout = UnknownLayout(
             np.array([len(m) for m in self.modes]),
             n_channels,
             n_channels if fit_sky else 0,
@@ -61,7 +61,7 @@ class Posterior:
         self.matrix = normal_matrix(
             solution.scene, exposures, images, solution.spectra, self.layout
         )
-        self.factor = Factor(self.matrix)
+        self.factor = BlockCholesky(self.matrix)
         self.covariance = self.factor.inverse()
         self.released = self._released(held)
 
@@ -71,16 +71,16 @@ class Posterior:
         for i, pull in enumerate(held):
             k = len(pull)
             steps = np.sqrt(pull @ self.covariance.block(i, i)[:k, :k] @ pull)
-            right[i][:k] = pull * min(1, MOST_RELEASED / max(steps, 1e-30))
+            right[i][:k] = pull * min(1, MAX_BOUND_RELEASE_SIGMA / max(steps, 1e-30))
         return self.factor.solve(right)
 
-    def errors(self, owner, residuals, unit, flux_floor) -> Errors:
+    def errors(self, owner, residuals, unit, flux_error_floor) -> Errors:
         """The Errors of sources, component i belonging to source owner[i] (n,).
 
         residuals (S, C) [sigma]: that widen them; unit (C,) [counts]: of the spectra; flux_floor:
             see Settings
         """
-        n_sources, wide = len(residuals), widening(residuals)
+        n_sources, wide = len(residuals), misfit_error_scale(residuals)
         flux, slopes = self._fluxes(owner, n_sources)
         n_channels = len(unit)
         between = np.zeros((n_channels, n_sources, n_sources))
@@ -97,8 +97,8 @@ class Posterior:
         floor = np.zeros(flux.shape)
         for i, slope in enumerate(slopes):
             own = self.solution.spectra[i] * slope[0, -self.layout.n_spectra]  # its flux
-            unlike = power_of(self.solution.unlikeness(i), FLOOR)
-            floor[owner[i]] += flux_floor * unlike * own
+            unlike = clipped_power(self.solution.structure_excess(i), FLOOR_EXPONENT)
+            floor[owner[i]] += flux_error_floor * unlike * own
         between[:, np.arange(n_sources), np.arange(n_sources)] += floor.T**2
         colour += floor[:, :, None] * floor[:, None, :]
         far = np.zeros(flux.shape)
@@ -125,10 +125,10 @@ class Posterior:
             residuals,
         )
 
-    def draws(self, owner, residuals, unit) -> Draws:
-        """What `Result.sample` draws from; for what it takes see `errors`."""
-        wide = widening(residuals)[owner]
-        return Draws(self.modes, self.factor, unit, wide, self.layout.ties)
+    def draws(self, owner, residuals, unit) -> PosteriorSampler:
+        """Sampler of the posterior for `Result.sample`; for its arguments see `errors`."""
+        wide = misfit_error_scale(residuals)[owner]
+        return PosteriorSampler(self.modes, self.factor, unit, wide, self.layout.ties)
 
     def _fluxes(self, owner, n_sources):
         """Fluxes (S, C), and each component's slopes (C, k + B) of its own by its unknowns."""
@@ -144,8 +144,10 @@ class Posterior:
         return flux, slopes
 
     def _moments(self, owner, n_sources, error):
-        """Covariances (S, 5, 5) of centroids and second moments, and what they change by (S, 5)
-        without the bound; error (S, C): of the fluxes."""
+        """Covariances (S, 5, 5) of centroids and second moments, and their bound bias (S, 5).
+
+        error (S, C): of the fluxes.
+        """
         s, out, moved = self.solution, np.full((n_sources, 5, 5), np.nan), np.zeros((n_sources, 5))
         for source in np.unique(owner):
             own = np.flatnonzero(owner == source)
@@ -156,7 +158,9 @@ class Posterior:
             if not n_modes or not light.any():
                 continue
             far = np.array([self.beyond[i].sums for i in own])
-            slopes, by_far = moments_of(s.scene.origin[own], [s.morphs[i] for i in own], light, far)
+            slopes, by_far = moment_derivatives(
+                s.scene.origin[own], [s.morphs[i] for i in own], light, far
+            )
             rows = []
             for i, slope, part in zip(own, slopes, light, strict=True):
                 flat, images = slope.reshape(5, -1), self.modes[i]
@@ -197,13 +201,13 @@ def with_errors(fit, result, peaks, seen):
 
     Its seconds are taken down in the fit.
     """
-    began, result = time.perf_counter(), judged(result)
+    began, result = time.perf_counter(), with_misfit_status(result)
     morphs = [c.morphology for c in result.components]
     posterior, messages = posterior_of(fit, morphs, peaks, seen)
     if posterior is None:
         return noted(result, messages=(*result.messages, *messages))
     owner, residuals = fit.fitted[fit.start.source], channel_residuals(result)
-    errors = posterior.errors(owner, residuals, fit.unit, fit.settings.flux_floor)
+    errors = posterior.errors(owner, residuals, fit.unit, fit.settings.flux_error_floor)
     draws = posterior.draws(owner, residuals, fit.unit)
     start = fit.start
     outside = light_outside(
@@ -222,7 +226,7 @@ def posterior_of(fit, morphs, peaks, seen):
     seen: Seen, of these
     """
     settings, scene = fit.settings, fit.scene
-    if not settings.learns or not settings.errors or fit.findings is None:
+    if not settings.has_multiscale_prior or not settings.errors or fit.strength_estimates is None:
         return None, []
     spectra, covariance = seen.spectra, seen.covariance
     variance = np.diagonal(covariance, axis1=1, axis2=2).T
@@ -234,19 +238,19 @@ def posterior_of(fit, morphs, peaks, seen):
         morphs,
         peaks,
         spectra,
-        np.sqrt(np.maximum(variance, (LEAST_ERROR * spectra) ** 2 + 1e-300)),
+        np.sqrt(np.maximum(variance, (MIN_ERROR * spectra) ** 2 + 1e-300)),
         fit.start.shapes,
         fit.start.thetas,
         fit.start.positions[fit.start.source],
         fit.start.source,
-        fit.findings,
+        fit.strength_estimates,
         _local_chi2(scene, fit.views, seen, residuals),
         settings.prior,
-        pulls(scene, fit.views, fit.start.source, seen.spectra, residuals),
+        negative_chi2_gradient(scene, fit.views, fit.start.source, seen.spectra, residuals),
     )
     try:
         sky, shifts = settings.fit_sky, settings.fit_shifts
-        return Posterior(solution, exposures_of(fit), fit_sky=sky, fit_shifts=shifts), []
+        return Posterior(solution, align_observations(fit), fit_sky=sky, fit_shifts=shifts), []
     except np.linalg.LinAlgError:
         why = "their normal matrix is not positive definite"
     return None, [f"errors are those of fixed morphologies: {why}"]
@@ -257,7 +261,7 @@ def _local_chi2(scene, views, seen, residuals):
     found, light = np.zeros((2, len(seen.spectra)))
     observed = zip(views, seen.observed, residuals, scene.channels(), strict=True)
     for view, rendered, left, part in observed:
-        weight, power = view.root**2, seen.spectra[:, part] ** 2
+        weight, power = view.sqrt_weights**2, seen.spectra[:, part] ** 2
         chi2 = weight * left**2
         for i, image in enumerate(rendered.images):
             image = image * weight[:, *rendered.window(i)]

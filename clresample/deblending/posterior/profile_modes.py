@@ -1,4 +1,4 @@
-"""How a component's smooth profile may change: its parameters, its place, its core and halo."""
+"""Modes of a component's smooth profile: its parameters, its position, its core and halo."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...sky.extent import box_slices
-from ..profiles import SIZE_SCATTER, Galaxy, Star
+from ..profiles import SIZE_SCATTER, GalaxyProfile, StarProfile
 
 # How galaxies scatter in ln sigma, g1, g2 (Leauthaud et al. 2007) and ln beta, in errors. Fits
 # expect less, which makes better models of faint ones; by what they expect 0.015 fewer of Euclid's
@@ -33,8 +33,8 @@ FAR_PX, FAR_LIGHT, FAR_HALO = 24, 0.003, 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class Beyond:
-    """What a component's profile has beyond its box.
+class OutsideBoxMoments:
+    """Flux and moments of a component's profile beyond its box.
 
     sums (6,): of the profile times 1, y, x, y y, y x, x x [frame px], where its maximum is 1
     slopes (6, k): of the sums by the coefficients of the modes
@@ -45,8 +45,11 @@ class Beyond:
 
     @classmethod
     def of(cls, images, low, box):
-        """That of images (1 + k, ny, nx), the profile and its modes, about a box, slices of them;
-        low (2,) [frame px]: the first pixel of images."""
+        """Those of images (1 + k, ny, nx), the profile and its modes, about a box.
+
+        The box ends `margin` (2,) pixels inside them; low (2,) [frame px]: the first pixel of
+        images.
+        """
         n_y, n_x = images.shape[1:]
         outside = np.ones((n_y, n_x))
         outside[box] = 0
@@ -63,14 +66,16 @@ class Beyond:
 
     def scaled(self, scales):
         """With the profile and its modes times scales (1 + k,)."""
-        return Beyond(self.sums * scales[0], self.slopes * scales[1:])
+        return OutsideBoxMoments(self.sums * scales[0], self.slopes * scales[1:])
 
-    def gauged(self, along):
-        """That of more modes, which come before these, and of which `along` (k,) times the profile
-        was taken off."""
+    def with_gauge(self, along):
+        """Those of more modes, from which `along` (k,) times the profile was subtracted.
+
+        The new modes come before these.
+        """
         slopes = np.zeros((6, len(along)))
         slopes[:, len(along) - self.slopes.shape[1] :] = self.slopes
-        return Beyond(self.sums, slopes - np.outer(self.sums, along))
+        return OutsideBoxMoments(self.sums, slopes - np.outer(self.sums, along))
 
 
 def profile_modes(shape, theta, position, profile, origin, *, radial=1.0):
@@ -81,24 +86,28 @@ def profile_modes(shape, theta, position, profile, origin, *, radial=1.0):
     radial: times CORE and HALO
     """
     core_and_halo = radial * CORE, radial * HALO
-    if isinstance(shape, Star):
+    if isinstance(shape, StarProfile):
         drawn = shape.draw(np.zeros(len(theta)), position)
         drawn = drawn[:, *box_slices(origin, profile.shape)] / drawn[0].max()
-        return drawn[1:], shape.scatter, Beyond.none(len(theta))
-    if isinstance(shape, Galaxy):
+        return drawn[1:], shape.scatter, OutsideBoxMoments.none(len(theta))
+    if isinstance(shape, GalaxyProfile):
         low, size = _surroundings(shape, theta, position, np.array(origin), profile.shape)
         box = box_slices(origin - low, profile.shape)
         drawn = shape.draw(theta, position - low, tuple(size))
-        moved = shape.place_slopes(theta, position - low, drawn[0])
+        moved = shape.position_derivatives(theta, position - low, drawn[0])
         peak = drawn[0].max()
         images = np.concatenate([drawn, moved, _core_and_halo(drawn[0] / peak) * peak]) / peak
         near = images[1:, *box].copy()
         scatter = np.concatenate([SCATTER, [POSITION_PX] * 2, core_and_halo])
         images[-2:] *= FAR_HALO
-        return near, scatter, Beyond.of(images, low, box)
+        return near, scatter, OutsideBoxMoments.of(images, low, box)
     slopes = np.stack([-_slope(profile, axis) for axis in (0, 1)])  # of a given image
     images = np.concatenate([slopes, _core_and_halo(profile)])
-    return images, np.array([POSITION_PX, POSITION_PX, *core_and_halo]), Beyond.none(len(images))
+    return (
+        images,
+        np.array([POSITION_PX, POSITION_PX, *core_and_halo]),
+        OutsideBoxMoments.none(len(images)),
+    )
 
 
 def _surroundings(galaxy, theta, position, origin, size):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...sky.noise import HALF_WIDTH
-from ..rendered import Rendered
+from ..component_images import ComponentImages
 
 # [sigma] of a filtered residual from which on a source is flagged as misfitted: among the 1e5
 # pixels of a large blend in all its channels, noise alone reaches it once in 20 blends.
@@ -21,7 +21,7 @@ WRONG_WEIGHTS = 1.3
 # the filter to two or three times what it is in single ones.
 CORRELATED = 3.0
 # Of a channel's largest filtered weight: pixels seen with less are not judged.
-LEAST_WEIGHT = 1e-6
+MIN_WEIGHT = 1e-6
 # [px] Images of several channels that are transformed at once: those of blends, for which each call
 # costs as much as its arithmetic. More would only take memory: a tile's channels go one by one.
 TOGETHER_PX = 1 << 17
@@ -31,7 +31,7 @@ TOGETHER_PX = 1 << 17
 class Remainder:
     """One observation's residual, whitened and filtered with its PSF (Co, My, Mx).
 
-    filtered [sigma]: t of `worst_residuals`, NaN unseen
+    filtered [sigma]: t of `max_filtered_residuals`, NaN unseen
     point [counts]: error of the flux of a point source there, which t times it is
     power (Co,) [1]: sum of the squared PSF: power t point is the residual smoothed with the PSF
     residual [sigma]: of single pixels, 0 without weight
@@ -61,9 +61,9 @@ class Remainder:
 def remainder(result, i_observation) -> Remainder:
     """The Remainder of an observation of a fitted blend."""
     footprint = result.footprints[i_observation]
-    observation = result.observations[i_observation].white
+    observation = result.observations[i_observation].whitened
     weights = np.where(footprint.used, observation.weights, 0.0)
-    model = result.observations[i_observation].as_white(result.model(i_observation))
+    model = result.observations[i_observation].whiten(result.model(i_observation))
     residual = np.where(weights > 0, observation.data - model, 0.0)
     kernels = _kernels(observation.psf)
     filtered, point = _filtered(residual, weights, kernels)
@@ -85,7 +85,7 @@ def remainder(result, i_observation) -> Remainder:
     return Remainder(filtered, point, power, scaled, weights > 0, sky, noise, owner)
 
 
-def worst_residuals(result, i_observation):
+def max_filtered_residuals(result, i_observation):
     """Largest |filtered residual| of each source in each channel: (S, Co) [sigma], NaN unseen.
 
         t(p) = sum_q P(q - p) w(q) r(q) / sqrt( sum_q P(q - p)^2 w(q) )
@@ -108,9 +108,11 @@ def _scatter(values):
 
 
 def fine_scatter(image, used):
-    """Robust scatter, 1 or more, of pixels (Ny, Nx) [sigma] about their neighbours, by second
-    differences along both axes (Immerkaer 1996, CVIU 64, 300): smooth light, which a model may
-    lack, has none."""
+    """Robust scatter, 1 or more, of pixels (Ny, Nx) [sigma] about their neighbours.
+
+    By second differences along both axes (Immerkaer 1996, CVIU 64, 300): smooth light, which a
+    model may lack, has none.
+    """
     along = image[:-2] - 2 * image[1:-1] + image[2:]
     both = along[:, :-2] - 2 * along[:, 1:-1] + along[:, 2:]
     whole = used[:-2] & used[1:-1] & used[2:]
@@ -121,7 +123,7 @@ def fine_scatter(image, used):
 
 
 def channel_residuals(result):
-    """`worst_residuals` in all channels of all observations: (S, C) [sigma].
+    """`max_filtered_residuals` in all channels of all observations: (S, C) [sigma].
 
     Of a result with Errors those that these were widened by.
     """
@@ -130,7 +132,7 @@ def channel_residuals(result):
     return result.misfit.residuals
 
 
-def widening(residuals):
+def misfit_error_scale(residuals):
     """Factors (S,), 1 or more, of the errors of sources with these `channel_residuals` (S, C).
 
     Where a model leaves a residual of r sigma, what it cannot follow has moved the source's flux,
@@ -168,7 +170,7 @@ def _filtered(residual, weights, kernels):
         w, kernel = weights[c], kernels[c, ::-1, ::-1]
         variance = convolved(w, kernel**2)
         most = variance.max(axis=(1, 2), keepdims=True, initial=0)
-        seen = (variance > LEAST_WEIGHT * most) & (w > 0)
+        seen = (variance > MIN_WEIGHT * most) & (w > 0)
         root = np.sqrt(variance[seen])
         found[c][seen] = convolved(w * residual[c], kernel)[seen] / root
         point[c][seen] = 1 / root
@@ -184,8 +186,10 @@ def _kernels(psf):
 
 
 def _owners(result, i_observation, positions):
-    """The source (Co, My, Mx) whose model is the brightest of those whose boxes hold a pixel; -1
-    where none does."""
+    """The source (Co, My, Mx) whose model is the brightest of those whose boxes hold a pixel.
+
+    -1 where none does.
+    """
     shape = result.observations[i_observation].shape
     owner, most = np.full(shape, -1), np.full(shape, -np.inf)
     for s, window, inside in pixels_in_boxes(result, i_observation, positions):
@@ -217,7 +221,7 @@ def pixels_in_boxes(result, i_observation, positions):
 
 def _window(rendered, parts, shape):
     """A window that holds the light of some components, and so their boxes."""
-    if not isinstance(rendered, Rendered):
+    if not isinstance(rendered, ComponentImages):
         return slice(0, shape[0]), slice(0, shape[1])
     windows = [rendered.window(i) for i in parts]
     return tuple(
@@ -229,7 +233,7 @@ def _light(result, i_observation, source, window):
     """One source's model (Co, ny, nx) on a window of an observation."""
     channels = result.channel_slices()[i_observation]
     rendered, total = result.rendered[i_observation], 0.0
-    boxed = isinstance(rendered, Rendered)
+    boxed = isinstance(rendered, ComponentImages)
     for i, c in enumerate(result.components):
         if c.source == source:
             image = rendered.within(i, window) if boxed else rendered[i][:, *window]

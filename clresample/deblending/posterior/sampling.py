@@ -35,8 +35,8 @@ def drawn_fluxes(result, n, rng):
     shape = n, len(result.sources), len(result.channels)
     found, beyond = np.zeros(shape), np.zeros(len(result.components))
     if result.errors is not None:
-        found += result.errors.released
-        beyond = result.errors.beyond[:, 0]
+        found += result.errors.flux_bound_bias
+        beyond = result.errors.outside_box_moments[:, 0]
     for one in found:
         for c, far in zip(drawn_components(result, rng), beyond, strict=True):
             one[c.source] += c.spectrum * (c.morphology.sum(dtype=np.float64) + far)
@@ -54,6 +54,8 @@ def undetermined(result) -> np.ndarray:
     owner = np.array([c.source for c in result.components], int)
     lost[owner] = False
     for i, c in enumerate(result.components):
-        if c.morphology.any() or (result.errors is not None and result.errors.beyond[i, 0]):
+        if c.morphology.any() or (
+            result.errors is not None and result.errors.outside_box_moments[i, 0]
+        ):
             lost[c.source] |= ~known[:, i]
     return lost

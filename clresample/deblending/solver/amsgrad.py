@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .scene import Memory
+from .scene import AmsgradMoments
 
 # Decay of the moments of gradients and of their squares (Reddi et al. 2018's defaults, as in the
 # paper's solver): an average over the last 10 and the last 1000 iterations.
@@ -29,11 +29,13 @@ N_MOMENTS = 3  # m, v, h
 
 @dataclass(frozen=True)
 class StepSizes:
-    """Lengths of the solver's steps where nothing damps them: larger ones come near the end sooner
-    and are less steady there.
+    """Lengths of the solver's undamped steps.
+
+    Larger ones come near the end sooner and are less steady there.
 
     latent: of z, in units of the prior's scatter; morphology: of S where there is no prior, in
-    units of its maximum, 1; spectrum: in units of `Scene.scale`, a flux's error and 2 % of the flux
+    units of its maximum, 1; spectrum: in units of `Scene.step_scale`, a flux's error and 2 % of the
+    flux
     """
 
     latent: float = 0.1
@@ -93,12 +95,12 @@ class AMSGrad:
         )
         self._morph.after_constraints()
 
-    def memories(self) -> list[Memory]:
+    def memories(self) -> list[AmsgradMoments]:
         """Each scene's moments, back on the host."""
         b = self.buffers
         morph = zip(*(b.unpack(a) for a in self._m_morph), strict=True)
         spectra = zip(*(b.split(b.device.get(a)) for a in self._m_spectra), strict=True)
-        return [Memory(list(m), np.stack(s)) for m, s in zip(morph, spectra, strict=True)]
+        return [AmsgradMoments(list(m), np.stack(s)) for m, s in zip(morph, spectra, strict=True)]
 
 
 class _LatentStep:
@@ -109,7 +111,7 @@ class _LatentStep:
         self._size = b.box_rows(b.n_free)
         common = {"active": b.free, "table": b.boxes.table, "taps": b.put(prior.taps)}
         blurred, weighed = b.zeros_flat(), b.zeros_flat()  # K along x, and what is blurred
-        kernels = ("blur", "step_latent", "blur", "form")
+        kernels = ("blur_latent", "step_latent", "blur_latent", "form_latent_morphology")
         self._blur_gradient, self._step, self._blur_latent, self._form = (
             _launcher(b, prior, name, 3).bind(**common) for name in kernels
         )
@@ -155,7 +157,7 @@ class _MorphologyStep:
             rate=self.step_size,
             **_named(moments),
         )
-        self._rescale = _launcher(b, None, "rescale", 1).bind(
+        self._rescale = _launcher(b, None, "rescale_spectra", 1).bind(
             factor=factor, n_channels=b.n_channels, spectra=b.spectra, n=b.spectra.size
         )
 

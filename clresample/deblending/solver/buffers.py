@@ -12,11 +12,11 @@ from .scene import State
 ITEMS_EACH = 64
 
 
-class Buffers:
+class SceneBuffers:
     """The arrays of B scenes of one signature, with S sources in all, on one device.
 
     scenes, device, dtype, tuning: Scenes, Device, NumPy type, Tuning
-    everyone (n,): int32, the sources that are rendered, all of them
+    all_sources (n,): int32, the sources that are rendered, all of them
     first (B + 1,), order (n,): int32, those by scene, and the first of each scene in that
     boxes, host_boxes: of all sources, with and without their table on the device
     free (n_free,): int32, the sources whose morphology is fitted; everyone's are in boxes
@@ -38,7 +38,7 @@ class Buffers:
             np.concatenate([s.center for s in scenes]),
         )
         self.boxes = self.host_boxes.put(device)
-        self.everyone = self.order = self.boxes.everyone
+        self.all_sources = self.order = self.boxes.everyone
         free = np.flatnonzero(~np.concatenate([s.fixed for s in scenes]))
         self.n_free = len(free)
         self.free = device.put(free if self.n_free else [0], np.int32)
@@ -46,7 +46,7 @@ class Buffers:
         self.profile = self.flat([s.profile for s in scenes])
         amplitude = prior.amplitude if prior else np.zeros_like
         self.amplitude = self.flat([[amplitude(p) for p in s.profile] for s in scenes])
-        self.scale = self.put(np.concatenate([s.scale for s in scenes]))
+        self.scale = self.put(np.concatenate([s.step_scale for s in scenes]))
         self.latent = self.flat([s.latent for s in states])
         self.morph = self.flat([s.morph for s in states])
         self.spectra = self.put(np.concatenate([s.spectra for s in states]))
@@ -65,7 +65,7 @@ class Buffers:
 
     @property
     def iterated(self):
-        """What the iterations change, on the device: latent, morph, spectra, sky."""
+        """Device buffers that the iterations change: latent, morph, spectra, sky."""
         return self.latent, self.morph, self.spectra, self.sky
 
     def put(self, values):
@@ -116,7 +116,7 @@ class Buffers:
         return self.sized(widest, tallest, n_boxes)
 
     def items(self, n):
-        """A launch for `n` items, several a work-item on CPUs; see FOR_I of group.h."""
+        """A launch for `n` items, several a work-item on CPUs; see FOR_I of work_group.h."""
         if self.tuning.row_loops:
             return (-(-n // ITEMS_EACH),)
         (group,) = self.tuning.local_size(1)

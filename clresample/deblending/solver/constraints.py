@@ -1,4 +1,4 @@
-"""Constraints on morphologies as operators on the device, over all sources of all scenes at once.
+"""Constraints on morphologies as operators on the device, over all sources of a batch.
 
 Each has `prox(morphs, boxes, *, step=1.0, active=None, factor=None)`, which overwrites morphs:
 
@@ -21,10 +21,10 @@ import weakref
 
 import numpy as np
 
-from .prox_launches import MOST_STEPS, FusedSteps, ProjectionLaunch
+from .prox_launches import MAX_STEPS, FusedSteps, ProjectionLaunch
 
 __all__ = [
-    "Chain",
+    "ProxChain",
     "L0",
     "L1",
     "MaxNorm",
@@ -37,7 +37,7 @@ __all__ = [
 
 
 class MonotoneWeights(enum.IntEnum):
-    """How a monotone morphology weighs the neighbours that are nearer to the centre.
+    """Weights of the neighbours nearer to the centre, for a monotone morphology.
 
     ANGLE: by the cosine of the angle between the ways to the neighbour and to the centre;
     FLAT: all alike; NEAREST: the one of the largest cosine alone; OFF: not monotone at all
@@ -101,7 +101,7 @@ class Prox:
         return {"on": 1}, {}
 
     def _launches(self, boxes, dtype):
-        """What is launched, in order, for boxes and morphologies of a type."""
+        """Kernel launches, in order, for boxes and morphologies of a type."""
         return [FusedSteps(self.steps(), boxes, dtype)]
 
 
@@ -180,7 +180,7 @@ class Monotone(Prox):
         super().__init__(weights=weights, gradient=gradient)
 
     def values(self):
-        """How neighbours are weighed, and the least relative fall per pixel."""
+        """Weights of neighbours, and the smallest relative fall per pixel."""
         weights = np.asarray(self.parameters["weights"])
         if not np.isin(weights, list(MonotoneWeights)).all():
             raise ValueError(f"weights is {weights}, it takes {[str(w) for w in MonotoneWeights]}")
@@ -224,7 +224,7 @@ class MonotoneProjection(Monotone):
         return [ProjectionLaunch(self, boxes, dtype), FusedSteps([sweep], boxes, dtype)]
 
 
-class Chain(Prox):
+class ProxChain(Prox):
     """One operator after the other, the first first; in one launch where none is a projection."""
 
     def __init__(self, *proxes):
@@ -232,7 +232,7 @@ class Chain(Prox):
         self._proxes = proxes
 
     def __repr__(self):
-        return f"Chain({', '.join(map(repr, self._proxes))})"
+        return f"ProxChain({', '.join(map(repr, self._proxes))})"
 
     def steps(self):
         """The steps of all of them, in order."""
@@ -247,14 +247,14 @@ class Chain(Prox):
             else:
                 steps = list(steps)
                 launches += [
-                    FusedSteps(steps[k : k + MOST_STEPS], boxes, dtype)
-                    for k in range(0, len(steps), MOST_STEPS)
+                    FusedSteps(steps[k : k + MAX_STEPS], boxes, dtype)
+                    for k in range(0, len(steps), MAX_STEPS)
                 ]
         return launches
 
 
 def _stands_alone(prox):
-    """Whether an operator is no step of prox.cl, but a kernel of its own."""
+    """Returns True if an operator is no step of prox.cl, but a kernel of its own."""
     return isinstance(prox, MonotoneProjection)
 
 

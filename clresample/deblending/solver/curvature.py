@@ -1,4 +1,4 @@
-"""How steep the loss is in each morphology, so that a solver's steps can respect it.
+"""Curvature of the loss in each morphology, for the steps of a solver.
 
 The Hessian of the loss by z (by S without a prior) is H = K amplitude A R^T w R A amplitude K, plus
 1 with a prior. Its entries are hardly ever negative, so its largest eigenvalue is at most its
@@ -44,8 +44,7 @@ def damping(scene, state, prior) -> np.ndarray:
 
 
 def _pull(scene, state, morphs, prior, *, rest):
-    """What R^T w R makes of the model of `morphs`, or of its residual `rest`, by each source's
-    variable: S arrays (ny, nx)."""
+    """Products of R^T w R with the model of `morphs`, or its `rest`: S arrays (ny, nx)."""
     by_morph, parts = 0, zip(scene.channels(), scene.ops, scene.weights, scene.data, strict=True)
     for i, (part, op, weights, data) in enumerate(parts):
         spectra = scene.parts(i, state.spectra[:, part])

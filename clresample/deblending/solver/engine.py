@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from .amsgrad import AMSGrad, StepSizes
-from .buffers import Buffers
-from .constraints import Chain
-from .gradient import Gradient
-from .prior import Prior
+from .buffers import SceneBuffers
+from .constraints import ProxChain
+from .gradient import LossGradient
+from .prior import SingleScalePrior
 from .scene import Scene, State
 
 # Most iterations of one `run`: so many losses of each scene wait on the device until they are read.
-MOST_STEPS = 16
+MAX_STEPS = 16
 # Which of these is for a loss at any other time: best and kept states belong to the first of a run.
-LAST = MOST_STEPS - 1
+LAST = MAX_STEPS - 1
 
 
 class Engine:
@@ -22,7 +22,7 @@ class Engine:
 
     scenes, states: of the scenes, all after the same number of iterations
     chain: constraints on the morphologies, applied after every step
-    prior: the Prior of all extended sources, or None to fit the morphologies themselves
+    prior: the SingleScalePrior of all extended sources, or None to fit the morphologies themselves
     step_sizes: the StepSizes; update: what steps, a class like AMSGrad
 
     buffers, update: the batch's Buffers and its update, with the present state
@@ -35,22 +35,22 @@ class Engine:
         device,
         dtype,
         *,
-        chain: Chain,
-        prior: Prior | None,
+        chain: ProxChain,
+        prior: SingleScalePrior | None,
         step_sizes: StepSizes,
         update=AMSGrad,
     ):
         self.scenes, self.device = scenes, device
-        b = self.buffers = Buffers(scenes, states, device, dtype, prior)
-        self._gradient = Gradient(b, with_prior=prior is not None)
+        b = self.buffers = SceneBuffers(scenes, states, device, dtype, prior)
+        self._gradient = LossGradient(b, with_prior=prior is not None)
         self.update = update(
             b, self._gradient, states, chain=chain, prior=prior, step_sizes=step_sizes
         )
-        self.losses = device.empty((MOST_STEPS, len(scenes)), b.dtype)
+        self.losses = device.empty((MAX_STEPS, len(scenes)), b.dtype)
         self._kept = [device.put(device.get(a)) for a in b.iterated]
         self._keep_size = b.box_rows(b.n_sources)
         names = "latent", "morph", "spectra", "sky"
-        self._keep = b.launcher("losses.cl", "keep", 3).bind(
+        self._keep = b.launcher("losses.cl", "keep_best", 3).bind(
             active=b.boxes.everyone,
             table=b.boxes.table,
             first=b.first,
@@ -71,8 +71,8 @@ class Engine:
 
         Of each scene the state before the first of them is kept if its loss is the lowest so far.
         """
-        if n_steps > MOST_STEPS:
-            raise ValueError(f"n_steps is {n_steps}, one run does at most {MOST_STEPS}")
+        if n_steps > MAX_STEPS:
+            raise ValueError(f"n_steps is {n_steps}, one run does at most {MAX_STEPS}")
         for i in range(n_steps):
             self.gradient(i)
             if i == 0:
@@ -102,6 +102,6 @@ class Engine:
         iterated = self._kept if kept else self.buffers.iterated
         return self.buffers.states(iterated, self.update.memories(), self.n_steps)
 
-    def follow_shifts(self):
+    def update_shifts(self):
         """Take over the shifts that the scenes' operators have by now."""
-        self._gradient.follow_shifts()
+        self._gradient.update_shifts()

@@ -18,10 +18,10 @@ import functools
 import numpy as np
 
 from ...resampling.resampler import Resampler
-from .rendering.choice import rendering
+from .rendering.stage_selection import select_rendering
 
 
-class Gradient:
+class LossGradient:
     """Queues model, residual, gradients and loss of a batch at its present state.
 
     buffers: the batch; d_morph and d_spectra of it are overwritten
@@ -98,7 +98,7 @@ class Gradient:
         if self._tie is not None:
             self._tie(self.buffers.items(self.buffers.n_sources))
 
-    def follow_shifts(self):
+    def update_shifts(self):
         """Take over the shifts that the scenes' own operators have by now."""
         for observed in self.observations:
             observed.follow_shifts()
@@ -119,7 +119,7 @@ class _ObservedBatch:
         n, channel = len(scenes), scenes[0].channels()[i].start
         n_bands, my, mx = self.op.shape_out
         self.image = device.empty((n, *self.op.shape_out), buffers.dtype)
-        self.rendering = rendering(buffers, i, self.op, depth)
+        self.rendering = select_rendering(buffers, i, self.op, depth)
         group = buffers.tuning.sum_group
         self.add, self._residual_size = i > 0, (group, my, n * n_bands)
         self._residual = buffers.scene_launcher("residual", (group, 1, 1)).bind(
@@ -144,7 +144,7 @@ class _ObservedBatch:
         shown.transform(b.morph)
         shown.render(b.spectra, self.image)
         self._residual(self._residual_size)
-        shown.collect(self.image)
+        shown.back_project(self.image)
         shown.gather_spectra(b.d_spectra)
         if b.n_free:
             shown.gather_morph(b.spectra, b.d_morph, b.free, add=self.add)
@@ -153,4 +153,4 @@ class _ObservedBatch:
         """Shift the batch's operator as the scenes' own ones are."""
         if self.op is not self._ops[0]:
             self.op.shift = np.stack([op.shift for op in self._ops])
-        self.rendering.follow_shifts()
+        self.rendering.update_shifts()

@@ -1,4 +1,4 @@
-"""The scene as linear operators: an image of it is linear in its morphologies and in its spectra.
+"""The scene as linear operators: an image is linear in morphologies and in spectra.
 
     I[b, c] = R_c M[b, c],   M[b, c] = sum_s A[s, c] S_s    sources s of scene b, an observation's
                                                             channels c
@@ -15,7 +15,7 @@ from ...resampling.linop import LinOp
 
 
 class SceneOperator(LinOp):
-    """What both have: the images of one observation for every scene of a batch, (B, Co, My, Mx).
+    """Base of both operators: one observation's images of every scene of a batch (B, Co, My, Mx).
 
     buffers: the batch; op: its operator of that observation; rendering: its Frames or Transformed
     """
@@ -51,12 +51,12 @@ class MorphologyOperator(SceneOperator):
     def _adjoint(self, y, out):
         self._refuse_batch(y)
         self.device.copy(self._zeros, out)  # no kernel writes to what lies between the boxes
-        self.rendering.collect(y[0])
+        self.rendering.back_project(y[0])
         self.rendering.gather_morph(self.buffers.spectra, out, self.buffers.boxes.everyone)
 
     @functools.cached_property
     def _zeros(self):
-        """What an adjoint starts from; the solver's own launches do without."""
+        """Zeros from which an adjoint starts; the solver's own launches do without."""
         return self.buffers.zeros_flat()
 
 
@@ -78,10 +78,10 @@ class SpectraOperator(SceneOperator):
         self._refuse_batch(y)
         self.device.copy(self._zeros, out)  # the channels of other observations
         self.rendering.transform(self.buffers.morph)
-        self.rendering.collect(y[0])
+        self.rendering.back_project(y[0])
         self.rendering.gather_spectra(out)
 
     @functools.cached_property
     def _zeros(self):
-        """What an adjoint starts from; the solver's own launches do without."""
+        """Zeros from which an adjoint starts; the solver's own launches do without."""
         return self.buffers.zeros_like_spectra()

@@ -8,24 +8,24 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Prior:
-    """What is expected of a morphology: S = p + alpha sqrt(p) K z, z unit normal.
+class SingleScalePrior:
+    """Prior on a morphology: S = p + alpha sqrt(p) K z, z unit normal.
 
     p is the smooth profile that is expected. The structure of galaxies is made of clumps, whose
     number, and so the variance, follows the light: hence the root.
 
-    alpha [1]: scatter of the brightest pixel about its expected value, relative to it; larger ones
-        let more of the noise into the morphology
+    strength [1]: scatter of the brightest pixel about its expected value, relative to it; larger
+        ones let more of the noise into the morphology
     correlation_px [model px]: Gaussian sigma of the kernel K that correlates neighbours; larger
         ones keep the structure smoother
     """
 
-    alpha: float = 0.1
+    strength: float = 0.1
     correlation_px: float = 2.0
 
     def amplitude(self, profile) -> np.ndarray:
         """Scatter of a profile's pixels: alpha sqrt(p); 0 where a star's rings are negative."""
-        return self.alpha * np.sqrt(np.maximum(profile, 0))
+        return self.strength * np.sqrt(np.maximum(profile, 0))
 
     @property
     def taps(self) -> np.ndarray:

@@ -9,7 +9,7 @@ from ...device.tuning import Tuning
 from .boxes import ALIGN
 
 # STEP0 .. STEP7 of prox.cl.
-MOST_STEPS = 8
+MAX_STEPS = 8
 
 
 class FusedSteps:
@@ -64,8 +64,10 @@ class ProjectionLaunch:
             **{name: prox.parameters[name] for name in ("positive", "tolerance")},
         )
         self.most = self.n_iterations
-        if tuning.loops is not None:
-            self.most = most_iterations(device, int(planes.max()) * ALIGN, self.group, tuning.loops)
+        if tuning.max_loop_iterations is not None:
+            self.most = most_iterations(
+                device, int(planes.max()) * ALIGN, self.group, tuning.max_loop_iterations
+            )
 
     def __call__(self, morphs, active, step, factor, first):
         """Queue the projection; it has no use for the last three."""
@@ -76,8 +78,9 @@ class ProjectionLaunch:
 
 
 def most_iterations(device, n, group, loops):
-    """Iterations of the projection in one launch on a device that ends a work-item's loops after
-    `loops` of them; n: elements of the largest plane, group: work-items that share it.
+    """Iterations of the projection in one launch on a device that limits loops to `loops`.
+
+    n: elements of the largest plane, group: work-items that share it.
 
     DeviceError: not even one is possible
     """

@@ -1,4 +1,6 @@
-"""The solver's kernels in NumPy, written from their definitions; the tests compare kernels with it.
+"""The solver's kernels in NumPy, written from their definitions.
+
+The tests compare kernels with it.
 
 First the iteration of one scene (scene.cl, update.cl), in float64: S sources with arrays (ny, nx),
 C channels. The model itself and the gathering of its gradients are in scene_model.py, which the

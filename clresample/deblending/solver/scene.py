@@ -12,24 +12,25 @@ from .rendering.ties import Ties
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What no iteration changes of one scene: data, operators, boxes, expected profiles.
+    """Constants of the iterations of one scene: data, operators, boxes, expected profiles.
 
     Fitted shifts change the operators, and boxes that follow their light make another Scene.
 
     S sources, C channels of all observations in their order, Co of observation o.
 
     shape (Ny, Nx) [px]: model frame
-    extent (Ny, Nx) [px]: the part of it, from its first pixel on, that is not padding
+    unpadded_shape (Ny, Nx) [px]: the part of it, from its first pixel on, that is not padding
     ops: one Resampler per observation, each at its observation's present shift
     data, weights: per observation (Co, My, Mx)
     origin, center (S, 2) [px]: first pixel of each box in the frame, which holds all of the box,
         and the pixel of the box about which the morphology falls
     profile (S): arrays (ny, nx) [1]: expected morphology, max = 1
     fixed (S,): bool, the morphology stays as it is
-    scale (S, C): what counts as one step of each spectrum, in the unit of the data
-    shares: per observation (S, Co, T), of its operator's terms in each component's PSF; None where
-        its PSF is the same for all
-    power (S, C): sum w (R p)^2 of each profile p, the curvature of the loss by its spectrum
+    step_scale (S, C): what counts as one step of each spectrum, in the unit of the data
+    coefficients: per observation (S, Co, T), of its operator's terms in each component's PSF; None
+        where its PSF is the same for all
+    spectrum_curvature (S, C): sum w (R p)^2 of each profile p, the curvature of the loss by its
+        spectrum
     damping (S,): gradients under which steps are shorter than the step sizes; see
         `curvature.damping`
     fit_sky: whether the sky level of each channel is free
@@ -39,7 +40,7 @@ class Scene:
     """
 
     shape: tuple[int, int]
-    extent: tuple[int, int]
+    unpadded_shape: tuple[int, int]
     ops: list[Resampler]
     data: list[np.ndarray]
     weights: list[np.ndarray]
@@ -47,9 +48,9 @@ class Scene:
     center: np.ndarray
     profile: list[np.ndarray]
     fixed: np.ndarray
-    scale: np.ndarray
-    shares: list | None = None
-    power: np.ndarray | None = None
+    step_scale: np.ndarray
+    coefficients: list | None = None
+    spectrum_curvature: np.ndarray | None = None
     damping: np.ndarray | None = None
     fit_sky: bool = False
     sky_precision: np.ndarray | None = None
@@ -62,7 +63,7 @@ class Scene:
 
     def shares_of(self, i):
         """Observation i's shares (S, Co, T) or None."""
-        return self.shares[i] if self.shares else None
+        return self.coefficients[i] if self.coefficients else None
 
     @property
     def known_sky(self) -> np.ndarray:
@@ -80,20 +81,23 @@ class Scene:
 
     @property
     def n_bytes(self) -> int:
-        """Device memory [bytes] that the scene takes in a batch, roughly: all numbers as float64,
-        two model and four observed images per channel, twelve arrays for each box."""
+        """Device memory [bytes] that the scene takes in a batch, roughly.
+
+        All numbers as float64, two model and four observed images per channel, twelve arrays for
+        each box.
+        """
         pixels = sum(2 * np.prod(o.shape_in) + 4 * np.prod(o.shape_out) for o in self.ops)
         return int(8 * (pixels + 12 * sum(m.size for m in self.profile)))
 
     @property
-    def signature(self):
+    def batch_key(self):
         """Scenes of equal signature can share a batch: frames, observed shapes, kernels to run."""
         return signature_of(self.shape, self.fit_sky, self.ops, self.ties)
 
 
 @dataclass(frozen=True, eq=False)
-class Memory:
-    """What an update remembers from step to step: k arrays like the morphologies and the spectra.
+class AmsgradMoments:
+    """Moments of AMSGrad: k arrays like the morphologies and the spectra.
 
     morph (k): each S arrays (ny, nx), in the boxes; spectra (k, S, C)
     """
@@ -103,10 +107,10 @@ class Memory:
 
 
 @dataclass(frozen=True, eq=False)
-class Learned:
-    """What a fit under a LearnedPrior knows of the structure of one scene's n components.
+class StructureState:
+    """Structure of one scene's n components in a fit under a MultiscalePrior.
 
-    structure [s][j] (ny_j, nx_j): coefficients z of each scale, on the grids of `Latents`
+    structure [s][j] (ny_j, nx_j): coefficients z of each scale, on the grids of `LatentLayout`
     strengths (n, J): their scatter; clear (n,): bool, see evidence.py. Of fixed ones
         without meaning
     """
@@ -118,23 +122,24 @@ class Learned:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What the iterations change of one scene.
+    """Variables of the iterations of one scene.
 
     latent, morph (S): arrays (ny, nx): z (see Prior; of no use without one) and S
     spectra (S, C): A, and sky (C,), in the unit of the data
     memory: of the update, None before its first step; n_steps: iterations done so far
-    learned: Learned under a LearnedPrior; None: no structure, strengths that are the prior's
+    learned: StructureState under a MultiscalePrior; None: no structure, strengths that are the
+        prior's
     """
 
     latent: list[np.ndarray]
     morph: list[np.ndarray]
     spectra: np.ndarray
     sky: np.ndarray
-    memory: Memory | None = None
+    memory: AmsgradMoments | None = None
     n_steps: int = 0
-    learned: Learned | None = None
+    learned: StructureState | None = None
 
 
 def signature_of(shape, fit_sky, ops, ties=None):
-    """`Scene.signature` of scenes with these."""
+    """`Scene.batch_key` of scenes with these."""
     return shape, fit_sky, tuple(op.layout for op in ops), ties

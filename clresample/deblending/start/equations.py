@@ -10,9 +10,11 @@ from ..spectra import RIDGE
 N_PARAMETERS = 4
 
 
-def equations(looking):
-    """Normal matrices (k, P, P) and right sides (k, P) of Gauss-Newton steps of all parameters,
-    the spectra and sky levels eliminated; P = 4 n. After a look with slopes, and `compare`."""
+def normal_equations(looking):
+    """Normal matrices (k, P, P) and right sides (k, P) of Gauss-Newton steps; P = 4 n.
+
+    Spectra and sky levels are eliminated. After `render` with slopes, and `compute_residuals`.
+    """
     k, n, rows = len(looking.scenes), looking.n_most, looking.rows
     own, p = looking.index[looking.at], N_PARAMETERS
     normal, right = np.zeros((k, n, p, n, p)), np.zeros((k, n, p))
@@ -22,9 +24,9 @@ def equations(looking):
     known = np.arange(p) < (looking.slots.n_images - 1)[:, None]  # (slots, p)
     if looking.fit_sky:
         rest[..., n], inner[..., n, n] = looking.of_level()
-    for sight, (table, on_device) in zip(looking.sights, looking.pairs, strict=True):
+    for sight, (table, on_device) in zip(looking.sights, looking.overlapping_pairs, strict=True):
         c, channels = np.arange(looking.n_channels)[sight.channels][None], sight.channels
-        gram, pull = sight.gram(on_device, 1 + p), sight.pull(1 + p)
+        gram, pull = sight.gram(on_device, 1 + p), sight.residual_products(1 + p)
         pairs = table[:, :2]
         a = looking.spectra[looking.at][:, channels]
         (i, j), b = own[pairs].T, rows[pairs[:, 0]]
@@ -56,7 +58,7 @@ def equations(looking):
 
 
 def _of_bands(ties, normal, right, inner, cross, rest, lit):
-    """What `_eliminated` takes, with the sky levels eliminated and tied channels summed.
+    """Arguments of `_eliminated`, with the sky levels eliminated and tied channels summed.
 
     `inner`, `cross`, `rest` and `lit` then have n spectra and, with Ties, B bands in place of C
     channels. A level has thousands of times the curvature of a spectrum: a ridge relative to that

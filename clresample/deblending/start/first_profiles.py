@@ -4,10 +4,11 @@ Those step from what is expected, galaxies of a few pixels. Where one galaxy of 
 larger, small profiles of all sources share its light at first, and each grows into it. So sizes
 GROWTH times apart, with the expected wings and with WIDE_WINGS, are compared here,
 
-    gain_k = sum_c max(0, <u_k, r>)^2 / (|u_k|^2 + (WRONG <u_k, M>)^2),
+    gain_k = sum_c max(0, <u_k, r>)^2 / (|u_k|^2 + (NEIGHBOUR_MODEL_ERROR <u_k, M>)^2),
 
 u_k being a source's whitened image with profile k, r what is left of the data by the models of the
-sources before it, and M these models: they are wrong by WRONG of their light, see population.py,
+sources before it, and M these models: they are wrong by NEIGHBOUR_MODEL_ERROR of their light, see
+    population.py,
 which a small neighbour must not take for its own. The source that gains the most comes first, with
 its best profile, whose shape is then fitted; then the one that gains the most of what is left, and
 so on: in whatever order they are listed.
@@ -19,8 +20,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..profiles import Galaxy
-from .population import WRONG
+from ..profiles import GalaxyProfile
+from .population import NEIGHBOUR_MODEL_ERROR
 
 # Sizes follow each other by this factor: the least squares find their way from half of it.
 GROWTH = 3.0
@@ -44,7 +45,7 @@ def profile_grid(looking, thetas, error) -> dict:
     looking: Looking that has its solution at `thetas` (N), those that are expected
     error: part of the light that adds to the noise
     """
-    going = [i for i, c in enumerate(looking.components) if isinstance(c.shape, Galaxy)]
+    going = [i for i, c in enumerate(looking.components) if isinstance(c.shape, GalaxyProfile)]
     going = [i for i in going if looking.components[i].shape.whole]
     if not going:
         return {}
@@ -104,17 +105,17 @@ def _next(looking, models, rest, error):
     if models:
         before = _instead(looking, list(models.items()))
         before.solve(error)
-        before.compare(error)
+        before.compute_residuals(error)
     around = _instead(looking, listed)
     right = np.zeros((len(listed), looking.n_channels))
     for sight in around.sights:
-        right[around.at, sight.channels] = sight.pull(1)[:, :, 0, 0] if models else 0
+        right[around.at, sight.channels] = sight.residual_products(1)[:, :, 0, 0] if models else 0
     if looking.ties is not None:
         right = looking.ties.spread(looking.ties.total(right))
     sky = before.sky if models else looking.sky
     light, alone = around.light_products(sky, error)
     right = right if models else light
-    noise = alone + (WRONG * (light - right)) ** 2
+    noise = alone + (NEIGHBOUR_MODEL_ERROR * (light - right)) ** 2
     square = np.maximum(right, 0) ** 2
     gain = np.divide(square, noise, out=np.zeros_like(noise), where=alone > 0).sum(axis=1)
     # of each component the best profile
@@ -146,9 +147,9 @@ def _instead(looking, listed):
         count[c.scene] = index = count.get(c.scene, -1) + 1
         components.append(replace(c, index=index))
         parameters.append(theta)
-    around = looking.instead(components)
+    around = looking.with_components(components)
     scenes = np.unique(around.scene)
-    around.look(scenes, parameters, np.zeros(len(components)), slopes=False)
+    around.render(scenes, parameters, np.zeros(len(components)), slopes=False)
     return around
 
 

@@ -1,8 +1,8 @@
-"""What is expected of the galaxies of a scene, at first and as learned from all of them.
+"""Prior on galaxy sizes and wings, updated by EM from the galaxies of the scene.
 
 Of a galaxy's ln sigma and ln beta, how large it is and how wide its wings are,
 
-    theta_i = mean_i + c + s x_i,    c ~ N(0, COMMON^2),    x_i ~ Student's t of FREEDOM
+    theta_i = mean_i + c + s x_i,    c ~ N(0, SCENE_SCATTER^2),    x_i ~ Student's t of STUDENT_DOF
 
 with c and s the scene's own. Faint galaxies are then taken for what others of their scene are like,
 and one that is unlike them all, a bright spiral among faint ones, counts for little. Both are
@@ -15,7 +15,7 @@ of the start (spectra.MODEL_ERROR) take that for noise of each pixel by itself, 
 would be left over a whole galaxy. With u a galaxy's whitened image, all channels in one, and M that
 of all other sources, what is wrong in M adds E to what the data know of u to 1,
 
-    E = WRONG <u, M> / |u|
+    E = NEIGHBOUR_MODEL_ERROR <u, M> / |u|
 
 so that its shape is known 1 + E^2 times less well than the data say. It is held to what is expected
 of it by so much more instead, which comes to the same and leaves its neighbours' shapes alone. A
@@ -27,23 +27,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..profiles import Galaxy
+from ..profiles import GalaxyProfile
 
-# Which parameters of `profiles.Galaxy` are learned: ln sigma and ln beta. How they are expected to
-# scatter from scene to scene and within one, together as a galaxy by itself (SIZE_SCATTER,
-# WINGS_SCATTER); what is expected within a scene has the weight of so many galaxies. Mean SDRs of
-# simulated COSMOS galaxies are 0.1 dB (joint) to 0.2 dB (Rubin's or Euclid's images alone) above
-# those of what is expected of any galaxy (180 scenes, seeds from 3000, 4000 and 5000). OWN from
-# 0.15 to 0.27 and 0.35 to 0.5, or a WEIGHT of 8, change them by up to 0.03 dB; a scatter of
-# ellipticities that is learned likewise costs up to 0.1 dB.
+# Which parameters of `profiles.GalaxyProfile` are learned: ln sigma and ln beta. How they are
+# expected to scatter from scene to scene and within one, together as a galaxy by itself
+# (SIZE_SCATTER, WINGS_SCATTER); what is expected within a scene has the weight of so many galaxies.
+# Mean SDRs of simulated COSMOS galaxies are 0.1 dB (joint) to 0.2 dB (Rubin's or Euclid's images
+# alone) above those of what is expected of any galaxy (180 scenes, seeds from 3000, 4000 and 5000).
+# GALAXY_SCATTER from 0.15 to 0.27 and 0.35 to 0.5, or a WEIGHT of 8, change them by up to 0.03 dB;
+# a scatter of ellipticities that is learned likewise costs up to 0.1 dB.
 LEARNED = np.array([0, 3])
-COMMON, OWN, WEIGHT = np.array([0.35, 0.5]), np.array([0.2, 0.5]), 4.0
+SCENE_SCATTER, GALAXY_SCATTER, WEIGHT = np.array([0.35, 0.5]), np.array([0.2, 0.5]), 4.0
 # Galaxies of a scene from which on there is something to learn.
-FEWEST = 2
+MIN_GALAXIES = 2
 # Degrees of freedom. With 4, one galaxy three times as large as five others leaves what is expected
 # of these as it was; under a Gaussian their scatter would grow from 0.2 to 0.35. Simulated galaxies
 # are fitted alike with both.
-FREEDOM = 4.0
+STUDENT_DOF = 4.0
 # The same of all four parameters of a galaxy by itself, before anything is learned: data overrule
 # what is expected of sizes and wings. Ellipticities are expected to be nearly Gaussian: tails of 4
 # degrees of freedom cost 0.1 dB.
@@ -53,56 +53,58 @@ TAILS = np.array([4.0, 1e6, 1e6, 4.0])
 # (joint, and Euclid alone) to 0.28 dB (Rubin alone), with 0.5 by as much (180 scenes, seeds from
 # 3000, 4000 and 5000). With 0.5 two bright galaxies on top of each other, a merger in HSC's images,
 # keep shapes that are wrong.
-WRONG = 0.2
+NEIGHBOUR_MODEL_ERROR = 0.2
 
 
-class Population:
-    """What is expected of the components of B scenes.
+class PopulationPrior:
+    """Prior on the profiles of the components of B scenes.
 
     shapes (N): their Shapes; scene, index (N,): of each, below B and n; n_parameters: p
 
     mean, scatter (B, n, p): of their parameters, 0 and 1 where there are none
-    doubt (B, n): 1 + E^2, see the module's text
+    contamination (B, n): 1 + E^2, see the module's text
     """
 
     def __init__(self, shapes, scene, index, n_scenes, n_most, n_parameters):
         size = n_scenes, n_most, n_parameters
         self.mean, self.scatter = np.zeros(size), np.ones(size)
-        self.doubt = np.ones(size[:2])
+        self.contamination = np.ones(size[:2])
         self._galaxies, self._known = np.zeros((2, *size[:2]), bool)
         for b, i, shape in zip(scene, index, shapes, strict=True):
             n = len(shape.mean)
             self.mean[b, i, :n], self.scatter[b, i, :n] = shape.mean, shape.scatter
-            self._galaxies[b, i] = isinstance(shape, Galaxy)
+            self._galaxies[b, i] = isinstance(shape, GalaxyProfile)
             # components of one source differ by more than galaxies
             self._known[b, i] = self._galaxies[b, i] and shape.whole
         self._before = self.mean[..., LEARNED]
-        self._common, self._own = np.zeros((n_scenes, len(OWN))), np.tile(OWN, (n_scenes, 1))
-        self._several = self._known.sum(1) >= FEWEST
+        self._common, self._own = (
+            np.zeros((n_scenes, len(GALAXY_SCATTER))),
+            np.tile(GALAXY_SCATTER, (n_scenes, 1)),
+        )
+        self._several = self._known.sum(1) >= MIN_GALAXIES
 
-    def doubt_shapes(self, scenes, found):
-        """Take down how far shapes of some scenes are to be doubted, (k, n) of `doubts`."""
-        self.doubt[scenes] = np.where(self._galaxies[scenes], found, 1)
+    def set_contamination(self, scenes, found):
+        """Stores the contamination of shapes of some scenes, (k, n) of `contamination_factors`."""
+        self.contamination[scenes] = np.where(self._galaxies[scenes], found, 1)
 
     def precision(self, scenes, theta):
         """With which the parameters (B, n, p) of some scenes are held to their means (k, n, p)."""
         weight = 1 / (1 + self._away(scenes, theta) / TAILS)
         weight = np.where(self._galaxies[scenes][..., None], weight, 1)
-        return self.doubt[scenes][..., None] * weight / np.square(self.scatter[scenes])
+        return self.contamination[scenes][..., None] * weight / np.square(self.scatter[scenes])
 
-    def pull(self, scenes, theta):
-        """What is added to chi2 (k,) of some scenes; theta (B, n, p)."""
+    def penalty(self, scenes, theta):
+        """Term added to chi2 (k,) of some scenes; theta (B, n, p)."""
         away = self._away(scenes, theta)
         tail = TAILS * np.log1p(away / TAILS)
         pulled = np.where(self._galaxies[scenes][..., None], tail, away)
-        return (self.doubt[scenes][..., None] * pulled).sum(axis=(1, 2))
+        return (self.contamination[scenes][..., None] * pulled).sum(axis=(1, 2))
 
     def _away(self, scenes, theta):
-        """Squares (k, n, p) of how far parameters (B, n, p) of some scenes are from their means, in
-        units of the scatter."""
+        """Squared distances (k, n, p) of parameters (B, n, p) from their means, in scatters."""
         return np.square((theta[scenes] - self.mean[scenes]) / self.scatter[scenes])
 
-    def learn(self, scenes, theta, normal):
+    def update(self, scenes, theta, normal):
         """Learn from the galaxies of some scenes what is expected in them.
 
         theta (B, n, p); normal (B, n p, n p): of their equations, what was expected among them
@@ -112,9 +114,9 @@ class Population:
         each = normal[scenes].reshape(-1, n, p, n, p)[:, np.arange(n), :, np.arange(n)]
         variance = np.diagonal(np.linalg.inv(each), axis1=2, axis2=3).swapaxes(0, 1)
         # as if what the data say had been divided, instead of the rest multiplied
-        variance = variance * self.doubt[scenes][..., None]
+        variance = variance * self.contamination[scenes][..., None]
         off, known = theta[scenes][..., LEARNED] - self._before[scenes], self._known[scenes]
-        self._common[scenes], self._own[scenes], scatter = learned(
+        self._common[scenes], self._own[scenes], scatter = em_step(
             off, variance[..., LEARNED], known, self._common[scenes], self._own[scenes]
         )
         k, i = np.nonzero(known)
@@ -124,7 +126,7 @@ class Population:
         self.scatter[at] = scatter[k, i]
 
 
-def doubts(normal, spectra, source):
+def contamination_factors(normal, spectra, source):
     """1 + E^2 (k, n) of the components of some scenes; see the module's text.
 
     normal (k, C, n, n): products of their whitened images; spectra (k, C, n)
@@ -133,10 +135,12 @@ def doubts(normal, spectra, source):
     light = spectra[:, :, :, None] * normal * spectra[:, :, None]
     own = np.einsum("kcii->ki", light)
     beside = np.einsum("kcij,kij->ki", light, source[:, :, None] != source[:, None])
-    return 1 + WRONG**2 * np.divide(beside**2, own, out=np.zeros_like(own), where=own > 0)
+    return 1 + NEIGHBOUR_MODEL_ERROR**2 * np.divide(
+        beside**2, own, out=np.zeros_like(own), where=own > 0
+    )
 
 
-def learned(off, variance, known, common, own):
+def em_step(off, variance, known, common, own):
     """c and s (k, 2) after one step, and what each galaxy is then expected to scatter (k, n, 2).
 
     off, variance (k, n, 2): theta - mean, and how well each galaxy's is known, what was expected of
@@ -144,9 +148,9 @@ def learned(off, variance, known, common, own):
     known (k, n): which of them are galaxies; common, own (k, 2): the present c and s
     """
     known, away = known[..., None], (off - common[:, None]) ** 2 + variance
-    weight = (FREEDOM + 1) / (FREEDOM + away / own[:, None] ** 2)
+    weight = (STUDENT_DOF + 1) / (STUDENT_DOF + away / own[:, None] ** 2)
     counted = weight * known
-    common = (counted * off).sum(1) / (counted.sum(1) + (own / COMMON) ** 2)
+    common = (counted * off).sum(1) / (counted.sum(1) + (own / SCENE_SCATTER) ** 2)
     away = counted * ((off - common[:, None]) ** 2 + variance)
-    own = np.sqrt((WEIGHT * OWN**2 + away.sum(1)) / (WEIGHT + known.sum(1)))
+    own = np.sqrt((WEIGHT * GALAXY_SCATTER**2 + away.sum(1)) / (WEIGHT + known.sum(1)))
     return common, own, own[:, None] / np.sqrt(weight)

@@ -7,27 +7,27 @@ from dataclasses import replace
 import numpy as np
 
 from ..spectra import MODEL_ERROR
-from .equations import N_PARAMETERS, equations
+from .component_batch import peaks_of
+from .equations import N_PARAMETERS, normal_equations
 from .first_profiles import first_profiles
-from .looking import Looking
-from .population import Population, doubts
-from .slots import peaks_of
+from .linearised_scenes import LinearisedScenes
+from .population import PopulationPrior, contamination_factors
 
 # Longest step of a parameter: far from the minimum the quadratic model of chi2 promises too much.
 LONGEST_STEP = 0.7
 # Most steps, and the chi2 that ends them when one of them gains no more than it.
-N_STEPS, ENOUGH = 40, 1.0
+N_STEPS, REL_CHI2_TOL = 40, 1.0
 # Most steps of large galaxies' profiles after each that is found, before all are fitted together.
 N_FIRST_STEPS = 5
 # Levenberg-Marquardt: damping of the first step as a part of the normal matrix's diagonal, what it
 # is divided by after a step that gains, multiplied by after one that does not, and where it ends.
-FIRST_DAMPING, LESS, MORE, MOST_DAMPING = 1e-2, 3, 10, 1e3
+FIRST_DAMPING, DAMPING_DECREASE, DAMPING_INCREASE, MAX_DAMPING = 1e-2, 3, 10, 1e3
 
 
 class ProfileFit:
     """The least-squares problems of B scenes' parameters theta (B, n, 4), padded with zeros.
 
-    looking: Looking; noise (B, C): of a model pixel
+    looking: LinearisedScenes; noise (B, C): of a model pixel
 
     population: what is expected of the parameters
     source (B, n): to which each component belongs, -1 where there is none
@@ -35,13 +35,13 @@ class ProfileFit:
     brightness (N,): of the components, see `thresholds`
     """
 
-    def __init__(self, looking: Looking, noise):
+    def __init__(self, looking: LinearisedScenes, noise):
         self.looking, self.noise = looking, noise
         shapes = [c.shape for c in looking.components]
         self.counts = np.array([len(shape.mean) for shape in shapes])
         self.at = looking.scene, looking.index
         size = looking.n_scenes, looking.n_most, N_PARAMETERS
-        self.population = Population(shapes, *self.at, *size)
+        self.population = PopulationPrior(shapes, *self.at, *size)
         self.source = np.full(size[:2], -1)
         self.source[self.at] = [c.source for c in looking.components]
         self.theta, self.chi2 = self.population.mean.copy(), np.full(size[0], np.inf)
@@ -79,7 +79,7 @@ class ProfileFit:
             c = self.looking.components[i]
             part.append(replace(c, index=int(count[c.scene])))
             count[c.scene] += 1
-        fit = ProfileFit(self.looking.instead(part), self.noise)
+        fit = ProfileFit(self.looking.with_components(part), self.noise)
         moves = np.zeros(fit.source.shape, bool)
         for c, i in zip(part, here, strict=True):
             fit.theta[c.scene, c.index, : len(thetas[i])] = thetas[i]
@@ -108,9 +108,11 @@ class ProfileFit:
                 return
             gain, trial = self._try(scenes, damping[scenes], free[scenes])
             gained = gain > 0
-            damping[scenes] = np.where(gained, damping[scenes] / LESS, damping[scenes] * MORE)
-            enough = gained & (gain < ENOUGH)
-            live[scenes] = ~enough & (damping[scenes] <= MOST_DAMPING)
+            damping[scenes] = np.where(
+                gained, damping[scenes] / DAMPING_DECREASE, damping[scenes] * DAMPING_INCREASE
+            )
+            enough = gained & (gain < REL_CHI2_TOL)
+            live[scenes] = ~enough & (damping[scenes] <= MAX_DAMPING)
             self.theta[scenes[gained]] = trial[scenes[gained]]
             self._measure_brightness(self.theta)
             further = scenes[gained & live[scenes]]
@@ -118,12 +120,14 @@ class ProfileFit:
                 if learn:
                     self._learn(further)
                 self._look(further, self.theta, slopes=True)
-                self.looking.compare(MODEL_ERROR)
+                self.looking.compute_residuals(MODEL_ERROR)
                 self._take_equations(further)
 
     def _try(self, scenes, damping, free):
-        """Try a step of each of the scenes; what it gains (k,), spectra those of the better one,
-        and theta (B, n, 4) after it."""
+        """Try a step of each of the scenes.
+
+        What it gains (k,), spectra those of the better one, and theta (B, n, 4) after it.
+        """
         looking, own = self.looking, np.eye(self.right.shape[1])
         moves = np.repeat(free, N_PARAMETERS, axis=1)
         normal = self.normal[scenes] * (moves[:, None] & moves[..., None])
@@ -143,29 +147,31 @@ class ProfileFit:
         return gain, trial
 
     def _look(self, scenes, theta, *, slopes):
-        self.looking.look(scenes, self.thetas(theta), self.brightness, slopes=slopes)
+        self.looking.render(scenes, self.thetas(theta), self.brightness, slopes=slopes)
 
     def _chi2(self, scenes, theta):
         """With what is expected (k,)."""
-        return self.looking.compare(MODEL_ERROR) + self.population.pull(scenes, theta)
+        return self.looking.compute_residuals(MODEL_ERROR) + self.population.penalty(scenes, theta)
 
     def _learn(self, scenes):
         """Learn what to expect of some scenes from the present parameters."""
-        before = self.population.pull(scenes, self.theta)
-        self.population.learn(scenes, self.theta, self.normal)
+        before = self.population.penalty(scenes, self.theta)
+        self.population.update(scenes, self.theta, self.normal)
         self._doubt(scenes)
-        self.chi2[scenes] += self.population.pull(scenes, self.theta) - before
+        self.chi2[scenes] += self.population.penalty(scenes, self.theta) - before
 
     def _doubt(self, scenes):
         """Note how far the shapes of some scenes, of those last solved, are to be doubted."""
         looking = self.looking
         rows = looking.rows_of(scenes)
         normal, spectra = looking.normal[rows][..., :-1, :-1], looking.solution()[rows][..., :-1]
-        self.population.doubt_shapes(scenes, doubts(normal, spectra, self.source[scenes]))
+        self.population.set_contamination(
+            scenes, contamination_factors(normal, spectra, self.source[scenes])
+        )
 
     def _take_equations(self, scenes):
         """Note the normal equations of some scenes, what is expected among them."""
-        normal, right = equations(self.looking)
+        normal, right = normal_equations(self.looking)
         weight = self.population.precision(scenes, self.theta).reshape(right.shape)
         away = self.population.mean[scenes] - self.theta[scenes]
         self.normal[scenes] = normal + weight[..., None] * np.eye(right.shape[1])

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...device.contraction import ImageBatch, Matrix
-from ...device.tuning import MOST_GROUPS
+from ...device.contraction import ImageBatch, MatrixBatch
+from ...device.tuning import MAX_GROUPS
 from ...resampling.resampler import EXECUTORS
 
 
-class Renderer:
+class BoxRenderer:
     """Plans of boxes of one shape on the device: images (n, ny, nx) to (n, C, wy, wx).
 
     plans: `Plan.window`'s, alike in layout and window, of one place of a distorted mapping, or of a
@@ -41,7 +41,7 @@ class Renderer:
                 nu[i, : len(own)] = own
         self._turn = device.launcher(
             "terms.cl",
-            "turn",
+            "apply_transfer",
             dtype=dtype,
             local_size=tuning.local_size(3),
             ROWS=tuning.row_loops,
@@ -62,7 +62,7 @@ class Renderer:
             None where it has one
         """
         e, count, (w_y, w_x) = self.executor, len(moves), self.size
-        fit = min(e.tuning.group_bytes // (n * self._n_bytes), MOST_GROUPS // (n * e.n_bands))
+        fit = min(e.tuning.group_bytes // (n * self._n_bytes), MAX_GROUPS // (n * e.n_bands))
         group = min(count, max(1, fit))
         self._reserve(group * n)
         phase = self.device.put(self._phases(which, moves), self.dtype)
@@ -71,11 +71,11 @@ class Renderer:
             m = min(group, count - first) * n
             at, to = i_image + first * n * e.n_y * e.n_x, i_seen + first * n * self.n_elements
             if e.which is not None:
-                e.follow(np.repeat(which[first : first + group], n))
+                e.select_plans(np.repeat(which[first : first + group], n))
             e.in_columns_once(m, a=ImageBatch(images.base_data, at, e.n_y * e.n_x, e.n_x))
             self._rows(m)
             self._turn((self._width, e.h_y, m * e.n_bands), n=n, first=first, phase=phase)
-            e.observe(ImageBatch(seen.base_data, to, w_y * w_x, w_x), m * e.n_bands)
+            e.frequencies_to_pixels(ImageBatch(seen.base_data, to, w_y * w_x, w_x), m * e.n_bands)
 
     def _reserve(self, n_images):
         """Make room for so many images at a time."""
@@ -88,9 +88,9 @@ class Renderer:
             e.which = self.device.empty(n_images, np.int32)
         e.reserve(n_images * e.n_bands)
         plain = self.device.zeros((n_images, e.k_y, e.k_pad), self.dtype)
-        z0 = Matrix(plain.base_data, e.k_pad, e.k_y * e.k_pad)
-        half, own = e.matrix("half", e.n_y), e.own(m=e.k_ys, n=e.k_xs)
-        in_y = e.in_y._replace(div=1)
+        z0 = MatrixBatch(plain.base_data, e.k_pad, e.k_y * e.k_pad)
+        half, own = e.matrix("half", e.n_y), e.item_sizes(m=e.k_ys, n=e.k_xs)
+        in_y = e.in_y._replace(items_per_matrix=1)
         self._rows = e.waves("in_y", "left").bind(e.k_y, e.k_x, e.n_y, in_y, half, z0, own=own)
         self._turn.bind(z0=z0.buffer, z=e.matrix("frequencies").buffer, which=e.which)
 

@@ -20,45 +20,47 @@ OVERHEAD = 2.7
 
 
 @dataclass(frozen=True)
-class Limits:
-    """What one fit may hold; blends over it are cut.
+class FitLimits:
+    """Limits of one fit; blends over them are cut.
 
-    sources: how many; pixels: of the model, in the box about the blend. Larger ones are fitted more
+    max_sources: how many; max_pixels: of the model, in the box about the blend. Larger ones are
+        fitted more
     exactly, as one scene, but take longer than in proportion: the errors' normal matrix grows with
     the square of the number of sources, its inverse with the cube
     work [px]: model pixels times sources that blends may have before they are cut where the light
         between their parts is weak (WEAK); others only over the limits above
-    memory [bytes]: that it may take by prediction, see `fit_bytes`; None = any; n_channels: of all
+    max_bytes [bytes]: that it may take by prediction, see `fit_bytes`; None = any; n_channels: of
+        all
     mosaics, for that
     """
 
-    sources: int = 40
-    pixels: int = 400 * 400
+    max_sources: int = 40
+    max_pixels: int = 400 * 400
     work: int = 1_000_000
-    memory: float | None = None
+    max_bytes: float | None = None
     n_channels: int = 1
 
     def __post_init__(self):
-        for name in ("sources", "pixels", "work"):
+        for name in ("max_sources", "max_pixels", "work"):
             if not getattr(self, name) >= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, must be 1 or more")
 
     @property
     def most_pixels(self) -> float:
         """Of the box of a single source."""
-        if self.memory is None:
-            return self.pixels
-        return min(self.pixels, self.memory / fit_bytes(1, 1, self.n_channels))
+        if self.max_bytes is None:
+            return self.max_pixels
+        return min(self.max_pixels, self.max_bytes / fit_bytes(1, 1, self.n_channels))
 
-    def hold(self, n_sources, n_pixels) -> bool:
-        """Whether a fit of so many sources in a box of so many pixels is within them."""
+    def allow(self, n_sources, n_pixels) -> bool:
+        """Returns True if a fit of so many sources in a box of so many pixels is within them."""
         n_bytes = fit_bytes(n_sources, n_pixels, self.n_channels)
-        few = n_sources <= self.sources and n_pixels <= self.pixels
-        return few and (self.memory is None or n_bytes <= self.memory)
+        few = n_sources <= self.max_sources and n_pixels <= self.max_pixels
+        return few and (self.max_bytes is None or n_bytes <= self.max_bytes)
 
     def quick(self, n_sources, n_pixels) -> bool:
-        """Whether a fit of so many sources in a box of so many pixels is within `work` too."""
-        return self.hold(n_sources, n_pixels) and n_sources * n_pixels <= self.work
+        """Returns True if a fit of this size is within `work` too."""
+        return self.allow(n_sources, n_pixels) and n_sources * n_pixels <= self.work
 
 
 def fit_bytes(n_sources, n_pixels, n_channels) -> float:
@@ -72,7 +74,7 @@ def fit_bytes(n_sources, n_pixels, n_channels) -> float:
     return OVERHEAD * 4.0 * images * n_pixels
 
 
-def pieces_of(light, inside, positions, limits, margin, groups=None):
+def cut_blend(light, inside, positions, limits, margin, groups=None):
     """Cut a blend into pieces within the limits: territories (Ny, Nx) and a piece (S,) per source.
 
     Each source gets the pixels from which the light rises to it (watershed); sources are then put
@@ -104,8 +106,8 @@ def pieces_of(light, inside, positions, limits, margin, groups=None):
         a, b = root(piece, a), root(piece, b)
         if a == b:
             continue
-        both = boxes[a].join(boxes[b])
-        fits = limits.hold if height > WEAK else limits.quick
+        both = boxes[a].union(boxes[b])
+        fits = limits.allow if height > WEAK else limits.quick
         if not fits(counts[a] + counts[b], both.grown(margin).area):
             continue
         piece[b], boxes[a] = a, both
@@ -125,11 +127,11 @@ def _boxes_within(basins, at, limits, margin):
     boxes = []
     for i, (rows, columns) in enumerate(ndimage.find_objects(basins)):
         box = Box(rows.start, columns.start, rows.stop, columns.stop)
-        if not limits.hold(1, box.grown(margin).area):
+        if not limits.allow(1, box.grown(margin).area):
             y, x = at[i]
-            near = Box(y - half, x - half, y + half, x + half).meet(box)
+            near = Box(y - half, x - half, y + half, x + half).intersection(box)
             own = basins[box.slices] == i + 1
-            own[near.within(box).slices] = False
+            own[near.relative_to(box).slices] = False
             basins[box.slices][own] = 0
             box = near
         boxes.append(box)

@@ -8,11 +8,11 @@ import numpy as np
 from scipy import ndimage
 
 from ..box import Box
-from ..mapped import mapped_array
+from ..memmap import create_memmap
 
 
 @dataclass(frozen=True, eq=False)
-class Footprints:
+class LinkedFootprints:
     """The light of a field, each blend's pixels by its number.
 
     labels (Ny, Nx): int32, 0 = no source's; 1 to n
@@ -24,7 +24,7 @@ class Footprints:
     light: np.ndarray
 
 
-def link(tiles, found, region, folder=None) -> Footprints:
+def link_footprints(tiles, found, region, folder=None) -> LinkedFootprints:
     """Connected footprints of a region, from its tiles: two pixels that touch belong together.
 
     tiles: of the region; found: called with a tile's number, returns its Found
@@ -35,24 +35,24 @@ def link(tiles, found, region, folder=None) -> Footprints:
     light = _image(folder, "light", np.float16, region.shape)
     n_labels, joined = 0, []
     for tile in tiles:
-        part, where = found(tile.number), tile.core.within(region).slices
-        own, n = ndimage.label(part.lit, np.ones((3, 3), int))
+        part, where = found(tile.number), tile.core.relative_to(region).slices
+        own, n = ndimage.label(part.footprint_mask, np.ones((3, 3), int))
         own[own > 0] += n_labels
-        labels[where], light[where] = own, part.light
-        joined.append(_touching(labels, tile.core.within(region)))
+        labels[where], light[where] = own, part.snr_map
+        joined.append(_touching(labels, tile.core.relative_to(region)))
         n_labels += n
     number = _roots(n_labels, np.concatenate([np.zeros((0, 2), int), *joined]))
     boxes: dict[int, Box] = {}
     for tile in tiles:
-        core = tile.core.within(region)
+        core = tile.core.relative_to(region)
         labels[core.slices] = number[labels[core.slices]]
         for i, slices in enumerate(ndimage.find_objects(labels[core.slices]), start=1):
             if slices is not None:
                 (rows, columns) = slices
                 box = Box(rows.start, columns.start, rows.stop, columns.stop)
                 box = Box(*(np.array(box) + np.array([*tile.core[:2], *tile.core[:2]])).tolist())
-                boxes[i] = box if i not in boxes else boxes[i].join(box)
-    return Footprints(labels, tuple(boxes[i] for i in sorted(boxes)), light)
+                boxes[i] = box if i not in boxes else boxes[i].union(box)
+    return LinkedFootprints(labels, tuple(boxes[i] for i in sorted(boxes)), light)
 
 
 def _touching(labels, core):
@@ -91,4 +91,4 @@ def _roots(n, pairs):
 def _image(folder, name, dtype, shape):
     if folder is None:
         return np.zeros(shape, dtype)
-    return mapped_array(folder / f"{name}.npy", dtype, shape)
+    return create_memmap(folder / f"{name}.npy", dtype, shape)

@@ -1,4 +1,4 @@
-"""What is to be done for a field: its sources, the fits to make, and in which groups."""
+"""Plan of a field's fits: sources, regions, groups."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from scipy import ndimage
 
-from ..box import Box, sized_up
-from .cut import Limits, fit_bytes, pieces_of
+from ..box import Box, round_up_size
+from .cut import FitLimits, cut_blend, fit_bytes
 from .search import nearest
 
 # [model px] Sky around a blend's footprint in the box of its fit: it shows where the light ends.
@@ -25,14 +25,15 @@ LARGEST_FIELD = (1 << 63 - 2 * POSITION_BITS) - 1
 
 
 @dataclass(frozen=True)
-class Patch:
+class FitRegion:
     """One fit: a blend, or a piece of one that is over the limits.
 
     number: in the plan; its pixels have the label number + 1; parent: id of the blend
     box: Box of the model's pixels that is fitted
     sources: indices of the plan's sources; siblings: numbers of the other pieces of its blend whose
         boxes meet this one
-    pieces: how many pieces its blend was cut into, 1 = not cut; n_blend: sources of the blend
+    pieces: how many pieces its blend was cut into, 1 = not cut; n_blend_sources: sources of the
+        blend
     """
 
     number: int
@@ -41,17 +42,18 @@ class Patch:
     sources: tuple[int, ...]
     siblings: tuple[int, ...] = ()
     pieces: int = 1
-    n_blend: int = 1
+    n_blend_sources: int = 1
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class FitPlan:
     """Sources (S), patches (P) and groups of patches that are fitted side by side.
 
     positions (S, 2) [px]: (y, x) in the field's model pixels; ids (S,): int64; peaks (S,) [sigma]
     groups: of patch numbers, those predicted to take longest first
-    giants: groups of pieces only, which are fitted again with their neighbours' light subtracted
-    lost: {tile's number: why it could not be searched}
+    cut_groups: groups of pieces only, which are fitted again with their neighbours' light
+        subtracted
+    failed_tiles: {tile's number: why it could not be searched}
     hosts (S,): int64, id of the source whose clump each may be, its own where there is none; None =
         their own
     """
@@ -59,10 +61,10 @@ class Plan:
     positions: np.ndarray
     ids: np.ndarray
     peaks: np.ndarray
-    patches: tuple[Patch, ...]
+    patches: tuple[FitRegion, ...]
     groups: tuple[tuple[int, ...], ...]
-    giants: tuple[tuple[int, ...], ...] = ()
-    lost: dict = field(default_factory=dict)
+    cut_groups: tuple[tuple[int, ...], ...] = ()
+    failed_tiles: dict = field(default_factory=dict)
     hosts: np.ndarray | None = None
 
     @cached_property
@@ -85,29 +87,29 @@ class Plan:
                 "peaks": self.peaks.tolist(),
                 "patches": [asdict(patch) for patch in self.patches],
                 "groups": self.groups,
-                "giants": self.giants,
-                "lost": self.lost,
+                "cut_groups": self.cut_groups,
+                "failed_tiles": self.failed_tiles,
                 "hosts": None if self.hosts is None else self.hosts.tolist(),
             }
         )
 
-    def only(self, core) -> Plan:
+    def restricted_to(self, core) -> FitPlan:
         """The plan of what is needed for the sources in a Box: blends that have one there."""
-        inside = core.holds(self.positions)
+        inside = core.contains(self.positions)
         parents = {p.parent for p in self.patches if inside[list(p.sources)].any()}
 
         def kept(groups):
             few = (tuple(n for n in g if self.patches[n].parent in parents) for g in groups)
             return tuple(group for group in few if group)
 
-        return replace(self, groups=kept(self.groups), giants=kept(self.giants))
+        return replace(self, groups=kept(self.groups), cut_groups=kept(self.cut_groups))
 
     @classmethod
-    def from_json(cls, text) -> Plan:
+    def from_json(cls, text) -> FitPlan:
         """The plan that `to_json` wrote."""
         about = json.loads(text)
         patches = [
-            Patch(
+            FitRegion(
                 **(p | {"box": Box(*p["box"])} | {k: tuple(p[k]) for k in ("sources", "siblings")})
             )
             for p in about["patches"]
@@ -118,8 +120,8 @@ class Plan:
             np.array(about["peaks"], float),
             tuple(patches),
             tuple(map(tuple, about["groups"])),
-            tuple(map(tuple, about["giants"])),
-            about["lost"],
+            tuple(map(tuple, about["cut_groups"])),
+            about["failed_tiles"],
             about.get("hosts") and np.array(about["hosts"], np.int64),
         )
 
@@ -145,7 +147,7 @@ def source_ids(positions, field_number=0) -> np.ndarray:
     return ids
 
 
-def make_plan(
+def make_fit_plan(
     positions,
     peaks,
     footprints,
@@ -157,7 +159,7 @@ def make_plan(
     n_channels=1,
     most=32,
     hosts=None,
-) -> Plan:
+) -> FitPlan:
     """Blends from sources and the labels of their light; giants cut; groups by predicted cost.
 
     positions (S, 2) [px], peaks (S,) [sigma]: in whose order blends are numbered
@@ -168,7 +170,7 @@ def make_plan(
         worker
     hosts (S, 2) [px]: see Found; in cut blends they stay with their clumps if the limits allow it
     """
-    limits = replace(limits or Limits(), memory=memory, n_channels=n_channels)
+    limits = replace(limits or FitLimits(), max_bytes=memory, n_channels=n_channels)
     ids = source_ids(positions, field_number)
     hosts = ids if hosts is None else host_ids(positions, peaks, ids, hosts)
     labels, corner = footprints.labels, np.array(region[:2])
@@ -179,8 +181,8 @@ def make_plan(
     for label in order:
         sources, box = of_label[label], footprints.boxes[label - 1]
         brightest = max(sources, key=lambda s: (peaks[s], -s))
-        own = {"parent": int(ids[brightest]), "n_blend": len(sources)}
-        inner = box.within(region)
+        own = {"parent": int(ids[brightest]), "n_blend_sources": len(sources)}
+        inner = box.relative_to(region)
         inside = labels[inner.slices] == label
         if limits.quick(len(sources), box.grown(MARGIN_PX).area) or len(sources) == 1:
             pending.append((inner, inside, len(made)))
@@ -188,20 +190,20 @@ def make_plan(
             continue
         light = footprints.light[inner.slices]
         local = positions[sources] - box[:2]
-        territory, number = pieces_of(light, inside, local, limits, MARGIN_PX, hosts[sources])
+        territory, number = cut_blend(light, inside, local, limits, MARGIN_PX, hosts[sources])
         n_pieces = int(number.max()) + 1
         for i, where in enumerate(ndimage.find_objects(territory)):
             part = territory[where] == i + 1
             small = Box(where[0].start, where[1].start, where[0].stop, where[1].stop)
             there = Box(*(np.array(small) + np.array([*box[:2], *box[:2]])).tolist())
-            pending.append((there.within(region), part, len(made)))
+            pending.append((there.relative_to(region), part, len(made)))
             few = tuple(s for s, piece in zip(sources, number, strict=True) if piece == i)
             made.append(own | {"box": there, "sources": few, "pieces": n_pieces})
     _number(labels, pending)
     patches = _patches(made)
     groups = _groups(patches, memory, n_channels, most)
     giants = _groups([p for p in patches if p.pieces > 1], memory, n_channels, most)
-    return Plan(positions, ids, np.asarray(peaks), patches, groups, giants, hosts=hosts)
+    return FitPlan(positions, ids, np.asarray(peaks), patches, groups, giants, hosts=hosts)
 
 
 def host_ids(positions, peaks, ids, hosts) -> np.ndarray:
@@ -237,15 +239,15 @@ def _number(labels, pending):
 
 def _patches(made):
     """Patches with the boxes of their fits, and the other pieces that each of them meets."""
-    boxes = [sized_up(one["box"].grown(MARGIN_PX), STEP_PX) for one in made]
+    boxes = [round_up_size(one["box"].grown(MARGIN_PX), STEP_PX) for one in made]
     of_parent: dict[int, list[int]] = {}
     for i, one in enumerate(made):
         of_parent.setdefault(one["parent"], []).append(i)
     patches = []
     for i, one in enumerate(made):
         others = [k for k in of_parent[one["parent"]] if k != i]
-        meet = tuple(k for k in others if boxes[i].meet(boxes[k]).area)
-        patches.append(Patch(i, **(one | {"box": boxes[i], "siblings": meet})))
+        meet = tuple(k for k in others if boxes[i].intersection(boxes[k]).area)
+        patches.append(FitRegion(i, **(one | {"box": boxes[i], "siblings": meet})))
     return tuple(patches)
 
 
@@ -255,13 +257,13 @@ def predicted_bytes(patch, n_channels) -> float:
 
 
 def predicted_cost(patch) -> float:
-    """What orders fits by their time: pixels times sources, and three more for what all share."""
+    """Relative time of fits: pixels times sources, and three more for the common part."""
     return patch.box.area * (len(patch.sources) + 3.0)
 
 
 def _groups(patches, memory, n_channels, most):
     """Numbers of patches in groups of one size of box, the largest first."""
-    of_shape: dict[tuple, list[Patch]] = {}
+    of_shape: dict[tuple, list[FitRegion]] = {}
     for patch in sorted(patches, key=lambda p: (-predicted_cost(p), p.number)):
         of_shape.setdefault(patch.box.shape, []).append(patch)
     groups = []

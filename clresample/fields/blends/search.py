@@ -7,29 +7,29 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from ...files.whole_file import FileError
+from ...files.atomic import FileError
 from ...measurement.detection import detect, noise_scatter
-from ...measurement.signal import WIDTHS_ARCSEC
+from ...measurement.signal_to_noise import WIDTHS_ARCSEC
 from ...sky.frame import model_frame
 from ..box import Box
 
 # [sigma] of the combined signal-to-noise image: pixels above it hold light of a source. At 2, what
 # is left out of a source's footprint is under the noise everywhere; lower, noise links sources that
 # do not touch; higher, faint wings are shared by two blends.
-LIGHT = 2.0
-# Peaks may lie on nothing else that is above LIGHT: those found by one instrument alone. They get a
-# footprint of this radius, in FWHM of the widest PSF.
-LEAST_RADIUS = 0.5
+FOOTPRINT_SIGMA = 2.0
+# Peaks may lie on nothing else that is above FOOTPRINT_SIGMA: those found by one instrument alone.
+# They get a footprint of this radius, in FWHM of the widest PSF.
+MIN_RADIUS = 0.5
 SAMPLE_PX = 512  # [model px] side of the part of a field that shows how its noise scatters
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """What the search of one tile has found.
+class TileDetections:
+    """Detections of the search of one tile.
 
     positions (S, 2) [px]: (y, x) in the field's model pixels of sources in the core; peaks (S,)
         [sigma]
-    light (Ny, Nx) [sigma]: float16, signal to noise of all instruments together, of the core
+    snr_map (Ny, Nx) [sigma]: float16, signal to noise of all instruments together, of the core
     lit (Ny, Nx) bool: the core's pixels of footprints, grown by the PSF
     hosts (S, 2) [px]: position of the source whose clump each may be, its own where there is none;
         None = their own
@@ -37,17 +37,17 @@ class Found:
 
     positions: np.ndarray
     peaks: np.ndarray
-    light: np.ndarray
-    lit: np.ndarray
+    snr_map: np.ndarray
+    footprint_mask: np.ndarray
     hosts: np.ndarray | None = None
 
 
-def search(mosaics, reference, tile, *, threshold, scatters=None) -> Found:
+def search_tile(mosaics, reference, tile, *, threshold, scatters=None) -> TileDetections:
     """Search one tile in all mosaics together.
 
     mosaics: of the field; reference: Grid of the model's pixels; tile: Tile
     threshold [sigma]: least signal to noise of a peak
-    scatters {mosaic's name: scatters of its signal to noise}: see `scatters_of`; None = each tile's
+    scatters {mosaic's name: scatters of its signal to noise}: see `snr_scatter`; None = each tile's
 
     Raises FileError for pixels that cannot be read, ImportError without sep.
     """
@@ -55,45 +55,45 @@ def search(mosaics, reference, tile, *, threshold, scatters=None) -> Found:
     n_y, n_x = tile.core.shape
     if not observations:
         empty = np.zeros((n_y, n_x))
-        return Found(np.zeros((0, 2)), np.zeros(0), empty.astype(np.float16), empty > 0)
+        return TileDetections(np.zeros((0, 2)), np.zeros(0), empty.astype(np.float16), empty > 0)
     frame = model_frame(observations, grid=_cut(reference, tile.outer))
     known = scatters and [scatters[o.name] for o in observations]
     found = detect(observations, frame, threshold=threshold, scatters=known)
     positions = np.array([s.position_px for s in found.sources]).reshape(-1, 2)
     radius = footprint_radius(observations, frame)
-    lit = grown_footprints(found.image > LIGHT, positions, radius)
+    lit = grown_footprints(found.image > FOOTPRINT_SIGMA, positions, radius)
     positions = positions + tile.outer[:2]
     hosts = positions[found.groups]
-    own = tile.core.holds(positions)
-    inner = tile.core.within(tile.outer).slices
+    own = tile.core.contains(positions)
+    inner = tile.core.relative_to(tile.outer).slices
     light = np.clip(found.image[inner], -100, 6e4).astype(np.float16)
-    return Found(positions[own], found.peaks[own], light, lit[inner], hosts[own])
+    return TileDetections(positions[own], found.peaks[own], light, lit[inner], hosts[own])
 
 
-def place(mosaics, reference, tile, positions, *, scatters=None) -> Found:
+def place_known_sources(mosaics, reference, tile, positions, *, scatters=None) -> TileDetections:
     """The Found of a tile for sources that a catalogue gives, positions (S, 2) [px of the field].
 
-    Their light is seen as `search` sees it; peaks are the combined signal to noise there.
+    Their light is seen as `search_tile` sees it; peaks are the combined signal to noise there.
     """
     whole = tile._replace(core=tile.outer)
-    outer = search(mosaics, reference, whole, threshold=1e30, scatters=scatters)
-    own = tile.core.holds(positions)
-    near = tile.outer.holds(positions)
-    light = outer.light.astype(np.float64)
+    outer = search_tile(mosaics, reference, whole, threshold=1e30, scatters=scatters)
+    own = tile.core.contains(positions)
+    near = tile.outer.contains(positions)
+    light = outer.snr_map.astype(np.float64)
     at = nearest(positions[near]) - np.array(tile.outer[:2])
     observations = observations_on(mosaics, reference, tile.outer)
-    inner = tile.core.within(tile.outer).slices
+    inner = tile.core.relative_to(tile.outer).slices
     lit = np.zeros(light.shape, bool)
     if observations:
         frame = model_frame(observations, grid=_cut(reference, tile.outer))
         radius = footprint_radius(observations, frame)
-        lit = grown_footprints(light > LIGHT, at, radius)
+        lit = grown_footprints(light > FOOTPRINT_SIGMA, at, radius)
     at = nearest(positions[own]) - np.array(tile.outer[:2])
     peaks = light[at[:, 0], at[:, 1]]
-    return Found(positions[own], peaks, outer.light[inner], lit[inner])
+    return TileDetections(positions[own], peaks, outer.snr_map[inner], lit[inner])
 
 
-def scatters_of(mosaics, reference) -> dict:
+def snr_scatter(mosaics, reference) -> dict:
     """{mosaic's name: scatters of its signal to noise without sources}, from the field's middle.
 
     A list for each, as `noise_scatter` finds them: the same for the whole field, so that the same
@@ -101,7 +101,7 @@ def scatters_of(mosaics, reference) -> dict:
     """
     region = Box.of(reference.shape)
     middle = [(a + b) // 2 for a, b in zip(region[:2], region[2:], strict=True)]
-    box = Box(*middle, *middle).grown(SAMPLE_PX // 2).meet(region)
+    box = Box(*middle, *middle).grown(SAMPLE_PX // 2).intersection(region)
     found = {mosaic.name: [1.0] * len(WIDTHS_ARCSEC) for mosaic in mosaics}
     try:
         observations = observations_on(mosaics, reference, box)
@@ -134,7 +134,7 @@ def footprint_radius(observations, frame) -> int:
     """Radius [model px] by which footprints grow: half the FWHM of the widest PSF."""
     scale = frame.grid.pixel_scale_arcsec
     widths = [o.psf.fwhm_px.max() * o.grid.pixel_scale_arcsec / scale for o in observations]
-    return max(1, round(LEAST_RADIUS * max(widths)))
+    return max(1, round(MIN_RADIUS * max(widths)))
 
 
 def grown_footprints(bright, positions, radius):

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from ..box import Box
 
 
-class Tile(NamedTuple):
+class SearchTile(NamedTuple):
     """One tile of the model's pixels.
 
     core: Box whose sources are this tile's; the cores of all tiles fill the field once
@@ -19,7 +19,7 @@ class Tile(NamedTuple):
     outer: Box
 
 
-def tiles_of(region, size, overlap) -> list[Tile]:
+def tiles_of(region, size, overlap) -> list[SearchTile]:
     """The tiles of a Box of the model's pixels, row by row, of nearly equal size.
 
     size [px]: largest side of a core. Larger tiles take more memory: each holds all instruments'
@@ -36,10 +36,13 @@ def tiles_of(region, size, overlap) -> list[Tile]:
         _parts(a, b, size) for a, b in ((region.y0, region.y1), (region.x0, region.x1))
     )
     cores = [Box(y0, x0, y1, x1) for y0, y1 in rows for x0, x1 in columns]
-    return [Tile(i, core, core.grown(overlap).meet(region)) for i, core in enumerate(cores)]
+    return [
+        SearchTile(i, core, core.grown(overlap).intersection(region))
+        for i, core in enumerate(cores)
+    ]
 
 
-def part_of(region, i, n) -> Box:
+def field_part(region, i, n) -> Box:
     """The i-th of n parts (from 1) of a Box, in rows and columns as nearly square as n allows.
 
     Raises ValueError for an i that is not 1 to n.

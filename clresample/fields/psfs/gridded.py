@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...files.whole_file import FileError
+from ...files.atomic import FileError
 from ...sky.psf import PSF
-from ...sky.varying.field import PSFField, finite
+from ...sky.varying_psf.field import PSFField, check_position
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +48,9 @@ class GriddedPSF(PSFField):
 
     @classmethod
     def of_model(cls, model) -> GriddedPSF:
-        """That of a photutils.psf.GriddedPSFModel, whose effective PSFs hold the pixel response,
-        centred on their images.
+        """Converts a photutils.psf.GriddedPSFModel to a PSF field.
+
+        Its effective PSFs hold the pixel response, centred on their images.
 
         Raises ValueError for another object, for positions that make no grid, and where the model
         is oversampled differently along its axes.
@@ -75,7 +76,7 @@ class GriddedPSF(PSFField):
 
     def psf_at(self, y, x):
         """The mean of the four places about (y, x)."""
-        y, x = finite(y, x)
+        y, x = check_position(y, x)
         (row, below, above), (column, left, right) = _between(self.y, y), _between(self.x, x)
         rows = below * self.images[row] + (above * self.images[row + 1] if above else 0)
         mean = left * rows[column] + (right * rows[column + 1] if right else 0)
@@ -93,8 +94,10 @@ def _between(along, at):
 
 
 def read_gridded(path, *, detector=None) -> GriddedPSF:
-    """That of a file which `photutils.psf.GriddedPSFModel.read` takes: STDPSF of HST and JWST, and
-    the grids that STPSF (WebbPSF) writes; detector: its number, of STDPSF files that have several.
+    """Reads a file of `photutils.psf.GriddedPSFModel.read` as a PSF field.
+
+    STDPSF of HST and JWST, and the grids that STPSF (WebbPSF) writes; detector: its number, of
+    STDPSF files that have several.
 
     Raises FileError for other files, ImportError without photutils.
     """

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from ...files.whole_file import FileError
+from ...files.atomic import FileError
 from ...sky.psf import PSF
-from ...sky.varying.field import PSFField, finite
+from ...sky.varying_psf.field import PSFField, check_position
 
 # [px] Side of the stamps that are drawn: as Rubin's; light beyond it is cut off.
 STAMP_PX = 51
@@ -22,7 +22,7 @@ class PiffPSF(PSFField):
     Needs Piff (the extra `piff`).
 
     path: of the file, made for this mosaic's pixels, which Piff counts from 1
-    chip: the detector's number in the file, None where it holds one
+    detector: the detector's number in the file, None where it holds one
     stamp_px [px]: side of the stamps, odd
 
     Raises FileError for a file that is not Piff's, has several detectors and none is given, or
@@ -32,27 +32,31 @@ class PiffPSF(PSFField):
     """
 
     path: Path
-    chip: int | None
+    detector: int | None
     stamp_px: int
     n_bands = 1
 
-    def __init__(self, path, *, chip=None, stamp_px=STAMP_PX):
+    def __init__(self, path, *, detector=None, stamp_px=STAMP_PX):
         if int(stamp_px) != stamp_px or stamp_px < 1 or stamp_px % 2 == 0:
             raise ValueError(f"stamp_px is {stamp_px}, must be an odd number of pixels")
-        for name, value in (("path", Path(path)), ("chip", chip), ("stamp_px", int(stamp_px))):
+        for name, value in (
+            ("path", Path(path)),
+            ("detector", detector),
+            ("stamp_px", int(stamp_px)),
+        ):
             object.__setattr__(self, name, value)
-        object.__setattr__(self, "_model", _opened(self.path, chip))
+        object.__setattr__(self, "_model", _opened(self.path, detector))
 
     def psf_at(self, y, x):
         """The file's PSF at (y, x), centred on its stamp."""
-        y, x = finite(y, x)
+        y, x = check_position(y, x)
         image = self._model.draw(
-            x + 1, y + 1, chipnum=self.chip, stamp_size=self.stamp_px, center=True
+            x + 1, y + 1, chipnum=self.detector, stamp_size=self.stamp_px, center=True
         )
         return PSF(image.array)
 
     def __getstate__(self):
-        return {"path": self.path, "chip": self.chip, "stamp_px": self.stamp_px}
+        return {"path": self.path, "detector": self.detector, "stamp_px": self.stamp_px}
 
     def __setstate__(self, state):
         self.__init__(**state)

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ...files.atomic import FileError
 from ...files.fits import open_fits
-from ...files.whole_file import FileError
 from ...sky.psf import PSF
-from ...sky.varying.field import PSFField, finite
+from ...sky.varying_psf.field import PSFField, check_position
 
 # [1] Stars of PSFEx lie at -0.5 to 0.5 of its scaled positions; half of that range beyond them the
 # polynomials, of second or third degree as a rule, still have the size of those inside.
@@ -65,7 +65,7 @@ class PSFExPSF(PSFField):
 
     def psf_at(self, y, x):
         """The file's PSF at (y, x), its position held within MAX_SCALED."""
-        y, x = finite(y, x)
+        y, x = check_position(y, x)
         u, v = np.clip(self.scaled(y, x), -MAX_SCALED, MAX_SCALED)
         powers = [u**i * v**j for j in range(self.degree + 1) for i in range(self.degree + 1 - j)]
         image = np.tensordot(powers, self.images, 1).astype(np.float32)

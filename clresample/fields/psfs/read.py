@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...files.atomic import FileError
 from ...files.fits import choose_hdu, open_fits, read_pixels, read_psf
-from ...files.whole_file import FileError
-from ...sky.given.checks import instance
 from ...sky.psf import PSF
-from ...sky.varying.field import PSFField
+from ...sky.validation.checks import check_instance
+from ...sky.varying_psf.field import PSFField
 from ..plugins import Formats
+from .combined import ConstantPSF
 from .gridded import read_gridded
 from .piff import STAMP_PX, PiffPSF
-from .psf_field import ConstantPSF
 from .psfex import PSFExPSF
-from .sampled import PSFCells, PSFCube
+from .sampled import CellPSF, ScatteredPSF
 
 OWN = ("image", "cube", "cells", "psfex", "piff", "gridded", "euclid-mer")
 
@@ -39,7 +39,7 @@ def read_psf_field(
         "cube": a FITS image (K, ny, nx) or (K, C, ny, nx) with a table HDU POSITIONS of K rows:
             x and y [px of the mosaic, from 0], or ra and dec [deg]
         "cells": a FITS image (cells_y, cells_x, ny, nx) or (cells_y, cells_x, C, ny, nx), with
-            cell_px and origin_px, see PSFCells
+            cell_px and origin_px, see CellPSF
         "psfex": a PSFEx file, or a table with a row for each detector, see PSFExPSF
         "piff": a Piff file
         "gridded": a file that photutils' GriddedPSFModel reads, see `read_gridded`
@@ -57,7 +57,9 @@ def read_psf_field(
     samples = {"spacing": spacing, "center": center}
     if form not in OWN:
         given = {"hdu": hdu, "bands": bands, "stamp_px": stamp_px, "detector": detector} | samples
-        found = instance(f"the result of {form!r}", FORMATS[form](path, grid, **given), PSF_KINDS)
+        found = check_instance(
+            f"the result of {form!r}", FORMATS[form](path, grid, **given), PSF_KINDS
+        )
         return ConstantPSF(found) if isinstance(found, PSF) else found
     if form == "image":
         return ConstantPSF(read_psf(path, hdu=hdu, bands=bands, **samples))
@@ -66,7 +68,7 @@ def read_psf_field(
     if isinstance(detector, str):
         raise ValueError(f"psf_detector is {detector!r}, must be a whole number for {form} files")
     if form == "piff":
-        return PiffPSF(path, chip=detector, stamp_px=stamp_px)
+        return PiffPSF(path, detector=detector, stamp_px=stamp_px)
     if form == "gridded":
         return read_gridded(path, detector=detector)
     with open_fits(path) as hdus:
@@ -75,8 +77,8 @@ def read_psf_field(
                 return read_mer_sheet(path, hdus, grid, **samples)
             images = _images(path, hdus, hdu)
             if form == "cells":
-                return PSFCells(images, **cells, **samples)
-            return PSFCube(images, _positions(path, hdus, "POSITIONS", grid), **samples)
+                return CellPSF(images, **cells, **samples)
+            return ScatteredPSF(images, _positions(path, hdus, "POSITIONS", grid), **samples)
         except FileError:
             raise
         except ValueError as error:
@@ -89,8 +91,8 @@ FORMATS = Formats("clresample.psf_formats", dict.fromkeys(OWN, read_psf_field))
 PSF_KINDS = PSFField, PSF
 
 
-def read_mer_sheet(path, hdus, grid, **samples) -> PSFCube:
-    """The stamps of a CATALOG-PSF of Euclid's MER as a PSFCube.
+def read_mer_sheet(path, hdus, grid, **samples) -> ScatteredPSF:
+    """The stamps of a CATALOG-PSF of Euclid's MER as a ScatteredPSF.
 
     HDU 1 is a sheet of stamps of STMPSIZE pixels a side (its header says how many), HDU 2 a table
     with x_center and y_center, a stamp's central pixel on the sheet counted from 1, and Ra and Dec
@@ -119,7 +121,7 @@ def read_mer_sheet(path, hdus, grid, **samples) -> PSFCube:
         stamps.append(stamp)
     places = grid.pixel(np.asarray(table["Ra"], float), np.asarray(table["Dec"], float))
     seen = np.isfinite(places).all(axis=1)
-    return PSFCube(np.array(stamps, np.float32)[seen], places[seen], **samples)
+    return ScatteredPSF(np.array(stamps, np.float32)[seen], places[seen], **samples)
 
 
 def _images(path, hdus, hdu):

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ...sky.psf import PSF
-from ...sky.varying.field import PSFField, finite
+from ...sky.varying_psf.field import PSFField, check_position
 
 
 @dataclass(frozen=True, eq=False)
-class PSFCube(PSFField):
+class ScatteredPSF(PSFField):
     """PSF images at K scattered places.
 
     Between three places the images are averaged with the weights of linear interpolation in their
@@ -63,7 +63,7 @@ class PSFCube(PSFField):
 
     def psf_at(self, y, x):
         """The images about (y, x) averaged, or the nearest one; see the class."""
-        point = np.array(finite(y, x))
+        point = np.array(check_position(y, x))
         which, weights = [int(((self.positions - point) ** 2).sum(1).argmin())], np.ones(1)
         simplex = -1 if self._triangles is None else int(self._triangles.find_simplex(point))
         if simplex >= 0:
@@ -78,7 +78,7 @@ class PSFCube(PSFField):
 
 
 @dataclass(frozen=True, eq=False)
-class PSFCells(PSFField):
+class CellPSF(PSFField):
     """One PSF for each cell of a regular array, constant inside a cell, as in Rubin's coadds.
 
     images (cells_y, cells_x, C, ny, nx) or (cells_y, cells_x, ny, nx) [1]: pixel response included;
@@ -86,7 +86,7 @@ class PSFCells(PSFField):
         not is taken in its place
     cell_px (2,) [px]: size (y, x) of a cell, or one number
     origin_px (2,) [px]: (y, x) of the first cell's outer corner; (-1/2, -1/2) is that of the mosaic
-    spacing [px], center: as in PSFCube
+    spacing [px], center: as in ScatteredPSF
 
     Raises ValueError for shapes that disagree, cells without a size, and where all are empty.
     """
@@ -121,7 +121,7 @@ class PSFCells(PSFField):
 
     def psf_at(self, y, x):
         """The PSF of the cell that holds (y, x), or of the nearest that is not empty."""
-        place = (np.array(finite(y, x)) - self.origin_px) / self.cell_px - 0.5
+        place = (np.array(check_position(y, x)) - self.origin_px) / self.cell_px - 0.5
         nearest = ((self._filled - place) ** 2 * self.cell_px**2).sum(axis=1).argmin()
         row, column = self._filled[nearest]
         return PSF(self.images[row, column], spacing=self.spacing, center=self.center)

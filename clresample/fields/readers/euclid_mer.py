@@ -1,4 +1,4 @@
-"""Tiles of Euclid's MER: mosaics of VIS, of NIR's bands and of the ground's, on 0.1 arcsec pixels.
+"""Reads tiles of Euclid's MER: mosaics of VIS, NIR and ground bands, on 0.1 arcsec pixels.
 
 A folder holds, for each band (VIS, NIR-Y, NIR-J, NIR-H, DECAM-g, ...) of a tile, as FITS files of
 which the first image is read, compressed (.gz) or not:
@@ -20,11 +20,20 @@ from __future__ import annotations
 
 import re
 
-from ...files.whole_file import FileError
+from ...files.atomic import FileError
+from ..field_toml.headers import mask_value, saturation, zero_point
 from ..mosaic import Mosaic
 from ..psfs.read import read_psf_field
-from ..reading.headers import mask_value, saturation, zero_point
-from .found import Found, Given, assembled, files_at, image_plane, paths_of, placed, plane_on
+from .band_files import (
+    BandFiles,
+    ReaderOptions,
+    assemble_mosaic,
+    files_at,
+    image_plane,
+    matching_plane,
+    paths_of,
+    require_grid,
+)
 
 NAME = re.compile(
     r"EUC_MER_(BGSUB-MOSAIC|MOSAIC|CATALOG-PSF)-(.+?)(-RMS|-FLAG)?_TILE(\d+)([-_].*)?\.fits(\.gz)?"
@@ -36,13 +45,13 @@ def read_euclid_mer(path, **given) -> Mosaic:
     """The Mosaic of a tile of Euclid's MER.
 
     path: a folder with one tile, or BGSUB-MOSAIC files whose RMS, FLAG and PSF lie beside them
-    given: see `Given`; bands are those of the files' names, such as "VIS" and "NIR-H"
+    given: see `ReaderOptions`; bands are those of the files' names, such as "VIS" and "NIR-H"
 
     Raises ValueError, one line, for what is missing; FileError for what cannot be read.
     """
-    known = Given(**given)
+    known = ReaderOptions(**given)
     found = [_band(band, files, known) for band, files in _bands(paths_of(path), known).items()]
-    return assembled("Euclid", found, known, noise="estimate")
+    return assemble_mosaic("Euclid", found, known, noise="estimate")
 
 
 def _bands(paths, given):
@@ -80,23 +89,23 @@ def _bands(paths, given):
 
 
 def _band(band, files, given):
-    """What is found of one band."""
+    """Locates the files of one band."""
     path = files[IMAGE]
     if RMS not in files:
         raise ValueError(f"rms of band {band} is missing: no EUC_MER_MOSAIC-{band}-RMS beside it")
     data, _, header, grid = image_plane(path)
-    grid = placed(path, grid)
-    rms, _ = plane_on(grid, files[RMS])
+    grid = require_grid(path, grid)
+    rms, _ = matching_plane(grid, files[RMS])
     mask = value = None
     if FLAG in files:
-        mask, flags = plane_on(grid, files[FLAG])
+        mask, flags = matching_plane(grid, files[FLAG])
         value = None if given.mask_bits is None else mask_value(flags, given.mask_bits)
     else:
         given.notes.append(f"{band}: no EUC_MER_MOSAIC-{band}-FLAG: no pixel is masked")
     psf = None
     if PSF in files and given.psf is None:
         psf = read_psf_field(files[PSF], "euclid-mer", grid)
-    return Found(
+    return BandFiles(
         band,
         grid,
         data,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ...sky.given.checks import instance
+from ...sky.validation.checks import check_instance
 from ..mosaic import Mosaic
 from ..plugins import Formats
 from .euclid_mer import read_euclid_mer
@@ -34,4 +34,6 @@ def read_survey(form, path, **given) -> Mosaic:
     """
     if form not in READERS:
         raise ValueError(f"format is {form!r}, it takes {', '.join(READERS)}")
-    return instance(f"the result of the reader {form!r}", READERS[form](path, **given), Mosaic)
+    return check_instance(
+        f"the result of the reader {form!r}", READERS[form](path, **given), Mosaic
+    )

@@ -23,14 +23,22 @@ import math
 
 import numpy as np
 
+from ...files.atomic import FileError
 from ...files.fits import open_fits
-from ...files.whole_file import FileError
 from ...sky.noise import noise_sigma
+from ..field_toml.estimates import sample_box
+from ..field_toml.headers import mask_value, zero_point
 from ..mosaic import Channel, Mosaic
-from ..reading.estimates import sample_box
-from ..reading.headers import mask_value, zero_point
-from .found import Found, Given, assembled, image_plane, paths_of, placed, plane_on
-from .planes import Scaled
+from .band_files import (
+    BandFiles,
+    ReaderOptions,
+    assemble_mosaic,
+    image_plane,
+    matching_plane,
+    paths_of,
+    require_grid,
+)
+from .planes import ScaledPlane
 
 CLEAR = "CLEAR", "N/A", "NONE", ""  # what filter wheels hold where they hold no filter
 
@@ -39,29 +47,30 @@ def read_hst(path, **given) -> Mosaic:
     """The Mosaic of drizzled images of HST.
 
     path: one file, or a list with one for each band on the same pixels
-    given: see `Given`; bands are named by the filters, such as "F814W". The files hold no PSF
+    given: see `ReaderOptions`; bands are named by the filters, such as "F814W". The files hold no
+        PSF
 
     Raises ValueError, one line, for what is missing; FileError for what cannot be read.
     """
-    known = Given(**given)
+    known = ReaderOptions(**given)
     found = [_band(file, known) for file in paths_of(path)]
     drizzled = all(one.kind == "weight" for one in found)
-    return assembled("HST", found, known, noise="estimate" if drizzled else "white")
+    return assemble_mosaic("HST", found, known, noise="estimate" if drizzled else "white")
 
 
 def _band(path, given):
-    """What is found in the file of one band."""
+    """Locates the planes in the file of one band."""
     with open_fits(path) as hdus:
         names = [hdu.name for hdu in hdus]
     data, _, header, grid = image_plane(path, "SCI" if "SCI" in names else None)
-    grid = placed(path, grid)
+    grid = require_grid(path, grid)
     band, files, mask, value = _filter(header, path), {"image": path}, None, None
     if "ERR" in names:
-        weight, kind = plane_on(grid, path, "ERR")[0], "rms"
+        weight, kind = matching_plane(grid, path, "ERR")[0], "rms"
     else:
         weight, kind = _weight(path, names, data, grid, band, files, given), "weight"
     if "DQ" in names:
-        mask, flags = plane_on(grid, path, "DQ")
+        mask, flags = matching_plane(grid, path, "DQ")
         value = None if given.mask_bits is None else mask_value(flags, given.mask_bits)
     point = zero_point(header, grid.pixel_scale_arcsec)
     unit = str(header.get("BUNIT", "")).upper().replace(" ", "")
@@ -69,7 +78,7 @@ def _band(path, given):
         if not header.get("EXPTIME"):
             raise ValueError(f"EXPTIME of {path.name} is missing, BUNIT is {unit}: give zero_point")
         point += 2.5 * math.log10(float(header["EXPTIME"]))
-    return Found(
+    return BandFiles(
         band,
         grid,
         data,
@@ -87,7 +96,7 @@ def _band(path, given):
 def _weight(path, names, data, grid, band, files, given):
     """The plane of WHT, times what makes it inverse variances."""
     if "WHT" in names:
-        plane, _ = plane_on(grid, path, "WHT")
+        plane, _ = matching_plane(grid, path, "WHT")
     else:
         beside = path.with_name("wht".join(path.name.rsplit("sci", 1)))
         if "sci" not in path.name or not beside.exists():
@@ -96,7 +105,7 @@ def _weight(path, names, data, grid, band, files, given):
                 "of weights (wht for sci in its name) lies beside it; without format, image and "
                 "rms name any files"
             )
-        plane, _ = plane_on(grid, beside)
+        plane, _ = matching_plane(grid, beside)
         files["weight"] = beside
     box = sample_box(grid)
     pixels = Channel(band, data, plane)
@@ -108,7 +117,7 @@ def _weight(path, names, data, grid, band, files, given):
     given.notes.append(
         f"{band}: WHT times {sigma**-2:.4g} taken as inverse variance, by the scatter of blank sky"
     )
-    return Scaled(plane, sigma**-2)
+    return ScaledPlane(plane, sigma**-2)
 
 
 def _filter(header, path):

@@ -23,10 +23,18 @@ import re
 
 from ...files.fits import open_fits
 from ...sky.grid import Grid
+from ..field_toml.headers import zero_point
 from ..mosaic import FilePlane, Mosaic
-from ..reading.headers import zero_point
-from .found import Found, Given, assembled, image_plane, paths_of, placed, plane_on
-from .planes import AnyFlag, NoImage
+from .band_files import (
+    BandFiles,
+    ReaderOptions,
+    assemble_mosaic,
+    image_plane,
+    matching_plane,
+    paths_of,
+    require_grid,
+)
+from .planes import AnyFlagPlane, NoContextPlane
 
 IS_FILTER = re.compile(r"F\d+\w+")
 
@@ -35,16 +43,19 @@ def read_jwst(path, **given) -> Mosaic:
     """The Mosaic of stage 3 images of JWST.
 
     path: one file, or a list with one for each band on the same pixels
-    given: see `Given`; bands are named by the filters, such as "F444W". The files hold no PSF
+    given: see `ReaderOptions`; bands are named by the filters, such as "F444W". The files hold no
+        PSF
 
     Raises ValueError, one line, for what is missing; FileError for what cannot be read.
     """
-    known = Given(**given)
-    return assembled("JWST", [_band(p, known) for p in paths_of(path)], known, noise="estimate")
+    known = ReaderOptions(**given)
+    return assemble_mosaic(
+        "JWST", [_band(p, known) for p in paths_of(path)], known, noise="estimate"
+    )
 
 
 def _band(path, given):
-    """What is found in the file of one band."""
+    """Locates the planes in the file of one band."""
     with open_fits(path) as hdus:
         names = [hdu.name for hdu in hdus]
         wcs, why = _gwcs(hdus)
@@ -58,20 +69,20 @@ def _band(path, given):
         grid = Grid.from_wcs(wcs, shape)
     if "ERR" not in names:
         raise ValueError(f"rms of band {band} is missing: {path.name} has no HDU ERR")
-    grid = placed(path, grid)
+    grid = require_grid(path, grid)
     empty: list = []
     if context is not None:
         indices = range(n_contexts) if n_contexts else [None]
-        empty.append((NoImage(tuple(FilePlane(path, context, i) for i in indices)), None))
+        empty.append((NoContextPlane(tuple(FilePlane(path, context, i) for i in indices)), None))
     if "WHT" in names:
-        empty.append((NoImage((plane_on(grid, path, "WHT")[0],)), None))
-    return Found(
+        empty.append((NoContextPlane((matching_plane(grid, path, "WHT")[0],)), None))
+    return BandFiles(
         band,
         grid,
         data,
-        plane_on(grid, path, "ERR")[0],
+        matching_plane(grid, path, "ERR")[0],
         "rms",
-        AnyFlag(tuple(empty)) if empty else None,
+        AnyFlagPlane(tuple(empty)) if empty else None,
         zero_point=zero_point(header, grid.pixel_scale_arcsec),
         missing_zero_point="the header has no BUNIT of MJy/sr",
         missing_psf="files of JWST hold none",

@@ -22,15 +22,24 @@ import re
 
 import numpy as np
 
+from ...files.atomic import FileError
 from ...files.fits import choose_hdu, open_fits, read_pixels
-from ...files.whole_file import FileError
 from ...sky.psf import PSF
 from ..box import Box
+from ..field_toml.headers import NANOMAGGY, mask_value
 from ..mosaic import Mosaic
-from ..psfs.psf_field import ConstantPSF
-from ..psfs.sampled import PSFCube
-from ..reading.headers import NANOMAGGY, mask_value
-from .found import Found, Given, assembled, files_at, image_plane, paths_of, placed, plane_on
+from ..psfs.combined import ConstantPSF
+from ..psfs.sampled import ScatteredPSF
+from .band_files import (
+    BandFiles,
+    ReaderOptions,
+    assemble_mosaic,
+    files_at,
+    image_plane,
+    matching_plane,
+    paths_of,
+    require_grid,
+)
 
 NAME = re.compile(r"legacysurvey-(\w+)-(image|invvar|copsf|psfsize|maskbits)(?:-(\w+))?\.fits.*")
 BITS = (  # of maskbits, by their numbers
@@ -50,14 +59,14 @@ def read_legacy_survey(path, **given) -> Mosaic:
     """The Mosaic of a brick of the Legacy Surveys.
 
     path: a folder with one brick, or its image files, with the others beside them
-    given: see `Given`; bands are "g", "r", "i", "z"
+    given: see `ReaderOptions`; bands are "g", "r", "i", "z"
 
     Raises ValueError, one line, for what is missing; FileError for what cannot be read.
     """
-    known = Given(**given)
+    known = ReaderOptions(**given)
     files = _files(paths_of(path))
     bands = sorted(band for kind, band in files if kind == "image")
-    return assembled("Legacy Surveys", [_band(b, files, known) for b in bands], known)
+    return assemble_mosaic("Legacy Surveys", [_band(b, files, known) for b in bands], known)
 
 
 def _files(paths):
@@ -79,16 +88,16 @@ def _files(paths):
 
 
 def _band(band, files, given):
-    """What is found of one band."""
+    """Locates the files of one band."""
     path = files["image", band]
     data, _, _, grid = image_plane(path)
-    grid = placed(path, grid)
+    grid = require_grid(path, grid)
     if ("invvar", band) not in files:
         raise ValueError(f"weight of band {band} is missing: no invvar-{band} beside {path.name}")
-    weight, _ = plane_on(grid, files["invvar", band])
+    weight, _ = matching_plane(grid, files["invvar", band])
     mask = value = None
     if ("maskbits", None) in files:
-        mask, header = plane_on(grid, files["maskbits", None])
+        mask, header = matching_plane(grid, files["maskbits", None])
         own = [n for n in (f"SATUR_{band.upper()}", f"ALLMASK_{band.upper()}") if n in BITS]
         bits = own if given.mask_bits is None else given.mask_bits
         value = mask_value(header, bits, {name: i for i, name in enumerate(BITS)})
@@ -96,7 +105,7 @@ def _band(band, files, given):
         given.notes.append(f"{band}: no maskbits beside {path.name}: no pixel is masked")
     psf = None if given.psf is not None else _psf(band, files, grid, given)
     used = {k: f for (k, b), f in files.items() if b in (band, None)}
-    return Found(
+    return BandFiles(
         band,
         grid,
         data,
@@ -119,7 +128,7 @@ def _psf(band, files, grid, given):
             return ConstantPSF(PSF(read_pixels(path, choose_hdu(path, hdus, None))))
     if ("psfsize", band) not in files:
         return None
-    widths, _ = plane_on(grid, files["psfsize", band])
+    widths, _ = matching_plane(grid, files["psfsize", band])
     places = np.array(
         [
             (y, x)
@@ -138,7 +147,7 @@ def _psf(band, files, grid, given):
         f"FWHM {middle:.2f} arcsec; give psf for a measured one"
     )
     half = int(np.ceil(REACH_FWHM * fwhm[good].max()))
-    return PSFCube(np.stack([_moffat(w, half) for w in fwhm[good]]), places[good])
+    return ScatteredPSF(np.stack([_moffat(w, half) for w in fwhm[good]]), places[good])
 
 
 def _moffat(fwhm, half):

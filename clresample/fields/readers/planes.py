@@ -10,7 +10,7 @@ from ..mosaic import Plane
 
 
 @dataclass(frozen=True, eq=False)
-class AnyFlag:
+class AnyFlagPlane:
     """True where any of several masks has any of its bits; of a mask with None, any bit at all.
 
     masks: pairs of a Plane and the sum of the bits
@@ -28,7 +28,7 @@ class AnyFlag:
 
 
 @dataclass(frozen=True, eq=False)
-class NoImage:
+class NoContextPlane:
     """True where the contexts of a drizzled mosaic name no image that went into a pixel.
 
     contexts: planes of 32 images each, a bit for each
@@ -42,7 +42,7 @@ class NoImage:
 
 
 @dataclass(frozen=True, eq=False)
-class Scaled:
+class ScaledPlane:
     """A plane times a factor."""
 
     plane: Plane

@@ -25,14 +25,22 @@ import json
 
 import numpy as np
 
+from ...files.atomic import FileError
 from ...files.fits import open_fits, read_pixels
-from ...files.whole_file import FileError
 from ...sky.correlation import NoiseCorrelation
+from ..field_toml.estimates import sample_box
+from ..field_toml.headers import saturation, zero_point
 from ..mosaic import Channel, FilePlane, Mosaic
-from ..psfs.sampled import PSFCells
-from ..reading.estimates import sample_box
-from ..reading.headers import saturation, zero_point
-from .found import Found, Given, assembled, image_plane, paths_of, placed, plane_on
+from ..psfs.sampled import CellPSF
+from .band_files import (
+    BandFiles,
+    ReaderOptions,
+    assemble_mosaic,
+    image_plane,
+    matching_plane,
+    paths_of,
+    require_grid,
+)
 from .rubin_mask import rubin_mask
 
 READS = 1  # version of the schemas; a file whose tree asks for a higher one is refused
@@ -43,23 +51,23 @@ def read_rubin_coadd(path, **given) -> Mosaic:
     """The Mosaic of cell coadds of one patch.
 
     path: one file, or a list with one for each band
-    given: see `Given`; bands are those of the files, such as "r"
+    given: see `ReaderOptions`; bands are those of the files, such as "r"
 
     Raises ValueError, one line, for what is missing; FileError for what is no cell coadd.
     """
-    known = Given(**given)
-    return assembled("Rubin", [_band(file, known) for file in paths_of(path)], known)
+    known = ReaderOptions(**given)
+    return assemble_mosaic("Rubin", [_band(file, known) for file in paths_of(path)], known)
 
 
 def _band(path, given):
-    """What is found in the file of one band."""
+    """Locates the planes in the file of one band."""
     with open_fits(path) as hdus:
         tree = _tree(path, hdus)
         images = read_pixels(path, hdus["PSF"])
         noises = [i for i, hdu in enumerate(hdus) if hdu.name.startswith(NOISE)]
     data, _, header, grid = image_plane(path, "IMAGE")
-    grid = placed(path, grid)
-    variance, _ = plane_on(grid, path, "VARIANCE")
+    grid = require_grid(path, grid)
+    variance, _ = matching_plane(grid, path, "VARIANCE")
     try:
         bounds, first = tree["psf"]["bounds"], tree["image"]["yx0"]
         cell = [bounds["grid"]["cell_shape"][axis] for axis in "yx"]
@@ -69,7 +77,7 @@ def _band(path, given):
     origin = np.array(start, float) - first - 0.5
     band = tree.get("band") or path.name.split(".")[0]
     mask = rubin_mask(path, grid, given.mask_bits, band, given.notes)
-    return Found(
+    return BandFiles(
         band,
         grid,
         data,
@@ -78,7 +86,7 @@ def _band(path, given):
         mask,
         None,
         zero_point(header, grid.pixel_scale_arcsec),
-        PSFCells(images, cell_px=cell, origin_px=origin),
+        CellPSF(images, cell_px=cell, origin_px=origin),
         noise=_noise(path, noises, grid, data, variance, mask, given),
         missing_zero_point=f"BUNIT is {header.get('BUNIT')!r}",
         saturation=saturation(header),

@@ -23,11 +23,19 @@ import math
 
 import numpy as np
 
+from ...files.atomic import FileError
 from ...files.fits import open_fits
-from ...files.whole_file import FileError
+from ..field_toml.headers import NANOJANSKY, saturation, zero_point
 from ..mosaic import Mosaic
-from ..reading.headers import NANOJANSKY, saturation, zero_point
-from .found import Found, Given, assembled, image_plane, paths_of, placed, plane_on
+from .band_files import (
+    BandFiles,
+    ReaderOptions,
+    assemble_mosaic,
+    image_plane,
+    matching_plane,
+    paths_of,
+    require_grid,
+)
 from .rubin_mask import rubin_mask
 
 
@@ -35,17 +43,17 @@ def read_rubin_exposure(path, **given) -> Mosaic:
     """The Mosaic of exposures on the same pixels.
 
     path: one file, or a list with one for each band
-    given: see `Given`; bands are those of the files. psf is needed: the files hold none that can be
-        read without the LSST pipelines
+    given: see `ReaderOptions`; bands are those of the files. psf is needed: the files hold none
+        that can be read without the LSST pipelines
 
     Raises ValueError, one line, for what is missing; FileError for what is no exposure.
     """
-    known = Given(**given)
-    return assembled("Rubin", [_band(file, known) for file in paths_of(path)], known)
+    known = ReaderOptions(**given)
+    return assemble_mosaic("Rubin", [_band(file, known) for file in paths_of(path)], known)
 
 
 def _band(path, given):
-    """What is found in the file of one band."""
+    """Locates the planes in the file of one band."""
     with open_fits(path) as hdus:
         names = [hdu.name for hdu in hdus]
         photo, constant = _calibration(hdus)
@@ -56,8 +64,8 @@ def _band(path, given):
             f"{path}: no exposure, which has IMAGE, MASK and VARIANCE (HDUs: {', '.join(names)})"
         )
     data, _, header, grid = image_plane(path, "IMAGE" if named else 1)
-    grid = placed(path, grid)
-    variance, _ = plane_on(grid, path, "VARIANCE" if named else 3)
+    grid = require_grid(path, grid)
+    variance, _ = matching_plane(grid, path, "VARIANCE" if named else 3)
     band = label or str(header.get("BAND", header.get("FILTER", ""))).strip()
     band = band or path.name.split(".")[0]
     own = {key: header[key] for key in ("BUNIT", "PIXAR_SR") if key in header}
@@ -68,7 +76,7 @@ def _band(path, given):
             given.notes.append(f"{band}: calibration varies over the image, its mean is taken")
     if point is None:
         point = zero_point(header, grid.pixel_scale_arcsec)
-    return Found(
+    return BandFiles(
         band,
         grid,
         data,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from ...files.atomic import FileError
 from ...files.fits import open_fits
-from ...files.whole_file import FileError
+from ..field_toml.headers import bit_names, mask_value
 from ..mosaic import FilePlane
-from ..reading.headers import bit_names, mask_value
-from .planes import AnyFlag
+from .planes import AnyFlagPlane
 
 # What a fit must not see: nothing was measured there, or not what fell on the pixel. Pixels that
 # were interpolated (INTRP, CR) hold a value of which the PSF knows; in coadds they are replaced by
@@ -43,4 +43,4 @@ def rubin_mask(path, grid, bits, band, notes):
     for plane, names in parts:
         own = [bit for bit in asked if isinstance(bit, int) or bit in names]
         masks.append((plane, mask_value({}, own, names)))
-    return AnyFlag(tuple(masks))
+    return AnyFlagPlane(tuple(masks))

@@ -13,7 +13,7 @@ from astropy.io import fits
 from astropy.table import Table
 
 from ...files.fits import write_hdus
-from ..reading.headers import NANOJANSKY
+from ..field_toml.headers import NANOJANSKY
 
 LOSSLESS = {"compression_type": "GZIP_2", "quantize_level": 0}
 SHEET_STAMPS = 16  # stamps side by side on the sheet of a CATALOG-PSF
@@ -24,7 +24,7 @@ def write_mer_tile(folder, tile, band, data, grid, *, rms, flags, zero_point, ps
 
     folder: that exists; tile: its number; band: such as "VIS"
     data, rms (Ny, Nx) [counts]; flags (Ny, Nx): whole numbers; zero_point [mag]: AB of one count
-    psfs (K, n, n) [1], places (K, 2) [px]: the PSF at (y, x), as PSFCube has it; n is odd
+    psfs (K, n, n) [1], places (K, 2) [px]: the PSF at (y, x), as ScatteredPSF has it; n is odd
     """
     folder, header = Path(folder), grid.to_wcs().to_header(relax=True)
     header["MAGZERO"] = (zero_point, "AB zero point")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...device.errors import DeviceError
-from ...files.whole_file import FileError
+from ...files.atomic import FileError
 from ..box import Box
 from ..cutouts import FieldCutouts, MissingSource
 
@@ -35,8 +35,10 @@ class OwnModels:
         self._notes.append(f"no pictures of sources without their neighbours: {reason}")
 
     def on(self, source, instrument, box):
-        """Model (C, ny, nx) [counts] of a source on a Box of an instrument's pixels; None where it
-        has none, or cannot be had."""
+        """Model (C, ny, nx) [counts] of a source on a Box of an instrument's pixels.
+
+        None where it has none, or cannot be had.
+        """
         if self._cutouts is None:
             return None
         if source not in self._rendered and len(self._rendered) == MAX_SOURCES:
@@ -52,7 +54,7 @@ class OwnModels:
             return None
         own = Box(*first, *(np.add(first, found.own.shape[1:]).tolist()))
         image = np.zeros((len(instrument.channels), *box.shape))
-        both = own.meet(box)
+        both = own.intersection(box)
         if both.area:
-            image[:, *both.within(box).slices] = found.own[:, *both.within(own).slices]
+            image[:, *both.relative_to(box).slices] = found.own[:, *both.relative_to(own).slices]
         return image

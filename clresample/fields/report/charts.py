@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from .codes import as_text
+from .colours import EMPTY
 from .png import png
-from .shades import EMPTY
 from .stamps import plain
-from .svg import SQUARE, Chart, Scale
+from .svg import SQUARE, Chart, ChartAxis
 
 BIN_MAG = 0.5
-MOST_CHANNELS = 12  # with a chart of their own
+MAX_CHANNELS = 12  # with a chart of their own
 UJY_MAG = 23.9  # AB magnitude of one microjansky
 CLEAR = 5.0  # [errors] a flux that is surely there: a dotted line
 PULL_RANGE, PULL_BIN = 5.0, 0.5  # [errors]
@@ -30,9 +30,9 @@ def magnitudes(flux, unit):
     return mag + (UJY_MAG if unit == "uJy" else 0.0)
 
 
-def fluxes(run):
-    """(channel, flux (S,), error (S,), unit) of the channels, MOST_CHANNELS at most."""
-    for channel in run.channels[:MOST_CHANNELS]:
+def channel_fluxes(run):
+    """(channel, flux (S,), error (S,), unit) of the channels, MAX_CHANNELS at most."""
+    for channel in run.channels[:MAX_CHANNELS]:
         names = f"flux_{channel}", f"flux_err_{channel}"
         if set(names) <= set(run.sources.colnames):
             flux, error = (plain(run.sources[name]) for name in names)
@@ -43,11 +43,11 @@ def number_counts(run, truth, area_arcmin2):
     """[(title, svg)] of sources in magnitude, one for each channel, beside the true ones."""
     found, per = [], "/ arcmin² /" if area_arcmin2 else "per"
     area = area_arcmin2 or 1.0
-    for channel, flux, _, unit in fluxes(run):
+    for channel, flux, _, unit in channel_fluxes(run):
         mags = [magnitudes(flux, unit)]
         name = f"flux_{channel}"
         if truth is not None and unit == "uJy" and name in truth.table.colnames:
-            mags.append(magnitudes(plain(truth.table[name])[truth.inner], unit))
+            mags.append(magnitudes(plain(truth.table[name])[truth.is_interior], unit))
         mags = [m[np.isfinite(m)] for m in mags]
         every = np.concatenate(mags)
         if not len(every):
@@ -59,8 +59,8 @@ def number_counts(run, truth, area_arcmin2):
         least = min(c[c > 0].min() for c in counts if c.any())
         system = "AB mag" if unit == "uJy" else "−2.5 log₁₀ counts"
         chart = Chart(
-            Scale(low, high, f"{channel} [{system}]"),
-            Scale(least / 2, top * 1.6, f"sources {per} {BIN_MAG:g} mag", log=True),
+            ChartAxis(low, high, f"{channel} [{system}]"),
+            ChartAxis(least / 2, top * 1.6, f"sources {per} {BIN_MAG:g} mag", log=True),
             f"Number of sources by magnitude in {channel}",
         )
         chart.steps(edges, counts[0], "bars")
@@ -73,7 +73,7 @@ def number_counts(run, truth, area_arcmin2):
 def signal_to_noise(run):
     """[(title, svg)] of flux over its error against flux, one for each channel."""
     found = []
-    for channel, flux, error, unit in fluxes(run):
+    for channel, flux, error, unit in channel_fluxes(run):
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = flux / error
         good = np.isfinite(ratio) & (ratio > 0)
@@ -81,8 +81,8 @@ def signal_to_noise(run):
             continue
         shown = "µJy" if unit == "uJy" else unit
         chart = Chart(
-            Scale.over(flux[good], f"flux in {channel} [{shown}]", log=True),
-            Scale.over([*ratio[good], CLEAR], "flux / its error", log=True),
+            ChartAxis.over(flux[good], f"flux in {channel} [{shown}]", log=True),
+            ChartAxis.over([*ratio[good], CLEAR], "flux / its error", log=True),
             f"Signal to noise against flux in {channel}, {good.sum()} sources",
         )
         chart.path([chart.x.low, chart.x.high], [CLEAR, CLEAR], "mark")
@@ -98,8 +98,8 @@ def chi2_maps(pyramids):
         n_y, n_x = pyramid.instrument.grid.shape
         side = max(n_y, n_x)
         chart = Chart(
-            Scale(-0.5, side - 0.5, f"x [px of {pyramid.instrument.name}]"),
-            Scale(-0.5, side - 0.5, f"y [px of {pyramid.instrument.name}]"),
+            ChartAxis(-0.5, side - 0.5, f"x [px of {pyramid.instrument.name}]"),
+            ChartAxis(-0.5, side - 0.5, f"y [px of {pyramid.instrument.name}]"),
             f"Mean chi2 per pixel of {pyramid.instrument.name} in cells of {pyramid.cell_px} px",
             SQUARE,
         )
@@ -131,7 +131,7 @@ def pull_charts(run, truth):
     """[(title, svg, median, width, number)] of (flux - truth) / error, one for each channel."""
     found = []
     edges = np.arange(-PULL_RANGE, PULL_RANGE + PULL_BIN / 2, PULL_BIN)
-    for channel in run.channels[:MOST_CHANNELS]:
+    for channel in run.channels[:MAX_CHANNELS]:
         pulls = truth.pulls(run, channel)
         if not len(pulls):
             continue
@@ -141,8 +141,8 @@ def pull_charts(run, truth):
         x = np.linspace(-PULL_RANGE, PULL_RANGE, 101)
         normal = PULL_BIN * np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
         chart = Chart(
-            Scale(-PULL_RANGE, PULL_RANGE, f"(flux − truth) / error in {channel}"),
-            Scale(0, 1.1 * max(share.max(), normal.max()), f"share per {PULL_BIN:g}"),
+            ChartAxis(-PULL_RANGE, PULL_RANGE, f"(flux − truth) / error in {channel}"),
+            ChartAxis(0, 1.1 * max(share.max(), normal.max()), f"share per {PULL_BIN:g}"),
             f"Pulls of {len(pulls)} fluxes in {channel}: median {middle:.2f}, width {width:.2f}",
         )
         chart.steps(edges, share, "bars")
@@ -152,18 +152,23 @@ def pull_charts(run, truth):
 
 
 def completeness(truth):
-    """(svg, shares [(low, high, found, of)]) of the true sources found, by their signal to noise;
-    None where the truth does not say it."""
+    """(svg, shares [(low, high, found, of)]) of the true sources found, by their signal to noise.
+
+    None where the truth does not say it.
+    """
     if "snr" not in truth.table.colnames:
         return None
-    snr, own = plain(truth.table["snr"])[truth.inner], truth.rows[truth.inner] >= 0
+    snr, own = (
+        plain(truth.table["snr"])[truth.is_interior],
+        truth.matched_rows[truth.is_interior] >= 0,
+    )
     of, _ = np.histogram(snr, SNR_EDGES)
     found, _ = np.histogram(snr[own], SNR_EDGES)
     share = np.where(of >= FEW, found / np.maximum(of, 1), np.nan)
     middle = np.sqrt(SNR_EDGES[1:] * SNR_EDGES[:-1])
     chart = Chart(
-        Scale(SNR_EDGES[0], SNR_EDGES[-1], "true signal to noise, all channels", log=True),
-        Scale(0, 1.05, "share found"),
+        ChartAxis(SNR_EDGES[0], SNR_EDGES[-1], "true signal to noise, all channels", log=True),
+        ChartAxis(0, 1.05, "share found"),
         "Share of the true sources that were found, by their signal to noise",
     )
     chart.path(middle, share, "line")
@@ -178,8 +183,8 @@ def fit_times(run):
         return None
     seconds, n = plain(run.fits["seconds"]), plain(run.fits["n_sources"])
     chart = Chart(
-        Scale.over(n, "sources in the fit", log=True, least=0.7),
-        Scale.over(seconds, "time of the fit [s]", log=True),
+        ChartAxis.over(n, "sources in the fit", log=True, least=0.7),
+        ChartAxis.over(seconds, "time of the fit [s]", log=True),
         f"Time of {len(seconds)} fits against their number of sources",
     )
     chart.points(n, seconds)

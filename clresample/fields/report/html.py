@@ -18,7 +18,7 @@ SCRIPTS = (
 EMPTY = "–"
 
 
-def number(value, form=".4g") -> str:
+def format_number(value, form=".4g") -> str:
     """A number as text, with a proper minus; EMPTY for NaN and None."""
     if value is None or not math.isfinite(value):
         return EMPTY
@@ -83,8 +83,8 @@ def text(words, kind="about") -> str:
     return f"<p{_class(kind)}>{escape(words)}</p>"
 
 
-def facts(pairs) -> str:
-    """What and its value, in two columns."""
+def definition_table(pairs) -> str:
+    """Table of terms and values, in two columns."""
     inner = "".join(
         f"<dt>{escape(str(what))}</dt><dd>{escape(str(value))}</dd>" for what, value in pairs
     )

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ...files.atomic import FileError
 from ...files.fits import celestial_header, open_fits
-from ...files.whole_file import FileError
 from ...sky.grid import Grid
 from ..box import Box
 
@@ -24,8 +24,8 @@ class Instrument:
     """An instrument of a run: the files model_NAME.fits and residual_NAME.fits.
 
     name; channels (C,); grid: Grid of (Ny, Nx)
-    sigma (C,) [counts]: scatter of the residuals, 1.4826 times the median of their distance from
-        their median: that of a pixel's noise where most pixels are sky
+    noise_sigma (C,) [counts]: scatter of the residuals, 1.4826 times the median of their distance
+        from their median: that of a pixel's noise where most pixels are sky
     sample (C, L) [counts]: some pixels of the model
     """
 
@@ -34,13 +34,15 @@ class Instrument:
     grid: Grid
     model: Path
     residual: Path
-    sigma: np.ndarray
+    noise_sigma: np.ndarray
     sample: np.ndarray
 
     @contextmanager
     def opened(self):
-        """A function of a Box that reads (model, residual) (C, Ny, Nx) [counts]; residuals of dead
-        columns are NaN. Raises FileError."""
+        """A function of a Box that reads (model, residual) (C, Ny, Nx) [counts].
+
+        Residuals of dead columns are NaN. Raises FileError.
+        """
         with open_fits(self.model) as models, open_fits(self.residual) as residuals:
 
             def read(box):
@@ -52,9 +54,9 @@ class Instrument:
     def dead(self, residual):
         """(C, 1, Nx) bool: the columns of a strip of residuals that hold no sky."""
         if not residual.size:
-            return np.zeros((len(self.sigma), 1, residual.shape[2]), bool)
+            return np.zeros((len(self.noise_sigma), 1, residual.shape[2]), bool)
         middle = np.median(np.abs(np.nan_to_num(residual)), axis=1, keepdims=True)
-        return middle > DEAD_SIGMAS * self.sigma[:, None, None]
+        return middle > DEAD_SIGMAS * self.noise_sigma[:, None, None]
 
 
 def instruments_in(folder, notes, names):

@@ -8,8 +8,8 @@ import numpy as np
 
 from ..box import Box
 from .codes import encode
+from .colours import Stretch, stretch_of
 from .instrument import Instrument
-from .shades import Stretch, stretch_of
 
 TILE_PX = 256  # side of a tile: smaller ones are more to list, larger ones more to decode at once
 LAYERS = "model", "residual"  # the data are their sum
@@ -17,9 +17,9 @@ LAYERS = "model", "residual"  # the data are their sum
 # from; what it really takes decides.
 PIXEL_BYTES = 1.0
 CELLS = 96  # of the map of chi2 along the longer side, at most
-LEAST_CELL_PX = 8  # smaller cells scatter by over 20 % in one channel from the noise alone
+MIN_CELL_PX = 8  # smaller cells scatter by over 20 % in one channel from the noise alone
 # [sigma^2] A pixel counts no more: one cosmic ray or star's core does not hide what a cell says.
-MOST_CHI2 = 36.0
+MAX_CHI2 = 36.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +44,14 @@ class Pyramid:
 
 
 def pyramid_of(instrument, frame, budget) -> Pyramid:
-    """Tiles of an instrument within a number of bytes: the finest levels are left out until they
-    fit; the coarsest, of one tile, always stays.
+    """Tiles of an instrument within a number of bytes.
+
+    The finest levels are left out until they fit; the coarsest, of one tile, always stays.
 
     frame: Grid in whose pixels the page shows everything
     """
     shape = instrument.grid.shape
-    stretch = stretch_of(instrument.sample, instrument.sigma)
+    stretch = stretch_of(instrument.sample, instrument.noise_sigma)
     coarsest = max(0, int(np.ceil(np.log2(max(shape) / TILE_PX))))
     # what is predicted may be a half too much: a level is not left out for that
     more = max(full_bytes(instrument) / (1.5 * max(budget, 1)), 1)
@@ -80,11 +81,11 @@ def _read(instrument, level):
     """
     n_y, n_x = instrument.grid.shape
     step = 2**level
-    cell = LEAST_CELL_PX
+    cell = MIN_CELL_PX
     while max(n_y, n_x) > CELLS * cell:
         cell *= 2
     rows = max(step, cell, TILE_PX)  # of a strip: a multiple of both, all being powers of 2
-    sigma = instrument.sigma[:, None, None]
+    sigma = instrument.noise_sigma[:, None, None]
     strips, cells = [], []
     with instrument.opened() as read:
         for y0 in range(0, n_y, rows):
@@ -92,7 +93,7 @@ def _read(instrument, level):
             left = np.where(instrument.dead(left), np.nan, left)
             model = np.where(np.isfinite(left), model, np.nan)
             strips.append([_averaged(plane, step) for plane in (model, left)])
-            squares = np.minimum((left / sigma) ** 2, MOST_CHI2).mean(axis=0, keepdims=True)
+            squares = np.minimum((left / sigma) ** 2, MAX_CHI2).mean(axis=0, keepdims=True)
             cells.append(_averaged(squares, cell)[0])
     planes = [np.concatenate(few, axis=1) for few in zip(*strips, strict=True)]
     return planes, np.concatenate(cells), cell
@@ -125,12 +126,12 @@ def _tiles(planes, level, instrument, frame):
     """
     found = {"scale": 2**level, "places": [], "origins": []} | {layer: [] for layer in LAYERS}
     n_y, n_x = planes[0].shape[1:]
-    units = instrument.sigma / 2.0**level
+    units = instrument.noise_sigma / 2.0**level
     for y0 in range(0, n_y, TILE_PX):
         for x0 in range(0, n_x, TILE_PX):
             cut = [plane[:, y0 : y0 + TILE_PX, x0 : x0 + TILE_PX] for plane in planes]
             sides = cut[0].shape[1:]
-            place = placed(instrument.grid, frame, (y0, x0), sides, 2**level)
+            place = frame_transform(instrument.grid, frame, (y0, x0), sides, 2**level)
             if place is None:
                 continue
             found["places"].append([sides[1], sides[0], *place])
@@ -143,7 +144,7 @@ def _tiles(planes, level, instrument, frame):
     return found
 
 
-def placed(grid, frame, corner, shape, scale):
+def frame_transform(grid, frame, corner, shape, scale):
     """Six numbers that take (column, row) in a piece of an image to (x, y) of the frame's pixels.
 
     grid: Grid of the image; corner (2,), shape (2,): first pixel (y, x) and size of the piece, in

@@ -18,20 +18,20 @@ from .charts import (
     pull_charts,
     signal_to_noise,
 )
-from .content import FAILED, FLAGGED, flag_names, order_of, states
-from .html import PAGE, charts, facts, number, section, table, text
+from .html import PAGE, charts, definition_table, format_number, section, table, text
+from .page_data import FAILED, FLAGGED, flag_names, order_of, source_states
 from .stamps import plain
 from .table import columns_of
 from .truth import EDGE_PX, FOUND_PX
 
-MOST_ROWS = 500  # of the table of sources: the page stays quick, and the catalogue has them all
+MAX_ROWS = 500  # of the table of sources: the page stays quick, and the catalogue has them all
 FILTERS = (PAGE / "filters.html").read_text()
-SLOWEST, MOST_FAILED = 15, 200
+SLOWEST, MAX_FAILED = 15, 200
 
 
 def heading(run, area_arcmin2) -> str:
     """Title, instruments, the numbers that matter, and what is missing."""
-    state = states(run)
+    state = source_states(run)
     what = " + ".join(f"{i.name} ({', '.join(i.channels)})" for i in run.instruments)
     numbers = [(f"{len(run.sources):,}", "sources"), (f"{len(run.fits):,}", "fits")]
     if len(run.fits) and "status" in run.fits.colnames:
@@ -50,7 +50,7 @@ def heading(run, area_arcmin2) -> str:
 
 
 def notices(run, notes) -> str:
-    """What the reader must know first: an unfinished run, lost tiles, files that are missing."""
+    """Notices at the top: an unfinished run, failed tiles, files that are missing."""
     lines = []
     if not run.finished:
         done = dict(run.done)
@@ -64,7 +64,7 @@ def notices(run, notes) -> str:
     part = run.settings.get("part")
     if isinstance(part, list) and len(part) >= 2:
         lines.append(f"Part {part[0]} of {part[1]} of its field.")
-    lost = run.provenance.get("lost_tiles") or {}
+    lost = run.provenance.get("failed_tiles") or {}
     lines += [f"Tile {tile} is lost: {reason}" for tile, reason in dict(lost).items()]
     lines += [str(note) for note in notes]
     if not lines:
@@ -79,11 +79,11 @@ def source_table(run) -> str:
     if not len(rows):
         return section("sources", "Sources", text("No source was found or fitted."))
     columns = columns_of(run)
-    order = order_of(run)[:MOST_ROWS].tolist()
+    order = order_of(run)[:MAX_ROWS].tolist()
     body = [
         [
             str(int(rows["id"][k])),
-            *(number(one.values[k], one.form) for one in columns),
+            *(format_number(one.values[k], one.form) for one in columns),
             flag_names(np.nan_to_num(rows["flags"][k])) if "flags" in rows.colnames else "",
             str(rows["status"][k]) if "status" in rows.colnames else "",
         ]
@@ -119,7 +119,7 @@ def photometry(run, truth, area_arcmin2) -> str:
 
 
 def chi2(run, pyramids) -> str:
-    """Where the model does not agree with the data."""
+    """Sources whose model does not agree with the data."""
     if not pyramids:
         return ""
     told = (
@@ -145,7 +145,7 @@ def _ramp(palette):
 
 def _misfits(run):
     """The sources with the largest residuals."""
-    names = [n for n in run.sources.colnames if n.startswith("residual_")]
+    names = [n for n in run.sources.colnames if n.startswith("max_residual_")]
     if not names or not len(run.sources):
         return ""
     values = np.nan_to_num(np.stack([plain(run.sources[n]) for n in names], axis=1))
@@ -153,8 +153,8 @@ def _misfits(run):
     rows = [
         [
             str(int(run.sources["id"][k])),
-            names[int(values[k].argmax())].removeprefix("residual_"),
-            number(values[k].max(), ".1f"),
+            names[int(values[k].argmax())].removeprefix("max_residual_"),
+            format_number(values[k].max(), ".1f"),
             flag_names(np.nan_to_num(run.sources["flags"][k])),
         ]
         for k in order
@@ -169,20 +169,27 @@ def truth_section(run, truth) -> str:
     """Pulls, and which true sources were found."""
     if truth is None:
         return ""
-    n = int((truth.rows[truth.inner] >= 0).sum())
+    n = int((truth.matched_rows[truth.is_interior] >= 0).sum())
     told = (
-        f"{n} of the {truth.inner.sum()} true sources over {EDGE_PX:g} pixels from the edge have a "
+        f"{n} of the {truth.is_interior.sum()} true sources over {EDGE_PX:g} pixels from the edge "
+        f"have a "
         f"row within {FOUND_PX:g} pixels. Pulls of correct errors scatter like the dashed normal "
         "distribution, median 0 and width 1. The outermost bins hold all that is farther out."
     )
     figures = [
-        (channel, svg, f"median {number(m, '.2f')}, width {number(w, '.2f')}, n = {k}")
+        (
+            channel,
+            svg,
+            f"median {format_number(m, '.2f')}, width {format_number(w, '.2f')}, n = {k}",
+        )
         for channel, svg, m, w, k in pull_charts(run, truth)
     ]
     parts = [text(told), charts(figures)]
     found = completeness(truth)
     if found is not None:
-        rows = [[number(a, ".4g"), number(b, ".4g"), k, m] for a, b, k, m in found[1] if m]
+        rows = [
+            [format_number(a, ".4g"), format_number(b, ".4g"), k, m] for a, b, k, m in found[1] if m
+        ]
         heads = [("S/N from", "", "n"), ("to", "", "n"), ("found", "", "n"), ("of", "", "n")]
         told = f"True sources over {EDGE_PX:g} px from the field's edge"
         shares = charts([("Completeness", found[0], "")], table(told, heads, rows))
@@ -191,7 +198,7 @@ def truth_section(run, truth) -> str:
 
 
 def fits(run) -> str:
-    """How the fits ended, the slowest and the failed ones."""
+    """Outcomes of the fits, the slowest and the failed ones."""
     if not len(run.fits):
         return section("fits", "Fits", text("Nothing is known of single fits."))
     rows = run.fits
@@ -203,9 +210,11 @@ def fits(run) -> str:
     ]  # fmt: skip
 
     def row(k):
-        whole = [str(int(rows[n][k])) for n in ("parent_id", "n_sources", "n_pixels", "iterations")]
-        seconds = number(plain(rows["seconds"][k : k + 1])[0], ".2f")
-        return [*whole, seconds, str(int(rows["round"][k])), str(rows["status"][k])]
+        whole = [
+            str(int(rows[n][k])) for n in ("parent_id", "n_sources", "n_pixels", "n_iterations")
+        ]
+        seconds = format_number(plain(rows["seconds"][k : k + 1])[0], ".2f")
+        return [*whole, seconds, str(int(rows["n_refits"][k])), str(rows["status"][k])]
 
     slow = np.argsort(-plain(rows["seconds"]), kind="stable")[:SLOWEST]
     bad = [k for k, s in enumerate(rows["status"]) if str(s).startswith("failed")]
@@ -215,7 +224,7 @@ def fits(run) -> str:
     parts.append(table(caption, heads, [row(k) for k in slow], sort=True, link=0))
     parts.append("<h3>Failed</h3>")
     if bad:
-        shown = [row(k) for k in bad[:MOST_FAILED]]
+        shown = [row(k) for k in bad[:MAX_FAILED]]
         caption = f"{len(shown)} of {len(bad)} fits that failed, with the reason"
         parts.append(table(caption, heads, shown, sort=True, link=0))
     else:
@@ -224,7 +233,7 @@ def fits(run) -> str:
 
 
 def origin(run) -> str:
-    """What made the field: versions, device, times, settings, inputs with their checksums."""
+    """Provenance of the field: versions, device, times, settings, inputs with their checksums."""
     found = run.provenance
     pairs = [("clresample", found.get("clresample", "")), ("Python", found.get("python", ""))]
     pairs += [(name, v or "not installed") for name, v in dict(found.get("packages") or {}).items()]
@@ -241,7 +250,9 @@ def origin(run) -> str:
         if isinstance(one, dict)
     ]
     heads = [("input", "", ""), ("file", "", ""), ("SHA-256", "", "long")]
-    return section("origin", "Origin", facts(pairs), table("Files that were read", heads, inputs))
+    return section(
+        "origin", "Origin", definition_table(pairs), table("Files that were read", heads, inputs)
+    )
 
 
 def _is_number(value):

@@ -6,38 +6,38 @@ from contextlib import ExitStack
 
 import numpy as np
 
-from ...files.whole_file import FileError
+from ...files.atomic import FileError
 from ..box import Box
 from .alone import OwnModels
 from .codes import encode
-from .pyramid import placed
+from .pyramid import frame_transform
 
 # [frame px] Half the side of a source's pictures: some sky is seen around the faintest, and the
 # largest still fit a page.
-LEAST_HALF, MOST_HALF = 18, 64
+MIN_HALF, MAX_HALF = 18, 64
 SIZES = 4.0  # half sides in units of a source's size
 LAYERS = "model", "residual", "own"
-MOST_STAMPS = 2000  # sources with pictures, at most: reading them takes some 10 ms each
+MAX_STAMPS = 2000  # sources with pictures, at most: reading them takes some 10 ms each
 
 
 def stamps_of(run, frame, order, budget, notes):
-    """{source's row: its pictures as the page reads them}, of the first rows of `order` that fit
-    into `budget` bytes.
+    """{source's row: its pictures}, of the first rows of `order` that fit into `budget` bytes.
 
     run: Run; frame: Grid of the page's pixels; order: rows of the catalogue, the first ones first
 
     Of each: "box" [x0, y0, side] of the frame's pixels shown, and "rows", a dict for each channel:
     "name", "instrument" and "channel" (numbers), "model" and "residual" (texts of `codes.encode` in
     units of the channel's noise), "own" (the source's own model, where it can be had), "size"
-    [columns, rows], "origin" (x, y) of the first pixel, "place" as `pyramid.placed` gives it.
+    [columns, rows], "origin" (x, y) of the first pixel, "place" as `pyramid.frame_transform` gives
+    it.
     """
     at = positions(run)
     sizes = _sizes(run, frame)
     found, used, own = {}, 0, OwnModels(run, notes)
     with ExitStack() as files:
         opened = [(one, files.enter_context(one.opened())) for one in run.instruments]
-        for row in list(order)[:MOST_STAMPS]:
-            half = int(np.clip(np.ceil(SIZES * sizes[row]), LEAST_HALF, MOST_HALF))
+        for row in list(order)[:MAX_STAMPS]:
+            half = int(np.clip(np.ceil(SIZES * sizes[row]), MIN_HALF, MAX_HALF))
             if not np.isfinite(at[row]).all():
                 continue
             y, x = np.rint(at[row]).astype(int).tolist()
@@ -71,9 +71,9 @@ def plain(column):
 
 def _sizes(run, frame):
     """(S,) [frame px] sizes of the sources, 0 where unknown."""
-    if "size" not in run.sources.colnames:
+    if "rms_size" not in run.sources.colnames:
         return np.zeros(len(run.sources))
-    return np.nan_to_num(plain(run.sources["size"])) / frame.pixel_scale_arcsec
+    return np.nan_to_num(plain(run.sources["rms_size"])) / frame.pixel_scale_arcsec
 
 
 def _rows(number, instrument, read, frame, wanted, own, source):
@@ -82,18 +82,18 @@ def _rows(number, instrument, read, frame, wanted, own, source):
     corners = frame.positions_in(instrument.grid, [y0, y0, y1, y1], [x0, x1, x0, x1])
     if not np.isfinite(corners).all():
         return
-    box = Box.around(corners).meet(Box.of(instrument.grid.shape))
+    box = Box.around(corners).intersection(Box.of(instrument.grid.shape))
     if not box.area:
         return
     models, left = read(box)
     left = np.where(instrument.dead(left), np.nan, left)
     models = np.where(np.isfinite(left), models, np.nan)
-    place = placed(instrument.grid, frame, box[:2], box.shape, 1)
+    place = frame_transform(instrument.grid, frame, box[:2], box.shape, 1)
     if place is None:
         return
     light = own.on(source, instrument, box)
     for c, name in enumerate(instrument.channels):
-        sigma = float(instrument.sigma[c])
+        sigma = float(instrument.noise_sigma[c])
         found = {
             "name": name,
             "instrument": number,

@@ -12,14 +12,14 @@ WIDTH, HEIGHT = 284, 208  # [units of the drawing] the page scales it
 LEFT, RIGHT, TOP, BOTTOM = 50, 14, 10, 40  # for the labels
 SQUARE = WIDTH - LEFT - RIGHT + TOP + BOTTOM  # height at which both axes are as long
 # More points than this are shown as shaded cells: as single points they would be one blot.
-MOST_POINTS = 1200
+MAX_POINTS = 1200
 CELL = 5  # [units] side of such a cell
 SHADES = 4  # of cells, by the logarithm of the number of points
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @dataclass(frozen=True)
-class Scale:
+class ChartAxis:
     """An axis: from `low` to `high`, linear or logarithmic, with its label (quantity and unit)."""
 
     low: float
@@ -28,7 +28,7 @@ class Scale:
     log: bool = False
 
     @classmethod
-    def over(cls, values, label, *, log=False, least=None, low=None, high=None) -> Scale:
+    def over(cls, values, label, *, log=False, least=None, low=None, high=None) -> ChartAxis:
         """An axis that holds all values that are finite, and with `log` positive.
 
         least: the smallest extent, in decades if `log`; low, high: ends that are given
@@ -67,11 +67,11 @@ class Scale:
 class Chart:
     """A chart to which marks are added; `svg` is its text.
 
-    x, y: Scale; about: what it shows, for those who cannot see it; height [units]
+    x, y: ChartAxis; about: what it shows, for those who cannot see it; height [units]
     """
 
-    x: Scale
-    y: Scale
+    x: ChartAxis
+    y: ChartAxis
     about: str
     height: int = HEIGHT
     marks: list = field(default_factory=list)
@@ -106,7 +106,7 @@ class Chart:
         good = np.isfinite(u) & np.isfinite(v) & (u >= LEFT) & (u <= WIDTH - RIGHT)
         good &= (v >= TOP) & (v <= self.height - BOTTOM)
         u, v = u[good], v[good]
-        if len(u) <= MOST_POINTS:
+        if len(u) <= MAX_POINTS:
             d = "".join(f"M{a:.1f} {b:.1f}h0" for a, b in zip(u, v, strict=True))
             self.marks.append(f'<path class="{kind}" d="{d}"/>')
             return

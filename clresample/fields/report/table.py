@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .charts import fluxes, magnitudes
+from .charts import channel_fluxes, magnitudes
 from .stamps import plain
 
 MAX_CHANNELS = 8  # with columns in the table
@@ -39,7 +39,7 @@ def columns_of(run) -> list[TableColumn]:
     sky = [n for n in ("ra", "dec", "y_sky", "x_sky", "l", "b") if n in rows.colnames][:2]
     found = [_column(rows, name, name, str(rows[name].unit or ""), ".6f", "sky") for name in sky]
     found.append(_column(rows, "snr", "S/N", "all channels", ".4g"))
-    measured = list(fluxes(run))[:MAX_CHANNELS]
+    measured = list(channel_fluxes(run))[:MAX_CHANNELS]
     for channel, flux, _, unit in measured:
         found.append(TableColumn(channel, unit.replace("uJy", "µJy"), ".4g", flux, "flux", channel))
     for channel, flux, _, unit in measured:

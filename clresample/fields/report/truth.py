@@ -9,8 +9,8 @@ import numpy as np
 from astropy.table import QTable
 from scipy.spatial import cKDTree
 
+from ...files.atomic import FileError
 from ...files.tables import read_catalogue
-from ...files.whole_file import FileError
 from .stamps import plain
 
 # [px] A row is a true source's own when it lies as near; further off it is another one in most
@@ -20,18 +20,18 @@ EDGE_PX = 8.0  # true sources nearer to the field's edge are not counted: part o
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
+class TruthMatch:
     """True sources (T) beside the catalogue's rows (S).
 
     path; table: columns flux_CHANNEL [uJy], snr where it is given
-    rows (T,): the catalogue's row that is its own, -1 for none
+    matched_rows (T,): the catalogue's row that is its own, -1 for none
     inner (T,) bool: well on the field, so that it could be found
     """
 
     path: Path
     table: QTable
-    rows: np.ndarray
-    inner: np.ndarray
+    matched_rows: np.ndarray
+    is_interior: np.ndarray
 
     def pulls(self, run, channel):
         """(flux - truth) / error of the sources found in a channel; empty where it has none."""
@@ -40,14 +40,14 @@ class Truth:
             return np.zeros(0)
         if str(run.sources[names[0]].unit) != "uJy":
             return np.zeros(0)
-        found = self.rows >= 0
-        flux, error = (plain(run.sources[name])[self.rows[found]] for name in names)
+        found = self.matched_rows >= 0
+        flux, error = (plain(run.sources[name])[self.matched_rows[found]] for name in names)
         with np.errstate(divide="ignore", invalid="ignore"):
             pulls = (flux - plain(self.table[names[0]])[found]) / error
         return pulls[np.isfinite(pulls)]
 
 
-def truth_of(run, path, notes) -> Truth | None:
+def truth_of(run, path, notes) -> TruthMatch | None:
     """The truth at a path, or that which lies in the run's folder or beside its inputs.
 
     path: None = look for truth.ecsv; None is returned where there is none
@@ -68,7 +68,7 @@ def truth_of(run, path, notes) -> Truth | None:
 
 
 def _places(run):
-    """Where `clresample simulate field` leaves the truth: beside the files that were read."""
+    """Folders to which `clresample simulate field` writes the truth: beside the input files."""
     inputs = run.provenance.get("inputs") or run.settings.get("inputs") or {}
     files = [v.get("file", "") if isinstance(v, dict) else k for k, v in inputs.items()]
     folders = [run.folder, run.folder.absolute().parent, *(Path(str(f)).parent for f in files)]
@@ -83,7 +83,7 @@ def _read(run, path):
     true = np.stack([plain(table[c]) for c in ("y", "x")], axis=1)
     rows = run.sources
     at = np.stack([plain(rows[c]) for c in ("y", "x")], axis=1) if len(rows) else np.zeros((0, 2))
-    return Truth(Path(path), table, matched(at, true), _inner(run, true))
+    return TruthMatch(Path(path), table, matched(at, true), _inner(run, true))
 
 
 def _inner(run, true):

@@ -8,29 +8,29 @@ from pathlib import Path
 
 import numpy as np
 
-from ...files.whole_file import FileError, check_folder, check_output, whole_file
+from ...files.atomic import FileError, atomic_file, check_folder, check_output
 from ...sky.wcs import local_axes
 from ..box import Box
 from . import sections
-from .content import data_of, instrument_data
-from .folder import read_run
 from .html import PAGE, data_block, page
+from .page_data import data_of, instrument_data
 from .pyramid import full_bytes, pyramid_of
+from .run_folder import read_run
 from .truth import truth_of
 
 NAME = "report.html"
 # [bytes] of a page: browsers open it within some seconds. 4096 x 4096 pixels beside Rubin's in
 # three bands are there with all their pixels, and pictures of their 1700 sources.
-MOST_BYTES = 64 << 20
+MAX_BYTES = 64 << 20
 TEXT_BYTES = 700_000  # [bytes] that tables and figures take at most, whatever the field
-LEAST_BYTES = 2_000_000
+MIN_BYTES = 2_000_000
 
 FIELD = (PAGE / "field.html").read_text()
 
 
 @dataclass(frozen=True)
 class Report:
-    """What was written.
+    """Files that were written.
 
     path: of the page; n_bytes; n_sources: of the catalogue; n_pictures: sources with pictures
     notes: what is missing in it, a line each
@@ -43,9 +43,7 @@ class Report:
     notes: tuple[str, ...] = ()
 
 
-def write_report(
-    folder, path=None, *, truth=None, most_bytes=MOST_BYTES, overwrite=False
-) -> Report:
+def write_report(folder, path=None, *, truth=None, most_bytes=MAX_BYTES, overwrite=False) -> Report:
     """Write the report of a run of `run_field`, finished or not: one HTML page.
 
     The page holds the pixel values of the field's data, models and residuals as tiles to zoom into,
@@ -66,8 +64,8 @@ def write_report(
     Raises FileError for a folder without a run, a catalogue or `truth` that cannot be read, and
     where the page cannot be written; ValueError for a limit under 2 MB.
     """
-    if not most_bytes >= LEAST_BYTES:
-        raise ValueError(f"most_bytes is {most_bytes}, must be {LEAST_BYTES} or more")
+    if not most_bytes >= MIN_BYTES:
+        raise ValueError(f"most_bytes is {most_bytes}, must be {MIN_BYTES} or more")
     folder = Path(folder)
     run = read_run(folder)
     out = folder / NAME if path is None else Path(path)
@@ -86,7 +84,7 @@ def write_report(
         f"{folder.absolute().name}: field report", _body(run, known, pyramids, notes), data
     )
     content = written.encode()
-    with whole_file(out) as part:
+    with atomic_file(out) as part:
         part.write_bytes(content)
     return Report(out, len(content), len(run.sources), n_pictures, tuple(notes))
 
@@ -180,7 +178,7 @@ def _field(run, pyramids):
 
 
 def _compass(run):
-    """Where north and east are, as arrows."""
+    """Arrows to north and east."""
     if not run.instruments:
         return ""
     grid = run.instruments[0].grid

@@ -17,34 +17,36 @@ import numpy as np
 
 from ...device.contraction import ImageBatch
 from ...device.tuning import Tuning
-from ..plan import Plan
-from ..tables import waves
+from ..plan import ResamplingPlan
+from ..wave_tables import wave_table
 
 # [bytes] of float64 intermediates of one image, which one work-item takes through the whole chain:
 # half of a core's second cache. Larger images, from some 200 pixels a side on, are better shared
 # among cores, product by product.
-MOST_BYTES = 1 << 20
+MAX_BYTES = 1 << 20
 
 
 class FoldedExecutor:
-    """Forward and adjoint of one aligned Plan, as Executor has them; inside it is float64.
+    """Forward and adjoint of one aligned ResamplingPlan, as Executor has them.
 
-    Images on either side are float32. `serves` says for which operators it is made.
+    Inside it is float64.
+
+    Images on either side are float32. `is_preferred` says for which operators it is made.
 
     scratch: all that it holds on the device, by names; nothing before it is first used
     """
 
-    def __init__(self, device, plan: Plan):
+    def __init__(self, device, plan: ResamplingPlan):
         self.device, self.plan, self.tuning = device, plan, Tuning.of(device, np.float64)
         self.scratch: dict = {}
         self._transfer = np.zeros((plan.n_bands, len(plan.nu[0]), 4, self.h_pad))
 
     @staticmethod
-    def serves(device, dtype, plan) -> bool:
-        """Whether it is as fast as float32 there, and rounds less: on CPUs, for small images."""
-        if np.dtype(dtype) != np.float32 or not (device.has_fp64 and Tuning.of(device).folds):
+    def is_preferred(device, dtype, plan) -> bool:
+        """Returns True if it is as fast as float32 and rounds less: on CPUs, for small images."""
+        if np.dtype(dtype) != np.float32 or not (device.has_fp64 and Tuning.of(device).use_folded):
             return False
-        small = 8 * sum(n_elements(plan)) <= MOST_BYTES
+        small = 8 * sum(n_elements(plan)) <= MAX_BYTES
         return plan.geometry == "aligned" and plan.n_terms == 1 and small
 
     @property
@@ -71,12 +73,12 @@ class FoldedExecutor:
         plan, mapping, axes, put = self.plan, self.plan.mapping, self.plan.axes, self.device.put
         shape = tuple(mapping.shape_in[axis] for axis in axes)
         tables = [table[:, n // 2 :].T for table, n in zip((plan.in_y, plan.in_x), shape)]
-        model = Side(self, shape, tables, [np.ones(n) for n in shape], axes)
+        model = FoldedImages(self, shape, tables, [np.ones(n) for n in shape], axes)
         off = [np.arange(n // 2, n) - (n - 1) / 2 for n in mapping.shape_out]
         rates = [mapping.matrix[axes[i], i] for i in (0, 1)]
-        tables = [waves(nu, rate * x) for nu, rate, x in zip(plan.nu, rates, off)]
+        tables = [wave_table(nu, rate * x) for nu, rate, x in zip(plan.nu, rates, off)]
         lit = [mapping.covered.any(axis=1 - i) for i in (0, 1)]
-        observed = Side(self, mapping.shape_out, tables, lit, (0, 1))
+        observed = FoldedImages(self, mapping.shape_out, tables, lit, (0, 1))
         parts, lines, z = n_elements(plan, self.whole_vectors)
         work = self.device.empty((self.device.compute_units, parts + lines + z), np.float64)
         at = {"at_lines": parts, "at_z": parts + lines, "stride_scratch": work.shape[1]}
@@ -106,7 +108,7 @@ class FoldedExecutor:
             given |= {f"{name}_ld": at.ld, f"{name}_step": at.step}
         launch((min(n // n_seen, self.device.compute_units), 1, 1), **given)
 
-    def _bound(self, source: Side, target: Side, sign, shared):
+    def _bound(self, source: FoldedImages, target: FoldedImages, sign, shared):
         """The kernel of one way, and the axes of its images."""
         launch = self.device.launcher(
             "folded.cl",
@@ -128,7 +130,7 @@ class FoldedExecutor:
         return launch, source.axes, target.axes
 
 
-class Side:
+class FoldedImages:
     """The images of one end of the operator, and waves about their middle.
 
     folded: the executor
@@ -154,13 +156,13 @@ class Side:
         }
 
     def arguments(self, way):
-        """What the kernel takes of this side: "to" the frequencies or "from" them."""
+        """Arguments of the kernel for this side: "to" the frequencies or "from" them."""
         waves = {name: self.tables[f"{way} {name}"] for name in ("wave_y", "wave_x")}
         weights = {name: self.tables[name] for name in ("weight_y", "weight_x")}
         return self._sizes | weights | waves
 
 
-def n_elements(plan: Plan, whole_vectors=lambda n: n):
+def n_elements(plan: ResamplingPlan, whole_vectors=lambda n: n):
     """Elements of one image's intermediates: its parts, their lines, and frequencies twice."""
     mapping, (h_y, h_x) = plan.mapping, (len(nu) for nu in plan.nu)
     shapes = [mapping.shape_out, tuple(mapping.shape_in[axis] for axis in plan.axes)]

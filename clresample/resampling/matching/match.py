@@ -6,13 +6,13 @@ import warnings
 
 import numpy as np
 
-from ...device.workers import one_blas_thread
+from ...device.multi_device import one_blas_thread
 from ...sky.correlation import NoiseCorrelation
-from ...sky.given.checks import instance
 from ...sky.grid import Grid
 from ...sky.observation import Observation, check_observations
 from ...sky.psf import PSF
 from ...sky.psf_checks import PSFWarning
+from ...sky.validation.checks import check_instance
 from ..plan import is_identity
 from ..tiled.resampler import TiledResampler
 from .kernel import NoiseKernel
@@ -53,11 +53,11 @@ def match(observations, grid=None, psf=None, *, max_gain=2.0, device=None) -> Ob
     like, band = widest(observations)
     if grid is None:
         grid = observations[like].grid
-    instance("grid", grid, Grid)
+    check_instance("grid", grid, Grid)
     if psf is None:
         own = observations[like].psf[band]
         psf = own if grid is observations[like].grid else psf_on(own, observations[like].grid, grid)
-    instance("psf", psf, PSF)
+    check_instance("psf", psf, PSF)
     if psf.n_bands != 1:
         raise ValueError(f"psf has {psf.n_bands} bands, must have one: choose with psf[band]")
     parts = [_matched(o, grid, psf, max_gain, device) for o in observations]

@@ -11,14 +11,14 @@ from the cache.
 
 from __future__ import annotations
 
-from ...device.contraction import Contraction, ImageBatch, Matrix, padded, whole
+from ...device.contraction import Contraction, ImageBatch, MatrixBatch, round_up_columns, row_stride
 from ...device.tuning import Tuning
-from .launches import Pixels, Shifts, SlabLaunches
-from .slabs import SHIFT_COST, cut
-from .tables import device_matrix, trigonometric, wave
+from .launches import PixelLaunches, ShiftLaunches, SlabLaunches
+from .slabs import SHIFT_COST, cut_slabs
+from .tables import cos_sin_table, device_matrix, wave_planes
 
 
-class Factors:
+class PaperFactors:
     """The two factors where steps i along observed axis `axis` shift the model, steps l the kernel.
 
     axes: model axes taken as rows and columns; n_y, n_x and k_y, k_x: their lengths, padded lengths
@@ -37,13 +37,13 @@ class Factors:
         self.tuning = Tuning.of(device, dtype)
         self.axis, self.axes = axis, self.model_axes(mapping, axis)
         self.n_i, self.n_l = mapping.shape_out[axis], mapping.shape_out[1 - axis]
-        self.n_cols, self.l_pad = self.whole_lanes(self.n_i), padded(self.n_l)
+        self.n_cols, self.l_pad = self.whole_lanes(self.n_i), row_stride(self.n_l)
         self.n_y, self.n_x = (mapping.shape_in[k] for k in self.axes)
         self.k_y, self.k_x = (n_fft[k] for k in self.axes)
         self.h_y, self.h_x = (self.k_y + 1) // 2, (self.k_x + 1) // 2
         self.n_units, self.unit_rows, self.z_rows = self.units()
         self.n_terms = self.n_units * self.unit_rows
-        self.cost = self.n_terms * whole(self.n_i) * (self.n_l + SHIFT_COST)
+        self.cost = self.n_terms * round_up_columns(self.n_i) * (self.n_l + SHIFT_COST)
 
     def prepare(self):
         """Kernels and the model's transform on the device, and the slabs of the inner index."""
@@ -54,16 +54,18 @@ class Factors:
             # half of the largest buffer: a slab may be a unit longer than the others
             -(-self.n_terms * self.l_pad * dtype.itemsize // (device.max_alloc // 2)),
         )
-        self.slabs = cut(self.n_units, self.unit_rows, n_slabs, tuning.chunk_terms)
+        self.slabs = cut_slabs(self.n_units, self.unit_rows, n_slabs, tuning.chunk_terms)
         self.slab_rows = max(slab.n_rows for slab in self.slabs)
         self.group = max(1, budget // (self.slab_rows * self.n_cols))
         self.plain = Contraction(device, dtype)
         self.ragged = Contraction(device, dtype, ragged=True)
         self.strided = Contraction(device, dtype, strided=self.axes != (0, 1))
-        in_x = trigonometric(self.n_x, self.k_x)
+        in_x = cos_sin_table(self.n_x, self.k_x)
         self.in_x, self.in_x_t = self.table(in_x), self.table(in_x.T)
-        self.shifts = Shifts(device, dtype, self.name, self.h_x, tuning.lanes)
-        self.pixels = Pixels(device, dtype, self.mapping, self.axis, self.n_cols, tuning.lanes)
+        self.shifts = ShiftLaunches(device, dtype, self.name, self.h_x, tuning.lanes)
+        self.pixels = PixelLaunches(
+            device, dtype, self.mapping, self.axis, self.n_cols, tuning.lanes
+        )
         self.scratch, self.bound = {}, {}
 
     def set_transfer(self, d, shift):
@@ -78,7 +80,7 @@ class Factors:
         """Make room for the intermediates of `n` images at a time."""
         if self.scratch.get("n") == n:
             return
-        ld, n_chunks = padded(n * self.n_cols), sum(slab.n_chunks for slab in self.slabs)
+        ld, n_chunks = row_stride(n * self.n_cols), sum(slab.n_chunks for slab in self.slabs)
         shapes = {
             "half": (n, self.n_y, self.in_x.ld),
             "frequencies": (n, self.z_rows, self.in_x.ld),
@@ -134,16 +136,19 @@ class Factors:
         if (band, n) not in self.bound:
             z = self.matrix("frequencies" if self.z_rows else "half")
             n_cols, i_chunk, slabs = n * self.n_cols, 0, []
-            ld, f = padded(n_cols), self.scratch["shifted"]
-            part = Matrix(self.scratch["part"].base_data, ld, self.n_l * ld)
+            ld, f = row_stride(n_cols), self.scratch["shifted"]
+            part = MatrixBatch(self.scratch["part"].base_data, ld, self.n_l * ld)
             for slab, (kernel, kernel_t) in zip(self.slabs, self.kernels[band], strict=True):
                 shift, unshift = self.shifts.bind(slab, z, self.waves, f, self.n_cols, ld, n)
-                left = Matrix(kernel_t.base_data, slab.n_rows, slab.chunk)
-                right = Matrix(f.base_data, ld, slab.chunk * ld)
+                left = MatrixBatch(kernel_t.base_data, slab.n_rows, slab.chunk)
+                right = MatrixBatch(f.base_data, ld, slab.chunk * ld)
                 sums = part._replace(offset=i_chunk * part.stride)
                 product = self.plain.bind(self.n_l, n_cols, slab.chunk, left, right, sums)
-                n_rows, left = slab.n_units * self.unit_rows, Matrix(kernel.base_data, self.l_pad)
-                right, rows = Matrix(part.buffer, ld), Matrix(f.base_data, ld)
+                n_rows, left = (
+                    slab.n_units * self.unit_rows,
+                    MatrixBatch(kernel.base_data, self.l_pad),
+                )
+                right, rows = MatrixBatch(part.buffer, ld), MatrixBatch(f.base_data, ld)
                 product_t = self.plain.bind(n_rows, n_cols, self.n_l, left, right, rows)
                 slabs.append(SlabLaunches(shift, product, slab.n_chunks, product_t, unshift))
                 i_chunk += slab.n_chunks
@@ -151,18 +156,18 @@ class Factors:
             self.bound[band, n] = slabs, pixels
         return self.bound[band, n]
 
-    def matrix(self, name) -> Matrix:
+    def matrix(self, name) -> MatrixBatch:
         """Intermediate matrices of all images."""
         array = self.scratch[name]
-        return Matrix(array.base_data, array.shape[2], array.shape[1] * array.shape[2])
+        return MatrixBatch(array.base_data, array.shape[2], array.shape[1] * array.shape[2])
 
-    def table(self, host) -> Matrix:
+    def table(self, host) -> MatrixBatch:
         """A host table (rows, columns) or (bands, rows, columns) on the device."""
         return device_matrix(self.device, self.dtype, host)
 
-    def wave(self, k, x):
+    def wave_planes(self, k, x):
         """exp(2 pi i nu x) on the device; see tables.wave."""
-        return self.device.put(wave(k, x, self.whole_lanes(len(x))), self.dtype).base_data
+        return self.device.put(wave_planes(k, x, self.whole_lanes(len(x))), self.dtype).base_data
 
     def whole_lanes(self, n) -> int:
         """`n` columns rounded up to whole work-items of shift.cl."""

@@ -7,25 +7,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...device.contraction import COLUMN_PAD, Matrix, Product
+from ...device.contraction import COLUMN_PAD, BoundContraction, MatrixBatch
 from ...device.tuning import Tuning
 
 
 class SlabLaunches(NamedTuple):
-    """What forward and adjoint queue for one slab; all but the products take no arguments.
+    """Launches of forward and adjoint for one slab; all but the products take no arguments.
 
     shift: G from the frequencies; product(n_chunks): partial sums P G
     product_t(1): P^T times the observed pixels, into G; unshift: from G back to the frequencies
     """
 
     shift: functools.partial
-    product: Product
+    product: BoundContraction
     n_chunks: int
-    product_t: Product
+    product_t: BoundContraction
     unshift: functools.partial
 
 
-class Shifts:
+class ShiftLaunches:
     """Shifted models G from frequencies Z, and back: the kernels shift_* and unshift_*.
 
     name: "line" or "plane", the kernels of aligned and of rotated grids
@@ -47,7 +47,7 @@ class Shifts:
             for way, local_size in (("shift", tuning.tile_group), ("unshift", tuning.item_group))
         ]
 
-    def bind(self, slab, z: Matrix, waves, g, n_cols, ld, n):
+    def bind(self, slab, z: MatrixBatch, waves, g, n_cols, ld, n):
         """The launches for a slab's units of `n` images: Z to G, and its adjoint, G to Z.
 
         waves (w_y, w_x): buffers (h, 2, n_cols); g: device array of rows ld long, n * n_cols used
@@ -75,7 +75,7 @@ class Shifts:
         ]
 
 
-class Pixels:
+class PixelLaunches:
     """Observed pixels from the partial sums of all chunks, and back: collect and spread.
 
     mapping: its observed pixels, and which of them the model covers; axis: the observed axis of
@@ -94,7 +94,10 @@ class Pixels:
             functools.partial(
                 device.launcher, "shift.cl", name, dtype=dtype, local_size=local_size, LANES=lanes
             )
-            for name, local_size in (("collect", (group, 1, 1)), ("spread", (COLUMN_PAD, 1)))
+            for name, local_size in (
+                ("sum_chunks", (group, 1, 1)),
+                ("scatter_pixels", (COLUMN_PAD, 1)),
+            )
         ]
 
     def bind(self, part, n_chunks, ld, n):

@@ -1,4 +1,4 @@
-"""The paper's own factorised operator: same inputs and outputs as Resampler, at its higher cost."""
+"""The paper's factorised operator: same inputs and outputs as Resampler, at a higher cost."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import math
 
 import numpy as np
 
-from ...device.contraction import ImageBatch, Matrix
+from ...device.contraction import ImageBatch, MatrixBatch
 from ..grid_operator import GridOperator
 from ..plan import count_bands
 from ..transfer import Certificate, wrap_radius
-from .factors import Factors
+from .factors import PaperFactors
 from .sincs import sinc_table, sinc_transfer
-from .tables import both_ways, trigonometric
+from .tables import cos_sin_table, with_transpose
 
 
 class PaperResampler(GridOperator):
@@ -90,7 +90,7 @@ class PaperResampler(GridOperator):
                 chain(*ends, band, min(group, batch - start))
 
 
-class AlignedFactors(Factors):
+class AlignedFactors(PaperFactors):
     """Eq. `compact_sinc_sep`: inner index (y, nu_x), y a model row, x the axis that is shifted.
 
     F = I1^(y, nu_x) exp(2 pi i nu_x X_i),    P = sum_ym Pd^(nu_x, y_m) sinc(Y_l - y - y_m)
@@ -112,7 +112,7 @@ class AlignedFactors(Factors):
         """The waves of the steps i, and the factors P of each band and slab; see set_transfer."""
         (y, x), matrix = self.axes, self.mapping.matrix
         t = self.mapping.offset + shift
-        wave = self.wave(self.k_x, matrix[x, self.axis] * np.arange(self.n_i) + t[x])
+        wave = self.wave_planes(self.k_x, matrix[x, self.axis] * np.arange(self.n_i) + t[x])
         p = np.fft.fftshift(np.fft.ifft(d, axis=1 + y), axes=1 + y).swapaxes(1 + y, 2)
         p = p[:, : self.h_x] * np.where(np.arange(self.h_x) == 0, 1, 2)[:, None] / self.k_x
         p = self.table(np.stack([p.real, -p.imag], axis=2).reshape(len(d), 2 * self.h_x, -1))
@@ -130,11 +130,11 @@ class AlignedFactors(Factors):
                     self.unit_rows,
                     self.n_l,
                     self.k_y,
-                    Matrix(p.buffer, p.ld, offset=i * p.stride),
-                    Matrix(sincs.base_data, self.l_pad, self.l_pad),
-                    Matrix(kernel.base_data, self.l_pad, self.unit_rows * self.l_pad),
+                    MatrixBatch(p.buffer, p.ld, offset=i * p.stride),
+                    MatrixBatch(sincs.base_data, self.l_pad, self.l_pad),
+                    MatrixBatch(kernel.base_data, self.l_pad, self.unit_rows * self.l_pad),
                 )(slab.n_units)
-                slabs.append(both_ways(self.device, kernel, self.n_l))
+                slabs.append(with_transpose(self.device, kernel, self.n_l))
         return (wave, wave), kernels  # a line's kernels use the second wave alone
 
     def analyse(self, x: ImageBatch, n):
@@ -146,7 +146,7 @@ class AlignedFactors(Factors):
         self.from_half(n, c=x)
 
 
-class RotatedFactors(Factors):
+class RotatedFactors(PaperFactors):
     """Eq. `fast_reconvampling` for any affine mapping: inner index (nu_y, nu_x) with nu_y >= 0.
 
     F = I1^(nu) exp(2 pi i nu.(i a + t)),    P = D(nu) exp(2 pi i nu.(l b))
@@ -166,7 +166,7 @@ class RotatedFactors(Factors):
     def prepare(self):
         """Also the transform along the model's columns."""
         super().prepare()
-        in_y = trigonometric(self.n_y, self.k_y)
+        in_y = cos_sin_table(self.n_y, self.k_y)
         self.in_y, self.in_y_t = self.table(in_y), self.table(in_y.T)
 
     def make_kernels(self, d, shift):
@@ -174,9 +174,9 @@ class RotatedFactors(Factors):
         a, b = self.mapping.matrix[:, self.axis], self.mapping.matrix[:, 1 - self.axis]
         t, k = self.mapping.offset + shift, (self.k_y, self.k_x)
         steps_i, steps_l = np.arange(self.n_i), np.arange(self.n_l)
-        waves_i = [self.wave(k[j], a[j] * steps_i + t[j]) for j in (0, 1)]
+        waves_i = [self.wave_planes(k[j], a[j] * steps_i + t[j]) for j in (0, 1)]
         # conj(P), so that the sum of products is the real part: conj(D) and the opposite steps
-        waves_l = [self.wave(k[j], -b[j] * steps_l) for j in (0, 1)]
+        waves_l = [self.wave_planes(k[j], -b[j] * steps_l) for j in (0, 1)]
         d = d[:, : self.h_y].conj() / (self.k_y * self.k_x)
         d[:, 1:] *= 2  # -nu as well
         plus, minus = d[:, :, : self.h_x], d[:, :, -np.arange(self.h_x)]
@@ -193,7 +193,7 @@ class RotatedFactors(Factors):
                 kernel = self.device.zeros((slab.n_rows, self.l_pad), self.dtype)
                 launch, _ = self.shifts.bind(slab, z, waves_l, kernel, n_cols, self.l_pad, 1)
                 launch()
-                kernels[-1].append(both_ways(self.device, kernel, self.n_l))
+                kernels[-1].append(with_transpose(self.device, kernel, self.n_l))
         return waves_i, kernels
 
     def bind(self):

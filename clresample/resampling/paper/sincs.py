@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ...device.contraction import Contraction, Matrix, padded
+from ...device.contraction import Contraction, MatrixBatch, row_stride
 from ...device.tuning import Tuning
 from ...sky.psf import PSF
 from ..transfer import transfer_function
@@ -52,7 +52,7 @@ def interpolate_psf(device, matrix, psf: PSF, n_fft, fine=1):
     axes = [(np.arange(fine * k) - fine * k // 2) / fine for k in n_fft]
     x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     q = x @ np.linalg.inv(matrix).T / psf.spacing
-    (n_y, n_x), n_pad = psf.images.shape[1:], padded(psf.images.shape[2])
+    (n_y, n_x), n_pad = psf.images.shape[1:], row_stride(psf.images.shape[2])
     along_y, group = Contraction(device, dtype), Tuning.of(device, dtype).line_group
     along_x = device.launcher("warp.cl", "rowdot", dtype=dtype, local_size=(group, 1))
     result, n_block = np.empty((psf.n_bands, len(q))), min(POSITIONS, len(q))
@@ -63,13 +63,13 @@ def interpolate_psf(device, matrix, psf: PSF, n_fft, fine=1):
     along_x.bind(n_pad=n_pad, n=n_x, n_bands=1, n_tables=1, y=values, y_offset=0, T=sums, E=columns)
     for band, image in enumerate(psf.images):
         samples = device.put(np.pad(image, ((0, 0), (0, n_pad - n_x))), dtype)
-        samples = Matrix(samples.base_data, n_pad)
+        samples = MatrixBatch(samples.base_data, n_pad)
         for start in range(0, len(q), n_block):
             block = q[start : start + n_block] + psf.center[band]
             n = len(block)
             sinc_table(device, block[:, 0], 0, n_y, rows, n_y, 1)
             sinc_table(device, block[:, 1], 0, n_x, columns, n_pad, 1)
-            tall = Matrix(rows.base_data, n_y), samples, Matrix(sums.base_data, n_pad)
+            tall = MatrixBatch(rows.base_data, n_y), samples, MatrixBatch(sums.base_data, n_pad)
             along_y.bind(n, n_x, n_y, *tall)(1)
             along_x((n, 1), n_positions=n)
             result[band, start : start + n] = device.get(values)[:n]

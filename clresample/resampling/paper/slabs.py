@@ -1,4 +1,4 @@
-"""How much of the paper's scheme is worked on at once."""
+"""Slabs of the paper's scheme: the part worked on at once."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Slab:
         self.n_rows = self.n_chunks * self.chunk
 
 
-def cut(n_units, unit_rows, n_slabs, chunk_terms):
+def cut_slabs(n_units, unit_rows, n_slabs, chunk_terms):
     """`n_units` units of `unit_rows` terms in `n_slabs` slabs, which differ by one unit at most."""
     n_slabs = min(n_slabs, n_units)
     ends = np.linspace(0, n_units, n_slabs + 1).astype(int)

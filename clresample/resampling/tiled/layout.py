@@ -7,14 +7,14 @@ from itertools import product
 
 import numpy as np
 
-from ...device.contraction import padded
+from ...device.contraction import row_stride
 from ...device.tuning import Tuning
-from ...sky.extent import intersection
+from ...sky.extent import grid_intersection
 from ...sky.grid import Grid
 from ...sky.mapping import Mapping
 from ...sky.psf import PSF
 from ..affine import kept_taps
-from ..plan import Precision, make_plan
+from ..plan import Precision, make_resampling_plan
 from ..transfer import wrap_radius
 
 GEOMETRIES = ("aligned", "affine", "distorted")  # from the cheapest on
@@ -29,21 +29,21 @@ SIDES = np.unique(np.rint(8 * 2 ** (np.arange(45) / 4)).astype(int))
 
 
 @dataclass(frozen=True)
-class Tile:
+class OutputTile:
     """One tile of the observed frame.
 
     origin (2,) [observed px]: its first pixel
-    place (2,) [model px]: its window's first pixel; rarely whole
+    window_origin (2,) [model px]: its window's first pixel; rarely whole
     mask (My, Mx) bool: the pixels it gives to the frame; each pixel has one giver
     """
 
     origin: tuple[int, int]
-    place: np.ndarray
+    window_origin: np.ndarray
     mask: np.ndarray
 
 
 @dataclass(frozen=True)
-class Group:
+class TileGroup:
     """Tiles that share one operator, from a window of the model to a tile, wherever these lie.
 
     taper (Ny,), (Nx,): weights of the window's rows and columns
@@ -51,7 +51,7 @@ class Group:
 
     mapping: Mapping
     taper: tuple[np.ndarray, np.ndarray]
-    tiles: list[Tile]
+    tiles: list[OutputTile]
 
 
 def make_groups(
@@ -64,7 +64,7 @@ def make_groups(
     tolerance_px: float,
     tuning: Tuning,
     memory: int,
-) -> list[Group]:
+) -> list[TileGroup]:
     """Tiles that give every observed pixel on the model once, in groups that share an operator.
 
     grid_in, psf_in: the model's; grid_out, psf_out: the observation's
@@ -75,14 +75,14 @@ def make_groups(
     Raises ValueError for grids that do not overlap, band counts that do not match, and a memory
     that is too small for the smallest tile.
     """
-    region = intersection([grid_in, grid_out], like=grid_out)
+    region = grid_intersection([grid_in, grid_out], like=grid_out)
     corner = np.rint(region.map_to(grid_out).at(0, 0)).astype(int)
     shape = tuple(min(n, TRIAL_PX) for n in region.shape)
     middle = [(n - m) // 2 for n, m in zip(region.shape, shape, strict=True)]
     trial = region.cutout(*middle, shape).map_to(grid_in, tolerance_px)
     radius = np.array(wrap_radius(psf_out, trial.matrix))
     margin = np.ceil(radius * FLAT + np.maximum(radius * (1 - FLAT), TAPER_PX)).astype(int)
-    sizes = Sizes(trial, margin, psf_in, psf_out, precision, tuning)
+    sizes = TileCosts(trial, margin, psf_in, psf_out, precision, tuning)
     geometry = trial.geometry
     while True:
         shape = sizes.choose(geometry, region.shape, memory)
@@ -90,11 +90,11 @@ def make_groups(
         if worst == geometry:
             break
         geometry = worst  # its tiles cost more, so that another size is the quickest
-    groups: list[Group] = []
+    groups: list[TileGroup] = []
     for start, mapping, mask in tiles:
         group, place = _find(groups, mapping, margin, margin - radius * FLAT, tolerance_px)
         y, x = (int(a + b) for a, b in zip(corner, start, strict=True))
-        group.tiles.append(Tile((y, x), place, mask))
+        group.tiles.append(OutputTile((y, x), place, mask))
     if not groups:
         raise ValueError(
             f"grids do not overlap: no pixel of the observation {grid_out.shape} lies on the model "
@@ -103,8 +103,8 @@ def make_groups(
     return groups
 
 
-class Sizes:
-    """What tiles of any size cost, from one small plan.
+class TileCosts:
+    """Costs of tiles of any size, from one small plan.
 
     Small tiles spend their time on the margins of their windows, large ones on matrix products that
     grow as the cube of a side, and no larger one may exceed the memory. Which size is the quickest
@@ -117,7 +117,7 @@ class Sizes:
     def __init__(self, trial: Mapping, margin, psf_in: PSF, psf_out: PSF, precision, tuning):
         geometry = "affine" if trial.geometry == "distorted" else trial.geometry
         window = window_of(replace(trial, geometry=geometry, positions=None, area=None), margin)
-        plan = make_plan(window, psf_in, psf_out, precision=precision)
+        plan = make_resampling_plan(window, psf_in, psf_out, precision=precision)
         n_fft = plan.certificate.n_fft
         self.tuning = tuning
         self.n_bands, self.itemsize = plan.n_bands, 4 if precision == Precision.of("f4") else 8
@@ -138,22 +138,25 @@ class Sizes:
         return self.account(geometry, m, *self.sides(m))
 
     def sides(self, m):
-        """Of a tile of m x m observed pixels, at most: pixels n of a side of its window, waves k
-        that each axis has, and columns j that its lines cross."""
+        """Sides of a tile of m x m observed pixels: window pixels n, waves k, columns j.
+
+        At most: pixels of a side of its window, waves that each axis has, columns that its lines
+        cross.
+        """
         n = int(np.ceil(self.scale * (m - 1))) + self.border
         k = 2 * (int(self.band * (n + self.pad)) + 1)
         return n, k, int(self.columns * self.scale * m) + self.taps + 1
 
     def account(self, geometry, m, n, k, j):
-        """What `cost` says, from the sides of all matrices: those that the executors have."""
+        """Terms of `cost`, from the sides of all matrices: those that the executors have."""
         rows = m * m if geometry == "distorted" else m
-        wide, crossed = padded(k), padded(j)
+        wide, crossed = row_stride(k), row_stride(j)
         flops = n * n * k + n * k * k
-        tables = 2 * n * k + k * padded(n) + n * wide + 2 * rows * k
+        tables = 2 * n * k + k * row_stride(n) + n * wide + 2 * rows * k
         each_band = (max(n, rows) + 2 * k) * wide + 2 * (n * n + m * m)  # images: both ways
         if geometry == "aligned":
             flops += m * k * k + m * m * k
-            tables += k * padded(m) + m * wide
+            tables += k * row_stride(m) + m * wide
         elif geometry == "affine":
             flops += k * k * j + m * k * j + m * m * self.taps
             tables += 2 * k * crossed + j * wide
@@ -227,7 +230,7 @@ def _find(groups, mapping, margin, width, tolerance_px):
         low = np.floor(inside.min(axis=0)).astype(int) - margin
         shape = np.ceil(inside.max(axis=0)).astype(int) + margin - low + 1
         window = mapping.window(low, tuple(int(n) for n in shape), (0, 0), mapping.shape_out)
-        groups.append(Group(window, _taper(window.shape_in, width), []))
+        groups.append(TileGroup(window, _taper(window.shape_in, width), []))
         return groups[-1], low.astype(float)
     for group in groups:
         if group.mapping.geometry != mapping.geometry:
@@ -238,7 +241,7 @@ def _find(groups, mapping, margin, width, tolerance_px):
             break
     else:
         window = window_of(mapping, margin)
-        group = Group(window, _taper(window.shape_in, width), [])
+        group = TileGroup(window, _taper(window.shape_in, width), [])
         groups.append(group)
     window = group.mapping
     return group, mapping.matrix @ middle + mapping.offset - window.matrix @ middle - window.offset

@@ -9,19 +9,19 @@ import numpy as np
 from tqdm import tqdm
 
 from ...device.tuning import Tuning
-from ...sky.extent import box_slices, shared_part
-from ...sky.given.checks import float_type
-from ...sky.given.observed import PSFLike, as_psf
+from ...sky.extent import box_slices, intersect_boxes
 from ...sky.grid import GridLike, as_grid
 from ...sky.psf import PSF
+from ...sky.validation.checks import check_dtype
+from ...sky.validation.observed import PSFLike, as_psf
 from ..grid_operator import GridOperator
-from ..linop import HostOp, LinOp
-from ..plan import Precision, is_identity, make_plan
+from ..linop import HostLinOp, LinOp
+from ..plan import Precision, is_identity, make_resampling_plan
 from ..resampler import Resampler
-from .layout import GEOMETRIES, Group, make_groups
+from .layout import GEOMETRIES, TileGroup, make_groups
 
 
-class TiledResampler(HostOp, GridOperator):
+class TiledResampler(HostLinOp, GridOperator):
     """The operator of `Resampler` on frames of any size, tile by tile.
 
         I2[tile] = R_tile I1[window]
@@ -62,7 +62,7 @@ class TiledResampler(HostOp, GridOperator):
     ):
         grid_in, grid_out = as_grid("grid_in", grid_in), as_grid("grid_out", grid_out)
         model_psf, seen_psf = as_psf("psf_in", psf_in), as_psf("psf_out", psf_out)
-        dtype = float_type(dtype)
+        dtype = check_dtype(dtype)
         n_bands = max(model_psf.n_bands, seen_psf.n_bands)
         shapes = (n_bands, *grid_in.shape), (n_bands, *grid_out.shape)
         LinOp.__init__(self, device, dtype, *shapes)
@@ -100,7 +100,10 @@ class TiledResampler(HostOp, GridOperator):
 
     @cached_property
     def mapping(self):
-        """Where the observed pixels lie in the model's, of the whole frame; made when asked for."""
+        """Mapping of the observed pixels of the whole frame into the model's.
+
+        Made when first read.
+        """
         return self.grid_out.map_to(self.grid_in, self.tolerance_px)
 
     @property
@@ -119,7 +122,7 @@ class TiledResampler(HostOp, GridOperator):
 
     @property
     def certificate(self):
-        """What the set-up of the first tile found."""
+        """Findings of the set-up of the first tile."""
         return self._operators.of(self.groups[0]).certificate
 
     def _forward(self, x, out):
@@ -154,7 +157,7 @@ class TiledResampler(HostOp, GridOperator):
         ) as bar:
             for group in self.groups:
                 for tile in group.tiles:
-                    place = tile.place + self.shift
+                    place = tile.window_origin + self.shift
                     first = place + group.mapping.offset
                     if self._operators.copy(group) and (first == np.rint(first)).all():
                         yield None, tile, first.astype(int)
@@ -174,23 +177,28 @@ class TileOperators:
 
     def __init__(self, psf_in: PSF, psf_out: PSF, dtype, device):
         self.psf_in, self.psf_out, self.dtype, self.device = psf_in, psf_out, dtype, device
-        self._group: Group | None = None
+        self._group: TileGroup | None = None
         self._op: Resampler | None = None
 
-    def of(self, group: Group) -> Resampler:
+    def of(self, group: TileGroup) -> Resampler:
         """The operator from a window of the group to its tile, without the tile's shift."""
         if self._op is None or self._group is not group:
             self._group, self._op = None, None  # frees the memory first
             precision = Precision.of(self.dtype)
-            plan = make_plan(group.mapping, self.psf_in, self.psf_out, precision=precision)
+            plan = make_resampling_plan(
+                group.mapping, self.psf_in, self.psf_out, precision=precision
+            )
             y, x = (group.taper[axis] for axis in plan.axes)
             plan = replace(plan, in_y=plan.in_y * y, in_x=plan.in_x * x)
             self._op = Resampler.from_plans([plan], dtype=self.dtype, device=self.device)
             self._group = group
         return self._op
 
-    def copy(self, group: Group) -> bool:
-        """Whether the group's pixels and PSFs are the same: a tile is its window's middle."""
+    def copy(self, group: TileGroup) -> bool:
+        """Returns True if the group's pixels and PSFs are the same.
+
+        A tile is its window's middle.
+        """
         shape = group.mapping.shape_out
         mapping = replace(group.mapping, shape_in=shape, offset=np.zeros(2))
         return is_identity(mapping, self.psf_in, self.psf_out)
@@ -199,12 +207,12 @@ class TileOperators:
 def _cut(frame, origin, shape):
     """The window of a frame (..., Ny, Nx) from `origin` on, zero beyond its edges."""
     window = np.zeros((*frame.shape[:-2], *shape), frame.dtype)
-    there, here = shared_part((0, 0), frame.shape[-2:], origin, shape)
+    there, here = intersect_boxes((0, 0), frame.shape[-2:], origin, shape)
     window[(..., *here)] = frame[(..., *there)]
     return window
 
 
 def _add(frame, origin, window):
     """Add a window to a frame (..., Ny, Nx) from `origin` on, as far as they meet."""
-    there, here = shared_part((0, 0), frame.shape[-2:], origin, window.shape[-2:])
+    there, here = intersect_boxes((0, 0), frame.shape[-2:], origin, window.shape[-2:])
     frame[(..., *there)] += window[(..., *here)]

@@ -26,7 +26,7 @@ BETA = np.pi * np.sqrt((TAPS * (1 - 0.5 / PADDING)) ** 2 - 0.8)
 BLOCK = 1 << 20
 
 
-def transform_at(images, f, g):
+def nufft_type2(images, f, g):
     """Sums (B, ...) complex128 of images (B, ny, nx) at f, g (...) [cycles per sample].
 
     Positions count from the image's first sample.

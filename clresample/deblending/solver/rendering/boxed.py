@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ....device.contraction import stretch, whole
+from ....device.contraction import round_up_columns, terms_per_block
 
 # The columns of the kernel's table, each int64.
 COLUMNS = ["m", "n", "k", "begin_a", "ld_a", "next_a", "begin_b", "ld_b", "skip"]
@@ -28,12 +28,12 @@ class BoxedProduct:
         items = [np.broadcast_to(sizes[name], b.n_sources) for name in COLUMNS]
         tile, m, width = _tile(b.tuning), max(items[0]), max(items[1] + items[8])
         group = tile["WGX"], tile["WGY"]
-        along = math.ceil(whole(int(width)) / (tile["VW"] * tile["NV"]))
+        along = math.ceil(round_up_columns(int(width)) / (tile["VW"] * tile["NV"]))
         tiles = b.along_row(along), int(m) / tile["MR"]
         self._size = tuple(math.ceil(n / g) * g for n, g in zip(map(math.ceil, tiles), group))
         self._launch = b.device.launcher(
             "boxed.cl",
-            "boxed",
+            "multiply_boxes",
             dtype=b.dtype,
             local_size=(*group, 1),
             STRIDED=strided,
@@ -41,7 +41,7 @@ class BoxedProduct:
             **tile,
         ).bind(
             items=b.device.put(np.stack(items, axis=1), np.int64),
-            block=stretch(int(max(items[2]))),
+            block=terms_per_block(int(max(items[2]))),
             inward=inward,
         )
 
@@ -51,8 +51,10 @@ class BoxedProduct:
 
 
 def _tile(tuning):
-    """Macros of the kernel: the contraction's where a work-item has a tile to itself; else groups
-    of 64 that own 32 rows and 16 vectors of a row, since boxes are lower than frames."""
+    """Macros of the kernel: the contraction's where a work-item has a tile to itself.
+
+    Else groups of 64 that own 32 rows and 16 vectors of a row, since boxes are lower than frames.
+    """
     if tuning.row_loops:
         return tuning.tile
     return {"VW": tuning.tile["VW"], "NV": 1, "MR": 8, "WGX": 16, "WGY": 4}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 
-class Composition:
+class SpectralComposition:
     """Sums over sources of one observation's frames, which any stage of rendering may have.
 
         frame[b, c] = sum_s A[s, c] boxed_s        d_boxed_s = sum_c A[s, c] frame[b, c] on the box
@@ -27,7 +27,7 @@ class Composition:
         n_bands, n_channels, channel = part.stop - part.start, b.n_channels, part.start
         self._parts = None
         if b.scenes[0].shares_of(i_observation) is not None:
-            self._parts = _Parts(b, i_observation, part)
+            self._parts = _TermSpectra(b, i_observation, part)
             n_bands = n_channels = self._parts.n_frames
             channel = 0
         group, n_images = b.tuning.sum_group, len(b.scenes) * n_bands
@@ -58,8 +58,8 @@ class Composition:
         )
         tallest, widest = boxes.shape.max(0).tolist()
         self._morph_size = b.sized(widest, tallest, 1)[:2]
-        self._spectra.bind(active=b.everyone)
-        self._spectra_size = group, n_bands, b.everyone.size
+        self._spectra.bind(active=b.all_sources)
+        self._spectra_size = group, n_bands, b.all_sources.size
 
     def compose(self, boxed, spectra, frame):
         """Queue frame = sum_s A boxed_s, times the transfer function where there is one."""
@@ -88,7 +88,7 @@ class Composition:
             self._parts.gather(d_spectra)
 
 
-class _Parts:
+class _TermSpectra:
     """Spectra of one observation's terms, (S, Co * T): kernels/scene.cl, share and unshare.
 
     buffers: the batch; i: which observation; channels: slice of all
@@ -110,7 +110,7 @@ class _Parts:
                 channel=channels.start,
                 shares=b.put(shares),
             )
-            for name in ("share", "unshare")
+            for name in ("split_spectra", "merge_spectra")
         )
         self._size = b.sized(n_bands, n_sources, 1)
         self._share.bind(n_sources=n_sources)

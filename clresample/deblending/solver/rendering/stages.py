@@ -11,7 +11,7 @@ and backwards, Q_c being what the observation's residuals are there:
 
     depth 2    dS_s = Ty[:, rows_s]^T (sum_c A_sc Q_c) Tx[cols_s]^T,    dA_sc = <Z_s, Q_c>
 
-All three are the same sum, to rounding; choice.py says which takes least. Symbols as in
+All three are the same sum, to rounding; stage_selection.py says which takes least. Symbols as in
 resampling/executor.py. Where the PSF varies, each Z_c is a sum over the operator's terms, and A_sc
 the part of the spectrum that a source has in each (composition.py).
 """
@@ -22,13 +22,13 @@ import functools
 
 import numpy as np
 
-from ....device.contraction import COLUMN_PAD, ImageBatch, padded, whole
+from ....device.contraction import COLUMN_PAD, ImageBatch, round_up_columns, row_stride
 from ..boxes import Boxes
 from .boxed import BoxedProduct
-from .composition import Composition
+from .composition import SpectralComposition
 
 
-class Frames:
+class FrameRendering:
     """Depth 0: models M_c in full frames, each rendered as an image.
 
     buffers: the batch; i_observation: of it; op: the batch's operator there
@@ -40,7 +40,9 @@ class Frames:
         self.buffers, self._op = buffers, op
         n = len(buffers.scenes)
         self._model = buffers.device.empty((n, *op.shape_in), buffers.dtype)
-        self._composition = Composition(buffers, i_observation, buffers.host_boxes, op.shape_in[1:])
+        self._composition = SpectralComposition(
+            buffers, i_observation, buffers.host_boxes, op.shape_in[1:]
+        )
 
     def transform(self, morph):
         """Take these morphologies (boxes.size,) for all that is queued next."""
@@ -51,7 +53,7 @@ class Frames:
         self._composition.compose(self._morph, spectra, self._model)
         self._op.queue_plain("forward", self._model, image)
 
-    def collect(self, image):
+    def back_project(self, image):
         """Queue the way back of an image (B, Co, My, Mx), whose gradients are asked for next."""
         self._op.queue_plain("adjoint", image, self._model)
 
@@ -63,11 +65,11 @@ class Frames:
         """Queue dS of the sources `active` (n,): written into d_morph, or added to it."""
         self._composition.gather_boxed(self._model, spectra, d_morph, active, add=add)
 
-    def follow_shifts(self):
+    def update_shifts(self):
         """Nothing to do: what it has of the operator is the operator's own."""
 
 
-class Transformed:
+class BoxTransformRendering:
     """Depth 1 or 2: each source's box transformed along one axis, or both; as Frames."""
 
     def __init__(self, buffers, i_observation, op, depth):
@@ -85,25 +87,25 @@ class Transformed:
             transfer = e.tables(e.transfer)[:2]
             self._boxed, self._frame = self._empty(boxes), e.model_frequencies
         self._d_boxed = self._empty(boxes)
-        self._composition = Composition(b, i_observation, boxes, shape, transfer)
+        self._composition = SpectralComposition(b, i_observation, boxes, shape, transfer)
 
     def _empty(self, boxes):
         return self.buffers.device.empty(boxes.size, self.buffers.dtype)
 
     def transform(self, morph):
         b, e = self.buffers, self._executor
-        self._boxes.to_lines(morph, e.in_x_t.buffer, self._lines, b.everyone)
+        self._boxes.to_lines(morph, e.in_x_t.buffer, self._lines, b.all_sources)
         if self.depth == 2:
-            self._boxes.to_planes(e.in_y.buffer, self._lines, self._boxed, b.everyone)
+            self._boxes.to_planes(e.in_y.buffer, self._lines, self._boxed, b.all_sources)
 
     def render(self, spectra, image):
         self._composition.compose(self._boxed, spectra, self._frame)
         if self.depth == 1:
             self._executor.in_rows(self._n_images * self._executor.n_terms)
-        self._executor.show(ImageBatch.of(image), self._n_images)
+        self._executor.render_from_frequencies(ImageBatch.of(image), self._n_images)
 
-    def collect(self, image):
-        self._executor.take(ImageBatch.of(image), self._n_images)
+    def back_project(self, image):
+        self._executor.adjoint_to_frequencies(ImageBatch.of(image), self._n_images)
         if self.depth == 1:
             self._executor.back_rows(self._n_images * self._executor.n_terms)
 
@@ -118,7 +120,7 @@ class Transformed:
             self._boxes.from_planes(e.in_y_t.buffer, self._d_boxed, d_lines, active)
         self._boxes.from_lines(d_lines, e.in_x.buffer, d_morph, active, add=add)
 
-    def follow_shifts(self):
+    def update_shifts(self):
         """Nothing to do, as for Frames."""
 
 
@@ -138,7 +140,7 @@ class _Boxes:
         self._buffers, self._executor = b, e
         # frequencies of the sources' own scenes: elements of a row, and those that are not padding
         self._k_y, self._k_x = (k[own.scene % len(k)] for k in (e.k_ys, e.k_xs))
-        self._wide = whole(self._k_x)
+        self._wide = round_up_columns(self._k_x)
         zero = np.zeros(n, np.int32)
         self.lines = Boxes(
             own.scene,
@@ -152,7 +154,7 @@ class _Boxes:
         return Boxes(scene, np.zeros_like(shape), shape)
 
     def _image(self, letter):
-        """Where the morphologies lie, as matrix A or C of a product."""
+        """Layout of the morphologies as matrix A or C of a product."""
         own = self._buffers.host_boxes
         steps = own.shape[:, 1], 1
         ld, step = steps if self._axes == [0, 1] else steps[::-1]
@@ -228,7 +230,7 @@ class _Boxes:
             begin_a=self.lines.offset,
             ld_a=self._wide,
             begin_b=self._begin(e.in_x, aligned),
-            ld_b=padded(e.n_x),
+            ld_b=row_stride(e.n_x),
             skip=self._column0 - aligned,
             **self._image("c"),
         )

@@ -20,7 +20,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Ties:
-    """Which channels belong to which band.
+    """Assignment of channels to bands.
 
     bands (C,): the number of each channel's band, counted by their first channels
     """

@@ -1,4 +1,4 @@
-"""One observation of large scenes, rendered in windows: neighbouring sources in one small frame.
+"""Renders large scenes in windows: neighbouring sources in one small frame.
 
 Products along whole frames grow with the cube of their side. Here sources are taken together by
 the cell of the frame in which their boxes' middles lie, each group in a frame of its own that
@@ -24,7 +24,7 @@ from ..boxes import Boxes
 ROUND_PX = 16
 
 
-class Groups:
+class WindowGroups:
     """Sources of a batch by the cell of `cell` (2,) [px] in which their boxes' middles lie.
 
     boxes: the batch's; which (n,): the sources that are meant
@@ -51,13 +51,15 @@ class Groups:
         return len(self.scene)
 
     def buffers(self, buffers):
-        """The batch with a scene for each group: the same arrays, other boxes, and only the sources
-        that are meant."""
+        """The batch with a scene for each group.
+
+        Same arrays, other boxes, its own sources alone.
+        """
         b, own = copy.copy(buffers), buffers.host_boxes
         b.scenes = [buffers.scenes[i] for i in self.scene]
         b.host_boxes = Boxes(self.group, own.origin - self.low[self.group], own.shape, own.center)
         b.boxes = b.host_boxes.put(b.device)
-        b.everyone = b.device.put(self.which, np.int32)
+        b.all_sources = b.device.put(self.which, np.int32)
         group = self.group[self.which]
         counts = np.bincount(group, minlength=len(self))
         b.first = b.device.put(np.concatenate([[0], np.cumsum(counts)]), np.int32)
@@ -66,12 +68,15 @@ class Groups:
 
 
 def reach_of(plan):
-    """How far [model px] the light of a group is followed: as far as frames are padded for it."""
+    """Distance [model px] to which the light of a group is followed.
+
+    As far as frames are padded.
+    """
     return max(plan.certificate.wrap_radius_px)
 
 
 class WindowOperator:
-    """What sees the frames of `groups` as `op` sees the scenes' own: (G, C, ny, nx) to windows.
+    """Renders the frames of `groups` as `op` renders the scenes' own: (G, C, ny, nx) to windows.
 
     shape_in, shape_out (3,); low (G, 2): the windows' first pixels in the observation
     """
@@ -94,8 +99,8 @@ class WindowOperator:
         self._executor.set_transfer([self.plan.shifted(move) for move in moves])
 
     def executor(self):
-        """What computes it, with intermediates of its own."""
-        return self._executor.apart()
+        """Executor with intermediates of its own."""
+        return self._executor.clone()
 
     def queue_plain(self, way, source, target):
         """Queue "forward", windows = R frames of all groups, or "adjoint", frames = R^T windows."""
@@ -104,7 +109,7 @@ class WindowOperator:
         getattr(self._executor, way)(ImageBatch.of(source), ImageBatch.of(target), n)
 
 
-class _Part:
+class _GroupRendering:
     """One set of Groups: their frames' rendering, and their windows of the observation."""
 
     def __init__(self, buffers, i_observation, op, groups, make):
@@ -119,8 +124,8 @@ class _Part:
         shared["windows"] = self.windows
         first = np.searchsorted(groups.scene, np.arange(len(buffers.scenes) + 1))
         launcher = functools.partial(buffers.launcher, "windows.cl", n_axes=3)
-        self._assemble = launcher("assemble").bind(**shared, first=put(first))
-        self._cut = launcher("cut").bind(**shared, scene=put(groups.scene))
+        self._assemble = launcher("add_windows").bind(**shared, first=put(first))
+        self._cut = launcher("cut_windows").bind(**shared, scene=put(groups.scene))
         self._assemble_size = buffers.sized(m_x, m_y, len(buffers.scenes) * n_bands)
         self._cut_size = buffers.sized(w_x, w_y, len(groups) * n_bands)
 
@@ -128,16 +133,16 @@ class _Part:
         self.inner.render(spectra, self.windows)
         self._assemble(self._assemble_size, image=image, add=add)
 
-    def collect(self, image):
+    def back_project(self, image):
         self._cut(self._cut_size, image=image)
-        self.inner.collect(self.windows)
+        self.inner.back_project(self.windows)
 
-    def follow_shifts(self):
+    def update_shifts(self):
         self.seen_by.place()
         self.seen_by.op.device.upload(self.seen_by.low.astype(np.int32), self._low)
 
 
-class Windows:
+class WindowRendering:
     """Rendering in windows; methods as those of stages.Frames.
 
     buffers: the batch; i_observation: of it; op: the batch's operator there, of one plan
@@ -149,7 +154,7 @@ class Windows:
 
     def __init__(self, buffers, i_observation, op, parts, make):
         self.buffers = buffers
-        self.parts = [_Part(buffers, i_observation, op, groups, make) for groups in parts]
+        self.parts = [_GroupRendering(buffers, i_observation, op, groups, make) for groups in parts]
         self._active: dict = {}
 
     def transform(self, morph):
@@ -162,10 +167,10 @@ class Windows:
         for i, part in enumerate(self.parts):
             part.render(spectra, image, i > 0)
 
-    def collect(self, image):
+    def back_project(self, image):
         """Queue the way back of an image (B, Co, My, Mx), whose gradients are asked for next."""
         for part in self.parts:
-            part.collect(image)
+            part.back_project(image)
 
     def gather_spectra(self, d_spectra):
         """Queue dA of this observation's channels into d_spectra (S, C)."""
@@ -178,10 +183,10 @@ class Windows:
             if own is not None:
                 part.inner.gather_morph(spectra, d_morph, own, add=add)
 
-    def follow_shifts(self):
+    def update_shifts(self):
         """Take over the shift that the operator has by now."""
         for part in self.parts:
-            part.follow_shifts()
+            part.update_shifts()
 
     def _own(self, active):
         """Of a device array of sources, the parts' own ones; None for a part that has none."""

@@ -1,0 +1,1 @@
+"""Commands that measure devices: `clresample devices --bench` and `clresample tune`."""

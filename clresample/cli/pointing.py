@@ -1,4 +1,0 @@
-"""Where the demonstration and the example put their simulated sky."""
-
-ANGLE_DEG = 20.0  # of Rubin's pixels against Euclid's
-CENTER_DEG = 150.1, 2.2  # right ascension, declination

@@ -1,0 +1,30 @@
+"""Bias of fluxes and sizes caused by the bound S >= 0.
+
+In a galaxy's wings structure follows the noise up, but not down: S >= 0 holds it. So the light of
+bright galaxies comes out 0.1 to 1 % too high, about half an error. Where a pixel is held the loss
+still has a slope; released along the modes it leads to the minimum without the bound, whose fluxes
+and moments are not biased so.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...sky.extent import box_slices
+
+
+def negative_chi2_gradient(scene, views, source, spectra, residuals):
+    """Minus the slopes of half chi2 by all pixels (ny, nx) of n morphologies with max = 1.
+
+    scene: Scene; views: WhitenedViews; source (n,): of each component, by which views know its PSF
+    spectra (n, C): theirs; residuals: data minus model (Co, My, Mx) of each view
+    """
+    out = [np.zeros(p.shape) for p in scene.profile]
+    for view, left, part in zip(views, residuals, scene.channels(), strict=True):
+        frames = view.op.adjoint((view.sqrt_weights**2 * left).astype(view.op.dtype))
+        own = spectra[:, part]
+        if view.coefficients is not None:
+            own = (own[:, :, None] * view.coefficients[source]).reshape(len(own), -1)
+        for image, origin, a in zip(out, scene.origin, own, strict=True):
+            image += np.tensordot(a, frames[:, *box_slices(origin, image.shape)], 1)
+    return out

@@ -1,0 +1,142 @@
+"""Second components for sources with a gradient of colour, kept where the fit gains by them."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+from ..blend import INTERRUPTED, ITERATION_LIMIT, STOPPED_FOR_REFIT
+from ..iterate import iterate
+from .colour_gradient import run_gradient_tests
+from .two_component_start import start_refits
+
+# What a second component must lower the loss by, for each number that it adds: a spectrum and a
+# profile's four. Half a unit each is what noise alone gives.
+MIN_GAIN = 1.0
+N_PROFILE = 4
+# [loss] By so much more than MIN_GAIN a second fit must be better than a first one that was taken
+# over; else the first one goes on to its end before they are compared. Twice what fits of HST and
+# HSC, and of a bright blend of HSC, still gained at most where they went on.
+MIN_DECISIVE_GAIN = 200.0
+# A second fit may take so many times `max_iter`: the first one, if it was taken over, has left some
+# of its own, and one in 40 fits of a bright blend of HSC needs more than 1.5.
+REFIT_ITER_FACTOR = 2.0
+
+
+def needs_second_component(fit):
+    """Returns True if a Fit in its present state clearly needs second components.
+
+    Where that cannot be told it goes on: `refit_two_components` asks again, and says in its
+    messages what is wrong.
+    """
+    try:
+        (asked,) = run_gradient_tests([fit])
+    except Exception:
+        return False
+    return asked is not None and len(asked.significant) > 0
+
+
+def refit_two_components(fits, settings, device, dtype, progress=None):
+    """Returns for ended Fits each itself, or a second fit with more components.
+
+    fits: of one signature; those STOPPED_FOR_REFIT go on to their end, unless a second one is
+        better than they can become; settings, device, dtype: theirs; progress: see `deblend`
+    returns Fits, in the order of `fits`
+    """
+    before = [fit.shifts for fit in fits]
+    again = _second_fits(fits, settings, device, dtype, progress)
+    after = {i: second.shifts for i, second in again.items()}
+    for i in again:
+        fits[i].shift(before[i])
+    if not any(second.status == INTERRUPTED for second in again.values()):
+        sure = [i for i, second in again.items() if _is_better(second, fits[i], MIN_DECISIVE_GAIN)]
+        going = [
+            fit for i, fit in enumerate(fits) if i not in sure and fit.status == STOPPED_FOR_REFIT
+        ]
+        _go_on(going, settings, device, dtype, _after(list(again.values()), _after(fits, progress)))
+    kept = list(fits)
+    for i, second in again.items():
+        if second.status != INTERRUPTED and _is_better(second, fits[i]):
+            second.shift(after[i])
+            kept[i] = _following(second, fits[i])
+        elif second.status == INTERRUPTED:
+            kept[i].interrupt()
+    for fit in kept:
+        if fit.status == STOPPED_FOR_REFIT:
+            fit.interrupt()
+    return kept
+
+
+def _second_fits(fits, settings, device, dtype, progress):
+    """{index: a Fit that has ended} with more components of those that need them.
+
+    None where that fails, which their messages say.
+    """
+    began, shifts = time.perf_counter(), [fit.shifts for fit in fits]
+    asked = fits
+    try:
+        again = start_refits(fits)
+        for fit in fits:
+            fit.note_seconds("components", (time.perf_counter() - began) / len(fits))
+        asked = [fits[i] for i in again]
+        if again:
+            longer = replace(settings, max_iter=int(REFIT_ITER_FACTOR * settings.max_iter))
+            iterate(list(again.values()), longer, device, dtype, _after(fits, progress))
+    except Exception as error:
+        for fit, shift in zip(fits, shifts, strict=True):
+            fit.shift(shift)
+        for fit in asked:
+            fit.messages.append(f"second components could not be fitted: {error}")
+        return {}
+    return again
+
+
+def _go_on(fits, settings, device, dtype, progress):
+    """Run fits that were STOPPED_FOR_REFIT to their end, from where they are.
+
+    Nobody asks them again.
+    """
+    if not fits:
+        return
+    before = [fit.seconds["fit"] for fit in fits]
+    for fit in fits:
+        fit.status = ITERATION_LIMIT
+        del fit.losses[-1]  # that of the present state, which comes first again
+    iterate(fits, settings, device, dtype, progress)
+    for fit, seconds in zip(fits, before, strict=True):
+        fit.note_seconds("fit", seconds + fit.seconds["fit"])
+
+
+def _following(second, first):
+    """The second fit, with the time of both."""
+    for stage, seconds in first.seconds.items():
+        second.note_seconds(stage, seconds + second.seconds.get(stage, 0.0))
+    return second
+
+
+def _is_better(second, first, more=0.0):
+    """Returns True if more components fit the data better, by more than their number costs.
+
+    The loss must fall by `more` than that, and chi2 as well: one component with stronger structure
+    may lower chi2 at a higher loss.
+    """
+    if second.strength_estimates is None or _half_chi2(second) > _half_chi2(first):
+        return False
+    n_more = len(second.state.morph) - len(first.state.morph)
+    n_spectra = first.state.spectra.shape[1] if first.ties is None else first.ties.n_bands
+    n_numbers = n_more * (N_PROFILE + n_spectra)
+    return second.losses[-1] < first.losses[-1] - MIN_GAIN * n_numbers - more
+
+
+def _half_chi2(fit):
+    """The loss of a finished fit without what its structure costs."""
+    free, found = ~fit.scene.fixed, fit.strength_estimates
+    return fit.losses[-1] - 0.5 * (found.energies[free] / found.strengths[free] ** 2).sum()
+
+
+def _after(fits, progress):
+    """`progress`, with the iterations of the first fits counted."""
+    if progress is None:
+        return None
+    n_first = max((len(fit.losses) for fit in fits), default=0)
+    return lambda n_steps, loss: progress(n_first + n_steps, loss)

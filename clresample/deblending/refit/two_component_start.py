@@ -1,0 +1,211 @@
+"""Starting models of two-component fits: of three candidates the one with the lowest chi2.
+
+Smooth profiles of two components are where a bulge and its disc begin. In a merger they would leave
+most of what one component has taken as structure: there it stays, with a core beside it.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import replace
+
+import numpy as np
+
+from ...sky.sources import ExtendedSource
+from ..blend import ITERATION_LIMIT
+from ..profiles import FixedProfile, GalaxyProfile
+from ..solver.multiscale.structure import coarse_count
+from ..solver.scene import StructureState
+from ..start.final_render import render_models
+from ..start.first_scene import first_scene
+from ..start.profile_start import StartInput, fit_start_profiles, profile_peak
+from .colour_gradient import model_of, run_gradient_tests
+
+# Sigma of a core that begins beside its component, as a part of this one's: that of a Gaussian's
+# square, as the core is whose colour was tested.
+CORE = 0.5**0.5
+
+
+def start_refits(fits):
+    """{index: a Fit at its start} of the scenes with sources that clearly need two components.
+
+    Of three starts the one that fits the data best where it begins, with the best spectra:
+    known   all else as the first fit has left it, structure and strengths too, and smooth profiles
+            of the two components alone, fitted to what that leaves of the data: real neighbours are
+            known from then on, but their structure may hold what one component could not take
+    whole   smooth profiles alone share the light, those of all else being the first start's
+    beside  all as the first fit has left it, and a core beside each component in question: real
+            structure is known from then on, whatever holds it
+    """
+    asked = {
+        i: one
+        for i, one in enumerate(run_gradient_tests(fits))
+        if one is not None and len(one.significant)
+    }
+    if not asked:
+        return {}
+    fit_sky = fits[0].settings.fit_sky
+    alone = fit_start_profiles([_alone(fits[i], one) for i, one in asked.items()])
+    patches = [_together(fits[i], one.significant) for i, one in asked.items()]
+    together = fit_start_profiles(patches, fit_sky=fit_sky)
+    starts = []
+    for (i, one), own, all_smooth in zip(asked.items(), alone, together, strict=True):
+        first = fits[i]
+        known = _again(first, _joined(first.start, own, one.significant))
+        known.state = _going_on(known.state, first, *_places(len(first.start), one.significant))
+        whole = _again(first, _as_before(all_smooth, first.start, one.significant))
+        beside = _again(first, _with_cores(first, one))
+        beside.state = _going_on(beside.state, first, *_cores(len(first.start), one.significant))
+        starts.append((known, whole, beside))
+    return dict(zip(asked, _best(starts, fit_sky), strict=True))
+
+
+def _best(starts, fit_sky):
+    """Selects of each scene's Fits at their starts the one with the lowest chi2.
+
+    All have as many starts; spectra and sky are the best there.
+    """
+    fits = [fit for of_scene in starts for fit in of_scene]
+    images, chi2 = render_models([model_of(fit) for fit in fits], fit_sky=fit_sky), []
+    for fit, seen in zip(fits, images, strict=True):
+        residuals = seen.residuals(fit.scene.channels(), fit.views)
+        pairs = zip(fit.views, residuals, strict=True)
+        chi2.append(sum(((view.sqrt_weights * left) ** 2).sum() for view, left in pairs))
+        fit.state = replace(fit.state, spectra=seen.spectra, sky=seen.sky)
+    best = np.reshape(chi2, (len(starts), -1)).argmin(axis=1)
+    return [of_scene[k] for of_scene, k in zip(starts, best, strict=True)]
+
+
+def _again(fit, point):
+    """A fit of the same views, where their shifts are by now, from another StartingPoint."""
+    new = copy(fit)
+    new.start = point
+    new.scene, new.state = first_scene(new)
+    new.losses, new.status, new.strength_estimates = [], ITERATION_LIMIT, None
+    new.messages, new.seconds = list(fit.messages), {}
+    new.last_steps = np.zeros_like(fit.last_steps)
+    return new
+
+
+def _together(fit, chosen):
+    """The start input of a fit in which the components `chosen` (k,) have two each.
+
+    Other galaxies of one component have the profiles of the first fit's start.
+    """
+    begin, sources = fit.start, list(fit.patch.sources)
+    for i, source in enumerate(sources):
+        own = np.flatnonzero(begin.source == i)
+        if own[0] in chosen:
+            sources[i] = replace(source, n_components=2)
+        elif len(own) == 1 and isinstance(begin.shapes[own[0]], GalaxyProfile):
+            profile = begin.drawn(own[0], (0, 0), fit.frame.shape)
+            sources[i] = replace(source, profile=profile, n_components=None)
+    return replace(fit.patch, sources=sources)
+
+
+def _as_before(point, begin, chosen):
+    """The StartingPoint of `_together`, with the Shapes of the first one for what it was given."""
+    before, new = _places(len(begin), chosen)
+    drawn = [isinstance(shape, FixedProfile) for shape in point.shapes]
+    held = np.flatnonzero(~new & drawn)
+    shapes, thetas = list(point.shapes), list(point.thetas)
+    places, peaks = point.drawn_positions.copy(), point.peaks.copy()
+    for k in held:
+        i = before[k]
+        shapes[k], thetas[k] = begin.shapes[i], begin.thetas[i]
+        places[k], peaks[k] = begin.drawn_positions[i], begin.peaks[i]
+    return replace(point, shapes=shapes, thetas=thetas, drawn_positions=places, peaks=peaks)
+
+
+def _alone(fit, asked):
+    """The Patch of the sources that need two components, all others' light taken off the data."""
+    chosen, begin = asked.significant, fit.start
+    spectra = fit.state.spectra.copy()
+    spectra[chosen] = 0
+    views = []
+    for view, seen, part in zip(fit.views, asked.observed, fit.scene.channels(), strict=True):
+        others = seen.total(spectra[:, part]) + fit.state.sky[part, None, None]
+        own = view.for_sources(begin.source[chosen])
+        views.append(replace(own, data=view.data - others))
+    positions = begin.positions[begin.source[chosen]]
+    sources = [ExtendedSource(position_px=tuple(map(float, p)), n_components=2) for p in positions]
+    return StartInput(fit.frame, sources, positions, views)
+
+
+def _joined(begin, point, chosen):
+    """A StartingPoint with the components of `point`, two each, in place of those `chosen` (k,)."""
+    order = []
+    for i in range(len(begin)):
+        own = 2 * np.flatnonzero(chosen == i)
+        order += [(point, own[0]), (point, own[0] + 1)] if len(own) else [(begin, i)]
+    source = [begin.source[chosen[k // 2]] if p is point else begin.source[k] for p, k in order]
+    parts = {
+        name: [getattr(p, name)[k] for p, k in order]
+        for name in (
+            "shapes",
+            "thetas",
+            "drawn_positions",
+            "peaks",
+            "spectra",
+            "spectrum_curvature",
+        )
+    }
+    arrays = {
+        name: np.array(parts[name])
+        for name in ("drawn_positions", "peaks", "spectra", "spectrum_curvature")
+    }
+    return replace(begin, source=np.array(source), **(parts | arrays))
+
+
+def _with_cores(fit, asked):
+    """The StartingPoint of a fit's components, and a core after each of those in question."""
+    begin, places = fit.start, fit.start.positions[fit.start.source]
+    before, new = _cores(len(begin), asked.significant)
+    thetas = [begin.thetas[i] for i in before]
+    peaks, power = begin.peaks[before], begin.spectrum_curvature[before]
+    power[new] = asked.power[np.isin(asked.components, asked.significant)]
+    for k, i in zip(np.flatnonzero(new), before[new], strict=True):
+        thetas[k] = thetas[k] + np.array([np.log(CORE), 0, 0, 0])
+        peaks[k] = profile_peak(
+            begin.shapes[i], thetas[k], begin.drawn_positions[i], places[i], fit.frame.shape
+        )
+    return replace(
+        begin,
+        source=begin.source[before],
+        shapes=[begin.shapes[i] for i in before],
+        thetas=thetas,
+        drawn_positions=begin.drawn_positions[before],
+        peaks=peaks,
+        spectra=begin.spectra[before],
+        spectrum_curvature=power,
+    )
+
+
+def _places(n, chosen):
+    """Maps the components of a second fit to the n of the first: (n + k,), bool (n + k,).
+
+    The second array says which are one of two; chosen (k,): the components that were split.
+    """
+    two = np.isin(np.arange(n), chosen)
+    return np.repeat(np.arange(n), 1 + two), np.repeat(two, 1 + two)
+
+
+def _cores(n, chosen):
+    """The same with cores beside the chosen components: whether it is a core."""
+    before, two = _places(n, chosen)
+    return before, two & (np.diff(before, prepend=-1) == 0)
+
+
+def _going_on(state, first, before, new):
+    """The morphologies of a State that are not new where the first fit has left them.
+
+    state: at the start of all; first: a finished Fit; before, new: see `_places`
+    """
+    end, steps = first.state, first.settings.prior.steps
+    known, structure, morph = end.learned, [], []
+    for i, is_new, begin in zip(before, new, state.morph, strict=True):
+        nothing = [np.zeros(coarse_count(begin.shape, step)) for step in steps]
+        structure.append(nothing if is_new else known.structure[i])
+        morph.append(begin if is_new else end.morph[i])
+    learned = StructureState(structure, known.strengths[before], known.clear[before])
+    return replace(state, morph=morph, learned=learned)

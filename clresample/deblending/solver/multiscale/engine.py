@@ -1,0 +1,239 @@
+"""Runs a batch of scenes under the prior that learns: rounds of trials, strengths, stops.
+
+    L = 1/2 sum_o |sqrt(w_o) (R_o M + sky - d_o)|^2 + 1/2 sum_c p_c sky_c^2
+        + 1/2 sum_sj |z_sj|^2 / alpha_sj^2,      p: Scene.known_sky
+
+A round costs one pair of operators for the whole batch. Each scene then does what its own loss
+asks for: it accepts its trial and takes a new direction, or goes back and takes a shorter step. The
+host decides, from sums of rows and chunks that are added in float64: a float32 loss of 3e5 is known
+to 0.05, a twentieth of what ends a fit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..buffers import SceneBuffers
+from ..gradient import LossGradient
+from ..scene import State, StructureState
+from .inverse import MAX_BLOCK_SIZE
+from .lbfgs_control import LbfgsControl
+from .lbfgs_pairs import LbfgsPairs
+from .lbfgs_steps import REST, STAY, TRY, LbfgsSteps
+from .strengths import PriorStrengths
+from .structure import StructureOperator, coarse_count
+from .vectors import SceneGradient, SolverVectors
+
+# Pairs of changes that a scene remembers: 20 take no fewer iterations, 5 some more.
+N_PAIRS = 10
+# Part of the largest power of a source in any channel under which a channel holds nothing of it.
+UNSEEN = 1e-14
+
+
+class MultiscaleEngine:
+    """A batch of scenes of one signature on the device, under a MultiscalePrior.
+
+    scenes, states: of the scenes at their start: on the profiles, but where states have a
+        StructureState
+    enough: a scene has converged when its loss fell by less than this over some
+        iterations, see lbfgs_control.py
+    past: another engine and the indices (n,) of its scenes that go on here, which are `scenes`
+
+    progress: the scenes' Progress; strengths: their sources' Strengths
+    """
+
+    def __init__(self, scenes, states, device, dtype, prior, loss_tol, *, past=None):
+        self.scenes, self._states, self.device, self.prior = scenes, states, device, prior
+        b = self.buffers = SceneBuffers(scenes, states, device, dtype, prior)
+        self._gradient = LossGradient(b, with_prior=False)
+        self.structure = StructureOperator(b, prior)
+        latents = self.structure.latents
+        v = self.vectors = SolverVectors(b, latents, N_PAIRS + 1)
+        self.steps = LbfgsSteps(v, None if past is None else past[0].steps.shelf)
+        self._row0 = device.put(self._gradient.rows, np.int32)
+        if past is None:
+            self.progress = LbfgsControl(len(scenes), loss_tol, [_n_pixels(s) for s in scenes])
+            self.pairs = LbfgsPairs(len(scenes), N_PAIRS)
+            self.strengths = PriorStrengths(b, self._gradient, latents, prior, states)
+            v.start(*_begins(latents, states), _inverse_curvature(scenes))
+            self._rest_others(self.progress.live)
+            weights = self.strengths.weights(np.concatenate([s.spectra for s in states]))
+            self.steps.reweigh(self.strengths.light, weights, self.strengths.blocks)
+        else:
+            engine, keep = past
+            self.progress, self.pairs = engine.progress.take(keep), engine.pairs.subset(keep)
+            self.strengths = PriorStrengths(
+                b, self._gradient, latents, prior, past=(engine.strengths, keep)
+            )
+            v.copy_from(engine.vectors, keep)
+            self._rest_others(self.progress.live)
+            self.steps.take_blocks(self.strengths.blocks)
+
+    def subset(self, keep):
+        """An engine of the scenes `keep` (n,) alone, which go on as if nothing had happened."""
+        return MultiscaleEngine(
+            [self.scenes[i] for i in keep],
+            [self._states[i] for i in keep],
+            self.device,
+            self.buffers.dtype,
+            self.prior,
+            self.progress.loss_tol,
+            past=(self, keep),
+        )
+
+    def round(self):
+        """One pair of operators: try every live scene's trial, decide, and queue the next ones.
+
+        returns accepted (B,): scenes whose progress.loss is new
+        """
+        p = self.progress
+        sums, slope, loss = self._evaluate()
+        accepted, stepped = p.accept_trials(loss, slope)
+        new = np.flatnonzero(stepped)
+        self.pairs.take(new, sums[new, :, 2], sums[new, :, 3])
+        due = p.strengths_due(accepted) | self._clear(p.significance_due(accepted))
+        if due.any():
+            sums = self._learn(due)
+        mode, length, bare = p.next_actions(accepted)
+        self.pairs.forget(bare)
+        a, c, scale = self.pairs.coefficients(sums[:, :, 0], sums[:, :, 1])
+        self.steps.follow(self.pairs, mode)
+        self.steps.advance(a, c, scale, length)
+        return accepted
+
+    def _evaluate(self):
+        """Inner products, slopes and losses at the trials."""
+        v, gradient = self.vectors, self._gradient
+        self.structure.form(v.x_new)
+        v.unpack_spectra(v.x_new)
+        gradient.queue()
+        self.structure.gradient(v.x_new, self.strengths.precision, v.g_new)
+        v.pack_gradients(gradient.rows_pull, self._row0)
+        sums, slope, energy = self.steps.change()
+        rows = self.device.get(gradient.rows_loss).sum(1, dtype=np.float64)
+        return sums, slope, rows + 0.5 * energy
+
+    def _clear(self, asking):
+        """Selects scenes (B,) of those `asking` (B,) that hold significant structure."""
+        if not asking.any():
+            return asking
+        clear = self.strengths.find_significant(asking, *self._energies(self.vectors.x_new))
+        return self.progress.record_significance(asking, clear)
+
+    def _energies(self, vector):
+        """|z|^2 (S, J) of a vector, and the spectra (S, C) last taken."""
+        self.structure.energy(vector)
+        energies, spectra = self.structure.energies, self.buffers.spectra
+        return tuple(self.device.get(a).astype(np.float64) for a in (energies, spectra))
+
+    def _learn(self, due):
+        """New strengths of the scenes `due` (B,), and all that follows; other inner products."""
+        energies, spectra = self._energies(self.vectors.x_new)
+        moved, weights, change = self.strengths.learn(due, energies, spectra)
+        self._rest_others(self.progress.live)
+        self.steps.reweigh(self.strengths.light, weights, self.strengths.blocks)
+        self.progress.record_strengths(due, moved, change)
+        return self.steps.change()[0]  # its s and y go into spare slots
+
+    def _rest_others(self, live):
+        """Let only the scenes `live` (B,) take part in what is queued next."""
+        self.steps.follow(self.pairs, np.where(live, TRY, REST))
+
+    def states(self) -> list[State]:
+        """The scenes' present states, back on the host."""
+        b, v = self.buffers, self.vectors
+        self.structure.form(v.x)
+        v.unpack_spectra(v.x)
+        found = b.states(b.iterated, [None] * len(self.scenes), int(self.progress.n_rounds.max()))
+        return _that_learned(found, v.split(v.x), self.strengths.by_scene())
+
+    def findings(self, which):
+        """Findings of the scenes `which` (B,) at their present states; None for the others."""
+        self.vectors.unpack_spectra(self.vectors.x)
+        return self.strengths.findings(which, *self._energies(self.vectors.x))
+
+    def slopes(self, which):
+        """The Slopes of the scenes `which` (B,) where they are; None for the others."""
+        x, g = (self.vectors.split(v) for v in (self.vectors.x, self.vectors.g))
+        return [
+            SceneGradient(*slopes, (now[1] <= 0) & (slopes[1] > 0)) if on else None
+            for now, slopes, on in zip(x, g, which, strict=True)
+        ]
+
+    def step(self, steps):
+        """Let scenes try steps next, also those that have converged.
+
+        Steps {scene: changes of structure, spectra and sky, see Slopes; structure None where there
+        is none}.
+        """
+        which = np.isin(np.arange(len(self.scenes)), list(steps))
+        self.vectors.put_directions(steps)
+        self.progress.resume(which)
+        self._queue(np.where(which, TRY, REST), 1.0)
+
+    def update_shifts(self, moved):
+        """Take over the shifts that the operators of the scenes `moved` (B,) have by now."""
+        self._gradient.update_shifts()
+        self.progress.refresh_loss(moved)
+        self._queue(np.where(moved, STAY, REST), 0.0)
+
+    def _queue(self, mode, length):
+        """Queue trials of one length in the directions that are there already; mode (B,)."""
+        nothing = np.zeros((len(self.scenes), N_PAIRS + 1))
+        self.steps.follow(self.pairs, mode)
+        self.steps.advance(nothing, nothing, nothing[:, 0], nothing[:, 0] + length)
+        self._rest_others(self.progress.live)
+
+
+def _begins(latents, states):
+    """Starting vectors: coefficients, spectra (S, C), sky levels (B, C)."""
+    arrays = []
+    for state in states:
+        arrays += state.learned.structure if state.learned else [None] * len(state.morph)
+    spectra, sky = np.concatenate([s.spectra for s in states]), [s.sky for s in states]
+    return latents.pack(arrays), spectra, sky
+
+
+def _that_learned(states, parts, known):
+    """States with what was learned; parts: see `SolverVectors.split`.
+
+    known: `PriorStrengths.by_scene`.
+    """
+    return [
+        replace(state, learned=StructureState(structure, *own))
+        for state, (structure, *_), own in zip(states, parts, known, strict=True)
+    ]
+
+
+def _n_pixels(scene):
+    """Observed pixels of a scene that have a weight."""
+    return max(sum(np.count_nonzero(w) for w in scene.weights), 1)
+
+
+def vector_bytes(scene, prior) -> int:
+    """Device memory [bytes] of the scene's vectors in a batch, roughly, of float64.
+
+    Both rings, eleven others and the light; and its blocks, of a quarter of each source's
+    coefficients: half a matrix each, with room for half as many more, and half a one on the host.
+    """
+    n = [sum(coarse_count(p.shape, step).prod() for step in prior.steps) for p in scene.profile]
+    blocks = 1.25 * sum(k / 4 * min(k / 4, 2 * MAX_BLOCK_SIZE) for k in n)
+    return int(8 * ((2 * (N_PAIRS + 1) + 12) * (sum(n) + scene.spectrum_curvature.size) + blocks))
+
+
+def _inverse_curvature(scenes):
+    """1 / (sum w (R S)^2) of every spectrum (S, C) and 1 / (sum w + p) of every sky level (B, C), p
+    its precision as it is expected; 0 where nothing is seen, and of levels that are not fitted."""
+    power, ties = np.concatenate([s.spectrum_curvature for s in scenes]), scenes[0].ties
+    power = power if ties is None else ties.mean(power)
+    seen = power > UNSEEN * power.max(initial=0)
+    total = np.array([np.concatenate([w.sum((1, 2)) for w in s.weights]) for s in scenes])
+    total = total + np.array([s.known_sky for s in scenes])
+    free = (total > 0) & np.array([s.fit_sky for s in scenes])[:, None]
+    return _inverse(power, seen), _inverse(total, free)
+
+
+def _inverse(values, where):
+    return np.divide(1, values, where=where, out=np.zeros(values.shape))

@@ -1,0 +1,256 @@
+"""Inverse curvature of each source, in blocks of the coefficients that its data determine.
+
+Coefficients of neighbouring places and of several scales are about the same light, so that the
+curvature is far from a diagonal: L-BFGS that begins with one takes a hundred iterations and more
+for a bright galaxy, with these blocks ten to thirty. For a source of profile p and spectrum A
+
+    H = 1 / alpha^2 + U^T T U,    U = sqrt(p) o K_j less its part along p,    T = sum_c A_c^2 T_c
+
+T_c (evidence.py) is taken for that of the whole box. A source of many coefficients has a block for
+each part of its box, and added to these blocks of its coarser scales alone, which reach further:
+the inverse is then off by a factor of a hundred, and without them by thousands, for its widest
+waves. What the blocks leave out, other sources, edges and the spectra, is left to L-BFGS. In NumPy
+on the host, at first and after strengths were learned.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.linalg import lapack
+
+from .evidence import N_FREQUENCIES
+from .prior import kernel_rows
+
+# Coefficients of which the data say more than so many times what the prior does are in blocks. With
+# 3 the blocks take a tenth more of a fit's time, and it no fewer iterations; with 100, half as many
+# iterations more.
+MIN_DATA_TO_PRIOR = 10.0
+# Coefficients of a block, at most: its time goes with their third power, its memory with their
+# square; with fewer, fits of large sources take more iterations. Kernels hold four numbers of each
+# in local memory, of which devices have 32 KiB and more.
+MAX_BLOCK_SIZE = 512
+# [px] Pixels are binned by as much as the steps of a block's finest scale, but by no more than
+# this: 2 changes single directions' curvature by up to 1.9, 4 by up to 5. Blocks of wide waves over
+# large boxes, of more binned pixels than MAX_PIXELS, have them coarser: the time and memory that
+# they take grow with their number.
+COARSEST, MAX_PIXELS = 2, 3000
+# Binned pixels from which on T is applied by transforms, at 2000 pixels in a third of the time that
+# it takes as a matrix, which is quicker below. So many images are transformed at a time.
+MANY_PIXELS, TOGETHER = 1200, 32
+# A block is made of the pixels where one of its coefficients has more than this part of its largest
+# value. Blocks stand until the logarithm of a strength, or the spectrum as a part of its largest
+# value, has changed by more than CHANGE: with 0.35 fits of simulated scenes take a tenth more time,
+# and as many rounds; with 2, some more rounds.
+MIN_RELATIVE_SIZE, CHANGE = 0.1, 1.0
+# Rows of a root that are stored with one length, as many numbers as a CPU takes at a time.
+PANEL = 8
+
+
+@dataclass(frozen=True, eq=False)
+class CurvatureBlock:
+    """The inverse W^T W of a part of H, of m coefficients.
+
+    level: see `BlockPreconditioner.blocks`
+    indices (m,): of the coefficients among all of the source's, scale by scale
+    cholesky: W, lower triangular, in panels, see `_panels`
+    """
+
+    level: int
+    indices: np.ndarray
+    cholesky: np.ndarray
+
+
+class BlockPreconditioner:
+    """The blocks of one free source.
+
+    evidence: its SourceEvidence; profile (ny, nx); light [j]: about its coefficients (ny_j, nx_j),
+        see evidence.blurred_light
+    """
+
+    def __init__(self, evidence, profile, light):
+        self._evidence, self._light = evidence, light
+        self._profile = np.asarray(profile, np.float32)
+        self._root = evidence.prior.amplitude(self._profile)
+        self._power = (self._profile**2).sum()
+        self._at = self._blocks = None
+
+    def blocks(self, strengths, spectrum):
+        """The Blocks near strengths (J,) and a spectrum (C,).
+
+        Those of one level have no coefficient in common, and what levels say is added.
+        """
+        if self._at is None or self._moved(strengths, spectrum):
+            self._at = strengths.copy(), spectrum.copy()
+            self._blocks = list(self._made(*self._at))
+        return self._blocks
+
+    def _moved(self, strengths, spectrum):
+        before = self._at
+        more = np.abs(spectrum - before[1]).max() > CHANGE * np.abs(before[1]).max()
+        return more or np.abs(np.log(strengths / before[0])).max() > CHANGE
+
+    def _made(self, strengths, spectrum):
+        """Yield the blocks at these strengths and spectrum."""
+        data = np.square(strengths) * self._evidence.curvature(spectrum)
+        heard = [
+            np.argwhere(part * light > MIN_DATA_TO_PRIOR) for part, light in zip(data, self._light)
+        ]
+        scale = np.repeat(np.arange(len(heard)), [len(h) for h in heard])
+        rows = np.column_stack([scale, np.concatenate(heard)])
+        steps = np.array(self._evidence.prior.steps)
+        for level in range(len(heard)):
+            parts = _split(rows, rows[:, 1:] * steps[rows[:, :1]])
+            for own in parts:
+                curvature = self._curvature(own, spectrum)
+                root = _root(curvature, strengths[own[:, 0]] ** -2)
+                yield CurvatureBlock(level, self._places(own), root)
+            if len(parts) < 2:
+                return
+            rows = rows[rows[:, 0] > rows[:, 0].min()]
+
+    def _places(self, rows):
+        """Indices of coefficients (m, 3) of scale, y, x among all of the source's."""
+        first = np.cumsum([0, *(light.size for light in self._light[:-1])])
+        width = np.array([light.shape[1] for light in self._light])
+        scale, y, x = rows.T
+        return first[scale] + y * width[scale] + x
+
+    def _curvature(self, rows, spectrum):
+        """U^T T U (m, m) of coefficients (m, 3), by scale, on binned pixels."""
+        prior, scales = self._evidence.prior, np.unique(rows[:, 0])
+        step = min(COARSEST, *(prior.steps[j] for j in scales))
+        reach = max(prior.radii[j] for j in scales)
+        at = rows[:, 1:] * np.array(prior.steps)[rows[:, :1]]
+        low = np.maximum(at.min(0) - reach, 0)
+        high = np.minimum(at.max(0) + reach + 1, self._profile.shape)
+        while (-(-(high - low) // step)).prod() > MAX_PIXELS:
+            step *= 2
+        window = tuple(map(slice, low, high))
+        u = [self._seen(j, rows[rows[:, 0] == j, 1:], window, step) for j in scales]
+        u = np.concatenate(u)
+        size = np.abs(u)
+        near = (size >= MIN_RELATIVE_SIZE * size.max((1, 2), keepdims=True)).any(0)
+        y, x = (np.flatnonzero(near.any(axis)) for axis in (1, 0))
+        u = u[:, y[0] : y[-1] + 1, x[0] : x[-1] + 1]
+        seen = _through(self._evidence.sharpness(spectrum), u, step)
+        return seen @ u.reshape(len(rows), -1).T
+
+    def _seen(self, j, places, window, step):
+        """Columns of U, of scale j and places (m, 2), in a window of the box and binned."""
+        p, (y, x) = self._profile, places.T
+        along_y, along_x = (kernel_rows(self._evidence.prior, j, n) for n in p.shape)
+        first, of_x = np.unique(x, return_inverse=True)
+        rows = self._root[window][:, None] * along_x[first][:, window[1]]
+        rows = _binned(rows, 2, step)[:, of_x].swapaxes(0, 1)  # (m, ny, nx / step)
+        u = _binned(along_y[y][:, window[0], None] * rows, 1, step)
+        along = (along_y @ (p * self._root) @ along_x.T)[y, x] / self._power
+        return u - along[:, None, None] * _binned(_binned(p[window], 0, step), 1, step)
+
+
+def _split(rows, places):
+    """Parts of rows (n, 3) at places (n, 2) [px], at most MAX_BLOCK_SIZE neighbours each.
+
+    In order.
+    """
+    if len(rows) <= MAX_BLOCK_SIZE:
+        return [rows] if len(rows) else []
+    along = places[:, np.argmax(np.ptp(places, axis=0))]
+    first = np.zeros(len(rows), bool)
+    first[np.argsort(along, kind="stable")[: len(rows) // 2]] = True
+    return [part for half in (first, ~first) for part in _split(rows[half], places[half])]
+
+
+def _binned(values, axis, step):
+    """Sums of `step` neighbours each along an axis, with zeros beyond its end."""
+    if step == 1:
+        return values
+    values = np.moveaxis(values, axis, 0)
+    out = np.zeros((-(-len(values) // step), *values.shape[1:]), values.dtype)
+    for k in range(step):
+        part = values[k::step]
+        out[: len(part)] += part
+    return np.moveaxis(out, 0, axis)
+
+
+def _through(sharpness, images, step):
+    """T (n, n) times images (m, ny, nx), of n pixels, as rows (m, n); see `_between`."""
+    shape = images.shape[1:]
+    if shape[0] * shape[1] < MANY_PIXELS:
+        return images.reshape(len(images), -1) @ _between(sharpness, shape, step)
+    from scipy import fft  # 0.05 s, which small galaxies need not wait for
+
+    lags = _lags(sharpness, step)
+    far = np.arange(1 - len(lags) // 2, len(lags) // 2)
+    far = far[far % step == 0]
+    size = [fft.next_fast_len(n + int(far[-1]) // step, real=True) for n in shape]
+    around = np.zeros(size, np.float32)
+    y, x = (far // step % n for n in size)
+    around[y[:, None], x] = lags[far[:, None] % len(lags), far % len(lags)]
+    power, out = fft.rfft2(around).real, np.empty_like(images)  # T is symmetric
+    for first in range(0, len(images), TOGETHER):
+        some = slice(first, first + TOGETHER)
+        waves = fft.rfft2(images[some], size) * power
+        out[some] = fft.irfft2(waves, size)[:, : shape[0], : shape[1]]
+    return out.reshape(len(images), -1)
+
+
+def _between(sharpness, shape, step):
+    """T (n, n) between the n pixels of images of a shape, each a mean over step x step.
+
+    Of those that sharpness (F,) is of, see evidence.LocalPowerSpectra.
+    """
+    n, lags = N_FREQUENCIES, _lags(sharpness, step)
+    far = np.zeros([2 * side - 1 for side in shape], np.float32)
+    at = [np.arange(1 - side, side) for side in shape]
+    near = [np.flatnonzero(np.abs(a) * step < n // 2) for a in at]
+    y, x = (step * a[k] % n for a, k in zip(at, near, strict=True))
+    far[near[0][:, None], near[1]] = lags[y[:, None], x]
+    size = shape[0] * shape[1]
+    return sliding_window_view(far, shape)[::-1, ::-1].reshape(size, size)
+
+
+def _lags(sharpness, step):
+    """T between two means over step x step pixels, by their distance before that.
+
+    (n, n), (0, 0) first.
+    """
+    n = N_FREQUENCIES
+    phase = np.exp(2j * np.pi * np.fft.fftfreq(n)[:, None] * np.arange(step))
+    mean = np.abs(phase.mean(1)) ** 2
+    power = sharpness.reshape(n, n // 2 + 1) * mean[:, None] * mean[: n // 2 + 1]
+    return np.fft.irfft2(power, (n, n))
+
+
+def _root(curvature, precision):
+    """Lower triangular W (m, m) in panels, W^T W the inverse of curvature + precision.
+
+    curvature (m, m), precision (m,). A product of roots is positive definite whatever their
+    rounding, so that float32 does: only a matrix that it cannot factor is tried in float64.
+    """
+    for dtype in (np.float32, np.float64):
+        matrix = curvature.astype(dtype)
+        matrix[np.diag_indices(len(matrix))] += precision
+        potrf, trtri = lapack.get_lapack_funcs(("potrf", "trtri"), (matrix,))
+        factor, info = potrf(matrix.T, lower=0, clean=1, overwrite_a=1)
+        if not info:
+            inverse, info = trtri(factor, lower=0, overwrite_c=1)
+        if not info:
+            return _panels(inverse.T)
+    # lags that T_c leaves out: the diagonal alone
+    return _panels(np.diag(1 / np.sqrt(curvature.diagonal() + precision)))
+
+
+def _panels(root):
+    """A lower triangular matrix (m, m), float32, in panels.
+
+    Each PANEL of its rows up to the diagonal of the last one, one after the other, with zeros where
+    the matrix has ended.
+    """
+    m = -(-len(root) // PANEL) * PANEL
+    whole = np.zeros((m, m), np.float32)
+    whole[: len(root), : len(root)] = root
+    panels = [whole[i : i + PANEL, : i + PANEL].ravel() for i in range(0, m, PANEL)]
+    return np.concatenate(panels)

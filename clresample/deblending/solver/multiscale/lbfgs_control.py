@@ -1,0 +1,187 @@
+"""Controls the batched L-BFGS: trial steps, strength updates and convergence of each scene."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .lbfgs_steps import AGAIN, NEXT, REST, STAY, TRY
+
+# A trial is accepted if the loss falls by this part of what the slope promises.
+ARMIJO = 1e-4
+# Shortest and longest next step after a trial that was not accepted, as parts of it; trials before
+# the memory is dropped, and after that before a scene is left where it is.
+SHRINK = 0.1, 0.5
+MAX_TRIALS = 8
+# Strengths are learned where a scene's loss fell by less than STRENGTH_LOSS_DROP, times chi2 per
+# pixel where that is above 1, over the last LOSS_WINDOW iterations, so that its structure is near
+# that of the present ones; at the latest after FIRST_STRENGTH_ROUND rounds, and then
+# STRENGTH_ROUNDS so many, until none moves by more than MAX_LOG_STRENGTH_CHANGE in its logarithm.
+STRENGTH_LOSS_DROP, LOSS_WINDOW = 5.0, 3
+FIRST_STRENGTH_ROUND, STRENGTH_ROUNDS, MAX_LOG_STRENGTH_CHANGE = 16, 8, 0.1
+# Whether the finest structure of sources is clear (evidence.py) is asked once strengths have
+# settled, where a scene's loss fell by less than this (or `loss_tol`, where that is more: none has
+# converged before it is asked), times chi2 per pixel likewise, over the last LOSS_WINDOW
+# iterations. Earlier, structure still holds what spectra and neighbours will take from it: with 5,
+# more simulated galaxies exceed what is clear. With 1 the same ones do, up to 30 iterations later.
+SIGNIFICANCE_LOSS_DROP = 2.5
+# It is also asked after LATE_LOOK rounds where a scene still falls by FALLING and more over these
+# iterations, times chi2 per pixel likewise: blends of large galaxies with clumps fall so for
+# hundreds of rounds before they are calm, all of them lost where a second fit takes over. SDRs of
+# 32 simulated scenes are the same with it and without (bench.settings).
+LATE_LOOK, FALLING = 80, 50.0
+# A fit has converged when its strengths have settled and its loss fell by less than `loss_tol` over
+# CONVERGENCE_WINDOW iterations and over the last twelfth of all, at most LONGEST; by that times
+# chi2 per pixel where that is above 1: a model that misfits so knows its fluxes less well by its
+# root. Light of a small galaxy inside a giant comes back from the giant's structure over hundreds
+# of iterations that gain 0.03 each: without the twelfth such fits ended 8 above the lowest loss,
+# and fluxes 6 errors from the truth (bench.ladder, giant). Fits of up to 60 iterations end as
+# without it.
+CONVERGENCE_WINDOW, TWELFTH, LONGEST = 5, 12, 100
+
+
+class LbfgsControl:
+    """Arrays over the scenes of a batch (B,).
+
+    loss_tol: see Settings; n_pixels (B,): observed, with a weight
+
+    live: those that go on; converged, failed: those that have come to their end, failed ones
+        because the loss of their start is no number
+    loss: of the last accepted trial; n_iterations: accepted trials, the start not counted
+    n_rounds: of each scene, trials so far
+    settled: scenes whose strengths are; tested: those that know which structure is clear
+    """
+
+    def __init__(self, n_scenes, loss_tol, n_pixels):
+        n, self.loss_tol, self._n_pixels = n_scenes, loss_tol, np.asarray(n_pixels, float)
+        self.live, self.converged, self.failed = (
+            np.ones(n, bool),
+            np.zeros(n, bool),
+            np.zeros(n, bool),
+        )
+        self.loss = np.full(n, np.inf)
+        self.n_iterations, self.n_rounds = np.zeros(n, int), np.zeros(n, int)
+        self.settled, self.tested = np.zeros(n, bool), np.zeros(n, bool)
+        self._due = np.full(n, FIRST_STRENGTH_ROUND)
+        self._fresh = np.ones(n, bool)  # the trial is where the scene is, with another loss
+        self._bare = np.zeros(n, bool)  # without pairs since a direction that led nowhere
+        self._length, self._trials = np.ones(n), np.zeros(n, int)
+        self._losses = np.full((n, LONGEST + 1), np.inf)  # the last ones, the present one first
+
+    def take(self, keep):
+        """That of the scenes `keep` (n,) alone."""
+        new = LbfgsControl(len(keep), self.loss_tol, self._n_pixels[keep])
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                setattr(new, name, value[keep])
+        return new
+
+    def accept_trials(self, loss, slope):
+        """Accepts or rejects each scene's trial (B,), and selects steps that give a pair (B,).
+
+        slope (B,): g . (x_new - x)
+        """
+        self.n_rounds += self.live
+        finite = np.isfinite(loss)
+        self.failed |= self.live & self._fresh & ~finite
+        self.live &= ~self.failed
+        with np.errstate(invalid="ignore"):
+            lower = (slope < 0) & (loss <= self.loss + ARMIJO * slope)
+            shrink = -slope / (2 * np.maximum(loss - self.loss - slope, 1e-30))
+        self._shrink = np.clip(np.where(np.isfinite(shrink), shrink, 0), *SHRINK)
+        self._uphill = ~(slope < 0)
+        accepted = self.live & finite & (lower | self._fresh)
+        stepped = accepted & ~self._fresh
+        self._losses[stepped] = np.roll(self._losses[stepped], 1, axis=1)
+        self.n_iterations += stepped
+        self._losses[accepted, 0] = self.loss[accepted] = loss[accepted]
+        self._fresh &= ~accepted
+        return accepted, stepped
+
+    def strengths_due(self, accepted):
+        """Selects scenes (B,) whose strengths are updated now."""
+        calm = self._fallen(LOSS_WINDOW) < STRENGTH_LOSS_DROP * self.chi2()
+        return accepted & ~self.settled & (calm | (self.n_rounds >= self._due))
+
+    def significance_due(self, accepted):
+        """Selects scenes (B,) to be tested now for significant structure."""
+        fall, chi2 = self._fallen(LOSS_WINDOW), self.chi2()
+        calm = fall < max(SIGNIFICANCE_LOSS_DROP, self.loss_tol) * chi2
+        far = (self.n_rounds >= LATE_LOOK) & (fall > FALLING * chi2) & np.isfinite(fall)
+        return accepted & self.settled & ~self.tested & (calm | far)
+
+    def record_significance(self, which, clear):
+        """Records that the scenes `which` (B,) were tested for significant structure.
+
+        Where `clear` (B,) is true more was found: they update strengths again from now on, and are
+        tested again after that.
+        """
+        self.tested |= which & ~clear
+        self.settled &= ~clear
+        return clear
+
+    def record_strengths(self, due, moved, change):
+        """Records the strength updates of the scenes `due`.
+
+        moved (B,): largest change of a logarithm of a strength; change (B,): of their losses.
+        """
+        self.loss += np.where(due, change, 0)
+        self.settled |= due & (moved < MAX_LOG_STRENGTH_CHANGE)
+        self._due[due] = self.n_rounds[due] + STRENGTH_ROUNDS
+        self._losses[due, 0], self._losses[due, 1:] = self.loss[due], np.inf
+
+    def refresh_loss(self, which):
+        """Marks the losses of scenes `which` (B,) as changed.
+
+        Their next trial is where they are.
+        """
+        self._fresh |= which
+        self._bare &= ~which
+        self._call_back(which)
+
+    def resume(self, which):
+        """Lets the scenes `which` (B,), converged or not, try a step that was not theirs."""
+        self._call_back(which)
+        self._length[which], self._trials[which] = 1.0, 0
+
+    def _call_back(self, which):
+        """The scenes `which` (B,) go on, whatever they had gained."""
+        self._losses[which, 1:] = np.inf
+        self.converged &= ~which
+        self.live |= which
+
+    def next_actions(self, accepted):
+        """Mode (B,) and length (B,) of each scene's next step, and which drop their pairs (B,)."""
+        enough = self.loss_tol * self.chi2()
+        patience = np.clip(self.n_iterations // TWELFTH, CONVERGENCE_WINDOW, LONGEST)
+        calm = (self._fallen(CONVERGENCE_WINDOW) < enough) & (self._fallen(patience) < enough)
+        self.converged |= accepted & self.settled & calm
+        self.live &= ~self.converged
+        refused = self.live & ~accepted
+        self._trials = np.where(refused, self._trials + 1, 0)
+        self._length = np.where(refused, self._length * self._shrink, 1.0)
+        lost = refused & (self._uphill | (self._trials >= MAX_TRIALS))
+        bare, stuck = lost & ~self._bare, lost & self._bare
+        self._length[bare], self._trials[bare] = 1.0, 0
+        self._bare = (self._bare & ~accepted) | bare
+        # No step lowers the loss: all that its rounding lets see has been reached. Strengths are
+        # learned from here, or the fit has converged.
+        self.converged |= stuck & self.settled
+        self.live &= ~self.converged
+        stuck &= self.live
+        self._due[stuck] = 0
+        self._fresh |= stuck
+        mode = np.full(len(accepted), REST)
+        for which, what in ((refused, TRY), (bare, AGAIN), (stuck, STAY), (accepted, NEXT)):
+            mode[which] = what
+        mode[~self.live & ~accepted] = REST
+        return mode, self._length, bare
+
+    def _fallen(self, n):
+        """By how much the losses (B,) fell over the last n iterations, a number or (B,)."""
+        before = np.take_along_axis(self._losses, np.broadcast_to(n, len(self.loss))[:, None], 1)
+        with np.errstate(invalid="ignore"):  # of scenes without a loss so far
+            return before[:, 0] - self._losses[:, 0]
+
+    def chi2(self):
+        """chi2 per pixel (B,), at least 1."""
+        return np.maximum(1, 2 * self.loss / self._n_pixels)

@@ -1,0 +1,139 @@
+"""Directions, steps and inner products of a batch's vectors: lbfgs.cl and block_inverse.cl."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..boxes import ALIGN
+from .factor_store import FactorStore
+from .inverse import MAX_BLOCK_SIZE, PANEL
+
+# What the kernels do with a scene; the same numbers in lbfgs.cl.
+REST, NEXT, AGAIN, TRY, STAY = range(5)
+
+
+class LbfgsSteps:
+    """L-BFGS on the Vectors of a batch; the decisions come as arrays over its scenes (B,).
+
+    vectors: the Vectors
+    shelf: FactorStore of blocks that these or other Steps have had; a new one for None
+    """
+
+    def __init__(self, vectors, shelf=None):
+        v, n_slots = vectors, vectors.n_slots
+        b, self._latents = v.buffers, v.latents
+        self._buffers = b
+        self._n_slots, self._n_chunks = n_slots, len(v.chunks)
+        self._first_chunks = np.flatnonzero(np.diff(v.chunks[:, 0], prepend=-1))
+        n = len(b.scenes)
+        self._plan = b.device.put(np.zeros((n, 3)), np.int32)
+        self._coefficients = b.put(np.zeros((n, 2 * n_slots + 2)))
+        self._sums = b.put(np.zeros((self._n_chunks, 4 * n_slots + 2)))
+        self._levels, self.shelf = [], shelf or FactorStore(b.device, b.dtype)
+        y, projected, hg_new = (b.device.zeros(v.size, b.dtype) for _ in range(3))
+        shared = {"plan": self._plan, "size": v.size, "ring_s": v.s, "ring_hy": v.hy}
+        shared |= {"chunks": v.chunk_table, "x_new": v.x_new}
+        group = b.tuning.sum_group
+
+        def launcher(name, size=(group, 1)):
+            return b.launcher("lbfgs.cl", name, len(size), local_size=size, SLOTS=n_slots)
+
+        self._trial = launcher("form_pairs").bind(
+            **shared,
+            x=v.x,
+            g=v.g,
+            g_new=v.g_new,
+            h=v.h,
+            y=y,
+            projected=projected,
+            hg_new=hg_new,
+        )
+        size, macros = (group, 1), {"MAX_BLOCK": MAX_BLOCK_SIZE, "PANEL": PANEL}
+        self._invert = b.launcher(
+            "block_inverse.cl", "apply_block_inverse", 2, local_size=size, **macros
+        ).bind(plan=self._plan, size=v.size, ring_hy=v.hy, y=y, projected=projected, hg_new=hg_new)
+        self._change = launcher("inner_products").bind(
+            **shared, g=v.g, y=y, projected=projected, precision=v.precision, out=self._sums
+        )
+        self._advance = launcher("take_step").bind(
+            **shared,
+            x=v.x,
+            g=v.g,
+            g_new=v.g_new,
+            hg=v.hg,
+            hg_new=hg_new,
+            d=v.d,
+            coefficients=self._coefficients,
+        )
+        planes = v.latents.planes()
+        self._reweigh = launcher("update_preconditioner", (group, 1, 1)).bind(
+            active=b.free,
+            planes=b.device.put(planes.reshape(-1, 2), np.int32),
+            x_new=v.x_new,
+            g_new=v.g_new,
+            precision=v.precision,
+            h=v.h,
+        )
+        self._size = group, self._n_chunks
+        self._reweigh_size = group, planes.shape[1], b.n_free
+
+    def follow(self, pairs, mode):
+        """Uploads the mode (B,) of each scene, IDLE, ACCEPT, ..., and the slots of its pairs."""
+        plan = np.stack([mode, pairs.used, pairs.spare], axis=1)
+        self._buffers.device.upload(np.ascontiguousarray(plan, np.int32), self._plan)
+
+    def change(self):
+        """Inner products of trials; s and H y go into the spare slots.
+
+        s_k . P g, H y_k . P g, s_k . y, H y_k . y (B, slots, 4), g . s (B,), x_new . precision
+        x_new (B,); for idle scenes the former values.
+        """
+        self._trial(self._size)
+        for size, given in self._levels:
+            self._invert(size, **given)
+        self._change(self._size)
+        sums = self._by_scene(self._sums)
+        return sums[:, :-2].reshape(len(sums), self._n_slots, 4), sums[:, -2], sums[:, -1]
+
+    def _by_scene(self, sums):
+        values = self._buffers.device.get(sums).astype(np.float64)
+        return np.add.reduceat(values, self._first_chunks, axis=0)
+
+    def advance(self, a, c, scale, length):
+        """Queue the next trials: a, c (B, slots), scale, length (B,)."""
+        b = self._buffers
+        table = np.concatenate([a, c, scale[:, None], length[:, None]], axis=1)
+        b.device.upload(np.ascontiguousarray(table, b.dtype), self._coefficients)
+        self._advance(self._size)
+
+    def reweigh(self, light, weights, blocks):
+        """Queue h and g_new of other strengths, and take their blocks.
+
+        light, weights, blocks: see Strengths. Pairs of what went before stay: they say what the
+        data think of the curvature, and without them fits take a tenth more rounds.
+        """
+        b = self._buffers
+        if b.n_free:
+            self._reweigh(self._reweigh_size, light=light, weights=b.put(weights))
+            self.take_blocks(blocks)
+
+    def take_blocks(self, blocks):
+        """Take the Blocks of all sources (S)."""
+        b = self._buffers
+        start, scene = self._latents.start, b.host_boxes.scene
+        self._levels = []
+        self.shelf.retain([block for some in blocks for block in some])
+        listed = [(s, block) for s, some in enumerate(blocks) for block in some]
+        for level in range(1 + max((block.level for _, block in listed), default=-1)):
+            own = [(s, block) for s, block in listed if block.level == level]
+            sizes = [len(block.indices) for _, block in own]
+            first = [self.shelf.first(block) // ALIGN for _, block in own]
+            table = [[scene[s] for s, _ in own], sizes, np.cumsum([0, *sizes[:-1]]), first]
+            places = np.concatenate([start[s] + block.indices for s, block in own])
+            given = {
+                "blocks": b.device.put(np.stack(table, axis=1), np.int32),
+                "indices": b.device.put(places, np.int32),
+                "roots": self.shelf.values,
+                "more": level > 0,
+            }
+            self._levels.append(((self._size[0], len(own)), given))

@@ -1,0 +1,157 @@
+"""Fitted morphologies as all observations see them, and the spectra that go with them best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...resampling.plan import Precision
+from ...sky.extent import intersect_boxes
+from ..component_images import ComponentImages
+from ..profiles import ComponentProfile
+from ..view import WhitenedView
+from .component_batch import StartComponent
+from .linearised_scenes import linearise
+
+# [px] Frames of no more pixels are seen whole, by the views' own operators: making others for boxes
+# would take longer. In larger ones the boxes' operators see what the whole one does but for 2e-5 of
+# the brightest pixel, by where a box that ends in the middle of light is repeated.
+WHOLE_PX = 160**2
+
+
+@dataclass(frozen=True, eq=False)
+class MorphologyModel:
+    """The morphologies of a scene, and what sees them.
+
+    frame (2,) [px]: its shape, padding included
+    views: WhitenedViews; unfiltered_views: others like them, or None where the view itself is as
+        the observation was taken
+    source (n,): number of each one's source, by which views know its PSF
+    origin (n, 2) [px], morphs (n): arrays (ny, nx), in boxes of the frame
+    """
+
+    frame: tuple[int, int]
+    views: list[WhitenedView]
+    unfiltered_views: list
+    source: np.ndarray
+    origin: np.ndarray
+    morphs: list
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedModel:
+    """Images of a MorphologyModel in the observations.
+
+    spectra (n, C), sky (C,): least squares; covariance (C, n, n): of the spectra. In the views'
+        units
+    observed: per view, ComponentImages (n, Co, My, Mx); unfiltered_views: likewise, None where it
+        is the same
+    """
+
+    spectra: np.ndarray
+    sky: np.ndarray
+    covariance: np.ndarray
+    observed: tuple[ComponentImages, ...]
+    unfiltered_views: tuple
+
+    def residuals(self, channels, views):
+        """Data minus model (Co, My, Mx) of each of the WhitenedViews, in their units.
+
+        channels: the slices of all channels that these have.
+        """
+        out = []
+        for part, view, rendered in zip(channels, views, self.observed, strict=True):
+            model = rendered.total(self.spectra[:, part]) + self.sky[part, None, None]
+            out.append(view.data - model)
+        return out
+
+
+class _ImageProfile(ComponentProfile):
+    """An image (ny, nx) in a box of the frame from `origin` on; no parameters.
+
+    frame (2,) [px]: its shape
+    """
+
+    def __init__(self, image, origin, frame):
+        self.image, self.origin, self.frame = image, np.asarray(origin), np.array(frame)
+
+    def bounding_box(self, theta, position, threshold):
+        """All of the box, or all of the frame where that is small."""
+        if self.frame.prod() <= WHOLE_PX:
+            return (self.frame - 1) / 2, np.full(2, self.frame.max())
+        size = np.array(self.image.shape)
+        return self.origin + (size - 1) / 2, size / 2
+
+    def draw_box(self, theta, position, origin, size, *, slopes=True):
+        """A part of it, 0 beyond."""
+        out = np.zeros((1, *size))
+        here, there = intersect_boxes(origin, size, self.origin, self.image.shape)
+        out[0][here] = self.image[there]
+        return out
+
+
+def render_models(models: list[MorphologyModel], *, fit_sky=False) -> list[RenderedModel]:
+    """Render the morphologies of all models, and solve for their spectra, side by side.
+
+    models: of equal numbers of observations, these of equal shapes, as of one batch
+    fit_sky: also solve for a level per channel
+    """
+    components = []
+    for b, model in enumerate(models):
+        rows = zip(model.source, model.origin, model.morphs, strict=True)
+        for i, (source, origin, morph) in enumerate(rows):
+            shape = _ImageProfile(morph, origin, model.frame)
+            place = np.asarray(origin, float)
+            components.append(StartComponent(b, i, int(source), shape, place, model.frame))
+    looking = _looking([m.views for m in models], components, fit_sky)
+    scenes, thetas = np.arange(len(models)), [np.zeros(0)] * len(components)
+    brightness = np.zeros(len(components))
+    looking.render(scenes, thetas, brightness, slopes=False, whiten=False)
+    observed = _taken(looking)
+    looking.whiten()
+    looking.solve(0.0)
+    bare = [[None] * len(m.views) for m in models]
+    others = [[b or v for b, v in zip(m.unfiltered_views, m.views, strict=True)] for m in models]
+    if any(b is not None for m in models for b in m.unfiltered_views):
+        again = _looking(others, components, False)
+        again.render(scenes, thetas, brightness, slopes=False, whiten=False)
+        bare = _taken(again)
+    found = []
+    for b in range(len(models)):
+        at = looking.scene == b
+        found.append(
+            RenderedModel(
+                looking.spectra[at],
+                looking.sky[b],
+                looking.covariance(b),
+                tuple(observed[b]),
+                tuple(bare[b]),
+            )
+        )
+    return found
+
+
+def _looking(views, components, fit_sky):
+    precision = Precision.of(views[0][0].op.dtype)
+    return linearise(views, components, precision, 0.0, fit_sky=fit_sky)
+
+
+def _taken(looking):
+    """Per scene and view, the ComponentImages of what is seen at present."""
+    found = [[] for _ in range(looking.n_scenes)]
+    for sight in looking.sights:
+        seen, shape = looking.device.get(sight.seen), (sight.n_bands, sight.my, sight.mx)
+        images = [None] * len(looking.at)
+        for row in range(len(looking.at)):
+            _, _, _, wy, wx, _, begin = sight.place[row]
+            window = seen[begin : begin + sight.n_bands * wy * wx]
+            (y0, x0), (ny, nx) = sight.lit[row, :2] - sight.place[row, 1:3], sight.lit[row, 2:]
+            lit = window.reshape(sight.n_bands, wy, wx)[:, y0 : y0 + ny, x0 : x0 + nx]
+            images[row] = lit.astype(np.float64)
+        for b, ends in enumerate(found):
+            own = np.flatnonzero(looking.slots.scene == b)
+            own = own[np.argsort(looking.at[own])]
+            part = [images[k] for k in own]
+            ends.append(ComponentImages.cropped((len(own), *shape), sight.lit[own, :2], part))
+    return found

@@ -1,0 +1,213 @@
+"""Components of a group of scenes as all observations see them, and the spectra that fit best."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...device.tuning import Tuning
+from ..solver.rendering.ties import band_equations
+from ..spectra import nnls_batch, spectrum_covariance
+from .component_batch import ComponentBatch, boxes_of, profile_thresholds
+from .slot_observation import SlotObservation
+
+
+def linearise(views, components, precision, tolerance, *, fit_sky) -> LinearisedScenes:
+    """Sets up the rendering of these components in every observation.
+
+    views: of each scene, its WhitenedViews; precision, tolerance: see SlotObservation
+    """
+    first = views[0]
+    device, dtype = first[0].op.device, first[0].op.dtype
+    tuning, ends = Tuning.of(device, dtype), np.cumsum([0, *(len(v.data) for v in first)])
+    sights = [
+        SlotObservation(
+            [own[k] for own in views],
+            slice(int(ends[k]), int(ends[k + 1])),
+            device,
+            dtype,
+            tuning,
+            precision,
+            tolerance,
+        )
+        for k in range(len(first))
+    ]
+    return LinearisedScenes(components, sights, len(views), device, dtype, tuning, fit_sky=fit_sky)
+
+
+class LinearisedScenes:
+    """The components of a group of scenes at some parameters, as all observations see them.
+
+    components (N): all scenes' Components; sights: the observations; n_scenes: B; fit_sky
+
+    spectra (N, C), sky (B, C): of the last solution, in the views' units, for profiles of unit
+        integral
+    sky_precision (B, C): with which each level is expected to be 0; 0 where it is not fitted
+    """
+
+    def __init__(self, components, sights, n_scenes, device, dtype, tuning, *, fit_sky):
+        self.components, self.sights, self.n_scenes = components, sights, n_scenes
+        self.device, self.dtype, self.tuning, self.fit_sky = device, dtype, tuning, fit_sky
+        self.scene = np.array([c.scene for c in components])
+        self.index = np.array([c.index for c in components])
+        self.n_most = int(self.index.max()) + 1
+        self.n_channels, self.ties = sights[-1].channels.stop, sights[0].ties
+        self.spectra = np.zeros((len(components), self.n_channels))
+        self.sky = np.zeros((n_scenes, self.n_channels))
+        known = np.concatenate([sight.sky_precision for sight in sights], axis=1)
+        self.sky_precision = known * bool(fit_sky)
+        self._kept: dict = {}
+
+    def render(self, scenes, thetas, brightness, *, slopes, whiten=True):
+        """Draw and render the components of some scenes (k,).
+
+        thetas (N): arrays; brightness (N,): see `profile_thresholds`; whiten: else `whiten` is to
+            follow
+        """
+        self.scenes = np.asarray(scenes)
+        at = np.flatnonzero(np.isin(self.scene, self.scenes))
+        chosen, theta = [self.components[i] for i in at], [thetas[i] for i in at]
+        boxes = boxes_of(chosen, theta, profile_thresholds(brightness[at]))
+        self.slots = ComponentBatch(chosen, theta, boxes, slopes=slopes)
+        self.at = at[self.slots.order]
+        self._row = np.full(self.n_scenes, -1)
+        self._row[self.scenes] = np.arange(len(self.scenes))
+        images = self.slots.draw(self.device, self.dtype, self.tuning, self._kept)
+        for sight in self.sights:
+            sight.render(self.slots, images)
+        self.overlapping_pairs = [sight.overlapping_pairs() for sight in self.sights]
+        if whiten:
+            self.whiten()
+
+    def whiten(self):
+        """Bring what is seen to units of the noise."""
+        for sight in self.sights:
+            sight.whiten()
+
+    @property
+    def rows(self):
+        """The row (slots,) among the scenes looked at of each slot's scene."""
+        return self.rows_of(self.scene[self.at])
+
+    def rows_of(self, scenes):
+        """The rows of scenes among those looked at; -1 of others."""
+        return self._row[scenes]
+
+    def compute_residuals(self, error) -> np.ndarray:
+        """Compare the present solution with the data.
+
+        chi2 (k,) of the scenes looked at, with what is expected of the sky.
+        """
+        spectra = self.spectra[self.at]
+        self.sums = [
+            sight.compute_residuals(self.scenes, self.slots, spectra, self.sky, error)
+            for sight in self.sights
+        ]
+        of_sky = (self.sky_precision * self.sky**2)[self.scenes].sum(axis=1)
+        return sum(sums[:, :, 0].sum(axis=1) for sums in self.sums) + of_sky
+
+    def of_level(self):
+        """Right sides and curvatures (k, C) of the sky levels about the solution last compared."""
+        sums = np.concatenate([s[..., 1:] for s in self.sums], axis=1)
+        right, curvature = np.moveaxis(sums, -1, 0)
+        known = self.sky_precision[self.scenes]
+        return right - known * self.sky[self.scenes], curvature + known
+
+    def solve(self, error):
+        """Spectra and sky levels of the least squares, weights from the present solution.
+
+        error: part of the model that adds to the noise; 0: none of it
+        normal (k, C, n + 1, n + 1), right (k, C, n + 1): products of the scenes' components, and
+        then of a level of 1, with each other and with the data
+        """
+        self.compute_residuals(error)
+        n, rows = self.n_most, self.rows
+        normal = np.zeros((len(self.scenes), self.n_channels, n + 1, n + 1))
+        right = np.zeros(normal.shape[:3])
+        own = self.index[self.at]
+        right[..., n], normal[..., n, n] = self.of_level()
+        for sight, (table, pairs) in zip(self.sights, self.overlapping_pairs, strict=True):
+            channels = np.arange(self.n_channels)[sight.channels]
+            gram, pull = sight.gram(pairs, 1)[..., 0, 0], sight.residual_products(1)[:, :, 0]
+            (i, j), c = own[table[:, :2]].T[:, :, None], channels[None]
+            b = rows[table[:, 0], None]
+            normal[b, c, i, j] = normal[b, c, j, i] = gram
+            right[rows[:, None], c, own[:, None]] = pull[..., 0]
+            normal[rows[:, None], c, own[:, None], n] = pull[..., 1]
+            normal[rows[:, None], c, n, own[:, None]] = pull[..., 1]
+        solution = self.solution()
+        right += np.einsum("kcij,kcj->kci", normal, solution)
+        self.normal, self.right = normal, right
+        found = self._non_negative()
+        self.spectra[self.at] = found[rows, :, own]
+        if self.fit_sky:
+            self.sky[self.scenes] = found[..., n]
+
+    def with_components(self, components) -> LinearisedScenes:
+        """The same observations with other components."""
+        device = self.device, self.dtype, self.tuning
+        return LinearisedScenes(
+            components, self.sights, self.n_scenes, *device, fit_sky=self.fit_sky
+        )
+
+    def light_products(self, sky, error=0.0):
+        """Products (N, C) of each component's whitened image with all light but the sky's, and with
+        itself; 0 where it has no pixels.
+
+        sky (B, C); error: part of the light that adds to the noise
+        """
+        spectra = np.zeros((len(self.slots), self.n_channels))
+        right, power = np.zeros((2, len(self.components), self.n_channels))
+        for sight, (table, pairs) in zip(self.sights, self.overlapping_pairs, strict=True):
+            sight.compute_residuals(self.scenes, self.slots, spectra, sky, error)
+            alone = table[:, 0] == table[:, 1]
+            square = sight.gram(pairs, 1)[alone][..., 0, 0]
+            power[self.at[table[alone, 0]], sight.channels] = square
+            right[self.at, sight.channels] = sight.residual_products(1)[:, :, 0, 0]
+        if self.ties is not None:
+            right, power = (self.ties.spread(self.ties.total(a)) for a in (right, power))
+        return right, power
+
+    def signal_to_noise(self, sky, error=0.0):
+        """<u, d> / |u| (N, C) of `light_products`, 0 without pixels."""
+        right, power = self.light_products(sky, error)
+        return np.divide(right, np.sqrt(power), out=np.zeros_like(right), where=power > 0)
+
+    def solution(self):
+        """The present spectra and sky levels (k, C, n + 1)."""
+        out = np.zeros((len(self.scenes), self.n_channels, self.n_most + 1))
+        out[self.rows, :, self.index[self.at]] = self.spectra[self.at]
+        out[..., self.n_most] = self.sky[self.scenes]
+        return out
+
+    def _non_negative(self):
+        """The least squares (k, C, n) or, with the sky, (k, C, n + 1)."""
+        if self.ties is not None:
+            return _by_band(self)
+        size = self.n_most + self.fit_sky
+        free = np.arange(size) >= self.n_most
+        normal = self.normal[..., :size, :size].reshape(-1, size, size)
+        found = nnls_batch(normal, self.right[..., :size].reshape(-1, size), free)
+        return found.reshape(len(self.scenes), self.n_channels, size)
+
+    def covariance(self, row):
+        """Of one scene's spectra (C, n, n), the sky levels unknown too if they are fitted."""
+        n = int((self.scene == self.scenes[row]).sum())
+        if self.ties is not None:
+            given = self.ties, self.normal[row], self.right[row], self.fit_sky
+            return self.ties.spread(
+                spectrum_covariance(band_equations(*given)[0][:, :n, :n]), axis=0
+            )
+        own = np.r_[0:n, self.n_most : self.n_most + self.fit_sky]
+        return spectrum_covariance(self.normal[row][:, own[:, None], own])[:, :n, :n]
+
+
+def _by_band(looking):
+    """The least squares (k, C, n) of tied channels or, with the sky, (k, C, n + 1)."""
+    ties, n = looking.ties, looking.n_most
+    normal, right, own, value = band_equations(ties, looking.normal, looking.right, looking.fit_sky)
+    found = nnls_batch(normal.reshape(-1, n, n), right.reshape(-1, n))
+    spectra = ties.spread(found.reshape(right.shape), axis=1)
+    if not looking.fit_sky:
+        return spectra
+    sky = value - (own * spectra).sum(axis=-1)
+    return np.concatenate([spectra, sky[..., None]], axis=-1)

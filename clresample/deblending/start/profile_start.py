@@ -1,0 +1,236 @@
+"""Starting point of a fit: smooth profiles and positions of free stars, fitted to all data.
+
+Gauss-Newton on the shapes with the spectra eliminated (variable projection), over every channel of
+every instrument, so that a source that only one of them sees still starts right:
+
+    min  sum_pixels w (d - sum_s A_s R S_s)^2 + sum doubt ((theta - mean) / scatter)^2,     A >= 0
+
+What is expected of theta, and how far shapes are doubted beside other sources: population.py.
+Smooth profiles leave a tenth of a bright galaxy's light unexplained. The weights allow for it,
+1/w = sigma^2 + (MODEL_ERROR * light)^2: without, spiral arms would be taken for faint neighbours.
+The light is that of the data, smoothed, so that weights stay as they are while profiles change:
+weights that followed the model would make chi2 smaller the more light a model claims.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...resampling.gridding import KaiserBessel
+from ...resampling.plan import Precision
+from ...sky.frame import Frame
+from ..profiles import FixedProfile, GalaxyProfile, StarProfile, components_of
+from ..view import WhitenedView, allow_for_psf_error, pixel_noise
+from .component_batch import StartComponent
+from .linearised_scenes import linearise
+from .profile_fit import ProfileFit
+
+# What is enough for profiles: they leave a tenth of a galaxy's light. Frequencies and light of the
+# PSF beyond these parts of it, and six taps, change chi2 by 1e-4; the operator's own precision and
+# reach take three times as long.
+PRECISION, TOLERANCE = Precision(1e-4, KaiserBessel(6, 1.5)), 1e-4
+# [sigma] What counts as light at a source: noise alone reaches it once in 740 times, what `detect`
+# finds has 5. A source is far from any light where neither its expected profile at its position
+# shows that, nor a galaxy NEARBY times larger than expected does, 1.5" in sigma: a source that is
+# too faint by itself, but beside others, is probably meant.
+LIGHT_SIGMAS, NEARBY = 3.0, 6.0
+
+
+@dataclass(frozen=True, eq=False)
+class StartInput:
+    """Inputs of the start of one scene.
+
+    frame: Frame; sources (S), positions (S, 2) [px]: those inside it; views: WhitenedViews
+    """
+
+    frame: Frame
+    sources: list
+    positions: np.ndarray
+    views: list[WhitenedView]
+
+
+@dataclass(frozen=True, eq=False)
+class StartingPoint:
+    """Components of a scene before their own structure is fitted.
+
+    source (n): the source of each component
+    positions (S, 2) [px]: of the sources, free stars where they were found
+    undetected (S,): bool, whether a source is far from any light, see `_is_dark`
+    shapes (n): the components' Shapes; thetas (n): arrays of their parameters
+    drawn_positions (n, 2) [px]: where the shapes are drawn with these parameters
+    peaks (n,): by which profiles of unit integral are divided, so that max = 1
+    spectra (n, C), sky (C,): least squares for these profiles; spectrum_curvature (n, C): sum u^2
+        of each one's whitened image u. In the views' units
+    """
+
+    source: np.ndarray
+    positions: np.ndarray
+    undetected: np.ndarray
+    shapes: list
+    thetas: list
+    drawn_positions: np.ndarray
+    peaks: np.ndarray
+    spectra: np.ndarray
+    sky: np.ndarray
+    spectrum_curvature: np.ndarray
+
+    def __len__(self):
+        return len(self.shapes)
+
+    def stars(self):
+        """List of point sources: StarProfile, number of its source, place (2,) [px].
+
+        spectrum (C,).
+        """
+        spectra = self.spectra / self.peaks[:, None]
+        rows = zip(self.shapes, self.source, self.positions[self.source], spectra, strict=True)
+        return [row for row in rows if isinstance(row[0], StarProfile)]
+
+    def drawn(self, i, origin, size):
+        """Component i's profile in a box of the frame, (ny, nx)."""
+        image = self.shapes[i].draw_box(
+            self.thetas[i], self.drawn_positions[i], origin, size, slopes=False
+        )
+        return image[0] / self.peaks[i]
+
+    def reach(self, i, threshold):
+        """Middle (2,) and half size (2,) [px] of what of it is above a part of its peak."""
+        return self.shapes[i].bounding_box(self.thetas[i], self.drawn_positions[i], threshold)
+
+
+def fit_start_profiles(patches: list[StartInput], *, fit_sky=False) -> list[StartingPoint]:
+    """Fit profiles and free stars of all patches side by side; see the module's text.
+
+    patches: of equal numbers of observations, these of equal shapes
+    fit_sky: also a level per channel
+    """
+    sources, components = _components(patches)
+    views = [p.views for p in patches]
+    looking = linearise(views, components, PRECISION, TOLERANCE, fit_sky=fit_sky)
+    noise = np.array([pixel_noise(p.views) for p in patches])
+    fit = ProfileFit(looking, noise)
+    fit.begin()
+    dark = _dark(patches, sources, looking)
+    fit.run()
+    thetas = fit.thetas()
+    looking.render(np.arange(len(patches)), thetas, fit.brightness, slopes=False)
+    looking.solve(0.0)
+    return [_point(patch, looking, thetas, sources, b, dark[b]) for b, patch in enumerate(patches)]
+
+
+def with_psf_error_weights(patch, point: StartingPoint, settings):
+    """Views whose weights hold the PSF's error in bright stars, and the start under them."""
+    views = allow_for_psf_error(patch.views, point.stars(), settings.psf_error)
+    if all(new is old for new, old in zip(views, patch.views, strict=True)):
+        return patch.views, point
+    return views, _solved_again(replace(patch, views=views), point, settings.fit_sky)
+
+
+def _solved_again(patch, point, fit_sky):
+    """The same profiles, with other spectra, sky and power."""
+    rows = enumerate(zip(point.source, point.shapes, point.drawn_positions, strict=True))
+    components = [StartComponent(0, i, *row, patch.frame.shape) for i, row in rows]
+    looking = linearise([patch.views], components, PRECISION, TOLERANCE, fit_sky=fit_sky)
+    noise = pixel_noise(patch.views)
+    brightness = (point.spectra / noise).max(axis=1)
+    looking.render(np.arange(1), point.thetas, brightness, slopes=False)
+    looking.solve(0.0)
+    power = np.diagonal(looking.normal[0], axis1=1, axis2=2)[:, : len(point)].T
+    return replace(
+        point,
+        spectra=looking.spectra * point.peaks[:, None],
+        sky=looking.sky[0].copy(),
+        spectrum_curvature=power / point.peaks[:, None] ** 2,
+    )
+
+
+def _point(patch, looking, thetas, sources, b, dark):
+    """The StartingPoint of scene b, all solved for."""
+    at = np.flatnonzero(looking.scene == b)
+    chosen, own, positions = [looking.components[i] for i in at], [], patch.positions.astype(float)
+    peaks = np.zeros(len(at))
+    for k, (i, c) in enumerate(zip(at, chosen, strict=True)):
+        own.append(thetas[i])
+        positions[sources[i]] = c.shape.center(thetas[i], c.position)
+        center = positions[sources[i]]
+        peaks[k] = profile_peak(c.shape, thetas[i], c.position, center, c.frame)
+    power = np.diagonal(looking.normal[b], axis1=1, axis2=2)[:, : len(at)].T
+    return StartingPoint(
+        source=sources[at],
+        positions=positions,
+        undetected=dark,
+        shapes=[c.shape for c in chosen],
+        thetas=own,
+        drawn_positions=np.array([c.position for c in chosen]),
+        peaks=peaks,
+        spectra=looking.spectra[at] * peaks[:, None],
+        sky=looking.sky[b].copy(),
+        spectrum_curvature=power / peaks[:, None] ** 2,
+    )
+
+
+def profile_peak(shape, theta, place, center, frame):
+    """The largest pixel of a Shape's profile of unit integral in its frame.
+
+    place, center (2,) [px]: where it is drawn, and near which that pixel lies; frame (2,) [px]
+    """
+    if isinstance(shape, FixedProfile):
+        return shape.peak
+    middle, top = np.floor(center + 0.5).astype(int), np.array(frame)
+    low, high = np.maximum(middle - 2, 0), np.minimum(middle + 3, top)
+    return float(shape.draw_box(theta, place, low, high - low, slopes=False).max())
+
+
+def _components(patches):
+    """Sources (N,) in their patches, and StartComponents of all patches."""
+    sources, components = [], []
+    for b, patch in enumerate(patches):
+        n = 0
+        for i, (source, position) in enumerate(zip(patch.sources, patch.positions, strict=True)):
+            for shape in components_of(source, patch.frame):
+                place = np.array(position, dtype=np.float64)
+                components.append(StartComponent(b, n, i, shape, place, patch.frame.shape))
+                sources.append(i)
+                n += 1
+    return np.array(sources), components
+
+
+def _dark(patches, sources, looking):
+    """Selects sources far from any light: (S,) bool of each patch.
+
+    looking: at all components as they are expected, the sky level solved for; sources (N,): theirs
+    """
+    seen, found = looking.signal_to_noise(looking.sky), []
+    for b, patch in enumerate(patches):
+        at = looking.scene == b
+        snr = np.full((len(patch.sources), seen.shape[1]), -np.inf)
+        np.maximum.at(snr, sources[at], seen[at])
+        found.append(_is_dark(snr))
+    again = [(b, i) for b, dark in enumerate(found) for i in np.flatnonzero(dark)]
+    if again:
+        wide, count = [], np.zeros(len(patches), int)
+        for b, i in again:
+            frame, position = patches[b].frame, np.array(patches[b].positions[i], float)
+            shape = GalaxyProfile(frame, widened=NEARBY)
+            wide.append(StartComponent(b, int(count[b]), i, shape, position, frame.shape))
+            count[b] += 1
+        around = looking.with_components(wide)
+        scenes = np.unique(around.scene)
+        around.render(scenes, [c.shape.mean for c in wide], np.zeros(len(wide)), slopes=False)
+        dark = _is_dark(around.signal_to_noise(looking.sky))
+        for (b, i), still in zip(again, dark, strict=True):
+            found[b][i] = still
+    return found
+
+
+def _is_dark(snr):
+    """Selects positions (n,) without light, from their signal to noise (n, C).
+
+    Neither in any channel nor in all that see the place together, each with the same weight: that
+    finds what is faint in each of many channels.
+    """
+    n_seen = np.maximum(np.count_nonzero(snr, axis=1), 1)
+    together = snr.sum(axis=1) / np.sqrt(n_seen)
+    return np.maximum(snr.max(axis=1), together) < LIGHT_SIGMAS

@@ -1,0 +1,201 @@
+"""Plans the rendering of component boxes: the window that each box reaches, and its operator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...resampling.plan import Precision, ResamplingPlan, make_resampling_plan
+from ...resampling.transfer import light_reach
+from ...sky.mapping import PaddedMapping
+from .renderer import BoxRenderer
+
+# [model px] Departure from an affine mapping that a box of a distorted one may have, as for frames.
+TOLERANCE_PX = 1e-4
+# [px] Windows that several plans share have sides of multiples of it, so that those of other scenes
+# beside them are as large, and are not made anew: with 1 px they often are, with 8 px windows hold
+# more pixels that no light reaches.
+SIZE_PX = 4
+
+
+@dataclass(frozen=True, eq=False)
+class RenderRun:
+    """Slots that follow each other and are rendered at once.
+
+    first, last: of them, last + 1; renderer: None where nothing is near
+    plan_index (m,): index of each one's plan there; low (m, 2): first pixels of their windows
+    lit_window (m, 4): first pixels and sizes of the parts of these that light reaches
+    offsets_px (m, 2) [model px]: by how much the pixels are off the plan's
+    """
+
+    first: int
+    last: int
+    renderer: BoxRenderer | None
+    plan_index: np.ndarray
+    low: np.ndarray
+    lit_window: np.ndarray
+    offsets_px: np.ndarray
+
+
+class RenderPlanner:
+    """Renderers for the boxes of slots, one observation of each of B scenes.
+
+    views (B): WhitenedViews; precision: of the operators
+    tolerance: part of the PSF's light beyond windows; 0: as little as beyond those of whole frames,
+        and these are seen with the views' own plans
+
+    Scenes whose plans are alike in layout share a renderer for each shape of boxes.
+    """
+
+    def __init__(self, views, device, dtype, precision: Precision, tolerance):
+        self.views, self.device, self.dtype, self.precision = views, device, dtype, precision
+        self._exact = not tolerance
+        plans = [v.op.plans[0] for v in views]
+        self._plans = list({id(p): p for p in plans}.values())
+        at = {id(p): i for i, p in enumerate(self._plans)}
+        self._plan = np.array([at[id(p)] for p in plans])  # of each scene, among these
+        layouts = [_layout(p) for p in self._plans]
+        self._layout = np.array([layouts.index(layouts[i]) for i in self._plan])
+        self._distorted = np.array([p.geometry == "distorted" for p in plans])
+        self._reach = [_reach(p, tolerance) for p in self._plans]
+        self._inverse = np.array([np.linalg.inv(p.mapping.matrix) for p in plans])
+        self._renderers: dict[object, _WindowRenderer | BoxRenderer] = {}
+
+    def runs(self, slots):
+        """Yield the RenderRuns of slots."""
+        # on distorted pixels each place has its own plan
+        whole = (slots.size == self.views[0].op.shape_in[1:]).all(axis=1) & self._exact
+        alone = self._distorted[slots.scene] & ~whole
+        key = np.where(alone, -1 - np.arange(len(slots)), self._layout[slots.scene])
+        for first, last in slots.runs(key):
+            aim = self._at_all if whole[first] else self._at_place if alone[first] else self._about
+            yield RenderRun(first, last, *aim(slots, first, last))
+
+    def shares(self, slots, first, last):
+        """Coefficients (m, Co, T) of the operators' terms in the PSFs of slots' sources, or None.
+
+        None where there is one term; see WhitenedView.
+        """
+        if self.views[0].coefficients is None:
+            return None
+        rows = zip(slots.scene[first:last], slots.components[first:last], strict=True)
+        return np.array([self.views[b].coefficients[c.source] for b, c in rows])
+
+    def _about(self, slots, first, last):
+        """Renderer and offsets of slots whose plans are those of all boxes of their shape."""
+        scene, origin = slots.scene[first:last], slots.origin[first:last]
+        shape, used = tuple(slots.size[first].tolist()), np.unique(self._plan[scene])
+        key = int(self._layout[scene[0]]), shape
+        windows = self._renderers.get(key)
+        if windows is None or not np.isin(used, windows.members).all():
+            members = used if windows is None else np.union1d(used, windows.members)
+            windows = self._renderers[key] = self._windows(key[0], members, shape)
+        which = np.searchsorted(windows.members, self._plan[scene])
+        placed = np.array([self.views[s].mapping.offset + self.views[s].op.shift for s in scene])
+        off = placed - origin - windows.offset[which]
+        low = np.rint(-np.einsum("nij,nj->ni", self._inverse[scene], off))
+        moves = off + np.einsum("nij,nj->ni", windows.matrix[which], low)
+        lit = np.concatenate([low, windows.own[which]], axis=1).astype(int)
+        return windows.renderer, which, lit[:, :2] - windows.before[which], lit, moves
+
+    def _windows(self, layout, members, shape):
+        """The _Windows of the plans `members` for boxes of a shape, of one size for all scenes."""
+        own = [
+            PaddedMapping.window_size(plan.mapping, shape, reach)
+            for plan, reach in zip(self._plans, self._reach, strict=True)
+        ]
+        alike = np.unique(self._plan[self._layout == layout])
+        size = None
+        if len(alike) > 1:
+            most = np.max([own[i] for i in alike], axis=0)
+            size = tuple((-(-most // SIZE_PX) * SIZE_PX).tolist())
+        plans = [
+            self._plans[i].window(shape, self._reach[i], self.precision, size) for i in members
+        ]
+        renderer = BoxRenderer(self.device, self.dtype, plans)
+        return _WindowRenderer(members, renderer, np.array([own[i] for i in members]))
+
+    def _at_all(self, slots, first, last):
+        """The same for boxes that are the whole frame."""
+        scene = slots.scene[first:last]
+        layout = self._layout[scene[0]]
+        of_layout = self._layout == layout
+        members, n = np.unique(self._plan[of_layout]), last - first
+        ops = {id(view.op): view.op for view, on in zip(self.views, of_layout, strict=True) if on}
+        moves = np.array([self.views[s].op.shift for s in scene])
+        executor = None
+        if len(ops) == 1:  # its tables are there, with the shift
+            executor, moves = ops.popitem()[1].executor(), np.zeros((n, 2))
+        renderer = self._renderer(int(layout), [self._plans[i] for i in members], executor)
+        which, low = np.searchsorted(members, self._plan[scene]), np.zeros((n, 2), int)
+        return renderer, which, low, np.concatenate([low, low + renderer.size], axis=1), moves
+
+    def _at_place(self, slots, i, _):
+        """The same for one slot of a distorted mapping; no BoxRenderer where nothing is near."""
+        scene, origin, shape = slots.scene[i], slots.origin[i], slots.size[i]
+        plan, view = self._plans[self._plan[scene]], self.views[scene]
+        reach = self._reach[self._plan[scene]]
+        which, moves = np.zeros(1, int), view.op.shift[None]
+        near = view.mapping.positions + view.op.shift
+        near = ((near >= origin - reach) & (near <= origin + shape + reach)).all(axis=2)
+        rows, columns = (np.flatnonzero(near.any(axis=1 - axis)) for axis in (0, 1))
+        if not len(rows):
+            nowhere = np.zeros((1, 4), int)
+            return None, which, nowhere[:, :2], nowhere, moves
+        low = np.array([rows[0], columns[0]])
+        size = np.array([rows[-1], columns[-1]]) + 1 - low
+        margin = int(np.ceil(reach))
+        key = int(scene), *origin.tolist(), *shape.tolist()
+        renderer = self._renderers.get(key)
+        if renderer is None:
+            cut = plan.mapping.window(
+                origin - margin, shape + 2 * margin, low, size, tolerance_px=TOLERANCE_PX
+            )
+            around = PaddedMapping.of(cut, shape, margin)
+            extent = tuple((shape + reach).tolist())
+            given = {"precision": self.precision, "n_terms": plan.n_terms}
+            at_place = make_resampling_plan(around, *plan.psfs, extent=extent, **given)
+            renderer = self._renderer(key, [at_place])
+        return renderer, which, low[None], np.concatenate([low, size])[None], moves
+
+    def _renderer(self, key, plans, executor=None):
+        """The Renderer of plans, made once for a key."""
+        if key not in self._renderers:
+            self._renderers[key] = BoxRenderer(self.device, self.dtype, plans, executor)
+        return self._renderers[key]
+
+
+class _WindowRenderer:
+    """Renders boxes of one shape about their middle.
+
+    members (P,): the plans of whole frames that they are windows of, ascending; renderer: of them
+    offset, matrix: of mappings (P, 2), (P, 2, 2) that begin where the light does
+    own (P, 2): pixels that each one's light reaches; before (P, 2): those in front of these
+    """
+
+    def __init__(self, members, renderer, own):
+        self.members, self.renderer, self.own = members, renderer, own
+        mappings = [plan.mapping for plan in renderer.plans]
+        self.offset = np.array([m.offset for m in mappings])
+        self.matrix = np.array([m.matrix for m in mappings])
+        self.before = (np.array(renderer.size) - self.own) // 2
+        self.offset = self.offset + np.einsum("nij,nj->ni", self.matrix, self.before)
+
+
+def _layout(plan: ResamplingPlan):
+    """Properties that plans share to be rendered together; distorted ones are alone."""
+    if plan.geometry == "distorted":
+        return id(plan)
+    by_row = None if plan.lines is None else plan.lines.by_row
+    return plan.geometry, plan.axes, plan.n_terms, by_row
+
+
+def _reach(plan, tolerance):
+    """Distance [model px] to which the light of a box is followed.
+
+    With no tolerance it is as far as a plan's model is padded for it.
+    """
+    if not tolerance:
+        return max(plan.certificate.wrap_radius_px)
+    return light_reach(plan.psfs[1], plan.mapping.matrix, tolerance)

@@ -1,0 +1,223 @@
+"""One observation of all scenes of a group: what it sees of slots, and sums over its pixels."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from ...resampling.plan import Precision
+from .component_batch import ComponentBatch, cumulative_offsets
+from .render_planner import RenderPlanner
+
+FILE = "start.cl"
+# [px] Sigma by which data are smoothed before a model's error is taken as a part of them. Noise
+# is then 10 times smaller. SDRs of simulated COSMOS galaxies are the same with 2 to 4, and 0.1 dB
+# lower with 1.
+LIGHT_PX = 3.0
+
+
+class SlotObservation:
+    """One observation of each of B scenes, and the slots that it sees at present.
+
+    views (B): WhitenedViews of equal shapes; channels: slice of all the scenes' channels
+    precision, tolerance: see RenderPlanner
+
+    lit (slots, 4): first pixels and sizes of what the slots seen last light up
+    n_elements: that were last seen; n_pixels: of all products so far
+    ties: Ties of all channels, or None; scale (B, Co): WhitenedView.error_scale
+    sky_precision (B, Co): the views', 0 where they have none
+    root (B, Co, My, Mx): on the device, as are data (times root), residual and weight
+    """
+
+    def __init__(self, views, channels, device, dtype, tuning, precision: Precision, tolerance):
+        self.views, self.channels, self.device, self.dtype = views, channels, device, dtype
+        self.tuning = tuning
+        shape = self.n_bands, self.my, self.mx = views[0].sqrt_weights.shape
+        shape = len(views), *shape
+        self.root = device.put(np.array([v.sqrt_weights for v in views]), dtype)
+        self.data = device.put(np.array([v.data * v.sqrt_weights for v in views]), dtype)
+        self.residual, self.weight = (device.empty(shape, dtype) for _ in range(2))
+        self.sums = device.empty((*shape[:3], 3), dtype)
+        self.ties, self.scale = views[0].ties, np.array([v.error_scale for v in views])
+        known = [v.sky_precision for v in views]
+        self.sky_precision = np.zeros(shape[:2]) if known[0] is None else np.array(known)
+        self.aim = RenderPlanner(views, device, dtype, precision, tolerance)
+        self.n_elements = self.n_pixels = 0
+        self._listed = None  # of the scenes last compared, on the device
+
+    @cached_property
+    def _light(self):
+        """`smoothed_light` of all views, on the device."""
+        return self.device.put(np.array([smoothed_light(v) for v in self.views]), self.dtype)
+
+    def _launch(self, name, size, *, local_size=None, **arguments):
+        """Queue a kernel of start.cl; K of them: images of a slot that are summed."""
+        n_images = arguments.pop("K", 1)
+        sums = {"WG": self.tuning.sum_group, "K": n_images} if local_size else {}
+        launch = self.device.launcher(
+            FILE,
+            name,
+            dtype=self.dtype,
+            local_size=local_size or self.tuning.local_size(3),
+            ROWS=self.tuning.row_loops,
+            **sums,
+        )
+        launch(size, n_bands=self.n_bands, my=self.my, mx=self.mx, **arguments)
+
+    def render(self, slots: ComponentBatch, images):
+        """Render the slots' images, and keep what is seen of them."""
+        low, size = np.zeros((2, len(slots), 2), int)
+        self.lit, runs = np.zeros((len(slots), 4), int), []
+        for run in self.aim.runs(slots):
+            part = slice(run.first, run.last)
+            low[part], self.lit[part] = run.low, run.lit_window
+            if run.renderer is not None:
+                size[part] = run.renderer.size
+                runs.append(run)
+        begin, n = cumulative_offsets(slots.n_images * self.n_bands * size.prod(axis=1))
+        self.place = np.column_stack([slots.scene, low, size, slots.n_images, begin])
+        self.place_on_device = self.device.put(self.place.astype(np.int32))
+        self._listed = None
+        self.n_elements, self.seen = n, self.device.empty(n, self.dtype)
+        for run in runs:
+            at = int(slots.begin[run.first]), int(begin[run.first])
+            n, shares = int(slots.n_images[run.first]), self.aim.shares(slots, run.first, run.last)
+            run.renderer(images, at[0], self.seen, at[1], n, run.plan_index, run.offsets_px, shares)
+
+    def whiten(self):
+        """Bring what is seen to units of the noise."""
+        tallest, widest = self.place[:, 3:5].max(axis=0).tolist()
+        self._launch(
+            "whiten",
+            (1 if self.tuning.row_loops else widest, tallest, len(self.place)),
+            place=self.place_on_device,
+            root=self.root,
+            images=self.seen,
+        )
+
+    def compute_residuals(self, scenes, slots, spectra, sky, error):
+        """Residuals and weights of the scenes (k,) of the slots rendered last.
+
+        And sums (k, Co, 3) over the pixels.
+
+        spectra (slots, C), sky (B, C): of the model; error: part of the light that adds to
+        the noise
+        """
+        put = self.device.put
+        if self._listed is None:
+            self._listed = [put(x.astype(np.int32)) for x in _listed(slots, scenes)]
+        scenes_on_device, first, listed = self._listed
+        group = self.tuning.sum_group
+        self._launch(
+            "compute_residuals",
+            (group * self.my, self.n_bands, len(scenes)),
+            local_size=(group, 1, 1),
+            scenes=scenes_on_device,
+            first=first,
+            listed=listed,
+            place=self.place_on_device,
+            channel=self.channels.start,
+            n_channels=spectra.shape[1],
+            error=put(error * self.scale, self.dtype),
+            spectra=put(spectra, self.dtype),
+            sky=put(sky, self.dtype),
+            root=self.root,
+            data=self.data,
+            light=self._light if error else self.data,  # times 0 without an error
+            images=self.seen,
+            residual=self.residual,
+            weight=self.weight,
+            sums=self.sums,
+        )
+        return self.device.get(self.sums).astype(np.float64).sum(axis=2)[scenes]
+
+    def overlapping_pairs(self):
+        """Table (pairs, 6) of slots a <= b of one scene whose windows overlap on the pixels.
+
+        With the first pixel and size of the overlap; NumPy's, and on the device. Slots without
+        pixels are left out.
+        """
+        table = _pairs(self.place[:, 0], self.lit, (self.my, self.mx))
+        self.n_pixels += int(table[:, 4:].prod(axis=1).sum())
+        return table, self.device.put(table.astype(np.int32))
+
+    def gram(self, pairs, n_images):
+        """Products (pairs, Co, K, K) of pairs' images, under the present weights.
+
+        K = n_images, of which images that a slot does not have repeat its last. pairs: a table on
+        the device
+        """
+        out = self.device.empty((len(pairs), self.n_bands, n_images, n_images), self.dtype)
+        if len(pairs):
+            group = self.tuning.sum_group
+            self._launch(
+                "gram",
+                (group * len(pairs), self.n_bands),
+                local_size=(group, 1),
+                K=n_images,
+                pairs=pairs,
+                place=self.place_on_device,
+                images=self.seen,
+                weight=self.weight,
+                out=out,
+            )
+        return self.device.get(out).astype(np.float64)
+
+    def residual_products(self, n_images):
+        """Products (slots, Co, K, 2) of the slots' images with the residual, and with the root."""
+        group, n = self.tuning.sum_group, len(self.place)
+        out = self.device.empty((n, self.n_bands, n_images, 2), self.dtype)
+        self._launch(
+            "residual_products",
+            (group * n, self.n_bands),
+            local_size=(group, 1),
+            K=n_images,
+            place=self.place_on_device,
+            images=self.seen,
+            weight=self.weight,
+            residual=self.residual,
+            root=self.root,
+            out=out,
+        )
+        return self.device.get(out).astype(np.float64)
+
+
+def smoothed_light(view):
+    """Light of a WhitenedView's pixels over their noise (Co, My, Mx), smoothed over neighbours.
+
+    Pixels without a weight take no part, and have none.
+    """
+    seen = gaussian_filter(view.sqrt_weights**2, (0, LIGHT_PX, LIGHT_PX), mode="constant")
+    light = gaussian_filter(
+        view.sqrt_weights**2 * view.data, (0, LIGHT_PX, LIGHT_PX), mode="constant"
+    )
+    return view.sqrt_weights * np.divide(
+        light, seen, out=np.zeros_like(light), where=view.sqrt_weights > 0
+    )
+
+
+def _listed(slots, scenes):
+    """Scenes (k,), where each one's slots begin (k + 1,) in a list, and the list, not empty."""
+    by_scene = np.argsort(slots.scene, kind="stable")
+    begin, end = (
+        np.searchsorted(slots.scene[by_scene], scenes, side) for side in ("left", "right")
+    )
+    listed = [by_scene[a:b] for a, b in zip(begin, end, strict=True)]
+    return np.asarray(scenes), np.cumsum([0, *map(len, listed)]), np.concatenate([*listed, [0]])
+
+
+def _pairs(scenes, lit, shape):
+    """Overlapping pairs of slots of `scenes` (n,), `lit` (n, 4) on an observation of this shape."""
+    low = np.maximum(lit[:, :2], 0)
+    high = np.minimum(lit[:, :2] + lit[:, 2:], shape)
+    found = []
+    for scene in np.unique(scenes):
+        at = np.flatnonzero(scenes == scene)
+        both = np.maximum(low[at, None], low[at]), np.minimum(high[at, None], high[at])
+        meet = np.triu((both[1] > both[0]).all(axis=2))
+        i, j = np.nonzero(meet)
+        start = both[0][i, j]
+        found.append(np.column_stack([at[i], at[j], start, both[1][i, j] - start]))
+    return np.concatenate(found)

@@ -1,0 +1,103 @@
+"""Measurements of a device kept for later runs: tuned sizes, self-test.
+
+One JSON file for each device, driver and version of clresample lies in the user's cache folder, or
+in the folder that CLRESAMPLE_CACHE names. All of it can be deleted: it is measured again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+import warnings
+from contextlib import suppress
+from pathlib import Path
+
+from .. import __version__
+
+
+class DeviceWarning(UserWarning):
+    """Something about a device that a user should know, in one line."""
+
+
+def cache_folder():
+    """Folder of what can be made again: CLRESAMPLE_CACHE, or the system's place."""
+    given = os.environ.get("CLRESAMPLE_CACHE")
+    return Path(given) if given else system_caches() / "clresample"
+
+
+def system_caches():
+    """The folder in which this system's programs have the user's cache folders."""
+    import platformdirs  # for commands that need no device
+
+    return platformdirs.user_cache_path()
+
+
+class DeviceCache:
+    """The file of one device: named parts, each of them JSON.
+
+    cl_device: the pyopencl device; another driver, or version of clresample, has another file
+    """
+
+    def __init__(self, cl_device):
+        self.about = {
+            "platform": cl_device.platform.name.strip(),
+            "device": cl_device.name.strip(),
+            "driver": f"{cl_device.platform.version} {cl_device.driver_version}".strip(),
+            "clresample": __version__,
+        }
+        key = hashlib.sha256(json.dumps(self.about).encode()).hexdigest()[:16]
+        self._content = None
+        self.path = cache_folder() / "devices" / f"{key}.json"
+
+    def read(self, part):
+        """A part as it was kept, or None. A file that cannot be read is ignored, with a warning."""
+        return self._all().get(part)
+
+    def write(self, part, content):
+        """Keep a part beside the others. Raises OSError where the file cannot be written."""
+        everything = self.about | self._all() | {part: content}
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=self.path.parent, prefix=f"{self.path.stem}-")
+        try:
+            with os.fdopen(handle, "w", encoding="utf-8") as file:
+                json.dump(everything, file, indent=1)
+            os.replace(name, self.path)
+        except BaseException:
+            with suppress(OSError):
+                os.unlink(name)
+            raise
+        self._content = everything
+
+    def override(self, part, content):
+        """Let a part read so for the rest of this process; the file stays as it is."""
+        self._all()[part] = content
+
+    def invalidate(self, part, why):
+        """Ignore a part for the rest of this process, with a warning; the file stays as it is."""
+        if self._all().pop(part, None) is not None:
+            self.warn_ignored(why)
+
+    def warn_ignored(self, why):
+        """Warn, in one line, that what the file says is not used."""
+        warnings.warn(f"{self.path} is ignored: {why}", DeviceWarning, stacklevel=2)
+
+    def _all(self):
+        """The file's content, read once."""
+        if self._content is None:
+            self._content = self._read()
+        return self._content
+
+    def _read(self):
+        try:
+            content = json.loads(self.path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError) as error:
+            self.warn_ignored(" ".join(str(error).split()))
+            return {}
+        if not isinstance(content, dict):
+            self.warn_ignored("it holds no JSON object")
+            return {}
+        return content

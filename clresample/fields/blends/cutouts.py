@@ -1,0 +1,111 @@
+"""Cutouts of every mosaic around one fit region, with neighbours' models subtracted."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...deblending.blend import Blend
+from ...deblending.spectra import MODEL_ERROR
+from ...sky.frame import model_frame
+from ...sky.sources import ExtendedSource
+from ..box import Box, box_within
+
+# [px] Sides of the cutouts of fits are multiples of it, as the boxes of their models are of theirs:
+# smaller ones make more batches, larger ones more sky to compute.
+SIDE_PX = 4
+
+
+def make_blend(patch, plan, mosaics, reference, labels, corner, neighbours=None, components=None):
+    """The Blend of a patch, and the Boxes on the mosaics that its observations were cut from.
+
+    patch: Patch of plan: Plan; mosaics: of the field; reference: Grid of the model's pixels
+    labels (Ny, Nx): patch numbers + 1 of the model's pixels from `corner` (2,) [px] on
+    neighbours: {mosaic's name: list of (Box, model (C, Ny, Nx) [counts])}: light of the other
+        pieces of the same blend, to be subtracted. None: their pixels are ignored, as those of all
+        other blends are
+    components: {id: how many a source has}; of the others the data choose
+
+    A patch that no mosaic sees gives a Blend without observations. Raises FileError for pixels that
+    cannot be read.
+    """
+    grid = reference.cutout(patch.box.y0, patch.box.x0, patch.box.shape)
+    foreign = _foreign(patch, labels, corner, neighbours is not None)
+    known, observations, boxes = components or {}, [], {}
+    for mosaic in mosaics:
+        box = fit_box(mosaic, grid)
+        if not box.area:
+            continue
+        light = None
+        if neighbours is not None:
+            light = _light_in(box, neighbours.get(mosaic.name, ()), len(mosaic.channels))
+        cut = mosaic.grid.cutout(box.y0, box.x0, box.shape)
+        seen = mosaic.observation(
+            box,
+            ignore=_foreign_pixels(cut, grid, foreign),
+            subtract=light,
+            extra=None if light is None else (MODEL_ERROR * light) ** 2,
+            grid=cut,
+        )
+        if seen is not None:
+            observations.append(seen)
+            boxes[mosaic.name] = box
+    sources = tuple(
+        ExtendedSource(
+            position_px=tuple(map(float, plan.positions[s] - patch.box[:2])),
+            name=str(plan.ids[s]),
+            n_components=known.get(int(plan.ids[s])),
+        )
+        for s in patch.sources
+    )
+    frame = model_frame(observations, grid=grid) if observations else None
+    return Blend(tuple(observations), sources, frame), boxes
+
+
+def fit_box(mosaic, grid) -> Box:
+    """The pixels of a mosaic whose centres lie on a grid: those that a fit in it looks at.
+
+    Where noise is correlated, one more on each side: the filter that makes it white leaves a
+    cutout's outer pixels without a weight. Grids of one shape have Boxes of one shape, so that
+    their fits share a batch without padding. Of area 0 where there are none.
+    """
+    there = mosaic.edge_of(grid)
+    if not len(there):
+        return Box(0, 0, 0, 0)
+    margin = 0 if mosaic.noise is None else 1
+    return box_within(there, margin, SIDE_PX, Box.of(mosaic.grid.shape))
+
+
+def _foreign(patch, labels, corner, siblings_too):
+    """Pixels of the patch's box that belong to other patches: (Ny, Nx) bool.
+
+    siblings_too: those of its own blend's other pieces do not count, their light is subtracted
+    """
+    y, x = corner
+    box = Box(patch.box.y0 - y, patch.box.x0 - x, patch.box.y1 - y, patch.box.x1 - x)
+    there = box.intersection(Box.of(labels.shape))
+    own = np.zeros(patch.box.shape, labels.dtype)
+    own[there.relative_to(box).slices] = labels[there.slices]
+    known = [0, patch.number + 1]
+    if siblings_too:
+        known += [k + 1 for k in patch.siblings]
+    return ~np.isin(own, known)
+
+
+def _foreign_pixels(cut, grid, foreign):
+    """Pixels (My, Mx) of an observation's grid whose centre lies on a foreign one of the frame."""
+    mapping = cut.map_to(grid)
+    n, m = np.indices(cut.shape)
+    at = np.floor(mapping.at(n, m) + 0.5).astype(int)
+    inside = ((at >= 0) & (at < np.array(foreign.shape))).all(axis=-1)
+    at = np.clip(at, 0, np.array(foreign.shape) - 1)
+    return inside & foreign[at[..., 0], at[..., 1]]
+
+
+def _light_in(box, models, n_channels):
+    """Models of Boxes on a mosaic added up (C, Ny, Nx) in one of them."""
+    light = np.zeros((n_channels, *box.shape))
+    for there, model in models:
+        both = box.intersection(there)
+        if both.area:
+            light[:, *both.relative_to(box).slices] += model[:, *both.relative_to(there).slices]
+    return light

@@ -1,0 +1,93 @@
+"""The folder of a run: whose it is, and whether another may go on in it."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+
+import numpy as np
+
+from ...files.atomic import FileError, atomic_file, check_folder, remove_stale, remove_tree
+from .search_setup import FILE as LOOK_FILE
+
+WORK = "work"  # folder of the parts inside the output folder
+FORMAT = 2  # of that folder; raised when another version would misread it
+
+
+def open_folder(folder, mosaics, reference, options, resume, overwrite, progress, inputs=()):
+    """Creates or reopens the folder of group results; returns it and the options.
+
+    The options have the memory of the run that goes on: it decides which blends are fitted side by
+    side.
+
+    inputs: files whose sizes and times must be the same in a run that goes on
+
+    Raises FileError for the folder of another run.
+    """
+    work, mine = folder / WORK, _fingerprint(mosaics, reference, options, inputs)
+    check_folder(folder)
+    if overwrite and work.exists():
+        remove_tree(work)
+    there = work / "run.json"
+    _check_format(folder, there)
+    if there.exists() and (work / LOOK_FILE).exists():  # before that look nothing is done
+        if not resume:
+            raise FileError(f"{folder}: holds a run already: --resume goes on, --overwrite forgets")
+        before = json.loads(there.read_text())
+        other = [key for key in mine if key != "memory" and before.get(key) != mine[key]]
+        if other:
+            raise FileError(
+                f"{folder}: holds a run with another {other[0]}, {before.get(other[0])!r} and not "
+                f"{mine[other[0]]!r}: --overwrite forgets it"
+            )
+        progress.message(f"going on with the run in {folder}")
+        remove_stale(work)  # files in the midst of which it was killed
+        return work, replace(options, group_memory=before["memory"])
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"{work}: cannot be made ({error.strerror or error})") from error
+    with atomic_file(there) as part:
+        part.write_text(json.dumps(mine, indent=1))
+    return work, options
+
+
+def _check_format(folder, path):
+    """Raises FileError for the folder of a run by a version with another format."""
+    found = json.loads(path.read_text()).get("format", 1) if path.exists() else FORMAT
+    if found != FORMAT:
+        raise FileError(
+            f"{folder}: holds a run of format {found}, this version goes on with {FORMAT}: "
+            "--overwrite forgets it"
+        )
+
+
+def _fingerprint(mosaics, reference, options, inputs):
+    """Properties that a resumed run must share with the one before, in values that JSON returns."""
+    positions = options.positions
+    return {
+        "format": FORMAT,
+        "mosaics": [[m.name, *m.grid.shape, *(c.name for c in m.channels)] for m in mosaics],
+        "corner": np.round(reference.sky(0, 0), 9).tolist(),
+        "settings": repr(options.settings),
+        "threshold": options.threshold,
+        "passes": options.passes,
+        "sources": None if positions is None else np.round(positions, 9).tolist(),
+        "part": options.part and [*options.part, options.margin_px],
+        "tile_px": options.tile_px,
+        "overlap_px": options.overlap_px,
+        "limits": [options.limits.max_sources, options.limits.max_pixels],
+        "memory": options.group_memory,
+        "field_number": options.field_number,
+        "inputs": {str(f): _size_and_time(f) for f in inputs},
+    }
+
+
+def _size_and_time(path):
+    """[bytes, ns] of a file; None where it is not there."""
+    try:
+        found = os.stat(path)
+    except OSError:
+        return None
+    return [found.st_size, found.st_mtime_ns]

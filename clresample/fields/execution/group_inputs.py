@@ -1,0 +1,81 @@
+"""Gathers the inputs of a group of fits, so that workers need no access to the run folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..box import Box
+from .group_results import GroupResultsFile
+
+
+@dataclass(frozen=True)
+class FitGroup:
+    """Patches that are fitted side by side, and the part that they leave.
+
+    name: of the part; patches: numbers; round: 0, or which repetition of a cut blend's pieces
+    neighbour_models: (patch, name of a part, share) for each model of a neighbour that is
+        subtracted; the shares of a patch add up to 1
+    components: (id, how many) of those sources whose number of components an earlier round found
+    found: (patch, id, y, x, id of the host) of sources that an earlier round found in a patch's
+        residuals, at (y, x) [px] of the field's model pixels
+    """
+
+    name: str
+    patches: tuple[int, ...]
+    round: int = 0
+    neighbour_models: tuple[tuple[int, str, float], ...] = ()
+    components: tuple[tuple[int, int], ...] = ()
+    found: tuple[tuple[int, int, float, float, int], ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class GroupInputs:
+    """Inputs of a group's fits beside the mosaics.
+
+    labels {patch: (corner (2,) [px], (Ny, Nx) int32)}: patch numbers + 1 of its box's pixels, from
+        the model pixel `corner` on
+    light {patch: {mosaic's name: [(Box, model (C, Ny, Nx) [counts])]}}: of the neighbours; None in
+        the first round, where their pixels are ignored
+    """
+
+    labels: dict
+    light: dict | None
+
+
+def gather_inputs(job, group) -> GroupInputs:
+    """Reads the inputs of a group from the run's folder. Raises FileError, OSError."""
+    whole = np.load(job.folder / "labels.npy", mmap_mode="r")
+    region = Box.of(whole.shape)
+    labels = {}
+    for number in group.patches:
+        box, (y, x) = job.plan.patches[number].box, job.origin_px
+        there = Box(box.y0 - y, box.x0 - x, box.y1 - y, box.x1 - x).intersection(region)
+        corner = there.y0 + y, there.x0 + x
+        labels[number] = corner, np.array(whole[there.slices])
+    return GroupInputs(labels, None if group.round == 0 else _light(job, group))
+
+
+def _light(job, group):
+    """{patch: {mosaic's name: [(Box, model)]}}: of its neighbours, where its cutouts see them."""
+    shares: dict[str, dict[int, float]] = {}
+    for patch, name, share in group.neighbour_models:
+        shares.setdefault(name, {})[patch] = share
+    models: dict[int, list] = {}
+    for name, of_patch in sorted(shares.items()):
+        for patch, i, box, model in GroupResultsFile(job.folder / f"{name}.fits").models(of_patch):
+            models.setdefault(patch, []).append((i, box, of_patch[patch] * model))
+    found = {}
+    for number in group.patches:
+        patch = job.plan.patches[number]
+        grid = job.reference.cutout(patch.box.y0, patch.box.x0, patch.box.shape)
+        seen = [mosaic.box_on(grid) for mosaic in job.mosaics]
+        found[number] = own = {}
+        for sibling in patch.siblings:
+            for i, box, model in models.get(sibling, ()):
+                both = box.intersection(seen[i])
+                if both.area:
+                    here = np.ascontiguousarray(model[:, *both.relative_to(box).slices])
+                    own.setdefault(job.mosaics[i].name, []).append((both, here))
+    return found

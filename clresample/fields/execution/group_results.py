@@ -1,0 +1,181 @@
+"""Results of a group of fits on disk: one FITS file, whole or absent."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from astropy import units as u
+from astropy.io import fits
+
+from ...files.fits import open_fits
+from ...measurement.columns import Columns
+from ..box import Box
+
+PATCH_COLUMNS: dict[str, type | str] = {
+    "fit_id": np.int64,
+    "parent_id": np.int64,
+    "n_refits": np.int64,
+    "status": "U",
+    "n_sources": np.int64,
+    "n_pixels": np.int64,
+    "n_iterations": np.int64,
+    "seconds": float,
+}
+META = "FRAME", "EXTNAME"  # cards of a table's header that its Columns know too
+FITS_FORMATS = {"int16": "I", "int32": "J", "int64": "K", "float32": "E", "float64": "D"}
+FOUND_COLUMNS: dict[str, type] = {
+    "fit_id": np.int64,
+    "id": np.int64,
+    "y": float,
+    "x": float,
+    "host": np.int64,
+}
+COMPONENT_COLUMNS = ("id", "parent_id", "fit_id", "y0", "x0", "n_y", "n_x", "offset")
+MODEL_COLUMNS = ("fit_id", "mosaic", "y0", "x0", "y1", "x1", "offset")
+
+
+@dataclass(eq=False)
+class GroupResults:
+    """The results of a group of patches.
+
+    rows: Columns of sources, one for each patch; patches: rows of PATCH_COLUMNS
+    found: rows of FOUND_COLUMNS, sources in residuals that the next round is to fit
+    components: rows of COMPONENT_COLUMNS, offsets counted in `flat`; spectra: (C,) of each
+    flat: morphologies, flattened; models: rows of MODEL_COLUMNS, pixels: of these, flattened
+    offsets: (1 + 2 M + C,) of each patch with fitted shifts or sky levels other than 0: its number,
+        shifts (M, 2) [model px] of all mosaics, sky levels (C,) [counts] of all channels
+    """
+
+    rows: list = field(default_factory=list)
+    patches: list = field(default_factory=list)
+    found: list = field(default_factory=list)
+    components: list = field(default_factory=list)
+    spectra: list = field(default_factory=list)
+    flat: list = field(default_factory=list)
+    models: list = field(default_factory=list)
+    pixels: list = field(default_factory=list)
+    offsets: list = field(default_factory=list)
+    n_flat: int = 0
+    n_pixels: int = 0
+
+    def add_component(self, source_id, patch, origin, morphology, spectrum):
+        """A component of a source: its box begins at `origin` (2,) of the field's model pixels."""
+        where = (source_id, patch.parent, patch.number, *origin, *morphology.shape, self.n_flat)
+        self.components.append(tuple(map(int, where)))
+        self.spectra.append(spectrum)
+        self.flat.append(np.ravel(morphology).astype(np.float32))
+        self.n_flat += morphology.size
+
+    def add_model(self, patch, i_mosaic, box, model):
+        """All sources of a patch (C, Ny, Nx) [counts] as a mosaic sees them on a Box."""
+        self.models.append((patch.number, i_mosaic, *box, self.n_pixels))
+        self.pixels.append(np.ravel(model).astype(np.float32))
+        self.n_pixels += model.size
+
+    def add_offsets(self, patch, shifts, sky):
+        """A patch's shifts (M, 2) [model px] and sky levels (C,) [counts], if any is not 0."""
+        if np.any(shifts) or np.any(sky):
+            self.offsets.append(np.concatenate([[patch.number], np.ravel(shifts), sky]))
+
+    def to_bytes(self) -> bytes:
+        """The file that GroupResultsFile reads."""
+        hdus = [
+            fits.PrimaryHDU(),
+            _table(Columns.concatenate([rows for rows in self.rows if len(rows)]), "CATALOGUE"),
+            _table(_typed(self.patches, PATCH_COLUMNS), "PATCHES"),
+            _table(_typed(self.found, FOUND_COLUMNS), "FOUND"),
+            _table(_whole(self.components, COMPONENT_COLUMNS), "COMPONENTS"),
+            _floats(self.spectra, "SPECTRA"),
+            _floats(self.flat and np.concatenate(self.flat), "MORPHOLOGIES"),
+            _table(_whole(self.models, MODEL_COLUMNS), "MODELS"),
+            _floats(self.pixels and np.concatenate(self.pixels), "PIXELS"),
+            _floats(self.offsets, "OFFSETS"),
+        ]
+        file = BytesIO()
+        fits.HDUList(hdus).writeto(file)
+        return file.getvalue()
+
+
+def _typed(rows, kinds):
+    """The Columns of rows; kinds: {name: type}."""
+    columns = zip(*rows, strict=True) if rows else [()] * len(kinds)
+    pairs = zip(kinds.items(), columns, strict=True)
+    return Columns({name: np.array(values, kind) for (name, kind), values in pairs})
+
+
+def _whole(rows, names):
+    values = np.array(rows, np.int64).reshape(-1, len(names))
+    return Columns(dict(zip(names, values.T, strict=True)))
+
+
+def _table(columns, name):
+    """The HDU of Columns; their meta are cards of its header."""
+    found = []
+    for key, values in columns.values.items():
+        form, unit = FITS_FORMATS.get(values.dtype.name), columns.units.get(key)
+        if form is None:  # text
+            values = np.char.encode(values, "ascii")
+            form = f"{max(1, values.dtype.itemsize)}A"
+        unit = None if unit is None else unit.to_string("fits")
+        found.append(fits.Column(key, form, unit, array=values))
+    hdu = fits.BinTableHDU.from_columns(found, name=name) if found else fits.BinTableHDU(name=name)
+    hdu.header.update(columns.meta)
+    return hdu
+
+
+def _floats(array, name):
+    array = np.asarray(array)
+    return fits.ImageHDU(array if array.size else None, name=name)
+
+
+@dataclass(frozen=True)
+class GroupResultsFile:
+    """A part on disk."""
+
+    path: Path
+
+    def read(self, *names) -> list:
+        """Reads HDUs, native: the Columns of a table, an image's pixels; empty ones are skipped."""
+        with open_fits(self.path) as hdus:
+            chosen = [hdus[name] for name in names]
+            return [_array(hdu) if hdu.is_image else _columns(hdu) for hdu in chosen]
+
+    def offsets(self) -> np.ndarray:
+        """The rows of `GroupResults.offsets`; none of a part that an older version wrote."""
+        with open_fits(self.path) as hdus:
+            rows = _array(hdus["OFFSETS"]) if "OFFSETS" in hdus else np.zeros(0)
+        return np.zeros((0, 1)) if not rows.size else rows.astype(np.float64)
+
+    def models(self, chosen=None, mosaic=None):
+        """(patch, mosaic, Box, model (C, Ny, Nx)) of its patches, or of those in `chosen`.
+
+        On all mosaics, or on that with a number.
+        """
+        with open_fits(self.path) as hdus:
+            index, hdu = _columns(hdus["MODELS"]), hdus["PIXELS"]
+            rows = np.stack([index[name] for name in MODEL_COLUMNS], axis=1).tolist()
+            ends = [*index["offset"][1:].tolist(), hdu.header.get("NAXIS1", 0)] if rows else []
+            for (patch, i_mosaic, *corners, start), end in zip(rows, ends, strict=True):
+                if (chosen is None or patch in chosen) and mosaic in (None, i_mosaic):
+                    image, box = np.array(hdu.section[start:end], np.float32), Box(*corners)
+                    yield patch, i_mosaic, box, image.reshape(-1, *box.shape)
+
+
+def _columns(hdu):
+    """The Columns of a table's HDU, native."""
+    found = Columns(meta={k: hdu.header[k] for k in META if k in hdu.header})
+    for column in hdu.columns:
+        values = np.asarray(hdu.data[column.name])
+        unit = column.unit and u.Unit(column.unit, format="fits")
+        found.put(column.name, values.astype(values.dtype.newbyteorder("=")), unit)
+    return found
+
+
+def _array(hdu):
+    """The pixels of an image's HDU, native; empty where it has none."""
+    if hdu.data is None:
+        return np.zeros(0, np.float32)
+    return np.array(hdu.data, dtype=hdu.data.dtype.newbyteorder("="))

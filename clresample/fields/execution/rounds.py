@@ -1,0 +1,257 @@
+"""All groups of fits, round by round, whatever happens to their workers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ...files.atomic import FileError
+from .backend import TaskKind
+from .fitting import fit_group, is_large, mark_failed
+from .group_inputs import FitGroup, gather_inputs
+from .group_results import FOUND_COLUMNS, GroupResultsFile
+
+# Most rounds in which a cut blend's pieces are fitted again, their neighbours' light subtracted.
+# The first takes the neighbours out; crowded pieces settle by the third or fourth.
+ROUNDS = 4
+# The same of large pieces, which take tens of seconds each (fitting.LARGE), but where their
+# residuals held more sources: the first round subtracts their neighbours' light, and what these
+# gain by that is a part of what it is taken to be wrong by
+LARGE_ROUNDS = 1
+# [errors] A blend's pieces have settled when no flux changes by more than this from one round to
+# the next. Fits end within 0.2 of their limit (Settings.enough), two of them within 0.3 of each
+# other: a smaller number would not be reached.
+MAX_FLUX_CHANGE_SIGMA = 0.3
+# [of a flux] The same of bright sources: the pixels that a neighbour's light is subtracted from are
+# weighted as if it were wrong by 15 % (MODEL_ERROR). A change of it by 0.5 % then moves a flux that
+# is measured on 50 pixels by sqrt(50) 0.5 / 15 = 0.24 of its error at most.
+SETTLED_PART = 0.005
+
+
+def part_path(job, group):
+    """Path of the results of a group."""
+    return job.folder / f"{group.name}.fits"
+
+
+FIT = TaskKind(gather_inputs, fit_group, part_path)
+
+
+def fit_all_groups(job, engine, progress):
+    """Fit all groups that are not yet, round by round.
+
+    A cut blend's pieces are fitted again as long as a neighbour of theirs moves, and where their
+    residuals held more sources.
+    returns the PartFiles, the last round's of each patch counting, and the parents of those cut
+    blends whose pieces had not settled when the rounds ended
+    """
+    progress.stage("fit", len(job.plan.patches))
+    tasks = [FitGroup(_name(0, i), patches) for i, patches in enumerate(job.plan.groups)]
+    names = _fit_round(job, tasks, engine, progress)
+    parts, history = list(names), _PieceHistory(job)
+    history.add(names)
+    pieces = {n for group in job.plan.cut_groups for n in group}
+    pending = {n for n in pieces if job.plan.patches[n].siblings}
+    moved: set[int] = set()
+    n_last = 0
+    for n_round in range(1, ROUNDS + 1):
+        again = {n for n in pending if n_round <= LARGE_ROUNDS or not _is_large(job, n)}
+        again |= history.new
+        groups = [few for g in job.plan.cut_groups if (few := tuple(n for n in g if n in again))]
+        if not groups:
+            break
+        progress.stage(f"pieces, round {n_round}", sum(map(len, groups)))
+        tasks = [
+            FitGroup(
+                _name(n_round, i),
+                patches,
+                n_round,
+                history.light_about(patches),
+                history.components_of(patches),
+                history.found_in(patches),
+            )
+            for i, patches in enumerate(groups)
+        ]
+        names = _fit_round(job, tasks, engine, progress)
+        history.add(names)
+        moved = history.moved({n for patches in names.values() for n in patches})
+        pending = {n for n in pieces if moved.intersection(job.plan.patches[n].siblings)}
+        parts += names
+        n_last = n_round
+    # by round and group, in whichever order they ended: sums of models are the same to the last bit
+    # the first round's fits come after rough ones, by which nobody can tell
+    judged = moved if pending and n_last > 1 else ()
+    unsettled = {job.plan.patches[n].parent for n in judged}
+    return [_file(job, name) for name in sorted(parts)], unsettled
+
+
+def _is_large(job, number):
+    """Returns True if a patch is large, see fitting.LARGE."""
+    patch = job.plan.patches[number]
+    return is_large(len(patch.sources), patch.box.shape)
+
+
+def _name(n_round, i):
+    return f"fit-{n_round}-{i:06d}"
+
+
+def _file(job, name):
+    return GroupResultsFile(job.folder / f"{name}.fits")
+
+
+class _PieceHistory:
+    """In which parts a cut blend's pieces are, round by round.
+
+    new: pieces in whose residuals the last round has found sources
+    """
+
+    def __init__(self, job):
+        self.job, self.names, self.found, self.new = job, {}, {}, set()
+
+    def add(self, names):
+        """Add a round: {name: patches} of its parts."""
+        self.new = set()
+        for name in sorted(names):
+            (table,) = _file(self.job, name).read("FOUND")
+            for row in zip(*(table[column].tolist() for column in FOUND_COLUMNS), strict=True):
+                self.found.setdefault(row[0], []).append(row)
+                self.new.add(row[0])
+            for patch in names[name]:
+                if self.job.plan.patches[patch].pieces > 1:
+                    self.names.setdefault(patch, []).append(name)
+
+    def light_about(self, patches):
+        """`FitGroup.neighbour_models` of some pieces: all their neighbours' last models.
+
+        From its third on, a neighbour's is the mean of its last two: where both sides of a border
+        follow each other's last model alone, light goes back and forth between them. Of its first,
+        their light was in the data.
+        """
+        found = []
+        wanted = {k for n in patches for k in self.job.plan.patches[n].siblings}
+        for patch in sorted(wanted):
+            *older, last = self.names[patch]
+            mean = len(older) >= 2
+            found.append((patch, last, 0.5 if mean else 1.0))
+            if mean:
+                found.append((patch, older[-1], 0.5))
+        return tuple(found)
+
+    def found_in(self, patches):
+        """`FitGroup.found` of some pieces: all that was found in their residuals so far."""
+        return tuple(row for patch in patches for row in self.found.get(patch, ()))
+
+    def components_of(self, patches):
+        """`FitGroup.components` of some pieces, by their last fits.
+
+        Asked again in each round, a source on the edge would go to and fro.
+        """
+        found: dict[int, int] = {}
+        for name in sorted({self.names[patch][-1] for patch in patches}):
+            for source, patch in _owners(_file(self.job, name)):
+                if patch in patches:
+                    found[source] = found.get(source, 0) + 1
+        return tuple(sorted(found.items()))
+
+    def moved(self, patches):
+        """Pieces whose flux changed by over MAX_FLUX_CHANGE_SIGMA errors since their fit before.
+
+        And by over SETTLED_PART of it.
+        """
+        old = self._fluxes([(n, self.names[n][-2]) for n in patches])
+        moved = set()
+        for source, (patch, flux, error) in self._fluxes(
+            [(n, self.names[n][-1]) for n in patches]
+        ).items():
+            if source not in old:
+                moved.add(patch)
+                continue
+            known = np.isfinite(error) & (error > 0)
+            change = np.abs(flux - old[source][1])[known]
+            part = SETTLED_PART * np.abs(flux[known])
+            if (change > np.maximum(MAX_FLUX_CHANGE_SIGMA * error[known], part)).any():
+                moved.add(patch)
+        return moved
+
+    def _fluxes(self, pairs):
+        """{id: (patch, fluxes (C,), errors (C,))} of (patch, name of its part)."""
+        found, of_name = {}, {}
+        for patch, name in pairs:
+            of_name.setdefault(name, set()).add(patch)
+        for name, patches in of_name.items():
+            part = _file(self.job, name)
+            rows, where = part.read("CATALOGUE")[0], dict(_owners(part))
+            flux, error = (_columns(rows, kind, self.job) for kind in ("flux", "flux_err"))
+            for k, source in enumerate(rows["id"].tolist()):
+                if where.get(source) in patches:
+                    found[source] = where[source], flux[k], error[k]
+        return found
+
+
+def _owners(part):
+    """(id of the source, patch) of each component in a GroupResultsFile."""
+    (table,) = part.read("COMPONENTS")
+    return list(zip(table["id"].tolist(), table["fit_id"].tolist(), strict=True))
+
+
+def _columns(rows, kind, job):
+    """Columns of all bands that the rows have: (S, B)."""
+    names = [f"{kind}_{b}" for b in job.bands if f"{kind}_{b}" in rows]
+    return np.array([rows[name] for name in names], float).reshape(len(names), len(rows)).T
+
+
+def _fit_round(job, tasks, engine, progress):
+    """Fit the groups of one round; {name: patches} of their parts."""
+    names, todo = {}, []
+    there = _parts_of(job.folder)
+    for task in tasks:
+        mine = {name: ps for name, ps in there.items() if name.startswith(task.name)}
+        names |= mine
+        left = tuple(p for p in task.patches if p not in {q for ps in mine.values() for q in ps})
+        progress.step(len(task.patches) - len(left))
+        if left:
+            todo.append(
+                task
+                if len(left) == len(task.patches)
+                else replace(task, name=f"{task.name}-{left[0]}", patches=left)
+            )
+    tries: dict[tuple, int] = {}
+
+    def again(outcome):
+        group = outcome.task
+        _check_space(job.folder, outcome.reason)
+        tries[group.patches] = tries.get(group.patches, 0) + 1
+        if tries[group.patches] < 2:  # killed from outside, perhaps: the same once more
+            return [group]
+        if len(group.patches) == 1:
+            return None
+        half = len(group.patches) // 2
+        return [
+            replace(group, name=f"{group.name}-{few[0]}", patches=few)
+            for few in (group.patches[:half], group.patches[half:])
+        ]
+
+    for outcome in engine.run(FIT, job, todo, again=again, stage="fit"):
+        group, value = outcome.task, outcome.value
+        if outcome.reason is not None:
+            value, content = mark_failed(job, group, outcome.reason)
+            FIT.keep(job, group, content)
+            progress.message(f"{len(group.patches)} blends are set aside: {outcome.reason}")
+        names[group.name] = group.patches
+        progress.step(value["patches"], value["sources"])
+    return names
+
+
+def _parts_of(folder):
+    """{name: patches} of the parts on disk."""
+    found = {}
+    for path in sorted(folder.glob("fit-*.fits")):
+        (patches,) = GroupResultsFile(path).read("PATCHES")
+        found[path.stem] = tuple(patches["fit_id"].tolist())
+    return found
+
+
+def _check_space(folder, reason):
+    """Raise FileError where a group failed because the disk is full: going on would lose all."""
+    if "cannot be written" in reason or "No space left" in reason:
+        raise FileError(f"{folder}: {reason}; what is finished stays: --resume goes on")

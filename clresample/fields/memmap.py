@@ -1,0 +1,25 @@
+"""Arrays on disk that are mapped into memory."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from ..files.atomic import FileError
+
+
+def create_memmap(path, dtype, shape) -> np.ndarray:
+    """A new array of zeros in a file, an older one of that name replaced.
+
+    Its place on the disk is taken at once: a disk that is full is a FileError here, not a signal
+    that ends the process when a page is written (SIGBUS).
+    """
+    try:
+        array = np.lib.format.open_memmap(path, "w+", dtype, shape)
+        if hasattr(os, "posix_fallocate"):
+            with open(path, "r+b") as file:
+                os.posix_fallocate(file.fileno(), 0, os.path.getsize(path))
+    except OSError as error:
+        raise FileError(f"{path}: cannot be written ({error.strerror or error})") from error
+    return array

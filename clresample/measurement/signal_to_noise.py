@@ -1,0 +1,232 @@
+"""Signal to noise of observations under filters of several widths, in the model's pixels.
+
+For light of unit flux at x, a point convolved with a Gaussian G, the best linear estimate in one
+channel is the matched filter: with weights w, data d and the PSF P, K = P * G,
+
+    n(x) = sum_q K(q - x) w(q) d(q),    v(x) = sum_q K(q - x)^2 w(q)
+
+and the signal to noise n / sqrt(v). It is found on the observation's own pixels; being as smooth as
+two PSFs, it is then interpolated (cubic splines) to the model's.
+
+Source: the matched filter, Zackay & Ofek 2017 (ApJ 836, 187); the sum of squares over bands,
+Szalay, Connolly & Szokoly 1999 (AJ 117, 68).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from ..deblending.posterior.residuals import TOGETHER_PX
+from ..sky.noise import sigma_below_zero
+from .levels import level_of
+
+# [arcsec] Standard deviations of G: of points, of galaxies of the usual size in deep images (half
+# of their light within 0.25 arcsec) and of large faint ones. A galaxy between two of them loses
+# under a tenth of its signal to noise. Each more costs one transform a channel.
+WIDTHS_ARCSEC = (0.0, 0.2, 0.5)
+SMALL_GALAXY = 1  # which of them is that of galaxies of the usual size
+# of a channel's largest variance v: a point with less lies on pixels that are masked or not seen
+MIN_WEIGHT = 0.1
+# of the same, below which float32 holds nothing of n any more
+NO_WEIGHT = 1e-5
+SAME_PX = 1e-3  # by which pixels of the model may lie beside observed ones and count as the same
+# [sigma^2] Sum of squares up to which its significance is tabulated; above, both grow alike
+TABLE_END, TABLE_STEP = 400.0, 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class SignalToNoise:
+    """One observation's signal to noise; of unit scatter in white noise.
+
+    sums, squares (W, Ny, Nx): float32, in the model's pixels, of each width: the sum over channels
+        of the signal to noise, and that of the squares of what is positive; 0 where not seen
+    n_seen (Ny, Nx): how many channels have seen a pixel
+    channels (C, My, Mx) [sigma]: of the narrowest filter, on the observation's pixels
+    places (Ny, Nx, 2) [px]: of the model's pixels on these
+    """
+
+    sums: np.ndarray
+    squares: np.ndarray
+    n_seen: np.ndarray
+    channels: np.ndarray
+    places: np.ndarray
+
+    def flat(self, width=0):
+        """Channels together (Ny, Nx) [sigma], as of a spectrum of equal signal to noise in all."""
+        return self.sums[width] / np.sqrt(np.maximum(self.n_seen, 1))
+
+    def scatters(self):
+        """Scatter (W,) of the channels together where there is no source, at least 1.
+
+        That of the negative pixels, which are noise. Correlated noise has more.
+        """
+        flats = (self.flat(w) for w in range(len(self.sums)))
+        return np.array([max(1.0, sigma_below_zero(image) or 1.0) for image in flats])
+
+    def divided_by(self, scatters):
+        """The same in units of these scatters (W,)."""
+        by = np.asarray(scatters, np.float32)[:, None, None]
+        return SignalToNoise(
+            self.sums / by, self.squares / by**2, self.n_seen, self.channels / by[0], self.places
+        )
+
+    def levelled(self):
+        """The same without smooth levels, see levels.py, and those of its sky alone (W,) [sigma].
+
+        Sums of squares are left out where there is a level: they hold it in every channel.
+        """
+        sums, squares, skies = self.sums.copy(), self.squares.copy(), []
+        root = np.sqrt(np.maximum(self.n_seen, 1))
+        for w in range(len(sums)):
+            level, sky = level_of(self.flat(w), self.n_seen > 0)
+            sums[w] -= np.where(self.n_seen > 0, level * root, 0)
+            squares[w][level != 0] = 0
+            skies.append(sky)
+        levelled = SignalToNoise(sums, squares, self.n_seen, self.channels, self.places)
+        return levelled, np.array(skies)
+
+    def spectra(self, at):
+        """Signal to noise (n, C) [sigma] of the channels at pixels (n, 2) of the model.
+
+        Pixels outside are taken to its edge: that of the nearest observed pixel, 0 where there is
+        none.
+        """
+        at = np.clip(at, 0, np.array(self.n_seen.shape) - 1)
+        places = np.rint(self.places[at[:, 0], at[:, 1]]).astype(int)
+        shape = np.array(self.channels.shape[1:])
+        inside = ((places >= 0) & (places < shape)).all(axis=1)
+        places = np.clip(places, 0, shape - 1)
+        return np.where(inside, self.channels[:, places[:, 0], places[:, 1]], 0).T
+
+
+def signal_of(observation, frame, places=None) -> SignalToNoise:
+    """The Signal of an observation in a frame, under the filters of `WIDTHS_ARCSEC`.
+
+    places (Ny, Nx, 2) [px]: of the frame's pixels on the observation; None = by their grids
+    """
+    from scipy import fft
+
+    observation = observation.whitened
+    if places is None:
+        places = frame.grid.map_to(observation.grid).at(*np.indices(frame.shape))
+    sigmas = np.array(WIDTHS_ARCSEC) / observation.grid.pixel_scale_arcsec
+    n_channels, *shape = observation.data.shape
+    # zeros beyond the edges, wide enough for the PSF and four sigma of the widest filter
+    psf = observation.psf
+    reach = int(max(psf.images.shape[1:]) * psf.spacing) // 2 + int(4 * sigmas[-1]) + 1
+    size = [fft.next_fast_len(n + reach, real=True) for n in shape]
+    nu = np.fft.fftfreq(size[0]), np.fft.rfftfreq(size[1])
+    inside = (..., *(slice(n) for n in shape))
+    totals = np.zeros((2, len(sigmas), *shape), np.float32)
+    channels, seen = np.zeros(observation.data.shape, np.float32), np.zeros(shape, np.int16)
+    step = max(1, TOGETHER_PX // math.prod(size))
+    for first in range(0, n_channels, step):
+        c = slice(first, first + step)
+        data, weights = observation.data[c], observation.weights[c]
+        unit = weights.max(axis=(1, 2), keepdims=True)
+        unit = np.where(unit > 0, unit, 1.0)  # so that float32 holds data of any scale
+        light = fft.rfft2((weights / unit**0.5 * data).astype(np.float32), size)
+        weight = fft.rfft2((weights / unit).astype(np.float32), size)
+        transfer = psf.select(c).otf(*nu).astype(np.complex64)
+        for w, sigma in enumerate(sigmas):
+            kernel = transfer * _gaussian(nu[0], sigma)[:, None] * _gaussian(nu[1], sigma)
+            power = fft.rfft2(fft.irfft2(kernel, size) ** 2)
+            variance = fft.irfft2(weight * power.conj(), size)[inside]
+            most = variance.max(axis=(1, 2), keepdims=True, initial=0)
+            some = variance > NO_WEIGHT * most
+            images = fft.irfft2(light * kernel.conj(), size)[inside]
+            images = np.where(some, images / np.sqrt(np.where(some, variance, 1)), 0)
+            for image in images:  # added one by one, whatever the step
+                totals[0, w] += image
+                totals[1, w] += np.maximum(image, 0) ** 2
+            if w == 0:
+                channels[c] = images
+                seen += (variance > MIN_WEIGHT * most).sum(axis=0, dtype=np.int16)
+    found, n_seen = _in_frame(totals.reshape(-1, *shape), seen, places)
+    found = found.reshape(2, len(sigmas), *frame.shape)
+    return SignalToNoise(found[0], np.maximum(found[1], 0), n_seen, channels, places)
+
+
+def _in_frame(images, seen, places):
+    """Images (n, My, Mx), and how many channels have seen each pixel, at places (Ny, Nx, 2) [px].
+
+    Images are interpolated, 0 where nothing was seen; where all places are pixels they are taken.
+    """
+    from scipy.ndimage import map_coordinates
+
+    nearest = np.rint(places)
+    found = np.zeros((len(images), *places.shape[:2]), np.float32)
+    if np.abs(places - nearest).max(initial=0) < SAME_PX:
+        size = np.array(seen.shape)
+        inside = ((nearest >= 0) & (nearest < size)).all(axis=-1)
+        at = np.clip(nearest, 0, size - 1).astype(np.intp)
+        at = at[..., 0] * size[1] + at[..., 1]
+        n_seen = np.where(inside, seen.ravel()[at], 0)
+        for total, image in zip(images, found, strict=True):
+            image[n_seen > 0] = total.ravel()[at[n_seen > 0]]
+        return found, n_seen
+    at = np.moveaxis(places, -1, 0)
+    n_seen = map_coordinates(seen, at, order=0)
+    for total, image in zip(images, found, strict=True):
+        map_coordinates(total, at, order=3, output=image)
+        image[n_seen == 0] = 0
+    return found, n_seen
+
+
+def combine_bands(signals) -> tuple[np.ndarray, np.ndarray]:
+    """All channels of SignalToNoises in one frame together: two images (Ny, Nx) [sigma].
+
+    the first: as of a spectrum of equal signal to noise in all channels, under the narrowest filter
+    the second: at each pixel the most significant of all widths, and of two sums over channels,
+        that of the first, best for a source that all of them see, and the sum of the squares of
+        those that are positive, best for one whose spectrum nothing is known of: very red ones or
+        very blue ones are in few bands. Both are in units in which noise alone is normal. Noise
+        reaches 5 in the largest of them six times as often as in one: once in 3e5 resolved places
+    """
+    n_seen = sum(s.n_seen for s in signals)
+    root = np.sqrt(np.maximum(n_seen, 1))
+    flats = [sum(s.sums[w] for s in signals) / root for w in range(len(WIDTHS_ARCSEC))]
+    best = np.maximum.reduce(flats)
+    for w in range(len(WIDTHS_ARCSEC)):
+        squares = sum(s.squares[w] for s in signals)
+        best = np.maximum(best, significance(squares, n_seen))
+    return flats[0], best
+
+
+def significance(squares, n_channels) -> np.ndarray:
+    """Sigmas (...) of a normal distribution that noise reaches as often as it does such a sum.
+
+        P(sum > q) = sum_k binomial(n, k) 2^-n P(chi^2_k > q)
+
+    squares (...): sum over channels of the squares of the signal to noise that is positive
+    n_channels (...): integers, how many were added
+    """
+    found = np.zeros(np.shape(squares), np.float32)
+    for n in np.unique(n_channels).tolist():
+        if n == 0:
+            continue
+        knots, sigmas = _table(n)
+        at = n_channels == n
+        q = np.asarray(squares)[at]
+        above = sigmas[-1] + np.sqrt(np.maximum(q, TABLE_END)) - np.sqrt(TABLE_END)
+        found[at] = np.where(q < TABLE_END, np.interp(q, knots, sigmas), above)
+    return found
+
+
+@lru_cache(maxsize=64)
+def _table(n):
+    """Sums of squares, and the `significance` of each with n channels."""
+    from scipy.special import binom, chdtrc, ndtri
+
+    knots = np.arange(0, TABLE_END + TABLE_STEP, TABLE_STEP)
+    beyond = sum(binom(n, k) / 2.0**n * chdtrc(k, knots) for k in range(1, n + 1))
+    return knots, -ndtri(np.maximum(beyond, 1e-300))
+
+
+def _gaussian(nu, sigma):
+    """Transform of a Gaussian of `sigma` [px] at frequencies nu [1/px]."""
+    return np.exp(-2 * (np.pi * sigma * nu) ** 2).astype(np.float32)

@@ -1,0 +1,111 @@
+"""An executor's tables and intermediates on the device."""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import Self
+
+import numpy as np
+
+from ...device.contraction import ItemSizes, MatrixBatch
+from ...device.tuning import Tuning
+
+
+class DeviceMemory:
+    """An executor's memory on the device: tables, and intermediates of as many images as asked for.
+
+    device, dtype, tuning, plans, n_bands: of the executor
+    n_reserved: images that there is room for; scratch: the intermediates, by their names
+    which (items,): int32, on the device: the plan of each item; None where all are seen alike
+    Subclasses implement scratch_shapes, bind and bind_back
+    """
+
+    def __init__(self, device, dtype, plans):
+        self.device, self.dtype, self.plans = device, dtype, plans
+        self.tuning, self.n_bands = Tuning.of(device, dtype), plans[0].n_bands
+        self.n_reserved, self.scratch = 0, {}
+        self.which = None
+        self._made = {}  # what only the adjoint reads, once it is asked for
+        self._bound_back = False
+
+    def scratch_shapes(self):
+        """Intermediate matrices of one image: {name: (rows, elements of a row)}."""
+        raise NotImplementedError
+
+    def bind(self):
+        """Bind the products to the scratch that is there, those of the way forward at least."""
+        raise NotImplementedError
+
+    def bind_adjoint(self):
+        """Bind those of the adjoint, which many callers never ask for."""
+
+    def ensure_adjoint(self):
+        """See that the products of the adjoint are bound."""
+        if not self._bound_back:
+            self.bind_adjoint()
+            self._bound_back = True
+
+    def select_plans(self, which):
+        """Have the next items seen by these plans (items,), of `which` made as large as that."""
+        self.device.upload(np.ascontiguousarray(which, np.int32), self.which[: len(which)])
+
+    def cached(self, name, make):
+        """Result of `make()`, made once for this executor and those `clone` returns."""
+        if name not in self._made:
+            self._made[name] = make()
+        return self._made[name]
+
+    def clone(self) -> Self:
+        """An executor of the same tables on the device, with intermediates of its own.
+
+        For callers that work between its stages. A shift of either is one of both.
+        """
+        other = copy.copy(self)
+        other.n_reserved, other.scratch, other._bound_back = 0, {}, False
+        return other
+
+    def reserve(self, n_images):
+        """Make room for the intermediates of `n_images` images at a time."""
+        if self.n_reserved != n_images:
+            # until all is bound: an interruption leaves nothing half done
+            self.n_reserved, self._bound_back = 0, False
+            # items of their own sizes leave the rest as it is, which sums may meet with weight 0
+            make = self.device.empty if self.which is None else self.device.zeros
+            self.scratch = {
+                name: make((n_images, rows, ld), self.dtype)
+                for name, (rows, ld) in self.scratch_shapes().items()
+            }
+            self.bind()
+            self.n_reserved = n_images
+
+    def matrix(self, name, rows=None) -> MatrixBatch:
+        """Intermediate matrices, with all their rows or the first ones of each."""
+        array = self.scratch[name]
+        return MatrixBatch(
+            array.base_data, array.shape[2], (rows or array.shape[1]) * array.shape[2]
+        )
+
+    def tables(self, array):
+        """Tables (plans or items, bands, ...) of an epilogue as `Contraction.bind` takes them."""
+        stride = math.prod(array.shape[1:]) if len(array) > 1 else 0
+        return array.base_data, stride, math.prod(array.shape[2:])
+
+    def whole_groups(self, n):
+        """`n` pixels of a line rounded up to whole groups of work-items."""
+        return -(-n // self.tuning.line_group) * self.tuning.line_group
+
+    def item_sizes(self, **sizes) -> ItemSizes | None:
+        """The Own of products with these sizes of each plan; None where all items share them."""
+        return None if self.which is None else ItemSizes(self.which, **sizes)
+
+    def _table(self, tables, *shape) -> MatrixBatch:
+        """Host tables, one per plan, zero-padded to a common shape, on the device."""
+        host = np.zeros((len(tables), *shape), self.dtype)
+        for item, table in zip(host, tables, strict=True):
+            item[tuple(slice(n) for n in table.shape)] = table
+        stride = math.prod(shape) if len(tables) > 1 else 0
+        table = self.device.put(host).base_data
+        return MatrixBatch(
+            table, shape[-1], stride, items_per_matrix=self.n_bands, own=len(tables) > 1
+        )

@@ -1,1 +1,0 @@
-"""What users give, checked where it comes in: every refusal is a ValueError that names it."""

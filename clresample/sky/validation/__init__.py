@@ -1,0 +1,1 @@
+"""Checks users' input where it comes in: every refusal is a ValueError that names it."""

@@ -1,0 +1,184 @@
+"""Numbers, arrays and objects from a user: as floats, or a ValueError that names the argument.
+
+NumPy turns much into floats without a word: the imaginary part, a unit, a mask, a date and a text
+are dropped or reinterpreted. Here each is honoured or refused by name.
+"""
+
+from __future__ import annotations
+
+import math
+import numbers as kinds
+from decimal import Decimal
+
+import numpy as np
+
+# kinds of NumPy types that are real numbers: bool, integers, floats
+REAL = "biuf"
+# How a user makes what an argument must be, for messages.
+WAYS = {
+    "Grid": "Grid.from_wcs(wcs, shape) or Grid.flat(shape, scale_arcsec)",
+    "PSF": "PSF(array)",
+    "Observation": "Observation(data, psf, grid) or Observation.from_nddata(image, psf)",
+}
+
+
+def as_float_array(name, values, unit=None) -> np.ndarray:
+    """The values as float64, of any shape.
+
+    unit: what numbers with a unit (astropy's Quantity) are converted to; None takes no unit
+
+    Raises ValueError for complex numbers, texts, dates, masked values, and other units.
+    """
+    with np.errstate(invalid="ignore"):  # NaN of damaged files may be of the kind that signals
+        return np.asarray(as_real_array(name, values, unit), dtype=np.float64)
+
+
+def as_real_array(name, values, unit=None) -> np.ndarray:
+    """`as_float_array` of the type they have, where that is a number's; else float64."""
+    if type(values) is np.ndarray and values.dtype.kind in REAL:
+        return values
+    values = to_unit(name, values, unit)
+    mask = mask_of(values)
+    if mask is not None and mask.any():
+        raise ValueError(
+            f"{name} is masked at {np.count_nonzero(mask)} of {mask.size} values: fill them first"
+        )
+    try:
+        array = np.asarray(getattr(values, "unmasked", values))
+        check_real(name, array)
+        return array.astype(np.float64) if array.dtype.kind == "O" else array
+    except (TypeError, OverflowError) as error:
+        raise ValueError(f"{name} must be an array of real numbers: {error}") from None
+    except ValueError as error:
+        if str(error).startswith(name):
+            raise
+        raise ValueError(f"{name} must be an array of real numbers: {error}") from None
+
+
+def check_real(name, array):
+    """Raise ValueError, calling it `name`, unless a NumPy array holds real numbers."""
+    if array.dtype.kind in REAL:
+        return
+    if array.dtype.kind == "O":
+        for value in array.flat:
+            if not isinstance(value, (kinds.Real, np.bool_, Decimal)):
+                raise ValueError(f"{name} must be an array of real numbers, it holds {value!r:.80}")
+        return
+    raise ValueError(f"{name} must be an array of real numbers, not of type {array.dtype}")
+
+
+def to_unit(name, values, unit=None):
+    """The values, in `unit` if they have one. Raises ValueError for a unit that does not fit."""
+    if isinstance(values, list | tuple) and any(hasattr(value, "unit") for value in values):
+        return [to_unit(name, value, unit) for value in values]
+    given = getattr(values, "unit", None)
+    if given is None or str(given) == "":
+        return values
+    if unit is not None and hasattr(values, "to_value"):
+        try:
+            return values.to_value(unit)
+        except Exception as error:  # astropy raises a class of its own
+            raise ValueError(f"{name} has the unit {given}, not {unit}: {error}") from None
+    way = f" in {unit}" if unit else ""
+    raise ValueError(f"{name} has the unit {given}: give plain numbers{way}, such as its .value")
+
+
+def mask_of(values):
+    """Mask of values (bool, of their shape); None for types without masks."""
+    if isinstance(values, np.ma.MaskedArray):
+        return np.ma.getmaskarray(values)
+    if hasattr(values, "unmasked") and hasattr(values, "mask"):  # astropy's Masked
+        return np.broadcast_to(np.asarray(values.mask, dtype=bool), np.shape(values))
+    return None
+
+
+def split_mask(name, values):
+    """Values with what is masked in them filled by 0, and where that was; None = nowhere."""
+    mask = mask_of(values)
+    if mask is None:
+        return values, None
+    values = to_unit(name, values)
+    plain = np.asarray(values.unmasked if hasattr(values, "unmasked") else np.ma.getdata(values))
+    check_real(name, plain)
+    return (np.where(mask, 0, plain), mask) if mask.any() else (plain, None)
+
+
+def check_number(name, value, what="a finite number", fits=math.isfinite) -> float:
+    """One number as a float. Raises ValueError unless `fits`, which `what` describes."""
+    found = as_float_array(name, value)
+    if found.shape != () or not fits(float(found)):
+        raise ValueError(f"{name} is {value!r:.80}, must be {what}")
+    return float(found)
+
+
+def check_integer(name, value, least=0) -> int:
+    """A whole number from `least`. Raises ValueError for all else."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
+        raise ValueError(f"{name} is {value!r:.80}, must be a whole number, {least} or more")
+    if value < least:
+        raise ValueError(f"{name} is {value}, must be {least} or more")
+    return int(value)
+
+
+def check_dtype(dtype) -> np.dtype:
+    """float32 or float64 as NumPy's type. Raises ValueError for all else, None among it."""
+    try:
+        found = None if dtype is None else np.dtype(dtype)
+    except TypeError:
+        found = None
+    # NumPy's types equal whatever names them, and None names float64
+    if found is None or found.kind != "f" or found.itemsize not in (4, 8):
+        raise ValueError(f"dtype is {dtype!r:.80}, allowed are float32 and float64")
+    return found
+
+
+def check_instance(name, value, kind):
+    """The value. Raises ValueError unless it is an instance of a class, or of one of several."""
+    if isinstance(value, kind):
+        return value
+    wanted = kind if isinstance(kind, tuple) else (kind,)
+    names = [k.__name__ for k in wanted]
+    ways = [WAYS[one] for one in names if one in WAYS]
+    raise ValueError(
+        f"{name} is {described(value)}, must be {' or '.join(names)}"
+        + (f": give {' or '.join(ways)}" if ways else "")
+    )
+
+
+def described(value) -> str:
+    """A value in a few words for messages; of arrays and images the type and shape alone."""
+    kind, shape = type(value).__name__, getattr(value, "shape", None)
+    if shape is not None and np.ndim(shape) == 1 and len(shape):
+        return f"of type {kind} and shape {tuple(shape)}"
+    text = repr(value)
+    if isinstance(value, str | int | float | bool | None):
+        return f"{text:.80} ({kind})"
+    if "\n" in text or len(text) > 80:
+        return f"of type {kind}"
+    return f"{text} ({kind})"
+
+
+def check_image_shape(shape):
+    """(Ny, Nx) as a tuple of int. Raises ValueError for anything else."""
+    found = as_float_array("shape", shape)
+    if found.shape != (2,) or not (found >= 1).all() or (found != np.rint(found)).any():
+        raise ValueError(f"shape must be (Ny, Nx), each at least 1 pixel, not {shape}")
+    return int(found[0]), int(found[1])
+
+
+def check_pixel_scale(name, values):
+    """Two numbers [arcsec], from one for both or two. Raises ValueError for anything else."""
+    found = as_float_array(name, values, "arcsec")
+    if found.shape not in ((), (2,)) or not np.isfinite(found).all():
+        raise ValueError(f"{name} is {values!r:.80}, must be one or two finite numbers")
+    return np.broadcast_to(found, 2)
+
+
+class ReadOnly:
+    """Mixin: arrays that its instances hold are read-only, also in copies and after unpickling."""
+
+    def __setstate__(self, state):
+        for value in state.values():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+        self.__dict__.update(state)

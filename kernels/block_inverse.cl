@@ -1,0 +1,125 @@
+/* What the blocks of a batch of scenes say of a vector: a part of the solver of lbfgs.cl.
+ *
+ * A block holds the inverse of a part of the curvature, as W^T W with a triangular W, its root.
+ *   blocks    (n, 4) int: scene, variables m, the first of its indices, its root's first element
+ *             / ALIGN;  indices: of the variables;  roots: W of each, lower triangular, in panels
+ *             of PANEL rows that end with their last one's diagonal; zeros beyond
+ *   plan      (B, 3) int, see lbfgs.cl: of scenes at rest blocks say nothing
+ *
+ * apply_block_inverse  what blocks, which share no variable, say of H y and H P g_new, in place of
+ *           what there was or, with `more`, added to it; launch: (WG, n blocks), groups of (WG, 1)
+ */
+#include "common.h"
+#include "boxes.h"
+#include "work_group.h"
+#ifndef MAX_BLOCK        /* variables of a block, at most; a multiple of PANEL */
+#define MAX_BLOCK 512
+#endif
+#ifndef PANEL       /* rows of a root that have one length; SUM8 is for 8 */
+#define PANEL 8
+#endif
+#define REST 0
+
+/* Row i of the root of a block: as long as the last one of its panel. */
+#define LENGTH(i) ((i) / PANEL * PANEL + PANEL)
+#define ROW(i) \
+    (root + (size_t)PANEL * PANEL * ((i) / PANEL) * ((i) / PANEL + 1) / 2 \
+     + (i) % PANEL * LENGTH(i))
+
+__kernel __attribute__((reqd_work_group_size(WG, 1, 1)))
+void apply_block_inverse(__global const int *restrict blocks, __global const int *restrict indices,
+            __global const REAL *restrict roots, __global const int *restrict plan,
+            const ulong size, const int more, __global const REAL *restrict y,
+            __global const REAL *restrict projected, __global REAL *restrict ring_hy,
+            __global REAL *restrict hg_new)
+{
+    __local REAL ys[MAX_BLOCK], ps[MAX_BLOCK], wy[MAX_BLOCK], wp[MAX_BLOCK];
+    const int lid = (int)get_local_id(0), block = (int)get_global_id(1);
+    /* of a scene at rest no variables: PoCL crashes where a group returns before this SYNC */
+    const int b = blocks[4 * block], m = plan[3 * b] == REST ? 0 : blocks[4 * block + 1];
+    __global const int *index = indices + blocks[4 * block + 2];
+    __global const REAL *root = roots + (size_t)blocks[4 * block + 3] * ALIGN;
+    __global REAL *hy = ring_hy + plan[3 * b + 2] * (size_t)size;
+    const int n = (m + PANEL - 1) / PANEL * PANEL;
+    for (int k = lid; k < n; k += WG) {
+        ys[k] = k < m ? y[index[k]] : 0;
+        ps[k] = k < m ? projected[index[k]] : 0;
+    }
+    SYNC();
+#if ROWS
+    for (int k = 0; k < n; ++k) wy[k] = wp[k] = 0;
+    for (int i = 0; i < n; i += PANEL) {    /* a panel is read once, and stays in the first cache */
+        const int length = i + PANEL;
+        __global const REAL *panel = ROW(i);
+        REAL of_y[PANEL], of_p[PANEL];
+        for (int r = 0; r < PANEL; r += 4) {
+            __global const REAL *r0 = panel + r * length, *r1 = r0 + length;
+            __global const REAL *r2 = r1 + length, *r3 = r2 + length;
+            REAL y0[PANEL], y1[PANEL], y2[PANEL], y3[PANEL];
+            REAL p0[PANEL], p1[PANEL], p2[PANEL], p3[PANEL];
+            for (int l = 0; l < PANEL; ++l)
+                y0[l] = y1[l] = y2[l] = y3[l] = p0[l] = p1[l] = p2[l] = p3[l] = 0;
+            for (int k = 0; k < length; k += PANEL) {
+                for (int l = 0; l < PANEL; ++l) y0[l] += r0[k + l] * ys[k + l];
+                for (int l = 0; l < PANEL; ++l) p0[l] += r0[k + l] * ps[k + l];
+                for (int l = 0; l < PANEL; ++l) y1[l] += r1[k + l] * ys[k + l];
+                for (int l = 0; l < PANEL; ++l) p1[l] += r1[k + l] * ps[k + l];
+                for (int l = 0; l < PANEL; ++l) y2[l] += r2[k + l] * ys[k + l];
+                for (int l = 0; l < PANEL; ++l) p2[l] += r2[k + l] * ps[k + l];
+                for (int l = 0; l < PANEL; ++l) y3[l] += r3[k + l] * ys[k + l];
+                for (int l = 0; l < PANEL; ++l) p3[l] += r3[k + l] * ps[k + l];
+            }
+            of_y[r] = SUM8(y0);
+            of_y[r + 1] = SUM8(y1);
+            of_y[r + 2] = SUM8(y2);
+            of_y[r + 3] = SUM8(y3);
+            of_p[r] = SUM8(p0);
+            of_p[r + 1] = SUM8(p1);
+            of_p[r + 2] = SUM8(p2);
+            of_p[r + 3] = SUM8(p3);
+        }
+        for (int k = 0; k < length; k += PANEL) {
+            REAL sum_y[PANEL], sum_p[PANEL];
+            for (int l = 0; l < PANEL; ++l) {
+                sum_y[l] = wy[k + l];
+                sum_p[l] = wp[k + l];
+            }
+            for (int r = 0; r < PANEL; ++r)
+                for (int l = 0; l < PANEL; ++l) {
+                    sum_y[l] += panel[r * length + k + l] * of_y[r];
+                    sum_p[l] += panel[r * length + k + l] * of_p[r];
+                }
+            for (int l = 0; l < PANEL; ++l) {
+                wy[k + l] = sum_y[l];
+                wp[k + l] = sum_p[l];
+            }
+        }
+    }
+    for (int k = 0; k < m; ++k) {
+        hy[index[k]] = more ? hy[index[k]] + wy[k] : wy[k];
+        hg_new[index[k]] = more ? hg_new[index[k]] + wp[k] : wp[k];
+    }
+#else
+    for (int i = lid; i < n; i += WG) {
+        __global const REAL *row = ROW(i);
+        REAL sum_y = 0, sum_p = 0;
+        for (int k = 0; k <= i; ++k) {
+            sum_y += row[k] * ys[k];
+            sum_p += row[k] * ps[k];
+        }
+        wy[i] = sum_y;
+        wp[i] = sum_p;
+    }
+    SYNC();
+    for (int k = lid; k < m; k += WG) {     /* down columns, where neighbours read neighbours */
+        REAL sum_y = 0, sum_p = 0;
+        for (int i = k; i < m; ++i) {
+            const REAL value = ROW(i)[k];
+            sum_y += value * wy[i];
+            sum_p += value * wp[i];
+        }
+        hy[index[k]] = more ? hy[index[k]] + sum_y : sum_y;
+        hg_new[index[k]] = more ? hg_new[index[k]] + sum_p : sum_p;
+    }
+#endif
+}

@@ -1,0 +1,284 @@
+"""Where a second fit begins, on fits made by hand."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from clresample.deblending.component_images import ComponentImages
+from clresample.deblending.profiles import FixedProfile, GalaxyProfile, StarProfile
+from clresample.deblending.refit import two_component_start as second
+from clresample.deblending.refit.colour_gradient import GradientTest
+from clresample.deblending.solver.multiscale.prior import MultiscalePrior
+from clresample.deblending.solver.multiscale.structure import coarse_count
+from clresample.deblending.solver.scene import State, StructureState
+from clresample.deblending.start.final_render import RenderedModel
+from clresample.deblending.start.profile_start import StartingPoint, StartInput
+from clresample.deblending.view import WhitenedView
+from clresample.sky.frame import Frame
+from clresample.sky.grid import Grid
+from clresample.sky.psf import PSF
+from clresample.sky.sources import ExtendedSource, PointSource
+
+
+def test_the_second_start_is_from_what_the_others_leave():
+    """Their light and the sky are taken off the data, in every channel of each observation."""
+    rng, shape = np.random.default_rng(6), (5, 4)
+    spectra, sky = rng.uniform(1, 2, (3, 3)), np.array([0.5, -0.25, 0.125])
+    parts, views, observed = [slice(0, 1), slice(1, 3)], [], []
+    begin = SimpleNamespace(source=np.array([0, 2, 1]), positions=rng.uniform(0, 4, (3, 2)))
+    for part in parts:
+        images = rng.random((3, part.stop - part.start, *shape))
+        observed.append(ComponentImages(images.shape, np.zeros((3, 2), int), list(images)))
+        data, root = rng.normal(size=images.shape[1:]), np.ones(images.shape[1:])
+        shares = rng.random((3, part.stop - part.start, 2))
+        views.append(WhitenedView(None, None, None, None, root, data, shares))
+    fit = SimpleNamespace(
+        state=SimpleNamespace(spectra=spectra, sky=sky),
+        scene=SimpleNamespace(channels=lambda: parts),
+        start=begin,
+        views=views,
+        frame="home",
+    )
+    patch = second._alone(
+        fit, GradientTest(np.array([1]), np.array([9.0]), np.ones((1, 3)), observed)
+    )
+    for view, own, images, part in zip(views, patch.views, observed, parts, strict=True):
+        others = np.einsum("ic,icyx->cyx", spectra[[0, 2], part], np.asarray(images)[[0, 2]])
+        np.testing.assert_allclose(own.data, view.data - others - sky[part, None, None])
+        np.testing.assert_array_equal(own.coefficients, view.coefficients[[2]])
+    (source,) = patch.sources
+    assert source.n_components == 2 and patch.frame == "home"
+    np.testing.assert_array_equal(patch.positions, begin.positions[[2]])
+    np.testing.assert_array_equal(source.position_px, begin.positions[2])
+    assert fit.state.spectra.all()  # the first fit's own stay
+
+
+def test_the_second_fit_takes_the_place_of_the_chosen_components():
+    """Two each, in the order of the sources."""
+
+    def point(n, first):
+        fields = {
+            name: np.arange(n) + first
+            for name in ("peaks", "spectra", "spectrum_curvature", "drawn_positions")
+        }
+        return fields | {"shapes": list("abcdef"[:n]), "thetas": [first] * n}
+
+    others = {"positions": np.zeros((3, 2)), "undetected": np.zeros(3, bool), "sky": np.zeros(1)}
+    begin = StartingPoint(source=np.array([0, 2, 1]), **others, **point(3, 0))
+    found = StartingPoint(source=np.array([0, 0, 1, 1]), **others, **point(4, 10))
+    joined = second._joined(begin, found, np.array([2, 0]))
+    assert joined.source.tolist() == [0, 0, 2, 1, 1]
+    for name in ("peaks", "spectra", "spectrum_curvature", "drawn_positions"):
+        assert getattr(joined, name).tolist() == [12, 13, 1, 10, 11]
+    assert joined.shapes == list("cdbab") and joined.thetas == [10, 10, 0, 10, 10]
+
+
+def test_a_second_fit_goes_on_where_the_first_has_ended():
+    """Two components in place of one begin on their profiles, with its strengths; all else where it
+    was left, also what has a core beside it."""
+    rng, prior = (
+        np.random.default_rng(8),
+        MultiscalePrior(scales_px=(1.0, 2.0), strengths=(0.1, 0.2)),
+    )
+
+    def coefficients(shape):
+        return [rng.normal(size=[coarse_count(n, step) for n in shape]) for step in prior.steps]
+
+    def state(shapes, learned=None):
+        n = len(shapes)
+        morph = [rng.random(shape) for shape in shapes]
+        return State([0] * n, morph, rng.random((n, 2)), rng.random(2), learned=learned)
+
+    shapes = (4, 5), (6, 7), (3, 3)
+    known = StructureState([coefficients(s) for s in shapes], rng.random((3, 2)), np.arange(3) == 1)
+    end, chosen = state(shapes, known), np.array([1])
+    first = SimpleNamespace(state=end, settings=SimpleNamespace(prior=prior))
+    cases = (
+        (second._places, ((4, 5), (8, 9), (7, 5), (3, 3)), {0: 0, 3: 2}),
+        (second._cores, ((4, 5), (6, 7), (7, 5), (3, 3)), {0: 0, 1: 1, 3: 2}),
+    )
+    for places, boxes, kept in cases:
+        begin = state(boxes)
+        found = second._going_on(begin, first, *places(3, chosen))
+        for k, box in enumerate(boxes):
+            own = found.learned.structure[k]
+            if k in kept:
+                np.testing.assert_array_equal(found.morph[k], end.morph[kept[k]])
+                assert own is known.structure[kept[k]]
+                continue
+            assert found.morph[k] is begin.morph[k]
+            assert not any(part.any() for part in own)
+            for part, step in zip(own, prior.steps, strict=True):
+                assert part.shape == tuple(coarse_count(n, step) for n in box)
+        np.testing.assert_array_equal(found.learned.strengths, known.strengths[[0, 1, 1, 2]])
+        assert found.learned.clear.tolist() == [False, True, True, False]
+
+
+def test_a_core_begins_beside_each_component_in_question():
+    """With half its area, its axes and its wings: nearly its square; all else stays."""
+    home = Frame(Grid.flat((40, 44), 0.1), PSF.gaussian(0.3, n_pixels=11))
+    shape, theta = GalaxyProfile(home), np.array([1.2, 0.2, -0.1, 3.0])
+    position = np.array([[20.3, 21.6], [9.0, 9.0]])
+    drawn = shape.draw(theta, position[0])[0]
+    begin = StartingPoint(
+        source=np.array([1, 0]),
+        positions=position,
+        undetected=np.zeros(2, bool),
+        shapes=["other", shape],
+        thetas=["its", theta],
+        drawn_positions=position[::-1],
+        peaks=np.array([0.5, drawn.max()]),
+        spectra=np.array([[1.0, 2.0], [4.0, 5.0]]),
+        sky=np.zeros(2),
+        spectrum_curvature=np.array([[1.0, 1.0], [2.0, 2.0]]),
+    )
+    asked = GradientTest(
+        np.array([0, 1]), np.array([0.0, 9.0]), np.array([[7.0] * 2, [8.0] * 2]), []
+    )
+    found = second._with_cores(SimpleNamespace(start=begin, frame=home), asked)
+    assert found.source.tolist() == [1, 0, 0] and found.shapes == ["other", shape, shape]
+    assert found.thetas[0] == "its" and found.thetas[1] is theta and theta[0] == 1.2
+    np.testing.assert_allclose(found.thetas[2], [1.2 - np.log(2) / 2, 0.2, -0.1, 3.0])
+    np.testing.assert_array_equal(found.drawn_positions, position[[1, 0, 0]])
+    np.testing.assert_array_equal(found.spectra, begin.spectra[[0, 1, 1]])
+    assert found.spectrum_curvature.tolist() == [
+        [1] * 2,
+        [2] * 2,
+        [8] * 2,
+    ] and begin.spectrum_curvature.shape == (2, 2)
+    core = found.drawn(2, (0, 0), home.shape)
+    assert core.max() == pytest.approx(1)
+    assert abs(core - (drawn / drawn.max()) ** 2).max() < 0.06
+
+
+def test_of_three_starts_the_one_that_fits_best_is_taken(monkeypatch):
+    """Of each scene; chi2 of all observations, with the best spectra and sky, kept from then on."""
+    rng, views, observed = np.random.default_rng(5), [], []
+    spectra, sky = rng.random((2, 3)), rng.random(3)
+    parts = slice(0, 1), slice(1, 3)
+    for part in parts:
+        images = rng.random((2, part.stop - part.start, 4, 5))
+        observed.append(ComponentImages(images.shape, np.zeros((2, 2), int), images))
+        root, noise = rng.uniform(1, 2, (2, *images.shape[1:]))
+        model = np.einsum("ic,icyx->cyx", spectra[:, part], images) + sky[part, None, None]
+        views.append(SimpleNamespace(sqrt_weights=root, data=model + noise))
+
+    def fit(name):
+        channels = SimpleNamespace(channels=lambda: parts)
+        state = State([], [], np.zeros((2, 3)), np.zeros(3))
+        return SimpleNamespace(name=name, views=views, scene=channels, state=state)
+
+    def of(change):  # what is seen, with the sky off by so much
+        return RenderedModel(spectra, sky + change, None, tuple(observed), ())
+
+    starts, skies = [fit(k) for k in range(3)], [0.5, 1.4, -1.0]
+    chi2 = [0.0] * 3
+    for k, change in enumerate(skies):
+        for view, part, rendered in zip(views, parts, observed, strict=True):
+            model = np.einsum("ic,icyx->cyx", spectra[:, part], np.asarray(rendered))
+            left = view.data - model - (sky + change)[part, None, None]
+            chi2[k] += (view.sqrt_weights**2 * left**2).sum()
+    monkeypatch.setattr(second, "model_of", lambda one: one.name)
+    monkeypatch.setattr(
+        second, "render_models", lambda names, fit_sky: [of(skies[k]) for k in names]
+    )
+    others = [fit(k) for k in (2, 0, 1)]  # another scene's
+    best, other = second._best([starts, others], True)
+    assert best is starts[int(np.argmin(chi2))] and best.name == 1 and other is others[2]
+    np.testing.assert_array_equal(best.state.spectra, spectra)
+    np.testing.assert_array_equal(best.state.sky, sky + skies[1])
+
+
+def test_scenes_with_clear_gradients_begin_anew(monkeypatch):
+    """They alone; each of its three starts from what it should be made of."""
+
+    def clear(*which):
+        return SimpleNamespace(significant=np.array(which, int))
+
+    asked = [None, clear(1), clear(), clear(0, 2)]
+    settings = SimpleNamespace(fit_sky=True)
+    fits = [SimpleNamespace(name=i, start=[i] * 3, settings=settings) for i in range(4)]
+    monkeypatch.setattr(second, "run_gradient_tests", lambda fits: asked)
+    monkeypatch.setattr(second, "_alone", lambda fit, one: f"alone {fit.name}")
+    monkeypatch.setattr(second, "_together", lambda fit, which: f"all {fit.name} {which.tolist()}")
+    monkeypatch.setattr(second, "fit_start_profiles", lambda patches, fit_sky=False: patches)
+    monkeypatch.setattr(second, "_joined", lambda begin, own, which: f"{own} in {begin[0]}")
+    monkeypatch.setattr(second, "_as_before", lambda whole, begin, _: f"{whole} as {begin[0]}")
+    monkeypatch.setattr(second, "_with_cores", lambda fit, one: f"cores {one.significant.tolist()}")
+    monkeypatch.setattr(
+        second, "_again", lambda fit, point: SimpleNamespace(point=point, state="new")
+    )
+    monkeypatch.setattr(
+        second,
+        "_going_on",
+        lambda state, first, before, new: (first.name, before.tolist(), new.tolist()),
+    )
+    monkeypatch.setattr(second, "_best", lambda starts, fit_sky: starts)
+    begun = second.start_refits(fits)
+    assert {i: [(one.point, one.state) for one in three] for i, three in begun.items()} == {
+        1: [
+            ("alone 1 in 1", (1, [0, 1, 1, 2], [False, True, True, False])),
+            ("all 1 [1] as 1", "new"),
+            ("cores [1]", (1, [0, 1, 1, 2], [False, False, True, False])),
+        ],
+        3: [
+            ("alone 3 in 3", (3, [0, 0, 1, 2, 2], [True, True, False, True, True])),
+            ("all 3 [0, 2] as 3", "new"),
+            ("cores [0, 2]", (3, [0, 0, 1, 2, 2], [False, True, False, False, True])),
+        ],
+    }
+    asked[1] = asked[3] = None
+    assert second.start_refits(fits) == {}
+
+
+def test_the_other_start_takes_galaxies_over():
+    """Given profiles, stars and galaxies of two components are fitted as ever."""
+    frame = SimpleNamespace(shape=(6, 7))
+    one, two = object.__new__(GalaxyProfile), object.__new__(GalaxyProfile)
+    shapes = [one, StarProfile.__new__(StarProfile), two, two, FixedProfile(np.ones((6, 7))), one]
+    source = np.array([0, 1, 2, 2, 3, 4])
+    drawn = np.random.default_rng(9).random((6, 7))
+    begin = SimpleNamespace(source=source, shapes=shapes, drawn=lambda i, low, size: drawn + i)
+    place = {"position_px": (1.0, 2.0)}
+    sources = [
+        ExtendedSource(**place),
+        PointSource(**place),
+        ExtendedSource(**place, n_components=2),
+        ExtendedSource(**place, profile=np.ones((6, 7))),
+        ExtendedSource(**place),
+    ]
+    patch = StartInput(frame, sources, np.ones((5, 2)), ["view"])
+    found = second._together(SimpleNamespace(start=begin, patch=patch, frame=frame), np.array([5]))
+    assert found.sources[1:4] == sources[1:4] and found.views == ["view"]
+    assert found.sources[4].n_components == 2 and found.sources[4].profile is None
+    np.testing.assert_array_equal(found.sources[0].profile, drawn)
+    assert patch.sources[0].profile is None
+
+
+def test_what_was_taken_over_has_its_first_shape_again():
+    one, star, own = (
+        object.__new__(GalaxyProfile),
+        StarProfile.__new__(StarProfile),
+        FixedProfile(np.ones((3, 3))),
+    )
+    held, new = FixedProfile(np.ones((3, 3))), object.__new__(GalaxyProfile)
+
+    def point(shapes, first):
+        n = len(shapes)
+        numbers = {
+            name: np.arange(n) + first
+            for name in ("drawn_positions", "peaks", "spectra", "spectrum_curvature")
+        }
+        rest = {"source": np.arange(n), "positions": 0, "undetected": 0, "sky": 0}
+        thetas = [first + i for i in range(n)]
+        return StartingPoint(shapes=shapes, thetas=thetas, **numbers, **rest)
+
+    begin = point([one, star, one, own], 0)
+    whole = point([held, star, new, new, own], 10)
+    found = second._as_before(whole, begin, np.array([2]))
+    assert found.shapes == [one, star, new, new, own]
+    assert found.thetas == [0, 11, 12, 13, 3]
+    assert found.drawn_positions.tolist() == found.peaks.tolist() == [0, 11, 12, 13, 3]
+    assert found.spectra.tolist() == found.spectrum_curvature.tolist() == [10, 11, 12, 13, 14]
+    assert whole.shapes[0] is held and whole.peaks[0] == 10

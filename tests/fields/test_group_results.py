@@ -1,0 +1,143 @@
+"""Parts on disk: what went in comes out, of sources that failed too."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.io import fits
+from astropy.table import QTable
+from helpers.fields import mosaics_of
+
+from clresample.fields.blends.plan import FitRegion
+from clresample.fields.box import Box
+from clresample.fields.execution.group_results import (
+    COMPONENT_COLUMNS,
+    PATCH_COLUMNS,
+    GroupResults,
+    GroupResultsFile,
+)
+from clresample.fields.run import reference_grid
+from clresample.measurement.columns import Columns
+
+PATCH = FitRegion(number=7, parent=3 << 41, box=Box(5, 6, 25, 36), sources=(0,))
+
+
+@pytest.fixture
+def part():
+    ok, failed = Columns(meta={"frame": "icrs"}), Columns()
+    ok.put("ra", [1.5, -2.0], u.deg)
+    ok.put("flux", [np.inf, 3e-9], u.uJy)
+    ok.put("flags", np.array([64, 0], np.int32))
+    ok.put("n_components", np.array([1, 2]))
+    failed.put("ra", [7.0], u.deg)
+    failed.put("flags", np.array([2], np.int32))
+    for rows, status, reason in ((ok, "converged", ""), (failed, "failed", "no pixel")):
+        rows.put("id", np.arange(len(rows), dtype=np.int64) + (5 << 41))
+        rows.put("status", np.full(len(rows), status))
+        rows.put("reason", np.full(len(rows), reason))
+    made = GroupResults(rows=[ok, Columns(), failed])
+    made.patches = [
+        (7, 3 << 41, 0, "converged", 2, 600, 20, 0.25),
+        (9, 1, 1, "failed: x", 1, 9, 0, 0.0),
+    ]
+    return made
+
+
+def read(part, tmp_path):
+    path = tmp_path / "fit-0-000000.fits"
+    path.write_bytes(part.to_bytes())
+    return GroupResultsFile(path), path
+
+
+def test_sources_that_failed_leave_whole_numbers_whole(part, tmp_path):
+    file, path = read(part, tmp_path)
+    (rows,) = file.read("CATALOGUE")
+    assert len(rows) == 3 and rows.meta == {"FRAME": "icrs", "EXTNAME": "CATALOGUE"}
+    assert rows.units == {"ra": u.deg, "flux": u.uJy}
+    assert rows["ra"].tolist() == [1.5, -2.0, 7.0]
+    np.testing.assert_array_equal(rows["flux"], [np.inf, 3e-9, np.nan])
+    assert rows["n_components"].tolist() == [1, 2, 0] and rows["flags"].tolist() == [64, 0, 2]
+    assert [rows[name].dtype.str for name in ("flags", "id", "flux")] == ["<i4", "<i8", "<f8"]
+    assert rows["id"].tolist() == [5 << 41, (5 << 41) + 1, 5 << 41]
+    assert rows["status"].tolist() == ["converged", "converged", "failed"]
+    assert rows["reason"].tolist() == ["", "", "no pixel"]
+    table = QTable.read(path, hdu="CATALOGUE")  # as any other program sees it
+    assert table["ra"].unit == u.deg and table["flux"].unit == u.uJy
+
+
+def test_patches_components_and_models_come_back(part, tmp_path):
+    morphology = np.arange(6.0).reshape(2, 3)
+    part.add_component(11, PATCH, np.array([8, 9]), morphology, np.array([1.0, np.nan]))
+    part.add_component(12, PATCH, np.array([1, 2]), 2 * morphology, np.array([3.0, 4.0]))
+    models = {0: np.full((1, 4, 5), 2.5), 1: np.arange(12.0).reshape(2, 2, 3)}
+    boxes = {0: Box(0, 1, 4, 6), 1: Box(7, 8, 9, 11)}
+    for i, model in models.items():
+        part.add_model(PATCH, i, boxes[i], model)
+    file, _ = read(part, tmp_path)
+    patches, components = file.read("PATCHES", "COMPONENTS")
+    assert list(patches.values) == list(PATCH_COLUMNS)
+    assert patches["fit_id"].tolist() == [7, 9] and patches["parent_id"].tolist() == [3 << 41, 1]
+    assert patches["status"].tolist() == ["converged", "failed: x"]
+    assert patches["seconds"].tolist() == [0.25, 0.0]
+    rows = np.stack([components[name] for name in COMPONENT_COLUMNS], axis=1).tolist()
+    assert rows == [[11, 3 << 41, 7, 8, 9, 2, 3, 0], [12, 3 << 41, 7, 1, 2, 2, 3, 6]]
+    spectra, morphologies = file.read("SPECTRA", "MORPHOLOGIES")
+    np.testing.assert_array_equal(spectra, [[1.0, np.nan], [3.0, 4.0]])
+    assert morphologies.tolist() == [*range(6), *range(0, 12, 2)]
+    found = list(file.models())
+    assert [(patch, i, box) for patch, i, box, _ in found] == [(7, i, boxes[i]) for i in (0, 1)]
+    for _, i, _, model in found:
+        np.testing.assert_array_equal(model, models[i])
+    assert list(file.models({8})) == []
+    assert [m[1] for m in file.models(mosaic=1)] == [m[1] for m in found if m[1] == 1]
+
+
+def test_an_empty_part_is_a_file_too(tmp_path):
+    file, _ = read(GroupResults(), tmp_path)
+    assert [len(one) for one in file.read("CATALOGUE", "PATCHES", "PIXELS")] == [0, 0, 0]
+    assert list(file.models()) == []
+
+
+def test_files_are_fits_as_others_see_them(part, tmp_path):
+    named = "flux_it's a long name" + " of a channel" * 2
+    part.rows[0].put(named, np.array([1.0, 2.0]))
+    part.rows[0].meta["note"] = "quoted 'text', " * 8 + "and its end"
+    for n, one in enumerate([part, GroupResults()]):
+        path = tmp_path / f"{n}.fits"
+        path.write_bytes(one.to_bytes())
+        with fits.open(path) as hdus:
+            hdus.verify("exception")
+            for hdu in hdus[1:]:
+                again = type(hdu)(hdu.data, hdu.header).header  # as astropy would write it
+                assert dict(again) == dict(hdu.header)
+    file = GroupResultsFile(tmp_path / "0.fits")
+    np.testing.assert_array_equal(file.read("CATALOGUE")[0][named], [1.0, 2.0, np.nan])
+    header = fits.getheader(file.path, "CATALOGUE")
+    assert header["NOTE"] == part.rows[0].meta["note"]
+    part.rows[0].put("reason", np.array(["\N{LATIN SMALL LETTER E WITH ACUTE}", ""]))
+    with pytest.raises(ValueError, match="ascii"):
+        part.to_bytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("caf\u00e9", "'caf\u00e9' must be printable ASCII"),
+        ("g ", "'g ' must be printable ASCII without a space at its end"),
+        ("g" * 64, "FITS takes 68: give observations and channels shorter names"),
+        ("g'" * 30, "has [0-9]+ characters, FITS takes 68"),
+    ],
+)
+def test_names_that_no_part_can_hold_are_refused_before_the_fits(sky, name, message):
+    euclid, _ = mosaics_of(sky)
+    renamed = replace(euclid, channels=(replace(euclid.channels[0], name=name),))
+    for mosaic in (replace(euclid, name=name), renamed):
+        with pytest.raises(ValueError, match=message):
+            reference_grid([mosaic])
+
+
+def test_mosaics_whose_files_would_be_one_are_refused(sky):
+    euclid, rubin = mosaics_of(sky)
+    with pytest.raises(ValueError, match="file names of mosaics must be unique, not u_g, u_g"):
+        reference_grid([replace(euclid, name="u g"), replace(rubin, name="u_g")])
