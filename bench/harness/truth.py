@@ -88,6 +88,8 @@ def _truths(scene, mode, columns):
 def _quantity(column):
     if column.endswith("_centroid"):
         return "position"
+    if column == "rms_size":
+        return "size"
     return "ellipticity" if column in ("e1", "e2") else column.split("_")[0]
 
 

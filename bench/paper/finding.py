@@ -51,19 +51,19 @@ def verdict(finding, departs="", original=None):
     departs: "setting" or "start", in which a run differs from the paper's; "" where it does not
     original: the finding about the same claim in the paper's own setting, if it was run
     """
-    if finding.contains is None:
+    if finding.holds is None:
         return "Not decided."
-    if finding.contains:
+    if finding.holds:
         return "Holds."
     if finding.better:
         return "Does not hold: we are better."
     if not (departs and finding.claim.label):  # targets of ours are meant for every setting
         return "Does not hold: we fall short."
     about = f"Does not hold: the statement is about another {departs}"
-    if original is None or original.contains is None:
+    if original is None or original.holds is None:
         return f"{about}."
     there = {"setting": "in that one", "start": "from that one"}[departs]
-    if original.contains:
+    if original.holds:
         return f"{about}, and {there} it holds."
     return f"{about}, and {there} " + (
         "we are better." if original.better else "we fall short too."

@@ -64,7 +64,7 @@ class ModelLight:
         chosen = np.flatnonzero(meet)
         box = seen.grown(1)
         for i in chosen:
-            box = box.join(Box(*models.low[i].tolist(), *models.high[i].tolist()))
+            box = box.union(Box(*models.low[i].tolist(), *models.high[i].tolist()))
         found: dict[int, np.ndarray] = {}
         by_shift: dict[tuple, list] = {}
         for i in chosen.tolist():

@@ -46,10 +46,10 @@ def test_verdicts_follow_the_numbers(change, failing):
     from bench.paper.accuracy_findings import findings
 
     found = findings("accuracy", accuracy_numbers(**change))
-    assert tuple(f.claim.title for f in found if f.contains is False) == failing
-    better = {f.claim.title for f in found if f.contains is False and f.better}
+    assert tuple(f.claim.title for f in found if f.holds is False) == failing
+    better = {f.claim.title for f in found if f.holds is False and f.better}
     assert better == {"Scatter of the SDR"}.intersection(failing)
-    assert all(isinstance(f.contains, bool) for f in found)
+    assert all(isinstance(f.holds, bool) for f in found)
 
 
 @pytest.mark.parametrize("which", [0, 1], ids=["of two surveys", "of one survey"])
@@ -111,8 +111,8 @@ def test_verdicts_on_times_follow_the_numbers(change, holds, better):
     from bench.paper.timing_findings import findings
 
     found = findings(timing_numbers(**change))
-    assert [f.contains for f in found] == holds
-    failing = [i for i, f in enumerate(found) if not f.contains and f.better]
+    assert [f.holds for f in found] == holds
+    failing = [i for i, f in enumerate(found) if not f.holds and f.better]
     assert failing == ([better] if better is not None and change else [])
 
 
@@ -164,6 +164,6 @@ def test_joint_findings_say_what_the_numbers_say(gain, verdict):
     numbers = joint_bins.summarise(table, maps, ["own"])
     found = joint_findings.findings("own", numbers)
     gains = next(f for f in found if f.claim is joint_findings.GAIN)
-    assert gains.contains is verdict
+    assert gains.holds is verdict
     assert ("it gains for galaxies bright in both" in gains.found) == (gain > 0)
     assert ("it loses" in gains.found) == (gain < 0)

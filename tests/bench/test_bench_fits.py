@@ -206,7 +206,7 @@ def test_crowded_blend_holds_its_light():
 
     blend = crowded_blend(1, 4, 100)
     assert [o.shape for o in blend.observations] == [(1, 100, 100), (6, 50, 50)]
-    assert blend.frame.contains(blend.frame.place(blend.sources)).all()
+    assert blend.frame.contains(blend.frame.positions_of(blend.sources)).all()
     for o in blend.observations:
         level = np.median(o.data, axis=(1, 2)) * np.sqrt(o.weights[:, 0, 0])
         assert np.abs(level).max() < 1

@@ -14,7 +14,9 @@ from bench import faults, on_paper, scaling
 
 
 def turn(n_round, seat, began, ended):
-    return SimpleNamespace(task=SimpleNamespace(round=n_round), seat=seat, began=began, ended=ended)
+    return SimpleNamespace(
+        task=SimpleNamespace(round=n_round), worker=seat, start_s=began, end_s=ended
+    )
 
 
 def test_the_tail_is_what_the_last_worker_did_alone():

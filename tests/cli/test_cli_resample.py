@@ -130,7 +130,7 @@ def test_small_memory_gives_the_same(files, capsys):
 
 
 def test_nan_pixels_filled_and_gain_allowed_where_asked(files, capsys):
-    assert resample(**nan_image(), nan="0") == 0
+    assert resample(**nan_image(), fill_nan="0") == 0
     assert np.isfinite(fits.getdata("out.fits")).all()
     capsys.readouterr()
     fits.writeto("narrow.fits", PSF.gaussian(0.5, n_pixels=21).images[0])

@@ -100,4 +100,4 @@ def test_a_field_prints_what_its_kernels_took(tmp_path, workers):
     answer = run_python("-m", "clresample.cli", "field", *map(str, words))
     assert answer.returncode == 0, answer.stderr
     assert answer.stderr.count("kernels on ") == 1
-    assert re.search(r"\btrial +\d", answer.stderr), answer.stderr
+    assert re.search(r"\btake_step +\d", answer.stderr), answer.stderr

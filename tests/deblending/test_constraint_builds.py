@@ -103,11 +103,11 @@ def test_projections_in_many_launches_are_those_in_one(device, monkeypatch, grou
     boxes = many_boxes()
     images = morphologies(boxes, np.float32)
     prox = {"n_iterations": n_iterations, "tolerance": 2e-2}
-    tune(monkeypatch, sum_group=group, loops=None)
+    tune(monkeypatch, sum_group=group, max_loop_iterations=None)
     whole = apply(device, MonotoneProjection(**prox), boxes, images)
     largest = max(-(-(y + 2) * (x + 2) // ALIGN) * ALIGN for y, x in boxes.shape.tolist())
     for loops in (65535, 8 * (largest // group + 2) + 2 * group, 20 * (largest // group + 2)):
-        tune(monkeypatch, loops=loops)
+        tune(monkeypatch, max_loop_iterations=loops)
         parts = apply(device, MonotoneProjection(**prox), boxes, images)
         for a, b in zip(whole, parts, strict=True):
             np.testing.assert_array_equal(a, b)

@@ -202,9 +202,9 @@ def test_groups_prepared_ahead_come_out_the_same(device, monkeypatch):
     blends = [blend(seed=i) for i in range(5)]
     blends.insert(3, replace(blends[0], sources=()))
     given = {"settings": replace(SETTINGS, max_iter=5), "device": device}
-    tune(monkeypatch, n_scenes=2, ahead=False)
+    tune(monkeypatch, n_scenes=2, prefetch_groups=False)
     alone, seen = deblend_many(blends, **given), []
-    tune(monkeypatch, n_scenes=2, ahead=True)
+    tune(monkeypatch, n_scenes=2, prefetch_groups=True)
     results = deblend_many(blends, progress=seen.append, **given)
     assert seen == [2, 3, 5, 6] and results[3].status.startswith("failed")
     for result, other in zip(results[:3] + results[4:], alone[:3] + alone[4:], strict=True):

@@ -153,7 +153,7 @@ def test_a_prior_of_nonsense_is_refused():
         {"scales_px": (1.0,)},
         {"strengths": (0.1, -1.0, 0.1)},
         {"scales_px": (), "strengths": ()},
-        {"weight": 0.0},
+        {"hyperprior_weight": 0.0},
     ):
         with pytest.raises(ValueError):
             MultiscalePrior(**given)

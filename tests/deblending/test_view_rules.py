@@ -64,7 +64,11 @@ def test_data_are_above_the_sky_that_is_expected():
     np.testing.assert_allclose(found.sky_precision, [4, 0])
     wanted = np.where(one.sqrt_weights > 0, data - np.array([1.5, -2.0])[:, None, None], 0)
     np.testing.assert_allclose(found.data, wanted / np.array([0.5, 0.2])[:, None, None])
-    assert found.root is one.sqrt_weights and one.sky_level is None and one.sky_precision is None
+    assert (
+        found.sqrt_weights is one.sqrt_weights
+        and one.sky_level is None
+        and one.sky_precision is None
+    )
 
 
 def test_an_error_of_the_model_is_added_to_the_noise():

@@ -33,7 +33,7 @@ def test_every_column_has_its_unit_and_a_description(done):
         assert about[b"description"].decode() == rows[name].info.description
         assert about.get(b"unit", b"").decode() == str(getattr(rows[name], "unit", None) or "")
     one, other = read_catalogue(folder / "catalogue.parquet"), rows
-    assert [one[n].noise_unit for n in one.colnames] == [other[n].unit for n in one.colnames]
+    assert [one[n].unit for n in one.colnames] == [other[n].unit for n in one.colnames]
     np.testing.assert_array_equal(one["colour_err_VIS_i"].value, other["colour_err_VIS_i"].value)
     blends = QTable.read(folder / "fit_table.ecsv")
     assert all(blends[name].info.description for name in blends.colnames)

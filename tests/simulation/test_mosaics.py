@@ -69,7 +69,7 @@ def test_all_of_a_drop_lands_on_the_mosaic():
     wide = drizzle(grids, Grid.flat((60, 60), 0.14), 0.8)
     # the weights before they are divided by what a pixel received: undone by one's own areas
     area = np.array(wide.matrix.sum(axis=1)).ravel()
-    assert area[wide.seen.ravel()] == pytest.approx((0.14 / 0.2) ** 2, rel=1e-9)
+    assert area[wide.has_data.ravel()] == pytest.approx((0.14 / 0.2) ** 2, rel=1e-9)
     assert set(np.diff(wide.matrix.tocsc().indptr)) <= set(range(1, 17))
 
 
@@ -78,8 +78,8 @@ def test_light_is_kept(name):
     grids, mosaicking = MOSAICS[name]
     flat = mosaicking.images([np.ones((1, *g.shape)) for g in grids])[0]
     per_pixel = mosaicking.grid.pixel_scale_arcsec**2 / 0.2**2
-    assert flat[mosaicking.seen] == pytest.approx(per_pixel, rel=1e-9)
-    assert mosaicking.seen.all()
+    assert flat[mosaicking.has_data] == pytest.approx(per_pixel, rel=1e-9)
+    assert mosaicking.has_data.all()
     seen = mosaicking.images([star(g)[None] for g in grids])[0]
     assert seen.sum() == pytest.approx(1, rel=2e-3)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 
 # [sigma] Rings of less light are left to medians along rays; pixels of a ring, at least; rings over
 # which the slope at either end is taken.
@@ -44,6 +43,10 @@ class Fall:
         """The light at distances [px], any shape; those under a pixel count as one."""
         x = np.log(np.maximum(radius, 1.0))
         u, v = self.log_radius, self.log_light
+        from scipy.interpolate import (
+            PchipInterpolator,
+        )  # which scenes without such stars do without
+
         found = PchipInterpolator(u, v)(np.clip(x, u[0], u[-1]))
         k = min(END_RINGS, len(u) - 1)
         for end, far, outside in ((0, k, x < u[0]), (-1, -1 - k, x > u[-1])):

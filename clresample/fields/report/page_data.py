@@ -16,7 +16,7 @@ from .table import columns_of
 OK, FLAGGED, FAILED = 0, 1, 2  # states of a source, as the script counts them
 # [bytes] of a source on the field, of one of its numbers there, of its measurements
 SOURCE_BYTES, NUMBER_BYTES, DETAIL_BYTES = 76, 6, 1000
-SHAPE = "size", "e1", "e2"
+SHAPE = {"size": "rms_size", "e1": "e1", "e2": "e2"}  # the script's names: columns
 # of the page: places of sources, their measurements, their pictures
 SOURCES_PART, DETAILS_PART, STAMPS_PART = 0.25, 0.1, 0.25
 
@@ -87,7 +87,7 @@ def data_of(run, most_bytes, notes) -> dict:
             "snr": [_short(v, 1) for v in snr],
             "flags": _whole(run, "flags", order),
             "status": _places(run, "status", order),
-            **{name: _numbers(run, name, order) for name in SHAPE},
+            **{name: _numbers(run, column, order) for name, column in SHAPE.items()},
             "columns": [[_shown(v, one.form) for v in one.values[order]] for one in columns],
         },
         "statuses": _different(run, "status"),
@@ -189,7 +189,7 @@ def instrument_data(pyramid) -> dict:
     return {
         "name": one.name,
         "channels": one.channels,
-        "sigma": [_digits(v) for v in one.sigma],
+        "sigma": [_digits(v) for v in one.noise_sigma],
         "whites": [_digits(v) for v in stretch.whites],
         "colour": {
             "title": f"{', '.join(names)} as blue, green, red",

@@ -46,7 +46,7 @@ def columns_of(run) -> list[TableColumn]:
         system = "AB mag" if unit == "uJy" else "−2.5 log₁₀"
         mags = magnitudes(flux, unit)
         found.append(TableColumn(channel, system, ".2f", mags, "magnitude", channel))
-    found.append(_column(rows, "size", "size", "arcsec", ".3f"))
+    found.append(_column(rows, "rms_size", "size", "arcsec", ".3f"))
     for name in rows.colnames:
         if name.startswith("chi2_"):
             found.append(_column(rows, name, f"χ² {name[5:]}", "", ".2f"))
