@@ -60,17 +60,18 @@ def deblend(
     dtype=np.float32,
     progress=None,
 ) -> Result:
-    """Fit one scene to all observations at once.
+    """Fits one scene to all observations at once.
 
         min 1/2 sum_o |sqrt(w_o) (R_o sum_s A_s S_s - d_o)|^2 + 1/2 |z|^2,  A >= 0, S constrained
 
-    observations, sources, frame, shifts: see Blend; among observations may be astropy's NDData and
-        CCDData that have a PSF; settings: see Settings
+    observations, sources, frame, shifts: see Blend; observations may include astropy's NDData and
+        CCDData that have a PSF
+    settings: see Settings; device: see get_device; dtype: float32 or float64, of the fit
     progress: called every few iterations with their number so far and the loss (1,)
-    raises ValueError for what `check_observations`, `model_frame` and `Source` refuse, and when no
-    source lies inside the frame. Warns (SourceWarning) of sources far from any light. Ctrl-C ends
-    the fit with the best state so far. Warns (InputWarning) of what is wrong with the observations
-    and the list of sources, as far as their light tells (inspection/): messages of the result.
+    Raises ValueError for arguments that `check_observations`, `model_frame` and `Source` reject, and
+    when no source lies inside the frame. Warns (SourceWarning) of sources far from any light. Ctrl-C
+    ends the fit with the best state so far. Warns (InputWarning) of problems of the observations and
+    of the list of sources, as far as their light shows (inspection/): messages of the result.
     """
     blend = Blend(as_observations(observations), _listed("sources", sources), frame, shifts)
     settings, dtype = _checked(settings, dtype)

@@ -218,7 +218,7 @@ def _known():
 
 
 def _read(place):
-    """What a folder of .icd files, or one of them, names: {name: library}."""
+    """Libraries named by a folder of .icd files, or by one of them: {name: library}."""
     path = Path(place)
     files = [path] if path.suffix == ".icd" else sorted(path.glob("*.icd"))
     return {file.name: _in_full(file) for file in files}

@@ -146,8 +146,9 @@ class ModelFile:
 
 
 def read_models(path, parent_id=None) -> list[ComponentModel]:
-    """The models of one blend, or of all; of the pixels, only theirs are read.
+    """Reads the models of one blend, or of all, and no other pixels.
 
+    path: of the file of models; parent_id: of the blend, None = all blends
     Raises FileError for a file without models, or without this blend.
     """
     file = ModelFile(path)

@@ -109,8 +109,11 @@ def run_field(
 
 
 def _degrees(positions, reference):
-    """Positions (S, 2) [deg] in the frame of the reference's WCS where a SkyCoord is given, else as
-    they are. Raises ValueError for a SkyCoord on a flat sky."""
+    """Positions (S, 2) [deg] in the frame of the reference's WCS.
+
+    A SkyCoord is transformed to it; other positions are returned unchanged.
+    Raises ValueError for a SkyCoord on a flat sky.
+    """
     if not isinstance(positions, SkyCoord):
         return positions
     if reference.is_flat:

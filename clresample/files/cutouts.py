@@ -59,9 +59,10 @@ def write_cutouts(path, cutouts, *, overwrite=False, device=None, inputs=None):
 
 
 def read_cutouts(path) -> list[CCDData]:
-    """The cutouts that `write_cutouts` or `clresample cutout` wrote into a file.
+    """Reads the cutouts that `write_cutouts` or `clresample cutout` wrote: a list of CCDData.
 
-    Raises FileError for a file that is not there, is damaged, or holds none.
+    path: of the FITS file
+    Raises FileError if the file does not exist, is damaged, or contains no cutouts.
     """
     with open_fits(path) as hdus:
         if "CUTOUTS" not in hdus:

@@ -46,8 +46,9 @@ class FitsImage(NamedTuple):
 
 
 def read_image(path, *, hdu=None, bands=None):
-    """Image or cube of a FITS file with its celestial grid: FitsImage(data, grid, header, bands).
+    """Reads an image or cube of a FITS file: FitsImage(data, grid, header, bands).
 
+    path: of the FITS file
     hdu: number (from 0), "NAME" or "NAME,VERSION"; None = the first that holds an image
     bands: numbers (from 0) or names, one or several; None = all. Names are those of the cards
         BAND1, BAND2, ..., and of a 2-D image BAND or FILTER
@@ -76,11 +77,11 @@ def read_image(path, *, hdu=None, bands=None):
 
 
 def read_psf(path, *, hdu=None, bands=None, spacing=1.0, center=None):
-    """PSF of a FITS image or cube; no WCS is needed.
+    """Reads the PSF of a FITS image or cube; no WCS is needed.
 
-    hdu, bands: as in `read_image`; spacing [px], center [samples]: as in `PSF`
+    path: of the FITS file; hdu, bands: as in `read_image`; spacing [px], center [samples]: as in `PSF`
 
-    Raises FileError as `read_image` does, and for samples that `PSF` refuses. Warns as `PSF` does.
+    Raises FileError as `read_image` does, and for samples that `PSF` rejects. Warns as `PSF` does.
     """
     with open_fits(path) as hdus:
         chosen = choose_hdu(path, hdus, hdu)

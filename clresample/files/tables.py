@@ -47,9 +47,10 @@ def read_catalogue(path) -> QTable:
 
 
 def write_catalogue(path, table, *, overwrite=False):
-    """Write a catalogue, whole or not at all: as ECSV or, by the file's name, as FITS or Parquet.
+    """Writes a catalogue, whole or not at all: as ECSV or, by the file's name, FITS or Parquet.
 
     path: ends in .ecsv, .parquet, .fits or .fits.gz; table: of `catalogue`
+    overwrite: replace an existing file
     Raises FileError when the file exists or cannot be written, ValueError for other endings
     and columns' names too long for FITS; ImportError without pyarrow for Parquet.
     """

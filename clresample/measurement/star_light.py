@@ -1,14 +1,13 @@
-"""Light of stars with a saturated core in signal-to-noise images, so that peaks on it can be told.
+"""Removes the light of saturated stars from signal-to-noise images, so peaks on it show.
 
-Such a star's light is not that of the PSF that is known: wings beyond its image, diffraction
-spikes, ghosts. But it comes from one place, and changes slowly outwards. Along every ray from the
-star the part of the light, above the median of each ring, that stays for longer than a source is
-wide, its morphological opening,
+The light of such a star departs from the known PSF: wings beyond its image, diffraction spikes,
+ghosts. It still comes from one place and changes slowly outwards. Along every ray from the star
+the light above the median of each ring is opened: the part that persists over more than a source's
+width belongs to the star,
 
-    m(r) = max over windows of length L that hold r of the least light in them,
+    m(r) = max over windows of length L that contain r of the least light in them.
 
-is the star's, too. What is left of the image above it, in units of its scatter on the same ring, is
-searched.
+The search runs on the remainder of the image, in units of its scatter on the same ring.
 """
 
 from __future__ import annotations
@@ -96,10 +95,10 @@ def height_beside(image, star) -> float:
 
 
 def starless(signal, stars, fwhm_px, pixel_arcsec) -> tuple[SignalToNoise, np.ndarray]:
-    """The Signal without the light of StarPlaces, in units of its scatter there, and the pixels
-    (Ny, Nx) bool that held it.
+    """Removes the light of StarPlaces from a signal, in units of its scatter there.
 
-    Sums of squares are left out where there is such light: they hold it in every channel.
+    Also returns the pixels (Ny, Nx) bool from which light was removed. Their sums of squares are
+    left out, because such light adds to every channel.
     fwhm_px [px]: of the PSF; pixel_arcsec [arcsec]: side of a pixel
     """
     all_held = np.zeros(signal.n_seen.shape, bool)
@@ -119,8 +118,9 @@ def starless(signal, stars, fwhm_px, pixel_arcsec) -> tuple[SignalToNoise, np.nd
 
 
 def _without_stars(image, seen, stars, fwhm):
-    """An image (Ny, Nx) [sigma] without the light of StarPlaces, and the pixels (Ny, Nx) bool that
-    held it.
+    """Removes the light of StarPlaces from an image (Ny, Nx) [sigma].
+
+    Also returns the pixels (Ny, Nx) bool from which light was removed.
 
     seen (Ny, Nx): bool; fwhm [px]: of a point source in the image
     """

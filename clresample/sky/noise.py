@@ -275,8 +275,10 @@ def _inverse(variance, shape):
 
 
 def _estimated(data, ignored, channels, unit):
-    """Weights (C, Ny, Nx) from each channel's own background, and messages on the estimate, which
-    name the unit."""
+    """Estimates weights (C, Ny, Nx) from each channel's own background; also returns messages.
+
+    The messages report the estimates in this unit.
+    """
     weights, messages = np.ones(data.shape), []
     for i, channel in enumerate(channels):
         if ignored[i].all():

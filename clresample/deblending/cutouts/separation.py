@@ -89,8 +89,10 @@ class Separation:
         return ~(self.weights > 0)
 
     def padded(self, origin, shape) -> Separation:
-        """The same on a window of `shape` (2,) [px] that begins `origin` (2,) [px] before this one,
-        both at least as large; there are no data and no models in what is added."""
+        """The same Separation on a larger window, without data or models in the added pixels.
+
+        The window has `shape` (2,) [px] and begins `origin` (2,) [px] before this one.
+        """
         n_y, n_x = self.data.shape[1:]
         sides = [(before, size - before - n) for before, size, n in
                  zip(origin, shape, (n_y, n_x), strict=True)]  # fmt: skip

@@ -34,8 +34,11 @@ def saturated(image) -> np.ndarray:
 
 
 def saturated_pixels(observation, significance, usable) -> np.ndarray:
-    """The same of an observation, of its data in units of the noise (C, My, Mx) [sigma] and its
-    pixels (C, My, Mx) bool with a weight."""
+    """Saturated pixels (C, My, Mx) bool of an observation.
+
+    significance (C, My, Mx) [sigma]: data in units of the noise
+    usable (C, My, Mx): bool, pixels with a weight
+    """
     found = np.zeros(usable.shape, bool)
     limit = getattr(observation, "saturation", None)
     if limit is not None:

@@ -68,8 +68,10 @@ def star_cores(significance, usable, psf, band) -> list[StarCore]:
 
 
 def _core(light, usable, masked, psf, band, fwhm):
-    """The StarCore of one group of masked pixels (My, Mx), None where the light beside it is not
-    that of a star."""
+    """The StarCore of one group of masked pixels (My, Mx).
+
+    None if the light beside the group is not that of a star.
+    """
     edge = usable & binary_dilation(masked, np.ones((3, 3), bool))
     if not edge.any() or light[edge].max() < MIN_EDGE_SIGMAS:
         return None
@@ -115,8 +117,10 @@ def _reach_of(masked, away):
 
 
 def _centred(light, ring, guess, fwhm):
-    """Place (2,) [px] about which the light of a ring depends on the radius alone, and the mean
-    deviation of its logarithm there."""
+    """Fits the centre (2,) [px] of a ring of light; also returns the scatter about it.
+
+    The scatter is the mean deviation of the light's logarithm from a function of the radius.
+    """
     y, x = np.nonzero(ring)
     value = np.log(np.maximum(light[ring], 1.0))
 

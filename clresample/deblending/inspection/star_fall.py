@@ -26,8 +26,10 @@ class Fall:
 
     @classmethod
     def of(cls, data, usable, away, sigma):
-        """Of pixels (My, Mx) at distances `away` [px]: rings of one pixel's width, as far out as
-        their light falls and is over RING_SIGMAS; None where these are fewer than three."""
+        """Measures rings one pixel wide in pixels (My, Mx) at distances `away` [px].
+
+        Rings end where their light rises or is below RING_SIGMAS. None if fewer than three remain.
+        """
         rings, found = np.rint(away[usable]).astype(int), []
         value, radius = data[usable], away[usable]
         for r in range(rings.min(initial=0), rings.max(initial=-1) + 1):

@@ -79,12 +79,12 @@ class StarPSFs(PSFField):
 
 
 def with_star_psfs(image, sources, places, sky):
-    """The Image with PSFs of their own for stars with masked cores, and in how many channels each
-    source (S,) has one.
+    """The Image with own PSFs for stars with masked cores, and their number of channels (S,).
 
-    The masked pixels of these cores grow by `spoilt.GROW_PX`. Without such a star it is the same.
+    The masked pixels of these cores grow by `spoilt.GROW_PX`. Without such a star the Image is
+    returned unchanged.
 
-    sources: those of which `image.places` are; places (S, 2) [px]: of them, without any shift
+    sources: those that `image.places` belongs to; places (S, 2) [px]: theirs, without any shift
     sky: whether a level of the sky is fitted
     """
     stars = [i for i, source in enumerate(sources) if _may_be(source) and image.inside[i]]
@@ -126,8 +126,10 @@ def with_star_psfs(image, sources, places, sky):
 
 
 def as_stars(sources, numbers, still):
-    """Sources with those of `numbers` as PointSources, at rest if they are among `still`: their
-    PSFs were measured about their positions."""
+    """Replaces the sources with these numbers by PointSources; those in `still` are at rest.
+
+    The PSFs of sources in `still` were measured about their positions.
+    """
     found = list(sources)
     for i in numbers:
         keys = ("sky_deg", "position_px", "observation", "name")
@@ -167,10 +169,10 @@ def _joined(given, own):
 
 
 def _own(image, c, place, core, sky):
-    """Samples of a star's own PSF in channel c, their centre (2,) [samples], and the doubt of its
-    flux, see StarPSFs; None where its light does not fall from the core on.
+    """Measures a star's own PSF in channel c: samples, their centre and the flux uncertainty.
 
-    The samples' sum is 1 less the light left out of the core.
+    The centre (2,) is in samples; for the uncertainty see StarPSFs. None if the star's light does
+    not fall from the core outwards. The samples' sum is 1 less the light left out of the core.
     place (2,) [px]: of the model's star; core: StarCore; sky: see `with_star_psfs`
     """
     o, fwhm = image.observation, float(image.observation.psf.fwhm_px[c])
@@ -208,8 +210,10 @@ def _own(image, c, place, core, sky):
 
 
 def _rays(data, usable, place, radius):
-    """An image (My, Mx) along rays from a place: (radii, angles), and which of them are known: on
-    usable pixels from the radius [px] on."""
+    """Samples an image (My, Mx) along rays from a place: (radii, angles), and their validity.
+
+    Valid samples lie on usable pixels, from the radius [px] on.
+    """
     corners = np.array([(y, x) for y in (0, data.shape[0] - 1) for x in (0, data.shape[1] - 1)])
     end = int(np.ceil(np.hypot(*(corners - place).T).max())) + 1
     n_angles = int(np.ceil(2 * np.pi * end))

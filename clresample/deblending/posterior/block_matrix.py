@@ -77,8 +77,11 @@ class BlockCholesky:
 
     @classmethod
     def restore(cls, sizes, scale, order, later, lower, below) -> BlockCholesky:
-        """The Factor whose attributes and `blocks` these are: sizes (n,), scale (n): arrays, order
-        (n,), later (n): lists of nodes, lower and below {node: block}."""
+        """Restores a BlockCholesky from its attributes and `blocks`.
+
+        sizes (n,), scale (n): arrays; order (n,), later (n): lists of nodes; lower and below:
+        {node: block}
+        """
         factor = object.__new__(cls)
         factor.sizes, factor.scale, factor.order, factor._later = sizes, scale, order, later
         factor._lower, factor._below = lower, below

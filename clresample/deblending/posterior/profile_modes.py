@@ -111,7 +111,7 @@ def profile_modes(shape, theta, position, profile, origin, *, radial=1.0):
 
 
 def _surroundings(galaxy, theta, position, origin, size):
-    """Where a galaxy's light is followed about its box: first pixel (2,) and size (2,)."""
+    """Window about a galaxy's box in which its light is followed: first pixel (2,), size (2,)."""
     near = np.minimum(np.array(size) // 2, FAR_PX)
     beta, frame = np.exp(theta[3]), np.array(galaxy.shape)
     # beyond t of the peak lies t^(beta / (beta + 1)) of the light

@@ -95,8 +95,9 @@ def first_profiles(fit, error):
 
 
 def _next(looking, models, rest, error):
-    """The components of `rest` that gain the most of all near them, with their best profiles, in
-    scenes where a larger one gains: {component: theta}.
+    """Selects in each scene the components of the largest gain nearby: {component: best theta}.
+
+    Scenes add some only if a larger profile gains more than the first one by over NEED.
 
     models: those before it, {component: theta}; rest: {component: [theta expected, ...]}
     """
@@ -127,8 +128,10 @@ def _next(looking, models, rest, error):
 
 
 def _apart(around, listed, gain, at):
-    """Of those `listed` (n) that are `at` some places the ones of the largest gain (n,), in boxes
-    apart."""
+    """Selects the components of the largest gain (n,) at these places, with disjoint boxes.
+
+    listed (n): components; at: the places among them that compete
+    """
     low, high = np.zeros((2, len(listed), 2))
     low[around.at], high[around.at] = around.slots.origin, around.slots.origin + around.slots.size
     taken: list[int] = []

@@ -150,8 +150,9 @@ class LinearisedScenes:
         )
 
     def light_products(self, sky, error=0.0):
-        """Products (N, C) of each component's whitened image with all light but the sky's, and with
-        itself; 0 where it has no pixels.
+        """Products (N, C) of each component's whitened image with the data's light and with itself.
+
+        The light excludes the sky's. Products are 0 where a component has no pixels.
 
         sky (B, C); error: part of the light that adds to the noise
         """

@@ -55,8 +55,9 @@ class SceneFile:
 
 
 def read_scene(path) -> SceneFile:
-    """Read a scene file and everything that it names.
+    """Reads a scene file and all files that it names.
 
+    path: of the TOML file; its relative paths start from its folder
     Raises SceneError, and FileError for the images: ValueErrors of one line.
     """
     path = Path(path)

@@ -13,8 +13,10 @@ from .checks import as_float_array, check_instance, split_mask
 
 
 def images_of(data, grid, mask):
-    """Data (C, Ny, Nx) float64 of as many pixels as the grid has, the mask with data's own, and the
-    grid, made of a WCS where one is given."""
+    """Validates data (C, Ny, Nx), mask and grid: float64 data of the grid's size.
+
+    The mask returned includes the data's own; the grid is made from a WCS where one is passed.
+    """
     data, hidden = split_mask("data", data)
     data = as_float_array("data", data)
     if data.ndim == 2:

@@ -224,8 +224,11 @@ def vector_bytes(scene, prior) -> int:
 
 
 def _inverse_curvature(scenes):
-    """1 / (sum w (R S)^2) of every spectrum (S, C) and 1 / (sum w + p) of every sky level (B, C), p
-    its precision as it is expected; 0 where nothing is seen, and of levels that are not fitted."""
+    """Inverse curvatures of all spectra (S, C) and sky levels (B, C).
+
+    They are 1 / (sum w (R S)^2) and 1 / (sum w + p), p the precision of the expected level; 0 for
+    unobserved spectra and for levels that are not fitted.
+    """
     power, ties = np.concatenate([s.spectrum_curvature for s in scenes]), scenes[0].ties
     power = power if ties is None else ties.mean(power)
     seen = power > UNSEEN * power.max(initial=0)
