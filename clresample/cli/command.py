@@ -42,7 +42,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def main(argv=None):
-    """Run `clresample` with these arguments (None: sys.argv's); returns the exit status."""
+    """Runs `clresample` with these arguments (None: sys.argv's); returns the exit status."""
     with _ended_as_interrupted():
         try:
             return _run(argv)
@@ -87,7 +87,7 @@ def _run(argv):
 
 
 def _show_in_one_line(arguments):
-    """Let a DeviceWarning appear as a note, without the line of source that warnings come with."""
+    """Lets a DeviceWarning appear as a note, without the line of source that warnings come with."""
     shown = warnings.showwarning
 
     def show(message, category, *rest, **more):

@@ -67,7 +67,7 @@ def _wcs(grid):
 
 
 def run(folder="demo", *, device=None):
-    """Make the demonstration's files in `folder`; returns its SDR [dB] and the files' paths."""
+    """Makes the demonstration's files in `folder`; returns its SDR [dB] and the files' paths."""
     started = time.perf_counter()
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

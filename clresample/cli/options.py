@@ -10,7 +10,7 @@ SIZES = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30}  # [bytes] powers of 1
 
 
 def add_device_option(parser, several=False):
-    """Add `--device`, whose value `get_device` takes as it is; several: or a list, by commas."""
+    """Adds `--device`, whose value `get_device` takes as it is; several: or a list, by commas."""
     parser.add_argument(
         "--device",
         metavar="CHOICE",
@@ -22,7 +22,7 @@ def add_device_option(parser, several=False):
 
 
 def add_profile_option(parser):
-    """Add `--profile`, which sets CLRESAMPLE_PROFILE."""
+    """Adds `--profile`, which sets CLRESAMPLE_PROFILE."""
     parser.add_argument(
         "--profile",
         action="store_true",
@@ -31,7 +31,7 @@ def add_profile_option(parser):
 
 
 def add_dtype_option(parser, what):
-    """Add `--dtype`, the floating type of `what`."""
+    """Adds `--dtype`, the floating type of `what`."""
     parser.add_argument(
         "--dtype",
         choices=("float32", "float64"),
@@ -41,12 +41,12 @@ def add_dtype_option(parser, what):
 
 
 def print_note(arguments, message):
-    """Print what the user should know on standard error."""
+    """Prints what the user should know on standard error."""
     print_progress(arguments, f"note: {message}")
 
 
 def print_progress(arguments, message):
-    """Print a line of progress on standard error."""
+    """Prints a line of progress on standard error."""
     print(f"clresample {arguments.command}: {printable(message)}", file=sys.stderr, flush=True)
 
 
@@ -62,7 +62,7 @@ def printable(text, most=None):
 
 
 def check_matplotlib(option, way_out=""):
-    """Raise ValueError where `option` needs matplotlib and it is not there; it is not imported."""
+    """Raises ValueError where `option` needs matplotlib and it is not there; it is not imported."""
     if find_spec("matplotlib") is None:
         from ..drawing.figure import NO_MATPLOTLIB
 

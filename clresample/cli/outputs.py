@@ -27,7 +27,7 @@ def folder_outputs(arguments, names):
 
 
 def check_scene(arguments, scene, paths):
-    """Raise ValueError, before the fit, where an output is an input or could not hold its names."""
+    """Raises ValueError if an output is an input or cannot store the channels' names."""
     from ..files.atomic import check_output
     from ..files.fits_names import check_catalogue_names
 

@@ -94,7 +94,7 @@ def deblend(
 def deblend_many(
     blends, *, settings=None, device=None, dtype=np.float32, memory=MEMORY, progress=None
 ) -> list[Result | Failure]:
-    """Fit many blends side by side; each comes out as if it were fitted alone, to float accuracy.
+    """Fits many blends side by side; each comes out as if it were fitted alone, to float accuracy.
 
     device: see get_device; or a list of such choices: the blends are dealt to all of them by their
         speed, each with a process of its own, so that a script that calls this must do so under
@@ -166,7 +166,7 @@ class _BatchRunner:
         self.warned = {}
 
     def run(self, progress):
-        """Fit them all; raises KeyboardInterrupt when the group that runs was interrupted."""
+        """Fits them all; raises KeyboardInterrupt when the group that runs was interrupted."""
         n_done, groups = 0, self._groups()
         with contextlib.closing(
             prefetch(groups) if self.tuning.prefetch_groups else groups
@@ -208,7 +208,7 @@ class _BatchRunner:
         return len(group), self._begin(group)
 
     def _begin(self, group):
-        """Start a group of (index, Fit); those that could, one by one where all at once fails."""
+        """Starts a group of (index, Fit); those that could, one by one where all at once fails."""
         try:
             start_fits([fit for _, fit in group])
         except Exception as error:
@@ -221,7 +221,7 @@ class _BatchRunner:
         return group
 
     def _fit(self, group):
-        """Fit a group of (index, Fit) that has begun; True where Ctrl-C has ended that."""
+        """Fits a group of (index, Fit) that has begun; True where Ctrl-C has ended that."""
         for part in self._parts(group):
             for i, done in self._try(part):
                 self.done[i] = done
@@ -242,7 +242,7 @@ class _BatchRunner:
             yield part
 
     def _try(self, group):
-        """Yield (index, Result or Failure) of a group; one by one where all at once fails."""
+        """Yields (index, Result or Failure) of a group; one by one where all at once fails."""
         fits = [fit for _, fit in group]
         run = fits[0].settings, self.device, self.dtype
         try:
@@ -297,7 +297,7 @@ def _sizes(blend):
 
 
 def _warn_dark(dark, where):
-    """Warn the caller of `deblend` or `deblend_many` of sources far from any light."""
+    """Warns the caller of `deblend` or `deblend_many` of sources far from any light."""
     n = sum(map(len, dark))
     warnings.warn(
         f"{n} source{'s lie' if n > 1 else ' lies'} far from any light{where}: see the messages of "

@@ -43,7 +43,7 @@ class Blend:
     shifts: np.ndarray | None = None
 
     def check(self):
-        """Raise ValueError where an observation, a source or the frame is something else."""
+        """Raises ValueError where an observation, a source or the frame is something else."""
         for i, observation in enumerate(self.observations):
             check_instance(f"observations[{i}]", observation, Observation)
         for i, source in enumerate(self.sources):
@@ -52,7 +52,7 @@ class Blend:
             check_instance("frame", self.frame, Frame)
 
     def _check_work(self, frame):
-        """Raise ValueError where a fit would take more than could be meant, before it begins."""
+        """Raises ValueError where a fit would take more than could be meant, before it begins."""
         n_pixels = int(np.prod(frame.shape, dtype=float))
         if n_pixels > MAX_PIXELS:
             raise ValueError(

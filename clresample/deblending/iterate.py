@@ -42,7 +42,7 @@ RESIZE_ITERATIONS = 40
 
 
 def iterate(fits, settings, device, dtype, progress=None, *, takes_over=None):
-    """Run the fits of one signature until each has stopped; they keep their final states.
+    """Runs the fits of one signature until each has stopped; they keep their final states.
 
     takes_over: of a fit that has learned clear structure; where True the fit ends,
         STOPPED_FOR_REFIT
@@ -116,20 +116,20 @@ class _AmsgradRun:
         return losses
 
     def remember(self, which):
-        """Bring the states kept on the device to those of the fits (B,) that had none better."""
+        """Brings the states kept on the device to those of the fits (B,) that had none better."""
         losses, kept = self.engine.best_losses(), self.engine.states(kept=True)
         for i in np.flatnonzero(which):
             self.fits[i].keep_best(losses[i], self.engine.scenes[i], kept[i])
 
     def settle(self, stop):
-        """Leave the fits (B,) that stop here with their final state and its loss."""
+        """Leaves the fits (B,) that stop here with their final state and its loss."""
         self.remember(stop)
         states, losses = self.engine.states(), self.engine.final_losses()
         for i in np.flatnonzero(stop):
             self.fits[i].store_final(losses[i], self.engine.scenes[i], states[i])
 
     def shift(self):
-        """Shift the observations, where that is asked for and due."""
+        """Shifts the observations, where that is asked for and due."""
         if not self.settings.fit_shifts or self.engine.n_steps % SHIFT_ITERATIONS:
             return
         self.remember(self.live)
@@ -214,12 +214,12 @@ class _LbfgsRun:
         return engine.progress.loss[None]
 
     def shift(self):
-        """Shift the observations, where that is asked for and due."""
+        """Shifts the observations, where that is asked for and due."""
         if self.settings.fit_shifts and self.n_steps % SHIFT_ITERATIONS == 0:
             self._move(self.live)
 
     def _move(self, which):
-        """Shift the observations of the fits (B,), also of converged ones, which then go on."""
+        """Shifts the observations of the fits (B,), also of converged ones, which then go on."""
         if not which.any():
             return
         states, moved = self.engine.states(), np.zeros(len(self.fits), bool)
@@ -288,7 +288,7 @@ class _LbfgsRun:
             engine.step(steps)
 
     def settle(self, stop):
-        """Leave the fits (B,) that stop here with their present state."""
+        """Leaves the fits (B,) that stop here with their present state."""
         states, p = self.engine.states(), self.engine.progress
         findings = self.engine.findings(stop)
         for i in np.flatnonzero(stop):

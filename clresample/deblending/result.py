@@ -207,7 +207,7 @@ class Result(ResultDisplay):
         return cutout(self, source, observation, what, size=size, unit=unit)
 
     def sample(self, n, rng=None) -> list[tuple[Component, ...]]:
-        """Draw n sets of components from the posterior about the solution, as `errors` has it.
+        """Draws n sets of components from the posterior about the solution, as `errors` has it.
 
         rng: NumPy Generator, or a seed: equal seeds give equal draws, also of a result read from a
         file. Morphologies and spectra below 0 become 0, so that faint sources are
@@ -225,7 +225,7 @@ class Result(ResultDisplay):
         return [drawn_components(self, rng) for _ in range(n)]
 
     def sample_fluxes(self, n, rng=None) -> np.ndarray:
-        """Draw the sources' fluxes (n, S, C) [counts] from the posterior, n times.
+        """Draws the sources' fluxes (n, S, C) [counts] from the posterior, n times.
 
         Those of `sample`, with what `fluxes` adds for light beyond the boxes and takes off for the
         bound at 0, so that they scatter about the catalogue's; NaN where nothing was measured.

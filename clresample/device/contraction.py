@@ -248,7 +248,7 @@ class BoundContraction:
         self.n_x = _groups(-(-width // columns), tile["WGX"])
 
     def __call__(self, batch, *, a=None, c=None):
-        """Queue `batch` products.
+        """Queues `batch` products.
 
         a, c (ImageBatch): the left factor and the result of this call, strides as they are bound
         """

@@ -261,7 +261,7 @@ def load_pyopencl():
 
 @functools.cache
 def _ignore_remarks(cl):
-    """Leave out pyopencl's warnings of compilers that, as Intel's, remark on every build."""
+    """Leaves out pyopencl's warnings of compilers that, as Intel's, remark on every build."""
     warnings.filterwarnings("ignore", category=cl.CompilerWarning)
 
 

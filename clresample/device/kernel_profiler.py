@@ -43,7 +43,7 @@ class KernelProfiler:
         self.name, self._rows, self._events = name, defaultdict(KernelTimes), []
 
     def record(self, event, kernel, arguments, global_size):
-        """Keep a launch; arguments {name: value} as the kernel has them."""
+        """Keeps a launch; arguments {name: value} as the kernel has them."""
         buffers = {id(v): v for v in arguments.values() if hasattr(v, "size")}
         work = launch_flops(kernel, arguments, global_size), sum(b.size for b in buffers.values())
         self._events.append((event, kernel, work))
@@ -83,7 +83,7 @@ class KernelProfiler:
         return "\n".join([f"kernels on {self.name}:", *lines])
 
     def add(self, rows):
-        """Add what another process has measured, {kernel: KernelTimes}."""
+        """Adds what another process has measured, {kernel: KernelTimes}."""
         for kernel, row in rows.items():
             mine = self._rows[kernel]
             mine.n_calls += row.n_calls
@@ -92,7 +92,7 @@ class KernelProfiler:
             mine.n_bytes += row.n_bytes
 
     def clear(self):
-        """Begin anew."""
+        """Begins anew."""
         self._rows.clear()
 
     def _read(self):
@@ -166,14 +166,14 @@ def drain():
 
 
 def add(found):
-    """Add what another process has `drain` to this one's tables, one for each device's name."""
+    """Adds what another process has `drain` to this one's tables, one for each device's name."""
     for name, rows in found:
         same = [profile for profile in _PROFILES if profile.name == name]
         (same[0] if same else _begun(name)).add(rows)
 
 
 def report():
-    """Print the tables of all devices that are profiled on standard error, and start them anew."""
+    """Prints the tables of all profiled devices on standard error and clears them."""
     for profile in _PROFILES:
         table = profile.table()
         if table:

@@ -224,14 +224,14 @@ class _DeviceProcess:
         other.close()
 
     def give(self, portion, items):
-        """Send a portion, if there is one; a dead process is found when its answer is awaited."""
+        """Sends a portion, if there is one; a dead process is found when its answer is awaited."""
         self.portion, self._began = portion, time.perf_counter()
         if portion:
             with suppress(OSError):
                 self.pipe.send(items)
 
     def collect(self, table, patience_s=None):
-        """Take in what the process answers; returns a fault, or None."""
+        """Takes in what the process answers; returns a fault, or None."""
         if not self.portion:
             return None
         try:

@@ -32,7 +32,7 @@ NAMES = {
 
 @functools.cache  # once a device; a second time would find no name to set
 def set_pocl_cpu_name(device):
-    """Give PoCL the name of this processor where it has none that its compiler takes.
+    """Gives PoCL the name of this processor where it has none that its compiler takes.
 
     device: a pyopencl device, of any platform
     returns the name given, None where nothing was to be done or could be: the device's self-test

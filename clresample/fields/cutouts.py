@@ -91,7 +91,7 @@ class FieldCutouts:
         return field.mosaics
 
     def _note_changes(self, about, inputs):
-        """Note inputs that are not as large, or not as old, as when the run was made."""
+        """Notes inputs that are not as large, or not as old, as when the run was made."""
         known = (about.get("run") or {}).get("inputs") or {}
         for path in map(str, inputs.values()):
             state = os.stat(path) if os.path.exists(path) else None

@@ -93,7 +93,7 @@ def partitions(index, most=MAX_ROWS) -> list[tuple[int, int]]:
 
 
 def write_hats(folder, table, *, name="clresample", most_rows=MAX_ROWS) -> Path:
-    """Write a catalogue of a field, or of several, in the HATS layout.
+    """Writes a catalogue of a field, or of several, in the HATS layout.
 
     folder: to make; one of this name that holds HATS is replaced
     table: QTable with ra and dec [deg, ICRS]
@@ -126,7 +126,7 @@ def write_hats(folder, table, *, name="clresample", most_rows=MAX_ROWS) -> Path:
 
 
 def _write(folder, table, index, name, most_rows):
-    """Write the files into a new folder. table: pyarrow.Table; index (S,): of its rows."""
+    """Writes the files into a new folder. table: pyarrow.Table; index (S,): of its rows."""
     import pyarrow as pa
     from pyarrow import parquet
 

@@ -13,7 +13,7 @@ STRIP_PX = 512  # rows of a mosaic that are read and written at a time
 
 
 def write_mosaics(folder, job, parts, last):
-    """Write model_NAME.fits and residual_NAME.fits of every mosaic: cubes [counts] with its WCS.
+    """Writes model_NAME.fits and residual_NAME.fits of every mosaic: cubes [counts] with its WCS.
 
     A model is the sum of all sources' models in the blends' cutouts; a residual is data minus it,
     the background subtracted where it was, NaN where the data are none or cannot be read.

@@ -35,7 +35,7 @@ class ComponentModel:
 
 
 def write_models(path, job, parts, last, ids):
-    """Write the models of the sources with these ids, sorted by their blends.
+    """Writes the models of the sources with these ids, sorted by their blends.
 
     HDUs: COMPONENTS, a row for each with COMPONENT_COLUMNS, offset being its first pixel in
     MORPHOLOGIES, and the spectrum; MORPHOLOGIES, one float32 array of all pixels; OFFSETS, rows of

@@ -46,7 +46,7 @@ class FieldRun:
 def run_field(
     mosaics, folder, *, options=None, resume=False, overwrite=False, progress=None, about=None
 ) -> FieldRun:
-    """Find, fit and measure every source of a field of mosaics.
+    """Finds, fits and measures every source of a field of mosaics.
 
     mosaics: sequence of Mosaic; the model's pixels are those of the one with the smallest
     folder: for catalogue.{parquet,fits,ecsv}, fit_table.ecsv, models.fits, model and residual
@@ -126,7 +126,7 @@ def _degrees(positions, reference):
 
 
 def _check_outputs(folder, mosaics, reference, options):
-    """Raise ValueError, FileError or ImportError, now, for what cannot be written at the end."""
+    """Raises ValueError, FileError or ImportError, now, for what cannot be written at the end."""
     if options.hats:
         check_hats(reference)
     check_outputs(folder, mosaics)

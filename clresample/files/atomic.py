@@ -27,7 +27,7 @@ class FileError(ValueError):
 
 
 def check_output(path, *, overwrite=False, inputs=()):
-    """Raise FileError where a file could not be written; ask before a long computation.
+    """Raises FileError where a file could not be written; ask before a long computation.
 
     path: the file; overwrite: whether one that exists may be replaced; inputs: files that may not
     be, under whatever name
@@ -55,7 +55,7 @@ def check_output(path, *, overwrite=False, inputs=()):
 
 
 def check_folder(folder):
-    """Raise FileError where nothing can be written into a folder, or where it could not be made.
+    """Raises FileError where nothing can be written into a folder, or where it could not be made.
 
     It tries, in the folder or in the first one above that exists, and removes what it made there.
     What runs on this machine that were killed have left there is cleared away.
@@ -135,7 +135,7 @@ class _Outputs:
 
     @contextmanager
     def named(self, names):
-        """Open them, and close them after the block; messages have files by names {file: name}."""
+        """Opens them, and close them after the block; messages have files by names {file: name}."""
         try:
             self.open()
             yield
@@ -151,7 +151,7 @@ class _Outputs:
             self.close()
 
     def open(self):
-        """Make them, after what killed runs left is cleared away."""
+        """Makes them, after what killed runs left is cleared away."""
         for folder in self.folders:
             home = folder
             if not folder.is_dir():
@@ -163,7 +163,7 @@ class _Outputs:
             self.stages[folder] = _new_folder(home)
 
     def commit(self, files):
-        """Bring all files to the disk, then move them; those moved go back where one cannot be."""
+        """Brings all files to the disk, then move them; those moved go back where one cannot be."""
         for stage in self.stages.values():
             for one in (*stage.rglob("*"), stage):
                 _to_disk(one)
@@ -213,7 +213,7 @@ class _Outputs:
             (folder / name).unlink(missing_ok=True)
 
     def close(self):
-        """Remove what is left of them."""
+        """Removes what is left of them."""
         for stage in (*self.stages.values(), *self.old.values()):
             shutil.rmtree(stage, ignore_errors=True)
         for folder in self.made:
@@ -239,7 +239,7 @@ def remove_stale(folder):
 
 
 def remove_tree(folder):
-    """Remove a folder with all in it, all at once.
+    """Removes a folder with all in it, all at once.
 
     What a kill leaves of it, `remove_stale` removes.
     """
@@ -249,7 +249,7 @@ def remove_tree(folder):
 
 
 def _put(file, path):
-    """Move a file to its place, into a folder that is made where there is none."""
+    """Moves a file to its place, into a folder that is made where there is none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     os.replace(file, path)
 
@@ -273,7 +273,7 @@ def _new_folder(home):
 
 
 def _to_disk(path):
-    """Wait until a file or folder is on the disk, where the system can be asked for that."""
+    """Waits until a file or folder is on the disk, where the system can be asked for that."""
     with suppress(OSError):
         descriptor = os.open(path, os.O_RDONLY)
         try:

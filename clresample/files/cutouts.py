@@ -19,7 +19,7 @@ COLUMNS = ("source", "observation", "what", "ny", "nx")
 
 
 def write_cutouts(path, cutouts, *, overwrite=False, device=None, inputs=None):
-    """Write cutouts into one FITS file, whole or not at all.
+    """Writes cutouts into one FITS file, whole or not at all.
 
     HDUs: CUTOUTS, a table with a row for each: source, observation, what it is, ny and nx [px];
     and of cutout k, from 1 on, with EXTVER = k: DATA with WCS and unit, UNCERT (standard

@@ -107,7 +107,7 @@ def write_fits(
     shift_px=None,
     overwrite=False,
 ):
-    """Write an image or cube with its WCS, coverage and provenance, whole or not at all.
+    """Writes an image or cube with its WCS, coverage and provenance, whole or not at all.
 
     data (Ny, Nx) or (C, Ny, Nx) [flux per pixel]
     grid: Grid of the same (Ny, Nx); a flat one is put at RA = Dec = 0
@@ -146,7 +146,7 @@ def write_fits(
 
 
 def write_hdus(path, hdus):
-    """Write HDUs with their checksums, whole or not at all. Raises FileError."""
+    """Writes HDUs with their checksums, whole or not at all. Raises FileError."""
     with atomic_file(path) as part:
         fits.HDUList(hdus).writeto(part, checksum=True, overwrite=True)
 
@@ -275,7 +275,7 @@ def choose_bands(path, names, bands):
 
 
 def add_provenance(header, dtype, device, inputs, shift_px):
-    """Add cards with the software, date, arithmetic, OpenCL device, shift and input files."""
+    """Adds cards with the software, date, arithmetic, OpenCL device, shift and input files."""
     header["CREATOR"] = (f"clresample {__version__}", "software")
     header["DATE"] = (datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "written, UTC")
     header["CLDTYPE"] = (str(dtype), "arithmetic of the operator")

@@ -27,7 +27,7 @@ def text_card(text, comment):
 
 
 def check_columns(names):
-    """Raise ValueError where a catalogue's columns have names that FITS cards cannot hold."""
+    """Raises ValueError where a catalogue's columns have names that FITS cards cannot hold."""
     for name in names:
         n = len(name) + name.count("'")
         if n > COLUMN:
@@ -52,7 +52,7 @@ def check_catalogue_names(observations, *, magnitudes=False):
 
 
 def check_channels(channels):
-    """Raise ValueError where the names of all observations' channels can be no FITS columns.
+    """Raises ValueError where the names of all observations' channels can be no FITS columns.
 
     Too long, or the same once characters that FITS does not have are replaced.
     """

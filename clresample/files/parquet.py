@@ -31,7 +31,7 @@ def arrow_table(table):
 
 
 def write_parquet(path, table):
-    """Write a QTable to Parquet, units and descriptions in the metadata of its columns.
+    """Writes a QTable to Parquet, units and descriptions in the metadata of its columns.
 
     Raises ImportError, with what to install, without pyarrow.
     """

@@ -179,7 +179,7 @@ class _Tree:
         return number
 
     def join(self, a, b, height):
-        """Join two basins at the height of their saddle."""
+        """Joins two basins at the height of their saddle."""
         a, b = root(self.parent, a), root(self.parent, b)
         if a == b:
             return
@@ -202,13 +202,13 @@ class _Tree:
         self.basins[a] += self.basins[b]
 
     def end(self, threshold):
-        """Make bodies of what is wide enough at the threshold."""
+        """Makes bodies of what is wide enough at the threshold."""
         for i in range(len(self.parent)):
             if self.parent[i] == i:
                 self._widen(i, threshold)
 
     def _widen(self, one, height):
-        """Make a body of a root's basins if they are wide enough above a height."""
+        """Makes a body of a root's basins if they are wide enough above a height."""
         if self.of_root[one] >= 0:
             return
         n = sum(len(p) - np.searchsorted(p, height) for p in self.parts[one])

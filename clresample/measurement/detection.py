@@ -76,7 +76,7 @@ class Detection(ShownDetection):
 
 
 def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> Detection:
-    """Find sources in all observations together, in each alone, and beside brighter ones.
+    """Finds sources in all observations together, in each alone, and beside brighter ones.
 
     The sharpest image separates neighbours best, the combined one reaches the faintest sources. So
     the images are searched one after the other, the sharpest first and then all together under
@@ -115,7 +115,7 @@ def noise_scatter(observation, frame) -> np.ndarray:
 
 
 def detect_more(result, *, threshold=THRESHOLD) -> Detection:
-    """Find sources in a fit's residuals: those too faint beside others to be found before it.
+    """Finds sources in a fit's residuals: those too faint beside others to be found before it.
 
     The residuals are searched as `detect` does, but for neighbours on flanks. Where the model is
     bright its own errors are larger than the noise: there the variance is 1 / w + (0.15 model)^2.

@@ -41,7 +41,7 @@ class _LRUStore:
         return len(self._entries)
 
     def clear(self):
-        """Drop all."""
+        """Drops all."""
         self._entries.clear()
         self._held.clear()
 
@@ -131,7 +131,7 @@ class OperatorCache:
         return len(self._operators)
 
     def clear(self):
-        """Forget all plans and operators; those in use elsewhere live on."""
+        """Forgets all plans and operators; those in use elsewhere live on."""
         with self._lock:
             self._plans.clear()
             self._operators.clear()

@@ -65,7 +65,7 @@ class LinOp:
     __call__ = __matmul__ = forward
 
     def forward_into(self, x, out):
-        """Queue out = A x without any check: for loops that call it with the same arrays.
+        """Queues out = A x without any check: for loops that call it with the same arrays.
 
         x (B,) + shape_in, out (B,) + shape_out: C-contiguous arrays of `dtype` on `device`
         """
@@ -73,7 +73,7 @@ class LinOp:
             self._forward(x, out)
 
     def adjoint_into(self, y, out):
-        """Queue out = A^T y without any check; y (B,) + shape_out, out (B,) + shape_in."""
+        """Queues out = A^T y without any check; y (B,) + shape_out, out (B,) + shape_in."""
         with self._lock:
             self._adjoint(y, out)
 

@@ -237,7 +237,7 @@ def observation_index(observations, key) -> int:
 
 
 def check_observations(observations):
-    """Raise ValueError unless these observations can be fitted together.
+    """Raises ValueError unless these observations can be fitted together.
 
     There is at least one, channel names are unique over all of them, zero points are given by all
     of them or by none, and their grids are all flat or all placed by a WCS.

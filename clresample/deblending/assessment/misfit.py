@@ -98,7 +98,7 @@ class Misfit:
 
 
 def misfit_of(result) -> Misfit:
-    """Compare a fitted blend with its data."""
+    """Compares a fitted blend with its data."""
     n_sources, worst, rest = len(result.sources), [], []
     for i in range(len(result.observations)):
         left = remainder(result, i)

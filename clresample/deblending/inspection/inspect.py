@@ -39,7 +39,7 @@ class InputWarning(UserWarning):
 
 
 def warn_of_many(problems):
-    """Warn once of the problems of blends, a list of messages of each."""
+    """Warns once of the problems of blends, a list of messages of each."""
     n = len(problems)
     warnings.warn(
         f"{n} blend{'s have' if n > 1 else ' has'} problems with observations or sources, such as: "

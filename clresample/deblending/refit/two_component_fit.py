@@ -92,7 +92,7 @@ def _second_fits(fits, settings, device, dtype, progress):
 
 
 def _go_on(fits, settings, device, dtype, progress):
-    """Run fits that were STOPPED_FOR_REFIT to their end, from where they are.
+    """Runs fits that were STOPPED_FOR_REFIT to their end, from where they are.
 
     Nobody asks them again.
     """

@@ -80,7 +80,7 @@ class AMSGrad:
         self._sky = _sky_step(b, gradient, prior) if b.scenes[0].fit_sky else None
 
     def step(self):
-        """Queue one step along the gradients that were queued before."""
+        """Queues one step along the gradients that were queued before."""
         b = self.buffers
         self.n_steps += 1
         t1, t2 = (1 / (1 - beta**self.n_steps) for beta in (BETA1, BETA2))
@@ -132,7 +132,7 @@ class _LatentStep:
         self._form.bind(scratch=blurred, profile=b.profile, amplitude=b.amplitude, morph=b.morph)
 
     def step(self, t1, t2):
-        """Queue a step; t1, t2 = 1 / (1 - B^t) of both moments."""
+        """Queues a step; t1, t2 = 1 / (1 - B^t) of both moments."""
         self._blur_gradient(self._size)
         self._step(self._size, t1=t1, t2=t2)
         self._blur_latent(self._size)
@@ -162,11 +162,11 @@ class _MorphologyStep:
         )
 
     def step(self, t1, t2):
-        """Queue a step; t1, t2 = 1 / (1 - B^t) of both moments."""
+        """Queues a step; t1, t2 = 1 / (1 - B^t) of both moments."""
         self._step(self._size, t1=t1, t2=t2)
 
     def after_constraints(self):
-        """Queue the spectra's part of a normalisation."""
+        """Queues the spectra's part of a normalisation."""
         self._rescale(self._spectra_size)
 
 

@@ -72,7 +72,7 @@ class Prox:
         return f"{type(self).__name__}({values})"
 
     def prox(self, morphs, boxes, *, step=1.0, active=None, factor=None):
-        """Overwrite morphs by the operator's answer; see the module's text.
+        """Overwrites morphs by the operator's answer; see the module's text.
 
         ValueError: morphs or factor have another shape or type than the boxes ask for
         """

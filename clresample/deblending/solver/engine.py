@@ -81,11 +81,11 @@ class Engine:
         return self.device.get(self.losses)[:n_steps].astype(np.float64)
 
     def gradient(self, i_loss=0):
-        """Queue model, residual, gradients, and the losses into losses[i_loss]."""
+        """Queues model, residual, gradients, and the losses into losses[i_loss]."""
         self._gradient(self.losses, i_loss)
 
     def step(self):
-        """Queue one step of the update along the gradients."""
+        """Queues one step of the update along the gradients."""
         self.update.step()
 
     def final_losses(self):
@@ -103,5 +103,5 @@ class Engine:
         return self.buffers.states(iterated, self.update.memories(), self.n_steps)
 
     def update_shifts(self):
-        """Take over the shifts that the scenes' operators have by now."""
+        """Takes over the shifts that the scenes' operators have by now."""
         self._gradient.update_shifts()

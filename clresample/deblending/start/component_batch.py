@@ -157,7 +157,7 @@ class ComponentBatch:
         return images
 
     def _draw_galaxies(self, at, device, dtype, tuning, images):
-        """Queue the kernel that draws the slots `at`."""
+        """Queues the kernel that draws the slots `at`."""
         table = np.column_stack([self.size, self.n_images, self.begin])[at].astype(np.int32)
         theta, moment = _stacked(self.components, self.thetas, at)
         place = np.array([c.position for c in self.components])[at] - self.origin[at]

@@ -92,7 +92,7 @@ class _ImageProfile(ComponentProfile):
 
 
 def render_models(models: list[MorphologyModel], *, fit_sky=False) -> list[RenderedModel]:
-    """Render the morphologies of all models, and solve for their spectra, side by side.
+    """Renders the morphologies of all models, and solves for their spectra, side by side.
 
     models: of equal numbers of observations, these of equal shapes, as of one batch
     fit_sky: also solve for a level per channel

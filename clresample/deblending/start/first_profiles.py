@@ -68,7 +68,7 @@ def profile_grid(looking, thetas, error) -> dict:
 
 
 def first_profiles(fit, error):
-    """Set the parameters of large galaxies of a ProfileFit, which are at their means.
+    """Sets the parameters of large galaxies of a ProfileFit, which are at their means.
 
     error: part of the light that adds to the noise
     """

@@ -58,7 +58,7 @@ class LinearisedScenes:
         self._kept: dict = {}
 
     def render(self, scenes, thetas, brightness, *, slopes, whiten=True):
-        """Draw and render the components of some scenes (k,).
+        """Draws and renders the components of some scenes (k,).
 
         thetas (N): arrays; brightness (N,): see `profile_thresholds`; whiten: else `whiten` is to
             follow
@@ -79,7 +79,7 @@ class LinearisedScenes:
             self.whiten()
 
     def whiten(self):
-        """Bring what is seen to units of the noise."""
+        """Brings what is seen to units of the noise."""
         for sight in self.sights:
             sight.whiten()
 
@@ -93,7 +93,7 @@ class LinearisedScenes:
         return self._row[scenes]
 
     def compute_residuals(self, error) -> np.ndarray:
-        """Compare the present solution with the data.
+        """Compares the present solution with the data.
 
         chi2 (k,) of the scenes looked at, with what is expected of the sky.
         """

@@ -105,7 +105,7 @@ class PopulationPrior:
         return np.square((theta[scenes] - self.mean[scenes]) / self.scatter[scenes])
 
     def update(self, scenes, theta, normal):
-        """Learn from the galaxies of some scenes what is expected in them.
+        """Learns from the galaxies of some scenes what is expected in them.
 
         theta (B, n, p); normal (B, n p, n p): of their equations, what was expected among them
         """

@@ -55,7 +55,7 @@ class ProfileFit:
         return [t[:n] for t, n in zip(theta[self.at], self.counts, strict=True)]
 
     def begin(self):
-        """Solve at the mean, and fit the profiles of larger galaxies, one after another."""
+        """Solves at the mean, and fits the profiles of larger galaxies, one after another."""
         looking, scenes = self.looking, np.arange(len(self.theta))
         self._look(scenes, self.theta, slopes=False)
         looking.solve(MODEL_ERROR)
@@ -68,7 +68,7 @@ class ProfileFit:
         self._step(np.flatnonzero(some), np.ones(self.source.shape, bool), N_STEPS, learn=True)
 
     def fit_part(self, thetas, free, scenes):
-        """Fit profiles of some components without the others; their parameters, as `thetas`.
+        """Fits profiles of some components without the others; their parameters, as `thetas`.
 
         thetas: {component: parameters (n,)}; free: set of those that move; scenes (k,): that are
             fitted, others stay as they are
@@ -89,7 +89,7 @@ class ProfileFit:
         return thetas | dict(zip(here, fit.thetas(), strict=True))
 
     def _take(self, scenes):
-        """Solve some scenes at their present parameters, and note all that a step needs."""
+        """Solves some scenes at their present parameters, and notes all that a step needs."""
         if len(scenes):
             self._measure_brightness(self.theta)
             self._look(scenes, self.theta, slopes=True)
@@ -154,14 +154,14 @@ class ProfileFit:
         return self.looking.compute_residuals(MODEL_ERROR) + self.population.penalty(scenes, theta)
 
     def _learn(self, scenes):
-        """Learn what to expect of some scenes from the present parameters."""
+        """Learns what to expect of some scenes from the present parameters."""
         before = self.population.penalty(scenes, self.theta)
         self.population.update(scenes, self.theta, self.normal)
         self._doubt(scenes)
         self.chi2[scenes] += self.population.penalty(scenes, self.theta) - before
 
     def _doubt(self, scenes):
-        """Note how far the shapes of some scenes, of those last solved, are to be doubted."""
+        """Notes how far the shapes of some scenes, of those last solved, are to be doubted."""
         looking = self.looking
         rows = looking.rows_of(scenes)
         normal, spectra = looking.normal[rows][..., :-1, :-1], looking.solution()[rows][..., :-1]
@@ -170,7 +170,7 @@ class ProfileFit:
         )
 
     def _take_equations(self, scenes):
-        """Note the normal equations of some scenes, what is expected among them."""
+        """Notes the normal equations of some scenes, what is expected among them."""
         normal, right = normal_equations(self.looking)
         weight = self.population.precision(scenes, self.theta).reshape(right.shape)
         away = self.population.mean[scenes] - self.theta[scenes]
@@ -178,7 +178,7 @@ class ProfileFit:
         self.right[scenes] = right + weight * away.reshape(right.shape)
 
     def _measure_brightness(self, theta):
-        """Note the components' peaks over the noise of a model pixel, where they are best seen."""
+        """Notes the components' peaks over the noise of a model pixel, where they are best seen."""
         looking = self.looking
         best = (looking.spectra / self.noise[looking.scene]).max(axis=1)
         self.brightness = best * peaks_of(looking.components, self.thetas(theta))

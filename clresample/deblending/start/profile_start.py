@@ -101,7 +101,7 @@ class StartingPoint:
 
 
 def fit_start_profiles(patches: list[StartInput], *, fit_sky=False) -> list[StartingPoint]:
-    """Fit profiles and free stars of all patches side by side; see the module's text.
+    """Fits profiles and free stars of all patches side by side; see the module's text.
 
     patches: of equal numbers of observations, these of equal shapes
     fit_sky: also a level per channel

@@ -63,7 +63,7 @@ class RenderPlanner:
         self._renderers: dict[object, _WindowRenderer | BoxRenderer] = {}
 
     def runs(self, slots):
-        """Yield the RenderRuns of slots."""
+        """Yields the RenderRuns of slots."""
         # on distorted pixels each place has its own plan
         whole = (slots.size == self.views[0].op.shape_in[1:]).all(axis=1) & self._exact
         alone = self._distorted[slots.scene] & ~whole

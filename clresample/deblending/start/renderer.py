@@ -54,7 +54,7 @@ class BoxRenderer:
         return self.executor.n_bands * int(np.prod(self.size))
 
     def __call__(self, images, i_image, seen, i_seen, n, which, moves, shares=None):
-        """Queue the images of slots that follow each other, n of each.
+        """Queues the images of slots that follow each other, n of each.
 
         images, i_image: device array and the element of it where they begin; seen, i_seen: likewise
             where they go; which (slots,): index of each one's plan; moves (slots, 2) [model px]: by
@@ -78,7 +78,7 @@ class BoxRenderer:
             e.frequencies_to_pixels(ImageBatch(seen.base_data, to, w_y * w_x, w_x), m * e.n_bands)
 
     def _reserve(self, n_images):
-        """Make room for so many images at a time."""
+        """Makes room for so many images at a time."""
         if n_images <= self._capacity:
             return
         # twice as many at a time, as slots of this size come and go; no more than one launch takes

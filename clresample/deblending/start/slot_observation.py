@@ -53,7 +53,7 @@ class SlotObservation:
         return self.device.put(np.array([smoothed_light(v) for v in self.views]), self.dtype)
 
     def _launch(self, name, size, *, local_size=None, **arguments):
-        """Queue a kernel of start.cl; K of them: images of a slot that are summed."""
+        """Queues a kernel of start.cl; K of them: images of a slot that are summed."""
         n_images = arguments.pop("K", 1)
         sums = {"WG": self.tuning.sum_group, "K": n_images} if local_size else {}
         launch = self.device.launcher(
@@ -67,7 +67,7 @@ class SlotObservation:
         launch(size, n_bands=self.n_bands, my=self.my, mx=self.mx, **arguments)
 
     def render(self, slots: ComponentBatch, images):
-        """Render the slots' images, and keep what is seen of them."""
+        """Renders the slots' images, and keeps what is seen of them."""
         low, size = np.zeros((2, len(slots), 2), int)
         self.lit, runs = np.zeros((len(slots), 4), int), []
         for run in self.aim.runs(slots):
@@ -87,7 +87,7 @@ class SlotObservation:
             run.renderer(images, at[0], self.seen, at[1], n, run.plan_index, run.offsets_px, shares)
 
     def whiten(self):
-        """Bring what is seen to units of the noise."""
+        """Brings what is seen to units of the noise."""
         tallest, widest = self.place[:, 3:5].max(axis=0).tolist()
         self._launch(
             "whiten",

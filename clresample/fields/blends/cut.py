@@ -75,7 +75,7 @@ def fit_bytes(n_sources, n_pixels, n_channels) -> float:
 
 
 def cut_blend(light, inside, positions, limits, margin, groups=None):
-    """Cut a blend into pieces within the limits: territories (Ny, Nx) and a piece (S,) per source.
+    """Cuts a blend into pieces within the limits: territories (Ny, Nx) and a piece (S,) per source.
 
     Each source gets the pixels from which the light rises to it (watershed); sources are then put
     together in the order of the light at the saddle between them, brightest first, as long as the

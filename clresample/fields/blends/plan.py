@@ -231,7 +231,7 @@ def _by_label(labels, at):
 
 
 def _number(labels, pending):
-    """Write the numbers of patches, from 1, into labels (Ny, Nx); pending: (Box, mask, number)."""
+    """Writes the numbers of patches, from 1, into labels (Ny, Nx); pending: (Box, mask, number)."""
     labels[:] = 0
     for inner, inside, i in pending:
         labels[inner.slices][inside] = i + 1

@@ -43,7 +43,7 @@ class TileDetections:
 
 
 def search_tile(mosaics, reference, tile, *, threshold, scatters=None) -> TileDetections:
-    """Search one tile in all mosaics together.
+    """Searches one tile in all mosaics together.
 
     mosaics: of the field; reference: Grid of the model's pixels; tile: Tile
     threshold [sigma]: least signal to noise of a peak

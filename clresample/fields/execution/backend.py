@@ -32,7 +32,7 @@ class TaskKind:
         return value
 
     def keep(self, context, task, content):
-        """Write a task's file, whole or not at all. Raises FileError."""
+        """Writes a task's file, whole or not at all. Raises FileError."""
         with atomic_file(self.path(context, task)) as part:
             part.write_bytes(content)
 
@@ -60,11 +60,11 @@ class LocalWorkers:
         return [(device, n) for device in self.devices]
 
     def begin(self, work):
-        """Begin the processes now, and have them load what the work needs."""
+        """Begins the processes now, and have them load what the work needs."""
         self.pool.begin(work)
 
     def run(self, work, context, tasks, again=None, stage=""):
-        """Yield the Outcome of every task, as `WorkerPool.run` does."""
+        """Yields the Outcome of every task, as `WorkerPool.run` does."""
         contexts = [replace(context, device=device) for device in self.devices]
         for outcome in self.pool.run(work, contexts, tasks, again):
             if outcome.reason is None:
@@ -72,7 +72,7 @@ class LocalWorkers:
             yield outcome
 
     def close(self):
-        """End the processes."""
+        """Ends the processes."""
         self.pool.close()
 
 

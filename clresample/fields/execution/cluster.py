@@ -64,7 +64,7 @@ class DaskCluster:
         progress.dashboard(self.client.dashboard_link)
 
     def _check(self):
-        """Refuse a cluster without workers, or whose workers cannot run our functions."""
+        """Refuses a cluster without workers, or whose workers cannot run our functions."""
         try:
             self.client.wait_for_workers(1, timeout=CONNECT_S)
         except TimeoutError as error:
@@ -86,14 +86,14 @@ class DaskCluster:
         return [(device, 1) for device in self.seats.devices or (None,)]
 
     def close(self):
-        """Leave the cluster as it is."""
+        """Leaves the cluster as it is."""
         self.client.close()
 
     def begin(self, work):
         """The workers run already."""
 
     def run(self, work, context, tasks, again=None, stage=""):
-        """Yield the Outcome of every task, as `WorkerPool.run` does.
+        """Yields the Outcome of every task, as `WorkerPool.run` does.
 
         Raises DeviceError when every worker's device fails, FileError when the scheduler is gone or
         no worker has come for long.
@@ -130,7 +130,7 @@ class _Run:
         self.ended: queue.Queue = queue.Queue()
 
     def outcomes(self):
-        """Yield the Outcomes of tasks, those that failed too, until none is left."""
+        """Yields the Outcomes of tasks, those that failed too, until none is left."""
         looked = 0.0
         while self.waiting or self.seats.busy:
             if time.monotonic() - looked > POLL_S:
@@ -143,7 +143,7 @@ class _Run:
                 yield outcome
 
     def _give(self, seat):
-        """Give a worker the next task; an Outcome where what it needs cannot be read."""
+        """Gives a worker the next task; an Outcome where what it needs cannot be read."""
         seat.task, seat.start_s = self.waiting.popleft(), time.monotonic()
         try:
             given = self.work.gather(self.context, seat.task)

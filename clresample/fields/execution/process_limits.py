@@ -42,7 +42,7 @@ def limit_memory(bound):
 
 
 def trim_memory():
-    """Give what this process no longer needs back to the system, where the C library can (glibc).
+    """Gives what this process no longer needs back to the system, where the C library can (glibc).
 
     Operators refer to themselves, so that only the collector frees them: Python calls it for many
     objects, not for large ones, and a giant's pieces left 0.1 to 0.3 GB of them a group, 2 GB in

@@ -38,7 +38,7 @@ FIT = TaskKind(gather_inputs, fit_group, part_path)
 
 
 def fit_all_groups(job, engine, progress):
-    """Fit all groups that are not yet, round by round.
+    """Fits all groups that are not yet, round by round.
 
     A cut blend's pieces are fitted again as long as a neighbour of theirs moves, and where their
     residuals held more sources.
@@ -109,7 +109,7 @@ class _PieceHistory:
         self.job, self.names, self.found, self.new = job, {}, {}, set()
 
     def add(self, names):
-        """Add a round: {name: patches} of its parts."""
+        """Adds a round: {name: patches} of its parts."""
         self.new = set()
         for name in sorted(names):
             (table,) = _file(self.job, name).read("FOUND")
@@ -201,7 +201,7 @@ def _columns(rows, kind, job):
 
 
 def _fit_round(job, tasks, engine, progress):
-    """Fit the groups of one round; {name: patches} of their parts."""
+    """Fits the groups of one round; {name: patches} of their parts."""
     names, todo = {}, []
     there = _parts_of(job.folder)
     for task in tasks:
@@ -252,6 +252,6 @@ def _parts_of(folder):
 
 
 def _check_space(folder, reason):
-    """Raise FileError where a group failed because the disk is full: going on would lose all."""
+    """Raises FileError where a group failed because the disk is full: going on would lose all."""
     if "cannot be written" in reason or "No space left" in reason:
         raise FileError(f"{folder}: {reason}; what is finished stays: --resume goes on")

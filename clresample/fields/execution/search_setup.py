@@ -42,7 +42,7 @@ class _Field:
 
 
 def prepare_search(mosaics, reference, work, engine):
-    """Take the first look at a field, unless it was taken. Raises ImportError without sep."""
+    """Takes the first look at a field, unless it was taken. Raises ImportError without sep."""
     if (work / FILE).exists():
         return
     tried: list = []

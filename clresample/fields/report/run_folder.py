@@ -62,7 +62,7 @@ class RunFolder:
 
 
 def read_run(folder) -> RunFolder:
-    """Read a run's folder. Raises FileError where it holds none, or a catalogue that is damaged."""
+    """Reads a run's folder. Raises FileError without a run, or if its catalogue is damaged."""
     folder = Path(folder)
     if not folder.is_dir():
         raise FileError(f"{folder}: no such folder")

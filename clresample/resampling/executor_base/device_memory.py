@@ -34,11 +34,11 @@ class DeviceMemory:
         raise NotImplementedError
 
     def bind(self):
-        """Bind the products to the scratch that is there, those of the way forward at least."""
+        """Binds the products to the scratch that is there, those of the way forward at least."""
         raise NotImplementedError
 
     def bind_adjoint(self):
-        """Bind those of the adjoint, which many callers never ask for."""
+        """Binds those of the adjoint, which many callers never ask for."""
 
     def ensure_adjoint(self):
         """See that the products of the adjoint are bound."""
@@ -66,7 +66,7 @@ class DeviceMemory:
         return other
 
     def reserve(self, n_images):
-        """Make room for the intermediates of `n_images` images at a time."""
+        """Makes room for the intermediates of `n_images` images at a time."""
         if self.n_reserved != n_images:
             # until all is bound: an interruption leaves nothing half done
             self.n_reserved, self._bound_back = 0, False

@@ -56,7 +56,7 @@ def as_real_array(name, values, unit=None) -> np.ndarray:
 
 
 def check_real(name, array):
-    """Raise ValueError, calling it `name`, unless a NumPy array holds real numbers."""
+    """Raises ValueError, calling it `name`, unless a NumPy array holds real numbers."""
     if array.dtype.kind in REAL:
         return
     if array.dtype.kind == "O":

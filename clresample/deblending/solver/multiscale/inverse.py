@@ -93,7 +93,7 @@ class BlockPreconditioner:
         return more or np.abs(np.log(strengths / before[0])).max() > CHANGE
 
     def _made(self, strengths, spectrum):
-        """Yield the blocks at these strengths and spectrum."""
+        """Yields the blocks at these strengths and spectrum."""
         data = np.square(strengths) * self._evidence.curvature(spectrum)
         heard = [
             np.argwhere(part * light > MIN_DATA_TO_PRIOR) for part, light in zip(data, self._light)

@@ -100,14 +100,14 @@ class LbfgsSteps:
         return np.add.reduceat(values, self._first_chunks, axis=0)
 
     def advance(self, a, c, scale, length):
-        """Queue the next trials: a, c (B, slots), scale, length (B,)."""
+        """Queues the next trials: a, c (B, slots), scale, length (B,)."""
         b = self._buffers
         table = np.concatenate([a, c, scale[:, None], length[:, None]], axis=1)
         b.device.upload(np.ascontiguousarray(table, b.dtype), self._coefficients)
         self._advance(self._size)
 
     def reweigh(self, light, weights, blocks):
-        """Queue h and g_new of other strengths, and take their blocks.
+        """Queues h and g_new of other strengths, and takes their blocks.
 
         light, weights, blocks: see Strengths. Pairs of what went before stay: they say what the
         data think of the curvature, and without them fits take a tenth more rounds.
@@ -118,7 +118,7 @@ class LbfgsSteps:
             self.take_blocks(blocks)
 
     def take_blocks(self, blocks):
-        """Take the Blocks of all sources (S)."""
+        """Takes the Blocks of all sources (S)."""
         b = self._buffers
         start, scene = self._latents.start, b.host_boxes.scene
         self._levels = []

@@ -125,13 +125,13 @@ class StructureOperator:
         self._energy_size = group, self.n_scales, b.n_free
 
     def form(self, vector):
-        """Queue the morphologies of a vector (latents.size or more,) of coefficients."""
+        """Queues the morphologies of a vector (latents.size or more,) of coefficients."""
         if self.buffers.n_free:
             self._spread(self._rows_size, z=vector)
             self._form(self._sources_size)
 
     def gradient(self, vector, precision, gradient):
-        """Queue dL/dz + precision z into a vector, from d_morph, which is overwritten.
+        """Queues dL/dz + precision z into a vector, from d_morph, which is overwritten.
 
         vector: the coefficients that the morphologies were formed of; precision (S, J)
         """
@@ -140,7 +140,7 @@ class StructureOperator:
             self._condense(self._coarse_size, z=vector, precision=precision, gradient=gradient)
 
     def energy(self, vector):
-        """Queue sum z_sj^2 of a vector into `energies`."""
+        """Queues sum z_sj^2 of a vector into `energies`."""
         if self.buffers.n_free:
             self._energy(self._energy_size, z=vector)
 

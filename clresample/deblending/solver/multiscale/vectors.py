@@ -128,7 +128,7 @@ class SolverVectors:
         upload(h, self.h)
 
     def copy_from(self, other, keep):
-        """Take the values of scenes `keep` (n,) of other Vectors, which are all that are here."""
+        """Takes the values of scenes `keep` (n,) of other Vectors, which are all that are here."""
         shift = (other.parts()[keep] - self.parts())[:, :, 0]
         scene, first = self.chunks[:, 0], self.chunks[:, 1]
         kind = np.digitize(first, [self.latents.size, self.latents.size + self.n_spectra])
@@ -142,10 +142,10 @@ class SolverVectors:
             move(size, values_from=getattr(other, name), values=getattr(self, name))
 
     def unpack_spectra(self, vector):
-        """Queue spectra and sky levels of a vector into the batch's buffers."""
+        """Queues spectra and sky levels of a vector into the batch's buffers."""
         self._take(self._numbers_size, x=vector)
 
     def pack_gradients(self, pull, rows):
-        """Queue the gradients of spectra and sky into g_new; pull (B, n), rows (C + 1,)."""
+        """Queues the gradients of spectra and sky into g_new; pull (B, n), rows (C + 1,)."""
         n_rows = pull.shape[1]
         self._give(self._numbers_size, pull=pull, n_rows=n_rows, row0=rows)

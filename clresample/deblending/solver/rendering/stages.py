@@ -45,24 +45,24 @@ class FrameRendering:
         )
 
     def transform(self, morph):
-        """Take these morphologies (boxes.size,) for all that is queued next."""
+        """Takes these morphologies (boxes.size,) for all that is queued next."""
         self._morph = morph
 
     def render(self, spectra, image):
-        """Queue the image (B, Co, My, Mx) of the morphologies with spectra (S, C)."""
+        """Queues the image (B, Co, My, Mx) of the morphologies with spectra (S, C)."""
         self._composition.compose(self._morph, spectra, self._model)
         self._op.queue_plain("forward", self._model, image)
 
     def back_project(self, image):
-        """Queue the way back of an image (B, Co, My, Mx), whose gradients are asked for next."""
+        """Queues the way back of an image (B, Co, My, Mx), whose gradients are asked for next."""
         self._op.queue_plain("adjoint", image, self._model)
 
     def gather_spectra(self, d_spectra):
-        """Queue dA of this observation's channels into d_spectra (S, C)."""
+        """Queues dA of this observation's channels into d_spectra (S, C)."""
         self._composition.gather_spectra(self._model, self._morph, d_spectra)
 
     def gather_morph(self, spectra, d_morph, active, *, add=False):
-        """Queue dS of the sources `active` (n,): written into d_morph, or added to it."""
+        """Queues dS of the sources `active` (n,): written into d_morph, or added to it."""
         self._composition.gather_boxed(self._model, spectra, d_morph, active, add=add)
 
     def update_shifts(self):
