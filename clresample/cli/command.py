@@ -87,7 +87,7 @@ def _run(argv):
 
 
 def _show_in_one_line(arguments):
-    """Lets a DeviceWarning appear as a note, without the line of source that warnings come with."""
+    """Shows a DeviceWarning as a note, without the source line that warnings print."""
     shown = warnings.showwarning
 
     def show(message, category, *rest, **more):

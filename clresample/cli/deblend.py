@@ -214,7 +214,7 @@ def _deblend(arguments, what, observations, sources, settings, given):
 
 
 def _import_drawing():
-    """Imports what draws the figure, 0.2 s of Python, while a fit waits for the device."""
+    """Imports the modules of the figure (0.2 s) while a fit waits for the device."""
     with suppress(ImportError):  # raised again, and reported, when the figure is drawn
         from matplotlib.backends import backend_agg  # noqa: F401
 
@@ -240,7 +240,7 @@ def _write(arguments, result, inputs, device, paths):
 
 
 def _report(arguments, result, found, device, took):
-    """Prints how the fit ended and each channel's chi2; what the user should know, as notes."""
+    """Prints how the fit ended and each channel's chi2; prints messages as notes."""
     lost = found["n_sources"] - found["n_fitted"]
     print(
         f"{found['n_fitted']} sources in {len(result.channels)} channels"

@@ -24,7 +24,7 @@ def add_devices(commands):
 
 
 def run(arguments):
-    """Prints the table. Raises DeviceError, after the table, for a choice that fits no device."""
+    """Prints the table. Raises DeviceError, after the table, if the choice matches no device."""
     from ..device.device import get_device
 
     print(format_table(list_devices(arguments.device)))

@@ -170,7 +170,7 @@ def run(arguments):
 
 
 def _report(arguments, done, took):
-    """Prints what was done and the files; the exit status."""
+    """Prints a summary and the files written; returns the exit status."""
     out = done.outputs
     ended = ", ".join(f"{n} {how}" for how, n in sorted(out.status.items()))
     stages = ", ".join(f"{name} {s:.1f} s" for name, s in done.seconds.items())

@@ -10,7 +10,7 @@ SIZES = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30}  # [bytes] powers of 1
 
 
 def add_device_option(parser, several=False):
-    """Adds `--device`, whose value `get_device` takes as it is; several: or a list, by commas."""
+    """Adds `--device`, a choice for `get_device`; several: also a list, separated by commas."""
     parser.add_argument(
         "--device",
         metavar="CHOICE",
@@ -41,7 +41,7 @@ def add_dtype_option(parser, what):
 
 
 def print_note(arguments, message):
-    """Prints what the user should know on standard error."""
+    """Prints a note for the user on standard error."""
     print_progress(arguments, f"note: {message}")
 
 
@@ -62,7 +62,7 @@ def printable(text, most=None):
 
 
 def check_matplotlib(option, way_out=""):
-    """Raises ValueError where `option` needs matplotlib and it is not there; it is not imported."""
+    """Raises ValueError if `option` needs matplotlib, which is not installed; imports nothing."""
     if find_spec("matplotlib") is None:
         from ..drawing.figure import NO_MATPLOTLIB
 

@@ -81,7 +81,7 @@ def write_field(folder, field, *, overwrite=True) -> list[Path]:
 
 
 def write_surveys(folder, field, *, overwrite=True) -> list[Path]:
-    """Writes a SimulatedField as its surveys hand out their data, field.toml, truth.ecsv.
+    """Writes a SimulatedField in its surveys' formats, field.toml and truth.ecsv.
 
     As `write_field`. euclid/ holds a tile of MER, rubin/ a cell coadd for each band. Dead columns
     have the flag 1 there and NO_DATA here. Raises ValueError for PSFs sampled more finely than the

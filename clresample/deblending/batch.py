@@ -68,10 +68,10 @@ def deblend(
         CCDData that have a PSF
     settings: see Settings; device: see get_device; dtype: float32 or float64, of the fit
     progress: called every few iterations with their number so far and the loss (1,)
-    Raises ValueError for arguments that `check_observations`, `model_frame` and `Source` reject, and
-    when no source lies inside the frame. Warns (SourceWarning) of sources far from any light. Ctrl-C
-    ends the fit with the best state so far. Warns (InputWarning) of problems of the observations and
-    of the list of sources, as far as their light shows (inspection/): messages of the result.
+    Raises ValueError for arguments that `check_observations`, `model_frame` and `Source` reject,
+    and when no source lies inside the frame. Warns (SourceWarning) of sources far from any light.
+    Ctrl-C ends the fit with the best state so far. Warns (InputWarning) of problems of the
+    observations and of the list of sources (inspection/); the result has them in its messages.
     """
     blend = Blend(as_observations(observations), _listed("sources", sources), frame, shifts)
     settings, dtype = _checked(settings, dtype)
@@ -94,7 +94,7 @@ def deblend(
 def deblend_many(
     blends, *, settings=None, device=None, dtype=np.float32, memory=MEMORY, progress=None
 ) -> list[Result | Failure]:
-    """Fits many blends side by side; each comes out as if it were fitted alone, to float accuracy.
+    """Fits many blends side by side, each with the result of a fit alone to float accuracy.
 
     device: see get_device; or a list of such choices: the blends are dealt to all of them by their
         speed, each with a process of its own, so that a script that calls this must do so under
@@ -166,7 +166,7 @@ class _BatchRunner:
         self.warned = {}
 
     def run(self, progress):
-        """Fits them all; raises KeyboardInterrupt when the group that runs was interrupted."""
+        """Fits all blends. Raises KeyboardInterrupt if the running group was interrupted."""
         n_done, groups = 0, self._groups()
         with contextlib.closing(
             prefetch(groups) if self.tuning.prefetch_groups else groups
@@ -208,7 +208,7 @@ class _BatchRunner:
         return len(group), self._begin(group)
 
     def _begin(self, group):
-        """Starts a group of (index, Fit); those that could, one by one where all at once fails."""
+        """Starts a group of (index, Fit), one by one if the group fails; returns those started."""
         try:
             start_fits([fit for _, fit in group])
         except Exception as error:
@@ -221,7 +221,7 @@ class _BatchRunner:
         return group
 
     def _fit(self, group):
-        """Fits a group of (index, Fit) that has begun; True where Ctrl-C has ended that."""
+        """Fits a started group of (index, Fit). Returns True if Ctrl-C ended it."""
         for part in self._parts(group):
             for i, done in self._try(part):
                 self.done[i] = done
@@ -242,7 +242,7 @@ class _BatchRunner:
             yield part
 
     def _try(self, group):
-        """Yields (index, Result or Failure) of a group; one by one where all at once fails."""
+        """Yields (index, Result or Failure) of a group, fitted one by one if the group fails."""
         fits = [fit for _, fit in group]
         run = fits[0].settings, self.device, self.dtype
         try:

@@ -43,7 +43,7 @@ class Blend:
     shifts: np.ndarray | None = None
 
     def check(self):
-        """Raises ValueError where an observation, a source or the frame is something else."""
+        """Raises ValueError if an observation, a source or the frame has another type."""
         for i, observation in enumerate(self.observations):
             check_instance(f"observations[{i}]", observation, Observation)
         for i, source in enumerate(self.sources):
@@ -52,7 +52,7 @@ class Blend:
             check_instance("frame", self.frame, Frame)
 
     def _check_work(self, frame):
-        """Raises ValueError where a fit would take more than could be meant, before it begins."""
+        """Raises ValueError, before a fit starts, if it would exceed the limits on work."""
         n_pixels = int(np.prod(frame.shape, dtype=float))
         if n_pixels > MAX_PIXELS:
             raise ValueError(

@@ -117,7 +117,7 @@ class Fit:
         return known, self.settings.fit_shifts
 
     def begin(self, point: StartingPoint, seconds):
-        """Makes the scene and its state from where it starts; seconds: that this took."""
+        """Makes the scene and its state from the starting point; seconds: the time of the start."""
         began = time.perf_counter()
         self.views, self.start = with_psf_error_weights(self.patch, point, self.settings)
         self.undetected = self.fitted[point.undetected]
@@ -146,14 +146,14 @@ class Fit:
             view.op.shift = shift
 
     def stopped(self, losses) -> bool:
-        """Takes the losses (n,) of the last iterations; whether the fit ends here, and why."""
+        """Records the losses (n,) of the last iterations; returns True if the fit stops."""
         self.losses.extend(losses.tolist())
         reason = stop_reason(self.losses, len(losses), self.settings.rel_tol)
         self.status = reason or self.status
         return reason is not None
 
     def end(self, scene, state, findings, status):
-        """Ends here, with this state."""
+        """Ends the fit with this state."""
         self.scene, self.state, self.strength_estimates, self.status = (
             scene,
             state,
@@ -162,11 +162,11 @@ class Fit:
         )
 
     def interrupt(self):
-        """Notes that the fit ends because the user wants it to."""
+        """Records that the user interrupted the fit."""
         self.status = INTERRUPTED
 
     def note_seconds(self, stage, seconds):
-        """Takes down how long a stage has taken."""
+        """Records the time of a stage."""
         self.seconds[stage] = seconds
 
     def keep_best(self, loss, scene, state):
@@ -175,7 +175,7 @@ class Fit:
             self._best = _BestState(float(loss), scene, state, self.shifts)
 
     def store_final(self, loss, scene, state):
-        """Ends here, with the present state, or with the best one where that is better.
+        """Ends the fit with the present state, or with the best one if that is better.
 
         The present one, if it was interrupted, may be half-way through an iteration.
         """

@@ -116,20 +116,20 @@ class _AmsgradRun:
         return losses
 
     def remember(self, which):
-        """Brings the states kept on the device to those of the fits (B,) that had none better."""
+        """Copies the best states from the device to the fits (B,), if better than their own."""
         losses, kept = self.engine.best_losses(), self.engine.states(kept=True)
         for i in np.flatnonzero(which):
             self.fits[i].keep_best(losses[i], self.engine.scenes[i], kept[i])
 
     def settle(self, stop):
-        """Leaves the fits (B,) that stop here with their final state and its loss."""
+        """Stores the final state and loss of the fits (B,) that stop here."""
         self.remember(stop)
         states, losses = self.engine.states(), self.engine.final_losses()
         for i in np.flatnonzero(stop):
             self.fits[i].store_final(losses[i], self.engine.scenes[i], states[i])
 
     def shift(self):
-        """Shifts the observations, where that is asked for and due."""
+        """Updates the observations' shifts if they are fitted and due."""
         if not self.settings.fit_shifts or self.engine.n_steps % SHIFT_ITERATIONS:
             return
         self.remember(self.live)
@@ -214,12 +214,12 @@ class _LbfgsRun:
         return engine.progress.loss[None]
 
     def shift(self):
-        """Shifts the observations, where that is asked for and due."""
+        """Updates the observations' shifts if they are fitted and due."""
         if self.settings.fit_shifts and self.n_steps % SHIFT_ITERATIONS == 0:
             self._move(self.live)
 
     def _move(self, which):
-        """Shifts the observations of the fits (B,), also of converged ones, which then go on."""
+        """Updates the shifts of the fits (B,); converged fits continue."""
         if not which.any():
             return
         states, moved = self.engine.states(), np.zeros(len(self.fits), bool)
@@ -288,7 +288,7 @@ class _LbfgsRun:
             engine.step(steps)
 
     def settle(self, stop):
-        """Leaves the fits (B,) that stop here with their present state."""
+        """Stores the present state of the fits (B,) that stop here."""
         states, p = self.engine.states(), self.engine.progress
         findings = self.engine.findings(stop)
         for i in np.flatnonzero(stop):

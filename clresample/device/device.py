@@ -148,7 +148,7 @@ class Device:
         return Launcher(self, kernel, is_buffer, self._lock, local_size)
 
     def build_ahead(self, requests):
-        """Starts to build programs, (file, dtype, {macro: value}) each, in a thread."""
+        """Starts building programs, (file, dtype, {macro: value}) each, in a thread."""
         self._programs.build_ahead(requests)
 
     def launch(self, kernel, global_size, local_size=None):
@@ -156,7 +156,7 @@ class Device:
         return self._call(self._enqueue, self.queue, kernel, global_size, local_size)
 
     def finish(self, queue=None):
-        """Waits until everything queued is done, here or in another in-order queue."""
+        """Waits until all queued work is done, here or in another in-order queue."""
         import pyopencl as cl
 
         self._call(self._call(cl.enqueue_marker, queue or self.queue).wait)
@@ -195,7 +195,7 @@ class Device:
 
 
 def _copy(device, target, source, **options):
-    """Queues a copy; one from or to the host is done when this comes back."""
+    """Queues a copy; one from or to the host has finished when this returns."""
     import pyopencl as cl
 
     event = device._call(cl.enqueue_copy, device.queue, target, source, **options)

@@ -261,7 +261,7 @@ def load_pyopencl():
 
 @functools.cache
 def _ignore_remarks(cl):
-    """Leaves out pyopencl's warnings of compilers that, as Intel's, remark on every build."""
+    """Filters pyopencl's warnings of compilers, such as Intel's, that comment on every build."""
     warnings.filterwarnings("ignore", category=cl.CompilerWarning)
 
 

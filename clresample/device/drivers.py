@@ -119,7 +119,7 @@ def driver_fault(library, served):
 
 @functools.cache  # once
 def warn_named_library(library, served):
-    """Warns of the library of CLRESAMPLE_ICD where it brings no device."""
+    """Warns if the library of CLRESAMPLE_ICD provides no device."""
     if fault := driver_fault(library, served):
         warnings.warn(f"CLRESAMPLE_ICD={library} {fault}", DeviceWarning, stacklevel=3)
 
@@ -161,7 +161,7 @@ def temporary_folder(kind):
 
 
 def _remove_of_gone(entry, pid):
-    """Removes a folder unless a process has this number, or may have it."""
+    """Removes a folder unless a process has this number, or could have it."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

@@ -43,7 +43,7 @@ class KernelProfiler:
         self.name, self._rows, self._events = name, defaultdict(KernelTimes), []
 
     def record(self, event, kernel, arguments, global_size):
-        """Keeps a launch; arguments {name: value} as the kernel has them."""
+        """Records a launch; arguments {name: value} of the kernel."""
         buffers = {id(v): v for v in arguments.values() if hasattr(v, "size")}
         work = launch_flops(kernel, arguments, global_size), sum(b.size for b in buffers.values())
         self._events.append((event, kernel, work))
@@ -83,7 +83,7 @@ class KernelProfiler:
         return "\n".join([f"kernels on {self.name}:", *lines])
 
     def add(self, rows):
-        """Adds what another process has measured, {kernel: KernelTimes}."""
+        """Adds the measurements of another process, {kernel: KernelTimes}."""
         for kernel, row in rows.items():
             mine = self._rows[kernel]
             mine.n_calls += row.n_calls
@@ -92,7 +92,7 @@ class KernelProfiler:
             mine.n_bytes += row.n_bytes
 
     def clear(self):
-        """Begins anew."""
+        """Clears the tables."""
         self._rows.clear()
 
     def _read(self):
@@ -166,7 +166,7 @@ def drain():
 
 
 def add(found):
-    """Adds what another process has `drain` to this one's tables, one for each device's name."""
+    """Adds the drained tables of another process, one for each device's name."""
     for name, rows in found:
         same = [profile for profile in _PROFILES if profile.name == name]
         (same[0] if same else _begun(name)).add(rows)

@@ -231,7 +231,7 @@ class _DeviceProcess:
                 self.pipe.send(items)
 
     def collect(self, table, patience_s=None):
-        """Takes in what the process answers; returns a fault, or None."""
+        """Receives the process's answer; returns a fault, or None."""
         if not self.portion:
             return None
         try:

@@ -106,7 +106,7 @@ class Programs:
         return self._kernels[build, name]
 
     def build_ahead(self, requests):
-        """Starts to build programs in a thread; `kernel` waits for one that is being built.
+        """Starts building programs in a thread; `kernel` waits for one in progress.
 
         requests: (file, dtype, defines), as `kernel` takes them. One that does not build raises
         its error when `kernel` asks for it again.
@@ -181,12 +181,12 @@ class Launcher:
         self._bound = dict.fromkeys(is_buffer, UNSET)  # in the kernel's order
 
     def bind(self, **arguments):
-        """Gives arguments that stay; returns the launcher. ValueError for an unknown name."""
+        """Binds arguments; returns the launcher. Raises ValueError for an unknown name."""
         self._bound = self._merged(arguments)
         return self
 
     def __call__(self, global_size, **arguments):
-        """Queues the kernel on `global_size` (x, y, z), `arguments` in place of what is bound.
+        """Queues the kernel on `global_size` (x, y, z); `arguments` replace bound ones.
 
         The size is rounded up to whole groups; kernels leave out the work-items beyond it.
 

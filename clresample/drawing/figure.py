@@ -69,7 +69,7 @@ def add_panel(figure, left, top, width, height):
 
 
 def show_image(axes, image, mapping, *, residual=False):
-    """Draws an image in the place and orientation that it has on other pixels.
+    """Draws an image with its position and orientation on other pixels.
 
     image (My, Mx): 0 ... 1 in the colours of the sky, or -1 ... 1 in those of a residual; or
         (My, Mx, 3) red, green and blue of 0 ... 1

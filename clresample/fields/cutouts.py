@@ -91,7 +91,7 @@ class FieldCutouts:
         return field.mosaics
 
     def _note_changes(self, about, inputs):
-        """Notes inputs that are not as large, or not as old, as when the run was made."""
+        """Records inputs whose size or date differs from those of the run."""
         known = (about.get("run") or {}).get("inputs") or {}
         for path in map(str, inputs.values()):
             state = os.stat(path) if os.path.exists(path) else None

@@ -126,7 +126,7 @@ def _degrees(positions, reference):
 
 
 def _check_outputs(folder, mosaics, reference, options):
-    """Raises ValueError, FileError or ImportError, now, for what cannot be written at the end."""
+    """Raises ValueError, FileError or ImportError, at the start, for unwritable outputs."""
     if options.hats:
         check_hats(reference)
     check_outputs(folder, mosaics)

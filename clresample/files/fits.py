@@ -79,7 +79,8 @@ def read_image(path, *, hdu=None, bands=None):
 def read_psf(path, *, hdu=None, bands=None, spacing=1.0, center=None):
     """Reads the PSF of a FITS image or cube; no WCS is needed.
 
-    path: of the FITS file; hdu, bands: as in `read_image`; spacing [px], center [samples]: as in `PSF`
+    path: of the FITS file; hdu, bands: as in `read_image`
+    spacing [px], center [samples]: as in `PSF`
 
     Raises FileError as `read_image` does, and for samples that `PSF` rejects. Warns as `PSF` does.
     """

@@ -41,7 +41,7 @@ END = re.compile(rb"END([^A-Z0-9_-]|$)")
 
 
 def check_headers(path):
-    """Raises FileError where a header of a FITS file holds a number that no such file has.
+    """Raises FileError if a header of a FITS file has an impossible number.
 
     All HDUs are looked at, of compressed files too. What is not FITS, or ends too early, passes:
     astropy says so.
@@ -158,7 +158,7 @@ def _axes(what, values, key):
 
 
 def _check_tiles(what, values):
-    """Raises FileError where an image is cut into more tiles than the table has rows for them."""
+    """Raises FileError if an image has more tiles than its table has rows."""
     shape = _axes(what, values, "ZNAXIS")
     # whole rows where the header does not say it
     tiles = [values.get(f"ZTILE{i + 1}") or (1 if i else n) for i, n in enumerate(shape)]

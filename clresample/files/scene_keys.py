@@ -117,7 +117,7 @@ def read_tables(path, what) -> dict:
 
 
 def check_table(where, name, table, tables, needed):
-    """Raises SceneError unless a table holds what the rules of its name say.
+    """Raises SceneError unless a table follows the rules of its name.
 
     where: file and table, for messages; tables {name: {key: KeyRule}}; needed {name: keys}
     """
@@ -134,7 +134,7 @@ def check_table(where, name, table, tables, needed):
 
 
 def check_names(where, given, known, what):
-    """Raises SceneError for a name that is not among those known; what: "table" or "key"."""
+    """Raises SceneError for an unknown name; what: "table" or "key"."""
     for key in given:
         if key not in known:
             raise SceneError(f"{where}: {what} {key} is unknown; allowed are {', '.join(known)}")

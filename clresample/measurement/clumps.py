@@ -202,7 +202,7 @@ class _Tree:
         self.basins[a] += self.basins[b]
 
     def end(self, threshold):
-        """Makes bodies of what is wide enough at the threshold."""
+        """Makes bodies of the basins that are wide enough at the threshold."""
         for i in range(len(self.parent)):
             if self.parent[i] == i:
                 self._widen(i, threshold)

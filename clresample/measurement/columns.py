@@ -30,7 +30,7 @@ class Columns:
         return self.values[name]
 
     def put(self, name, values, unit=None):
-        """Sets a column, a new one after those there are."""
+        """Sets a column; a new one becomes the last."""
         self.values[name] = np.asarray(values)
         if unit is not None:
             self.units[name] = unit

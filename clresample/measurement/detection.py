@@ -115,7 +115,7 @@ def noise_scatter(observation, frame) -> np.ndarray:
 
 
 def detect_more(result, *, threshold=THRESHOLD) -> Detection:
-    """Finds sources in a fit's residuals: those too faint beside others to be found before it.
+    """Finds sources in a fit's residuals that were too faint beside others before the fit.
 
     The residuals are searched as `detect` does, but for neighbours on flanks. Where the model is
     bright its own errors are larger than the noise: there the variance is 1 / w + (0.15 model)^2.

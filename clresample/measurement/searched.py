@@ -36,7 +36,7 @@ class Search:
         self.owners.append(owner)
 
     def add(self, image, label, narrow, wide):
-        """Adds the peaks of an image that are not yet known; of bodies seen before none."""
+        """Adds the new peaks of an image, except those on bodies searched before."""
         before = self.known + self.positions + self.clumps
         area, apart = MIN_AREA * narrow**2, SAME_SOURCE * wide
         for position, peak in new_peaks(self.sep, image, self.threshold, area, before, apart):
@@ -44,7 +44,7 @@ class Search:
                 self._put(position, peak, label)
 
     def sort_out(self, image, fwhm, scale):
-        """Finds the bodies of the searched image, and leaves out peaks that are their structure."""
+        """Finds the bodies of the searched image and removes peaks that are their structure."""
         self.bodies = bodies_of(image, np.array(self.positions), fwhm, self.threshold, scale)
         if not self.bodies.bodies:
             return
@@ -63,7 +63,7 @@ class Search:
             self._put(body.center, float(image[y, x]), labels[0], i)
 
     def add_companions(self, new, image, label):
-        """Adds peaks beside others: positions and heights of what is left of an image there."""
+        """Adds peaks beside others: positions and heights of an image's residual there."""
         for position, height in new:
             owner = self.bodies.body_at(position)
             if owner >= 0:

@@ -41,7 +41,7 @@ class _LRUStore:
         return len(self._entries)
 
     def clear(self):
-        """Drops all."""
+        """Empties the cache."""
         self._entries.clear()
         self._held.clear()
 
@@ -131,7 +131,7 @@ class OperatorCache:
         return len(self._operators)
 
     def clear(self):
-        """Forgets all plans and operators; those in use elsewhere live on."""
+        """Drops all plans and operators; those in use elsewhere remain valid."""
         with self._lock:
             self._plans.clear()
             self._operators.clear()

@@ -64,7 +64,7 @@ class Executor(ExecutorTables):
         return self.scratch["terms" if self.terms else "frequencies"]
 
     def bind(self):
-        """Binds the products of the model's end to the scratch that is there."""
+        """Binds the products at the model's end to the present scratch buffers."""
         half, n = self.matrix("half", self.n_y), self.n_bands * self.n_terms
         z = self.matrix("terms" if self.terms else "frequencies", self.k_y)
         model = ImageBatch.shaped(*self.plans[0].mapping.shape_in).matrix(self.axes)
@@ -95,7 +95,7 @@ class Executor(ExecutorTables):
             self.terms.bind(self.scratch)
 
     def bind_adjoint(self):
-        """Binds those of the adjoint."""
+        """Binds the products of the adjoint."""
         half, n = self.matrix("half", self.n_y), self.n_bands * self.n_terms
         z = self.matrix("terms" if self.terms else "frequencies", self.k_y)
         model = ImageBatch.shaped(*self.plans[0].mapping.shape_in).matrix(self.axes)

@@ -86,7 +86,7 @@ class GridOperator(LinOp):
         raise NotImplementedError
 
     def _use_shift(self):
-        """Brings what the device holds in line with `_shift` (n, 2)."""
+        """Updates the device's tables to `_shift` (n, 2)."""
         raise NotImplementedError
 
     def _begin(self, device, dtype, n_bands, mappings, n_terms=1):

@@ -216,7 +216,7 @@ def _moved(d_plus, d_minus, nu, way):
 
 
 def _check_size(mapping, psf_out, n_fft, n_bands):
-    """Raises ValueError where a plan would take more than MAX_BYTES."""
+    """Raises ValueError if a plan would need more than MAX_BYTES."""
     k = [_half_count(mapping.matrix, psf_out.spacing, i, n_fft[i]) for i in (0, 1)]
     n_bytes = 3 * 16 * n_bands * k[0] * 2 * k[1]  # D and both OTFs; then waves at the pixels
     n_bytes += 16 * sum(n * h for n, h in zip(mapping.shape_in, k, strict=True))

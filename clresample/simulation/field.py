@@ -117,7 +117,7 @@ def _plain(surveys, grids, sources, rngs, psf_variation, bad_columns, center_deg
 
 
 def _check(n_pixels, density, faintest, clustering, stars, psf_variation, bad_columns, rubin_bands):
-    """Raises ValueError for what `simulate_field` does not take."""
+    """Raises ValueError for invalid arguments of `simulate_field`."""
     for name, value, good in (
         ("n_pixels", n_pixels, n_pixels >= 32),
         ("density", density, density is None or density > 0),

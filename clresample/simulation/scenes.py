@@ -249,7 +249,7 @@ def simulate_scene(
 
 
 def _check(n_sources, sky, catalogue, spectra):
-    """Raises ValueError for what `simulate_scene` does not take."""
+    """Raises ValueError for invalid arguments of `simulate_scene`."""
     if n_sources < 1:
         raise ValueError(f"n_sources is {n_sources}, must be 1 or more")
     if sky not in ("plain", "real") or (sky == "real" and catalogue is not None):

@@ -208,7 +208,7 @@ def _weights_of(data, bad, given, mask, channels, unit, estimates):
 
 
 def _check_range(data, weights):
-    """Raises ValueError where data or weights leave the numbers that a fit can be done in."""
+    """Raises ValueError if data or weights exceed the numeric range of a fit."""
     light = np.where(weights > 0, np.abs(data), 0.0)
     root, one = np.sqrt(weights), np.ones_like(weights)
     inverse = np.divide(one, weights, out=np.zeros_like(weights), where=weights > 0)

@@ -45,7 +45,7 @@ class RenderWorkload:
         self.y = device.empty((BATCH, *self.op.shape_out), dtype)
 
     def __call__(self):
-        """Renders them once, until they are done."""
+        """Renders all stamps once and waits for the device."""
         self.op(self.x, out=self.y)
         self.device.finish()
 
@@ -97,7 +97,7 @@ def fit(given, device, **settings):
 
 
 def iterate_once(blend, device):
-    """Starts a fit of the blend and iterate a little: all kernels of a fit are then built."""
+    """Starts a fit of the blend and iterates a little, so that all its kernels are built."""
     settings = Settings(max_iter=1)
     fits = [Fit(blend, settings, device, np.float32, pad=1)]
     start_fits(fits)

@@ -153,7 +153,7 @@ def separation_of(data, weights, images, chosen, deviations, faintest=None, *, j
 
 
 def check_kind(what):
-    """Raises ValueError for what is not one of KINDS."""
+    """Raises ValueError unless the kind is one of KINDS."""
     if what not in KINDS:
         raise ValueError(f"what is {what!r}, must be one of {', '.join(map(repr, KINDS))}")
 

@@ -172,7 +172,7 @@ class Solution:
         return along
 
     def along(self, i, images):
-        """Takes off images, in place, what lies along the profile; returns how much it was (k,)."""
+        """Subtracts from images, in place, their projection on the profile; returns it (k,)."""
         p = flush_faint(self.scene.profile[i].astype(images.dtype))
         along = images.reshape(len(images), p.size) @ p.ravel() / max((p * p).sum(), 1e-30)
         images -= along[:, None, None] * p

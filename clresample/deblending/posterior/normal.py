@@ -140,7 +140,7 @@ class _NormalAccumulator:
             self.at = at
 
     def run(self, origin, images, spectra):
-        """Adds it."""
+        """Adds the observation's products of all pairs of components to the matrix."""
         pairs = zip(origin, images, strict=True)
         windows = [self.exposure.window(at, m.shape[1:]) for at, m in pairs]
         near: list[_ComponentView] = []
@@ -176,7 +176,7 @@ class _NormalAccumulator:
         return _ComponentView(i, k, low, high, light, unit)
 
     def _add(self, a, b, modes, by_a, by_b, units):
-        """Adds what `_products` has found of two components, a.i <= b.i."""
+        """Adds the products of two components, a.i <= b.i, to the matrix."""
         same = a is b
         if self.sum is not None:
             by_a, by_b, units = by_a @ self.sum, by_b @ self.sum, units @ self.sum

@@ -103,5 +103,5 @@ class Engine:
         return self.buffers.states(iterated, self.update.memories(), self.n_steps)
 
     def update_shifts(self):
-        """Takes over the shifts that the scenes' operators have by now."""
+        """Copies the current shifts of the scenes' operators."""
         self._gradient.update_shifts()

@@ -71,7 +71,7 @@ class LossGradient:
             )
 
     def __call__(self, losses, i_loss):
-        """Queues it all; losses[i_loss] of losses (n, B), on the device, are the scenes' losses."""
+        """Queues the evaluation; writes the scenes' losses to row i_loss of losses (n, B)."""
         self.queue()
         self._losses((self.buffers.tuning.sum_group, len(self.best)), out=losses, i_loss=i_loss)
 
@@ -99,7 +99,7 @@ class LossGradient:
             self._tie(self.buffers.items(self.buffers.n_sources))
 
     def update_shifts(self):
-        """Takes over the shifts that the scenes' own operators have by now."""
+        """Copies the current shifts of the scenes' own operators."""
         for observed in self.observations:
             observed.follow_shifts()
 
@@ -139,7 +139,7 @@ class _ObservedBatch:
         )
 
     def queue(self):
-        """Queues the model, its residual and what that adds to the gradients."""
+        """Queues the model, its residual and their contribution to the gradients."""
         b, shown = self.buffers, self.rendering
         shown.transform(b.morph)
         shown.render(b.spectra, self.image)
@@ -150,7 +150,7 @@ class _ObservedBatch:
             shown.gather_morph(b.spectra, b.d_morph, b.free, add=self.add)
 
     def follow_shifts(self):
-        """Shifts the batch's operator as the scenes' own ones are."""
+        """Copies the shifts of the scenes' own operators to the batch's operator."""
         if self.op is not self._ops[0]:
             self.op.shift = np.stack([op.shift for op in self._ops])
         self.rendering.update_shifts()

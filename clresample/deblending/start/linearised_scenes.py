@@ -79,7 +79,7 @@ class LinearisedScenes:
             self.whiten()
 
     def whiten(self):
-        """Brings what is seen to units of the noise."""
+        """Whitens the rendered images."""
         for sight in self.sights:
             sight.whiten()
 

@@ -105,7 +105,7 @@ class PopulationPrior:
         return np.square((theta[scenes] - self.mean[scenes]) / self.scatter[scenes])
 
     def update(self, scenes, theta, normal):
-        """Learns from the galaxies of some scenes what is expected in them.
+        """Updates the prior of some scenes from their galaxies.
 
         theta (B, n, p); normal (B, n p, n p): of their equations, what was expected among them
         """

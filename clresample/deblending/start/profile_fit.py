@@ -89,7 +89,7 @@ class ProfileFit:
         return thetas | dict(zip(here, fit.thetas(), strict=True))
 
     def _take(self, scenes):
-        """Solves some scenes at their present parameters, and notes all that a step needs."""
+        """Solves some scenes at their present parameters and stores the inputs of a step."""
         if len(scenes):
             self._measure_brightness(self.theta)
             self._look(scenes, self.theta, slopes=True)
@@ -154,14 +154,14 @@ class ProfileFit:
         return self.looking.compute_residuals(MODEL_ERROR) + self.population.penalty(scenes, theta)
 
     def _learn(self, scenes):
-        """Learns what to expect of some scenes from the present parameters."""
+        """Updates the prior of some scenes from the present parameters."""
         before = self.population.penalty(scenes, self.theta)
         self.population.update(scenes, self.theta, self.normal)
         self._doubt(scenes)
         self.chi2[scenes] += self.population.penalty(scenes, self.theta) - before
 
     def _doubt(self, scenes):
-        """Notes how far the shapes of some scenes, of those last solved, are to be doubted."""
+        """Stores the shape errors caused by neighbours, for some of the scenes solved last."""
         looking = self.looking
         rows = looking.rows_of(scenes)
         normal, spectra = looking.normal[rows][..., :-1, :-1], looking.solution()[rows][..., :-1]
@@ -170,7 +170,7 @@ class ProfileFit:
         )
 
     def _take_equations(self, scenes):
-        """Notes the normal equations of some scenes, what is expected among them."""
+        """Stores the normal equations of some scenes, priors included."""
         normal, right = normal_equations(self.looking)
         weight = self.population.precision(scenes, self.theta).reshape(right.shape)
         away = self.population.mean[scenes] - self.theta[scenes]
@@ -178,7 +178,7 @@ class ProfileFit:
         self.right[scenes] = right + weight * away.reshape(right.shape)
 
     def _measure_brightness(self, theta):
-        """Notes the components' peaks over the noise of a model pixel, where they are best seen."""
+        """Stores the components' peaks over a model pixel's noise, in their best channel."""
         looking = self.looking
         best = (looking.spectra / self.noise[looking.scene]).max(axis=1)
         self.brightness = best * peaks_of(looking.components, self.thetas(theta))

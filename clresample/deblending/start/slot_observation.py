@@ -67,7 +67,7 @@ class SlotObservation:
         launch(size, n_bands=self.n_bands, my=self.my, mx=self.mx, **arguments)
 
     def render(self, slots: ComponentBatch, images):
-        """Renders the slots' images, and keeps what is seen of them."""
+        """Renders the slots' images and stores their observed parts."""
         low, size = np.zeros((2, len(slots), 2), int)
         self.lit, runs = np.zeros((len(slots), 4), int), []
         for run in self.aim.runs(slots):
@@ -87,7 +87,7 @@ class SlotObservation:
             run.renderer(images, at[0], self.seen, at[1], n, run.plan_index, run.offsets_px, shares)
 
     def whiten(self):
-        """Brings what is seen to units of the noise."""
+        """Whitens the rendered images."""
         tallest, widest = self.place[:, 3:5].max(axis=0).tolist()
         self._launch(
             "whiten",

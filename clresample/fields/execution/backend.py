@@ -60,7 +60,7 @@ class LocalWorkers:
         return [(device, n) for device in self.devices]
 
     def begin(self, work):
-        """Begins the processes now, and have them load what the work needs."""
+        """Starts the processes now and loads in them the modules of the work."""
         self.pool.begin(work)
 
     def run(self, work, context, tasks, again=None, stage=""):

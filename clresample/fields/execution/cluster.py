@@ -64,7 +64,7 @@ class DaskCluster:
         progress.dashboard(self.client.dashboard_link)
 
     def _check(self):
-        """Refuses a cluster without workers, or whose workers cannot run our functions."""
+        """Raises an error for a cluster without workers, or with workers that cannot run ours."""
         try:
             self.client.wait_for_workers(1, timeout=CONNECT_S)
         except TimeoutError as error:
@@ -130,7 +130,7 @@ class _Run:
         self.ended: queue.Queue = queue.Queue()
 
     def outcomes(self):
-        """Yields the Outcomes of tasks, those that failed too, until none is left."""
+        """Yields the Outcomes of all tasks, failed ones included."""
         looked = 0.0
         while self.waiting or self.seats.busy:
             if time.monotonic() - looked > POLL_S:
@@ -143,7 +143,7 @@ class _Run:
                 yield outcome
 
     def _give(self, seat):
-        """Gives a worker the next task; an Outcome where what it needs cannot be read."""
+        """Sends a worker the next task; returns an Outcome if the task's inputs cannot be read."""
         seat.task, seat.start_s = self.waiting.popleft(), time.monotonic()
         try:
             given = self.work.gather(self.context, seat.task)

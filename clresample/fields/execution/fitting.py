@@ -226,7 +226,7 @@ def _settings(job, rough, large):
 
 
 def _second_look(job, given, cuts, results, part, n_round):
-    """Fits those blends again in whose residuals there are more sources, with these: cuts, results.
+    """Refits blends with the sources detected in their residuals: (cuts, results).
 
     The residuals are those of the whole fit. A first look of 30 iterations without structure, as
     `clresample deblend` takes, leaves bright galaxies' own structure in them: in simulated fields

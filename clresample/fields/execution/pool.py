@@ -83,12 +83,12 @@ class WorkerPool:
         self.close()
 
     def close(self):
-        """Ends all workers, whatever they do."""
+        """Ends all workers, busy ones included."""
         while self._workers:
             _end(self._workers.pop())
 
     def begin(self, function):
-        """Begins every worker now, and have it load what the function needs, before it is asked."""
+        """Starts every worker now and loads in it the modules of the function."""
         for worker in self._added(self.n_workers):
             with contextlib.suppress(OSError):  # it has died: its successor loads what it is given
                 worker.pipe.send((function, None))
@@ -123,7 +123,7 @@ class WorkerPool:
             raise
 
     def _some(self, run, waiting):
-        """Gives tasks to those without; the Outcomes of some that have ended since."""
+        """Sends tasks to idle workers; returns the Outcomes of tasks that ended meanwhile."""
         if self.n_workers == 0:
             return [_in_this_process(run[0], run[1][0], waiting.popleft())]
         for worker in [w for w in self._workers if w.task is None and not w.process.is_alive()]:
@@ -170,7 +170,7 @@ class WorkerPool:
 
 
 def _give(worker, run, task):
-    """Sends a worker a task, and before its first one of a run what the tasks share."""
+    """Sends a worker a task, before the first one also the data that tasks share."""
     worker.task, worker.since = task, time.monotonic()
     with contextlib.suppress(OSError):  # of one that has died: seen when its answer is awaited
         if worker.run is not run:
@@ -255,7 +255,7 @@ def _dead(worker):
 
 
 def _end(worker):
-    """Ends a worker's process, whatever it does."""
+    """Ends a worker's process, busy or not."""
     worker.pipe.close()
     worker.process.terminate()
     worker.process.join(2)

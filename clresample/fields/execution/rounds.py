@@ -38,7 +38,7 @@ FIT = TaskKind(gather_inputs, fit_group, part_path)
 
 
 def fit_all_groups(job, engine, progress):
-    """Fits all groups that are not yet, round by round.
+    """Fits all groups that are not on disk yet, round by round.
 
     A cut blend's pieces are fitted again as long as a neighbour of theirs moves, and where their
     residuals held more sources.
@@ -252,6 +252,6 @@ def _parts_of(folder):
 
 
 def _check_space(folder, reason):
-    """Raises FileError where a group failed because the disk is full: going on would lose all."""
+    """Raises FileError if a group failed because the disk is full, which would lose all."""
     if "cannot be written" in reason or "No space left" in reason:
         raise FileError(f"{folder}: {reason}; what is finished stays: --resume goes on")

@@ -42,7 +42,7 @@ class _Field:
 
 
 def prepare_search(mosaics, reference, work, engine):
-    """Takes the first look at a field, unless it was taken. Raises ImportError without sep."""
+    """Measures the search setup of a field, once per run. Raises ImportError without sep."""
     if (work / FILE).exists():
         return
     tried: list = []

@@ -42,7 +42,7 @@ def read_field(path) -> FieldFile:
     """Opens the mosaics that a field file names; pixels are read later, piece by piece.
 
     path: of the TOML file; its relative paths start from its folder
-    Estimates of noise read pixels at once. Raises SceneError and FileError: ValueErrors of one line.
+    Noise estimates read pixels at once. Raises SceneError and FileError: ValueErrors of one line.
     """
     path = Path(path)
     tables = parse_field(path)

@@ -34,20 +34,20 @@ class DeviceMemory:
         raise NotImplementedError
 
     def bind(self):
-        """Binds the products to the scratch that is there, those of the way forward at least."""
+        """Binds the products, at least the forward ones, to the present scratch buffers."""
         raise NotImplementedError
 
     def bind_adjoint(self):
-        """Binds those of the adjoint, which many callers never ask for."""
+        """Binds the products of the adjoint, which many callers never use."""
 
     def ensure_adjoint(self):
-        """See that the products of the adjoint are bound."""
+        """Binds the products of the adjoint if they are not bound yet."""
         if not self._bound_back:
             self.bind_adjoint()
             self._bound_back = True
 
     def select_plans(self, which):
-        """Have the next items seen by these plans (items,), of `which` made as large as that."""
+        """Selects the plans `which` (items,) of the next items; reserve as many items before."""
         self.device.upload(np.ascontiguousarray(which, np.int32), self.which[: len(which)])
 
     def cached(self, name, make):

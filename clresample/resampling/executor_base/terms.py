@@ -26,7 +26,7 @@ class PSFTerms:
         )
 
     def bind(self, scratch):
-        """Takes the executor's intermediates, as they are by now."""
+        """Binds the executor's present intermediates."""
         e = self._executor
         buffer, stride, _ = e.tables(e.transfer)
         shared = {

@@ -56,7 +56,7 @@ def as_real_array(name, values, unit=None) -> np.ndarray:
 
 
 def check_real(name, array):
-    """Raises ValueError, calling it `name`, unless a NumPy array holds real numbers."""
+    """Raises ValueError, naming the array `name`, unless its values are real numbers."""
     if array.dtype.kind in REAL:
         return
     if array.dtype.kind == "O":

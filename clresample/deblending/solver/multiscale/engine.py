@@ -138,7 +138,7 @@ class MultiscaleEngine:
         return self.steps.change()[0]  # its s and y go into spare slots
 
     def _rest_others(self, live):
-        """Lets only the scenes `live` (B,) take part in what is queued next."""
+        """Restricts the launches that follow to the scenes `live` (B,)."""
         self.steps.follow(self.pairs, np.where(live, TRY, REST))
 
     def states(self) -> list[State]:
@@ -163,10 +163,10 @@ class MultiscaleEngine:
         ]
 
     def step(self, steps):
-        """Lets scenes try steps next, also those that have converged.
+        """Queues trial steps of these scenes, which resume if they have converged.
 
-        Steps {scene: changes of structure, spectra and sky, see Slopes; structure None where there
-        is none}.
+        steps {scene: changes of structure, spectra and sky, see Slopes}; structure is None in
+        scenes without any
         """
         which = np.isin(np.arange(len(self.scenes)), list(steps))
         self.vectors.put_directions(steps)
@@ -174,13 +174,13 @@ class MultiscaleEngine:
         self._queue(np.where(which, TRY, REST), 1.0)
 
     def update_shifts(self, moved):
-        """Takes over the shifts that the operators of the scenes `moved` (B,) have by now."""
+        """Copies the current shifts of the operators of the scenes `moved` (B,)."""
         self._gradient.update_shifts()
         self.progress.refresh_loss(moved)
         self._queue(np.where(moved, STAY, REST), 0.0)
 
     def _queue(self, mode, length):
-        """Queues trials of one length in the directions that are there already; mode (B,)."""
+        """Queues trials of one length along the present directions; mode (B,)."""
         nothing = np.zeros((len(self.scenes), N_PAIRS + 1))
         self.steps.follow(self.pairs, mode)
         self.steps.advance(nothing, nothing, nothing[:, 0], nothing[:, 0] + length)

@@ -27,7 +27,7 @@ class FactorStore:
         return self._first[block]
 
     def retain(self, blocks):
-        """Holds the roots of these Blocks, and of no others any longer."""
+        """Keeps the factors of these Blocks and drops all others."""
         need = sum(_room(block) for block in blocks)
         new = [block for block in blocks if block not in self._first]
         full = self._end + sum(_room(block) for block in new) > self.values.size

@@ -49,7 +49,7 @@ class LbfgsPairs:
         return self._valid.sum(1)
 
     def take(self, which, sy, yy):
-        """Keeps the spare slots' pairs of the scenes `which` (n,), where they show curvature.
+        """Keeps the new pairs of the scenes `which` (n,) that have positive curvature.
 
         sy, yy (n, SLOTS): s_k . y and y_k . H y of every slot with the spare one
         """

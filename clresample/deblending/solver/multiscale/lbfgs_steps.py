@@ -118,7 +118,7 @@ class LbfgsSteps:
             self.take_blocks(blocks)
 
     def take_blocks(self, blocks):
-        """Takes the Blocks of all sources (S)."""
+        """Sets the Blocks of all sources (S)."""
         b = self._buffers
         start, scene = self._latents.start, b.host_boxes.scene
         self._levels = []

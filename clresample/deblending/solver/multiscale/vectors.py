@@ -128,7 +128,7 @@ class SolverVectors:
         upload(h, self.h)
 
     def copy_from(self, other, keep):
-        """Takes the values of scenes `keep` (n,) of other Vectors, which are all that are here."""
+        """Copies the scenes `keep` (n,) of other Vectors, which then are all scenes here."""
         shift = (other.parts()[keep] - self.parts())[:, :, 0]
         scene, first = self.chunks[:, 0], self.chunks[:, 1]
         kind = np.digitize(first, [self.latents.size, self.latents.size + self.n_spectra])

@@ -45,7 +45,7 @@ class FrameRendering:
         )
 
     def transform(self, morph):
-        """Takes these morphologies (boxes.size,) for all that is queued next."""
+        """Sets the morphologies (boxes.size,) for the launches that follow."""
         self._morph = morph
 
     def render(self, spectra, image):
@@ -54,7 +54,7 @@ class FrameRendering:
         self._op.queue_plain("forward", self._model, image)
 
     def back_project(self, image):
-        """Queues the way back of an image (B, Co, My, Mx), whose gradients are asked for next."""
+        """Queues the adjoint of an image (B, Co, My, Mx) for the gradients that follow."""
         self._op.queue_plain("adjoint", image, self._model)
 
     def gather_spectra(self, d_spectra):

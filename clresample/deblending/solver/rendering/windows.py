@@ -91,7 +91,7 @@ class WindowOperator:
         self.place()
 
     def place(self):
-        """Puts the windows where the operator's present shift has them."""
+        """Moves the windows to the operator's present shift."""
         mapping, small = self.op.plans[0].mapping, self.plan.mapping
         off = mapping.offset + self.op.shift - self._groups.low - small.offset
         self.low = np.rint(-off @ np.linalg.inv(mapping.matrix).T).astype(int)
@@ -103,7 +103,7 @@ class WindowOperator:
         return self._executor.clone()
 
     def queue_plain(self, way, source, target):
-        """Queues "forward" (windows = R frames of all groups) or "adjoint" (frames = R^T windows)."""
+        """Queues "forward", windows = R frames of all groups, or "adjoint", its transpose."""
         n = len(self._groups) * self.shape_in[0]
         self._executor.reserve(n)
         getattr(self._executor, way)(ImageBatch.of(source), ImageBatch.of(target), n)
@@ -158,7 +158,7 @@ class WindowRendering:
         self._active: dict = {}
 
     def transform(self, morph):
-        """Takes these morphologies (boxes.size,) for all that is queued next."""
+        """Sets the morphologies (boxes.size,) for the launches that follow."""
         for part in self.parts:
             part.inner.transform(morph)
 
@@ -168,7 +168,7 @@ class WindowRendering:
             part.render(spectra, image, i > 0)
 
     def back_project(self, image):
-        """Queues the way back of an image (B, Co, My, Mx), whose gradients are asked for next."""
+        """Queues the adjoint of an image (B, Co, My, Mx) for the gradients that follow."""
         for part in self.parts:
             part.back_project(image)
 
@@ -184,7 +184,7 @@ class WindowRendering:
                 part.inner.gather_morph(spectra, d_morph, own, add=add)
 
     def update_shifts(self):
-        """Takes over the shift that the operator has by now."""
+        """Copies the current shift of the operator."""
         for part in self.parts:
             part.update_shifts()
 
