@@ -40,7 +40,7 @@ from .levels import level_of
 from .peaks import import_sep, new_peaks
 from .searched import SAME_SOURCE, Search
 from .signal_to_noise import SMALL_GALAXY, combine_bands, signal_of
-from .star_light import UNEVEN, height_beside, saturated_stars, starless
+from .star_light import UNEVEN, peak_beside, remove_star_light, saturated_stars
 
 # [sigma] of the combined image: white noise reaches it once in two million independent pixels
 THRESHOLD = 5.0
@@ -225,7 +225,7 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
     scale = frame.grid.pixel_scale_arcsec
     stars = saturated_stars(observations, frame) if beside else []
     full = signals
-    parted = [starless(s, stars, w, scale) for s, w in zip(signals, widths, strict=True)]
+    parted = [remove_star_light(s, stars, w, scale) for s, w in zip(signals, widths, strict=True)]
     signals, held = zip(*parted, strict=True)
     if scatters is None:
         scatters = [signal.scatters() for signal in signals]
@@ -259,7 +259,7 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
     points = [
         PointSource(position_px=tuple(map(float, star.place)), free_position=True) for star in stars
     ]
-    heights = [height_beside(everything, star) for star in stars]
+    heights = [peak_beside(everything, star) for star in stars]
     return Detection(
         sources=(*points, *(ExtendedSource(position_px=position) for position in positions)),
         frame=frame,

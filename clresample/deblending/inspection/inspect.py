@@ -14,7 +14,7 @@ from . import listing, shifted, spoilt
 from .centroids import centroids
 from .image import InspectedImage
 from .levels import SkyLevel, sky_level
-from .star_psfs import as_stars, with_star_psfs
+from .star_psfs import replace_by_stars, with_star_psfs
 from .stars import misfitting_widths
 
 # A level counts as left in or over-subtracted above this many of its errors, and above this part
@@ -104,7 +104,7 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         blend = replace(blend, observations=observations)
     stars, still = near[n_own[0] > 0], near[(n_own[0] > 0) & (n_own[0] == n_own[1])]
     if len(stars):
-        blend = replace(blend, sources=as_stars(blend.sources, stars, still))
+        blend = replace(blend, sources=replace_by_stars(blend.sources, stars, still))
     if moved is not None:
         shifts = shifts + moved
     settings = replace(settings, fit_shifts=move)
