@@ -86,7 +86,9 @@ def name_list(text):
     """Comma-separated names or numbers."""
     found = [part.strip() for part in text.split(",")]
     if not all(found):
-        raise argparse.ArgumentTypeError(f"{text!r} is no list of bands, such as i or g,r,i or 0,2")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a list of bands, such as i or g,r,i or 0,2"
+        )
     return found
 
 
@@ -105,7 +107,7 @@ def positive_number(text):
     """A number above zero."""
     number = _number(text)
     if not 0 < number < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is no number above 0")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
     return number
 
 
@@ -113,14 +115,14 @@ def fraction(text):
     """A number from 0 to below 1."""
     number = _number(text)
     if not 0 <= number < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number from 0 to 1")
+        raise argparse.ArgumentTypeError(f"{text!r} must be at least 0 and less than 1")
     return number
 
 
 def non_negative_integer(text):
     """A whole number from 0."""
     if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number from 0")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0")
     return int(text)
 
 

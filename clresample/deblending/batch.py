@@ -25,6 +25,7 @@ from .iterate import iterate
 from .refit.two_component_fit import needs_second_component, refit_two_components
 from .result import Result
 from .settings import Settings
+from .start.profile_start import LIGHT_SIGMAS
 
 LOG = logging.getLogger("clresample")
 # [px] Blends of several sizes have their frames and observations padded to multiples of this, so
@@ -300,8 +301,8 @@ def _warn_dark(dark, where):
     """Warns the caller of `deblend` or `deblend_many` of sources far from any light."""
     n = sum(map(len, dark))
     warnings.warn(
-        f"{n} source{'s lie' if n > 1 else ' lies'} far from any light{where}: see the messages of "
-        "the result",
+        f"no light above {LIGHT_SIGMAS:g} sigma at or near {n} source position{'s' * (n > 1)}"
+        f"{where}: see Result.messages",
         SourceWarning,
         stacklevel=3,
     )

@@ -63,8 +63,8 @@ class Blend:
         n_seen = max(int(np.count_nonzero(o.weights, axis=(1, 2)).max()) for o in self.observations)
         if n > n_seen > 0:
             raise ValueError(
-                f"{len(self.sources)} sources have {n} components, more than any channel has "
-                f"pixels with a weight ({n_seen}): each has a flux in each channel; give fewer"
+                f"{len(self.sources)} sources have {n} components, but no channel has more than "
+                f"{n_seen} pixels with weight: reduce the number of sources"
             )
         n_bytes = BYTES_A_BOX * n * min(n_pixels, BOX_PIXELS)
         n_bytes += BYTES_A_PIXEL * (n_pixels + sum(o.data.size for o in self.observations))

@@ -67,7 +67,7 @@ def write_models(path, job, parts, last, ids):
     hdu.name = "COMPONENTS"
     image = fits.ImageHDU(np.concatenate([flat[k] for k in order]) if order else None)
     image.name = "MORPHOLOGIES"
-    known = set(table[:, COMPONENT_COLUMNS.index("patch")].tolist())
+    known = set(table[:, COMPONENT_COLUMNS.index("fit_id")].tolist())
     offsets = [row for row in offsets if int(row[0]) in known]
     moved = fits.ImageHDU(np.array(sorted(offsets, key=lambda row: row[0])) if offsets else None)
     moved.name = "OFFSETS"
@@ -125,12 +125,12 @@ class ModelFile:
 
     def shift(self, i, i_mosaic) -> tuple[float, float]:
         """(y, x) [model px] by which a mosaic's pixels were moved in the fit of component i."""
-        row = self._offsets.get(int(self.table["patch"][i]))
+        row = self._offsets.get(int(self.table["fit_id"][i]))
         return (0.0, 0.0) if row is None else tuple(row[2 * i_mosaic : 2 * i_mosaic + 2].tolist())
 
     def sky(self, i) -> np.ndarray:
         """Sky levels (C,) [counts] of all channels, as fitted with component i."""
-        n_channels, row = len(self.channels), self._offsets.get(int(self.table["patch"][i]))
+        n_channels, row = len(self.channels), self._offsets.get(int(self.table["fit_id"][i]))
         return np.zeros(n_channels) if row is None else row[-n_channels:]
 
     def model(self, i) -> ComponentModel:

@@ -20,7 +20,8 @@ def draw_hdus(draws):
     DRAWNODES: a row for each node of the matrix: its modes, unknowns, place in the elimination, and
     number of neighbours that are eliminated later. DRAWLATER: these neighbours. DRAWMODES,
     DRAWSCALE, DRAWFACTOR: all arrays one after the other; of the factor each node's own block and
-    the block below, in the order of elimination. DRAWUNIT, DRAWWIDE, DRAWBANDS: as in PosteriorSampler.
+    the block below, in the order of elimination. DRAWUNIT, DRAWWIDE, DRAWBANDS: as in
+    PosteriorSampler.
     """
     if draws is None:
         return []

@@ -60,7 +60,7 @@ def _above(value):
 
 
 TEXT = KeyRule("a text", is_text)
-FRACTION = KeyRule("a number from 0 to 1", lambda value: is_number(value) and 0 <= value < 1)
+FRACTION = KeyRule("a number x with 0 <= x < 1", lambda value: is_number(value) and 0 <= value < 1)
 COUNT = KeyRule("a whole number, 0 or more", is_whole)
 FILE = KeyRule("the name of a file", is_text)
 HDU = KeyRule('a number from 0, "NAME" or "NAME,VERSION"', is_any_of(is_whole, is_text))

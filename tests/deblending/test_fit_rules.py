@@ -152,8 +152,8 @@ def test_what_a_failure_says():
     assert not Failure("b", "failed").converged
     with pytest.raises(ValueError, match="blends is 3 .int., must be a sequence"):
         batch._listed("blends", 3)
-    for n, words in ((1, "1 source lies far"), (2, "2 sources lie far")):
-        with pytest.warns(SourceWarning, match=f"{words} from any light here: see the messages"):
+    for n, words in ((1, "1 source position"), (2, "2 source positions")):
+        with pytest.warns(SourceWarning, match=f"{words} here: see Result"):
             batch._warn_dark([np.arange(n)], " here")
 
 

@@ -229,7 +229,7 @@ def test_bands_of_the_image_choose_those_of_the_psf(folder):
         (ONE + "[frame]\npsf_sigma_px = 0", "psf_sigma_px is 0, it takes a number above 0"),
         (ONE + "[fit]\nmax_iter = -1", "max_iter is -1, it takes a whole number"),
         (ONE + "[fit]\nmax_iter = true", "max_iter is True, it takes a whole number"),
-        (ONE + "[fit]\nrel_tol = 1.0", "rel_tol is 1.0, it takes a number from 0 to 1"),
+        (ONE + "[fit]\nrel_tol = 1.0", "rel_tol is 1.0, it takes a number x with 0 <= x < 1"),
         (ONE + "[fit]\nfit_shifts = 1", 'fit_shifts is 1, it takes true, false or "auto"'),
         (ONE + "[detection]\npasses = 3", "passes is 3, it takes 1, or 2"),
         (ONE + "[detection]\nthreshold = 0", "threshold is 0, it takes a number above 0"),

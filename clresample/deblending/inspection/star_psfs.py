@@ -244,7 +244,8 @@ def _lasting(rest, known, light, first, fwhm):
     """Light above the mean that persists along rays: (radii, angles + 1), first angle repeated.
 
     rest, known (radii, angles): light above the mean, and its valid samples
-    light (radii,) [sigma]: the mean; first: number of the core's last ring, within which the result falls to 0
+    light (radii,) [sigma]: the mean
+    first: number of the core's last ring, within which the result falls to 0
     """
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     rest = rest[tuple(nearest)]

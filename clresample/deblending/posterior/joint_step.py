@@ -1,15 +1,14 @@
-"""Newton's step along what sources that overlap exchange: structure, spectra and sky in one.
+"""A joint Newton step over smooth structure, spectra and sky of overlapping sources.
 
-L-BFGS knows the curvature of each source by itself. Light that a source may as well give to its
-neighbours lowers the loss by little in each iteration, and moves fluxes by more than their errors
-in the end. Along the smooth changes of which errors are made (smooth_modes.py) the curvature of all
-sources together is one normal matrix, which says where the minimum lies, and how far below.
+L-BFGS has the curvature of each source alone. Moving light between neighbours barely changes the
+loss, yet can move their fluxes by more than their errors. Along the smooth changes from which
+errors are computed (smooth_modes.py), the curvature of all sources together is one normal matrix,
+which predicts the minimum and the gain.
 
-The matrix does not know that morphologies are held at 0: many pixels of wings lie right at that
-bound, and a step that lifts them raises the loss along a kink. So three in four of the full steps
-are refused on simulated scenes (133 of 180 in 120 scenes), nearly all in a bright blend of HSC, and
-a shortened one gains: without any, a fit of HST and HSC to a merger was 50 higher in its loss after
-500 iterations than with them after 250.
+The matrix ignores the bound S >= 0. Many wing pixels lie on that bound, and a step that lifts them
+raises the loss. Three in four of the full steps are rejected on simulated scenes (133 of 180 in 120
+scenes), nearly all in a bright blend of HSC, and a shortened step gains. Without any such step, a
+fit of HST and HSC to a merger had a loss 50 higher after 500 iterations than with them after 250.
 """
 
 from __future__ import annotations

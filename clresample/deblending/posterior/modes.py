@@ -1,4 +1,4 @@
-"""A fitted scene, and all modes of its components: what their morphologies may still be."""
+"""A fitted scene and the modes along which its morphologies can vary under the prior."""
 
 from __future__ import annotations
 

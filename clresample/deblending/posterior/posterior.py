@@ -1,4 +1,4 @@
-"""A scene's errors: one factored normal matrix of all unknowns, and what is asked of it."""
+"""Factorises the normal matrix of all unknowns of a scene and derives its errors from it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fitted morphologies as all observations see them, and the spectra that go with them best."""
+"""Renders the final morphologies in every observation and solves for their spectra."""
 
 from __future__ import annotations
 

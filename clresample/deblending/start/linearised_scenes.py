@@ -1,4 +1,4 @@
-"""Components of a group of scenes as all observations see them, and the spectra that fit best."""
+"""Renders the components of a batch of scenes in all observations; solves for their spectra."""
 
 from __future__ import annotations
 

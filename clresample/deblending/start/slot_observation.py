@@ -1,4 +1,4 @@
-"""One observation of all scenes of a group: what it sees of slots, and sums over its pixels."""
+"""Renders component images in one observation of a batch of scenes and sums their products."""
 
 from __future__ import annotations
 

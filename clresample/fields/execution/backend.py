@@ -11,14 +11,16 @@ from .pool import WorkerPool
 
 @dataclass(frozen=True)
 class TaskKind:
-    """A kind of task in three steps, of which the second alone takes time, and no folder.
+    """A task type in three steps: gather, compute, store.
 
-    gather: called as given(context, task), returns what the task needs from the run's folder
-    compute: called as done(context, task, given), returns (value, content): a small value for
-        whoever asked, and the bytes of the file that the task leaves
-    path: called as path(context, task), returns where that file belongs
+    Only `compute` takes time; it needs no run folder.
 
-    All are functions of modules, so that another process can import them. Called itself, it does
+    gather: called as gather(context, task), returns the task's inputs from the run's folder
+    compute: called as compute(context, task, inputs), returns (value, content): a small value for
+        the caller, and the bytes of the task's file
+    path: called as path(context, task), returns the path of that file
+
+    All are functions of modules, so that another process can import them. Calling the TaskKind runs
     all three in turn and returns the value.
     """
 

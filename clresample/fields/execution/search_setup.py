@@ -1,4 +1,4 @@
-"""The first look at a field, once: how its noise scatters, and what the devices hold."""
+"""Measures once per run the noise scatter of each mosaic and the device memory of a group."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ def stack_bands(psfs) -> PSF:
     spacings = [psf.spacing for psf in psfs]
     if len(set(spacings)) > 1:
         raise ValueError(
-            f"psfs have samples {spacings} px apart, bands of one PSF share a distance"
+            f"PSFs have sample spacings {spacings} px; all bands of a PSF must have the same"
         )
     shape = np.max([psf.images.shape[1:] for psf in psfs], axis=0)
     images, centers = [], []

@@ -189,7 +189,7 @@ def instrument_data(pyramid) -> dict:
     return {
         "name": one.name,
         "channels": one.channels,
-        "sigma": [_digits(v) for v in one.sigma],
+        "sigma": [_digits(v) for v in one.noise_sigma],
         "whites": [_digits(v) for v in stretch.whites],
         "colour": {
             "title": f"{', '.join(names)} as blue, green, red",

@@ -1,4 +1,4 @@
-"""The roots of all sources' blocks on the device: only those that are new are uploaded."""
+"""Stores the factors of all sources' blocks on the device and uploads only new ones."""
 
 from __future__ import annotations
 
