@@ -1,4 +1,4 @@
-"""One patch of sky to deblend (Blend), and what a batch returns where that failed (Failure)."""
+"""One patch of sky to deblend (Blend), and its result if the fit failed (Failure)."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ class Blend:
 
 @dataclass(frozen=True)
 class Failure:
-    """A blend of a batch that could not be fitted; `status` says why."""
+    """A blend of a batch that could not be fitted, with the reason in `status`."""
 
     blend: Blend
     status: str

@@ -1,4 +1,4 @@
-"""Smooth profiles on model pixels: what a source looks like before its own structure is fitted.
+"""Smooth profiles of sources on model pixels, from which their own structure departs.
 
 A source has one ComponentProfile for each of its components: a GalaxyProfile, a FixedProfile
 profile or a StarProfile. A shape is drawn from a few parameters theta (n,), which `start` fits to

@@ -1,4 +1,4 @@
-"""Tells whoever looks that kernels are being compiled: a wait of seconds that happens once."""
+"""Reports that kernels are being compiled: a wait of seconds that happens once."""
 
 from __future__ import annotations
 

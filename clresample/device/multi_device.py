@@ -93,10 +93,10 @@ def map_threads(n_threads, function, items):
 
 
 def prefetch(items):
-    """The items of an iterator, the next one made by a thread while the last one is in use.
+    """Yields the items of an iterator, while a thread makes the next one.
 
-    At most one lies ready and one is being made beside that which is in use. What the iterator
-    raises is raised here in its turn. Closed early, the thread ends with the item that it makes.
+    At most one item is ready and one in progress beside the one in use. An exception of the
+    iterator is raised here in its turn. If closed early, the thread ends with its current item.
     """
     ready: queue.Queue = queue.Queue(maxsize=1)
     stop = threading.Event()

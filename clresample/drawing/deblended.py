@@ -1,4 +1,4 @@
-"""The picture of a deblended scene: what each instrument saw, the model, and what is left."""
+"""Draws a deblended scene: observed images, model and residual of each instrument."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ def healpix_index(ra, dec) -> np.ndarray:
 def partitions(index, most=MAX_ROWS) -> list[tuple[int, int]]:
     """The (order, pixel) of each partition of rows with these pixels of order 29, in their order.
 
-    Of the lowest order at which a pixel has at most `most` rows, up to LARGEST_ORDER.
+    Each has the lowest order at which a pixel has at most `most` rows, up to LARGEST_ORDER.
     """
     found, ahead = [], [(0, int(pixel)) for pixel in np.unique(index >> 2 * FINEST)[::-1]]
     order_of_rows = np.sort(index)

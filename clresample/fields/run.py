@@ -1,4 +1,4 @@
-"""A field from mosaics to catalogue: search, link, fit, write; what is done stays done."""
+"""Runs a field from mosaics to catalogue: search, link, fit, write; a run resumes."""
 
 from __future__ import annotations
 

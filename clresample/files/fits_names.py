@@ -18,7 +18,7 @@ def to_ascii(text):
 def text_card(text, comment):
     """(value, comment) of a FITS card: the text in ASCII, the comment if there is room for it.
 
-    What is longer than a card goes on in others, which have room.
+    Text longer than a card continues in further cards.
     """
     value, comment = to_ascii(text), to_ascii(comment)
     length = max(len(value) + value.count("'"), 8)  # shorter ones are padded

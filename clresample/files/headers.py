@@ -1,4 +1,4 @@
-"""A look at the headers of a FITS file before astropy reads them.
+"""Checks the headers of a FITS file before astropy reads them.
 
 astropy (to 8.0 at least) believes some numbers in a header and counts up to them: with NAXIS =
 99999999999 or SIP polynomials of order 30000 it does not end, TFIELDS = 2000000000 takes all

@@ -164,9 +164,9 @@ def catalogue_columns(result, *, magnitudes=True, groups=None, bands=None) -> Co
 
 
 def _add_partners(table, result, flux, covariance):
-    """The column of ambiguous sources' partners and their flag.
+    """Adds the column of ambiguous sources' partners and their flag.
 
-    Of results with Errors, since at fixed morphologies light is not exchanged.
+    Only results with Errors have them, because light is not exchanged at fixed morphologies.
     """
     found = np.full(len(flux), -1)
     if result.errors is not None:

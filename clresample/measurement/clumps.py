@@ -72,7 +72,7 @@ class Body:
     def takes(self, above, base):
         """Selects peaks of heights above [sigma] on a base [sigma] that are its structure.
 
-        And whether they are in its group.
+        Also returns whether they are in its group.
         """
         part = above / self.light
         faint = part < CLUMP_PART
@@ -235,7 +235,7 @@ def _outline(image, basins, numbers, level):
 def _center(image, outline, level, at, area, bright):
     """The peak of those at (k, 2) [px] in the middle of an outline, or the middle itself (2,).
 
-    Of a faint body its brightest peak.
+    For a faint body it is the brightest peak.
     """
     where, mask = outline
     radius = np.sqrt(area / np.pi)

@@ -42,9 +42,9 @@ class Columns:
 
     @classmethod
     def concatenate(cls, several) -> Columns:
-        """Rows of several one after the other; names in the order in which they first come.
+        """Concatenates the rows of several, with names in the order of first appearance.
 
-        Where one has no such column its rows hold NaN, 0 of whole numbers, "" of texts.
+        Rows without a column get NaN, 0 for whole numbers, "" for texts.
         """
         found = cls()
         for one in several:

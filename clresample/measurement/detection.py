@@ -273,7 +273,8 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
 def _companions(sep, signals, sharp, everything, places, threshold, fwhm, scale):
     """Positions and heights of sources on the flanks of those at `places` (S, 2).
 
-    In the sharpest observation, whose PSF has the width fwhm [px]; scale [arcsec]: of a pixel.
+    They are found in the sharpest observation, whose PSF has the width fwhm [px]; scale [arcsec]:
+    of a pixel.
     """
     image, seen = signals[sharp].flat(), signals[sharp].n_seen > 0
     centres = np.array(

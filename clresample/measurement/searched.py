@@ -1,4 +1,4 @@
-"""Sources of successive searches: what is known already, and the bodies of large galaxies."""
+"""Sources of successive searches, with the bodies of large galaxies."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ class SignalToNoise:
     def scatters(self):
         """Scatter (W,) of the channels together where there is no source, at least 1.
 
-        That of the negative pixels, which are noise. Correlated noise has more.
+        It is measured from negative pixels, which are noise. Correlated noise scatters more.
         """
         flats = (self.flat(w) for w in range(len(self.sums)))
         return np.array([max(1.0, sigma_below_zero(image) or 1.0) for image in flats])

@@ -140,7 +140,7 @@ class NoiseCorrelation(ReadOnly):
     def colouring_filter(self) -> np.ndarray:
         """Filter (n, n), n odd, that makes this noise out of white noise of unit variance.
 
-        Symmetric, with the transform P^(1/2).
+        It is symmetric, with the transform P^(1/2).
         """
         root = np.fft.fftshift(np.fft.ifft2(np.sqrt(_power(self.autocorrelation))).real)
         return root[1:, 1:]  # of an even number of taps the middle one is n // 2

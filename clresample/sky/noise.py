@@ -1,4 +1,4 @@
-"""The noise of images: weights from what a user gives, or estimated from the background."""
+"""Noise of images: weights from a user's arguments, or estimated from the background."""
 
 from __future__ import annotations
 

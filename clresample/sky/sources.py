@@ -12,7 +12,7 @@ from .validation.checks import as_float_array, check_integer
 
 
 class SourceWarning(UserWarning):
-    """A source where the images show nothing: its position is probably not what was meant."""
+    """A source where the images show no light: its position is probably wrong."""
 
 
 @dataclass(frozen=True, kw_only=True)

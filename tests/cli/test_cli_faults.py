@@ -85,7 +85,8 @@ def test_too_much_work_is_refused_before_it_starts(scene, capsys, n_sources, n_c
     assert deblend(scene) == 2
     assert time.process_time() - began < 15
     said = refused(capsys)
-    assert f"{n_sources} sources have " in said and "components, more than any channel has" in said
+    assert f"{n_sources} sources have " in said
+    assert "components, but no channel has more than" in said
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1e9])

@@ -189,7 +189,7 @@ def test_work_is_bounded_before_it_begins():
     seen = [np.count_nonzero(o.weights[0]) for o in given.observations]
     many = Blend(given.observations, (ExtendedSource(position_px=(3, 3)),) * (max(seen) + 1))
     with pytest.raises(
-        ValueError, match=rf"{max(seen) + 1} components, more than .*\({max(seen)}\)"
+        ValueError, match=rf"{max(seen) + 1} components, but .* than {max(seen)} pixels"
     ):
         many._check_work(given.frame)
     Blend(given.observations, many.sources[1:])._check_work(given.frame)
@@ -201,7 +201,7 @@ def test_work_is_bounded_before_it_begins():
     one = SimpleNamespace(weights=dot, data=dot)
     Blend((one,), many.sources)._check_work(given.frame)  # nothing is seen: nothing is fitted
     dot[0, 5, 6] = 1
-    with pytest.raises(ValueError, match=r"2 components, more than .*\(1\)"):
+    with pytest.raises(ValueError, match=r"2 components, but .* than 1 pixels"):
         Blend((one,), many.sources[:2])._check_work(given.frame)
     two = ExtendedSource(position_px=(3, 3), n_components=2)
     wide = SimpleNamespace(weights=np.ones((1, 60, 60)), data=np.zeros((1, 60, 60)))

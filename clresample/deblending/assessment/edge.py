@@ -1,4 +1,4 @@
-"""Light of galaxies outside of what was observed: how much their models would have there."""
+"""Light of galaxies outside the observed area, by continuation of their models."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def widened(errors, outside):
 def reaches_outside(result, flux) -> np.ndarray:
     """Selects sources (S,) with more than OUTSIDE of their flux (S, C) outside the observed area.
 
-    In a channel where that is more than the noise of the flux at fixed morphology.
+    Only channels count in which that light exceeds the flux error at fixed morphology.
     """
     if result.errors is None:
         return np.zeros(len(flux), bool)

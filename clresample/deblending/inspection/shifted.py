@@ -28,7 +28,7 @@ MAX_ERROR_PX = 0.5
 def disagreements(images, found, fit_shifts):
     """Shifts (n_observations, 2) [model px] that align disagreeing observations, the first at rest.
 
-    None where none disagree. And a sentence on each, also on channels that disagree.
+    None without disagreement. Also returns a sentence on each, and on channels that disagree.
 
     images, found: Image and Centroids of each observation; fit_shifts: see Settings, with True
         nothing is measured
@@ -73,7 +73,7 @@ def sharpest(images) -> int:
 def _between(one, its, other, theirs):
     """Shift (2,) [model px] of the light in Image `other` against `one`, and its error (2,).
 
-    From their Centroids, and where these differ from the images themselves.
+    Measured from their Centroids; if these differ, from the images themselves.
     """
     _, at, there = np.intersect1d(its.sources, theirs.sources, return_indices=True)
     ends = []

@@ -186,7 +186,7 @@ class BandLimitedTransfer:
     def at(self, shape, reach):
         """Frequencies nu_y (Hy,) >= 0, nu_x (W,) and D (Hy, C T, W) with the half-plane's weights.
 
-        Of a period at which a box does not overlap itself within `reach`.
+        The period is long enough that a box does not overlap itself within `reach`.
         """
         sides = [int(np.ceil((n + 2 * reach) / PERIOD_PX)) * PERIOD_PX + 1 for n in shape]
         key = tuple(sides)
@@ -223,7 +223,7 @@ def _waves(a, b):
 def _parallel(view, pixel):
     """Rows, columns and root weights of an observation whose axes are the model's.
 
-    On pixels of a side `pixel` [model px] over the model's frame where its own are smaller.
+    If its pixels are smaller than `pixel` [model px], pixels of that side cover the model's frame.
     """
     mapping, root = view.mapping, view.sqrt_weights
     if mapping.matrix[0, 0] == 0:

@@ -186,7 +186,7 @@ def _root(diagonal):
 def _eliminated(near, sizes):
     """Order of elimination, and for each node those of its neighbours that come after it.
 
-    Fewest unknowns in the neighbours first. near (n): sets, which are used up.
+    Nodes whose neighbours have the fewest unknowns come first. near (n): sets, which are modified.
     """
     weight = [sum(sizes[u] for u in others) for others in near]
     heap = [(w, v) for v, w in enumerate(weight)]

@@ -185,9 +185,9 @@ def _held(matrix, counts, bound):
 
 
 def make_joint_step(fit, scene, state, findings):
-    """The Exchange of a Fit at a State of a Scene, with the Findings there.
+    """The JointNewtonStep of a Fit at a State of a Scene.
 
-    None where no sources share light.
+    None if no sources share light.
     """
     n = len(state.morph)
     solution = Solution(

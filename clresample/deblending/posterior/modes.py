@@ -217,9 +217,9 @@ class Solution:
         return self.scene.origin, self.scene.origin + [p.shape for p in self.scene.profile]
 
     def overlap_mask(self, i, *, faint=FAINT, ratio=0.0):
-        """Pixels (ny, nx) with i and another source over faint [noise].
+        """Pixels (ny, nx) with source i and another source over `faint` [noise].
 
-        That one over ratio of i's.
+        The other source exceeds `ratio` times source i there.
         """
         own = self._light(i, i)
         shared = np.zeros(own.shape, bool)

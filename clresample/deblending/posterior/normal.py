@@ -219,10 +219,10 @@ class _NormalAccumulator:
 
 
 def _products(a, b):
-    """Products of two _ComponentView where their windows overlap, None where they do not.
+    """Products of two _ComponentViews where their windows overlap; None without overlap.
 
-    Of the light of both (ka, kb), of b's light with a's unit and of a's with b's (k, C), of the
-    units (C,).
+    They are products of the light of both (ka, kb), of b's light with a's unit and of a's light
+    with b's (k, C), and of the units (C,).
     """
     low, high = np.maximum(a.low, b.low), np.minimum(a.high, b.high)
     if not (high > low).all():

@@ -69,9 +69,9 @@ class OutsideBoxMoments:
         return OutsideBoxMoments(self.sums * scales[0], self.slopes * scales[1:])
 
     def with_gauge(self, along):
-        """Those of more modes, from which `along` (k,) times the profile was subtracted.
+        """The moments of more modes, from which `along` (k,) times the profile was subtracted.
 
-        The new modes come before these.
+        The new modes come before the present ones.
         """
         slopes = np.zeros((6, len(along)))
         slopes[:, len(along) - self.slopes.shape[1] :] = self.slopes

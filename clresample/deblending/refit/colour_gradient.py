@@ -143,7 +143,7 @@ def _asked(fit, which, seen):
 def _eliminated(covariance, slope, power, k):
     """Coefficients (k, C) of the last k images in the residuals of a fit, all others free too.
 
-    And their precisions (k, C); 0 where they have no light, or are no longer apart.
+    Also returns their precisions (k, C); 0 for images without light, or no longer distinct.
 
     covariance (C, n, n): of all n coefficients; slope, power (n, C): their images' products with
     the residuals, and with themselves
@@ -159,8 +159,8 @@ def _eliminated(covariance, slope, power, k):
 def log_evidence_ratio(core, precision, spectrum):
     """Logarithm of the ratio of evidences, of a colour gradient to none.
 
-    From the changes at the core (C,), their precisions (C,) and the spectrum (C,), more than 0. See
-    the module's text.
+    Computed from the changes at the core (C,), their precisions (C,) and the spectrum (C,), above
+    0. See the module's text.
     """
     seen = precision > 0
     if seen.sum() < 2:

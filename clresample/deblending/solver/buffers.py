@@ -1,4 +1,4 @@
-"""A batch of scenes on the device: what is uploaded, and how states come back."""
+"""A batch of scenes on the device: uploads, and downloads of states."""
 
 from __future__ import annotations
 

@@ -67,9 +67,9 @@ class Engine:
         return self.update.n_steps
 
     def run(self, n_steps):
-        """Losses (n_steps, B) before each of `n_steps` iterations, which are done by then.
+        """Losses (n_steps, B) before each of `n_steps` iterations, which it runs.
 
-        Of each scene the state before the first of them is kept if its loss is the lowest so far.
+        The state before the first of them is kept for each scene whose loss is the lowest so far.
         """
         if n_steps > MAX_STEPS:
             raise ValueError(f"n_steps is {n_steps}, one run does at most {MAX_STEPS}")

@@ -1,4 +1,4 @@
-"""One scene to fit, on the host: what stays (Scene) and what the iterations change (State)."""
+"""One scene to fit, on the host: constants (Scene) and iterated variables (State)."""
 
 from __future__ import annotations
 

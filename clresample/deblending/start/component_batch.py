@@ -1,4 +1,4 @@
-"""Components drawn in boxes: where the boxes lie, how large they are, and their images."""
+"""Draws components in boxes: positions, sizes and images of the boxes."""
 
 from __future__ import annotations
 

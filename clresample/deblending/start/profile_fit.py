@@ -124,9 +124,9 @@ class ProfileFit:
                 self._take_equations(further)
 
     def _try(self, scenes, damping, free):
-        """Try a step of each of the scenes.
+        """Tries a step of each of the scenes.
 
-        What it gains (k,), spectra those of the better one, and theta (B, n, 4) after it.
+        Returns the gain (k,), spectra of the better state, and theta (B, n, 4) after it.
         """
         looking, own = self.looking, np.eye(self.right.shape[1])
         moves = np.repeat(free, N_PARAMETERS, axis=1)

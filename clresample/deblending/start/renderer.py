@@ -1,4 +1,4 @@
-"""Images in boxes as an observation sees them, in windows that hold what their light reaches."""
+"""Renders images of boxes in an observation, in windows that contain their light."""
 
 from __future__ import annotations
 

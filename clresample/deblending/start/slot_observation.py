@@ -100,7 +100,7 @@ class SlotObservation:
     def compute_residuals(self, scenes, slots, spectra, sky, error):
         """Residuals and weights of the scenes (k,) of the slots rendered last.
 
-        And sums (k, Co, 3) over the pixels.
+        Also returns sums (k, Co, 3) over the pixels.
 
         spectra (slots, C), sky (B, C): of the model; error: part of the light that adds to
         the noise
@@ -136,7 +136,7 @@ class SlotObservation:
     def overlapping_pairs(self):
         """Table (pairs, 6) of slots a <= b of one scene whose windows overlap on the pixels.
 
-        With the first pixel and size of the overlap; NumPy's, and on the device. Slots without
+        It has the first pixel and size of the overlap; NumPy's, and on the device. Slots without
         pixels are left out.
         """
         table = _pairs(self.place[:, 0], self.lit, (self.my, self.mx))

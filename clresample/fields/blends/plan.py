@@ -209,7 +209,7 @@ def make_fit_plan(
 def host_ids(positions, peaks, ids, hosts) -> np.ndarray:
     """Ids (S,) int64 of sources' hosts, whose positions (S, 2) [px] are `hosts`.
 
-    Where none of the sources is at a host's position, the brightest of those with it is.
+    Without a source at a host's position, the brightest source with that host is used.
     """
     at = {tuple(p): i for i, p in enumerate(np.asarray(positions).tolist())}
     of_host: dict[tuple, list[int]] = {}

@@ -119,9 +119,9 @@ class DaskCluster:
 
 
 class _Run:
-    """The tasks of one stage on their way.
+    """Unfinished tasks of one stage.
 
-    waiting: tasks that no worker has; ended: (seat, its future) of those that have ended
+    waiting: tasks without a worker; ended: (seat, its future) of finished tasks
     """
 
     def __init__(self, client, seats, work, context, waiting):

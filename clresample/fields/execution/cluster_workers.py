@@ -1,4 +1,4 @@
-"""The workers of a cluster that come, go and hang, each of which has one task at most."""
+"""Workers of a cluster, which may join, leave or hang, with one task at most each."""
 
 from __future__ import annotations
 

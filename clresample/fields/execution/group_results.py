@@ -152,7 +152,7 @@ class GroupResultsFile:
     def models(self, chosen=None, mosaic=None):
         """(patch, mosaic, Box, model (C, Ny, Nx)) of its patches, or of those in `chosen`.
 
-        On all mosaics, or on that with a number.
+        All mosaics are included, or the one with a number.
         """
         with open_fits(self.path) as hdus:
             index, hdu = _columns(hdus["MODELS"]), hdus["PIXELS"]

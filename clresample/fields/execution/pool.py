@@ -1,4 +1,4 @@
-"""Tasks in worker processes that may fail, hang or be killed, none of which loses a task."""
+"""Runs tasks in worker processes that may fail, hang or be killed, without losing a task."""
 
 from __future__ import annotations
 
@@ -265,10 +265,7 @@ def _end(worker):
 
 
 def _work(pipe, bound, parent):
-    """Runs a worker: functions, contexts and tasks from the pipe, answers into it.
-
-    Until its end.
-    """
+    """Runs a worker until its end: reads functions, contexts and tasks, writes answers."""
     import signal
 
     limit_memory(bound)

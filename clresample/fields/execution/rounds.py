@@ -144,7 +144,7 @@ class _PieceHistory:
     def components_of(self, patches):
         """`FitGroup.components` of some pieces, by their last fits.
 
-        Asked again in each round, a source on the edge would go to and fro.
+        They are not tested again in each round, because a borderline source would alternate.
         """
         found: dict[int, int] = {}
         for name in sorted({self.names[patch][-1] for patch in patches}):
@@ -156,7 +156,7 @@ class _PieceHistory:
     def moved(self, patches):
         """Pieces whose flux changed by over MAX_FLUX_CHANGE_SIGMA errors since their fit before.
 
-        And by over SETTLED_PART of it.
+        The change must also exceed SETTLED_PART of the flux.
         """
         old = self._fluxes([(n, self.names[n][-2]) for n in patches])
         moved = set()

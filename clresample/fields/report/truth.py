@@ -1,4 +1,4 @@
-"""A catalogue beside the truth of a simulated field: which source is which, and how far off."""
+"""Compares a catalogue with the truth of a simulated field, matched source by source."""
 
 from __future__ import annotations
 

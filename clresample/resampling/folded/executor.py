@@ -27,9 +27,9 @@ MAX_BYTES = 1 << 20
 
 
 class FoldedExecutor:
-    """Forward and adjoint of one aligned ResamplingPlan, as Executor has them.
+    """Forward and adjoint of one aligned ResamplingPlan, with the interface of Executor.
 
-    Inside it is float64.
+    It computes in float64.
 
     Images on either side are float32. `is_preferred` says for which operators it is made.
 

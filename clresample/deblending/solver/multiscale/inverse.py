@@ -153,7 +153,7 @@ class BlockPreconditioner:
 def _split(rows, places):
     """Parts of rows (n, 3) at places (n, 2) [px], at most MAX_BLOCK_SIZE neighbours each.
 
-    In order.
+    Rows keep their order within a part.
     """
     if len(rows) <= MAX_BLOCK_SIZE:
         return [rows] if len(rows) else []

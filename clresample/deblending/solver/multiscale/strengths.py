@@ -1,4 +1,4 @@
-"""The strengths of structure of all sources of a batch, and what the solver needs of them."""
+"""Strengths of structure of all sources of a batch, and the solver's tables from them."""
 
 from __future__ import annotations
 

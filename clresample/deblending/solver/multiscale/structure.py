@@ -1,6 +1,6 @@
 """Morphologies of structure at several scales, and their transpose, on the device.
 
-structure.cl.
+The kernels are those of structure.cl.
 
     S_s = max(0, b + u - b <b, u> / <b, b>),      u_s = sqrt(b) o sum_j K_j z_sj
 
@@ -46,7 +46,7 @@ class LatentLayout:
     def pack(self, arrays):
         """One vector (size,) from arrays[s][j] of the shapes `shape`.
 
-        Of free sources alone, 0 of those whose arrays[s] is None.
+        It contains free sources alone, and 0 for those whose arrays[s] is None.
         """
         out = np.zeros(self.size)
         for s, scales in enumerate(arrays):

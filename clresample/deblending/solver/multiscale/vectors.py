@@ -70,7 +70,7 @@ class SolverVectors:
     def split(self, vector):
         """Splits a host vector by scenes: coefficients [s][j], spectra (n, C) and sky (C,).
 
-        Coefficients (ny_j, nx_j).
+        Coefficients have the shape (ny_j, nx_j).
         """
         values = self.buffers.device.get(vector).astype(np.float64)
         structure = self.latents.unpack(values)
@@ -116,7 +116,7 @@ class SolverVectors:
     def start(self, structure, spectra, sky, inverse_curvature):
         """Uploads x and the first trial: z (latents.size,), spectra (S, C), sky (B, C).
 
-        And h of the latter two.
+        Also uploads h of the spectra and the sky.
         """
         upload, nothing = self.buffers.device.upload, np.zeros(self.latents.size)
         there, h = (

@@ -68,10 +68,7 @@ class WindowGroups:
 
 
 def reach_of(plan):
-    """Distance [model px] to which the light of a group is followed.
-
-    As far as frames are padded.
-    """
+    """Distance [model px] to which the light of a group is followed: the frames' padding."""
     return max(plan.certificate.wrap_radius_px)
 
 
