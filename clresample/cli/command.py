@@ -1,4 +1,4 @@
-"""The command `clresample`: one function per subcommand adds its parser and names what runs.
+"""The command `clresample`: one function per subcommand adds its parser and its function.
 
 A subcommand's function takes argparse's subparsers, adds its own, and calls
 `parser.set_defaults(run=...)`; `run(arguments)` returns an exit status, None being 0. It raises
@@ -106,7 +106,7 @@ def _fail(arguments, message):
 
 @contextmanager
 def _ended_as_interrupted():
-    """The signal to end, SIGTERM, counts as Ctrl-C: fits end with what they have, no part stays."""
+    """Treats SIGTERM like Ctrl-C: fits end with their present state, no partial file stays."""
 
     def interrupt(*_):
         raise KeyboardInterrupt

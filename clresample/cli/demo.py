@@ -60,7 +60,7 @@ def fit_all(scene, *, device=None):
 
 
 def run(folder="demo", *, device=None):
-    """Makes the demonstration's files in `folder`; returns what `fit_all` does and the files."""
+    """Makes the demonstration's files in `folder`; returns `fit_all`'s result and the files."""
     folder, device = Path(folder), get_device(device)
     sky = {"angle_deg": ANGLE_DEG, "center_deg": CENTER_DEG, "spectra": "smooth"}
     scene = simulate_scene(SEED, n_sources=N_SOURCES, **sky)

@@ -31,7 +31,7 @@ def add_profile_option(parser):
 
 
 def add_dtype_option(parser, what):
-    """Adds `--dtype`, the floating type of `what`."""
+    """Adds `--dtype`, the floating type of a quantity."""
     parser.add_argument(
         "--dtype",
         choices=("float32", "float64"),

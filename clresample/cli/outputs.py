@@ -41,7 +41,7 @@ def check_scene(arguments, scene, paths):
 
 
 def file_outputs(arguments, inputs):
-    """The paths of OUT and, if it is asked for, PNG.
+    """The paths of OUT and, if requested, PNG.
 
     Raises ValueError where one of them could not be written, or is a file that is read.
     """

@@ -97,7 +97,7 @@ def write_surveys(folder, field, *, overwrite=True) -> list[Path]:
 
 
 def _written(write, folder, field, overwrite):
-    """The paths of what write(part, field) has put into a folder `part`, moved to `folder`."""
+    """Moves the files that write(part, field) made in a folder `part` to `folder`; their paths."""
     from ..files.atomic import atomic_tree
 
     with atomic_tree(folder, overwrite=overwrite) as part:

@@ -142,7 +142,7 @@ def deblend_many(
 
 @one_blas_thread()
 def _fit_all(blends, *, device, progress=lambda n_done: None, **given):
-    """(Result or Failure, what is warned about: sources far from any light, problems)."""
+    """(Result or Failure, its warnings: sources far from any light, problems)."""
     many = _BatchRunner(blends, device, **given)
     # the results of what was not done say so
     with contextlib.suppress(KeyboardInterrupt):
@@ -283,13 +283,13 @@ def _listed(name, values):
 
 
 def _failure(blend, error):
-    """The Failure of a blend that ended with an exception, which its status tells."""
+    """The Failure of a blend that ended with an exception, with that in its status."""
     kind = "" if isinstance(error, ERRORS) else f"{type(error).__name__}: "
     return Failure(blend, f"failed: {kind}{error}")
 
 
 def _sizes(blend):
-    """The shapes of a blend's images and of its frame; None of what is no blend."""
+    """The shapes of a blend's images and of its frame; None for an invalid blend."""
     try:
         blend.check()
     except (ValueError, TypeError, AttributeError):

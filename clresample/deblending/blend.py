@@ -28,7 +28,7 @@ BYTES_A_BOX, BOX_PIXELS, BYTES_A_PIXEL = 40, 256 * 256, 100
 
 @dataclass(frozen=True)
 class Blend:
-    """One patch of sky: what was seen, and what is there.
+    """One patch of sky: its observations and its sources.
 
     observations: at least one Observation; sources: Point and Extended
     frame: the model's Frame; None = `model_frame` of the observations

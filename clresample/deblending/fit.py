@@ -37,7 +37,7 @@ DIVERGED = 10.0
 
 @dataclass(frozen=True, eq=False)
 class _BestState:
-    """The lowest loss so far, and what it belongs to."""
+    """The lowest loss so far, with its scene, state and shifts."""
 
     loss: float
     scene: Scene | None
@@ -246,7 +246,7 @@ def _joined(parts, n_channels):
 
 
 def _model(fit) -> MorphologyModel:
-    """A fit's morphologies as they are by now, max = 1, and what sees them."""
+    """A fit's present morphologies, max = 1, and the views that render them."""
     pairs = zip(fit.views, fit.blend.observations, strict=True)
     return MorphologyModel(
         fit.padded.shape,

@@ -131,7 +131,7 @@ class Result(ResultDisplay):
         ]
 
     def source_model(self, i_source, i_observation=None) -> np.ndarray:
-        """One source (C, Ny, Nx) in the model frame, or (Co, My, Mx) as an observation sees it.
+        """One source (C, Ny, Nx) in the model frame, or (Co, My, Mx) rendered in an observation.
 
         i_observation: number or name of the observation; None = the model frame
         """
@@ -147,7 +147,7 @@ class Result(ResultDisplay):
         return sum((c.spectrum[channels, None, None] * unit[i] for i, c in parts), zero)
 
     def as_galsim(self, i_source, channel):
-        """One source as GalSim sees it: galsim.InterpolatedImage, under the frame's PSF.
+        """One source as a GalSim object: galsim.InterpolatedImage, under the frame's PSF.
 
         i_source: its number; channel: a name, or a number in the order of `channels`
         returns the profile about the source's position [arcsec, u to the west, v to the north],
@@ -165,7 +165,7 @@ class Result(ResultDisplay):
         return profile_of(self.source_model(i_source)[channel], self.frame.grid, position)
 
     def model(self, i_observation) -> np.ndarray:
-        """All sources and the sky (Co, My, Mx) [counts] as an observation sees them.
+        """All sources and the sky (Co, My, Mx) [counts], rendered in an observation.
 
         i_observation: its number or name
         """

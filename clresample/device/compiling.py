@@ -20,7 +20,7 @@ class CompilationNotice:
         self.device, self._lock, self._is_said = device, threading.Lock(), False
 
     def build(self, build):
-        """Returns `build()`, and tells the user if it took longer than a cache does."""
+        """Returns `build()`, and reports if it took longer than a cached build."""
         began = time.thread_time()
         built = build()
         if time.thread_time() - began > MAX_CACHED_S:

@@ -154,7 +154,7 @@ class Contraction:
         self.options |= {epilogue: True} if epilogue else {}
 
     def build(self, n_rows=None, n_terms=0, n=0):
-        """(file, macros) for matrices of so many rows, terms and columns; of most, if not given."""
+        """(file, macros) for numbers of rows, terms and columns; by default the largest."""
         tile = self.tuning.tile_for(n_rows) if n_rows else self.tuning.tile
         if "KB" not in tile:
             own = {"RT": ROW_TILES, "READ_AHEAD": self.tuning.prefetch_columns}

@@ -1,4 +1,4 @@
-"""One OpenCL device: its memory, its kernels, and what is copied and launched there.
+"""One OpenCL device: its memory, kernels, copies and launches.
 
 What waits, waits for an event, though copies from and to the host are blocking ones and OpenCL has
 clFinish: Mesa's rusticl (22.3) comes back from both too early where another thread, on its way to
@@ -212,7 +212,7 @@ def _buffer_type():
 
 
 def get_device(choice=None) -> Device:
-    """The chosen device; asked twice it is the same object.
+    """The chosen device; repeated calls return the same object.
 
     choice: None, a Device, an index, "platform:device" (each an index or part of a name), or part
         of a device's or platform's name. None reads CLRESAMPLE_DEVICE (the same forms), then

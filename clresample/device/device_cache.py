@@ -18,11 +18,11 @@ from .. import __version__
 
 
 class DeviceWarning(UserWarning):
-    """Something about a device that a user should know, in one line."""
+    """A message about a device for the user, in one line."""
 
 
 def cache_folder():
-    """Folder of what can be made again: CLRESAMPLE_CACHE, or the system's place."""
+    """Folder of files that can be made again: CLRESAMPLE_CACHE, or the system's cache."""
     given = os.environ.get("CLRESAMPLE_CACHE")
     return Path(given) if given else system_caches() / "clresample"
 

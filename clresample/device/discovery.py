@@ -40,7 +40,7 @@ __kernel void probe(__global double *x) { x[0] = x[0] / 3.0; }
 
 
 class DeviceError(RuntimeError):
-    """The device cannot do what was asked; the message says why and what to do about it."""
+    """A failed operation of a device; the message has the reason and the remedy."""
 
 
 @dataclass(frozen=True)

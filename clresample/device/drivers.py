@@ -125,7 +125,7 @@ def warn_named_library(library, served):
 
 
 def _platforms_of(library):
-    """Addresses of a driver library's platforms, None of what is no driver: as the loader asks."""
+    """Addresses of a driver library's platforms, as for the loader; None if not a driver."""
     find = getattr(library, "clGetExtensionFunctionAddress", None)
     if find is None:
         return None
@@ -187,7 +187,7 @@ def driver_advice(vendor, path, served):
 
 
 def icd_export_line(path):
-    """The line to type, without root, that lets clresample see the driver library at `path`."""
+    """The shell command, without root, that registers the driver library at `path`."""
     return f"export CLRESAMPLE_ICD={path}"
 
 

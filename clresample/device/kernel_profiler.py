@@ -141,7 +141,7 @@ _PROFILES: list[KernelProfiler] = []
 
 
 def start_profiling(name):
-    """A Profile for a device that is opened now; None where CLRESAMPLE_PROFILE does not ask."""
+    """A KernelProfiler of a newly opened device; None unless CLRESAMPLE_PROFILE is set."""
     if os.environ.get("CLRESAMPLE_PROFILE", "0") in ("", "0"):
         return None
     return _begun(name)

@@ -80,7 +80,7 @@ def host_threads(device):
 
 
 def map_threads(n_threads, function, items):
-    """[function(item), ...] of items, in their order, so many at a time.
+    """[function(item), ...] of items, in their order, a number at a time.
 
     For calls that spend their time in large products of NumPy's, for which other threads need not
     wait.
@@ -134,7 +134,7 @@ def prefetch(items):
 
 
 def distribute(function, items, devices, *, done, most):
-    """Have several devices work through `items`; returns what they made, in the items' order.
+    """Distributes `items` to several devices; returns the results in the items' order.
 
     function(items, device=) -> [result, ...]: picklable, as are items and results
     devices: choices as `get_device` takes them, at least one; one named twice gets two processes

@@ -87,7 +87,7 @@ class Programs:
         self._notice = CompilationNotice(device.name)
 
     def kernel(self, file, name, dtype, defines):
-        """A pyopencl.Kernel that knows its scalars' types, and {argument: whether it is a buffer}.
+        """A pyopencl.Kernel with its scalars' types, and {argument: True for a buffer}.
 
         DeviceError: the file does not build here (with the compiler's log), or no float64
         ValueError: dtype is another, or the file has no such kernel
@@ -122,7 +122,7 @@ class Programs:
         threading.Thread(target=build).start()
 
     def _program(self, file, dtype, defines):
-        """A program, built by the first thread that asks for it; the others wait."""
+        """A program, built by the first thread that requests it; the others wait."""
         build, mine = _request(file, dtype, defines), Future()
         program = self._programs.setdefault(build, mine)
         if program is mine:
@@ -145,7 +145,7 @@ class Programs:
 
 
 def _request(file, dtype, defines):
-    """Key by which programs are told apart."""
+    """Key that identifies a program."""
     return file, np.dtype(dtype), tuple(sorted(defines.items()))
 
 

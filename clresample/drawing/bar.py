@@ -61,5 +61,5 @@ def tell(line):
 
 
 def _is_watched():
-    """Returns True if someone looks: a terminal, or a notebook's kernel."""
+    """Returns True if the output is interactive: a terminal, or a notebook's kernel."""
     return sys.stderr.isatty() or "ipykernel" in sys.modules

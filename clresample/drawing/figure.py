@@ -31,7 +31,7 @@ def stretch(image, limits):
 
 
 def import_figure():
-    """matplotlib's Figure. Raises ImportError that says what to install."""
+    """matplotlib's Figure. Raises ImportError that names the package to install."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:

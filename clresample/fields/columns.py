@@ -115,7 +115,7 @@ def finalise_catalogue(job, parts, last, unsettled=()):
 
 
 def _order(job, names):
-    """Names of columns: who and where, how it went, positions and shapes, then all channels."""
+    """Names of columns: ids, status, positions and shapes, then all channels."""
     channels, labels = job.channels, [m.name for m in job.mosaics]
     kinds = "flux", "flux_err", "mag", "mag_err", "group_flux", "group_flux_err"
     fluxes = [f"{key}_{b}" for b in job.bands for key in kinds]

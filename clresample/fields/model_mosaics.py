@@ -74,7 +74,7 @@ def _write_cube(path, header, mosaic, here, model, residual):
 
 
 def _read(channel, box):
-    """Pixels of a channel; NaN where they cannot be read, which the blends there say too."""
+    """Pixels of a channel; NaN where they cannot be read."""
     try:
         return channel.read(box)
     except FileError:

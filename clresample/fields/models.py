@@ -77,7 +77,7 @@ def write_models(path, job, parts, last, ids):
 
 
 class ModelFile:
-    """The models of a field, opened: what is small in memory, pixels read when they are asked for.
+    """The models of a field, opened: tables in memory, pixels read when used.
 
     path: of models.fits
     table: COMPONENT_COLUMNS {name: (n,) int64} of all components; spectra (n, C) [counts]

@@ -117,5 +117,5 @@ class RunProgress:
         LOG.info(text)
 
     def dashboard(self, address):
-        """The address of a page that shows what the workers do, where there is one: a line."""
+        """Reports the address of the page that shows the workers' tasks, if there is one."""
         self.message(f"dashboard: {address}")

@@ -153,7 +153,7 @@ class _Clock:
 
 
 def free_memory() -> int:
-    """Memory [bytes] of this machine that is free; 2 GiB where it does not say."""
+    """Free memory [bytes] of this machine; 2 GiB if unknown."""
     try:
         return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (ValueError, OSError, AttributeError):

@@ -222,7 +222,7 @@ class _Outputs:
 
 
 def remove_stale(folder):
-    """Clear away what this user's killed runs on this machine left in a folder."""
+    """Removes files in a folder left by this user's killed runs on this machine."""
     if os.name != "posix":  # elsewhere none can be asked whether it is alive
         return
     for entry in list(os.scandir(folder)):
@@ -266,7 +266,7 @@ def _alive(pid):
 
 
 def _new_folder(home):
-    """A folder of this run in another one, which nobody else can have made."""
+    """A folder of this run in another one, with a unique name."""
     folder = home / f".part-{HOST}-{os.getpid()}-{secrets.token_hex(8)}"
     folder.mkdir()
     return folder

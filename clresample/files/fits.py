@@ -256,7 +256,7 @@ def band_names(header, n_bands):
 
 
 def choose_bands(path, names, bands):
-    """Indices of the bands asked for by number or name; FileError for one that is not there."""
+    """Indices of bands selected by number or name. Raises FileError for an unknown band."""
     if bands is None:
         return list(range(len(names)))
     chosen = []

@@ -221,7 +221,7 @@ def _about_table(about):
 
 
 def _placed(grid, number):
-    """WCS cards that give back the same float64, and HDUs of look-up tables.
+    """WCS cards that restore the same float64, and HDUs of look-up tables.
 
     number: of the grid in the file, which sets the version numbers of its tables apart
     """

@@ -31,7 +31,7 @@ def is_number(value):
 
 
 def is_list_of(fits):
-    """Returns True if a value is a list of at least one, each of which fits."""
+    """Returns True if a value is a list, not empty, of valid items."""
     return lambda value: isinstance(value, list) and len(value) > 0 and all(map(fits, value))
 
 
@@ -102,7 +102,7 @@ TABLES = {
 
 
 def read_tables(path, what) -> dict:
-    """The tables of a TOML file, unchecked; `what` it is called in messages. Raises SceneError."""
+    """The tables of a TOML file, unchecked; `what`: its kind in messages. Raises SceneError."""
     if Path(path).exists() and not Path(path).is_file():  # reading it might never end
         raise SceneError(f"{path}: is no regular file")
     try:

@@ -238,7 +238,7 @@ def _released(centroid, second, moved):
 
 
 def _scatter(slopes, covariance):
-    """Errors (n,) of quantities with slopes (n, k) by what has a covariance (k, k)."""
+    """Errors (n,) of quantities with slopes (n, k) by variables of covariance (k, k)."""
     return np.sqrt(np.einsum("nk,kl,nl->n", slopes, covariance, slopes))
 
 

@@ -82,7 +82,7 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Bodies:
-    """The bodies of an image and what its peaks are to them.
+    """The bodies of an image, and the relation of its peaks to them.
 
     owners (S,): number of a peak's body, -1 for none; structure (S,) bool: peaks that are no source
     """

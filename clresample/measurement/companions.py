@@ -1,4 +1,4 @@
-"""Neighbours on the flanks of brighter sources: what their symmetry does not account for.
+"""Finds neighbours on the flanks of brighter sources by their asymmetry.
 
 A galaxy's light is much the same on both sides of its centre and falls outwards, a neighbour's is
 on one side. So the least light that a source has on each ring and on both sides,
@@ -116,7 +116,7 @@ def brightest_peak_near(rest, place, radius):
 
 
 def is_a_source(place, height, model, image, signals, centres, fwhm, scale):
-    """Returns True if a residual peak is a source of its own, as the head of this module says.
+    """Returns True if a residual peak is a source of its own, by this module's criteria.
 
     place (2,) ints: (y, x) of the peak; height [sigma]: of what is left there, as
     `brightest_peak_near` says

@@ -15,7 +15,7 @@ SAME_SOURCE = 0.7
 
 
 class Search:
-    """Sources of the searches so far, and what large galaxies' bodies make of them.
+    """Sources of the searches so far, and the bodies of large galaxies that contain them.
 
     positions (S), peaks (S) [sigma], labels (S), owners (S): number of a source's body, -1 = none
     """

@@ -75,7 +75,7 @@ class SignalToNoise:
         )
 
     def levelled(self):
-        """The same without smooth levels, see levels.py, and those of its sky alone (W,) [sigma].
+        """The signal without smooth levels (levels.py), and those of its sky alone (W,) [sigma].
 
         Sums of squares are left out where there is a level: they hold it in every channel.
         """
@@ -152,7 +152,7 @@ def signal_of(observation, frame, places=None) -> SignalToNoise:
 
 
 def _in_frame(images, seen, places):
-    """Images (n, My, Mx), and how many channels have seen each pixel, at places (Ny, Nx, 2) [px].
+    """Images (n, My, Mx) and the channels that cover each pixel, at places (Ny, Nx, 2) [px].
 
     Images are interpolated, 0 where nothing was seen; where all places are pixels they are taken.
     """

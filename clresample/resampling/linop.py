@@ -41,7 +41,7 @@ class LinOp:
         return ()
 
     def __getstate__(self):
-        """Without what belongs to one process: lock and staging arrays, which copies make anew."""
+        """State for copies, without lock and staging arrays, which they make anew."""
         return {k: v for k, v in self.__dict__.items() if k not in ("_staged", "_lock")}
 
     def __setstate__(self, state):
@@ -180,11 +180,11 @@ class HostLinOp(LinOp):
     """
 
     def _on_device(self, run, name, *call):
-        """Refused: there is no way in for device arrays."""
+        """Raises an error: device arrays are not accepted."""
         raise ValueError(f"{name} is on the device: {type(self).__name__} takes NumPy arrays")
 
     def _through_host(self, run, name, x, out, batched_x, batched_out, shape_result):
-        """`run` on a caller's NumPy arrays, copied only where dtype or layout ask for it."""
+        """`run` on a caller's NumPy arrays, copied only if dtype or layout require it."""
         x = _cast(name, x, self.dtype).reshape(batched_x)
         direct = out is not None and out.dtype == self.dtype and out.flags.c_contiguous
         direct = direct and not np.may_share_memory(x, out)

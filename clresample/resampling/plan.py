@@ -107,7 +107,7 @@ class ResamplingPlan:
         return own + lines + sum(plan.n_bytes for plan in self.windows.values())
 
     def window(self, shape, reach_px, precision: Precision, size=None) -> ResamplingPlan:
-        """The plan of a box of the model, by what its light reaches of the observation.
+        """The plan of a box of the model and the part of the observation that its light reaches.
 
         One for all boxes of a shape: those observed pixels lie about the box's middle, and how far
         off they are in truth is a shift of up to half an observed pixel. Not of distorted mappings,

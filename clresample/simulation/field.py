@@ -41,7 +41,7 @@ def simulate_field(
     bad_columns=0,
     center_deg=(150.0, 2.0),
 ) -> SimulatedField:
-    """A field as Euclid VIS and Rubin see it; one seed gives one field.
+    """Simulates a field of Euclid VIS and Rubin; one seed gives one field.
 
     seed: whole number; n_pixels: of Euclid a side; Rubin's mosaic holds the same sky
     sky: "plain", small parametric galaxies (`parametric_galaxy`) under Gaussian PSFs; "real",

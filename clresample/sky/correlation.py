@@ -1,4 +1,4 @@
-"""Correlated noise: what it is, how it is estimated, and the filter that makes it white.
+"""Correlated noise: its description, its estimate, and the filter that whitens it.
 
 Drizzled, resampled and stacked images share noise between neighbouring pixels. With sigma the
 standard deviation of single pixels (from the weights) and rho the correlation of two pixels,
@@ -115,7 +115,7 @@ class NoiseCorrelation(ReadOnly):
 
     @classmethod
     def estimate(cls, image, weights, *, max_lag_px=MAX_LAG_PX) -> NoiseCorrelation:
-        """From the blank sky of an image (Ny, Nx), weights (Ny, Nx): what is no source's light.
+        """Estimates it from the blank sky of an image (Ny, Nx) with weights (Ny, Nx).
 
         Blank are pixels under 3.5 sigma in a smoothed image, 5 pixels away from those above it.
         Raises ValueError where too little sky is left.
@@ -152,7 +152,7 @@ class NoiseCorrelation(ReadOnly):
         return ~binary_dilation(~good, np.ones(shape, bool), border_value=1)
 
     def error_factor(self, sigma_px):
-        """By how much white errors are too small for a round Gaussian source of this sigma [px].
+        """Factor by which white errors are too small for a round Gaussian source of sigma [px].
 
         The ratio of the true scatter of its matched (white) filter's flux to the one that white
         noise of the same variance per pixel gives: sqrt(sum rho a) / sqrt(a(0)), a the

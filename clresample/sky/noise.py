@@ -127,7 +127,7 @@ def _usable(image, mask):
 
 
 def weights_from(data, bad, given, mask, channels, unit=None):
-    """Weights (C, Ny, Nx), `n_invalid` and messages of an Observation, from what its user gave.
+    """Weights (C, Ny, Nx), `n_invalid` and messages of an Observation from its arguments.
 
     data (C, Ny, Nx) float64; bad (C, Ny, Nx) bool: pixels where they are NaN or infinite
     given: weights and variance, and mask: as in Observation, None where they are not given
@@ -172,7 +172,7 @@ def _has_gaps(name, values, data):
 
 
 def _weights_of(data, bad, given, mask, channels, unit, estimates):
-    """As `weights_from`, of values without gaps; what is estimated is added to `estimates`."""
+    """Like `weights_from`, for values without gaps; adds the estimates to `estimates`."""
     weights, variance = given
     masked, messages = mask, []
     if unit is not None:

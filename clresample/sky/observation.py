@@ -161,7 +161,7 @@ class Observation(ReadOnly, ObservationDisplay, DerivedQuantities):
 
     @classmethod
     def restore(cls, data, psf, grid, *, weights, n_invalid, messages, **given) -> Observation:
-        """An observation as it was made once, from what is read back.
+        """Restores an observation from values read back.
 
         n_invalid and messages are those that were found then. Raises ValueError as the constructor
         does.

@@ -180,7 +180,7 @@ def test_the_command_writes_many_sources_into_one_file(copied, field, tmp_path, 
     more = ["--overwrite", "--quiet", "--group", "--what", "model", "--observation", "Euclid"]
     assert main([*arguments, *more, "--size", "2arcsec", "--unit", "uJy"]) == 0
     (one,) = read_cutouts(out)
-    assert one.meta["CUTKIND"] == "model" and str(one.noise_unit) == "uJy" and one.shape == (20, 20)
+    assert one.meta["CUTKIND"] == "model" and str(one.unit) == "uJy" and one.shape == (20, 20)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""`clresample devices --bench`: what the chosen device does in a second."""
+"""`clresample devices --bench`: work of the chosen device in a second."""
 
 from __future__ import annotations
 

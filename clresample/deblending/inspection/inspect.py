@@ -1,4 +1,4 @@
-"""All checks of a blend's observations before its fit, with what is said and what is cured."""
+"""All checks of a blend's observations before its fit: messages and masks."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ def _level_lines(image, sky):
 
 
 def _unsure_lines(image, sky):
-    """Message about a fitted sky of which the SkyLevel says little; none where it says enough."""
+    """Message about a fitted sky whose SkyLevel is uncertain; none for a certain one."""
     seen = image.usable.any(axis=(1, 2))
     part, names = sky.error / image.sigma, image.observation.channels
     unsure = seen & (part > UNSURE_PART)
@@ -208,7 +208,7 @@ def _parts(image, level, chosen):
 
 
 def _spoilt(image):
-    """Pixels (C, My, Mx) to mask, and what is said of them."""
+    """Pixels (C, My, Mx) to mask, and messages about them."""
     names, lines = image.observation.channels, []
     full = spoilt.saturated(image)
     for c in np.flatnonzero(full.any(axis=(1, 2))):

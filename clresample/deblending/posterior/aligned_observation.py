@@ -92,7 +92,7 @@ class AlignedObservation:
         ).T  # fmt: skip
 
     def threads_for(self, images):
-        """Threads that share what is done with the images of a component."""
+        """Number of threads for the images of a component."""
         return self.n_threads if images.size > MIN_THREADED_ELEMENTS else 1
 
     def observe(self, images, i, origin, low, high):

@@ -100,7 +100,7 @@ class BlockCholesky:
                 yield self._below[v]
 
     def _eliminate(self, v, rest):
-        """Factor node v's columns, and take their products off what is left."""
+        """Factorises node v's columns and subtracts their products from the rest."""
         later = self._later[v]
         self._lower[v] = lower = np.linalg.cholesky(rest.pop((v, v)))
         if not later:
@@ -132,7 +132,7 @@ class BlockCholesky:
         return self._upwards(parts)
 
     def draw(self, normal):
-        """H^-1/2 of numbers (N,), node after node: arrays (n) that scatter as the inverse says."""
+        """H^-1/2 times numbers (N,), node after node: arrays (n) with the inverse as covariance."""
         return self._upwards(np.split(np.asarray(normal, float), np.cumsum(self.sizes)[:-1]))
 
     def _upwards(self, parts):

@@ -211,7 +211,7 @@ def make_joint_step(fit, scene, state, findings):
 
 
 def solve_joint_step(exchange, slopes):
-    """An Exchange's step, None where its matrix is not positive definite, and what that gains."""
+    """Step and gain of a JointNewtonStep; None, 0 if its matrix is not positive definite."""
     try:
         *step, gain = exchange.step(slopes)
     except np.linalg.LinAlgError:

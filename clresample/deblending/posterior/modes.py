@@ -56,7 +56,7 @@ def clipped_power(unlikeness, exponent):
 
 
 def _unlike(energy, determined):
-    """Unlikeness by |z|^2 of the structure and how many numbers of it the data determine."""
+    """Unlikeness by |z|^2 of the structure and the number of its determined coefficients."""
     return np.sqrt((energy + WEIGHT * STRENGTH**2) / (determined + WEIGHT)) / STRENGTH
 
 

@@ -101,7 +101,7 @@ def whitening_transform(precision):
 
 
 def _without_faint(table):
-    """A table in float32, with what is TINY set to 0."""
+    """A table in float32, with TINY values set to 0."""
     size = np.abs(table)
     return np.where(size > TINY * size.max(initial=0), table, 0).astype(np.float32)
 

@@ -58,7 +58,7 @@ class GradientTest:
 
 
 def run_gradient_tests(fits):
-    """Asked (n) of Fits of one signature; None for those with nothing to ask."""
+    """GradientTests (n) of Fits of one signature; None for fits without candidates."""
     which = [_candidates(fit) for fit in fits]
     going = [i for i, own in enumerate(which) if len(own)]
     out: list[GradientTest | None] = [None] * len(fits)
@@ -71,7 +71,7 @@ def run_gradient_tests(fits):
 
 
 def _candidates(fit):
-    """Components (k,) of a finished Fit whose sources let the data choose, bright enough to ask."""
+    """Components (k,) of a finished Fit that are bright enough for the test."""
     if (
         not fit.settings.has_multiscale_prior
         or fit.strength_estimates is None
@@ -87,7 +87,7 @@ def _candidates(fit):
 
 
 def _is_free(source):
-    """Returns True if the data choose how many components a source has."""
+    """Returns True if the data choose a source's number of components."""
     return (
         isinstance(source, ExtendedSource)
         and source.n_components is None

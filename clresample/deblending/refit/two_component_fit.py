@@ -128,7 +128,7 @@ def _is_better(second, first, more=0.0):
 
 
 def _half_chi2(fit):
-    """The loss of a finished fit without what its structure costs."""
+    """The loss of a finished fit without the prior's term of its structure."""
     free, found = ~fit.scene.fixed, fit.strength_estimates
     return fit.losses[-1] - 0.5 * (found.energies[free] / found.strengths[free] ** 2).sum()
 

@@ -44,7 +44,7 @@ class StepSizes:
 
 
 class AMSGrad:
-    """The steps of one batch. What `Engine` asks of an update: to be made so, `step`, `memories`.
+    """The steps of one batch. `Engine` needs of an update this signature, `step`, `memories`.
 
     buffers: the batch, whose latent, morph, spectra and sky are stepped along d_morph, d_spectra
     gradient: its Gradient, for the sky; states: the scenes' States, for what they remember
@@ -143,7 +143,7 @@ class _LatentStep:
 
 
 class _MorphologyStep:
-    """Steps S itself along dS; what a normalisation divides it by multiplies its spectrum."""
+    """Steps S itself along dS; a normalisation of S multiplies its spectrum by the divisor."""
 
     def __init__(self, buffers, moments, factor, step_sizes):
         b, self.step_size = buffers, step_sizes.morphology

@@ -103,7 +103,7 @@ class Boxes:
 
 
 class DeviceBoxes:
-    """Boxes and what kernels need of them on one device.
+    """Boxes and their tables for kernels on one device.
 
     boxes: the Boxes; device: the Device
     table (S, 8): int32, columns COLUMNS; everyone (S,): int32, the indices of all sources

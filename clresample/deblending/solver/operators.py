@@ -26,7 +26,7 @@ class SceneOperator(LinOp):
         super().__init__(buffers.device, buffers.dtype, shape_in, shape_out)
 
     def _refuse_batch(self, x):
-        """The kernels know one buffer of each kind: the scenes of a batch are inside an item."""
+        """Copies have one buffer of each kind: the scenes of a batch are inside an item."""
         if len(x) != 1:
             raise ValueError(
                 f"a batch of {len(x)} items is given; {type(self).__name__} takes one, which holds "

@@ -22,7 +22,7 @@ WHOLE_PX = 160**2
 
 @dataclass(frozen=True, eq=False)
 class MorphologyModel:
-    """The morphologies of a scene, and what sees them.
+    """The morphologies of a scene, and the views that render them.
 
     frame (2,) [px]: its shape, padding included
     views: WhitenedViews; unfiltered_views: others like them, or None where the view itself is as
@@ -138,7 +138,7 @@ def _looking(views, components, fit_sky):
 
 
 def _taken(looking):
-    """Per scene and view, the ComponentImages of what is seen at present."""
+    """Per scene and view, the ComponentImages of the present components."""
     found = [[] for _ in range(looking.n_scenes)]
     for sight in looking.sights:
         seen, shape = looking.device.get(sight.seen), (sight.n_bands, sight.my, sight.mx)

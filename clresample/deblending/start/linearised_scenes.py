@@ -35,7 +35,7 @@ def linearise(views, components, precision, tolerance, *, fit_sky) -> Linearised
 
 
 class LinearisedScenes:
-    """The components of a group of scenes at some parameters, as all observations see them.
+    """The components of a batch of scenes at given parameters, rendered in all observations.
 
     components (N): all scenes' Components; sights: the observations; n_scenes: B; fit_sky
 

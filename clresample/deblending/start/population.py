@@ -142,7 +142,7 @@ def contamination_factors(normal, spectra, source):
 
 
 def em_step(off, variance, known, common, own):
-    """c and s (k, 2) after one step, and what each galaxy is then expected to scatter (k, n, 2).
+    """c and s (k, 2) after one step, and the expected scatter of each galaxy (k, n, 2).
 
     off, variance (k, n, 2): theta - mean, and how well each galaxy's is known, what was expected of
         it included, neighbours as they are

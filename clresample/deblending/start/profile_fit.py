@@ -150,7 +150,7 @@ class ProfileFit:
         self.looking.render(scenes, self.thetas(theta), self.brightness, slopes=slopes)
 
     def _chi2(self, scenes, theta):
-        """With what is expected (k,)."""
+        """With the priors (k,)."""
         return self.looking.compute_residuals(MODEL_ERROR) + self.population.penalty(scenes, theta)
 
     def _learn(self, scenes):

@@ -96,7 +96,7 @@ class StartingPoint:
         return image[0] / self.peaks[i]
 
     def reach(self, i, threshold):
-        """Middle (2,) and half size (2,) [px] of what of it is above a part of its peak."""
+        """Middle (2,) and half size (2,) [px] of its pixels above a part of its peak."""
         return self.shapes[i].bounding_box(self.thetas[i], self.drawn_positions[i], threshold)
 
 

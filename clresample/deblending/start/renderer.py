@@ -50,7 +50,7 @@ class BoxRenderer:
 
     @property
     def n_elements(self) -> int:
-        """Elements of one image as all bands see it."""
+        """Elements of one image in all bands."""
         return self.executor.n_bands * int(np.prod(self.size))
 
     def __call__(self, images, i_image, seen, i_seen, n, which, moves, shares=None):
@@ -78,7 +78,7 @@ class BoxRenderer:
             e.frequencies_to_pixels(ImageBatch(seen.base_data, to, w_y * w_x, w_x), m * e.n_bands)
 
     def _reserve(self, n_images):
-        """Makes room for so many images at a time."""
+        """Reserves memory for a number of images at a time."""
         if n_images <= self._capacity:
             return
         # twice as many at a time, as slots of this size come and go; no more than one launch takes

@@ -19,7 +19,7 @@ LIGHT_PX = 3.0
 
 
 class SlotObservation:
-    """One observation of each of B scenes, and the slots that it sees at present.
+    """One observation of each of B scenes, and the slots rendered in it at present.
 
     views (B): WhitenedViews of equal shapes; channels: slice of all the scenes' channels
     precision, tolerance: see RenderPlanner

@@ -62,7 +62,7 @@ def make_blend(patch, plan, mosaics, reference, labels, corner, neighbours=None,
 
 
 def fit_box(mosaic, grid) -> Box:
-    """The pixels of a mosaic whose centres lie on a grid: those that a fit in it looks at.
+    """The pixels of a mosaic whose centres lie on a grid: those of a fit in it.
 
     Where noise is correlated, one more on each side: the filter that makes it white leaves a
     cutout's outer pixels without a weight. Grids of one shape have Boxes of one shape, so that

@@ -94,7 +94,7 @@ class FitPlan:
         )
 
     def restricted_to(self, core) -> FitPlan:
-        """The plan of what is needed for the sources in a Box: blends that have one there."""
+        """The plan of the sources in a Box: the blends with a source there."""
         inside = core.contains(self.positions)
         parents = {p.parent for p in self.patches if inside[list(p.sources)].any()}
 

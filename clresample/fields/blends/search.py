@@ -115,7 +115,7 @@ def snr_scatter(mosaics, reference) -> dict:
 
 
 def observations_on(mosaics, reference, box):
-    """The Observations of all mosaics on a Box of the model's pixels, those that see it.
+    """The Observations of all mosaics that overlap a Box of the model's pixels.
 
     Their PSFs are those of the mosaics' middles, so that signal to noise does not depend on the
     Box. Where a PSF is wider than its filter by a tenth, that costs half a percent of it.

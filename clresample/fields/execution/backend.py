@@ -57,7 +57,7 @@ class LocalWorkers:
 
     @property
     def device_shares(self) -> list[tuple]:
-        """Each device, and how many workers share it at most."""
+        """Each device, and the largest number of workers that share it."""
         n = -(-max(self.n_workers, 1) // len(self.devices))
         return [(device, n) for device in self.devices]
 
@@ -79,7 +79,7 @@ class LocalWorkers:
 
 
 def make_backend(options, progress):
-    """The engine that FieldOptions ask for. Raises ImportError, ValueError for a cluster's."""
+    """The backend of FieldOptions. Raises ImportError or ValueError for a cluster's."""
     devices = options.devices
     if options.scheduler is not None:
         from .cluster import DaskCluster

@@ -82,7 +82,7 @@ class DaskCluster:
 
     @property
     def device_shares(self) -> list[tuple]:
-        """Each device, and how many workers share it: one."""
+        """Each device, and the number of workers that share it: one."""
         return [(device, 1) for device in self.seats.devices or (None,)]
 
     def close(self):
@@ -188,7 +188,7 @@ class _Run:
         return outcome
 
     def _answer(self, seat, future):
-        """(value, reason, whether the worker is gone) of a task that has ended, its file kept."""
+        """(value, reason, True if the worker died) of a finished task; stores its file."""
         try:
             (value, content), reason = future.result(timeout=FETCH_S)
         except DeviceError as error:  # as the worker opened it
@@ -219,7 +219,7 @@ def _version():
 
 
 def _opened(blob, n_beside):
-    """The context on a worker, which shares its host's processor with so many."""
+    """The context on a worker, with the number of workers on its host's processor."""
     from distributed import get_worker
 
     for name, value in thread_environment(n_beside).items():

@@ -181,7 +181,7 @@ def _source(patch, number, y, x, host):
 
 
 def is_large(n_sources, shape):
-    """Returns True if a fit of so many sources has over LARGE model pixels times them.
+    """Returns True if a fit has more than LARGE model pixels times sources.
 
     shape (2,) [px].
     """

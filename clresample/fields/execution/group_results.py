@@ -70,7 +70,7 @@ class GroupResults:
         self.n_flat += morphology.size
 
     def add_model(self, patch, i_mosaic, box, model):
-        """All sources of a patch (C, Ny, Nx) [counts] as a mosaic sees them on a Box."""
+        """All sources of a patch (C, Ny, Nx) [counts], rendered on a Box of a mosaic."""
         self.models.append((patch.number, i_mosaic, *box, self.n_pixels))
         self.pixels.append(np.ravel(model).astype(np.float32))
         self.n_pixels += model.size

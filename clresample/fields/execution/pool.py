@@ -150,7 +150,7 @@ class WorkerPool:
         return found
 
     def _added(self, most):
-        """New workers on empty seats, so many at most."""
+        """Starts workers on empty seats, a given number at most."""
         free = sorted(self._faults.keys() - {w.seat for w in self._workers})
         n_before = len(self._workers)
         for seat in free[:most]:

@@ -13,7 +13,7 @@ PR_SET_PDEATHSIG = 1  # of prctl(2)
 
 
 def thread_environment(n_workers) -> dict:
-    """Environment of a worker that shares this machine's processor with so many, itself included.
+    """Environment of a worker, one of a number that share this machine's processor.
 
     NumPy's libraries get one thread, PoCL's CPU device its part of all, by the names of its older
     and newer versions.

@@ -1,4 +1,4 @@
-"""FIELD.toml: the mosaics of a field, opened, and how it is run.
+"""Reads FIELD.toml: opens the mosaics of a field and the options of its run.
 
     [[mosaic]]                      one table for each instrument
     [sources] or [detection]        a catalogue, or how to look for sources

@@ -97,7 +97,7 @@ def write_cell_coadd(
 
 
 def _tree(band, shape, cells, cell_px):
-    """The HDU of the tree, as far as it says where the PSF's cells lie."""
+    """The HDU of the tree, with the positions of the PSF's cells alone."""
     whole = {axis: {"start": 0, "stop": n * cell_px} for axis, n in zip("yx", cells, strict=True)}
     bounds = {
         "grid": {"bbox": whole, "cell_shape": {"y": cell_px, "x": cell_px}},

@@ -60,7 +60,7 @@ class Instrument:
 
 
 def instruments_in(folder, notes, names):
-    """The instruments of a folder, the smallest pixels first; what cannot be read gets a note.
+    """The instruments of a folder, smallest pixels first; unreadable ones get a note.
 
     names: {part of a file's name: name of the mosaic}, as far as they are known
     """

@@ -134,7 +134,7 @@ def _json(path, notes):
 
 
 def _done(work):
-    """{"tiles searched": ..., "fits": ...} of an unfinished run: (done, of how many or None)."""
+    """{"tiles searched": ..., "fits": ...} of an unfinished run: (done, total or None)."""
     tiles = len(list(work.glob("tile-*.npz")))
     notes: list[str] = []
     plan = _json(work / "plan.json", notes) if (work / "plan.json").is_file() else None

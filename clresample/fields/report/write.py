@@ -96,7 +96,7 @@ def _inputs(folder, truth):
 
 
 def _pyramids(run, budget, notes):
-    """Tiles of all instruments; each gets its share of the bytes by what it would take."""
+    """Tiles of all instruments, with bytes divided in proportion to their full sizes."""
     found: list = []
     wanted = [full_bytes(one) for one in run.instruments]
     for k, one in enumerate(run.instruments):

@@ -94,7 +94,7 @@ def mask_of(values):
 
 
 def split_mask(name, values):
-    """Values with what is masked in them filled by 0, and where that was; None = nowhere."""
+    """Fills masked values with 0; also returns their mask, None without any."""
     mask = mask_of(values)
     if mask is None:
         return values, None

@@ -11,7 +11,7 @@ from ..psf import PSF
 
 
 class PSFField(ABC):
-    """The PSF of an image wherever it is asked for.
+    """The PSF of an image at any position.
 
     n_bands: of the PSFs that it returns; varies: whether they are not all the same
     """

@@ -197,7 +197,7 @@ def _begins(latents, states):
 
 
 def _that_learned(states, parts, known):
-    """States with what was learned; parts: see `SolverVectors.split`.
+    """States with structure and strengths; parts: see `SolverVectors.split`.
 
     known: `PriorStrengths.by_scene`.
     """

@@ -177,7 +177,7 @@ class LbfgsControl:
         return mode, self._length, bare
 
     def _fallen(self, n):
-        """By how much the losses (B,) fell over the last n iterations, a number or (B,)."""
+        """Decrease of the losses (B,) over the last n iterations, a number or (B,)."""
         before = np.take_along_axis(self._losses, np.broadcast_to(n, len(self.loss))[:, None], 1)
         with np.errstate(invalid="ignore"):  # of scenes without a loss so far
             return before[:, 0] - self._losses[:, 0]

@@ -66,7 +66,7 @@ class FrameRendering:
         self._composition.gather_boxed(self._model, spectra, d_morph, active, add=add)
 
     def update_shifts(self):
-        """Nothing to do: what it has of the operator is the operator's own."""
+        """Does nothing: the operator owns its shifts."""
 
 
 class BoxTransformRendering:
@@ -125,7 +125,7 @@ class BoxTransformRendering:
 
 
 class _Boxes:
-    """The sources' boxes as an operator's tables see them, and the products that transform them.
+    """The sources' boxes in an operator's tables, and the products that transform them.
 
     Rows and columns are those of the tables' axes, which may be the model's columns and rows.
     lines, planes: Boxes of (rows, k_pad) in (n_y, k_pad), and of all of (k_y, k_pad)
@@ -218,7 +218,7 @@ class _Boxes:
 
     @functools.cached_property
     def from_lines(self):
-        """lines, Tx[cols_s]^T -> lines Tx[cols_s]^T, added where that is asked for."""
+        """lines, Tx[cols_s]^T -> lines Tx[cols_s]^T, added if requested."""
         e, aligned = self._executor, self._column0 // COLUMN_PAD * COLUMN_PAD
         return BoxedProduct(
             self._buffers,
