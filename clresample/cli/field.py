@@ -107,7 +107,7 @@ def _part(text):
     """I/N as two whole numbers."""
     i, _, n = text.partition("/")
     if not (i.isdecimal() and n.isdecimal() and 1 <= int(i) <= int(n)):
-        raise argparse.ArgumentTypeError(f"{text!r} is no part such as 2/4")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a part: use for example 2/4")
     return int(i), int(n)
 
 

@@ -78,7 +78,7 @@ def byte_size(text):
     except ValueError:
         n_bytes = 0
     if not 1 <= n_bytes < 1 << 63:
-        raise argparse.ArgumentTypeError(f"{text!r} is no size, such as 512M or 2G")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size: use for example 512M or 2G")
     return int(n_bytes)
 
 

@@ -71,8 +71,8 @@ class Blend:
         if n > MAX_COMPONENTS or n_bytes > MAX_BYTES:
             raise ValueError(
                 f"{len(self.sources)} sources with {n} components on {n_pixels} model pixels need "
-                f"{n_bytes / 2**30:.3g} GiB in one fit; it takes {MAX_COMPONENTS} components and "
-                f"{MAX_BYTES >> 30} GiB at most: cut the field into blends for deblend_many"
+                f"{n_bytes / 2**30:.3g} GiB in one fit, must be at most {MAX_COMPONENTS} "
+                f"components and {MAX_BYTES >> 30} GiB: cut the field into blends for deblend_many"
             )
 
     def initial_shifts(self) -> np.ndarray:

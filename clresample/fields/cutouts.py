@@ -132,7 +132,7 @@ class FieldCutouts:
         ids = [int(one) for one in np.atleast_1d(source)]
         for one in ids:
             if one not in self._row:
-                raise ValueError(f"source is {one}, which is no id of {self.folder}")
+                raise ValueError(f"source is {one}, must be an id of {self.folder}")
         if group:
             groups = self.group_ids[[self._row[one] for one in ids]]
             ids = self.ids[np.isin(self.group_ids, groups)].tolist()

@@ -86,7 +86,7 @@ class Channel:
         Raises ValueError for a channel without a plane of them.
         """
         if self.weight is None:
-            raise ValueError(f"weight of channel {self.name!r} is None, it takes a plane")
+            raise ValueError(f"weight of channel {self.name!r} is None, must be a plane")
         values = np.asarray(self.weight.read(box), dtype=np.float64)
         if self.weight_kind == "weight":
             bad = ~np.isfinite(values) | (values < 0)

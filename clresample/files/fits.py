@@ -161,7 +161,7 @@ def open_fits(path):
     if not path.exists():
         raise FileError(f"{path}: no such file")
     if not path.is_file():  # reading it might never end
-        raise FileError(f"{path}: is no regular file, but a device, a pipe or a socket")
+        raise FileError(f"{path}: is not a regular file, but a device, a pipe or a socket")
     # astropy warns of every header that it repairs: recorded here and not shown
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", AstropyWarning)

@@ -104,7 +104,7 @@ TABLES = {
 def read_tables(path, what) -> dict:
     """The tables of a TOML file, unchecked; `what`: its kind in messages. Raises SceneError."""
     if Path(path).exists() and not Path(path).is_file():  # reading it might never end
-        raise SceneError(f"{path}: is no regular file")
+        raise SceneError(f"{path}: is not a regular file")
     try:
         with open(path, "rb") as file:
             return tomllib.load(file)
@@ -127,10 +127,10 @@ def check_table(where, name, table, tables, needed):
     check_names(where, table, rules, "key")
     for key in needed.get(name, ()):
         if key not in table:
-            raise SceneError(f"{where}: {key} is missing, it takes {rules[key].text}")
+            raise SceneError(f"{where}: {key} is missing, must be {rules[key].text}")
     for key, value in table.items():
         if not rules[key].fits(value):
-            raise SceneError(f"{where}: {key} is {value!r}, it takes {rules[key].text}")
+            raise SceneError(f"{where}: {key} is {value!r}, must be {rules[key].text}")
 
 
 def check_names(where, given, known, what):

@@ -61,7 +61,7 @@ class NoiseCorrelation(ReadOnly):
         rho = as_float_array("autocorrelation", autocorrelation)
         if rho.ndim != 2 or rho.shape[0] % 2 == 0 or rho.shape[1] % 2 == 0:
             raise ValueError(
-                f"autocorrelation has the shape {rho.shape}, it takes odd numbers of lags a side, "
+                f"autocorrelation has the shape {rho.shape}, must have odd numbers of lags a side, "
                 "(2L + 1, 2L + 1), lag 0 in the middle"
             )
         peak = rho[rho.shape[0] // 2, rho.shape[1] // 2]
@@ -291,7 +291,7 @@ def channel_correlations(noise, data, weights, channels):
         if isinstance(correlation, str):
             if correlation != "estimate":
                 raise ValueError(
-                    f'noise is {correlation!r}, it takes a NoiseCorrelation, an array or "estimate"'
+                    f'noise is {correlation!r}, must be a NoiseCorrelation, an array or "estimate"'
                 )
             try:
                 correlation = NoiseCorrelation.estimate(image, weight)

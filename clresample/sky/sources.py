@@ -59,7 +59,7 @@ class Source:
         if not plain and position.shape == (2,):
             object.__setattr__(self, name, tuple(map(float, position)))
         if position.shape != (2,) or not np.isfinite(position).all():
-            raise ValueError(f"{name} is {getattr(self, name)}, it takes two finite numbers")
+            raise ValueError(f"{name} is {getattr(self, name)}, must be two finite numbers")
         if self.observation is not None and self.position_px is None:
             raise ValueError(
                 f"observation is {self.observation!r}, but the position is on the sky: "

@@ -17,7 +17,7 @@ def _up_to(largest, said):
         except ValueError:
             number = -1.0
         if not 0 <= number <= largest:
-            raise argparse.ArgumentTypeError(f"{text!r} is no number {said}")
+            raise argparse.ArgumentTypeError(f"{text!r} is not a number {said}")
         return number
 
     return convert

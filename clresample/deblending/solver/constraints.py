@@ -81,7 +81,7 @@ class Prox:
             raise ValueError(f"morphs is {morphs.shape}, the boxes take ({boxes.boxes.size},)")
         if factor is not None and (factor.shape, factor.dtype) != ((n_sources,), morphs.dtype):
             raise ValueError(
-                f"factor is {factor.shape} {factor.dtype}, it takes ({n_sources},) {morphs.dtype}"
+                f"factor is {factor.shape} {factor.dtype}, must be ({n_sources},) {morphs.dtype}"
             )
         active = boxes.active(active)
         if active.size == 0:
@@ -183,7 +183,7 @@ class Monotone(Prox):
         """Weights of neighbours, and the smallest relative fall per pixel."""
         weights = np.asarray(self.parameters["weights"])
         if not np.isin(weights, list(MonotoneWeights)).all():
-            raise ValueError(f"weights is {weights}, it takes {[str(w) for w in MonotoneWeights]}")
+            raise ValueError(f"weights is {weights}, must be {[str(w) for w in MonotoneWeights]}")
         gradient = self.parameters["gradient"]
         return {"weights": weights}, {"gradient": _at_least_0("gradient", gradient, 1)}
 

@@ -171,7 +171,7 @@ def _frame(table, observations):
     if reference is not None:
         if reference not in names:
             raise ValueError(
-                f"frame: reference is {reference!r}, it takes the name of an observation: "
+                f"frame: reference is {reference!r}, must be the name of an observation: "
                 f"{', '.join(names)}"
             )
         grid = (grid_intersection if shared else grid_union)(

@@ -43,7 +43,7 @@ class PerBandPSF(PSFField):
         fields = tuple(fields)
         bands = [field.n_bands for field in fields]
         if not fields or set(bands) != {1}:
-            raise ValueError(f"fields have {bands} bands, it takes one or more with one band each")
+            raise ValueError(f"fields have {bands} bands, must be one or more with one band each")
         object.__setattr__(self, "fields", fields)
 
     @property

@@ -33,7 +33,7 @@ def read_survey(form, path, **given) -> Mosaic:
     cannot be imported or returns something else; FileError for what cannot be read.
     """
     if form not in READERS:
-        raise ValueError(f"format is {form!r}, it takes {', '.join(READERS)}")
+        raise ValueError(f"format is {form!r}, must be {', '.join(READERS)}")
     return check_instance(
         f"the result of the reader {form!r}", READERS[form](path, **given), Mosaic
     )

@@ -116,7 +116,7 @@ def _finished(folder, notes):
     if (folder / "fit_table.ecsv").is_file():
         fits = read_catalogue(folder / "fit_table.ecsv")
     else:
-        notes.append("fit_table.ecsv is not there: nothing is told of single fits")
+        notes.append("fit_table.ecsv does not exist: the report has no table of fits")
     return sources, fits
 
 

@@ -129,7 +129,7 @@ def check_dtype(dtype) -> np.dtype:
         found = None
     # NumPy's types equal whatever names them, and None names float64
     if found is None or found.kind != "f" or found.itemsize not in (4, 8):
-        raise ValueError(f"dtype is {dtype!r:.80}, allowed are float32 and float64")
+        raise ValueError(f"dtype is {dtype!r:.80}, must be float32 or float64")
     return found
 
 
