@@ -30,7 +30,7 @@ BYTES_A_BOX, BOX_PIXELS, BYTES_A_PIXEL = 40, 256 * 256, 100
 class Blend:
     """One patch of sky: its observations and its sources.
 
-    observations: at least one Observation; sources: Point and Extended
+    observations: at least one Observation; sources: PointSource and ExtendedSource
     frame: the model's Frame; None = `model_frame` of the observations
     shifts (n_observations, 2) [model px]: of the observations' pixels, where known; a fit of shifts
         starts from them. Where a fit finds a shift of more than a pixel, a second one that starts

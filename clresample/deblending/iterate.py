@@ -26,16 +26,16 @@ REPACK_FRACTION = 0.25
 # A fit under a MultiscalePrior stays where it is if the next shift would lower its loss by less
 # than this part of what ends it.
 MIN_GAIN = 0.5
-# [iterations] When a fit whose strengths have settled takes a step of its Exchange: at first, and
+# [iterations] When a fit with settled strengths takes a step of its JointNewtonStep: at first, and
 # between two; also where it has converged. Every 40 of them, bright scenes take a third longer.
 FIRST_JOINT_STEP, JOINT_STEP_ITERATIONS = 40, 20
 # It takes the step if its loss is expected to fall by more than this part of what ends it. With
 # 0.4, two in 100 fluxes of simulated scenes of Rubin's or Euclid's alone move by over 0.2 errors
 # where fits go on, with 0.2 one in 200.
 MIN_JOINT_GAIN = 0.2
-# If until the next one the loss has fallen by less than this part of what an Exchange promised, it
-# is made anew, of the scene as it is now. The second one is given up: bounds hold the scene
-# elsewhere, and trials along its steps would be refused.
+# If the loss has fallen by less than this part of the predicted gain until the next one, the
+# JointNewtonStep is made anew, of the present scene. The second one is given up: bounds hold the
+# scene elsewhere, and trials along its steps would be rejected.
 MIN_JOINT_PROGRESS, MAX_JOINT_MATRICES = 0.2, 2
 # [iterations] between two adjustments of the boxes to the light they hold; each makes a new batch.
 RESIZE_ITERATIONS = 40
@@ -162,8 +162,9 @@ class _LbfgsRun:
 
     Boxes stay as they are: structure fades at their edges, as the profile does that they follow.
 
-    exchanges (B): each fit's Exchange, or None; asked (B, 4): when that was last looked at a fit's
-        rounds and loss, 0 and infinite before, the gain that it promised, and how many were made
+    exchanges (B): each fit's JointNewtonStep, or None; asked (B, 4): when that was last looked at
+        a fit's rounds and loss, 0 and infinite before, the gain that it promised, and how many
+        were made
     stop_for_refit: see `iterate`
     """
 

@@ -82,7 +82,7 @@ DETECTION_COLUMNS = ("n_blend_sources", "n_group", "detection_pass", "detection_
 def finalise_catalogue(job, parts, last, unsettled=()):
     """The catalogue of the core, sorted by id, and the table of fits, sorted by patch.
 
-    parts: PartFiles; last: {patch: index of the part with its last round}
+    parts: GroupResultsFiles; last: {patch: index of the part with its last round}
     unsettled: parents of blends that were cut into pieces which did not settle
     """
     tables, fits = [], []

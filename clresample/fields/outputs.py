@@ -60,7 +60,7 @@ def check_outputs(folder, mosaics):
 def write_outputs(folder, job, parts, unsettled, about, seconds, hats=False) -> FieldOutputs:
     """Writes all outputs of a field together or none; the folder of HATS before them.
 
-    folder: to write into; job: Job; parts: PartFiles, those of later rounds last
+    folder: to write into; job: FieldJob; parts: GroupResultsFiles, those of later rounds last
     unsettled: parents of cut blends whose pieces did not settle
     about: plain values for the provenance; seconds: wall time by stage so far
     hats: write the catalogue in the HATS layout too, if it has rows

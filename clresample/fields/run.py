@@ -31,7 +31,7 @@ from .strips import STRIPS
 class FieldRun:
     """Results of a run in its folder.
 
-    outputs: paths and numbers, see Outputs; seconds: wall time by stage
+    outputs: paths and numbers, see FieldOutputs; seconds: wall time by stage
     failed: fits that were set aside; failed_tiles: {tile: why it could not be searched}
     task_times: (stage, Outcome) of every task that the workers have done: who had it, and when
     """
@@ -53,7 +53,7 @@ def run_field(
         mosaics, provenance.json; and for work/, what is done so far
     options: FieldOptions
     resume: go on where a run with the same options stopped; overwrite: forget such a run
-    progress: Progress; about: dict of plain values for the provenance, such as input files
+    progress: RunProgress; about: dict of plain values for the provenance, such as input files
 
     With several workers a script must be guarded by `if __name__ == "__main__"`, as for all of
     Python's processes. Ctrl-C ends the run; what is finished stays, for `resume`.

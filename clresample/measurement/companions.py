@@ -121,7 +121,7 @@ def is_a_source(place, height, model, image, signals, centres, fwhm, scale):
     place (2,) ints: (y, x) of the peak; height [sigma]: of what is left there, as
     `brightest_peak_near` says
     model, image (Ny, Nx) [sigma]: models, what was searched
-    signals: Signal of each observation; centres (S, 2) [px]: of the sources
+    signals: SignalToNoise of each observation; centres (S, 2) [px]: of the sources
     fwhm [px]: of the searched image's PSF; scale [arcsec]: of a pixel
     """
     at = tuple(place)

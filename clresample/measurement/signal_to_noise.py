@@ -104,7 +104,7 @@ class SignalToNoise:
 
 
 def signal_of(observation, frame, places=None) -> SignalToNoise:
-    """The Signal of an observation in a frame, under the filters of `WIDTHS_ARCSEC`.
+    """The SignalToNoise of an observation in a frame, under the filters of `WIDTHS_ARCSEC`.
 
     places (Ny, Nx, 2) [px]: of the frame's pixels on the observation; None = by their grids
     """

@@ -97,7 +97,7 @@ class OperatorCache:
 
         extent (2,) [px]: what of the frame holds light, the rest is padding; None = all of it
         private: an operator of the caller's own, whose shift may be set, on the same plan
-        n_terms: PSFs that psf has in turn for each band, see Plan
+        n_terms: PSFs that psf has in turn for each band, see ResamplingPlan
 
         Raises ValueError as Resampler does.
         """

@@ -7,7 +7,7 @@
     adjoint   the same factors transposed, in reverse order
 
 Where a band adds up T images of the model, one through each PSF of a basis, Z = sum_t Z_t with
-Z_t = D_t o (Ty I1_t Tx): what follows is done once (Terms).
+Z_t = D_t o (Ty I1_t Tx): what follows is done once (PSFTerms).
 
     I1 (Ny, Nx), I2 (My, Mx): one band of the model and of the observation
     Ty (ky, Ny), Tx (Nx, kx): cos and sin waves at the model's pixels; ky = 2 Hy, kx = 2 Hx
@@ -30,8 +30,9 @@ from .executor_base.terms import PSFTerms
 class Executor(ExecutorTables):
     """Base of the three executors: from a model to its frequencies, and back.
 
-    plans, axes, n_rows: see Tables
-    Subclasses add to scratch_shapes, bind and bind_back, and implement observe and collect
+    plans, axes, n_rows: see ExecutorTables
+    Subclasses extend scratch_shapes, bind and bind_adjoint, and implement frequencies_to_pixels
+    and pixels_to_frequencies
     """
 
     def __init__(self, device, dtype, plans):

@@ -39,10 +39,10 @@ HIDDEN = 0.02
 
 @dataclass(frozen=True, eq=False)
 class ImagePlane:
-    """One channel of an Image.
+    """One channel of an InspectedImage.
 
     data (My, Mx) [counts]: above the sky, 0 where not usable; usable (My, Mx): bool
-    sigma [counts]; psf: PSF of one band; matrix, offset: as those of Image
+    sigma [counts]; psf: PSF of one band; matrix, offset: as those of InspectedImage
     """
 
     data: np.ndarray
@@ -54,7 +54,7 @@ class ImagePlane:
 
     @classmethod
     def of(cls, image, c) -> ImagePlane:
-        """Channel c of an Image."""
+        """Channel c of an InspectedImage."""
         usable = image.usable[c]
         data = np.where(usable, image.observation.data[c] - image.level[c], 0)
         psf = image.observation.psf[c]

@@ -47,7 +47,7 @@ class SkyLevel:
 
 
 def sky_level(image) -> SkyLevel:
-    """The SkyLevel of an Image.
+    """The SkyLevel of an InspectedImage.
 
         mean of block b = level + wing T_b,    T_b = sum_s f_s (r_sb^2 + r_0^2)^(-p/2),    wing >= 0
 

@@ -80,10 +80,10 @@ class StarPSFs(PSFField):
 
 
 def with_star_psfs(image, sources, places, sky):
-    """The Image with own PSFs for stars with masked cores, and their number of channels (S,).
+    """The InspectedImage with own PSFs for masked stars, and their number of channels (S,).
 
-    The masked pixels of these cores grow by `spoilt.GROW_PX`. Without such a star the Image is
-    returned unchanged.
+    The masked pixels of these cores grow by `spoilt.GROW_PX`. Without such a star the
+    InspectedImage is returned unchanged.
 
     sources: those of `image.places`; places (S, 2) [px]: their positions without any shift
     sky: True if a sky level is fitted

@@ -131,7 +131,7 @@ class AlignedObservation:
 
 
 def align_observations(fit):
-    """An Exposure of each observation of a Fit: 1 ms each, 15 ms of 500 x 500 pixels."""
+    """An AlignedObservation of each observation of a Fit: 1 ms each, 15 ms of 500 x 500 pixels."""
     pairs = zip(fit.views, fit.blend.observations, strict=True)
     return [AlignedObservation.of(view, fit.frame, one, fit.start.source) for view, one in pairs]
 
@@ -153,7 +153,7 @@ class _PSFKey:
 
 @functools.lru_cache(maxsize=MAX_TRANSFERS)
 def _transfer(matrix, psf_in, psf_out):
-    """The Transfer of a matrix, as bytes, and two PSFs: one for all fits of equal observations."""
+    """The BandLimitedTransfer of a matrix (as bytes) and two PSFs, shared by equal observations."""
     return BandLimitedTransfer(np.frombuffer(matrix).reshape(2, 2), psf_in.psf, psf_out.psf)
 
 

@@ -46,7 +46,7 @@ class BlockMatrix:
 
 
 class BlockCholesky:
-    """Cholesky's factor of Blocks, scaled to a unit diagonal, with RIDGE added.
+    """Cholesky's factor of a BlockMatrix, scaled to a unit diagonal, with RIDGE added.
 
     scale (n): arrays, square roots of the diagonal; order (n,): in which nodes are eliminated
 

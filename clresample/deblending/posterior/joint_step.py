@@ -47,9 +47,10 @@ class JointNewtonStep:
 
     solution: Solution with the solver's own morphologies and spectra, its peaks 1
     shared (n): where (ny, nx) each component may exchange light, see Solution.shared
-    exposures: an Exposure of each observation; fit_sky: whether sky levels are unknowns too
+    exposures: an AlignedObservation of each observation; fit_sky: whether sky levels are unknowns
+        too
 
-    moves (n): each component's Moves, None where it shares no light with another
+    moves (n): each component's ComponentModes, None where it shares no light with another
     """
 
     def __init__(self, solution, shared, exposures, *, fit_sky=False):
@@ -72,7 +73,7 @@ class JointNewtonStep:
         self._held = None
 
     def step(self, slopes):
-        """The step to the minimum of all unknowns; slopes: Slopes of the loss.
+        """The step to the minimum of all unknowns; slopes: SceneGradient of the loss.
 
         returns changes [i][j] (ny_j, nx_j) of the structure, None of components that share none,
         (n, C) of the spectra, (C,) of the sky, and by how much the loss is expected to fall
@@ -98,7 +99,7 @@ class JointNewtonStep:
         return structure, spectra if ties is None else ties.spread(spectra), sky, gain
 
     def _factor(self, bound):
-        """The Factor with the spectra `bound` (n, B) held; the last one stays."""
+        """The BlockCholesky with the spectra `bound` (n, B) held; the last one stays."""
         if self._held is None or (self._held[0] != bound).any():
             self._held = (
                 bound.copy(),

@@ -77,9 +77,9 @@ class Solution:
     scene: Scene; morphs (n): arrays (ny, nx) with max = 1; peaks (n,): of the solver's
         morphologies, by which those were divided
     spectra (n, C); fixed_error (n, C): of these at fixed morphologies
-    shapes, thetas, positions (n): the start's Shapes, parameters, places (2,) [px]
+    shapes, thetas, positions (n): the start's ComponentProfiles, parameters, places (2,) [px]
     source (n,): to which each component belongs
-    findings: Findings; chi2 (n,): per pixel, where each component's light is
+    findings: StrengthEstimates; chi2 (n,): per pixel, where each component's light is
     prior: MultiscalePrior
     negative_chi2_gradient (n): arrays (ny, nx), see bound_bias.py; None where nothing asks for
         `modes`

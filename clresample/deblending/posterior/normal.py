@@ -79,7 +79,7 @@ class UnknownLayout:
 def normal_matrix(scene, exposures, images, spectra, layout) -> BlockMatrix:
     """J^T J + prior^-1, where sky levels have the precision of Scene.known_sky.
 
-    scene: Scene; exposures: an Exposure of each observation
+    scene: Scene; exposures: an AlignedObservation of each observation
     images (n): arrays (1 + k, ny, nx), float32, of morphologies and their modes
     spectra (n, C), in the views' units
     """

@@ -79,9 +79,9 @@ class OutsideBoxMoments:
 
 
 def profile_modes(shape, theta, position, profile, origin, *, radial=1.0):
-    """Slopes (k, ny, nx) of a component's profile in its box, their prior scatter (k,), Beyond.
+    """Slopes (k, ny, nx) of a profile in its box, prior scatter (k,), OutsideBoxMoments.
 
-    shape: Shape, theta (n,): its parameters, position (2,) [px]: where in the frame
+    shape: ComponentProfile, theta (n,): its parameters, position (2,) [px]: where in the frame
     profile (ny, nx): with max = 1; origin (2,) [px]: of the box in the frame
     radial: times CORE and HALO
     """

@@ -118,7 +118,7 @@ def _as_before(point, begin, chosen):
 
 
 def _alone(fit, asked):
-    """The Patch of the sources that need two components, all others' light taken off the data."""
+    """The StartInput of sources that need two components, with others' light subtracted."""
     chosen, begin = asked.significant, fit.start
     spectra = fit.state.spectra.copy()
     spectra[chosen] = 0

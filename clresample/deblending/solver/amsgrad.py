@@ -47,9 +47,9 @@ class AMSGrad:
     """The steps of one batch. `Engine` needs of an update this signature, `step`, `memories`.
 
     buffers: the batch, whose latent, morph, spectra and sky are stepped along d_morph, d_spectra
-    gradient: its Gradient, for the sky; states: the scenes' States, for what they remember
+    gradient: its LossGradient, for the sky; states: the scenes' States, for what they remember
     chain: constraints on the morphologies, applied after every step
-    prior: the Prior of extended sources, or None; step_sizes: StepSizes
+    prior: the SingleScalePrior of extended sources, or None; step_sizes: StepSizes
     """
 
     def __init__(self, buffers, gradient, states, *, chain, prior, step_sizes):

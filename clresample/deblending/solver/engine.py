@@ -25,7 +25,7 @@ class Engine:
     prior: the SingleScalePrior of all extended sources, or None to fit the morphologies themselves
     step_sizes: the StepSizes; update: what steps, a class like AMSGrad
 
-    buffers, update: the batch's Buffers and its update, with the present state
+    buffers, update: the batch's SceneBuffers and its update, with the present state
     """
 
     def __init__(

@@ -107,7 +107,7 @@ class LossGradient:
 class _ObservedBatch:
     """One observation of every scene of a batch: data, operator and buffers for its images.
 
-    op: the operator; rendering: its Frames, Transformed or Windows
+    op: the operator; rendering: its FrameRendering, BoxTransformRendering or WindowRendering
     image (B, Co, My, Mx): R M, then w r
     """
 

@@ -17,7 +17,8 @@ from ...resampling.linop import LinOp
 class SceneOperator(LinOp):
     """Base of both operators: one observation's images of every scene of a batch (B, Co, My, Mx).
 
-    buffers: the batch; op: its operator of that observation; rendering: its Frames or Transformed
+    buffers: the batch; op: its operator of that observation; rendering: its FrameRendering or
+        BoxTransformRendering
     """
 
     def __init__(self, buffers, op, rendering, shape_in):

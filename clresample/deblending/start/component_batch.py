@@ -27,7 +27,7 @@ class StartComponent:
     """One component of one scene.
 
     scene: which; index: of the component in its scene; source: number of its source there
-    shape: Shape; position (2,) [px]
+    shape: ComponentProfile; position (2,) [px]
     frame (2,) [px]: the frame's shape
     """
 

@@ -60,7 +60,7 @@ NEIGHBOUR_MODEL_ERROR = 0.2
 class PopulationPrior:
     """Prior on the profiles of the components of B scenes.
 
-    shapes (N): their Shapes; scene, index (N,): of each, below B and n; n_parameters: p
+    shapes (N): their ComponentProfiles; scene, index (N,): of each, below B and n; n_parameters: p
 
     mean, scatter (B, n, p): of their parameters, 0 and 1 where there are none
     contamination (B, n): 1 + E^2, see the module's text

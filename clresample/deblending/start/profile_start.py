@@ -172,7 +172,7 @@ def _point(patch, looking, thetas, sources, b, dark):
 
 
 def profile_peak(shape, theta, place, center, frame):
-    """The largest pixel of a Shape's profile of unit integral in its frame.
+    """The largest pixel of a ComponentProfile's profile of unit integral in its frame.
 
     place, center (2,) [px]: where it is drawn, and near which that pixel lies; frame (2,) [px]
     """

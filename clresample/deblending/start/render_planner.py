@@ -160,7 +160,7 @@ class RenderPlanner:
         return renderer, which, low[None], np.concatenate([low, size])[None], moves
 
     def _renderer(self, key, plans, executor=None):
-        """The Renderer of plans, made once for a key."""
+        """The BoxRenderer of plans, made once for a key."""
         if key not in self._renderers:
             self._renderers[key] = BoxRenderer(self.device, self.dtype, plans, executor)
         return self._renderers[key]

@@ -12,7 +12,7 @@ from ...resampling.resampler import EXECUTORS
 class BoxRenderer:
     """Plans of boxes of one shape on the device: images (n, ny, nx) to (n, C, wy, wx).
 
-    plans: `Plan.window`'s, alike in layout and window, of one place of a distorted mapping, or of a
+    plans: `ResamplingPlan.window`'s, alike in layout and window, of one place of a distorted mapping, or of a
         whole frame
     executor: of the plans, with their transfer functions; None makes one
 

@@ -18,7 +18,7 @@ SIDE_PX = 4
 def make_blend(patch, plan, mosaics, reference, labels, corner, neighbours=None, components=None):
     """The Blend of a patch, and the Boxes on the mosaics that its observations were cut from.
 
-    patch: Patch of plan: Plan; mosaics: of the field; reference: Grid of the model's pixels
+    patch: FitRegion of plan: FitPlan; mosaics: of the field; reference: Grid of the model's pixels
     labels (Ny, Nx): patch numbers + 1 of the model's pixels from `corner` (2,) [px] on
     neighbours: {mosaic's name: list of (Box, model (C, Ny, Nx) [counts])}: light of the other
         pieces of the same blend, to be subtracted. None: their pixels are ignored, as those of all

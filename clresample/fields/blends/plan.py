@@ -163,12 +163,14 @@ def make_fit_plan(
     """Blends from sources and the labels of their light; giants cut; groups by predicted cost.
 
     positions (S, 2) [px], peaks (S,) [sigma]: in whose order blends are numbered
-    footprints: Footprints of `region`, whose labels are renumbered here: label n + 1 is patch n's
+    footprints: LinkedFootprints of `region`, whose labels are renumbered here: label n + 1 is
+        patch n's
     memory [bytes]: that the fits of one group may take; None = no limit; n_channels: of all mosaics
     most: blends in a group, as many as a CPU fits side by side. More share a round's launches,
         which take longer than the arithmetic of small blends, but are lost together with their
         worker
-    hosts (S, 2) [px]: see Found; in cut blends they stay with their clumps if the limits allow it
+    hosts (S, 2) [px]: see TileDetections; in cut blends they stay with their clumps if the limits
+        allow it
     """
     limits = replace(limits or FitLimits(), max_bytes=memory, n_channels=n_channels)
     ids = source_ids(positions, field_number)

@@ -38,7 +38,7 @@ class DaskCluster:
     devices: choices as `get_device` takes them, dealt to the workers of each host by turns; empty =
         each worker's own, which its environment's CLRESAMPLE_DEVICE names
     limit_s [s]: a task that takes longer is ended with its worker
-    progress: Progress, told the dashboard's address, and of workers that go
+    progress: RunProgress, told the dashboard's address, and of workers that go
     turns: (stage, Outcome) of every task so far that ended well
 
     Raises ImportError without distributed, ValueError where nothing answers, no worker is there, or

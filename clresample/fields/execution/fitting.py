@@ -105,7 +105,7 @@ class _BlendCutout:
 def fit_group(job, group, given) -> tuple[dict, bytes]:
     """Fits a group: {"sources", "patches", "failed", "seconds"}, and its part as bytes.
 
-    given: Given of the group. A patch that fails is in the part with its reason. Raises
+    given: GroupInputs of the group. A patch that fails is in the part with its reason. Raises
     KeyboardInterrupt after Ctrl-C, DeviceError where the device no longer answers.
     """
     try:

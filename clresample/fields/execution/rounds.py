@@ -42,8 +42,8 @@ def fit_all_groups(job, engine, progress):
 
     A cut blend's pieces are fitted again as long as a neighbour of theirs moves, and where their
     residuals held more sources.
-    returns the PartFiles, the last round's of each patch counting, and the parents of those cut
-    blends whose pieces had not settled when the rounds ended
+    returns the GroupResultsFiles, the last round's of each patch counting, and the parents of
+    those cut blends whose pieces had not settled when the rounds ended
     """
     progress.stage("fit", len(job.plan.patches))
     tasks = [FitGroup(_name(0, i), patches) for i, patches in enumerate(job.plan.groups)]

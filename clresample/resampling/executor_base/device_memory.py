@@ -96,7 +96,7 @@ class DeviceMemory:
         return -(-n // self.tuning.line_group) * self.tuning.line_group
 
     def item_sizes(self, **sizes) -> ItemSizes | None:
-        """The Own of products with these sizes of each plan; None where all items share them."""
+        """The ItemSizes of products with these sizes of each plan; None if all items share them."""
         return None if self.which is None else ItemSizes(self.which, **sizes)
 
     def _table(self, tables, *shape) -> MatrixBatch:

@@ -46,7 +46,7 @@ class Ape14Wcs:
 
     @classmethod
     def of(cls, wcs) -> Ape14Wcs:
-        """The Interface of a WCS. Raises ValueError for one that is not celestial alone."""
+        """The Ape14Wcs of a WCS. Raises ValueError for one that is not celestial alone."""
         low = wcs.low_level_wcs if isinstance(wcs, BaseHighLevelWCS) else wcs
         if (low.pixel_n_dim, low.world_n_dim) != (2, 2):
             raise ValueError(

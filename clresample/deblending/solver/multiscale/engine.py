@@ -155,7 +155,7 @@ class MultiscaleEngine:
         return self.strengths.findings(which, *self._energies(self.vectors.x))
 
     def slopes(self, which):
-        """The Slopes of the scenes `which` (B,) where they are; None for the others."""
+        """The SceneGradient of the scenes `which` (B,) where they are; None for the others."""
         x, g = (self.vectors.split(v) for v in (self.vectors.x, self.vectors.g))
         return [
             SceneGradient(*slopes, (now[1] <= 0) & (slopes[1] > 0)) if on else None
@@ -165,8 +165,8 @@ class MultiscaleEngine:
     def step(self, steps):
         """Queues trial steps of these scenes, which resume if they have converged.
 
-        steps {scene: changes of structure, spectra and sky, see Slopes}; structure is None in
-        scenes without any
+        steps {scene: changes of structure, spectra and sky, see SceneGradient}; structure is None
+        in scenes without any
         """
         which = np.isin(np.arange(len(self.scenes)), list(steps))
         self.vectors.put_directions(steps)

@@ -78,7 +78,7 @@ class BlockPreconditioner:
         self._at = self._blocks = None
 
     def blocks(self, strengths, spectrum):
-        """The Blocks near strengths (J,) and a spectrum (C,).
+        """The CurvatureBlocks near strengths (J,) and a spectrum (C,).
 
         Those of one level have no coefficient in common, and what levels say is added.
         """

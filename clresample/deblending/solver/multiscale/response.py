@@ -10,9 +10,9 @@ from ..rendering.composition import SpectralComposition
 
 
 class OperatorResponse:
-    """The operators of a batch's Gradient, applied to noise and misfit.
+    """The operators of a batch's LossGradient, applied to noise and misfit.
 
-    buffers, gradient: the batch and its Gradient, whose image buffers are overwritten
+    buffers, gradient: the batch and its LossGradient, whose image buffers are overwritten
     weights: per observation R^T w (B, Co T, Ny, Nx) on the device; T > 1 where the PSF varies, and
         then that of the first term is in the middle of the scene
     """

@@ -26,9 +26,9 @@ class StrengthEstimates:
 class PriorStrengths:
     """Present strengths of a batch's sources, learned from their evidence.
 
-    states (B): the scenes' States at their start; their Learned, if any, says which strengths they
-        begin with
-    past: other Strengths and the scenes (n,) of theirs that go on here, which are all
+    states (B): the scenes' States at their start; their StructureState, if any, says which
+        strengths they begin with
+    past: other PriorStrengths and the scenes (n,) of theirs that go on here, which are all
 
     values (S, J): alpha; of fixed sources without meaning
     significant (S,): sources whose finest structure is, see evidence.py

@@ -67,7 +67,7 @@ class StructureOperator:
     """The morphologies of a batch's free sources from their coefficients, and the way back.
 
     buffers: the batch; its morph is overwritten by `form`, its d_morph by `gradient`
-    prior: the MultiscalePrior; latents: the Latents
+    prior: the MultiscalePrior; latents: the LatentLayout
     energies (S, J): of the coefficients last asked for, on the device
     """
 

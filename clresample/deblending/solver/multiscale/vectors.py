@@ -27,7 +27,7 @@ class SceneGradient:
 class SolverVectors:
     """The vectors of a batch that L-BFGS works on.
 
-    buffers: the batch; latents: its Latents; n_slots: of the ring of pairs
+    buffers: the batch; latents: its LatentLayout; n_slots: of the ring of pairs
     size: elements of a vector; n_spectra, n_sky: its last ones
     chunks (n, 4): scene, first element, length, whether its variables are at least 0; by scene
     x, x_new, g, g_new, hg, d, h, precision (size,): see lbfgs.cl; s, hy (n_slots, size)
@@ -128,7 +128,7 @@ class SolverVectors:
         upload(h, self.h)
 
     def copy_from(self, other, keep):
-        """Copies the scenes `keep` (n,) of other Vectors, which then are all scenes here."""
+        """Copies the scenes `keep` (n,) of other SolverVectors, which then are all scenes here."""
         shift = (other.parts()[keep] - self.parts())[:, :, 0]
         scene, first = self.chunks[:, 0], self.chunks[:, 1]
         kind = np.digitize(first, [self.latents.size, self.latents.size + self.n_spectra])

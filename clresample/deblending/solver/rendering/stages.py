@@ -70,7 +70,7 @@ class FrameRendering:
 
 
 class BoxTransformRendering:
-    """Depth 1 or 2: each source's box transformed along one axis, or both; as Frames."""
+    """Depth 1 or 2: each source's box transformed along one axis, or both; as FrameRendering."""
 
     def __init__(self, buffers, i_observation, op, depth):
         b, self.buffers, self.depth = buffers, buffers, depth
@@ -121,7 +121,7 @@ class BoxTransformRendering:
         self._boxes.from_lines(d_lines, e.in_x.buffer, d_morph, active, add=add)
 
     def update_shifts(self):
-        """Nothing to do, as for Frames."""
+        """Nothing to do, as for FrameRendering."""
 
 
 class _Boxes:
