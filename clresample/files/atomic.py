@@ -75,7 +75,7 @@ def check_folder(folder):
 def atomic_file(path):
     """The path to write a file under, moved to `path` once the block has ended.
 
-        with whole_file("out.txt") as part:
+        with atomic_file("out.txt") as part:
             part.write_text("...")
 
     The other path has the name of `path`, by whose ending some writers choose a format or a

@@ -114,7 +114,7 @@ class ResamplingPlan:
         which are another at each place.
 
         shape (2,) [model px]: of the box; reach_px [model px]: how far its light is followed
-        size (2,) [observed px]: of the window, at least as many; see PaddedMapping.box_of
+        size (2,) [observed px]: of the window, at least as many; see PaddedMapping.for_box
         """
         key = tuple(shape), reach_px, precision, size
         if key not in self.windows:

@@ -195,5 +195,5 @@ def test_a_field_file_is_checked_as_scene_files_are(tmp_path, text, said):
     path.write_text(text)
     with pytest.raises(SceneError, match=said):
         parse_field(path)
-    with pytest.raises(SceneError, match="no regular file"):
+    with pytest.raises(SceneError, match="not a regular file"):
         parse_field(tmp_path)

@@ -40,8 +40,8 @@ class Posterior:
         unknowns too
 
     modes (n): arrays (k, ny, nx), beyond (n): see Solution.modes; layout: UnknownLayout; matrix:
-        BlockMatrix; factor: its BlockCholesky; covariance: a BlockMatrix of the inverse, for the same
-        nodes
+        BlockMatrix; factor: its BlockCholesky; covariance: a BlockMatrix of the inverse, for the
+        same nodes
     released: arrays, for each node what its unknowns change by without the bound of bound_bias.py
 
     Raises LinAlgError where the matrix is not positive definite.

@@ -12,8 +12,8 @@ from ...resampling.resampler import EXECUTORS
 class BoxRenderer:
     """Plans of boxes of one shape on the device: images (n, ny, nx) to (n, C, wy, wx).
 
-    plans: `ResamplingPlan.window`'s, alike in layout and window, of one place of a distorted mapping, or of a
-        whole frame
+    plans: `ResamplingPlan.window`'s, alike in layout and window, of one place of a distorted
+        mapping, or of a whole frame
     executor: of the plans, with their transfer functions; None makes one
 
     size (2,) [px]: of the windows

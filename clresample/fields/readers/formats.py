@@ -27,7 +27,8 @@ READERS = Formats("clresample.readers", OWN)
 def read_survey(form, path, **given) -> Mosaic:
     """The Mosaic of a survey's files.
 
-    form: of READERS; path: a file, a list of files or a folder, see its module; given: see ReaderOptions
+    form: of READERS; path: a file, a list of files or a folder, see its module; given: see
+        ReaderOptions
 
     Raises ValueError for another format, what is missing, and a reader of another package that
     cannot be imported or returns something else; FileError for what cannot be read.

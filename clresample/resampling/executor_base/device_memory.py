@@ -18,7 +18,7 @@ class DeviceMemory:
     device, dtype, tuning, plans, n_bands: of the executor
     n_reserved: images that there is room for; scratch: the intermediates, by their names
     which (items,): int32, on the device: the plan of each item; None where all are seen alike
-    Subclasses implement scratch_shapes, bind and bind_back
+    Subclasses implement scratch_shapes, bind and bind_adjoint
     """
 
     def __init__(self, device, dtype, plans):
