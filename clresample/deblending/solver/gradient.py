@@ -77,7 +77,7 @@ class LossGradient:
 
     @functools.cached_property
     def _losses(self):
-        """The kernel that sums them; the prior that learns does without."""
+        """The kernel that sums them; the multi-scale prior does not need it."""
         b, group = self.buffers, self.buffers.tuning.sum_group
         return b.launcher("losses.cl", "losses", 2, local_size=(group, 1)).bind(
             first=b.first,

@@ -1,4 +1,4 @@
-"""Runs a batch of scenes under the prior that learns: rounds of trials, strengths, stops.
+"""Runs a batch of scenes under the multi-scale prior: rounds of trials, strengths, stops.
 
     L = 1/2 sum_o |sqrt(w_o) (R_o M + sky - d_o)|^2 + 1/2 sum_c p_c sky_c^2
         + 1/2 sum_sj |z_sj|^2 / alpha_sj^2,      p: Scene.known_sky
