@@ -48,7 +48,7 @@ def _dot(a, b):
 
 
 def check_prox(prox, penalty, shape, rng, *, step=1.0, convex=True, tolerance=1e-6, n_trials=20):
-    """Check p = prox(y) against its definition: p minimises F(z) = step f(z) + |z - y|^2 / 2.
+    """Checks p = prox(y) against its definition: p minimises F(z) = step f(z) + |z - y|^2 / 2.
 
     Optimality: f(p) is finite and F(p) <= F(z) for many z: on the way from p to points where f is
     finite, with single pixels taken from y, from 0 or from these points. If convex, firm

@@ -1,13 +1,13 @@
-/* What the blocks of a batch of scenes say of a vector: a part of the solver of lbfgs.cl.
+/* Applies the block-diagonal inverse curvature to vectors: part of the solver of lbfgs.cl.
  *
  * A block holds the inverse of a part of the curvature, as W^T W with a triangular W, its root.
  *   blocks    (n, 4) int: scene, variables m, the first of its indices, its root's first element
  *             / ALIGN;  indices: of the variables;  roots: W of each, lower triangular, in panels
  *             of PANEL rows that end with their last one's diagonal; zeros beyond
- *   plan      (B, 3) int, see lbfgs.cl: of scenes at rest blocks say nothing
+ *   plan      (B, 3) int, see lbfgs.cl: blocks of idle scenes are skipped
  *
- * apply_block_inverse  what blocks, which share no variable, say of H y and H P g_new, in place of
- *           what there was or, with `more`, added to it; launch: (WG, n blocks), groups of (WG, 1)
+ * apply_block_inverse  H y and H P g_new by blocks, which share no variable; written over the old
+ *           values or, with `more`, added to them; launch: (WG, n blocks), groups of (WG, 1)
  */
 #include "common.h"
 #include "boxes.h"

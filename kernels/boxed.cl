@@ -6,7 +6,7 @@
  * items (S, N_COLUMNS) long, a row a source with the columns below: sizes, and in elements where
  * A, B and C begin in their buffers, the distances of A's rows and columns, of B's rows, and of
  * C's rows and columns.
- *   B is read as vectors: it begins at a multiple of 16 elements, as its LD_B is one.  SKIP of its
+ *   B is read as vectors: its start and LD_B are multiples of 16 elements.  SKIP of its
  *      columns come before the first that is wanted; they are computed and left out.
  *   C is stored by vectors, up to a multiple of 16 columns, where B's zeros become C's; its first
  *      element and its rows lie as B's do, and SKIP is 0.  If RAGGED, element by element, n of them

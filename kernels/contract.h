@@ -1,5 +1,5 @@
-/* What the kernels of contract.cl, boxed.cl, contract_group.cl and mirror.h share: their sizes,
- * vectors of VW, and the sums of a tile in registers.
+/* Common parts of contract.cl, boxed.cl, contract_group.cl and mirror.h: their sizes, vectors of
+ * VW, and the sums of a tile in registers.
  *
  * Order of the terms: the smallest first, so that roundings are those of small sums.
  *   inward 1   of sums over pixels, whose light is brightest about the middle: blocks from both

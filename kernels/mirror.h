@@ -1,5 +1,5 @@
-/* Products with a table of waves, in half the operations of contract.cl: what mirror_to_waves.cl,
- * to waves, and mirror_to_pixels.cl, to pixels, share.
+/* Products with a table of waves, in half the operations of contract.cl: common parts of
+ * mirror_to_waves.cl (to waves) and mirror_to_pixels.cl (to pixels).
  *
  *   C[b] = A[b] . B[b], as there, where one factor is a table W (k, n) of waves at n pixels, or its
  *   transpose, whose halves mirror each other: of rows 2i, cosines, the pixels p and n - 1 - p have

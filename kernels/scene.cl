@@ -1,4 +1,4 @@
-/* A batch of scenes: what each observation is shown of the sources, and how they are to change.
+/* A batch of scenes: model frames, residuals, loss, gradients by morphology and spectrum.
  *
  * Those of scene b are order[first[b]] .. order[first[b + 1] - 1].  Each has an
  * image in a box of its scene's frame.  The image is a morphology, or a morphology that was

@@ -1,6 +1,6 @@
-/* Windows of observations: what groups of sources are seen as, each in its own part of an image.
+/* Adds rendered windows of source groups to observed images; cuts windows out of images.
  *
- *   image     (B, n_bands, my, mx); windows (G, n_bands, wy, wx), of which window g shows the
+ *   image     (B, n_bands, my, mx); windows (G, n_bands, wy, wx); window g covers the
  *             pixels from low[g] (y, x) on, in part or all of them outside of the image
  *   Groups are sorted by scene; those of scene b are first[b] .. first[b + 1] - 1.
  *

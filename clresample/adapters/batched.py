@@ -6,8 +6,11 @@ import numpy as np
 
 
 def with_bands(op, x):
-    """An image (Ny, Nx) of an operator of one band as (1, Ny, Nx), others as they are, and whether
-    it was one. Raises ValueError for shapes that the operator does not take."""
+    """Adds the band axis to an image of a one-band operator: (image, True if it was added).
+
+    An image (Ny, Nx) becomes (1, Ny, Nx); others are returned unchanged.
+    Raises ValueError for shapes that the operator does not accept.
+    """
     shape, expected = tuple(x.shape), op.shape_in
     if len(expected) == 3 and expected[0] == 1 == op.shape_out[0] and shape == expected[1:]:
         return x[None], True

@@ -1,4 +1,4 @@
-"""Import a package that a bridge needs, or say how to install it."""
+"""Imports the optional packages of the bridges, or names the extra to install."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from importlib import import_module
 
 
 def require(module, extra):
-    """The module, imported. Raises ImportError that says what to install.
+    """Imports a module. Raises ImportError that names the package to install.
 
     module: its full name; extra: of clresample, which installs it
     """

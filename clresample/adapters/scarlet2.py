@@ -61,7 +61,7 @@ def _renderer_class():
         channels: tuple = equinox.field(static=True)
 
         def __call__(self, model, key=None):
-            """Model (C, Ny, Nx) -> (Co, My, Mx) as the observation sees it."""
+            """Renders a model (C, Ny, Nx) in the observation (Co, My, Mx)."""
             return self.function(model[np.array(self.channels)])
 
     return OperatorRenderer

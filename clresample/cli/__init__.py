@@ -12,7 +12,7 @@ __all__ = ["main"]
 
 
 def main(argv=None):
-    """Run `clresample` with these arguments (None: sys.argv's); returns the exit status."""
+    """Runs `clresample` with these arguments (None: sys.argv's); returns the exit status."""
     try:
         from .command import main as run
     except KeyboardInterrupt:  # Ctrl-C ends the imports too in one line

@@ -1,4 +1,4 @@
-"""The command `clresample`: one function per subcommand adds its parser and names what runs.
+"""The command `clresample`: one function per subcommand adds its parser and its function.
 
 A subcommand's function takes argparse's subparsers, adds its own, and calls
 `parser.set_defaults(run=...)`; `run(arguments)` returns an exit status, None being 0. It raises
@@ -42,7 +42,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def main(argv=None):
-    """Run `clresample` with these arguments (None: sys.argv's); returns the exit status."""
+    """Runs `clresample` with these arguments (None: sys.argv's); returns the exit status."""
     with _ended_as_interrupted():
         try:
             return _run(argv)
@@ -87,7 +87,7 @@ def _run(argv):
 
 
 def _show_in_one_line(arguments):
-    """Let a DeviceWarning appear as a note, without the line of source that warnings come with."""
+    """Shows a DeviceWarning as a note, without the source line that warnings print."""
     shown = warnings.showwarning
 
     def show(message, category, *rest, **more):
@@ -106,7 +106,7 @@ def _fail(arguments, message):
 
 @contextmanager
 def _ended_as_interrupted():
-    """The signal to end, SIGTERM, counts as Ctrl-C: fits end with what they have, no part stays."""
+    """Treats SIGTERM like Ctrl-C: fits end with their present state, no partial file stays."""
 
     def interrupt(*_):
         raise KeyboardInterrupt

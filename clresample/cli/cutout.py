@@ -37,7 +37,7 @@ example  clresample cutout sky/out --id 99615072 -o alone.fits
 
 
 def add_cutout(commands):
-    """Add `clresample cutout`."""
+    """Adds `clresample cutout`."""
     parser = commands.add_parser(
         "cutout",
         help="single sources without their neighbours",
@@ -103,7 +103,7 @@ def extent(text):
 
 
 def run(arguments):
-    """Cut out, write. Raises ValueError and FileError, one line, for what cannot be done."""
+    """Runs the command. Raises ValueError and FileError, one line, for unusable arguments."""
     from ..files.atomic import check_folder, check_output
 
     if not arguments.ids and not arguments.ids_from:

@@ -48,7 +48,7 @@ OUTPUTS = "catalogue.fits", "catalogue.ecsv", "result.fits", "deblended.png"
 
 
 def add_deblend(commands):
-    """Add `clresample deblend`."""
+    """Adds `clresample deblend`."""
     parser = commands.add_parser(
         "deblend",
         help="fit blended sources to several instruments' images",
@@ -88,7 +88,7 @@ def add_deblend(commands):
 
 
 def run(arguments):
-    """Read, detect, fit, write. Raises ValueError or OSError, one line, for what cannot be used."""
+    """Runs the command. Raises ValueError or OSError, one line, for unusable arguments."""
     if arguments.example is not None:
         return _run_example(arguments)
     if arguments.scene is None or arguments.output is None:
@@ -214,7 +214,7 @@ def _deblend(arguments, what, observations, sources, settings, given):
 
 
 def _import_drawing():
-    """Import what draws the figure, 0.2 s of Python, while a fit waits for the device."""
+    """Imports the modules of the figure (0.2 s) while a fit waits for the device."""
     with suppress(ImportError):  # raised again, and reported, when the figure is drawn
         from matplotlib.backends import backend_agg  # noqa: F401
 
@@ -222,7 +222,7 @@ def _import_drawing():
 
 
 def _write(arguments, result, inputs, device, paths):
-    """Write the catalogue twice, the result and, where `paths` has a fourth, the figure."""
+    """Writes the catalogue twice, the result and, where `paths` has a fourth, the figure."""
     from ..files.atomic import atomic_files
     from ..files.results import write_result
     from ..files.tables import write_catalogue
@@ -240,7 +240,7 @@ def _write(arguments, result, inputs, device, paths):
 
 
 def _report(arguments, result, found, device, took):
-    """Print how the fit ended and each channel's chi2; what the user should know, as notes."""
+    """Prints how the fit ended and each channel's chi2; prints messages as notes."""
     lost = found["n_sources"] - found["n_fitted"]
     print(
         f"{found['n_fitted']} sources in {len(result.channels)} channels"

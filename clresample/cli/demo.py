@@ -60,7 +60,7 @@ def fit_all(scene, *, device=None):
 
 
 def run(folder="demo", *, device=None):
-    """Make the demonstration's files in `folder`; returns what `fit_all` does and the files."""
+    """Makes the demonstration's files in `folder`; returns `fit_all`'s result and the files."""
     folder, device = Path(folder), get_device(device)
     sky = {"angle_deg": ANGLE_DEG, "center_deg": CENTER_DEG, "spectra": "smooth"}
     scene = simulate_scene(SEED, n_sources=N_SOURCES, **sky)
@@ -103,7 +103,7 @@ def _report(scene, fitted, device):
 
 
 def main(argv=None):
-    """Run the demonstration; returns the exit status."""
+    """Runs the demonstration; returns the exit status."""
     parser = argparse.ArgumentParser(
         prog="python -m clresample.cli.demo", description=__doc__.split("\n")[0]
     )

@@ -1,4 +1,4 @@
-"""Part of the demonstration: a simulated Euclid image as Rubin sees it, beside the truth.
+"""Part of the demonstration: a simulated Euclid image rendered for Rubin, with the truth.
 
 Writes euclid.fits, rubin.fits, rubin_truth.fits and resampled.png.
 """
@@ -39,7 +39,7 @@ class SimulatedSky(NamedTuple):
 
 
 def simulate(seed=SEED):
-    """Galaxies of bulge, disk and knots, uniform over the field, as both telescopes see them."""
+    """Galaxies of bulge, disk and knots, uniform over the field, drawn for both telescopes."""
     rng = np.random.default_rng(seed)
     # Rubin's turned square fits into Euclid's field
     turned = np.cos(np.radians(ANGLE_DEG)) + np.sin(np.radians(ANGLE_DEG))
@@ -67,7 +67,7 @@ def _wcs(grid):
 
 
 def run(folder="demo", *, device=None):
-    """Make the demonstration's files in `folder`; returns its SDR [dB] and the files' paths."""
+    """Makes the demonstration's files in `folder`; returns its SDR [dB] and the files' paths."""
     started = time.perf_counter()
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

@@ -9,7 +9,7 @@ COLUMNS = ("platform", "device", "kind", "OpenCL", "units", "memory", "largest b
 
 
 def add_devices(commands):
-    """Add `clresample devices`."""
+    """Adds `clresample devices`."""
     parser = commands.add_parser(
         "devices",
         help="list the OpenCL devices",
@@ -24,7 +24,7 @@ def add_devices(commands):
 
 
 def run(arguments):
-    """Print the table. Raises DeviceError, after the table, for a choice that fits no device."""
+    """Prints the table. Raises DeviceError, after the table, if the choice matches no device."""
     from ..device.device import get_device
 
     print(format_table(list_devices(arguments.device)))

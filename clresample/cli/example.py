@@ -31,7 +31,7 @@ FILES = (
 
 
 def write_example(folder, *, overwrite=False) -> list[Path]:
-    """Write scene.toml, images and PSFs of a simulated blend, and its sources' positions.
+    """Writes scene.toml, images and PSFs of a simulated blend, and its sources' positions.
 
     Returns the paths, the scene file first. Raises FileError for files that exist, ImportError
     without GalSim.
@@ -49,7 +49,7 @@ def write_example(folder, *, overwrite=False) -> list[Path]:
 
 
 def _write(paths, scene):
-    """Write a simulated scene's files, by name under these paths."""
+    """Writes a simulated scene's files, by name under these paths."""
     for name, image in (("euclid", scene.euclid), ("rubin", scene.rubin)):
         bands, data = image.survey.bands, image.data.astype(np.float32)
         path = paths[f"{name}.fits"]

@@ -44,7 +44,7 @@ MEMORY_PART = 8
 
 
 def add_field(commands):
-    """Add `clresample field`."""
+    """Adds `clresample field`."""
     parser = commands.add_parser(
         "field",
         help="one catalogue of whole mosaics",
@@ -107,12 +107,12 @@ def _part(text):
     """I/N as two whole numbers."""
     i, _, n = text.partition("/")
     if not (i.isdecimal() and n.isdecimal() and 1 <= int(i) <= int(n)):
-        raise argparse.ArgumentTypeError(f"{text!r} is no part such as 2/4")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a part: use for example 2/4")
     return int(i), int(n)
 
 
 def run(arguments):
-    """Read the field file, run the field, report. Returns the exit status."""
+    """Reads the field file, runs the field and reports. Returns the exit status."""
     import os
 
     # what runs beside the fits has small matrices too: see one_blas_thread
@@ -170,7 +170,7 @@ def run(arguments):
 
 
 def _report(arguments, done, took):
-    """Print what was done and the files; the exit status."""
+    """Prints a summary and the files written; returns the exit status."""
     out = done.outputs
     ended = ", ".join(f"{n} {how}" for how, n in sorted(out.status.items()))
     stages = ", ".join(f"{name} {s:.1f} s" for name, s in done.seconds.items())

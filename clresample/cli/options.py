@@ -10,7 +10,7 @@ SIZES = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30}  # [bytes] powers of 1
 
 
 def add_device_option(parser, several=False):
-    """Add `--device`, whose value `get_device` takes as it is; several: or a list, by commas."""
+    """Adds `--device`, a choice for `get_device`; several: also a list, separated by commas."""
     parser.add_argument(
         "--device",
         metavar="CHOICE",
@@ -22,7 +22,7 @@ def add_device_option(parser, several=False):
 
 
 def add_profile_option(parser):
-    """Add `--profile`, which sets CLRESAMPLE_PROFILE."""
+    """Adds `--profile`, which sets CLRESAMPLE_PROFILE."""
     parser.add_argument(
         "--profile",
         action="store_true",
@@ -31,7 +31,7 @@ def add_profile_option(parser):
 
 
 def add_dtype_option(parser, what):
-    """Add `--dtype`, the floating type of `what`."""
+    """Adds `--dtype`, the floating type of a quantity."""
     parser.add_argument(
         "--dtype",
         choices=("float32", "float64"),
@@ -41,12 +41,12 @@ def add_dtype_option(parser, what):
 
 
 def print_note(arguments, message):
-    """Print what the user should know on standard error."""
+    """Prints a note for the user on standard error."""
     print_progress(arguments, f"note: {message}")
 
 
 def print_progress(arguments, message):
-    """Print a line of progress on standard error."""
+    """Prints a line of progress on standard error."""
     print(f"clresample {arguments.command}: {printable(message)}", file=sys.stderr, flush=True)
 
 
@@ -62,7 +62,7 @@ def printable(text, most=None):
 
 
 def check_matplotlib(option, way_out=""):
-    """Raise ValueError where `option` needs matplotlib and it is not there; it is not imported."""
+    """Raises ValueError if `option` needs matplotlib, which is not installed; imports nothing."""
     if find_spec("matplotlib") is None:
         from ..drawing.figure import NO_MATPLOTLIB
 
@@ -78,7 +78,7 @@ def byte_size(text):
     except ValueError:
         n_bytes = 0
     if not 1 <= n_bytes < 1 << 63:
-        raise argparse.ArgumentTypeError(f"{text!r} is no size, such as 512M or 2G")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size: use for example 512M or 2G")
     return int(n_bytes)
 
 
@@ -86,7 +86,9 @@ def name_list(text):
     """Comma-separated names or numbers."""
     found = [part.strip() for part in text.split(",")]
     if not all(found):
-        raise argparse.ArgumentTypeError(f"{text!r} is no list of bands, such as i or g,r,i or 0,2")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a list of bands, such as i or g,r,i or 0,2"
+        )
     return found
 
 
@@ -105,7 +107,7 @@ def positive_number(text):
     """A number above zero."""
     number = _number(text)
     if not 0 < number < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is no number above 0")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
     return number
 
 
@@ -113,14 +115,14 @@ def fraction(text):
     """A number from 0 to below 1."""
     number = _number(text)
     if not 0 <= number < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number from 0 to 1")
+        raise argparse.ArgumentTypeError(f"{text!r} must be at least 0 and less than 1")
     return number
 
 
 def non_negative_integer(text):
     """A whole number from 0."""
     if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number from 0")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0")
     return int(text)
 
 

@@ -27,7 +27,7 @@ def folder_outputs(arguments, names):
 
 
 def check_scene(arguments, scene, paths):
-    """Raise ValueError, before the fit, where an output is an input or could not hold its names."""
+    """Raises ValueError if an output is an input or cannot store the channels' names."""
     from ..files.atomic import check_output
     from ..files.fits_names import check_catalogue_names
 
@@ -41,7 +41,7 @@ def check_scene(arguments, scene, paths):
 
 
 def file_outputs(arguments, inputs):
-    """The paths of OUT and, if it is asked for, PNG.
+    """The paths of OUT and, if requested, PNG.
 
     Raises ValueError where one of them could not be written, or is a file that is read.
     """

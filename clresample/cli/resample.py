@@ -45,7 +45,7 @@ example  clresample resample hst.fits --psf psf_hst.fits --psf-center core \\
 
 
 def add_resample(commands):
-    """Add `clresample resample`."""
+    """Adds `clresample resample`."""
     parser = commands.add_parser(
         "resample",
         help="show an image on the pixels and PSF of another",
@@ -140,7 +140,7 @@ def _add_ways(group):
 
 
 def run(arguments):
-    """Read, resample, write. Raises ValueError or OSError, one line, for what cannot be used."""
+    """Runs the command. Raises ValueError or OSError, one line, for unusable arguments."""
     inputs = {
         "image": arguments.image,
         "its PSF": arguments.psf,

@@ -20,7 +20,7 @@ stars that saturate, and images with faults; clumps.ecsv lists clumps by galaxy.
 
 
 def add_simulate(commands):
-    """Add `clresample simulate`."""
+    """Adds `clresample simulate`."""
     parser = commands.add_parser(
         "simulate",
         help="write a simulated field with its truth",
@@ -36,7 +36,7 @@ def add_simulate(commands):
 
 
 def run(arguments):
-    """Simulate and write. Raises ValueError and FileError, one line, for what cannot be done."""
+    """Runs the command. Raises ValueError and FileError, one line, for unusable arguments."""
     from ..files.atomic import check_folder, check_output
     from ..simulation.field import simulate_field
     from ..simulation.spoilers import Spoilers
@@ -71,7 +71,7 @@ def run(arguments):
 
 
 def write_field(folder, field, *, overwrite=True) -> list[Path]:
-    """Write a SimulatedField: an image and a PSF cube of each mosaic, field.toml, truth.ecsv.
+    """Writes a SimulatedField: an image and a PSF cube of each mosaic, field.toml, truth.ecsv.
 
     An image file has the HDUs SCI (cube of bands, tile-compressed without loss), RMS and MASK,
     whose bit BAD (1) marks dead columns. All files appear together. overwrite: whether they may
@@ -81,7 +81,7 @@ def write_field(folder, field, *, overwrite=True) -> list[Path]:
 
 
 def write_surveys(folder, field, *, overwrite=True) -> list[Path]:
-    """Write a SimulatedField as its surveys hand out their data, field.toml, truth.ecsv.
+    """Writes a SimulatedField in its surveys' formats, field.toml and truth.ecsv.
 
     As `write_field`. euclid/ holds a tile of MER, rubin/ a cell coadd for each band. Dead columns
     have the flag 1 there and NO_DATA here. Raises ValueError for PSFs sampled more finely than the
@@ -97,7 +97,7 @@ def write_surveys(folder, field, *, overwrite=True) -> list[Path]:
 
 
 def _written(write, folder, field, overwrite):
-    """The paths of what write(part, field) has put into a folder `part`, moved to `folder`."""
+    """Moves the files that write(part, field) made in a folder `part` to `folder`; their paths."""
     from ..files.atomic import atomic_tree
 
     with atomic_tree(folder, overwrite=overwrite) as part:
@@ -144,7 +144,7 @@ def _write_plain(folder, field):
 
 
 def _with_truth(folder, tables, paths, field):
-    """Write field.toml and truth.ecsv; all paths, field.toml first."""
+    """Writes field.toml and truth.ecsv; all paths, field.toml first."""
     from astropy.table import Table
 
     (folder / FILES[0]).write_text("\n".join(tables))

@@ -25,6 +25,7 @@ from .iterate import iterate
 from .refit.two_component_fit import needs_second_component, refit_two_components
 from .result import Result
 from .settings import Settings
+from .start.profile_start import LIGHT_SIGMAS
 
 LOG = logging.getLogger("clresample")
 # [px] Blends of several sizes have their frames and observations padded to multiples of this, so
@@ -60,17 +61,18 @@ def deblend(
     dtype=np.float32,
     progress=None,
 ) -> Result:
-    """Fit one scene to all observations at once.
+    """Fits one scene to all observations at once.
 
         min 1/2 sum_o |sqrt(w_o) (R_o sum_s A_s S_s - d_o)|^2 + 1/2 |z|^2,  A >= 0, S constrained
 
-    observations, sources, frame, shifts: see Blend; among observations may be astropy's NDData and
-        CCDData that have a PSF; settings: see Settings
+    observations, sources, frame, shifts: see Blend; observations may include astropy's NDData and
+        CCDData that have a PSF
+    settings: see Settings; device: see get_device; dtype: float32 or float64, of the fit
     progress: called every few iterations with their number so far and the loss (1,)
-    raises ValueError for what `check_observations`, `model_frame` and `Source` refuse, and when no
-    source lies inside the frame. Warns (SourceWarning) of sources far from any light. Ctrl-C ends
-    the fit with the best state so far. Warns (InputWarning) of what is wrong with the observations
-    and the list of sources, as far as their light tells (inspection/): messages of the result.
+    Raises ValueError for arguments that `check_observations`, `model_frame` and `Source` reject,
+    and when no source lies inside the frame. Warns (SourceWarning) of sources far from any light.
+    Ctrl-C ends the fit with the best state so far. Warns (InputWarning) of problems of the
+    observations and of the list of sources (inspection/); the result has them in its messages.
     """
     blend = Blend(as_observations(observations), _listed("sources", sources), frame, shifts)
     settings, dtype = _checked(settings, dtype)
@@ -93,7 +95,7 @@ def deblend(
 def deblend_many(
     blends, *, settings=None, device=None, dtype=np.float32, memory=MEMORY, progress=None
 ) -> list[Result | Failure]:
-    """Fit many blends side by side; each comes out as if it were fitted alone, to float accuracy.
+    """Fits many blends side by side, each with the result of a fit alone to float accuracy.
 
     device: see get_device; or a list of such choices: the blends are dealt to all of them by their
         speed, each with a process of its own, so that a script that calls this must do so under
@@ -140,7 +142,7 @@ def deblend_many(
 
 @one_blas_thread()
 def _fit_all(blends, *, device, progress=lambda n_done: None, **given):
-    """(Result or Failure, what is warned about: sources far from any light, problems)."""
+    """(Result or Failure, its warnings: sources far from any light, problems)."""
     many = _BatchRunner(blends, device, **given)
     # the results of what was not done say so
     with contextlib.suppress(KeyboardInterrupt):
@@ -165,7 +167,7 @@ class _BatchRunner:
         self.warned = {}
 
     def run(self, progress):
-        """Fit them all; raises KeyboardInterrupt when the group that runs was interrupted."""
+        """Fits all blends. Raises KeyboardInterrupt if the running group was interrupted."""
         n_done, groups = 0, self._groups()
         with contextlib.closing(
             prefetch(groups) if self.tuning.prefetch_groups else groups
@@ -207,7 +209,7 @@ class _BatchRunner:
         return len(group), self._begin(group)
 
     def _begin(self, group):
-        """Start a group of (index, Fit); those that could, one by one where all at once fails."""
+        """Starts a group of (index, Fit), one by one if the group fails; returns those started."""
         try:
             start_fits([fit for _, fit in group])
         except Exception as error:
@@ -220,7 +222,7 @@ class _BatchRunner:
         return group
 
     def _fit(self, group):
-        """Fit a group of (index, Fit) that has begun; True where Ctrl-C has ended that."""
+        """Fits a started group of (index, Fit). Returns True if Ctrl-C ended it."""
         for part in self._parts(group):
             for i, done in self._try(part):
                 self.done[i] = done
@@ -241,7 +243,7 @@ class _BatchRunner:
             yield part
 
     def _try(self, group):
-        """Yield (index, Result or Failure) of a group; one by one where all at once fails."""
+        """Yields (index, Result or Failure) of a group, fitted one by one if the group fails."""
         fits = [fit for _, fit in group]
         run = fits[0].settings, self.device, self.dtype
         try:
@@ -281,13 +283,13 @@ def _listed(name, values):
 
 
 def _failure(blend, error):
-    """The Failure of a blend that ended with an exception, which its status tells."""
+    """The Failure of a blend that ended with an exception, with that in its status."""
     kind = "" if isinstance(error, ERRORS) else f"{type(error).__name__}: "
     return Failure(blend, f"failed: {kind}{error}")
 
 
 def _sizes(blend):
-    """The shapes of a blend's images and of its frame; None of what is no blend."""
+    """The shapes of a blend's images and of its frame; None for an invalid blend."""
     try:
         blend.check()
     except (ValueError, TypeError, AttributeError):
@@ -296,11 +298,11 @@ def _sizes(blend):
 
 
 def _warn_dark(dark, where):
-    """Warn the caller of `deblend` or `deblend_many` of sources far from any light."""
+    """Warns the caller of `deblend` or `deblend_many` of sources far from any light."""
     n = sum(map(len, dark))
     warnings.warn(
-        f"{n} source{'s lie' if n > 1 else ' lies'} far from any light{where}: see the messages of "
-        "the result",
+        f"no light above {LIGHT_SIGMAS:g} sigma at or near {n} source position{'s' * (n > 1)}"
+        f"{where}: see Result.messages",
         SourceWarning,
         stacklevel=3,
     )

@@ -1,4 +1,4 @@
-"""One patch of sky to deblend (Blend), and what a batch returns where that failed (Failure)."""
+"""One patch of sky to deblend (Blend), and its result if the fit failed (Failure)."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ BYTES_A_BOX, BOX_PIXELS, BYTES_A_PIXEL = 40, 256 * 256, 100
 
 @dataclass(frozen=True)
 class Blend:
-    """One patch of sky: what was seen, and what is there.
+    """One patch of sky: its observations and its sources.
 
-    observations: at least one Observation; sources: Point and Extended
+    observations: at least one Observation; sources: PointSource and ExtendedSource
     frame: the model's Frame; None = `model_frame` of the observations
     shifts (n_observations, 2) [model px]: of the observations' pixels, where known; a fit of shifts
         starts from them. Where a fit finds a shift of more than a pixel, a second one that starts
@@ -43,7 +43,7 @@ class Blend:
     shifts: np.ndarray | None = None
 
     def check(self):
-        """Raise ValueError where an observation, a source or the frame is something else."""
+        """Raises ValueError if an observation, a source or the frame has another type."""
         for i, observation in enumerate(self.observations):
             check_instance(f"observations[{i}]", observation, Observation)
         for i, source in enumerate(self.sources):
@@ -52,7 +52,7 @@ class Blend:
             check_instance("frame", self.frame, Frame)
 
     def _check_work(self, frame):
-        """Raise ValueError where a fit would take more than could be meant, before it begins."""
+        """Raises ValueError, before a fit starts, if it would exceed the limits on work."""
         n_pixels = int(np.prod(frame.shape, dtype=float))
         if n_pixels > MAX_PIXELS:
             raise ValueError(
@@ -63,16 +63,16 @@ class Blend:
         n_seen = max(int(np.count_nonzero(o.weights, axis=(1, 2)).max()) for o in self.observations)
         if n > n_seen > 0:
             raise ValueError(
-                f"{len(self.sources)} sources have {n} components, more than any channel has "
-                f"pixels with a weight ({n_seen}): each has a flux in each channel; give fewer"
+                f"{len(self.sources)} sources have {n} components, but no channel has more than "
+                f"{n_seen} pixels with weight: reduce the number of sources"
             )
         n_bytes = BYTES_A_BOX * n * min(n_pixels, BOX_PIXELS)
         n_bytes += BYTES_A_PIXEL * (n_pixels + sum(o.data.size for o in self.observations))
         if n > MAX_COMPONENTS or n_bytes > MAX_BYTES:
             raise ValueError(
                 f"{len(self.sources)} sources with {n} components on {n_pixels} model pixels need "
-                f"{n_bytes / 2**30:.3g} GiB in one fit; it takes {MAX_COMPONENTS} components and "
-                f"{MAX_BYTES >> 30} GiB at most: cut the field into blends for deblend_many"
+                f"{n_bytes / 2**30:.3g} GiB in one fit, must be at most {MAX_COMPONENTS} "
+                f"components and {MAX_BYTES >> 30} GiB: cut the field into blends for deblend_many"
             )
 
     def initial_shifts(self) -> np.ndarray:
@@ -112,7 +112,7 @@ class Blend:
 
 @dataclass(frozen=True)
 class Failure:
-    """A blend of a batch that could not be fitted; `status` says why."""
+    """A blend of a batch that could not be fitted, with the reason in `status`."""
 
     blend: Blend
     status: str

@@ -37,7 +37,7 @@ DIVERGED = 10.0
 
 @dataclass(frozen=True, eq=False)
 class _BestState:
-    """The lowest loss so far, and what it belongs to."""
+    """The lowest loss so far, with its scene, state and shifts."""
 
     loss: float
     scene: Scene | None
@@ -117,7 +117,7 @@ class Fit:
         return known, self.settings.fit_shifts
 
     def begin(self, point: StartingPoint, seconds):
-        """Make the scene and its state from where it starts; seconds: that this took."""
+        """Makes the scene and its state from the starting point; seconds: the time of the start."""
         began = time.perf_counter()
         self.views, self.start = with_psf_error_weights(self.patch, point, self.settings)
         self.undetected = self.fitted[point.undetected]
@@ -141,19 +141,19 @@ class Fit:
         return np.array([view.op.shift for view in self.views])
 
     def shift(self, shifts):
-        """Move the observations' pixels to these shifts."""
+        """Moves the observations' pixels to these shifts."""
         for view, shift in zip(self.views, shifts, strict=True):
             view.op.shift = shift
 
     def stopped(self, losses) -> bool:
-        """Take the losses (n,) of the last iterations; whether the fit ends here, and why."""
+        """Records the losses (n,) of the last iterations; returns True if the fit stops."""
         self.losses.extend(losses.tolist())
         reason = stop_reason(self.losses, len(losses), self.settings.rel_tol)
         self.status = reason or self.status
         return reason is not None
 
     def end(self, scene, state, findings, status):
-        """End here, with this state."""
+        """Ends the fit with this state."""
         self.scene, self.state, self.strength_estimates, self.status = (
             scene,
             state,
@@ -162,20 +162,20 @@ class Fit:
         )
 
     def interrupt(self):
-        """Note that the fit ends because the user wants it to."""
+        """Records that the user interrupted the fit."""
         self.status = INTERRUPTED
 
     def note_seconds(self, stage, seconds):
-        """Take down how long a stage has taken."""
+        """Records the time of a stage."""
         self.seconds[stage] = seconds
 
     def keep_best(self, loss, scene, state):
-        """Keep a state, at the present shifts, if its loss is the lowest so far."""
+        """Keeps a state, at the present shifts, if its loss is the lowest so far."""
         if loss < self._best.loss:
             self._best = _BestState(float(loss), scene, state, self.shifts)
 
     def store_final(self, loss, scene, state):
-        """End here, with the present state, or with the best one where that is better.
+        """Ends the fit with the present state, or with the best one if that is better.
 
         The present one, if it was interrupted, may be half-way through an iteration.
         """
@@ -223,7 +223,7 @@ class Fit:
 
 
 def start_fits(fits):
-    """Start fits of one signature side by side."""
+    """Starts fits of one signature side by side."""
     began = time.perf_counter()
     points = fit_start_profiles([fit.patch for fit in fits], fit_sky=fits[0].settings.fit_sky)
     seconds = (time.perf_counter() - began) / len(fits)
@@ -246,7 +246,7 @@ def _joined(parts, n_channels):
 
 
 def _model(fit) -> MorphologyModel:
-    """A fit's morphologies as they are by now, max = 1, and what sees them."""
+    """A fit's present morphologies, max = 1, and the views that render them."""
     pairs = zip(fit.views, fit.blend.observations, strict=True)
     return MorphologyModel(
         fit.padded.shape,

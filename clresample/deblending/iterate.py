@@ -26,23 +26,23 @@ REPACK_FRACTION = 0.25
 # A fit under a MultiscalePrior stays where it is if the next shift would lower its loss by less
 # than this part of what ends it.
 MIN_GAIN = 0.5
-# [iterations] When a fit whose strengths have settled takes a step of its Exchange: at first, and
+# [iterations] When a fit with settled strengths takes a step of its JointNewtonStep: at first, and
 # between two; also where it has converged. Every 40 of them, bright scenes take a third longer.
 FIRST_JOINT_STEP, JOINT_STEP_ITERATIONS = 40, 20
 # It takes the step if its loss is expected to fall by more than this part of what ends it. With
 # 0.4, two in 100 fluxes of simulated scenes of Rubin's or Euclid's alone move by over 0.2 errors
 # where fits go on, with 0.2 one in 200.
 MIN_JOINT_GAIN = 0.2
-# If until the next one the loss has fallen by less than this part of what an Exchange promised, it
-# is made anew, of the scene as it is now. The second one is given up: bounds hold the scene
-# elsewhere, and trials along its steps would be refused.
+# If the loss has fallen by less than this part of the predicted gain until the next one, the
+# JointNewtonStep is made anew, of the present scene. The second one is given up: bounds hold the
+# scene elsewhere, and trials along its steps would be rejected.
 MIN_JOINT_PROGRESS, MAX_JOINT_MATRICES = 0.2, 2
 # [iterations] between two adjustments of the boxes to the light they hold; each makes a new batch.
 RESIZE_ITERATIONS = 40
 
 
 def iterate(fits, settings, device, dtype, progress=None, *, takes_over=None):
-    """Run the fits of one signature until each has stopped; they keep their final states.
+    """Runs the fits of one signature until each has stopped; they keep their final states.
 
     takes_over: of a fit that has learned clear structure; where True the fit ends,
         STOPPED_FOR_REFIT
@@ -116,20 +116,20 @@ class _AmsgradRun:
         return losses
 
     def remember(self, which):
-        """Bring the states kept on the device to those of the fits (B,) that had none better."""
+        """Copies the best states from the device to the fits (B,), if better than their own."""
         losses, kept = self.engine.best_losses(), self.engine.states(kept=True)
         for i in np.flatnonzero(which):
             self.fits[i].keep_best(losses[i], self.engine.scenes[i], kept[i])
 
     def settle(self, stop):
-        """Leave the fits (B,) that stop here with their final state and its loss."""
+        """Stores the final state and loss of the fits (B,) that stop here."""
         self.remember(stop)
         states, losses = self.engine.states(), self.engine.final_losses()
         for i in np.flatnonzero(stop):
             self.fits[i].store_final(losses[i], self.engine.scenes[i], states[i])
 
     def shift(self):
-        """Shift the observations, where that is asked for and due."""
+        """Updates the observations' shifts if they are fitted and due."""
         if not self.settings.fit_shifts or self.engine.n_steps % SHIFT_ITERATIONS:
             return
         self.remember(self.live)
@@ -162,8 +162,9 @@ class _LbfgsRun:
 
     Boxes stay as they are: structure fades at their edges, as the profile does that they follow.
 
-    exchanges (B): each fit's Exchange, or None; asked (B, 4): when that was last looked at a fit's
-        rounds and loss, 0 and infinite before, the gain that it promised, and how many were made
+    exchanges (B): each fit's JointNewtonStep, or None; asked (B, 4): when that was last looked at
+        a fit's rounds and loss, 0 and infinite before, the gain that it promised, and how many
+        were made
     stop_for_refit: see `iterate`
     """
 
@@ -214,12 +215,12 @@ class _LbfgsRun:
         return engine.progress.loss[None]
 
     def shift(self):
-        """Shift the observations, where that is asked for and due."""
+        """Updates the observations' shifts if they are fitted and due."""
         if self.settings.fit_shifts and self.n_steps % SHIFT_ITERATIONS == 0:
             self._move(self.live)
 
     def _move(self, which):
-        """Shift the observations of the fits (B,), also of converged ones, which then go on."""
+        """Updates the shifts of the fits (B,); converged fits continue."""
         if not which.any():
             return
         states, moved = self.engine.states(), np.zeros(len(self.fits), bool)
@@ -288,7 +289,7 @@ class _LbfgsRun:
             engine.step(steps)
 
     def settle(self, stop):
-        """Leave the fits (B,) that stop here with their present state."""
+        """Stores the present state of the fits (B,) that stop here."""
         states, p = self.engine.states(), self.engine.progress
         findings = self.engine.findings(stop)
         for i in np.flatnonzero(stop):

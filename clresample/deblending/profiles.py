@@ -1,4 +1,4 @@
-"""Smooth profiles on model pixels: what a source looks like before its own structure is fitted.
+"""Smooth profiles of sources on model pixels, from which their own structure departs.
 
 A source has one ComponentProfile for each of its components: a GalaxyProfile, a FixedProfile
 profile or a StarProfile. A shape is drawn from a few parameters theta (n,), which `start` fits to
@@ -152,7 +152,7 @@ class ComponentProfile:
         return drawn if slopes else drawn[:1]
 
     def bounding_box(self, theta, position, threshold):
-        """Middle (2,) and half size (2,) [px] of what is above a part of the peak."""
+        """Middle (2,) and half size (2,) [px] of the pixels above a part of the peak."""
         raise NotImplementedError
 
     def center(self, theta, position):
@@ -193,7 +193,7 @@ class GalaxyProfile(ComponentProfile):
         return position, half[0]
 
     def position_derivatives(self, theta, position, image):
-        """Slopes (2, ny, nx) by the position (y, x) [px] of `image`, what is drawn there."""
+        """Slopes (2, ny, nx) of the drawn `image` by the position (y, x) [px]."""
         inverse, beta = np.linalg.inv(covariance(theta, self.psf_moment)[0]), np.exp(theta[3])
         dy, dx = (np.arange(n) - p for n, p in zip(image.shape, position, strict=True))
         along = np.tensordot(inverse, np.stack(np.broadcast_arrays(dy[:, None], dx)), 1)
@@ -231,7 +231,7 @@ class FixedProfile(ComponentProfile):
 
 
 class StarProfile(ComponentProfile):
-    """The model's PSF; theta (2,) [px] = how far off the given position it is, if free."""
+    """The model's PSF; theta (2,) [px]: its offset from the listed position, if free."""
 
     def __init__(self, frame, *, free):
         self.shape, self.psf, self.free = frame.shape, frame.psf, free

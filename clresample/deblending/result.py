@@ -131,7 +131,7 @@ class Result(ResultDisplay):
         ]
 
     def source_model(self, i_source, i_observation=None) -> np.ndarray:
-        """One source (C, Ny, Nx) in the model frame, or (Co, My, Mx) as an observation sees it.
+        """One source (C, Ny, Nx) in the model frame, or (Co, My, Mx) rendered in an observation.
 
         i_observation: number or name of the observation; None = the model frame
         """
@@ -147,7 +147,7 @@ class Result(ResultDisplay):
         return sum((c.spectrum[channels, None, None] * unit[i] for i, c in parts), zero)
 
     def as_galsim(self, i_source, channel):
-        """One source as GalSim sees it: galsim.InterpolatedImage, under the frame's PSF.
+        """One source as a GalSim object: galsim.InterpolatedImage, under the frame's PSF.
 
         i_source: its number; channel: a name, or a number in the order of `channels`
         returns the profile about the source's position [arcsec, u to the west, v to the north],
@@ -165,7 +165,7 @@ class Result(ResultDisplay):
         return profile_of(self.source_model(i_source)[channel], self.frame.grid, position)
 
     def model(self, i_observation) -> np.ndarray:
-        """All sources and the sky (Co, My, Mx) [counts] as an observation sees them.
+        """All sources and the sky (Co, My, Mx) [counts], rendered in an observation.
 
         i_observation: its number or name
         """
@@ -207,7 +207,7 @@ class Result(ResultDisplay):
         return cutout(self, source, observation, what, size=size, unit=unit)
 
     def sample(self, n, rng=None) -> list[tuple[Component, ...]]:
-        """Draw n sets of components from the posterior about the solution, as `errors` has it.
+        """Draws n sets of components from the posterior about the solution, as `errors` has it.
 
         rng: NumPy Generator, or a seed: equal seeds give equal draws, also of a result read from a
         file. Morphologies and spectra below 0 become 0, so that faint sources are
@@ -225,7 +225,7 @@ class Result(ResultDisplay):
         return [drawn_components(self, rng) for _ in range(n)]
 
     def sample_fluxes(self, n, rng=None) -> np.ndarray:
-        """Draw the sources' fluxes (n, S, C) [counts] from the posterior, n times.
+        """Draws the sources' fluxes (n, S, C) [counts] from the posterior, n times.
 
         Those of `sample`, with what `fluxes` adds for light beyond the boxes and takes off for the
         bound at 0, so that they scatter about the catalogue's; NaN where nothing was measured.

@@ -26,11 +26,11 @@ class Settings:
         source's data say, by L-BFGS. Prior: structure of one scale and strength; None: the
         morphologies themselves, by the constraints alone; both by the adaptive proximal gradients
         of Melchior et al. (2019)
-    loss_tol: with a MultiscalePrior a fit has converged when its loss, half of chi2, fell by less
-        than this, times chi2 per pixel where that is above 1, over 5 iterations, and a step along
-        what its sources exchange would gain less than a fifth of this. With 0.5 it takes a tenth
-        fewer iterations, and where fits of Euclid's or Rubin's images alone go on, over 1 in 100
-        fluxes move by more than 0.2 errors; with 0.25 about 1 in 200 (`bench.settings --continued`)
+    loss_tol: with a MultiscalePrior a fit has converged when the loss (half chi2) fell by less than
+        `loss_tol` over 5 iterations and a joint Newton step would gain less than a fifth of that.
+        Both limits scale with chi2 per pixel where it exceeds 1. With 0.5 fits take a tenth fewer
+        iterations, and where fits of Euclid's or Rubin's images alone go on, over 1 in 100 fluxes
+        move by more than 0.2 errors; with 0.25 about 1 in 200 (`bench.settings --continued`)
     rel_tol: with others it has when its best loss fell by less than this part of itself over 15
     constraints: with others, ProxChain of proximal operators on the morphologies; None:
         non-negative, and monotone by the sweep. With a MultiscalePrior they are non-negative and
@@ -43,17 +43,15 @@ class Settings:
     fit_sky: fit a constant per channel. Its prior is Gaussian, with the level of the pixels that
         hold no source and its error (inspection/levels.py), so that it takes no light of wide
         sources; where no pixel is free of sources the constant is unconstrained
-    flux_error_floor: with a MultiscalePrior, part of each flux added to its error in quadrature,
-        the same for all channels of a source: what no likelihood knows, the error of the model of
-            bright
-        galaxies, their photons' own noise where the weights leave it out, and PSFs. It is that of
-        a galaxy that is like its smooth profile, and grows with the cube of the structure that
-        the data show, to 0.4 % for a typical bright galaxy of COSMOS and 1.4 % at most. Larger
-        ones are not needed by simulated parametric galaxies, smaller ones cover COSMOS' less.
-        PSFs that are wrong by a percent need 0.01
-    errors: with a MultiscalePrior, whether errors are worked out that know of morphologies and
-        neighbours. False takes two thirds of the time; fluxes have those of fixed morphologies,
-        and sizes none
+    flux_error_floor: relative systematic flux error with a MultiscalePrior, added in quadrature,
+        the same for all channels of a source. It covers model errors of bright galaxies, photon
+        noise missing from the weights, and PSF errors. It applies to a galaxy that equals its
+        smooth profile, and grows with the cube of the structure in the data, to 0.4 % for a typical
+        bright galaxy of COSMOS and 1.4 % at most. Simulated parametric galaxies need no larger
+        value; smaller ones cover COSMOS' galaxies less. PSFs that are wrong by a percent need 0.01
+    errors: with a MultiscalePrior, compute errors that include morphologies and neighbours. False
+        takes two thirds of the time; then flux errors are those at fixed morphologies, and sizes
+        have none
     psf_error: part by which PSFs may be too narrow or too wide. That part of a bright point
         source's light, more in its wings, adds to the noise of its pixels, so that what the PSF
         does not explain of a star is not given to its neighbours. Weights follow the stars' light
@@ -62,11 +60,11 @@ class Settings:
         of galaxies from 7.5 to 12.9 dB (12.9 with a right PSF, too), and their stated flux errors
         by a quarter. Larger values help against worse PSFs, and cost more precision
     psf_tolerance: of PSFs that vary over an observation (PSFField), how far each source's may be
-        from its own, as a part of the norm of its samples (PSFBasis.error). Fits follow the PSF
+        from its own, as a part of the norm of its samples (PSFBasis.max_error). Fits follow the PSF
         from source to source where it varies by more. With 0.001 a star of signal to noise 1000
         is off by one sigma, all its pixels together, and no flux by more than about 0.1 %, less
-        than flux_floor; measured PSFs are known to 0.2 to 1 %. Larger values take fewer terms, each
-        of which adds 10 to 20 % to a fit's time; 0: each source's own PSF exactly
+        than flux_error_floor; measured PSFs are known to 0.2 to 1 %. Larger values take fewer
+        terms, each of which adds 10 to 20 % to a fit's time; 0: each source's own PSF exactly
     """
 
     max_iter: int = 500

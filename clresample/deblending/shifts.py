@@ -48,8 +48,8 @@ def shift_steps(scene, state) -> tuple[np.ndarray, float]:
 def extrapolate(steps, last):
     """Limits (n, 2) of steps that fall off by a factor each, from the `last` ones.
 
-    As the model follows each shift by a part of it, steps sum up to the first one over 1 minus that
-    factor.
+    The model follows each shift only in part, so that the steps sum up to the first one divided by
+    1 minus that factor.
     """
     factor = (steps * last).sum() / max((last * last).sum(), 1e-30)
     return steps / (1 - np.clip(factor, 0, MAX_DECAY_FACTOR))

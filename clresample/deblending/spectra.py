@@ -83,7 +83,7 @@ def _by_active_sets(matrix, right, free):
 
 
 def spectrum_covariance(normal):
-    """Covariances (M, n, n): infinite variance of what is not seen, and none with others.
+    """Covariances (M, n, n); undetermined values have infinite variance and no covariance.
 
     Where many sources lie in one place, rounding of `normal` can leave it with eigenvalues below
     zero, and its inverse with variances that are too small, or negative: no variance is less than

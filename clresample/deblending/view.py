@@ -215,7 +215,8 @@ class SceneGeometry:
     def _on(self, observation):
         """The places (S, 2) in an Observation's pixels.
 
-        Of those outside, the nearest on its image, so that its PSF there takes no term of its own.
+        Places outside move to the nearest pixel of the image, so that its PSF there needs no extra
+        term.
         """
         at = self.frame.grid.positions_in(observation.grid, *self.source_positions.T)
         top = np.array(observation.data.shape[1:]) - 1

@@ -1,4 +1,4 @@
-"""Tells whoever looks that kernels are being compiled: a wait of seconds that happens once."""
+"""Reports that kernels are being compiled: a wait of seconds that happens once."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class CompilationNotice:
         self.device, self._lock, self._is_said = device, threading.Lock(), False
 
     def build(self, build):
-        """Returns `build()`, and tells the user if it took longer than a cache does."""
+        """Returns `build()`, and reports if it took longer than a cached build."""
         began = time.thread_time()
         built = build()
         if time.thread_time() - began > MAX_CACHED_S:

@@ -154,7 +154,7 @@ class Contraction:
         self.options |= {epilogue: True} if epilogue else {}
 
     def build(self, n_rows=None, n_terms=0, n=0):
-        """(file, macros) for matrices of so many rows, terms and columns; of most, if not given."""
+        """(file, macros) for numbers of rows, terms and columns; by default the largest."""
         tile = self.tuning.tile_for(n_rows) if n_rows else self.tuning.tile
         if "KB" not in tile:
             own = {"RT": ROW_TILES, "READ_AHEAD": self.tuning.prefetch_columns}
@@ -248,7 +248,7 @@ class BoundContraction:
         self.n_x = _groups(-(-width // columns), tile["WGX"])
 
     def __call__(self, batch, *, a=None, c=None):
-        """Queue `batch` products.
+        """Queues `batch` products.
 
         a, c (ImageBatch): the left factor and the result of this call, strides as they are bound
         """

@@ -1,4 +1,4 @@
-"""One OpenCL device: its memory, its kernels, and what is copied and launched there.
+"""One OpenCL device: its memory, kernels, copies and launches.
 
 What waits, waits for an event, though copies from and to the host are blocking ones and OpenCL has
 clFinish: Mesa's rusticl (22.3) comes back from both too early where another thread, on its way to
@@ -117,15 +117,15 @@ class Device:
         return array
 
     def upload(self, values, array):
-        """Overwrite a device array with a C-contiguous NumPy array of its size and dtype."""
+        """Overwrites a device array with a C-contiguous NumPy array of its size and dtype."""
         _copy(self, array.base_data, values, dst_offset=array.offset)
 
     def download(self, array, values):
-        """Overwrite a C-contiguous NumPy array with a device array, once all queued is done."""
+        """Overwrites a C-contiguous NumPy array with a device array, once all queued is done."""
         _copy(self, values, array.base_data, src_offset=array.offset)
 
     def copy(self, source, target):
-        """Overwrite a device array with another of its size and dtype."""
+        """Overwrites a device array with another of its size and dtype."""
         places = {"src_offset": source.offset, "dst_offset": target.offset}
         _copy(self, target.base_data, source.base_data, byte_count=source.nbytes, **places)
 
@@ -148,15 +148,15 @@ class Device:
         return Launcher(self, kernel, is_buffer, self._lock, local_size)
 
     def build_ahead(self, requests):
-        """Start to build programs, (file, dtype, {macro: value}) each, in a thread."""
+        """Starts building programs, (file, dtype, {macro: value}) each, in a thread."""
         self._programs.build_ahead(requests)
 
     def launch(self, kernel, global_size, local_size=None):
-        """Queue a kernel whose arguments are set; sizes (x, y, z) as OpenCL counts them."""
+        """Queues a kernel whose arguments are set; sizes (x, y, z) as OpenCL counts them."""
         return self._call(self._enqueue, self.queue, kernel, global_size, local_size)
 
     def finish(self, queue=None):
-        """Wait until everything queued is done, here or in another in-order queue."""
+        """Waits until all queued work is done, here or in another in-order queue."""
         import pyopencl as cl
 
         self._call(self._call(cl.enqueue_marker, queue or self.queue).wait)
@@ -195,7 +195,7 @@ class Device:
 
 
 def _copy(device, target, source, **options):
-    """Queue a copy; one from or to the host is done when this comes back."""
+    """Queues a copy; one from or to the host has finished when this returns."""
     import pyopencl as cl
 
     event = device._call(cl.enqueue_copy, device.queue, target, source, **options)
@@ -212,7 +212,7 @@ def _buffer_type():
 
 
 def get_device(choice=None) -> Device:
-    """The chosen device; asked twice it is the same object.
+    """The chosen device; repeated calls return the same object.
 
     choice: None, a Device, an index, "platform:device" (each an index or part of a name), or part
         of a device's or platform's name. None reads CLRESAMPLE_DEVICE (the same forms), then

@@ -18,11 +18,11 @@ from .. import __version__
 
 
 class DeviceWarning(UserWarning):
-    """Something about a device that a user should know, in one line."""
+    """A message about a device for the user, in one line."""
 
 
 def cache_folder():
-    """Folder of what can be made again: CLRESAMPLE_CACHE, or the system's place."""
+    """Folder of files that can be made again: CLRESAMPLE_CACHE, or the system's cache."""
     given = os.environ.get("CLRESAMPLE_CACHE")
     return Path(given) if given else system_caches() / "clresample"
 
@@ -56,7 +56,7 @@ class DeviceCache:
         return self._all().get(part)
 
     def write(self, part, content):
-        """Keep a part beside the others. Raises OSError where the file cannot be written."""
+        """Stores a part beside the others. Raises OSError if the file cannot be written."""
         everything = self.about | self._all() | {part: content}
         self.path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=self.path.parent, prefix=f"{self.path.stem}-")
@@ -71,16 +71,16 @@ class DeviceCache:
         self._content = everything
 
     def override(self, part, content):
-        """Let a part read so for the rest of this process; the file stays as it is."""
+        """Overrides a part for the rest of this process; the file is unchanged."""
         self._all()[part] = content
 
     def invalidate(self, part, why):
-        """Ignore a part for the rest of this process, with a warning; the file stays as it is."""
+        """Ignores a part for the rest of this process, with a warning; the file is unchanged."""
         if self._all().pop(part, None) is not None:
             self.warn_ignored(why)
 
     def warn_ignored(self, why):
-        """Warn, in one line, that what the file says is not used."""
+        """Warns, in one line, that the file's content is not used."""
         warnings.warn(f"{self.path} is ignored: {why}", DeviceWarning, stacklevel=2)
 
     def _all(self):

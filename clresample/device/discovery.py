@@ -40,7 +40,7 @@ __kernel void probe(__global double *x) { x[0] = x[0] / 3.0; }
 
 
 class DeviceError(RuntimeError):
-    """The device cannot do what was asked; the message says why and what to do about it."""
+    """A failed operation of a device; the message has the reason and the remedy."""
 
 
 @dataclass(frozen=True)
@@ -261,7 +261,7 @@ def load_pyopencl():
 
 @functools.cache
 def _ignore_remarks(cl):
-    """Leave out pyopencl's warnings of compilers that, as Intel's, remark on every build."""
+    """Filters pyopencl's warnings of compilers, such as Intel's, that comment on every build."""
     warnings.filterwarnings("ignore", category=cl.CompilerWarning)
 
 

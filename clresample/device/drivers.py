@@ -119,13 +119,13 @@ def driver_fault(library, served):
 
 @functools.cache  # once
 def warn_named_library(library, served):
-    """Warn of the library of CLRESAMPLE_ICD where it brings no device."""
+    """Warns if the library of CLRESAMPLE_ICD provides no device."""
     if fault := driver_fault(library, served):
         warnings.warn(f"CLRESAMPLE_ICD={library} {fault}", DeviceWarning, stacklevel=3)
 
 
 def _platforms_of(library):
-    """Addresses of a driver library's platforms, None of what is no driver: as the loader asks."""
+    """Addresses of a driver library's platforms, as for the loader; None if not a driver."""
     find = getattr(library, "clGetExtensionFunctionAddress", None)
     if find is None:
         return None
@@ -161,7 +161,7 @@ def temporary_folder(kind):
 
 
 def _remove_of_gone(entry, pid):
-    """Remove a folder unless a process has this number, or may have it."""
+    """Removes a folder unless a process has this number, or could have it."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -187,7 +187,7 @@ def driver_advice(vendor, path, served):
 
 
 def icd_export_line(path):
-    """The line to type, without root, that lets clresample see the driver library at `path`."""
+    """The shell command, without root, that registers the driver library at `path`."""
     return f"export CLRESAMPLE_ICD={path}"
 
 
@@ -218,7 +218,7 @@ def _known():
 
 
 def _read(place):
-    """What a folder of .icd files, or one of them, names: {name: library}."""
+    """Libraries named by a folder of .icd files, or by one of them: {name: library}."""
     path = Path(place)
     files = [path] if path.suffix == ".icd" else sorted(path.glob("*.icd"))
     return {file.name: _in_full(file) for file in files}

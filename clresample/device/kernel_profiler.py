@@ -43,7 +43,7 @@ class KernelProfiler:
         self.name, self._rows, self._events = name, defaultdict(KernelTimes), []
 
     def record(self, event, kernel, arguments, global_size):
-        """Keep a launch; arguments {name: value} as the kernel has them."""
+        """Records a launch; arguments {name: value} of the kernel."""
         buffers = {id(v): v for v in arguments.values() if hasattr(v, "size")}
         work = launch_flops(kernel, arguments, global_size), sum(b.size for b in buffers.values())
         self._events.append((event, kernel, work))
@@ -83,7 +83,7 @@ class KernelProfiler:
         return "\n".join([f"kernels on {self.name}:", *lines])
 
     def add(self, rows):
-        """Add what another process has measured, {kernel: KernelTimes}."""
+        """Adds the measurements of another process, {kernel: KernelTimes}."""
         for kernel, row in rows.items():
             mine = self._rows[kernel]
             mine.n_calls += row.n_calls
@@ -92,7 +92,7 @@ class KernelProfiler:
             mine.n_bytes += row.n_bytes
 
     def clear(self):
-        """Begin anew."""
+        """Clears the tables."""
         self._rows.clear()
 
     def _read(self):
@@ -141,7 +141,7 @@ _PROFILES: list[KernelProfiler] = []
 
 
 def start_profiling(name):
-    """A Profile for a device that is opened now; None where CLRESAMPLE_PROFILE does not ask."""
+    """A KernelProfiler of a newly opened device; None unless CLRESAMPLE_PROFILE is set."""
     if os.environ.get("CLRESAMPLE_PROFILE", "0") in ("", "0"):
         return None
     return _begun(name)
@@ -166,14 +166,14 @@ def drain():
 
 
 def add(found):
-    """Add what another process has `drain` to this one's tables, one for each device's name."""
+    """Adds the drained tables of another process, one for each device's name."""
     for name, rows in found:
         same = [profile for profile in _PROFILES if profile.name == name]
         (same[0] if same else _begun(name)).add(rows)
 
 
 def report():
-    """Print the tables of all devices that are profiled on standard error, and start them anew."""
+    """Prints the tables of all profiled devices on standard error and clears them."""
     for profile in _PROFILES:
         table = profile.table()
         if table:

@@ -80,7 +80,7 @@ def host_threads(device):
 
 
 def map_threads(n_threads, function, items):
-    """[function(item), ...] of items, in their order, so many at a time.
+    """[function(item), ...] of items, in their order, a number at a time.
 
     For calls that spend their time in large products of NumPy's, for which other threads need not
     wait.
@@ -93,10 +93,10 @@ def map_threads(n_threads, function, items):
 
 
 def prefetch(items):
-    """The items of an iterator, the next one made by a thread while the last one is in use.
+    """Yields the items of an iterator, while a thread makes the next one.
 
-    At most one lies ready and one is being made beside that which is in use. What the iterator
-    raises is raised here in its turn. Closed early, the thread ends with the item that it makes.
+    At most one item is ready and one in progress beside the one in use. An exception of the
+    iterator is raised here in its turn. If closed early, the thread ends with its current item.
     """
     ready: queue.Queue = queue.Queue(maxsize=1)
     stop = threading.Event()
@@ -134,7 +134,7 @@ def prefetch(items):
 
 
 def distribute(function, items, devices, *, done, most):
-    """Have several devices work through `items`; returns what they made, in the items' order.
+    """Distributes `items` to several devices; returns the results in the items' order.
 
     function(items, device=) -> [result, ...]: picklable, as are items and results
     devices: choices as `get_device` takes them, at least one; one named twice gets two processes
@@ -224,14 +224,14 @@ class _DeviceProcess:
         other.close()
 
     def give(self, portion, items):
-        """Send a portion, if there is one; a dead process is found when its answer is awaited."""
+        """Sends a portion, if there is one; a dead process is found when its answer is awaited."""
         self.portion, self._began = portion, time.perf_counter()
         if portion:
             with suppress(OSError):
                 self.pipe.send(items)
 
     def collect(self, table, patience_s=None):
-        """Take in what the process answers; returns a fault, or None."""
+        """Receives the process's answer; returns a fault, or None."""
         if not self.portion:
             return None
         try:

@@ -32,11 +32,11 @@ NAMES = {
 
 @functools.cache  # once a device; a second time would find no name to set
 def set_pocl_cpu_name(device):
-    """Give PoCL the name of this processor where it has none that its compiler takes.
+    """Sets the processor's name for PoCL if its compiler does not know the detected one.
 
     device: a pyopencl device, of any platform
-    returns the name given, None where nothing was to be done or could be: the device's self-test
-    then tells
+    returns the name that was set, or None. Nothing was to be done then, or nothing could be: the
+    device's self-test decides
     """
     if not (device.version.endswith(VERSION) and device.driver_version.startswith(RELEASE)):
         return None

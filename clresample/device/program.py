@@ -87,7 +87,7 @@ class Programs:
         self._notice = CompilationNotice(device.name)
 
     def kernel(self, file, name, dtype, defines):
-        """A pyopencl.Kernel that knows its scalars' types, and {argument: whether it is a buffer}.
+        """A pyopencl.Kernel with its scalars' types, and {argument: True for a buffer}.
 
         DeviceError: the file does not build here (with the compiler's log), or no float64
         ValueError: dtype is another, or the file has no such kernel
@@ -106,7 +106,7 @@ class Programs:
         return self._kernels[build, name]
 
     def build_ahead(self, requests):
-        """Start to build programs in a thread; `kernel` waits for one that is being built.
+        """Starts building programs in a thread; `kernel` waits for one in progress.
 
         requests: (file, dtype, defines), as `kernel` takes them. One that does not build raises
         its error when `kernel` asks for it again.
@@ -122,7 +122,7 @@ class Programs:
         threading.Thread(target=build).start()
 
     def _program(self, file, dtype, defines):
-        """A program, built by the first thread that asks for it; the others wait."""
+        """A program, built by the first thread that requests it; the others wait."""
         build, mine = _request(file, dtype, defines), Future()
         program = self._programs.setdefault(build, mine)
         if program is mine:
@@ -145,7 +145,7 @@ class Programs:
 
 
 def _request(file, dtype, defines):
-    """Key by which programs are told apart."""
+    """Key that identifies a program."""
     return file, np.dtype(dtype), tuple(sorted(defines.items()))
 
 
@@ -181,12 +181,12 @@ class Launcher:
         self._bound = dict.fromkeys(is_buffer, UNSET)  # in the kernel's order
 
     def bind(self, **arguments):
-        """Give arguments that stay; returns the launcher. ValueError for an unknown name."""
+        """Binds arguments; returns the launcher. Raises ValueError for an unknown name."""
         self._bound = self._merged(arguments)
         return self
 
     def __call__(self, global_size, **arguments):
-        """Queue the kernel on `global_size` (x, y, z), `arguments` in place of what is bound.
+        """Queues the kernel on `global_size` (x, y, z); `arguments` replace bound ones.
 
         The size is rounded up to whole groups; kernels leave out the work-items beyond it.
 

@@ -29,7 +29,7 @@ N_Y, N_X, M_Y, M_X, H_Y, H_X = 19, 21, 11, 13, 9, 10
 def self_test_fault(device, remembered):
     """Why `device` is not to be used, or None. What has passed once is remembered, not tried again.
 
-    remembered: the Remembered of the device
+    remembered: the DeviceCache of the device
     """
     files = FILE, GROUP_FILE, WAVES_FILE, BACK_FILE
     kernels = hashlib.sha256("".join(map(read_kernel, files)).encode()).hexdigest()

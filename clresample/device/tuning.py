@@ -92,7 +92,7 @@ class Tuning:
 
     @classmethod
     def untuned(cls, device, dtype=np.float32) -> Tuning:
-        """The sizes for a device of which nothing was measured."""
+        """Default sizes for a device that has not been measured."""
         shared = {
             "line_group": 32,  # one warp of a GPU
             "lanes": 8,

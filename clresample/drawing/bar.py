@@ -51,13 +51,15 @@ class ProgressBar:
 
 
 def tell(line):
-    """A line of progress that was asked for: to the logger, and to standard error unless Python's
-    `logging` is set up to show such lines or to hide them."""
+    """Logs a requested line of progress, and prints it unless `logging` handles such lines.
+
+    It is printed on standard error, unless Python's `logging` is configured to show or to hide it.
+    """
     LOG.info(line)
     if not LOG.isEnabledFor(logging.INFO) and LOG.level == logging.NOTSET:
         print(line, file=sys.stderr, flush=True)
 
 
 def _is_watched():
-    """Returns True if someone looks: a terminal, or a notebook's kernel."""
+    """Returns True if the output is interactive: a terminal, or a notebook's kernel."""
     return sys.stderr.isatty() or "ipykernel" in sys.modules

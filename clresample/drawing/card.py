@@ -1,4 +1,4 @@
-"""Cards: what a notebook shows of an object, a table of its properties and its picture."""
+"""Notebook cards of objects: a table of their properties and their picture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The picture of a deblended scene: what each instrument saw, the model, and what is left."""
+"""Draws a deblended scene: observed images, model and residual of each instrument."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def deblended_figure(result, *, title=""):
 
 
 def _shown(result, i_observation):
-    """Channels to show: three neighbours where there are so many, else the best one."""
+    """Channels to show: three neighbours if there are three or more, else the best one."""
     o = result.observations[i_observation]
     signal = np.sqrt((o.weights * result.model(i_observation) ** 2).sum(axis=(1, 2)))
     if len(signal) < 3:

@@ -31,7 +31,7 @@ def stretch(image, limits):
 
 
 def import_figure():
-    """matplotlib's Figure. Raises ImportError that says what to install."""
+    """matplotlib's Figure. Raises ImportError that names the package to install."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -69,7 +69,7 @@ def add_panel(figure, left, top, width, height):
 
 
 def show_image(axes, image, mapping, *, residual=False):
-    """Draw an image in the place and orientation that it has on other pixels.
+    """Draws an image with its position and orientation on other pixels.
 
     image (My, Mx): 0 ... 1 in the colours of the sky, or -1 ... 1 in those of a residual; or
         (My, Mx, 3) red, green and blue of 0 ... 1

@@ -8,6 +8,7 @@ import numpy as np
 from astropy import units as u
 from astropy.table import QTable
 
+from ..measurement.catalogue import Flag
 from ..measurement.columns import Columns
 from ..measurement.photometry import whole_groups
 from .execution.group_results import PATCH_COLUMNS
@@ -17,8 +18,8 @@ DESCRIPTIONS = {
     "parent_id": "id of the brightest source that was detected in the same blend",
     "group_id": "id of the galaxy whose clump the source may be, or its own",
     "n_group": "sources of the group",
-    "flags": "sum of what limits the measurement: 1 EDGE, 2 NOT_CONVERGED, 4 ZERO_FLUX, "
-    "8 NO_COVERAGE, 16 OUTSIDE_FRAME, 32 CENTER_MASKED, 64 MISFIT, 128 SATURATED, 256 AMBIGUOUS",
+    "flags": "sum of what limits the measurement: "
+    + ", ".join(f"{flag.value} {flag.name}" for flag in Flag),
     "status": "how the fit ended",
     "reason": "why it failed, or was cut",
     "n_blend_sources": "sources that were detected in the blend",
@@ -81,7 +82,7 @@ DETECTION_COLUMNS = ("n_blend_sources", "n_group", "detection_pass", "detection_
 def finalise_catalogue(job, parts, last, unsettled=()):
     """The catalogue of the core, sorted by id, and the table of fits, sorted by patch.
 
-    parts: PartFiles; last: {patch: index of the part with its last round}
+    parts: GroupResultsFiles; last: {patch: index of the part with its last round}
     unsettled: parents of blends that were cut into pieces which did not settle
     """
     tables, fits = [], []
@@ -114,7 +115,7 @@ def finalise_catalogue(job, parts, last, unsettled=()):
 
 
 def _order(job, names):
-    """Names of columns: who and where, how it went, positions and shapes, then all channels."""
+    """Names of columns: ids, status, positions and shapes, then all channels."""
     channels, labels = job.channels, [m.name for m in job.mosaics]
     kinds = "flux", "flux_err", "mag", "mag_err", "group_flux", "group_flux_err"
     fluxes = [f"{key}_{b}" for b in job.bands for key in kinds]

@@ -1,8 +1,8 @@
-"""Single sources of a finished field without their neighbours, rebuilt from what the run keeps.
+"""Rebuilds single sources of a finished field without their neighbours.
 
-Pixels, weights and PSFs are read from the mosaics that the run was given, models from models.fits,
-errors of fluxes from the catalogue. A window about a source is rendered with the operator of the
-fits: all models that reach into it, of whichever blend, under the PSF at the source.
+Pixels, weights and PSFs are read from the mosaics of the run, models from models.fits, errors of
+fluxes from the catalogue. A window about a source is rendered with the operator of the fits: all
+models that reach into it, of any blend, under the PSF at the source.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from .reference import reference_grid
 
 
 class FieldCutouts:
-    """Cutouts of the sources of a run over a field that has ended.
+    """Cutouts of the sources of a finished run over a field.
 
-    folder: that `run_field` or `clresample field` has written into
-    mosaics: those that the run was given; None = those of its field file, which provenance.json
-        names, with the images that it names
-    device: as `get_device` takes it
+    folder: written by `run_field` or `clresample field`
+    mosaics: those of the run; None = those of its field file, which provenance.json names, with its
+        images
+    device: see `get_device`
 
-    Read back: ids (S,) int64 and group_ids (S,) of the catalogue; mosaics; notes: what the user
-    should know, a line each
+    Attributes: ids (S,) int64 and group_ids (S,) of the catalogue; mosaics; notes: messages for the
+    user, one line each
 
-    Raises FileError for a folder without a finished run, and for inputs that are gone or of other
-    names; ImportError as `read_field` does.
+    Raises FileError for a folder without a finished run, and for inputs that are missing or have
+    other names; ImportError as `read_field` does.
     """
 
     def __init__(self, folder, mosaics=None, *, device=None):
@@ -71,7 +71,7 @@ class FieldCutouts:
         self._light = ModelLight(self._models, self.mosaics, self._reference, device)
 
     def _read_mosaics(self):
-        """The mosaics of the field file that the run was made with."""
+        """Reads the mosaics of the run's field file."""
         path = self.folder / "provenance.json"
         try:
             about = json.loads(path.read_text())
@@ -91,7 +91,7 @@ class FieldCutouts:
         return field.mosaics
 
     def _note_changes(self, about, inputs):
-        """Note inputs that are not as large, or not as old, as when the run was made."""
+        """Records inputs whose size or date differs from those of the run."""
         known = (about.get("run") or {}).get("inputs") or {}
         for path in map(str, inputs.values()):
             state = os.stat(path) if os.path.exists(path) else None
@@ -101,19 +101,19 @@ class FieldCutouts:
                 self.notes.append(f"{path} has changed since the run: models may not belong to it")
 
     def cutout(self, source, observation, what="data", *, size=None, unit=None, group=False):
-        """A source without its neighbours in the pixels of a mosaic: see `Result.cutout`.
+        """Cuts out a source without its neighbours in the pixels of a mosaic.
 
         source: id of the catalogue, or several that are cut out as one
         observation: number or name of a mosaic, or the name of a channel
-        what, size, unit: as of `Result.cutout`
-        group: take all sources of the source's group (group_id) as one
+        what, size, unit: see `Result.cutout`
+        group: cut out all sources of the source's group (group_id) as one
 
         The standard deviation of "data" is that of the noise and of the neighbours' fluxes: flux
-        errors of the catalogue times the models' shapes, one neighbour independent of another.
-        Images are those of the input, its background subtracted where the run did that.
+        errors of the catalogue times the models' shapes, neighbours being independent.
+        Images are those of the input, minus its background if the run subtracted it.
 
-        Raises ValueError for an id that is none, a source without a model or without data there,
-        and as `Result.cutout` does; FileError for pixels that cannot be read.
+        Raises ValueError for an unknown id, a source without a model or without data there, and as
+        `Result.cutout` does; FileError for pixels that cannot be read.
         """
         check_kind(what)
         ids = self._chosen(source, group)
@@ -125,14 +125,14 @@ class FieldCutouts:
 
     @property
     def _labels(self):
-        """Names of mosaics and channels as `chosen_observation` takes them."""
-        return [_Label(m) for m in self.mosaics]
+        """Names of mosaics and channels, as `chosen_observation` expects them."""
+        return [_MosaicNames(m) for m in self.mosaics]
 
     def _chosen(self, source, group):
         ids = [int(one) for one in np.atleast_1d(source)]
         for one in ids:
             if one not in self._row:
-                raise ValueError(f"source is {one}, which is no id of {self.folder}")
+                raise ValueError(f"source is {one}, must be an id of {self.folder}")
         if group:
             groups = self.group_ids[[self._row[one] for one in ids]]
             ids = self.ids[np.isin(self.group_ids, groups)].tolist()
@@ -175,14 +175,14 @@ class FieldCutouts:
             before = window.y0 - wide.y0, window.x0 - wide.x0
             padded = found.padded(before, wide.shape)
             grid = mosaic.grid.cutout(wide.y0, wide.x0, wide.shape)
-            return padded, _Seen(o, grid, mosaic, psf), (wide.y0, wide.x0)
+            return padded, _CutoutObservation(o, grid, mosaic, psf), (wide.y0, wide.x0)
         local = position - np.array(window[:2])
         inner = Box(*window_of(found.own, o.weights, local, fwhm))
         if not inner.area:
             raise MissingSource(f"source {ids[0]} lies outside of {mosaic.name!r}")
         first = window.y0 + inner.y0, window.x0 + inner.x0
         grid = mosaic.grid.cutout(*first, inner.shape)
-        return found.part(inner.slices), _Seen(o, grid, mosaic, psf), first
+        return found.part(inner.slices), _CutoutObservation(o, grid, mosaic, psf), first
 
     def _position(self, mosaic, rows):
         """(y, x) [px] of the middle of some sources in a mosaic."""
@@ -194,7 +194,7 @@ class FieldCutouts:
         return middle
 
     def _errors(self, images, ids, observation, i_mosaic):
-        """Deviations (K, C, ny, nx) of own and others, one for each source: its flux error."""
+        """Deviations (K, C, ny, nx) of own and other sources: one row each, its flux error."""
         shape = (len(images), *observation.shape)
         own, others = np.zeros((2, *shape))
         bands = [c.band or c.name for c in self.mosaics[i_mosaic].channels]
@@ -212,14 +212,14 @@ class FieldCutouts:
         return own, others
 
 
-class _Label:
-    """A mosaic's name and channels, as observations have them."""
+class _MosaicNames:
+    """A mosaic's name and channels, for `chosen_observation`."""
 
     def __init__(self, mosaic):
         self.name, self.channels = mosaic.name, tuple(c.name for c in mosaic.channels)
 
 
-class _Seen:
+class _CutoutObservation:
     """Properties of an observation for `as_ccddata`: the grid of a cutout, the source's PSF."""
 
     psf_field = None

@@ -75,7 +75,7 @@ def healpix_index(ra, dec) -> np.ndarray:
 def partitions(index, most=MAX_ROWS) -> list[tuple[int, int]]:
     """The (order, pixel) of each partition of rows with these pixels of order 29, in their order.
 
-    Of the lowest order at which a pixel has at most `most` rows, up to LARGEST_ORDER.
+    Each has the lowest order at which a pixel has at most `most` rows, up to LARGEST_ORDER.
     """
     found, ahead = [], [(0, int(pixel)) for pixel in np.unique(index >> 2 * FINEST)[::-1]]
     order_of_rows = np.sort(index)
@@ -93,7 +93,7 @@ def partitions(index, most=MAX_ROWS) -> list[tuple[int, int]]:
 
 
 def write_hats(folder, table, *, name="clresample", most_rows=MAX_ROWS) -> Path:
-    """Write a catalogue of a field, or of several, in the HATS layout.
+    """Writes a catalogue of a field, or of several, in the HATS layout.
 
     folder: to make; one of this name that holds HATS is replaced
     table: QTable with ra and dec [deg, ICRS]
@@ -126,7 +126,7 @@ def write_hats(folder, table, *, name="clresample", most_rows=MAX_ROWS) -> Path:
 
 
 def _write(folder, table, index, name, most_rows):
-    """Write the files into a new folder. table: pyarrow.Table; index (S,): of its rows."""
+    """Writes the files into a new folder. table: pyarrow.Table; index (S,): of its rows."""
     import pyarrow as pa
     from pyarrow import parquet
 

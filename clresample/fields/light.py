@@ -41,7 +41,7 @@ class ModelLight:
     def window_about(self, i_mosaic, components, reach):
         """The pixels of a mosaic about the boxes of some components: a Box.
 
-        Of area 0 where its projection does not hold them.
+        Its area is 0 if the mosaic's projection does not contain them.
         """
         models, mosaic = self.models, self.mosaics[i_mosaic]
         low, high = models.low[components].min(axis=0), models.high[components].max(axis=0)

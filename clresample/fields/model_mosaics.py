@@ -13,7 +13,7 @@ STRIP_PX = 512  # rows of a mosaic that are read and written at a time
 
 
 def write_mosaics(folder, job, parts, last):
-    """Write model_NAME.fits and residual_NAME.fits of every mosaic: cubes [counts] with its WCS.
+    """Writes model_NAME.fits and residual_NAME.fits of every mosaic: cubes [counts] with its WCS.
 
     A model is the sum of all sources' models in the blends' cutouts; a residual is data minus it,
     the background subtracted where it was, NaN where the data are none or cannot be read.
@@ -74,7 +74,7 @@ def _write_cube(path, header, mosaic, here, model, residual):
 
 
 def _read(channel, box):
-    """Pixels of a channel; NaN where they cannot be read, which the blends there say too."""
+    """Pixels of a channel; NaN where they cannot be read."""
     try:
         return channel.read(box)
     except FileError:

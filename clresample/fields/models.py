@@ -35,7 +35,7 @@ class ComponentModel:
 
 
 def write_models(path, job, parts, last, ids):
-    """Write the models of the sources with these ids, sorted by their blends.
+    """Writes the models of the sources with these ids, sorted by their blends.
 
     HDUs: COMPONENTS, a row for each with COMPONENT_COLUMNS, offset being its first pixel in
     MORPHOLOGIES, and the spectrum; MORPHOLOGIES, one float32 array of all pixels; OFFSETS, rows of
@@ -77,7 +77,7 @@ def write_models(path, job, parts, last, ids):
 
 
 class ModelFile:
-    """The models of a field, opened: what is small in memory, pixels read when they are asked for.
+    """The models of a field, opened: tables in memory, pixels read when used.
 
     path: of models.fits
     table: COMPONENT_COLUMNS {name: (n,) int64} of all components; spectra (n, C) [counts]
@@ -146,8 +146,9 @@ class ModelFile:
 
 
 def read_models(path, parent_id=None) -> list[ComponentModel]:
-    """The models of one blend, or of all; of the pixels, only theirs are read.
+    """Reads the models of one blend, or of all, and no other pixels.
 
+    path: of the file of models; parent_id: of the blend, None = all blends
     Raises FileError for a file without models, or without this blend.
     """
     file = ModelFile(path)

@@ -1,4 +1,4 @@
-"""One instrument's mosaic: images of any size, of which only what is asked for is read."""
+"""One instrument's mosaic: images of any size, read in parts."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class Channel:
         Raises ValueError for a channel without a plane of them.
         """
         if self.weight is None:
-            raise ValueError(f"weight of channel {self.name!r} is None, it takes a plane")
+            raise ValueError(f"weight of channel {self.name!r} is None, must be a plane")
         values = np.asarray(self.weight.read(box), dtype=np.float64)
         if self.weight_kind == "weight":
             bad = ~np.isfinite(values) | (values < 0)
@@ -102,9 +102,9 @@ class Channel:
         return np.where(bad, 0.0, values)
 
     def saturation_of(self, box) -> float:
-        """Saturation level [counts] of what `read` returns of a Box; infinite where unknown.
+        """Saturation level [counts] of the result of `read` on a Box; infinite where unknown.
 
-        Of a background that is subtracted its mean over the Box counts.
+        A subtracted background lowers it by its mean over the Box.
         """
         if self.saturation is None:
             return np.inf
@@ -215,7 +215,7 @@ class Mosaic:
     def box_on(self, grid) -> Box:
         """The pixels of this mosaic whose centres may lie on a grid: a Box on the mosaic.
 
-        Of area 0 where there are none.
+        Its area is 0 without any.
         """
         there = self.edge_of(grid)
         if not len(there):

@@ -101,8 +101,8 @@ def default_group_memory(bound) -> int:
 class RunProgress:
     """Progress callbacks of a field run; override those you need.
 
-    stage(name, total): a stage begins, of so many tiles or blends; step(n, sources): n of them are
-    done; say(text): what the user should know; dashboard(address): where workers can be watched
+    stage(name, total): a stage begins, with the number of its tiles or blends; step(n, sources): n
+    of them are done; message(text): a line for the user; dashboard(address): page of the workers
     """
 
     def stage(self, name, total):
@@ -117,5 +117,5 @@ class RunProgress:
         LOG.info(text)
 
     def dashboard(self, address):
-        """The address of a page that shows what the workers do, where there is one: a line."""
+        """Reports the address of the page that shows the workers' tasks, if there is one."""
         self.message(f"dashboard: {address}")

@@ -49,7 +49,7 @@ class FieldOutputs:
 
 
 def check_outputs(folder, mosaics):
-    """Raise FileError where something is in the way that is kept: folders, links, devices."""
+    """Raises FileError if an output path is a folder, link or device, which are kept."""
     names = list(FILES)
     for mosaic in mosaics:
         names += [f"{what}_{file_name(mosaic.name)}.fits" for what in ("model", "residual")]
@@ -58,9 +58,9 @@ def check_outputs(folder, mosaics):
 
 
 def write_outputs(folder, job, parts, unsettled, about, seconds, hats=False) -> FieldOutputs:
-    """Write all outputs of a field, all files together or none; the folder of HATS before them.
+    """Writes all outputs of a field together or none; the folder of HATS before them.
 
-    folder: to write into; job: Job; parts: PartFiles, those of later rounds last
+    folder: to write into; job: FieldJob; parts: GroupResultsFiles, those of later rounds last
     unsettled: parents of cut blends whose pieces did not settle
     about: plain values for the provenance; seconds: wall time by stage so far
     hats: write the catalogue in the HATS layout too, if it has rows

@@ -1,4 +1,4 @@
-"""The model's pixels of a field, and whether its mosaics go together."""
+"""The model's pixels of a field, and a check that its mosaics go together."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def reference_grid(mosaics) -> Grid:
 
 
 def _check_names(mosaics):
-    """Raise ValueError for names of mosaics or channels that tables cannot hold."""
+    """Raises ValueError for names of mosaics or channels that tables cannot hold."""
     for what, name in [
         *(("name", m.name) for m in mosaics),
         *(("channel", c.name) for m in mosaics for c in m.channels),

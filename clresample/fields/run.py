@@ -1,4 +1,4 @@
-"""A field from mosaics to catalogue: search, link, fit, write; what is done stays done."""
+"""Runs a field from mosaics to catalogue: search, link, fit, write; a run resumes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from .strips import STRIPS
 class FieldRun:
     """Results of a run in its folder.
 
-    outputs: paths and numbers, see Outputs; seconds: wall time by stage
+    outputs: paths and numbers, see FieldOutputs; seconds: wall time by stage
     failed: fits that were set aside; failed_tiles: {tile: why it could not be searched}
     task_times: (stage, Outcome) of every task that the workers have done: who had it, and when
     """
@@ -46,14 +46,14 @@ class FieldRun:
 def run_field(
     mosaics, folder, *, options=None, resume=False, overwrite=False, progress=None, about=None
 ) -> FieldRun:
-    """Find, fit and measure every source of a field of mosaics.
+    """Finds, fits and measures every source of a field of mosaics.
 
     mosaics: sequence of Mosaic; the model's pixels are those of the one with the smallest
     folder: for catalogue.{parquet,fits,ecsv}, fit_table.ecsv, models.fits, model and residual
         mosaics, provenance.json; and for work/, what is done so far
     options: FieldOptions
     resume: go on where a run with the same options stopped; overwrite: forget such a run
-    progress: Progress; about: dict of plain values for the provenance, such as input files
+    progress: RunProgress; about: dict of plain values for the provenance, such as input files
 
     With several workers a script must be guarded by `if __name__ == "__main__"`, as for all of
     Python's processes. Ctrl-C ends the run; what is finished stays, for `resume`.
@@ -109,8 +109,11 @@ def run_field(
 
 
 def _degrees(positions, reference):
-    """Positions (S, 2) [deg] in the frame of the reference's WCS where a SkyCoord is given, else as
-    they are. Raises ValueError for a SkyCoord on a flat sky."""
+    """Positions (S, 2) [deg] in the frame of the reference's WCS.
+
+    A SkyCoord is transformed to it; other positions are returned unchanged.
+    Raises ValueError for a SkyCoord on a flat sky.
+    """
     if not isinstance(positions, SkyCoord):
         return positions
     if reference.is_flat:
@@ -123,7 +126,7 @@ def _degrees(positions, reference):
 
 
 def _check_outputs(folder, mosaics, reference, options):
-    """Raise ValueError, FileError or ImportError, now, for what cannot be written at the end."""
+    """Raises ValueError, FileError or ImportError, at the start, for unwritable outputs."""
     if options.hats:
         check_hats(reference)
     check_outputs(folder, mosaics)
@@ -150,7 +153,7 @@ class _Clock:
 
 
 def free_memory() -> int:
-    """Memory [bytes] of this machine that is free; 2 GiB where it does not say."""
+    """Free memory [bytes] of this machine; 2 GiB if unknown."""
     try:
         return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (ValueError, OSError, AttributeError):

@@ -41,11 +41,11 @@ class StripCache:
         self._lock = threading.Lock()
 
     def set_limit(self, bound):
-        """Keep within a part of the memory [bytes] that this process may take; None = any."""
+        """Limits the store to a part of this process's memory limit [bytes]; None = any."""
         self.most = MAX_BYTES if bound is None else min(MAX_BYTES, int(PART * bound))
 
     def clear(self):
-        """Keep none of those that are there."""
+        """Drops all rows kept."""
         with self._lock:
             self._kept.clear()
             self.n_bytes = 0

@@ -27,7 +27,7 @@ class FileError(ValueError):
 
 
 def check_output(path, *, overwrite=False, inputs=()):
-    """Raise FileError where a file could not be written; ask before a long computation.
+    """Raises FileError if a file could not be written: a check before long computations.
 
     path: the file; overwrite: whether one that exists may be replaced; inputs: files that may not
     be, under whatever name
@@ -55,7 +55,7 @@ def check_output(path, *, overwrite=False, inputs=()):
 
 
 def check_folder(folder):
-    """Raise FileError where nothing can be written into a folder, or where it could not be made.
+    """Raises FileError if a folder is not writable, or could not be made.
 
     It tries, in the folder or in the first one above that exists, and removes what it made there.
     What runs on this machine that were killed have left there is cleared away.
@@ -75,7 +75,7 @@ def check_folder(folder):
 def atomic_file(path):
     """The path to write a file under, moved to `path` once the block has ended.
 
-        with whole_file("out.txt") as part:
+        with atomic_file("out.txt") as part:
             part.write_text("...")
 
     The other path has the name of `path`, by whose ending some writers choose a format or a
@@ -135,7 +135,7 @@ class _Outputs:
 
     @contextmanager
     def named(self, names):
-        """Open them, and close them after the block; messages have files by names {file: name}."""
+        """Opens the files and closes them after the block; messages use the names {file: name}."""
         try:
             self.open()
             yield
@@ -151,7 +151,7 @@ class _Outputs:
             self.close()
 
     def open(self):
-        """Make them, after what killed runs left is cleared away."""
+        """Creates the files, after those left by killed runs are removed."""
         for folder in self.folders:
             home = folder
             if not folder.is_dir():
@@ -163,7 +163,7 @@ class _Outputs:
             self.stages[folder] = _new_folder(home)
 
     def commit(self, files):
-        """Bring all files to the disk, then move them; those moved go back where one cannot be."""
+        """Writes all files to the disk, then moves them; if one cannot be moved, all move back."""
         for stage in self.stages.values():
             for one in (*stage.rglob("*"), stage):
                 _to_disk(one)
@@ -213,7 +213,7 @@ class _Outputs:
             (folder / name).unlink(missing_ok=True)
 
     def close(self):
-        """Remove what is left of them."""
+        """Removes the files that were not moved."""
         for stage in (*self.stages.values(), *self.old.values()):
             shutil.rmtree(stage, ignore_errors=True)
         for folder in self.made:
@@ -222,7 +222,7 @@ class _Outputs:
 
 
 def remove_stale(folder):
-    """Clear away what this user's killed runs on this machine left in a folder."""
+    """Removes files in a folder left by this user's killed runs on this machine."""
     if os.name != "posix":  # elsewhere none can be asked whether it is alive
         return
     for entry in list(os.scandir(folder)):
@@ -239,7 +239,7 @@ def remove_stale(folder):
 
 
 def remove_tree(folder):
-    """Remove a folder with all in it, all at once.
+    """Removes a folder and its content at once.
 
     What a kill leaves of it, `remove_stale` removes.
     """
@@ -249,7 +249,7 @@ def remove_tree(folder):
 
 
 def _put(file, path):
-    """Move a file to its place, into a folder that is made where there is none."""
+    """Moves a file to its destination; creates the folder if it does not exist."""
     path.parent.mkdir(parents=True, exist_ok=True)
     os.replace(file, path)
 
@@ -266,14 +266,14 @@ def _alive(pid):
 
 
 def _new_folder(home):
-    """A folder of this run in another one, which nobody else can have made."""
+    """A folder of this run in another one, with a unique name."""
     folder = home / f".part-{HOST}-{os.getpid()}-{secrets.token_hex(8)}"
     folder.mkdir()
     return folder
 
 
 def _to_disk(path):
-    """Wait until a file or folder is on the disk, where the system can be asked for that."""
+    """Waits until a file or folder is on the disk, if the system supports that."""
     with suppress(OSError):
         descriptor = os.open(path, os.O_RDONLY)
         try:

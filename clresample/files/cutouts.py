@@ -19,7 +19,7 @@ COLUMNS = ("source", "observation", "what", "ny", "nx")
 
 
 def write_cutouts(path, cutouts, *, overwrite=False, device=None, inputs=None):
-    """Write cutouts into one FITS file, whole or not at all.
+    """Writes cutouts into one FITS file, whole or not at all.
 
     HDUs: CUTOUTS, a table with a row for each: source, observation, what it is, ny and nx [px];
     and of cutout k, from 1 on, with EXTVER = k: DATA with WCS and unit, UNCERT (standard
@@ -59,9 +59,10 @@ def write_cutouts(path, cutouts, *, overwrite=False, device=None, inputs=None):
 
 
 def read_cutouts(path) -> list[CCDData]:
-    """The cutouts that `write_cutouts` or `clresample cutout` wrote into a file.
+    """Reads the cutouts that `write_cutouts` or `clresample cutout` wrote: a list of CCDData.
 
-    Raises FileError for a file that is not there, is damaged, or holds none.
+    path: of the FITS file
+    Raises FileError if the file does not exist, is damaged, or contains no cutouts.
     """
     with open_fits(path) as hdus:
         if "CUTOUTS" not in hdus:

@@ -1,4 +1,4 @@
-"""The posterior of a fit in HDUs and back: modes of the morphologies and the matrix's factor."""
+"""Writes and reads the posterior of a fit: modes of morphologies, factor of the matrix."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ NODES = ("n_modes", "size", "order", "n_later")
 
 
 def draw_hdus(draws):
-    """HDUs of Draws, none for None.
+    """HDUs of a PosteriorSampler; an empty list for None.
 
-    DRAWNODES: a row a node of the matrix, its modes, unknowns, place in the elimination, and number
-    of neighbours that are eliminated later; DRAWLATER: these. DRAWMODES, DRAWSCALE, DRAWFACTOR: all
-    arrays one after the other, of the factor each node's own block and the block below, in the
-    order of elimination. DRAWUNIT, DRAWWIDE, DRAWBANDS: as in Draws.
+    DRAWNODES: a row for each node of the matrix: its modes, unknowns, place in the elimination, and
+    number of neighbours that are eliminated later. DRAWLATER: these neighbours. DRAWMODES,
+    DRAWSCALE, DRAWFACTOR: all arrays one after the other; of the factor each node's own block and
+    the block below, in the order of elimination. DRAWUNIT, DRAWWIDE, DRAWBANDS: as in
+    PosteriorSampler.
     """
     if draws is None:
         return []
@@ -43,7 +44,7 @@ def draw_hdus(draws):
 
 
 def read_draws(hdus, shapes):
-    """The Draws of `draw_hdus`, bit by bit; None where there are none.
+    """Reads the PosteriorSampler of `draw_hdus`, bit by bit; None if there is none.
 
     shapes (n): (ny, nx) [px] of each component's box
     """
@@ -53,8 +54,8 @@ def read_draws(hdus, shapes):
     counts, sizes, order, n_later = (table[name].astype(np.int64) for name in NODES)
     ends = np.cumsum(n_later)[:-1]
     later = [part.tolist() for part in np.split(array_of(hdus["DRAWLATER"]), ends)]
-    modes = _Flat(array_of(hdus["DRAWMODES"]))
-    scale, factor = (_Flat(array_of(hdus[name])) for name in ("DRAWSCALE", "DRAWFACTOR"))
+    modes = _ArrayReader(array_of(hdus["DRAWMODES"]))
+    scale, factor = (_ArrayReader(array_of(hdus[name])) for name in ("DRAWSCALE", "DRAWFACTOR"))
     lower, below = {}, {}
     for v in order.tolist():
         lower[v] = factor.take(sizes[v], sizes[v])
@@ -73,12 +74,12 @@ def read_draws(hdus, shapes):
 
 
 def _flat(arrays, dtype):
-    """All values of arrays, one after the other."""
+    """Concatenates all values of arrays."""
     return np.concatenate([np.zeros(0, dtype), *(np.ravel(array) for array in arrays)])
 
 
-class _Flat:
-    """Values (N,) that arrays are taken from, one after the other."""
+class _ArrayReader:
+    """Values (N,) from which arrays are read one after the other."""
 
     def __init__(self, values):
         self.values, self.start = values, 0

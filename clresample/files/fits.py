@@ -46,8 +46,9 @@ class FitsImage(NamedTuple):
 
 
 def read_image(path, *, hdu=None, bands=None):
-    """Image or cube of a FITS file with its celestial grid: FitsImage(data, grid, header, bands).
+    """Reads an image or cube of a FITS file: FitsImage(data, grid, header, bands).
 
+    path: of the FITS file
     hdu: number (from 0), "NAME" or "NAME,VERSION"; None = the first that holds an image
     bands: numbers (from 0) or names, one or several; None = all. Names are those of the cards
         BAND1, BAND2, ..., and of a 2-D image BAND or FILTER
@@ -76,11 +77,12 @@ def read_image(path, *, hdu=None, bands=None):
 
 
 def read_psf(path, *, hdu=None, bands=None, spacing=1.0, center=None):
-    """PSF of a FITS image or cube; no WCS is needed.
+    """Reads the PSF of a FITS image or cube; no WCS is needed.
 
-    hdu, bands: as in `read_image`; spacing [px], center [samples]: as in `PSF`
+    path: of the FITS file; hdu, bands: as in `read_image`
+    spacing [px], center [samples]: as in `PSF`
 
-    Raises FileError as `read_image` does, and for samples that `PSF` refuses. Warns as `PSF` does.
+    Raises FileError as `read_image` does, and for samples that `PSF` rejects. Warns as `PSF` does.
     """
     with open_fits(path) as hdus:
         chosen = choose_hdu(path, hdus, hdu)
@@ -106,7 +108,7 @@ def write_fits(
     shift_px=None,
     overwrite=False,
 ):
-    """Write an image or cube with its WCS, coverage and provenance, whole or not at all.
+    """Writes an image or cube with its WCS, coverage and provenance, whole or not at all.
 
     data (Ny, Nx) or (C, Ny, Nx) [flux per pixel]
     grid: Grid of the same (Ny, Nx); a flat one is put at RA = Dec = 0
@@ -145,7 +147,7 @@ def write_fits(
 
 
 def write_hdus(path, hdus):
-    """Write HDUs with their checksums, whole or not at all. Raises FileError."""
+    """Writes HDUs with their checksums, whole or not at all. Raises FileError."""
     with atomic_file(path) as part:
         fits.HDUList(hdus).writeto(part, checksum=True, overwrite=True)
 
@@ -159,7 +161,7 @@ def open_fits(path):
     if not path.exists():
         raise FileError(f"{path}: no such file")
     if not path.is_file():  # reading it might never end
-        raise FileError(f"{path}: is no regular file, but a device, a pipe or a socket")
+        raise FileError(f"{path}: is not a regular file, but a device, a pipe or a socket")
     # astropy warns of every header that it repairs: recorded here and not shown
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", AstropyWarning)
@@ -254,7 +256,7 @@ def band_names(header, n_bands):
 
 
 def choose_bands(path, names, bands):
-    """Indices of the bands asked for by number or name; FileError for one that is not there."""
+    """Indices of bands selected by number or name. Raises FileError for an unknown band."""
     if bands is None:
         return list(range(len(names)))
     chosen = []
@@ -274,7 +276,7 @@ def choose_bands(path, names, bands):
 
 
 def add_provenance(header, dtype, device, inputs, shift_px):
-    """Add cards with the software, date, arithmetic, OpenCL device, shift and input files."""
+    """Adds cards with the software, date, arithmetic, OpenCL device, shift and input files."""
     header["CREATOR"] = (f"clresample {__version__}", "software")
     header["DATE"] = (datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"), "written, UTC")
     header["CLDTYPE"] = (str(dtype), "arithmetic of the operator")

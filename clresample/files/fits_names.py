@@ -18,7 +18,7 @@ def to_ascii(text):
 def text_card(text, comment):
     """(value, comment) of a FITS card: the text in ASCII, the comment if there is room for it.
 
-    What is longer than a card goes on in others, which have room.
+    Text longer than a card continues in further cards.
     """
     value, comment = to_ascii(text), to_ascii(comment)
     length = max(len(value) + value.count("'"), 8)  # shorter ones are padded
@@ -27,7 +27,7 @@ def text_card(text, comment):
 
 
 def check_columns(names):
-    """Raise ValueError where a catalogue's columns have names that FITS cards cannot hold."""
+    """Raises ValueError for column names of a catalogue that do not fit into FITS cards."""
     for name in names:
         n = len(name) + name.count("'")
         if n > COLUMN:
@@ -52,7 +52,7 @@ def check_catalogue_names(observations, *, magnitudes=False):
 
 
 def check_channels(channels):
-    """Raise ValueError where the names of all observations' channels can be no FITS columns.
+    """Raises ValueError if the channels' names cannot be FITS columns.
 
     Too long, or the same once characters that FITS does not have are replaced.
     """

@@ -1,4 +1,4 @@
-"""A look at the headers of a FITS file before astropy reads them.
+"""Checks the headers of a FITS file before astropy reads them.
 
 astropy (to 8.0 at least) believes some numbers in a header and counts up to them: with NAXIS =
 99999999999 or SIP polynomials of order 30000 it does not end, TFIELDS = 2000000000 takes all
@@ -41,7 +41,7 @@ END = re.compile(rb"END([^A-Z0-9_-]|$)")
 
 
 def check_headers(path):
-    """Raise FileError where a header of a FITS file holds a number that no such file has.
+    """Raises FileError if a header of a FITS file has an impossible number.
 
     All HDUs are looked at, of compressed files too. What is not FITS, or ends too early, passes:
     astropy says so.
@@ -60,7 +60,7 @@ def check_headers(path):
 
 
 def _check(path, file):
-    """Walk from header to header to the file's end. Raises FileError."""
+    """Walks from header to header to the file's end. Raises FileError."""
     place = 0
     for number in itertools.count():
         file.seek(place)
@@ -158,7 +158,7 @@ def _axes(what, values, key):
 
 
 def _check_tiles(what, values):
-    """Raise FileError where an image is cut into more tiles than the table has rows for them."""
+    """Raises FileError if an image has more tiles than its table has rows."""
     shape = _axes(what, values, "ZNAXIS")
     # whole rows where the header does not say it
     tiles = [values.get(f"ZTILE{i + 1}") or (1 if i else n) for i, n in enumerate(shape)]

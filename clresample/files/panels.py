@@ -55,7 +55,7 @@ def stretch_limits(image):
 
 
 def save_panels(path, panels, *, like: Grid, title=""):
-    """Write a row of panels as a PNG, each in the place and orientation that it has on `like`.
+    """Writes a row of panels as a PNG, each with its position and orientation on `like`.
 
     path: the file, written whole or not at all; panels: list of Panel
     like: the pixels that fill every panel's frame; title: above the row
@@ -83,7 +83,7 @@ def save_panels(path, panels, *, like: Grid, title=""):
 
 
 def write_png(path, figure):
-    """Write a figure as a PNG of 256 colours, whole or not at all. Raises FileError."""
+    """Writes a figure as a PNG of 256 colours, whole or not at all. Raises FileError."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image  # comes with matplotlib
 

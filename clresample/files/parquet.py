@@ -31,7 +31,7 @@ def arrow_table(table):
 
 
 def write_parquet(path, table):
-    """Write a QTable to Parquet, units and descriptions in the metadata of its columns.
+    """Writes a QTable to Parquet, units and descriptions in the metadata of its columns.
 
     Raises ImportError, with what to install, without pyarrow.
     """
@@ -55,13 +55,13 @@ def read_parquet(path) -> QTable:
 
 
 def _texts(metadata):
-    """Metadata of Parquet as texts, without what other packages keep there for themselves."""
+    """Metadata of Parquet as texts, without other packages' entries."""
     pairs = (metadata or {}).items()
     return {k.decode(): v.decode() for k, v in pairs if k not in (b"pandas", b"ARROW:schema")}
 
 
 def _parquet():
-    """pyarrow's module. Raises ImportError, with what to install, without it."""
+    """Imports pyarrow. Raises ImportError that names the package to install."""
     try:
         from pyarrow import parquet
     except ImportError as error:

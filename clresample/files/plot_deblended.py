@@ -6,7 +6,7 @@ from .panels import write_png
 
 
 def plot_deblended(path, result, *, title=""):
-    """Write `Result.plot` as a PNG, whole or not at all.
+    """Writes `Result.plot` as a PNG, whole or not at all.
 
     Raises ImportError, with what to install, without matplotlib; FileError where the file cannot be
     written.

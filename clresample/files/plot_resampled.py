@@ -26,7 +26,7 @@ class Comparison(NamedTuple):
 
 
 def compare(rendered, observed, covered, width_px):
-    """Fit one flux scale and one sky level: two instruments count in different units.
+    """Fits one flux scale and one sky level: two instruments count in different units.
 
     rendered, observed (My, Mx); covered (My, Mx) bool
     width_px [px]: nearer to the edge of the coverage, pixels are left out: they lack the light of
@@ -44,7 +44,7 @@ def compare(rendered, observed, covered, width_px):
 
 
 def plot_resampled(path, image, reference, result, covered, psf_out, *, names, title=""):
-    """Draw the first band of an image, of its resampling and, if the bands match, of the reference.
+    """Draws the first band of an image, its resampling and, if bands match, the reference.
 
     image, reference: as `read_image` returns them; result (C, My, Mx), covered (My, Mx)
     psf_out: the reference's PSF; names (2,): of the image and of the reference, for the titles

@@ -52,7 +52,7 @@ RELAX = WCSHDO_all | WCSHDO_SIP | WCSHDO_P17 | WCSHDO_EFMT
 
 
 def write_result(path, result, *, overwrite=False, device=None, inputs=None):
-    """Write a fitted blend to FITS, whole or not at all.
+    """Writes a fitted blend to FITS, whole or not at all.
 
     HDUs that `read_result` reads: ABOUT (keys and JSON: sources, names, status, messages, ...),
     COMPONENTS (boxes), SPECTRA (n, C), MORPHOLOGIES (one after the other), SKY, COVARIANCE, SHIFTS,
@@ -221,7 +221,7 @@ def _about_table(about):
 
 
 def _placed(grid, number):
-    """WCS cards that give back the same float64, and HDUs of look-up tables.
+    """WCS cards that restore the same float64, and HDUs of look-up tables.
 
     number: of the grid in the file, which sets the version numbers of its tables apart
     """

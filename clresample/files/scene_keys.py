@@ -31,7 +31,7 @@ def is_number(value):
 
 
 def is_list_of(fits):
-    """Returns True if a value is a list of at least one, each of which fits."""
+    """Returns True if a value is a list, not empty, of valid items."""
     return lambda value: isinstance(value, list) and len(value) > 0 and all(map(fits, value))
 
 
@@ -60,7 +60,7 @@ def _above(value):
 
 
 TEXT = KeyRule("a text", is_text)
-FRACTION = KeyRule("a number from 0 to 1", lambda value: is_number(value) and 0 <= value < 1)
+FRACTION = KeyRule("a number x with 0 <= x < 1", lambda value: is_number(value) and 0 <= value < 1)
 COUNT = KeyRule("a whole number, 0 or more", is_whole)
 FILE = KeyRule("the name of a file", is_text)
 HDU = KeyRule('a number from 0, "NAME" or "NAME,VERSION"', is_any_of(is_whole, is_text))
@@ -102,9 +102,9 @@ TABLES = {
 
 
 def read_tables(path, what) -> dict:
-    """The tables of a TOML file, unchecked; `what` it is called in messages. Raises SceneError."""
+    """The tables of a TOML file, unchecked; `what`: its kind in messages. Raises SceneError."""
     if Path(path).exists() and not Path(path).is_file():  # reading it might never end
-        raise SceneError(f"{path}: is no regular file")
+        raise SceneError(f"{path}: is not a regular file")
     try:
         with open(path, "rb") as file:
             return tomllib.load(file)
@@ -117,7 +117,7 @@ def read_tables(path, what) -> dict:
 
 
 def check_table(where, name, table, tables, needed):
-    """Raise SceneError unless a table holds what the rules of its name say.
+    """Raises SceneError unless a table follows the rules of its name.
 
     where: file and table, for messages; tables {name: {key: KeyRule}}; needed {name: keys}
     """
@@ -127,14 +127,14 @@ def check_table(where, name, table, tables, needed):
     check_names(where, table, rules, "key")
     for key in needed.get(name, ()):
         if key not in table:
-            raise SceneError(f"{where}: {key} is missing, it takes {rules[key].text}")
+            raise SceneError(f"{where}: {key} is missing, must be {rules[key].text}")
     for key, value in table.items():
         if not rules[key].fits(value):
-            raise SceneError(f"{where}: {key} is {value!r}, it takes {rules[key].text}")
+            raise SceneError(f"{where}: {key} is {value!r}, must be {rules[key].text}")
 
 
 def check_names(where, given, known, what):
-    """Raise SceneError for a name that is not among those known; what: "table" or "key"."""
+    """Raises SceneError for an unknown name; what: "table" or "key"."""
     for key in given:
         if key not in known:
             raise SceneError(f"{where}: {what} {key} is unknown; allowed are {', '.join(known)}")

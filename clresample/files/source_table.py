@@ -95,7 +95,7 @@ def _numbers(path, what, column, unit):
             raise ValueError(f"its type is {np.asarray(values).dtype}")
         values = np.ma.filled(np.ma.asarray(values, dtype=float), np.nan)
     except Exception as error:  # astropy and NumPy raise several on texts and other units
-        raise ValueError(f"{path}: column {what} is no position in {unit} ({error})") from error
+        raise ValueError(f"{path}: column {what} is not a position in {unit} ({error})") from error
     if values.ndim != 1:
         raise ValueError(
             f"{path}: column {what} has {values.shape[1:]} values a row, a position takes one"
@@ -111,7 +111,7 @@ def _source(found, i, given):
         given["observation"] = None if where is np.ma.masked else str(where).strip() or None
     kind = str(found["type"][i]).strip().lower() if "type" in found else "extended"
     if kind not in KINDS:
-        raise ValueError(f"type is {kind!r}, it takes {' or '.join(KINDS)}")
+        raise ValueError(f"type is {kind!r}, must be {' or '.join(KINDS)}")
     chosen = "components" in found and found["components"][i] is not np.ma.masked
     if kind == "extended" and chosen:
         given["n_components"] = _whole("components", found["components"][i])
@@ -126,5 +126,5 @@ def _whole(what, value):
     except (TypeError, ValueError, OverflowError):
         number, whole = math.nan, 0
     if number != whole:
-        raise ValueError(f"{what} is {value!s:.80}, it takes a whole number")
+        raise ValueError(f"{what} is {value!s:.80}, must be a whole number")
     return whole

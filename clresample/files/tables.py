@@ -1,4 +1,4 @@
-"""Catalogues on disk: read from FITS, ECSV and Parquet, and written."""
+"""Reads catalogues from FITS, ECSV and Parquet, and writes them."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ ENDINGS = ".ecsv", ".parquet", ".fits", ".fits.gz"
 
 
 def read_catalogue(path) -> QTable:
-    """A catalogue of a FITS, ECSV or Parquet file, columns with units and descriptions.
+    """Reads a catalogue from a FITS, ECSV or Parquet file, with units and descriptions.
 
-    Parquet takes pyarrow (the extra `field`), not pandas. Texts are str, nothing is masked.
+    Parquet needs pyarrow (the extra `field`), not pandas. Texts are str, nothing is masked.
 
-    path: a file that `write_catalogue` or `run_field` left, or any table of these kinds
+    path: a file written by `write_catalogue` or `run_field`, or any table of these formats
 
-    Raises FileError for a file that does not exist or is no table; ImportError without pyarrow.
+    Raises FileError for a file that does not exist or is not a table; ImportError without pyarrow.
     """
     path = Path(path)
     if not path.is_file():
@@ -47,9 +47,10 @@ def read_catalogue(path) -> QTable:
 
 
 def write_catalogue(path, table, *, overwrite=False):
-    """Write a catalogue, whole or not at all: as ECSV or, by the file's name, as FITS or Parquet.
+    """Writes a catalogue, whole or not at all: as ECSV or, by the file's name, FITS or Parquet.
 
     path: ends in .ecsv, .parquet, .fits or .fits.gz; table: of `catalogue`
+    overwrite: replace an existing file
     Raises FileError when the file exists or cannot be written, ValueError for other endings
     and columns' names too long for FITS; ImportError without pyarrow for Parquet.
     """
@@ -68,7 +69,7 @@ def write_catalogue(path, table, *, overwrite=False):
 
 
 def table_hdu(table, name):
-    """A table as an HDU; other characters than ASCII, which FITS does not have, become "?"."""
+    """Converts a table to an HDU; characters outside ASCII, which FITS lacks, become "?"."""
     check_columns(table.colnames)
     table = QTable(table, names=[to_ascii(column) for column in table.colnames])
     table["name"] = [to_ascii(value) for value in table["name"]]
@@ -84,7 +85,7 @@ def flag_table_hdu():
 
 
 def _with_text(table):
-    """The table with texts in place of bytes, and no masked values."""
+    """Converts bytes of a table to text and fills its masked values."""
     for name in table.colnames:
         column = table[name]
         kind = getattr(getattr(column, "dtype", None), "kind", "")

@@ -164,9 +164,9 @@ def catalogue_columns(result, *, magnitudes=True, groups=None, bands=None) -> Co
 
 
 def _add_partners(table, result, flux, covariance):
-    """The column of ambiguous sources' partners and their flag.
+    """Adds the column of ambiguous sources' partners and their flag.
 
-    Of results with Errors, since at fixed morphologies light is not exchanged.
+    Only results with Errors have them, because light is not exchanged at fixed morphologies.
     """
     found = np.full(len(flux), -1)
     if result.errors is not None:
@@ -238,7 +238,7 @@ def _released(centroid, second, moved):
 
 
 def _scatter(slopes, covariance):
-    """Errors (n,) of quantities with slopes (n, k) by what has a covariance (k, k)."""
+    """Errors (n,) of quantities with slopes (n, k) by variables of covariance (k, k)."""
     return np.sqrt(np.einsum("nk,kl,nl->n", slopes, covariance, slopes))
 
 

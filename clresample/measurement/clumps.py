@@ -72,7 +72,7 @@ class Body:
     def takes(self, above, base):
         """Selects peaks of heights above [sigma] on a base [sigma] that are its structure.
 
-        And whether they are in its group.
+        Also returns whether they are in its group.
         """
         part = above / self.light
         faint = part < CLUMP_PART
@@ -82,7 +82,7 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Bodies:
-    """The bodies of an image and what its peaks are to them.
+    """The bodies of an image, and the relation of its peaks to them.
 
     owners (S,): number of a peak's body, -1 for none; structure (S,) bool: peaks that are no source
     """
@@ -179,7 +179,7 @@ class _Tree:
         return number
 
     def join(self, a, b, height):
-        """Join two basins at the height of their saddle."""
+        """Joins two basins at the height of their saddle."""
         a, b = root(self.parent, a), root(self.parent, b)
         if a == b:
             return
@@ -202,13 +202,13 @@ class _Tree:
         self.basins[a] += self.basins[b]
 
     def end(self, threshold):
-        """Make bodies of what is wide enough at the threshold."""
+        """Makes bodies of the basins that are wide enough at the threshold."""
         for i in range(len(self.parent)):
             if self.parent[i] == i:
                 self._widen(i, threshold)
 
     def _widen(self, one, height):
-        """Make a body of a root's basins if they are wide enough above a height."""
+        """Makes a body of a root's basins if they are wide enough above a height."""
         if self.of_root[one] >= 0:
             return
         n = sum(len(p) - np.searchsorted(p, height) for p in self.parts[one])
@@ -235,7 +235,7 @@ def _outline(image, basins, numbers, level):
 def _center(image, outline, level, at, area, bright):
     """The peak of those at (k, 2) [px] in the middle of an outline, or the middle itself (2,).
 
-    Of a faint body its brightest peak.
+    For a faint body it is the brightest peak.
     """
     where, mask = outline
     radius = np.sqrt(area / np.pi)

@@ -30,7 +30,7 @@ class Columns:
         return self.values[name]
 
     def put(self, name, values, unit=None):
-        """Set a column, a new one after those there are."""
+        """Sets a column; a new one becomes the last."""
         self.values[name] = np.asarray(values)
         if unit is not None:
             self.units[name] = unit
@@ -42,9 +42,9 @@ class Columns:
 
     @classmethod
     def concatenate(cls, several) -> Columns:
-        """Rows of several one after the other; names in the order in which they first come.
+        """Concatenates the rows of several, with names in the order of first appearance.
 
-        Where one has no such column its rows hold NaN, 0 of whole numbers, "" of texts.
+        Rows without a column get NaN, 0 for whole numbers, "" for texts.
         """
         found = cls()
         for one in several:

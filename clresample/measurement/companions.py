@@ -1,4 +1,4 @@
-"""Neighbours on the flanks of brighter sources: what their symmetry does not account for.
+"""Finds neighbours on the flanks of brighter sources by their asymmetry.
 
 A galaxy's light is much the same on both sides of its centre and falls outwards, a neighbour's is
 on one side. So the least light that a source has on each ring and on both sides,
@@ -116,12 +116,12 @@ def brightest_peak_near(rest, place, radius):
 
 
 def is_a_source(place, height, model, image, signals, centres, fwhm, scale):
-    """Returns True if a residual peak is a source of its own, as the head of this module says.
+    """Returns True if a residual peak is a source of its own, by this module's criteria.
 
     place (2,) ints: (y, x) of the peak; height [sigma]: of what is left there, as
     `brightest_peak_near` says
     model, image (Ny, Nx) [sigma]: models, what was searched
-    signals: Signal of each observation; centres (S, 2) [px]: of the sources
+    signals: SignalToNoise of each observation; centres (S, 2) [px]: of the sources
     fwhm [px]: of the searched image's PSF; scale [arcsec]: of a pixel
     """
     at = tuple(place)

@@ -40,7 +40,7 @@ from .levels import level_of
 from .peaks import import_sep, new_peaks
 from .searched import SAME_SOURCE, Search
 from .signal_to_noise import SMALL_GALAXY, combine_bands, signal_of
-from .star_light import UNEVEN, height_beside, saturated_stars, starless
+from .star_light import UNEVEN, peak_beside, remove_star_light, saturated_stars
 
 # [sigma] of the combined image: white noise reaches it once in two million independent pixels
 THRESHOLD = 5.0
@@ -76,7 +76,7 @@ class Detection(ShownDetection):
 
 
 def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> Detection:
-    """Find sources in all observations together, in each alone, and beside brighter ones.
+    """Finds sources in all observations together, in each alone, and beside brighter ones.
 
     The sharpest image separates neighbours best, the combined one reaches the faintest sources. So
     the images are searched one after the other, the sharpest first and then all together under
@@ -115,7 +115,7 @@ def noise_scatter(observation, frame) -> np.ndarray:
 
 
 def detect_more(result, *, threshold=THRESHOLD) -> Detection:
-    """Find sources in a fit's residuals: those too faint beside others to be found before it.
+    """Finds sources in a fit's residuals that were too faint beside others before the fit.
 
     The residuals are searched as `detect` does, but for neighbours on flanks. Where the model is
     bright its own errors are larger than the noise: there the variance is 1 / w + (0.15 model)^2.
@@ -225,7 +225,7 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
     scale = frame.grid.pixel_scale_arcsec
     stars = saturated_stars(observations, frame) if beside else []
     full = signals
-    parted = [starless(s, stars, w, scale) for s, w in zip(signals, widths, strict=True)]
+    parted = [remove_star_light(s, stars, w, scale) for s, w in zip(signals, widths, strict=True)]
     signals, held = zip(*parted, strict=True)
     if scatters is None:
         scatters = [signal.scatters() for signal in signals]
@@ -259,7 +259,7 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
     points = [
         PointSource(position_px=tuple(map(float, star.place)), free_position=True) for star in stars
     ]
-    heights = [height_beside(everything, star) for star in stars]
+    heights = [peak_beside(everything, star) for star in stars]
     return Detection(
         sources=(*points, *(ExtendedSource(position_px=position) for position in positions)),
         frame=frame,
@@ -273,7 +273,8 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
 def _companions(sep, signals, sharp, everything, places, threshold, fwhm, scale):
     """Positions and heights of sources on the flanks of those at `places` (S, 2).
 
-    In the sharpest observation, whose PSF has the width fwhm [px]; scale [arcsec]: of a pixel.
+    They are found in the sharpest observation, whose PSF has the width fwhm [px]; scale [arcsec]:
+    of a pixel.
     """
     image, seen = signals[sharp].flat(), signals[sharp].n_seen > 0
     centres = np.array(

@@ -99,7 +99,7 @@ def spectra_of(result):
 
 
 def flux_scale(result):
-    """Per channel, what turns counts into the catalogue's unit, and that unit.
+    """Per channel, the factor from counts to the catalogue's unit, and that unit.
 
     The unit of the data where all observations have the same one; else uJy, or counts without zero
     points.

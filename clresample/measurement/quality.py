@@ -53,7 +53,7 @@ def summary(result) -> dict:
 def channel_chi2(result) -> tuple[dict, dict]:
     """Chi2 per pixel with a weight on the frame, and the number of these pixels, by channel.
 
-    NaN without any.
+    NaN without such pixels.
     """
     chi2, n_pixels = {}, {}
     for i, (observation, footprint) in enumerate(

@@ -1,4 +1,4 @@
-"""Sources of successive searches: what is known already, and the bodies of large galaxies."""
+"""Sources of successive searches, with the bodies of large galaxies."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SAME_SOURCE = 0.7
 
 
 class Search:
-    """Sources of the searches so far, and what large galaxies' bodies make of them.
+    """Sources of the searches so far, and the bodies of large galaxies that contain them.
 
     positions (S), peaks (S) [sigma], labels (S), owners (S): number of a source's body, -1 = none
     """
@@ -36,7 +36,7 @@ class Search:
         self.owners.append(owner)
 
     def add(self, image, label, narrow, wide):
-        """Add the peaks of an image that are not yet known; of bodies seen before none."""
+        """Adds the new peaks of an image, except those on bodies searched before."""
         before = self.known + self.positions + self.clumps
         area, apart = MIN_AREA * narrow**2, SAME_SOURCE * wide
         for position, peak in new_peaks(self.sep, image, self.threshold, area, before, apart):
@@ -44,7 +44,7 @@ class Search:
                 self._put(position, peak, label)
 
     def sort_out(self, image, fwhm, scale):
-        """Find the bodies of the searched image, and leave out peaks that are their structure."""
+        """Finds the bodies of the searched image and removes peaks that are their structure."""
         self.bodies = bodies_of(image, np.array(self.positions), fwhm, self.threshold, scale)
         if not self.bodies.bodies:
             return
@@ -63,7 +63,7 @@ class Search:
             self._put(body.center, float(image[y, x]), labels[0], i)
 
     def add_companions(self, new, image, label):
-        """Add peaks beside others: positions and heights of what is left of an image there."""
+        """Adds peaks beside others: positions and heights of an image's residual there."""
         for position, height in new:
             owner = self.bodies.body_at(position)
             if owner >= 0:

@@ -62,7 +62,7 @@ class SignalToNoise:
     def scatters(self):
         """Scatter (W,) of the channels together where there is no source, at least 1.
 
-        That of the negative pixels, which are noise. Correlated noise has more.
+        It is measured from negative pixels, which are noise. Correlated noise scatters more.
         """
         flats = (self.flat(w) for w in range(len(self.sums)))
         return np.array([max(1.0, sigma_below_zero(image) or 1.0) for image in flats])
@@ -75,7 +75,7 @@ class SignalToNoise:
         )
 
     def levelled(self):
-        """The same without smooth levels, see levels.py, and those of its sky alone (W,) [sigma].
+        """The signal without smooth levels (levels.py), and those of its sky alone (W,) [sigma].
 
         Sums of squares are left out where there is a level: they hold it in every channel.
         """
@@ -104,7 +104,7 @@ class SignalToNoise:
 
 
 def signal_of(observation, frame, places=None) -> SignalToNoise:
-    """The Signal of an observation in a frame, under the filters of `WIDTHS_ARCSEC`.
+    """The SignalToNoise of an observation in a frame, under the filters of `WIDTHS_ARCSEC`.
 
     places (Ny, Nx, 2) [px]: of the frame's pixels on the observation; None = by their grids
     """
@@ -152,7 +152,7 @@ def signal_of(observation, frame, places=None) -> SignalToNoise:
 
 
 def _in_frame(images, seen, places):
-    """Images (n, My, Mx), and how many channels have seen each pixel, at places (Ny, Nx, 2) [px].
+    """Images (n, My, Mx) and the channels that cover each pixel, at places (Ny, Nx, 2) [px].
 
     Images are interpolated, 0 where nothing was seen; where all places are pixels they are taken.
     """

@@ -1,14 +1,13 @@
-"""Light of stars with a saturated core in signal-to-noise images, so that peaks on it can be told.
+"""Removes the light of saturated stars from signal-to-noise images, so peaks on it show.
 
-Such a star's light is not that of the PSF that is known: wings beyond its image, diffraction
-spikes, ghosts. But it comes from one place, and changes slowly outwards. Along every ray from the
-star the part of the light, above the median of each ring, that stays for longer than a source is
-wide, its morphological opening,
+The light of such a star departs from the known PSF: wings beyond its image, diffraction spikes,
+ghosts. It still comes from one place and changes slowly outwards. Along every ray from the star
+the light above the median of each ring is opened: the part that persists over more than a source's
+width belongs to the star,
 
-    m(r) = max over windows of length L that hold r of the least light in them,
+    m(r) = max over windows of length L that contain r of the least light in them.
 
-is the star's, too. What is left of the image above it, in units of its scatter on the same ring, is
-searched.
+The search runs on the remainder of the image, in units of its scatter on the same ring.
 """
 
 from __future__ import annotations
@@ -20,23 +19,23 @@ from scipy.ndimage import distance_transform_edt, grey_dilation, grey_erosion, m
 
 from ..deblending.inspection.spoilt import saturated_pixels
 from ..deblending.inspection.star_cores import star_cores
-from ..deblending.inspection.star_fall import Fall
+from ..deblending.inspection.star_profile import RadialProfile
 from .signal_to_noise import WIDTHS_ARCSEC, SignalToNoise
 
 # [FWHM of the filtered image] Length L: a source is narrower along every ray.
 SOURCE_FWHM = 3.0
 # [sigma] Median light of a ring over the least of any, where that of the star has ended; rings
 # count of which this part was seen.
-END_SIGMAS, MIN_COVERED = 0.5, 0.25
-SPIKES = 2.0  # [radii of that ring] how far spikes reach, which hold a small part of a ring
+END_SIGMAS, MIN_COVERED_FRACTION = 0.5, 0.25
+SPIKE_REACH = 2.0  # [radii of that ring] how far spikes reach, which hold a small part of a ring
 UNEVEN = 0.1  # [1] of what lasts: spikes are not even along a ray
 MAX_REACH_PX = 300  # [model px] of a star's light that is searched apart; further out it is faint
-ALL_SEEN = 0.99  # [1] of the weights of interpolation between pixels
+MIN_SEEN_WEIGHT = 0.99  # [1] of the weights of interpolation between pixels
 FWHM_A_SIGMA = 2.3548  # of a Gaussian
 # [FWHM of a filtered point] Pixels nearer to the core's edge hold no peak of their own.
-CORE_FWHM = 1.0
+MIN_CORE_DISTANCE_FWHM = 1.0
 # [FWHM of a filtered point] Pixels nearer to masked ones hold none either, beside a star.
-BESIDE_FWHM = 1.0
+MIN_MASK_DISTANCE_FWHM = 1.0
 # [FWHM of the PSF] Cores of several images nearer than this, and than their radius, are one star's.
 SAME_STAR_FWHM = 1.0
 # Median |x| of a unit Gaussian, inverted.
@@ -52,9 +51,9 @@ class StarPlace:
 
 
 def saturated_stars(observations, frame) -> list[StarPlace]:
-    """Stars with a saturated or masked core in any channel, the brightest first.
+    """Finds stars with a saturated or masked core in any channel, the brightest first.
 
-    observations: of any kind; frame: Frame in whose pixels their places are
+    observations: of any kind; frame: Frame of the pixels in which their places are returned
     """
     found = []
     for o in observations:
@@ -71,7 +70,7 @@ def saturated_stars(observations, frame) -> list[StarPlace]:
 
 
 def _merged(found):
-    """StarPlaces of cores (light, FWHM, StarPlace), one of each star: at their median place."""
+    """Merges cores (light, FWHM, StarPlace) of the same star at their median place."""
     stars: list[list] = []
     for _, fwhm, star in sorted(found, key=lambda one: -one[0]):
         for group in stars:
@@ -88,18 +87,18 @@ def _merged(found):
     ]
 
 
-def height_beside(image, star) -> float:
-    """The brightest pixel of an image (Ny, Nx) within two radii of a star's core."""
+def peak_beside(image, star) -> float:
+    """Brightest pixel of an image (Ny, Nx) within two radii of a star's core."""
     n_y, n_x = image.shape
     away = np.hypot(np.arange(n_y)[:, None] - star.place[0], np.arange(n_x) - star.place[1])
     return float(image[away < 2 * star.radius + 1].max(initial=0.0))
 
 
-def starless(signal, stars, fwhm_px, pixel_arcsec) -> tuple[SignalToNoise, np.ndarray]:
-    """The Signal without the light of StarPlaces, in units of its scatter there, and the pixels
-    (Ny, Nx) bool that held it.
+def remove_star_light(signal, stars, fwhm_px, pixel_arcsec) -> tuple[SignalToNoise, np.ndarray]:
+    """Removes the light of StarPlaces from a signal, in units of its scatter there.
 
-    Sums of squares are left out where there is such light: they hold it in every channel.
+    Also returns the pixels (Ny, Nx) bool from which light was removed. Their sums of squares are
+    left out, because such light adds to every channel.
     fwhm_px [px]: of the PSF; pixel_arcsec [arcsec]: side of a pixel
     """
     all_held = np.zeros(signal.n_seen.shape, bool)
@@ -119,8 +118,9 @@ def starless(signal, stars, fwhm_px, pixel_arcsec) -> tuple[SignalToNoise, np.nd
 
 
 def _without_stars(image, seen, stars, fwhm):
-    """An image (Ny, Nx) [sigma] without the light of StarPlaces, and the pixels (Ny, Nx) bool that
-    held it.
+    """Removes the light of StarPlaces from an image (Ny, Nx) [sigma].
+
+    Also returns the pixels (Ny, Nx) bool from which light was removed.
 
     seen (Ny, Nx): bool; fwhm [px]: of a point source in the image
     """
@@ -132,7 +132,10 @@ def _without_stars(image, seen, stars, fwhm):
 
 
 def _without(image, seen, star, fwhm):
-    """`_without_stars` of one star, in the window about it that its light may reach."""
+    """Removes the light of one star within the window that it may reach.
+
+    Arguments and results are those of `_without_stars`.
+    """
     at, shape = np.rint(star.place).astype(int), np.array(image.shape)
     low, high = np.clip(at - MAX_REACH_PX, 0, shape), np.clip(at + MAX_REACH_PX + 1, 0, shape)
     window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
@@ -155,10 +158,12 @@ def _in_window(image, seen, star, fwhm):
     angles = np.arange(n_angles) * 2 * np.pi / n_angles
     radii = np.arange(end + 1.0)[:, None]
     at = [star.place[0] + radii * np.sin(angles), star.place[1] + radii * np.cos(angles)]
-    fall = Fall.of(image, own & (away >= star.radius), away, 1.0)
-    mean = fall.at(away) if fall else np.zeros(image.shape)
+    profile = RadialProfile.measure(image, own & (away >= star.radius), away, 1.0)
+    mean = profile.at(away) if profile else np.zeros(image.shape)
     rays = map_coordinates(np.where(seen, image - mean, 0), at, order=1, mode="nearest")
-    rays[map_coordinates(seen.astype(np.float32), at, order=1, mode="nearest") < ALL_SEEN] = np.inf
+    rays[
+        map_coordinates(seen.astype(np.float32), at, order=1, mode="nearest") < MIN_SEEN_WEIGHT
+    ] = np.inf
     lasting = _opened(rays, int(np.ceil(SOURCE_FWHM * fwhm)))
     turn = np.arctan2(dy, dx) / (2 * np.pi) * n_angles % n_angles
     lasting = np.concatenate([lasting, lasting[:, :1]], axis=1)
@@ -168,17 +173,20 @@ def _in_window(image, seen, star, fwhm):
     noise = np.hypot(spread[np.minimum(rings, end)], UNEVEN * (mean + model))
     left = (left - middle[np.minimum(rings, end)]) / noise
     # light beside pixels without weight is that of one side
-    left[(away < star.radius + CORE_FWHM * fwhm) | _beside(~seen, BESIDE_FWHM * fwhm)] = 0
+    left[
+        (away < star.radius + MIN_CORE_DISTANCE_FWHM * fwhm)
+        | _beside(~seen, MIN_MASK_DISTANCE_FWHM * fwhm)
+    ] = 0
     return np.where(own, left, image).astype(image.dtype), own
 
 
 def _beside(pixels, radius):
-    """Pixels (Ny, Nx) bool within a radius [px] of some, these too."""
+    """Pixels (Ny, Nx) bool within a radius [px] of the given ones, included themselves."""
     return distance_transform_edt(~pixels) < radius if pixels.any() else pixels
 
 
 def _opened(rays, length):
-    """The opening of rays (radii, angles) over a length [px], their unseen pixels left out."""
+    """Morphological opening of rays (radii, angles) over a length [px], without unseen pixels."""
     size = (length, 1)
     least = grey_erosion(rays, size=size, mode="nearest")
     least = np.where(np.isfinite(least), least, -np.inf)
@@ -187,23 +195,23 @@ def _opened(rays, length):
 
 
 def _end(image, seen, rings, first):
-    """Radius [px] from which on the median light of rings (Ny, Nx) of pixels falls no more."""
+    """Radius [px] beyond which the median light of rings (Ny, Nx) no longer falls."""
     order = np.argsort(rings[seen], kind="stable")
     number, values = rings[seen][order], image[seen][order]
     starts = np.searchsorted(number, np.arange(number[-1] + 2 if len(number) else 1))
     light = np.full(len(starts) - 1, np.inf)
     for r in range(first, len(light)):
         part = values[starts[r] : starts[r + 1]]
-        if len(part) > MIN_COVERED * 2 * np.pi * r:
+        if len(part) > MIN_COVERED_FRACTION * 2 * np.pi * r:
             light[r] = np.median(part)
     if not np.isfinite(light).any():
         return len(light)
     end = int(np.argmax(light < light.min() + END_SIGMAS))
-    return int(SPIKES * end)
+    return int(SPIKE_REACH * end)
 
 
 def _statistics(values, rings, end):
-    """Median and scatter, at least 1, (end + 1,) of values on rings."""
+    """Median and scatter (at least 1) of values on rings, each (end + 1,)."""
     middle, spread = np.zeros(end + 1), np.ones(end + 1)
     order = np.argsort(rings, kind="stable")
     number, values = rings[order], values[order]

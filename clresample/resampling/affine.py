@@ -156,7 +156,7 @@ class LineInterpolation:
         self.size = 1 if tuning.row_loops else executor.whole_groups(n_out), n_lines
 
     def __call__(self, source: MatrixBatch, target: MatrixBatch, n, which):
-        """Queue the sums of `n` images, all bands of some scenes: rows of source to target.
+        """Queues the sums of `n` images, all bands of some scenes: rows of source to target.
 
         which: the executor's
         """

@@ -26,7 +26,7 @@ GROWTH = 0.1
 
 
 class _LRUStore:
-    """Entries by their keys, those asked for longest ago dropped beyond `most` bytes.
+    """Entries by their keys; the least recently used are dropped beyond `most` bytes.
 
     Entries grow while they are used, and to ask each of hundreds for its size at every new one
     took longer than to make that: what they held when last asked counts, until so many new ones
@@ -41,7 +41,7 @@ class _LRUStore:
         return len(self._entries)
 
     def clear(self):
-        """Drop all."""
+        """Empties the cache."""
         self._entries.clear()
         self._held.clear()
 
@@ -66,7 +66,7 @@ class _LRUStore:
 
 
 class OperatorCache:
-    """Resamplers by what they are made of, and the plans behind them, bounded in bytes.
+    """Resamplers by their grids and PSFs, with their plans, bounded in bytes.
 
     plan_bytes [bytes]: host memory that plans may hold
     device_bytes [bytes]: device memory that operators may hold, with their intermediates as large
@@ -93,11 +93,11 @@ class OperatorCache:
         private=False,
         n_terms=1,
     ) -> Resampler:
-        """The Resampler from `frame` to `grid` and `psf`; asked twice it is the same object.
+        """The Resampler from `frame` to `grid` and `psf`; repeated calls return the same object.
 
         extent (2,) [px]: what of the frame holds light, the rest is padding; None = all of it
         private: an operator of the caller's own, whose shift may be set, on the same plan
-        n_terms: PSFs that psf has in turn for each band, see Plan
+        n_terms: PSFs that psf has in turn for each band, see ResamplingPlan
 
         Raises ValueError as Resampler does.
         """
@@ -131,7 +131,7 @@ class OperatorCache:
         return len(self._operators)
 
     def clear(self):
-        """Forget all plans and operators; those in use elsewhere live on."""
+        """Drops all plans and operators; those in use elsewhere remain valid."""
         with self._lock:
             self._plans.clear()
             self._operators.clear()
@@ -139,7 +139,7 @@ class OperatorCache:
 
 @functools.cache
 def default_cache() -> OperatorCache:
-    """The cache of everyone who brings none."""
+    """The default cache."""
     return OperatorCache()
 
 

@@ -7,7 +7,7 @@
     adjoint   the same factors transposed, in reverse order
 
 Where a band adds up T images of the model, one through each PSF of a basis, Z = sum_t Z_t with
-Z_t = D_t o (Ty I1_t Tx): what follows is done once (Terms).
+Z_t = D_t o (Ty I1_t Tx): what follows is done once (PSFTerms).
 
     I1 (Ny, Nx), I2 (My, Mx): one band of the model and of the observation
     Ty (ky, Ny), Tx (Nx, kx): cos and sin waves at the model's pixels; ky = 2 Hy, kx = 2 Hx
@@ -30,8 +30,9 @@ from .executor_base.terms import PSFTerms
 class Executor(ExecutorTables):
     """Base of the three executors: from a model to its frequencies, and back.
 
-    plans, axes, n_rows: see Tables
-    Subclasses add to scratch_shapes, bind and bind_back, and implement observe and collect
+    plans, axes, n_rows: see ExecutorTables
+    Subclasses extend scratch_shapes, bind and bind_adjoint, and implement frequencies_to_pixels
+    and pixels_to_frequencies
     """
 
     def __init__(self, device, dtype, plans):
@@ -64,7 +65,7 @@ class Executor(ExecutorTables):
         return self.scratch["terms" if self.terms else "frequencies"]
 
     def bind(self):
-        """Bind the products of the model's end to the scratch that is there."""
+        """Binds the products at the model's end to the present scratch buffers."""
         half, n = self.matrix("half", self.n_y), self.n_bands * self.n_terms
         z = self.matrix("terms" if self.terms else "frequencies", self.k_y)
         model = ImageBatch.shaped(*self.plans[0].mapping.shape_in).matrix(self.axes)
@@ -95,7 +96,7 @@ class Executor(ExecutorTables):
             self.terms.bind(self.scratch)
 
     def bind_adjoint(self):
-        """Bind those of the adjoint."""
+        """Binds the products of the adjoint."""
         half, n = self.matrix("half", self.n_y), self.n_bands * self.n_terms
         z = self.matrix("terms" if self.terms else "frequencies", self.k_y)
         model = ImageBatch.shaped(*self.plans[0].mapping.shape_in).matrix(self.axes)

@@ -27,7 +27,8 @@ class GridOperator(LinOp):
     Images are flux per pixel, (C, Ny, Nx) or (B, C, Ny, Nx). Observed pixels whose centre the
     model does not cover come out as 0.
 
-    n_terms: T images of the model that each band adds up, see Plan; shape_in has C * T of them then
+    n_terms: T images of the model that each band adds up, see ResamplingPlan; shape_in has C * T
+        of them then
 
     An operator whose items have a geometry each (`Resampler.from_plans`) gives `mapping` and
     `certificate` as lists, `covered` as (n, My, Mx) and `shift` as (n, 2); all others one of each.
@@ -86,7 +87,7 @@ class GridOperator(LinOp):
         raise NotImplementedError
 
     def _use_shift(self):
-        """Bring what the device holds in line with `_shift` (n, 2)."""
+        """Updates the device's tables to `_shift` (n, 2)."""
         raise NotImplementedError
 
     def _begin(self, device, dtype, n_bands, mappings, n_terms=1):

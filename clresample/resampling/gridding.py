@@ -93,13 +93,13 @@ class LineTaps:
 
     @property
     def n_bytes(self) -> int:
-        """Host memory of what there is so far [bytes]."""
+        """Host memory [bytes] of the present tables."""
         parts = self.start, self.weight, self.covered, *vars(self).get("_back", ())
         return sum(part.nbytes for part in parts)
 
     @property
     def start_t(self) -> np.ndarray:
-        """Worked out when first asked for: what only renders never does."""
+        """Computed at its first use, which rendering does not need."""
         return self._back[0]
 
     @property

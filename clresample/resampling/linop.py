@@ -41,7 +41,7 @@ class LinOp:
         return ()
 
     def __getstate__(self):
-        """Without what belongs to one process: lock and staging arrays, which copies make anew."""
+        """State for copies, without lock and staging arrays, which they make anew."""
         return {k: v for k, v in self.__dict__.items() if k not in ("_staged", "_lock")}
 
     def __setstate__(self, state):
@@ -65,7 +65,7 @@ class LinOp:
     __call__ = __matmul__ = forward
 
     def forward_into(self, x, out):
-        """Queue out = A x without any check: for loops that call it with the same arrays.
+        """Queues out = A x without any check: for loops that call it with the same arrays.
 
         x (B,) + shape_in, out (B,) + shape_out: C-contiguous arrays of `dtype` on `device`
         """
@@ -73,7 +73,7 @@ class LinOp:
             self._forward(x, out)
 
     def adjoint_into(self, y, out):
-        """Queue out = A^T y without any check; y (B,) + shape_out, out (B,) + shape_in."""
+        """Queues out = A^T y without any check; y (B,) + shape_out, out (B,) + shape_in."""
         with self._lock:
             self._adjoint(y, out)
 
@@ -180,11 +180,11 @@ class HostLinOp(LinOp):
     """
 
     def _on_device(self, run, name, *call):
-        """Refused: there is no way in for device arrays."""
+        """Raises an error: device arrays are not accepted."""
         raise ValueError(f"{name} is on the device: {type(self).__name__} takes NumPy arrays")
 
     def _through_host(self, run, name, x, out, batched_x, batched_out, shape_result):
-        """`run` on a caller's NumPy arrays, copied only where dtype or layout ask for it."""
+        """`run` on a caller's NumPy arrays, copied only if dtype or layout require it."""
         x = _cast(name, x, self.dtype).reshape(batched_x)
         direct = out is not None and out.dtype == self.dtype and out.flags.c_contiguous
         direct = direct and not np.may_share_memory(x, out)

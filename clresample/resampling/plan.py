@@ -107,14 +107,14 @@ class ResamplingPlan:
         return own + lines + sum(plan.n_bytes for plan in self.windows.values())
 
     def window(self, shape, reach_px, precision: Precision, size=None) -> ResamplingPlan:
-        """The plan of a box of the model, by what its light reaches of the observation.
+        """The plan of a box of the model and the part of the observation that its light reaches.
 
         One for all boxes of a shape: those observed pixels lie about the box's middle, and how far
         off they are in truth is a shift of up to half an observed pixel. Not of distorted mappings,
         which are another at each place.
 
         shape (2,) [model px]: of the box; reach_px [model px]: how far its light is followed
-        size (2,) [observed px]: of the window, at least as many; see PaddedMapping.box_of
+        size (2,) [observed px]: of the window, at least as many; see PaddedMapping.for_box
         """
         key = tuple(shape), reach_px, precision, size
         if key not in self.windows:
@@ -216,7 +216,7 @@ def _moved(d_plus, d_minus, nu, way):
 
 
 def _check_size(mapping, psf_out, n_fft, n_bands):
-    """Raise ValueError where a plan would take more than MAX_BYTES."""
+    """Raises ValueError if a plan would need more than MAX_BYTES."""
     k = [_half_count(mapping.matrix, psf_out.spacing, i, n_fft[i]) for i in (0, 1)]
     n_bytes = 3 * 16 * n_bands * k[0] * 2 * k[1]  # D and both OTFs; then waves at the pixels
     n_bytes += 16 * sum(n * h for n, h in zip(mapping.shape_in, k, strict=True))

@@ -99,7 +99,7 @@ class Resampler(GridOperator):
         self._group = _images_at_once(self._executor) // n_bands or 1
 
     def _use_shift(self):
-        """Upload D with the phases of the shift."""
+        """Uploads D with the phases of the shift."""
         self._identity = all(p.identity for p in self.plans) and not self._shift.any()
         pairs = zip(self.plans, self._shift, strict=True)
         transfer = [plan.shifted(shift) for plan, shift in pairs]
@@ -160,7 +160,7 @@ class Resampler(GridOperator):
             self._run(way, source, target, whole=self._executor)
 
     def _run(self, way, source, target, *, whole=None, **options):
-        """Queue "forward" or "adjoint" on as many items at a time as the cache holds.
+        """Queues "forward" or "adjoint" on as many items at a time as the cache holds.
 
         source, target: device arrays (B,) + shape of an item; whole: the executor, None for that of
         callers; options: of `way`
@@ -179,7 +179,7 @@ class Resampler(GridOperator):
 
 
 def _queue(executor, way, source, target, group, n_bands, **options):
-    """Queue the items of device arrays, `group` at a time; see `Resampler._run`."""
+    """Queues the items of device arrays, `group` at a time; see `Resampler._run`."""
     executor.reserve(group * n_bands)
     for start in range(0, len(source), group):
         n = min(group, len(source) - start) * n_bands

@@ -105,7 +105,7 @@ def _light_ends(psf, tolerance):
 
 
 def transfer_function(otf_in, otf_out):
-    """D / |det A| = P2^ / P1^ from both OTFs, and what the division had to do.
+    """D / |det A| = P2^ / P1^ from both OTFs, and the frequencies limited in the division.
 
     Computed as P2^ conj(P1^) / max(|P1^|, floor)^2: the exact ratio wherever the model's PSF
     carries more than DIVISION_FLOOR, falling to zero with |P1^| below it.

@@ -1,4 +1,4 @@
-"""Tables of waves at the pixels of each geometry, in float64; Plan says what they are."""
+"""Tables of waves at the pixels of each geometry, in float64; see ResamplingPlan."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def uniform_wave_table(nu, first, step, n) -> np.ndarray:
 def aligned_tables(mapping: Mapping, nu, axes, center):
     """Waves at the observed rows and columns about their middle, zero outside the model.
 
-    And how far off the model's middle that is (2,) [model px].
+    Also returns the distance of that middle from the model's (2,) [model px].
     """
     tables, middle = [], []
     for i in (0, 1):

@@ -65,7 +65,7 @@ def mosaic_scene(scene, rng, *, kind, noise="correlated") -> SimulatedScene:
     Raises ValueError for another kind, another noise, and scenes with a celestial WCS.
     """
     if kind not in ("lanczos", "drizzle"):
-        raise ValueError(f'kind is {kind!r}, it takes "lanczos" or "drizzle"')
+        raise ValueError(f'kind is {kind!r}, must be "lanczos" or "drizzle"')
     images = {}
     for name in ("euclid", "rubin"):
         image = getattr(scene, name)
@@ -117,7 +117,7 @@ def _expose(image, profiles, positions_arcsec, grids, rng):
 def _mosaic(image, mosaicking: MosaicOperator, exposures, noise):
     """The MosaicImage of an image; noise: "correlated" or "white"."""
     if noise not in ("correlated", "white"):
-        raise ValueError(f'noise is {noise!r}, it takes "correlated" or "white"')
+        raise ValueError(f'noise is {noise!r}, must be "correlated" or "white"')
     variance = mosaicking.variance() * len(exposures)
     inverse = np.divide(1, variance, out=np.zeros(variance.shape), where=variance > 0)
     mosaic = Observation(

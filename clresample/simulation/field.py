@@ -41,7 +41,7 @@ def simulate_field(
     bad_columns=0,
     center_deg=(150.0, 2.0),
 ) -> SimulatedField:
-    """A field as Euclid VIS and Rubin see it; one seed gives one field.
+    """Simulates a field of Euclid VIS and Rubin; one seed gives one field.
 
     seed: whole number; n_pixels: of Euclid a side; Rubin's mosaic holds the same sky
     sky: "plain", small parametric galaxies (`parametric_galaxy`) under Gaussian PSFs; "real",
@@ -117,7 +117,7 @@ def _plain(surveys, grids, sources, rngs, psf_variation, bad_columns, center_deg
 
 
 def _check(n_pixels, density, faintest, clustering, stars, psf_variation, bad_columns, rubin_bands):
-    """Raise ValueError for what `simulate_field` does not take."""
+    """Raises ValueError for invalid arguments of `simulate_field`."""
     for name, value, good in (
         ("n_pixels", n_pixels, n_pixels >= 32),
         ("density", density, density is None or density > 0),
@@ -200,7 +200,7 @@ def _psf(survey, width):
 
 
 def _add(data, survey, grid, sources, s, counts, variation, axis):
-    """Draw a source on its stamp and add it to the mosaic; returns its squared signal to noise."""
+    """Draws a source, adds it to the mosaic and returns its squared signal to noise."""
     profile, position, power = sources.profiles[s], sources.positions[s], 0.0
     pixel = np.linalg.solve(grid.jacobian, position - grid.origin)
     reach = next(half for limit, half in STAMP_ARCSEC if sources.mag_i[s] < limit)

@@ -23,7 +23,7 @@ AXIS_RATIO = (0.3, 1.0)
 
 
 def import_galsim():
-    """The galsim module. Raises ImportError that says what to install."""
+    """Imports galsim. Raises ImportError that names the package to install."""
     try:
         import galsim
     except ImportError as error:

@@ -203,6 +203,6 @@ def _centers(grids_in, grid):
 
 
 def _check_flat(*grids):
-    """Raise ValueError for a grid with a celestial WCS."""
+    """Raises ValueError for a grid with a celestial WCS."""
     if not all(g.is_flat for g in grids):
         raise ValueError("a grid has a celestial WCS; mosaics are made on flat grids (Grid.flat)")

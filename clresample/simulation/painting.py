@@ -116,7 +116,7 @@ def painted(survey, grid, sources, spoilers, rng, center_deg, *, second, **optio
 
 
 def _saturated(data, instrument):
-    """Saturate the bands; pixels (Ny, Nx) bool that are full in any of them."""
+    """Saturates the bands; pixels (Ny, Nx) bool that are full in any of them."""
     survey = instrument.survey
     galsim, scale = import_galsim(), survey.pixel_scale_arcsec
     counts = survey.counts(np.full(survey.n_bands, SATURATION_MAG[survey.name]))
@@ -135,7 +135,7 @@ def band_fluxes(source, bands):
 
 
 def _add(data, instrument, grid, source):
-    """Draw a source on its stamp and add it to images in place; its squared signal to noise."""
+    """Draws a source, adds it to images in place and returns its squared signal to noise."""
     galsim, survey, power = import_galsim(), instrument.survey, 0.0
     pixel = np.linalg.solve(grid.jacobian, source.position - grid.origin)
     share = band_fluxes(source, survey.bands)

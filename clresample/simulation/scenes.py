@@ -1,4 +1,4 @@
-"""Blended scenes as two telescopes see them, with the truth, as in the paper's tests.
+"""Simulates blended scenes of two telescopes, with their truth, as in the paper's tests.
 
 The flat sky has its origin in the middle of every stamp; y [arcsec] points north and x west, so
 that the stamps of a scene that is put on the celestial sphere show east to the left.
@@ -195,7 +195,7 @@ def simulate_scene(
     sky="plain",
     spectra="independent",
 ):
-    """A blend of galaxies as Euclid (VIS) and Rubin (ugrizy) see it; one seed gives one scene.
+    """Simulates a blend in Euclid (VIS) and Rubin (ugrizy); one seed gives one scene.
 
     Positions are uniform in the central two thirds of the stamp, VIS magnitudes uniform in 20 - 29;
     a row of colours is shifted so that its brightest Rubin band is uniform in 20 - 29. Galaxies,
@@ -249,7 +249,7 @@ def simulate_scene(
 
 
 def _check(n_sources, sky, catalogue, spectra):
-    """Raise ValueError for what `simulate_scene` does not take."""
+    """Raises ValueError for invalid arguments of `simulate_scene`."""
     if n_sources < 1:
         raise ValueError(f"n_sources is {n_sources}, must be 1 or more")
     if sky not in ("plain", "real") or (sky == "real" and catalogue is not None):

@@ -84,7 +84,7 @@ def offset_of(rng, size):
 
 
 def add_cosmic_rays(data, sigma, rng, per_million):
-    """Add tracks to images (C, Ny, Nx) [counts] in place, each in one band; sigma (C,) [counts]."""
+    """Adds tracks to images (C, Ny, Nx) [counts] in place, one band each; sigma (C,) [counts]."""
     n_bands, n_y, n_x = data.shape
     for _ in range(rng.poisson(per_million * n_bands * n_y * n_x / 1e6)):
         band, length = int(rng.integers(n_bands)), rng.uniform(*COSMIC_PX)
@@ -108,7 +108,7 @@ def gap_pixels(shape, rng, n):
 
 
 def saturate(data, level):
-    """Clip an image (Ny, Nx) [counts] at a level in place; the surplus flows along its columns.
+    """Clips an image (Ny, Nx) [counts] at a level in place; the surplus flows along its columns.
 
     returns the pixels (Ny, Nx) bool at the level
     """

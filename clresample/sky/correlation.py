@@ -1,4 +1,4 @@
-"""Correlated noise: what it is, how it is estimated, and the filter that makes it white.
+"""Correlated noise: its description, its estimate, and the filter that whitens it.
 
 Drizzled, resampled and stacked images share noise between neighbouring pixels. With sigma the
 standard deviation of single pixels (from the weights) and rho the correlation of two pixels,
@@ -61,7 +61,7 @@ class NoiseCorrelation(ReadOnly):
         rho = as_float_array("autocorrelation", autocorrelation)
         if rho.ndim != 2 or rho.shape[0] % 2 == 0 or rho.shape[1] % 2 == 0:
             raise ValueError(
-                f"autocorrelation has the shape {rho.shape}, it takes odd numbers of lags a side, "
+                f"autocorrelation has the shape {rho.shape}, must have odd numbers of lags a side, "
                 "(2L + 1, 2L + 1), lag 0 in the middle"
             )
         peak = rho[rho.shape[0] // 2, rho.shape[1] // 2]
@@ -115,7 +115,7 @@ class NoiseCorrelation(ReadOnly):
 
     @classmethod
     def estimate(cls, image, weights, *, max_lag_px=MAX_LAG_PX) -> NoiseCorrelation:
-        """From the blank sky of an image (Ny, Nx), weights (Ny, Nx): what is no source's light.
+        """Estimates it from the blank sky of an image (Ny, Nx) with weights (Ny, Nx).
 
         Blank are pixels under 3.5 sigma in a smoothed image, 5 pixels away from those above it.
         Raises ValueError where too little sky is left.
@@ -140,7 +140,7 @@ class NoiseCorrelation(ReadOnly):
     def colouring_filter(self) -> np.ndarray:
         """Filter (n, n), n odd, that makes this noise out of white noise of unit variance.
 
-        Symmetric, with the transform P^(1/2).
+        It is symmetric, with the transform P^(1/2).
         """
         root = np.fft.fftshift(np.fft.ifft2(np.sqrt(_power(self.autocorrelation))).real)
         return root[1:, 1:]  # of an even number of taps the middle one is n // 2
@@ -152,7 +152,7 @@ class NoiseCorrelation(ReadOnly):
         return ~binary_dilation(~good, np.ones(shape, bool), border_value=1)
 
     def error_factor(self, sigma_px):
-        """By how much white errors are too small for a round Gaussian source of this sigma [px].
+        """Factor by which white errors are too small for a round Gaussian source of sigma [px].
 
         The ratio of the true scatter of its matched (white) filter's flux to the one that white
         noise of the same variance per pixel gives: sqrt(sum rho a) / sqrt(a(0)), a the
@@ -291,7 +291,7 @@ def channel_correlations(noise, data, weights, channels):
         if isinstance(correlation, str):
             if correlation != "estimate":
                 raise ValueError(
-                    f'noise is {correlation!r}, it takes a NoiseCorrelation, an array or "estimate"'
+                    f'noise is {correlation!r}, must be a NoiseCorrelation, an array or "estimate"'
                 )
             try:
                 correlation = NoiseCorrelation.estimate(image, weight)

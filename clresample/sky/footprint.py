@@ -32,7 +32,7 @@ class Footprint:
 
     @cached_property
     def used(self) -> np.ndarray:
-        """Pixels (C, My, Mx) that a fit looks at: on the frame, with a weight in white noise."""
+        """Pixels (C, My, Mx) that a fit uses: on the frame, with a weight after whitening."""
         return (self.observation.whitened.weights > 0) & self.mapping.covered
 
     @cached_property
@@ -72,7 +72,7 @@ class Footprint:
 
 
 def coverage_border(footprints, shape) -> np.ndarray:
-    """Pixels of the frame from which light may leave what was observed: (Ny, Nx) bool.
+    """Pixels (Ny, Nx) bool of the frame from which light may leave the observed area.
 
     Those on the frame's edge, those of `unobserved`, and the neighbours of these.
     """
@@ -80,7 +80,7 @@ def coverage_border(footprints, shape) -> np.ndarray:
 
 
 def unobserved(footprints, shape) -> np.ndarray:
-    """Pixels of the frame outside of what was observed, and a border: (Ny + 2, Nx + 2) bool.
+    """Unobserved pixels of the frame, with a border: (Ny + 2, Nx + 2) bool.
 
     The border, and those without a weight in any channel that are connected to it through others
     without one. Masked pixels within an image, single or in patches, are not outside.

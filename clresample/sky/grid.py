@@ -171,7 +171,7 @@ class Grid(GridDisplay, ABC):
         return self._map_to(grid_in, tolerance)
 
     def check_like(self, other: Grid, name):
-        """Raise ValueError, calling the other grid `name`, where one is flat and one is not."""
+        """Raises ValueError, naming the other grid `name`, if only one of the two is flat."""
         if self.is_flat != other.is_flat:
             raise ValueError(
                 f"{name} is {other.sky_description} and this grid {self.sky_description}: "

@@ -1,4 +1,4 @@
-"""The noise of images: weights from what a user gives, or estimated from the background."""
+"""Noise of images: weights from a user's arguments, or estimated from the background."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def _usable(image, mask):
 
 
 def weights_from(data, bad, given, mask, channels, unit=None):
-    """Weights (C, Ny, Nx), `n_invalid` and messages of an Observation, from what its user gave.
+    """Weights (C, Ny, Nx), `n_invalid` and messages of an Observation from its arguments.
 
     data (C, Ny, Nx) float64; bad (C, Ny, Nx) bool: pixels where they are NaN or infinite
     given: weights and variance, and mask: as in Observation, None where they are not given
@@ -172,7 +172,7 @@ def _has_gaps(name, values, data):
 
 
 def _weights_of(data, bad, given, mask, channels, unit, estimates):
-    """As `weights_from`, of values without gaps; what is estimated is added to `estimates`."""
+    """Like `weights_from`, for values without gaps; adds the estimates to `estimates`."""
     weights, variance = given
     masked, messages = mask, []
     if unit is not None:
@@ -208,7 +208,7 @@ def _weights_of(data, bad, given, mask, channels, unit, estimates):
 
 
 def _check_range(data, weights):
-    """Raise ValueError where data or weights leave the numbers that a fit can be done in."""
+    """Raises ValueError if data or weights exceed the numeric range of a fit."""
     light = np.where(weights > 0, np.abs(data), 0.0)
     root, one = np.sqrt(weights), np.ones_like(weights)
     inverse = np.divide(one, weights, out=np.zeros_like(weights), where=weights > 0)
@@ -275,8 +275,10 @@ def _inverse(variance, shape):
 
 
 def _estimated(data, ignored, channels, unit):
-    """Weights (C, Ny, Nx) from each channel's own background, and messages on the estimate, which
-    name the unit."""
+    """Estimates weights (C, Ny, Nx) from each channel's own background; also returns messages.
+
+    The messages report the estimates in this unit.
+    """
     weights, messages = np.ones(data.shape), []
     for i, channel in enumerate(channels):
         if ignored[i].all():

@@ -161,7 +161,7 @@ class Observation(ReadOnly, ObservationDisplay, DerivedQuantities):
 
     @classmethod
     def restore(cls, data, psf, grid, *, weights, n_invalid, messages, **given) -> Observation:
-        """An observation as it was made once, from what is read back.
+        """Restores an observation from values read back.
 
         n_invalid and messages are those that were found then. Raises ValueError as the constructor
         does.
@@ -237,7 +237,7 @@ def observation_index(observations, key) -> int:
 
 
 def check_observations(observations):
-    """Raise ValueError unless these observations can be fitted together.
+    """Raises ValueError unless these observations can be fitted together.
 
     There is at least one, channel names are unique over all of them, zero points are given by all
     of them or by none, and their grids are all flat or all placed by a WCS.

@@ -186,7 +186,7 @@ class PSF(ReadOnly, PSFDisplay):
 
 
 def _center(images, center):
-    """Centres (C, 2) [samples] from what the user gave."""
+    """Centres (C, 2) [samples] from the user's argument."""
     n_bands, n_y, n_x = images.shape
     if isinstance(center, str):
         if center != "core":

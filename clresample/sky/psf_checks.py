@@ -59,7 +59,7 @@ def core_centroid(image):
 
 
 def check_edge(images):
-    """Raise ValueError for images (C, ny, nx) of unit sum that are too small for their light."""
+    """Raises ValueError for images (C, ny, nx) of unit sum that are too small for their light."""
     light = float(light_beyond_edge(images).max())
     if light > EDGE_REFUSED:
         raise ValueError(

@@ -12,7 +12,7 @@ from .validation.checks import as_float_array, check_integer
 
 
 class SourceWarning(UserWarning):
-    """A source where the images show nothing: its position is probably not what was meant."""
+    """A source where the images show no light: its position is probably wrong."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +59,7 @@ class Source:
         if not plain and position.shape == (2,):
             object.__setattr__(self, name, tuple(map(float, position)))
         if position.shape != (2,) or not np.isfinite(position).all():
-            raise ValueError(f"{name} is {getattr(self, name)}, it takes two finite numbers")
+            raise ValueError(f"{name} is {getattr(self, name)}, must be two finite numbers")
         if self.observation is not None and self.position_px is None:
             raise ValueError(
                 f"observation is {self.observation!r}, but the position is on the sky: "

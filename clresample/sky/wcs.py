@@ -149,7 +149,7 @@ def convert(wcs_from, wcs_to, lon, lat):
 
 
 def _is_icrs(wcs):
-    """Returns True if a WCS's header says so by name."""
+    """Returns True if a WCS's header declares it by name."""
     return not isinstance(wcs, Ape14Wcs) and wcs.wcs.radesys == "ICRS"
 
 

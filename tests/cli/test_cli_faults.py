@@ -62,7 +62,7 @@ def test_tables_of_complex_numbers(scene, capsys):
     table.write(scene / "sources.fits", overwrite=True)
     change(scene, "sources.ecsv", "sources.fits")
     assert deblend(scene) == 2
-    assert "column ra is no position in deg (its type is >c16)" in refused(capsys)
+    assert "column ra is not a position in deg (its type is >c16)" in refused(capsys)
 
 
 @pytest.mark.parametrize("value", [1e400, "many", 1.5])
@@ -85,7 +85,8 @@ def test_too_much_work_is_refused_before_it_starts(scene, capsys, n_sources, n_c
     assert deblend(scene) == 2
     assert time.process_time() - began < 15
     said = refused(capsys)
-    assert f"{n_sources} sources have " in said and "components, more than any channel has" in said
+    assert f"{n_sources} sources have " in said
+    assert "components, but no channel has more than" in said
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1e9])
@@ -172,7 +173,7 @@ def test_devices_links_and_pipes(files, capsys):
         assert said in refused(capsys)
     for name in ("pipe", "/dev/zero"):
         assert resample(image=name) == 2
-        assert f"{name}: is no regular file" in refused(capsys)
+        assert f"{name}: is not a regular file" in refused(capsys)
 
 
 @pytest.mark.filterwarnings("error")

@@ -29,7 +29,7 @@ def test_what_is_missing_is_noted(tmp_path, capsys):
         (["{}/none"], "none: no such folder"),
         (["{}"], "holds no run of `clresample field`"),
         (["{}/run", "--truth", "{}/none.fits"], "none.fits: no such file"),
-        (["{}/run", "--truth", "{}/run/fit_table.ecsv"], "is no truth of a field"),
+        (["{}/run", "--truth", "{}/run/fit_table.ecsv"], "is not the truth of a field"),
         (["{}/run", "--max-size", "1M"], "most_bytes is 1048576"),
         (["{}/run", "-o", "{}/run/catalogue.fits", "--overwrite"], "is one of the inputs"),
         (["{}/run", "-o", "{}/run/provenance.json"], "is one of the inputs"),

@@ -79,10 +79,10 @@ def not_fits():
         (lambda: {"hdu": "SCI"}, "in.fits: no HDU SCI"),
         (lambda: {"psf_like": "q3.fits", "psf_like_hdu": "0"}, "holds no 2-D or 3-D image"),
         (lambda: {"memory": "1K"}, "memory is 1024 bytes"),
-        (lambda: {"memory": "lots"}, "'lots' is no size"),
-        (lambda: {"psf_spacing": "0"}, "'0' is no number above 0"),
+        (lambda: {"memory": "lots"}, "'lots' is not a size"),
+        (lambda: {"psf_spacing": "0"}, "'0' is not a positive number"),
         (lambda: {"psf_center": "left"}, "'left' is not core, middle or Y,X"),
-        (lambda: {"band": "g,,r"}, "is no list of bands"),
+        (lambda: {"band": "g,,r"}, "is not a list of bands"),
         (lambda: {"device": "no such device"}, "no such device"),
     ],
 )

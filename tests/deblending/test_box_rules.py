@@ -124,8 +124,8 @@ def test_active_sources_are_those_there_are(device, which):
 
 def test_boxes_that_make_no_sense_are_refused():
     for given, words in (
-        (([0], [[0, 0, 0]], [[3, 3]]), r"origin has shape \(1, 3\), it takes \(S, 2\)"),
-        (([[0]], [[0, 0]], [[3, 3]]), r"scene has shape \(1, 1\), it takes \(S,\)"),
+        (([0], [[0, 0, 0]], [[3, 3]]), r"origin has shape \(1, 3\), must be \(S, 2\)"),
+        (([[0]], [[0, 0]], [[3, 3]]), r"scene has shape \(1, 1\), must be \(S,\)"),
         (([0], [[0, 0]], [[0, 3]]), r"shape is \[0, 3\] for source 0"),
         (([0, 0], [[0, 0]] * 2, [[3, 3]] * 2, [[1, 1]]), "center has 1 boxes, scene has 2"),
     ):

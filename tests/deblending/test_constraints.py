@@ -213,7 +213,7 @@ def test_wrong_arrays_are_named(device, boxes):
     with pytest.raises(ValueError, match=r"morphs is \(5,\)"):
         Positivity().prox(device.zeros(5, np.float32), placed)
     morphs = device.zeros(boxes.size, np.float32)
-    with pytest.raises(ValueError, match=r"factor is \(3,\) float32, it takes \(10,\)"):
+    with pytest.raises(ValueError, match=r"factor is \(3,\) float32, must be \(10,\)"):
         MaxNorm().prox(morphs, placed, factor=device.zeros(3, np.float32))
     with pytest.raises(ValueError, match="active names source 10"):
         MaxNorm().prox(morphs, placed, active=[10])

@@ -71,7 +71,7 @@ def test_names_sizes_groups_and_units(field):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ((1, 0), "source is 1, which is no id of"),
+        ((1, 0), "source is 1, must be an id of"),
         (([], 0), "source is empty"),
         (("id", "VISTA"), "observation is 'VISTA', must be a number from 0 to 1"),
         (("id", 0, "light"), "what is 'light'"),
@@ -188,7 +188,7 @@ def test_the_command_writes_many_sources_into_one_file(copied, field, tmp_path, 
     [
         ([], "--id is missing"),
         (["--id", "x"], "--id is x: ids of a field are numbers"),
-        (["--id", "7"], "source is 7, which is no id of"),
+        (["--id", "7"], "source is 7, must be an id of"),
         (["--ids-from", "none.ecsv"], "no such file"),
         (["--id", "7", "--size", "2.5"], "'2.5' is not a size"),
         (["--id", "7", "--what", "light"], "invalid choice"),

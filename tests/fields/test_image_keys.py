@@ -166,9 +166,9 @@ def test_an_image_away_from_the_files_stars_is_noted(folder):
     "more, message",
     [
         ("psf_cutout_px = [1, 2]\npsf_crpix = [1, 2]", "are both given"),
-        ("psf_cutout_px = 3", "psf_cutout_px is 3, it takes two numbers"),
-        ("saturation = -1", "saturation is -1, it takes a number above 0"),
-        ("saturation = [1.0, 2.0]", "saturation has 2 numbers, it takes one"),
+        ("psf_cutout_px = 3", "psf_cutout_px is 3, must be two numbers"),
+        ("saturation = -1", "saturation is -1, must be a number above 0"),
+        ("saturation = [1.0, 2.0]", "saturation has 2 numbers, must have one"),
         ("mask_bits = [1]", "mask_bits is given, but mask names no file"),
     ],
 )
@@ -216,7 +216,7 @@ def test_the_band_of_an_exposure_is_read(folder, table):
     _, o, _ = opened(folder, more, table)
     assert (o.channels, o.bands) == (("g1",), ("g",))
     assert opened(folder, 'psf_format = "psfex"', table)[1].bands == ("cam",)
-    with pytest.raises(SceneError, match="band has 2 names, it takes one"):
+    with pytest.raises(SceneError, match="band has 2 names, must have one"):
         opened(folder, 'psf_format = "psfex"\nband = ["g", "r"]', table)
 
 

@@ -84,7 +84,7 @@ def test_the_names_are_listed_and_our_own_stay(package, tmp_path):
     assert list(READERS)[-3:] == ["broken", "dots", "nothing"] and "round" in FORMATS
     assert READERS["hst"].__module__ == "clresample.fields.readers.hst"
     (tmp_path / "field.toml").write_text(FIELD.replace("dots", "dosts", 1))
-    with pytest.raises(SceneError, match='format is .dosts., it takes .*"legacy" or "broken"'):
+    with pytest.raises(SceneError, match='format is .dosts., must be .*"legacy" or "broken"'):
         read_field(tmp_path / "field.toml")
 
 

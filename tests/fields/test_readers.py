@@ -195,7 +195,7 @@ def test_a_mosaic_of_field_toml_takes_two_lines(tmp_path):
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        ('format = "lagacy"\npath = "brick"', "format is 'lagacy', it takes \"euclid-mer\""),
+        ('format = "lagacy"\npath = "brick"', "format is 'lagacy', must be \"euclid-mer\""),
         ('format = "legacy"', "mosaic 1: path is missing"),
         ('format = "legacy"\npath = "none"', "none: no such file or folder"),
         ('format = "legacy"\npath = "brick"\nrms = 2.0', "key rms is unknown"),
@@ -212,7 +212,7 @@ def test_mistakes_in_a_survey_s_table(tmp_path, lines, message):
 
 
 def test_every_format_has_a_name():
-    with pytest.raises(ValueError, match="format is 'fits', it takes euclid-mer, rubin-coadd"):
+    with pytest.raises(ValueError, match="format is 'fits', must be euclid-mer, rubin-coadd"):
         read_survey("fits", "x")
 
 

@@ -105,11 +105,14 @@ def test_options_of_the_file(files):
     [
         ("varianze = 1.0", "mosaic 1: key varianze is unknown"),
         ("weight = 1.0\nrms = 2.0", "mosaic 1: weight and rms are both given: an image takes one"),
-        ("weight = -1.0", "mosaic 1: weight is -1.0, it takes"),
+        ("weight = -1.0", "mosaic 1: weight is -1.0, must be"),
         ('variance = "none.fits"', "none.fits: no such file"),
         ('weight = 1.0\nmask = "mask.fits"\nmask_bits = ["BAD"]', "names SAT, CR"),
         ('weight = 1.0\npsf_format = "cells"', "psf_cell_px is missing"),
-        ("weight = 1.0\nzero_point = [1.0, 2.0]", "zero_point has 2 numbers, it takes one for all"),
+        (
+            "weight = 1.0\nzero_point = [1.0, 2.0]",
+            "zero_point has 2 numbers, must have one for all",
+        ),
         ('weight = "a.fits"', "weight is in the image's own file"),
         ('variance = "large.fits"', "variance has (301, 260) pixels"),
         ('weight = 1.0\nmask = "large.fits"', "mask has (301, 260) pixels"),
@@ -192,5 +195,5 @@ def test_a_field_file_is_checked_as_scene_files_are(tmp_path, text, said):
     path.write_text(text)
     with pytest.raises(SceneError, match=said):
         parse_field(path)
-    with pytest.raises(SceneError, match="no regular file"):
+    with pytest.raises(SceneError, match="not a regular file"):
         parse_field(tmp_path)

@@ -221,7 +221,7 @@ def test_what_cannot_be_read_is_said(tmp_path):
     QTable({"y": [1.0], "x": [1.0]}).write(places, format="ascii.ecsv")
     with pytest.raises(FileError, match="truth.ecsv: no such file"):
         write_report(folder, truth=tmp_path / "truth.ecsv")
-    with pytest.raises(FileError, match="is no truth of a field"):
+    with pytest.raises(FileError, match="is not the truth of a field"):
         write_report(folder, truth=places)
     with pytest.raises(FileError, match="exists already"):
         write_report(folder, report.path)

@@ -178,7 +178,7 @@ def test_a_turned_grid_of_the_papers_scheme_says_what_it_costs(device):
         ),
         ({"tolerance_px": np.nan}, "tolerance_px is nan"),
         ({"tolerance_px": -1}, "tolerance_px is -1"),
-        ({"dtype": None}, "dtype is None, allowed are float32 and float64"),
+        ({"dtype": None}, "dtype is None, must be float32 or float64"),
         ({"dtype": "nonsense"}, "dtype is 'nonsense'"),
         ({"dtype": complex}, "dtype is .*complex"),
         ({"shift": "a"}, "shift must be"),

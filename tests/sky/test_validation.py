@@ -227,7 +227,7 @@ def test_types_of_floats():
     for name in ("f4", ">f8", np.float32, "float64"):
         assert check_dtype(name) in (np.dtype(name),)
     for name in (None, "f2", "f16", "i4", "i8", "c8", "M8[s]", "nonsense", 3):
-        with pytest.raises(ValueError, match="dtype is .* allowed are float32 and float64"):
+        with pytest.raises(ValueError, match="dtype is .* must be float32 or float64"):
             check_dtype(name)
 
 

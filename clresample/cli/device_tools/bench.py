@@ -1,4 +1,4 @@
-"""`clresample devices --bench`: what the chosen device does in a second."""
+"""`clresample devices --bench`: work of the chosen device in a second."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ALL_SECONDS = 8.0
 
 
 def bench_lines(device):
-    """Measure one thing after the other; yields a line of text for each.
+    """Measures one thing after the other; yields a line of text for each.
 
     Kernels are built before anything is timed; the first run on a machine takes longer for that.
     As many blends are fitted side by side as the device takes at once and the time allows: one at

@@ -41,7 +41,7 @@ N_SCENES = {"CPU": (8, 16, 32), "GPU": (64, 256, 1024)}
 
 
 def add_tune(commands):
-    """Add `clresample tune`."""
+    """Adds `clresample tune`."""
     parser = commands.add_parser(
         "tune", help="measure and keep the sizes that suit the device", description=DESCRIPTION
     )
@@ -54,7 +54,7 @@ def add_tune(commands):
 
 
 def run(arguments):
-    """Measure, keep, and say what was gained. OSError where the file cannot be written."""
+    """Measures, stores and reports the gain. Raises OSError if the file cannot be written."""
     from ...device.device import get_device
     from ...device.tuning import PART
 

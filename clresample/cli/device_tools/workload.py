@@ -32,7 +32,7 @@ SIGMA = 1e-3  # [peak of a galaxy] noise of the blends
 
 
 class RenderWorkload:
-    """Stamps of 100 x 100 Euclid pixels as Rubin sees them in one band, 64 in a call."""
+    """Stamps of 100 x 100 Euclid pixels rendered in one band of Rubin, 64 in a call."""
 
     def __init__(self, device, dtype=np.float32):
         euclid = Grid.flat((STAMP_PX, STAMP_PX), EUCLID_ARCSEC)
@@ -45,7 +45,7 @@ class RenderWorkload:
         self.y = device.empty((BATCH, *self.op.shape_out), dtype)
 
     def __call__(self):
-        """Render them once, until they are done."""
+        """Renders all stamps once and waits for the device."""
         self.op(self.x, out=self.y)
         self.device.finish()
 
@@ -97,7 +97,7 @@ def fit(given, device, **settings):
 
 
 def iterate_once(blend, device):
-    """Start a fit of the blend and iterate a little: all kernels of a fit are then built."""
+    """Starts a fit of the blend and iterates a little, so that all its kernels are built."""
     settings = Settings(max_iter=1)
     fits = [Fit(blend, settings, device, np.float32, pad=1)]
     start_fits(fits)
@@ -105,7 +105,7 @@ def iterate_once(blend, device):
 
 
 class FitWorkload:
-    """The iterations of `n` fits, so many side by side as Tuning says; they are set up once."""
+    """The iterations of `n` fits, set up once, with Tuning's number of them side by side."""
 
     def __init__(self, device, n):
         self.device, self.settings = device, Settings(max_iter=N_ITERATIONS)

@@ -81,7 +81,7 @@ class ProgressDisplay(RunProgress):
                 print_progress(self.arguments, text)
 
     def close(self):
-        """Take the bar away."""
+        """Removes the bar."""
         if self.bar is not None:
             self.bar.close()
 

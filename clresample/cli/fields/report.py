@@ -20,7 +20,7 @@ example  clresample simulate field -o sky
 
 
 def add_report(commands):
-    """Add `clresample report`."""
+    """Adds `clresample report`."""
     parser = commands.add_parser(
         "report",
         help="one HTML page about a field",
@@ -49,7 +49,7 @@ def add_report(commands):
 
 
 def run(arguments):
-    """Write the page. Raises ValueError and FileError, one line, for what cannot be done."""
+    """Writes the page. Raises ValueError and FileError, one line, for unusable arguments."""
     from ...fields.report.write import MAX_BYTES, write_report
 
     report = write_report(

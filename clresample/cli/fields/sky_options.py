@@ -17,7 +17,7 @@ def _up_to(largest, said):
         except ValueError:
             number = -1.0
         if not 0 <= number <= largest:
-            raise argparse.ArgumentTypeError(f"{text!r} is no number {said}")
+            raise argparse.ArgumentTypeError(f"{text!r} is not a number {said}")
         return number
 
     return convert
@@ -27,7 +27,7 @@ _part, _size = _up_to(1, "from 0 to 1"), _up_to(sys.float_info.max, "of 0 or mor
 
 
 def add_sky(sky):
-    """Add the options of the group `sky`."""
+    """Adds the options of the group `sky`."""
     sky.add_argument("--seed", type=non_negative_integer, default=0, help="(default %(default)s)")
     sky.add_argument(
         "--size",
@@ -67,7 +67,7 @@ def add_sky(sky):
 
 
 def add_images(images):
-    """Add the options of the group `images`."""
+    """Adds the options of the group `images`."""
     images.add_argument(
         "--bands",
         type=name_list,

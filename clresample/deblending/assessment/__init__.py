@@ -1,4 +1,4 @@
-"""Judges finished fits: what models leave in the data, light outside the frame, divided light.
+"""Assesses finished fits: residual light, light outside the frame, ambiguous sources.
 
 Functions of a Result and of its Errors: pure NumPy, no device.
 """

@@ -1,4 +1,4 @@
-"""Light whose owner the data do not tell: pairs of sources that may exchange it."""
+"""Finds pairs of sources whose light the data cannot assign: they may exchange it."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ def is_ambiguous(flux, covariance) -> np.ndarray:
 
 
 def partners(flux, covariance) -> np.ndarray:
-    """For each source that with which its light may be exchanged, -1 without any: (S,) int.
+    """Partner of each source with which its light may be exchanged, -1 without one: (S,) int.
 
-    Of several the one whose covariance takes the most from its variance in some channel.
-    flux (S, C) [counts]; covariance (C, S, S) [counts^2]
+    Of several candidates, the one whose covariance takes the most from its variance in some
+    channel. flux (S, C) [counts]; covariance (C, S, S) [counts^2]
     """
     found, most = np.full(len(flux), -1), np.zeros(len(flux))
     for s, t in np.argwhere(np.triu((covariance < 0).any(axis=0), 1)):

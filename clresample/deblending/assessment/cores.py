@@ -28,7 +28,7 @@ def core_errors(result, psf_error) -> np.ndarray:
             star = observation.psf_field.number_at(*there[c.source])
             if star is not None:
                 flux = np.abs(c.spectrum[channels]) * c.morphology.sum()
-                found[c.source, channels] += observation.psf_field.doubt[star] * flux
+                found[c.source, channels] += observation.psf_field.flux_error[star] * flux
     return psf_error * found
 
 

@@ -1,4 +1,4 @@
-"""Light of galaxies outside of what was observed: how much their models would have there."""
+"""Light of galaxies outside the observed area, by continuation of their models."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAX_SCALE = 0.5
 
 
 def light_outside(result, shapes, thetas, positions, peaks) -> np.ndarray:
-    """Flux that each source's model would have outside of what was observed: (S, C) [counts].
+    """Flux (S, C) [counts] of each source's model, continued outside the observed area.
 
     At most what it has inside, and the smaller one of two estimates: what the smooth profile has
     there, which may have wings that its morphology lacks, and the morphology continued, which in
@@ -109,7 +109,7 @@ def _tail(brightness):
 
 
 def widened(errors, outside):
-    """Errors with the light outside of what was observed (S, C) [counts] in those of fluxes.
+    """Errors of fluxes widened by the light outside the observed area (S, C) [counts].
 
     It is as uncertain as it is large, and common to all channels of a source.
     """
@@ -122,7 +122,7 @@ def widened(errors, outside):
 def reaches_outside(result, flux) -> np.ndarray:
     """Selects sources (S,) with more than OUTSIDE of their flux (S, C) outside the observed area.
 
-    In a channel where that is more than the noise of the flux at fixed morphology.
+    Only channels count in which that light exceeds the flux error at fixed morphology.
     """
     if result.errors is None:
         return np.zeros(len(flux), bool)

@@ -98,7 +98,7 @@ class Misfit:
 
 
 def misfit_of(result) -> Misfit:
-    """Compare a fitted blend with its data."""
+    """Compares a fitted blend with its data."""
     n_sources, worst, rest = len(result.sources), [], []
     for i in range(len(result.observations)):
         left = remainder(result, i)
@@ -134,7 +134,7 @@ def _of_channel(rest, c, n_sources):
 
 
 def chi2_excess(chi2, n):
-    """By how many sigma chi2 per pixel of n pixels (of independent noise) is over TRUSTED_CHI2.
+    """Excess [sigma] of chi2 per pixel over TRUSTED_CHI2, of n pixels of independent noise.
 
     The cube root of chi2 / n is all but normal, with mean 1 - 2 / 9n and variance 2 / 9n (Wilson &
     Hilferty 1931, PNAS 17, 684): noise is over 5 sigma once in 3e6, from 10 pixels on.

@@ -1,4 +1,4 @@
-"""The status of a finished fit: whether its model describes the data, beside how it ended."""
+"""Determines the status of a finished fit by how well its model describes the data."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def with_misfit_status(result):
 def misfitted_sources(result) -> np.ndarray:
     """Selects sources (S,) flagged as misfits: those that leave light (`Misfit.sources`).
 
-    Of a result with the status "misfit" all that were fitted where no single one is to blame.
+    If a result has the status "misfit" and no such source, all fitted sources are selected.
     """
     fitted = np.zeros(len(result.sources), bool)
     fitted[[c.source for c in result.components]] = True

@@ -1,4 +1,4 @@
-"""Sources and observations of a result by what users call them."""
+"""Resolves numbers and names of a result's sources and observations."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ class MissingSource(ValueError):
 
 
 def chosen_sources(result, source) -> tuple[int, ...]:
-    """Numbers of the sources meant by a number, a name, or a sequence of these.
+    """Numbers of the sources selected by a number, a name, or a sequence of these.
 
-    A number that is none of the sources' is looked up among their names, as those of fields are.
-    Raises ValueError for what names no source, and for an empty sequence.
+    A number outside the sources' range is looked up among their names, as those of fields are.
+    Raises ValueError for an unknown source and for an empty sequence.
     """
     one = isinstance(source, (str, numbers.Integral)) or np.ndim(source) == 0
     wanted = [source] if one else list(source)
@@ -38,10 +38,10 @@ def chosen_sources(result, source) -> tuple[int, ...]:
 
 
 def chosen_observation(observations, observation) -> tuple[int, int | None]:
-    """The number of an observation, and of one channel of it, or None for all of them.
+    """Number of an observation, and of one channel of it, or None for all channels.
 
     observation: a number, an observation's name, or a channel's
-    Raises ValueError for what names none, or several.
+    Raises ValueError if it selects no observation, or several.
     """
     if isinstance(observation, numbers.Integral) and not isinstance(observation, bool):
         if 0 <= int(observation) < len(observations):

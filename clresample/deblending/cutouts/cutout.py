@@ -31,10 +31,10 @@ def cutout(result, source, observation, what="data", *, size=None, unit=None):
 
 
 def separate(result, chosen, i_observation, *, size=None) -> tuple[Separation, tuple[int, int]]:
-    """The Separation of sources from all others, and its first pixel (y, x) in the observation.
+    """Separates sources from all others; also returns the window's first pixel (y, x).
 
     chosen: numbers of sources; size: see `Result.cutout`
-    Raises ValueError for a window that holds no pixel of the image.
+    Raises ValueError for a window without pixels of the image.
     """
     o = result.observations[i_observation]
     position = _position(result, chosen, i_observation)
@@ -75,12 +75,13 @@ def _position(result, chosen, i_observation):
 
 
 def as_ccddata(found, observation, origin, what, *, channel=None, unit=None, name="", first=(0, 0)):
-    """A Separation as CCDData; one channel of it where a number is given.
+    """Converts a Separation, or one channel of it, to CCDData.
 
-    observation: of its grid, names, zero points and PSF; origin (2,) [px]: (y, x) of the first
-    pixel in it; unit: None for counts, or one of flux density; name: of the source; first (2,)
-    [px]: (y, x) of the observation's first pixel in the instrument's image
-    Raises ValueError for a unit of another kind, and for any without zero points.
+    observation: has its grid, names, zero points and PSF; unit: None for counts, or one of flux
+        density; name: of the source
+    origin (2,) [px]: (y, x) of the first pixel in it; first (2,) [px]: (y, x) of the observation's
+        first pixel in the instrument's image
+    Raises ValueError for a unit of another kind, and for any unit without zero points.
     """
     o, (y0, x0) = observation, origin
     image, variance, mask = found.image(what), found.variance(what), found.mask
@@ -116,7 +117,7 @@ def as_ccddata(found, observation, origin, what, *, channel=None, unit=None, nam
 
 
 def _scale(observation, unit):
-    """A unit and what one count of each channel (C,) is in it."""
+    """The unit, and the value of one count of each channel (C,) in it."""
     n_channels = observation.shape[0]
     if unit is None:
         return u.ct, np.ones(n_channels)

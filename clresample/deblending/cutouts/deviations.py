@@ -1,11 +1,11 @@
 """Changes of models that the posterior allows: images whose products are covariances.
 
-From draws (A_k, S_k) of the posterior, where a result has some, none of them below 0:
+With draws (A_k, S_k) of the posterior, clipped at 0:
 
     dm_k = sum_i R (A_ik S_ik - A_i S_i) / sqrt(K),    k = 1 .. K,
 
-R being the operator of the observation. From the covariances of fluxes alone, where
-a result was read from a file: the models are right up to a factor each, with
+R being the operator of the observation. A result read from a file without draws has covariances of
+fluxes alone. Then each model is assumed correct up to a factor,
 
     <dm_s dm_t> = m_s m_t cov(F_s, F_t) / (F_s F_t).
 """
@@ -39,7 +39,7 @@ def deviations(result, chosen, i_observation, window):
 
 
 def _of_draws(result, chosen, i_observation, window):
-    """From draws of morphologies and spectra."""
+    """Computes the deviations from draws of morphologies and spectra."""
     channels = result.channel_slices()[i_observation]
     o, draws = result.observations[i_observation], result.draws
     corner, shape = _frame_part(result, i_observation, window)
@@ -82,7 +82,7 @@ def _of_draws(result, chosen, i_observation, window):
 
 
 def _frame_part(result, i_observation, window):
-    """First pixel and shape of the part of the frame that a window sees, and what lies near."""
+    """First pixel and shape of the frame's part that a window observes, with a margin."""
     o, frame = result.observations[i_observation], result.frame
     y, x = ([part.start - 0.5, part.stop - 0.5] for part in window)
     rows, columns = np.repeat(y, 2), np.tile(x, 2)
@@ -97,7 +97,7 @@ def _frame_part(result, i_observation, window):
 
 
 def _of_fluxes(result, chosen, i_observation, window):
-    """From the covariances of fluxes, or of spectra where the result has no Errors."""
+    """Computes the deviations from covariances of fluxes, or of spectra without Errors."""
     channels = result.channel_slices()[i_observation]
     n_y, n_x = (part.stop - part.start for part in window)
     units, owners, covariance = [], [], []
@@ -135,7 +135,7 @@ def _unit_image(result, source, i_observation, window):
 
 
 def _root(covariance):
-    """A matrix (n, n) whose product with its transpose is the covariance; 0 where infinite."""
+    """Square root (n, n) of a covariance; rows of infinite variance are 0."""
     known = np.isfinite(np.diag(covariance))
     covariance = np.where(known[:, None] & known, covariance, 0.0)
     values, vectors = np.linalg.eigh(covariance)

@@ -1,4 +1,4 @@
-"""Data of a window divided between chosen sources and all others, with the noise of the result.
+"""Divides the data of a window between chosen sources and all others, with their noise.
 
 With the data d (its sky subtracted), the model t of the chosen sources and u of all others:
 
@@ -10,9 +10,9 @@ so that data = model + residual. The error of `data` against the light of the ch
 
     <(d - u - t_true)^2> = 1 / w - var(u) - 2 cov(t, u),
 
-by the posterior covariance of t and u: what the fit does not know of the neighbours is in var(u);
-as much of the noise as their model has followed is not in d - u any more; and where light could
-belong to either, cov(t, u) is negative and the error grows. It is never stated below the noise.
+with the posterior covariance of t and u. The uncertainty of the neighbours is in var(u). Noise that
+their model followed is no longer part of d - u. Where light could belong to either, cov(t, u) is
+negative and the error grows. The error is never below the noise.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ OUTSIDE = {"weights": 0.0}  # of an image: all else is NaN there
 KINDS = "data", "model", "residual", "neighbours", "redistributed"
 # of a channel's brightest model pixel: where all models are fainter, a pixel is shared by none.
 # There the rounding of float32 renderings (1e-6), not light, would decide whose it is
-TRACE = 1e-5
+MIN_LIGHT_FRACTION = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +35,9 @@ class Separation:
     data (C, Ny, Nx) [counts]: without the fitted sky; NaN where there are no data
     weights (C, Ny, Nx) [counts^-2]: inverse variances, 0 = ignore this pixel
     own, others (C, Ny, Nx) [counts]: models of the chosen sources and of all others
-    fraction (C, Ny, Nx) [1]: part of each pixel's light that the models give to the chosen sources
+    fraction (C, Ny, Nx) [1]: part of each pixel's light that belongs to the chosen sources' models
     own_variance, others_variance (C, Ny, Nx) [counts^2]: of `own` and `others`
-    added_variance (C, Ny, Nx) [counts^2]: what the models' errors add to the noise of `data`
+    added_variance (C, Ny, Nx) [counts^2]: contribution of the models' errors to the noise of `data`
     fraction_variance (C, Ny, Nx) [1]: of `fraction`
     """
 
@@ -69,7 +69,7 @@ class Separation:
         return data * self.fraction
 
     def variance(self, what) -> np.ndarray:
-        """Variance (C, Ny, Nx) [counts^2] of `image`; NaN where that is, infinite nowhere."""
+        """Variance (C, Ny, Nx) [counts^2] of `image`; NaN where the image is NaN."""
         check_kind(what)
         if what == "model":
             return self.own_variance.copy()
@@ -89,8 +89,10 @@ class Separation:
         return ~(self.weights > 0)
 
     def padded(self, origin, shape) -> Separation:
-        """The same on a window of `shape` (2,) [px] that begins `origin` (2,) [px] before this one,
-        both at least as large; there are no data and no models in what is added."""
+        """The same Separation on a larger window, without data or models in the added pixels.
+
+        The window has `shape` (2,) [px] and begins `origin` (2,) [px] before this one.
+        """
         n_y, n_x = self.data.shape[1:]
         sides = [(before, size - before - n) for before, size, n in
                  zip(origin, shape, (n_y, n_x), strict=True)]  # fmt: skip
@@ -104,19 +106,22 @@ class Separation:
         )
 
     def part(self, window) -> Separation:
-        """The same on a part of it: slices (y, x)."""
+        """Cuts the Separation to slices (y, x)."""
         return Separation(**{name: image[:, *window] for name, image in vars(self).items()})
 
 
 def separation_of(data, weights, images, chosen, deviations, faintest=None, *, joint=True):
     """The Separation of a window from its sources' models.
 
-    data, weights: see Separation; images {source: (C, Ny, Nx) [counts]}: models of all sources
-        that have light there; chosen: the sources that are wanted, a set or sequence
-    deviations: own and others (K, C, Ny, Nx) [counts], changes of the two models whose sums of
-        squares over K are their variances; joint: sums of products are their covariances; else
-        those are unknown, and var(u) is added to the noise as if light went from u to t
-    faintest (C,) [counts]: models below this share no pixel; None = TRACE of the window's brightest
+    data, weights: see Separation
+    images {source: (C, Ny, Nx) [counts]}: models of all sources with light there
+    chosen: the selected sources, a set or sequence
+    deviations: own and others (K, C, Ny, Nx) [counts], changes of the two models, whose sums of
+        squares over K are their variances
+    joint: True if sums of products are their covariances. Otherwise these are unknown, and var(u)
+        is added to the noise, which assumes that light moves from u to t
+    faintest (C,) [counts]: models below this share no pixel; None = MIN_LIGHT_FRACTION of the
+        brightest pixel of the window
     """
     own, others, own_shared, shared = np.zeros((4, *data.shape))
     for source, image in images.items():
@@ -151,13 +156,16 @@ def separation_of(data, weights, images, chosen, deviations, faintest=None, *, j
 
 
 def check_kind(what):
-    """Raise ValueError for what is not one of KINDS."""
+    """Raises ValueError unless the kind is one of KINDS."""
     if what not in KINDS:
         raise ValueError(f"what is {what!r}, must be one of {', '.join(map(repr, KINDS))}")
 
 
 def fraction_of(part, total, faintest):
-    """part / total (..., C, Ny, Nx) where total (C, Ny, Nx) is over `faintest` (C,), else 0."""
+    """Divides part by total (C, Ny, Nx) where total exceeds `faintest` (C,); 0 elsewhere.
+
+    part, returned (..., C, Ny, Nx)
+    """
     lit = np.broadcast_to(total > faintest[:, None, None], part.shape)
     return np.divide(part, total, out=np.zeros(part.shape), where=lit)
 
@@ -207,8 +215,8 @@ def component_image(rendered, i, window):
 
 
 def faintest_light(total) -> np.ndarray:
-    """Light (C,) [counts] below which a pixel is shared by none.
+    """Light (C,) [counts] below which models share no pixel.
 
     total (C, My, Mx): of all models on the whole image.
     """
-    return TRACE * total.max(axis=(1, 2), initial=0)
+    return MIN_LIGHT_FRACTION * total.max(axis=(1, 2), initial=0)

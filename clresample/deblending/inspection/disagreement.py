@@ -39,10 +39,10 @@ HIDDEN = 0.02
 
 @dataclass(frozen=True, eq=False)
 class ImagePlane:
-    """One channel of an Image.
+    """One channel of an InspectedImage.
 
     data (My, Mx) [counts]: above the sky, 0 where not usable; usable (My, Mx): bool
-    sigma [counts]; psf: PSF of one band; matrix, offset: as those of Image
+    sigma [counts]; psf: PSF of one band; matrix, offset: as those of InspectedImage
     """
 
     data: np.ndarray
@@ -54,7 +54,7 @@ class ImagePlane:
 
     @classmethod
     def of(cls, image, c) -> ImagePlane:
-        """Channel c of an Image."""
+        """Channel c of an InspectedImage."""
         usable = image.usable[c]
         data = np.where(usable, image.observation.data[c] - image.level[c], 0)
         psf = image.observation.psf[c]
@@ -97,7 +97,7 @@ def shifts_at(one: ImagePlane, other: ImagePlane, places) -> tuple[np.ndarray, n
 def _foreign(images, brightness, s, place, radius):
     """Light of another colour from other sources near source s, as part of its own light.
 
-    Infinite without any of its own.
+    Infinite if the source has no light of its own.
     """
     y, x = (np.arange(n) - p for n, p in zip(images[s].shape, place, strict=True))
     near = y[:, None] ** 2 + x**2 <= radius**2
@@ -125,7 +125,7 @@ def _nearest(shape, places):
 def _solved(images, there, good, noise):
     """Shifts (n, 2), their errors (n,) and the brightness (n,) of sources in the image `there`.
 
-    From the good pixels of sources' images (n); noise: of a pixel of either.
+    Computed from the good pixels of the sources' images (n); noise: of a pixel of either image.
     """
     n = len(images)
     light = np.stack([image[good] for image in images])
@@ -152,7 +152,7 @@ def _solved(images, there, good, noise):
 def _brightness(light, value, sigma):
     """Brightness (n,) of the light (n, P) of the sources in pixels of `value` (P,), noise sigma.
 
-    Of sources that cannot be told apart it is that of all together.
+    Sources that cannot be separated share their total brightness.
     """
     total = np.stack([np.ones_like(value), light.sum(axis=0)])
     background, mean = np.linalg.lstsq(total.T, value, rcond=None)[0]

@@ -1,4 +1,4 @@
-"""All checks of a blend's observations before its fit, with what is said and what is cured."""
+"""All checks of a blend's observations before its fit: messages and masks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from . import listing, shifted, spoilt
 from .centroids import centroids
 from .image import InspectedImage
 from .levels import SkyLevel, sky_level
-from .star_psfs import as_stars, with_star_psfs
+from .star_psfs import replace_by_stars, with_star_psfs
 from .stars import misfitting_widths
 
 # A level counts as left in or over-subtracted above this many of its errors, and above this part
@@ -39,7 +39,7 @@ class InputWarning(UserWarning):
 
 
 def warn_of_many(problems):
-    """Warn once of the problems of blends, a list of messages of each."""
+    """Warns once of the problems of blends, a list of messages of each."""
     n = len(problems)
     warnings.warn(
         f"{n} blend{'s have' if n > 1 else ' has'} problems with observations or sources, such as: "
@@ -104,7 +104,7 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         blend = replace(blend, observations=observations)
     stars, still = near[n_own[0] > 0], near[(n_own[0] > 0) & (n_own[0] == n_own[1])]
     if len(stars):
-        blend = replace(blend, sources=as_stars(blend.sources, stars, still))
+        blend = replace(blend, sources=replace_by_stars(blend.sources, stars, still))
     if moved is not None:
         shifts = shifts + moved
     settings = replace(settings, fit_shifts=move)
@@ -181,7 +181,7 @@ def _level_lines(image, sky):
 
 
 def _unsure_lines(image, sky):
-    """Message about a fitted sky of which the SkyLevel says little; none where it says enough."""
+    """Message about a fitted sky whose SkyLevel is uncertain; none for a certain one."""
     seen = image.usable.any(axis=(1, 2))
     part, names = sky.error / image.sigma, image.observation.channels
     unsure = seen & (part > UNSURE_PART)
@@ -208,7 +208,7 @@ def _parts(image, level, chosen):
 
 
 def _spoilt(image):
-    """Pixels (C, My, Mx) to mask, and what is said of them."""
+    """Pixels (C, My, Mx) to mask, and messages about them."""
     names, lines = image.observation.channels, []
     full = spoilt.saturated(image)
     for c in np.flatnonzero(full.any(axis=(1, 2))):

@@ -47,7 +47,7 @@ class SkyLevel:
 
 
 def sky_level(image) -> SkyLevel:
-    """The SkyLevel of an Image.
+    """The SkyLevel of an InspectedImage.
 
         mean of block b = level + wing T_b,    T_b = sum_s f_s (r_sb^2 + r_0^2)^(-p/2),    wing >= 0
 
@@ -108,7 +108,7 @@ def _rim(means, white, kept):
 def _blocks(image):
     """Means (C, B) [counts] and numbers (C, B) of usable pixels in blocks.
 
-    And the blocks' centres (B, 2) [px] and their side [px].
+    Also returns the blocks' centres (B, 2) [px] and their side [px].
     """
     data = image.observation.data
     n_y, n_x = data.shape[1:]
@@ -166,7 +166,7 @@ def _wings(image, means, centers):
 def _fitted(means, wings, white, kept):
     """Level and wing (C,) by least squares with wing >= 0, and the level's variance (C,).
 
-    Of blocks with noise `white`.
+    The blocks have noise `white`.
     """
     weight = kept / white**2
     a, b, c = weight.sum(1), (weight * wings).sum(1), (weight * wings**2).sum(1)

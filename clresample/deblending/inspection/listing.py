@@ -44,7 +44,7 @@ def doubles(sources, positions):
 def common_offset(found):
     """Offset (2,) [px] and its error (2,) of the light from all sources, of their Centroids.
 
-    None where there is none that is significant.
+    None if no offset is significant.
     """
     offsets, errors = over_channels(found)
     errors = np.hypot(errors, OFFSET_FLOOR_PX)

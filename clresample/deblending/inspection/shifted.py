@@ -28,10 +28,10 @@ MAX_ERROR_PX = 0.5
 def disagreements(images, found, fit_shifts):
     """Shifts (n_observations, 2) [model px] that align disagreeing observations, the first at rest.
 
-    None where none disagree. And a sentence on each, also on channels that disagree.
+    None without disagreement. Also returns a sentence on each, and on channels that disagree.
 
-    images, found: Image and Centroids of each observation; fit_shifts: see Settings, with True
-        nothing is measured
+    images, found: InspectedImage and Centroids of each observation; fit_shifts: see Settings, with
+        True nothing is measured
     """
     if fit_shifts != AUTO and fit_shifts:
         return None, []
@@ -71,9 +71,9 @@ def sharpest(images) -> int:
 
 
 def _between(one, its, other, theirs):
-    """Shift (2,) [model px] of the light in Image `other` against `one`, and its error (2,).
+    """Shift (2,) [model px] of the light in image `other` against `one`, and its error (2,).
 
-    From their Centroids, and where these differ from the images themselves.
+    Measured from their Centroids; if these differ, from the images themselves.
     """
     _, at, there = np.intersect1d(its.sources, theirs.sources, return_indices=True)
     ends = []
@@ -115,7 +115,7 @@ def _trusted(shifts, errors):
 
 
 def _channels_of_light(image):
-    """Channels (C,) of an Image, those in which its sources are brightest first."""
+    """Channels (C,) of an InspectedImage, those in which its sources are brightest first."""
     light = np.maximum(image.significance, 0) ** 2
     return np.argsort(-light.sum(axis=(1, 2)), kind="stable")
 

@@ -25,7 +25,7 @@ COARSE_PART = 0.5
 
 
 def saturated(image) -> np.ndarray:
-    """Saturated pixels (C, My, Mx) bool of an Image, and those within 2 px of them.
+    """Saturated pixels (C, My, Mx) bool of an InspectedImage, and those within 2 px of them.
 
     Those at or above the observation's saturation, where it has one, and flat tops: connected
     bright pixels of exactly one value, brighter than all that touch them.
@@ -34,8 +34,11 @@ def saturated(image) -> np.ndarray:
 
 
 def saturated_pixels(observation, significance, usable) -> np.ndarray:
-    """The same of an observation, of its data in units of the noise (C, My, Mx) [sigma] and its
-    pixels (C, My, Mx) bool with a weight."""
+    """Saturated pixels (C, My, Mx) bool of an observation.
+
+    significance (C, My, Mx) [sigma]: data in units of the noise
+    usable (C, My, Mx): bool, pixels with a weight
+    """
     found = np.zeros(usable.shape, bool)
     limit = getattr(observation, "saturation", None)
     if limit is not None:
@@ -84,7 +87,7 @@ def _flat_tops(data, bright):
 
 
 def sharper_than_psf(image) -> np.ndarray:
-    """Pixels (C, My, Mx) bool of an Image that are sharper than any light behind its PSF.
+    """Pixels (C, My, Mx) bool of an InspectedImage that are sharper than its PSF permits.
 
         kappa v > v_up + v_down + 6 sigma + uncertainty of the PSF, or the same along x
 

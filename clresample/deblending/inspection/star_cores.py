@@ -1,4 +1,4 @@
-"""Stars whose core is saturated or masked, found by the light around it."""
+"""Finds stars with a saturated or masked core by the light around it."""
 
 from __future__ import annotations
 
@@ -31,8 +31,9 @@ MAX_SCATTER = 0.5
 class StarCore:
     """A star with a masked core in one channel of an image.
 
-    place (2,) [px]: (y, x) of the star; radius [px]: from which on its light is unmasked in most
-        directions; light [sigma]: of a pixel there; masked (My, Mx): bool, the core with its bleeds
+    place (2,) [px]: (y, x) of the star; radius [px]: beyond it, the light is unmasked in most
+        directions; light [sigma]: of a pixel at that radius; masked (My, Mx): bool, the core with
+        its bleed trails
     """
 
     place: np.ndarray
@@ -42,10 +43,10 @@ class StarCore:
 
 
 def star_cores(significance, usable, psf, band) -> list[StarCore]:
-    """Stars with a masked core in a channel, the brightest first.
+    """Finds the stars with a masked core in a channel, the brightest first.
 
     significance (My, Mx) [sigma]: data over the noise, 0 where not usable; usable (My, Mx): bool,
-    pixels with a weight that are not saturated; psf: PSF; band: of it
+    pixels with a weight that are not saturated; psf: PSF; band: number of its band
     """
     fwhm = float(psf.fwhm_px[band])
     depth = distance_transform_edt(np.pad(~usable, 1, mode="edge"))[1:-1, 1:-1]
@@ -68,8 +69,10 @@ def star_cores(significance, usable, psf, band) -> list[StarCore]:
 
 
 def _core(light, usable, masked, psf, band, fwhm):
-    """The StarCore of one group of masked pixels (My, Mx), None where the light beside it is not
-    that of a star."""
+    """The StarCore of one group of masked pixels (My, Mx).
+
+    None if the light beside the group is not that of a star.
+    """
     edge = usable & binary_dilation(masked, np.ones((3, 3), bool))
     if not edge.any() or light[edge].max() < MIN_EDGE_SIGMAS:
         return None
@@ -93,7 +96,7 @@ def _core(light, usable, masked, psf, band, fwhm):
 def _ring(usable, masked, place, fwhm):
     """Pixels (My, Mx) bool of the ring beside a core, and its inner radius [px].
 
-    None, 0 where they are too few.
+    Returns (None, 0) if the ring has too few pixels.
     """
     n_y, n_x = usable.shape
     away = np.hypot(np.arange(n_y)[:, None] - place[0], np.arange(n_x) - place[1])
@@ -115,8 +118,10 @@ def _reach_of(masked, away):
 
 
 def _centred(light, ring, guess, fwhm):
-    """Place (2,) [px] about which the light of a ring depends on the radius alone, and the mean
-    deviation of its logarithm there."""
+    """Fits the centre (2,) [px] of a ring of light; also returns the scatter about it.
+
+    The scatter is the mean deviation of the light's logarithm from a function of the radius.
+    """
     y, x = np.nonzero(ring)
     value = np.log(np.maximum(light[ring], 1.0))
 

@@ -1,12 +1,13 @@
-"""PSFs of single stars, measured from their own light, where the PSF given does not hold it.
+"""Measures PSFs of single stars from their own light, beyond the PSF passed by the user.
 
-A saturated star shows its PSF out to where no PSF image reaches: far wings, spikes, ghosts. That
-light is the star's, not its neighbours'. About each star whose core is masked the part of it that
-lasts along rays is the star's own PSF, beside that given, which holds the core:
+A saturated star shows its PSF farther out than any PSF image: far wings, spikes, ghosts. That
+light belongs to the star, not to its neighbours. Around each star with a masked core, the part of
+the light that persists along rays is the star's own PSF. The core comes from the PSF of the
+observation, P:
 
     P_s(r, t) ~ B(r) + G(r, t),    B: median of d over angles,    G: median of d - B along rays
 
-beyond the core, and a P in it, the mean of a P being B at its rim.
+beyond the core, and a P inside it, where the mean of a P equals B at the rim.
 """
 
 from __future__ import annotations
@@ -31,43 +32,43 @@ from .image import SIGMAS_A_FWHM
 from .psf_samples import psf_at
 from .spoilt import GROW_PX
 from .star_cores import star_cores
-from .star_fall import Fall
+from .star_profile import RadialProfile
 
 # [FWHM of the PSF] Length of the medians along rays, where sources are narrower than half of it,
-# and where the star's light is over BRIGHT_SIGMAS: there no source is as bright.
-LONG_FWHM, SHORT_FWHM, BRIGHT_SIGMAS = 8.0, 1.0, 100.0
+# and where the star's light is over BRIGHT_STAR_SIGMAS: there no source is as bright.
+LONG_MEDIAN_FWHM, SHORT_MEDIAN_FWHM, BRIGHT_STAR_SIGMAS = 8.0, 1.0, 100.0
 # Times that what is left is smoothed and added: once more than a convolution, gradients stay.
 N_ROUNDS = 5
 # [FWHM of the PSF] Radius of a core from which on a source is taken for a star if it was listed as
 # a galaxy: no galaxy's light falls like that of a PSF so far out.
-SURE_FWHM = 1.0
+MIN_STAR_RADIUS_FWHM = 1.0
 # [px] By which a place may differ from the star's, as positions are rounded.
 SAME_PLACE_PX = 0.5
 N_ANGLES = 16  # of the rings over which a PSF image is averaged
-ALL_USABLE = 0.99  # [1] of the weights of interpolation between pixels
+MIN_USABLE_WEIGHT = 0.99  # [1] of the weights of interpolation between pixels
 
 
 @dataclass(frozen=True, eq=False)
 class StarPSFs(PSFField):
-    """The PSFs of an observation with those of single stars in their places.
+    """PSFs of an observation, replaced at single stars by the stars' own.
 
-    psf: PSF of all other places, or field: PSFField of them, not None; places (K, 2) [px] of the
-    stars; own (K): their PSFs; doubt (K, C) [1]: by how much more than the PSF's width their fluxes
-    change, as a part
+    psf: PSF at all other places, or field: PSFField of them; places (K, 2) [px] of the stars
+    own (K): PSFs of the stars
+    flux_error (K, C) [1]: relative flux error of each star, beyond that of the PSF's width
     """
 
     psf: PSF
     field: PSFField | None
     places: np.ndarray
     own: tuple[PSF, ...]
-    doubt: np.ndarray
+    flux_error: np.ndarray
 
     @property
     def n_bands(self):
         return self.psf.n_bands
 
     def number_at(self, y, x):
-        """Number of the star at (y, x) [px], None where there is none."""
+        """Number of the star at (y, x) [px], or None."""
         away = np.hypot(*(self.places - (y, x)).T)
         return int(away.argmin()) if away.min() < SAME_PLACE_PX else None
 
@@ -79,15 +80,15 @@ class StarPSFs(PSFField):
 
 
 def with_star_psfs(image, sources, places, sky):
-    """The Image with PSFs of their own for stars with masked cores, and in how many channels each
-    source (S,) has one.
+    """The InspectedImage with own PSFs for masked stars, and their number of channels (S,).
 
-    The masked pixels of these cores grow by `spoilt.GROW_PX`. Without such a star it is the same.
+    The masked pixels of these cores grow by `spoilt.GROW_PX`. Without such a star the
+    InspectedImage is returned unchanged.
 
-    sources: those of which `image.places` are; places (S, 2) [px]: of them, without any shift
-    sky: whether a level of the sky is fitted
+    sources: those of `image.places`; places (S, 2) [px]: their positions without any shift
+    sky: True if a sky level is fitted
     """
-    stars = [i for i, source in enumerate(sources) if _may_be(source) and image.inside[i]]
+    stars = [i for i, source in enumerate(sources) if _may_be_star(source) and image.inside[i]]
     found, n_own = {}, np.zeros(len(sources), int)
     if not stars or image.usable.all():
         return image, n_own
@@ -96,7 +97,7 @@ def with_star_psfs(image, sources, places, sky):
         for core in star_cores(image.significance[c], image.usable[c], image.observation.psf, c):
             away = np.hypot(*(image.places[stars] - core.place).T)
             i = stars[int(away.argmin())]
-            is_wide = core.radius > SURE_FWHM * image.observation.psf.fwhm_px[c]
+            is_wide = core.radius > MIN_STAR_RADIUS_FWHM * image.observation.psf.fwhm_px[c]
             if away.min() < max(core.radius, 1.0) and (
                 is_wide or isinstance(sources[i], PointSource)
             ):
@@ -106,7 +107,7 @@ def with_star_psfs(image, sources, places, sky):
                 found.setdefault(i, {})[c] = core
     image = image.without(wide) if wide.any() else image
     found = {
-        i: {c: _own(image, c, image.places[i], core, sky) for c, core in cores.items()}
+        i: {c: _measure_psf(image, c, image.places[i], core, sky) for c, core in cores.items()}
         for i, cores in found.items()
     }
     found = {i: {c: p for c, p in own.items() if p is not None} for i, own in found.items()}
@@ -116,29 +117,31 @@ def with_star_psfs(image, sources, places, sky):
     for i, own in found.items():
         n_own[i] = len(own)
     o, numbers = image.observation, sorted(found)
-    psfs = tuple(_joined(_given(o, places[i]), found[i]) for i in numbers)
-    doubt = np.zeros((len(numbers), len(wide)))
+    psfs = tuple(_combine_psfs(_listed_psf(o, places[i]), found[i]) for i in numbers)
+    flux_error = np.zeros((len(numbers), len(wide)))
     for k, i in enumerate(numbers):
         for c, (_, _, part) in found[i].items():
-            doubt[k, c] = part
-    field = StarPSFs(o.psf, o.psf_field, places[numbers], psfs, doubt)
+            flux_error[k, c] = part
+    field = StarPSFs(o.psf, o.psf_field, places[numbers], psfs, flux_error)
     return dataclasses.replace(image, observation=with_psf_field(o, field)), n_own
 
 
-def as_stars(sources, numbers, still):
-    """Sources with those of `numbers` as PointSources, at rest if they are among `still`: their
-    PSFs were measured about their positions."""
+def replace_by_stars(sources, numbers, still):
+    """Replaces the sources with these numbers by PointSources; those in `still` are fixed.
+
+    The PSFs of sources in `still` were measured about their positions.
+    """
     found = list(sources)
     for i in numbers:
         keys = ("sky_deg", "position_px", "observation", "name")
         given = {key: getattr(sources[i], key) for key in keys}
-        free = i not in still and getattr(sources[i], "free", True)
+        free = i not in still and getattr(sources[i], "free_position", True)
         found[i] = PointSource(**given, free_position=free)
     return tuple(found)
 
 
-def _may_be(source):
-    """Returns True if a source is a star, or one of which nothing is said but its position."""
+def _may_be_star(source):
+    """Returns True if a source is a star, or has no property but its position."""
     if isinstance(source, PointSource):
         return True
     return (
@@ -148,15 +151,15 @@ def _may_be(source):
     )
 
 
-def _given(observation, place):
-    """The PSF of an observation at a place (2,) [px]."""
+def _listed_psf(observation, place):
+    """The PSF of an observation at a place (2,) [px], as the user passed it."""
     if observation.psf_field is None:
         return observation.psf
     return observation.psf_field.psf_at(*place)
 
 
-def _joined(given, own):
-    """The PSF given with the samples {band: (image, centre, doubt)} in place of some bands'."""
+def _combine_psfs(given, own):
+    """Replaces bands of a PSF by samples {band: (image, centre, flux error)}."""
     shape = np.max([given.images.shape[1:], *(image.shape for image, *_ in own.values())], axis=0)
     images, centers = np.zeros((given.n_bands, *shape)), given.center.copy()
     for c, image in enumerate(given.images):
@@ -166,25 +169,25 @@ def _joined(given, own):
     return PSF.restore(images, spacing=given.spacing, center=centers)
 
 
-def _own(image, c, place, core, sky):
-    """Samples of a star's own PSF in channel c, their centre (2,) [samples], and the doubt of its
-    flux, see StarPSFs; None where its light does not fall from the core on.
+def _measure_psf(image, c, place, core, sky):
+    """Measures a star's own PSF in channel c: samples, their centre and the flux uncertainty.
 
-    The samples' sum is 1 less the light left out of the core.
+    The centre (2,) is in samples; for the uncertainty see StarPSFs. None if the star's light does
+    not fall from the core outwards. The samples' sum is 1 less the light left out of the core.
     place (2,) [px]: of the model's star; core: StarCore; sky: see `with_star_psfs`
     """
     o, fwhm = image.observation, float(image.observation.psf.fwhm_px[c])
-    psf, (n_y, n_x) = _given(o, place), image.usable.shape[1:]
+    psf, (n_y, n_x) = _listed_psf(o, place), image.usable.shape[1:]
     # what is fitted is the light above no level, or above one that is fitted
     data = np.where(image.usable[c], o.data[c] - sky * image.level[c], 0.0)
     radius = core.radius + GROW_PX
     away = np.hypot(np.arange(n_y)[:, None] - core.place[0], np.arange(n_x) - core.place[1])
-    fall = Fall.of(data, image.usable[c] & (away >= radius), away, image.sigma[c])
-    scale = fall and _scale(psf, c, fall, radius)
+    profile = RadialProfile.measure(data, image.usable[c] & (away >= radius), away, image.sigma[c])
+    scale = profile and _scale(psf, c, profile, radius)
     if not scale:
         return None
-    rays, known = _rays(data - fall.at(away), image.usable[c], core.place, radius)
-    light = fall.at(np.arange(len(rays))) / image.sigma[c]
+    rays, known = _rays(data - profile.at(away), image.usable[c], core.place, radius)
+    light = profile.at(np.arange(len(rays))) / image.sigma[c]
     lasting = _lasting(rays, known, light, int(np.ceil(radius)), fwhm)
     # samples at the PSF's spacing about the star, over all of the image
     step, low = psf.spacing, -core.place
@@ -197,19 +200,21 @@ def _own(image, c, place, core, sky):
     n_angles = lasting.shape[1] - 1
     more = map_coordinates(lasting, [away, turn % 1 * n_angles], order=1, mode="nearest")
     taken = np.clip((radius - away) / fwhm, 0, 1)  # of the PSF given, none beside the core
-    mean, more = fall.at(away), _smooth(more, fwhm / SIGMAS_A_FWHM / step)
+    mean, more = profile.at(away), _smooth(more, fwhm / SIGMAS_A_FWHM / step)
     total = (taken * scale * _within_image(psf, c, y, x) + (1 - taken) * mean + more).sum()
-    own = fall.outside(away, radius) + more
+    own = profile.with_core(away, radius) + more
     if not total > 0:
         return None
     # the model's star lies at `place`, its light about the core's
     centre = np.array([-y[0], -x[0]]) / step + (place - core.place) / step
-    return own / total, centre, abs(fall.power(radius) - 2)
+    return own / total, centre, abs(profile.power(radius) - 2)
 
 
 def _rays(data, usable, place, radius):
-    """An image (My, Mx) along rays from a place: (radii, angles), and which of them are known: on
-    usable pixels from the radius [px] on."""
+    """Samples an image (My, Mx) along rays from a place: (radii, angles), and their validity.
+
+    Valid samples lie on usable pixels, from the radius [px] on.
+    """
     corners = np.array([(y, x) for y in (0, data.shape[0] - 1) for x in (0, data.shape[1] - 1)])
     end = int(np.ceil(np.hypot(*(corners - place).T).max())) + 1
     n_angles = int(np.ceil(2 * np.pi * end))
@@ -217,13 +222,13 @@ def _rays(data, usable, place, radius):
     at = [place[0] + radii * np.sin(angles), place[1] + radii * np.cos(angles)]
     rays = map_coordinates(np.where(usable, data, 0.0), at, order=1, mode="constant")
     seen = map_coordinates(usable.astype(float), at, order=1, mode="constant")
-    return rays, (seen > ALL_USABLE) & (radii >= radius)
+    return rays, (seen > MIN_USABLE_WEIGHT) & (radii >= radius)
 
 
-def _scale(psf, band, fall, radius):
-    """Factor by which the PSF given has the light of a Fall at a radius [px].
+def _scale(psf, band, profile, radius):
+    """Factor that scales a PSF to the light of a RadialProfile at a radius [px].
 
-    None where it has none there.
+    None if the PSF has no light there.
     """
     (n_y, n_x), (y0, x0) = psf.images.shape[1:], psf.center[band]
     end = min(radius, psf.spacing * min(y0, x0, n_y - 1 - y0, n_x - 1 - x0) - 1)
@@ -232,27 +237,29 @@ def _scale(psf, band, fall, radius):
     angles = np.arange(N_ANGLES) * 2 * np.pi / N_ANGLES
     places = [([end * np.sin(t)], [end * np.cos(t)]) for t in angles]
     ring = np.mean([psf_at(psf, band, y, x)[0, 0] for y, x in places])
-    return float(fall.at(end)) / ring if ring > 0 else None
+    return float(profile.at(end)) / ring if ring > 0 else None
 
 
 def _lasting(rest, known, light, first, fwhm):
-    """Light above the mean that lasts along rays: (radii, angles + 1), the first angle twice.
+    """Light above the mean that persists along rays: (radii, angles + 1), first angle repeated.
 
-    rest, known (radii, angles): light above the mean, and where it is known; light (radii,)
-    [sigma]: the mean; first: number of the core's last ring, within which it falls to 0
+    rest, known (radii, angles): light above the mean, and its valid samples
+    light (radii,) [sigma]: the mean
+    first: number of the core's last ring, within which the result falls to 0
     """
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     rest = rest[tuple(nearest)]
     long, short = (
-        median_filter(rest, (_odd(n * fwhm), 1), mode="nearest") for n in (LONG_FWHM, SHORT_FWHM)
+        median_filter(rest, (_odd(n * fwhm), 1), mode="nearest")
+        for n in (LONG_MEDIAN_FWHM, SHORT_MEDIAN_FWHM)
     )
-    lasting = np.where(light[:, None] > BRIGHT_SIGMAS, short, long)[tuple(nearest)]
+    lasting = np.where(light[:, None] > BRIGHT_STAR_SIGMAS, short, long)[tuple(nearest)]
     lasting[:first] = np.arange(first)[:, None] / max(first, 1) * lasting[first]
     return np.concatenate([lasting, lasting[:, :1]], axis=1)
 
 
 def _smooth(image, sigma):
-    """An image (n, m) as smooth as light behind a Gaussian PSF of `sigma` [samples]."""
+    """Smooths an image (n, m) like light behind a Gaussian PSF of `sigma` [samples]."""
     found = np.zeros(image.shape)
     for _ in range(N_ROUNDS):
         found += gaussian_filter(image - found, sigma, mode="nearest")

@@ -23,11 +23,11 @@ WIDTH_STEP, SHIFT_STEP = 0.05, 0.1
 
 
 def misfitting_widths(image, sources):
-    """Sources whose width disagrees with an Image's PSF: [(source, channel, part, error)].
+    """Sources whose width disagrees with an image's PSF: [(source, channel, part, error)].
 
-    part: by which the light is wider than the PSF, negative where it is narrower. Of Points, alone
-    within 4 FWHM, both are reported; of other sources only narrower light, which no source behind
-    this PSF has.
+    part: by which the light is wider than the PSF, negative where it is narrower. Of PointSources,
+    alone within 4 FWHM, both are reported; of other sources only narrower light, which no source
+    behind this PSF has.
     """
     found = []
     stars = np.array([isinstance(source, PointSource) for source in sources], bool)

@@ -1,4 +1,4 @@
-"""Errors of fits under the prior that learns, marginal over what a morphology may still be.
+"""Errors of fits with the multi-scale prior, marginalised over the morphologies.
 
 About the solution everything is linear, in units of the noise and per channel c,
 
@@ -7,9 +7,9 @@ About the solution everything is linear, in units of the noise and per channel c
 
 with one matrix H a scene, in blocks of sources that meet. modes.py makes the images m_ik, from
 smooth_modes.py and profile_modes.py; aligned_observation.py renders them from their boxes;
-normal.py adds up H and block_matrix.py factors and inverts it; posterior.py reads errors off it,
-and, by bound_bias.py, what S >= 0 has added to fluxes and sizes, H^-1 times the slopes that it
-holds back. There, and only there, errors of sources that leave structure in the residuals, as
+normal.py sums H and block_matrix.py factorises and inverts it; posterior.py derives errors from
+it. bound_bias.py computes the bias from S >= 0 in fluxes and sizes: H^-1 times the gradient at the
+bound. There, and only there, errors of sources that leave structure in the residuals, as
 residuals.py measures it, are made larger; errors.py is what a Result keeps, from which sampling.py
 draws. Imports solver and sky, the profiles and views of deblending, none of its fits.
 

@@ -92,7 +92,7 @@ class AlignedObservation:
         ).T  # fmt: skip
 
     def threads_for(self, images):
-        """Threads that share what is done with the images of a component."""
+        """Number of threads for the images of a component."""
         return self.n_threads if images.size > MIN_THREADED_ELEMENTS else 1
 
     def observe(self, images, i, origin, low, high):
@@ -131,7 +131,7 @@ class AlignedObservation:
 
 
 def align_observations(fit):
-    """An Exposure of each observation of a Fit: 1 ms each, 15 ms of 500 x 500 pixels."""
+    """An AlignedObservation of each observation of a Fit: 1 ms each, 15 ms of 500 x 500 pixels."""
     pairs = zip(fit.views, fit.blend.observations, strict=True)
     return [AlignedObservation.of(view, fit.frame, one, fit.start.source) for view, one in pairs]
 
@@ -153,7 +153,7 @@ class _PSFKey:
 
 @functools.lru_cache(maxsize=MAX_TRANSFERS)
 def _transfer(matrix, psf_in, psf_out):
-    """The Transfer of a matrix, as bytes, and two PSFs: one for all fits of equal observations."""
+    """The BandLimitedTransfer of a matrix (as bytes) and two PSFs, shared by equal observations."""
     return BandLimitedTransfer(np.frombuffer(matrix).reshape(2, 2), psf_in.psf, psf_out.psf)
 
 
@@ -186,7 +186,7 @@ class BandLimitedTransfer:
     def at(self, shape, reach):
         """Frequencies nu_y (Hy,) >= 0, nu_x (W,) and D (Hy, C T, W) with the half-plane's weights.
 
-        Of a period at which a box does not overlap itself within `reach`.
+        The period is long enough that a box does not overlap itself within `reach`.
         """
         sides = [int(np.ceil((n + 2 * reach) / PERIOD_PX)) * PERIOD_PX + 1 for n in shape]
         key = tuple(sides)
@@ -223,7 +223,7 @@ def _waves(a, b):
 def _parallel(view, pixel):
     """Rows, columns and root weights of an observation whose axes are the model's.
 
-    On pixels of a side `pixel` [model px] over the model's frame where its own are smaller.
+    If its pixels are smaller than `pixel` [model px], pixels of that side cover the model's frame.
     """
     mapping, root = view.mapping, view.sqrt_weights
     if mapping.matrix[0, 0] == 0:

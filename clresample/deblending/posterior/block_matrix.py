@@ -46,7 +46,7 @@ class BlockMatrix:
 
 
 class BlockCholesky:
-    """Cholesky's factor of Blocks, scaled to a unit diagonal, with RIDGE added.
+    """Cholesky's factor of a BlockMatrix, scaled to a unit diagonal, with RIDGE added.
 
     scale (n): arrays, square roots of the diagonal; order (n,): in which nodes are eliminated
 
@@ -77,8 +77,11 @@ class BlockCholesky:
 
     @classmethod
     def restore(cls, sizes, scale, order, later, lower, below) -> BlockCholesky:
-        """The Factor whose attributes and `blocks` these are: sizes (n,), scale (n): arrays, order
-        (n,), later (n): lists of nodes, lower and below {node: block}."""
+        """Restores a BlockCholesky from its attributes and `blocks`.
+
+        sizes (n,), scale (n): arrays; order (n,), later (n): lists of nodes; lower and below:
+        {node: block}
+        """
         factor = object.__new__(cls)
         factor.sizes, factor.scale, factor.order, factor._later = sizes, scale, order, later
         factor._lower, factor._below = lower, below
@@ -97,7 +100,7 @@ class BlockCholesky:
                 yield self._below[v]
 
     def _eliminate(self, v, rest):
-        """Factor node v's columns, and take their products off what is left."""
+        """Factorises node v's columns and subtracts their products from the rest."""
         later = self._later[v]
         self._lower[v] = lower = np.linalg.cholesky(rest.pop((v, v)))
         if not later:
@@ -129,7 +132,7 @@ class BlockCholesky:
         return self._upwards(parts)
 
     def draw(self, normal):
-        """H^-1/2 of numbers (N,), node after node: arrays (n) that scatter as the inverse says."""
+        """H^-1/2 times numbers (N,), node after node: arrays (n) with the inverse as covariance."""
         return self._upwards(np.split(np.asarray(normal, float), np.cumsum(self.sizes)[:-1]))
 
     def _upwards(self, parts):
@@ -183,7 +186,7 @@ def _root(diagonal):
 def _eliminated(near, sizes):
     """Order of elimination, and for each node those of its neighbours that come after it.
 
-    Fewest unknowns in the neighbours first. near (n): sets, which are used up.
+    Nodes whose neighbours have the fewest unknowns come first. near (n): sets, which are modified.
     """
     weight = [sum(sizes[u] for u in others) for others in near]
     heap = [(w, v) for v, w in enumerate(weight)]

@@ -85,8 +85,10 @@ class PosteriorSampler:
         return [np.array(rows) for rows in zip(*found, strict=True)]
 
     def changes(self, i):
-        """Component i in `samples`: changes of its morphology (N_SAMPLES, ny, nx) and of its
-        spectrum (N_SAMPLES, C) [counts]."""
+        """Sampled changes of component i: of its morphology and of its spectrum [counts].
+
+        returns (N_SAMPLES, ny, nx) and (N_SAMPLES, C)
+        """
         images, values = self.modes[i], self.misfit_scale[i] * self.samples[i]
         morphs = np.tensordot(values[:, : len(images)], images, 1)
         return morphs, self._spectra(values[:, len(images) :])

@@ -1,15 +1,14 @@
-"""Newton's step along what sources that overlap exchange: structure, spectra and sky in one.
+"""A joint Newton step over smooth structure, spectra and sky of overlapping sources.
 
-L-BFGS knows the curvature of each source by itself. Light that a source may as well give to its
-neighbours lowers the loss by little in each iteration, and moves fluxes by more than their errors
-in the end. Along the smooth changes of which errors are made (smooth_modes.py) the curvature of all
-sources together is one normal matrix, which says where the minimum lies, and how far below.
+L-BFGS has the curvature of each source alone. Moving light between neighbours barely changes the
+loss, yet can move their fluxes by more than their errors. Along the smooth changes from which
+errors are computed (smooth_modes.py), the curvature of all sources together is one normal matrix,
+which predicts the minimum and the gain.
 
-The matrix does not know that morphologies are held at 0: many pixels of wings lie right at that
-bound, and a step that lifts them raises the loss along a kink. So three in four of the full steps
-are refused on simulated scenes (133 of 180 in 120 scenes), nearly all in a bright blend of HSC, and
-a shortened one gains: without any, a fit of HST and HSC to a merger was 50 higher in its loss after
-500 iterations than with them after 250.
+The matrix ignores the bound S >= 0. Many wing pixels lie on that bound, and a step that lifts them
+raises the loss. Three in four of the full steps are rejected on simulated scenes (133 of 180 in 120
+scenes), nearly all in a bright blend of HSC, and a shortened step gains. Without any such step, a
+fit of HST and HSC to a merger had a loss 50 higher after 500 iterations than with them after 250.
 """
 
 from __future__ import annotations
@@ -48,9 +47,10 @@ class JointNewtonStep:
 
     solution: Solution with the solver's own morphologies and spectra, its peaks 1
     shared (n): where (ny, nx) each component may exchange light, see Solution.shared
-    exposures: an Exposure of each observation; fit_sky: whether sky levels are unknowns too
+    exposures: an AlignedObservation of each observation; fit_sky: whether sky levels are unknowns
+        too
 
-    moves (n): each component's Moves, None where it shares no light with another
+    moves (n): each component's ComponentModes, None where it shares no light with another
     """
 
     def __init__(self, solution, shared, exposures, *, fit_sky=False):
@@ -73,7 +73,7 @@ class JointNewtonStep:
         self._held = None
 
     def step(self, slopes):
-        """The step to the minimum of all unknowns; slopes: Slopes of the loss.
+        """The step to the minimum of all unknowns; slopes: SceneGradient of the loss.
 
         returns changes [i][j] (ny_j, nx_j) of the structure, None of components that share none,
         (n, C) of the spectra, (C,) of the sky, and by how much the loss is expected to fall
@@ -99,7 +99,7 @@ class JointNewtonStep:
         return structure, spectra if ties is None else ties.spread(spectra), sky, gain
 
     def _factor(self, bound):
-        """The Factor with the spectra `bound` (n, B) held; the last one stays."""
+        """The BlockCholesky with the spectra `bound` (n, B) held; the last one stays."""
         if self._held is None or (self._held[0] != bound).any():
             self._held = (
                 bound.copy(),
@@ -186,9 +186,9 @@ def _held(matrix, counts, bound):
 
 
 def make_joint_step(fit, scene, state, findings):
-    """The Exchange of a Fit at a State of a Scene, with the Findings there.
+    """The JointNewtonStep of a Fit at a State of a Scene.
 
-    None where no sources share light.
+    None if no sources share light.
     """
     n = len(state.morph)
     solution = Solution(
@@ -212,7 +212,7 @@ def make_joint_step(fit, scene, state, findings):
 
 
 def solve_joint_step(exchange, slopes):
-    """An Exchange's step, None where its matrix is not positive definite, and what that gains."""
+    """Step and gain of a JointNewtonStep; None, 0 if its matrix is not positive definite."""
     try:
         *step, gain = exchange.step(slopes)
     except np.linalg.LinAlgError:

@@ -1,4 +1,4 @@
-"""A fitted scene, and all modes of its components: what their morphologies may still be."""
+"""A fitted scene and the modes along which its morphologies can vary under the prior."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def clipped_power(unlikeness, exponent):
 
 
 def _unlike(energy, determined):
-    """Unlikeness by |z|^2 of the structure and how many numbers of it the data determine."""
+    """Unlikeness by |z|^2 of the structure and the number of its determined coefficients."""
     return np.sqrt((energy + WEIGHT * STRENGTH**2) / (determined + WEIGHT)) / STRENGTH
 
 
@@ -77,9 +77,9 @@ class Solution:
     scene: Scene; morphs (n): arrays (ny, nx) with max = 1; peaks (n,): of the solver's
         morphologies, by which those were divided
     spectra (n, C); fixed_error (n, C): of these at fixed morphologies
-    shapes, thetas, positions (n): the start's Shapes, parameters, places (2,) [px]
+    shapes, thetas, positions (n): the start's ComponentProfiles, parameters, places (2,) [px]
     source (n,): to which each component belongs
-    findings: Findings; chi2 (n,): per pixel, where each component's light is
+    findings: StrengthEstimates; chi2 (n,): per pixel, where each component's light is
     prior: MultiscalePrior
     negative_chi2_gradient (n): arrays (ny, nx), see bound_bias.py; None where nothing asks for
         `modes`
@@ -172,7 +172,7 @@ class Solution:
         return along
 
     def along(self, i, images):
-        """Take off images, in place, what lies along the profile; returns how much it was (k,)."""
+        """Subtracts from images, in place, their projection on the profile; returns it (k,)."""
         p = flush_faint(self.scene.profile[i].astype(images.dtype))
         along = images.reshape(len(images), p.size) @ p.ravel() / max((p * p).sum(), 1e-30)
         images -= along[:, None, None] * p
@@ -217,9 +217,9 @@ class Solution:
         return self.scene.origin, self.scene.origin + [p.shape for p in self.scene.profile]
 
     def overlap_mask(self, i, *, faint=FAINT, ratio=0.0):
-        """Pixels (ny, nx) with i and another source over faint [noise].
+        """Pixels (ny, nx) with source i and another source over `faint` [noise].
 
-        That one over ratio of i's.
+        The other source exceeds `ratio` times source i there.
         """
         own = self._light(i, i)
         shared = np.zeros(own.shape, bool)

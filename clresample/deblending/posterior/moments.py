@@ -9,7 +9,7 @@ def moment_derivatives(origins, morphs, light, beyond=None):
     """Slopes of (y, x, yy, yx, xx) of I = sum_i light_i S_i by the pixels of each S_i / light_i.
 
     origins (k, 2) [px], morphs (k): arrays (ny, nx); light (k,), any unit
-    beyond (k, 6): sums over what lies beyond the boxes, see Beyond; None: nothing
+    beyond (k, 6): sums over what lies beyond the boxes, see OutsideBoxMoments; None: nothing
     returns k arrays (5, ny, nx), and (5, 6), by the sums over what lies beyond
     """
     at = [

@@ -79,7 +79,7 @@ class UnknownLayout:
 def normal_matrix(scene, exposures, images, spectra, layout) -> BlockMatrix:
     """J^T J + prior^-1, where sky levels have the precision of Scene.known_sky.
 
-    scene: Scene; exposures: an Exposure of each observation
+    scene: Scene; exposures: an AlignedObservation of each observation
     images (n): arrays (1 + k, ny, nx), float32, of morphologies and their modes
     spectra (n, C), in the views' units
     """
@@ -140,7 +140,7 @@ class _NormalAccumulator:
             self.at = at
 
     def run(self, origin, images, spectra):
-        """Add it."""
+        """Adds the observation's products of all pairs of components to the matrix."""
         pairs = zip(origin, images, strict=True)
         windows = [self.exposure.window(at, m.shape[1:]) for at, m in pairs]
         near: list[_ComponentView] = []
@@ -176,7 +176,7 @@ class _NormalAccumulator:
         return _ComponentView(i, k, low, high, light, unit)
 
     def _add(self, a, b, modes, by_a, by_b, units):
-        """Add what `_products` has found of two components, a.i <= b.i."""
+        """Adds the products of two components, a.i <= b.i, to the matrix."""
         same = a is b
         if self.sum is not None:
             by_a, by_b, units = by_a @ self.sum, by_b @ self.sum, units @ self.sum
@@ -219,10 +219,10 @@ class _NormalAccumulator:
 
 
 def _products(a, b):
-    """Products of two _ComponentView where their windows overlap, None where they do not.
+    """Products of two _ComponentViews where their windows overlap; None without overlap.
 
-    Of the light of both (ka, kb), of b's light with a's unit and of a's with b's (k, C), of the
-    units (C,).
+    They are products of the light of both (ka, kb), of b's light with a's unit and of a's light
+    with b's (k, C), and of the units (C,).
     """
     low, high = np.maximum(a.low, b.low), np.minimum(a.high, b.high)
     if not (high > low).all():

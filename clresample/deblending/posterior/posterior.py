@@ -1,4 +1,4 @@
-"""A scene's errors: one factored normal matrix of all unknowns, and what is asked of it."""
+"""Factorises the normal matrix of all unknowns of a scene and derives its errors from it."""
 
 from __future__ import annotations
 
@@ -35,12 +35,13 @@ MAX_BOUND_RELEASE_SIGMA = 3.0
 class Posterior:
     """The linear posterior about a solution.
 
-    solution: Solution; exposures: an Exposure of each observation
+    solution: Solution; exposures: an AlignedObservation of each observation
     fit_sky, fit_shifts: whether sky levels, and shifts of all observations but the first, are
         unknowns too
 
     modes (n): arrays (k, ny, nx), beyond (n): see Solution.modes; layout: UnknownLayout; matrix:
-        Blocks; factor: its BlockCholesky; covariance: Blocks of the inverse, for the same nodes
+        BlockMatrix; factor: its BlockCholesky; covariance: a BlockMatrix of the inverse, for the
+        same nodes
     released: arrays, for each node what its unknowns change by without the bound of bound_bias.py
 
     Raises LinAlgError where the matrix is not positive definite.
@@ -195,7 +196,7 @@ class Posterior:
 
 
 def with_errors(fit, result, peaks, seen):
-    """The Result of a Fit that has ended, judged, with its Errors and Draws or why there are none.
+    """The Result of a finished Fit with Errors and PosteriorSampler, or messages instead.
 
     peaks, seen: see `posterior_of`
 
@@ -223,7 +224,7 @@ def posterior_of(fit, morphs, peaks, seen):
     """The Posterior of a Fit that has ended, or None, and messages of why there is none.
 
     morphs (n): its components' morphologies with max = 1, peaks (n,): what they were divided by;
-    seen: Seen, of these
+    seen: RenderedModel, of these
     """
     settings, scene = fit.settings, fit.scene
     if not settings.has_multiscale_prior or not settings.errors or fit.strength_estimates is None:

@@ -69,9 +69,9 @@ class OutsideBoxMoments:
         return OutsideBoxMoments(self.sums * scales[0], self.slopes * scales[1:])
 
     def with_gauge(self, along):
-        """Those of more modes, from which `along` (k,) times the profile was subtracted.
+        """The moments of more modes, from which `along` (k,) times the profile was subtracted.
 
-        The new modes come before these.
+        The new modes come before the present ones.
         """
         slopes = np.zeros((6, len(along)))
         slopes[:, len(along) - self.slopes.shape[1] :] = self.slopes
@@ -79,9 +79,9 @@ class OutsideBoxMoments:
 
 
 def profile_modes(shape, theta, position, profile, origin, *, radial=1.0):
-    """Slopes (k, ny, nx) of a component's profile in its box, their prior scatter (k,), Beyond.
+    """Slopes (k, ny, nx) of a profile in its box, prior scatter (k,), OutsideBoxMoments.
 
-    shape: Shape, theta (n,): its parameters, position (2,) [px]: where in the frame
+    shape: ComponentProfile, theta (n,): its parameters, position (2,) [px]: where in the frame
     profile (ny, nx): with max = 1; origin (2,) [px]: of the box in the frame
     radial: times CORE and HALO
     """
@@ -111,7 +111,7 @@ def profile_modes(shape, theta, position, profile, origin, *, radial=1.0):
 
 
 def _surroundings(galaxy, theta, position, origin, size):
-    """Where a galaxy's light is followed about its box: first pixel (2,) and size (2,)."""
+    """Window about a galaxy's box in which its light is followed: first pixel (2,), size (2,)."""
     near = np.minimum(np.array(size) // 2, FAR_PX)
     beta, frame = np.exp(theta[3]), np.array(galaxy.shape)
     # beyond t of the peak lies t^(beta / (beta + 1)) of the light

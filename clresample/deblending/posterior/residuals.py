@@ -125,7 +125,7 @@ def fine_scatter(image, used):
 def channel_residuals(result):
     """`max_filtered_residuals` in all channels of all observations: (S, C) [sigma].
 
-    Of a result with Errors those that these were widened by.
+    If the result has Errors, returns the residuals from which their scale factors were computed.
     """
     if result.errors is not None:
         return result.errors.residuals
@@ -186,9 +186,9 @@ def _kernels(psf):
 
 
 def _owners(result, i_observation, positions):
-    """The source (Co, My, Mx) whose model is the brightest of those whose boxes hold a pixel.
+    """Brightest source (Co, My, Mx) among those whose boxes contain a pixel.
 
-    -1 where none does.
+    -1 without any.
     """
     shape = result.observations[i_observation].shape
     owner, most = np.full(shape, -1), np.full(shape, -np.inf)

@@ -1,10 +1,10 @@
-"""Smooth changes of a morphology under the prior that learns: bumps weighted by its covariance.
+"""Smooth changes of a morphology under the multi-scale prior: Gaussians times its covariance.
 
     m = sqrt(p) o (P * y),   P = sum_j alpha_j^2 K_j * K_j,   Q^-1_kl = <y_k, P * y_l>
 
-y is a Gaussian; about any y this is the most probable change of the data's choice, so that errors
-from few y are at most the exact posterior's. Every y and K_j is a product of a function of the row
-and one of the column, so that images and Q^-1 come of tables along the two axes.
+y is a Gaussian. Restricting y to a few Gaussians can only underestimate the errors of the exact
+posterior. Every y and K_j is a product of a function of the row and one of the column, so that
+images and Q^-1 follow from tables along the two axes.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def whitening_transform(precision):
 
 
 def _without_faint(table):
-    """A table in float32, with what is TINY set to 0."""
+    """A table in float32, with TINY values set to 0."""
     size = np.abs(table)
     return np.where(size > TINY * size.max(initial=0), table, 0).astype(np.float32)
 

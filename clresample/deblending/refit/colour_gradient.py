@@ -58,7 +58,7 @@ class GradientTest:
 
 
 def run_gradient_tests(fits):
-    """Asked (n) of Fits of one signature; None for those with nothing to ask."""
+    """GradientTests (n) of Fits of one signature; None for fits without candidates."""
     which = [_candidates(fit) for fit in fits]
     going = [i for i, own in enumerate(which) if len(own)]
     out: list[GradientTest | None] = [None] * len(fits)
@@ -71,7 +71,7 @@ def run_gradient_tests(fits):
 
 
 def _candidates(fit):
-    """Components (k,) of a finished Fit whose sources let the data choose, bright enough to ask."""
+    """Components (k,) of a finished Fit that are bright enough for the test."""
     if (
         not fit.settings.has_multiscale_prior
         or fit.strength_estimates is None
@@ -87,7 +87,7 @@ def _candidates(fit):
 
 
 def _is_free(source):
-    """Returns True if the data choose how many components a source has."""
+    """Returns True if the data choose a source's number of components."""
     return (
         isinstance(source, ExtendedSource)
         and source.n_components is None
@@ -143,7 +143,7 @@ def _asked(fit, which, seen):
 def _eliminated(covariance, slope, power, k):
     """Coefficients (k, C) of the last k images in the residuals of a fit, all others free too.
 
-    And their precisions (k, C); 0 where they have no light, or are no longer apart.
+    Also returns their precisions (k, C); 0 for images without light, or no longer distinct.
 
     covariance (C, n, n): of all n coefficients; slope, power (n, C): their images' products with
     the residuals, and with themselves
@@ -159,8 +159,8 @@ def _eliminated(covariance, slope, power, k):
 def log_evidence_ratio(core, precision, spectrum):
     """Logarithm of the ratio of evidences, of a colour gradient to none.
 
-    From the changes at the core (C,), their precisions (C,) and the spectrum (C,), more than 0. See
-    the module's text.
+    Computed from the changes at the core (C,), their precisions (C,) and the spectrum (C,), above
+    0. See the module's text.
     """
     seen = precision > 0
     if seen.sum() < 2:

@@ -24,10 +24,9 @@ REFIT_ITER_FACTOR = 2.0
 
 
 def needs_second_component(fit):
-    """Returns True if a Fit in its present state clearly needs second components.
+    """Returns True if a source of a running Fit needs a second component.
 
-    Where that cannot be told it goes on: `refit_two_components` asks again, and says in its
-    messages what is wrong.
+    Returns False also if the test fails; `refit_two_components` repeats it and reports the error.
     """
     try:
         (asked,) = run_gradient_tests([fit])
@@ -68,9 +67,9 @@ def refit_two_components(fits, settings, device, dtype, progress=None):
 
 
 def _second_fits(fits, settings, device, dtype, progress):
-    """{index: a Fit that has ended} with more components of those that need them.
+    """{index: finished Fit} with more components of those that need them.
 
-    None where that fails, which their messages say.
+    None for fits that fail, which their messages report.
     """
     began, shifts = time.perf_counter(), [fit.shifts for fit in fits]
     asked = fits
@@ -92,9 +91,9 @@ def _second_fits(fits, settings, device, dtype, progress):
 
 
 def _go_on(fits, settings, device, dtype, progress):
-    """Run fits that were STOPPED_FOR_REFIT to their end, from where they are.
+    """Continues fits that were STOPPED_FOR_REFIT to their end.
 
-    Nobody asks them again.
+    They are not tested again.
     """
     if not fits:
         return
@@ -129,7 +128,7 @@ def _is_better(second, first, more=0.0):
 
 
 def _half_chi2(fit):
-    """The loss of a finished fit without what its structure costs."""
+    """The loss of a finished fit without the prior's term of its structure."""
     free, found = ~fit.scene.fixed, fit.strength_estimates
     return fit.losses[-1] - 0.5 * (found.energies[free] / found.strengths[free] ** 2).sum()
 

@@ -104,7 +104,7 @@ def _together(fit, chosen):
 
 
 def _as_before(point, begin, chosen):
-    """The StartingPoint of `_together`, with the Shapes of the first one for what it was given."""
+    """The StartingPoint of `_together`, with the first one's profiles for listed components."""
     before, new = _places(len(begin), chosen)
     drawn = [isinstance(shape, FixedProfile) for shape in point.shapes]
     held = np.flatnonzero(~new & drawn)
@@ -118,7 +118,7 @@ def _as_before(point, begin, chosen):
 
 
 def _alone(fit, asked):
-    """The Patch of the sources that need two components, all others' light taken off the data."""
+    """The StartInput of sources that need two components, with others' light subtracted."""
     chosen, begin = asked.significant, fit.start
     spectra = fit.state.spectra.copy()
     spectra[chosen] = 0
@@ -191,7 +191,7 @@ def _places(n, chosen):
 
 
 def _cores(n, chosen):
-    """The same with cores beside the chosen components: whether it is a core."""
+    """Numbers of the components before cores were added to the chosen ones; True for cores."""
     before, two = _places(n, chosen)
     return before, two & (np.diff(before, prepend=-1) == 0)
 

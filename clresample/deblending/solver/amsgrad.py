@@ -44,12 +44,12 @@ class StepSizes:
 
 
 class AMSGrad:
-    """The steps of one batch. What `Engine` asks of an update: to be made so, `step`, `memories`.
+    """The steps of one batch. `Engine` needs of an update this signature, `step`, `memories`.
 
     buffers: the batch, whose latent, morph, spectra and sky are stepped along d_morph, d_spectra
-    gradient: its Gradient, for the sky; states: the scenes' States, for what they remember
+    gradient: its LossGradient, for the sky; states: the scenes' States, for what they remember
     chain: constraints on the morphologies, applied after every step
-    prior: the Prior of extended sources, or None; step_sizes: StepSizes
+    prior: the SingleScalePrior of extended sources, or None; step_sizes: StepSizes
     """
 
     def __init__(self, buffers, gradient, states, *, chain, prior, step_sizes):
@@ -80,7 +80,7 @@ class AMSGrad:
         self._sky = _sky_step(b, gradient, prior) if b.scenes[0].fit_sky else None
 
     def step(self):
-        """Queue one step along the gradients that were queued before."""
+        """Queues one step along the gradients that were queued before."""
         b = self.buffers
         self.n_steps += 1
         t1, t2 = (1 / (1 - beta**self.n_steps) for beta in (BETA1, BETA2))
@@ -132,7 +132,7 @@ class _LatentStep:
         self._form.bind(scratch=blurred, profile=b.profile, amplitude=b.amplitude, morph=b.morph)
 
     def step(self, t1, t2):
-        """Queue a step; t1, t2 = 1 / (1 - B^t) of both moments."""
+        """Queues a step; t1, t2 = 1 / (1 - B^t) of both moments."""
         self._blur_gradient(self._size)
         self._step(self._size, t1=t1, t2=t2)
         self._blur_latent(self._size)
@@ -143,7 +143,7 @@ class _LatentStep:
 
 
 class _MorphologyStep:
-    """Steps S itself along dS; what a normalisation divides it by multiplies its spectrum."""
+    """Steps S itself along dS; a normalisation of S multiplies its spectrum by the divisor."""
 
     def __init__(self, buffers, moments, factor, step_sizes):
         b, self.step_size = buffers, step_sizes.morphology
@@ -162,11 +162,11 @@ class _MorphologyStep:
         )
 
     def step(self, t1, t2):
-        """Queue a step; t1, t2 = 1 / (1 - B^t) of both moments."""
+        """Queues a step; t1, t2 = 1 / (1 - B^t) of both moments."""
         self._step(self._size, t1=t1, t2=t2)
 
     def after_constraints(self):
-        """Queue the spectra's part of a normalisation."""
+        """Queues the spectra's part of a normalisation."""
         self._rescale(self._spectra_size)
 
 

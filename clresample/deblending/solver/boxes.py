@@ -103,7 +103,7 @@ class Boxes:
 
 
 class DeviceBoxes:
-    """Boxes and what kernels need of them on one device.
+    """Boxes and their tables for kernels on one device.
 
     boxes: the Boxes; device: the Device
     table (S, 8): int32, columns COLUMNS; everyone (S,): int32, the indices of all sources
@@ -145,10 +145,10 @@ def _integers(name, values, n_dim):
     """An int32 copy (S,) or (S, 2)."""
     array = np.array(values, ndmin=n_dim)
     if array.size and not np.issubdtype(array.dtype, np.integer):
-        raise ValueError(f"{name} is of type {array.dtype}, it takes whole pixels")
+        raise ValueError(f"{name} is of type {array.dtype}, must be whole pixels")
     if array.ndim != n_dim or (n_dim == 2 and array.shape[1] != 2):
         wanted = "(S,)" if n_dim == 1 else "(S, 2)"
-        raise ValueError(f"{name} has shape {array.shape}, it takes {wanted}")
+        raise ValueError(f"{name} has shape {array.shape}, must be {wanted}")
     return array.astype(np.int32)
 
 

@@ -1,4 +1,4 @@
-"""A batch of scenes on the device: what is uploaded, and how states come back."""
+"""A batch of scenes on the device: uploads, and downloads of states."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class SceneBuffers:
         return 1 if self.tuning.row_loops else int(n)
 
     def box_rows(self, n_boxes):
-        """A launch over the rows of `n_boxes` boxes, of which any may be the largest."""
+        """A launch over the rows of `n_boxes` boxes, any of them as large as the largest."""
         tallest, widest = self.host_boxes.shape.max(0)
         return self.sized(widest, tallest, n_boxes)
 

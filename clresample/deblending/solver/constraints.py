@@ -50,7 +50,7 @@ class MonotoneWeights(enum.IntEnum):
 
 
 class Prox:
-    """An operator; what is done is set by `_launches`, compiled once per boxes and type.
+    """An operator with the kernels of `_launches`, compiled once per boxes and type.
 
     parameters: by name, as they were given
     name (of those that are steps): of the step in prox.cl
@@ -61,7 +61,7 @@ class Prox:
         self._bound = weakref.WeakKeyDictionary()
 
     def __getstate__(self):
-        """Without what is bound to a device: copies bind it anew."""
+        """State for copies, without the parts bound to a device."""
         return {**self.__dict__, "_bound": None}
 
     def __setstate__(self, state):
@@ -72,7 +72,7 @@ class Prox:
         return f"{type(self).__name__}({values})"
 
     def prox(self, morphs, boxes, *, step=1.0, active=None, factor=None):
-        """Overwrite morphs by the operator's answer; see the module's text.
+        """Overwrites morphs by the operator's result; see the module's text.
 
         ValueError: morphs or factor have another shape or type than the boxes ask for
         """
@@ -81,7 +81,7 @@ class Prox:
             raise ValueError(f"morphs is {morphs.shape}, the boxes take ({boxes.boxes.size},)")
         if factor is not None and (factor.shape, factor.dtype) != ((n_sources,), morphs.dtype):
             raise ValueError(
-                f"factor is {factor.shape} {factor.dtype}, it takes ({n_sources},) {morphs.dtype}"
+                f"factor is {factor.shape} {factor.dtype}, must be ({n_sources},) {morphs.dtype}"
             )
         active = boxes.active(active)
         if active.size == 0:
@@ -183,7 +183,7 @@ class Monotone(Prox):
         """Weights of neighbours, and the smallest relative fall per pixel."""
         weights = np.asarray(self.parameters["weights"])
         if not np.isin(weights, list(MonotoneWeights)).all():
-            raise ValueError(f"weights is {weights}, it takes {[str(w) for w in MonotoneWeights]}")
+            raise ValueError(f"weights is {weights}, must be {[str(w) for w in MonotoneWeights]}")
         gradient = self.parameters["gradient"]
         return {"weights": weights}, {"gradient": _at_least_0("gradient", gradient, 1)}
 
@@ -254,7 +254,7 @@ class ProxChain(Prox):
 
 
 def _stands_alone(prox):
-    """Returns True if an operator is no step of prox.cl, but a kernel of its own."""
+    """Returns True if an operator has a kernel of its own instead of a step of prox.cl."""
     return isinstance(prox, MonotoneProjection)
 
 

@@ -29,7 +29,7 @@ def damping(scene, state, prior) -> np.ndarray:
     Where the start is far from the data, g > NOISE_GRADIENT sqrt(curvature), it falls as g^-2:
     there the size of the gradient itself limits the steps.
 
-    scene, state: a Scene and its State at the start; prior: the Prior, or None for plain
+    scene, state: a Scene and its State at the start; prior: the SingleScalePrior, or None for plain
         morphologies
     """
     ones = [np.ones_like(profile) for profile in scene.profile]

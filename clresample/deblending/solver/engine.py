@@ -25,7 +25,7 @@ class Engine:
     prior: the SingleScalePrior of all extended sources, or None to fit the morphologies themselves
     step_sizes: the StepSizes; update: what steps, a class like AMSGrad
 
-    buffers, update: the batch's Buffers and its update, with the present state
+    buffers, update: the batch's SceneBuffers and its update, with the present state
     """
 
     def __init__(
@@ -67,9 +67,9 @@ class Engine:
         return self.update.n_steps
 
     def run(self, n_steps):
-        """Losses (n_steps, B) before each of `n_steps` iterations, which are done by then.
+        """Losses (n_steps, B) before each of `n_steps` iterations, which it runs.
 
-        Of each scene the state before the first of them is kept if its loss is the lowest so far.
+        The state before the first of them is kept for each scene whose loss is the lowest so far.
         """
         if n_steps > MAX_STEPS:
             raise ValueError(f"n_steps is {n_steps}, one run does at most {MAX_STEPS}")
@@ -81,11 +81,11 @@ class Engine:
         return self.device.get(self.losses)[:n_steps].astype(np.float64)
 
     def gradient(self, i_loss=0):
-        """Queue model, residual, gradients, and the losses into losses[i_loss]."""
+        """Queues model, residual, gradients, and the losses into losses[i_loss]."""
         self._gradient(self.losses, i_loss)
 
     def step(self):
-        """Queue one step of the update along the gradients."""
+        """Queues one step of the update along the gradients."""
         self.update.step()
 
     def final_losses(self):
@@ -103,5 +103,5 @@ class Engine:
         return self.buffers.states(iterated, self.update.memories(), self.n_steps)
 
     def update_shifts(self):
-        """Take over the shifts that the scenes' operators have by now."""
+        """Copies the current shifts of the scenes' operators."""
         self._gradient.update_shifts()

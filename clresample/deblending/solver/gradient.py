@@ -71,13 +71,13 @@ class LossGradient:
             )
 
     def __call__(self, losses, i_loss):
-        """Queue it all; losses[i_loss] of losses (n, B), on the device, are the scenes' losses."""
+        """Queues the evaluation; writes the scenes' losses to row i_loss of losses (n, B)."""
         self.queue()
         self._losses((self.buffers.tuning.sum_group, len(self.best)), out=losses, i_loss=i_loss)
 
     @functools.cached_property
     def _losses(self):
-        """The kernel that sums them; the prior that learns does without."""
+        """The kernel that sums them; the multi-scale prior does not need it."""
         b, group = self.buffers, self.buffers.tuning.sum_group
         return b.launcher("losses.cl", "losses", 2, local_size=(group, 1)).bind(
             first=b.first,
@@ -90,7 +90,7 @@ class LossGradient:
         )
 
     def queue(self):
-        """Queue everything but the losses' sums: gradients, rows_loss and rows_pull."""
+        """Queues everything but the losses' sums: gradients, rows_loss and rows_pull."""
         for observed in self.observations:
             observed.queue()
         if self._expect_sky is not None:
@@ -99,7 +99,7 @@ class LossGradient:
             self._tie(self.buffers.items(self.buffers.n_sources))
 
     def update_shifts(self):
-        """Take over the shifts that the scenes' own operators have by now."""
+        """Copies the current shifts of the scenes' own operators."""
         for observed in self.observations:
             observed.follow_shifts()
 
@@ -107,7 +107,7 @@ class LossGradient:
 class _ObservedBatch:
     """One observation of every scene of a batch: data, operator and buffers for its images.
 
-    op: the operator; rendering: its Frames, Transformed or Windows
+    op: the operator; rendering: its FrameRendering, BoxTransformRendering or WindowRendering
     image (B, Co, My, Mx): R M, then w r
     """
 
@@ -139,7 +139,7 @@ class _ObservedBatch:
         )
 
     def queue(self):
-        """Queue the model, its residual and what that adds to the gradients."""
+        """Queues the model, its residual and their contribution to the gradients."""
         b, shown = self.buffers, self.rendering
         shown.transform(b.morph)
         shown.render(b.spectra, self.image)
@@ -150,7 +150,7 @@ class _ObservedBatch:
             shown.gather_morph(b.spectra, b.d_morph, b.free, add=self.add)
 
     def follow_shifts(self):
-        """Shift the batch's operator as the scenes' own ones are."""
+        """Copies the shifts of the scenes' own operators to the batch's operator."""
         if self.op is not self._ops[0]:
             self.op.shift = np.stack([op.shift for op in self._ops])
         self.rendering.update_shifts()

@@ -17,7 +17,8 @@ from ...resampling.linop import LinOp
 class SceneOperator(LinOp):
     """Base of both operators: one observation's images of every scene of a batch (B, Co, My, Mx).
 
-    buffers: the batch; op: its operator of that observation; rendering: its Frames or Transformed
+    buffers: the batch; op: its operator of that observation; rendering: its FrameRendering or
+        BoxTransformRendering
     """
 
     def __init__(self, buffers, op, rendering, shape_in):
@@ -26,7 +27,7 @@ class SceneOperator(LinOp):
         super().__init__(buffers.device, buffers.dtype, shape_in, shape_out)
 
     def _refuse_batch(self, x):
-        """The kernels know one buffer of each kind: the scenes of a batch are inside an item."""
+        """Copies have one buffer of each kind: the scenes of a batch are inside an item."""
         if len(x) != 1:
             raise ValueError(
                 f"a batch of {len(x)} items is given; {type(self).__name__} takes one, which holds "

@@ -29,7 +29,7 @@ class FusedSteps:
         )
 
     def __call__(self, morphs, active, step, factor, first):
-        """Queue the steps; arguments as of `Prox.prox`, first: whether `factor` starts from 1."""
+        """Queues the steps; arguments as of `Prox.prox`, first: whether `factor` starts from 1."""
         size = (active.size * self.group,)
         if factor is None:
             self.chain(size, x=morphs, active=active, step=step)
@@ -70,7 +70,7 @@ class ProjectionLaunch:
             )
 
     def __call__(self, morphs, active, step, factor, first):
-        """Queue the projection; it has no use for the last three."""
+        """Queues the projection, which ignores the last three arguments."""
         size, end = (active.size * self.group,), self.n_iterations
         for begin in range(0, max(end, 1), max(self.most, 1)):
             span = {"first": begin, "last": min(begin + self.most, end)}

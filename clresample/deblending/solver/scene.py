@@ -1,4 +1,4 @@
-"""One scene to fit, on the host: what stays (Scene) and what the iterations change (State)."""
+"""One scene to fit, on the host: constants (Scene) and iterated variables (State)."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class StructureState:
 class State:
     """Variables of the iterations of one scene.
 
-    latent, morph (S): arrays (ny, nx): z (see Prior; of no use without one) and S
+    latent, morph (S): arrays (ny, nx): z (see SingleScalePrior; of no use without one) and S
     spectra (S, C): A, and sky (C,), in the unit of the data
     memory: of the update, None before its first step; n_steps: iterations done so far
     learned: StructureState under a MultiscalePrior; None: no structure, strengths that are the

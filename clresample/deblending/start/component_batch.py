@@ -1,4 +1,4 @@
-"""Components drawn in boxes: where the boxes lie, how large they are, and their images."""
+"""Draws components in boxes: positions, sizes and images of the boxes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class StartComponent:
     """One component of one scene.
 
     scene: which; index: of the component in its scene; source: number of its source there
-    shape: Shape; position (2,) [px]
+    shape: ComponentProfile; position (2,) [px]
     frame (2,) [px]: the frame's shape
     """
 
@@ -157,7 +157,7 @@ class ComponentBatch:
         return images
 
     def _draw_galaxies(self, at, device, dtype, tuning, images):
-        """Queue the kernel that draws the slots `at`."""
+        """Queues the kernel that draws the slots `at`."""
         table = np.column_stack([self.size, self.n_images, self.begin])[at].astype(np.int32)
         theta, moment = _stacked(self.components, self.thetas, at)
         place = np.array([c.position for c in self.components])[at] - self.origin[at]

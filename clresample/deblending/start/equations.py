@@ -13,7 +13,8 @@ N_PARAMETERS = 4
 def normal_equations(looking):
     """Normal matrices (k, P, P) and right sides (k, P) of Gauss-Newton steps; P = 4 n.
 
-    Spectra and sky levels are eliminated. After `render` with slopes, and `compute_residuals`.
+    Spectra and sky levels are eliminated. Call it after `render` with slopes and
+    `compute_residuals`.
     """
     k, n, rows = len(looking.scenes), looking.n_most, looking.rows
     own, p = looking.index[looking.at], N_PARAMETERS

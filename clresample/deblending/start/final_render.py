@@ -1,4 +1,4 @@
-"""Fitted morphologies as all observations see them, and the spectra that go with them best."""
+"""Renders the final morphologies in every observation and solves for their spectra."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WHOLE_PX = 160**2
 
 @dataclass(frozen=True, eq=False)
 class MorphologyModel:
-    """The morphologies of a scene, and what sees them.
+    """The morphologies of a scene, and the views that render them.
 
     frame (2,) [px]: its shape, padding included
     views: WhitenedViews; unfiltered_views: others like them, or None where the view itself is as
@@ -92,7 +92,7 @@ class _ImageProfile(ComponentProfile):
 
 
 def render_models(models: list[MorphologyModel], *, fit_sky=False) -> list[RenderedModel]:
-    """Render the morphologies of all models, and solve for their spectra, side by side.
+    """Renders the morphologies of all models, and solves for their spectra, side by side.
 
     models: of equal numbers of observations, these of equal shapes, as of one batch
     fit_sky: also solve for a level per channel
@@ -138,7 +138,7 @@ def _looking(views, components, fit_sky):
 
 
 def _taken(looking):
-    """Per scene and view, the ComponentImages of what is seen at present."""
+    """Per scene and view, the ComponentImages of the present components."""
     found = [[] for _ in range(looking.n_scenes)]
     for sight in looking.sights:
         seen, shape = looking.device.get(sight.seen), (sight.n_bands, sight.my, sight.mx)

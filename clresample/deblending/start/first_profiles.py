@@ -1,17 +1,16 @@
-"""Profiles of large galaxies, from a coarse grid, before the least squares of all shapes begin.
+"""Chooses the profiles of large galaxies from a coarse grid, before least squares.
 
-Those step from what is expected, galaxies of a few pixels. Where one galaxy of a scene is far
-larger, small profiles of all sources share its light at first, and each grows into it. So sizes
-GROWTH times apart, with the expected wings and with WIDE_WINGS, are compared here,
+Least squares start from the expected profiles, galaxies of a few pixels. If one galaxy of a scene
+is far larger, small profiles of all sources share its light at first, and each grows into it.
+Therefore sizes GROWTH times apart, with the expected wings and with WIDE_WINGS, are compared by
 
     gain_k = sum_c max(0, <u_k, r>)^2 / (|u_k|^2 + (NEIGHBOUR_MODEL_ERROR <u_k, M>)^2),
 
-u_k being a source's whitened image with profile k, r what is left of the data by the models of the
-sources before it, and M these models: they are wrong by NEIGHBOUR_MODEL_ERROR of their light, see
-    population.py,
-which a small neighbour must not take for its own. The source that gains the most comes first, with
-its best profile, whose shape is then fitted; then the one that gains the most of what is left, and
-so on: in whatever order they are listed.
+u_k being a source's whitened image with profile k, r the data less the models of the sources before
+it, and M these models. Their error is NEIGHBOUR_MODEL_ERROR of their light (population.py); a small
+neighbour must not take that error for its own light. The source with the largest gain comes first,
+with its best profile, whose shape is then fitted. The source with the largest gain in the rest is
+next, and so on: the result does not depend on the order of the list.
 """
 
 from __future__ import annotations
@@ -39,10 +38,10 @@ NEED = 25.0
 def profile_grid(looking, thetas, error) -> dict:
     """Parameters of galaxies that may be larger than expected: {component: [theta, ...]}.
 
-    All light there, whosever it is, is clearly more significant as such a profile weighs it than as
-    the one before does.
+    A larger profile enters if the light around the source is more significant with its weights than
+    with those of the profile before, by over NEED.
 
-    looking: Looking that has its solution at `thetas` (N), those that are expected
+    looking: LinearisedScenes that are solved at `thetas` (N), the expected parameters
     error: part of the light that adds to the noise
     """
     going = [i for i, c in enumerate(looking.components) if isinstance(c.shape, GalaxyProfile)]
@@ -68,7 +67,7 @@ def profile_grid(looking, thetas, error) -> dict:
 
 
 def first_profiles(fit, error):
-    """Set the parameters of large galaxies of a ProfileFit, which are at their means.
+    """Sets the parameters of large galaxies of a ProfileFit, which are at their means.
 
     error: part of the light that adds to the noise
     """
@@ -95,8 +94,9 @@ def first_profiles(fit, error):
 
 
 def _next(looking, models, rest, error):
-    """The components of `rest` that gain the most of all near them, with their best profiles, in
-    scenes where a larger one gains: {component: theta}.
+    """Selects in each scene the components of the largest gain nearby: {component: best theta}.
+
+    Scenes add some only if a larger profile gains more than the first one by over NEED.
 
     models: those before it, {component: theta}; rest: {component: [theta expected, ...]}
     """
@@ -127,8 +127,10 @@ def _next(looking, models, rest, error):
 
 
 def _apart(around, listed, gain, at):
-    """Of those `listed` (n) that are `at` some places the ones of the largest gain (n,), in boxes
-    apart."""
+    """Selects the components of the largest gain (n,) at these places, with disjoint boxes.
+
+    listed (n): components; at: the places among them that compete
+    """
     low, high = np.zeros((2, len(listed), 2))
     low[around.at], high[around.at] = around.slots.origin, around.slots.origin + around.slots.size
     taken: list[int] = []
@@ -140,7 +142,7 @@ def _apart(around, listed, gain, at):
 
 
 def _instead(looking, listed):
-    """A Looking that has looked at components [(i, theta)] as they would be."""
+    """LinearisedScenes rendered with components [(i, theta)] in place of the present ones."""
     components, parameters, count = [], [], {}
     for i, theta in listed:
         c = looking.components[i]
@@ -154,5 +156,5 @@ def _instead(looking, listed):
 
 
 def _significance(looking, sky, error):
-    """Chi2 (N,) that each of the components looked at explains of all light but the sky's."""
+    """Chi2 (N,) explained by each component, of all light but the sky's."""
     return (np.maximum(looking.signal_to_noise(sky, error), 0) ** 2).sum(axis=1)

@@ -1,4 +1,4 @@
-"""Components of a group of scenes as all observations see them, and the spectra that fit best."""
+"""Renders the components of a batch of scenes in all observations; solves for their spectra."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def linearise(views, components, precision, tolerance, *, fit_sky) -> Linearised
 
 
 class LinearisedScenes:
-    """The components of a group of scenes at some parameters, as all observations see them.
+    """The components of a batch of scenes at given parameters, rendered in all observations.
 
     components (N): all scenes' Components; sights: the observations; n_scenes: B; fit_sky
 
@@ -58,7 +58,7 @@ class LinearisedScenes:
         self._kept: dict = {}
 
     def render(self, scenes, thetas, brightness, *, slopes, whiten=True):
-        """Draw and render the components of some scenes (k,).
+        """Draws and renders the components of some scenes (k,).
 
         thetas (N): arrays; brightness (N,): see `profile_thresholds`; whiten: else `whiten` is to
             follow
@@ -79,7 +79,7 @@ class LinearisedScenes:
             self.whiten()
 
     def whiten(self):
-        """Bring what is seen to units of the noise."""
+        """Whitens the rendered images."""
         for sight in self.sights:
             sight.whiten()
 
@@ -93,7 +93,7 @@ class LinearisedScenes:
         return self._row[scenes]
 
     def compute_residuals(self, error) -> np.ndarray:
-        """Compare the present solution with the data.
+        """Compares the present solution with the data.
 
         chi2 (k,) of the scenes looked at, with what is expected of the sky.
         """
@@ -150,8 +150,9 @@ class LinearisedScenes:
         )
 
     def light_products(self, sky, error=0.0):
-        """Products (N, C) of each component's whitened image with all light but the sky's, and with
-        itself; 0 where it has no pixels.
+        """Products (N, C) of each component's whitened image with the data's light and with itself.
+
+        The light excludes the sky's. Products are 0 where a component has no pixels.
 
         sky (B, C); error: part of the light that adds to the noise
         """

@@ -1,26 +1,27 @@
-"""Prior on galaxy sizes and wings, updated by EM from the galaxies of the scene.
+"""Prior on the sizes and wings of a scene's galaxies, updated by EM from the same galaxies.
 
-Of a galaxy's ln sigma and ln beta, how large it is and how wide its wings are,
+A galaxy's ln sigma and ln beta, its size and the width of its wings, follow
 
     theta_i = mean_i + c + s x_i,    c ~ N(0, SCENE_SCATTER^2),    x_i ~ Student's t of STUDENT_DOF
 
-with c and s the scene's own. Faint galaxies are then taken for what others of their scene are like,
-and one that is unlike them all, a bright spiral among faint ones, counts for little. Both are
-learned by a step of expectation and maximisation (Dempster, Laird & Rubin 1977, J. R. Stat. Soc. B
+with c and s common to the scene. Faint galaxies are then similar to the others of their scene. A
+galaxy unlike all others, a bright spiral among faint ones, has little weight. Both c and s are
+updated by a step of expectation and maximisation (Dempster, Laird & Rubin 1977, J. R. Stat. Soc. B
 39, 1) after each step of the fit.
 
-What the data say of a galaxy's shape may be what is wrong in its neighbours' models. Real galaxies
-differ from smooth profiles by a tenth of their light and more, over many pixels alike; the weights
-of the start (spectra.MODEL_ERROR) take that for noise of each pixel by itself, of which little
-would be left over a whole galaxy. With u a galaxy's whitened image, all channels in one, and M that
-of all other sources, what is wrong in M adds E to what the data know of u to 1,
+Errors in the models of neighbours can mimic the shape of a galaxy. Real galaxies differ from smooth
+profiles by a tenth of their light and more, with correlated differences over many pixels. The
+weights of the start (spectra.MODEL_ERROR) count that as independent noise of each pixel, which
+nearly cancels over a whole galaxy. With u a galaxy's whitened image, all channels in one, and M
+that of all other sources, an error in M changes the light of u by
 
     E = NEIGHBOUR_MODEL_ERROR <u, M> / |u|
 
-so that its shape is known 1 + E^2 times less well than the data say. It is held to what is expected
-of it by so much more instead, which comes to the same and leaves its neighbours' shapes alone. A
-faint galaxy beside a bright one then has the shape that is expected; the bright one's own data
-outweigh that. Stars have no shape, and their places, given beforehand, are seen by their cores.
+in units of its error, so that the variance of its shape is 1 + E^2 times that of the data alone.
+The prior on its shape is made stronger by that factor instead, which has the same effect and leaves
+its neighbours' shapes unchanged. A faint galaxy beside a bright one then has the expected shape;
+the bright one's own data outweigh the prior. Stars have no shape, and their positions are fixed by
+their cores.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ NEIGHBOUR_MODEL_ERROR = 0.2
 class PopulationPrior:
     """Prior on the profiles of the components of B scenes.
 
-    shapes (N): their Shapes; scene, index (N,): of each, below B and n; n_parameters: p
+    shapes (N): their ComponentProfiles; scene, index (N,): of each, below B and n; n_parameters: p
 
     mean, scatter (B, n, p): of their parameters, 0 and 1 where there are none
     contamination (B, n): 1 + E^2, see the module's text
@@ -105,7 +106,7 @@ class PopulationPrior:
         return np.square((theta[scenes] - self.mean[scenes]) / self.scatter[scenes])
 
     def update(self, scenes, theta, normal):
-        """Learn from the galaxies of some scenes what is expected in them.
+        """Updates the prior of some scenes from their galaxies.
 
         theta (B, n, p); normal (B, n p, n p): of their equations, what was expected among them
         """
@@ -141,7 +142,7 @@ def contamination_factors(normal, spectra, source):
 
 
 def em_step(off, variance, known, common, own):
-    """c and s (k, 2) after one step, and what each galaxy is then expected to scatter (k, n, 2).
+    """c and s (k, 2) after one step, and the expected scatter of each galaxy (k, n, 2).
 
     off, variance (k, n, 2): theta - mean, and how well each galaxy's is known, what was expected of
         it included, neighbours as they are

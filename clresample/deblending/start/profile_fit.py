@@ -55,7 +55,7 @@ class ProfileFit:
         return [t[:n] for t, n in zip(theta[self.at], self.counts, strict=True)]
 
     def begin(self):
-        """Solve at the mean, and fit the profiles of larger galaxies, one after another."""
+        """Solves at the mean, and fits the profiles of larger galaxies, one after another."""
         looking, scenes = self.looking, np.arange(len(self.theta))
         self._look(scenes, self.theta, slopes=False)
         looking.solve(MODEL_ERROR)
@@ -68,7 +68,7 @@ class ProfileFit:
         self._step(np.flatnonzero(some), np.ones(self.source.shape, bool), N_STEPS, learn=True)
 
     def fit_part(self, thetas, free, scenes):
-        """Fit profiles of some components without the others; their parameters, as `thetas`.
+        """Fits profiles of some components without the others; their parameters, as `thetas`.
 
         thetas: {component: parameters (n,)}; free: set of those that move; scenes (k,): that are
             fitted, others stay as they are
@@ -89,7 +89,7 @@ class ProfileFit:
         return thetas | dict(zip(here, fit.thetas(), strict=True))
 
     def _take(self, scenes):
-        """Solve some scenes at their present parameters, and note all that a step needs."""
+        """Solves some scenes at their present parameters and stores the inputs of a step."""
         if len(scenes):
             self._measure_brightness(self.theta)
             self._look(scenes, self.theta, slopes=True)
@@ -124,9 +124,9 @@ class ProfileFit:
                 self._take_equations(further)
 
     def _try(self, scenes, damping, free):
-        """Try a step of each of the scenes.
+        """Tries a step of each of the scenes.
 
-        What it gains (k,), spectra those of the better one, and theta (B, n, 4) after it.
+        Returns the gain (k,), spectra of the better state, and theta (B, n, 4) after it.
         """
         looking, own = self.looking, np.eye(self.right.shape[1])
         moves = np.repeat(free, N_PARAMETERS, axis=1)
@@ -150,18 +150,18 @@ class ProfileFit:
         self.looking.render(scenes, self.thetas(theta), self.brightness, slopes=slopes)
 
     def _chi2(self, scenes, theta):
-        """With what is expected (k,)."""
+        """With the priors (k,)."""
         return self.looking.compute_residuals(MODEL_ERROR) + self.population.penalty(scenes, theta)
 
     def _learn(self, scenes):
-        """Learn what to expect of some scenes from the present parameters."""
+        """Updates the prior of some scenes from the present parameters."""
         before = self.population.penalty(scenes, self.theta)
         self.population.update(scenes, self.theta, self.normal)
         self._doubt(scenes)
         self.chi2[scenes] += self.population.penalty(scenes, self.theta) - before
 
     def _doubt(self, scenes):
-        """Note how far the shapes of some scenes, of those last solved, are to be doubted."""
+        """Stores the shape errors caused by neighbours, for some of the scenes solved last."""
         looking = self.looking
         rows = looking.rows_of(scenes)
         normal, spectra = looking.normal[rows][..., :-1, :-1], looking.solution()[rows][..., :-1]
@@ -170,7 +170,7 @@ class ProfileFit:
         )
 
     def _take_equations(self, scenes):
-        """Note the normal equations of some scenes, what is expected among them."""
+        """Stores the normal equations of some scenes, priors included."""
         normal, right = normal_equations(self.looking)
         weight = self.population.precision(scenes, self.theta).reshape(right.shape)
         away = self.population.mean[scenes] - self.theta[scenes]
@@ -178,7 +178,7 @@ class ProfileFit:
         self.right[scenes] = right + weight * away.reshape(right.shape)
 
     def _measure_brightness(self, theta):
-        """Note the components' peaks over the noise of a model pixel, where they are best seen."""
+        """Stores the components' peaks over a model pixel's noise, in their best channel."""
         looking = self.looking
         best = (looking.spectra / self.noise[looking.scene]).max(axis=1)
         self.brightness = best * peaks_of(looking.components, self.thetas(theta))

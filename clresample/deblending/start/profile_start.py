@@ -96,12 +96,12 @@ class StartingPoint:
         return image[0] / self.peaks[i]
 
     def reach(self, i, threshold):
-        """Middle (2,) and half size (2,) [px] of what of it is above a part of its peak."""
+        """Middle (2,) and half size (2,) [px] of its pixels above a part of its peak."""
         return self.shapes[i].bounding_box(self.thetas[i], self.drawn_positions[i], threshold)
 
 
 def fit_start_profiles(patches: list[StartInput], *, fit_sky=False) -> list[StartingPoint]:
-    """Fit profiles and free stars of all patches side by side; see the module's text.
+    """Fits profiles and free stars of all patches side by side; see the module's text.
 
     patches: of equal numbers of observations, these of equal shapes
     fit_sky: also a level per channel
@@ -172,7 +172,7 @@ def _point(patch, looking, thetas, sources, b, dark):
 
 
 def profile_peak(shape, theta, place, center, frame):
-    """The largest pixel of a Shape's profile of unit integral in its frame.
+    """The largest pixel of a ComponentProfile's profile of unit integral in its frame.
 
     place, center (2,) [px]: where it is drawn, and near which that pixel lies; frame (2,) [px]
     """

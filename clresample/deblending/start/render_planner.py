@@ -63,7 +63,7 @@ class RenderPlanner:
         self._renderers: dict[object, _WindowRenderer | BoxRenderer] = {}
 
     def runs(self, slots):
-        """Yield the RenderRuns of slots."""
+        """Yields the RenderRuns of slots."""
         # on distorted pixels each place has its own plan
         whole = (slots.size == self.views[0].op.shape_in[1:]).all(axis=1) & self._exact
         alone = self._distorted[slots.scene] & ~whole
@@ -160,7 +160,7 @@ class RenderPlanner:
         return renderer, which, low[None], np.concatenate([low, size])[None], moves
 
     def _renderer(self, key, plans, executor=None):
-        """The Renderer of plans, made once for a key."""
+        """The BoxRenderer of plans, made once for a key."""
         if key not in self._renderers:
             self._renderers[key] = BoxRenderer(self.device, self.dtype, plans, executor)
         return self._renderers[key]

@@ -1,4 +1,4 @@
-"""Images in boxes as an observation sees them, in windows that hold what their light reaches."""
+"""Renders images of boxes in an observation, in windows that contain their light."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from ...resampling.resampler import EXECUTORS
 class BoxRenderer:
     """Plans of boxes of one shape on the device: images (n, ny, nx) to (n, C, wy, wx).
 
-    plans: `Plan.window`'s, alike in layout and window, of one place of a distorted mapping, or of a
-        whole frame
+    plans: `ResamplingPlan.window`'s, alike in layout and window, of one place of a distorted
+        mapping, or of a whole frame
     executor: of the plans, with their transfer functions; None makes one
 
     size (2,) [px]: of the windows
@@ -50,11 +50,11 @@ class BoxRenderer:
 
     @property
     def n_elements(self) -> int:
-        """Elements of one image as all bands see it."""
+        """Elements of one image in all bands."""
         return self.executor.n_bands * int(np.prod(self.size))
 
     def __call__(self, images, i_image, seen, i_seen, n, which, moves, shares=None):
-        """Queue the images of slots that follow each other, n of each.
+        """Queues the images of slots that follow each other, n of each.
 
         images, i_image: device array and the element of it where they begin; seen, i_seen: likewise
             where they go; which (slots,): index of each one's plan; moves (slots, 2) [model px]: by
@@ -78,7 +78,7 @@ class BoxRenderer:
             e.frequencies_to_pixels(ImageBatch(seen.base_data, to, w_y * w_x, w_x), m * e.n_bands)
 
     def _reserve(self, n_images):
-        """Make room for so many images at a time."""
+        """Reserves memory for a number of images at a time."""
         if n_images <= self._capacity:
             return
         # twice as many at a time, as slots of this size come and go; no more than one launch takes

@@ -1,4 +1,4 @@
-"""One observation of all scenes of a group: what it sees of slots, and sums over its pixels."""
+"""Renders component images in one observation of a batch of scenes and sums their products."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LIGHT_PX = 3.0
 
 
 class SlotObservation:
-    """One observation of each of B scenes, and the slots that it sees at present.
+    """One observation of each of B scenes, and the slots rendered in it at present.
 
     views (B): WhitenedViews of equal shapes; channels: slice of all the scenes' channels
     precision, tolerance: see RenderPlanner
@@ -53,7 +53,7 @@ class SlotObservation:
         return self.device.put(np.array([smoothed_light(v) for v in self.views]), self.dtype)
 
     def _launch(self, name, size, *, local_size=None, **arguments):
-        """Queue a kernel of start.cl; K of them: images of a slot that are summed."""
+        """Queues a kernel of start.cl; K of them: images of a slot that are summed."""
         n_images = arguments.pop("K", 1)
         sums = {"WG": self.tuning.sum_group, "K": n_images} if local_size else {}
         launch = self.device.launcher(
@@ -67,7 +67,7 @@ class SlotObservation:
         launch(size, n_bands=self.n_bands, my=self.my, mx=self.mx, **arguments)
 
     def render(self, slots: ComponentBatch, images):
-        """Render the slots' images, and keep what is seen of them."""
+        """Renders the slots' images and stores their observed parts."""
         low, size = np.zeros((2, len(slots), 2), int)
         self.lit, runs = np.zeros((len(slots), 4), int), []
         for run in self.aim.runs(slots):
@@ -87,7 +87,7 @@ class SlotObservation:
             run.renderer(images, at[0], self.seen, at[1], n, run.plan_index, run.offsets_px, shares)
 
     def whiten(self):
-        """Bring what is seen to units of the noise."""
+        """Whitens the rendered images."""
         tallest, widest = self.place[:, 3:5].max(axis=0).tolist()
         self._launch(
             "whiten",
@@ -100,7 +100,7 @@ class SlotObservation:
     def compute_residuals(self, scenes, slots, spectra, sky, error):
         """Residuals and weights of the scenes (k,) of the slots rendered last.
 
-        And sums (k, Co, 3) over the pixels.
+        Also returns sums (k, Co, 3) over the pixels.
 
         spectra (slots, C), sky (B, C): of the model; error: part of the light that adds to
         the noise
@@ -136,7 +136,7 @@ class SlotObservation:
     def overlapping_pairs(self):
         """Table (pairs, 6) of slots a <= b of one scene whose windows overlap on the pixels.
 
-        With the first pixel and size of the overlap; NumPy's, and on the device. Slots without
+        It has the first pixel and size of the overlap; NumPy's, and on the device. Slots without
         pixels are left out.
         """
         table = _pairs(self.place[:, 0], self.lit, (self.my, self.mx))

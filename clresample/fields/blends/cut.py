@@ -53,7 +53,7 @@ class FitLimits:
         return min(self.max_pixels, self.max_bytes / fit_bytes(1, 1, self.n_channels))
 
     def allow(self, n_sources, n_pixels) -> bool:
-        """Returns True if a fit of so many sources in a box of so many pixels is within them."""
+        """Returns True if numbers of sources and pixels are within the limits."""
         n_bytes = fit_bytes(n_sources, n_pixels, self.n_channels)
         few = n_sources <= self.max_sources and n_pixels <= self.max_pixels
         return few and (self.max_bytes is None or n_bytes <= self.max_bytes)
@@ -75,7 +75,7 @@ def fit_bytes(n_sources, n_pixels, n_channels) -> float:
 
 
 def cut_blend(light, inside, positions, limits, margin, groups=None):
-    """Cut a blend into pieces within the limits: territories (Ny, Nx) and a piece (S,) per source.
+    """Cuts a blend into pieces within the limits: territories (Ny, Nx) and a piece (S,) per source.
 
     Each source gets the pixels from which the light rises to it (watershed); sources are then put
     together in the order of the light at the saddle between them, brightest first, as long as the

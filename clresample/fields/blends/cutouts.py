@@ -18,7 +18,7 @@ SIDE_PX = 4
 def make_blend(patch, plan, mosaics, reference, labels, corner, neighbours=None, components=None):
     """The Blend of a patch, and the Boxes on the mosaics that its observations were cut from.
 
-    patch: Patch of plan: Plan; mosaics: of the field; reference: Grid of the model's pixels
+    patch: FitRegion of plan: FitPlan; mosaics: of the field; reference: Grid of the model's pixels
     labels (Ny, Nx): patch numbers + 1 of the model's pixels from `corner` (2,) [px] on
     neighbours: {mosaic's name: list of (Box, model (C, Ny, Nx) [counts])}: light of the other
         pieces of the same blend, to be subtracted. None: their pixels are ignored, as those of all
@@ -62,7 +62,7 @@ def make_blend(patch, plan, mosaics, reference, labels, corner, neighbours=None,
 
 
 def fit_box(mosaic, grid) -> Box:
-    """The pixels of a mosaic whose centres lie on a grid: those that a fit in it looks at.
+    """The pixels of a mosaic whose centres lie on a grid: those of a fit in it.
 
     Where noise is correlated, one more on each side: the filter that makes it white leaves a
     cutout's outer pixels without a weight. Grids of one shape have Boxes of one shape, so that

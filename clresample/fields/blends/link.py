@@ -27,7 +27,7 @@ class LinkedFootprints:
 def link_footprints(tiles, found, region, folder=None) -> LinkedFootprints:
     """Connected footprints of a region, from its tiles: two pixels that touch belong together.
 
-    tiles: of the region; found: called with a tile's number, returns its Found
+    tiles: of the region; found: called with a tile's number, returns its TileDetections
     region: Box of the model's pixels
     folder: where labels and light are kept in files that are mapped into memory; None = in memory
     """

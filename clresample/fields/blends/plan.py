@@ -94,7 +94,7 @@ class FitPlan:
         )
 
     def restricted_to(self, core) -> FitPlan:
-        """The plan of what is needed for the sources in a Box: blends that have one there."""
+        """The plan of the sources in a Box: the blends with a source there."""
         inside = core.contains(self.positions)
         parents = {p.parent for p in self.patches if inside[list(p.sources)].any()}
 
@@ -163,12 +163,14 @@ def make_fit_plan(
     """Blends from sources and the labels of their light; giants cut; groups by predicted cost.
 
     positions (S, 2) [px], peaks (S,) [sigma]: in whose order blends are numbered
-    footprints: Footprints of `region`, whose labels are renumbered here: label n + 1 is patch n's
+    footprints: LinkedFootprints of `region`, whose labels are renumbered here: label n + 1 is
+        patch n's
     memory [bytes]: that the fits of one group may take; None = no limit; n_channels: of all mosaics
     most: blends in a group, as many as a CPU fits side by side. More share a round's launches,
         which take longer than the arithmetic of small blends, but are lost together with their
         worker
-    hosts (S, 2) [px]: see Found; in cut blends they stay with their clumps if the limits allow it
+    hosts (S, 2) [px]: see TileDetections; in cut blends they stay with their clumps if the limits
+        allow it
     """
     limits = replace(limits or FitLimits(), max_bytes=memory, n_channels=n_channels)
     ids = source_ids(positions, field_number)
@@ -209,7 +211,7 @@ def make_fit_plan(
 def host_ids(positions, peaks, ids, hosts) -> np.ndarray:
     """Ids (S,) int64 of sources' hosts, whose positions (S, 2) [px] are `hosts`.
 
-    Where none of the sources is at a host's position, the brightest of those with it is.
+    Without a source at a host's position, the brightest source with that host is used.
     """
     at = {tuple(p): i for i, p in enumerate(np.asarray(positions).tolist())}
     of_host: dict[tuple, list[int]] = {}
@@ -231,7 +233,7 @@ def _by_label(labels, at):
 
 
 def _number(labels, pending):
-    """Write the numbers of patches, from 1, into labels (Ny, Nx); pending: (Box, mask, number)."""
+    """Writes the numbers of patches, from 1, into labels (Ny, Nx); pending: (Box, mask, number)."""
     labels[:] = 0
     for inner, inside, i in pending:
         labels[inner.slices][inside] = i + 1

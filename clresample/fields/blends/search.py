@@ -43,9 +43,9 @@ class TileDetections:
 
 
 def search_tile(mosaics, reference, tile, *, threshold, scatters=None) -> TileDetections:
-    """Search one tile in all mosaics together.
+    """Searches one tile in all mosaics together.
 
-    mosaics: of the field; reference: Grid of the model's pixels; tile: Tile
+    mosaics: of the field; reference: Grid of the model's pixels; tile: SearchTile
     threshold [sigma]: least signal to noise of a peak
     scatters {mosaic's name: scatters of its signal to noise}: see `snr_scatter`; None = each tile's
 
@@ -71,7 +71,7 @@ def search_tile(mosaics, reference, tile, *, threshold, scatters=None) -> TileDe
 
 
 def place_known_sources(mosaics, reference, tile, positions, *, scatters=None) -> TileDetections:
-    """The Found of a tile for sources that a catalogue gives, positions (S, 2) [px of the field].
+    """TileDetections of a catalogue's sources at positions (S, 2) [px of the field].
 
     Their light is seen as `search_tile` sees it; peaks are the combined signal to noise there.
     """
@@ -115,7 +115,7 @@ def snr_scatter(mosaics, reference) -> dict:
 
 
 def observations_on(mosaics, reference, box):
-    """The Observations of all mosaics on a Box of the model's pixels, those that see it.
+    """The Observations of all mosaics that overlap a Box of the model's pixels.
 
     Their PSFs are those of the mosaics' middles, so that signal to noise does not depend on the
     Box. Where a PSF is wider than its filter by a tenth, that costs half a percent of it.

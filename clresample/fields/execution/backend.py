@@ -11,14 +11,16 @@ from .pool import WorkerPool
 
 @dataclass(frozen=True)
 class TaskKind:
-    """A kind of task in three steps, of which the second alone takes time, and no folder.
+    """A task type in three steps: gather, compute, store.
 
-    gather: called as given(context, task), returns what the task needs from the run's folder
-    compute: called as done(context, task, given), returns (value, content): a small value for
-        whoever asked, and the bytes of the file that the task leaves
-    path: called as path(context, task), returns where that file belongs
+    Only `compute` takes time; it needs no run folder.
 
-    All are functions of modules, so that another process can import them. Called itself, it does
+    gather: called as gather(context, task), returns the task's inputs from the run's folder
+    compute: called as compute(context, task, inputs), returns (value, content): a small value for
+        the caller, and the bytes of the task's file
+    path: called as path(context, task), returns the path of that file
+
+    All are functions of modules, so that another process can import them. Calling the TaskKind runs
     all three in turn and returns the value.
     """
 
@@ -32,7 +34,7 @@ class TaskKind:
         return value
 
     def keep(self, context, task, content):
-        """Write a task's file, whole or not at all. Raises FileError."""
+        """Writes a task's file, whole or not at all. Raises FileError."""
         with atomic_file(self.path(context, task)) as part:
             part.write_bytes(content)
 
@@ -55,16 +57,16 @@ class LocalWorkers:
 
     @property
     def device_shares(self) -> list[tuple]:
-        """Each device, and how many workers share it at most."""
+        """Each device, and the largest number of workers that share it."""
         n = -(-max(self.n_workers, 1) // len(self.devices))
         return [(device, n) for device in self.devices]
 
     def begin(self, work):
-        """Begin the processes now, and have them load what the work needs."""
+        """Starts the processes now and loads in them the modules of the work."""
         self.pool.begin(work)
 
     def run(self, work, context, tasks, again=None, stage=""):
-        """Yield the Outcome of every task, as `WorkerPool.run` does."""
+        """Yields the Outcome of every task, as `WorkerPool.run` does."""
         contexts = [replace(context, device=device) for device in self.devices]
         for outcome in self.pool.run(work, contexts, tasks, again):
             if outcome.reason is None:
@@ -72,12 +74,12 @@ class LocalWorkers:
             yield outcome
 
     def close(self):
-        """End the processes."""
+        """Ends the processes."""
         self.pool.close()
 
 
 def make_backend(options, progress):
-    """The engine that FieldOptions ask for. Raises ImportError, ValueError for a cluster's."""
+    """The backend of FieldOptions. Raises ImportError or ValueError for a cluster's."""
     devices = options.devices
     if options.scheduler is not None:
         from .cluster import DaskCluster

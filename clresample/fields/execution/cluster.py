@@ -38,7 +38,7 @@ class DaskCluster:
     devices: choices as `get_device` takes them, dealt to the workers of each host by turns; empty =
         each worker's own, which its environment's CLRESAMPLE_DEVICE names
     limit_s [s]: a task that takes longer is ended with its worker
-    progress: Progress, told the dashboard's address, and of workers that go
+    progress: RunProgress, told the dashboard's address, and of workers that go
     turns: (stage, Outcome) of every task so far that ended well
 
     Raises ImportError without distributed, ValueError where nothing answers, no worker is there, or
@@ -64,7 +64,7 @@ class DaskCluster:
         progress.dashboard(self.client.dashboard_link)
 
     def _check(self):
-        """Refuse a cluster without workers, or whose workers cannot run our functions."""
+        """Raises an error for a cluster without workers, or with workers that cannot run ours."""
         try:
             self.client.wait_for_workers(1, timeout=CONNECT_S)
         except TimeoutError as error:
@@ -82,18 +82,18 @@ class DaskCluster:
 
     @property
     def device_shares(self) -> list[tuple]:
-        """Each device, and how many workers share it: one."""
+        """Each device, and the number of workers that share it: one."""
         return [(device, 1) for device in self.seats.devices or (None,)]
 
     def close(self):
-        """Leave the cluster as it is."""
+        """Leaves the cluster as it is."""
         self.client.close()
 
     def begin(self, work):
         """The workers run already."""
 
     def run(self, work, context, tasks, again=None, stage=""):
-        """Yield the Outcome of every task, as `WorkerPool.run` does.
+        """Yields the Outcome of every task, as `WorkerPool.run` does.
 
         Raises DeviceError when every worker's device fails, FileError when the scheduler is gone or
         no worker has come for long.
@@ -119,9 +119,9 @@ class DaskCluster:
 
 
 class _Run:
-    """The tasks of one stage on their way.
+    """Unfinished tasks of one stage.
 
-    waiting: tasks that no worker has; ended: (seat, its future) of those that have ended
+    waiting: tasks without a worker; ended: (seat, its future) of finished tasks
     """
 
     def __init__(self, client, seats, work, context, waiting):
@@ -130,7 +130,7 @@ class _Run:
         self.ended: queue.Queue = queue.Queue()
 
     def outcomes(self):
-        """Yield the Outcomes of tasks, those that failed too, until none is left."""
+        """Yields the Outcomes of all tasks, failed ones included."""
         looked = 0.0
         while self.waiting or self.seats.busy:
             if time.monotonic() - looked > POLL_S:
@@ -143,7 +143,7 @@ class _Run:
                 yield outcome
 
     def _give(self, seat):
-        """Give a worker the next task; an Outcome where what it needs cannot be read."""
+        """Sends a worker the next task; returns an Outcome if the task's inputs cannot be read."""
         seat.task, seat.start_s = self.waiting.popleft(), time.monotonic()
         try:
             given = self.work.gather(self.context, seat.task)
@@ -188,7 +188,7 @@ class _Run:
         return outcome
 
     def _answer(self, seat, future):
-        """(value, reason, whether the worker is gone) of a task that has ended, its file kept."""
+        """(value, reason, True if the worker died) of a finished task; stores its file."""
         try:
             (value, content), reason = future.result(timeout=FETCH_S)
         except DeviceError as error:  # as the worker opened it
@@ -219,7 +219,7 @@ def _version():
 
 
 def _opened(blob, n_beside):
-    """The context on a worker, which shares its host's processor with so many."""
+    """The context on a worker, with the number of workers on its host's processor."""
     from distributed import get_worker
 
     for name, value in thread_environment(n_beside).items():

@@ -1,4 +1,4 @@
-"""The workers of a cluster that come, go and hang, each of which has one task at most."""
+"""Workers of a cluster, which may join, leave or hang, with one task at most each."""
 
 from __future__ import annotations
 
@@ -67,14 +67,14 @@ class ClusterWorkers:
         return sum(other.host == seat.host for other in self)
 
     def release_all(self):
-        """Give up all tasks and what they share."""
+        """Releases all tasks and their shared data."""
         with contextlib.suppress(Exception):  # of a scheduler that is gone
             self.client.cancel([s.future for s in self if s.future is not None])
         for seat in self:
             seat.context = seat.task = seat.future = None
 
     def poll(self) -> list[Outcome]:
-        """Take in workers that came; the Outcomes of tasks whose workers went or hang.
+        """Adds new workers; returns the Outcomes of tasks whose workers died or hang.
 
         Raises FileError when none has been there for NO_WORKER_TIMEOUT_S.
         """
@@ -114,13 +114,13 @@ class ClusterWorkers:
 
     @staticmethod
     def _cancel(seat):
-        """Forget a task that its worker may still be at: what it answers does not count."""
+        """Cancels a task that its worker may still run, and ignores the answer."""
         future, seat.future = seat.future, None
         if future is not None:
             future.cancel()
 
     def end(self, seat):
-        """End a worker, which its nanny replaces; one without a nanny leaves the cluster."""
+        """Ends a worker; its nanny replaces it, without a nanny it leaves the cluster."""
         self.there.pop(seat.address, None)
         self._cancel(seat)
         try:

@@ -103,9 +103,9 @@ class _BlendCutout:
 
 
 def fit_group(job, group, given) -> tuple[dict, bytes]:
-    """Fit a group: {"sources", "patches", "failed", "seconds"}, and its part as bytes.
+    """Fits a group: {"sources", "patches", "failed", "seconds"}, and its part as bytes.
 
-    given: Given of the group. A patch that fails is in the part with its reason. Raises
+    given: GroupInputs of the group. A patch that fails is in the part with its reason. Raises
     KeyboardInterrupt after Ctrl-C, DeviceError where the device no longer answers.
     """
     try:
@@ -181,7 +181,7 @@ def _source(patch, number, y, x, host):
 
 
 def is_large(n_sources, shape):
-    """Returns True if a fit of so many sources has over LARGE model pixels times them.
+    """Returns True if a fit has more than LARGE model pixels times sources.
 
     shape (2,) [px].
     """
@@ -226,7 +226,7 @@ def _settings(job, rough, large):
 
 
 def _second_look(job, given, cuts, results, part, n_round):
-    """Fit those blends again in whose residuals there are more sources, with these: cuts, results.
+    """Refits blends with the sources detected in their residuals: (cuts, results).
 
     The residuals are those of the whole fit. A first look of 30 iterations without structure, as
     `clresample deblend` takes, leaves bright galaxies' own structure in them: in simulated fields
@@ -290,7 +290,7 @@ def _on_patch(given, patch, source):
 
 
 def _take(part, job, cut, result, n_round):
-    """Add a fitted patch to the part."""
+    """Adds a fitted patch to the part."""
     patch, origin = cut.patch, np.array(cut.patch.box[:2])
     result = with_source_misfit_status(result)  # of its neighbours there is light in wide pixels
     names = [int(source.name) for source in result.sources]
@@ -349,7 +349,7 @@ def _all_channels(job, channels, values):
 
 
 def _set_aside(part, job, patch, n_round, status):
-    """Add a patch without a fit: its sources have their positions and the reason."""
+    """Adds a patch without a fit: its sources have their positions and the reason."""
     sources = list(patch.sources)
     rows = Columns()
     positions, ids = job.plan.positions[sources], job.plan.ids[sources]

@@ -1,4 +1,4 @@
-"""The folder of a run: whose it is, and whether another may go on in it."""
+"""The folder of a run: its owner, and whether another run may continue it."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ def gather_inputs(job, group) -> GroupInputs:
 
 
 def _light(job, group):
-    """{patch: {mosaic's name: [(Box, model)]}}: of its neighbours, where its cutouts see them."""
+    """{patch: {mosaic's name: [(Box, model)]}} of neighbours that overlap its cutouts."""
     shares: dict[str, dict[int, float]] = {}
     for patch, name, share in group.neighbour_models:
         shares.setdefault(name, {})[patch] = share

@@ -70,7 +70,7 @@ class GroupResults:
         self.n_flat += morphology.size
 
     def add_model(self, patch, i_mosaic, box, model):
-        """All sources of a patch (C, Ny, Nx) [counts] as a mosaic sees them on a Box."""
+        """All sources of a patch (C, Ny, Nx) [counts], rendered on a Box of a mosaic."""
         self.models.append((patch.number, i_mosaic, *box, self.n_pixels))
         self.pixels.append(np.ravel(model).astype(np.float32))
         self.n_pixels += model.size
@@ -152,7 +152,7 @@ class GroupResultsFile:
     def models(self, chosen=None, mosaic=None):
         """(patch, mosaic, Box, model (C, Ny, Nx)) of its patches, or of those in `chosen`.
 
-        On all mosaics, or on that with a number.
+        All mosaics are included, or the one with a number.
         """
         with open_fits(self.path) as hdus:
             index, hdu = _columns(hdus["MODELS"]), hdus["PIXELS"]

@@ -1,4 +1,4 @@
-"""Tasks in worker processes that may fail, hang or be killed, none of which loses a task."""
+"""Runs tasks in worker processes that may fail, hang or be killed, without losing a task."""
 
 from __future__ import annotations
 
@@ -83,18 +83,18 @@ class WorkerPool:
         self.close()
 
     def close(self):
-        """End all workers, whatever they do."""
+        """Ends all workers, busy ones included."""
         while self._workers:
             _end(self._workers.pop())
 
     def begin(self, function):
-        """Begin every worker now, and have it load what the function needs, before it is asked."""
+        """Starts every worker now and loads in it the modules of the function."""
         for worker in self._added(self.n_workers):
             with contextlib.suppress(OSError):  # it has died: its successor loads what it is given
                 worker.pipe.send((function, None))
 
     def run(self, function, contexts, tasks, again=None):
-        """Yield the Outcome of every task, as they end.
+        """Yields the Outcome of every task, as they end.
 
         function: called as function(context, task), in a module, so that a process can import it
         contexts: worker k gets the one numbered k modulo their number, pickled
@@ -123,7 +123,7 @@ class WorkerPool:
             raise
 
     def _some(self, run, waiting):
-        """Give tasks to those without; the Outcomes of some that have ended since."""
+        """Sends tasks to idle workers; returns the Outcomes of tasks that ended meanwhile."""
         if self.n_workers == 0:
             return [_in_this_process(run[0], run[1][0], waiting.popleft())]
         for worker in [w for w in self._workers if w.task is None and not w.process.is_alive()]:
@@ -150,7 +150,7 @@ class WorkerPool:
         return found
 
     def _added(self, most):
-        """New workers on empty seats, so many at most."""
+        """Starts workers on empty seats, a given number at most."""
         free = sorted(self._faults.keys() - {w.seat for w in self._workers})
         n_before = len(self._workers)
         for seat in free[:most]:
@@ -158,7 +158,7 @@ class WorkerPool:
         return self._workers[n_before:]
 
     def _count(self, seat, outcome):
-        """Count a device's error.
+        """Counts a device's error.
 
         The seat goes when there were too many, DeviceError with the last.
         """
@@ -170,7 +170,7 @@ class WorkerPool:
 
 
 def _give(worker, run, task):
-    """Send a worker a task, and before its first one of a run what the tasks share."""
+    """Sends a worker a task, before the first one also the data that tasks share."""
     worker.task, worker.since = task, time.monotonic()
     with contextlib.suppress(OSError):  # of one that has died: seen when its answer is awaited
         if worker.run is not run:
@@ -255,7 +255,7 @@ def _dead(worker):
 
 
 def _end(worker):
-    """End a worker's process, whatever it does."""
+    """Ends a worker's process, busy or not."""
     worker.pipe.close()
     worker.process.terminate()
     worker.process.join(2)
@@ -265,10 +265,7 @@ def _end(worker):
 
 
 def _work(pipe, bound, parent):
-    """Runs a worker: functions, contexts and tasks from the pipe, answers into it.
-
-    Until its end.
-    """
+    """Runs a worker until its end: reads functions, contexts and tasks, writes answers."""
     import signal
 
     limit_memory(bound)

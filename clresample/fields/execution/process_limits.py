@@ -13,7 +13,7 @@ PR_SET_PDEATHSIG = 1  # of prctl(2)
 
 
 def thread_environment(n_workers) -> dict:
-    """Environment of a worker that shares this machine's processor with so many, itself included.
+    """Environment of a worker, one of a number that share this machine's processor.
 
     NumPy's libraries get one thread, PoCL's CPU device its part of all, by the names of its older
     and newer versions.
@@ -27,7 +27,7 @@ def thread_environment(n_workers) -> dict:
 
 
 def limit_memory(bound):
-    """Have the system refuse this process private memory beyond so many bytes, where it can.
+    """Limits this process's private memory [bytes], if the system can.
 
     What is refused is a MemoryError, or a device's, which costs a group of fits its batch: they are
     fitted one by one. Files that are mapped do not count (RLIMIT_DATA of Linux).
@@ -42,7 +42,7 @@ def limit_memory(bound):
 
 
 def trim_memory():
-    """Give what this process no longer needs back to the system, where the C library can (glibc).
+    """Returns free memory to the system, if the C library can (glibc).
 
     Operators refer to themselves, so that only the collector frees them: Python calls it for many
     objects, not for large ones, and a giant's pieces left 0.1 to 0.3 GB of them a group, 2 GB in
@@ -56,7 +56,7 @@ def trim_memory():
 
 
 def freeze_objects():
-    """Have the collector pass over all that this process holds: modules, kernels, their context.
+    """Excludes all objects that exist now (modules, kernels, context) from garbage collection.
 
     Of a worker, after the first task of a stage: to collect then takes 1 ms instead of 70. What is
     kept and refers to itself is freed after `unfreeze_objects`, which the next stage begins with.
@@ -65,12 +65,12 @@ def freeze_objects():
 
 
 def unfreeze_objects():
-    """Have the collector look at all of it again."""
+    """Includes all objects in garbage collection again."""
     gc.unfreeze()
 
 
 def die_with_parent(parent):
-    """Have the system end this process when its parent is killed, where it can (Linux).
+    """Makes the system end this process when its parent is killed, if it can (Linux).
 
     Elsewhere it ends once its task has: until then it holds its memory beside those of a run that
     goes on, and leaves the part that this run makes too.

@@ -38,12 +38,12 @@ FIT = TaskKind(gather_inputs, fit_group, part_path)
 
 
 def fit_all_groups(job, engine, progress):
-    """Fit all groups that are not yet, round by round.
+    """Fits all groups that are not on disk yet, round by round.
 
     A cut blend's pieces are fitted again as long as a neighbour of theirs moves, and where their
     residuals held more sources.
-    returns the PartFiles, the last round's of each patch counting, and the parents of those cut
-    blends whose pieces had not settled when the rounds ended
+    returns the GroupResultsFiles, the last round's of each patch counting, and the parents of
+    those cut blends whose pieces had not settled when the rounds ended
     """
     progress.stage("fit", len(job.plan.patches))
     tasks = [FitGroup(_name(0, i), patches) for i, patches in enumerate(job.plan.groups)]
@@ -109,7 +109,7 @@ class _PieceHistory:
         self.job, self.names, self.found, self.new = job, {}, {}, set()
 
     def add(self, names):
-        """Add a round: {name: patches} of its parts."""
+        """Adds a round: {name: patches} of its parts."""
         self.new = set()
         for name in sorted(names):
             (table,) = _file(self.job, name).read("FOUND")
@@ -144,7 +144,7 @@ class _PieceHistory:
     def components_of(self, patches):
         """`FitGroup.components` of some pieces, by their last fits.
 
-        Asked again in each round, a source on the edge would go to and fro.
+        They are not tested again in each round, because a borderline source would alternate.
         """
         found: dict[int, int] = {}
         for name in sorted({self.names[patch][-1] for patch in patches}):
@@ -156,7 +156,7 @@ class _PieceHistory:
     def moved(self, patches):
         """Pieces whose flux changed by over MAX_FLUX_CHANGE_SIGMA errors since their fit before.
 
-        And by over SETTLED_PART of it.
+        The change must also exceed SETTLED_PART of the flux.
         """
         old = self._fluxes([(n, self.names[n][-2]) for n in patches])
         moved = set()
@@ -201,7 +201,7 @@ def _columns(rows, kind, job):
 
 
 def _fit_round(job, tasks, engine, progress):
-    """Fit the groups of one round; {name: patches} of their parts."""
+    """Fits the groups of one round; {name: patches} of their parts."""
     names, todo = {}, []
     there = _parts_of(job.folder)
     for task in tasks:
@@ -252,6 +252,6 @@ def _parts_of(folder):
 
 
 def _check_space(folder, reason):
-    """Raise FileError where a group failed because the disk is full: going on would lose all."""
+    """Raises FileError if a group failed because the disk is full, which would lose all."""
     if "cannot be written" in reason or "No space left" in reason:
         raise FileError(f"{folder}: {reason}; what is finished stays: --resume goes on")

@@ -1,4 +1,4 @@
-"""The first look at a field, once: how its noise scatters, and what the devices hold."""
+"""Measures once per run the noise scatter of each mosaic and the device memory of a group."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class _Field:
 
 
 def prepare_search(mosaics, reference, work, engine):
-    """Take the first look at a field, unless it was taken. Raises ImportError without sep."""
+    """Measures the search setup of a field, once per run. Raises ImportError without sep."""
     if (work / FILE).exists():
         return
     tried: list = []
@@ -61,7 +61,7 @@ def prepare_search(mosaics, reference, work, engine):
 
 
 def read_search_setup(work) -> SearchSetup:
-    """The first look that was taken."""
+    """Reads the setup that was measured."""
     return SearchSetup(**json.loads((work / FILE).read_text()))
 
 
@@ -70,7 +70,7 @@ def _given(field, sharing):
 
 
 def _look(field, sharing, given):
-    """sharing: [(choice of a device, how many workers share it)]; None is the worker's own."""
+    """sharing: [(choice of a device, number of its workers)]; None is the worker's own."""
     devices = [(get_device(field.device if choice is None else choice), n) for choice, n in sharing]
     scatters = snr_scatter(field.mosaics, field.reference)
     look = SearchSetup(

@@ -93,7 +93,7 @@ def load_or_make_plan(mosaics, reference, region, core, work, options, engine, p
 
 
 def _searched(mosaics, reference, tiles, work, options, engine, progress):
-    """Search the tiles that are not yet; {number: reason} of those that could not be."""
+    """Searches the remaining tiles; returns {number: reason} of those that failed."""
     positions = _given_px(options.positions, reference)
     todo = [tile for tile in tiles if not _found_path(work, tile.number).exists()]
     progress.stage("search", len(tiles))
@@ -149,7 +149,7 @@ def _nothing(shared, tile):
 
 
 def _search_tile(shared, tile, given):
-    """Search one tile: the number of sources, and what was found as bytes."""
+    """Searches one tile: (number of sources, detections as bytes)."""
     known = shared.mosaics, shared.reference, tile
     if shared.positions is None:
         found = search_tile(*known, threshold=shared.threshold, scatters=shared.scatters)

@@ -1,4 +1,4 @@
-"""FIELD.toml, scene files and what they name: keys, headers, mosaics opened, sky and noise.
+"""FIELD.toml, scene files and their files: keys, headers, mosaics, sky and noise.
 
 Imports `files`, `measurement`, `deblending` and `sky`.
 """

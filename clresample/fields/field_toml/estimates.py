@@ -1,4 +1,4 @@
-"""Estimates from pixels what a mosaic lacks: sky, noise and its correlation."""
+"""Estimates from pixels the sky, noise and correlation that a mosaic lacks."""
 
 from __future__ import annotations
 
@@ -16,10 +16,7 @@ SAMPLE_PX = 1024
 
 
 def _good(channel):
-    """Returns a function that selects the valid pixels of a Box.
-
-    By a channel's mask and weights.
-    """
+    """Returns a function that selects the valid pixels of a Box by a channel's mask and weights."""
     only = channel if channel.weight is not None else replace(channel, weight=ConstantPlane(1.0))
     return lambda box: only.weights(box) > 0
 

@@ -1,4 +1,4 @@
-"""FIELD.toml: the mosaics of a field, opened, and how it is run.
+"""Reads FIELD.toml: opens the mosaics of a field and the options of its run.
 
     [[mosaic]]                      one table for each instrument
     [sources] or [detection]        a catalogue, or how to look for sources
@@ -39,9 +39,10 @@ class FieldFile:
 
 
 def read_field(path) -> FieldFile:
-    """Open what a field file names. Pixels are read later, piece by piece, but for estimates.
+    """Opens the mosaics that a field file names; pixels are read later, piece by piece.
 
-    Raises SceneError and FileError: ValueErrors of one line.
+    path: of the TOML file; its relative paths start from its folder
+    Noise estimates read pixels at once. Raises SceneError and FileError: ValueErrors of one line.
     """
     path = Path(path)
     tables = parse_field(path)

@@ -14,7 +14,7 @@ STERADIAN_ARCSEC2 = (180 / math.pi * 3600) ** 2
 
 
 def zero_point(header, pixel_scale_arcsec) -> float | None:
-    """AB magnitude of one count [mag] by a header, or None where it does not say.
+    """AB magnitude of one count [mag] from a header, or None.
 
     By BUNIT: nJy, uJy, Jy, nanomaggies, and MJy/sr with the pixels' area; by FLUXMAG0, the counts
     of magnitude 0; by PHOTFLAM and PHOTPLAM of HST; by a card of ZERO_POINTS, taken as AB.

@@ -162,7 +162,7 @@ class ImageFiles:
         return [FilePlane(path, number, i) for i in _indices(hdu.shape)]
 
     def _note(self, what, k, n, path):
-        """Add a file to the inputs, numbered where there are several."""
+        """Adds a file to the inputs, numbered where there are several."""
         number = f" {k + 1}" if n > 1 else ""
         self.inputs[f"{what}{number} of {self.table['name']}"] = path
 

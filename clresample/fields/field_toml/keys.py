@@ -51,7 +51,7 @@ class OneOf:
 
     @property
     def text(self):
-        """What messages say of it."""
+        """The permitted names as messages quote them."""
         return " or ".join(f'"{form}"' for form in self.formats)
 
     def fits(self, value):

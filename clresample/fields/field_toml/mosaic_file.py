@@ -98,7 +98,7 @@ def _bands(table, n):
         return [None] * n
     names = as_list(table["band"])
     if len(names) not in (1, n):
-        raise ValueError(f"band has {len(names)} names, it takes one, or one for each of {n}")
+        raise ValueError(f"band has {len(names)} names, must have one, or one for each of {n}")
     return names * (n if len(names) == 1 else 1)
 
 
@@ -127,6 +127,7 @@ def _numbers(table, key, n):
     given = [float(value) for value in as_list(table[key])]
     if len(given) not in (1, n):
         raise ValueError(
-            f"{key} has {len(given)} numbers, it takes one for all channels, or one for each of {n}"
+            f"{key} has {len(given)} numbers, must have one for all channels, or one for each "
+            f"of {n}"
         )
     return given * (n if len(given) == 1 else 1)

@@ -124,7 +124,7 @@ def _origin(table, form, header, grid, psf, notes) -> np.ndarray:
 
 
 def _check_stars(psf, origin, grid, name, notes):
-    """Add a note where an image lies away from the stars of a PSFEx file."""
+    """Adds a note where an image lies away from the stars of a PSFEx file."""
     middle = (np.array(grid.shape) - 1) / 2
     if psf.degree and not _among_stars(psf, middle + origin):
         notes.append(

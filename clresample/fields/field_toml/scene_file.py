@@ -55,8 +55,9 @@ class SceneFile:
 
 
 def read_scene(path) -> SceneFile:
-    """Read a scene file and everything that it names.
+    """Reads a scene file and all files that it names.
 
+    path: of the TOML file; its relative paths start from its folder
     Raises SceneError, and FileError for the images: ValueErrors of one line.
     """
     path = Path(path)
@@ -170,7 +171,7 @@ def _frame(table, observations):
     if reference is not None:
         if reference not in names:
             raise ValueError(
-                f"frame: reference is {reference!r}, it takes the name of an observation: "
+                f"frame: reference is {reference!r}, must be the name of an observation: "
                 f"{', '.join(names)}"
             )
         grid = (grid_intersection if shared else grid_union)(

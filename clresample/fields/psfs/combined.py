@@ -43,7 +43,7 @@ class PerBandPSF(PSFField):
         fields = tuple(fields)
         bands = [field.n_bands for field in fields]
         if not fields or set(bands) != {1}:
-            raise ValueError(f"fields have {bands} bands, it takes one or more with one band each")
+            raise ValueError(f"fields have {bands} bands, must be one or more with one band each")
         object.__setattr__(self, "fields", fields)
 
     @property
@@ -67,7 +67,7 @@ def stack_bands(psfs) -> PSF:
     spacings = [psf.spacing for psf in psfs]
     if len(set(spacings)) > 1:
         raise ValueError(
-            f"psfs have samples {spacings} px apart, bands of one PSF share a distance"
+            f"PSFs have sample spacings {spacings} px; all bands of a PSF must have the same"
         )
     shape = np.max([psf.images.shape[1:] for psf in psfs], axis=0)
     images, centers = [], []

@@ -119,7 +119,7 @@ def _number(hdu, detector):
 
 
 def _model(cards, images):
-    """The fields of a PSFExPSF. Raises ValueError and KeyError for what it cannot be."""
+    """The fields of a PSFExPSF. Raises ValueError and KeyError for invalid ones."""
     images = images[None] if images.ndim == 2 else images
     if images.ndim != 3 or not np.isfinite(images).all():
         raise ValueError(f"PSF_MASK has the shape {images.shape}, must be (K, ny, nx), finite")

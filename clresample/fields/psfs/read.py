@@ -53,7 +53,7 @@ def read_psf_field(
     Raises FileError, one line that names the file, and ValueError for another form.
     """
     if form not in FORMATS:
-        raise ValueError(f"psf_format is {form!r}, it takes {', '.join(FORMATS)}")
+        raise ValueError(f"psf_format is {form!r}, must be {', '.join(FORMATS)}")
     samples = {"spacing": spacing, "center": center}
     if form not in OWN:
         given = {"hdu": hdu, "bands": bands, "stamp_px": stamp_px, "detector": detector} | samples

@@ -139,7 +139,7 @@ def require_grid(path, grid) -> Grid:
 
 
 def assemble_mosaic(survey, found, given, *, noise="white") -> Mosaic:
-    """The Mosaic of what a reader has found and its user given.
+    """Assembles a Mosaic from a reader's files and its user's options.
 
     survey: its name where none is given; found: sequence of BandFiles; given: ReaderOptions
     noise: what is done with its correlation unless the user says otherwise
@@ -199,7 +199,7 @@ def corner_distance_px(one, other) -> float:
 
 
 def _chosen(found, bands):
-    """Those of the bands asked for, in their order."""
+    """The selected bands, in their order."""
     if bands is None:
         return list(found)
     there = {one.band: one for one in found}

@@ -27,13 +27,14 @@ READERS = Formats("clresample.readers", OWN)
 def read_survey(form, path, **given) -> Mosaic:
     """The Mosaic of a survey's files.
 
-    form: of READERS; path: a file, a list of files or a folder, see its module; given: see `Given`
+    form: of READERS; path: a file, a list of files or a folder, see its module; given: see
+        ReaderOptions
 
     Raises ValueError for another format, what is missing, and a reader of another package that
     cannot be imported or returns something else; FileError for what cannot be read.
     """
     if form not in READERS:
-        raise ValueError(f"format is {form!r}, it takes {', '.join(READERS)}")
+        raise ValueError(f"format is {form!r}, must be {', '.join(READERS)}")
     return check_instance(
         f"the result of the reader {form!r}", READERS[form](path, **given), Mosaic
     )

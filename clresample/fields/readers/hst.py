@@ -94,7 +94,7 @@ def _band(path, given):
 
 
 def _weight(path, names, data, grid, band, files, given):
-    """The plane of WHT, times what makes it inverse variances."""
+    """The plane of WHT, scaled to inverse variances."""
     if "WHT" in names:
         plane, _ = matching_plane(grid, path, "WHT")
     else:
@@ -121,7 +121,7 @@ def _weight(path, names, data, grid, band, files, given):
 
 
 def _filter(header, path):
-    """The filter's name, by FILTER or the one of FILTER1 and FILTER2 that is no clear glass."""
+    """The filter's name: FILTER, or the one of FILTER1 and FILTER2 that is not clear."""
     for key in ("FILTER", "FILTER1", "FILTER2", "FILTNAM1"):
         name = str(header.get(key, "")).strip()
         if name.upper() not in CLEAR and not name.upper().startswith("CLEAR"):

@@ -102,7 +102,7 @@ def _tables(hdus):
 
 
 def _calibration(hdus):
-    """nJy a count and whether it is the same everywhere, of the archive; (None, True) without."""
+    """nJy a count of the archive, and True if it is uniform; (None, True) without it."""
     tables, header = _tables(hdus), hdus[0].header
     index = header.get("AR_HDU", 0) - 1
     if index in tables and {"id", "cat.archive", "row0"} <= tables[index]:

@@ -20,7 +20,7 @@ SHEET_STAMPS = 16  # stamps side by side on the sheet of a CATALOG-PSF
 
 
 def write_mer_tile(folder, tile, band, data, grid, *, rms, flags, zero_point, psfs, places):
-    """Write one band of a tile of Euclid's MER; returns the four paths, the image first.
+    """Writes one band of a tile of Euclid's MER; returns the four paths, the image first.
 
     folder: that exists; tile: its number; band: such as "VIS"
     data, rms (Ny, Nx) [counts]; flags (Ny, Nx): whole numbers; zero_point [mag]: AB of one count
@@ -64,7 +64,7 @@ def _mer_sheet(grid, psfs, places):
 def write_cell_coadd(
     path, band, data, grid, *, variance, mask, zero_point, psf_at, cell_px, noises=()
 ):
-    """Write a cell coadd of Rubin; returns the path.
+    """Writes a cell coadd of Rubin; returns the path.
 
     data [counts], variance [counts^2] (Ny, Nx): they are written in nJy
     mask {name: (Ny, Nx) bool}: planes; zero_point [mag]: AB of one count
@@ -97,7 +97,7 @@ def write_cell_coadd(
 
 
 def _tree(band, shape, cells, cell_px):
-    """The HDU of the tree, as far as it says where the PSF's cells lie."""
+    """The HDU of the tree, with the positions of the PSF's cells alone."""
     whole = {axis: {"start": 0, "stop": n * cell_px} for axis, n in zip("yx", cells, strict=True)}
     bounds = {
         "grid": {"bbox": whole, "cell_shape": {"y": cell_px, "x": cell_px}},

@@ -15,8 +15,8 @@ MAX_SOURCES = 1000  # of a page: each takes some 20 core-milliseconds an instrum
 class OwnModels:
     """Renders single sources of a finished run, MAX_SOURCES at most.
 
-    Needs the inputs of the run, models.fits and an OpenCL device; without them a note says so, and
-    `on` gives None.
+    Needs the inputs of the run, models.fits and an OpenCL device. Without them `on` returns None,
+    and a note gives the reason.
     """
 
     def __init__(self, run, notes):
@@ -37,7 +37,7 @@ class OwnModels:
     def on(self, source, instrument, box):
         """Model (C, ny, nx) [counts] of a source on a Box of an instrument's pixels.
 
-        None where it has none, or cannot be had.
+        None for a source without a model, or if it cannot be rendered.
         """
         if self._cutouts is None:
             return None

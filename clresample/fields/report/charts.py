@@ -154,7 +154,7 @@ def pull_charts(run, truth):
 def completeness(truth):
     """(svg, shares [(low, high, found, of)]) of the true sources found, by their signal to noise.
 
-    None where the truth does not say it.
+    None if the truth has no signal to noise.
     """
     if "snr" not in truth.table.colnames:
         return None

@@ -1,4 +1,4 @@
-"""How the sky's light is shown at first: channels as colours, and the limits of the stretch."""
+"""Initial display of the sky's light: channels as colours, and the limits of the stretch."""
 
 from __future__ import annotations
 

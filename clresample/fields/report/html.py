@@ -100,7 +100,7 @@ def data_block(name, data) -> str:
 
 
 def page(title, body, data) -> str:
-    """The whole page. The browser is told to run this script alone and to load nothing."""
+    """The whole page, with a policy that permits this script alone and loads nothing."""
     style = (PAGE / "report.css").read_text()
     script = "\n".join((PAGE / name).read_text() for name in SCRIPTS)
     policy = (

@@ -60,7 +60,7 @@ class Instrument:
 
 
 def instruments_in(folder, notes, names):
-    """The instruments of a folder, the smallest pixels first; what cannot be read gets a note.
+    """The instruments of a folder, smallest pixels first; unreadable ones get a note.
 
     names: {part of a file's name: name of the mosaic}, as far as they are known
     """
@@ -80,7 +80,7 @@ def _instrument(name, model, residual):
         header = hdus[0].header
         shape = hdus[0].shape
         if len(shape) != 3 or 0 in shape or models[0].shape != shape:
-            raise FileError(f"{residual}: is no cube of the shape of {model.name}")
+            raise FileError(f"{residual}: is not a cube of the shape of {model.name}")
         channels = tuple(str(header.get(f"BAND{i + 1}", i)) for i in range(shape[0]))
         grid = Grid.from_wcs(celestial_header(residual, header, hdus), shape)
         rows = np.unique(np.linspace(0, shape[1] - 1, SAMPLE_ROWS).astype(int))

@@ -233,7 +233,7 @@ def _value(table, name, row):
 
 
 def _facts(table, row):
-    """[what, text] of a source, for its panel."""
+    """Title and text of each line of a source's panel."""
     texts = [["Fit", f"{table['status'][row]}"]] if "status" in table.colnames else []
     if "reason" in table.colnames and str(table["reason"][row]):
         texts.append(["Reason", str(table["reason"][row])])

@@ -1,4 +1,4 @@
-"""An instrument's images as tiles at several scales: what a page holds of a mosaic of any size."""
+"""An instrument's images as tiles at several scales, for mosaics of any size."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ class RunFolder:
 
 
 def read_run(folder) -> RunFolder:
-    """Read a run's folder. Raises FileError where it holds none, or a catalogue that is damaged."""
+    """Reads a run's folder. Raises FileError without a run, or if its catalogue is damaged."""
     folder = Path(folder)
     if not folder.is_dir():
         raise FileError(f"{folder}: no such folder")
@@ -116,7 +116,7 @@ def _finished(folder, notes):
     if (folder / "fit_table.ecsv").is_file():
         fits = read_catalogue(folder / "fit_table.ecsv")
     else:
-        notes.append("fit_table.ecsv is not there: nothing is told of single fits")
+        notes.append("fit_table.ecsv does not exist: the report has no table of fits")
     return sources, fits
 
 
@@ -134,7 +134,7 @@ def _json(path, notes):
 
 
 def _done(work):
-    """{"tiles searched": ..., "fits": ...} of an unfinished run: (done, of how many or None)."""
+    """{"tiles searched": ..., "fits": ...} of an unfinished run: (done, total or None)."""
     tiles = len(list(work.glob("tile-*.npz")))
     notes: list[str] = []
     plan = _json(work / "plan.json", notes) if (work / "plan.json").is_file() else None

@@ -30,7 +30,7 @@ SLOWEST, MAX_FAILED = 15, 200
 
 
 def heading(run, area_arcmin2) -> str:
-    """Title, instruments, the numbers that matter, and what is missing."""
+    """Title, instruments, main numbers, and missing parts."""
     state = source_states(run)
     what = " + ".join(f"{i.name} ({', '.join(i.channels)})" for i in run.instruments)
     numbers = [(f"{len(run.sources):,}", "sources"), (f"{len(run.fits):,}", "fits")]

@@ -23,7 +23,8 @@ MAX_STAMPS = 2000  # sources with pictures, at most: reading them takes some 10 
 def stamps_of(run, frame, order, budget, notes):
     """{source's row: its pictures}, of the first rows of `order` that fit into `budget` bytes.
 
-    run: Run; frame: Grid of the page's pixels; order: rows of the catalogue, the first ones first
+    run: RunFolder; frame: Grid of the page's pixels; order: rows of the catalogue, the first ones
+        first
 
     Of each: "box" [x0, y0, side] of the frame's pixels shown, and "rows", a dict for each channel:
     "name", "instrument" and "channel" (numbers), "model" and "residual" (texts of `codes.encode` in

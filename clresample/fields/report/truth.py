@@ -1,4 +1,4 @@
-"""A catalogue beside the truth of a simulated field: which source is which, and how far off."""
+"""Compares a catalogue with the truth of a simulated field, matched source by source."""
 
 from __future__ import annotations
 
@@ -79,7 +79,9 @@ def _read(run, path):
     table = read_catalogue(path)
     names = set(table.colnames)
     if not {"y", "x"} <= names or not any(name.startswith("flux_") for name in names):
-        raise FileError(f"{path}: is no truth of a field: it needs y, x [px] and flux_CHANNEL")
+        raise FileError(
+            f"{path}: is not the truth of a field: it must have y, x [px] and flux_CHANNEL"
+        )
     true = np.stack([plain(table[c]) for c in ("y", "x")], axis=1)
     rows = run.sources
     at = np.stack([plain(rows[c]) for c in ("y", "x")], axis=1) if len(rows) else np.zeros((0, 2))

@@ -44,7 +44,7 @@ class Report:
 
 
 def write_report(folder, path=None, *, truth=None, most_bytes=MAX_BYTES, overwrite=False) -> Report:
-    """Write the report of a run of `run_field`, finished or not: one HTML page.
+    """Writes the report of a run of `run_field`, finished or not: one HTML page.
 
     The page holds the pixel values of the field's data, models and residuals as tiles to zoom into,
     every source of it, pictures of up to 2000 sources in every channel, the source alone where the
@@ -96,7 +96,7 @@ def _inputs(folder, truth):
 
 
 def _pyramids(run, budget, notes):
-    """Tiles of all instruments; each gets its share of the bytes by what it would take."""
+    """Tiles of all instruments, with bytes divided in proportion to their full sizes."""
     found: list = []
     wanted = [full_bytes(one) for one in run.instruments]
     for k, one in enumerate(run.instruments):

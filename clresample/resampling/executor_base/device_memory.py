@@ -18,7 +18,7 @@ class DeviceMemory:
     device, dtype, tuning, plans, n_bands: of the executor
     n_reserved: images that there is room for; scratch: the intermediates, by their names
     which (items,): int32, on the device: the plan of each item; None where all are seen alike
-    Subclasses implement scratch_shapes, bind and bind_back
+    Subclasses implement scratch_shapes, bind and bind_adjoint
     """
 
     def __init__(self, device, dtype, plans):
@@ -34,20 +34,20 @@ class DeviceMemory:
         raise NotImplementedError
 
     def bind(self):
-        """Bind the products to the scratch that is there, those of the way forward at least."""
+        """Binds the products, at least the forward ones, to the present scratch buffers."""
         raise NotImplementedError
 
     def bind_adjoint(self):
-        """Bind those of the adjoint, which many callers never ask for."""
+        """Binds the products of the adjoint, which many callers never use."""
 
     def ensure_adjoint(self):
-        """See that the products of the adjoint are bound."""
+        """Binds the products of the adjoint if they are not bound yet."""
         if not self._bound_back:
             self.bind_adjoint()
             self._bound_back = True
 
     def select_plans(self, which):
-        """Have the next items seen by these plans (items,), of `which` made as large as that."""
+        """Selects the plans `which` (items,) of the next items; reserve as many items before."""
         self.device.upload(np.ascontiguousarray(which, np.int32), self.which[: len(which)])
 
     def cached(self, name, make):
@@ -66,7 +66,7 @@ class DeviceMemory:
         return other
 
     def reserve(self, n_images):
-        """Make room for the intermediates of `n_images` images at a time."""
+        """Makes room for the intermediates of `n_images` images at a time."""
         if self.n_reserved != n_images:
             # until all is bound: an interruption leaves nothing half done
             self.n_reserved, self._bound_back = 0, False
@@ -96,7 +96,7 @@ class DeviceMemory:
         return -(-n // self.tuning.line_group) * self.tuning.line_group
 
     def item_sizes(self, **sizes) -> ItemSizes | None:
-        """The Own of products with these sizes of each plan; None where all items share them."""
+        """The ItemSizes of products with these sizes of each plan; None if all items share them."""
         return None if self.which is None else ItemSizes(self.which, **sizes)
 
     def _table(self, tables, *shape) -> MatrixBatch:

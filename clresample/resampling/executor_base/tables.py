@@ -58,7 +58,7 @@ class ExecutorTables(DeviceMemory):
         return self._table([getattr(plan, name).T for plan in self.plans], *shape)
 
     def set_transfer(self, transfer):
-        """Upload the transfer functions: a pair D(+,+), D(+,-) (C, Hy, Hx) for each plan.
+        """Uploads the transfer functions: a pair D(+,+), D(+,-) (C, Hy, Hx) for each plan.
 
         Of a batch that one plan serves, for each item, from before `clone` and `reserve` on.
         """

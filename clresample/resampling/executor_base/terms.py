@@ -26,7 +26,7 @@ class PSFTerms:
         )
 
     def bind(self, scratch):
-        """Take the executor's intermediates, as they are by now."""
+        """Binds the executor's present intermediates."""
         e = self._executor
         buffer, stride, _ = e.tables(e.transfer)
         shared = {
@@ -40,11 +40,11 @@ class PSFTerms:
         self._spread.bind(**shared, n_bands=e.n_bands, D=buffer, stride_d=stride)
 
     def add(self, n):
-        """Queue the sums of `n` images."""
+        """Queues the sums of `n` images."""
         self._run(self._add, n)
 
     def split(self, n):
-        """Queue the parts of `n` images."""
+        """Queues the parts of `n` images."""
         self._run(self._spread, n)
 
     def _run(self, launch, n):

@@ -27,9 +27,9 @@ MAX_BYTES = 1 << 20
 
 
 class FoldedExecutor:
-    """Forward and adjoint of one aligned ResamplingPlan, as Executor has them.
+    """Forward and adjoint of one aligned ResamplingPlan, with the interface of Executor.
 
-    Inside it is float64.
+    It computes in float64.
 
     Images on either side are float32. `is_preferred` says for which operators it is made.
 
@@ -59,7 +59,7 @@ class FoldedExecutor:
         return -(-n // self.tuning.tile["VW"]) * self.tuning.tile["VW"]
 
     def set_transfer(self, transfer):
-        """Take the transfer functions, one pair D(+,+), D(+,-) (C, Hy, Hx), in a list."""
+        """Sets the transfer functions: a list of one pair D(+,+), D(+,-) (C, Hy, Hx)."""
         ((d_plus, d_minus),) = transfer
         for i, plane in enumerate((d_plus.real, d_plus.imag, d_minus.real, d_minus.imag)):
             self._transfer[:, :, i, : plane.shape[2]] = plane
@@ -67,7 +67,7 @@ class FoldedExecutor:
             self.device.upload(self._transfer, self.scratch["transfer"])
 
     def reserve(self, n_images):
-        """Make what is held on the device: intermediates for each core, for any `n_images`."""
+        """Allocates the intermediates of each core on the device, for any `n_images`."""
         if self.scratch:
             return
         plan, mapping, axes, put = self.plan, self.plan.mapping, self.plan.axes, self.device.put
@@ -99,7 +99,7 @@ class FoldedExecutor:
         self._queue(self._adjoint, y, x, n, 1)
 
     def _queue(self, way, source: ImageBatch, target: ImageBatch, n, n_seen):
-        """Queue one way to `n` images, `n_seen` of them from each that goes in."""
+        """Queues forward or adjoint to `n` images, `n_seen` of them per input image."""
         launch, *all_axes = way
         given = {"n_sources": n // n_seen, "n_seen": n_seen}
         for name, images, axes in zip(("source", "target"), (source, target), all_axes):

@@ -1,5 +1,5 @@
-"""Images of several instruments on one grid and under one PSF, with their noise.
+"""Maps images of several instruments onto one grid and one PSF, with their noise.
 
-match.py: the call; kernel.py: the noise of the result; target.py: which grid and PSF. They
-import sky and the operator.
+match.py has the call `match`; kernel.py propagates the noise; target.py chooses the grid and PSF.
+The package imports sky and the operator.
 """

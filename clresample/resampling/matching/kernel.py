@@ -1,13 +1,13 @@
-"""The noise of an operator's output: the variance of its pixels, and their correlation.
+"""Propagates noise through an operator: variances of pixels and their correlation.
 
 With the kernel h of an operator, I2(X) = sum_x h(X - x) I1(x), and white noise of variance
 sigma^2(x) in the input,
 
     var(X) = sum_x h(X - x)^2 sigma^2(x),     rho(d) = sum_X h(X) h(X + d) / sum_X h(X)^2.
 
-h is sampled finely enough along the output's axes that h^2 is, too; sums with h^2 are then those of
-a second operator, whose PSF is h^2. Input noise that is correlated takes h convolved with the
-filter that would make it of white noise.
+h is sampled finely enough along the output's axes that h^2 is resolved too. Sums with h^2 are then
+those of a second operator, whose PSF is h^2. For correlated input noise, h is first convolved with
+the filter that would make that noise from white noise.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class NoiseKernel:
 
 
 def _correlation(h, finer):
-    """The NoiseCorrelation of noise that was convolved with h, sampled finer; None if white."""
+    """NoiseCorrelation of white noise convolved with h, sampled finer; None if white."""
     size = [2 * n for n in h.shape]
     found = np.fft.irfft2(np.abs(np.fft.rfft2(h, size)) ** 2, size)
     lags = finer * np.arange(-MAX_LAG_PX, MAX_LAG_PX + 1)

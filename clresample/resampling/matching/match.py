@@ -1,4 +1,4 @@
-"""`match`: any images onto one grid and under one PSF, with the noise that they have there."""
+"""Maps any images onto one grid and one PSF, with their noise there: `match`."""
 
 from __future__ import annotations
 
@@ -27,23 +27,24 @@ FILL_SIGMA_PX = 1.5
 
 @one_blas_thread()
 def match(observations, grid=None, psf=None, *, max_gain=2.0, device=None) -> Observation:
-    """Images of several instruments on one grid and under one PSF, as one Observation.
+    """Maps images of several instruments onto one grid and one PSF, as one Observation.
 
     Each channel is mapped by the operator of the fits: resampled and convolved exactly, in one
-    step, its flux per pixel that of the new pixels. The noise is propagated: the variance of every
-    pixel, and how the noise of neighbouring pixels is correlated.
+    step, to the flux per pixel of the new pixels. The noise is propagated: the variance of every
+    pixel, and the correlation of neighbouring pixels.
 
     observations: one Observation or several, of one patch of sky
     grid: Grid of the result; None = that of the observation with the widest PSF
     psf: PSF of the result in pixels of `grid`, of one band; None = the widest of all, in arcsec
-    max_gain: by how much noise of any frequency may grow: PSFs that are wider than `psf` have to be
-        sharpened
-    device: as `get_device` takes it
+    max_gain: largest permitted gain of the noise at any frequency, which grows where a PSF wider
+        than `psf` is sharpened
+    device: see `get_device`
 
-    returns Observation: all channels (C, Ny, Nx) in the order given, each in its own counts, with
-        its weights, names, zero points and NoiseCorrelation. Weights are 0 beyond an image's edge
-        and where over a hundredth of a pixel's noise comes from pixels without weight, which are
-        filled from those about them. Of a PSF that varies that in the middle of its image counts
+    returns Observation: all channels (C, Ny, Nx) in the order passed, each in its own counts, with
+        its weights, names, zero points and NoiseCorrelation. Pixels without weight are filled from
+        their neighbours. Weights are 0 beyond an image's edge, and where over a hundredth of a
+        pixel's noise comes from filled pixels. A PSF that varies is evaluated in the middle of its
+        image
 
     Raises ValueError for observations that do not go together, a grid that none of them overlaps,
     a PSF of several bands, and a gain over max_gain.
@@ -119,7 +120,7 @@ def _matched(observation, grid, psf, max_gain, device):
 
 
 def _filled(image, seen):
-    """An image (Ny, Nx) whose pixels without weight are filled from those about them."""
+    """Fills the pixels of an image (Ny, Nx) without weight from their neighbours."""
     if seen.all():
         return image
     from astropy.convolution import Gaussian2DKernel, interpolate_replace_nans

@@ -1,4 +1,4 @@
-"""The grid and PSF that images are matched to: those of the image with the widest PSF."""
+"""Chooses the grid and PSF of matched images: those of the image with the widest PSF."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ...sky.wcs import local_axes
 
 
 def widest(observations):
-    """The observation and the band of the PSF of the largest area 1 / sum P^2: two numbers."""
+    """Numbers of the observation and band whose PSF has the largest area 1 / sum P^2."""
     widths = [
         o.psf.spacing * o.grid.pixel_scale_arcsec / np.sqrt((o.psf.images**2).sum(axis=(1, 2)))
         for o in observations
@@ -22,7 +22,7 @@ def widest(observations):
 
 
 def local_matrix(grid_from: Grid, grid_to: Grid) -> np.ndarray:
-    """Jacobian (2, 2) from pixels of one grid to those of another, in the first one's middle."""
+    """Jacobian (2, 2) from pixels of one grid to those of another, in the middle of the first."""
     y, x = (np.array(grid_from.shape) - 1) / 2
     if grid_from.is_flat:
         steps = [[y - 0.5, x], [y + 0.5, x], [y, x - 0.5], [y, x + 0.5]]
@@ -36,10 +36,10 @@ def local_matrix(grid_from: Grid, grid_to: Grid) -> np.ndarray:
 
 
 def psf_on(psf: PSF, grid_from: Grid, grid_to: Grid) -> PSF:
-    """A PSF of one grid's pixels as one of another grid's, by sinc interpolation of its samples.
+    """Resamples a PSF from one grid's pixels to another's by sinc interpolation.
 
-    The samples lie along the other grid's axes, so close that they hold all frequencies of the
-    first ones: `spacing` is not 1 then.
+    The samples lie along the other grid's axes, finely enough for all frequencies of the original:
+    `spacing` is then not 1.
     """
     matrix = local_matrix(grid_to, grid_from)  # from pixels of grid_to to those of grid_from
     scale = math.sqrt(abs(np.linalg.det(matrix)))

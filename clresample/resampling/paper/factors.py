@@ -77,7 +77,7 @@ class PaperFactors:
         self.waves, self.kernels = self.make_kernels(d, shift)
 
     def reserve(self, n):
-        """Make room for the intermediates of `n` images at a time."""
+        """Makes room for the intermediates of `n` images at a time."""
         if self.scratch.get("n") == n:
             return
         ld, n_chunks = row_stride(n * self.n_cols), sum(slab.n_chunks for slab in self.slabs)
@@ -93,7 +93,7 @@ class PaperFactors:
         self.scratch["n"] = n
 
     def bind(self):
-        """Bind the products between the model and its row sums to the scratch that is there."""
+        """Binds the products between the model and its row sums to the present scratch."""
         image = ImageBatch.shaped(*self.mapping.shape_in, every=len(self.kernels))
         image, half, k = image.matrix(self.axes), self.matrix("half"), 2 * self.h_x
         self.to_half = self.strided.bind(self.n_y, k, self.n_x, image, self.in_x, half)

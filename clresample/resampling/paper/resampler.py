@@ -79,7 +79,7 @@ class PaperResampler(GridOperator):
         self._run(self._factors.adjoint, y, out)
 
     def _run(self, chain, source, target):
-        """Queue one way of the factors, `chain`, band by band on groups of items (B, C, Ny, Nx)."""
+        """Queues the factors `chain`, band by band, on groups of items (B, C, Ny, Nx)."""
         batch, n_bands = source.shape[:2]
         group = min(self._factors.group, batch)
         self._factors.reserve(group)

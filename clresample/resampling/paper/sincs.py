@@ -18,7 +18,7 @@ BAND_SLACK = 1e-12
 
 
 def sinc_table(device, positions, first, n, table, step_p, step_i):
-    """Queue table[p, i] = sinc(positions[p] - first - i), i < n; see kernels/sinc.cl.
+    """Queues table[p, i] = sinc(positions[p] - first - i), i < n; see kernels/sinc.cl.
 
     positions (P,) [px]; table: device array, element (p, i) at p * step_p + i * step_i
     """

@@ -1,4 +1,4 @@
-"""Tiles of a frame: how large they should be, where they lie, which of them share an operator."""
+"""Tiles of a frame: their sizes, positions and groups that share an operator."""
 
 from __future__ import annotations
 

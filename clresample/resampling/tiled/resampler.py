@@ -213,6 +213,6 @@ def _cut(frame, origin, shape):
 
 
 def _add(frame, origin, window):
-    """Add a window to a frame (..., Ny, Nx) from `origin` on, as far as they meet."""
+    """Adds the overlapping part of a window at `origin` to a frame (..., Ny, Nx)."""
     there, here = intersect_boxes((0, 0), frame.shape[-2:], origin, window.shape[-2:])
     frame[(..., *there)] += window[(..., *here)]

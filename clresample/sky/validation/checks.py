@@ -1,7 +1,7 @@
-"""Numbers, arrays and objects from a user: as floats, or a ValueError that names the argument.
+"""Validates a user's numbers, arrays and objects; a ValueError names the argument.
 
-NumPy turns much into floats without a word: the imaginary part, a unit, a mask, a date and a text
-are dropped or reinterpreted. Here each is honoured or refused by name.
+NumPy converts much to floats silently: it drops or reinterprets an imaginary part, a unit, a mask,
+a date or a text. These functions respect each of them, or raise a ValueError.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ WAYS = {
 
 
 def as_float_array(name, values, unit=None) -> np.ndarray:
-    """The values as float64, of any shape.
+    """Converts values of any shape to float64.
 
-    unit: what numbers with a unit (astropy's Quantity) are converted to; None takes no unit
+    unit: the unit that values with a unit (astropy's Quantity) are converted to; None permits no
+        unit
 
     Raises ValueError for complex numbers, texts, dates, masked values, and other units.
     """
@@ -34,7 +35,7 @@ def as_float_array(name, values, unit=None) -> np.ndarray:
 
 
 def as_real_array(name, values, unit=None) -> np.ndarray:
-    """`as_float_array` of the type they have, where that is a number's; else float64."""
+    """Converts values like `as_float_array`, but keeps the type of real numbers."""
     if type(values) is np.ndarray and values.dtype.kind in REAL:
         return values
     values = to_unit(name, values, unit)
@@ -56,7 +57,7 @@ def as_real_array(name, values, unit=None) -> np.ndarray:
 
 
 def check_real(name, array):
-    """Raise ValueError, calling it `name`, unless a NumPy array holds real numbers."""
+    """Raises ValueError, naming the array `name`, unless its values are real numbers."""
     if array.dtype.kind in REAL:
         return
     if array.dtype.kind == "O":
@@ -68,7 +69,7 @@ def check_real(name, array):
 
 
 def to_unit(name, values, unit=None):
-    """The values, in `unit` if they have one. Raises ValueError for a unit that does not fit."""
+    """Converts values with a unit to `unit`. Raises ValueError for an incompatible unit."""
     if isinstance(values, list | tuple) and any(hasattr(value, "unit") for value in values):
         return [to_unit(name, value, unit) for value in values]
     given = getattr(values, "unit", None)
@@ -93,7 +94,7 @@ def mask_of(values):
 
 
 def split_mask(name, values):
-    """Values with what is masked in them filled by 0, and where that was; None = nowhere."""
+    """Fills masked values with 0; also returns their mask, None without any."""
     mask = mask_of(values)
     if mask is None:
         return values, None
@@ -104,7 +105,7 @@ def split_mask(name, values):
 
 
 def check_number(name, value, what="a finite number", fits=math.isfinite) -> float:
-    """One number as a float. Raises ValueError unless `fits`, which `what` describes."""
+    """Returns one number as a float. Raises ValueError unless `fits`, described by `what`."""
     found = as_float_array(name, value)
     if found.shape != () or not fits(float(found)):
         raise ValueError(f"{name} is {value!r:.80}, must be {what}")
@@ -112,7 +113,7 @@ def check_number(name, value, what="a finite number", fits=math.isfinite) -> flo
 
 
 def check_integer(name, value, least=0) -> int:
-    """A whole number from `least`. Raises ValueError for all else."""
+    """Returns a whole number from `least`. Raises ValueError for any other value."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
         raise ValueError(f"{name} is {value!r:.80}, must be a whole number, {least} or more")
     if value < least:
@@ -121,19 +122,19 @@ def check_integer(name, value, least=0) -> int:
 
 
 def check_dtype(dtype) -> np.dtype:
-    """float32 or float64 as NumPy's type. Raises ValueError for all else, None among it."""
+    """Returns NumPy's type of float32 or float64. Raises ValueError for others, and None."""
     try:
         found = None if dtype is None else np.dtype(dtype)
     except TypeError:
         found = None
     # NumPy's types equal whatever names them, and None names float64
     if found is None or found.kind != "f" or found.itemsize not in (4, 8):
-        raise ValueError(f"dtype is {dtype!r:.80}, allowed are float32 and float64")
+        raise ValueError(f"dtype is {dtype!r:.80}, must be float32 or float64")
     return found
 
 
 def check_instance(name, value, kind):
-    """The value. Raises ValueError unless it is an instance of a class, or of one of several."""
+    """Returns the value. Raises ValueError unless it is an instance of a class, or of several."""
     if isinstance(value, kind):
         return value
     wanted = kind if isinstance(kind, tuple) else (kind,)
@@ -146,7 +147,7 @@ def check_instance(name, value, kind):
 
 
 def described(value) -> str:
-    """A value in a few words for messages; of arrays and images the type and shape alone."""
+    """Describes a value in a few words for messages; arrays by type and shape alone."""
     kind, shape = type(value).__name__, getattr(value, "shape", None)
     if shape is not None and np.ndim(shape) == 1 and len(shape):
         return f"of type {kind} and shape {tuple(shape)}"
@@ -159,7 +160,7 @@ def described(value) -> str:
 
 
 def check_image_shape(shape):
-    """(Ny, Nx) as a tuple of int. Raises ValueError for anything else."""
+    """Returns (Ny, Nx) as a tuple of int. Raises ValueError for anything else."""
     found = as_float_array("shape", shape)
     if found.shape != (2,) or not (found >= 1).all() or (found != np.rint(found)).any():
         raise ValueError(f"shape must be (Ny, Nx), each at least 1 pixel, not {shape}")
@@ -167,7 +168,7 @@ def check_image_shape(shape):
 
 
 def check_pixel_scale(name, values):
-    """Two numbers [arcsec], from one for both or two. Raises ValueError for anything else."""
+    """Returns two numbers [arcsec], from one or two. Raises ValueError for anything else."""
     found = as_float_array(name, values, "arcsec")
     if found.shape not in ((), (2,)) or not np.isfinite(found).all():
         raise ValueError(f"{name} is {values!r:.80}, must be one or two finite numbers")

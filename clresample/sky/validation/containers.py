@@ -1,4 +1,4 @@
-"""astropy's image containers, NDData, CCDData and Cutout2D, as arguments of an Observation."""
+"""Converts astropy's NDData, CCDData and Cutout2D to arguments of an Observation."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from astropy.nddata import (
 
 
 def is_container(image) -> bool:
-    """Returns True if it is an image with a WCS of its own."""
+    """Returns True if an object is an image with a WCS of its own."""
     return isinstance(image, NDData | Cutout2D)
 
 
 def arguments_of(image, psf, given) -> dict:
-    """Arguments of Observation, by name, for an image and what is given beside it.
+    """Arguments of Observation, by name, for an image and the options passed with it.
 
     Raises ValueError for an image without a WCS or a PSF, or with an unknown kind of uncertainty.
     """
@@ -41,7 +41,7 @@ def arguments_of(image, psf, given) -> dict:
 
 
 def _noise(image, given):
-    """Weights or variance by the image's uncertainty; nothing where the caller gave them."""
+    """Weights or variance from the image's uncertainty; empty if the caller passed them."""
     uncertainty = getattr(image, "uncertainty", None)
     if uncertainty is None or {"weights", "variance"} & set(given):
         return {}

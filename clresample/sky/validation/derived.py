@@ -29,10 +29,10 @@ class DerivedQuantities:
 
     @cached_property
     def whitened(self):
-        """The same light with white noise, which is what is fitted; itself where noise is white.
+        """The observation with white noise, which is fitted; itself if its noise is white.
 
-        Data and PSF are convolved with each channel's whitening filter; a constant stays, and
-        pixels nearer to a mask or to the edge than the filter's radius have weight 0.
+        Data and PSF are convolved with each channel's whitening filter. A constant is preserved,
+        and pixels nearer to a mask or to the edge than the filter's radius have weight 0.
         """
         if self.noise is None:
             return self
@@ -45,16 +45,16 @@ class DerivedQuantities:
         return type(self)(data, psf, self.grid, weights=weights, **names)
 
     def whiten(self, images) -> np.ndarray:
-        """Images (C, Ny, Nx) of this observation as they are in `whitened`."""
+        """Filters images (C, Ny, Nx) of this observation as in `whitened`."""
         if self.noise is None:
             return images
         pairs = zip(self.noise, images, strict=True)
         return np.stack([n.filtered(image) / n.filter.sum() for n, image in pairs])
 
     def chi2_map(self, residual) -> np.ndarray:
-        """Weighted squared residuals (C, Ny, Nx) of expectation 1; NaN where nothing is known.
+        """Weighted squared residuals (C, Ny, Nx) of expectation 1; NaN where weights are 0.
 
-        residual (C, Ny, Nx) [counts]: data minus model; whitened here where noise is correlated
+        residual (C, Ny, Nx) [counts]: data minus model; whitened here if the noise is correlated
         """
         weights = self.weights
         if self.noise is None:
@@ -67,7 +67,10 @@ class DerivedQuantities:
 
     @property
     def flux_scale(self) -> np.ndarray | None:
-        """Flux of one count (C,) [uJy]: 10^(-0.4 (zero_points - 23.9)); None without them."""
+        """Flux of one count (C,) [uJy]; None without zero points.
+
+        It is 10^(-0.4 (zero_points - 23.9)).
+        """
         if self.zero_points is None:
             return None
         return 10 ** (-0.4 * (self.zero_points - ZERO_POINT_UJY))

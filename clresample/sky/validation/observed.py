@@ -1,4 +1,4 @@
-"""Arguments of an Observation, checked and brought to one form."""
+"""Validates the arguments of an Observation and converts them to one form."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from .checks import as_float_array, check_instance, split_mask
 
 
 def images_of(data, grid, mask):
-    """Data (C, Ny, Nx) float64 of as many pixels as the grid has, the mask with data's own, and the
-    grid, made of a WCS where one is given."""
+    """Validates data (C, Ny, Nx), mask and grid: float64 data of the grid's size.
+
+    The mask returned includes the data's own; the grid is made from a WCS where one is passed.
+    """
     data, hidden = split_mask("data", data)
     data = as_float_array("data", data)
     if data.ndim == 2:
@@ -46,7 +48,7 @@ def psfs_of(psf, shape):
 
 
 def channels_of(channels, name, n_channels):
-    """Channel names (C,), numbered after the instrument where none are given."""
+    """Channel names (C,); by default the instrument's name and a number."""
     if channels is None:
         return tuple(f"{name or 'channel'}{i}" for i in range(n_channels))
     channels = (channels,) if isinstance(channels, str) else tuple(channels)
@@ -60,7 +62,7 @@ def channels_of(channels, name, n_channels):
 
 
 def bands_of(bands, channels):
-    """Names (C,) of the bands of channels; the channels' own names for None."""
+    """Band names (C,) of channels; by default the channels' names."""
     if bands is None:
         return channels
     bands = (bands,) if isinstance(bands, str) else tuple(bands)
@@ -74,14 +76,14 @@ PSFLike = PSF | np.ndarray
 
 
 def as_psf(name, psf, kinds=PSF):
-    """The PSF, made of its images where an array is given. Raises ValueError for anything else."""
+    """Returns the PSF, made from images if passed. Raises ValueError for anything else."""
     if isinstance(psf, np.ndarray) or (isinstance(psf, list | tuple) and len(psf)):
         return PSF(psf)
     return check_instance(name, psf, kinds)
 
 
 def saturation_of(values, n_channels, unit=None):
-    """Saturation levels (C,) [counts] above 0, infinite ones where unknown; None for None.
+    """Saturation levels (C,) [counts] above 0, infinite where unknown; None for None.
 
     unit: of the data, to which levels with a unit are converted
     """

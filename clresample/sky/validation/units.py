@@ -1,4 +1,4 @@
-"""Units of images: flux densities, whose zero points follow from them, and counts."""
+"""Units of images: flux densities, which imply zero points, and counts."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ SAME_MAG = 1e-6
 
 
 def take_unit(data, unit):
-    """Data without their unit, and this unit; data in `unit` where they have another one.
+    """Splits data into plain values and their unit; converts them if `unit` is another one.
 
     unit: an astropy unit or its name, for data without one; None = that of the data, if any
     returns the plain data, and the astropy unit or None
 
-    Raises ValueError for what is not a unit, and for data that cannot be converted to it.
+    Raises ValueError for an invalid unit, and for data that cannot be converted to it.
     """
     own = getattr(data, "unit", None)
     if unit is None and own is None:
@@ -33,7 +33,7 @@ def take_unit(data, unit):
 
 
 def flux_unit(unit):
-    """The unit of flux density of an image in `unit`, "per pixel" taken off; None for counts.
+    """Unit of flux density of an image in `unit`, without "per pixel"; None for counts.
 
     Raises ValueError for units that are neither.
     """
@@ -49,9 +49,9 @@ def flux_unit(unit):
 
 
 def zero_points_of(unit, given, n_channels):
-    """Zero points (C,) [mag] of images in a unit of flux density; those given where it is None.
+    """Zero points (C,) [mag] implied by a unit of flux density; those passed if it is None.
 
-    Raises ValueError for given ones that say something else than the unit.
+    Raises ValueError if the zero points passed contradict the unit.
     """
     if unit is None:
         return given

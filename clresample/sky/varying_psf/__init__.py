@@ -1,1 +1,1 @@
-"""PSFs that vary over an image: what each answers, and the few PSFs that stand for many."""
+"""PSFs that vary over an image: their interface, and their bases of few PSFs."""

@@ -11,7 +11,7 @@ from ..psf import PSF
 
 
 class PSFField(ABC):
-    """The PSF of an image wherever it is asked for.
+    """The PSF of an image at any position.
 
     n_bands: of the PSFs that it returns; varies: whether they are not all the same
     """
@@ -79,5 +79,5 @@ class FunctionPSF(PSFField):
 def check_position(y, x) -> tuple[float, float]:
     """The position as two floats. Raises ValueError where one of them is not finite."""
     if not np.isfinite([y, x]).all():
-        raise ValueError(f"psf_at was asked for (y, x) = ({y}, {x}), it takes finite numbers")
+        raise ValueError(f"psf_at: (y, x) is ({y}, {x}), must be finite")
     return float(y), float(x)

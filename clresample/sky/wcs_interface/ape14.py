@@ -46,7 +46,7 @@ class Ape14Wcs:
 
     @classmethod
     def of(cls, wcs) -> Ape14Wcs:
-        """The Interface of a WCS. Raises ValueError for one that is not celestial alone."""
+        """The Ape14Wcs of a WCS. Raises ValueError for one that is not celestial alone."""
         low = wcs.low_level_wcs if isinstance(wcs, BaseHighLevelWCS) else wcs
         if (low.pixel_n_dim, low.world_n_dim) != (2, 2):
             raise ValueError(
@@ -100,7 +100,7 @@ class Ape14Wcs:
     def to_fits(self, shape) -> WCS:
         """A FITS WCS of an image (Ny, Nx): gnomonic with SIP polynomials fitted to this one.
 
-        Of the lowest order, up to 5, that departs from it by less than 1e-4 px; else of order 5.
+        It has the lowest order, up to 5, that departs from it by less than 1e-4 px; else order 5.
         """
         y, x = (np.linspace(-0.5, n - 0.5, N_POINTS) for n in shape)
         points = np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Runs a batch of scenes under the prior that learns: rounds of trials, strengths, stops.
+"""Runs a batch of scenes under the multi-scale prior: rounds of trials, strengths, stops.
 
     L = 1/2 sum_o |sqrt(w_o) (R_o M + sky - d_o)|^2 + 1/2 sum_c p_c sky_c^2
         + 1/2 sum_sj |z_sj|^2 / alpha_sj^2,      p: Scene.known_sky
@@ -138,7 +138,7 @@ class MultiscaleEngine:
         return self.steps.change()[0]  # its s and y go into spare slots
 
     def _rest_others(self, live):
-        """Let only the scenes `live` (B,) take part in what is queued next."""
+        """Restricts the launches that follow to the scenes `live` (B,)."""
         self.steps.follow(self.pairs, np.where(live, TRY, REST))
 
     def states(self) -> list[State]:
@@ -155,7 +155,7 @@ class MultiscaleEngine:
         return self.strengths.findings(which, *self._energies(self.vectors.x))
 
     def slopes(self, which):
-        """The Slopes of the scenes `which` (B,) where they are; None for the others."""
+        """The SceneGradient of the scenes `which` (B,) where they are; None for the others."""
         x, g = (self.vectors.split(v) for v in (self.vectors.x, self.vectors.g))
         return [
             SceneGradient(*slopes, (now[1] <= 0) & (slopes[1] > 0)) if on else None
@@ -163,10 +163,10 @@ class MultiscaleEngine:
         ]
 
     def step(self, steps):
-        """Let scenes try steps next, also those that have converged.
+        """Queues trial steps of these scenes, which resume if they have converged.
 
-        Steps {scene: changes of structure, spectra and sky, see Slopes; structure None where there
-        is none}.
+        steps {scene: changes of structure, spectra and sky, see SceneGradient}; structure is None
+        in scenes without any
         """
         which = np.isin(np.arange(len(self.scenes)), list(steps))
         self.vectors.put_directions(steps)
@@ -174,13 +174,13 @@ class MultiscaleEngine:
         self._queue(np.where(which, TRY, REST), 1.0)
 
     def update_shifts(self, moved):
-        """Take over the shifts that the operators of the scenes `moved` (B,) have by now."""
+        """Copies the current shifts of the operators of the scenes `moved` (B,)."""
         self._gradient.update_shifts()
         self.progress.refresh_loss(moved)
         self._queue(np.where(moved, STAY, REST), 0.0)
 
     def _queue(self, mode, length):
-        """Queue trials of one length in the directions that are there already; mode (B,)."""
+        """Queues trials of one length along the present directions; mode (B,)."""
         nothing = np.zeros((len(self.scenes), N_PAIRS + 1))
         self.steps.follow(self.pairs, mode)
         self.steps.advance(nothing, nothing, nothing[:, 0], nothing[:, 0] + length)
@@ -197,7 +197,7 @@ def _begins(latents, states):
 
 
 def _that_learned(states, parts, known):
-    """States with what was learned; parts: see `SolverVectors.split`.
+    """States with structure and strengths; parts: see `SolverVectors.split`.
 
     known: `PriorStrengths.by_scene`.
     """
@@ -224,8 +224,11 @@ def vector_bytes(scene, prior) -> int:
 
 
 def _inverse_curvature(scenes):
-    """1 / (sum w (R S)^2) of every spectrum (S, C) and 1 / (sum w + p) of every sky level (B, C), p
-    its precision as it is expected; 0 where nothing is seen, and of levels that are not fitted."""
+    """Inverse curvatures of all spectra (S, C) and sky levels (B, C).
+
+    They are 1 / (sum w (R S)^2) and 1 / (sum w + p), p the precision of the expected level; 0 for
+    unobserved spectra and for levels that are not fitted.
+    """
     power, ties = np.concatenate([s.spectrum_curvature for s in scenes]), scenes[0].ties
     power = power if ties is None else ties.mean(power)
     seen = power > UNSEEN * power.max(initial=0)

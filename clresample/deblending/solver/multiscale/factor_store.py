@@ -1,4 +1,4 @@
-"""The roots of all sources' blocks on the device: only those that are new are uploaded."""
+"""Stores the factors of all sources' blocks on the device and uploads only new ones."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class FactorStore:
         self._first, self._end = {}, 0
 
     def first(self, block):
-        """The first element of a Block's root, a multiple of ALIGN."""
+        """The first element of a CurvatureBlock's root, a multiple of ALIGN."""
         return self._first[block]
 
     def retain(self, blocks):
-        """Hold the roots of these Blocks, and of no others any longer."""
+        """Keeps the factors of these CurvatureBlocks and drops all others."""
         need = sum(_room(block) for block in blocks)
         new = [block for block in blocks if block not in self._first]
         full = self._end + sum(_room(block) for block in new) > self.values.size
@@ -49,5 +49,5 @@ class FactorStore:
 
 
 def _room(block):
-    """Elements that a Block's root takes."""
+    """Elements that a CurvatureBlock's root takes."""
     return -(-block.cholesky.size // ALIGN) * ALIGN

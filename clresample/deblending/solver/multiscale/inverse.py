@@ -78,7 +78,7 @@ class BlockPreconditioner:
         self._at = self._blocks = None
 
     def blocks(self, strengths, spectrum):
-        """The Blocks near strengths (J,) and a spectrum (C,).
+        """The CurvatureBlocks near strengths (J,) and a spectrum (C,).
 
         Those of one level have no coefficient in common, and what levels say is added.
         """
@@ -93,7 +93,7 @@ class BlockPreconditioner:
         return more or np.abs(np.log(strengths / before[0])).max() > CHANGE
 
     def _made(self, strengths, spectrum):
-        """Yield the blocks at these strengths and spectrum."""
+        """Yields the blocks at these strengths and spectrum."""
         data = np.square(strengths) * self._evidence.curvature(spectrum)
         heard = [
             np.argwhere(part * light > MIN_DATA_TO_PRIOR) for part, light in zip(data, self._light)
@@ -153,7 +153,7 @@ class BlockPreconditioner:
 def _split(rows, places):
     """Parts of rows (n, 3) at places (n, 2) [px], at most MAX_BLOCK_SIZE neighbours each.
 
-    In order.
+    Rows keep their order within a part.
     """
     if len(rows) <= MAX_BLOCK_SIZE:
         return [rows] if len(rows) else []

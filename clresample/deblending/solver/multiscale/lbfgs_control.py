@@ -18,24 +18,24 @@ MAX_TRIALS = 8
 # STRENGTH_ROUNDS so many, until none moves by more than MAX_LOG_STRENGTH_CHANGE in its logarithm.
 STRENGTH_LOSS_DROP, LOSS_WINDOW = 5.0, 3
 FIRST_STRENGTH_ROUND, STRENGTH_ROUNDS, MAX_LOG_STRENGTH_CHANGE = 16, 8, 0.1
-# Whether the finest structure of sources is clear (evidence.py) is asked once strengths have
-# settled, where a scene's loss fell by less than this (or `loss_tol`, where that is more: none has
-# converged before it is asked), times chi2 per pixel likewise, over the last LOSS_WINDOW
-# iterations. Earlier, structure still holds what spectra and neighbours will take from it: with 5,
-# more simulated galaxies exceed what is clear. With 1 the same ones do, up to 30 iterations later.
+# The finest structure of sources is tested for significance (evidence.py) once strengths have
+# settled and a scene's loss fell by less than this over the last LOSS_WINDOW iterations, times chi2
+# per pixel likewise. `loss_tol` counts where it is larger, so that no scene converges before its
+# test. Earlier, structure still holds light that spectra and neighbours will take: with 5, more
+# simulated galaxies pass. A threshold of 1 selects the same galaxies, up to 30 iterations later.
 SIGNIFICANCE_LOSS_DROP = 2.5
-# It is also asked after LATE_LOOK rounds where a scene still falls by FALLING and more over these
-# iterations, times chi2 per pixel likewise: blends of large galaxies with clumps fall so for
-# hundreds of rounds before they are calm, all of them lost where a second fit takes over. SDRs of
-# 32 simulated scenes are the same with it and without (bench.settings).
+# A scene is also tested after LATE_LOOK rounds if its loss still falls by FALLING and more over
+# these iterations, times chi2 per pixel likewise. Blends of large galaxies with clumps fall so for
+# hundreds of rounds, all of them wasted if a second fit follows. SDRs of 32 simulated scenes are
+# the same with this test and without (bench.settings).
 LATE_LOOK, FALLING = 80, 50.0
 # A fit has converged when its strengths have settled and its loss fell by less than `loss_tol` over
-# CONVERGENCE_WINDOW iterations and over the last twelfth of all, at most LONGEST; by that times
-# chi2 per pixel where that is above 1: a model that misfits so knows its fluxes less well by its
-# root. Light of a small galaxy inside a giant comes back from the giant's structure over hundreds
-# of iterations that gain 0.03 each: without the twelfth such fits ended 8 above the lowest loss,
-# and fluxes 6 errors from the truth (bench.ladder, giant). Fits of up to 60 iterations end as
-# without it.
+# CONVERGENCE_WINDOW iterations and over the last twelfth of all, at most LONGEST.
+# The tolerance scales with chi2 per pixel above 1, because flux errors grow as its square root.
+# Light of a small galaxy inside a giant returns from the giant's structure over hundreds of
+# iterations that gain 0.03 each. Without the twelfth such fits ended 8 above the lowest loss, and
+# fluxes 6 errors from the truth (bench.ladder, giant). It does not change fits of up to 60
+# iterations.
 CONVERGENCE_WINDOW, TWELFTH, LONGEST = 5, 12, 100
 
 
@@ -44,11 +44,11 @@ class LbfgsControl:
 
     loss_tol: see Settings; n_pixels (B,): observed, with a weight
 
-    live: those that go on; converged, failed: those that have come to their end, failed ones
-        because the loss of their start is no number
+    live: unfinished scenes; converged, failed: finished ones
+    failed: scenes whose loss at their current point is not finite
     loss: of the last accepted trial; n_iterations: accepted trials, the start not counted
     n_rounds: of each scene, trials so far
-    settled: scenes whose strengths are; tested: those that know which structure is clear
+    settled: scenes with settled strengths; tested: scenes tested for significant structure
     """
 
     def __init__(self, n_scenes, loss_tol, n_pixels):
@@ -177,7 +177,7 @@ class LbfgsControl:
         return mode, self._length, bare
 
     def _fallen(self, n):
-        """By how much the losses (B,) fell over the last n iterations, a number or (B,)."""
+        """Decrease of the losses (B,) over the last n iterations, a number or (B,)."""
         before = np.take_along_axis(self._losses, np.broadcast_to(n, len(self.loss))[:, None], 1)
         with np.errstate(invalid="ignore"):  # of scenes without a loss so far
             return before[:, 0] - self._losses[:, 0]

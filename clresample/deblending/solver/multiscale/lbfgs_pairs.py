@@ -49,7 +49,7 @@ class LbfgsPairs:
         return self._valid.sum(1)
 
     def take(self, which, sy, yy):
-        """Keep the spare slots' pairs of the scenes `which` (n,), where they show curvature.
+        """Keeps the new pairs of the scenes `which` (n,) that have positive curvature.
 
         sy, yy (n, SLOTS): s_k . y and y_k . H y of every slot with the spare one
         """
@@ -64,7 +64,7 @@ class LbfgsPairs:
         self.used[kept] = np.minimum(self.used[kept] + 1, self.n_slots)
 
     def forget(self, which):
-        """Drop all pairs of the scenes `which`."""
+        """Drops all pairs of the scenes `which`."""
         self._valid[which] = False
 
     def coefficients(self, sg, yg):

@@ -13,10 +13,10 @@ REST, NEXT, AGAIN, TRY, STAY = range(5)
 
 
 class LbfgsSteps:
-    """L-BFGS on the Vectors of a batch; the decisions come as arrays over its scenes (B,).
+    """L-BFGS on the SolverVectors of a batch; the decisions come as arrays over its scenes (B,).
 
-    vectors: the Vectors
-    shelf: FactorStore of blocks that these or other Steps have had; a new one for None
+    vectors: the SolverVectors
+    shelf: FactorStore of blocks that these or other LbfgsSteps have had; a new one for None
     """
 
     def __init__(self, vectors, shelf=None):
@@ -100,17 +100,17 @@ class LbfgsSteps:
         return np.add.reduceat(values, self._first_chunks, axis=0)
 
     def advance(self, a, c, scale, length):
-        """Queue the next trials: a, c (B, slots), scale, length (B,)."""
+        """Queues the next trials: a, c (B, slots), scale, length (B,)."""
         b = self._buffers
         table = np.concatenate([a, c, scale[:, None], length[:, None]], axis=1)
         b.device.upload(np.ascontiguousarray(table, b.dtype), self._coefficients)
         self._advance(self._size)
 
     def reweigh(self, light, weights, blocks):
-        """Queue h and g_new of other strengths, and take their blocks.
+        """Queues h and g_new of other strengths, and takes their blocks.
 
-        light, weights, blocks: see Strengths. Pairs of what went before stay: they say what the
-        data think of the curvature, and without them fits take a tenth more rounds.
+        light, weights, blocks: see PriorStrengths. Pairs of what went before stay: they say what
+        the data think of the curvature, and without them fits take a tenth more rounds.
         """
         b = self._buffers
         if b.n_free:
@@ -118,7 +118,7 @@ class LbfgsSteps:
             self.take_blocks(blocks)
 
     def take_blocks(self, blocks):
-        """Take the Blocks of all sources (S)."""
+        """Sets the CurvatureBlocks of all sources (S)."""
         b = self._buffers
         start, scene = self._latents.start, b.host_boxes.scene
         self._levels = []

@@ -1,4 +1,4 @@
-"""The prior that learns: structure at several scales, how much of each found from the data."""
+"""The multi-scale prior: structure at several scales, with strengths found from the data."""
 
 from __future__ import annotations
 

@@ -10,9 +10,9 @@ from ..rendering.composition import SpectralComposition
 
 
 class OperatorResponse:
-    """The operators of a batch's Gradient, asked about noise and misfit rather than gradients.
+    """The operators of a batch's LossGradient, applied to noise and misfit.
 
-    buffers, gradient: the batch and its Gradient, whose image buffers are overwritten
+    buffers, gradient: the batch and its LossGradient, whose image buffers are overwritten
     weights: per observation R^T w (B, Co T, Ny, Nx) on the device; T > 1 where the PSF varies, and
         then that of the first term is in the middle of the scene
     """
@@ -30,7 +30,7 @@ class OperatorResponse:
 
     @functools.cached_property
     def weights(self):
-        """Made when first asked for: a batch whose strengths have settled does without."""
+        """Computed at first use: a batch whose strengths have settled does not need it."""
         b, found = self.buffers, []
         for i, o in enumerate(self._observations):
             weights = b.put(np.stack([s.weights[i] for s in b.scenes]))
@@ -89,6 +89,6 @@ def _middle(weights):
 
 
 def _median(weights):
-    """The median of what is above 0; 0 where nothing is."""
+    """The median of the values above 0; 0 without any."""
     seen = weights[weights > 0]
     return float(np.median(seen)) if seen.size else 0.0

@@ -1,4 +1,4 @@
-"""The strengths of structure of all sources of a batch, and what the solver needs of them."""
+"""Strengths of structure of all sources of a batch, and the solver's tables from them."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class StrengthEstimates:
 class PriorStrengths:
     """Present strengths of a batch's sources, learned from their evidence.
 
-    states (B): the scenes' States at their start; their Learned, if any, says which strengths they
-        begin with
-    past: other Strengths and the scenes (n,) of theirs that go on here, which are all
+    states (B): the scenes' States at their start; their StructureState, if any, says which
+        strengths they begin with
+    past: other PriorStrengths and the scenes (n,) of theirs that go on here, which are all
 
     values (S, J): alpha; of fixed sources without meaning
     significant (S,): sources whose finest structure is, see evidence.py

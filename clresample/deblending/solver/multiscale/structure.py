@@ -1,6 +1,6 @@
 """Morphologies of structure at several scales, and their transpose, on the device.
 
-structure.cl.
+The kernels are those of structure.cl.
 
     S_s = max(0, b + u - b <b, u> / <b, b>),      u_s = sqrt(b) o sum_j K_j z_sj
 
@@ -46,7 +46,7 @@ class LatentLayout:
     def pack(self, arrays):
         """One vector (size,) from arrays[s][j] of the shapes `shape`.
 
-        Of free sources alone, 0 of those whose arrays[s] is None.
+        It contains free sources alone, and 0 for those whose arrays[s] is None.
         """
         out = np.zeros(self.size)
         for s, scales in enumerate(arrays):
@@ -67,7 +67,7 @@ class StructureOperator:
     """The morphologies of a batch's free sources from their coefficients, and the way back.
 
     buffers: the batch; its morph is overwritten by `form`, its d_morph by `gradient`
-    prior: the MultiscalePrior; latents: the Latents
+    prior: the MultiscalePrior; latents: the LatentLayout
     energies (S, J): of the coefficients last asked for, on the device
     """
 
@@ -125,13 +125,13 @@ class StructureOperator:
         self._energy_size = group, self.n_scales, b.n_free
 
     def form(self, vector):
-        """Queue the morphologies of a vector (latents.size or more,) of coefficients."""
+        """Queues the morphologies of a vector (latents.size or more,) of coefficients."""
         if self.buffers.n_free:
             self._spread(self._rows_size, z=vector)
             self._form(self._sources_size)
 
     def gradient(self, vector, precision, gradient):
-        """Queue dL/dz + precision z into a vector, from d_morph, which is overwritten.
+        """Queues dL/dz + precision z into a vector, from d_morph, which is overwritten.
 
         vector: the coefficients that the morphologies were formed of; precision (S, J)
         """
@@ -140,7 +140,7 @@ class StructureOperator:
             self._condense(self._coarse_size, z=vector, precision=precision, gradient=gradient)
 
     def energy(self, vector):
-        """Queue sum z_sj^2 of a vector into `energies`."""
+        """Queues sum z_sj^2 of a vector into `energies`."""
         if self.buffers.n_free:
             self._energy(self._energy_size, z=vector)
 

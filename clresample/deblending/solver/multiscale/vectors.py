@@ -27,7 +27,7 @@ class SceneGradient:
 class SolverVectors:
     """The vectors of a batch that L-BFGS works on.
 
-    buffers: the batch; latents: its Latents; n_slots: of the ring of pairs
+    buffers: the batch; latents: its LatentLayout; n_slots: of the ring of pairs
     size: elements of a vector; n_spectra, n_sky: its last ones
     chunks (n, 4): scene, first element, length, whether its variables are at least 0; by scene
     x, x_new, g, g_new, hg, d, h, precision (size,): see lbfgs.cl; s, hy (n_slots, size)
@@ -70,7 +70,7 @@ class SolverVectors:
     def split(self, vector):
         """Splits a host vector by scenes: coefficients [s][j], spectra (n, C) and sky (C,).
 
-        Coefficients (ny_j, nx_j).
+        Coefficients have the shape (ny_j, nx_j).
         """
         values = self.buffers.device.get(vector).astype(np.float64)
         structure = self.latents.unpack(values)
@@ -116,7 +116,7 @@ class SolverVectors:
     def start(self, structure, spectra, sky, inverse_curvature):
         """Uploads x and the first trial: z (latents.size,), spectra (S, C), sky (B, C).
 
-        And h of the latter two.
+        Also uploads h of the spectra and the sky.
         """
         upload, nothing = self.buffers.device.upload, np.zeros(self.latents.size)
         there, h = (
@@ -128,7 +128,7 @@ class SolverVectors:
         upload(h, self.h)
 
     def copy_from(self, other, keep):
-        """Take the values of scenes `keep` (n,) of other Vectors, which are all that are here."""
+        """Copies the scenes `keep` (n,) of other SolverVectors, which then are all scenes here."""
         shift = (other.parts()[keep] - self.parts())[:, :, 0]
         scene, first = self.chunks[:, 0], self.chunks[:, 1]
         kind = np.digitize(first, [self.latents.size, self.latents.size + self.n_spectra])
@@ -142,10 +142,10 @@ class SolverVectors:
             move(size, values_from=getattr(other, name), values=getattr(self, name))
 
     def unpack_spectra(self, vector):
-        """Queue spectra and sky levels of a vector into the batch's buffers."""
+        """Queues spectra and sky levels of a vector into the batch's buffers."""
         self._take(self._numbers_size, x=vector)
 
     def pack_gradients(self, pull, rows):
-        """Queue the gradients of spectra and sky into g_new; pull (B, n), rows (C + 1,)."""
+        """Queues the gradients of spectra and sky into g_new; pull (B, n), rows (C + 1,)."""
         n_rows = pull.shape[1]
         self._give(self._numbers_size, pull=pull, n_rows=n_rows, row0=rows)

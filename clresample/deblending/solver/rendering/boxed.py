@@ -46,7 +46,7 @@ class BoxedProduct:
         )
 
     def __call__(self, a, b, c, active, *, add=False):
-        """Queue the products of the sources `active` (n,): C from A and B, added if ragged."""
+        """Queues the products of the sources `active` (n,): C from A and B, added if ragged."""
         self._launch((*self._size, active.size), A=a, B=b, C=c, active=active, add=add)
 
 

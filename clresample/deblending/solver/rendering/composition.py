@@ -62,13 +62,13 @@ class SpectralComposition:
         self._spectra_size = group, n_bands, b.all_sources.size
 
     def compose(self, boxed, spectra, frame):
-        """Queue frame = sum_s A boxed_s, times the transfer function where there is one."""
+        """Queues frame = sum_s A boxed_s, times the transfer function where there is one."""
         if self._parts is not None:
             spectra = self._parts.of(spectra)
         self._compose(self._compose_size, boxed=boxed, spectra=spectra, frame=frame)
 
     def gather_boxed(self, frame, spectra, d_boxed, active, *, add=False):
-        """Queue d_boxed of the sources `active` (n,): written, or added to what is there."""
+        """Queues d_boxed of the sources `active` (n,): written, or added to what is there."""
         if self._parts is not None:
             spectra = self._parts.of(spectra)
         self._morph(
@@ -81,7 +81,7 @@ class SpectralComposition:
         )
 
     def gather_spectra(self, frame, boxed, d_spectra):
-        """Queue dA of this observation's channels into d_spectra (S, C)."""
+        """Queues dA of this observation's channels into d_spectra (S, C)."""
         found = d_spectra if self._parts is None else self._parts.d_parts
         self._spectra(self._spectra_size, frame=frame, boxed=boxed, d_spectra=found)
         if self._parts is not None:
@@ -117,10 +117,10 @@ class _TermSpectra:
         self._unshare.bind(n_sources=n_sources)
 
     def of(self, spectra):
-        """Queue those of spectra (S, C), and return them."""
+        """Queues those of spectra (S, C), and returns them."""
         self._share(self._size, spectra=spectra, parts=self._spectra)
         return self._spectra
 
     def gather(self, d_spectra):
-        """Queue dA of this observation's channels into d_spectra (S, C), from `d_parts`."""
+        """Queues dA of this observation's channels into d_spectra (S, C), from `d_parts`."""
         self._unshare(self._size, parts=self.d_parts, spectra=d_spectra)

@@ -54,7 +54,7 @@ def _counts(shape, n_bands, n_y, n_x, of_frame, of_box):
 
 
 def select_rendering(buffers, i_observation, op, depth=None):
-    """The Frames, Transformed or Windows of one observation of a batch.
+    """The FrameRendering, BoxTransformRendering or WindowRendering of one observation of a batch.
 
     depth: 0, 1, 2, or 3 for windows; None takes that of the fewest operations
     """
@@ -72,7 +72,7 @@ def select_rendering(buffers, i_observation, op, depth=None):
 
 
 def _in_frames(buffers, i_observation, op, depth=None):
-    """The Frames or BoxTransformRendering of one observation."""
+    """The FrameRendering or BoxTransformRendering of one observation."""
     if depth is None:
         depth = int(np.argmin(stage_flops(buffers, op, op.executor())))
     if depth == 0:

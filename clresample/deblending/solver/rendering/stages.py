@@ -45,32 +45,32 @@ class FrameRendering:
         )
 
     def transform(self, morph):
-        """Take these morphologies (boxes.size,) for all that is queued next."""
+        """Sets the morphologies (boxes.size,) for the launches that follow."""
         self._morph = morph
 
     def render(self, spectra, image):
-        """Queue the image (B, Co, My, Mx) of the morphologies with spectra (S, C)."""
+        """Queues the image (B, Co, My, Mx) of the morphologies with spectra (S, C)."""
         self._composition.compose(self._morph, spectra, self._model)
         self._op.queue_plain("forward", self._model, image)
 
     def back_project(self, image):
-        """Queue the way back of an image (B, Co, My, Mx), whose gradients are asked for next."""
+        """Queues the adjoint of an image (B, Co, My, Mx) for the gradients that follow."""
         self._op.queue_plain("adjoint", image, self._model)
 
     def gather_spectra(self, d_spectra):
-        """Queue dA of this observation's channels into d_spectra (S, C)."""
+        """Queues dA of this observation's channels into d_spectra (S, C)."""
         self._composition.gather_spectra(self._model, self._morph, d_spectra)
 
     def gather_morph(self, spectra, d_morph, active, *, add=False):
-        """Queue dS of the sources `active` (n,): written into d_morph, or added to it."""
+        """Queues dS of the sources `active` (n,): written into d_morph, or added to it."""
         self._composition.gather_boxed(self._model, spectra, d_morph, active, add=add)
 
     def update_shifts(self):
-        """Nothing to do: what it has of the operator is the operator's own."""
+        """Does nothing: the operator owns its shifts."""
 
 
 class BoxTransformRendering:
-    """Depth 1 or 2: each source's box transformed along one axis, or both; as Frames."""
+    """Depth 1 or 2: each source's box transformed along one axis, or both; as FrameRendering."""
 
     def __init__(self, buffers, i_observation, op, depth):
         b, self.buffers, self.depth = buffers, buffers, depth
@@ -121,11 +121,11 @@ class BoxTransformRendering:
         self._boxes.from_lines(d_lines, e.in_x.buffer, d_morph, active, add=add)
 
     def update_shifts(self):
-        """Nothing to do, as for Frames."""
+        """Nothing to do, as for FrameRendering."""
 
 
 class _Boxes:
-    """The sources' boxes as an operator's tables see them, and the products that transform them.
+    """The sources' boxes in an operator's tables, and the products that transform them.
 
     Rows and columns are those of the tables' axes, which may be the model's columns and rows.
     lines, planes: Boxes of (rows, k_pad) in (n_y, k_pad), and of all of (k_y, k_pad)
@@ -218,7 +218,7 @@ class _Boxes:
 
     @functools.cached_property
     def from_lines(self):
-        """lines, Tx[cols_s]^T -> lines Tx[cols_s]^T, added where that is asked for."""
+        """lines, Tx[cols_s]^T -> lines Tx[cols_s]^T, added if requested."""
         e, aligned = self._executor, self._column0 // COLUMN_PAD * COLUMN_PAD
         return BoxedProduct(
             self._buffers,

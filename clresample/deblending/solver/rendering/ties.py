@@ -59,7 +59,7 @@ class Ties:
         return (self.band[:, None] == np.arange(self.n_bands)).astype(float)
 
     def total(self, values, axis=-1) -> np.ndarray:
-        """Sums over the channels of each band: `axis` has length C, and B in what is returned."""
+        """Sums over the channels of each band: `axis` has length C, and B in the result."""
         return np.moveaxis(np.moveaxis(np.asarray(values), axis, -1) @ self.matrix, -1, axis)
 
     def spread(self, values, axis=-1) -> np.ndarray:

@@ -68,10 +68,7 @@ class WindowGroups:
 
 
 def reach_of(plan):
-    """Distance [model px] to which the light of a group is followed.
-
-    As far as frames are padded.
-    """
+    """Distance [model px] to which the light of a group is followed: the frames' padding."""
     return max(plan.certificate.wrap_radius_px)
 
 
@@ -91,7 +88,7 @@ class WindowOperator:
         self.place()
 
     def place(self):
-        """Put the windows where the operator's present shift has them."""
+        """Moves the windows to the operator's present shift."""
         mapping, small = self.op.plans[0].mapping, self.plan.mapping
         off = mapping.offset + self.op.shift - self._groups.low - small.offset
         self.low = np.rint(-off @ np.linalg.inv(mapping.matrix).T).astype(int)
@@ -103,7 +100,7 @@ class WindowOperator:
         return self._executor.clone()
 
     def queue_plain(self, way, source, target):
-        """Queue "forward", windows = R frames of all groups, or "adjoint", frames = R^T windows."""
+        """Queues "forward", windows = R frames of all groups, or "adjoint", its transpose."""
         n = len(self._groups) * self.shape_in[0]
         self._executor.reserve(n)
         getattr(self._executor, way)(ImageBatch.of(source), ImageBatch.of(target), n)
@@ -158,33 +155,33 @@ class WindowRendering:
         self._active: dict = {}
 
     def transform(self, morph):
-        """Take these morphologies (boxes.size,) for all that is queued next."""
+        """Sets the morphologies (boxes.size,) for the launches that follow."""
         for part in self.parts:
             part.inner.transform(morph)
 
     def render(self, spectra, image):
-        """Queue the image (B, Co, My, Mx) of the morphologies with spectra (S, C)."""
+        """Queues the image (B, Co, My, Mx) of the morphologies with spectra (S, C)."""
         for i, part in enumerate(self.parts):
             part.render(spectra, image, i > 0)
 
     def back_project(self, image):
-        """Queue the way back of an image (B, Co, My, Mx), whose gradients are asked for next."""
+        """Queues the adjoint of an image (B, Co, My, Mx) for the gradients that follow."""
         for part in self.parts:
             part.back_project(image)
 
     def gather_spectra(self, d_spectra):
-        """Queue dA of this observation's channels into d_spectra (S, C)."""
+        """Queues dA of this observation's channels into d_spectra (S, C)."""
         for part in self.parts:
             part.inner.gather_spectra(d_spectra)
 
     def gather_morph(self, spectra, d_morph, active, *, add=False):
-        """Queue dS of the sources `active` (n,): written into d_morph, or added to it."""
+        """Queues dS of the sources `active` (n,): written into d_morph, or added to it."""
         for part, own in zip(self.parts, self._own(active), strict=True):
             if own is not None:
                 part.inner.gather_morph(spectra, d_morph, own, add=add)
 
     def update_shifts(self):
-        """Take over the shift that the operator has by now."""
+        """Copies the current shift of the operator."""
         for part in self.parts:
             part.update_shifts()
 

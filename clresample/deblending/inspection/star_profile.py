@@ -1,4 +1,4 @@
-"""Light of a star by distance from it, all directions together."""
+"""Radial profile of a star, averaged over all directions."""
 
 from __future__ import annotations
 
@@ -13,20 +13,22 @@ LOG_STEP = 0.1  # of a radius, over which the slope at the rim is taken
 
 
 @dataclass(frozen=True, eq=False)
-class Fall:
-    """Light of a star by distance, all directions together.
+class RadialProfile:
+    """Radial profile of a star, averaged over all directions.
 
-    log_radius, log_light (n,): of its rings, n > 2, between which it is interpolated; it goes on as
-    a power of the distance beyond both ends
+    log_radius, log_light (n,): of its rings, n > 2. Light is interpolated between them and
+    continued by a power of the distance beyond both ends.
     """
 
     log_radius: np.ndarray
     log_light: np.ndarray
 
     @classmethod
-    def of(cls, data, usable, away, sigma):
-        """Of pixels (My, Mx) at distances `away` [px]: rings of one pixel's width, as far out as
-        their light falls and is over RING_SIGMAS; None where these are fewer than three."""
+    def measure(cls, data, usable, away, sigma):
+        """Measures rings one pixel wide in pixels (My, Mx) at distances `away` [px].
+
+        Rings end where their light rises or is below RING_SIGMAS. None if fewer than three remain.
+        """
         rings, found = np.rint(away[usable]).astype(int), []
         value, radius = data[usable], away[usable]
         for r in range(rings.min(initial=0), rings.max(initial=-1) + 1):
@@ -40,7 +42,7 @@ class Fall:
         return cls(*np.log(found).T) if len(found) > 2 else None
 
     def at(self, radius):
-        """The light at distances [px], any shape; those under a pixel count as one."""
+        """Light at distances [px], of any shape; distances below one pixel count as one."""
         x = np.log(np.maximum(radius, 1.0))
         u, v = self.log_radius, self.log_light
         from scipy.interpolate import (
@@ -55,15 +57,16 @@ class Fall:
         return np.exp(found)
 
     def power(self, radius) -> float:
-        """Power of the distance by which the light falls at a radius [px]."""
+        """Exponent of the power of the distance by which the light falls at a radius [px]."""
         ends = self.at(np.array([1.0, np.exp(LOG_STEP)]) * radius)
         return float(np.log(ends[0] / ends[1]) / LOG_STEP)
 
-    def outside(self, radius, core):
-        """The same with the Gaussian in a core [px] that has its light and slope at the rim.
+    def with_core(self, radius, core):
+        """Light at distances [px], with a Gaussian inside a core [px].
 
-        What nobody sees of a star is rendered with errors of rounding that are parts of the
-        brightest sample: a Gaussian is fainter, and as smooth as can be.
+        The Gaussian has the profile's light and slope at the core's rim. It is smooth and fainter
+        than a continued power. Unobserved samples are rendered with rounding errors proportional
+        to the brightest sample.
         """
         inside = self.at(core) * np.exp(0.5 * self.power(core) * (1 - (radius / core) ** 2))
         return np.where(radius < core, inside, self.at(radius))
