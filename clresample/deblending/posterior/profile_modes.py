@@ -115,7 +115,7 @@ def _surroundings(galaxy, theta, position, origin, size):
     near = np.minimum(np.array(size) // 2, FAR_PX)
     beta, frame = np.exp(theta[3]), np.array(galaxy.shape)
     # beyond t of the peak lies t^(beta / (beta + 1)) of the light
-    middle, half = galaxy.reach(theta, position, FAR_LIGHT ** min((beta + 1) / beta, 10.0))
+    middle, half = galaxy.bounding_box(theta, position, FAR_LIGHT ** min((beta + 1) / beta, 10.0))
     low = np.minimum(origin - near, np.maximum(np.floor(middle - half), 0))
     high = np.maximum(origin + size + near, np.minimum(np.ceil(middle + half) + 1, frame))
     return low.astype(int), (high - low).astype(int)
