@@ -16,6 +16,7 @@ import numpy as np
 from clresample import get_device
 from clresample.device.contraction import GROUP_FILE, ONE_SUM, Contraction
 from clresample.device.device import Device
+from clresample.device.gpu_sizes import gpu_sizes
 from clresample.device.program import Launcher, source_of
 from clresample.device.tuning import Tuning
 
@@ -109,7 +110,7 @@ def contraction_builds(device, vendor):
     notebook = Notebook()
     for dtype, layout in itertools.product((np.float32, np.float64), LAYOUTS):
         epilogue, adjoint, ragged, strided = layout
-        tuning = Tuning.untuned(device, dtype)
+        tuning = replace(Tuning.untuned(device, dtype), **gpu_sizes(vendor, dtype))
         product = Contraction(
             device,
             np.dtype(dtype),
