@@ -1,4 +1,4 @@
-"""Sizes of kernels that differ from vendor to vendor of GPUs; `make gpu-builds` shows what they take.
+"""Sizes of kernels that differ among vendors of GPUs; `make gpu-builds` shows what they take.
 
 They follow from compilers' figures: no build spills registers in float32, and enough waves fit
 beside each other to hide a wait for memory. All of them give the same sums in the same order.
@@ -34,14 +34,15 @@ def gpu_sizes(vendor, dtype=np.float32) -> dict:
         return {"tile": tile, "row_choices": rows, "two_sum_rows": 6, "box_tile": boxes, "lanes": 8}
     if vendor == "Intel":
         # of a thread's 128 registers 32 lanes with 8 sums each take a quarter
+        tile |= {"VW": 2, "MR": 2 if double else 4}
         boxes |= {"VW": 2, "MR": 2, "KU": 1 if double else 2}
-        sizes = {"tile": tile | {"MR": 2}, "row_choices": (2,), "two_sum_rows": 2}
-        return sizes | {"box_tile": boxes, "lanes": 4}
+        rows = (2,) if double else (2, 4)
+        return {"tile": tile, "row_choices": rows, "two_sum_rows": 2, "box_tile": boxes, "lanes": 4}
     return {
         # a square of 64 work-items that every GPU allows: 64 x 64 floats of the product, and two
         # slabs of 8 KiB in local memory
         "tile": {"VW": vector, "NV": 2, "MR": 8, "WGX": 8, "WGY": 8, "KB": 16},
-        "row_choices": (6, 8, 10),  # 48, 64 or 80 rows a group; more spill
+        "row_choices": (6, 8) if double else (6, 8, 10),  # 48, 64 or 80 rows; more spill
         "two_sum_rows": 6 if double else 8,
         "box_tile": boxes,
         "lanes": 8,

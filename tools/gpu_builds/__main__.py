@@ -151,7 +151,7 @@ def compiled(compilers, jobs):
         from .captured import captured_builds, contraction_builds
 
         shared = captured_builds(grind.WORKS)
-        tasks = [(c, b) for c in compilers for b in shared]
+        tasks = [(c, build.for_vendor(c.vendor)) for c in compilers for build in shared]
         for compiler in compilers:
             own = contraction_builds(get_device(), compiler.vendor)
             tasks += [(compiler, build) for build in own]

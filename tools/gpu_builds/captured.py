@@ -20,6 +20,7 @@ from clresample.device.gpu_sizes import gpu_sizes
 from clresample.device.program import Launcher, source_of
 from clresample.device.tuning import Tuning
 
+BOXED_FILE = "boxed.cl"
 # (epilogue, adjoint, ragged, strided) of the products that operators and fits ask for.
 LAYOUTS = (
     (None, False, False, False),
@@ -56,10 +57,17 @@ class Build:
             if name not in COMMON and (name, value) != ("SIGN", 1)
         )
 
-    def in_double(self):
-        """The same in float64."""
-        text = source_of(self.file, np.float64, self.macros)
-        return replace(self, dtype="float64", text=text)
+    def for_vendor(self, vendor):
+        """The same with a vendor's sizes: of products of boxes, and of columns side by side."""
+        sizes, groups = gpu_sizes(vendor, self.dtype), self.groups
+        macros = dict(self.macros)
+        if self.file == BOXED_FILE:
+            macros |= sizes["box_tile"]
+            groups = {name: {(macros["WGX"], macros["WGY"], 1)} for name in groups}
+        if "LANES" in macros:
+            macros["LANES"] = sizes["lanes"]
+        text = source_of(self.file, self.dtype, macros)
+        return replace(self, text=text, macros=macros, groups=groups)
 
 
 class Notebook:
