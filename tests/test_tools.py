@@ -98,7 +98,7 @@ esac
         (
             "exit 2",
             2,
-            "passed in 1.0s ===; intel FAILED; pair NOT RUN; rusticl NOT RUN; gpu-compilers NOT RUN",
+            "=; intel FAILED; pair NOT RUN; rusticl NOT RUN; gpu-compilers NOT RUN",
         ),
     ],
 )

@@ -2,8 +2,8 @@
 
     python tools/gpu_model.py [--scenes 8] [--groups 32 256 1024] [--card NAME] [--json FILE]
 
-Scenes of bench.throughput are fitted with kernels as they are built for GPUs, which counts launches,
-copies that are waited for, operations of the matrix products and bytes of buffers, and the calling
+Scenes of bench.throughput are fitted with kernels as they are built for GPUs. That counts launches,
+copies that are waited for, operations of the matrix products, bytes of buffers, and the calling
 thread's own seconds. Nothing here was measured on a GPU: a launch is predicted to take
 
     GAP_S + the longest of its floor, operations / (peak share), bytes / (bandwidth BANDWIDTH_SHARE)
@@ -31,8 +31,8 @@ ROOT = Path(__file__).resolve().parents[1]
 GAP_S = 1.5e-6
 # [s] A launch of few groups: some ten reads of memory, each after the other, of 650 clocks.
 FLOOR_S = 5e-6
-# [s] The same of kernels whose work-items walk slabs, boxes, vectors or blocks: instructions and reads
-# of their loops as compiled for sm_90, times the trips that the largest sources of 32 scenes take.
+# [s] The same of kernels whose work-items walk slabs, boxes, vectors or blocks: instructions and
+# reads of their loops as compiled for sm_90, times the trips of the largest sources of 32 scenes.
 FLOORS_S = {
     "contract_group": 10e-6,
     "multiply_boxes": 10e-6,
@@ -66,10 +66,11 @@ class Card:
     share: float
 
 
+# The first three shares are of machine code from Clang 19; Intel's, which cannot be read, is assumed.
 CARDS = (
     Card("H100 SXM", "sm_90", 67e12, 3.35e12, 0.79 * 0.61),
-    Card("MI250X, one die", "gfx90a", 23.9e12, 1.6e12, 0.44 * 0.73),
-    Card("RX 7900 XTX", "gfx1100", 30.7e12, 0.96e12, 0.44 * 0.73),
+    Card("MI250X, one die", "gfx90a", 23.9e12, 1.6e12, 0.70 * 0.61),
+    Card("RX 7900 XTX", "gfx1100", 61.4e12, 0.96e12, 0.77 * 0.61),
     Card("Max 1550, one stack", "pvc", 26e12, 1.6e12, 0.40 * 0.73),
 )
 
@@ -139,7 +140,6 @@ def count(n_scenes, catalogue=None):
     """
     from bench import throughput
     from bench.harness import scenes as simulated
-
     from clresample import deblend_many, get_device
     from clresample.device import device as devices, kernel_profiler
 
@@ -191,7 +191,8 @@ def tables(counts, cards, groups):
             rates = f"{n / one.total_s:.1f} | {n / (one.device_s + one.waits_s):.0f}"
             yield f"| {' | '.join(cells)} | {rates} | {one.limit} |"
     first = predict(counts, cards[0], groups[0])
-    yield f"\nDevice, waits and host in ms a scene. By kernel, {cards[0].name}, {groups[0]} scenes:\n"
+    where = f"{cards[0].name}, {groups[0]} scenes"
+    yield f"\nDevice, waits and host in ms a scene. By kernel, {where}:\n"
     yield "| kernel | launches | ms | bound by |\n|---|---|---|---|"
     for name in sorted(first.kernels, key=first.kernels.__getitem__, reverse=True):
         launches = counts.kernels[name][0]
