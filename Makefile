@@ -10,7 +10,7 @@ PYTEST = $(RUN) pytest -n auto --maxprocesses 4 --dist loadfile
 
 .PHONY: demo test test-on test-kernels-on grind lint mutants fuzz clean paper paper-full dist \
     test-as-gpu test-install test-oldest test-adapters threads docs soak kills \
-    kernel-tests
+    kernel-tests gpu-builds gpu-model
 
 # What runs on one OpenCL device whatever the others are: operators, and the solver's kernels.
 KERNEL_TESTS = tests/device/test_contraction.py tests/device/test_launcher.py \
@@ -38,6 +38,16 @@ test-on: $(STAMP)
 # Kernels' tests on one other runtime.
 test-kernels-on: TESTS = $(KERNEL_TESTS)
 test-kernels-on: test-on
+
+# What every kernel takes on GPUs of three vendors, compiled without one; ARGS='sm_90 --all'
+gpu-builds: $(STAMP)
+	@PYTHON=$(PYTHON) tools/on_runtime.sh gpu-compilers \
+	    env PYTHONPATH=tools OMP_NUM_THREADS=1 $(RUN) gpu_builds $(ARGS) || \
+	    { status=$$?; [ $$status = 77 ] || exit $$status; }
+
+# What a GPU would take for joint fits, by arithmetic from counts made here: docs/gpu.md
+gpu-model: $(STAMP)
+	$(VENV)/bin/python tools/gpu_model.py $(ARGS)
 
 # Their names, for bench/gpu_check.sh.
 kernel-tests:

@@ -33,6 +33,14 @@
 #define TWO_SUMS 0
 #endif
 
+/* Unrolled, the next terms are fetched while one is multiplied. With two sums, or in double
+ * precision, there are no registers left for them. */
+#if TWO_SUMS || defined(USE_DOUBLE)
+#define EACH_TERM(l) for (int l = KB - 1; l >= 0; --l)
+#else
+#define EACH_TERM(l) _Pragma("unroll") for (int l = KB - 1; l >= 0; --l)
+#endif
+
 #define GROUP (WGX * WGY)
 #define TM (WGY * MR)
 #define VECTORS (WGX * NV)                   /* vectors of a row of B's slab */
@@ -140,7 +148,7 @@ void contract_group(int m, int n, const int n_pad, int k,
         if (turn + 1 < n_slabs) {
             FETCH(SLAB(turn + 1))
         }
-        for (int l = KB - 1; l >= 0; --l) {
+        EACH_TERM(l) {
             WIDE right[NV];
             REAL left[MR];
             UNROLL(v, NV) right[v] = slab_b[slab][l][v * WGX + lx];

@@ -92,9 +92,14 @@ esac
         (
             "echo ..F.; sleep 9",
             1,
-            "; intel NOT RUN TO THE END, no answer in time, FAILED; pair NOT RUN; rusticl NOT RUN",
+            "; intel NOT RUN TO THE END, no answer in time, FAILED; pair NOT RUN; rusticl NOT RUN; "
+            "gpu-compilers NOT RUN",
         ),
-        ("exit 2", 2, "passed in 1.0s ===; intel FAILED; pair NOT RUN; rusticl NOT RUN"),
+        (
+            "exit 2",
+            2,
+            "=; intel FAILED; pair NOT RUN; rusticl NOT RUN; gpu-compilers NOT RUN",
+        ),
     ],
 )
 def test_runtimes_that_were_not_tested_stand_in_the_last_line(tmp_path, intel, status, said):

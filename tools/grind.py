@@ -181,7 +181,7 @@ def leave(device):
     scenes, states = [f.scene for f in fits], [f.state for f in fits]
     engine = MultiscaleEngine(scenes, states, device, np.float32, settings.prior, 1.0)
     engine.round()
-    engine.take([1]).round()
+    engine.subset([1]).round()
 
 
 def vary(device):
@@ -211,6 +211,10 @@ def constrain(device):
     CHAIN.prox(morphs, boxes)
 
 
+# In the order in which they are run.
+WORKS = (resample, render, constrain, leave, vary, fit)
+
+
 def plant(device, fault):
     """Launch a kernel with a fault."""
     import pyopencl as cl
@@ -233,7 +237,7 @@ def main():
         plant(device, arguments.plant)
         return 0
     launched = watch(device, arguments.kind)
-    for work in (resample, render, constrain, leave, vary, fit):
+    for work in WORKS:
         work(device)
         device.finish()
         print(f"grind: {work.__name__} after {time.perf_counter() - began:.0f} s", flush=True)

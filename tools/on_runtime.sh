@@ -8,6 +8,8 @@
 #   pair         Intel's beside PoCL's wheel: two unlike devices in one process
 #   rusticl      Mesa's OpenCL on llvmpipe: a CPU that behaves as a GPU without double precision
 #   oclgrind     a simulator that reports races and accesses out of bounds on standard error
+#   gpu-compilers  none: compilers for GPUs of NVIDIA, AMD and Intel, in $GPU_COMPILERS and, from
+#                pip, $GPU_COMPILERS_PYTHON, and the runtime that is there
 #
 # What it needs is fetched into $RUNTIMES/RUNTIME (default .runtimes) once: by pip, or by apt-get
 # download and dpkg -x, which need no root. Nothing is installed on the machine. Where it cannot be
@@ -27,14 +29,15 @@ here=$(cd "$(dirname "$0")" && pwd)
 root=$home/root
 arch=$(uname -m)-linux-gnu
 
-# unpack PACKAGE [NAMES]: a Debian package and what it needs beside what is installed here. Packages
+# unpack PACKAGES [NAMES]: Debian packages and what they need beside what is installed here. Packages
 # whose names match the regular expression NAMES are left out.
 unpack() {
     [ -e "$home/made" ] && return
     command -v apt-get dpkg >/dev/null || skip "apt-get and dpkg are needed"
     mkdir -p "$home/debs" "$root"
     local names
-    names=$(apt-get install --simulate --no-install-recommends "$1" 2>/dev/null |
+    # shellcheck disable=SC2086  # one word a package
+    names=$(apt-get install --simulate --no-install-recommends $1 2>/dev/null |
         awk '/^Inst/ {print $2}' | grep -vxE "lib32.*|libc6-i386|libobjc.*${2:+|$2}" || true)
     [ -n "$names" ] || skip "apt-get does not know $1, or it is installed"
     # shellcheck disable=SC2086  # one word a package
@@ -93,8 +96,19 @@ oclgrind)
     export OCL_ICD_VENDORS=$root/usr/lib/oclgrind/liboclgrind-rt-icd.so
     export OCLGRIND_DATA_RACES=1
     ;;
+gpu-compilers)
+    packages="clang-19 libclc-19 llvm-19 rocm-device-libs intel-opencl-icd"
+    # shellcheck disable=SC2086  # one word a package
+    dpkg -s $packages >/dev/null 2>&1 || unpack "$packages" 'ocl-icd-.*'
+    export GPU_COMPILERS=$root GPU_COMPILERS_PYTHON=$home/python
+    # a target without its compiler is left out, and named
+    [ -e "$GPU_COMPILERS_PYTHON" ] || command -v ptxas >/dev/null ||
+        timeout 300 "${PYTHON:-python3}" -m pip install --quiet --target "$GPU_COMPILERS_PYTHON" \
+            nvidia-cuda-nvcc >>"$home/log" 2>&1 || rm -rf "$GPU_COMPILERS_PYTHON"
+    ;;
 *)
-    echo "RUNTIME is $runtime; there are pocl, pocl-debian, intel, pair, rusticl and oclgrind" >&2
+    echo "RUNTIME is $runtime; there are pocl, pocl-debian, intel, pair, rusticl, oclgrind and" \
+        "gpu-compilers" >&2
     exit 2
     ;;
 esac

@@ -155,11 +155,12 @@ class Contraction:
 
     def build(self, n_rows=None, n_terms=0, n=0):
         """(file, macros) for numbers of rows, terms and columns; by default the largest."""
-        tile = self.tuning.tile_for(n_rows) if n_rows else self.tuning.tile
+        two_sums = "KB" in self.tuning.tile and n_terms > ONE_SUM
+        tile = self.tuning.tile_for(n_rows or None, two_sums=two_sums)
         if "KB" not in tile:
             own = {"RT": ROW_TILES, "READ_AHEAD": self.tuning.prefetch_columns}
             return FILE, self.options | own | self.tuning.tile_for_columns(n, round_up_columns(n))
-        return GROUP_FILE, self.options | tile | {"TWO_SUMS": n_terms > ONE_SUM}
+        return GROUP_FILE, self.options | tile | {"TWO_SUMS": two_sums}
 
     def bind(
         self,

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .gpu_sizes import gpu_sizes, gpu_vendor
 from .pocl_cpu_name import set_pocl_cpu_name
 
 # Groups of a launch along its second and third axis, which GPUs limit to so many: NVIDIA's compute
@@ -32,6 +33,8 @@ class Tuning:
         With KB, the terms of a slab in local memory, they are macros of contract_group.cl
     row_choices: MR of a tile may be one of these instead, where a matrix then has fewer rows that
         are computed and not stored
+    two_sum_rows: MR at most where a product sums stretches first, which takes twice the registers
+    box_tile: macros of boxed.cl, where boxes are lower than frames; None takes the tile
     row_loops: one work-item takes a whole row of pixels, as a CPU's vector unit wants it; else one
         takes a pixel
     prefetch_columns: the contraction fetches the right factor's next columns while it multiplies.
@@ -66,6 +69,8 @@ class Tuning:
 
     tile: dict[str, int]
     row_choices: tuple[int, ...]
+    two_sum_rows: int
+    box_tile: dict[str, int] | None
     row_loops: bool
     prefetch_columns: bool
     sum_group: int
@@ -95,7 +100,6 @@ class Tuning:
         """Default sizes for a device that has not been measured."""
         shared = {
             "line_group": 32,  # one warp of a GPU
-            "lanes": 8,
             "chunk_terms": 1024,
             "tile_flops": 4e7,  # 1 ms, where PoCL does 40 Gflop/s
             "pixel_flops": 80.0,  # 2 ns
@@ -108,6 +112,9 @@ class Tuning:
             return cls(
                 tile=_cpu_tile(device, np.dtype(dtype)),
                 row_choices=(),
+                two_sum_rows=16,
+                box_tile=None,
+                lanes=8,
                 row_loops=True,
                 prefetch_columns=True,
                 tile_group=(8, 1, 1),  # fewer cost more in starting them, more are cut off
@@ -122,11 +129,7 @@ class Tuning:
                 **shared,
             )
         return cls(
-            # 16-byte loads, and a square of 64 work-items that every GPU allows: 64 x 64 floats
-            # of the product, and two slabs of 8 KiB in local memory
-            tile={"VW": 4 if np.dtype(dtype) == np.float32 else 2, "NV": 2, "MR": 8}
-            | {"WGX": 8, "WGY": 8, "KB": 16},
-            row_choices=(6, 8, 10),  # 48, 64 or 80 rows a group; more spill
+            **gpu_sizes(gpu_vendor(device.cl.vendor), dtype),
             row_loops=False,
             prefetch_columns=False,
             tile_group=(8, 8, 1),
@@ -141,14 +144,22 @@ class Tuning:
             **shared,
         )
 
-    def tile_for(self, n_rows) -> dict[str, int]:
-        """The tile for matrices of `n_rows`: of those allowed, the one that covers them best."""
+    def tile_for(self, n_rows=None, *, two_sums=False) -> dict[str, int]:
+        """The tile for matrices of `n_rows`, or of most: of those allowed, what covers them best.
+
+        two_sums: the product sums stretches first
+        """
 
         def covered(rows):
             group = rows * self.tile["WGY"]
             return -(-n_rows // group) * group, -rows
 
         choices = {*self.row_choices, self.tile["MR"]}
+        if two_sums:
+            choices = {rows for rows in choices if rows <= self.two_sum_rows} or choices
+        if n_rows is None:
+            middle = self.tile["MR"]
+            return self.tile | {"MR": middle if middle in choices else max(choices)}
         return self.tile | {"MR": min(choices, key=covered)}
 
     def tile_for_columns(self, n, n_pad) -> dict[str, int]:

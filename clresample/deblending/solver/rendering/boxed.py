@@ -26,7 +26,7 @@ class BoxedProduct:
     def __init__(self, buffers, *, strided=False, ragged=False, inward=True, **sizes):
         b, sizes = buffers, {"next_a": 1, "next_c": 1, "skip": 0} | sizes
         items = [np.broadcast_to(sizes[name], b.n_sources) for name in COLUMNS]
-        tile, m, width = _tile(b.tuning), max(items[0]), max(items[1] + items[8])
+        tile, m, width = b.tuning.box_tile or b.tuning.tile, max(items[0]), max(items[1] + items[8])
         group = tile["WGX"], tile["WGY"]
         along = math.ceil(round_up_columns(int(width)) / (tile["VW"] * tile["NV"]))
         tiles = b.along_row(along), int(m) / tile["MR"]
@@ -48,13 +48,3 @@ class BoxedProduct:
     def __call__(self, a, b, c, active, *, add=False):
         """Queues the products of the sources `active` (n,): C from A and B, added if ragged."""
         self._launch((*self._size, active.size), A=a, B=b, C=c, active=active, add=add)
-
-
-def _tile(tuning):
-    """Macros of the kernel: the contraction's where a work-item has a tile to itself.
-
-    Else groups of 64 that own 32 rows and 16 vectors of a row, since boxes are lower than frames.
-    """
-    if tuning.row_loops:
-        return tuning.tile
-    return {"VW": tuning.tile["VW"], "NV": 1, "MR": 8, "WGX": 16, "WGY": 4}

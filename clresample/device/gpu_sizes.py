@@ -1,0 +1,49 @@
+"""Sizes of kernels that differ among vendors of GPUs; `make gpu-builds` shows what they take.
+
+They follow from compilers' figures: no build spills registers in float32, and enough waves fit
+beside each other to hide a wait for memory. All of them give the same sums in the same order.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+# How the drivers of each vendor begin its name.
+VENDORS = {
+    "Advanced Micro Devices": "AMD",
+    "AMD": "AMD",
+    "Intel": "Intel",
+    "NVIDIA": "NVIDIA",
+}
+
+
+def gpu_vendor(name):
+    """The vendor that a driver's name of it means: "AMD", "Intel" or "NVIDIA", also of others."""
+    return next((v for begin, v in VENDORS.items() if name.startswith(begin)), "NVIDIA")
+
+
+def gpu_sizes(vendor, dtype=np.float32) -> dict:
+    """Fields of Tuning for GPUs of "AMD", "Intel" or "NVIDIA" and float32 or float64."""
+    double = np.dtype(dtype) == np.float64
+    vector = 2 if double else 4  # 16-byte loads
+    tile = {"VW": vector, "NV": 1, "MR": 4, "WGX": 16, "WGY": 16, "KB": 16}
+    boxes = {"VW": vector, "NV": 1, "MR": 8, "WGX": 16, "WGY": 4}
+    if vendor == "AMD":
+        # a group of 64 is one wave with 15 KB of local memory, of which a SIMD then holds one
+        rows = (2, 4) if double else (2, 4, 6)
+        return {"tile": tile, "row_choices": rows, "two_sum_rows": 6, "box_tile": boxes, "lanes": 8}
+    if vendor == "Intel":
+        # of a thread's 128 registers 32 lanes with 8 sums each take a quarter
+        tile |= {"VW": 2, "MR": 2 if double else 4}
+        boxes |= {"VW": 2, "MR": 2, "KU": 1 if double else 2}
+        rows = (2,) if double else (2, 4)
+        return {"tile": tile, "row_choices": rows, "two_sum_rows": 2, "box_tile": boxes, "lanes": 4}
+    return {
+        # a square of 64 work-items that every GPU allows: 64 x 64 floats of the product, and two
+        # slabs of 8 KiB in local memory
+        "tile": {"VW": vector, "NV": 2, "MR": 8, "WGX": 8, "WGY": 8, "KB": 16},
+        "row_choices": (6, 8) if double else (6, 8, 10),  # 48, 64 or 80 rows; more spill
+        "two_sum_rows": 6 if double else 8,
+        "box_tile": boxes,
+        "lanes": 8,
+    }
