@@ -43,6 +43,8 @@ class RadialProfile:
 
     def at(self, radius):
         """Light at distances [px], of any shape; distances below one pixel count as one."""
+        from scipy.interpolate import PchipInterpolator  # 0.1 s, for saturated stars alone
+
         x = np.log(np.maximum(radius, 1.0))
         u, v = self.log_radius, self.log_light
         from scipy.interpolate import PchipInterpolator  # 0.1 s, for such stars alone
