@@ -66,7 +66,7 @@ class Card:
     share: float
 
 
-# The first three shares are of machine code from Clang 19; Intel's, which cannot be read, is assumed.
+# The first three shares are of machine code from Clang 19; that of Intel, unread, is assumed.
 CARDS = (
     Card("H100 SXM", "sm_90", 67e12, 3.35e12, 0.79 * 0.61),
     Card("MI250X, one die", "gfx90a", 23.9e12, 1.6e12, 0.70 * 0.61),

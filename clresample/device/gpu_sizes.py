@@ -28,22 +28,24 @@ def gpu_sizes(vendor, dtype=np.float32) -> dict:
     vector = 2 if double else 4  # 16-byte loads
     tile = {"VW": vector, "NV": 1, "MR": 4, "WGX": 16, "WGY": 16, "KB": 16}
     boxes = {"VW": vector, "NV": 1, "MR": 8, "WGX": 16, "WGY": 4}
+    rows: tuple[int, ...]
     if vendor == "AMD":
         # a group of 64 is one wave with 15 KB of local memory, of which a SIMD then holds one
-        rows = (2, 4) if double else (2, 4, 6)
-        return {"tile": tile, "row_choices": rows, "two_sum_rows": 6, "box_tile": boxes, "lanes": 8}
-    if vendor == "Intel":
+        rows, two_sum_rows, lanes = (2, 4) if double else (2, 4, 6), 6, 8
+    elif vendor == "Intel":
         # of a thread's 128 registers 32 lanes with 8 sums each take a quarter
         tile |= {"VW": 2, "MR": 2 if double else 4}
         boxes |= {"VW": 2, "MR": 2, "KU": 1 if double else 2}
-        rows = (2,) if double else (2, 4)
-        return {"tile": tile, "row_choices": rows, "two_sum_rows": 2, "box_tile": boxes, "lanes": 4}
-    return {
+        rows, two_sum_rows, lanes = (2,) if double else (2, 4), 2, 4
+    else:
         # a square of 64 work-items that every GPU allows: 64 x 64 floats of the product, and two
-        # slabs of 8 KiB in local memory
-        "tile": {"VW": vector, "NV": 2, "MR": 8, "WGX": 8, "WGY": 8, "KB": 16},
-        "row_choices": (6, 8) if double else (6, 8, 10),  # 48, 64 or 80 rows; more spill
-        "two_sum_rows": 6 if double else 8,
+        # slabs of 8 KiB in local memory; 48, 64 or 80 rows, more spill
+        tile |= {"NV": 2, "MR": 8, "WGX": 8, "WGY": 8}
+        rows, two_sum_rows, lanes = ((6, 8), 6, 8) if double else ((6, 8, 10), 8, 8)
+    return {
+        "tile": tile,
+        "row_choices": rows,
+        "two_sum_rows": two_sum_rows,
         "box_tile": boxes,
-        "lanes": 8,
+        "lanes": lanes,
     }

@@ -54,7 +54,7 @@ def test_two_sums_take_tiles_with_registers_for_them(device, monkeypatch, dtype)
             _, macros = product.build(n_rows, n_terms, 64)
             assert macros["TWO_SUMS"] == (n_terms > ONE_SUM)
             assert not macros["TWO_SUMS"] or macros["MR"] <= most
-    assert product.build(80, 64, 64)[1]["MR"] == 10
+    assert product.build(80, 64, 64)[1]["MR"] == (10 if dtype == np.float32 else 6)
 
 
 def product_with(sizes, device, monkeypatch, a, b, dtype):
@@ -100,9 +100,8 @@ def gradient_with(vendor, device, monkeypatch):
         return [own.get(array) for array in (buffers.d_morph, buffers.d_spectra)]
 
 
-def test_gradients_are_those_of_every_vendor(device, monkeypatch):
-    first, *others = (gradient_with(vendor, device, monkeypatch) for vendor in VENDORS)
-    for other in others:
-        for one, same in zip(first, other, strict=True):
-            assert np.abs(one).max() > 0
-            np.testing.assert_array_equal(same, one)
+def test_gradients_have_the_same_bits_with_smaller_tiles_of_boxes(device, monkeypatch):
+    first, other = (gradient_with(vendor, device, monkeypatch) for vendor in ("NVIDIA", "Intel"))
+    for one, same in zip(first, other, strict=True):
+        assert np.abs(one).max() > 0
+        np.testing.assert_array_equal(same, one)
