@@ -233,7 +233,7 @@ def test_errors_name_the_argument_and_give_both_values(device):
         Resampler(grid, psf, far, psf, device=device)
     with pytest.raises(ValueError, match="psf_in has 2 bands.*3"):
         Resampler(grid, PSF.gaussian([1, 2]), grid, PSF.gaussian([1, 2, 3]), device=device)
-    with pytest.raises(ValueError, match="int32.*float32 and float64"):
+    with pytest.raises(ValueError, match="int32.*float32 or float64"):
         Resampler(grid, psf, grid, psf, dtype=np.int32, device=device)
     with pytest.raises(ValueError, match="plans is empty"):
         Resampler.from_plans([], device=device)

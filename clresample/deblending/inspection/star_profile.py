@@ -47,7 +47,6 @@ class RadialProfile:
 
         x = np.log(np.maximum(radius, 1.0))
         u, v = self.log_radius, self.log_light
-        from scipy.interpolate import PchipInterpolator  # 0.1 s, for such stars alone
 
         found = PchipInterpolator(u, v)(np.clip(x, u[0], u[-1]))
         k = min(END_RINGS, len(u) - 1)
