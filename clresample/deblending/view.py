@@ -226,7 +226,7 @@ class SceneGeometry:
 def whitened_view(home, observation, pad, device, dtype, *, private) -> WhitenedView:
     """The view of an Observation on the frame of a SceneGeometry, padded to multiples of `pad`.
 
-    Correlated noise is made white first (Observation.white).
+    Correlated noise is made white first (Observation.whitened).
 
     private: with an operator of its own, which may be shifted; else one that equal observations
         share
