@@ -5,7 +5,7 @@
 case        single, of Sersic n = 1, 2.5, 4; neighbour: the same with one of signal to noise 20 at
             1, 2.5 or 4 r_e and 4 px; pair of equals at 0.5 to 3 r_e; bulge_disk of other colours;
             giant with eight satellites; cosmos: real galaxies drawn 4 and 8 times as large;
-            star_as_galaxy, a star fitted as Extended; galaxy_as_point, a galaxy as Point
+            star_as_galaxy, a star fitted as ExtendedSource; galaxy_as_point, the reverse
 mode        one: a survey of three bands, Moffat PSF 4.2 px wide; joint: Euclid and Rubin
 
 Frames are 8 r_e wide, or 65 px, or as their sources need. Positions are the true ones. The truth of

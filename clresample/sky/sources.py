@@ -110,7 +110,7 @@ def _icrs(coordinate):
     if coordinate.shape != ():
         raise ValueError(
             f"sky_deg is a SkyCoord of shape {coordinate.shape}, must be of one place: give each "
-            "source its own, [Extended(sky_deg=c) for c in coordinates]"
+            "source its own, [ExtendedSource(sky_deg=c) for c in coordinates]"
         )
     sky = SkyCoord(coordinate).icrs
     return float(sky.ra.deg), float(sky.dec.deg)
