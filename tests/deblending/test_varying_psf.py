@@ -112,7 +112,7 @@ def test_errors_cover_fluxes_all_over_a_blend(device):
         for result in deblend_many(blends, settings=settings, device=device):
             pulls[name].append(_pulls(result))
     own = np.array(pulls["own"])  # (n, S, C)
-    # their ripples end at the frame's edge, which takes 0.1 % off fluxes, and flux_error_floor allows it
+    # their ripples end at the frame's edge: 0.1 % less flux, which flux_error_floor allows
     assert 0.7 < own.std() < 1.1
     assert np.abs(own.mean(axis=0)).max() < 1
     assert 0.62 < (np.abs(own) < 1).mean() < 0.86

@@ -10,8 +10,9 @@ from ...sky.noise import HALF_WIDTH
 from ..posterior.residuals import MIN_PIXELS, MISFIT_SIGMAS, remainder
 
 # Part of a source's flux in a channel from which on a significant residual is a misfit. Errors of
-# bright galaxies are about 1 % (Settings.flux_error_floor, structure, their growth with the residual), so
-# that three of them cover less; simulated galaxies that are fitted well have fluxes within 3 %.
+# bright galaxies are about 1 % (Settings.flux_error_floor, structure, their growth with the
+# residual), so that three of them cover less; simulated galaxies that are fitted well have fluxes
+# within 3 %.
 MISFIT_FRACTION = 0.03
 # Part of the flux of all sources of a blend that is left where its model does not describe the
 # data. What a single one leaves is said by its flag.
