@@ -45,11 +45,11 @@ def test_every_page_is_in_the_contents():
     assert set(PAGES) == listed
 
 
-def test_every_public_name_is_in_the_reference():
+def test_every_public_name_is_in_the_reference_once():
     reference = (DOCS / "reference.md").read_text()
     kinds = r"auto(?:class|function)|py:data"
-    found = set(re.findall(rf"^\.\. (?:{kinds}):: ([A-Za-z_]+)$", reference, re.MULTILINE))
-    assert found == set(clresample.__all__)
+    found = re.findall(rf"^\.\. (?:{kinds}):: ([A-Za-z_]+)$", reference, re.MULTILINE)
+    assert sorted(found) == sorted(clresample.__all__)
 
 
 def test_links_to_other_packages_lead_to_what_there_is(monkeypatch, tmp_path):
