@@ -95,20 +95,15 @@ class Posterior:
                 between[:, t, s] += np.diag(found)
             if s == t:
                 colour[s] += found if i == j else found + found.T
-        floor = np.zeros(flux.shape)
-        for i, slope in enumerate(slopes):
-            own = self.solution.spectra[i] * slope[0, -self.layout.n_spectra]  # its flux
-            unlike = clipped_power(self.solution.structure_excess(i), FLOOR_EXPONENT)
-            floor[owner[i]] += flux_error_floor * unlike * own
-        between[:, np.arange(n_sources), np.arange(n_sources)] += floor.T**2
-        colour += floor[:, :, None] * floor[:, None, :]
-        far = np.zeros(flux.shape)
-        for i, (spectrum, beyond) in enumerate(
-            zip(self.solution.spectra, self.beyond, strict=True)
-        ):
+        floor, far = np.zeros((2, *flux.shape))
+        for i, (slope, beyond) in enumerate(zip(slopes, self.beyond, strict=True)):
+            spectrum, unlike = self.solution.spectra[i], self.solution.structure_excess(i)
+            own = spectrum * slope[0, -self.layout.n_spectra]  # its flux
+            floor[owner[i]] += flux_error_floor * clipped_power(unlike, FLOOR_EXPONENT) * own
             far[owner[i]] += FAR_ERROR * spectrum * beyond.sums[0]
-        between[:, np.arange(n_sources), np.arange(n_sources)] += far.T**2
-        colour += far[:, :, None] * far[:, None, :]
+        for common in (floor, far):  # to all channels of a source
+            between[:, np.arange(n_sources), np.arange(n_sources)] += common.T**2
+            colour += common[:, :, None] * common[:, None, :]
         error = np.sqrt(np.diagonal(colour, axis1=1, axis2=2))
         released = np.zeros(flux.shape)
         for s, slope, change in zip(owner, slopes, self.released, strict=False):
