@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,6 +37,16 @@ class StartComponent:
     shape: object
     position: np.ndarray
     frame: tuple[int, int]
+
+
+def renumbered(components) -> list[StartComponent]:
+    """Numbers components anew, in each scene from 0 on, in their order."""
+    count: dict[int, int] = {}
+    out = []
+    for c in components:
+        out.append(replace(c, index=count.get(c.scene, 0)))
+        count[c.scene] = out[-1].index + 1
+    return out
 
 
 def boxes_of(components, thetas, thresholds):

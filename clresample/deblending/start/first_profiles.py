@@ -15,11 +15,10 @@ next, and so on: the result does not depend on the order of the list.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from ..profiles import GalaxyProfile
+from .component_batch import renumbered
 from .population import NEIGHBOUR_MODEL_ERROR
 
 # Sizes follow each other by this factor: the least squares find their way from half of it.
@@ -143,15 +142,9 @@ def _apart(around, listed, gain, at):
 
 def _instead(looking, listed):
     """LinearisedScenes rendered with components [(i, theta)] in place of the present ones."""
-    components, parameters, count = [], [], {}
-    for i, theta in listed:
-        c = looking.components[i]
-        count[c.scene] = index = count.get(c.scene, -1) + 1
-        components.append(replace(c, index=index))
-        parameters.append(theta)
-    around = looking.with_components(components)
-    scenes = np.unique(around.scene)
-    around.render(scenes, parameters, np.zeros(len(components)), slopes=False)
+    around = looking.with_components(renumbered(looking.components[i] for i, _ in listed))
+    scenes, thetas = np.unique(around.scene), [theta for _, theta in listed]
+    around.render(scenes, thetas, np.zeros(len(listed)), slopes=False)
     return around
 
 

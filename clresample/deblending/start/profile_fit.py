@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from ..spectra import MODEL_ERROR
-from .component_batch import peaks_of
+from .component_batch import peaks_of, renumbered
 from .equations import N_PARAMETERS, normal_equations
 from .first_profiles import first_profiles
 from .linearised_scenes import LinearisedScenes
@@ -16,7 +14,7 @@ from .population import PopulationPrior, contamination_factors
 # Longest step of a parameter: far from the minimum the quadratic model of chi2 promises too much.
 LONGEST_STEP = 0.7
 # Most steps, and the chi2 that ends them when one of them gains no more than it.
-N_STEPS, REL_CHI2_TOL = 40, 1.0
+N_STEPS, CHI2_TOL = 40, 1.0
 # Most steps of large galaxies' profiles after each that is found, before all are fitted together.
 N_FIRST_STEPS = 5
 # Levenberg-Marquardt: damping of the first step as a part of the normal matrix's diagonal, what it
@@ -73,17 +71,13 @@ class ProfileFit:
         thetas: {component: parameters (n,)}; free: set of those that move; scenes (k,): that are
             fitted, others stay as they are
         """
-        count = np.zeros(len(self.theta), int)
-        part, here = [], [i for i in thetas if self.looking.scene[i] in scenes]
-        for i in here:
-            c = self.looking.components[i]
-            part.append(replace(c, index=int(count[c.scene])))
-            count[c.scene] += 1
-        fit = ProfileFit(self.looking.with_components(part), self.noise)
+        here = [i for i in thetas if self.looking.scene[i] in scenes]
+        part = self.looking.with_components(renumbered(self.looking.components[i] for i in here))
+        fit = ProfileFit(part, self.noise)
         moves = np.zeros(fit.source.shape, bool)
-        for c, i in zip(part, here, strict=True):
-            fit.theta[c.scene, c.index, : len(thetas[i])] = thetas[i]
-            moves[c.scene, c.index] = i in free
+        for b, k, i in zip(*fit.at, here, strict=True):
+            fit.theta[b, k, : len(thetas[i])] = thetas[i]
+            moves[b, k] = i in free
         fit._take(scenes)
         fit._step(scenes, moves, N_FIRST_STEPS)
         return thetas | dict(zip(here, fit.thetas(), strict=True))
@@ -111,7 +105,7 @@ class ProfileFit:
             damping[scenes] = np.where(
                 gained, damping[scenes] / DAMPING_DECREASE, damping[scenes] * DAMPING_INCREASE
             )
-            enough = gained & (gain < REL_CHI2_TOL)
+            enough = gained & (gain < CHI2_TOL)
             live[scenes] = ~enough & (damping[scenes] <= MAX_DAMPING)
             self.theta[scenes[gained]] = trial[scenes[gained]]
             self._measure_brightness(self.theta)

@@ -23,7 +23,7 @@ from ...resampling.plan import Precision
 from ...sky.frame import Frame
 from ..profiles import FixedProfile, GalaxyProfile, StarProfile, components_of
 from ..view import WhitenedView, allow_for_psf_error, pixel_noise
-from .component_batch import StartComponent
+from .component_batch import StartComponent, renumbered
 from .linearised_scenes import linearise
 from .profile_fit import ProfileFit
 
@@ -210,12 +210,12 @@ def _dark(patches, sources, looking):
         found.append(_is_dark(snr))
     again = [(b, i) for b, dark in enumerate(found) for i in np.flatnonzero(dark)]
     if again:
-        wide, count = [], np.zeros(len(patches), int)
+        wide = []
         for b, i in again:
             frame, position = patches[b].frame, np.array(patches[b].positions[i], float)
             shape = GalaxyProfile(frame, widened=NEARBY)
-            wide.append(StartComponent(b, int(count[b]), i, shape, position, frame.shape))
-            count[b] += 1
+            wide.append(StartComponent(b, 0, i, shape, position, frame.shape))
+        wide = renumbered(wide)
         around = looking.with_components(wide)
         scenes = np.unique(around.scene)
         around.render(scenes, [c.shape.mean for c in wide], np.zeros(len(wide)), slopes=False)
