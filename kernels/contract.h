@@ -7,6 +7,7 @@
  *   inward 0   of sums over frequencies, which fall off: from the last term down to the first
  */
 #include "common.h"
+#include "transfer.h"
 
 #ifndef VW          /* columns of a vector */
 #define VW 16

@@ -9,19 +9,13 @@
     if (E) UNROLL(h, MR / 2) UNROLL(v, NV) {
         const int i = 2 * h;
         if (!OWNED(i, v)) continue;
-        const WIDE c = acc[i][v], s = acc[i + 1][v];
         const HALF pr = AT(const HALF, PLANE(h, 0, column[v]));
         const HALF pi = SIGN * AT(const HALF, PLANE(h, 1, column[v]));
         const HALF mr = AT(const HALF, PLANE(h, 2, column[v]));
         const HALF mi = SIGN * AT(const HALF, PLANE(h, 3, column[v]));
-        const HALF fpr = EVEN(c) - ODD(s), fpi = -(ODD(c) + EVEN(s));   /* F(+nu_y, +nu_x) */
-        const HALF fmr = EVEN(c) + ODD(s), fmi = ODD(c) - EVEN(s);      /* F(+nu_y, -nu_x) */
-        const HALF gpr = pr * fpr - pi * fpi, gpi = pr * fpi + pi * fpr;
-        const HALF gmr = mr * fmr - mi * fmi, gmi = mr * fmi + mi * fmr;
-        EVEN(acc[i][v]) = gpr + gmr;
-        ODD(acc[i][v]) = gmi - gpi;
-        EVEN(acc[i + 1][v]) = -(gpi + gmi);
-        ODD(acc[i + 1][v]) = gmr - gpr;
+        const WIDE c = acc[i][v], s = acc[i + 1][v];
+        TIMES_TRANSFER(HALF, pr, pi, mr, mi, EVEN(c), ODD(c), EVEN(s), ODD(s),
+                       EVEN(acc[i][v]), ODD(acc[i][v]), EVEN(acc[i + 1][v]), ODD(acc[i + 1][v]))
     }
 #elif TWIST
     UNROLL(h, MR / 2) UNROLL(v, NV) {

@@ -130,14 +130,9 @@ INLINE void turn(const int h_y, const int h_pad, __global const REAL *D, __globa
             const WIDE pr = AT(const WIDE, d + j), pi = SIGN * AT(const WIDE, d + h_pad + j);
             const WIDE mr = AT(const WIDE, d + 2 * h_pad + j);
             const WIDE mi = SIGN * AT(const WIDE, d + 3 * h_pad + j);
-            const WIDE fpr = cc - ss, fpi = -(cs + sc);     /* F(+nu_y, +nu_x) */
-            const WIDE fmr = cc + ss, fmi = cs - sc;        /* F(+nu_y, -nu_x) */
-            const WIDE gpr = pr * fpr - pi * fpi, gpi = pr * fpi + pi * fpr;
-            const WIDE gmr = mr * fmr - mi * fmi, gmi = mr * fmi + mi * fmr;
-            AT(WIDE, to_c + j) = gpr + gmr;
-            AT(WIDE, to_c + h_pad + j) = gmi - gpi;
-            AT(WIDE, to_s + j) = -(gpi + gmi);
-            AT(WIDE, to_s + h_pad + j) = gmr - gpr;
+            TIMES_TRANSFER(WIDE, pr, pi, mr, mi, cc, cs, sc, ss,
+                           AT(WIDE, to_c + j), AT(WIDE, to_c + h_pad + j),
+                           AT(WIDE, to_s + j), AT(WIDE, to_s + h_pad + j))
         }
     }
 }

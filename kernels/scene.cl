@@ -111,14 +111,8 @@ __kernel void compose_frequencies(
             __global const REAL *d = e + x / 2;
             const HALF pr = AT(const HALF, d), pi = AT(const HALF, d + nx_frame / 2);
             const HALF mr = AT(const HALF, d + nx_frame), mi = AT(const HALF, d + nx_frame / 2 * 3);
-            const HALF fpr = EVEN(cos_y) - ODD(sin_y), fpi = -(ODD(cos_y) + EVEN(sin_y));
-            const HALF fmr = EVEN(cos_y) + ODD(sin_y), fmi = ODD(cos_y) - EVEN(sin_y);
-            const HALF gpr = pr * fpr - pi * fpi, gpi = pr * fpi + pi * fpr;
-            const HALF gmr = mr * fmr - mi * fmi, gmi = mr * fmi + mi * fmr;
-            EVEN(cos_y) = gpr + gmr;
-            ODD(cos_y) = gmi - gpi;
-            EVEN(sin_y) = -(gpi + gmi);
-            ODD(sin_y) = gmr - gpr;
+            TIMES_TRANSFER(HALF, pr, pi, mr, mi, EVEN(cos_y), ODD(cos_y), EVEN(sin_y), ODD(sin_y),
+                           EVEN(cos_y), ODD(cos_y), EVEN(sin_y), ODD(sin_y))
             AT(WIDE, row + x) = cos_y;
             AT(WIDE, row + nx_frame + x) = sin_y;
         }

@@ -19,6 +19,7 @@
  *     n_pad / 2
  */
 #include "common.h"
+#include "transfer.h"
 #include "work_group.h"
 #ifndef TERMS       /* of each band's transfer function, in turn */
 #define TERMS 1
@@ -54,17 +55,12 @@ __kernel void split_terms(const int n_terms, const int h_y, const int n_pad, con
         FOR_X(j, n_half) {
             const REAL cc = in[2 * j], cs = in[2 * j + 1];
             const REAL sc = in[n_pad + 2 * j], ss = in[n_pad + 2 * j + 1];
-            const REAL fpr = cc - ss, fpi = -(cs + sc), fmr = cc + ss, fmi = cs - sc;
             for (int t = 0; t < n_terms; ++t) {
                 __global const REAL *d = D + t * plane + row + j;
                 __global REAL *out = terms + (image * n_terms + t) * plane + row + 2 * j;
                 const REAL pr = d[0], pi = -d[n_half], mr = d[2 * n_half], mi = -d[3 * n_half];
-                const REAL gpr = pr * fpr - pi * fpi, gpi = pr * fpi + pi * fpr;
-                const REAL gmr = mr * fmr - mi * fmi, gmi = mr * fmi + mi * fmr;
-                out[0] = gpr + gmr;
-                out[1] = gmi - gpi;
-                out[n_pad] = -(gpi + gmi);
-                out[n_pad + 1] = gmr - gpr;
+                TIMES_TRANSFER(REAL, pr, pi, mr, mi, cc, cs, sc, ss,
+                               out[0], out[1], out[n_pad], out[n_pad + 1])
             }
         }
     }
@@ -95,7 +91,6 @@ __kernel void apply_transfer(const int h_y, const int n_pad, const int n_bands, 
         const REAL cc = in[2 * j], cs = in[2 * j + 1];
         const REAL sc = in[n_pad + 2 * j], ss = in[n_pad + 2 * j + 1];
         const REAL xr = along[2 * j], xi = along[2 * j + 1];
-        const REAL fpr = cc - ss, fpi = -(cs + sc), fmr = cc + ss, fmi = cs - sc;
         const REAL tpr = yr * xr - yi * xi, tpi = yr * xi + yi * xr;    /* at (+nu_y, +nu_x) */
         const REAL tmr = yr * xr + yi * xi, tmi = yi * xr - yr * xi;    /* at (+nu_y, -nu_x) */
         REAL dpr = d[j], dpi = d[n_half + j], dmr = d[2 * n_half + j], dmi = d[3 * n_half + j];
@@ -111,11 +106,7 @@ __kernel void apply_transfer(const int h_y, const int n_pad, const int n_bands, 
 #endif
         const REAL pr = dpr * tpr - dpi * tpi, pi = dpr * tpi + dpi * tpr;
         const REAL mr = dmr * tmr - dmi * tmi, mi = dmr * tmi + dmi * tmr;
-        const REAL gpr = pr * fpr - pi * fpi, gpi = pr * fpi + pi * fpr;
-        const REAL gmr = mr * fmr - mi * fmi, gmi = mr * fmi + mi * fmr;
-        out[2 * j] = gpr + gmr;
-        out[2 * j + 1] = gmi - gpi;
-        out[n_pad + 2 * j] = -(gpi + gmi);
-        out[n_pad + 2 * j + 1] = gmr - gpr;
+        TIMES_TRANSFER(REAL, pr, pi, mr, mi, cc, cs, sc, ss,
+                       out[2 * j], out[2 * j + 1], out[n_pad + 2 * j], out[n_pad + 2 * j + 1])
     }
 }
