@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 
-# [s] Processor time of a build: from PoCL's or pyopencl's cache 0.02, from source 0.08 and more.
+# [s] Processor time of a build: 0.02 from PoCL's or pyopencl's cache, 0.08 and more from source.
 MAX_CACHED_S = 0.04
 
 

@@ -9,47 +9,51 @@ import numpy as np
 
 from .tuning import MAX_GROUPS, Tuning
 
-# The kernel of a tile in registers, for CPUs, and that of a group with local memory, for GPUs.
+# Kernels: for CPUs, whose tiles are in registers, and for GPUs, whose groups use local memory.
 FILE, GROUP_FILE = "contract.cl", "contract_group.cl"
 # Columns of device matrices are padded with zeros to a multiple of this, the widest OpenCL vector.
 COLUMN_PAD = 16
-# Rows as long as a multiple of this many elements would begin in few sets of a core's first cache,
-# which then does not hold the columns of B that a tile reads: each takes a vector more. Products
-# with 128 or 256 columns take 4 to 11 % less time on AVX2.
+# If the row length is a multiple of this many elements, all rows begin in few sets of a core's
+# first cache, where the columns of B that a tile reads then do not fit: such rows get one more
+# vector. Products with 128 or 256 columns take 4 to 11 % less time on AVX2.
 CROWDED = 128
-# Terms summed at a stretch, at most, before the stretches are summed. With 16, products take up to
-# 10 % longer on CPUs; with 256, 5 % less, and frames of 400 pixels are rounded half as much again.
+# Largest number of terms in one partial sum, before the partial sums are added. With 16, products
+# take up to 10 % longer on CPUs; with 256, 5 % less, but rounding errors of frames of 400 pixels
+# are half as large again.
 SUM_BLOCK = 64
-# Tiles of the kernel for CPUs that a work-item takes one below the other, while their columns of B
-# stay in its core's first cache. With 1 products take 3 to 8 % longer on AVX2, with 16 as long, and
-# a single image has fewer work-items for many cores.
+# Tiles that a work-item of the CPU kernel computes, one below the other, while their columns of B
+# stay in its core's first cache. With 1, products take 3 to 8 % longer on AVX2. With 16 they take
+# as long as with 8, and a single image has fewer work-items for many cores.
 ROW_TILES = 8
-# Terms that a turn of its loop adds, KU of contract.h: stretches are a multiple of them.
+# Terms added in one iteration of the CPU kernel's loop, KU of contract.h. Partial sums have a
+# multiple of this number of terms.
 TERMS = 4
-# Terms that the kernel for groups sums in one go: a second sum takes half of a GPU's registers.
+# Largest number of terms that the GPU kernel adds in a single sum: partial sums would take half of
+# a GPU's registers.
 ONE_SUM = 256
 
 
 def round_up_columns(n):
-    """`n` columns rounded up to whole vectors; of an array each."""
+    """`n` columns rounded up to whole vectors; elementwise for an array."""
     return -(-n // COLUMN_PAD) * COLUMN_PAD
 
 
 def row_stride(n):
-    """Elements from row to row of matrices with `n` columns on the device; of an array each.
+    """Row stride [elements] of device matrices with `n` columns; elementwise for an array.
 
-    Products make the columns up to `round_up_columns(n)`, zeros beyond n. What lies beyond is not
-    touched.
+    Products write the columns up to `round_up_columns(n)`, with zeros from n on. Columns beyond
+    these are not written.
     """
     n = round_up_columns(n)
     return n + COLUMN_PAD * (n % CROWDED == 0)
 
 
 def terms_per_block(k: int) -> int:
-    """Terms of k that are summed at a stretch: a half of them, or as many for each end.
+    """Number of terms in one partial sum of a sum of k terms.
 
-    sqrt(k) if that is more than SUM_BLOCK, so that stretches and their sum round alike. A multiple
-    of TERMS: the last one of each end alone has terms left that are added one by one
+    At most SUM_BLOCK, or sqrt(k) if that is more, so that the partial sums and their total have
+    equal rounding errors. The number of partial sums is even, as many from each end of the sum. The
+    result is a multiple of TERMS: only the last partial sum of each end has single terms left.
     """
     n_stretches = 2 * max(1, -(-k // (2 * SUM_BLOCK)))
     return -(-max(math.isqrt(k), -(-k // n_stretches)) // TERMS) * TERMS
@@ -58,10 +62,10 @@ def terms_per_block(k: int) -> int:
 class MatrixBatch(NamedTuple):
     """A batch of matrices in device memory; item b starts at offset + (b // div) * stride.
 
-    buffer: OpenCL buffer, or None where each call of a BoundContraction gives one
+    buffer: OpenCL buffer, or None if it is passed to each call of a BoundContraction
     offset, ld, stride [elements]: start, distance of rows, of items
     step [elements]: distance of columns (only of a strided left factor, and of a ragged result)
-    own: item b starts at `table_index` of ItemSizes instead, where a product has that
+    own: if the product has ItemSizes, item b starts at its `table_index` instead
     """
 
     buffer: object
@@ -74,10 +78,10 @@ class MatrixBatch(NamedTuple):
 
 
 class ItemSizes(NamedTuple):
-    """Sizes and tables that the items of a batch have of their own.
+    """Sizes and tables of each item of a batch.
 
     table_index (batch / n_bands,): int32, on the device: the table of each n_bands items in turn
-    m, n, k (tables,): rows, columns and terms of each; None where all have those of the product
+    m, n, k (tables,): rows, columns and terms of each; None if all equal those of the product
     """
 
     table_index: object
@@ -86,13 +90,15 @@ class ItemSizes(NamedTuple):
     k: np.ndarray | None = None
 
     def sizes(self, m, n, k):
-        """(tables, 3), of those of the product where none are given; ValueError for larger ones."""
+        """Sizes (tables, 3), those of the product if None. Raises ValueError for larger ones."""
         found = [
             most if own is None else own for own, most in zip(self[1:], (m, n, k), strict=True)
         ]
         table = np.stack(np.broadcast_arrays(*found), axis=1)
         if (table > (m, n, k)).any():
-            raise ValueError(f"own sizes are up to {table.max(axis=0)}, the product's {(m, n, k)}")
+            raise ValueError(
+                f"own sizes reach {table.max(axis=0)}, must be at most the product's {(m, n, k)}"
+            )
         return table
 
 
@@ -116,7 +122,7 @@ class ImageBatch(NamedTuple):
 
     @classmethod
     def shaped(cls, n_y, n_x, every=1) -> ImageBatch:
-        """Every `every`-th of many images (n_y, n_x), of an array that is not there yet."""
+        """Every `every`-th of many images (n_y, n_x) of an array that is passed later."""
         return cls(None, 0, every * n_y * n_x, n_x)
 
     def matrix(self, axes=(0, 1)) -> MatrixBatch:
@@ -134,7 +140,7 @@ class Contraction:
     adjoint: conjugate the epilogue
     ragged: C is a caller's array, of any strides; otherwise its rows are padded with zeros
     strided: A's columns may be any distance apart; otherwise they are adjacent
-    tuning: that of device and dtype, where it is at hand: to work it out takes 60 us
+    tuning: Tuning of device and dtype, which otherwise takes 60 us to compute
     """
 
     def __init__(
@@ -178,13 +184,13 @@ class Contraction:
     ) -> BoundContraction:
         """The products of (m, k) matrices A with (k, n) matrices B into C.
 
-        inward: the largest terms lie about the middle, as those of pixels do; otherwise they come
-            first, as those of low frequencies. Small terms are summed first, to round less
+        inward: the largest terms lie in the middle, as for sums over pixels; if False they come
+        first, as for sums over frequencies. Small terms are added first, to round less
         e (buffer, stride, band stride): tables of the epilogue, shared by `n_bands` items
         own: ItemSizes, of whose sizes m, n and k are the largest; C is not written beyond an item's
         """
         buffer_e, stride_e, band_e = e or (None, 0, 0)
-        # one right factor for all: the rows of all items are those of one tall matrix
+        # one right factor for all items: their rows are stacked into one tall matrix
         whole_a = a.step == 1 and a.stride == m * a.ld and a.items_per_matrix == 1
         tall = e is None and b.stride == 0 and whole_a and c.step == 1 and c.stride == m * c.ld
         file, tile = self.build(None if tall else m, k, n)
@@ -228,7 +234,7 @@ class Contraction:
         return BoundContraction(launch, tile, m, self._extent(tile, n), starts if tall else None)
 
     def _extent(self, tile, n):
-        """Rows and columns of C that a work-item takes, and columns that all take."""
+        """Rows and columns of C computed by one work-item, and columns computed by all."""
         return tile["MR"] * tile.get("RT", 1), tile["NV"] * tile["VW"], round_up_columns(n)
 
     def _order(self, k, inward):
@@ -239,7 +245,7 @@ class Contraction:
 class BoundContraction:
     """A contraction with all its matrices bound; `Contraction.bind` makes it.
 
-    tall: where items are stacked into one matrix of m rows each: the offsets and strides of A and
+    tall: if items are stacked into one matrix of m rows each, the offsets and strides of A and
         C [elements]; else None
     """
 
@@ -251,7 +257,7 @@ class BoundContraction:
     def __call__(self, batch, *, a=None, c=None):
         """Queues `batch` products.
 
-        a, c (ImageBatch): the left factor and the result of this call, strides as they are bound
+        a, c (ImageBatch): left factor and result of this call, with the strides that were bound
         """
         given, m = {}, self.m
         if a is not None:

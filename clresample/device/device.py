@@ -1,9 +1,9 @@
 """One OpenCL device: its memory, kernels, copies and launches.
 
-What waits, waits for an event, though copies from and to the host are blocking ones and OpenCL has
-clFinish: Mesa's rusticl (22.3) comes back from both too early where another thread, on its way to
-wait for an event, has just sent the commands to the device. In three threads 15 of 24,000 blocking
-copies had not been made; an event has always told the truth, and costs 2 us.
+Every wait is a wait for an event, although blocking copies and clFinish exist. Mesa's rusticl 22.3
+ends these too early if another thread that is about to wait for an event has just flushed the
+commands. In three threads 15 of 24,000 blocking copies were incomplete when they returned. Waits
+for events were always correct; each costs 2 us.
 
 pyopencl is imported when a device is first asked for, never before.
 """
@@ -39,7 +39,7 @@ from .program import Launcher, Programs
 
 __all__ = ["Device", "get_device"]
 
-# NVIDIA and AMD mishandle fills of 2 GiB and more: zero memory in pieces [bytes].
+# [bytes] Memory is zeroed in pieces of this size: NVIDIA and AMD mishandle fills of 2 GiB and more.
 FILL_BYTES = 1 << 30
 
 
@@ -48,11 +48,11 @@ class Device:
 
     context, queue, cl: pyopencl's Context, CommandQueue and Device
     name, platform, kind: what the driver calls it; kind is "GPU", "CPU", "ACCELERATOR" or "OTHER"
-    simulated: it stands in for another device, see `is_simulated`
+    simulated: True for simulators and software drivers, see `is_simulated`
     compute_units: their number
-    memory, max_alloc, in_use [bytes]: all of it, the largest buffer, what arrays made here hold
-    remembered: what earlier runs have measured of this device
-    profile: the times of all launches, where CLRESAMPLE_PROFILE was set; or None
+    memory, max_alloc, in_use [bytes]: total, largest buffer, total of the arrays made here
+    remembered: measurements of this device by earlier runs
+    profile: times of all launches if CLRESAMPLE_PROFILE was set, else None
     """
 
     def __init__(self, cl_device):
@@ -76,16 +76,16 @@ class Device:
         return f"Device({self.platform}: {self.name})"
 
     def __reduce__(self):
-        """Copied as itself; unpickled elsewhere, the device of the same platform and name there."""
+        """Copies are the same object; pickles give the device of the same platform and name."""
         return get_device, (f"{self.platform}:{self.name}",)
 
     @functools.cached_property
     def has_fp64(self):
-        """True where a kernel in double precision builds."""
+        """True if a kernel in double precision builds."""
         return builds_fp64(self.context)
 
     def empty(self, shape, dtype):
-        """A pyopencl array (shape) with undefined values; DeviceError where it cannot fit."""
+        """A pyopencl array (shape) with undefined values. Raises DeviceError if it does not fit."""
         import pyopencl.array
 
         dtype = np.dtype(dtype)
@@ -97,7 +97,7 @@ class Device:
         return self._call(pyopencl.array.Array, self.queue, shape, dtype, allocator=self._allocate)
 
     def zeros(self, shape, dtype):
-        """A pyopencl array (shape) of zeros; DeviceError where it cannot fit."""
+        """A pyopencl array (shape) of zeros. Raises DeviceError if it does not fit."""
         import pyopencl as cl
 
         array = self.empty(shape, dtype)
@@ -121,7 +121,7 @@ class Device:
         _copy(self, array.base_data, values, dst_offset=array.offset)
 
     def download(self, array, values):
-        """Overwrites a C-contiguous NumPy array with a device array, once all queued is done."""
+        """Overwrites a C-contiguous NumPy array with a device array, after all queued work."""
         _copy(self, values, array.base_data, src_offset=array.offset)
 
     def copy(self, source, target):
@@ -130,7 +130,7 @@ class Device:
         _copy(self, target.base_data, source.base_data, byte_count=source.nbytes, **places)
 
     def get(self, array):
-        """The values of a pyopencl array as a NumPy array, once all that was queued is done."""
+        """The values of a pyopencl array as a NumPy array, after all queued work."""
         values = np.empty(array.shape, array.dtype)
         if values.size:
             self.download(array, values)
@@ -172,8 +172,8 @@ class Device:
             raise meant from error
 
     def _allocate(self, n_bytes):
-        # Some CPU runtimes promise more memory than there is, and the process dies on writing it:
-        # count what is in use, each buffer until it is gone.
+        # Some CPU runtimes allocate more memory than exists, and the process dies when it is
+        # written: the bytes of all live buffers are counted here.
         import pyopencl as cl
 
         if self.in_use + n_bytes > self.memory:
@@ -206,7 +206,7 @@ def _copy(device, target, source, **options):
 @functools.cache
 def _buffer_type():
     class Buffer(load_pyopencl().Buffer):
-        """pyopencl's own cannot be watched by a weak reference; a Python class can."""
+        """A buffer that permits weak references, which pyopencl's own class does not."""
 
     return Buffer
 
@@ -218,9 +218,10 @@ def get_device(choice=None) -> Device:
         of a device's or platform's name. None reads CLRESAMPLE_DEVICE (the same forms), then
         PYOPENCL_CTX (pyopencl's form), and then takes the first GPU, or else the first CPU;
         simulators come last. CLRESAMPLE_ICD names a driver library to look for devices in.
-    A device renders a small image at its first use, which is compared with NumPy's. One that fails
-    is not used: another is taken, with a DeviceWarning, where none was named.
-    DeviceError: there is no platform, nothing fits the choice, or what was chosen fails that test
+    At its first use a device renders a small image, which is compared with NumPy's. If the test
+    fails and no device was named, the next device is used, with a DeviceWarning.
+    Raises DeviceError if there is no platform, if nothing matches the choice, or if the device
+    that was chosen fails that test.
     """
     if isinstance(choice, Device):
         return _of_this_process(choice)
@@ -244,16 +245,16 @@ _opened: weakref.WeakKeyDictionary[Device, int] = weakref.WeakKeyDictionary()
 
 
 def _of_this_process(device):
-    """The device; DeviceError in a process that was forked after it was opened."""
+    """The device. Raises DeviceError in a process that was forked after the device was opened."""
     if os.getpid() != _opened[device]:
         raise fork_error(device)
     return device
 
 
 def _refuse_in_child():
-    """In a forked process every use of a device that was open raises, at no cost to the parent.
+    """Makes every use of an open device raise in forked processes, at no cost to the parent.
 
-    A driver's threads do not live on in it: whatever asks them for an answer waits for ever.
+    The threads of a driver do not exist in a forked process, so that a call would wait for ever.
     """
 
     def refuse(device):
@@ -274,7 +275,7 @@ def _open(cl_device):
 
 @functools.cache
 def _fault(cl_device):
-    """Why a pyopencl device is not to be used, or None."""
+    """Reason not to use a pyopencl device, or None."""
     try:
         device = _open(cl_device)
         return selftest.self_test_fault(device, device.remembered)

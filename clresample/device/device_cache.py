@@ -1,7 +1,7 @@
 """Measurements of a device kept for later runs: tuned sizes, self-test.
 
-One JSON file for each device, driver and version of clresample lies in the user's cache folder, or
-in the folder that CLRESAMPLE_CACHE names. All of it can be deleted: it is measured again.
+The user's cache folder, or the folder named by CLRESAMPLE_CACHE, has one JSON file for each device,
+driver and version of clresample. The files may be deleted: the measurements are then repeated.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ def cache_folder():
 
 
 def system_caches():
-    """The folder in which this system's programs have the user's cache folders."""
+    """The system's folder for the user's caches."""
     import platformdirs  # for commands that need no device
 
     return platformdirs.user_cache_path()
 
 
 class DeviceCache:
-    """The file of one device: named parts, each of them JSON.
+    """The JSON file of one device, in named parts.
 
-    cl_device: the pyopencl device; another driver, or version of clresample, has another file
+    cl_device: the pyopencl device; each driver and version of clresample has a file of its own
     """
 
     def __init__(self, cl_device):
@@ -52,7 +52,7 @@ class DeviceCache:
         self.path = cache_folder() / "devices" / f"{key}.json"
 
     def read(self, part):
-        """A part as it was kept, or None. A file that cannot be read is ignored, with a warning."""
+        """A stored part, or None. A file that cannot be read is ignored, with a warning."""
         return self._all().get(part)
 
     def write(self, part, content):

@@ -1,6 +1,6 @@
 """Lists OpenCL devices and selects one by a user's choice such as "GPU" or "0:1".
 
-pyopencl is imported when devices are first looked for, never before.
+pyopencl is imported only when devices are first listed.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from .pocl_cpu_name import set_pocl_cpu_name
 
 # Order of preference when nothing is chosen; a kind that is not listed comes last.
 DEVICE_KINDS = ("GPU", "CPU", "ACCELERATOR")
-# Parts of the names of devices that stand in for others: simulators, and drivers that draw on the
-# CPU. They come last in the choice, whatever kind they say they are.
+# Parts of the names of simulators and of software drivers that run on the CPU. These devices come
+# last in the choice, whatever kind they report.
 SIMULATED = ("oclgrind", "simulator", "emulat", "llvmpipe", "softpipe", "swiftshader")
 # Compiles only where double is a type of 8 bytes, whatever the driver claims.
 FP64_PROBE = """
@@ -40,12 +40,12 @@ __kernel void probe(__global double *x) { x[0] = x[0] / 3.0; }
 
 
 class DeviceError(RuntimeError):
-    """A failed operation of a device; the message has the reason and the remedy."""
+    """A failed device operation; the message gives the reason and the remedy."""
 
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """One row of the table of devices; sizes in bytes, `fp64` None where it could not be tried."""
+    """One row of the table of devices; sizes in bytes, `fp64` None if it could not be tested."""
 
     index: int
     platform: str
@@ -84,7 +84,7 @@ def list_devices(choice=None):
 
 
 def format_size(n_bytes):
-    """A number of bytes as a person reads it: 3.5 GiB, 512 MiB, 12 B."""
+    """A number of bytes with a unit: 3.5 GiB, 512 MiB, 12 B."""
     for unit, power in (("GiB", 30), ("MiB", 20), ("KiB", 10)):
         if n_bytes >= 1 << power:
             return f"{n_bytes / (1 << power):.3g} {unit}"
@@ -92,7 +92,7 @@ def format_size(n_bytes):
 
 
 def choose(choice):
-    """The pyopencl device for a choice as `get_device` takes it."""
+    """The pyopencl device for a choice in the forms of `get_device`."""
     found = find_devices()
     if choice is not None:
         return _match(str(choice), found, "device")
@@ -150,7 +150,7 @@ def _no_fit(source, choice, found):
 
 
 def by_preference(found):
-    """Devices in the order in which they are taken when nothing is chosen."""
+    """Devices in order of preference, for use when nothing is chosen."""
     return sorted(found, key=_preference)
 
 
@@ -161,13 +161,13 @@ def _preference(device):
 
 
 def is_simulated(device):
-    """True of a simulator, or of a driver that draws on the CPU, by its name."""
+    """True for a simulator or a software driver on the CPU, by its name."""
     names = f"{device.platform.name} {device.name}".lower()
     return any(name in names for name in SIMULATED)
 
 
 def driver_hints():
-    """Lines on GPU drivers of this machine that bring no device, each with its cure."""
+    """Lines on GPU drivers of this machine that provide no device, each with its remedy."""
     try:
         found = find_devices()
     except DeviceError:
@@ -194,12 +194,12 @@ def _addresses(found):
 def find_devices():
     """Every device of every platform, in the drivers' order; DeviceError where there is none.
 
-    A DeviceWarning says so where the library of CLRESAMPLE_ICD brings no device.
+    Issues a DeviceWarning if the library of CLRESAMPLE_ICD provides no device.
     """
     cl = load_pyopencl()
     try:
         platforms = cl.get_platforms()
-    except cl.Error:  # the loader's way of saying that there are none
+    except cl.Error:  # the loader reports this way that there are none
         platforms = []
     found = []
     for platform in platforms:

@@ -41,7 +41,7 @@ FOLDERS = (
     "/opt/rocm*/lib",
     "/opt/amdgpu*/lib/*-linux-gnu",
 )
-MIN_SPACE = 800 << 20  # [bytes] of addresses, under which builds of small kernels failed
+MIN_SPACE = 800 << 20  # [bytes] of address space: with less, builds of small kernels failed
 VENDORS = "/etc/OpenCL/vendors"
 # Lets the loader of a conda environment read the drivers of VENDORS too.
 CONDA_CURE = "conda install -c conda-forge ocl-icd-system"
@@ -59,15 +59,15 @@ def conda_prefix():
 
 
 def named_library():
-    """Value of CLRESAMPLE_ICD or None: a library's path, or a name the system finds it by."""
+    """Value of CLRESAMPLE_ICD, a library's path or a name that the system resolves; or None."""
     return os.environ.get("CLRESAMPLE_ICD") or None
 
 
 def register_named_library():
-    """Have the loader read the library of CLRESAMPLE_ICD beside the drivers that it reads anyway.
+    """Makes the loader read the library of CLRESAMPLE_ICD beside its other drivers.
 
-    It must be called before the process asks pyopencl for platforms: the loader reads once.
-    FileNotFoundError: CLRESAMPLE_ICD is a path where there is nothing
+    Must be called before the process first lists platforms: the loader reads its drivers once.
+    FileNotFoundError: CLRESAMPLE_ICD is a path that does not exist
     """
     library = named_library()
     if library is None or Path(os.environ.get("OCL_ICD_VENDORS", "")) == _Vendors.made:
@@ -89,9 +89,9 @@ class _Vendors:
 
 
 def undetected_drivers(served):
-    """GPU drivers on this machine that brought no device: [(vendor, path)].
+    """GPU drivers on this machine that provide no device: [(vendor, path)].
 
-    served: names of platforms that have a GPU; their vendors' drivers are not looked for
+    served: names of platforms that have a GPU; drivers of their vendors are left out
     """
     seen = " ".join(served).upper()
     paths: dict[str, Path] = {}
@@ -103,7 +103,7 @@ def undetected_drivers(served):
 
 
 def driver_fault(library, served):
-    """Fault of a driver library that brings no device, in words; None where it has none.
+    """Fault of a driver library that provides no device, in words; None if it has none.
 
     served: addresses of the platforms that have a device
     """
@@ -148,7 +148,7 @@ def _platforms_of(library):
 def temporary_folder(kind):
     """A folder of this process among the temporary files.
 
-    Those of this user's processes on this machine that are gone, killed perhaps, are removed first.
+    Folders of processes of this user and machine that have ended are removed first.
     """
     host = re.sub(r"[\W_]", "", platform.node())[:32] or "host"  # containers may share the place
     mine = re.compile(rf"clresample-{kind}-{host}-(\d+)-\w+")
@@ -172,7 +172,7 @@ def _remove_of_gone(entry, pid):
 
 
 def driver_advice(vendor, path, served):
-    """Remedy for a GPU's driver library that brings no device, in words.
+    """Remedy for a GPU's driver library that provides no device, in words.
 
     served: see `driver_fault`
     """
@@ -209,7 +209,7 @@ def _libraries():
 
 
 def _known():
-    """Drivers that the loader reads beside those that come with pyopencl: {name: library}."""
+    """Drivers that the loader reads in addition to those of pyopencl: {name: library}."""
     if given := os.environ.get("OCL_ICD_VENDORS"):
         is_library = not Path(given).is_dir() and Path(given).suffix != ".icd"
         return {"given.icd": given} if is_library else _read(given)
@@ -253,7 +253,7 @@ def pocl_cache_fault():
 
 
 def write_fault(folder):
-    """Why files cannot be made in a folder, in the system's words; None where they can."""
+    """The system's reason why no file can be made in a folder; None if one can."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
@@ -263,9 +263,9 @@ def write_fault(folder):
 
 
 def address_space_warning():
-    """Warning where this process may not have the addresses that drivers need; or None.
+    """Warning if the limit on this process's address space is too low for drivers; or None.
 
-    Under less, PoCL's compiler ends the process or waits for ever, or no driver is found.
+    Below MIN_SPACE, PoCL's compiler ends the process or waits for ever, or no driver is found.
     """
     try:
         import resource

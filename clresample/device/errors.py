@@ -32,7 +32,7 @@ def status_of(error):
 
 
 def to_device_error(device, error):
-    """A DeviceError for a pyopencl error that a user can meet; None for a mistake of our own."""
+    """A DeviceError for a pyopencl error that a user can meet; None for a bug of clresample."""
     status = status_of(error)
     if status in OUT_OF_MEMORY_STATUS:
         return DeviceError(

@@ -1,7 +1,7 @@
 """Sizes of kernels that differ among vendors of GPUs; `make gpu-builds` shows what they take.
 
-They follow from compilers' figures: no build spills registers in float32, and enough waves fit
-beside each other to hide a wait for memory. All of them give the same sums in the same order.
+They follow from the compilers' reports: no float32 build spills registers, and enough waves run
+side by side to hide the latency of memory. With all of them sums have the same order.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ VENDORS = {
 
 
 def gpu_vendor(name):
-    """The vendor that a driver's name of it means: "AMD", "Intel" or "NVIDIA", also of others."""
+    """Vendor by a driver's name for it: "AMD" or "Intel"; "NVIDIA" also for all others."""
     return next((v for begin, v in VENDORS.items() if name.startswith(begin)), "NVIDIA")
 
 

@@ -1,8 +1,8 @@
 """Times each kernel by OpenCL's own clocks: CLRESAMPLE_PROFILE=1, or --profile.
 
-A device that is opened while CLRESAMPLE_PROFILE is set times every launch. The table is printed on
+If CLRESAMPLE_PROFILE is set when a device is opened, every launch is timed. The table is printed on
 standard error when the process ends, or by the command at its end. Timing takes some microseconds
-a launch. Of a field's worker processes it holds the sums.
+a launch. For a field the table has the sums over all worker processes.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import sys
 from collections import defaultdict
 from dataclasses import dataclass
 
-# Launches whose events are kept before they are read: reading waits for the device.
+# Number of events stored before their times are read: reading waits for the device.
 MAX_EVENTS = 2000
-# [s] No launch is that short: Mesa's llvmpipe says 1 ns of each, whatever it does.
+# [s] Shorter times are not real: Mesa's llvmpipe reports 1 ns for every launch.
 NO_TIME = 1e-8
 COLUMNS = ("kernel", "calls", "seconds", "share", "GFLOP/s", "GB/s")
 
@@ -25,9 +25,9 @@ COLUMNS = ("kernel", "calls", "seconds", "share", "GFLOP/s", "GB/s")
 class KernelTimes:
     """Totals over the launches of one kernel.
 
-    flops: of the kernels whose arithmetic is counted, 0 for others
-    n_bytes: the kernel's buffers, each counted once a launch: what it reads and writes at least,
-        where it runs through all of them
+    flops: counted for matrix products, 0 for other kernels
+    n_bytes: sizes of the kernel's buffers, summed over launches: a lower limit of the memory
+        traffic of kernels that read or write whole buffers
     """
 
     n_calls: int = 0
@@ -51,14 +51,14 @@ class KernelProfiler:
             self._read()
 
     def rows(self):
-        """{kernel: KernelTimes} of all that was launched, once it is done; longest first."""
+        """{kernel: KernelTimes} of all launches, after they have finished; longest first."""
         self._read()
         return dict(sorted(self._rows.items(), key=lambda item: -item[1].seconds))
 
     def table(self):
-        """The rows as text, with a line of sums; "" where nothing was launched.
+        """The rows as text, with a line of sums; "" if nothing was launched.
 
-        Calls alone where the driver does not time its kernels.
+        Without times if the driver does not measure them.
         """
         rows = self.rows()
         total = sum(row.seconds for row in rows.values())
@@ -109,8 +109,8 @@ class KernelProfiler:
 def launch_flops(kernel, arguments, global_size):
     """Floating-point operations of a launch's matrix products.
 
-    0 of kernels without, and of others that are not counted. Items with sizes of their own count as
-    the largest, so that their rates are upper bounds.
+    0 for all other kernels. Items with sizes of their own are counted as the largest, so that rates
+    are upper bounds.
     """
     if kernel.startswith("contract"):
         return 2.0 * math.prod(int(arguments[name]) for name in "mnk") * global_size[2]
@@ -122,9 +122,10 @@ def launch_flops(kernel, arguments, global_size):
 
 
 def _folded_flops(arguments):
-    """Products of folded.cl, without the columns that pad its vectors.
+    """Floating-point operations of folded.cl, without the columns that pad its vectors.
 
-    Of each source and of each image of the target, even and odd waves along x and along y.
+    Counted are the products of each source and each target image with even and odd waves along x
+    and along y.
     """
 
     def products(n_y, n_x):
@@ -157,7 +158,7 @@ def _begun(name):
 def drain():
     """Launches since the last call: [(device's name, {kernel: KernelTimes}), ...].
 
-    For the process that this one works for.
+    A worker sends them to its parent process.
     """
     found = [(profile.name, profile.rows()) for profile in _PROFILES]
     for profile in _PROFILES:

@@ -6,12 +6,12 @@ from .contraction import ROW_TILES, Contraction, round_up_columns
 from .tuning import Tuning
 
 FILE, BACK_FILE = "mirror_to_waves.cl", "mirror_to_pixels.cl"
-# Tiles that a work-item of X W^T takes one below the other: the sums and differences of their rows
-# stay in its core's first cache. With 2 products take a quarter longer; more would leave fewer
-# work-items of a single image for many cores.
+# Tiles that a work-item of X W^T computes, one below the other: the sums and differences of their
+# rows stay in its core's first cache. With 2, products take a quarter longer. More tiles would
+# leave fewer work-items of a single image for many cores.
 OF_ROWS = 4
-# Likewise of W X, where all of them share the sums and differences of its columns. With 8 products
-# take up to 10 % longer.
+# The same for W X, where all tiles share the sums and differences of their columns. With 8,
+# products take up to 10 % longer.
 OF_COLUMNS = 16
 
 
@@ -24,8 +24,8 @@ def fourier_contraction(
 
     side: "left" or "right", the factor that is the table
     back: from waves to pixels, Z W or W^T Z; else to waves, X W^T or W X
-    mirrored: whether all tables are, see `sky.fourier_contraction.is_mirror_symmetric`
-    tuning, options: Contraction's
+    mirrored: True if all tables are symmetric, see `sky.fourier.is_mirror_symmetric`
+    tuning, options: as for Contraction
     """
     options["tuning"] = tuning or Tuning.of(device, dtype)
     if not mirrored or not is_supported(options["tuning"]):
@@ -34,14 +34,14 @@ def fourier_contraction(
 
 
 def is_supported(tuning) -> bool:
-    """Returns True for CPUs, whose work-items are alone in a group: the kernels are for these."""
+    """Returns True for CPUs with one work-item a group, for which the kernels are written."""
     return tuning.row_loops and "KB" not in tuning.tile
 
 
 class MirrorContraction(Contraction):
     """A Contraction with a table of waves as one of its factors; see kernels/mirror.h, for CPUs.
 
-    Its sums have an order of their own, whatever `bind` is asked for with `inward`.
+    The order of its sums is fixed: `inward` of `bind` has no effect.
 
     side, back: see `fourier_contraction`
     """
@@ -63,11 +63,11 @@ class MirrorContraction(Contraction):
         return file, self.options | own | self.tuning.tile_for_columns(n, round_up_columns(n))
 
     def _columns(self, n):
-        """Columns that are summed, of n: of those that mirror each other, the first half."""
+        """Number of columns that are summed, of n: if columns mirror each other, the first half."""
         return -(-n // 2) if self.right and self.back else n
 
     def _extent(self, tile, n):
-        """Rows and columns of C that a work-item takes, and columns that all take."""
+        """Rows and columns of C computed by one work-item, and columns computed by all."""
         rows, columns = tile["MR"] * tile["RT"], tile["NV"] * tile["VW"]
         if self.back:
             return rows // 2 if self.right else rows, columns, round_up_columns(self._columns(n))
@@ -78,11 +78,11 @@ class MirrorContraction(Contraction):
 
 
 def operator_programs(device, dtype):
-    """Contractions of operators between aligned images, or images turned against each other.
+    """Builds needed by operators between aligned or rotated images.
 
     The images lie within the model.
 
-    returns [(file, dtype, macros)], as `Device.build_ahead` takes them
+    returns [(file, dtype, macros)], the requests of `Device.build_ahead`
     """
     taken = {"epilogue": "MIX", "adjoint": True}
     turned = {"epilogue": "TWIST", "adjoint": True}

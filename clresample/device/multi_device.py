@@ -1,9 +1,9 @@
 """Threads of the host beside a device, and work distributed to a process for each device.
 
-OpenCL drivers share badly within one process.
+Each device has its own process, because several OpenCL drivers in one process disturb each other.
 
-Each process is started anew (spawn), so a script that calls this must keep what it does itself
-under `if __name__ == "__main__":`, as Python's multiprocessing asks.
+Processes are started by "spawn": a script that calls this must put its own statements under
+`if __name__ == "__main__":`, as for Python's multiprocessing.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from .kernel_profiler import report
 
 # Items of a device's first portion, before its speed is known.
 FIRST_BATCH = 4
-# Part of what is left that is dealt at once, to all devices together: what remains evens out
-# devices that turn out slower or faster.
+# Fraction of the remaining items that is dealt out at once, to all devices together: the rest evens
+# out devices that turn out slower or faster.
 BATCH_FRACTION = 0.5
-# [s] An interrupted process has so long to hand in what it has.
+# [s] Time for an interrupted process to return its results.
 INTERRUPT_TIMEOUT_S = 60.0
-# Threads of the host at most, each with intermediate arrays of its own. More were not tried.
+# Largest number of host threads, each with its own intermediate arrays. More were not tried.
 MAX_THREADS = 4
 
 
@@ -48,11 +48,11 @@ class _BlasThreadLimit:
 
 @contextmanager
 def one_blas_thread():
-    """NumPy's and SciPy's linear algebra on one thread of this process meanwhile.
+    """Context in which NumPy's and SciPy's linear algebra uses one thread of this process.
 
-    Its threads wait for each other and for a CPU device's by counting, not asleep. On matrices as
-    small as a fit's that takes 2.7 times the processor time on two cores, and 1.8 times as long.
-    Callers in several threads share it: the last one to leave restores what the first one found.
+    BLAS threads spin while they wait for each other and for a CPU device. On the small matrices of
+    a fit this takes 2.7 times the processor time on two cores, and 1.8 times as long. Callers in
+    several threads share the context: the last one to leave restores the previous setting.
     """
     with _BlasThreadLimit.lock:
         if not _BlasThreadLimit.n_callers:
@@ -70,8 +70,8 @@ def one_blas_thread():
 def host_threads(device):
     """Number of host threads to use beside a device.
 
-    One for each core of this process, but no more than a CPU device has compute units: it has few
-    where processes share the cores.
+    One for each core of this process, but no more than a CPU device has compute units, which are
+    few if processes share the cores.
     """
     affinity = getattr(os, "sched_getaffinity", None)
     n_cores = len(affinity(0)) if affinity else os.cpu_count() or 1
@@ -82,8 +82,7 @@ def host_threads(device):
 def map_threads(n_threads, function, items):
     """[function(item), ...] of items, in their order, a number at a time.
 
-    For calls that spend their time in large products of NumPy's, for which other threads need not
-    wait.
+    For functions that spend their time in large NumPy products, which release Python's lock.
     """
     items = list(items)
     if min(n_threads, len(items)) < 2:
@@ -93,10 +92,10 @@ def map_threads(n_threads, function, items):
 
 
 def prefetch(items):
-    """Yields the items of an iterator, while a thread makes the next one.
+    """Yields the items of an iterator, while a thread prepares the next one.
 
-    At most one item is ready and one in progress beside the one in use. An exception of the
-    iterator is raised here in its turn. If closed early, the thread ends with its current item.
+    Beside the item in use, at most one is ready and one in progress. An exception of the iterator
+    is raised in the order of the items. If closed early, the thread ends with its current item.
     """
     ready: queue.Queue = queue.Queue(maxsize=1)
     stop = threading.Event()
@@ -137,12 +136,12 @@ def distribute(function, items, devices, *, done, most):
     """Distributes `items` to several devices; returns the results in the items' order.
 
     function(items, device=) -> [result, ...]: picklable, as are items and results
-    devices: choices as `get_device` takes them, at least one; one named twice gets two processes
+    devices: choices in the forms of `get_device`, at least one; one named twice gets two processes
     done: called with the number of items done, after each portion
     most: items of a portion at most
-    returns a list of results; None for an item that no device could be asked for, because of Ctrl-C
-    Portions are dealt by measured speed. A device that cannot be opened, or whose process dies or
-    raises, is named by a DeviceWarning and its portion goes to the others.
+    returns a list of results; None for an item that was not computed because of Ctrl-C
+    Portions are sized by measured speed. If a device cannot be opened, or its process dies or
+    raises, a DeviceWarning names it and its portion goes to the others.
     ValueError: there are no devices; DeviceError: nothing fits a choice, or all devices have failed
     """
     if not devices:
@@ -182,7 +181,7 @@ def distribute(function, items, devices, *, done, most):
 
 
 class _WorkQueue:
-    """Items that wait, and results that are there.
+    """Waiting items and finished results.
 
     waiting: indices of items; open: whether any item is not done
     """
@@ -196,7 +195,7 @@ class _WorkQueue:
         return self.n_done < len(self.items)
 
     def take(self, worker, workers):
-        """The next portion for a worker: [index, ...], by its part of all known speed."""
+        """The next portion for a worker, [index, ...], by its fraction of the total speed."""
         if worker.speed:
             known = [w.speed for w in workers if w.speed]
             total = sum(known) + worker.speed * (len(workers) - len(known))
@@ -211,7 +210,7 @@ class _WorkQueue:
 class _DeviceProcess:
     """A process with one device.
 
-    portion: indices of the items it has; speed [items/s]: of its last portion, None before that
+    portion: indices of its items; speed [items/s]: of its last portion, None before that
     """
 
     def __init__(self, function, choice):
@@ -224,7 +223,7 @@ class _DeviceProcess:
         other.close()
 
     def give(self, portion, items):
-        """Sends a portion, if there is one; a dead process is found when its answer is awaited."""
+        """Sends a portion, if there is one; a dead process is detected by `collect`."""
         self.portion, self._began = portion, time.perf_counter()
         if portion:
             with suppress(OSError):
@@ -261,7 +260,7 @@ class _DeviceProcess:
 
 
 def _named(choice):
-    """A device's name and its index among all, which another process understands."""
+    """A device's name and its index among all, valid in another process too."""
     cl_device = choice.cl if isinstance(choice, Device) else choose(choice)
     return cl_device.name.strip(), find_devices().index(cl_device)
 
@@ -284,4 +283,4 @@ def _work(function, index, pipe):
                 answer = None, what
             pipe.send(answer)
     report()
-    os._exit(0)  # leaves out the exit handlers of drivers, some of which wait for ever
+    os._exit(0)  # skips the exit handlers of drivers, some of which wait for ever

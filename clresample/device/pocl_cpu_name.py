@@ -1,11 +1,11 @@
 """PoCL 3.0 on x86 processors newer than the compiler in it.
 
-PoCL asks its LLVM for the processor's name and hands it to its C compiler. For a processor that
-LLVM 14 does not know, as AMD's of 2024 (Zen 5), the name is "generic", which that compiler refuses:
-no kernel builds. PoCL 3.1 and later give another name; pip has PoCL 3.0 only, and no environment
-variable of it sets the name. So it is set in PoCL's own record of the device, before the first
-build, to one whose instructions are those of the library of functions that PoCL links on this
-processor.
+PoCL passes the processor's name from its LLVM to its C compiler. For a processor newer than LLVM
+14, such as AMD's of 2024 (Zen 5), that name is "generic", which the compiler refuses: no kernel
+builds. PoCL 3.1 and later pass another name, but pip provides PoCL 3.0 only, which has no
+environment variable for the name. So the name is overwritten in PoCL's record of the device, before
+the first build. The new name is that of a processor with the instructions of the function library
+that PoCL links on this processor.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ VERSION = f"-{TRIPLE}-{UNKNOWN}"
 RELEASE = "3.0"
 RECORD_BYTES = 1024  # of the device's record, in which the name lies at byte 640 in release 3.0
 POINTER = ctypes.sizeof(ctypes.c_void_p)
-# Names that LLVM 14 knows, with what /proc/cpuinfo lists where their instructions are there, best
-# first: those of which PoCL's wheel has a library of functions (its files kernel-*-avx512.bc and
-# kernel-*-avx2.bc). Arguments of functions travel in other registers where the two differ.
+# Processor names of LLVM 14, best first, with the flags of /proc/cpuinfo that they need. PoCL's
+# wheel has a library of functions for each (its files kernel-*-avx512.bc and kernel-*-avx2.bc).
+# Kernel and library must agree, because the instruction set decides which registers pass arguments.
 NAMES = {
     "skylake-avx512": "avx512f avx512bw avx512cd avx512dq avx512vl avx2 fma bmi1 bmi2",
     "haswell": "avx2 fma bmi1 bmi2 f16c movbe",
@@ -35,8 +35,8 @@ def set_pocl_cpu_name(device):
     """Sets the processor's name for PoCL if its compiler does not know the detected one.
 
     device: a pyopencl device, of any platform
-    returns the name that was set, or None. Nothing was to be done then, or nothing could be: the
-    device's self-test decides
+    returns the name that was set; None if none was needed or none could be set, in which case the
+        device's self-test decides
     """
     if not (device.version.endswith(VERSION) and device.driver_version.startswith(RELEASE)):
         return None
@@ -61,9 +61,9 @@ def _flags():
 
 
 def _place(record):
-    """The address in a device's record where the pointer to its processor's name is, or None.
+    """Address of the pointer to the processor's name in a device's record, or None.
 
-    record: the record's address; the pointer to the triple stands right before the one looked for
+    record: the record's address; the pointer to the target triple precedes the one to the name
     """
     mapped = _mapped()
 

@@ -15,9 +15,9 @@ from .compiling import CompilationNotice
 from .discovery import DeviceError, load_pyopencl
 from .errors import build_error, float64_error
 
-# Types of scalar arguments; REAL is the floating type of a build. Whatever else is a buffer.
+# Types of scalar arguments; REAL is the floating type of a build. All other arguments are buffers.
 SCALARS = {"int": np.int32, "uint": np.uint32, "long": np.int64, "ulong": np.uint64}
-# The value of an argument that was never given: pyopencl refuses to set it.
+# The value of an argument that was never bound: pyopencl refuses to set it.
 UNSET = object()
 
 
@@ -108,8 +108,8 @@ class Programs:
     def build_ahead(self, requests):
         """Starts building programs in a thread; `kernel` waits for one in progress.
 
-        requests: (file, dtype, defines), as `kernel` takes them. One that does not build raises
-        its error when `kernel` asks for it again.
+        requests: (file, dtype, defines), the arguments of `kernel`. The error of a failed build is
+            raised when `kernel` requests the same program.
         """
 
         def build():
@@ -150,7 +150,7 @@ def _request(file, dtype, defines):
 
 
 def build_log(error):
-    """The compiler's own words out of pyopencl's message."""
+    """The compiler's log, extracted from pyopencl's message."""
     log = re.sub(r"\(options: .*\)\s*$", "", str(error).split(">:\n", 1)[-1], flags=re.DOTALL)
     return log.strip()
 
@@ -161,14 +161,14 @@ class Launcher:
         blur = device.launcher("update.cl", "blur_latent", dtype=dtype).bind(table=table, taps=taps)
         blur((nx, ny, n_sources), v=latent)
 
-    `bind` gives arguments that stay, a call those of one launch. A buffer is a pyopencl array that
-    starts at its buffer's first byte, a pyopencl Buffer, or None where the kernel reads none. Bound
-    buffers live as long as the launcher; OpenCL keeps those of a call until its kernel has run.
+    `bind` sets arguments for all launches, a call those of one launch. A buffer is a pyopencl array
+    that starts at its buffer's first byte, a pyopencl Buffer, or None if the kernel reads none.
+    Bound buffers live as long as the launcher; OpenCL keeps those of a call until its kernel ends.
 
-    All arguments are set before each launch, in one call to pyopencl: 1.5 us for 23 of them, where
-    one number by itself takes 6 us. So nothing remembers what an earlier launch has set, and all
-    launchers of one build share its pyopencl.Kernel, which takes 0.2 ms to make; `lock` keeps other
-    threads away between setting and queueing.
+    All arguments are set before each launch, in one call to pyopencl, which takes 1.5 us for 23
+    arguments; setting a single number takes 6 us. No state is left from earlier launches, so all
+    launchers of one build share its pyopencl.Kernel, which takes 0.2 ms to make. `lock` excludes
+    other threads between setting and queueing.
 
     is_buffer {name: bool}: the kernel's arguments in its order
     local_size: work-items of a group along each axis of a launch; None leaves it to the driver
@@ -188,10 +188,10 @@ class Launcher:
     def __call__(self, global_size, **arguments):
         """Queues the kernel on `global_size` (x, y, z); `arguments` replace bound ones.
 
-        The size is rounded up to whole groups; kernels leave out the work-items beyond it.
+        The size is rounded up to whole groups; work-items beyond `global_size` do nothing.
 
-        ValueError: a name that the kernel does not have, one that was never given, or an array
-            that starts inside its buffer
+        Raises ValueError for a name that the kernel does not have, for an argument that was never
+        given, and for an array that does not start at its buffer's first byte.
         """
         values = (self._merged(arguments) if arguments else self._bound).values()
         with self._lock:
@@ -217,7 +217,7 @@ class Launcher:
                 if value.offset:
                     raise ValueError(
                         f"{name} of {self!r} starts at byte {value.offset} of its buffer: kernels "
-                        "take arrays from byte 0 on"
+                        "need arrays that start at byte 0"
                     )
                 arguments[name] = value.base_data
         merged = self._bound | arguments

@@ -1,6 +1,6 @@
-"""A small render on a device against NumPy: a driver that computes wrongly is found at once.
+"""Compares a small render on a device with NumPy's, to detect drivers that compute wrongly.
 
-    Y = Re[ Sy (D o (Ty X Tx)) Sx ]     by the kernels that aligned operators take there
+    Y = Re[ Sy (D o (Ty X Tx)) Sx ]     by the kernels of aligned operators on that device
 
 A render of random numbers passes every step of an aligned operator: products of cos and sin
 waves, the transfer function, and rows that are stored one element at a time.
@@ -17,19 +17,19 @@ from .contraction import FILE, GROUP_FILE, MatrixBatch, row_stride
 from .mirror_contraction import BACK_FILE, FILE as WAVES_FILE, fourier_contraction
 from .program import read_kernel
 
-# [1] Largest relative error, L2. float32 on a sound device leaves 1e-7; a wrong driver, one that
-# computes in half precision, or one that loses a row, leaves 1e-3 and more.
+# [1] Largest relative error, L2. In float32 a correct device has 1e-7. A driver that computes in
+# half precision or loses a row has 1e-3 and more.
 ALLOWED = 1e-5
 PART = "self_test"
-# Rows and columns of the model and of the observation, and frequencies of either axis: no multiple
-# of a tile, so that its edges are tried.
+# Rows and columns of the model and of the observation, and frequencies of either axis. None is a
+# multiple of a tile, so that partial tiles are tested too.
 N_Y, N_X, M_Y, M_X, H_Y, H_X = 19, 21, 11, 13, 9, 10
 
 
 def self_test_fault(device, remembered):
-    """Why `device` is not to be used, or None. What has passed once is remembered, not tried again.
+    """Reason not to use `device`, or None.
 
-    remembered: the DeviceCache of the device
+    remembered: the DeviceCache of the device; a test that was passed is stored there, not repeated
     """
     files = FILE, GROUP_FILE, WAVES_FILE, BACK_FILE
     kernels = hashlib.sha256("".join(map(read_kernel, files)).encode()).hexdigest()
@@ -42,7 +42,7 @@ def self_test_fault(device, remembered):
             f"{device.name} ({device.platform}) fails its self-test: a small render is off by "
             f"{error:.1g}, where {ALLOWED:g} is allowed"
         )
-    with suppress(OSError):  # then the next process tries again, which takes some milliseconds
+    with suppress(OSError):  # the next process repeats the test, which takes some milliseconds
         remembered.write(PART, kernels)
     return None
 
@@ -60,7 +60,7 @@ def _given():
 
 
 def reference():
-    """The render in float64 by complex arithmetic, term by term as the formula stands."""
+    """The render in float64 by complex arithmetic, term by term from the formula."""
     x, ty, tx, sy, sx, d = _given()
     total = np.zeros((M_Y, M_X))
     for sign, of_sign in zip((1, -1), d, strict=True):

@@ -1,7 +1,7 @@
 """Sizes that depend on the device: tiles, group sizes, memory of one launch.
 
-Measured on CPUs through PoCL; the values for other devices follow from their documents and are the
-first to measure on a GPU. Kernels get these sizes as macros; none is written in a kernel too.
+Sizes for CPUs were measured through PoCL. Those for GPUs follow from the vendors' documents and
+from their compilers (gpu_sizes.py). Kernels get all of these sizes as macros.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ import numpy as np
 from .gpu_sizes import gpu_sizes, gpu_vendor
 from .pocl_cpu_name import set_pocl_cpu_name
 
-# Groups of a launch along its second and third axis, which GPUs limit to so many: NVIDIA's compute
-# capabilities list it, Mesa's drivers have the same.
+# Largest number of groups along the second and third axis of a launch: the limit of NVIDIA's
+# compute capabilities and of Mesa's drivers.
 MAX_GROUPS = 65535
-# Mesa's driver for CPUs, llvmpipe, counts the iterations of all loops of a work-item in a launch;
-# after 65,535 of them it ends every loop at once, and reports no error.
+# Mesa's driver for CPUs, llvmpipe, counts the iterations of all loops of a work-item in a launch.
+# After 65,535 iterations it ends every loop at once, without an error.
 LLVMPIPE_LOOPS = 65535
-# Processors, as PoCL's compiler names them and its device's version ends, for which it makes code
-# of 16 registers, whatever width of vectors PoCL reports.
+# Processors for which PoCL compiles to 16 registers, whatever vector width it reports. The names
+# are those of PoCL's compiler, with which the device's version string ends.
 NARROW = ("haswell", "znver1", "znver2", "znver3")
 
 
@@ -31,38 +31,37 @@ class Tuning:
     tile: macros of contract.cl: VW columns a vector, NV vectors and MR rows a work-item owns,
         WGX x WGY work-items a group. Larger tiles load less for each product, until they spill.
         With KB, the terms of a slab in local memory, they are macros of contract_group.cl
-    row_choices: MR of a tile may be one of these instead, where a matrix then has fewer rows that
-        are computed and not stored
-    two_sum_rows: MR at most where a product sums stretches first, which takes twice the registers
-    box_tile: macros of boxed.cl, where boxes are lower than frames; None takes the tile
-    row_loops: one work-item takes a whole row of pixels, as a CPU's vector unit wants it; else one
-        takes a pixel
+    row_choices: other values of MR, used if fewer rows of a matrix are then computed in vain
+    two_sum_rows: largest MR of products with partial sums, which need twice the registers
+    box_tile: macros of boxed.cl, whose boxes are lower than frames; None = those of `tile`
+    row_loops: True = one work-item for each row of pixels, to fill a CPU's vectors; False = one for
+        each pixel
     prefetch_columns: the contraction fetches the right factor's next columns while it multiplies.
         Without it, a CPU takes 15 to 20 % longer for a batch that is not in its cache
     sum_group: work-items that share one sum over a box or one sweep: 1 needs no barrier
-    line_group: work-items of a group along an image row where a kernel has no loop of its own.
-        Left to choose, CPU runtimes take another number for every image size and build the kernel
-        anew for each, 0.1 to 0.3 s
+    line_group: work-items of a group along an image row, for kernels without a loop. If it is not
+        set, CPU runtimes choose another number for each image size and build the kernel again each
+        time, which takes 0.1 to 0.3 s
     tile_group, item_group: groups of kernels over a matrix, and over items that each have a loop
-    lanes: columns that a work-item of shift.cl takes at a time, one vector: 4, 8 or 16
+    lanes: columns of a vector in shift.cl: 4, 8 or 16
     group_bytes [bytes]: intermediate matrices of one launch of the operator; more images than fit
         go in several launches
     slab_bytes [bytes]: shifted model of one slab of the paper's scheme
-    chunk_terms: terms that a work-item of the paper's contraction sums; 16 columns of so many stay
-        in a core's cache, where they are read again for each row
-    tile_flops, pixel_flops: what a tile of a frame costs beside its arithmetic, as the arithmetic
-        that takes as long: launches and the tables of its shift; each pixel's way out of the frame
-        and back. Larger values make larger tiles
-    vector_chunk: elements of a vector that one sum of lbfgs.cl runs over; on CPUs what stays in the
-        first cache with all that it is multiplied by
-    use_folded: small float32 images go through float64 in parts even and odd about their middles,
-        where the device has it: as fast as float32 on CPUs, which do half as many a second, not on
-            GPUs
+    chunk_terms: terms summed by one work-item of the paper's contraction; 16 columns of this many
+        terms stay in a core's cache, where they are read again for each row
+    tile_flops, pixel_flops [flop]: overheads of a tile of a frame in units of arithmetic: launches
+        and shift tables for each tile, copies from and to the frame for each pixel. Larger values
+        make larger tiles
+    vector_chunk: elements of one partial sum of lbfgs.cl; on CPUs chosen so that they stay in the
+        first cache together with their factors
+    use_folded: small float32 images are computed in float64, in parts even and odd about their
+        middles. On CPUs with float64 that is as fast as float32, since it needs half of the
+        products and float64 has half the speed; on GPUs it is slower
     n_scenes: scenes fitted side by side; more hide the launches better, and need more memory
-    prefetch_groups: a group of fits is prepared and uploaded by a second thread while another
-        iterates; where the device is the CPU itself, both would share its cores
-    max_loop_iterations: iterations of all its loops that a work-item may make in one launch; None
-        where a device has no such limit
+    prefetch_groups: a second thread prepares and uploads a group of fits while another group
+        iterates; False if the device is the CPU, whose cores both would share
+    max_loop_iterations: largest number of iterations of all loops of a work-item in one launch;
+        None if a device has no such limit
     memory [bytes]: of the device for one frame in tiles, unless a caller says otherwise. With less,
         tiles are smaller and overlap more; most instruments' quickest tiles take less than 1 GiB
     """
@@ -92,7 +91,7 @@ class Tuning:
 
     @classmethod
     def of(cls, device, dtype=np.float32) -> Tuning:
-        """The sizes for a Device and float32 or float64: those `clresample tune` kept, if any."""
+        """Sizes for a Device and float32 or float64: those stored by `clresample tune`, if any."""
         return replace(cls.untuned(device, dtype), **tuned(device, dtype))
 
     @classmethod
@@ -106,8 +105,8 @@ class Tuning:
             "max_loop_iterations": LLVMPIPE_LOOPS if "llvmpipe" in device.name else None,
             "memory": min(1 << 30, device.memory // 4),
         }
-        # Drivers that draw on the CPU compile as for a GPU, with many work-items at a time; and a
-        # work-item that walks a whole box alone soon makes more loops than Mesa's allows.
+        # Software drivers on the CPU compile as for a GPU, with many work-items at a time. A
+        # work-item that loops over a whole box alone would soon exceed Mesa's limit on iterations.
         if device.kind == "CPU" and not device.simulated:
             return cls(
                 tile=_cpu_tile(device, np.dtype(dtype)),
@@ -117,7 +116,7 @@ class Tuning:
                 lanes=8,
                 row_loops=True,
                 prefetch_columns=True,
-                tile_group=(8, 1, 1),  # fewer cost more in starting them, more are cut off
+                tile_group=(8, 1, 1),  # fewer groups start slower, larger ones waste work-items
                 item_group=(1, 1),
                 sum_group=1,
                 group_bytes=4 << 20,  # in the cache, where they are read back at speed
@@ -145,9 +144,9 @@ class Tuning:
         )
 
     def tile_for(self, n_rows=None, *, two_sums=False) -> dict[str, int]:
-        """The tile for matrices of `n_rows`, or of most: of those allowed, what covers them best.
+        """The tile that covers matrices of `n_rows`, or many rows, with the fewest wasted rows.
 
-        two_sums: the product sums stretches first
+        two_sums: the product has partial sums
         """
 
         def covered(rows):
@@ -165,10 +164,10 @@ class Tuning:
     def tile_for_columns(self, n, n_pad) -> dict[str, int]:
         """The tile for rows of `n` columns, of `n_pad` in whole vectors, on CPUs.
 
-        Where two vectors at a time would leave one alone, which uses half of the registers: five at
-        a time, if that leaves none. Where the last of few float32 vectors is half empty or more:
-        two half as wide, of which that one is not summed. With more columns it gains less than the
-        2 % that the two take longer.
+        Two vectors at a time are the default. If they would leave a single one, which uses half of
+        the registers: five at a time, if five leave none. If at least half of the last float32
+        vector is empty and there are few vectors: two of half the width, of which the empty one is
+        not summed. With more columns this gains less than the 2 % that half vectors take longer.
         """
         tile = self.tile
         two = tile["NV"] == 2 and tile["MR"] == 8
@@ -181,9 +180,9 @@ class Tuning:
     def local_size(self, n_axes):
         """Group of a kernel with a work-item for each item (1 axis), or row or pixel (3 axes).
 
-        Groups of one on CPUs: left to choose, their runtimes take another size for every box and
-        build each kernel anew for it, 0.6 s in all. On GPUs neighbours in a row read together, and
-        two warps of 32 make a group that every GPU allows.
+        One on CPUs, whose runtimes would otherwise choose another size for every box and build each
+        kernel again, 0.6 s in all. On GPUs neighbours in a row read adjacent memory, and two warps
+        of 32 make a group that every GPU permits.
         """
         return (1,) * n_axes if self.row_loops else {1: (64,), 3: (32, 2, 1)}[n_axes]
 
@@ -231,5 +230,5 @@ def tuned(device, dtype):
             return {n: tuple(s) if n == "row_choices" else s for n, s in sizes.items()}
     except (TypeError, ValueError, AttributeError, KeyError):
         pass
-    device.remembered.invalidate(PART, "its sizes are none that `clresample tune` keeps")
+    device.remembered.invalidate(PART, "its sizes are not those that `clresample tune` stores")
     return {}
