@@ -12,8 +12,8 @@ class AffineExecutor(Executor):
     """Any affine mapping in two passes: columns of the model to lines, then along each line.
 
     Observed rows, or columns, are L lines through the model; J equidistant columns cross them.
-    Sx (kx, J), Sy (L, ky): waves at the columns, and where the lines cut the model's middle column,
-        about the middle line
+    Sx (kx, J): waves at the columns
+    Sy (L, ky): waves where the lines cross the model's middle column, relative to the middle line
     twist: multiplies column frequencies by the conjugate of waves (Hy, J), which shears the lines
     gather: from the J columns of a line to its observed pixels; see LineTaps
     """
@@ -106,7 +106,7 @@ class AffineExecutor(Executor):
 def kept_taps(n_taps, n_in, tuning):
     """Number of taps kept of each sum of n_taps along a line of n_in elements.
 
-    Where a work-item walks a line, whole fours if the line has so many.
+    If a work-item loops over a line, a multiple of four, unless the line is shorter.
     """
     return min(-(-n_taps // 4) * 4, n_in) if tuning.row_loops else n_taps
 
@@ -129,7 +129,7 @@ class LineInterpolation:
         for i, (s, w) in enumerate(zip(starts, weights, strict=True)):
             taps = np.arange(w.shape[1])
             by_tap[i, :, : len(taps), : w.shape[2]] = w
-            # with more taps than its own, a plan's last ones would read beyond the line
+            # a plan with fewer taps than this number would read beyond the line at its end
             back = np.maximum(s - (n_in - n_taps), 0)
             start[i, :, : s.shape[1]] = s - back
             line, at = np.nonzero(back)
@@ -151,7 +151,7 @@ class LineInterpolation:
             start=device.put(start),
             weight=device.put(weight),
         )
-        # where a work-item walks a line, it does so for all bands of a scene
+        # a work-item that loops over a line does so for all bands of a scene
         self.bands_each = executor.n_bands if tuning.row_loops else 1
         self.size = 1 if tuning.row_loops else executor.whole_groups(n_out), n_lines
 

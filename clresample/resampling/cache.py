@@ -16,21 +16,20 @@ from ..sky.psf import PSF
 from .plan import Precision, make_resampling_plan
 from .resampler import Resampler
 
-# [bytes] For blends of 50 to 200 pixels plans take 0.1 to 4 MB each and operators twice that, so
-# that hundreds are kept: those of one survey tile's epochs and bands. With less room its fits make
-# them anew (10 to 100 ms each); with more, memory is held that is never read again.
+# [bytes] For blends of 50 to 200 pixels, plans take 0.1 to 4 MB each and operators twice that. This
+# stores hundreds, those of the epochs and bands of one survey tile. With less memory, fits compute
+# them again (10 to 100 ms each); more memory would hold entries that are never used again.
 PLAN_BYTES, DEVICE_BYTES = 512 << 20, 256 << 20
-# Part of all entries that is new before all are asked again for what they hold. A tenth costs each
-# new one ten such questions; a larger part finds out later that others have grown.
+# Sizes of all entries are measured again when this fraction of them is new. A tenth costs ten
+# measurements for each new entry; with a larger fraction, growth is noticed later.
 GROWTH = 0.1
 
 
 class _LRUStore:
     """Entries by their keys; the least recently used are dropped beyond `most` bytes.
 
-    Entries grow while they are used, and to ask each of hundreds for its size at every new one
-    took longer than to make that: what they held when last asked counts, until so many new ones
-    have come as GROWTH of all.
+    Entries grow while they are used. Measuring hundreds of entries for each new one takes longer
+    than making it, so sizes are measured only when the fraction GROWTH of the entries is new.
     """
 
     def __init__(self, most):
@@ -69,9 +68,8 @@ class OperatorCache:
     """Resamplers by their grids and PSFs, with their plans, bounded in bytes.
 
     plan_bytes [bytes]: host memory that plans may hold
-    device_bytes [bytes]: device memory that operators may hold, with their intermediates as large
-        as their last batch made them; what was asked for longest ago goes first, and the newest
-        stays however large it is
+    device_bytes [bytes]: limit on the device memory of operators, with the intermediates of their
+        last batch. The least recently used operator is dropped first; the newest always stays
 
     Safe to share between threads, as the operators are.
     """
@@ -95,8 +93,8 @@ class OperatorCache:
     ) -> Resampler:
         """The Resampler from `frame` to `grid` and `psf`; repeated calls return the same object.
 
-        extent (2,) [px]: what of the frame holds light, the rest is padding; None = all of it
-        private: an operator of the caller's own, whose shift may be set, on the same plan
+        extent (2,) [px]: part of the frame that can have light, the rest being padding; None = all
+        private: True = an operator for this caller alone, whose shift may be set, on the same plan
         n_terms: PSFs that psf has in turn for each band, see ResamplingPlan
 
         Raises ValueError as Resampler does.

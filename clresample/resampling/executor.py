@@ -6,8 +6,8 @@
               distorted  I2[p] = sum_x (Sy Z)[p, x] Sx[p, x]
     adjoint   the same factors transposed, in reverse order
 
-Where a band adds up T images of the model, one through each PSF of a basis, Z = sum_t Z_t with
-Z_t = D_t o (Ty I1_t Tx): what follows is done once (PSFTerms).
+If a band is the sum of T images of the model, one through each PSF of a basis, then Z = sum_t Z_t
+with Z_t = D_t o (Ty I1_t Tx) (PSFTerms). The steps after Z are done once.
 
     I1 (Ny, Nx), I2 (My, Mx): one band of the model and of the observation
     Ty (ky, Ny), Tx (Nx, kx): cos and sin waves at the model's pixels; ky = 2 Hy, kx = 2 Hx
@@ -180,7 +180,7 @@ class Executor(ExecutorTables):
     def model_to_frequencies(self, x: ImageBatch, n, spread=False):
         """Z = D o (Ty I1 Tx) for `n` images, into `model_frequencies`.
 
-        spread: the images are n / n_bands, each of which is seen in every band
+        spread: there are n / n_bands images, each of them observed in every band
         """
         if spread:
             self.in_columns_once(n // self.n_bands, a=x)

@@ -15,23 +15,22 @@ from .transfer import Certificate
 class GridOperator(LinOp):
     """A linear operator from images on one pixel grid to images on another.
 
-    grid_in, grid_out (Grid): pixels of the model and of the observation, or WCS that know their
-        shapes
+    grid_in, grid_out (Grid): pixels of the model and of the observation, or WCS with shapes
     psf_in (1 or C bands), psf_out (1 or C bands): their PSFs, each in its own grid's pixels, or
-        images that `PSF` takes
-    dtype: float32, or float64 where the device has it
-    device: as `get_device` takes it; None = the default one
+        images accepted by `PSF`
+    dtype: float32, or float64 if the device supports it
+    device: see `get_device`; None = the default device
     shift (2,) [model px]: moves every observed pixel; may be set again at any time
-    tolerance_px [model px]: departures up to this count as none when the geometry is chosen
+    tolerance_px [model px]: departures up to this size are ignored when the geometry is chosen
 
-    Images are flux per pixel, (C, Ny, Nx) or (B, C, Ny, Nx). Observed pixels whose centre the
-    model does not cover come out as 0.
+    Images are flux per pixel, (C, Ny, Nx) or (B, C, Ny, Nx). Observed pixels whose centres are not
+    on the model are 0.
 
-    n_terms: T images of the model that each band adds up, see ResamplingPlan; shape_in has C * T
-        of them then
+    n_terms: T, the number of model images whose sum is a band, see ResamplingPlan; shape_in then
+        has C * T images
 
-    An operator whose items have a geometry each (`Resampler.from_plans`) gives `mapping` and
-    `certificate` as lists, `covered` as (n, My, Mx) and `shift` as (n, 2); all others one of each.
+    If each item has its own geometry (`Resampler.from_plans`), `mapping` and `certificate` are
+    lists, `covered` is (n, My, Mx) and `shift` (n, 2); otherwise there is one of each.
 
     Raises ValueError for grids that do not overlap and for band counts that do not match.
     Subclasses implement `_prepare` and `_use_shift`, beside `_forward` and `_adjoint`.
@@ -95,7 +94,7 @@ class GridOperator(LinOp):
 
         n_terms: images of the model that each band of the observation adds up
 
-        Whoever calls it also sets `_certificates`, one for each of them.
+        The caller must also set `_certificates`, one for each mapping.
         """
         self.n_terms = n_terms
         shape_in, shape_out = mappings[0].shape_in, mappings[0].shape_out
@@ -109,7 +108,7 @@ class GridOperator(LinOp):
 
     @property
     def geometry(self) -> str:
-        """The simplest that holds within tolerance_px: "aligned", "affine" or "distorted"."""
+        """Simplest geometry valid within tolerance_px: "aligned", "affine" or "distorted"."""
         return self._mappings[0].geometry
 
     @property
@@ -127,8 +126,8 @@ class GridOperator(LinOp):
     def shift(self) -> np.ndarray:
         """Offset (2,) [model px] by which every observed pixel is moved; read-only.
 
-        Set it to one number, (2,), or (n, 2) for n geometries. Raises ValueError for other shapes
-        and for numbers that are not finite.
+        It can be set to one number, (2,), or (n, 2) for n geometries. Raises ValueError for other
+        shapes and for numbers that are not finite.
         """
         return self._shift[0] if len(self._shift) == 1 else self._shift
 

@@ -16,14 +16,15 @@ class LinOp:
     shape_in, shape_out: shapes of one item, for images (C, Ny, Nx)
     dtype: float32 or float64, of both sides
 
-    NumPy arrays in give NumPy arrays out, a Quantity one in its unit; pyopencl arrays in give
-    pyopencl arrays out and never touch the host.  Where both sides have one band, (Ny, Nx) images
-    may be given without the band axis.  Subclasses implement `_forward` and `_adjoint` on device
-    arrays (B,) + shape; both overwrite `out` and leave their input alone.
+    The result has the type of the input: a NumPy array, a Quantity in its unit, or a pyopencl
+        array,
+    which never touches the host.  If both sides have one band, (Ny, Nx) images may be passed
+    without the band axis.  Subclasses implement `_forward` and `_adjoint` on device arrays (B,) +
+    shape; both overwrite `out` and leave their input unchanged.
 
-    Safe to use from several threads: intermediates and staging arrays are one set an operator, so
-    each call has the operator for itself between upload and download. Casting NumPy arrays to
-    `dtype` happens before that. Threads gain nothing by operators of their own but that casting.
+    Safe to use from several threads. An operator has one set of intermediates and staging arrays,
+    so a lock admits one call at a time between upload and download; only the cast of NumPy arrays
+    to `dtype` runs in parallel. Separate operators for each thread gain nothing else.
     """
 
     def __init__(self, device, dtype, shape_in, shape_out):
@@ -41,7 +42,7 @@ class LinOp:
         return ()
 
     def __getstate__(self):
-        """State for copies, without lock and staging arrays, which they make anew."""
+        """State for copies, without lock and staging arrays, of which a copy makes its own."""
         return {k: v for k, v in self.__dict__.items() if k not in ("_staged", "_lock")}
 
     def __setstate__(self, state):
@@ -50,8 +51,8 @@ class LinOp:
     def forward(self, x, out=None):
         """A x.  x (B,) + shape_in -> (B,) + shape_out, into `out` (of x's kind) if given.
 
-        Raises ValueError for shapes that do not fit, complex or too large numbers, device arrays of
-        another dtype, layout or context, an `out` on the host where x is not or the reverse.
+        Raises ValueError for wrong shapes, for complex or too large numbers, for device arrays of
+        another dtype, layout or context, and if only one of x and `out` is on the device.
         """
         return self._apply(self._forward, "x", x, out, self.shape_in, self.shape_out)
 
@@ -65,7 +66,7 @@ class LinOp:
     __call__ = __matmul__ = forward
 
     def forward_into(self, x, out):
-        """Queues out = A x without any check: for loops that call it with the same arrays.
+        """Queues out = A x without checks, for loops that reuse the same arrays.
 
         x (B,) + shape_in, out (B,) + shape_out: C-contiguous arrays of `dtype` on `device`
         """
@@ -102,7 +103,7 @@ class LinOp:
         raise NotImplementedError
 
     def _apply(self, run, name, x, out, shape_x, shape_out):
-        """`run`, one of the two above, on an array `x` of a caller, who calls it `name`."""
+        """`run`, one of the two above, on a caller's array `x`; messages name it `name`."""
         on_device = hasattr(x, "base_data")
         unit = None if on_device or out is not None else getattr(x, "unit", None)
         if unit is not None and hasattr(x, "to_value"):
@@ -116,14 +117,14 @@ class LinOp:
         return go(run, name, x, out, (batch, *shape_x), (batch, *shape_out), shape_result)
 
     def _on_device(self, run, name, x, out, batched_x, batched_out, shape_result):
-        """`run` on a caller's device arrays, straight from and to their memory."""
+        """`run` on a caller's device arrays, without copies."""
         x = self._checked(name, x)
         if out is None:
             out = self.device.empty(shape_result, self.dtype)
         else:
             out = self._checked("out", out)
         others = {a.queue for a in (x, out)} - {None, self.device.queue}
-        for queue in others:  # of the caller, who may still write or read there
+        for queue in others:  # the caller's queues may still write or read these arrays
             self.device.finish(queue)
         with self._lock:
             run(_shaped(x, batched_x), _shaped(out, batched_out))
@@ -132,7 +133,7 @@ class LinOp:
         return out
 
     def _through_host(self, run, name, x, out, batched_x, batched_out, shape_result):
-        """`run` on a caller's NumPy arrays, through device arrays that are kept for the next."""
+        """`run` on a caller's NumPy arrays, through staging arrays on the device."""
         x = _cast(name, x, self.dtype)
         direct = out is None or (out.dtype == self.dtype and out.flags.c_contiguous)
         result = np.empty(shape_result, self.dtype) if out is None or not direct else out
@@ -147,7 +148,7 @@ class LinOp:
         return out
 
     def _checked(self, name, array):
-        """A caller's device array, as the kernels take it; ValueError for others."""
+        """A caller's device array, validated. Raises ValueError if kernels cannot read it."""
         if array.dtype != self.dtype:
             raise ValueError(f"{name} has dtype {array.dtype}, the operator has {self.dtype}")
         if not array.flags.c_contiguous:
@@ -205,7 +206,7 @@ class AdjointLinOp(LinOp):
         self.op = op
 
     def _apply(self, *call):
-        """On the device or on the host, as the operator itself does it."""
+        """Applies the operator's adjoint, on the device or on the host."""
         return self.op._apply(*call)
 
     def _forward(self, x, out):
@@ -260,7 +261,7 @@ def _check_out(name, x, out, on_device, shape):
 def _cast(name, x, dtype):
     """A caller's NumPy array in the operator's type and in C order.
 
-    ValueError where the type cannot hold its numbers.
+    Raises ValueError if its numbers exceed the type's range.
     """
     try:
         with np.errstate(over="raise"):
@@ -279,5 +280,5 @@ def _kind(array):
 
 
 def _shaped(array, shape):
-    """The array, or a view: pyopencl takes 15 us to make one, even of the same shape."""
+    """The array itself or a view; pyopencl takes 15 us for a view, even of the same shape."""
     return array if array.shape == shape else array.reshape(shape)

@@ -5,7 +5,7 @@ With X = A p + t the position of observed pixel p in model pixels and nu = kappa
     I2(X) = K^-2 sum_nu D(nu) F(nu) exp(+2 pi i nu.X),    F(nu) = sum_k I1(x_k) exp(-2 pi i nu.x_k)
     D(nu) = |det A| P2^(A^T nu) / P1^(nu)
 
-which is eq. `reconvampling2D` of the paper summed over the band that the observed PSF can carry.
+which is eq. `reconvampling2D` of the paper summed over the band of the observed PSF.
 Images are real, so the sum runs over nu_y >= 0, nu_x >= 0 with the pair D(+,+), D(+,-), and every
 exponential is a (cos, sin) pair of real table rows: a plan is a list of real matrices.
 """
@@ -25,21 +25,21 @@ from .gridding import KaiserBessel, LineTaps
 from .transfer import Certificate, transfer_function, wrap_radius
 from .wave_tables import aligned_tables, distorted_tables, line_tables, uniform_wave_table
 
-# [bytes] of the tables of one operator. Frames of 7000 pixels a side need so much, and take minutes
-# where tiles take seconds; a WCS that is wrong by orders of magnitude needs far more.
+# [bytes] Largest tables of one operator. Frames of 7000 pixels a side reach it; they take minutes,
+# in tiles seconds. A WCS that is wrong by orders of magnitude would need far more.
 MAX_BYTES = 8 << 30
 
-# Part of the band's tolerance that a PSF's transform may lack of its light: that of outer samples,
-# which a sum over all samples would otherwise spend most of its time on.
+# Fraction of the band's tolerance that a PSF may lose in light of its outer samples, on which a sum
+# over all samples would spend most of its time.
 FAINT = 1e-2
 
 
 @dataclass(frozen=True)
 class Precision:
-    """Precision of a plan: to the rounding of the floating-point type that it serves.
+    """Precision of a plan: that of the floating-point type of its operator.
 
     band_tolerance [1]: |D| / max |D| below which a frequency is dropped
-    window: by which pixels are interpolated along lines; see KaiserBessel for its error
+    window: interpolates pixels along lines; see KaiserBessel for its error
     """
 
     band_tolerance: float
@@ -58,21 +58,21 @@ class Precision:
 class ResamplingPlan:
     """Tables of one observation; rows 2i, 2i+1 of a table are the cos and sin parts of frequency i.
 
-    mapping: observed pixels -> model pixels; its geometry decides which tables there are
-    identity: same pixels and PSF, so that without a shift the operator returns its input
+    mapping: observed pixels -> model pixels; its geometry decides which tables exist
+    identity: True for equal pixels and PSFs, when the operator without a shift returns its input
     nu (Hy,), (Hx,) [cycles per model px]: frequencies >= 0 of the two table axes
-    axes: the model axis of each table axis; (1, 0) where the observed rows run along the model's y
+    axes: the model axis of each table axis; (1, 0) if the observed rows run along the model's y
     psfs: of the model and of the observation
-    n_bands, n_terms: C bands of the observation, each of which adds up T images of the model, one
-        through each PSF of a PSFBasis; 1 where its PSF is the same everywhere
+    n_bands, n_terms: C bands of the observation, each the sum of T images of the model, one
+        through each PSF of a PSFBasis; T is 1 if the PSF is the same everywhere
     d_plus, d_minus (C * T, Hy, Hx) complex: D(+,+), D(+,-) times K^-2 and the half-plane weights,
-        and the phases that take the observed rows and columns, if aligned, or lines, if affine, to
-        their places: their own tables begin and end at equal distances from 0
+        and the phases that shift the observed rows and columns (aligned) or lines (affine) to their
+        positions: their tables are symmetric about 0
     in_y (2Hy, Ny), in_x (2Hx, Nx): transforms of the model
     out_y, out_x: aligned (My, 2Hy), (2Hx, Mx); affine (L, 2Hy), (2Hx, J); distorted (P, 2Hy),
         (P, 2Hx)
     twist (Hy, J) complex, lines: affine only
-    windows: plans that `window` has made, by what they were made for
+    windows: plans made by `window`, by its arguments
     """
 
     mapping: Mapping
@@ -109,11 +109,12 @@ class ResamplingPlan:
     def window(self, shape, reach_px, precision: Precision, size=None) -> ResamplingPlan:
         """The plan of a box of the model and the part of the observation that its light reaches.
 
-        One for all boxes of a shape: those observed pixels lie about the box's middle, and how far
-        off they are in truth is a shift of up to half an observed pixel. Not of distorted mappings,
-        which are another at each place.
+        One plan serves all boxes of a shape: its observed pixels are centred on the box, and their
+        true offset is a shift of up to half an observed pixel. Not available for distorted
+        mappings, which differ from place to place.
 
-        shape (2,) [model px]: of the box; reach_px [model px]: how far its light is followed
+        shape (2,) [model px]: of the box; reach_px [model px]: distance to which its light is
+            rendered
         size (2,) [observed px]: of the window, at least as many; see PaddedMapping.for_box
         """
         key = tuple(shape), reach_px, precision, size
@@ -137,7 +138,7 @@ class ResamplingPlan:
 
     @functools.cached_property
     def mirrored(self) -> dict[str, bool]:
-        """True if halves of tables mirror each other; of pixels beyond the model they do not."""
+        """True if halves of tables mirror each other, as they do if all pixels are on the model."""
         tables = {"in_y": self.in_y, "in_x": self.in_x}
         if self.geometry != "distorted":
             tables |= {"out_y": self.out_y.T, "out_x": self.out_x}
@@ -157,11 +158,10 @@ def make_resampling_plan(
     """Tables that take a model to the observed pixels and PSF of `mapping`.
 
     mapping: observed pixels -> model pixels; psf_in (1 or C bands), psf_out (C bands): the PSFs
-    n_terms: T, of which psf_out has so many in turn for each band that is observed; see
-        ResamplingPlan
-    extent (2,) [model px]: from its first pixel on, what of the model holds light, and sets the
-        frequencies; None = all of it
-    radius (2,) [model px]: by which the model is padded; None = `wrap_radius`
+    n_terms: T; psf_out has T bands in turn for each observed band; see ResamplingPlan
+    extent (2,) [model px]: the part of the model, from its first pixel on, that can have light; it
+        determines the frequencies; None = all of it
+    radius (2,) [model px]: padding of the model; None = `wrap_radius`
     Raises ValueError for incompatible band counts, no overlap, or a PSF without light in the band.
     """
     n_bands = count_bands(mapping, psf_in, psf_out)

@@ -8,7 +8,7 @@ With A the Jacobian and X the positions of the observed pixels in model pixels, 
     I2(X)  = K^-2 sum_nu D(nu) F[I1](nu) exp(2 pi i nu.X)                         frequency_sum
     I2(X)  = sum_k I1(x_k) sum_m Pd(x_m) sinc(X - x_k - x_m),  Pd = F^-1[D]         dense_matrix
 
-Nothing is left out, separated or interpolated here; only for small images.
+The sums are complete, without separation or interpolation, and therefore for small images only.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def resample(images, mapping, psf_in, psf_out, n_fft):
 def frequency_sum(images, positions, matrix, psf_in, psf_out, n_fft):
     """I2(X) = K^-2 sum_nu D(nu) F[I1](nu) exp(2 pi i nu.X), summed for each position by itself.
 
-    images (..., C, Ny, Nx) [flux/px]; positions (*P, 2) [model px]: any X; matrix (2, 2): A
+    images (..., C, Ny, Nx) [flux/px]; positions (*P, 2) [model px]: X; matrix (2, 2): A
     returns (..., C, *P): flux in an observed pixel of area |det A| at X
     """
     nu_y, nu_x, d = otf_ratio(matrix, psf_in, psf_out, n_fft)
@@ -52,7 +52,8 @@ def dense_matrix(shape_in, positions, matrix, psf_in, psf_out, n_fft):
 
     shape_in (Ny, Nx) [px]: model; positions (*P, 2) [model px]; matrix (2, 2): A
     n_fft (2,): the kernel is kept to |x_m| <= (K - 1) / 2
-    returns (C, P, Ny Nx); infinite sincs, so it is the spectral sum only as far as Pd ends within K
+    returns (C, P, Ny Nx); its sincs are infinite, so it equals the spectral sum if Pd vanishes
+        beyond K
     Source: eqs. `reconvampling2D`, `I2model`.
     """
     kernel = difference_kernel(matrix, psf_in, psf_out, n_fft)

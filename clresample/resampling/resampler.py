@@ -28,8 +28,8 @@ class Resampler(GridOperator):
 
         I2(X) = K^-2 sum_nu D(nu) F[I1](nu) exp(2 pi i nu.X),  D = |det A| P2^(A^T nu) / P1^(nu)
 
-    grid_in, psf_in, grid_out, psf_out, dtype, device, shift, tolerance_px, and what can be read
-    back: see GridOperator.  `plans` are its tables, one or one for each item of a batch.
+    grid_in, psf_in, grid_out, psf_out, dtype, device, shift, tolerance_px, and the properties: see
+    GridOperator.  `plans`: its tables, one plan, or one for each item of a batch.
 
     Raises ValueError for grids that do not overlap and for band counts that do not match.  Warns
     (PSFWarning) of a difference kernel that amplifies noise, and of a division that was floored.
@@ -42,20 +42,20 @@ class Resampler(GridOperator):
     ) -> Resampler:
         """An operator on batches whose item b has its own geometry and PSFs, plans[b].
 
-        plans: one for batches of any length, or one for each item; alike in geometry, axes, bands,
-            shapes and, when affine, in whether lines are rows
+        plans: one for batches of any length, or one for each item; of equal geometry, axes, bands
+            and shapes, and if affine, with lines along the same axis
         shift (2,) or (len(plans), 2) [model px]
 
-        Sums of float32 are float32: round them as batches of one plan and of many do alike.
+        float32 operators sum in float32, so that batches of one plan and of many round alike.
 
-        Raises ValueError for plans that differ in these.
+        Raises ValueError for plans that differ in these properties.
         """
         _check_alike(plans)
         return cls._made(plans, dtype, device, shift, folds=False)
 
     @classmethod
     def _made(cls, plans, dtype, device, shift, folds):
-        """An operator of plans; folds: a single one may go through float64, see FoldedExecutor."""
+        """An operator of plans; folds: a single plan may use float64, see FoldedExecutor."""
         op, dtype = cls.__new__(cls), check_dtype(dtype)
         op._take(plans, dtype, device, folds)
         op.shift = shift
@@ -65,8 +65,9 @@ class Resampler(GridOperator):
     def of_items(cls, ops: list[Resampler]) -> Resampler:
         """The operator of batches whose item b is rendered by ops[b].
 
-        Theirs where they are one, else one of all their plans, at their present shifts. ValueError
-        where their layouts differ.
+        The same operator if all are one, else an operator of all their plans, at their present
+        shifts.
+        Raises ValueError if their layouts differ.
         """
         if all(op is ops[0] for op in ops):
             return ops[0]
@@ -76,7 +77,7 @@ class Resampler(GridOperator):
 
     @property
     def layout(self):
-        """Properties that operators share to serve one batch: see from_plans."""
+        """Properties that must be equal for operators to serve one batch: see from_plans."""
         plan = self.plans[0]
         by_row = None if plan.lines is None else plan.lines.by_row
         return self.geometry, plan.axes, self.shape_in, self.shape_out, by_row
@@ -154,7 +155,8 @@ class Resampler(GridOperator):
     def queue_plain(self, way, source, target):
         """Queues "forward" or "adjoint" like `forward_into`, in the operator's own type throughout.
 
-        float32 images that go through float64 there take two thirds of the time here.
+        For float32 images that `forward_into` computes in float64, this takes two thirds of the
+        time.
         """
         with self._lock:
             self._run(way, source, target, whole=self._executor)
@@ -162,8 +164,8 @@ class Resampler(GridOperator):
     def _run(self, way, source, target, *, whole=None, **options):
         """Queues "forward" or "adjoint" on as many items at a time as the cache holds.
 
-        source, target: device arrays (B,) + shape of an item; whole: the executor, None for that of
-        callers; options: of `way`
+        source, target: device arrays (B,) + shape of an item; whole: the executor, None = that of
+            `forward`; options: of `way`
         """
         batch, whole = source.shape[0], whole or self._whole
         if len(self.plans) not in (1, batch):
@@ -171,8 +173,8 @@ class Resampler(GridOperator):
         if self._identity and not options:
             self.device.copy(source, target)
             return
-        # per-item tables are counted from a launch's first item, so they go in one group; so do
-        # images of a folded executor, which has intermediates for cores
+        # items with tables of their own need one launch, since tables are counted from its first
+        # item; a folded executor needs one too, since its intermediates are those of the cores
         grouped = len(self.plans) == 1 and whole is self._executor
         group = min(self._group, batch) if grouped else batch
         _queue(whole, way, source, target, group, self.plans[0].n_bands, **options)
@@ -188,7 +190,7 @@ def _queue(executor, way, source, target, group, n_bands, **options):
 
 
 def _images_at_once(executor: Executor) -> int:
-    """Images, one for each band, whose intermediates the cache holds and a launch may have."""
+    """Largest number of images of one launch: their intermediates must fit the cache."""
     per_image = sum(rows * ld for rows, ld in executor.scratch_shapes().values())
     fit = executor.tuning.group_bytes // (per_image * np.dtype(executor.dtype).itemsize)
     return min(fit, MAX_GROUPS // executor.n_terms)

@@ -12,17 +12,17 @@ import numpy as np
 from ..drawing.display import CertificateDisplay
 from ..sky.psf import PSF
 
-# Light of the observed PSF beyond the wrap radius, as a fraction; images drawn by FFT ring at 1e-6.
+# [1] Fraction of the observed PSF's light beyond the wrap radius. Images drawn by FFT ring at 1e-6.
 WRAP_TOLERANCE = 1e-5
-# The radius is larger by this factor than where the light ends (4.9 sigma of a Gaussian), since the
-# band's sharp edge makes the kernel ring beyond. At 1.5 (7.4 sigma, 1e-12 of a Gaussian's light)
-# what wraps stays under 4e-7 of an image, 0.06 dB at 58 dB; larger factors only add frequencies.
+# Ratio of the wrap radius to the radius where the light ends (4.9 sigma of a Gaussian): the band's
+# sharp edge makes the kernel ring beyond. At 1.5 (7.4 sigma, 1e-12 of a Gaussian's light) the light
+# that wraps is under 4e-7 of an image, 0.06 dB at 58 dB. Larger factors only add frequencies.
 WRAP_MARGIN = 1.5
 # |P1^| below which the division is floored: 1e-6 of a point source's light per frequency, ten times
-# the rounding of a PSF stored in float32.
+# the rounding of a PSF in float32.
 DIVISION_FLOOR = 1e-6
-# Amplification |D| / |det A| from which on a user is warned: PSFs that nearly agree stay a few per
-# cent above 1. Share of the observed PSF's power that the floor may take without a warning.
+# Amplification |D| / |det A| above which a warning is issued; PSFs that nearly agree stay a few per
+# cent above 1. Then the fraction of the observed PSF's power that may be floored without a warning.
 NOISY_GAIN, FLOORED_POWER = 2.0, 1e-3
 
 
@@ -34,7 +34,8 @@ class Certificate(CertificateDisplay):
     n_fft (2,): K, the padded length of each axis; frequencies are kappa / K
     n_frequencies (2,): frequencies >= 0 of each axis that are summed
     max_gain (C,) [1]: largest |D| / |det A|, by which noise of that frequency is multiplied
-    floored_power (C,) [1]: share of the observed PSF's power where |P1^| was floored
+    P1^| was floored|floored_power (C,) [1]: fraction of the observed PSF's power where |P1^| was
+    floored|P1^| was floored
     """
 
     wrap_radius_px: tuple[float, float]
@@ -53,7 +54,7 @@ class Certificate(CertificateDisplay):
 
 
 def noise_warnings(certificate: Certificate) -> list[str]:
-    """Warnings about a difference kernel that does more than blur, a line each."""
+    """Warnings about a difference kernel that amplifies noise or was floored, a line each."""
     gain, floored = certificate.max_gain.max(), certificate.floored_power.max()
     lines = []
     if gain > NOISY_GAIN:
@@ -70,9 +71,9 @@ def noise_warnings(certificate: Certificate) -> list[str]:
 
 
 def wrap_radius(psf: PSF, matrix) -> tuple[float, float]:
-    """Distance (y, x) [model px] beyond which the observed PSF holds no light worth wrapping.
+    """Distance (y, x) [model px] beyond which the observed PSF has negligible light.
 
-    K >= N + radius keeps what leaves one edge of the model from coming in at the other.
+    With K >= N + radius, light that leaves one edge of the model does not enter at the other.
 
     psf: the observed one; matrix (2, 2) [model px / observed px]: A
     """
@@ -83,14 +84,14 @@ def wrap_radius(psf: PSF, matrix) -> tuple[float, float]:
 
 
 def light_reach(psf: PSF, matrix, tolerance) -> float:
-    """Distance [model px] beyond which the observed PSF holds less than this part of its light."""
+    """Distance [model px] beyond which the observed PSF has less than this part of its light."""
     reach, image = _light_ends(psf, tolerance)
     circle = np.linalg.norm(matrix, axis=1) * reach
     return float(np.minimum(circle, np.abs(matrix) @ image).max())
 
 
 def _light_ends(psf, tolerance):
-    """Distance [px] beyond which lies this part of a PSF's light, and half its image (2,) [px]."""
+    """Distance [px] beyond which lies this fraction of a PSF's light; half its image (2,) [px]."""
     y, x = (
         np.abs(np.arange(n) - psf.center[:, i, None]) * psf.spacing
         for i, n in enumerate(psf.images.shape[1:])
@@ -112,7 +113,7 @@ def transfer_function(otf_in, otf_out):
 
     otf_in, otf_out (C or 1, Ky, Kx) complex: P1^(nu), P2^(A^T nu); D itself if P2^ comes times
         |det A|, as in the paper's scheme
-    returns the ratio (C, Ky, Kx), its largest size (C,), and the share (C,) of P2^'s power where
+    returns the ratio (C, Ky, Kx), its largest size (C,), and the fraction (C,) of P2^'s power where
         the division was floored
     """
     size = np.abs(otf_in)

@@ -15,7 +15,7 @@ def wave_table(nu, x) -> np.ndarray:
 
 
 def uniform_wave_table(nu, first, step, n) -> np.ndarray:
-    """`wave_table` (n, 2 len(nu)) at equal distances, x = first + step k; quicker."""
+    """`wave_table` (n, 2 len(nu)) at equal distances, x = first + step k; faster."""
     return uniform_waves(nu, first, step, n).view(np.float64)
 
 

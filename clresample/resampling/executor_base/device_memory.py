@@ -13,11 +13,11 @@ from ...device.tuning import Tuning
 
 
 class DeviceMemory:
-    """An executor's memory on the device: tables, and intermediates of as many images as asked for.
+    """An executor's memory on the device: tables, and intermediates of the reserved images.
 
     device, dtype, tuning, plans, n_bands: of the executor
-    n_reserved: images that there is room for; scratch: the intermediates, by their names
-    which (items,): int32, on the device: the plan of each item; None where all are seen alike
+    n_reserved: number of images with memory; scratch: the intermediates, by their names
+    which (items,): int32, on the device: the plan of each item; None if all items have one plan
     Subclasses implement scratch_shapes, bind and bind_adjoint
     """
 
@@ -26,7 +26,7 @@ class DeviceMemory:
         self.tuning, self.n_bands = Tuning.of(device, dtype), plans[0].n_bands
         self.n_reserved, self.scratch = 0, {}
         self.which = None
-        self._made = {}  # what only the adjoint reads, once it is asked for
+        self._made = {}  # tables of the adjoint alone, made at its first use
         self._bound_back = False
 
     def scratch_shapes(self):
@@ -38,7 +38,7 @@ class DeviceMemory:
         raise NotImplementedError
 
     def bind_adjoint(self):
-        """Binds the products of the adjoint, which many callers never use."""
+        """Binds the products of the adjoint, if a caller uses it."""
 
     def ensure_adjoint(self):
         """Binds the products of the adjoint if they are not bound yet."""
@@ -59,7 +59,7 @@ class DeviceMemory:
     def clone(self) -> Self:
         """An executor of the same tables on the device, with intermediates of its own.
 
-        For callers that work between its stages. A shift of either is one of both.
+        For callers that work between its stages. A shift of one executor applies to both.
         """
         other = copy.copy(self)
         other.n_reserved, other.scratch, other._bound_back = 0, {}, False
@@ -68,9 +68,9 @@ class DeviceMemory:
     def reserve(self, n_images):
         """Makes room for the intermediates of `n_images` images at a time."""
         if self.n_reserved != n_images:
-            # until all is bound: an interruption leaves nothing half done
+            # until all are bound, so that an interruption leaves a consistent state
             self.n_reserved, self._bound_back = 0, False
-            # items of their own sizes leave the rest as it is, which sums may meet with weight 0
+            # items with sizes of their own leave the rest unwritten; sums may read it with weight 0
             make = self.device.empty if self.which is None else self.device.zeros
             self.scratch = {
                 name: make((n_images, rows, ld), self.dtype)
@@ -87,7 +87,7 @@ class DeviceMemory:
         )
 
     def tables(self, array):
-        """Tables (plans or items, bands, ...) of an epilogue as `Contraction.bind` takes them."""
+        """Tables (plans or items, bands, ...) of an epilogue: arguments of `Contraction.bind`."""
         stride = math.prod(array.shape[1:]) if len(array) > 1 else 0
         return array.base_data, stride, math.prod(array.shape[2:])
 

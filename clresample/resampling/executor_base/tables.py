@@ -18,7 +18,7 @@ class ExecutorTables(DeviceMemory):
     """
 
     n_rows: int
-    bounded = True  # whether products of an item end where the tables of its plan do
+    bounded = True  # True if products of an item end where the tables of its plan end
 
     def __init__(self, device, dtype, plans):
         super().__init__(device, dtype, plans)
@@ -60,7 +60,8 @@ class ExecutorTables(DeviceMemory):
     def set_transfer(self, transfer):
         """Uploads the transfer functions: a pair D(+,+), D(+,-) (C, Hy, Hx) for each plan.
 
-        Of a batch that one plan serves, for each item, from before `clone` and `reserve` on.
+        If one plan serves a batch, there is a pair for each item; call it before `clone` and
+        `reserve`.
         """
         if len(transfer) != len(self.transfer):
             self.transfer = self.device.empty((len(transfer), *self.transfer.shape[1:]), self.dtype)

@@ -44,7 +44,7 @@ class PSFTerms:
         self._run(self._add, n)
 
     def split(self, n):
-        """Queues the parts of `n` images."""
+        """Queues the terms of `n` images."""
         self._run(self._spread, n)
 
     def _run(self, launch, n):

@@ -1,4 +1,4 @@
-"""Operators between images that are even and odd parts about their middles, inside in float64.
+"""Operators in float64 between float32 images, by even and odd parts about their middles.
 
 Imports `device` and the modules of `resampling`.
 """

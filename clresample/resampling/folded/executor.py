@@ -1,14 +1,14 @@
 """The chain of aligned geometries in float64 between float32 images, at float32's cost.
 
-A product in float64 takes a CPU twice as long. Images in parts even and odd about their middles
-need half of the products, since a cos meets even parts alone and a sin odd ones. So a float32
-operator may round its input and its output and nothing between; in float32 throughout, tables,
-intermediates and sums are rounded too: 1e-7 of an image instead of 3e-8.
+On CPUs a float64 product takes twice as long as a float32 product. If images are split into parts
+even and odd about their middles, half of the products suffice: cosines need the even parts only,
+and sines the odd parts. So a float32 operator can compute in float64 at no cost, and rounds only
+its input and output. The error is 3e-8 of an image, instead of 1e-7 in float32 throughout.
 
     forward   I2 = unfold(Sy (D o (Ty fold(I1) Tx)) Sx)
     adjoint   the same factors transposed, in reverse order
 
-D holds the way from the model's middle to the observation's, and all waves are about the middles.
+D contains the phase from the model's middle to the observation's; all waves are about the middles.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from ...device.tuning import Tuning
 from ..plan import ResamplingPlan
 from ..wave_tables import wave_table
 
-# [bytes] of float64 intermediates of one image, which one work-item takes through the whole chain:
-# half of a core's second cache. Larger images, from some 200 pixels a side on, are better shared
-# among cores, product by product.
+# [bytes] Largest float64 intermediates of one image, which one work-item computes from end to end:
+# half of a core's second cache. Images of more than some 200 pixels a side are faster if cores
+# share each product.
 MAX_BYTES = 1 << 20
 
 
@@ -31,9 +31,9 @@ class FoldedExecutor:
 
     It computes in float64.
 
-    Images on either side are float32. `is_preferred` says for which operators it is made.
+    Images on either side are float32. `is_preferred` tests if an operator should use it.
 
-    scratch: all that it holds on the device, by names; nothing before it is first used
+    scratch: its arrays on the device, by names; empty before the first use
     """
 
     def __init__(self, device, plan: ResamplingPlan):
@@ -88,7 +88,7 @@ class FoldedExecutor:
         at |= {"D": held["transfer"], "scratch": work}
         self._forward = self._bound(model, observed, 1, at)
         self._adjoint = self._bound(observed, model, -1, at)
-        self.scratch = held  # last: an interruption leaves nothing half done
+        self.scratch = held  # last, so that an interruption leaves a consistent state
 
     def forward(self, x: ImageBatch, y: ImageBatch, n, spread=False):
         """I2 from I1: x (n, Ny, Nx), or (n / n_bands, Ny, Nx) if `spread`, to y (n, My, Mx)."""
@@ -136,8 +136,8 @@ class FoldedImages:
     folded: the executor
     shape (2,) [px]: along the tables' axes, which are the images' `axes`
     both_waves (half_y, 2 Hy), (half_x, 2 Hx): at the pixels from the middle on, cos, sin in turn
-    lit (n_y,), (n_x,): 0 of rows and columns that do not count, else 1
-    tables: on the device, of the way to the frequencies and the way from them
+    lit (n_y,), (n_x,): 0 for rows and columns to ignore, else 1
+    tables: on the device, from pixels to frequencies and back
     """
 
     def __init__(self, folded: FoldedExecutor, shape, both_waves, lit, axes):

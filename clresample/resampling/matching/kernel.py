@@ -5,9 +5,9 @@ sigma^2(x) in the input,
 
     var(X) = sum_x h(X - x)^2 sigma^2(x),     rho(d) = sum_X h(X) h(X + d) / sum_X h(X)^2.
 
-h is sampled finely enough along the output's axes that h^2 is resolved too. Sums with h^2 are then
-those of a second operator, whose PSF is h^2. For correlated input noise, h is first convolved with
-the filter that would make that noise from white noise.
+h is sampled finely enough along the output's axes to resolve h^2. The variances are the result of a
+second operator, whose PSF is h^2. For correlated input noise, h is first convolved with the filter
+that makes such noise from white noise.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from ..resampler import Resampler
 from ..tiled.resampler import TiledResampler
 from .target import local_matrix
 
-# [FWHM of the wider PSF] How far a kernel is followed, and [px] at least; what lies beyond is
-# ringing at the band's edge, under 1e-4 of its power.
+# Radius of the sampled kernel, in FWHM of the wider PSF, and its minimum [px]. Beyond it lies only
+# ringing from the band's edge, under 1e-4 of the kernel's power.
 REACH_FWHM, MIN_REACH_PX = 4.0, 8
-# Correlations below this at all lags are none.
+# Noise with correlations below this at all lags is treated as white.
 WHITE = 1e-3
 
 
@@ -37,7 +37,7 @@ class NoiseKernel:
 
     grid_in, psf_in, grid_out, psf_out: of the operator, PSFs of one band
     noise: NoiseCorrelation of the input, or None where it is white
-    device: as `get_device` takes it
+    device: see `get_device`
 
     correlation: NoiseCorrelation of the output, or None where it is white
     gain [1]: variance of the output for a variance of 1 all over the input
@@ -80,7 +80,7 @@ class NoiseKernel:
             psf_out.images, spacing=psf_out.spacing * self.finer, center=psf_out.center
         )
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", PSFWarning)  # of the images' own operator it is said
+            warnings.simplefilter("ignore", PSFWarning)  # the images' own operator has warned
             op = Resampler(grids[0], psf_in, grids[1], spaced, device=self.device)
         return op(source.astype(np.float32))[0].astype(np.float64) * self.finer**2
 

@@ -18,8 +18,8 @@ from ..tiled.resampler import TiledResampler
 from .kernel import NoiseKernel
 from .target import psf_on, widest
 
-# Part of a pixel's noise power that may come from pixels without weight, or from outside of the
-# image; where it is more, the pixel has no weight. A kernel's tails add up to some 1e-3.
+# Largest fraction of a pixel's noise power from pixels without weight or outside the image. Pixels
+# above it get weight 0. The tails of a kernel add up to some 1e-3.
 MAX_LOST = 1e-2
 # [px] Width of the Gaussian that fills pixels without weight from those about them.
 FILL_SIGMA_PX = 1.5
@@ -33,10 +33,10 @@ def match(observations, grid=None, psf=None, *, max_gain=2.0, device=None) -> Ob
     step, to the flux per pixel of the new pixels. The noise is propagated: the variance of every
     pixel, and the correlation of neighbouring pixels.
 
-    observations: one Observation or several, of one patch of sky
+    observations: one or several Observations of one patch of sky
     grid: Grid of the result; None = that of the observation with the widest PSF
     psf: PSF of the result in pixels of `grid`, of one band; None = the widest of all, in arcsec
-    max_gain: largest permitted gain of the noise at any frequency, which grows where a PSF wider
+    max_gain [1]: largest permitted gain of the noise at any frequency; it exceeds 1 if a PSF wider
         than `psf` is sharpened
     device: see `get_device`
 
@@ -46,7 +46,7 @@ def match(observations, grid=None, psf=None, *, max_gain=2.0, device=None) -> Ob
         pixel's noise comes from filled pixels. A PSF that varies is evaluated in the middle of its
         image
 
-    Raises ValueError for observations that do not go together, a grid that none of them overlaps,
+    Raises ValueError for incompatible observations, a grid that none of them overlaps,
     a PSF of several bands, and a gain over max_gain.
     """
     observations = [observations] if isinstance(observations, Observation) else list(observations)
@@ -94,7 +94,7 @@ def _matched(observation, grid, psf, max_gain, device):
     if not rest:
         return data, weights, noise
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PSFWarning)  # refused below where it counts
+        warnings.simplefilter("ignore", PSFWarning)  # an error is raised below if it matters
         op = TiledResampler(o.grid, o.psf[rest], grid, psf, device=device, progress=False)
     gains = op.certificate.max_gain
     if gains.max() > max_gain:

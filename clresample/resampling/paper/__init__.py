@@ -1,4 +1,4 @@
-"""The paper's own scheme as a second operator: sinc tables and shifts, the yardstick in bench/.
+"""The paper's own scheme as a second operator, for comparison: sinc tables and shifts.
 
 Imports `device`, `sky` and the modules of `resampling`.
 """

@@ -2,10 +2,10 @@
 
     I2(i, l) = sum_u F^i(u) P^l(u),    F^i(u) = I1(i a + t - u),    P^l(u) = Pd(l b + u)
 
-Both factors are band-limited, so that a sum over the pixels u of the padded grid is exact, and by
-Parseval's theorem u may as well be a frequency: there a shift is a complex exponential, and the
-inverse transform of every shifted image falls away.  The inner index u still takes as many
-values as the padded grid has pixels. They are done slab by slab, so that a slab of F is read back
+Both factors are band-limited, so that a sum over the pixels u of the padded grid is exact. By
+Parseval's theorem the sum may run over frequencies instead: there a shift is a complex exponential,
+and no shifted image needs an inverse transform.  The inner index u still has as many values as
+the padded grid has pixels. They are computed slab by slab, so that a slab of F is read back
 from the cache.
 """
 
@@ -51,7 +51,7 @@ class PaperFactors:
         budget = tuning.slab_bytes // dtype.itemsize
         n_slabs = max(
             -(-self.n_terms * self.n_cols // budget),
-            # half of the largest buffer: a slab may be a unit longer than the others
+            # half of the largest buffer, because a slab may be one unit longer than others
             -(-self.n_terms * self.l_pad * dtype.itemsize // (device.max_alloc // 2)),
         )
         self.slabs = cut_slabs(self.n_units, self.unit_rows, n_slabs, tuning.chunk_terms)

@@ -1,4 +1,4 @@
-"""The paper's factorised operator: same inputs and outputs as Resampler, at a higher cost."""
+"""The paper's factorised operator, with the inputs and outputs of Resampler."""
 
 from __future__ import annotations
 
@@ -26,15 +26,16 @@ class PaperResampler(GridOperator):
     back: see GridOperator
     n_terms: length of the sum over u; model_axis: the observed axis along i, 0 (y) or 1 (x)
 
-    P2 is interpolated to the model's grid by sincs (eq. `psf_interp`). These, and those of aligned
-    grids, end at the padded grid's edge: the difference to `Resampler`, see docs/schemes.md.
+    P2 is interpolated to the model's grid by sincs (eq. `psf_interp`). These sincs, and those of
+    aligned grids, are cut off at the padded grid's edge. Results differ from those of `Resampler`
+    for this reason only; see docs/schemes.md.
     Raises ValueError for distorted mappings, grids that do not overlap and bands that do not match;
     DeviceError where a factor does not fit on the device.
     Source: eqs. `compact_sinc_sep`, `fast_reconvampling`, `rotation`, `psf_interp`.
     """
 
     def _prepare(self, mapping, psf_in, psf_out, dtype, device):
-        """The transfer function, and the factors of the association that costs less."""
+        """The transfer function and the factors, multiplied in the cheaper order."""
         if mapping.geometry == "distorted":
             raise ValueError(
                 f"grid_out departs from an affine mapping by {mapping.departure_px:.2g} px of "

@@ -11,7 +11,7 @@ from ...device.tuning import Tuning
 from ...sky.psf import PSF
 from ..transfer import transfer_function
 
-# Positions at which a PSF is interpolated at once: three tables of 48 float64 each, 36 MiB.
+# Positions at which a PSF is interpolated in one launch: three tables of 48 float64 each, 36 MiB.
 POSITIONS = 1 << 15
 # Relative slack on the edges of bands, above the rounding of A^T nu in float64.
 BAND_SLACK = 1e-12
@@ -79,9 +79,10 @@ def interpolate_psf(device, matrix, psf: PSF, n_fft, fine=1):
 def sinc_transfer(device, matrix, psf_in: PSF, psf_out: PSF, n_fft):
     """D = F[P2i] / F[P1] in FFT order, floored as `transfer_function` does it.
 
-    The transform of the sincs is a rectangle: D is 0 beyond the observed PSF's band, where only the
-    sincs' cut at the padded grid's edge would be divided by a vanishing F[P1]. Where that band
-    reaches past the model's Nyquist frequency, P2i is taken on a finer grid and does not fold back.
+    The transform of the sincs is a rectangle, so D is 0 beyond the observed PSF's band. Without
+    this, the truncation of the sincs at the padded grid's edge would be divided by a vanishing
+    F[P1]. If the band exceeds the model's Nyquist frequency, P2i is sampled on a finer grid,
+    without aliases.
 
     matrix (2, 2): A; n_fft (2,) [model px]: K
     returns D (C, Ky, Kx) complex; max_gain, floored_power (C,) as in Certificate

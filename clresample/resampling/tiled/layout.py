@@ -18,11 +18,11 @@ from ..plan import Precision, make_resampling_plan
 from ..transfer import wrap_radius
 
 GEOMETRIES = ("aligned", "affine", "distorted")  # from the cheapest on
-# [observed px] side of the tile that shows which frequencies the band holds: a larger one knows the
-# band's edge, one frequency in a hundred here, better, and takes longer
+# [observed px] Side of the tile from which the band is measured. It finds the band's edge to one
+# frequency in a hundred; a larger tile is more accurate and slower.
 TRIAL_PX = 32
-# A window reaches half the wrap radius beyond its tile at full weight, then falls to zero over the
-# other half, or over TAPER_PX [model px]: cut sharply, an image rings through the tile.
+# [model px] A window has full weight up to half the wrap radius beyond its tile, then falls to zero
+# over the other half, or over TAPER_PX if that is more: a sharp edge would ring through the tile.
 FLAT, TAPER_PX = 0.5, 24
 # [observed px] sides to choose from, 8 to 16384
 SIDES = np.unique(np.rint(8 * 2 ** (np.arange(45) / 4)).astype(int))
@@ -33,8 +33,8 @@ class OutputTile:
     """One tile of the observed frame.
 
     origin (2,) [observed px]: its first pixel
-    window_origin (2,) [model px]: its window's first pixel; rarely whole
-    mask (My, Mx) bool: the pixels it gives to the frame; each pixel has one giver
+    window_origin (2,) [model px]: its window's first pixel; rarely a whole number
+    mask (My, Mx) bool: its pixels in the result; each pixel of the frame belongs to one tile
     """
 
     origin: tuple[int, int]
@@ -65,12 +65,12 @@ def make_groups(
     tuning: Tuning,
     memory: int,
 ) -> list[TileGroup]:
-    """Tiles that give every observed pixel on the model once, in groups that share an operator.
+    """Tiles that cover every observed pixel on the model once, in groups that share an operator.
 
     grid_in, psf_in: the model's; grid_out, psf_out: the observation's
-    tolerance_px [model px]: how far a pixel may be from where the WCS puts it
-    tuning: what tiles cost on the device beside their arithmetic
-    memory [bytes]: what one group's operator may take there
+    tolerance_px [model px]: largest distance of a pixel from its position by the WCS
+    tuning: overheads of tiles on the device
+    memory [bytes]: limit for one group's operator
 
     Raises ValueError for grids that do not overlap, band counts that do not match, and a memory
     that is too small for the smallest tile.
@@ -106,9 +106,9 @@ def make_groups(
 class TileCosts:
     """Costs of tiles of any size, from one small plan.
 
-    Small tiles spend their time on the margins of their windows, large ones on matrix products that
-    grow as the cube of a side, and no larger one may exceed the memory. Which size is the quickest
-    depends on both pixel scales, both PSFs and the geometry: tens to hundreds of pixels.
+    Small tiles spend their time on the margins of their windows, large ones on matrix products,
+    whose cost grows as the cube of a side; and memory limits their size. The fastest size is tens
+    to hundreds of pixels, depending on both pixel scales, both PSFs and the geometry.
 
     trial: mapping of a small tile; margin (2,) [model px] of every window
     precision, tuning: of the operators and of their device
@@ -124,7 +124,7 @@ class TileCosts:
         self.scale = np.abs(trial.matrix).sum(axis=1).max()
         self.border = 2 * int(margin.max()) + 2
         self.pad = max(k - n for k, n in zip(n_fft, window.shape_in, strict=True))
-        # the band's edge, known to one frequency of the small plan
+        # the band's edge, to one frequency of the small plan
         n_frequencies = plan.certificate.n_frequencies
         self.band = max((h + 1) / k for h, k in zip(n_frequencies, n_fft, strict=True))
         self.columns, self.taps, self.taps_back = 0.0, 0, 0
@@ -140,15 +140,15 @@ class TileCosts:
     def sides(self, m):
         """Sides of a tile of m x m observed pixels: window pixels n, waves k, columns j.
 
-        At most: pixels of a side of its window, waves that each axis has, columns that its lines
-        cross.
+        Upper limits: pixels of a side of its window, waves of an axis, columns crossed by its
+            lines.
         """
         n = int(np.ceil(self.scale * (m - 1))) + self.border
         k = 2 * (int(self.band * (n + self.pad)) + 1)
         return n, k, int(self.columns * self.scale * m) + self.taps + 1
 
     def account(self, geometry, m, n, k, j):
-        """Terms of `cost`, from the sides of all matrices: those that the executors have."""
+        """Terms of `cost`, from the sides of the executors' matrices."""
         rows = m * m if geometry == "distorted" else m
         wide, crossed = row_stride(k), row_stride(j)
         flops = n * n * k + n * k * k
@@ -191,7 +191,7 @@ class TileCosts:
 
 
 def window_of(mapping: Mapping, margin) -> Mapping:
-    """The mapping, affine, between the same tile and the middle of a window that holds it.
+    """The affine mapping between this tile and the middle of a window that contains it.
 
     The window leaves `margin` (2,) [model px] on every side, and half a pixel for a shift.
     """
@@ -203,7 +203,7 @@ def window_of(mapping: Mapping, margin) -> Mapping:
 
 
 def _lay(region, grid_in, shape, geometry, tolerance_px):
-    """The geometry that a region's tiles need; where none needs more than `geometry`: the tiles.
+    """Geometry needed by the tiles of a region, and the tiles if that is `geometry` or simpler.
 
     returns one of GEOMETRIES, and for each tile its first pixel, mapping and mask
     """
@@ -223,7 +223,7 @@ def _lay(region, grid_in, shape, geometry, tolerance_px):
 
 
 def _find(groups, mapping, margin, width, tolerance_px):
-    """The first group whose operator serves a tile, or a new one; and the tile's place in it."""
+    """The first group whose operator serves a tile, or a new one; and the tile's index in it."""
     middle = np.subtract(mapping.shape_out, 1) / 2
     if mapping.geometry == "distorted":
         inside = mapping.positions[mapping.covered]

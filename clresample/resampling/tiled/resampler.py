@@ -26,20 +26,21 @@ class TiledResampler(HostLinOp, GridOperator):
 
         I2[tile] = R_tile I1[window]
 
-    A window is what the tile's pixels see: where they lie and the wrap radius around, falling
-    smoothly to zero at its edge, zero beyond the model's. Windows start at whole pixels, so that
-    tiles with one Jacobian share an operator and differ in its shift. A distorted frame is affine
-    tile by tile where tolerance_px allows.
+    A window is the part of the model that contributes to a tile: the tile's area and the wrap
+        radius
+    around it. It falls smoothly to zero at its edge, and is zero beyond the model. Windows start at
+    whole pixels, so that tiles with one Jacobian share an operator and differ in its shift. A
+    distorted frame is affine tile by tile if tolerance_px permits.
 
-    Against one tile, images as sharp as the model's PSF agree to 2e-6 (5e-6 where the PSF samples
-    alias), which is what padding that single tile otherwise changes. White noise, sharper than the
-    PSF, agrees to 1e-6 from HST to HSC, 1e-4 from Euclid to Rubin, 6e-2 between rotated equal
-    pixels, whose sinc interpolation never ends.
+    Images as sharp as the model's PSF agree with the result of a single tile to 2e-6 (5e-6 if the
+    PSF's samples alias), the effect of another padding of that tile. White noise, sharper than the
+    PSF, agrees to 1e-6 from HST to HSC, 1e-4 from Euclid to Rubin, and 6e-2 between rotated grids
+    of equal pixels, whose sinc interpolation has infinite range.
 
-    grid_in, psf_in, grid_out, psf_out, dtype, device, shift, tolerance_px, and what can be read
-    back: see GridOperator; `certificate` is of the first tile
-    memory [bytes]: device memory to stay within; None = 1 GiB, or a quarter of what the device has
-    progress: show a bar where standard error is a terminal
+    grid_in, psf_in, grid_out, psf_out, dtype, device, shift, tolerance_px, and the properties: see
+    GridOperator; `certificate` is that of the first tile
+    memory [bytes]: limit on device memory; None = 1 GiB, or a quarter of the device's memory
+    progress: True = show a progress bar if standard error is a terminal
 
     Frames are NumPy arrays, (C, Ny, Nx) or (B, C, Ny, Nx), and stay on the host.
     Raises ValueError for grids that do not overlap, band counts that do not match, and a memory too
@@ -86,7 +87,7 @@ class TiledResampler(HostLinOp, GridOperator):
         return (*super()._about(), f"{self.n_tiles} tiles")
 
     def _use_shift(self):
-        """Nothing to do: each tile's operator is shifted when its turn comes."""
+        """Does nothing: each tile's operator is shifted when the tile is rendered."""
 
     @property
     def n_tiles(self) -> int:
@@ -108,7 +109,7 @@ class TiledResampler(HostLinOp, GridOperator):
 
     @property
     def geometry(self) -> str:
-        """Of the tile that needs most: "aligned", "affine" or "distorted"."""
+        """The most general geometry among the tiles: "aligned", "affine" or "distorted"."""
         return max((group.mapping.geometry for group in self.groups), key=GEOMETRIES.index)
 
     @property
@@ -145,7 +146,7 @@ class TiledResampler(HostLinOp, GridOperator):
     def _steps(self):
         """Each tile, its operator with its shift, and the first pixel of its window.
 
-        Where pixels and PSF are the same the operator is None: the window is the tile.
+        If pixels and PSFs are equal, the operator is None: the window is the tile.
         """
         # tqdm's None: a bar on a terminal only
         with tqdm(
@@ -170,7 +171,7 @@ class TiledResampler(HostLinOp, GridOperator):
 
 
 class TileOperators:
-    """The operators of groups of tiles, one at a time: two might not fit the memory.
+    """The operators of groups of tiles, one at a time, since two might not fit the memory.
 
     psf_in, psf_out, dtype, device: of the TiledResampler
     """
