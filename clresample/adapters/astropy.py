@@ -15,7 +15,7 @@ from .optional import require
 def observation_of(image, psf=None, **given) -> Observation:
     """The Observation of an astropy NDData, CCDData or Cutout2D.
 
-    image, psf, given: see `Observation.from_nddata`, which this is
+    image, psf, given: see `Observation.from_nddata`, which this calls
 
     Raises ValueError as that does.
     """
@@ -27,7 +27,7 @@ def ccddata_of(data, grid, *, variance=None, mask=None, psf=None, unit=u.ct, car
 
     data (C, Ny, Nx) or (Ny, Nx): one channel is returned as (Ny, Nx), several as a cube, whose WCS
         is that of its rows and columns
-    grid: Grid of (Ny, Nx); a flat one is put at RA = Dec = 0
+    grid: Grid of (Ny, Nx); a flat grid is placed at RA = Dec = 0
     variance, mask: of the shape of data, or None; psf: PSF of 1 or C bands, or None
     unit: of data; cards: (keyword, value, comment) of the FITS header that is `meta`
 
@@ -57,9 +57,9 @@ def regions_of(table, *, radius_arcsec=1.0):
     """Sources of a catalogue as sky regions, to draw or to write for DS9.
 
     table: QTable of `catalogue`, with ra and dec
-    radius_arcsec: of the circles of sources whose size was not measured, points among them
-    returns regions.Regions: an ellipse a source, of twice its second moments' half-axes;
-        circles elsewhere; each with the source's name as text
+    radius_arcsec [arcsec]: radius of the circles of sources without a measured size, such as stars
+    returns regions.Regions: an ellipse for each source, with twice the half-axes of its second
+        moments, or a circle; the text of each is the source's name
 
     Raises ImportError without regions; ValueError for a table of a flat sky.
     """
@@ -74,7 +74,7 @@ def regions_of(table, *, radius_arcsec=1.0):
         meta = regions.RegionMeta({"text": str(row["name"])})
         if np.isfinite(size.value) and size.value > 0 and np.isfinite(e):
             axes = 4 * size * np.sqrt([1 + e, 1 - e])
-            # ours is counted from north to east, that of regions from west to north
+            # our position angle is counted from north to east, that of regions from west to north
             angle = row["position_angle"] + 90 * u.deg
             found.append(regions.EllipseSkyRegion(centre, *axes, angle=angle, meta=meta))
         else:

@@ -20,7 +20,7 @@ def with_bands(op, x):
 
 
 def batched_shapes(x, op, transposed):
-    """Of one item of x, and of the result with all of x's leading axes."""
+    """Shapes of one item of x, and of the result with all leading axes of x."""
     shape_x, shape_result = op.shape_in, op.shape_out
     if transposed:
         shape_x, shape_result = shape_result, shape_x

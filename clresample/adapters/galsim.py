@@ -40,12 +40,12 @@ def grid_of(image) -> Grid:
 
 
 def psf_of(profile, grid, *, n_pixels=41, oversampling=1, position_px=None) -> PSF:
-    """The PSF of a GalSim profile on a grid's pixels, their response included.
+    """The PSF of a GalSim profile on a grid's pixels, pixel response included.
 
     profile: galsim.GSObject, the PSF before pixels; a list of C of them makes C bands
     n_pixels: side of the images [pixels of the grid], odd; light beyond is cut off
     oversampling: samples per pixel and axis, odd
-    position_px (2,) [px]: (y, x) where on the grid; None is its centre
+    position_px (2,) [px]: (y, x), a position on the grid; None = its centre
 
     Raises ValueError for even numbers.
     """
@@ -87,14 +87,14 @@ def image_of(array, grid):
 
 
 def profile_of(image, grid, position_px, *, interpolant="lanczos15"):
-    """An image as a GalSim profile about one of its places.
+    """An image as a GalSim profile about a position in it.
 
     image (Ny, Nx): flux per pixel of a band-limited model, as those of fits are
     grid: of the image; position_px (2,) [px]: (y, x) that becomes the profile's origin
-    interpolant: GalSim's name of the one between pixels. "sinc" is exact, but GalSim 2.8 ends the
-        process by a segmentation fault where it draws one in real space;
-        lanczos15 is within 1e-3 of the peak for images sampled as finely as models are
-    returns galsim.InterpolatedImage, in arcsec on the tangent plane at that place
+    interpolant: GalSim's name for the interpolation between pixels. "sinc" is exact, but GalSim 2.8
+        crashes with a segmentation fault when it draws such a profile in real space. lanczos15 is
+        within 1e-3 of the peak for images as finely sampled as models
+    returns galsim.InterpolatedImage, in arcsec on the tangent plane at that position
     """
     galsim = require("galsim", "galsim")
     image, position = np.asarray(image, np.float64), np.asarray(position_px, np.float64)
@@ -125,7 +125,7 @@ def as_galsim(op, grid_out):
 
 
 def _position(grid, position_px):
-    """(y, x) [px]; None is the grid's centre."""
+    """The position (y, x) [px]; None = the grid's centre."""
     if position_px is None:
         return (np.array(grid.shape) - 1) / 2
     return np.asarray(position_px, np.float64)

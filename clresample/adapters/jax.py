@@ -11,10 +11,11 @@ from .optional import require
 def as_jax(op):
     """The operator as a function of a JAX array.
 
-    Both directions run on the operator's OpenCL device, called back from JAX's CPU backend: arrays
-    cross the host once each way. Being linear, the operator is its own derivative, and its adjoint
-    is the reverse one; `jax.jvp`, `jax.vjp`, `jax.grad`, `jax.linear_transpose` and second
-    derivatives are exact. `jax.vmap` makes one launch of a batch, not many.
+    Both directions run on the operator's OpenCL device, in a callback from JAX's CPU backend:
+    arrays are copied through the host once each way. The operator is linear, so it is its own
+    forward
+    derivative, and its adjoint is the reverse derivative: `jax.jvp`, `jax.vjp`, `jax.grad`,
+    `jax.linear_transpose` and second derivatives are exact. `jax.vmap` makes one launch of a batch.
 
     op: any LinOp (Resampler, TiledResampler, ...) of item shapes shape_in and shape_out
     returns f(x): x (...,) + shape_in -> (...,) + shape_out, arrays of the operator's dtype; of one

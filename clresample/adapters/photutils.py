@@ -9,15 +9,15 @@ from .optional import require
 
 
 def psf_of(model, *, position_px=(0.0, 0.0), n_pixels=41, oversampling=None) -> PSF:
-    """The PSF that a photutils model has at one place.
+    """The PSF of a photutils model at one position.
 
-    photutils' models give flux per pixel at any offset from the centre, so the pixel's response is
-    in them; sampled on a finer grid they are what `PSF(images, spacing=...)` takes.
+    photutils' models return flux per pixel at any offset from the centre, pixel response included.
+    So their samples on a finer grid are images for `PSF(images, spacing=...)`.
 
     model: a two-dimensional model with parameters x_0, y_0 and flux; a list of C makes C bands
-    position_px (2,) [px]: (y, x), of interest to a GriddedPSFModel, which varies over its image
+    position_px (2,) [px]: (y, x), used by a GriddedPSFModel, which varies over its image
     n_pixels: side of the images [pixels]; light beyond is cut off
-    oversampling: samples per pixel and axis; None takes the model's own, or 1 where it has none
+    oversampling: samples per pixel and axis; None = that of the model, or 1 if it has none
 
     Raises ImportError without photutils; ValueError for a model that is not of that kind.
     """

@@ -21,12 +21,12 @@ def renderer_of(model_frame, obs_frame, *, device=None, dtype=np.float32):
     It replaces scarlet2's own convolution and resampling: exact for band-limited models, for any
     rotation, parity and distortion of the WCS, and differentiable by the operator's own adjoint.
 
-    model_frame, obs_frame: scarlet2.Frame, with WCS and PSF; the observation's channels are among
-        the model's
-    device: as of `get_device`; dtype: float32, or float64 under jax_enable_x64
+    model_frame, obs_frame: scarlet2.Frame, with WCS and PSF; the model must have the observation's
+        channels
+    device: see `get_device`; dtype: float32, or float64 under jax_enable_x64
 
     Raises ImportError without scarlet2; ValueError for frames without a WCS or a PSF, and for
-    channels that the model has not.
+    channels that the model does not have.
     """
     for name, frame in (("model_frame", model_frame), ("obs_frame", obs_frame)):
         for part in ("psf", "wcs"):
@@ -50,7 +50,7 @@ def renderer_of(model_frame, obs_frame, *, device=None, dtype=np.float32):
 
 @functools.cache
 def _renderer_class():
-    """A scarlet2 Renderer of a function, made once scarlet2 is there."""
+    """The scarlet2 Renderer class, defined at the first import of scarlet2."""
     equinox = require("equinox", "scarlet2")
     renderer = require("scarlet2.renderer", "scarlet2")
 

@@ -9,9 +9,10 @@ from .optional import require
 def as_torch(op):
     """The operator as a function of a torch tensor.
 
-    Both directions run on the operator's OpenCL device; tensors cross the host once each way, so
-    they should lie on torch's CPU (others are copied there and back). Derivatives of any order are
-    exact: the backward pass is the adjoint, and its own backward pass the operator.
+    Both directions run on the operator's OpenCL device. Tensors are copied through the host once
+    each way, so they should be on torch's CPU (others are copied there and back). Derivatives of
+    any order
+    are exact: the backward pass is the adjoint, and the backward pass of that is the operator.
 
     op: any LinOp (Resampler, TiledResampler, ...) of item shapes shape_in and shape_out
     returns f(x): x (...,) + shape_in -> (...,) + shape_out, tensors of x's dtype and device; of one

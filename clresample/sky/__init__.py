@@ -1,4 +1,4 @@
 """Pixel grids, PSFs, images with their noise, sources. NumPy, SciPy, astropy.
 
-The ground floor, beside `device`: imports nothing of clresample's, and never pyopencl.
+The lowest layer, beside `device`: imports only `drawing` of clresample, and never pyopencl.
 """

@@ -7,8 +7,8 @@ standard deviation of single pixels (from the weights) and rho the correlation o
 
 and the filter w with the transform P^(-1/2) makes e white. Convolution on the observed pixels
 multiplies the operator's transfer function by w's transform, exactly, at any rotation: an image
-convolved by w is an image with white noise and the PSF convolved by w. Pixels that w would mix with
-masked ones, or with what lies beyond the edge, say nothing and lose their weight.
+convolved with w is an image with white noise and the PSF convolved with w. Pixels that w mixes
+with masked pixels, or with the outside of the image, get weight 0.
 """
 
 from __future__ import annotations
@@ -23,20 +23,21 @@ from .validation.checks import ReadOnly, as_float_array
 
 # Lags that are estimated from an image [px]: drizzle and Lanczos kernels end within 5 pixels.
 MAX_LAG_PX = 8
-# Least power, of the largest: frequencies with less noise count as having so much. Resampling has
-# removed the signal there too; the error of a star's flux grows by under 2 % through it.
+# [1] Floor of the noise power, relative to the largest. Below it resampling has removed the signal
+# too; the floor increases the error of a star's flux by less than 2 %.
 POWER_FLOOR = 0.03
-# The filter is the smallest with which the flux errors of round sources of these sizes (Gaussian
-# sigma) are as right, to this part, as the floor above lets them be: 1 to 5 pixels a side for
-# drizzle and Lanczos kernels, 7 where these halve the pixels. Errors of smaller ones may be larger.
+# [px] Gaussian sigmas of the round sources by which the filter is chosen, and the tolerance of
+# their flux errors. The filter is the smallest within this tolerance of the best that the floor
+# permits: 1 to 5 pixels a side for drizzle and Lanczos kernels, 7 if these halve the pixels. Flux
+# errors of smaller sources may deviate more.
 ERROR_TOLERANCE, SIGMAS_PX = 0.015, (0.8, 1.2, 2.0, 4.0)
-WEIGHT_ELSEWHERE = 0.1  # in the filter's fit, beside that of frequencies where these have power
+WEIGHT_ELSEWHERE = 0.1  # in the filter's fit, of frequencies where these sources have no power
 MAX_RADIUS_PX = 6  # of the largest filter tried, 13 x 13 pixels
 N_GRID = 64  # frequencies along each axis: far more than the filter's extent
-# Blank sky: no smoothed pixel of more than so many of its own sigmas, nor pixels so near to one.
-# A lower limit cuts the peaks of correlated noise away and underestimates it.
+# Blank sky excludes smoothed pixels above this many of their sigmas, and pixels within this
+# distance of one. A lower limit would cut off the peaks of correlated noise and underestimate it.
 BLANK_SIGMAS, BLANK_GROW_PX = 3.5, 5
-# Pixel pairs that an estimated correlation needs at each lag: it is then known to 0.03.
+# Pixel pairs needed at each lag to estimate a correlation: its error is then 0.03.
 MIN_PAIRS = 1000
 
 
@@ -46,8 +47,8 @@ class NoiseCorrelation(ReadOnly):
 
     autocorrelation (2L + 1, 2L + 1) [1]: rho(dy, dx), symmetric, rho(0, 0) = 1; zero beyond
     filter (2r + 1, 2r + 1) [1]: w, which makes such noise white, with unit power, at all
-        frequencies that hold at least 3 % of the largest noise power
-    variance [1]: of a filtered pixel of unit noise; under 1 by the frequencies that hold less
+        frequencies with at least 3 % of the largest noise power
+    variance [1]: of a filtered pixel of unit noise; below 1 because of the other frequencies
 
     Raises ValueError for shapes that are not odd, values that are not finite, a centre that is not
     the largest value, and arrays that are not symmetric: no autocorrelation.
@@ -128,7 +129,7 @@ class NoiseCorrelation(ReadOnly):
 
     @property
     def radius_px(self) -> int:
-        """Half the extent of the filter: so far from masks and edges pixels lose their weight."""
+        """Half the extent of the filter: pixels this near to masks and edges get weight 0."""
         return self.filter.shape[0] // 2
 
     def filtered(self, images):
@@ -138,7 +139,7 @@ class NoiseCorrelation(ReadOnly):
         return convolve(images, taps, mode="constant")
 
     def colouring_filter(self) -> np.ndarray:
-        """Filter (n, n), n odd, that makes this noise out of white noise of unit variance.
+        """Filter (n, n), n odd, that makes this noise from white noise of unit variance.
 
         It is symmetric, with the transform P^(1/2).
         """
@@ -146,13 +147,13 @@ class NoiseCorrelation(ReadOnly):
         return root[1:, 1:]  # of an even number of taps the middle one is n // 2
 
     def valid_after_filter(self, weights):
-        """Pixels (..., Ny, Nx) that w mixes with none that has no weight, nor with the outside."""
+        """Pixels (..., Ny, Nx) that w mixes only with pixels of positive weight."""
         good = np.asarray(weights) > 0
         shape = (1,) * (good.ndim - 2) + self.filter.shape
         return ~binary_dilation(~good, np.ones(shape, bool), border_value=1)
 
     def error_factor(self, sigma_px):
-        """Factor by which white errors are too small for a round Gaussian source of sigma [px].
+        """Factor by which errors for white noise are too small for a Gaussian source of sigma [px].
 
         The ratio of the true scatter of its matched (white) filter's flux to the one that white
         noise of the same variance per pixel gives: sqrt(sum rho a) / sqrt(a(0)), a the
@@ -182,9 +183,9 @@ def _power(rho):
 def _whitening(power):
     """The smallest filter w that gives right errors, and the variance that it leaves.
 
-    Its taps minimise sum_f u(f) (W(f) P(f)^(1/2) - 1)^2, u the power of sources. With w a source of
-    power spectrum s has the claimed flux variance 1 / sum(s W^2), and the true one is
-    sum(s W^4 P) / sum(s W^2)^2.
+    Its taps minimise sum_f u(f) (W(f) P(f)^(1/2) - 1)^2, where u is the power of sources. Filtered
+    with w, a source of power spectrum s has the claimed flux variance 1 / sum(s W^2) and the true
+    flux variance sum(s W^4 P) / sum(s W^2)^2.
     """
     f = np.fft.fftfreq(len(power))
     distance = np.hypot(f[:, None], f)
@@ -236,7 +237,7 @@ def _correlate(noise, good, max_lag_px):
 
 
 def _lit(noise, seen):
-    """Pixels with a source's light, and those near them."""
+    """Pixels with light of sources, and pixels near these."""
     smooth = gaussian_filter(noise, 2.0)
     level = smooth[seen]
     middle = np.median(level) if level.size else 0.0
@@ -251,7 +252,7 @@ def filtered_psf(psf: PSF, filters) -> tuple[PSF, np.ndarray]:
     filters: C arrays (2r + 1, 2r + 1) [1], taps one pixel of the PSF's grid apart, one a band
     returns the PSF, larger by the filters and again of unit sum
 
-    Raises ValueError where a pixel is no whole number of samples.
+    Raises ValueError if a pixel is not a whole number of samples.
     """
     step = round(1 / psf.spacing)
     if abs(step * psf.spacing - 1) > 1e-9:

@@ -6,13 +6,13 @@ import numpy as np
 
 from .mapping import BLOCK, NOISE_PX, lattice
 
-# Pixels per axis that `grids_overlap` looks at first. They find what holds 1/33 of a side of the
-# part that can be reached; more of them cost time in every call, fewer a whole search more often.
+# Pixels per axis that `grids_overlap` tests first. They find overlaps of 1/33 of a side of the part
+# within reach. More pixels cost time in every call; with fewer, all pixels are tested more often.
 N_PROBES = 33
 
 
 def grid_union(grids, *, like):
-    """Smallest grid on `like`'s pixels that holds every pixel of `grids`, whole or in part."""
+    """Smallest grid on `like`'s pixels that contains or touches every pixel of `grids`."""
     boxes = np.array([_box(grid, like) for grid in grids])
     return _on(like, boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0))
 
@@ -39,7 +39,7 @@ def _box(grid, like):
     grid.check_like(like, "like")
     edges = grid.positions_in(like, *lattice((0, 0), grid.shape))
     if not np.isfinite(edges).all():
-        raise ValueError("grids: one reaches where `like`'s projection holds no sky")
+        raise ValueError("grids: one extends to where `like`'s projection has no sky")
     low = np.floor(edges.min(axis=(0, 1)) + 0.5 + NOISE_PX)
     return low, np.maximum(np.ceil(edges.max(axis=(0, 1)) + 0.5 - NOISE_PX) - 1, low)
 
@@ -47,15 +47,15 @@ def _box(grid, like):
 def grids_overlap(grid_out, grid_in) -> bool:
     """Returns True if the centre of any pixel of `grid_out` lies on `grid_in`, a grid of its kind.
 
-    Some pixels are looked at first, spread over the part of `grid_out` that `grid_in` can reach;
-    all of that part only where none of these lies on it.
+    First some pixels are tested, spread over the part of `grid_out` that `grid_in` can reach; all
+    pixels of that part are tested only if none of these lies on it.
     """
     last = np.array(grid_out.shape) - 1
     try:
         low, high = _box(grid_in, grid_out)
-    except ValueError:  # grid_out's projection does not hold all of grid_in: no bounds
+    except ValueError:  # grid_out's projection does not cover all of grid_in: no bounds
         low, high = np.zeros(2), last
-    # one pixel more for what an outline bends between the points of the lattice
+    # one pixel more for the curvature of an outline between the points of the lattice
     low, high = np.maximum(low - 1, 0).astype(int), np.minimum(high + 1, last).astype(int)
     if (high < low).any():
         return False
@@ -81,7 +81,7 @@ def bounding_boxes_overlap(one, other, like) -> bool:
     """Returns True if the bounding boxes of two grids meet on `like`'s pixels."""
     try:
         grid_intersection([one, other], like=like)
-    except ValueError:  # they do not, or `like`'s projection does not hold them
+    except ValueError:  # they do not, or `like`'s projection does not cover them
         return False
     return True
 
@@ -103,9 +103,9 @@ def box_slices(origin, shape):
 
 
 def crop_psf(psf, share):
-    """Removes a PSF's outer rows and columns with no more than this share of any band's light.
+    """Removes a PSF's outer rows and columns with at most this fraction of any band's light.
 
-    Its transform changes by so much at most. Not divided by its sum again.
+    Its transform changes by at most the same fraction. It is not divided by its sum again.
     """
     light = np.abs(psf.images)
     light = light / np.maximum(light.sum(axis=(1, 2), keepdims=True), 1e-300)
@@ -117,7 +117,7 @@ def crop_psf(psf, share):
 
 
 def _lit(light, share):
-    """First and one-past-last element of light (n,), beyond which lies no more than `share`."""
+    """First and one-past-last element of light (n,) beyond which lies at most `share`."""
     first = np.searchsorted(np.cumsum(light), share, side="right")
     last = len(light) - np.searchsorted(np.cumsum(light[::-1]), share, side="right")
     return (int(first), int(last)) if first < last else (0, len(light))

@@ -11,11 +11,11 @@ from scipy import ndimage
 from .mapping import Mapping
 from .observation import Observation
 
-# rounds of p <- p + A^-1 (X - X(p)) for a distorted mapping: each multiplies the error by the
-# distortion's relative change over it, 1e-2 at most in real instruments. Three leave 1e-6 of it;
-# more would only cost time
+# Iterations of p <- p + A^-1 (X - X(p)) for a distorted mapping: each multiplies the error by the
+# relative change of the Jacobian, at most 1e-2 in real instruments. Three leave 1e-6 of it; more
+# would only cost time.
 INVERSE_ROUNDS = 3
-# of a pixel: those that share a side or a corner with it
+# neighbours of a pixel: those that share a side or a corner with it
 NEIGHBOURS = np.ones((3, 3), dtype=bool)
 
 
@@ -23,7 +23,7 @@ NEIGHBOURS = np.ones((3, 3), dtype=bool)
 class Footprint:
     """One observation's pixels in the model frame: X(p) = A p + t + shift.
 
-    observation: what was seen; mapping: of its grid to the frame's; shift (2,) [model px]
+    observation: the Observation; mapping: from its grid to the frame's; shift (2,) [model px]
     """
 
     observation: Observation
@@ -58,7 +58,7 @@ class Footprint:
         return self._look(points)[0]
 
     def weighted(self, points) -> np.ndarray:
-        """At which points (..., 2) [model px] the pixel has a weight: (C, ...) bool."""
+        """True where the pixel at points (..., 2) [model px] has a weight: (C, ...) bool."""
         held, (n, m) = self._look(points)
         return held & (self.observation.weights > 0)[:, n, m]
 
@@ -82,8 +82,8 @@ def coverage_border(footprints, shape) -> np.ndarray:
 def unobserved(footprints, shape) -> np.ndarray:
     """Unobserved pixels of the frame, with a border: (Ny + 2, Nx + 2) bool.
 
-    The border, and those without a weight in any channel that are connected to it through others
-    without one. Masked pixels within an image, single or in patches, are not outside.
+    These are the border and all pixels without weight in any channel that are connected to it
+    through such pixels. Masked pixels inside an image, single or in groups, do not belong to them.
     """
     points = np.stack([*np.indices(shape)], axis=-1)
     seen = np.zeros(shape, dtype=bool)

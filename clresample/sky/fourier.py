@@ -11,10 +11,10 @@ ROUNDING = 1e-10
 
 
 def phases(frequencies, positions):
-    """2 pi f u (F, U) [rad] for f (F,) [cycles/px], u (U,) [px], whole cycles taken off.
+    """2 pi f u (F, U) [rad] for f (F,) [cycles/px], u (U,) [px], without whole cycles.
 
-    Whole cycles are taken off before the product with 2 pi: with them, that product would round
-    away as many digits as they have.
+    Whole cycles are subtracted before the product with 2 pi, which would otherwise lose as many
+    digits as they have.
     """
     cycles = np.multiply.outer(frequencies, positions)
     cycles -= np.rint(cycles)
@@ -24,8 +24,8 @@ def phases(frequencies, positions):
 def uniform_waves(frequencies, first, step, n):
     """exp(2 pi i f u) (n, F) at equal distances, u = first + step k [px], f (F,) [cycles/px].
 
-    Products of the waves at every b-th position with those of the b positions from 0 on: 2 sqrt(n)
-    cosines and sines of each frequency instead of n, rounded once more.
+    They are products of the waves at every b-th position with those at the first b positions. This
+    takes 2 sqrt(n) cosines and sines of each frequency instead of n, and rounds once more.
     """
     block = math.isqrt(max(n - 1, 0)) + 1
     fine, coarse = np.arange(block), block * np.arange(-(-n // block))

@@ -14,10 +14,10 @@ from .observation import as_observations, check_observations
 from .psf import PSF
 from .validation.observed import as_psf
 
-# [sigma] half-width of the model PSF's image: less than 1e-16 of the light lies beyond, float64's
-# rounding; larger images only cost time
+# [sigma] Half-width of the model PSF's image: less than 1e-16 of the light, float64's rounding,
+# lies beyond. Larger images only cost time.
 REACH = 8.5
-# relative difference of two pixel scales that counts as none: digits of a header leave as much
+# Relative difference below which two pixel scales are equal: the precision of headers.
 SAME_SCALE = 1e-6
 
 
@@ -25,7 +25,7 @@ SAME_SCALE = 1e-6
 class Frame:
     """Pixels and PSF of the model.
 
-    grid: Grid of the model's pixels (Ny, Nx), or a WCS that knows its shape
+    grid: Grid of the model's pixels (Ny, Nx), or a WCS with a shape
     psf: PSF of one band in these pixels, pixel response included; see `model_frame`
 
     Raises ValueError for anything else.
@@ -44,10 +44,10 @@ class Frame:
         return self.grid.shape
 
     def positions_of(self, sources, observations=(), shifts=None) -> np.ndarray:
-        """Positions (S, 2) [px] of the sources: (y, x); NaN where the projection has no place.
+        """Positions (S, 2) [px] of the sources: (y, x); NaN outside the projection.
 
-        observations: those in whose pixels sources may be given; shifts (n_observations, 2)
-        [model px] of them: see `Source.pixel`
+        observations: Observations that sources may refer to; shifts (n_observations, 2) [model px]:
+            of these; see `Source.pixel`
         """
         found = [source.pixel(self.grid, observations, shifts) for source in sources]
         return np.array(found).reshape(-1, 2)
@@ -55,10 +55,12 @@ class Frame:
     def contains(self, positions) -> np.ndarray:
         """Selects positions (..., 2) [px] on a pixel of the frame: -1/2 <= x < N - 1/2.
 
-        The edge belongs to one pixel only, floor(x + 1/2). A fit leaves out a source that is not
-        inside and reports it: the frame does not hold its centre, from which morphologies fall, and
-        a part of its light at best. A source inside is fitted, however near to the edge, with the
-        light that the frame holds of it.
+        A position on the edge of a pixel belongs to pixel floor(x + 1/2). A fit omits a source
+        outside
+        the frame, with a warning: its centre, from which morphologies decrease, is not in the
+            frame,
+        nor is most of its light. A source inside is fitted, however near to the edge, with the part
+        of its light that falls on the frame.
 
         returns (...) bool; False for NaN
         """
@@ -70,21 +72,19 @@ def model_frame(observations, *, grid=None, psf_sigma_px=0.8, shared=False) -> F
     """Frame on the finest pixels among the observations, with a Gaussian PSF.
 
     observations: what will be fitted; see `check_observations`
-    grid: Grid to take as it is; None = the pixels and orientation of the observation with the
-        smallest pixel (of equal ones the first), as many as needed
+    grid: Grid to use unchanged; None = the pixels and orientation of the observation with the
+        smallest pixels (the first if several are equal), as many pixels as needed
     psf_sigma_px [model px]: standard deviation of the PSF before its convolution with the pixel;
         no more than the frame has pixels along a side
-    shared: cover only what all observations see (the intersection of their footprints), instead of
-        what any of them sees (the union)
+    shared: cover the intersection of the observations' footprints instead of their union
 
-    Footprints are upright boxes in the frame's pixels: the union reaches to the corners of a
-    rotated observation, so parts of the frame may be seen by none, and the intersection of rotated
-    ones may do so too. Observed pixels outside the frame have no model and must get no weight
+    Footprints are bounding boxes along the frame's axes. The union includes the corners of a
+    rotated observation, so parts of the frame, or of an intersection, may be covered by no
+    observation. Observed pixels outside the frame have no model and must get weight 0
     (`Resampler.covered`).
 
-    Raises ValueError for a grid that is flat where observations have a WCS or the reverse, where
-    an observation overlaps none of the others, or not the frame, and for what `check_observations`
-    finds.
+    Raises ValueError if only one of grid and observations has a WCS, if an observation does not
+    overlap the others or the frame, and as `check_observations` does.
     """
     observations = as_observations(observations)
     check_observations(observations)

@@ -35,11 +35,11 @@ from .wcs_interface.ape14 import Ape14Wcs
 
 
 class Grid(GridDisplay, ABC):
-    """Pixels of one image and where they lie on the sky.
+    """Pixels of one image and their positions on the sky.
 
     shape (Ny, Nx) [px]
-    is_flat: whether the sky is a plane, with positions (y, x) [arcsec]; else they are longitude and
-        latitude [deg] of a celestial WCS
+    is_flat: True if the sky is a plane with positions (y, x) [arcsec]; else positions are longitude
+        and latitude [deg] of a celestial WCS
     sky_description: the same in words, for messages
 
     Make one with `Grid.from_wcs`, `Grid.flat` or `Grid.from_jacobian`. Positions in pixels are
@@ -54,9 +54,9 @@ class Grid(GridDisplay, ABC):
     def from_wcs(wcs, shape) -> Grid:
         """Grid of an image with a celestial WCS: CD, PC, CROTA, SIP, TPV, cubes, either parity.
 
-        wcs: astropy WCS, of whose axes the celestial ones are taken; or any object of two axes
+        wcs: astropy WCS, of which only the celestial axes are used; or any object of two axes
             with astropy's common interface (APE 14), such as a gwcs of JWST or Roman
-        shape (..., Ny, Nx) [px]: the last two count
+        shape (..., Ny, Nx) [px]: the last two numbers are used
 
         Raises ValueError without a celestial part, or where it cannot be evaluated.
         """
@@ -107,20 +107,20 @@ class Grid(GridDisplay, ABC):
 
     @abstractmethod
     def sky(self, n, m) -> np.ndarray:
-        """Sky at pixel positions: (y, x) [arcsec] if flat, else (longitude, latitude) [deg].
+        """Sky positions of pixels: (y, x) [arcsec] if flat, else (longitude, latitude) [deg].
 
         n, m: rows and columns, any shapes that broadcast
-        returns (2, ...); NaN where a projection holds no sky
+        returns (2, ...); NaN outside the projection
         """
 
     @abstractmethod
     def pixel(self, a, b=None) -> np.ndarray:
-        """Pixel positions at points of the sky, the inverse of `sky`.
+        """Pixel positions of points of the sky, the inverse of `sky`.
 
         a, b: y and x [arcsec] if flat, else longitude and latitude [deg] in the WCS's own frame
             (right ascension and declination if that is equatorial); any shapes that broadcast. Or,
             unless flat, a SkyCoord alone, of any frame
-        returns (..., 2) [px]: (y, x); NaN where the projection holds no such point
+        returns (..., 2) [px]: (y, x); NaN outside the projection
 
         Raises ValueError for a SkyCoord on a flat grid.
         """
@@ -130,7 +130,7 @@ class Grid(GridDisplay, ABC):
         """Pixels (n, m) of this grid in those of another one of its kind, exactly.
 
         n, m: rows and columns, any shapes that broadcast
-        returns (..., 2) [px of `other`]: (y, x); NaN where there is no such place
+        returns (..., 2) [px of `other`]: (y, x); NaN outside its projection
         """
 
     @abstractmethod
@@ -141,10 +141,10 @@ class Grid(GridDisplay, ABC):
     def to_wcs(self, *, ra_deg=0.0, dec_deg=0.0) -> WCS:
         """The WCS; for a flat grid a gnomonic one (ICRS) that touches the sky at (y, x) = (0, 0).
 
-        x grows to the west there (east is left, north up), so that two flat grids placed at the
-        same point map into each other exactly as they do flat.
+        x increases to the west (north is up, east is left), so that two flat grids placed at the
+        same point keep their mapping exactly.
 
-        ra_deg, dec_deg [deg]: where (0, 0) lies; of no effect on a grid that has a WCS
+        ra_deg, dec_deg [deg]: position of (0, 0); ignored by a grid that has a WCS
         """
 
     @abstractmethod
@@ -154,14 +154,15 @@ class Grid(GridDisplay, ABC):
     def map_to(self, grid_in: Grid, tolerance_px=1e-4) -> Mapping:
         """Mapping of this grid's pixels into those of `grid_in`: X = A p + t, or one by one.
 
-        Both WCS are evaluated, celestial frames (ICRS, FK5, galactic, ...) converted; A and t are
-        fitted where `grid_in` covers this grid. What the fit leaves decides the geometry.
+        Both WCS are evaluated and their celestial frames (ICRS, FK5, galactic, ...) converted. A
+        and t are fitted where `grid_in` covers this grid; the residuals of the fit decide the
+        geometry.
 
         grid_in: the model's grid; WCS or flat as this one is
-        tolerance_px [model px]: largest departure that counts as none
+        tolerance_px [model px]: largest departure that is ignored
 
-        Raises ValueError when one grid is flat and the other not, when no pixel has a place in
-        `grid_in`'s projection, and for a singular Jacobian.
+        Raises ValueError if only one grid is flat, if no pixel lies in `grid_in`'s projection, and
+        for a singular Jacobian.
         """
         grid_in = as_grid("grid_in", grid_in)
         self.check_like(grid_in, "grid_in")
@@ -295,7 +296,7 @@ class WcsGrid(Grid):
     def _map_to(self, grid_in, tolerance_px):
         """The simplest geometry that agrees with both WCS within tolerance_px.
 
-        The last one that holds no positions is kept: fits and what is measured of them ask for it.
+        The last mapping without positions is cached, because a fit and its measurements reuse it.
         """
         other, tolerance, known = LAST.get(self, (lambda: None, None, None))
         if other() is grid_in and tolerance == tolerance_px:
@@ -317,9 +318,9 @@ GridLike = Grid | BaseLowLevelWCS | BaseHighLevelWCS
 
 
 def as_grid(name, grid, shape=None) -> Grid:
-    """The Grid, made of a WCS where one is given: astropy's, gwcs, or any other of APE 14.
+    """The Grid, made from a WCS if one is passed: astropy's, gwcs, or any other of APE 14.
 
-    shape (..., Ny, Nx) [px]: of the image; None = as the WCS knows it (array_shape)
+    shape (..., Ny, Nx) [px]: of the image; None = that of the WCS (array_shape)
 
     Raises ValueError for anything else, and for a WCS without a shape.
     """
@@ -334,7 +335,7 @@ def as_grid(name, grid, shape=None) -> Grid:
 
 
 def _cos_sin(angle_deg):
-    """Exact at the quarter turns, so that these stay aligned."""
+    """Rotation matrix, exact at quarter turns, so that these stay aligned."""
     quarter, rest = divmod(angle_deg, 90)
     if rest == 0:
         return ((1, 0), (0, 1), (-1, 0), (0, -1))[int(quarter) % 4]

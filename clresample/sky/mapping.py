@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-# [px] what evaluating two WCS in float64 may leave (up to 1e-8 seen at 0.01 arcsec): mappings this
-# near to whole pixels are taken for these, and centres this near to an edge lie on it
+# [px] Rounding of two WCS in float64 (up to 1e-8 at 0.01 arcsec). Mappings this near to whole
+# pixels are rounded to them, and centres this near to an edge count as on it.
 NOISE_PX = 1e-6
-# points per axis at which two WCS are compared: SIP and TPV polynomials are of order 9 at most,
-# which half as many would follow; more only cost time
+# Points per axis at which two WCS are compared. SIP and TPV polynomials have at most order 9, for
+# which half as many points suffice; more only cost time.
 N_LATTICE = 33
 # [px] positions evaluated at once, 8 MiB per axis: larger blocks only take more memory
 BLOCK = 1 << 20
-# |det A| / |A|^2 under which A counts as singular: its float64 inverse keeps no digit of a pixel
+# |det A| / |A|^2 below which A is singular: its float64 inverse has no correct digit of a pixel.
 SINGULAR = 1e-10
 
 
@@ -28,8 +28,8 @@ class Mapping:
     offset (2,) [model px]: t
     geometry: "aligned" (A exactly diagonal or anti-diagonal), "affine" or "distorted"
     departure_px [model px]: largest distance of the true mapping from A p + t
-    positions (My, Mx, 2) [model px]: (y, x) when distorted, else None; pixels without a place in
-        the model's projection are put outside the model
+    positions (My, Mx, 2) [model px]: (y, x) when distorted, else None; pixels outside the model's
+        projection get a position outside the model
     area (My, Mx): |det J| / |det A| of the true mapping when distorted, else None
     """
 
@@ -53,7 +53,7 @@ class Mapping:
     def covered(self):
         """(My, Mx) bool: observed pixels whose centre lies on the model, [-1/2, N - 1/2].
 
-        Centres on the very edge count, whatever the last digits of two WCS make of them.
+        Centres on the edge are included, regardless of rounding in the two WCS.
         """
         return self._within(NOISE_PX)
 
@@ -70,7 +70,7 @@ class Mapping:
         return inside
 
     def window(self, in_origin, in_shape, out_origin, out_shape, *, tolerance_px=None):
-        """Mapping between a cutout of the observed pixels and one of the model, same placing.
+        """Mapping between a cutout of the observed pixels and a cutout of the model.
 
         in_origin, in_shape (2,) [model px]; out_origin, out_shape (2,) [observed px]
         tolerance_px [model px]: when given, a distorted mapping becomes affine where the cutout
@@ -109,9 +109,10 @@ class Mapping:
 
 @dataclass(frozen=True, eq=False)
 class PaddedMapping(Mapping):
-    """Observed pixels within `reach_px` [model px] of a model: those beyond it are covered too.
+    """Mapping that also covers observed pixels up to `reach_px` [model px] beyond the model.
 
-    part: first row and column of the pixels that may be, and those behind the last; None: all
+    part: first row and column of the pixels that may be covered, and those after the last; None:
+        all
     """
 
     reach_px: float = 0.0
@@ -119,11 +120,11 @@ class PaddedMapping(Mapping):
 
     @classmethod
     def for_box(cls, mapping, shape, reach_px, size=None):
-        """The pixels about a box of this shape (2,) [px], its middle in theirs; not distorted.
+        """The pixels centred on a box of this shape (2,) [px]; not for distorted mappings.
 
-        Half a pixel more of them on each side, for boxes that lie by so much off that middle.
+        There is half a pixel more on each side, for boxes whose middle is off by half a pixel.
 
-        size (2,): of pixels, where there are to be more than that; the others are not covered
+        size (2,): number of pixels, if larger than needed; the additional pixels are not covered
         """
         own = cls.window_size(mapping, shape, reach_px)
         size = own if size is None else np.array(size)
@@ -208,14 +209,14 @@ def map_positions(forward, backward, shape_in, shape_out, tolerance_px):
 
     Raises ValueError when no observed pixel has a position, and for a singular Jacobian.
     """
-    # only what the model covers counts: a stamp's model meets few pixels of a whole frame
+    # only pixels on the model matter: the model of a stamp overlaps few pixels of a whole frame
     low, shape = _met(backward(*lattice((0, 0), shape_in)), shape_out)
     n, m = lattice(low, shape)
     true = forward(n, m)
     good = np.isfinite(true).all(axis=-1)
     points = np.stack([n, m], axis=-1)[good]
     if not _spans(points):
-        raise ValueError("grids do not overlap: grid_in's projection holds none of these pixels")
+        raise ValueError("grids do not overlap: grid_in's projection contains none of these pixels")
     geometry, matrix, offset, departure = _decide(points, true[good], tolerance_px)
     if geometry != "distorted" and good.all():
         return Mapping(shape_in, shape_out, matrix, offset, geometry, departure)
@@ -229,7 +230,7 @@ def _met(corners, shape_out):
     corners = corners[np.isfinite(corners).all(axis=-1)]
     if not len(corners):
         return whole
-    # one pixel of margin for what an outline bends between the points of the lattice
+    # one pixel of margin for the curvature of an outline between the points of the lattice
     low = np.maximum(np.floor(corners.min(axis=0)) - 1, 0)
     high = np.minimum(np.ceil(corners.max(axis=0)) + 1, np.array(shape_out) - 1)
     if (high < low).any():
@@ -266,7 +267,7 @@ def _decide(points, true, tolerance_px, matrix=None):
 
 
 def _centred(points, true, matrix):
-    """The offset (2,) [px] with equal errors either way on each axis, and the largest distance."""
+    """Offset (2,) [px] with equal errors in both directions of each axis; largest distance."""
     rest = true - points @ matrix.T
     offset = (rest.max(axis=0) + rest.min(axis=0)) / 2
     return offset, _departure(points, true, matrix, offset)
@@ -282,7 +283,7 @@ def _evaluate(forward, shape_in, shape_out, det):
     n_y, n_x = shape_out
     positions = np.empty((n_y, n_x, 2))
     area = np.empty(shape_out)
-    m = np.arange(-1.0, n_x + 1)  # a ring more, so that every difference is central
+    m = np.arange(-1.0, n_x + 1)  # one ring more, so that every difference is central
     n_rows = max(1, BLOCK // (n_x + 2))
     for i in range(0, n_y, n_rows):
         n = np.arange(i - 1.0, min(i + n_rows, n_y) + 1)

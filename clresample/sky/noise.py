@@ -15,23 +15,23 @@ class NoiseWarning(UserWarning):
     """An image without weights, whose noise was estimated from its background."""
 
 
-# [sigma] pixels further from the median are sources: one in 370 of pure noise is lost
+# [sigma] Pixels further from the median count as sources; so does one in 370 of pure noise.
 CLIP = 3.0
-# each round drops at least one pixel; 3 to 8 rounds settle images that are half sources
+# Each iteration removes at least one pixel; images half covered by sources need 3 to 8.
 MAX_ROUNDS = 50
-# pixels that a noise estimate takes at least: the error of their MAD is a fifth of it
+# Smallest number of pixels of a noise estimate: the MAD then has an error of a fifth.
 MIN_PIXELS = 32
-# Largest data, weights and variances: their squares are still far from float64's end.
+# Largest data, weights and variances: their squares are far below float64's limit.
 LARGEST = 1e100
-# [sigma] Largest signal to noise of a pixel: in float32, whose rounding is 1e5 sigma there, chi2
-# comes to its end soon after. Real images reach 1e4.
+# [sigma] Largest signal to noise of a pixel: float32 rounds it by 1e5 sigma, and chi2 overflows
+# soon above it. Real images reach 1e4.
 MAX_SIGMAS = 1e12
-# Pixels of each value from which on, on average, an image is taken to be one in steps: noise of
-# sigma in 1000 pixels of integers has some 7 sigma values, float images as many as pixels.
+# Mean number of pixels of equal value from which an image counts as quantised. 1000 pixels of
+# integers with noise of sigma have some 7 sigma values; float images have as many values as pixels.
 EQUAL = 4
-# Pixels from which is told at first whether an image has steps at all: most are of floats.
+# Number of pixels for a first test for quantisation, since most images are of floats.
 SOME = 2000
-# median |x| of a unit Gaussian, whole and cut at CLIP
+# median |x| of a unit Gaussian, untruncated and truncated at CLIP
 HALF_WIDTH = NormalDist().inv_cdf(0.75)
 HALF_WIDTH_CUT = NormalDist().inv_cdf(0.5 + math.erf(CLIP / math.sqrt(2)) / 4)
 
@@ -41,15 +41,15 @@ def background(image, mask=None) -> tuple[float, float]:
 
         level = median x,  sigma = MAD / q,  MAD = median |x - level| over |x - level| <= 3 sigma
 
-    iterated, with q = 0.672 the MAD of a unit Gaussian cut at 3 sigma. Unbiased for white noise;
-    sigma is too large by 2 % where faint wings of sources fill 3 % of the pixels, by a third where
-    they fill half, by 30 to 50 % on a 48 x 58 cutout of a real blend. Of correlated noise it is the
-    scatter of single pixels; 0 where more than half of the pixels have one value.
+    iterated, with q = 0.672, the MAD of a unit Gaussian truncated at 3 sigma. It is unbiased for
+    white noise. sigma is too large by 2 % if faint wings of sources cover 3 % of the pixels, by a
+    third if they cover half, and by 30 to 50 % on a 48 x 58 cutout of a real blend. For correlated
+    noise it is the scatter of single pixels. It is 0 if more than half of the pixels are equal.
 
     image (Ny, Nx); mask (Ny, Nx): True = ignore; NaN and infinite pixels are ignored too
 
-    Of an image in steps, such as one of integers, whose MAD would move in steps too, equal values
-    are spread evenly over their step first.
+    The MAD of a quantised image, such as one of integers, would be quantised too. So equal values
+    are first spread evenly over their step.
     """
     values, step = _spread_steps(_usable(image, mask))
     level = np.median(values)
@@ -63,14 +63,14 @@ def background(image, mask=None) -> tuple[float, float]:
             break
         values = values[kept]
     if step and sigma:
-        sigma = math.sqrt(max(sigma**2 - step**2 / 12, 0))  # what spreading has added
+        sigma = math.sqrt(max(sigma**2 - step**2 / 12, 0))  # variance added by spreading
     return float(level), float(sigma)
 
 
 def _spread_steps(values):
-    """Spreads equal values (n,) evenly over the step between neighbouring ones; and the step.
+    """Values (n,) with equal ones spread evenly over the step to the next value; and the step.
 
-    As they are, and 0, where few are equal, or more than half.
+    If few values are equal, or more than half, returns the unchanged values and 0.
     """
     some = values[:: max(1, values.size // SOME)]
     if 2 * np.unique(some).size > some.size:
@@ -84,7 +84,7 @@ def _spread_steps(values):
 
 
 def noise_sigma(image, mask=None) -> float:
-    """The scatter of an image's background, as `background` finds it, where that can be trusted.
+    """Scatter of an image's background by `background`; an error if it is not reliable.
 
     image (Ny, Nx); mask (Ny, Nx): True = ignore; NaN and infinite pixels are ignored too
     Raises ValueError for fewer than 32 pixels, and where more than half of them have one value.
@@ -103,13 +103,13 @@ def noise_sigma(image, mask=None) -> float:
 
 
 def sigma_below_zero(image) -> float | None:
-    """Scatter of an image that is zero where nothing is, from its negative pixels alone.
+    """Scatter of an image with zero sky level, from its negative pixels alone.
 
         sigma = median |x| / 0.674  over x < 0
 
-    For images that are mostly sources, which raise what `background` finds: no pixel of a source is
-    negative. Of pure noise it has the larger error, from half of the pixels, and a sky level that
-    is not zero enters it.
+    For images mostly covered by sources, which bias `background`; sources have no negative pixels.
+    For pure noise its error is larger than that of `background`, because it uses half of the
+    pixels, and a sky level other than zero biases it.
 
     image (...); None where fewer than 32 pixels are negative
     """
@@ -130,8 +130,8 @@ def weights_from(data, bad, given, mask, channels, unit=None):
     """Weights (C, Ny, Nx), `n_invalid` and messages of an Observation from its arguments.
 
     data (C, Ny, Nx) float64; bad (C, Ny, Nx) bool: pixels where they are NaN or infinite
-    given: weights and variance, and mask: as in Observation, None where they are not given
-    channels (C,): names; unit: of the data, None where they have none
+    given: weights, variance and mask, as in Observation; None if not passed
+    channels (C,): names; unit: of the data, None if they have none
 
     Warns (NoiseWarning) of noise that is estimated. Raises ValueError where Observation does, for
     these.
@@ -181,7 +181,7 @@ def _weights_of(data, bad, given, mask, channels, unit, estimates):
     weights, hidden = split_mask("weights", weights)
     variance, unknown = split_mask("variance", variance)
     for name, more in (("weights", hidden), ("variance", unknown)):
-        if more is not None:  # a masked weight is one that says: ignore this pixel
+        if more is not None:  # a masked weight means: ignore this pixel
             masked = masked | (_spread(name, more.astype(float), data.shape) > 0)
     if weights is not None:
         weights, no_weight = _checked_weights(weights, data.shape)
@@ -240,7 +240,7 @@ def mask_from(mask, shape):
     if mask is None:
         return np.zeros(shape, dtype=bool)
     hidden, values = mask_of(mask), np.asarray(getattr(mask, "unmasked", mask))
-    if hidden is not None:  # what is masked in a mask is not known to be good
+    if hidden is not None:  # masked elements of a mask count as bad
         values = np.where(hidden, 1, values)
     if values.shape not in (shape[1:], shape):
         raise ValueError(f"mask has the shape {values.shape}, data {shape}")
@@ -254,7 +254,7 @@ def mask_from(mask, shape):
 
 
 def _checked_weights(weights, shape):
-    """Weights (C, Ny, Nx), and where they were NaN."""
+    """Weights (C, Ny, Nx), and a mask of those that were NaN."""
     weights = _spread("weights", as_float_array("weights", weights), shape)
     for wrong, what in ((weights < 0, "negative"), (np.isinf(weights), "infinite")):
         if wrong.any():
@@ -268,7 +268,7 @@ def _checked_weights(weights, shape):
 
 
 def _inverse(variance, shape):
-    """Weights (C, Ny, Nx) from variances, and where these were no variance."""
+    """Weights (C, Ny, Nx) from variances, and a mask of invalid variances."""
     variance = _spread("variance", as_float_array("variance", variance), shape)
     good = variance >= np.finfo(np.float64).tiny  # the inverse of less may overflow
     return np.divide(1.0, variance, out=np.zeros(shape), where=good), ~good

@@ -34,11 +34,11 @@ class Observation(ReadOnly, ObservationDisplay, DerivedQuantities):
 
         chi2 = sum weights (model - data)^2
 
-    data (C, Ny, Nx) [counts per pixel]: background-subtracted images; (Ny, Nx) is one channel. Read
-        back, they are float64 and hold 0 where they were NaN or infinite. A Quantity of counts or
+    data (C, Ny, Nx) [counts per pixel]: background-subtracted images; (Ny, Nx) is one channel. The
+        attribute is float64, with 0 in place of NaN and infinite pixels. A Quantity of counts or
         of flux density per pixel (data * u.nJy) keeps its unit: see `unit`
     psf: PSF of C bands, pixel response included; one band serves all channels. Or its images, an
-        array that `PSF` takes. Or a PSFField: fits render each source with the PSF at its position
+        array accepted by `PSF`. Or a PSFField: fits render each source with the PSF at its position
     grid: Grid of (Ny, Nx), or the WCS of these pixels, of astropy or gwcs
     weights [counts^-2]: inverse variance, 0 = ignore this pixel; or, instead of it,
     variance [counts^2]: NaN, infinite, zero and negative ones mean: ignore this pixel. Weights and
@@ -60,18 +60,18 @@ class Observation(ReadOnly, ObservationDisplay, DerivedQuantities):
     unit: of data without one of their own, an astropy unit or its name. A flux density sets
         zero_points, and is the unit of the catalogue's fluxes where all observations have it
 
-    With neither weights nor variance the noise is estimated, channel by channel, from the scatter
-    of the background (`noise_sigma`): one number, without sources' photon noise. Warns
-    (NoiseWarning) of it.
+    Without weights and variance the noise of each channel is estimated from the scatter of the
+    background (`noise_sigma`), as one number without the photon noise of sources, and a
+    NoiseWarning is issued.
 
-    Read back: data and weights (C, Ny, Nx) float64, psf of C bands, that in the middle, psf_field
-    of C bands where it varies, else None, zero_points and noise (C,) or None, n_invalid = number of
-    unmasked pixels whose weight became 0 because data, weight or variance is none, messages;
-    saturation (C,) or None, unit of flux density or None, of counts
+    Attributes: data and weights (C, Ny, Nx) float64; psf of C bands, that in the middle of the
+    image; psf_field of C bands if the PSF varies, else None; zero_points and noise (C,) or None;
+    n_invalid, the number of unmasked pixels with weight 0 because of invalid data, weight or
+    variance; messages; saturation (C,) or None; unit, a flux density, or None for counts
 
-    Raises ValueError for shapes that disagree, negative or infinite weights, masks not of 0 and 1,
-    names not unique, weights beside variance, noise not to be found, units that do not fit, and
-    what is no real number.
+    Raises ValueError for shapes that disagree, negative or infinite weights, masks with values
+    other than 0 and 1, repeated names, weights together with variance, noise that cannot be
+    estimated, incompatible units, and values that are not real numbers.
     """
 
     data: np.ndarray
@@ -163,8 +163,7 @@ class Observation(ReadOnly, ObservationDisplay, DerivedQuantities):
     def restore(cls, data, psf, grid, *, weights, n_invalid, messages, **given) -> Observation:
         """Restores an observation from values read back.
 
-        n_invalid and messages are those that were found then. Raises ValueError as the constructor
-        does.
+        n_invalid and messages are those of the original. Raises ValueError as the constructor does.
         """
         restored = cls(data, psf, grid, weights=weights, **given)
         restored._set(n_invalid=int(n_invalid), messages=tuple(messages))
@@ -184,7 +183,7 @@ class Observation(ReadOnly, ObservationDisplay, DerivedQuantities):
 def masked(observation, pixels) -> Observation:
     """The same observation with the pixels (C, Ny, Nx) bool masked: their weight is 0."""
     made = copy.copy(observation)
-    made.__dict__.pop("whitened", None)  # that of the observation before
+    made.__dict__.pop("whitened", None)  # cached for the unmasked observation
     made._set(weights=np.where(pixels, 0.0, observation.weights))
     return made
 
@@ -218,7 +217,7 @@ def as_observations(observations) -> tuple[Observation, ...]:
 
 
 def observation_index(observations, key) -> int:
-    """The number of an observation, from its number or name (label where it has no name).
+    """Index of an observation, from its index or name (or label, if it has no name).
 
     Raises ValueError for a name that none of them or several have, and for another number.
     """
@@ -239,8 +238,8 @@ def observation_index(observations, key) -> int:
 def check_observations(observations):
     """Raises ValueError unless these observations can be fitted together.
 
-    There is at least one, channel names are unique over all of them, zero points are given by all
-    of them or by none, and their grids are all flat or all placed by a WCS.
+    There must be at least one; channel names must be unique; all or none must have zero points; and
+    their grids must be all flat or all placed by a WCS.
     """
     if not observations:
         raise ValueError("observations is empty, at least one is needed")

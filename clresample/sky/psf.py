@@ -14,19 +14,19 @@ from .psf_checks import PSFWarning, core_centroid, fwhm, light_beyond_edge, psf_
 from .transforms.nufft import nufft_type2
 from .validation.checks import ReadOnly, as_float_array, check_number
 
-# relative slack on the band's edge, above the rounding of A^T nu in float64
+# Relative tolerance of the band's edge, larger than the rounding of A^T nu in float64.
 BAND_SLACK = 1e-12
-# [px] largest distance of two samples, and the inverse of the smallest: beyond lie mistakes of unit
+# [px] Largest distance of two samples, and the inverse of the smallest: others are errors of unit.
 COARSEST = 1e3
 SPACINGS = f"a positive number of pixels, from {1 / COARSEST:g} to {COARSEST:g}"
-# [samples] from the middle of the array to a centre, at most: who is off by more has mistaken units
+# [samples] Largest distance of a centre from the middle of the array: others are errors of unit.
 FAR = 1e3
-# [complex numbers] one block of the general transform's tables: 16 MiB, near the cache's size;
-# larger ones are read back from memory, smaller ones make many small products
+# [complex numbers] One block of the general transform's tables: 16 MiB, about the size of the
+# cache. Larger blocks are read back from memory, smaller ones make many small products.
 BLOCK = 1 << 20
-# [samples] PSF images from this size on are transformed by an FFT and interpolation where their
-# axes are turned: there the sum over all samples takes 26 us a frequency, the FFT 5; its error of
-# 1e-14 of the light is near float64's rounding. Smaller images keep the sum, which has no window.
+# [samples] Rotated PSF images of at least this size are transformed by an FFT and interpolation,
+# which takes 5 us a frequency instead of 26 us for the sum over all samples. Its error of 1e-14 of
+# the light is near float64's rounding. Smaller images use the sum, which is exact.
 LARGE = 256 * 256
 
 
@@ -36,11 +36,11 @@ class PSF(ReadOnly, PSFDisplay):
 
     images (C, ny, nx) [1]: samples, pixel response included; a single (ny, nx) image is one band
     spacing [px]: distance of two samples in pixels of the PSF's grid; 0.5 = 2x oversampled
-    center (C, 2) [samples]: (y, x) array coordinates of each band's centre. Given as None: the
-        geometric centre (n-1)/2; as "core": the centroid of each band's core; else (2,) or (C, 2)
+    center (C, 2) [samples]: (y, x) array coordinates of each band's centre. None = the geometric
+        centre (n-1)/2; "core" = the centroid of each band's core; else (2,) or (C, 2)
 
     Raises ValueError for wrong shapes, NaN or infinite samples, sums that are not positive, and
-    centres over FAR away. Warns (PSFWarning) of what `warnings` lists.
+    centres more than FAR from the middle. Issues a PSFWarning for each of `warnings`.
     """
 
     images: np.ndarray
@@ -102,10 +102,10 @@ class PSF(ReadOnly, PSFDisplay):
 
     @classmethod
     def restore(cls, images, *, spacing, center) -> PSF:
-        """The PSF whose `images`, `spacing` and `center` these are, bit for bit.
+        """A PSF with exactly these `images`, `spacing` and `center`.
 
-        images (C, ny, nx) are taken as they are, not divided by their sums again; nothing is
-        checked or warned about: that was done when the PSF was first made.
+        images (C, ny, nx) are not divided by their sums again, and there are no checks and no
+        warnings, which the original PSF had.
         """
         psf = object.__new__(cls)
         images, center = np.array(images, np.float64), np.array(center, np.float64)
@@ -246,7 +246,7 @@ def _transform(psf, bands, center, nu_y, nu_x, matrix):
         f_y, f_x = (p * nu_y[:, None] + q * nu_x for p, q in ((a, c), (b, d)))
         turns = f_y * y0 + f_x * x0
         return nufft_type2(images, f_y, f_x) * np.exp(2j * np.pi * (turns - np.rint(turns)))
-    # the images are real: where nu_x has both signs, one of them follows from sums of the other
+    # the images are real: if nu_x has both signs, sums for one sign give those for the other
     n_half = nu_x.size // 2 if nu_x.size % 2 and np.array_equal(nu_x, -nu_x[::-1]) else 0
     nu_half = nu_x[n_half:]
     waves_yu, waves_yv = along_y(nu_y, a), along_x(nu_y, b)

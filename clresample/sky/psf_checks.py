@@ -8,16 +8,16 @@ import numpy as np
 
 # [samples] half of what confusing the centre n/2 with (n-1)/2 gives, well above centroid errors
 CORE_TOLERANCE = 0.25
-# share of the light beyond the image's edge from which on a PSF is warned about; by
-# `light_beyond_edge`, good HST and HSC images have 2 to 5 %
+# Fraction of the light beyond the image's edge (`light_beyond_edge`) from which a warning is
+# issued; good HST and HSC images have 2 to 5 %.
 EDGE_TOLERANCE = 0.05
-# The same share from which on the command refuses an image: an evenly bright one has 1.6.
+# The same fraction from which an image is refused: a uniform image has 1.6.
 EDGE_REFUSED = 0.5
 
 
-# Part of a PSF's transform left at the frequency limit of its samples from which on they are too
-# coarse: about that part of what is rendered with it is wrong, as light beyond the limit is folded
-# back. Measured with noise, good PSF images have a percent; a Gaussian of sigma 0.8 px, 2.7 %.
+# Fraction of a PSF's transform at the frequency limit of its samples from which the sampling is too
+# coarse. About the same fraction of a rendered image is wrong, because light beyond the limit is
+# aliased. Good PSF images with noise have one percent; a Gaussian of sigma 0.8 px has 2.7 %.
 LIMIT_TOLERANCE = 0.05
 
 
@@ -28,8 +28,8 @@ class PSFWarning(UserWarning):
 def fwhm(image):
     """Width [samples] of a PSF image (ny, nx): diameter of the disc of its samples over half peak.
 
-    Counted, not fitted: exact to about a sample, for any shape of the core, and without noise as
-    long as that stays under half of the peak.
+    Samples are counted, not fitted. The result is exact to about one sample for any shape of the
+    core, and independent of noise below half of the peak.
     """
     return 2 * math.sqrt(_n_above_half(image) / math.pi)
 
@@ -37,8 +37,9 @@ def fwhm(image):
 def core_centroid(image):
     """Centroid of the core of an image (ny, nx), Gaussian-weighted: (2,) [samples], (y, x).
 
-    The fixed point c of sum_s w(s - c) P[s] (s - c) = 0, w a Gaussian as wide as the core, from the
-    brightest sample on; this sample where the steps leave its neighbourhood, as they do in noise.
+    The fixed point c of sum_s w(s - c) P[s] (s - c) = 0, with w a Gaussian as wide as the core. The
+    iteration begins at the brightest sample, which is the result if the steps leave its
+    neighbourhood, as they do in noise.
     """
     peak = np.unravel_index(np.argmax(image), image.shape)
     # sigma of a round core with as many samples above half its maximum; one sample at least
@@ -103,11 +104,11 @@ def limit_power(images):
 def psf_warnings(images, center, core='center="core"') -> list[str]:
     """Warnings about PSF images: a sentence each, with figures.
 
-    A core more than 0.25 samples off the centre along an axis, and more than 5 % of the light
-    (either sign) beyond the edge, by `light_beyond_edge`; samples too coarse, by `limit_power`.
+    Causes: a core more than 0.25 samples off the centre along an axis; more than 5 % of the light
+    (of either sign) beyond the edge, by `light_beyond_edge`; samples too coarse, by `limit_power`.
 
-    images (C, ny, nx): of unit sum; center (C, 2) [samples]: (y, x), where they are said to be
-    core: how the reader of the message makes the core the centre
+    images (C, ny, nx): of unit sum; center (C, 2) [samples]: (y, x) of the stated centres
+    core: the option that makes the core the centre, for the message
     """
     messages = []
     cores = np.stack([core_centroid(image) for image in images])

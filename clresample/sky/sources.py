@@ -12,7 +12,7 @@ from .validation.checks import as_float_array, check_integer
 
 
 class SourceWarning(UserWarning):
-    """A source where the images show no light: its position is probably wrong."""
+    """A source without light in the images: its position is probably wrong."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,19 +20,19 @@ class Source:
     """A source at one position, given on the sky, in an observation's or in the model's pixels.
 
     sky_deg (2,) [deg]: right ascension and declination (for a flat sky: y, x [arcsec]), or
-        longitude and latitude in the WCS's own frame. Or a SkyCoord of one place, in any frame: it
-        is kept in degrees, with `sky_frame`
-    position_px (2,) [px]: (y, x), the centre of the first pixel at (0, 0); exactly one of the two
-        is given
-    observation: the name of the Observation whose pixels position_px counts (its label, where it
-        has no name); None = those of the model frame. By default that is the union of all
-        footprints (see `model_frame`), of which few users know the first pixel: give the frame
-        too, or the observation's name
-    name: how the catalogue calls it; None numbers it
+        longitude and latitude in the WCS's own frame. Or a SkyCoord of one position, in any frame,
+        which is stored in degrees, with `sky_frame`
+    position_px (2,) [px]: (y, x), the centre of the first pixel at (0, 0). Exactly one of sky_deg
+        and position_px must be passed
+    observation: the name (or label, if it has no name) of the Observation whose pixels position_px
+        refers to; None = those of the model frame. By default the model frame is the union of all
+        footprints (see `model_frame`), whose first pixel few users know: pass the frame too, or
+        the observation's name
+    name: its name in the catalogue; None = its number
     sky_frame: "icrs" where sky_deg was a SkyCoord; None = numbers in the frame of the grid's WCS
 
-    Raises ValueError where not exactly one finite position is given, and for an observation beside
-    sky_deg.
+    Raises ValueError unless there is exactly one position, which must be finite, and for an
+    observation together with sky_deg.
     """
 
     sky_deg: tuple[float, float] | None = None
@@ -67,7 +67,7 @@ class Source:
             )
 
     def pixel(self, grid, observations=(), shifts=None) -> np.ndarray:
-        """Position (2,) [px]: (y, x) on the model's grid; NaN where its projection holds none.
+        """Position (2,) [px]: (y, x) on the model's grid; NaN outside its projection.
 
         observations: among which `observation` is looked up
         shifts (n_observations, 2) [model px]: of their pixels, None = none
@@ -132,10 +132,10 @@ class ExtendedSource(Source):
 
     For the position see `Source`.
 
-    n_components: None = one, or two where the data show clearly that the galaxy's core has another
-        colour than the rest; this takes a fit with a MultiscalePrior, others have one
-    profile (Ny, Nx) [1]: what its one morphology is expected to look like under the model's PSF, on
-        the frame's pixels, non-negative; None = a smooth profile fitted to the data
+    n_components: None = one, or two if the galaxy's core differs significantly in colour from the
+        rest, which only fits with a MultiscalePrior test
+    profile (Ny, Nx) [1]: expected image of its only morphology under the model's PSF, on the
+        frame's pixels, non-negative; None = a smooth profile fitted to the data
     """
 
     n_components: int | None = None

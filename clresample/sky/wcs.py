@@ -1,7 +1,7 @@
-"""Functions of a WCS, astropy's own or an Ape14Wcs, that grids need.
+"""Functions of a WCS, astropy's or an Ape14Wcs, for grids.
 
-Longitudes come before latitudes here, whatever the order of a header's axes, and the inverse gives
-NaN where astropy's raises.
+Longitudes come before latitudes, whatever the order of a header's axes. The inverse returns NaN
+where astropy's raises.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from astropy.wcs.wcsapi import BaseHighLevelWCS, BaseLowLevelWCS
 from .validation.checks import check_instance
 from .wcs_interface.ape14 import Ape14Wcs
 
-# [px] the iterated inverse of SIP and look-up tables stops here, well under NOISE_PX
+# [px] Tolerance of the iterated inverse of SIP and look-up tables, far below NOISE_PX.
 INVERSE_PX = 1e-8
-# [px] by which a pixel may come back from the sky at another place: sixteen digits of an angle let
-# pixels of 0.1 milliarcseconds do so
+# [px] Largest error of a pixel mapped to the sky and back: angles of sixteen digits have it for
+# pixels of 0.1 milliarcseconds.
 BACK_PX = 1e-4
 ARCSEC = math.radians(1 / 3600)  # [rad]
 
@@ -57,7 +57,7 @@ def pixel_to_world(wcs, n, m):
     return world[[wcs.wcs.lng, wcs.wcs.lat]].reshape((2,) + np.shape(n))
 
 
-# Length of a pixel over its width, at most: those of slit spectrographs have 10, beyond lie
+# Largest ratio of a pixel's length to its width. Slit spectrographs have 10; larger ratios are
 # mistakes in headers.
 MAX_ELONGATED = 100.0
 
@@ -81,9 +81,9 @@ def pixel_problem(wcs, shape):
 
 
 def _lost_digits(wcs, shape):
-    """Fault where the middle pixel of an image (Ny, Nx) does not come back from the sky.
+    """Fault if the middle pixel of an image (Ny, Nx) is not mapped to the sky and back.
 
-    None where there is none, or nothing comes back. Other packages' WCS are not tested.
+    None if it is, or if the inverse fails. WCS of other packages are not tested.
     """
     if isinstance(wcs, Ape14Wcs):
         return None
@@ -97,7 +97,7 @@ def _lost_digits(wcs, shape):
 
 
 def _pixel_sides(wcs, n, m):
-    """Sides of a pixel as vectors (3,) on the unit sphere, along the rows' and columns' numbers."""
+    """Sides of a pixel as vectors (3,) on the unit sphere, along rows and along columns."""
     half = np.array([-0.5, 0.5])
     n, m = np.concatenate([n + half, [n, n]]), np.concatenate([[m, m], m + half])
     lon, lat = np.radians(pixel_to_world(wcs, n, m))
@@ -111,7 +111,7 @@ def local_axes(grid, pixel):
     Columns are (y, x). North is that of the WCS's own frame; on a flat sky it is +y, and east is
     -x, as in `Grid.to_wcs`.
 
-    pixel (2,) [px]: (y, x), where on the grid
+    pixel (2,) [px]: (y, x), a position on the grid
     """
     if grid.is_flat:
         return grid.jacobian * [[1.0], [-1.0]]
@@ -126,7 +126,7 @@ def local_axes(grid, pixel):
 
 
 def celestial_frame(wcs):
-    """The celestial frame of a WCS, as astropy's coordinates have it."""
+    """The celestial frame of a WCS as an astropy coordinate frame."""
     return wcs.frame if isinstance(wcs, Ape14Wcs) else wcs_to_celestial_frame(wcs)
 
 

@@ -1,1 +1,1 @@
-"""Transforms of large images at frequencies that lie on no grid of theirs."""
+"""Transforms of large images at arbitrary frequencies."""

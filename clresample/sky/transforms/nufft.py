@@ -3,9 +3,9 @@
     F(f, g) = sum_yx P[y, x] exp(-2 pi i (f y + g x))
 
 The image is divided by the transform of a Kaiser-Bessel window, padded to twice its size and
-transformed; the window then interpolates between the grid's frequencies. What is left out folds
-back with the window's own side lobes: with TAPS = 16, errors stay under 1e-14 of sum |P|. Cost per
-frequency TAPS^2, of the sum itself ny nx.
+transformed; the window then interpolates between the grid's frequencies. The error comes from the
+window's side lobes: with TAPS = 16 it is below 1e-14 of sum |P|. The cost per frequency is TAPS^2,
+that of the direct sum ny nx.
 
 Source: Dutt & Rokhlin 1993 (SIAM J. Sci. Comput. 14, 1368), with the window of Fessler & Sutton
 2003 (IEEE Trans. Signal Process. 51, 560).

@@ -1,1 +1,1 @@
-"""Checks users' input where it comes in: every refusal is a ValueError that names it."""
+"""Validates users' input: every error is a ValueError that names the argument."""

@@ -14,7 +14,7 @@ import numpy as np
 
 # kinds of NumPy types that are real numbers: bool, integers, floats
 REAL = "biuf"
-# How a user makes what an argument must be, for messages.
+# How a user makes the objects that arguments must be, for messages.
 WAYS = {
     "Grid": "Grid.from_wcs(wcs, shape) or Grid.flat(shape, scale_arcsec)",
     "PSF": "PSF(array)",
@@ -30,7 +30,7 @@ def as_float_array(name, values, unit=None) -> np.ndarray:
 
     Raises ValueError for complex numbers, texts, dates, masked values, and other units.
     """
-    with np.errstate(invalid="ignore"):  # NaN of damaged files may be of the kind that signals
+    with np.errstate(invalid="ignore"):  # damaged files may contain signalling NaN
         return np.asarray(as_real_array(name, values, unit), dtype=np.float64)
 
 
@@ -113,7 +113,7 @@ def check_number(name, value, what="a finite number", fits=math.isfinite) -> flo
 
 
 def check_integer(name, value, least=0) -> int:
-    """Returns a whole number from `least`. Raises ValueError for any other value."""
+    """Returns an integer of at least `least`. Raises ValueError for any other value."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
         raise ValueError(f"{name} is {value!r:.80}, must be a whole number, {least} or more")
     if value < least:
@@ -127,7 +127,7 @@ def check_dtype(dtype) -> np.dtype:
         found = None if dtype is None else np.dtype(dtype)
     except TypeError:
         found = None
-    # NumPy's types equal whatever names them, and None names float64
+    # NumPy's types compare equal to their names, and to None, which means float64
     if found is None or found.kind != "f" or found.itemsize not in (4, 8):
         raise ValueError(f"dtype is {dtype!r:.80}, must be float32 or float64")
     return found
@@ -176,7 +176,7 @@ def check_pixel_scale(name, values):
 
 
 class ReadOnly:
-    """Mixin: arrays that its instances hold are read-only, also in copies and after unpickling."""
+    """Mixin: arrays of its instances are read-only, also in copies and after unpickling."""
 
     def __setstate__(self, state):
         for value in state.values():

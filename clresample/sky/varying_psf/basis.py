@@ -1,4 +1,4 @@
-"""The few PSFs whose sums stand for those of many places, to a stated tolerance."""
+"""Represents the PSFs of many positions as sums of a few, to a stated tolerance."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from ..psf import PSF
 from ..psf_checks import PSFWarning
 from .field import PSFField
 
-# Part of a PSF's norm below which a difference is rounding: nothing is gained by more terms.
+# Fraction of a PSF's norm below which differences are rounding errors, and terms are useless.
 ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class PSFBasis:
-    """PSFs B of C bands and T terms, whose sums are the PSFs of S places.
+    """PSFs B of C bands and T terms, whose sums are the PSFs at S positions.
 
         P[s, c] = sum_t shares[s, c, t] B[c, t],     sum_t shares[s, c, t] = 1
 
-    Each term is the PSF of one of the places, so that it is as narrow and as smooth as those are,
-    and all sums have the flux 1.
+    Each term is the PSF at one of the positions, so that it is as narrow and smooth as the others,
+    and all sums have flux 1.
 
     psf: PSF of C * T bands, the terms of a band in turn; shares (S, C, T); n_terms: T
-    max_variation (C,): largest distance |P[s] - P[r]| / |P[r]| of a place's PSF from that of place
-        r in the middle, the norm being the root of the sum of squared samples; max_error (C,): what
-        the sums leave of it
+    max_variation (C,): largest distance |P[s] - P[r]| / |P[r]| of a PSF from that of position r in
+        the middle, the norm being the root of the sum of squared samples
+    max_error (C,): largest such distance between a PSF and its sum
     """
 
     psf: PSF
@@ -40,14 +40,14 @@ class PSFBasis:
     def of(cls, field: PSFField, places, tolerance) -> PSFBasis:
         """Basis of a PSFField at places (S, 2) [px], S > 0, to `tolerance` [1].
 
-        No PSF is off by more than that, as `max_error` has it; with 0 they are exact.
+        `max_error` is at most the tolerance; with 0 the PSFs are exact.
 
-        A star of signal to noise N, in noise that is the same everywhere, whose PSF is off by
-        epsilon, leaves N epsilon sigma in its residuals, all pixels together.
-        Raises ValueError where the distances of the PSFs' samples differ.
+        For a star of signal to noise N, in uniform noise, a PSF error of epsilon leaves residuals
+        of N epsilon sigma in all pixels together.
+        Raises ValueError if the PSFs differ in the distance of their samples.
         """
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", PSFWarning)  # said of the PSF in the middle
+            warnings.simplefilter("ignore", PSFWarning)  # the PSF in the middle has warned
             psfs = [field.psf_at(*place) for place in places]
         spacings = {psf.spacing for psf in psfs}
         if len(spacings) > 1:
@@ -89,10 +89,11 @@ def _spectra(psfs, band, shape):
 
 
 def _terms(spectra, first, tolerance):
-    """Selects places (T) whose spectra span all of (S, n) within the tolerance, from `first` on.
+    """Selects positions (T) whose spectra span all of (S, n) within the tolerance, from `first` on.
 
-    Each next one is the farthest from the span of those before. Coefficients (S, T) of them, the
-    largest distance from the first, and what is left; as parts of the first one's norm.
+    Each further position is the one farthest from the span of the previous ones. Also returns the
+    coefficients (S, T), the largest distance from the first spectrum and the largest distance from
+    the span, both relative to the norm of the first.
     """
     size = np.linalg.norm(spectra[first])
     rest = (spectra - spectra[first]) / size

@@ -1,4 +1,4 @@
-"""PSF fields that are made of another one."""
+"""PSF fields derived from another PSF field."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from ..psf import PSF
 class PSFField(ABC):
     """The PSF of an image at any position.
 
-    n_bands: of the PSFs that it returns; varies: whether they are not all the same
+    n_bands: of the PSFs that it returns; varies: False if they are all equal
     """
 
     n_bands: int
@@ -23,8 +23,8 @@ class PSFField(ABC):
     def psf_at(self, y, x) -> PSF:
         """The PSF at (y, x) [px]: row and column of the image, the first pixel's centre at (0, 0).
 
-        Outside the image, or where the PSF was not measured, that of the nearest place is
-        returned, so that a source at the edge can be fitted.
+        Outside the image, or where the PSF was not measured, the PSF at the nearest such position
+        is returned, so that a source at the edge can be fitted.
         Raises ValueError for positions that are not finite.
         """
 
@@ -35,7 +35,7 @@ class PSFField(ABC):
 
 @dataclass(frozen=True, eq=False)
 class _GridCutout(PSFField):
-    """Those of `field` where the image begins at `origin` (y, x) [px] of the field's."""
+    """The PSFs of `field` for an image that begins at its pixel `origin` (y, x) [px]."""
 
     field: PSFField
     origin: tuple[float, float]
@@ -56,16 +56,16 @@ class _GridCutout(PSFField):
 class FunctionPSF(PSFField):
     """PSF field of a function of the position.
 
-    function: called as function(y, x) [px]; returns a PSF of n_bands, or images that `PSF` takes,
-        (C, ny, nx) or (ny, nx), with the pixel response and one sample per pixel. To be sent to
-        worker processes it must be one that `pickle` takes: defined in a module, not a lambda
+    function: called as function(y, x) [px]; returns a PSF of n_bands, or images accepted by `PSF`,
+        (C, ny, nx) or (ny, nx), with the pixel response and one sample per pixel. Worker processes
+        require that it can be pickled: it must be defined in a module, not a lambda
     """
 
     function: object
     n_bands: int = 1
 
     def psf_at(self, y, x):
-        """PSF of the function's answer. Raises ValueError for another number of bands."""
+        """PSF returned by the function. Raises ValueError for another number of bands."""
         psf = self.function(*check_position(y, x))
         psf = psf if isinstance(psf, PSF) else PSF(psf)
         if psf.n_bands != self.n_bands:

@@ -17,13 +17,13 @@ from astropy.wcs import WCS, Sip
 from astropy.wcs.utils import celestial_frame_to_wcs
 from astropy.wcs.wcsapi import BaseHighLevelWCS, BaseLowLevelWCS
 
-# [px] FITS approximations take the lowest order that is as near as this: a hundredth of what
-# centroids of the brightest stars are known to
+# [px] FITS approximations have the lowest order with a smaller error: a hundredth of the errors of
+# the brightest stars' centroids.
 FITS_PX = 1e-4
 MAX_ORDER = 5  # of the SIP polynomials: higher ones follow rounding, not optics
 N_POINTS = 25  # along each axis: four times as many as the coefficients of the highest order
-INVERSE_PX = 1e-8  # [px] inverses as near as this are taken as they are
-STEP_PX = 0.5  # [px] of the differences that stand for derivatives in a Newton step
+INVERSE_PX = 1e-8  # [px] inverses with smaller errors need no Newton step
+STEP_PX = 0.5  # [px] of the finite differences of a Newton step
 STEPS_PX = np.eye(2) * STEP_PX
 
 
@@ -32,7 +32,7 @@ class Ape14Wcs:
     """A WCS behind the common interface, for an array that starts at pixel (y0, x0) of its own.
 
     low: BaseLowLevelWCS of two pixel and two world axes; frame: astropy's celestial frame
-    lng, lat: which world axis is longitude, and which latitude
+    lng, lat: indices of the world axes longitude and latitude
     to_deg (2,): factors from the world axes' units to degrees
     """
 
@@ -126,7 +126,7 @@ def _offsets(world, other):
 
 
 def _sky_axes(low):
-    """The celestial frame, and which world axes are its longitude and latitude."""
+    """The celestial frame, and the indices of its longitude and latitude axes."""
     for key, entry in low.world_axis_object_classes.items():
         if not (isinstance(entry[0], type) and issubclass(entry[0], SkyCoord)):
             continue
@@ -142,7 +142,8 @@ def _sky_axes(low):
 
 
 def _unbounded(low):
-    """The WCS evaluated beyond its bounding box too, as a FITS WCS is: cutouts may reach there."""
+    """The WCS evaluated beyond its bounding box too, like a FITS WCS, for cutouts that reach
+    there."""
     if getattr(low, "bounding_box", None) is None:
         return low
     low = copy.deepcopy(low)
