@@ -1,5 +1,5 @@
 """Figures and cards of grids, PSFs, observations and results, for notebooks and files.
 
-The ground floor: imports nothing of clresample's. It draws what it is handed, by its attributes;
+The lowest layer: imports no other package of clresample. Objects are drawn by their attributes;
 matplotlib is imported when something is drawn.
 """

@@ -13,9 +13,9 @@ LINE_S = 30.0
 
 
 class ProgressBar:
-    """Called with the number of items that are done; a context manager that ends its line.
+    """Progress display, called with the number of finished items; a context manager.
 
-    total: number of all items; unit: what they are, in the plural
+    total: number of all items; unit: their name in the plural
     """
 
     def __init__(self, total, unit):
@@ -44,7 +44,7 @@ class ProgressBar:
     def _drawn(self):
         """tqdm's own choice between a notebook's bar and a terminal's."""
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of notebooks without widgets: they get text
+            warnings.simplefilter("ignore")  # notebooks without widgets get text
             from tqdm.auto import tqdm
 
             return tqdm(total=self.total, unit=f" {self.unit}")

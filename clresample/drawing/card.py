@@ -14,7 +14,7 @@ CELL = "text-align:left;padding:0.15em 1em 0.15em 0;vertical-align:top"
 def card(title, properties, draw=None):
     """HTML of an object, in the page's own colours, light or dark.
 
-    title: what it is; properties {name: text}; draw: makes its figure, left out without matplotlib
+    title: heading; properties {name: text}; draw: makes its figure, omitted without matplotlib
     """
     rows = "".join(
         f'<tr><th style="{CELL};font-weight:normal;opacity:0.7">{html.escape(str(name))}</th>'

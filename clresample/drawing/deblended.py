@@ -11,7 +11,7 @@ ABOVE, BELOW = 0.62, 0.28  # [inch] for the titles, and for the line below each 
 KNEE_SIGMAS = 2.0  # [sigma] where the asinh stretch turns from linear to logarithmic
 BRIGHT_QUANTILE = 0.999  # of the model's pixels: shown as white
 RESIDUAL_SIGMAS = 6.0  # at which a residual's colours end
-FEW = 40  # up to so many sources are numbered; of more, only the places are marked
+FEW = 40  # up to this many sources are numbered; with more, only positions are marked
 MARK = "#7fe3ff"
 COLUMNS = "observed", "model", "residual"
 

@@ -40,7 +40,7 @@ def import_figure():
 
 
 def new_figure(width, height):
-    """An empty dark figure of this size [inches], apart from pyplot: notebooks show it once."""
+    """An empty dark figure of this size [inches], without pyplot: notebooks show it once."""
     figure = import_figure()(figsize=(width, height), dpi=DPI, facecolor=PAPER)
     figure._repr_png_ = lambda: png_of(figure)
     return figure

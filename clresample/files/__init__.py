@@ -1,4 +1,4 @@
-"""Files: FITS images and results, scene files, tables, figures; each whole or absent.
+"""Files: FITS images and results, scene files, tables, figures; all written atomically.
 
 Imports `measurement`, `deblending` and `sky`.
 """

@@ -1,7 +1,7 @@
 """Stores arrays as image HDUs of FITS files, to the last bit: also empty and unknown values.
 
-Many programs stop at NaN and infinity, so files hold none: the most negative number of the type
-stands for NaN, the largest for infinity, and a card of the header says so.
+Many programs fail on NaN and infinity. So in files the most negative number of the type stands for
+NaN and the largest for infinity, which a header card states.
 """
 
 from __future__ import annotations

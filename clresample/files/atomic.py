@@ -1,8 +1,8 @@
 """Writes files, one or several together, that appear whole or not at all.
 
-All are written in a folder of their own beside their place, `.part-HOST-PID-xxxx`, brought to the
-disk, and then moved. Just before the first is moved the folder becomes `.done-HOST-PID-xxxx`: what
-a killed run left of the one kind is thrown away by the next run, of the other kind moved.
+All files are first written to the folder `.part-HOST-PID-xxxx` beside their destination and flushed
+to the disk. Then the folder is renamed to `.done-HOST-PID-xxxx`, and the files are moved. The next
+run deletes a `.part` folder of a killed run, and moves the files of a `.done` folder.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class FileError(ValueError):
 def check_output(path, *, overwrite=False, inputs=()):
     """Raises FileError if a file could not be written: a check before long computations.
 
-    path: the file; overwrite: whether one that exists may be replaced; inputs: files that may not
-    be, under whatever name
+    path: the file; overwrite: True if an existing file may be replaced; inputs: files that must not
+        be replaced, under any name
     """
     path = Path(path)
     try:
@@ -57,8 +57,8 @@ def check_output(path, *, overwrite=False, inputs=()):
 def check_folder(folder):
     """Raises FileError if a folder is not writable, or could not be made.
 
-    It tries, in the folder or in the first one above that exists, and removes what it made there.
-    What runs on this machine that were killed have left there is cleared away.
+    It writes a test file in the folder, or in the first existing folder above it, and removes it.
+    Files left by killed runs on this machine are removed too.
     """
     folder = Path(folder)
     try:
@@ -92,9 +92,9 @@ def atomic_file(path):
 def atomic_files(paths):
     """Paths to write several files under; all of them appear together, or none does.
 
-    As `atomic_file`. A folder that does not exist yet appears with all its files in it. Where one
-    exists, files are moved in the order of `paths`; a run killed in the midst of that is completed
-    by the next `check_folder` or `atomic_files` there.
+    See `atomic_file`. A new folder appears with all its files in it. In an existing folder files
+    are moved in the order of `paths`; if a run is killed during the moves, the next `check_folder`
+    or `atomic_files` there completes them.
     """
     paths = [Path(path) for path in paths]
     files = [(path.absolute().parent, path.name) for path in paths]
@@ -106,10 +106,10 @@ def atomic_files(paths):
 
 @contextmanager
 def atomic_tree(folder, *, overwrite=True):
-    """A folder to write into; all that it then holds appears together in `folder`, or nothing does.
+    """A folder to write into; all its files then appear together in `folder`, or none does.
 
-    As `atomic_files`, for files whose names nobody knows before, in folders of that folder too.
-    What lies in `folder` under other names stays. overwrite: whether files may be replaced
+    See `atomic_files`; for files whose names are not known before, also in subfolders. Other files
+    in `folder` stay. overwrite: True if files may be replaced
     """
     home = Path(folder).absolute()
     outputs = _Outputs([home])
@@ -223,7 +223,7 @@ class _Outputs:
 
 def remove_stale(folder):
     """Removes files in a folder left by this user's killed runs on this machine."""
-    if os.name != "posix":  # elsewhere none can be asked whether it is alive
+    if os.name != "posix":  # other systems cannot test if a process is alive
         return
     for entry in list(os.scandir(folder)):
         found = STAGE.fullmatch(entry.name)
@@ -241,7 +241,7 @@ def remove_stale(folder):
 def remove_tree(folder):
     """Removes a folder and its content at once.
 
-    What a kill leaves of it, `remove_stale` removes.
+    If it is killed, `remove_stale` removes the rest.
     """
     aside = _new_folder(folder.absolute().parent)
     os.rename(folder, aside)

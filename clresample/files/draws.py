@@ -17,10 +17,10 @@ NODES = ("n_modes", "size", "order", "n_later")
 def draw_hdus(draws):
     """HDUs of a PosteriorSampler; an empty list for None.
 
-    DRAWNODES: a row for each node of the matrix: its modes, unknowns, place in the elimination, and
-    number of neighbours that are eliminated later. DRAWLATER: these neighbours. DRAWMODES,
-    DRAWSCALE, DRAWFACTOR: all arrays one after the other; of the factor each node's own block and
-    the block below, in the order of elimination. DRAWUNIT, DRAWWIDE, DRAWBANDS: as in
+    DRAWNODES: a row for each node of the matrix: its modes, unknowns, position in the elimination
+    order, and number of neighbours that are eliminated later. DRAWLATER: these neighbours.
+    DRAWMODES, DRAWSCALE, DRAWFACTOR: all arrays, concatenated; the factor consists of each node's
+    diagonal block and the block below it, in elimination order. DRAWUNIT, DRAWWIDE, DRAWBANDS: see
     PosteriorSampler.
     """
     if draws is None:

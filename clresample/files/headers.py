@@ -1,9 +1,9 @@
 """Checks the headers of a FITS file before astropy reads them.
 
-astropy (to 8.0 at least) believes some numbers in a header and counts up to them: with NAXIS =
-99999999999 or SIP polynomials of order 30000 it does not end, TFIELDS = 2000000000 takes all
-memory. After data of a negative size it reads the same header again without end, and so it does in
-compressed files that begin without SIMPLE, or that say with it that they are not FITS.
+astropy (up to 8.0 at least) loops up to numbers in a header without checks. With NAXIS =
+99999999999 or SIP polynomials of order 30000 it does not end; TFIELDS = 2000000000 takes all
+memory. After data of a negative size it reads the same header for ever. It does the same in
+compressed files without SIMPLE or with SIMPLE = F.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from astropy.utils.data import get_readable_fileobj
 from .atomic import FileError
 
 BLOCK, CARD = 2880, 80  # bytes
-# A header has at most so many cards, 8 MB: an end of it is not looked for in all of a large file.
+# Largest number of cards of a header, 8 MB, so that a search for its end cannot read a whole file.
 MAX_CARDS = 100_000
 # Least and most of what each card may hold. 999 axes and columns are the FITS standard's limits, 9
 # that of the names of SIP's coefficients; sizes and places in files are 64-bit integers.
@@ -43,8 +43,8 @@ END = re.compile(rb"END([^A-Z0-9_-]|$)")
 def check_headers(path):
     """Raises FileError if a header of a FITS file has an impossible number.
 
-    All HDUs are looked at, of compressed files too. What is not FITS, or ends too early, passes:
-    astropy says so.
+    All HDUs are checked, also in compressed files. Files that are not FITS or are truncated pass,
+    since astropy reports them.
     """
     try:
         with _opened(path) as file:
@@ -55,7 +55,7 @@ def check_headers(path):
                 raise FileError(f"{path}: damaged, begins with a header without SIMPLE")
     except FileError:
         raise
-    except Exception:  # of the libraries that decompress, on what is cut or nothing of theirs
+    except Exception:  # decompression fails on truncated or foreign files
         return
 
 
@@ -121,7 +121,7 @@ def _values(what, cards):
         claim = f"{what} has {key} = {text[:40]}"
         try:
             least, most = next(limits for name, limits in LIMITS.items() if re.fullmatch(name, key))
-            # real numbers are taken, and made whole, for the sky alone
+            # real numbers are accepted, and rounded, only for cards of the WCS
             value = int(text) if least > -math.inf else float(text.upper().replace("D", "E"))
         except ValueError:
             raise FileError(f"{claim}, not a whole number") from None
@@ -139,7 +139,7 @@ def _n_bytes(what, values, flags):
         _check_tiles(what, values)
     if not shape:
         return 0
-    if "GROUPS" in flags and shape[0] == 0:  # random groups say so by an axis of no pixel
+    if "GROUPS" in flags and shape[0] == 0:  # random groups have an axis of length 0
         shape = shape[1:]
     n_pixels = values.get("GCOUNT", 1) * (values.get("PCOUNT", 0) + math.prod(shape))
     n_bytes = abs(values.get("BITPIX", 8)) * n_pixels // 8

@@ -24,11 +24,11 @@ PANEL_INCHES = 2.75  # a row of four panels fills a page's width
 # of the pixels: shown as white, so that one hot pixel does not darken the others
 BRIGHT_QUANTILE = 0.9995
 RESIDUAL_SIGMAS = 10  # [sigma of its background] at which a residual's colours end
-# Colours of a PNG: a third of the size of a file of all colours, with differences of 3 of 256 rms.
-# They are chosen from every fourth pixel of every fourth row, 7 times faster than from all pixels
-# and as near to the drawing; sparser samples lose the colour of thin lines.
+# Number of colours of a PNG: the file has a third of the size of a full-colour file, with an rms
+# difference of 3 of 256. Colours are chosen from every fourth pixel of every fourth row, 7 times
+# faster than from all pixels and as accurate; sparser samples lose the colour of thin lines.
 N_COLOURS, SAMPLE_STEP = 256, 4
-KMEANS_ROUNDS = 4  # that move the colours to the means of the pixels they stand for
+KMEANS_ROUNDS = 4  # iterations of k-means
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,8 +29,8 @@ def compare(rendered, observed, covered, width_px):
     """Fits one flux scale and one sky level: two instruments count in different units.
 
     rendered, observed (My, Mx); covered (My, Mx) bool
-    width_px [px]: nearer to the edge of the coverage, pixels are left out: they lack the light of
-        sources outside
+    width_px [px]: pixels nearer to the edge of the coverage are left out, since they lack the light
+        of sources outside
     returns Comparison, or None where fewer than three pixels compare, or one image is constant.
     """
     inside = distance_transform_edt(np.pad(covered, 1))[1:-1, 1:-1] > width_px

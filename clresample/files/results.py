@@ -147,8 +147,8 @@ def _observation_hdus(result, i):
 def read_result(path) -> Result:
     """Reads the blend that `write_result` wrote to a file, equal to the last bit.
 
-    Except for Result.draws and for PSFs that vary (Observation.psf_field), which files do not hold:
-    psf is that in the middle, `rendered` what each source's own made of it.
+    Files do not contain Result.draws and varying PSFs (Observation.psf_field): psf is that in the
+    middle of the image; `rendered` was made with the PSF of each source.
 
     path: of the file
 
@@ -192,7 +192,7 @@ def _about(result):
         "messages": result.messages,
         "seconds": result.seconds,
         "sources": [
-            # without what fits start from (ExtendedSource.profile): the morphologies came of it
+            # without ExtendedSource.profile, which only starts a fit
             {"kind": type(s).__name__}
             | {f.name: getattr(s, f.name) for f in fields(s) if f.compare}
             for s in result.sources

@@ -14,7 +14,7 @@ from ..sky.sources import ExtendedSource, PointSource
 from .headers import check_headers
 
 KINDS = {"point": PointSource, "extended": ExtendedSource}
-# what columns may hold; each is looked for under this name unless the scene file gives another
+# Quantities of columns; the column has the same name unless the scene file specifies another.
 COLUMNS = ("ra", "dec", "y", "x", "name", "type", "components", "observation")
 
 
@@ -24,9 +24,9 @@ def read_sources(path, columns=None) -> tuple:
     path: a file that `astropy.table.Table.read` takes
     columns: {what: column's name} for ra, dec [deg, or the column's own unit], y, x [px, counted
         from 0], observation (in whose pixels y and x count; none or "" = in the model's), name,
-        type ("point" or "extended"), components (how many spectra an extended source has; masked
-            = as many as the data show); and
-        format: astropy's name of it. What is left out is looked for under its own name
+        type ("point" or "extended"), components (number of components of an extended source;
+        masked = decided by the data); and
+        format: astropy's name of it. By default each column has the name of its quantity
     returns a tuple of PointSource and ExtendedSource; sources without a type are extended
 
     Raises ValueError, one line that names file, column and row.

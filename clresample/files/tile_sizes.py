@@ -16,8 +16,8 @@ SIZES = slice(2, 10)
 def check_tiles(path, hdu):
     """Raises FileError where an HCOMPRESS tile has another size than its header says.
 
-    astropy (to 8.0 at least) makes room by the header and writes by the tile, over whatever lies
-    behind it in memory.
+    astropy (up to 8.0 at least) allocates memory by the header and writes by the tile's own size,
+    beyond the end of that memory.
     """
     if not isinstance(hdu, fits.CompImageHDU) or hdu.compression_type != "HCOMPRESS_1":
         return

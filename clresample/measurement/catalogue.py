@@ -22,11 +22,12 @@ from .photometry import add_groups, channel_covariances, flux_scale, fluxes
 from .quality import box_chi2, fitted_sources, masked_cores, observation_labels
 from .shapes import moments, shape, shape_slopes
 
-# of a morphology's peak: light at the edge of what was seen is flagged when it is brighter. Fainter
-# light makes no flux wrong by more than a few percent; lower, noise in the wings is flagged too
+# [1] Light at the edge of the observed area is flagged if it exceeds this fraction of a
+# morphology's peak. Fainter light changes fluxes by at most a few percent; a lower limit flags
+# noise in the wings.
 EDGE_LIGHT = 0.01
 
-# [deg] scatter of an angle that may have any value: no error is larger
+# [deg] Scatter of a uniformly distributed angle: the largest possible error.
 UNKNOWN_ANGLE_DEG = 180 / np.sqrt(12)
 SHAPE_UNITS = {"rms_size": u.arcsec, "e1": None, "e2": None, "position_angle": u.deg}
 
@@ -78,40 +79,41 @@ def catalogue(result, *, magnitudes=True, groups=None) -> QTable:
         ra, dec [deg], or what the frame's WCS calls them; y_sky, x_sky [arcsec] on a flat sky; and
             y, x [model px]: position as given
         flags: sum of `Flag`
-        snr: signal to noise of all B bands together, sqrt(sum_b flux_b^2 / variance_b), which
-            is about sqrt(B) where there is no source
-        n_components: of morphology and spectrum, of which the source is the sum; two where the data
-            show that its core has another colour, see `ExtendedSource`
+        snr: signal to noise of all B bands together, sqrt(sum_b flux_b^2 / variance_b); about
+            sqrt(B) without a source
+        n_components: number of components; two if the core has a significantly different colour,
+            see `ExtendedSource`
         *_centroid: the same positions, of the fitted light
         size [arcsec], e1, e2, angle [deg]: see `shapes.shape`. They are those of the model under
-            the model's PSF, not deconvolved; a source's components are weighted by their flux, that
-            of all channels, each in units of its error. Where the result has Errors, what the
-            smooth profile has beyond its box is counted, and what the bound of morphologies at 0
-            adds is taken off, see `Errors.moment_bound_bias`
+            the model's PSF, not deconvolved. A source's components are weighted by their flux in
+            all channels, each in units of its error. If the result has Errors, the light of the
+            smooth profile beyond its box is included, and the bias from the bound of morphologies
+            at 0 is subtracted, see `Errors.moment_bound_bias`
         *_centroid_err, size_err, e1_err, e2_err, angle_err: errors in the units of the values, to
             first order; ra's in degrees of ra, angle_err at most 52 deg, that of an unknown angle.
-            NaN where the result has no Errors, and where the shape was not fitted, as stars'. They,
+            NaN if the result has no Errors, or if the shape was not fitted, as for stars. They,
             and those of fluxes, are larger for misfitted sources, see `Errors`
-        flux_*, flux_err_* per band, which is a channel's own name where the observation has no
-            `bands`; of several exposures the one flux that all of them give [the unit of the data
-            where all observations have the same, else uJy where they have zero points, else
-            counts]: see `fluxes`. NaN where no pixel of the band determines it
+        flux_*, flux_err_* per band, or per channel if the observation has no `bands`; the
+            exposures of a band have one flux, see `fluxes`. The unit is that of the data if all
+            observations have the same, else uJy if they have zero points, else counts. NaN if no
+            pixel of the band determines it
         mag_*, mag_err_* per band [mag, AB]: where the flux is positive
-        colour_A_B, colour_err_A_B [mag]: mag_A - mag_B of bands A, B next to each other; the
-            error from the covariance of the two fluxes, see `channel_covariances`, to first order:
-            of use where both are detected
+        colour_A_B, colour_err_A_B [mag]: mag_A - mag_B of neighbouring bands A and B; the error
+            follows from the covariance of the two fluxes to first order, see
+            `channel_covariances`, and is valid if both are detected
         group_id, n_group: number of the group, and its sources; group_flux_*, group_flux_err_* per
             channel: of all of them together, the error with the covariances of their fluxes
         chi2_* per observation: mean chi2 of the pixels with weight in the source's box, of all
             channels and with all sources' models
         max_residual_* per channel [sigma]: the largest residual on the source once filtered with
             the PSF, see `residuals.max_filtered_residuals`
-        misfit_sigma [sigma]: the largest of these, or of the excess of chi2 of the source's pixels
-            in a channel, if larger; misfit_fraction: the light that is left there over the flux, in
-            the channel where it is the largest of those over 5 sigma, 0 without any. Over 5 sigma
-            and over 0.03 the source is flagged MISFIT, see `Misfit`
-        ambiguous_with: row of the source with which light may be exchanged, see `is_ambiguous`; -1
-            without any
+        misfit_sigma [sigma]: the larger of two: the largest of these residuals, and the excess of
+            chi2 of the source's pixels in a channel
+        misfit_fraction [1]: residual light over flux, in the channel with the largest ratio of
+            those over 5 sigma; 0 if there is none. A source over 5 sigma and over 0.03 is flagged
+            MISFIT, see `Misfit`
+        ambiguous_with: row of the source whose light cannot be told apart from this source's, see
+            `is_ambiguous`; -1 if there is none
     """
     table = catalogue_columns(result, magnitudes=magnitudes, groups=groups).table()
     table["flags"].info.description = ", ".join(f"{flag.value} {flag.name}" for flag in Flag)
@@ -121,7 +123,7 @@ def catalogue(result, *, magnitudes=True, groups=None) -> QTable:
 def catalogue_columns(result, *, magnitudes=True, groups=None, bands=None) -> Columns:
     """The same as `catalogue`, before it is a table.
 
-    bands: names in the order whose neighbours make colours; None = as in the result
+    bands: names in the order whose neighbours form colours; None = as in the result
     """
     worst, misfit = channel_residuals(result), result.misfit
     flux, covariance = fluxes(result)
@@ -166,7 +168,7 @@ def catalogue_columns(result, *, magnitudes=True, groups=None, bands=None) -> Co
 def _add_partners(table, result, flux, covariance):
     """Adds the column of ambiguous sources' partners and their flag.
 
-    Only results with Errors have them, because light is not exchanged at fixed morphologies.
+    Only results with Errors have them, because at fixed morphologies fluxes are not ambiguous.
     """
     found = np.full(len(flux), -1)
     if result.errors is not None:
@@ -226,9 +228,10 @@ def _add_shapes(table, result, error):
 
 
 def _released(centroid, second, moved):
-    """A centroid (2,) and second moments (2, 2) changed by `moved` (5,), see Errors.
+    """A centroid (2,) and second moments (2, 2) plus the correction `moved` (5,), see Errors.
 
-    As they were where that would leave no moments of an image, as it may those of noise.
+    They are unchanged if the second moments would not be positive definite, as can happen for
+    noise.
     """
     yy, yx, xx = moved[2:]
     changed = second + [[yy, yx], [yx, xx]]

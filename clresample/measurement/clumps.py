@@ -1,20 +1,26 @@
 """Peaks inside the light of large galaxies: structure of one object, or sources of their own.
 
-A body is the light of a galaxy that is much wider than the PSF: the connected pixels above a level
-L cover `BODY_AREA` widths of the PSF squared, and at least `WIDE` of the light is left when all
-that exceeds L is cut off. Of a star or a small galaxy that is a hundredth. A peak of height I
-stands on a body at the level B of its isophote, L, or of the saddle to it, if that is lower:
+A body is the light of a galaxy much wider than the PSF: the connected pixels above a level L cover
+`BODY_AREA` squared widths of the PSF, and the light below L is at least the fraction `WIDE`. For a
+star or a small galaxy that fraction is a hundredth. The background B of a peak of height I is the
+lower of L and the saddle between peak and body:
 
     contrast = I / B - 1,    part = (I - B) a / sum of the body's light,
 
-a being the area of a point source's image. Every disk has peaks at high resolution. By chance as
-many sources lie before or behind a galaxy as on an equal area of sky: n = `CHANCE` times its area.
-So a peak of low part and of a contrast under `CLUMP` is structure and no source, the galaxy's
-morphology has its light; on galaxies so large that n is over 1, under `CLUMP` / n. Up to
-`MEMBER_PART` it is a source in the galaxy's group, clump or neighbour; not so if its part is over
-`CLUMP_PART` and its contrast over `STAR`. To all others the galaxy is a background. The galaxy's
-own position is the peak next to the middle of its body, where the light, clipped at L / 2, is
-highest under a filter as wide as the body: there clumps weigh no more than the disk they lie in.
+where a is the area of a point source's image. Every disk has peaks at high resolution. The expected
+number of unrelated sources in front of or behind a galaxy is n = `CHANCE` times its area. The
+rules:
+
+* A peak of low part and of a contrast under `CLUMP` (under `CLUMP` / n if n exceeds 1) is
+    structure,
+  not a source: its light belongs to the galaxy's morphology.
+* Other peaks up to `MEMBER_PART` are sources in the galaxy's group, clumps or neighbours, unless
+  their part is over `CLUMP_PART` and their contrast over `STAR`.
+* For all other peaks the galaxy is a background.
+
+The galaxy's own position is the peak nearest to the middle of its body. The middle is the maximum
+of the light, clipped at L / 2 and filtered to the width of the body, so that clumps have little
+weight.
 """
 
 from __future__ import annotations
@@ -28,8 +34,8 @@ from .hills import root, saddles, watershed
 
 # [FWHM^2] area of a body's highest isophote, FWHM of the PSF: a star reaches it at 1e-3 of its peak
 BODY_AREA = 100.0
-# [thresholds] level of a body from which its peaks can be structure: of fainter ones little is
-# above the noise, and every peak stays a source
+# [thresholds] Level of a body from which its peaks can be structure. Little of a fainter body is
+# above the noise, so that each of its peaks stays a source.
 BRIGHT = 8.0
 # [1] light under a body's level, of all that is above OUTLINE of it
 WIDE = 0.3
@@ -39,10 +45,10 @@ CLUMP, CLUMP_PART, MEMBER_PART = 2.0, 0.03, 0.2
 STAR = 30.0
 # [arcsec^-2] sources by chance: 90 on a square arcminute, to i = 26 (simulation/counts.py)
 CHANCE = 0.025
-# [1] of a body's level: saddles to it below that are its outskirts, peaks behind them not its own
+# [1] of a body's level: a peak behind a lower saddle does not belong to the body.
 FRINGE = 0.03
-# [1] two bodies are one where the fainter one's level exceeds that of the saddle between them by
-# less, and where the saddle has at least that part of the brighter one's level
+# [1] Two bodies are merged if the fainter one's level exceeds the saddle between them by less than
+# the first number, and the saddle is at least the second number times the brighter one's level.
 SAME_BODY, SAME_LIGHT = 0.4, 0.2
 # [1] of a body's level: its outline, down to which its light is added up
 OUTLINE = 0.1
@@ -92,7 +98,7 @@ class Bodies:
     structure: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
 
     def body_at(self, position) -> int:
-        """Number of the bright body whose outline holds a position (2,) [px], -1 for none."""
+        """Number of the bright body whose outline contains a position (2,) [px], -1 for none."""
         y, x = np.rint(position).astype(int)
         for i, body in enumerate(self.bodies):
             (rows, columns), mask = body.outline
@@ -152,7 +158,7 @@ def bodies_of(image, places, fwhm_px, threshold, scale) -> Bodies:
 
 
 class _Tree:
-    """Basins joined at falling levels; bodies are those that have become wide enough.
+    """Basins merged at decreasing levels; bodies are those that have become wide enough.
 
     body (n,), level (n,): of each basin the number of its body, -1 for none, and the level at which
     it is part of it; levels: of each body, the highest of those that were joined
@@ -246,7 +252,7 @@ def _center(image, outline, level, at, area, bright):
     away = np.hypot(*(at - middle).T) / radius
     if not bright:
         return at[int(image[at[:, 0], at[:, 1]].argmax())].astype(float)
-    if (away < 1).any():  # the brightest for its distance: light of a galaxy falls outwards
+    if (away < 1).any():  # the brightest for its distance, since a galaxy fades outwards
         heights = np.log(np.maximum(image[at[:, 0], at[:, 1]], 1e-3))
         return at[int(np.where(away < 1, heights - away, -np.inf).argmax())].astype(float)
     return middle.astype(float)

@@ -5,19 +5,20 @@ on one side. So the least light that a source has on each ring and on both sides
 
     m(r, t) = min over r' <= r of min(I(r', t), I(r', t + pi)),
 
-is taken for the source's own, and the image less the sum of these is searched. What is left may
-also be a clump of the galaxy itself. Two things tell: clumps are where the galaxy's light is, and
-have its colours. A peak h is a source of its own where
+is its symmetric model, and the image minus the sum of all these models is searched. A residual peak
+may also be a clump of the galaxy itself. Two criteria distinguish them: clumps lie on the galaxy's
+light, and have its colours. A peak h is a source of its own if
 
     h >= c(r) sqrt(H (m + 1)),   or   h >= COLOURED sqrt(H (m + 1)) and its spectrum is another
 
-H being the galaxy's peak and m its light there, all in sigma, r the distance from its centre and
-c(r) = CLUMP r / CLUMP_ARCSEC within MIN_CLUMP and MAX_CLUMP. Clumps that hold some part of all
-the galaxy's light would ask for H, those that hold some part of the light about them for m; the
-mean of the two, sqrt(H m), tells neighbours from clumps better than either. Near the centre the
-symmetric light holds part of the neighbour's too, so that less of it is left than it has; far out a
-single clump, whose other side is empty, is left whole. Galaxies are also wider than clumps: under
-the filter of small galaxies, too, a neighbour is left.
+where H is the galaxy's peak and m its light there, all in sigma, r is the distance from its centre
+and c(r) = CLUMP r / CLUMP_ARCSEC, limited to MIN_CLUMP and MAX_CLUMP. If a clump's light were a
+fraction of the galaxy's, the threshold would scale with H; if it were a fraction of the local
+light, with m. The mean of both, sqrt(H m), separates neighbours from clumps better than either.
+c(r) grows
+outwards: near the centre the symmetric model contains part of the neighbour, so that less of it is
+left; far out a single clump, whose opposite side is empty, is left whole. Galaxies are also wider
+than clumps, so a neighbour must also be left under the filter of small galaxies.
 
 Source: the symmetry, Lupton et al. 2005 (SDSS's deblender) and Melchior et al. 2018 (Astronomy and
 Computing 24, 129).
@@ -27,23 +28,23 @@ from __future__ import annotations
 
 import numpy as np
 
-# Chosen on forty simulated fields of 1024 pixels (4000 sources) and reported on others, see
-# docs/fields.md. Larger ones lose neighbours, smaller ones take clumps for sources.
+# Chosen on forty simulated fields of 1024 pixels (4000 sources); results on other fields are in
+# docs/fields.md. With larger values neighbours are lost, with smaller ones clumps become sources.
 CLUMP, MIN_CLUMP, MAX_CLUMP, COLOURED = 0.45, 0.15, 0.75, 0.15
-# [arcsec] from its centre where a galaxy's clumps reach CLUMP: three half-light radii of the usual
-# galaxy in deep images. A larger one finds more neighbours and takes more clumps for sources
+# [arcsec] Distance from a galaxy's centre at which c(r) is CLUMP: three half-light radii of a
+# typical galaxy in deep images. A larger value finds more neighbours and more clumps.
 CLUMP_ARCSEC = 0.8
-# [sigma^2] chi2 beyond its mean by which a residual's spectrum must differ from the galaxy's; and
-# the part of the galaxy's light there by which the model may be wrong in each channel
+# [sigma^2] Smallest excess of chi2 between a residual's spectrum and the galaxy's; and the relative
+# error of the galaxy's model in each channel.
 OTHER_COLOUR, MODEL_PART = 8.0, 0.1
-# of the galaxy's light in the searched image: what symmetry leaves of a smooth one
+# [1] of the galaxy's light in the searched image: residual of a smooth, symmetric galaxy
 ASYMMETRY = 0.05
-# [sigma] a peak's height, and its height under the filter of small galaxies: two noisy sides are
-# compared, and many places tried
+# [sigma] Smallest height of a peak, and its height under the filter of small galaxies. They are
+# high because the noise of both sides enters and many positions are tested.
 MIN_PEAK_SIGMA, MIN_WIDE = 5.0, 6.0
-REACH_PX, N_ANGLES = 60, 32  # of a source's light, and directions in which it is followed
+REACH_PX, N_ANGLES = 60, 32  # radius and number of rays of a source's symmetric model
 MIN_LIGHT = 0.5  # [sigma] where a source's own light ends
-UNSEEN = 1e30  # [sigma] a side that was not seen: the other one tells
+UNSEEN = 1e30  # [sigma] value of unobserved pixels: the minimum is then that of the other side
 
 
 def symmetric_residual(image, seen, positions):
@@ -63,7 +64,7 @@ def symmetric_residual(image, seen, positions):
         )
         rings = np.minimum(rings, np.roll(rings, N_ANGLES // 2, axis=1))
         rings = np.clip(np.minimum.accumulate(rings, axis=0), 0, UNSEEN / 2)
-        if rings[0].max() == UNSEEN / 2:  # nothing is known of its centre
+        if rings[0].max() == UNSEEN / 2:  # its centre was not observed
             continue
         bright = np.flatnonzero((rings > MIN_LIGHT).any(axis=1))
         if not len(bright):
@@ -86,7 +87,7 @@ def residual_scatter(model):
 
 
 def parabolic_peak(image, position):
-    """The top of the parabolas through a peak and its neighbours, within half a pixel: (2,)."""
+    """Offset (2,) of a peak by parabolas through it and its neighbours, within half a pixel."""
     y, x = (int(p) for p in position)
     if not (0 < y < image.shape[0] - 1 and 0 < x < image.shape[1] - 1):
         return np.array(position, float)
@@ -106,8 +107,8 @@ def _top(before, at, after):
 def brightest_peak_near(rest, place, radius):
     """Position (2,) and height of the brightest that is left within `radius` [px] of a peak.
 
-    Peaks are searched in units of `residual_scatter`, which is larger towards the brighter source:
-    they lie outwards of the light's own top, by a pixel or so.
+    Peaks are found in units of `residual_scatter`, which increases towards the brighter source.
+    So they lie about a pixel outwards of the maximum of the light.
     """
     low = np.maximum(np.asarray(place) - radius, 0)
     window = rest[low[0] : place[0] + radius + 1, low[1] : place[1] + radius + 1]
@@ -128,7 +129,7 @@ def is_a_source(place, height, model, image, signals, centres, fwhm, scale):
     inside = np.clip(np.rint(centres).astype(int), 0, np.array(image.shape) - 1)
     heights = np.maximum(image[inside[:, 0], inside[:, 1]], 1e-3)
     away = np.hypot(*(centres - place).T)
-    host = np.argmax(np.log(heights) - away / fwhm)  # brightest there, if light falls by e a FWHM
+    host = np.argmax(np.log(heights) - away / fwhm)  # brightest if light falls by e per FWHM
     clump = np.sqrt(max(heights[host], 1.0) * (model[at] + 1))
     part = CLUMP * away[host] * scale / CLUMP_ARCSEC
     if height >= np.clip(part, MIN_CLUMP, MAX_CLUMP) * clump:

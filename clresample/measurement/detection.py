@@ -1,13 +1,13 @@
 """Detects sources with `sep` on signal-to-noise images in the model frame.
 
-Three searches, each adding what those before have not found:
+Three searches, each of which adds new sources:
 
-1. every observation alone, the sharpest first, its channels added up (`signal_to_noise.py`): there
-   neighbours are best told apart
-2. all observations together, under filters of several widths: there faint sources, large ones and
-   those seen in few bands are reached (`signal.combine_bands`)
-3. what is left of the sharpest observation without the symmetric light of those found: neighbours
-   on the flanks of brighter ones (`companions.py`)
+1. every observation alone, the sharpest first, its channels added up (`signal_to_noise.py`), which
+   separates neighbours best
+2. all observations together, under filters of several widths (`combine_bands`), which detects
+   faint sources, large ones and those bright in few bands
+3. the sharpest observation minus the symmetric light of the sources so far (`companions.py`), which
+   shows neighbours on the flanks of brighter sources
 
 Sources: sep, Barbary 2016 (JOSS 1, 58), after SExtractor, Bertin & Arnouts 1996 (A&AS 117, 393);
 those of signal_to_noise.py and companions.py.
@@ -44,8 +44,8 @@ from .star_light import UNEVEN, peak_beside, remove_star_light, saturated_stars
 
 # [sigma] of the combined image: white noise reaches it once in two million independent pixels
 THRESHOLD = 5.0
-# [FWHM^2] least area of what is left beside brighter sources: its area above the threshold is what
-# a noise that grows towards them leaves
+# [FWHM^2] Smallest area above the threshold of a residual beside a brighter source. It is small
+# because the noise grows towards that source.
 MIN_AREA_BESIDE = 0.125
 ALL = "all"  # the name of the combined image
 
@@ -59,11 +59,11 @@ class Detection(ShownDetection):
     frame: Frame that their positions, pixels (y, x), belong to
     peaks (S,) [sigma]: signal to noise of each in the image that found it
     found_in (S,): name of that image: an observation's, or "all"
-    groups (S,): number of the source in whose light each lies and whose clump it may be, see
-        clumps.py; its own number where there is none
-    image (Ny, Nx) [sigma]: signal to noise of all observations together, 0 where nothing was seen
-    hosts (S,): by `detect_more`, number of the fit's source, the large galaxy in whose light each
-        lies and whose clump it may be; -1 where there is none. None by `detect`
+    groups (S,): number of the large galaxy of which each may be a clump, see clumps.py; its own
+        number if there is none
+    image (Ny, Nx) [sigma]: signal to noise of all observations together, 0 if not observed
+    hosts (S,): only from `detect_more`: number of the fit's source, a large galaxy, of which each
+        may be a clump; -1 if there is none. None from `detect`
     """
 
     sources: tuple[Source, ...]
@@ -80,20 +80,19 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> D
 
     The sharpest image separates neighbours best, the combined one reaches the faintest sources. So
     the images are searched one after the other, the sharpest first and then all together under
-    filters of several widths; a peak within 0.7 FWHM of a source that an earlier image found is
-    that source again, the FWHM being that of the image's PSF. At last the sharpest image is
-    searched without the symmetric light of what was found. The light of stars with a saturated core
-    is left out before. Needs `sep` (the extra `detect`).
+    filters of several widths. A peak within 0.7 FWHM of the image's PSF of an earlier source is
+    the same source. Finally the sharpest image is searched without the symmetric light of these
+    sources. The light of stars with a saturated core is removed first. Needs `sep` (the extra
+    `detect`).
 
-    observations: sequence of Observation, as `check_observations` takes them, or of astropy's
-        NDData and CCDData that have a PSF
-    frame: Frame to search and to place the sources in; None = `model_frame(observations)`
-    threshold [sigma]: least signal to noise of a peak. 5 is reached by white noise once in two
+    observations: sequence of Observation, see `check_observations`, or of astropy's NDData and
+        CCDData that have a PSF
+    frame: Frame to search, in whose pixels positions are; None = `model_frame(observations)`
+    threshold [sigma]: smallest signal to noise of a peak. White noise reaches 5 once in two
         million independent pixels of one image; lower thresholds find more noise
-    scatters (n_observations, n_widths): of the observations' signal to noise where there is no
-        source, which it is divided by; None = as `noise_scatter` finds them, so that each patch has
-        its own
-    returns Detection; its sources can be given to `deblend` with its frame
+    scatters (n_observations, n_widths): scatter of each observation's signal to noise without
+        sources, by which it is divided; None = from `noise_scatter`, for this patch of sky
+    returns Detection; pass its sources to `deblend` with its frame
 
     Raises ValueError for a threshold that is not a positive number, and for observations that do
     not fit together; ImportError, with what to install, without `sep`.
@@ -107,7 +106,7 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> D
 def noise_scatter(observation, frame) -> np.ndarray:
     """Scatter (n_widths,) of an observation's signal to noise where there is no source, at least 1.
 
-    More than 1 is noise that the weights do not tell of, such as that of correlated pixels.
+    It exceeds 1 if the weights underestimate the noise, for example of correlated pixels.
 
     observation: one; frame: Frame that it is searched in
     """
@@ -117,8 +116,8 @@ def noise_scatter(observation, frame) -> np.ndarray:
 def detect_more(result, *, threshold=THRESHOLD) -> Detection:
     """Finds sources in a fit's residuals that were too faint beside others before the fit.
 
-    The residuals are searched as `detect` does, but for neighbours on flanks. Where the model is
-    bright its own errors are larger than the noise: there the variance is 1 / w + (0.15 model)^2.
+    The residuals are searched as by `detect`, without the search for neighbours on flanks. Errors
+    of a bright model exceed the noise, so the variance is 1 / w + (0.15 model)^2.
 
     result: a fitted blend
     threshold [sigma]: as for `detect`
@@ -251,7 +250,7 @@ def _search(observations, frame, threshold, known, scatters=None, beside=True, p
     if beside and found.positions:
         places = np.array(found.positions)
         new = _companions(sep, levelled, sharp, everything, places, threshold, widths[sharp], scale)
-        # what is left of a star's light is not symmetric about a source on it
+        # the residual light of a star is not symmetric about a source on it
         new = [one for one in new if not held[sharp][tuple(np.rint(one[0]).astype(int))]]
         found.add_companions(new, signals[sharp].flat(), observations[sharp].label)
     order, groups = found.in_order()
@@ -298,7 +297,7 @@ def _companions(sep, signals, sharp, everything, places, threshold, fwhm, scale)
     for place, _ in new:
         at = place.astype(int)
         top, height = brightest_peak_near(rest, at, round(fwhm / 2))
-        # two peaks, one on either side of a top, are that one source
+        # two peaks on either side of a maximum are one source
         if any(np.hypot(*(top - p)) <= SAME_SOURCE * fwhm for p, _ in found):
             continue
         if brightest_peak_near(wide, at, round(fwhm))[1] < MIN_WIDE:

@@ -8,7 +8,7 @@ import numpy as np
 def watershed(light, inside, at):
     """Basins (Ny, Nx) int32 of the sources at pixels (S, 2), numbered from 1, 0 outside.
 
-    Without gaps: each pixel belongs to the source from which the light falls to it.
+    There are no gaps: from each pixel the steepest ascent leads to the source that it belongs to.
     """
     peaks, n_peaks = _hills(light, inside)
     hills = peaks[at[:, 0], at[:, 1]] - 1
@@ -29,7 +29,7 @@ def watershed(light, inside, at):
 def _hills(light, inside):
     """The hills of the light (Ny, Nx) int32, numbered from 1, 0 outside, and their number.
 
-    A hill: all pixels from which the steepest way up ends on the same peak.
+    A hill is the set of pixels from which the steepest ascent ends at the same peak.
     """
     n_y, n_x = light.shape
     kind = np.int32 if light.size < 1 << 31 else np.int64

@@ -1,8 +1,8 @@
 """Smooth levels of signal-to-noise images: sky left in, and the far wings of bright sources.
 
-A level that is wider than any source that is searched for makes peaks of noise exceed a threshold,
-and joins all light of an image. It is the median in cells of `CELL_PX`, over 3 x 3 cells, between
-which it is interpolated. Up to `DEAD_SIGMA` it counts as the light of faint sources, and stays.
+A smooth level lifts peaks of noise over the threshold and connects all light of an image. It is
+estimated as the median in cells of `CELL_PX`, over 3 x 3 cells, and interpolated between them. A
+level up to `DEAD_SIGMA` is attributed to faint sources and not subtracted.
 """
 
 from __future__ import annotations

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-# sep's deblending: levels between a threshold and a peak, of equal ratio, and the part of an
-# object's light that a branch must hold to be an object of its own. SExtractor's 32 levels and
-# 0.005 lose the neighbours of bright galaxies, whose branch rises over few of the levels; a part
-# under 0.001 takes clumps of large galaxies for objects.
+# sep's deblending: number of levels of equal ratio between threshold and peak, and the smallest
+# fraction of an object's light in a branch that becomes an object. With SExtractor's 32 levels and
+# 0.005, neighbours of bright galaxies are lost, because their branches span few levels. With less
+# than 0.001, clumps of large galaxies become objects.
 N_LEVELS, MIN_CONTRAST = 256, 0.001
 # How often sep's limits are doubled: to 32 times an image's pixels in its buffer, and to 32,768
 # branches of one object, some 100 bytes for each of both
@@ -28,9 +28,10 @@ def import_sep():
 def new_peaks(sep, image, threshold, area, known, apart, own=True):
     """Positions (y, x) and heights of the objects in a signal-to-noise image, brightest first.
 
-    area [px]: least of an object; known: positions (2,) of sources; objects whose peak is within
-    `apart` [px] of one are left out, and (own) those that hold one: under a wide filter a pair of
-    them is one object whose peak lies between
+    area [px]: smallest area of an object
+    known: positions (2,) of sources; objects whose peak is within `apart` [px] of one are left out
+    own: also leave out objects that contain a known source: under a wide filter a pair of sources
+        is one object with its peak between them
     """
     objects, segments = _objects(sep, image, threshold, area)
     places = np.array(known).reshape(-1, 2)
@@ -49,7 +50,7 @@ def _objects(sep, image, threshold, area):
 
     From 1, 0 = none.
     """
-    if not image.max(initial=0) > threshold:  # as most residuals: sep takes 1 ms to say so
+    if not image.max(initial=0) > threshold:  # true of most residuals; sep would take 1 ms
         return [], np.zeros(image.shape, np.int32)
     objects, segments = _with_room(
         sep,
@@ -79,7 +80,7 @@ def _with_room(sep, n_pixels, extract):
     for _ in range(DOUBLINGS):
         try:
             return extract()
-        except Exception as error:  # sep raises nothing more special
+        except Exception as error:  # sep raises no more specific class
             if "set_extract_pixstack" in str(error):
                 sep.set_extract_pixstack(2 * sep.get_extract_pixstack())
             elif "set_sub_object_limit" in str(error) or "deblend" in str(error):

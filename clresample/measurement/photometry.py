@@ -14,11 +14,13 @@ def fluxes(result):
 
         F_s = sum_i A_i |S_i|,  cov(F_s, F_t) = sum_ij |S_i| cov(A_i, A_j) |S_j|,  |S| = sum of S
 
-    over the components i of s and j of t: with morphologies fixed. Where the result has Errors, the
-    covariances are theirs, marginal over morphologies, and |S| has what the smooth profile holds
-    beyond its box, where it is under the noise: a percent of the flux at signal to noise 10. And
-    F is without what the bound of morphologies at 0 adds to it, 0.1 to 1 % of bright galaxies,
-    see `Errors.flux_bound_bias`; it may be below 0 by chance.
+    over the components i of s and j of t: with morphologies fixed. If the result has Errors, the
+    covariances are theirs, marginalised over morphologies. |S| then includes the light of the
+    smooth
+    profile beyond its box, below the noise: a percent of the flux at signal to noise 10. The bias
+        of
+    F from the bound of morphologies at 0 is subtracted, 0.1 to 1 % for bright galaxies, see
+    `Errors.flux_bound_bias`; so F can be negative.
 
     result: a fitted blend
     returns flux (S, C) [counts] and covariance (C, S, S) [counts^2]: flux and variance are NaN
@@ -49,9 +51,9 @@ def fluxes(result):
 def channel_covariances(result):
     """Covariances (S, C, C) [counts^2] of each source's fluxes between channels.
 
-    Morphologies that are not known move the fluxes of all channels together, so that colours are
-    known better than fluxes. Without Errors channels are independent. Settings.flux_floor is in it
-    as common to all channels. The variance is NaN as in `fluxes`.
+    Errors of a morphology change the fluxes of all channels together, so that colours are more
+    accurate than fluxes. Without Errors channels are independent. Settings.flux_floor is included
+    as an error common to all channels. The variance is NaN as in `fluxes`.
     """
     variance = np.diagonal(fluxes(result)[1], axis1=1, axis2=2).T  # (S, C)
     found = np.zeros((*variance.shape, variance.shape[1]))
@@ -68,9 +70,9 @@ def redistribute(result, i_observation) -> np.ndarray:
 
         share_s = (data - sky) max(m_s, 0) / sum_t max(m_t, 0)
 
-    m_s being the model of s on the observed pixels. The shares of a pixel add up to its data
+    where m_s is the model of s on the observed pixels. The shares of a pixel add up to its data
     without the sky, unless all models are fainter there than 1e-5 of the channel's brightest model
-    pixel: there all shares are 0.
+    pixel: then all shares are 0.
 
     result: a fitted blend; i_observation: number or name of the observation
     returns (S, Co, My, Mx) [counts]: NaN where the data have no weight
@@ -149,7 +151,7 @@ def add_groups(table, result, flux, covariance, groups):
 
 
 def whole_groups(rows, bands):
-    """Groups whose members were fitted apart, in Columns of all fits: in place.
+    """Sets the group columns of groups whose members were fitted apart, in Columns of all fits.
 
     Their fluxes are the sums of their members', their errors those of members without covariance.
     """

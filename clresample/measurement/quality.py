@@ -10,7 +10,7 @@ from ..sky.sources import PointSource
 
 # [px] from a pixel's centre to its corners
 PIXEL_RADIUS = 0.5**0.5
-# [radii of the core] Light beside a masked core, which is wider than the core where it saturates.
+# [radii of the core] Distance up to which light beside a masked core shows that it is saturated.
 BESIDE = 4.0
 # [sigma] Light of a pixel beside a saturated core is brighter: detectors saturate at 1e3 sigma.
 SATURATED_SIGMAS = 20.0
@@ -24,8 +24,8 @@ def summary(result) -> dict:
         frame), n_components, n_iterations, losses; chi2 {channel: per pixel with a weight on the
         frame, NaN without any}, n_pixels {channel: number of these pixels}, sky {channel} [counts],
         shifts {observation: (y, x)} [model px]; misfits, the numbers of the sources that
-        are flagged MISFIT (`misfitted_sources`); good, whether the fit converged at a model that
-        describes the data and there is none
+        are flagged MISFIT (`misfitted_sources`); good, True if the fit converged at a model that
+        describes the data and no source is a misfit
     """
     chi2, n_pixels = channel_chi2(result)
     misfits = np.flatnonzero(misfitted_sources(result)).tolist()
@@ -86,9 +86,10 @@ def fitted_sources(result):
 def masked_cores(result, positions):
     """Sources (S,) bool whose core is masked in some channel, as it is where it is saturated.
 
-    The core is what lies within half of the PSF's FWHM of the position (S, 2) [model px], and the
-    pixel that holds it. Of a point source, one pixel without weight is enough; of others half of
-    the core, beside light of over 20 sigma in a pixel: faint ones are not saturated.
+    The core consists of the pixels within half of the PSF's FWHM of the position (S, 2)
+    [model px], and the pixel at the position. The criterion is one pixel without weight for a point
+    source. For others it is half of the core, and a neighbouring pixel of over 20 sigma, since
+    faint sources do not saturate.
     """
     found = np.zeros(len(result.sources), dtype=bool)
     for footprint in result.footprints:

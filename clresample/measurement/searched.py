@@ -10,7 +10,7 @@ from .peaks import new_peaks
 # [FWHM^2] least area of connected pixels above the threshold: smaller ones are not as wide as the
 # PSF, but noise on top of light just below the threshold
 MIN_AREA = 0.25
-# of the wider PSF's FWHM: nearer to a source that is found, a peak counts as that source
+# [FWHM of the wider PSF] A peak nearer than this to a source counts as that source.
 SAME_SOURCE = 0.7
 
 

@@ -10,9 +10,9 @@ def moments(components, light, beyond=None):
 
         c = sum_x x I(x) / sum_x I(x),   Q = sum_x (x - c)(x - c)^T I(x) / sum_x I(x)
 
-    components (k): with `origin` and `morphology`; light (k,): share of each in I, in its box, any
-        unit; where there is no light at all, components count alike
-    beyond (k, 6): sums over what each has beyond its box, see Errors.beyond; None: nothing
+    components (k): with `origin` and `morphology`; light (k,): weight of each in I, in its box, in
+        any unit; without any light, components have equal weights
+    beyond (k, 6): sums over the light of each beyond its box, see Errors.beyond; None = none
     returns c (2,) [px] and Q (2, 2) [px^2], rows and columns (y, x); NaN where every morphology is
         zero, or the light no number
     """

@@ -5,8 +5,8 @@ channel is the matched filter: with weights w, data d and the PSF P, K = P * G,
 
     n(x) = sum_q K(q - x) w(q) d(q),    v(x) = sum_q K(q - x)^2 w(q)
 
-and the signal to noise n / sqrt(v). It is found on the observation's own pixels; being as smooth as
-two PSFs, it is then interpolated (cubic splines) to the model's.
+and the signal to noise n / sqrt(v). It is computed on the observation's own pixels. As it is twice
+as smooth as the PSF, it can then be interpolated to the model's pixels by cubic splines.
 
 Source: the matched filter, Zackay & Ofek 2017 (ApJ 836, 187); the sum of squares over bands,
 Szalay, Connolly & Szokoly 1999 (AJ 117, 68).
@@ -24,16 +24,16 @@ from ..deblending.posterior.residuals import TOGETHER_PX
 from ..sky.noise import sigma_below_zero
 from .levels import level_of
 
-# [arcsec] Standard deviations of G: of points, of galaxies of the usual size in deep images (half
-# of their light within 0.25 arcsec) and of large faint ones. A galaxy between two of them loses
-# under a tenth of its signal to noise. Each more costs one transform a channel.
+# [arcsec] Standard deviations of G: for points, for galaxies of typical size in deep images (half
+# of their light within 0.25 arcsec) and for large faint ones. A galaxy between two of them loses
+# less than a tenth of its signal to noise. Each further width costs one transform a channel.
 WIDTHS_ARCSEC = (0.0, 0.2, 0.5)
 SMALL_GALAXY = 1  # which of them is that of galaxies of the usual size
-# of a channel's largest variance v: a point with less lies on pixels that are masked or not seen
+# [1] of a channel's largest variance v: smaller values mean masked or unobserved pixels
 MIN_WEIGHT = 0.1
-# of the same, below which float32 holds nothing of n any more
+# [1] of the same: below it n is lost in the rounding of float32
 NO_WEIGHT = 1e-5
-SAME_PX = 1e-3  # by which pixels of the model may lie beside observed ones and count as the same
+SAME_PX = 1e-3  # [px] distance below which model and observed pixels coincide
 # [sigma^2] Sum of squares up to which its significance is tabulated; above, both grow alike
 TABLE_END, TABLE_STEP = 400.0, 0.25
 
@@ -43,8 +43,8 @@ class SignalToNoise:
     """One observation's signal to noise; of unit scatter in white noise.
 
     sums, squares (W, Ny, Nx): float32, in the model's pixels, of each width: the sum over channels
-        of the signal to noise, and that of the squares of what is positive; 0 where not seen
-    n_seen (Ny, Nx): how many channels have seen a pixel
+        of the signal to noise, and of the squares of its positive values; 0 if not observed
+        n_seen (Ny, Nx): number of channels that cover a pixel
     channels (C, My, Mx) [sigma]: of the narrowest filter, on the observation's pixels
     places (Ny, Nx, 2) [px]: of the model's pixels on these
     """
@@ -77,7 +77,7 @@ class SignalToNoise:
     def levelled(self):
         """The signal without smooth levels (levels.py), and those of its sky alone (W,) [sigma].
 
-        Sums of squares are left out where there is a level: they hold it in every channel.
+        Sums of squares are omitted where there is a level, since it enters them in every channel.
         """
         sums, squares, skies = self.sums.copy(), self.squares.copy(), []
         root = np.sqrt(np.maximum(self.n_seen, 1))
@@ -92,8 +92,7 @@ class SignalToNoise:
     def spectra(self, at):
         """Signal to noise (n, C) [sigma] of the channels at pixels (n, 2) of the model.
 
-        Pixels outside are taken to its edge: that of the nearest observed pixel, 0 where there is
-        none.
+        Pixels outside get the value of the nearest observed pixel, or 0 if there is none.
         """
         at = np.clip(at, 0, np.array(self.n_seen.shape) - 1)
         places = np.rint(self.places[at[:, 0], at[:, 1]]).astype(int)
@@ -180,12 +179,13 @@ def _in_frame(images, seen, places):
 def combine_bands(signals) -> tuple[np.ndarray, np.ndarray]:
     """All channels of SignalToNoises in one frame together: two images (Ny, Nx) [sigma].
 
-    the first: as of a spectrum of equal signal to noise in all channels, under the narrowest filter
-    the second: at each pixel the most significant of all widths, and of two sums over channels,
-        that of the first, best for a source that all of them see, and the sum of the squares of
-        those that are positive, best for one whose spectrum nothing is known of: very red ones or
-        very blue ones are in few bands. Both are in units in which noise alone is normal. Noise
-        reaches 5 in the largest of them six times as often as in one: once in 3e5 resolved places
+    the first: for a spectrum of equal signal to noise in all channels, under the narrowest filter
+    the second: at each pixel the most significant value of all widths and of two sums over
+        channels. One is the sum of the first image, best for sources visible in all channels. The
+        other is the sum of the squares of positive values, best for unknown spectra, such as very
+        red or very blue ones. Both have a normal distribution for noise. Their maximum reaches 5 in
+        noise six
+        times as often as a single one: once in 3e5 resolution elements
     """
     n_seen = sum(s.n_seen for s in signals)
     root = np.sqrt(np.maximum(n_seen, 1))
@@ -198,7 +198,7 @@ def combine_bands(signals) -> tuple[np.ndarray, np.ndarray]:
 
 
 def significance(squares, n_channels) -> np.ndarray:
-    """Sigmas (...) of a normal distribution that noise reaches as often as it does such a sum.
+    """Significance (...) [sigma] of sums of squares: normal deviates of equal probability in noise.
 
         P(sum > q) = sum_k binomial(n, k) 2^-n P(chi^2_k > q)
 

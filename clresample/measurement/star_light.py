@@ -1,13 +1,13 @@
-"""Removes the light of saturated stars from signal-to-noise images, so peaks on it show.
+"""Removes the light of saturated stars from signal-to-noise images.
 
-The light of such a star departs from the known PSF: wings beyond its image, diffraction spikes,
-ghosts. It still comes from one place and changes slowly outwards. Along every ray from the star
-the light above the median of each ring is opened: the part that persists over more than a source's
-width belongs to the star,
+The light of such a star differs from the model PSF: wings beyond the PSF image, diffraction spikes,
+ghosts. It still changes slowly along rays from the star. The light above the median of each ring is
+opened morphologically along every ray, so that light that extends over more than a source's width
+is attributed to the star:
 
-    m(r) = max over windows of length L that contain r of the least light in them.
+m(r) = max over windows of length L that contain r of the minimum in the window.
 
-The search runs on the remainder of the image, in units of its scatter on the same ring.
+The remainder of the image is searched, in units of its scatter on the same ring.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ SOURCE_FWHM = 3.0
 # [sigma] Median light of a ring over the least of any, where that of the star has ended; rings
 # count of which this part was seen.
 END_SIGMAS, MIN_COVERED_FRACTION = 0.5, 0.25
-SPIKE_REACH = 2.0  # [radii of that ring] how far spikes reach, which hold a small part of a ring
-UNEVEN = 0.1  # [1] of what lasts: spikes are not even along a ray
-MAX_REACH_PX = 300  # [model px] of a star's light that is searched apart; further out it is faint
+SPIKE_REACH = 2.0  # [radii of that ring] radius up to which spikes are removed
+UNEVEN = 0.1  # [1] of the opened light: fluctuation of spikes along a ray
+MAX_REACH_PX = 300  # [model px] largest radius from which light is removed; it is faint beyond
 MIN_SEEN_WEIGHT = 0.99  # [1] of the weights of interpolation between pixels
 FWHM_A_SIGMA = 2.3548  # of a Gaussian
-# [FWHM of a filtered point] Pixels nearer to the core's edge hold no peak of their own.
+# [FWHM of a filtered point] Pixels nearer to the core's edge have no peaks of their own.
 MIN_CORE_DISTANCE_FWHM = 1.0
-# [FWHM of a filtered point] Pixels nearer to masked ones hold none either, beside a star.
+# [FWHM of a filtered point] Pixels nearer to masked ones beside a star have none either.
 MIN_MASK_DISTANCE_FWHM = 1.0
 # [FWHM of the PSF] Cores of several images nearer than this, and than their radius, are one star's.
 SAME_STAR_FWHM = 1.0
@@ -172,7 +172,7 @@ def _in_window(image, seen, star, fwhm):
     middle, spread = _statistics(left[own], rings[own], end)
     noise = np.hypot(spread[np.minimum(rings, end)], UNEVEN * (mean + model))
     left = (left - middle[np.minimum(rings, end)]) / noise
-    # light beside pixels without weight is that of one side
+    # light beside pixels without weight comes from one side only
     left[
         (away < star.radius + MIN_CORE_DISTANCE_FWHM * fwhm)
         | _beside(~seen, MIN_MASK_DISTANCE_FWHM * fwhm)

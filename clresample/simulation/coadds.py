@@ -1,7 +1,7 @@
 """Mosaics of simulated scenes, as Observations: exposures drawn on their own grids, then added.
 
-A scene's image and its mosaic hold the same exposure time and the same sources; noise is drawn
-anew, exposure by exposure.
+A scene's image and its mosaic have the same exposure time and the same sources. Noise is drawn
+again for each exposure.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from .galaxies import draw
 from .mosaics import MosaicOperator, drizzle, lanczos
 from .scenes import SimulatedImage, SimulatedScene
 
-# [deg] Pixels of exposures are turned against those of the mosaic, so that the sub-pixel phases,
-# of which the noise depends, change from pixel to pixel.
+# [deg] Rotation between exposures and mosaic, so that the sub-pixel phases, on which the noise
+# depends, change from pixel to pixel.
 ANGLE_DEG = 20.0
 # [px] Dithers of drizzled exposures: a box of half pixels. Then their drops [px], and the pixel of
 # the mosaic in units of theirs: common choices for HST.
@@ -39,15 +39,15 @@ class MosaicImage(SimulatedImage):
         return self.mosaic
 
     def with_noise(self, rng):
-        """Refused: the noise of a mosaic is drawn with its exposures."""
+        """Raises ValueError: the noise of a mosaic is drawn with its exposures."""
         raise ValueError("the noise of a mosaic comes of its exposures: make another mosaic")
 
 
 def resampled(image, *, noise="correlated", order=3, grid=None) -> MosaicImage:
-    """A SimulatedImage, light and noise as they are, Lanczos-resampled to another `Grid.flat`.
+    """A SimulatedImage with its light and noise Lanczos-resampled to another `Grid.flat`.
 
-    noise: "correlated" states the noise's correlation, "white" leaves it out, as most do
-    grid: None has the image's pixel scale, upright, on the same sky
+    noise: "correlated" = with the NoiseCorrelation; "white" = without it, as in most analyses
+    grid: None = the image's pixel scale, without rotation, on the same sky
     """
     grid = grid or _upright(image.grid, 1.0)
     return _mosaic(image, lanczos(image.grid, grid, order), [image.data], noise)

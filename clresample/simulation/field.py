@@ -17,11 +17,11 @@ from .surveys import EUCLID_VIS, PSF_PIXELS, RUBIN_UGRIZY
 SKIES = "plain", "real", "bright"
 # [mag] brightest i magnitude, and dex per magnitude of the number counts, as of galaxies of i 20-26
 BRIGHTEST, COUNTS_SLOPE = 18.0, 0.32
-# [arcsec] half side of the stamp that a source is drawn on, down to each i magnitude: beyond it the
-# light of a source as bright is under a tenth of the deepest noise
+# [arcsec] Half side of a source's stamp, down to each i magnitude: beyond it the light of such a
+# source is under a tenth of the lowest noise.
 STAMP_ARCSEC = ((20.0, 15.0), (22.0, 10.0), (24.0, 6.0), (99.0, 4.0))
 CLUSTER_ARCSEC = 1.5  # scatter of a companion's position about its host, in y and in x
-PSF_NODES = 5  # places along each axis at which the PSF cube of a mosaic is given
+PSF_NODES = 5  # positions along each axis of a mosaic's PSF samples
 
 
 def simulate_field(
@@ -55,11 +55,11 @@ def simulate_field(
     density [arcmin^-2]: of sources with i < `faintest` [mag]; None = 36, for "real" as published
     rubin_bands: some of u g r i z y
     angle_deg [deg]: by which Rubin's pixels are turned
-    clustering: part of the sources that lie beside another one, 1.5 arcsec away or so
-    stars: part of the sources that are stars; None = 0.05, for "real" as published
-    psf_variation: by which part the PSF's width grows from the left edge to the right one; Rubin's
-        from the lower to the upper
-    bad_columns: of each mosaic that hold nothing
+    clustering: fraction of the sources that lie beside another one, about 1.5 arcsec away
+    stars: fraction of the sources that are stars; None = 0.05, for "real" as published
+    psf_variation: relative growth of the PSF's width from the left edge to the right edge, Rubin's
+        from the lower edge to the upper edge
+    bad_columns: number of dead columns of each mosaic
     center_deg (2,) [deg]: right ascension and declination of the field's centre
 
     Spectra are power laws. "bright" takes no density, faintest, clustering and stars. Needs GalSim.
@@ -179,7 +179,7 @@ def _mosaic(survey, grid, sources, rng, variation, axis, n_bad, center_deg):
     data += sigma[:, None, None] * rng.standard_normal(data.shape)
     bad = np.zeros(grid.shape, bool)
     bad[:, rng.choice(grid.shape[1], n_bad, replace=False)] = True
-    data[:, bad] = 1e6  # what a dead column holds: no light
+    data[:, bad] = 1e6  # values of dead columns
     nodes = [np.linspace(0, n - 1, PSF_NODES) for n in grid.shape]
     places = np.array([(y, x) for y in nodes[0] for x in nodes[1]])
     images = np.stack([_psf(survey, _width(grid, p, variation, axis)) for p in places])

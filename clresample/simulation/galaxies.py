@@ -8,15 +8,15 @@ import numpy as np
 
 CATALOGUE_FILE = "real_galaxy_catalog.fits"
 # GalSim's folding, k-space cut and k-space accuracy, 5, 10 and 100 times below its defaults:
-# Gaussians are right to 3e-6 of their peak, and two drawings of a parametric galaxy (EUCLID, RUBIN)
-# agree to 75 dB; the default accuracy holds them to 56
+# Gaussians are accurate to 3e-6 of their peak, and two drawings of a parametric galaxy (EUCLID,
+# RUBIN) agree to 75 dB; with the defaults they agree to 56 dB.
 DRAWING = {"folding_threshold": 1e-3, "maxk_threshold": 1e-4, "kvalue_accuracy": 1e-7}
 
 # Parametric galaxies: sizes as of the COSMOS sample's faint galaxies, the rest plain ranges
 HALF_LIGHT_ARCSEC, HALF_LIGHT_SCATTER = 0.25, 0.4  # median, standard deviation of its logarithm
 BULGE_FRACTION = (0.0, 0.5)  # of all light
 BULGE_SIZE = 0.4  # half-light radius in units of the disk's
-BULGE_CUT = 8.0  # half-light radii, where the wings of n = 4, which never end, are cut
+BULGE_CUT = 8.0  # half-light radii at which the infinite wings of n = 4 are cut off
 KNOT_FRACTION = (0.1, 0.4)  # of the disk's light
 N_KNOTS = (5, 30)
 AXIS_RATIO = (0.3, 1.0)

@@ -19,8 +19,8 @@ class SimulatedMosaic:
 
     survey: the instrument; grid: Grid with a WCS
     data (C, Ny, Nx) [counts]: float32; noise_sigma (C,) [counts]: of every pixel
-    bad (Ny, Nx) bool: pixels whose data are worthless: dead columns, gaps, saturated cores
-    psf_positions (K, 2) [px], psf_images (K, C, ny, nx): the PSF where it is given
+    bad (Ny, Nx) bool: invalid pixels: dead columns, gaps, saturated cores
+    psf_positions (K, 2) [px], psf_images (K, C, ny, nx): the PSF at K positions
     psf_spacing [px]: distance of two samples of the PSF images
     """
 
@@ -41,11 +41,11 @@ class SimulatedField:
     mosaics: of Euclid and Rubin
     truth: {column: array (S,)}: ra, dec [deg]; y, x [px of the first mosaic]; snr, the signal to
         noise of the best possible filter over all mosaics and channels; kind "galaxy" or
-        "star"; host, the number of the source that it was put beside, -1 for none; mag_* and flux_*
-        [mag, uJy] of each channel, a galaxy's with all of its clumps
-    clumps: {column: array (K,)}: the clumps of galaxies, which are no sources: group, the number in
-        truth of the galaxy; ra, dec [deg]; y, x [px of the first mosaic]; flux_* [uJy] of each
-        channel. Empty for fields whose galaxies have none listed
+        "star"; host, the number of the source beside which it was placed, -1 for none; mag_* and
+        flux_* [mag, uJy] of each channel, those of a galaxy with all of its clumps
+        clumps: {column: array (K,)}: the clumps of galaxies, which are not sources: group, the
+            number in truth of the galaxy; ra, dec [deg]; y, x [px of the first mosaic]; flux_*
+            [uJy] of each channel. Empty for fields without a list of clumps
     """
 
     mosaics: tuple[SimulatedMosaic, ...]

@@ -5,8 +5,8 @@ Both are linear. With the pixels d_k of all exposures, of noise sigma, a mosaic'
     m_i = sum_k M_ik d_k,      variance_i = sigma^2 sum_k M_ik^2
     PSF(v) = < sum_k M_ik P(v - c_i + x_k) >
 
-c_i and x_k being the centres of pixels and < > the mean over the mosaic. Neighbours share input
-pixels, and so their noise.
+where c_i and x_k are the centres of pixels and < > is the mean over the mosaic. Neighbouring pixels
+share input pixels, so their noise is correlated.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ..sky.psf import PSF
 N_MEAN = 1500
 # Lags of the correlation [input px]: Lanczos-3 sums over 6 pixels a side.
 MAX_LAG_PX = 6
-# Least share of a mosaic's pixel that drops must fill for it to have a value.
+# Smallest fraction of a mosaic's pixel covered by drops for it to have a value.
 MIN_FILLED = 1e-3
 
 
@@ -58,7 +58,7 @@ class MosaicOperator:
         return np.asarray(self.matrix.power(2).sum(axis=1)).reshape(self.grid.shape)
 
     def correlation(self) -> NoiseCorrelation:
-        """Of two pixels' noise, each in units of its own scatter, in the mean over the mosaic."""
+        """Mean correlation of two pixels' noise over the mosaic, in units of their own scatters."""
         rows, offsets = self._sample()
         scatter = np.sqrt(self.variance().ravel())
         scaled = sparse.diags(1 / np.where(scatter > 0, scatter, 1)) @ self.matrix

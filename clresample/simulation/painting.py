@@ -18,30 +18,32 @@ from .surveys import EUCLID_VIS
 DIAMETER_M, OBSCURATION, JITTER_ARCSEC = 1.2, 0.35, 0.03
 MOFFAT_BETA = 4.765
 FWHM_OF_SIGMA = 2.3548
-# Halo of the handed-out PSF's missing wings, about as r^-3 (King 1971, PASP 83, 199; Slater et al.
-# 2009, PASP 121, 1267)
+# Halo of the wings missing in the published PSF, about r^-3 (King 1971, PASP 83, 199; Slater et al.
+# 2009, PASP 121, 1267).
 HALO_BETA, HALO_ARCSEC = 1.5, 3.0  # [1], [arcsec] of a Moffat profile
-# [mag] i.e. of the band itself, of the faintest star whose brightest pixel is full
+# [mag] in the band itself: the faintest star with a saturated pixel
 SATURATION_MAG = {"Euclid": 17.8, "Rubin": 16.5}
 # [noise of a pixel] surface brightness down to which a source is drawn, in every channel
 FAINTEST_LIGHT = 0.1
-RADII_ARCSEC = np.geomspace(0.5, 120, 100)  # [arcsec] where it is looked for
-# [samples a side] of handed-out PSF images: an Airy pattern has a hundredth of its light beyond
+RADII_ARCSEC = np.geomspace(
+    0.5, 120, 100
+)  # [arcsec] radii at which the surface brightness is tested
+# [samples a side] of published PSF images: an Airy pattern has a hundredth of its light beyond
 PSF_PX = {"Euclid": 129, "Rubin": 65}
-# Samples of handed-out PSFs in pixels: an Airy pattern's highest frequency, D / wavelength = 8.1
-# per arcsec, is above what pixels of 0.1 arcsec hold
+# [px] Spacing of published PSFs: an Airy pattern's highest frequency, D / wavelength = 8.1 per
+# arcsec, exceeds the limit of pixels of 0.1 arcsec.
 PSF_SPACING = {"Euclid": 0.5, "Rubin": 1.0}
-PSF_NODES = 3  # places along each axis at which a PSF that varies is given
-DEAD = 1e6  # [counts] value of worthless pixels
+PSF_NODES = 3  # positions along each axis of the samples of a varying PSF
+DEAD = 1e6  # [counts] value of invalid pixels
 LARGEST_FFT = 16384  # [samples a side] of a drawing
 
 
 @dataclass(frozen=True, eq=False)
 class InstrumentModel:
-    """One survey's PSFs, handed out and true, and where its pixels really lie.
+    """One survey's published and true PSFs, and the true positions of its pixels.
 
-    width (C,): of the handed-out PSF over the true one; wings: see Spoilers.psf_wings
-    variation: by which part the PSF widens across the mosaic, along axis `axis`
+    width (C,): ratio of the published PSF's width to the true one; wings: see Spoilers.psf_wings
+    variation: relative growth of the PSF's width across the mosaic, along axis `axis`
     """
 
     survey: object
@@ -67,7 +69,7 @@ class InstrumentModel:
         return 1 + self.variation * (pixel[self.axis] / (shape[self.axis] - 1) - 0.5)
 
     def psf_images(self, grid):
-        """Places (K, 2) [px] and handed-out images (K, C, ny, nx), pixel response included."""
+        """Positions (K, 2) [px] and published images (K, C, ny, nx), pixel response included."""
         galsim, survey = import_galsim(), self.survey
         nodes = PSF_NODES if self.variation else 1
         ends = [np.linspace(0, n - 1, nodes) if nodes > 1 else [(n - 1) / 2] for n in grid.shape]
@@ -88,7 +90,7 @@ class InstrumentModel:
 def painted(survey, grid, sources, spoilers, rng, center_deg, *, second, **options):
     """The SimulatedMosaic of sources and their squared signal to noise (S,).
 
-    grid: flat Grid where the pixels really lie; second: whether its WCS is offset from the other's
+    grid: flat Grid of the true pixel positions; second: True if its WCS has an offset
     options: variation, axis, bad_columns
     """
     width = signed(rng, spoilers.psf_width, survey.n_bands)
@@ -116,7 +118,7 @@ def painted(survey, grid, sources, spoilers, rng, center_deg, *, second, **optio
 
 
 def _saturated(data, instrument):
-    """Saturates the bands; pixels (Ny, Nx) bool that are full in any of them."""
+    """Saturates the bands; returns the pixels (Ny, Nx) bool that are saturated in any of them."""
     survey = instrument.survey
     galsim, scale = import_galsim(), survey.pixel_scale_arcsec
     counts = survey.counts(np.full(survey.n_bands, SATURATION_MAG[survey.name]))

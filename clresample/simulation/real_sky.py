@@ -22,7 +22,7 @@ from .surveys import EUCLID_VIS
 # Spectral index of f_nu ~ wavelength^index: mean, standard deviation
 DISK_SPECTRUM, RED_SPECTRUM, STAR_SPECTRUM = (1.2, 0.7), (2.5, 0.3), (1.0, 1.0)
 CLUSTER_ARCSEC = 1.5  # [arcsec] scatter of a companion's position about its host, in y and in x
-LARGE_ARCSEC = (2.0, 20.0)  # [arcsec] half-light radii of galaxies that are asked for
+LARGE_ARCSEC = (2.0, 20.0)  # [arcsec] half-light radii of the `n_large` galaxies
 # The bright field: its galaxies' half-light radii [Euclid px], Sersic indices and magnitudes
 N_BRIGHT, BRIGHT_PX, BRIGHT_N, BRIGHT_MAG = 6, (8.0, 30.0), (1.0, 4.0), (17.5, 20.5)
 N_KNOTS, DISK_LIKE = 30, 1.6  # clumps of its disks; Sersic index up to which one is a disk

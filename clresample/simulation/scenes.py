@@ -18,13 +18,16 @@ from .galaxies import draw, import_galsim, open_catalogue, random_galaxy
 from .structure import real_galaxy
 from .surveys import EUCLID_VIS, RUBIN_UGRIZY, Survey
 
-MODEL_PSF_SIGMA_PX = 0.8  # the paper's minimal PSF, in pixels of the frame that a model lives in
+MODEL_PSF_SIGMA_PX = 0.8  # the paper's minimal PSF, in pixels of the model frame
 MAGNITUDE_RANGE = (20.0, 29.0)  # [mag] the paper's uniform range
-SMOOTH_MAGNITUDE_RANGE = (20.0, 25.5)  # [mag] of VIS with smooth spectra: what both telescopes see
+SMOOTH_MAGNITUDE_RANGE = (
+    20.0,
+    25.5,
+)  # [mag] of VIS with smooth spectra: detectable by both telescopes
 CENTRAL_FRACTION = 2 / 3  # of a stamp's side: where galaxies are put
 MAX_REAL_ARCSEC = 2.0  # [arcsec] half-light radius of a stamp's largest galaxy of a real sky
 MAX_SOURCES = 10  # the paper's scenes hold 1 to 10 galaxies
-# Gaussians of sigma 2 and then 1 Euclid pixels, in one: no light is left above Nyquist's limit
+# Gaussians of sigma 2 and 1 Euclid pixels, combined: they leave no light above Nyquist's limit
 SMOOTHING_ARCSEC = np.hypot(2, 1) * EUCLID_VIS.pixel_scale_arcsec
 # Colours where no table is given: mean and spread of the power law's index, fitted to CatSim's rows
 POWER_LAW_INDEX = (1.3, 1.2)
@@ -47,7 +50,7 @@ class SimulatedImage:
     data (C, Ny, Nx) [counts]: all sources and noise, the sky subtracted
     contributions (S, C, Ny, Nx) [counts]: each source alone, without noise
     truth (S, Ny, Nx) [1]: each source at unit flux under a Gaussian PSF of 0.8 pixels of this grid
-        and its pixel: what a perfect model on this grid would be
+        and its pixel: the perfect model on this grid
     magnitudes (S, C) [mag], counts (S, C) [counts]: of the whole sources, also beyond the stamp
     positions_px (S, 2) [px]: (row, column) of the sources
     """
@@ -73,7 +76,7 @@ class SimulatedImage:
         return np.broadcast_to(inverse[:, None, None], self.data.shape).copy()
 
     def observation(self):
-        """The image as the `Observation` that a fit is given."""
+        """The image as an `Observation` for a fit."""
         return Observation(
             self.data,
             self.psf,
@@ -93,9 +96,9 @@ class SimulatedImage:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SimulatedScene:
-    """A blend of S galaxies seen by Euclid and Rubin.
+    """A blend of S galaxies observed by Euclid and Rubin.
 
-    seed: what made it
+    seed: of the random numbers
     euclid, rubin: `SimulatedImage` of each; the Euclid grid is the one of joint models
     profiles (S): GalSim objects at unit flux, smoothed, centred on the origin
     galaxies (S): rows of the catalogue, or None for parametric galaxies
@@ -210,8 +213,8 @@ def simulate_scene(
     n_pixels: Rubin pixels a side; Euclid has as many as the same sky holds
     center_deg (2,) [deg]: right ascension and declination of the centre; grids then have a WCS
     sky: "plain", or "real" for galaxies to 2 arcsec as of `simulate_field`, without a catalogue
-    spectra: "independent", VIS magnitudes and Rubin's drawn apart, as in the paper's tests;
-        "smooth", one spectrum a galaxy: VIS is what r, i and z make of it, uniform in 20 - 25.5
+    spectra: "independent", VIS and Rubin magnitudes drawn independently, as in the paper's tests;
+        "smooth", one spectrum a galaxy: VIS follows from r, i and z, uniform in 20 - 25.5
     returns SimulatedScene: images with noise [counts], and the truth behind them
 
     Raises ValueError for bad numbers, sky, spectra or table; ImportError without GalSim.
@@ -291,8 +294,8 @@ def _random_source(rng, half_arcsec, catalogue, rows, sky, spectra):
 def vis_magnitude(ugrizy):
     """Euclid's VIS magnitude of sources of given Rubin magnitudes.
 
-    The flux density of VIS is the mean of r, i and z, weighted by ln(wavelength) of the part of VIS
-    that each covers: by the photons that a flat f_nu sends there.
+    The flux density of VIS is the mean of r, i and z. The weight of each is the number of photons
+    of a flat f_nu in its part of VIS, the difference of ln(wavelength).
 
     ugrizy (..., 6) [mag]; returns (...) [mag]
     """

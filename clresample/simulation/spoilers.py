@@ -9,22 +9,22 @@ import numpy as np
 GAP_PX = 24  # [px] width of a gap between two chips, of either survey, once exposures are added
 COSMIC_PX = (3, 15)  # [px] length of a cosmic ray's track
 COSMIC_SIGMA = (20.0, 300.0)  # [sigma] height of its pixels, log-uniform
-BLEED_DECAY = 0.7  # part of a saturated column's surplus that goes on to the next pixel
+BLEED_DECAY = 0.7  # fraction of a saturated column's surplus passed to the next pixel
 
 
 @dataclass(frozen=True)
 class Spoilers:
-    """Sizes of the faults of simulated images; one generator seed decides their signs and places.
+    """Sizes of the faults of simulated images; a random seed sets their signs and positions.
 
     wcs_offset_px [px]: range of the offset of the second instrument's WCS, in its own pixels
-    psf_width [1]: range by which the PSF that is handed out is wider or narrower than the one that
-        drew the image, each band by its own
-    psf_wings [1]: part of a star's light in a halo that the handed-out PSF does not have
-    sky_sigma [sigma]: of a pixel's noise, the level of sky left in, or taken too much of, each band
+    psf_width [1]: range of the relative difference in width between the published PSF and the one
+        that drew the image, drawn for each band
+    psf_wings [1]: fraction of a star's light in a halo that the published PSF does not have
+    sky_sigma [sigma]: level of sky left in each band, of either sign, in units of a pixel's noise
     cosmic_rays [1e6 px]: unmasked tracks in a million pixels
     gaps: chip gaps of each mosaic, whose pixels have no weight
-    saturation: whether bright stars saturate and bleed along their columns
-    mask_saturated: whether saturated pixels and bleeds are masked
+    saturation: True if bright stars saturate and bleed along their columns
+    mask_saturated: True if saturated pixels and bleeds are masked
 
     Raises ValueError for a size below 0.
     """

@@ -9,8 +9,8 @@ import numpy as np
 from .counts import half_light_arcsec, is_elliptical, sersic_index
 from .galaxies import BULGE_CUT, import_galsim
 
-# Spectral indices of f_nu ~ wavelength^index about that of the galaxy: bulges and bars are old and
-# red, arms and clumps young and blue, by half a magnitude of g - i either way
+# Spectral indices of f_nu ~ wavelength^index relative to the galaxy's: bulges and bars are old and
+# red, arms and clumps young and blue, by half a magnitude of g - i in either direction.
 BULGE_INDEX, ARM_INDEX, CLUMP_INDEX = 0.8, -0.5, -1.2
 ARM_STEPS = 18  # Gaussians along one arm, half of their width apart at its outer end
 ARM_TURNS = 0.75  # turns of an arm from 0.6 to 2.2 half-light radii
@@ -74,8 +74,9 @@ def disk_parts(
 ) -> tuple[LightPart, ...]:
     """The parts of a disk galaxy.
 
-    size [arcsec]: half-light radius of the disk; n: its Sersic index; n_knots: clumps in it, None =
-    more in larger ones; knots: range of their part of the light. Large ones have bars and arms
+    size [arcsec]: half-light radius of the disk; n: its Sersic index; n_knots: number of clumps,
+    None = more in larger disks; knots: range of their fraction of the light. Large disks have bars
+    and arms
     """
     galsim = import_galsim()
     ratio, angle = rng.uniform(0.3, 1.0), _angle(rng)
@@ -178,7 +179,7 @@ def _gaussians(places, widths, fluxes):
 
 
 def _clumps(rng, disk, n, fraction, index, arms):
-    """The LightPart of n clumps: on the arms where there are any, else as the disk's light is.
+    """The LightPart of n clumps on the arms, or distributed as the disk's light if it has none.
 
     Their fluxes follow N(>f) ~ 1 / f, as of luminosities of HII regions, Kennicutt et al. 1989
     (ApJ 337, 761), over a factor of 20.

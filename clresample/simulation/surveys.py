@@ -1,9 +1,8 @@
 """The surveys of the paper: pixels, PSFs, and magnitudes turned into counts and noise.
 
-Three tables: what the paper prints for its five surveys (`PAPER_SURVEYS`), what its notebooks use
-for them (`NOTEBOOK_SURVEYS`: two entries in the printed table's column of sigmas look like full
-widths at half maximum), and the two instruments of its blended scenes (`EUCLID_VIS`,
-`RUBIN_UGRIZY`).
+Three tables: the five surveys with the paper's printed values (`PAPER_SURVEYS`), with those of its
+notebooks (`NOTEBOOK_SURVEYS`: two of the printed sigmas seem to be full widths at half maximum),
+and the two instruments of its blended scenes (`EUCLID_VIS`, `RUBIN_UGRIZY`).
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ class Survey:
         counts(m) = exposure * zero point * 10^(-0.4 (m - 24))
         variance of a pixel = counts(sky) * pixel^2                  sky [mag/arcsec^2]
 
-    name: what it is called
+    name: of the survey
     pixel_scale_arcsec [arcsec]: side of a pixel
     bands (C,): names of the channels
     psf_sigma_arcsec (C,) [arcsec]: standard deviation of the PSF before the pixel
