@@ -1,9 +1,9 @@
-"""The command `clresample` and the demonstration. Imports every room; nothing imports it.
+"""The command `clresample` and the demonstration. Imports all packages; none imports it.
 
-`clresample --help` and a run's first line must appear at once, while NumPy, astropy, pyopencl and
-matplotlib take a tenth to half a second each. So the modules of the command import what they run
-inside the functions that run it. The demonstration and the example are themselves imported when
-they run, and have their imports at the top.
+`clresample --help` and a run's first line must appear at once, but NumPy, astropy, pyopencl and
+matplotlib take a tenth to half a second each to import. So the command's modules import inside the
+functions that need the import. The demonstration and the example are imported only when they run,
+and have their imports at the top.
 """
 
 import sys

@@ -30,12 +30,12 @@ from .options import print_note, printable
 from .resample import add_resample
 from .simulate import add_simulate
 
-# Of an error's line: some errors quote a whole file.
+# Largest length of an error's line: some errors quote a whole file.
 MAX_CHARACTERS = 900
 
 
 class Parser(argparse.ArgumentParser):
-    """Complains in one line, without the usage that `--help` gives."""
+    """Prints an error in one line, without the usage text."""
 
     def error(self, message):
         self.exit(2, f"{self.prog}: {printable(message, MAX_CHARACTERS)}\n")

@@ -22,8 +22,8 @@ from .options import (
 )
 from .outputs import check_scene, folder_outputs
 
-# iterations of the fit whose residuals are searched for more sources: by then the sources that were
-# found are fitted to a few percent; more would find the same ones later
+# Iterations of the fit whose residuals are searched for more sources: the detected sources are then
+# fitted to a few percent. More iterations would find the same sources later.
 FIRST_LOOK = 30
 
 DESCRIPTION = """\
@@ -78,7 +78,7 @@ def add_deblend(commands):
         "--rel-tol",
         metavar="T",
         type=fraction,
-        help="stop when the loss falls by less than this part of itself",
+        help="stop when the loss falls by less than this fraction of itself",
     )
     add_dtype_option(fit, "arithmetic of the fit")
     add_device_option(fit)
@@ -127,7 +127,7 @@ def _progress(arguments, message):
 
 
 def _fit(arguments, scene, device):
-    """The fit; before it, where sources or shifts are to be found, a short one to find them in."""
+    """The fit; preceded by a short one if sources or shifts are to be determined first."""
     import numpy as np
 
     settings = _settings(arguments, scene.settings)
@@ -143,7 +143,7 @@ def _fit(arguments, scene, device):
             from ..deblending.solver.constraints import Positivity, ProxChain
             from ..deblending.solver.prior import SingleScalePrior
 
-            # structure of a pixel alone leaves unknown neighbours' light in the residuals
+            # structure at the scale of a pixel only leaves undetected neighbours in the residuals
             small = SingleScalePrior(correlation_px=1.0)
             first = replace(first, prior=small, constraints=ProxChain(Positivity()))
         result = _deblend(arguments, "first look", scene.observations, sources, first, given)

@@ -1,8 +1,8 @@
-"""`python -m clresample.cli.demo`: galaxies seen by Euclid and Rubin, deblended and resampled.
+"""`python -m clresample.cli.demo`: galaxies in Euclid and Rubin, deblended and resampled.
 
 Six blended galaxies are simulated, then fitted to both telescopes' images at once and to each
 alone, and compared with the truth. Writes deblended.png, the catalogue, and the joint fit with its
-models and residuals; and, of the resampling alone, what `demo_resample` writes.
+models and residuals; and the files of `demo_resample`.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ example  clresample simulate field -o sky
          clresample field sky/field.toml -o sky/out
          clresample report sky/out"""
 
-# the largest group of fits that is asked for by default, as a part of the memory that is free
+# Default memory of a group of fits, as a fraction of the free memory.
 MEMORY_PART = 8
 
 
@@ -115,7 +115,7 @@ def run(arguments):
     """Reads the field file, runs the field and reports. Returns the exit status."""
     import os
 
-    # what runs beside the fits has small matrices too: see one_blas_thread
+    # other threads have small matrices too: see one_blas_thread
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     from ..fields.field_toml.field_file import read_field
     from ..fields.options import MEMORY, MIN_BOUND, MIN_MEMORY, default_group_memory

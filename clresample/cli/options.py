@@ -1,4 +1,4 @@
-"""Options that subcommands share, the values they take, and the lines that subcommands print."""
+"""Shared options of subcommands, the types of their values, and printed lines."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def print_progress(arguments, message):
 def printable(text, most=None):
     """A text for a terminal: control characters as their escapes, no more than `most` characters.
 
-    Of a longer one the middle is left out: the end often says what to do.
+    The middle of a longer text is left out, since the end often contains the remedy.
     """
     shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
     if most is None or len(shown) <= most:
@@ -127,7 +127,7 @@ def non_negative_integer(text):
 
 
 def _number(text):
-    """The number that a text holds, NaN where it holds none."""
+    """The number in a text; NaN if the text is not a number."""
     try:
         return float(text)
     except ValueError:

@@ -20,8 +20,8 @@ from .options import (
 )
 from .outputs import file_outputs
 
-# |D|, the factor by which the difference kernel raises noise: warned of above the first, refused
-# above the second. Equal PSFs have 1; in an image with a hundred times the noise nothing is seen.
+# |D|, the noise gain of the difference kernel: a note above the first value, an error above the
+# second. Equal PSFs have 1; an image with a hundred times the noise would be useless.
 GAIN_WARNED, GAIN_REFUSED = 2.0, 100.0
 
 DESCRIPTION = """\
@@ -198,7 +198,7 @@ def run(arguments):
 
 
 def _operator(arguments, device, grid_in, grid_out, psfs):
-    """The TiledResampler; its gain and its floored power are checked, and noted where they count.
+    """The TiledResampler; prints notes on its gain and its floored power if they are large.
 
     Raises ValueError for grids that do not overlap, too little memory and too much gain.
     """

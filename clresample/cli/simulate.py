@@ -195,7 +195,7 @@ def _write_surveys(folder, field):
         )
         paths.append(path)
     coadds = ", ".join(f'"rubin/coadd_{band}.fits"' for band in rubin.survey.bands)
-    # MER's noise is correlated, which is found unless it is said that this one's is not
+    # the reader would estimate the correlation of MER's noise; this simulation's is white
     tables = [
         f'[[mosaic]]\nformat = "euclid-mer"\npath = "euclid"\nname = "{euclid.survey.name}"\n'
         'noise = "white"\n',

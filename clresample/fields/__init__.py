@@ -1,4 +1,4 @@
-"""Whole fields: survey mosaics of any size to one catalogue, blend by blend, losing none.
+"""Whole fields: survey mosaics of any size to one catalogue, blend by blend.
 
 Imports `files`, `measurement`, `deblending` and `sky`.
 """

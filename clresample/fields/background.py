@@ -10,8 +10,8 @@ from scipy import ndimage
 from ..sky.noise import MIN_PIXELS, background
 from .box import Box
 
-# [px] Side of a cell. Large against sources, which else are taken for sky: with smaller cells the
-# wings of bright galaxies go; with larger ones gradients of the sky stay.
+# [px] Side of a cell, large compared to sources. With smaller cells the wings of bright galaxies
+# are subtracted as sky; with larger ones gradients of the sky remain.
 CELL_PX = 128
 
 
@@ -19,7 +19,7 @@ CELL_PX = 128
 class Background:
     """A surface through levels at the middles of cells, linear between them.
 
-    Beyond the outer ones it goes on as between the last two.
+    Beyond the outermost levels it is extrapolated linearly.
 
     levels (n_y, n_x) [counts]; cell (2,) [px]: their distance (y, x)
     """
@@ -41,12 +41,12 @@ class Background:
 def find_background(read, good, shape) -> Background:
     """The Background of an image.
 
-    read: called with a Box, returns its pixels; good: the same, which of them count
+    read: called with a Box, returns its pixels; good: called with a Box, returns its valid pixels
     shape (Ny, Nx) [px]
 
-    Each cell has the level of `sky.noise.background`, sources clipped away; cells without 32 good
-    pixels that of their neighbours; then each takes the median of the 3 x 3 about it, so that a
-    cell full of a bright galaxy does not count.
+    The level of a cell is that of `sky.noise.background`, with sources clipped. Cells with fewer
+    than 32 valid pixels get the level of their neighbours. Then each level is replaced by the
+    median of 3 x 3 cells, which removes cells dominated by a bright galaxy.
     """
     counts = [max(1, round(n / CELL_PX)) for n in shape]
     edges = [np.linspace(0, n, k + 1).astype(int) for n, k in zip(shape, counts, strict=True)]

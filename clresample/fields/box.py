@@ -9,7 +9,7 @@ import numpy as np
 
 from ..sky.mapping import NOISE_PX
 
-# [px] by which equal pieces of sky may differ in size across an image, its distortion's effect
+# [px] Difference in size of equal pieces of sky across an image, because of its distortion.
 SAME_PX = 0.01
 
 
@@ -90,9 +90,9 @@ def outline(shape):
 def box_within(points, margin, step, whole) -> Box:
     """The pixels whose centres lie between points (n, 2) [px], (y, x), of the Box `whole`.
 
-    With `margin` more on each side, and more until the sides are multiples of `step`, both as far
-    as `whole` goes: where it ends on one side, they are taken on the other. So they have one shape
-    wherever in `whole` the points lie.
+    With `margin` more on each side, and more until the sides are multiples of `step`. At an edge of
+    `whole` the additional pixels are taken on the other side, so that the shape does not depend on
+    the position of the points in `whole`.
     """
     low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
     sides = []

@@ -1,8 +1,9 @@
 """Rebuilds single sources of a finished field without their neighbours.
 
 Pixels, weights and PSFs are read from the mosaics of the run, models from models.fits, errors of
-fluxes from the catalogue. A window about a source is rendered with the operator of the fits: all
-models that reach into it, of any blend, under the PSF at the source.
+fluxes from the catalogue. The operator of the fits renders a window around a source: all models
+    that
+reach into it, of any blend, with the PSF at the source.
 """
 
 from __future__ import annotations
@@ -31,8 +32,7 @@ class FieldCutouts:
     """Cutouts of the sources of a finished run over a field.
 
     folder: written by `run_field` or `clresample field`
-    mosaics: those of the run; None = those of its field file, which provenance.json names, with its
-        images
+    mosaics: those of the run; None = those of its field file, which is named in provenance.json
     device: see `get_device`
 
     Attributes: ids (S,) int64 and group_ids (S,) of the catalogue; mosaics; notes: messages for the

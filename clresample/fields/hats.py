@@ -28,8 +28,8 @@ from ..sky.wcs import axis_names
 
 FINEST = 29  # order of the index: pixels of 0.4 milliarcseconds, the finest that int64 numbers
 INDEX = f"_healpix_{FINEST}"
-# rows of a partition: one of ours takes 1 kB, and LSDB's workers hold a few partitions each; with
-# more they need gigabytes, with fewer there are thousands of files for a sky survey
+# Rows of a partition: a row takes 1 kB, and each of LSDB's workers has a few partitions in memory.
+# With more rows they need gigabytes; with fewer there are thousands of files for a sky survey.
 MAX_ROWS = 300_000
 LARGEST_ORDER = 10  # pixels of 3.4 arcminutes, smaller than a tile: no partition is divided further
 

@@ -14,7 +14,7 @@ from ..sky.psf_checks import PSFWarning
 from .box import Box
 from .models import ModelFile
 
-# [FWHM of the PSF] How far beyond a model's box its light is rendered, and looked for.
+# [FWHM of the PSF] Distance beyond a model's box up to which its light is rendered.
 REACH_FWHM = 3.0
 # [bytes] Images that are rendered in one call: more would not be faster.
 BATCH_BYTES = 64 << 20
@@ -71,7 +71,7 @@ class ModelLight:
             by_shift.setdefault(models.shift(i, i_mosaic), []).append(i)
         frame = self.reference.cutout(box.y0, box.x0, box.shape)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", PSFWarning)  # said when the field was run
+            warnings.simplefilter("ignore", PSFWarning)  # the field run has warned
             op = Resampler(frame, model_psf(), grid, psf, device=self.device)
         n_at_once = max(1, BATCH_BYTES // (4 * psf.n_bands * box.area))
         for shift, components in by_shift.items():

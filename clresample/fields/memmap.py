@@ -12,8 +12,8 @@ from ..files.atomic import FileError
 def create_memmap(path, dtype, shape) -> np.ndarray:
     """A new array of zeros in a file, an older one of that name replaced.
 
-    Its place on the disk is taken at once: a disk that is full is a FileError here, not a signal
-    that ends the process when a page is written (SIGBUS).
+    Its disk space is allocated at once. So a full disk raises FileError here, instead of ending the
+    process by a signal when a page is written (SIGBUS).
     """
     try:
         array = np.lib.format.open_memmap(path, "w+", dtype, shape)

@@ -24,7 +24,7 @@ class ComponentModel:
         model pixels
     morphology (ny, nx) [1]: its image under the model's PSF, with maximum 1
     spectrum (C,) [counts]: flux per model pixel where the morphology is 1; NaN in channels that do
-        not see it
+        not cover it
     """
 
     id: int

@@ -130,11 +130,11 @@ class Channel:
 class Mosaic:
     """One instrument's mosaic of a field.
 
-    name: of the instrument; grid: Grid of (Ny, Nx) of all channels, or a WCS that knows its shape
+    name: of the instrument; grid: Grid of (Ny, Nx) of all channels, or a WCS with a shape
     channels: of Channel, at least one
     psf: PSFField, PSF or its images, of one band or of one for each channel
-    noise: correlation of neighbouring pixels' noise, as in Observation, or None. An estimate is
-        made once, for the whole mosaic, by whoever makes the mosaic
+    noise: correlation of neighbouring pixels' noise, as in Observation, or None. An estimate must
+        be made before, once for the whole mosaic
     """
 
     name: str
@@ -236,9 +236,9 @@ class Mosaic:
         ignore (Ny, Nx) bool: pixels that get no weight
         subtract (C, Ny, Nx) [counts]: light that is not to be fitted
         extra (C, Ny, Nx) [counts^2]: variance that is added to the pixels'
-        psf_box: Box in whose middle the PSF is taken, as if it were the same everywhere; None = it
+        psf_box: Box in whose middle the PSF is evaluated, for the whole Observation; None = it
             varies as the mosaic's does
-        grid: Grid of the Box, where it was made before
+        grid: Grid of the Box, if it exists already
         """
         box = box or Box.of(self.grid.shape)
         weights = self._weights(box)
@@ -253,7 +253,7 @@ class Mosaic:
             weights = weights / (1 + weights * extra)
         zero_points = [c.zero_point for c in self.channels]
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", PSFWarning)  # said once, when the field is opened
+            warnings.simplefilter("ignore", PSFWarning)  # issued once, when the field is opened
             psf = self.psf.cutout(box.y0, box.x0) if psf_box is None else self._middle(psf_box)
             return Observation(
                 data,

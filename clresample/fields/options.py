@@ -27,24 +27,23 @@ class FieldOptions:
     settings: of the fits
     threshold [sigma]: least signal to noise of a source; passes: 1, or 2 to search each blend's
         residuals too
-    positions (S, 2) [deg]: right ascension and declination (y, x [arcsec] on a flat sky) of sources
-        that are known, or a SkyCoord of S places; None = search for them
-    part (i, n): run the i-th of n parts of the field (from 1) alone, for job arrays: its catalogue
-        has the sources whose centres lie in it; None = the whole
-    margin_px [model px]: around the part, which is searched and fitted too. Blends that reach from
-        the part to beyond the border are fitted without what lies there
-    tile_px [model px]: largest side of a tile of the search; overlap_px: by which tiles overlap
+    positions (S, 2) [deg]: right ascension and declination (y, x [arcsec] on a flat sky) of known
+        sources, or a SkyCoord of S positions; None = detect sources
+    part (i, n): run only the i-th of n parts of the field (from 1), for job arrays: its catalogue
+        has the sources whose centres lie in it; None = the whole field
+    margin_px [model px]: width of the border around the part that is searched and fitted too.
+        Blends that extend beyond the border are fitted without the sources beyond it
+    tile_px [model px]: largest side of a tile of the search; overlap_px [model px]: of tiles
     limits: of one fit; larger blends are cut
-    group_memory [bytes]: that a group of fits, and the search of a tile, may take in a worker; a
-        run that goes on keeps what it began with
-    worker_memory [bytes]: private memory that the system lets a worker process take in all (Linux);
-        None = what it has. What is refused costs a group its batch: it is fitted in halves, then
-        alone
+    group_memory [bytes]: limit for a group of fits, and for the search of a tile, in a worker; a
+        resumed run keeps the value of the first run
+    worker_memory [bytes]: limit on the private memory of a worker process, enforced by the system
+        (Linux); None = no limit. A group that exceeds it is fitted in halves, then one by one
     workers: processes; 0 = this one. task_timeout_s [s]: longest time of a group, None = no limit
     hats: write the catalogue in the HATS layout too, into DIR/hats
-    device: as `get_device` takes it, or a list: one worker process a device at least
-    scheduler: address of a `dask.distributed` scheduler, whose workers do the work instead; None =
-        this machine's
+    device: a choice for `get_device`, or a list, with at least one worker process for each device
+    scheduler: address of a `dask.distributed` scheduler, whose workers run the tasks; None =
+        processes of this machine
     field_number: of the ids, 0 to 8,388,607, see `source_ids`
     """
 
@@ -91,8 +90,8 @@ class FieldOptions:
 def default_group_memory(bound) -> int:
     """Memory [bytes] of a group of fits by prediction, in a process that may take `bound` in all.
 
-    Half of what its libraries leave: predictions are rough, and a group's results are held beside
-    the device's memory.
+    Half of the memory beside its libraries: predictions are rough, and a group's results need host
+    memory in addition to the device's.
     """
     return max(MIN_MEMORY, min(MEMORY, (bound - MIN_BOUND // 2) // 2))
 

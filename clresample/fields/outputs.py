@@ -65,8 +65,8 @@ def write_outputs(folder, job, parts, unsettled, about, seconds, hats=False) -> 
     about: plain values for the provenance; seconds: wall time by stage so far
     hats: write the catalogue in the HATS layout too, if it has rows
 
-    catalogue.{parquet,fits,ecsv} hold nothing that another run of the same field would change:
-    times are in fit_table.ecsv and provenance.json. Raises FileError.
+    catalogue.{parquet,fits,ecsv} are identical for repeated runs of the same field: times are in
+    fit_table.ecsv and provenance.json. Raises FileError.
     """
     last = _last_rounds(parts)
     table, blends = finalise_catalogue(job, parts, last, unsettled)

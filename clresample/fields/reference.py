@@ -1,4 +1,4 @@
-"""The model's pixels of a field, and a check that its mosaics go together."""
+"""The model's pixels of a field, and a check that its mosaics are consistent."""
 
 from __future__ import annotations
 

@@ -32,8 +32,8 @@ class FieldRun:
     """Results of a run in its folder.
 
     outputs: paths and numbers, see FieldOutputs; seconds: wall time by stage
-    failed: fits that were set aside; failed_tiles: {tile: why it could not be searched}
-    task_times: (stage, Outcome) of every task that the workers have done: who had it, and when
+    failed: fits that were set aside; failed_tiles: {tile: reason of the failed search}
+    task_times: (stage, Outcome) of every finished task, with its worker and times
     """
 
     outputs: FieldOutputs
@@ -96,7 +96,7 @@ def run_field(
             field_number=options.field_number,
         )
         parts, unsettled = fit_all_groups(job, engine, progress)
-        engine.close()  # its memory is for what follows
+        engine.close()  # frees its memory for the outputs
         clock.stop("fit")
         progress.stage("write", 1)
         outputs = write_outputs(folder, job, parts, unsettled, about or {}, seconds, options.hats)
@@ -135,8 +135,8 @@ def _check_outputs(folder, mosaics, reference, options):
 def _as_sent(mosaics):
     """The mosaics with their grids as another process gets them.
 
-    A WCS is sent as a header, whose numbers are rounded to their last digits. Fits take another
-    way for that, to 1e-5 of a flux: so this process, which may fit too, works with the same.
+    A WCS is sent as a header, with rounded numbers, which changes fluxes by 1e-5. This process,
+    which may run fits too, uses the same rounded WCS, so that results do not depend on the workers.
     """
     return tuple(replace(m, grid=pickle.loads(pickle.dumps(m.grid))) for m in mosaics)
 

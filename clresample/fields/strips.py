@@ -1,4 +1,4 @@
-"""Planes of images in files, read piece by piece; decoded rows are kept for other cutouts."""
+"""Planes of images in files, read piece by piece, with a cache of decoded rows."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from astropy.io import fits
 
 from ..files.atomic import FileError
 
-# [px] Rows that are kept together, in whole tiles: about the side of a small blend's cutout. Fewer
-# are more entries, more are decoded for a cutout that is the only one there.
+# [px] Rows of an entry, in whole tiles: about the side of a small blend's cutout. With fewer rows
+# there are more entries; with more, rows are decoded in vain for an isolated cutout.
 STRIP_PX = 64
-# [bytes] of all strips: a field of 4096 pixels a side, with six bands in pixels twice as large and
-# the errors of all, has 350 MB of them. The blends of a group lie all over a field. With 64 MB each
-# decoded its rows again: 7.6 GB of that field in all, at 160 MB a second a fifth of a run's time.
+# [bytes] Limit for all strips. A field of 4096 pixels a side, with six bands in pixels twice as
+# large and the errors of all, has 350 MB, and the blends of a group lie all over the field. With 64
+# MB each
+# blend decoded its rows again: 7.6 GB in all, at 160 MB a second a fifth of a run's time.
 MAX_BYTES = 384 << 20
-# Part of the memory that a process is bound to which they may take.
+# Largest fraction of a process's memory limit for all strips.
 PART = 0.1
-# Part of them that the rows of one box may take; larger ones would drive out all others.
+# Largest fraction of the cache for the rows of one box; larger ones would displace all others.
 LARGEST = 0.25
 BYTES = 4  # [bytes] of a pixel, of most images
 PLAIN = fits.ImageHDU, fits.PrimaryHDU
@@ -30,9 +31,9 @@ SCALES = {"BSCALE", "BZERO", "BLANK"}  # cards of images whose pixels are comput
 
 
 class StripCache:
-    """Strips of planes, those read longest ago dropped beyond `most` bytes. Safe between threads.
+    """Strips of planes, the least recently used dropped beyond `most` bytes. Thread-safe.
 
-    Only of images whose tiles are as wide as they are, of which any cutout decodes whole rows.
+    Used only for images whose tiles span their full width, so that any cutout decodes whole rows.
     """
 
     def __init__(self, most=MAX_BYTES):
@@ -102,8 +103,8 @@ STRIPS = StripCache()
 def read_section(hdu, plane, box):
     """The pixels of a Box of an HDU's plane, None where it has one.
 
-    Of a plain image, whole rows are taken and cut: astropy reads them at once, as a view of the
-    mapped file, but parts of rows one by one, 40 us each.
+    Whole rows of an uncompressed image are read and cut: astropy reads them at once, as a view of
+    the mapped file, but parts of rows one by one, 40 us each.
     """
     rows, columns = box.slices
     plain = isinstance(hdu, PLAIN) and not isinstance(hdu, fits.CompImageHDU)
@@ -146,6 +147,6 @@ class FilePlane:
 def _opened(path):
     """The HDUs of a file, which stay open: each process maps a file into its memory once.
 
-    Asked for by memmap=True, astropy would refuse integers without a sign, as masks have them.
+    With memmap=True astropy would refuse unsigned integers, which masks have.
     """
     return fits.open(path, lazy_load_hdus=True)

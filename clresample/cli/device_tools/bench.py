@@ -11,8 +11,8 @@ from . import measure
 from .workload import N_SOURCES, RenderWorkload, blends, fit, iterate_once
 
 N_FEW = 3  # blends, fitted after a first one
-GROWTH = 8  # times as many blends at most as were fitted before
-N_DIFFERENT = 32  # blends, which are fitted several times where more are wanted
+GROWTH = 8  # largest ratio of blends to those of the step before
+N_DIFFERENT = 32  # different blends; larger numbers repeat them
 # [s] Of one measurement.
 SECONDS = 0.2
 # [s] Of all measurements: one blend is fitted, and more while that much time is left.
@@ -22,9 +22,8 @@ ALL_SECONDS = 8.0
 def bench_lines(device):
     """Measures one thing after the other; yields a line of text for each.
 
-    Kernels are built before anything is timed; the first run on a machine takes longer for that.
-    As many blends are fitted side by side as the device takes at once and the time allows: one at
-    least.
+    Kernels are built before the measurements, so the first run on a machine takes longer. The
+    number of blends fitted side by side is limited by the device and by the time, and at least one.
     """
     end = time.perf_counter() + ALL_SECONDS
     yield f"copy         {measure.copy_rate(device, SECONDS) / 1e9:.1f} GB/s read and written"
@@ -54,10 +53,10 @@ def largest_batch(seconds_of, n_most, end, clock=time.perf_counter):
 
     seconds_of: a function that fits n blends and returns the time it took
 
-    One, a few, then again more while twice as many or more are thought to be done in time. The
-    first fit is often slower than others, so that it says how many follow it at most, and nothing
-    of what each one more costs: that say the last two numbers, and before these are known, and
-    where noise has more of them take less time, each costs as much as the last did on average.
+    Fits one blend, then a few, then more as long as at least twice as many are expected to end in
+    time. The cost of a further blend is estimated from the last two steps. The first fit is often
+    slower than others, so it limits the second step only. If the estimate is not available, or is
+    negative because of noise, the mean cost of the last step is used.
     """
     fitted = [(1, seconds_of(1))]
     n, seconds = fitted[0]

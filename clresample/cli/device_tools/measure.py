@@ -41,7 +41,7 @@ def copy_rate(device, seconds=0.3):
 
 
 def launch_seconds(device, seconds=0.3):
-    """Seconds that a launch costs of a kernel with next to nothing to do, one after the other."""
+    """Seconds per launch of an almost empty kernel, in a sequence of launches."""
     y = device.zeros(16, np.float32)
     launch = device.launcher("warp.cl", "rowscale", local_size=(16, 1))
     launch.bind(n_positions=1, n_pad=16, n_bands=1, n_tables=1, y=y, y_offset=0)
@@ -56,7 +56,7 @@ def launch_seconds(device, seconds=0.3):
 
 
 class ProductTimer:
-    """Products of the operator's shapes, with the tile that Tuning has for a device and type."""
+    """Products of the operator's shapes, with Tuning's tile for a device and type."""
 
     def __init__(self, device, dtype=np.float32, shapes=SHAPES):
         self.device, self.runs, self.kept = device, [], []
@@ -89,7 +89,7 @@ class ProductTimer:
 
 
 def peak_flops(device):
-    """Single-precision operations in a second that a GPU's documents promise; None elsewhere.
+    """Nominal single-precision operations of a GPU in a second; None for other devices.
 
     Units times lanes times the highest clock, two operations each: multiply and add.
     """

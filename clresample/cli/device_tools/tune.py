@@ -13,11 +13,11 @@ cache folder (or CLRESAMPLE_CACHE) for this device, driver and version, and used
 then on. Results change by rounding alone. It takes a minute or two; the machine should
 have nothing else to do."""
 
-# Part of the time that a size must save to be kept: less is noise of the clock.
+# Smallest fraction of the time that a size must save to be stored: less is noise of the clock.
 MIN_GAIN = 0.03
-# [s] Of one measurement, taken in turn with those of the sizes that it is compared with.
+# [s] Duration of one measurement; the sizes to compare are measured in turn.
 SECONDS, ROUNDS = 0.15, 3
-# Of the winner against the size that is used now.
+# Number of measurements of the winner against the present size.
 DUEL_ROUNDS = 7
 
 # Macros of contract.cl, in float32; VW is halved in float64.
@@ -118,10 +118,10 @@ def _steps(device, quick):
 
 
 def _best(device, dtype, known, name, candidates, make, bar):
-    """The candidate that is quickest, as {name: value}, and the part of the time that it saves.
+    """The fastest candidate, as {name: value}, and the fraction of the time that it saves.
 
-    (None, 0) where none is enough quicker than what Tuning has without it; the part is None where
-    that does not run on the device. DeviceError where none does.
+    (None, 0) if none is sufficiently faster than Tuning's present size. The fraction is None if the
+    present size does not run on the device. Raises DeviceError if no size runs.
     """
     from ...device.discovery import DeviceError
     from ...device.tuning import Tuning
@@ -161,10 +161,10 @@ def _best(device, dtype, known, name, candidates, make, bar):
 
 
 def _duel(device, dtype, now, better):
-    """The part of the time that the better one saves, each (sizes, work), in turn.
+    """The fraction of the time that the better one saves, each (sizes, work), in turn.
 
-    The smaller of what the shortest and the median times say: on a machine that has other work the
-    one measured in a quiet moment would win.
+    It is the smaller of the savings in the shortest and in the median time. On a machine with other
+    work, the shortest time alone would favour a size measured in a quiet moment.
     """
     import numpy as np
 
@@ -177,7 +177,7 @@ def _duel(device, dtype, now, better):
 
 
 def row_choices(tile):
-    """Rows of a tile that matrices may choose among: on GPUs, those next to its own."""
+    """Alternative numbers of rows of a tile: on GPUs, those next to its own."""
     return [tile["MR"] - 2, tile["MR"], tile["MR"] + 2] if "KB" in tile else []
 
 
@@ -189,7 +189,7 @@ def _timed(work):
 
 @contextmanager
 def with_sizes(device, dtype, sizes):
-    """While it lasts, Tuning has these sizes for the device and the type, and no others."""
+    """Context in which Tuning has exactly these sizes for the device and the type."""
     from ...device.tuning import PART
 
     before = device.remembered.read(PART)

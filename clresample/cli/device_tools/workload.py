@@ -27,7 +27,7 @@ from .measure import best_seconds
 EUCLID_ARCSEC, RUBIN_ARCSEC = 0.1, 0.2
 STAMP_PX, BATCH = 100, 64
 BLEND_PX, N_SOURCES, N_ITERATIONS = 48, 3, 10
-N_SET_UP = 4  # different fits, of which copies make as many as are wanted
+N_SET_UP = 4  # different fits; copies of them give larger numbers
 SIGMA = 1e-3  # [peak of a galaxy] noise of the blends
 
 
@@ -86,7 +86,7 @@ def blends(n, device):
 
 
 def fit(given, device, **settings):
-    """Their Results, fitted side by side; sources lost in the noise are no matter here."""
+    """Their Results, fitted side by side; undetected sources do not matter here."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SourceWarning)
         results = deblend_many(given, settings=Settings(**settings), device=device)

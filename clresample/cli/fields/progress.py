@@ -52,7 +52,7 @@ class ProgressDisplay(RunProgress):
     def step(self, n, sources=0):
         """Counts finished tasks.
 
-        Those on disk already, in which no source is counted, do not count in the speed of this run.
+        Tasks found on disk have no sources counted, and do not enter this run's speed.
         """
         self.done += n
         self.sources += sources
@@ -70,7 +70,7 @@ class ProgressDisplay(RunProgress):
         seconds = self.clock() - self.began
         if not self.counted or not seconds > 0:
             return ""
-        # by the number of blends: the largest go first, so that the end comes rather sooner
+        # by the number of blends: the largest are first, so that the estimate is an upper limit
         left = (self.total - self.done) * seconds / self.counted
         return f"{self.sources / seconds:.1f} sources/s, about {duration(left)} left"
 

@@ -1,4 +1,4 @@
-"""From a field's light to its blends: tiles, sources, footprints, giants cut, cutouts.
+"""From a field's images to its blends: tiles, sources, footprints, cuts, cutouts.
 
 Imports `measurement`, `deblending` and `sky`.
 """

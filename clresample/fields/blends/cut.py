@@ -1,4 +1,4 @@
-"""Giants: blends over the limits, cut where their light is weakest."""
+"""Cuts oversized blends, those over the limits, where their light is weakest."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from scipy import ndimage
 from ...measurement.hills import root, saddles, watershed
 from ..box import Box
 
-# [sigma] of the combined signal to noise at a saddle: what lies beyond is worth a joint fit only
-# where that takes little time. A piece's neighbours are subtracted to 15 % (MODEL_ERROR): what is
-# left of their light at the border is under a sigma of a point source's flux there.
+# [sigma] Combined signal to noise at a saddle below which sources are fitted jointly only if the
+# fit takes little time. A piece's neighbours are subtracted to 15 % (MODEL_ERROR), so their
+# residual light at the border is less than a sigma of a point source's flux there.
 WEAK = 6.0
-# A fit's memory over that of its images: four pieces of 512 x 320 pixels, 12 sources and seven
-# channels each, took 2.8 GB for 1.03 GB of images.
+# Ratio of a fit's memory to that of its images: four pieces of 512 x 320 pixels, with 12 sources
+# and seven channels each, took 2.8 GB for 1.03 GB of images.
 OVERHEAD = 2.7
 
 
@@ -23,15 +23,13 @@ OVERHEAD = 2.7
 class FitLimits:
     """Limits of one fit; blends over them are cut.
 
-    max_sources: how many; max_pixels: of the model, in the box about the blend. Larger ones are
-        fitted more
-    exactly, as one scene, but take longer than in proportion: the errors' normal matrix grows with
-    the square of the number of sources, its inverse with the cube
-    work [px]: model pixels times sources that blends may have before they are cut where the light
-        between their parts is weak (WEAK); others only over the limits above
-    max_bytes [bytes]: that it may take by prediction, see `fit_bytes`; None = any; n_channels: of
-        all
-    mosaics, for that
+    max_sources: largest number of sources; max_pixels: of the model's box around the blend. Larger
+    limits give more accurate fits, as one scene, but the time grows faster than the size: the
+    errors' normal matrix with the square of the number of sources, its inverse with the cube
+    work [px]: model pixels times sources above which a blend is also cut where the light between
+    its parts is weak (WEAK); smaller blends are cut only over the limits above
+    max_bytes [bytes]: largest predicted memory, see `fit_bytes`; None = any
+    n_channels: of all mosaics, for that prediction
     """
 
     max_sources: int = 40
@@ -67,8 +65,8 @@ def fit_bytes(n_sources, n_pixels, n_channels) -> float:
     """Memory [bytes] that a fit takes on device and host together, roughly.
 
     Each source has its morphology, its gradients and directions (some 20 images of the model's
-    pixels) and its image in every channel, in float32; each channel some 10 more images. All else
-    (tables, padded frames, transforms, the errors' modes) makes it `OVERHEAD` times as much.
+    pixels) and its image in every channel, in float32; each channel has some 10 more images. The
+    factor `OVERHEAD` accounts for tables, padded frames, transforms and the errors' modes.
     """
     images = 20 * n_sources + n_channels * (n_sources + 10)
     return OVERHEAD * 4.0 * images * n_pixels
@@ -77,16 +75,16 @@ def fit_bytes(n_sources, n_pixels, n_channels) -> float:
 def cut_blend(light, inside, positions, limits, margin, groups=None):
     """Cuts a blend into pieces within the limits: territories (Ny, Nx) and a piece (S,) per source.
 
-    Each source gets the pixels from which the light rises to it (watershed); sources are then put
-    together in the order of the light at the saddle between them, brightest first, as long as the
-    pieces stay within the limits, and below WEAK as long as they are quick. So they part where the
+    Each source gets the pixels from which the light rises to it (watershed). Sources are then
+    merged in the order of the light at the saddle between them, brightest first, as long as the
+    pieces stay within the limits, and below WEAK only within `work`. So cuts are made where the
     light is weakest.
 
     light (Ny, Nx) [sigma]; inside (Ny, Nx) bool: the blend's pixels; positions (S, 2) [px] in these
     groups (S,): sources of one number are put together first; None = each has its own
-    margin [px]: by which the box of a piece's fit is larger on each side
-    A single source whose own pixels are over the limits keeps those near it: the others are
-    nobody's, and sky in the pieces that hold them.
+    margin [px]: of the box of a piece's fit, on each side
+    If the pixels of a single source exceed the limits, it keeps those near it. The others belong
+    to no source, and are sky in the pieces around them.
     returns territories int32, 0 = none, else 1 + number of the piece; numbers count from 0
     """
     at = np.clip(np.rint(positions).astype(int), 0, np.array(light.shape) - 1)
@@ -119,7 +117,7 @@ def cut_blend(light, inside, positions, limits, margin, groups=None):
 
 
 def _boxes_within(basins, at, limits, margin):
-    """The Box of each basin, after those over the limits have lost what lies far from their source.
+    """The Box of each basin, after removing far pixels from basins over the limits.
 
     basins: (Ny, Nx), changed in place; at {basin, from 0: (y, x) of its source}
     """

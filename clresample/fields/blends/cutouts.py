@@ -10,8 +10,8 @@ from ...sky.frame import model_frame
 from ...sky.sources import ExtendedSource
 from ..box import Box, box_within
 
-# [px] Sides of the cutouts of fits are multiples of it, as the boxes of their models are of theirs:
-# smaller ones make more batches, larger ones more sky to compute.
+# [px] Sides of the cutouts of fits are multiples of this number, like the boxes of their models:
+# with smaller steps there are more batches, with larger ones more sky to compute.
 SIDE_PX = 4
 
 
@@ -21,12 +21,12 @@ def make_blend(patch, plan, mosaics, reference, labels, corner, neighbours=None,
     patch: FitRegion of plan: FitPlan; mosaics: of the field; reference: Grid of the model's pixels
     labels (Ny, Nx): patch numbers + 1 of the model's pixels from `corner` (2,) [px] on
     neighbours: {mosaic's name: list of (Box, model (C, Ny, Nx) [counts])}: light of the other
-        pieces of the same blend, to be subtracted. None: their pixels are ignored, as those of all
-        other blends are
-    components: {id: how many a source has}; of the others the data choose
+        pieces of the same blend, to be subtracted. None = their pixels are ignored, like those of
+        all other blends
+    components: {id: number of components}; for other sources the data decide
 
-    A patch that no mosaic sees gives a Blend without observations. Raises FileError for pixels that
-    cannot be read.
+    A patch that is covered by no mosaic gives a Blend without observations. Raises FileError for
+    pixels that cannot be read.
     """
     grid = reference.cutout(patch.box.y0, patch.box.x0, patch.box.shape)
     foreign = _foreign(patch, labels, corner, neighbours is not None)
@@ -64,9 +64,10 @@ def make_blend(patch, plan, mosaics, reference, labels, corner, neighbours=None,
 def fit_box(mosaic, grid) -> Box:
     """The pixels of a mosaic whose centres lie on a grid: those of a fit in it.
 
-    Where noise is correlated, one more on each side: the filter that makes it white leaves a
-    cutout's outer pixels without a weight. Grids of one shape have Boxes of one shape, so that
-    their fits share a batch without padding. Of area 0 where there are none.
+    If the noise is correlated, the Box has one more pixel on each side, because the whitening
+    filter leaves a cutout's outer pixels without weight. Grids of one shape have Boxes of one
+    shape, so that
+    their fits share a batch without padding. The area is 0 if there are no such pixels.
     """
     there = mosaic.edge_of(grid)
     if not len(there):
@@ -78,7 +79,7 @@ def fit_box(mosaic, grid) -> Box:
 def _foreign(patch, labels, corner, siblings_too):
     """Pixels of the patch's box that belong to other patches: (Ny, Nx) bool.
 
-    siblings_too: those of its own blend's other pieces do not count, their light is subtracted
+    siblings_too: False = without those of its own blend's other pieces, whose light is subtracted
     """
     y, x = corner
     box = Box(patch.box.y0 - y, patch.box.x0 - x, patch.box.y1 - y, patch.box.x1 - x)

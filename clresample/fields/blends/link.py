@@ -15,7 +15,7 @@ from ..memmap import create_memmap
 class LinkedFootprints:
     """The light of a field, each blend's pixels by its number.
 
-    labels (Ny, Nx): int32, 0 = no source's; 1 to n
+    labels (Ny, Nx): int32, 1 to n, 0 = no source
     boxes (n): Box of each; light (Ny, Nx) [sigma]: float16
     """
 
@@ -29,7 +29,7 @@ def link_footprints(tiles, found, region, folder=None) -> LinkedFootprints:
 
     tiles: of the region; found: called with a tile's number, returns its TileDetections
     region: Box of the model's pixels
-    folder: where labels and light are kept in files that are mapped into memory; None = in memory
+    folder: for labels and light in memory-mapped files; None = in memory
     """
     labels = _image(folder, "labels", np.int32, region.shape)
     light = _image(folder, "light", np.float16, region.shape)
@@ -74,7 +74,7 @@ def _touching(labels, core):
 
 
 def _roots(n, pairs):
-    """For each label 0 to n its new number: those joined by pairs share one; 0 stays."""
+    """The new number of each label 0 to n: those joined by pairs share one; 0 stays."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

@@ -13,11 +13,11 @@ from ..box import Box, round_up_size
 from .cut import FitLimits, cut_blend, fit_bytes
 from .search import nearest
 
-# [model px] Sky around a blend's footprint in the box of its fit: it shows where the light ends.
-# More makes fits slower; less leaves wings without sky.
+# [model px] Sky around a blend's footprint in the box of its fit, which constrains the wings. More
+# makes fits slower; less leaves wings without sky.
 MARGIN_PX = 8
-# [model px] Sides of these boxes are multiples of it, so that blends share batches: smaller ones
-# make more batches, larger ones more sky to compute.
+# [model px] Sides of these boxes are multiples of this number, so that blends share batches: with
+# smaller steps there are more batches, with larger ones more sky to compute.
 STEP_PX = 16
 # Bits of an id for each of a source's row and column, and of the field's number above them.
 POSITION_BITS = 20
@@ -79,7 +79,7 @@ class FitPlan:
         return dict(zip(self.ids.tolist(), hosts.tolist(), strict=True))
 
     def to_json(self) -> str:
-        """All of it, as `from_json` takes it; floats with the digits that give them back."""
+        """The plan as text for `from_json`, with all digits of floats."""
         return json.dumps(
             {
                 "positions": self.positions.tolist(),
@@ -131,9 +131,9 @@ def source_ids(positions, field_number=0) -> np.ndarray:
 
         id = (field number << 40) + (row << 20) + column
 
-    of the pixel that holds the source: the same in every run over the field, whole or in parts.
-    Rows and columns are those of the model's grid, 0 to 1,048,575; a source outside is counted at
-    the edge. Ids that are given already go to the next free column, in the order given.
+    of the source's pixel: the same in every run over the field, whole or in parts. Rows and columns
+    are those of the model's grid, 0 to 1,048,575; a source outside gets the nearest one. If an id
+    is taken, the next free column is used, in the order of the positions.
     """
     most = (1 << POSITION_BITS) - 1
     at = np.clip(nearest(positions).astype(np.int64), 0, most)
@@ -160,17 +160,17 @@ def make_fit_plan(
     most=32,
     hosts=None,
 ) -> FitPlan:
-    """Blends from sources and the labels of their light; giants cut; groups by predicted cost.
+    """Blends from sources and the labels of their light, oversized ones cut, in groups by cost.
 
-    positions (S, 2) [px], peaks (S,) [sigma]: in whose order blends are numbered
+    positions (S, 2) [px], peaks (S,) [sigma]: blends are numbered in the order of peaks
     footprints: LinkedFootprints of `region`, whose labels are renumbered here: label n + 1 is
         patch n's
-    memory [bytes]: that the fits of one group may take; None = no limit; n_channels: of all mosaics
-    most: blends in a group, as many as a CPU fits side by side. More share a round's launches,
-        which take longer than the arithmetic of small blends, but are lost together with their
-        worker
-    hosts (S, 2) [px]: see TileDetections; in cut blends they stay with their clumps if the limits
-        allow it
+    memory [bytes]: limit for the fits of one group; None = no limit; n_channels: of all mosaics
+    most: largest number of blends in a group, that of a CPU's batch. Larger groups share launches,
+        which take longer than the arithmetic of small blends, but are lost together if their
+        worker dies
+    hosts (S, 2) [px]: see TileDetections; cut blends keep them with their clumps if the limits
+        permit it
     """
     limits = replace(limits or FitLimits(), max_bytes=memory, n_channels=n_channels)
     ids = source_ids(positions, field_number)

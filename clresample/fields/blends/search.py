@@ -1,4 +1,4 @@
-"""Detection, tile by tile: sources and the light that links them."""
+"""Detection, tile by tile: sources and their footprints."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from ...measurement.signal_to_noise import WIDTHS_ARCSEC
 from ...sky.frame import model_frame
 from ..box import Box
 
-# [sigma] of the combined signal-to-noise image: pixels above it hold light of a source. At 2, what
-# is left out of a source's footprint is under the noise everywhere; lower, noise links sources that
-# do not touch; higher, faint wings are shared by two blends.
+# [sigma] Level of footprints in the combined signal-to-noise image. At 2, light outside a source's
+# footprint is below the noise everywhere. With a lower level noise links separate sources; with a
+# higher one faint wings extend into another blend.
 FOOTPRINT_SIGMA = 2.0
-# Peaks may lie on nothing else that is above FOOTPRINT_SIGMA: those found by one instrument alone.
-# They get a footprint of this radius, in FWHM of the widest PSF.
+# [FWHM of the widest PSF] Radius of the footprint of peaks without other pixels above
+# FOOTPRINT_SIGMA, which were detected by one instrument alone.
 MIN_RADIUS = 0.5
-SAMPLE_PX = 512  # [model px] side of the part of a field that shows how its noise scatters
+SAMPLE_PX = 512  # [model px] side of the part of a field from which the noise is measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ def search_tile(mosaics, reference, tile, *, threshold, scatters=None) -> TileDe
 def place_known_sources(mosaics, reference, tile, positions, *, scatters=None) -> TileDetections:
     """TileDetections of a catalogue's sources at positions (S, 2) [px of the field].
 
-    Their light is seen as `search_tile` sees it; peaks are the combined signal to noise there.
+    Their footprints are those of `search_tile`; peaks are the combined signal to noise there.
     """
     whole = tile._replace(core=tile.outer)
     outer = search_tile(mosaics, reference, whole, threshold=1e30, scatters=scatters)
@@ -96,8 +96,8 @@ def place_known_sources(mosaics, reference, tile, positions, *, scatters=None) -
 def snr_scatter(mosaics, reference) -> dict:
     """{mosaic's name: scatters of its signal to noise without sources}, from the field's middle.
 
-    A list for each, as `noise_scatter` finds them: the same for the whole field, so that the same
-    is found however it is divided into tiles.
+    A list from `noise_scatter` for each mosaic, valid for the whole field, so that detections do
+    not depend on the division into tiles.
     """
     region = Box.of(reference.shape)
     middle = [(a + b) // 2 for a, b in zip(region[:2], region[2:], strict=True)]
@@ -105,7 +105,7 @@ def snr_scatter(mosaics, reference) -> dict:
     found = {mosaic.name: [1.0] * len(WIDTHS_ARCSEC) for mosaic in mosaics}
     try:
         observations = observations_on(mosaics, reference, box)
-    except FileError:  # its tile will say so
+    except FileError:  # the search of its tile reports it
         return found
     if observations:
         frame = model_frame(observations, grid=_cut(reference, box))
@@ -118,7 +118,7 @@ def observations_on(mosaics, reference, box):
     """The Observations of all mosaics that overlap a Box of the model's pixels.
 
     Their PSFs are those of the mosaics' middles, so that signal to noise does not depend on the
-    Box. Where a PSF is wider than its filter by a tenth, that costs half a percent of it.
+    Box. If a PSF is wider than its filter by a tenth, it is lower by half a percent.
     """
     grid, found = _cut(reference, box), []
     for mosaic in mosaics:
@@ -138,7 +138,7 @@ def footprint_radius(observations, frame) -> int:
 
 
 def grown_footprints(bright, positions, radius):
-    """Pixels of the connected bright parts that hold a source, and discs about the sources, grown.
+    """Pixels of connected bright parts with a source and of discs around the sources, dilated.
 
     bright (Ny, Nx) bool; positions (S, 2) [px]; radius [px]
     """
@@ -152,7 +152,7 @@ def grown_footprints(bright, positions, radius):
 
 
 def nearest(positions) -> np.ndarray:
-    """Pixels (S, 2) int that hold positions (S, 2) [px]; the edge belongs to one of them only."""
+    """Pixels (S, 2) int of positions (S, 2) [px]; an edge belongs to one pixel only."""
     return np.floor(np.asarray(positions).reshape(-1, 2) + 0.5).astype(int)
 
 

@@ -1,4 +1,4 @@
-"""A field in tiles: where each is searched, and which sources belong to it."""
+"""Divides a field into tiles: the box that is searched, and the core that owns sources."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class SearchTile(NamedTuple):
 def tiles_of(region, size, overlap) -> list[SearchTile]:
     """The tiles of a Box of the model's pixels, row by row, of nearly equal size.
 
-    size [px]: largest side of a core. Larger tiles take more memory: each holds all instruments'
-        images as float64, about 100 bytes a pixel and channel
-    overlap [px]: by which the outer box is larger on each side, cut at the region's edge. It must
-        hold a source and what its detection depends on; an object that is cut by the outer edge
-        would be split otherwise than one seen whole
+    size [px]: largest side of a core. Larger tiles take more memory: about 100 bytes a pixel and
+        channel, for float64 images of all instruments
+    overlap [px]: margin of the outer box on each side, cut at the region's edge. It must contain
+        a source and its surroundings: an object cut by the outer edge would be split into other
+        sources than the whole object
 
     Raises ValueError for a size that is not positive, or an overlap below 0.
     """

@@ -45,7 +45,7 @@ class LocalWorkers:
     n_workers: 0 = this process; at least one for each device
     devices: choices as `get_device` takes them, dealt to the workers by turns; empty = the default
     limit_s [s], bound [bytes]: see `WorkerPool`
-    turns: (stage, Outcome) of every task so far that ended well, for whoever wants to see the time
+    turns: (stage, Outcome) of every task that has succeeded so far, with its times
     """
 
     def __init__(self, n_workers, devices=(), limit_s=None, bound=None):

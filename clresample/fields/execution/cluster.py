@@ -1,9 +1,8 @@
 """Tasks on the workers of a `dask.distributed` cluster, any of which may fail, hang or go away.
 
-Each worker has one task at a time, given to it by name: so the largest begin first wherever there
-is room, one device serves one fit, and a task whose worker is gone is known to be that task. What a
-task needs from the run's folder and the file that it leaves travel as bytes, so workers see the
-mosaics' files and nothing else of this machine.
+Each worker has one task at a time, sent to it by name. So the largest tasks begin first, one device
+serves one fit, and the task of a lost worker is known. The inputs from the run's folder and the
+resulting file are sent as bytes, so workers need access only to the files of the mosaics.
 """
 
 from __future__ import annotations
@@ -38,11 +37,11 @@ class DaskCluster:
     devices: choices as `get_device` takes them, dealt to the workers of each host by turns; empty =
         each worker's own, which its environment's CLRESAMPLE_DEVICE names
     limit_s [s]: a task that takes longer is ended with its worker
-    progress: RunProgress, told the dashboard's address, and of workers that go
-    turns: (stage, Outcome) of every task so far that ended well
+    progress: RunProgress, which receives the dashboard's address and messages on lost workers
+    turns: (stage, Outcome) of every task that has succeeded so far
 
-    Raises ImportError without distributed, ValueError where nothing answers, no worker is there, or
-    one has another version of this package.
+    Raises ImportError without distributed; ValueError if the scheduler does not answer, has no
+    worker, or a worker has another version of this package.
     """
 
     def __init__(self, address, devices, limit_s, progress):

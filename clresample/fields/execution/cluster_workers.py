@@ -1,4 +1,4 @@
-"""Workers of a cluster, which may join, leave or hang, with one task at most each."""
+"""Workers of a cluster, which may join, leave or hang, with at most one task each."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from ...device.discovery import DeviceError
 from ...files.atomic import FileError
 from .pool import MAX_DEVICE_FAULTS, Outcome, took_too_long
 
-RESTART_S = 30.0  # [s] within which a worker that hangs is ended
-# [s] without any worker until a run gives up: a batch system that replaces nodes takes minutes
+RESTART_S = 30.0  # [s] time limit for ending a worker that hangs
+# [s] Time without any worker after which a run fails: batch systems replace nodes in minutes.
 NO_WORKER_TIMEOUT_S = 1800.0
 
 
 @dataclass(eq=False)
 class ClusterWorker:
-    """One worker, and the task that it has since when.
+    """One worker, with its task and the start time of the task.
 
-    number: from 0 in the order in which workers came; device: choice as `get_device` takes it
-    context, future: Futures of what its tasks share, and of the task
-    faults: of its device, in a row
+    number: from 0 in the order in which workers joined; device: a choice for `get_device`
+    context, future: Futures of the data shared by its tasks, and of the task
+    faults: number of consecutive faults of its device
     """
 
     number: int
@@ -131,7 +131,7 @@ class ClusterWorkers:
                 self.client.retire_workers([seat.address], close_workers=True, remove=True)
 
     def record_fault(self, seat, reason):
-        """A worker's device has failed: at the second time in a row it gets no more tasks.
+        """Counts a fault of a worker's device: after the second in a row it gets no more tasks.
 
         Raises DeviceError with the last worker.
         """

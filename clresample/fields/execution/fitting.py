@@ -26,22 +26,23 @@ from ..blends.search import nearest
 from ..box import Box
 from .group_results import GroupResults
 
-# What can go wrong with one patch and is no reason to give up the others.
+# Errors that concern one patch only: the others of its group continue.
 ERRORS = (ValueError, ArithmeticError, MemoryError, OSError, np.linalg.LinAlgError)
-# Iterations of the first fits of a cut blend's pieces, which the next round replaces: all that this
-# one takes of them is their light, which it subtracts as if it were wrong by 15 % (MODEL_ERROR).
+# Iterations of the first fits of a cut blend's pieces. The next round replaces these fits and uses
+# only their light, which it subtracts with an assumed error of 15 % (MODEL_ERROR).
 ROUGH_ITERATIONS = 60
-# [px] Blends of more model pixels times sources, and most iterations of theirs. Large galaxies with
-# clumps go on for a thousand, in which clumps and neighbours exchange light with what they lie on.
-# With 150 a disk of signal to noise 8600 has 0.95 of its light, with 500 it has 0.975.
+# [px] Model pixels times sources above which a blend is large, and the largest number of iterations
+# of large blends. Large galaxies with clumps need up to a thousand, in which light moves between
+# clumps or neighbours and the galaxy. With 150 iterations a disk of signal to noise 8600 has 0.95
+# of its light, with 500 it has 0.975.
 LARGE, LARGE_ITERATIONS = 500_000, 250
-# [per pixel] Chi2 of a fit over which its residuals are not searched: they are the model's own
-# errors, as about a star that is far from its PSF, with dozens of peaks. Large galaxies with clumps
-# have up to 10 in a first fit.
+# Chi2 per pixel of a fit above which its residuals are not searched: they then show errors of the
+# model, with dozens of peaks, for example around a star with a wrong PSF. Large galaxies with
+# clumps have up to 10 in a first fit.
 MAX_CHI2 = 100.0
-# The round in which pieces' residuals are searched; the next one fits what is found there.
+# The round in which pieces' residuals are searched; the next one fits the new sources.
 SEARCHED = 1
-NO_ANSWER = "no longer answers"  # in the message of a device that is gone with all its memory
+NO_ANSWER = "no longer answers"  # in the message of a lost device
 POSITIONS = ("y", "x", "y_centroid", "x_centroid")  # columns in pixels of a fit's frame
 
 
@@ -51,7 +52,7 @@ class FieldJob:
 
     mosaics, reference: of the field; folder: of its parts; plan: FitPlan
     origin_px (2,) [px]: (y, x) of the first pixel of labels.npy in the model's pixels
-    core: Box of the model's pixels whose sources are wanted
+    core: Box of the model's pixels whose sources enter the catalogue
     settings: of the fits; threshold [sigma]: of the second pass; passes: 1, or 2 to search the
         residuals too; memory [bytes]: of the device; device: as `get_device` takes it
     field_number: of the ids
@@ -84,7 +85,7 @@ class FieldJob:
 
 @dataclass(frozen=True, eq=False)
 class _BlendCutout:
-    """A patch with its blend and where its observations lie on the mosaics.
+    """A patch with its blend and the Boxes of its observations on the mosaics.
 
     more: sources found in residuals, (id, y, x, id of the host), see FOUND_COLUMNS
     """
@@ -111,7 +112,7 @@ def fit_group(job, group, given) -> tuple[dict, bytes]:
     try:
         return _fitted(job, group, given)
     finally:
-        default_cache().clear()  # its places and PSFs do not come again
+        default_cache().clear()  # its positions and PSFs are not used again
 
 
 def _fitted(job, group, given):
@@ -216,7 +217,7 @@ def _fits(job, blends, rough=None):
 def _settings(job, rough, large):
     """Settings of rough fits, and of those of large blends.
 
-    Other priors than the one that learns need all their iterations.
+    Only fits with the multi-scale prior can be shortened: other priors need all their iterations.
     """
     settings = job.settings
     if not settings.has_multiscale_prior or not (rough or large):
@@ -228,11 +229,11 @@ def _settings(job, rough, large):
 def _second_look(job, given, cuts, results, part, n_round):
     """Refits blends with the sources detected in their residuals: (cuts, results).
 
-    The residuals are those of the whole fit. A first look of 30 iterations without structure, as
-    `clresample deblend` takes, leaves bright galaxies' own structure in them: in simulated fields
-    15 % of all rows were clumps of it then, and no more true sources were found. Pieces of a cut
-    blend are looked at in the round SEARCHED, when their neighbours' light is subtracted; their
-    new sources are left in the part, for the next round.
+    The residuals are those of the complete fit. A short fit of 30 iterations without structure, as
+    in `clresample deblend`, leaves the structure of bright galaxies in the residuals. In simulated
+    fields 15 % of all rows were then clumps, and no more true sources were found. Pieces of a cut
+    blend are searched in the round SEARCHED, after their neighbours' light was subtracted; their
+    new sources are stored in the group's results, for the next round.
     """
     cuts, results, again = list(cuts), list(results), []
     for i, (cut, result) in enumerate(zip(cuts, results, strict=True)):
@@ -244,14 +245,14 @@ def _second_look(job, given, cuts, results, part, n_round):
         try:
             rows = _found(job, given, cut, result)
         except ERRORS:
-            continue  # the fit stands as it is
+            continue  # the fit is kept
         if is_piece:
             part.found += [(cut.patch.number, *row) for row in rows]
         elif rows:
             again.append((i, cut.joined(rows)))
     fits = _fits(job, [cut.blend for _, cut in again])
     for (i, cut), result in zip(again, fits, strict=True):
-        if not isinstance(result, Failure):  # else what was fitted before stands
+        if not isinstance(result, Failure):  # else the earlier fit is kept
             cuts[i], results[i] = cut, result
     return cuts, results
 
@@ -292,7 +293,7 @@ def _on_patch(given, patch, source):
 def _take(part, job, cut, result, n_round):
     """Adds a fitted patch to the part."""
     patch, origin = cut.patch, np.array(cut.patch.box[:2])
-    result = with_source_misfit_status(result)  # of its neighbours there is light in wide pixels
+    result = with_source_misfit_status(result)  # wide pixels contain light of other blends
     names = [int(source.name) for source in result.sources]
     host_of = _hosts(job, cut)
     hosts = np.array([host_of.get(name, name) for name in names], np.int64)

@@ -18,10 +18,10 @@ FORMAT = 2  # of that folder; raised when another version would misread it
 def open_folder(folder, mosaics, reference, options, resume, overwrite, progress, inputs=()):
     """Creates or reopens the folder of group results; returns it and the options.
 
-    The options have the memory of the run that goes on: it decides which blends are fitted side by
-    side.
+    The returned options have the memory of the earlier run, because it determines which blends are
+    fitted side by side.
 
-    inputs: files whose sizes and times must be the same in a run that goes on
+    inputs: files whose sizes and times must be unchanged in a resumed run
 
     Raises FileError for the folder of another run.
     """
@@ -31,7 +31,7 @@ def open_folder(folder, mosaics, reference, options, resume, overwrite, progress
         remove_tree(work)
     there = work / "run.json"
     _check_format(folder, there)
-    if there.exists() and (work / LOOK_FILE).exists():  # before that look nothing is done
+    if there.exists() and (work / LOOK_FILE).exists():  # before it nothing is done
         if not resume:
             raise FileError(f"{folder}: holds a run already: --resume goes on, --overwrite forgets")
         before = json.loads(there.read_text())

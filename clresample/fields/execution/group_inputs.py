@@ -12,13 +12,14 @@ from .group_results import GroupResultsFile
 
 @dataclass(frozen=True)
 class FitGroup:
-    """Patches that are fitted side by side, and the part that they leave.
+    """Patches that are fitted side by side, with the name of their file of results.
 
-    name: of the part; patches: numbers; round: 0, or which repetition of a cut blend's pieces
-    neighbour_models: (patch, name of a part, share) for each model of a neighbour that is
-        subtracted; the shares of a patch add up to 1
-    components: (id, how many) of those sources whose number of components an earlier round found
-    found: (patch, id, y, x, id of the host) of sources that an earlier round found in a patch's
+    name: of the file of results; patches: numbers; round: 0, or the repetition of a cut blend's
+        pieces
+    neighbour_models: (patch, name of a file of results, weight) for each neighbour's model that is
+        subtracted; the weights of a patch add up to 1
+    components: (id, number of components) of sources, as determined by an earlier round
+    found: (patch, id, y, x, id of the host) of sources that an earlier round detected in a patch's
         residuals, at (y, x) [px] of the field's model pixels
     """
 

@@ -1,4 +1,4 @@
-"""Results of a group of fits on disk: one FITS file, whole or absent."""
+"""Results of a group of fits on disk: one FITS file, written atomically."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PATCH_COLUMNS: dict[str, type | str] = {
     "n_iterations": np.int64,
     "seconds": float,
 }
-META = "FRAME", "EXTNAME"  # cards of a table's header that its Columns know too
+META = "FRAME", "EXTNAME"  # cards of a table's header that enter its Columns too
 FITS_FORMATS = {"int16": "I", "int32": "J", "int64": "K", "float32": "E", "float64": "D"}
 FOUND_COLUMNS: dict[str, type] = {
     "fit_id": np.int64,
@@ -42,7 +42,7 @@ class GroupResults:
     """The results of a group of patches.
 
     rows: Columns of sources, one for each patch; patches: rows of PATCH_COLUMNS
-    found: rows of FOUND_COLUMNS, sources in residuals that the next round is to fit
+    found: rows of FOUND_COLUMNS, sources in residuals, for the next round
     components: rows of COMPONENT_COLUMNS, offsets counted in `flat`; spectra: (C,) of each
     flat: morphologies, flattened; models: rows of MODEL_COLUMNS, pixels: of these, flattened
     offsets: (1 + 2 M + C,) of each patch with fitted shifts or sky levels other than 0: its number,

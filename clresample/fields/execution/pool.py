@@ -23,10 +23,10 @@ from .process_limits import (
     unfreeze_objects,
 )
 
-# [s] Between two looks at whether a worker takes too long.
+# [s] Interval between two checks of the workers' times.
 POLL_S = 1.0
-# Device errors that follow each other, after each of which the worker gets a new process: one may
-# be a driver that was reset, at the second the device itself is taken to be gone.
+# Number of consecutive device errors of a worker, each of which gives it a new process. One error
+# may come from a driver that was reset; after the second the device counts as lost.
 MAX_DEVICE_FAULTS = 2
 
 
@@ -35,7 +35,7 @@ class Outcome:
     """End of a task: its value, or the reason why there is none.
 
     worker_died: the reason is that the process ended or hung, not an error that it reported
-    worker: which worker had it, from 0; start_s, end_s [s]: by the monotonic clock
+    worker: number of its worker, from 0; start_s, end_s [s]: by the monotonic clock
     """
 
     task: object
@@ -62,10 +62,9 @@ class _WorkerProcess:
 class WorkerPool:
     """Worker processes, begun when there is work for them, alive until `close`.
 
-    n_workers: processes; 0 runs all in this one, where errors are reported but nothing that ends a
-        process is
+    n_workers: processes; 0 = all in this one, where errors are reported but a crash is not
     limit_s [s]: a task that takes longer is ended with its worker, which is replaced; None = none
-    bound [bytes]: private memory that a worker may take in all, held by the system; None = any
+    bound [bytes]: limit on a worker's private memory, enforced by the system; None = any
 
     A context manager, which closes it.
     """
@@ -90,22 +89,22 @@ class WorkerPool:
     def begin(self, function):
         """Starts every worker now and loads in it the modules of the function."""
         for worker in self._added(self.n_workers):
-            with contextlib.suppress(OSError):  # it has died: its successor loads what it is given
+            with contextlib.suppress(OSError):  # it has died: its successor loads the modules
                 worker.pipe.send((function, None))
 
     def run(self, function, contexts, tasks, again=None):
         """Yields the Outcome of every task, as they end.
 
         function: called as function(context, task), in a module, so that a process can import it
-        contexts: worker k gets the one numbered k modulo their number, pickled
+        contexts: worker k gets the context numbered k modulo their number, pickled
         tasks: in the order in which they begin
         again: called with the Outcome of a task that failed; returns the tasks to run in its place,
-            or None to let the Outcome stand. A failed task is yielded only where it stands
+            or None to accept the Outcome. A failed task is yielded only if it is accepted
 
-        A worker with a DeviceError gets a new process and the task waits again, which counts as no
-        failure; at the next one in a row its seat stays empty, and the other workers go on. Raises
-        DeviceError when no seat is left. Ctrl-C, and a generator that is closed before its end, end
-        the workers.
+        After a DeviceError the worker gets a new process and the task is repeated, which is not
+        counted as a failure. After the next DeviceError in a row the worker is not replaced, and
+        the others continue. Raises DeviceError when no worker is left. Ctrl-C, and closing the
+        generator early, end the workers.
         """
         waiting = deque(tasks)
         again = again or (lambda outcome: None)
@@ -160,7 +159,7 @@ class WorkerPool:
     def _count(self, seat, outcome):
         """Counts a device's error.
 
-        The seat goes when there were too many, DeviceError with the last.
+        The worker is not replaced after too many; raises DeviceError with the last worker.
         """
         self._faults[seat] += 1
         if self._faults[seat] >= MAX_DEVICE_FAULTS:
@@ -172,7 +171,7 @@ class WorkerPool:
 def _give(worker, run, task):
     """Sends a worker a task, before the first one also the data that tasks share."""
     worker.task, worker.since = task, time.monotonic()
-    with contextlib.suppress(OSError):  # of one that has died: seen when its answer is awaited
+    with contextlib.suppress(OSError):  # it has died, which is detected when its answer is read
         if worker.run is not run:
             function, contexts = run
             worker.pipe.send((function, contexts[worker.seat % len(contexts)]))
@@ -194,7 +193,7 @@ def _in_this_process(function, context, task):
 
 
 def _starter(n_workers, bound):
-    """Returns a function that starts a worker with its part of the processor's threads."""
+    """Returns a function that starts a worker with its fraction of the processor's threads."""
     processes = multiprocessing.get_context("spawn")
     environment = thread_environment(n_workers)
 
@@ -281,7 +280,7 @@ def _work(pipe, bound, parent):
             return
         if given is not None:
             function, context, kept = given, what, False
-            unfreeze_objects()  # the last stage's context is no longer kept
+            unfreeze_objects()  # the last stage's context can be freed
             continue
         try:
             answer = function(context, what), None
@@ -295,7 +294,7 @@ def _work(pipe, bound, parent):
             return
         del answer, what
         trim_memory()
-        if not kept:  # its first task has loaded what the others need
+        if not kept:  # the first task has loaded all modules and kernels
             freeze_objects()
             kept = True
 

@@ -15,8 +15,8 @@ PR_SET_PDEATHSIG = 1  # of prctl(2)
 def thread_environment(n_workers) -> dict:
     """Environment of a worker, one of a number that share this machine's processor.
 
-    NumPy's libraries get one thread, PoCL's CPU device its part of all, by the names of its older
-    and newer versions.
+    NumPy's libraries get one thread, PoCL's CPU device its fraction of all threads, by the
+    variables of its older and newer versions.
     """
     environment = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     if n_workers > 1:
@@ -29,8 +29,8 @@ def thread_environment(n_workers) -> dict:
 def limit_memory(bound):
     """Limits this process's private memory [bytes], if the system can.
 
-    What is refused is a MemoryError, or a device's, which costs a group of fits its batch: they are
-    fitted one by one. Files that are mapped do not count (RLIMIT_DATA of Linux).
+    An allocation beyond it raises MemoryError or DeviceError; the fits of the group are then run
+    one by one. Mapped files do not count (RLIMIT_DATA of Linux).
     """
     if bound is None or not sys.platform.startswith("linux"):
         return
@@ -44,10 +44,11 @@ def limit_memory(bound):
 def trim_memory():
     """Returns free memory to the system, if the C library can (glibc).
 
-    Operators refer to themselves, so that only the collector frees them: Python calls it for many
-    objects, not for large ones, and a giant's pieces left 0.1 to 0.3 GB of them a group, 2 GB in
-    all before it did. Of what is free the C library keeps most, in pieces that the next task's
-    arrays may not fit into: after sixteen groups 1.7 GB were held, of which 0.25 GB were in use.
+    Operators are in reference cycles, so that only the garbage collector frees them. Python runs it
+    by the number of objects, not by their size: the pieces of an oversized blend left 0.1 to 0.3 GB
+    a group, 2 GB in all, before it ran. The C library keeps most of the freed memory in fragments
+    that the next task's arrays may not fit into: after sixteen groups it held 1.7 GB, of which
+    0.25 GB were in use.
     """
     gc.collect()
     if sys.platform.startswith("linux"):
@@ -58,8 +59,9 @@ def trim_memory():
 def freeze_objects():
     """Excludes all objects that exist now (modules, kernels, context) from garbage collection.
 
-    Of a worker, after the first task of a stage: to collect then takes 1 ms instead of 70. What is
-    kept and refers to itself is freed after `unfreeze_objects`, which the next stage begins with.
+    Called by a worker after the first task of a stage: a collection then takes 1 ms instead of 70.
+    Cycles among the excluded objects are freed after `unfreeze_objects`, at the start of the next
+    stage.
     """
     gc.freeze()
 
@@ -72,8 +74,8 @@ def unfreeze_objects():
 def die_with_parent(parent):
     """Makes the system end this process when its parent is killed, if it can (Linux).
 
-    Elsewhere it ends once its task has: until then it holds its memory beside those of a run that
-    goes on, and leaves the part that this run makes too.
+    On other systems it ends after its task. Until then it uses memory beside a resumed run, and
+    writes a file of results that the resumed run writes too.
     """
     if not sys.platform.startswith("linux"):
         return

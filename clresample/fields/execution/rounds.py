@@ -1,4 +1,4 @@
-"""All groups of fits, round by round, whatever happens to their workers."""
+"""Fits all groups, round by round, in spite of failing workers."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from .fitting import fit_group, is_large, mark_failed
 from .group_inputs import FitGroup, gather_inputs
 from .group_results import FOUND_COLUMNS, GroupResultsFile
 
-# Most rounds in which a cut blend's pieces are fitted again, their neighbours' light subtracted.
-# The first takes the neighbours out; crowded pieces settle by the third or fourth.
+# Largest number of rounds in which a cut blend's pieces are fitted again, with their neighbours'
+# light subtracted. Crowded pieces settle in the third or fourth round.
 ROUNDS = 4
-# The same of large pieces, which take tens of seconds each (fitting.LARGE), but where their
-# residuals held more sources: the first round subtracts their neighbours' light, and what these
-# gain by that is a part of what it is taken to be wrong by
+# The same for large pieces without new sources in their residuals, which take tens of seconds each
+# (fitting.LARGE). The first round subtracts their neighbours' light; the changes in later rounds
+# are smaller than the assumed error of that light.
 LARGE_ROUNDS = 1
-# [errors] A blend's pieces have settled when no flux changes by more than this from one round to
-# the next. Fits end within 0.2 of their limit (Settings.enough), two of them within 0.3 of each
-# other: a smaller number would not be reached.
+# [errors] A blend's pieces have settled if no flux changes by more than this between two rounds.
+# Fits end within 0.2 of the minimum (Settings.enough), two of them within 0.3 of each other, so a
+# smaller number would not be reached.
 MAX_FLUX_CHANGE_SIGMA = 0.3
-# [of a flux] The same of bright sources: the pixels that a neighbour's light is subtracted from are
-# weighted as if it were wrong by 15 % (MODEL_ERROR). A change of it by 0.5 % then moves a flux that
-# is measured on 50 pixels by sqrt(50) 0.5 / 15 = 0.24 of its error at most.
+# [of a flux] The same for bright sources. Pixels from which a neighbour's light is subtracted have
+# weights for an error of 15 % of that light (MODEL_ERROR). If the light changes by 0.5 %, a flux
+# measured on 50 pixels changes by at most sqrt(50) 0.5 / 15 = 0.24 of its error.
 SETTLED_PART = 0.005
 
 
@@ -40,10 +40,10 @@ FIT = TaskKind(gather_inputs, fit_group, part_path)
 def fit_all_groups(job, engine, progress):
     """Fits all groups that are not on disk yet, round by round.
 
-    A cut blend's pieces are fitted again as long as a neighbour of theirs moves, and where their
-    residuals held more sources.
-    returns the GroupResultsFiles, the last round's of each patch counting, and the parents of
-    those cut blends whose pieces had not settled when the rounds ended
+    A cut blend's pieces are fitted again as long as the fluxes of a neighbour change, and if their
+    residuals contained more sources.
+    returns the GroupResultsFiles, of which the last round of each patch is valid, and the parents
+    of the cut blends whose pieces had not settled when the rounds ended
     """
     progress.stage("fit", len(job.plan.patches))
     tasks = [FitGroup(_name(0, i), patches) for i, patches in enumerate(job.plan.groups)]
@@ -78,10 +78,10 @@ def fit_all_groups(job, engine, progress):
         pending = {n for n in pieces if moved.intersection(job.plan.patches[n].siblings)}
         parts += names
         n_last = n_round
-    # by round and group, in whichever order they ended: sums of models are the same to the last bit
-    # the first round's fits come after rough ones, by which nobody can tell
+    # the first round follows rough fits, with which fluxes cannot be compared
     judged = moved if pending and n_last > 1 else ()
     unsettled = {job.plan.patches[n].parent for n in judged}
+    # sorted by name, so that sums of models do not depend on the order in which the groups ended
     return [_file(job, name) for name in sorted(parts)], unsettled
 
 
@@ -100,7 +100,7 @@ def _file(job, name):
 
 
 class _PieceHistory:
-    """In which parts a cut blend's pieces are, round by round.
+    """The files of results of a cut blend's pieces, round by round.
 
     new: pieces in whose residuals the last round has found sources
     """
@@ -123,9 +123,9 @@ class _PieceHistory:
     def light_about(self, patches):
         """`FitGroup.neighbour_models` of some pieces: all their neighbours' last models.
 
-        From its third on, a neighbour's is the mean of its last two: where both sides of a border
-        follow each other's last model alone, light goes back and forth between them. Of its first,
-        their light was in the data.
+        From its third fit on, a neighbour's model is the mean of its last two. If both sides of a
+        border used only the last model, light would oscillate between them. In the first fits the
+        neighbours' light was in the data.
         """
         found = []
         wanted = {k for n in patches for k in self.job.plan.patches[n].siblings}
@@ -221,7 +221,7 @@ def _fit_round(job, tasks, engine, progress):
         group = outcome.task
         _check_space(job.folder, outcome.reason)
         tries[group.patches] = tries.get(group.patches, 0) + 1
-        if tries[group.patches] < 2:  # killed from outside, perhaps: the same once more
+        if tries[group.patches] < 2:  # it may have been killed from outside: try once more
             return [group]
         if len(group.patches) == 1:
             return None

@@ -14,8 +14,8 @@ from ...sky.grid import Grid
 from ..blends.search import snr_scatter
 from .backend import TaskKind
 
-# A group of fits may take so much of its device's memory by prediction: predictions are rough, and
-# the driver, its kernels and the next group's data need room too.
+# Largest fraction of a device's memory that a group of fits may take by prediction: predictions are
+# rough, and the driver, its kernels and the next group's data need memory too.
 DEVICE_PART = 4
 FILE = "search_setup.json"
 
@@ -51,7 +51,7 @@ def prepare_search(mosaics, reference, work, engine):
         tried.append(outcome)
         return [outcome.task] if outcome.worker_died and len(tried) < 2 else None
 
-    engine.begin(PREPARE)  # one worker looks, the others load meanwhile what their tiles need
+    engine.begin(PREPARE)  # one worker measures while the others load their modules
     field = _Field(mosaics, reference, work)
     for outcome in engine.run(PREPARE, field, [engine.device_shares], again=again, stage="search"):
         if outcome.reason is not None:

@@ -17,11 +17,11 @@ from ..blends.tiles import tiles_of
 from .backend import TaskKind
 from .search_setup import read_search_setup
 
-# [bytes] that searching a pixel of the model takes for each channel, and two more for all together:
-# of channels in the model's own pixels 132, 268 and 536 bytes a pixel were held for 1, 4 and 8
+# [bytes] Memory of a search per model pixel and channel; the total has two channels more. Measured:
+# 132, 268 and 536 bytes a pixel for 1, 4 and 8 channels in the model's own pixels.
 SEARCH_BYTES = 60
-STEPS = 1024  # of the positions that are found, in a pixel: a hundredth of a bright source's error
-LOST_RADIUS_PX = 8  # of a given source's footprint on a tile whose light could not be looked at
+STEPS = 1024  # [1/px] resolution of detected positions: a hundredth of a bright source's error
+LOST_RADIUS_PX = 8  # of a catalogue source's footprint on a tile whose search failed
 MIN_TILE_PX = 64  # however little memory there is: smaller tiles are mostly overlap
 
 
@@ -42,7 +42,7 @@ def load_or_make_plan(mosaics, reference, region, core, work, options, engine, p
     """The plan: that on disk, or a new one after the search of all tiles.
 
     region: Box of the model's pixels that is searched; core: Box of it whose sources are wanted
-    engine: who searches it
+    engine: the backend that searches it
     """
     path = work / "plan.json"
     if path.exists():
@@ -64,8 +64,8 @@ def load_or_make_plan(mosaics, reference, region, core, work, options, engine, p
     peaks = np.concatenate([f.peaks for f in everything])
     hosts = np.concatenate([f.positions if f.hosts is None else f.hosts for f in everything])
     del everything
-    # What a field's division into tiles would change: the last digits, and who comes first. Both
-    # decide how fits round, which moves fluxes of some blends by two tenths of their errors.
+    # The division into tiles changes the last digits and the order of detections. Both affect the
+    # rounding of fits, which would change fluxes of some blends by two tenths of their errors.
     if options.positions is None:
         positions = np.floor(positions * STEPS) / STEPS  # not up: over the edge of the core
         hosts = np.floor(hosts * STEPS) / STEPS

@@ -10,8 +10,8 @@ from ..background import find_background
 from ..box import Box
 from ..mosaic import ConstantPlane
 
-# [px] Side of the part in a mosaic's middle from which its noise is estimated: a million pixels
-# give the noise to 0.1 % and its correlation to 1 %, and are read in a second
+# [px] Side of the region in a mosaic's middle from which its noise is estimated. A million pixels
+# give the noise to 0.1 % and its correlation to 1 %, and are read in a second.
 SAMPLE_PX = 1024
 
 
@@ -22,7 +22,7 @@ def _good(channel):
 
 
 def subtract_background(mosaic, table):
-    """The mosaic with the surfaces that are to be subtracted."""
+    """The mosaic with the background surfaces to subtract."""
     if table.get("background", "none") == "none":
         return mosaic
     channels = [

@@ -23,7 +23,7 @@ from ..readers.band_files import SAME_PX, corner_distance_px
 from .headers import mask_value
 from .keys import WEIGHTS
 
-# values of `noise` that name no file
+# values of `noise` other than the name of a file
 NO_FILE = "estimate", "white"
 
 
@@ -73,7 +73,7 @@ class ImageFiles:
                 sizes = [n for i, n in enumerate(shape) if len(shape) == 2 or i != axis]
                 here = _grid(path, wcs, (*sizes,))
                 header = hdus[0].header.copy()
-                header.extend(own, update=True)  # the primary header's cards count where it lacks
+                header.extend(own, update=True)  # the primary header completes the HDU's own
                 found = self._planes(path, hdus, chosen, axis)
             if grid is None:
                 grid = here

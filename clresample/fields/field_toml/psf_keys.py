@@ -14,8 +14,8 @@ from ..psfs.read import read_psf_field
 
 # Remedy for a PSF whose core lies off its array's centre.
 CORE = 'psf_center = "core"'
-# [px] PSFs of whole detectors change by less than 1e-3 of their norm within it. Headers of images
-# whose first row was trimmed have LTV = -1.
+# [px] Offsets up to this are not reported: PSFs of detectors change by less than 1e-3 of their norm
+# within it. Headers of images whose first row was trimmed have LTV = -1.
 SMALL_PX = 2.0
 # [1] of PSFEx's scaled positions, at whose -0.5 and 0.5 its outermost stars lie.
 STARS_REACH = 0.6

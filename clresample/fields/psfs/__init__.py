@@ -1,5 +1,6 @@
-"""PSFs that vary over a mosaic: one small class for each form in which they are kept.
+"""PSFs that vary over a mosaic: one small class for each file format.
 
-All answer `psf_at(y, x)` with the PSF of that place, in the mosaic's own pixels. Imports `sky` and
+`psf_at(y, x)` of each returns the PSF at that position, in the mosaic's own pixels. Imports `sky`
+and
 `files`; Piff and photutils only where their files are read.
 """

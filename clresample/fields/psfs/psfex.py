@@ -12,8 +12,8 @@ from ...files.fits import open_fits
 from ...sky.psf import PSF
 from ...sky.varying_psf.field import PSFField, check_position
 
-# [1] Stars of PSFEx lie at -0.5 to 0.5 of its scaled positions; half of that range beyond them the
-# polynomials, of second or third degree as a rule, still have the size of those inside.
+# [1] Largest scaled position. PSFEx's stars lie at -0.5 to 0.5; half of that range beyond them the
+# polynomials, usually of second or third degree, still have values as inside.
 MAX_SCALED = 1.0
 
 

@@ -14,10 +14,10 @@ from ...sky.varying_psf.field import PSFField, check_position
 class ScatteredPSF(PSFField):
     """PSF images at K scattered places.
 
-    Between three places the images are averaged with the weights of linear interpolation in their
-    triangle (Delaunay's), beyond them all the nearest is taken; so it is everywhere with fewer than
-    three places, or all on a line. A mean of two PSFs that were both normalised is normalised, and
-    its second moments are the mean of theirs, to first order in how the PSF changes between them.
+    Inside a Delaunay triangle of three positions the images are interpolated linearly. Outside all
+    triangles the nearest image is used, and so it is everywhere if there are fewer than three
+    positions, or if all lie on a line. A mean of normalised PSFs is normalised, and its second
+    moments are the mean of theirs, to first order in the change of the PSF between them.
 
     images (K, C, ny, nx) or (K, ny, nx) [1]: pixel response included
     positions (K, 2) [px]: (y, x) in the mosaic
@@ -82,8 +82,8 @@ class CellPSF(PSFField):
     """One PSF for each cell of a regular array, constant inside a cell, as in Rubin's coadds.
 
     images (cells_y, cells_x, C, ny, nx) or (cells_y, cells_x, ny, nx) [1]: pixel response included;
-        a cell whose images are not finite or have no light is empty, and the nearest one that is
-        not is taken in its place
+        a cell whose images are not finite or have no light is empty, and replaced by the nearest
+        one that is not
     cell_px (2,) [px]: size (y, x) of a cell, or one number
     origin_px (2,) [px]: (y, x) of the first cell's outer corner; (-1/2, -1/2) is that of the mosaic
     spacing [px], center: as in ScatteredPSF
@@ -120,7 +120,7 @@ class CellPSF(PSFField):
         return self.images.shape[2]
 
     def psf_at(self, y, x):
-        """The PSF of the cell that holds (y, x), or of the nearest that is not empty."""
+        """The PSF of the cell at (y, x), or of the nearest cell that is not empty."""
         place = (np.array(check_position(y, x)) - self.origin_px) / self.cell_px - 0.5
         nearest = ((self._filled - place) ** 2 * self.cell_px**2).sum(axis=1).argmin()
         row, column = self._filled[nearest]

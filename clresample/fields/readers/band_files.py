@@ -23,8 +23,8 @@ from ..field_toml.estimates import (
 from ..mosaic import Channel, FilePlane, Mosaic, Plane
 from ..psfs.combined import ConstantPSF, PerBandPSF, PSFField
 
-SAME_PX = 1e-3  # bands whose corners lie as near as this are on the same pixels
-# of the pixels in a mosaic's middle; with more of them masked the user is told
+SAME_PX = 1e-3  # [px] distance of corners below which bands have the same pixels
+# [1] of the pixels in a mosaic's middle; a larger masked fraction causes a note
 MANY_MASKED = 0.1
 
 
@@ -32,8 +32,8 @@ MANY_MASKED = 0.1
 class ReaderOptions:
     """Options of a reader; those that are None are read, or are the format's own.
 
-    name: of the mosaic, unique in a field; bands: those to take, as the format calls them
-    channels (C,): what they are to be called, unique in a field
+    name: of the mosaic, unique in a field; bands: those to read, by the format's names
+    channels (C,): their names, unique in a field
     band (C,): of which they are exposures, where several mosaics have some; see Observation
     mask_bits: bits that mean: ignore this pixel, by number or name
     zero_point [mag]: AB of one count, one number or C of them
@@ -64,7 +64,7 @@ class BandFiles:
     """One band of a mosaic, as a reader finds it.
 
     band: the format's name of it; grid, data, weight, kind, mask, mask_value, zero_point: as in
-    Channel, None where the file does not say; psf: PSFField, or None
+    Channel, None if the file has none; psf: PSFField, or None
     noise: NoiseCorrelation, or None; saturation [counts]: of the image's pixels, or None
     missing_zero_point, missing_psf: why there is none
     files {what: file}
@@ -142,8 +142,8 @@ def assemble_mosaic(survey, found, given, *, noise="white") -> Mosaic:
     """Assembles a Mosaic from a reader's files and its user's options.
 
     survey: its name where none is given; found: sequence of BandFiles; given: ReaderOptions
-    noise: what is done with its correlation unless the user says otherwise
-    Raises ValueError, one line that names it, for what is missing or does not go together.
+    noise: default treatment of its correlation
+    Raises ValueError, one line, for missing or inconsistent files and options.
     """
     found = _chosen(found, given.bands)
     name = given.name or survey

@@ -20,7 +20,7 @@ OWN = {
     "jwst": read_jwst,
     "legacy": read_legacy_survey,
 }
-# Called as reader(path, **given), with what the user gives of `Given`; they return a Mosaic.
+# Called as reader(path, **given), with the user's ReaderOptions; they return a Mosaic.
 READERS = Formats("clresample.readers", OWN)
 
 

@@ -7,10 +7,10 @@ One file a band:
     *_flt.fits, *_flc.fits    HDUs SCI, ERR and DQ of one chip
 
 SCI or the primary header has the WCS, BUNIT, PHOTFLAM and PHOTPLAM (AB zero point of one count a
-second; counts of the whole exposure are told by a BUNIT without "/S", and EXPTIME) and FILTER, or
+second; with a BUNIT without "/S" counts are those of EXPTIME, the whole exposure) and FILTER, or
 FILTER1 and FILTER2. An ERR is the pixels' standard deviation. A WHT may be exposure time or
-inverse variance, in whatever scale: it is taken as proportional to the inverse variance, and the
-factor is that with which the blank sky in the mosaic's middle has unit scatter. Drizzling
+inverse variance, in any scale: it is used as proportional to the inverse variance, with the
+factor for which the blank sky in the mosaic's middle has unit scatter. Drizzling
 correlates the noise of neighbouring pixels: its correlation is estimated unless noise = "white".
 DQ: any bit means ignore, unless mask_bits are given.
 
@@ -40,7 +40,7 @@ from .band_files import (
 )
 from .planes import ScaledPlane
 
-CLEAR = "CLEAR", "N/A", "NONE", ""  # what filter wheels hold where they hold no filter
+CLEAR = "CLEAR", "N/A", "NONE", ""  # values of filter wheels without a filter
 
 
 def read_hst(path, **given) -> Mosaic:

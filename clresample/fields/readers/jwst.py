@@ -10,8 +10,8 @@ One file a band, with the HDUs
     ASDF      the tree of metadata, whose meta.wcs is the gwcs
 
 The gwcs places the pixels where gwcs is installed (the extra `jwst`); else the header's WCS does,
-and a note says so. Resampling correlates the noise of neighbouring pixels, which ERR does not know:
-its correlation is estimated unless noise = "white".
+with a note. Resampling correlates the noise of neighbouring pixels, which ERR does not include: its
+correlation is estimated unless noise = "white".
 
 Source: https://jwst-pipeline.readthedocs.io, "Resampled 2-D data: i2d".
 """
@@ -91,7 +91,7 @@ def _band(path, given):
 
 
 def _gwcs(hdus):
-    """The gwcs of the ASDF tree, and None; or None, and why there is none."""
+    """(gwcs of the ASDF tree, None), or (None, the reason why there is none)."""
     if "ASDF" not in hdus:
         return None, "no gwcs in the file"
     try:
@@ -100,7 +100,7 @@ def _gwcs(hdus):
     except ImportError:
         return None, "gwcs is not installed (pip install gwcs)"
     try:
-        # arrays of other HDUs stay unread: only the WCS is asked for, which holds its own numbers
+        # arrays of other HDUs stay unread: only the WCS is read, which contains its own numbers
         return asdf.open(io.BytesIO(hdus["ASDF"].data.tobytes())).tree["meta"]["wcs"], None
     except Exception as error:  # of asdf, of tags that nothing installed knows
         return None, f"its gwcs cannot be read ({' '.join(str(error).split()) or type(error)})"

@@ -47,8 +47,8 @@ BITS = (  # of maskbits, by their numbers
     *("WISEM1", "WISEM2", "BAILOUT", "MEDIUM", "GALAXY", "CLUSTER"),
     *("SATUR_I", "ALLMASK_I", "SUB_BLOB"),
 )
-# of the Moffat profile: stars at good sites (Racine 1996, PASP 108, 699); with a smaller one more
-# of the light lies in the wings, and fluxes come out larger
+# Exponent of the Moffat profile: that of stars at good sites (Racine 1996, PASP 108, 699). A
+# smaller one has more light in the wings and gives larger fluxes.
 MOFFAT_BETA = 3.0
 N_PLACES = 5  # along each axis at which the PSF is made: widths change over thousands of pixels
 # [FWHM] half side of its stamps: beyond it lies 0.2 % of the light of such a profile

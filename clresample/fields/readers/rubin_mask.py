@@ -8,9 +8,9 @@ from ..field_toml.headers import bit_names, mask_value
 from ..mosaic import FilePlane
 from .planes import AnyFlagPlane
 
-# What a fit must not see: nothing was measured there, or not what fell on the pixel. Pixels that
-# were interpolated (INTRP, CR) hold a value of which the PSF knows; in coadds they are replaced by
-# other exposures.
+# Planes of pixels that a fit must ignore, because they have no measurement or a wrong one.
+# Interpolated pixels (INTRP, CR) have a value consistent with the PSF; in coadds other exposures
+# replace them.
 UNUSABLE = "NO_DATA", "BAD", "SAT", "SATURATED", "SUSPECT", "UNMASKEDNAN"
 
 

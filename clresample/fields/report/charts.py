@@ -13,12 +13,12 @@ from .svg import SQUARE, Chart, ChartAxis
 BIN_MAG = 0.5
 MAX_CHANNELS = 12  # with a chart of their own
 UJY_MAG = 23.9  # AB magnitude of one microjansky
-CLEAR = 5.0  # [errors] a flux that is surely there: a dotted line
+CLEAR = 5.0  # [errors] significance of the dotted line
 PULL_RANGE, PULL_BIN = 5.0, 0.5  # [errors]
 # bins of the true signal to noise, in equal steps of its logarithm
 SNR_EDGES = 10 ** np.arange(0.5, 3.01, 0.25)
-FEW = 3  # true sources in a bin: of fewer no share is shown
-# chi2 of the map's colours: a quarter of the noise's, the noise's, four times as much
+FEW = 3  # true sources in a bin; with fewer no fraction is shown
+# chi2 of the map's colours: a quarter of the noise's, and four times as much
 CHI2_SHADES, CHI2_ENDS = 31, (0.25, 4.0)
 CHI2_LOW, CHI2_MIDDLE, CHI2_HIGH = (70, 110, 190), (228, 228, 226), (196, 88, 20)
 

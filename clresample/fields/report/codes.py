@@ -1,4 +1,4 @@
-"""Pixel values as compact text: numbers of steps that grow with the value, deflated, in base64.
+"""Pixel values as compact text: quantised in growing steps, deflated, in base64.
 
     value = unit KNEE sinh(step n),     code = 0 for NaN, else 1 + (2 n if n >= 0, else -2 n - 1)
 

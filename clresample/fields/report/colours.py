@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 KNEE_SIGMAS = 2.5  # [sigma] where the stretch turns from linear to logarithmic
-BRIGHT_QUANTILE = 0.9995  # of the model's pixels: shown as white
+BRIGHT_QUANTILE = 0.9995  # [1] quantile of the model's pixels that is shown as white
 MIN_WHITE = 8.0  # [knees] white of a field in which nothing is bright
 EMPTY = (52, 56, 66)  # colour of pixels without data
 

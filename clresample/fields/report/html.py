@@ -1,4 +1,4 @@
-"""Pieces of HTML. Whatever comes from a file is escaped here."""
+"""Pieces of HTML; all texts from files are escaped here."""
 
 from __future__ import annotations
 

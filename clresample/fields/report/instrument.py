@@ -14,8 +14,8 @@ from ...sky.grid import Grid
 from ..box import Box
 
 SAMPLE_ROWS = 64  # rows of a mosaic from which noise and stretch are found, spread evenly
-# [sigma] A column of a strip whose median is beyond it holds no sky: a dead one. Light that a model
-# misses is never as bright over half a strip.
+# [sigma] A column of a strip with a larger median is dead. Light missing in a model is never as
+# bright over half a strip.
 DEAD_SIGMAS = 20.0
 
 

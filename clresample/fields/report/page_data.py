@@ -66,7 +66,7 @@ def data_of(run, most_bytes, notes) -> dict:
     state, at = source_states(run)[order], positions(run)[order]
     known = "snr" in run.sources.colnames
     snr = plain(run.sources["snr"])[order] if known else np.full(len(order), np.nan)
-    # failed ones first, then those whose models misfit: what one wants to see
+    # failed sources first, then those whose models misfit
     misfit = np.zeros(len(order), bool)
     if "flags" in run.sources.colnames:
         misfit = (np.nan_to_num(plain(run.sources["flags"]))[order].astype(int) & Flag.MISFIT) > 0

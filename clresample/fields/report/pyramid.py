@@ -13,12 +13,12 @@ from .instrument import Instrument
 
 TILE_PX = 256  # side of a tile: smaller ones are more to list, larger ones more to decode at once
 LAYERS = "model", "residual"  # the data are their sum
-# [bytes] that a pixel of both layers takes in one channel, as base64. Where a finest level starts
-# from; what it really takes decides.
+# [bytes] Estimated base64 size of a pixel of both layers in one channel, to choose a first finest
+# level; the true size decides.
 PIXEL_BYTES = 1.0
 CELLS = 96  # of the map of chi2 along the longer side, at most
 MIN_CELL_PX = 8  # smaller cells scatter by over 20 % in one channel from the noise alone
-# [sigma^2] A pixel counts no more: one cosmic ray or star's core does not hide what a cell says.
+# [sigma^2] Largest chi2 of a pixel, so that one cosmic ray or star's core does not dominate a cell.
 MAX_CHI2 = 36.0
 
 
@@ -53,7 +53,7 @@ def pyramid_of(instrument, frame, budget) -> Pyramid:
     shape = instrument.grid.shape
     stretch = stretch_of(instrument.sample, instrument.noise_sigma)
     coarsest = max(0, int(np.ceil(np.log2(max(shape) / TILE_PX))))
-    # what is predicted may be a half too much: a level is not left out for that
+    # predictions may be too large by a half, for which no level is left out
     more = max(full_bytes(instrument) / (1.5 * max(budget, 1)), 1)
     finest = int(np.clip(np.ceil(np.log2(more) / 2), 0, coarsest))
     planes, chi2, cell = _read(instrument, finest)

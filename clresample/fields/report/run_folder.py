@@ -25,7 +25,7 @@ class RunFolder:
         finished; fits: QTable of fit_table.ecsv
     instruments: with model and residual mosaics, the smallest pixels first
     provenance: of provenance.json, {} where there is none; settings: of the run
-    finished: whether the catalogue is there; done: {what: (how many, of how many)} where it is not
+    finished: True if the catalogue exists; done: {stage: (number done, total)} if it does not
     notes: what is missing or cannot be read, a line each
     """
 

@@ -24,7 +24,7 @@ from .stamps import plain
 from .table import columns_of
 from .truth import EDGE_PX, FOUND_PX
 
-MAX_ROWS = 500  # of the table of sources: the page stays quick, and the catalogue has them all
+MAX_ROWS = 500  # of the table of sources, to keep the page fast; the catalogue has all of them
 FILTERS = (PAGE / "filters.html").read_text()
 SLOWEST, MAX_FAILED = 15, 200
 

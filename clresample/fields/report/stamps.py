@@ -12,8 +12,8 @@ from .alone import OwnModels
 from .codes import encode
 from .pyramid import frame_transform
 
-# [frame px] Half the side of a source's pictures: some sky is seen around the faintest, and the
-# largest still fit a page.
+# [frame px] Half the side of a source's pictures, smallest and largest: the faintest have some sky
+# around them, and the largest fit on a page.
 MIN_HALF, MAX_HALF = 18, 64
 SIZES = 4.0  # half sides in units of a source's size
 LAYERS = "model", "residual", "own"

@@ -13,10 +13,10 @@ from ...files.atomic import FileError
 from ...files.tables import read_catalogue
 from .stamps import plain
 
-# [px] A row is a true source's own when it lies as near; further off it is another one in most
-# fields, nearer the noise of faint sources' positions would lose them.
+# [px] Largest distance of a row from its true source. With a larger one unrelated sources would be
+# matched; with a smaller one faint sources would be lost by the noise of their positions.
 FOUND_PX = 4.0
-EDGE_PX = 8.0  # true sources nearer to the field's edge are not counted: part of their light is out
+EDGE_PX = 8.0  # [px] true sources nearer to the field's edge are not counted
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,8 +19,8 @@ from .run_folder import read_run
 from .truth import truth_of
 
 NAME = "report.html"
-# [bytes] of a page: browsers open it within some seconds. 4096 x 4096 pixels beside Rubin's in
-# three bands are there with all their pixels, and pictures of their 1700 sources.
+# [bytes] Default size of a page, which browsers open within some seconds. It suffices for all
+# pixels of a field of 4096 x 4096 with Rubin's three bands, and pictures of its 1700 sources.
 MAX_BYTES = 64 << 20
 TEXT_BYTES = 700_000  # [bytes] that tables and figures take at most, whatever the field
 MIN_BYTES = 2_000_000
@@ -101,7 +101,7 @@ def _pyramids(run, budget, notes):
     wanted = [full_bytes(one) for one in run.instruments]
     for k, one in enumerate(run.instruments):
         left = budget - sum(pyramid.n_bytes for pyramid in found)
-        share = left * wanted[k] / sum(wanted[k:])  # with what those before did not take
+        share = left * wanted[k] / sum(wanted[k:])  # bytes not used by earlier ones included
         try:
             found.append(pyramid_of(one, run.instruments[0].grid, share))
         except FileError as error:
