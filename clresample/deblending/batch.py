@@ -28,24 +28,24 @@ from .settings import Settings
 from .start.profile_start import LIGHT_SIGMAS
 
 LOG = logging.getLogger("clresample")
-# [px] Blends of several sizes have their frames and observations padded to multiples of this, so
-# that they share batches: smaller ones make more batches, larger ones more padding to compute.
+# [px] Frames and observations of blends of several sizes are padded to multiples of this number, so
+# that they share batches. A smaller one gives more batches, a larger one more padding to compute.
 PAD_PX = 16
 # [bytes] Device memory of the scenes of one batch, by default.
 MEMORY = 1 << 30
-# Components of the scenes of one batch: each is a group of work-items along the third axis of a
-# launch, of which GPUs take no more.
+# Largest number of components in a batch: each is a group of work-items along the third axis of a
+# launch, and this is the limit of GPUs.
 MAX_SOURCES = 65_535
-# Blends that one of several devices is given at a time, at most: what a full batch of a GPU holds.
+# Largest number of blends sent to one of several devices at a time: a full batch of a GPU.
 SCENES_A_PORTION = 1024
-# What says by itself what went wrong with one blend; other errors are named by their kind as well.
-# None of them is a reason to give up the other blends.
+# Errors of a blend whose message is sufficient; for others the status names the class too. In
+# either case the other blends continue.
 ERRORS = (ValueError, DeviceError, np.linalg.LinAlgError)
-# Sources that are started together at most: each takes up to 1 MB, profile and slopes as all
-# observations see them. A few dozen hide what a launch costs.
+# Largest number of sources started together: each takes up to 1 MB, for its profile and slopes in
+# all observations. A few dozen hide the cost of a launch.
 START_SOURCES = 500
 
-# What a blend has that nothing is warned about: sources far from any light, and problems.
+# A blend without warnings: no sources far from any light, and no problems.
 NOTHING: tuple = ((), ())
 
 
@@ -69,10 +69,10 @@ def deblend(
         CCDData that have a PSF
     settings: see Settings; device: see get_device; dtype: float32 or float64, of the fit
     progress: called every few iterations with their number so far and the loss (1,)
-    Raises ValueError for arguments that `check_observations`, `model_frame` and `Source` reject,
-    and when no source lies inside the frame. Warns (SourceWarning) of sources far from any light.
-    Ctrl-C ends the fit with the best state so far. Warns (InputWarning) of problems of the
-    observations and of the list of sources (inspection/); the result has them in its messages.
+    Raises ValueError as `check_observations`, `model_frame` and `Source` do, and if no source lies
+    inside the frame. Issues a SourceWarning for sources far from any light, and an InputWarning for
+    problems of the observations and of the list of sources (inspection/); the result has them in
+    its messages. Ctrl-C ends the fit with the best state so far.
     """
     blend = Blend(as_observations(observations), _listed("sources", sources), frame, shifts)
     settings, dtype = _checked(settings, dtype)
@@ -97,20 +97,20 @@ def deblend_many(
 ) -> list[Result | Failure]:
     """Fits many blends side by side, each with the result of a fit alone to float accuracy.
 
-    device: see get_device; or a list of such choices: the blends are dealt to all of them by their
-        speed, each with a process of its own, so that a script that calls this must do so under
-        `if __name__ == "__main__":`. Results are those of one device. One that fails is named by a
-        DeviceWarning, and the others do its part
+    device: see get_device; or a list of such choices, which share the blends by their speed. Each
+        device has a process of its own, so a script must call this under
+        `if __name__ == "__main__":`. Results equal those of one device. If a device fails, a
+        DeviceWarning names it and the others do its work
     blends: Blend, with sizes, sources, PSFs, WCS and instruments of their own
     settings: see Settings; dtype: float32 or float64, of the fits
-    memory [bytes]: of the device for one group of scenes; GPUs hold the next group's data beside it
-    progress: called with the number of blends done, after each group and each failure; True draws
-        a bar in terminals and notebooks, and prints a line now and then where nobody looks
-    returns a Result for each blend, in their order, or a Failure: it does not harm the others.
-        Ctrl-C ends the fits of the group that runs with the best state so far; what was done before
-        comes back, and Failures with the status "interrupted" for the rest
-    Warns once (SourceWarning) of all sources far from any light, and once (InputWarning) of all
-    problems with observations and lists of sources; results' messages name them.
+    memory [bytes]: of the device for one group of scenes; GPUs need memory for the next group too
+    progress: called with the number of finished blends, after each group and each failure; True
+        shows a progress bar in terminals and notebooks, and prints occasional lines elsewhere
+    returns a Result for each blend, in their order, or a Failure, which does not affect the others.
+        Ctrl-C ends the fits of the present group with the best state so far; earlier results are
+        returned, with Failures of the status "interrupted" for the rest
+    Issues one SourceWarning for all sources far from any light, and one InputWarning for all
+    problems with observations and lists of sources; the results' messages name them.
     """
     blends = list(blends)
     if progress is True:
@@ -120,7 +120,7 @@ def deblend_many(
     settings, dtype = _checked(settings, dtype)
     progress = progress or (lambda n_done: None)
     given = {"settings": settings, "dtype": dtype, "memory": memory}
-    # blends of one size keep it; those of several are padded, whoever fits them
+    # blends of one size are not padded; those of several sizes are, on every device
     given["pad"] = PAD_PX if len({_sizes(b) for b in blends} - {None}) > 1 else 1
     if isinstance(device, (list, tuple)):
         fit_some = functools.partial(_fit_all, **given)
@@ -144,7 +144,7 @@ def deblend_many(
 def _fit_all(blends, *, device, progress=lambda n_done: None, **given):
     """(Result or Failure, its warnings: sources far from any light, problems)."""
     many = _BatchRunner(blends, device, **given)
-    # the results of what was not done say so
+    # the results of unfinished blends have the status
     with contextlib.suppress(KeyboardInterrupt):
         many.run(progress)
     return [
@@ -154,7 +154,7 @@ def _fit_all(blends, *, device, progress=lambda n_done: None, **given):
 
 
 class _BatchRunner:
-    """Blends on their way through groups of fits that share a batch.
+    """Blends that are fitted in groups that share a batch.
 
     done: for each blend its Result or Failure, None before that
     warned {blend: (array, list)}: indices of its sources far from any light, and its problems
@@ -183,8 +183,8 @@ class _BatchRunner:
     def _groups(self):
         """Groups of (index, Fit) that have begun, as they fill up.
 
-        Each comes with the number of blends that are done with it; a group is empty where a blend
-        has failed.
+        Each comes with the number of blends that it finishes; a group is empty if a blend has
+        failed.
         """
         waiting = defaultdict(list)
         for i, blend in enumerate(self.blends):

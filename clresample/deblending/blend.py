@@ -11,18 +11,19 @@ from ..sky.observation import Observation, check_observations
 from ..sky.sources import Source
 from ..sky.validation.checks import as_float_array, check_instance
 
-# Status of a fit whose loss falls no further, and of its result if that does not describe the data.
+# Status of a converged fit, and of its result if the model does not describe the data.
 CONVERGED, MISFIT = "converged", "misfit"
-# Status of a fit until something else ends it than `max_iter`, and of one that Ctrl-C ended.
+# Status of a fit ended by `max_iter`, which is the initial one, and of one ended by Ctrl-C.
 ITERATION_LIMIT, INTERRUPTED = "iteration limit", "interrupted"
-# That of a fit whose scene another one takes over; no result has it.
+# Status of a fit that is replaced by another fit of its scene; no result has it.
 STOPPED_FOR_REFIT = "stopped for refit"
-# What one fit takes at most. Its spectra are solved together, n^3 for n components: 2000 take
-# minutes. Arrays of components times pixels are held several at a time. A blend of 4096 pixels a
-# side has no neighbours that would need to be fitted at once.
+# Limits of one fit. Its spectra are solved together, in time n^3 for n components: 2000 take
+# minutes. Several arrays of components times pixels are in memory at a time. Sources further apart
+# than 4096 pixels need no joint fit.
 MAX_COMPONENTS, MAX_BYTES, MAX_PIXELS = 2000, 8 << 30, 1 << 24
-# [bytes] What a fit holds for each pixel of a component's box, here one of bright galaxies, and for
-# each pixel of the frame and the data: 60 sources at 512 px take 0.4 GB, 300 at 1024 px 1 GB.
+# [bytes] Memory of a fit for each pixel of a component's box, for bright galaxies, and for each
+# pixel
+# of the frame and the data: 60 sources at 512 px take 0.4 GB, 300 at 1024 px 1 GB.
 BYTES_A_BOX, BOX_PIXELS, BYTES_A_PIXEL = 40, 256 * 256, 100
 
 
@@ -32,9 +33,9 @@ class Blend:
 
     observations: at least one Observation; sources: PointSource and ExtendedSource
     frame: the model's Frame; None = `model_frame` of the observations
-    shifts (n_observations, 2) [model px]: of the observations' pixels, where known; a fit of shifts
-        starts from them. Where a fit finds a shift of more than a pixel, a second one that starts
-        from it finds the rest: the first one's profiles came from images that disagreed
+    shifts (n_observations, 2) [model px]: of the observations' pixels, if known; a fit of shifts
+        starts from them. If a fit finds a shift of more than a pixel, start a second fit from it,
+        because the profiles of the first came from images that disagreed
     """
 
     observations: tuple[Observation, ...]

@@ -1,4 +1,4 @@
-"""One blend on its way from data to result: views of its observations, start, scene, result."""
+"""The fit of one blend: views of its observations, start, scene, result."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from .start.profile_start import (
 from .view import SceneGeometry, pixel_noise, tied_views, unfiltered_view, whitened_view
 
 # The stopping rule compares the best loss with the best one this many iterations ago: losses of
-# single iterations scatter, and a smaller number would take a pause for the end.
+# single iterations scatter, and with a smaller number a plateau would end the fit.
 PATIENCE = 15
 # A loss this many times the best one, or NaN, is a divergence.
 DIVERGED = 10.0
@@ -46,10 +46,10 @@ class _BestState:
 
 
 class Fit:
-    """One blend on its way from data to result.
+    """The fit of one blend, from its data to its Result.
 
-    blend, settings, frame: what is fitted, how, and on which Frame; as `inspect` returns them
-    problems (n,): sentences on what that has found; sky_levels: SkyLevel of each observation
+    blend, settings, frame: as `inspect` returns them
+    problems (n,): messages of that inspection; sky_levels: SkyLevel of each observation
     sources: the blend's, with positions in the frame's pixels where an observation's were given
     fitted (n,): indices of those inside the frame; undetected (n_dark,): of those far from any
         light
@@ -57,11 +57,11 @@ class Fit:
     noise (C,): of one model pixel, in the views' units; unit (C,) [counts]: of these
     ties: Ties of the channels, or None
     padded: the frame with its sides grown to those that a batch shares; geometry: SceneGeometry
-    last_steps (n_observations, 2) [model px]: what shifts were last asked for, before `ahead`
-    start: the StartingPoint that `begin` was given; from then on
-    scene, state: Scene and State, as of the start or of where `store_final` left them;
-        strength_estimates: what a MultiscalePrior has learned by then, or None; losses, status,
-            messages, seconds: see Result
+    last_steps (n_observations, 2) [model px]: the last steps of the shifts, before `ahead`
+    start: the StartingPoint passed to `begin`, which sets the following
+    scene, state: Scene and State at the start, later those of `store_final`
+    strength_estimates: those of a MultiscalePrior, or None; losses, status, messages, seconds: see
+        Result
     """
 
     def __init__(self, blend, settings, device, dtype, *, pad):
@@ -111,7 +111,7 @@ class Fit:
 
     @property
     def signature(self):
-        """Fits of equal signature start and iterate side by side; see Scene.signature."""
+        """Fits of equal signature start and iterate side by side; see Scene.batch_key."""
         ops = [view.op for view in self.views]
         known = signature_of(self.padded.shape, self.settings.fit_sky, ops, self.ties)
         return known, self.settings.fit_shifts
@@ -132,7 +132,7 @@ class Fit:
 
     @property
     def sky_precision(self) -> np.ndarray:
-        """Inverse variance (C,) of that level, in their units; 0 where nothing is expected."""
+        """Inverse variance (C,) of that level, in their units; 0 without an expected level."""
         return _joined([view.sky_precision for view in self.views], len(self.unit))
 
     @property
@@ -177,7 +177,7 @@ class Fit:
     def store_final(self, loss, scene, state):
         """Ends the fit with the present state, or with the best one if that is better.
 
-        The present one, if it was interrupted, may be half-way through an iteration.
+        An interrupted fit may be in the middle of an iteration.
         """
         best = self._best
         if self.status != INTERRUPTED and loss <= best.loss:

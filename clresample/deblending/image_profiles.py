@@ -1,9 +1,9 @@
-"""Morphologies to start from, read off all instruments' images, as the paper's deblender does.
+"""Initial morphologies from the instruments' images, as in the paper's deblender.
 
-For each source the sharpest instrument that sees it above 5 sigma: its channels combined by their
-signal-to-noise, brought to the model frame by Whittaker-Shannon interpolation, cut to what is
-symmetric about the source, made monotone, and set to 0 where it is under the noise. A source that
-no instrument sees above 5 sigma takes what all of them together show.
+The image of the sharpest instrument that detects a source above 5 sigma is used. Its channels are
+combined by their signal to noise and interpolated to the model frame (Whittaker-Shannon). The
+result is made symmetric about the source and monotone, and is 0 below the noise. For a source that
+no instrument detects above 5 sigma, the images of all instruments are combined.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from .blend import Blend
 from .solver.boxes import Boxes
 from .solver.constraints import MaxNorm, Monotone, Positivity, ProxChain
 
-# [sigma] What an instrument shows at a source's centre from which on its image is taken: below, the
-# noise would shape the morphology. And what a pixel needs to count as light.
+# [sigma] Signal to noise at a source's centre from which an instrument's image is used: below it
+# the noise would shape the morphology. Then that of a pixel to count as light.
 SEEN, LIGHT = 5.0, 1.0
-# [model px] Half side of the part of the images that is looked at; light beyond is left out. A
-# larger one costs time, the fit's boxes are cut to the light afterwards.
+# [model px] Half side of the region of the images that is used; light beyond is left out. A larger
+# one costs time, and the fit's boxes are cut to the light afterwards.
 RADIUS_PX = 30
 
 

@@ -1,4 +1,4 @@
-"""The loop of a batch of fits: steps, stops, shifts, and boxes resized to the light they hold."""
+"""The loop of a batch of fits: steps, stops, shifts, and boxes resized to their light."""
 
 from __future__ import annotations
 
@@ -15,27 +15,28 @@ from .solver.engine import Engine
 from .solver.multiscale.engine import MultiscaleEngine
 from .solver.multiscale.lbfgs_control import CONVERGENCE_WINDOW
 
-# [iterations] between two looks at the losses: each waits for the device, but fits stop only there.
+# [iterations] between two checks of the losses: each waits for the device, and fits stop only
+# there.
 CHECK_ITERATIONS = 5
-# [iterations] between two shifts of the observations: by then the model has followed most of the
-# last one. Fewer would measure a shift on a model that lags behind, more would take longer.
+# [iterations] between two shifts of the observations: the model has then followed most of the last
+# one. With fewer, a shift would be measured on a lagging model; more would take longer.
 SHIFT_ITERATIONS = 10
-# Part of a batch's fits that have stopped by when the others go on in a smaller batch: making that
-# costs some iterations, and until then the stopped ones are still computed.
+# Fraction of stopped fits at which the others continue in a smaller batch. Making it costs the time
+# of some iterations; until then the stopped fits are still computed.
 REPACK_FRACTION = 0.25
-# A fit under a MultiscalePrior stays where it is if the next shift would lower its loss by less
-# than this part of what ends it.
+# A fit with a MultiscalePrior is not shifted if the next shift would lower its loss by less than
+# this fraction of Settings.loss_tol.
 MIN_GAIN = 0.5
-# [iterations] When a fit with settled strengths takes a step of its JointNewtonStep: at first, and
-# between two; also where it has converged. Every 40 of them, bright scenes take a third longer.
+# [iterations] of a fit with settled strengths before its first JointNewtonStep, and between two; a
+# converged fit takes one too. With one every 40 iterations, bright scenes take a third longer.
 FIRST_JOINT_STEP, JOINT_STEP_ITERATIONS = 40, 20
-# It takes the step if its loss is expected to fall by more than this part of what ends it. With
-# 0.4, two in 100 fluxes of simulated scenes of Rubin's or Euclid's alone move by over 0.2 errors
-# where fits go on, with 0.2 one in 200.
+# The step is taken if the predicted decrease of the loss exceeds this fraction of
+# Settings.loss_tol. With 0.4, two in 100 fluxes of simulated scenes of Rubin or Euclid alone change
+# by over 0.2 errors if the fits are continued; with 0.2, one in 200.
 MIN_JOINT_GAIN = 0.2
-# If the loss has fallen by less than this part of the predicted gain until the next one, the
-# JointNewtonStep is made anew, of the present scene. The second one is given up: bounds hold the
-# scene elsewhere, and trials along its steps would be rejected.
+# If the loss has fallen by less than this fraction of the predicted gain until the next step, a new
+# JointNewtonStep is computed from the present scene. If that one fails too, no more are tried: the
+# scene is then limited by bounds, and further steps would be rejected.
 MIN_JOINT_PROGRESS, MAX_JOINT_MATRICES = 0.2, 2
 # [iterations] between two adjustments of the boxes to the light they hold; each makes a new batch.
 RESIZE_ITERATIONS = 40
@@ -44,8 +45,8 @@ RESIZE_ITERATIONS = 40
 def iterate(fits, settings, device, dtype, progress=None, *, takes_over=None):
     """Runs the fits of one signature until each has stopped; they keep their final states.
 
-    takes_over: of a fit that has learned clear structure; where True the fit ends,
-        STOPPED_FOR_REFIT
+    takes_over: called with a fit that has significant structure; if it returns True, the fit ends
+        with the status STOPPED_FOR_REFIT
     """
     began, running = time.perf_counter(), None
     try:
@@ -74,7 +75,7 @@ def iterate(fits, settings, device, dtype, progress=None, *, takes_over=None):
 
 
 class _AmsgradRun:
-    """The fits of one engine, on their way.
+    """The running fits of one engine.
 
     fits (B): in the engine's order; live (B,): those that have not stopped
     """
@@ -158,13 +159,13 @@ class _AmsgradRun:
 
 
 class _LbfgsRun:
-    """The fits of one engine under a MultiscalePrior, on their way; else as _AmsgradRun.
+    """The running fits of one engine with a MultiscalePrior; otherwise like _AmsgradRun.
 
-    Boxes stay as they are: structure fades at their edges, as the profile does that they follow.
+    Boxes are not resized: structure vanishes at their edges together with the profile.
 
-    exchanges (B): each fit's JointNewtonStep, or None; asked (B, 4): when that was last looked at
-        a fit's rounds and loss, 0 and infinite before, the gain that it promised, and how many
-        were made
+    exchanges (B): each fit's JointNewtonStep, or None
+    asked (B, 4): for its last evaluation, the fit's rounds and loss (0 and infinite before), the
+        predicted gain, and the number of JointNewtonSteps computed
     stop_for_refit: see `iterate`
     """
 
@@ -236,7 +237,7 @@ class _LbfgsRun:
             self.engine.update_shifts(moved)
 
     def _handed_over(self, which):
-        """Those of the fits (B,) that end here, since another one takes their scene over."""
+        """Selects the fits (B,) that end because another fit of their scene replaces them."""
         if not which.any() or self.stop_for_refit is None:
             return np.zeros_like(which)
         which = which & self.engine.strengths.significant_scenes()
@@ -250,23 +251,23 @@ class _LbfgsRun:
         return which
 
     def _exchange(self, which):
-        """Takes the joint step of those fits (B,) whose time has come, if it gains enough.
+        """Takes the joint step of those fits (B,) for which it is due, if it gains enough.
 
-        Those that have converged then go on.
+        Converged fits then continue.
         """
         engine, p = self.engine, self.engine.progress
         enough = MIN_JOINT_GAIN * self.settings.loss_tol * p.chi2()
         rounds, loss, promised, made = self.asked.T
         there = np.array([e is not None for e in self.exchanges])
         due = p.n_rounds >= np.maximum(rounds + JOINT_STEP_ITERATIONS, FIRST_JOINT_STEP)
-        with np.errstate(invalid="ignore"):  # of a fit whose loss was never a number
+        with np.errstate(invalid="ignore"):  # fits whose loss was never finite
             fallen = loss - p.loss
         failed = there & (fallen < MIN_JOINT_PROGRESS * promised)
         old = failed & (made < MAX_JOINT_MATRICES)
         ready = p.converged | (p.live & p.settled & p.tested & due)
         which = which & ready & ((fallen > enough) | old)
         if not which.any() or self.n_steps + CONVERGENCE_WINDOW >= self.settings.max_iter:
-            return  # a fit takes that long to converge again
+            return  # a fit needs this many iterations to converge again
         new = which & ((made == 0) | old)
         self.asked[which] = np.stack([p.n_rounds, p.loss, 0 * p.loss, made + new], 1)[which]
         for i in np.flatnonzero(which & failed):

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 
-# Part of a source's variance that its covariance with another one cancels in their sum, from which
-# on its error is that of dividing their light. Two equal sources have it with a correlation of
-# -0.8: their difference has three times the error of their sum.
+# Fraction of a source's variance cancelled by its covariance with another source in the sum of
+# both, above which its error is dominated by the division of their light. For two equal sources it
+# means a
+# correlation of -0.8: their difference then has three times the error of their sum.
 EXCHANGED = 0.8
-# Part of a flux that is its error at least: within two errors there may be half as much or half as
-# much again.
+# Smallest relative error of the flux of an ambiguous source: with two such errors the flux is half
+# as large, or larger by a half.
 UNDETERMINED = 0.25
-# [sigma] Least signal to noise of the sum: what is no light at all has no owner.
+# [sigma] Smallest signal to noise of the sum of both: undetected light is not ambiguous.
 DETECTED = 5.0
 
 
 def is_ambiguous(flux, covariance) -> np.ndarray:
     """Returns for two sources (2,) True if its light may be the other one's.
 
-    In the channel that determines a source best its flux is uncertain by more than UNDETERMINED of
-    itself, that error is one of exchange, since the other source has what this one lacks, and the
-    sum of both is detected. Noise and the own errors of a bright neighbour make none ambiguous.
+    Criteria, in the channel that determines a source best: its relative flux error is more than
+    UNDETERMINED; the error is dominated by the division of light, since it cancels in the sum of
+    both fluxes; and the sum is detected. Noise alone, or the errors of a bright neighbour, do not
+    suffice.
 
     flux (C, 2) [counts]; covariance (C, 2, 2) [counts^2]: of the two fluxes in each channel, those
         of channels without coverage infinite
@@ -48,8 +50,8 @@ def is_ambiguous(flux, covariance) -> np.ndarray:
 def partners(flux, covariance) -> np.ndarray:
     """Partner of each source with which its light may be exchanged, -1 without one: (S,) int.
 
-    Of several candidates, the one whose covariance takes the most from its variance in some
-    channel. flux (S, C) [counts]; covariance (C, S, S) [counts^2]
+    Of several candidates, the one whose covariance cancels the largest part of its variance in
+    some channel. flux (S, C) [counts]; covariance (C, S, S) [counts^2]
     """
     found, most = np.full(len(flux), -1), np.zeros(len(flux))
     for s, t in np.argwhere(np.triu((covariance < 0).any(axis=0), 1)):

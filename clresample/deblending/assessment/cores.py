@@ -14,7 +14,7 @@ def core_errors(result, psf_error) -> np.ndarray:
 
         psf_error |p - 2| flux,    p: power of the distance by which the light falls beside the core
 
-    A PSF that grows by a part epsilon has (p - 2) epsilon more of its light there.
+    If a PSF's width grows by the fraction epsilon, its light there grows by (p - 2) epsilon.
 
     psf_error [1]: see Settings
     """
@@ -33,7 +33,7 @@ def core_errors(result, psf_error) -> np.ndarray:
 
 
 def with_core_errors(errors, cores):
-    """Errors with those of `core_errors` (S, C) [counts] in the fluxes, each channel's its own."""
+    """Errors that include `core_errors` (S, C) [counts], independent between channels."""
     if not cores.any():
         return errors
     flux, colour, s = errors.flux.copy(), errors.colour.copy(), np.arange(len(cores))

@@ -9,26 +9,26 @@ import numpy as np
 from ...sky.footprint import unobserved
 from ..profiles import GalaxyProfile
 
-# Part of a flux that is outside where light is said to reach the edge: three errors of a bright
-# galaxy's flux are as much.
+# Fraction of a flux outside the observed area from which a source is flagged: three errors of a
+# bright galaxy's flux.
 OUTSIDE = 0.03
-# Share of a ring's area that must have been observed for its mean brightness to stand for all of
-# it: less is a corner of the frame.
+# Smallest observed fraction of a ring's area for its mean brightness to be valid for all of it: a
+# smaller fraction is a corner of the frame.
 MIN_COVERED = 0.2
-# Rings at the end of a profile, as a part of all, whose mean slope it goes on with.
+# Fraction of the rings, at the end of a profile, from whose mean slope it is extrapolated.
 OUTER = 0.25
-# [radius] Largest scale length with which it does: a galaxy that falls less steeply where its image
-# ends is noise, or a sky that is wrong.
+# [radius] Largest scale length of the extrapolation: a flatter profile at the image's edge means
+# noise or a wrong sky level.
 MAX_SCALE = 0.5
 
 
 def light_outside(result, shapes, thetas, positions, peaks) -> np.ndarray:
     """Flux (S, C) [counts] of each source's model, continued outside the observed area.
 
-    At most what it has inside, and the smaller one of two estimates: what the smooth profile has
-    there, which may have wings that its morphology lacks, and the morphology continued, which in
-    its wings may have noise. 0 of sources whose boxes end before the border, and of all but
-    galaxies: the wings of stars are those of the PSF.
+    It is at most the flux inside, and the smaller of two estimates: that of the smooth profile,
+    which may have wings that the morphology lacks, and that of the extrapolated morphology, whose
+    wings may have noise. It is 0 for sources whose boxes end before the border, and for all sources
+    but galaxies: the wings of stars are those of the PSF.
 
     shapes, thetas, positions (n): of the components' profiles; peaks (n,): of the morphologies
         before they were scaled to a maximum of 1, where those of the profiles are 1
@@ -52,9 +52,10 @@ def light_outside(result, shapes, thetas, positions, peaks) -> np.ndarray:
 def continued(origin, morphology, centre, outside) -> float:
     """Sum of a morphology (ny, nx) where its frame was not observed; outside: see `unobserved`.
 
-    Its elliptical rings about the centre (2,) [frame px] have their mean brightness outside too;
-    from where less than a fifth of a ring was observed it goes on as an exponential, with the slope
-    of the last quarter of the rings. No more than the sum that was observed.
+    Elliptical rings around the centre (2,) [frame px] are assumed to have the same mean brightness
+    outside. From the radius where less than a fifth of a ring was observed, the profile is
+    extrapolated as an exponential, with the slope of the last quarter of the rings. The result is
+    at most the observed sum.
     """
     rings = _rings(origin, morphology, centre, outside.shape)
     if rings is None:
@@ -68,7 +69,7 @@ def continued(origin, morphology, centre, outside) -> float:
     area = np.pi * (2 * ring + 1)
     bare = n <= MIN_COVERED * area
     first = rings[outside].min()
-    bare &= ring >= first  # rings within have all their pixels
+    bare &= ring >= first  # inner rings are completely observed
     end = int(np.argmax(bare)) if bare.any() else len(n)
     brightness = light[:end] / np.maximum(n[:end], 1)
     missing = np.where(ring >= first, np.maximum(area - n, 0.0), 0.0)[:end]
@@ -95,7 +96,7 @@ def _rings(origin, morphology, centre, shape):
 
 
 def _tail(brightness):
-    """Sum beyond rings of one pixel, brightness (n,), that go on as an exponential."""
+    """Sum beyond rings of one pixel and brightness (n,), extrapolated as an exponential."""
     if len(brightness) < 2:
         return 0.0
     end, n = float(len(brightness)), max(1, int(OUTER * len(brightness) / 2))
@@ -111,7 +112,8 @@ def _tail(brightness):
 def widened(errors, outside):
     """Errors of fluxes widened by the light outside the observed area (S, C) [counts].
 
-    It is as uncertain as it is large, and common to all channels of a source.
+    The error of this light is assumed as large as the light, and common to all channels of a
+    source.
     """
     flux, s = errors.flux.copy(), np.arange(len(outside))
     flux[:, s, s] += outside.T**2
@@ -122,7 +124,7 @@ def widened(errors, outside):
 def reaches_outside(result, flux) -> np.ndarray:
     """Selects sources (S,) with more than OUTSIDE of their flux (S, C) outside the observed area.
 
-    Only channels count in which that light exceeds the flux error at fixed morphology.
+    Channels in which that light is below the flux error at fixed morphology are ignored.
     """
     if result.errors is None:
         return np.zeros(len(flux), bool)

@@ -9,28 +9,29 @@ import numpy as np
 from ...sky.noise import HALF_WIDTH
 from ..posterior.residuals import MIN_PIXELS, MISFIT_SIGMAS, remainder
 
-# Part of a source's flux in a channel from which on a significant residual is a misfit. Errors of
-# bright galaxies are about 1 % (Settings.flux_error_floor, structure, their growth with the
-# residual), so that three of them cover less; simulated galaxies that are fitted well have fluxes
-# within 3 %.
+# Fraction of a source's flux in a channel from which a significant residual is a misfit. Smaller
+# residuals are within three errors of bright galaxies, which are about 1 %
+# (Settings.flux_error_floor, structure, and their growth with the residual). Simulated galaxies
+# with good fits have fluxes within 3 %.
 MISFIT_FRACTION = 0.03
-# Part of the flux of all sources of a blend that is left where its model does not describe the
-# data. What a single one leaves is said by its flag.
+# Residual fraction of the flux of all sources of a blend from which its model is wrong. The
+# residual of a single source sets only its flag.
 WRONG_FRACTION = 0.1
-# chi2 per pixel, over that of the noise, from which on it is not of noise: weights whose sigma is
-# wrong by 15 % somewhere in an image have as much.
+# chi2 per pixel, relative to that of the noise, from which it is significant: a local error of 15 %
+# in the weights' sigma has the same effect.
 WRONG_CHI2 = 1.3
-# chi2 per pixel of a channel, over that of the noise, that is not of noise whatever is left.
+# chi2 per pixel of a channel, relative to that of the noise, that is significant in any case.
 WRONG_ANYWAY = 2.0
-# chi2 per pixel, over that of the noise, that is not counted as misfit: weights are as right as
-# that from place to place.
+# chi2 per pixel, relative to that of the noise, up to which it does not count as misfit: the local
+# accuracy of weights.
 TRUSTED_CHI2 = 1.1
-# [sigma] Smoothed residuals over this count as light that is left, and the mean absolute value that
-# noise has there, over its scatter: 2 phi(2).
+# [sigma] Smoothed residuals above this count as residual light. Then the mean absolute value of
+# noise
+# above it, in units of the scatter: 2 phi(2).
 LEFT_SIGMAS, LEFT_BY_NOISE = 2.0, 0.108
-# [px] Lags (y, x) at which noise may be correlated unstated; the opposite ones are alike.
+# [px] Lags (y, x) at which noise may be correlated although not declared; opposite lags are equal.
 LAGS_PX = (0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0)
-# [sigma] Residuals of the sky are cut here before they are correlated: stars nobody listed.
+# [sigma] Residuals of the sky are clipped here before correlation, because of unlisted stars.
 CUT = 3.0
 
 
@@ -41,10 +42,10 @@ class Misfit:
     residuals (S, C) [sigma]: see `max_filtered_residuals`, NaN unseen
     excess (S, C) [sigma]: by how much chi2 of the source's pixels is over TRUSTED_CHI2
     chi2 (S, C) [1]: per pixel there, over that of the noise; NaN without pixels
-    light (S, C) [counts]: sum of the absolute residual there, smoothed with the PSF, without what
-        noise adds; where a residual is over 5 sigma, at least the flux of that point source
+    light (S, C) [counts]: sum of the absolute residual there, smoothed with the PSF, minus the
+        contribution of noise; if a residual is over 5 sigma, at least the flux of that point source
     flux (S, C) [counts]: of the model, and at least its error at fixed morphology
-    whole_excess, whole_chi2, whole_light (2, C): the same of the pixels of all sources together,
+    whole_excess, whole_chi2, whole_light (2, C): the same for the pixels of all sources together,
         and of all pixels of the channel on the frame
     """
 
@@ -62,7 +63,7 @@ class Misfit:
         return np.maximum(np.nan_to_num(self.residuals), np.nan_to_num(self.excess))
 
     def fraction(self) -> np.ndarray:
-        """Light that is left over flux (S,), of the channel where it is the largest.
+        """Residual light over flux (S,), in the channel where it is largest.
 
         0 where no channel has over 5 sigma.
         """
@@ -77,15 +78,15 @@ class Misfit:
     def is_wrong(self) -> bool:
         """True if the model as a whole does not describe the data.
 
-        chi2 of a channel is not of noise, where the sources are or on the frame, and much of the
-        light is left, or that of the frame is large.
+        chi2 of a channel is significant, at the sources or on the frame, and the residual fraction
+        of the light is large, or chi2 of the frame is.
         """
         beyond = self.whole_chi2[1] > WRONG_ANYWAY
         return bool((self._wrong | [np.zeros_like(beyond), beyond & self._significant[1]]).any())
 
     @property
     def is_wrong_on_sources(self) -> bool:
-        """The same of the pixels of the sources alone, whatever there is beside them."""
+        """`is_wrong` for the pixels of the sources alone."""
         return bool(self._wrong[0].any())
 
     @property
@@ -111,7 +112,7 @@ def misfit_of(result) -> Misfit:
 
 
 def _of_channel(rest, c, n_sources):
-    """excess, chi2, light (S + 2,) of a channel of a Remainder, the last ones of the whole."""
+    """excess, chi2, light (S + 2,) of a channel of a Remainder, the last two for the whole."""
     used, owner = rest.used[c], rest.owner[c]
 
     def sums(where, values):
@@ -129,7 +130,9 @@ def _of_channel(rest, c, n_sources):
     points = np.where(size > MISFIT_SIGMAS, size * np.nan_to_num(rest.point[c]), 0.0)
     np.maximum.at(light, np.where(owner < 0, n_sources + 1, owner)[seen], points[seen])
     excess = chi2_excess(chi2, count)
-    if (excess > MISFIT_SIGMAS).any():  # else it is no misfit, however few pixels are independent
+    if (
+        excess > MISFIT_SIGMAS
+    ).any():  # otherwise it is no misfit even if few pixels are independent
         excess = chi2_excess(chi2, count / correlation_sum(rest.residual[c], rest.sky[c]))
     return excess, chi2, np.maximum(light, 0.0)
 
@@ -137,8 +140,8 @@ def _of_channel(rest, c, n_sources):
 def chi2_excess(chi2, n):
     """Excess [sigma] of chi2 per pixel over TRUSTED_CHI2, of n pixels of independent noise.
 
-    The cube root of chi2 / n is all but normal, with mean 1 - 2 / 9n and variance 2 / 9n (Wilson &
-    Hilferty 1931, PNAS 17, 684): noise is over 5 sigma once in 3e6, from 10 pixels on.
+    The cube root of chi2 / n is nearly normal, with mean 1 - 2 / 9n and variance 2 / 9n (Wilson &
+    Hilferty 1931, PNAS 17, 684): from 10 pixels on, noise exceeds 5 sigma once in 3e6.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         variance = 2 / (9 * np.asarray(n, float))

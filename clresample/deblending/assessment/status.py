@@ -23,7 +23,7 @@ def with_misfit_status(result):
 
 
 def misfitted_sources(result) -> np.ndarray:
-    """Selects sources (S,) flagged as misfits: those that leave light (`Misfit.sources`).
+    """Selects sources (S,) flagged as misfits, by their residual light (`Misfit.sources`).
 
     If a result has the status "misfit" and no such source, all fitted sources are selected.
     """
@@ -34,9 +34,9 @@ def misfitted_sources(result) -> np.ndarray:
 
 
 def with_source_misfit_status(result):
-    """The result of a piece of a larger image, beside which there is light of others.
+    """The result of a piece of a larger image, with light of other sources around it.
 
-    Its status is "converged" again unless the model does not describe its own sources.
+    Its status becomes "converged" again if the model describes its own sources.
     """
     if result.status != MISFIT or result.misfit.is_wrong_on_sources:
         return result

@@ -4,8 +4,8 @@ With draws (A_k, S_k) of the posterior, clipped at 0:
 
     dm_k = sum_i R (A_ik S_ik - A_i S_i) / sqrt(K),    k = 1 .. K,
 
-R being the operator of the observation. A result read from a file without draws has covariances of
-fluxes alone. Then each model is assumed correct up to a factor,
+where R is the operator of the observation. A result read from a file without draws has covariances
+of fluxes only. Then each model is assumed correct up to a factor,
 
     <dm_s dm_t> = m_s m_t cov(F_s, F_t) / (F_s F_t).
 """
@@ -22,8 +22,8 @@ from ...sky.extent import intersect_boxes
 from ...sky.psf_checks import PSFWarning
 from .separation import component_image, source_image
 
-# [FWHM of the observation's PSF] How far from the window components are followed into the frame: a
-# change of a morphology is smaller than its light, of which 1e-3 lies further away.
+# [FWHM of the observation's PSF] Margin of the window in the frame, for components outside it: 1e-3
+# of a morphology's light lies further away, and of its changes even less.
 REACH_FWHM = 3.0
 
 
@@ -68,7 +68,7 @@ def _of_draws(result, chosen, i_observation, window):
     if images.any():
         y0, x0 = (part.start for part in window)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", PSFWarning)  # of the fit's operator it was said
+            warnings.simplefilter("ignore", PSFWarning)  # the fit's operator has warned
             op = Resampler(
                 result.frame.grid.cutout(*corner, shape),
                 result.frame.psf,

@@ -23,8 +23,8 @@ import numpy as np
 
 OUTSIDE = {"weights": 0.0}  # of an image: all else is NaN there
 KINDS = "data", "model", "residual", "neighbours", "redistributed"
-# of a channel's brightest model pixel: where all models are fainter, a pixel is shared by none.
-# There the rounding of float32 renderings (1e-6), not light, would decide whose it is
+# [1] of a channel's brightest model pixel: if all models are fainter, a pixel's light is assigned
+# to no source, because the rounding of float32 renderings (1e-6) would decide.
 MIN_LIGHT_FRACTION = 1e-5
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from astropy import units as u
 
-# [noise of a pixel] Model light down to which a cutout reaches: ten such pixels beyond its edge add
-# up to less than the noise of one.
+# [noise of a pixel] Model light at the edge of a cutout: ten such pixels beyond the edge add up to
+# less than the noise of one pixel.
 FAINTEST_SIGMA = 0.1
-# The same of the model's brightest pixel, where that is more: wings of bright stars go on for ever.
+# The same relative to the model's brightest pixel, if that is more, because of bright stars' wings.
 FAINTEST_PART = 1e-4
 # [px] Sky about that light; [FWHM of the PSF] least distance of a cutout's edge from the source.
 MARGIN_PX, MIN_HALF_FWHM = 2, 2.0

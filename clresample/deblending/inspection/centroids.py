@@ -12,10 +12,10 @@ from .image import SIGMAS_A_FWHM, InspectedImage
 BRIGHT_SIGMAS = 20.0
 # [standard deviations of the weight] Half-width of the pixels about a source.
 REACH = 2.5
-# Part of its shift by which a weighted centroid moves: half for light as wide as the weight, less
-# for wider light, of which it says little from a tenth on.
+# Smallest ratio of a weighted centroid's shift to the light's: it is a half for light as wide as
+# the weight and less for wider light, for which the centroid is uncertain below this ratio.
 MIN_RESPONSE = 0.1
-# [px] Centroids are trusted to no better than this: neighbours, structure, errors of the PSF.
+# [px] Smallest error of centroids, because of neighbours, structure and errors of the PSF.
 FLOOR_PX = 0.03
 
 
@@ -80,7 +80,7 @@ def over_channels(found) -> tuple[np.ndarray, np.ndarray]:
 def common(offsets, errors) -> tuple[np.ndarray, np.ndarray]:
     """Weighted mean (2,) of offsets (n, 2) with errors (n,), and its error (2,).
 
-    The error is that of their scatter where this is larger; infinite of none.
+    The error follows from their scatter if that is larger; it is infinite without any.
     """
     weight = errors**-2.0
     total = weight.sum()

@@ -1,7 +1,7 @@
 """Shift between two images of one patch of sky, measured without a model of it.
 
-Either image convolved with the other's PSF has one PSF, the convolution of both. The light of the
-sharper one, A, is parted among the sources by nearness, so that each may have any colour, and
+Each image is convolved with the other's PSF, after which both have the same PSF. The light of the
+sharper image, A, is divided among the sources by distance, so that each may have any colour, and
 
     V = b + sum_s [ a_s U_s - a_s t_s . grad U_s ],    V = P_A * d_B,    U_s = P_B * d_A of source s
 
@@ -20,20 +20,20 @@ from ...sky.psf import PSF
 
 # [FWHM of the wider PSF] Radius of the pixels about a source that are compared.
 RADIUS_FWHM = 1.2
-# Relative weight of "nothing" beside sources that the images hardly tell apart: rounding's.
+# Relative ridge for sources that the images can hardly separate, of the size of rounding errors.
 RIDGE = 1e-10
-# Pixels that a fit takes at least, beside three for each source.
+# Smallest number of pixels of a fit, beside three for each source.
 MIN_PIXELS = 12
-# [px of the coarser image] A source's shift is trusted to no better than this: neighbours of other
+# [px of the coarser image] Smallest error of a source's shift, because of neighbours of other
 # colours, structure, and errors of the PSFs.
 FLOOR_PX = 0.02
-# Part of a neighbour's light that is taken to lie elsewhere than the sharper image has it, as
-# colours differ inside galaxies and light is parted by nearness alone.
+# Fraction of a neighbour's light whose position is uncertain, because colours differ inside
+# galaxies and light is divided by distance alone.
 COLOUR = 0.2
-# [FWHM] Half-width of the image of a PSF that is convolved with: of light further out, which is
-# spread evenly about a source, no shift follows.
+# [FWHM] Half-width of the PSF images of these convolutions: light further out is nearly uniform
+# around a source and does not affect the shift.
 KERNEL_FWHM = 3.0
-# Part of a pixel's light that comes from unusable pixels, above which it is left out.
+# Largest fraction of a pixel's light from unusable pixels; above it the pixel is left out.
 HIDDEN = 0.02
 
 

@@ -1,4 +1,4 @@
-"""One observation as it is inspected: significance of its pixels, places of the sources."""
+"""One observation for inspection: significance of its pixels, positions of the sources."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 
 from ...sky.observation import Observation, masked
 
-# [pixels] Noise of a channel: the median of this many weights, evenly spread over the image. Their
-# median is known to a few percent of the spread of weights, which is all that thresholds need.
+# [pixels] Number of weights, evenly spread over the image, whose median gives the noise of a
+# channel. Its error is a few percent of the scatter of weights, which suffices for thresholds.
 N_WEIGHTS = 1000
 # [model px] Lattice of points from which positions in the observation are taken to be affine.
 LATTICE = np.array([(y, x) for y in (0.0, 0.5, 1.0) for x in (0.0, 0.5, 1.0)])
-# Sources that are measured in an image at most, the brightest: more would only cost time.
+# Largest number of sources measured in an image, the brightest: more would only cost time.
 MAX_SOURCES = 12
 SIGMAS_A_FWHM = 2.3548  # of a Gaussian
-# Relative size under which an element of a matrix fitted to the lattice is rounding.
+# Relative size below which an element of a matrix fitted to the lattice is a rounding error.
 ROUNDING = 1e-9
 
 
@@ -27,7 +27,7 @@ class InspectedImage:
 
     observation: Observation; usable (C, My, Mx): bool, pixels with a weight
     sigma (C,) [counts]: noise of a typical pixel, 1 of channels without a weight
-    level (C,) [counts]: of the sky, as far as known: 0 before `levels.sky_levels`
+    level (C,) [counts]: of the sky; 0 before `levels.sky_levels`
     places (S, 2) [px]: of the sources; inside (S,): bool, those on a pixel of the image
     matrix (2, 2), offset (2,): p = matrix X + offset, from model pixels to observed ones
     """

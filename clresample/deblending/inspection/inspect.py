@@ -17,25 +17,26 @@ from .levels import SkyLevel, sky_level
 from .star_psfs import replace_by_stars, with_star_psfs
 from .stars import misfitting_widths
 
-# A level counts as left in or over-subtracted above this many of its errors, and above this part
-# of a pixel's noise: over 100 pixels of a source that moves a flux by its own error.
+# A sky level is reported as left in or over-subtracted above this many of its errors, and above
+# this fraction of a pixel's noise, which changes a flux measured on 100 pixels by its own error.
 LEVEL_SIGMAS, LEVEL_PART = 4.0, 0.1
-# The same of the light at the rim, which may be that of wings: 4 errors of the flux in 100 pixels,
-# by two errors of its own at least.
+# The same for the light at the rim, which may come from wings: 4 errors of the flux in 100 pixels,
+# and at least two errors of that light.
 RIM_PART, RIM_SIGMAS = 0.4, 2.0
-# A level that wings leave unsure is reported as one that may be wrong above this many of its errors
-# and this part of a pixel's noise: none of 400 clean simulated images has two thirds of it.
+# A level that is uncertain because of wings is reported as possibly wrong above this many of its
+# errors and this fraction of a pixel's noise: none of 400 clean simulated images reaches two
+# thirds.
 DOUBT_SIGMAS, DOUBT_PART = 1.5, 0.3
-# Part of a pixel's noise above which the error of a level is reported where the sky is fitted: it
-# moves a flux by its own error over 50 pixels.
+# Fraction of a pixel's noise above which the error of a fitted sky level is reported: it changes a
+# flux measured on 50 pixels by its own error.
 UNSURE_PART = 0.15
-# [FWHM], [px] Pixels nearer to a listed source are not masked as cosmic rays: its core may be one
-# of a PSF narrower than the one given.
+# [FWHM], [px] Pixels nearer to a listed source are not masked as cosmic rays, because the true PSF
+# may be narrower than the one passed.
 CORE_FWHM, CORE_PX = 0.5, 1.5
 
 
 class InputWarning(UserWarning):
-    """Observations or sources that were fitted, with something in them that spoils fluxes."""
+    """A problem of fitted observations or sources that biases fluxes."""
 
 
 def warn_of_many(problems):
@@ -86,7 +87,7 @@ def inspect(blend, frame, positions, shifts, settings) -> Inspection:
         there = frame.grid.positions_in(observation.grid, *positions[near].T)
         image, own = with_star_psfs(image, sources, there, settings.fit_sky)
         n_own += own, image.inside * len(image.usable)
-        # beside a star whose wings fill an image its sky is not known
+        # the wings of a star that fill the image make its sky level uncertain
         if own.any():
             levels[-1] = replace(levels[-1], error=np.full_like(levels[-1].error, np.inf))
         about = _unsure_lines if settings.fit_sky else _level_lines
@@ -136,20 +137,20 @@ def _unmeasured(image):
 
 
 def _level_lines(image, sky):
-    """Messages about a SkyLevel that is not zero, and about a rim that is not dark."""
+    """Messages about a SkyLevel other than zero, and about light at the rim."""
     part, error = sky.level / image.sigma, sky.error / image.sigma
     known, doubt = np.isfinite(error), False
     rim, rim_error = sky.rim / image.sigma, sky.rim_error / image.sigma
     unsure = RIM_SIGMAS * rim_error.mean() / np.sqrt(len(rim))
     wrong = known & (np.abs(part) > np.maximum(LEVEL_SIGMAS * error, LEVEL_PART))
-    if known.any():  # all channels together: what wings leave unsure is common to them
+    if known.any():  # all channels together: the uncertainty from wings is common to them
         mean, shared = part[known].mean(), (sky.wings / image.sigma)[known].mean()
         own = np.maximum(error[known] ** 2 - (sky.wings / image.sigma)[known] ** 2, 0).sum()
         total = np.hypot(shared, np.sqrt(own) / known.sum())
         wrong |= known & (abs(mean) > max(LEVEL_SIGMAS * total, LEVEL_PART)) & (part * mean > 0)
         doubt = abs(mean) > max(DOUBT_SIGMAS * total, DOUBT_PART)
         doubt &= mean > 0 or rim.mean() < -unsure
-    # light is positive: a rim below zero is sky, and where it is not, the sky need not be
+    # light is positive: a rim below zero is over-subtracted sky; a rim above it may be wings
     below = rim < -np.maximum(LEVEL_SIGMAS * rim_error, LEVEL_PART)
     level = np.where(below & ~(wrong & (part < 0)), sky.rim, sky.level)
     lines = []
@@ -279,7 +280,7 @@ def _missing(image):
 
 
 def _offset(images, found):
-    """Message about positions that are off in the sharpest image, from the Centroids in each."""
+    """Message about wrong positions in the sharpest image, from the Centroids in each."""
     i = shifted.sharpest(images)
     offset = listing.common_offset(found[i])
     if offset is None:
@@ -293,7 +294,7 @@ def _offset(images, found):
 
 
 def _widths(image, sources, numbers):
-    """Message about a PSF that the sources disagree with."""
+    """Message about a PSF whose width differs from that of the sources."""
     lines = []
     for i, c, part, error in misfitting_widths(image, sources):
         how = "narrower" if part < 0 else "wider"

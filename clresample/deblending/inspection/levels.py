@@ -1,4 +1,4 @@
-"""Level of the sky in the pixels of an observation that hold no source, with its uncertainty."""
+"""Level of the sky in the source-free pixels of an observation, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -6,24 +6,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# Blocks along the longer side of an image: enough to leave many between the sources, each large
-# enough for its mean to be known better than a pixel.
+# Blocks along the longer side of an image: enough for many blocks between the sources, each large
+# enough to average the noise of pixels.
 N_BLOCKS = 16
 MIN_BLOCK_PX = 3
-# Blocks without a source that a level needs: of fewer, their scatter is not known to a factor of 2.
+# Smallest number of source-free blocks: with fewer, their scatter is uncertain by a factor of 2.
 MIN_BLOCKS = 8
-# [FWHM of the PSF] Blocks whose centre is nearer to a source hold its light.
+# [FWHM of the PSF] Blocks whose centre is nearer to a source contain its light.
 NEAR_SOURCE = 1.5
-# [sigma] Blocks further from the level and the wings hold sources that nobody listed, or defects.
+# [sigma] Blocks that deviate more from level and wings contain unlisted sources or defects.
 CLIP = 3.0
 N_ROUNDS = 3
 # Median |x| of a unit Gaussian, inverted.
 SIGMAS_A_MAD = 1.4826
-# Parts of the blocks without a source, those furthest from the light: the level is fitted in the
-# first, where wings are faint; the second is the rim, where they should have ended.
+# Fractions of the source-free blocks, those furthest from the light. The level is fitted in the
+# first fraction, where wings are faint; the second is the rim, where they should have ended.
 DARK, RIM = 0.5, 0.25
-# Powers of the distance by which wings fall: exponential disks end faster, the outskirts of
-# ellipticals (n = 4) fall by r^-2.5 to r^-3.5 from 3 to 12 effective radii, other powers bound it.
+# Powers of the distance by which wings fall. The outskirts of ellipticals (n = 4) fall as r^-2.5 to
+# r^-3.5 from 3 to 12 effective radii, and exponential disks faster; the outer two powers are
+# bounds.
 POWERS = 2.0, 3.0, 4.0
 
 
@@ -31,12 +32,12 @@ POWERS = 2.0, 3.0, 4.0
 class SkyLevel:
     """Level of the sky in each channel of an observation.
 
-    level (C,) [counts]: of source-free pixels, the sources' wings in them taken off
-    error (C,) [counts]: of it, all causes; infinite where too few pixels are free of sources
-    wings (C,) [counts]: part of the error from wings that may fall slower or faster, which is of
-        one sign in all channels
-    rim (C,) [counts]: level of the pixels furthest from the sources, with all that is in them
-    rim_error (C,) [counts]: of it; infinite where it is not known
+    level (C,) [counts]: of source-free pixels, after subtraction of the sources' wings
+    error (C,) [counts]: total error of the level; infinite if too few pixels are free of sources
+    wings (C,) [counts]: contribution of the unknown slope of wings to the error, which has the same
+        sign in all channels
+    rim (C,) [counts]: level of the pixels furthest from the sources, wings included
+    rim_error (C,) [counts]: error of the rim; infinite if it is unknown
     """
 
     level: np.ndarray
@@ -51,10 +52,10 @@ def sky_level(image) -> SkyLevel:
 
         mean of block b = level + wing T_b,    T_b = sum_s f_s (r_sb^2 + r_0^2)^(-p/2),    wing >= 0
 
-    fitted with p = 3 to the means of blocks of pixels in the darker half of the image, those off by
-    over 3 sigma left out. f_s is the light at source s, r its distance, r_0 the PSF's FWHM. Half of
-    what the level moves by from p = 2 to 4 is part of its error; the rest of the error follows from
-    the scatter of the blocks, correlated noise included.
+    fitted with p = 3 to the means of blocks of pixels in the darker half of the image, without
+    3-sigma outliers. f_s is the light at source s, r its distance, r_0 the PSF's FWHM. Half of the
+    change of the level between p = 2 and 4 is part of its error; the rest follows from the scatter
+    of the blocks, which includes correlated noise.
     """
     means, counts, centers, side = _blocks(image)
     n_channels = len(means)
@@ -158,7 +159,7 @@ def _wings(image, means, centers):
         return np.zeros((len(POWERS), *means.shape))
     squares = ((centers[:, None] - places) ** 2).sum(axis=-1)  # (B, S)
     light = means[:, squares.argmin(axis=0)] - np.median(means, axis=1, keepdims=True)
-    light = np.maximum(light, image.sigma[:, None] * 1e-3)  # wings of undetected sources are none
+    light = np.maximum(light, image.sigma[:, None] * 1e-3)  # undetected sources have no wings
     core = max(image.width_px, 1.0) ** 2
     return np.stack([light @ (1 + squares / core).T ** (-p / 2) for p in POWERS])
 
@@ -191,7 +192,7 @@ def _middle(values, kept):
 def _spread(values, white, middle, kept):
     """Scatter (C, B) of blocks about the middle (C,).
 
-    It is their white noise, times how much wider the kept ones scatter, at least 1.
+    It is their white noise times the ratio of the kept blocks' scatter to it, at least 1.
     """
     wide = SIGMAS_A_MAD * _middle(np.abs(values - middle[:, None]) / white, kept)
     return np.maximum(1.0, wide)[:, None] * white

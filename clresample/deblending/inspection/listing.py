@@ -8,23 +8,23 @@ import numpy as np
 
 from .centroids import common, over_channels
 
-# [model px] Two sources nearer than this share every pixel: no image tells their fluxes apart.
+# [model px] Two sources nearer than this share every pixel, and no image can separate their fluxes.
 SAME_PLACE_PX = 1.0
-# [sigma] Light that nobody listed counts from here on, in all channels together.
+# [sigma] Smallest significance of unlisted light, in all channels together.
 UNLISTED_SIGMAS = 10.0
-# Unlisted light is named when it is brighter than this part of the typical listed source: fainter
-# light is given to its neighbours in part, and moves them by less.
+# Unlisted light is reported if it is brighter than this fraction of the typical listed source.
+# Fainter light is partly attributed to its neighbours, and changes them little.
 UNLISTED_PART = 0.25
 # [FWHM of the PSF] Light nearer to a listed source belongs to it; at least in pixels.
 OWN_FWHM, OWN_PX = 1.5, 3.0
-# Of a peak: light that stays above this part all the way to a listed source is a part of it.
+# [1] of a peak: light that stays above this level up to a listed source belongs to that source.
 SADDLE_PART = 0.5
-N_NEAREST = 6  # sources that light may be a part of, the nearest ones
-# [px], [sigma] Offset that all positions share, from which on it is named, and its significance.
+N_NEAREST = 6  # number of the nearest sources that light may belong to
+# [px], [sigma] Smallest common offset of all positions that is reported, and its significance.
 OFFSET_PX, OFFSET_SIGMAS = 0.6, 4.0
-# Sources from whose scatter the error of an offset is known.
+# Smallest number of sources for the error of an offset from their scatter.
 MIN_SOURCES = 3
-# [px] By which a galaxy's light within the PSF's width lies off its catalogued centre, as a rule.
+# [px] Typical offset of a galaxy's light within the PSF's width from its catalogued centre.
 OFFSET_FLOOR_PX = 0.2
 
 

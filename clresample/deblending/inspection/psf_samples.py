@@ -9,15 +9,15 @@ import numpy as np
 # [px] Sub-pixel positions of a point at which the contrast of its image is evaluated: four more
 # change the sharpest contrast of a PSF of 1.5 px FWHM by less than a hundredth.
 PHASES = np.array([-0.5, -0.25, 0.0, 0.25, 0.5])
-# Contrast is that of a PSF narrower by this factor: measured PSFs are known to a few percent, those
-# of other exposures or filters differ by more, and no star's core may be taken for a cosmic ray.
+# Contrast is that of a PSF narrower by this factor, so that no star's core is masked as a cosmic
+# ray: PSFs are measured to a few percent, and those of other exposures or filters differ by more.
 NARROWER = 1.25
 
 
 def psf_at(psf, band, y, x) -> np.ndarray:
     """Values (n, m) [1] of a band of a PSF at y (n,), x (m,) [px] from its centre.
 
-    Sinc interpolation of the samples, which is exact for what they hold.
+    Sinc interpolation of the samples, which is exact for a band-limited PSF.
     """
     image, (y0, x0) = psf.images[band], psf.center[band]
     n_y, n_x = image.shape
@@ -32,8 +32,9 @@ def pair_ratios(psf) -> np.ndarray:
 
         kappa_y = min_x [P(1 - x) + P(-1 - x)] / P(-x),    x: position of a point in its pixel
 
-    Along y and along x, of the PSF made narrower by a quarter. Non-negative light behind the PSF
-    itself nowhere has less: a pixel that has is no light from the sky.
+    Along y and along x, for the PSF made narrower by a quarter. Non-negative light convolved with
+    the
+    PSF has at least this ratio everywhere: a pixel with less is not light from the sky.
     """
     places = NARROWER * (PHASES[:, None] + [-1.0, 0.0, 1.0]).ravel()
     n = len(PHASES)

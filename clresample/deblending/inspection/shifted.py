@@ -1,4 +1,4 @@
-"""Observations, and channels of one, whose light lies at different places of the sky."""
+"""Finds observations, and channels of one, whose light lies at different sky positions."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from ..settings import AUTO
 from .centroids import common, over_channels
 from .disagreement import ImagePlane, shifts_at
 
-# [model px] Shifts from here on count: world coordinates of good surveys agree to about this, and
-# smaller ones move fluxes by less than the PSF's errors do.
+# [model px] Smallest shift that counts: world coordinates of good surveys agree to about this, and
+# smaller shifts change fluxes by less than the PSF's errors.
 MIN_SHIFT_PX = 0.25
 # [px] The same between channels of one observation.
 MIN_CHANNEL_PX = 0.15
-# [sigma] significance of a shift; between channels, of which there are many more, colours that
-# differ inside a galaxy count as one too.
+# [sigma] Significance of a shift between observations, and between channels; the latter are many
+# more, and colour differences inside a galaxy look like shifts.
 SHIFT_SIGMAS, CHANNEL_SIGMAS = 3.0, 5.0
-# Part of the least shift from which on centroids call for a closer look, which takes ten times as
-# long; neighbours move centroids.
+# Fraction of the smallest shift from which the centroids are verified by the images themselves,
+# which takes ten times as long; neighbours bias centroids.
 CLOSER = 0.7
 # Channels of each observation that are compared, those of most light.
 MAX_CHANNELS = 2
-# [px of the coarser image] Shifts of single sources known no better tell nothing.
+# [px of the coarser image] Shifts of single sources with larger errors are ignored.
 MAX_ERROR_PX = 0.5
 
 
@@ -101,7 +101,7 @@ def _closer(one, other):
     ]
     shifts, errors = (np.concatenate(some) for some in zip(*pairs, strict=True))
     shift, error = common(shifts @ inverse.T, errors * scale)
-    return shift, error * np.sqrt(len(pairs))  # channels share what is wrong with a source
+    return shift, error * np.sqrt(len(pairs))  # errors of a source are common to all channels
 
 
 def _suspect(shift, error, least):
@@ -110,7 +110,7 @@ def _suspect(shift, error, least):
 
 
 def _trusted(shifts, errors):
-    """Shifts and errors, infinite where a shift is hardly known."""
+    """Shifts and errors, the errors infinite if a shift is too uncertain."""
     return shifts, np.where(errors < MAX_ERROR_PX, errors, np.inf)
 
 

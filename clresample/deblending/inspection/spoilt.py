@@ -1,4 +1,4 @@
-"""Pixels that hold no light of the sky as it is: saturated ones, cosmic rays, hot pixels."""
+"""Finds invalid pixels: saturated ones, cosmic rays, hot pixels."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from scipy.ndimage import binary_dilation, label
 from ...sky.psf_checks import LIMIT_TOLERANCE, limit_power
 from .psf_samples import pair_ratios
 
-# [sigma] Pixels of a plateau are brighter: noise alone gives images of integers small ones.
+# [sigma] Smallest brightness of a plateau: noise in images of integers has faint plateaus.
 FLAT_SIGMAS = 20.0
-# Connected pixels of one value that make a plateau, and of images of integers, where two bright
-# pixels are equal by chance once in a few sigma [counts].
+# Smallest number of connected pixels of one value in a plateau, and the same for images of
+# integers, where bright pixels can be equal by chance.
 FLAT_PIXELS, FLAT_INTEGERS = 3, 5
-# [px] Pixels beside saturated ones have taken some of their charge.
+# [px] Margin around saturated pixels, into which charge spreads.
 GROW_PX = 2
-# [sigma] Of 1e6 pixels of noise none is so far off.
+# [sigma] Not reached by 1e6 pixels of noise.
 SHARP_SIGMAS = 6.0
-# Part of the brightest pixel near one that is uncertain in it: PSFs are known to a few percent.
+# Uncertainty of a pixel in units of the brightest pixel nearby: PSFs are accurate to a few percent.
 NEIGHBOUR_PART = 0.05
-# PSF images with more of their transform left at their limit (psf_checks.LIMIT_TOLERANCE) are
-# interpolated with errors of that order: their contrast is taken to be this part.
+# Contrast of PSF images with more of their transform at their frequency limit
+# (psf_checks.LIMIT_TOLERANCE), in units of the computed one: their interpolation has such errors.
 COARSE_PART = 0.5
 
 
@@ -91,8 +91,9 @@ def sharper_than_psf(image) -> np.ndarray:
 
         kappa v > v_up + v_down + 6 sigma + uncertainty of the PSF, or the same along x
 
-    kappa: `psf_samples.pair_ratios`. None where pixels as negative are as many: the noise is larger
-    than its weights, then. Pixels beside unusable ones and on the edge are left alone.
+    kappa: `psf_samples.pair_ratios`. No pixel is selected if equally many pixels are equally
+    negative, because the noise is then larger than the weights imply. Pixels beside unusable ones
+    and on the edge are not selected.
     """
     z, psf = image.significance, image.observation.psf
     ratios = pair_ratios(psf)

@@ -10,19 +10,20 @@ from scipy.optimize import minimize
 
 from .psf_samples import psf_at
 
-# [FWHM of the PSF] Least radius of the disc that fits into the masked pixels of a core: narrower
-# ones are bad columns and cosmic rays.
+# [FWHM of the PSF] Smallest radius of the largest disc inside the masked pixels of a core: narrower
+# masks are bad columns and cosmic rays.
 MIN_RADIUS_FWHM = 0.35
-# [sigma] Light of a pixel beside a core: detectors saturate at 1e3 sigma, a pixel or two inwards.
+# [sigma] Smallest light of a pixel beside a core: detectors saturate at 1e3 sigma, 1 to 2 px
+# inwards.
 MIN_EDGE_SIGMAS = 20.0
 # [FWHM] Width of the ring beside a core in which the star's light is compared with the PSF.
 RING_FWHM = 1.5
-# Pixels of that ring with a weight, at least, and how many of its four quarters they lie in.
+# Smallest number of pixels of that ring with a weight, and of its quarters that contain them.
 MIN_RING_PIXELS, MIN_QUARTERS = 12, 3
-# Light of the outer half of the ring over that of the inner one may be larger than the PSF has it
-# by this factor: PSFs are uncertain in their wings. A galaxy's is larger by more.
+# Largest ratio of outer to inner light in the ring, in units of the PSF's ratio: PSFs are uncertain
+# in their wings. A galaxy has a larger ratio.
 MAX_FLATTER = 2.0
-# [e-foldings] Mean deviation of the ring's light from its value at each radius: of a star it is
+# [e-foldings] Largest mean deviation of the ring's light from its value at each radius: stars have
 # that of spikes and of the PSF's ellipticity.
 MAX_SCATTER = 0.5
 
@@ -80,7 +81,7 @@ def _core(light, usable, masked, psf, band, fwhm):
     weight = np.maximum(light[edge], 0) ** 2
     guess = np.array([weight @ y, weight @ x]) / weight.sum()
     top = np.array(light.shape) - 1
-    for _ in range(2):  # the ring is chosen about the place, which is found from the ring
+    for _ in range(2):  # ring and position depend on each other
         at = tuple(np.clip(np.rint(guess).astype(int), 0, top))
         if not masked[at] and not binary_dilation(masked, np.ones((3, 3), bool))[at]:
             return None

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# [sigma] Rings of less light are left to medians along rays; pixels of a ring, at least; rings over
-# which the slope at either end is taken.
+# [sigma] Smallest light of a ring; smallest number of its pixels; number of rings over which the
+# slope at either end is measured.
 RING_SIGMAS, MIN_RING, END_RINGS = 3.0, 6, 3
 LOG_STEP = 0.1  # of a radius, over which the slope at the rim is taken
 

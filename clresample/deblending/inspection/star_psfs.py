@@ -34,15 +34,16 @@ from .spoilt import GROW_PX
 from .star_cores import star_cores
 from .star_profile import RadialProfile
 
-# [FWHM of the PSF] Length of the medians along rays, where sources are narrower than half of it,
-# and where the star's light is over BRIGHT_STAR_SIGMAS: there no source is as bright.
+# [FWHM of the PSF] Length of the medians along rays. The second one is used where the star's light
+# is over BRIGHT_STAR_SIGMAS, brighter than any source. Sources are narrower than half of the
+# length.
 LONG_MEDIAN_FWHM, SHORT_MEDIAN_FWHM, BRIGHT_STAR_SIGMAS = 8.0, 1.0, 100.0
-# Times that what is left is smoothed and added: once more than a convolution, gradients stay.
+# Iterations in which the smoothed remainder is added, so that gradients are preserved.
 N_ROUNDS = 5
-# [FWHM of the PSF] Radius of a core from which on a source is taken for a star if it was listed as
-# a galaxy: no galaxy's light falls like that of a PSF so far out.
+# [FWHM of the PSF] Radius of a core from which a source listed as a galaxy is fitted as a star: no
+# galaxy's light falls like that of a PSF at such radii.
 MIN_STAR_RADIUS_FWHM = 1.0
-# [px] By which a place may differ from the star's, as positions are rounded.
+# [px] Tolerance in the comparison of positions with those of stars, because of rounding.
 SAME_PLACE_PX = 0.5
 N_ANGLES = 16  # of the rings over which a PSF image is averaged
 MIN_USABLE_WEIGHT = 0.99  # [1] of the weights of interpolation between pixels
@@ -178,7 +179,7 @@ def _measure_psf(image, c, place, core, sky):
     """
     o, fwhm = image.observation, float(image.observation.psf.fwhm_px[c])
     psf, (n_y, n_x) = _listed_psf(o, place), image.usable.shape[1:]
-    # what is fitted is the light above no level, or above one that is fitted
+    # the fit has no sky level, or a fitted one
     data = np.where(image.usable[c], o.data[c] - sky * image.level[c], 0.0)
     radius = core.radius + GROW_PX
     away = np.hypot(np.arange(n_y)[:, None] - core.place[0], np.arange(n_x) - core.place[1])

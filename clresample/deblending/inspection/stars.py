@@ -9,8 +9,8 @@ from .psf_samples import psf_at
 
 # [sigma] Light of a source, in one channel, whose width is then known to a few percent.
 STAR_SIGMAS = 50.0
-# Part by which a PSF is reported to be too wide or too narrow: 5 % moves fluxes by 2.5 sigma beside
-# sources of signal to noise 100 (fluxes of real HSC images), and is what PSFs are known to.
+# Smallest relative width error of a PSF that is reported: 5 % changes fluxes by 2.5 sigma beside
+# sources of signal to noise 100 (real HSC images), and is the accuracy of measured PSFs.
 WIDTH_PART = 0.05
 # [sigma] significance of that
 WIDTH_SIGMAS = 5.0
@@ -25,14 +25,14 @@ WIDTH_STEP, SHIFT_STEP = 0.05, 0.1
 def misfitting_widths(image, sources):
     """Sources whose width disagrees with an image's PSF: [(source, channel, part, error)].
 
-    part: by which the light is wider than the PSF, negative where it is narrower. Of PointSources,
-    alone within 4 FWHM, both are reported; of other sources only narrower light, which no source
-    behind this PSF has.
+    part [1]: relative excess of the light's width over the PSF's, negative if it is narrower.
+        PointSources without neighbours within 4 FWHM are reported in both cases. Other sources are
+        reported only if narrower, which no source convolved with this PSF can be.
     """
     found = []
     stars = np.array([isinstance(source, PointSource) for source in sources], bool)
     bright = image.brightest[image.light[image.brightest] > STAR_SIGMAS]
-    # of others the brightest tells as much as all
+    # of the other sources the brightest suffices
     for i in [*bright[stars[bright]][:MAX_STARS], *bright[~stars[bright]][:1]]:
         star = stars[i]
         if star and not _alone(image, i):
