@@ -1,8 +1,7 @@
-"""Smooth profiles of sources on model pixels, from which their own structure departs.
+"""Smooth profiles of sources on model pixels, to which the prior adds structure.
 
-A source has one ComponentProfile for each of its components: a GalaxyProfile, a FixedProfile
-profile or a StarProfile. A shape is drawn from a few parameters theta (n,), which `start` fits to
-the data.
+A source has one ComponentProfile for each of its components: a GalaxyProfile, a FixedProfile or a
+StarProfile. A profile is drawn from a few parameters theta (n,), which `start` fits to the data.
 
     S(x) = (1 + q / (2 beta))^(-beta - 1),   q = (x - c)^T C^-1 (x - c)
     C = sigma^2 [[1 + e1, e2], [e2, 1 - e1]] + C_psf      rows and columns (y, x)
@@ -21,25 +20,25 @@ from ..sky.extent import box_slices
 from ..sky.psf import PSF
 from ..sky.sources import ExtendedSource, PointSource
 
-# OTFs of model PSFs that are kept: the stars of one frame share one, of 1 MB at 256 pixels.
+# Number of cached OTFs of model PSFs: the stars of a frame share one, of 1 MB at 256 pixels.
 N_OTFS = 8
-# What is expected of a galaxy before its images are looked at (start/population.py learns more of
-# it from a scene's other galaxies): Gaussian sigma 0.25" (half-light radius 0.3") with a scatter of
-# 0.4 in its logarithm, as in deep fields; round, with a scatter of 0.17 per component; wings
-# between exponential and Gaussian, nearer to this. Galaxies are less round, 0.26 (Leauthaud et al.
-# 2007), but under their own scatter and wings of 5 models of faint ones follow the noise: median
-# SDRs of simulated COSMOS galaxies, 0.22" wide or more, are 0.1 to 0.3 dB lower in Euclid's or
-# Rubin's images alone, and as high without that smoothing.
+# Prior on a galaxy (start/population.py updates it from the scene's other galaxies): Gaussian sigma
+# 0.25" (half-light radius 0.3") with a scatter of 0.4 in its logarithm, as in deep fields; round,
+# with a scatter of 0.17 per component; wings between exponential and Gaussian, nearer to the
+# latter. Real galaxies are less round, 0.26 (Leauthaud et al. 2007). With that scatter, and wings
+# of 5, models of
+# faint galaxies follow the noise: median SDRs of simulated COSMOS galaxies, 0.22" wide or more, are
+# 0.1 to 0.3 dB lower in Euclid's or Rubin's images alone. Without that smoothing they are equal.
 SIZE_ARCSEC, SIZE_SCATTER = 0.25, 0.4
 ELLIPTICITY_SCATTER = 0.17
 WINGS, WINGS_SCATTER = 6.5, 0.7
 # Several components of a source start this far apart in ln(size), as a bulge and a disk do.
 COMPONENT_SPREAD = 1.0
-# [px] A star is drawn up to this over the threshold, in parts of its peak: there the rings of one
-# between two pixels, thin lines along both axes, are a few times the threshold. Twice as much makes
-# boxes twice as large.
+# [px] The half size of a star's box is this over the threshold, which is a fraction of the peak.
+# The rings of a star between two pixels, thin lines along both axes, are there a few times the
+# threshold. Twice the value doubles the boxes.
 RING_PX = 0.002
-# [px] scatter of a free star's position about the one given
+# [px] Scatter of a free star's position about the listed one.
 STAR_SCATTER_PX = 0.5
 
 
@@ -135,7 +134,7 @@ def _otf(psf, n_fft):
 class ComponentProfile:
     """The smooth profile of a component.
 
-    mean, scatter (n,): what is expected of theta
+    mean, scatter (n,): of the prior on theta
     draw(theta, position, shape): (1 + n, Ny, Nx), the profile of unit integral for a source at a
         position (2,) [px], and its slopes by theta: on the frame, or on a box of a `shape`
     """
@@ -164,9 +163,9 @@ class GalaxyProfile(ComponentProfile):
     """A smooth elliptical profile; theta = (ln sigma [px], g1, g2, ln beta), see profiles.py.
 
     frame: the model's Frame; i_component of n_components: of its source, from compact to wide
-    widened: how much larger than usual it is expected to be
+    widened: factor of its expected size
 
-    whole: whether it is all of its source
+    whole: True if it is the only component of its source
     """
 
     def __init__(self, frame, i_component=0, n_components=1, *, widened=1.0):
@@ -202,7 +201,7 @@ class GalaxyProfile(ComponentProfile):
 
 
 class FixedProfile(ComponentProfile):
-    """A profile (Ny, Nx) that comes with the source; no parameters."""
+    """A profile (Ny, Nx) passed with the source; no parameters."""
 
     def __init__(self, image):
         self.image = np.asarray(image) / np.sum(image)

@@ -1,4 +1,4 @@
-"""Boxes that follow the light: grown where it reaches their edge, trimmed where there is none."""
+"""Resizes boxes to the light: grown where it reaches their edge, trimmed where there is none."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 from ..sky.extent import box_slices, intersect_boxes
 from .solver.scene import Scene, State
 
-# A box holds the pixels where the source is brighter than this part of the noise of a model pixel;
-# smaller values make larger boxes, which cost time and hold no more light that is seen.
+# [noise of a model pixel] Brightness of a source at the edge of its box. Smaller values make larger
+# boxes, which cost time and add no detectable light.
 BOX_NOISE = 0.1
-# Least and largest threshold, as parts of the profile's peak: a star of any brightness ends where
-# its PSF's float32 does; the box of a source that is hardly seen still holds its profile.
+# Smallest and largest threshold, as fractions of the profile's peak: the first is the rounding of
+# the PSF in float32, the second keeps the profile of a hardly detected source in its box.
 BOX_FAINTEST, BOX_BRIGHTEST = 1e-7, 5e-3
 # [px] Boxes reach at least this far from their centre, however faint the source.
 SMALLEST_RADIUS_PX = 5
-# [px] by which a side grows where light reaches it, and the least by which one is trimmed: each
-# change of a box makes a new engine.
+# [px] Growth of a side reached by light, and smallest trim of a side: each change of a box requires
+# a new engine.
 GROW_PX, TRIM_PX = 8, 4
 # A side grows when a pixel of its edge is brighter than this many times BOX_NOISE.
 GROW_AT = 4.0
@@ -27,9 +27,10 @@ GROW_AT = 4.0
 def box_threshold(brightness):
     """Part of a profile's peak down to which its pixels belong into its box.
 
-    brightness: the peak over the noise of a model pixel. A pixel belongs there if the profile
-    reaches BOX_NOISE of the noise, or if the structure does that the prior allows about it: with
-    alpha = 0.1 that is 0.1 sqrt(profile) of the peak, so the profile's part is brightness^-2
+    brightness: the peak over the noise of a model pixel. A pixel belongs to the box if the profile,
+        or the prior's scatter of structure there, reaches BOX_NOISE of the noise. With alpha = 0.1
+        that scatter is 0.1 sqrt(profile) of the peak, so the threshold on the profile is
+        brightness^-2
     """
     brightness = max(brightness, 1.0)
     return np.clip(min(BOX_NOISE / brightness, brightness**-2), BOX_FAINTEST, BOX_BRIGHTEST)
@@ -39,7 +40,7 @@ def box_around(profile, position, brightness):
     """Box of one profile: origin (2,) and shape (2,) inside the frame, and its centre pixel (2,).
 
     profile (Ny, Nx): over the frame; position (2,) [px]; brightness: its peak over the noise of a
-    model pixel, in the channel that sees it best
+        model pixel, in the channel with the highest signal to noise
     """
     threshold = box_threshold(brightness) * profile.max()
     top = np.array(profile.shape) - 1
@@ -73,9 +74,9 @@ def component_box(start, i, frame, brightness):
 def resize_boxes(scene: Scene, state: State, start, noise) -> tuple[Scene, State]:
     """Scene and state in boxes that fit the present morphologies; themselves where all of them do.
 
-    start: StartingPoint, whose profiles are expected; noise (C,): of a model pixel. What the state
-    holds of a box moves along: new pixels start at the profile, with z and all that the update
-    remembers at 0.
+    start: StartingPoint with the expected profiles; noise (C,): of a model pixel. Arrays of the
+        state
+    are copied to the new boxes: new pixels start at the profile, with z and all moments at 0.
     """
     boxes = [_box(scene, state, i, start, noise) for i in range(len(state.morph))]
     if all(_same(scene, i, box) for i, box in enumerate(boxes)):

@@ -53,25 +53,25 @@ class Component:
 class Result(ResultDisplay):
     """The fitted model of one blend.
 
-    observations, frame, sources: what was fitted; sources that were given in an observation's
-        pixels have their position in the frame's now; components (n): in the order of the sources
+    observations, frame, sources: the input of the fit; positions of sources in an observation's
+        pixels were converted to the frame's; components (n): in the order of the sources
     rendered: per observation (n, Co, My, Mx) [1], each component's morphology on its pixels under
         its PSF: spectrum times this is the model of the data. An array, or a ComponentImages, which
-            holds
-        each component only where its light reaches
+        stores each component within the window of its light
     sky (C,) [counts]: constant background per channel, 0 where it was not fitted
     covariance (C, n, n) [counts^2]: of the spectra of one channel over all components, inverse of
         the normal matrix with morphologies fixed (and sky free where it was); infinite variance for
         components without coverage
-    errors: of fits with a MultiscalePrior, the Errors of fluxes, shapes and morphologies, marginal
-        over the morphologies, which `fluxes` and `catalogue` report. None where there are none: of
-        other priors, and where `messages` says so; then these report the covariance above
-    draws: what `sample` and `sample_fluxes` draw from
+    errors: of fits with a MultiscalePrior, the Errors of fluxes, shapes and morphologies,
+        marginalised over the morphologies, which `fluxes` and `catalogue` report. None for other
+        priors, and if they failed, with a reason in `messages`; then these report the covariance
+        above
+    draws: PosteriorSampler of `sample` and `sample_fluxes`
     shifts (n_observations, 2) [model px]: fitted offsets of the observations' pixels
     losses (n_iterations + 1,): half chi2 (plus priors) before each iteration and at the end
     status: "converged", "misfit" (its steps ended, but the model does not describe the data, see
         `Misfit.is_wrong`), "iteration limit", "diverged", "interrupted" or "failed: ..."
-    messages: what the user should know, a line each; seconds: wall time by stage
+    messages: for the user, a line each; seconds: wall time by stage
     """
 
     observations: tuple[Observation, ...]
@@ -91,7 +91,7 @@ class Result(ResultDisplay):
 
     @property
     def converged(self) -> bool:
-        """True if the fit's loss did not fall any further, at a model that describes the data."""
+        """True if the fit converged to a model that describes the data."""
         return self.status == CONVERGED
 
     @property
@@ -153,7 +153,7 @@ class Result(ResultDisplay):
         returns the profile about the source's position [arcsec, u to the west, v to the north],
             with its flux in that channel's counts; `galsim.Deconvolve` takes the frame's PSF off
 
-        Raises ImportError without GalSim; ValueError for a channel that there is not.
+        Raises ImportError without GalSim; ValueError for an unknown channel.
         """
         from ..adapters.galsim import profile_of
 
@@ -191,18 +191,18 @@ class Result(ResultDisplay):
             "redistributed", the source's share of the data in proportion to the models, see
             `redistribute`. "data" is "model" plus "residual"
         size: (ny, nx) or one number of pixels, or angles as Quantities, about the source; None =
-            what holds its model down to a tenth of the noise, as far as the image goes
-        unit: None = counts, or one of flux density, such as "uJy", where there are zero points
+            the extent of its model down to a tenth of the noise, within the image
+        unit: None = counts, or one of flux density, such as "uJy", which requires zero points
 
         returns astropy.nddata.CCDData (Ny, Nx), or (C, Ny, Nx) of several channels: with the WCS,
             the standard deviation (of "data": noise and what the posterior leaves open of the
             neighbours, see docs/howto/alone.md), mask (True = ignore: no data, or outside), and the
             PSF at the middle. Images of data are NaN where they are masked
 
-        Raises ValueError for names and sizes that are none, for a source outside of the
-        observation, and for units without zero points.
+        Raises ValueError for unknown names, invalid sizes, a source outside of the observation, and
+        units without zero points.
         """
-        from .cutouts.cutout import cutout  # 0.1 s of astropy, which fits need not wait for
+        from .cutouts.cutout import cutout  # 0.1 s of astropy, not needed by fits
 
         return cutout(self, source, observation, what, size=size, unit=unit)
 
@@ -210,14 +210,17 @@ class Result(ResultDisplay):
         """Draws n sets of components from the posterior about the solution, as `errors` has it.
 
         rng: NumPy Generator, or a seed: equal seeds give equal draws, also of a result read from a
-        file. Morphologies and spectra below 0 become 0, so that faint sources are
-        brighter in the mean, and where a morphology is at that bound it stays there; morphologies
-        keep their scale, their maximum is no longer 1. Misfitted sources scatter more, as Errors
-        has it. Fluxes scatter about the components' own, not about those of `fluxes` and the
-        catalogue, from which Errors.released was taken. Settings.flux_floor is not in them, nor is
-        what lies beyond the boxes, which makes fluxes of faint sources scatter by up to a tenth
-        less than `errors` has it. The bound at 0 takes more of it from misfitted sources that stand
-        where light was missed, up to 0.4: their changes are as large as their morphologies.
+            file.
+
+        Draws differ from the catalogue's errors in these ways. Morphologies and spectra below 0 are
+        set to 0, so that faint sources are brighter in the mean; pixels at that bound stay at 0.
+        Morphologies keep their scale, so that their maximum is no longer 1. Misfitted sources have
+        a larger scatter, as in Errors. Fluxes scatter about those of the components, not about
+        those of `fluxes` and the catalogue, which include Errors.flux_bound_bias.
+        Settings.flux_error_floor and light beyond the boxes are not included, so that fluxes of
+        faint sources scatter by up to a tenth less than in `errors`. For misfitted sources at
+        positions where light was missed the bound at 0 reduces the scatter by up to 0.4, because
+        their changes are as large as their morphologies.
 
         Raises ValueError for results without draws: of other priors, or without errors.
         """
@@ -227,8 +230,8 @@ class Result(ResultDisplay):
     def sample_fluxes(self, n, rng=None) -> np.ndarray:
         """Draws the sources' fluxes (n, S, C) [counts] from the posterior, n times.
 
-        Those of `sample`, with what `fluxes` adds for light beyond the boxes and takes off for the
-        bound at 0, so that they scatter about the catalogue's; NaN where nothing was measured.
+        They are the fluxes of `sample`, corrected for light beyond the boxes and for the bound at 0
+        like those of `fluxes`, so that they scatter about the catalogue's; NaN if not measured.
 
         rng: NumPy Generator, or a seed
 

@@ -19,52 +19,54 @@ AUTO = "auto"  # fit_shifts: by measurement
 class Settings:
     """Settings of a fit.
 
-    max_iter: most iterations; a second fit, with more components, may take twice as many, and a
-        first one that goes on after it as many again
-    prior: what is expected of extended sources' morphologies about their smooth profiles, which
-        also chooses the solver. MultiscalePrior: structure at several scales, as strong as each
-        source's data say, by L-BFGS. Prior: structure of one scale and strength; None: the
-        morphologies themselves, by the constraints alone; both by the adaptive proximal gradients
-        of Melchior et al. (2019)
+    max_iter: largest number of iterations; a second fit, with more components, may take twice as
+        many, and a continued first fit as many again
+    prior: prior on the structure of extended sources, which also selects the solver.
+        MultiscalePrior: structure at several scales, with strengths determined by each source's
+        data, by L-BFGS. SingleScalePrior: structure of one scale and strength. None: morphologies
+        with the constraints only. The latter two use the adaptive proximal gradients of Melchior
+        et al. (2019)
     loss_tol: with a MultiscalePrior a fit has converged when the loss (half chi2) fell by less than
         `loss_tol` over 5 iterations and a joint Newton step would gain less than a fifth of that.
         Both limits scale with chi2 per pixel where it exceeds 1. With 0.5 fits take a tenth fewer
         iterations, and where fits of Euclid's or Rubin's images alone go on, over 1 in 100 fluxes
         move by more than 0.2 errors; with 0.25 about 1 in 200 (`bench.settings --continued`)
-    rel_tol: with others it has when its best loss fell by less than this part of itself over 15
-    constraints: with others, ProxChain of proximal operators on the morphologies; None:
-        non-negative, and monotone by the sweep. With a MultiscalePrior they are non-negative and
-        nothing else: on simulated galaxies a monotone morphology gains nothing, and real ones are
-            none
-    step_sizes: with others, their StepSizes
-    fit_shifts: let each observation but the first move by a constant shift. "auto": where light of
-        isolated sources lies over 0.25 model pixels and 3 sigma apart in two observations
-        (inspection/shifted.py), from the shift measured there; else the fit is that of False
-    fit_sky: fit a constant per channel. Its prior is Gaussian, with the level of the pixels that
-        hold no source and its error (inspection/levels.py), so that it takes no light of wide
-        sources; where no pixel is free of sources the constant is unconstrained
+    rel_tol [1]: with other priors a fit has converged when its best loss fell by less than this
+        fraction of itself over 15 iterations
+    constraints: with other priors, ProxChain of proximal operators on the morphologies; None =
+        non-negative, and monotone by the sweep. With a MultiscalePrior morphologies are only
+        non-negative: monotonicity does not improve models of simulated galaxies, and real galaxies
+        are not monotone
+    step_sizes: with other priors, their StepSizes
+    fit_shifts: fit a constant shift of each observation but the first. "auto" = only if light of
+        isolated sources differs in position by over 0.25 model pixels and 3 sigma between two
+        observations (inspection/shifted.py), starting from the measured shift
+    fit_sky: fit a constant per channel. Its prior is Gaussian, with the level of source-free pixels
+        and its error (inspection/levels.py), so that it does not absorb light of wide sources. If
+        no pixel is free of sources the constant is unconstrained
     flux_error_floor: relative systematic flux error with a MultiscalePrior, added in quadrature,
         the same for all channels of a source. It covers model errors of bright galaxies, photon
         noise missing from the weights, and PSF errors. It applies to a galaxy that equals its
         smooth profile, and grows with the cube of the structure in the data, to 0.4 % for a typical
         bright galaxy of COSMOS and 1.4 % at most. Simulated parametric galaxies need no larger
-        value; smaller ones cover COSMOS' galaxies less. PSFs that are wrong by a percent need 0.01
+        value; with smaller values the coverage of COSMOS galaxies is too low. PSFs that are wrong
+        by a percent require 0.01
     errors: with a MultiscalePrior, compute errors that include morphologies and neighbours. False
         takes two thirds of the time; then flux errors are those at fixed morphologies, and sizes
         have none
-    psf_error: part by which PSFs may be too narrow or too wide. That part of a bright point
-        source's light, more in its wings, adds to the noise of its pixels, so that what the PSF
-        does not explain of a star is not given to its neighbours. Weights follow the stars' light
-        as fitted at the start, and stay. Stars whose error is everywhere under 0.05 sigma change
-        nothing. Beside a star of signal to noise 1e4 whose PSF is 1 % too narrow it raises the SDR
-        of galaxies from 7.5 to 12.9 dB (12.9 with a right PSF, too), and their stated flux errors
-        by a quarter. Larger values help against worse PSFs, and cost more precision
-    psf_tolerance: of PSFs that vary over an observation (PSFField), how far each source's may be
-        from its own, as a part of the norm of its samples (PSFBasis.max_error). Fits follow the PSF
-        from source to source where it varies by more. With 0.001 a star of signal to noise 1000
-        is off by one sigma, all its pixels together, and no flux by more than about 0.1 %, less
-        than flux_error_floor; measured PSFs are known to 0.2 to 1 %. Larger values take fewer
-        terms, each of which adds 10 to 20 % to a fit's time; 0: each source's own PSF exactly
+    psf_error [1]: relative error of PSF widths. This fraction of a bright point source's light,
+        and more in its wings, is added to the noise of its pixels, so that residuals of a star are
+        not fitted by its neighbours. The weights use the stars' light at the start of the fit, and
+        are then constant. Stars whose error is below 0.05 sigma everywhere have no effect. Beside a
+        star of signal to noise 1e4 whose PSF is 1 % too narrow, the SDR of galaxies increases from
+        7.5 to 12.9 dB (12.9 also with a correct PSF), and their flux errors by a quarter. Larger
+        values allow for worse PSFs, and cost precision
+    psf_tolerance [1]: largest error of each source's PSF if PSFs vary over an observation
+        (PSFField), relative to the norm of its samples (PSFBasis.max_error). Fits use different
+        PSFs for sources if the PSF varies by more. With 0.001 a star of signal to noise 1000 has an
+        error of one sigma in all its pixels together, and fluxes change by at most about 0.1 %,
+        less than flux_error_floor; PSFs are measured to 0.2 to 1 %. Larger values need fewer terms,
+        each of which adds 10 to 20 % to a fit's time; 0 = each source's own PSF exactly
     """
 
     max_iter: int = 500

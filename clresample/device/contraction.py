@@ -185,7 +185,7 @@ class Contraction:
         """The products of (m, k) matrices A with (k, n) matrices B into C.
 
         inward: the largest terms lie in the middle, as for sums over pixels; if False they come
-        first, as for sums over frequencies. Small terms are added first, to round less
+            first, as for sums over frequencies. Small terms are added first, to round less
         e (buffer, stride, band stride): tables of the epilogue, shared by `n_bands` items
         own: ItemSizes, of whose sizes m, n and k are the largest; C is not written beyond an item's
         """

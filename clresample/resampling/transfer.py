@@ -34,8 +34,7 @@ class Certificate(CertificateDisplay):
     n_fft (2,): K, the padded length of each axis; frequencies are kappa / K
     n_frequencies (2,): frequencies >= 0 of each axis that are summed
     max_gain (C,) [1]: largest |D| / |det A|, by which noise of that frequency is multiplied
-    P1^| was floored|floored_power (C,) [1]: fraction of the observed PSF's power where |P1^| was
-    floored|P1^| was floored
+    floored_power (C,) [1]: fraction of the observed PSF's power where |P1^| was floored
     """
 
     wrap_radius_px: tuple[float, float]

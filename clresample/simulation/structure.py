@@ -75,8 +75,8 @@ def disk_parts(
     """The parts of a disk galaxy.
 
     size [arcsec]: half-light radius of the disk; n: its Sersic index; n_knots: number of clumps,
-    None = more in larger disks; knots: range of their fraction of the light. Large disks have bars
-    and arms
+        None = more in larger disks; knots: range of their fraction of the light. Large disks have
+        bars and arms
     """
     galsim = import_galsim()
     ratio, angle = rng.uniform(0.3, 1.0), _angle(rng)

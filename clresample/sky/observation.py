@@ -38,7 +38,8 @@ class Observation(ReadOnly, ObservationDisplay, DerivedQuantities):
         attribute is float64, with 0 in place of NaN and infinite pixels. A Quantity of counts or
         of flux density per pixel (data * u.nJy) keeps its unit: see `unit`
     psf: PSF of C bands, pixel response included; one band serves all channels. Or its images, an
-        array accepted by `PSF`. Or a PSFField: fits render each source with the PSF at its position
+            array accepted by `PSF`. Or a PSFField: fits render each source with the PSF at its
+            position
     grid: Grid of (Ny, Nx), or the WCS of these pixels, of astropy or gwcs
     weights [counts^-2]: inverse variance, 0 = ignore this pixel; or, instead of it,
     variance [counts^2]: NaN, infinite, zero and negative ones mean: ignore this pixel. Weights and

@@ -1,12 +1,11 @@
 """An observation on rows and columns along the model's axes, for the normal matrix.
 
-Sums of products over the observed pixels are all that errors need. An image that the observation's
-band can carry has the same sum of squares on any pixels of equal density, as long as they resolve
-the band. So an observation that is turned or distorted, or has smaller pixels than its band needs,
-is replaced by one along the model's axes, with its weights spread over it; any other one, parallel
-to the model, stays as it is. Then images are
-rendered from their boxes by a few products with thin matrices, without a full frame, and with a
-band and a period of no more than errors need.
+Errors need only sums of products over the observed pixels. A band-limited image has the same sum of
+squares on any pixels of equal density that resolve the band. So an observation that is rotated or
+distorted, or has smaller pixels than its band needs, is replaced by one along the model's axes, to
+which its weights are resampled. Any other observation is used unchanged. Then images are rendered
+from their boxes by a few products with thin matrices, without a full frame, and with the smallest
+sufficient band and period.
 """
 
 from __future__ import annotations
@@ -23,29 +22,31 @@ from ...sky.extent import crop_psf
 from ...sky.psf import PSF
 from ..view import WhitenedView
 
-# [FWHM of the observation's PSF] How far about its box a component's light is followed. Errors of
-# simulated Euclid and Rubin scenes differ by less than 1e-4 from those with 5, with 1 by 5e-4.
+# [FWHM of the observation's PSF] Margin around its box up to which a component's light is rendered.
+# Errors of simulated Euclid and Rubin scenes differ by less than 1e-4 from those with 5; with 1, by
+# 5e-4.
 REACH_FWHM = 1.5
-# |D| / max |D| under which a frequency is left out: of a source's information it holds the square.
-# Errors of simulated Euclid and Rubin scenes differ by less than 1e-3 from those with a tenth of
-# it.
+# |D| / max |D| below which a frequency is left out; its information is the square of that. Errors
+# of simulated Euclid and Rubin scenes differ by less than 1e-3 from those with a tenth of the
+# limit.
 BAND = 1e-2
-# An observation is replaced by one of pixels as wide as its band allows where that is so many times
-# the width of its own: half as many pixels and less, for which 99 % of the errors of fluxes and
+# An observation is replaced by one of the widest pixels that resolve its band if these are wider
+# than its own by this factor, which halves their number at least. 99 % of the errors of fluxes and
 # moments of simulated scenes change by less than 0.2 %.
 MIN_REBIN_FACTOR = 1.2
-# Frequencies, of all channels and as many images as are observed at a time: their 8 bytes each, and
-# what is made of them, stay in a core's second cache. All at once take a quarter more time.
+# Number of frequencies, over channels and images, that are computed at a time, so that they stay in
+# a core's second cache. All at once take a quarter more time.
 CACHED = 1 << 15
-# [px] Periods are multiples of it, and one: boxes of about one size share their transfer function.
+# [px] Periods are a multiple of this plus one, so that similar boxes share a transfer function.
 PERIOD_PX = 8
-# [px] Period at which the band is looked for.
+# [px] Period at which the band is determined.
 BAND_PERIOD_PX = 65
-# Transfers that are kept, of 0.3 to 1 MB: those of all observations of a field's tile and more.
+# Number of cached transfer functions, of 0.3 to 1 MB: those of all observations of a field's tile.
 MAX_TRANSFERS = 32
-# Elements of a component's images, in its box or as they are seen, from which on several threads of
-# the host share the work on them: 100 modes of a galaxy of 100 pixels a side take 20 ms. Where
-# threads shared smaller ones too, errors of 300 galaxies of 40 pixels took 4.1 s instead of 2.9.
+# Number of elements of a component's images, in its box or rendered, from which several host
+# threads
+# share the work: 100 modes of a galaxy of 100 pixels a side take 20 ms. When threads also shared
+# smaller ones, errors of 300 galaxies of 40 pixels took 4.1 s instead of 2.9 s.
 MIN_THREADED_ELEMENTS = 1 << 20
 
 
@@ -53,10 +54,10 @@ MIN_THREADED_ELEMENTS = 1 << 20
 class AlignedObservation:
     """An observation on rows and columns along the model's axes, in units of its noise.
 
-    y (My,), x (Mx,) [model px]: where they are, ascending
+    y (My,), x (Mx,) [model px]: positions of rows and columns, ascending
     sqrt_weights (C, My, Mx): square root of the weights
     reach_px [model px]: see REACH_FWHM; transfer: its BandLimitedTransfer
-    coefficients (n, C, T): of its terms in the PSF of each component, None where it has one
+    coefficients (n, C, T): of its terms in the PSF of each component, None for one term
     n_threads: of the host, for components of MIN_THREADED_ELEMENTS elements
     """
 
@@ -70,7 +71,7 @@ class AlignedObservation:
 
     @classmethod
     def of(cls, view: WhitenedView, frame, observation, source):
-        """That of an Observation and its view on a Frame; source (n,): of each component."""
+        """The AlignedObservation of an Observation and its view; source (n,): of each component."""
         scale = np.sqrt(abs(np.linalg.det(view.mapping.matrix)))
         reach = REACH_FWHM * float(observation.psf.fwhm_px.max()) * scale
         matrix = view.mapping.matrix
@@ -177,7 +178,7 @@ class BandLimitedTransfer:
     @functools.cached_property
     def _edge(self):
         """Largest frequencies (2,) along y and x that are needed."""
-        # not beyond what the observation's own pixels carry
+        # at most the limit of the observation's own pixels
         inside = np.abs(np.linalg.inv(self.matrix).T).sum(1) * 0.5 / self.psf_out.spacing
         nu_y, nu_x, _ = self._band((BAND_PERIOD_PX, BAND_PERIOD_PX), inside)
         # another period may have its last one half a step further
@@ -237,7 +238,7 @@ def _parallel(view, pixel):
     ]
     if pixel > np.abs(steps).max():
         grid = [_lattice(n, pixel) for n in mapping.shape_in]
-        # of each of its rows and columns, the parts that its neighbours on the lattice take
+        # fractions of each row and column that go to its neighbours on the lattice
         to_y, to_x = (
             np.maximum(1 - np.abs(to[:, None] - own) / pixel, 0)
             for to, own in zip(grid, at, strict=True)
@@ -255,10 +256,10 @@ def _lattice(n, pixel):
 
 
 def _mean_root(power, count, density):
-    """Root weights (C, n_y, n_x) of pixels that took the weights `power` of `count` others.
+    """Root weights (C, n_y, n_x) of pixels with the weights `power` of `count` others.
 
-    power (C, n_y, n_x); count (n_y, n_x); there are `density` on average: without the ripples that
-    two rasters make.
+    power (C, n_y, n_x); count (n_y, n_x); `density`: mean of count, used to remove the moire
+    pattern of the two grids.
     """
     mean = power / np.maximum(count, 1e-9) * density
     return np.sqrt(np.where(count > 0.5 * density, mean, 0)).astype(np.float32)

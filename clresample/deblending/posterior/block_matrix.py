@@ -1,8 +1,8 @@
 """Symmetric positive definite matrices in sparse blocks: factors, and parts of the inverse.
 
-Blocks belong to pairs of nodes that are neighbours. Nodes are eliminated in the order of fewest
-neighbours, by which those of a field that is many sources wide fill in little: memory and time
-follow the number of sources rather than its square and cube.
+Blocks belong to pairs of neighbouring nodes. Nodes with the fewest neighbours are eliminated first,
+which causes little fill-in for wide fields: memory and time are proportional to the number of
+sources, rather than to its square and cube.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ import heapq
 import numpy as np
 from scipy.linalg import solve_triangular
 
-# Added to the unit diagonal of the matrix, so that what neither data nor prior know has a number.
+# Added to the unit diagonal of the matrix, so that undetermined unknowns have finite variances.
 RIDGE = 1e-9
 
 
 class BlockMatrix:
     """A symmetric matrix of nodes of `sizes` (n,): blocks (size_i, size_j) of pairs i <= j.
 
-    Blocks that nobody asked for are zero.
+    Blocks that were never accessed are zero.
     """
 
     def __init__(self, sizes):

@@ -1,9 +1,9 @@
 """Bias of fluxes and sizes caused by the bound S >= 0.
 
-In a galaxy's wings structure follows the noise up, but not down: S >= 0 holds it. So the light of
-bright galaxies comes out 0.1 to 1 % too high, about half an error. Where a pixel is held the loss
-still has a slope; released along the modes it leads to the minimum without the bound, whose fluxes
-and moments are not biased so.
+In a galaxy's wings structure follows positive noise, but not negative noise, because S >= 0. So the
+light of bright galaxies is 0.1 to 1 % too high, about half an error. At a pixel on the bound the
+gradient of the loss is not zero. The Newton step along the modes leads to the minimum without the
+bound, whose fluxes and moments do not have this bias.
 """
 
 from __future__ import annotations

@@ -10,38 +10,36 @@ import numpy as np
 from ..solver.rendering.ties import Ties
 from .block_matrix import BlockCholesky
 
-# Draws that errors of cutouts are summed from, with the seed of these: standard deviations of so
-# many are known to a part 1 / sqrt(2 N) = 0.09, and more take longer in proportion.
+# Number of draws for the errors of cutouts, and their seed. Standard deviations have a relative
+# error of 1 / sqrt(2 N) = 0.09; the time is proportional to the number.
 N_SAMPLES, SEED = 64, 0
 
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Errors of one blend's sources, marginal over morphologies, neighbours, fitted sky and shifts.
+    """Errors of a blend's sources, marginalised over shapes, neighbours, fitted sky and shifts.
 
-    S sources, C channels of all observations, n components. A misfitted source's are all larger by
-    one factor, see `residuals.misfit_error_scale`; its covariances with others by both factors.
+    S sources, C channels of all observations, n components. All errors of a misfitted source are
+    multiplied by one factor, see `residuals.misfit_error_scale`; its covariances by both factors.
 
-    flux (C, S, S) [counts^2]: covariance of the fluxes of one channel, Settings.flux_floor
-        included; 0 between sources that share no light, what a common sky or shift does to them
-        left out
+    flux (C, S, S) [counts^2]: covariance of the fluxes of one channel, Settings.flux_error_floor
+        included; 0 between sources that do not overlap, without the effect of a common sky or shift
     colour (S, C, C) [counts^2]: covariance of one source's fluxes; the floor is common to all its
         channels, so that it does not enter ratios of fluxes
     moments (S, 5, 5) [px, px^2]: covariance of a source's centroid (y, x) and second moments
-        (yy, yx, xx), its components weighted by their light as in the catalogue; NaN of what was
-        not fitted: all of stars at a given place, the second moments of free ones
+        (yy, yx, xx), its components weighted by their light as in the catalogue; NaN if not fitted:
+        all for stars at a fixed position, the second moments for free ones
     morphology (n): arrays (ny, nx) [1]: standard deviation of each component's morphology, at a
         fixed projection onto its smooth profile
-    outside_box_moments (n, 6) [1, px, px^2]: no error, but what belongs to the fluxes and moments:
+    outside_box_moments (n, 6) [1, px, px^2]: a contribution to fluxes and moments, not an error:
         the sums of each component's smooth profile beyond its box, times 1, y, x, y y, y x, x x of
-        the frame, where the morphology has its maximum 1
-    released (S, C) [counts], moment_bound_bias (S, 5) [px, px^2]: likewise no errors: what fluxes,
-    and
-        centroids and second moments, change by when the bound of morphologies at 0 is released,
-        see bound_bias.py; second moments of stars stay
+        the frame, if the morphology has its maximum 1
+    flux_bound_bias (S, C) [counts], moment_bound_bias (S, 5) [px, px^2]: corrections, not errors:
+        the changes of fluxes, and of centroids and second moments, without the bound of
+        morphologies at 0, see bound_bias.py; 0 for second moments of stars
     residuals (S, C) [sigma]: the largest on each source, see `channel_residuals`
-    outside (S, C) [counts]: flux that models would have outside of what was observed, see
-        `light_outside`; its square is in `flux` and `colour`. 0 where it is not given
+    outside (S, C) [counts]: flux of the models outside the observed area, see `light_outside`; its
+        square is included in `flux` and `colour`. 0 by default
     """
 
     flux: np.ndarray
@@ -65,9 +63,8 @@ class PosteriorSampler:
 
     modes (n): (k_i, ny, nx), images of each component's modes
     factor: of the normal matrix, whose node i is component i, its modes and then its spectrum (B,)
-    unit (C,) [counts]: in which spectra count there
-    misfit_scale (n,): by what draws of misfitted sources' components scatter more, as their Errors
-        do
+    unit (C,) [counts]: unit of the spectra there
+    misfit_scale (n,): factor of the scatter of misfitted sources' components, as for their Errors
     ties: Ties of the channels, of B bands; None: B = C
     """
 

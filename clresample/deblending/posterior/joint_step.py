@@ -25,32 +25,33 @@ from .modes import Solution
 from .normal import UnknownLayout, normal_matrix
 from .smooth_modes import SmoothModes, whitening_transform
 
-# Light is exchanged where a neighbour has more than MIN_LIGHT_RATIO of the source's own, and both
-# more than FAINT of a pixel's noise: less of it moves a fit by too little to be worth its unknowns.
+# Sources overlap in a pixel if a neighbour has more than MIN_LIGHT_RATIO of the source's light, and
+# both more than FAINT of the pixel's noise. Fainter light changes a fit too little to justify more
+# unknowns.
 MIN_LIGHT_RATIO, FAINT = 0.05, 0.3
-# Changes of structure that the prior allows to move a flux or a second moment by less than this
-# many errors at fixed morphologies are left out. With 1, as for errors, the losses of simulated
-# scenes end 0.5 higher in the mean.
+# Modes whose prior scatter changes a flux or a second moment by less than this many errors at fixed
+# morphologies are left out. With 1, as for errors, the losses of simulated scenes end 0.5 higher in
+# the mean.
 MIN_CHANGE = 0.3
-# Most changes of one component; where it shares more light they are further apart. With 400 the
-# matrix of 18 galaxies in HST's pixels takes three times as long, and fits no fewer iterations.
+# Largest number of modes of a component; for larger overlaps their spacing increases. With 400 the
+# matrix of 18 galaxies in HST's pixels takes three times as long, and fits need as many iterations.
 MAX_CHANGES = 100
-MIN_POWER = 1e-30  # of a component in a channel that does not see it
-# Spectra of which the data say less than this part of what they say of the best one stay: what is
-# left of wings in their channel would move them by thousands. Of such levels the slopes count as 0;
-# their rows stay, so that they still follow what structure does in their channel.
+MIN_POWER = 1e-30  # of a component in a channel that does not cover it
+# Spectra whose precision is below this fraction of the best channel's are held fixed, because
+# residual wings in their channel would change them by large factors. For such sky levels the slopes
+# are set to 0, but their rows stay in the matrix, so that they still follow the structure.
 MIN_RELATIVE_POWER = 1e-9
 
 
 class JointNewtonStep:
-    """The unknowns of a scene that is nearly fitted, and their normal matrix.
+    """The unknowns of a nearly converged scene, and their normal matrix.
 
     solution: Solution with the solver's own morphologies and spectra, its peaks 1
-    shared (n): where (ny, nx) each component may exchange light, see Solution.shared
-    exposures: an AlignedObservation of each observation; fit_sky: whether sky levels are unknowns
-        too
+    shared (n): masks (ny, nx) of the pixels where each component overlaps others, see
+        Solution.shared
+    exposures: an AlignedObservation of each observation; fit_sky: True if sky levels are unknowns
 
-    moves (n): each component's ComponentModes, None where it shares no light with another
+    moves (n): each component's ComponentModes, None if it overlaps no other
     """
 
     def __init__(self, solution, shared, exposures, *, fit_sky=False):
@@ -75,8 +76,8 @@ class JointNewtonStep:
     def step(self, slopes):
         """The step to the minimum of all unknowns; slopes: SceneGradient of the loss.
 
-        returns changes [i][j] (ny_j, nx_j) of the structure, None of components that share none,
-        (n, C) of the spectra, (C,) of the sky, and by how much the loss is expected to fall
+        returns changes [i][j] (ny_j, nx_j) of the structure, None for components without overlap,
+            (n, C) of the spectra, (C,) of the sky, and the predicted decrease of the loss
 
         Raises LinAlgError where the matrix is not positive definite.
         """
@@ -112,7 +113,7 @@ class JointNewtonStep:
 class ComponentModes:
     """Smooth changes of one component's structure.
 
-    The prior expects their coefficients (k,) to scatter by 1, each on its own.
+    Under the prior their coefficients (k,) are independent with unit variance.
 
     weights (k, m): of m bumps; rows (m, ny), columns (m, nx): whose products are these
     scale_kernels (J): pairs (ny_j, ny), (nx_j, nx), see prior.kernel_rows; variance (J,): of the
@@ -143,10 +144,10 @@ class ComponentModes:
 def _moves(solution, i, shared, image):
     """Modes of component i and images (1 + k, ny, nx), float32, of its morphology and changes.
 
-    morphology (1, ny, nx); None and the morphology alone where it shares no light.
+    morphology (1, ny, nx); None and the morphology alone if it overlaps no other.
 
-    What a source may be where it shares none L-BFGS finds by itself: of changes all over a large
-    galaxy most would be there.
+    Modes cover the overlaps only: elsewhere L-BFGS converges by itself, and most modes of a large
+    galaxy would be there.
     """
     scene, prior = solution.scene, solution.prior
     if scene.fixed[i] or not shared.any():

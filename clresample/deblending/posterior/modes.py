@@ -14,49 +14,49 @@ from ..view import flush_faint
 from .profile_modes import profile_modes
 from .smooth_modes import MIN_LIGHT, SmoothModes, whitening_transform
 
-# Modes that the prior allows to change a flux or a second moment by less than this many errors at
-# fixed morphologies are left out.
+# Modes whose prior scatter changes a flux or a second moment by less than this many errors at fixed
+# morphologies are left out.
 MIN_CHANGE = 1.0
-# [noise] So are bumps whose light is nowhere more than this or, where that is more of a source's
-# peak, than bumps.MIN_LIGHT of it. By MIN_LIGHT alone the wings of galaxies above signal to
-# noise 1000 have none, and what the bound of morphologies at 0 adds there stays in their sizes, an
-# error or 0.2 %, and in their fluxes, half an error.
+# [noise] Bumps whose light is nowhere above this, or above smooth_modes.MIN_LIGHT of the source's
+# peak if that is less, are left out too. With MIN_LIGHT alone the wings of galaxies above signal to
+# noise 1000 have no bumps, and the bias from the bound of morphologies at 0 remains in their sizes,
+# one error or 0.2 %, and in their fluxes, half an error.
 FAINTEST = 1e-3
-# [noise] For errors light may be exchanged where two sources have more than this in a pixel: a
-# faint galaxy's flux is as uncertain as the fine structure of the bright one that it lies on. Only
-# where fits exchange light, see joint_step.py, the coverage of fluxes of Euclid alone is 0.02 lower
-# below signal to noise 10 and above 300 (400 scenes, seeds from 60000 and 61000).
+# [noise] For errors, two sources overlap in a pixel if both have more light than this: a faint
+# galaxy's flux is as uncertain as the fine structure of the bright one on which it lies. With the
+# overlaps of joint_step.py only, the coverage of fluxes of Euclid alone is 0.02 lower below signal
+# to noise 10 and above 300 (400 scenes, seeds from 60000 and 61000).
 FAINT = 0.05
-# The prior's scale next to STRUCTURE_PX is given the strength that the source's own data show,
-# under a weak hyperprior of WEIGHT pixels about STRENGTH, that of simulated parametric galaxies.
-# The fit's own is held near its centre, twice as large, with which positions (0.80 in 68 %
-# intervals) and ellipticities (0.74) are over-covered.
+# For errors, the strength of the prior's scale nearest to STRUCTURE_PX follows the source's own
+# data, with a weak hyperprior of WEIGHT pixels about STRENGTH, the value of simulated parametric
+# galaxies. The fit's own strength stays near the centre of its prior, which is twice as large. With
+# it, positions (0.80 in 68 % intervals) and ellipticities (0.74) would be over-covered.
 STRUCTURE_PX, WEIGHT, STRENGTH = 2.0, 10.0, 0.05
-# Powers of that strength, over STRENGTH, with which the other scales, the core and the halo of a
-# profile, and Settings.flux_floor go: what is unlike a smooth profile at one scale is so at all.
-# Parametric galaxies have 0.7 to 1.1 and hardly notice; real ones of COSMOS have 2, a quarter of
-# them 3. With STRENGTH_EXPONENT = 3.5 and HALO = 0.01 their errors are those of 2.5 and 0.02; with
-# 1.5 and 0.02 the coverage of their sizes is 0.04 lower, and that of fluxes from signal to noise 10
-# to 100 as well.
+# Exponents of the ratio of that strength to STRENGTH, by which the other scales, the core and the
+# halo of a profile, and Settings.flux_error_floor are scaled: a galaxy that departs from a smooth
+# profile at one scale does so at all. Parametric galaxies have ratios of 0.7 to 1.1 and are hardly
+# affected; real ones of COSMOS have 2, a quarter of them 3. With STRENGTH_EXPONENT = 3.5 and
+# HALO = 0.01 their errors equal those with 2.5 and 0.02. With 1.5 and 0.02 the coverage of their
+# sizes, and of fluxes from signal to noise 10 to 100, is 0.04 lower.
 STRENGTH_EXPONENT, FLOOR_EXPONENT = 3.5, 3.0
-# Where sources overlap strengths are learned from light whose owner is uncertain, and come out too
-# small. For errors they are multiplied by OVERLAPPED where MAX_OVERLAPPED of the light, or more,
-# is that of other sources, by less in proportion where less is. With 1.5 joint fits have 76 % of
+# Strengths of overlapping sources are estimated from ambiguous light, and are too small. For errors
+# they are multiplied by OVERLAPPED if the fraction MAX_OVERLAPPED of the light, or more, belongs to
+# other sources, and by proportionally less for smaller fractions. With 1.5 joint fits have 76 % of
 # positions in 68 % intervals (seeds 20400 to 20459; without, 73 %). 0.1 more adds 0.005 to the
 # coverage of fluxes and positions (200 scenes each, joint and of Euclid, seeds from 50000).
 OVERLAPPED, MAX_OVERLAPPED = 1.2, 0.2
-# Unlikeness that counts for these at most: a merger of real galaxies reaches 10, of which the
-# powers would be a floor of half its flux.
+# Largest ratio used for these powers: a merger of real galaxies reaches 10, which would give an
+# error floor of half its flux.
 MAX_STRUCTURE_EXCESS = 3.0
 
 
 def clipped_power(unlikeness, exponent):
-    """Unlikeness to the power of STRENGTH_EXPONENT or FLOOR_EXPONENT, see MAX_STRUCTURE_EXCESS."""
+    """Structure excess to the power of an exponent, limited by MAX_STRUCTURE_EXCESS."""
     return min(unlikeness, MAX_STRUCTURE_EXCESS) ** exponent
 
 
 def _unlike(energy, determined):
-    """Unlikeness by |z|^2 of the structure and the number of its determined coefficients."""
+    """Structure excess from |z|^2 and the number of determined coefficients."""
     return np.sqrt((energy + WEIGHT * STRENGTH**2) / (determined + WEIGHT)) / STRENGTH
 
 
@@ -79,10 +79,9 @@ class Solution:
     spectra (n, C); fixed_error (n, C): of these at fixed morphologies
     shapes, thetas, positions (n): the start's ComponentProfiles, parameters, places (2,) [px]
     source (n,): to which each component belongs
-    findings: StrengthEstimates; chi2 (n,): per pixel, where each component's light is
+    findings: StrengthEstimates; chi2 (n,): per pixel, in each component's light
     prior: MultiscalePrior
-    negative_chi2_gradient (n): arrays (ny, nx), see bound_bias.py; None where nothing asks for
-        `modes`
+    negative_chi2_gradient (n): arrays (ny, nx), see bound_bias.py; None if `modes` is not called
     """
 
     scene: Scene
@@ -102,7 +101,8 @@ class Solution:
     def structure_excess(self, i):
         """Strength of component i's structure over that of a galaxy like its smooth profile.
 
-        See STRENGTH; 1 of fixed ones. Misfit is not taken for structure, but takes none below 1.
+        See STRENGTH; 1 for fixed components. It is divided by chi2 per pixel, so that misfit does
+        not count as structure, but not to less than 1.
         """
         if self.scene.fixed[i]:
             return 1.0
@@ -127,9 +127,8 @@ class Solution:
     def modes(self, i):
         """Images (1 + k, ny, nx), float32, of component i's morphology and of its modes.
 
-        The prior expects their coefficients to scatter by 1, each on its own. With its
-        OutsideBoxMoments, and the data's gradient by each mode (k,) where the bound at 0 holds the
-        morphology.
+        Under the prior their coefficients are independent with unit variance. Also returns its
+        OutsideBoxMoments, and the data's gradient by each mode (k,) from pixels on the bound at 0.
         """
         profile, scene = self.scene.profile[i], self.scene
         images, scatter, far = profile_modes(
@@ -179,7 +178,7 @@ class Solution:
         return along.astype(np.float64)
 
     def _held(self, i, images):
-        """Data gradient by images (k, ny, nx) where the bound holds the morphology: (k,)."""
+        """Data gradient (k,) by images (k, ny, nx), from pixels where the morphology is at 0."""
         held = self.morphs[i] <= 0
         if self.scene.fixed[i] or not held.any():
             return np.zeros(len(images))
@@ -229,7 +228,7 @@ class Solution:
         return shared
 
     def _beside(self, i):
-        """Other components whose boxes meet component i's."""
+        """Other components whose boxes overlap component i's."""
         low, high = self._boxes
         meet = ((low < high[i]) & (high > low[i])).all(1)
         return [j for j in np.flatnonzero(meet) if j != i]

@@ -1,9 +1,10 @@
 """The normal matrix of a scene about its solution: modes, spectra, sky and shifts in one.
 
-Each component's modes are rendered from its box to the pixels within its reach; components whose
-reaches meet have a block of the matrix together. Components come in the order of their rows, and
-what is rendered of one is dropped once no other can reach it: memory follows the sources that meet,
-rather than all.
+Each component's modes are rendered from its box in a window of the observation. Components with
+overlapping windows have a common block of the matrix. They are processed in the order of their
+rows,
+and images are dropped once no further window overlaps them: memory is proportional to the number of
+overlapping sources, not of all.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from ..shifts import SCATTER_PX
 from ..solver.rendering.ties import Ties
 from .block_matrix import BlockMatrix
 
-# [1] Products of this size and more are summed in float64: in float32 they round to what the prior,
-# which is 1, says of a mode. A source of signal to noise 300 has products of 1e5. With 1e6 moments'
-# errors change by up to 3e-3.
+# [1] Products of this size and more are summed in float64: in float32 their rounding error would
+# approach the prior's precision of 1. A source of signal to noise 300 has products of 1e5. With
+# 1e6, errors of moments change by up to 3e-3.
 LARGE = 3e5
 
 
@@ -43,7 +44,7 @@ class UnknownLayout:
     ties: Ties | None = None
 
     def band_weights(self, weights):
-        """Weights (C,) with which each band counts once: 0 in channels but its first; and (B,)."""
+        """Weights (C,) that count each band once: 0 in all channels but its first; and (B,)."""
         if self.ties is None:
             return weights, weights
         first = self.ties.first
@@ -101,7 +102,7 @@ def normal_matrix(scene, exposures, images, spectra, layout) -> BlockMatrix:
 class _ComponentView:
     """Images of one component in an observation.
 
-    i: which; k: its modes; low, high (2,): its window
+    i: its index; k: number of its modes; low, high (2,): its window
     light (k or k + 2, C, ry, rx): of its modes, then of its slopes along y and x where a shift is
         unknown, all times its spectrum; unit (C, ry, rx): of its morphology alone
     """
@@ -229,7 +230,7 @@ def _products(a, b):
         return None
     dtype = np.float64 if a.size * b.size > LARGE else np.float32
     light_a, unit_a = a.within(low, high, dtype)
-    same = a is b  # NumPy takes half the products where both factors are one array
+    same = a is b  # NumPy computes half the products if both factors are the same array
     light_b, unit_b = (light_a, unit_a) if same else b.within(low, high, dtype)
     by_b = _by_channel(light_a, unit_b)
     by_a = by_b if same else _by_channel(light_b, unit_a)

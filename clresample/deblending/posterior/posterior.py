@@ -20,15 +20,15 @@ from .moments import moment_derivatives
 from .normal import UnknownLayout, normal_matrix
 from .residuals import channel_residuals, misfit_error_scale
 
-# Least error of a spectrum at fixed morphology, relative to it: smaller ones are rounding.
+# Smallest relative error of a spectrum at fixed morphology: smaller ones are rounding errors.
 MIN_ERROR = 1e-9
-# Relative error of the light that a profile has beyond its box, where it is under the noise.
-# Fluxes of galaxies of r_e over 30 px and signal to noise 30 to 60 are 15 % too faint: two of these
-# errors, three without this part (bench.ladder).
+# Relative error of the light of a profile beyond its box, where it is below the noise. Fluxes of
+# galaxies of r_e over 30 px and signal to noise 30 to 60 are 15 % too faint: two of their errors,
+# and three without this contribution (bench.ladder).
 FAR_ERROR = 0.3
-# [sigma] How far one component is released from the bound at 0 at most. Noise holds 98 in 100
-# simulated galaxies back by less; galaxies with negative light, of which images of COSMOS have
-# much, by up to 600, and no morphology should take that to its neighbours.
+# [sigma] Largest correction of a component for the bound at 0. For 98 in 100 simulated galaxies the
+# noise causes less. Galaxies with negative light, of which images of COSMOS have much, would have
+# up to 600, which must not affect their neighbours.
 MAX_BOUND_RELEASE_SIGMA = 3.0
 
 
@@ -36,13 +36,13 @@ class Posterior:
     """The linear posterior about a solution.
 
     solution: Solution; exposures: an AlignedObservation of each observation
-    fit_sky, fit_shifts: whether sky levels, and shifts of all observations but the first, are
-        unknowns too
+    fit_sky, fit_shifts: True if sky levels, and shifts of all observations but the first, are
+        unknowns
 
     modes (n): arrays (k, ny, nx), beyond (n): see Solution.modes; layout: UnknownLayout; matrix:
         BlockMatrix; factor: its BlockCholesky; covariance: a BlockMatrix of the inverse, for the
         same nodes
-    released: arrays, for each node what its unknowns change by without the bound of bound_bias.py
+    released: arrays, for each node the changes of its unknowns without the bound of bound_bias.py
 
     Raises LinAlgError where the matrix is not positive definite.
     """
@@ -67,7 +67,7 @@ class Posterior:
         self.released = self._released(held)
 
     def _released(self, held):
-        """See the class; held (n): arrays (k,), what the data pull of each component's modes."""
+        """See the class; held (n): arrays (k,), gradients by each component's modes there."""
         right = [np.zeros(size) for size in self.layout.sizes]
         for i, pull in enumerate(held):
             k = len(pull)
@@ -170,7 +170,7 @@ class Posterior:
                     block = self.covariance.block(min(i, j), max(i, j))
                     covariance += rows[a] @ (block if i <= j else block.T) @ rows[b].T
             moved[source] = sum(row @ self.released[i] for i, row in zip(own, rows, strict=True))
-            if s.scene.fixed[own].all():  # a star's place was fitted, but no shape
+            if s.scene.fixed[own].all():  # a star's position was fitted, but no shape
                 covariance[2:] = covariance[:, 2:] = np.nan
                 moved[source, 2:] = 0
             out[source] = covariance
@@ -183,7 +183,7 @@ class Posterior:
         if not k:
             return np.zeros(self.solution.morphs[i].shape)
         covariance = self.covariance.block(i, i)[:k, :k]
-        ridge = np.diag(RIDGE * np.diag(covariance))  # more than its rounding
+        ridge = np.diag(RIDGE * np.diag(covariance))  # larger than its rounding errors
         root = np.linalg.cholesky(covariance + ridge).astype(np.float32)
         # the transpose, since BLAS counts rows first
         turned = strmm(1.0, root, images.reshape(k, -1).T, side=1, lower=1)
@@ -195,7 +195,7 @@ def with_errors(fit, result, peaks, seen):
 
     peaks, seen: see `posterior_of`
 
-    Its seconds are taken down in the fit.
+    The time is recorded in the fit.
     """
     began, result = time.perf_counter(), with_misfit_status(result)
     morphs = [c.morphology for c in result.components]
@@ -216,9 +216,9 @@ def with_errors(fit, result, peaks, seen):
 
 
 def posterior_of(fit, morphs, peaks, seen):
-    """The Posterior of a Fit that has ended, or None, and messages of why there is none.
+    """The Posterior of a finished Fit, or None, and messages with the reason.
 
-    morphs (n): its components' morphologies with max = 1, peaks (n,): what they were divided by;
+    morphs (n): its components' morphologies with max = 1; peaks (n,): their maxima before that;
     seen: RenderedModel, of these
     """
     settings, scene = fit.settings, fit.scene
@@ -226,7 +226,9 @@ def posterior_of(fit, morphs, peaks, seen):
         return None, []
     spectra, covariance = seen.spectra, seen.covariance
     variance = np.diagonal(covariance, axis1=1, axis2=2).T
-    if scene.ties is not None:  # of one exposure, as each of a band counts
+    if (
+        scene.ties is not None
+    ):  # those of one exposure, since each exposure of a band has its own weight
         variance = variance * scene.ties.count
     residuals = seen.residuals(scene.channels(), fit.views)
     solution = Solution(

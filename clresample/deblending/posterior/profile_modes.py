@@ -9,26 +9,30 @@ import numpy as np
 from ...sky.extent import box_slices
 from ..profiles import SIZE_SCATTER, GalaxyProfile, StarProfile
 
-# How galaxies scatter in ln sigma, g1, g2 (Leauthaud et al. 2007) and ln beta, in errors. Fits
-# expect less, which makes better models of faint ones; by what they expect 0.015 fewer of Euclid's
-# fluxes of signal to noise 10 to 30 would be within their errors, and 0.02 fewer of its sizes.
+# Scatter of galaxies in ln sigma, g1, g2 (Leauthaud et al. 2007) and ln beta, for errors. The prior
+# of fits is narrower, which gives better models of faint galaxies. With that prior the coverage
+# would be lower by 0.015 for Euclid's fluxes of signal to noise 10 to 30, and by 0.02 for its
+# sizes.
 SCATTER = np.array([SIZE_SCATTER, 0.26, 0.26, 0.9])
-# [px] scatter of a catalogue's position. 0.5 makes the errors of faint sources' positions half as
-# large again as their scatter.
+# [px] Scatter of a catalogue's position. With 0.5 the errors of faint sources' positions are larger
+# than their scatter by a half.
 POSITION_PX = 0.1
-# [peak] Scatter of what is added in proportion to p^2, a core, and to sqrt(p), a halo: how galaxies
-# differ from the family of profiles. Without them the sizes of simulated bright galaxies lie within
-# their errors in 59 % of cases. HALO = 0.02 adds 0.02 to the coverage of sizes and 0.025 to that of
-# fluxes above signal to noise 300, which is too much then; twice or half the CORE adds nothing.
+# [peak] Scatter of two additional modes, a core proportional to p^2 and a halo proportional to
+# sqrt(p), for the difference of galaxies from the family of profiles. Without them the sizes of
+# simulated bright galaxies lie within their errors in 59 % of cases. HALO = 0.02 increases the
+# coverage of sizes by 0.02 and that of fluxes above signal to noise 300 by 0.025, which is then too
+# high. Twice or half the CORE has no effect.
 CORE, HALO = 0.1, 0.01
 
 
-# A box ends where its profile is under the noise of a pixel. What lies beyond is followed for half
-# its side, at most FAR_PX, on every side: of a galaxy at signal to noise 10 it holds 1 % of the
-# light and 4 % of the size. A profile with wings is followed inside the frame until only FAR_LIGHT
-# of its light is left: de Vaucouleurs galaxies of r_e 40 to 60 px at signal to noise 30 to 60 have
-# a third of their light there (bench.ladder). There HALO is taken times FAR_HALO: with twice as
-# much the coverage of simulated galaxies' sizes is 0.02 higher.
+# A box ends where its profile is below the noise of a pixel. Light beyond the box is summed on
+# every side up to half of the box's side, at most FAR_PX: for a galaxy of signal to noise 10 this
+# region has 1 % of the light and changes the size by 4 %. For a profile with wings the region
+# extends inside the
+# frame until only FAR_LIGHT of the light is left: de Vaucouleurs galaxies of r_e 40 to 60 px at
+# signal to noise 30 to 60 have a third of their light there (bench.ladder). There HALO is
+# multiplied by
+# FAR_HALO: with twice as much the coverage of simulated galaxies' sizes is 0.02 higher.
 FAR_PX, FAR_LIGHT, FAR_HALO = 24, 0.003, 0.2
 
 
@@ -61,11 +65,11 @@ class OutsideBoxMoments:
 
     @classmethod
     def none(cls, k):
-        """Nothing, of a component with k modes."""
+        """Zero, for a component with k modes."""
         return cls(np.zeros(6), np.zeros((6, k)))
 
     def scaled(self, scales):
-        """With the profile and its modes times scales (1 + k,)."""
+        """The moments for the profile and its modes times scales (1 + k,)."""
         return OutsideBoxMoments(self.sums * scales[0], self.slopes * scales[1:])
 
     def with_gauge(self, along):
@@ -81,7 +85,7 @@ class OutsideBoxMoments:
 def profile_modes(shape, theta, position, profile, origin, *, radial=1.0):
     """Slopes (k, ny, nx) of a profile in its box, prior scatter (k,), OutsideBoxMoments.
 
-    shape: ComponentProfile, theta (n,): its parameters, position (2,) [px]: where in the frame
+    shape: ComponentProfile; theta (n,): its parameters; position (2,) [px]: in the frame
     profile (ny, nx): with max = 1; origin (2,) [px]: of the box in the frame
     radial: times CORE and HALO
     """
@@ -111,7 +115,7 @@ def profile_modes(shape, theta, position, profile, origin, *, radial=1.0):
 
 
 def _surroundings(galaxy, theta, position, origin, size):
-    """Window about a galaxy's box in which its light is followed: first pixel (2,), size (2,)."""
+    """Window around a galaxy's box for the light beyond it: first pixel (2,), size (2,)."""
     near = np.minimum(np.array(size) // 2, FAR_PX)
     beta, frame = np.exp(theta[3]), np.array(galaxy.shape)
     # beyond t of the peak lies t^(beta / (beta + 1)) of the light

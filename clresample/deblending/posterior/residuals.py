@@ -1,4 +1,4 @@
-"""Structure that a fit has left in its residuals, source by source and channel by channel."""
+"""Measures structure in the residuals of a fit, by source and channel."""
 
 from __future__ import annotations
 
@@ -9,21 +9,22 @@ import numpy as np
 from ...sky.noise import HALF_WIDTH
 from ..component_images import ComponentImages
 
-# [sigma] of a filtered residual from which on a source is flagged as misfitted: among the 1e5
-# pixels of a large blend in all its channels, noise alone reaches it once in 20 blends.
+# [sigma] Filtered residual from which a source is flagged as misfitted: noise reaches it in one of
+# 20 large blends, each with 1e5 pixels in all channels.
 MISFIT_SIGMAS = 5.0
-# Least number of sky pixels that say how much correlated noise adds up under the filter.
+# Smallest number of sky pixels to measure how much correlated noise adds up under the filter.
 MIN_PIXELS = 400
-# Most by which the scatter of single pixels of the sky is taken for noise over that about their
-# neighbours: the noise of published weight maps is wrong by 10 to 30 %.
+# Largest ratio of the scatter of single sky pixels to that about their neighbours that is
+# attributed
+# to noise: the noise of published weight maps is wrong by 10 to 30 %.
 WRONG_WEIGHTS = 1.3
-# Likewise of filtered pixels: noise that resampling has correlated over two pixels adds up under
-# the filter to two or three times what it is in single ones.
+# The same ratio for filtered pixels: noise correlated over two pixels by resampling is two or three
+# times larger after the filter than in single pixels.
 CORRELATED = 3.0
-# Of a channel's largest filtered weight: pixels seen with less are not judged.
+# [1] of a channel's largest filtered weight: pixels with less are ignored.
 MIN_WEIGHT = 1e-6
-# [px] Images of several channels that are transformed at once: those of blends, for which each call
-# costs as much as its arithmetic. More would only take memory: a tile's channels go one by one.
+# [px] Largest size of several channels' images that are transformed in one call. For blends a call
+# costs as much as its arithmetic; larger images, such as tiles, are transformed one by one.
 TOGETHER_PX = 1 << 17
 
 
@@ -36,8 +37,8 @@ class Remainder:
     power (Co,) [1]: sum of the squared PSF: power t point is the residual smoothed with the PSF
     residual [sigma]: of single pixels, 0 without weight
     used, sky (bool): pixels with a weight; those of them with less than one sigma of model
-    noise (Co,) [1]: variance of the noise over the weights' own, 1 or more
-    owner: the source whose model is the brightest in a pixel, or -1
+    noise (Co,) [1]: ratio of the noise's variance to that of the weights, 1 or more
+    owner: the source with the brightest model in a pixel, or -1
     """
 
     filtered: np.ndarray
@@ -90,14 +91,16 @@ def max_filtered_residuals(result, i_observation):
 
         t(p) = sum_q P(q - p) w(q) r(q) / sqrt( sum_q P(q - p)^2 w(q) )
 
-    with the residual r, the weights w, and the observed PSF P: how significant a point source at p
-    would be in what is left. Noise alone gives t unit scatter. A pixel belongs to the brightest
-    model among the sources whose boxes hold it. Where a channel has 400 pixels of sky, those with
-    less than one sigma of model, t is divided by its robust scatter there, if over 1: then the
-    noise is larger than the weights say, or correlated. By no more than CORRELATED times the
-    scatter of single pixels about their neighbours: more is light that the model lacks.
+    with the residual r, the weights w, and the observed PSF P: the significance of a point source
+        at
+    p in the residuals. For noise t has unit scatter. A pixel belongs to the source with the
+    brightest model among those whose boxes contain it. If a channel has 400 pixels of sky, those
+    with less than one sigma of model, t is divided by its robust scatter there if that exceeds 1,
+    because the noise is then correlated or larger than the weights imply. The divisor is at most
+    CORRELATED times the scatter of single pixels about their neighbours, since more scatter is
+    light missing in the model.
 
-    result: a fitted blend; i_observation: of which the channels are
+    result: a fitted blend; i_observation: number of the observation
     """
     return remainder(result, i_observation).worst(len(result.sources))
 
@@ -135,11 +138,11 @@ def channel_residuals(result):
 def misfit_error_scale(residuals):
     """Factors (S,), 1 or more, of the errors of sources with these `channel_residuals` (S, C).
 
-    Where a model leaves a residual of r sigma, what it cannot follow has moved the source's flux,
-    place and shape too, and by more than noise does. From where a source counts as misfitted errors
-    grow with r: r / 5. Of 102 simulated COSMOS galaxies, in blends with others whose light is in
-    part negative, it raises the share whose place is within its error from 0.62 to 0.70, whose size
-    from 0.52 to 0.61, and of their fluxes from 0.64 to 0.73.
+    A model error that leaves a residual of r sigma also biases the source's flux, position and
+    shape, by more than the noise. Above the threshold of misfits, errors are multiplied by r / 5.
+    For 102 simulated COSMOS galaxies, in blends with others whose light is in part negative, this
+    raises the fraction of positions within their errors from 0.62 to 0.70, of sizes from 0.52 to
+    0.61, and of fluxes from 0.64 to 0.73.
     """
     worst = np.nan_to_num(residuals).max(axis=1, initial=0)
     return np.maximum(1, worst / MISFIT_SIGMAS)
@@ -151,7 +154,7 @@ def convolved(image, psf):
     The same to the last bit as scipy.signal.fftconvolve(mode="same"), whose import takes half a
     second.
     """
-    from scipy import fft  # 0.05 s, which fits of a catalogue need not wait for
+    from scipy import fft  # takes 0.05 s, not needed by all fits
 
     shape, taps = image.shape[-2:], psf.shape[-2:]
     full = [n + k - 1 for n, k in zip(shape, taps, strict=True)]

@@ -14,7 +14,7 @@ def drawn_components(result, rng):
     """
     if result.draws is None:
         raise ValueError(
-            "this result has no posterior to draw from, see Result.draws: fit with a LearnedPrior"
+            "result has no posterior to draw from: fit with a MultiscalePrior and errors=True"
         )
     morphs, spectra = result.draws.draw(rng)
     return tuple(
@@ -47,7 +47,7 @@ def drawn_fluxes(result, n, rng):
 def undetermined(result) -> np.ndarray:
     """Fluxes (S, C) bool that nothing determines: channels without data, sources not fitted.
 
-    A component that is zero everywhere leaves the flux of its source as it is.
+    A component that is zero everywhere does not contribute to its source's flux.
     """
     known = np.isfinite(np.diagonal(result.covariance, axis1=1, axis2=2))  # (C, n)
     lost = np.ones((len(result.sources), len(result.channels)), bool)

@@ -14,27 +14,28 @@ import functools
 import numpy as np
 from scipy.linalg.lapack import dtrtri
 
-# [model px] between bumps, which are half as wide (sigma). FINE_SPACING_PX where light may be
-# exchanged with a neighbour, of which the data say little. On crowded simulated scenes flux errors
-# reach 0.99 (median) and 0.92 (5 % quantile) of those from all modes; with COARSE_SPACING_PX
-# everywhere 0.51 in blends.
+# [model px] Distance of bumps, whose sigma is half of it. FINE_SPACING_PX is used where a source
+# overlaps a neighbour, because the data hardly constrain the division of light there. In crowded
+# simulated scenes flux errors are 0.99 (median) and 0.92 (5 % quantile) of those from all modes;
+# with COARSE_SPACING_PX everywhere they are 0.51 of them in blends.
 COARSE_SPACING_PX, FINE_SPACING_PX = 8, 4
-# [1] Most bumps of one component: of larger galaxies spacings are doubled until there are no more.
-# Their cost grows with the square. 400 are those of a box of 160 pixels a side; a galaxy that is
-# wider has its light, and what may be unknown of it, in more than that.
+# [1] Largest number of bumps of a component: for larger galaxies spacings are doubled until the
+# number is not exceeded. The cost grows with its square. A box of 160 pixels a side has 400; the
+# light of wider galaxies, and its uncertainty, varies on larger scales.
 MAX_MODES = 400
-# Modes that hold no more than this of the profile's peak anywhere are left out: they add no light
-# that overlapping sources could exchange. Errors go further, see modes.py.
+# [1] Modes with less light than this everywhere, relative to the profile's peak, are left out:
+# their light is too faint for the division between overlapping sources. Errors use more, see
+# modes.py.
 MIN_LIGHT = 1e-4
-# Sides of boxes whose tables are kept, 50 kB each at 30 pixels.
+# Number of box sides whose tables are cached, 50 kB each at 30 pixels.
 MAX_AXES = 256
-# Part of a bump's peak that must lie where light is exchanged.
+# Fraction of a bump's peak that must lie in the overlap.
 REACHED = 0.8
 # Added to Q^-1, whose diagonal is 1: combinations of overlapping bumps that cancel to less are
-# rounding, and count as known.
+# rounding errors, and get no variance.
 MIN_SHARE = 1e-6
-# Part of its largest number under which a table counts as 0: products of three tables that are over
-# it are no denormals of float32, which take 20 times as long to add up.
+# Elements of a table below this fraction of its largest are set to 0, so that products of three
+# tables are not denormals of float32, which take 20 times as long to add.
 TINY = 1e-10
 
 
@@ -45,8 +46,8 @@ class SmoothModes:
     sides: (k, ny) and (k, nx), whose products are the Gaussians y
 
     origin (2,) [px]: of the box in the frame; profile (ny, nx); strengths (J,): of the prior's
-        scales; kernels: its J kernels; shared (ny, nx): where light may be exchanged; all_over:
-        else there are none but where that is; most: how many at most, MAX_MODES by default;
+        scales; kernels: its J kernels; shared (ny, nx): mask of the overlap; all_over: False =
+        modes in the overlap only; most: largest number of modes, MAX_MODES by default;
         least_light: see MIN_LIGHT
     """
 
@@ -90,7 +91,7 @@ class SmoothModes:
 
 
 def whitening_transform(precision):
-    """Combinations (k, k) of modes whose coefficients scatter by 1, each on its own.
+    """Combinations (k, k) of modes whose coefficients are independent with unit variance.
 
     Those of the modes have the inverse covariance `precision` (k, k); 0 above the diagonal.
     """

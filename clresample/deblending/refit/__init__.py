@@ -1,4 +1,4 @@
-"""One component or two: sources whose core shows another colour are fitted once more with both.
+"""Second components for sources whose core has another colour, by a second fit.
 
 Imports the rest of `deblending`, whose batch.py calls it.
 """

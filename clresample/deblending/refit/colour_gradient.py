@@ -7,9 +7,9 @@ what the fit has left in each channel, which gives beta_c with precision n_c; th
     beta_c ~ N(lambda A_c, 1/n_c + (CORE_COLOUR_SCATTER A_c)^2)       lambda of any size: S follows
     it
 
-against the same without CORE_COLOUR_SCATTER. The ratio of the evidences of both, that is of their
-likelihoods with lambda integrated out, grows with a gradient's significance, and falls with the
-number of channels that could have shown one and do not.
+is compared with the same distribution without CORE_COLOUR_SCATTER. The ratio of both evidences, the
+likelihoods integrated over lambda, increases with the significance of a gradient, and decreases
+with the number of sensitive channels without one.
 """
 
 from __future__ import annotations
@@ -22,18 +22,19 @@ from ...sky.sources import ExtendedSource
 from ..component_images import ComponentImages
 from ..start.final_render import MorphologyModel, render_models
 
-# Scatter of the core's spectrum about the whole's, relative to it: 0.3 mag, as between bulges and
-# discs. Of half or twice that, evidences differ by a few; gradients over 3 % are found in bright
-# galaxies all the same.
+# Relative scatter of the core's spectrum about that of the whole source: 0.3 mag, as between bulges
+# and discs. With half or twice that, evidences differ by a few; gradients over 3 % are detected in
+# bright galaxies in any case.
 CORE_COLOUR_SCATTER = 0.3
-# ln of the ratio of evidences from which on a gradient is clear, odds of 150 to 1. Of 385 simulated
-# galaxies of one colour each 4 reach it: where COSMOS images hold negative light, which no model
-# follows, the residuals of instruments of different sharpness look like a gradient too. Of 80
-# bulges with discs whose colours differ by 7 sigma or more it finds 19 in 20.
+# ln of the ratio of evidences from which a gradient is significant: odds of 150 to 1. Of 385
+# simulated galaxies of one colour each, 4 reach it, because negative light in COSMOS images, which
+# no model can fit, mimics a gradient in instruments of different resolution. Of 80 bulges with
+# discs whose colours differ by 7 sigma or more, 19 in 20 are detected.
 MIN_LOG_EVIDENCE = 5.0
-# Signal to noise of a source from which on it is asked: below it no gradient can be clear.
+# Signal to noise from which a source is tested: below it no gradient can be significant.
 MIN_SNR = 30.0
-# Part of a channel's precision without neighbours under which they leave nothing of a source's own.
+# Fraction of a channel's precision without neighbours below which a source is not separable from
+# them.
 MIN_OWN = 1e-6
 
 
@@ -53,7 +54,7 @@ class GradientTest:
 
     @property
     def significant(self):
-        """Those of the components that clearly need a second one."""
+        """The components that significantly need a second one."""
         return self.components[self.evidence > MIN_LOG_EVIDENCE]
 
 
@@ -143,7 +144,7 @@ def _asked(fit, which, seen):
 def _eliminated(covariance, slope, power, k):
     """Coefficients (k, C) of the last k images in the residuals of a fit, all others free too.
 
-    Also returns their precisions (k, C); 0 for images without light, or no longer distinct.
+    Also returns their precisions (k, C); 0 for images without light, or not separable from others.
 
     covariance (C, n, n): of all n coefficients; slope, power (n, C): their images' products with
     the residuals, and with themselves

@@ -1,4 +1,4 @@
-"""Second components for sources with a gradient of colour, kept where the fit gains by them."""
+"""Fits second components to sources with a colour gradient; keeps them if the fit improves."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from ..iterate import iterate
 from .colour_gradient import run_gradient_tests
 from .two_component_start import start_refits
 
-# What a second component must lower the loss by, for each number that it adds: a spectrum and a
-# profile's four. Half a unit each is what noise alone gives.
+# Decrease of the loss that a second component must reach for each of its parameters, a spectrum and
+# four of a profile. Noise gives half a unit each.
 MIN_GAIN = 1.0
 N_PROFILE = 4
-# [loss] By so much more than MIN_GAIN a second fit must be better than a first one that was taken
-# over; else the first one goes on to its end before they are compared. Twice what fits of HST and
-# HSC, and of a bright blend of HSC, still gained at most where they went on.
+# [loss] Additional gain, beyond MIN_GAIN, of a second fit over a first fit that was stopped for it;
+# if it is not reached, the first fit is continued to its end before both are compared. The value is
+# twice the largest gain of continued fits of HST and HSC, and of a bright blend of HSC.
 MIN_DECISIVE_GAIN = 200.0
-# A second fit may take so many times `max_iter`: the first one, if it was taken over, has left some
-# of its own, and one in 40 fits of a bright blend of HSC needs more than 1.5.
+# Largest number of iterations of a second fit in units of `max_iter`. A first fit that was stopped
+# has not used all of its own, and one in 40 fits of a bright blend of HSC needs more than 1.5.
 REFIT_ITER_FACTOR = 2.0
 
 
@@ -38,8 +38,8 @@ def needs_second_component(fit):
 def refit_two_components(fits, settings, device, dtype, progress=None):
     """Returns for ended Fits each itself, or a second fit with more components.
 
-    fits: of one signature; those STOPPED_FOR_REFIT go on to their end, unless a second one is
-        better than they can become; settings, device, dtype: theirs; progress: see `deblend`
+    fits: of one signature; those STOPPED_FOR_REFIT are continued to their end, unless the second
+        fit is better than they can become; settings, device, dtype: theirs; progress: see `deblend`
     returns Fits, in the order of `fits`
     """
     before = [fit.shifts for fit in fits]
@@ -67,7 +67,7 @@ def refit_two_components(fits, settings, device, dtype, progress=None):
 
 
 def _second_fits(fits, settings, device, dtype, progress):
-    """{index: finished Fit} with more components of those that need them.
+    """{index: finished Fit} with more components, for fits that need them.
 
     None for fits that fail, which their messages report.
     """
@@ -100,7 +100,7 @@ def _go_on(fits, settings, device, dtype, progress):
     before = [fit.seconds["fit"] for fit in fits]
     for fit in fits:
         fit.status = ITERATION_LIMIT
-        del fit.losses[-1]  # that of the present state, which comes first again
+        del fit.losses[-1]  # that of the present state, with which the continuation begins
     iterate(fits, settings, device, dtype, progress)
     for fit, seconds in zip(fits, before, strict=True):
         fit.note_seconds("fit", seconds + fit.seconds["fit"])
@@ -116,8 +116,8 @@ def _following(second, first):
 def _is_better(second, first, more=0.0):
     """Returns True if more components fit the data better, by more than their number costs.
 
-    The loss must fall by `more` than that, and chi2 as well: one component with stronger structure
-    may lower chi2 at a higher loss.
+    The loss must fall by `more` than that, and chi2 must fall too: one component with stronger
+    structure may have a lower chi2 at a higher loss.
     """
     if second.strength_estimates is None or _half_chi2(second) > _half_chi2(first):
         return False

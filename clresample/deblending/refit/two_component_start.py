@@ -1,7 +1,8 @@
 """Starting models of two-component fits: of three candidates the one with the lowest chi2.
 
-Smooth profiles of two components are where a bulge and its disc begin. In a merger they would leave
-most of what one component has taken as structure: there it stays, with a core beside it.
+For a bulge with a disc, smooth profiles of two components are the best start. In a merger they
+would
+lose most of the fitted structure: there the fitted component is kept, and a core is added to it.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from ..start.first_scene import first_scene
 from ..start.profile_start import StartInput, fit_start_profiles, profile_peak
 from .colour_gradient import model_of, run_gradient_tests
 
-# Sigma of a core that begins beside its component, as a part of this one's: that of a Gaussian's
-# square, as the core is whose colour was tested.
+# Ratio of the sigma of an added core to that of its component: that of a Gaussian's square, which
+# is the core in the test of colours.
 CORE = 0.5**0.5
 
 
@@ -30,12 +31,12 @@ def start_refits(fits):
     """{index: a Fit at its start} of the scenes with sources that clearly need two components.
 
     Of three starts the one that fits the data best where it begins, with the best spectra:
-    known   all else as the first fit has left it, structure and strengths too, and smooth profiles
-            of the two components alone, fitted to what that leaves of the data: real neighbours are
-            known from then on, but their structure may hold what one component could not take
-    whole   smooth profiles alone share the light, those of all else being the first start's
-    beside  all as the first fit has left it, and a core beside each component in question: real
-            structure is known from then on, whatever holds it
+    known   all other components from the first fit, with structure and strengths, and smooth
+            profiles of the two components, fitted to the rest of the data: the neighbours' models
+            are good, but their structure may contain light of the component in question
+    whole   smooth profiles only, those of all other components from the first start
+    beside  all components from the first fit, and a core added to each component in question: all
+            structure is kept, whichever component contains it
     """
     asked = {
         i: one
@@ -63,7 +64,7 @@ def start_refits(fits):
 def _best(starts, fit_sky):
     """Selects of each scene's Fits at their starts the one with the lowest chi2.
 
-    All have as many starts; spectra and sky are the best there.
+    All scenes have equally many starts, compared with their best spectra and sky.
     """
     fits = [fit for of_scene in starts for fit in of_scene]
     images, chi2 = render_models([model_of(fit) for fit in fits], fit_sky=fit_sky), []
@@ -77,7 +78,7 @@ def _best(starts, fit_sky):
 
 
 def _again(fit, point):
-    """A fit of the same views, where their shifts are by now, from another StartingPoint."""
+    """A fit of the same views, at their present shifts, from another StartingPoint."""
     new = copy(fit)
     new.start = point
     new.scene, new.state = first_scene(new)
@@ -197,7 +198,7 @@ def _cores(n, chosen):
 
 
 def _going_on(state, first, before, new):
-    """The morphologies of a State that are not new where the first fit has left them.
+    """A State whose morphologies, unless new, are those of the first fit.
 
     state: at the start of all; first: a finished Fit; before, new: see `_places`
     """

@@ -24,10 +24,10 @@ class FitLimits:
     """Limits of one fit; blends over them are cut.
 
     max_sources: largest number of sources; max_pixels: of the model's box around the blend. Larger
-    limits give more accurate fits, as one scene, but the time grows faster than the size: the
-    errors' normal matrix with the square of the number of sources, its inverse with the cube
+        limits give more accurate fits, as one scene, but the time grows faster than the size: the
+        errors' normal matrix with the square of the number of sources, its inverse with the cube
     work [px]: model pixels times sources above which a blend is also cut where the light between
-    its parts is weak (WEAK); smaller blends are cut only over the limits above
+        its parts is weak (WEAK); smaller blends are cut only over the limits above
     max_bytes [bytes]: largest predicted memory, see `fit_bytes`; None = any
     n_channels: of all mosaics, for that prediction
     """

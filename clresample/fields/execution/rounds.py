@@ -43,7 +43,7 @@ def fit_all_groups(job, engine, progress):
     A cut blend's pieces are fitted again as long as the fluxes of a neighbour change, and if their
     residuals contained more sources.
     returns the GroupResultsFiles, of which the last round of each patch is valid, and the parents
-    of the cut blends whose pieces had not settled when the rounds ended
+        of the cut blends whose pieces had not settled when the rounds ended
     """
     progress.stage("fit", len(job.plan.patches))
     tasks = [FitGroup(_name(0, i), patches) for i, patches in enumerate(job.plan.groups)]

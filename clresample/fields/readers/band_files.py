@@ -64,7 +64,7 @@ class BandFiles:
     """One band of a mosaic, as a reader finds it.
 
     band: the format's name of it; grid, data, weight, kind, mask, mask_value, zero_point: as in
-    Channel, None if the file has none; psf: PSFField, or None
+        Channel, None if the file has none; psf: PSFField, or None
     noise: NoiseCorrelation, or None; saturation [counts]: of the image's pixels, or None
     missing_zero_point, missing_psf: why there is none
     files {what: file}
