@@ -1,8 +1,8 @@
 """Constant shifts between observations, from the model as it stands.
 
-A model fitted to images that disagree by a shift lies between them. Each image's own best shift
-against the model, to first order, is t_o; the differences of these are the shifts between the
-images, however irregular the sources are:
+A model fitted to images with a relative shift lies between them. Each image's own best shift
+against the model, to first order, is t_o. The differences of these are the shifts between the
+images, for sources of any shape:
 
     t_o = (D_o^T w_o D_o)^-1 D_o^T w_o (d_o - R_o M),    D_o = R_o dM/dx,    step = t_o - t_first
 """
@@ -13,17 +13,18 @@ import numpy as np
 
 from .solver.scene_model import compose
 
-# Steps that fall off by a larger factor than this are taken to fall off by it.
+# Largest assumed ratio of successive steps.
 MAX_DECAY_FACTOR = 0.8
-# [model px] scatter that is expected of a shift. Where the data leave a larger scatter than this,
-# the step falls to 0; a larger value lets noise move observations that hold hardly any light.
+# [model px] Prior scatter of a shift. If the data leave a larger uncertainty, the step goes to 0.
+# With a larger value noise would shift observations with hardly any light.
 SCATTER_PX = 2.0
 
 
 def shift_steps(scene, state) -> tuple[np.ndarray, float]:
     """Steps of the observations (n_observations, 2) [model px], the first at rest, and their gain.
 
-    The gain is of half of chi2, to second order, where the model fits the first.
+    The gain is the decrease of half of chi2, to second order, if the model fits the first
+    observation.
 
     scene: a Scene, its operators at their present shifts; state: its present State
     """
@@ -46,10 +47,10 @@ def shift_steps(scene, state) -> tuple[np.ndarray, float]:
 
 
 def extrapolate(steps, last):
-    """Limits (n, 2) of steps that fall off by a factor each, from the `last` ones.
+    """Limits (n, 2) of the sums of geometrically decreasing steps, from the `last` ones.
 
     The model follows each shift only in part, so that the steps sum up to the first one divided by
-    1 minus that factor.
+    1 minus the ratio of successive steps.
     """
     factor = (steps * last).sum() / max((last * last).sum(), 1e-30)
     return steps / (1 - np.clip(factor, 0, MAX_DECAY_FACTOR))

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-# Error of a smooth profile, as a part of the light in a pixel: what galaxies' own structure, spiral
-# arms or clumps, adds to it. Larger values let faint neighbours absorb less of that structure, and
-# make bright sources count for less.
+# Relative error of a smooth profile's light in a pixel, because of galaxies' structure such as
+# spiral arms or clumps. With larger values faint neighbours absorb less of that structure, and
+# bright sources have less weight.
 MODEL_ERROR = 0.15
 # Added to the diagonal of the normal matrix, which is scaled to a diagonal of 1. Without it the
-# matrix of two sources with equal profiles, two stars in one place, is singular; with it they get
-# equal parts of their light. It changes the flux of a source apart from others by this part of it;
-# a larger one would share light between neighbours that the data can tell apart.
+# matrix of two sources with equal profiles, such as two stars at one position, is singular; with it
+# each gets half of their light. It changes the flux of an isolated source by this fraction; a
+# larger value would share light between neighbours that the data can separate.
 RIDGE = 1e-8
-# Rounds of exchanges of whole sets: problems of sources that the data can tell apart take 2 to 5.
-# Those that still change are solved one by one, some ms for each of 200 unknowns.
+# Largest number of exchanges of whole sets: problems of separable sources take 2 to 5. Those that
+# still change are solved one by one, in some ms for each of 200 unknowns.
 SPECTRUM_ITERATIONS = 10
 
 
@@ -33,13 +33,13 @@ def unit_diagonal(normal):
 
 
 def nnls_batch(normal, right, free=None):
-    """x (M, n) >= 0 of the least 1/2 x N x - x r; 0 where N is.
+    """x (M, n) >= 0 that minimises 1/2 x N x - x r; 0 where N is 0.
 
     normal N (M, n, n), right r (M, n); free (n,): bool, those that may be negative
 
     Block principal pivoting (Kim and Park 2011): sets of unknowns at 0 and off it are exchanged
-    until both have the right signs; all problems side by side. Where many sources lie in one place
-    this may go round in circles, all the more as rounding leaves N eigenvalues below zero.
+    until both have the right signs, for all problems side by side. With many sources at one
+    position this may cycle, in particular if rounding leaves N with negative eigenvalues.
     """
     matrix, scale, seen = unit_diagonal(normal)
     right = np.where(seen, right / scale, 0)
@@ -74,7 +74,7 @@ def _by_active_sets(matrix, right, free):
     values, vectors = np.linalg.eigh(matrix)
     root = np.sqrt(np.maximum(values, RIDGE))
     images, data = root[:, None] * vectors.T, vectors.T @ right / root
-    any_sign, _ = np.linalg.qr(images[:, free])  # what those explain is none of the others'
+    any_sign, _ = np.linalg.qr(images[:, free])  # their span is removed from the others
     others = images[:, ~free] - any_sign @ (any_sign.T @ images[:, ~free])
     x = np.zeros(len(right))
     x[~free], _ = nnls(others, data - any_sign @ (any_sign.T @ data), maxiter=30 * len(right))
@@ -85,9 +85,9 @@ def _by_active_sets(matrix, right, free):
 def spectrum_covariance(normal):
     """Covariances (M, n, n); undetermined values have infinite variance and no covariance.
 
-    Where many sources lie in one place, rounding of `normal` can leave it with eigenvalues below
-    zero, and its inverse with variances that are too small, or negative: no variance is less than
-    with all other unknowns known. There eigenvalues are at least RIDGE.
+    With many sources at one position, rounding can leave `normal` with negative eigenvalues, and
+    its inverse with negative or too small variances, below those with all other unknowns fixed. In
+    that case eigenvalues are set to RIDGE at least.
     """
     matrix, scale, seen = unit_diagonal(normal)
     out = np.linalg.inv(matrix)

@@ -14,10 +14,10 @@ from ..sky.varying_psf.basis import PSFBasis
 from .profiles import draw_psf
 from .solver.rendering.ties import Ties
 
-# [sigma] Stars whose PSF's error is nowhere more than this leave the weights as they are.
+# [sigma] Stars whose PSF error is below this everywhere do not change the weights.
 MIN_PSF_ERROR_SIGMA = 0.05
-# Pixels of a model under this part of its brightest one count as 0 when it is rendered: of the
-# model's light they hold nothing, but float32 keeps them as denormals, 20 times slower.
+# Pixels of a model below this fraction of its brightest are set to 0 before rendering: their light
+# is negligible, but in float32 they would become denormals, which are 20 times slower.
 DENORMAL_FRACTION = 1e-20
 
 
@@ -25,21 +25,19 @@ DENORMAL_FRACTION = 1e-20
 class WhitenedView:
     """One observation ready to be fitted: its operator and whitened data.
 
-    op: model frame, padded where scenes share a batch -> observation, padded alike; of T terms, see
-        Plan, where the PSF varies over the scene's sources
-    mapping: the op's, with the frame itself, without its padding, as the model
+    op: operator from the model frame to the observation, both padded if scenes share a batch; of T
+        terms, see ResamplingPlan, if the PSF varies over the scene's sources
+    mapping: that of op, but from the frame without padding
     covered (My, Mx): bool, whose centre lies on the frame itself
-    noise_unit (Co,) [counts]: noise of a typical pixel of each channel, in which data and model
-        count
-    sqrt_weights (Co, My, Mx) [1 / unit]: square root of the weights, 0 where the frame does not
-        cover
-    data (Co, My, Mx) [unit]: the observation's data, 0 where root is
+    noise_unit (Co,) [counts]: noise of a typical pixel of each channel, the unit of data and model
+    sqrt_weights (Co, My, Mx) [1 / unit]: square root of the weights, 0 outside the frame
+    data (Co, My, Mx) [unit]: the observation's data, 0 where the weight is 0
     coefficients (S, Co, T): of the op's terms in the PSF of each of the scene's sources; None where
         its PSF is the same for all
     noise (Co,) [unit]: of a typical pixel, where `noise_unit` is another one; None = 1
     ties: Ties of the channels of all views of the scene; None where each has a band of its own
-    exposures (Co,): with ties, how many exposures like this one the band has the weight of
-    sky_level (Co,) [unit]: expected level of the sky, which is taken off the data; 0 where unknown
+    exposures (Co,): with ties, ratio of the band's total weight to that of this exposure
+    sky_level (Co,) [unit]: expected level of the sky, subtracted from the data; 0 if unknown
     sky_precision (Co,) [1 / unit^2]: inverse variance of that expectation; 0 where unknown
         Both are None unless the sky is fitted.
     """
@@ -61,7 +59,7 @@ class WhitenedView:
     def of(cls, op, frame, data, weights, shares=None):
         """The view of an observation's data and weights (Co, My, Mx) on a model Frame.
 
-        op: of the frame, or of a larger one that starts at the same pixel: what lies beyond the
+        op: of the frame, or of a larger one that starts at the same pixel: pixels beyond the
             frame itself gets no weight; shares: see the class
         """
         unit = np.array([_typical_noise(channel) for channel in weights])
@@ -109,8 +107,8 @@ class WhitenedView:
     def expecting_sky(self, level, error) -> WhitenedView:
         """The same view with the sky at this level, with this Gaussian error, (Co,) [counts].
 
-        The data are above the level, so that a fitted sky deviates from it. An infinite error is
-        one of which nothing is known.
+        The level is subtracted from the data, so that a fitted sky is the deviation from it. An
+        infinite error means that the level is unknown.
         """
         level = level / self.noise_unit
         data = np.where(self.sqrt_weights > 0, self.data - level[:, None, None], 0.0)
@@ -246,8 +244,8 @@ def allow_for_psf_error(views, stars, psf_error) -> list[WhitenedView]:
 
         1/w = sigma^2 + psf_error^2 sum_s [ L_s^2 + (r . grad L_s)^2 ],      L_s = A_s R S_s
 
-    r being the distance from star s: L changes by -(2 L + r . grad L) epsilon when the PSF grows by
-    epsilon, so that its wings are less certain than its core.
+    where r is the distance from star s: L changes by -(2 L + r . grad L) epsilon if the PSF's width
+    grows by the fraction epsilon, so that its wings are more uncertain than its core.
 
     stars: tuples of a Star, the number of its source, its place (2,) [model px] and its spectrum
         (C,) [unit]
@@ -257,7 +255,7 @@ def allow_for_psf_error(views, stars, psf_error) -> list[WhitenedView]:
     for star, source, place, spectrum in stars if psf_error else ():
         parts = [spectrum[a:b, None, None] for a, b in zip(ends, ends[1:], strict=False)]
         pairs = list(zip(views, parts, strict=True))
-        # no pixel holds more than all of its light
+        # no pixel has more than all of its light
         if all(
             psf_error * np.abs(a * view.sqrt_weights).max() < MIN_PSF_ERROR_SIGMA
             for view, a in pairs

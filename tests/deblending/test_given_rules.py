@@ -90,11 +90,11 @@ def test_constraints_go_with_priors():
 @pytest.mark.parametrize(
     "prox, words",
     [
-        (L1(-1e-9), "strength is -1e-09, it must lie between 0 and inf"),
+        (L1(-1e-9), "strength is -1e-09, must be between 0 and inf"),
         (L0([1.0, -1.0]), "strength"),
-        (Symmetry(1.01), "strength is 1.01, it must lie between 0 and 1"),
+        (Symmetry(1.01), "strength is 1.01, must be between 0 and 1"),
         (Symmetry(-0.01), "strength is -0.01"),
-        (Monotone(gradient=1.01), "gradient is 1.01, it must lie between 0 and 1"),
+        (Monotone(gradient=1.01), "gradient is 1.01, must be between 0 and 1"),
         (Monotone(weights=4), "weights is 4"),
         (Monotone(weights=-1), "weights is -1"),
         (L1(np.ones(3)), r"strength has shape \(3,\) for 2 sources"),

@@ -18,10 +18,10 @@ from .scene import AmsgradMoments
 # Decay of the moments of gradients and of their squares (Reddi et al. 2018's defaults, as in the
 # paper's solver): an average over the last 10 and the last 1000 iterations.
 BETA1, BETA2 = 0.9, 0.999
-# Part of `Scene.damping` by which steps are damped. That is a bound on the curvature, twice the
-# largest one there is in most scenes (see curvature.py), so all of it would make steps shorter than
-# they need be; with none, steps of one length for all pixels would take a bright source far from a
-# start that fits.
+# Fraction of `Scene.damping` by which steps are damped. The damping is a bound on the curvature, in
+# most scenes twice the largest curvature (see curvature.py), so all of it would make steps too
+# short. Without damping, steps of one length for all pixels would move a bright source far away
+# from a good start.
 DAMPING = 0.3
 DECAY = {"B1": BETA1, "B2": BETA2}  # as macros
 N_MOMENTS = 3  # m, v, h
@@ -31,7 +31,7 @@ N_MOMENTS = 3  # m, v, h
 class StepSizes:
     """Lengths of the solver's undamped steps.
 
-    Larger ones come near the end sooner and are less steady there.
+    Larger steps approach the minimum faster and are less stable there.
 
     latent: of z, in units of the prior's scatter; morphology: of S where there is no prior, in
     units of its maximum, 1; spectrum: in units of `Scene.step_scale`, a flux's error and 2 % of the
@@ -44,10 +44,10 @@ class StepSizes:
 
 
 class AMSGrad:
-    """The steps of one batch. `Engine` needs of an update this signature, `step`, `memories`.
+    """The steps of one batch. An update for `Engine` needs this signature, `step` and `memories`.
 
     buffers: the batch, whose latent, morph, spectra and sky are stepped along d_morph, d_spectra
-    gradient: its LossGradient, for the sky; states: the scenes' States, for what they remember
+    gradient: its LossGradient, for the sky; states: the scenes' States, with their moments
     chain: constraints on the morphologies, applied after every step
     prior: the SingleScalePrior of extended sources, or None; step_sizes: StepSizes
     """
@@ -139,7 +139,7 @@ class _LatentStep:
         self._form(self._size)
 
     def after_constraints(self):
-        """Nothing: no constraint beside a prior changes a morphology's scale (see Settings)."""
+        """Does nothing: with a prior no constraint changes a morphology's scale (see Settings)."""
 
 
 class _MorphologyStep:
@@ -177,7 +177,7 @@ def _launcher(buffers, prior, name, n_axes):
 
 
 def _sky_step(buffers, gradient, prior):
-    """The kernel that moves sky levels by a part of a Newton step; launch: (B * C)."""
+    """The kernel that changes sky levels by a fraction of a Newton step; launch: (B * C)."""
     totals = [w.sum(axis=(1, 2)) for s in buffers.scenes for w in s.weights]
     total = np.concatenate(totals) + np.concatenate([s.known_sky for s in buffers.scenes])
     inverse = np.divide(1, total, where=total > 0, out=np.zeros_like(total))

@@ -1,4 +1,4 @@
-"""Boxes: where the morphologies of all sources of all scenes lie in one flat buffer.
+"""Boxes: the layout of the morphologies of all sources and scenes in one flat buffer.
 
 Source s owns ny * nx elements from offset[s], row by row. Every box starts at a multiple of ALIGN
 elements; the few elements between two boxes are padding, zero when packed here and never read.

@@ -8,7 +8,7 @@ from ...device.tuning import Tuning
 from .boxes import ALIGN, Boxes
 from .scene import State
 
-# Items that a work-item takes on CPUs: PoCL starts one in 50 ns, in which many numbers are stepped.
+# Items of a work-item on CPUs: PoCL takes 50 ns to start one, the time of many items.
 ITEMS_EACH = 64
 
 
@@ -129,7 +129,7 @@ class SceneBuffers:
         return tuple(-(-n // g) * g for n, g in zip(size, group, strict=True))
 
     def split(self, rows):
-        """Arrays (S, ...) of all sources, one part for each scene."""
+        """Arrays (S, ...) of all sources, split by scene."""
         return np.split(rows, self._ends[:-1])
 
     def unpack(self, flat):

@@ -4,9 +4,9 @@ Each has `prox(morphs, boxes, *, step=1.0, active=None, factor=None)`, which ove
 
 morphs (boxes.size,): pyopencl array, float32 or float64, laid out by `boxes` (a DeviceBoxes)
 step: of the gradient descent that the operator follows; multiplies penalties, not constraints
-active: the sources to treat (see DeviceBoxes.active); the others stay as they are, at no cost
-factor (S,): device array of morphs' type or None; what the normalisations divided each active
-    source by (1 without one): multiply the spectrum by it, and the model stays
+active: the sources to change (see DeviceBoxes.active); others are unchanged, at no cost
+factor (S,): device array of morphs' type or None; receives the divisor of each active source's
+    normalisation (1 without one): the spectrum times this factor leaves the model unchanged
 
 Parameters are numbers, or arrays (S,) with one value per source. The NumPy references are in
 reference.py; sources: Parikh & Boyd 2014, Melchior et al. 2018 (arXiv:1802.10157) and 2019
@@ -52,7 +52,7 @@ class MonotoneWeights(enum.IntEnum):
 class Prox:
     """An operator with the kernels of `_launches`, compiled once per boxes and type.
 
-    parameters: by name, as they were given
+    parameters: by name, as passed
     name (of those that are steps): of the step in prox.cl
     """
 
@@ -74,7 +74,7 @@ class Prox:
     def prox(self, morphs, boxes, *, step=1.0, active=None, factor=None):
         """Overwrites morphs by the operator's result; see the module's text.
 
-        ValueError: morphs or factor have another shape or type than the boxes ask for
+        ValueError: morphs or factor have another shape or type than the boxes require
         """
         n_sources = len(boxes)
         if morphs.shape != (boxes.boxes.size,):
@@ -93,7 +93,7 @@ class Prox:
             launch(morphs, active, step, factor, i_launch == 0)
 
     def steps(self):
-        """The operators that are one step of prox.cl each, or stand alone."""
+        """The operators, each of which is one step of prox.cl or has its own kernel."""
         return [self]
 
     def values(self):
@@ -150,7 +150,7 @@ class Symmetry(Prox):
         super().__init__(strength=strength)
 
     def values(self):
-        """The share of the antisymmetric part that is taken off."""
+        """The fraction of the antisymmetric part that is subtracted."""
         return {"strength": _at_least_0("strength", self.parameters["strength"], 1)}, {}
 
 
@@ -194,12 +194,12 @@ class MonotoneProjection(Monotone):
     min 1/2 |z - x|^2  with  z_i <= (1-g) sum_j w_ij z_j  for all i but the centre, z >= 0
 
     By accelerated ascent of the dual (kernels/project.cl), then a sweep that makes it exactly
-    monotone. The dual is kept from call to call for each boxes and type, so that the calls of a
-    fit, whose images differ little, start nearly done; that takes 15 numbers a pixel.
-    positive: whether z >= 0 is asked for
-    n_iterations: at most so many a call; tolerance: a call ends when an iteration moves the dual
-        by less than this part of |x|. As given, a galaxy in noise comes out within 1e-4 |x| at
-        41 x 41 pixels, 1e-3 |x| at 101 x 101
+    monotone. The dual is stored between calls for each boxes and type, so that later calls of a
+    fit, whose images differ little, start near the solution; that takes 15 numbers a pixel.
+    positive: True to require z >= 0
+    n_iterations: largest number in a call; tolerance: a call ends if an iteration changes the dual
+    by less than this fraction of |x|. With the defaults the projection of a galaxy in noise is
+    accurate to 1e-4 |x| at 41 x 41 pixels, and to 1e-3 |x| at 101 x 101
     """
 
     def __init__(
@@ -225,7 +225,7 @@ class MonotoneProjection(Monotone):
 
 
 class ProxChain(Prox):
-    """One operator after the other, the first first; in one launch where none is a projection."""
+    """Applies operators in turn, in one launch if none is a projection."""
 
     def __init__(self, *proxes):
         super().__init__()
@@ -239,7 +239,7 @@ class ProxChain(Prox):
         return list(itertools.chain.from_iterable(prox.steps() for prox in self._proxes))
 
     def _launches(self, boxes, dtype):
-        """As few launches as there are projections and runs of steps between them."""
+        """The launches: one for each projection and for each sequence of steps between them."""
         launches = []
         for alone, steps in itertools.groupby(self.steps(), _stands_alone):
             if alone:
@@ -262,5 +262,5 @@ def _at_least_0(name, value, most=np.inf):
     """A parameter as an array; ValueError unless it lies between 0 and `most`."""
     value = np.asarray(value)
     if not ((value >= 0) & (value <= most)).all():
-        raise ValueError(f"{name} is {value}, it must lie between 0 and {most}")
+        raise ValueError(f"{name} is {value}, must be between 0 and {most}")
     return value

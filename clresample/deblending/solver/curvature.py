@@ -5,8 +5,9 @@ The Hessian of the loss by z (by S without a prior) is H = K amplitude A R^T w R
 largest row sum, which is the largest pixel of H applied to an image of ones.
 
 In simulated Euclid + Rubin scenes this bound is twice the largest eigenvalue (median; 1.4 to 11
-times). It is 60 times H along a single pixel (1.6 to 150 times), since so many pixels are blurred
-into each other; the root of that, not of the bound, is the scatter of a gradient of pure noise.
+times). It is 60 times H along a single pixel (1.6 to 150 times), because of the blur between
+pixels. The scatter of a gradient of pure noise is the root of the single-pixel value, not of the
+bound.
 """
 
 from __future__ import annotations
@@ -16,18 +17,18 @@ from scipy.ndimage import convolve1d
 
 from .scene_model import compose, gather_morph
 
-# [sqrt(bound)] A larger gradient at the start says that more than noise is left to fit. The largest
-# pixel of a gradient of pure noise has 0.13 of the bound's root (median of the same scenes; 0.2 at
-# most, and 0.66 without a prior). A smaller value would take noise for a bad start and damp too
-# little; a larger one would damp the way from a bad start.
+# [sqrt(bound)] A larger gradient at the start means a bad start. The largest pixel of a gradient of
+# pure noise has 0.13 of the bound's root (median of the same scenes; 0.2 at most, and 0.66 without
+# a prior). With a smaller value noise would count as a bad start, and steps would be damped too
+# little; with a larger one steps from a bad start would be damped.
 NOISE_GRADIENT = 0.7
 
 
 def damping(scene, state, prior) -> np.ndarray:
     """Gradient (S,) by which each source's steps are damped: a bound on its curvature.
 
-    Where the start is far from the data, g > NOISE_GRADIENT sqrt(curvature), it falls as g^-2:
-    there the size of the gradient itself limits the steps.
+    If the start is far from the data, g > NOISE_GRADIENT sqrt(curvature), it falls as g^-2, because
+    the size of the gradient itself then limits the steps.
 
     scene, state: a Scene and its State at the start; prior: the SingleScalePrior, or None for plain
         morphologies

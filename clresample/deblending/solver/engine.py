@@ -1,4 +1,4 @@
-"""Runs a batch of scenes on the device: gradients and steps in turn, the best state kept."""
+"""Runs a batch of scenes on the device: gradients and steps in turn; stores the best state."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from .gradient import LossGradient
 from .prior import SingleScalePrior
 from .scene import Scene, State
 
-# Most iterations of one `run`: so many losses of each scene wait on the device until they are read.
+# Largest number of iterations of one `run`: their losses stay on the device until they are read.
 MAX_STEPS = 16
-# Which of these is for a loss at any other time: best and kept states belong to the first of a run.
+# Index of an additional loss; best states belong to the losses of a run.
 LAST = MAX_STEPS - 1
 
 

@@ -7,8 +7,8 @@
 
 dA of tied channels is the mean over their band, see rendering/ties.py.
 
-|z|^2 is the prior's, and its gradient is added where z is stepped (amsgrad.py). rendering/ has how
-R_o M and the gradients are computed; kernels in scene.cl, boxed.cl and losses.cl.
+|z|^2 is the prior's term; its gradient is added in the step of z (amsgrad.py). rendering/ computes
+R_o M and the gradients; kernels are in scene.cl, boxed.cl and losses.cl.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ class LossGradient:
     """Queues model, residual, gradients and loss of a batch at its present state.
 
     buffers: the batch; d_morph and d_spectra of it are overwritten
-    with_prior: whether the loss has the term of z
-    depth: at which stage of rendering spectra are applied, see rendering/stages.py; None leaves it
-        to each observation's count
+    with_prior: True if the loss has the term of z
+    depth: the stage of rendering at which spectra are applied, see rendering/stages.py; None = the
+        cheapest for each observation
     rows (C + 1,): observed rows of all channels up to each, the columns of:
-    rows_loss, rows_pull (B, n_rows): 1/2 sum w r^2 and sum w r of each observed row, in a channel's
-        first one with what is expected of its sky; sums over its rows are its loss and dL/dsky
+    rows_loss, rows_pull (B, n_rows): 1/2 sum w r^2 and sum w r of each observed row; the first row
+        of a channel includes the prior of its sky. Sums over its rows are its loss and dL/dsky
     best (B,): lowest loss of each scene among those computed with i_loss = 0, infinite before
     """
 

@@ -51,7 +51,7 @@ class MorphologyOperator(SceneOperator):
 
     def _adjoint(self, y, out):
         self._refuse_batch(y)
-        self.device.copy(self._zeros, out)  # no kernel writes to what lies between the boxes
+        self.device.copy(self._zeros, out)  # no kernel writes between the boxes
         self.rendering.back_project(y[0])
         self.rendering.gather_morph(self.buffers.spectra, out, self.buffers.boxes.everyone)
 

@@ -11,8 +11,9 @@ import numpy as np
 class SingleScalePrior:
     """Prior on a morphology: S = p + alpha sqrt(p) K z, z unit normal.
 
-    p is the smooth profile that is expected. The structure of galaxies is made of clumps, whose
-    number, and so the variance, follows the light: hence the root.
+    p is the expected smooth profile. The structure of galaxies consists of clumps, whose number,
+    and so
+    the variance, is proportional to the light: hence the root.
 
     strength [1]: scatter of the brightest pixel about its expected value, relative to it; larger
         ones let more of the noise into the morphology

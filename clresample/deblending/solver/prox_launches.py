@@ -84,7 +84,7 @@ def most_iterations(device, n, group, loops):
 
     DeviceError: not even one is possible
     """
-    walk = -(-n // group) + 1  # one pass over the plane, and the look that ends it
+    walk = -(-n // group) + 1  # one pass over the plane, and the test that ends it
     # Image and dual, and each fourth time two sums: of four elements a step, then over the group.
     # Before and after all turns one such sum and four passes.
     inner = walk / 4 + 1 + group

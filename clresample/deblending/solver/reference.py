@@ -122,7 +122,7 @@ def monotone_weights(shape, center, weights=MonotoneWeights.ANGLE):
         to_y, to_x = y + dy + center[0], x + dx + center[1]
         inside = (to_y >= 0) & (to_y < shape[0]) & (to_x >= 0) & (to_x < shape[1])
         nearer = (y + dy) ** 2 + (x + dx) ** 2 < y**2 + x**2
-        # The way to the centre has the same length for all 8, so it drops out of the normalisation.
+        # The distance to the centre is the same for all 8, so it cancels in the normalisation.
         cosine = -(dy * y + dx * x) / np.hypot(dy, dx)
         w[i_way] = np.where(inside & nearer, 1.0 if weights == MonotoneWeights.FLAT else cosine, 0)
     if weights == MonotoneWeights.NEAREST:

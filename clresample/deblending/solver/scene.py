@@ -26,17 +26,18 @@ class Scene:
         and the pixel of the box about which the morphology falls
     profile (S): arrays (ny, nx) [1]: expected morphology, max = 1
     fixed (S,): bool, the morphology stays as it is
-    step_scale (S, C): what counts as one step of each spectrum, in the unit of the data
+    step_scale (S, C): size of one step of each spectrum, in the unit of the data
     coefficients: per observation (S, Co, T), of its operator's terms in each component's PSF; None
-        where its PSF is the same for all
+        if its PSF is the same for all
     spectrum_curvature (S, C): sum w (R p)^2 of each profile p, the curvature of the loss by its
         spectrum
     damping (S,): gradients under which steps are shorter than the step sizes; see
         `curvature.damping`
     fit_sky: whether the sky level of each channel is free
-    sky_precision (C,): of a fitted level inverse variance with which it is expected to be 0, as the
-        data are above what is expected of the sky; 0 where nothing is, None = 0 in all channels
-    ties: Ties of the channels; None where each has a band of its own
+    sky_precision (C,): inverse variance of the prior of a fitted sky level, whose mean is 0 because
+        the expected level was subtracted from the data; 0 without an expectation; None = 0 in all
+        channels
+    ties: Ties of the channels; None if each has its own band
     """
 
     shape: tuple[int, int]
@@ -111,8 +112,8 @@ class StructureState:
     """Structure of one scene's n components in a fit under a MultiscalePrior.
 
     structure [s][j] (ny_j, nx_j): coefficients z of each scale, on the grids of `LatentLayout`
-    strengths (n, J): their scatter; clear (n,): bool, see evidence.py. Of fixed ones
-        without meaning
+    strengths (n, J): their scatter; clear (n,): bool, significant structure, see evidence.py. Both
+        are meaningless for fixed components
     """
 
     structure: list[list[np.ndarray]]
@@ -126,9 +127,8 @@ class State:
 
     latent, morph (S): arrays (ny, nx): z (see SingleScalePrior; of no use without one) and S
     spectra (S, C): A, and sky (C,), in the unit of the data
-    memory: of the update, None before its first step; n_steps: iterations done so far
-    learned: StructureState under a MultiscalePrior; None: no structure, strengths that are the
-        prior's
+    memory: moments of the update, None before its first step; n_steps: iterations done so far
+    learned: StructureState with a MultiscalePrior; None = no structure, the prior's strengths
     """
 
     latent: list[np.ndarray]

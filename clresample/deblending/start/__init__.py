@@ -1,9 +1,9 @@
 """The start of fits: profiles, free stars and spectra, for all scenes of a group at once.
 
-profile_start.py is what fits ask for, first_scene.py turns its answer into a Scene. profile_fit.py
-steps (Levenberg-Marquardt) with the normal equations of equations.py; linearised_scenes.py holds
-what all observations see of the components, and solves for spectra. Of one observation,
-slot_observation.py has the device add up products over pixels; render_planner.py and renderer.py
-bring boxes, which component_batch.py draws, to the pixels that their light reaches. final_render.py
-looks at finished fits in the same way. Cost and memory follow the number of components.
+Fits call profile_start.py; first_scene.py makes a Scene from its result. profile_fit.py takes
+Levenberg-Marquardt steps with the normal equations of equations.py. linearised_scenes.py renders
+the components in all observations and solves for spectra; slot_observation.py sums products over
+the pixels of one observation on the device. component_batch.py draws boxes, which render_planner.py
+and renderer.py render in the pixels that their light reaches. final_render.py does the same for
+finished fits. Cost and memory are proportional to the number of components.
 """

@@ -9,16 +9,17 @@ import numpy as np
 
 from ..profiles import GalaxyProfile, covariance, galaxy_reach
 
-# [px] Sides of boxes: of few sizes, since each is an operator of its own, and components in boxes
-# of one size are rendered together. More of them cost scenes with pixels of their own a quarter
-# more time, and gain others nothing; beyond the last they double.
+# [px] Sides of boxes. There are few sizes, since each needs an operator, and components in boxes of
+# one size are rendered together. With more sizes, scenes with different pixel grids take a quarter
+# more time, and others gain nothing. Beyond the last the sizes double.
 BOX_SIDES = (24, 40, 64, 96, 128)
-# [noise of a model pixel] A box reaches to where the profile is this faint in the channel that sees
-# it best. With 0.05 a real HSC blend, of bright galaxies with wide wings, starts from other shapes
-# and ends at chi2 of 1.29 in place of 1.19; with 0.02 it does not. Smaller: larger boxes.
+# [noise of a model pixel] Brightness of the profile at the edge of its box, in the channel of
+# highest signal to noise. With 0.05 a real HSC blend, of bright galaxies with wide wings, starts
+# from other shapes and ends at chi2 of 1.29 instead of 1.19; with 0.02 it does not. Smaller values
+# make larger boxes.
 EDGE_NOISE_FRACTION = 0.01
-# Part of a profile's peak at the edge of its box, at least and at most: the first as float32 keeps
-# it, the second while its flux is not known.
+# Smallest and largest fraction of a profile's peak at the edge of its box: the first is the
+# precision of float32, the second is used before the flux is known.
 FAINTEST, BRIGHTEST = 1e-6, 2e-3
 
 
@@ -116,8 +117,8 @@ def profile_thresholds(brightness):
 class ComponentBatch:
     """Components drawn side by side; those of equal boxes and scenes follow each other.
 
-    components (n): any; thetas (n): their parameters; boxes (n): (origin, size); slopes: whether
-        slopes are drawn with the profiles
+    components (n): any; thetas (n): their parameters; boxes (n): (origin, size); slopes: True to
+        draw slopes with the profiles
 
     order (n,): the components in the order of the slots; scene, n_images (n,), origin, size (n, 2),
     begin (n,): first element of each slot's images in the device array that `draw` returns

@@ -1,4 +1,4 @@
-"""Normal equations of all parameters of a group of scenes, from sums that the device adds up."""
+"""Normal equations of all parameters of a group of scenes, from sums of the device."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from ..spectra import RIDGE
 
-# Parameters of a component at most; those of others are padded.
+# Largest number of parameters of a component; others are padded.
 N_PARAMETERS = 4
 
 
@@ -51,7 +51,7 @@ def normal_equations(looking):
             inner[*at, own[:, None], n] = inner[*at, n, own[:, None]] = pull[:, :, 0, 1]
             cross[*at, n, own[:, None]] = slope[..., 1]
     lit = looking.solution() > 0
-    lit[..., n] = inner[..., n, n] > 0  # none in a channel without weights, nor if it is not fitted
+    lit[..., n] = inner[..., n, n] > 0  # 0 in a channel without weights, or if it is not fitted
     parts = normal, right, inner, cross, rest, lit
     if looking.fit_sky or looking.ties is not None:
         parts = _of_bands(looking.ties, *parts)

@@ -14,9 +14,9 @@ from ..view import WhitenedView
 from .component_batch import StartComponent
 from .linearised_scenes import linearise
 
-# [px] Frames of no more pixels are seen whole, by the views' own operators: making others for boxes
-# would take longer. In larger ones the boxes' operators see what the whole one does but for 2e-5 of
-# the brightest pixel, by where a box that ends in the middle of light is repeated.
+# [px] Frames of at most this many pixels are rendered whole, by the views' own operators, since
+# making operators for boxes would take longer. In larger frames the boxes' operators agree with
+# that of the frame to 2e-5 of the brightest pixel, the effect of aliases of boxes that cut light.
 WHOLE_PX = 160**2
 
 
@@ -25,9 +25,9 @@ class MorphologyModel:
     """The morphologies of a scene, and the views that render them.
 
     frame (2,) [px]: its shape, padding included
-    views: WhitenedViews; unfiltered_views: others like them, or None where the view itself is as
-        the observation was taken
-    source (n,): number of each one's source, by which views know its PSF
+    views: WhitenedViews; unfiltered_views: the same without whitening filter, or None if the view
+        has none
+    source (n,): number of each one's source, which selects its PSF in the views
     origin (n, 2) [px], morphs (n): arrays (ny, nx), in boxes of the frame
     """
 
@@ -77,7 +77,7 @@ class _ImageProfile(ComponentProfile):
         self.image, self.origin, self.frame = image, np.asarray(origin), np.array(frame)
 
     def bounding_box(self, theta, position, threshold):
-        """All of the box, or all of the frame where that is small."""
+        """All of the box, or of the frame if that is small."""
         if self.frame.prod() <= WHOLE_PX:
             return (self.frame - 1) / 2, np.full(2, self.frame.max())
         size = np.array(self.image.shape)

@@ -6,11 +6,12 @@ Therefore sizes GROWTH times apart, with the expected wings and with WIDE_WINGS,
 
     gain_k = sum_c max(0, <u_k, r>)^2 / (|u_k|^2 + (NEIGHBOUR_MODEL_ERROR <u_k, M>)^2),
 
-u_k being a source's whitened image with profile k, r the data less the models of the sources before
-it, and M these models. Their error is NEIGHBOUR_MODEL_ERROR of their light (population.py); a small
-neighbour must not take that error for its own light. The source with the largest gain comes first,
-with its best profile, whose shape is then fitted. The source with the largest gain in the rest is
-next, and so on: the result does not depend on the order of the list.
+where u_k is a source's whitened image with profile k, r is the data minus the models of the sources
+before it, and M are these models. The term with M allows for their error, NEIGHBOUR_MODEL_ERROR of
+their light (population.py), so that a small neighbour does not fit that error. The source with the
+largest gain comes first, with its best profile, whose shape is then fitted. The source with the
+largest gain in the residuals is next, and so on: the result does not depend on the order of the
+    list.
 """
 
 from __future__ import annotations
@@ -21,16 +22,15 @@ from ..profiles import GalaxyProfile
 from .component_batch import renumbered
 from .population import NEIGHBOUR_MODEL_ERROR
 
-# Sizes follow each other by this factor: the least squares find their way from half of it.
+# Ratio of successive sizes: least squares converge from half of it.
 GROWTH = 3.0
 # Beta of large galaxies with wings: fits of Sersic profiles of n = 1 to 4 have 1.5 to 0.1.
 WIDE_WINGS = 0.7
-# Most rounds, in each of which sources that are apart from each other take their profiles; what is
-# left then is for the least squares.
+# Largest number of rounds, in each of which separate sources get their profiles; the remaining
+# sources are left to the least squares.
 N_ROUNDS = 12
-# Chi2 by which another profile must be better. Noise gains under 10 for the few numbers of a
-# profile; smaller differences are left to the least squares, which take account of what is
-# expected.
+# Smallest gain in chi2 of another profile. Noise gains less than 10 for the few parameters of a
+# profile; smaller differences are left to the least squares, which include the prior.
 NEED = 25.0
 
 
@@ -73,7 +73,7 @@ def first_profiles(fit, error):
     looking, thetas = fit.looking, fit.thetas()
     grid = profile_grid(looking, thetas, error)
     scenes = np.unique(looking.scene[list(grid)])
-    # those without larger light about them are there from the first
+    # sources without wider light around them are included from the start
     models = {i: thetas[i] for i in np.flatnonzero(np.isin(looking.scene, scenes)) if i not in grid}
     large: set[int] = set()
     for _ in range(N_ROUNDS):

@@ -1,4 +1,4 @@
-"""The scene of a fit as it begins: the start's profiles in the boxes that hold their light."""
+"""The initial scene of a fit: the start's profiles in the boxes of their light."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from ..resize import component_box
 from ..solver.curvature import damping
 from ..solver.scene import Scene, State
 
-# A spectrum's step size counts in errors of the flux plus this part of the flux: bright sources,
-# whose errors are far smaller than what a changing morphology does to their flux, can follow it.
+# A spectrum's step size is its flux error plus this fraction of the flux, so that fluxes of bright
+# sources can follow changes of their morphology, which are much larger than their errors.
 SPECTRUM_PART = 0.02
-# Least power sum |u|^2 of a component's whitened image u in a channel, whose root is the inverse of
-# its spectrum's error; and the error from which on the channel holds nothing of the component, so
-# that its spectrum is not stepped there. A covered component has errors of 1e6 at most.
+# Smallest curvature sum |u|^2 of a component's whitened image u in a channel, whose root is the
+# inverse of its spectrum's error; and the error above which the channel does not contain the
+# component, so that its spectrum is fixed there. A covered component has errors of at most 1e6.
 MIN_POWER, UNSEEN = 1e-30, 1e14
 
 

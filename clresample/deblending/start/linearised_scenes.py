@@ -41,7 +41,7 @@ class LinearisedScenes:
 
     spectra (N, C), sky (B, C): of the last solution, in the views' units, for profiles of unit
         integral
-    sky_precision (B, C): with which each level is expected to be 0; 0 where it is not fitted
+    sky_precision (B, C): of the prior of each level, whose mean is 0; 0 if it is not fitted
     """
 
     def __init__(self, components, sights, n_scenes, device, dtype, tuning, *, fit_sky):
@@ -85,17 +85,17 @@ class LinearisedScenes:
 
     @property
     def rows(self):
-        """The row (slots,) among the scenes looked at of each slot's scene."""
+        """The row (slots,) of each slot's scene among the rendered scenes."""
         return self.rows_of(self.scene[self.at])
 
     def rows_of(self, scenes):
-        """The rows of scenes among those looked at; -1 of others."""
+        """The rows of scenes among the rendered ones; -1 for others."""
         return self._row[scenes]
 
     def compute_residuals(self, error) -> np.ndarray:
         """Compares the present solution with the data.
 
-        chi2 (k,) of the scenes looked at, with what is expected of the sky.
+        chi2 (k,) of the rendered scenes, with the prior of the sky.
         """
         spectra = self.spectra[self.at]
         self.sums = [
@@ -191,7 +191,7 @@ class LinearisedScenes:
         return found.reshape(len(self.scenes), self.n_channels, size)
 
     def covariance(self, row):
-        """Of one scene's spectra (C, n, n), the sky levels unknown too if they are fitted."""
+        """Covariance (C, n, n) of one scene's spectra, with unknown sky levels if fitted."""
         n = int((self.scene == self.scenes[row]).sum())
         if self.ties is not None:
             given = self.ties, self.normal[row], self.right[row], self.fit_sky

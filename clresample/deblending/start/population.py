@@ -30,30 +30,31 @@ import numpy as np
 
 from ..profiles import GalaxyProfile
 
-# Which parameters of `profiles.GalaxyProfile` are learned: ln sigma and ln beta. How they are
-# expected to scatter from scene to scene and within one, together as a galaxy by itself
-# (SIZE_SCATTER, WINGS_SCATTER); what is expected within a scene has the weight of so many galaxies.
-# Mean SDRs of simulated COSMOS galaxies are 0.1 dB (joint) to 0.2 dB (Rubin's or Euclid's images
-# alone) above those of what is expected of any galaxy (180 scenes, seeds from 3000, 4000 and 5000).
+# Indices of the parameters of `profiles.GalaxyProfile` whose prior is updated, ln sigma and ln
+# beta. Then their scatter between scenes and within a scene, which together equal that of a single
+# galaxy (SIZE_SCATTER, WINGS_SCATTER), and the weight of the prior scatter within a scene, in
+# galaxies. Mean SDRs of simulated COSMOS galaxies are 0.1 dB (joint) to 0.2 dB (Rubin's or Euclid's
+# images alone) above those with the fixed prior (180 scenes, seeds from 3000, 4000 and 5000).
 # GALAXY_SCATTER from 0.15 to 0.27 and 0.35 to 0.5, or a WEIGHT of 8, change them by up to 0.03 dB;
-# a scatter of ellipticities that is learned likewise costs up to 0.1 dB.
+# updating the scatter of ellipticities too costs up to 0.1 dB.
 LEARNED = np.array([0, 3])
 SCENE_SCATTER, GALAXY_SCATTER, WEIGHT = np.array([0.35, 0.5]), np.array([0.2, 0.5]), 4.0
-# Galaxies of a scene from which on there is something to learn.
+# Smallest number of galaxies in a scene for which the prior is updated.
 MIN_GALAXIES = 2
-# Degrees of freedom. With 4, one galaxy three times as large as five others leaves what is expected
-# of these as it was; under a Gaussian their scatter would grow from 0.2 to 0.35. Simulated galaxies
-# are fitted alike with both.
+# Degrees of freedom. With 4, one galaxy three times as large as five others does not change the
+# prior of these; with a Gaussian their scatter would grow from 0.2 to 0.35. Fits of simulated
+# galaxies are equal with both.
 STUDENT_DOF = 4.0
-# The same of all four parameters of a galaxy by itself, before anything is learned: data overrule
-# what is expected of sizes and wings. Ellipticities are expected to be nearly Gaussian: tails of 4
-# degrees of freedom cost 0.1 dB.
+# The same for all four parameters of a single galaxy, before updates: data can override the prior
+# of
+# sizes and wings. The prior of ellipticities is nearly Gaussian: tails of 4 degrees of freedom cost
+# 0.1 dB.
 TAILS = np.array([4.0, 1e6, 1e6, 4.0])
-# Part of its light by which a neighbour's model is wrong in the same sense all over a galaxy. With
-# 0.1 the mean SDR of simulated COSMOS galaxies is 0.1 dB above that without; with 0.2 it is by 0.13
-# (joint, and Euclid alone) to 0.28 dB (Rubin alone), with 0.5 by as much (180 scenes, seeds from
-# 3000, 4000 and 5000). With 0.5 two bright galaxies on top of each other, a merger in HSC's images,
-# keep shapes that are wrong.
+# Relative error of a neighbour's model, of one sign over a whole galaxy. With 0.1 the mean SDR of
+# simulated COSMOS galaxies is 0.1 dB above that without it; with 0.2 the gain is 0.13 dB (joint,
+# and Euclid alone) to 0.28 dB (Rubin alone), and with 0.5 the same (180 scenes, seeds from 3000,
+# 4000 and 5000). With 0.5 the shapes of two overlapping bright galaxies, a merger in HSC's images,
+# stay wrong.
 NEIGHBOUR_MODEL_ERROR = 0.2
 
 
@@ -89,7 +90,7 @@ class PopulationPrior:
         self.contamination[scenes] = np.where(self._galaxies[scenes], found, 1)
 
     def precision(self, scenes, theta):
-        """With which the parameters (B, n, p) of some scenes are held to their means (k, n, p)."""
+        """Precisions (k, n, p) of the prior on the parameters (B, n, p) of some scenes."""
         weight = 1 / (1 + self._away(scenes, theta) / TAILS)
         weight = np.where(self._galaxies[scenes][..., None], weight, 1)
         return self.contamination[scenes][..., None] * weight / np.square(self.scatter[scenes])
@@ -108,13 +109,13 @@ class PopulationPrior:
     def update(self, scenes, theta, normal):
         """Updates the prior of some scenes from their galaxies.
 
-        theta (B, n, p); normal (B, n p, n p): of their equations, what was expected among them
+        theta (B, n, p); normal (B, n p, n p): of their equations, with the prior
         """
         scenes = scenes[self._several[scenes]]
         n, p = theta.shape[1:]
         each = normal[scenes].reshape(-1, n, p, n, p)[:, np.arange(n), :, np.arange(n)]
         variance = np.diagonal(np.linalg.inv(each), axis1=2, axis2=3).swapaxes(0, 1)
-        # as if what the data say had been divided, instead of the rest multiplied
+        # equivalent to dividing the data's precision, instead of multiplying the prior's
         variance = variance * self.contamination[scenes][..., None]
         off, known = theta[scenes][..., LEARNED] - self._before[scenes], self._known[scenes]
         self._common[scenes], self._own[scenes], scatter = em_step(
@@ -144,8 +145,8 @@ def contamination_factors(normal, spectra, source):
 def em_step(off, variance, known, common, own):
     """c and s (k, 2) after one step, and the expected scatter of each galaxy (k, n, 2).
 
-    off, variance (k, n, 2): theta - mean, and how well each galaxy's is known, what was expected of
-        it included, neighbours as they are
+    off, variance (k, n, 2): theta - mean, and its variance for each galaxy, with the prior and
+        fixed neighbours
     known (k, n): which of them are galaxies; common, own (k, 2): the present c and s
     """
     known, away = known[..., None], (off - common[:, None]) ** 2 + variance

@@ -11,14 +11,14 @@ from .first_profiles import first_profiles
 from .linearised_scenes import LinearisedScenes
 from .population import PopulationPrior, contamination_factors
 
-# Longest step of a parameter: far from the minimum the quadratic model of chi2 promises too much.
+# Longest step of a parameter: the quadratic model of chi2 is not valid far from the minimum.
 LONGEST_STEP = 0.7
-# Most steps, and the chi2 that ends them when one of them gains no more than it.
+# Largest number of steps, and the gain in chi2 below which they end.
 N_STEPS, CHI2_TOL = 40, 1.0
-# Most steps of large galaxies' profiles after each that is found, before all are fitted together.
+# Largest number of steps after each large profile that is added, before all are fitted together.
 N_FIRST_STEPS = 5
-# Levenberg-Marquardt: damping of the first step as a part of the normal matrix's diagonal, what it
-# is divided by after a step that gains, multiplied by after one that does not, and where it ends.
+# Levenberg-Marquardt: damping of the first step relative to the normal matrix's diagonal, its
+# divisor after a successful step, its factor after a rejected one, and its largest value.
 FIRST_DAMPING, DAMPING_DECREASE, DAMPING_INCREASE, MAX_DAMPING = 1e-2, 3, 10, 1e3
 
 
@@ -27,7 +27,7 @@ class ProfileFit:
 
     looking: LinearisedScenes; noise (B, C): of a model pixel
 
-    population: what is expected of the parameters
+    population: PopulationPrior on the parameters
     source (B, n): to which each component belongs, -1 where there is none
     theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs
     brightness (N,): of the components, see `thresholds`

@@ -1,15 +1,17 @@
 """Starting point of a fit: smooth profiles and positions of free stars, fitted to all data.
 
 Gauss-Newton on the shapes with the spectra eliminated (variable projection), over every channel of
-every instrument, so that a source that only one of them sees still starts right:
+every instrument, so that a source detected by a single instrument starts correctly:
 
-    min  sum_pixels w (d - sum_s A_s R S_s)^2 + sum doubt ((theta - mean) / scatter)^2,     A >= 0
+    min  sum_pixels w (d - sum_s A_s R S_s)^2 + sum contamination ((theta - mean) / scatter)^2,
+    A >= 0
 
-What is expected of theta, and how far shapes are doubted beside other sources: population.py.
-Smooth profiles leave a tenth of a bright galaxy's light unexplained. The weights allow for it,
-1/w = sigma^2 + (MODEL_ERROR * light)^2: without, spiral arms would be taken for faint neighbours.
-The light is that of the data, smoothed, so that weights stay as they are while profiles change:
-weights that followed the model would make chi2 smaller the more light a model claims.
+The prior on theta, and the factor `contamination` for sources with neighbours, are in
+population.py. Residuals of smooth profiles are a tenth of a bright galaxy's light. The weights
+include them, 1/w = sigma^2 + (MODEL_ERROR * light)^2, so that faint neighbours do not fit spiral
+arms. The light
+is that of the smoothed data, so that weights do not depend on the profiles: with weights from the
+model, chi2 would decrease with the flux of the model.
 """
 
 from __future__ import annotations
@@ -27,14 +29,14 @@ from .component_batch import StartComponent, renumbered
 from .linearised_scenes import linearise
 from .profile_fit import ProfileFit
 
-# What is enough for profiles: they leave a tenth of a galaxy's light. Frequencies and light of the
-# PSF beyond these parts of it, and six taps, change chi2 by 1e-4; the operator's own precision and
-# reach take three times as long.
+# Precision for smooth profiles, whose errors are a tenth of a galaxy's light. Omitting frequencies
+# and light of the PSF below these fractions, with six taps, changes chi2 by 1e-4; with the
+# operator's own precision and reach it takes three times as long.
 PRECISION, TOLERANCE = Precision(1e-4, KaiserBessel(6, 1.5)), 1e-4
-# [sigma] What counts as light at a source: noise alone reaches it once in 740 times, what `detect`
-# finds has 5. A source is far from any light where neither its expected profile at its position
-# shows that, nor a galaxy NEARBY times larger than expected does, 1.5" in sigma: a source that is
-# too faint by itself, but beside others, is probably meant.
+# [sigma] Smallest signal to noise of light at a source: noise reaches it once in 740 times; sources
+# of `detect` have 5. A source is far from any light if neither its expected profile reaches it, nor
+# a galaxy NEARBY times larger than expected, with a sigma of 1.5": a faint source beside others is
+# probably real.
 LIGHT_SIGMAS, NEARBY = 3.0, 6.0
 
 
@@ -56,9 +58,9 @@ class StartingPoint:
     """Components of a scene before their own structure is fitted.
 
     source (n): the source of each component
-    positions (S, 2) [px]: of the sources, free stars where they were found
-    undetected (S,): bool, whether a source is far from any light, see `_is_dark`
-    shapes (n): the components' Shapes; thetas (n): arrays of their parameters
+    positions (S, 2) [px]: of the sources, for free stars the fitted ones
+    undetected (S,): bool, sources far from any light, see `_is_dark`
+    shapes (n): the components' ComponentProfiles; thetas (n): arrays of their parameters
     drawn_positions (n, 2) [px]: where the shapes are drawn with these parameters
     peaks (n,): by which profiles of unit integral are divided, so that max = 1
     spectra (n, C), sky (C,): least squares for these profiles; spectrum_curvature (n, C): sum u^2
@@ -174,7 +176,7 @@ def _point(patch, looking, thetas, sources, b, dark):
 def profile_peak(shape, theta, place, center, frame):
     """The largest pixel of a ComponentProfile's profile of unit integral in its frame.
 
-    place, center (2,) [px]: where it is drawn, and near which that pixel lies; frame (2,) [px]
+    place, center (2,) [px]: its position, and a position near that pixel; frame (2,) [px]
     """
     if isinstance(shape, FixedProfile):
         return shape.peak
@@ -228,8 +230,8 @@ def _dark(patches, sources, looking):
 def _is_dark(snr):
     """Selects positions (n,) without light, from their signal to noise (n, C).
 
-    Neither in any channel nor in all that see the place together, each with the same weight: that
-    finds what is faint in each of many channels.
+    Tested are each channel, and the sum of all channels that cover the position with equal weights,
+    which detects sources that are faint in each of many channels.
     """
     n_seen = np.maximum(np.count_nonzero(snr, axis=1), 1)
     together = snr.sum(axis=1) / np.sqrt(n_seen)

@@ -11,11 +11,11 @@ from ...resampling.transfer import light_reach
 from ...sky.mapping import PaddedMapping
 from .renderer import BoxRenderer
 
-# [model px] Departure from an affine mapping that a box of a distorted one may have, as for frames.
+# [model px] Largest departure from an affine mapping within a box, as for frames.
 TOLERANCE_PX = 1e-4
-# [px] Windows that several plans share have sides of multiples of it, so that those of other scenes
-# beside them are as large, and are not made anew: with 1 px they often are, with 8 px windows hold
-# more pixels that no light reaches.
+# [px] Sides of windows shared by several plans are multiples of this, so that windows of
+# neighbouring scenes have the same size and are reused. With 1 px they are often recomputed; with 8
+# px windows have more pixels without light.
 SIZE_PX = 4
 
 
@@ -23,10 +23,10 @@ SIZE_PX = 4
 class RenderRun:
     """Slots that follow each other and are rendered at once.
 
-    first, last: of them, last + 1; renderer: None where nothing is near
+    first, last: of the first slot, and of the last plus 1; renderer: None if no pixel is near
     plan_index (m,): index of each one's plan there; low (m, 2): first pixels of their windows
     lit_window (m, 4): first pixels and sizes of the parts of these that light reaches
-    offsets_px (m, 2) [model px]: by how much the pixels are off the plan's
+    offsets_px (m, 2) [model px]: distance of the pixels from those of the plan
     """
 
     first: int
@@ -42,10 +42,10 @@ class RenderPlanner:
     """Renderers for the boxes of slots, one observation of each of B scenes.
 
     views (B): WhitenedViews; precision: of the operators
-    tolerance: part of the PSF's light beyond windows; 0: as little as beyond those of whole frames,
-        and these are seen with the views' own plans
+    tolerance: fraction of the PSF's light beyond windows; 0 = that of whole frames, which are
+        rendered with the views' own plans
 
-    Scenes whose plans are alike in layout share a renderer for each shape of boxes.
+    Scenes whose plans have the same layout share a renderer for each shape of boxes.
     """
 
     def __init__(self, views, device, dtype, precision: Precision, tolerance):
@@ -64,7 +64,7 @@ class RenderPlanner:
 
     def runs(self, slots):
         """Yields the RenderRuns of slots."""
-        # on distorted pixels each place has its own plan
+        # on distorted pixels each position has its own plan
         whole = (slots.size == self.views[0].op.shape_in[1:]).all(axis=1) & self._exact
         alone = self._distorted[slots.scene] & ~whole
         key = np.where(alone, -1 - np.arange(len(slots)), self._layout[slots.scene])
@@ -194,7 +194,7 @@ def _layout(plan: ResamplingPlan):
 def _reach(plan, tolerance):
     """Distance [model px] to which the light of a box is followed.
 
-    With no tolerance it is as far as a plan's model is padded for it.
+    Without a tolerance it is the padding of the plan's model.
     """
     if not tolerance:
         return max(plan.certificate.wrap_radius_px)

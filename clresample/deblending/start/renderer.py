@@ -18,9 +18,9 @@ class BoxRenderer:
 
     size (2,) [px]: of the windows
 
-    A box is transformed once for all bands and all slots; the offset of each slot and the transfer
-    functions of the bands, of which each slot has its own sum of terms where the PSF varies, are
-    multiplied in between (kernels/terms.cl, turn).
+    A box is transformed once for all bands and slots. Its transform is multiplied by the phase of
+    each slot's offset and by the transfer functions of the bands, which are sums of terms for each
+    slot if the PSF varies (kernels/terms.cl, apply_transfer).
     """
 
     def __init__(self, device, dtype, plans, executor=None):
@@ -81,7 +81,7 @@ class BoxRenderer:
         """Reserves memory for a number of images at a time."""
         if n_images <= self._capacity:
             return
-        # twice as many at a time, as slots of this size come and go; no more than one launch takes
+        # twice as many at a time, since their number changes; at most those of one launch
         e, most = self.executor, self.executor.tuning.group_bytes // self._n_bytes
         self._capacity = n_images = max(n_images, min(2 * self._capacity, most))
         if e.which is not None:

@@ -12,9 +12,9 @@ from .component_batch import ComponentBatch, cumulative_offsets
 from .render_planner import RenderPlanner
 
 FILE = "start.cl"
-# [px] Sigma by which data are smoothed before a model's error is taken as a part of them. Noise
-# is then 10 times smaller. SDRs of simulated COSMOS galaxies are the same with 2 to 4, and 0.1 dB
-# lower with 1.
+# [px] Sigma by which data are smoothed for the model's error, a fraction of them. Noise is then 10
+# times smaller. SDRs of simulated COSMOS galaxies are the same with 2 to 4, and 0.1 dB lower with
+# 1.
 LIGHT_PX = 3.0
 
 
@@ -24,8 +24,8 @@ class SlotObservation:
     views (B): WhitenedViews of equal shapes; channels: slice of all the scenes' channels
     precision, tolerance: see RenderPlanner
 
-    lit (slots, 4): first pixels and sizes of what the slots seen last light up
-    n_elements: that were last seen; n_pixels: of all products so far
+    lit (slots, 4): first pixels and sizes of the parts reached by the light of the last slots
+    n_elements: of the last rendered slots; n_pixels: of all products so far
     ties: Ties of all channels, or None; scale (B, Co): WhitenedView.error_scale
     sky_precision (B, Co): the views', 0 where they have none
     root (B, Co, My, Mx): on the device, as are data (times root), residual and weight
@@ -45,7 +45,7 @@ class SlotObservation:
         self.sky_precision = np.zeros(shape[:2]) if known[0] is None else np.array(known)
         self.aim = RenderPlanner(views, device, dtype, precision, tolerance)
         self.n_elements = self.n_pixels = 0
-        self._listed = None  # of the scenes last compared, on the device
+        self._listed = None  # for the scenes of the last residuals, on the device
 
     @cached_property
     def _light(self):
@@ -187,7 +187,7 @@ class SlotObservation:
 def smoothed_light(view):
     """Light of a WhitenedView's pixels over their noise (Co, My, Mx), smoothed over neighbours.
 
-    Pixels without a weight take no part, and have none.
+    Pixels without weight are ignored, and get no light.
     """
     seen = gaussian_filter(view.sqrt_weights**2, (0, LIGHT_PX, LIGHT_PX), mode="constant")
     light = gaussian_filter(

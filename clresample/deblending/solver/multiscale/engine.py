@@ -3,10 +3,10 @@
     L = 1/2 sum_o |sqrt(w_o) (R_o M + sky - d_o)|^2 + 1/2 sum_c p_c sky_c^2
         + 1/2 sum_sj |z_sj|^2 / alpha_sj^2,      p: Scene.known_sky
 
-A round costs one pair of operators for the whole batch. Each scene then does what its own loss
-asks for: it accepts its trial and takes a new direction, or goes back and takes a shorter step. The
-host decides, from sums of rows and chunks that are added in float64: a float32 loss of 3e5 is known
-to 0.05, a twentieth of what ends a fit.
+A round costs one pair of operators for the whole batch. Each scene then accepts its trial and takes
+a new direction, or rejects it and takes a shorter step, depending on its own loss. The host
+decides, from sums of rows and chunks that are added in float64, because a float32 loss of 3e5 is
+accurate only to 0.05, a fifth of Settings.loss_tol.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from .strengths import PriorStrengths
 from .structure import StructureOperator, coarse_count
 from .vectors import SceneGradient, SolverVectors
 
-# Pairs of changes that a scene remembers: 20 take no fewer iterations, 5 some more.
+# Number of (s, y) pairs of a scene: with 20, fits need as many iterations; with 5, some more.
 N_PAIRS = 10
-# Part of the largest power of a source in any channel under which a channel holds nothing of it.
+# Fraction of a source's largest curvature in any channel below which a channel does not contain it.
 UNSEEN = 1e-14
 
 
 class MultiscaleEngine:
     """A batch of scenes of one signature on the device, under a MultiscalePrior.
 
-    scenes, states: of the scenes at their start: on the profiles, but where states have a
+    scenes, states: of the scenes at their start: at the profiles, unless states have a
         StructureState
-    enough: a scene has converged when its loss fell by less than this over some
-        iterations, see lbfgs_control.py
-    past: another engine and the indices (n,) of its scenes that go on here, which are `scenes`
+    enough: a scene has converged when its loss fell by less than this over some iterations, see
+        lbfgs_control.py
+    past: another engine and the indices (n,) of its scenes that continue here as `scenes`
 
-    progress: the scenes' Progress; strengths: their sources' Strengths
+    progress: the scenes' LbfgsControl; strengths: their sources' PriorStrengths
     """
 
     def __init__(self, scenes, states, device, dtype, prior, loss_tol, *, past=None):
@@ -72,7 +72,7 @@ class MultiscaleEngine:
             self.steps.take_blocks(self.strengths.blocks)
 
     def subset(self, keep):
-        """An engine of the scenes `keep` (n,) alone, which go on as if nothing had happened."""
+        """An engine of the scenes `keep` (n,) alone, which continue unchanged."""
         return MultiscaleEngine(
             [self.scenes[i] for i in keep],
             [self._states[i] for i in keep],
@@ -129,7 +129,7 @@ class MultiscaleEngine:
         return tuple(self.device.get(a).astype(np.float64) for a in (energies, spectra))
 
     def _learn(self, due):
-        """New strengths of the scenes `due` (B,), and all that follows; other inner products."""
+        """Updates strengths, and all that depends, of the scenes `due` (B,); inner products."""
         energies, spectra = self._energies(self.vectors.x_new)
         moved, weights, change = self.strengths.learn(due, energies, spectra)
         self._rest_others(self.progress.live)
@@ -150,12 +150,12 @@ class MultiscaleEngine:
         return _that_learned(found, v.split(v.x), self.strengths.by_scene())
 
     def findings(self, which):
-        """Findings of the scenes `which` (B,) at their present states; None for the others."""
+        """StrengthEstimates of the scenes `which` (B,) at their present states, None for others."""
         self.vectors.unpack_spectra(self.vectors.x)
         return self.strengths.findings(which, *self._energies(self.vectors.x))
 
     def slopes(self, which):
-        """The SceneGradient of the scenes `which` (B,) where they are; None for the others."""
+        """The SceneGradient of the scenes `which` (B,) at their present states, None for others."""
         x, g = (self.vectors.split(v) for v in (self.vectors.x, self.vectors.g))
         return [
             SceneGradient(*slopes, (now[1] <= 0) & (slopes[1] > 0)) if on else None
@@ -215,8 +215,9 @@ def _n_pixels(scene):
 def vector_bytes(scene, prior) -> int:
     """Device memory [bytes] of the scene's vectors in a batch, roughly, of float64.
 
-    Both rings, eleven others and the light; and its blocks, of a quarter of each source's
-    coefficients: half a matrix each, with room for half as many more, and half a one on the host.
+    Counted are both rings of pairs, eleven other vectors and the light; and the blocks of a quarter
+    of each source's coefficients: half a matrix each, half as much again as reserve, and half a
+    matrix on the host.
     """
     n = [sum(coarse_count(p.shape, step).prod() for step in prior.steps) for p in scene.profile]
     blocks = 1.25 * sum(k / 4 * min(k / 4, 2 * MAX_BLOCK_SIZE) for k in n)

@@ -1,8 +1,8 @@
 """Strength of each source's structure at each scale, by the evidence of its own data.
 
-Near a source with profile b and spectrum A the data's curvature by structure at frequency nu is
-b t(nu), t = sum_c A_c^2 T_c, T_c the transform of R_c^T w R_c's answer to one pixel. With k_j(nu)
-the power spectrum of K_j, of mean 1, scale j has
+Near a source with profile b and spectrum A the curvature of chi2 by structure at frequency nu is
+b t(nu), with t = sum_c A_c^2 T_c, where T_c is the transform of the response of R_c^T w R_c to one
+pixel. With k_j(nu), the power spectrum of K_j, of mean 1, scale j has
 
     gamma_j = sum_x mean_nu [ alpha_j^2 k_j b t / (1 + b t sum_i alpha_i^2 k_i) ]
 
@@ -10,17 +10,18 @@ determined parameters, and MacKay's (1992) fixed point under a hyperprior about 
 
     alpha_j^2 <- (|z_j|^2 / max(1, chi2_s) + m alpha0_j^2) / (gamma_j + m),   m = weight / seen_j^2
 
-chi2_s is chi2 per pixel where the source's light is: misfit that no structure can take up is not
-taken for structure. seen_j is the share of scale j's power that the data show at the profile's
-peak: what they barely resolve is not extrapolated to. All of it in float64 on the host.
+chi2_s is chi2 per pixel in the source's light, so that misfit does not count as structure. seen_j
+is the fraction of scale j's power that the data resolve at the profile's peak, so that strengths
+are not extrapolated to unresolved scales. All is computed in float64 on the host.
 
-Where a fit has come so far that its structure hardly changes, a source's structure is *clear* if
+When the structure of a fit hardly changes any more, a source's structure is *significant* if
 
     |z_0|^2 / alpha_0^2 - gamma_0 > MIN_SIGNIFICANCE
 
-at the finest scale 0, whose lack no other one makes up for: the slope of the log of the evidence
-with ln alpha_0. From then on alpha_0 follows the data, without chi2_s and with CLEAR_WEIGHT of m:
-alpha0 is that of ordinary galaxies, and mergers and bright cores are none.
+at the finest scale 0, which no other scale can replace. This is the slope of the logarithm of the
+evidence with ln alpha_0. From then on alpha_0 follows the data, without chi2_s and with the
+fraction CLEAR_WEIGHT of m, because alpha0 is that of ordinary galaxies, unlike mergers and bright
+cores.
 """
 
 from __future__ import annotations
@@ -30,29 +31,30 @@ from scipy.ndimage import convolve1d
 
 from .prior import gaussian
 
-# Frequencies along a side of a local spectrum: one for each of so many pixels, over which T_c falls
-# to nothing. Half of the plane is kept; the other half is its mirror image.
+# Number of frequencies along a side of a local spectrum, which is the number of pixels over which
+# T_c vanishes. Half of the plane is stored; the other half is its mirror image.
 N_FREQUENCIES = 64
 # Values of ln b, over 6 decades, in the table by which the sum over pixels is interpolated.
 N_LEVELS = 24
-# Strength of the structure that `resolved_fraction` asks about [part of the peak]: that of
-# galaxies' clumps.
+# [of the peak] Strength of the structure in `resolved_fraction`: that of galaxies' clumps.
 SEEN_STRENGTH = 0.1
-MIN_SEEN = 1e-3  # so that m stays a number where the data show nothing
-# Most by which a strength grows or shrinks at once: the first |z|^2 lag behind their end.
+MIN_SEEN = 1e-3  # so that m is finite if the data resolve nothing
+# Largest factor of a change of strength in one update: the first |z|^2 are not converged.
 STEP = 4.0
-# Where strengths end: structure of 0.1 % is none, and of 100 % the profile means nothing.
+# Smallest and largest strength: structure of 0.1 % is negligible, and with 100 % the profile is
+# irrelevant.
 STRENGTHS = 1e-3, 1.0
-# From where on the finest structure is clear [1]. Of 259 simulated galaxies, which have none, one
-# exceeds it, the next ones have 12 and less; bright real ones of HST and HSC have 24 to 490.
+# [1] Smallest value for significant structure. Of 259 simulated galaxies, which have no structure,
+# one exceeds it, the next ones have 12 and less; bright real ones of HST and HSC have 24 to 490.
 MIN_SIGNIFICANCE = 20.0
-# Part of `weight` that strengths which are clear keep: 10 numbers, of which bright cores determine
-# hundreds. With all of it the core of a merger that HST sees is left with residuals of 19 sigma.
+# Fraction of `hyperprior_weight` for significant structure: 10 parameters, compared to hundreds
+# that bright cores determine. With all of it the core of a merger in HST's image has residuals of
+# 19 sigma.
 CLEAR_WEIGHT = 0.1
-# The preconditioner's light is the profile blurred by so many sigma of each scale, its curvature
-# the mean of t with weights P^POWER, P being k_j broadened by the source's extent: between the true
-# diagonal (1), and the curvature of the smoothest structure (2). Other values take up to 4 times
-# as many iterations, on simulations or on bright real galaxies.
+# The preconditioner's light is the profile blurred by this many sigma of each scale. Its curvature
+# is the mean of t with weights P^POWER, where P is k_j broadened by the source's extent. The power
+# is between that of the true diagonal (1) and of the curvature of the smoothest structure (2). With
+# other values simulations or bright real galaxies need up to 4 times as many iterations.
 WIDE, POWER = 3.0, 1.5
 
 
@@ -81,7 +83,7 @@ class LocalPowerSpectra:
         return np.maximum(power, 0).reshape(*lags.shape[:-2], -1)
 
     def from_impulse_responses(self, answers, pixels):
-        """T_c (C, F) from R_c^T w R_c's answers (C, Ny, Nx) to one pixel (C, 2) each."""
+        """T_c (C, F) from the responses (C, Ny, Nx) of R_c^T w R_c to one pixel (C, 2) each."""
         n = N_FREQUENCIES
         lags = np.zeros((len(answers), n, n))
         for lag, answer, pixel in zip(lags, answers, pixels, strict=True):
@@ -130,18 +132,18 @@ class SourceEvidence:
         """gamma (J,): parameters that the data determine at each scale."""
         w = np.square(strengths)[:, None] * self.spectra.k * self.sharpness(spectrum)
         total = w.sum(0)
-        heard = total * self._levels[-1] > 1e-5  # what is left out determines 1e-5 of a pixel
+        heard = total * self._levels[-1] > 1e-5  # other frequencies determine 1e-5 of a parameter
         w, total, weight = w[:, heard], total[heard], self.spectra.weight[heard]
         shares = self._levels / (1 + self._levels * total[:, None])  # (F, levels)
         return (w * weight) @ shares @ self._pixels
 
     def resolved_fraction(self, spectrum):
-        """Share (J,) of each scale's power that the data show at the peak."""
+        """Fraction (J,) of each scale's power that the data resolve at the peak."""
         k, x = self.spectra.k, SEEN_STRENGTH**2 * self.sharpness(spectrum) * self.spectra.k
         return np.maximum((k * x / (1 + x)) @ self.spectra.weight, MIN_SEEN)
 
     def is_clear(self, strengths, energies, spectrum):
-        """Returns True if the finest structure is clear; energies (J,): |z_j|^2."""
+        """Returns True if the finest structure is significant; energies (J,): |z_j|^2."""
         ratio = energies[0] / strengths[0] ** 2
         return (
             ratio > MIN_SIGNIFICANCE

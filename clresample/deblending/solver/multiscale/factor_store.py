@@ -6,8 +6,8 @@ import numpy as np
 
 from ..boxes import ALIGN
 
-# Room for roots over what is needed, when new ones do not fit any more and all are stored anew;
-# and part of the room that is used at least, or a smaller one is made.
+# Ratio of a new array's size to that of the factors, when it must grow; and the smallest used
+# fraction, below which a smaller array is made.
 ROOM, MIN_USED = 1.5, 0.25
 
 
@@ -23,7 +23,7 @@ class FactorStore:
         self._first, self._end = {}, 0
 
     def first(self, block):
-        """The first element of a CurvatureBlock's root, a multiple of ALIGN."""
+        """The first element of a CurvatureBlock's factor, a multiple of ALIGN."""
         return self._first[block]
 
     def retain(self, blocks):
@@ -49,5 +49,5 @@ class FactorStore:
 
 
 def _room(block):
-    """Elements that a CurvatureBlock's root takes."""
+    """Number of elements of a CurvatureBlock's factor."""
     return -(-block.cholesky.size // ALIGN) * ALIGN

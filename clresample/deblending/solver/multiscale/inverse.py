@@ -1,16 +1,16 @@
 """Inverse curvature of each source, in blocks of the coefficients that its data determine.
 
-Coefficients of neighbouring places and of several scales are about the same light, so that the
-curvature is far from a diagonal: L-BFGS that begins with one takes a hundred iterations and more
-for a bright galaxy, with these blocks ten to thirty. For a source of profile p and spectrum A
+Coefficients of neighbouring positions and of several scales describe the same light, so that the
+curvature is far from diagonal. With a diagonal preconditioner L-BFGS takes a hundred iterations and
+more for a bright galaxy, with these blocks ten to thirty. For a source of profile p and spectrum A
 
     H = 1 / alpha^2 + U^T T U,    U = sqrt(p) o K_j less its part along p,    T = sum_c A_c^2 T_c
 
-T_c (evidence.py) is taken for that of the whole box. A source of many coefficients has a block for
-each part of its box, and added to these blocks of its coarser scales alone, which reach further:
-the inverse is then off by a factor of a hundred, and without them by thousands, for its widest
-waves. What the blocks leave out, other sources, edges and the spectra, is left to L-BFGS. In NumPy
-on the host, at first and after strengths were learned.
+T_c (evidence.py) is used for the whole box. A source of many coefficients has a block for each part
+of its box, to which blocks of its coarser scales, which extend further, are added. The inverse is
+then wrong by a factor of a hundred for its widest waves, and without these by thousands. Other
+sources, edges and the spectra are not in the blocks; L-BFGS accounts for them. The blocks are
+computed in NumPy on the host, at the start and after updates of strengths.
 """
 
 from __future__ import annotations
@@ -24,28 +24,29 @@ from scipy.linalg import lapack
 from .evidence import N_FREQUENCIES
 from .prior import kernel_rows
 
-# Coefficients of which the data say more than so many times what the prior does are in blocks. With
-# 3 the blocks take a tenth more of a fit's time, and it no fewer iterations; with 100, half as many
-# iterations more.
+# Smallest ratio of the data's curvature to the prior's for coefficients in blocks. With 3 the
+# blocks take a tenth more of a fit's time, without fewer iterations; with 100, fits need half as
+# many iterations again.
 MIN_DATA_TO_PRIOR = 10.0
-# Coefficients of a block, at most: its time goes with their third power, its memory with their
-# square; with fewer, fits of large sources take more iterations. Kernels hold four numbers of each
-# in local memory, of which devices have 32 KiB and more.
+# Largest number of coefficients of a block: its time grows with the cube, its memory with the
+# square. With fewer, fits of large sources need more iterations. Kernels have four numbers of each
+# in local memory, of which devices have at least 32 KiB.
 MAX_BLOCK_SIZE = 512
-# [px] Pixels are binned by as much as the steps of a block's finest scale, but by no more than
-# this: 2 changes single directions' curvature by up to 1.9, 4 by up to 5. Blocks of wide waves over
-# large boxes, of more binned pixels than MAX_PIXELS, have them coarser: the time and memory that
-# they take grow with their number.
+# [px] Largest binning of pixels, otherwise the steps of a block's finest scale. A binning of 2
+# changes the curvature of single directions by up to a factor of 1.9, 4 by up to 5. Blocks of wide
+# waves over large boxes, with more binned pixels than MAX_PIXELS, are binned more, to limit time
+# and memory.
 COARSEST, MAX_PIXELS = 2, 3000
-# Binned pixels from which on T is applied by transforms, at 2000 pixels in a third of the time that
-# it takes as a matrix, which is quicker below. So many images are transformed at a time.
+# Number of binned pixels from which T is applied by transforms, which at 2000 pixels take a third
+# of the time of a matrix product; below it the matrix is faster. Then the number of images that are
+# transformed at a time.
 MANY_PIXELS, TOGETHER = 1200, 32
-# A block is made of the pixels where one of its coefficients has more than this part of its largest
-# value. Blocks stand until the logarithm of a strength, or the spectrum as a part of its largest
-# value, has changed by more than CHANGE: with 0.35 fits of simulated scenes take a tenth more time,
-# and as many rounds; with 2, some more rounds.
+# A block uses the pixels where one of its coefficients has more than this fraction of its largest
+# value. It is recomputed if the logarithm of a strength, or the spectrum relative to its largest
+# value, has changed by more than CHANGE: with 0.35 fits of simulated scenes take a tenth more time
+# and equally many rounds; with 2, some more rounds.
 MIN_RELATIVE_SIZE, CHANGE = 0.1, 1.0
-# Rows of a root that are stored with one length, as many numbers as a CPU takes at a time.
+# Rows of a factor that are stored with one length, for a CPU's vectors.
 PANEL = 8
 
 
@@ -80,7 +81,7 @@ class BlockPreconditioner:
     def blocks(self, strengths, spectrum):
         """The CurvatureBlocks near strengths (J,) and a spectrum (C,).
 
-        Those of one level have no coefficient in common, and what levels say is added.
+        Blocks of one level have no coefficient in common; the results of levels are added.
         """
         if self._at is None or self._moved(strengths, spectrum):
             self._at = strengths.copy(), spectrum.copy()
@@ -180,7 +181,7 @@ def _through(sharpness, images, step):
     shape = images.shape[1:]
     if shape[0] * shape[1] < MANY_PIXELS:
         return images.reshape(len(images), -1) @ _between(sharpness, shape, step)
-    from scipy import fft  # 0.05 s, which small galaxies need not wait for
+    from scipy import fft  # takes 0.05 s, not needed by small galaxies
 
     lags = _lags(sharpness, step)
     far = np.arange(1 - len(lags) // 2, len(lags) // 2)

@@ -6,36 +6,38 @@ import numpy as np
 
 from .lbfgs_steps import AGAIN, NEXT, REST, STAY, TRY
 
-# A trial is accepted if the loss falls by this part of what the slope promises.
+# A trial is accepted if the loss falls by this fraction of the prediction by the slope.
 ARMIJO = 1e-4
-# Shortest and longest next step after a trial that was not accepted, as parts of it; trials before
-# the memory is dropped, and after that before a scene is left where it is.
+# Shortest and longest next step after a rejected trial, relative to it; number of rejected trials
+# before the pairs are dropped, and after that before the scene stops.
 SHRINK = 0.1, 0.5
 MAX_TRIALS = 8
-# Strengths are learned where a scene's loss fell by less than STRENGTH_LOSS_DROP, times chi2 per
-# pixel where that is above 1, over the last LOSS_WINDOW iterations, so that its structure is near
-# that of the present ones; at the latest after FIRST_STRENGTH_ROUND rounds, and then
-# STRENGTH_ROUNDS so many, until none moves by more than MAX_LOG_STRENGTH_CHANGE in its logarithm.
+# Strengths are updated if a scene's loss fell by less than STRENGTH_LOSS_DROP, times chi2 per pixel
+# if above 1, over the last LOSS_WINDOW iterations, so that the structure has nearly converged for
+# the present strengths. The first update is made after FIRST_STRENGTH_ROUND rounds at the latest,
+# further ones after STRENGTH_ROUNDS each, until no logarithm changes by more than
+# MAX_LOG_STRENGTH_CHANGE.
 STRENGTH_LOSS_DROP, LOSS_WINDOW = 5.0, 3
 FIRST_STRENGTH_ROUND, STRENGTH_ROUNDS, MAX_LOG_STRENGTH_CHANGE = 16, 8, 0.1
 # The finest structure of sources is tested for significance (evidence.py) once strengths have
 # settled and a scene's loss fell by less than this over the last LOSS_WINDOW iterations, times chi2
-# per pixel likewise. `loss_tol` counts where it is larger, so that no scene converges before its
-# test. Earlier, structure still holds light that spectra and neighbours will take: with 5, more
+# per pixel as above. `loss_tol` is used if it is larger, so that no scene converges before its
+# test.
+# Before that, structure contains light that later moves to spectra and neighbours: with 5, more
 # simulated galaxies pass. A threshold of 1 selects the same galaxies, up to 30 iterations later.
 SIGNIFICANCE_LOSS_DROP = 2.5
 # A scene is also tested after LATE_LOOK rounds if its loss still falls by FALLING and more over
-# these iterations, times chi2 per pixel likewise. Blends of large galaxies with clumps fall so for
-# hundreds of rounds, all of them wasted if a second fit follows. SDRs of 32 simulated scenes are
-# the same with this test and without (bench.settings).
+# these iterations, times chi2 per pixel as above. Losses of large galaxies with clumps fall like
+# this for hundreds of rounds, all of them wasted if a second fit follows. SDRs of 32 simulated
+# scenes are the same with and without this test (bench.settings).
 LATE_LOOK, FALLING = 80, 50.0
 # A fit has converged when its strengths have settled and its loss fell by less than `loss_tol` over
 # CONVERGENCE_WINDOW iterations and over the last twelfth of all, at most LONGEST.
 # The tolerance scales with chi2 per pixel above 1, because flux errors grow as its square root.
-# Light of a small galaxy inside a giant returns from the giant's structure over hundreds of
-# iterations that gain 0.03 each. Without the twelfth such fits ended 8 above the lowest loss, and
-# fluxes 6 errors from the truth (bench.ladder, giant). It does not change fits of up to 60
-# iterations.
+# Light of a small galaxy on a large one moves back from the large galaxy's structure over hundreds
+# of iterations that gain 0.03 each. Without the criterion of the last twelfth such fits ended 8
+# above the lowest loss, with fluxes 6 errors from the truth (bench.ladder, giant). It does not
+# affect fits of up to 60 iterations.
 CONVERGENCE_WINDOW, TWELFTH, LONGEST = 5, 12, 100
 
 
@@ -62,13 +64,13 @@ class LbfgsControl:
         self.n_iterations, self.n_rounds = np.zeros(n, int), np.zeros(n, int)
         self.settled, self.tested = np.zeros(n, bool), np.zeros(n, bool)
         self._due = np.full(n, FIRST_STRENGTH_ROUND)
-        self._fresh = np.ones(n, bool)  # the trial is where the scene is, with another loss
-        self._bare = np.zeros(n, bool)  # without pairs since a direction that led nowhere
+        self._fresh = np.ones(n, bool)  # the trial is at the present point, with a changed loss
+        self._bare = np.zeros(n, bool)  # pairs were dropped after a direction without descent
         self._length, self._trials = np.ones(n), np.zeros(n, int)
-        self._losses = np.full((n, LONGEST + 1), np.inf)  # the last ones, the present one first
+        self._losses = np.full((n, LONGEST + 1), np.inf)  # the last losses, the present one first
 
     def take(self, keep):
-        """That of the scenes `keep` (n,) alone."""
+        """The LbfgsControl of the scenes `keep` (n,) alone."""
         new = LbfgsControl(len(keep), self.loss_tol, self._n_pixels[keep])
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray):
@@ -112,8 +114,8 @@ class LbfgsControl:
     def record_significance(self, which, clear):
         """Records that the scenes `which` (B,) were tested for significant structure.
 
-        Where `clear` (B,) is true more was found: they update strengths again from now on, and are
-        tested again after that.
+        Scenes with `clear` (B,) true have new significant structure: they update strengths again,
+        and are then tested again.
         """
         self.tested |= which & ~clear
         self.settled &= ~clear
@@ -132,19 +134,19 @@ class LbfgsControl:
     def refresh_loss(self, which):
         """Marks the losses of scenes `which` (B,) as changed.
 
-        Their next trial is where they are.
+        Their next trial is at the present point.
         """
         self._fresh |= which
         self._bare &= ~which
         self._call_back(which)
 
     def resume(self, which):
-        """Lets the scenes `which` (B,), converged or not, try a step that was not theirs."""
+        """Prepares the scenes `which` (B,), converged or not, for a trial of an external step."""
         self._call_back(which)
         self._length[which], self._trials[which] = 1.0, 0
 
     def _call_back(self, which):
-        """The scenes `which` (B,) go on, whatever they had gained."""
+        """Continues the scenes `which` (B,), even if they had converged."""
         self._losses[which, 1:] = np.inf
         self.converged &= ~which
         self.live |= which
@@ -163,8 +165,8 @@ class LbfgsControl:
         bare, stuck = lost & ~self._bare, lost & self._bare
         self._length[bare], self._trials[bare] = 1.0, 0
         self._bare = (self._bare & ~accepted) | bare
-        # No step lowers the loss: all that its rounding lets see has been reached. Strengths are
-        # learned from here, or the fit has converged.
+        # No step lowers the loss any more, because of its rounding errors. Strengths are updated
+        # from here, or the fit has converged.
         self.converged |= stuck & self.settled
         self.live &= ~self.converged
         stuck &= self.live
@@ -179,7 +181,7 @@ class LbfgsControl:
     def _fallen(self, n):
         """Decrease of the losses (B,) over the last n iterations, a number or (B,)."""
         before = np.take_along_axis(self._losses, np.broadcast_to(n, len(self.loss))[:, None], 1)
-        with np.errstate(invalid="ignore"):  # of scenes without a loss so far
+        with np.errstate(invalid="ignore"):  # scenes without a loss so far
             return before[:, 0] - self._losses[:, 0]
 
     def chi2(self):

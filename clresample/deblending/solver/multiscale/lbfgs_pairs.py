@@ -1,8 +1,8 @@
 """L-BFGS history of each scene on the host: inner products of its (s, y) pairs.
 
-s_k, y_k: changes of the variables and of the gradient; H: the inverse of the curvature as it is
-thought to be. d by the two loops from scale H (Nocedal & Wright 2006, algorithm 7.4), which need of
-the vectors only s_i . y_j, y_i . H y_j, s_i . g and y_i . H g:
+s_k, y_k: changes of the variables and of the gradient; H: the estimated inverse curvature. The
+direction d follows from the two-loop recursion from scale H (Nocedal & Wright 2006, algorithm 7.4),
+which needs only the inner products s_i . y_j, y_i . H y_j, s_i . g and y_i . H g:
 d = scale H (sum_k a_k y_k - g) - sum_k c_k s_k
 """
 
@@ -10,16 +10,15 @@ from __future__ import annotations
 
 import numpy as np
 
-# A pair is kept if s . y exceeds this part of y . H y. It is about all of it where H says what the
-# curvature is; far below that the sums of float32 hold rounding alone.
+# A pair is stored if s . y exceeds this fraction of y . H y. The ratio is about 1 if H is the
+# inverse curvature; far below that, sums in float32 consist of rounding errors.
 MIN_CURVATURE = 1e-6
 
 
 class LbfgsPairs:
     """Pairs (s, y) of B scenes in SLOTS slots each, one of them spare for the next pair.
 
-    used (B,): slots 0 .. used - 1 hold pairs or are
-        spare, so that kernels need not look at the others
+    used (B,): slots 0 .. used - 1 contain pairs or are spare; kernels skip the others
     """
 
     def __init__(self, n_scenes, n_pairs):
@@ -32,7 +31,7 @@ class LbfgsPairs:
         self.used = np.ones(n_scenes, int)
 
     def subset(self, keep):
-        """Those of the scenes `keep` (n,) alone."""
+        """The pairs of the scenes `keep` (n,) alone."""
         new = LbfgsPairs(len(keep), self.n_slots - 1)
         for name in ("_sy", "_yy", "_order", "_valid", "used"):
             setattr(new, name, getattr(self, name)[keep])

@@ -13,10 +13,10 @@ REST, NEXT, AGAIN, TRY, STAY = range(5)
 
 
 class LbfgsSteps:
-    """L-BFGS on the SolverVectors of a batch; the decisions come as arrays over its scenes (B,).
+    """L-BFGS on the SolverVectors of a batch; decisions are arrays over its scenes (B,).
 
     vectors: the SolverVectors
-    shelf: FactorStore of blocks that these or other LbfgsSteps have had; a new one for None
+    shelf: FactorStore of the blocks, which may be that of other LbfgsSteps; None = a new one
     """
 
     def __init__(self, vectors, shelf=None):
@@ -109,8 +109,8 @@ class LbfgsSteps:
     def reweigh(self, light, weights, blocks):
         """Queues h and g_new of other strengths, and takes their blocks.
 
-        light, weights, blocks: see PriorStrengths. Pairs of what went before stay: they say what
-        the data think of the curvature, and without them fits take a tenth more rounds.
+        light, weights, blocks: see PriorStrengths. Earlier pairs are kept, because the curvature of
+        chi2 does not change; without them fits take a tenth more rounds.
         """
         b = self._buffers
         if b.n_free:

@@ -14,19 +14,20 @@ class MultiscalePrior:
 
         S = max(0, p + u - p <p, u> / <p, p>),      u = sqrt(p) sum_j K_j z_j
 
-    p is the smooth profile that is expected, K_j a Gaussian kernel of unit variance, z_j normal of
-    scatter strength_j, which starts at `strengths` and is learned for each source and scale. The
-    structure of galaxies is made of clumps, whose number, and so the variance, follows the light:
-    hence the root. What lies along the profile itself is left to the spectrum.
+    p is the expected smooth profile, K_j a Gaussian kernel of unit variance, and z_j is normal with
+    scatter strength_j, which starts at `strengths` and is estimated for each source and scale. The
+    structure of galaxies consists of clumps, whose number, and so the variance, is proportional to
+    the
+    light: hence the root. The projection on the profile is subtracted, since the spectrum fits it.
 
     scales_px [model px]: Gaussian sigmas of the kernels, ascending: the model PSF's own width,
         galaxies' clumps, their wings
     strengths [1]: typical scatter of the brightest pixel about its expected value, relative to it,
         at each scale; medians of fits to simulated galaxies
-    hyperprior_weight [px]: determined pixels whose evidence counts as much as `strengths`: larger
-        ones learn less from a source's own data. A faint galaxy determines 10 to 60 numbers, a
-        bright blend of HSC thousands. A tenth counts at the finest scale where data clearly ask for
-        more of it, as cores of bright galaxies do
+    hyperprior_weight [px]: number of determined parameters with the same weight as `strengths`:
+        with larger values a source's own data have less influence. A faint galaxy determines 10 to
+        60 parameters, a bright blend of HSC thousands. A tenth is used at the finest scale for
+        significant structure, as in cores of bright galaxies
     """
 
     scales_px: tuple[float, ...] = (0.8, 2.0, 5.0)

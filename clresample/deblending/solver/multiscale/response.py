@@ -13,8 +13,8 @@ class OperatorResponse:
     """The operators of a batch's LossGradient, applied to noise and misfit.
 
     buffers, gradient: the batch and its LossGradient, whose image buffers are overwritten
-    weights: per observation R^T w (B, Co T, Ny, Nx) on the device; T > 1 where the PSF varies, and
-        then that of the first term is in the middle of the scene
+    weights: per observation R^T w (B, Co T, Ny, Nx) on the device; if the PSF varies, T > 1, and
+        the first term is the PSF in the middle of the scene
     """
 
     def __init__(self, buffers, gradient):

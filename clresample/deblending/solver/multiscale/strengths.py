@@ -24,14 +24,15 @@ class StrengthEstimates:
 
 
 class PriorStrengths:
-    """Present strengths of a batch's sources, learned from their evidence.
+    """Present strengths of a batch's sources, estimated by their evidence.
 
-    states (B): the scenes' States at their start; their StructureState, if any, says which
-        strengths they begin with
-    past: other PriorStrengths and the scenes (n,) of theirs that go on here, which are all
+    states (B): the scenes' States at their start, with initial strengths in their StructureState,
+        if any
+    past: other PriorStrengths and the indices (n,) of their scenes that continue here, which are
+        all scenes
 
-    values (S, J): alpha; of fixed sources without meaning
-    significant (S,): sources whose finest structure is, see evidence.py
+    values (S, J): alpha; meaningless for fixed sources
+    significant (S,): sources whose finest structure is significant, see evidence.py
     precision (S, J): alpha^-2 on the device; light: a vector on the device, see lbfgs.cl
     blocks (S): of each source, see `BlockPreconditioner.blocks`; none of fixed ones
     """
@@ -87,8 +88,8 @@ class PriorStrengths:
     def weights(self, spectra, due=None, change=0.0):
         """For `LbfgsSteps.reweigh` (S, J, 3): precision, curvature, change.
 
-        spectra (S, C): at which the curvature is taken anew, blocks too, in the scenes `due` (B,)
-            or in all
+        spectra (S, C): at which curvature and blocks are recomputed, in the scenes `due` (B,) or in
+        all
         """
         for s in self._free if due is None else self._free[due[self._scene[self._free]]]:
             self._curvature[s] = self._evidence[s].curvature(spectra[s])
@@ -125,7 +126,7 @@ class PriorStrengths:
         return moved, self.weights(spectra, due, change), loss
 
     def findings(self, which, energies, spectra):
-        """Findings of the scenes `which` (B,), None for the others; energies (S, J): |z|^2."""
+        """StrengthEstimates of the scenes `which` (B,), None for others; energies (S, J): |z|^2."""
         determined = np.zeros_like(self.values)
         for s in self._free[which[self._scene[self._free]]]:
             determined[s] = self._evidence[s].determined(self.values[s], spectra[s])
@@ -138,7 +139,7 @@ class PriorStrengths:
         ]
 
     def by_scene(self):
-        """Strengths (n, J) and which are clear (n,) of each scene's n components, pairs."""
+        """(strengths (n, J), significance (n,) bool) of each scene's n components."""
         at = [self._scene == i for i in range(len(self.buffers.scenes))]
         return [(self.values[own], self.significant[own]) for own in at]
 

@@ -1,4 +1,4 @@
-"""The variables of a batch of scenes as vectors on the device: where each scene's part lies.
+"""The variables of a batch of scenes as vectors on the device, and their layout.
 
 x = (z of all free sources, A (S, C), sky (B, C))
 """
@@ -12,7 +12,7 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class SceneGradient:
-    """Slopes of one scene's loss by its variables.
+    """Gradient of one scene's loss by its variables.
 
     structure [s][j] (ny_j, nx_j): by the coefficients of each source and scale
     spectra (n, C), sky (C,); at_bound (n, C): spectra that are 0 and would fall
@@ -59,7 +59,7 @@ class SolverVectors:
         )
 
     def parts(self):
-        """Of each scene (B, 3, 2) first and one-past-last elements of z, spectra and sky."""
+        """First and one-past-last elements (B, 3, 2) of each scene's z, spectra and sky."""
         b, c = self.buffers, self.buffers.n_channels
         source = b.device.get(b.first).astype(np.int64)
         starts = np.append(self.latents.start, self.latents.size)

@@ -3,5 +3,5 @@
 Spectra are applied to morphologies as they are, or after they were transformed, each in its box, in
 whole frames or in windows of neighbouring sources.
 
-Modules here may import `device`, `resampling` and the solver's own; they are asked by solver/.
+Modules here may import `device`, `resampling` and modules of the solver, which calls them.
 """

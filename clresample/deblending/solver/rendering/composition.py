@@ -15,8 +15,9 @@ class SpectralComposition:
     shape (ny, nx); transfer (buffer, elements of a scene): where frames are frequencies, which
     `compose` then multiplies by it
 
-    Where the PSF varies, an observation of Co channels has Co * T frames, one for each of its
-    operator's terms, in which a source has its spectrum times its shares (Scene.shares):
+    If the PSF varies, an observation of Co channels has Co * T frames, one for each of its
+    operator's terms, in which a source has its spectrum times its coefficients
+    (Scene.coefficients):
 
         frame[b, c, t] = sum_s A[s, c] shares[s, c, t] boxed_s
     """
@@ -89,7 +90,7 @@ class SpectralComposition:
 
 
 class _TermSpectra:
-    """Spectra of one observation's terms, (S, Co * T): kernels/scene.cl, share and unshare.
+    """Spectra of one observation's terms, (S, Co * T): split_spectra, merge_spectra of scene.cl.
 
     buffers: the batch; i: which observation; channels: slice of all
     """

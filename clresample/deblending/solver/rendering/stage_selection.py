@@ -11,26 +11,29 @@ from ....device.contraction import round_up_columns
 from .stages import BoxTransformRendering, FrameRendering
 from .windows import WindowGroups, WindowRendering, reach_of
 
-# An operation of a boxed product takes as long as so many of a large one, as its tiles are cut by
-# the box and its terms are few; and one of a sum over sources or bands, which loads all that it
-# multiplies. Fitted to processor times on one CPU with AVX-512 (1.7 and 12 on other scenes than
-# these): what is chosen then takes 8 % more than the fastest stage at most. With larger values
-# sources stay in frames more often.
+# Cost of an operation relative to one of a large product: first in a product of the size of a box,
+# whose tiles are cut by the box and whose sums are short; then in a sum over sources or bands,
+# which loads all its factors from memory. Fitted to processor times on one CPU with AVX-512 (1.7
+# and 12 on
+# other scenes): the selected stage then takes at most 8 % more time than the fastest. With larger
+# values frames are selected more often.
 BOX_COST, SUM_COST = 1.9, 10.0
-# Cells along a side of a frame that are tried for windows, and what part of the operations they
-# must have at most. Their count is an estimate, and small products, windows cut and added up take
-# longer: measured times are 1.3 to 2.6 times what it says, most of all for six bands turned against
-# the model. With 0.7, six bands of scenes of 256 pixels a side take 1.6 times as long as in frames.
+# Numbers of cells along a side of a frame that are tried for windows, and the largest ratio of
+# their operations to those of frames. The count is an estimate, and small products, cutting and
+# adding
+# windows take longer: measured times are 1.3 to 2.6 times the estimate, most of all for six bands
+# rotated against the model. With 0.7, six bands of scenes of 256 pixels a side take 1.6 times as
+# long as in frames.
 CELLS, MAX_WINDOW_COST = (2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32), 0.4
-# Sources with boxes so many times larger than the median's may get windows of their own, since the
-# largest box sets the frame of all groups.
+# Sources whose boxes exceed the median by this factor may get windows of their own, since the
+# largest box determines the frame of all groups.
 LARGE = np.array([1.3, 1.6, 2.0])
 
 
 def stage_flops(buffers, op, executor) -> list[float]:
     """Floating-point operations of one pair, weighed as above, at depths 0, 1 and 2.
 
-    What all of them do, from frequencies to the observation and back, is left out.
+    Operations common to all depths, between frequencies and the observation, are not counted.
     """
     e, shape = executor, buffers.host_boxes.shape[:, list(executor.axes)]
     waves = np.stack([e.k_ys, round_up_columns(e.k_xs)], axis=1)

@@ -11,9 +11,9 @@ and backwards, Q_c being what the observation's residuals are there:
 
     depth 2    dS_s = Ty[:, rows_s]^T (sum_c A_sc Q_c) Tx[cols_s]^T,    dA_sc = <Z_s, Q_c>
 
-All three are the same sum, to rounding; stage_selection.py says which takes least. Symbols as in
-resampling/executor.py. Where the PSF varies, each Z_c is a sum over the operator's terms, and A_sc
-the part of the spectrum that a source has in each (composition.py).
+All three are the same sum, to rounding; stage_selection.py selects the cheapest. Symbols are those
+of resampling/executor.py. If the PSF varies, each Z_c is a sum over the operator's terms, and A_sc
+is a source's spectrum times its coefficient of the term (composition.py).
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class BoxTransformRendering:
         e, d_lines = self._executor, self._d_boxed
         self._composition.gather_boxed(self._frame, spectra, self._d_boxed, active)
         if self.depth == 2:
-            d_lines = self._lines  # of no more use once the planes are made of them
+            d_lines = self._lines  # reused, since the planes have been computed from them
             self._boxes.from_planes(e.in_y_t.buffer, self._d_boxed, d_lines, active)
         self._boxes.from_lines(d_lines, e.in_x.buffer, d_morph, active, add=add)
 

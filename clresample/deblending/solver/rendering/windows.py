@@ -1,10 +1,10 @@
 """Renders large scenes in windows: neighbouring sources in one small frame.
 
-Products along whole frames grow with the cube of their side. Here sources are taken together by
-the cell of the frame in which their boxes' middles lie, each group in a frame of its own that
-holds their boxes, and is seen in a window that holds what its light reaches, as far as the model
-is padded for it (resampling/transfer.py). Windows overlap, and their sum is the observation's
-image; backwards, each window is cut out of that. Kernels in windows.cl.
+The cost of products along whole frames grows with the cube of their side. Here sources are grouped
+by the cell of the frame that contains the middle of their box. Each group has its own frame, which
+contains its boxes, and is rendered in a window of the observation as large as the reach of its
+light, the padding of the model (resampling/transfer.py). Windows overlap, and their sum is the
+observation's image; in the adjoint, each window is cut out of that. Kernels are in windows.cl.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from ....resampling.plan import Precision
 from ....resampling.resampler import EXECUTORS
 from ..boxes import Boxes
 
-# [px] Groups' frames have sides of multiples of this, so that boxes that were resized find the
-# tables that were made before: a larger one computes more padding.
+# [px] Sides of groups' frames are multiples of this, so that cached tables can be used after boxes
+# were resized. A larger one gives more padding to compute.
 ROUND_PX = 16
 
 
@@ -140,11 +140,11 @@ class _GroupRendering:
 
 
 class WindowRendering:
-    """Rendering in windows; methods as those of stages.Frames.
+    """Rendering in windows, with the methods of stages.FrameRendering.
 
     buffers: the batch; i_observation: of it; op: the batch's operator there, of one plan
-    parts: Groups, which have all sources together; each part has frames of its own size
-    make: what makes the rendering of their frames, as choice.rendering does
+    parts: WindowGroups, which together have all sources; each has frames of its own size
+    make: makes the rendering of their frames, see stage_selection
     """
 
     depth = 3
@@ -191,5 +191,5 @@ class WindowRendering:
             device, given = self.buffers.device, self.buffers.device.get(active)
             lists = [given[np.isin(given, part.which)] for part in self.parts]
             arrays = [device.put(own, np.int32) if len(own) else None for own in lists]
-            self._active[id(active)] = active, arrays  # kept, so that no other has its id
+            self._active[id(active)] = active, arrays  # stored, so that no other has its id
         return self._active[id(active)][1]
