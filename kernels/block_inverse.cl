@@ -1,7 +1,7 @@
 /* Applies the block-diagonal inverse curvature to vectors: part of the solver of lbfgs.cl.
  *
- * A block holds the inverse of a part of the curvature, as W^T W with a triangular W, its root.
- *   blocks    (n, 4) int: scene, variables m, the first of its indices, its root's first element
+ * A block is the inverse of a part of the curvature, W^T W with a triangular factor W, its root.
+ *   blocks    (n, 4) int: scene, variables m, the first of its indices, first element of its root
  *             / ALIGN;  indices: of the variables;  roots: W of each, lower triangular, in panels
  *             of PANEL rows that end with their last one's diagonal; zeros beyond
  *   plan      (B, 3) int, see lbfgs.cl: blocks of idle scenes are skipped
@@ -35,7 +35,7 @@ void apply_block_inverse(__global const int *restrict blocks, __global const int
 {
     __local REAL ys[MAX_BLOCK], ps[MAX_BLOCK], wy[MAX_BLOCK], wp[MAX_BLOCK];
     const int lid = (int)get_local_id(0), block = (int)get_global_id(1);
-    /* of a scene at rest no variables: PoCL crashes where a group returns before this SYNC */
+    /* an idle scene has no variables here: PoCL crashes if a group returns before this SYNC */
     const int b = blocks[4 * block], m = plan[3 * b] == REST ? 0 : blocks[4 * block + 1];
     __global const int *index = indices + blocks[4 * block + 2];
     __global const REAL *root = roots + (size_t)blocks[4 * block + 3] * ALIGN;
@@ -111,7 +111,7 @@ void apply_block_inverse(__global const int *restrict blocks, __global const int
         wp[i] = sum_p;
     }
     SYNC();
-    for (int k = lid; k < m; k += WG) {     /* down columns, where neighbours read neighbours */
+    for (int k = lid; k < m; k += WG) {     /* down columns: neighbours read neighbours */
         REAL sum_y = 0, sum_p = 0;
         for (int i = k; i < m; ++i) {
             const REAL value = ROW(i)[k];

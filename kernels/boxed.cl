@@ -1,23 +1,23 @@
-/* Products of the sources' boxes with tables that all of them share: one for each source, of sizes
- * and places of its own.
+/* Products of the sources' boxes with shared tables: one product for each source, with its own
+ * sizes and positions.
  *
  *   C[s] = A[s] . B[s],  A (m, k), B (k, n), C (m, n), for the sources listed in `active`
  *
- * items (S, N_COLUMNS) long, a row a source with the columns below: sizes, and in elements where
- * A, B and C begin in their buffers, the distances of A's rows and columns, of B's rows, and of
- * C's rows and columns.
- *   B is read as vectors: its start and LD_B are multiples of 16 elements.  SKIP of its
- *      columns come before the first that is wanted; they are computed and left out.
- *   C is stored by vectors, up to a multiple of 16 columns, where B's zeros become C's; its first
- *      element and its rows lie as B's do, and SKIP is 0.  If RAGGED, element by element, n of them
- *      and no more; then `add` adds to what is there.
+ * items (S, N_COLUMNS) long, one row a source with the columns below: sizes; first elements of A, B
+ * and C in their buffers; distances [elements] of A's rows and columns, of B's rows, and of C's
+ * rows and columns.
+ *   B is read as vectors: its start and LD_B are multiples of 16 elements.  The first SKIP columns
+ *      are computed but not stored.
+ *   C is stored by vectors, up to a multiple of 16 columns, where B's zeros give zeros; its first
+ *      element and its rows are aligned like B's, and SKIP is 0.  If RAGGED, C is stored element by
+ *      element, n in a row; then `add` adds to the present values.
  *
- * A work-item owns MR rows and NV vectors of VW columns of C at a time, in registers, and sums
- * terms in stretches of `block` and the order `inward`: contract.cl has the picture, and why.
+ * A work-item owns MR rows and NV vectors of VW columns of C at a time, in registers, and adds
+ * partial sums of `block` terms in the order `inward`, see contract.cl.
  *
  * Launch: (any number of work-items, which share the columns, ceil(most rows / MR), len(active)),
- * each rounded up to its local size.  On CPUs one takes all columns: a tile of a small box takes
- * no longer than the start of a work-item.
+ * each rounded up to its local size.  On CPUs one work-item computes all columns, because a tile of
+ * a small box takes no longer than the start of a work-item.
  */
 #include "contract.h"
 

@@ -1,4 +1,4 @@
-/* Boxes: where the morphologies of all sources of all scenes lie in one flat buffer.
+/* Boxes: the layout of the morphologies of all sources and scenes in one flat buffer.
  *
  *         0      x0     x0 + nx
  *       0 +------+---------+------ model frame of `scene`
@@ -11,7 +11,7 @@
  * Source s owns the elements BEGIN .. BEGIN + ny * nx - 1 of each flat buffer, row by row. Boxes
  * begin at multiples of ALIGN elements; the elements between two boxes are never read.
  */
-#ifndef ALIGN       /* elements; the host defines it as solver/boxes.py has it */
+#ifndef ALIGN       /* elements; the host defines the value of solver/boxes.py */
 #define ALIGN 16
 #endif
 

@@ -1,16 +1,16 @@
 /* The one floating type of a build.
  *
  * The host prepends "#define REAL float", or "#define REAL double" with "#define USE_DOUBLE",
- * before each file. A file opens with #include "common.h"; the host pastes this text there, since
- * some drivers' build caches do not notice a changed include.
+ * before each file. A file begins with #include "common.h", which the host replaces by this text,
+ * because some drivers' build caches do not detect changes of includes.
  *
  * VEC(n) is the vector type of n REALs: VEC(4) is float4 or double4.
  * AT(type, p) is the value of that type at address p: AT(const VEC(4), p) reads p[0] .. p[3].
  * SUM8(p) adds p[0] .. p[7] in pairs: eight running sums vectorise, and round less than one.
- * UNROLL(i, n) is a loop over i < n, a constant, that is written out: left rolled, what it keeps in
- * an array goes through memory.
- * INLINE begins a function of vectors, which, compiled by itself, would have them cut in two: PoCL
- * allows the widest to kernels.
+ * UNROLL(i, n) is an unrolled loop over i < n, a constant: otherwise arrays indexed by i would be
+ * in memory instead of registers.
+ * INLINE begins a function with vector arguments. If such a function is not inlined, PoCL splits
+ * the widest vectors in two.
  */
 #ifndef REAL         /* float or double */
 #define REAL float

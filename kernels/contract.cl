@@ -17,39 +17,40 @@
  *          +---------+         +-----------------+
  *                                n in whole vectors
  *
- * The tile is kept in registers: B is read as aligned vectors, A as scalars that broadcast.  No
- * local memory, no barrier, no builtin but READ_AHEAD's.  A work-item takes RT such tiles, one
- * below the other.
+ * The tile is in registers: B is read as aligned vectors, A as scalars that are broadcast.  There
+ * is no local memory, no barrier, and no builtin but that of READ_AHEAD.  A work-item computes RT
+ * such tiles, one below the other.
  *
- * Layout: `width` = n rounded up to a multiple of 16, so to whole vectors; where a tile reaches
- *   beyond, its vectors there do the first one's work again.  Rows of B lie n_pad >= width apart,
- *   with zeros from n to width; so do those of C, unless RAGGED, when C is a caller's array:
- *   element (i, j) at i * ld_c + j * step_c, any alignment.  Beyond width nothing is read or
+ * Layout: `width` = n rounded up to a multiple of 16, and so to whole vectors.  If a tile extends
+ *   beyond it, the vectors there repeat the work of the first one.  Rows of B are n_pad >= width
+ *   apart, with zeros from n to width; so are those of C, unless RAGGED, when C is a caller's
+ *   array: element (i, j) at i * ld_c + j * step_c, any alignment.  Nothing beyond width is read or
  *   written.  A is any array: element (i, l) at i * ld_a + l, or at i * ld_a + l * step_a if
  *   STRIDED, so that it may be read transposed.
- * Batch: item b uses A + (b / div_a) * stride_a and likewise for B, so a table that all bands of a
- *   scene share has div = n_bands, one that every scene shares has stride 0.
- * Terms are summed in stretches of `block` and the stretches' sums in a second set of registers:
- *   rounding then grows with the root of block + k / block, not of k.  Their order: `inward`, see
- *   contract.h.
- * READ_AHEAD: what is slow to come from memory is fetched while something else is multiplied.
- *   Of B the columns that the next work-item reads, into the core's second cache, a row of each KU
- *   for each tile: they lie a row of B apart.  After the last columns come the first of the next
- *   item's.  Of A, by the work-item of the first columns, the rows of the tile below, a stretch at
- *   a time.  Of C and E what the tile itself will write and read.
+ * Batch: item b uses A + (b / div_a) * stride_a, and B correspondingly, so that a table shared by
+ *   all bands of a scene has div = n_bands, one shared by all scenes has stride 0.
+ * Terms are added in partial sums of `block` terms, and these in a second set of registers: the
+ *   rounding error then grows with the root of block + k / block, not of k.  Their order: `inward`,
+ *   see contract.h.
+ * READ_AHEAD: prefetches memory during the multiplication:
+ *   B: the columns of the next work-item, into the core's second cache, one row of KU for each
+ *      tile, since its elements are a row of B apart.  After the last columns, the first columns of
+ *      the next item.
+ *   A: the rows of the tile below, one partial sum at a time, by the work-item of the first columns
+ *   C, E: the elements that the tile itself writes and reads
  * Rows beyond m read row m - 1 again and are not stored.
  *
- * Epilogue, at most one of (rows 2i, 2i+1 hold the cos and sin parts of row frequency i):
- *   MIX    columns 2j, 2j+1 hold cos and sin of column frequency j.  The quad (CC, CS, SC, SS) is a
- *          pair of complex amplitudes at (+nu_y, +nu_x) and (+nu_y, -nu_x); each is multiplied by
- *          its transfer function D and turned back into a quad.  E: D (n_bands, k_y, 4, n_pad / 2),
- *          planes Re D(+,+), Im D(+,+), Re D(+,-), Im D(+,-).  SIGN -1 conjugates D: the adjoint.
+ * Epilogue, at most one of (rows 2i, 2i+1 are the cos and sin parts of row frequency i):
+ *   MIX    multiplies by the transfer function D, see transfer.h.  Columns 2j, 2j+1 are cos and sin
+ *          of column frequency j; with two rows they form a quad.  E: D
+ *          (n_bands, k_y, 4, n_pad / 2), planes Re D(+,+), Im D(+,+), Re D(+,-), Im D(+,-).
+ *          SIGN -1 conjugates D: the adjoint.
  *   TWIST  rotates each (cos, sin) row pair by the angle of E: (k_y, 2, n_pad), planes cos and sin.
  *          SIGN -1 turns the other way: the adjoint.
  *   E of item b starts at (b / n_bands) * stride_e + (b % n_bands) * band_e.
  * OWN: items have sizes and tables of their own, b those of t = which[b / n_bands]: own (tables, 3)
- *   are m, n and k, none larger than the arguments, which set the layout. What of C lies beyond is
- *   not written. A factor with div 0, and E, are those of t.
+ *   are m, n and k, none larger than the arguments, which determine the layout. Elements of C
+ *   beyond them are not written. A factor with div 0, and E, are those of t.
  *
  * Launch: global = (ceil(width / (NV VW)), ceil(m / (MR RT)), batch), each rounded up to its
  *   local size.
@@ -57,7 +58,7 @@
 #include "prefetch.h"
 #if READ_AHEAD
 #define PREFETCH_B(from, step) PREFETCH((from) + next + (step) * skipped, 0, 2)
-#if !STRIDED        /* rows that follow each other closely, as they do nearly everywhere */
+#if !STRIDED        /* adjacent rows, the usual case */
 #define AHEAD_LEFT(row, l, step, n) \
     if (j0 == 0) _Pragma("nounroll") for (int q = 0; q < (n) * MR; q += LINE) \
         PREFETCH(row[0] + (long)MR * ld_a + (l) * MR + (step) * q, 0, 3)
@@ -69,8 +70,8 @@
 #define RT 1
 #endif
 #define OWNED(i, v) (i0 + (i) < m && j0 + (v) * VW < width)
-/* By the vector's address: on CPUs the vector leaves its register in one store. Of adjacent columns
- * that is one store to C too; asked of each lane, it would take a third of the product's time. */
+/* By the vector's address, so that on CPUs the vector is stored at once, and for adjacent columns
+ * also to C. With a test for each lane the store would take a third of the product's time. */
 #define STORE_LANES(sums, c, n_left) \
     const REAL *lane = (const REAL *)&sums; \
     if (step_c == 1 && n_left >= VW) { \

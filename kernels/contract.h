@@ -1,10 +1,10 @@
 /* Common parts of contract.cl, boxed.cl, contract_group.cl and mirror.h: their sizes, vectors of
  * VW, and the sums of a tile in registers.
  *
- * Order of the terms: the smallest first, so that roundings are those of small sums.
- *   inward 1   of sums over pixels, whose light is brightest about the middle: blocks from both
+ * Order of the terms: the smallest first, so that rounding errors are those of small sums.
+ *   inward 1   for sums over pixels, whose light is brightest in the middle: partial sums from both
  *              ends in turn, each from its end towards the middle
- *   inward 0   of sums over frequencies, which fall off: from the last term down to the first
+ *   inward 0   for sums over frequencies, whose terms decrease: from the last term to the first
  */
 #include "common.h"
 #include "transfer.h"
@@ -40,13 +40,13 @@
 #define SIGN 1
 #endif
 
-#ifndef KU          /* terms that a turn of the loop adds: with 1, counting takes 6 % of the time */
+#ifndef KU          /* terms of one iteration: with 1, loop overhead takes 6 % of the time */
 #define KU 4
 #endif
-#ifndef PREFETCH_B  /* what a kernel reads ahead of a turn's terms, which begin at `from` in B */
+#ifndef PREFETCH_B  /* prefetch for the terms of an iteration, which begin at `from` in B */
 #define PREFETCH_B(from, step)
 #endif
-#ifndef AHEAD_LEFT  /* likewise of the n terms of a stretch from l on, in the rows of A */
+#ifndef AHEAD_LEFT  /* prefetch for the n terms of a partial sum from l on, in the rows of A */
 #define AHEAD_LEFT(row, l, step, n)
 #endif
 
@@ -54,7 +54,7 @@
 #define OWN 0
 #endif
 
-/* Of an item b: its sizes, and the table that a factor reads. */
+/* Sizes of item b, and the table of a factor. */
 #if OWN
 #define TAKE_OWN \
     const int table = which[b / n_bands]; \
@@ -67,7 +67,7 @@
 #define TABLE(div) (size_t)(b / (div))
 #endif
 
-/* Where plane q of the epilogue's tables is for an item's row pair h and column j. */
+/* Address of plane q of the epilogue's tables for an item's row pair h and column j. */
 #if MIX
 #define PLANES 4
 #define BAND_E (size_t)(b % n_bands) * band_e
@@ -109,9 +109,10 @@
     UNROLL(v, nv) right[v] = AT(const WIDE, (from) + column[v]); \
     UNROLL(i, mr) UNROLL(v, nv) part[i][v] += row[i][(l) * STEP_A] * right[v];
 
-/* sums[mr][nv] += the next stretch of `block` terms, ku a turn, or of those that remain: from l on,
- * whose row of B is at `from`, upwards or downwards as `step` is 1 or -1. Both go on with the next
- * stretch of that direction: found anew for each of them, they would take 6 % of the time. */
+/* sums[mr][nv] += the next partial sum of `block` terms, or of the remaining ones, ku an iteration.
+ * It begins at term l, whose row of B is at `from`, and goes upwards or downwards for `step` 1 or
+ * -1. l and `from` are advanced to the next partial sum of that direction: recomputing them would
+ * take 6 % of the time. */
 #define ADD_STRETCH(mr, nv, ku, sums, row, l, step, from, ld_b, column, block) { \
         int n_terms = remain < (block) ? remain : (block); \
         WIDE part[mr][nv], right[nv]; \
@@ -134,8 +135,8 @@
         UNROLL(i, mr) UNROLL(v, nv) sums[i][v] += part[i][v]; \
     }
 
-/* sums[mr][nv] = the terms l < k, in stretches of `block` and in the order above. A loop for each
- * direction: one with a step that is a variable takes 4 % longer. */
+/* sums[mr][nv] = the terms l < k, in partial sums of `block` and in the order above. Each direction
+ * has its own loop: a loop with a variable step takes 4 % longer. */
 #define SUM_TERMS(mr, nv, ku, sums, row, B, ld_b, column, k, block, inward) { \
         int remain = (k); \
         long up = 0, down = (k) - 1; \
@@ -148,11 +149,11 @@
         } \
     }
 
-/* The same of a tile of MR rows and NV vectors of which the columns from `inside` on and the rows
- * from `below` on count for nothing: of the last tile of a row, one vector alone is summed where it
- * is the only one inside, and the others are zero; of the last of a column, two rows alone, and
- * the others are left as they were. Those two take two terms a turn: with KU, they took half of the
- * time of compilers. */
+/* The same for a tile of MR rows and NV vectors, whose columns from `inside` on and rows from
+ * `below` on are not needed. If only one vector is inside, in the last tile of a row, only that one
+ * is summed, and the others are zero. If only two rows are inside, in the last tile of a column,
+ * only these are summed, and the others are not written. Both cases add two terms an iteration:
+ * with KU, they took half of the compile time. */
 #define SUM_INSIDE(inside, below, sums, row, B, ld_b, column, k, block, inward) \
     if (NV > 1 && (inside) <= VW) { \
         UNROLL(i, MR) UNROLL(v, NV) sums[i][v] = (WIDE)(0); \

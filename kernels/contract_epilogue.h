@@ -2,8 +2,8 @@
  * epilogue, then the stores.
  *
  * acc[MR][NV]: the sums of rows i0 + i and of the VW columns from column[v] on. A kernel defines
- * OWNED(i, v), whether they lie inside C, and STORE_LANES(sums, c, n_left), which stores the lanes
- * of a vector from c on, step_c apart, n_left of them at most.
+ * OWNED(i, v), true if they lie inside C, and STORE_LANES(sums, c, n_left), which stores at most
+ * n_left lanes of a vector from c on, step_c apart.
  */
 #if MIX
     if (E) UNROLL(h, MR / 2) UNROLL(v, NV) {

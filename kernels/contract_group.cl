@@ -14,13 +14,13 @@
  *           m |              |      m |                    |
  *
  * A work-item owns MR neighbouring rows, and NV vectors of VW columns that lie WGX VW apart, so
- * that neighbours read neighbouring vectors. A's slab is kept transposed: the rows of a work-item
- * are read at once, and are the same for all work-items of a row of the group.
+ * that neighbours read neighbouring vectors. A's slab is transposed: the rows of a work-item are
+ * read at once, and are the same for all work-items of a row of the group.
  *
- * Sums: one set of registers for all k terms, by slabs: the last one first, or from both ends in
- *   turn if `inward`, as contract.h has it; within a slab from the last term down. With TWO_SUMS
- *   stretches of `block` terms, rounded up to whole slabs, are summed first. What lies beyond k or
- *   m counts as zero.
+ * Sums: one set of registers for all k terms, slab by slab: the last one first, or from both ends
+ *   in turn if `inward`, see contract.h; within a slab from the last term down. With TWO_SUMS there
+ *   are partial sums of `block` terms, rounded up to whole slabs. Elements beyond k or m count as
+ *   zero.
  *
  * Launch: global = (ceil(width / TN) WGX, ceil(m / TM) WGY, batch), groups of (WGX, WGY, 1).
  */
@@ -33,8 +33,8 @@
 #define TWO_SUMS 0
 #endif
 
-/* Unrolled, the next terms are fetched while one is multiplied. With two sums, or in double
- * precision, there are no registers left for them. */
+/* If unrolled, the next terms are fetched while one is multiplied. With two sums, or in double
+ * precision, there are not enough registers for them. */
 #if TWO_SUMS || defined(USE_DOUBLE)
 #define EACH_TERM(l) for (int l = KB - 1; l >= 0; --l)
 #else
@@ -55,7 +55,7 @@
 #define LEFT VEC(ROWS_AT_ONCE)
 #define OWNED(i, v) (i0 + (i) < m && column[v] < width)
 
-/* Lane by lane: an address would have a GPU keep all sums in memory. */
+/* Lane by lane: taking an address would make a GPU keep all sums in memory. */
 #define STORE_LANES(sums, c, n_left) EACH_LANE(STORE, sums, c, n_left)
 #define STORE(j, lane, sums, c, n_left) if (j < n_left) c[(size_t)j * step_c] = sums.lane;
 #define EACH_2(f, ...) f(0, s0, __VA_ARGS__) f(1, s1, __VA_ARGS__)
@@ -77,7 +77,7 @@
 #define SLAB_TERM(t) ((t) % KB)
 #endif
 
-/* First term of the slab whose turn it is. */
+/* First term of the present slab. */
 #define SLAB(turn) \
     (KB * (!inward ? n_slabs - 1 - (turn) \
            : (turn) % 2 == 0 ? (turn) / 2 : n_slabs - 1 - (turn) / 2))
@@ -142,8 +142,8 @@ void contract_group(int m, int n, const int n_pad, int k,
             const int t = f * GROUP + lid;
             slab_b[slab][t / VECTORS][t % VECTORS] = next_b[f];
         }
-        /* One barrier a slab: whoever writes this slab again has passed the next barrier, which
-         * all reach only after they have read it. */
+        /* One barrier a slab suffices: this slab is overwritten only after the next barrier, which
+         * all work-items reach after they have read it. */
         barrier(CLK_LOCAL_MEM_FENCE);
         if (turn + 1 < n_slabs) {
             FETCH(SLAB(turn + 1))

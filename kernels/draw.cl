@@ -31,8 +31,8 @@ enum { CY, CX, I_YY, I_YX, I_XX, BETA, NORM, SLOPES, N_SHAPE = SLOPES + 12 };
 
 #if ROWS && !defined(USE_DOUBLE)
 /* ln x of 1 <= x < 2^127: x = 2^n m with m in [sqrt(1/2), sqrt(2)), and ln m = 2 artanh(s) with
- * s = (m - 1) / (m + 1), |s| < 0.172: what the series leaves out is 2e-9 of it.  Arithmetic alone,
- * which a compiler for CPUs does for several pixels at once, other than the functions built in. */
+ * s = (m - 1) / (m + 1), |s| < 0.172: the truncated series has an error of 2e-9.  Unlike built-in
+ * functions, plain arithmetic is vectorised over pixels by compilers for CPUs. */
 static float ln(const float x)
 {
     const int bits = as_int(x), over = (bits & 0x7fffff) > 0x3504f3;    /* m of sqrt(2) */
@@ -42,8 +42,8 @@ static float ln(const float x)
     return ((bits >> 23) - 127 + over) * 0.69314718f + 2 * s * series;
 }
 
-/* e^x of x <= 0, 0 where that is under DARK: 2^n e^r with |r| <= ln 2 / 2, of whose series 5e-9 is
- * left out. */
+/* e^x of x <= 0, 0 where that is below DARK: 2^n e^r with |r| <= ln 2 / 2; the truncated series has
+ * an error of 5e-9. */
 static float power_of_e(const float x)
 {
     const float y = x < -60 ? -60 : x;

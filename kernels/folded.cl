@@ -2,19 +2,19 @@
  *
  *     target = unfold(Sy (D o (Ty fold(source) Tx)) Sx)
  *
- * A wave about the middle of an image is a cos, which meets parts that are even there, or a sin,
- * which meets odd ones.  Each of the four parts of an image, even or odd along y and along x, is a
- * quarter of it and meets half of the waves along each axis: half of the arithmetic in all.
+ * A cosine about the middle of an image has products with even parts only, a sine with odd parts
+ * only.  Each of the four parts of an image, even or odd along y and along x, has a quarter of its
+ * size and is multiplied by half of the waves along each axis: half of the arithmetic in total.
  *
- * For CPUs: a work-item takes every n-th source, n the work-items there are, with scratch of its
- * own that stays in its core's cache; it owns tiles of MR rows and NV vectors in registers, as in
- * contract.cl.  Images are float, all else is REAL.
+ * For CPUs: each of n work-items computes every n-th source, with its own scratch memory, which
+ * stays in its core's cache, and tiles of MR rows and NV vectors in registers, as in contract.cl.
+ * Images are float, all else is REAL.
  *
  *   images: element (b, y, x) at offset + b * stride + y * ld + x * step
  *   half_y, half_x: pixels from the middle on, ceil(n / 2); row and column i of a part lie i pixels
  *            off the middle, or i + 1/2 where there is an even number
  *   weight_y (2, half_y), weight_x (2, half_x): of these pixels, then of their partners before the
- *            middle: 0 of pixels that do not count, and of a middle pixel's partner
+ *            middle: 0 for pixels to ignore, and for a middle pixel's partner
  *   wave_y of the source (2, h_y, half_y), of the target (2, half_y, h_y): cos, then sin
  *   wave_x of the source (2, half_x, h_pad), of the target (2, h_x, pad_x): likewise, zero-padded
  *   D (n_bands, h_y, 4, h_pad): planes as MIX of contract.cl has them; image b has the D of band
@@ -28,7 +28,7 @@
  *
  * Launch: (work-items, 1, 1)
  */
-#define KU 1        /* its sums are short: what four leave over would cost as much as they gain */
+#define KU 1        /* its sums are short: with 4, the remaining terms would cost the gain */
 #include "contract.h"
 
 #ifndef SPACED      /* 1: an image's columns lie `step` apart; 0: they are adjacent */
@@ -96,7 +96,7 @@ INLINE void unfold(const int n_y, const int n_x, const int pad_x, __global float
         __global float *after = image + (size_t)(n_y / 2 + i) * ld;
         __global float *before = image + (size_t)(n_y - 1 - n_y / 2 - i) * ld;
         __global const REAL *from = parts + (size_t)i * pad_x;
-        /* what lies after the middle last: of a middle pixel that is what counts */
+        /* pixels after the middle last, since a middle pixel belongs to these */
         for (int j = 0; j < half_x; ++j) {
             const int left = n_x - 1 - n_x / 2 - j;
             const REAL w_left = weight_x[half_x + j];

@@ -1,34 +1,34 @@
-/* Projected L-BFGS for a batch of scenes: all vectors stay on the device, decisions are the host's.
+/* Projected L-BFGS for a batch of scenes: vectors stay on the device, the host decides.
  *
- * A vector holds the variables of all scenes.  Chunks of it belong to one scene each:
+ * A vector consists of the variables of all scenes.  Each of its chunks belongs to one scene:
  *   chunks    (n, 4) int: scene, first element, length, whether its variables are at least 0
  *   ring_s, ring_hy (SLOTS, size)  changes of x in earlier iterations, and of g times the inverse
  *             of the curvature, one each in a slot
- *   plan      (B, 3) int: MODE, what to do with the scene, one of the modes below; USED, how many
- *             slots, from the first on; SPARE, the slot among them that takes what a trial changes
- * x, g: where a scene is, and the gradient there; x_new, g_new: those of its trial; d: direction
- * h: the inverse of the curvature's diagonal.  A variable is held where it must not fall: bounded,
- * x <= 0 and g > 0.  P g is g where variables are free and 0 where they are held.
- * H: h, but for the variables of blocks, see block_inverse.cl
+ *   plan      (B, 3) int: MODE, one of the modes below; USED, number of used slots, from the first
+ *             on; SPARE, the slot among them for the changes of the trial
+ * x, g: point and gradient of a scene; x_new, g_new: those of its trial; d: direction
+ * h: the inverse of the curvature's diagonal.  A variable is held at its bound if bounded, x <= 0
+ * and g > 0.  P g is g for free variables and 0 for held ones.
+ * H: h, except for the variables in blocks, see block_inverse.cl
  *
  * form_pairs     s = x_new - x and h y into the spare slots, y = g_new - g, P g_new and h P g_new;
- *           scenes at rest stay as they are, here and below
+ *           scenes in mode REST are unchanged, here and below
  * inner_products  for each chunk the sums s_k . P g_new, H y_k . P g_new, s_k . y, H y_k . y of
  *           each slot k, g . s and x_new . precision x_new;  out (n, 4 SLOTS + 2)
  * take_step   NEXT: x, g, hg <- x_new, g_new, H P g_new, and
  *           d = P (scale (sum_k a_k H y_k - hg) - sum_k c_k s_k)
- *           AGAIN: the same d from the x, g, hg that are there; TRY: d as it is
+ *           AGAIN: the same d from the present x, g, hg;  TRY: the present d
  *           then x_new = x + length d, at least 0 where bounded;  STAY: x_new = x
  *           coefficients (B, 2 SLOTS + 2): a, c, scale, length
  * update_preconditioner  after new strengths of the prior: precision, h = 1 / (precision +
  *           curvature light), g_new += change x_new; launch: (WG, n_scales, n_free)
  *           weights (S, n_scales, 3): precision, curvature, change
- * launch of trial, change, advance: (WG, n chunks), groups of (WG, 1)
+ * launch of form_pairs, inner_products, take_step: (WG, n chunks), groups of (WG, 1)
  */
 #include "common.h"
 #include "boxes.h"
 #include "work_group.h"
-#ifndef SLOTS       /* of the ring: pairs that are remembered, and the spare one */
+#ifndef SLOTS       /* of the ring: stored pairs and the spare one */
 #define SLOTS 11
 #endif
 #define PLAN(b, what) plan[3 * (b) + what]
@@ -38,7 +38,7 @@ enum { MODE, USED, SPARE };
 #define AGAIN 2
 #define TRY 3
 #define STAY 4
-/* Sums that run side by side, and elements taken at a time, where a work-item has whole rows. */
+/* Parallel sums, and elements of a block, if a work-item has whole rows. */
 #if ROWS
 #define LANES 8
 #define BLOCK 256

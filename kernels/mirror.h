@@ -10,12 +10,12 @@
  *                              of X sin (X[p] - X[-1-p])
  *   mirror_to_pixels.cl  C = W^T Z:  C[p], C[-1-p] = E +- O C = Z W, the same of the columns of C
  *
- * To waves, the sums and differences of X's halves are made first and multiplied by half of the
- * table. Back, E sums the cosines alone and O the sines, for half of the pixels. The middle one of
- * an odd number of pixels has no partner: to waves it is added last; back it is its own.
+ * To waves, the sums and differences of X's halves are computed first and multiplied by half of the
+ * table. Back, E is the sum over cosines and O that over sines, for half of the pixels. The middle
+ * pixel of an odd number has no partner: to waves it is added last; back its C is E + O.
  *
  * Tiles, layout, batches, epilogues, OWN and arguments are those of contract.cl, but for this:
- *   Terms are summed in stretches of FOLDED pairs, the smallest first: from both ends of an image
+ *   Terms are added in partial sums of FOLDED pairs, the smallest first: from both ends of an image
  *   towards its middle, and from the highest frequency down. There is no `block` or `inward`.
  *   Only W X has epilogues; Z W alone is RAGGED, and always; X W^T alone may be STRIDED.
  *
@@ -32,7 +32,7 @@
 #ifndef RT          /* tiles that a work-item owns, one below the other; even for W X */
 #define RT 2
 #endif
-#ifndef FOLDED      /* pairs of a stretch: with 128, sums of 400 pixels are rounded more */
+#ifndef FOLDED      /* pairs of a partial sum: with 128, sums of 400 pixels are rounded more */
 #define FOLDED 64
 #endif
 

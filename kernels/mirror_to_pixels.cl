@@ -24,7 +24,7 @@
     UNROLL(v, nv) right[v] = AT(const WIDE, (cosines) + n_pad + column[v]); \
     UNROLL(i, (mr) / 2) UNROLL(v, nv) \
         part[2 * i + 1][v] += row[i][2 * (l) + 1] * right[v];
-/* `from` and l go down together: found anew for each pair, they take as long as the sums. */
+/* `from` and l decrease together: recomputed for each pair, they take as long as the sums. */
 #define ADD_PAIRS(mr, nv, ku) { \
         WIDE part[mr][nv], right[nv]; \
         __global const REAL *from = B + 2 * last * (long)n_pad; \
@@ -100,7 +100,7 @@ void mirror_to_pixels(int m, int n, const int n_pad, int k,
             AT(WIDE, C + (size_t)(i0 + i) * ld_c + column[v]) = here;
             AT(WIDE, C + (size_t)(m - 1 - i0 - i) * ld_c + column[v]) = there;
 #else
-            /* by addresses of lanes, as contract.cl stores them */
+            /* by addresses of lanes, as in contract.cl */
             __global REAL *c = C + (size_t)(i0 + i) * ld_c;
             const WIDE reversed = REVERSED(there);
             const REAL *lane = (const REAL *)&here, *lane_there = (const REAL *)&reversed;

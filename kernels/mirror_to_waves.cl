@@ -19,7 +19,7 @@
         for (; l < (n); ++l) { add(l) } \
     }
 
-/* A stretch of pairs of rows or of columns, whose sums and differences are in `folded`. */
+/* A partial sum of pairs of rows or of columns, with sums and differences in `folded`. */
 #if SIDE == 0
 #define ADD_PAIR(l) UNROLL(i, rows) UNROLL(v, vectors) part[i][v] += row[i][l] * folded[odd][l][v];
 #define ADD_PAIRS(mr, nv, ku) { \
@@ -63,7 +63,7 @@ void mirror_to_waves(int m, int n, const int n_pad, int k,
     const int bottom = m - top < MR * RT ? m : top + MR * RT;
     if (j0 >= width || top >= m) return;
 #if SIDE == 1
-    if (j0 > 0) return;                     /* one takes all columns */
+    if (j0 > 0) return;                     /* one work-item computes all columns */
 #endif
     A += offset_a + TABLE(div_a) * stride_a;
     B += TABLE(div_b) * stride_b;

@@ -9,8 +9,8 @@
  * until |new - l| < tolerance |y| or n_iterations; then x <- max(0, y - B^T l). l stays for the
  * next projection.
  *
- * A launch does the iterations first + 1 .. last, and goes on where the one before it stopped: on
- * most devices one launch does all n_iterations.
+ * A launch does the iterations first + 1 .. last, and continues the launch before it: on most
+ * devices one launch does all n_iterations.
  *
  * Layout: a source of ny x nx pixels has a plane of (ny+2) x P elements, P = nx+2, its pixels
  * inside a rim of zeros, filled up to a multiple of ALIGN; plane s begins at ALIGN pads[s].
@@ -27,8 +27,8 @@
  *
  *   w (8 planes a source, at 8 ALIGN pads[s]): weights of the neighbours, times 1 - g; 0 on the rim
  *   tau, y, l, v, z, g, move (1 plane a source); x, table, active as in prox.cl
- *   momenta (S): the momentum after a launch, at least 1; 0 of a source that has come to its end
- *   values (2, S): the kind of weights (1 angle, 2 flat, 3 nearest, 0 leaves the source alone), g
+ *   momenta (S): the momentum after a launch, at least 1; 0 for a source that has converged
+ *   values (2, S): the kind of weights (1 angle, 2 flat, 3 nearest, 0 skips the source), g
  *
  * Launch: n * WG work-items in groups of WG, one a source. WG 1 has no barrier and suits CPUs.
  */
@@ -36,7 +36,7 @@
 #include "boxes.h"
 #include "work_group.h"
 
-#ifndef CHECK_EVERY /* iterations between looks at the sums, which cost about half an iteration */
+#ifndef CHECK_EVERY /* iterations between checks of the sums, which cost about half an iteration */
 #define CHECK_EVERY 4
 #endif
 

@@ -1,12 +1,12 @@
 /* Constraints on morphologies: up to 8 steps in one launch, in place.
  *
  *   chain         x_s <- STEP7( ... STEP1(STEP0(x_s)))       for each active source s
- *   chain_factor  the same, and factor[s] = product of the scales that the normalisations took out,
- *                 times what was there unless this is the first launch
+ *   chain_factor  the same, and factor[s] = product of the divisors of the normalisations, times
+ *                 its present value unless this is the first launch
  *
  * STEP0 .. STEP7 name functions of this file (-D STEP0=positivity ...); the last may be missing.
  *   x, table: the morphologies and their boxes, see boxes.h
- *   active  (n) int: sources to treat; the others cost nothing
+ *   active  (n) int: sources to change; the others cost nothing
  *   values  (N_STEPS, 2, S) REAL: two parameters per step and source, named at each function
  *   step    of the gradient descent, multiplies penalties
  *
@@ -14,9 +14,9 @@
  *
  * The monotone sweep goes by levels l = 2 max(|dy|,|dx|) + min(|dy|,|dx|): every neighbour nearer
  * to the centre has a smaller level, so the pixels of one level are independent. A neighbour that
- * is not nearer has weight 0 and may be of the same level, which other work-items write: it must
- * not be read at all. 0 times an infinity would be NaN, and comparing with a bound
- * of NaN is never true, so that the pixel would stay as it is.
+ * is not nearer has weight 0 and may have the same level, which other work-items write: it must not
+ * be read. 0 times infinity would be NaN, and the comparison with a bound of NaN is false, so that
+ * the pixel would not change.
  */
 #include "common.h"
 #include "boxes.h"

@@ -1,8 +1,8 @@
 /* A batch of scenes: model frames, residuals, loss, gradients by morphology and spectrum.
  *
- * Those of scene b are order[first[b]] .. order[first[b + 1] - 1].  Each has an
- * image in a box of its scene's frame.  The image is a morphology, or a morphology that was
- * transformed along one or both axes; then the box is as wide as the frame, or all of it:
+ * The sources of scene b are order[first[b]] .. order[first[b + 1] - 1].  Each has an image in a
+ * box of its scene's frame.  The image is a morphology, or a morphology transformed along one or
+ * both axes; then the box is as wide as the frame, or is the whole frame:
  *   boxed, d_boxed, table: images, their gradients and their boxes, see boxes.h; boxes lie inside
  *             the frame
  *   spectra   (S, C): all channels of all observations; an observation has n_bands from `channel`
@@ -11,11 +11,10 @@
  *
  * compose     frame[b, c, y, x] = sum_s spectra[s, channel + c] boxed_s[y - y0, x - x0]
  *             launch: (X, ny_frame, B * n_bands)
- * compose_frequencies  the same of images with both axes transformed, whose boxes are the first
- *             rows and columns of the frame, as many for all sources of a scene; the rest of its
- *             frame is not written;  times the transfer functions E, (B or 1, n_bands,
- *             ny_frame / 2, 4, nx_frame / 2) as MIX of contract.cl has them; stride_e: elements
- *             from a scene's to the next
+ * compose_frequencies  the same for images with both axes transformed, times the transfer functions
+ *             E (B or 1, n_bands, ny_frame / 2, 4, nx_frame / 2), see MIX of contract.cl; stride_e:
+ *             elements between scenes.  The boxes are the first rows and columns of the frame,
+ *             equal for all sources of a scene; the rest of its frame is not written.
  *             launch: (vectors of VW columns of a row, or 1 with ROWS, ny_frame / 2, B * n_bands)
  *             VW divides nx_frame
  * residual    r = image + sky - data, image <- w r, loss[b, row] = 1/2 sum_x w r^2,
@@ -38,7 +37,7 @@
 #include "contract.h"
 #include "boxes.h"
 #include "work_group.h"
-#define LANES 16    /* sums that run side by side where a work-item has a whole row */
+#define LANES 16    /* parallel sums if a work-item has a whole row */
 
 #define HEAD(s) \
     __global const int *box = BOX(s); \
@@ -224,7 +223,7 @@ void gather_spectra(__global const int *restrict active, __global const int *res
     __global const REAL *m = boxed + offset;
     REAL total = 0;
 #if ROWS
-    /* two vectors' sums at a time: one alone waits for its last addition */
+    /* sums of two vectors at a time, which hides the latency of additions */
     REAL part[LANES], other[LANES];
     for (int l = 0; l < LANES; ++l) part[l] = other[l] = 0;
     for (int y = 0; y < ny; ++y, m += nx, g += nx_frame) {

@@ -25,10 +25,11 @@
  *   Launch: shift (n_cols / LANES, h_x, n_units * n_items), unshift (h_x, n_units * n_items); the
  *   first two axes, or the first, may be rounded up.
  *
- *   collect  pixels[b, p] = sum over chunks of part[chunk, l, b * n_cols + i]; 0 where not covered
+ *   sum_chunks  pixels[b, p] = sum over chunks of part[chunk, l, b * n_cols + i]; 0 where
+ *            not covered;
  *            launch (n_i rounded up, n_l, n_items); p = l * step_l + i * step_i
- *   spread   part[l, b * n_cols + i] = pixels[b, p] where covered, else 0, the adjoint of one chunk
- *            launch (ld, n_l); columns that are no pixel's become 0
+ *   scatter_pixels  part[l, b * n_cols + i] = pixels[b, p] where covered, else 0, the adjoint
+ *            of one chunk;  launch (ld, n_l); columns without a pixel become 0
  *   pixels: image b from offset + b * stride on;  covered: of each pixel p, 1 or 0
  */
 #include "common.h"

@@ -1,7 +1,7 @@
-/* The start of a fit: smooth profiles drawn in boxes, seen in windows, compared with the data.
+/* The start of a fit: products of profiles, rendered in windows, with each other and with the data.
  *
- * A slot is one component of one scene, with n images: its profile and, where asked for, the
- * slopes of that by its parameters, which draw.cl has drawn.
+ * A slot is one component of one scene, with n images drawn by draw.cl: its profile and,
+ * optionally, the slopes of the profile by its parameters.
  *
  *         model frame                      one channel of an observation
  *         +-----------------+              +------------------+
@@ -23,8 +23,8 @@
  *          those of scenes[k] from first[k] to first[k + 1]
  * gram     out (pairs, n_bands, K, K) = sum over the pixels where both windows lie of w a_i b_j;
  *          pairs (., 6) int: slots a, b, and the pixels: y, x, height, width; images beyond a
- *          slot's n are its last again;  launch: (WG pairs, n_bands), groups of (WG, 1): of pairs
- *          there may be more than a GPU's groups along other axes
+ *          slot's n repeat its last;  launch: (WG pairs, n_bands), groups of (WG, 1): pairs are on
+ *          the first axis because GPUs limit the groups along other axes
  * residual_products     out (slots, n_bands, K, 2) = sums of w a_i r and w a_i root;
  *          launch: (WG slots, n_bands)
  *
@@ -62,8 +62,8 @@ __kernel void whiten(__global const int *restrict place, const int n_bands, cons
         }
 }
 
-/* Of slot s in row y of channel c: the window's columns wx from x0 on, its flux a, and its image's
- * row u; the next slot's turn where it has no light there. */
+/* For slot s in row y of channel c: the window's columns wx from x0 on, its flux a, and its image's
+ * row u; continues with the next slot if it has no light there. */
 #define SLOT(s) \
     __global const int *p = place + N_PLACE * (size_t)(s); \
     const int wy = p[WY], wx = p[WX], row = y - p[Y0], x0 = p[X0]; \
@@ -140,8 +140,8 @@ void compute_residuals(__global const int *restrict scenes, __global const int *
      (((size_t)((i) < (p)[N_IMAGES] ? (i) : (p)[N_IMAGES] - 1) * n_bands + c) * (p)[WY] \
       + y0 + y - (p)[Y0]) * (p)[WX] + x0 - (p)[X0])
 
-/* What is done for each image j of the other slot, without an array of arrays, which compilers for
- * CPUs keep out of registers. */
+/* The operation for each image j of the other slot, without an array of arrays, which compilers for
+ * CPUs would keep in memory instead of registers. */
 #if K > 1
 #define EACH(DO) DO(0) DO(1) DO(2) DO(3) DO(4)
 #else

@@ -1,17 +1,17 @@
 /* Structure of galaxies at several scales about their profiles, and its transpose.
  *
  *   u_s = amp_s o sum_j K_j z_sj              amp = sqrt(profile)
- *   S_s = max(0, b + u - b <b, u> / <b, b>)   b: the profile; the light along b is the spectrum's
+ *   S_s = max(0, b + u - b <b, u> / <b, b>)   b: the profile, on which u has no projection
  *
  * K_j is a Gaussian of standard deviation sigma_j [px], cut at RADII[j]; its coefficients z_sj lie
  * on every STEPS[j]-th pixel of the box, COARSE(ny, j) x COARSE(nx, j) of them, row by row, scale
- * after scale from LATENTS on in the solver's vectors.  A step of sigma or less loses nothing: the
- * kernel holds no frequency that the coarse grid lacks (0.7 % of its amplitude at most).
+ * after scale from LATENTS on in the solver's vectors.  A step of at most sigma loses nothing: at
+ * the coarse grid's Nyquist frequency the kernel has at most 0.7 % of its amplitude.
  *
  * coefficients_to_image     u = amp o sum_j K_j z;  launch: (X, tallest box, n_free)
  * form_morphology       S from u, the gauge with it;  launch: (WG, n_free), groups (WG, 1)
  * morphology_adjoint  q = amp o (v - b <b, v> / <b, b>), v = dS where S > 0, over dS;  launch: as
- *     form
+ *     for form_morphology
  * image_to_coefficients  g = K_j^T q + precision[s, j] z for every scale;  launch: (X, COARSE rows,
  *     n_free)
  * coefficient_norms  out[s, j] = sum z_sj^2 of the sources listed;      launch: (WG, n_scales,

@@ -1,19 +1,19 @@
-/* Frequencies of images seen through several PSFs: sums over the terms of a basis, in bands that
- * add up T images of the model, and in boxes of which each has its own sum.
+/* Frequencies of images with varying PSFs: sums over the terms of a PSF basis, for bands that are
+ * the sum of T images of the model, and for boxes, each with its own sum.
  *
  *   z (n, 2 h_y, n_pad): of each of n images of the observation, n_bands of them for each plan
- *   terms (n, T, 2 h_y, n_pad): its parts.  Both hold quads as contract.cl has them
+ *   terms (n, T, 2 h_y, n_pad): its terms.  Both consist of quads, see transfer.h
  *
  * sum_terms      z = sum_t terms[t]
  * split_terms   terms[t] = conj(D_t) o z;  D (plans, n_bands, T, h_y, 4, n_pad / 2) as MIX has it,
  *          stride_d: elements from a plan's to the next
  *
- * apply_transfer  z = D o phase o z0: n_bands spectra from one, each moved by its slot's own
- *          offset: z0 (items, 2 h_y, n_pad), z (items * n_bands, 2 h_y, n_pad); D of its plan,
- *          TERMS of each band, added up with the slot's shares (slots, n_bands, TERMS), which are
- *          not read where there is one; phase (slots, h_y + n_pad / 2, 2) cos and sin by row and by
- *          column; item i belongs to slot first + i / n, and where there are more plans than one
- *          its D is that of which[i];  launch: (X, h_y, items * n_bands)
+ * apply_transfer  z = D o phase o z0: n_bands transforms from one, shifted by the slot's offset:
+ *          z0 (items, 2 h_y, n_pad), z (items * n_bands, 2 h_y, n_pad).  D of the item's plan has
+ *          TERMS for each band, which are summed with the slot's shares (slots, n_bands, TERMS),
+ *          not read if there is one term.  phase (slots, h_y + n_pad / 2, 2): cos and sin by row and by
+ *          column.  Item i belongs to slot first + i / n; if there are several plans, its D is that
+ *          of which[i];  launch: (X, h_y, items * n_bands)
  *
  * Launch: (X, h_y, n); X is 1 where a work-item walks a whole row (ROWS of work_group.h), else
  *     n_pad / 2

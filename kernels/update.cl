@@ -3,8 +3,8 @@
  *   m <- B1 m + (1 - B1) g,  v <- B2 v + (1 - B2) g^2,  h <- max(h, v)
  *   x <- x - rate (m / (1 - B1^t)) / (sqrt(h / (1 - B2^t)) + e)
  *
- * A morphology with a prior is S = P + W o (K z): P its expected `profile`, W the `amplitude` by
- * which it may depart, K the correlation kernel (separable taps (2 RADIUS + 1), symmetric), z its
+ * A morphology with a prior is S = P + W o (K z): P is the expected `profile`, W the `amplitude` of
+ * its structure, K the correlation kernel (separable taps (2 RADIUS + 1), symmetric), z the
  * unit-normal `latent` image.  The variable is z, its gradient K (W o dS) + z; constraints act on
  * S.  Without a prior the variable is S itself.
  *
@@ -17,7 +17,7 @@
  * step_sky     sky <- sky - SKY_RATE sum(w r) / sum(w); for n = B C levels
  *              pull (B, n_rows): sum of w r of each observed row; channel c has rows
  *              row0[c] .. row0[c + 1] - 1;  inverse (B, C): 1 / sum(w)
- * rescale_spectra  A[s, c] *= factor[s]: what a normalisation took out of a morphology; for n = S C
+ * rescale_spectra  A[s, c] *= factor[s], the divisor of a morphology's normalisation; for n = S C
  *              launch of these three: any (see FOR_I of work_group.h)
  *
  * e = EPSILON + rate damping[s] for morphologies: no step is longer than gradient / damping, where
@@ -29,16 +29,16 @@
 #include "boxes.h"
 #include "work_group.h"
 
-#ifndef B1           /* part of the first moment that an iteration keeps */
+#ifndef B1           /* decay of the first moment in an iteration */
 #define B1 0.9
 #endif
-#ifndef B2           /* part of the second moment that an iteration keeps */
+#ifndef B2           /* decay of the second moment in an iteration */
 #define B2 0.999
 #endif
 #ifndef EPSILON      /* far below a unit-normal variable's gradient, above float32's underflow */
 #define EPSILON 1e-8
 #endif
-#ifndef SKY_RATE     /* of a Newton step: sources and sky exchange light, a full one overshoots */
+#ifndef SKY_RATE     /* of a Newton step: sources and sky are coupled, so a full step overshoots */
 #define SKY_RATE 0.5
 #endif
 #ifndef RADIUS       /* taps of K on either side of its middle one */
@@ -51,7 +51,7 @@
     const int ny = box[NY], nx = box[NX]; \
     if (y >= ny) return; \
     const size_t begin = BEGIN(box), row = begin + (size_t)y * nx;
-#define LANES 16     /* sums that run side by side where a work-item has a whole row */
+#define LANES 16     /* parallel sums if a work-item has a whole row */
 
 /* sqrt(x), x >= 0, from plain arithmetic so that loops vectorise everywhere: a first guess of
  * 1 / sqrt from the exponent, then Newton's steps, each of which doubles the digits from 5 bits. */

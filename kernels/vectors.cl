@@ -1,9 +1,9 @@
-/* Into and out of vectors of the variables of all scenes of a batch, as lbfgs.cl has them.
+/* Copies into and out of the vectors of lbfgs.cl, the variables of all scenes of a batch.
  *
  * unpack_spectra  spectra and sky levels out of x, n of them in all;  launch: any, see FOR_I of
  *     work_group.h
  * pack_gradients  their gradients into g_new: pull[b, row] summed over rows row0[c] .. row0[c + 1]
- *           - 1 launch: as take
+ *           - 1;  launch: as for unpack_spectra
  * copy_chunks  values[row, first + i] = values_from[row, source + i] of each chunk, the source of
  *           each given; launch: (WG, n chunks, rows)
  */

@@ -1,13 +1,13 @@
 /* Stages of the operator for grids that are rotated, sheared or distorted against each other.
  *
  * gather   target[b, l, p] = sum_t weight[l, t, p] * source[b, l, start[l, p] + t]
- *          One line at a time, both ways: from the columns of pass 1 to the observed pixels of a
+ *          Line by line, in both directions: from the columns of pass 1 to the observed pixels of a
  *          line (forward), and back (adjoint, with the transposed tables).
  *   source, target: element (b, l, p) at offset + b * stride + l * ld + p * step, so that lines
  *            may be rows or columns of an observed image.
  *   start (n_tables, n_lines, n_out), weight (n_tables, n_lines, N_TAPS, n_out) or, where ROWS are
  *            set, (n_tables, n_lines, n_out, N_TAPS)
- *   Taps of weight 0 stand for "outside" and may read any element of the line.
+ *   Taps of weight 0 mean "outside" and may read any element of the line.
  *   Launch: (n_out rounded up to the local size, n_lines, batch), or, where ROWS are set and a
  *            work-item takes a line of all bands of a scene, whose taps it reads once for all of
  *            them, (1, n_lines, batch / n_bands).

@@ -1,11 +1,11 @@
 /* Work-items that share one box, and loops over the pixels of a row.
  *
- * WG work-items make a group, one group a source: they share its pixels, and meet at SYNC(). With
- * WG 1 there is no barrier at all, which suits CPUs; a GPU takes 64.
+ * A group has WG work-items and one source, whose pixels they share; SYNC() is a barrier. With WG 1
+ * there is no barrier, as is best for CPUs; GPUs use 64.
  * FOR_X runs over a row of n pixels: all of them in one work-item (ROWS), or those of this one.
- * FOR_Y runs over those of n rows that are this work-item's, counted by a launch's second axis;
- * FOR_I over those of n items, by its first.  Any launch covers all of them, none goes beyond: a
- * launch is rounded up to whole groups.
+ * FOR_Y runs over this work-item's share of n rows, by the second axis of the launch; FOR_I over
+ * its share of n items, by the first axis.  A launch of any size covers all of them and no more, so
+ * that it may be rounded up to whole groups.
  */
 #ifndef WG          /* work-items of a group */
 #define WG 1

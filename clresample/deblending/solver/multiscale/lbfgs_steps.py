@@ -78,7 +78,7 @@ class LbfgsSteps:
         self._reweigh_size = group, planes.shape[1], b.n_free
 
     def follow(self, pairs, mode):
-        """Uploads the mode (B,) of each scene, IDLE, ACCEPT, ..., and the slots of its pairs."""
+        """Uploads the mode (B,) of each scene, REST, NEXT, ..., and the slots of its pairs."""
         plan = np.stack([mode, pairs.used, pairs.spare], axis=1)
         self._buffers.device.upload(np.ascontiguousarray(plan, np.int32), self._plan)
 
