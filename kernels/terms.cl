@@ -11,9 +11,9 @@
  * apply_transfer  z = D o phase o z0: n_bands transforms from one, shifted by the slot's offset:
  *          z0 (items, 2 h_y, n_pad), z (items * n_bands, 2 h_y, n_pad).  D of the item's plan has
  *          TERMS for each band, which are summed with the slot's shares (slots, n_bands, TERMS),
- *          not read if there is one term.  phase (slots, h_y + n_pad / 2, 2): cos and sin by row and by
- *          column.  Item i belongs to slot first + i / n; if there are several plans, its D is that
- *          of which[i];  launch: (X, h_y, items * n_bands)
+ *          not read if there is one term.  phase (slots, h_y + n_pad / 2, 2): cos and sin by row
+ *          and by column.  Item i belongs to slot first + i / n; if there are several plans, its D
+ *          is that of which[i];  launch: (X, h_y, items * n_bands)
  *
  * Launch: (X, h_y, n); X is 1 where a work-item walks a whole row (ROWS of work_group.h), else
  *     n_pad / 2

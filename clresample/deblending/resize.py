@@ -25,7 +25,7 @@ GROW_AT = 4.0
 
 
 def box_threshold(brightness):
-    """Part of a profile's peak down to which its pixels belong into its box.
+    """Fraction of a profile's peak at the edge of its box.
 
     brightness: the peak over the noise of a model pixel. A pixel belongs to the box if the profile,
         or the prior's scatter of structure there, reaches BOX_NOISE of the noise. With alpha = 0.1
@@ -56,9 +56,9 @@ def box_around(profile, position, brightness):
 
 
 def component_box(start, i, frame, brightness):
-    """`box_around` of a component that a start has found, and its profile there (ny, nx), max = 1.
+    """`box_around` for a component of a start, and its profile in that box (ny, nx), max = 1.
 
-    start: StartingPoint; i: which component; frame (2,) [px]: the frame's shape
+    start: StartingPoint; i: index of the component; frame (2,) [px]: the frame's shape
     """
     middle, half = start.reach(i, box_threshold(brightness))
     place, top = start.positions[start.source[i]], np.array(frame)
@@ -72,11 +72,11 @@ def component_box(start, i, frame, brightness):
 
 
 def resize_boxes(scene: Scene, state: State, start, noise) -> tuple[Scene, State]:
-    """Scene and state in boxes that fit the present morphologies; themselves where all of them do.
+    """Scene and state in boxes resized to the present morphologies; unchanged if no box changes.
 
     start: StartingPoint with the expected profiles; noise (C,): of a model pixel. Arrays of the
-        state
-    are copied to the new boxes: new pixels start at the profile, with z and all moments at 0.
+        state are copied to the new boxes: new pixels start at the profile, with z and all moments
+        at 0.
     """
     boxes = [_box(scene, state, i, start, noise) for i in range(len(state.morph))]
     if all(_same(scene, i, box) for i, box in enumerate(boxes)):

@@ -1,4 +1,4 @@
-"""Products with tables of waves at pixels that mirror each other, in half the operations."""
+"""Products with mirror-symmetric tables of waves, in half the operations."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class MirrorContraction(Contraction):
 def operator_programs(device, dtype):
     """Builds needed by operators between aligned or rotated images.
 
-    The images lie within the model.
+    All pixels of the images must lie on the model.
 
     returns [(file, dtype, macros)], the requests of `Device.build_ahead`
     """

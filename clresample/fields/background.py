@@ -1,4 +1,4 @@
-"""The sky of a mosaic: a smooth surface through the medians of cells, for images that have one."""
+"""The sky background of a mosaic: a smooth surface through the medians of cells."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Background:
     def read(self, box) -> np.ndarray:
         """The surface [counts] on a Box."""
         axes = [
-            (np.arange(a, b) + 0.5) / cell + 0.5  # of the levels with one more on each side
+            (np.arange(a, b) + 0.5) / cell + 0.5  # index into the levels, padded by one
             for a, b, cell in zip(box[:2], box[2:], self.cell, strict=True)
         ]
         where = np.meshgrid(*axes, indexing="ij")

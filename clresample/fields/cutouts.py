@@ -2,8 +2,7 @@
 
 Pixels, weights and PSFs are read from the mosaics of the run, models from models.fits, errors of
 fluxes from the catalogue. The operator of the fits renders a window around a source: all models
-    that
-reach into it, of any blend, with the PSF at the source.
+that reach into it, of any blend, with the PSF at the source.
 """
 
 from __future__ import annotations

@@ -12,10 +12,10 @@ from .model_mosaics import file_name
 
 
 def reference_grid(mosaics) -> Grid:
-    """The grid of the mosaic with the smallest pixels, of equal ones the first.
+    """The grid of the mosaic with the smallest pixels, the first if several are equal.
 
-    Raises ValueError for no mosaic, names or channels that are not unique or that tables cannot
-    hold, zero points that only some have, and grids of which some are flat.
+    Raises ValueError without mosaics, for names or channels that are repeated or not valid in
+    tables, and if only some mosaics have zero points or a WCS.
     """
     if not mosaics:
         raise ValueError("mosaics is empty, at least one is needed")

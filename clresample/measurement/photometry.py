@@ -18,8 +18,7 @@ def fluxes(result):
     covariances are theirs, marginalised over morphologies. |S| then includes the light of the
     smooth
     profile beyond its box, below the noise: a percent of the flux at signal to noise 10. The bias
-        of
-    F from the bound of morphologies at 0 is subtracted, 0.1 to 1 % for bright galaxies, see
+    of F from the bound of morphologies at 0 is subtracted, 0.1 to 1 % for bright galaxies, see
     `Errors.flux_bound_bias`; so F can be negative.
 
     result: a fitted blend

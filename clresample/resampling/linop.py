@@ -17,8 +17,7 @@ class LinOp:
     dtype: float32 or float64, of both sides
 
     The result has the type of the input: a NumPy array, a Quantity in its unit, or a pyopencl
-        array,
-    which never touches the host.  If both sides have one band, (Ny, Nx) images may be passed
+    array, which never touches the host.  If both sides have one band, (Ny, Nx) images may be passed
     without the band axis.  Subclasses implement `_forward` and `_adjoint` on device arrays (B,) +
     shape; both overwrite `out` and leave their input unchanged.
 

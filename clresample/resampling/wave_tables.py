@@ -20,7 +20,7 @@ def uniform_wave_table(nu, first, step, n) -> np.ndarray:
 
 
 def aligned_tables(mapping: Mapping, nu, axes, center):
-    """Waves at the observed rows and columns about their middle, zero outside the model.
+    """Waves at the observed rows and columns, relative to their middle; 0 outside the model.
 
     Also returns the distance of that middle from the model's (2,) [model px].
     """
@@ -48,10 +48,10 @@ def distorted_tables(mapping: Mapping, nu, center):
 def line_tables(mapping: Mapping, nu, d, center, window: KaiserBessel):
     """Observed rows (or columns) as lines y = y0 + r x through the model, and pass 2 along them.
 
-    Along a line a plane wave has the single frequency nu_x + r nu_y; columns finer than its Nyquist
-    spacing by window.oversampling carry it, divided by the window's transform.  Returns
-    (tables, d, middle): the lines' waves are about the middle line, which is `middle` (2,)
-    [model px, along the table axes] off the model's middle.
+    Along a line a plane wave has the single frequency nu_x + r nu_y.  It is sampled on columns
+    window.oversampling times finer than its Nyquist spacing, and divided by the window's transform.
+    Returns (tables, d, middle): the lines' waves are relative to the middle line, which has the
+    distance `middle` (2,) [model px, along the table axes] from the model's middle.
     """
     slope = np.abs(mapping.matrix[1]) / np.linalg.norm(mapping.matrix, axis=0)
     by_row = slope[1] >= slope[0]

@@ -58,9 +58,8 @@ class Frame:
         A position on the edge of a pixel belongs to pixel floor(x + 1/2). A fit omits a source
         outside
         the frame, with a warning: its centre, from which morphologies decrease, is not in the
-            frame,
-        nor is most of its light. A source inside is fitted, however near to the edge, with the part
-        of its light that falls on the frame.
+        frame, nor is most of its light. A source inside is fitted, however near to the edge, with
+        the part of its light that falls on the frame.
 
         returns (...) bool; False for NaN
         """

@@ -1,4 +1,4 @@
-"""Work of the usual kind to time devices by: renders of stamps, and joint fits of small blends.
+"""Standard workloads to time devices: renders of stamps, and joint fits of small blends.
 
 Needs no data and no GalSim: galaxies are exponential discs, PSFs Gaussians.
 """
@@ -86,7 +86,7 @@ def blends(n, device):
 
 
 def fit(given, device, **settings):
-    """Their Results, fitted side by side; undetected sources do not matter here."""
+    """Results of blends, fitted side by side, without warnings about undetected sources."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SourceWarning)
         results = deblend_many(given, settings=Settings(**settings), device=device)
@@ -117,7 +117,7 @@ class FitWorkload:
         self.n = n
 
     def __call__(self):
-        """All of them once, from the start."""
+        """Iterates all fits once, from their start."""
         n_most = Tuning.of(self.device).n_scenes
         fits = [copy.copy(self.fits[i % len(self.fits)]) for i in range(self.n)]
         for fit in fits:

@@ -92,8 +92,7 @@ def max_filtered_residuals(result, i_observation):
         t(p) = sum_q P(q - p) w(q) r(q) / sqrt( sum_q P(q - p)^2 w(q) )
 
     with the residual r, the weights w, and the observed PSF P: the significance of a point source
-        at
-    p in the residuals. For noise t has unit scatter. A pixel belongs to the source with the
+    at p in the residuals. For noise t has unit scatter. A pixel belongs to the source with the
     brightest model among those whose boxes contain it. If a channel has 400 pixels of sky, those
     with less than one sigma of model, t is divided by its robust scatter there if that exceeds 1,
     because the noise is then correlated or larger than the weights imply. The divisor is at most

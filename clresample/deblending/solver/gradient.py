@@ -28,7 +28,8 @@ class LossGradient:
     with_prior: True if the loss has the term of z
     depth: the stage of rendering at which spectra are applied, see rendering/stages.py; None = the
         cheapest for each observation
-    rows (C + 1,): observed rows of all channels up to each, the columns of:
+    rows (C + 1,): first observed row of each channel, then their total; the columns of rows_loss
+        and rows_pull
     rows_loss, rows_pull (B, n_rows): 1/2 sum w r^2 and sum w r of each observed row; the first row
         of a channel includes the prior of its sky. Sums over its rows are its loss and dL/dsky
     best (B,): lowest loss of each scene among those computed with i_loss = 0, infinite before
@@ -77,7 +78,7 @@ class LossGradient:
 
     @functools.cached_property
     def _losses(self):
-        """The kernel that sums them; the multi-scale prior does not need it."""
+        """The kernel that sums the losses, built at first use: the multi-scale prior needs none."""
         b, group = self.buffers, self.buffers.tuning.sum_group
         return b.launcher("losses.cl", "losses", 2, local_size=(group, 1)).bind(
             first=b.first,

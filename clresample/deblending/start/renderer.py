@@ -12,9 +12,9 @@ from ...resampling.resampler import EXECUTORS
 class BoxRenderer:
     """Plans of boxes of one shape on the device: images (n, ny, nx) to (n, C, wy, wx).
 
-    plans: `ResamplingPlan.window`'s, alike in layout and window, of one place of a distorted
-        mapping, or of a whole frame
-    executor: of the plans, with their transfer functions; None makes one
+    plans: from `ResamplingPlan.window`, of equal layout and window; or the plans of one position of
+        a distorted mapping, or of a whole frame
+    executor: of the plans, with their transfer functions; None = a new one
 
     size (2,) [px]: of the windows
 
@@ -54,12 +54,13 @@ class BoxRenderer:
         return self.executor.n_bands * int(np.prod(self.size))
 
     def __call__(self, images, i_image, seen, i_seen, n, which, moves, shares=None):
-        """Queues the images of slots that follow each other, n of each.
+        """Queues the rendering of n images for each of several consecutive slots.
 
-        images, i_image: device array and the element of it where they begin; seen, i_seen: likewise
-            where they go; which (slots,): index of each one's plan; moves (slots, 2) [model px]: by
-            which the slots' pixels are off the plan's; shares (slots, C, T): of the plan's terms,
-            None where it has one
+        images, i_image: device array of the input, and its first element
+        seen, i_seen: device array of the result, and its first element
+        which (slots,): index of each slot's plan
+        moves (slots, 2) [model px]: distance of the slots' pixels from those of the plan
+        shares (slots, C, T): coefficients of the plan's terms, None for one term
         """
         e, count, (w_y, w_x) = self.executor, len(moves), self.size
         fit = min(e.tuning.group_bytes // (n * self._n_bytes), MAX_GROUPS // (n * e.n_bands))

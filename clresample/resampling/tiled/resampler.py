@@ -27,10 +27,9 @@ class TiledResampler(HostLinOp, GridOperator):
         I2[tile] = R_tile I1[window]
 
     A window is the part of the model that contributes to a tile: the tile's area and the wrap
-        radius
-    around it. It falls smoothly to zero at its edge, and is zero beyond the model. Windows start at
-    whole pixels, so that tiles with one Jacobian share an operator and differ in its shift. A
-    distorted frame is affine tile by tile if tolerance_px permits.
+    radius around it. It falls smoothly to zero at its edge, and is zero beyond the model. Windows
+    start at whole pixels, so that tiles with one Jacobian share an operator and differ in its
+    shift. A distorted frame is affine tile by tile if tolerance_px permits.
 
     Images as sharp as the model's PSF agree with the result of a single tile to 2e-6 (5e-6 if the
     PSF's samples alias), the effect of another padding of that tile. White noise, sharper than the

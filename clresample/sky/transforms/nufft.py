@@ -5,7 +5,7 @@
 The image is divided by the transform of a Kaiser-Bessel window, padded to twice its size and
 transformed; the window then interpolates between the grid's frequencies. The error comes from the
 window's side lobes: with TAPS = 16 it is below 1e-14 of sum |P|. The cost per frequency is TAPS^2,
-that of the direct sum ny nx.
+compared to ny nx for the direct sum.
 
 Source: Dutt & Rokhlin 1993 (SIAM J. Sci. Comput. 14, 1368), with the window of Fessler & Sutton
 2003 (IEEE Trans. Signal Process. 51, 560).
@@ -17,10 +17,11 @@ import numpy as np
 from scipy.fft import fft2, next_fast_len
 from scipy.special import i0e
 
-# Elements of the grid that enter each frequency, along an axis, and the padding; fewer taps are
-# less exact (12: 1e-11), more padding takes more memory.
+# Number of grid elements along an axis for each frequency, and the padding factor. Fewer taps are
+# less
+# accurate (12: 1e-11); more padding takes more memory.
 TAPS, PADDING = 16, 2.0
-# The window's shape that makes its side lobes beyond the padded grid smallest.
+# The window's shape parameter for the smallest side lobes beyond the padded grid.
 BETA = np.pi * np.sqrt((TAPS * (1 - 0.5 / PADDING)) ** 2 - 0.8)
 # Frequencies interpolated at once: 16 MiB of each intermediate array.
 BLOCK = 1 << 20
