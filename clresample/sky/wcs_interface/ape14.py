@@ -142,8 +142,7 @@ def _sky_axes(low):
 
 
 def _unbounded(low):
-    """The WCS evaluated beyond its bounding box too, like a FITS WCS, for cutouts that reach
-    there."""
+    """The WCS without a bounding box, like a FITS WCS, for cutouts that reach beyond it."""
     if getattr(low, "bounding_box", None) is None:
         return low
     low = copy.deepcopy(low)
