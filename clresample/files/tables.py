@@ -36,9 +36,7 @@ def read_catalogue(path) -> QTable:
         if path.suffix == ".parquet":
             return read_parquet(path)
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore", AstropyWarning
-            )  # units and headers that astropy repairs
+            warnings.simplefilter("ignore", AstropyWarning)  # units that astropy repairs
             table = QTable.read(path, **form)
     except ImportError:
         raise

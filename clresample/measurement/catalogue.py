@@ -84,15 +84,15 @@ def catalogue(result, *, magnitudes=True, groups=None) -> QTable:
         n_components: number of components; two if the core has a significantly different colour,
             see `ExtendedSource`
         *_centroid: the same positions, of the fitted light
-        size [arcsec], e1, e2, angle [deg]: see `shapes.shape`. They are those of the model under
-            the model's PSF, not deconvolved. A source's components are weighted by their flux in
-            all channels, each in units of its error. If the result has Errors, the light of the
-            smooth profile beyond its box is included, and the bias from the bound of morphologies
-            at 0 is subtracted, see `Errors.moment_bound_bias`
-        *_centroid_err, size_err, e1_err, e2_err, angle_err: errors in the units of the values, to
-            first order; ra's in degrees of ra, angle_err at most 52 deg, that of an unknown angle.
-            NaN if the result has no Errors, or if the shape was not fitted, as for stars. They,
-            and those of fluxes, are larger for misfitted sources, see `Errors`
+        rms_size [arcsec], e1, e2, position_angle [deg]: see `shapes.shape`. They are those of the
+            model under the model's PSF, not deconvolved. A source's components are weighted by
+            their flux in all channels, each in units of its error. If the result has Errors, the
+            light of the smooth profile beyond its box is included, and the bias from the bound of
+            morphologies at 0 is subtracted, see `Errors.moment_bound_bias`
+        *_centroid_err, rms_size_err, e1_err, e2_err, position_angle_err: errors in the units of the
+            values, to first order; ra's in degrees of ra, position_angle_err at most 52 deg, that
+            of an unknown angle. NaN if the result has no Errors, or if the shape was not fitted, as
+            for stars. They, and those of fluxes, are larger for misfitted sources, see `Errors`
         flux_*, flux_err_* per band, or per channel if the observation has no `bands`; the
             exposures of a band have one flux, see `fluxes`. The unit is that of the data if all
             observations have the same, else uJy if they have zero points, else counts. NaN if no

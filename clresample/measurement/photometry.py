@@ -51,8 +51,8 @@ def channel_covariances(result):
     """Covariances (S, C, C) [counts^2] of each source's fluxes between channels.
 
     Errors of a morphology change the fluxes of all channels together, so that colours are more
-    accurate than fluxes. Without Errors channels are independent. Settings.flux_floor is included
-    as an error common to all channels. The variance is NaN as in `fluxes`.
+    accurate than fluxes. Without Errors channels are independent. Settings.flux_error_floor is
+    included as an error common to all channels. The variance is NaN as in `fluxes`.
     """
     variance = np.diagonal(fluxes(result)[1], axis1=1, axis2=2).T  # (S, C)
     found = np.zeros((*variance.shape, variance.shape[1]))

@@ -78,8 +78,8 @@ class Posterior:
     def errors(self, owner, residuals, unit, flux_error_floor) -> Errors:
         """The Errors of sources, component i belonging to source owner[i] (n,).
 
-        residuals (S, C) [sigma]: that widen them; unit (C,) [counts]: of the spectra; flux_floor:
-            see Settings
+        residuals (S, C) [sigma]: that widen them; unit (C,) [counts]: of the spectra;
+            flux_error_floor: see Settings
         """
         n_sources, wide = len(residuals), misfit_error_scale(residuals)
         flux, slopes = self._fluxes(owner, n_sources)

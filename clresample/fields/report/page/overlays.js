@@ -1,4 +1,4 @@
-/* What is drawn over the field: marks, ids, ellipses, outlines of blends, the scale. */
+/* Marks drawn over the field: sources, ids, ellipses, outlines of blends, the scale. */
 
 const MARK = "#8fc2ff";  // the accent of dark pages: the sky is dark in both
 const MAX_MARKS = 2500;  // at once, the brightest of those in view: more take seconds without a GPU
@@ -13,7 +13,7 @@ function strokeTwice(c, path, style = MARK, width = 1.2) {
   }
 }
 
-/* Draws all that is wanted over a pane; the number of sources marked. */
+/* Draws the marks over a pane; returns the number of marked sources. */
 function drawOverlays(view, c, pane) {
   const seen = sourcesInView(view);
   if (view.show.outlines) strokeTwice(c, outlinesOf(view, seen), "#ffd479");

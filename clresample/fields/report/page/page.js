@@ -1,4 +1,4 @@
-/* What starts the page: choices, pointer and keys of the field, search, links to sources. */
+/* Starts the page: choices, pointer and keys of the field, search, links to sources. */
 
 function startView() {
   const canvas = byId("sky"), view = new View(canvas);
@@ -46,14 +46,14 @@ function pick(layer) {
   document.querySelector(`input[name=layer][value=${layer}]`)?.click();
 }
 
-/* Compare in this way, or no longer. */
+/* Switches a way of comparing on or off. */
 function compareBy(way) {
   const select = byId("compare");
   select.value = select.value === way ? "single" : way;
   select.dispatchEvent(new Event("change"));
 }
 
-/* Draw again after a choice that changes what limits are of. */
+/* Draws again after a choice that changes the limits. */
 function refresh(view) {
   view.measured.clear();
   if (view.look.mode === "own" && view.ownOf !== ownKey(view)) { view.look.mode = "auto"; byId("limits").value = "auto"; }
@@ -239,7 +239,7 @@ function positionOf(text) {
   return ra === null || dec === null || Math.abs(dec) > 90 || ra < 0 || ra >= 360 ? null : [ra, dec];
 }
 
-/* Go to a source by its id, or to a position; what to answer. */
+/* Goes to a source by its id, or to a position; returns the message. */
 function search(view, text) {
   const row = ROW_OF.get(text.trim());
   if (row !== undefined) { location.hash = `source-${text.trim()}`; return `Source ${text.trim()}`; }

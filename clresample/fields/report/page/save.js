@@ -1,4 +1,4 @@
-/* What can be taken along: PNG, FITS, regions for DS9, coordinates. */
+/* Files to save: PNG, FITS, regions for DS9; coordinates to copy. */
 
 const RAD = Math.PI / 180, BLOCK = 2880, CARD = 80;
 

@@ -97,7 +97,7 @@ function painted(pictures, layer, balance, look, columns, rows, then) {
     if (Number.isFinite(light[i])) {
       const part = level(light[i]);
       if (three) {
-        // colours only where there is light: those of the noise are no colours of anything
+        // colours only where there is light: those of the noise are meaningless
         const bright = Math.max(light[i], 0), share = bright / (bright + knee), shift = Math.max(-low, 0);
         const factor = part / Math.max(light[i] + shift, knee / 4);
         const own = planes.map((plane, k) => (light[i] + (plane[i] * balance[k] - light[i]) * share + shift) * factor);

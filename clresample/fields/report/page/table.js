@@ -28,7 +28,7 @@ function flagNames(sum) {
   return [...names, ...(rest ? [String(rest)] : [])].join(", ") || "none";
 }
 
-/* Which sources the filters' form leaves: an array of booleans. */
+/* The sources that pass the filters: an array of booleans. */
 function wantedSources() {
   const value = (id) => byId(id)?.value ?? "";
   const number = (id) => (value(id) === "" ? null : Number(value(id)));
