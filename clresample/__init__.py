@@ -1,8 +1,8 @@
 """clresample: one exact operator between telescopes' pixels and PSFs, and joint deblending.
 
-Start with five things. A `Grid` says where an image's pixels lie on the sky and a `PSF` how they
-are blurred. A `Resampler` takes a model image from one grid and PSF to another, exactly, and its
-adjoint back. An `Observation` is an instrument's image with its grid, PSF and weights, and
+Start with five things. A `Grid` has the positions of an image's pixels on the sky and a `PSF` how
+they are blurred. A `Resampler` takes a model image from one grid and PSF to another, exactly, and
+its adjoint back. An `Observation` is an instrument's image with its grid, PSF and weights, and
 `deblend` fits one scene of sources to any number of observations; `catalogue` turns what it
 returns into a table. The packages behind these names are described in docs/architecture.md.
 """

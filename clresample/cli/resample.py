@@ -241,7 +241,7 @@ def _resampled(arguments, op, pixels):
     import numpy as np
 
     try:
-        with np.errstate(over="ignore"):  # NumPy's warning, of which more is said here
+        with np.errstate(over="ignore"):  # NumPy's warning; the error below is more specific
             result = op(pixels)
     except ValueError as error:  # of pixels that the type cannot hold
         reason = str(error).replace("dtype=", "--dtype ")

@@ -5,7 +5,7 @@ ends these too early if another thread that is about to wait for an event has ju
 commands. In three threads 15 of 24,000 blocking copies were incomplete when they returned. Waits
 for events were always correct; each costs 2 us.
 
-pyopencl is imported when a device is first asked for, never before.
+pyopencl is imported only when a device is first requested.
 """
 
 from __future__ import annotations

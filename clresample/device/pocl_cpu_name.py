@@ -16,7 +16,7 @@ from pathlib import Path
 
 UNKNOWN = "generic"
 TRIPLE = "x86_64-unknown-linux-gnu"
-# How PoCL's device says that it holds that name, and the releases that mean it.
+# Patterns of that name in the version string of PoCL's device, and of the affected releases.
 VERSION = f"-{TRIPLE}-{UNKNOWN}"
 RELEASE = "3.0"
 RECORD_BYTES = 1024  # of the device's record, in which the name lies at byte 640 in release 3.0

@@ -82,7 +82,7 @@ class Channel:
     def weights(self, box, masked=None) -> np.ndarray:
         """Inverse variances (Ny, Nx) [counts^-2] of a Box, 0 = ignore this pixel.
 
-        masked (Ny, Nx): what `masked` says of the Box, where it was asked before
+        masked (Ny, Nx): the result of `masked` for the Box, if it was computed before
         Raises ValueError for a channel without a plane of them.
         """
         if self.weight is None:

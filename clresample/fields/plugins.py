@@ -14,7 +14,7 @@ class Formats(Mapping):
         [project.entry-points."clresample.readers"]
         my-survey = "my_package.clresample:read_my_survey"
 
-    and it is imported when a file asks for it. Our own names cannot be replaced.
+    and it is imported when a file uses the format. Built-in names cannot be replaced.
 
     group: of the entry points; own {name: function}
     """

@@ -142,7 +142,7 @@ class _Outputs:
         except OSError as error:
             given = ", ".join(map(str, names.values()))
             raise FileError(f"{given}: cannot be written ({error.strerror or error})") from error
-        except FileError as error:  # of a writer, which knows the file under its other path
+        except FileError as error:  # of a writer, with the file's temporary path
             message = str(error)
             for (folder, name), given in names.items():
                 message = message.replace(str(self.stages.get(folder, folder) / name), str(given))

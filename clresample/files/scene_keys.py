@@ -7,7 +7,7 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
-# Integers above this are no floats, nor is infinity.
+# Integers above this exceed float64; infinity does too.
 LARGEST = sys.float_info.max
 
 

@@ -73,7 +73,7 @@ def _read(path, name):
         raise ValueError(f"{path}: no such file")
     check_headers(path)
     try:
-        with warnings.catch_warnings():  # of types that ECSV does not know, and then reads
+        with warnings.catch_warnings():  # about types outside ECSV, which are read nevertheless
             warnings.simplefilter("ignore", AstropyWarning)
             return Table.read(path, format=name)
     except Exception as error:  # readers raise any exception on a file of another format

@@ -14,7 +14,7 @@ SIZES = slice(2, 10)
 
 
 def check_tiles(path, hdu):
-    """Raises FileError where an HCOMPRESS tile has another size than its header says.
+    """Raises FileError if an HCOMPRESS tile has another size than in its header.
 
     astropy (up to 8.0 at least) allocates memory by the header and writes by the tile's own size,
     beyond the end of that memory.

@@ -90,7 +90,8 @@ class Body:
 class Bodies:
     """The bodies of an image, and the relation of its peaks to them.
 
-    owners (S,): number of a peak's body, -1 for none; structure (S,) bool: peaks that are no source
+    owners (S,): number of a peak's body, -1 for none; structure (S,) bool: peaks that are not
+        sources
     """
 
     bodies: tuple[Body, ...] = ()

@@ -14,7 +14,7 @@ class Columns:
     An astropy table takes 0.2 ms for each column that it gets, loses or joins: a catalogue of one
     blend has 60 of them, a field has thousands of blends.
 
-    values {name: array}, units {name: unit}; meta: what is known of the whole table
+    values {name: array}, units {name: unit}; meta: metadata of the whole table
     """
 
     def __init__(self, values=None, units=None, meta=None):

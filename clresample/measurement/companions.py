@@ -119,8 +119,8 @@ def brightest_peak_near(rest, place, radius):
 def is_a_source(place, height, model, image, signals, centres, fwhm, scale):
     """Returns True if a residual peak is a source of its own, by this module's criteria.
 
-    place (2,) ints: (y, x) of the peak; height [sigma]: of what is left there, as
-    `brightest_peak_near` says
+    place (2,) ints: (y, x) of the peak; height [sigma]: of the residual there, from
+        `brightest_peak_near`
     model, image (Ny, Nx) [sigma]: models, what was searched
     signals: SignalToNoise of each observation; centres (S, 2) [px]: of the sources
     fwhm [px]: of the searched image's PSF; scale [arcsec]: of a pixel

@@ -104,7 +104,7 @@ def detect(observations, frame=None, *, threshold=THRESHOLD, scatters=None) -> D
 
 
 def noise_scatter(observation, frame) -> np.ndarray:
-    """Scatter (n_widths,) of an observation's signal to noise where there is no source, at least 1.
+    """Scatter (n_widths,) of an observation's signal to noise without sources, at least 1.
 
     It exceeds 1 if the weights underestimate the noise, for example of correlated pixels.
 

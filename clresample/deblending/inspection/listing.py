@@ -63,7 +63,7 @@ def unlisted(image):
     places = image.places[np.isfinite(image.places).all(axis=1)]
     if not image.inside.any():
         return []  # sources all lie outside, which is reported by itself
-    # what is masked may be as bright as anything
+    # masked pixels may be of any brightness
     smooth = np.where(image.usable.all(axis=0), image.smooth, np.inf)
     own = max(OWN_FWHM * image.width_px, OWN_PX)
     least = UNLISTED_PART * np.median(np.maximum(image.light[image.inside], 0))

@@ -41,7 +41,7 @@ class StartComponent:
 
 
 def renumbered(components) -> list[StartComponent]:
-    """Numbers components anew, in each scene from 0 on, in their order."""
+    """Renumbers components in their order, from 0 on in each scene."""
     count: dict[int, int] = {}
     out = []
     for c in components:
@@ -109,7 +109,7 @@ def _box_about(middle, half, frame):
 def profile_thresholds(brightness):
     """Parts of their peaks (n,) down to which profiles are drawn.
 
-    brightness (n,): these over the noise of a model pixel in the channel that sees each best.
+    brightness (n,): these over the noise of a model pixel, in the best channel of each.
     """
     return np.clip(EDGE_NOISE_FRACTION / np.maximum(brightness, 1e-30), FAINTEST, BRIGHTEST)
 

@@ -11,7 +11,7 @@ class SearchTile(NamedTuple):
     """One tile of the model's pixels.
 
     core: Box whose sources are this tile's; the cores of all tiles fill the field once
-    outer: Box that is searched, the core and what is around it
+    outer: Box that is searched, the core with a margin
     """
 
     number: int

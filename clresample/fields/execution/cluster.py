@@ -164,7 +164,7 @@ class _Run:
         """Future of a call on one worker and no other."""
         where = {"workers": [seat.address], "allow_other_workers": False, "pure": False}
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of the size of what is sent
+            warnings.simplefilter("ignore", UserWarning)  # about the size of sent data
             key = f"clresample{function.__name__}-{secrets.token_hex(8)}"
             return self.client.submit(function, *arguments, key=key, **where)
 

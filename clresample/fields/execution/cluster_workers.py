@@ -44,7 +44,7 @@ class ClusterWorkers:
     """All workers of a scheduler.
 
     client: distributed.Client; devices: dealt to the workers of each host by turns, empty = each
-    worker's own; limit_s [s]: longest time of a task; progress: told of workers that go
+    worker's own; limit_s [s]: longest time of a task; progress: gets messages on lost workers
     """
 
     def __init__(self, client, devices, limit_s, progress):

@@ -25,7 +25,7 @@ class SearchSetup:
     """Measurements that precede the search of a run.
 
     scatters {mosaic's name: scatters of its signal to noise}: see `snr_scatter`
-    devices: names of those asked for; memory [bytes]: of the smallest, for one group
+    devices: names of the requested ones; memory [bytes]: of the smallest, for one group
     """
 
     scatters: dict

@@ -29,7 +29,7 @@ class FieldFile:
     """A field file with its mosaics opened.
 
     mosaics: for `run_field`; options: of the file, without workers and memory
-    inputs: {what: file}; notes: what the user should know, a line each
+    inputs: {what: file}; notes: messages for the user, a line each
     """
 
     mosaics: tuple[Mosaic, ...]

@@ -8,7 +8,7 @@ NANOJANSKY, MICROJANSKY, NANOMAGGY = 31.4, 23.9, 22.5  # [mag] AB of one, to a m
 JANSKY = 8.90  # [mag] AB of one: -2.5 log10(3631)
 # cards that hold an AB zero point: Euclid's MER, DES, SWarp's users, HSC
 ZERO_POINTS = "MAGZERO", "MAGZPT", "MAGZP", "PHOTZP", "ZEROPNT", "MAG_ZERO"
-BIT_PREFIX = "MP_"  # of Rubin's and HSC's masks: MP_SAT = 1 says that bit 1 is SAT
+BIT_PREFIX = "MP_"  # of Rubin's and HSC's masks: MP_SAT = 1 means that bit 1 is SAT
 LAST_BIT = 62  # of masks, which are read as integers of 64 bits with a sign
 STERADIAN_ARCSEC2 = (180 / math.pi * 3600) ** 2
 
@@ -54,8 +54,8 @@ def saturation(header) -> float | None:
 def bit_names(header) -> dict[str, int]:
     """The bits of a mask by name, as its header has them.
 
-    MP_SAT = 1 says that bit 1 is SAT (Rubin, HSC); MSKN0001 = 'SAT' with MSKM0001 = 2, its power of
-    two, says the same (lsst.images).
+    MP_SAT = 1 means that bit 1 is SAT (Rubin, HSC); so does MSKN0001 = 'SAT' with MSKM0001 = 2, its
+    power of two (lsst.images).
     """
     names = {}
     for key in header:

@@ -33,7 +33,7 @@ def read_psf_keys(folder, table, grid, header, bands, inputs, notes):
     files = table["psf"] if isinstance(table["psf"], list) else [table["psf"]]
     found = []
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PSFWarning)  # said in the notes
+        warnings.simplefilter("ignore", PSFWarning)  # reported in the notes
         for k, one in enumerate(files):
             number = f" {k + 1}" if len(files) > 1 else ""
             inputs[f"PSF{number} of {name}"] = folder / one

@@ -40,8 +40,8 @@ class SceneFile:
     """A scene file with all its files read.
 
     observations, frame, settings: for `deblend`
-    sources: of the catalogue; None = detect them, with threshold [sigma] in so many passes
-    inputs: {what: file}, for provenance; notes: what the user should know, a line each
+    sources: of the catalogue; None = detect them, with threshold [sigma] and number of passes
+    inputs: {what: file}, for provenance; notes: messages for the user, a line each
     """
 
     observations: tuple[Observation, ...]
@@ -113,8 +113,8 @@ def _mosaic(folder, table, inputs, notes):
 def _observation(mosaic, table, calibrated):
     """The Observation of all of a Mosaic.
 
-    calibrated: whether all observations have zero points; else nobody's count, so that all fluxes
-        are in counts
+    calibrated: True if all observations have zero points; otherwise zero points are ignored, so
+        that all fluxes are in counts
     """
     box, channels = Box.of(mosaic.grid.shape), mosaic.channels
     given = {"noise": "estimate"} if table.get("noise") == "estimate" else {"noise": mosaic.noise}

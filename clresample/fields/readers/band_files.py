@@ -42,7 +42,7 @@ class ReaderOptions:
     background: "subtract", or "none" where it is subtracted already
     noise: "estimate" its correlation, or "white"
     saturation [counts]: one number or C of them
-    inputs {what: file}, notes: filled with the files, and with what the user should know
+    inputs {what: file}, notes: filled with the files, and with messages for the user
     """
 
     name: str | None = None

@@ -102,7 +102,7 @@ def _gwcs(hdus):
     try:
         # arrays of other HDUs stay unread: only the WCS is read, which contains its own numbers
         return asdf.open(io.BytesIO(hdus["ASDF"].data.tobytes())).tree["meta"]["wcs"], None
-    except Exception as error:  # of asdf, of tags that nothing installed knows
+    except Exception as error:  # asdf, or tags without an installed reader
         return None, f"its gwcs cannot be read ({' '.join(str(error).split()) or type(error)})"
 
 

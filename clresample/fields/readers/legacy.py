@@ -11,7 +11,7 @@ which the first image is read:
 
 Pixels of which every exposure of the band is masked (ALLMASK) or one is saturated (SATUR) are
 ignored, unless mask_bits are given. Without copsf the PSF is a Moffat profile with the widths of
-psfsize, which varies over the brick, and a note says so: give psf for a measured one.
+psfsize, which varies over the brick, with a note: pass psf for a measured one.
 
 Source: https://www.legacysurvey.org/dr10/files/ and /dr10/bitmasks/.
 """

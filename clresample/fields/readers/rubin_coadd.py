@@ -43,7 +43,7 @@ from .band_files import (
 )
 from .rubin_mask import rubin_mask
 
-READS = 1  # version of the schemas; a file whose tree asks for a higher one is refused
+READS = 1  # version of the schemas; a file that requires a higher one raises FileError
 NOISE = "NOISE_REALIZATIONS/"
 
 

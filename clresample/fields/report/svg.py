@@ -67,7 +67,7 @@ class ChartAxis:
 class Chart:
     """A chart to which marks are added; `svg` is its text.
 
-    x, y: ChartAxis; about: what it shows, for those who cannot see it; height [units]
+    x, y: ChartAxis; about: description for screen readers; height [units]
     """
 
     x: ChartAxis

@@ -68,7 +68,7 @@ class StructureOperator:
 
     buffers: the batch; its morph is overwritten by `form`, its d_morph by `gradient`
     prior: the MultiscalePrior; latents: the LatentLayout
-    energies (S, J): of the coefficients last asked for, on the device
+    energies (S, J): of the coefficients passed last, on the device
     """
 
     def __init__(self, buffers, prior):
