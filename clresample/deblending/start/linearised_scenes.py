@@ -78,6 +78,13 @@ class LinearisedScenes:
         if whiten:
             self.whiten()
 
+    def n_pixels(self) -> np.ndarray:
+        """Numbers (B,) of pixels with weight, all channels together."""
+        return sum(
+            np.array([np.count_nonzero(view.sqrt_weights) for view in sight.views])
+            for sight in self.sights
+        )
+
     def whiten(self):
         """Whitens the rendered images."""
         for sight in self.sights:
