@@ -1,4 +1,4 @@
-"""Chooses the profiles of large galaxies from a coarse grid, for a second start of least squares.
+"""Chooses the profiles of large galaxies from a coarse grid, for a second start.
 
 The first start is from the expected profiles, galaxies of a few pixels. If one galaxy of a scene is
 far larger, small profiles of all sources share its light at first, and each grows into it.
