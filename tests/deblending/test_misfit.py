@@ -140,7 +140,7 @@ def test_scatter_about_neighbours_is_that_of_white_noise_and_not_of_light():
 @pytest.mark.parametrize("sigma_px, misfit", [(3.0, True), (0, False)])
 @pytest.mark.parametrize("angle", [0, 25])
 def test_a_galaxy_given_as_a_point_is_a_misfit_and_a_star_is_none(device, sigma_px, misfit, angle):
-    """No pixel of its residual, filtered with the PSF, is significant, and chi2 is that of noise."""
+    """No pixel of its residual, filtered with the PSF, is significant."""
     objects = [((14.2, 17.1), (20, 14, 18), sigma_px)]
     images = scenes.observe(objects, noise=0.45, seed=4, angle=angle)
     point = PointSource(position_px=objects[0][0])

@@ -45,7 +45,7 @@ def profile_grid(looking, scenes, thetas, error) -> dict:
         parameters
     error: part of the light that adds to the noise
     """
-    here = np.flatnonzero(np.isin(looking.scene, scenes))
+    here = np.flatnonzero(np.isin(looking.scene, scenes)).tolist()
     going = [i for i in here if isinstance(looking.components[i].shape, GalaxyProfile)]
     going = [i for i in going if looking.components[i].shape.whole]
     if not going:

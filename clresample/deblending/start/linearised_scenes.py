@@ -80,10 +80,8 @@ class LinearisedScenes:
 
     def n_pixels(self) -> np.ndarray:
         """Numbers (B,) of pixels with weight, all channels together."""
-        return sum(
-            np.array([np.count_nonzero(view.sqrt_weights) for view in sight.views])
-            for sight in self.sights
-        )
+        weights = [[view.sqrt_weights for view in sight.views] for sight in self.sights]
+        return np.array([[np.count_nonzero(w) for w in own] for own in weights]).sum(axis=0)
 
     def whiten(self):
         """Whitens the rendered images."""
