@@ -18,20 +18,23 @@ SMALL = [
 
 @pytest.fixture
 def sized(device, monkeypatch):
-    """Sizes [ln px] that are expected of objects, those of the grid, and those of the start."""
-    kept = []
+    """Sizes [ln px] that are expected of objects, those of the grid, and those of the start.
 
-    def noted(fit, error):
-        kept.append([theta[0] for theta in fit.thetas()])
-        first_profiles(fit, error)
-        kept.append([theta[0] for theta in fit.thetas()])
+    Those of the grid are None if no scene is started again; `instead` takes the grid's place.
+    """
 
-    monkeypatch.setattr(profile_fit, "first_profiles", noted)
+    def sizes_of(objects, instead=first_profiles):
+        kept = []
 
-    def sizes_of(objects):
+        def noted(fit, scenes, error):
+            kept.append(np.array([theta[0] for theta in fit.thetas()]))
+            instead(fit, scenes, error)
+            kept.append(np.array([theta[0] for theta in fit.thetas()]))
+
+        monkeypatch.setattr(profile_fit, "first_profiles", noted)
         one = Fit(blend(objects, shape=(96, 96), seed=5), Settings(), device, np.float32, pad=1)
         start_fits([one])
-        return *map(np.array, kept), np.array([theta[0] for theta in one.start.thetas])
+        return *(kept or (None, None)), np.array([theta[0] for theta in one.start.thetas])
 
     return sizes_of
 
@@ -55,7 +58,19 @@ def test_of_two_giants_each_has_its_size(sized):
     np.testing.assert_allclose(found[[0, 2]], sizes, atol=0.1)
 
 
-def test_sizes_of_small_galaxies_are_left_alone(sized):
-    """Noise and neighbours are no reason for another size."""
-    before, first, _ = sized(SMALL)
-    np.testing.assert_array_equal(before, first)
+def test_small_galaxies_are_started_once(sized):
+    """Noise and neighbours are no reason for another start."""
+    _, first, found = sized(SMALL)
+    assert first is None
+    assert (found < np.log(1.5 * GROWTH)).all()
+
+
+def test_of_two_starts_the_better_fit_stays(sized):
+    """A grid that gives every galaxy the size of the giant changes nothing."""
+
+    def spoilt(fit, scenes, error):
+        fit.theta[scenes, :, 0] = np.log(100 * GIANT[2])
+
+    *_, found = sized([*SMALL[:2], GIANT], spoilt)
+    assert found[2] == pytest.approx(np.log(GIANT[2]), abs=0.1)
+    assert (found[:2] < np.log(1.5 * GROWTH)).all()

@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers import scenes
 from helpers.blends import blend, gaussian, observe, round_component
 
-from clresample import Flag, Grid, catalogue, summary
+from clresample import Flag, Grid, PointSource, catalogue, deblend, summary
 from clresample.deblending.assessment.misfit import chi2_excess, correlation_sum
 from clresample.deblending.assessment.status import with_misfit_status
-from clresample.deblending.posterior.residuals import fine_scatter
+from clresample.deblending.posterior.residuals import MISFIT_SIGMAS, fine_scatter
 
 GRID = Grid.flat((80, 84), 0.1)
 PLACES = (30, 28), (48, 55)
@@ -134,3 +135,16 @@ def test_scatter_about_neighbours_is_that_of_white_noise_and_not_of_light():
     assert fine_scatter(noise, used) == pytest.approx(2.5, rel=0.06)
     assert fine_scatter(noise + light, used) == pytest.approx(2.5, rel=0.06)
     assert fine_scatter(noise, used & (np.arange(60) < 5)) == 1
+
+
+@pytest.mark.parametrize("sigma_px, misfit", [(3.0, True), (0, False)])
+@pytest.mark.parametrize("angle", [0, 25])
+def test_a_galaxy_given_as_a_point_is_a_misfit_and_a_star_is_none(device, sigma_px, misfit, angle):
+    """No pixel of its residual, filtered with the PSF, is significant."""
+    objects = [((14.2, 17.1), (20, 14, 18), sigma_px)]
+    images = scenes.observe(objects, noise=0.45, seed=4, angle=angle)
+    point = PointSource(position_px=objects[0][0])
+    found = deblend(images, [point], frame=scenes.frame(), device=device)
+    assert found.converged and np.nanmax(found.misfit.residuals) < MISFIT_SIGMAS
+    assert flagged(found) == [misfit]
+    assert (found.misfit.wide_part[0] > 0.3) == misfit

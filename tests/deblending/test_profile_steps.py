@@ -31,6 +31,9 @@ class Valley:
     def solve(self, _error):
         self.spectra[self.scenes, 0] = self.now[self.scenes]
 
+    def n_pixels(self):
+        return np.full(self.n_scenes, np.inf)
+
     def rows_of(self, scenes):
         return np.searchsorted(self.scenes, scenes)
 
@@ -73,8 +76,8 @@ def test_profiles_step_to_the_bottom_and_stop_there(valley):
     np.testing.assert_allclose(fit.chi2, 100 + 1e4 * looking.goals**2)
     before = looking.n_looks.copy()
     fit.run()
-    np.testing.assert_allclose(fit.theta[:, 0, 0], looking.goals, atol=1e-3)
-    np.testing.assert_allclose(fit.chi2, 100, rtol=1e-3)
+    np.testing.assert_allclose(fit.theta[:, 0, 0], looking.goals, atol=0.01)  # chi2 of 1
+    np.testing.assert_allclose(fit.chi2, 100, atol=1)
     np.testing.assert_allclose(looking.spectra[:, 0], fit.theta[:, 0, 0])
     # 0.7, 0.7, 0.5 and what the damping left; a scene at its end tries until damping is too large
     assert (looking.n_looks - before)[0] < (looking.n_looks - before)[1] <= 6
@@ -83,36 +86,40 @@ def test_profiles_step_to_the_bottom_and_stop_there(valley):
 def test_a_step_that_gains_nothing_is_taken_back_and_damped(valley):
     """Equations that promise three times the way: 10 times more each time, then 3 times less."""
     fit, looking = valley([0.1], promise=3.0)
-    gains, real = [], fit._try
+    gains, real, damped, planned = [], fit._try, [], fit._next_step
 
-    def tried(scenes, damping, free):
-        gain, trial = real(scenes, damping, free)
-        gains.append((float(damping[0]), bool(gain[0] > 0), float(fit.theta[0, 0, 0])))
+    def plan(scenes, damping, free):
+        damped.extend(damping.tolist())
+        return planned(scenes, damping, free)
+
+    def tried(scenes, step):
+        gain, trial = real(scenes, step)
+        gains.append((bool(gain[0] > 0), float(fit.theta[0, 0, 0])))
         assert looking.spectra[0, 0] == (trial[0, 0, 0] if gain[0] > 0 else fit.theta[0, 0, 0])
         return gain, trial
 
-    fit._try = tried
+    fit._try, fit._next_step = tried, plan
     fit.run()
-    damped, gained, at = zip(*gains, strict=True)
+    gained, at = zip(*gains, strict=True)
     assert damped[:5] == pytest.approx([0.01, 0.1, 1, 1 / 3, 10 / 3])
     assert gained[:5] == (False, False, True, False, True)
     assert at[:4] == pytest.approx([0, 0, 0, 0.15]) and len(gains) <= 10
-    # equations are made anew where a step has gained, and another one follows it
-    assert gained[-1] and looking.n_slopes.tolist() == [1 + sum(gained[:-1])]
-    assert fit.chi2[0] == pytest.approx(100, abs=0.2)
+    # equations are made anew where a step has gained
+    assert looking.n_slopes.tolist() == [1 + sum(gained)]
+    assert fit.chi2[0] == pytest.approx(100, abs=1)
 
 
 def test_a_scene_ends_when_a_step_gains_chi2_of_one(valley):
-    """0.9 of 10,000, but not 1.15."""
+    """Or is expected to: 0.9 of 10,000 is not tried, 1.15 is."""
     fit, looking = valley([0.0095, 0.0108], rest=1e4)
     before = looking.n_looks.copy()
     fit.run()
-    assert (looking.n_looks - before).tolist() == [1, 2] and looking.n_slopes.tolist() == [1, 2]
+    assert (looking.n_looks - before).tolist() == [0, 1] and looking.n_slopes.tolist() == [1, 2]
 
 
 def test_a_scene_that_no_step_helps_is_left_when_damping_is_too_large(valley):
     """After six of them, ten times shorter each time, to a thousandth of the first way."""
-    fit, looking = valley([0.1], promise=-3.0)
+    fit, looking = valley([0.1], promise=3e3)
     before = looking.n_looks.copy()
     fit.run()
     assert (looking.n_looks - before).tolist() == [6] and not fit.theta.any()
@@ -124,7 +131,7 @@ def test_a_scene_that_no_step_helps_is_left_when_damping_is_too_large(valley):
     still.counts[:] = 0  # a scene without parameters
     before = seen.n_looks.copy()
     still.run()
-    assert (seen.n_looks == before).all() and far.n_looks[0] == 41
+    assert (seen.n_looks == before).all() and far.n_looks[0] == 40
 
 
 def test_profiles_end_between_the_data_and_what_is_expected(valley):

@@ -21,13 +21,17 @@ GRID = Grid.flat((60, 60), 0.1)
 def test_five_sigma_and_three_percent_in_any_channel_are_a_misfit():
     residuals = np.array([[4.99, np.nan], [5.01, 0], [1, 5.01], [np.nan, np.nan], [9, 1], [9, 9]])
     light = np.array([[9, 9], [3.01, 0], [9, 3.01], [9, 9], [2.99, 9], [2.99, 3.01]])
-    whole = np.zeros((2, 2))
+    whole, wide = np.zeros((2, 2)), np.zeros(len(light))
+    rest = np.full(light.shape, 100.0), whole, whole, whole, wide, wide
     none = np.full(residuals.shape, np.nan)
-    found = Misfit(residuals, none, none, light, np.full(light.shape, 100.0), whole, whole, whole)
+    found = Misfit(residuals, none, none, light, *rest)
     assert found.sources().tolist() == [False, True, True, False, False, True]
     excess = np.where(residuals > 5, residuals, np.nan)  # as well
-    found = Misfit(none, excess, none, light, np.full(light.shape, 100.0), whole, whole, whole)
+    found = Misfit(none, excess, none, light, *rest)
     assert found.sources().tolist() == [False, True, True, False, False, True]
+    around = np.array([4.99, 5.01, 9, 9, 0, 0]), np.array([9, 0.0301, 0.0299, 9, 9, 9])
+    found = Misfit(none, none, none, light, *rest[:4], *around)
+    assert found.sources().tolist() == [False, True, False, True, False, False]
 
 
 @pytest.mark.parametrize(

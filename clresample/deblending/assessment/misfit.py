@@ -8,6 +8,7 @@ import numpy as np
 
 from ...sky.noise import HALF_WIDTH
 from ..posterior.residuals import MIN_PIXELS, MISFIT_SIGMAS, remainder
+from .extended import extended_light
 
 # Fraction of a source's flux in a channel from which a significant residual is a misfit. Smaller
 # residuals are within three errors of bright galaxies, which are about 1 %
@@ -47,6 +48,7 @@ class Misfit:
     flux (S, C) [counts]: of the model, and at least its error at fixed morphology
     whole_excess, whole_chi2, whole_light (2, C): the same for the pixels of all sources together,
         and of all pixels of the channel on the frame
+    wide_sigma, wide_part (S,): of light around point sources, see `extended_light`
     """
 
     residuals: np.ndarray
@@ -57,18 +59,21 @@ class Misfit:
     whole_excess: np.ndarray
     whole_chi2: np.ndarray
     whole_light: np.ndarray
+    wide_sigma: np.ndarray
+    wide_part: np.ndarray
 
     def sigma(self) -> np.ndarray:
-        """The larger one of residuals and excess (S, C) [sigma], 0 where both are less."""
-        return np.maximum(np.nan_to_num(self.residuals), np.nan_to_num(self.excess))
+        """The largest one of residuals, excess and wide_sigma (S, C) [sigma], 0 or more."""
+        return np.maximum(self._own_sigma, self.wide_sigma[:, None])
 
     def fraction(self) -> np.ndarray:
         """Residual light over flux (S,), in the channel where it is largest.
 
         0 where no channel has over 5 sigma.
         """
-        part = np.where(self.sigma() > MISFIT_SIGMAS, self.light / self.flux, 0.0)
-        return part.max(axis=1, initial=0.0)
+        part = np.where(self._own_sigma > MISFIT_SIGMAS, self.light / self.flux, 0.0)
+        wide = np.where(self.wide_sigma > MISFIT_SIGMAS, self.wide_part, 0.0)
+        return np.maximum(part.max(axis=1, initial=0.0), wide)
 
     def sources(self) -> np.ndarray:
         """Selects misfitted sources (S,): over 5 sigma and over MISFIT_FRACTION of the flux."""
@@ -90,6 +95,10 @@ class Misfit:
         return bool(self._wrong[0].any())
 
     @property
+    def _own_sigma(self):
+        return np.maximum(np.nan_to_num(self.residuals), np.nan_to_num(self.excess))
+
+    @property
     def _significant(self):
         return self.whole_excess > MISFIT_SIGMAS
 
@@ -102,13 +111,14 @@ class Misfit:
 def misfit_of(result) -> Misfit:
     """Compares a fitted blend with its data."""
     n_sources, worst, rest = len(result.sources), [], []
-    for i in range(len(result.observations)):
-        left = remainder(result, i)
+    remainders = [remainder(result, i) for i in range(len(result.observations))]
+    for left in remainders:
         worst.append(left.worst(n_sources))
         rest += [_of_channel(left, c, n_sources) for c in range(len(left.filtered))]
     own = [np.stack(rows, axis=-1) for rows in zip(*rest, strict=True)]  # (S + 2, C)
-    given = np.concatenate(worst, axis=1), *(rows[:-2] for rows in own), _model_flux(result)
-    return Misfit(*given, *(rows[-2:] for rows in own))
+    fields = [np.concatenate(worst, axis=1), *(rows[:-2] for rows in own), _model_flux(result)]
+    fields += [*(rows[-2:] for rows in own), *extended_light(result, remainders)]
+    return Misfit(*fields)
 
 
 def _of_channel(rest, c, n_sources):

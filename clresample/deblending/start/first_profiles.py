@@ -1,8 +1,9 @@
-"""Chooses the profiles of large galaxies from a coarse grid, before least squares.
+"""Chooses the profiles of large galaxies from a coarse grid, for a second start.
 
-Least squares start from the expected profiles, galaxies of a few pixels. If one galaxy of a scene
-is far larger, small profiles of all sources share its light at first, and each grows into it.
-Therefore sizes GROWTH times apart, with the expected wings and with WIDE_WINGS, are compared by
+The first start is from the expected profiles, galaxies of a few pixels. If one galaxy of a scene is
+far larger, small profiles of all sources share its light at first, and each grows into it.
+Where one grew (profile_fit.MAX_GROWTH), sizes GROWTH times apart, with the expected wings and with
+WIDE_WINGS, are compared by
 
     gain_k = sum_c max(0, <u_k, r>)^2 / (|u_k|^2 + (NEIGHBOUR_MODEL_ERROR <u_k, M>)^2),
 
@@ -34,20 +35,22 @@ N_ROUNDS = 12
 NEED = 25.0
 
 
-def profile_grid(looking, thetas, error) -> dict:
+def profile_grid(looking, scenes, thetas, error) -> dict:
     """Parameters of galaxies that may be larger than expected: {component: [theta, ...]}.
 
     A larger profile enters if the light around the source is more significant with its weights than
     with those of the profile before, by over NEED.
 
-    looking: LinearisedScenes that are solved at `thetas` (N), the expected parameters
+    looking: LinearisedScenes of which `scenes` (k,) are solved at `thetas` (N), the expected
+        parameters
     error: part of the light that adds to the noise
     """
-    going = [i for i, c in enumerate(looking.components) if isinstance(c.shape, GalaxyProfile)]
+    here = np.flatnonzero(np.isin(looking.scene, scenes)).tolist()
+    going = [i for i in here if isinstance(looking.components[i].shape, GalaxyProfile)]
     going = [i for i in going if looking.components[i].shape.whole]
     if not going:
         return {}
-    before = dict(enumerate(_significance(looking, looking.sky, error)))
+    before = dict(zip(here, _significance(looking, looking.sky, error)[here], strict=True))
     grid: dict[int, list] = {}
     while going:
         sizes = {i: grid.get(i, [thetas[i]])[-1][0] + np.log(GROWTH) for i in going}
@@ -65,13 +68,13 @@ def profile_grid(looking, thetas, error) -> dict:
     return grid
 
 
-def first_profiles(fit, error):
-    """Sets the parameters of large galaxies of a ProfileFit, which are at their means.
+def first_profiles(fit, scenes, error):
+    """Sets the parameters of large galaxies in some scenes (k,) of a ProfileFit.
 
-    error: part of the light that adds to the noise
+    fit: solved at its means in these scenes; error: part of the light that adds to the noise
     """
     looking, thetas = fit.looking, fit.thetas()
-    grid = profile_grid(looking, thetas, error)
+    grid = profile_grid(looking, scenes, thetas, error)
     scenes = np.unique(looking.scene[list(grid)])
     # sources without wider light around them are included from the start
     models = {i: thetas[i] for i in np.flatnonzero(np.isin(looking.scene, scenes)) if i not in grid}

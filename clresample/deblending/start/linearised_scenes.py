@@ -78,6 +78,11 @@ class LinearisedScenes:
         if whiten:
             self.whiten()
 
+    def n_pixels(self) -> np.ndarray:
+        """Numbers (B,) of pixels with weight, all channels together."""
+        weights = [[view.sqrt_weights for view in sight.views] for sight in self.sights]
+        return np.array([[np.count_nonzero(w) for w in own] for own in weights]).sum(axis=0)
+
     def whiten(self):
         """Whitens the rendered images."""
         for sight in self.sights:

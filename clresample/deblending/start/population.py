@@ -65,19 +65,20 @@ class PopulationPrior:
 
     mean, scatter (B, n, p): of their parameters, 0 and 1 where there are none
     contamination (B, n): 1 + E^2, see the module's text
+    galaxies (B, n): bool, of which there are galaxies
     """
 
     def __init__(self, shapes, scene, index, n_scenes, n_most, n_parameters):
         size = n_scenes, n_most, n_parameters
         self.mean, self.scatter = np.zeros(size), np.ones(size)
         self.contamination = np.ones(size[:2])
-        self._galaxies, self._known = np.zeros((2, *size[:2]), bool)
+        self.galaxies, self._known = np.zeros((2, *size[:2]), bool)
         for b, i, shape in zip(scene, index, shapes, strict=True):
             n = len(shape.mean)
             self.mean[b, i, :n], self.scatter[b, i, :n] = shape.mean, shape.scatter
-            self._galaxies[b, i] = isinstance(shape, GalaxyProfile)
+            self.galaxies[b, i] = isinstance(shape, GalaxyProfile)
             # components of one source differ by more than galaxies
-            self._known[b, i] = self._galaxies[b, i] and shape.whole
+            self._known[b, i] = self.galaxies[b, i] and shape.whole
         self._before = self.mean[..., LEARNED]
         self._common, self._own = (
             np.zeros((n_scenes, len(GALAXY_SCATTER))),
@@ -85,21 +86,26 @@ class PopulationPrior:
         )
         self._several = self._known.sum(1) >= MIN_GALAXIES
 
+    def reset(self, scenes, other):
+        """Takes over the prior of some scenes of another one, for the same components."""
+        for name in ("mean", "scatter", "contamination", "_common", "_own"):
+            getattr(self, name)[scenes] = getattr(other, name)[scenes]
+
     def set_contamination(self, scenes, found):
         """Stores the contamination of shapes of some scenes, (k, n) of `contamination_factors`."""
-        self.contamination[scenes] = np.where(self._galaxies[scenes], found, 1)
+        self.contamination[scenes] = np.where(self.galaxies[scenes], found, 1)
 
     def precision(self, scenes, theta):
         """Precisions (k, n, p) of the prior on the parameters (B, n, p) of some scenes."""
         weight = 1 / (1 + self._away(scenes, theta) / TAILS)
-        weight = np.where(self._galaxies[scenes][..., None], weight, 1)
+        weight = np.where(self.galaxies[scenes][..., None], weight, 1)
         return self.contamination[scenes][..., None] * weight / np.square(self.scatter[scenes])
 
     def penalty(self, scenes, theta):
         """Term added to chi2 (k,) of some scenes; theta (B, n, p)."""
         away = self._away(scenes, theta)
         tail = TAILS * np.log1p(away / TAILS)
-        pulled = np.where(self._galaxies[scenes][..., None], tail, away)
+        pulled = np.where(self.galaxies[scenes][..., None], tail, away)
         return (self.contamination[scenes][..., None] * pulled).sum(axis=(1, 2))
 
     def _away(self, scenes, theta):
