@@ -12,7 +12,7 @@ before it, and M are these models. The term with M allows for their error, NEIGH
 their light (population.py), so that a small neighbour does not fit that error. The source with the
 largest gain comes first, with its best profile, whose shape is then fitted. The source with the
 largest gain in the residuals is next, and so on: the result does not depend on the order of the
-    list.
+list.
 """
 
 from __future__ import annotations
