@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...sky.footprint import unobserved
 from ..profiles import GalaxyProfile
 
 # Part of a flux that is outside where light is said to reach the edge: three errors of a bright
@@ -34,7 +33,7 @@ def light_outside(result, shapes, thetas, positions, peaks) -> np.ndarray:
         before they were scaled to a maximum of 1, where those of the profiles are 1
     """
     found = np.zeros((len(result.sources), len(result.channels)))
-    outside = unobserved(result.footprints, result.frame.shape)
+    outside = result.unobserved
     observed = ~outside[1:-1, 1:-1]
     for i, c in enumerate(result.components):
         (y, x), (n_y, n_x) = c.origin, c.morphology.shape
@@ -50,7 +49,7 @@ def light_outside(result, shapes, thetas, positions, peaks) -> np.ndarray:
 
 
 def continued(origin, morphology, centre, outside) -> float:
-    """Sum of a morphology (ny, nx) where its frame was not observed; outside: see `unobserved`.
+    """Sum of a morphology (ny, nx) where its frame was not observed; outside: `Result.unobserved`.
 
     Its elliptical rings about the centre (2,) [frame px] have their mean brightness outside too;
     from where less than a fifth of a ring was observed it goes on as an exponential, with the slope
