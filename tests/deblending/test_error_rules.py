@@ -201,6 +201,7 @@ def made_up(rng, *, fixed=(), n_common=2):
     for i in range(len(nodes)):
         for j in range(i, len(nodes)):
             made.covariance.block(i, j)[:] = dense[ends[i] : ends[i + 1], ends[j] : ends[j + 1]]
+    made.factor = SimpleNamespace(inverse=lambda: made.covariance)
     made.released = [1e-4 * rng.normal(size=k) for k in nodes]
     made.solution = SimpleNamespace(
         spectra=rng.uniform(5, 9, (3, n_channels)),
