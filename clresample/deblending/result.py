@@ -242,7 +242,7 @@ class Result(ResultDisplay):
         return drawn_fluxes(self, n, np.random.default_rng(rng))
 
 
-# Of a Result's cached properties, those that follow from neither status, messages, errors nor draws.
+# Cached properties of a Result that do not depend on its status, messages, errors or draws.
 _DERIVED = "footprints", "unobserved", "misfit"
 
 
