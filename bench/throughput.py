@@ -13,7 +13,8 @@ wall_s              of the whole: set-up, fit, errors, result, catalogue
 galsim_ms           processor time of one GalSim quintic render of one band, EUCLID -> RUBIN at
                     N = 118, as a clock: median of renders before and after
 renders_per_source  core_s_per_source in such renders
-stage               seconds of wall time by stage, as results have them, and of catalogues
+stage               seconds of wall time by stage, as results have them, and of catalogues; of
+                    results that threads make side by side, those of each
 peak_gb             largest memory of the process so far, all included; before the row: base_gb
 status              share of converged fits; of a blend how it ended, or why it did not
 """

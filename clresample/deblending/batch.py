@@ -12,7 +12,13 @@ import numpy as np
 
 from ..device.device import get_device
 from ..device.discovery import DeviceError
-from ..device.multi_device import distribute, one_blas_thread, prefetch
+from ..device.multi_device import (
+    distribute,
+    host_threads,
+    iterate_threads,
+    one_blas_thread,
+    prefetch,
+)
 from ..device.tuning import Tuning
 from ..drawing.bar import ProgressBar
 from ..sky.observation import as_observations
@@ -260,11 +266,10 @@ class _BatchRunner:
                 if item[1].status == INTERRUPTED:
                     return
             return
-        for (i, _), fit, own in zip(group, fits, seen, strict=True):
-            try:
-                yield i, fit.result(own)
-            except Exception as error:
-                yield i, _failure(fit.blend, error)
+        pairs = zip(fits, seen, strict=True)
+        results = iterate_threads(host_threads(self.device), _result_or_failure, pairs)
+        with contextlib.closing(results):
+            yield from zip((i for i, _ in group), results, strict=True)
 
 
 def _checked(settings, dtype):
@@ -280,6 +285,15 @@ def _listed(name, values):
         return tuple(values)
     except TypeError:
         raise ValueError(f"{name} is {described(values)}, must be a sequence") from None
+
+
+def _result_or_failure(pair):
+    """The Result of a Fit and its RenderedModel, or a Failure."""
+    fit, seen = pair
+    try:
+        return fit.result(seen)
+    except Exception as error:
+        return _failure(fit.blend, error)
 
 
 def _failure(blend, error):

@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 
+from ..device.multi_device import host_threads, map_threads
 from .blend import STOPPED_FOR_REFIT
 from .posterior.joint_step import make_joint_step, solve_joint_step
 from .resize import resize_boxes
@@ -273,11 +274,7 @@ class _LbfgsRun:
         for i in np.flatnonzero(which & failed):
             self.exchanges[i] = None
         if new.any():
-            states, findings = engine.states(), engine.findings(new)
-            for i in np.flatnonzero(new):
-                given = engine.scenes[i], states[i], findings[i]
-                with contextlib.suppress(np.linalg.LinAlgError):
-                    self.exchanges[i] = make_joint_step(self.fits[i], *given)
+            self._make_joint_steps(new)
         which &= np.array([e is not None for e in self.exchanges])
         slopes, steps = engine.slopes(which) if which.any() else (), {}
         for i in np.flatnonzero(which):
@@ -288,6 +285,17 @@ class _LbfgsRun:
                 steps[i], self.asked[i, 2] = step, gain
         if steps:
             engine.step(steps)
+
+    def _make_joint_steps(self, new):
+        """Makes the joint steps of the fits `new` (B,), several at a time."""
+        states, findings = self.engine.states(), self.engine.findings(new)
+
+        def make(i):
+            with contextlib.suppress(np.linalg.LinAlgError):
+                given = self.engine.scenes[i], states[i], findings[i]
+                self.exchanges[i] = make_joint_step(self.fits[i], *given)
+
+        map_threads(host_threads(self.device), make, np.flatnonzero(new))
 
     def settle(self, stop):
         """Stores the present state of the fits (B,) that stop here."""

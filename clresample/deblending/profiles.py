@@ -70,10 +70,11 @@ def galaxy_reach(parameters, psf_moment, threshold):
     return np.sqrt(q[:, None] * np.diagonal(c, axis1=1, axis2=2))
 
 
-def profile(parameters, position, shape, psf_moment, *, slopes=True):
+def profile(parameters, position, shape, psf_moment, *, slopes=True, moved=False):
     """Profile of unit integral and its derivatives by (ln sigma, g1, g2, ln beta), (5, ny, nx).
 
-    The profile alone (1, ny, nx) without `slopes`.
+    The profile alone (1, ny, nx) without `slopes`; if `moved`, those by the position (y, x) [px]
+    too, (7, ny, nx).
     """
     c, by_parameter = covariance(parameters, psf_moment)
     inverse, beta = np.linalg.inv(c), np.exp(parameters[3])
@@ -81,16 +82,21 @@ def profile(parameters, position, shape, psf_moment, *, slopes=True):
     dy = dy[:, None]
     u, v = (inverse[i, 0] * dy + inverse[i, 1] * dx for i in (0, 1))  # C^-1 x
     q = dy * u + dx * v
-    s = np.exp(-(beta + 1) * np.log1p(q / (2 * beta))) / (2 * np.pi * np.sqrt(np.linalg.det(c)))
+    log = np.log1p(q / (2 * beta))
+    s = np.exp(-(beta + 1) * log) / (2 * np.pi * np.sqrt(np.linalg.det(c)))
     if not slopes:
         return s[None]
     fall = (beta + 1) / (2 * beta + q)  # - d ln S / dq
-    out = [s]
-    for dc in by_parameter:
-        dq = -(dc[0, 0] * u**2 + 2 * dc[0, 1] * u * v + dc[1, 1] * v**2)
-        out.append(-s * (fall * dq + 0.5 * np.trace(inverse @ dc)))
-    out.append(s * (q * fall - beta * np.log1p(q / (2 * beta))))
-    return np.array(out)
+    out = np.empty((7 if moved else 5, *q.shape))
+    out[0] = s
+    squares = np.stack([u * u, 2 * u * v, v * v]).reshape(3, -1)
+    by_q = by_parameter[:, [0, 0, 1], [0, 1, 1]] @ squares  # - dq
+    np.multiply(s * fall, by_q.reshape(3, *q.shape), out=out[1:4])
+    out[1:4] -= 0.5 * np.trace(inverse @ by_parameter, axis1=1, axis2=2)[:, None, None] * s
+    out[4] = s * (q * fall - beta * log)
+    if moved:
+        np.multiply(2 * s * fall, (u, v), out=out[5:])
+    return out
 
 
 @functools.lru_cache(maxsize=N_OTFS)
@@ -177,9 +183,9 @@ class GalaxyProfile(ComponentProfile):
         self.mean = np.array([size, 0, 0, np.log(WINGS)])
         self.scatter = np.array([SIZE_SCATTER, *[ELLIPTICITY_SCATTER] * 2, WINGS_SCATTER])
 
-    def draw(self, theta, position, shape=None):
-        """The profile and its four slopes, (5, Ny, Nx)."""
-        return profile(theta, position, shape or self.shape, self.psf_moment)
+    def draw(self, theta, position, shape=None, *, moved=False):
+        """The profile and its four slopes (5, Ny, Nx), if `moved` those by the position too."""
+        return profile(theta, position, shape or self.shape, self.psf_moment, moved=moved)
 
     def draw_box(self, theta, position, origin, size, *, slopes=True):
         """The same in a box of the frame."""
@@ -190,14 +196,6 @@ class GalaxyProfile(ComponentProfile):
         """Its ellipse where the profile falls to the threshold."""
         half = galaxy_reach(np.array([theta]), self.psf_moment[None], np.array([threshold]))
         return position, half[0]
-
-    def position_derivatives(self, theta, position, image):
-        """Slopes (2, ny, nx) of the drawn `image` by the position (y, x) [px]."""
-        inverse, beta = np.linalg.inv(covariance(theta, self.psf_moment)[0]), np.exp(theta[3])
-        dy, dx = (np.arange(n) - p for n, p in zip(image.shape, position, strict=True))
-        along = np.tensordot(inverse, np.stack(np.broadcast_arrays(dy[:, None], dx)), 1)
-        q = dy[:, None] * along[0] + dx * along[1]
-        return 2 * image * (beta + 1) / (2 * beta + q) * along
 
 
 class FixedProfile(ComponentProfile):

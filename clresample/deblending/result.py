@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from ..drawing.display import ResultDisplay
-from ..sky.footprint import Footprint
+from ..sky.footprint import Footprint, unobserved
 from ..sky.frame import Frame
 from ..sky.observation import Observation, observation_index
 from ..sky.sources import Source
@@ -112,6 +112,11 @@ class Result(ResultDisplay):
             Footprint(o, o.grid.map_to(self.frame.grid), np.asarray(shift, np.float64))
             for o, shift in zip(self.observations, self.shifts, strict=True)
         )
+
+    @cached_property
+    def unobserved(self) -> np.ndarray:
+        """Unobserved pixels (Ny + 2, Nx + 2) bool of the frame and its border."""
+        return unobserved(self.footprints, self.frame.shape)
 
     @cached_property
     def misfit(self) -> Misfit:
@@ -240,9 +245,12 @@ class Result(ResultDisplay):
         return drawn_fluxes(self, n, np.random.default_rng(rng))
 
 
+# Cached properties of a Result that do not depend on its status, messages, errors or draws.
+_DERIVED = "footprints", "unobserved", "misfit"
+
+
 def noted(result, **given) -> Result:
-    """A copy with another status, other messages, errors or draws, and the same misfit."""
+    """A copy with another status, other messages, errors or draws, and what was derived before."""
     copy = replace(result, **given)
-    if "misfit" in vars(result):
-        vars(copy)["misfit"] = result.misfit
+    vars(copy).update((name, vars(result)[name]) for name in _DERIVED if name in vars(result))
     return copy

@@ -80,15 +80,22 @@ def host_threads(device):
 
 
 def map_threads(n_threads, function, items):
-    """[function(item), ...] of items, in their order, a number at a time.
+    """[function(item), ...] of items, in their order; see `iterate_threads`."""
+    return list(iterate_threads(n_threads, function, items))
 
-    For functions that spend their time in large NumPy products, which release Python's lock.
+
+def iterate_threads(n_threads, function, items):
+    """Yields function(item) of items, in their order, while others are computed in threads.
+
+    For calls that spend their time in NumPy's loops over large arrays, for which other threads need
+    not wait. Items that are not begun when the iterator is closed are left out.
     """
     items = list(items)
     if min(n_threads, len(items)) < 2:
-        return [function(item) for item in items]
+        yield from map(function, items)
+        return
     with ThreadPoolExecutor(min(n_threads, len(items))) as pool:
-        return list(pool.map(function, items))
+        yield from pool.map(function, items)
 
 
 def prefetch(items):

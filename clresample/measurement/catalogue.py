@@ -302,7 +302,7 @@ def _flags(result, flux, error, positions, footprints):
         flags[fitted & held & ~footprint.weighted(positions).all(axis=0)] |= Flag.CENTER_MASKED
     flags[masked_cores(result, positions)] |= Flag.SATURATED
     flags[reaches_outside(result, flux)] |= Flag.EDGE
-    edge = coverage_border(footprints, result.frame.shape)
+    edge = coverage_border(result.unobserved)
     for c in result.components:
         (y, x), (n_y, n_x) = c.origin, c.morphology.shape
         bright = c.morphology > EDGE_LIGHT * c.morphology.max(initial=0.0)

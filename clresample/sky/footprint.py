@@ -71,12 +71,12 @@ class Footprint:
         return held, np.stack([np.clip(y, 0, last_y), np.clip(x, 0, last_x)]).astype(int)
 
 
-def coverage_border(footprints, shape) -> np.ndarray:
+def coverage_border(outside) -> np.ndarray:
     """Pixels (Ny, Nx) bool of the frame from which light may leave the observed area.
 
-    Those on the frame's edge, those of `unobserved`, and the neighbours of these.
+    Those on the frame's edge, those outside, and the neighbours of these; outside: `unobserved`.
     """
-    return ndimage.binary_dilation(unobserved(footprints, shape), NEIGHBOURS)[1:-1, 1:-1]
+    return ndimage.binary_dilation(outside, NEIGHBOURS)[1:-1, 1:-1]
 
 
 def unobserved(footprints, shape) -> np.ndarray:

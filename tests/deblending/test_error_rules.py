@@ -201,6 +201,8 @@ def made_up(rng, *, fixed=(), n_common=2):
     for i in range(len(nodes)):
         for j in range(i, len(nodes)):
             made.covariance.block(i, j)[:] = dense[ends[i] : ends[i + 1], ends[j] : ends[j + 1]]
+    made.inverted = []  # each time that its factor is
+    made.factor = SimpleNamespace(inverse=lambda: made.inverted.append(1) or made.covariance)
     made.released = [1e-4 * rng.normal(size=k) for k in nodes]
     made.solution = SimpleNamespace(
         spectra=rng.uniform(5, 9, (3, n_channels)),
@@ -287,10 +289,12 @@ def test_errors_follow_from_the_covariance_of_all_unknowns():
             np.testing.assert_allclose(errors.moment_bound_bias[s], by @ released, rtol=1e-4)
     assert np.isnan(errors.moments[0]).all() and not errors.moment_bound_bias[0].any()
     ends = np.cumsum([0, *made.layout.sizes])
+    assert len(errors.morphology) == 3 and not made.inverted
     for i, modes in enumerate(made.modes):
         block = covariance[ends[i] : ends[i] + len(modes), ends[i] : ends[i] + len(modes)]
         wanted = np.sqrt(np.einsum("kyx,kl,lyx->yx", modes, block, modes))
         np.testing.assert_allclose(errors.morphology[i], wide[OWNER[i]] * wanted, rtol=1e-5)
+    assert len(made.inverted) == 1  # when the first one was read, for all
     np.testing.assert_array_equal(errors.outside_box_moments, [far.sums for far in made.beyond])
 
 

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.blends import SCALE, blend, gaussian, observe
+from helpers.blends import SCALE, blend, gaussian, observe, one_source
 
 from clresample.deblending.assessment.edge import continued, light_outside, reaches_outside, widened
 from clresample.deblending.posterior.errors import Errors
 from clresample.deblending.profiles import GalaxyProfile
-from clresample.deblending.result import Component
+from clresample.deblending.result import Component, noted
 from clresample.measurement.catalogue import Flag, catalogue
 from clresample.sky.frame import Frame
 from clresample.sky.grid import Grid
@@ -106,3 +106,12 @@ def test_noise_at_the_edge_is_no_light_there():
     errors = widened(errors_of(result, 1.0), light_outside(result, *given))
     noisy = replace(result, errors=errors, covariance=np.full((2, 1, 1), 1e4))
     assert not reaches_outside(noisy, np.array([c.flux for c in result.components])).any()
+
+
+def test_copies_of_a_result_keep_what_was_derived_from_its_model():
+    """Where its pixels lie, what was not observed, and its misfit; nothing is derived for them."""
+    result = one_source()
+    footprints, outside = result.footprints, result.unobserved
+    copy = noted(result, status="misfit")
+    assert copy.status == "misfit" and copy.footprints is footprints
+    assert copy.unobserved is outside and "misfit" not in vars(copy)

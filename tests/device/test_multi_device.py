@@ -15,6 +15,7 @@ from clresample.device.device_cache import DeviceWarning
 from clresample.device.multi_device import (
     _WorkQueue,
     distribute,
+    iterate_threads,
     map_threads,
     one_blas_thread,
     prefetch,
@@ -175,6 +176,20 @@ def test_threads_give_what_each_item_gives_in_order(n_threads):
     assert max(most) == n_threads and map_threads(n_threads, square, []) == []
     with pytest.raises(ZeroDivisionError):
         map_threads(n_threads, lambda i: 1 / i, [1, 0, 2])
+
+
+def test_items_that_no_thread_has_begun_are_left_out_once_nobody_asks():
+    begun, gate = [], threading.Event()
+
+    def wait(i):
+        begun.append(i)
+        gate.wait(0.05 * (i > 0))
+        return i
+
+    results = iterate_threads(2, wait, range(100))
+    assert next(results) == 0
+    results.close()
+    assert len(begun) < 100
 
 
 def test_the_host_has_as_many_threads_as_its_processor_may_use(monkeypatch):

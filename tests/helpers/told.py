@@ -7,6 +7,8 @@ import numpy as np
 from clresample.deblending import iterate as room
 from clresample.deblending.blend import INTERRUPTED
 
+CPU = SimpleNamespace(kind="CPU", compute_units=1)
+
 
 class Told(SimpleNamespace):
     """A fit that notes what is done with it."""
@@ -60,7 +62,7 @@ def learning(n_rounds, *, live=None, converged=None, failed=None, **settings):
         **({"max_iter": 100, "fit_shifts": False, "loss_tol": 0.5} | settings)
     )
     past = engine, [None] * n, np.tile([0, np.inf, 0, 0], (n, 1))
-    return room._LbfgsRun([Told(c) for c in "abc"[:n]], settings, None, None, past)
+    return room._LbfgsRun([Told(c) for c in "abc"[:n]], settings, CPU, None, past)
 
 
 def named(name, status="converged", shifts=0.0, of=None):

@@ -31,4 +31,4 @@ def test_locate_inverts_the_mapping_of_a_distorted_image():
 def test_the_open_edge_of_a_frame_that_is_all_seen_is_its_border():
     expected = np.ones((60, 70), bool)
     expected[1:-1, 1:-1] = False
-    np.testing.assert_array_equal(coverage_border(one_source().footprints, (60, 70)), expected)
+    np.testing.assert_array_equal(coverage_border(one_source().unobserved), expected)

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...sky.footprint import unobserved
 from ..profiles import GalaxyProfile
 
 # Fraction of a flux outside the observed area from which a source is flagged: three errors of a
@@ -34,7 +33,7 @@ def light_outside(result, shapes, thetas, positions, peaks) -> np.ndarray:
         before they were scaled to a maximum of 1, where those of the profiles are 1
     """
     found = np.zeros((len(result.sources), len(result.channels)))
-    outside = unobserved(result.footprints, result.frame.shape)
+    outside = result.unobserved
     observed = ~outside[1:-1, 1:-1]
     for i, c in enumerate(result.components):
         (y, x), (n_y, n_x) = c.origin, c.morphology.shape
@@ -50,7 +49,7 @@ def light_outside(result, shapes, thetas, positions, peaks) -> np.ndarray:
 
 
 def continued(origin, morphology, centre, outside) -> float:
-    """Sum of a morphology (ny, nx) where its frame was not observed; outside: see `unobserved`.
+    """Sum of a morphology (ny, nx) where its frame was not observed; outside: `Result.unobserved`.
 
     Elliptical rings around the centre (2,) [frame px] are assumed to have the same mean brightness
     outside. From the radius where less than a fifth of a ring was observed, the profile is

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg.blas import strmm
 
 from ..solver.rendering.ties import Ties
-from .block_matrix import BlockCholesky
+from .block_matrix import RIDGE, BlockCholesky
 
 # Number of draws for the errors of cutouts, and their seed. Standard deviations have a relative
 # error of 1 / sqrt(2 N) = 0.09; the time is proportional to the number.
@@ -30,7 +32,7 @@ class Errors:
         (yy, yx, xx), its components weighted by their light as in the catalogue; NaN if not fitted:
         all for stars at a fixed position, the second moments for free ones
     morphology (n): arrays (ny, nx) [1]: standard deviation of each component's morphology, at a
-        fixed projection onto its smooth profile
+        fixed projection onto its smooth profile; MorphologyErrors, computed when first read
     outside_box_moments (n, 6) [1, px, px^2]: a contribution to fluxes and moments, not an error:
         the sums of each component's smooth profile beyond its box, times 1, y, x, y y, y x, x x of
         the frame, if the morphology has its maximum 1
@@ -45,7 +47,7 @@ class Errors:
     flux: np.ndarray
     colour: np.ndarray
     moments: np.ndarray
-    morphology: tuple[np.ndarray, ...]
+    morphology: Sequence[np.ndarray]
     outside_box_moments: np.ndarray
     flux_bound_bias: np.ndarray
     moment_bound_bias: np.ndarray
@@ -103,3 +105,41 @@ class PosteriorSampler:
     def _spectra(self, values):
         """Spectra (..., C) [counts] of values (..., B) of the bands."""
         return (values if self.ties is None else self.ties.spread(values)) * self.unit
+
+
+class MorphologyErrors(Sequence):
+    """Standard deviations of morphologies, n arrays (ny, nx), computed when one is first read.
+
+    A catalogue reads none, and they take a tenth of the time of all errors.
+
+    draws: PosteriorSampler
+    """
+
+    def __init__(self, draws: PosteriorSampler):
+        self._draws = draws
+
+    def __len__(self):
+        return len(self._draws.modes)
+
+    def __getitem__(self, i):
+        return self._maps[i]
+
+    @cached_property
+    def _maps(self):
+        draws, covariance = self._draws, self._draws.factor.inverse()
+        return tuple(
+            wide * _standard_deviation(images, covariance.block(i, i)[: len(images), : len(images)])
+            for i, (images, wide) in enumerate(zip(draws.modes, draws.misfit_scale, strict=True))
+        )
+
+
+def _standard_deviation(images, covariance):
+    """Standard deviation (ny, nx) of a sum of images (k, ny, nx); covariance (k, k) of factors."""
+    k, shape = len(images), images.shape[1:]
+    if not k:
+        return np.zeros(shape)
+    ridge = np.diag(RIDGE * np.diag(covariance))  # more than its rounding
+    root = np.linalg.cholesky(covariance + ridge).astype(np.float32)
+    # the transpose, since BLAS counts rows first
+    turned = strmm(1.0, root, images.reshape(k, -1).T, side=1, lower=1)
+    return np.sqrt(np.square(turned, out=turned).sum(1)).astype(float).reshape(shape)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg.blas import strmm
 
 from ...sky.extent import intersect_boxes
 from ..solver.multiscale.prior import MultiscalePrior
@@ -153,9 +154,10 @@ class Solution:
         seen = np.empty((1 + n_own + len(images), *profile.shape), np.float32)
         seen[0], out = flush_faint(self.morphs[i].copy()), seen[1:]
         if n_own:
-            flat = bumps.images.reshape(len(bumps.images), profile.size)
-            flat = flat if len(keep) == len(flat) else flat[keep]
-            np.matmul(own.astype(np.float32), flat, out=out[:n_own].reshape(n_own, -1))
+            np.take(bumps.images, keep, axis=0, out=out[:n_own])
+            flat = out[:n_own].reshape(n_own, -1)
+            # the transpose, since BLAS counts rows first; in place
+            strmm(1.0, own.astype(np.float32).T, flat.T, side=1, overwrite_b=1)
         out[n_own:] = flush_faint(scatter[:, None, None] * images)
         far = far.with_gauge(self.along(i, out) * self.peaks[i])
         return seen, far, self._held(i, out)

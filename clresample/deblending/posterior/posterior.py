@@ -5,16 +5,15 @@ from __future__ import annotations
 import time
 
 import numpy as np
-from scipy.linalg.blas import strmm
 
 from ..assessment.cores import core_errors, with_core_errors
 from ..assessment.edge import light_outside, widened
 from ..assessment.status import with_misfit_status
 from ..result import noted
 from .aligned_observation import align_observations
-from .block_matrix import RIDGE, BlockCholesky
+from .block_matrix import BlockCholesky
 from .bound_bias import negative_chi2_gradient
-from .errors import Errors, PosteriorSampler
+from .errors import Errors, MorphologyErrors, PosteriorSampler
 from .modes import FLOOR_EXPONENT, Solution, clipped_power
 from .moments import moment_derivatives
 from .normal import UnknownLayout, normal_matrix
@@ -114,7 +113,7 @@ class Posterior:
             between * scale.T[:, :, None] * scale.T[:, None],
             colour * scale[:, :, None] * scale[:, None],
             moments * wide[:, None, None] ** 2,
-            tuple(w * self._map(i) for i, w in enumerate(wide[owner])),
+            MorphologyErrors(self.draws(owner, residuals, unit)),
             np.array([far.sums for far in self.beyond]),
             released * unit,
             moved,
@@ -175,19 +174,6 @@ class Posterior:
                 moved[source, 2:] = 0
             out[source] = covariance
         return out, moved
-
-    def _map(self, i):
-        """Standard deviation (ny, nx) of component i's morphology."""
-        images = self.modes[i]
-        k = len(images)
-        if not k:
-            return np.zeros(self.solution.morphs[i].shape)
-        covariance = self.covariance.block(i, i)[:k, :k]
-        ridge = np.diag(RIDGE * np.diag(covariance))  # larger than its rounding errors
-        root = np.linalg.cholesky(covariance + ridge).astype(np.float32)
-        # the transpose, since BLAS counts rows first
-        turned = strmm(1.0, root, images.reshape(k, -1).T, side=1, lower=1)
-        return np.sqrt(np.square(turned, out=turned).sum(1)).astype(float).reshape(images.shape[1:])
 
 
 def with_errors(fit, result, peaks, seen):

@@ -51,14 +51,12 @@ class OutsideBoxMoments:
     def of(cls, images, low, box):
         """Those of images (1 + k, ny, nx), the profile and its modes, about a box.
 
-        The box ends `margin` (2,) pixels inside them; low (2,) [frame px]: the first pixel of
-        images.
+        Images are set to 0 in the box (slices y, x); low (2,) [frame px]: their first pixel.
         """
         n_y, n_x = images.shape[1:]
-        outside = np.ones((n_y, n_x))
-        outside[box] = 0
+        images[:, *box] = 0
         y, x = np.arange(n_y) + low[0], np.arange(n_x) + low[1]
-        rows = np.stack([np.ones(n_y), y, y * y]) @ (images * outside)  # (1 + k, 3, nx)
+        rows = np.stack([np.ones(n_y), y, y * y]) @ images  # (1 + k, 3, nx)
         found = rows @ np.stack([np.ones(n_x), x, x * x], axis=1)
         sums = found[:, [0, 1, 0, 2, 1, 0], [0, 0, 1, 0, 1, 2]].T
         return cls(sums[:, 0], sums[:, 1:])
@@ -97,14 +95,13 @@ def profile_modes(shape, theta, position, profile, origin, *, radial=1.0):
     if isinstance(shape, GalaxyProfile):
         low, size = _surroundings(shape, theta, position, np.array(origin), profile.shape)
         box = box_slices(origin - low, profile.shape)
-        drawn = shape.draw(theta, position - low, tuple(size))
-        moved = shape.position_derivatives(theta, position - low, drawn[0])
-        peak = drawn[0].max()
-        images = np.concatenate([drawn, moved, _core_and_halo(drawn[0] / peak) * peak]) / peak
+        drawn = shape.draw(theta, position - low, tuple(size), moved=True)
+        drawn /= drawn[0].max()
+        images = np.concatenate([drawn, _core_and_halo(drawn[0])])
         near = images[1:, *box].copy()
         scatter = np.concatenate([SCATTER, [POSITION_PX] * 2, core_and_halo])
-        images[-2:] *= FAR_HALO
-        return near, scatter, OutsideBoxMoments.of(images, low, box)
+        far = OutsideBoxMoments.of(images, low, box)
+        return near, scatter, far.scaled(np.append(np.ones(len(drawn)), [FAR_HALO] * 2))
     slopes = np.stack([-_slope(profile, axis) for axis in (0, 1)])  # of a given image
     images = np.concatenate([slopes, _core_and_halo(profile)])
     return (
