@@ -77,8 +77,9 @@ _PUBLIC_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
         "readers.legacy": ("read_legacy_survey",),
         "readers.rubin_coadd": ("read_rubin_coadd",),
         "readers.rubin_exposure": ("read_rubin_exposure",),
-        "report.write": ("write_report",),
     },
+    # runs over fields as pages
+    "report": {"write": ("write_report",)},
     # scenes with their truth
     "simulation": {
         "scenes": ("simulate_scene",),
@@ -126,7 +127,6 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from .fields.readers.legacy import read_legacy_survey as read_legacy_survey
     from .fields.readers.rubin_coadd import read_rubin_coadd as read_rubin_coadd
     from .fields.readers.rubin_exposure import read_rubin_exposure as read_rubin_exposure
-    from .fields.report.write import write_report as write_report
     from .fields.run import run_field as run_field
     from .files.atomic import FileError as FileError
     from .files.cutouts import read_cutouts as read_cutouts, write_cutouts as write_cutouts
@@ -145,6 +145,7 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     )
     from .measurement.photometry import fluxes as fluxes, redistribute as redistribute
     from .measurement.quality import summary as summary
+    from .report.write import write_report as write_report
     from .resampling.matching.match import match as match
     from .resampling.paper.resampler import PaperResampler as PaperResampler
     from .resampling.resampler import Resampler as Resampler

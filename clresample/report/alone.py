@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...device.errors import DeviceError
-from ...files.atomic import FileError
-from ..box import Box
-from ..cutouts import FieldCutouts, MissingSource
+from ..device.errors import DeviceError
+from ..fields.box import Box
+from ..fields.cutouts import FieldCutouts, MissingSource
+from ..files.atomic import FileError
 
 MAX_SOURCES = 1000  # of a page: each takes some 20 core-milliseconds an instrument
 

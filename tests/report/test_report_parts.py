@@ -15,14 +15,14 @@ from helpers.field_folder import SIGMA, write_folder
 
 from clresample import Grid
 from clresample.fields.box import Box
-from clresample.fields.report import alone, codes, colours, pyramid
-from clresample.fields.report.charts import chi2_numbers, chi2_palette, magnitudes
-from clresample.fields.report.html import data_block, format_number
-from clresample.fields.report.page_data import flag_names
-from clresample.fields.report.png import png
-from clresample.fields.report.run_folder import RunFolder, read_run
-from clresample.fields.report.svg import Chart, ChartAxis
-from clresample.fields.report.truth import FOUND_PX, matched
+from clresample.report import alone, codes, colours, pyramid
+from clresample.report.charts import chi2_numbers, chi2_palette, magnitudes
+from clresample.report.html import data_block, format_number
+from clresample.report.page_data import flag_names
+from clresample.report.png import png
+from clresample.report.run_folder import RunFolder, read_run
+from clresample.report.svg import Chart, ChartAxis
+from clresample.report.truth import FOUND_PX, matched
 
 
 def decoded(data):

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ...files.atomic import FileError
-from ...files.fits import celestial_header, open_fits
-from ...sky.grid import Grid
-from ..box import Box
+from ..fields.box import Box
+from ..files.atomic import FileError
+from ..files.fits import celestial_header, open_fits
+from ..sky.grid import Grid
 
 SAMPLE_ROWS = 64  # rows of a mosaic from which noise and stretch are found, spread evenly
 # [sigma] A column of a strip whose median is beyond it holds no sky: a dead one. Light that a model

@@ -14,7 +14,7 @@ from helpers.browser import BROWSER, Browser
 from helpers.field_folder import write_folder
 
 from clresample import write_report
-from clresample.fields.report import alone
+from clresample.report import alone
 
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no chromium")
 ROOT = "document.documentElement.dataset"

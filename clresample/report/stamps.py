@@ -6,8 +6,8 @@ from contextlib import ExitStack
 
 import numpy as np
 
-from ...files.atomic import FileError
-from ..box import Box
+from ..fields.box import Box
+from ..files.atomic import FileError
 from .alone import OwnModels
 from .codes import encode
 from .pyramid import frame_transform

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ...files.atomic import FileError, atomic_file, check_folder, check_output
-from ...sky.wcs import local_axes
-from ..box import Box
+from ..fields.box import Box
+from ..files.atomic import FileError, atomic_file, check_folder, check_output
+from ..sky.wcs import local_axes
 from . import sections
 from .html import PAGE, data_block, page
 from .page_data import data_of, instrument_data

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from astropy.table import QTable, vstack
 
-from ...files.atomic import FileError
-from ...files.tables import read_catalogue
-from ..execution.folder import WORK
-from ..execution.group_results import GroupResultsFile
-from ..model_mosaics import file_name
+from ..fields.execution.folder import WORK
+from ..fields.execution.group_results import GroupResultsFile
+from ..fields.model_mosaics import file_name
+from ..files.atomic import FileError
+from ..files.tables import read_catalogue
 from .instrument import Instrument, instruments_in
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from astropy.table import QTable
 from scipy.spatial import cKDTree
 
-from ...files.atomic import FileError
-from ...files.tables import read_catalogue
+from ..files.atomic import FileError
+from ..files.tables import read_catalogue
 from .stamps import plain
 
 # [px] A row is a true source's own when it lies as near; further off it is another one in most

@@ -10,7 +10,7 @@ from helpers.browser import BROWSER, Browser
 from helpers.field_folder import write_folder
 
 from clresample import write_report
-from clresample.fields.report.html import PAGE
+from clresample.report.html import PAGE
 
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no chromium")
 ROOT = "document.documentElement"

@@ -17,9 +17,9 @@ from helpers.fields import mosaics_of
 
 from clresample import write_report
 from clresample.fields.mosaic import ArrayPlane
-from clresample.fields.report.run_folder import read_run
 from clresample.fields.run import run_field
 from clresample.files.atomic import FileError
+from clresample.report.run_folder import read_run
 
 
 class Elements(HTMLParser):

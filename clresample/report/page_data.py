@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...measurement.catalogue import FLAG_MEANINGS, Flag
-from ...sky.wcs import local_axes
+from ..measurement.catalogue import FLAG_MEANINGS, Flag
+from ..sky.wcs import local_axes
 from .charts import channel_fluxes, magnitudes
 from .codes import KNEE, NOISY_STEP, SMOOTH_STEP
 from .colours import EMPTY as NO_DATA
