@@ -122,8 +122,8 @@ def batch_row(batch, clock, settings):
     seconds = time.perf_counter() - start
     clock.ticks(N_TICKS)
     for result in results:
-        if result.status.startswith("failed"):
-            raise RuntimeError(result.status)
+        if result.status == "failed":
+            raise RuntimeError(result.reason)
     n_iterations = sum(map(scenes.iterations, results))
     ms = sum(r.seconds["fit"] for r in results) / max(n_iterations, 1) * 1e3
     return _row("joint", len(batch), results, batch, ms, clock) | {

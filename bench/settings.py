@@ -104,7 +104,7 @@ def _changes(scene, blend, result, settings):
 
 
 def _scores(scene, result):
-    if result.status.startswith("failed"):
+    if result.status == "failed":
         return {"sdr": [float("nan")] * len(scene.profiles), "status": result.status}
     return {
         "sdr": scenes.scores(result, scene),

@@ -188,8 +188,8 @@ def vary(device):
     """A fit with a PSF that varies over the blend."""
     settings = Settings(prior=SingleScalePrior(), max_iter=1)
     (result,) = deblend_many(blends(1, _disc(), varying=True), settings=settings, device=device)
-    if result.status.startswith("failed"):
-        raise SystemExit(f"grind: a fit {result.status}")
+    if result.status == "failed":
+        raise SystemExit(f"grind: a fit failed: {result.reason}")
 
 
 def fit(device):
@@ -199,8 +199,8 @@ def fit(device):
         began = time.perf_counter()
         profile = None if settings is FITS[0] else disc
         for result in deblend_many(blends(3, profile), settings=settings, device=device):
-            if result.status.startswith("failed"):
-                raise SystemExit(f"grind: a fit {result.status}")
+            if result.status == "failed":
+                raise SystemExit(f"grind: a fit failed: {result.reason}")
         print(f"grind: fit in {time.perf_counter() - began:.0f} s", flush=True)
 
 

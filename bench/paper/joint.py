@@ -51,7 +51,7 @@ def measure(folder, seeds):
                 for scene, given in zip(found, profiles, strict=True)
             ]
             for part, scene, result in zip(parts, found, deblend_many(blends), strict=True):
-                failed = result.status.startswith("failed")
+                failed = result.status == "failed"
                 sdr = [None] * len(scene.profiles) if failed else scenes.scores(result, scene)
                 part[f"{start}-{mode}"] = [None if s is None else round(s, 3) for s in sdr]
     return parts

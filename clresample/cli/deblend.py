@@ -97,6 +97,7 @@ def run(arguments):
     started = time.perf_counter()
     paths = folder_outputs(arguments, OUTPUTS[: 3 if arguments.no_figure else 4])
     _progress(arguments, f"reading {arguments.scene}")
+    from ..deblending.ended import Ended
     from ..device.device import get_device
     from ..device.mirror_contraction import operator_programs
 
@@ -117,7 +118,7 @@ def run(arguments):
     _report(arguments, result, summary(result), device, time.perf_counter() - started)
     for path in paths:
         print(printable(path))
-    if result.status == "interrupted":
+    if result.status == Ended.INTERRUPTED:
         raise KeyboardInterrupt  # the best state is written; the exit status is that of Ctrl-C
 
 
@@ -129,6 +130,8 @@ def _progress(arguments, message):
 def _fit(arguments, scene, device):
     """The fit; before it, where sources or shifts are to be found, a short one to find them in."""
     import numpy as np
+
+    from ..deblending.ended import Ended
 
     settings = _settings(arguments, scene.settings)
     given = {"frame": scene.frame, "device": device, "dtype": np.dtype(arguments.dtype)}
@@ -147,7 +150,7 @@ def _fit(arguments, scene, device):
             small = SingleScalePrior(correlation_px=1.0)
             first = replace(first, prior=small, constraints=ProxChain(Positivity()))
         result = _deblend(arguments, "first look", scene.observations, sources, first, given)
-        if result.status == "interrupted":
+        if result.status == Ended.INTERRUPTED:
             return result
         given["shifts"] = result.shifts
         if looking and scene.passes > 1:

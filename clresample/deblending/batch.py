@@ -18,7 +18,8 @@ from ..drawing.bar import ProgressBar
 from ..sky.observation import as_observations
 from ..sky.sources import SourceWarning
 from ..sky.validation.checks import check_dtype, check_instance, described
-from .blend import INTERRUPTED, Blend, Failure
+from .blend import Blend, Failure
+from .ended import Ended
 from .fit import Fit, data_bytes, render_fits, scene_bytes, start_fits
 from .inspection.inspect import InputWarning, warn_of_many
 from .iterate import iterate
@@ -85,7 +86,7 @@ def deblend(
     for problem in fit.problems:
         warnings.warn(problem, InputWarning, stacklevel=3)
     iterate([fit], settings, device, dtype, progress, takes_over=needs_second_component)
-    if fit.status != INTERRUPTED:
+    if fit.status != Ended.INTERRUPTED:
         (fit,) = refit_two_components([fit], settings, device, dtype, progress)
     result = fit.result(*render_fits([fit]))
     LOG.info("%r in %.2f s", result, sum(result.seconds.values()))
@@ -128,7 +129,7 @@ def deblend_many(
     else:
         pairs = _fit_all(blends, device=get_device(device), progress=progress, **given)
     pairs = [
-        pair or (Failure(blend, INTERRUPTED), NOTHING)
+        pair or (Failure(blend, Ended.INTERRUPTED), NOTHING)
         for blend, pair in zip(blends, pairs, strict=True)
     ]
     dark = [sources for _, (sources, _) in pairs if len(sources)]
@@ -148,7 +149,7 @@ def _fit_all(blends, *, device, progress=lambda n_done: None, **given):
     with contextlib.suppress(KeyboardInterrupt):
         many.run(progress)
     return [
-        (Failure(blend, INTERRUPTED) if done is None else done, many.warned.get(i, NOTHING))
+        (Failure(blend, Ended.INTERRUPTED) if done is None else done, many.warned.get(i, NOTHING))
         for i, (blend, done) in enumerate(zip(blends, many.done, strict=True))
     ]
 
@@ -226,7 +227,7 @@ class _BatchRunner:
         for part in self._parts(group):
             for i, done in self._try(part):
                 self.done[i] = done
-            if any(fit.status == INTERRUPTED for _, fit in part):
+            if any(fit.status == Ended.INTERRUPTED for _, fit in part):
                 return True
         return False
 
@@ -248,7 +249,7 @@ class _BatchRunner:
         run = fits[0].settings, self.device, self.dtype
         try:
             iterate(fits, *run, takes_over=needs_second_component)
-            if not any(fit.status == INTERRUPTED for fit in fits):
+            if not any(fit.status == Ended.INTERRUPTED for fit in fits):
                 fits = refit_two_components(fits, *run)
             seen = render_fits(fits)
         except Exception as error:
@@ -257,7 +258,7 @@ class _BatchRunner:
                 return
             for item in group:
                 yield from self._try([item])
-                if item[1].status == INTERRUPTED:
+                if item[1].status == Ended.INTERRUPTED:
                     return
             return
         for (i, _), fit, own in zip(group, fits, seen, strict=True):
@@ -283,9 +284,9 @@ def _listed(name, values):
 
 
 def _failure(blend, error):
-    """The Failure of a blend that ended with an exception, with that in its status."""
+    """The Failure of a blend that ended with an exception, with that as its reason."""
     kind = "" if isinstance(error, ERRORS) else f"{type(error).__name__}: "
-    return Failure(blend, f"failed: {kind}{error}")
+    return Failure(blend, Ended.FAILED, f"{kind}{error}", type(error))
 
 
 def _sizes(blend):

@@ -10,13 +10,8 @@ from ..sky.frame import Frame, model_frame
 from ..sky.observation import Observation, check_observations
 from ..sky.sources import Source
 from ..sky.validation.checks import as_float_array, check_instance
+from .ended import Ended
 
-# Status of a fit whose loss falls no further, and of its result if that does not describe the data.
-CONVERGED, MISFIT = "converged", "misfit"
-# Status of a fit until something else ends it than `max_iter`, and of one that Ctrl-C ended.
-ITERATION_LIMIT, INTERRUPTED = "iteration limit", "interrupted"
-# That of a fit whose scene another one takes over; no result has it.
-STOPPED_FOR_REFIT = "stopped for refit"
 # What one fit takes at most. Its spectra are solved together, n^3 for n components: 2000 take
 # minutes. Arrays of components times pixels are held several at a time. A blend of 4096 pixels a
 # side has no neighbours that would need to be fitted at once.
@@ -112,9 +107,14 @@ class Blend:
 
 @dataclass(frozen=True)
 class Failure:
-    """A blend of a batch that could not be fitted, with the reason in `status`."""
+    """A blend of a batch that could not be fitted.
+
+    status: Ended.FAILED or INTERRUPTED; reason: of the failure; error: class of its exception
+    """
 
     blend: Blend
-    status: str
+    status: Ended
+    reason: str = ""
+    error: type[BaseException] | None = None
 
     converged = False

@@ -10,8 +10,8 @@ import numpy as np
 
 from ..resampling.transfer import noise_warnings
 from ..sky.frame import Frame
-from .blend import INTERRUPTED, ITERATION_LIMIT
 from .component_images import ComponentImages
+from .ended import Ended
 from .inspection.inspect import inspect
 from .posterior.posterior import with_errors
 from .result import Component, Result
@@ -98,7 +98,7 @@ class Fit:
         self.unit = np.concatenate([view.noise_unit for view in self.views])
         self.noise = pixel_noise(self.views)
         self.padded, self._positions, self.start = padded, positions, None
-        self.losses, self.status, self.strength_estimates = [], ITERATION_LIMIT, None
+        self.losses, self.status, self.strength_estimates = [], Ended.LIMIT, None
         self._best = _BestState(np.inf, None, None, self.shifts)
         self.last_steps = np.zeros_like(self.shifts)
         self.seconds = {"setup": time.perf_counter() - began}
@@ -163,7 +163,7 @@ class Fit:
 
     def interrupt(self):
         """Records that the user interrupted the fit."""
-        self.status = INTERRUPTED
+        self.status = Ended.INTERRUPTED
 
     def note_seconds(self, stage, seconds):
         """Records the time of a stage."""
@@ -180,7 +180,7 @@ class Fit:
         The present one, if it was interrupted, may be half-way through an iteration.
         """
         best = self._best
-        if self.status != INTERRUPTED and loss <= best.loss:
+        if self.status != Ended.INTERRUPTED and loss <= best.loss:
             self.scene, self.state = scene, state
         elif best.state is not None:
             loss, self.scene, self.state = best.loss, best.scene, best.state
@@ -320,14 +320,14 @@ def _dark_message(i_source, position):
     )
 
 
-def stop_reason(losses, n_new, tol) -> str | None:
-    """The stopping rule: "diverged", "converged", or None to go on.
+def stop_reason(losses, n_new, tol) -> Ended | None:
+    """The stopping rule: DIVERGED, CONVERGED, or None to go on.
 
     losses: of all iterations so far, of which the last n_new are new; tol: see Settings
     """
     best = np.nanmin(losses) if np.isfinite(losses[-n_new:]).all() else np.nan
     if np.isnan(best) or losses[-1] > DIVERGED * best:
-        return "diverged"
+        return Ended.DIVERGED
     if len(losses) > PATIENCE and min(losses[:-PATIENCE]) - best < tol * best:
-        return "converged"
+        return Ended.CONVERGED
     return None

@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 
-from .blend import STOPPED_FOR_REFIT
+from .ended import Ended
 from .posterior.joint_step import make_joint_step, solve_joint_step
 from .resize import resize_boxes
 from .shifts import extrapolate, shift_steps
@@ -44,8 +44,8 @@ RESIZE_ITERATIONS = 40
 def iterate(fits, settings, device, dtype, progress=None, *, takes_over=None):
     """Runs the fits of one signature until each has stopped; they keep their final states.
 
-    takes_over: of a fit that has learned clear structure; where True the fit ends,
-        STOPPED_FOR_REFIT
+    takes_over: of a fit that has learned clear structure; where True the fit ends for a
+        refit
     """
     began, running = time.perf_counter(), None
     try:
@@ -64,7 +64,7 @@ def iterate(fits, settings, device, dtype, progress=None, *, takes_over=None):
             running.shift()
             running = running.repacked()
     except KeyboardInterrupt:
-        handed_over = [f for f in fits if f.status == STOPPED_FOR_REFIT]
+        handed_over = [f for f in fits if f.status == Ended.REFIT]
         for f in handed_over + (running.going() if running else fits):
             f.interrupt()
         if running:
@@ -245,7 +245,7 @@ class _LbfgsRun:
         for i in np.flatnonzero(which):
             which[i] = self.stop_for_refit(self.fits[i])
             if which[i]:
-                self.fits[i].status = STOPPED_FOR_REFIT
+                self.fits[i].status = Ended.REFIT
         self.engine.progress.live &= ~which
         return which
 
@@ -293,7 +293,7 @@ class _LbfgsRun:
         states, p = self.engine.states(), self.engine.progress
         findings = self.engine.findings(stop)
         for i in np.flatnonzero(stop):
-            f, ended = self.fits[i], "diverged" if p.failed[i] else "converged"
+            f, ended = self.fits[i], Ended.DIVERGED if p.failed[i] else Ended.CONVERGED
             status = ended if p.failed[i] or p.converged[i] else f.status
             f.end(self.engine.scenes[i], states[i], findings[i], status)
 

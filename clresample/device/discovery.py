@@ -43,6 +43,10 @@ class DeviceError(RuntimeError):
     """A failed operation of a device; the message has the reason and the remedy."""
 
 
+class DeviceLostError(DeviceError):
+    """A device that no longer answers, with all of its memory."""
+
+
 @dataclass(frozen=True)
 class DeviceInfo:
     """One row of the table of devices; sizes in bytes, `fp64` None where it could not be tried."""

@@ -15,6 +15,7 @@ from pathlib import Path
 from astropy.io import fits
 
 from .. import __version__
+from ..deblending.ended import Ended
 from ..files.atomic import atomic_tree, check_output
 from ..files.parquet import write_parquet
 from .columns import finalise_catalogue
@@ -70,7 +71,7 @@ def write_outputs(folder, job, parts, unsettled, about, seconds, hats=False) -> 
     """
     last = _last_rounds(parts)
     table, blends = finalise_catalogue(job, parts, last, unsettled)
-    status = Counter(str(s).split(":")[0] for s in blends["status"])
+    status = Counter(Ended(str(s).partition(":")[0]) for s in blends["status"])
     notes = () if find_spec("pyarrow") else (NO_PARQUET,)
     paths = [write_hats(folder / "hats", table)] if hats and len(table) else []
     with atomic_tree(folder) as part:

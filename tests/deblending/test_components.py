@@ -9,7 +9,8 @@ from scipy.stats import multivariate_normal
 
 from clresample.deblending import batch
 from clresample.deblending.batch import deblend, deblend_many
-from clresample.deblending.blend import INTERRUPTED, Blend
+from clresample.deblending.blend import Blend
+from clresample.deblending.ended import Ended
 from clresample.deblending.profiles import profile, psf_second_moment
 from clresample.deblending.refit import colour_gradient, two_component_fit, two_component_start
 from clresample.deblending.refit.colour_gradient import (
@@ -191,7 +192,7 @@ def test_ctrl_c_in_the_second_fit_leaves_the_first(device, monkeypatch):
 
     monkeypatch.setattr(LbfgsControl, "accept_trials", interrupted)
     result = deblend(b.observations, b.sources, frame=b.frame, device=device)
-    assert result.status == INTERRUPTED and counts(result) == [1, 1]
+    assert result.status == Ended.INTERRUPTED and counts(result) == [1, 1]
 
 
 def test_a_second_fit_that_fails_leaves_the_first(device, monkeypatch):

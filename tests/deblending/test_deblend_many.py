@@ -206,7 +206,7 @@ def test_groups_prepared_ahead_come_out_the_same(device, monkeypatch):
     alone, seen = deblend_many(blends, **given), []
     tune(monkeypatch, n_scenes=2, prefetch_groups=True)
     results = deblend_many(blends, progress=seen.append, **given)
-    assert seen == [2, 3, 5, 6] and results[3].status.startswith("failed")
+    assert seen == [2, 3, 5, 6] and results[3].status == "failed"
     for result, other in zip(results[:3] + results[4:], alone[:3] + alone[4:], strict=True):
         np.testing.assert_array_equal(result.model(1), other.model(1))
         np.testing.assert_array_equal(result.losses, other.losses)

@@ -76,7 +76,7 @@ def test_those_that_can_begin_though_others_cannot(monkeypatch):
         2: ([1], []),
     }
     assert [done is None for done in many.done] == [True, False, True]
-    assert many.done[1].blend == "bad" and "bad data" in many.done[1].status
+    assert many.done[1].blend == "bad" and "bad data" in many.done[1].reason
 
 
 def test_one_that_fails_is_fitted_apart_from_the_others(monkeypatch):
@@ -84,7 +84,7 @@ def test_one_that_fails_is_fitted_apart_from_the_others(monkeypatch):
     assert many._fit(group) is False
     assert many.done[0] == "a seen 1" and seconds == [1, 1]
     assert all(isinstance(done, Failure) for done in many.done[1:])
-    assert "bad data" in many.done[1].status and "no result" in many.done[2].status
+    assert "bad data" in many.done[1].reason and "no result" in many.done[2].reason
     many, group, seconds = many_of(["a", "b"], monkeypatch)
     assert many._fit(group) is False and many.done == ["a seen 2", "b seen 2"] and seconds == [2]
 

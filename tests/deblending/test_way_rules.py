@@ -277,8 +277,8 @@ def test_a_fit_that_cannot_start_leaves_the_others(monkeypatch, group):
     ]
     good = [one for one in fits if one[1].blend != "b"]
     assert many._begin(fits) == good
-    assert {i: done.status for i, done in many.done.items()} == {
-        i: "failed: no" for i, fit in fits if fit.blend == "b"
+    assert {i: (done.status, done.reason) for i, done in many.done.items()} == {
+        i: ("failed", "no") for i, fit in fits if fit.blend == "b"
     }
     assert many.warned == {i: ([7], []) for i, _ in good}
     alone = [1] * len(group) if "b" in group and len(group) > 1 else []

@@ -1,10 +1,10 @@
 """A small simulated field and one run over it, which the tests of whole runs compare with."""
 
 import pytest
-from helpers.fields import mosaics_of
 
 from clresample import simulate_field
 from clresample.fields.run import run_field
+from helpers.fields import mosaics_of
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from clresample.deblending import iterate as room
-from clresample.deblending.blend import INTERRUPTED
+from clresample.deblending.ended import Ended
 
 
 class Told(SimpleNamespace):
@@ -70,5 +70,5 @@ def named(name, status="converged", shifts=0.0, of=None):
     one.shifts, one.losses = shifts, [1.0]
     one.note_seconds = one.seconds.__setitem__
     one.shift = lambda shifts: one.at.update(shifts=shifts)
-    one.interrupt = lambda: setattr(one, "status", INTERRUPTED)
+    one.interrupt = lambda: setattr(one, "status", Ended.INTERRUPTED)
     return one

@@ -47,6 +47,7 @@ class GroupResults:
     flat: morphologies, flattened; models: rows of MODEL_COLUMNS, pixels: of these, flattened
     offsets: (1 + 2 M + C,) of each patch with fitted shifts or sky levels other than 0: its number,
         shifts (M, 2) [model px] of all mosaics, sky levels (C,) [counts] of all channels
+    n_failed: patches without a fit
     """
 
     rows: list = field(default_factory=list)
@@ -60,6 +61,7 @@ class GroupResults:
     offsets: list = field(default_factory=list)
     n_flat: int = 0
     n_pixels: int = 0
+    n_failed: int = 0
 
     def add_component(self, source_id, patch, origin, morphology, spectrum):
         """A component of a source: its box begins at `origin` (2,) of the field's model pixels."""
