@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..sky.extent import box_slices, intersect_boxes
+from ..sky.box import box_slices, intersect_boxes
 from .solver.scene import Scene, State
 
 # A box holds the pixels where the source is brighter than this part of the noise of a model pixel;

@@ -12,9 +12,9 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 
 from ..deblending.ended import Ended
+from ..sky.box import Box
 from ..sky.wcs import celestial_frame
 from .blends.tiles import field_part
-from .box import Box
 from .execution.backend import make_backend
 from .execution.fitting import FieldJob
 from .execution.folder import open_folder

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ..device.errors import DeviceError
-from ..fields.box import Box
 from ..fields.cutouts import FieldCutouts, MissingSource
 from ..files.atomic import FileError
+from ..sky.box import Box
 
 MAX_SOURCES = 1000  # of a page: each takes some 20 core-milliseconds an instrument
 

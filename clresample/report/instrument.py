@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..fields.box import Box
 from ..files.atomic import FileError
 from ..files.fits import celestial_header, open_fits
+from ..sky.box import Box
 from ..sky.grid import Grid
 
 SAMPLE_ROWS = 64  # rows of a mosaic from which noise and stretch are found, spread evenly

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..fields.box import Box
+from ..sky.box import Box
 from .codes import encode
 from .colours import Stretch, stretch_of
 from .instrument import Instrument

@@ -6,8 +6,8 @@ from contextlib import ExitStack
 
 import numpy as np
 
-from ..fields.box import Box
 from ..files.atomic import FileError
+from ..sky.box import Box
 from .alone import OwnModels
 from .codes import encode
 from .pyramid import frame_transform

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..fields.box import Box
 from ..files.atomic import FileError, atomic_file, check_folder, check_output
+from ..sky.box import Box
 from ..sky.wcs import local_axes
 from . import sections
 from .html import PAGE, data_block, page

@@ -9,12 +9,12 @@ from clresample.deblending.settings import Settings
 from clresample.fields.blends.cut import FitLimits, cut_blend
 from clresample.fields.blends.plan import host_ids, source_ids
 from clresample.fields.blends.tiles import SearchTile
-from clresample.fields.box import Box
 from clresample.fields.execution import fitting
 from clresample.fields.execution.fitting import LARGE, _settings, is_large
 from clresample.fields.execution.group_results import GroupResults, GroupResultsFile
 from clresample.fields.execution.rounds import _PieceHistory
 from clresample.fields.execution.searching import _lost
+from clresample.sky.box import Box
 
 
 def chain(saddle, n=4):

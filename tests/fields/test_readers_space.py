@@ -20,7 +20,7 @@ from helpers.survey_files import (
 )
 
 from clresample import PSF, FieldOptions, Grid, read_hst, read_jwst, run_field
-from clresample.fields.box import Box
+from clresample.sky.box import Box
 from clresample.sky.wcs_interface.ape14 import Ape14Wcs
 
 WHOLE = Box.of(SHAPE)

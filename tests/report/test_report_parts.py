@@ -14,7 +14,6 @@ from astropy.table import QTable
 from helpers.field_folder import SIGMA, write_folder
 
 from clresample import Grid
-from clresample.fields.box import Box
 from clresample.report import alone, codes, colours, pyramid
 from clresample.report.charts import chi2_numbers, chi2_palette, magnitudes
 from clresample.report.html import data_block, format_number
@@ -23,6 +22,7 @@ from clresample.report.png import png
 from clresample.report.run_folder import RunFolder, read_run
 from clresample.report.svg import Chart, ChartAxis
 from clresample.report.truth import FOUND_PX, matched
+from clresample.sky.box import Box
 
 
 def decoded(data):

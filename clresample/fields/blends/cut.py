@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from ...measurement.hills import root, saddles, watershed
-from ..box import Box
+from ...sky.box import Box
 
 # [sigma] of the combined signal to noise at a saddle: what lies beyond is worth a joint fit only
 # where that takes little time. A piece's neighbours are subtracted to 15 % (MODEL_ERROR): what is

@@ -10,8 +10,8 @@ from scipy import ndimage
 from ...files.atomic import FileError
 from ...measurement.detection import detect, noise_scatter
 from ...measurement.signal_to_noise import WIDTHS_ARCSEC
+from ...sky.box import Box
 from ...sky.frame import model_frame
-from ..box import Box
 
 # [sigma] of the combined signal-to-noise image: pixels above it hold light of a source. At 2, what
 # is left out of a source's footprint is under the noise everywhere; lower, noise links sources that

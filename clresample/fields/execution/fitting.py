@@ -19,12 +19,12 @@ from ...measurement.catalogue import Flag, add_positions, catalogue_columns
 from ...measurement.columns import Columns
 from ...measurement.detection import detect_more
 from ...resampling.cache import default_cache
+from ...sky.box import Box
 from ...sky.grid import Grid
 from ...sky.sources import ExtendedSource
 from ..blends.cutouts import make_blend
 from ..blends.plan import FitPlan, source_ids
 from ..blends.search import nearest
-from ..box import Box
 from .group_results import GroupResults
 
 # What can go wrong with one patch and is no reason to give up the others.

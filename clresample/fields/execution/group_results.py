@@ -12,7 +12,7 @@ from astropy.io import fits
 
 from ...files.fits import open_fits
 from ...measurement.columns import Columns
-from ..box import Box
+from ...sky.box import Box
 
 PATCH_COLUMNS: dict[str, type | str] = {
     "fit_id": np.int64,

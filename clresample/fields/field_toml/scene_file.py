@@ -22,13 +22,13 @@ from ...deblending.solver.prior import SingleScalePrior
 from ...files.scene_keys import SceneError
 from ...files.source_table import read_sources
 from ...measurement.detection import THRESHOLD
+from ...sky.box import Box
 from ...sky.extent import grid_intersection, grid_union
 from ...sky.frame import Frame, model_frame
 from ...sky.noise import NoiseWarning
 from ...sky.observation import Observation, check_observations
 from ...sky.psf_checks import PSFWarning
 from ...sky.sources import Source
-from ..box import Box
 from ..mosaic import saturations
 from .estimates import subtract_background
 from .keys import parse_scene

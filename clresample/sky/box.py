@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..sky.mapping import NOISE_PX
+from .mapping import NOISE_PX
 
 # [px] by which equal pieces of sky may differ in size across an image, its distortion's effect
 SAME_PX = 0.01
@@ -68,6 +68,12 @@ class Box(NamedTuple):
         return cls(0, 0, int(shape[0]), int(shape[1]))
 
     @classmethod
+    def at(cls, origin, shape) -> Box:
+        """The pixels of an image of `shape` (2,) [px] whose first one is at `origin` (2,) [px]."""
+        (y, x), (n_y, n_x) = origin, shape
+        return cls(int(y), int(x), int(y + n_y), int(x + n_x))
+
+    @classmethod
     def around(cls, points) -> Box:
         """The pixels that points (..., 2) [px], (y, x), touch. ValueError: one is not finite."""
         points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
@@ -113,3 +119,19 @@ def round_up_size(box, step) -> Box:
     sides = [step * math.ceil(n / step) for n in box.shape]
     y0, x0 = (a - (side - n) // 2 for a, n, side in zip(box[:2], box.shape, sides, strict=True))
     return Box(y0, x0, y0 + sides[0], x0 + sides[1])
+
+
+def intersect_boxes(origin_a, shape_a, origin_b, shape_b):
+    """Common part of two boxes of pixels: slices of the first array and of the second.
+
+    origin_a, origin_b (2,) [px]: first pixels (y, x), on one grid; shape_a, shape_b (2,) [px]
+    Slices are empty where the boxes do not meet.
+    """
+    a, b = Box.at(origin_a, shape_a), Box.at(origin_b, shape_b)
+    both = a.intersection(b)
+    return both.relative_to(a).slices, both.relative_to(b).slices
+
+
+def box_slices(origin, shape):
+    """The slices (y, x) of a box of `shape` (2,) [px] that starts at `origin` (2,) [px]."""
+    return Box.at(origin, shape).slices
