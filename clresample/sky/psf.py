@@ -10,8 +10,8 @@ import numpy as np
 
 from ..drawing.display import PSFDisplay
 from .fourier import uniform_waves
+from .nufft import nufft_type2
 from .psf_checks import PSFWarning, core_centroid, fwhm, light_beyond_edge, psf_warnings
-from .transforms.nufft import nufft_type2
 from .validation.checks import ReadOnly, as_float_array, check_number
 
 # relative slack on the band's edge, above the rounding of A^T nu in float64

@@ -15,10 +15,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...device.contraction import ImageBatch
-from ...device.tuning import Tuning
-from ..plan import ResamplingPlan
-from ..wave_tables import wave_table
+from ..device.contraction import ImageBatch
+from ..device.tuning import Tuning
+from .plan import ResamplingPlan
+from .wave_tables import wave_table
 
 # [bytes] of float64 intermediates of one image, which one work-item takes through the whole chain:
 # half of a core's second cache. Larger images, from some 200 pixels a side on, are better shared
