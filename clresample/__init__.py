@@ -31,7 +31,6 @@ _PUBLIC_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
     "resampling": {
         "resampler": ("Resampler",),
         "tiled.resampler": ("TiledResampler",),
-        "paper.resampler": ("PaperResampler",),
         "matching.match": ("match",),
     },
     # fits of scenes to observations
@@ -45,6 +44,10 @@ _PUBLIC_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
         "image_profiles": ("with_image_profiles",),
         "inspection.inspect": ("InputWarning",),
         "result": ("Component", "Result"),
+    },
+    # the paper's own methods
+    "paper": {
+        "operator.resampler": ("PaperResampler",),
     },
     # sources found before a fit, quantities measured after it
     "measurement": {
@@ -145,9 +148,9 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     )
     from .measurement.photometry import fluxes as fluxes, redistribute as redistribute
     from .measurement.quality import summary as summary
+    from .paper.operator.resampler import PaperResampler as PaperResampler
     from .report.write import write_report as write_report
     from .resampling.matching.match import match as match
-    from .resampling.paper.resampler import PaperResampler as PaperResampler
     from .resampling.resampler import Resampler as Resampler
     from .resampling.tiled.resampler import TiledResampler as TiledResampler
     from .simulation.field import simulate_field as simulate_field

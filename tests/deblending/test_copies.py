@@ -14,7 +14,7 @@ from clresample.deblending.blend import Blend, Failure
 from clresample.deblending.result import Result
 from clresample.deblending.settings import Settings
 from clresample.deblending.solver.constraints import Monotone, Positivity, ProxChain
-from clresample.resampling.paper.resampler import PaperResampler
+from clresample.paper.operator.resampler import PaperResampler
 from clresample.resampling.tiled.resampler import TiledResampler
 from clresample.sky.grid import Grid
 from clresample.sky.psf import PSF

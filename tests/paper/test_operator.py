@@ -22,9 +22,9 @@ from helpers.geometries import (
 from helpers.tuning import tune
 
 from clresample import DeviceError
+from clresample.paper.operator import factors, sincs
+from clresample.paper.operator.resampler import PaperResampler
 from clresample.resampling import reference
-from clresample.resampling.paper import factors, sincs
-from clresample.resampling.paper.resampler import PaperResampler
 from clresample.resampling.resampler import Resampler
 from clresample.resampling.transfer import WRAP_TOLERANCE
 from clresample.sky.grid import Grid

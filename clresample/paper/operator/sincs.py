@@ -8,8 +8,8 @@ import numpy as np
 
 from ...device.contraction import Contraction, MatrixBatch, row_stride
 from ...device.tuning import Tuning
+from ...resampling.transfer import transfer_function
 from ...sky.psf import PSF
-from ..transfer import transfer_function
 
 # Positions at which a PSF is interpolated at once: three tables of 48 float64 each, 36 MiB.
 POSITIONS = 1 << 15

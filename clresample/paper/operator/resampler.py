@@ -8,9 +8,9 @@ import math
 import numpy as np
 
 from ...device.contraction import ImageBatch, MatrixBatch
-from ..grid_operator import GridOperator
-from ..plan import count_bands
-from ..transfer import Certificate, wrap_radius
+from ...resampling.grid_operator import GridOperator
+from ...resampling.plan import count_bands
+from ...resampling.transfer import Certificate, wrap_radius
 from .factors import PaperFactors
 from .sincs import sinc_table, sinc_transfer
 from .tables import cos_sin_table, with_transpose
