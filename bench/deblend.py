@@ -224,7 +224,7 @@ def main(options):
     n_scenes = options.scenes or (N_QUICK if options.quick else N_SCENES)
     record = records.record(threads) | {
         "scenes": f"{n_scenes} from seed {options.seed}; {sky.name}",
-        "settings": f"at most {settings.max_iter} iterations, rel_tol {settings.rel_tol:g}",
+        "settings": f"at most {settings.max_iter} iterations, loss_tol {settings.loss_tol:g}",
     }
     records.print_record(record)
     views = options.views or (["upright"] if options.quick else list(VIEWS))

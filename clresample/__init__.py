@@ -38,16 +38,17 @@ _PUBLIC_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
         "batch": ("deblend", "deblend_many"),
         "blend": ("Blend", "Failure"),
         "settings": ("Settings",),
-        "solver.prior": ("SingleScalePrior",),
         "solver.multiscale.prior": ("MultiscalePrior",),
-        "solver.amsgrad": ("StepSizes",),
-        "image_profiles": ("with_image_profiles",),
         "inspection.inspect": ("InputWarning",),
         "result": ("Component", "Result"),
     },
     # the paper's own methods
     "paper": {
         "operator.resampler": ("PaperResampler",),
+        "settings": ("PaperSettings",),
+        "solver.prior": ("SingleScalePrior",),
+        "solver.amsgrad": ("StepSizes",),
+        "image_profiles": ("with_image_profiles",),
     },
     # sources found before a fit, quantities measured after it
     "measurement": {
@@ -107,13 +108,10 @@ __all__ = sorted(_MODULE_OF)
 if TYPE_CHECKING:  # the same names for type checkers and editors
     from .deblending.batch import deblend as deblend, deblend_many as deblend_many
     from .deblending.blend import Blend as Blend, Failure as Failure
-    from .deblending.image_profiles import with_image_profiles as with_image_profiles
     from .deblending.inspection.inspect import InputWarning as InputWarning
     from .deblending.result import Component as Component, Result as Result
     from .deblending.settings import Settings as Settings
-    from .deblending.solver.amsgrad import StepSizes as StepSizes
     from .deblending.solver.multiscale.prior import MultiscalePrior as MultiscalePrior
-    from .deblending.solver.prior import SingleScalePrior as SingleScalePrior
     from .device.device import Device as Device, get_device as get_device
     from .device.device_cache import DeviceWarning as DeviceWarning
     from .device.discovery import DeviceError as DeviceError, list_devices as list_devices
@@ -148,7 +146,11 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     )
     from .measurement.photometry import fluxes as fluxes, redistribute as redistribute
     from .measurement.quality import summary as summary
+    from .paper.image_profiles import with_image_profiles as with_image_profiles
     from .paper.operator.resampler import PaperResampler as PaperResampler
+    from .paper.settings import PaperSettings as PaperSettings
+    from .paper.solver.amsgrad import StepSizes as StepSizes
+    from .paper.solver.prior import SingleScalePrior as SingleScalePrior
     from .report.write import write_report as write_report
     from .resampling.matching.match import match as match
     from .resampling.resampler import Resampler as Resampler

@@ -32,6 +32,7 @@ from clresample import (  # noqa: E402
     MultiscalePrior,
     Observation,
     PaperResampler,
+    PaperSettings,
     PointSource,
     Resampler,
     Settings,
@@ -43,7 +44,11 @@ from clresample import (  # noqa: E402
 from clresample.deblending.fit import Fit, start_fits  # noqa: E402
 from clresample.deblending.solver.boxes import Boxes  # noqa: E402
 from clresample.deblending.solver.buffers import SceneBuffers  # noqa: E402
-from clresample.deblending.solver.constraints import (  # noqa: E402
+from clresample.deblending.solver.gradient import LossGradient  # noqa: E402
+from clresample.deblending.solver.multiscale.engine import MultiscaleEngine  # noqa: E402
+from clresample.device import tuning  # noqa: E402
+from clresample.device.program import Launcher  # noqa: E402
+from clresample.paper.solver.constraints import (  # noqa: E402
     L0,
     L1,
     MaxNorm,
@@ -54,10 +59,6 @@ from clresample.deblending.solver.constraints import (  # noqa: E402
     SumNorm,
     Symmetry,
 )
-from clresample.deblending.solver.gradient import LossGradient  # noqa: E402
-from clresample.deblending.solver.multiscale.engine import MultiscaleEngine  # noqa: E402
-from clresample.device import tuning  # noqa: E402
-from clresample.device.program import Launcher  # noqa: E402
 
 FAULTS = {
     "race": "__kernel void race(__global float *x) { x[0] += get_global_id(0); }",
@@ -153,7 +154,7 @@ def render(device):
     scene, state = posed(device, np.float32, fixed=(1,))
     for depth in (0, 1, 2, 3):
         buffers = SceneBuffers([scene, scene], [state, state], device, np.float32, PRIOR)
-        LossGradient(buffers, with_prior=False, depth=depth).queue()
+        LossGradient(buffers, depth=depth).queue()
     device.finish()
 
 
@@ -162,9 +163,9 @@ CHAIN = ProxChain(Positivity(), L1(1e-3), L0(1e-3), Symmetry(0.5), Monotone(), M
 FITS = (
     Settings(prior=MultiscalePrior(), max_iter=2),
     Settings(prior=MultiscalePrior(), max_iter=25, loss_tol=20.0, fit_sky=True),
-    Settings(prior=SingleScalePrior(), max_iter=2, fit_sky=True),
-    Settings(prior=None, max_iter=2, constraints=CHAIN),
-    Settings(prior=None, max_iter=2, constraints=ProxChain(MonotoneProjection(), SumNorm())),
+    PaperSettings(prior=SingleScalePrior(), max_iter=2, fit_sky=True),
+    PaperSettings(prior=None, max_iter=2, constraints=CHAIN),
+    PaperSettings(prior=None, max_iter=2, constraints=ProxChain(MonotoneProjection(), SumNorm())),
 )
 
 
@@ -186,7 +187,7 @@ def leave(device):
 
 def vary(device):
     """A fit with a PSF that varies over the blend."""
-    settings = Settings(prior=SingleScalePrior(), max_iter=1)
+    settings = PaperSettings(prior=SingleScalePrior(), max_iter=1)
     (result,) = deblend_many(blends(1, _disc(), varying=True), settings=settings, device=device)
     if result.status == "failed":
         raise SystemExit(f"grind: a fit failed: {result.reason}")

@@ -132,7 +132,7 @@ def main(options):
     sky = scenes.opened(options.catalogue)
     threads, fit = on_one_thread(), Settings()
     record = records.record(threads) | {
-        "settings": f"at most {fit.max_iter} iterations, rel_tol {fit.rel_tol:g}, {fit.prior}",
+        "settings": f"at most {fit.max_iter} iterations, loss_tol {fit.loss_tol:g}, {fit.prior}",
         "scenes": sky.name,
     }
     kept = ("clresample", "galsim", "device", "settings", "scenes")

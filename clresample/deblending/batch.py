@@ -25,7 +25,7 @@ from .inspection.inspect import InputWarning, warn_of_many
 from .iterate import iterate
 from .refit.two_component_fit import needs_second_component, refit_two_components
 from .result import Result
-from .settings import Settings
+from .settings import FitSettings, Settings
 from .start.profile_start import LIGHT_SIGMAS
 
 LOG = logging.getLogger("clresample")
@@ -64,11 +64,12 @@ def deblend(
 ) -> Result:
     """Fits one scene to all observations at once.
 
-        min 1/2 sum_o |sqrt(w_o) (R_o sum_s A_s S_s - d_o)|^2 + 1/2 |z|^2,  A >= 0, S constrained
+        min 1/2 sum_o |sqrt(w_o) (R_o sum_s A_s S_s - d_o)|^2 + 1/2 |z|^2,  A >= 0, S >= 0
 
     observations, sources, frame, shifts: see Blend; observations may include astropy's NDData and
         CCDData that have a PSF
-    settings: see Settings; device: see get_device; dtype: float32 or float64, of the fit
+    settings: Settings, or PaperSettings; device: see get_device
+    dtype: float32 or float64, of the fit
     progress: called every few iterations with their number so far and the loss (1,)
     Raises ValueError for arguments that `check_observations`, `model_frame` and `Source` reject,
     and when no source lies inside the frame. Warns (SourceWarning) of sources far from any light.
@@ -103,7 +104,7 @@ def deblend_many(
         `if __name__ == "__main__":`. Results are those of one device. One that fails is named by a
         DeviceWarning, and the others do its part
     blends: Blend, with sizes, sources, PSFs, WCS and instruments of their own
-    settings: see Settings; dtype: float32 or float64, of the fits
+    settings: Settings, or PaperSettings; dtype: float32 or float64, of the fits
     memory [bytes]: of the device for one group of scenes; GPUs hold the next group's data beside it
     progress: called with the number of blends done, after each group and each failure; True draws
         a bar in terminals and notebooks, and prints a line now and then where nobody looks
@@ -271,7 +272,7 @@ class _BatchRunner:
 def _checked(settings, dtype):
     """Settings, the default ones for None, and the NumPy type. ValueError for anything else."""
     return check_instance(
-        "settings", Settings() if settings is None else settings, Settings
+        "settings", Settings() if settings is None else settings, FitSettings
     ), check_dtype(dtype)
 
 

@@ -18,11 +18,11 @@ from clresample.deblending.refit.colour_gradient import (
     _eliminated,
     log_evidence_ratio,
 )
-from clresample.deblending.settings import Settings
 from clresample.deblending.solver.multiscale.engine import MultiscaleEngine
 from clresample.deblending.solver.multiscale.lbfgs_control import LbfgsControl
 from clresample.deblending.solver.multiscale.prior import MultiscalePrior
 from clresample.measurement.catalogue import catalogue
+from clresample.paper.settings import PaperSettings
 from clresample.resampling.resampler import Resampler
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
@@ -113,7 +113,7 @@ def test_many_are_as_if_each_were_alone(two, device):
 
 def test_other_priors_have_one(device):
     b, _ = blend()
-    given = {"frame": b.frame, "device": device, "settings": Settings(prior=None, max_iter=20)}
+    given = {"frame": b.frame, "device": device, "settings": PaperSettings(prior=None, max_iter=20)}
     assert counts(deblend(b.observations, b.sources, **given)) == [1, 1]
 
 

@@ -12,16 +12,16 @@ from clresample.deblending.batch import deblend_many
 from clresample.deblending.blend import Failure
 from clresample.deblending.fit import Fit
 from clresample.deblending.result import Result
-from clresample.deblending.settings import Settings
-from clresample.deblending.solver.engine import Engine
-from clresample.deblending.solver.prior import SingleScalePrior
 from clresample.device.discovery import DeviceError
+from clresample.paper.settings import PaperSettings
+from clresample.paper.solver.engine import Engine
+from clresample.paper.solver.prior import SingleScalePrior
 from clresample.sky.frame import Frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.sources import ExtendedSource
 
-SETTINGS = Settings(prior=SingleScalePrior(), max_iter=30, rel_tol=0)
+SETTINGS = PaperSettings(prior=SingleScalePrior(), max_iter=30, rel_tol=0)
 
 
 def fit(b, device, settings=SETTINGS, **given):

@@ -13,18 +13,17 @@ from clresample.deblending import iterate as iterate_module
 from clresample.deblending.batch import deblend_many
 from clresample.deblending.blend import Blend
 from clresample.deblending.fit import Fit, start_fits
-from clresample.deblending.iterate import _AmsgradRun
 from clresample.deblending.result import Result
-from clresample.deblending.settings import Settings
-from clresample.deblending.solver.engine import Engine
-from clresample.deblending.solver.prior import SingleScalePrior
+from clresample.paper.settings import PaperSettings
+from clresample.paper.solver.engine import Engine
+from clresample.paper.solver.prior import SingleScalePrior
 from clresample.sky.frame import Frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
 from clresample.sky.sources import PointSource
 
-SETTINGS = Settings(prior=SingleScalePrior(), max_iter=30, rel_tol=0)
+SETTINGS = PaperSettings(prior=SingleScalePrior(), max_iter=30, rel_tol=0)
 CORNER = ((28.0, 34.0), (25, 60, 50), 1.6)
 STAR = ((5.0, 20.0), (40, 30, 60), 0)
 
@@ -73,7 +72,7 @@ def test_each_is_as_if_alone(device, settings, dtype):
 
 def test_known_shifts_of_each(device):
     """In one group, and in another engine once boxes have changed."""
-    settings = Settings(prior=SingleScalePrior(), max_iter=45, rel_tol=0)
+    settings = PaperSettings(prior=SingleScalePrior(), max_iter=45, rel_tol=0)
     moves = [(0.5, 0.5), (-1.0, 0.7), (0.0, 0.0)]
     blends = [
         replace(blend(seed=i, shift=move), shifts=np.array([(0, 0), move]))
@@ -92,7 +91,7 @@ def test_the_best_state_has_its_own_shifts(device, monkeypatch):
         return np.array([(0.0, 0.0), (2.5, -2.0)]), 0.0
 
     monkeypatch.setattr(iterate_module, "shift_steps", astray)
-    settings = Settings(prior=SingleScalePrior(), max_iter=15, rel_tol=0, fit_shifts=True)
+    settings = PaperSettings(prior=SingleScalePrior(), max_iter=15, rel_tol=0, fit_shifts=True)
     blends = [blend(seed=i) for i in range(2)]
     for result in deblend_many(blends, settings=settings, device=device):
         assert not result.shifts.any() and chi2(result) < 1.1
@@ -102,7 +101,7 @@ def test_equal_blends_share_a_group_and_boxes_move(device, monkeypatch):
     """Of one size: one group, no padding, and the resizing of boxes in it."""
     engines = watch_engines(monkeypatch)
     blends = [blend(seed=i) for i in range(4)]
-    settings = Settings(prior=SingleScalePrior(), max_iter=50, rel_tol=0)
+    settings = PaperSettings(prior=SingleScalePrior(), max_iter=50, rel_tol=0)
     results = deblend_many(blends, settings=settings, device=device)
     assert engines[0] == 4 and results[0].frame.shape == (30, 36)
     for b, result in zip(blends, results, strict=True):
@@ -167,7 +166,7 @@ def test_the_budget_counts_what_a_scene_takes(device):
     start_fits(fits)
     gc.collect()
     before = device.in_use
-    running = _AmsgradRun(fits, SETTINGS, device, np.float32)
+    running = SETTINGS.start_run(fits, device, np.float32)
     running.engine.run(1)
     used, counted = device.in_use - before, sum(f.scene.n_bytes for f in fits)
     assert 0.5 * counted < used < 2 * counted
@@ -176,7 +175,7 @@ def test_the_budget_counts_what_a_scene_takes(device):
 def test_device_memory_stays_constant(device, monkeypatch):
     """Over 64 blends in groups of 8, with PSFs and so operators of their own now and then."""
     tune(monkeypatch, n_scenes=8)
-    settings, held = Settings(prior=SingleScalePrior(), max_iter=2), []
+    settings, held = PaperSettings(prior=SingleScalePrior(), max_iter=2), []
     psf = PSF.gaussian(1.1, n_pixels=11)
     grid, psf_in = Grid.flat((20, 22), 0.1), PSF.gaussian(0.8, n_pixels=11)
     rng = np.random.default_rng(0)

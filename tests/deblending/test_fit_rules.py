@@ -10,16 +10,17 @@ from clresample.deblending import batch, fit as fit_module
 from clresample.deblending.batch import _BatchRunner
 from clresample.deblending.blend import Blend, Failure
 from clresample.deblending.ended import Ended
-from clresample.deblending.fit import DIVERGED, PATIENCE, Fit, data_bytes, stop_reason
+from clresample.deblending.fit import Fit, data_bytes
 from clresample.deblending.settings import Settings
 from clresample.deblending.solver.scene import Scene
+from clresample.paper.run import DIVERGENCE_RATIO, PATIENCE, stop_reason
 from clresample.sky.sources import ExtendedSource, SourceWarning
 
 
 def test_when_a_fit_ends():
     """After fifteen iterations in which the best loss fell by less than the part; ten times the
     best one is a divergence, as is NaN among the new losses alone."""
-    assert (PATIENCE, DIVERGED) == (15, 10)
+    assert (PATIENCE, DIVERGENCE_RATIO) == (15, 10)
     flat = [100.0] * 16
     assert stop_reason(flat[:15], 5, 1e-3) is None and stop_reason(flat, 5, 1e-3) == "converged"
     assert stop_reason([100.0] + [99.91] * 15, 5, 1e-3) == "converged"

@@ -54,8 +54,8 @@ def test_ctrl_c_interrupts_fits_that_wait_to_be_taken_over(monkeypatch):
         raise KeyboardInterrupt
 
     one.run = stopped
-    monkeypatch.setattr(room, "_LbfgsRun", lambda *_, takes_over: one)
-    room.iterate(one.fits, SimpleNamespace(has_multiscale_prior=True, max_iter=100), None, None)
+    settings = SimpleNamespace(start_run=lambda *_: one, max_iter=100)
+    room.iterate(one.fits, settings, None, None)
     assert [f.status for f in one.fits] == ["interrupted"] * 2
 
 

@@ -14,7 +14,7 @@ class Told(SimpleNamespace):
     def __init__(self, name, status="iteration limit"):
         super().__init__(name=name, status=status, ended=None, best=None, seconds={})
         self.shifts, self.last_steps = np.zeros((2, 2)), np.full((2, 2), 9.0)
-        self.losses = []
+        self.losses, self.fit = [], self
 
     def shift(self, shifts):
         self.shifts = shifts
@@ -60,7 +60,7 @@ def learning(n_rounds, *, live=None, converged=None, failed=None, **settings):
         **({"max_iter": 100, "fit_shifts": False, "loss_tol": 0.5} | settings)
     )
     past = engine, [None] * n, np.tile([0, np.inf, 0, 0], (n, 1))
-    return room._LbfgsRun([Told(c) for c in "abc"[:n]], settings, None, None, past)
+    return room.LbfgsRun([Told(c) for c in "abc"[:n]], settings, None, None, past)
 
 
 def named(name, status="converged", shifts=0.0, of=None):

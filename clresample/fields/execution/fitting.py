@@ -12,12 +12,13 @@ from ...deblending.assessment.status import with_source_misfit_status
 from ...deblending.batch import deblend_many
 from ...deblending.blend import Blend, Failure
 from ...deblending.ended import Ended
-from ...deblending.settings import Settings
+from ...deblending.settings import FitSettings, Settings
 from ...device.device import get_device
 from ...device.discovery import DeviceLostError
 from ...measurement.catalogue import Flag, add_positions, catalogue_columns
 from ...measurement.columns import Columns
 from ...measurement.detection import detect_more
+from ...measurement.late_sources import fit_with_late_sources
 from ...resampling.cache import default_cache
 from ...sky.box import Box
 from ...sky.grid import Grid
@@ -63,7 +64,7 @@ class FieldJob:
     plan: FitPlan
     origin_px: tuple[int, int]
     core: Box
-    settings: Settings = Settings()
+    settings: FitSettings = Settings()
     threshold: float = 5.0
     passes: int = 2
     memory: int = 1 << 30
@@ -142,10 +143,7 @@ def _fitted(job, group, given):
             continue
         cut = _BlendCutout(patch, blend, boxes, time.perf_counter() - start)
         cuts.append(cut.joined(more))
-    rough = [group.round == 0 and bool(cut.patch.siblings) for cut in cuts]
-    results = _fits(job, [cut.blend for cut in cuts], rough)
-    if job.passes > 1:
-        cuts, results = _second_look(job, given, cuts, results, part, group.round)
+    cuts, results = _fits_of(job, given, cuts, part, group.round)
     for cut, result in zip(cuts, results, strict=True):
         if isinstance(result, Failure):
             if result.status == Ended.INTERRUPTED:
@@ -218,17 +216,17 @@ def _fits(job, blends, rough=None):
 def _settings(job, rough, large):
     """Settings of rough fits, and of those of large blends.
 
-    Other priors than the one that learns need all their iterations.
+    The paper's method needs all its iterations.
     """
     settings = job.settings
-    if not settings.has_multiscale_prior or not (rough or large):
+    if not isinstance(settings, Settings) or not (rough or large):
         return settings
     most = min(settings.max_iter, ROUGH_ITERATIONS if rough else LARGE_ITERATIONS)
     return replace(settings, max_iter=most, errors=settings.errors and not rough)
 
 
-def _second_look(job, given, cuts, results, part, n_round):
-    """Refits blends with the sources detected in their residuals: (cuts, results).
+def _fits_of(job, given, cuts, part, n_round):
+    """Fits blends, and again with the sources detected in their residuals: (cuts, results).
 
     The residuals are those of the whole fit. A first look of 30 iterations without structure, as
     `clresample deblend` takes, leaves bright galaxies' own structure in them: in simulated fields
@@ -236,26 +234,27 @@ def _second_look(job, given, cuts, results, part, n_round):
     blend are looked at in the round SEARCHED, when their neighbours' light is subtracted; their
     new sources are left in the part, for the next round.
     """
-    cuts, results, again = list(cuts), list(results), []
-    for i, (cut, result) in enumerate(zip(cuts, results, strict=True)):
+
+    def fit(some):
+        rough = [n_round == 0 and bool(cut.patch.siblings) for cut in some]
+        return _fits(job, [cut.blend for cut in some], rough)
+
+    def find(cut, result):
         is_piece = bool(cut.patch.siblings)
-        if isinstance(result, Failure) or _chi2(result) > MAX_CHI2:
-            continue
-        if n_round != (SEARCHED if is_piece else 0):
-            continue
+        if n_round != (SEARCHED if is_piece else 0) or _chi2(result) > MAX_CHI2:
+            return None
         try:
             rows = _found(job, given, cut, result)
         except ERRORS:
-            continue  # the fit stands as it is
+            return None  # the fit stands as it is
         if is_piece:
             part.found += [(cut.patch.number, *row) for row in rows]
-        elif rows:
-            again.append((i, cut.joined(rows)))
-    fits = _fits(job, [cut.blend for _, cut in again])
-    for (i, cut), result in zip(again, fits, strict=True):
-        if not isinstance(result, Failure):  # else what was fitted before stands
-            cuts[i], results[i] = cut, result
-    return cuts, results
+        return cut.joined(rows) if rows and not is_piece else None
+
+    if job.passes == 1:
+        return cuts, fit(cuts)
+    pairs = fit_with_late_sources(cuts, fit, find)
+    return [cut for cut, _ in pairs], [result for _, result in pairs]
 
 
 def _chi2(result):

@@ -7,9 +7,9 @@ from helpers.solver import BOXES, changed, posed
 
 from clresample import get_device
 from clresample.deblending.settings import Settings
-from clresample.deblending.solver import curvature as module
-from clresample.deblending.solver.curvature import damping
-from clresample.deblending.solver.prior import SingleScalePrior
+from clresample.paper.solver import curvature as module
+from clresample.paper.solver.curvature import damping
+from clresample.paper.solver.prior import SingleScalePrior
 
 
 @pytest.mark.parametrize("prior", [SingleScalePrior(), None])

@@ -6,9 +6,9 @@ from helpers.morphologies import DTYPES, KINDS, apply, eps, many_boxes, morpholo
 from helpers.tuning import tune
 from scipy.optimize import nnls
 
-from clresample.deblending.solver import reference as ref
 from clresample.deblending.solver.boxes import Boxes
-from clresample.deblending.solver.constraints import (
+from clresample.paper.solver import reference as ref
+from clresample.paper.solver.constraints import (
     MaxNorm,
     Monotone,
     MonotoneProjection,

@@ -4,17 +4,44 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...deblending.solver.gradient import LossGradient
 from .amsgrad import AMSGrad, StepSizes
-from .buffers import SceneBuffers
+from .buffers import AmsgradBuffers
 from .constraints import ProxChain
-from .gradient import LossGradient
 from .prior import SingleScalePrior
-from .scene import Scene, State
+from .scene import AmsgradScene, AmsgradState
 
 # Most iterations of one `run`: so many losses of each scene wait on the device until they are read.
 MAX_STEPS = 16
 # Which of these is for a loss at any other time: best and kept states belong to the first of a run.
 LAST = MAX_STEPS - 1
+
+
+class AmsgradLoss(LossGradient):
+    """The loss of a batch and its gradients, with the prior's term 1/2 |z|^2 in the loss.
+
+    with_prior: whether the loss has that term; the gradient has it where z is stepped (amsgrad.py)
+    best (B,): lowest loss of each scene among those computed with i_loss = 0, infinite before
+    """
+
+    def __init__(self, buffers, with_prior, depth=None):
+        super().__init__(buffers, depth)
+        b, group = buffers, buffers.tuning.sum_group
+        self.best = b.put(np.full(len(b.scenes), np.inf))
+        self._losses = b.launcher("losses.cl", "losses", 2, local_size=(group, 1)).bind(
+            first=b.first,
+            table=b.boxes.table,
+            n_rows=self.rows[-1],
+            rows=self.rows_loss,
+            prior=with_prior,
+            latent=b.latent,
+            best=self.best,
+        )
+
+    def __call__(self, losses, i_loss):
+        """Queues the evaluation; writes the scenes' losses to row i_loss of losses (n, B)."""
+        self.queue()
+        self._losses((self.buffers.tuning.sum_group, len(self.best)), out=losses, i_loss=i_loss)
 
 
 class Engine:
@@ -25,13 +52,13 @@ class Engine:
     prior: the SingleScalePrior of all extended sources, or None to fit the morphologies themselves
     step_sizes: the StepSizes; update: what steps, a class like AMSGrad
 
-    buffers, update: the batch's SceneBuffers and its update, with the present state
+    buffers, update: the batch's AmsgradBuffers and its update, with the present state
     """
 
     def __init__(
         self,
-        scenes: list[Scene],
-        states: list[State],
+        scenes: list[AmsgradScene],
+        states: list[AmsgradState],
         device,
         dtype,
         *,
@@ -41,8 +68,8 @@ class Engine:
         update=AMSGrad,
     ):
         self.scenes, self.device = scenes, device
-        b = self.buffers = SceneBuffers(scenes, states, device, dtype, prior)
-        self._gradient = LossGradient(b, with_prior=prior is not None)
+        b = self.buffers = AmsgradBuffers(scenes, states, device, dtype, prior)
+        self._gradient = AmsgradLoss(b, with_prior=prior is not None)
         self.update = update(
             b, self._gradient, states, chain=chain, prior=prior, step_sizes=step_sizes
         )
@@ -97,10 +124,10 @@ class Engine:
         """Losses (B,) of the states kept, infinite before the first iteration."""
         return self.device.get(self._gradient.best).astype(np.float64)
 
-    def states(self, *, kept=False) -> list[State]:
+    def states(self, *, kept=False) -> list[AmsgradState]:
         """The scenes' present states, or the best ones kept, back on the host."""
         iterated = self._kept if kept else self.buffers.iterated
-        return self.buffers.states(iterated, self.update.memories(), self.n_steps)
+        return self.buffers.stepped(iterated, self.update.memories(), self.n_steps)
 
     def update_shifts(self):
         """Copies the current shifts of the scenes' operators."""

@@ -14,9 +14,9 @@ from helpers.solver import (
     references,
 )
 
-from clresample.deblending.solver import reference as ref
-from clresample.deblending.solver.amsgrad import BETA1
-from clresample.deblending.solver.gradient import LossGradient
+from clresample.paper.solver import reference as ref
+from clresample.paper.solver.amsgrad import BETA1
+from clresample.paper.solver.engine import AmsgradLoss
 
 
 @pytest.mark.parametrize("depth", [0, 1, 2, None])
@@ -27,7 +27,7 @@ def test_kernels_are_their_references(build, dtype, depth):
     e, found = engine(pairs, build, dtype), references(pairs, PRIOR)
     for r in found:
         r.gradient()
-    e._gradient = LossGradient(e.buffers, with_prior=True, depth=depth)
+    e._gradient = AmsgradLoss(e.buffers, with_prior=True, depth=depth)
     e.gradient(3)
     close(build.get(e.losses)[3], [r.loss for r in found], dtype)
     close(build.get(e.buffers.d_spectra), np.concatenate([r.d_spectra for r in found]), dtype)

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from helpers.morphologies import DTYPES, apply, eps, many_boxes, morphologies
 
-from clresample.deblending.solver import reference as ref
 from clresample.deblending.solver.boxes import Boxes
-from clresample.deblending.solver.constraints import (
+from clresample.paper.solver import reference as ref
+from clresample.paper.solver.constraints import (
     L0,
     L1,
     MaxNorm,

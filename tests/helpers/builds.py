@@ -1,4 +1,4 @@
-"""Fixtures of the solver's tests."""
+"""Fixture of the tests of solvers: both builds of their kernels."""
 
 import pytest
 

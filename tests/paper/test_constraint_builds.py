@@ -9,9 +9,9 @@ from helpers.tuning import tune
 from test_constraints import CASES
 
 from clresample import DeviceError
-from clresample.deblending.solver import reference as ref
 from clresample.deblending.solver.boxes import ALIGN, Boxes
-from clresample.deblending.solver.constraints import (
+from clresample.paper.solver import reference as ref
+from clresample.paper.solver.constraints import (
     L0,
     L1,
     MaxNorm,
@@ -22,7 +22,7 @@ from clresample.deblending.solver.constraints import (
     SumNorm,
     Symmetry,
 )
-from clresample.deblending.solver.prox_launches import most_iterations
+from clresample.paper.solver.prox_launches import most_iterations
 
 GROUPS = 1, 64
 SHAPE, CENTER = (17, 19), (6, 11)  # more pixels than four for each work-item of a group

@@ -15,10 +15,10 @@ from helpers.solver import (
     with_and_without,
 )
 
-from clresample.deblending.solver import reference as ref
-from clresample.deblending.solver.amsgrad import StepSizes
-from clresample.deblending.solver.constraints import MaxNorm, ProxChain
-from clresample.deblending.solver.prior import SingleScalePrior
+from clresample.paper.solver import reference as ref
+from clresample.paper.solver.amsgrad import StepSizes
+from clresample.paper.solver.constraints import MaxNorm, ProxChain
+from clresample.paper.solver.prior import SingleScalePrior
 
 
 @every_type

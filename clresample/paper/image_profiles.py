@@ -12,12 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..deblending.blend import Blend
+from ..deblending.solver.boxes import Boxes
 from ..device.device import get_device
 from ..resampling.resampler import Resampler
 from ..sky.frame import model_frame
 from ..sky.sources import ExtendedSource
-from .blend import Blend
-from .solver.boxes import Boxes
 from .solver.constraints import MaxNorm, Monotone, Positivity, ProxChain
 
 # [sigma] What an instrument shows at a source's centre from which on its image is taken: below, the

@@ -6,8 +6,8 @@ from helpers.scenes import SHAPE
 from helpers.solver import changed, posed
 from helpers.start import point_of
 
-from clresample.deblending.resize import GROW_PX, resize_boxes
-from clresample.deblending.solver.scene import AmsgradMoments
+from clresample.paper.resize import GROW_PX, resize_boxes
+from clresample.paper.solver.scene import AmsgradMoments
 
 NOISE = np.ones(3)
 WIDE = (48, 48)  # a frame with padding beyond SHAPE

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import convolve1d
 
-from .scene_model import compose, gather_morph
+from ...deblending.solver.scene_model import compose, gather_morph
 
 # [sqrt(bound)] A larger gradient at the start says that more than noise is left to fit. The largest
 # pixel of a gradient of pure noise has 0.13 of the bound's root (median of the same scenes; 0.2 at

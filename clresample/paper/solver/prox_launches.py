@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...deblending.solver.boxes import ALIGN
 from ...device.discovery import DeviceError
 from ...device.tuning import Tuning
-from .boxes import ALIGN
 
 # STEP0 .. STEP7 of prox.cl.
 MAX_STEPS = 8

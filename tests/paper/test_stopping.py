@@ -7,12 +7,12 @@ import pytest
 from helpers.scenes import BRIGHT, blend, chi2, fit, same
 
 from clresample.deblending.batch import deblend
-from clresample.deblending.fit import stop_reason
 from clresample.deblending.iterate import CHECK_ITERATIONS
-from clresample.deblending.settings import Settings
-from clresample.deblending.solver.amsgrad import StepSizes
-from clresample.deblending.solver.engine import Engine
-from clresample.deblending.solver.prior import SingleScalePrior
+from clresample.paper.run import stop_reason
+from clresample.paper.settings import PaperSettings
+from clresample.paper.solver.amsgrad import StepSizes
+from clresample.paper.solver.engine import Engine
+from clresample.paper.solver.prior import SingleScalePrior
 from clresample.sky.sources import ExtendedSource
 
 
@@ -38,7 +38,8 @@ def test_the_stopping_rule(before, now, status):
 
 
 def starts(device, b, **given):
-    return fit(b, device, settings=Settings(**({"prior": SingleScalePrior()} | given), max_iter=0))
+    settings = PaperSettings(**({"prior": SingleScalePrior()} | given), max_iter=0)
+    return fit(b, device, settings=settings)
 
 
 @pytest.mark.parametrize("prior", [True, False])
@@ -47,7 +48,7 @@ def test_divergence_gives_the_best_state(device, rate, prior):
     given = {"step_sizes": StepSizes(rate, rate, rate)} | {
         "prior": SingleScalePrior() if prior else None
     }
-    result = fit(blend(), device, settings=Settings(**given))
+    result = fit(blend(), device, settings=PaperSettings(**given))
     assert result.status == "diverged" and not result.converged
     same(result, starts(device, blend(), **given))
     assert np.isfinite(result.losses[-1]) and result.losses[-1] == np.nanmin(result.losses)
@@ -66,7 +67,9 @@ def test_a_nan_gives_the_best_state(device, monkeypatch, when):
 
     monkeypatch.setattr(Engine, "step", broken)
     result = fit(
-        blend(BRIGHT), device, settings=Settings(prior=SingleScalePrior(), max_iter=50, rel_tol=0)
+        blend(BRIGHT),
+        device,
+        settings=PaperSettings(prior=SingleScalePrior(), max_iter=50, rel_tol=0),
     )
     assert result.status == "diverged" and 0.8 < chi2(result) < 1.2
     monkeypatch.undo()
@@ -76,7 +79,7 @@ def test_a_nan_gives_the_best_state(device, monkeypatch, when):
         fit(
             blend(BRIGHT),
             device,
-            settings=Settings(prior=SingleScalePrior(), max_iter=before, rel_tol=0),
+            settings=PaperSettings(prior=SingleScalePrior(), max_iter=before, rel_tol=0),
         ),
     )
     assert np.isfinite(result.losses[-1])
@@ -86,7 +89,7 @@ def test_rising_losses_give_the_best_state(device):
     """Sources where no light is: the fit ends no worse than it ever was."""
     b = blend()
     wrong = (ExtendedSource(position_px=(-0.5, 12.1)), ExtendedSource(position_px=(29.4, 35.4)))
-    settings = Settings(prior=SingleScalePrior())
+    settings = PaperSettings(prior=SingleScalePrior())
     result = deblend(b.observations, wrong, frame=b.frame, device=device, settings=settings)
     assert result.losses[-1] <= result.losses[:-1:CHECK_ITERATIONS].min()
 
@@ -110,7 +113,7 @@ def interrupt_call(monkeypatch, where, when):
 def test_ctrl_c_gives_the_best_state(device, monkeypatch, where, when, sizes):
     """However far an iteration has come, and be the state half-way through it a better one."""
     interrupt_call(monkeypatch, where, when)
-    settings = Settings(prior=SingleScalePrior(), max_iter=60, rel_tol=0, step_sizes=sizes)
+    settings = PaperSettings(prior=SingleScalePrior(), max_iter=60, rel_tol=0, step_sizes=sizes)
     result = fit(blend(BRIGHT), device, settings=settings)
     assert result.status == "interrupted" and not result.converged
     monkeypatch.undo()
@@ -128,11 +131,11 @@ def test_ctrl_c_gives_the_best_state(device, monkeypatch, where, when, sizes):
 def test_ctrl_c_while_an_engine_is_made(device, monkeypatch, when):
     """The first one, or one for boxes of other sizes."""
     interrupt_call(monkeypatch, "__init__", when)
-    monkeypatch.setattr(
-        "clresample.deblending.iterate.resize_boxes", lambda s, p, *_: (replace(s), p)
-    )
+    monkeypatch.setattr("clresample.paper.run.resize_boxes", lambda s, p, *_: (replace(s), p))
     result = fit(
-        blend(BRIGHT), device, settings=Settings(prior=SingleScalePrior(), max_iter=60, rel_tol=0)
+        blend(BRIGHT),
+        device,
+        settings=PaperSettings(prior=SingleScalePrior(), max_iter=60, rel_tol=0),
     )
     assert result.status == "interrupted" and 0.85 < chi2(result) < 1.1
     if not when:

@@ -7,10 +7,10 @@ import pytest
 from helpers.buffers import Guards
 from helpers.solver import BOXES, PRIOR, PSFS, changed, engine, posed, ragged
 
-from clresample.deblending.solver.constraints import Positivity, ProxChain
-from clresample.deblending.solver.engine import MAX_STEPS, Engine
 from clresample.device.device import Device
 from clresample.device.tuning import Tuning
+from clresample.paper.solver.constraints import Positivity, ProxChain
+from clresample.paper.solver.engine import MAX_STEPS, Engine
 
 
 def test_the_best_state_is_kept(build):
