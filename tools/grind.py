@@ -53,7 +53,6 @@ from clresample.paper.solver.constraints import (  # noqa: E402
     L1,
     MaxNorm,
     Monotone,
-    MonotoneProjection,
     Positivity,
     ProxChain,
     SumNorm,
@@ -67,7 +66,6 @@ FAULTS = {
 # Terms of the paper's contraction for a work-item: small models have few, and are cut all the same.
 CHUNK_TERMS = 32
 # Loops of a work-item in a launch: few enough that a projection takes several.
-LOOPS = 4000
 
 
 def all_kernels():
@@ -94,7 +92,7 @@ def watch(device, kind):
     Device.launcher, Launcher.__call__ = of_file, noted
     of = tuning.Tuning.of
     # Oclgrind knows no instruction that reads ahead, which changes no result.
-    sizes = {"chunk_terms": CHUNK_TERMS, "max_loop_iterations": LOOPS, "prefetch_columns": False}
+    sizes = {"chunk_terms": CHUNK_TERMS, "prefetch_columns": False}
     tuning.Tuning.of = lambda *a: replace(of(*a), **sizes)
     return launched
 
@@ -165,7 +163,7 @@ FITS = (
     Settings(prior=MultiscalePrior(), max_iter=25, loss_tol=20.0, fit_sky=True),
     PaperSettings(prior=SingleScalePrior(), max_iter=2, fit_sky=True),
     PaperSettings(prior=None, max_iter=2, constraints=CHAIN),
-    PaperSettings(prior=None, max_iter=2, constraints=ProxChain(MonotoneProjection(), SumNorm())),
+    PaperSettings(prior=None, max_iter=2, constraints=ProxChain(Positivity(), SumNorm())),
 )
 
 

@@ -16,9 +16,6 @@ from .pocl_cpu_name import set_pocl_cpu_name
 # Groups of a launch along its second and third axis, which GPUs limit to so many: NVIDIA's compute
 # capabilities list it, Mesa's drivers have the same.
 MAX_GROUPS = 65535
-# Mesa's driver for CPUs, llvmpipe, counts the iterations of all loops of a work-item in a launch;
-# after 65,535 of them it ends every loop at once, and reports no error.
-LLVMPIPE_LOOPS = 65535
 # Processors, as PoCL's compiler names them and its device's version ends, for which it makes code
 # of 16 registers, whatever width of vectors PoCL reports.
 NARROW = ("haswell", "znver1", "znver2", "znver3")
@@ -61,8 +58,6 @@ class Tuning:
     n_scenes: scenes fitted side by side; more hide the launches better, and need more memory
     prefetch_groups: a group of fits is prepared and uploaded by a second thread while another
         iterates; where the device is the CPU itself, both would share its cores
-    max_loop_iterations: iterations of all its loops that a work-item may make in one launch; None
-        where a device has no such limit
     memory [bytes]: of the device for one frame in tiles, unless a caller says otherwise. With less,
         tiles are smaller and overlap more; most instruments' quickest tiles take less than 1 GiB
     """
@@ -87,7 +82,6 @@ class Tuning:
     use_folded: bool
     n_scenes: int
     prefetch_groups: bool
-    max_loop_iterations: int | None
     memory: int
 
     @classmethod
@@ -103,7 +97,6 @@ class Tuning:
             "chunk_terms": 1024,
             "tile_flops": 4e7,  # 1 ms, where PoCL does 40 Gflop/s
             "pixel_flops": 80.0,  # 2 ns
-            "max_loop_iterations": LLVMPIPE_LOOPS if "llvmpipe" in device.name else None,
             "memory": min(1 << 30, device.memory // 4),
         }
         # Drivers that draw on the CPU compile as for a GPU, with many work-items at a time; and a

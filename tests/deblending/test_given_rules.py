@@ -15,7 +15,6 @@ from clresample.paper.solver.constraints import (
     L1,
     MaxNorm,
     Monotone,
-    MonotoneProjection,
     Positivity,
     ProxChain,
     SumNorm,
@@ -114,9 +113,6 @@ def test_parameters_of_constraints_by_source():
     assert parameter_table(L1([2.0, 0.0]), 2).tolist() == [[2, 0], [0, 0]]
     table = parameter_table(Monotone(weights=[3, 0], gradient=[0.0, 1.0]), 2)
     assert table.tolist() == [[3, 0], [0, 1]] and parameter_table(Symmetry(), 1)[0, 0] == 1
-    given = MonotoneProjection(positive=False).parameters
-    assert (given["positive"], given["n_iterations"], given["tolerance"]) == (False, 300, 1e-5)
-    assert MonotoneProjection().parameters["positive"] is True
 
 
 def test_draws_below_zero_become_zero(monkeypatch):

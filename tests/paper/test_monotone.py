@@ -4,14 +4,12 @@ import numpy as np
 import pytest
 from helpers.morphologies import DTYPES, KINDS, apply, eps, many_boxes, morphologies
 from helpers.tuning import tune
-from scipy.optimize import nnls
 
 from clresample.deblending.solver.boxes import Boxes
 from clresample.paper.solver import reference as ref
 from clresample.paper.solver.constraints import (
     MaxNorm,
     Monotone,
-    MonotoneProjection,
     MonotoneWeights,
     ProxChain,
     SumNorm,
@@ -61,15 +59,13 @@ def test_pixels_of_one_level_do_not_see_each_other(device, weights, group, monke
 def test_groups_of_a_gpu(device, boxes, monkeypatch):
     """64 work-items a source with barriers, whatever the device, answer as one work-item does."""
     images = morphologies(boxes, np.float32)
-    for prox in (
-        lambda: ProxChain(Symmetry(), Monotone(gradient=0.1), SumNorm(), MaxNorm()),
-        lambda: MonotoneProjection(weights=MonotoneWeights.FLAT),
-    ):
-        tune(monkeypatch, sum_group=64)
-        many = apply(device, prox(), boxes, images)
-        tune(monkeypatch, sum_group=1)
-        for a, b in zip(many, apply(device, prox(), boxes, images), strict=True):
-            np.testing.assert_allclose(a, b, rtol=0, atol=3e-6)
+    found = []
+    for group in (64, 1):
+        tune(monkeypatch, sum_group=group)
+        prox = ProxChain(Symmetry(), Monotone(gradient=0.1), SumNorm(), MaxNorm())
+        found.append(apply(device, prox, boxes, images))
+    for a, b in zip(*found, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=3e-6)
 
 
 @pytest.mark.parametrize("weights", KINDS)
@@ -100,61 +96,3 @@ def test_weights_by_hand():
     np.testing.assert_allclose(w[MonotoneWeights.ANGLE], want)
     edge = ref.monotone_weights((9, 9), (0, 4), MonotoneWeights.FLAT)[:, 0, 7]
     np.testing.assert_allclose(edge, np.array([0, 0, 0, 1, 0, 1, 0, 0]) / 2)  # none from outside
-
-
-def exact_projection(y, center, weights, gradient, positive):
-    """By the dual, min |B^T l (- m) - y| with l, m >= 0, solved by active sets: exact, and slow."""
-    n = y.size
-    rows = [
-        ref.monotone_violation(unit.reshape(y.shape), center, weights, gradient).ravel()
-        for unit in np.eye(n)
-    ]  # column j of B is B e_j, so this is B^T
-    matrix = np.array(rows)
-    if positive:
-        matrix = np.hstack([matrix, -np.eye(n)])
-    dual, _ = nnls(matrix, y.ravel())
-    return (y.ravel() - matrix @ dual).reshape(y.shape)
-
-
-@pytest.mark.parametrize("positive", [False, True])
-@pytest.mark.parametrize("weights", KINDS)
-def test_projection_is_exact(device, boxes, weights, positive):
-    """Reference against active sets, device against reference."""
-    images = morphologies(boxes, np.float64)
-    prox = MonotoneProjection(
-        weights=weights, gradient=0.05, positive=positive, n_iterations=5000, tolerance=1e-7
-    )
-    found = apply(device, prox, boxes, images, np.float32)
-    for image, center, got in zip(images, boxes.center, found, strict=True):
-        want, bound = ref.monotone_projection(image, center, weights, 0.05, positive=positive)
-        assert bound <= 1e-7 * np.linalg.norm(image)
-        # float32, and an iteration that stops some 100 moves of 1e-7 before the end
-        assert np.linalg.norm(got - want) <= 2e-5 * np.linalg.norm(image)
-        if image.size < 100:
-            exact = exact_projection(image, center, weights, 0.05, positive)
-            np.testing.assert_allclose(want, exact, rtol=0, atol=1e-6)
-
-
-def test_projection_as_given_is_near(device):
-    """The default iterations and tolerance reach the error that the class states, in much noise."""
-    box = Boxes([0], [[0, 0]], [[41, 41]])
-    y, x = np.indices((41, 41)) - 20
-    noise = np.random.default_rng(8).normal(size=(41, 41))
-    image = (np.exp(-np.hypot(y, 1.3 * x + 0.2 * y) / 4) + 0.2 * noise).astype(np.float32)
-    want, _ = ref.monotone_projection(image.astype(float), (20, 20), tolerance=1e-5)
-    (found,) = apply(device, MonotoneProjection(), box, [image])
-    assert np.linalg.norm(found - want) <= 1e-4 * np.linalg.norm(image)
-
-
-def test_projection_goes_on_where_it_stopped(device, boxes):
-    """Many short calls on the same image end where one long call does."""
-    images = morphologies(boxes, np.float32)
-    short = MonotoneProjection(n_iterations=8, tolerance=1e-7)
-    placed = boxes.put(device)
-    for _ in range(100):
-        flat = device.put(boxes.pack(images))
-        short.prox(flat, placed)
-    found = boxes.unpack(device.get(flat))
-    whole = apply(device, MonotoneProjection(n_iterations=5000, tolerance=1e-7), boxes, images)
-    for a, b in zip(found, whole, strict=True):
-        assert np.linalg.norm(a - b) <= 1e-4 * np.linalg.norm(b) + 1e-6

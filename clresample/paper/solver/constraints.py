@@ -21,7 +21,7 @@ import weakref
 
 import numpy as np
 
-from .prox_launches import MAX_STEPS, FusedSteps, ProjectionLaunch
+from .prox_launches import MAX_STEPS, FusedSteps
 
 __all__ = [
     "ProxChain",
@@ -29,7 +29,6 @@ __all__ = [
     "L1",
     "MaxNorm",
     "Monotone",
-    "MonotoneProjection",
     "Positivity",
     "SumNorm",
     "Symmetry",
@@ -93,7 +92,7 @@ class Prox:
             launch(morphs, active, step, factor, i_launch == 0)
 
     def steps(self):
-        """The operators that are one step of prox.cl each, or stand alone."""
+        """The operators that are one step of prox.cl each."""
         return [self]
 
     def values(self):
@@ -170,7 +169,7 @@ class Monotone(Prox):
     """The monotone sweep, outward from the centre: x_i <- min(x_i, (1-g) sum_j w_ij x_j).
 
     j runs over the neighbours (of 8) nearer to the centre. A heuristic, not a projection: it only
-    lowers pixels, so noise biases it low; MonotoneProjection projects onto the same images.
+    lowers pixels, so noise biases it low.
     weights: of MonotoneWeights, one or (S,); gradient: g, number or (S,), 0 <= g < 1
     """
 
@@ -188,44 +187,8 @@ class Monotone(Prox):
         return {"weights": weights}, {"gradient": _at_least_0("gradient", gradient, 1)}
 
 
-class MonotoneProjection(Monotone):
-    """The monotone image nearest to x: the projection onto the cone of the sweep's images.
-
-    min 1/2 |z - x|^2  with  z_i <= (1-g) sum_j w_ij z_j  for all i but the centre, z >= 0
-
-    By accelerated ascent of the dual (kernels/project.cl), then a sweep that makes it exactly
-    monotone. The dual is kept from call to call for each boxes and type, so that the calls of a
-    fit, whose images differ little, start nearly done; that takes 15 numbers a pixel.
-    positive: whether z >= 0 is asked for
-    n_iterations: at most so many a call; tolerance: a call ends when an iteration moves the dual
-        by less than this part of |x|. As given, a galaxy in noise comes out within 1e-4 |x| at
-        41 x 41 pixels, 1e-3 |x| at 101 x 101
-    """
-
-    def __init__(
-        self,
-        *,
-        weights=MonotoneWeights.ANGLE,
-        gradient=0.0,
-        positive=True,
-        n_iterations=300,
-        tolerance=1e-5,
-    ):
-        super().__init__(weights=weights, gradient=gradient)
-        self.parameters |= {
-            "positive": positive,
-            "n_iterations": n_iterations,
-            "tolerance": tolerance,
-        }
-
-    def _launches(self, boxes, dtype):
-        """The projection, and a sweep that makes its answer exactly monotone."""
-        sweep = Monotone(weights=self.parameters["weights"], gradient=self.parameters["gradient"])
-        return [ProjectionLaunch(self, boxes, dtype), FusedSteps([sweep], boxes, dtype)]
-
-
 class ProxChain(Prox):
-    """One operator after the other, the first first; in one launch where none is a projection."""
+    """One operator after the other, the first first; 8 of them in a launch."""
 
     def __init__(self, *proxes):
         super().__init__()
@@ -239,23 +202,12 @@ class ProxChain(Prox):
         return list(itertools.chain.from_iterable(prox.steps() for prox in self._proxes))
 
     def _launches(self, boxes, dtype):
-        """As few launches as there are projections and runs of steps between them."""
-        launches = []
-        for alone, steps in itertools.groupby(self.steps(), _stands_alone):
-            if alone:
-                launches += [launch for s in steps for launch in s._launches(boxes, dtype)]
-            else:
-                steps = list(steps)
-                launches += [
-                    FusedSteps(steps[k : k + MAX_STEPS], boxes, dtype)
-                    for k in range(0, len(steps), MAX_STEPS)
-                ]
-        return launches
-
-
-def _stands_alone(prox):
-    """Returns True if an operator has a kernel of its own instead of a step of prox.cl."""
-    return isinstance(prox, MonotoneProjection)
+        """A launch for every MAX_STEPS steps."""
+        steps = self.steps()
+        return [
+            FusedSteps(steps[k : k + MAX_STEPS], boxes, dtype)
+            for k in range(0, len(steps), MAX_STEPS)
+        ]
 
 
 def _at_least_0(name, value, most=np.inf):

@@ -1,11 +1,10 @@
-"""Launches of the constraints' kernels, prox.cl and project.cl."""
+"""Launches of the constraints' kernel, prox.cl."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from ...deblending.solver.boxes import ALIGN
-from ...device.discovery import DeviceError
 from ...device.tuning import Tuning
 
 # STEP0 .. STEP7 of prox.cl.
@@ -36,66 +35,6 @@ class FusedSteps:
         else:
             given = {"factor": factor, "first": first}
             self.chain_factor(size, x=morphs, active=active, step=step, **given)
-
-
-class ProjectionLaunch:
-    """project.cl on some boxes, with its dual and its scratch."""
-
-    def __init__(self, prox, boxes, dtype):
-        device, n = boxes.device, len(boxes)
-        tuning = Tuning.of(device, dtype)
-        self.group, self.n_iterations = tuning.sum_group, prox.parameters["n_iterations"]
-        planes = -(-(boxes.boxes.shape.astype(np.int64) + 2).prod(1) // ALIGN)
-        size = int(planes.sum()) * ALIGN
-        given = {
-            "table": boxes.table,
-            "pads": device.put(np.concatenate([[0], np.cumsum(planes)])[:-1], np.int32),
-            "values": device.put(parameter_table(prox, n), dtype),
-            "w": device.zeros(8 * size, dtype),
-        }
-        given |= {name: device.zeros(size, dtype) for name in ("tau", "z")}
-        macros = {"WG": self.group, "ALIGN": ALIGN, "dtype": dtype, "local_size": (self.group,)}
-        weigh = device.launcher("project.cl", "project_weights", **macros).bind(**given)
-        weigh((n * self.group,), active=boxes.everyone, n_sources=n)
-        given |= {name: device.zeros(size, dtype) for name in ("y", "l", "v", "g", "move")}
-        self.project = device.launcher("project.cl", "project", **macros).bind(
-            **given,
-            momenta=device.zeros(n, dtype),
-            **{name: prox.parameters[name] for name in ("positive", "tolerance")},
-        )
-        self.most = self.n_iterations
-        if tuning.max_loop_iterations is not None:
-            self.most = most_iterations(
-                device, int(planes.max()) * ALIGN, self.group, tuning.max_loop_iterations
-            )
-
-    def __call__(self, morphs, active, step, factor, first):
-        """Queues the projection, which ignores the last three arguments."""
-        size, end = (active.size * self.group,), self.n_iterations
-        for begin in range(0, max(end, 1), max(self.most, 1)):
-            span = {"first": begin, "last": min(begin + self.most, end)}
-            self.project(size, x=morphs, active=active, **span)
-
-
-def most_iterations(device, n, group, loops):
-    """Iterations of the projection in one launch on a device that limits loops to `loops`.
-
-    n: elements of the largest plane, group: work-items that share it.
-
-    DeviceError: not even one is possible
-    """
-    walk = -(-n // group) + 1  # one pass over the plane, and the look that ends it
-    # Image and dual, and each fourth time two sums: of four elements a step, then over the group.
-    # Before and after all turns one such sum and four passes.
-    inner = walk / 4 + 1 + group
-    turn, once = 1 + 2 * walk + 2 * inner / 4, 4 * walk + inner
-    most = int((loops - once) / turn)
-    if most < 1:
-        raise DeviceError(
-            f"{device.name} ends the loops of a kernel after {loops} iterations, too few for a "
-            f"projection of {n} pixels: use smaller boxes, or another device"
-        )
-    return most
 
 
 def parameter_table(prox, n_sources):

@@ -5,7 +5,7 @@ The tests compare kernels with it.
 First the steps of one scene (update.cl), in float64: S sources with arrays (ny, nx), C channels.
 Its loss is in deblending/solver/reference.py.
 
-Then the constraints (prox.cl, project.cl): every function takes one image x (Ny, Nx) and returns a
+Then the constraints (prox.cl): every function takes one image x (Ny, Nx) and returns a
 new one of the same type. Where a `center` is asked for it is the pixel (cy, cx). Sources: Parikh &
 Boyd 2014 for the proximal operators; Melchior et al. 2018 (arXiv:1802.10157) for the monotone sweep
 and the symmetry; Melchior et al. 2019 (arXiv:1910.10094) for proximal AMSGrad.
@@ -147,70 +147,8 @@ def monotone_violation(x, center, weights=MonotoneWeights.ANGLE, gradient=0.0):
     return out
 
 
-def monotone_projection(
-    y,
-    center,
-    weights=MonotoneWeights.ANGLE,
-    gradient=0.0,
-    *,
-    positive=True,
-    tolerance=1e-7,
-    n_max=20_000,
-):
-    """The image nearest to y among the monotone (and, if `positive`, non-negative) ones.
-
-    min 1/2 |x - y|^2  with  (B x)_i = x_i - (1-g) sum_j w_ij x_j <= 0  for all i but the centre
-
-    By its dual: x(l) = y - B^T l (clipped at 0 if `positive`), l >= 0, ascended by
-    l <- max(0, l + t B x) with Nesterov's momentum, dropped when it points downhill, and the steps
-    of Pock & Chambolle (2011), t_i = 1 / (|B| |B|^T 1)_i. A sweep makes the answer feasible. It
-    ends when the duality gap shows the error |x - exact| <= sqrt(2 gap) below tolerance * |y|.
-
-    returns x (Ny, Nx) and that bound on |x - exact|
-    """
-    w = monotone_weights(y.shape, center, weights) * (1 - gradient)
-    free = np.ones(y.shape)
-    free[tuple(center)] = 0
-    step = free / np.maximum(_rows(w, _columns(w, free, 1), 1), 1)  # 1 is only for the centre
-    target = np.asarray(y, float)
-    lower = 0 if positive else -np.inf
-
-    def image(dual):
-        """The image that belongs to a dual variable."""
-        return np.maximum(target - _columns(w, dual, -1), lower)
-
-    dual = ahead = np.zeros(y.shape)
-    momentum = 1.0
-    bound = np.inf
-    for i_step in range(n_max + 1):
-        if i_step % 50 == 0:  # the gap costs a sequential sweep: look seldom
-            x = image(dual)
-            lower_bound = 0.5 * ((x - target) ** 2).sum() + (dual * _rows(w, x, -1)).sum()
-            x = monotone_sweep(x, center, weights, gradient)
-            bound = np.sqrt(2 * max(0.5 * ((x - target) ** 2).sum() - lower_bound, 0))
-            if bound <= tolerance * np.linalg.norm(target):
-                break
-        new = np.maximum(0, ahead + step * _rows(w, image(ahead), -1))
-        downhill = ((ahead - new) * (new - dual) / np.where(free, step, 1)).sum() > 0
-        before = 1.0 if downhill else momentum
-        momentum = (1 + np.sqrt(1 + 4 * before * before)) / 2
-        ahead, dual = new + (before - 1) / momentum * (new - dual), new
-    return x.astype(y.dtype), bound
-
-
 def _ahead(x, way):
     """x at i + way, 0 outside."""
     dy, dx = way
     padded = np.pad(x, 1)
     return padded[1 + dy : 1 + dy + x.shape[0], 1 + dx : 1 + dx + x.shape[1]]
-
-
-def _rows(w, x, sign):
-    """x_i + sign sum_j w_ij x_j."""
-    return x + sign * sum(wi * _ahead(x, way) for wi, way in zip(w, NEIGHBOURS, strict=True))
-
-
-def _columns(w, dual, sign):
-    """The transpose: l_j + sign sum_i w_ij l_i."""
-    ways = [(-dy, -dx) for dy, dx in NEIGHBOURS]
-    return dual + sign * sum(_ahead(wi * dual, way) for wi, way in zip(w, ways, strict=True))
