@@ -19,6 +19,7 @@ from ..deblending.ended import Ended
 from ..files.atomic import atomic_tree, check_output
 from ..files.parquet import write_parquet
 from .columns import finalise_catalogue
+from .execution.group_results import last_rounds
 from .execution.search_setup import read_search_setup
 from .hats import write_hats
 from .model_mosaics import file_name, write_mosaics
@@ -69,7 +70,7 @@ def write_outputs(folder, job, parts, unsettled, about, seconds, hats=False) -> 
     catalogue.{parquet,fits,ecsv} hold nothing that another run of the same field would change:
     times are in fit_table.ecsv and provenance.json. Raises FileError.
     """
-    last = _last_rounds(parts)
+    last = last_rounds([part.read("PATCHES")[0] for part in parts])
     table, blends = finalise_catalogue(job, parts, last, unsettled)
     status = Counter(Ended(str(s).partition(":")[0]) for s in blends["status"])
     notes = () if find_spec("pyarrow") else (NO_PARQUET,)
@@ -82,17 +83,6 @@ def write_outputs(folder, job, parts, unsettled, about, seconds, hats=False) -> 
         made.append(_write_provenance(part / "provenance.json", job, about, seconds, status))
     paths += [folder / path.name for path in made]
     return FieldOutputs(tuple(paths), len(table), len(blends), dict(status), notes)
-
-
-def _last_rounds(parts):
-    """{patch: index of the part with its last round}."""
-    last, n_round = {}, {}
-    for i, part in enumerate(parts):
-        (rows,) = part.read("PATCHES")
-        for patch, one in zip(rows["fit_id"].tolist(), rows["n_refits"].tolist(), strict=True):
-            if one >= n_round.get(patch, -1):
-                last[patch], n_round[patch] = i, one
-    return last
 
 
 def _write_catalogues(folder, table):

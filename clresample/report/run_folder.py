@@ -10,7 +10,7 @@ import numpy as np
 from astropy.table import QTable, vstack
 
 from ..fields.execution.folder import WORK
-from ..fields.execution.group_results import GroupResultsFile
+from ..fields.execution.group_results import GroupResultsFile, last_rounds
 from ..fields.model_mosaics import file_name
 from ..files.atomic import FileError
 from ..files.tables import read_catalogue
@@ -146,25 +146,22 @@ def _done(work):
 
 def _so_far(work, notes):
     """Sources and fits of the groups that are finished, the last round's of each fit."""
-    last: dict[int, tuple] = {}
+    parts = []
     for path in sorted(work.glob("fit-*.fits")):
         part = GroupResultsFile(path)
         try:
-            patches, rows = (one.table() for one in part.read("PATCHES", "CATALOGUE"))
+            parts.append(part.read("PATCHES", "CATALOGUE"))
         except (FileError, KeyError) as error:
             notes.append(f"{path.name} cannot be read ({' '.join(str(error).split())})")
-            continue
-        start = 0
-        for k, patch in enumerate(patches):
-            n, number = int(patch["n_sources"]), int(patch["fit_id"])
-            if number not in last or int(patch["n_refits"]) >= last[number][0]:
-                last[number] = int(patch["n_refits"]), patches[k : k + 1], rows[start : start + n]
-            start += n
-    found = [last[number] for number in sorted(last)]
-    tables = [rows for _, _, rows in found if len(rows)]
-    sources = _stacked(tables)
-    return (sources[np.argsort(sources["id"])] if len(sources) else sources), _stacked(
-        [fits for _, fits, _ in found]
+    last, tables, fits = last_rounds([patches for patches, _ in parts]), [], []
+    for i, (patches, rows) in enumerate(parts):
+        mine = np.array([last[number] == i for number in patches["fit_id"].tolist()], bool)
+        fits.append(patches.select_rows(mine).table())
+        tables.append(rows.select_rows(np.repeat(mine, patches["n_sources"])).table())
+    sources, fits = (_stacked([t for t in some if len(t)]) for some in (tables, fits))
+    return (
+        sources[np.argsort(sources["id"], kind="stable")] if len(sources) else sources,
+        fits[np.argsort(fits["fit_id"], kind="stable")] if len(fits) else fits,
     )
 
 

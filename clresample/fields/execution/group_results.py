@@ -166,6 +166,16 @@ class GroupResultsFile:
                     yield patch, i_mosaic, box, image.reshape(-1, *box.shape)
 
 
+def last_rounds(tables) -> dict:
+    """{fit_id: number of the table with its last round}; tables: rows of PATCH_COLUMNS of parts."""
+    last, n_round = {}, {}
+    for i, rows in enumerate(tables):
+        for patch, one in zip(rows["fit_id"].tolist(), rows["n_refits"].tolist(), strict=True):
+            if one >= n_round.get(patch, -1):
+                last[patch], n_round[patch] = i, one
+    return last
+
+
 def _columns(hdu):
     """The Columns of a table's HDU, native."""
     found = Columns(meta={k: hdu.header[k] for k in META if k in hdu.header})
