@@ -12,8 +12,8 @@ from ..deblending.solver.multiscale.prior import MultiscalePrior
 # Iterations of a first look: by then the sources that were found are fitted to a few percent; more
 # would find the same ones later.
 LOOK_ITERATIONS = 30
-# Structure of a model pixel alone: larger scales would take up unknown neighbours' light. A tenth of
-# this strength leaves structure of bright galaxies, which is taken for sources twice as often.
+# Structure of a model pixel alone: larger scales would take up unknown neighbours' light. Much
+# weaker structure leaves clumps of bright galaxies in the residuals, which are taken for sources.
 LOOK_PRIOR = MultiscalePrior(scales_px=(0.8,), strengths=(0.1,))
 
 
