@@ -52,7 +52,6 @@ def test_who_is_asked_for_a_gradient():
     ]
     assert colour_gradient._candidates(fitted([(90, 90)] * 4, kinds)).tolist() == [3]
     for given in (
-        {"settings": SimpleNamespace(has_multiscale_prior=False)},
         {"strength_estimates": None},
         {"losses": [2.0, np.nan]},
     ):

@@ -9,11 +9,12 @@ from helpers import scenes
 from helpers.scenes import GALAXIES, alike, blend, chi2
 from helpers.tuning import tune
 
-from clresample.deblending import iterate as iterate_module
 from clresample.deblending.batch import deblend_many
 from clresample.deblending.blend import Blend
 from clresample.deblending.fit import Fit, start_fits
 from clresample.deblending.result import Result
+from clresample.paper import run as paper_run
+from clresample.paper.run import FitTrack
 from clresample.paper.settings import PaperSettings
 from clresample.paper.solver.engine import Engine
 from clresample.paper.solver.prior import SingleScalePrior
@@ -90,7 +91,7 @@ def test_the_best_state_has_its_own_shifts(device, monkeypatch):
     def astray(scene, state):
         return np.array([(0.0, 0.0), (2.5, -2.0)]), 0.0
 
-    monkeypatch.setattr(iterate_module, "shift_steps", astray)
+    monkeypatch.setattr(paper_run, "shift_steps", astray)
     settings = PaperSettings(prior=SingleScalePrior(), max_iter=15, rel_tol=0, fit_shifts=True)
     blends = [blend(seed=i) for i in range(2)]
     for result in deblend_many(blends, settings=settings, device=device):
@@ -124,15 +125,16 @@ def test_fits_that_stop_leave_the_batch_and_keep_their_state(device, monkeypatch
     """One by one, as losses settle; the others go on in smaller engines."""
     engines = watch_engines(monkeypatch)
     ends = {0: 10, 2: 20, 3: 20}  # of four, at these iterations
-    original = Fit.stopped
+    original = FitTrack.stopped
 
     def stopped(self, losses):
         original(self, losses)
-        end = len(self.losses) >= ends.get(blends.index(self.blend), 99)
-        self.status = "converged" if end else self.status
+        fit = self.fit
+        end = len(fit.losses) >= ends.get(blends.index(fit.blend), 99)
+        fit.status = "converged" if end else fit.status
         return end
 
-    monkeypatch.setattr(Fit, "stopped", stopped)
+    monkeypatch.setattr(FitTrack, "stopped", stopped)
     blends = [blend(seed=i) for i in range(4)]
     results = deblend_many(blends, settings=SETTINGS, device=device)
     assert engines == [4, 3, 1]
