@@ -14,11 +14,9 @@ PYTEST = $(RUN) pytest -n auto --maxprocesses 4 --dist loadfile
 
 # What runs on one OpenCL device whatever the others are: operators, and the solver's kernels.
 KERNEL_TESTS = tests/device/test_contraction.py tests/device/test_launcher.py \
-    tests/device/test_selftest.py tests/resampling tests/deblending/test_engine.py \
-    tests/deblending/test_constraints.py tests/deblending/test_monotone.py \
+    tests/device/test_selftest.py tests/resampling tests/paper \
     tests/deblending/test_lbfgs.py tests/deblending/test_structure.py \
-    tests/deblending/test_gradient.py tests/deblending/test_boxed_start.py \
-    tests/deblending/test_constraint_builds.py tests/deblending/test_small_kernels.py \
+    tests/deblending/test_boxed_start.py tests/deblending/test_small_kernels.py \
     tests/deblending/test_start_kernels.py
 
 demo: $(STAMP)

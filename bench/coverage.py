@@ -126,7 +126,7 @@ def measure(galaxies, mode, folder, seeds, negative=NEGATIVE, as_drawn=False):
     results = scenes.fit([scenes.blend(scene, mode) for scene in found])
     values = []
     for scene, result in zip(found, results, strict=True):
-        if not result.status.startswith("failed"):
+        if result.status != "failed":
             keep = parametric | (truth.negative_light(scene) < negative)
             values.append(truth.compare(result, scene, mode, keep=keep))
     return values, [result.status for result in results]

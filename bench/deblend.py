@@ -122,8 +122,8 @@ def batch_row(batch, clock, settings):
     seconds = time.perf_counter() - start
     clock.ticks(N_TICKS)
     for result in results:
-        if result.status.startswith("failed"):
-            raise RuntimeError(result.status)
+        if result.status == "failed":
+            raise RuntimeError(result.reason)
     n_iterations = sum(map(scenes.iterations, results))
     ms = sum(r.seconds["fit"] for r in results) / max(n_iterations, 1) * 1e3
     return _row("joint", len(batch), results, batch, ms, clock) | {
@@ -224,7 +224,7 @@ def main(options):
     n_scenes = options.scenes or (N_QUICK if options.quick else N_SCENES)
     record = records.record(threads) | {
         "scenes": f"{n_scenes} from seed {options.seed}; {sky.name}",
-        "settings": f"at most {settings.max_iter} iterations, rel_tol {settings.rel_tol:g}",
+        "settings": f"at most {settings.max_iter} iterations, loss_tol {settings.loss_tol:g}",
     }
     records.print_record(record)
     views = options.views or (["upright"] if options.quick else list(VIEWS))

@@ -88,7 +88,7 @@ def measure(seeds):
 
 def _values(scene, result):
     truth = np.concatenate([scene.euclid.counts, scene.rubin.counts], axis=1)
-    if result.status.startswith("failed"):
+    if result.status == "failed":
         lost = np.full(truth.shape, np.nan)
         return {"sdr": lost[:, 0], "flux": lost, "error": lost, "truth": truth, "status": "failed"}
     flux, covariance = fluxes(result)

@@ -23,9 +23,9 @@ import numpy as np
 from clresample import get_device
 from clresample.deblending.solver.buffers import SceneBuffers
 from clresample.deblending.solver.gradient import LossGradient
-from clresample.deblending.solver.prior import SingleScalePrior
 from clresample.deblending.solver.rendering.stage_selection import stage_flops
 from clresample.deblending.solver.scene import Scene, State
+from clresample.paper.solver.prior import SingleScalePrior
 from clresample.resampling.resampler import Resampler
 from clresample.simulation.surveys import EUCLID_VIS, RUBIN_UGRIZY
 
@@ -85,11 +85,9 @@ def scene(rng, ops, n_sources):
         center=sizes // 2,
         profile=profiles,
         fixed=np.zeros(n_sources, bool),
-        step_scale=np.ones((n_sources, n_channels)),
     )
     spectra = rng.uniform(5, 50, (n_sources, n_channels))
-    nothing = [np.zeros_like(p) for p in profiles]
-    return found, State(nothing, profiles, spectra, np.zeros(n_channels))
+    return found, State(profiles, spectra, np.zeros(n_channels))
 
 
 def iteration(device, observed):
@@ -104,8 +102,8 @@ def rows_of(case, rng, seconds):
     ops, device = operators(n_model, angle_deg), get_device()
     scenes, states = zip(*(scene(rng, ops, n_sources) for _ in range(n_scenes)), strict=True)
     buffers = SceneBuffers(scenes, states, device, np.float32, SingleScalePrior())
-    ways = {depth: LossGradient(buffers, False, depth).observations for depth in (0, 1, 2)}
-    chosen = LossGradient(buffers, False).observations
+    ways = {depth: LossGradient(buffers, depth).observations for depth in (0, 1, 2)}
+    chosen = LossGradient(buffers).observations
     for i, survey in enumerate((EUCLID_VIS, RUBIN_UGRIZY)):
         observed = {depth: observations[i] for depth, observations in ways.items()}
         observed.setdefault(chosen[i].rendering.depth, chosen[i])

@@ -149,7 +149,7 @@ def measure(psf, snr, seeds):
         values[psf_error] = [
             (*_fluxes(result), truth, _sdrs(result, images))
             for result, (_, truth, images) in zip(results, found, strict=True)
-            if not result.status.startswith("failed")
+            if result.status != "failed"
         ]
     return values
 

@@ -73,8 +73,8 @@ def timed(what, blends, clock):
     wall_s, core_s = time.perf_counter(), time.process_time()
     results = scenes.fit(blends)
     for result in results:
-        if result.status.startswith("failed"):
-            raise RuntimeError(result.status)
+        if result.status == "failed":
+            raise RuntimeError(result.reason)
     began = time.perf_counter()
     n_sources = sum(len(catalogue(result)) for result in results)
     ended = time.perf_counter()

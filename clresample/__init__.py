@@ -31,7 +31,6 @@ _PUBLIC_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
     "resampling": {
         "resampler": ("Resampler",),
         "tiled.resampler": ("TiledResampler",),
-        "paper.resampler": ("PaperResampler",),
         "matching.match": ("match",),
     },
     # fits of scenes to observations
@@ -39,12 +38,17 @@ _PUBLIC_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
         "batch": ("deblend", "deblend_many"),
         "blend": ("Blend", "Failure"),
         "settings": ("Settings",),
-        "solver.prior": ("SingleScalePrior",),
         "solver.multiscale.prior": ("MultiscalePrior",),
-        "solver.amsgrad": ("StepSizes",),
-        "image_profiles": ("with_image_profiles",),
         "inspection.inspect": ("InputWarning",),
         "result": ("Component", "Result"),
+    },
+    # the paper's own methods
+    "paper": {
+        "operator.resampler": ("PaperResampler",),
+        "settings": ("PaperSettings",),
+        "solver.prior": ("SingleScalePrior",),
+        "solver.amsgrad": ("StepSizes",),
+        "image_profiles": ("with_image_profiles",),
     },
     # sources found before a fit, quantities measured after it
     "measurement": {
@@ -77,8 +81,9 @@ _PUBLIC_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
         "readers.legacy": ("read_legacy_survey",),
         "readers.rubin_coadd": ("read_rubin_coadd",),
         "readers.rubin_exposure": ("read_rubin_exposure",),
-        "report.write": ("write_report",),
     },
+    # runs over fields as pages
+    "report": {"write": ("write_report",)},
     # scenes with their truth
     "simulation": {
         "scenes": ("simulate_scene",),
@@ -103,13 +108,10 @@ __all__ = sorted(_MODULE_OF)
 if TYPE_CHECKING:  # the same names for type checkers and editors
     from .deblending.batch import deblend as deblend, deblend_many as deblend_many
     from .deblending.blend import Blend as Blend, Failure as Failure
-    from .deblending.image_profiles import with_image_profiles as with_image_profiles
     from .deblending.inspection.inspect import InputWarning as InputWarning
     from .deblending.result import Component as Component, Result as Result
     from .deblending.settings import Settings as Settings
-    from .deblending.solver.amsgrad import StepSizes as StepSizes
     from .deblending.solver.multiscale.prior import MultiscalePrior as MultiscalePrior
-    from .deblending.solver.prior import SingleScalePrior as SingleScalePrior
     from .device.device import Device as Device, get_device as get_device
     from .device.device_cache import DeviceWarning as DeviceWarning
     from .device.discovery import DeviceError as DeviceError, list_devices as list_devices
@@ -126,7 +128,6 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     from .fields.readers.legacy import read_legacy_survey as read_legacy_survey
     from .fields.readers.rubin_coadd import read_rubin_coadd as read_rubin_coadd
     from .fields.readers.rubin_exposure import read_rubin_exposure as read_rubin_exposure
-    from .fields.report.write import write_report as write_report
     from .fields.run import run_field as run_field
     from .files.atomic import FileError as FileError
     from .files.cutouts import read_cutouts as read_cutouts, write_cutouts as write_cutouts
@@ -145,8 +146,13 @@ if TYPE_CHECKING:  # the same names for type checkers and editors
     )
     from .measurement.photometry import fluxes as fluxes, redistribute as redistribute
     from .measurement.quality import summary as summary
+    from .paper.image_profiles import with_image_profiles as with_image_profiles
+    from .paper.operator.resampler import PaperResampler as PaperResampler
+    from .paper.settings import PaperSettings as PaperSettings
+    from .paper.solver.amsgrad import StepSizes as StepSizes
+    from .paper.solver.prior import SingleScalePrior as SingleScalePrior
+    from .report.write import write_report as write_report
     from .resampling.matching.match import match as match
-    from .resampling.paper.resampler import PaperResampler as PaperResampler
     from .resampling.resampler import Resampler as Resampler
     from .resampling.tiled.resampler import TiledResampler as TiledResampler
     from .simulation.field import simulate_field as simulate_field

@@ -7,6 +7,7 @@ itself.
 import ast
 import subprocess
 import sys
+import warnings
 
 import pytest
 from helpers.checkout import ROOT
@@ -18,25 +19,31 @@ ALLOWED_IMPORTS = {
     "resampling": ("device", "drawing", "sky"),
     "adapters": ("sky", "resampling"),
     "deblending": ("device", "drawing", "sky", "resampling", "adapters"),
+    "paper": ("device", "drawing", "sky", "resampling", "deblending"),
     "measurement": ("drawing", "sky", "resampling", "deblending"),
     "files": ("drawing", "sky", "deblending", "measurement"),
     "simulation": ("sky",),
-    "fields": ("device", "sky", "resampling", "deblending", "measurement", "files"),
+    "fields": ("device", "sky", "resampling", "deblending", "paper", "measurement", "files"),
+    "report": ("device", "sky", "measurement", "files", "fields"),
     "cli": (
         "device",
         "drawing",
         "sky",
         "resampling",
         "deblending",
+        "paper",
         "measurement",
         "files",
         "simulation",
         "fields",
+        "report",
     ),
 }
 # Packages that work without any OpenCL driver.
 NUMPY_ONLY = ("sky", "simulation")
-MAX_LINES, MAX_CLASS, MAX_FUNCTION, MAX_FILES, MAX_FOLDERS = 450, 220, 90, 24, 11
+# Over a limit the test fails; over what is enough for nearly all it warns.
+MAX_LINES, MAX_CLASS, MAX_FUNCTION, MAX_FILES, MAX_FOLDERS = 450, 220, 90, 24, 13
+ENOUGH_LINES, ENOUGH_CLASS, ENOUGH_FUNCTION, ENOUGH_FILES = 300, 150, 60, 20
 
 PACKAGE = ROOT / "clresample"
 MODULES = {
@@ -118,13 +125,13 @@ def find_circle(imports):
     return next(filter(None, (walk(name, []) for name in imports)), None)
 
 
-def too_long(source):
+def too_long(source, max_class=MAX_CLASS, max_function=MAX_FUNCTION):
     """Classes and functions of a Python source that are over the limits, with their lengths."""
     for node in ast.walk(ast.parse(source)):
         n_lines = getattr(node, "end_lineno", 0) - getattr(node, "lineno", 0) + 1
-        if isinstance(node, ast.ClassDef) and n_lines > MAX_CLASS:
+        if isinstance(node, ast.ClassDef) and n_lines > max_class:
             yield f"class {node.name}: {n_lines} lines"
-        if isinstance(node, ast.FunctionDef) and n_lines > MAX_FUNCTION:
+        if isinstance(node, ast.FunctionDef) and n_lines > max_function:
             yield f"{node.name}: {n_lines} lines"
 
 
@@ -141,9 +148,15 @@ def test_there_is_no_circle():
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_nothing_is_too_long(path):
     source = path.read_text()
-    assert len(source.splitlines()) <= MAX_LINES
+    n_lines = len(source.splitlines())
+    assert n_lines <= MAX_LINES
     if path.suffix == ".py":
         assert not list(too_long(source))
+    large = [f"{n_lines} lines"] if n_lines > ENOUGH_LINES else []
+    if path.suffix == ".py":
+        large += too_long(source, ENOUGH_CLASS, ENOUGH_FUNCTION)
+    if large:
+        warnings.warn(f"{path.relative_to(ROOT)}: {', '.join(large)}", stacklevel=1)
 
 
 def test_the_house_has_few_rooms_with_few_files():
@@ -151,7 +164,11 @@ def test_the_house_has_few_rooms_with_few_files():
     assert {path.name for path in packages} - {"kernels"} == set(ALLOWED_IMPORTS)
     assert len(packages) <= MAX_FOLDERS
     for folder in {path.parent for path in MODULES.values()} - {PACKAGE}:
-        assert len(list(folder.glob("*.py"))) <= MAX_FILES, folder
+        n_files, n_folders = (len(list(folder.glob(name))) for name in ("*.py", "*/__init__.py"))
+        assert n_files != 2 or n_folders, f"{folder} holds one file beside __init__.py"
+        assert n_files <= MAX_FILES, folder
+        if n_files > ENOUGH_FILES:
+            warnings.warn(f"{folder.relative_to(ROOT)}: {n_files} files", stacklevel=1)
 
 
 @pytest.mark.parametrize("package", ALLOWED_IMPORTS)
@@ -177,8 +194,8 @@ def test_an_upward_import_is_seen(line):
 
 
 def test_the_solver_is_kept_from_the_fits_around_it():
-    assert list(violations("clresample.deblending.solver.engine", "from ..fit import Fit"))
-    assert not list(violations("clresample.deblending.solver.engine", "from .boxes import Boxes"))
+    assert list(violations("clresample.deblending.solver.gradient", "from ..fit import Fit"))
+    assert not list(violations("clresample.deblending.solver.gradient", "from .boxes import Boxes"))
 
 
 def test_a_circle_is_seen():

@@ -74,7 +74,7 @@ def test_wheel_and_sdist_hold_the_kernels_and_the_example(folder):
     assert sorted(n.split("/")[-1] for n in names if n.startswith("clresample/kernels/")) == KERNELS
     assert any(n.endswith("licenses/LICENSE") for n in names)
     assert "clresample/cli/example.toml" in names
-    assert "clresample/fields/report/page/report.css" in names
+    assert "clresample/report/page/report.css" in names
     (sdist,) = folder.glob("*.tar.gz")
     top = f"clresample-{clresample.__version__}"
     with tarfile.open(sdist) as archive:

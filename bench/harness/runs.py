@@ -16,10 +16,10 @@ from astropy.table import QTable
 from clresample.cli.simulate import write_field
 from clresample.fields.blends.search import search_tile, snr_scatter
 from clresample.fields.blends.tiles import tiles_of
-from clresample.fields.box import Box
 from clresample.fields.field_toml.field_file import read_field
 from clresample.fields.options import FieldOptions
 from clresample.fields.run import reference_grid
+from clresample.sky.box import Box
 
 from .memory import TreeMemory
 from .options import ROOT

@@ -51,7 +51,7 @@ def measure(folder, seeds):
                 for scene, given in zip(found, profiles, strict=True)
             ]
             for part, scene, result in zip(parts, found, deblend_many(blends), strict=True):
-                failed = result.status.startswith("failed")
+                failed = result.status == "failed"
                 sdr = [None] * len(scene.profiles) if failed else scenes.scores(result, scene)
                 part[f"{start}-{mode}"] = [None if s is None else round(s, 3) for s in sdr]
     return parts
@@ -132,7 +132,7 @@ def main(options):
     sky = scenes.opened(options.catalogue)
     threads, fit = on_one_thread(), Settings()
     record = records.record(threads) | {
-        "settings": f"at most {fit.max_iter} iterations, rel_tol {fit.rel_tol:g}, {fit.prior}",
+        "settings": f"at most {fit.max_iter} iterations, loss_tol {fit.loss_tol:g}, {fit.prior}",
         "scenes": sky.name,
     }
     kept = ("clresample", "galsim", "device", "settings", "scenes")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clresample.resampling.paper.resampler import PaperResampler
+from clresample.paper.operator.resampler import PaperResampler
 from clresample.simulation.galaxies import draw
 from clresample.simulation.sdr import sdr
 

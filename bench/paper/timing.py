@@ -17,7 +17,7 @@ import time
 import numpy as np
 from tqdm import tqdm
 
-from clresample.resampling.paper.resampler import PaperResampler
+from clresample.paper.operator.resampler import PaperResampler
 
 from ..harness import records
 from ..harness.cases import Case, Galaxies, check_observed

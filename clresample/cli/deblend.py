@@ -22,10 +22,6 @@ from .options import (
 )
 from .outputs import check_scene, folder_outputs
 
-# Iterations of the fit whose residuals are searched for more sources: the detected sources are then
-# fitted to a few percent. More iterations would find the same sources later.
-FIRST_LOOK = 30
-
 DESCRIPTION = """\
 Fit one scene of sources to the images of all instruments at once, each with its
 own pixels, orientation and PSF. SCENE.toml names images, PSFs, weights and zero
@@ -78,7 +74,8 @@ def add_deblend(commands):
         "--rel-tol",
         metavar="T",
         type=fraction,
-        help="stop when the loss falls by less than this fraction of itself",
+        help="stop when the loss falls by less than this fraction of itself; with monotone or "
+        "correlation_px in [fit]",
     )
     add_dtype_option(fit, "arithmetic of the fit")
     add_device_option(fit)
@@ -97,6 +94,7 @@ def run(arguments):
     started = time.perf_counter()
     paths = folder_outputs(arguments, OUTPUTS[: 3 if arguments.no_figure else 4])
     _progress(arguments, f"reading {arguments.scene}")
+    from ..deblending.ended import Ended
     from ..device.device import get_device
     from ..device.mirror_contraction import operator_programs
 
@@ -117,7 +115,7 @@ def run(arguments):
     _report(arguments, result, summary(result), device, time.perf_counter() - started)
     for path in paths:
         print(printable(path))
-    if result.status == "interrupted":
+    if result.status == Ended.INTERRUPTED:
         raise KeyboardInterrupt  # the best state is written; the exit status is that of Ctrl-C
 
 
@@ -130,33 +128,37 @@ def _fit(arguments, scene, device):
     """The fit; preceded by a short one if sources or shifts are to be determined first."""
     import numpy as np
 
+    from ..deblending.blend import Blend
+    from ..measurement.detection import detect_more
+    from ..measurement.late_sources import fit_with_late_sources, look_settings
+
     settings = _settings(arguments, scene.settings)
-    given = {"frame": scene.frame, "device": device, "dtype": np.dtype(arguments.dtype)}
-    sources, looking = scene.sources, scene.sources is None
-    if looking:
+    given = {"device": device, "dtype": np.dtype(arguments.dtype)}
+    sources, looking = scene.sources, scene.sources is None and scene.passes > 1
+    if scene.sources is None:
         sources = _detect(arguments, scene)
     seen = ", ".join(f"{o.name} ({' '.join(o.channels)})" for o in scene.observations)
     _progress(arguments, f"fitting {len(sources)} sources to {seen} on {device.name}")
-    if settings.max_iter and (settings.fit_shifts is True or (looking and scene.passes > 1)):
-        first = replace(settings, max_iter=min(FIRST_LOOK, settings.max_iter))
-        if looking and scene.passes > 1 and settings.has_multiscale_prior:
-            from ..deblending.solver.constraints import Positivity, ProxChain
-            from ..deblending.solver.prior import SingleScalePrior
+    blends = [Blend(scene.observations, sources, scene.frame)]
 
-            # structure at the scale of a pixel only leaves undetected neighbours in the residuals
-            small = SingleScalePrior(correlation_px=1.0)
-            first = replace(first, prior=small, constraints=ProxChain(Positivity()))
-        result = _deblend(arguments, "first look", scene.observations, sources, first, given)
-        if result.status == "interrupted":
-            return result
-        given["shifts"] = result.shifts
-        if looking and scene.passes > 1:
-            from ..measurement.detection import detect_more
+    def fit(some):
+        return [_deblend(arguments, "fit", blend, settings, given) for blend in some]
 
+    def look(some):
+        first = look_settings(settings, sources=looking)
+        return [_deblend(arguments, "first look", blend, first, given) for blend in some]
+
+    def find(blend, result):
+        more = ()
+        if looking:
             more = detect_more(result, threshold=scene.threshold).sources
             _progress(arguments, f"{len(more)} more sources found in the residuals")
-            sources += more
-    return _deblend(arguments, "fit", scene.observations, sources, settings, given)
+        return replace(blend, sources=blend.sources + more, shifts=result.shifts)
+
+    if not settings.max_iter or not (settings.fit_shifts is True or looking):
+        return fit(blends)[0]
+    ((_, result),) = fit_with_late_sources(blends, fit, find, look=look)
+    return result
 
 
 def _settings(arguments, settings):
@@ -167,6 +169,11 @@ def _settings(arguments, settings):
         if (value := getattr(arguments, key)) is not None
     }
     given |= {key: True for key in ("fit_shifts", "fit_sky") if getattr(arguments, key)}
+    if "rel_tol" in given and not hasattr(settings, "rel_tol"):
+        raise ValueError(
+            f"--rel-tol is {given['rel_tol']:g}, but goes with monotone = true or correlation_px "
+            f"in [fit] of {arguments.scene}: leave it out, or give loss_tol in [fit]"
+        )
     return replace(settings, **given)
 
 
@@ -185,7 +192,7 @@ def _detect(arguments, scene):
     return found.sources
 
 
-def _deblend(arguments, what, observations, sources, settings, given):
+def _deblend(arguments, what, blend, settings, given):
     from tqdm import tqdm
 
     from ..deblending.batch import deblend
@@ -210,7 +217,15 @@ def _deblend(arguments, what, observations, sources, settings, given):
             bar.update(n_steps - bar.n)
             bar.set_postfix(loss=f"{float(losses[0]):.4g}", refresh=False)
 
-        return deblend(observations, sources, settings=settings, progress=progress, **given)
+        return deblend(
+            blend.observations,
+            blend.sources,
+            frame=blend.frame,
+            shifts=blend.shifts,
+            settings=settings,
+            progress=progress,
+            **given,
+        )
 
 
 def _import_drawing():

@@ -24,13 +24,14 @@ from ..drawing.bar import ProgressBar
 from ..sky.observation import as_observations
 from ..sky.sources import SourceWarning
 from ..sky.validation.checks import check_dtype, check_instance, described
-from .blend import INTERRUPTED, Blend, Failure
+from .blend import Blend, Failure
+from .ended import Ended
 from .fit import Fit, data_bytes, render_fits, scene_bytes, start_fits
 from .inspection.inspect import InputWarning, warn_of_many
 from .iterate import iterate
 from .refit.two_component_fit import needs_second_component, refit_two_components
 from .result import Result
-from .settings import Settings
+from .settings import FitSettings, Settings
 from .start.profile_start import LIGHT_SIGMAS
 
 LOG = logging.getLogger("clresample")
@@ -69,11 +70,12 @@ def deblend(
 ) -> Result:
     """Fits one scene to all observations at once.
 
-        min 1/2 sum_o |sqrt(w_o) (R_o sum_s A_s S_s - d_o)|^2 + 1/2 |z|^2,  A >= 0, S constrained
+        min 1/2 sum_o |sqrt(w_o) (R_o sum_s A_s S_s - d_o)|^2 + 1/2 |z|^2,  A >= 0, S >= 0
 
     observations, sources, frame, shifts: see Blend; observations may include astropy's NDData and
         CCDData that have a PSF
-    settings: see Settings; device: see get_device; dtype: float32 or float64, of the fit
+    settings: Settings, or PaperSettings; device: see get_device
+    dtype: float32 or float64, of the fit
     progress: called every few iterations with their number so far and the loss (1,)
     Raises ValueError as `check_observations`, `model_frame` and `Source` do, and if no source lies
     inside the frame. Issues a SourceWarning for sources far from any light, and an InputWarning for
@@ -91,7 +93,7 @@ def deblend(
     for problem in fit.problems:
         warnings.warn(problem, InputWarning, stacklevel=3)
     iterate([fit], settings, device, dtype, progress, takes_over=needs_second_component)
-    if fit.status != INTERRUPTED:
+    if fit.status != Ended.INTERRUPTED:
         (fit,) = refit_two_components([fit], settings, device, dtype, progress)
     result = fit.result(*render_fits([fit]))
     LOG.info("%r in %.2f s", result, sum(result.seconds.values()))
@@ -108,7 +110,7 @@ def deblend_many(
         `if __name__ == "__main__":`. Results equal those of one device. If a device fails, a
         DeviceWarning names it and the others do its work
     blends: Blend, with sizes, sources, PSFs, WCS and instruments of their own
-    settings: see Settings; dtype: float32 or float64, of the fits
+    settings: Settings, or PaperSettings; dtype: float32 or float64, of the fits
     memory [bytes]: of the device for one group of scenes; GPUs need memory for the next group too
     progress: called with the number of finished blends, after each group and each failure; True
         shows a progress bar in terminals and notebooks, and prints occasional lines elsewhere
@@ -134,7 +136,7 @@ def deblend_many(
     else:
         pairs = _fit_all(blends, device=get_device(device), progress=progress, **given)
     pairs = [
-        pair or (Failure(blend, INTERRUPTED), NOTHING)
+        pair or (Failure(blend, Ended.INTERRUPTED), NOTHING)
         for blend, pair in zip(blends, pairs, strict=True)
     ]
     dark = [sources for _, (sources, _) in pairs if len(sources)]
@@ -154,7 +156,7 @@ def _fit_all(blends, *, device, progress=lambda n_done: None, **given):
     with contextlib.suppress(KeyboardInterrupt):
         many.run(progress)
     return [
-        (Failure(blend, INTERRUPTED) if done is None else done, many.warned.get(i, NOTHING))
+        (Failure(blend, Ended.INTERRUPTED) if done is None else done, many.warned.get(i, NOTHING))
         for i, (blend, done) in enumerate(zip(blends, many.done, strict=True))
     ]
 
@@ -232,7 +234,7 @@ class _BatchRunner:
         for part in self._parts(group):
             for i, done in self._try(part):
                 self.done[i] = done
-            if any(fit.status == INTERRUPTED for _, fit in part):
+            if any(fit.status == Ended.INTERRUPTED for _, fit in part):
                 return True
         return False
 
@@ -254,7 +256,7 @@ class _BatchRunner:
         run = fits[0].settings, self.device, self.dtype
         try:
             iterate(fits, *run, takes_over=needs_second_component)
-            if not any(fit.status == INTERRUPTED for fit in fits):
+            if not any(fit.status == Ended.INTERRUPTED for fit in fits):
                 fits = refit_two_components(fits, *run)
             seen = render_fits(fits)
         except Exception as error:
@@ -263,7 +265,7 @@ class _BatchRunner:
                 return
             for item in group:
                 yield from self._try([item])
-                if item[1].status == INTERRUPTED:
+                if item[1].status == Ended.INTERRUPTED:
                     return
             return
         pairs = zip(fits, seen, strict=True)
@@ -275,7 +277,7 @@ class _BatchRunner:
 def _checked(settings, dtype):
     """Settings, the default ones for None, and the NumPy type. ValueError for anything else."""
     return check_instance(
-        "settings", Settings() if settings is None else settings, Settings
+        "settings", Settings() if settings is None else settings, FitSettings
     ), check_dtype(dtype)
 
 
@@ -297,9 +299,9 @@ def _result_or_failure(pair):
 
 
 def _failure(blend, error):
-    """The Failure of a blend that ended with an exception, with that in its status."""
+    """The Failure of a blend that ended with an exception, with that as its reason."""
     kind = "" if isinstance(error, ERRORS) else f"{type(error).__name__}: "
-    return Failure(blend, f"failed: {kind}{error}")
+    return Failure(blend, Ended.FAILED, f"{kind}{error}", type(error))
 
 
 def _sizes(blend):

@@ -10,13 +10,8 @@ from ..sky.frame import Frame, model_frame
 from ..sky.observation import Observation, check_observations
 from ..sky.sources import Source
 from ..sky.validation.checks import as_float_array, check_instance
+from .ended import Ended
 
-# Status of a converged fit, and of its result if the model does not describe the data.
-CONVERGED, MISFIT = "converged", "misfit"
-# Status of a fit ended by `max_iter`, which is the initial one, and of one ended by Ctrl-C.
-ITERATION_LIMIT, INTERRUPTED = "iteration limit", "interrupted"
-# Status of a fit that is replaced by another fit of its scene; no result has it.
-STOPPED_FOR_REFIT = "stopped for refit"
 # Limits of one fit. Its spectra are solved together, in time n^3 for n components: 2000 take
 # minutes. Several arrays of components times pixels are in memory at a time. Sources further apart
 # than 4096 pixels need no joint fit.
@@ -113,9 +108,14 @@ class Blend:
 
 @dataclass(frozen=True)
 class Failure:
-    """A blend of a batch that could not be fitted, with the reason in `status`."""
+    """A blend of a batch that could not be fitted.
+
+    status: Ended.FAILED or INTERRUPTED; reason: of the failure; error: class of its exception
+    """
 
     blend: Blend
-    status: str
+    status: Ended
+    reason: str = ""
+    error: type[BaseException] | None = None
 
     converged = False

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..sky.extent import box_slices, intersect_boxes
+from ..sky.box import box_slices, intersect_boxes
 
 
 class ComponentImages:

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from ..resampling.transfer import noise_warnings
 from ..sky.frame import Frame
-from .blend import INTERRUPTED, ITERATION_LIMIT
 from .component_images import ComponentImages
+from .ended import Ended
 from .inspection.inspect import inspect
 from .posterior.posterior import with_errors
 from .result import Component, Result
-from .solver.multiscale.engine import vector_bytes
-from .solver.scene import Scene, State, signature_of
+from .solver.scene import signature_of
 from .start.final_render import MorphologyModel, RenderedModel, render_models
 from .start.first_scene import first_scene
 from .start.profile_start import (
@@ -27,22 +25,6 @@ from .start.profile_start import (
     with_psf_error_weights,
 )
 from .view import SceneGeometry, pixel_noise, tied_views, unfiltered_view, whitened_view
-
-# The stopping rule compares the best loss with the best one this many iterations ago: losses of
-# single iterations scatter, and with a smaller number a plateau would end the fit.
-PATIENCE = 15
-# A loss this many times the best one, or NaN, is a divergence.
-DIVERGED = 10.0
-
-
-@dataclass(frozen=True, eq=False)
-class _BestState:
-    """The lowest loss so far, with its scene, state and shifts."""
-
-    loss: float
-    scene: Scene | None
-    state: State | None
-    shifts: np.ndarray
 
 
 class Fit:
@@ -59,7 +41,7 @@ class Fit:
     padded: the frame with its sides grown to those that a batch shares; geometry: SceneGeometry
     last_steps (n_observations, 2) [model px]: the last steps of the shifts, before `ahead`
     start: the StartingPoint passed to `begin`, which sets the following
-    scene, state: Scene and State at the start, later those of `store_final`
+    scene, state: Scene and State at the start, later those of `end`
     strength_estimates: those of a MultiscalePrior, or None; losses, status, messages, seconds: see
         Result
     """
@@ -98,8 +80,7 @@ class Fit:
         self.unit = np.concatenate([view.noise_unit for view in self.views])
         self.noise = pixel_noise(self.views)
         self.padded, self._positions, self.start = padded, positions, None
-        self.losses, self.status, self.strength_estimates = [], ITERATION_LIMIT, None
-        self._best = _BestState(np.inf, None, None, self.shifts)
+        self.losses, self.status, self.strength_estimates = [], Ended.LIMIT, None
         self.last_steps = np.zeros_like(self.shifts)
         self.seconds = {"setup": time.perf_counter() - began}
 
@@ -145,13 +126,6 @@ class Fit:
         for view, shift in zip(self.views, shifts, strict=True):
             view.op.shift = shift
 
-    def stopped(self, losses) -> bool:
-        """Records the losses (n,) of the last iterations; returns True if the fit stops."""
-        self.losses.extend(losses.tolist())
-        reason = stop_reason(self.losses, len(losses), self.settings.rel_tol)
-        self.status = reason or self.status
-        return reason is not None
-
     def end(self, scene, state, findings, status):
         """Ends the fit with this state."""
         self.scene, self.state, self.strength_estimates, self.status = (
@@ -163,32 +137,11 @@ class Fit:
 
     def interrupt(self):
         """Records that the user interrupted the fit."""
-        self.status = INTERRUPTED
+        self.status = Ended.INTERRUPTED
 
     def note_seconds(self, stage, seconds):
         """Records the time of a stage."""
         self.seconds[stage] = seconds
-
-    def keep_best(self, loss, scene, state):
-        """Keeps a state, at the present shifts, if its loss is the lowest so far."""
-        if loss < self._best.loss:
-            self._best = _BestState(float(loss), scene, state, self.shifts)
-
-    def store_final(self, loss, scene, state):
-        """Ends the fit with the present state, or with the best one if that is better.
-
-        An interrupted fit may be in the middle of an iteration.
-        """
-        best = self._best
-        if self.status != INTERRUPTED and loss <= best.loss:
-            self.scene, self.state = scene, state
-        elif best.state is not None:
-            loss, self.scene, self.state = best.loss, best.scene, best.state
-            if not np.array_equal(best.shifts, self.shifts):
-                self.shift(best.shifts)
-        else:
-            return
-        self.losses.append(float(loss))
 
     def result(self, seen: RenderedModel) -> Result:
         """Everything back in the data's own units; seen: by `render_fits`."""
@@ -276,8 +229,7 @@ def data_bytes(fit) -> int:
 
 def scene_bytes(fit) -> int:
     """Device memory [bytes] that a fit takes in a batch, roughly, once it has begun."""
-    learns, prior = fit.settings.has_multiscale_prior, fit.settings.prior
-    return fit.scene.n_bytes + (vector_bytes(fit.scene, prior) if learns else 0)
+    return fit.scene.n_bytes + fit.settings.solver_bytes(fit.scene)
 
 
 def _inside(frame, positions):
@@ -318,16 +270,3 @@ def _dark_message(i_source, position):
         f"source {i_source} at (y, x) = ({y:.1f}, {x:.1f}) [px] in the model frame lies far from "
         f"any light: no image shows {LIGHT_SIGMAS:g} sigma there or beside it"
     )
-
-
-def stop_reason(losses, n_new, tol) -> str | None:
-    """The stopping rule: "diverged", "converged", or None to go on.
-
-    losses: of all iterations so far, of which the last n_new are new; tol: see Settings
-    """
-    best = np.nanmin(losses) if np.isfinite(losses[-n_new:]).all() else np.nan
-    if np.isnan(best) or losses[-1] > DIVERGED * best:
-        return "diverged"
-    if len(losses) > PATIENCE and min(losses[:-PATIENCE]) - best < tol * best:
-        return "converged"
-    return None

@@ -1,4 +1,4 @@
-"""The loop of a batch of fits: steps, stops, shifts, and boxes resized to their light."""
+"""The loop of a batch of fits: steps, stops, shifts, and smaller batches as fits stop."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ import time
 import numpy as np
 
 from ..device.multi_device import host_threads, map_threads
-from .blend import STOPPED_FOR_REFIT
+from .ended import Ended
 from .posterior.joint_step import make_joint_step, solve_joint_step
-from .resize import resize_boxes
 from .shifts import extrapolate, shift_steps
-from .solver.engine import Engine
 from .solver.multiscale.engine import MultiscaleEngine
 from .solver.multiscale.lbfgs_control import CONVERGENCE_WINDOW
 
@@ -39,24 +37,17 @@ MIN_JOINT_GAIN = 0.2
 # JointNewtonStep is computed from the present scene. If that one fails too, no more are tried: the
 # scene is then limited by bounds, and further steps would be rejected.
 MIN_JOINT_PROGRESS, MAX_JOINT_MATRICES = 0.2, 2
-# [iterations] between two adjustments of the boxes to the light they hold; each makes a new batch.
-RESIZE_ITERATIONS = 40
 
 
 def iterate(fits, settings, device, dtype, progress=None, *, takes_over=None):
     """Runs the fits of one signature until each has stopped; they keep their final states.
 
     takes_over: called with a fit that has significant structure; if it returns True, the fit ends
-        with the status STOPPED_FOR_REFIT
+        for a refit
     """
     began, running = time.perf_counter(), None
     try:
-        given = fits, settings, device, dtype
-        running = (
-            _LbfgsRun(*given, takes_over=takes_over)
-            if settings.has_multiscale_prior
-            else _AmsgradRun(*given)
-        )
+        running = settings.start_run(fits, device, dtype, takes_over)
         while running.n_steps < settings.max_iter:
             losses = running.run()
             if progress is not None:
@@ -66,7 +57,7 @@ def iterate(fits, settings, device, dtype, progress=None, *, takes_over=None):
             running.shift()
             running = running.repacked()
     except KeyboardInterrupt:
-        handed_over = [f for f in fits if f.status == STOPPED_FOR_REFIT]
+        handed_over = [f for f in fits if f.status == Ended.REFIT]
         for f in handed_over + (running.going() if running else fits):
             f.interrupt()
         if running:
@@ -75,95 +66,12 @@ def iterate(fits, settings, device, dtype, progress=None, *, takes_over=None):
         f.note_seconds("fit", (time.perf_counter() - began) / len(fits))
 
 
-class _AmsgradRun:
-    """The running fits of one engine.
-
-    fits (B): in the engine's order; live (B,): those that have not stopped
-    """
-
-    def __init__(self, fits, settings, device, dtype, scenes=None, states=None):
-        self.fits, self.settings, self.device, self.dtype = list(fits), settings, device, dtype
-        self.live = np.ones(len(self.fits), bool)
-        self.engine = Engine(
-            scenes or [f.scene for f in self.fits],
-            states or [f.state for f in self.fits],
-            device,
-            dtype,
-            chain=settings.constraint_chain,
-            prior=settings.prior,
-            step_sizes=settings.step_sizes,
-        )
-
-    @property
-    def n_steps(self) -> int:
-        """Iterations done so far."""
-        return self.engine.n_steps
-
-    def going(self):
-        """The fits that have not stopped."""
-        return [f for f, on in zip(self.fits, self.live, strict=True) if on]
-
-    def run(self):
-        """Some iterations, after which fits may have stopped; their losses (n, B)."""
-        engine, max_iter = self.engine, self.settings.max_iter
-        losses = engine.run(min(CHECK_ITERATIONS, max_iter - engine.n_steps))
-        stop = np.zeros(len(self.fits), bool)
-        for i in np.flatnonzero(self.live):
-            stop[i] = self.fits[i].stopped(losses[:, i])
-        if engine.n_steps >= max_iter:
-            stop = self.live.copy()
-        if stop.any():
-            self.settle(stop)
-            self.live &= ~stop
-        return losses
-
-    def remember(self, which):
-        """Copies the best states from the device to the fits (B,), if better than their own."""
-        losses, kept = self.engine.best_losses(), self.engine.states(kept=True)
-        for i in np.flatnonzero(which):
-            self.fits[i].keep_best(losses[i], self.engine.scenes[i], kept[i])
-
-    def settle(self, stop):
-        """Stores the final state and loss of the fits (B,) that stop here."""
-        self.remember(stop)
-        states, losses = self.engine.states(), self.engine.final_losses()
-        for i in np.flatnonzero(stop):
-            self.fits[i].store_final(losses[i], self.engine.scenes[i], states[i])
-
-    def shift(self):
-        """Updates the observations' shifts if they are fitted and due."""
-        if not self.settings.fit_shifts or self.engine.n_steps % SHIFT_ITERATIONS:
-            return
-        self.remember(self.live)
-        states = self.engine.states()
-        for i in np.flatnonzero(self.live):
-            f = self.fits[i]
-            f.shift(f.shifts + shift_steps(self.engine.scenes[i], states[i])[0])
-        self.engine.update_shifts()
-
-    def repacked(self) -> _AmsgradRun:
-        """Returns itself, or a new batch where boxes change or enough fits have stopped."""
-        engine, resize = self.engine, self.engine.n_steps % RESIZE_ITERATIONS == 0
-        if not resize and (~self.live).mean() < REPACK_FRACTION:
-            return self
-        states, going = engine.states(), np.flatnonzero(self.live)
-        pairs = [(engine.scenes[i], states[i]) for i in going]
-        if resize:
-            fits = [self.fits[i] for i in going]
-            pairs = [resize_boxes(*pair, f.start, f.noise) for f, pair in zip(fits, pairs)]
-        same = [scene is engine.scenes[i] for i, (scene, _) in zip(going, pairs)]
-        if all(same) and len(going) == len(self.fits):
-            return self
-        self.remember(self.live)
-        scenes, states = map(list, zip(*pairs, strict=True))
-        return _AmsgradRun(self.going(), self.settings, self.device, self.dtype, scenes, states)
-
-
-class _LbfgsRun:
-    """The running fits of one engine with a MultiscalePrior; otherwise like _AmsgradRun.
+class LbfgsRun:
+    """The running fits of one engine with a MultiscalePrior.
 
     Boxes are not resized: structure vanishes at their edges together with the profile.
 
+    fits (B): in the engine's order
     exchanges (B): each fit's JointNewtonStep, or None
     asked (B, 4): for its last evaluation, the fit's rounds and loss (0 and infinite before), the
         predicted gain, and the number of JointNewtonSteps computed
@@ -247,7 +155,7 @@ class _LbfgsRun:
         for i in np.flatnonzero(which):
             which[i] = self.stop_for_refit(self.fits[i])
             if which[i]:
-                self.fits[i].status = STOPPED_FOR_REFIT
+                self.fits[i].status = Ended.REFIT
         self.engine.progress.live &= ~which
         return which
 
@@ -302,16 +210,16 @@ class _LbfgsRun:
         states, p = self.engine.states(), self.engine.progress
         findings = self.engine.findings(stop)
         for i in np.flatnonzero(stop):
-            f, ended = self.fits[i], "diverged" if p.failed[i] else "converged"
+            f, ended = self.fits[i], Ended.DIVERGED if p.failed[i] else Ended.CONVERGED
             status = ended if p.failed[i] or p.converged[i] else f.status
             f.end(self.engine.scenes[i], states[i], findings[i], status)
 
-    def repacked(self) -> _LbfgsRun:
-        """Returns itself, or a new batch where boxes change or enough fits have stopped."""
+    def repacked(self) -> LbfgsRun:
+        """Returns itself, or a new batch where enough fits have stopped."""
         if (~self.live).mean() < REPACK_FRACTION:
             return self
         keep = np.flatnonzero(self.live)
         fits, exchanges = ([some[i] for i in keep] for some in (self.fits, self.exchanges))
         past = self.engine.subset(keep), exchanges, self.asked[keep]
         given = fits, self.settings, self.device, self.dtype, past
-        return _LbfgsRun(*given, takes_over=self.stop_for_refit)
+        return LbfgsRun(*given, takes_over=self.stop_for_refit)

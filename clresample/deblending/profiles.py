@@ -16,7 +16,7 @@ import functools
 
 import numpy as np
 
-from ..sky.extent import box_slices
+from ..sky.box import box_slices
 from ..sky.psf import PSF
 from ..sky.sources import ExtendedSource, PointSource
 

@@ -13,8 +13,8 @@ from ..sky.frame import Frame
 from ..sky.observation import Observation, observation_index
 from ..sky.sources import Source
 from .assessment.misfit import Misfit, misfit_of
-from .blend import CONVERGED
 from .component_images import ComponentImages, weighted_sum
+from .ended import Ended
 from .posterior.errors import Errors, PosteriorSampler
 from .posterior.sampling import drawn_components, drawn_fluxes
 from .solver.scene_model import compose
@@ -69,8 +69,9 @@ class Result(ResultDisplay):
     draws: PosteriorSampler of `sample` and `sample_fluxes`
     shifts (n_observations, 2) [model px]: fitted offsets of the observations' pixels
     losses (n_iterations + 1,): half chi2 (plus priors) before each iteration and at the end
-    status: "converged", "misfit" (its steps ended, but the model does not describe the data, see
-        `Misfit.is_wrong`), "iteration limit", "diverged", "interrupted" or "failed: ..."
+    status: an Ended, which compares as its text: "converged", "misfit" (its steps ended, but the
+        model does not describe the data, see `Misfit.is_wrong`), "iteration limit", "diverged" or
+        "interrupted"
     messages: for the user, a line each; seconds: wall time by stage
     """
 
@@ -83,7 +84,7 @@ class Result(ResultDisplay):
     covariance: np.ndarray
     shifts: np.ndarray
     losses: np.ndarray
-    status: str
+    status: Ended
     errors: Errors | None = None
     draws: PosteriorSampler | None = None
     messages: tuple[str, ...] = ()
@@ -92,7 +93,7 @@ class Result(ResultDisplay):
     @property
     def converged(self) -> bool:
         """True if the fit converged to a model that describes the data."""
-        return self.status == CONVERGED
+        return self.status == Ended.CONVERGED
 
     @property
     def channels(self) -> tuple[str, ...]:

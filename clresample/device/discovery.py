@@ -43,6 +43,10 @@ class DeviceError(RuntimeError):
     """A failed device operation; the message gives the reason and the remedy."""
 
 
+class DeviceLostError(DeviceError):
+    """A device that no longer answers, with all of its memory."""
+
+
 @dataclass(frozen=True)
 class DeviceInfo:
     """One row of the table of devices; sizes in bytes, `fp64` None if it could not be tested."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .discovery import DeviceError, format_size, load_pyopencl
+from .discovery import DeviceError, DeviceLostError, format_size, load_pyopencl
 from .drivers import pocl_cache_fault
 
 # Status codes after which the device or its queue no longer answers.
@@ -40,7 +40,7 @@ def to_device_error(device, error):
             "smaller batches or tiles, or free other arrays"
         )
     if status in LOST_STATUS:
-        return DeviceError(
+        return DeviceLostError(
             f"{device.name} ({device.platform}) no longer answers ({status}): start again, look "
             "at the driver's log for a reset or a time limit on kernels, use smaller "
             "batches, or choose another device with CLRESAMPLE_DEVICE"

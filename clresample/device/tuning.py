@@ -16,9 +16,6 @@ from .pocl_cpu_name import set_pocl_cpu_name
 # Largest number of groups along the second and third axis of a launch: the limit of NVIDIA's
 # compute capabilities and of Mesa's drivers.
 MAX_GROUPS = 65535
-# Mesa's driver for CPUs, llvmpipe, counts the iterations of all loops of a work-item in a launch.
-# After 65,535 iterations it ends every loop at once, without an error.
-LLVMPIPE_LOOPS = 65535
 # Processors for which PoCL compiles to 16 registers, whatever vector width it reports. The names
 # are those of PoCL's compiler, with which the device's version string ends.
 NARROW = ("haswell", "znver1", "znver2", "znver3")
@@ -60,8 +57,6 @@ class Tuning:
     n_scenes: scenes fitted side by side; more hide the launches better, and need more memory
     prefetch_groups: a second thread prepares and uploads a group of fits while another group
         iterates; False if the device is the CPU, whose cores both would share
-    max_loop_iterations: largest number of iterations of all loops of a work-item in one launch;
-        None if a device has no such limit
     memory [bytes]: of the device for one frame in tiles, unless a caller says otherwise. With less,
         tiles are smaller and overlap more; most instruments' quickest tiles take less than 1 GiB
     """
@@ -86,7 +81,6 @@ class Tuning:
     use_folded: bool
     n_scenes: int
     prefetch_groups: bool
-    max_loop_iterations: int | None
     memory: int
 
     @classmethod
@@ -102,7 +96,6 @@ class Tuning:
             "chunk_terms": 1024,
             "tile_flops": 4e7,  # 1 ms, where PoCL does 40 Gflop/s
             "pixel_flops": 80.0,  # 2 ns
-            "max_loop_iterations": LLVMPIPE_LOOPS if "llvmpipe" in device.name else None,
             "memory": min(1 << 30, device.memory // 4),
         }
         # Software drivers on the CPU compile as for a GPU, with many work-items at a time. A

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from ..sky.box import Box
 from ..sky.noise import MIN_PIXELS, background
-from .box import Box
 
 # [px] Side of a cell, large compared to sources. With smaller cells the wings of bright galaxies
 # are subtracted as sky; with larger ones gradients of the sky remain.

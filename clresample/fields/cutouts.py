@@ -20,7 +20,7 @@ from ..deblending.cutouts.window import sized_window, window_of
 from ..device.multi_device import one_blas_thread
 from ..files.atomic import FileError
 from ..files.fits import open_fits
-from .box import Box
+from ..sky.box import Box
 from .field_toml.field_file import read_field
 from .light import REACH_FWHM, ModelLight
 from .models import ModelFile

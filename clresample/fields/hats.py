@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import __version__
-from ..files.atomic import FileError
+from ..files.atomic import FileError, WriteError
 from ..files.parquet import arrow_table
 from ..sky.wcs import axis_names
 
@@ -121,7 +121,7 @@ def write_hats(folder, table, *, name="clresample", most_rows=MAX_ROWS) -> Path:
         shutil.rmtree(old, ignore_errors=True)
     except OSError as error:
         shutil.rmtree(part, ignore_errors=True)
-        raise FileError(f"{folder}: cannot be written ({error.strerror or error})") from error
+        raise WriteError(f"{folder}: cannot be written ({error.strerror or error})") from error
     return folder
 
 

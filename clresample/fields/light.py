@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..resampling.resampler import Resampler
+from ..sky.box import Box
 from ..sky.frame import model_psf
 from ..sky.grid import Grid
 from ..sky.psf_checks import PSFWarning
-from .box import Box
 from .models import ModelFile
 
 # [FWHM of the PSF] Distance beyond a model's box up to which its light is rendered.

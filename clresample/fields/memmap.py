@@ -6,7 +6,7 @@ import os
 
 import numpy as np
 
-from ..files.atomic import FileError
+from ..files.atomic import WriteError
 
 
 def create_memmap(path, dtype, shape) -> np.ndarray:
@@ -21,5 +21,5 @@ def create_memmap(path, dtype, shape) -> np.ndarray:
             with open(path, "r+b") as file:
                 os.posix_fallocate(file.fileno(), 0, os.path.getsize(path))
     except OSError as error:
-        raise FileError(f"{path}: cannot be written ({error.strerror or error})") from error
+        raise WriteError(f"{path}: cannot be written ({error.strerror or error})") from error
     return array

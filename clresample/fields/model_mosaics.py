@@ -6,7 +6,7 @@ import numpy as np
 from astropy.io import fits
 
 from ..files.atomic import FileError, atomic_file
-from .box import Box
+from ..sky.box import Box
 from .memmap import create_memmap
 
 STRIP_PX = 512  # rows of a mosaic that are read and written at a time

@@ -8,13 +8,13 @@ from typing import Protocol
 
 import numpy as np
 
+from ..sky.box import Box, outline
 from ..sky.grid import Grid, as_grid
 from ..sky.observation import Observation
 from ..sky.psf_checks import PSFWarning
 from ..sky.validation.observed import as_psf
 from ..sky.varying_psf.field import PSFField
 from .background import Background
-from .box import Box, outline
 from .psfs.combined import ConstantPSF
 from .strips import FilePlane as FilePlane  # beside the other kinds of Plane
 

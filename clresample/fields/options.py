@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..deblending.settings import Settings
+from ..deblending.settings import FitSettings, Settings
 from ..measurement.detection import THRESHOLD
 from .blends.cut import FitLimits
 from .blends.plan import LARGEST_FIELD
@@ -47,7 +47,7 @@ class FieldOptions:
     field_number: of the ids, 0 to 8,388,607, see `source_ids`
     """
 
-    settings: Settings = Settings()
+    settings: FitSettings = Settings()
     threshold: float = THRESHOLD
     passes: int = 2
     positions: np.ndarray | None = None

@@ -15,9 +15,11 @@ from pathlib import Path
 from astropy.io import fits
 
 from .. import __version__
+from ..deblending.ended import Ended
 from ..files.atomic import atomic_tree, check_output
 from ..files.parquet import write_parquet
 from .columns import finalise_catalogue
+from .execution.group_results import last_rounds
 from .execution.search_setup import read_search_setup
 from .hats import write_hats
 from .model_mosaics import file_name, write_mosaics
@@ -68,9 +70,9 @@ def write_outputs(folder, job, parts, unsettled, about, seconds, hats=False) -> 
     catalogue.{parquet,fits,ecsv} are identical for repeated runs of the same field: times are in
     fit_table.ecsv and provenance.json. Raises FileError.
     """
-    last = _last_rounds(parts)
+    last = last_rounds([part.read("PATCHES")[0] for part in parts])
     table, blends = finalise_catalogue(job, parts, last, unsettled)
-    status = Counter(str(s).split(":")[0] for s in blends["status"])
+    status = Counter(Ended(str(s).partition(":")[0]) for s in blends["status"])
     notes = () if find_spec("pyarrow") else (NO_PARQUET,)
     paths = [write_hats(folder / "hats", table)] if hats and len(table) else []
     with atomic_tree(folder) as part:
@@ -81,17 +83,6 @@ def write_outputs(folder, job, parts, unsettled, about, seconds, hats=False) -> 
         made.append(_write_provenance(part / "provenance.json", job, about, seconds, status))
     paths += [folder / path.name for path in made]
     return FieldOutputs(tuple(paths), len(table), len(blends), dict(status), notes)
-
-
-def _last_rounds(parts):
-    """{patch: index of the part with its last round}."""
-    last, n_round = {}, {}
-    for i, part in enumerate(parts):
-        (rows,) = part.read("PATCHES")
-        for patch, one in zip(rows["fit_id"].tolist(), rows["n_refits"].tolist(), strict=True):
-            if one >= n_round.get(patch, -1):
-                last[patch], n_round[patch] = i, one
-    return last
 
 
 def _write_catalogues(folder, table):

@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 from astropy.coordinates import SkyCoord
 
+from ..deblending.ended import Ended
+from ..sky.box import Box
 from ..sky.wcs import celestial_frame
 from .blends.tiles import field_part
-from .box import Box
 from .execution.backend import make_backend
 from .execution.fitting import FieldJob
 from .execution.folder import open_folder
@@ -104,7 +105,7 @@ def run_field(
         engine.close()
         STRIPS.clear()
     clock.stop("write")
-    failed = outputs.status.get("failed", 0)
+    failed = outputs.status.get(Ended.FAILED, 0)
     return FieldRun(outputs, seconds, failed, plan.failed_tiles, tuple(engine.turns))
 
 

@@ -26,6 +26,10 @@ class FileError(ValueError):
     """A file that cannot be read or written: one line that names it."""
 
 
+class WriteError(FileError):
+    """A file that cannot be written, such as on a full disk."""
+
+
 def check_output(path, *, overwrite=False, inputs=()):
     """Raises FileError if a file could not be written: a check before long computations.
 
@@ -51,7 +55,7 @@ def check_output(path, *, overwrite=False, inputs=()):
         if not path.absolute().parent.is_dir():
             raise FileError(f"{path}: the folder {path.parent} does not exist")
     except OSError as error:
-        raise FileError(f"{path}: cannot be written ({error.strerror or error})") from error
+        raise WriteError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
 def check_folder(folder):
@@ -68,7 +72,7 @@ def check_folder(folder):
         remove_stale(there)
         _new_folder(there).rmdir()
     except OSError as error:
-        raise FileError(f"{folder}: cannot be written ({error.strerror or error})") from error
+        raise WriteError(f"{folder}: cannot be written ({error.strerror or error})") from error
 
 
 @contextmanager
@@ -141,12 +145,12 @@ class _Outputs:
             yield
         except OSError as error:
             given = ", ".join(map(str, names.values()))
-            raise FileError(f"{given}: cannot be written ({error.strerror or error})") from error
+            raise WriteError(f"{given}: cannot be written ({error.strerror or error})") from error
         except FileError as error:  # of a writer, with the file's temporary path
             message = str(error)
             for (folder, name), given in names.items():
                 message = message.replace(str(self.stages.get(folder, folder) / name), str(given))
-            raise FileError(message) from error
+            raise type(error)(message) from error
         finally:
             self.close()
 

@@ -13,6 +13,7 @@ from astropy.table import Table
 from astropy.wcs import WCSHDO_EFMT, WCSHDO_P17, WCSHDO_all
 from astropy.wcs.wcs import WCSHDO_SIP
 
+from ..deblending.ended import Ended
 from ..deblending.posterior.errors import Errors
 from ..deblending.result import Component, Result
 from ..measurement.catalogue import catalogue
@@ -176,7 +177,7 @@ def read_result(path) -> Result:
             sources=tuple(_source(path, **source) for source in about["sources"]),
             components=_components(hdus),
             rendered=tuple(array_of(hdus["RENDERED", i + 1]) for i in numbers),
-            status=about["status"],
+            status=Ended(about["status"]),
             messages=tuple(about["messages"]),
             seconds=about["seconds"],
             errors=_errors(hdus),

@@ -12,7 +12,7 @@ from astropy.table import QTable
 from ..deblending.assessment.ambiguity import partners
 from ..deblending.assessment.edge import reaches_outside
 from ..deblending.assessment.status import misfitted_sources
-from ..deblending.blend import CONVERGED, MISFIT
+from ..deblending.ended import Ended
 from ..deblending.posterior.residuals import channel_residuals
 from ..sky.footprint import coverage_border
 from ..sky.observation import ZERO_POINT_UJY
@@ -291,7 +291,7 @@ def _flags(result, flux, error, positions, footprints):
     """Bit masks (S,) of `Flag`; flux (S, C): of the components, at their bound or above."""
     fitted = fitted_sources(result)
     flags = np.zeros(len(fitted), dtype=np.int32)
-    if result.status not in (CONVERGED, MISFIT):
+    if result.status not in (Ended.CONVERGED, Ended.MISFIT):
         flags |= Flag.NOT_CONVERGED
     flags[~fitted] |= Flag.OUTSIDE_FRAME
     flags[((flux <= 0) & np.isfinite(error)).any(axis=1)] |= Flag.ZERO_FLUX

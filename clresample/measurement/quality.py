@@ -30,7 +30,7 @@ def summary(result) -> dict:
     chi2, n_pixels = channel_chi2(result)
     misfits = np.flatnonzero(misfitted_sources(result)).tolist()
     return {
-        "status": result.status,
+        "status": str(result.status),
         "good": result.converged and not misfits,
         "misfits": misfits,
         "messages": list(result.messages),

@@ -17,10 +17,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..sky.extent import crop_psf
 from ..sky.fourier import is_mirror_symmetric
 from ..sky.mapping import Mapping, PaddedMapping
-from ..sky.psf import PSF
+from ..sky.psf import PSF, crop_psf
 from .gridding import KaiserBessel, LineTaps
 from .transfer import Certificate, transfer_function, wrap_radius
 from .wave_tables import aligned_tables, distorted_tables, line_tables, uniform_wave_table

@@ -15,7 +15,7 @@ from .affine import AffineExecutor
 from .aligned import AlignedExecutor
 from .distorted import DistortedExecutor
 from .executor import Executor
-from .folded.executor import FoldedExecutor
+from .folded import FoldedExecutor
 from .grid_operator import GridOperator
 from .plan import Precision, ResamplingPlan, make_resampling_plan
 from .transfer import noise_warnings

@@ -1,4 +1,4 @@
-"""Unions, intersections and overlaps of grids, and boxes of pixels."""
+"""Unions, intersections and overlaps of grids."""
 
 from __future__ import annotations
 
@@ -84,40 +84,3 @@ def bounding_boxes_overlap(one, other, like) -> bool:
     except ValueError:  # they do not, or `like`'s projection does not cover them
         return False
     return True
-
-
-def intersect_boxes(origin_a, shape_a, origin_b, shape_b):
-    """Common part of two boxes of pixels: slices of the first array and of the second.
-
-    origin_a, origin_b (2,) [px]: first pixels (y, x), on one grid; shape_a, shape_b (2,) [px]
-    Slices are empty where the boxes do not meet.
-    """
-    low = np.maximum(origin_a, origin_b)
-    high = np.maximum(np.minimum(np.add(origin_a, shape_a), np.add(origin_b, shape_b)), low)
-    return box_slices(low - origin_a, high - low), box_slices(low - origin_b, high - low)
-
-
-def box_slices(origin, shape):
-    """The slices (y, x) of a box of `shape` (2,) [px] that starts at `origin` (2,) [px]."""
-    return tuple(slice(int(start), int(start + n)) for start, n in zip(origin, shape, strict=True))
-
-
-def crop_psf(psf, share):
-    """Removes a PSF's outer rows and columns with at most this fraction of any band's light.
-
-    Its transform changes by at most the same fraction. It is not divided by its sum again.
-    """
-    light = np.abs(psf.images)
-    light = light / np.maximum(light.sum(axis=(1, 2), keepdims=True), 1e-300)
-    (y0, y1), (x0, x1) = (_lit(light.sum(axis).max(axis=0), share / 4) for axis in (2, 1))
-    if (y1 - y0, x1 - x0) == light.shape[1:]:
-        return psf
-    images, center = psf.images[:, y0:y1, x0:x1], psf.center - (y0, x0)
-    return psf.restore(images, spacing=psf.spacing, center=center)
-
-
-def _lit(light, share):
-    """First and one-past-last element of light (n,) beyond which lies at most `share`."""
-    first = np.searchsorted(np.cumsum(light), share, side="right")
-    last = len(light) - np.searchsorted(np.cumsum(light[::-1]), share, side="right")
-    return (int(first), int(last)) if first < last else (0, len(light))

@@ -31,7 +31,7 @@ from .wcs import (
     tangent_wcs,
     world_to_pixel,
 )
-from .wcs_interface.ape14 import Ape14Wcs
+from .wcs_interface import Ape14Wcs
 
 
 class Grid(GridDisplay, ABC):

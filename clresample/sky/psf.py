@@ -10,8 +10,8 @@ import numpy as np
 
 from ..drawing.display import PSFDisplay
 from .fourier import uniform_waves
+from .nufft import nufft_type2
 from .psf_checks import PSFWarning, core_centroid, fwhm, light_beyond_edge, psf_warnings
-from .transforms.nufft import nufft_type2
 from .validation.checks import ReadOnly, as_float_array, check_number
 
 # Relative tolerance of the band's edge, larger than the rounding of A^T nu in float64.
@@ -273,3 +273,24 @@ def _parts(waves):
     """Real and imaginary parts of waves (F, n, m), one below the other: (2F, n m)."""
     flat = waves.reshape(len(waves), -1)
     return np.concatenate([flat.real, flat.imag])
+
+
+def crop_psf(psf, share):
+    """Removes a PSF's outer rows and columns with no more than this share of any band's light.
+
+    Its transform changes by so much at most. Not divided by its sum again.
+    """
+    light = np.abs(psf.images)
+    light = light / np.maximum(light.sum(axis=(1, 2), keepdims=True), 1e-300)
+    (y0, y1), (x0, x1) = (_lit(light.sum(axis).max(axis=0), share / 4) for axis in (2, 1))
+    if (y1 - y0, x1 - x0) == light.shape[1:]:
+        return psf
+    images, center = psf.images[:, y0:y1, x0:x1], psf.center - (y0, x0)
+    return psf.restore(images, spacing=psf.spacing, center=center)
+
+
+def _lit(light, share):
+    """First and one-past-last element of light (n,), beyond which lies no more than `share`."""
+    first = np.searchsorted(np.cumsum(light), share, side="right")
+    last = len(light) - np.searchsorted(np.cumsum(light[::-1]), share, side="right")
+    return (int(first), int(last)) if first < last else (0, len(light))

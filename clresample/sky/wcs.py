@@ -15,7 +15,7 @@ from astropy.wcs.utils import wcs_to_celestial_frame
 from astropy.wcs.wcsapi import BaseHighLevelWCS, BaseLowLevelWCS
 
 from .validation.checks import check_instance
-from .wcs_interface.ape14 import Ape14Wcs
+from .wcs_interface import Ape14Wcs
 
 # [px] Tolerance of the iterated inverse of SIP and look-up tables, far below NOISE_PX.
 INVERSE_PX = 1e-8

@@ -6,16 +6,10 @@ import numpy as np
 import pytest
 from helpers.start import point_of
 
-from clresample.deblending.resize import (
-    _box,
-    _moved,
-    _same,
-    box_around,
-    box_threshold,
-    component_box,
-)
 from clresample.deblending.solver.boxes import Boxes
 from clresample.deblending.spectra import spectrum_covariance
+from clresample.deblending.start.boxes import box_around, box_threshold, component_box
+from clresample.paper.resize import _box, _moved, _same
 
 
 def test_boxes_hold_a_tenth_of_the_noise():

@@ -22,7 +22,7 @@ from clresample.deblending.view import WhitenedView
 from clresample.device.tuning import Tuning
 from clresample.resampling.cache import cached_resampler
 from clresample.resampling.plan import Precision
-from clresample.sky.extent import box_slices, intersect_boxes
+from clresample.sky.box import box_slices, intersect_boxes
 from clresample.sky.psf import PSF
 from clresample.sky.sources import PointSource
 

@@ -8,9 +8,10 @@ from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.blend import Blend
 from clresample.deblending.fit import Fit, start_fits
 from clresample.deblending.settings import Settings
-from clresample.deblending.solver.prior import SingleScalePrior
 from clresample.measurement.catalogue import Flag, catalogue
 from clresample.measurement.photometry import fluxes
+from clresample.paper.settings import PaperSettings
+from clresample.paper.solver.prior import SingleScalePrior
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
 from clresample.sky.sources import PointSource
@@ -54,9 +55,10 @@ def flux_errors(result):
 @pytest.mark.parametrize("prior", ["learned", "one scale", None])
 def test_neighbours_of_a_star_whose_psf_is_wrong(device, prior):
     given = {"one scale": {"prior": SingleScalePrior()}, None: {"prior": None}}.get(prior, {})
+    kind = PaperSettings if given else Settings
     scene = star_scene(WIDER)
     without, with_it = (
-        fit(scene, device, settings=Settings(psf_error=error, **given)) for error in (0, 0.03)
+        fit(scene, device, settings=kind(psf_error=error, **given)) for error in (0, 0.03)
     )
     wrong, right = (np.abs(flux_errors(result)) for result in (without, with_it))
     assert np.median(wrong) > 3 * np.median(right)

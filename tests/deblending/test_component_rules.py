@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from helpers.told import named
 
-from clresample.deblending.blend import INTERRUPTED
 from clresample.deblending.component_images import ComponentImages
+from clresample.deblending.ended import Ended
 from clresample.deblending.refit import colour_gradient, two_component_fit
 from clresample.deblending.refit.colour_gradient import GradientTest, log_evidence_ratio
 from clresample.deblending.settings import Settings
@@ -52,7 +52,6 @@ def test_who_is_asked_for_a_gradient():
     ]
     assert colour_gradient._candidates(fitted([(90, 90)] * 4, kinds)).tolist() == [3]
     for given in (
-        {"settings": SimpleNamespace(has_multiscale_prior=False)},
         {"strength_estimates": None},
         {"losses": [2.0, np.nan]},
     ):
@@ -164,14 +163,14 @@ def test_each_scene_keeps_its_second_fit_where_that_is_better(monkeypatch):
     """Whatever the others do; what is not kept gives the shifts of the first fit back."""
     firsts = [named(k, shifts=float(k)) for k in range(5)]
     again = {k: named(10 + k, shifts=9.0, of=firsts[k]) for k in (0, 1, 3, 4)}
-    again[4].status = INTERRUPTED
+    again[4].status = Ended.INTERRUPTED
     monkeypatch.setattr(two_component_fit, "start_refits", lambda fits: again)
     monkeypatch.setattr(two_component_fit, "iterate", lambda *given: None)
     monkeypatch.setattr(two_component_fit, "_is_better", lambda new, old, more=0: new.name != 11)
     kept = two_component_fit.refit_two_components(firsts, Settings(), None, None)
     assert [one.name for one in kept] == [10, 1, 2, 13, 4]
     assert [one.at["shifts"] for one in firsts] == [9, 1, 2, 9, 4]
-    assert [one.status == INTERRUPTED for one in kept] == [False] * 4 + [True]
+    assert [one.status == Ended.INTERRUPTED for one in kept] == [False] * 4 + [True]
 
 
 def test_progress_goes_on_from_the_first_fits():

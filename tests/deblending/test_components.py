@@ -9,7 +9,8 @@ from scipy.stats import multivariate_normal
 
 from clresample.deblending import batch
 from clresample.deblending.batch import deblend, deblend_many
-from clresample.deblending.blend import INTERRUPTED, Blend
+from clresample.deblending.blend import Blend
+from clresample.deblending.ended import Ended
 from clresample.deblending.profiles import profile, psf_second_moment
 from clresample.deblending.refit import colour_gradient, two_component_fit, two_component_start
 from clresample.deblending.refit.colour_gradient import (
@@ -17,11 +18,11 @@ from clresample.deblending.refit.colour_gradient import (
     _eliminated,
     log_evidence_ratio,
 )
-from clresample.deblending.settings import Settings
 from clresample.deblending.solver.multiscale.engine import MultiscaleEngine
 from clresample.deblending.solver.multiscale.lbfgs_control import LbfgsControl
 from clresample.deblending.solver.multiscale.prior import MultiscalePrior
 from clresample.measurement.catalogue import catalogue
+from clresample.paper.settings import PaperSettings
 from clresample.resampling.resampler import Resampler
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
@@ -112,7 +113,7 @@ def test_many_are_as_if_each_were_alone(two, device):
 
 def test_other_priors_have_one(device):
     b, _ = blend()
-    given = {"frame": b.frame, "device": device, "settings": Settings(prior=None, max_iter=20)}
+    given = {"frame": b.frame, "device": device, "settings": PaperSettings(prior=None, max_iter=20)}
     assert counts(deblend(b.observations, b.sources, **given)) == [1, 1]
 
 
@@ -191,7 +192,7 @@ def test_ctrl_c_in_the_second_fit_leaves_the_first(device, monkeypatch):
 
     monkeypatch.setattr(LbfgsControl, "accept_trials", interrupted)
     result = deblend(b.observations, b.sources, frame=b.frame, device=device)
-    assert result.status == INTERRUPTED and counts(result) == [1, 1]
+    assert result.status == Ended.INTERRUPTED and counts(result) == [1, 1]
 
 
 def test_a_second_fit_that_fails_leaves_the_first(device, monkeypatch):

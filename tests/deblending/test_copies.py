@@ -13,8 +13,9 @@ from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.blend import Blend, Failure
 from clresample.deblending.result import Result
 from clresample.deblending.settings import Settings
-from clresample.deblending.solver.constraints import Monotone, Positivity, ProxChain
-from clresample.resampling.paper.resampler import PaperResampler
+from clresample.paper.operator.resampler import PaperResampler
+from clresample.paper.settings import PaperSettings
+from clresample.paper.solver.constraints import Monotone, Positivity, ProxChain
 from clresample.resampling.tiled.resampler import TiledResampler
 from clresample.sky.grid import Grid
 from clresample.sky.psf import PSF
@@ -71,7 +72,7 @@ def test_tiled_operators(device, way):
 @ways
 def test_settings_that_were_used_and_results(device, way):
     chain = ProxChain(Positivity(), Monotone())
-    settings = Settings(max_iter=6, prior=None, constraints=chain)
+    settings = PaperSettings(max_iter=6, prior=None, constraints=chain)
     first = deblend(observe(), SOURCES, settings=settings, device=device)
     again = deblend(observe(), SOURCES, settings=way(settings), device=device)
     np.testing.assert_array_equal(again.losses, first.losses)
@@ -109,8 +110,8 @@ def test_a_bad_blend_harms_no_other(device):
     np.testing.assert_array_equal(found[0].losses, found[-1].losses)
     for failure, said in zip(found[1:-1], wrong, strict=True):
         assert isinstance(failure, Failure)
-        assert failure.status.startswith("failed: ")
-        assert said in failure.status or said == "no blend"
+        assert failure.status == "failed"
+        assert said in failure.reason or said == "no blend"
 
 
 @pytest.mark.parametrize(
@@ -118,14 +119,11 @@ def test_a_bad_blend_harms_no_other(device):
     [
         ({"max_iter": 1.5}, "max_iter is 1.5, must be a whole number"),
         ({"max_iter": True}, "max_iter is True"),
-        ({"rel_tol": np.nan}, "rel_tol is nan"),
-        ({"rel_tol": "a"}, "rel_tol must be an array of real numbers"),
         ({"loss_tol": np.nan}, "loss_tol is nan"),
         ({"flux_error_floor": None}, "flux_error_floor"),
         ({"fit_sky": 1}, "fit_sky is 1"),
         ({"prior": 3}, "prior is 3"),
-        ({"constraints": Positivity()}, "constraints is .* must be ProxChain"),
-        ({"step_sizes": 0.1}, "step_sizes is 0.1"),
+        ({"prior": None}, "prior is None"),
     ],
 )
 def test_settings_of_other_types_are_refused(given, said):

@@ -10,7 +10,7 @@ from clresample.sky.frame import Frame
 from clresample.sky.observation import Observation
 from clresample.sky.sources import ExtendedSource, PointSource
 
-EXACT = Settings(rel_tol=0, max_iter=20)
+EXACT = Settings(max_iter=20)
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ from helpers.scenes import GALAXIES, observe
 
 from clresample.deblending.batch import deblend
 from clresample.deblending.settings import Settings
+from clresample.paper.settings import PaperSettings
 from clresample.sky.sources import ExtendedSource
 
 N_THREADS = 3
@@ -17,7 +18,7 @@ N_THREADS = 3
 @pytest.mark.parametrize("fit_shifts", [False, True])
 def test_fits_in_threads_are_those_alone(device, prior, fit_shifts):
     given = {} if prior else {"prior": None}
-    settings = Settings(max_iter=25, fit_shifts=fit_shifts, **given)
+    settings = (PaperSettings if given else Settings)(max_iter=25, fit_shifts=fit_shifts, **given)
     seen = [observe(seed=i) for i in range(N_THREADS)]
     sources = [ExtendedSource(position_px=position) for position, _, _ in GALAXIES]
 

@@ -9,6 +9,7 @@ from clresample.deblending import batch, fit as fit_module
 from clresample.deblending.batch import _BatchRunner
 from clresample.deblending.blend import Failure
 from clresample.deblending.fit import Fit
+from clresample.paper.run import FitTrack
 
 
 class Named(SimpleNamespace):
@@ -76,7 +77,7 @@ def test_those_that_can_begin_though_others_cannot(monkeypatch):
         2: ([1], []),
     }
     assert [done is None for done in many.done] == [True, False, True]
-    assert many.done[1].blend == "bad" and "bad data" in many.done[1].status
+    assert many.done[1].blend == "bad" and "bad data" in many.done[1].reason
 
 
 def test_one_that_fails_is_fitted_apart_from_the_others(monkeypatch):
@@ -84,7 +85,7 @@ def test_one_that_fails_is_fitted_apart_from_the_others(monkeypatch):
     assert many._fit(group) is False
     assert many.done[0] == "a seen 1" and seconds == [1, 1]
     assert all(isinstance(done, Failure) for done in many.done[1:])
-    assert "bad data" in many.done[1].status and "no result" in many.done[2].status
+    assert "bad data" in many.done[1].reason and "no result" in many.done[2].reason
     many, group, seconds = many_of(["a", "b"], monkeypatch)
     assert many._fit(group) is False and many.done == ["a seen 2", "b seen 2"] and seconds == [2]
 
@@ -104,11 +105,11 @@ def going(status="iteration limit"):
     """A fit on its way at shift 1, whose best state so far is of loss 5 at shift 0."""
     one = object.__new__(Fit)
     one.views = [SimpleNamespace(op=SimpleNamespace(shift=np.zeros(2))) for _ in range(2)]
-    one.losses, one.status, one.settings = [9.0], status, SimpleNamespace(rel_tol=1e-3)
-    one._best = fit_module._BestState(np.inf, None, None, one.shifts)
-    one.keep_best(5.0, "best scene", "best state")
+    one.losses, one.status = [9.0], status
+    track = FitTrack(one, 1e-3)
+    track.keep_best(5.0, "best scene", "best state")
     one.shift(np.ones((2, 2)))
-    return one
+    return one, track
 
 
 @pytest.mark.parametrize(
@@ -122,35 +123,34 @@ def going(status="iteration limit"):
     ],
 )
 def test_a_fit_ends_with_its_best_state_and_the_shifts_of_that(loss, status, kept):
-    one = going(status)
-    one.store_final(loss, "present scene", "present state")
+    one, track = going(status)
+    track.store_final(loss, "present scene", "present state")
     assert (one.scene, one.state) == (f"{kept} scene", f"{kept} state")
     assert one.losses == [9.0, loss if kept == "present" else 5.0]
     assert one.shifts.tolist() == [[float(kept == "present")] * 2] * 2
 
 
 def test_only_better_states_are_remembered():
-    one = going()
+    one, track = going()
     for loss in (5.0, 6.0, np.nan):
-        one.keep_best(loss, "other scene", "other state")
-    one.store_final(7.0, "present scene", "present state")
+        track.keep_best(loss, "other scene", "other state")
+    track.store_final(7.0, "present scene", "present state")
     assert one.state == "best state"
-    one.keep_best(4.0, "new scene", "new state")
+    track.keep_best(4.0, "new scene", "new state")
     one.shift(np.full((2, 2), 2.0))
-    one.store_final(7.0, "present scene", "present state")
+    track.store_final(7.0, "present scene", "present state")
     assert one.state == "new state" and one.shifts.tolist() == [[0.0, 0.0]] * 2
-    none = going("interrupted")
-    none._best = fit_module._BestState(np.inf, None, None, none.shifts)
+    none, _ = going("interrupted")
     none.scene, none.state = "first scene", "first state"
-    none.store_final(1.0, "present scene", "present state")
+    FitTrack(none, 1e-3).store_final(1.0, "present scene", "present state")
     assert none.state == "first state" and none.losses == [9.0]
 
 
 def test_losses_that_come_in_say_whether_a_fit_goes_on():
-    one = going()
-    assert one.stopped(np.array([8.0, 7.0])) is False
+    one, track = going()
+    assert track.stopped(np.array([8.0, 7.0])) is False
     assert one.losses == [9.0, 8.0, 7.0] and one.status == "iteration limit"
-    assert one.stopped(np.array([6.0, np.nan])) is True and one.status == "diverged"
+    assert track.stopped(np.array([6.0, np.nan])) is True and one.status == "diverged"
     one.end("scene", "state", "findings", "converged")
     assert (one.scene, one.state, one.strength_estimates) == ("scene", "state", "findings")
     assert one.status == "converged"

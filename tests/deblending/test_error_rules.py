@@ -21,6 +21,7 @@ from clresample.deblending.posterior.profile_modes import OutsideBoxMoments
 from clresample.deblending.result import Component
 from clresample.deblending.settings import Settings
 from clresample.measurement.shapes import moments
+from clresample.paper.settings import PaperSettings
 from clresample.sky.psf import PSF
 
 
@@ -176,7 +177,7 @@ def test_errors_at_fixed_morphologies_are_those_of_the_normal_matrix(monkeypatch
     wanted = [[1e-4, 3e-9], [2.0, 1e-150]]
     np.testing.assert_allclose(made[0].fixed_error, wanted)
     assert posterior_module.posterior_of(
-        SimpleNamespace(settings=Settings(prior=None), scene=None, strength_estimates=1),
+        SimpleNamespace(settings=PaperSettings(), scene=None, strength_estimates=None),
         [],
         0,
         seen,

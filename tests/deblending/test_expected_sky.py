@@ -9,13 +9,14 @@ from helpers import scenes
 from clresample.deblending.inspection import inspect as room
 from clresample.deblending.inspection.levels import sky_level
 from clresample.deblending.settings import Settings
-from clresample.deblending.solver.prior import SingleScalePrior
 from clresample.measurement.photometry import fluxes
+from clresample.paper.settings import PaperSettings
+from clresample.paper.solver.prior import SingleScalePrior
 from clresample.sky.observation import Observation
 
 NOISE = 0.05
 LEVELS = 0.4 * NOISE, -0.3 * NOISE, 0.5 * NOISE  # in v, g, r
-LEARNS, PLAIN = Settings(), Settings(prior=SingleScalePrior(), max_iter=150)
+LEARNS, PLAIN = Settings(), PaperSettings(prior=SingleScalePrior(), max_iter=150)
 
 
 def raised(blend, by):

@@ -12,7 +12,9 @@ from clresample import (
     ExtendedSource,
     Grid,
     Observation,
+    PaperSettings,
     Settings,
+    SingleScalePrior,
     catalogue,
     deblend,
     deblend_many,
@@ -254,9 +256,7 @@ def test_an_exposure_without_weight_changes_nothing(images):
 
 @pytest.mark.parametrize("prior", [None, "one scale"])
 def test_other_priors_keep_one_value_a_band(images, prior):
-    from clresample.deblending.solver.prior import SingleScalePrior
-
-    settings = Settings(prior=None if prior is None else SingleScalePrior(), max_iter=60)
+    settings = PaperSettings(prior=None if prior is None else SingleScalePrior(), max_iter=60)
     result = deblend([*exposures(images[0]), red(images)], SOURCES, settings=settings)
     spectra = np.array([c.spectrum[:N] for c in result.components])
     np.testing.assert_allclose(spectra, spectra[:, :1] * np.ones(N), rtol=1e-5)

@@ -7,10 +7,11 @@ import pytest
 
 from clresample.deblending.start import first_scene as room
 from clresample.deblending.start.first_scene import first_scene
+from clresample.paper.solver import scene as steps
 from clresample.sky.sources import ExtendedSource, PointSource
 
 
-def posed(monkeypatch, *, learns=True, shares=False):
+def posed(monkeypatch, *, shares=False):
     """A fit of three components of two sources, the second one outside the frame; boxes are as
     large as their light is bright, so that each shows by what it was asked."""
     rng, asked = np.random.default_rng(0), []
@@ -20,7 +21,6 @@ def posed(monkeypatch, *, learns=True, shares=False):
         return np.array([i, 2 * i]), (3 + i, 4), np.array([1, i]), np.full((3 + i, 4), 1.0 + i)
 
     monkeypatch.setattr(room, "component_box", box_of)
-    monkeypatch.setattr(room, "damping", lambda scene, state, prior: (scene, state, prior))
     spectra = np.array([[30.0, 40.0, 1.0], [5.0, 6.0, 0.0], [7.0, 80.0, 9.0]])
     power = np.array([[4.0, 0.25, 1.0], [1e-27, 1e-29, 0.0], [100.0, 1e-10, 16.0]])
     start = SimpleNamespace(
@@ -51,7 +51,7 @@ def posed(monkeypatch, *, learns=True, shares=False):
             ExtendedSource(position_px=(3, 4)),
         ],
         fitted=[0, 2],
-        settings=SimpleNamespace(has_multiscale_prior=learns, fit_sky=True, prior="prior"),
+        settings=SimpleNamespace(fit_sky=True),
     )
     return fit, asked
 
@@ -77,23 +77,21 @@ def test_a_first_scene_holds_what_the_start_has_found(monkeypatch, shares):
         np.testing.assert_array_equal(scene.profile[i], np.full((3 + i, 4), 1.0 + i))
         np.testing.assert_array_equal(state.morph[i], scene.profile[i])
         assert state.morph[i] is not scene.profile[i]  # it changes
-        assert state.latent[i].shape == (3 + i, 4) and not state.latent[i].any()
     assert state.spectra is fit.start.spectra and state.sky is fit.start.sky
     assert scene.known_sky is fit.sky_precision
-    assert scene.spectrum_curvature is fit.start.spectrum_curvature and scene.damping is None
+    assert scene.spectrum_curvature is fit.start.spectrum_curvature
 
 
 def test_spectra_step_by_their_error_and_a_fiftieth_of_themselves(monkeypatch):
     """Where the channel holds nothing of a component they stay."""
-    scene, _ = first_scene(posed(monkeypatch)[0])
+    monkeypatch.setattr(steps, "damping", lambda *given: given)
+    first = first_scene(posed(monkeypatch)[0])
+    scene, state = steps.begin_steps(*first, "prior")
+    assert scene.damping == (*first, "prior") and steps.begin_steps(scene, state, None)[0] is scene
+    for z, morph in zip(state.latent, state.morph, strict=True):
+        assert z.shape == morph.shape and not z.any()
     wanted = [[1.1, 2.8, 1.02], [10**13.5 + 0.1, 0, 0], [0.24, 1e5 + 1.6, 0.43]]
     np.testing.assert_allclose(scene.step_scale, wanted, rtol=1e-9)
-
-
-def test_only_a_prior_that_does_not_learn_asks_for_damping(monkeypatch):
-    scene, state = first_scene(posed(monkeypatch, learns=False)[0])
-    bare, same, prior = scene.damping
-    assert same is state and prior == "prior" and bare.origin is scene.origin
 
 
 def test_spectra_of_terms_are_each_channels_times_its_shares(monkeypatch):

@@ -131,9 +131,8 @@ def test_fits_start_side_by_side_each_from_its_own_point(monkeypatch):
     assert asked == [(100, 2.0), (101, 2.0), (102, 2.0)]
 
 
-def test_memory_of_a_fit_holds_the_vectors_of_a_prior_that_learns(monkeypatch):
-    monkeypatch.setattr(room, "vector_bytes", lambda scene, prior: 1000 * prior)
-    for learns, wanted in ((True, 3007), (False, 7)):
-        settings = SimpleNamespace(has_multiscale_prior=learns, prior=3)
+def test_memory_of_a_fit_holds_what_its_solver_takes():
+    for n_bytes, wanted in ((3000, 3007), (0, 7)):
+        settings = SimpleNamespace(solver_bytes=lambda scene, n_bytes=n_bytes: n_bytes)
         fit = SimpleNamespace(settings=settings, scene=SimpleNamespace(n_bytes=7))
         assert room.scene_bytes(fit) == wanted

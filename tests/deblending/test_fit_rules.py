@@ -9,16 +9,18 @@ from helpers import scenes
 from clresample.deblending import batch, fit as fit_module
 from clresample.deblending.batch import _BatchRunner
 from clresample.deblending.blend import Blend, Failure
-from clresample.deblending.fit import DIVERGED, PATIENCE, Fit, data_bytes, stop_reason
+from clresample.deblending.ended import Ended
+from clresample.deblending.fit import Fit, data_bytes
 from clresample.deblending.settings import Settings
 from clresample.deblending.solver.scene import Scene
+from clresample.paper.run import DIVERGENCE_RATIO, PATIENCE, stop_reason
 from clresample.sky.sources import ExtendedSource, SourceWarning
 
 
 def test_when_a_fit_ends():
     """After fifteen iterations in which the best loss fell by less than the part; ten times the
     best one is a divergence, as is NaN among the new losses alone."""
-    assert (PATIENCE, DIVERGED) == (15, 10)
+    assert (PATIENCE, DIVERGENCE_RATIO) == (15, 10)
     flat = [100.0] * 16
     assert stop_reason(flat[:15], 5, 1e-3) is None and stop_reason(flat, 5, 1e-3) == "converged"
     assert stop_reason([100.0] + [99.91] * 15, 5, 1e-3) == "converged"
@@ -147,9 +149,9 @@ def test_parts_fit_into_the_memory(monkeypatch, sizes, parts):
 
 
 def test_what_a_failure_says():
-    assert batch._failure("b", ValueError("no")) == Failure("b", "failed: no")
-    assert batch._failure("b", KeyError("no")).status == "failed: KeyError: 'no'"
-    assert not Failure("b", "failed").converged
+    assert batch._failure("b", ValueError("no")) == Failure("b", Ended.FAILED, "no", ValueError)
+    assert batch._failure("b", KeyError("no")).reason == "KeyError: 'no'"
+    assert not Failure("b", Ended.FAILED).converged
     with pytest.raises(ValueError, match="blends is 3 .int., must be a sequence"):
         batch._listed("blends", 3)
     for n, words in ((1, "1 source position"), (2, "2 source positions")):
@@ -172,7 +174,7 @@ def test_blends_of_one_size_keep_it_and_others_share_one(monkeypatch):
 
     def fitted(blends, *, pad, **_):
         pads.append(pad)
-        return [(Failure(b, "not asked"), ((), ())) for b in blends]
+        return [(Failure(b, Ended.FAILED, "not asked"), ((), ())) for b in blends]
 
     monkeypatch.setattr(batch, "_fit_all", fitted)
     monkeypatch.setattr(batch, "get_device", lambda device: device)

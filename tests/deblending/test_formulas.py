@@ -7,16 +7,16 @@ import pytest
 from helpers.scenes import blend, fit, frame, observe
 from helpers.solver import BOXES, changed, posed
 
-from clresample.deblending import iterate as iterate_module
 from clresample.deblending.fit import Fit, start_fits
 from clresample.deblending.profiles import SIZE_ARCSEC, components_of
-from clresample.deblending.settings import Settings
-from clresample.deblending.solver import curvature as curvature_module
-from clresample.deblending.solver.amsgrad import AMSGrad
-from clresample.deblending.solver.curvature import damping
-from clresample.deblending.solver.prior import SingleScalePrior
-from clresample.deblending.start.first_scene import SPECTRUM_PART
 from clresample.deblending.view import SceneGeometry, whitened_view
+from clresample.paper import run as paper_run
+from clresample.paper.settings import PaperSettings
+from clresample.paper.solver import curvature as curvature_module
+from clresample.paper.solver.amsgrad import AMSGrad
+from clresample.paper.solver.curvature import damping
+from clresample.paper.solver.prior import SingleScalePrior
+from clresample.paper.solver.scene import SPECTRUM_PART, begin_steps
 from clresample.sky.sources import ExtendedSource
 
 
@@ -63,11 +63,12 @@ def test_the_sky_is_part_of_the_model_that_damps(device):
 
 def test_scale_of_the_spectra_steps(device):
     """A flux's error, and 2 % of the flux."""
-    f = Fit(blend(), Settings(), device, np.float32, pad=1)
+    f = Fit(blend(), PaperSettings(), device, np.float32, pad=1)
     start_fits([f])
+    scene, _ = begin_steps(f.scene, f.state, None)
     error = 1 / np.sqrt(f.scene.spectrum_curvature)
     assert SPECTRUM_PART == 0.02 and (f.state.spectra > 20 * error).any()
-    np.testing.assert_allclose(f.scene.step_scale, error + 0.02 * f.state.spectra, rtol=1e-12)
+    np.testing.assert_allclose(scene.step_scale, error + 0.02 * f.state.spectra, rtol=1e-12)
 
 
 def test_sizes_of_several_components_lie_about_that_of_one():
@@ -96,9 +97,9 @@ def test_a_fit_that_worsens_after_a_new_batch_ends_at_its_best(device, monkeypat
         return replace(scene), state
 
     monkeypatch.setattr(AMSGrad, "step", worse)
-    monkeypatch.setattr(iterate_module, "RESIZE_ITERATIONS", 10)
-    monkeypatch.setattr(iterate_module, "resize_boxes", resized)
-    settings = Settings(prior=SingleScalePrior(), max_iter=20, rel_tol=0)
+    monkeypatch.setattr(paper_run, "RESIZE_ITERATIONS", 10)
+    monkeypatch.setattr(paper_run, "resize_boxes", resized)
+    settings = PaperSettings(prior=SingleScalePrior(), max_iter=20, rel_tol=0)
     result = fit(blend(), device, settings=settings)
     best = result.losses[:7].min()
     assert made and result.losses[10] > 1.05 * best

@@ -8,83 +8,86 @@ import pytest
 from helpers.blends import blend, observe, round_component
 
 from clresample.deblending.settings import Settings
-from clresample.deblending.solver.constraints import (
+from clresample.deblending.solver.multiscale.prior import MultiscalePrior
+from clresample.paper.settings import PaperSettings
+from clresample.paper.solver.constraints import (
     L0,
     L1,
     MaxNorm,
     Monotone,
-    MonotoneProjection,
     Positivity,
     ProxChain,
     SumNorm,
     Symmetry,
 )
-from clresample.deblending.solver.multiscale.prior import MultiscalePrior
-from clresample.deblending.solver.prior import SingleScalePrior
-from clresample.deblending.solver.prox_launches import parameter_table
+from clresample.paper.solver.prior import SingleScalePrior
+from clresample.paper.solver.prox_launches import parameter_table
 from clresample.sky.grid import Grid
 
 
 def test_defaults_are_those_of_the_docstring():
     """Steps, errors and tolerances as they are documented, and measured."""
     s = Settings()
-    assert (s.max_iter, s.loss_tol, s.rel_tol, s.flux_error_floor) == (500, 0.25, 1e-5, 0.0005)
+    assert (s.max_iter, s.loss_tol, s.flux_error_floor) == (500, 0.25, 0.0005)
     assert (s.psf_error, s.psf_tolerance, s.fit_shifts, s.fit_sky) == (0.03, 1e-3, "auto", False)
-    assert (
-        s.errors
-        and s.has_multiscale_prior
-        and s.constraints is None
-        and s.prior == MultiscalePrior()
-    )
-    steps = s.step_sizes
+    assert s.errors and s.prior == MultiscalePrior()
+    paper = PaperSettings()
+    assert (paper.max_iter, paper.rel_tol) == (500, 1e-5)
+    assert paper.prior is paper.constraints is None
+    steps = paper.step_sizes
     assert (steps.latent, steps.morphology, steps.spectrum) == (0.1, 0.01, 0.1)
     assert (s.prior.scales_px, s.prior.hyperprior_weight) == ((0.8, 2.0, 5.0), 100)
     assert s.prior.strengths == (0.005, 0.1, 0.02)
     assert (SingleScalePrior().strength, SingleScalePrior().correlation_px) == (0.1, 2.0)
 
 
+BOTH = (Settings, PaperSettings)
+
+
 @pytest.mark.parametrize(
-    "name, wrong, right",
+    "kinds, name, wrong, right",
     [
-        ("max_iter", [-1, 1.5, "many"], [0, 1]),
-        ("loss_tol", [-0.1, np.nan, "a"], [0, 9.0]),
-        ("rel_tol", [-1e-9, 1.0, np.nan], [0, 0.99]),
-        ("flux_error_floor", [-1e-9, 1.0, np.inf], [0, 0.99]),
-        ("psf_error", [-1e-9, 1.0], [0, 0.99]),
-        ("psf_tolerance", [-1e-9, 1.0], [0, 0.99]),
-        ("fit_shifts", [1, "no", None], [True, np.False_, "auto"]),
-        ("fit_sky", [1, "no", None], [True, np.False_]),
-        ("errors", [1, "no", None], [True, np.False_]),
-        ("prior", [3, "none"], [None, SingleScalePrior(), MultiscalePrior()]),
-        ("constraints", [Positivity(), [Positivity()]], [None, ProxChain(Positivity())]),
-        ("step_sizes", [None, 0.1], []),
+        (BOTH, "max_iter", [-1, 1.5, "many"], [0, 1]),
+        ((Settings,), "loss_tol", [-0.1, np.nan, "a"], [0, 9.0]),
+        ((PaperSettings,), "rel_tol", [-1e-9, 1.0, np.nan, "a"], [0, 0.99]),
+        ((Settings,), "flux_error_floor", [-1e-9, 1.0, np.inf], [0, 0.99]),
+        (BOTH, "psf_error", [-1e-9, 1.0], [0, 0.99]),
+        (BOTH, "psf_tolerance", [-1e-9, 1.0], [0, 0.99]),
+        (BOTH, "fit_shifts", [1, "no", None], [True, np.False_, "auto"]),
+        (BOTH, "fit_sky", [1, "no", None], [True, np.False_]),
+        ((Settings,), "errors", [1, "no", None], [True, np.False_]),
+        ((Settings,), "prior", [3, "none", None, SingleScalePrior()], [MultiscalePrior()]),
+        ((PaperSettings,), "prior", [3, MultiscalePrior()], [None, SingleScalePrior()]),
+        (
+            (PaperSettings,),
+            "constraints",
+            [Positivity(), [Positivity()]],
+            [None, ProxChain(Positivity())],
+        ),
+        ((PaperSettings,), "step_sizes", [None, 0.1], []),
     ],
 )
-def test_settings_are_named_where_they_cannot_be(name, wrong, right):
-    for value in wrong:
-        with pytest.raises(ValueError, match=name):
-            Settings(**{name: value})
-    for value in right:
-        assert getattr(Settings(**{name: value}), name) == value
+def test_settings_are_named_where_they_cannot_be(kinds, name, wrong, right):
+    for kind in kinds:
+        for value in wrong:
+            with pytest.raises(ValueError, match=name):
+                kind(**{name: value})
+        for value in right:
+            assert getattr(kind(**{name: value}), name) == value
 
 
 def test_constraints_go_with_priors():
-    """Scales are the profiles' where there is a prior; the learning one takes positivity alone."""
-    kinds = [type(p) for p in Settings().constraint_chain.steps()]
-    assert kinds == [Positivity]
+    """Scales are the profiles' where there is a prior."""
     for prior in (None, SingleScalePrior()):
-        kinds = [type(p) for p in Settings(prior=prior).constraint_chain.steps()]
+        kinds = [type(p) for p in PaperSettings(prior=prior).constraint_chain.steps()]
         assert kinds == [Positivity, Monotone]
     for scale in (MaxNorm(), SumNorm()):
         given = ProxChain(Positivity(), scale)
-        assert Settings(prior=None, constraints=given).constraint_chain is given
+        assert PaperSettings(prior=None, constraints=given).constraint_chain is given
         with pytest.raises(ValueError, match=f"constraints hold {type(scale).__name__}.*scale of"):
-            Settings(prior=SingleScalePrior(), constraints=given)
+            PaperSettings(prior=SingleScalePrior(), constraints=given)
     given = ProxChain(Positivity(), Monotone())
-    assert Settings(prior=SingleScalePrior(), constraints=given).constraint_chain is given
-    with pytest.raises(ValueError, match="constraints hold Monotone.*non-negative and nothing"):
-        Settings(constraints=given)
-    assert Settings(constraints=ProxChain(Positivity())).has_multiscale_prior
+    assert PaperSettings(prior=SingleScalePrior(), constraints=given).constraint_chain is given
 
 
 @pytest.mark.parametrize(
@@ -110,9 +113,6 @@ def test_parameters_of_constraints_by_source():
     assert parameter_table(L1([2.0, 0.0]), 2).tolist() == [[2, 0], [0, 0]]
     table = parameter_table(Monotone(weights=[3, 0], gradient=[0.0, 1.0]), 2)
     assert table.tolist() == [[3, 0], [0, 1]] and parameter_table(Symmetry(), 1)[0, 0] == 1
-    given = MonotoneProjection(positive=False).parameters
-    assert (given["positive"], given["n_iterations"], given["tolerance"]) == (False, 300, 1e-5)
-    assert MonotoneProjection().parameters["positive"] is True
 
 
 def test_draws_below_zero_become_zero(monkeypatch):

@@ -15,6 +15,7 @@ from clresample.deblending.iterate import (
     SHIFT_ITERATIONS,
     iterate,
 )
+from clresample.paper import run as paper_run
 
 
 @pytest.fixture(autouse=True)
@@ -192,12 +193,13 @@ class Engine:
         self.followed += 1
 
 
-RUNNING = room._AmsgradRun
+RUNNING = paper_run.AmsgradRun
 
 
 def running(n, *, live=None, n_steps=0, **settings):
     one = object.__new__(RUNNING)
-    one.fits, one.engine = [Told(c) for c in "abcdefgh"[:n]], Engine(n, n_steps)
+    one.tracks, one.engine = [Told(c) for c in "abcdefgh"[:n]], Engine(n, n_steps)
+    one.fits = one.tracks
     one.live = np.ones(n, bool) if live is None else np.array(live)
     one.settings = SimpleNamespace(**({"max_iter": 100, "fit_shifts": False} | settings))
     one.device = one.dtype = None
@@ -227,7 +229,7 @@ def test_other_engines_run_a_few_iterations_and_settle_who_stops():
 )
 def test_other_engines_shift_every_few_iterations(fit_shifts, n_steps, monkeypatch):
     one = running(3, live=[True, False, True], fit_shifts=fit_shifts, n_steps=n_steps)
-    monkeypatch.setattr(room, "shift_steps", lambda scene, state: (np.full((2, 2), 0.5), 1.0))
+    monkeypatch.setattr(paper_run, "shift_steps", lambda scene, state: (np.full((2, 2), 0.5), 1.0))
     one.fits[0].shifts = np.ones((2, 2))
     one.shift()
     due = fit_shifts and n_steps == SHIFT_ITERATIONS
@@ -239,10 +241,9 @@ def test_other_engines_shift_every_few_iterations(fit_shifts, n_steps, monkeypat
 def test_ctrl_c_settles_those_that_go_on(monkeypatch):
     one = running(3, live=[True, False, True])
     one.run = lambda: (_ for _ in ()).throw(KeyboardInterrupt)
-    monkeypatch.setattr(room, "_AmsgradRun", lambda *_: one)
     clock = iter([10.0, 13.0, 13.0, 13.0])
     monkeypatch.setattr(room, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
-    iterate(one.fits, SimpleNamespace(has_multiscale_prior=False, max_iter=9), None, None)
+    iterate(one.fits, SimpleNamespace(start_run=lambda *_: one, max_iter=9), None, None)
     assert [f.status == "interrupted" for f in one.fits] == [True, False, True]
     assert [f.ended is not None for f in one.fits] == [True, False, True]
     assert [f.seconds for f in one.fits] == [{"fit": 1.0}] * 3  # shared among them
@@ -254,8 +255,7 @@ def test_a_run_ends_when_no_fit_goes_on_or_at_the_limit(monkeypatch):
         one, seen, calls = running(2, max_iter=max_iter), [], []
         one.fits[0].stopped = lambda losses, one=one: one.n_steps >= 10
         one.shift, one.repacked = lambda calls=calls: calls.append(1), lambda one=one: one
-        monkeypatch.setattr(room, "_AmsgradRun", lambda *_, one=one: one)
-        settings = SimpleNamespace(has_multiscale_prior=False, max_iter=max_iter)
+        settings = SimpleNamespace(start_run=lambda *_, one=one: one, max_iter=max_iter)
         iterate(one.fits, settings, None, None, lambda n, loss, seen=seen: seen.append((n, loss)))
         assert [n for n, _ in seen] == wanted and len(calls) == max(len(wanted) - 1, 0)
         if seen:

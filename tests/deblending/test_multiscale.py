@@ -10,10 +10,8 @@ from helpers.solver import close, posed, ragged
 
 from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.settings import Settings
-from clresample.deblending.solver.constraints import Monotone, Positivity, ProxChain
 from clresample.deblending.solver.multiscale.engine import MultiscaleEngine
 from clresample.deblending.solver.multiscale.prior import MultiscalePrior
-from clresample.deblending.solver.prior import SingleScalePrior
 from clresample.sky.sources import PointSource
 
 SHORT = Settings(max_iter=12, loss_tol=0)
@@ -215,11 +213,6 @@ def test_ctrl_c_gives_the_present_state(device, monkeypatch, when):
     assert len(result.losses) <= when
 
 
-def test_constraints_beside_it_are_refused():
-    with pytest.raises(ValueError, match=r"constraints hold Monotone.*MultiscalePrior"):
-        Settings(constraints=ProxChain(Positivity(), Monotone()))
-    assert Settings(constraints=ProxChain(Positivity())).has_multiscale_prior
-    chain = Settings(prior=SingleScalePrior()).constraint_chain
-    assert str(chain) == str(ProxChain(Positivity(), Monotone()))
+def test_settings_that_cannot_be():
     with pytest.raises(ValueError, match="loss_tol is -1"):
         Settings(loss_tol=-1)

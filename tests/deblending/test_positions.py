@@ -9,15 +9,15 @@ from helpers.headers import grid_of, header
 from helpers.scenes import GALAXIES, SHAPE, blend, fit, frame, same
 
 from clresample.deblending.batch import deblend, deblend_many
-from clresample.deblending.image_profiles import with_image_profiles
 from clresample.deblending.inspection.inspect import InputWarning
 from clresample.deblending.settings import Settings
+from clresample.paper.image_profiles import with_image_profiles
 from clresample.sky.frame import model_frame
 from clresample.sky.observation import Observation
 from clresample.sky.psf import PSF
 from clresample.sky.sources import ExtendedSource, PointSource, SourceWarning
 
-SHORT = Settings(max_iter=10, rel_tol=0)
+SHORT = Settings(max_iter=10)
 
 
 def in_pixels_of(observation, position, home=None):

@@ -13,13 +13,14 @@ from clresample.deblending.inspection.inspect import InputWarning
 from clresample.deblending.posterior import aligned_observation
 from clresample.deblending.posterior.moments import moment_derivatives
 from clresample.deblending.settings import Settings
-from clresample.deblending.solver.prior import SingleScalePrior
 from clresample.files import results as store
 from clresample.files.atomic import FileError
 from clresample.files.results import read_result, write_result
 from clresample.measurement.catalogue import Flag, catalogue
 from clresample.measurement.photometry import fluxes
 from clresample.measurement.shapes import moments
+from clresample.paper.settings import PaperSettings
+from clresample.paper.solver.prior import SingleScalePrior
 from clresample.sky.observation import Observation
 from clresample.sky.sources import ExtendedSource, PointSource
 
@@ -200,7 +201,8 @@ def test_the_floor_is_added_in_quadrature_and_leaves_colours(device, fitted, mon
     "given", [{"prior": SingleScalePrior()}, {"prior": None}, {"errors": False}], ids=str
 )
 def test_others_keep_errors_of_fixed_morphologies(device, given):
-    result = scenes.fit(blend(BRIGHT), device, settings=Settings(max_iter=20, **given))
+    kind = PaperSettings if "prior" in given else Settings
+    result = scenes.fit(blend(BRIGHT), device, settings=kind(max_iter=20, **given))
     assert result.errors is None and result.draws is None
     sums = np.array([c.morphology.sum() for c in result.components])
     wanted = np.sqrt(np.einsum("css->sc", result.covariance)) * sums[:, None]

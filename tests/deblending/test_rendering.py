@@ -51,7 +51,6 @@ def pairs_of(device, mapping, dtype, *, own=False):
                 ops=[op],
                 data=[rng.normal(0, 3, op.shape_out)],
                 weights=[rng.uniform(0.5, 1.5, op.shape_out) * op.covered],
-                step_scale=rng.uniform(0.1, 0.3, (len(boxes), 2)),
                 spectra=rng.uniform(0.5, 2, (len(boxes), 2)),
                 sky=rng.normal(size=2),
             )
@@ -122,7 +121,7 @@ def test_gradients_are_the_same_at_every_depth(build, name):
     pairs, found = pairs_of(build, GEOMETRIES[name](), np.float64, own=True), []
     for depth in (0, 1, 2):
         b = buffers_of(pairs, build, np.float64)
-        gradient = LossGradient(b, with_prior=False, depth=depth)
+        gradient = LossGradient(b, depth=depth)
         gradient.queue()
         gradient.queue()  # what is added to is written first
         arrays = b.d_morph, b.d_spectra, gradient.rows_loss, gradient.rows_pull
@@ -245,7 +244,6 @@ def test_what_takes_least_is_chosen(device):
         ops=scene.ops,
         data=scene.data,
         weights=scene.weights,
-        step_scale=np.ones((n, 2)),
         spectra=np.ones((n, 2)),
         sky=state.sky,
     )

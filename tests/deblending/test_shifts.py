@@ -165,7 +165,6 @@ def truth(b, device):
         center=np.array([(25, 25), (28, 31), (40, 45)]),
         profile=morphs,
         fixed=np.zeros(3, bool),
-        step_scale=np.ones((3, 3)),
     )
     spectra = np.repeat(peaks[:, None], 3, axis=1)
-    return scene, State([0 * m for m in morphs], morphs, spectra, np.zeros(3))
+    return scene, State(morphs, spectra, np.zeros(3))

@@ -24,6 +24,7 @@ from clresample.deblending.solver.multiscale.lbfgs_control import LbfgsControl
 from clresample.deblending.solver.multiscale.lbfgs_pairs import LbfgsPairs
 from clresample.deblending.solver.multiscale.prior import MultiscalePrior
 from clresample.deblending.spectra import RIDGE, unit_diagonal
+from clresample.paper.settings import PaperSettings
 from clresample.sky.psf import PSF
 
 
@@ -90,7 +91,7 @@ def test_weights_of_a_scene_are_those_that_bright_stars_have_lowered(device):
 
 def test_seconds_are_those_that_passed(device):
     began = time.perf_counter()
-    one = Fit(blend(), Settings(prior=None), device, np.float32, pad=1)
+    one = Fit(blend(), PaperSettings(prior=None), device, np.float32, pad=1)
     start_fits([one])
     assert 0 < sum(one.seconds.values()) <= time.perf_counter() - began
     (seen,) = render_fits([one])

@@ -7,10 +7,10 @@ import pytest
 from helpers.scenes import GALAXIES, SHAPE, blend, frame, observe, sources, truth
 from helpers.start import least_squares, point_of, profiles, rendered, started, view, views
 
-from clresample.deblending.resize import SMALLEST_RADIUS_PX, box_around, component_box
+from clresample.deblending.start.boxes import SMALLEST_RADIUS_PX, box_around, component_box
 from clresample.deblending.start.final_render import MorphologyModel, render_models
 from clresample.resampling.cache import cached_resampler
-from clresample.sky.extent import box_slices
+from clresample.sky.box import box_slices
 from clresample.sky.sources import ExtendedSource, PointSource
 
 FLUX = (100.0, 80.0, 90.0)

@@ -30,9 +30,9 @@ from clresample.deblending.start.component_batch import (
 )
 from clresample.deblending.start.equations import _eliminated
 from clresample.deblending.start.final_render import _ImageProfile
-from clresample.deblending.start.first_scene import UNSEEN
 from clresample.deblending.start.profile_start import LIGHT_SIGMAS, _is_dark, profile_peak
 from clresample.deblending.start.slot_observation import _listed, _pairs
+from clresample.paper.solver.scene import UNSEEN
 from clresample.sky.sources import ExtendedSource, PointSource
 
 BIG = (1000, 900)

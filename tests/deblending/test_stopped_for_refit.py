@@ -7,7 +7,7 @@ import pytest
 from helpers.told import learning, named
 
 from clresample.deblending import iterate as room
-from clresample.deblending.blend import INTERRUPTED, STOPPED_FOR_REFIT
+from clresample.deblending.ended import Ended
 from clresample.deblending.refit import two_component_fit
 from clresample.deblending.refit.colour_gradient import GradientTest
 from clresample.deblending.settings import Settings
@@ -54,15 +54,15 @@ def test_ctrl_c_interrupts_fits_that_wait_to_be_taken_over(monkeypatch):
         raise KeyboardInterrupt
 
     one.run = stopped
-    monkeypatch.setattr(room, "_LbfgsRun", lambda *_, takes_over: one)
-    room.iterate(one.fits, SimpleNamespace(has_multiscale_prior=True, max_iter=100), None, None)
+    settings = SimpleNamespace(start_run=lambda *_: one, max_iter=100)
+    room.iterate(one.fits, settings, None, None)
     assert [f.status for f in one.fits] == ["interrupted"] * 2
 
 
 def test_a_fit_that_is_taken_over_goes_on_unless_the_second_one_is_surely_better(monkeypatch):
     """Then with the shifts that it had, and no less time; the better one is kept in the end. Second
     ones may take twice as many iterations."""
-    firsts = [named(k, STOPPED_FOR_REFIT, shifts=float(k)) for k in range(4)]
+    firsts = [named(k, Ended.REFIT, shifts=float(k)) for k in range(4)]
     again = {k: named(10 + k, shifts=9.0, of=firsts[k]) for k in (0, 1, 2)}
     monkeypatch.setattr(two_component_fit, "start_refits", lambda fits: again)
     runs = []
@@ -94,7 +94,7 @@ def test_a_fit_that_is_taken_over_goes_on_unless_the_second_one_is_surely_better
     assert [one.at["shifts"] for one in firsts] == [9, 9, 2, 3]
     assert [one.seconds["fit"] for one in kept] == [3, 5, 3, 3]
     # at its limit one that goes on is neither that nor interrupted
-    assert [one.status for one in firsts] == [STOPPED_FOR_REFIT] + ["iteration limit"] * 3
+    assert [one.status for one in firsts] == [Ended.REFIT] + ["iteration limit"] * 3
     # the loss of the state in which it goes on is there once
     assert [one.losses for one in firsts] == [[1.0]] + [[0.5]] * 3
 
@@ -102,7 +102,7 @@ def test_a_fit_that_is_taken_over_goes_on_unless_the_second_one_is_surely_better
 @pytest.mark.parametrize("begins", [True, False])
 def test_a_fit_that_is_taken_over_goes_on_where_the_second_one_fails(begins, monkeypatch):
     """With a message, and the shifts that it had."""
-    first, ended = named(0, STOPPED_FOR_REFIT, shifts=3.0), []
+    first, ended = named(0, Ended.REFIT, shifts=3.0), []
 
     def fails(*_):
         raise ValueError("no memory")
@@ -127,7 +127,7 @@ def test_a_fit_that_is_taken_over_goes_on_where_the_second_one_fails(begins, mon
 @pytest.mark.parametrize("when", ["second", "first"])
 def test_a_fit_that_was_taken_over_and_interrupted_says_so(when, monkeypatch):
     """In the second fit, or when it goes on after that."""
-    first = named(0, STOPPED_FOR_REFIT)
+    first = named(0, Ended.REFIT)
     new = named(1, of=first)
     monkeypatch.setattr(two_component_fit, "start_refits", lambda fits: {0: new})
     monkeypatch.setattr(
@@ -137,7 +137,7 @@ def test_a_fit_that_was_taken_over_and_interrupted_says_so(when, monkeypatch):
     )
     monkeypatch.setattr(two_component_fit, "_is_better", lambda *_: False)
     assert two_component_fit.refit_two_components([first], Settings(), None, None) == [first]
-    assert first.status == INTERRUPTED
+    assert first.status == Ended.INTERRUPTED
 
 
 @pytest.mark.parametrize("evidence", [None, [4.9], [4.9, 5.1]])

@@ -49,7 +49,7 @@ def made(build, unit=1.0):
     scenes, states = map(list, zip(*ragged(build, np.float64), strict=True))
     scenes = [replace(s, weights=[unit * w for w in s.weights]) for s in scenes]
     b = SceneBuffers(scenes, states, build, np.float64, MultiscalePrior())
-    gradient = LossGradient(b, with_prior=False)
+    gradient = LossGradient(b)
     return scenes, states, gradient, OperatorResponse(b, gradient)
 
 
@@ -199,7 +199,7 @@ def test_scenes_that_go_on_alone_keep_their_strengths(build):
     m.strengths.significant[:] = np.arange(9) % 2
     scenes, states = [m.scenes[i] for i in keep], [m.states[i] for i in keep]
     b = SceneBuffers(scenes, states, build, np.float64, m.prior)
-    gradient = LossGradient(b, with_prior=False)
+    gradient = LossGradient(b)
     part = PriorStrengths(b, gradient, latents(b, m.prior), m.prior, past=(m.strengths, keep))
     kept = np.concatenate([np.flatnonzero(m.scene == i) for i in keep])
     np.testing.assert_array_equal(part.values, m.strengths.values[kept])

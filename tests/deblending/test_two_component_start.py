@@ -88,7 +88,7 @@ def test_a_second_fit_goes_on_where_the_first_has_ended():
     def state(shapes, learned=None):
         n = len(shapes)
         morph = [rng.random(shape) for shape in shapes]
-        return State([0] * n, morph, rng.random((n, 2)), rng.random(2), learned=learned)
+        return State(morph, rng.random((n, 2)), rng.random(2), learned=learned)
 
     shapes = (4, 5), (6, 7), (3, 3)
     known = StructureState([coefficients(s) for s in shapes], rng.random((3, 2)), np.arange(3) == 1)
@@ -166,7 +166,7 @@ def test_of_three_starts_the_one_that_fits_best_is_taken(monkeypatch):
 
     def fit(name):
         channels = SimpleNamespace(channels=lambda: parts)
-        state = State([], [], np.zeros((2, 3)), np.zeros(3))
+        state = State([], np.zeros((2, 3)), np.zeros(3))
         return SimpleNamespace(name=name, views=views, scene=channels, state=state)
 
     def of(change):  # what is seen, with the sky off by so much

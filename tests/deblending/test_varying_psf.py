@@ -13,6 +13,7 @@ from clresample import (
     FunctionPSF,
     Grid,
     Observation,
+    PaperSettings,
     PointSource,
     Settings,
     SingleScalePrior,
@@ -64,7 +65,7 @@ def test_every_kind_of_fit_follows_the_psf(device, given):
     second = observation(again, channels=("G", "R"))
     sources = [ExtendedSource(position_px=tuple(map(float, p))) for p in CORNERS[:2]]
     sources += points(CORNERS[2:])
-    settings = Settings(psf_error=0, **given)
+    settings = (PaperSettings if "prior" in given else Settings)(psf_error=0, **given)
     pair = [observation(stars(CORNERS)), second]
     result = deblend(pair, sources, settings=settings, device=device)
     for i in (0, 1):

@@ -46,7 +46,6 @@ def batch_of(device, geometry, dtype):
             "ops": [op],
             "data": [rng.normal(0, 3, op.shape_out)],
             "weights": [rng.uniform(0.5, 1.5, op.shape_out)],
-            "step_scale": np.ones((n, 2)),
             "spectra": rng.uniform(0.5, 2, (n, 2)),
             "sky": np.zeros(2),
             "coefficients": [shares],

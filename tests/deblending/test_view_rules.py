@@ -5,10 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clresample.deblending import image_profiles, view as view_module
+from clresample.deblending import view as view_module
 from clresample.deblending.blend import Blend
 from clresample.deblending.component_images import ComponentImages, weighted_sum
 from clresample.deblending.view import WhitenedView, _padded, _typical_noise, flush_faint
+from clresample.paper import image_profiles
 from clresample.sky.sources import ExtendedSource, PointSource
 
 

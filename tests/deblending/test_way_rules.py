@@ -20,6 +20,7 @@ from clresample.deblending.start.linearised_scenes import linearise
 from clresample.deblending.start.profile_start import PRECISION, TOLERANCE, profile_peak
 from clresample.deblending.start.render_planner import _WindowRenderer
 from clresample.deblending.view import SceneGeometry, whitened_view
+from clresample.paper import run as paper_run
 from clresample.sky.frame import Frame
 from clresample.sky.grid import Grid
 from clresample.sky.observation import Observation
@@ -59,9 +60,8 @@ def moved(weight, sky=0.0, mask=False):
         center=np.array([(19, 22)]),
         profile=[morph],
         fixed=np.zeros(1, bool),
-        step_scale=np.ones((1, 2)),
     )
-    return scene, State([0 * morph], [morph], np.ones((1, 2)), np.array([0.0, sky]))
+    return scene, State([morph], np.ones((1, 2)), np.array([0.0, sky]))
 
 
 def test_the_sky_and_masks_move_nothing():
@@ -193,21 +193,22 @@ def test_boxes_of_a_whole_frame_are_seen_through_the_observations_own_operator(d
 
 def running(live, n_steps=5, resize=False):
     """A batch of fits on their way, as `repacked` and `run` see it."""
-    one = object.__new__(iterate_module._AmsgradRun)
-    one.live, one.fits = np.array(live), list("abcdefgh"[: len(live)])
+    one = object.__new__(paper_run.AmsgradRun)
+    one.live = np.array(live)
+    one.tracks = [SimpleNamespace(fit=name) for name in "abcdefgh"[: len(live)]]
     one.engine = SimpleNamespace(n_steps=n_steps)
     return one
 
 
 def test_a_batch_is_made_anew_when_a_quarter_has_stopped():
-    assert (iterate_module.REPACK_FRACTION, iterate_module.RESIZE_ITERATIONS) == (0.25, 40)
+    assert (iterate_module.REPACK_FRACTION, paper_run.RESIZE_ITERATIONS) == (0.25, 40)
     going = running([True] * 7 + [False])
     assert going.repacked() is going and going.going() == list("abcdefg")
     with pytest.raises(AttributeError):  # asks its engine for states
         running([True, True, True, False]).repacked()
     with pytest.raises(AttributeError):
         running([True] * 8, n_steps=40).repacked()
-    one = object.__new__(iterate_module._LbfgsRun)
+    one = object.__new__(iterate_module.LbfgsRun)
     one.engine = SimpleNamespace(progress=SimpleNamespace(live=np.array([True] * 7 + [False])))
     assert one.repacked() is one
 
@@ -216,7 +217,7 @@ def test_learning_runs_five_rounds_at_a_time_and_no_more_than_it_may():
     """The start is none of them."""
     assert iterate_module.CHECK_ITERATIONS == 5
     for max_iter, wanted in ((100, [6, 5, 5]), (7, [6, 2, 0])):
-        one, rounds = object.__new__(iterate_module._LbfgsRun), []
+        one, rounds = object.__new__(iterate_module.LbfgsRun), []
         n = np.zeros(2, int)
         progress = SimpleNamespace(
             live=np.array([True, False]),
@@ -277,8 +278,8 @@ def test_a_fit_that_cannot_start_leaves_the_others(monkeypatch, group):
     ]
     good = [one for one in fits if one[1].blend != "b"]
     assert many._begin(fits) == good
-    assert {i: done.status for i, done in many.done.items()} == {
-        i: "failed: no" for i, fit in fits if fit.blend == "b"
+    assert {i: (done.status, done.reason) for i, done in many.done.items()} == {
+        i: ("failed", "no") for i, fit in fits if fit.blend == "b"
     }
     assert many.warned == {i: ([7], []) for i, _ in good}
     alone = [1] * len(group) if "b" in group and len(group) > 1 else []

@@ -102,7 +102,7 @@ def test_gradients_are_those_of_frames(build, name):
     pairs, found = pairs_of(build, GEOMETRIES[name](), np.float64), []
     for depth in (0, 3):
         b = buffers_of(pairs, build, np.float64)
-        gradient = LossGradient(b, with_prior=False, depth=depth)
+        gradient = LossGradient(b, depth=depth)
         gradient.queue()
         arrays = b.d_morph, b.d_spectra, gradient.rows_loss, gradient.rows_pull
         found.append([build.get(array) for array in arrays])
@@ -136,7 +136,6 @@ def _scene(device, op, shape, boxes):
         ops=[op],
         data=[np.zeros(op.shape_out)],
         weights=[np.ones(op.shape_out) * op.covered],
-        step_scale=np.ones((len(boxes), 2)),
         spectra=np.ones((len(boxes), 2)),
         sky=np.zeros(2),
     )

@@ -96,7 +96,7 @@ def gradient_with(vendor, device, monkeypatch):
         tune(patch, **gpu_sizes(vendor))
         scene, state = posed(own, np.float32, fixed=(1,))
         buffers = SceneBuffers([scene, scene], [state, state], own, np.float32, PRIOR)
-        LossGradient(buffers, with_prior=False).queue()
+        LossGradient(buffers).queue()
         return [own.get(array) for array in (buffers.d_morph, buffers.d_spectra)]
 
 

@@ -55,7 +55,7 @@ def test_fits_have_linear_algebra_on_one_thread(monkeypatch):
         with pytest.raises(ValueError, match="no fit"):
             deblend([None], [None])
     assert seen == [{1}, {1}]
-    assert "no fit" in failure.status
+    assert "no fit" in failure.reason
 
 
 def dealt(function, items, devices, most=1000):

@@ -12,6 +12,7 @@ from helpers.fields import mosaics_of
 from clresample import FieldOptions
 from clresample.fields.execution.backend import TaskKind
 from clresample.fields.execution.cluster import DaskCluster
+from clresample.fields.execution.reason import Cause
 from clresample.fields.options import RunProgress
 from clresample.fields.run import run_field
 from clresample.fields.strips import MAX_BYTES, STRIPS
@@ -83,9 +84,9 @@ def test_workers_that_die_or_hang_cost_their_own_tasks_alone(scheduler, tmp_path
         cluster.close()
     assert [found[t].value for t in "abcd"] == list("ABCD")
     assert all((tmp_path / f"{t}.txt").read_text() == t for t in "abcd")
-    assert found["die"].worker_died and found["hang"].worker_died
-    assert "over 20 s" in found["hang"].reason
-    assert found["raise"].reason.startswith("ValueError: a bad blend")
+    assert found["die"].cause is found["hang"].cause is Cause.WORKER
+    assert "over 20 s" in str(found["hang"].reason)
+    assert str(found["raise"].reason).startswith("ValueError: a bad blend")
 
 
 def rows_kept(context, task, given):

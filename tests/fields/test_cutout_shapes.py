@@ -5,8 +5,8 @@ import pytest
 
 from clresample import PSF, Grid, NoiseCorrelation
 from clresample.fields.blends.cutouts import SIDE_PX, fit_box
-from clresample.fields.box import Box, box_within
 from clresample.fields.mosaic import ArrayPlane, Channel, Mosaic
+from clresample.sky.box import Box, box_within
 
 REFERENCE = Grid.flat((400, 400), 0.1)
 

@@ -10,7 +10,6 @@ from astropy.table import QTable
 from helpers.fields import mosaics_of
 
 from clresample.fields.blends.plan import FitRegion
-from clresample.fields.box import Box
 from clresample.fields.execution.group_results import (
     COMPONENT_COLUMNS,
     PATCH_COLUMNS,
@@ -19,6 +18,7 @@ from clresample.fields.execution.group_results import (
 )
 from clresample.fields.run import reference_grid
 from clresample.measurement.columns import Columns
+from clresample.sky.box import Box
 
 PATCH = FitRegion(number=7, parent=3 << 41, box=Box(5, 6, 25, 36), sources=(0,))
 

@@ -5,16 +5,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from clresample.deblending.ended import Ended
 from clresample.deblending.settings import Settings
 from clresample.fields.blends.cut import FitLimits, cut_blend
 from clresample.fields.blends.plan import host_ids, source_ids
 from clresample.fields.blends.tiles import SearchTile
-from clresample.fields.box import Box
 from clresample.fields.execution import fitting
 from clresample.fields.execution.fitting import LARGE, _settings, is_large
 from clresample.fields.execution.group_results import GroupResults, GroupResultsFile
 from clresample.fields.execution.rounds import _PieceHistory
 from clresample.fields.execution.searching import _lost
+from clresample.paper.settings import PaperSettings
+from clresample.sky.box import Box
 
 
 def chain(saddle, n=4):
@@ -97,12 +99,13 @@ def test_a_large_piece_has_many_pixels_times_sources():
         (False, True, {}, 250, True),
         (False, False, {}, 500, True),
         (True, False, {"max_iter": 10}, 10, False),
-        (True, True, {"prior": None}, 500, True),
     ],
 )
 def test_rough_and_large_fits_have_few_iterations(rough, large, given, most, errors):
     settings = _settings(SimpleNamespace(settings=Settings(**given)), rough, large)
     assert (settings.max_iter, settings.errors) == (most, errors)
+    paper = PaperSettings()
+    assert _settings(SimpleNamespace(settings=paper), rough, large) is paper
 
 
 @pytest.mark.parametrize("siblings, fitted, left", [((), 1, 0), ((1,), 0, 1)])
@@ -115,18 +118,30 @@ def test_what_is_found_beside_pieces_is_left_for_the_next_round(
     cut = fitting._BlendCutout(patch, fitting.Blend((), (), None), {}, 0.0)
     row, blends = (77, 15.0, 27.0, 5), []
     seen = SimpleNamespace(weights=np.ones((1, 10, 10)))
-    good, bad = (SimpleNamespace(observations=[seen], losses=[2, x]) for x in (4900.0, 5100.0))
+    good, bad = (
+        SimpleNamespace(observations=[seen], losses=[2, x], status=Ended.CONVERGED)
+        for x in (4900.0, 5100.0)
+    )
     monkeypatch.setattr(fitting, "_found", lambda *given: [row])
-    monkeypatch.setattr(fitting, "_fits", lambda job, some, *limits: blends.extend(some) or some)
-    n_round = 1 if siblings else 0
+    first = []
+
+    def fits(job, some, rough):
+        blends.extend(b for b in some if b is not cut.blend)
+        return [first[0] for _ in some]
+
+    monkeypatch.setattr(fitting, "_fits", fits)
+    job, n_round = SimpleNamespace(passes=2), 1 if siblings else 0
     for i in (n_round, 2):
         part = GroupResults()
-        cuts, _ = fitting._second_look(None, None, [cut], [good], part, i)
-        assert fitting._second_look(None, None, [cut], [bad], part, i)[0] == [cut]
+        first[:] = [good]
+        cuts, _ = fitting._fits_of(job, None, [cut], part, i)
         if i == 2:
             assert not part.found and cuts == [cut]
         else:
             assert part.found == [(3, *row)] * left and cuts[0].more == (row,) * fitted
+        first[:] = [bad]
+        assert fitting._fits_of(job, None, [cut], part, i)[0] == [cut]
+        assert fitting._fits_of(SimpleNamespace(passes=1), None, [cut], part, i)[0] == [cut]
     assert [b.sources[0].position_px for b in blends] == [(5.0, 7.0)] * fitted
     assert [b.sources[0].name for b in blends] == ["77"] * fitted
 

@@ -5,9 +5,9 @@ import pytest
 from astropy.io import fits
 
 from clresample import PSF, FunctionPSF, Grid
-from clresample.fields.box import Box, round_up_size
 from clresample.fields.mosaic import ArrayPlane, Channel, ConstantPlane, FilePlane, Mosaic
 from clresample.files.atomic import FileError
+from clresample.sky.box import Box, round_up_size
 
 SHAPE = (60, 90)
 

@@ -12,12 +12,12 @@ from helpers.fields import mosaics_of
 
 import clresample
 from clresample import FieldOptions
-from clresample.fields.box import Box
 from clresample.fields.mosaic import FilePlane
 from clresample.fields.run import run_field
 from clresample.fields.strips import STRIPS
 from clresample.files.atomic import FileError
 from clresample.files.tables import read_catalogue
+from clresample.sky.box import Box
 
 
 def test_every_column_has_its_unit_and_a_description(done):

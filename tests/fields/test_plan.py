@@ -9,7 +9,7 @@ from clresample.fields.blends.link import link_footprints
 from clresample.fields.blends.plan import STEP_PX, FitPlan, make_fit_plan, source_ids
 from clresample.fields.blends.search import TileDetections, grown_footprints
 from clresample.fields.blends.tiles import tiles_of
-from clresample.fields.box import Box
+from clresample.sky.box import Box
 
 
 def test_cores_of_tiles_fill_the_region_once():

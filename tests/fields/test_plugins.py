@@ -9,10 +9,10 @@ from astropy.io import fits
 from helpers.checkout import ROOT
 
 from clresample import PSF, read_field, read_scene
-from clresample.fields.box import Box
 from clresample.fields.psfs.read import FORMATS, read_psf_field
 from clresample.fields.readers.formats import READERS, read_survey
 from clresample.files.scene_keys import SceneError
+from clresample.sky.box import Box
 from clresample.sky.grid import Grid
 
 MODULE = """

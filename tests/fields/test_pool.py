@@ -1,5 +1,6 @@
 """Worker processes: tasks that fail, hang or are killed cost themselves at most."""
 
+import errno
 import multiprocessing
 import os
 import signal
@@ -15,9 +16,12 @@ import pytest
 from helpers.checkout import ROOT
 
 from clresample import DeviceError, FieldOptions
+from clresample.device.discovery import DeviceLostError
 from clresample.fields.execution.backend import make_backend
 from clresample.fields.execution.pool import WorkerPool
+from clresample.fields.execution.reason import Cause, Reason
 from clresample.fields.options import RunProgress
+from clresample.files.atomic import FileError, WriteError
 
 
 def work(folder, task):
@@ -47,8 +51,8 @@ def outcomes(folder, tasks, n_workers=2, **given):
 def test_values_and_errors_come_back(tmp_path, n_workers):
     found = outcomes(tmp_path, ["a", "raise", "b"], n_workers)
     assert [found[t].value for t in "ab"] == ["A", "B"]
-    assert found["raise"].reason.startswith("ValueError: a bad blend")
-    assert not found["raise"].worker_died
+    assert str(found["raise"].reason).startswith("ValueError: a bad blend")
+    assert found["raise"].cause is Cause.TASK
 
 
 def test_a_worker_that_is_killed_or_hangs_loses_its_own_task_alone(tmp_path):
@@ -57,8 +61,8 @@ def test_a_worker_that_is_killed_or_hangs_loses_its_own_task_alone(tmp_path):
     found = outcomes(tmp_path, tasks, limit_s=20.0)  # a loaded machine begins one in 8
     assert time.monotonic() - began < 120
     assert [found[t].value for t in "abc"] == ["A", "B", "C"]
-    assert "signal 9" in found["die"].reason and found["die"].worker_died
-    assert "over 20 s" in found["hang"].reason
+    assert "signal 9" in str(found["die"].reason) and found["die"].cause is Cause.WORKER
+    assert "over 20 s" in str(found["hang"].reason)
 
 
 def test_again_replaces_a_failed_task(tmp_path):
@@ -124,7 +128,7 @@ def test_the_system_holds_a_worker_to_its_memory():
     found = ran(take, [0], [10, 4000], 1, bound=1 << 30)
     small, large = sorted(found, key=lambda o: o.task)
     assert small.value == 10 << 20
-    assert large.reason.startswith("MemoryError") and not large.worker_died
+    assert large.reason.kind == "MemoryError" and large.cause is Cause.TASK
 
 
 class Itself:
@@ -243,3 +247,22 @@ def test_each_device_has_a_worker_at_least():
     assert engine.n_workers == 3 and engine.device_shares == [("a", 2), ("b", 2)]
     assert make_backend(FieldOptions(device=["a", "b"]), RunProgress()).n_workers == 2
     assert make_backend(FieldOptions(device="a"), RunProgress()).n_workers == 0
+
+
+@pytest.mark.parametrize(
+    "error, cause",
+    [
+        (ValueError("cannot be written"), Cause.TASK),
+        (FileError("gone.fits: cannot be read"), Cause.TASK),
+        (WriteError("part.fits: cannot be written"), Cause.DISK),
+        (OSError(errno.ENOSPC, "No space left on device"), Cause.DISK),
+        (OSError(errno.EACCES, "denied"), Cause.TASK),
+        (DeviceLostError("gone no longer answers"), Cause.DEVICE),
+        (ModuleNotFoundError("no sep"), Cause.PACKAGE),
+    ],
+)
+def test_an_error_has_a_cause_whatever_its_words(error, cause):
+    with pytest.raises(type(error)) as raised:
+        raise error
+    found = Reason.of(raised.value)
+    assert found.cause is cause and str(found).startswith(f"{type(error).__name__}: ")

@@ -9,13 +9,13 @@ from helpers.survey_files import SHAPE, noise_image, psf_image, sky_grid, write_
 
 from clresample import PSF, read_euclid_mer, read_legacy_survey
 from clresample.cli import main
-from clresample.fields.box import Box
 from clresample.fields.field_toml.field_file import read_field
 from clresample.fields.psfs.sampled import ScatteredPSF
 from clresample.fields.readers.formats import read_survey
 from clresample.fields.readers.writers import write_mer_tile
 from clresample.files.atomic import FileError
 from clresample.files.scene_keys import SceneError
+from clresample.sky.box import Box
 
 WHOLE = Box.of(SHAPE)
 

@@ -10,9 +10,9 @@ from astropy.io import fits
 from helpers.survey_files import SHAPE, noise_image, psf_image, sky_grid, write_exposure
 
 from clresample import PSF, NoiseCorrelation, read_rubin_coadd, read_rubin_exposure
-from clresample.fields.box import Box
 from clresample.fields.readers.writers import write_cell_coadd
 from clresample.files.atomic import FileError
+from clresample.sky.box import Box
 
 # 2 x 3 cells of 40 px from (160, 120) of the tract on, one missing, with 33 mask planes and two
 # realisations of white noise; made by lsst-images 30.2026.4300

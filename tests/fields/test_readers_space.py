@@ -20,8 +20,8 @@ from helpers.survey_files import (
 )
 
 from clresample import PSF, FieldOptions, Grid, read_hst, read_jwst, run_field
-from clresample.fields.box import Box
-from clresample.sky.wcs_interface.ape14 import Ape14Wcs
+from clresample.sky.box import Box
+from clresample.sky.wcs_interface import Ape14Wcs
 
 WHOLE = Box.of(SHAPE)
 PSF_OF = PSF(psf_image())

@@ -10,11 +10,11 @@ from astropy.io import fits
 from clresample import PSF, Grid
 from clresample.cli import main
 from clresample.fields.background import find_background
-from clresample.fields.box import Box
 from clresample.fields.field_toml.field_file import read_field
 from clresample.fields.field_toml.headers import mask_value, zero_point
 from clresample.fields.field_toml.keys import parse_field
 from clresample.files.scene_keys import SceneError
+from clresample.sky.box import Box
 
 SHAPE = (300, 260)
 TOML = """

@@ -6,11 +6,11 @@ from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable, Table
 
-from clresample.deblending.solver.constraints import Positivity, ProxChain
 from clresample.fields.field_toml.scene_file import read_scene
 from clresample.files.fits import write_fits
 from clresample.files.scene_keys import SceneError
 from clresample.files.source_table import read_sources
+from clresample.paper.solver.constraints import Positivity, ProxChain
 from clresample.sky.grid import Grid
 from clresample.sky.psf import PSF
 from clresample.sky.sources import ExtendedSource, PointSource
@@ -230,6 +230,11 @@ def test_bands_of_the_image_choose_those_of_the_psf(folder):
         (ONE + "[fit]\nmax_iter = -1", "max_iter is -1, must be a whole number"),
         (ONE + "[fit]\nmax_iter = true", "max_iter is True, must be a whole number"),
         (ONE + "[fit]\nrel_tol = 1.0", "rel_tol is 1.0, must be a number x with 0 <= x < 1"),
+        (ONE + "[fit]\nrel_tol = 0.1", "rel_tol is 0.1, but goes with monotone = true or"),
+        (
+            ONE + "[fit]\nmonotone = true\nloss_tol = 1",
+            "loss_tol is 1, but goes without monotone = true or",
+        ),
         (ONE + "[fit]\nfit_shifts = 1", 'fit_shifts is 1, must be true, false or "auto"'),
         (ONE + "[detection]\npasses = 3", "passes is 3, must be 1, or 2"),
         (ONE + "[detection]\nthreshold = 0", "threshold is 0, must be a number above 0"),

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from clresample.fields.box import Box
 from clresample.fields.strips import (
     MAX_BYTES,
     STRIP_PX,
@@ -13,6 +12,7 @@ from clresample.fields.strips import (
     _opened,
     read_section,
 )
+from clresample.sky.box import Box
 
 SHAPE = 3, 150, 90
 

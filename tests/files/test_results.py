@@ -10,6 +10,7 @@ from astropy.wcs import Sip
 from helpers.blends import SCALE, blend, observe, round_component
 from helpers.headers import OBSERVED, grid_of, header, observed_headers, with_tables
 
+from clresample.deblending.ended import Ended
 from clresample.files import results as store
 from clresample.files.fits import FileError, read_image
 from clresample.files.results import read_result, write_result
@@ -88,7 +89,7 @@ def rich(rng, grid, other, **given):
         covariance=np.where(np.eye(3) == 1, np.inf, rng.normal(size=(3, 3, 3))),
         shifts=rng.normal(size=(2, 2)),
         losses=rng.random(17),
-        status="failed: no light in channel ö",
+        status=Ended.FAILED,
         messages=("one 'line'", 'another\twith "quotes"'),
         seconds={"set-up": 1 / 3, "fit": np.float64(2 / 7)},
         **given,

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from clresample.deblending.ended import Ended
 from clresample.deblending.result import Component, Result
 from clresample.sky.frame import Frame
 from clresample.sky.grid import Grid
@@ -75,7 +76,7 @@ def blend(components, *, observations=None, sources=None, grid=None, **given):
         "covariance": np.tile(np.eye(n), (n_channels, 1, 1)),
         "shifts": np.zeros((len(observations), 2)),
         "losses": np.array([100.0, 10.0, 9.0]),
-        "status": "converged",
+        "status": Ended.CONVERGED,
     }
     return Result(
         observations=tuple(observations),

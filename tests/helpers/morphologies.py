@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clresample.deblending.solver.boxes import Boxes
-from clresample.deblending.solver.constraints import MonotoneWeights
+from clresample.paper.solver.constraints import MonotoneWeights
 
 # Odd, even, non-square, thin, one pixel; centres in the middle, off it, on edges and in corners.
 SHAPES = [(21, 21), (12, 17), (17, 12), (9, 9), (8, 13), (1, 1), (1, 7), (6, 1), (2, 2), (30, 5)]

@@ -5,13 +5,14 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from clresample.deblending.solver import reference as ref
-from clresample.deblending.solver.amsgrad import DAMPING, StepSizes
-from clresample.deblending.solver.constraints import Monotone, Positivity, ProxChain
-from clresample.deblending.solver.engine import Engine
-from clresample.deblending.solver.prior import SingleScalePrior
-from clresample.deblending.solver.scene import Scene, State
+from clresample.deblending.solver import reference as loss_ref
 from clresample.deblending.solver.scene_model import compose, gather_morph, gather_spectra
+from clresample.paper.solver import reference as ref
+from clresample.paper.solver.amsgrad import DAMPING, StepSizes
+from clresample.paper.solver.constraints import Monotone, Positivity, ProxChain
+from clresample.paper.solver.engine import Engine
+from clresample.paper.solver.prior import SingleScalePrior
+from clresample.paper.solver.scene import AmsgradScene, AmsgradState
 from clresample.resampling.cache import cached_resampler
 from clresample.sky.psf import PSF
 
@@ -48,7 +49,7 @@ def posed(
     weights = [rng.uniform(0.5, 1.5, op.shape_out) * op.covered for op in ops]
     for w in weights:
         w[:, 3, 2:5] = 0
-    scene = Scene(
+    scene = AmsgradScene(
         shape=home.shape,
         unpadded_shape=home.shape,
         ops=ops,
@@ -63,7 +64,7 @@ def posed(
         fit_sky=True,
         sky_precision=np.resize(KNOWN_SKY, np.shape(given.get("sky", KNOWN_SKY))),
     )
-    state = State(
+    state = AmsgradState(
         latent=latent,
         morph=[p * (1 + 0.1 * z) for p, z in zip(profile, latent, strict=True)],
         spectra=rng.uniform(0.5, 2, (n, 3)),
@@ -128,13 +129,13 @@ class Reference:
         model = compose(s.shape, s.origin, self.morph, self.spectra)
         g, self.loss, pull = [], 0.0, []
         for part, op, data, weights in zip(s.channels(), s.ops, s.data, s.weights, strict=True):
-            wr, loss, total = ref.residual(
+            wr, loss, total = loss_ref.residual(
                 op.forward(model[part].astype(op.dtype)), data, weights, self.sky[part]
             )
             g.append(op.adjoint(wr.astype(op.dtype)))
             self.loss += loss
             pull.append(total)
-        of_sky, slopes = ref.expected_sky(self.sky, s.known_sky)
+        of_sky, slopes = loss_ref.expected_sky(self.sky, s.known_sky)
         self.loss += of_sky
         self.pull, self.g = np.concatenate(pull) + slopes, np.concatenate(g).astype(float)
         self.d_morph = gather_morph(self.g, s.origin, self.morph, self.spectra)

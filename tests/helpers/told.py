@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from clresample.deblending import iterate as room
-from clresample.deblending.blend import INTERRUPTED
+from clresample.deblending.ended import Ended
 
 CPU = SimpleNamespace(kind="CPU", compute_units=1)
 
@@ -16,7 +16,7 @@ class Told(SimpleNamespace):
     def __init__(self, name, status="iteration limit"):
         super().__init__(name=name, status=status, ended=None, best=None, seconds={})
         self.shifts, self.last_steps = np.zeros((2, 2)), np.full((2, 2), 9.0)
-        self.losses = []
+        self.losses, self.fit = [], self
 
     def shift(self, shifts):
         self.shifts = shifts
@@ -62,7 +62,7 @@ def learning(n_rounds, *, live=None, converged=None, failed=None, **settings):
         **({"max_iter": 100, "fit_shifts": False, "loss_tol": 0.5} | settings)
     )
     past = engine, [None] * n, np.tile([0, np.inf, 0, 0], (n, 1))
-    return room._LbfgsRun([Told(c) for c in "abc"[:n]], settings, CPU, None, past)
+    return room.LbfgsRun([Told(c) for c in "abc"[:n]], settings, CPU, None, past)
 
 
 def named(name, status="converged", shifts=0.0, of=None):
@@ -72,5 +72,5 @@ def named(name, status="converged", shifts=0.0, of=None):
     one.shifts, one.losses = shifts, [1.0]
     one.note_seconds = one.seconds.__setitem__
     one.shift = lambda shifts: one.at.update(shifts=shifts)
-    one.interrupt = lambda: setattr(one, "status", INTERRUPTED)
+    one.interrupt = lambda: setattr(one, "status", Ended.INTERRUPTED)
     return one

@@ -178,7 +178,7 @@ def test_nothing_fitted_is_still_a_catalogue():
 
 
 def test_a_failed_fit_with_nan_is_still_a_catalogue():
-    table = catalogue(blend([round_component(0, MIDDLE, (np.nan, 1))], status="failed: NaN"))
+    table = catalogue(blend([round_component(0, MIDDLE, (np.nan, 1))], status="failed"))
     assert table["flags"][0] & Flag.NOT_CONVERGED
     assert np.isnan(table["flux_g"][0]) and np.isnan(table["rms_size"][0])
 

@@ -20,9 +20,9 @@ def test_files(path):
     """The test files, relative to the checkout, that may notice a change of a file or folder."""
     parts = path.relative_to(ROOT).parts
     if parts[0] == "kernels":
-        rooms = ["device", "resampling", "deblending", "measurement"]
+        rooms = ["device", "resampling", "deblending", "paper", "measurement"]
     elif len(parts) > 2 or path.is_dir():
-        rooms = {"deblending": ["deblending", "measurement"]}.get(parts[1], [parts[1]])
+        rooms = {"deblending": ["deblending", "measurement", "paper"]}.get(parts[1], [parts[1]])
     else:
         rooms = ["resampling", "deblending"]
     return sorted(

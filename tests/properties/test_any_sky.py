@@ -11,9 +11,9 @@ from clresample import get_device
 from clresample.resampling.resampler import Resampler
 from clresample.sky.fourier import phases
 from clresample.sky.grid import Grid
+from clresample.sky.nufft import nufft_type2
 from clresample.sky.psf import PSF
 from clresample.sky.psf_checks import PSFWarning
-from clresample.sky.transforms.nufft import nufft_type2
 from clresample.sky.validation.checks import as_float_array
 
 ANGLE = st.floats(-720, 720) | st.sampled_from([0, 45, 90, 180, 270])

@@ -15,7 +15,7 @@ from helpers.geometries import (
     turn,
 )
 
-from clresample.resampling.paper.resampler import PaperResampler
+from clresample.paper.operator.resampler import PaperResampler
 from clresample.resampling.plan import Precision, make_resampling_plan
 from clresample.resampling.resampler import Resampler
 from clresample.sky.psf import PSF

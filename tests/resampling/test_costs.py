@@ -8,8 +8,8 @@ import pytest
 from helpers.geometries import GEOMETRIES, affine, distorted, operator, psfs, turn
 
 from clresample.device.tuning import Tuning
+from clresample.paper.operator.resampler import PaperResampler
 from clresample.resampling import plan as plan_module
-from clresample.resampling.paper.resampler import PaperResampler
 from clresample.resampling.plan import Precision, make_resampling_plan
 from clresample.resampling.resampler import Resampler
 from clresample.resampling.tiled.layout import SIDES, TileCosts, window_of

@@ -8,9 +8,8 @@ import pytest
 from helpers.geometries import GEOMETRIES, affine, distance, expected, psfs, turn
 
 from clresample.device.tuning import Tuning
-from clresample.resampling import plan as plan_module
-from clresample.resampling.folded import executor as folded_module
-from clresample.resampling.folded.executor import FoldedExecutor
+from clresample.resampling import folded as folded_module, plan as plan_module
+from clresample.resampling.folded import FoldedExecutor
 from clresample.resampling.reference import frequency_sum
 from clresample.resampling.resampler import Resampler
 from clresample.sky.psf import PSF

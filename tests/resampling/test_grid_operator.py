@@ -7,9 +7,9 @@ from astropy.wcs import WCS
 from helpers.geometries import GEOMETRIES, distance, operator, psfs
 
 from clresample.device.device import Device
+from clresample.paper.operator.resampler import PaperResampler
 from clresample.resampling import resampler
 from clresample.resampling.grid_operator import GridOperator
-from clresample.resampling.paper.resampler import PaperResampler
 from clresample.resampling.resampler import Resampler
 from clresample.resampling.tiled.resampler import TiledResampler
 from clresample.resampling.transfer import Certificate, noise_warnings

@@ -14,9 +14,9 @@ from helpers.geometries import (
 )
 
 from clresample.device.tuning import Tuning
-from clresample.resampling.paper.resampler import PaperResampler
-from clresample.resampling.paper.slabs import cut_slabs
-from clresample.resampling.paper.tables import cos_sin_table, wave_planes
+from clresample.paper.operator.resampler import PaperResampler
+from clresample.paper.operator.slabs import cut_slabs
+from clresample.paper.operator.tables import cos_sin_table, wave_planes
 from clresample.resampling.plan import Precision, make_resampling_plan
 from clresample.resampling.tiled.layout import TileCosts, _taper, make_groups, window_of
 from clresample.resampling.transfer import wrap_radius

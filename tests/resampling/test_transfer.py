@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 
-from clresample.resampling.paper.sincs import sinc_transfer
+from clresample.paper.operator.sincs import sinc_transfer
 from clresample.resampling.transfer import (
     DIVISION_FLOOR,
     FLOORED_POWER,

@@ -5,7 +5,8 @@ import pytest
 from helpers.headers import DEC, OBSERVED, RA, SCALE, SIP, grid_of, header, observed_headers
 
 from clresample.sky import grid as grid_module
-from clresample.sky.extent import box_slices, grids_overlap, intersect_boxes
+from clresample.sky.box import box_slices, intersect_boxes
+from clresample.sky.extent import grids_overlap
 from clresample.sky.grid import Grid
 from clresample.sky.wcs import pixel_to_world
 

@@ -10,7 +10,7 @@ from helpers.geometries import sky_grid
 
 from clresample import Grid
 from clresample.sky.wcs import axis_names, celestial_frame
-from clresample.sky.wcs_interface.ape14 import Ape14Wcs
+from clresample.sky.wcs_interface import Ape14Wcs
 
 SHAPE = (300, 200)
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from ...deblending.batch import deblend_many
 from ...deblending.blend import Blend
+from ...deblending.ended import Ended
 from ...deblending.fit import Fit, start_fits
 from ...deblending.iterate import iterate
 from ...deblending.settings import Settings
@@ -91,8 +92,8 @@ def fit(given, device, **settings):
         warnings.simplefilter("ignore", SourceWarning)
         results = deblend_many(given, settings=Settings(**settings), device=device)
     for result in results:
-        if result.status.startswith("failed"):
-            raise DeviceError(f"{device.name}: a fit that should succeed {result.status}")
+        if result.status == Ended.FAILED:
+            raise DeviceError(f"{device.name}: a fit that should succeed failed: {result.reason}")
     return results
 
 

@@ -50,7 +50,7 @@ def add_report(commands):
 
 def run(arguments):
     """Writes the page. Raises ValueError and FileError, one line, for unusable arguments."""
-    from ...fields.report.write import MAX_BYTES, write_report
+    from ...report.write import MAX_BYTES, write_report
 
     report = write_report(
         arguments.folder,

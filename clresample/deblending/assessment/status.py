@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..blend import CONVERGED, MISFIT
+from ..ended import Ended
 from ..result import noted
 
 # Sources and channels that a message names.
 MAX_NAMED = 5
-WRONG = "the model does not describe the data"  # how the message begins
 
 
 def with_misfit_status(result):
@@ -17,9 +16,9 @@ def with_misfit_status(result):
 
     A wrong model does not describe the data, see `Misfit.is_wrong`.
     """
-    if result.status != CONVERGED or not result.misfit.is_wrong:
+    if result.status != Ended.CONVERGED or not result.misfit.is_wrong:
         return result
-    return noted(result, status=MISFIT, messages=(*result.messages, _message(result)))
+    return noted(result, status=Ended.MISFIT, messages=(*result.messages, _message(result)))
 
 
 def misfitted_sources(result) -> np.ndarray:
@@ -30,7 +29,7 @@ def misfitted_sources(result) -> np.ndarray:
     fitted = np.zeros(len(result.sources), bool)
     fitted[[c.source for c in result.components]] = True
     found = result.misfit.sources() & fitted
-    return fitted if result.status == MISFIT and not found.any() else found
+    return fitted if result.status == Ended.MISFIT and not found.any() else found
 
 
 def with_source_misfit_status(result):
@@ -38,10 +37,11 @@ def with_source_misfit_status(result):
 
     Its status becomes "converged" again if the model describes its own sources.
     """
-    if result.status != MISFIT or result.misfit.is_wrong_on_sources:
+    if result.status != Ended.MISFIT or result.misfit.is_wrong_on_sources:
         return result
-    kept = (line for line in result.messages if not line.startswith(WRONG))
-    return noted(result, status=CONVERGED, messages=tuple(kept))
+    message = _message(result)
+    kept = tuple(line for line in result.messages if line != message)
+    return noted(result, status=Ended.CONVERGED, messages=kept)
 
 
 def _message(result):
@@ -49,7 +49,7 @@ def _message(result):
     largest = np.nan_to_num(misfit.whole_chi2).max(axis=0)
     worst = np.argsort(-largest, kind="stable")[:MAX_NAMED]
     chi2 = ", ".join(f"{largest[c]:.2f} in {result.channels[c]}" for c in sorted(worst))
-    text = f"{WRONG}: chi2 per pixel, over that of the noise, {chi2}"
+    text = f"the model does not describe the data: chi2 per pixel, over that of the noise, {chi2}"
     fraction = misfit.fraction()
     named = [s for s in np.argsort(-fraction, kind="stable")[:MAX_NAMED] if fraction[s] > 0]
     parts = ", ".join(f"source {s} leaves {100 * fraction[s]:.1f} % of its flux" for s in named)

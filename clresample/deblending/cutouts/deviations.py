@@ -18,7 +18,7 @@ import numpy as np
 
 from ...device.multi_device import one_blas_thread
 from ...resampling.resampler import Resampler
-from ...sky.extent import intersect_boxes
+from ...sky.box import intersect_boxes
 from ...sky.psf_checks import PSFWarning
 from .separation import component_image, source_image
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...sky.psf_checks import LIMIT_TOLERANCE, limit_power
 from ..blend import Blend
-from ..settings import AUTO, Settings
+from ..settings import AUTO, FitSettings
 from . import listing, shifted, spoilt
 from .centroids import centroids
 from .image import InspectedImage
@@ -55,14 +55,14 @@ class Inspection:
     """Results of the inspection of a blend.
 
     blend: the Blend to be fitted, spoilt pixels masked; the one inspected where there are none
-    settings: Settings with fit_shifts decided
+    settings: FitSettings with fit_shifts decided
     shifts (n_observations, 2) [model px]: of the observations, from which a fit of them starts
     messages: a sentence for each problem
     levels: SkyLevel of each observation
     """
 
     blend: Blend
-    settings: Settings
+    settings: FitSettings
     shifts: np.ndarray
     messages: list[str]
     levels: list[SkyLevel]
@@ -71,7 +71,7 @@ class Inspection:
 def inspect(blend, frame, positions, shifts, settings) -> Inspection:
     """The Inspection of a Blend with sources at positions (S, 2) [model px] of its Frame.
 
-    shifts (n_observations, 2) [model px]: of the observations, as known; settings: Settings
+    shifts (n_observations, 2) [model px]: of the observations, as known; settings: FitSettings
     """
     near = np.flatnonzero(frame.contains(positions))
     sources = [blend.sources[i] for i in near]

@@ -18,8 +18,7 @@ import numpy as np
 from ...device.multi_device import host_threads, map_threads
 from ...resampling.plan import FAINT
 from ...resampling.transfer import transfer_function
-from ...sky.extent import crop_psf
-from ...sky.psf import PSF
+from ...sky.psf import PSF, crop_psf
 from ..view import WhitenedView
 
 # [FWHM of the observation's PSF] Margin around its box up to which a component's light is rendered.

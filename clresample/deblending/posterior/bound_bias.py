@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...sky.extent import box_slices
+from ...sky.box import box_slices
 
 
 def negative_chi2_gradient(scene, views, source, spectra, residuals):

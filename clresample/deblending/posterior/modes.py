@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg.blas import strmm
 
-from ...sky.extent import intersect_boxes
+from ...sky.box import intersect_boxes
 from ..solver.multiscale.prior import MultiscalePrior
 from ..solver.scene import Scene
 from ..view import flush_faint

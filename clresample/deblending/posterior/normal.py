@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from ...device.multi_device import map_threads
-from ...sky.extent import box_slices
+from ...sky.box import box_slices
 from ..shifts import SCATTER_PX
 from ..solver.rendering.ties import Ties
 from .block_matrix import BlockMatrix

@@ -208,7 +208,7 @@ def posterior_of(fit, morphs, peaks, seen):
     seen: RenderedModel, of these
     """
     settings, scene = fit.settings, fit.scene
-    if not settings.has_multiscale_prior or not settings.errors or fit.strength_estimates is None:
+    if fit.strength_estimates is None or not settings.errors:
         return None, []
     spectra, covariance = seen.spectra, seen.covariance
     variance = np.diagonal(covariance, axis1=1, axis2=2).T

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...sky.extent import box_slices
+from ...sky.box import box_slices
 from ..profiles import SIZE_SCATTER, GalaxyProfile, StarProfile
 
 # Scatter of galaxies in ln sigma, g1, g2 (Leauthaud et al. 2007) and ln beta, for errors. The prior

@@ -73,11 +73,7 @@ def run_gradient_tests(fits):
 
 def _candidates(fit):
     """Components (k,) of a finished Fit that are bright enough for the test."""
-    if (
-        not fit.settings.has_multiscale_prior
-        or fit.strength_estimates is None
-        or not np.isfinite(fit.losses[-1:]).all()
-    ):
+    if fit.strength_estimates is None or not np.isfinite(fit.losses[-1:]).all():
         return np.zeros(0, int)
     source = fit.fitted[fit.start.source]
     free = [_is_free(fit.blend.sources[i]) for i in source]

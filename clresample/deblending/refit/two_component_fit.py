@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 
-from ..blend import INTERRUPTED, ITERATION_LIMIT, STOPPED_FOR_REFIT
+from ..ended import Ended
 from ..iterate import iterate
 from .colour_gradient import run_gradient_tests
 from .two_component_start import start_refits
@@ -38,7 +38,7 @@ def needs_second_component(fit):
 def refit_two_components(fits, settings, device, dtype, progress=None):
     """Returns for ended Fits each itself, or a second fit with more components.
 
-    fits: of one signature; those STOPPED_FOR_REFIT are continued to their end, unless the second
+    fits: of one signature; those stopped for a refit are continued to their end, unless the second
         fit is better than they can become; settings, device, dtype: theirs; progress: see `deblend`
     returns Fits, in the order of `fits`
     """
@@ -47,21 +47,19 @@ def refit_two_components(fits, settings, device, dtype, progress=None):
     after = {i: second.shifts for i, second in again.items()}
     for i in again:
         fits[i].shift(before[i])
-    if not any(second.status == INTERRUPTED for second in again.values()):
+    if not any(second.status == Ended.INTERRUPTED for second in again.values()):
         sure = [i for i, second in again.items() if _is_better(second, fits[i], MIN_DECISIVE_GAIN)]
-        going = [
-            fit for i, fit in enumerate(fits) if i not in sure and fit.status == STOPPED_FOR_REFIT
-        ]
+        going = [fit for i, fit in enumerate(fits) if i not in sure and fit.status == Ended.REFIT]
         _go_on(going, settings, device, dtype, _after(list(again.values()), _after(fits, progress)))
     kept = list(fits)
     for i, second in again.items():
-        if second.status != INTERRUPTED and _is_better(second, fits[i]):
+        if second.status != Ended.INTERRUPTED and _is_better(second, fits[i]):
             second.shift(after[i])
             kept[i] = _following(second, fits[i])
-        elif second.status == INTERRUPTED:
+        elif second.status == Ended.INTERRUPTED:
             kept[i].interrupt()
     for fit in kept:
-        if fit.status == STOPPED_FOR_REFIT:
+        if fit.status == Ended.REFIT:
             fit.interrupt()
     return kept
 
@@ -91,7 +89,7 @@ def _second_fits(fits, settings, device, dtype, progress):
 
 
 def _go_on(fits, settings, device, dtype, progress):
-    """Continues fits that were STOPPED_FOR_REFIT to their end.
+    """Continues fits that were stopped for a refit to their end.
 
     They are not tested again.
     """
@@ -99,7 +97,7 @@ def _go_on(fits, settings, device, dtype, progress):
         return
     before = [fit.seconds["fit"] for fit in fits]
     for fit in fits:
-        fit.status = ITERATION_LIMIT
+        fit.status = Ended.LIMIT
         del fit.losses[-1]  # that of the present state, with which the continuation begins
     iterate(fits, settings, device, dtype, progress)
     for fit, seconds in zip(fits, before, strict=True):

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...sky.sources import ExtendedSource
-from ..blend import ITERATION_LIMIT
+from ..ended import Ended
 from ..profiles import FixedProfile, GalaxyProfile
 from ..solver.multiscale.structure import coarse_count
 from ..solver.scene import StructureState
@@ -82,7 +82,7 @@ def _again(fit, point):
     new = copy(fit)
     new.start = point
     new.scene, new.state = first_scene(new)
-    new.losses, new.status, new.strength_estimates = [], ITERATION_LIMIT, None
+    new.losses, new.status, new.strength_estimates = [], Ended.LIMIT, None
     new.messages, new.seconds = list(fit.messages), {}
     new.last_steps = np.zeros_like(fit.last_steps)
     return new

@@ -1,8 +1,6 @@
 """The solver: batches of scenes on the device.
 
-A Scene and its State (scene.py) go into an Engine, which queues the loss and its gradients
-(gradient.py) and the steps (amsgrad.py) with their constraints (constraints.py), and returns
-States. rendering/ renders the model. To try another update, pass `Engine` another class in place of
-AMSGrad. This package does not depend on blends, fits and results. Imports `resampling`, `device`
-and `sky`.
+A Scene and its State (scene.py) are uploaded (buffers.py); gradient.py queues the loss and its
+gradients, rendering/ renders the model, and multiscale/ takes the steps and returns States. This
+package does not depend on blends, fits and results. Imports `resampling`, `device` and `sky`.
 """

@@ -20,9 +20,9 @@ class SceneBuffers:
     first (B + 1,), order (n,): int32, those by scene, and the first of each scene in that
     boxes, host_boxes: of all sources, with and without their table on the device
     free (n_free,): int32, the sources whose morphology is fitted; everyone's are in boxes
-    profile, amplitude, latent, morph, d_morph (boxes.size,): flat, laid out by the boxes: expected
-        morphologies, the scatter that the prior allows about them (0 without one), z, S, dL/dS
-    spectra, d_spectra, scale (S, C); sky (B, C)
+    profile, amplitude, morph, d_morph (boxes.size,): flat, laid out by the boxes: expected
+        morphologies, the scatter that the prior allows about them (0 without one), S, dL/dS
+    spectra, d_spectra (S, C); sky (B, C)
     """
 
     def __init__(self, scenes, states, device, dtype, prior):
@@ -46,8 +46,6 @@ class SceneBuffers:
         self.profile = self.flat([s.profile for s in scenes])
         amplitude = prior.amplitude if prior else np.zeros_like
         self.amplitude = self.flat([[amplitude(p) for p in s.profile] for s in scenes])
-        self.scale = self.put(np.concatenate([s.step_scale for s in scenes]))
-        self.latent = self.flat([s.latent for s in states])
         self.morph = self.flat([s.morph for s in states])
         self.spectra = self.put(np.concatenate([s.spectra for s in states]))
         self.sky = self.put(np.array([s.sky for s in states]))
@@ -65,8 +63,8 @@ class SceneBuffers:
 
     @property
     def iterated(self):
-        """Device buffers that the iterations change: latent, morph, spectra, sky."""
-        return self.latent, self.morph, self.spectra, self.sky
+        """Device buffers that the iterations change: morph, spectra, sky."""
+        return self.morph, self.spectra, self.sky
 
     def put(self, values):
         """Values on the device, in the batch's floating type."""
@@ -137,9 +135,11 @@ class SceneBuffers:
         arrays, starts = self.host_boxes.unpack(self.device.get(flat)), [0, *self._ends]
         return [arrays[a:b] for a, b in zip(starts, self._ends, strict=False)]
 
-    def states(self, iterated, memories, n_steps) -> list[State]:
-        """States of all scenes from device arrays like `iterated`, back on the host."""
-        latent, morph, spectra, sky = iterated
+    def states(self) -> list[State]:
+        """The present States of all scenes, back on the host."""
+        return [State(*parts) for parts in zip(*self.downloaded(*self.iterated), strict=True)]
+
+    def downloaded(self, morph, spectra, sky):
+        """Morphologies, spectra and sky levels of each scene, of device arrays like these."""
         spectra, sky = (self.device.get(a).astype(float) for a in (spectra, sky))
-        parts = self.unpack(latent), self.unpack(morph), self.split(spectra), sky, memories
-        return [State(*part, n_steps=n_steps) for part in zip(*parts, strict=True)]
+        return self.unpack(morph), self.split(spectra), sky

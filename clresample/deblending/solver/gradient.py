@@ -1,19 +1,17 @@
 """The loss of a batch of scenes and its gradients, on the device.
 
-    L = 1/2 sum_o |sqrt(w_o) (R_o M + sky - d_o)|^2 + 1/2 sum_c p_c sky_c^2 + 1/2 |z|^2
+    L = 1/2 sum_o |sqrt(w_o) (R_o M + sky - d_o)|^2 + 1/2 sum_c p_c sky_c^2
     M_c = sum_s A[s, c] S_s,   p = Scene.known_sky,   G_o = R_o^T w_o (R_o M + sky - d_o)
     dS_s = sum_c A[s, c] G_c on the box,   dA[s, c] = <S_s, G_c>
     dsky_c = sum of w_o (...) + p_c sky_c
 
 dA of tied channels is the mean over their band, see rendering/ties.py.
 
-|z|^2 is the prior's term; its gradient is added in the step of z (amsgrad.py). rendering/ computes
+The solvers add the prior's term and its gradient in their steps. rendering/ computes
 R_o M and the gradients; kernels are in scene.cl, boxed.cl and losses.cl.
 """
 
 from __future__ import annotations
-
-import functools
 
 import numpy as np
 
@@ -25,17 +23,15 @@ class LossGradient:
     """Queues model, residual, gradients and loss of a batch at its present state.
 
     buffers: the batch; d_morph and d_spectra of it are overwritten
-    with_prior: True if the loss has the term of z
     depth: the stage of rendering at which spectra are applied, see rendering/stages.py; None = the
         cheapest for each observation
     rows (C + 1,): first observed row of each channel, then their total; the columns of rows_loss
         and rows_pull
     rows_loss, rows_pull (B, n_rows): 1/2 sum w r^2 and sum w r of each observed row; the first row
         of a channel includes the prior of its sky. Sums over its rows are its loss and dL/dsky
-    best (B,): lowest loss of each scene among those computed with i_loss = 0, infinite before
     """
 
-    def __init__(self, buffers, with_prior, depth=None):
+    def __init__(self, buffers, depth=None):
         self.buffers, scenes = buffers, buffers.scenes
         heights = [op.shape_out[1] for op in scenes[0].ops for _ in range(op.shape_out[0])]
         self.rows = np.concatenate([[0], np.cumsum(heights)])
@@ -43,9 +39,8 @@ class LossGradient:
         self.rows_loss, self.rows_pull = (
             buffers.device.empty(shape, buffers.dtype) for _ in range(2)
         )
-        self.best = buffers.put(np.full(len(scenes), np.inf))
         self.observations = [_ObservedBatch(self, i, depth) for i in range(len(scenes[0].ops))]
-        self._with_prior, self._tie, self._expect_sky = with_prior, None, None
+        self._tie, self._expect_sky = None, None
         known = np.array([scene.known_sky for scene in scenes])
         if known.any():
             self._expect_sky = buffers.launcher("losses.cl", "expect_sky", 1).bind(
@@ -71,27 +66,8 @@ class LossGradient:
                 d_spectra=buffers.d_spectra,
             )
 
-    def __call__(self, losses, i_loss):
-        """Queues the evaluation; writes the scenes' losses to row i_loss of losses (n, B)."""
-        self.queue()
-        self._losses((self.buffers.tuning.sum_group, len(self.best)), out=losses, i_loss=i_loss)
-
-    @functools.cached_property
-    def _losses(self):
-        """The kernel that sums the losses, built at first use: the multi-scale prior needs none."""
-        b, group = self.buffers, self.buffers.tuning.sum_group
-        return b.launcher("losses.cl", "losses", 2, local_size=(group, 1)).bind(
-            first=b.first,
-            table=b.boxes.table,
-            n_rows=self.rows[-1],
-            rows=self.rows_loss,
-            prior=self._with_prior,
-            latent=b.latent,
-            best=self.best,
-        )
-
     def queue(self):
-        """Queues everything but the losses' sums: gradients, rows_loss and rows_pull."""
+        """Queues the evaluation: gradients, rows_loss and rows_pull."""
         for observed in self.observations:
             observed.queue()
         if self._expect_sky is not None:

@@ -26,13 +26,10 @@ class Scene:
         and the pixel of the box about which the morphology falls
     profile (S): arrays (ny, nx) [1]: expected morphology, max = 1
     fixed (S,): bool, the morphology stays as it is
-    step_scale (S, C): size of one step of each spectrum, in the unit of the data
     coefficients: per observation (S, Co, T), of its operator's terms in each component's PSF; None
         if its PSF is the same for all
     spectrum_curvature (S, C): sum w (R p)^2 of each profile p, the curvature of the loss by its
         spectrum
-    damping (S,): gradients under which steps are shorter than the step sizes; see
-        `curvature.damping`
     fit_sky: whether the sky level of each channel is free
     sky_precision (C,): inverse variance of the prior of a fitted sky level, whose mean is 0 because
         the expected level was subtracted from the data; 0 without an expectation; None = 0 in all
@@ -49,10 +46,8 @@ class Scene:
     center: np.ndarray
     profile: list[np.ndarray]
     fixed: np.ndarray
-    step_scale: np.ndarray
     coefficients: list | None = None
     spectrum_curvature: np.ndarray | None = None
-    damping: np.ndarray | None = None
     fit_sky: bool = False
     sky_precision: np.ndarray | None = None
     ties: Ties | None = None
@@ -97,17 +92,6 @@ class Scene:
 
 
 @dataclass(frozen=True, eq=False)
-class AmsgradMoments:
-    """Moments of AMSGrad: k arrays like the morphologies and the spectra.
-
-    morph (k): each S arrays (ny, nx), in the boxes; spectra (k, S, C)
-    """
-
-    morph: list[list[np.ndarray]]
-    spectra: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class StructureState:
     """Structure of one scene's n components in a fit under a MultiscalePrior.
 
@@ -125,18 +109,14 @@ class StructureState:
 class State:
     """Variables of the iterations of one scene.
 
-    latent, morph (S): arrays (ny, nx): z (see SingleScalePrior; of no use without one) and S
+    morph (S): arrays (ny, nx), S
     spectra (S, C): A, and sky (C,), in the unit of the data
-    memory: moments of the update, None before its first step; n_steps: iterations done so far
     learned: StructureState with a MultiscalePrior; None = no structure, the prior's strengths
     """
 
-    latent: list[np.ndarray]
     morph: list[np.ndarray]
     spectra: np.ndarray
     sky: np.ndarray
-    memory: AmsgradMoments | None = None
-    n_steps: int = 0
     learned: StructureState | None = None
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...sky.extent import box_slices
+from ...sky.box import box_slices
 
 
 def compose(shape, origin, morphs, spectra):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...resampling.plan import Precision
-from ...sky.extent import intersect_boxes
+from ...sky.box import intersect_boxes
 from ..component_images import ComponentImages
 from ..profiles import ComponentProfile
 from ..view import WhitenedView

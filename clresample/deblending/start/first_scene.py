@@ -2,22 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from ...sky.sources import PointSource
-from ..resize import component_box
-from ..solver.curvature import damping
 from ..solver.scene import Scene, State
-
-# A spectrum's step size is its flux error plus this fraction of the flux, so that fluxes of bright
-# sources can follow changes of their morphology, which are much larger than their errors.
-SPECTRUM_PART = 0.02
-# Smallest curvature sum |u|^2 of a component's whitened image u in a channel, whose root is the
-# inverse of its spectrum's error; and the error above which the channel does not contain the
-# component, so that its spectrum is fixed there. A covered component has errors of at most 1e6.
-MIN_POWER, UNSEEN = 1e-30, 1e14
+from .boxes import component_box
 
 
 def first_scene(fit) -> tuple[Scene, State]:
@@ -28,9 +17,6 @@ def first_scene(fit) -> tuple[Scene, State]:
         for i, spectrum in enumerate(begin.spectra)
     ]
     morphs = [image for *_, image in boxes]
-    spectra, power = begin.spectra, begin.spectrum_curvature
-    together = power if fit.ties is None else fit.ties.spread(fit.ties.total(power))
-    error = 1 / np.sqrt(np.maximum(together, MIN_POWER))
     scene = Scene(
         shape=fit.padded.shape,
         unpadded_shape=fit.frame.shape,
@@ -41,17 +27,12 @@ def first_scene(fit) -> tuple[Scene, State]:
         center=np.array([center for _, _, center, _ in boxes]),
         profile=morphs,
         fixed=np.array([isinstance(fit.sources[fit.fitted[i]], PointSource) for i in begin.source]),
-        step_scale=np.where(error < UNSEEN, error + SPECTRUM_PART * spectra, 0),
         coefficients=[
             None if v.coefficients is None else v.coefficients[begin.source] for v in fit.views
         ],
-        spectrum_curvature=power,
+        spectrum_curvature=begin.spectrum_curvature,
         fit_sky=fit.settings.fit_sky,
         sky_precision=fit.sky_precision,
         ties=fit.ties,
     )
-    latent = [np.zeros_like(m) for m in morphs]
-    state = State(latent, [m.copy() for m in morphs], spectra, begin.sky)
-    if not fit.settings.has_multiscale_prior:
-        scene = replace(scene, damping=damping(scene, state, fit.settings.prior))
-    return scene, state
+    return scene, State([m.copy() for m in morphs], begin.spectra, begin.sky)

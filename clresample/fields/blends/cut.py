@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from ...measurement.hills import root, saddles, watershed
-from ..box import Box
+from ...sky.box import Box
 
 # [sigma] Combined signal to noise at a saddle below which sources are fitted jointly only if the
 # fit takes little time. A piece's neighbours are subtracted to 15 % (MODEL_ERROR), so their

@@ -6,9 +6,9 @@ import numpy as np
 
 from ...deblending.blend import Blend
 from ...deblending.spectra import MODEL_ERROR
+from ...sky.box import Box, box_within
 from ...sky.frame import model_frame
 from ...sky.sources import ExtendedSource
-from ..box import Box, box_within
 
 # [px] Sides of the cutouts of fits are multiples of this number, like the boxes of their models:
 # with smaller steps there are more batches, with larger ones more sky to compute.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from ..box import Box
+from ...sky.box import Box
 from ..memmap import create_memmap
 
 

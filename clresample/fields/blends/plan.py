@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from scipy import ndimage
 
-from ..box import Box, round_up_size
+from ...sky.box import Box, round_up_size
 from .cut import FitLimits, cut_blend, fit_bytes
 from .search import nearest
 

@@ -10,8 +10,8 @@ from scipy import ndimage
 from ...files.atomic import FileError
 from ...measurement.detection import detect, noise_scatter
 from ...measurement.signal_to_noise import WIDTHS_ARCSEC
+from ...sky.box import Box
 from ...sky.frame import model_frame
-from ..box import Box
 
 # [sigma] Level of footprints in the combined signal-to-noise image. At 2, light outside a source's
 # footprint is below the noise everywhere. With a lower level noise links separate sources; with a

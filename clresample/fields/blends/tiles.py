@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from ..box import Box
+from ...sky.box import Box
 
 
 class SearchTile(NamedTuple):

@@ -22,8 +22,9 @@ from ...device.discovery import DeviceError
 from ...files.atomic import FileError
 from ..strips import STRIPS
 from .cluster_workers import ClusterWorkers
-from .pool import POLL_S, reason_of
+from .pool import POLL_S
 from .process_limits import thread_environment, trim_memory
+from .reason import Cause, Reason
 
 NO_DASK = "distributed is not installed (pip install distributed)"
 CONNECT_S = 30.0  # [s] within which the scheduler answers and its first worker is there
@@ -110,7 +111,7 @@ class DaskCluster:
                 yield outcome
         except _lost() as error:
             raise FileError(
-                f"the scheduler {self.address} no longer answers ({reason_of(error)}); what is "
+                f"the scheduler {self.address} no longer answers ({Reason.of(error)}); what is "
                 "finished stays: --resume goes on"
             ) from error
         finally:
@@ -147,7 +148,7 @@ class _Run:
         try:
             given = self.work.gather(self.context, seat.task)
         except Exception as error:
-            failed, seat.task = seat.outcome(reason=reason_of(error)), None
+            failed, seat.task = seat.outcome(reason=Reason.of(error)), None
             return failed
         if seat.context is None:
             if seat.device not in self.blobs:
@@ -176,31 +177,31 @@ class _Run:
             return None
         if seat.future is not future:  # of a worker that was given up
             return None
-        value, reason, died = self._answer(seat, future)
-        outcome = seat.outcome(value, reason, died)
+        outcome = seat.outcome(*self._answer(seat, future))
         seat.task = seat.future = None
-        if (reason or "").startswith(DeviceError.__name__):
+        if outcome.cause is Cause.DEVICE:
             self.waiting.appendleft(outcome.task)
-            self.seats.record_fault(seat, reason)
+            self.seats.record_fault(seat, outcome.reason)
             return None
         seat.faults = 0
         return outcome
 
     def _answer(self, seat, future):
-        """(value, reason, True if the worker died) of a finished task; stores its file."""
+        """(value, reason) of a finished task; stores its file."""
         try:
             (value, content), reason = future.result(timeout=FETCH_S)
         except DeviceError as error:  # as the worker opened it
-            return None, f"{DeviceError.__name__}: {error}", False
+            return None, Reason(str(error), Cause.DEVICE, type(error).__name__)
         except Exception as error:
             self.seats.end(seat)
-            return None, f"its worker {seat.address} ended ({error or future.status})", True
+            why = f"its worker {seat.address} ended ({error or future.status})"
+            return None, Reason(why, Cause.WORKER)
         if reason is None:
             try:
                 self.work.keep(self.context, seat.task, content)
             except Exception as error:
-                return None, reason_of(error), False
-        return value, reason, False
+                return None, Reason.of(error)
+        return value, reason
 
 
 def _lost():
@@ -235,6 +236,6 @@ def _done(context, parcel):
     try:
         return done(context, task, given), None
     except Exception as error:
-        return (None, None), reason_of(error)
+        return (None, None), Reason.of(error)
     finally:
         trim_memory()

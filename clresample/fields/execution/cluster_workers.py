@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from ...device.discovery import DeviceError
 from ...files.atomic import FileError
 from .pool import MAX_DEVICE_FAULTS, Outcome, took_too_long
+from .reason import Cause, Reason
 
 RESTART_S = 30.0  # [s] time limit for ending a worker that hangs
 # [s] Time without any worker after which a run fails: batch systems replace nodes in minutes.
@@ -34,10 +35,10 @@ class ClusterWorker:
     start_s: float = 0.0
     faults: int = 0
 
-    def outcome(self, value=None, reason=None, died=False) -> Outcome:
+    def outcome(self, value=None, reason=None) -> Outcome:
         """Outcome of its task, now."""
         now = time.monotonic()
-        return Outcome(self.task, value, reason, died, self.number, self.start_s, now)
+        return Outcome(self.task, value, reason, self.number, self.start_s, now)
 
 
 class ClusterWorkers:
@@ -84,13 +85,14 @@ class ClusterWorkers:
             seat = self.there.pop(address)
             self.progress.message(f"worker {address} is gone")
             if seat.task is not None:
-                found.append(seat.outcome(reason=f"its worker {address} ended", died=True))
+                gone = Reason(f"its worker {address} ended", Cause.WORKER)
+                found.append(seat.outcome(reason=gone))
                 self._cancel(seat)
         for address in sorted(now - self.there.keys() - self.given_up):
             self._add(address)
         for seat in self.busy:
             if self.limit_s is not None and time.monotonic() - seat.start_s > self.limit_s:
-                found.append(seat.outcome(reason=took_too_long(self.limit_s), died=True))
+                found.append(seat.outcome(reason=took_too_long(self.limit_s)))
                 self.end(seat)
         self._anybody()
         return found
@@ -142,4 +144,4 @@ class ClusterWorkers:
         self.given_up.add(seat.address)
         self.progress.message(f"worker {seat.address} is given up: {reason}")
         if not self.there:
-            raise DeviceError(reason.partition(": ")[2])
+            raise DeviceError(reason.message)

@@ -10,20 +10,22 @@ import numpy as np
 
 from ...deblending.assessment.status import with_source_misfit_status
 from ...deblending.batch import deblend_many
-from ...deblending.blend import INTERRUPTED, Blend, Failure
-from ...deblending.settings import Settings
+from ...deblending.blend import Blend, Failure
+from ...deblending.ended import Ended
+from ...deblending.settings import FitSettings, Settings
 from ...device.device import get_device
-from ...device.discovery import DeviceError
+from ...device.discovery import DeviceLostError
 from ...measurement.catalogue import Flag, add_positions, catalogue_columns
 from ...measurement.columns import Columns
 from ...measurement.detection import detect_more
+from ...measurement.late_sources import fit_with_late_sources
 from ...resampling.cache import default_cache
+from ...sky.box import Box
 from ...sky.grid import Grid
 from ...sky.sources import ExtendedSource
 from ..blends.cutouts import make_blend
 from ..blends.plan import FitPlan, source_ids
 from ..blends.search import nearest
-from ..box import Box
 from .group_results import GroupResults
 
 # Errors that concern one patch only: the others of its group continue.
@@ -42,7 +44,6 @@ LARGE, LARGE_ITERATIONS = 500_000, 250
 MAX_CHI2 = 100.0
 # The round in which pieces' residuals are searched; the next one fits the new sources.
 SEARCHED = 1
-NO_ANSWER = "no longer answers"  # in the message of a lost device
 POSITIONS = ("y", "x", "y_centroid", "x_centroid")  # columns in pixels of a fit's frame
 
 
@@ -64,7 +65,7 @@ class FieldJob:
     plan: FitPlan
     origin_px: tuple[int, int]
     core: Box
-    settings: Settings = Settings()
+    settings: FitSettings = Settings()
     threshold: float = 5.0
     passes: int = 2
     memory: int = 1 << 30
@@ -107,7 +108,8 @@ def fit_group(job, group, given) -> tuple[dict, bytes]:
     """Fits a group: {"sources", "patches", "failed", "seconds"}, and its part as bytes.
 
     given: GroupInputs of the group. A patch that fails is in the part with its reason. Raises
-    KeyboardInterrupt after Ctrl-C, DeviceError where the device no longer answers.
+    KeyboardInterrupt after Ctrl-C, DeviceLostError where the device no longer
+    answers.
     """
     try:
         return _fitted(job, group, given)
@@ -135,27 +137,24 @@ def _fitted(job, group, given):
                 dict(group.components),
             )
         except ERRORS as error:
-            _set_aside(part, job, patch, group.round, f"failed: {_line(error)}")
+            _set_aside(part, job, patch, group.round, _line(error))
             continue
         if not blend.observations:
-            _set_aside(part, job, patch, group.round, "failed: no pixel here has a weight")
+            _set_aside(part, job, patch, group.round, "no pixel here has a weight")
             continue
         cut = _BlendCutout(patch, blend, boxes, time.perf_counter() - start)
         cuts.append(cut.joined(more))
-    rough = [group.round == 0 and bool(cut.patch.siblings) for cut in cuts]
-    results = _fits(job, [cut.blend for cut in cuts], rough)
-    if job.passes > 1:
-        cuts, results = _second_look(job, given, cuts, results, part, group.round)
+    cuts, results = _fits_of(job, given, cuts, part, group.round)
     for cut, result in zip(cuts, results, strict=True):
         if isinstance(result, Failure):
-            if result.status == INTERRUPTED:
+            if result.status == Ended.INTERRUPTED:
                 raise KeyboardInterrupt
-            _set_aside(part, job, cut.patch, group.round, _line(result.status))
+            _set_aside(part, job, cut.patch, group.round, _line(result.reason))
             continue
         try:
             _take(part, job, cut, result, group.round)
         except ERRORS as error:
-            _set_aside(part, job, cut.patch, group.round, f"failed: {_line(error)}")
+            _set_aside(part, job, cut.patch, group.round, _line(error))
     return _summary(part, time.perf_counter() - began), part.to_bytes()
 
 
@@ -163,7 +162,7 @@ def mark_failed(job, group, reason) -> tuple[dict, bytes]:
     """As `fit_group` for a group that could not be fitted: each source with the reason."""
     part = GroupResults()
     for number in group.patches:
-        _set_aside(part, job, job.plan.patches[number], group.round, f"failed: {_line(reason)}")
+        _set_aside(part, job, job.plan.patches[number], group.round, _line(reason))
     return _summary(part, 0.0), part.to_bytes()
 
 
@@ -171,7 +170,7 @@ def _summary(part, seconds):
     return {
         "sources": sum(len(rows) for rows in part.rows),
         "patches": len(part.patches),
-        "failed": sum(str(row[3]).startswith("failed") for row in part.patches),
+        "failed": part.n_failed,
         "seconds": seconds,
     }
 
@@ -205,10 +204,11 @@ def _fits(job, blends, rough=None):
     for (limits, *_), alike in sizes.items():  # all at once, those of one size would be padded too
         settings, few = _settings(job, *limits), [blends[i] for i in alike]
         found = deblend_many(few, settings=settings, device=device, memory=job.memory)
-        if any(r.status == INTERRUPTED for r in found):
+        if any(r.status == Ended.INTERRUPTED for r in found):
             raise KeyboardInterrupt
-        if lost := next((r.status for r in found if NO_ANSWER in r.status), None):
-            raise DeviceError(lost.removeprefix("failed: "))
+        for failure in (r for r in found if isinstance(r, Failure)):
+            if failure.error and issubclass(failure.error, DeviceLostError):
+                raise DeviceLostError(failure.reason)
         for i, result in zip(alike, found, strict=True):
             results[i] = result
     return results
@@ -217,17 +217,17 @@ def _fits(job, blends, rough=None):
 def _settings(job, rough, large):
     """Settings of rough fits, and of those of large blends.
 
-    Only fits with the multi-scale prior can be shortened: other priors need all their iterations.
+    The paper's method needs all its iterations.
     """
     settings = job.settings
-    if not settings.has_multiscale_prior or not (rough or large):
+    if not isinstance(settings, Settings) or not (rough or large):
         return settings
     most = min(settings.max_iter, ROUGH_ITERATIONS if rough else LARGE_ITERATIONS)
     return replace(settings, max_iter=most, errors=settings.errors and not rough)
 
 
-def _second_look(job, given, cuts, results, part, n_round):
-    """Refits blends with the sources detected in their residuals: (cuts, results).
+def _fits_of(job, given, cuts, part, n_round):
+    """Fits blends, and again with the sources detected in their residuals: (cuts, results).
 
     The residuals are those of the complete fit. A short fit of 30 iterations without structure, as
     in `clresample deblend`, leaves the structure of bright galaxies in the residuals. In simulated
@@ -235,26 +235,27 @@ def _second_look(job, given, cuts, results, part, n_round):
     blend are searched in the round SEARCHED, after their neighbours' light was subtracted; their
     new sources are stored in the group's results, for the next round.
     """
-    cuts, results, again = list(cuts), list(results), []
-    for i, (cut, result) in enumerate(zip(cuts, results, strict=True)):
+
+    def fit(some):
+        rough = [n_round == 0 and bool(cut.patch.siblings) for cut in some]
+        return _fits(job, [cut.blend for cut in some], rough)
+
+    def find(cut, result):
         is_piece = bool(cut.patch.siblings)
-        if isinstance(result, Failure) or _chi2(result) > MAX_CHI2:
-            continue
-        if n_round != (SEARCHED if is_piece else 0):
-            continue
+        if n_round != (SEARCHED if is_piece else 0) or _chi2(result) > MAX_CHI2:
+            return None
         try:
             rows = _found(job, given, cut, result)
         except ERRORS:
-            continue  # the fit is kept
+            return None  # the fit is kept
         if is_piece:
             part.found += [(cut.patch.number, *row) for row in rows]
-        elif rows:
-            again.append((i, cut.joined(rows)))
-    fits = _fits(job, [cut.blend for _, cut in again])
-    for (i, cut), result in zip(again, fits, strict=True):
-        if not isinstance(result, Failure):  # else the earlier fit is kept
-            cuts[i], results[i] = cut, result
-    return cuts, results
+        return cut.joined(rows) if rows and not is_piece else None
+
+    if job.passes == 1:
+        return cuts, fit(cuts)
+    pairs = fit_with_late_sources(cuts, fit, find)
+    return [cut for cut, _ in pairs], [result for _, result in pairs]
 
 
 def _chi2(result):
@@ -303,7 +304,7 @@ def _take(part, job, cut, result, n_round):
         rows.put(name, rows[name] + origin[0 if name[0] == "y" else 1])
     partner = rows["ambiguous_with"]
     rows.put("ambiguous_with", np.where(partner < 0, -1, ids[partner]))
-    _add_columns(rows, ids, job, patch, result.status)
+    _add_columns(rows, ids, job, patch, result.status, "")
     models = [
         (job.mosaics.index(mosaic), box, result.model(i) - _sky(result, i))
         for i, (mosaic, box) in enumerate(_mosaics_of(job, cut.boxes))
@@ -349,7 +350,7 @@ def _all_channels(job, channels, values):
     return np.array([have.get(name, np.nan) for name in job.channels])
 
 
-def _set_aside(part, job, patch, n_round, status):
+def _set_aside(part, job, patch, n_round, reason):
     """Adds a patch without a fit: its sources have their positions and the reason."""
     sources = list(patch.sources)
     rows = Columns()
@@ -359,18 +360,19 @@ def _set_aside(part, job, patch, n_round, status):
     rows.put("ambiguous_with", np.full(len(sources), -1))
     rows.put("group_id", np.array([job.plan.host_of[i] for i in ids.tolist()], np.int64))
     rows.put("n_group", np.zeros(len(sources), np.int32))
-    _add_columns(rows, ids, job, patch, status)
+    _add_columns(rows, ids, job, patch, Ended.FAILED, reason)
     part.rows.append(rows)
+    status = f"{Ended.FAILED}: {reason}"
     part.patches.append(
         (patch.number, patch.parent, n_round, status, len(rows), patch.box.area, 0, 0.0)
     )
+    part.n_failed += 1
 
 
-def _add_columns(rows, ids, job, patch, status):
+def _add_columns(rows, ids, job, patch, status, reason):
     """Adds the columns of a field's catalogue to those of a blend."""
     n = len(ids)
     peaks = job.plan.peak_of
-    kind, _, reason = status.partition(": ")
     if patch.pieces > 1:
         cut = f"blend of {patch.n_blend_sources} sources cut into {patch.pieces} pieces"
         reason = f"{reason}; {cut}" if reason else cut
@@ -379,11 +381,11 @@ def _add_columns(rows, ids, job, patch, status):
     rows.put("detection_snr", np.array([peaks.get(i, np.nan) for i in ids.tolist()]))
     rows.put("detection_pass", np.array([1 if i in peaks else 2 for i in ids.tolist()], np.int16))
     rows.put("n_blend_sources", np.full(n, patch.n_blend_sources, np.int32))
-    rows.put("status", np.full(n, kind))
+    rows.put("status", np.full(n, status))
     rows.put("reason", np.full(n, reason))
 
 
 def _line(error):
     """An error in one line of ASCII, as FITS tables hold it."""
-    text = error if isinstance(error, str) else f"{error or type(error).__name__}"
+    text = str(error) or type(error).__name__
     return " ".join(text.split()).encode("ascii", "replace").decode()[:190]

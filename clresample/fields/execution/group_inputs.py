@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..box import Box
+from ...sky.box import Box
 from .group_results import GroupResultsFile
 
 

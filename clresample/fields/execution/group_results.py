@@ -12,7 +12,7 @@ from astropy.io import fits
 
 from ...files.fits import open_fits
 from ...measurement.columns import Columns
-from ..box import Box
+from ...sky.box import Box
 
 PATCH_COLUMNS: dict[str, type | str] = {
     "fit_id": np.int64,
@@ -47,6 +47,7 @@ class GroupResults:
     flat: morphologies, flattened; models: rows of MODEL_COLUMNS, pixels: of these, flattened
     offsets: (1 + 2 M + C,) of each patch with fitted shifts or sky levels other than 0: its number,
         shifts (M, 2) [model px] of all mosaics, sky levels (C,) [counts] of all channels
+    n_failed: patches without a fit
     """
 
     rows: list = field(default_factory=list)
@@ -60,6 +61,7 @@ class GroupResults:
     offsets: list = field(default_factory=list)
     n_flat: int = 0
     n_pixels: int = 0
+    n_failed: int = 0
 
     def add_component(self, source_id, patch, origin, morphology, spectrum):
         """A component of a source: its box begins at `origin` (2,) of the field's model pixels."""
@@ -162,6 +164,16 @@ class GroupResultsFile:
                 if (chosen is None or patch in chosen) and mosaic in (None, i_mosaic):
                     image, box = np.array(hdu.section[start:end], np.float32), Box(*corners)
                     yield patch, i_mosaic, box, image.reshape(-1, *box.shape)
+
+
+def last_rounds(tables) -> dict:
+    """{fit_id: number of the table with its last round}; tables: rows of PATCH_COLUMNS of parts."""
+    last, n_round = {}, {}
+    for i, rows in enumerate(tables):
+        for patch, one in zip(rows["fit_id"].tolist(), rows["n_refits"].tolist(), strict=True):
+            if one >= n_round.get(patch, -1):
+                last[patch], n_round[patch] = i, one
+    return last
 
 
 def _columns(hdu):

@@ -6,7 +6,6 @@ import contextlib
 import multiprocessing
 import os
 import time
-import traceback
 from collections import deque
 from dataclasses import dataclass
 from multiprocessing.connection import wait
@@ -22,6 +21,7 @@ from .process_limits import (
     trim_memory,
     unfreeze_objects,
 )
+from .reason import Cause, Reason
 
 # [s] Interval between two checks of the workers' times.
 POLL_S = 1.0
@@ -34,17 +34,20 @@ MAX_DEVICE_FAULTS = 2
 class Outcome:
     """End of a task: its value, or the reason why there is none.
 
-    worker_died: the reason is that the process ended or hung, not an error that it reported
-    worker: number of its worker, from 0; start_s, end_s [s]: by the monotonic clock
+    worker: which worker had it, from 0; start_s, end_s [s]: by the monotonic clock
     """
 
     task: object
     value: object = None
-    reason: str | None = None
-    worker_died: bool = False
+    reason: Reason | None = None
     worker: int = 0
     start_s: float = 0.0
     end_s: float = 0.0
+
+    @property
+    def cause(self) -> Cause | None:
+        """Kind of the reason, None of a task with a value."""
+        return None if self.reason is None else self.reason.cause
 
 
 @dataclass(eq=False)
@@ -135,8 +138,8 @@ class WorkerPool:
                 _give(worker, run, waiting.popleft())
         found = []
         for worker, outcome in _ended(self._workers, self.limit_s):
-            broken = (outcome.reason or "").startswith(DeviceError.__name__)
-            if outcome.worker_died or broken:
+            broken = outcome.cause is Cause.DEVICE
+            if broken or outcome.cause is Cause.WORKER:
                 self._workers.remove(worker)
                 _end(worker)
             else:
@@ -165,7 +168,7 @@ class WorkerPool:
         if self._faults[seat] >= MAX_DEVICE_FAULTS:
             del self._faults[seat]
         if not self._faults:
-            raise DeviceError(outcome.reason.partition(": ")[2])
+            raise DeviceError(outcome.reason.message)
 
 
 def _give(worker, run, task):
@@ -187,7 +190,7 @@ def _in_this_process(function, context, task):
     except DeviceError:
         raise
     except Exception as error:
-        value, reason = None, reason_of(error)
+        value, reason = None, Reason.of(error)
     trim_memory()
     return Outcome(task, value, reason, start_s=began, end_s=time.monotonic())
 
@@ -225,24 +228,23 @@ def _ended(workers, limit_s):
         if worker.pipe in ready:
             try:
                 value, reason, kernels = worker.pipe.recv()
-                died = False
                 kernel_profiler.add(kernels)
             except (EOFError, OSError):
-                value, reason, died = None, _dead(worker), True
+                value, reason = None, _dead(worker)
         elif worker.process.sentinel in ready:
-            value, reason, died = None, _dead(worker), True
+            value, reason = None, _dead(worker)
         elif limit_s is not None and now - worker.since > limit_s:
-            value, reason, died = None, took_too_long(limit_s), True
+            value, reason = None, took_too_long(limit_s)
         else:
             continue
-        outcome = Outcome(worker.task, value, reason, died, worker.seat, worker.since, now)
+        outcome = Outcome(worker.task, value, reason, worker.seat, worker.since, now)
         found.append((worker, outcome))
     return found
 
 
 def took_too_long(limit_s):
     """The reason of a task that was ended with its worker."""
-    return f"its worker took over {limit_s:g} s and was ended"
+    return Reason(f"its worker took over {limit_s:g} s and was ended", Cause.WORKER)
 
 
 def _dead(worker):
@@ -250,7 +252,7 @@ def _dead(worker):
     worker.process.join(5)
     code = worker.process.exitcode
     how = f"signal {-code}" if code is not None and code < 0 else f"exit status {code}"
-    return f"its worker ended with {how}"
+    return Reason(f"its worker ended with {how}", Cause.WORKER)
 
 
 def _end(worker):
@@ -287,7 +289,7 @@ def _work(pipe, bound, parent):
         except KeyboardInterrupt:
             return
         except Exception as error:
-            answer = None, reason_of(error)
+            answer = None, Reason.of(error)
         try:
             pipe.send((*answer, kernel_profiler.drain()))
         except OSError:
@@ -297,10 +299,3 @@ def _work(pipe, bound, parent):
         if not kept:  # the first task has loaded all modules and kernels
             freeze_objects()
             kept = True
-
-
-def reason_of(error):
-    """An error in one line, with the place where it was raised."""
-    text = " ".join(str(error).split()) or "no message"
-    last = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{type(error).__name__}: {text} ({last.name}, line {last.lineno})"

@@ -11,6 +11,7 @@ from .backend import TaskKind
 from .fitting import fit_group, is_large, mark_failed
 from .group_inputs import FitGroup, gather_inputs
 from .group_results import FOUND_COLUMNS, GroupResultsFile
+from .reason import Cause
 
 # Largest number of rounds in which a cut blend's pieces are fitted again, with their neighbours'
 # light subtracted. Crowded pieces settle in the third or fourth round.
@@ -219,7 +220,10 @@ def _fit_round(job, tasks, engine, progress):
 
     def again(outcome):
         group = outcome.task
-        _check_space(job.folder, outcome.reason)
+        if outcome.cause is Cause.DISK:  # which would lose all
+            raise FileError(
+                f"{job.folder}: {outcome.reason}; what is finished stays: --resume goes on"
+            )
         tries[group.patches] = tries.get(group.patches, 0) + 1
         if tries[group.patches] < 2:  # it may have been killed from outside: try once more
             return [group]
@@ -249,9 +253,3 @@ def _parts_of(folder):
         (patches,) = GroupResultsFile(path).read("PATCHES")
         found[path.stem] = tuple(patches["fit_id"].tolist())
     return found
-
-
-def _check_space(folder, reason):
-    """Raises FileError if a group failed because the disk is full, which would lose all."""
-    if "cannot be written" in reason or "No space left" in reason:
-        raise FileError(f"{folder}: {reason}; what is finished stays: --resume goes on")

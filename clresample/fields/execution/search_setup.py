@@ -13,6 +13,7 @@ from ...files.atomic import FileError
 from ...sky.grid import Grid
 from ..blends.search import snr_scatter
 from .backend import TaskKind
+from .reason import Cause
 
 # Largest fraction of a device's memory that a group of fits may take by prediction: predictions are
 # rough, and the driver, its kernels and the next group's data need memory too.
@@ -49,14 +50,14 @@ def prepare_search(mosaics, reference, work, engine):
 
     def again(outcome):
         tried.append(outcome)
-        return [outcome.task] if outcome.worker_died and len(tried) < 2 else None
+        return [outcome.task] if outcome.cause is Cause.WORKER and len(tried) < 2 else None
 
     engine.begin(PREPARE)  # one worker measures while the others load their modules
     field = _Field(mosaics, reference, work)
     for outcome in engine.run(PREPARE, field, [engine.device_shares], again=again, stage="search"):
         if outcome.reason is not None:
-            if outcome.reason.startswith(ImportError.__name__):
-                raise ImportError(outcome.reason)
+            if outcome.cause is Cause.PACKAGE:
+                raise ImportError(str(outcome.reason))
             raise FileError(f"{work.parent}: nothing can be searched ({outcome.reason})")
 
 

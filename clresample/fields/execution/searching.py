@@ -15,6 +15,7 @@ from ..blends.plan import FitPlan, make_fit_plan
 from ..blends.search import TileDetections, grown_footprints, place_known_sources, search_tile
 from ..blends.tiles import tiles_of
 from .backend import TaskKind
+from .reason import Cause
 from .search_setup import read_search_setup
 
 # [bytes] Memory of a search per model pixel and channel; the total has two channels more. Measured:
@@ -106,16 +107,16 @@ def _searched(mosaics, reference, tiles, work, options, engine, progress):
     tried: set[int] = set()
 
     def again(outcome):
-        if outcome.worker_died and outcome.task.number not in tried:
+        if outcome.cause is Cause.WORKER and outcome.task.number not in tried:
             tried.add(outcome.task.number)
             return [outcome.task]
         return None
 
     for outcome in engine.run(SEARCH, shared, todo, again=again, stage="search"):
         if outcome.reason is not None:
-            if outcome.reason.startswith("ImportError"):
-                raise ImportError(outcome.reason)
-            lost[str(outcome.task.number)] = outcome.reason
+            if outcome.cause is Cause.PACKAGE:
+                raise ImportError(str(outcome.reason))
+            lost[str(outcome.task.number)] = str(outcome.reason)
             progress.message(f"tile {outcome.task.number} is lost: {outcome.reason}")
         progress.step(1, outcome.value or 0)
     return lost

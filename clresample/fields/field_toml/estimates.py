@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from ...sky.box import Box
 from ...sky.correlation import NoiseCorrelation
 from ...sky.noise import noise_sigma
 from ..background import find_background
-from ..box import Box
 from ..mosaic import ConstantPlane
 
 # [px] Side of the region in a mosaic's middle from which its noise is estimated. A million pixels

@@ -11,24 +11,25 @@ comment. Paths are relative to the file's folder.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
-from ...deblending.settings import Settings
-from ...deblending.solver.constraints import Positivity, ProxChain
-from ...deblending.solver.prior import SingleScalePrior
+from ...deblending.settings import FitSettings, Settings
 from ...files.scene_keys import SceneError
 from ...files.source_table import read_sources
 from ...measurement.detection import THRESHOLD
+from ...paper.settings import PaperSettings
+from ...paper.solver.constraints import Positivity, ProxChain
+from ...paper.solver.prior import SingleScalePrior
+from ...sky.box import Box
 from ...sky.extent import grid_intersection, grid_union
 from ...sky.frame import Frame, model_frame
 from ...sky.noise import NoiseWarning
 from ...sky.observation import Observation, check_observations
 from ...sky.psf_checks import PSFWarning
 from ...sky.sources import Source
-from ..box import Box
 from ..mosaic import saturations
 from .estimates import subtract_background
 from .keys import parse_scene
@@ -46,7 +47,7 @@ class SceneFile:
 
     observations: tuple[Observation, ...]
     frame: Frame
-    settings: Settings
+    settings: FitSettings
     sources: tuple[Source, ...] | None
     threshold: float
     passes: int
@@ -82,6 +83,7 @@ def read_scene(path) -> SceneFile:
     try:
         check_observations(observations)
         frame = _frame(tables["frame"], observations)
+        settings = _settings(tables["fit"])
     except ValueError as error:
         raise SceneError(f"{path}: {error}") from error
     sources = None
@@ -95,7 +97,7 @@ def read_scene(path) -> SceneFile:
     return SceneFile(
         tuple(observations),
         frame,
-        _settings(tables["fit"]),
+        settings,
         sources,
         detection.get("threshold", THRESHOLD),
         detection.get("passes", 2),
@@ -150,16 +152,23 @@ def _settings(table):
     """Settings of the table [fit].
 
     `monotone = true` and `correlation_px`, the correlation length, select the SingleScalePrior and
-    its solver; `monotone = false` leaves morphologies any form that is not negative.
+    its solver, the paper's; `monotone = false` leaves morphologies any form that is not negative.
     """
     given = dict(table)
     monotone = given.pop("monotone", None)
-    if monotone or "correlation_px" in given:
+    kind = PaperSettings if monotone or "correlation_px" in given else Settings
+    if kind is PaperSettings:
         length = given.pop("correlation_px", SingleScalePrior().correlation_px)
         given["prior"] = SingleScalePrior(correlation_px=length)
-    if monotone is False:
-        given["constraints"] = ProxChain(Positivity())
-    return Settings(**given)
+        if monotone is False:
+            given["constraints"] = ProxChain(Positivity())
+    for name in given.keys() - {field.name for field in fields(kind)}:
+        raise ValueError(
+            f"fit: {name} is {given[name]!r}, but goes "
+            + ("without" if kind is PaperSettings else "with")
+            + " monotone = true or correlation_px: leave one of them out"
+        )
+    return kind(**given)
 
 
 def _frame(table, observations):

@@ -24,8 +24,8 @@ import numpy as np
 
 from ...files.atomic import FileError
 from ...files.fits import choose_hdu, open_fits, read_pixels
+from ...sky.box import Box
 from ...sky.psf import PSF
-from ..box import Box
 from ..field_toml.headers import NANOMAGGY, mask_value
 from ..mosaic import Mosaic
 from ..psfs.combined import ConstantPSF

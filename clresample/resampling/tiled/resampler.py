@@ -9,7 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ...device.tuning import Tuning
-from ...sky.extent import box_slices, intersect_boxes
+from ...sky.box import box_slices, intersect_boxes
 from ...sky.grid import GridLike, as_grid
 from ...sky.psf import PSF
 from ...sky.validation.checks import check_dtype

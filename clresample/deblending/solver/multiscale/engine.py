@@ -47,7 +47,7 @@ class MultiscaleEngine:
     def __init__(self, scenes, states, device, dtype, prior, loss_tol, *, past=None):
         self.scenes, self._states, self.device, self.prior = scenes, states, device, prior
         b = self.buffers = SceneBuffers(scenes, states, device, dtype, prior)
-        self._gradient = LossGradient(b, with_prior=False)
+        self._gradient = LossGradient(b)
         self.structure = StructureOperator(b, prior)
         latents = self.structure.latents
         v = self.vectors = SolverVectors(b, latents, N_PAIRS + 1)
@@ -146,8 +146,7 @@ class MultiscaleEngine:
         b, v = self.buffers, self.vectors
         self.structure.form(v.x)
         v.unpack_spectra(v.x)
-        found = b.states(b.iterated, [None] * len(self.scenes), int(self.progress.n_rounds.max()))
-        return _that_learned(found, v.split(v.x), self.strengths.by_scene())
+        return _that_learned(b.states(), v.split(v.x), self.strengths.by_scene())
 
     def findings(self, which):
         """StrengthEstimates of the scenes `which` (B,) at their present states, None for others."""

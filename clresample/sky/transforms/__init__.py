@@ -1,1 +1,0 @@
-"""Transforms of large images at arbitrary frequencies."""
