@@ -10,6 +10,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 
 import numpy as np
+from tqdm import tqdm
 
 from clresample import get_device
 
@@ -57,15 +58,29 @@ def _start_with(wanted):
     return " ".join(f"{name}={value}" for name, value in wanted.items())
 
 
-def in_processes(function, tasks, n_processes):
-    """Pairs (task, function(*task)) in the order in which worker processes finish them."""
+def in_processes(function, tasks, n_processes, size_of=None, initial=0, unit="scenes"):
+    """Pairs (task, function(*task)) in the order in which worker processes finish them.
+
+    size_of: how many scenes a task has, for a bar of progress; initial: how many were done before
+    """
     pool = ProcessPoolExecutor(n_processes, mp_context=get_context("spawn"))
+    sizes = [size_of(task) if size_of else 1 for task in tasks]
+    no_bar = None if size_of else True  # None: none where the output is no terminal
+    bar = tqdm(total=initial + sum(sizes), initial=initial, unit=f" {unit}", disable=no_bar)
     try:
-        futures = {pool.submit(function, *task): task for task in tasks}
+        futures = {pool.submit(function, *t): (t, n) for t, n in zip(tasks, sizes, strict=True)}
         for future in as_completed(futures):
-            yield futures[future], future.result()
+            task, size = futures[future]
+            yield task, future.result()
+            bar.update(size)
     finally:
         pool.shutdown(cancel_futures=True)
+        bar.close()
+
+
+def in_chunks(seeds, n):
+    """Ranges of at most n seeds, which together are all."""
+    return [seeds[i : i + n] for i in range(0, len(seeds), n)]
 
 
 def interleaved_ms(functions, *, seconds, least=5, timer=time.perf_counter):

@@ -1,4 +1,4 @@
-"""The benchmarks of deblending on a few scenes: rows, summaries, runs that go on, bad options."""
+"""The benchmarks of deblending on a few scenes: rows, summaries, runs that go on."""
 
 import json
 
@@ -86,24 +86,3 @@ def test_sersic_profiles_are_found():
     image = 5 * np.exp(-0.5 * ((y / 4) ** 2 + (x / 2) ** 2) ** (1 / 1.6))
     found = sersic.fit(image, np.array([30.0, 33.0]))
     assert np.abs(found / found.max() - image / image.max()).max() < 0.02
-
-
-@pytest.mark.parametrize(
-    ("module", "options", "words"),
-    [
-        ("deblend", ("--scenes", "0"), "0 is not above 0"),
-        ("deblend", ("--seed", "-1"), "-1 is below 0"),
-        ("deblend", ("--views", "upside-down"), "upside-down"),
-        ("deblend", ("--max-iter", "few"), "few"),
-        ("deblend", ("--catalogue", "nowhere"), "nowhere"),
-        ("deblend", ("--json", "."), "--json ."),
-        ("paper.joint", ("--scenes", "none"), "none"),
-        ("paper.joint", ("--catalogue", "nowhere", "--folder", "."), "nowhere"),
-    ],
-)
-def test_bad_options_get_one_line(module, options, words):
-    result = run_python("-m", f"bench.{module}", *options)
-    assert result.returncode == 2
-    assert result.stdout == ""
-    assert result.stderr.count("\n") == 1
-    assert words in result.stderr

@@ -227,34 +227,6 @@ def test_settings(tmp_path):
         assert 0 <= row["worse"] <= 1
 
 
-@pytest.mark.parametrize(
-    ("module", "options", "words"),
-    [
-        ("coverage", ("--scenes", "0"), "0 is not above 0"),
-        ("coverage", ("--modes", "hst"), "hst"),
-        ("coverage", ("--catalogue", "nowhere"), "nowhere"),
-        ("throughput", ("--blends", "7"), "7"),
-        ("throughput", ("--limit", "-1"), "-1 is not above 0"),
-        ("settings", ("--settings", "best"), "best"),
-        ("real", ("--galaxies", "many"), "many"),
-        ("real", ("--json", "."), "--json ."),
-    ],
-)
-def test_bad_options_get_one_line(module, options, words):
-    result = run_python("-m", f"bench.{module}", *options)
-    assert result.returncode == 2
-    assert result.stderr.count("\n") == 1
-    assert words in result.stderr
-
-
-@pytest.mark.usefixtures("data")
-def test_scenes_that_are_not_there():
-    result = run_python("-m", "bench.real", "--only", "m87")
-    assert result.returncode == 2
-    assert result.stderr.count("\n") == 1
-    assert "--only" in result.stderr
-
-
 def test_noise(tmp_path):
     rows = run(tmp_path, "noise", "--scenes", 1, "--processes", 1)
     assert [(row["recipe"], row["bands"]) for row in rows] == [

@@ -148,14 +148,3 @@ def test_every_case_draws_its_sources_in_the_frame():
             place = source.pixel(image.grid)
             assert (place > 10).all()
             assert (place < np.array(image.grid.shape) - 11).all()
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [(("--only", "single,comet"), "comet"), (("--snr", "-3"), "-3 is not above 0")],
-)
-def test_bad_options_get_one_line(options, words):
-    result = run_python("-m", "bench.ladder", *options)
-    assert result.returncode == 2
-    assert result.stderr.count("\n") == 1
-    assert words in result.stderr

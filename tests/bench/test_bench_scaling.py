@@ -1,4 +1,4 @@
-"""`bench.scaling`, `bench.faults` and `bench.on_paper`: what their figures count."""
+"""`bench.scaling`, `bench.kills` and `bench.on_paper`: what their figures count."""
 
 import json
 from types import SimpleNamespace
@@ -10,7 +10,8 @@ from astropy.io import fits
 from astropy.table import QTable
 from helpers.checkout import run_python
 
-from bench import faults, on_paper, scaling
+from bench import on_paper, scaling
+from bench.kills import fields
 
 
 def turn(n_round, seat, began, ended):
@@ -46,7 +47,7 @@ def test_one_tile_of_a_compressed_image_is_damaged_and_no_other(tmp_path):
     given = {"compression_type": "GZIP_2", "quantize_level": 0, "tile_shape": (1, 64, 90)}
     hdus = [fits.PrimaryHDU(), fits.CompImageHDU(image, name="SCI", **given)]
     fits.HDUList(hdus).writeto(path)
-    assert faults.damage(path) == (192, 8)
+    assert fields.damage(path) == (192, 8)
     with fits.open(path) as hdus:
         np.testing.assert_array_equal(hdus["SCI"].section[0, :192], image[0, :192])
         with pytest.raises((OSError, ValueError, RuntimeError)):
@@ -58,7 +59,7 @@ def test_differences_are_counted_in_errors():
     clean["flux_err_i"] = [0.1, 0.1, 0.1] * u.uJy
     rows = clean[:2].copy()
     rows["flux_i"][1] = 2.03 * u.uJy
-    missing, worst = faults.compared(rows, clean)
+    missing, worst = fields.compared(rows, clean)
     assert missing == 1 and worst == pytest.approx(0.3)
 
 

@@ -114,14 +114,3 @@ def test_ways_of_spoiling_do_what_they_say():
         scene.observations[0].data * scene.observations[0].weights ** 0.5,
         rtol=1e-5,
     )
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [(("--only", "rain"), "rain"), (("--scenes", "m87"), "m87")],
-)
-def test_bad_options_get_one_line(options, words):
-    result = run_python("-m", "bench.spoilt", *options)
-    assert result.returncode == 2
-    assert result.stderr.count("\n") == 1
-    assert words in result.stderr
