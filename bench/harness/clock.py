@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import sys
@@ -61,21 +62,23 @@ def _start_with(wanted):
 def in_processes(function, tasks, n_processes, size_of=None, initial=0, unit="scenes"):
     """Pairs (task, function(*task)) in the order in which worker processes finish them.
 
+    n_processes: 1 is this process alone
     size_of: how many scenes a task has, for a bar of progress; initial: how many were done before
     """
-    pool = ProcessPoolExecutor(n_processes, mp_context=get_context("spawn"))
     sizes = [size_of(task) if size_of else 1 for task in tasks]
     no_bar = None if size_of else True  # None: none where the output is no terminal
     bar = tqdm(total=initial + sum(sizes), initial=initial, unit=f" {unit}", disable=no_bar)
-    try:
-        futures = {pool.submit(function, *t): (t, n) for t, n in zip(tasks, sizes, strict=True)}
-        for future in as_completed(futures):
-            task, size = futures[future]
-            yield task, future.result()
-            bar.update(size)
-    finally:
-        pool.shutdown(cancel_futures=True)
-        bar.close()
+    with bar, contextlib.ExitStack() as stack:
+        if n_processes == 1:
+            done = ((i, function(*task)) for i, task in enumerate(tasks))
+        else:
+            pool = ProcessPoolExecutor(n_processes, mp_context=get_context("spawn"))
+            stack.callback(pool.shutdown, cancel_futures=True)
+            futures = {pool.submit(function, *task): i for i, task in enumerate(tasks)}
+            done = ((futures[future], future.result()) for future in as_completed(futures))
+        for i, found in done:
+            yield tasks[i], found
+            bar.update(sizes[i])
 
 
 def in_chunks(seeds, n):

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from helpers.checkout import run_python
+from helpers.benches import run_bench
 
 ROW = {
     "from", "to", "n_model", "n_obs", "angle_deg", "batch", "ours_ms", "ours_both_ms",
@@ -13,16 +13,10 @@ ROW = {
 RECORD = {"date", "device", "platform", "machine", "python", "threads", "clresample", "numpy"}
 
 
-def run(module, *options):
-    result = run_python("-m", f"bench.{module}", *options)
-    assert result.returncode == 0, result.stderr
-    return result.stdout
-
-
 def test_render(tmp_path):
     pytest.importorskip("galsim")
     file = tmp_path / "render.json"
-    text = run(
+    text = run_bench(
         "render", "--sizes", "20", "30", "--pairs", "EUCLID-RUBIN", "hst-hst",
         "--galaxies", "1", "--seconds", "0.01", "--json", str(file),
     )  # fmt: skip
@@ -66,7 +60,7 @@ def test_quick_has_every_pair_and_the_main_sizes():
 
 def test_contract(tmp_path):
     file = tmp_path / "contract.json"
-    run("contract", "--seconds", "0.001", "--json", str(file))
+    run_bench("contract", "--seconds", "0.001", "--json", str(file))
     found = json.loads(file.read_text())
     assert found["record"].keys() >= RECORD
     for row in found["rows"]:
@@ -80,7 +74,7 @@ def test_contract(tmp_path):
 def test_stages(tmp_path):
     pytest.importorskip("galsim")
     file = tmp_path / "stages.json"
-    run("stages", "--quick", "--seconds", "0.001", "--json", str(file))
+    run_bench("stages", "--quick", "--seconds", "0.001", "--json", str(file))
     found = json.loads(file.read_text())
     assert found["record"].keys() >= RECORD
     assert [(r["survey"], r["n_sources"]) for r in found["rows"]] == [

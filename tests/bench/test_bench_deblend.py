@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from helpers.checkout import run_python
+from helpers.benches import run_bench
 
 pytest.importorskip("galsim")
 
@@ -20,15 +20,9 @@ BATCH_ROW = {
 }  # fmt: skip
 
 
-def run(module, *options):
-    result = run_python("-m", f"bench.{module}", *options)
-    assert result.returncode == 0, result.stderr
-    return result.stdout
-
-
 def test_deblend(tmp_path):
     file = tmp_path / "deblend.json"
-    text = run(
+    text = run_bench(
         "deblend", *SHORT, "--seed", "2", "--views", "upright", "turned", "--batches", "1", "2",
         "--json", str(file),
     )  # fmt: skip
@@ -62,9 +56,9 @@ def test_joint_goes_on_where_it_ended(tmp_path):
     from bench.paper import joint_findings
 
     options = ("--processes", "1", "--folder", str(tmp_path))
-    run("paper.joint", "--scenes", "1", *options)
+    run_bench("paper.joint", "--scenes", "1", *options)
     one = (tmp_path / "joint.jsonl").read_text()
-    text = run("paper.joint", "--scenes", "2", *options)
+    text = run_bench("paper.joint", "--scenes", "2", *options)
     two = (tmp_path / "joint.jsonl").read_text()
     assert two.startswith(one)
     assert two.count("\n") == 3  # settings and two scenes

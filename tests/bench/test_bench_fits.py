@@ -1,12 +1,11 @@
 """The benchmarks of accuracy, errors and cost on the smallest configurations: rows, failures."""
 
-import json
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.checkout import run_python
+from helpers.benches import bench_json
 
 pytest.importorskip("galsim")
 
@@ -38,10 +37,7 @@ SETTINGS = {
 
 def run(folder, module, *options):
     """Rows that a benchmark writes."""
-    file = folder / f"{module}.json"
-    result = run_python("-m", f"bench.{module}", *map(str, options), "--json", str(file))
-    assert result.returncode == 0, result.stderr
-    found = json.loads(file.read_text())
+    found = bench_json(folder, module, *options)
     assert found["record"].keys() >= RECORD
     return found["rows"]
 

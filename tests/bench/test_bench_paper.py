@@ -3,18 +3,12 @@
 import json
 
 import pytest
-from helpers.checkout import run_python
+from helpers.benches import run_bench
 
 from clresample import get_device
 
 TIMING = ("--sizes", 20, 30, "--pairs", "HST-RUBIN", "EUCLID-RUBIN", "--seconds", 0.01)
 METHODS = ("ours", "ours64", "paper", "quintic", "sinc")
-
-
-def run(module, *options):
-    result = run_python("-m", f"bench.{module}", *map(str, options))
-    assert result.returncode == 0, result.stderr
-    return result.stdout
 
 
 def load(folder, name):
@@ -30,10 +24,10 @@ def folder(tmp_path_factory):
         pytest.skip(f"{get_device().name} has no double precision, which the paper's figures need")
     folder = tmp_path_factory.mktemp("report")
     pairs = ("--pairs", "EUCLID-RUBIN", "RUBIN-RUBIN", "--processes", 1, "--folder", folder)
-    run("paper.accuracy", "--galaxies", 1, *pairs)
-    run("paper.accuracy", "--galaxies", 2, *pairs)
-    run("paper.timing", *TIMING, "--folder", folder)
-    run("paper.report", "--folder", folder)
+    run_bench("paper.accuracy", "--galaxies", 1, *pairs)
+    run_bench("paper.accuracy", "--galaxies", 2, *pairs)
+    run_bench("paper.timing", *TIMING, "--folder", folder)
+    run_bench("paper.report", "--folder", folder)
     return folder
 
 
@@ -97,7 +91,7 @@ def test_report_shows_every_figure_beside_its_statement(folder):
 
 
 def test_a_run_says_what_it_found(folder):
-    text = run("paper.timing", *TIMING, "--folder", folder)  # all of it is in the log
+    text = run_bench("paper.timing", *TIMING, "--folder", folder)  # all of it is in the log
     assert "Section 4: speed: Time beside GalSim's sinc: " in text
     assert "Growth of both schemes with N: Not decided." in text  # no slope from sizes below 100
 

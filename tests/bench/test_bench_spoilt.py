@@ -1,10 +1,8 @@
 """The benchmark of spoilt input: rows, ways of spoiling, words that name them."""
 
-import json
-
 import numpy as np
 import pytest
-from helpers.checkout import run_python
+from helpers.benches import bench_json
 
 pytest.importorskip("galsim")
 
@@ -14,17 +12,9 @@ SPOILT = {
 }  # fmt: skip
 
 
-def run(folder, *options):
-    """What the benchmark writes."""
-    file = folder / "spoilt.json"
-    result = run_python("-m", "bench.spoilt", *map(str, options), "--json", str(file))
-    assert result.returncode == 0, result.stderr
-    return json.loads(file.read_text())
-
-
 def test_spoilt(tmp_path):
-    found = run(
-        tmp_path, "--scenes", "sim", "--only", "nothing", "listed twice",
+    found = bench_json(
+        tmp_path, "spoilt", "--scenes", "sim", "--only", "nothing", "listed twice",
         "a band without weight", "--clean", 1, "--processes", 1,
     )  # fmt: skip
     rows = {row["spoilt"]: row for row in found["rows"]}
