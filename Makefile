@@ -5,8 +5,9 @@ PYTHON ?= $(shell python3.11 -c '' 2>/dev/null && echo python3.11 || echo python
 VENV ?= .venv
 STAMP = $(VENV)/made
 RUN = $(VENV)/bin/python -m
-# Test files side by side, on up to four cores: most of a test's time is Python's.
-PYTEST = $(RUN) pytest -n auto --maxprocesses 4 --dist loadfile
+# Test files side by side, on up to four cores: most of a test's time is Python's. In their order:
+# by numbers of tests the long files of few tests, such as tests/fields/test_kills.py, come last.
+PYTEST = $(RUN) pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test test-on test-kernels-on grind lint mutants fuzz clean paper paper-full dist \
     test-as-gpu test-install test-oldest test-adapters threads docs kills \
