@@ -51,7 +51,7 @@ from ..harness import records
 from ..harness.memory import children
 from ..harness.options import ROOT
 
-TIMES = 30
+TIMES, WORKERS = 30, 2
 SIZE, DENSITY = 192, 120  # [px, arcmin^-2]: some ten sources, in fits of several sizes
 COLUMNS = records.columns("what:6 at:5.2f kills:5d parts:5d same:5 good:5 about:40")
 
@@ -69,13 +69,13 @@ TALL, AWAY_PX = 384, 144
 TILES = "\n[field]\ntile_px = 64\noverlap_px = 16\n"
 
 
-def start(sky, out, *options, workers=2, environment=None, before=None):
+def start(sky, out, *options, workers=None, environment=None, before=None):
     """The command, begun; it goes on where a run in this folder has begun. For its errors see
     `told`: a file holds them, since a pipe that nobody reads would stop it when full."""
     if (out / "work" / "run.json").exists():
         options = *options, "--resume"
     words = [sys.executable, "-m", "clresample.cli", "field", sky / "field.toml", "-o", out]
-    words += ["--workers", workers, "--quiet", *options]
+    words += ["--workers", WORKERS if workers is None else workers, "--quiet", *options]
     errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - read when the process has ended
     process = subprocess.Popen(
         [str(word) for word in words],
