@@ -5,11 +5,12 @@ PYTHON ?= $(shell python3.11 -c '' 2>/dev/null && echo python3.11 || echo python
 VENV ?= .venv
 STAMP = $(VENV)/made
 RUN = $(VENV)/bin/python -m
-# Test files side by side, on up to four cores: most of a test's time is Python's.
-PYTEST = $(RUN) pytest -n auto --maxprocesses 4 --dist loadfile
+# Test files side by side, on up to four cores: most of a test's time is Python's. In their order:
+# by numbers of tests the long files of few tests, such as tests/fields/test_kills.py, come last.
+PYTEST = $(RUN) pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test test-on test-kernels-on grind lint mutants fuzz clean paper paper-full dist \
-    test-as-gpu test-install test-oldest test-adapters threads docs soak kills \
+    test-as-gpu test-install test-oldest test-adapters threads docs kills \
     kernel-tests gpu-builds gpu-model
 
 # What runs on one OpenCL device whatever the others are: operators, and the solver's kernels.
@@ -77,15 +78,14 @@ mutants: $(STAMP)
 fuzz: $(STAMP)
 	CLRESAMPLE_EXAMPLES=$(or $(EXAMPLES),2000) $(RUN) pytest tests/properties $(ARGS)
 
-# Whole fields killed thirty times at random moments, starved and damaged, half an hour.
-soak: $(STAMP)
-	$(RUN) bench.soak $(ARGS)
-
-# Every command killed in the midst of its writing, 56 times, a quarter of an hour.
+# Every command killed in the midst of its writing, 56 times, a quarter of an hour; MODE=fields:
+# whole fields killed thirty times at random moments, starved and damaged, half an hour.
+MODE ?= commands
 kills: $(STAMP)
-	$(RUN) bench.kills $(ARGS)
+	$(RUN) bench.kills $(MODE) $(ARGS)
 
-# The paper's evidence, in bench/report/report.md; an interrupted run continues, a larger one adds.
+# The paper's evidence, in bench/report/: report.md, which is kept, and its details. An interrupted
+# run continues, a larger one adds.
 paper: GALAXIES = 600
 paper: GALAXIES_MORE = 120
 paper: SECONDS = 1

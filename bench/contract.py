@@ -21,13 +21,8 @@ from .harness.options import Parser, run
 
 YARDSTICKS = (((60, 256, 256), 8), ((60, 256, 256), 64), ((256, 256, 256), 8))
 OPERATOR_SIZES = ((100, 1), (100, 64), (200, 1), (200, 64), (400, 1))  # (N, batch)
-COLUMNS = (
-    ("shape", 16, ""),
-    ("batch", 5, "d"),
-    ("dtype", 7, ""),
-    ("ours_gflops", 11, ".1f"),
-    ("numpy_gflops", 12, ".1f"),
-    ("ratio", 6, ".2f"),
+COLUMNS = records.columns(
+    "shape:16 batch:5d dtype:7 ours_gflops:11.1f numpy_gflops:12.1f ratio:6.2f"
 )
 
 
@@ -74,24 +69,16 @@ def measure(shape, batch, dtype, seconds):
 
 def main(options):
     threads = on_one_thread()
-    record = records.record(threads)
-    records.print_record(record)
     products = list(YARDSTICKS)
     for n_model, batch in OPERATOR_SIZES:
         products += [(shape, batch) for shape in operator_shapes(n_model)]
     dtypes = ["float32", "float64"] if get_device().has_fp64 else ["float32"]
-    records.print_head(COLUMNS)
-    rows = []
-    for dtype in dtypes:
-        for shape, batch in products:
-            rows.append(measure(shape, batch, dtype, options.seconds))
-            records.print_row(COLUMNS, rows[-1])
-    if options.json is not None:
-        records.write_json(options.json, {"record": record, "rows": rows})
+    rows = (measure(*product, dtype, options.seconds) for dtype in dtypes for product in products)
+    records.show(COLUMNS, rows, records.record(threads), options.json)
 
 
 def parser():
-    parser = Parser("bench.contract", description=__doc__.splitlines()[0])
+    parser = Parser(__doc__)
     parser.add_seconds(0.3, "row")
     parser.add_json()
     return parser

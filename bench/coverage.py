@@ -31,7 +31,6 @@ import itertools
 from collections import Counter, defaultdict
 
 import numpy as np
-from tqdm import tqdm
 
 from clresample import Settings
 from clresample.simulation.coadds import mosaic_scene
@@ -39,8 +38,9 @@ from clresample.simulation.scenes import simulate_scene
 
 from .harness import records, scenes, truth
 from .harness.brightness import evened
-from .harness.clock import in_processes, on_one_thread
-from .harness.options import BadOption, Parser, positive, run
+from .harness.clock import in_chunks, in_processes, on_one_thread
+from .harness.judged import error_of_mean, robust
+from .harness.options import BadOption, Parser, run
 
 GALAXIES, REAL = ("parametric", "cosmos"), "real"
 EDGES = (3.0, 10.0, 30.0, 100.0, 300.0, np.inf)  # signal to noise
@@ -77,18 +77,9 @@ CHUNK = 5  # scenes fitted side by side: some seconds
 # by 0.5 % from here to 0.01, and by 0.65 % to 0.02. Three quarters of the catalogue's galaxies have
 # more, from the noise of HST's images.
 NEGATIVE = 0.005
-COLUMNS = (
-    ("mode", 22, ""),
-    ("galaxies", 10, ""),
-    ("light", 5, ""),
-    ("quantity", 11, ""),
-    ("snr_low", 7, "g"),
-    ("snr_high", 8, "g"),
-    ("n", 6, "d"),
-    ("coverage", 8, ".3f"),
-    ("error", 6, ".3f"),
-    ("width", 6, ".2f"),
-    ("bias", 8, ".4f"),
+COLUMNS = records.columns(
+    "mode:22 galaxies:10 light:5 quantity:11 snr_low:7g snr_high:8g n:6d coverage:8.3f "
+    "error:6.3f width:6.2f bias:8.4f"
 )
 
 
@@ -155,12 +146,10 @@ def _statistics(pull, bias, i_scene):
     if not len(pull):
         return dict.fromkeys(("coverage", "error", "width", "bias"), np.nan)
     held = np.abs(pull) < 1
-    share = held.mean()
-    excess = np.bincount(i_scene, held - share)  # of each scene over what is expected of it
     return {
-        "coverage": float(share),
-        "error": float(np.sqrt((excess**2).sum()) / len(pull)),
-        "width": float(1.4826 * np.median(np.abs(pull - np.median(pull)))),
+        "coverage": float(held.mean()),
+        "error": error_of_mean(held, i_scene),
+        "width": robust(pull),
         "bias": float(np.median(bias)),
     }
 
@@ -173,24 +162,22 @@ def fitted(wanted, n_scenes, options):
     """
     how = options.negative, options.as_drawn
     tasks = [
-        (galaxies, mode, options.catalogue, range(start, min(start + CHUNK, end)), *how)
+        (galaxies, mode, options.catalogue, chunk, *how)
         for galaxies, mode in wanted
         for end in [options.seed + n_scenes[galaxies][mode]]
-        for start in range(options.seed, end, CHUNK)
+        for chunk in in_chunks(range(options.seed, end), CHUNK)
     ]
     missing = Counter(task[:2] for task in tasks)
     values, ends = defaultdict(dict), defaultdict(Counter)
-    total = sum(n_scenes[galaxies][mode] for galaxies, mode in wanted)
-    with tqdm(total=total, unit=" scenes", desc="coverage", disable=None) as bar:
-        for task, (found, statuses) in in_processes(measure, tasks, options.processes):
-            kind, seeds = task[:2], task[3]
-            values[kind][seeds.start] = found
-            ends[kind].update(statuses)
-            bar.update(len(seeds))
-            missing[kind] -= 1
-            if not missing[kind]:
-                ordered = [one for _, chunk in sorted(values.pop(kind).items()) for one in chunk]
-                yield *kind, ordered, ends[kind]
+    done = in_processes(measure, tasks, options.processes, lambda task: len(task[3]))
+    for task, (found, statuses) in done:
+        kind = task[:2]
+        values[kind][task[3].start] = found
+        ends[kind].update(statuses)
+        missing[kind] -= 1
+        if not missing[kind]:
+            ordered = [one for _, chunk in sorted(values.pop(kind).items()) for one in chunk]
+            yield *kind, ordered, ends[kind]
 
 
 def main(options):
@@ -215,54 +202,29 @@ def main(options):
         "settings": f"{Settings()}",
         "left out": f"COSMOS galaxies with {options.negative:.1%} of negative light or more",
     }
-    records.print_record(record)
-    rows, summary = [], {"how fits ended": {}}
-    records.print_head(COLUMNS)
-    for kind, mode, values, ends in fitted(wanted, n_scenes, options):
-        for row in rows_of(mode, kind, light_of(kind, options.as_drawn), values):
-            rows.append(row)
-            records.print_row(COLUMNS, row)
-        summary["how fits ended"][f"{kind}, {mode}"] = dict(ends)
-    records.print_summary(summary)
-    if options.json is not None:
-        records.write_json(options.json, {"record": record, "summary": summary, "rows": rows})
+    summary = {"how fits ended": {}}
+
+    def found():
+        for kind, mode, values, ends in fitted(wanted, n_scenes, options):
+            yield from rows_of(mode, kind, light_of(kind, options.as_drawn), values)
+            summary["how fits ended"][f"{kind}, {mode}"] = dict(ends)
+
+    records.show(COLUMNS, found(), record, options.json, summarise=lambda _: summary)
 
 
 def parser():
-    parser = Parser("bench.coverage", description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--quick",
-        action="store_true",
-        help=f"{N_QUICK} scenes of each, {N_QUICK_MOSAICS} of mosaics",
-    )
-    parser.add_argument(
-        "--scenes",
-        type=positive(int),
-        metavar="N",
-        help="how many scenes of each mode and kind of galaxies "
-        f"({', '.join(f'{n} {m}' for m, n in N_SCENES['parametric'].items())}; a few of COSMOS)",
-    )
-    parser.add_first_seed(FIRST_SEED)
-    parser.add_argument("--modes", nargs="+", choices=MODES, default=MODES)
-    parser.add_argument(
-        "--as-drawn",
-        action="store_true",
-        help="leave the light of parametric galaxies as drawn",
-    )
-    parser.add_argument(
-        "--galaxies",
-        nargs="+",
-        choices=(*GALAXIES, REAL),
-        default=GALAXIES,
-        help="which; without a catalogue of COSMOS galaxies only parametric ones (both)",
-    )
-    parser.add_argument(
-        "--negative",
-        type=positive(float),
-        default=NEGATIVE,
-        metavar="SHARE",
-        help="of a COSMOS galaxy's light: with more than this it is left out (%(default)s)",
-    )
+    parser = Parser(__doc__)
+    parser.add_flag("quick", f"{N_QUICK} scenes of each, {N_QUICK_MOSAICS} of mosaics")
+    counts = ", ".join(f"{n} {m}" for m, n in N_SCENES["parametric"].items())
+    about = f"how many scenes of each mode and kind of galaxies ({counts}; a few of COSMOS)"
+    parser.add_number("scenes", about)
+    parser.add_seed(FIRST_SEED)
+    parser.add("modes", "which", nargs="+", choices=MODES, default=MODES)
+    parser.add_flag("as-drawn", "leave the light of parametric galaxies as drawn")
+    about = "which; without a catalogue of COSMOS galaxies only parametric ones (both)"
+    parser.add("galaxies", about, nargs="+", choices=(*GALAXIES, REAL), default=GALAXIES)
+    about = "of a COSMOS galaxy's light: with more than this it is left out"
+    parser.add_number("negative", about, NEGATIVE, float, "SHARE")
     parser.add_catalogue()
     parser.add_processes()
     parser.add_json()

@@ -26,7 +26,7 @@ from clresample.deblending.settings import Settings
 
 from .harness import records, scenes
 from .harness.clock import on_one_thread
-from .harness.options import Parser, positive, run
+from .harness.options import Parser, run
 
 VIEWS = {"upright": (0.0, False), "turned": (30.0, False), "mirrored": (0.0, True)}
 BATCHES = (1, 4, 16, 64)
@@ -35,31 +35,11 @@ N_SCENES, N_QUICK = 24, 6
 N_TICKS = 10
 # [s] --quick leaves out batches that would end later, so that it takes less than a minute
 QUICK_SECONDS = 42.0
-COST_COLUMNS = (
-    ("mode", 6, ""),
-    ("batch", 5, "d"),
-    ("n_sources", 9, "d"),
-    ("iterations", 10, "d"),
-    ("ms_per_iteration", 16, ".3f"),
-    ("galsim_ms", 9, ".3f"),
-    ("ratio", 6, ".2f"),
-    ("wall_s", 7, ".3f"),
-)
-SCORE_COLUMNS = (("sdr_median", 10, ".2f"), ("chi2", 6, ".3f"))
-COLUMNS = (
-    ("seed", 4, "d"),
-    ("view", 8, ""),
-    *COST_COLUMNS,
-    ("wall_again_s", 12, ".3f"),
-    *SCORE_COLUMNS,
-    ("converged", 9, ""),
-)
-BATCH_COLUMNS = (
-    *COST_COLUMNS,
-    ("scenes_per_second", 17, ".2f"),
-    *SCORE_COLUMNS,
-    ("n_converged", 11, "d"),
-)
+COST = "mode:6 batch:5d n_sources:9d iterations:10d ms_per_iteration:16.3f galsim_ms:9.3f "
+COST += "ratio:6.2f wall_s:7.3f"
+SCORE = "sdr_median:10.2f chi2:6.3f"
+COLUMNS = records.columns(f"seed:4d view:8 {COST} wall_again_s:12.3f {SCORE} converged:9")
+BATCH_COLUMNS = records.columns(f"{COST} scenes_per_second:17.2f {SCORE} n_converged:11d")
 
 
 class Pace:
@@ -255,37 +235,15 @@ def main(options):
 
 
 def parser():
-    parser = Parser("bench.deblend", description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--quick",
-        action="store_true",
-        help=f"{N_QUICK} scenes, upright only, and batches that fit into the time",
-    )
-    parser.add_argument(
-        "--scenes", type=positive(int), metavar="N", help=f"how many scenes ({N_SCENES})"
-    )
-    parser.add_first_seed(0)
-    parser.add_argument(
-        "--views",
-        nargs="+",
-        choices=VIEWS,
-        help="Rubin's pixels along Euclid's, turned by 30 degrees, of the opposite parity (all)",
-    )
-    parser.add_argument(
-        "--batches",
-        nargs="*",
-        type=positive(int),
-        default=BATCHES,
-        metavar="N",
-        help=f"scenes fitted side by side ({' '.join(map(str, BATCHES))})",
-    )
-    parser.add_argument(
-        "--max-iter",
-        type=positive(int),
-        default=Settings().max_iter,
-        metavar="N",
-        help="most iterations of a fit (%(default)s)",
-    )
+    parser = Parser(__doc__)
+    parser.add_flag("quick", f"{N_QUICK} scenes, upright only, and batches that fit into the time")
+    parser.add_number("scenes", f"how many scenes ({N_SCENES})")
+    parser.add_seed()
+    about = "Rubin's pixels along Euclid's, turned by 30 degrees, of the opposite parity (all)"
+    parser.add("views", about, nargs="+", choices=VIEWS)
+    about = f"scenes fitted side by side ({' '.join(map(str, BATCHES))})"
+    parser.add_number("batches", about, BATCHES, nargs="*")
+    parser.add_number("max-iter", "most iterations of a fit", Settings().max_iter)
     parser.add_catalogue()
     parser.add_json()
     return parser

@@ -45,7 +45,7 @@ from clresample import simulate_field
 from .harness import photometry, records
 from .harness.clock import ONE_THREAD, on_all_cores
 from .harness.judged import NEAR_PX, Judged, fluxes, robust, shares, typical
-from .harness.options import Parser, positive, run, seed
+from .harness.options import Parser, run
 from .harness.runs import fitted, found_in
 
 SIZES, QUICK_SIZES = (1024, 2048), (384,)
@@ -54,25 +54,10 @@ MAX_PAIRS, BLENDED_PX = 60, 16.0
 N_SCALE, SCALE_SNR = 20, 50.0  # sources alone, of each field, that say what part apertures see
 PUBLISHED = "36 (plain) or as published (real)"
 MIN_FLUX = 5.0  # [sigma] of a point source's flux: fainter ones say how deep a band is
-COLUMNS = (
-    ("n_model", 7, "d"),
-    ("n_truth", 7, "d"),
-    ("n_sources", 9, "d"),
-    ("completeness", 12, ".3f"),
-    ("faint", 6, ".3f"),
-    ("bright", 6, ".3f"),
-    ("close", 6, ".3f"),
-    ("spurious", 8, ".3f"),
-    ("flux_bias", 9, ".4f"),
-    ("pull_width", 10, ".3f"),
-    ("n_pairs", 7, "d"),
-    ("pairs", 6, ".3f"),
-    ("aperture_factor", 15, ".2f"),
-    ("forced_factor", 13, ".2f"),
-    ("core_s_per_source", 17, ".3f"),
-    ("wall_s", 7, ".1f"),
-    ("peak_gb", 7, ".2f"),
-    ("status", 20, ""),
+COLUMNS = records.columns(
+    "n_model:7d n_truth:7d n_sources:9d completeness:12.3f faint:6.3f bright:6.3f close:6.3f "
+    "spurious:8.3f flux_bias:9.4f pull_width:10.3f n_pairs:7d pairs:6.3f aperture_factor:15.2f "
+    "forced_factor:13.2f core_s_per_source:17.3f wall_s:7.1f peak_gb:7.2f status:20"
 )
 
 
@@ -211,48 +196,22 @@ def main(options):
         f"{QUICK_BANDS if options.quick else BANDS} at 12 degrees",
         "workers": f"{options.workers}, {' '.join(ONE_THREAD)} = 1 each",
     }
-    records.print_record(record)
-    records.print_head(COLUMNS)
-    rows = []
-    for size in sizes:
-        rows.append((searched if options.search_only else row_of)(size, options))
-        records.print_row(COLUMNS, rows[-1])
-        records.print_stages(rows[-1])
-    if options.json is not None:
-        records.write_json(options.json, {"record": record, "rows": rows})
+    measure = searched if options.search_only else row_of
+    rows = (measure(size, options) for size in sizes)
+    records.show(COLUMNS, rows, record, options.json, below=records.print_stages)
 
 
 def parser():
-    parser = Parser("bench.field", description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--quick", action="store_true", help="one field of 384 pixels, two bands of Rubin"
-    )
+    parser = Parser(__doc__)
+    parser.add_flag("quick", "one field of 384 pixels, two bands of Rubin")
     parser.add_sizes(SIZES)
-    parser.add_density(None, "36; of a real sky as published")
-    parser.add_sky()
-    parser.add_argument(
-        "--faintest",
-        type=positive(float),
-        default=26.0,
-        metavar="MAG",
-        help="i magnitude of the faintest sources (%(default)s)",
-    )
-    parser.add_argument(
-        "--fields",
-        type=positive(int),
-        default=1,
-        metavar="N",
-        help="fields of each size, of successive seeds (%(default)s)",
-    )
-    parser.add_argument(
-        "--search-only", action="store_true", help="search for sources, without fits"
-    )
-    parser.add_argument(
-        "--workers", type=positive(int), default=2, metavar="N", help="processes (%(default)s)"
-    )
-    parser.add_argument(
-        "--seed", type=seed, default=0, metavar="S", help="of the first field (%(default)s)"
-    )
+    parser.add_density(None, " (36; of a real sky as published)")
+    parser.add_sky(("plain", "real", "bright"), "of simulated fields, see simulate_field")
+    parser.add_number("faintest", "i magnitude of the faintest sources", 26.0, float, "MAG")
+    parser.add_number("fields", "fields of each size, of successive seeds", 1)
+    parser.add_flag("search-only", "search for sources, without fits")
+    parser.add_number("workers", "processes", 2)
+    parser.add_seed(0, "of the first field")
     parser.add_json()
     return parser
 

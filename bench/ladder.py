@@ -42,7 +42,7 @@ from .harness import records, scenes
 from .harness.clock import in_processes, on_one_thread
 from .harness.ladder_cases import CASES, Limits, cosmos_catalogue, scene_of
 from .harness.ladder_scenes import MODES
-from .harness.options import BadOption, Parser, positive, run
+from .harness.options import BadOption, Parser, run
 
 N_SCENES = {
     "single": 150, "neighbour": 40, "pair": 40, "bulge_disk": 30, "giant": 10, "cosmos": 24,
@@ -61,22 +61,9 @@ CHI2 = 1.1
 SAYS_SO = {"MISFIT", "NOT_CONVERGED", "SATURATED", "AMBIGUOUS", "NO_COVERAGE", "OUTSIDE_FRAME"}
 COVERAGE_RE_PX = (4.0, 32.0)
 COVERAGE_SNR = (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0, np.inf)  # of a band's flux
-COLUMNS = (
-    ("case", 15, ""),
-    ("mode", 5, ""),
-    ("scene", 5, "d"),
-    ("source", 6, "d"),
-    ("n", 3, ".1f"),
-    ("re_px", 6, ".1f"),
-    ("q", 4, ".2f"),
-    ("snr", 7, ".0f"),
-    ("ratio", 9, ".3f"),
-    ("pull", 8, ".1f"),
-    ("chi2", 8, ".2f"),
-    ("status", 15, ""),
-    ("flags", 24, ""),
-    ("silent", 6, ""),
-    ("seconds", 7, ".2f"),
+COLUMNS = records.columns(
+    "case:15 mode:5 scene:5d source:6d n:3.1f re_px:6.1f q:4.2f snr:7.0f ratio:9.3f pull:8.1f "
+    "chi2:8.2f status:15 flags:24 silent:6 seconds:7.2f"
 )
 
 
@@ -228,18 +215,15 @@ def main(options):
     if not tasks:
         raise BadOption("no case is left to be fitted")
     record = records.record(threads) | {"seed": options.seed, "settings": "all by default"}
-    records.print_record(record)
-    records.print_head(COLUMNS)
-    rows = []
-    for _, found in in_processes(measure, tasks, options.processes):
-        for row in found:
-            rows.append(row)
-            records.print_row(COLUMNS, row)
-    rows.sort(key=lambda row: (list(CASES).index(row["case"]), row["mode"] != MODES[0]))
-    summary = summarise(rows)
-    records.print_summary(summary)
-    if options.json is not None:
-        records.write_json(options.json, {"record": record, "summary": summary, "rows": rows})
+    found = (row for _, r in in_processes(measure, tasks, options.processes) for row in r)
+    records.show(
+        COLUMNS,
+        found,
+        record,
+        options.json,
+        order=lambda row: (list(CASES).index(row["case"]), row["mode"] != MODES[0]),
+        summarise=summarise,
+    )
 
 
 def cases(text):
@@ -252,23 +236,16 @@ def cases(text):
 
 
 def parser():
-    parser = Parser("bench.ladder", description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="60 fits, of r_e up to 16 px")
-    parser.add_argument(
-        "--only",
-        type=cases,
-        default=list(CASES),
-        metavar="CASE,...",
-        help=f"of {', '.join(CASES)} (all)",
-    )
-    parser.add_argument("--modes", nargs="+", choices=MODES, default=MODES)
-    parser.add_argument(
-        "--scenes", type=positive(int), metavar="N", help="scenes of each case, mode and cell"
-    )
+    parser = Parser(__doc__)
+    parser.add_flag("quick", "60 fits, of r_e up to 16 px")
+    about = f"of {', '.join(CASES)} (all)"
+    parser.add("only", about, type=cases, default=list(CASES), metavar="CASE,...")
+    parser.add("modes", "which", nargs="+", choices=MODES, default=MODES)
+    parser.add_number("scenes", "scenes of each case, mode and cell")
     for name, what in (("n", "Sersic indices"), ("re", "r_e [px]"), ("snr", "signals to noise")):
         about = f"{what} in place of drawn ones; one scene of each combination"
-        parser.add_argument(f"--{name}", nargs="+", type=positive(float), metavar="X", help=about)
-    parser.add_first_seed(FIRST_SEED)
+        parser.add_number(name, about, kind=float, metavar="X", nargs="+")
+    parser.add_seed(FIRST_SEED)
     parser.add_processes()
     parser.add_json()
     return parser

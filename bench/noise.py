@@ -25,15 +25,15 @@ import time
 from dataclasses import replace
 
 import numpy as np
-from tqdm import tqdm
 
 from clresample import Settings, fluxes
 from clresample.simulation.coadds import resampled
 from clresample.simulation.scenes import simulate_scene
 
 from .harness import records, scenes
-from .harness.clock import in_processes, on_one_thread
-from .harness.options import Parser, positive, run
+from .harness.clock import in_chunks, in_processes, on_one_thread
+from .harness.judged import error_of_mean, robust
+from .harness.options import Parser, n_scenes, run
 
 RECIPES = ("native", "correlated", "white")
 BANDS = {"Euclid": slice(0, 1), "Rubin": slice(1, 7)}
@@ -43,19 +43,9 @@ FIRST_SEED = 2000
 CHUNK = 4  # scenes fitted side by side: some seconds
 ANGLE_DEG = 20.0
 MIN_SNR, BIAS_SNR = 3.0, 10.0
-COLUMNS = (
-    ("recipe", 10, ""),
-    ("bands", 6, ""),
-    ("n", 5, "d"),
-    ("median", 6, ".2f"),
-    ("mean", 6, ".2f"),
-    ("against", 7, ".3f"),
-    ("coverage", 8, ".3f"),
-    ("error", 6, ".3f"),
-    ("width", 6, ".2f"),
-    ("scatter", 7, ".3f"),
-    ("bias", 8, ".4f"),
-    ("seconds", 7, ".3f"),
+COLUMNS = records.columns(
+    "recipe:10 bands:6 n:5d median:6.2f mean:6.2f against:7.3f coverage:8.3f error:6.3f "
+    "width:6.2f scatter:7.3f bias:8.4f seconds:7.3f"
 )
 
 
@@ -127,56 +117,36 @@ def _fluxes(one, native, part):
     snr = truth / unit
     good = np.isfinite(away) & np.isfinite(error) & (snr > MIN_SNR)
     held = np.abs(away[good]) < error[good]
-    excess = np.bincount(i_scene[good], held - held.mean())
     return {
         "n": int(good.sum()),
         "coverage": float(held.mean()),
-        "error": float(np.sqrt((excess**2).sum()) / len(held)),
-        "width": _width(away[good] / error[good]),
-        "scatter": _width(away[good] / unit[good]),
+        "error": error_of_mean(held, i_scene[good]),
+        "width": robust(away[good] / error[good]),
+        "scatter": robust(away[good] / unit[good]),
         "bias": float(np.median((away / truth)[good & (snr > BIAS_SNR)])),
     }
 
 
-def _width(values):
-    return float(1.4826 * np.median(np.abs(values - np.median(values))))
-
-
 def main(options):
     threads = on_one_thread()
-    n_scenes = options.scenes or (N_QUICK if options.quick else N_SCENES)
+    seeds = range(options.seed, options.seed + n_scenes(options))
     record = records.record(threads) | {
-        "scenes": f"{n_scenes} joint, parametric galaxies; from seed {options.seed}",
+        "scenes": f"{len(seeds)} joint, parametric galaxies; from seed {options.seed}",
         "settings": f"{Settings()}",
     }
-    records.print_record(record)
-    end = options.seed + n_scenes
-    tasks = [(range(i, min(i + CHUNK, end)),) for i in range(options.seed, end, CHUNK)]
-    chunks = {}
-    with tqdm(total=n_scenes, unit=" scenes", desc="noise", disable=None) as bar:
-        for (seeds,), found in in_processes(measure, tasks, options.processes):
-            chunks[seeds.start] = found
-            bar.update(len(seeds))
-    ordered = [chunk for _, chunk in sorted(chunks.items())]
+    tasks = [(chunk,) for chunk in in_chunks(seeds, CHUNK)]
+    found = in_processes(measure, tasks, options.processes, lambda task: len(task[0]))
+    ordered = [chunk for _, chunk in sorted(found, key=lambda pair: pair[0][0].start)]
     parts = {recipe: [s for chunk in ordered for s in chunk[recipe]] for recipe in RECIPES}
-    rows = list(rows_of(parts))
-    records.print_head(COLUMNS)
-    for row in rows:
-        records.print_row(COLUMNS, row)
     ends = {r: float(np.mean([s["status"] == "converged" for s in p])) for r, p in parts.items()}
     summary = {"share of fits that converged": ends}
-    records.print_summary(summary)
-    if options.json is not None:
-        records.write_json(options.json, {"record": record, "summary": summary, "rows": rows})
+    records.show(COLUMNS, rows_of(parts), record, options.json, summarise=lambda _: summary)
 
 
 def parser():
-    parser = Parser("bench.noise", description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help=f"{N_QUICK} scenes")
-    parser.add_argument(
-        "--scenes", type=positive(int), metavar="N", help=f"how many scenes ({N_SCENES})"
-    )
-    parser.add_first_seed(FIRST_SEED)
+    parser = Parser(__doc__)
+    parser.add_scenes(N_QUICK, N_SCENES)
+    parser.add_seed(FIRST_SEED)
     parser.add_processes()
     parser.add_json()
     return parser

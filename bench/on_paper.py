@@ -79,8 +79,8 @@ def main(options):
 
 
 def parser():
-    parser = Parser("bench.on_paper", description=__doc__.splitlines()[0])
-    parser.add_argument("--write", action="store_true", help="into docs/scale.md")
+    parser = Parser(__doc__)
+    parser.add_flag("write", "into docs/scale.md")
     return parser
 
 

@@ -50,7 +50,7 @@ from clresample.simulation.galaxies import import_galsim, open_catalogue
 
 from .harness import decam, records
 from .harness.clock import on_all_cores
-from .harness.options import ROOT, BadOption, Parser, data_folder, positive, run
+from .harness.options import ROOT, BadOption, Parser, data_folder, run
 from .harness.toml import lines_of
 
 STRUCTURED = 5.0  # [sigma] A residual above this is no noise.
@@ -61,19 +61,9 @@ ABOUT_THE_DATA = ("fit_shifts", "fit_sky")
 HSC_SCALE_ARCSEC = 0.168
 HST_ZERO_POINT = 25.94  # [mag] AB magnitude of 1 count/s in COSMOS' F814W images
 PEAK_SIGMA_PX = 2.0  # Smoothing of a COSMOS image before its brightest point is looked for.
-COLUMNS = (
-    ("scene", 21, ""),
-    ("band", 5, ""),
-    ("chi2", 6, ".2f"),
-    ("status", 15, ""),
-    ("seconds", 7, ".2f"),
-    ("core_s", 6, ".2f"),
-    ("iterations", 10, "d"),
-    ("n_sources", 9, "d"),
-    ("residual", 8, ".1f"),
-    ("source", 6, "d"),
-    ("flagged", 7, ""),
-    ("n_unflagged", 11, "d"),
+COLUMNS = records.columns(
+    "scene:21 band:5 chi2:6.2f status:15 seconds:7.2f core_s:6.2f iterations:10d n_sources:9d "
+    "residual:8.1f source:6d flagged:7 n_unflagged:11d"
 )
 
 
@@ -228,44 +218,34 @@ def main(options):
     if not data.is_dir() and not options.scene:
         raise BadOption(f"no data folder at {data}: set CLRESAMPLE_DATA, or name files by --scene")
     record = records.record(threads) | {"settings": "all by default", "data": str(data)}
-    records.print_record(record)
-    rows = []
-    records.print_head(COLUMNS)
     n_galaxies = QUICK_COSMOS if options.quick else N_COSMOS
     n_galaxies = n_galaxies if options.galaxies is None else options.galaxies
-    with tempfile.TemporaryDirectory() as folder:
-        for name, fit in plan(data, options.scene, n_galaxies, Path(folder)):
-            if options.only and not any(name.startswith(start) for start in options.only):
-                continue
-            for row in rows_of(name, fit):
-                rows.append(row)
-                records.print_row(COLUMNS, row)
-            for message in row["messages"]:
-                print(f"    {message}", flush=True)
-    if not rows:
-        raise BadOption(f"no scene in {data}, or none that --only names")
-    summary_of_all = summarise(rows)
-    records.print_summary(summary_of_all)
-    if options.json is not None:
-        content = {"record": record, "summary": summary_of_all, "rows": rows}
-        records.write_json(options.json, content)
+
+    def found():
+        with tempfile.TemporaryDirectory() as folder:
+            for name, fit in plan(data, options.scene, n_galaxies, Path(folder)):
+                if not options.only or name.startswith(tuple(options.only)):
+                    for row in rows_of(name, fit):
+                        yield row
+                    records.print_lines(row["messages"])
+
+    def figures(rows):
+        if not rows:
+            raise BadOption(f"no scene in {data}, or none that --only names")
+        return summarise(rows)
+
+    records.show(COLUMNS, found(), record, options.json, summarise=figures)
 
 
 def parser():
-    parser = Parser("bench.real", description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help=f"{QUICK_COSMOS} COSMOS galaxies only")
-    parser.add_argument(
-        "--galaxies",
-        type=positive(int),
-        metavar="N",
-        help=f"how many COSMOS galaxies, from the highest signal to noise ({N_COSMOS})",
-    )
-    parser.add_argument(
-        "--only", nargs="+", metavar="NAME", help="scenes whose names start so: hsc_blend, cosmos"
-    )
-    parser.add_argument(
-        "--scene", nargs="+", type=Path, default=[], metavar="SCENE.toml", help="further scenes"
-    )
+    parser = Parser(__doc__)
+    parser.add_flag("quick", f"{QUICK_COSMOS} COSMOS galaxies only")
+    about = f"how many COSMOS galaxies, from the highest signal to noise ({N_COSMOS})"
+    parser.add_number("galaxies", about)
+    about = "scenes whose names start so: hsc_blend, cosmos"
+    parser.add("only", about, nargs="+", metavar="NAME")
+    about = "further scenes"
+    parser.add("scene", about, nargs="+", type=Path, default=[], metavar="SCENE.toml")
     parser.add_json()
     return parser
 

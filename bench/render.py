@@ -35,23 +35,10 @@ ANGLE_DEG = 30.0
 BATCH = 64  # stamps rendered by one call, in the rows of batches
 N_SETUPS = 3  # whose mean is setup_ms
 MAIN_PAIR = ("EUCLID", "RUBIN")
-COLUMNS = (
-    ("from", 6, ""),
-    ("to", 6, ""),
-    ("n_model", 7, "d"),
-    ("n_obs", 5, "d"),
-    ("angle_deg", 9, "g"),
-    ("batch", 5, "d"),
-    ("ours_ms", 8, ".4f"),
-    ("ours_both_ms", 12, ".4f"),
-    ("ours_device_ms", 14, ".4f"),
-    ("galsim_ms", 9, ".3f"),
-    ("galsim_sinc_ms", 14, ".3f"),
-    ("ratio", 6, ".1f"),
-    ("ours_sdr", 8, ".2f"),
-    ("galsim_sdr", 10, ".2f"),
-    ("galsim_sinc_sdr", 15, ".2f"),
-    ("setup_ms", 8, ".1f"),
+COLUMNS = records.columns(
+    "from:6 to:6 n_model:7d n_obs:5d angle_deg:9g batch:5d ours_ms:8.4f ours_both_ms:12.4f "
+    "ours_device_ms:14.4f galsim_ms:9.3f galsim_sinc_ms:14.3f ratio:6.1f ours_sdr:8.2f "
+    "galsim_sdr:10.2f galsim_sinc_sdr:15.2f setup_ms:8.1f"
 )
 
 
@@ -195,32 +182,23 @@ def main(options):
         "galaxies": f"{options.galaxies} {galaxies.name}",
         "times": "per stamp, without set-up; ours_ms and galsim_ms from NumPy array to NumPy array",
     }
-    records.print_record(record)
-    records.print_head(COLUMNS)
-    rows = []
-    for (name_in, name_out), n_model, angles, batches in plan(options):
-        cases = [Case(surveys[name_in], surveys[name_out], n_model, angle) for angle in angles]
-        contests = [Contest(case, galaxies, options.galaxies) for case in cases]
-        for row in measure(contests, batches, options.seconds):
-            rows.append(row)
-            records.print_row(COLUMNS, row)
-    summary = summarise(rows)
-    for name, figures in summary.items():
-        print(
-            f"{'-'.join(MAIN_PAIR)} {name}: "
-            + ", ".join(f"{key}: {value:.2f}" for key, value in figures.items())
-        )
-    if options.json is not None:
-        records.write_json(options.json, {"record": record, "summary": summary, "rows": rows})
+
+    def found():
+        for (name_in, name_out), n_model, angles, batches in plan(options):
+            cases = [Case(surveys[name_in], surveys[name_out], n_model, angle) for angle in angles]
+            contests = [Contest(case, galaxies, options.galaxies) for case in cases]
+            yield from measure(contests, batches, options.seconds)
+
+    def figures(rows):
+        print(f"{'-'.join(MAIN_PAIR)}:")
+        return summarise(rows)
+
+    records.show(COLUMNS, found(), record, options.json, summarise=figures)
 
 
 def parser():
-    parser = Parser("bench.render", description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--quick",
-        action="store_true",
-        help="the main pair at 4 sizes, and one row of every other pair",
-    )
+    parser = Parser(__doc__)
+    parser.add_flag("quick", "the main pair at 4 sizes, and one row of every other pair")
     parser.add_sizes(SIZES)
     parser.add_seconds(0.3, "row")
     parser.add_surveys()

@@ -43,7 +43,7 @@ from clresample.fields.run import run_field
 from .harness import records
 from .harness.clock import on_all_cores
 from .harness.memory import TreeMemory
-from .harness.options import Parser, positive, run, seed
+from .harness.options import Parser, run
 
 SIZES, QUICK_SIZES, GIANT_SIZES = (2048,), (256,), (3000,)
 REPEATS = 3  # of a field; a giant, and with --quick, once
@@ -55,24 +55,10 @@ MIN_SNR = 5.0  # of sources whose places are given
 # in a piece the halo is nearly flat, which the fitted sky takes up; in 3000 pixels it falls to a
 # fifth.
 HALO_SIGMA, CORE_ARCSEC = 0.1, 100.0
-COLUMNS = (
-    ("n_model", 7, "d"),
-    ("workers", 7, "d"),
-    ("n_sources", 9, "d"),
-    ("measured", 8, "d"),
-    ("n_blends", 8, "d"),
-    ("pieces", 6, "d"),
-    ("wall_s", 7, ".1f"),
-    ("fit_s", 7, ".1f"),
-    ("core_s_per_source", 17, ".3f"),
-    ("speed_up", 8, ".2f"),
-    ("fit_speed", 9, ".2f"),
-    ("own_cost", 8, ".4f"),
-    ("busy", 5, ".2f"),
-    ("tail_s", 6, ".1f"),
-    ("peak_gb", 7, ".2f"),
-    ("largest_gb", 10, ".2f"),
-    ("status", 20, ""),
+COLUMNS = records.columns(
+    "n_model:7d workers:7d n_sources:9d measured:8d n_blends:8d pieces:6d wall_s:7.1f "
+    "fit_s:7.1f core_s_per_source:17.3f speed_up:8.2f fit_speed:9.2f own_cost:8.4f busy:5.2f "
+    "tail_s:6.1f peak_gb:7.2f largest_gb:10.2f status:20"
 )
 
 
@@ -216,45 +202,22 @@ def main(options):
     record = records.record(f"{threads}, one thread a worker") | {
         "fields": f"seed {options.seed}, {what}, Euclid VIS and Rubin {''.join(bands)}"
     }
-    records.print_record(record)
-    records.print_head(COLUMNS)
-    rows = []
-    for size in options.sizes or usual:
-        for row in rows_of(size, options, bands):
-            rows.append(row)
-            records.print_row(COLUMNS, row)
-            records.print_stages(row)
+    rows = (row for size in options.sizes or usual for row in rows_of(size, options, bands))
+    rows = records.show(COLUMNS, rows, record, options.json, below=records.print_stages)
     for line in medians(rows):
         print(line)
-    if options.json is not None:
-        records.write_json(options.json, {"record": record, "rows": rows})
 
 
 def parser():
-    parser = Parser("bench.scaling", description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="256 pixels, two bands of Rubin, once")
-    parser.add_argument(
-        "--repeats", type=positive(int), metavar="N", help=f"turns of a field ({REPEATS})"
-    )
+    parser = Parser(__doc__)
+    parser.add_flag("quick", "256 pixels, two bands of Rubin, once")
+    parser.add_number("repeats", f"turns of a field ({REPEATS})")
     parser.add_sizes(SIZES)
-    parser.add_argument(
-        "--workers",
-        nargs="+",
-        type=positive(int),
-        default=[1, 2],
-        metavar="N",
-        help="numbers of processes, by turns (1 2)",
-    )
-    parser.add_argument(
-        "--giant",
-        type=positive(int),
-        metavar="S",
-        help="one blend of so many sources instead of a field (3000 pixels a side)",
-    )
+    parser.add_number("workers", "numbers of processes, by turns (1 2)", [1, 2], nargs="+")
+    about = "one blend of so many sources instead of a field (3000 pixels a side)"
+    parser.add_number("giant", about, metavar="S")
     parser.add_density()
-    parser.add_argument(
-        "--seed", type=seed, default=0, metavar="S", help="of the field (%(default)s)"
-    )
+    parser.add_seed(0, "of the field")
     parser.add_json()
     return parser
 

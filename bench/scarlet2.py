@@ -45,22 +45,15 @@ from clresample.adapters.scarlet2 import renderer_of
 
 from .harness import records
 from .harness.clock import on_all_cores
-from .harness.options import Parser, data_folder, positive, run
+from .harness.options import Parser, data_folder, run
 
 CENTER_DEG, ANGLE_DEG, SEED, N_SOURCES = (150.1, 2.2), 12.0, 100, 5
 START_PX, BOX_PX = 3.0, 61  # [model px] sigma of the start's Gaussians, side of their boxes
 # Steps of scarlet2's tutorial: 5 % of a spectrum, 0.01 of a morphology whose maximum is 1.
 SPECTRUM_STEP, MORPHOLOGY_STEP = 0.05, 0.01
-COLUMNS = (
-    ("scene", 9, ""),
-    ("renderer", 10, ""),
-    ("n_sources", 9, "d"),
-    ("iterations", 10, "d"),
-    ("render_db", 9, ".1f"),
-    ("truth_chi2", 10, ".3f"),
-    ("sdr", 6, ".2f"),
-    ("chi2", 6, ".3f"),
-    ("seconds", 8, ".3f"),
+COLUMNS = records.columns(
+    "scene:9 renderer:10 n_sources:9d iterations:10d render_db:9.1f truth_chi2:10.3f sdr:6.2f "
+    "chi2:6.3f seconds:8.3f"
 )
 
 
@@ -243,28 +236,18 @@ def rows_of(name, truth, n_iterations):
 
 def main(options):
     threads = on_all_cores()
-    record = records.record(threads)
-    records.print_record(record)
     scenes = {"turned": turned()}
     data = data_folder() / "hst_hsc"
     if data.is_dir() and not options.quick:
         scenes["tutorial"] = tutorial(data)
-    rows = []
-    records.print_head(COLUMNS)
-    for name, truth in scenes.items():
-        for row in rows_of(name, truth, options.iterations):
-            rows.append(row)
-            records.print_row(COLUMNS, row)
-    if options.json is not None:
-        records.write_json(options.json, {"record": record, "rows": rows})
+    rows = (row for scene in scenes.items() for row in rows_of(*scene, options.iterations))
+    records.show(COLUMNS, rows, records.record(threads), options.json)
 
 
 def parser():
-    parser = Parser("bench.scarlet2", description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="the turned scene only")
-    parser.add_argument(
-        "--iterations", type=positive(int), default=300, metavar="N", help="%(default)s"
-    )
+    parser = Parser(__doc__)
+    parser.add_flag("quick", "the turned scene only")
+    parser.add_number("iterations", "of each fit", 300)
     parser.add_json()
     return parser
 

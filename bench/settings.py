@@ -25,14 +25,14 @@ import time
 from dataclasses import replace
 
 import numpy as np
-from tqdm import tqdm
 
 from clresample import PaperSettings, Settings, SingleScalePrior
 from clresample.measurement.photometry import fluxes
 
 from .harness import records, scenes
-from .harness.clock import in_processes, on_one_thread
-from .harness.options import Parser, positive, run
+from .harness.clock import in_chunks, in_processes, on_one_thread
+from .harness.judged import error_of_mean
+from .harness.options import Parser, n_scenes, run
 
 SETTINGS = {
     "default": Settings(),
@@ -44,26 +44,13 @@ CHUNK = 4  # scenes fitted side by side: some seconds
 WORSE_DB = 0.5
 # A fit is continued for so many times its iterations; what then counts as moved and redrawn.
 LONGER, MOVED_SIGMA, REDRAWN_DB = 10, 0.2, 0.1
-COLUMNS = (
-    ("settings", 8, ""),
-    ("mode", 6, ""),
-    ("n", 4, "d"),
-    ("median", 6, ".2f"),
-    ("mean", 6, ".2f"),
-    ("worse", 5, ".3f"),
-    ("below", 6, ".2f"),
-    ("against", 7, ".3f"),
-    ("error", 5, ".3f"),
-    ("chi2", 5, ".3f"),
-    ("converged", 9, ".2f"),
-    ("iterations", 10, ".0f"),
-    ("seconds", 7, ".3f"),
-    ("moved", 6, ".4f"),
-    ("redrawn", 7, ".3f"),
+COLUMNS = records.columns(
+    "settings:8 mode:6 n:4d median:6.2f mean:6.2f worse:5.3f below:6.2f against:7.3f "
+    "error:5.3f chi2:5.3f converged:9.2f iterations:10.0f seconds:7.3f moved:6.4f redrawn:7.3f"
 )
 
 
-def measure(names, folder, seeds, continued):
+def measure(names, folder, continued, seeds):
     """Scenes fitted with several settings in all modes: SDRs, chi2, how the fits ended.
 
     continued: also what changes when fits go on
@@ -141,7 +128,7 @@ def rows_of(parts):
                     "worse": float((found < better - WORSE_DB).mean()),
                     "below": float(np.nanmean(found) - np.nanmean(better)),
                     "against": float(np.nanmean(gain)),
-                    "error": _error(gain, i_scene),
+                    "error": error_of_mean(gain, i_scene),
                     "converged": float(np.mean([p["status"] == "converged" for p in some])),
                 }
                 | {
@@ -173,58 +160,31 @@ def _lengths(parts):
     return np.arange(len(parts)), [len(p["sdr"]) for p in parts]
 
 
-def _error(values, i_scene):
-    """Standard error of a mean over scenes, whose galaxies hang together."""
-    good = np.isfinite(values)
-    excess = np.bincount(i_scene[good], values[good] - values[good].mean())
-    return float(np.sqrt((excess**2).sum()) / good.sum())
-
-
 def main(options):
     threads = on_one_thread()
-    n_scenes = options.scenes or (N_QUICK if options.quick else N_SCENES)
+    seeds = range(options.seed, options.seed + n_scenes(options))
     record = records.record(threads) | {
-        "scenes": f"{n_scenes} from seed {options.seed}; {scenes.Scenes(options.catalogue).name}",
+        "scenes": f"{len(seeds)} from seed {options.seed}; {scenes.Scenes(options.catalogue).name}",
         "settings": "; ".join(f"{name} = {SETTINGS[name]}" for name in options.settings),
     }
-    records.print_record(record)
-    seeds = range(options.seed, options.seed + n_scenes)
-    chunks = [seeds[i : i + CHUNK] for i in range(0, n_scenes, CHUNK)]
-    tasks = [(options.settings, options.catalogue, chunk, options.continued) for chunk in chunks]
-    done = {}
-    with tqdm(total=n_scenes, unit=" scenes", desc="settings", disable=None) as bar:
-        for (*_, chunk, _), found in in_processes(measure, tasks, options.processes):
-            done[chunk.start] = found
-            bar.update(len(chunk))
+    given = options.settings, options.catalogue, options.continued
+    tasks = [(*given, chunk) for chunk in in_chunks(seeds, CHUNK)]
+    found = in_processes(measure, tasks, options.processes, lambda task: len(task[-1]))
+    ordered = [chunk for _, chunk in sorted(found, key=lambda pair: pair[0][-1].start)]
     keys = itertools.product(options.settings, scenes.MODES)
-    parts = {key: [one for _, found in sorted(done.items()) for one in found[key]] for key in keys}
-    rows = list(rows_of(parts))
-    records.print_head(COLUMNS)
-    for row in rows:
-        records.print_row(COLUMNS, row)
-    if options.json is not None:
-        fits = {f"{name}, {mode}": some for (name, mode), some in parts.items()}
-        records.write_json(options.json, {"record": record, "rows": rows, "fits": fits})
+    parts = {key: [one for chunk in ordered for one in chunk[key]] for key in keys}
+    fits = {f"{name}, {mode}": some for (name, mode), some in parts.items()}
+    records.show(COLUMNS, rows_of(parts), record, options.json, fits=fits)
 
 
 def parser():
-    parser = Parser("bench.settings", description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help=f"{N_QUICK} scenes")
-    parser.add_argument(
-        "--scenes", type=positive(int), metavar="N", help=f"how many scenes ({N_SCENES})"
-    )
-    parser.add_first_seed(0)
-    parser.add_argument(
-        "--settings",
-        nargs="+",
-        choices=SETTINGS,
-        default=("default", "prior"),
-        metavar="NAME",
-        help=f"which, of {', '.join(SETTINGS)} (default prior)",
-    )
-    parser.add_argument(
-        "--continued", action="store_true", help=f"also let each fit go on, {LONGER} times as long"
-    )
+    parser = Parser(__doc__)
+    parser.add_scenes(N_QUICK, N_SCENES)
+    parser.add_seed()
+    about = f"which, of {', '.join(SETTINGS)} (default prior)"
+    default = ("default", "prior")
+    parser.add("settings", about, nargs="+", choices=SETTINGS, default=default, metavar="NAME")
+    parser.add_flag("continued", f"also let each fit go on, {LONGER} times as long")
     parser.add_catalogue()
     parser.add_processes()
     parser.add_json()

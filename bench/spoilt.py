@@ -41,20 +41,9 @@ FIRST_CLEAN = 30000
 NAMES = dict.fromkeys((*spoiling.SPOILT, *spoiling.SAMPLED))
 ENOUGH_SIGMA = 3.0
 UNDER_NOISE = "far from any light"  # of messages about sources that no image shows
-COLUMNS = (
-    ("scene", 10, ""),
-    ("spoilt", 21, ""),
-    ("moved", 7, ".1f"),
-    ("ratio", 6, ".2f"),
-    ("own", 6, ".1f"),
-    ("neighbour", 9, ".1f"),
-    ("n_ratio", 7, ".2f"),
-    ("n_own", 6, ".1f"),
-    ("chi2", 7, ".2f"),
-    ("status", 15, ""),
-    ("flags", 26, ""),
-    ("named", 5, ""),
-    ("good", 5, ""),
+COLUMNS = records.columns(
+    "scene:10 spoilt:21 moved:7.1f ratio:6.2f own:6.1f neighbour:9.1f n_ratio:7.2f n_own:6.1f "
+    "chi2:7.2f status:15 flags:26 named:5 good:5"
 )
 
 
@@ -212,40 +201,42 @@ def main(options):
     if not any(ways for *_, ways in wanted):
         raise BadOption(f"--only {' '.join(options.only)}: none of {', '.join(NAMES)}")
     record = records.record(threads) | {"settings": "all by default", "data": str(data)}
-    records.print_record(record)
-    rows, clean = [], {}
-    records.print_head(COLUMNS)
-    for (name, *_), found in in_processes(measure, wanted, options.processes):
-        if found is None:
-            print(f"{name}: skipped, it is not in {data} (set CLRESAMPLE_DATA)")
-            continue
-        if name != "roman":  # of which it is true that the model's PSF is wider than its own
-            clean[name] = found[1]
-        for row in found[0]:
-            rows.append(row)
-            records.print_row(COLUMNS, row)
-            for text in row["texts"]:
-                print(f"    {text}", flush=True)
-    n_clean = (N_QUICK if options.quick else N_CLEAN) if options.clean is None else options.clean
-    seeds = [(FIRST_CLEAN + i,) for i in range(n_clean)]
-    for (i,), texts in in_processes(measure_clean, seeds, options.processes):
-        clean[f"sim {i}"] = texts
-    rows.sort(key=lambda row: SCENES.index(row["scene"]))
-    figures = summarise(rows, clean)
-    records.print_summary(figures)
-    if options.json is not None:
-        content = {"record": record, "summary": figures, "rows": rows, "clean": clean}
-        records.write_json(options.json, content)
+    clean = {}
+
+    def spoilt():
+        for (name, *_), found in in_processes(measure, wanted, options.processes):
+            if found is None:
+                print(f"{name}: skipped, it is not in {data} (set CLRESAMPLE_DATA)")
+                continue
+            if name != "roman":  # of which it is true that the model's PSF is wider than its own
+                clean[name] = found[1]
+            yield from found[0]
+
+    def summary_of(rows):
+        n = (N_QUICK if options.quick else N_CLEAN) if options.clean is None else options.clean
+        seeds = [(FIRST_CLEAN + i,) for i in range(n)]
+        for (i,), texts in in_processes(measure_clean, seeds, options.processes):
+            clean[f"sim {i}"] = texts
+        return summarise(rows, clean)
+
+    records.show(
+        COLUMNS,
+        spoilt(),
+        record,
+        options.json,
+        below=lambda row: records.print_lines(row["texts"]),
+        order=lambda row: SCENES.index(row["scene"]),
+        summarise=summary_of,
+        clean=clean,
+    )
 
 
 def parser():
-    parser = Parser("bench.spoilt", description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--quick", action="store_true", help=f"{N_QUICK} clean simulated scenes ({N_CLEAN})"
-    )
-    parser.add_argument("--only", nargs="+", metavar="NAME", help=f"of {', '.join(NAMES)} (all)")
-    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=SCENES)
-    parser.add_argument("--clean", type=seed, metavar="N", help="how many clean simulated scenes")
+    parser = Parser(__doc__)
+    parser.add_flag("quick", f"{N_QUICK} clean simulated scenes ({N_CLEAN})")
+    parser.add("only", f"of {', '.join(NAMES)} (all)", nargs="+", metavar="NAME")
+    parser.add("scenes", "which", nargs="+", choices=SCENES, default=SCENES)
+    parser.add("clean", "how many clean simulated scenes", type=seed, metavar="N")
     parser.add_processes()
     parser.add_json()
     return parser

@@ -32,7 +32,7 @@ from clresample.simulation.surveys import EUCLID_VIS, RUBIN_UGRIZY
 from .harness import records
 from .harness.clock import interleaved_ms, on_one_thread
 from .harness.crowded import crowded_blend
-from .harness.options import Parser, run, seed
+from .harness.options import Parser, run
 
 # Sources, model pixels a side, scenes of the batch, turn of Rubin's pixels [degrees]
 QUICK = ((2, 118, 8, 0.0), (9, 118, 8, 0.0))
@@ -42,16 +42,8 @@ ALL = tuple((n, 118, 8, 0.0) for n in (1, 3, 5, 9, 20)) + (
     (60, 512, 1, 12.0),
 )
 BOX_PX = 18, 50  # Sides of the boxes that galaxies of bench.deblend have
-COLUMNS = (
-    ("survey", 12, ""),
-    ("geometry", 8, ""),
-    ("n_sources", 9, "d"),
-    ("n_model", 7, "d"),
-    ("n_scenes", 8, "d"),
-    ("mf", 22, ""),
-    ("ms", 32, ""),
-    ("chosen", 6, "d"),
-    ("gain", 5, ".2f"),
+COLUMNS = records.columns(
+    "survey:12 geometry:8 n_sources:9d n_model:7d n_scenes:8d mf:22 ms:32 chosen:6d gain:5.2f"
 )
 
 
@@ -128,24 +120,15 @@ def rows_of(case, rng, seconds):
 
 def main(options):
     threads = on_one_thread()
-    record = records.record(threads)
-    records.print_record(record)
-    records.print_head(COLUMNS)
-    rows, rng = [], np.random.default_rng(options.seed)
-    for case in QUICK if options.quick else ALL:
-        for row in rows_of(case, rng, options.seconds):
-            rows.append(row)
-            records.print_row(COLUMNS, row)
-    if options.json is not None:
-        records.write_json(options.json, {"record": record, "rows": rows})
+    rng, cases = np.random.default_rng(options.seed), QUICK if options.quick else ALL
+    rows = (row for case in cases for row in rows_of(case, rng, options.seconds))
+    records.show(COLUMNS, rows, records.record(threads), options.json)
 
 
 def parser():
-    parser = Parser("bench.stages", description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="two batches of small scenes")
-    parser.add_argument(
-        "--seed", type=seed, default=0, metavar="S", help="of the random boxes (%(default)s)"
-    )
+    parser = Parser(__doc__)
+    parser.add_flag("quick", "two batches of small scenes")
+    parser.add_seed(0, "of the random boxes")
     parser.add_seconds(1.0, "row")
     parser.add_json()
     return parser

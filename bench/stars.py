@@ -24,7 +24,6 @@ import itertools
 import warnings
 
 import numpy as np
-from tqdm import tqdm
 
 from clresample import (
     PSF,
@@ -43,8 +42,8 @@ from clresample.deblending.profiles import draw_psf, profile, psf_second_moment
 from clresample.simulation.sdr import sdr
 
 from .harness import records, scenes
-from .harness.clock import in_processes, on_one_thread
-from .harness.options import Parser, positive, run
+from .harness.clock import in_chunks, in_processes, on_one_thread
+from .harness.options import Parser, n_scenes, run
 
 PSFS = {
     "right": (),
@@ -72,17 +71,9 @@ SNR_RANGE = (20.0, 200.0)
 LOG_SIZE = (np.log(2.5), 0.3)  # ln of sigma [px], mean and scatter
 ELLIPTICITY = 0.26  # scatter of a component
 GIVEN_PX = 0.15  # scatter of the star's position, which is fitted, about the one given
-COLUMNS = (
-    ("psf", 13, ""),
-    ("snr", 7, "g"),
-    ("psf_error", 9, "g"),
-    ("n", 5, "d"),
-    ("sdr", 6, ".2f"),
-    ("coverage", 8, ".3f"),
-    ("typical", 7, ".3f"),
-    ("worst", 7, ".3f"),
-    ("stated", 7, ".3f"),
-    ("star", 7, ".4f"),
+COLUMNS = records.columns(
+    "psf:13 snr:7g psf_error:9g n:5d sdr:6.2f coverage:8.3f typical:7.3f worst:7.3f "
+    "stated:7.3f star:7.4f"
 )
 
 
@@ -182,41 +173,29 @@ def row_of(values):
 
 def main(options):
     threads = on_one_thread()
-    n_scenes = options.scenes or (N_QUICK if options.quick else N_SCENES)
+    seeds = range(options.seed, options.seed + n_scenes(options))
     psfs, snrs = (QUICK["psfs"], QUICK["snrs"]) if options.quick else (tuple(PSFS), SNRS)
     record = records.record(threads) | {
-        "scenes": f"{n_scenes} from seed {options.seed}",
+        "scenes": f"{len(seeds)} from seed {options.seed}",
         "settings": f"{Settings()}",
     }
-    records.print_record(record)
-    end = options.seed + n_scenes
-    chunks = [range(i, min(i + CHUNK, end)) for i in range(options.seed, end, CHUNK)]
-    tasks = [(psf, snr, seeds) for snr, psf in itertools.product(snrs, psfs) for seeds in chunks]
-    found = {}
-    with tqdm(total=len(tasks) * 2, unit=" fits", desc="stars", disable=None) as bar:
-        for task, values in in_processes(measure, tasks, options.processes):
-            found[task] = values
-            bar.update(2)
-    rows = []
-    records.print_head(COLUMNS)
-    for snr, psf in itertools.product(snrs, psfs):
-        for psf_error in (0.0, Settings().psf_error):
-            values = [v for seeds in chunks for v in found[psf, snr, seeds][psf_error]]
-            rows.append({"psf": psf, "snr": snr, "psf_error": psf_error} | row_of(values))
-            records.print_row(COLUMNS, rows[-1])
-    if options.json is not None:
-        records.write_json(options.json, {"record": record, "rows": rows})
+    chunks, cases = in_chunks(seeds, CHUNK), list(itertools.product(snrs, psfs))
+    tasks = [(psf, snr, chunk) for snr, psf in cases for chunk in chunks]
+    found = dict(in_processes(measure, tasks, options.processes, lambda task: len(task[-1])))
+    rows = (
+        {"psf": psf, "snr": snr, "psf_error": psf_error}
+        | row_of([v for chunk in chunks for v in found[psf, snr, chunk][psf_error]])
+        for snr, psf in cases
+        for psf_error in (0.0, Settings().psf_error)
+    )
+    records.show(COLUMNS, rows, record, options.json)
 
 
 def parser():
-    parser = Parser("bench.stars", description=__doc__.splitlines()[0])
-    quick = f"{N_QUICK} scenes of {' and '.join(QUICK['psfs'])}, S/N {QUICK['snrs'][0]:g}"
-    parser.add_argument("--quick", action="store_true", help=quick.replace("%", "%%"))
-    parser.add_argument(
-        "--scenes", type=positive(int), metavar="N", help=f"how many of each ({N_SCENES})"
-    )
+    parser = Parser(__doc__)
+    parser.add_scenes(N_QUICK, N_SCENES, "how many of each")
     # the default psf_error was chosen on the scenes before these
-    parser.add_first_seed(1000)
+    parser.add_seed(1000)
     parser.add_processes()
     parser.add_json()
     return parser

@@ -38,7 +38,7 @@ from clresample import catalogue
 from .harness import records, scenes
 from .harness.clock import on_all_cores
 from .harness.crowded import crowded_blend
-from .harness.options import ROOT, Parser, positive, run
+from .harness.options import ROOT, Parser, run
 
 N_SCENES, N_QUICK = 32, 8
 # Sources of a blend, and its model's pixels a side.
@@ -50,19 +50,9 @@ MEMORY_GB = 8.0  # A process that wants more is refused it, before the machine s
 N_TICKS = 10  # GalSim renders before and after each row
 WARM_SEED = 1000  # Of scenes that only have the kernels built before anything is timed.
 WARM_BLEND = 3, 96  # Sources and pixels of a small blend for the same purpose.
-COLUMNS = (
-    ("what", 6, ""),
-    ("n_scenes", 8, "d"),
-    ("n_sources", 9, "d"),
-    ("n_model", 7, "d"),
-    ("core_s_per_source", 17, ".4f"),
-    ("wall_s", 7, ".2f"),
-    ("galsim_ms", 9, ".3f"),
-    ("renders_per_source", 18, ".1f"),
-    ("iterations", 10, ".0f"),
-    ("chi2", 6, ".3f"),
-    ("peak_gb", 7, ".2f"),
-    ("status", 15, ""),
+COLUMNS = records.columns(
+    "what:6 n_scenes:8d n_sources:9d n_model:7d core_s_per_source:17.4f wall_s:7.2f "
+    "galsim_ms:9.3f renders_per_source:18.1f iterations:10.0f chi2:6.3f peak_gb:7.2f status:15"
 )
 
 
@@ -191,57 +181,24 @@ def main(options):
         "settings": "all by default",
         "limits": f"{options.limit:g} s and {options.memory:g} GB for a blend",
     }
-    records.print_record(record)
-    records.print_head(COLUMNS)
-    rows = []
-    for row in [blend_row(options)] if options.blend else rows_of(options):
-        rows.append(row)
-        records.print_row(COLUMNS, row)
-        if row["stage"]:
-            records.print_stages(row)
-    if options.json is not None:
-        records.write_json(options.json, {"record": record, "rows": rows})
+    rows = [blend_row(options)] if options.blend else rows_of(options)
+    records.show(COLUMNS, rows, record, options.json, below=records.print_stages)
 
 
 def parser():
-    parser = Parser("bench.throughput", description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--quick", action="store_true", help=f"{N_QUICK} scenes, and the smallest blend"
-    )
-    parser.add_argument(
-        "--scenes", type=positive(int), metavar="N", help=f"how many scenes ({N_SCENES})"
-    )
-    parser.add_argument(
-        "--blends",
-        nargs="*",
-        type=int,
-        choices=BLENDS,
-        metavar="N",
-        help=f"sources of single large blends ({' '.join(map(str, BLENDS))})",
-    )
-    parser.add_argument(
-        "--blend", type=int, choices=BLENDS, metavar="N", help="only this blend, in this process"
-    )
-    parser.add_argument(
-        "--limit",
-        type=positive(float),
-        metavar="S",
-        help=f"seconds after which a blend is given up ({LIMIT_S:g})",
-    )
-    parser.add_argument(
-        "--memory",
-        type=positive(float),
-        default=MEMORY_GB,
-        metavar="GB",
-        help="that the process of a blend may have (%(default)s)",
-    )
-    parser.add_argument(
-        "--sky",
-        choices=("plain", "real"),
-        default="plain",
-        help="galaxies of the single large blends (%(default)s)",
-    )
-    parser.add_first_seed(0)
+    parser = Parser(__doc__)
+    parser.add_flag("quick", f"{N_QUICK} scenes, and the smallest blend")
+    parser.add_number("scenes", f"how many scenes ({N_SCENES})")
+    about = f"sources of single large blends ({' '.join(map(str, BLENDS))})"
+    parser.add("blends", about, nargs="*", type=int, choices=BLENDS, metavar="N")
+    about = "only this blend, in this process"
+    parser.add("blend", about, type=int, choices=BLENDS, metavar="N")
+    about = f"seconds after which a blend is given up ({LIMIT_S:g})"
+    parser.add_number("limit", about, kind=float, metavar="S")
+    about = "that the process of a blend may have"
+    parser.add_number("memory", about, MEMORY_GB, float, "GB")
+    parser.add_sky(("plain", "real"), "galaxies of the single large blends")
+    parser.add_seed()
     parser.add_catalogue()
     parser.add_json()
     return parser

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import sys
@@ -10,6 +11,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 
 import numpy as np
+from tqdm import tqdm
 
 from clresample import get_device
 
@@ -57,15 +59,31 @@ def _start_with(wanted):
     return " ".join(f"{name}={value}" for name, value in wanted.items())
 
 
-def in_processes(function, tasks, n_processes):
-    """Pairs (task, function(*task)) in the order in which worker processes finish them."""
-    pool = ProcessPoolExecutor(n_processes, mp_context=get_context("spawn"))
-    try:
-        futures = {pool.submit(function, *task): task for task in tasks}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
-    finally:
-        pool.shutdown(cancel_futures=True)
+def in_processes(function, tasks, n_processes, size_of=None, initial=0, unit="scenes"):
+    """Pairs (task, function(*task)) in the order in which worker processes finish them.
+
+    n_processes: 1 is this process alone
+    size_of: how many scenes a task has, for a bar of progress; initial: how many were done before
+    """
+    sizes = [size_of(task) if size_of else 1 for task in tasks]
+    no_bar = None if size_of else True  # None: none where the output is no terminal
+    bar = tqdm(total=initial + sum(sizes), initial=initial, unit=f" {unit}", disable=no_bar)
+    with bar, contextlib.ExitStack() as stack:
+        if n_processes == 1:
+            done = ((i, function(*task)) for i, task in enumerate(tasks))
+        else:
+            pool = ProcessPoolExecutor(n_processes, mp_context=get_context("spawn"))
+            stack.callback(pool.shutdown, cancel_futures=True)
+            futures = {pool.submit(function, *task): i for i, task in enumerate(tasks)}
+            done = ((futures[future], future.result()) for future in as_completed(futures))
+        for i, found in done:
+            yield tasks[i], found
+            bar.update(sizes[i])
+
+
+def in_chunks(seeds, n):
+    """Ranges of at most n seeds, which together are all."""
+    return [seeds[i : i + n] for i in range(0, len(seeds), n)]
 
 
 def interleaved_ms(functions, *, seconds, least=5, timer=time.perf_counter):

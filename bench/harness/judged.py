@@ -110,6 +110,13 @@ def typical(errors):
     return float(1.4826 * np.median(errors)) if errors.size else np.nan
 
 
+def error_of_mean(values, i_scene):
+    """Standard error of a mean over scenes, whose values hang together; i_scene: of each value."""
+    good = np.isfinite(values)
+    excess = np.bincount(i_scene[good], values[good] - values[good].mean())
+    return float(np.sqrt((excess**2).sum()) / good.sum())
+
+
 def robust(values):
     """1.4826 median absolute deviation of the finite values, NaN of none."""
     values = np.asarray(values)[np.isfinite(values)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import re
 from pathlib import Path
 
 from clresample import DeviceError
@@ -20,110 +21,84 @@ class BadOption(Exception):
 
 
 class Parser(argparse.ArgumentParser):
-    """Answers a bad option in one line, with exit status 2."""
+    """Options of a command; answers a bad one in one line, with exit status 2.
+
+    doc: of the command's module: its first line, and in "python -m NAME" the command's name
+    """
+
+    def __init__(self, doc):
+        prog = re.search(r"python -m (\S+)", doc)[1]
+        super().__init__(prog, description=doc.splitlines()[0])
 
     def error(self, message):
         self.exit(2, f"{self.prog}: {message}\n")
 
+    def add(self, name, about, **given):
+        """Add an option; a default, where it is a number or a word, ends its help."""
+        shown = given.get("default") is not None and isinstance(given["default"], (int, float, str))
+        about = about.replace("%", "%%") + " (%(default)s)" * shown
+        self.add_argument(f"--{name}", help=about, **given)
+
+    def add_flag(self, name, about):
+        """Add an option without a value."""
+        self.add_argument(f"--{name}", action="store_true", help=about.replace("%", "%%"))
+
+    def add_number(self, name, about, default=None, kind=int, metavar="N", **given):
+        """Add an option of a number above 0, or of several."""
+        self.add(name, about, type=positive(kind), default=default, metavar=metavar, **given)
+
+    def add_scenes(self, quick, all_of_them, what="how many scenes"):
+        """Add --quick and --scenes, see `n_scenes`; quick, all_of_them: numbers of scenes."""
+        self.set_defaults(scenes_by_default=(all_of_them, quick))
+        self.add_flag("quick", f"{quick} scenes")
+        self.add_number("scenes", f"{what} ({all_of_them})")
+
+    def add_seed(self, default=0, what="of the first scene"):
+        self.add("seed", what, type=seed, default=default, metavar="S")
+
     def add_json(self):
-        self.add_argument("--json", metavar="FILE", type=Path, help="write rows and record there")
+        self.add("json", "write rows and record there", metavar="FILE", type=Path)
 
     def add_folder(self):
-        self.add_argument(
-            "--folder",
-            type=Path,
-            default=REPORT,
-            metavar="FOLDER",
-            help="the report's: results are written there, and an interrupted run goes on from "
-            "what is there (bench/report)",
-        )
+        about = "results are written there, and an interrupted run goes on from what is there"
+        given = {"type": Path, "default": REPORT, "metavar": "FOLDER"}
+        self.add("folder", f"{about} (bench/report)", **given)
 
     def add_sizes(self, sizes):
-        self.add_argument(
-            "--sizes",
-            nargs="+",
-            metavar="N",
-            type=positive(int),
-            help=f"model pixels a side (default: {' '.join(map(str, sizes))})",
-        )
+        about = f"model pixels a side (default: {' '.join(map(str, sizes))})"
+        self.add_number("sizes", about, nargs="+")
 
     def add_seconds(self, seconds, what):
-        self.add_argument(
-            "--seconds",
-            type=positive(float),
-            default=seconds,
-            metavar="S",
-            help=f"how long each {what} is measured (%(default)s)",
-        )
+        self.add_number("seconds", f"how long each {what} is measured", seconds, float, "S")
 
     def add_surveys(self):
-        self.add_argument(
-            "--printed",
-            action="store_true",
-            help="survey parameters as the paper's table prints them, "
-            "not as its notebooks use them",
-        )
-        self.add_argument(
-            "--pairs",
-            nargs="+",
-            metavar="FROM-TO",
-            type=pair_of_surveys,
-            help="survey pairs, such as EUCLID-RUBIN (all 15)",
-        )
+        about = "survey parameters as the paper's table prints them, not as its notebooks use them"
+        self.add_flag("printed", about)
+        about = "survey pairs, such as EUCLID-RUBIN (all 15)"
+        self.add("pairs", about, nargs="+", metavar="FROM-TO", type=pair_of_surveys)
 
     def add_galaxies(self, n_galaxies):
-        self.add_argument(
-            "--galaxies",
-            type=positive(int),
-            default=n_galaxies,
-            metavar="N",
-            help="galaxies in each mean SDR (%(default)s)",
-        )
+        self.add_number("galaxies", "galaxies in each mean SDR", n_galaxies)
         self.add_catalogue()
 
     def add_catalogue(self):
-        self.add_argument(
-            "--catalogue",
-            type=Path,
-            metavar="FOLDER",
-            help="COSMOS galaxies; default: cosmos in CLRESAMPLE_DATA, or in the "
-            "data folder beside the checkout, or else parametric galaxies",
-        )
+        about = "COSMOS galaxies; default: cosmos in CLRESAMPLE_DATA, or in the data folder beside "
+        about += "the checkout, or else parametric galaxies"
+        self.add("catalogue", about, type=Path, metavar="FOLDER")
 
-    def add_first_seed(self, default):
-        self.add_argument(
-            "--seed",
-            type=seed,
-            default=default,
-            metavar="S",
-            help="seed of the first scene (%(default)s)",
-        )
+    def add_density(self, default=36.0, said=""):
+        self.add_number("density", f"sources per square arcminute{said}", default, float)
 
-    def add_density(self, default=36.0, said="36"):
-        self.add_argument(
-            "--density",
-            type=positive(float),
-            default=default,
-            metavar="N",
-            help=f"sources per square arcminute ({said})",
-        )
-
-    def add_sky(self):
-        self.add_argument(
-            "--sky",
-            choices=("plain", "real", "bright"),
-            default="plain",
-            help="of simulated fields, see simulate_field (%(default)s)",
-        )
+    def add_sky(self, skies, about):
+        self.add("sky", about, choices=skies, default="plain")
 
     def add_processes(self):
-        self.add_argument(
-            "--processes",
-            type=positive(int),
-            default=2,
-            metavar="N",
-            help="processes, of one thread each (%(default)s)",
-        )
+        self.add_number("processes", "processes, of one thread each", 2)
+
+
+def n_scenes(options):
+    """How many scenes the options of `Parser.add_scenes` ask for."""
+    return options.scenes or options.scenes_by_default[options.quick]
 
 
 def positive(kind):

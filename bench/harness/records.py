@@ -7,6 +7,7 @@ import json
 import math
 import os
 import platform
+import re
 from importlib.metadata import version
 
 from clresample import __version__, get_device
@@ -31,8 +32,14 @@ def record(threads):
     }
 
 
+def columns(text):
+    """A table's columns, (field, width, format of numbers) each, from "name:6 flux:8.2f"."""
+    found = (re.fullmatch(r"(\w+):(\d+)(.*)", word).groups() for word in text.split())
+    return tuple((name, int(width), form) for name, width, form in found)
+
+
 def print_head(columns):
-    """Print the names of a table's columns, each (field, width, format of numbers)."""
+    """Print the names of a table's columns."""
     print("  ".join(name.rjust(width) for name, width, _ in columns), flush=True)
 
 
@@ -45,28 +52,44 @@ def print_row(columns, row):
     print("  ".join(cells), flush=True)
 
 
-def judged(columns, found, record, path):
-    """Rows, each with whether it is `good`, printed as they are found and written to a JSON file.
+def show(columns, found, record, path, *, summarise=None, below=None, order=None, **more):
+    """Print a record, then rows as they are found; write all to a JSON file.
 
-    What is said `about` one that is not has a line of its own, unless it is a column. path: the
-    file, or None. Returns the rows and how many of them are not good.
+    path: the file, or None
+    summarise: from all rows to the groups of figures that are printed at the end
+    below: prints more of a row, below it
+    order: the key by which rows are sorted before the end
+    more: further entries of the file
+    returns the rows
     """
     print_record(record)
     print_head(columns)
-    rows, in_line = [], "about" in [name for name, *_ in columns]
+    rows = []
     for row in found:
         rows.append(row)
         print_row(columns, row)
-        if not row["good"] and not in_line:
-            print(f"  {row['about']}", flush=True)
+        if below is not None:
+            below(row)
+    if order is not None:
+        rows.sort(key=order)
+    if summarise is not None:
+        more["summary"] = summarise(rows)
+        print_summary(more["summary"])
     if path is not None:
-        write_json(path, {"record": record, "rows": rows})
-    return rows, sum(not row["good"] for row in rows)
+        write_json(path, {"record": record, "rows": rows, **more})
+    return rows
 
 
 def print_stages(row):
-    """Print the seconds of a row's stages in one line below it."""
-    print("  " + ", ".join(f"{name} {s:.2f} s" for name, s in row["stage"].items()), flush=True)
+    """Print the seconds of a row's stages, where it has some, in one line below it."""
+    if row["stage"]:
+        print("  " + ", ".join(f"{name} {s:.2f} s" for name, s in row["stage"].items()), flush=True)
+
+
+def print_lines(texts):
+    """Print texts below a row, a line each."""
+    for text in texts:
+        print(f"    {text}", flush=True)
 
 
 def print_record(record):

@@ -11,7 +11,6 @@ A run continues where it was interrupted; more galaxies add to those that are th
 from __future__ import annotations
 
 import numpy as np
-from tqdm import tqdm
 
 from clresample.simulation.sdr import sdr
 
@@ -43,11 +42,9 @@ def run_chunks(cases, options, log):
     ]
     total = sum(stop - start for _, start, stop in chunks)
     there = total - sum(stop - start for *_, start, stop in missing)
-    with tqdm(total=total, initial=there, unit=" stamps", desc="accuracy") as bar:
-        for task, rows in in_processes(measure, missing, options.processes):
-            case, _, start, stop = task
-            log.append(key(case, start), rows)
-            bar.update(stop - start)
+    given = measure, missing, options.processes
+    for task, rows in in_processes(*given, lambda task: task[3] - task[2], there, "stamps"):
+        log.append(key(task[0], task[2]), rows)
 
 
 def key(case, start):
@@ -238,14 +235,11 @@ def main(options):
 
 
 def parser():
-    parser = Parser("bench.paper.accuracy", description=__doc__.splitlines()[0])
+    parser = Parser(__doc__)
     parser.add_surveys()
     parser.add_galaxies(1000)
-    parser.add_argument(
-        "--wide",
-        action="store_true",
-        help=f"cut the stamps from drawings of {FIELD_ARCSEC:g} arcsec, so that no light folds in",
-    )
+    about = f"cut the stamps from drawings of {FIELD_ARCSEC:g} arcsec, so that no light folds in"
+    parser.add_flag("wide", about)
     parser.add_processes()
     parser.add_folder()
     return parser

@@ -15,14 +15,13 @@ interrupted; more scenes add to those that are there.
 from __future__ import annotations
 
 import numpy as np
-from tqdm import tqdm
 
 from clresample.deblending.batch import deblend_many
 from clresample.deblending.settings import Settings
 
 from ..harness import records, scenes
-from ..harness.clock import in_processes, on_one_thread
-from ..harness.options import Parser, positive, run
+from ..harness.clock import in_chunks, in_processes, on_one_thread
+from ..harness.options import Parser, run
 from . import figures, report, sersic
 from .joint_bins import SINGLES, bin_galaxies, summarise
 
@@ -67,14 +66,12 @@ def _profiles(scene):
 def run_scenes(options, log):
     """Fit the scenes that the log lacks, in several processes, each on one thread."""
     missing = [seed for seed in range(options.scenes) if (seed,) not in log.done]
-    chunks = [missing[i : i + CHUNK] for i in range(0, len(missing), CHUNK)]
-    tasks = [(options.catalogue, chunk) for chunk in chunks]
+    tasks = [(options.catalogue, chunk) for chunk in in_chunks(missing, CHUNK)]
     there = options.scenes - len(missing)
-    with tqdm(total=options.scenes, initial=there, unit=" scenes", desc="joint") as bar:
-        for (_, seeds), parts in in_processes(measure, tasks, options.processes):
-            for seed, part in zip(seeds, parts, strict=True):
-                log.append((seed,), part)
-            bar.update(len(seeds))
+    done = in_processes(measure, tasks, options.processes, lambda task: len(task[1]), there)
+    for (_, seeds), parts in done:
+        for seed, part in zip(seeds, parts, strict=True):
+            log.append((seed,), part)
 
 
 def collect(log):
@@ -147,14 +144,9 @@ def main(options):
 
 
 def parser():
-    parser = Parser("bench.paper.joint", description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--scenes",
-        type=positive(int),
-        default=200,
-        metavar="N",
-        help="how many scenes there shall be in all; the paper has 2315 (%(default)s)",
-    )
+    parser = Parser(__doc__)
+    about = "how many scenes there shall be in all; the paper has 2315"
+    parser.add_number("scenes", about, 200)
     parser.add_catalogue()
     parser.add_processes()
     parser.add_folder()

@@ -4,8 +4,8 @@
 
 Each benchmark of the paper writes FOLDER/NAME.json, NAME as in `SECTIONS`, and its figures: the
 record, where, when and with what it ran, and its numbers.  The report is made from these files
-alone, so that its sentences can change without a new run.  A benchmark that has not run is left
-out.
+alone, so that its sentences can change without a new run: report.md, the statements, and
+details.md, a section for each run.  A benchmark that has not run is left out.
 """
 
 from __future__ import annotations
@@ -71,8 +71,9 @@ INTRODUCTION = """\
 
 What Joseph, Melchior & Moolekamp, *Joint survey processing: combined resampling and convolution
 for galaxy modelling and deblending*, state about their scheme, each statement beside what was found
-here; then what this project asks of itself; then figures and tables. Every sentence and verdict is
-computed from the runs' numbers, which lie beside this page as JSON.
+here; then what this project asks of itself. Every sentence and verdict is computed from the runs'
+numbers. `make paper` measures them and writes figures, tables and the machine's record beside this
+page, in details.md, with the numbers as JSON; of these only this page is kept.
 
 - **Ours** is `Resampler`, in float32 where float64 is not named. **The paper's scheme** is the
   paper's own factorisation on OpenCL, `PaperResampler`. **GalSim's default** interpolates with a
@@ -85,8 +86,8 @@ computed from the runs' numbers, which lie beside this page as JSON.
 - A statement that **does not hold** fails for one of three reasons, named beside it: we are better
   than the statement says; the statement is about another setting or start than the run's; or we
   fall short of it.
-- The paper has 10 000 galaxies and 2315 blended scenes; how many were run here is written in the
-  details of each section."""
+- The paper has 10 000 galaxies and 2315 blended scenes; the Makefile says how many
+  `make paper` runs."""
 PAPER = """\
 ## The paper's statements
 
@@ -105,7 +106,7 @@ TARGETS = """\
 
 What this project asks of itself, in the paper's setting and others; the paper states none of it."""
 DETAILS = """\
-## Details
+# The paper's evidence, recomputed: details
 
 A section for each run: what it ran on, its figures and its tables."""
 
@@ -134,17 +135,21 @@ def load(folder):
     return {name: records.read_json(path) for name, path in paths.items() if path.exists()}
 
 
-def markdown(results):
-    """The report as text; results: as `load` returns them."""
+def statements(results):
+    """The page of the statements as text; results: as `load` returns them."""
     entries = _entries(results)
     of_paper = [entry for entry in entries if entry.finding.claim.label]
     lines = [INTRODUCTION, "", PAPER]
-    lines += _statements([entry for entry in of_paper if not entry.section.departs])
+    lines += _statements([entry for entry in of_paper if not entry.section.departs], results)
     lines += _elsewhere([entry for entry in of_paper if entry.section.departs])
     lines += _targets([entry for entry in entries if not entry.finding.claim.label])
-    lines += ["", DETAILS]
-    section = None
-    for entry in entries:
+    return "\n".join(lines) + "\n"
+
+
+def details(results):
+    """The page with a section for each run as text; results: as `load` returns them."""
+    lines, section = [DETAILS], None
+    for entry in _entries(results):
         if entry.section is not section:
             section = entry.section
             lines += _record(section.title, results[section.name]["record"])
@@ -159,7 +164,7 @@ def _entries(results):
     return [_Entry(s, f, verdict(f, s.departs, originals.get(f.claim))) for s, f in found]
 
 
-def _statements(entries):
+def _statements(entries, results):
     """The paper's statements in its own setting, a table for each of its sections."""
     for section in dict.fromkeys(entry.section for entry in entries):
         rows = [
@@ -173,7 +178,9 @@ def _statements(entries):
             if entry.section is section
             for f in [entry.finding]
         ]
-        yield from ("", f"### {section.title}", "")
+        record = results[section.name]["record"]
+        run_on = f"{record['date'][:10]}, {record['device']}, clresample {record['clresample']}."
+        yield from ("", f"### {section.title}", "", f"Measured on {run_on}", "")
         yield from _table(["the paper says", "its number", "here", "what was found"], rows)
 
 
@@ -208,7 +215,7 @@ def _targets(entries):
 
 def _record(title, record):
     """The head of a section of details."""
-    yield from ("", f"### {title}", "")
+    yield from ("", f"## {title}", "")
     yield from ("<details><summary>Device, versions, date</summary>", "")
     yield from (f"- {name}: {value}" for name, value in record.items())
     yield from ("", "</details>")
@@ -217,7 +224,7 @@ def _record(title, record):
 def _details(entry):
     """One finding with its figure and table."""
     finding, claim = entry.finding, entry.finding.claim
-    yield from ("", f"#### {claim.title}" + (f" (`{claim.label}`)" if claim.label else ""))
+    yield from ("", f"### {claim.title}" + (f" (`{claim.label}`)" if claim.label else ""))
     if finding.figure:
         yield from ("", f"![{claim.title}]({finding.figure})")
     yield from ("", f"*{'The paper' if claim.label else 'Our target'}:* {claim.text}", "")
@@ -236,13 +243,14 @@ def main(options):
     results = load(options.folder)
     if not results:
         raise BadOption(f"--folder {options.folder} holds no results yet")
-    path = options.folder / "report.md"
-    records.write_text(path, markdown(results))
-    print(f"{path}: {', '.join(results)}")
+    for name, page in {"report": statements, "details": details}.items():
+        path = options.folder / f"{name}.md"
+        records.write_text(path, page(results))
+        print(f"{path}: {', '.join(results)}")
 
 
 def parser():
-    parser = Parser("bench.paper.report", description=__doc__.splitlines()[0])
+    parser = Parser(__doc__)
     parser.add_folder()
     return parser
 

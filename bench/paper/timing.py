@@ -134,7 +134,7 @@ def main(options):
 
 
 def parser():
-    parser = Parser("bench.paper.timing", description=__doc__.splitlines()[0])
+    parser = Parser(__doc__)
     parser.add_sizes(SIZES)
     parser.add_seconds(1.0, "case")
     parser.add_surveys()

@@ -34,9 +34,10 @@ def checkout(tmp_path_factory):
             "render",
             ("--sizes", "20", "--pairs", "EUCLID-RUBIN", "--galaxies", "1", "--seconds", "0.01"),
         ),
-        (
-            "deblend",
-            ("--scenes", "1", "--max-iter", "2", "--views", "upright", "--batches", "1"),
+        (  # by worker processes
+            "ladder",
+            ("--only", "single", "--modes", "one", "--scenes", "1", "--n", "1", "--re", "2")
+            + ("--snr", "100", "--processes", "2"),
         ),
     ],
 )

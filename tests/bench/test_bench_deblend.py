@@ -1,10 +1,10 @@
-"""The benchmarks of deblending on a few scenes: rows, summaries, runs that go on, bad options."""
+"""The benchmarks of deblending on a few scenes: rows, summaries, runs that go on."""
 
 import json
 
 import numpy as np
 import pytest
-from helpers.checkout import run_python
+from helpers.benches import run_bench
 
 pytest.importorskip("galsim")
 
@@ -20,15 +20,9 @@ BATCH_ROW = {
 }  # fmt: skip
 
 
-def run(module, *options):
-    result = run_python("-m", f"bench.{module}", *options)
-    assert result.returncode == 0, result.stderr
-    return result.stdout
-
-
 def test_deblend(tmp_path):
     file = tmp_path / "deblend.json"
-    text = run(
+    text = run_bench(
         "deblend", *SHORT, "--seed", "2", "--views", "upright", "turned", "--batches", "1", "2",
         "--json", str(file),
     )  # fmt: skip
@@ -62,9 +56,9 @@ def test_joint_goes_on_where_it_ended(tmp_path):
     from bench.paper import joint_findings
 
     options = ("--processes", "1", "--folder", str(tmp_path))
-    run("paper.joint", "--scenes", "1", *options)
+    run_bench("paper.joint", "--scenes", "1", *options)
     one = (tmp_path / "joint.jsonl").read_text()
-    text = run("paper.joint", "--scenes", "2", *options)
+    text = run_bench("paper.joint", "--scenes", "2", *options)
     two = (tmp_path / "joint.jsonl").read_text()
     assert two.startswith(one)
     assert two.count("\n") == 3  # settings and two scenes
@@ -86,24 +80,3 @@ def test_sersic_profiles_are_found():
     image = 5 * np.exp(-0.5 * ((y / 4) ** 2 + (x / 2) ** 2) ** (1 / 1.6))
     found = sersic.fit(image, np.array([30.0, 33.0]))
     assert np.abs(found / found.max() - image / image.max()).max() < 0.02
-
-
-@pytest.mark.parametrize(
-    ("module", "options", "words"),
-    [
-        ("deblend", ("--scenes", "0"), "0 is not above 0"),
-        ("deblend", ("--seed", "-1"), "-1 is below 0"),
-        ("deblend", ("--views", "upside-down"), "upside-down"),
-        ("deblend", ("--max-iter", "few"), "few"),
-        ("deblend", ("--catalogue", "nowhere"), "nowhere"),
-        ("deblend", ("--json", "."), "--json ."),
-        ("paper.joint", ("--scenes", "none"), "none"),
-        ("paper.joint", ("--catalogue", "nowhere", "--folder", "."), "nowhere"),
-    ],
-)
-def test_bad_options_get_one_line(module, options, words):
-    result = run_python("-m", f"bench.{module}", *options)
-    assert result.returncode == 2
-    assert result.stdout == ""
-    assert result.stderr.count("\n") == 1
-    assert words in result.stderr

@@ -1,6 +1,5 @@
 """`bench.field`: a small field end to end, and what its figures count."""
 
-import json
 import os
 import signal
 import subprocess
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from astropy import units as u
 from astropy.table import QTable
-from helpers.checkout import run_python
+from helpers.benches import bench_json
 
 from bench import field
 from bench.harness import judged, memory, photometry
@@ -105,10 +104,7 @@ def test_a_small_field(tmp_path):
     pytest.importorskip("galsim")
     pytest.importorskip("sep")
     given = ["--quick", "--sizes", "160", "--density", "90", "--seed", "3", "--workers", "1"]
-    # in a process of its own: a bench starts itself anew with its threads set
-    result = run_python("-m", "bench.field", *given, "--json", str(tmp_path / "rows.json"))
-    assert result.returncode == 0, result.stderr
-    (row,) = json.loads((tmp_path / "rows.json").read_text())["rows"]
+    (row,) = bench_json(tmp_path, "field", *given)["rows"]
     assert row.keys() >= {name for name, *_ in field.COLUMNS} | {"stage"}
     assert row["n_sources"] > 3 and "converged" in row["status"]
     assert row["core_s_per_source"] > 0 and row["peak_gb"] > 0.1

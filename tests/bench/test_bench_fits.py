@@ -1,12 +1,11 @@
 """The benchmarks of accuracy, errors and cost on the smallest configurations: rows, failures."""
 
-import json
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.checkout import run_python
+from helpers.benches import bench_json
 
 pytest.importorskip("galsim")
 
@@ -38,10 +37,7 @@ SETTINGS = {
 
 def run(folder, module, *options):
     """Rows that a benchmark writes."""
-    file = folder / f"{module}.json"
-    result = run_python("-m", f"bench.{module}", *map(str, options), "--json", str(file))
-    assert result.returncode == 0, result.stderr
-    found = json.loads(file.read_text())
+    found = bench_json(folder, module, *options)
     assert found["record"].keys() >= RECORD
     return found["rows"]
 
@@ -225,34 +221,6 @@ def test_settings(tmp_path):
         assert row["against"] == 0
     for row in rows:
         assert 0 <= row["worse"] <= 1
-
-
-@pytest.mark.parametrize(
-    ("module", "options", "words"),
-    [
-        ("coverage", ("--scenes", "0"), "0 is not above 0"),
-        ("coverage", ("--modes", "hst"), "hst"),
-        ("coverage", ("--catalogue", "nowhere"), "nowhere"),
-        ("throughput", ("--blends", "7"), "7"),
-        ("throughput", ("--limit", "-1"), "-1 is not above 0"),
-        ("settings", ("--settings", "best"), "best"),
-        ("real", ("--galaxies", "many"), "many"),
-        ("real", ("--json", "."), "--json ."),
-    ],
-)
-def test_bad_options_get_one_line(module, options, words):
-    result = run_python("-m", f"bench.{module}", *options)
-    assert result.returncode == 2
-    assert result.stderr.count("\n") == 1
-    assert words in result.stderr
-
-
-@pytest.mark.usefixtures("data")
-def test_scenes_that_are_not_there():
-    result = run_python("-m", "bench.real", "--only", "m87")
-    assert result.returncode == 2
-    assert result.stderr.count("\n") == 1
-    assert "--only" in result.stderr
 
 
 def test_noise(tmp_path):

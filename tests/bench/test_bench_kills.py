@@ -1,15 +1,15 @@
-"""`bench.kills` in small: what it kills, and that it finds what is not whole."""
+"""`bench.kills commands` in small: what it kills, and that it finds what is not whole."""
 
 import json
 
 import pytest
 
-from bench import kills
+from bench.kills import commands as kills
 
 
 def test_killed_runs_leave_all_or_nothing():
     pytest.importorskip("galsim")
-    rows = list(kills.kills(1, ["example"], 0))
+    rows = list(kills.kills(1, 0, ["example"]))
     assert [(row["command"], row["over"]) for row in rows] == [
         ("example", False),
         ("example", True),

@@ -1,12 +1,11 @@
 """The benchmark of galaxies of all sizes: rows, truth, what counts as silently wrong."""
 
-import json
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from astropy.table import Table
-from helpers.checkout import run_python
+from helpers.benches import bench_json
 
 pytest.importorskip("galsim")
 
@@ -16,17 +15,9 @@ LADDER = {
 }  # fmt: skip
 
 
-def run(folder, *options):
-    """What the benchmark writes."""
-    file = folder / "ladder.json"
-    result = run_python("-m", "bench.ladder", *map(str, options), "--json", str(file))
-    assert result.returncode == 0, result.stderr
-    return json.loads(file.read_text())
-
-
 def test_ladder(tmp_path):
-    found = run(
-        tmp_path, "--only", "single,star_as_galaxy", "--modes", "one", "--scenes", 1,
+    found = bench_json(
+        tmp_path, "ladder", "--only", "single,star_as_galaxy", "--modes", "one", "--scenes", 1,
         "--n", 1, "--re", 2, 3, "--snr", 100, "--processes", 1,
     )  # fmt: skip
     rows = found["rows"]
@@ -148,14 +139,3 @@ def test_every_case_draws_its_sources_in_the_frame():
             place = source.pixel(image.grid)
             assert (place > 10).all()
             assert (place < np.array(image.grid.shape) - 11).all()
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [(("--only", "single,comet"), "comet"), (("--snr", "-3"), "-3 is not above 0")],
-)
-def test_bad_options_get_one_line(options, words):
-    result = run_python("-m", "bench.ladder", *options)
-    assert result.returncode == 2
-    assert result.stderr.count("\n") == 1
-    assert words in result.stderr

@@ -1,6 +1,5 @@
-"""`bench.scaling`, `bench.faults` and `bench.on_paper`: what their figures count."""
+"""`bench.scaling`, `bench.kills` and `bench.on_paper`: what their figures count."""
 
-import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,9 +7,10 @@ import pytest
 from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable
-from helpers.checkout import run_python
+from helpers.benches import bench_json
 
-from bench import faults, on_paper, scaling
+from bench import on_paper, scaling
+from bench.kills import fields
 
 
 def turn(n_round, seat, began, ended):
@@ -46,7 +46,7 @@ def test_one_tile_of_a_compressed_image_is_damaged_and_no_other(tmp_path):
     given = {"compression_type": "GZIP_2", "quantize_level": 0, "tile_shape": (1, 64, 90)}
     hdus = [fits.PrimaryHDU(), fits.CompImageHDU(image, name="SCI", **given)]
     fits.HDUList(hdus).writeto(path)
-    assert faults.damage(path) == (192, 8)
+    assert fields.damage(path) == (192, 8)
     with fits.open(path) as hdus:
         np.testing.assert_array_equal(hdus["SCI"].section[0, :192], image[0, :192])
         with pytest.raises((OSError, ValueError, RuntimeError)):
@@ -58,7 +58,7 @@ def test_differences_are_counted_in_errors():
     clean["flux_err_i"] = [0.1, 0.1, 0.1] * u.uJy
     rows = clean[:2].copy()
     rows["flux_i"][1] = 2.03 * u.uJy
-    missing, worst = faults.compared(rows, clean)
+    missing, worst = fields.compared(rows, clean)
     assert missing == 1 and worst == pytest.approx(0.3)
 
 
@@ -71,14 +71,13 @@ def test_the_page_holds_what_follows_from_its_figures():
     assert "| Rubin patch, 10' x 10' | 3,600 | 1 | 3,600 |" in other
 
 
-def test_a_small_field_by_workers(tmp_path):
+def test_a_small_field_by_workers(tmp_path, monkeypatch):
     pytest.importorskip("galsim")
     pytest.importorskip("sep")
     given = ["--quick", "--sizes", "160", "--density", "90", "--seed", "3"]
-    # in a process of its own: a bench starts itself anew with its threads set
-    result = run_python("-m", "bench.scaling", *given, "--json", str(tmp_path / "rows.json"))
-    assert result.returncode == 0, result.stderr
-    one, two = json.loads((tmp_path / "rows.json").read_text())["rows"]
+    for name in ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT"):  # set for the workers
+        monkeypatch.setenv(name, "1")
+    one, two = bench_json(tmp_path, "scaling", *given)["rows"]
     assert one.keys() == two.keys() >= {name for name, *_ in scaling.COLUMNS}
     assert one["n_sources"] == two["n_sources"] == two["measured"] > 3
     assert one["speed_up"] == 1 and 0 < two["own_cost"] < 1 and two["peak_gb"] > 0.1

@@ -1,10 +1,8 @@
 """The benchmark of spoilt input: rows, ways of spoiling, words that name them."""
 
-import json
-
 import numpy as np
 import pytest
-from helpers.checkout import run_python
+from helpers.benches import bench_json
 
 pytest.importorskip("galsim")
 
@@ -14,17 +12,9 @@ SPOILT = {
 }  # fmt: skip
 
 
-def run(folder, *options):
-    """What the benchmark writes."""
-    file = folder / "spoilt.json"
-    result = run_python("-m", "bench.spoilt", *map(str, options), "--json", str(file))
-    assert result.returncode == 0, result.stderr
-    return json.loads(file.read_text())
-
-
 def test_spoilt(tmp_path):
-    found = run(
-        tmp_path, "--scenes", "sim", "--only", "nothing", "listed twice",
+    found = bench_json(
+        tmp_path, "spoilt", "--scenes", "sim", "--only", "nothing", "listed twice",
         "a band without weight", "--clean", 1, "--processes", 1,
     )  # fmt: skip
     rows = {row["spoilt"]: row for row in found["rows"]}
@@ -114,14 +104,3 @@ def test_ways_of_spoiling_do_what_they_say():
         scene.observations[0].data * scene.observations[0].weights ** 0.5,
         rtol=1e-5,
     )
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [(("--only", "rain"), "rain"), (("--scenes", "m87"), "m87")],
-)
-def test_bad_options_get_one_line(options, words):
-    result = run_python("-m", "bench.spoilt", *options)
-    assert result.returncode == 2
-    assert result.stderr.count("\n") == 1
-    assert words in result.stderr

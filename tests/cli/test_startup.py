@@ -3,6 +3,8 @@
 import pytest
 from helpers.checkout import run_python
 
+from clresample.cli import main
+
 # Each takes a tenth of a second or more, some half a second.
 SLOW = {"numpy", "scipy", "astropy", "pyopencl", "matplotlib", "PIL", "galsim", "sep", "tqdm"}
 # Parts of these that a fit with a catalogue has no use for.
@@ -43,11 +45,18 @@ def test_devices_imports_opencl_and_numpy_only():
     assert imported("devices") & SLOW == {"numpy", "pyopencl"}
 
 
-@pytest.mark.parametrize("figure", [True, False])
-def test_a_fit_imports_what_it_uses(tmp_path, figure):
+@pytest.fixture(scope="module")
+def example(tmp_path_factory):
+    """The scene file of the example."""
     pytest.importorskip("galsim")
-    imported("deblend", "--example", tmp_path)
-    arguments = ["deblend", tmp_path / "scene.toml", "-o", tmp_path / "out", "--max-iter", 3]
+    folder = tmp_path_factory.mktemp("example")
+    assert main(["deblend", "--example", str(folder)]) == 0
+    return folder / "scene.toml"
+
+
+@pytest.mark.parametrize("figure", [True, False])
+def test_a_fit_imports_what_it_uses(example, tmp_path, figure):
+    arguments = ["deblend", example, "-o", tmp_path / "out", "--max-iter", 3]
     if figure:
         pytest.importorskip("matplotlib")
     else:

@@ -40,28 +40,36 @@ def test_every_column_has_its_unit_and_a_description(done):
     assert blends["seconds"].unit == "s"
 
 
-def test_a_run_leaves_no_decoded_rows(sky, tmp_path):
-    """They may be hundreds of megabytes, which a notebook would hold to its end."""
+@pytest.fixture(scope="module")
+def packed(sky, tmp_path_factory):
+    """A run over Euclid's compressed image alone: its folder, the channel, rows that it left."""
+    folder = tmp_path_factory.mktemp("packed")
     (euclid,) = mosaics_of(sky)[:1]
     (channel,) = euclid.channels
     pixels = channel.data.read(Box.of(euclid.grid.shape))
     lossless = {"compression_type": "GZIP_2", "quantize_level": 0}
-    fits.CompImageHDU(pixels, **lossless).writeto(tmp_path / "packed.fits")
-    packed = replace(channel, data=FilePlane(tmp_path / "packed.fits", 1))
+    fits.CompImageHDU(pixels, **lossless).writeto(folder / "packed.fits")
+    channel = replace(channel, data=FilePlane(folder / "packed.fits", 1))
     options = FieldOptions(passes=1, threshold=7.0)
-    run_field([replace(euclid, channels=(packed,))], tmp_path / "out", options=options)
-    assert STRIPS.n_bytes == 0
-    packed.data.read(Box(0, 0, 9, 9))
+    (folder / "in.txt").write_text("input")
+    about = {"inputs": {"x": folder / "in.txt"}}
+    given = {"options": options, "about": about}
+    run_field([replace(euclid, channels=(channel,))], folder / "out", **given)
+    return folder / "out", channel, STRIPS.n_bytes
+
+
+def test_a_run_leaves_no_decoded_rows(packed):
+    """They may be hundreds of megabytes, which a notebook would hold to its end."""
+    _, channel, n_bytes = packed
+    assert n_bytes == 0
+    STRIPS.clear()
+    channel.data.read(Box(0, 0, 9, 9))
     assert STRIPS.n_bytes > 0  # they would have been kept
     STRIPS.clear()
 
 
-def test_the_provenance_says_what_was_read_and_with_what(sky, tmp_path):
-    (tmp_path / "in.txt").write_text("input")
-    options = FieldOptions(passes=1, threshold=7.0)
-    about = {"inputs": {"x": tmp_path / "in.txt"}}
-    run_field(mosaics_of(sky)[:1], tmp_path / "out", options=options, about=about)
-    found = json.loads((tmp_path / "out" / "provenance.json").read_text())
+def test_the_provenance_says_what_was_read_and_with_what(packed):
+    found = json.loads((packed[0] / "provenance.json").read_text())
     assert found["inputs"]["x"]["sha256"] == hashlib.sha256(b"input").hexdigest()
     assert found["clresample"] == clresample.__version__
     assert found["packages"]["numpy"] == np.__version__ and found["device"] and found["system"]

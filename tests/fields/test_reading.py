@@ -162,7 +162,7 @@ def test_commands_from_simulation_to_catalogue_in_worker_processes(tmp_path, cap
     pytest.importorskip("galsim")
     pytest.importorskip("sep")
     sky, out = tmp_path / "sky", tmp_path / "out"
-    size = ["--size", "160", "--density", "90", "--bands", "i", "--seed", "3"]
+    size = ["--size", "112", "--density", "120", "--bands", "i", "--seed", "3"]
     assert main(["simulate", "field", "-o", str(sky), *size]) == 0
     assert main(["simulate", "field", "-o", str(sky)]) == 2  # kept
     command = ["field", str(sky / "field.toml"), "-o", str(out), "--quiet"]

@@ -1,13 +1,16 @@
 """A headless Chromium that is driven over a pipe, by its own DevTools protocol."""
 
+import atexit
 import base64
 import contextlib
+import functools
 import json
 import os
 import select
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 
 NAMES = "chromium", "chromium-browser", "google-chrome", "chrome"
@@ -33,16 +36,16 @@ os.execv(sys.argv[3], sys.argv[3:])
 PATIENCE_S = 60.0  # for one answer: machines that run other tests beside are slow
 
 
-class Browser:
-    """One page in a browser of its own; a context manager.
+class _Chromium:
+    """The one browser of this process, with a session for each page; it ends as its pipe does.
 
-    folder: for the browser's profile; size: of the window [px]; dark: which colours the user likes
-    messages: errors and warnings of the console, and requests that left the machine
+    pages: {session: Browser}
     """
 
-    def __init__(self, folder, *, size=(1400, 1000), dark=False, script=True):
+    def __init__(self):
         (theirs_in, self.out), (self.into, theirs_out) = os.pipe(), os.pipe()
-        words = [BROWSER, f"--user-data-dir={folder}", *OPTIONS]
+        self.folder = tempfile.TemporaryDirectory(prefix="browser-", ignore_cleanup_errors=True)
+        words = [BROWSER, f"--user-data-dir={self.folder.name}", *OPTIONS]
         self.process = subprocess.Popen(
             [sys.executable, "-c", WRAPPER, str(theirs_in), str(theirs_out), *words],
             pass_fds=(theirs_in, theirs_out),
@@ -52,9 +55,66 @@ class Browser:
         )
         os.close(theirs_in)
         os.close(theirs_out)
-        self.buffer, self.number, self.session, self.messages = b"", 0, None, []
-        target = self.ask("Target.createTarget", url="about:blank")["targetId"]
+        self.buffer, self.number, self.pages = b"", 0, {}
+        atexit.register(self.close)
+
+    def close(self):
+        with contextlib.suppress(OSError, AssertionError):
+            self.ask("Browser.close")
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(10)
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        os.close(self.out)
+        os.close(self.into)
+
+    def ask(self, method, session=None, **parameters):
+        """The answer to a request; what pages say meanwhile is noted by them."""
+        self.number += 1
+        request = {"id": self.number, "method": method, "params": parameters}
+        if session:
+            request["sessionId"] = session
+        os.write(self.out, json.dumps(request).encode() + b"\0")
+        while True:
+            answer = self._next()
+            if answer.get("id") == self.number:
+                assert "error" not in answer, (method, answer["error"])
+                return answer["result"]
+            if page := self.pages.get(answer.get("sessionId")):
+                page.note(answer)
+
+    def _next(self):
+        end = time.monotonic() + PATIENCE_S
+        while b"\0" not in self.buffer:
+            ready, _, _ = select.select([self.into], [], [], max(0, end - time.monotonic()))
+            assert ready, "the browser does not answer"
+            piece = os.read(self.into, 1 << 16)
+            assert piece, "the browser has ended"
+            self.buffer += piece
+        text, _, self.buffer = self.buffer.partition(b"\0")
+        return json.loads(text)
+
+
+@functools.cache
+def _chromium():
+    return _Chromium()
+
+
+class Browser:
+    """One page with a profile of its own; a context manager.
+
+    size: of the window [px]; dark: which colours the user likes
+    messages: errors and warnings of the console, and requests that left the machine
+    """
+
+    def __init__(self, *, size=(1400, 1000), dark=False, script=True):
+        self.chromium, self.session, self.messages = _chromium(), None, []
+        self.profile = self.ask("Target.createBrowserContext")["browserContextId"]
+        own = {"browserContextId": self.profile}
+        target = self.ask("Target.createTarget", url="about:blank", **own)["targetId"]
         self.session = self.ask("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        self.chromium.pages[self.session] = self
         for room in ("Page", "Runtime", "Log", "Network"):
             self.ask(f"{room}.enable")
         width, height = size
@@ -74,43 +134,15 @@ class Browser:
         return self
 
     def __exit__(self, *error):
+        del self.chromium.pages[self.session]
         with contextlib.suppress(OSError, AssertionError):
-            self.session = None
-            self.ask("Browser.close")
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(10)
-        if self.process.poll() is None:
-            self.process.kill()
-            self.process.wait()
-        os.close(self.out)
-        os.close(self.into)
+            self.chromium.ask("Target.disposeBrowserContext", browserContextId=self.profile)
 
     def ask(self, method, **parameters):
         """The answer to a request."""
-        self.number += 1
-        request = {"id": self.number, "method": method, "params": parameters}
-        if self.session:
-            request["sessionId"] = self.session
-        os.write(self.out, json.dumps(request).encode() + b"\0")
-        while True:
-            answer = self._next()
-            if answer.get("id") == self.number:
-                assert "error" not in answer, (method, answer["error"])
-                return answer["result"]
-            self._note(answer)
+        return self.chromium.ask(method, self.session, **parameters)
 
-    def _next(self):
-        end = time.monotonic() + PATIENCE_S
-        while b"\0" not in self.buffer:
-            ready, _, _ = select.select([self.into], [], [], max(0, end - time.monotonic()))
-            assert ready, "the browser does not answer"
-            piece = os.read(self.into, 1 << 16)
-            assert piece, "the browser has ended"
-            self.buffer += piece
-        text, _, self.buffer = self.buffer.partition(b"\0")
-        return json.loads(text)
-
-    def _note(self, event):
+    def note(self, event):
         """Keep what a page should never do."""
         given = event.get("params", {})
         match event.get("method"):
@@ -124,6 +156,11 @@ class Browser:
                 url = given["request"]["url"]
                 if not url.startswith(("file:", "data:", "about:")):
                     self.messages.append(f"asks for {url}")
+
+    def save_into(self, folder):
+        """Let the page save files there."""
+        where = {"behavior": "allow", "downloadPath": str(folder)}
+        self.ask("Browser.setDownloadBehavior", browserContextId=self.profile, **where)
 
     def open(self, path, anchor=""):
         """Show a file, and wait until all of it is there."""

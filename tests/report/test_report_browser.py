@@ -26,9 +26,9 @@ def page(tmp_path_factory):
 
 
 @pytest.fixture
-def browser(tmp_path, page):
+def browser(page):
     """A browser that shows it, drawn; at its end it must have complained of nothing."""
-    with Browser(tmp_path) as one:
+    with Browser() as one:
         one.open(page[0])
         one.until(DRAWN)
         yield one
@@ -150,9 +150,9 @@ def test_tables_are_sorted_and_lead_to_sources(browser, page):
     assert "#source-" in browser.value("location.hash")
 
 
-def test_colours_follow_the_user_and_the_button(tmp_path, page):
+def test_colours_follow_the_user_and_the_button(page):
     paper = "getComputedStyle(document.body).backgroundColor"
-    with Browser(tmp_path, dark=True) as browser:
+    with Browser(dark=True) as browser:
         browser.open(page[0])
         browser.until(DRAWN)
         dark = browser.value(paper)
@@ -161,8 +161,8 @@ def test_colours_follow_the_user_and_the_button(tmp_path, page):
         assert browser.messages == []
 
 
-def test_without_a_script_the_tables_are_there(tmp_path, page):
-    with Browser(tmp_path, script=False, size=(1400, 4000)) as browser:
+def test_without_a_script_the_tables_are_there(page):
+    with Browser(script=False, size=(1400, 4000)) as browser:
         browser.open(page[0])
         root = browser.ask("DOM.getDocument", depth=-1)["root"]["nodeId"]
         for selector, there in (("#sources tbody tr", True), (".live canvas", False)):
@@ -179,7 +179,7 @@ def test_a_page_without_images_marks_its_sources(tmp_path, page):
     shutil.copytree(page[0].parent, folder)
     for path in folder.glob("*_*.fits"):
         path.unlink()
-    with Browser(tmp_path / "profile") as browser:
+    with Browser() as browser:
         browser.open(write_report(folder).path)
         browser.until(f"({ROOT}.dataset.drawn ?? '') === '0 tiles, 12 marks'")
         assert browser.value("document.getElementById('scale-text').textContent").endswith(" px")
@@ -190,7 +190,7 @@ def test_hostile_names_run_nothing(tmp_path):
     bad = "</script><script>pwned=1</script><img src=x onerror=pwned=2>"
     names = {"<b>E": ("<i onclick=pwned=3>",), "R": ("&lt;",)}
     rows = write_folder(tmp_path / "run", instruments=names, status={0: ("failed", bad)})
-    with Browser(tmp_path / "profile") as browser:
+    with Browser() as browser:
         browser.open(write_report(tmp_path / "run").path, f"#source-{rows['id'][0]}")
         browser.until(DRAWN)
         browser.until(f"Boolean({ROOT}.dataset.stamps)")
@@ -210,7 +210,7 @@ def test_hostile_names_run_nothing(tmp_path):
 def test_a_broken_page_is_noticed(tmp_path, page, old, new):
     path = tmp_path / "broken.html"
     path.write_text(page[0].read_text().replace(old, new))
-    with Browser(tmp_path / "profile") as browser:
+    with Browser() as browser:
         browser.open(path)
         browser.value("new Promise((done) => setTimeout(done, 500))")
         errors = browser.value(f"{ROOT}.dataset.errors")

@@ -54,10 +54,8 @@ def page(tmp_path_factory):
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory, page):
     """A browser that shows the page, with a folder that takes what it saves."""
-    folder = tmp_path_factory.mktemp("browser")
-    with Browser(folder / "profile", size=(1400, 1100)) as one:
-        one.saved = folder / "saved"
-        one.saved.mkdir()
+    with Browser(size=(1400, 1100)) as one:
+        one.saved = tmp_path_factory.mktemp("saved")
         yield one
 
 
@@ -66,8 +64,7 @@ def browser(shared, page):
     """That browser with a fresh page; at its end the page must have complained of nothing."""
     shared.open(page[0], f"?{time.monotonic()}")
     shared.until(f"({ROOT}.drawn ?? '').includes('tiles')")
-    where = {"behavior": "allow", "downloadPath": str(shared.saved)}
-    shared.ask("Browser.setDownloadBehavior", **where)
+    shared.save_into(shared.saved)
     yield shared
     assert shared.value(f"{ROOT}.errors") == "0" and shared.messages == []
 
@@ -353,8 +350,8 @@ def test_regions_and_pictures_are_saved(browser, page):
     assert len(regions.Regions.parse("\n".join(lines), format="ds9")) == len(rows)
 
 
-def test_nothing_is_wider_than_a_phone(tmp_path, page):
-    with Browser(tmp_path, size=(390, 800)) as browser:
+def test_nothing_is_wider_than_a_phone(page):
+    with Browser(size=(390, 800)) as browser:
         browser.open(page[0], f"#source-{page[1]['id'][0]}")
         browser.until(f"Boolean({ROOT}.shown)")
         choose(browser, "compare", "layers")

@@ -1,4 +1,9 @@
-"""What `bench.soak` does to a field beside killing it.
+"""Fields killed, starved and damaged: whether they end with the same catalogue whatever happens.
+
+A small simulated field is run once undisturbed. Then, each time in a new folder, the command or one
+of its workers is killed (SIGKILL) at a random moment; a run that was killed is resumed, and killed
+again with one chance in two. At the end the catalogue must be the undisturbed one, byte for byte.
+Five more runs follow:
 
 disk       the output folder is a small file system of its own, which fills up; each time it gets
            twice the room, and the run goes on. Where none may be mounted, no file may be larger
@@ -11,6 +16,14 @@ memory     the device has a tenth of this machine's memory, and a worker process
 write      the run is killed whenever one more of its files is being written, until WRITES of them
            were left unfinished. The catalogue must be the same
 hang       a worker is stopped (SIGSTOP) and never goes on. The catalogue must be the same
+
+Columns:
+
+what       "run" or "worker": what was killed; or one of these faults
+at         when, as part of the undisturbed run's time
+kills      how often it was killed, or was ended by what it met
+parts      groups of fits that were on disk when that came
+same, good whether the catalogue is the same, and whether all is as it must be; about: what was seen
 """
 
 from __future__ import annotations
@@ -25,6 +38,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
@@ -33,12 +47,17 @@ from astropy.table import QTable
 from clresample import simulate_field
 from clresample.cli.simulate import write_field
 
-from .harness.memory import children
-from .harness.options import ROOT
+from ..harness import records
+from ..harness.memory import children
+from ..harness.options import ROOT
+
+TIMES, WORKERS = 30, 2
+SIZE, DENSITY = 192, 120  # [px, arcmin^-2]: some ten sources, in fits of several sizes
+COLUMNS = records.columns("what:6 at:5.2f kills:5d parts:5d same:5 good:5 about:40")
 
 LOOK_S = 0.02
 NEAR = 0.1  # [errors] of a flux: what batches of other sizes change is under a hundredth
-FIRST_ROOM = 128 << 10  # [bytes] of the file system that fills up
+FIRST_ROOM = 512 << 10  # [bytes] of the file system that fills up
 WRITES = 5  # unfinished files, each of which the next run must clear away
 SOON_S = 1e-3  # [s] between two looks for a file that is being written, which takes some ms
 HANGS_S = 30.0  # [s] after which a worker is taken to hang
@@ -50,13 +69,13 @@ TALL, AWAY_PX = 384, 144
 TILES = "\n[field]\ntile_px = 64\noverlap_px = 16\n"
 
 
-def start(sky, out, *options, environment=None, before=None):
+def start(sky, out, *options, workers=None, environment=None, before=None):
     """The command, begun; it goes on where a run in this folder has begun. For its errors see
     `told`: a file holds them, since a pipe that nobody reads would stop it when full."""
     if (out / "work" / "run.json").exists():
         options = *options, "--resume"
     words = [sys.executable, "-m", "clresample.cli", "field", sky / "field.toml", "-o", out]
-    words += ["--workers", 2, "--quiet", *options]
+    words += ["--workers", WORKERS if workers is None else workers, "--quiet", *options]
     errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - read when the process has ended
     process = subprocess.Popen(
         [str(word) for word in words],
@@ -160,13 +179,13 @@ def damaged_tile(sky, out, whole, took_s):
         with open(folder / "field.toml", "a") as file:
             file.write(TILES)
     first, _ = damage(bad / "euclid.fits")
-    start(good, out.with_name("clean")).wait()
-    process = start(bad, out)
+    start(good, out.with_name("clean"), workers=0).wait()
+    process = start(bad, out, workers=0)
     kills = kill_at(process, took_s * 0.6, "run", random.Random(0))
     process.wait()
     parts = parts_in(out)
     if kills:
-        process = start(bad, out)
+        process = start(bad, out, workers=0)
         process.wait()
     rows, clean = (QTable.read(f / "catalogue.fits") for f in (out, out.with_name("clean")))
     lost = json.loads((out / "provenance.json").read_text())["failed_tiles"]
@@ -273,3 +292,40 @@ FAULTS = {
     "write": killed_writing,
     "hang": hanging,
 }
+
+
+def disturbed(sky, out, whole, took_s, what, rng):
+    """One row: a run that is killed at random, or has its workers killed, and ends."""
+    at = rng.random()
+    process, kills = start(sky, out), 0
+    kills += kill_at(process, at * took_s, what, rng)
+    parts = parts_in(out)
+    status = process.wait()
+    while status != 0:
+        if status != -signal.SIGKILL:
+            said = told(process)
+            raise RuntimeError(f"exit status {status} after {kills} kills of a {what}: {said}")
+        process = start(sky, out)
+        if rng.random() < 0.5:
+            kills += kill_at(process, rng.random() * took_s, "run", rng)
+        status = process.wait()
+    same = same_bytes(out, whole)
+    return {"what": what} | row_of(same, same, "", kills, parts, at)
+
+
+def soak(times, seed, faults):
+    """Rows of so many runs that are killed, whole runs and single workers by turns; then faults."""
+    with tempfile.TemporaryDirectory() as folder:
+        folder = Path(folder)
+        sky, whole = folder / "sky", folder / "whole"
+        given = {"rubin_bands": ("i",), "clustering": 0.4, "psf_variation": 0.1}
+        write_field(sky, simulate_field(1, n_pixels=SIZE, density=DENSITY, **given))
+        began = time.monotonic()
+        if start(sky, whole).wait() != 0:
+            raise RuntimeError("the undisturbed run failed")
+        took_s = time.monotonic() - began
+        for i in range(times):
+            what, rng = ("run", "worker")[i % 2], random.Random(f"{seed} {i}")
+            yield disturbed(sky, folder / f"out{i}", whole, took_s, what, rng)
+        for what in faults:
+            yield {"what": what} | FAULTS[what](sky, folder / what, whole, took_s)

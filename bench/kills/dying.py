@@ -1,6 +1,6 @@
 """`clresample` that ends in the midst of its writing, at a moment that is told beforehand.
 
-    python -m bench.harness.dying LOG FOLDER MOMENT N_BYTES COMMAND ...
+    python -m bench.kills.dying LOG FOLDER MOMENT N_BYTES COMMAND ...
 
 A moment is what the process is about to do in the folder: to open a file that it writes, to move,
 link or remove one, to make or remove a folder; they are counted from 1, and LOG gets a line each.

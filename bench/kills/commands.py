@@ -1,9 +1,7 @@
 """Every command killed while it writes: whether its outputs are whole, as a set, and can be redone.
 
-    python -m bench.kills [--each N] [--commands NAME ...] [--json FILE]
-
 Each command is run undisturbed, into an empty place and over files that are there (--overwrite);
-then killed N times in each way, spread over all that it does in its folder, see harness/dying.py:
+then killed so many times in each way, spread over all that it does in its folder, see dying.py:
 with SIGKILL as it opens, moves, links or removes something, and by turns in the midst of a file.
 
 command    what was run; over: over files that were there
@@ -33,19 +31,12 @@ from astropy.table import Table
 
 from clresample.files.atomic import check_folder
 
-from .harness import records
-from .harness.clock import on_all_cores
-from .harness.options import ROOT, Parser, run, seed
+from ..harness import records
+from ..harness.options import ROOT
 
-EACH = 4
+TIMES = 4
 MAX_BYTES = 600  # of a file that is cut short: less than any output has
-COLUMNS = (
-    ("command", 8, ""),
-    ("over", 5, ""),
-    ("moment", 58, ""),
-    ("left", 6, ""),
-    ("good", 5, ""),
-)
+COLUMNS = records.columns("command:8 over:5 moment:58 left:6 good:5")
 OLD = b"what was there before\n"
 # what differs from one run to the next: times in headers, tables and JSON
 TIMES = "DATE", "CHECKSUM", "DATASUM", "written", "seconds"
@@ -72,6 +63,9 @@ def commands(base):
     }
 
 
+NAMES = tuple(commands(Path()))
+
+
 def prepare(base, names):
     """The inputs of these commands."""
     after = {"report", "cutout"}
@@ -92,7 +86,7 @@ def ended(log, out, moment, n_bytes, words):
     """(exit status, standard error) of the command, which dies at a moment unless that is 0."""
     given = [str(word).replace("OUT", str(out)) for word in words]
     done = subprocess.run(
-        [sys.executable, "-m", "bench.harness.dying", log, out.parent, *map(str, (moment, n_bytes))]
+        [sys.executable, "-m", "bench.kills.dying", log, out.parent, *map(str, (moment, n_bytes))]
         + given,
         cwd=ROOT,
         capture_output=True,
@@ -247,7 +241,7 @@ def moments_of(way, n, rng):
     return found
 
 
-def kills(each, names, seed_of_kills):
+def kills(times, seed, names):
     """Rows of all commands of these names, killed so many times in each way."""
     with tempfile.TemporaryDirectory() as scratch:
         base = Path(scratch)
@@ -256,38 +250,8 @@ def kills(each, names, seed_of_kills):
             for over in (False, True) if name in names else ():
                 folder = base / f"{name}-{over}"
                 folder.mkdir()
-                way, rng = Way(name, words, folder, over), random.Random(f"{seed_of_kills} {name}")
-                for moment, n_bytes in moments_of(way, each, rng):
+                way, rng = Way(name, words, folder, over), random.Random(f"{seed} {name}")
+                for moment, n_bytes in moments_of(way, times, rng):
                     row = way.killed(moment, n_bytes)
                     if row is not None:
                         yield row
-
-
-def main(options):
-    record = records.record(on_all_cores()) | {"kills": f"seed {options.seed}"}
-    found = kills(options.each, options.commands, options.seed)
-    rows, bad = records.judged(COLUMNS, found, record, options.json)
-    print(f"{len(rows)} kills inside writes, {bad} not as they must be")
-    if bad:
-        sys.exit(1)
-
-
-def parser():
-    parser = Parser("bench.kills", description=__doc__.splitlines()[0])
-    every = list(commands(Path()))
-    parser.add_argument(
-        "--each", type=seed, default=EACH, metavar="N", help="kills in each way (%(default)s)"
-    )
-    parser.add_argument(
-        "--commands", nargs="+", default=every, choices=every, metavar="NAME",
-        help=f"{', '.join(every)} (all)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--seed", type=seed, default=0, metavar="S", help="of the moments (%(default)s)"
-    )
-    parser.add_json()
-    return parser
-
-
-if __name__ == "__main__":
-    run(main, parser())
