@@ -13,6 +13,7 @@ from clresample.deblending.start.population import (
     GALAXY_SCATTER,
     LEARNED,
     NEIGHBOUR_MODEL_ERROR,
+    OWN_LIGHT,
     SCENE_SCATTER,
     TAILS,
     PopulationPrior,
@@ -132,7 +133,9 @@ def test_shapes_are_doubted_for_the_light_of_other_sources():
     expected = []
     for i in range(3):
         others = seen.sum(1) - seen[:, i]
-        expected.append((others * seen[:, i]).sum() ** 2 / (seen[:, i] ** 2).sum())
+        own = (seen[:, i] ** 2).sum()
+        expected.append(max((others * seen[:, i]).sum() - OWN_LIGHT * own, 0) ** 2 / own)
+    assert np.count_nonzero(expected) >= 2
     found = contamination_factors(normal, light[None], source)[0]
     np.testing.assert_allclose(found, 1 + NEIGHBOUR_MODEL_ERROR**2 * np.array(expected))
     # components of one source do not doubt each other, and one without light is not doubted

@@ -21,6 +21,8 @@ POSITION_PX = 0.1
 # their errors in 59 % of cases. HALO = 0.02 adds 0.02 to the coverage of sizes and 0.025 to that of
 # fluxes above signal to noise 300, which is too much then; twice or half the CORE adds nothing.
 CORE, HALO = 0.1, 0.01
+# Which of a galaxy's modes, its last ones, are its four shape parameters.
+SHAPE_MODES = np.arange(-8, -4)
 
 
 # A box ends where its profile is under the noise of a pixel. What lies beyond is followed for half

@@ -15,9 +15,10 @@ weights of the start (spectra.MODEL_ERROR) count that as independent noise of ea
 nearly cancels over a whole galaxy. With u a galaxy's whitened image, all channels in one, and M
 that of all other sources, an error in M changes the light of u by
 
-    E = NEIGHBOUR_MODEL_ERROR <u, M> / |u|
+    E = NEIGHBOUR_MODEL_ERROR max(0, <u, M> - OWN_LIGHT <u, u>) / |u|
 
-in units of its error, so that the variance of its shape is 1 + E^2 times that of the data alone.
+in units of its error, so that the variance of its shape is 1 + E^2 times that of the data alone. Of
+two galaxies that are alike each has its own light in the data, and neither shape is doubted.
 The prior on its shape is made stronger by that factor instead, which has the same effect and leaves
 its neighbours' shapes unchanged. A faint galaxy beside a bright one then has the expected shape;
 the bright one's own data outweigh the prior. Stars have no shape, and their positions are fixed by
@@ -55,6 +56,10 @@ TAILS = np.array([4.0, 1e6, 1e6, 4.0])
 # 3000, 4000 and 5000). With 0.5 two bright galaxies on top of each other, a merger in HSC's images,
 # keep shapes that are wrong.
 NEIGHBOUR_MODEL_ERROR = 0.2
+# Light of neighbours, as a part of a galaxy's own at its place, that leaves no doubt of its shape.
+# Of pairs of equals 98 % of the fluxes are right with 0.5, 94 % with 1 or 2, and 85 % with 0, where
+# both keep the shapes that are expected (24 scenes of bench.ladder, pair, seed 101).
+OWN_LIGHT = 0.5
 
 
 class PopulationPrior:
@@ -136,8 +141,9 @@ def contamination_factors(normal, spectra, source):
     light = spectra[:, :, :, None] * normal * spectra[:, :, None]
     own = np.einsum("kcii->ki", light)
     beside = np.einsum("kcij,kij->ki", light, source[:, :, None] != source[:, None])
+    beyond = np.maximum(beside - OWN_LIGHT * own, 0)
     return 1 + NEIGHBOUR_MODEL_ERROR**2 * np.divide(
-        beside**2, own, out=np.zeros_like(own), where=own > 0
+        beyond**2, own, out=np.zeros_like(own), where=own > 0
     )
 
 
