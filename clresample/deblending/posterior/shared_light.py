@@ -32,6 +32,9 @@ from .profile_modes import SHAPE_MODES
 
 # Least variance of a parameter under the posterior: a smaller one is rounding.
 MIN_VARIANCE = 1e-12
+# Part of its flux by which the doubt of a component's shape moves that at most: farther away fluxes
+# do not follow the slopes, and what gets twice as large as expected is seen.
+MAX_DOUBT = 0.5
 
 
 def shape_doubts(posterior, owner, n_sources) -> np.ndarray:
@@ -58,8 +61,10 @@ def shape_doubts(posterior, owner, n_sources) -> np.ndarray:
             out[owner[j]][:, column[i]] += slopes[j] @ block[at[i]].T
     for i in doubted:
         known = posterior.covariance.block(i, i)[at[i][:, None], at[i]]
-        root = _added_root(known, factors[i])
-        out[..., column[i]] = out[..., column[i]] @ root
+        moved = out[..., column[i]] @ _added_root(known, factors[i])
+        own = np.linalg.norm(solution.spectra[i] * slopes[i][0, layout.n_modes[i]])
+        most = MAX_DOUBT * own / max(np.linalg.norm(moved[owner[i]]), 1e-30)
+        out[..., column[i]] = min(1.0, most) * moved
     return out
 
 
