@@ -133,8 +133,11 @@ def test_shapes_are_doubted_for_the_light_of_other_sources():
     expected = []
     for i in range(3):
         others = seen.sum(1) - seen[:, i]
-        own = (seen[:, i] ** 2).sum()
-        expected.append(max((others * seen[:, i]).sum() - OWN_LIGHT * own, 0) ** 2 / own)
+        own, beside = (seen[:, i] ** 2).sum(), (seen * seen[:, i, None]).sum(axis=(0, 2))
+        alike = np.minimum(1, np.sqrt(own / (seen**2).sum(axis=(0, 2))))
+        beside[i] = 0
+        held = OWN_LIGHT * own * (beside @ alike) / beside.sum()
+        expected.append(max((others * seen[:, i]).sum() - held, 0) ** 2 / own)
     assert np.count_nonzero(expected) >= 2
     found = contamination_factors(normal, light[None], source)[0]
     np.testing.assert_allclose(found, 1 + NEIGHBOUR_MODEL_ERROR**2 * np.array(expected))
