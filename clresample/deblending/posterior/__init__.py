@@ -10,8 +10,10 @@ smooth_modes.py and profile_modes.py; aligned_observation.py renders them from t
 normal.py sums H and block_matrix.py factorises and inverts it; posterior.py derives errors from
 it. bound_bias.py computes the bias from S >= 0 in fluxes and sizes: H^-1 times the gradient at the
 bound. There, and only there, errors of sources that leave structure in the residuals, as
-residuals.py measures it, are made larger; errors.py is what a Result keeps, from which sampling.py
-draws. Imports solver and sky, the profiles and views of deblending, none of its fits.
+residuals.py measures it, are made larger; shared_light.py adds what the fit assumes of the division
+of light between neighbours; errors.py is what a Result keeps, from which sampling.py
+draws. Imports solver and sky, the profiles and views of deblending and what start/population.py
+doubts, none of its fits.
 
 Not in these errors, since no likelihood knows it: errors of the PSFs, of the model in bright
 galaxies (Settings.flux_floor stands for both), and of the bounds of spectra at 0.
