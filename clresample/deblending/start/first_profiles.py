@@ -68,6 +68,8 @@ def profile_grid(looking, thetas, error) -> dict:
 def first_profiles(fit, error):
     """Sets the parameters of large galaxies of a ProfileFit, which are at their means.
 
+    Returns their components.
+
     error: part of the light that adds to the noise
     """
     looking, thetas = fit.looking, fit.thetas()
@@ -90,6 +92,7 @@ def first_profiles(fit, error):
             models = fit.fit_part(models, large, np.unique(looking.scene[list(new)]))
     for i in large:
         fit.theta[looking.scene[i], looking.index[i], : len(models[i])] = models[i]
+    return np.array(sorted(large), int)
 
 
 def _next(looking, models, rest, error):

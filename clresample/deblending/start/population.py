@@ -57,10 +57,10 @@ TAILS = np.array([4.0, 1e6, 1e6, 4.0])
 # 3000, 4000 and 5000). With 0.5 two bright galaxies on top of each other, a merger in HSC's images,
 # keep shapes that are wrong.
 NEIGHBOUR_MODEL_ERROR = 0.2
-# Light of neighbours, as a part of a galaxy's own at its place, that leaves no doubt of its shape.
-# Of pairs of equals 98 % of the fluxes are right with 0.5, 94 % with 1 or 2, and 85 % with 0, where
-# both keep the shapes that are expected (24 scenes of bench.ladder, pair, seed 101).
-OWN_LIGHT = 0.5
+# Light of alike neighbours, as a part of a galaxy's own at its place, that leaves no doubt of its
+# shape. With 0.5 one of 12 pairs of equals has half of its light in the other one, with 0 one in
+# five (bench.ladder, pair, seeds 101 and 303).
+OWN_LIGHT = 1.5
 
 
 class PopulationPrior:

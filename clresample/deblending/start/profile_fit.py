@@ -31,6 +31,7 @@ class ProfileFit:
     source (B, n): to which each component belongs, -1 where there is none
     theta, chi2 (B,): of the last steps that gained; looking.spectra, looking.sky: theirs
     brightness (N,): of the components, see `thresholds`
+    large (B,): scenes with galaxies found larger than expected
     """
 
     def __init__(self, looking: LinearisedScenes, noise):
@@ -43,7 +44,7 @@ class ProfileFit:
         self.source = np.full(size[:2], -1)
         self.source[self.at] = [c.source for c in looking.components]
         self.theta, self.chi2 = self.population.mean.copy(), np.full(size[0], np.inf)
-        self.brightness = np.zeros(len(shapes))
+        self.brightness, self.large = np.zeros(len(shapes)), np.zeros(size[0], bool)
         self.right = np.zeros((size[0], size[1] * size[2]))
         self.normal = np.zeros((*self.right.shape, self.right.shape[1]))
 
@@ -57,13 +58,37 @@ class ProfileFit:
         looking, scenes = self.looking, np.arange(len(self.theta))
         self._look(scenes, self.theta, slopes=False)
         looking.solve(MODEL_ERROR)
-        first_profiles(self, MODEL_ERROR)
+        self.large[looking.scene[first_profiles(self, MODEL_ERROR)]] = True
         self._take(np.arange(len(self.theta)))
 
     def run(self):
         """Step until all scenes have ended."""
         some = [(self.counts[self.looking.scene == b] > 0).any() for b in range(len(self.theta))]
         self._step(np.flatnonzero(some), np.ones(self.source.shape, bool), N_STEPS, learn=True)
+        self._look_again(
+            np.flatnonzero(self.large & (self.population.contamination > 1).any(axis=1))
+        )
+
+    def _look_again(self, scenes):
+        """Fits some scenes once more without doubt of their shapes, and keeps what is better.
+
+        Better is a lower chi2 with the priors, doubted as it is there: where one of two alike has
+        taken the other one's light, this one's shape is doubted only because it has.
+        """
+        if not len(scenes):
+            return
+        looking, doubt = self.looking, self.population.contamination
+        before = self.theta.copy(), self.chi2.copy(), doubt.copy(), looking.sky.copy()
+        spectra = looking.spectra.copy()
+        self._take(scenes, doubt=False)
+        self._step(scenes, np.ones(self.source.shape, bool), N_STEPS)
+        self._take(scenes)
+        worse = scenes[~(self.chi2[scenes] < before[1][scenes])]
+        for now, old in zip((self.theta, self.chi2, doubt, looking.sky), before, strict=True):
+            now[worse] = old[worse]
+        back = np.isin(looking.scene, worse)
+        looking.spectra[back] = spectra[back]
+        self._measure_brightness(self.theta)
 
     def fit_part(self, thetas, free, scenes):
         """Fits profiles of some components without the others; their parameters, as `thetas`.
@@ -82,13 +107,19 @@ class ProfileFit:
         fit._step(scenes, moves, N_FIRST_STEPS)
         return thetas | dict(zip(here, fit.thetas(), strict=True))
 
-    def _take(self, scenes):
-        """Solves some scenes at their present parameters and stores the inputs of a step."""
+    def _take(self, scenes, *, doubt=True):
+        """Solves some scenes at their present parameters and stores the inputs of a step.
+
+        doubt: of shapes beside other sources, or none of them
+        """
         if len(scenes):
             self._measure_brightness(self.theta)
             self._look(scenes, self.theta, slopes=True)
             self.looking.solve(MODEL_ERROR)
-            self._doubt(scenes)
+            if doubt:
+                self._doubt(scenes)
+            else:
+                self.population.contamination[scenes] = 1
             self.chi2[scenes] = self._chi2(scenes, self.theta)
             self._take_equations(scenes)
 
