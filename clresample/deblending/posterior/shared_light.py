@@ -16,7 +16,7 @@ profile fits, and is as uncertain as it is large: of component t at the place of
     e = A_t <p, S_t - a p_t> / <p, p> sum p,    a = <S_t, p_t> / <p_t, p_t>
 
 moves from one source to the other. Without these two parts 2 in 100 satellites of giant galaxies
-were over 5 % and 5 sigma off with no flag, and none of 108 with them (bench.ladder).
+were over 5 % and 5 sigma off with no flag, and none of 32 with them (bench.ladder).
 """
 
 from __future__ import annotations
