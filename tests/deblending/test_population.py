@@ -13,12 +13,14 @@ from clresample.deblending.start.population import (
     GALAXY_SCATTER,
     LEARNED,
     NEIGHBOUR_MODEL_ERROR,
+    OWN_LIGHT,
     SCENE_SCATTER,
     TAILS,
     PopulationPrior,
     contamination_factors,
     em_step,
 )
+from clresample.deblending.start.profile_fit import ProfileFit
 
 
 def shrunk(data, noise, mean, scatter):
@@ -124,6 +126,7 @@ def test_shapes_are_doubted_for_the_light_of_other_sources():
     """By what a neighbour's light counts in units of the noise, seen as the galaxy sees its own."""
     rng = np.random.default_rng(2)
     images, light = rng.uniform(0, 1, (2, 3, 40)), rng.uniform(1, 9, (2, 3))  # channels, components
+    light[:, 1] *= 30
     images[:, 2, :20] = 0
     images[:, 0, 20:] = 0  # the first one and the third one have no pixel in common
     source = np.array([[0, 1, 2]])
@@ -132,13 +135,18 @@ def test_shapes_are_doubted_for_the_light_of_other_sources():
     expected = []
     for i in range(3):
         others = seen.sum(1) - seen[:, i]
-        expected.append((others * seen[:, i]).sum() ** 2 / (seen[:, i] ** 2).sum())
+        own, beside = (seen[:, i] ** 2).sum(), (seen * seen[:, i, None]).sum(axis=(0, 2))
+        alike = np.minimum(1, np.sqrt(own / (seen**2).sum(axis=(0, 2))))
+        beside[i] = 0
+        held = OWN_LIGHT * own * (beside @ alike) / beside.sum()
+        expected.append(max((others * seen[:, i]).sum() - held, 0) ** 2 / own)
+    assert np.count_nonzero(expected) >= 2
     found = contamination_factors(normal, light[None], source)[0]
     np.testing.assert_allclose(found, 1 + NEIGHBOUR_MODEL_ERROR**2 * np.array(expected))
     # components of one source do not doubt each other, and one without light is not doubted
     np.testing.assert_allclose(contamination_factors(normal, light[None], 0 * source), 1)
-    dark = contamination_factors(normal, light[None] * [0, 1, 1], source)[0]
-    assert dark[0] == 1 and dark[1] < found[1]
+    dark = contamination_factors(normal, light[None] * [1, 0, 1], source)[0]
+    assert dark[1] == 1 and (dark[[0, 2]] < found[[0, 2]]).all()
 
 
 def test_doubt_holds_a_galaxy_as_if_its_data_said_less():
@@ -208,3 +216,23 @@ def test_a_faint_galaxy_takes_less_of_what_is_wrong_with_a_bright_one(device, mo
     assert before > 1.2 and after < 0.5 * before
     # that of the bright one hardly changes
     np.testing.assert_allclose(shapes[1][0], shapes[0][0], atol=0.1)
+
+
+@pytest.mark.parametrize("spoilt", [False, True])
+def test_two_bright_galaxies_that_are_alike_have_their_own_shapes(device, monkeypatch, spoilt):
+    """Each is known by its own light, though the other one has as much at its place; also where one
+    of them had become small and doubted."""
+    pair = ((26, 24), (3000, 2500, 2100), 6.0), ((28, 27), (3000, 2500, 2100), 6.0)
+
+    def run(fit):
+        fit.theta[0, 1] = np.log(1.5), 0, 0, np.log(6.5)
+        fit._take(np.arange(1))
+        assert fit.large.all() and fit.population.contamination[0, 1] > 10
+        fit._look_again(np.arange(1))
+
+    if spoilt:
+        monkeypatch.setattr(ProfileFit, "run", run)
+    one = Fit(blend(pair, shape=(56, 56), seed=6), Settings(), device, np.float32, pad=1)
+    start_fits([one])
+    wanted = (np.log(6.0), 0.2, -0.1)
+    np.testing.assert_allclose([theta[:3] for theta in one.start.thetas], [wanted] * 2, atol=0.02)

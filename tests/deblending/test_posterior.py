@@ -10,7 +10,7 @@ from helpers.scenes import BRIGHT, blend
 
 from clresample.deblending.batch import deblend, deblend_many
 from clresample.deblending.inspection.inspect import InputWarning
-from clresample.deblending.posterior import aligned_observation
+from clresample.deblending.posterior import aligned_observation, posterior
 from clresample.deblending.posterior.moments import moment_derivatives
 from clresample.deblending.settings import Settings
 from clresample.files import results as store
@@ -51,6 +51,7 @@ def test_the_error_of_a_lone_source_is_the_dense_one(device, monkeypatch):
 
 
 def test_blended_sources_exchange_light(device, monkeypatch):
+    monkeypatch.setattr(posterior, "with_shared_light", lambda errors, *_: errors)
     kept = capture(monkeypatch)
     result = scenes.fit(blend(PAIR), device, settings=BARE)
     for i in (0, 1):

@@ -10,8 +10,9 @@ smooth_modes.py and profile_modes.py; aligned_observation.py renders them from t
 normal.py sums H and block_matrix.py factorises and inverts it; posterior.py derives errors from
 it. bound_bias.py computes the bias from S >= 0 in fluxes and sizes: H^-1 times the gradient at the
 bound. Only posterior.py widens the errors of sources with structure in their residuals, as measured
-by residuals.py. errors.py has the classes that a Result stores; sampling.py draws from them.
-Imports solver and sky, the profiles and views of deblending, not its fits.
+by residuals.py; shared_light.py adds the assumptions of the fit on the division of light between
+neighbours. errors.py has the classes that a Result stores; sampling.py draws from them.
+Imports solver and sky, the profiles and views of deblending and start/population.py, not its fits.
 
 These errors do not include errors of the PSFs and of the model in bright galaxies
 (Settings.flux_error_floor accounts for both), nor the effect of the bounds of spectra at 0.

@@ -18,6 +18,7 @@ from .modes import FLOOR_EXPONENT, Solution, clipped_power
 from .moments import moment_derivatives
 from .normal import UnknownLayout, normal_matrix
 from .residuals import channel_residuals, misfit_error_scale
+from .shared_light import exchanged_light, shape_doubts, with_shared_light
 
 # Smallest relative error of a spectrum at fixed morphology: smaller ones are rounding errors.
 MIN_ERROR = 1e-9
@@ -81,7 +82,7 @@ class Posterior:
             flux_error_floor: see Settings
         """
         n_sources, wide = len(residuals), misfit_error_scale(residuals)
-        flux, slopes = self._fluxes(owner, n_sources)
+        flux, slopes = self.fluxes(owner, n_sources)
         n_channels = len(unit)
         between = np.zeros((n_channels, n_sources, n_sources))
         colour = np.zeros((n_sources, n_channels, n_channels))
@@ -125,7 +126,7 @@ class Posterior:
         wide = misfit_error_scale(residuals)[owner]
         return PosteriorSampler(self.modes, self.factor, unit, wide, self.layout.ties)
 
-    def _fluxes(self, owner, n_sources):
+    def fluxes(self, owner, n_sources):
         """Fluxes (S, C), and each component's slopes (C, k + B) of its own by its unknowns."""
         s, slopes, ties = self.solution, [], self.layout.ties
         of_channels = np.eye(self.layout.n_channels) if ties is None else ties.matrix
@@ -198,6 +199,8 @@ def with_errors(fit, result, peaks, seen):
     fit.note_seconds("errors", time.perf_counter() - began)
     cores = core_errors(result, fit.settings.psf_error)
     errors = with_core_errors(widened(errors, outside), cores)
+    doubts = shape_doubts(posterior, owner, len(result.sources)) * fit.unit[:, None]
+    errors = with_shared_light(errors, doubts, exchanged_light(result, start.source, fit.scene))
     return noted(result, errors=errors, draws=draws)
 
 

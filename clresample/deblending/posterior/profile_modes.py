@@ -23,6 +23,8 @@ POSITION_PX = 0.1
 # coverage of sizes by 0.02 and that of fluxes above signal to noise 300 by 0.025, which is then too
 # high. Twice or half the CORE has no effect.
 CORE, HALO = 0.1, 0.01
+# Which of a galaxy's modes, its last ones, are its four shape parameters.
+SHAPE_MODES = np.arange(-8, -4)
 
 
 # A box ends where its profile is below the noise of a pixel. Light beyond the box is summed on

@@ -71,9 +71,11 @@ class ProfileFit:
         scenes = self._with_large_galaxies()
         if len(scenes):
             self._run_from_large_galaxies(scenes)
+            doubted = (self.population.contamination[scenes] > 1).any(axis=1)
+            self._run_without_doubt(scenes[doubted])
 
-    def _run(self, scenes):
-        self._step(scenes, np.ones(self.source.shape, bool), N_STEPS, learn=True)
+    def _run(self, scenes, *, learn=True):
+        self._step(scenes, np.ones(self.source.shape, bool), N_STEPS, learn=learn)
 
     def _with_large_galaxies(self):
         """Selects the scenes (k,) that may hold large galaxies, or whose data are unexplained."""
@@ -83,26 +85,49 @@ class ProfileFit:
 
     def _run_from_large_galaxies(self, scenes):
         """Fits some scenes again from profiles of large galaxies; the better fit of each stays."""
-        looking, here = self.looking, np.isin(self.looking.scene, scenes)
-        first = self.theta[scenes], looking.spectra[here], looking.sky[scenes]
-        before = self._chi2_as_expected(scenes)
+        before, chi2 = self._copy(), self._chi2_as_expected(scenes)
         self.theta[scenes] = self.expected.mean[scenes]
         self.population.reset(scenes, self.expected)
         self._look(scenes, self.theta, slopes=False)
-        looking.solve(MODEL_ERROR)
+        self.looking.solve(MODEL_ERROR)
         first_profiles(self, scenes, MODEL_ERROR)
         self._take(scenes)
         self._run(scenes)
-        worse = before <= self._chi2_as_expected(scenes)
-        back = np.isin(looking.scene[here], scenes[worse])
-        self.theta[scenes[worse]], looking.sky[scenes[worse]] = first[0][worse], first[2][worse]
-        looking.spectra[np.flatnonzero(here)[back]] = first[1][back]
-        self._measure_brightness(self.theta)
+        self._restore(before, scenes[chi2 <= self._chi2_as_expected(scenes)])
 
     def _chi2_as_expected(self, scenes):
         """Chi2 (k,) with the priors as they were before any scene was fitted."""
         learned = self.population.penalty(scenes, self.theta)
         return self.chi2[scenes] - learned + self.expected.penalty(scenes, self.theta)
+
+    def _run_without_doubt(self, scenes):
+        """Fits some scenes again without contamination of their shapes; the better fit stays.
+
+        The better fit has the lower chi2 with the priors, which include the contamination by the
+        neighbours of that fit. If one of two similar galaxies has the other one's light, the
+        other one's shape is contaminated only for this reason.
+        """
+        if len(scenes):
+            before = self._copy()
+            self._take(scenes, doubt=False)
+            self._run(scenes, learn=False)
+            self._take(scenes)
+            self._restore(before, scenes[before[0][scenes] <= self.chi2[scenes]])
+
+    def _copy(self):
+        """Copies of chi2, theta, spectra, sky and the prior."""
+        looking = self.looking
+        arrays = self.chi2, self.theta, looking.spectra, looking.sky
+        return *(a.copy() for a in arrays), deepcopy(self.population)
+
+    def _restore(self, before, scenes):
+        """Restores some scenes (k,) from a `_copy`."""
+        looking, (chi2, theta, spectra, sky, population) = self.looking, before
+        here = np.isin(looking.scene, scenes)
+        self.chi2[scenes], self.theta[scenes] = chi2[scenes], theta[scenes]
+        looking.spectra[here], looking.sky[scenes] = spectra[here], sky[scenes]
+        self.population.reset(scenes, population)
+        self._measure_brightness(self.theta)
 
     def fit_part(self, thetas, free, scenes):
         """Fits profiles of some components without the others; their parameters, as `thetas`.
@@ -121,13 +146,19 @@ class ProfileFit:
         fit._step(scenes, moves, N_FIRST_STEPS)
         return thetas | dict(zip(here, fit.thetas(), strict=True))
 
-    def _take(self, scenes):
-        """Solves some scenes at their present parameters and stores the inputs of a step."""
+    def _take(self, scenes, *, doubt=True):
+        """Solves some scenes at their present parameters and stores the inputs of a step.
+
+        doubt: of shapes beside other sources, or none of them
+        """
         if len(scenes):
             self._measure_brightness(self.theta)
             self._look(scenes, self.theta, slopes=True)
             self.looking.solve(MODEL_ERROR)
-            self._doubt(scenes)
+            if doubt:
+                self._doubt(scenes)
+            else:
+                self.population.contamination[scenes] = 1
             self.chi2[scenes] = self._chi2(scenes, self.theta)
             self._take_equations(scenes)
 

@@ -168,7 +168,8 @@ class GroupResultsFile:
 
 def last_rounds(tables) -> dict:
     """{fit_id: number of the table with its last round}; tables: rows of PATCH_COLUMNS of parts."""
-    last, n_round = {}, {}
+    last: dict[int, int] = {}
+    n_round: dict[int, int] = {}
     for i, rows in enumerate(tables):
         for patch, one in zip(rows["fit_id"].tolist(), rows["n_refits"].tolist(), strict=True):
             if one >= n_round.get(patch, -1):
