@@ -39,8 +39,6 @@ LARGE, LARGE_ITERATIONS = 500_000, 250
 # errors, as about a star that is far from its PSF, with dozens of peaks. Large galaxies with clumps
 # have up to 10 in a first fit.
 MAX_CHI2 = 100.0
-# The round in which pieces' residuals are searched; the next one fits what is found there.
-SEARCHED = 1
 NO_ANSWER = "no longer answers"  # in the message of a device that is gone with all its memory
 POSITIONS = ("y", "x", "y_centroid", "x_centroid")  # columns in pixels of a fit's frame
 
@@ -231,15 +229,15 @@ def _second_look(job, given, cuts, results, part, n_round):
     The residuals are those of the whole fit. A first look of 30 iterations without structure, as
     `clresample deblend` takes, leaves bright galaxies' own structure in them: in simulated fields
     15 % of all rows were clumps of it then, and no more true sources were found. Pieces of a cut
-    blend are looked at in the round SEARCHED, when their neighbours' light is subtracted; their
-    new sources are left in the part, for the next round.
+    blend are looked at after their rough fits: their new sources are left in the part, for the next
+    round. Searched a round later, when neighbours are subtracted, they cost one more fit.
     """
     cuts, results, again = list(cuts), list(results), []
     for i, (cut, result) in enumerate(zip(cuts, results, strict=True)):
         is_piece = bool(cut.patch.siblings)
         if isinstance(result, Failure) or _chi2(result) > MAX_CHI2:
             continue
-        if n_round != (SEARCHED if is_piece else 0):
+        if n_round > 0:
             continue
         try:
             rows = _found(job, given, cut, result)

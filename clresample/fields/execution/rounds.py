@@ -15,9 +15,9 @@ from .group_results import FOUND_COLUMNS, GroupResultsFile
 # Most rounds in which a cut blend's pieces are fitted again, their neighbours' light subtracted.
 # The first takes the neighbours out; crowded pieces settle by the third or fourth.
 ROUNDS = 4
-# The same of large pieces, which take tens of seconds each (fitting.LARGE), but where their
-# residuals held more sources: the first round subtracts their neighbours' light, and what these
-# gain by that is a part of what it is taken to be wrong by
+# The same of large pieces, which take tens of seconds each (fitting.LARGE): the first round
+# subtracts their neighbours' light, and what these gain by that is a part of what it is taken to be
+# wrong by
 LARGE_ROUNDS = 1
 # [errors] A blend's pieces have settled when no flux changes by more than this from one round to
 # the next. Fits end within 0.2 of their limit (Settings.enough), two of them within 0.3 of each
@@ -40,8 +40,8 @@ FIT = TaskKind(gather_inputs, fit_group, part_path)
 def fit_all_groups(job, engine, progress):
     """Fits all groups that are not on disk yet, round by round.
 
-    A cut blend's pieces are fitted again as long as a neighbour of theirs moves, and where their
-    residuals held more sources.
+    A cut blend's pieces are fitted again with what their residuals held, and then as long as a
+    neighbour of theirs moves.
     returns the GroupResultsFiles, the last round's of each patch counting, and the parents of
     those cut blends whose pieces had not settled when the rounds ended
     """
@@ -56,7 +56,6 @@ def fit_all_groups(job, engine, progress):
     n_last = 0
     for n_round in range(1, ROUNDS + 1):
         again = {n for n in pending if n_round <= LARGE_ROUNDS or not _is_large(job, n)}
-        again |= history.new
         groups = [few for g in job.plan.cut_groups if (few := tuple(n for n in g if n in again))]
         if not groups:
             break
@@ -100,22 +99,17 @@ def _file(job, name):
 
 
 class _PieceHistory:
-    """In which parts a cut blend's pieces are, round by round.
-
-    new: pieces in whose residuals the last round has found sources
-    """
+    """In which parts a cut blend's pieces are, round by round."""
 
     def __init__(self, job):
-        self.job, self.names, self.found, self.new = job, {}, {}, set()
+        self.job, self.names, self.found = job, {}, {}
 
     def add(self, names):
         """Adds a round: {name: patches} of its parts."""
-        self.new = set()
         for name in sorted(names):
             (table,) = _file(self.job, name).read("FOUND")
             for row in zip(*(table[column].tolist() for column in FOUND_COLUMNS), strict=True):
                 self.found.setdefault(row[0], []).append(row)
-                self.new.add(row[0])
             for patch in names[name]:
                 if self.job.plan.patches[patch].pieces > 1:
                     self.names.setdefault(patch, []).append(name)
