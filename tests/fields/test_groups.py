@@ -109,8 +109,7 @@ def test_rough_and_large_fits_have_few_iterations(rough, large, given, most, err
 def test_what_is_found_beside_pieces_is_left_for_the_next_round(
     monkeypatch, siblings, fitted, left
 ):
-    """A blend that is whole is fitted again at once; only the first round after the rough one, or
-    the only one, searches."""
+    """A blend that is whole is fitted again at once; only the first round searches."""
     patch = SimpleNamespace(number=3, siblings=siblings, box=Box(10, 20, 40, 50), sources=(0,))
     cut = fitting._BlendCutout(patch, fitting.Blend((), (), None), {}, 0.0)
     row, blends = (77, 15.0, 27.0, 5), []
@@ -118,12 +117,11 @@ def test_what_is_found_beside_pieces_is_left_for_the_next_round(
     good, bad = (SimpleNamespace(observations=[seen], losses=[2, x]) for x in (4900.0, 5100.0))
     monkeypatch.setattr(fitting, "_found", lambda *given: [row])
     monkeypatch.setattr(fitting, "_fits", lambda job, some, *limits: blends.extend(some) or some)
-    n_round = 1 if siblings else 0
-    for i in (n_round, 2):
+    for i in (0, 1):
         part = GroupResults()
         cuts, _ = fitting._second_look(None, None, [cut], [good], part, i)
         assert fitting._second_look(None, None, [cut], [bad], part, i)[0] == [cut]
-        if i == 2:
+        if i == 1:
             assert not part.found and cuts == [cut]
         else:
             assert part.found == [(3, *row)] * left and cuts[0].more == (row,) * fitted
@@ -136,11 +134,10 @@ def test_what_was_found_is_carried_from_round_to_round(tmp_path):
     rows = [(3, 77, 15.0, 27.0, 5), (4, 78, 16.5, 2.25, 78)]
     patches = {3: SimpleNamespace(pieces=2), 4: SimpleNamespace(pieces=2)}
     parts.job.plan.patches = patches
-    for name, found in (("fit-1-000000", rows), ("fit-2-000000", [])):
+    for name, found in (("fit-0-000000", rows), ("fit-1-000000", [])):
         part = GroupResults(found=found)
         (tmp_path / f"{name}.fits").write_bytes(part.to_bytes())
         parts.add({name: (3, 4)})
-        assert parts.new == {row[0] for row in found}
     assert parts.found_in((4,)) == (rows[1],) and parts.found_in((3, 4)) == tuple(rows)
-    (table,) = GroupResultsFile(tmp_path / "fit-1-000000.fits").read("FOUND")
+    (table,) = GroupResultsFile(tmp_path / "fit-0-000000.fits").read("FOUND")
     assert table["host"].tolist() == [5, 78]
