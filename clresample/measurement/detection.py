@@ -191,9 +191,13 @@ def _without_structure(result, found, known, places, threshold):
 
 
 def _without_ghosts(result, found, places, threshold):
-    """The Detection without peaks that are the unevenness of a star's light, saturated or not."""
-    light = np.zeros(result.frame.shape)
-    points = _point_sources(result)
+    """The Detection without peaks that are the unevenness of a star's light, saturated or not.
+
+    A saturated star's counts in all images, that of another one in the image that found a peak, in
+    the sharpest for peaks of all together.
+    """
+    saturated = np.zeros(result.frame.shape)
+    points, of_points = _point_sources(result), {}
     for i, o in enumerate(result.observations):
         if isinstance(o.psf_field, StarPSFs):
             sky = result.sky[result.channel_slices()[i], None, None]
@@ -202,11 +206,20 @@ def _without_ghosts(result, found, places, threshold):
             image = sum(result.source_model(k, i) for k in points)
         else:
             continue
-        model = signal_of(_with_data(o, image, o.weights), result.frame, places[i])
-        light = np.maximum(light, model.flat())
-    noise = np.hypot(1, UNEVEN * light)
-    at = [tuple(np.rint(source.position_px).astype(int)) for source in found.sources]
-    return _chosen(found, [i for i, p in enumerate(at) if found.peaks[i] > threshold * noise[p]])
+        light = signal_of(_with_data(o, image, o.weights), result.frame, places[i]).flat()
+        if isinstance(o.psf_field, StarPSFs):
+            saturated = np.maximum(saturated, light)
+        else:
+            of_points[o.label] = light
+    sharp = min(result.observations, key=lambda o: _fwhm_px(o, result.frame)).label
+    none, kept = np.zeros(result.frame.shape), []
+    for i, source in enumerate(found.sources):
+        at = tuple(np.rint(source.position_px).astype(int))
+        label = found.found_in[i] if found.found_in[i] in of_points else sharp
+        light = max(saturated[at], of_points.get(label, none)[at])
+        if found.peaks[i] > threshold * np.hypot(1, UNEVEN * light):
+            kept.append(i)
+    return _chosen(found, kept)
 
 
 def _point_sources(result):

@@ -195,8 +195,9 @@ def test_two_galaxies_in_one_light_are_two_bodies_with_their_own_clumps():
 
 
 def test_a_clump_between_two_galaxies_is_the_ones_to_whose_centre_it_is_far_nearer():
-    faint, clump = np.array([60.0, 90.0]), (60, 74)
-    image = disk(16, 900.0, (60, 30)) + disk(16, 150.0, faint) + point(clump, 500)
+    """It rises from the brighter one's light."""
+    faint, clump = np.array([60.0, 90.0]), (78, 80)
+    image = disk(16, 1500.0, (60, 30)) + disk(12, 200.0, faint) + point(clump, 200)
     found = judged(image, [(60, 30), faint, clump])
     assert len(found.bodies) == 2
     assert found.owners[2] == found.owners[1] != found.owners[0]
